@@ -1,0 +1,62 @@
+# `make train` and `make test` need Python (3.11 or newer) and make, nothing else: each creates the
+# virtual environment, installs what it needs, and does its job.
+#
+#   make train ARGS="--steps 2e6"     options of `python -m dexsim_ppo.train`
+#   make test ARGS="-k touch"         options of pytest
+#   make PYTHON=python3.12 test       another interpreter (for a new .venv)
+#   make EXTRAS=cuda,warp train       other extras than the ones chosen by the device found
+
+PYTHON ?= python3
+VENV ?= .venv
+ARGS ?=
+PY := $(VENV)/bin/python
+PIP := $(PY) -m pip --disable-pip-version-check
+
+# With an NVIDIA driver present, training goes to the GPU through Warp.
+EXTRAS ?= video$(if $(shell nvidia-smi -L 2>/dev/null),$(comma)cuda$(comma)warp)
+comma := ,
+
+# One stamp for each set of requirements: a step runs again only when pyproject.toml has changed.
+INSTALLED := $(VENV)/.installed-$(subst $(comma),-,$(EXTRAS))
+TESTABLE := $(VENV)/.testable
+LINTABLE := $(VENV)/.lintable
+
+.PHONY: train test lint clean help
+.DELETE_ON_ERROR:
+.NOTPARALLEL:
+
+help:
+	@sed -n 's/^#  *\(make .*\)/  \1/p' Makefile
+
+train: $(INSTALLED)
+	$(PY) -m dexsim_ppo.train --task grasp $(ARGS)
+
+test: $(TESTABLE)
+	$(PY) -m pytest $(ARGS)
+
+lint: $(LINTABLE)
+	$(PY) -m ruff check $(ARGS)
+
+clean:
+	rm -rf $(VENV) dist .pytest_cache .ruff_cache
+	find . -name __pycache__ -not -path './.git/*' -prune -exec rm -rf {} +
+
+# pip 25.1 is the first that knows dependency groups.
+$(VENV)/.created:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "dexsim needs Python 3.11 or newer; name one with: make PYTHON=python3.12 ..." >&2; exit 2; }
+	$(PYTHON) -m venv $(VENV)
+	$(PIP) install --quiet --upgrade "pip>=25.1"
+	@touch $@
+
+$(INSTALLED): pyproject.toml | $(VENV)/.created
+	$(PIP) install --quiet --editable ".[$(EXTRAS)]"
+	@touch $@
+
+$(TESTABLE): pyproject.toml | $(VENV)/.created
+	$(PIP) install --quiet --editable ".[brax,warp,video,tb]" --group test
+	@touch $@
+
+$(LINTABLE): pyproject.toml | $(VENV)/.created
+	$(PIP) install --quiet --group lint
+	@touch $@

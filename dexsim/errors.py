@@ -1,0 +1,17 @@
+"""Errors that a user can act on: one clear line that says what is wrong and where."""
+
+
+class DexsimError(Exception):
+    """Base of every error raised on purpose. Command-line tools print it and exit with code 2."""
+
+
+class ConfigError(DexsimError):
+    """A configuration value is unknown, of the wrong type or out of range."""
+
+
+class AssetError(DexsimError):
+    """A model, layout or mesh file is missing, broken or asks for what the library cannot do."""
+
+
+class CheckpointError(DexsimError):
+    """A checkpoint or policy file is missing, damaged, of another task or of a newer version."""

@@ -1,0 +1,333 @@
+"""The hand: a static description read from files, and its kinematics in pure JAX.
+
+`load_hand` reads an MJCF, a taxel layout and a short TOML, so nothing in the library but the
+files under `assets/hand/` knows which hand it is. `forward_kinematics` is the one kinematics
+that simulation and hardware share.
+
+Shapes: J joints, B bodies, F fingers, N taxels a finger. Frames: poses are in the palm frame
+(fingers +z, palm normal +x, thumb side +y).
+"""
+
+import csv
+import dataclasses
+import tomllib
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dexsim import rotations
+from dexsim.assets import asset_path
+from dexsim.errors import AssetError
+from dexsim.pytree import pytree_dataclass
+
+TAXEL_COLUMNS = ("finger", "column", "row", "x", "y", "z", "nx", "ny", "nz", "area")
+
+
+@dataclasses.dataclass(frozen=True)
+class Geom:
+    """One primitive of the hand in its link's frame; `size` as in MuJoCo, `touches` the object."""
+
+    name: str
+    kind: str
+    body: int
+    size: np.ndarray
+    position: np.ndarray
+    rotation: np.ndarray
+    touches: bool
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Hand:
+    """What is fixed about a hand. Arrays are NumPy, so it can be closed over by jitted code."""
+
+    name: str
+    model_path: Path
+    palm: str
+    joint_names: tuple[str, ...]
+    joint_lower: np.ndarray  # [J] rad
+    joint_upper: np.ndarray  # [J] rad
+    torque_limit: np.ndarray  # [J] Nm, stall torque
+    speed_limit: np.ndarray  # [J] rad/s, no-load speed
+    body_names: tuple[str, ...]
+    body_parent: np.ndarray  # [B], -1 for the palm
+    body_position: np.ndarray  # [B, 3] m, in the parent's frame
+    body_rotation: np.ndarray  # [B, 3, 3]
+    body_joint: np.ndarray  # [B] index into joint_names, -1 where rigid
+    joint_axis: np.ndarray  # [B, 3], of the body's joint
+    joint_anchor: np.ndarray  # [B, 3] m
+    joint_reference: np.ndarray  # [B] rad, angle at which the body is as drawn
+    finger_names: tuple[str, ...]
+    tip_body: np.ndarray  # [F]
+    tip_offset: np.ndarray  # [F, 3] m, in the tip body's frame
+    root_joint: np.ndarray  # [F] the joint whose torque stands for the finger's
+    taxel_grid: tuple[int, int]  # columns, rows; index = column * rows + row
+    taxel_position: np.ndarray  # [F, N, 3] m, in the tip body's frame
+    taxel_normal: np.ndarray  # [F, N, 3] outward
+    taxel_area: np.ndarray  # [F, N] m^2
+    geoms: tuple[Geom, ...]
+
+    @property
+    def num_joints(self) -> int:
+        return len(self.joint_names)
+
+    @property
+    def num_fingers(self) -> int:
+        return len(self.finger_names)
+
+    @property
+    def num_taxels(self) -> int:
+        """Taxels of one finger."""
+        return self.taxel_position.shape[1]
+
+
+@pytree_dataclass
+class HandPose:
+    """Poses of all links and finger tips in the palm frame."""
+
+    body_position: jax.Array  # [B, 3] m
+    body_rotation: jax.Array  # [B, 3, 3]
+    tip_position: jax.Array  # [F, 3] m
+    tip_rotation: jax.Array  # [F, 3, 3]
+
+
+def forward_kinematics(hand: Hand, joint_position: jax.Array) -> HandPose:
+    """Poses of every link from joint angles [J] rad.
+
+    Bodies of equal depth in the tree move together, so the unrolled program has a few wide
+    operations instead of many small ones.
+    """
+    moving = hand.body_joint >= 0
+    angle = jnp.where(moving, joint_position[np.maximum(hand.body_joint, 0)], 0.0)
+    angle = angle - hand.joint_reference
+    turn = rotations.axis_angle_to_matrix(jnp.asarray(hand.joint_axis), angle)
+    local_rotation = rotations.compose(jnp.asarray(hand.body_rotation), turn)
+    lever = hand.joint_anchor - rotations.rotate(turn, jnp.asarray(hand.joint_anchor))
+    local_position = hand.body_position + rotations.rotate(jnp.asarray(hand.body_rotation), lever)
+
+    order, position, rotation = [], None, None
+    for level in _levels(hand.body_parent):
+        if position is None:
+            position, rotation = local_position[level], local_rotation[level]
+        else:
+            rows = np.array([order.index(p) for p in hand.body_parent[level]])
+            new_position = position[rows] + rotations.rotate(rotation[rows], local_position[level])
+            new_rotation = rotations.compose(rotation[rows], local_rotation[level])
+            position = jnp.concatenate([position, new_position])
+            rotation = jnp.concatenate([rotation, new_rotation])
+        order += list(level)
+    back = np.argsort(order)
+    position, rotation = position[back], rotation[back]
+    tip_rotation = rotation[hand.tip_body]
+    tip_position = position[hand.tip_body] + rotations.rotate(tip_rotation,
+                                                              jnp.asarray(hand.tip_offset))
+    return HandPose(position, rotation, tip_position, tip_rotation)
+
+
+def taxel_positions(hand: Hand, pose: HandPose) -> jax.Array:
+    """Taxel positions [F, N, 3] m in the palm frame."""
+    rotation, origin = pose.tip_rotation[:, None], pose.body_position[hand.tip_body][:, None]
+    return origin + rotations.rotate(rotation, jnp.asarray(hand.taxel_position))
+
+
+def taxel_normals(hand: Hand, pose: HandPose) -> jax.Array:
+    """Outward taxel normals [F, N, 3] in the palm frame."""
+    return rotations.rotate(pose.tip_rotation[:, None], jnp.asarray(hand.taxel_normal))
+
+
+def _levels(parent: np.ndarray) -> list[np.ndarray]:
+    """Body indices grouped by depth; every body comes after its parent."""
+    depth = np.zeros(len(parent), int)
+    for body, above in enumerate(parent):
+        depth[body] = 0 if above < 0 else depth[above] + 1
+    return [np.flatnonzero(depth == level) for level in range(depth.max() + 1)]
+
+
+def lattice_frame(position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Outward normals [C, R, 3] and areas [C, R] of a lattice of points [C, R, 3] on a surface.
+
+    The normal is the cross product of the two lattice tangents (central differences), turned
+    away from the lattice's centroid. Each cell's area goes in equal parts to its four corners.
+    """
+    along = np.gradient(position, axis=1)
+    around = np.gradient(position, axis=0)
+    normal = np.cross(around, along)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    outward = position - position.mean((0, 1))
+    if np.sum(normal * outward) < 0:
+        normal = -normal
+    a, b = position[:-1, :-1], position[1:, :-1]
+    c, d = position[1:, 1:], position[:-1, 1:]
+    cell = 0.5 * np.linalg.norm(np.cross(c - a, d - b), axis=-1)
+    area = np.zeros(position.shape[:2])
+    for rows in (slice(None, -1), slice(1, None)):
+        for columns in (slice(None, -1), slice(1, None)):
+            area[rows, columns] += cell / 4
+    return normal, area
+
+
+def load_hand(path: str | Path | None = None) -> Hand:
+    """Read a hand from its TOML (the shipped hand when `path` is None).
+
+    Raises:
+      AssetError: a file is missing or broken, or the three do not fit together.
+    """
+    import mujoco
+
+    path = Path(path) if path is not None else asset_path("hand/xhand_right.toml")
+    table = _read_toml(path)
+    for key in ("model", "taxels", "taxel_grid", "palm", "joints", "speed_limits", "fingers"):
+        if key not in table:
+            raise AssetError(f"{path}: no entry {key!r}")
+    model_path = path.parent / table["model"]
+    if not model_path.is_file():
+        raise AssetError(f"{model_path}: no such file (model of {path})")
+    try:
+        model = mujoco.MjModel.from_xml_path(str(model_path))
+    except ValueError as error:
+        raise AssetError(f"{model_path}: {' '.join(str(error).split())}") from None
+
+    def find(kind: str, name: str) -> int:
+        index = mujoco.mj_name2id(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), name)
+        if index < 0:
+            raise AssetError(f"{path}: {model_path.name} has no {kind} {name!r}")
+        return index
+
+    joints = [find("joint", name) for name in table["joints"]]
+    if len(set(joints)) != model.njnt or model.nq != model.njnt:
+        raise AssetError(f"{path}: joints lists {len(set(joints))} of the {model.njnt} joints of "
+                         f"{model_path.name}; every joint must be listed once and be a hinge")
+    if np.any(model.jnt_type != mujoco.mjtJoint.mjJNT_HINGE):
+        raise AssetError(f"{model_path}: only hinge joints are supported")
+    if len(table["speed_limits"]) != len(joints):
+        raise AssetError(f"{path}: {len(table['speed_limits'])} speed_limits "
+                         f"for {len(joints)} joints")
+    limit = model.jnt_actfrcrange[joints, 1]
+    if not np.all(model.jnt_limited[joints]) or np.any(limit <= 0):
+        bad = next(n for n, j, t in zip(table["joints"], joints, limit, strict=True)
+                   if not model.jnt_limited[j] or t <= 0)
+        raise AssetError(f"{model_path}: joint {bad!r} needs a range and an actuatorfrcrange")
+
+    palm = find("body", table["palm"])
+    bodies = [b for b in range(1, model.nbody) if _is_below(model.body_parentid, b, palm)]
+    row = {body: i for i, body in enumerate(bodies)}
+    body_joint = np.full(len(bodies), -1)
+    for index, joint in enumerate(joints):
+        body = int(model.jnt_bodyid[joint])
+        if body not in row or body_joint[row[body]] >= 0:
+            raise AssetError(f"{model_path}: joint {table['joints'][index]!r} must be the only "
+                             f"joint of a body below {table['palm']!r}")
+        body_joint[row[body]] = index
+    at = np.array([joints[j] if j >= 0 else -1 for j in body_joint])
+    has = at >= 0
+    tips = [find("site", finger["tip"]) for finger in table["fingers"]]
+    root = [table["joints"].index(finger["root_joint"])
+            if finger["root_joint"] in table["joints"] else -1 for finger in table["fingers"]]
+    if -1 in root:
+        name = table["fingers"][root.index(-1)]["root_joint"]
+        raise AssetError(f"{path}: root_joint {name!r} is not among joints")
+    finger_names = tuple(finger["name"] for finger in table["fingers"])
+    taxels = _read_taxels(path.parent / table["taxels"], finger_names, table["taxel_grid"])
+    parent = np.array([row.get(int(model.body_parentid[b]), -1) for b in bodies])
+    identity = np.eye(3)
+
+    return Hand(
+        name=table.get("name", path.stem), model_path=model_path, palm=table["palm"],
+        joint_names=tuple(table["joints"]),
+        joint_lower=_f32(model.jnt_range[joints, 0]), joint_upper=_f32(model.jnt_range[joints, 1]),
+        torque_limit=_f32(limit), speed_limit=_f32(table["speed_limits"]),
+        body_names=tuple(model.body(b).name for b in bodies), body_parent=parent,
+        body_position=_f32([np.zeros(3) if b == palm else model.body_pos[b] for b in bodies]),
+        body_rotation=_f32([identity if b == palm else _matrix(model.body_quat[b])
+                            for b in bodies]),
+        body_joint=body_joint,
+        joint_axis=_f32(np.where(has[:, None], model.jnt_axis[at], [0, 0, 1])),
+        joint_anchor=_f32(np.where(has[:, None], model.jnt_pos[at], 0)),
+        joint_reference=_f32(np.where(has, model.qpos0[model.jnt_qposadr[at]], 0)),
+        finger_names=finger_names,
+        tip_body=np.array([row[int(model.site_bodyid[s])] for s in tips]),
+        tip_offset=_f32(model.site_pos[tips]), root_joint=np.array(root),
+        taxel_grid=tuple(table["taxel_grid"]),
+        taxel_position=taxels[..., 0:3], taxel_normal=taxels[..., 3:6], taxel_area=taxels[..., 6],
+        geoms=_read_geoms(model, row),
+    )
+
+
+def _f32(values) -> np.ndarray:
+    return np.asarray(values, np.float32)
+
+
+def _matrix(quat: np.ndarray) -> np.ndarray:
+    import mujoco
+
+    matrix = np.zeros(9)
+    mujoco.mju_quat2Mat(matrix, quat)
+    return matrix.reshape(3, 3)
+
+
+def _is_below(parent: np.ndarray, body: int, ancestor: int) -> bool:
+    while body > 0:
+        if body == ancestor:
+            return True
+        body = int(parent[body])
+    return False
+
+
+def _read_geoms(model, row: dict[int, int]) -> tuple[Geom, ...]:
+    names = {2: "sphere", 3: "capsule", 4: "ellipsoid", 5: "cylinder", 6: "box", 0: "plane"}
+    geoms = []
+    for g in range(model.ngeom):
+        kind = names.get(int(model.geom_type[g]))
+        if int(model.geom_bodyid[g]) in row and kind is not None:
+            touches = bool(model.geom_contype[g] | model.geom_conaffinity[g])
+            geoms.append(Geom(model.geom(g).name, kind, row[int(model.geom_bodyid[g])],
+                              _f32(model.geom_size[g]), _f32(model.geom_pos[g]),
+                              _f32(_matrix(model.geom_quat[g])), touches))
+    return tuple(geoms)
+
+
+def _read_toml(path: Path) -> dict:
+    try:
+        with open(path, "rb") as file:
+            return tomllib.load(file)
+    except FileNotFoundError:
+        raise AssetError(f"{path}: no such file") from None
+    except tomllib.TOMLDecodeError as error:
+        raise AssetError(f"{path}: {error}") from None
+
+
+def _read_taxels(path: Path, fingers: tuple[str, ...], grid: list[int]) -> np.ndarray:
+    """[F, N, 7]: position, normal, area. Every finger must have columns * rows taxels."""
+    try:
+        with open(path, newline="") as file:
+            rows = list(csv.DictReader(file))
+    except FileNotFoundError:
+        raise AssetError(f"{path}: no such file") from None
+    if not rows or tuple(rows[0]) != TAXEL_COLUMNS:
+        raise AssetError(f"{path}: the first line must read {','.join(TAXEL_COLUMNS)}")
+    columns, length = grid
+    table = np.full((len(fingers), columns * length, 7), np.nan, np.float32)
+    for line, entry in enumerate(rows, start=2):
+        if entry["finger"] not in fingers:
+            raise AssetError(f"{path}:{line}: no finger {entry['finger']!r}; "
+                             f"the hand has {', '.join(fingers)}")
+        try:
+            column, at = int(entry["column"]), int(entry["row"])
+            values = [float(entry[name]) for name in TAXEL_COLUMNS[3:]]
+        except (TypeError, ValueError):
+            raise AssetError(f"{path}:{line}: not ten values with numbers from column 2 on"
+                             ) from None
+        if not (0 <= column < columns and 0 <= at < length) or not np.all(np.isfinite(values)):
+            raise AssetError(f"{path}:{line}: column {column}, row {at} or a number in the line "
+                             f"is outside the {columns} x {length} grid or not finite")
+        table[fingers.index(entry["finger"]), column * length + at] = values
+    count = np.sum(np.isfinite(table[..., 0]), axis=1)
+    if np.any(count != columns * length):
+        worst = int(np.argmin(count))
+        raise AssetError(f"{path}: finger {fingers[worst]!r} has {count[worst]} taxels, "
+                         f"the grid asks for {columns * length}")
+    if len(rows) != table.shape[0] * table.shape[1]:
+        raise AssetError(f"{path}: {len(rows)} taxels, expected {table.shape[0] * table.shape[1]} "
+                         "(a column and row is given twice)")
+    return table

@@ -1,0 +1,197 @@
+"""What is grasped: unions of a few primitives whose sizes are drawn at every episode start.
+
+One compiled model has a fixed slot per primitive kind. An object switches slots on and sizes
+them, so spheres, boxes, cylinders, capsules and compositions share one batch. Collision and
+touch read the same sizes.
+
+A sphere is the capsule slot with next to no length: a slot less to collide.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dexsim import sdf
+from dexsim.config import check_ranges, setting, validate
+from dexsim.errors import ConfigError
+from dexsim.pytree import pytree_dataclass
+
+SLOTS = ("box", "capsule", "cylinder")
+SHAPES = ("sphere", "box", "cylinder", "capsule", "composition")
+OFF = 1e-4  # m, size of a slot that is switched off: a speck at the object's centre
+_SHORT = 1e-4  # m, half-length of a capsule that plays a sphere
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ObjectConfig:
+    """Which objects are drawn, and their ranges (low, high). Resampled at every episode start."""
+
+    shapes: tuple[str, ...] = setting(SHAPES, choices=SHAPES)
+    """Kinds of object, drawn with equal probability."""
+    sphere_radius: tuple[float, float] = setting((0.022, 0.035), unit="m", low=0.005, high=0.08)
+    """Radius of a sphere."""
+    box_half: tuple[float, float] = setting((0.020, 0.030), unit="m", low=0.005, high=0.08)
+    """Each half-extent of a box."""
+    cylinder_radius: tuple[float, float] = setting((0.020, 0.030), unit="m", low=0.005, high=0.08)
+    """Radius of a cylinder or capsule."""
+    cylinder_half: tuple[float, float] = setting((0.020, 0.040), unit="m", low=0.002, high=0.10)
+    """Half-length of a cylinder, or of a capsule's straight part."""
+    neck_radius: tuple[float, float] = setting((0.010, 0.016), unit="m", low=0.003, high=0.05)
+    """Radius of the capsule that juts out of a composition."""
+    neck_half: tuple[float, float] = setting((0.010, 0.025), unit="m", low=0.002, high=0.10)
+    """Half-length of that capsule's straight part."""
+    mass: tuple[float, float] = setting((0.05, 0.20), unit="kg", low=0.001, high=5.0)
+    """Mass of the object."""
+    inertia_scale: tuple[float, float] = setting((0.8, 1.25), unit="1", low=0.05, high=20.0)
+    """Factor on the inertia of a uniform solid."""
+    com_offset: float = setting(0.003, unit="m", low=0.0, high=0.05)
+    """Largest offset of the centre of mass, per axis."""
+    friction: tuple[float, float] = setting((0.6, 1.2), unit="1", low=0.01, high=5.0)
+    """Sliding friction between hand and object."""
+    contact_time: tuple[float, float] = setting((0.02, 0.03), unit="s", low=0.01, high=0.5)
+    """Time constant of the contact spring: its softness."""
+    restitution: tuple[float, float] = setting((0.0, 0.2), unit="1", low=0.0, high=0.9)
+    """Coefficient of restitution of the contact spring: its damping."""
+
+    def __post_init__(self):
+        validate(self)
+        check_ranges(self, "sphere_radius", "box_half", "cylinder_radius", "cylinder_half",
+                     "neck_radius", "neck_half", "mass", "inertia_scale", "friction",
+                     "contact_time", "restitution")
+        if not self.shapes:
+            raise ConfigError("ObjectConfig.shapes is empty: name at least one shape")
+
+    @property
+    def largest(self) -> np.ndarray:
+        """Upper bound [K, 3] of every slot's size, for the compiled template."""
+        radius = max(self.cylinder_radius[1], self.sphere_radius[1], self.neck_radius[1])
+        half = max(self.cylinder_half[1], self.neck_half[1])
+        return np.array([[self.box_half[1]] * 3, [radius, half, 0.0],
+                         [self.cylinder_radius[1], self.cylinder_half[1], 0.0]])
+
+
+def bounding_radius(size: jax.Array) -> jax.Array:
+    """Radius [K] of the sphere round each slot's primitive, for the broad phase."""
+    (a, b, c), (r, h, _), (cr, ch, _) = size
+    return jnp.stack([jnp.sqrt(a * a + b * b + c * c), r + h, jnp.hypot(cr, ch)])
+
+
+def extent(size: jax.Array, position: jax.Array, active: jax.Array,
+           direction: jax.Array) -> jax.Array:
+    """How far [] m the object reaches along a unit `direction` [3] of its own frame."""
+    along = jnp.abs(direction)
+    across = jnp.sqrt(jnp.maximum(1.0 - direction[2] ** 2, 0.0))
+    (a, b, c), (r, h, _), (cr, ch, _) = size
+    reach = jnp.stack([along[0] * a + along[1] * b + along[2] * c, r + h * along[2],
+                       cr * across + ch * along[2]])
+    return jnp.max(jnp.where(active, reach + position @ direction, -jnp.inf))
+
+
+@pytree_dataclass
+class ObjectParams:
+    """One drawn object; every leaf may differ between environments."""
+
+    shape_index: jax.Array  # [] int32, into SHAPES
+    size: jax.Array  # [K, 3] m
+    position: jax.Array  # [K, 3] m, slot centres in the object's frame
+    active: jax.Array  # [K] bool
+    mass: jax.Array  # [] kg
+    inertia: jax.Array  # [3] kg m^2 about the centre of mass, along the object's axes
+    com: jax.Array  # [3] m
+    friction: jax.Array  # [] sliding
+    contact: jax.Array  # [2] time constant s, damping ratio of the contact spring
+
+    def shape(self) -> sdf.Shape:
+        """The union of primitives, for the taxels."""
+        eye = jnp.broadcast_to(jnp.eye(3), (len(SLOTS), 3, 3))
+        return sdf.Shape(SLOTS, self.size, self.position, eye, self.active)
+
+
+def sample_object(key: jax.Array, config: ObjectConfig) -> ObjectParams:
+    """Draw one object."""
+    keys = jax.random.split(key, 8)
+    allowed = jnp.array([SHAPES.index(name) for name in config.shapes])
+    shape_index = jax.random.choice(keys[0], allowed)
+    size, position, active = _sample_slots(keys[1], shape_index, config)
+    density_mass, com, inertia = _mass_properties(size, position, active)
+    mass = _uniform(keys[2], config.mass)
+    scale = _uniform(keys[3], config.inertia_scale) * mass / density_mass
+    com = com + config.com_offset * jax.random.uniform(keys[4], (3,), minval=-1.0)
+    contact = jnp.stack([_uniform(keys[6], config.contact_time),
+                         damping_ratio(_uniform(keys[7], config.restitution))])
+    return ObjectParams(shape_index.astype(jnp.int32), size, position, active, mass,
+                        inertia * scale, com, _uniform(keys[5], config.friction), contact)
+
+
+def damping_ratio(restitution: jax.Array) -> jax.Array:
+    """Damping ratio of a linear spring-damper that bounces with this restitution.
+
+    From e = exp(-pi z / sqrt(1 - z^2)); MuJoCo has no restitution parameter. A restitution
+    of 0 is critical damping.
+    """
+    log = jnp.log(jnp.maximum(restitution, 1e-6))
+    ratio = -log / jnp.sqrt(jnp.pi**2 + log**2)
+    return jnp.where(restitution < 1e-3, 1.0, ratio)
+
+
+def _uniform(key: jax.Array, span: tuple[float, float], shape=()) -> jax.Array:
+    return jax.random.uniform(key, shape, minval=span[0], maxval=span[1])
+
+
+def _sample_slots(key: jax.Array, shape_index: jax.Array,
+                  config: ObjectConfig) -> tuple[jax.Array, jax.Array, jax.Array]:
+    keys = jax.random.split(key, 7)
+    is_sphere, is_box, is_cylinder, is_capsule, is_union = (shape_index == i for i in range(5))
+    half = _uniform(keys[0], config.box_half, (3,))
+    radius, length = _uniform(keys[1], config.cylinder_radius), _uniform(keys[2],
+                                                                       config.cylinder_half)
+    ball = _uniform(keys[3], config.sphere_radius)
+    neck, neck_half = _uniform(keys[4], config.neck_radius), _uniform(keys[5], config.neck_half)
+    box_body = jax.random.bernoulli(keys[6])
+
+    # A composition is a box or a cylinder with a capsule jutting out along its axis.
+    body_half = jnp.where(box_body, half[2], length)
+    capsule = jnp.where(is_sphere, jnp.stack([ball, _SHORT]),
+                        jnp.where(is_union, jnp.stack([neck, neck_half]),
+                                  jnp.stack([radius, length])))
+    zero = jnp.zeros(())
+    size = jnp.stack([half, jnp.stack([*capsule, zero]), jnp.stack([radius, length, zero])])
+    active = jnp.stack([is_box | (is_union & box_body), is_sphere | is_capsule | is_union,
+                        is_cylinder | (is_union & ~box_body)])
+    jut = jnp.where(is_union, body_half + neck_half, 0.0)
+    # The frame's origin sits midway between the ends, so that every object is drawn alike.
+    middle = jnp.where(is_union, (jut + neck_half + neck - body_half) / 2, 0.0)
+    offset = jnp.stack([-middle, jut - middle, -middle])
+    z = jnp.where(active, offset, 0.0)
+    position = jnp.stack([jnp.zeros(3), jnp.zeros(3), z], -1)
+    return jnp.where(active[:, None], size, OFF), position, active
+
+
+def _mass_properties(size: jax.Array, position: jax.Array,
+                     active: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Mass, centre and inertia (about the centre) of the union at unit density.
+
+    Overlaps count twice; the drawn mass and inertia scale absorb it.
+    """
+    (a, b, c), (r, h, _), (cr, ch, _) = size
+    box_mass = 8 * a * b * c
+    box_inertia = box_mass / 3 * jnp.stack([b * b + c * c, a * a + c * c, a * a + b * b])
+    tube, ball = 2 * jnp.pi * r * r * h, 4 / 3 * jnp.pi * r**3
+    side = (tube * (r * r / 4 + h * h / 3)
+            + ball * (2 / 5 * r * r + h * h + 3 / 4 * r * h))
+    capsule_inertia = jnp.stack([side, side, tube * r * r / 2 + ball * 2 / 5 * r * r])
+    cylinder_mass = 2 * jnp.pi * cr * cr * ch
+    side = cylinder_mass * (cr * cr / 4 + ch * ch / 3)
+    cylinder_inertia = jnp.stack([side, side, cylinder_mass * cr * cr / 2])
+
+    mass = jnp.where(active, jnp.stack([box_mass, tube + ball, cylinder_mass]), 0.0)
+    inertia = jnp.where(active[:, None],
+                        jnp.stack([box_inertia, capsule_inertia, cylinder_inertia]), 0.0)
+    z = jnp.where(active, position[:, 2], 0.0)
+    total = jnp.sum(mass)
+    centre = jnp.sum(mass * z) / total
+    shift = jnp.sum(mass * (z - centre) ** 2)
+    return (total, jnp.stack([jnp.zeros(()), jnp.zeros(()), centre]),
+            jnp.sum(inertia, 0) + shift * jnp.array([1.0, 1.0, 0.0]))

@@ -1,0 +1,162 @@
+"""The read-out beside the picture: one unrolled taxel map per finger, forces in newton, command and colour scale.
+
+Drawn with Pillow and NumPy instead of matplotlib, which would cost more than the rest of a frame.
+
+A map shows the fingertip unrolled, seen from outside: column 0 at the left, row 0 (base of the fingertip) at the
+bottom and the last row (its tip) at the top; taxel index = column * rows + row.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+INK, FAINT, PANEL, EMPTY, ACCENT = ((233, 236, 241), (138, 146, 160), (24, 27, 33), (40, 44, 53), (94, 196, 255))
+_GAP = 1  # pixels between two cells
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where everything lies in a panel of `width` x `height` pixels."""
+
+    width: int
+    height: int
+    cell: int  # pitch of the taxels, pixels
+    grid: tuple[int, int]  # columns, rows
+    slots: tuple[tuple[int, int], ...]  # top left corner of each finger's block, then the read-outs' block
+    font: int  # pixels
+
+
+def make_layout(width: int, height: int, grid: tuple[int, int], fingers: int) -> Layout:
+    """Two columns of blocks, the fingers in order and the read-outs last."""
+    columns, rows = grid
+    lines = (fingers + 2) // 2
+    font = max(8, round(height / 36))
+    # A block is a title line, the map and a force bar, with air below.
+    cell = max(2, min((height // lines - int(2.6 * font)) // rows, int(width * 0.42) // columns))
+    block_width, block_height = cell * columns, cell * rows + int(2.0 * font)
+    left = (width - 2 * block_width) // 3
+    top = (height - lines * block_height) // (lines + 1)
+    slots = tuple(
+        (left + (k % 2) * (block_width + left), top + (k // 2) * (block_height + top)) for k in range(2 * lines)
+    )
+    return Layout(width, height, cell, grid, slots[:fingers] + (slots[fingers],), font)
+
+
+def cell_box(layout: Layout, finger: int, column: int, row: int) -> tuple[int, int, int, int]:
+    """Pixels (left, top, right, bottom; the last two exclusive) of one taxel's cell in the panel."""
+    x, y = layout.slots[finger]
+    left = x + column * layout.cell
+    top = y + int(1.3 * layout.font) + (layout.grid[1] - 1 - row) * layout.cell
+    return left, top, left + layout.cell - _GAP, top + layout.cell - _GAP
+
+
+def taxel_image(values: np.ndarray, grid: tuple[int, int]) -> np.ndarray:
+    """One finger's taxels [N, ...] as an image [rows, columns, ...]: tip at the top, column 0 at the left."""
+    columns, rows = grid
+    return np.swapaxes(np.asarray(values).reshape(columns, rows, *np.shape(values)[1:]), 0, 1)[::-1]
+
+
+def force_color(force: np.ndarray, force_range: float) -> np.ndarray:
+    """sRGB bytes [..., 3] of forces [...] on the perceptual colour scale from 0 to `force_range`, both in N."""
+    table = _color_table()
+    level = np.nan_to_num(np.asarray(force, np.float64) / force_range)
+    return table[np.clip(level * (len(table) - 1), 0, len(table) - 1).astype(int)]
+
+
+@lru_cache(maxsize=1)
+def _color_table() -> np.ndarray:
+    import matplotlib  # only the colour table; pyplot is never needed here
+
+    # The darkest eighth would vanish on the dark panel.
+    return (matplotlib.colormaps["inferno"](np.linspace(0.12, 1.0, 256))[:, :3] * 255).round().astype(np.uint8)
+
+
+@lru_cache(maxsize=8)
+def _font(size: int):
+    from PIL import ImageFont
+
+    return ImageFont.load_default(size)
+
+
+@lru_cache(maxsize=4)
+def _background(layout: Layout, names: tuple[str, ...], force_range: float):
+    """What stays the same in every frame of a video."""
+    from PIL import Image, ImageDraw
+
+    image = Image.new("RGB", (layout.width, layout.height), PANEL)
+    draw = ImageDraw.Draw(image)
+    width = layout.cell * layout.grid[0] - _GAP
+    for (x, y), name in zip(layout.slots[:-1], names, strict=True):
+        draw.text((x, y), name, fill=INK, font=_font(layout.font))
+    x, y = layout.slots[-1]
+    bottom = y + int(1.3 * layout.font) + layout.cell * layout.grid[1]
+    small, bar = _font(layout.font - 2), max(4, layout.cell)
+    top = bottom - bar - int(1.3 * layout.font)
+    scale = force_color(np.linspace(0, force_range, width)[None].repeat(bar, 0), force_range)
+    image.paste(Image.fromarray(scale), (x, top))
+    draw.text((x, top + bar + 3), "0", fill=FAINT, font=small)
+    label = f"{force_range:.2g} N / taxel"
+    draw.text((x + width - draw.textlength(label, small), top + bar + 3), label, fill=FAINT, font=small)
+    return image
+
+
+def draw_panel(
+    layout: Layout,
+    names: tuple[str, ...],
+    taxel_force: np.ndarray,
+    finger_force: np.ndarray,
+    command: np.ndarray,
+    target_force: float,
+    force_range: float,
+    finger_range: float,
+) -> np.ndarray:
+    """The panel as uint8 [height, width, 3].
+
+    `taxel_force` [F, N] N, `finger_force` [F] N, `command` any shape (none: left out), `target_force` N (not finite:
+    left out). The bar under a map is the finger's force out of `finger_range` N; its mark is the target.
+    """
+    from PIL import Image, ImageDraw
+
+    image = _background(layout, tuple(names), float(force_range)).copy()
+    draw = ImageDraw.Draw(image)
+    font, pad = _font(layout.font), int(1.3 * layout.font)
+    width, height = layout.cell * layout.grid[0] - _GAP, layout.cell * layout.grid[1]
+    colors = np.where(taxel_force[..., None] > 0, force_color(taxel_force, force_range), np.uint8(EMPTY))
+    grid = np.arange(layout.cell) >= layout.cell - _GAP
+    for f, (x, y) in enumerate(layout.slots[:-1]):
+        text = f"{finger_force[f]:.1f} N"
+        draw.text((x + width - draw.textlength(text, font), y), text, fill=INK, font=font)
+        cells = taxel_image(colors[f], layout.grid).repeat(layout.cell, 0).repeat(layout.cell, 1)
+        cells[np.tile(grid, layout.grid[1])] = PANEL
+        cells[:, np.tile(grid, layout.grid[0])] = PANEL
+        image.paste(Image.fromarray(cells), (x, y + pad))
+        bar = y + pad + height + 2
+        thick = max(2, layout.font // 4)
+        draw.rectangle((x, bar, x + width - 1, bar + thick), fill=EMPTY)
+        filled = int(np.clip(finger_force[f] / finger_range, 0, 1) * width)
+        if filled > 0:
+            draw.rectangle((x, bar, x + filled - 1, bar + thick), fill=ACCENT)
+        if np.isfinite(target_force) and 0 < target_force <= finger_range:
+            mark = x + int(target_force / finger_range * (width - 1))
+            draw.rectangle((mark, bar - 1, mark + 1, bar + thick + 1), fill=INK)
+    _read_outs(draw, layout, finger_force, command, target_force)
+    return np.asarray(image)
+
+
+def _read_outs(draw, layout: Layout, finger_force, command, target_force) -> None:
+    x, y = layout.slots[-1]
+    width = layout.cell * layout.grid[0] - _GAP
+    lines = [("force", f"{np.sum(finger_force):.1f} N")]
+    if np.isfinite(target_force):
+        lines.insert(0, ("target", f"{float(target_force):.1f} N"))
+    if np.size(command):
+        lines.insert(0, ("command", " ".join(f"{c:.2f}" for c in np.ravel(command)[:3])))
+    font = _font(layout.font)
+    y += int(1.3 * layout.font)
+    for name, value in lines:
+        draw.text((x, y), name, fill=FAINT, font=font)
+        draw.text((x + width - draw.textlength(value, font), y), value, fill=INK, font=font)
+        y += int(1.5 * layout.font)

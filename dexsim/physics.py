@@ -1,0 +1,289 @@
+"""The physics seam: the only room that imports `mujoco.mjx`.
+
+`Physics` compiles the hand, an object and explicit contact pairs into one model, and `advance`
+runs it for one control tick on either backend: `jax` (differentiable, any device) or `warp`
+(about six times faster on NVIDIA GPUs). The state that crosses this seam is Markov: positions,
+velocities and the solver's warm start. Everything derived is recomputed, which keeps the state
+small and lets an episode restart by selecting arrays, on both backends.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from mujoco import mjx
+
+from dexsim.config import setting, validate
+from dexsim.errors import AssetError, ConfigError
+from dexsim.hand import Hand
+from dexsim.model_guard import check_model
+from dexsim.objects import ObjectParams, bounding_radius
+from dexsim.pytree import pytree_dataclass
+
+GEOM_TYPES = {"sphere": mujoco.mjtGeom.mjGEOM_SPHERE, "box": mujoco.mjtGeom.mjGEOM_BOX,
+              "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
+              "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
+              "ellipsoid": mujoco.mjtGeom.mjGEOM_ELLIPSOID}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PhysicsConfig:
+    """Time step, solver and contact model."""
+
+    timestep: float = setting(0.005, unit="s", low=1e-4, high=0.02)
+    """One physics sub-step."""
+    substeps: int = setting(8, unit="1", low=1, high=200)
+    """Sub-steps in one control tick; the control rate is 1 / (timestep * substeps)."""
+    iterations: int = setting(5, unit="1", low=1, high=100)
+    """Newton iterations of the contact solver."""
+    line_search: int = setting(8, unit="1", low=1, high=100)
+    """Line-search iterations in each of them."""
+    condim: int = setting(3, unit="1", low=1, high=6)
+    """Contact dimension between hand and object: 3 sliding, 4 with torsion, 6 with rolling."""
+    palm: str = setting("face", choices=("face", "box"))
+    """Palm as a half-space at its face (exact and cheap for every primitive) or as its box."""
+    max_contacts: int = setting(20, unit="1", low=4, high=400)
+    """Contacts kept per environment (JAX backend: the deepest; Warp: mean over the batch)."""
+    max_pairs: int = setting(8, unit="1", low=1, high=1000)
+    """Nearest geom pairs tested per pair of primitive kinds (JAX backend)."""
+
+    def __post_init__(self):
+        validate(self)
+        if self.condim not in (1, 3, 4, 6):
+            raise ConfigError(f"PhysicsConfig.condim = {self.condim}: must be 1, 3, 4 or 6")
+
+    @property
+    def control_period(self) -> float:
+        """One control tick, s."""
+        return self.timestep * self.substeps
+
+
+@pytree_dataclass
+class PhysicsState:
+    """The Markov state: hand joints first, then the object's free joint."""
+
+    qpos: jax.Array  # [J + 7] rad; m and unit quaternion
+    qvel: jax.Array  # [J + 6] rad/s; m/s (palm frame) and rad/s (object frame)
+    warmstart: jax.Array  # [J + 6] last accelerations, the solver's first guess
+
+
+def choose_backend(backend: str) -> str:
+    """`auto` is Warp where it can be imported and JAX runs on an NVIDIA GPU, else JAX."""
+    if backend not in ("auto", "jax", "warp"):
+        raise ConfigError(f"backend {backend!r}: choose auto, jax or warp")
+    if backend == "jax":
+        return backend
+    import importlib.util
+
+    found = importlib.util.find_spec("warp") is not None
+    if backend == "warp" and not found:
+        raise ConfigError("backend 'warp' needs the extra: pip install 'dexsim[warp]'")
+    on_gpu = jax.default_backend() in ("gpu", "cuda")
+    return "warp" if backend == "warp" or (found and on_gpu) else "jax"
+
+
+class Physics:
+    """The compiled scene. Immutable; its methods are pure and written for one environment."""
+
+    def __init__(self, hand: Hand, slots: tuple[str, ...], largest: np.ndarray,
+                 config: PhysicsConfig, *, gravity: tuple[float, float, float],
+                 backend: str = "auto", num_envs: int = 1):
+        """Compile.
+
+        Args:
+          hand: the hand; its MJCF is read again here.
+          slots: kinds of the object's primitives.
+          largest: [K, 3] m, the largest size of each slot (broad phase bounds).
+          config: solver and contact model.
+          gravity: m/s^2 in the palm frame, which is the world's.
+          backend: "auto", "jax" or "warp".
+          num_envs: batch size that Warp's contact buffer is sized for.
+
+        Raises:
+          AssetError: the model uses what the backend ignores or lacks.
+        """
+        self.hand, self.slots, self.config = hand, slots, config
+        self.backend = choose_backend(backend)
+        # Warp shares one contact buffer among all worlds; the rest is per world.
+        self._contact_buffer = max(config.max_contacts * num_envs, 256)
+        self.mj_model = build_model(hand, slots, largest, config, gravity, self.backend)
+        try:
+            self._model = mjx.put_model(self.mj_model, impl=self.backend)
+        except NotImplementedError as error:
+            raise AssetError(f"{hand.model_path}: backend {self.backend}: {error}") from None
+        self._find_addresses()
+
+    def _find_addresses(self) -> None:
+        model, hand = self.mj_model, self.hand
+        joints = [model.joint(name) for name in hand.joint_names]
+        self.joint_qpos = np.array([j.qposadr[0] for j in joints])
+        self.joint_dof = np.array([j.dofadr[0] for j in joints])
+        free = model.joint("object")
+        self.object_qpos = np.arange(free.qposadr[0], free.qposadr[0] + 7)
+        self.object_dof = np.arange(free.dofadr[0], free.dofadr[0] + 6)
+        self.object_body = model.body("object").id
+        self.object_geoms = np.array([model.geom(f"object_{k}").id
+                                      for k in range(len(self.slots))])
+        is_object = np.isin(model.pair_geom1, self.object_geoms)
+        is_object |= np.isin(model.pair_geom2, self.object_geoms)
+        self.object_pairs = np.flatnonzero(is_object)
+        # finger_of_geom[g]: whose tip link a geom belongs to, -1 for none.
+        tips = {model.body(hand.body_names[b]).id: f for f, b in enumerate(hand.tip_body)}
+        self._finger_of_geom = np.array([tips.get(int(b), -1) for b in model.geom_bodyid])
+        self._is_object_geom = np.isin(np.arange(model.ngeom), self.object_geoms)
+
+    def configure(self, target: ObjectParams) -> Any:
+        """The MJX model with one environment's object and contact parameters put in."""
+        model, geoms, body = self._model, self.object_geoms, self.object_body
+        pair = self.object_pairs
+        slide = jnp.broadcast_to(target.friction, (len(pair), 2))
+        # body_invweight0 keeps its template value on purpose: it sets the contact's stiffness,
+        # which belongs to the skin and must not change with the mass of what is touched.
+        return model.replace(
+            geom_size=model.geom_size.at[geoms].set(target.size),
+            geom_rbound=model.geom_rbound.at[geoms].set(bounding_radius(target.size)),
+            geom_pos=model.geom_pos.at[geoms].set(target.position),
+            body_mass=model.body_mass.at[body].set(target.mass),
+            body_inertia=model.body_inertia.at[body].set(target.inertia),
+            body_ipos=model.body_ipos.at[body].set(target.com),
+            pair_friction=model.pair_friction.at[pair, :2].set(slide),
+            pair_solref=model.pair_solref.at[pair].set(target.contact),
+        )
+
+    def advance(self, target: ObjectParams, state: PhysicsState,
+                torque: Callable[[jax.Array, jax.Array, jax.Array], jax.Array],
+                push: jax.Array) -> tuple[PhysicsState, jax.Array]:
+        """Run one control tick.
+
+        Args:
+          target: the object.
+          state: where to start from.
+          torque: (sub-step, joint position [J], joint velocity [J]) to joint torque [J] Nm,
+            called before every sub-step.
+          push: [3] N, force on the object's centre of mass during the whole tick.
+
+        Returns:
+          The state after the tick, and the contact force of the object on each finger's tip
+          link [F, 3] N in the palm frame, at the last sub-step.
+        """
+        model = self.configure(target)
+        data = self._make_data().replace(qpos=state.qpos, qvel=state.qvel,
+                                         qacc_warmstart=state.warmstart)
+        wrench = jnp.zeros((self.mj_model.nbody, 6)).at[self.object_body, :3].set(push)
+        data = data.replace(xfrc_applied=wrench)
+
+        def substep(data: Any, index: jax.Array) -> tuple[Any, None]:
+            tau = torque(index, data.qpos[self.joint_qpos], data.qvel[self.joint_dof])
+            applied = jnp.zeros(self.mj_model.nv).at[self.joint_dof].set(tau)
+            return mjx.step(model, data.replace(qfrc_applied=applied)), None
+
+        # Forces are read after the scan: stacking sensordata as a scan output more than doubled
+        # the step and returned zeros on the GPU.
+        data, _ = jax.lax.scan(substep, data, jnp.arange(self.config.substeps))
+        after = PhysicsState(data.qpos, data.qvel, data.qacc_warmstart)
+        return after, self._finger_force(data)
+
+    def _make_data(self) -> Any:
+        if self.backend == "jax":
+            return mjx.make_data(self._model)
+        rows = 4 * self.config.condim * self.config.max_contacts + 2 * self.hand.num_joints
+        return mjx.make_data(self.mj_model, impl="warp", naconmax=self._contact_buffer,
+                             naccdmax=self._contact_buffer, njmax=min(rows, 160))
+
+    def _finger_force(self, data: Any) -> jax.Array:
+        if self.backend == "warp":
+            return -data.sensordata.reshape(self.hand.num_fingers, 3)
+        return self._force_from_contacts(data)
+
+    def _force_from_contacts(self, data: Any) -> jax.Array:
+        """Sum the solver's forces per finger; the JAX backend has no body-matching sensor."""
+        contact = data._impl.contact
+        dim, address = np.asarray(contact.dim), np.asarray(contact.efc_address)
+        use = np.flatnonzero((dim == self.config.condim) & (address >= 0))
+        width = 1 if self.config.condim == 1 else 2 * (self.config.condim - 1)
+        edges = data._impl.efc_force[address[use][:, None] + np.arange(width)]
+        normal = jnp.sum(edges, -1)
+        local = [normal, jnp.zeros_like(normal), jnp.zeros_like(normal)]
+        if self.config.condim >= 3:  # pyramidal cone: opposite edges, see mju_decodePyramid
+            for axis in (0, 1):
+                pair = edges[:, 2 * axis] - edges[:, 2 * axis + 1]
+                local[axis + 1] = pair * contact.friction[use, axis]
+        frame = contact.frame[use]  # rows are the axes; the normal points from geom1 to geom2
+        force = jnp.sum(frame * jnp.stack(local, -1)[..., None], 1)
+        touching = (contact.dist[use] < contact.includemargin[use])[:, None]
+        force = jnp.where(touching, force, 0.0)
+        finger = jnp.asarray(self._finger_of_geom)[contact.geom[use]]
+        is_object = jnp.asarray(self._is_object_geom)[contact.geom[use]]
+        # MuJoCo's contact force acts on geom2; geom1 feels the opposite.
+        on_second = is_object[:, 0] * jax.nn.one_hot(finger[:, 1], self.hand.num_fingers).T
+        on_first = is_object[:, 1] * jax.nn.one_hot(finger[:, 0], self.hand.num_fingers).T
+        return jnp.sum((on_second - on_first)[..., None] * force, 1)
+
+
+def build_model(hand: Hand, slots: tuple[str, ...], largest: np.ndarray, config: PhysicsConfig,
+                gravity: tuple[float, float, float], backend: str) -> mujoco.MjModel:
+    """The scene as a C MuJoCo model: hand, free object, explicit pairs, force sensors.
+
+    Also what the tests and the emulated hand compare against.
+    """
+    spec = mujoco.MjSpec.from_file(str(hand.model_path))
+    check_model(spec.compile(), backend, hand.model_path)
+    for element in (*spec.actuators, *spec.sensors, *spec.keys):
+        spec.delete(element)  # torques come from our actuator model, readings from our sensors
+    palm = spec.body(hand.palm)
+    palm.pos, palm.quat = [0, 0, 0], [1, 0, 0, 0]
+    touching = _touching_geoms(spec, hand, config)
+    for geom in spec.geoms:
+        geom.contype = geom.conaffinity = 0
+
+    # A template of middling mass: its invweight0 sets the contact stiffness for all objects.
+    body = spec.worldbody.add_body(name="object", mass=0.1, inertia=[5e-5] * 3,
+                                   explicitinertial=True, pos=[0.1, 0, 0.1])
+    body.add_freejoint(name="object")
+    for k, kind in enumerate(slots):
+        body.add_geom(name=f"object_{k}", type=GEOM_TYPES[kind], size=largest[k], contype=0,
+                      conaffinity=0, mass=0, group=3, rgba=[0.85, 0.55, 0.25, 1])
+        for name in touching:
+            spec.add_pair(geomname1=name, geomname2=f"object_{k}", condim=config.condim,
+                          friction=[0.9, 0.9, 0.005, 1e-4, 1e-4], solref=[0.02, 1.0])
+    if backend == "warp":
+        for b in hand.tip_body:
+            # data: bit 1 is the force; reduce: 3 is the net force, in the world frame.
+            spec.add_sensor(type=mujoco.mjtSensor.mjSENS_CONTACT,
+                            objtype=mujoco.mjtObj.mjOBJ_BODY, objname=hand.body_names[b],
+                            reftype=mujoco.mjtObj.mjOBJ_BODY, refname="object",
+                            intprm=[2, 3, 1], dim=3)
+    _set_options(spec, config, gravity)
+    return spec.compile()
+
+
+def _touching_geoms(spec: mujoco.MjSpec, hand: Hand, config: PhysicsConfig) -> list[str]:
+    geoms = [g for g in hand.geoms if g.touches]
+    palm = hand.body_names.index(hand.palm)
+    planes = [g for g in geoms if g.body == palm and g.kind == "plane"]
+    if planes:
+        use_plane = config.palm == "face"
+        geoms = [g for g in geoms if g.body != palm or (g.kind == "plane") == use_plane]
+    if not geoms or any(not g.name for g in geoms):
+        raise AssetError(f"{hand.model_path}: every geom that touches the object (contype or "
+                         "conaffinity not 0) needs a name, and there must be at least one")
+    return [g.name for g in geoms]
+
+
+def _set_options(spec: mujoco.MjSpec, config: PhysicsConfig,
+                 gravity: tuple[float, float, float]) -> None:
+    option = spec.option
+    option.timestep, option.gravity = config.timestep, gravity
+    option.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    option.solver, option.cone = mujoco.mjtSolver.mjSOL_NEWTON, mujoco.mjtCone.mjCONE_PYRAMIDAL
+    option.iterations, option.ls_iterations = config.iterations, config.line_search
+    # Box-box has its own kernel only with nativeccd off; eulerdamp costs a factorisation more.
+    option.disableflags |= (mujoco.mjtDisableBit.mjDSBL_EULERDAMP
+                            | mujoco.mjtDisableBit.mjDSBL_NATIVECCD)
+    for name, value in (("max_contact_points", config.max_contacts),
+                        ("max_geom_pairs", config.max_pairs)):
+        spec.add_numeric(name=name, data=[float(value)], size=1)

@@ -1,0 +1,92 @@
+"""Start states of the grasp task: an object below the palm, fingers half closed round it."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dexsim import rotations, sdf
+from dexsim.errors import ConfigError
+from dexsim.hand import Hand, forward_kinematics
+from dexsim.objects import extent, sample_object
+
+_OVERLAP = 0.001  # m, hand and object may start this deep in each other
+
+
+def make_pool(key: jax.Array, hand: Hand, config: Any, reference: tuple[float, float, float]):
+    """Draw candidates, keep `pool_size` of them in which the hand is clear of the object.
+
+    Raises:
+      ConfigError: fewer than one candidate in eight is clear, so the ranges do not fit the hand.
+    """
+    draw = jax.jit(jax.vmap(lambda k: _candidate(k, hand, config, reference)))
+    chunk = min(max(config.pool_size, 64), 4096)
+    kept, found = [], 0
+    for trial in range(8 * -(-config.pool_size // chunk)):
+        starts, clear = draw(jax.random.split(jax.random.fold_in(key, trial), chunk))
+        rows = np.flatnonzero(np.asarray(clear))
+        kept.append(jax.tree.map(lambda x, rows=rows: np.asarray(x)[rows], starts))
+        found += rows.size
+        if found >= config.pool_size:
+            break
+    if found < config.pool_size:
+        raise ConfigError(f"{type(config).__name__}: only {found} of the {config.pool_size} start "
+                          "states are free of overlap; open the posture or shrink the objects")
+    return jax.tree.map(lambda *parts: np.concatenate(parts)[:config.pool_size], *kept)
+
+
+def _candidate(key: jax.Array, hand: Hand, config: Any,
+               reference: tuple[float, float, float]) -> tuple[Any, jax.Array]:
+    from dexsim.env import Start
+
+    keys = jax.random.split(key, 7)
+    target = sample_object(keys[0], config.objects)
+    noise = config.posture_noise * jax.random.uniform(keys[1], (hand.num_joints,), minval=-1.0)
+    joints = jnp.clip(jnp.asarray(config.posture) + noise, hand.joint_lower, hand.joint_upper)
+
+    # Long objects lie across the fingers (their z along the palm's y), turned about the palm's
+    # normal and a little askew; the roll about their own axis is free.
+    roll, turn, askew = jax.random.uniform(keys[2], (3,), minval=-1.0)
+    quat = rotations.axis_angle_to_quat(jnp.array([0.0, 0.0, 1.0]), roll * jnp.pi)
+    for axis, angle in (((1.0, 0.0, 0.0), -jnp.pi / 2), ((0.0, 0.0, 1.0), 0.2 * askew),
+                        ((1.0, 0.0, 0.0), 0.5 * turn)):
+        quat = rotations.quat_multiply(rotations.axis_angle_to_quat(jnp.array(axis),
+                                                                    jnp.asarray(angle)), quat)
+    matrix = rotations.quat_to_matrix(quat)
+    up = rotations.rotate_inverse(matrix, jnp.array([-1.0, 0.0, 0.0]))
+    gap = jax.random.uniform(keys[3], minval=config.release_gap[0], maxval=config.release_gap[1])
+    shift = 0.01 * jax.random.uniform(keys[4], (2,), minval=-1.0)
+    top = extent(target.size, target.position, target.active, up)
+    position = jnp.stack([_palm_height(hand) + gap + top, reference[1] + shift[0],
+                          reference[2] + shift[1]])
+    speed = jax.random.uniform(keys[5], minval=config.release_speed[0],
+                               maxval=config.release_speed[1])
+    qpos = jnp.concatenate([joints, position, quat])
+    qvel = jnp.zeros(hand.num_joints + 6).at[hand.num_joints].set(speed)
+    start = Start(qpos, qvel, target)
+    return start, clearance(hand, joints, target.shape(), position, matrix) > -_OVERLAP
+
+
+def _palm_height(hand: Hand) -> float:
+    """x of the palm's face."""
+    palm = [g for g in hand.geoms if g.body == hand.body_names.index(hand.palm) and g.touches]
+    faces = [g.position[0] for g in palm if g.kind == "plane"]
+    faces += [g.position[0] + g.size[0] for g in palm if g.kind == "box"]
+    return float(max(faces, default=0.0))
+
+
+def clearance(hand: Hand, joints: jax.Array, shape: sdf.Shape, position: jax.Array,
+              rotation: jax.Array) -> jax.Array:
+    """Smallest distance [] m from the object to the hand's capsules, at seven points of each."""
+    pose = forward_kinematics(hand, joints)
+    capsules = [g for g in hand.geoms if g.touches and g.kind == "capsule"]
+    steps = np.linspace(-1.0, 1.0, 7)
+    local = np.stack([g.position + np.outer(steps * g.size[1], g.rotation[:, 2])
+                      for g in capsules]).astype(np.float32)
+    body = np.array([g.body for g in capsules])
+    radius = np.array([g.size[0] for g in capsules])[:, None]
+    points = pose.body_position[body][:, None] + rotations.rotate(
+        pose.body_rotation[body][:, None], jnp.asarray(local))
+    points = rotations.rotate_inverse(rotation, points - position)
+    return jnp.min(sdf.signed_distance(points, shape) - radius)

@@ -1,0 +1,208 @@
+"""The file format of checkpoints and policies, and how a file that is not sound is turned away.
+
+    offset  size  content
+    0       6     magic, b"DEXSIM"
+    6       2     format version, little-endian like all integers
+    8       8     length of the header, n
+    16      32    SHA-256 of bytes 0..15 and the header
+    48      n     header: msgpack map with "kind", "task", "library", "content" (what the kind needs),
+                  "leaves" (path, dtype, shape, PRNG implementation) and "sha256" of the payload
+    48 + n        payload: the leaves' bytes in C order, one after another
+
+Nothing is executed on loading, and no array is made before its shape, dtype and size have been checked
+against the file's true length. Any altered, missing or added byte is found by one of the two hashes.
+"""
+
+import hashlib
+import math
+import os
+import struct
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import msgpack
+import numpy as np
+
+from dexsim.errors import CheckpointError
+
+Tree = TypeVar("Tree")
+
+MAGIC = b"DEXSIM"
+FORMAT_VERSION = 1
+LIBRARY_VERSION = "0.1.0"
+_PREFIX = struct.Struct("<6sHQ32s")
+_HASHED_PREFIX = struct.Struct("<6sHQ")
+_DTYPES = ("bool", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64", "float16",
+           "bfloat16", "float32", "float64")
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A sound file's content."""
+
+    path: Path
+    kind: str
+    """`"train"` (a whole `TrainState`) or `"policy"`."""
+    task: str
+    library: str
+    """Version of dexsim that wrote it."""
+    content: dict[str, Any]
+    """Plain data: configurations, observation layout and the like."""
+    leaves: dict[str, Any]
+    """Arrays, and typed PRNG keys, by path."""
+
+
+def save(path: str | Path, *, kind: str, task: str, content: Mapping[str, Any], tree: Any) -> None:
+    """Write a pytree of arrays and what describes it.
+
+    The file appears whole or not at all: it is written beside `path`, flushed to disk and renamed.
+    """
+    leaves, arrays = [], []
+    for tree_path, leaf in jax.tree_util.tree_leaves_with_path(tree):
+        prng = ""
+        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            prng, leaf = str(jax.random.key_impl(leaf)), jax.random.key_data(leaf)
+        array = np.asarray(jax.device_get(leaf))
+        arrays.append(array if array.flags.c_contiguous else array.copy(order="C"))
+        leaves.append({"path": jax.tree_util.keystr(tree_path), "dtype": array.dtype.name,
+                       "shape": list(array.shape), "prng": prng})
+    digest = hashlib.sha256()
+    for array in arrays:
+        digest.update(_bytes(array))
+    header = msgpack.packb({"kind": kind, "task": task, "library": LIBRARY_VERSION,
+                            "content": dict(content), "leaves": leaves, "sha256": digest.digest()})
+    prefix = _HASHED_PREFIX.pack(MAGIC, FORMAT_VERSION, len(header))
+    head = prefix + hashlib.sha256(prefix + header).digest() + header
+    _write_atomically(Path(path), [head, *map(_bytes, arrays)])
+
+
+def load(path: str | Path, *, kind: str, task: str | None = None) -> Checkpoint:
+    """Read and check a file.
+
+    Args:
+      kind: what the caller can use, `"train"` or `"policy"`.
+      task: the task that the caller works on; None takes any.
+
+    Raises:
+      CheckpointError: missing, not of this format, of a newer version, cut short, altered, of another
+        kind or of another task.
+    """
+    path = Path(path)
+    try:
+        data = memoryview(path.read_bytes())
+    except OSError as error:
+        raise CheckpointError(f"{path}: cannot be read ({error.strerror or error})") from None
+    header, payload = _open_envelope(path, data)
+    if header["kind"] != kind:
+        raise CheckpointError(f"{path}: is a {header['kind']!r} file, not a {kind!r} file")
+    if task is not None and header["task"] != task:
+        raise CheckpointError(f"{path}: is of the task {header['task']!r}, not {task!r}")
+    return Checkpoint(path, header["kind"], header["task"], header["library"], header["content"],
+                      _read_leaves(path, header["leaves"], payload))
+
+
+def restore(checkpoint: Checkpoint, like: Tree) -> Tree:
+    """The loaded leaves in the shape of `like`, a pytree of arrays or of `jax.ShapeDtypeStruct`s.
+
+    Raises:
+      CheckpointError: a leaf is missing, left over, or of another shape or type; names it.
+    """
+    wanted, structure = jax.tree_util.tree_flatten_with_path(like)
+    paths = [jax.tree_util.keystr(tree_path) for tree_path, _ in wanted]
+    for name in (*paths, *checkpoint.leaves):
+        if (name in checkpoint.leaves) != (name in set(paths)):
+            raise CheckpointError(f"{checkpoint.path}: does not fit this configuration: {name} is "
+                                  f"{'not expected' if name in checkpoint.leaves else 'missing'}")
+    for name, (_, leaf) in zip(paths, wanted, strict=True):
+        found = checkpoint.leaves[name]
+        if found.shape != leaf.shape or found.dtype != leaf.dtype:
+            raise CheckpointError(
+                f"{checkpoint.path}: does not fit this configuration: {name} is "
+                f"{found.dtype}{list(found.shape)}, expected {leaf.dtype}{list(leaf.shape)}")
+    return jax.tree_util.tree_unflatten(structure, [checkpoint.leaves[name] for name in paths])
+
+
+def _bytes(array: np.ndarray) -> memoryview:
+    return memoryview(array.reshape(-1).view(np.uint8))
+
+
+def _write_atomically(path: Path, chunks: list[bytes | memoryview]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            for chunk in chunks:
+                file.write(chunk)
+            file.flush()
+            os.fsync(file.fileno())
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
+
+
+def _open_envelope(path: Path, data: memoryview) -> tuple[dict[str, Any], memoryview]:
+    """Header and payload of a file whose hashes are right."""
+    if bytes(data[:len(MAGIC)]) != MAGIC:
+        raise CheckpointError(f"{path}: is not a dexsim checkpoint or policy")
+    if len(data) < _PREFIX.size:
+        raise CheckpointError(f"{path}: is cut short")
+    _, version, header_size, digest = _PREFIX.unpack(data[:_PREFIX.size])
+    if version > FORMAT_VERSION:
+        raise CheckpointError(f"{path}: has format version {version}, and this dexsim reads up to "
+                              f"{FORMAT_VERSION}: update dexsim")
+    if header_size > len(data) - _PREFIX.size:
+        raise CheckpointError(f"{path}: is cut short")
+    header_bytes = data[_PREFIX.size:_PREFIX.size + header_size]
+    if hashlib.sha256(bytes(data[:_HASHED_PREFIX.size]) + header_bytes).digest() != digest:
+        raise CheckpointError(f"{path}: is damaged (the header's checksum is wrong)")
+    try:
+        header = msgpack.unpackb(header_bytes)
+        size = sum(_leaf_size(leaf) for leaf in header["leaves"])
+        for name, kind in (("kind", str), ("task", str), ("library", str), ("content", dict),
+                           ("sha256", bytes)):
+            if not isinstance(header[name], kind):
+                raise TypeError(f"{name} is not a {kind.__name__}")
+    except Exception as error:  # Hashed, so a faulty writer rather than damage.
+        raise CheckpointError(f"{path}: has a header that makes no sense ({error})") from None
+    payload = data[_PREFIX.size + header_size:]
+    if len(payload) != size:
+        raise CheckpointError(f"{path}: is {'cut short' if len(payload) < size else 'too long'}: "
+                              f"{len(payload)} bytes of arrays, expected {size}")
+    if hashlib.sha256(payload).digest() != header["sha256"]:
+        raise CheckpointError(f"{path}: is damaged (the arrays' checksum is wrong)")
+    return header, payload
+
+
+def _leaf_size(leaf: dict[str, Any]) -> int:
+    shape, dtype = leaf["shape"], leaf["dtype"]
+    if dtype not in _DTYPES or not isinstance(leaf["path"], str) or not isinstance(leaf["prng"], str):
+        raise ValueError(f"leaf {leaf!r}")
+    if not all(type(n) is int and 0 <= n < 2**40 for n in shape):
+        raise ValueError(f"shape {shape!r}")
+    return math.prod(shape) * jnp.dtype(dtype).itemsize
+
+
+def _read_leaves(path: Path, specs: list[dict[str, Any]], payload: memoryview) -> dict[str, Any]:
+    leaves, offset = {}, 0
+    for spec in specs:
+        dtype = jnp.dtype(spec["dtype"])
+        array = np.frombuffer(payload, dtype, math.prod(spec["shape"]), offset).reshape(spec["shape"])
+        offset += array.nbytes
+        try:
+            leaves[spec["path"]] = (jax.random.wrap_key_data(array, impl=spec["prng"])
+                                    if spec["prng"] else array)
+        except Exception as error:
+            raise CheckpointError(f"{path}: {spec['path']} is no PRNG key ({error})") from None
+    return leaves

@@ -1,0 +1,215 @@
+"""Measures a policy over fixed, seeded episodes.
+
+    python -m dexsim_ppo.evaluate grasp --episodes 1024 --seed 0
+
+The policy is a file, or the name of a shipped one. The episodes are the task's own protocol
+(`env.evaluation_starts`), never restarted: what counts is whether the hand still holds at the end.
+"""
+
+import math
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+
+from dexsim.assets import asset_path
+from dexsim.config import from_dict
+from dexsim.errors import AssetError, CheckpointError, ConfigError
+from dexsim_ppo import cli
+from dexsim_ppo.policy import Policy, PolicyParams, act, layout_to_list
+from dexsim_ppo.types import Environment
+
+
+class Evaluator:
+    """Runs evaluation episodes in compiled chunks, so that memory is bounded by the chunk.
+
+    Args:
+      env: the environment.
+      chunk: episodes run side by side.
+    """
+
+    def __init__(self, env: Environment, chunk: int):
+        self.env, self.chunk = env, chunk
+        self._run = jax.jit(self._episodes)
+
+    def __call__(self, params: PolicyParams, *, episodes: int, seed: int) -> dict[str, Any]:
+        """Report over at least `episodes` episodes, rounded up to whole chunks.
+
+        Returns:
+          `"held"` (share of episodes never terminated), `"return"` and `"steps_held"`, each with a 95 %
+          interval over episodes, and `"task"`: what the task's `summarize` makes of its metrics.
+        """
+        started = time.perf_counter()
+        chunks = [jax.device_get(self._run(params, jax.random.fold_in(jax.random.key(seed), i)))
+                  for i in range(math.ceil(episodes / self.chunk))]
+        metrics, terminated = jax.tree.map(lambda *xs: np.concatenate(xs, axis=1), *chunks)
+        return summarize(self.env, metrics, terminated) | {
+            "seed": seed, "seconds": time.perf_counter() - started}
+
+    def _episodes(self, params: PolicyParams, key: jax.Array):
+        def step(state, _):
+            state = jax.vmap(self.env.step)(state, act(params, state.obs["actor"]))
+            return state, (dict(state.metrics), state.terminated)
+
+        starts = self.env.evaluation_starts(key, self.chunk)
+        return jax.lax.scan(step, starts, None, length=self.env.evaluation_steps)[1]
+
+
+def summarize(env: Environment, metrics: dict[str, np.ndarray],
+              terminated: np.ndarray) -> dict[str, Any]:
+    """Report of episodes from their metrics `[T, N]` and termination flags `[T, N]`.
+
+    An episode lives up to, and not including, its first terminated step. That step's reward belongs to
+    the return, and nothing after it counts.
+    """
+    steps, episodes = terminated.shape
+    alive = ~np.logical_or.accumulate(terminated, axis=0)
+    steps_held = alive.sum(axis=0)
+    last = np.minimum(steps_held, steps - 1)
+    returns = metrics["return"][last, np.arange(episodes)]
+    masked = {name: np.where(alive, values, 0) for name, values in metrics.items()}
+    return {"episodes": episodes, "steps": steps, "held": proportion(alive[-1]),
+            "return": mean_interval(returns), "steps_held": mean_interval(steps_held),
+            "task": env.summarize(masked, alive)}
+
+
+def mean_interval(x: np.ndarray) -> dict[str, float]:
+    """Mean of independent samples with its normal 95 % interval."""
+    mean, half = float(np.mean(x)), 1.96 * float(np.std(x, ddof=min(1, x.size - 1))) / x.size**0.5
+    return {"value": mean, "low": mean - half, "high": mean + half}
+
+
+def proportion(x: np.ndarray) -> dict[str, float]:
+    """Share of true samples with its Wilson 95 % interval."""
+    n, p, z = x.size, float(np.mean(x)), 1.96
+    centre, half = p + z * z / (2 * n), z * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
+    scale = 1 + z * z / n
+    return {"value": p, "low": max(0.0, (centre - half) / scale),
+            "high": min(1.0, (centre + half) / scale)}
+
+
+def record(env: Environment, params: PolicyParams, *, seed: int, episodes: int = 8,
+           shown: Sequence[int] = (0, -1)) -> Any:
+    """Snapshots of some of `episodes` evaluation episodes, one after another along the first axis.
+
+    The task spreads its commands over the episodes, so the first and the last one show its two ends.
+    An episode that terminates is shown for half a second longer.
+    """
+    def step(state, _):
+        state = jax.vmap(env.step)(state, act(params, state.obs["actor"]))
+        snapshots = jax.vmap(env.snapshot)(state)
+        picked = jax.tree.map(lambda x: x[jnp.array(shown)], snapshots)
+        return state, (picked, state.terminated[jnp.array(shown)])
+
+    @jax.jit
+    def run(key):
+        return jax.lax.scan(step, env.evaluation_starts(key, episodes), None,
+                            length=env.evaluation_steps)[1]
+
+    snapshots, terminated = jax.device_get(run(jax.random.key(seed)))
+    after = round(0.5 / env.control_period)
+    ends = [int(np.argmax(t)) + after if t.any() else len(t) for t in terminated.T]
+    return jax.tree.map(lambda x: np.concatenate([x[:end, i] for i, end in enumerate(ends)]), snapshots)
+
+
+def write_video(env: Environment, params: PolicyParams, path: Path, *, seed: int) -> Path:
+    """Render the policy's episodes to a video file; returns the path written, which may be a GIF's."""
+    from dexsim.render import render_episode
+
+    written = render_episode(env, record(env, params, seed=seed), path,
+                             1.0 / env.control_period)
+    return Path(written or path)
+
+
+def load_policy(name: str) -> Policy:
+    """A policy from a file, or a shipped one by its name."""
+    if Path(name).exists() or "/" in name or name.endswith(".msgpack"):
+        return Policy.load(name)
+    try:
+        return Policy.load(asset_path(f"policies/{name}.msgpack"))
+    except AssetError:
+        raise CheckpointError(f"{name}: no such file, and no shipped policy has that name") from None
+
+
+def make_env(policy: Policy, *, backend: str, num_envs: int) -> Environment:
+    """The environment that a policy was trained in."""
+    import dexsim
+
+    entry = cli.find_task(policy.task)
+    env = dexsim.make(policy.task, from_dict(entry.config_class, policy.env_config), backend=backend,
+                      num_envs=num_envs)
+    if layout_to_list(env.observation_layout["actor"]) != layout_to_list(policy.observation_layout):
+        raise CheckpointError(f"the policy observes {layout_to_list(policy.observation_layout)}, and "
+                              f"{env.name} gives {layout_to_list(env.observation_layout['actor'])}")
+    return env
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateArguments:
+    """Options of `python -m dexsim_ppo.evaluate`."""
+
+    policy: Annotated[str, tyro.conf.Positional]
+    """A policy file, or the name of a shipped one ("grasp")."""
+    episodes: int = 1024
+    """Evaluation episodes."""
+    seed: int = 0
+    """Seed of the episodes."""
+    backend: Literal["auto", "jax", "warp"] = "auto"
+    """Physics backend."""
+    chunk: int = 0
+    """Episodes run side by side; 0 chooses by the device."""
+    output: Path | None = None
+    """File for the report as JSON."""
+    video: Path | None = None
+    """File for a video of the first and the last command (MP4 or GIF)."""
+
+    def __post_init__(self) -> None:
+        if self.episodes < 1 or self.chunk < 0:
+            raise ConfigError("--episodes must be at least 1 and --chunk at least 0")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command. Returns its exit code."""
+    arguments = cli.parse(EvaluateArguments, sys.argv[1:] if argv is None else argv,
+                          prog="python -m dexsim_ppo.evaluate",
+                          description="Measure a policy over fixed, seeded episodes.")
+    cli.enable_caches()
+    policy = load_policy(arguments.policy)
+    chunk = min(arguments.chunk or (1024 if jax.default_backend() == "gpu" else 64),
+                arguments.episodes)
+    env = make_env(policy, backend=arguments.backend, num_envs=chunk)
+    report = Evaluator(env, chunk)(policy.params, episodes=arguments.episodes, seed=arguments.seed)
+    report |= {"policy": arguments.policy, "backend": env.backend} | cli.environment_report()
+    if arguments.output:
+        cli.write_json(arguments.output, report)
+    print_report(report, title=f"{policy.task}: {arguments.policy}")
+    if arguments.video:
+        print(f"video: {write_video(env, policy.params, arguments.video, seed=arguments.seed)}")
+    return 0
+
+
+def print_report(report: dict[str, Any], *, title: str) -> None:
+    """A table of the report's headline."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table("measure", "value", "95 % interval", title=title)
+    for name in ("held", "return", "steps_held"):
+        entry = report[name]
+        table.add_row(name, f"{entry['value']:.4g}", f"{entry['low']:.4g} .. {entry['high']:.4g}")
+    for name, value in report["task"].get("headline", {}).items():
+        table.add_row(name, f"{value:.4g}", "")
+    Console().print(table)
+    print(f"{report['episodes']} episodes of {report['steps']} steps, seed {report['seed']}, "
+          f"{report['seconds']:.1f} s")
+
+
+if __name__ == "__main__":
+    cli.run(main)

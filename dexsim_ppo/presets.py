@@ -1,0 +1,39 @@
+"""How much to train, and how large, by the device found."""
+
+from dataclasses import dataclass
+
+from dexsim_ppo.ppo import PPOConfig
+
+
+@dataclass(frozen=True, kw_only=True)
+class Preset:
+    """Defaults of the training command; each can be set by its own option."""
+
+    ppo: PPOConfig
+    steps: int
+    """Environment steps; 0 for no limit."""
+    minutes: float
+    """Wall-clock of the training loop, compilation included; 0 for no limit."""
+    evaluate_every: int
+    """Iterations between evaluations."""
+    evaluation_chunk: int
+    """Episodes evaluated side by side; an evaluation during training is one chunk."""
+    evaluation_episodes: int
+    """Episodes of the final evaluation."""
+    log_every: int
+    """Iterations between lines of metrics."""
+
+
+PRESETS = {
+    # Two cores: simulation is nearly all of the time, so small networks and many passes over little data.
+    "cpu": Preset(
+        ppo=PPOConfig(num_envs=64, rollout_length=32, epochs=5, minibatches=4,
+                      actor_layers=(128, 128), critic_layers=(128, 128)),
+        steps=0, minutes=8.0, evaluate_every=50, evaluation_chunk=32, evaluation_episodes=128,
+        log_every=5),
+    # One large GPU: enough environments to fill it, few large minibatches.
+    "gpu": Preset(
+        ppo=PPOConfig(num_envs=16384, rollout_length=16, epochs=5, minibatches=4),
+        steps=0, minutes=9.0, evaluate_every=50, evaluation_chunk=1024, evaluation_episodes=1024,
+        log_every=10),
+}

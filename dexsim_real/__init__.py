@@ -1,0 +1,1 @@
+"""The bridge to a real hand: serial frames, driver, safety, log, control loop (not built yet)."""

@@ -1,0 +1,82 @@
+"""What the tests share: the CPU unless asked otherwise, a compilation cache, environments.
+
+Set `DEXSIM_TEST_GPU=1` to run on the GPU (`pytest -m gpu` then runs the tests that need one), and
+`DEXSIM_CACHE` to keep XLA's compiled programs elsewhere than in `~/.cache/dexsim/xla`.
+"""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+ON_GPU = os.environ.get("DEXSIM_TEST_GPU", "") not in ("", "0")
+
+# Through the environment and before JAX is imported: the programs that tests start inherit it.
+if not ON_GPU:
+    os.environ["JAX_PLATFORMS"] = "cpu"
+_cache = os.environ.get("DEXSIM_CACHE") or str(Path.home() / ".cache" / "dexsim" / "xla")
+os.environ["JAX_COMPILATION_CACHE_DIR"] = _cache
+os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
+os.environ["JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES"] = "-1"
+os.environ.setdefault("WARP_CACHE_PATH", str(Path(_cache).parent / "warp"))
+os.environ.setdefault("MPLBACKEND", "agg")
+
+import hypothesis  # noqa: E402
+import jax  # noqa: E402
+import pytest  # noqa: E402
+
+hypothesis.settings.register_profile("dexsim", deadline=None, max_examples=20, derandomize=True)
+hypothesis.settings.load_profile("dexsim")
+
+# The size of the batch that the tests share. Another batch is another compilation: use this one.
+NUM_ENVS = 8
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Skip what is marked `gpu` where there is none."""
+    if any("gpu" in item.keywords for item in items) and jax.default_backend() != "gpu":
+        skip = pytest.mark.skip(reason="needs a GPU and DEXSIM_TEST_GPU=1")
+        for item in items:
+            if "gpu" in item.keywords:
+                item.add_marker(skip)
+
+
+class Rollout(NamedTuple):
+    """An environment and its compiled functions over a batch of `num_envs` environments."""
+
+    env: Any
+    reset: Callable[[jax.Array], Any]
+    """`reset(key)`: one key in, a batch of states out."""
+    step: Callable[[Any, jax.Array], Any]
+    """`step(states, actions [num_envs, A])`"""
+    restart: Callable[[Any, jax.Array], Any]
+    """`restart(states, done [num_envs])`"""
+    num_envs: int
+
+
+@pytest.fixture(scope="session")
+def hand() -> Any:
+    """The XHand as shipped."""
+    from dexsim.hand import load_hand
+
+    return load_hand()
+
+
+@pytest.fixture(scope="session")
+def grasp_env() -> Any:
+    """The grasp task with its default configuration on the `jax` backend."""
+    import dexsim
+
+    return dexsim.make("grasp", backend="jax", num_envs=NUM_ENVS)
+
+
+@pytest.fixture(scope="session")
+def grasp_rollout(grasp_env: Any) -> Rollout:
+    """The grasp task over 8 environments; each function compiles at its first use, once."""
+    return Rollout(
+        env=grasp_env,
+        reset=jax.jit(lambda key: jax.vmap(grasp_env.reset)(jax.random.split(key, NUM_ENVS))),
+        step=jax.jit(jax.vmap(grasp_env.step)),
+        restart=jax.jit(jax.vmap(grasp_env.restart)),
+        num_envs=NUM_ENVS,
+    )

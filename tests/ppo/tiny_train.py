@@ -1,0 +1,22 @@
+"""The training command with the tiny task among its tasks; arguments as on the command line."""
+
+import types
+
+import dexsim
+import dexsim.tasks
+from tiny_env import TinyConfig, TinyEnv
+
+ENTRY = types.SimpleNamespace(config_class=TinyConfig, env_class=TinyEnv)
+
+
+def make(task, config=None, *, backend="auto", num_envs=1):
+    assert task == "tiny"
+    return TinyEnv(config, backend=backend, num_envs=num_envs)
+
+
+if __name__ == "__main__":
+    from dexsim_ppo import cli, train
+
+    dexsim.tasks.TASKS["tiny"] = ENTRY
+    dexsim.make = make
+    cli.run(train.main)

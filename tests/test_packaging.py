@@ -1,0 +1,151 @@
+"""The distribution: what importing costs, what the wheel holds, whether an installed copy works."""
+
+import re
+import subprocess
+import sys
+import tomllib
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from dexsim.assets import asset_path
+from dexsim.errors import AssetError
+
+ROOT = Path(__file__).resolve().parent.parent
+PACKAGES = ("dexsim", "dexsim_ppo", "dexsim_real")
+FORBIDDEN = ("optax", "flax", "orbax", "brax", "warp", "serial")
+
+in_checkout = pytest.mark.skipif(not (ROOT / "pyproject.toml").exists(), reason="needs a checkout")
+
+
+def run_python(code: str, cwd: Path, path: Path | None = None) -> str:
+    """Run `code` in a fresh interpreter, with `path` in front of everything importable."""
+    start = f"import sys; sys.path.insert(0, {str(path)!r})\n" if path else ""
+    done = subprocess.run([sys.executable, "-P", "-c", start + code], cwd=cwd,
+                          capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_import_needs_no_optional_library(package, tmp_path):
+    # A finder in front of all others sees every attempt, also at a library that is not installed.
+    attempts = run_python(f"""
+import sys
+class Watch:
+    seen = []
+    def find_spec(self, name, path=None, target=None):
+        if name in {FORBIDDEN!r}:
+            self.seen.append(name)
+sys.meta_path.insert(0, Watch())
+import {package}
+loaded = [name for name in {FORBIDDEN!r} if name in sys.modules]
+print(*sorted(set(Watch.seen + loaded)))
+""", tmp_path, ROOT)
+    assert attempts.split() == []
+
+
+def test_real_needs_no_physics(tmp_path):
+    loaded = run_python("import sys, dexsim_real; print(*(name for name in "
+                        "('mujoco', 'mujoco.mjx') if name in sys.modules))", tmp_path, ROOT)
+    assert loaded.split() == []
+
+
+def test_asset_path():
+    assert asset_path("hand/xhand_right.xml").is_file()
+    for name in ("hand/no_such_hand.xml", "../pyproject.toml", "/etc/passwd"):
+        with pytest.raises(AssetError, match=re.escape(name)) as caught:
+            asset_path(name)
+        assert "\n" not in str(caught.value)
+
+
+@in_checkout
+def test_core_dependencies_are_only_the_listed_ones():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    names = {re.match(r"[\w-]+", requirement).group() for requirement in project["dependencies"]}
+    assert names == {"jax", "mujoco", "mujoco-mjx", "numpy", "trimesh", "msgpack", "tyro", "rich",
+                     "matplotlib", "pillow"}
+    assert {"warp", "cuda", "real", "brax", "video"} <= set(project["optional-dependencies"])
+
+
+@in_checkout
+def test_checkpoints_name_the_version_of_the_distribution():
+    from dexsim_ppo.checkpoint import LIBRARY_VERSION
+
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert project["version"] == LIBRARY_VERSION
+
+
+@in_checkout
+def test_warp_is_the_version_that_mjx_names():
+    from importlib.metadata import requires
+
+    named = [line.partition(";")[0].strip() for line in requires("mujoco-mjx")
+             if line.startswith("warp-lang")]
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert project["optional-dependencies"]["warp"] == named
+
+
+@in_checkout
+def test_the_commands_of_the_readme_are_make_targets():
+    commands = re.findall(r"^make (\w+)", (ROOT / "README.md").read_text(), re.MULTILINE)
+    assert {"train", "test"} <= set(commands)
+    targets = re.findall(r"^(\w+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    assert set(commands) <= set(targets)
+
+
+@in_checkout
+@pytest.mark.parametrize("page", [path.relative_to(ROOT).as_posix() for path in
+                                  (*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"))])
+def test_links_lead_somewhere(page):
+    text = (ROOT / page).read_text()
+    links = re.findall(r"\]\(([^)#\s]+)", text)
+    missing = [link for link in links if "://" not in link
+               and not ((ROOT / page).parent / link).exists()]
+    assert missing == []
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory) -> Path:
+    """The wheel, built from this checkout without fetching anything."""
+    if not (ROOT / "pyproject.toml").exists():
+        pytest.skip("needs a checkout")
+    out = tmp_path_factory.mktemp("wheel")
+    subprocess.run([sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir",
+                    str(out), str(ROOT)], check=True, capture_output=True, text=True, timeout=300)
+    (built,) = out.glob("*.whl")
+    return built
+
+
+def test_wheel_holds_packages_assets_and_licence(wheel):
+    with zipfile.ZipFile(wheel) as archive:
+        names = archive.namelist()
+    for package in PACKAGES:
+        assert f"{package}/__init__.py" in names and f"{package}/py.typed" in names
+    shipped = {name.removeprefix("dexsim/_assets/") for name in names
+               if name.startswith("dexsim/_assets/")}
+    assets = ROOT / "assets"
+    assert shipped == {str(path.relative_to(assets)) for path in assets.rglob("*")
+                       if path.is_file() and "__pycache__" not in path.parts}
+    assert any(name.endswith(".dist-info/licenses/LICENSE") for name in names)
+    tops = {name.split("/")[0] for name in names if ".dist-info/" not in name}
+    assert tops == set(PACKAGES)
+
+
+@pytest.mark.slow
+def test_installed_wheel_works_from_another_directory(wheel, tmp_path):
+    site, elsewhere = tmp_path / "site", tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    subprocess.run([sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index",
+                    "--target", str(site), str(wheel)], check=True, capture_output=True,
+                   timeout=300)
+    found = run_python("""
+import dexsim, dexsim_ppo, dexsim_real
+from dexsim.assets import asset_path
+from dexsim.hand import load_hand
+load_hand()
+print(*(module.__file__ for module in (dexsim, dexsim_ppo, dexsim_real)))
+print(asset_path("hand/xhand_right.xml"))
+""", elsewhere, site)
+    assert all(Path(name).is_relative_to(site) for name in found.split()), found
