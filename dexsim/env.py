@@ -10,6 +10,7 @@ A task (grasp, rotate) is an object with pure methods; see `Task`.
 """
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, Protocol
 
 import jax
@@ -268,12 +269,7 @@ class Env:
         measured = state.physics.qpos[physics.joint_qpos]
         joint_target = self._joint_target(state.joint_target, action, measured)
 
-        def torque(substep: jax.Array, position: jax.Array, velocity: jax.Array) -> jax.Array:
-            target = actuator.delayed_target(substep, draw.latency, state.joint_target,
-                                             joint_target)
-            return actuator.drive(draw.actuator, target, jnp.zeros_like(target), position,
-                                  velocity)
-
+        torque = self._torque(state, joint_target)
         push = self.task.push(push_key, state.target) + self._tilt_force(draw, state.target)
         after, force = physics.advance(state.target, state.physics, torque, push)
         finite = (jnp.all(jnp.isfinite(after.qpos)) & jnp.all(jnp.isfinite(after.qvel))
@@ -316,6 +312,17 @@ class Env:
         return dataclasses.replace(state, tick=tick.astype(jnp.int32))
 
     # --- pieces of a step -----------------------------------------------------------------
+
+    def _torque(self, state: State, joint_target: jax.Array) -> Callable[..., jax.Array]:
+        """The motors as `Physics.advance` wants them."""
+        draw = state.draw
+
+        def torque(substep: jax.Array, position: jax.Array, velocity: jax.Array) -> jax.Array:
+            target = actuator.delayed_target(substep, draw.latency, state.joint_target,
+                                             joint_target)
+            return actuator.drive(draw.actuator, target, jnp.zeros_like(target), position,
+                                  velocity)
+        return torque
 
     def _joint_target(self, target: jax.Array, action: jax.Array,
                       measured: jax.Array) -> jax.Array:

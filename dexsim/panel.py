@@ -149,7 +149,7 @@ def draw_panel(
 def _read_outs(draw, layout: Layout, finger_force, command, target_force) -> None:
     x, y = layout.slots[-1]
     width = layout.cell * layout.grid[0] - _GAP
-    lines = [("force", f"{np.sum(finger_force):.1f} N")]
+    lines = [("total", f"{np.sum(finger_force):.1f} N")]
     if np.isfinite(target_force):
         lines.insert(0, ("target", f"{float(target_force):.1f} N"))
     if np.size(command):

@@ -13,7 +13,8 @@ from dexsim.raycast import Camera, Primitives, Surface, View, cast, crop, length
 
 _SUPERSAMPLE = 2
 _TAXEL_BIAS = 0.0025  # m; the pads follow the taxel lattice to within 1 mm, and no taxel may drown in its pad
-_OBJECT_OPACITY = 0.72  # so that fingers and loaded taxels behind the object stay visible
+_OBJECT_OPACITY = 0.62  # so that fingers behind the object stay visible
+_TAXEL_GLOW = 0.6  # how strongly a loaded taxel shows through the object
 _SHADOW_PIXELS = 256
 
 # Linear RGB.
@@ -64,10 +65,13 @@ def draw_scene(
     color = _backdrop(size)[:, rows, columns].reshape(3, -1)
     surface = cast(body, view)
     _paint(color, body, surface, view, light, bevel=1e-4)
-    _paint_taxels(color, surface, view, pose, frame.taxel_force, force_range)
+    pixel, rays, loaded = _taxel_rays(surface, view, pose, frame.taxel_force, force_range)
+    _blend(color, pixel, rays, 1.0)
     front = cast(thing, view)
     front.index[front.depth > surface.depth] = -1
     _paint(color, thing, front, view, light, bevel=0.003, opacity=_OBJECT_OPACITY)
+    # The taxels that matter lie between finger and object: let the loaded ones shine through.
+    _blend(color, pixel[loaded], rays[loaded], _TAXEL_GLOW)
 
     picture = _developed_backdrop(size).copy()
     picture[rows, columns] = _develop(color.reshape(3, rows.stop - rows.start, columns.stop - columns.start))
@@ -164,10 +168,12 @@ def _shade(tones, index, points, normal, toward, away, light: Light) -> np.ndarr
     return color
 
 
-def _paint_taxels(
-    color: np.ndarray, surface: Surface, view: View, pose: Pose, force: np.ndarray, force_range: float
-) -> None:
-    """Draw every taxel that faces the camera as a disc on the skin, in the colour of its force."""
+def _taxel_rays(surface: Surface, view: View, pose: Pose, force: np.ndarray, force_range: float):
+    """Every taxel that faces the camera as a disc on the skin, in the colour of its force.
+
+    Returns:
+      pixels [M], linear RGB [M, 3], and whether the taxel is loaded [M], of each ray that meets a disc.
+    """
     centre, normal = pose.taxel_position.reshape(-1, 3), pose.taxel_normal.reshape(-1, 3)
     pixels, depth = project(view, centre)
     seen = (np.sum(normal * (view.origin - centre), -1) > 0) & (depth > 0.02)
@@ -202,13 +208,16 @@ def _paint_taxels(
     hot = (force_color(level, force_range) / np.float32(255)) ** np.float32(2.2)
     facing = -np.sum(normal * centre, -1) / np.linalg.norm(centre, axis=-1)
     tone = np.where(level[:, None] > 0, hot, np.float32(_IDLE_TAXEL) * (0.35 + 0.65 * facing[:, None]))
-    pixel, share = (
-        (row // _SUPERSAMPLE) * (view.size[0] // _SUPERSAMPLE) + column // _SUPERSAMPLE,
-        1 / _SUPERSAMPLE**2,
-    )
+    pixel = (row // _SUPERSAMPLE) * (view.size[0] // _SUPERSAMPLE) + column // _SUPERSAMPLE
+    return pixel, tone[taxel].astype(np.float32), level[taxel] > 0
+
+
+def _blend(color: np.ndarray, pixel: np.ndarray, rays: np.ndarray, opacity: float) -> None:
+    """Lay the colours [M, 3] of single rays over the pixels [M] that they belong to."""
+    share = opacity / _SUPERSAMPLE**2
     keep = 1 - share * np.bincount(pixel, minlength=color.shape[1])
-    for plane, values in zip(color, tone.T, strict=True):
-        plane[:] = plane * keep + share * np.bincount(pixel, values[taxel], len(plane))
+    for plane, values in zip(color, rays.T, strict=True):
+        plane[:] = plane * keep + share * np.bincount(pixel, values, len(plane))
 
 
 def _key_light(primitives: Primitives, hand: int, view: View, up: tuple[float, float, float]) -> Light:

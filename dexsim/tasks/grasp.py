@@ -82,7 +82,7 @@ class GraspConfig(EnvConfig):
     drop_distance: float = setting(0.12, unit="m", low=0.02, high=1.0)
     """The object is lost when its centre is farther than this from the grasp centre."""
     posture: tuple[float, ...] = setting(
-        (1.45, 0.15, 0.25, 0.0, 0.7, 0.4, 0.7, 0.4, 0.7, 0.4, 0.7, 0.4), unit="rad",
+        (1.45, 0.15, 0.25, 0.0, 1.1, 0.8, 1.1, 0.8, 1.1, 0.8, 1.1, 0.8), unit="rad",
         low=-3.2, high=3.2)
     """Joint angles that episodes start near."""
     posture_noise: float = setting(0.1, unit="rad", low=0.0, high=1.0)

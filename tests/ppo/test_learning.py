@@ -13,6 +13,7 @@ from dexsim_ppo import ppo
 from dexsim_ppo.distribution import log_prob as gaussian_log_prob
 from dexsim_ppo.ppo import Learner, make_train
 
+
 @pytest.mark.slow
 @pytest.mark.parametrize("distribution", ["gaussian", "tanh"])
 def test_reaches_the_known_return(distribution):

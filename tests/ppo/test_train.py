@@ -8,14 +8,14 @@ import sys
 import time
 from pathlib import Path
 
-import dexsim
-import dexsim.tasks
 import jax
 import numpy as np
 import pytest
 import tiny_train
 from tiny_env import TinyEnv
 
+import dexsim
+import dexsim.tasks
 from dexsim_ppo import cli, evaluate, train
 from dexsim_ppo.policy import Policy
 from dexsim_ppo.runlog import RunFolder, read_metrics

@@ -2,9 +2,10 @@
 
 import types
 
+from tiny_env import TinyConfig, TinyEnv
+
 import dexsim
 import dexsim.tasks
-from tiny_env import TinyConfig, TinyEnv
 
 ENTRY = types.SimpleNamespace(config_class=TinyConfig, env_class=TinyEnv)
 
