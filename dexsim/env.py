@@ -401,9 +401,14 @@ class Env:
                         action)
 
     def _observe(self, readings: Readings, moment: Moment, goal: Any) -> dict[str, jax.Array]:
-        """The actor sees the readings; the critic the same fields without noise or delay."""
-        del moment, goal
-        return {group: observation.observe(self.hand, readings, names, self.config.observation)
+        """The actor sees the readings; the critic the truth, in the same fields."""
+        command, goal_quat = self.task.goal_readings(goal)
+        truth = Readings(
+            moment.joint_position, moment.joint_torque / self.hand.torque_limit,
+            moment.touch.force, moment.object_position, moment.object_velocity,
+            moment.object_quat, goal_quat, command, moment.action)
+        seen = {"actor": readings, "critic": truth}
+        return {group: observation.observe(self.hand, seen[group], names, self.config.observation)
                 for group, names in self.task.fields.items()}
 
     def _metrics(self, state: State, terms: dict[str, jax.Array],

@@ -144,6 +144,18 @@ def _levels(parent: np.ndarray) -> list[np.ndarray]:
     return [np.flatnonzero(depth == level) for level in range(depth.max() + 1)]
 
 
+def joints_below(hand: Hand, fingers: range) -> np.ndarray:
+    """Joint indices on the way from the palm to these fingers' tips."""
+    joints = []
+    for finger in fingers:
+        body = int(hand.tip_body[finger])
+        while body >= 0:
+            if hand.body_joint[body] >= 0:
+                joints.append(int(hand.body_joint[body]))
+            body = int(hand.body_parent[body])
+    return np.array(sorted(joints))
+
+
 def lattice_frame(position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Outward normals [C, R, 3] and areas [C, R] of a lattice of points [C, R, 3] on a surface.
 

@@ -36,12 +36,14 @@ class ObjectConfig:
     """Each half-extent of a box."""
     cylinder_radius: tuple[float, float] = setting((0.020, 0.030), unit="m", low=0.005, high=0.08)
     """Radius of a cylinder or capsule."""
-    cylinder_half: tuple[float, float] = setting((0.020, 0.040), unit="m", low=0.002, high=0.10)
+    cylinder_half: tuple[float, float] = setting((0.020, 0.035), unit="m", low=0.002, high=0.10)
     """Half-length of a cylinder, or of a capsule's straight part."""
     neck_radius: tuple[float, float] = setting((0.010, 0.016), unit="m", low=0.003, high=0.05)
     """Radius of the capsule that juts out of a composition."""
-    neck_half: tuple[float, float] = setting((0.010, 0.025), unit="m", low=0.002, high=0.10)
+    neck_half: tuple[float, float] = setting((0.008, 0.018), unit="m", low=0.002, high=0.10)
     """Half-length of that capsule's straight part."""
+    composition_scale: float = setting(0.8, unit="1", low=0.1, high=2.0)
+    """Size of a composition's box or cylinder, relative to one that stands alone."""
     mass: tuple[float, float] = setting((0.05, 0.20), unit="kg", low=0.001, high=5.0)
     """Mass of the object."""
     inertia_scale: tuple[float, float] = setting((0.8, 1.25), unit="1", low=0.05, high=20.0)
@@ -109,16 +111,19 @@ class ObjectParams:
         return sdf.Shape(SLOTS, self.size, self.position, eye, self.active)
 
 
-def sample_object(key: jax.Array, config: ObjectConfig) -> ObjectParams:
-    """Draw one object."""
+def sample_object(key: jax.Array, config: ObjectConfig,
+                  shape_index: jax.Array | None = None) -> ObjectParams:
+    """Draw one object, of a kind in `config.shapes` or of the given one (index into SHAPES)."""
     keys = jax.random.split(key, 8)
-    allowed = jnp.array([SHAPES.index(name) for name in config.shapes])
-    shape_index = jax.random.choice(keys[0], allowed)
+    if shape_index is None:
+        allowed = jnp.array([SHAPES.index(name) for name in config.shapes])
+        shape_index = jax.random.choice(keys[0], allowed)
     size, position, active = _sample_slots(keys[1], shape_index, config)
     density_mass, com, inertia = _mass_properties(size, position, active)
+    position = position - com  # the origin is the centre of a uniform solid
     mass = _uniform(keys[2], config.mass)
     scale = _uniform(keys[3], config.inertia_scale) * mass / density_mass
-    com = com + config.com_offset * jax.random.uniform(keys[4], (3,), minval=-1.0)
+    com = config.com_offset * jax.random.uniform(keys[4], (3,), minval=-1.0)
     contact = jnp.stack([_uniform(keys[6], config.contact_time),
                          damping_ratio(_uniform(keys[7], config.restitution))])
     return ObjectParams(shape_index.astype(jnp.int32), size, position, active, mass,
@@ -144,9 +149,10 @@ def _sample_slots(key: jax.Array, shape_index: jax.Array,
                   config: ObjectConfig) -> tuple[jax.Array, jax.Array, jax.Array]:
     keys = jax.random.split(key, 7)
     is_sphere, is_box, is_cylinder, is_capsule, is_union = (shape_index == i for i in range(5))
-    half = _uniform(keys[0], config.box_half, (3,))
-    radius, length = _uniform(keys[1], config.cylinder_radius), _uniform(keys[2],
-                                                                       config.cylinder_half)
+    part = jnp.where(is_union, config.composition_scale, 1.0)
+    half = part * _uniform(keys[0], config.box_half, (3,))
+    radius = part * _uniform(keys[1], config.cylinder_radius)
+    length = part * _uniform(keys[2], config.cylinder_half)
     ball = _uniform(keys[3], config.sphere_radius)
     neck, neck_half = _uniform(keys[4], config.neck_radius), _uniform(keys[5], config.neck_half)
     box_body = jax.random.bernoulli(keys[6])
@@ -161,11 +167,7 @@ def _sample_slots(key: jax.Array, shape_index: jax.Array,
     active = jnp.stack([is_box | (is_union & box_body), is_sphere | is_capsule | is_union,
                         is_cylinder | (is_union & ~box_body)])
     jut = jnp.where(is_union, body_half + neck_half, 0.0)
-    # The frame's origin sits midway between the ends, so that every object is drawn alike.
-    middle = jnp.where(is_union, (jut + neck_half + neck - body_half) / 2, 0.0)
-    offset = jnp.stack([-middle, jut - middle, -middle])
-    z = jnp.where(active, offset, 0.0)
-    position = jnp.stack([jnp.zeros(3), jnp.zeros(3), z], -1)
+    position = jnp.zeros((3, 3)).at[1, 2].set(jut)
     return jnp.where(active[:, None], size, OFF), position, active
 
 

@@ -22,7 +22,7 @@ from dexsim.raycast import Camera
 from dexsim.scene import Pose, draw_scene
 
 CAMERAS = {
-    "grasp": Camera(azimuth=118.0, elevation=-20.0, distance=0.46, target=(0.043, 0.010, 0.088), up=(-1.0, 0.0, 0.0)),
+    "grasp": Camera(azimuth=100.0, elevation=-20.0, distance=0.46, target=(0.048, 0.010, 0.092), up=(-1.0, 0.0, 0.0)),
     "rotate": Camera(azimuth=-130.0, elevation=35.0, distance=0.50, target=(0.040, 0.010, 0.100), up=(1.0, 0.0, 0.0)),
 }
 """The hand held palm down, and palm up."""

@@ -9,6 +9,7 @@ The policy is a file, or the name of a shipped one. The episodes are the task's 
 import math
 import sys
 import time
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,31 +36,49 @@ class Evaluator:
       chunk: episodes run side by side.
     """
 
+    # The task spreads its commands over a chunk, so its first and last episode show the two ends.
+    SHOWN = (0, -1)
+
     def __init__(self, env: Environment, chunk: int):
         self.env, self.chunk = env, chunk
         self._run = jax.jit(self._episodes)
 
-    def __call__(self, params: PolicyParams, *, episodes: int, seed: int) -> dict[str, Any]:
-        """Report over at least `episodes` episodes, rounded up to whole chunks.
+    def __call__(self, params: PolicyParams, *, episodes: int,
+                 seed: int) -> tuple[dict[str, Any], Any]:
+        """Measure over at least `episodes` episodes, rounded up to whole chunks.
 
         Returns:
-          `"held"` (share of episodes never terminated), `"return"` and `"steps_held"`, each with a 95 %
-          interval over episodes, and `"task"`: what the task's `summarize` makes of its metrics.
+          The report: `"held"` (share of episodes never terminated), `"return"` and `"steps_held"`, each
+          with a 95 % interval over episodes, and `"task"`: what the task's `summarize` makes of its
+          metrics. And the snapshots of the shown episodes, for `write_video`.
         """
         started = time.perf_counter()
         chunks = [jax.device_get(self._run(params, jax.random.fold_in(jax.random.key(seed), i)))
                   for i in range(math.ceil(episodes / self.chunk))]
-        metrics, terminated = jax.tree.map(lambda *xs: np.concatenate(xs, axis=1), *chunks)
-        return summarize(self.env, metrics, terminated) | {
+        metrics, terminated = jax.tree.map(lambda *xs: np.concatenate(xs, axis=1),
+                                           *((metrics, ended) for metrics, ended, _ in chunks))
+        report = summarize(self.env, metrics, terminated) | {
             "seed": seed, "seconds": time.perf_counter() - started}
+        _, ended, frames = chunks[0]
+        return report, self._film(frames, ended[:, self.SHOWN])
 
     def _episodes(self, params: PolicyParams, key: jax.Array):
+        """Metrics and termination flags [T, chunk], and snapshots [T, shown] of one chunk."""
         def step(state, _):
             state = jax.vmap(self.env.step)(state, act(params, state.obs["actor"]))
-            return state, (dict(state.metrics), state.terminated)
+            frame = jax.tree.map(lambda x: x[jnp.array(self.SHOWN)],
+                                 jax.vmap(self.env.snapshot)(state))
+            return state, (dict(state.metrics), state.terminated, frame)
 
         starts = self.env.evaluation_starts(key, self.chunk)
         return jax.lax.scan(step, starts, None, length=self.env.evaluation_steps)[1]
+
+    def _film(self, frames: Any, terminated: np.ndarray) -> Any:
+        """The shown episodes one after another, each to half a second after it terminated."""
+        after = round(0.5 / self.env.control_period)
+        ends = [int(np.argmax(t)) + after if t.any() else len(t) for t in terminated.T]
+        return jax.tree.map(lambda x: np.concatenate([x[:end, i] for i, end in enumerate(ends)]),
+                            frames)
 
 
 def summarize(env: Environment, metrics: dict[str, np.ndarray],
@@ -95,37 +114,14 @@ def proportion(x: np.ndarray) -> dict[str, float]:
             "high": min(1.0, (centre + half) / scale)}
 
 
-def record(env: Environment, params: PolicyParams, *, seed: int, episodes: int = 8,
-           shown: Sequence[int] = (0, -1)) -> Any:
-    """Snapshots of some of `episodes` evaluation episodes, one after another along the first axis.
-
-    The task spreads its commands over the episodes, so the first and the last one show its two ends.
-    An episode that terminates is shown for half a second longer.
-    """
-    def step(state, _):
-        state = jax.vmap(env.step)(state, act(params, state.obs["actor"]))
-        snapshots = jax.vmap(env.snapshot)(state)
-        picked = jax.tree.map(lambda x: x[jnp.array(shown)], snapshots)
-        return state, (picked, state.terminated[jnp.array(shown)])
-
-    @jax.jit
-    def run(key):
-        return jax.lax.scan(step, env.evaluation_starts(key, episodes), None,
-                            length=env.evaluation_steps)[1]
-
-    snapshots, terminated = jax.device_get(run(jax.random.key(seed)))
-    after = round(0.5 / env.control_period)
-    ends = [int(np.argmax(t)) + after if t.any() else len(t) for t in terminated.T]
-    return jax.tree.map(lambda x: np.concatenate([x[:end, i] for i, end in enumerate(ends)]), snapshots)
-
-
-def write_video(env: Environment, params: PolicyParams, path: Path, *, seed: int) -> Path:
-    """Render the policy's episodes to a video file; returns the path written, which may be a GIF's."""
+def write_video(env: Environment, snapshots: Any, path: Path) -> Path:
+    """Render an evaluation's snapshots; returns the file written, a GIF's where MP4 cannot be."""
     from dexsim.render import render_episode
 
-    written = render_episode(env, record(env, params, seed=seed), path,
-                             1.0 / env.control_period)
-    return Path(written or path)
+    with warnings.catch_warnings():
+        # The encoder is started by a fork that executes it at once.
+        warnings.filterwarnings("ignore", "os.fork", RuntimeWarning)
+        return Path(render_episode(env, snapshots, path, 1.0 / env.control_period))
 
 
 def load_policy(name: str) -> Policy:
@@ -185,13 +181,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     chunk = min(arguments.chunk or (1024 if jax.default_backend() == "gpu" else 64),
                 arguments.episodes)
     env = make_env(policy, backend=arguments.backend, num_envs=chunk)
-    report = Evaluator(env, chunk)(policy.params, episodes=arguments.episodes, seed=arguments.seed)
+    report, snapshots = Evaluator(env, chunk)(policy.params, episodes=arguments.episodes,
+                                              seed=arguments.seed)
     report |= {"policy": arguments.policy, "backend": env.backend} | cli.environment_report()
     if arguments.output:
         cli.write_json(arguments.output, report)
     print_report(report, title=f"{policy.task}: {arguments.policy}")
     if arguments.video:
-        print(f"video: {write_video(env, policy.params, arguments.video, seed=arguments.seed)}")
+        print(f"video: {write_video(env, snapshots, arguments.video)}")
     return 0
 
 
@@ -205,7 +202,8 @@ def print_report(report: dict[str, Any], *, title: str) -> None:
         entry = report[name]
         table.add_row(name, f"{entry['value']:.4g}", f"{entry['low']:.4g} .. {entry['high']:.4g}")
     for name, value in report["task"].get("headline", {}).items():
-        table.add_row(name, f"{value:.4g}", "")
+        if name not in report:  # With its interval it is in the table already.
+            table.add_row(name, "-" if value is None else f"{value:.4g}", "")
     Console().print(table)
     print(f"{report['episodes']} episodes of {report['steps']} steps, seed {report['seed']}, "
           f"{report['seconds']:.1f} s")

@@ -75,7 +75,7 @@ class PPOConfig:
     learning_rate_max: float = setting(2e-3, low=0.0, high=1.0)
     """Upper end of the adaptive learning rate."""
     kl_target: float = setting(0.012, unit="nats", low=0.0)
-    """Policy change per iteration that the learning rate adapts to; 0 keeps the rate fixed."""
+    """Policy change in one iteration that the learning rate adapts to; 0 keeps the rate fixed."""
     distribution: Literal["gaussian", "tanh"] = setting("gaussian", choices=("gaussian", "tanh"))
     """Gaussian clipped by the environment, or squashed by tanh."""
     initial_std: float = setting(0.6, low=1e-3, high=10.0)
@@ -284,7 +284,10 @@ class Learner(NamedTuple):
 
 def update(config: PPOConfig, normalizers: dict[str, Normalizer], samples: Samples, key: jax.Array,
            learner: Learner) -> tuple[Learner, Metrics]:
-    """All epochs over shuffled minibatches; metrics are means over them."""
+    """All epochs over shuffled minibatches, then the learning rate of the next iteration.
+
+    Metrics are means over the minibatches, but for the KL divergence: that of the last epoch.
+    """
     rows = config.steps_per_iteration
     keys = jax.random.split(key, config.epochs)
     order = jax.vmap(lambda key: jax.random.permutation(key, rows))(keys)
@@ -295,11 +298,14 @@ def update(config: PPOConfig, normalizers: dict[str, Normalizer], samples: Sampl
         batch = jax.tree.map(lambda x: x[indices], samples)
         grads, metrics = jax.grad(loss, has_aux=True)(learner.params, config, normalizers, batch,
                                                       old_log_std)
-        learner, norms = apply_gradients(config, learner, grads, metrics["kl"])
+        learner, norms = apply_gradients(config, learner, grads)
         return learner, metrics | norms
 
     learner, metrics = jax.lax.scan(minibatch, learner, order)
-    return learner, {"kl_last": metrics["kl"][-1]} | jax.tree.map(jnp.nanmean, metrics)
+    last_epoch = metrics["kl"][-config.minibatches:]
+    metrics = jax.tree.map(jnp.nanmean, metrics) | {"kl": jnp.nanmean(last_epoch)}
+    rate = adapt_learning_rate(config, learner.learning_rate, metrics["kl"])
+    return learner._replace(learning_rate=rate), metrics
 
 
 def loss(params: Params, config: PPOConfig, normalizers: dict[str, Normalizer], batch: Samples,
@@ -334,20 +340,19 @@ def loss(params: Params, config: PPOConfig, normalizers: dict[str, Normalizer], 
         "clip_fraction": jnp.mean((jnp.abs(ratio - 1) > config.clip_ratio).astype(jnp.float32))}
 
 
-def apply_gradients(config: PPOConfig, learner: Learner, grads: Params,
-                    kl: jax.Array) -> tuple[Learner, Metrics]:
-    """Adapt the learning rate, clip, step; a gradient that is not finite is skipped and counted."""
+def apply_gradients(config: PPOConfig, learner: Learner,
+                    grads: Params) -> tuple[Learner, Metrics]:
+    """Clip and step; a gradient that is not finite is skipped and counted."""
     actor_grads, actor_norm = adam.clip_by_global_norm((grads.actor, grads.log_std),
                                                        config.max_grad_norm)
     critic_grads, critic_norm = adam.clip_by_global_norm(grads.critic, config.max_grad_norm)
-    rate = adapt_learning_rate(config, learner.learning_rate, kl)
     params, moments = adam.update(Params(*actor_grads, critic_grads), learner.adam, learner.params,
-                                  rate)
+                                  learner.learning_rate)
     # Projected rather than clipped where it is used: a clip has no gradient to come back with.
     log_std = jnp.clip(params.log_std, jnp.log(config.std_min), jnp.log(config.std_max))
     params = Params(params.actor, log_std, params.critic)
     ok = jnp.isfinite(actor_norm) & jnp.isfinite(critic_norm)
-    new = Learner(params, moments, rate, learner.skipped_updates)
+    new = learner._replace(params=params, adam=moments)
     learner = jax.tree.map(functools.partial(jnp.where, ok), new, learner)
     skipped = learner.skipped_updates + (1 - ok.astype(jnp.int32))
     return learner._replace(skipped_updates=skipped), {"actor_grad_norm": actor_norm,
@@ -357,15 +362,15 @@ def apply_gradients(config: PPOConfig, learner: Learner, grads: Params,
 def adapt_learning_rate(config: PPOConfig, rate: jax.Array, kl: jax.Array) -> jax.Array:
     """Slow down beyond twice the target KL and speed up below half of it, within the band.
 
-    `kl` is the change from the policy that collected; it is zero before the first step of an iteration,
-    which says nothing about the rate.
+    `kl` is the change that a whole iteration made to the policy. Adapting within the iteration would
+    cut the rate at every minibatch after the first one beyond the target, and overshoot.
     """
     if config.kl_target == 0:
         return rate
     slower = jnp.maximum(rate / 1.5, config.learning_rate_min)
     faster = jnp.minimum(rate * 1.5, config.learning_rate_max)
     rate = jnp.where(kl > 2 * config.kl_target, slower, rate)
-    return jnp.where((kl > 1e-6) & (kl < 0.5 * config.kl_target), faster, rate)
+    return jnp.where(kl < 0.5 * config.kl_target, faster, rate)
 
 
 def strong_types(tree: Any) -> Any:

@@ -5,6 +5,7 @@ import shlex
 import sys
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, Literal, TypeVar
@@ -116,16 +117,21 @@ class Run:
         """The state to start from and the compiled training step."""
         training, key = make_train(self.env, self.config), jax.random.key(self.arguments.seed)
         begin = time.perf_counter()
-        if resumed:
-            state = checkpoint.restore(resumed, jax.eval_shape(training.init, key))
-            state = jax.tree.map(jnp.copy, state)
-            progress = resumed.content["progress"]
-            self.best, self.seconds_before = progress["best"], progress["seconds"]
-        else:
-            state = jax.block_until_ready(training.init(key))
-            self._policy(state).save(self.folder.untrained)
-        self.clock["init_s"] = time.perf_counter() - begin
-        step = training.step.lower(state).compile()
+        shapes = jax.eval_shape(training.init, key)
+        lowered = training.step.lower(shapes)
+        self.clock["trace_s"] = time.perf_counter() - begin
+        # The step compiles on one core while the first states are made on another.
+        with ThreadPoolExecutor(1) as compiler:
+            compiling = compiler.submit(lowered.compile)
+            if resumed:
+                state = jax.tree.map(jnp.copy, checkpoint.restore(resumed, shapes))
+                progress = resumed.content["progress"]
+                self.best, self.seconds_before = progress["best"], progress["seconds"]
+            else:
+                state = jax.block_until_ready(training.init(key))
+                self._policy(state).save(self.folder.untrained)
+            self.clock["init_s"] = time.perf_counter() - begin
+            step = compiling.result()
         self.clock["compile_s"] = time.perf_counter() - begin
         return state, step
 
@@ -134,7 +140,7 @@ class Run:
         arguments, per_call = self.arguments, self.config.iterations_per_call
         iteration = first = int(state.iteration)
         begin, spent_elsewhere = time.perf_counter(), 0.0
-        skipped = int(state.skipped_updates)
+        skipped, evaluated = int(state.skipped_updates), iteration == 0
         while not stopped() and self._seconds_left(iteration, 1.0) > 0:
             call = time.perf_counter()
             state, metrics = step(state)
@@ -147,10 +153,10 @@ class Run:
             skipped = self._check(metrics, skipped)
             row = {name: _mean(values) for name, values in metrics.items()}
             row |= self._progress(iteration, now - call)
-            evaluate = arguments.evaluate_every and self._due(iteration, arguments.evaluate_every)
-            if evaluate:
+            evaluated = self._due(iteration, arguments.evaluate_every)
+            if evaluated:
                 row |= self._evaluate(state, iteration, display)
-            if evaluate or iteration == first + per_call or self._due(iteration, arguments.log_every):
+            if evaluated or iteration == first + per_call or self._due(iteration, arguments.log_every):
                 log.write(row)
                 display.show(row)
             if self._due(iteration, arguments.checkpoint_every):
@@ -161,13 +167,13 @@ class Run:
         steps = (iteration - first) * self.config.steps_per_iteration
         self.clock["env_steps"] = iteration * self.config.steps_per_iteration
         self.clock["env_steps_per_s"] = steps / max(self.clock["step_s"], 1e-9)
-        if arguments.evaluate_every and not stopped() and iteration > first:
+        if arguments.evaluate_every and not stopped() and not evaluated:
             self._evaluate(state, iteration, display)
         self._save(state, iteration)
 
     def _due(self, iteration: int, every: int) -> bool:
-        """Whether a multiple of `every` lies in the call that ended at `iteration`."""
-        return iteration // every > (iteration - self.config.iterations_per_call) // every
+        """Whether a multiple of `every` lies in the call that ended at `iteration`; 0 is never."""
+        return every > 0 and iteration // every > (iteration - self.config.iterations_per_call) // every
 
     def _seconds(self) -> float:
         """Wall-clock of the whole run, that before a resume included."""
@@ -208,8 +214,8 @@ class Run:
     def _evaluate(self, state: TrainState, iteration: int, display: Display) -> dict[str, float]:
         """Measure the policy, and keep the very one measured if its return is the best so far."""
         policy = self._policy(state)
-        report = self.evaluator(policy.params, episodes=self.arguments.evaluation_chunk,
-                                seed=SELECTION_SEED)
+        report, _ = self.evaluator(policy.params, episodes=self.arguments.evaluation_chunk,
+                                   seed=SELECTION_SEED)
         score, held = report["return"]["value"], report["held"]["value"]
         better = self.best["return"] is None or score > self.best["return"]
         if better:
@@ -235,9 +241,10 @@ class Run:
         print(f"evaluating {chosen.name} and the untrained policy", flush=True)
         begin = time.perf_counter()
         trained, untrained = Policy.load(chosen), Policy.load(folder.untrained)
-        reports = {name: self.evaluator(policy.params, episodes=arguments.evaluation_episodes,
-                                        seed=REPORT_SEED)
-                   for name, policy in (("trained", trained), ("untrained", untrained))}
+        reports, films = {}, {}
+        for name, policy in (("trained", trained), ("untrained", untrained)):
+            reports[name], films[name] = self.evaluator(
+                policy.params, episodes=arguments.evaluation_episodes, seed=REPORT_SEED)
         self.clock["evaluation_s"] = time.perf_counter() - begin
         draw_curve(read_metrics(folder.metrics), folder.path / "curve.png", arguments.task)
         report = {
@@ -252,7 +259,7 @@ class Run:
         print_report(reports["trained"], title=f"{arguments.task}: {chosen}")
         if arguments.video:
             begin = time.perf_counter()
-            video = write_video(self.env, trained.params, folder.path / "policy.mp4", seed=REPORT_SEED)
+            video = write_video(self.env, films["trained"], folder.path / "policy.mp4")
             self.clock["video_s"] = time.perf_counter() - begin
             print(f"video: {video}")
         self.clock["total_s"] = time.perf_counter() - self.started

@@ -16,7 +16,7 @@ from dexsim import observation
 from dexsim.config import check_ranges, setting, validate
 from dexsim.env import EnvConfig, Moment, Start
 from dexsim.errors import ConfigError
-from dexsim.hand import Hand
+from dexsim.hand import Hand, joints_below
 from dexsim.objects import SLOTS, ObjectParams
 from dexsim.pytree import pytree_dataclass
 from dexsim.tasks.grasp_report import summarize
@@ -87,6 +87,8 @@ class GraspConfig(EnvConfig):
     """Joint angles that episodes start near."""
     posture_noise: float = setting(0.1, unit="rad", low=0.0, high=1.0)
     """Largest deviation from them."""
+    curl: tuple[float, float] = setting((-0.4, 0.1), unit="rad", low=-3.0, high=3.0)
+    """Added to all joints of the four fingers alike: how far closed they start."""
     release_gap: tuple[float, float] = setting((0.001, 0.009), unit="m", low=0.0, high=0.1)
     """Gap between palm and object at release."""
     release_speed: tuple[float, float] = setting((0.0, 0.2), unit="m/s", low=0.0, high=3.0)
@@ -96,7 +98,7 @@ class GraspConfig(EnvConfig):
 
     def __post_init__(self):
         validate(self)
-        check_ranges(self, "finger_force", "release_gap", "release_speed")
+        check_ranges(self, "finger_force", "curl", "release_gap", "release_speed")
 
 
 @pytree_dataclass
@@ -172,7 +174,7 @@ class Grasp:
         self.config, self.hand = config, hand
         self._roots = hand.root_joint
         self._max_torque = jnp.asarray(hand.torque_limit[hand.root_joint])
-        self._finger_joints = _joints_below(hand, range(1, hand.num_fingers))
+        self._finger_joints = joints_below(hand, range(1, hand.num_fingers))
         self._centre = jnp.asarray((hand.joint_lower + hand.joint_upper) / 2)
         period = config.physics.control_period
         self.episode_ticks = max(round(config.episode_seconds / period), 1)
@@ -251,6 +253,7 @@ class Grasp:
             "finger_force": mean_force,
             "total_force": jnp.sum(force),
             "taxel_force": sensed,
+            "skin_force": jnp.sum(moment.touch.skin_force),
             "touching": touching.astype(jnp.float32),
             "joint_speed": jnp.mean(jnp.abs(moment.joint_velocity)),
             "action_rate": jnp.mean(jnp.abs(moment.action - moment.last_action)),
@@ -281,14 +284,3 @@ class Grasp:
         """The report of an evaluation; see `grasp_report`."""
         return summarize(metrics, alive, control_period, self.config.finger_force)
 
-
-def _joints_below(hand: Hand, fingers: range) -> np.ndarray:
-    """Joint indices on the way from the palm to these fingers' tips."""
-    joints = []
-    for finger in fingers:
-        body = int(hand.tip_body[finger])
-        while body >= 0:
-            if hand.body_joint[body] >= 0:
-                joints.append(int(hand.body_joint[body]))
-            body = int(hand.body_parent[body])
-    return np.array(sorted(joints))

@@ -8,42 +8,60 @@ import numpy as np
 
 from dexsim import rotations, sdf
 from dexsim.errors import ConfigError
-from dexsim.hand import Hand, forward_kinematics
-from dexsim.objects import extent, sample_object
+from dexsim.hand import Hand, forward_kinematics, joints_below
+from dexsim.objects import SHAPES, extent, sample_object
 
 _OVERLAP = 0.001  # m, hand and object may start this deep in each other
 
 
 def make_pool(key: jax.Array, hand: Hand, config: Any, reference: tuple[float, float, float]):
-    """Draw candidates, keep `pool_size` of them in which the hand is clear of the object.
+    """Draw candidates and keep those in which the hand is clear of the object.
+
+    Every shape gets an equal share of the pool: large boxes overlap far more often than small
+    spheres, and a plain rejection would all but leave them out of training.
 
     Raises:
-      ConfigError: fewer than one candidate in eight is clear, so the ranges do not fit the hand.
+      ConfigError: next to no candidate of a shape is clear, so the ranges do not fit the hand.
     """
-    draw = jax.jit(jax.vmap(lambda k: _candidate(k, hand, config, reference)))
-    chunk = min(max(config.pool_size, 64), 4096)
-    kept, found = [], 0
-    for trial in range(8 * -(-config.pool_size // chunk)):
-        starts, clear = draw(jax.random.split(jax.random.fold_in(key, trial), chunk))
-        rows = np.flatnonzero(np.asarray(clear))
-        kept.append(jax.tree.map(lambda x, rows=rows: np.asarray(x)[rows], starts))
-        found += rows.size
-        if found >= config.pool_size:
-            break
-    if found < config.pool_size:
-        raise ConfigError(f"{type(config).__name__}: only {found} of the {config.pool_size} start "
-                          "states are free of overlap; open the posture or shrink the objects")
-    return jax.tree.map(lambda *parts: np.concatenate(parts)[:config.pool_size], *kept)
+    shapes = config.objects.shapes
+    share = -(-config.pool_size // len(shapes))
+    chunk = max(min(2 * share, 4096), 64)
+
+    @jax.jit
+    def draw(key: jax.Array, shape_index: jax.Array):
+        keys = jax.random.split(key, chunk)
+        return jax.vmap(lambda k: _candidate(k, shape_index, hand, config, reference))(keys)
+
+    pools = []
+    for name in shapes:
+        kept, found = [], 0
+        for trial in range(40):
+            shape_key = jax.random.fold_in(jax.random.fold_in(key, SHAPES.index(name)), trial)
+            starts, clear = draw(shape_key, jnp.int32(SHAPES.index(name)))
+            rows = np.flatnonzero(np.asarray(clear))[:share - found]
+            kept.append(jax.tree.map(lambda x, rows=rows: np.asarray(x)[rows], starts))
+            found += rows.size
+            if found == share:
+                break
+        if found < share:
+            raise ConfigError(f"{type(config).__name__}: only {found} of {share} start states of "
+                              f"shape {name!r} are free of overlap; open the posture or shrink it")
+        pools.append(jax.tree.map(lambda *parts: np.concatenate(parts), *kept))
+    return jax.tree.map(lambda *parts: np.concatenate(parts)[:config.pool_size], *pools)
 
 
-def _candidate(key: jax.Array, hand: Hand, config: Any,
+def _candidate(key: jax.Array, shape_index: jax.Array, hand: Hand, config: Any,
                reference: tuple[float, float, float]) -> tuple[Any, jax.Array]:
     from dexsim.env import Start
 
     keys = jax.random.split(key, 7)
-    target = sample_object(keys[0], config.objects)
+    target = sample_object(keys[0], config.objects, shape_index)
     noise = config.posture_noise * jax.random.uniform(keys[1], (hand.num_joints,), minval=-1.0)
-    joints = jnp.clip(jnp.asarray(config.posture) + noise, hand.joint_lower, hand.joint_upper)
+    curl = jax.random.uniform(keys[6], minval=config.curl[0], maxval=config.curl[1])
+    flexion = np.zeros(hand.num_joints, np.float32)
+    flexion[joints_below(hand, range(1, hand.num_fingers))] = 1.0
+    joints = jnp.asarray(config.posture) + noise + curl * flexion
+    joints = jnp.clip(joints, hand.joint_lower, hand.joint_upper)
 
     # Long objects lie across the fingers (their z along the palm's y), turned about the palm's
     # normal and a little askew; the roll about their own axis is free.

@@ -89,10 +89,10 @@ def test_a_gradient_that_is_not_finite_is_skipped_and_counted():
     learner = Learner(state.params, state.adam, state.learning_rate, state.skipped_updates)
     grads = jax.tree.map(jnp.ones_like, state.params)
     bad = dataclasses.replace(grads, log_std=jnp.full_like(grads.log_std, jnp.nan))
-    after, _ = ppo.apply_gradients(SMALL, learner, bad, jnp.float32(0.0))
+    after, _ = ppo.apply_gradients(SMALL, learner, bad)
     assert int(after.skipped_updates) == 1
     jax.tree.map(np.testing.assert_array_equal, after.params, state.params)
-    after, _ = ppo.apply_gradients(SMALL, after, grads, jnp.float32(0.0))
+    after, _ = ppo.apply_gradients(SMALL, after, grads)
     assert int(after.skipped_updates) == 1
     assert not np.array_equal(after.params.log_std, state.params.log_std)
 
@@ -104,7 +104,7 @@ def test_log_std_stays_between_floor_and_cap():
         learner = Learner(state.params, state.adam, state.learning_rate, state.skipped_updates)
         grads = jax.tree.map(lambda x, sign=sign: jnp.full_like(x, 100 * sign), state.params)
         for _ in range(5):
-            learner, _ = ppo.apply_gradients(config, learner, grads, jnp.float32(0.0))
+            learner, _ = ppo.apply_gradients(config, learner, grads)
         np.testing.assert_allclose(jnp.exp(learner.params.log_std), bound, rtol=1e-5)
 
 

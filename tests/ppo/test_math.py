@@ -166,8 +166,8 @@ class TestConfig:
         config = PPOConfig(learning_rate=1e-3, learning_rate_min=9e-4, learning_rate_max=1.2e-3,
                            kl_target=0.01)
         rate = lambda kl: float(adapt_learning_rate(config, jnp.float32(1e-3), jnp.float32(kl)))  # noqa: E731
-        assert [rate(kl) for kl in (0.0, 0.004, 0.01, 0.021)] == pytest.approx(
-            [1e-3, 1.2e-3, 1e-3, 9e-4])
+        assert [rate(kl) for kl in (0.0, 0.006, 0.01, 0.021)] == pytest.approx(
+            [1.2e-3, 1e-3, 1e-3, 9e-4])
         fixed = dataclasses.replace(config, kl_target=0.0)
         assert float(adapt_learning_rate(fixed, jnp.float32(1e-3), jnp.float32(9.0))) == pytest.approx(1e-3)
 

@@ -1,5 +1,6 @@
 """The two commands on the tiny task: what they write, how they resume, how they refuse."""
 
+import dataclasses
 import json
 import os
 import signal
@@ -70,11 +71,11 @@ def test_the_report_compares_with_the_untrained_policy(finished):
 def test_the_best_policy_is_the_one_that_was_measured(finished):
     rows = [r for r in read_metrics(finished.metrics) if r.get("evaluation/return") is not None]
     policy = Policy.load(finished.best, task="tiny")
-    report = evaluate.Evaluator(TinyEnv(), 16)(policy.params, episodes=16, seed=1)
+    report, _ = evaluate.Evaluator(TinyEnv(), 16)(policy.params, episodes=16, seed=1)
     if policy.training["iteration"] == rows[0]["iteration"]:
         assert report["return"]["value"] == pytest.approx(rows[0]["evaluation/return"], rel=1e-5)
     last = Policy.load(finished.last).params
-    last = evaluate.Evaluator(TinyEnv(), 16)(last, episodes=16, seed=1)
+    last, _ = evaluate.Evaluator(TinyEnv(), 16)(last, episodes=16, seed=1)
     assert report["return"]["value"] >= last["return"]["value"] - 1e-4
 
 
@@ -98,6 +99,22 @@ def test_evaluate_command(finished, tmp_path, capsys):
     report = json.loads(finished.report.read_text())
     assert first["return"]["value"] == pytest.approx(report["trained"]["return"]["value"], rel=1e-5)
     assert "held" in capsys.readouterr().out
+
+
+class Drops(TinyEnv):
+    """Terminates every episode at step 7."""
+
+    def step(self, state, action):
+        state = super().step(state, action)
+        return dataclasses.replace(state, terminated=state.metrics["length"] == 7)
+
+
+def test_film_shows_the_first_and_last_episode_to_half_a_second_after_its_end(finished):
+    params = Policy.load(finished.best).params
+    _, film = evaluate.Evaluator(TinyEnv(), 4)(params, episodes=4, seed=0)
+    assert film["x"].shape == (2 * 32,)
+    _, film = evaluate.Evaluator(Drops(), 4)(params, episodes=4, seed=0)
+    assert film["x"].shape == (2 * (6 + 5),)
 
 
 def test_episodes_end_at_their_first_termination():
