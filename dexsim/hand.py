@@ -144,14 +144,14 @@ def _levels(parent: np.ndarray) -> list[np.ndarray]:
     return [np.flatnonzero(depth == level) for level in range(depth.max() + 1)]
 
 
-def joints_below(hand: Hand, fingers: range) -> np.ndarray:
-    """Joint indices on the way from the palm to these fingers' tips."""
+def flexion_joints(hand: Hand, fingers: range) -> np.ndarray:
+    """Joint indices of these fingers from their root joint to the tip."""
     joints = []
     for finger in fingers:
-        body = int(hand.tip_body[finger])
-        while body >= 0:
-            if hand.body_joint[body] >= 0:
-                joints.append(int(hand.body_joint[body]))
+        body, joint = int(hand.tip_body[finger]), -1
+        while body >= 0 and joint != hand.root_joint[finger]:
+            joint = int(hand.body_joint[body])
+            joints += [joint] if joint >= 0 else []
             body = int(hand.body_parent[body])
     return np.array(sorted(joints))
 

@@ -16,7 +16,7 @@ from dexsim import observation
 from dexsim.config import check_ranges, setting, validate
 from dexsim.env import EnvConfig, Moment, Start
 from dexsim.errors import ConfigError
-from dexsim.hand import Hand, joints_below
+from dexsim.hand import Hand, flexion_joints
 from dexsim.objects import SLOTS, ObjectParams
 from dexsim.pytree import pytree_dataclass
 from dexsim.tasks.grasp_report import summarize
@@ -174,7 +174,7 @@ class Grasp:
         self.config, self.hand = config, hand
         self._roots = hand.root_joint
         self._max_torque = jnp.asarray(hand.torque_limit[hand.root_joint])
-        self._finger_joints = joints_below(hand, range(1, hand.num_fingers))
+        self._finger_joints = flexion_joints(hand, range(1, hand.num_fingers))
         self._centre = jnp.asarray((hand.joint_lower + hand.joint_upper) / 2)
         period = config.physics.control_period
         self.episode_ticks = max(round(config.episode_seconds / period), 1)

@@ -8,7 +8,7 @@ import numpy as np
 
 from dexsim import rotations, sdf
 from dexsim.errors import ConfigError
-from dexsim.hand import Hand, forward_kinematics, joints_below
+from dexsim.hand import Hand, flexion_joints, forward_kinematics
 from dexsim.objects import SHAPES, extent, sample_object
 
 _OVERLAP = 0.001  # m, hand and object may start this deep in each other
@@ -59,7 +59,7 @@ def _candidate(key: jax.Array, shape_index: jax.Array, hand: Hand, config: Any,
     noise = config.posture_noise * jax.random.uniform(keys[1], (hand.num_joints,), minval=-1.0)
     curl = jax.random.uniform(keys[6], minval=config.curl[0], maxval=config.curl[1])
     flexion = np.zeros(hand.num_joints, np.float32)
-    flexion[joints_below(hand, range(1, hand.num_fingers))] = 1.0
+    flexion[flexion_joints(hand, range(1, hand.num_fingers))] = 1.0
     joints = jnp.asarray(config.posture) + noise + curl * flexion
     joints = jnp.clip(joints, hand.joint_lower, hand.joint_upper)
 
