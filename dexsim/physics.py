@@ -36,7 +36,7 @@ class PhysicsConfig:
 
     timestep: float = setting(0.005, unit="s", low=1e-4, high=0.02)
     """One physics sub-step."""
-    substeps: int = setting(8, unit="1", low=1, high=200)
+    substeps: int = setting(6, unit="1", low=1, high=200)
     """Sub-steps in one control tick; the control rate is 1 / (timestep * substeps)."""
     iterations: int = setting(5, unit="1", low=1, high=100)
     """Newton iterations of the contact solver."""

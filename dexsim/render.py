@@ -7,6 +7,7 @@ installed), `draw_taxels` is the matplotlib figure for notebooks. Pillow and mat
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
@@ -16,13 +17,13 @@ import jax
 import numpy as np
 
 from dexsim.hand import Hand, forward_kinematics, load_hand, taxel_normals, taxel_positions
-from dexsim.panel import draw_panel, make_layout, taxel_image
+from dexsim.panel import draw_panel, force_color, make_layout, taxel_image
 from dexsim.pytree import pytree_dataclass
 from dexsim.raycast import Camera
 from dexsim.scene import Pose, draw_scene
 
 CAMERAS = {
-    "grasp": Camera(azimuth=100.0, elevation=-20.0, distance=0.46, target=(0.048, 0.010, 0.092), up=(-1.0, 0.0, 0.0)),
+    "grasp": Camera(azimuth=100.0, elevation=-20.0, distance=0.43, target=(0.048, 0.010, 0.092), up=(-1.0, 0.0, 0.0)),
     "rotate": Camera(azimuth=-130.0, elevation=35.0, distance=0.50, target=(0.040, 0.010, 0.100), up=(1.0, 0.0, 0.0)),
 }
 """The hand held palm down, and palm up."""
@@ -197,7 +198,10 @@ def _write_video(frame: Callable[[int], np.ndarray], count: int, path: Path, fps
         str(path), size, fps=fps, codec="libx264", pix_fmt_out="yuv420p", macro_block_size=2,
         output_params=["-crf", "20", "-preset", "veryfast", "-movflags", "+faststart"], ffmpeg_log_level="error",
     )  # fmt: skip
-    writer.send(None)
+    with warnings.catch_warnings():
+        # The encoder is started by a fork that executes another program at once, which JAX's threads survive.
+        warnings.filterwarnings("ignore", "os.fork", RuntimeWarning)
+        writer.send(None)
     try:
         for t in range(count):
             writer.send(np.ascontiguousarray(frame(t)))
@@ -209,10 +213,12 @@ def _write_video(frame: Callable[[int], np.ndarray], count: int, path: Path, fps
 def _write_gif(frame: Callable[[int], np.ndarray], count: int, path: Path, fps: float) -> Path:
     from PIL import Image
 
-    # One palette for all frames: quantising to a given palette is fast and nothing flickers. It is drawn from frames
-    # throughout the video, since the hot colours may come late.
+    # One palette for all frames: quantising to a given palette is fast and nothing flickers. A quarter of it is kept
+    # for the colours of force, which cover few pixels; the rest is drawn from frames throughout the video.
     some = np.concatenate([frame(t) for t in np.linspace(0, count - 1, min(count, 5)).astype(int)])
-    palette = Image.fromarray(some).quantize(256, Image.Quantize.MEDIANCUT)
+    scene = Image.fromarray(some).quantize(192, Image.Quantize.MEDIANCUT).getpalette()[: 3 * 192]
+    palette = Image.new("P", (1, 1))
+    palette.putpalette(scene + force_color(np.linspace(0, 1, 64), 1.0).reshape(-1).tolist())
     images = [Image.fromarray(frame(t)).quantize(palette=palette, dither=Image.Dither.NONE) for t in range(count)]
     images[0].save(path, save_all=True, append_images=images[1:], duration=round(1000 / fps), loop=0)
     return path

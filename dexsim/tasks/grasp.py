@@ -30,9 +30,9 @@ COMMANDS = (0.0, 0.25, 0.5, 0.75, 1.0)
 class GraspReward:
     """Weights and widths of the reward terms, per control tick."""
 
-    force: float = setting(1.0, unit="1", low=0.0, high=1000.0)
+    force: float = setting(2.0, unit="1", low=0.0, high=1000.0)
     """R_force: each touching finger's force against its target."""
-    torque: float = setting(0.3, unit="1", low=0.0, high=1000.0)
+    torque: float = setting(0.2, unit="1", low=0.0, high=1000.0)
     """R_torque: each touching finger's root-joint torque against its target."""
     alive: float = setting(0.5, unit="1", low=0.0, high=1000.0)
     """Each tick that the object is held."""
@@ -52,8 +52,10 @@ class GraspReward:
     """Width of the wide Gaussian that carries a gradient far from the target."""
     tail: float = setting(0.4, unit="1", low=0.0, high=1.0)
     """Share of the wide Gaussian."""
-    thumb: str = setting("track", choices=("track", "binary"))
-    """Thumb: follows the force target like the fingers, or gets the paper's in-bounds reward."""
+    thumb: str = setting("loose", choices=("loose", "track", "binary"))
+    """Thumb: it opposes all other fingers, so a balanced grasp needs more of it than of each of
+    them. "loose": only the wide Gaussian; "track": like the fingers; "binary": the paper's, any
+    force within the bounds."""
 
     def __post_init__(self):
         validate(self)
@@ -87,7 +89,7 @@ class GraspConfig(EnvConfig):
     """Joint angles that episodes start near."""
     posture_noise: float = setting(0.1, unit="rad", low=0.0, high=1.0)
     """Largest deviation from them."""
-    curl: tuple[float, float] = setting((-0.4, 0.1), unit="rad", low=-3.0, high=3.0)
+    curl: tuple[float, float] = setting((-0.3, 0.1), unit="rad", low=-3.0, high=3.0)
     """Added to all joints of the four fingers alike: how far closed they start."""
     release_gap: tuple[float, float] = setting((0.001, 0.009), unit="m", low=0.0, high=0.1)
     """Gap between palm and object at release."""
@@ -127,14 +129,17 @@ def command_reward(value: jax.Array, goal: jax.Array, contact: jax.Array, bounds
                    scale: float, weights: GraspReward) -> jax.Array:
     """Sum over touching fingers of the match between `value` [F] and `goal`, over F.
 
-    R_force and R_torque of the paper: zero outside `bounds` and without contact; the first
-    finger (the thumb) is binary if the weights say so.
+    R_force and R_torque of the paper: zero outside `bounds` and without contact. The first
+    finger is the thumb; see `GraspReward.thumb`.
     """
     valid = contact & (value >= bounds[0]) & (value <= bounds[1])
     match = tailed_gaussian((value - goal) / scale, weights.sigma, weights.tail_sigma,
                             weights.tail)
     if weights.thumb == "binary":
         match = match.at[0].set(1.0)
+    elif weights.thumb == "loose":
+        loose = tailed_gaussian((value - goal) / scale, 1.0, weights.tail_sigma, 1.0)
+        match = match.at[0].set(loose[0])
     return jnp.sum(jnp.where(valid, match, 0.0)) / value.shape[0]
 
 
@@ -242,8 +247,9 @@ class Grasp:
             "drop": weights.drop * dropped,
         }
         reward = sum(terms.values())
-        touching = jnp.sum(contact)
-        mean_force = jnp.sum(jnp.where(contact, force, 0.0)) / jnp.maximum(touching, 1)
+        # The command speaks to the four fingers; the thumb balances them.
+        inner = jnp.sum(contact[1:])
+        mean_force = jnp.sum(jnp.where(contact[1:], force[1:], 0.0)) / jnp.maximum(inner, 1)
         sensed = jnp.sum(moment.touch.force)
         return reward, {
             **{f"reward/{name}": value for name, value in terms.items()},
@@ -254,7 +260,8 @@ class Grasp:
             "total_force": jnp.sum(force),
             "taxel_force": sensed,
             "skin_force": jnp.sum(moment.touch.skin_force),
-            "touching": touching.astype(jnp.float32),
+            "thumb_force": force[0],
+            "touching": jnp.sum(contact).astype(jnp.float32),
             "joint_speed": jnp.mean(jnp.abs(moment.joint_velocity)),
             "action_rate": jnp.mean(jnp.abs(moment.action - moment.last_action)),
             **{f"force/{i}": force[i] for i in range(force.shape[0])},

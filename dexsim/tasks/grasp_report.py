@@ -18,9 +18,11 @@ def summarize(metrics: dict[str, np.ndarray], alive: np.ndarray, control_period:
       span: N, target force per touching finger at command 0 and 1.
 
     Returns:
-      A JSON-able dict. "force" is the solver's, averaged over the ticks from 3 s after release
-      (from the middle of shorter episodes), over the touching fingers, for episodes held to
-      the end. Intervals are 95 %: Wilson's for proportions, else bootstrap over episodes.
+      A JSON-able dict. Forces are averaged over the ticks from 3 s after release (from the
+      middle of shorter episodes), for episodes held to the end. "finger_force" is the solver's
+      force per touching finger among those commanded (all but the thumb), "total_force" the
+      sum over all fingers, "taxel_force" that sum as the taxels feel it. Intervals are 95 %:
+      Wilson's for proportions, else bootstrap over episodes.
     """
     ticks, episodes = alive.shape
     held = alive[-1]
@@ -29,6 +31,7 @@ def summarize(metrics: dict[str, np.ndarray], alive: np.ndarray, control_period:
     force = metrics["finger_force"][late].mean(0)
     total = metrics["total_force"][late].mean(0)
     sensed = metrics["taxel_force"][late].mean(0)
+    thumb = metrics["thumb_force"][late].mean(0)
     touching = metrics["touching"][late].mean(0)
     wanted = span[0] + command * (span[1] - span[0])
     returns = np.where(alive, metrics["reward"], 0.0).sum(0) if "reward" in metrics \
@@ -42,7 +45,8 @@ def summarize(metrics: dict[str, np.ndarray], alive: np.ndarray, control_period:
             "command": float(level), "episodes": int(mine.sum()),
             "held": proportion(held[mine]), "target_force_n": float(wanted[mine].mean()),
             "finger_force_n": mean(force[good]), "total_force_n": mean(total[good]),
-            "taxel_force_n": mean(sensed[good]), "touching_fingers": mean(touching[good])})
+            "taxel_force_n": mean(sensed[good]), "thumb_force_n": mean(thumb[good]),
+            "touching_fingers": mean(touching[good])})
     by_shape = []
     for index in np.unique(shape):
         mine = shape == index
