@@ -53,7 +53,7 @@ class ObjectConfig:
     friction: tuple[float, float] = setting((0.6, 1.2), unit="1", low=0.01, high=5.0)
     """Sliding friction between hand and object."""
     contact_time: tuple[float, float] = setting((0.02, 0.03), unit="s", low=0.01, high=0.5)
-    """Time constant of the contact spring: its softness."""
+    """Time constant of the contact spring at critical damping: its softness."""
     restitution: tuple[float, float] = setting((0.0, 0.2), unit="1", low=0.0, high=0.9)
     """Coefficient of restitution of the contact spring: its damping."""
 
@@ -124,8 +124,10 @@ def sample_object(key: jax.Array, config: ObjectConfig,
     mass = _uniform(keys[2], config.mass)
     scale = _uniform(keys[3], config.inertia_scale) * mass / density_mass
     com = config.com_offset * jax.random.uniform(keys[4], (3,), minval=-1.0)
-    contact = jnp.stack([_uniform(keys[6], config.contact_time),
-                         damping_ratio(_uniform(keys[7], config.restitution))])
+    # MuJoCo's stiffness falls with (time constant * damping ratio)^2: divide, so that the bounce
+    # changes the damping alone.
+    ratio = damping_ratio(_uniform(keys[7], config.restitution))
+    contact = jnp.stack([_uniform(keys[6], config.contact_time) / ratio, ratio])
     return ObjectParams(shape_index.astype(jnp.int32), size, position, active, mass,
                         inertia * scale, com, _uniform(keys[5], config.friction), contact)
 

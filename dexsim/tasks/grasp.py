@@ -44,7 +44,10 @@ class GraspReward:
     """R_action: squared change of the action."""
     velocity: float = setting(-0.002, unit="s^2/rad^2", low=-1000.0, high=0.0)
     """R_vel: squared joint velocity."""
-    drop: float = setting(-20.0, unit="1", low=-10000.0, high=0.0)
+    place: float = setting(-5.0, unit="1/m", low=-1000.0, high=0.0)
+    """Distance of the object from the grasp centre, beyond the first 2 cm: a grasp off the centre
+    is the one that slips."""
+    drop: float = setting(-60.0, unit="1", low=-10000.0, high=0.0)
     """Once, when the object is lost."""
     sigma: float = setting(0.10, unit="1", low=0.001, high=10.0)
     """Width of the Gaussians, on quantities over their maxima (the paper's value)."""
@@ -93,7 +96,7 @@ class GraspConfig(EnvConfig):
     """Added to all joints of the four fingers alike: how far closed they start."""
     release_gap: tuple[float, float] = setting((0.001, 0.009), unit="m", low=0.0, high=0.1)
     """Gap between palm and object at release."""
-    release_speed: tuple[float, float] = setting((0.0, 0.2), unit="m/s", low=0.0, high=3.0)
+    release_speed: tuple[float, float] = setting((0.0, 0.15), unit="m/s", low=0.0, high=3.0)
     """Speed of the object away from the palm at release."""
     reward: GraspReward = setting(GraspReward())
     """Reward weights."""
@@ -151,6 +154,11 @@ def joint_spread(first_joints: jax.Array) -> jax.Array:
 def posture_distance(joints: jax.Array, centre: jax.Array) -> jax.Array:
     """R_outer: Euclidean distance from the centre posture."""
     return jnp.sqrt(jnp.sum((joints - centre) ** 2) + 1e-12)
+
+
+def place_error(position: jax.Array, reference: jax.Array) -> jax.Array:
+    """Distance [] m of the object from where it belongs, beyond 2 cm."""
+    return jnp.maximum(jnp.linalg.norm(position - reference) - 0.02, 0.0)
 
 
 def action_rate(action: jax.Array, last_action: jax.Array) -> jax.Array:
@@ -244,6 +252,8 @@ class Grasp:
                 moment.joint_position[fingers], self._centre[fingers]),
             "action": weights.action * action_rate(moment.action, moment.last_action),
             "velocity": weights.velocity * joint_speed(moment.joint_velocity),
+            "place": held * weights.place * place_error(moment.object_position,
+                                                        jnp.asarray(self.reference)),
             "drop": weights.drop * dropped,
         }
         reward = sum(terms.values())
