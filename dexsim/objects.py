@@ -52,7 +52,7 @@ class ObjectConfig:
     """Largest offset of the centre of mass, per axis."""
     friction: tuple[float, float] = setting((0.6, 1.2), unit="1", low=0.01, high=5.0)
     """Sliding friction between hand and object."""
-    contact_time: tuple[float, float] = setting((0.02, 0.03), unit="s", low=0.01, high=0.5)
+    contact_time: tuple[float, float] = setting((0.01, 0.02), unit="s", low=0.01, high=0.5)
     """Time constant of the contact spring at critical damping: its softness."""
     restitution: tuple[float, float] = setting((0.0, 0.2), unit="1", low=0.0, high=0.9)
     """Coefficient of restitution of the contact spring: its damping."""

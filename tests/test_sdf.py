@@ -36,7 +36,8 @@ def radial(points, radius, height):
 def ball(points, centre, radius):
     seen = points - centre
     length = np.linalg.norm(seen, axis=1, keepdims=True)
-    return centre + radius * np.where(length > 0, seen / np.maximum(length, 1e-300), [0.0, 0.0, np.sign(centre[2]) or 1])
+    out = [0.0, 0.0, -1.0 if centre[2] < 0 else 1.0]
+    return centre + radius * np.where(length > 0, seen / np.maximum(length, 1e-300), out)
 
 
 def ellipsoid_point(size, points):

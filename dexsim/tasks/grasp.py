@@ -34,7 +34,7 @@ class GraspReward:
     """R_force: each touching finger's force against its target."""
     torque: float = setting(0.2, unit="1", low=0.0, high=1000.0)
     """R_torque: each touching finger's root-joint torque against its target."""
-    alive: float = setting(0.5, unit="1", low=0.0, high=1000.0)
+    alive: float = setting(1.0, unit="1", low=0.0, high=1000.0)
     """Each tick that the object is held."""
     spread: float = setting(-0.5, unit="1/rad^2", low=-1000.0, high=0.0)
     """R_diff: variance of the four inner fingers' first joint angles."""
@@ -47,7 +47,7 @@ class GraspReward:
     place: float = setting(-5.0, unit="1/m", low=-1000.0, high=0.0)
     """Distance of the object from the grasp centre, beyond the first 2 cm: a grasp off the centre
     is the one that slips."""
-    drop: float = setting(-60.0, unit="1", low=-10000.0, high=0.0)
+    drop: float = setting(-20.0, unit="1", low=-10000.0, high=0.0)
     """Once, when the object is lost."""
     sigma: float = setting(0.10, unit="1", low=0.001, high=10.0)
     """Width of the Gaussians, on quantities over their maxima (the paper's value)."""
@@ -80,7 +80,7 @@ class GraspConfig(EnvConfig):
     """Finger force per root-joint torque; ties the torque target to the force target."""
     command_change: float = setting(0.005, unit="1", low=0.0, high=1.0)
     """Probability per tick that the command is drawn anew within an episode."""
-    push_probability: float = setting(0.02, unit="1", low=0.0, high=1.0)
+    push_probability: float = setting(0.015, unit="1", low=0.0, high=1.0)
     """Probability per tick of a push on the object."""
     push_speed: float = setting(0.3, unit="m/s", low=0.0, high=5.0)
     """Largest change of the object's speed by a push."""
