@@ -13,7 +13,7 @@ import numpy as np
 from dexsim.errors import AssetError
 
 _UNSUPPORTED_COLLISIONS = {
-    ("cylinder", "sphere"), ("cylinder", "box"), ("cylinder", "mesh"),
+    ("cylinder", "box"), ("cylinder", "mesh"),
     ("ellipsoid", "box"), ("ellipsoid", "mesh"),
 }
 

@@ -27,9 +27,9 @@ class Preset:
 PRESETS = {
     # Two cores: simulation is nearly all of the time, so small networks and many passes over little data.
     "cpu": Preset(
-        ppo=PPOConfig(num_envs=64, rollout_length=32, epochs=5, minibatches=4,
+        ppo=PPOConfig(num_envs=256, rollout_length=16, epochs=5, minibatches=4,
                       actor_layers=(128, 128), critic_layers=(128, 128)),
-        steps=0, minutes=8.0, evaluate_every=50, evaluation_chunk=32, evaluation_episodes=128,
+        steps=0, minutes=6.5, evaluate_every=0, evaluation_chunk=50, evaluation_episodes=150,
         log_every=5),
     # One large GPU: enough environments to fill it, few large minibatches.
     "gpu": Preset(

@@ -34,7 +34,7 @@ class GraspReward:
     """R_force: each touching finger's force against its target."""
     torque: float = setting(0.2, unit="1", low=0.0, high=1000.0)
     """R_torque: each touching finger's root-joint torque against its target."""
-    alive: float = setting(1.0, unit="1", low=0.0, high=1000.0)
+    alive: float = setting(0.5, unit="1", low=0.0, high=1000.0)
     """Each tick that the object is held."""
     spread: float = setting(-0.5, unit="1/rad^2", low=-1000.0, high=0.0)
     """R_diff: variance of the four inner fingers' first joint angles."""
@@ -44,9 +44,6 @@ class GraspReward:
     """R_action: squared change of the action."""
     velocity: float = setting(-0.002, unit="s^2/rad^2", low=-1000.0, high=0.0)
     """R_vel: squared joint velocity."""
-    place: float = setting(-5.0, unit="1/m", low=-1000.0, high=0.0)
-    """Distance of the object from the grasp centre, beyond the first 2 cm: a grasp off the centre
-    is the one that slips."""
     drop: float = setting(-20.0, unit="1", low=-10000.0, high=0.0)
     """Once, when the object is lost."""
     sigma: float = setting(0.10, unit="1", low=0.001, high=10.0)
@@ -72,7 +69,7 @@ class GraspConfig(EnvConfig):
     """Time limit of a training episode."""
     evaluation_seconds: float = setting(8.0, unit="s", low=0.2, high=3600.0)
     """Length of an evaluation episode: an object must be held this long."""
-    finger_force: tuple[float, float] = setting((1.0, 7.0), unit="N", low=0.05, high=40.0)
+    finger_force: tuple[float, float] = setting((1.5, 6.5), unit="N", low=0.05, high=40.0)
     """Target force of a touching finger at command 0 and 1."""
     max_force: float = setting(10.0, unit="N", low=0.5, high=200.0)
     """Calibrated maximum that forces are normalised by."""
@@ -96,7 +93,7 @@ class GraspConfig(EnvConfig):
     """Added to all joints of the four fingers alike: how far closed they start."""
     release_gap: tuple[float, float] = setting((0.001, 0.009), unit="m", low=0.0, high=0.1)
     """Gap between palm and object at release."""
-    release_speed: tuple[float, float] = setting((0.0, 0.15), unit="m/s", low=0.0, high=3.0)
+    release_speed: tuple[float, float] = setting((0.0, 0.1), unit="m/s", low=0.0, high=3.0)
     """Speed of the object away from the palm at release."""
     reward: GraspReward = setting(GraspReward())
     """Reward weights."""
@@ -154,11 +151,6 @@ def joint_spread(first_joints: jax.Array) -> jax.Array:
 def posture_distance(joints: jax.Array, centre: jax.Array) -> jax.Array:
     """R_outer: Euclidean distance from the centre posture."""
     return jnp.sqrt(jnp.sum((joints - centre) ** 2) + 1e-12)
-
-
-def place_error(position: jax.Array, reference: jax.Array) -> jax.Array:
-    """Distance [] m of the object from where it belongs, beyond 2 cm."""
-    return jnp.maximum(jnp.linalg.norm(position - reference) - 0.02, 0.0)
 
 
 def action_rate(action: jax.Array, last_action: jax.Array) -> jax.Array:
@@ -252,8 +244,6 @@ class Grasp:
                 moment.joint_position[fingers], self._centre[fingers]),
             "action": weights.action * action_rate(moment.action, moment.last_action),
             "velocity": weights.velocity * joint_speed(moment.joint_velocity),
-            "place": held * weights.place * place_error(moment.object_position,
-                                                        jnp.asarray(self.reference)),
             "drop": weights.drop * dropped,
         }
         reward = sum(terms.values())
