@@ -189,9 +189,7 @@ def load_hand(path: str | Path | None = None) -> Hand:
 
     path = Path(path) if path is not None else asset_path("hand/xhand_right.toml")
     table = _read_toml(path)
-    for key in ("model", "taxels", "taxel_grid", "palm", "joints", "speed_limits", "fingers"):
-        if key not in table:
-            raise AssetError(f"{path}: no entry {key!r}")
+    _check_table(path, table)
     model_path = path.parent / table["model"]
     if not model_path.is_file():
         raise AssetError(f"{model_path}: no such file (model of {path})")
@@ -199,6 +197,7 @@ def load_hand(path: str | Path | None = None) -> Hand:
         model = mujoco.MjModel.from_xml_path(str(model_path))
     except ValueError as error:
         raise AssetError(f"{model_path}: {' '.join(str(error).split())}") from None
+    _check_finite(model, model_path)
 
     def find(kind: str, name: str) -> int:
         index = mujoco.mj_name2id(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), name)
@@ -227,13 +226,16 @@ def load_hand(path: str | Path | None = None) -> Hand:
     body_joint = np.full(len(bodies), -1)
     for index, joint in enumerate(joints):
         body = int(model.jnt_bodyid[joint])
-        if body not in row or body_joint[row[body]] >= 0:
+        if body not in row or body == palm or body_joint[row[body]] >= 0:
             raise AssetError(f"{model_path}: joint {table['joints'][index]!r} must be the only "
                              f"joint of a body below {table['palm']!r}")
         body_joint[row[body]] = index
     at = np.array([joints[j] if j >= 0 else -1 for j in body_joint])
     has = at >= 0
     tips = [find("site", finger["tip"]) for finger in table["fingers"]]
+    for finger, site in zip(table["fingers"], tips, strict=True):
+        if int(model.site_bodyid[site]) not in row:
+            raise AssetError(f"{path}: tip {finger['tip']!r} is on no body of {table['palm']!r}")
     root = [table["joints"].index(finger["root_joint"])
             if finger["root_joint"] in table["joints"] else -1 for finger in table["fingers"]]
     if -1 in root:
@@ -264,6 +266,42 @@ def load_hand(path: str | Path | None = None) -> Hand:
         taxel_position=taxels[..., 0:3], taxel_normal=taxels[..., 3:6], taxel_area=taxels[..., 6],
         geoms=_read_geoms(model, row),
     )
+
+
+def _check_table(path: Path, table: dict) -> None:
+    """Entries and their types; names are checked against the model by `load_hand`."""
+    kinds = {"model": str, "taxels": str, "taxel_grid": list, "palm": str, "joints": list,
+             "speed_limits": list, "fingers": list}
+    for key, kind in kinds.items():
+        if key not in table:
+            raise AssetError(f"{path}: no entry {key!r}")
+        if not isinstance(table[key], kind):
+            raise AssetError(f"{path}: {key} = {table[key]!r}: expected a "
+                             f"{'string' if kind is str else 'list'}")
+    grid, speeds = table["taxel_grid"], table["speed_limits"]
+    if len(grid) != 2 or any(type(n) is not int or n < 1 for n in grid):
+        raise AssetError(f"{path}: taxel_grid = {grid}: expected two whole numbers above 0")
+    if any(type(v) not in (int, float) or not 0 < v < np.inf for v in speeds):
+        raise AssetError(f"{path}: speed_limits = {speeds}: expected numbers above 0, rad/s")
+    if any(type(name) is not str for name in table["joints"]) or not table["fingers"]:
+        raise AssetError(f"{path}: joints must list names, and there must be a finger")
+    for number, finger in enumerate(table["fingers"], start=1):
+        for key in ("name", "tip", "root_joint"):
+            if not isinstance(finger, dict) or not isinstance(finger.get(key), str):
+                raise AssetError(f"{path}: finger {number} has no entry {key!r}")
+
+
+def _check_finite(model, path: Path) -> None:
+    """MuJoCo only warns of a NaN in the XML."""
+    fields = {"body": ("pos", "quat", "ipos", "mass", "inertia"), "geom": ("pos", "quat", "size"),
+              "jnt": ("pos", "axis", "range", "actfrcrange"), "site": ("pos", "quat")}
+    for kind, names in fields.items():
+        for name in names:
+            values = getattr(model, f"{kind}_{name}")
+            bad = np.flatnonzero(~np.all(np.isfinite(values.reshape(len(values), -1)), axis=1))
+            if bad.size:
+                element = getattr(model, kind)(int(bad[0])).name
+                raise AssetError(f"{path}: {kind} {element!r}: {name} is not a finite number")
 
 
 def _f32(values) -> np.ndarray:
@@ -305,7 +343,7 @@ def _read_toml(path: Path) -> dict:
             return tomllib.load(file)
     except FileNotFoundError:
         raise AssetError(f"{path}: no such file") from None
-    except tomllib.TOMLDecodeError as error:
+    except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise AssetError(f"{path}: {error}") from None
 
 
@@ -316,6 +354,8 @@ def _read_taxels(path: Path, fingers: tuple[str, ...], grid: list[int]) -> np.nd
             rows = list(csv.DictReader(file))
     except FileNotFoundError:
         raise AssetError(f"{path}: no such file") from None
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise AssetError(f"{path}: {error}") from None
     if not rows or tuple(rows[0]) != TAXEL_COLUMNS:
         raise AssetError(f"{path}: the first line must read {','.join(TAXEL_COLUMNS)}")
     columns, length = grid
@@ -327,12 +367,16 @@ def _read_taxels(path: Path, fingers: tuple[str, ...], grid: list[int]) -> np.nd
         try:
             column, at = int(entry["column"]), int(entry["row"])
             values = [float(entry[name]) for name in TAXEL_COLUMNS[3:]]
+            if None in entry:  # more values than columns
+                raise ValueError
         except (TypeError, ValueError):
             raise AssetError(f"{path}:{line}: not ten values with numbers from column 2 on"
                              ) from None
         if not (0 <= column < columns and 0 <= at < length) or not np.all(np.isfinite(values)):
             raise AssetError(f"{path}:{line}: column {column}, row {at} or a number in the line "
                              f"is outside the {columns} x {length} grid or not finite")
+        if abs(np.linalg.norm(values[3:6]) - 1) > 0.01 or values[6] <= 0:
+            raise AssetError(f"{path}:{line}: the normal must be of length 1 and the area above 0")
         table[fingers.index(entry["finger"]), column * length + at] = values
     count = np.sum(np.isfinite(table[..., 0]), axis=1)
     if np.any(count != columns * length):

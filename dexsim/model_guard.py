@@ -63,6 +63,8 @@ def _ignored(model: mujoco.MjModel) -> list[str]:
         found.append("SDF geoms")
     if model.opt.density or model.opt.viscosity or np.any(model.opt.wind):
         found.append("fluid forces (density, viscosity, wind)")
+    if model.opt.noslip_iterations:
+        found.append("noslip iterations")
     return found
 
 
@@ -92,8 +94,6 @@ def _lacking_warp(model: mujoco.MjModel) -> list[str]:
     found = []
     if model.opt.solver == mujoco.mjtSolver.mjSOL_PGS:
         found.append("solver PGS")
-    if model.opt.noslip_iterations:
-        found.append("noslip iterations")
     return found
 
 

@@ -70,8 +70,9 @@ class ObjectConfig:
         """Upper bound [K, 3] of every slot's size, for the compiled template."""
         radius = max(self.cylinder_radius[1], self.sphere_radius[1], self.neck_radius[1])
         half = max(self.cylinder_half[1], self.neck_half[1])
-        return np.array([[self.box_half[1]] * 3, [radius, half, 0.0],
-                         [self.cylinder_radius[1], self.cylinder_half[1], 0.0]])
+        body = max(self.composition_scale, 1.0)  # of the box or cylinder in a composition
+        return np.array([[body * self.box_half[1]] * 3, [radius, half, 0.0],
+                         [body * self.cylinder_radius[1], body * self.cylinder_half[1], 0.0]])
 
 
 def bounding_radius(size: jax.Array) -> jax.Array:
@@ -88,7 +89,7 @@ def extent(size: jax.Array, position: jax.Array, active: jax.Array,
     (a, b, c), (r, h, _), (cr, ch, _) = size
     reach = jnp.stack([along[0] * a + along[1] * b + along[2] * c, r + h * along[2],
                        cr * across + ch * along[2]])
-    return jnp.max(jnp.where(active, reach + position @ direction, -jnp.inf))
+    return jnp.max(jnp.where(active, reach + jnp.sum(position * direction, -1), -jnp.inf))
 
 
 @pytree_dataclass

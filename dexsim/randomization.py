@@ -10,6 +10,7 @@ import jax.numpy as jnp
 
 from dexsim.actuator import Actuator
 from dexsim.config import check_ranges, setting, validate
+from dexsim.errors import ConfigError
 from dexsim.hand import Hand
 from dexsim.pytree import pytree_dataclass
 
@@ -54,6 +55,12 @@ class Randomization:
         check_ranges(self, "stiffness_factor", "damping_factor", "dead_band", "torque_factor",
                      "speed_factor", "efficiency", "latency", "sensing_latency", "torque_gain",
                      "taxel_gain")
+        for name in ("stiffness_factor", "damping_factor", "torque_factor", "speed_factor",
+                     "efficiency", "torque_gain", "taxel_gain"):
+            low, high = getattr(self, name)
+            if min(1 + self.scale * (low - 1), 1 + self.scale * (high - 1)) < 0:
+                raise ConfigError(f"Randomization.{name} = ({low:g}, {high:g}) at scale "
+                                  f"{self.scale:g} reaches below 0: narrow one or the other")
 
 
 @pytree_dataclass

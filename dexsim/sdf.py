@@ -57,26 +57,26 @@ def ellipsoid(point: jax.Array, size: jax.Array) -> jax.Array:
 
     The nearest point is q = s^2 p / (t + s^2) with t the largest root of
     g(t) = sum (s p / (t + s^2))^2 - 1. g is convex and falling there, so Newton from the left
-    converges monotonically. The distance n.(p - q), with q and n held fixed, has the exact
-    gradient n (envelope theorem).
+    converges monotonically. The unknown is u = t + min(s)^2: deep inside t is all but -min(s)^2
+    and the sum would cancel. The distance n.(p - q), with n and the unit vector q / s held
+    fixed, has the exact gradient in point and size (envelope theorem).
     """
-    square = size**2
     p = jax.lax.stop_gradient(jnp.abs(point)) + 1e-9
-    s2 = jax.lax.stop_gradient(square)
-    s = jnp.sqrt(s2)
+    s = jax.lax.stop_gradient(size)
+    least = jnp.min(s)
+    gap = (s - least) * (s + least)
     # Each term alone must not exceed one at the root, so this start lies left of it.
-    t = jnp.max(s * p - s2, axis=-1)
+    u = jnp.max(s * p - gap, axis=-1)
     for _ in range(12):
-        shift = jnp.maximum(t[..., None] + s2, 1e-12)
+        shift = u[..., None] + gap
         term = s * p / shift
         value = jnp.sum(term**2, -1) - 1.0
-        slope = -2.0 * jnp.sum(term**2 / shift, -1)
-        t = t - value / jnp.minimum(slope, -1e-12)
-    nearest = s2 * p / jnp.maximum(t[..., None] + s2, 1e-12)
-    normal = nearest / s2
+        u = u + 0.5 * value / jnp.sum(term**2 / shift, -1)
+    unit = s * p / (u[..., None] + gap)
+    normal = unit / s
     normal = normal / _norm(normal)[..., None]
     sign = jnp.where(jax.lax.stop_gradient(point) < 0, -1.0, 1.0)
-    return jnp.sum(normal * sign * (point - sign * nearest), -1)
+    return jnp.sum(normal * (sign * point - size * unit), -1)
 
 
 _DISTANCE: dict[str, Callable[[jax.Array, jax.Array], jax.Array]] = {

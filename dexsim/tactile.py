@@ -8,13 +8,14 @@ measured taxels.
 Shapes: F fingers, N taxels a finger. Units: m, N, Pa.
 """
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 
 from dexsim import rotations, sdf
 from dexsim.config import setting, validate
 from dexsim.pytree import pytree_dataclass
-import dataclasses
 
 WEIGHTINGS = ("force", "depth", "none")
 

@@ -12,7 +12,8 @@ KINDS = ("box", "capsule", "cylinder")  # the order of `dexsim.objects.SLOTS`
 
 
 def compile_scene(hand, target, *, gravity=(9.81, 0.0, 0.0), timestep=0.005, iterations=5,
-                  line_search=8, condim=3, margin=0.0) -> mujoco.MjModel:
+                  line_search=8, condim=3, margin=0.0,
+                  exact=False) -> mujoco.MjModel:
     """One object (`ObjectParams` of NumPy leaves) under the hand; `margin` m for clearances."""
     spec = mujoco.MjSpec.from_file(str(hand.model_path))
     for actuator in list(spec.actuators):
@@ -36,8 +37,9 @@ def compile_scene(hand, target, *, gravity=(9.81, 0.0, 0.0), timestep=0.005, ite
     option.iterations, option.ls_iterations = iterations, line_search
     option.integrator, option.solver = mujoco.mjtIntegrator.mjINT_EULER, mujoco.mjtSolver.mjSOL_NEWTON
     option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
-    option.disableflags |= (mujoco.mjtDisableBit.mjDSBL_EULERDAMP
-                            | mujoco.mjtDisableBit.mjDSBL_NATIVECCD)
+    option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
+    if not exact:
+        option.disableflags |= mujoco.mjtDisableBit.mjDSBL_NATIVECCD
     model = spec.compile()
     # Contact softness is the skin's: that of a 0.1 kg object with 5e-5 kg m^2, whatever is held.
     model.body_invweight0[model.body("object").id] = 1 / 0.1, 1 / 5e-5

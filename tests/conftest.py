@@ -64,10 +64,11 @@ def hand() -> Any:
 
 @pytest.fixture(scope="session")
 def grasp_env() -> Any:
-    """The grasp task with its default configuration on the `jax` backend."""
+    """The grasp task on the `jax` backend: the defaults, but for a small pool (16 of each shape)."""
     import dexsim
+    from dexsim.tasks.grasp import GraspConfig
 
-    return dexsim.make("grasp", backend="jax", num_envs=NUM_ENVS)
+    return dexsim.make("grasp", GraspConfig(pool_size=80), backend="jax", num_envs=NUM_ENVS)
 
 
 @pytest.fixture(scope="session")

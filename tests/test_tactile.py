@@ -326,34 +326,42 @@ SHAPES = {"sphere": (0.030, 0, 0), "box": (0.027, 0.03, 0.024), "capsule": (0.02
           "cylinder": (0.029, 0.026, 0), "ellipsoid": (0.034, 0.026, 0.03)}
 
 
-@pytest.mark.parametrize("kind", sdf.KINDS)
-def test_gradient_of_touch_with_respect_to_the_objects_pose(hand, taxels, kind):
-    """Skin force and contact centre against central differences in double precision, for the shipped hand."""
+@pytest.fixture(scope="module")
+def pose_response(hand, taxels):
+    """Skin force and contact centre at poses about a grasp, and their Jacobian at the first, in double precision."""
     taxels = np.asarray(taxels, np.float64)
+    weight = np.random.default_rng(5).normal(size=(5, 3))
+    size = np.array([SHAPES[kind] for kind in sdf.KINDS])
+
+    def felt(pose, active):
+        """Pose: a shift and a small turn about each axis."""
+        count = len(sdf.KINDS)
+        shape = sdf.Shape(sdf.KINDS, jnp.asarray(np.where(size > 0, size, 1e-4)), jnp.zeros((count, 3)),
+                          jnp.tile(jnp.eye(3), (count, 1, 1)), active)
+        turn = axis_angle_to_matrix(jnp.array([0.48, 0.6, 0.64]), jnp.asarray(0.7))
+        for axis, angle in zip(jnp.eye(3), pose[3:], strict=True):
+            turn = compose(axis_angle_to_matrix(axis, angle), turn)
+        touch = tactile.feel(taxels, np.asarray(hand.taxel_area, np.float64), shape,
+                             jnp.array([0.075, -0.005, 0.13]) + pose[:3], turn,
+                             jnp.array([4.0, 1.0, 2.5, 0.5, 3.0]), Skin())
+        _, centre = tactile.reduce_touch(touch.force, taxels)
+        return jnp.stack([jnp.sum(touch.skin_force), jnp.sum(centre * weight)])
+
+    return jax.jit(lambda poses, active: (jax.vmap(felt, (0, None))(poses, active), jax.jacrev(felt)(poses[0], active)))
+
+
+@pytest.mark.parametrize("kind", sdf.KINDS)
+def test_gradient_of_touch_with_respect_to_the_objects_pose(pose_response, kind):
+    """Against central differences, with the shipped hand's taxels round an askew object."""
+    step = 1e-7
     with jax.enable_x64(True):
-        shape = sdf.Shape((kind,), jnp.asarray([SHAPES[kind]], jnp.float64), jnp.zeros((1, 3), jnp.float64),
-                          jnp.eye(3, dtype=jnp.float64)[None], jnp.array([True]))
-        tilt = axis_angle_to_matrix(jnp.array([0.48, 0.6, 0.64], jnp.float64), jnp.asarray(0.7, jnp.float64))
-        weight = jnp.asarray(np.random.default_rng(5).normal(size=(5, 3)))
-
-        def felt(pose):
-            """Pose: a shift and a small turn about each axis."""
-            turn = tilt
-            for axis, angle in zip(jnp.eye(3, dtype=jnp.float64), pose[3:], strict=True):
-                turn = compose(axis_angle_to_matrix(axis, angle), turn)
-            position = jnp.array([0.075, -0.005, 0.13], jnp.float64) + pose[:3]
-            touch = tactile.feel(taxels, jnp.asarray(hand.taxel_area, jnp.float64), shape, position, turn,
-                         jnp.array([4.0, 1.0, 2.5, 0.5, 3.0], jnp.float64), Skin())
-            _, centre = tactile.reduce_touch(touch.force, taxels)
-            return jnp.stack([jnp.sum(touch.skin_force), jnp.sum(centre * weight)])
-
-        step = 1e-7
-        poses = jnp.asarray(np.concatenate([np.zeros((1, 6)), step * np.eye(6), -step * np.eye(6)]))
-        value, exact = jax.jit(lambda poses: (jax.vmap(felt)(poses), jax.jacrev(felt)(poses[0])))(poses)
-        value, numeric = value[0], np.asarray((value[1:7] - value[7:]) / (2 * step)).T
-    assert float(value[0]) > 0.1
+        poses = np.concatenate([np.zeros((1, 6)), step * np.eye(6), -step * np.eye(6)])
+        value, exact = pose_response(poses, np.array([kind == other for other in sdf.KINDS]))
+        value, exact = np.asarray(value), np.asarray(exact)
+    assert value.dtype == np.float64 and value[0, 0] > 0.1
+    numeric = ((value[1:7] - value[7:]) / (2 * step)).T
     scale = np.abs(numeric).max(axis=1, keepdims=True)
-    np.testing.assert_allclose(np.asarray(exact) / scale, numeric / scale, atol=2e-4)
+    np.testing.assert_allclose(exact / scale, numeric / scale, atol=2e-4)
     assert np.all(np.abs(numeric[0, :3]) > 1e-3 * scale[0])
 
 
