@@ -30,6 +30,11 @@ GEOM_TYPES = {"sphere": mujoco.mjtGeom.mjGEOM_SPHERE, "box": mujoco.mjtGeom.mjGE
               "ellipsoid": mujoco.mjtGeom.mjGEOM_ELLIPSOID}
 
 
+# Warp's flags for full buffers: constraint rows, their non-zeros, broad phase, narrow phase,
+# convex collision, contact sensors. Its other flags tell of iteration limits, which are meant.
+_OVERFLOW = 1 | 2 | 4 | 8 | 16 | 64
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PhysicsConfig:
     """Time step, solver and contact model."""
@@ -199,7 +204,10 @@ class Physics:
 
     def _finger_force(self, data: Any) -> jax.Array:
         if self.backend == "warp":
-            return -data.sensordata.reshape(self.hand.num_fingers, 3)
+            force = -data.sensordata.reshape(self.hand.num_fingers, 3)
+            # What does not fit Warp's buffers it leaves out, down to all contacts of a world. NaN
+            # ends such an episode and is counted as non-finite.
+            return jnp.where(data._impl.overflow & _OVERFLOW, jnp.nan, force)
         return self._force_from_contacts(data)
 
     def _force_from_contacts(self, data: Any) -> jax.Array:
@@ -229,7 +237,7 @@ class Physics:
 
 def _quiet(model: Any, backend: str) -> Any:
     """Warp prints from the device whenever a solver stops at its iteration limit, as it is meant
-    to here; buffers are sized for the worst case instead of watched through the prints."""
+    to here; full buffers show in `_finger_force` instead."""
     if backend != "warp":
         return model
     option = model.opt

@@ -30,6 +30,10 @@ hypothesis.settings.load_profile("dexsim")
 
 # The size of the batch that the tests share. Another batch is another compilation: use this one.
 NUM_ENVS = 8
+# The physics alone is solved to the end, so that what differs between engines is arithmetic and
+# contact geometry.
+CONVERGED = {"iterations": 50, "line_search": 50}
+GRAVITY = (9.81, 0.0, 0.0)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -81,3 +85,19 @@ def grasp_rollout(grasp_env: Any) -> Rollout:
         restart=jax.jit(jax.vmap(grasp_env.restart)),
         num_envs=NUM_ENVS,
     )
+
+
+@pytest.fixture(scope="session")
+def physics_advance(hand: Any) -> Callable[..., Any]:
+    """One sub-step of 8 worlds on the `jax` backend, under given joint torques and pushes.
+
+    `physics_advance(target, state, torque [8, J], push [8, 3])` returns the state and the fingers'
+    forces [8, F, 3]; the solver converges.
+    """
+    from dexsim.objects import SLOTS, ObjectConfig
+    from dexsim.physics import Physics, PhysicsConfig
+
+    seam = Physics(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(substeps=1, **CONVERGED),
+                   gravity=GRAVITY, backend="jax", num_envs=NUM_ENVS)
+    return jax.jit(jax.vmap(lambda target, state, torque, push: seam.advance(
+        target, state, lambda index, position, velocity: torque, push)))

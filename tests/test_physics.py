@@ -19,23 +19,7 @@ from dexsim.model_guard import check_model
 from dexsim.objects import SHAPES, SLOTS, ObjectConfig
 from dexsim.physics import Physics, PhysicsConfig, PhysicsState, build_model, choose_backend
 
-WORLDS = 8
-# Solved to the end in both engines, so that what is left is arithmetic and contact geometry.
-CONVERGED = {"iterations": 50, "line_search": 50}
-GRAVITY = (9.81, 0.0, 0.0)
-
-
-@pytest.fixture(scope="module")
-def seam(hand):
-    return Physics(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(substeps=1, **CONVERGED),
-                   gravity=GRAVITY, backend="jax", num_envs=WORLDS)
-
-
-@pytest.fixture(scope="module")
-def advance(seam):
-    """One sub-step of 8 worlds under given joint torques [8, J] and pushes [8, 3]."""
-    return jax.jit(jax.vmap(lambda target, state, torque, push: seam.advance(
-        target, state, lambda index, position, velocity: torque, push)))
+from conftest import CONVERGED, GRAVITY, NUM_ENVS as WORLDS
 
 
 def row(pool, index):
@@ -80,14 +64,14 @@ class Steps(NamedTuple):
 
 
 @pytest.fixture(scope="module")
-def contact_steps(hand, grasp_env, advance):
+def contact_steps(hand, grasp_env, physics_advance):
     """By shape: a sub-step from 8 squeezed states, most of them in contact."""
     rng, found = np.random.default_rng(0), {}
     for shape in SHAPES:
         starts = [row(grasp_env.pool, i) for i in rows_of(grasp_env.pool, shape)[:WORLDS]]
         begun = [squeeze(hand, start, rng) for start in starts]
         qpos, qvel, warmstart, torque = (jnp.stack(x) for x in list(zip(*begun, strict=True))[1:])
-        after, force = advance(stack([s.target for s in starts]),
+        after, force = physics_advance(stack([s.target for s in starts]),
                                PhysicsState(qpos, qvel, warmstart), torque, jnp.zeros((WORLDS, 3)))
         c_rows = []
         for start, (model, *state, applied) in zip(starts, begun, strict=True):
@@ -127,7 +111,7 @@ class TestAgainstC:
         assert np.sum(strength > 0.5) >= 5
         assert np.all(wrong < 0.02 + strength / 3), (wrong, strength)
 
-    def test_every_shape_on_the_palm(self, hand, grasp_env, advance):
+    def test_every_shape_on_the_palm(self, hand, grasp_env, physics_advance):
         """Pressed against the palm's plane, whose contacts have one answer for every primitive."""
         starts = [row(grasp_env.pool, rows_of(grasp_env.pool, shape)[i])
                   for shape in SHAPES for i in (0, 1)]
@@ -150,7 +134,7 @@ class TestAgainstC:
             references.append((data.qpos.copy(), data.qvel.copy()))
         for part in (slice(0, WORLDS), slice(len(starts) - WORLDS, None)):
             qpos, qvel, warmstart, push = (jnp.stack(x) for x in zip(*begun[part], strict=True))
-            after, force = advance(stack([s.target for s in starts[part]]),
+            after, force = physics_advance(stack([s.target for s in starts[part]]),
                                    PhysicsState(qpos, qvel, warmstart), jnp.zeros((WORLDS, 12)), push)
             c_position, c_velocity = (np.stack(x) for x in zip(*references[part], strict=True))
             # Spin is the worst: contacts of 2 N at 3 cm turn a body of 1e-5 kg m^2.
@@ -159,7 +143,7 @@ class TestAgainstC:
             np.testing.assert_allclose(after.qpos, c_position, atol=3e-5)
             assert not np.any(force)
 
-    def test_free_motion(self, hand, grasp_env, advance):
+    def test_free_motion(self, hand, grasp_env, physics_advance):
         """1.5 s without contact: fingers under changing torques, the object on its way.
 
         300 sub-steps of float32 (6e-8 a step, against numbers below 10) add up to some 1e-5.
@@ -180,7 +164,7 @@ class TestAgainstC:
         for step in range(300):
             swing = 0.2 * np.sin(0.03 * step + np.arange(12) + np.arange(WORLDS)[:, None])
             torque = np.float32(0.3 * (middle + swing - np.asarray(state.qpos[:, :12])))
-            state, force = advance(target, state, jnp.asarray(torque), jnp.zeros((WORLDS, 3)))
+            state, force = physics_advance(target, state, jnp.asarray(torque), jnp.zeros((WORLDS, 3)))
             for model, data, tau in zip(models, datas, torque, strict=True):
                 data.qfrc_applied[:12] = tau
                 mujoco.mj_step(model, data)
@@ -191,7 +175,7 @@ class TestAgainstC:
         np.testing.assert_allclose(state.qpos[:, 15:], [d.qpos[15:] for d in datas], atol=1e-4)
         assert not np.any(force), "nothing touches, yet a finger feels a force"
 
-    def test_a_push_is_momentum(self, grasp_env, advance):
+    def test_a_push_is_momentum(self, grasp_env, physics_advance):
         """F dt = m dv at the centre of mass, whatever turns about it."""
         starts = [row(grasp_env.pool, i) for i in range(0, 80, 10)]
         qpos = np.stack([s.qpos for s in starts])
@@ -200,7 +184,7 @@ class TestAgainstC:
         target = stack([s.target for s in starts])
         target = dataclasses.replace(target, com=jnp.zeros((WORLDS, 3)))
         push = np.float32(np.random.default_rng(2).normal(size=(WORLDS, 3)))
-        after, _ = advance(target, state, jnp.zeros((WORLDS, 12)), jnp.asarray(push))
+        after, _ = physics_advance(target, state, jnp.zeros((WORLDS, 12)), jnp.asarray(push))
         wanted = 0.005 * (push / np.asarray(target.mass)[:, None] + np.array(GRAVITY))
         np.testing.assert_allclose(after.qvel[:, 12:15], wanted, rtol=1e-5, atol=1e-6)
 
