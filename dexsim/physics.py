@@ -207,7 +207,7 @@ class Physics:
             force = -data.sensordata.reshape(self.hand.num_fingers, 3)
             # What does not fit Warp's buffers it leaves out, down to all contacts of a world. NaN
             # ends such an episode and is counted as non-finite.
-            return jnp.where(data._impl.overflow & _OVERFLOW, jnp.nan, force)
+            return jnp.where((data._impl.overflow & _OVERFLOW) != 0, jnp.nan, force)
         return self._force_from_contacts(data)
 
     def _force_from_contacts(self, data: Any) -> jax.Array:

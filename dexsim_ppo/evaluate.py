@@ -24,6 +24,7 @@ from dexsim.assets import asset_path
 from dexsim.config import from_dict
 from dexsim.errors import AssetError, CheckpointError, ConfigError
 from dexsim_ppo import cli
+from dexsim_ppo.compilation import jit
 from dexsim_ppo.policy import Policy, PolicyParams, act, layout_to_list
 from dexsim_ppo.types import Environment
 
@@ -41,7 +42,7 @@ class Evaluator:
 
     def __init__(self, env: Environment, chunk: int):
         self.env, self.chunk = env, chunk
-        self._run = jax.jit(self._episodes)
+        self._run = jit(self._episodes)
 
     def __call__(self, params: PolicyParams, *, episodes: int,
                  seed: int) -> tuple[dict[str, Any], Any]:

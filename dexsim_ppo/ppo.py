@@ -19,6 +19,7 @@ from dexsim.errors import ConfigError
 from dexsim.pytree import pytree_dataclass
 from dexsim_ppo import adam, distribution
 from dexsim_ppo.adam import AdamState
+from dexsim_ppo.compilation import jit
 from dexsim_ppo.gae import compute_gae
 from dexsim_ppo.networks import Params, apply_mlp, init_params, rescale_output
 from dexsim_ppo.rollout import Decision, Rollout, collect
@@ -163,7 +164,7 @@ def make_train(env: Environment, config: PPOConfig) -> Training:
     # Copies part leaves that share a buffer (actor and critic may see the same array): no buffer can be
     # donated twice.
     return Training(init=lambda key: jax.tree.map(jnp.copy, compiled_init(key)),
-                    step=jax.jit(step, donate_argnums=0))
+                    step=jit(step, donate_argnums=0))
 
 
 def init_state(env: Environment, config: PPOConfig, key: jax.Array) -> TrainState:

@@ -5,16 +5,28 @@ inertia (C MuJoCo ignores geom offsets that are set on a compiled model whose ge
 body's origin), only its active primitives exist, and forces are summed from `mj_contactForce`.
 """
 
+import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from dexsim.objects import SHAPES
+
+GRAVITY = (9.81, 0.0, 0.0)
+# Solved to the end, so that what differs between engines is arithmetic and contact geometry.
+CONVERGED = {"iterations": 50, "line_search": 50}
 KINDS = ("box", "capsule", "cylinder")  # the order of `dexsim.objects.SLOTS`
 
 
-def compile_scene(hand, target, *, gravity=(9.81, 0.0, 0.0), timestep=0.005, iterations=5,
+def compile_scene(hand, target, *, gravity=GRAVITY, timestep=0.005, iterations=5,
                   line_search=8, condim=3, margin=0.0,
                   exact=False) -> mujoco.MjModel:
-    """One object (`ObjectParams` of NumPy leaves) under the hand; `margin` m for clearances."""
+    """One object (`ObjectParams` of NumPy leaves) under the hand.
+
+    `margin` m lists contacts that far apart, for clearances. `exact` takes C MuJoCo's native convex
+    collisions, whose one contact of a capsule on a cylinder is right; the older ones, which box on
+    box needs, give up to five at once, some of them millimetres too deep.
+    """
     spec = mujoco.MjSpec.from_file(str(hand.model_path))
     for actuator in list(spec.actuators):
         spec.delete(actuator)
@@ -72,3 +84,41 @@ def finger_force(model: mujoco.MjModel, data: mujoco.MjData, hand) -> np.ndarray
             elif first == tip:
                 total[finger] -= force
     return total
+
+
+# --- worlds to compare in ---------------------------------------------------------------------
+
+def row(tree, index):
+    """One row of a batch, as NumPy."""
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[index], tree)
+
+
+def rows_of(pool, shape: str) -> np.ndarray:
+    """Rows of a pool of start states with this shape."""
+    return np.flatnonzero(np.asarray(pool.target.shape_index) == SHAPES.index(shape))
+
+
+def stack(trees):
+    """A batch of such rows."""
+    return jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *trees)
+
+
+def squeeze(hand, begun, rng: np.random.Generator, steps=100):
+    """Close the hand round a weightless object of the pool, for 0.5 s.
+
+    Returns (model, qpos, qvel, warm start, joint torque), the numbers in single precision.
+    """
+    model = compile_scene(hand, begun.target, **CONVERGED)
+    data = start(model, begun.qpos, 0 * begun.qvel)
+    wanted = begun.qpos[:12] + rng.uniform(0.3, 0.8, 12) * (np.arange(12) > 3)
+    wanted[1:3] += rng.uniform(0.0, 0.5, 2)
+    model.opt.gravity[:] = 0
+    for _ in range(steps):
+        position, velocity = data.qpos[:12], data.qvel[:12]
+        reach = np.clip(wanted - position, -0.3, 0.3)
+        torque = np.clip(3 * reach - 0.1 * velocity, -hand.torque_limit, hand.torque_limit)
+        data.qfrc_applied[:12] = torque
+        mujoco.mj_step(model, data)
+    model.opt.gravity[:] = GRAVITY
+    single = [np.float32(x) for x in (data.qpos, data.qvel, data.qacc_warmstart)]
+    return model, *single, np.float32(torque * rng.uniform(0.5, 1.2, 12))

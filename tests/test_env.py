@@ -26,11 +26,6 @@ def row(tree, index):
     return jax.tree.map(lambda leaf: leaf[index], tree)
 
 
-def numpy_row(tree, index):
-    """One world, as NumPy (keys are left out of it: they are no arrays to NumPy)."""
-    return jax.tree.map(lambda leaf: np.asarray(leaf)[index], tree)
-
-
 def leaves(tree):
     """All leaves by path, keys as their data."""
     return {jax.tree_util.keystr(path): np.asarray(
@@ -130,10 +125,8 @@ class TestTick:
         contact that opens a sub-step later moves a force by some tenths of a newton.
         """
         pool, config = grasp_env.pool, grasp_env.config
-        index = np.asarray(pool.target.shape_index)
-        rows = np.concatenate([np.flatnonzero(index == SHAPES.index(shape))[:4]
-                               for shape in ("sphere", "capsule")])
-        starts = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], pool)
+        rows = np.concatenate([c_scene.rows_of(pool, shape)[:4] for shape in ("sphere", "capsule")])
+        starts = c_scene.row(pool, rows)
         state = placed(grasp_rollout, 11, starts.qpos, starts.qvel, starts.target)
         for tick in range(8):
             state = grasp_rollout.step(state, jnp.ones((WORLDS, 12)) * (np.arange(12) > 3))
@@ -144,7 +137,7 @@ class TestTick:
 
         strong = 0
         for world in range(WORLDS):
-            target = numpy_row(state.target, world)
+            target = c_scene.row(state.target, world)
             model = c_scene.compile_scene(hand, target, iterations=config.physics.iterations,
                                           line_search=config.physics.line_search)
             data = c_scene.start(model, *(np.asarray(x[world]) for x in (
@@ -154,7 +147,7 @@ class TestTick:
             new = old + config.control.step * np.clip(np.asarray(action[world]), -1, 1)
             new = np.clip(new, q - config.control.reach, q + config.control.reach)
             new = np.clip(new, hand.joint_lower, hand.joint_upper)
-            drive, latency = numpy_row(state.draw.actuator, world), int(state.draw.latency[world])
+            drive, latency = c_scene.row(state.draw.actuator, world), int(state.draw.latency[world])
             tilt = np.asarray(state.draw.tilt[world])
             down = np.array([1.0, -np.tan(tilt[1]), np.tan(tilt[0])])
             force = target.mass * 9.81 * (down / np.linalg.norm(down) - [1.0, 0, 0])
@@ -175,7 +168,7 @@ class TestTick:
         """The torque that the motors would give at the end of the tick, over the stall torque."""
         _, _, after = history[5]
         for world in range(WORLDS):
-            torque = plain_drive(numpy_row(after.draw.actuator, world),
+            torque = plain_drive(c_scene.row(after.draw.actuator, world),
                                  np.asarray(after.joint_target[world]),
                                  np.asarray(after.physics.qpos[world, :12]),
                                  np.asarray(after.physics.qvel[world, :12]))
@@ -450,11 +443,10 @@ def grips(hand, grasp_env, grasp_rollout):
     environment goes on for 8 ticks, so that the forces are the library's own.
     """
     rng, found = np.random.default_rng(0), {}
-    index = np.asarray(grasp_env.pool.target.shape_index)
     for shape in SHAPES:
         held = []
-        for pool_row in np.flatnonzero(index == SHAPES.index(shape)):
-            start = numpy_row(grasp_env.pool, pool_row)
+        for pool_row in c_scene.rows_of(grasp_env.pool, shape):
+            start = c_scene.row(grasp_env.pool, pool_row)
             model = c_scene.compile_scene(hand, start.target)
             data = c_scene.start(model, start.qpos, 0 * start.qvel)
             close = rng.uniform(0.5, 1.0, 12) * (np.arange(12) > 3)
@@ -479,7 +471,7 @@ def grips(hand, grasp_env, grasp_rollout):
             part = held[begin:begin + WORLDS]
             rows, *values = zip(*(part * WORLDS)[:WORLDS], strict=True)
             qpos, qvel, wanted = (np.stack(value) for value in values)
-            target = jax.tree.map(lambda leaf: np.asarray(leaf)[list(rows)], grasp_env.pool.target)
+            target = c_scene.row(grasp_env.pool.target, list(rows))
             state = placed(grasp_rollout, begin, qpos, qvel, target, wanted)
             for _ in range(8):
                 state = grasp_rollout.step(state, jnp.zeros((WORLDS, 12)))
@@ -566,7 +558,7 @@ class TestTouch:
         assert np.all(np.linalg.norm(state.physics.qvel[:, 12:15], axis=1) < 0.01), "still moving"
         names = set()
         for world in range(WORLDS):
-            model = c_scene.compile_scene(hand, numpy_row(target, world))
+            model = c_scene.compile_scene(hand, c_scene.row(target, world))
             data = c_scene.start(model, state.physics.qpos[world], state.physics.qvel[world])
             mujoco.mj_forward(model, data)
             names |= {model.geom(c.geom[0]).name for c in data.contact}
@@ -602,7 +594,7 @@ class TestTouch:
                 joints = jnp.asarray(np.asarray(after.physics.qpos[world, :12], np.float64))
                 taxels = taxel_positions(hand, forward_kinematics(hand, joints))
                 target = jax.tree.map(lambda x: jnp.asarray(x, jnp.float64) if x.dtype == np.float32
-                                      else jnp.asarray(x), numpy_row(after.target, world))
+                                      else jnp.asarray(x), c_scene.row(after.target, world))
                 shape = target.shape()
                 place = np.asarray(after.physics.qpos[world, 12:], np.float64)
                 place[3:] /= np.linalg.norm(place[3:])

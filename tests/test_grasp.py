@@ -20,13 +20,13 @@ from dexsim.objects import SHAPES, ObjectConfig
 from dexsim.physics import PhysicsConfig
 from dexsim.tasks import TASKS
 from dexsim.tasks.grasp import (COMMANDS, Goal, Grasp, GraspConfig, GraspReward, action_rate,
-                                command_reward, joint_speed, joint_spread, place_error,
-                                posture_distance, tailed_gaussian, target_force)
+                                command_reward, joint_speed, joint_spread, posture_distance,
+                                tailed_gaussian, target_force)
 
 
 # Pinned: the shipped defaults are tuned, the rules below are not.
 WEIGHTS = GraspReward(force=2.0, torque=0.2, alive=0.5, spread=-0.5, outer=-0.05, action=-0.02,
-                      velocity=-0.002, place=-5.0, drop=-20.0, sigma=0.1, tail_sigma=0.4, tail=0.4,
+                      velocity=-0.002, drop=-20.0, sigma=0.1, tail_sigma=0.4, tail=0.4,
                       thumb="loose")
 CONFIG = GraspConfig(finger_force=(1.0, 7.0), max_force=10.0, force_per_torque=19.0,
                      push_probability=0.02, push_speed=0.3, drop_distance=0.12, reward=WEIGHTS)
@@ -109,9 +109,6 @@ class TestTerms:
             pytest.approx(5.0)
         assert float(action_rate(jnp.array([1.0, -1.0]), jnp.array([0.0, 1.0]))) == 5.0
         assert float(joint_speed(jnp.array([3.0, -4.0]))) == 25.0
-        corner = jnp.array([0.0, 0.03, 0.04])
-        assert float(place_error(corner, jnp.zeros(3))) == pytest.approx(0.03)
-        assert float(place_error(0.3 * corner, jnp.zeros(3))) == 0.0
         assert jnp.isfinite(jax.grad(posture_distance)(jnp.ones(3), jnp.ones(3))).all()
 
     def test_target_force(self):
@@ -133,7 +130,7 @@ class TestReward:
         felt[1, :4] = 1.25
         moment = make_moment(
             hand, finger_force=force, joint_torque=torque, joint_position=position,
-            object_position=np.array(Grasp.reference) + [0.03, 0.0, 0.04], joint_velocity=velocity, action=action, last_action=before,
+            joint_velocity=velocity, action=action, last_action=before,
             touch=tactile.Touch(jnp.asarray(felt), jnp.asarray(0.5 * felt), jnp.asarray(felt)))
         reward, metrics = task.reward(goal_of(0.5), moment, jnp.zeros((), bool))
 
@@ -147,7 +144,7 @@ class TestReward:
             "torque": 0.2 * (gauss(0.1 - goal, 0.4) + torque_track) / 5,
             "alive": 0.5, "spread": -0.5 * np.var([0.1, -0.1, 0.3, 0.1]),
             "outer": -0.05 * math.sqrt(0.01 + 0.01 + 0.09 + 0.01), "action": -0.02 * 1.0,
-            "velocity": -0.002 * 4.0, "place": -5.0 * (0.05 - 0.02), "drop": 0.0}
+            "velocity": -0.002 * 4.0, "drop": 0.0}
         for name, value in wanted.items():
             assert float(metrics[f"reward/{name}"]) == pytest.approx(value, rel=1e-4, abs=1e-6), name
         assert {n for n in metrics if n.startswith("reward/")} == {f"reward/{n}" for n in wanted}
@@ -166,8 +163,8 @@ class TestReward:
         _, held = task.reward(goal_of(0.2), moment, jnp.zeros((), bool))
         reward, lost = task.reward(goal_of(0.2), moment, jnp.ones((), bool))
         assert float(held["reward/force"]) > 0 and float(held["reward/drop"]) == 0
-        assert [float(lost[f"reward/{n}"]) for n in ("force", "torque", "alive", "place", "drop")] == \
-            [0.0, 0.0, 0.0, 0.0, -20.0]
+        assert [float(lost[f"reward/{n}"]) for n in ("force", "torque", "alive", "drop")] == \
+            [0.0, 0.0, 0.0, -20.0]
         assert float(lost["success"]) == 0.0
         penalties = sum(float(lost[f"reward/{n}"]) for n in ("spread", "outer", "action", "velocity"))
         assert float(reward) == pytest.approx(-20.0 + penalties)

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from c_scene import CONVERGED, GRAVITY, row, rows_of, squeeze, stack
 
 from dexsim import physics as physics_module
 from dexsim.errors import AssetError, ConfigError
@@ -19,37 +20,8 @@ from dexsim.model_guard import check_model
 from dexsim.objects import SHAPES, SLOTS, ObjectConfig
 from dexsim.physics import Physics, PhysicsConfig, PhysicsState, build_model, choose_backend
 
-from conftest import CONVERGED, GRAVITY, NUM_ENVS as WORLDS
+WORLDS = 8
 
-
-def row(pool, index):
-    return jax.tree.map(lambda leaf: np.asarray(leaf)[index], pool)
-
-
-def rows_of(pool, shape):
-    return np.flatnonzero(np.asarray(pool.target.shape_index) == SHAPES.index(shape))
-
-
-def stack(trees):
-    return jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *trees)
-
-
-def squeeze(hand, start, rng, steps=100):
-    """C MuJoCo closes the hand round the object: (model, qpos, qvel, warm start, joint torque)."""
-    model = c_scene.compile_scene(hand, start.target, **CONVERGED)
-    data = c_scene.start(model, start.qpos, 0 * start.qvel)
-    wanted = start.qpos[:12] + rng.uniform(0.3, 0.8, 12) * (np.arange(12) > 3)
-    wanted[1:3] += rng.uniform(0.0, 0.5, 2)
-    model.opt.gravity[:] = 0
-    for _ in range(steps):
-        position, velocity = data.qpos[:12], data.qvel[:12]
-        reach = np.clip(wanted - position, -0.3, 0.3)
-        torque = np.clip(3 * reach - 0.1 * velocity, -hand.torque_limit, hand.torque_limit)
-        data.qfrc_applied[:12] = torque
-        mujoco.mj_step(model, data)
-    model.opt.gravity[:] = GRAVITY
-    single = [np.float32(x) for x in (data.qpos, data.qvel, data.qacc_warmstart)]
-    return model, *single, np.float32(torque * rng.uniform(0.5, 1.2, 12))
 
 
 class Steps(NamedTuple):

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from test_physics import CONVERGED, GRAVITY, row, rows_of, squeeze, stack
+from c_scene import CONVERGED, GRAVITY, row, rows_of, squeeze, stack
 
 from dexsim.objects import SHAPES, SLOTS, ObjectConfig
 from dexsim.physics import Physics, PhysicsConfig, PhysicsState
@@ -20,7 +20,7 @@ pytestmark = [pytest.mark.slow]
 WORLDS = 4
 
 
-def compile_advance(hand, config, rows=None):
+def compile_advance(hand, config):
     seam = Physics(hand, SLOTS, ObjectConfig().largest, config, gravity=GRAVITY, backend="warp",
                    num_envs=WORLDS)
     return jax.jit(jax.vmap(lambda target, state, torque: seam.advance(
@@ -75,8 +75,8 @@ def test_a_sub_step_equals_jax(worlds, results, physics_advance, shape):
     (target, state, torque), *_ = worlds[shape]
     double = jax.tree.map(lambda x: jnp.concatenate([x, x]), (target, state, torque))
     after, force = physics_advance(*double, jnp.zeros((2 * WORLDS, 3)))
-    np.testing.assert_allclose(results[shape][1], force[:WORLDS], atol=0.03)
-    np.testing.assert_allclose(results[shape][0].qvel, after.qvel[:WORLDS], atol=6e-3)
+    np.testing.assert_allclose(results[shape][1], force[:WORLDS], atol=0.03, rtol=0.03)
+    np.testing.assert_allclose(results[shape][0].qvel, after.qvel[:WORLDS], atol=0.02)
 
 
 def test_a_full_buffer_is_loud(hand, worlds, monkeypatch):
