@@ -128,7 +128,7 @@ class TestTick:
         rows = np.concatenate([c_scene.rows_of(pool, shape)[:4] for shape in ("sphere", "capsule")])
         starts = c_scene.row(pool, rows)
         state = placed(grasp_rollout, 11, starts.qpos, starts.qvel, starts.target)
-        for tick in range(8):
+        for _ in range(8):
             state = grasp_rollout.step(state, jnp.ones((WORLDS, 12)) * (np.arange(12) > 3))
         action = actions(3)
         after = grasp_rollout.step(state, action)

@@ -19,10 +19,20 @@ from dexsim.hand import forward_kinematics
 from dexsim.objects import SHAPES, ObjectConfig
 from dexsim.physics import PhysicsConfig
 from dexsim.tasks import TASKS
-from dexsim.tasks.grasp import (COMMANDS, Goal, Grasp, GraspConfig, GraspReward, action_rate,
-                                command_reward, joint_speed, joint_spread, posture_distance,
-                                tailed_gaussian, target_force)
-
+from dexsim.tasks.grasp import (
+    COMMANDS,
+    Goal,
+    Grasp,
+    GraspConfig,
+    GraspReward,
+    action_rate,
+    command_reward,
+    joint_speed,
+    joint_spread,
+    posture_distance,
+    tailed_gaussian,
+    target_force,
+)
 
 # Pinned: the shipped defaults are tuned, the rules below are not.
 WEIGHTS = GraspReward(force=2.0, torque=0.2, alive=0.5, spread=-0.5, outer=-0.05, action=-0.02,

@@ -46,7 +46,7 @@ def contact_steps(hand, grasp_env, physics_advance):
         after, force = physics_advance(stack([s.target for s in starts]),
                                PhysicsState(qpos, qvel, warmstart), torque, jnp.zeros((WORLDS, 3)))
         c_rows = []
-        for start, (model, *state, applied) in zip(starts, begun, strict=True):
+        for _, (model, *state, applied) in zip(starts, begun, strict=True):
             data = c_scene.start(model, *state)
             data.qfrc_applied[:12] = applied
             mujoco.mj_step(model, data)
