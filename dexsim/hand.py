@@ -111,13 +111,13 @@ def forward_kinematics(hand: Hand, joint_position: jax.Array) -> HandPose:
         if position is None:
             position, rotation = local_position[level], local_rotation[level]
         else:
-            rows = np.array([order.index(p) for p in hand.body_parent[level]])
+            rows = np.array([order.index(p) for p in hand.body_parent[level]], np.int32)
             new_position = position[rows] + rotations.rotate(rotation[rows], local_position[level])
             new_rotation = rotations.compose(rotation[rows], local_rotation[level])
             position = jnp.concatenate([position, new_position])
             rotation = jnp.concatenate([rotation, new_rotation])
         order += list(level)
-    back = np.argsort(order)
+    back = np.argsort(order).astype(np.int32)
     position, rotation = position[back], rotation[back]
     tip_rotation = rotation[hand.tip_body]
     tip_position = position[hand.tip_body] + rotations.rotate(tip_rotation,
@@ -141,7 +141,7 @@ def _levels(parent: np.ndarray) -> list[np.ndarray]:
     depth = np.zeros(len(parent), int)
     for body, above in enumerate(parent):
         depth[body] = 0 if above < 0 else depth[above] + 1
-    return [np.flatnonzero(depth == level) for level in range(depth.max() + 1)]
+    return [np.flatnonzero(depth == level).astype(np.int32) for level in range(depth.max() + 1)]
 
 
 def flexion_joints(hand: Hand, fingers: range) -> np.ndarray:
@@ -223,7 +223,7 @@ def load_hand(path: str | Path | None = None) -> Hand:
     palm = find("body", table["palm"])
     bodies = [b for b in range(1, model.nbody) if _is_below(model.body_parentid, b, palm)]
     row = {body: i for i, body in enumerate(bodies)}
-    body_joint = np.full(len(bodies), -1)
+    body_joint = np.full(len(bodies), -1, np.int32)
     for index, joint in enumerate(joints):
         body = int(model.jnt_bodyid[joint])
         if body not in row or body == palm or body_joint[row[body]] >= 0:
@@ -260,8 +260,8 @@ def load_hand(path: str | Path | None = None) -> Hand:
         joint_anchor=_f32(np.where(has[:, None], model.jnt_pos[at], 0)),
         joint_reference=_f32(np.where(has, model.qpos0[model.jnt_qposadr[at]], 0)),
         finger_names=finger_names,
-        tip_body=np.array([row[int(model.site_bodyid[s])] for s in tips]),
-        tip_offset=_f32(model.site_pos[tips]), root_joint=np.array(root),
+        tip_body=np.array([row[int(model.site_bodyid[s])] for s in tips], np.int32),
+        tip_offset=_f32(model.site_pos[tips]), root_joint=np.array(root, np.int32),
         taxel_grid=tuple(table["taxel_grid"]),
         taxel_position=taxels[..., 0:3], taxel_normal=taxels[..., 3:6], taxel_area=taxels[..., 6],
         geoms=_read_geoms(model, row),

@@ -112,7 +112,9 @@ class Physics:
         self.hand, self.slots, self.config = hand, slots, config
         self.backend = choose_backend(backend)
         # Warp shares one contact buffer among all worlds; the rest is per world.
-        self._contact_buffer = max(config.max_contacts * num_envs, 256)
+        # Candidates of the broad phase need more room than contacts: up to 15 a world were seen
+        # against 16 contacts, and a full buffer ends episodes.
+        self._contact_buffer = max(config.max_contacts * num_envs * 3 // 2, 256)
         self.mj_model = build_model(hand, slots, largest, config, gravity, self.backend)
         try:
             self._model = _quiet(mjx.put_model(self.mj_model, impl=self.backend), self.backend)

@@ -19,8 +19,7 @@ KINDS = ("box", "capsule", "cylinder")  # the order of `dexsim.objects.SLOTS`
 
 
 def compile_scene(hand, target, *, gravity=GRAVITY, timestep=0.005, iterations=5,
-                  line_search=8, condim=3, margin=0.0,
-                  exact=False) -> mujoco.MjModel:
+                  line_search=8, condim=3, margin=0.0, exact=False) -> mujoco.MjModel:
     """One object (`ObjectParams` of NumPy leaves) under the hand.
 
     `margin` m lists contacts that far apart, for clearances. `exact` takes C MuJoCo's native convex

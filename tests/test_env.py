@@ -421,7 +421,7 @@ class TestReadings:
         env = dexsim.make("grasp", GraspConfig(
             sensing=sensing, randomization=Randomization(scale=0.0), pool_size=4,
             objects=ObjectConfig(shapes=("sphere",))), backend="jax")
-        state = env.reset(jax.random.key(0))
+        state = jax.jit(env.reset)(jax.random.key(0))
         np.testing.assert_array_equal(state.readings.joint_position, state.physics.qpos[:12])
         np.testing.assert_array_equal(state.readings.object_position, state.physics.qpos[12:15])
         np.testing.assert_array_equal(state.readings.taxel_force, np.zeros((5, 120)))
