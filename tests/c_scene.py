@@ -5,6 +5,9 @@ inertia (C MuJoCo ignores geom offsets that are set on a compiled model whose ge
 body's origin), only its active primitives exist, and forces are summed from `mj_contactForce`.
 """
 
+import contextlib
+from collections.abc import Iterator
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -121,3 +124,12 @@ def squeeze(hand, begun, rng: np.random.Generator, steps=100):
     model.opt.gravity[:] = GRAVITY
     single = [np.float32(x) for x in (data.qpos, data.qvel, data.qacc_warmstart)]
     return model, *single, np.float32(torque * rng.uniform(0.5, 1.2, 12))
+
+
+@contextlib.contextmanager
+def double_precision() -> Iterator[None]:
+    """64-bit JAX. Traces that JAX keeps from 32-bit code clash with it, and the other way round."""
+    jax.clear_caches()
+    with jax.enable_x64(True):
+        yield
+    jax.clear_caches()

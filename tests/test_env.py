@@ -588,7 +588,7 @@ class TestTouch:
                                  jnp.ones(5), skin)
             return jnp.sum(touch.skin_force)
 
-        with jax.enable_x64(True):
+        with c_scene.double_precision():
             both = jax.jit(jax.value_and_grad(force, argnums=3))
             for world in worlds:
                 joints = jnp.asarray(np.asarray(after.physics.qpos[world, :12], np.float64))

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import c_scene
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -354,7 +355,7 @@ def pose_response(hand, taxels):
 def test_gradient_of_touch_with_respect_to_the_objects_pose(pose_response, kind):
     """Against central differences, with the shipped hand's taxels round an askew object."""
     step = 1e-7
-    with jax.enable_x64(True):
+    with c_scene.double_precision():
         poses = np.concatenate([np.zeros((1, 6)), step * np.eye(6), -step * np.eye(6)])
         value, exact = pose_response(poses, np.array([kind == other for other in sdf.KINDS]))
         value, exact = np.asarray(value), np.asarray(exact)
