@@ -13,10 +13,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dexsim import sdf
+from dexsim import rotations, sdf
 from dexsim.config import check_ranges, setting, validate
 from dexsim.errors import ConfigError
-from dexsim.pytree import pytree_dataclass
+from dexsim.pytree import pytree_dataclass, static
 
 SLOTS = ("box", "capsule", "cylinder")
 SHAPES = ("sphere", "box", "cylinder", "capsule", "composition")
@@ -75,10 +75,12 @@ class ObjectConfig:
                          [body * self.cylinder_radius[1], body * self.cylinder_half[1], 0.0]])
 
 
-def bounding_radius(size: jax.Array) -> jax.Array:
+def bounding_radius(size: jax.Array, kinds: tuple[str, ...] = SLOTS) -> jax.Array:
     """Radius [K] of the sphere round each slot's primitive, for the broad phase."""
-    (a, b, c), (r, h, _), (cr, ch, _) = size
-    return jnp.stack([jnp.sqrt(a * a + b * b + c * c), r + h, jnp.hypot(cr, ch)])
+    radius = {"sphere": lambda s: s[0], "box": lambda s: jnp.sqrt(jnp.sum(s * s)),
+              "capsule": lambda s: s[0] + s[1], "cylinder": lambda s: jnp.hypot(s[0], s[1]),
+              "ellipsoid": jnp.max}
+    return jnp.stack([radius[kind](size[k]) for k, kind in enumerate(kinds)])
 
 
 def extent(size: jax.Array, position: jax.Array, active: jax.Array,
@@ -105,11 +107,16 @@ class ObjectParams:
     com: jax.Array  # [3] m
     friction: jax.Array  # [] sliding
     contact: jax.Array  # [2] time constant s, damping ratio of the contact spring
+    quat: jax.Array | None = None  # [K, 4] slot orientations in the object's frame; None: aligned
+    kinds: tuple[str, ...] = static(default=SLOTS)
 
     def shape(self) -> sdf.Shape:
         """The union of primitives, for the taxels."""
-        eye = jnp.broadcast_to(jnp.eye(3), (len(SLOTS), 3, 3))
-        return sdf.Shape(SLOTS, self.size, self.position, eye, self.active)
+        if self.quat is None:
+            rotation = jnp.broadcast_to(jnp.eye(3), (len(self.kinds), 3, 3))
+        else:
+            rotation = rotations.quat_to_matrix(self.quat)
+        return sdf.Shape(self.kinds, self.size, self.position, rotation, self.active)
 
 
 def sample_object(key: jax.Array, config: ObjectConfig,

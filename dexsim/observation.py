@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from dexsim import rotations, tactile
 from dexsim.config import setting, validate
-from dexsim.hand import Hand, forward_kinematics, taxel_positions
+from dexsim.hand import Hand, HandPose, forward_kinematics, taxel_positions
 from dexsim.pytree import pytree_dataclass
 
 
@@ -33,6 +33,14 @@ class Readings:
     goal_quat: jax.Array  # [4] target orientation of the object
     command: jax.Array  # [] grip command in [0, 1]
     last_action: jax.Array  # [J] in [-1, 1]
+
+
+@pytree_dataclass
+class Motion:
+    """What only a simulator knows: the critic's part of an observation."""
+
+    joint_velocity: jax.Array  # [J] rad/s
+    object_spin: jax.Array  # [3] rad/s, palm frame
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,13 +67,13 @@ class ObservationConfig:
     """Encoding of the relative target orientation."""
     leave_out: tuple[str, ...] = setting((), choices=("contact_force", "contact_centre",
                                                       "relative_orientation"))
-    """Observation fields to drop."""
+    """Observation fields that the actor goes without."""
 
     def __post_init__(self):
         validate(self)
 
 
-@pytree_dataclass
+@dataclasses.dataclass(frozen=True)
 class Features:
     """What the fields are made of, computed once from the readings."""
 
@@ -73,15 +81,34 @@ class Features:
     tip_position: jax.Array  # [F, 3] m
     contact_force: jax.Array  # [F] N
     contact_centre: jax.Array  # [F, 3] m
+    pose: HandPose
+    motion: Motion | None
+    twist: Callable[[], jax.Array]  # [F, 6] m/s, rad/s, of the finger tips
+
+
+def _tip_twist(hand: Hand, joint_position: jax.Array, joint_velocity: jax.Array) -> jax.Array:
+    """Linear and angular velocity [F, 6] of the finger tips, m/s and rad/s in the palm frame."""
+    def tips(joints: jax.Array) -> tuple[jax.Array, jax.Array]:
+        pose = forward_kinematics(hand, joints)
+        return pose.tip_position, pose.tip_rotation
+
+    (_, rotation), (linear, change) = jax.jvp(tips, (joint_position,), (joint_velocity,))
+    skew = rotations.compose(change, jnp.swapaxes(rotation, -1, -2))
+    angular = jnp.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], -1)
+    return jnp.concatenate([linear, angular], -1)
+
+
+def _encode(quat: jax.Array, encoding: str) -> jax.Array:
+    if encoding == "quaternion":
+        return quat
+    return rotations.matrix_to_6d(rotations.quat_to_matrix(quat))
 
 
 def _relative_orientation(f: Features, encoding: str) -> jax.Array:
     """Rotation that takes the object to its goal, in the palm frame."""
     relative = rotations.quat_multiply(f.readings.goal_quat,
                                        rotations.quat_conjugate(f.readings.object_quat))
-    if encoding == "quaternion":
-        return relative
-    return rotations.matrix_to_6d(rotations.quat_to_matrix(relative))
+    return _encode(relative, encoding)
 
 
 _TERMS: dict[str, Callable[[Features], jax.Array]] = {
@@ -94,21 +121,34 @@ _TERMS: dict[str, Callable[[Features], jax.Array]] = {
     "fingertip_position": lambda f: f.tip_position.ravel(),
     "command": lambda f: f.readings.command[None],
     "last_action": lambda f: f.readings.last_action,
+    "fingertip_rotation": lambda f: rotations.matrix_to_6d(f.pose.tip_rotation).ravel(),
+    "fingertip_velocity": lambda f: f.twist().ravel(),
+    "joint_velocity": lambda f: f.motion.joint_velocity,
+    "object_spin": lambda f: f.motion.object_spin,
+}
+_ORIENTATIONS = {
+    "relative_orientation": _relative_orientation,
+    "object_orientation": lambda f, encoding: _encode(f.readings.object_quat, encoding),
 }
 
 GRASP = ("joint_position", "joint_torque", "object_position", "object_velocity",
          "contact_force", "contact_centre", "fingertip_position", "command")
 ROTATE = ("joint_position", "relative_orientation", "last_action", "contact_centre",
           "contact_force", "fingertip_position")
+ROTATE_CRITIC = (*ROTATE, "object_orientation", "fingertip_velocity", "fingertip_rotation",
+                 "joint_velocity", "object_velocity", "object_spin")
 
 
 def layout(hand: Hand, names: tuple[str, ...], config: ObservationConfig) -> tuple[Field, ...]:
     """Names, sizes and scales of an observation's fields, in order."""
     joints, fingers = hand.num_joints, hand.num_fingers
+    angles = 4 if config.orientation == "quaternion" else 6
     size = {"joint_position": joints, "joint_torque": joints, "object_position": 3,
             "object_velocity": 3, "contact_force": fingers, "contact_centre": 3 * fingers,
             "fingertip_position": 3 * fingers, "command": 1, "last_action": joints,
-            "relative_orientation": 4 if config.orientation == "quaternion" else 6}
+            "relative_orientation": angles, "object_orientation": angles,
+            "fingertip_rotation": 6 * fingers, "fingertip_velocity": 6 * fingers,
+            "joint_velocity": joints, "object_spin": 3}
     scale = {"contact_force": 5.0, "contact_centre": 0.1, "command": 0.5, "joint_torque": 0.3,
              "last_action": 1.0}
     return tuple(Field(name, size[name], scale.get(name)) for name in names
@@ -116,14 +156,16 @@ def layout(hand: Hand, names: tuple[str, ...], config: ObservationConfig) -> tup
 
 
 def observe(hand: Hand, readings: Readings, names: tuple[str, ...],
-            config: ObservationConfig) -> jax.Array:
+            config: ObservationConfig, motion: Motion | None = None) -> jax.Array:
     """The observation vector: the only road from measurements to a policy.
 
     Args:
       hand: the hand's description (static).
       readings: one tick of measurements.
-      names: the task's fields, `GRASP` (66 values for the shipped hand) or `ROTATE` (65).
+      names: the task's fields: `GRASP` (66 values for the shipped hand), `ROTATE` (65) or
+        `ROTATE_CRITIC` (149).
       config: what to leave out and how to encode.
+      motion: for a critic whose fields ask for it.
 
     Returns:
       [sum of the layout's sizes] float32, not normalised.
@@ -131,13 +173,15 @@ def observe(hand: Hand, readings: Readings, names: tuple[str, ...],
     pose = forward_kinematics(hand, readings.joint_position)
     force, centre = tactile.reduce_touch(readings.taxel_force, taxel_positions(hand, pose),
                                          config.weighting)
-    features = Features(readings, pose.tip_position, force, centre)
+    features = Features(
+        readings, pose.tip_position, force, centre, pose, motion,
+        lambda: _tip_twist(hand, readings.joint_position, motion.joint_velocity))
     parts = []
     for name in names:
         if name in config.leave_out:
             continue
-        if name == "relative_orientation":
-            parts.append(_relative_orientation(features, config.orientation))
+        if name in _ORIENTATIONS:
+            parts.append(_ORIENTATIONS[name](features, config.orientation))
         else:
             parts.append(_TERMS[name](features))
     return jnp.concatenate(parts).astype(jnp.float32)

@@ -150,8 +150,11 @@ class Physics:
         # which belongs to the skin and must not change with the mass of what is touched.
         return model.replace(
             geom_size=model.geom_size.at[geoms].set(target.size),
-            geom_rbound=model.geom_rbound.at[geoms].set(bounding_radius(target.size)),
+            geom_rbound=model.geom_rbound.at[geoms].set(
+                bounding_radius(target.size, self.slots)),
             geom_pos=model.geom_pos.at[geoms].set(target.position),
+            geom_quat=(model.geom_quat if target.quat is None
+                       else model.geom_quat.at[geoms].set(target.quat)),
             body_mass=model.body_mass.at[body].set(target.mass),
             body_inertia=model.body_inertia.at[body].set(target.inertia),
             body_ipos=model.body_ipos.at[body].set(target.com),
