@@ -15,3 +15,7 @@ class AssetError(DexsimError):
 
 class CheckpointError(DexsimError):
     """A checkpoint or policy file is missing, damaged, of another task or of a newer version."""
+
+
+class CalibrationError(DexsimError):
+    """Recorded data cannot answer what is asked of it, or a calibration file cannot be used."""
