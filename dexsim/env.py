@@ -19,6 +19,7 @@ import numpy as np
 
 from dexsim import actuator, observation, rotations, tactile
 from dexsim.config import setting, validate
+from dexsim.control import Control, move_target
 from dexsim.hand import Hand, HandPose, forward_kinematics, taxel_positions
 from dexsim.objects import ObjectConfig, ObjectParams
 from dexsim.observation import ObservationConfig, Readings
@@ -27,24 +28,6 @@ from dexsim.pytree import pytree_dataclass
 from dexsim.randomization import Draw, Randomization
 from dexsim.randomization import sample as sample_draw
 from dexsim.render import Snapshot
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Control:
-    """How an action in [-1, 1] becomes a joint target."""
-
-    mode: str = setting("delta", choices=("delta", "absolute"))
-    """"delta": the target moves by action * step; "absolute": it follows the action's place in
-    the joint's range, smoothed."""
-    step: float = setting(0.2, unit="rad", low=0.001, high=1.0)
-    """Largest change of a target in one tick (delta)."""
-    smoothing: float = setting(0.4, unit="1", low=0.01, high=1.0)
-    """Weight of the newest target in the moving average (absolute)."""
-    reach: float = setting(0.5, unit="rad", low=0.01, high=4.0)
-    """Largest distance of a target from the measured angle: bounds windup and grip torque."""
-
-    def __post_init__(self):
-        validate(self)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -328,15 +311,7 @@ class Env:
 
     def _joint_target(self, target: jax.Array, action: jax.Array,
                       measured: jax.Array) -> jax.Array:
-        control, hand = self.config.control, self.hand
-        if control.mode == "delta":
-            target = target + control.step * action
-        else:
-            middle = (hand.joint_upper + hand.joint_lower) / 2
-            wanted = middle + action * (hand.joint_upper - hand.joint_lower) / 2
-            target = target + control.smoothing * (wanted - target)
-        target = jnp.clip(target, measured - control.reach, measured + control.reach)
-        return jnp.clip(target, hand.joint_lower, hand.joint_upper)
+        return move_target(self.config.control, self.hand, target, action, measured)
 
     def _tilt_force(self, draw: Draw, target: ObjectParams) -> jax.Array:
         """The object's share of a tilted gravity, N; the links' share is small and left out."""

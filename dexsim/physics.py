@@ -1,4 +1,4 @@
-"""The physics seam: the only room that imports `mujoco.mjx`.
+"""The physics seam: the only room that imports `mujoco.mjx`, and not before a scene is compiled.
 
 `Physics` compiles the hand, an object and explicit contact pairs into one model, and `advance`
 runs it for one control tick on either backend: `jax` (differentiable, any device) or `warp`
@@ -15,7 +15,6 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from mujoco import mjx
 
 from dexsim.config import setting, validate
 from dexsim.errors import AssetError, ConfigError
@@ -109,7 +108,10 @@ class Physics:
         Raises:
           AssetError: the model uses what the backend ignores or lacks.
         """
+        from mujoco import mjx
+
         self.hand, self.slots, self.config = hand, slots, config
+        self._mjx = mjx
         self.backend = choose_backend(backend)
         # Warp shares one contact buffer among all worlds; the rest is per world.
         # Candidates of the broad phase need more room than contacts: up to 15 a world were seen
@@ -117,7 +119,7 @@ class Physics:
         self._contact_buffer = max(config.max_contacts * num_envs * 3 // 2, 256)
         self.mj_model = build_model(hand, slots, largest, config, gravity, self.backend)
         try:
-            self._model = _quiet(mjx.put_model(self.mj_model, impl=self.backend), self.backend)
+            self._model = _quiet(self._mjx.put_model(self.mj_model, impl=self.backend), self.backend)
         except NotImplementedError as error:
             raise AssetError(f"{hand.model_path}: backend {self.backend}: {error}") from None
         self._find_addresses()
@@ -187,7 +189,7 @@ class Physics:
         def substep(data: Any, index: jax.Array) -> tuple[Any, None]:
             tau = torque(index, data.qpos[self.joint_qpos], data.qvel[self.joint_dof])
             applied = jnp.zeros(self.mj_model.nv).at[self.joint_dof].set(tau)
-            return mjx.step(model, data.replace(qfrc_applied=applied)), None
+            return self._mjx.step(model, data.replace(qfrc_applied=applied)), None
 
         # Forces are read after the scan: stacking sensordata as a scan output more than doubled
         # the step and returned zeros on the GPU.
@@ -197,8 +199,8 @@ class Physics:
 
     def _make_data(self) -> Any:
         if self.backend == "jax":
-            return mjx.make_data(self._model)
-        return mjx.make_data(self.mj_model, impl="warp", naconmax=self._contact_buffer,
+            return self._mjx.make_data(self._model)
+        return self._mjx.make_data(self.mj_model, impl="warp", naconmax=self._contact_buffer,
                              naccdmax=self._contact_buffer, njmax=self.constraint_rows)
 
     @property
