@@ -12,8 +12,8 @@ import mujoco
 import numpy as np
 import pytest
 from c_scene import CONVERGED, GRAVITY, row, rows_of, squeeze, stack
+from mujoco import mjx
 
-from dexsim import physics as physics_module
 from dexsim.errors import AssetError, ConfigError
 from dexsim.hand import load_hand
 from dexsim.model_guard import check_model
@@ -271,7 +271,7 @@ class TestConstruction:
         def refuse(model, impl):
             raise NotImplementedError("no such joint")
 
-        monkeypatch.setattr(physics_module.mjx, "put_model", refuse)
+        monkeypatch.setattr(mjx, "put_model", refuse)
         with pytest.raises(AssetError, match="backend jax: no such joint"):
             Physics(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(), gravity=GRAVITY,
                     backend="jax")
@@ -308,7 +308,7 @@ def test_the_guards_list_of_collisions_is_mjxs_own(first, second):
         f"""<mujoco><worldbody>{body.format(x=0, kind=first)}{body.format(x=1, kind=second)}
             </worldbody><contact><pair geom1="0" geom2="1"/></contact></mujoco>""")
     try:
-        physics_module.mjx.put_model(model, impl="jax")
+        mjx.put_model(model, impl="jax")
     except NotImplementedError:
         with pytest.raises(AssetError, match=f"collision ({first}-{second}|{second}-{first})"):
             check_model(model, "jax")
