@@ -2,7 +2,7 @@
 
 Theil-Sen start, Huber and then Tukey's bisquare by iteratively reweighted least squares (an
 MM-estimate), and a sandwich covariance that allows for unequal and autocorrelated residuals
-(Newey and West 1987, bandwidth after Andrews 1991). Plain NumPy in double precision.
+(Andrews and Monahan 1992). Plain NumPy in double precision.
 """
 
 import dataclasses
@@ -42,8 +42,7 @@ def fit_line(x: np.ndarray, y: np.ndarray, *, seed: int = 0) -> Line:
     """Fit y = gain x + offset.
 
     Args:
-      x, y: [T] finite, in the order of time (autocorrelation widens the intervals), T > 2 and x
-        not constant.
+      x, y: [T] finite, in the order of time, T > 2 and x not constant.
       seed: of the pairs that Theil-Sen looks at where there are more than 20,000.
     """
     x, y = np.asarray(x, float), np.asarray(y, float)
@@ -52,7 +51,10 @@ def fit_line(x: np.ndarray, y: np.ndarray, *, seed: int = 0) -> Line:
     start = np.array(theil_sen(x, y, seed)) * [1.0, reach]
     guess, scale, weight = _reweight(design, y, start)
     residual = y - design @ guess
-    half = _half_widths(design, residual, weight, scale)
+    # Along x, what returns at the same place (ripple of the motor) lies side by side in repeated
+    # presses, and so does what drifts within one press: both must widen the intervals.
+    order = np.argsort(x, kind="stable")
+    half = _half_widths(design[order], residual[order], weight[order], scale)
     offset, gain = guess / [1.0, reach]
     half = half / [1.0, reach]
     kept = weight > 0
@@ -116,19 +118,42 @@ def _half_widths(design: np.ndarray, residual: np.ndarray, weight: np.ndarray,
     score = (weight * residual)[:, None] * design
     inverse = np.linalg.inv(np.mean(slope) * design.T @ design)
     freedom = max(len(residual) - 2, 1)
-    covariance = inverse @ long_run(score) @ inverse * len(residual) / freedom
-    return stdtrit(freedom, 0.975) * np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    random = np.diag(inverse @ long_run(score) @ inverse) * len(residual) / freedom
+    variance = np.maximum(random, _periodic(design, weight * residual, inverse))
+    return stdtrit(freedom, 0.975) * np.sqrt(np.maximum(variance, 0.0))
+
+
+def _periodic(design: np.ndarray, residual: np.ndarray, inverse: np.ndarray) -> np.ndarray:
+    """Variance [P] of the parameters over where along x a wave in the residuals happens to start.
+
+    A ripple of a few periods does not average out, and no autocovariance that dies away describes
+    it: the residuals are turned round along x by every offset and fitted each time.
+    """
+    spectrum = np.fft.rfft(design, axis=0).conj() * np.fft.rfft(residual)[:, None]
+    turned = np.fft.irfft(spectrum, n=len(residual), axis=0)  # design.T @ roll(residual, offset)
+    return np.mean((turned @ inverse) ** 2, 0)
 
 
 def long_run(score: np.ndarray) -> np.ndarray:
-    """Newey-West sum [P, P] of a series' autocovariances; `score` [T, P] has zero mean."""
+    """Sum [P, P] of the autocovariances of a series `score` [T, P] of zero mean, times T.
+
+    Newey-West on the series with its first-order autoregression taken out (Andrews and Monahan
+    1992), bandwidth after Andrews 1991.
+    """
     count = len(score)
-    before, after = score[:-1], score[1:]
-    rho = np.clip(np.sum(before * after, 0) / np.maximum(np.sum(score**2, 0), 1e-300), -0.97, 0.97)
-    alpha = float(np.max(4 * rho**2 / ((1 - rho) * (1 + rho)) ** 2))
-    lags = min(int(1.1447 * (alpha * count) ** (1 / 3)), count // 4)
-    total = score.T @ score
+    rho = _autocorrelation(score)
+    white = score[1:] - rho * score[:-1]
+    left = _autocorrelation(white)
+    alpha = float(np.max(4 * left**2 / ((1 - left) * (1 + left)) ** 2))
+    lags = min(int(1.1447 * (alpha * count) ** (1 / 3)) + 1, count // 4)
+    total = white.T @ white
     for lag in range(1, lags + 1):
-        cross = score[lag:].T @ score[:-lag]
+        cross = white[lag:].T @ white[:-lag]
         total += (1.0 - lag / (lags + 1)) * (cross + cross.T)
-    return total
+    return total / np.outer(1.0 - rho, 1.0 - rho) * count / (count - 1)
+
+
+def _autocorrelation(series: np.ndarray) -> np.ndarray:
+    """First-order coefficient [P] of each column, corrected for its bias in short series."""
+    rho = np.sum(series[:-1] * series[1:], 0) / np.maximum(np.sum(series**2, 0), 1e-300)
+    return np.clip(rho + (1.0 + 3.0 * rho) / len(series), -0.5, 0.97)
