@@ -43,7 +43,7 @@ VARIANTS = {"full": Env, "without touch": Env, "without observation": WithoutObs
 def make(task: str, variant: str, backend: str, num_envs: int) -> Env:
     """The environment, whole or with one room left out."""
     entry = TASKS[task]
-    config = entry.config_class()
+    config = entry.config()
     if variant == "without touch":
         config = dataclasses.replace(config, touch=False)
     hand = dexsim.load_hand()

@@ -1,5 +1,7 @@
-"""Finds the files of `assets/`: beside the packages in a checkout, in `dexsim` when installed."""
+"""Finds the files of `assets/`, beside the packages in a checkout, in `dexsim` when installed; and
+the folder for what is kept between runs."""
 
+import os
 from pathlib import Path
 
 from dexsim.errors import AssetError
@@ -36,3 +38,12 @@ def asset_path(name: str) -> Path:
     if not path.exists():
         raise AssetError(f"no asset {name!r} in {root}")
     return path
+
+
+def cache_path(name: str) -> Path:
+    """Where `name` (a kind of file) is kept between runs: in `$DEXSIM_CACHE`, else `~/.cache/dexsim`.
+
+    Everything there can be deleted at any time; it is made again. The folder may not exist yet.
+    """
+    root = os.environ.get("DEXSIM_CACHE")
+    return (Path(root) if root else Path.home() / ".cache" / "dexsim") / name

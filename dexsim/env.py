@@ -22,7 +22,13 @@ from dexsim.config import setting, validate
 from dexsim.control import Control, move_target
 from dexsim.hand import Hand, HandPose, forward_kinematics, taxel_positions
 from dexsim.objects import ObjectConfig, ObjectParams
-from dexsim.observation import ObservationConfig, Readings
+from dexsim.observation import Motion, ObservationConfig, Readings
+from dexsim.orientation_sensor import (
+    OrientationSensor,
+    SensorDraw,
+    draw_sensor,
+    measure_orientation,
+)
 from dexsim.physics import Physics, PhysicsConfig, PhysicsState
 from dexsim.pytree import pytree_dataclass
 from dexsim.randomization import Draw, Randomization
@@ -47,6 +53,8 @@ class Sensing:
     in the paper, where the camera gives only the height."""
     velocity_filter: float = setting(0.5, unit="1", low=0.01, high=1.0)
     """Weight of the newest difference in the object's velocity estimate."""
+    orientation: OrientationSensor = setting(OrientationSensor())
+    """The IMU inside the object."""
     taxel: tactile.TaxelSensor = setting(tactile.TaxelSensor())
     """The taxels."""
 
@@ -85,6 +93,7 @@ class Start:
     qpos: jax.Array
     qvel: jax.Array
     target: ObjectParams
+    joint_target: jax.Array | None = None  # [J] rad; None: where the joints are
 
 
 @pytree_dataclass
@@ -102,6 +111,7 @@ class Sample:
 class Moment:
     """The truth after a tick: what reward, termination and the critic may look at."""
 
+    target: ObjectParams
     joint_position: jax.Array  # [J] rad
     joint_velocity: jax.Array  # [J] rad/s
     joint_torque: jax.Array  # [J] Nm
@@ -124,6 +134,7 @@ class State:
     physics: PhysicsState
     target: ObjectParams
     draw: Draw
+    orientation_sensor: SensorDraw
     goal: Any  # the task's own pytree
     joint_target: jax.Array  # [J] rad
     action: jax.Array  # [J], the last one applied
@@ -151,7 +162,9 @@ class Task(Protocol):
     reference: tuple[float, float, float]  # m, where the object belongs
     episode_ticks: int
     slots: tuple[str, ...]
+    largest: np.ndarray  # [K, 3] m, upper bound of each slot's size
     evaluation_ticks: int
+    evaluation: str  # "series" or "totals": what `summarize` is given, see `Env.summarize`
 
     def make_pool(self, key: jax.Array) -> Start: ...
     def begin(self, key: jax.Array, start: Start) -> Any: ...
@@ -161,6 +174,7 @@ class Task(Protocol):
     def reward(self, goal: Any, moment: Moment,
                dropped: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]: ...
     def dropped(self, goal: Any, moment: Moment) -> jax.Array: ...
+    # What it calls dropped must follow from the goal and the moment alone.
     def target_force(self, goal: Any) -> jax.Array: ...
     def evaluation_plan(self, count: int, shape_index: np.ndarray) -> tuple[np.ndarray, Any]: ...
     def summarize(self, metrics: dict[str, np.ndarray], alive: np.ndarray,
@@ -187,13 +201,17 @@ class Env:
         self.task, self.name, self.config = task, task.name, task.config
         self.hand = hand
         config = self.config
-        self.physics = Physics(self.hand, task.slots, config.objects.largest, config.physics,
+        self.physics = Physics(self.hand, task.slots, task.largest, config.physics,
                                gravity=task.gravity, backend=backend, num_envs=num_envs)
         self.backend = self.physics.backend
         self.action_size = self.hand.num_joints
+        # What is left out is left out of the actor; a critic may always look.
+        self._seen = {group: config.observation if group == "actor" else dataclasses.replace(
+            config.observation, leave_out=()) for group in task.fields}
         self.observation_layout = {
-            group: observation.layout(self.hand, names, config.observation)
+            group: observation.layout(self.hand, names, self._seen[group])
             for group, names in task.fields.items()}
+        self._up = -jnp.asarray(task.gravity) / np.linalg.norm(task.gravity)
         self.primitive_kinds = task.slots
         self.pool = task.make_pool(jax.random.key(seed))
 
@@ -217,27 +235,30 @@ class Env:
 
     def reset_to(self, key: jax.Array, index: jax.Array, goal: Any = None) -> State:
         """A new episode from row `index` of the pool, with the task's goal or the given one."""
-        key, draw_key, goal_key, noise_key = jax.random.split(key, 4)
+        key, draw_key, goal_key, noise_key, sensor_key = jax.random.split(key, 5)
         start = jax.tree.map(lambda rows: jnp.asarray(rows)[index], self.pool)
         config, hand = self.config, self.hand
         draw = sample_draw(draw_key, config.randomization, hand,
                                     timestep=config.physics.timestep,
                                     control_period=self.control_period)
+        sensor = draw_sensor(sensor_key, config.sensing.orientation, config.randomization.scale,
+                             self.control_period)
         if goal is None:
             goal = self.task.begin(goal_key, start)
         joints = start.qpos[self.physics.joint_qpos]
         zero = jnp.zeros(hand.num_joints)
         place = start.qpos[self.physics.object_qpos]
         sample = Sample(joints, zero, jnp.zeros(hand.taxel_area.shape), place[:3], place[3:])
-        readings = self._read(noise_key, sample, sample, draw, goal, zero, jnp.zeros(3))
+        readings = self._read(noise_key, sample, sample, draw, sensor, goal, zero)
         physics = PhysicsState(start.qpos, start.qvel, jnp.zeros(self.physics.mj_model.nv))
         moment = self._moment(physics, start.target, zero, zero, zero,
                               jnp.zeros((hand.num_fingers, 3)))
         false = jnp.zeros((), bool)
         _, metrics = self.task.reward(goal, moment, false)
         state = State(
-            key=key, physics=physics, target=start.target, draw=draw, goal=goal,
-            joint_target=joints, action=zero, sample=sample, object_velocity=jnp.zeros(3),
+            key=key, physics=physics, target=start.target, draw=draw, orientation_sensor=sensor,
+            goal=goal, joint_target=joints if start.joint_target is None else start.joint_target,
+            action=zero, sample=sample, object_velocity=jnp.zeros(3),
             readings=readings, finger_force=jnp.zeros(hand.num_fingers),
             tick=jnp.zeros((), jnp.int32), length=jnp.zeros((), jnp.int32),
             episode_return=jnp.zeros(()), obs=self._observe(readings, moment, goal),
@@ -269,13 +290,14 @@ class Env:
         goal = self.task.update(goal_key, state.goal, moment)
         sample = Sample(moment.joint_position, last / hand.torque_limit,
                         moment.touch.force, moment.object_position, moment.object_quat)
-        readings = self._read(noise_key, sample, state.sample, draw, goal, action,
-                              state.object_velocity, state.readings.object_position)
+        readings = self._read(noise_key, sample, state.sample, draw, state.orientation_sensor,
+                              goal, action, state)
         dropped = self.task.dropped(goal, moment) | ~finite
         reward, metrics = self.task.reward(state.goal, moment, dropped)
         tick = state.tick + 1
         state = State(
-            key=key, physics=after, target=state.target, draw=draw, goal=goal,
+            key=key, physics=after, target=state.target, draw=draw,
+            orientation_sensor=state.orientation_sensor, goal=goal,
             joint_target=joint_target, action=action, sample=sample,
             object_velocity=readings.object_velocity, readings=readings,
             finger_force=jnp.linalg.norm(force, axis=-1), tick=tick, length=state.length + 1,
@@ -341,20 +363,20 @@ class Env:
             nothing = jnp.zeros(hand.taxel_area.shape)
             touch = tactile.Touch(nothing, nothing, nothing)
         return Moment(
-            joint_position=joints, joint_velocity=physics.qvel[seam.joint_dof],
+            target=target, joint_position=joints, joint_velocity=physics.qvel[seam.joint_dof],
             joint_torque=torque, pose=pose, finger_force=force, touch=touch,
             object_position=place[:3], object_quat=quat, object_velocity=motion[:3],
             object_spin=rotations.rotate(rotations.quat_to_matrix(quat), motion[3:]),
             action=action, last_action=last_action)
 
     def _read(self, key: jax.Array, sample: Sample, before: Sample, draw: Draw,
-              goal: Any, action: jax.Array, velocity: jax.Array,
-              position_before: jax.Array | None = None) -> Readings:
-        """Latency, noise and counts between the truth and the host."""
+              sensor: SensorDraw, goal: Any, action: jax.Array,
+              state: State | None = None) -> Readings:
+        """Latency, noise and counts between the truth and the host; no `state` at a reset."""
         sensing, config = self.config.sensing, self.config
         age = draw.sensing_latency
         late = jax.tree.map(lambda new, old: (1 - age) * new + age * old, sample, before)
-        keys = jax.random.split(key, 4)
+        keys = jax.random.split(key, 5)
         joints = late.joint_position + draw.encoder_bias
         joints = joints + sensing.joint_noise * jax.random.normal(keys[0], joints.shape)
         if sensing.joint_resolution > 0:
@@ -369,11 +391,18 @@ class Env:
         noise = sensing.object_noise * jax.random.normal(keys[3], (3,))
         position = jnp.where(jnp.array(sensing.object_axes), late.object_position + noise,
                              jnp.asarray(self.task.reference))
-        step = (position - position_before) / self.control_period \
-            if position_before is not None else jnp.zeros(3)
-        velocity = velocity + sensing.velocity_filter * (step - velocity)
+        velocity = jnp.zeros(3)
+        if state is not None:
+            step = (position - state.readings.object_position) / self.control_period
+            velocity = state.object_velocity
+            velocity = velocity + sensing.velocity_filter * (step - velocity)
         command, goal_quat = self.task.goal_readings(goal)
-        quat = late.object_quat / jnp.linalg.norm(late.object_quat)
+        # At a reset the sensor has just read for the first time.
+        length, held = (jnp.zeros(()), sample.object_quat) if state is None else (
+            state.length + 1.0, state.readings.object_quat)
+        quat = measure_orientation(keys[4], sensing.orientation, sensor, length,
+                                   sample.object_quat, before.object_quat, held, self._up,
+                                   self.control_period)
         return Readings(joints, torque, taxels, position, velocity, quat, goal_quat, command,
                         action)
 
@@ -385,7 +414,8 @@ class Env:
             moment.touch.force, moment.object_position, moment.object_velocity,
             moment.object_quat, goal_quat, command, moment.action)
         seen = {"actor": readings, "critic": truth}
-        return {group: observation.observe(self.hand, seen[group], names, self.config.observation)
+        motion = Motion(moment.joint_velocity, moment.object_spin)
+        return {group: observation.observe(self.hand, seen[group], names, self._seen[group], motion)
                 for group, names in self.task.fields.items()}
 
     def _metrics(self, state: State, terms: dict[str, jax.Array],
@@ -396,6 +426,11 @@ class Env:
                 "non_finite": 1.0 - jnp.asarray(finite, jnp.float32)}
 
     # --- evaluation and pictures ----------------------------------------------------------
+
+    @property
+    def evaluation(self) -> str:
+        """What `summarize` wants: "series" or "totals"."""
+        return self.task.evaluation
 
     @property
     def evaluation_steps(self) -> int:
@@ -409,7 +444,11 @@ class Env:
         return jax.vmap(self.reset_to)(keys, jnp.asarray(index), goal)
 
     def summarize(self, metrics: dict[str, np.ndarray], alive: np.ndarray) -> dict:
-        """The task's report of an evaluation: metrics [T, N], alive [T, N] (host)."""
+        """The task's report of an evaluation (host).
+
+        A task of kind "series" gets metrics [T, N] and alive [T, N]; one of kind "totals" those
+        of each episode's last tick [N] and the ticks lived [N].
+        """
         return self.task.summarize(metrics, alive, self.control_period)
 
     def snapshot(self, state: State) -> Snapshot:

@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
+from dexsim.assets import cache_path
 from dexsim.errors import DexsimError
 
 T = TypeVar("T")
@@ -70,15 +71,14 @@ def _one_line(box: str) -> str:
 
 
 def enable_caches() -> None:
-    """Keep compiled programs between runs: XLA's in `$DEXSIM_CACHE`, else in `~/.cache/dexsim/xla`."""
+    """Keep compiled programs between runs, in `$DEXSIM_CACHE` or else `~/.cache/dexsim`."""
     import jax
 
-    root = os.environ.get("JAX_COMPILATION_CACHE_DIR") or os.environ.get("DEXSIM_CACHE")
-    path = Path(root) if root else Path.home() / ".cache" / "dexsim" / "xla"
+    path = os.environ.get("JAX_COMPILATION_CACHE_DIR") or cache_path("xla")
     jax.config.update("jax_compilation_cache_dir", str(path))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-    os.environ.setdefault("WARP_CACHE_PATH", str(path.parent / "warp"))
+    os.environ.setdefault("WARP_CACHE_PATH", str(cache_path("warp")))
 
 
 def environment_report() -> dict[str, Any]:

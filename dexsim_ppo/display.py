@@ -9,6 +9,7 @@ from rich.table import Table
 
 # (heading, metric, format); a metric that the task does not have is left out.
 COLUMNS = (("return", "episode/return", ".2f"), ("success", "episode/success", ".1%"),
+           ("goals/min", "episode/goals_per_minute", ".1f"),
            ("length", "episode/length", ".0f"), ("reward", "reward", ".3f"), ("KL", "kl", ".4f"),
            ("lr", "learning_rate", ".1e"), ("std", "action_std", ".2f"))
 
@@ -56,7 +57,7 @@ class Display:
                  "steps/s": count(row["env_steps_per_s"]), "left": duration(row["seconds_left"])}
         errors = sorted(k for k in row if k.startswith("step/") and k.endswith("error"))
         extra = tuple((k.removeprefix("step/").replace("_", " "), k, ".3f") for k in errors[:1])
-        for heading, name, style in (*COLUMNS[:3], *extra, *COLUMNS[3:]):
+        for heading, name, style in (*COLUMNS[:4], *extra, *COLUMNS[4:]):
             if name in row:
                 cells[heading] = format(row[name], style)
         return cells

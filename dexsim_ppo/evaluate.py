@@ -6,6 +6,7 @@ The policy is a file, or the name of a shipped one. The episodes are the task's 
 (`env.evaluation_starts`), never restarted: what counts is whether the hand still holds at the end.
 """
 
+import dataclasses
 import math
 import sys
 import time
@@ -20,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
+from dexsim import statistics
 from dexsim.assets import asset_path
 from dexsim.config import from_dict
 from dexsim.errors import AssetError, CheckpointError, ConfigError
@@ -39,9 +41,11 @@ class Evaluator:
 
     # The task spreads its commands over a chunk, so its first and last episode show the two ends.
     SHOWN = (0, -1)
+    SHOWN_SECONDS = 60.0
 
     def __init__(self, env: Environment, chunk: int):
         self.env, self.chunk = env, chunk
+        self.totals = getattr(env, "evaluation", "series") == "totals"
         self._run = jit(self._episodes)
 
     def __call__(self, params: PolicyParams, *, episodes: int,
@@ -56,28 +60,42 @@ class Evaluator:
         started = time.perf_counter()
         chunks = [jax.device_get(self._run(params, jax.random.fold_in(jax.random.key(seed), i)))
                   for i in range(math.ceil(episodes / self.chunk))]
-        metrics, terminated = jax.tree.map(lambda *xs: np.concatenate(xs, axis=1),
-                                           *((metrics, ended) for metrics, ended, _ in chunks))
-        report = summarize(self.env, metrics, terminated) | {
+        # Episodes are the last axis of all that is measured.
+        measured = jax.tree.map(lambda *xs: np.concatenate(xs, axis=-1),
+                                *(measured for measured, _ in chunks))
+        report = (summarize_totals if self.totals else summarize)(self.env, *measured) | {
             "seed": seed, "seconds": time.perf_counter() - started}
-        _, ended, frames = chunks[0]
-        return report, self._film(frames, ended[:, self.SHOWN])
+        return report, self._film(*chunks[0][1])
 
     def _episodes(self, params: PolicyParams, key: jax.Array):
-        """Metrics and termination flags [T, chunk], and snapshots [T, shown] of one chunk."""
-        def step(state, _):
-            state = jax.vmap(self.env.step)(state, act(params, state.obs["actor"]))
-            frame = jax.tree.map(lambda x: x[jnp.array(self.SHOWN)],
-                                 jax.vmap(self.env.snapshot)(state))
-            return state, (dict(state.metrics), state.terminated, frame)
+        """One chunk: what the report needs, and snapshots and termination flags [T, shown].
 
-        starts = self.env.evaluation_starts(key, self.chunk)
-        return jax.lax.scan(step, starts, None, length=self.env.evaluation_steps)[1]
+        The report needs metrics and termination flags [T, chunk]; of long episodes, whose task keeps its
+        own totals, only the metrics of each one's last tick [chunk] and the ticks it lived [chunk].
+        """
+        shown = jnp.array(self.SHOWN)
+
+        def step(carry, _):
+            state, last = carry
+            state = jax.vmap(self.env.step)(state, act(params, state.obs["actor"]))
+            frame = jax.tree.map(lambda x: x[shown], jax.vmap(self.env.snapshot)(state))
+            series = (dict(state.metrics), state.terminated)
+            film = (frame, state.terminated[shown])
+            if not self.totals:
+                return (state, None), (series, film)
+            return (state, _follow(last, *series)), (None, film)
+
+        state = self.env.evaluation_starts(key, self.chunk)
+        last = (dict(state.metrics), jnp.zeros(self.chunk, jnp.int32), jnp.zeros(self.chunk, bool))
+        (_, last), (series, film) = jax.lax.scan(
+            step, (state, last if self.totals else None), None, length=self.env.evaluation_steps)
+        return (last[:2] if self.totals else series), film
 
     def _film(self, frames: Any, terminated: np.ndarray) -> Any:
         """The shown episodes one after another, each to half a second after it terminated."""
-        after = round(0.5 / self.env.control_period)
+        after, longest = (round(s / self.env.control_period) for s in (0.5, self.SHOWN_SECONDS))
         ends = [int(np.argmax(t)) + after if t.any() else len(t) for t in terminated.T]
+        ends = [min(end, longest) for end in ends]
         return jax.tree.map(lambda x: np.concatenate([x[:end, i] for i, end in enumerate(ends)]),
                             frames)
 
@@ -100,6 +118,23 @@ def summarize(env: Environment, metrics: dict[str, np.ndarray],
             "task": env.summarize(masked, alive)}
 
 
+def summarize_totals(env: Environment, metrics: dict[str, np.ndarray],
+                     lived: np.ndarray) -> dict[str, Any]:
+    """Report of episodes from the metrics of their last tick [N] and the ticks they lived [N]."""
+    held = lived == env.evaluation_steps
+    return {"episodes": int(lived.size), "steps": env.evaluation_steps, "held": proportion(held),
+            "return": mean_interval(metrics["return"]), "steps_held": mean_interval(lived),
+            "task": env.summarize(metrics, lived)}
+
+
+def _follow(last: tuple, metrics: dict[str, jax.Array], terminated: jax.Array) -> tuple:
+    """`last` (metrics, ticks lived, whether ended), one tick later; an ended episode stays as it is."""
+    before, lived, ended = last
+    kept = jax.tree.map(lambda old, new: jnp.where(ended, old, new), before, metrics)
+    ended = ended | terminated
+    return kept, lived + ~ended, ended
+
+
 def mean_interval(x: np.ndarray) -> dict[str, float]:
     """Mean of independent samples with its normal 95 % interval."""
     mean, half = float(np.mean(x)), 1.96 * float(np.std(x, ddof=min(1, x.size - 1))) / x.size**0.5
@@ -108,11 +143,8 @@ def mean_interval(x: np.ndarray) -> dict[str, float]:
 
 def proportion(x: np.ndarray) -> dict[str, float]:
     """Share of true samples with its Wilson 95 % interval."""
-    n, p, z = x.size, float(np.mean(x)), 1.96
-    centre, half = p + z * z / (2 * n), z * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
-    scale = 1 + z * z / n
-    return {"value": p, "low": max(0.0, (centre - half) / scale),
-            "high": min(1.0, (centre + half) / scale)}
+    share = statistics.proportion(x)
+    return {"value": share["mean"], "low": share["low"], "high": share["high"]}
 
 
 def write_video(env: Environment, snapshots: Any, path: Path) -> Path:
@@ -162,6 +194,8 @@ class EvaluateArguments:
     """Physics backend."""
     chunk: int = 0
     """Episodes run side by side; 0 chooses by the device."""
+    seconds: float = 0.0
+    """Length of an evaluation episode; 0 for the task's own."""
     output: Path | None = None
     """File for the report as JSON."""
     video: Path | None = None
@@ -170,6 +204,8 @@ class EvaluateArguments:
     def __post_init__(self) -> None:
         if self.episodes < 1 or self.chunk < 0:
             raise ConfigError("--episodes must be at least 1 and --chunk at least 0")
+        if not (math.isfinite(self.seconds) and self.seconds >= 0):
+            raise ConfigError("--seconds must be a finite number of at least 0")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -181,6 +217,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     policy = load_policy(arguments.policy)
     chunk = min(arguments.chunk or (1024 if jax.default_backend() == "gpu" else 64),
                 arguments.episodes)
+    if arguments.seconds:
+        policy = dataclasses.replace(policy, env_config=policy.env_config | {
+            "evaluation_seconds": arguments.seconds})
     env = make_env(policy, backend=arguments.backend, num_envs=chunk)
     report, snapshots = Evaluator(env, chunk)(policy.params, episodes=arguments.episodes,
                                               seed=arguments.seed)

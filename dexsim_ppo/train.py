@@ -73,11 +73,12 @@ def parse_arguments(argv: list[str]) -> tuple[TrainArguments, checkpoint.Checkpo
         file = path if path.is_file() else RunFolder(path).latest_checkpoint()
         resumed = checkpoint.load(file, kind="train", task=known.task)
     task = resumed.task if resumed else known.task or "grasp"
-    config_class = cli.find_task(task).config_class
+    entry = cli.find_task(task)
+    config_class = entry.config_class
     if resumed:
         default = arguments_from_dict(config_class, resumed.content["arguments"])
     else:
-        default = preset_arguments(task, config_class, known.preset or "auto")
+        default = preset_arguments(task, entry.config(), known.preset or "auto")
     given = {argument.split("=")[0] for argument in argv}
     if "--steps" in given and "--minutes" not in given:
         default = dataclasses.replace(default, minutes=0.0)
@@ -86,13 +87,13 @@ def parse_arguments(argv: list[str]) -> tuple[TrainArguments, checkpoint.Checkpo
     return arguments, resumed
 
 
-def preset_arguments(task: str, config_class: type, name: str) -> TrainArguments:
+def preset_arguments(task: str, env_config: Any, name: str) -> TrainArguments:
     """The options' defaults under a preset."""
     if name == "auto":
         name = "gpu" if jax.default_backend() == "gpu" else "cpu"
     preset = PRESETS.get(name, PRESETS["cpu"])
     values = {f.name: getattr(preset, f.name) for f in dataclasses.fields(Preset)}
-    return TrainArguments(env=config_class(), task=task, **values)
+    return TrainArguments(env=env_config, task=task, **values)
 
 
 def arguments_from_dict(config_class: type, data: dict[str, Any]) -> TrainArguments:

@@ -1,7 +1,7 @@
 """What the tests share: the CPU unless asked otherwise, a compilation cache, environments.
 
 Set `DEXSIM_TEST_GPU=1` to run on the GPU (`pytest -m gpu` then runs the tests that need one), and
-`DEXSIM_CACHE` to keep XLA's compiled programs elsewhere than in `~/.cache/dexsim/xla`.
+`DEXSIM_CACHE` to keep compiled programs elsewhere than in `~/.cache/dexsim`.
 """
 
 import os
@@ -14,11 +14,11 @@ ON_GPU = os.environ.get("DEXSIM_TEST_GPU", "") not in ("", "0")
 # Through the environment and before JAX is imported: the programs that tests start inherit it.
 if not ON_GPU:
     os.environ["JAX_PLATFORMS"] = "cpu"
-_cache = os.environ.get("DEXSIM_CACHE") or str(Path.home() / ".cache" / "dexsim" / "xla")
-os.environ["JAX_COMPILATION_CACHE_DIR"] = _cache
+_cache = Path(os.environ.get("DEXSIM_CACHE") or Path.home() / ".cache" / "dexsim")
+os.environ["JAX_COMPILATION_CACHE_DIR"] = str(_cache / "xla")
 os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
 os.environ["JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES"] = "-1"
-os.environ.setdefault("WARP_CACHE_PATH", str(Path(_cache).parent / "warp"))
+os.environ.setdefault("WARP_CACHE_PATH", str(_cache / "warp"))
 os.environ.setdefault("MPLBACKEND", "agg")
 if not ON_GPU:
     # Halves the compilation of a physics step, which is most of what the suite does.

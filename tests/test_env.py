@@ -429,8 +429,8 @@ class TestReadings:
         force = jnp.zeros((5, 120)).at[2, 40:44].set(jnp.array([0.013, 0.4, 1.26, 0.02]))
         sample = dataclasses.replace(state.sample, taxel_force=force,
                                      joint_torque=jnp.linspace(-1, 1, 12))
-        readings = env._read(jax.random.key(1), sample, state.sample, state.draw, state.goal,
-                             jnp.zeros(12), jnp.zeros(3))
+        readings = env._read(jax.random.key(1), sample, state.sample, state.draw,
+                             state.orientation_sensor, state.goal, jnp.zeros(12))
         np.testing.assert_array_equal(readings.taxel_force, force)
         np.testing.assert_array_equal(readings.joint_torque, sample.joint_torque)
 

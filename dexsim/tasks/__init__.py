@@ -1,6 +1,7 @@
 """The tasks by name."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 from dexsim.errors import ConfigError
@@ -12,12 +13,22 @@ class TaskEntry:
 
     config_class: type
     task_class: type
+    config: Callable[[], Any]
+    """Makes the configuration that the name stands for."""
 
 
 def _tasks() -> dict[str, TaskEntry]:
+    from dexsim.tasks import rotate
     from dexsim.tasks.grasp import Grasp, GraspConfig
 
-    return {"grasp": TaskEntry(GraspConfig, Grasp)}
+    def rotation(config: Callable[[], Any]) -> TaskEntry:
+        return TaskEntry(rotate.RotateConfig, rotate.Rotate, config)
+
+    return {"grasp": TaskEntry(GraspConfig, Grasp, GraspConfig),
+            "rotate": rotation(rotate.RotateConfig),
+            "rotate_paper": rotation(rotate.paper),
+            "rotate_without_orientation": rotation(rotate.without_orientation),
+            "rotate_clear": rotation(rotate.clear_of_palm)}
 
 
 TASKS = _tasks()
@@ -29,7 +40,7 @@ def make(task: str, config: Any = None, *, backend: str = "auto", num_envs: int 
 
     Args:
       task: a name in `TASKS`.
-      config: the task's config dataclass; its defaults when None.
+      config: the task's config dataclass; what the name stands for when None.
       backend: physics, "auto", "jax" or "warp".
       num_envs: batch size that Warp's contact buffer is sized for.
       hand: a `Hand` from `load_hand`; the shipped one when None.
@@ -44,7 +55,7 @@ def make(task: str, config: Any = None, *, backend: str = "auto", num_envs: int 
     if task not in TASKS:
         raise ConfigError(f"unknown task {task!r}: choose from {', '.join(sorted(TASKS))}")
     entry = TASKS[task]
-    config = entry.config_class() if config is None else config
+    config = entry.config() if config is None else config
     if not isinstance(config, entry.config_class):
         raise ConfigError(f"task {task!r} takes a {entry.config_class.__name__}, "
                           f"not a {type(config).__name__}")

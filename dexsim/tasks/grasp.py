@@ -168,6 +168,7 @@ class Grasp:
 
     name = "grasp"
     slots = SLOTS
+    evaluation = "series"
     fields = {"actor": observation.GRASP, "critic": observation.GRASP}
     gravity = (9.81, 0.0, 0.0)  # upside down: the palm's normal points to the ground
     reference = (0.055, -0.005, 0.090)  # m, between palm and half-closed fingers
@@ -176,7 +177,7 @@ class Grasp:
         if len(config.posture) != hand.num_joints:
             raise ConfigError(f"GraspConfig.posture has {len(config.posture)} angles, "
                               f"the hand {hand.num_joints} joints")
-        self.config, self.hand = config, hand
+        self.config, self.hand, self.largest = config, hand, config.objects.largest
         self._roots = hand.root_joint
         self._max_torque = jnp.asarray(hand.torque_limit[hand.root_joint])
         self._finger_joints = flexion_joints(hand, range(1, hand.num_fingers))

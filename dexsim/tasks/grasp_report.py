@@ -3,6 +3,7 @@
 import numpy as np
 
 from dexsim.objects import SHAPES
+from dexsim.statistics import bootstrap, mean, proportion, statistic
 
 _SETTLE = 3.0  # s after release from which forces count
 
@@ -56,7 +57,7 @@ def summarize(metrics: dict[str, np.ndarray], alive: np.ndarray, control_period:
             "pearson_r": pearson(command[good], force[good]),
             "pearson_r_total": pearson(command[good], total[good]),
             "pearson_r_taxels": pearson(command[good], sensed[good]),
-            "rmse_n": rmse(force[good], wanted[good])})
+            "rmse_n": _rmse(force[good], wanted[good])})
 
     means = [row["total_force_n"]["mean"] for row in by_command]
     finger_means = [row["finger_force_n"]["mean"] for row in by_command]
@@ -68,7 +69,7 @@ def summarize(metrics: dict[str, np.ndarray], alive: np.ndarray, control_period:
         "held": proportion(held), "hold_time_s": mean(alive.sum(0) * control_period),
         "return": mean(returns), "pearson_r": pearson(command[held], force[held]),
         "pearson_r_total": pearson(command[held], total[held]),
-        "rmse_n": rmse(force[held], wanted[held]),
+        "rmse_n": _rmse(force[held], wanted[held]),
         "force_range": ratio, "total_force_monotone": monotone,
         "finger_force_by_command_n": finger_means, "total_force_by_command_n": means,
         "skin_correlation": _optional_pearson(metrics, alive),
@@ -94,33 +95,9 @@ def _optional_pearson(metrics: dict[str, np.ndarray], alive: np.ndarray) -> dict
     return pearson(metrics["skin_force"][keep], metrics["total_force"][keep], samples=0)
 
 
-def proportion(hits: np.ndarray) -> dict:
-    """Share of True with Wilson's 95 % interval."""
-    n = int(hits.size)
-    if n == 0:
-        return {"mean": None, "low": None, "high": None, "count": 0}
-    p, z = float(np.mean(hits)), 1.959964
-    middle = (p + z * z / (2 * n)) / (1 + z * z / n)
-    half = z * np.sqrt(p * (1 - p) / n + z * z / (4 * n * n)) / (1 + z * z / n)
-    return {"mean": p, "low": float(max(middle - half, 0.0)),
-            "high": float(min(middle + half, 1.0)), "count": n}
-
-
-def mean(values: np.ndarray, samples: int = 500) -> dict:
-    """Mean with a bootstrap 95 % interval."""
-    if values.size == 0:
-        return {"mean": None, "low": None, "high": None}
-    low, high = _bootstrap(lambda rows: values[rows].mean(), values.size, samples)
-    return {"mean": float(values.mean()), "low": low, "high": high}
-
-
-def rmse(values: np.ndarray, wanted: np.ndarray) -> dict:
+def _rmse(values: np.ndarray, wanted: np.ndarray) -> dict:
     """Root mean square error with a bootstrap 95 % interval."""
-    if values.size == 0:
-        return {"mean": None, "low": None, "high": None}
-    square = (values - wanted) ** 2
-    low, high = _bootstrap(lambda rows: np.sqrt(square[rows].mean()), values.size, 500)
-    return {"mean": float(np.sqrt(square.mean())), "low": low, "high": high}
+    return statistic((values - wanted) ** 2, lambda square: np.sqrt(square.mean()), "mean")
 
 
 def pearson(x: np.ndarray, y: np.ndarray, samples: int = 500) -> dict:
@@ -131,12 +108,5 @@ def pearson(x: np.ndarray, y: np.ndarray, samples: int = 500) -> dict:
 
     if x.size < 3 or x.std() == 0 or y.std() == 0:
         return {"r": None, "low": None, "high": None}
-    low, high = _bootstrap(correlate, x.size, samples) if samples else (None, None)
+    low, high = bootstrap(correlate, x.size, samples) if samples else (None, None)
     return {"r": correlate(slice(None)), "low": low, "high": high}
-
-
-def _bootstrap(statistic, count: int, samples: int) -> tuple[float, float]:
-    rng = np.random.default_rng(0)
-    draws = [statistic(rng.integers(0, count, count)) for _ in range(samples)]
-    low, high = np.nanpercentile(draws, [2.5, 97.5])
-    return float(low), float(high)

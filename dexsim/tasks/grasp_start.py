@@ -76,7 +76,7 @@ def _candidate(key: jax.Array, shape_index: jax.Array, hand: Hand, config: Any,
     gap = jax.random.uniform(keys[3], minval=config.release_gap[0], maxval=config.release_gap[1])
     shift = 0.01 * jax.random.uniform(keys[4], (2,), minval=-1.0)
     top = extent(target.size, target.position, target.active, up)
-    position = jnp.stack([_palm_height(hand) + gap + top, reference[1] + shift[0],
+    position = jnp.stack([palm_height(hand) + gap + top, reference[1] + shift[0],
                           reference[2] + shift[1]])
     speed = jax.random.uniform(keys[5], minval=config.release_speed[0],
                                maxval=config.release_speed[1])
@@ -86,7 +86,7 @@ def _candidate(key: jax.Array, shape_index: jax.Array, hand: Hand, config: Any,
     return start, clearance(hand, joints, target.shape(), position, matrix) > -_OVERLAP
 
 
-def _palm_height(hand: Hand) -> float:
+def palm_height(hand: Hand) -> float:
     """x of the palm's face."""
     palm = [g for g in hand.geoms if g.body == hand.body_names.index(hand.palm) and g.touches]
     faces = [g.position[0] for g in palm if g.kind == "plane"]

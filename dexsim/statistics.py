@@ -1,0 +1,47 @@
+"""Intervals for reports: proportions, means and other statistics over episodes (host, NumPy)."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+_Z = 1.959964  # 97.5 % quantile of the normal distribution
+
+
+def proportion(hits: np.ndarray) -> dict:
+    """Share of True among `hits` [N], with Wilson's 95 % interval."""
+    n = int(hits.size)
+    if n == 0:
+        return {"mean": None, "low": None, "high": None, "count": 0}
+    p = float(np.mean(hits))
+    scale = 1 + _Z * _Z / n
+    middle = (p + _Z * _Z / (2 * n)) / scale
+    half = _Z * np.sqrt(p * (1 - p) / n + _Z * _Z / (4 * n * n)) / scale
+    return {"mean": p, "low": float(max(middle - half, 0.0)),
+            "high": float(min(middle + half, 1.0)), "count": n}
+
+
+def mean(values: np.ndarray, samples: int = 500) -> dict:
+    """Mean of `values` [N] with a bootstrap 95 % interval."""
+    return statistic(values, np.mean, "mean", samples)
+
+
+def median(values: np.ndarray, samples: int = 500) -> dict:
+    """Median of `values` [N] with a bootstrap 95 % interval."""
+    return statistic(values, np.median, "median", samples)
+
+
+def statistic(values: np.ndarray, function: Callable, name: str, samples: int = 500) -> dict:
+    """`function` of `values` [N] under `name`, with a bootstrap 95 % interval."""
+    if values.size == 0:
+        return {name: None, "low": None, "high": None}
+    low, high = bootstrap(lambda rows: function(values[rows]), values.size, samples)
+    return {name: float(function(values)), "low": low, "high": high}
+
+
+def bootstrap(function: Callable[[np.ndarray], float], count: int,
+              samples: int) -> tuple[float, float]:
+    """The 95 % interval of `function(rows)` over resampled rows of `count`."""
+    rng = np.random.default_rng(0)
+    draws = [function(rng.integers(0, count, count)) for _ in range(samples)]
+    low, high = np.nanpercentile(draws, [2.5, 97.5])
+    return float(low), float(high)

@@ -1,0 +1,353 @@
+"""Rotate: turn an object in the palm-up hand by 90 degree goals about one axis, again and again.
+
+Reward and success follow the paper (section Task Setup). Its weights alone give a policy that bats
+the cube round, so the default configuration adds what makes a gait that a hand can follow: penalties
+on speed and torque, a reward for fingertips that take part, and a limit on the spin at which a goal
+counts. `paper()` is the paper's own configuration.
+"""
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dexsim import observation, rotations
+from dexsim.config import check_ranges, setting, validate
+from dexsim.env import Control, EnvConfig, Moment, Start
+from dexsim.errors import ConfigError
+from dexsim.hand import Hand
+from dexsim.objects import ObjectConfig, ObjectParams
+from dexsim.observation import ObservationConfig
+from dexsim.pytree import pytree_dataclass
+from dexsim.tasks.rotate_report import summarize
+from dexsim.tasks.rotate_start import KINDS, largest_size, load_pool, lowest_point, palm_height
+
+TOUCH = 0.1  # N, force from which a fingertip counts as touching
+_MEMORY = 2.0  # s, over which a fingertip's share of work is averaged
+_RECENT = 0.2  # s, a fingertip that touched within this time before a drop pushed the object out
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RotateReward:
+    """Weights of the reward terms, per control tick."""
+
+    goal: float = setting(1.0, unit="rad", low=0.0, high=1000.0)
+    """Close to goal: 1 / (d_rot + epsilon), gated by the distance from the reference."""
+    epsilon: float = setting(0.1, unit="rad", low=1e-3, high=10.0)
+    """Floor under the angle in it."""
+    gate: float = setting(0.05, unit="m", low=0.001, high=1.0)
+    """Distance from the reference at which the gate is half closed."""
+    gate_steepness: float = setting(400.0, unit="1/m", low=1.0, high=1e5)
+    """How sharply it closes."""
+    bonus: float = setting(250.0, unit="1", low=0.0, high=1e5)
+    """Once for each goal reached."""
+    action: float = setting(-0.02, unit="1", low=-1000.0, high=0.0)
+    """Squared change of the action."""
+    velocity: float = setting(-0.02, unit="s^2/rad^2", low=-1000.0, high=0.0)
+    """Squared joint velocity."""
+    torque: float = setting(-0.1, unit="1/Nm^2", low=-1000.0, high=0.0)
+    """Squared joint torque."""
+    spin: float = setting(0.5, unit="s/rad", low=0.0, high=1000.0)
+    """Spin about the axis in the wanted direction, up to +-1 rad/s: a gradient before the first
+    goal is ever reached."""
+    fingertips: float = setting(1.0, unit="1", low=0.0, high=1000.0)
+    """Share of `working_tips` fingertips that have done their share of touching lately."""
+    working_tips: int = setting(3, unit="1", low=1, high=20)
+    """Fingertips that are asked to take part."""
+    working_duty: float = setting(0.25, unit="1", low=0.001, high=1.0)
+    """Share of the time for which one has to touch to earn all of that."""
+    drop: float = setting(-50.0, unit="1", low=-10000.0, high=0.0)
+    """Once, when the object is lost."""
+
+    def __post_init__(self):
+        validate(self)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RotateConfig(EnvConfig):
+    """The rotation task."""
+
+    objects: ObjectConfig = setting(ObjectConfig(
+        shapes=("box",), mass=(0.06, 0.15), friction=(0.6, 1.2), com_offset=0.003))
+    """Mass, inertia, centre of mass, friction and contact of the object; its sizes are `edge`."""
+    control: Control = setting(Control(step=0.08))
+    """From action to joint target."""
+    object: str = setting("cube", choices=tuple(KINDS))
+    """What is turned: a cube, an upright cylinder, or an eight-cornered union of two boxes."""
+    edge: tuple[float, float] = setting((0.050, 0.060), unit="m", low=0.02, high=0.12)
+    """Edge of the cube; width and height of the others."""
+    axis: tuple[float, float, float] = setting((1.0, 0.0, 0.0), unit="1", low=-1.0, high=1.0)
+    """Axis of rotation in the palm frame; (1, 0, 0) is the palm's normal."""
+    direction: int = setting(1, unit="1", low=-1, high=1)
+    """+1 or -1: sense of rotation about the axis."""
+    goal_step: float = setting(math.pi / 2, unit="rad", low=0.1, high=math.pi)
+    """Angle between two goals."""
+    goal_angle: float = setting(0.3, unit="rad", low=0.01, high=1.5)
+    """A goal is reached within this angle ..."""
+    goal_distance: float = setting(0.05, unit="m", low=0.001, high=0.5)
+    """... this far from the reference ..."""
+    goal_spin: float = setting(2.0, unit="rad/s", low=0.0, high=1000.0)
+    """... at no more than this spin about the axis (0: any) ..."""
+    goal_dwell: float = setting(0.0, unit="s", low=0.0, high=10.0)
+    """... held for this long."""
+    support: str = setting("palm", choices=("palm", "fingers"))
+    """Carried by the palm, or held clear of it by the fingers: then touching the palm is a drop."""
+    tilt: float = setting(0.2, unit="rad", low=-1.2, high=1.2)
+    """The hand's nominal pitch: positive lets the object slide toward the wrist."""
+    reference: tuple[float, float, float] = setting((0.047, 0.0, 0.071), unit="m", low=-0.5,
+                                                    high=0.5)
+    """Where the object belongs."""
+    drop_distance: float = setting(0.09, unit="m", low=0.01, high=1.0)
+    """The object is lost when its centre is farther than this from the reference."""
+    clearance: float = setting(0.001, unit="m", low=0.0, high=0.05)
+    """Smallest gap between palm and object with support "fingers"."""
+    episode_seconds: float = setting(60.0, unit="s", low=0.2, high=3600.0)
+    """Time limit of a training episode."""
+    evaluation_seconds: float = setting(120.0, unit="s", low=0.2, high=3600.0)
+    """Length of an evaluation episode."""
+    push_probability: float = setting(0.005, unit="1", low=0.0, high=1.0)
+    """Probability per tick of a push on the object."""
+    push_speed: float = setting(0.1, unit="m/s", low=0.0, high=5.0)
+    """Largest change of the object's speed by a push."""
+    posture: tuple[float, ...] = setting(
+        (1.0, 0.2, 0.3, 0.0, 0.8, 0.5, 0.8, 0.5, 0.8, 0.5, 0.8, 0.5), unit="rad",
+        low=-3.2, high=3.2)
+    """Joint angles that episodes start near."""
+    posture_noise: float = setting(0.15, unit="rad", low=0.0, high=1.0)
+    """Largest deviation from them."""
+    curl: tuple[float, float] = setting((0.0, 0.0), unit="rad", low=-2.0, high=2.0)
+    """Added to all joints of the four fingers alike."""
+    squeeze: tuple[float, float] = setting((0.0, 0.0), unit="rad", low=-1.0, high=1.0)
+    """How far the joint targets of thumb and fingers lie beyond that posture: the grip."""
+    heading_noise: float = setting(0.3, unit="rad", low=0.0, high=math.pi)
+    """Largest turn of the object about the axis at the start."""
+    place_noise: float = setting(0.006, unit="m", low=0.0, high=0.05)
+    """Largest shift of the object along the palm at the start."""
+    settle_seconds: float = setting(0.8, unit="s", low=0.05, high=10.0)
+    """Time that start states are given to come to rest; those that do not are left out."""
+    reward: RotateReward = setting(RotateReward())
+    """Reward weights."""
+
+    def __post_init__(self):
+        validate(self)
+        check_ranges(self, "edge", "curl", "squeeze")
+        if self.direction == 0:
+            raise ConfigError("RotateConfig.direction = 0: must be +1 or -1")
+        if np.linalg.norm(self.axis) < 1e-6:
+            raise ConfigError("RotateConfig.axis is (0, 0, 0): give a direction")
+
+
+def paper() -> RotateConfig:
+    """The paper's own weights and success test."""
+    return RotateConfig(
+        goal_spin=0.0, control=Control(step=0.3),
+        reward=RotateReward(action=-0.0002, velocity=0.0, torque=0.0, spin=0.0, fingertips=0.0,
+                            drop=0.0))
+
+
+def without_orientation() -> RotateConfig:
+    """The paper's second policy: the object's orientation is not observed."""
+    return RotateConfig(observation=ObservationConfig(leave_out=("relative_orientation",)))
+
+
+def clear_of_palm() -> RotateConfig:
+    """The object held clear of the palm by thumb and fingers, which point downhill."""
+    return RotateConfig(
+        support="fingers", tilt=-0.6, reference=(0.058, 0.0, 0.086), squeeze=(0.1, 0.4),
+        posture=(1.2, 0.4, 0.4, 0.0, 0.6, 0.5, 0.6, 0.5, 0.6, 0.5, 0.6, 0.5), posture_noise=0.25,
+        curl=(-0.2, 0.2))
+
+
+@pytree_dataclass
+class Goal:
+    """The target, and what has happened since the episode began."""
+
+    turns: jax.Array  # [] int32 goals reached
+    entered: jax.Array  # [] bool, inside the paper's window since this goal was set
+    entries: jax.Array  # [] int32 goals reached as the paper counts
+    dwell: jax.Array  # [] s inside the window
+    clock: jax.Array  # [] s
+    last_success: jax.Array  # [] s, clock at the last goal
+    duty: jax.Array  # [F] share of time touching, lately
+    since_touch: jax.Array  # [] s since any fingertip touched
+    totals: dict[str, jax.Array]  # sums over ticks
+
+
+@pytree_dataclass
+class Progress:
+    """What a tick did for the goal."""
+
+    angle: jax.Array  # [] rad, from the target orientation
+    distance: jax.Array  # [] m, from the reference
+    spin: jax.Array  # [] rad/s about the axis, positive in the wanted direction
+    entered: jax.Array  # [] bool
+    dwell: jax.Array  # [] s
+    success: jax.Array  # [] bool
+
+
+# --- small pure functions ----------------------------------------------------------------------
+
+def goal_quat(turns: jax.Array, axis: jax.Array, angle: jax.Array) -> jax.Array:
+    """Orientation [4] of the goal after `turns` goals: (turns + 1) steps of `angle` about `axis`."""
+    # Angles are taken modulo a full turn, so that single precision lasts for any number of goals.
+    total = jnp.remainder((turns + 1) * angle, 2 * jnp.pi)
+    return rotations.axis_angle_to_quat(axis, total)
+
+
+def goal_reward(angle: jax.Array, distance: jax.Array, weights: RotateReward) -> jax.Array:
+    """1 / (|d_rot| + epsilon) / (1 + exp(400 (d_goal - 0.05)))."""
+    gate = jax.nn.sigmoid(weights.gate_steepness * (weights.gate - distance))
+    return gate / (jnp.abs(angle) + weights.epsilon)
+
+
+def tips_at_work(duty: jax.Array, count: int, enough: float) -> jax.Array:
+    """Mean over the `count` busiest fingertips of min(duty / enough, 1)."""
+    busiest = jnp.sort(duty)[::-1][:count]
+    return jnp.sum(jnp.minimum(busiest / enough, 1.0)) / count
+
+
+class Rotate:
+    """The rules of the task, for `dexsim.env.Env`."""
+
+    name = "rotate"
+    fields = {"actor": observation.ROTATE, "critic": observation.ROTATE_CRITIC}
+    evaluation = "totals"
+
+    def __init__(self, config: RotateConfig, hand: Hand):
+        if len(config.posture) != hand.num_joints:
+            raise ConfigError(f"RotateConfig.posture has {len(config.posture)} angles, "
+                              f"the hand {hand.num_joints} joints")
+        self.config, self.hand = config, hand
+        self.slots = KINDS[config.object]
+        self.largest = largest_size(config)
+        # Palm up; the tilt lowers the wrist.
+        self.gravity = (-9.81 * math.cos(config.tilt), 0.0, -9.81 * math.sin(config.tilt))
+        self.reference, self._palm = config.reference, palm_height(hand)
+        self._axis = jnp.asarray(config.axis) / np.linalg.norm(config.axis)
+        self._step = config.direction * config.goal_step
+        self._period = config.physics.control_period
+        self.episode_ticks = max(round(config.episode_seconds / self._period), 1)
+        self.evaluation_ticks = max(round(config.evaluation_seconds / self._period), 1)
+
+    def make_pool(self, key: jax.Array) -> Start:
+        """Objects that came to rest in random postures of the hand; see `rotate_start`."""
+        return load_pool(key, self.hand, self.config, self.gravity)
+
+    def begin(self, key: jax.Array, start: Start) -> Goal:
+        del key, start
+        zero, none = jnp.zeros(()), jnp.zeros((), jnp.int32)
+        fingers = jnp.zeros(self.hand.num_fingers)
+        return Goal(turns=none, entered=jnp.zeros((), bool), entries=none, dwell=zero, clock=zero,
+                    last_success=zero, duty=fingers, since_touch=jnp.full((), 10.0),
+                    totals={"spin": zero, "joint_speed": zero, "action_rate": zero,
+                            "tilt": zero, "touch": fingers})
+
+    def progress(self, goal: Goal, moment: Moment) -> Progress:
+        """Where the object is with respect to the goal."""
+        config = self.config
+        angle = rotations.quat_angle(self._quat(goal), moment.object_quat)
+        distance = jnp.linalg.norm(moment.object_position - jnp.asarray(self.reference))
+        spin = config.direction * jnp.sum(moment.object_spin * self._axis)
+        inside = (angle < config.goal_angle) & (distance < config.goal_distance)
+        calm = jnp.abs(spin) <= config.goal_spin if config.goal_spin > 0 else True
+        dwell = jnp.where(inside, goal.dwell + self._period, 0.0)
+        success = inside & calm & (dwell >= config.goal_dwell)
+        return Progress(angle, distance, spin, goal.entered | inside, dwell, success)
+
+    def update(self, key: jax.Array, goal: Goal, moment: Moment) -> Goal:
+        del key
+        now, period = self.progress(goal, moment), self._period
+        touching = self._touching(moment)
+        clock = goal.clock + period
+        up = rotations.rotate(rotations.quat_to_matrix(moment.object_quat), self._axis)
+        change = {"spin": now.spin, "joint_speed": jnp.mean(jnp.abs(moment.joint_velocity)),
+                  "action_rate": jnp.mean(jnp.abs(moment.action - moment.last_action)),
+                  "tilt": jnp.arccos(jnp.clip(jnp.sum(up * self._axis), -1.0, 1.0)),
+                  "touch": touching}
+        return Goal(
+            turns=goal.turns + now.success, entered=now.entered & ~now.success,
+            entries=goal.entries + (now.entered & ~goal.entered),
+            dwell=jnp.where(now.success, 0.0, now.dwell), clock=clock,
+            last_success=jnp.where(now.success, clock, goal.last_success),
+            duty=goal.duty + period / _MEMORY * (touching - goal.duty),
+            since_touch=jnp.where(jnp.any(touching > 0), 0.0, goal.since_touch + period),
+            totals={name: goal.totals[name] + change[name] for name in goal.totals})
+
+    def goal_readings(self, goal: Goal) -> tuple[jax.Array, jax.Array]:
+        """Command (unused) and target orientation, as `Readings` carry them."""
+        return jnp.zeros(()), self._quat(goal)
+
+    def target_force(self, goal: Goal) -> jax.Array:
+        """No force is asked for."""
+        del goal
+        return jnp.zeros(())
+
+    def push(self, key: jax.Array, target: ObjectParams) -> jax.Array:
+        """Force [3] N that changes the object's velocity by up to `push_speed` in one tick."""
+        when, where, strength = jax.random.split(key, 3)
+        direction = jax.random.normal(where, (3,))
+        direction = direction / (jnp.linalg.norm(direction) + 1e-9)
+        speed = self.config.push_speed * jax.random.uniform(strength)
+        hit = jax.random.bernoulli(when, self.config.push_probability)
+        return jnp.where(hit, target.mass * speed / self._period, 0.0) * direction
+
+    def dropped(self, goal: Goal, moment: Moment) -> jax.Array:
+        del goal
+        away = jnp.linalg.norm(moment.object_position - jnp.asarray(self.reference))
+        lost = away > self.config.drop_distance
+        if self.config.support == "fingers":
+            low = lowest_point(moment.target, moment.object_quat, moment.object_position)
+            lost |= low < self._palm + self.config.clearance
+        return lost
+
+    def reward(self, goal: Goal, moment: Moment,
+               dropped: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """The reward of a tick and its terms; nothing but penalties once dropped."""
+        weights, now, held = self.config.reward, self.progress(goal, moment), 1.0 - dropped
+        after = self.update(jax.random.key(0), goal, moment)
+        terms = {
+            "goal": held * weights.goal * goal_reward(now.angle, now.distance, weights),
+            "bonus": held * weights.bonus * now.success,
+            "spin": held * weights.spin * jnp.clip(now.spin, -1.0, 1.0),
+            "fingertips": held * weights.fingertips * tips_at_work(
+                after.duty, weights.working_tips, weights.working_duty),
+            "action": weights.action * jnp.sum((moment.action - moment.last_action) ** 2),
+            "velocity": weights.velocity * jnp.sum(moment.joint_velocity**2),
+            "torque": weights.torque * jnp.sum(moment.joint_torque**2),
+            "drop": weights.drop * dropped,
+        }
+        ticks = jnp.maximum(after.clock / self._period, 1.0)
+        mean = {name: total / ticks for name, total in after.totals.items()}
+        turns, recent = after.turns.astype(jnp.float32), after.since_touch <= _RECENT
+        return sum(terms.values()), {
+            **{f"reward/{name}": value for name, value in terms.items()},
+            "goals_per_minute": turns / jnp.maximum(after.clock, self._period) * 60.0,
+            "successes": turns, "paper_successes": after.entries.astype(jnp.float32),
+            "time_at_last_success": after.last_success,
+            "angle_error": now.angle, "distance": now.distance,
+            "pushed_out": (dropped & recent).astype(jnp.float32),
+            "slipped": (dropped & ~recent).astype(jnp.float32),
+            "spin": mean["spin"], "joint_speed": mean["joint_speed"],
+            "action_rate": mean["action_rate"], "tilt": mean["tilt"],
+            "taxel_force": jnp.sum(moment.touch.force),
+            **{f"duty/{i}": mean["touch"][i] for i in range(self.hand.num_fingers)},
+        }
+
+    def _quat(self, goal: Goal) -> jax.Array:
+        return goal_quat(goal.turns, self._axis, self._step)
+
+    def _touching(self, moment: Moment) -> jax.Array:
+        return (jnp.linalg.norm(moment.finger_force, axis=-1) > TOUCH).astype(jnp.float32)
+
+    # --- evaluation ------------------------------------------------------------------------
+
+    def evaluation_plan(self, count: int, shape_index: np.ndarray) -> tuple[np.ndarray, None]:
+        """Rows [count] of the pool, evenly spread over it."""
+        return np.linspace(0, len(shape_index) - 1, count).round().astype(int), None
+
+    def summarize(self, metrics: dict[str, np.ndarray], lived: np.ndarray,
+                  control_period: float) -> dict:
+        """The report of an evaluation; see `rotate_report`."""
+        return summarize(metrics, lived, control_period, self.evaluation_ticks)

@@ -1,0 +1,250 @@
+"""Start states of the rotation task: objects that came to rest in random postures of the hand.
+
+Settling runs in C MuJoCo on the host's cores, once: it needs no compilation, and the pool is kept on
+disk under the hash of the hand's files and the configuration. Training never waits for it again.
+"""
+
+import dataclasses
+import functools
+import hashlib
+import json
+import os
+import tempfile
+import zipfile
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from dexsim import rotations
+from dexsim.assets import cache_path
+from dexsim.config import to_dict
+from dexsim.errors import ConfigError
+from dexsim.hand import Hand, flexion_joints
+from dexsim.objects import SHAPES, ObjectParams, sample_object
+from dexsim.physics import build_model
+from dexsim.tasks.grasp_start import clearance, palm_height
+
+KINDS = {"cube": ("box",), "cylinder": ("cylinder",), "octagon": ("box", "box")}
+"""Objects that can be turned, and the primitives each consists of."""
+_SHAPE_INDEX = {"cube": "box", "cylinder": "cylinder", "octagon": "composition"}
+_UPRIGHT = (np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0)  # takes a cylinder's axis to the palm's normal
+_EIGHTH = (np.cos(np.pi / 8), np.sin(np.pi / 8), 0.0, 0.0)  # 45 degrees about the palm's normal
+_VERSION = 1  # of the procedure: raise it when older pools no longer hold
+_AT_REST = (0.05, 1.0)  # m/s, rad/s
+_LEVEL = 0.35  # rad, largest angle from upright
+
+
+def largest_size(config: Any) -> np.ndarray:
+    """Upper bound [K, 3] m of each slot's size."""
+    half = config.edge[1] / 2
+    return np.full((len(KINDS[config.object]), 3), half)
+
+
+def sample_target(key: jax.Array, config: Any) -> ObjectParams:
+    """Draw one object."""
+    edge_key, base_key, scale_key = jax.random.split(key, 3)
+    kinds = KINDS[config.object]
+    base = sample_object(base_key, config.objects, jnp.int32(SHAPES.index("box")))
+    half = jax.random.uniform(edge_key, minval=config.edge[0], maxval=config.edge[1]) / 2
+    low, high = config.objects.inertia_scale
+    scale = base.mass * jax.random.uniform(scale_key, minval=low, maxval=high)
+    if config.object == "cube":
+        quat, inertia = None, jnp.full(3, 2 / 3) * half**2
+    else:  # round about the palm's normal: the octagon as the cylinder between its circles
+        radius = half if config.object == "cylinder" else 1.05 * half
+        across = radius**2 / 4 + half**2 / 3
+        inertia = jnp.stack([radius**2 / 2, across, across])
+        turns = {"cylinder": [_UPRIGHT], "octagon": [(1.0, 0.0, 0.0, 0.0), _EIGHTH]}
+        quat = jnp.array(turns[config.object], jnp.float32)
+    size = jnp.full((len(kinds), 3), half)
+    return dataclasses.replace(
+        base, shape_index=jnp.int32(SHAPES.index(_SHAPE_INDEX[config.object])),
+        size=size, position=jnp.zeros((len(kinds), 3)), active=jnp.ones(len(kinds), bool),
+        inertia=scale * inertia, quat=quat, kinds=kinds)
+
+
+def lowest_point(target: ObjectParams, quat: jax.Array, position: jax.Array) -> jax.Array:
+    """Smallest coordinate [] m of the object along the palm's normal (x)."""
+    down = rotations.rotate_inverse(rotations.quat_to_matrix(quat), jnp.array([-1.0, 0.0, 0.0]))
+    reach = []
+    for k, kind in enumerate(target.kinds):
+        local = down if target.quat is None else rotations.rotate_inverse(
+            rotations.quat_to_matrix(target.quat[k]), down)
+        size, part = target.size[k], jnp.abs(local)
+        if kind == "box":
+            far = jnp.sum(part * size)
+        else:
+            far = size[0] * jnp.sqrt(jnp.maximum(1 - part[2] ** 2, 0.0)) + size[1] * part[2]
+        reach.append(far + jnp.sum(down * target.position[k]))
+    return position[0] - jnp.max(jnp.stack(reach))
+
+
+# --- the pool -----------------------------------------------------------------------------------
+
+def load_pool(key: jax.Array, hand: Hand, config: Any, gravity: tuple[float, float, float]) -> Any:
+    """The pool of start states, from disk if it has been made before.
+
+    Raises:
+      ConfigError: next to nothing stays in the hand.
+    """
+    from dexsim.env import Start
+
+    path = cache_path("pools") / f"rotate-{_fingerprint(key, hand, config)}.npz"
+    template = jax.eval_shape(lambda: sample_target(key, config))
+    leaves, structure = jax.tree.flatten(template)
+    stored = _read(path, len(leaves))
+    if stored is None:
+        stored = _make(key, hand, config, gravity)
+        _write(path, stored)
+    qpos, qvel, joint_target, *rows = stored
+    return Start(qpos, qvel, jax.tree.unflatten(structure, rows), joint_target)
+
+
+def _fingerprint(key: jax.Array, hand: Hand, config: Any) -> str:
+    """What the pool depends on; rewards, sensing and observation do not belong to it."""
+    settings = to_dict(config)
+    for name in ("reward", "sensing", "observation", "skin", "control", "touch", "randomization",
+                 "goal_step", "goal_angle", "goal_distance", "goal_spin", "goal_dwell",
+                 "episode_seconds", "evaluation_seconds", "push_probability", "push_speed"):
+        settings.pop(name, None)
+    digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode())
+    digest.update(hand.model_path.read_bytes())
+    digest.update(np.asarray(jax.random.key_data(key)).tobytes())
+    digest.update(f"{_VERSION} {mujoco.__version__}".encode())
+    return digest.hexdigest()[:16]
+
+
+def _read(path: Path, count: int) -> list[np.ndarray] | None:
+    """The arrays of a pool file; None if it is missing, damaged or of another layout."""
+    try:
+        with np.load(path) as file:
+            return [file[f"a{i}"] for i in range(count + 3)]
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return None
+
+
+def _write(path: Path, arrays: list[np.ndarray]) -> None:
+    """Write whole or not at all; a cache that cannot be written is no error."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".npz", delete=False) as file:
+            np.savez(file, **{f"a{i}": a for i, a in enumerate(arrays)})
+        os.replace(file.name, path)
+    except OSError:
+        pass
+
+
+def _make(key: jax.Array, hand: Hand, config: Any,
+          gravity: tuple[float, float, float]) -> list[np.ndarray]:
+    """Settle candidates until the pool is full: qpos, qvel, joint targets, object leaves."""
+    draw = jax.jit(jax.vmap(lambda k: _candidate(k, hand, config)))
+    chunk, threads = 512, os.cpu_count() or 1
+    kept, found, tried = [], 0, 0
+    with ThreadPoolExecutor(threads) as pool:
+        models = [_model(hand, config, gravity) for _ in range(threads)]
+        while found < config.pool_size:
+            candidates = jax.device_get(draw(jax.random.split(jax.random.fold_in(key, tried),
+                                                              chunk)))
+            rows = np.arange(chunk)[candidates["clear"]]
+            parts = [rows[i::threads] for i in range(threads)]
+            settle = functools.partial(_settle, hand=hand, config=config, candidates=candidates)
+            settled = list(pool.map(settle, models, parts))
+            good, qpos = (np.concatenate(x) for x in zip(*settled, strict=True))
+            order = np.argsort(good)
+            good, qpos = good[order], qpos[order]
+            kept.append([qpos, np.zeros((len(good), hand.num_joints + 6), np.float32),
+                         candidates["joint_target"][good],
+                         *(leaf[good] for leaf in jax.tree.leaves(candidates["target"]))])
+            found, tried = found + len(good), tried + 1
+            if tried >= 8 and found < tried * chunk / 200:
+                raise ConfigError(f"RotateConfig: only {found} of {tried * chunk} start states "
+                                  "stayed in the hand; change posture, tilt, edge or support")
+    return [np.concatenate(x)[:config.pool_size] for x in zip(*kept, strict=True)]
+
+
+def _candidate(key: jax.Array, hand: Hand, config: Any) -> dict[str, Any]:
+    """An object just above where it will rest, in a random posture."""
+    keys = jax.random.split(key, 6)
+    target = sample_target(keys[0], config)
+    noise = config.posture_noise * jax.random.uniform(keys[1], (hand.num_joints,), minval=-1.0)
+    flexion = np.zeros(hand.num_joints, np.float32)
+    flexion[flexion_joints(hand, range(1, hand.num_fingers))] = 1.0
+    curl = jax.random.uniform(keys[4], minval=config.curl[0], maxval=config.curl[1])
+    joints = jnp.clip(jnp.asarray(config.posture) + noise + curl * flexion, hand.joint_lower,
+                      hand.joint_upper)
+    heading = config.heading_noise * jax.random.uniform(keys[2], minval=-1.0)
+    quat = rotations.axis_angle_to_quat(jnp.array([1.0, 0.0, 0.0]), heading)
+    shift = config.place_noise * jax.random.uniform(keys[3], (2,), minval=-1.0)
+    place = jnp.asarray(config.reference) + jnp.concatenate([jnp.zeros(1), shift])
+    if config.support == "palm":
+        floor = palm_height(hand) + 0.001 - lowest_point(target, quat, jnp.zeros(3))
+        place = place.at[0].set(floor)
+    overlap = clearance(hand, joints, target.shape(), place, rotations.quat_to_matrix(quat))
+    squeeze = jax.random.uniform(keys[5], minval=config.squeeze[0], maxval=config.squeeze[1])
+    closed = np.array(flexion)
+    closed[flexion_joints(hand, range(1))] = 1.0
+    joint_target = jnp.clip(joints + squeeze * closed, hand.joint_lower, hand.joint_upper)
+    return {"qpos": jnp.concatenate([joints, place, quat]), "joint_target": joint_target,
+            "target": target, "clear": overlap > -0.001}
+
+
+def _model(hand: Hand, config: Any, gravity: tuple[float, float, float]) -> mujoco.MjModel:
+    """The scene in C, with springs at the joints for the motors."""
+    model = build_model(hand, KINDS[config.object], largest_size(config), config.physics, gravity,
+                        "jax")
+    dofs = [model.joint(name).dofadr[0] for name in hand.joint_names]
+    model.jnt_stiffness[[model.joint(name).id for name in hand.joint_names]] = \
+        config.randomization.stiffness
+    model.dof_damping[dofs] += config.randomization.damping
+    # C MuJoCo takes shortcuts for frames that coincided when it compiled; sizes change here.
+    model.geom_sameframe[:] = model.body_sameframe[:] = 0
+    return model
+
+
+def _settle(model: mujoco.MjModel, rows: np.ndarray, *, hand: Hand, config: Any,
+            candidates: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    """Rows that came to rest where they belong, and their qpos."""
+    data, target = mujoco.MjData(model), candidates["target"]
+    geoms = [model.geom(f"object_{k}").id for k in range(len(target.kinds))]
+    body = model.body("object").id
+    springs = [model.joint(name).qposadr[0] for name in hand.joint_names]
+    pairs = np.isin(model.pair_geom1, geoms) | np.isin(model.pair_geom2, geoms)
+    ticks = max(round(config.settle_seconds / model.opt.timestep), 1)
+    good, kept = [], []
+    for row in rows:
+        model.geom_size[geoms] = target.size[row]
+        model.geom_pos[geoms] = target.position[row]
+        if target.quat is not None:
+            model.geom_quat[geoms] = target.quat[row]
+        model.body_mass[body], model.body_inertia[body] = target.mass[row], target.inertia[row]
+        model.body_ipos[body] = target.com[row]
+        model.pair_friction[pairs, :2] = target.friction[row]
+        mujoco.mj_resetData(model, data)
+        data.qpos[:] = candidates["qpos"][row]
+        model.qpos_spring[springs] = candidates["joint_target"][row]
+        mujoco.mj_step(model, data, ticks)
+        if _stays(model, hand, config, data):
+            good.append(row)
+            kept.append(data.qpos.astype(np.float32))
+    return np.array(good, int), np.reshape(np.array(kept, np.float32), (len(kept), model.nq))
+
+
+def _stays(model: mujoco.MjModel, hand: Hand, config: Any, data: mujoco.MjData) -> bool:
+    free = model.joint("object")
+    place = data.qpos[free.qposadr[0]:][:7]
+    motion = data.qvel[free.dofadr[0]:][:6]
+    upright = np.empty(9)
+    mujoco.mju_quat2Mat(upright, place[3:])
+    tilt = np.arccos(np.clip(upright[0], -1.0, 1.0))
+    near = np.linalg.norm(place[:3] - config.reference) < 0.6 * config.goal_distance
+    rest = (np.linalg.norm(motion[:3]) < _AT_REST[0]) & (np.linalg.norm(motion[3:]) < _AT_REST[1])
+    sound = np.all(np.isfinite(data.qpos)) and not np.any(data.warning.number)
+    if config.support == "fingers":
+        palm = model.body(hand.palm).id
+        sound &= not any(palm in model.geom_bodyid[c.geom] for c in data.contact)
+    return bool(near and rest and sound and tilt < _LEVEL)
