@@ -1,0 +1,361 @@
+"""The hand behind a serial port: one request, one answer, a deadline, and a count of everything.
+
+`SerialHand` speaks `dexsim_real.frames` over pyserial, to a USB adapter or to a pseudo-terminal.
+Whatever else can move a hand (a vendor's SDK that the user has installed) needs only `HandPort`'s few
+methods; see `open_port`.
+"""
+
+import contextlib
+import dataclasses
+import errno
+import grp
+import importlib
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from dexsim.config import check_ranges, setting, validate
+from dexsim.errors import DexsimError
+from dexsim_real import frames
+from dexsim_real.frames import Command, Frame, Mode
+
+BITS_PER_BYTE = 10  # 8N1
+_POLL = 0.002  # s, longest wait of one read
+
+
+class HandError(DexsimError):
+    """The hand cannot be reached, or not used as asked."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class LinkConfig:
+    """The serial line."""
+
+    baud: int = setting(3_000_000, unit="1/s", low=1200, high=20_000_000)
+    """Bits per second."""
+    hand_id: int = setting(0, unit="1", low=0, high=125)
+    """Id of the hand; its palm board answers at 0x80 + id."""
+    margin: float = setting(0.020, unit="s", low=0.0005, high=5.0)
+    """Time that an answer may take beyond its time on the wire. A USB adapter with its latency
+    timer at 16 ms needs most of this."""
+    settle: float = setting(1.0, unit="s", low=0.0, high=30.0)
+    """Pause after opening: the firmware answers damaged frames before."""
+    handshake: float = setting(1.0, unit="s", low=0.01, high=60.0)
+    """How long the hand is asked before it counts as silent."""
+    backoff: tuple[float, float] = setting((0.1, 3.0), unit="s", low=0.001, high=600.0)
+    """First and longest pause between attempts to reconnect; each is twice the one before."""
+
+    def __post_init__(self):
+        validate(self)
+        check_ranges(self, "backoff")
+
+    def deadline(self, request: int, reply: int) -> float:
+        """Seconds from sending `request` bytes until `reply` bytes must have come."""
+        return (request + reply) * BITS_PER_BYTE / self.baud + self.margin
+
+
+@dataclasses.dataclass
+class LinkCounts:
+    """Every request ends as exactly one of answered, corrupt, silent, refused or lost."""
+
+    sent: int = 0
+    answered: int = 0
+    corrupt: int = 0  # bytes came, but no sound answer
+    silent: int = 0  # nothing came in time
+    refused: int = 0  # the hand answered with an error
+    lost: int = 0  # the port failed
+    late: int = 0  # answers that came after their deadline and were thrown away
+    crc_errors: int = 0
+    resyncs: int = 0
+    reconnects: int = 0
+
+
+@dataclasses.dataclass(frozen=True)
+class Reply:
+    """An answered exchange."""
+
+    state: np.ndarray  # `frames.STATE_BLOCK`
+    sent: float  # s, monotonic clock
+    received: float  # s
+    sequence: int  # of this exchange since the port was made
+    generation: int  # handshakes so far: another number means that the hand was away
+
+
+class HandPort(Protocol):
+    """What the bridge needs of a hand. `exchange` is called from one thread only."""
+
+    counts: LinkCounts
+
+    def connect(self) -> str:
+        """Open, greet, and say in one line what was found. Motors stay off.
+
+        Raises:
+          HandError: what is wrong, and what helps.
+        """
+        ...
+
+    def exchange(self, command: np.ndarray) -> Reply | None:
+        """Send joint commands (`frames.COMMAND_BLOCK`); None when no sound answer came in time.
+
+        Never raises for trouble on the line. After a reconnection the command given is not sent:
+        the first reply of a new generation comes from a passive hand.
+        """
+        ...
+
+    def close(self) -> None: ...
+
+
+def passive_command() -> np.ndarray:
+    """Joint commands that leave all motors off."""
+    return frames.command_block(np.zeros(frames.JOINTS), kp=0, ki=0, kd=0, torque_max=0,
+                                mode=Mode.PASSIVE)
+
+
+class SerialHand:
+    """`HandPort` over a serial port.
+
+    Args:
+      port: device, by-id link, pseudo-terminal or pyserial URL.
+      tap: called with ("tx" or "rx", bytes) for every frame, from the thread that exchanges.
+    """
+
+    def __init__(self, port: str, config: LinkConfig | None = None, *,
+                 tap: Callable[[str, bytes], None] | None = None):
+        self.port, self.config = port, config or LinkConfig()
+        self.counts = LinkCounts()
+        self._tap = tap or (lambda direction, data: None)
+        self._serial: Any = None
+        self._parser = frames.Parser(frames.HAND_REPLIES)
+        self._received = 0  # bytes since the port was opened
+        self._generation = 0
+        self._first: Reply | None = None
+        self._retry_at, self._pause = 0.0, self.config.backoff[0]
+
+    def connect(self) -> str:
+        self._open()
+        try:
+            time.sleep(self.config.settle)
+            version = self._greet(self.config.handshake)
+        except HandError:
+            self.close()
+            raise
+        except OSError as error:
+            self.close()
+            raise HandError(f"{self.port}: failed while greeting the hand ({error})") from None
+        return f"{self.port}: hand {self.config.hand_id}, firmware {version}"
+
+    def exchange(self, command: np.ndarray) -> Reply | None:
+        if self._serial is None:
+            return self._reconnect()
+        try:
+            return self._exchange(command)
+        except OSError:  # pyserial's errors are.
+            self.counts.lost += 1
+            self._drop()
+            return None
+
+    def close(self) -> None:
+        if self._serial is not None:
+            with contextlib.suppress(OSError):
+                self._serial.close()
+            self._serial = None
+
+    def warnings(self) -> list[str]:
+        """What slows this port down, with the remedy."""
+        return latency_warnings(self.port)
+
+    # --- one exchange ---------------------------------------------------------------------
+
+    def _exchange(self, command: np.ndarray) -> Reply | None:
+        data = command.tobytes()
+        frame, sent = self._request(Command.EXCHANGE, data, frames.STATE_BLOCK.itemsize)
+        if frame is None:
+            return None
+        try:
+            state = frames.decode_state(frame.data)
+        except frames.FrameError:
+            self.counts.answered -= 1
+            self.counts.corrupt += 1
+            return None
+        return Reply(state, sent, time.monotonic(), self.counts.sent, self._generation)
+
+    def _request(self, command: Command, data: bytes, reply: int) -> tuple[Frame | None, float]:
+        """Send and wait for the answer to this command; and when it was sent."""
+        self._discard()
+        request = Frame(frames.HOST, frames.palm_address(self.config.hand_id), command, data).encode()
+        self.counts.sent += 1
+        self._tap("tx", request)
+        sent, before = time.monotonic(), self._received
+        self._serial.write(request)
+        deadline = sent + self.config.deadline(len(request), frames.OVERHEAD + reply)
+        answer = self._wait(command, deadline)
+        self.counts.crc_errors = self._parser.counts.crc_errors
+        self.counts.resyncs = self._parser.counts.resyncs
+        if answer is None:
+            self.counts.corrupt += self._received > before
+            self.counts.silent += self._received == before
+        elif answer.command == Command.ERROR:
+            self.counts.refused += 1
+            answer = None
+        else:
+            self.counts.answered += 1
+        return answer, sent
+
+    def _wait(self, command: Command, deadline: float) -> Frame | None:
+        final = False
+        while not final:
+            final = time.monotonic() >= deadline
+            data = self._read()
+            for frame in self._parser.feed(data) + (self._parser.expire() if final else []):
+                self._tap("rx", frame.encode())
+                if frame.command in (command, Command.ERROR):
+                    return frame
+        return None
+
+    def _read(self) -> bytes:
+        data = self._serial.read(1)
+        if data:
+            data += self._serial.read(self._serial.in_waiting)
+        self._received += len(data)
+        return data
+
+    def _discard(self) -> None:
+        """Throw away what came too late: it must not pass for the next answer."""
+        found = []
+        while self._serial.in_waiting:
+            data = self._serial.read(self._serial.in_waiting)
+            found += self._parser.feed(data)
+        found += self._parser.expire()
+        self.counts.late += len(found)
+
+    # --- opening and reopening --------------------------------------------------------------
+
+    def _open(self) -> None:
+        try:
+            import serial
+        except ImportError:
+            raise HandError("pyserial is missing: pip install 'dexsim[real]'") from None
+        self.close()
+        local = "://" not in self.port
+        try:
+            options = {"exclusive": True} if local else {}
+            self._serial = serial.serial_for_url(self.port, baudrate=self.config.baud, timeout=_POLL,
+                                                 write_timeout=1.0, **options)
+        except (OSError, ValueError) as error:
+            raise HandError(explain(self.port, error)) from None
+        if local:
+            # Only real adapters have it. The FTDI driver then sets its latency timer to 1 ms.
+            with contextlib.suppress(OSError, ValueError, AttributeError, NotImplementedError):
+                self._serial.set_low_latency_mode(True)
+        self._parser = frames.Parser(frames.HAND_REPLIES)
+        self._parser.counts.crc_errors = self.counts.crc_errors
+        self._parser.counts.resyncs = self.counts.resyncs
+        self._received = 0
+
+    def _greet(self, patience: float) -> str:
+        """Ask for the version and for one passive state; the version may stay unknown."""
+        until, version = time.monotonic() + patience, "unknown"
+        self._generation += 1
+        while True:
+            frame, _ = self._request(Command.VERSION, b"", 64)
+            if frame is not None:
+                version = _printable(frame.data)
+            self._first = self._exchange(passive_command())
+            if self._first is not None:
+                return version
+            if time.monotonic() > until:
+                raise HandError(self._silence())
+
+    def _silence(self) -> str:
+        if not self._received:
+            return (f"{self.port}: no answer. Is the hand powered, are A and B of RS485 swapped, is its "
+                    f"id {self.config.hand_id}?")
+        if not self._parser.counts.frames and not self._parser.counts.crc_errors:
+            return (f"{self.port}: {self._received} bytes came and none make a frame: is the hand set to "
+                    f"{self.config.baud} baud?")
+        return (f"{self.port}: the hand answers, but not with a sound state ({self.counts.crc_errors} "
+                f"wrong checksums, {self.counts.refused} refusals): check cable and termination")
+
+    def _drop(self) -> None:
+        self.close()
+        self._retry_at, self._pause = time.monotonic() + self.config.backoff[0], self.config.backoff[0]
+
+    def _reconnect(self) -> Reply | None:
+        if time.monotonic() < self._retry_at:
+            time.sleep(_POLL)
+            return None
+        try:
+            self._open()
+            self._greet(0.0)
+        except (HandError, OSError):
+            self.close()
+            self._pause = min(2 * self._pause, self.config.backoff[1])
+            self._retry_at = time.monotonic() + self._pause
+            return None
+        self.counts.reconnects += 1
+        return self._first
+
+
+def open_port(spec: str, config: LinkConfig, tap: Callable[[str, bytes], None] | None = None) -> HandPort:
+    """A hand by its name: a serial port, or `sdk:MODULE:FUNCTION`.
+
+    The function is the user's own, and gives a `HandPort` that drives a vendor's SDK; it is called
+    with the `LinkConfig`.
+
+    Raises:
+      HandError: the module or function cannot be found.
+    """
+    if not spec.startswith("sdk:"):
+        return SerialHand(spec, config, tap=tap)
+    module, _, function = spec.removeprefix("sdk:").partition(":")
+    try:
+        return getattr(importlib.import_module(module), function or "open_hand")(config)
+    except (ImportError, AttributeError) as error:
+        raise HandError(f"{spec}: {error}") from None
+
+
+# --- what to tell the user -----------------------------------------------------------------------
+
+def explain(port: str, error: Exception) -> str:
+    """One line about a port that does not open: the reason, and what helps."""
+    number = getattr(error, "errno", None)
+    if number == errno.EACCES:
+        return (f"{port}: permission denied. It belongs to the group {_group(port)!r}: run "
+                f"`sudo usermod -aG {_group(port)} $USER`, then log out and in again")
+    if number in (errno.EBUSY, errno.EAGAIN) or "exclusively lock" in str(error):
+        return f"{port}: another program has it open (`fuser -v {port}` names it): close that first"
+    if number in (errno.ENOENT, errno.ENXIO, errno.ENODEV):
+        found = sorted(str(link) for link in Path("/dev/serial/by-id").glob("*"))
+        return f"{port}: there is no such port; found {', '.join(found) if found else 'no serial port at all'}"
+    return f"{port}: cannot be opened ({error})"
+
+
+def latency_warnings(port: str, sysfs: Path = Path("/sys/bus/usb-serial/devices")) -> list[str]:
+    """An FTDI adapter's latency timer above 1 ms: at its usual 16 ms the loop runs at half its rate."""
+    name = os.path.basename(os.path.realpath(port))
+    timer = sysfs / name / "latency_timer"
+    try:
+        value = int(timer.read_text())
+    except (OSError, ValueError):
+        return []
+    if value <= 1:
+        return []
+    return [f"{port}: the adapter waits {value} ms before it passes on short packets. Now: "
+            f"`echo 1 | sudo tee {timer}`. For good, as /etc/udev/rules.d/99-dexsim.rules: "
+            'ACTION=="add", SUBSYSTEM=="usb-serial", DRIVER=="ftdi_sio", ATTR{latency_timer}="1"']
+
+
+def _group(port: str) -> str:
+    try:
+        return grp.getgrgid(os.stat(port).st_gid).gr_name
+    except (OSError, KeyError):
+        return "dialout"
+
+
+def _printable(data: bytes) -> str:
+    text = data.rstrip(b"\x00").decode("ascii", "replace")
+    return text if text.isprintable() and text else data.hex(" ")
