@@ -10,8 +10,9 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from dexsim import rotations
+from dexsim.errors import ConfigError
 from dexsim.pytree import pytree_dataclass, static
 
 KINDS = ("sphere", "box", "capsule", "cylinder", "ellipsoid")
@@ -31,24 +32,26 @@ class Shape:
 
 
 def sphere(point: jax.Array, size: jax.Array) -> jax.Array:
-    return _norm(point) - size[0]
+    x, y, z = _split(point)
+    return _length(x, y, z) - size[0]
 
 
 def box(point: jax.Array, size: jax.Array) -> jax.Array:
-    q = jnp.abs(point) - size
-    return _norm(jnp.maximum(q, 0.0)) + jnp.minimum(jnp.max(q, -1), 0.0)
+    x, y, z = (jnp.abs(p) - size[axis] for axis, p in enumerate(_split(point)))
+    outside = _length(jnp.maximum(x, 0.0), jnp.maximum(y, 0.0), jnp.maximum(z, 0.0))
+    return outside + jnp.minimum(jnp.maximum(jnp.maximum(x, y), z), 0.0)
 
 
 def capsule(point: jax.Array, size: jax.Array) -> jax.Array:
-    z = point[..., 2]
-    axial = z - jnp.clip(z, -size[1], size[1])
-    return _norm(jnp.stack([point[..., 0], point[..., 1], axial], -1)) - size[0]
+    x, y, z = _split(point)
+    return _length(x, y, z - jnp.clip(z, -size[1], size[1])) - size[0]
 
 
 def cylinder(point: jax.Array, size: jax.Array) -> jax.Array:
-    radial = _norm(point[..., :2]) - size[0]
-    axial = jnp.abs(point[..., 2]) - size[1]
-    outside = _norm(jnp.stack([jnp.maximum(radial, 0.0), jnp.maximum(axial, 0.0)], -1))
+    x, y, z = _split(point)
+    radial = _length(x, y) - size[0]
+    axial = jnp.abs(z) - size[1]
+    outside = _length(jnp.maximum(radial, 0.0), jnp.maximum(axial, 0.0))
     return outside + jnp.minimum(jnp.maximum(radial, axial), 0.0)
 
 
@@ -89,10 +92,48 @@ def signed_distance(points: jax.Array, shape: Shape) -> jax.Array:
     """Distance [...] m from `points` [..., 3] (object frame) to the union."""
     distance = None
     for k, kind in enumerate(shape.kinds):
-        local = rotations.rotate_inverse(shape.rotation[k], points - shape.position[k])
+        local = to_local(points, shape.position[k], shape.rotation[k])
         d = jnp.where(shape.active[k], _DISTANCE[kind](local, shape.size[k]), FAR)
         distance = d if distance is None else jnp.minimum(distance, d)
     return distance
+
+
+def to_local(points: jax.Array, position: jax.Array, rotation: jax.Array) -> jax.Array:
+    """Points [..., 3] in the frame at `position` [3], `rotation` [3, 3].
+
+    Component by component: XLA then makes one kernel of transform and distance, where sums over an
+    axis of three would each write their result to memory.
+    """
+    arm = [p - position[axis] for axis, p in enumerate(_split(points))]
+    return jnp.stack([sum(rotation[row, axis] * arm[row] for row in range(3))
+                      for axis in range(3)], -1)
+
+
+def bounds(shape: Shape) -> np.ndarray:
+    """Lowest and highest corner [2, 3] m of the active primitives' bounding boxes.
+
+    Raises:
+      ConfigError: nothing is active.
+    """
+    active = np.flatnonzero(np.asarray(shape.active))
+    if not active.size:
+        raise ConfigError("bounds: no active primitive")
+    position = np.asarray(shape.position, float)[active]
+    reach = np.stack([_reach(shape.kinds[k], np.asarray(shape.size[k], float),
+                             np.asarray(shape.rotation[k], float)) for k in active])
+    return np.stack([(position - reach).min(0), (position + reach).max(0)])
+
+
+def _reach(kind: str, size: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    """Half the sides [3] of the axis-aligned box round one turned primitive."""
+    along = np.minimum(np.abs(turn[:, 2]), 1.0)
+    if kind == "box":
+        return np.abs(turn) @ size
+    if kind == "ellipsoid":
+        return np.linalg.norm(turn * size, axis=1)
+    if kind == "cylinder":
+        return size[0] * np.sqrt(1 - along**2) + size[1] * along
+    return size[0] + (size[1] * along if kind == "capsule" else np.zeros(3))
 
 
 def distance_and_normal(points: jax.Array, shape: Shape) -> tuple[jax.Array, jax.Array]:
@@ -100,6 +141,14 @@ def distance_and_normal(points: jax.Array, shape: Shape) -> tuple[jax.Array, jax
     distance, pullback = jax.vjp(lambda p: signed_distance(p, shape), points)
     (normal,) = pullback(jnp.ones_like(distance))
     return distance, normal
+
+
+def _split(point: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    return point[..., 0], point[..., 1], point[..., 2]
+
+
+def _length(*parts: jax.Array) -> jax.Array:
+    return jnp.sqrt(sum(part * part for part in parts) + _TINY)
 
 
 def _norm(vector: jax.Array) -> jax.Array:

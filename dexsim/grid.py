@@ -1,0 +1,268 @@
+"""Signed-distance grids: baked once from any closed mesh (or union of primitives), looked up by interpolation.
+
+Nodes hold the exact distance. `linear` interpolates the 8 nodes round a point; `quadratic` also keeps the gradient at
+every node and adds half of each node's first-order term, which is exact for second-order polynomials (the two errors
+of interpolating values and of extrapolating from nodes are opposite, one twice the other). The normal is the analytic
+gradient of the interpolant, from the same reads.
+
+A grid holds one or several object classes; `index` says which, and may differ between environments under `vmap` while
+the values are shared. Beyond the grid the distance is that at the nearest point of its boundary plus the way there.
+
+Shapes: C classes, n nodes along each axis. Units: m.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import os
+import tempfile
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dexsim import mesh as meshes
+from dexsim import sdf
+from dexsim.config import setting, validate
+from dexsim.errors import ConfigError
+from dexsim.pytree import pytree_dataclass, static
+
+INTERPOLATIONS = ("linear", "quadratic")
+DTYPES = ("float32", "float16")
+_VERSION = 1  # of the files in the cache
+_MILLI = 1e-3  # values are kept in mm: a float16 then keeps its full precision down to 0.1 um
+_TINY = 1e-20
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class GridConfig:
+    """How a grid is baked."""
+
+    nodes: int = setting(64, unit="1", low=8, high=256)
+    """Nodes along each axis; the spacing differs per axis, so that thin objects get fine cells."""
+    pad: float = setting(0.004, unit="m", low=0.0005, high=0.1)
+    """Room round the object; must exceed the skin's margin."""
+    dtype: str = setting("float32", choices=DTYPES)
+    """Storage. float16 needs half the memory traffic: two neighbours are read as one word."""
+    interpolation: str = setting("linear", choices=INTERPOLATIONS)
+    """linear: 8 values a query; quadratic: 32, for ten times less error on smooth shapes."""
+
+    def __post_init__(self):
+        validate(self)
+
+
+@pytree_dataclass
+class Grid:
+    """Distances on nodes. `index` and `scale` may differ per environment, the rest is shared."""
+
+    nodes: int = static()
+    interpolation: str = static()
+    values: jax.Array
+    """Flat over [C, n, n, n, channel]; channels: distance in mm, then its gradient where quadratic. float32, or uint32
+    words of two float16 (linear: a node and the next along z; quadratic: two channels)."""
+    origin: jax.Array  # [C, 3] m, the first node
+    spacing: jax.Array  # [C, 3] m
+    index: jax.Array  # [] int32, the class of this object
+    scale: jax.Array  # [] the object's size relative to the baked one
+
+    @property
+    def classes(self) -> int:
+        return self.origin.shape[0]
+
+
+def bake(source: meshes.Mesh | sdf.Shape, config: GridConfig | None = None, *, cache: bool = True) -> Grid:
+    """A grid of one class.
+
+    Args:
+      source: a checked mesh (`mesh.load_mesh`) or a union of primitives with known sizes.
+      config: resolution and storage.
+      cache: keep what was computed from a mesh on disk (`cache_folder`) and use it again.
+
+    Raises:
+      AssetError: the mesh cannot be signed.
+    """
+    config = config or GridConfig()
+    low, high = source.bounds if isinstance(source, meshes.Mesh) else sdf.bounds(source)
+    axes = [np.linspace(a - config.pad, b + config.pad, config.nodes) for a, b in zip(low, high, strict=True)]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    if isinstance(source, meshes.Mesh):
+        distance, gradient = _measured(source, points, config, cache)
+    else:
+        distance, gradient = (np.asarray(x) for x in sdf.distance_and_normal(jnp.asarray(points, jnp.float32), source))
+    channels = distance[:, None] / _MILLI
+    if config.interpolation == "quadratic":
+        channels = np.concatenate([channels, gradient], 1)
+    return Grid(
+        nodes=config.nodes, interpolation=config.interpolation, values=jnp.asarray(_pack(channels, config.dtype)),
+        origin=jnp.asarray([[a[0] for a in axes]], jnp.float32),
+        spacing=jnp.asarray([[a[1] - a[0] for a in axes]], jnp.float32),
+        index=jnp.zeros((), jnp.int32), scale=jnp.ones(()),
+    )  # fmt: skip
+
+
+def stack(grids: list[Grid]) -> Grid:
+    """One grid of several classes, in order; all must be baked with the same configuration.
+
+    Raises:
+      ConfigError: they differ in resolution, interpolation or storage.
+    """
+    kinds = {(g.nodes, g.interpolation, g.values.dtype) for g in grids}
+    if len(kinds) != 1:
+        raise ConfigError(f"stack: grids of one configuration expected, found {len(kinds)}")
+    return dataclasses.replace(
+        grids[0], values=jnp.concatenate([g.values for g in grids]),
+        origin=jnp.concatenate([g.origin for g in grids]), spacing=jnp.concatenate([g.spacing for g in grids]),
+    )  # fmt: skip
+
+
+def select(grid: Grid, index: jax.Array, scale: jax.Array | float = 1.0) -> Grid:
+    """The object of class `index` [], `scale` times as large; the values stay shared under `vmap`."""
+    return dataclasses.replace(grid, index=jnp.asarray(index, jnp.int32), scale=jnp.asarray(scale, jnp.float32))
+
+
+def signed_distance(points: jax.Array, grid: Grid) -> jax.Array:
+    """Distance [...] m at points [..., 3] in the object's frame."""
+    return _look_up(points, grid)[0]
+
+
+def distance_and_normal(points: jax.Array, grid: Grid) -> tuple[jax.Array, jax.Array]:
+    """Distance [...] m and unit gradient [..., 3] of the interpolant."""
+    distance, gradient = _look_up(points, grid)
+    length = jnp.sqrt(sum(g * g for g in gradient) + _TINY)
+    return distance, jnp.stack([g / length for g in gradient], -1)
+
+
+def cache_folder() -> Path:
+    """Where baked grids are kept: `sdf` in `$DEXSIM_CACHE`, or in `~/.cache/dexsim`."""
+    return Path(os.environ.get("DEXSIM_CACHE") or Path.home() / ".cache" / "dexsim") / "sdf"
+
+
+def _look_up(points: jax.Array, grid: Grid) -> tuple[jax.Array, list[jax.Array]]:
+    """Distance and its gradient's three components. Component by component, so that XLA makes one kernel of it."""
+    n = grid.nodes
+    origin, spacing = grid.origin[grid.index], grid.spacing[grid.index]
+    gaps, cells, parts, free = [], [], [], []
+    for axis in range(3):
+        local = points[..., axis] / grid.scale
+        last = origin[axis] + (n - 1) * spacing[axis]
+        held = jnp.clip(local, origin[axis], last)
+        at = (held - origin[axis]) / spacing[axis]
+        cell = jnp.clip(jax.lax.stop_gradient(at).astype(jnp.int32), 0, n - 2)
+        gaps.append(local - held)
+        cells.append(cell)
+        parts.append(at - cell)
+        free.append((local >= origin[axis]) & (local <= last))
+    first = ((grid.index * n + cells[0]) * n + cells[1]) * n + cells[2]
+    if grid.interpolation == "linear":
+        value, slope = _linear(_read_linear(grid, first), parts)
+        slope = [s / spacing[axis] for axis, s in enumerate(slope)]
+    else:
+        value, slope = _quadratic(_read_quadratic(grid, first), parts, [spacing[axis] / _MILLI for axis in range(3)])
+        slope = [s / spacing[axis] for axis, s in enumerate(slope)]
+    way = jnp.sqrt(sum(g * g for g in gaps) + _TINY)
+    gradient = [jnp.where(f, s * _MILLI, 0.0) + g / way for f, s, g in zip(free, slope, gaps, strict=True)]
+    return grid.scale * (_MILLI * value + way - _TINY**0.5), gradient
+
+
+def _linear(corners: list[jax.Array], parts: list[jax.Array]) -> tuple[jax.Array, list[jax.Array]]:
+    """Trilinear value, and its derivative by each part, from the corners in the order (x, y, z), z fastest."""
+    tx, ty, tz = parts
+    rise = [corners[k + 1] - corners[k] for k in (0, 2, 4, 6)]
+    edge = [corners[k] + tz * r for k, r in zip((0, 2, 4, 6), rise, strict=True)]
+    face = [edge[0] + ty * (edge[1] - edge[0]), edge[2] + ty * (edge[3] - edge[2])]
+    dx = face[1] - face[0]
+    dy = (1 - tx) * (edge[1] - edge[0]) + tx * (edge[3] - edge[2])
+    dz = (1 - tx) * (rise[0] + ty * (rise[1] - rise[0])) + tx * (rise[2] + ty * (rise[3] - rise[2]))
+    return face[0] + tx * dx, [dx, dy, dz]
+
+
+def _quadratic(corners: list[list[jax.Array]], parts: list[jax.Array], spacing: list[jax.Array]):
+    """sum_i w_i (f_i + g_i . (x - x_i) / 2) and its derivative by each part; corners are lists of f, gx, gy, gz."""
+    value, slope = _linear([c[0] for c in corners], parts)
+    for axis in range(3):
+        half = 0.5 * spacing[axis]
+        at = [half * corners[k][1 + axis] * (parts[axis] - ((k >> (2 - axis)) & 1)) for k in range(8)]
+        term, by = _linear(at, parts)
+        own, _ = _linear([half * c[1 + axis] for c in corners], parts)
+        value = value + term
+        slope = [s + b for s, b in zip(slope, by, strict=True)]
+        slope[axis] = slope[axis] + own
+    return value, slope
+
+
+def _corner_offsets(n: int) -> list[int]:
+    return [(x * n + y) * n + z for x in (0, 1) for y in (0, 1) for z in (0, 1)]
+
+
+def _read(values: jax.Array, index: jax.Array) -> jax.Array:
+    return values.at[index].get(mode="promise_in_bounds")
+
+
+def _halves(words: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The two float16 of a word as float32."""
+    low = jax.lax.bitcast_convert_type(words.astype(jnp.uint16), jnp.float16)
+    high = jax.lax.bitcast_convert_type((words >> 16).astype(jnp.uint16), jnp.float16)
+    return low.astype(jnp.float32), high.astype(jnp.float32)
+
+
+def _read_linear(grid: Grid, first: jax.Array) -> list[jax.Array]:
+    offsets = _corner_offsets(grid.nodes)
+    if grid.values.dtype == jnp.float32:
+        return [_read(grid.values, first + k) for k in offsets]
+    return [half for k in offsets[::2] for half in _halves(_read(grid.values, first + k))]
+
+
+def _read_quadratic(grid: Grid, first: jax.Array) -> list[list[jax.Array]]:
+    offsets = _corner_offsets(grid.nodes)
+    if grid.values.dtype == jnp.float32:
+        return [[_read(grid.values, 4 * (first + k) + c) for c in range(4)] for k in offsets]
+    return [[half for c in range(2) for half in _halves(_read(grid.values, 2 * (first + k) + c))] for k in offsets]
+
+
+def _pack(channels: np.ndarray, dtype: str) -> np.ndarray:
+    """[nodes, 1 or 4] as `Grid.values`."""
+    if dtype == "float32":
+        return channels.astype(np.float32).reshape(-1)
+    halves = channels.astype(np.float16)
+    if halves.shape[1] == 1:  # with the next node along z; the last of a row is never a lower corner
+        halves = np.concatenate([halves, np.roll(halves, -1, axis=0)], 1)
+    return np.ascontiguousarray(halves).view(np.uint32).reshape(-1)
+
+
+def _measured(mesh: meshes.Mesh, points: np.ndarray, config: GridConfig, cache: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Exact distance and gradient at the nodes, from the cache where it is there."""
+    key = hashlib.sha256(f"{mesh.fingerprint} {config.nodes} {config.pad!r} {_VERSION}".encode()).hexdigest()[:32]
+    path = cache_folder() / f"{key}.npz"
+    if cache:
+        found = _load(path, len(points))
+        if found is not None:
+            return found
+    meshes.check_sign(mesh)
+    distance, gradient = meshes.signed_distance(mesh, points)
+    distance, gradient = distance.astype(np.float32), gradient.astype(np.float32)
+    if cache:
+        _store(path, distance, gradient)
+    return distance, gradient
+
+
+def _load(path: Path, count: int) -> tuple[np.ndarray, np.ndarray] | None:
+    try:
+        with np.load(path) as file:
+            distance, gradient = file["distance"], file["gradient"]
+    except Exception:  # missing, half written, of an older program: bake again
+        return None
+    whole = distance.shape == (count,) and gradient.shape == (count, 3) and np.all(np.isfinite(distance))
+    return (distance, gradient) if whole else None
+
+
+def _store(path: Path, distance: np.ndarray, gradient: np.ndarray) -> None:
+    """Written aside and renamed, so that two programs may bake at once; a cache that cannot be written is no error."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".npz", delete=False) as file:
+            np.savez_compressed(file, distance=distance, gradient=gradient)
+        os.replace(file.name, path)
+    except OSError:
+        return
