@@ -88,12 +88,17 @@ _DISTANCE: dict[str, Callable[[jax.Array, jax.Array], jax.Array]] = {
 }
 
 
+def primitive_distance(kind: str, points: jax.Array, size: jax.Array) -> jax.Array:
+    """Distance [...] m from `points` [..., 3] to one primitive in its own frame."""
+    return _DISTANCE[kind](points, size)
+
+
 def signed_distance(points: jax.Array, shape: Shape) -> jax.Array:
     """Distance [...] m from `points` [..., 3] (object frame) to the union."""
     distance = None
     for k, kind in enumerate(shape.kinds):
         local = to_local(points, shape.position[k], shape.rotation[k])
-        d = jnp.where(shape.active[k], _DISTANCE[kind](local, shape.size[k]), FAR)
+        d = jnp.where(shape.active[k], primitive_distance(kind, local, shape.size[k]), FAR)
         distance = d if distance is None else jnp.minimum(distance, d)
     return distance
 
