@@ -9,15 +9,20 @@ Shapes: F fingers, N taxels a finger. Units: m, N, Pa.
 """
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from dexsim import rotations, sdf
+from dexsim import materials, rotations, sdf
 from dexsim.config import setting, validate
+from dexsim.distance import signed_distance
+from dexsim.hand import Hand, HandPose
 from dexsim.pytree import pytree_dataclass
 
 WEIGHTINGS = ("force", "depth", "none")
+LAWS = ("mooney_rivlin", "linear")
+TOTALS = ("solver", "skin")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -26,8 +31,9 @@ class Skin:
 
     c10: float = setting(0.03e6, unit="Pa", low=0.0, high=1e8)
     """First Mooney-Rivlin coefficient; the skin's own value is not published."""
-    c01: float = setting(0.0, unit="Pa", low=0.0, high=1e8)
-    """Second Mooney-Rivlin coefficient; negative values (tension-only fits) are refused."""
+    c01: float = setting(0.0, unit="Pa", low=-1e8, high=1e8)
+    """Second Mooney-Rivlin coefficient. Negative values (fits to tension alone) are refused where
+    they would make the skin soften before `max_compression`."""
     thickness: float = setting(0.002, unit="m", low=1e-4, high=0.02)
     """Thickness of the compressed layer."""
     margin: float = setting(0.001, unit="m", low=0.0, high=0.01)
@@ -35,9 +41,25 @@ class Skin:
     stiffer than the skin, so without it the taxels round a contact would feel nothing."""
     max_compression: float = setting(0.7, unit="1", low=0.05, high=0.95)
     """Compression beyond which the stress no longer grows."""
+    law: str = setting("mooney_rivlin", choices=LAWS)
+    """linear: the slope at small strain throughout (Winkler's elastic foundation)."""
+    total: str = setting("solver", choices=TOTALS)
+    """Where a finger's total comes from: the physics' contact force, spread by the skin's law, or
+    the skin itself, whose stress times area is then the force on each taxel."""
 
     def __post_init__(self):
         validate(self)
+        materials.check_stiffness(self.c10, self.c01, self.max_compression)
+
+
+def skin_of(material: str, **settings) -> Skin:
+    """A skin of a named material (`materials.MATERIALS`), with other settings as given.
+
+    Raises:
+      ConfigError: no such material, or one that softens before `max_compression`.
+    """
+    c10, c01 = materials.material(material)
+    return Skin(c10=c10, c01=c01, **settings)
 
 
 @pytree_dataclass
@@ -46,36 +68,60 @@ class Touch:
 
     depth: jax.Array  # [F, N] m, compression of the skin (>= 0)
     skin_force: jax.Array  # [F, N] N, by the skin's law alone
-    force: jax.Array  # [F, N] N, spread of the physics' total: sum over N is the finger's force
+    force: jax.Array  # [F, N] N, by default a spread of the physics' total (see `Skin.total`)
 
 
 def skin_stress(compression: jax.Array, skin: Skin) -> jax.Array:
-    """Magnitude of the uniaxial Mooney-Rivlin stress [...] Pa at a compression [...] in [0, 1).
+    """Magnitude of the uniaxial stress [...] Pa at a compression [...] in [0, 1).
 
-    sigma = 2 (lambda - lambda^-2) (C10 + C01 / lambda), lambda = 1 - compression.
+    Mooney-Rivlin: sigma = 2 (lambda - lambda^-2) (C10 + C01 / lambda), lambda = 1 - compression.
     """
-    stretch = 1.0 - jnp.clip(compression, 0.0, skin.max_compression)
+    compression = jnp.clip(compression, 0.0, skin.max_compression)
+    if skin.law == "linear":
+        return 6.0 * (skin.c10 + skin.c01) * compression
+    stretch = 1.0 - compression
     return 2.0 * (stretch**-2 - stretch) * (skin.c10 + skin.c01 / stretch)
 
 
-def feel(taxels: jax.Array, area: jax.Array, shape: sdf.Shape, position: jax.Array,
+def feel(taxels: jax.Array, area: jax.Array, thing: Any, position: jax.Array,
          rotation: jax.Array, finger_force: jax.Array, skin: Skin) -> Touch:
     """Taxel forces from the geometry of the contact and the finger's total force.
 
     Args:
       taxels: [F, N, 3] m, taxel positions in the palm frame.
       area: [F, N] m^2.
-      shape, position [3], rotation [3, 3]: the object and its pose in the palm frame.
+      thing, position [3], rotation [3, 3]: the object, prepared for any method of
+        `dexsim.distance` (a `sdf.Shape` is as it is), and its pose in the palm frame.
       finger_force: [F] N, resultant fingertip-object force of the physics.
       skin: the skin's law.
 
     A finger whose taxels all lie clear of the object reads zero, whatever its total: it touches
     with a part of the link that carries no taxels.
     """
-    local = rotations.rotate_inverse(rotation, taxels - position)
-    depth = jnp.maximum(skin.margin - sdf.signed_distance(local, shape), 0.0)
+    return _press(sdf.to_local(taxels, position, rotation), area, thing, finger_force, skin)
+
+
+def feel_links(hand: Hand, pose: HandPose, thing: Any, position: jax.Array, rotation: jax.Array,
+               finger_force: jax.Array, skin: Skin) -> Touch:
+    """`feel` for all taxels of a posed hand, straight from the links' frames to the object's.
+
+    One transform a finger instead of two a taxel, and no taxel position in memory.
+    """
+    turn = rotations.compose(jnp.swapaxes(rotation, -1, -2), pose.tip_rotation)
+    shift = rotations.rotate_inverse(rotation, pose.body_position[hand.tip_body] - position)
+    taxel = [jnp.asarray(hand.taxel_position[..., axis]) for axis in range(3)]
+    local = [sum(turn[:, row, axis, None] * taxel[axis] for axis in range(3)) + shift[:, row, None]
+             for row in range(3)]
+    return _press(jnp.stack(local, -1), jnp.asarray(hand.taxel_area), thing, finger_force, skin)
+
+
+def _press(points: jax.Array, area: jax.Array, thing: Any, finger_force: jax.Array,
+           skin: Skin) -> Touch:
+    """`feel` for points [F, N, 3] in the object's frame."""
+    depth = jnp.maximum(skin.margin - signed_distance(points, thing), 0.0)
     skin_force = skin_stress(depth / skin.thickness, skin) * area
-    return Touch(depth, skin_force, spread(skin_force, finger_force))
+    force = skin_force if skin.total == "skin" else spread(skin_force, finger_force)
+    return Touch(depth, skin_force, force)
 
 
 def spread(skin_force: jax.Array, finger_force: jax.Array) -> jax.Array:
@@ -100,6 +146,46 @@ def reduce_touch(force: jax.Array, taxels: jax.Array,
     total = jnp.sum(weight, -1)
     centre = jnp.sum(weight[..., None] * taxels, -2) / jnp.where(total > 0, total, 1.0)[:, None]
     return jnp.sum(force, -1), centre
+
+
+def reduce_touch_links(force: jax.Array, hand: Hand, pose: HandPose,
+                       weighting: str = "force") -> tuple[jax.Array, jax.Array]:
+    """`reduce_touch` in the links' frames: the mean first, then one transform a finger."""
+    weight = (force > 0).astype(force.dtype) if weighting == "none" else force
+    total = jnp.sum(weight, -1)
+    moment = jnp.stack([jnp.sum(weight * hand.taxel_position[..., axis], -1)
+                        for axis in range(3)], -1)
+    mean = moment / jnp.where(total > 0, total, 1.0)[:, None]
+    centre = pose.body_position[hand.tip_body] + rotations.rotate(pose.tip_rotation, mean)
+    return jnp.sum(force, -1), jnp.where(total[:, None] > 0, centre, 0.0)
+
+
+def split_force(force: jax.Array, normals: jax.Array,
+                finger_force: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Each finger's force along and across the contact, for three-axis touch.
+
+    Args:
+      force: [F, N] N, normal forces on the taxels; they say where the contact is.
+      normals: [F, N, 3] outward taxel normals, palm frame (`hand.taxel_normals`).
+      finger_force: [F, 3] N, the physics' force vector on the finger, palm frame.
+
+    Returns:
+      [F] N pressed into the skin, and [F, 3] N tangential; both zero for a finger that touches
+      nothing.
+    """
+    inward = -jnp.sum(force[..., None] * normals, -2)
+    square = jnp.sum(inward**2, -1, keepdims=True)
+    touching = square > 0
+    inward = inward / jnp.sqrt(jnp.where(touching, square, 1.0))
+    pressed = jnp.sum(finger_force * inward, -1)
+    return pressed, jnp.where(touching, finger_force - pressed[:, None] * inward, 0.0)
+
+
+def taxel_vectors(force: jax.Array, finger_force: jax.Array) -> jax.Array:
+    """The force vector [F, 3] of each finger shared among its taxels [F, N, 3] like `force`."""
+    total = jnp.sum(force, -1, keepdims=True)
+    share = force / jnp.where(total > 0, total, 1.0)
+    return share[..., None] * finger_force[:, None]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
