@@ -275,8 +275,9 @@ class Env:
         joint_target = self._joint_target(state.joint_target, action, measured)
 
         torque = self._torque(state, joint_target)
+        net_torque = self._with_friction(draw, torque)
         push = self.task.push(push_key, state.target) + self._tilt_force(draw, state.target)
-        after, force = physics.advance(state.target, state.physics, torque, push)
+        after, force = physics.advance(state.target, state.physics, net_torque, push)
         # A diverging solver passes through speeds that are finite and square to 1e27 in the reward.
         finite = (sound & jnp.all(jnp.isfinite(after.qpos)) & jnp.all(jnp.abs(after.qvel) < 1e3)
                   & jnp.all(jnp.isfinite(force)))
@@ -330,6 +331,16 @@ class Env:
             return actuator.drive(draw.actuator, target, jnp.zeros_like(target), position,
                                   velocity)
         return torque
+
+    def _with_friction(self, draw: Draw, torque: Callable[..., jax.Array]) -> Callable[..., jax.Array]:
+        """The motors' torque less what friction in the gears keeps; readings show the former."""
+        model, dofs = self.physics.mj_model, self.physics.joint_dof
+        inertia_rate = jnp.asarray(model.dof_M0[dofs] / model.opt.timestep, jnp.float32)
+
+        def net_torque(substep: jax.Array, position: jax.Array, velocity: jax.Array) -> jax.Array:
+            return actuator.apply_friction(draw.actuator, torque(substep, position, velocity),
+                                           velocity, inertia_rate)
+        return net_torque
 
     def _joint_target(self, target: jax.Array, action: jax.Array,
                       measured: jax.Array) -> jax.Array:

@@ -1,9 +1,11 @@
 """What is drawn anew at every episode start, apart from the object itself.
 
-One dataclass of ranges and one `sample`. With `scale` 0 it gives the nominal hand exactly.
+One dataclass of ranges and one `sample`. With `scale` 0 it gives the nominal hand exactly. The
+scale may be traced, so that a curriculum widens the ranges while training (`Curriculum`).
 """
 
 import dataclasses
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +15,11 @@ from dexsim.config import check_ranges, setting, validate
 from dexsim.errors import ConfigError
 from dexsim.hand import Hand
 from dexsim.pytree import pytree_dataclass
+
+_FACTORS = ("stiffness_factor", "damping_factor", "torque_factor", "speed_factor", "efficiency",
+            "torque_gain", "taxel_gain")
+_SPANS = (*_FACTORS, "dead_band", "latency", "latency_spread", "ripple", "ripple_count",
+          "coulomb_friction", "viscous_friction", "sensing_latency")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -38,11 +45,22 @@ class Randomization:
     efficiency: tuple[float, float] = setting((0.85, 1.0), unit="1", low=0.05, high=2.0)
     """Efficiency eta; nominal 1."""
     latency: tuple[float, float] = setting((0.0, 0.02), unit="s", low=0.0, high=0.2)
-    """Delay from command to motor, in whole sub-steps; nominal 0."""
+    """Delay from command to motor, common to all joints, in whole sub-steps; nominal 0. At most
+    one control tick is modelled."""
+    latency_spread: tuple[float, float] = setting((0.0, 0.005), unit="s", low=0.0, high=0.2)
+    """Further delay of each joint by itself (the bus serves them in turn); nominal 0."""
+    ripple: tuple[float, float] = setting((0.0, 0.03), unit="1", low=0.0, high=0.3)
+    """Amplitude of the torque ripple, as a share of the torque; nominal 0."""
+    ripple_count: tuple[float, float] = setting((20.0, 200.0), unit="1/rad", low=0.0, high=2000.0)
+    """Ripples per radian of the joint. Neither it nor the phase has a nominal value."""
+    coulomb_friction: tuple[float, float] = setting((0.0, 0.03), unit="1", low=0.0, high=0.3)
+    """Coulomb friction as a share of the joint's stall torque; nominal 0."""
+    viscous_friction: tuple[float, float] = setting((0.0, 0.01), unit="Nm s/rad", low=0.0, high=1.0)
+    """Viscous friction, on top of the damping in the hand's MJCF; nominal 0."""
     sensing_latency: tuple[float, float] = setting((0.0, 0.02), unit="s", low=0.0, high=0.2)
     """Age of the readings; nominal 0. At most one control tick is modelled."""
     encoder_bias: float = setting(0.01, unit="rad", low=0.0, high=0.2)
-    """Largest constant error of a joint angle reading."""
+    """Largest constant error of a joint angle, in its reading and in its motor's loop."""
     torque_gain: tuple[float, float] = setting((0.9, 1.1), unit="1", low=0.05, high=5.0)
     """Factor on a joint's torque reading: error of the current-to-torque calibration."""
     taxel_gain: tuple[float, float] = setting((0.9, 1.1), unit="1", low=0.05, high=5.0)
@@ -52,11 +70,8 @@ class Randomization:
 
     def __post_init__(self):
         validate(self)
-        check_ranges(self, "stiffness_factor", "damping_factor", "dead_band", "torque_factor",
-                     "speed_factor", "efficiency", "latency", "sensing_latency", "torque_gain",
-                     "taxel_gain")
-        for name in ("stiffness_factor", "damping_factor", "torque_factor", "speed_factor",
-                     "efficiency", "torque_gain", "taxel_gain"):
+        check_ranges(self, *_SPANS)
+        for name in _FACTORS:
             low, high = getattr(self, name)
             if min(1 + self.scale * (low - 1), 1 + self.scale * (high - 1)) < 0:
                 raise ConfigError(f"Randomization.{name} = ({low:g}, {high:g}) at scale "
@@ -68,38 +83,113 @@ class Draw:
     """One episode's hand."""
 
     actuator: Actuator  # [J] leaves
-    latency: jax.Array  # [] int32, sub-steps
+    latency: jax.Array  # [J] int32, sub-steps
     sensing_latency: jax.Array  # [] fraction of a control tick
-    encoder_bias: jax.Array  # [J] rad
+    encoder_bias: jax.Array  # [J] rad, the same as in `actuator`
     torque_gain: jax.Array  # [J]
     taxel_gain: jax.Array  # [F, 1]
     tilt: jax.Array  # [2] rad
 
 
 def sample(key: jax.Array, config: Randomization, hand: Hand, *, timestep: float,
-           control_period: float) -> Draw:
-    """Draw one episode's hand."""
-    keys = iter(jax.random.split(key, 12))
-    joints, fingers = hand.num_joints, hand.num_fingers
+           control_period: float, scale: jax.Array | float = 1.0) -> Draw:
+    """Draw one episode's hand.
 
-    def draw(span: tuple[float, float], nominal: float, shape: tuple[int, ...]) -> jax.Array:
-        value = jax.random.uniform(next(keys), shape, minval=span[0], maxval=span[1])
-        return nominal + config.scale * (value - nominal)
+    Args:
+      key: of this episode.
+      config: the ranges.
+      hand: numbers of joints and fingers, torque and speed limits.
+      timestep, control_period: s, of a physics sub-step and a control tick.
+      scale: [] in [0, 1], on top of `config.scale`; may be traced. 0 is the nominal hand, exactly.
+    """
+    width = config.scale * scale
 
+    def draw(key: jax.Array, span: tuple[float, float], nominal: float,
+             shape: tuple[int, ...]) -> jax.Array:
+        value = jax.random.uniform(key, shape, minval=span[0], maxval=span[1])
+        return nominal + width * (value - nominal)
+
+    return _assemble(key, draw, config, hand, timestep, control_period)
+
+
+def sample_outside(key: jax.Array, config: Randomization, hand: Hand, *, timestep: float,
+                   control_period: float, stretch: float = 1.5) -> Draw:
+    """Draw a hand that lies outside the ranges in every parameter: for held-out evaluation.
+
+    Each value lies beyond one end of its range, up to `stretch` times as far from nominal as that
+    end. Ranges that begin at nominal are left at their far end only.
+    """
+    def draw(key: jax.Array, span: tuple[float, float], nominal: float,
+             shape: tuple[int, ...]) -> jax.Array:
+        low, high = span[0] - nominal, span[1] - nominal
+        which, how_far = jax.random.split(key)
+        odds = abs(high) / max(abs(low) + abs(high), 1e-30)
+        end = jnp.where(jax.random.uniform(which, shape) < odds, high, low)
+        far = jax.random.uniform(how_far, shape, minval=1.0, maxval=stretch)
+        return nominal + config.scale * far * end
+
+    return _assemble(key, draw, config, hand, timestep, control_period)
+
+
+def _assemble(key: jax.Array, draw: Callable[..., jax.Array], config: Randomization, hand: Hand,
+              timestep: float, control_period: float) -> Draw:
+    keys = iter(jax.random.split(key, 20))
+    joints, fingers = (hand.num_joints,), (hand.num_fingers, 1)
+    bias, tilt = ((-reach, reach) for reach in (config.encoder_bias, config.gravity_tilt))
+    stiffness = config.stiffness * draw(next(keys), config.stiffness_factor, 1.0, joints)
+    damping = config.damping * draw(next(keys), config.damping_factor, 1.0, joints)
+    dead_band = draw(next(keys), config.dead_band, 0.0, joints)
+    stall_torque = hand.torque_limit * draw(next(keys), config.torque_factor, 1.0, joints)
+    no_load_speed = hand.speed_limit * draw(next(keys), config.speed_factor, 1.0, joints)
+    efficiency = draw(next(keys), config.efficiency, 1.0, joints)
+    latency = draw(next(keys), config.latency, 0.0, ())
+    age = draw(next(keys), config.sensing_latency, 0.0, ()) / control_period
+    encoder_bias = draw(next(keys), bias, 0.0, joints)
+    torque_gain = draw(next(keys), config.torque_gain, 1.0, joints)
+    taxel_gain = draw(next(keys), config.taxel_gain, 1.0, fingers)
+    tilt = draw(next(keys), tilt, 0.0, (2,))
+    latency = latency + draw(next(keys), config.latency_spread, 0.0, joints)
+    low, high = config.ripple_count
     actuator = Actuator(
-        stiffness=config.stiffness * draw(config.stiffness_factor, 1.0, (joints,)),
-        damping=config.damping * draw(config.damping_factor, 1.0, (joints,)),
-        dead_band=draw(config.dead_band, 0.0, (joints,)),
-        stall_torque=hand.torque_limit * draw(config.torque_factor, 1.0, (joints,)),
-        no_load_speed=hand.speed_limit * draw(config.speed_factor, 1.0, (joints,)),
-        efficiency=draw(config.efficiency, 1.0, (joints,)))
-    bias = (-config.encoder_bias, config.encoder_bias)
-    tilt = (-config.gravity_tilt, config.gravity_tilt)
-    return Draw(
-        actuator=actuator,
-        latency=jnp.round(draw(config.latency, 0.0, ()) / timestep).astype(jnp.int32),
-        sensing_latency=jnp.clip(draw(config.sensing_latency, 0.0, ()) / control_period, 0.0, 1.0),
-        encoder_bias=draw(bias, 0.0, (joints,)),
-        torque_gain=draw(config.torque_gain, 1.0, (joints,)),
-        taxel_gain=draw(config.taxel_gain, 1.0, (fingers, 1)),
-        tilt=draw(tilt, 0.0, (2,)))
+        stiffness=stiffness, damping=damping, dead_band=dead_band, stall_torque=stall_torque,
+        no_load_speed=no_load_speed, efficiency=efficiency,
+        ripple=draw(next(keys), config.ripple, 0.0, joints),
+        ripple_count=jax.random.uniform(next(keys), joints, minval=low, maxval=high),
+        ripple_phase=jax.random.uniform(next(keys), joints, maxval=2 * jnp.pi),
+        encoder_bias=encoder_bias,
+        coulomb_friction=hand.torque_limit * draw(next(keys), config.coulomb_friction, 0.0, joints),
+        viscous_friction=draw(next(keys), config.viscous_friction, 0.0, joints))
+    substeps = jnp.round(jnp.minimum(latency, control_period) / timestep).astype(jnp.int32)
+    return Draw(actuator=actuator, latency=substeps, sensing_latency=jnp.clip(age, 0.0, 1.0),
+                encoder_bias=encoder_bias, torque_gain=torque_gain, taxel_gain=taxel_gain,
+                tilt=tilt)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Curriculum:
+    """How the scale of the ranges follows success; the scale is part of the training state."""
+
+    start: float = setting(0.1, unit="1", low=0.0, high=1.0)
+    """Scale at the beginning."""
+    widen_above: float = setting(0.8, unit="1", low=0.0, high=1.0)
+    """Rate of success from which the ranges grow."""
+    narrow_below: float = setting(0.4, unit="1", low=0.0, high=1.0)
+    """Rate of success below which they shrink."""
+    step: float = setting(0.02, unit="1", low=0.0001, high=1.0)
+    """Change of the scale at each update."""
+
+    def __post_init__(self):
+        validate(self)
+        if self.narrow_below > self.widen_above:
+            raise ConfigError(f"Curriculum.narrow_below = {self.narrow_below:g}: must not exceed "
+                              f"widen_above = {self.widen_above:g}")
+
+
+def next_scale(scale: jax.Array, success: jax.Array, curriculum: Curriculum) -> jax.Array:
+    """The scale [] in [0, 1] after an update with this rate of success [] in [0, 1].
+
+    A rate that is not a number (no episode has ended) leaves the scale as it is.
+    """
+    step = jnp.where(success >= curriculum.widen_above, curriculum.step,
+                     jnp.where(success < curriculum.narrow_below, -curriculum.step, 0.0))
+    return jnp.clip(scale + step, 0.0, 1.0)

@@ -1,18 +1,16 @@
-"""The joint drive against a plain-Python reference, and what is drawn of it at every episode start."""
+"""The joint drive against a plain-Python reference, closed forms and C MuJoCo."""
 
 import dataclasses
-import functools
 import math
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
 from dexsim import actuator
 from dexsim.actuator import Actuator
-from dexsim.errors import ConfigError
-from dexsim.randomization import Randomization, sample
 
 joint_torque = jax.jit(actuator.joint_torque)
 drive = jax.jit(actuator.drive)
@@ -44,6 +42,13 @@ def random_drives(count, seed=0):
     return jax.tree.map(cast, drives), tuple(cast(x) for x in state)
 
 
+EXTRAS = ("ripple", "ripple_count", "ripple_phase", "encoder_bias", "coulomb_friction", "viscous_friction")
+
+
+def with_extras(drives, value):
+    return dataclasses.replace(drives, **dict.fromkeys(EXTRAS, value))
+
+
 def motor(**changes):
     values = dict(stiffness=3.0, damping=0.1, dead_band=0.0, stall_torque=1.1, no_load_speed=8.63, efficiency=1.0)
     return Actuator(**{name: jnp.float32(value) for name, value in {**values, **changes}.items()})
@@ -52,7 +57,7 @@ def motor(**changes):
 def test_ten_thousand_random_drives():
     drives, state = random_drives(10_000)
     ours = np.asarray(drive(drives, *state))
-    leaves = [getattr(drives, f.name) for f in dataclasses.fields(drives)]
+    leaves = [getattr(drives, f.name) for f in dataclasses.fields(drives)[:6]]
     wanted = np.array([reference(*map(float, row)) for row in zip(*leaves, *state, strict=True)])
     np.testing.assert_allclose(ours, wanted, rtol=1e-5, atol=1e-6)
     # All regimes occur: within the band, free, and held by the envelope on either side, beyond the no-load speed.
@@ -130,13 +135,129 @@ def test_delay_within_a_scan_of_substeps():
     np.testing.assert_array_equal(np.argmax(seen[:6, :, 0], 1), np.arange(6))
 
 
+def test_delay_of_each_joint_by_itself():
+    previous, target, latency = jnp.full(12, -1.0), jnp.arange(12.0), jnp.arange(12) % 7
+    for substep in range(6):
+        acts = actuator.delayed_target(jnp.int32(substep), latency, previous, target)
+        np.testing.assert_array_equal(acts, np.where(substep < np.arange(12) % 7, -1.0, np.arange(12.0)))
+
+
+# --- ripple, encoder, friction ----------------------------------------------------------------------
+
+
+def test_parameters_that_are_zero_change_no_bit():
+    """What is not modelled and what is modelled with 0 give the same numbers, friction included."""
+    drives, state = random_drives(10_000, seed=2)
+    zeros = with_extras(drives, np.zeros(10_000, np.float32))
+    plain = np.asarray(drive(drives, *state))
+    np.testing.assert_array_equal(drive(zeros, *state), plain)
+    rate = np.float32(0.2)
+
+    @jax.jit
+    def net(drives, *state):
+        torque = actuator.drive(drives, *state)
+        return actuator.apply_friction(drives, torque, state[3], rate)
+
+    np.testing.assert_array_equal(net(zeros, *state), plain)
+    np.testing.assert_array_equal(net(drives, *state), plain)
+
+
+def test_ripple_is_a_wave_over_the_angle():
+    """Twenty waves a radian, of 5 % of the torque, whatever the torque; envelope and all."""
+    wavy = motor(ripple=0.05, ripple_count=20.0, ripple_phase=0.4)
+    position = np.linspace(0, 2, 400).astype(np.float32)
+    for target in (0.1, 5.0):
+        at = position + np.float32(target)
+        bare = joint_torque(motor(), at, 0.0, position, 1.0)
+        share = np.asarray(joint_torque(wavy, at, 0.0, position, 1.0)) / np.asarray(bare)
+        np.testing.assert_allclose(share, 1 + 0.05 * np.sin(20 * position + 0.4), atol=2e-6)
+
+
+def test_the_loop_sees_the_encoder():
+    """With a bias the joint comes to rest where the reading, not the joint, is at its target."""
+    biased = motor(encoder_bias=0.25, dead_band=0.125, damping=0.0)
+    assert float(joint_torque(biased, 1.0, 0.0, 0.75, 0.0)) == 0
+    assert float(joint_torque(biased, 1.0, 0.0, 1.0, 0.0)) == pytest.approx(-3 * 0.25)
+    assert float(joint_torque(biased, 1.0, 0.0, 0.5, 0.0)) == pytest.approx(3 * 0.25)
+    assert float(joint_torque(biased, 1.0, 0.0, 0.6875, 0.0)) == 0  # within the band of the reading
+
+
+def slide(torque, *, coulomb=0.0, viscous=0.0, inertia=1e-3, timestep=1e-3, velocity=0.0, steps=1000):
+    """Velocities of a joint with nothing but friction, semi-implicit as the physics."""
+    rubbing = motor(coulomb_friction=coulomb, viscous_friction=viscous)
+    wanted = jnp.broadcast_to(jnp.asarray(torque, jnp.float32), (steps,))
+
+    def body(speed, tau):
+        net = actuator.apply_friction(rubbing, tau, speed, inertia / timestep)
+        speed = speed + timestep / inertia * net
+        return speed, speed
+    return np.asarray(jax.lax.scan(body, jnp.float32(velocity), wanted)[1])
+
+
+def test_coulomb_friction_stops_in_time_and_holds():
+    """v(t) = v0 - c t / I, exactly 0 from v0 I / c on; held up to c, let go beyond."""
+    for sign in (1, -1):
+        speed = slide(0.0, coulomb=0.02, velocity=sign * 4.0)
+        times = 1e-3 * np.arange(1, 1001)
+        np.testing.assert_allclose(speed, sign * np.maximum(4.0 - 20.0 * times, 0), atol=2e-4)
+        assert np.all(speed[201:] == 0)
+        assert np.all(slide(sign * 0.0199, coulomb=0.02) == 0)
+        np.testing.assert_allclose(slide(sign * 0.03, coulomb=0.02)[-1], sign * 10.0, rtol=1e-4)
+
+
+def test_viscous_friction_settles_at_torque_over_b():
+    speed = slide(0.03, coulomb=0.01, viscous=0.02, steps=2000)
+    np.testing.assert_allclose(speed[-1], (0.03 - 0.01) / 0.02, rtol=1e-5)
+    times = 1e-3 * np.arange(1, 2001)  # backward Euler of v' = (tau - c - b v) / I
+    np.testing.assert_allclose(speed, 1 - (1 + 1e-3 * 0.02 / 1e-3) ** -np.arange(1, 2001), atol=1e-4)
+    np.testing.assert_allclose(speed, 1 - np.exp(-0.02 / 1e-3 * times), atol=0.01)
+
+
+@pytest.mark.parametrize("viscous", [1.0, 1e3])
+def test_no_friction_is_too_much_for_the_time_step(viscous):
+    speed = slide(0.0, coulomb=1.0, viscous=viscous, velocity=5.0, steps=50, timestep=0.005)
+    assert np.all(speed >= 0) and speed[-1] == 0
+    speed = slide(0.0, viscous=viscous, velocity=5.0, steps=50, timestep=0.005)
+    assert np.all(np.diff(speed) <= 0) and np.all(speed >= 0)
+
+
+def c_hinge(coulomb, viscous, torque, timestep=5e-4):
+    """Angles and speeds of a hinge with frictionloss and damping in C MuJoCo."""
+    model = mujoco.MjModel.from_xml_string(f"""<mujoco>
+      <option timestep="{timestep}" integrator="Euler" gravity="0 0 0" iterations="100" tolerance="1e-12"/>
+      <worldbody><body><joint type="hinge" axis="0 0 1" armature="0.001" frictionloss="{coulomb}" damping="{viscous}"
+        solreffriction="{2.1 * timestep} 1" solimpfriction="0.9999 0.9999 0.001"/>
+      <inertial mass="0.001" pos="0 0 0" diaginertia="1e-9 1e-9 1e-9"/></body></worldbody></mujoco>""")
+    data, track = mujoco.MjData(model), []
+    for tau in torque:
+        data.qfrc_applied[0] = tau
+        mujoco.mj_step(model, data)
+        track.append((data.qpos[0], data.qvel[0]))
+    return np.array(track)
+
+
+@pytest.mark.parametrize(("coulomb", "viscous"), [(0.02, 0.0), (0.0, 0.01), (0.02, 0.005)])
+def test_friction_is_c_mujocos(coulomb, viscous):
+    """A second of a torque that pushes, holds still below the friction, and reverses."""
+    times = 5e-4 * np.arange(2000)
+    torque = 0.05 * np.sin(2 * np.pi * 2.3 * times) * (1 + 0.4 * np.sin(2 * np.pi * 0.7 * times))
+    reference = c_hinge(coulomb, viscous, torque)
+    speed = slide(torque, coulomb=coulomb, viscous=viscous, timestep=5e-4, steps=2000)
+    assert np.max(np.abs(reference[:, 1])) > 2
+    np.testing.assert_allclose(speed, reference[:, 1], atol=0.01)
+    np.testing.assert_allclose(np.cumsum(speed) * 5e-4, reference[:, 0], atol=2e-3)
+    if coulomb:
+        assert np.mean(speed == 0) > 0.02
+
+
 # --- every parameter is a leaf -------------------------------------------------------------------
 
 
-def test_six_parameters_are_six_leaves():
+def test_every_parameter_is_a_leaf_and_none_is_none():
     drives, _ = random_drives(12)
     leaves = jax.tree.leaves(drives)
-    assert len(leaves) == len(dataclasses.fields(Actuator)) == 6
+    assert len(leaves) == 6
+    assert len(jax.tree.leaves(with_extras(drives, np.zeros(12)))) == len(dataclasses.fields(Actuator)) == 12
     assert all(leaf.shape == (12,) for leaf in leaves)
     doubled = jax.tree.map(lambda x: 2 * x, drives)
     np.testing.assert_array_equal(doubled.efficiency, 2 * drives.efficiency)
@@ -170,109 +291,3 @@ def test_gradients_are_finite_in_the_band_and_beyond_the_no_load_speed():
         assert all(np.isfinite(leaf) for leaf in jax.tree.leaves(gradient(drives, *state)))
 
 
-# --- what is drawn at every episode start ----------------------------------------------------------
-
-TIMES = dict(timestep=0.005, control_period=0.03)
-
-
-@functools.cache
-def draws(hand, config, seed=0):
-    """1,000 draws. Not jitted as a whole: a config is a constant, so each would be another compilation."""
-    keys = jax.random.split(jax.random.key(seed), 1000)
-    return jax.vmap(lambda key: sample(key, config, hand, **TIMES))(keys)
-
-
-def test_scale_zero_is_the_nominal_hand(hand):
-    config = Randomization(scale=0.0)
-    drawn = draws(hand, config)
-    for row in range(4):
-        one = jax.tree.map(lambda x, row=row: np.asarray(x[row]), drawn)
-        np.testing.assert_array_equal(one.actuator.stiffness, np.full(12, 3.0, np.float32))
-        np.testing.assert_array_equal(one.actuator.damping, np.full(12, 0.1, np.float32))
-        np.testing.assert_array_equal(one.actuator.stall_torque, hand.torque_limit)
-        np.testing.assert_array_equal(one.actuator.no_load_speed, hand.speed_limit)
-        np.testing.assert_array_equal(one.actuator.efficiency, np.ones(12))
-        np.testing.assert_array_equal(one.torque_gain, np.ones(12))
-        np.testing.assert_array_equal(one.taxel_gain, np.ones((5, 1)))
-        for zero in (one.actuator.dead_band, one.latency, one.sensing_latency, one.encoder_bias, one.tilt):
-            np.testing.assert_array_equal(zero, 0)
-
-
-def quantities(hand, drawn):
-    """Each drawn quantity as the config names its range, one row per draw."""
-    motors = drawn.actuator
-    return {"stiffness_factor": motors.stiffness / 3.0, "damping_factor": motors.damping / 0.1,
-            "dead_band": motors.dead_band, "torque_factor": motors.stall_torque / hand.torque_limit,
-            "speed_factor": motors.no_load_speed / hand.speed_limit, "efficiency": motors.efficiency,
-            "latency": drawn.latency[:, None] * TIMES["timestep"],
-            "sensing_latency": drawn.sensing_latency[:, None] * TIMES["control_period"],
-            "encoder_bias": drawn.encoder_bias, "torque_gain": drawn.torque_gain,
-            "taxel_gain": drawn.taxel_gain[..., 0], "gravity_tilt": drawn.tilt}
-
-
-# No two alike, so that none can be taken for another.
-DISTINCT = Randomization(stiffness_factor=(0.5, 0.7), damping_factor=(1.5, 1.9), dead_band=(0.03, 0.04),
-                         torque_factor=(0.75, 0.85), speed_factor=(1.1, 1.3), efficiency=(0.6, 0.65),
-                         latency=(0.03, 0.06), sensing_latency=(0.005, 0.01), encoder_bias=0.02,
-                         torque_gain=(1.3, 1.5), taxel_gain=(0.3, 0.4), gravity_tilt=0.5)
-
-
-@pytest.mark.parametrize("config", [Randomization(), DISTINCT], ids=["default", "distinct"])
-def test_a_thousand_draws_fill_their_ranges_and_leave_none(hand, config):
-    for name, values in quantities(hand, draws(hand, config)).items():
-        span = getattr(config, name)
-        low, high = span if isinstance(span, tuple) else (-span, span)
-        values, width = np.asarray(values, float), high - low
-        assert values.min() >= low - 1e-5 and values.max() <= high + 1e-5, name
-        assert values.min() < low + 0.02 * width and values.max() > high - 0.02 * width, name
-        assert values.mean() == pytest.approx((low + high) / 2, abs=0.05 * width), name
-        columns = values.reshape(len(values), -1)
-        if columns.shape[1] > 1:  # joints and fingers are drawn apart
-            correlation = np.corrcoef(columns.T) - np.eye(columns.shape[1])
-            assert np.abs(correlation).max() < 0.15, name
-
-
-def test_quantities_are_drawn_apart_from_one_another(hand):
-    columns = np.stack([np.asarray(v, float).reshape(1000, -1)[:, 0]
-                        for v in quantities(hand, draws(hand, Randomization())).values()])
-    assert np.abs(np.corrcoef(columns) - np.eye(len(columns))).max() < 0.15
-
-
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_scale_shrinks_all_ranges_about_the_nominal_hand(hand, seed):
-    """The same key at half the scale lands half way to nominal."""
-    nominal, half, full = (quantities(hand, draws(hand, Randomization(scale=s), seed)) for s in (0.0, 0.5, 1.0))
-    for name in full.keys() - {"latency"}:  # a whole number of sub-steps
-        wanted = (np.asarray(full[name]) + np.asarray(nominal[name])) / 2
-        np.testing.assert_allclose(half[name], wanted, atol=1e-5, err_msg=name)
-
-
-def test_latency_is_whole_substeps_and_reaches_its_bound(hand):
-    latency = np.asarray(draws(hand, Randomization(latency=(0.0, 0.02))).latency)
-    assert latency.dtype == np.int32 and set(latency) == {0, 1, 2, 3, 4}
-    fixed = draws(hand, Randomization(latency=(0.015, 0.015)))
-    np.testing.assert_array_equal(fixed.latency, 3)
-
-
-def test_a_range_the_wrong_way_round_is_refused():
-    with pytest.raises(ConfigError, match=r"Randomization\.efficiency = \(1, 0\.8\)"):
-        Randomization(efficiency=(1.0, 0.8))
-    with pytest.raises(ConfigError, match=r"Randomization\.latency = -0\.1 s: must be between 0 and 0\.2 s"):
-        Randomization(latency=(-0.1, 0.01))
-
-
-@pytest.mark.parametrize("name", ["stiffness_factor", "damping_factor", "torque_factor", "speed_factor", "efficiency",
-                                  "torque_gain", "taxel_gain"])
-def test_a_scale_that_would_turn_a_motor_round_is_refused(name):
-    """A factor of 0.5 at scale 3 would be 1 - 1.5: a negative gain, torque or speed."""
-    Randomization(**{name: (0.5, 1.0)})
-    with pytest.raises(ConfigError, match=f"{name}.*scale"):
-        Randomization(scale=3.0, **{name: (0.5, 1.0)})
-
-
-def test_the_widest_scale_keeps_the_motors_the_right_way_round(hand):
-    drawn = draws(hand, Randomization(scale=3.0))
-    for name in ("stiffness", "damping", "stall_torque", "no_load_speed", "efficiency"):
-        assert np.min(getattr(drawn.actuator, name)) > 0, name
-    assert np.min(drawn.actuator.dead_band) >= 0 and np.min(drawn.latency) >= 0
-    assert 0 <= np.min(drawn.sensing_latency) and np.max(drawn.sensing_latency) <= 1

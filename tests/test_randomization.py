@@ -1,0 +1,189 @@
+"""What is drawn at every episode start: ranges, the nominal hand, curriculum, held-out hands."""
+
+import functools
+
+import jax
+import numpy as np
+import pytest
+
+from dexsim.errors import ConfigError
+from dexsim.randomization import Curriculum, Randomization, next_scale, sample, sample_outside
+
+TIMES = dict(timestep=0.005, control_period=0.03)
+
+
+@functools.cache
+def draws(hand, config, seed=0):
+    """1,000 draws. Not jitted as a whole: a config is a constant, so each would be another compilation."""
+    keys = jax.random.split(jax.random.key(seed), 1000)
+    return jax.vmap(lambda key: sample(key, config, hand, **TIMES))(keys)
+
+
+def test_scale_zero_is_the_nominal_hand(hand):
+    config = Randomization(scale=0.0)
+    drawn = draws(hand, config)
+    for row in range(4):
+        one = jax.tree.map(lambda x, row=row: np.asarray(x[row]), drawn)
+        np.testing.assert_array_equal(one.actuator.stiffness, np.full(12, 3.0, np.float32))
+        np.testing.assert_array_equal(one.actuator.damping, np.full(12, 0.1, np.float32))
+        np.testing.assert_array_equal(one.actuator.stall_torque, hand.torque_limit)
+        np.testing.assert_array_equal(one.actuator.no_load_speed, hand.speed_limit)
+        np.testing.assert_array_equal(one.actuator.efficiency, np.ones(12))
+        np.testing.assert_array_equal(one.torque_gain, np.ones(12))
+        np.testing.assert_array_equal(one.taxel_gain, np.ones((5, 1)))
+        motors = one.actuator
+        for zero in (motors.dead_band, motors.ripple, motors.coulomb_friction, motors.viscous_friction,
+                     motors.encoder_bias, one.latency, one.sensing_latency, one.encoder_bias, one.tilt):
+            np.testing.assert_array_equal(zero, 0)
+
+
+def quantities(hand, drawn):
+    """Each drawn quantity as the config names its range, one row per draw."""
+    motors = drawn.actuator
+    return {"stiffness_factor": motors.stiffness / 3.0, "damping_factor": motors.damping / 0.1,
+            "dead_band": motors.dead_band, "torque_factor": motors.stall_torque / hand.torque_limit,
+            "speed_factor": motors.no_load_speed / hand.speed_limit, "efficiency": motors.efficiency,
+            "ripple": motors.ripple, "ripple_count": motors.ripple_count,
+            "coulomb_friction": motors.coulomb_friction / hand.torque_limit,
+            "viscous_friction": motors.viscous_friction,
+            "latency": drawn.latency[:, :1] * TIMES["timestep"],
+            "sensing_latency": drawn.sensing_latency[:, None] * TIMES["control_period"],
+            "encoder_bias": drawn.encoder_bias, "torque_gain": drawn.torque_gain,
+            "taxel_gain": drawn.taxel_gain[..., 0], "gravity_tilt": drawn.tilt}
+
+
+# No two alike, so that none can be taken for another.
+EVEN = Randomization(latency_spread=(0.0, 0.0))  # so that the common latency shows
+DISTINCT = Randomization(ripple=(0.05, 0.06), ripple_count=(300.0, 310.0), coulomb_friction=(0.2, 0.21),
+                         viscous_friction=(0.002, 0.003), latency_spread=(0.0, 0.0),
+                         stiffness_factor=(0.5, 0.7), damping_factor=(1.5, 1.9), dead_band=(0.03, 0.04),
+                         torque_factor=(0.75, 0.85), speed_factor=(1.1, 1.3), efficiency=(0.6, 0.65),
+                         latency=(0.01, 0.025), sensing_latency=(0.005, 0.01), encoder_bias=0.02,
+                         torque_gain=(1.3, 1.5), taxel_gain=(0.3, 0.4), gravity_tilt=0.5)
+
+
+@pytest.mark.parametrize("config", [EVEN, DISTINCT], ids=["default", "distinct"])
+def test_a_thousand_draws_fill_their_ranges_and_leave_none(hand, config):
+    for name, values in quantities(hand, draws(hand, config)).items():
+        span = getattr(config, name)
+        low, high = span if isinstance(span, tuple) else (-span, span)
+        values, width = np.asarray(values, float), high - low
+        assert values.min() >= low - 1e-5 and values.max() <= high + 1e-5, name
+        assert values.min() < low + 0.02 * width and values.max() > high - 0.02 * width, name
+        assert values.mean() == pytest.approx((low + high) / 2, abs=0.05 * width), name
+        columns = values.reshape(len(values), -1)
+        if columns.shape[1] > 1:  # joints and fingers are drawn apart
+            correlation = np.corrcoef(columns.T) - np.eye(columns.shape[1])
+            assert np.abs(correlation).max() < 0.15, name
+
+
+def test_quantities_are_drawn_apart_from_one_another(hand):
+    columns = np.stack([np.asarray(v, float).reshape(1000, -1)[:, 0]
+                        for v in quantities(hand, draws(hand, Randomization())).values()])
+    assert np.abs(np.corrcoef(columns) - np.eye(len(columns))).max() < 0.15
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_scale_shrinks_all_ranges_about_the_nominal_hand(hand, seed):
+    """The same key at half the scale lands half way to nominal."""
+    nominal, half, full = (quantities(hand, draws(hand, Randomization(scale=s), seed)) for s in (0.0, 0.5, 1.0))
+    for name in full.keys() - {"latency", "ripple_count"}:  # whole sub-steps; no nominal value
+        wanted = (np.asarray(full[name]) + np.asarray(nominal[name])) / 2
+        np.testing.assert_allclose(half[name], wanted, atol=1e-5, err_msg=name)
+
+
+def test_latency_is_whole_substeps_and_reaches_its_bound(hand):
+    latency = np.asarray(draws(hand, EVEN).latency)
+    assert latency.dtype == np.int32 and set(latency.ravel()) == {0, 1, 2, 3, 4}
+    assert np.all(latency == latency[:, :1])  # common to all joints
+    fixed = draws(hand, Randomization(latency=(0.015, 0.015), latency_spread=(0.0, 0.0)))
+    np.testing.assert_array_equal(fixed.latency, 3)
+
+
+def test_joints_are_late_by_themselves_too(hand):
+    latency = np.asarray(draws(hand, Randomization(latency=(0.005, 0.005), latency_spread=(0.0, 0.01))).latency)
+    assert latency.shape == (1000, 12) and set(latency.ravel()) == {1, 2, 3}
+    assert np.abs(np.corrcoef(latency.T) - np.eye(12)).max() < 0.15
+
+
+def test_latency_ends_at_one_tick(hand):
+    latency = np.asarray(draws(hand, Randomization(latency=(0.02, 0.08))).latency)
+    assert latency.max() == 6 and np.mean(latency == 6) > 0.7
+
+
+def test_a_range_the_wrong_way_round_is_refused():
+    with pytest.raises(ConfigError, match=r"Randomization\.efficiency = \(1, 0\.8\)"):
+        Randomization(efficiency=(1.0, 0.8))
+    with pytest.raises(ConfigError, match=r"Randomization\.latency = -0\.1 s: must be between 0 and 0\.2 s"):
+        Randomization(latency=(-0.1, 0.01))
+
+
+@pytest.mark.parametrize("name", ["stiffness_factor", "damping_factor", "torque_factor", "speed_factor", "efficiency",
+                                  "torque_gain", "taxel_gain"])
+def test_a_scale_that_would_turn_a_motor_round_is_refused(name):
+    """A factor of 0.5 at scale 3 would be 1 - 1.5: a negative gain, torque or speed."""
+    Randomization(**{name: (0.5, 1.0)})
+    with pytest.raises(ConfigError, match=f"{name}.*scale"):
+        Randomization(scale=3.0, **{name: (0.5, 1.0)})
+
+
+def test_the_widest_scale_keeps_the_motors_the_right_way_round(hand):
+    drawn = draws(hand, Randomization(scale=3.0))
+    for name in ("ripple", "coulomb_friction", "viscous_friction"):
+        assert np.min(getattr(drawn.actuator, name)) >= 0, name
+    for name in ("stiffness", "damping", "stall_torque", "no_load_speed", "efficiency"):
+        assert np.min(getattr(drawn.actuator, name)) > 0, name
+    assert np.min(drawn.actuator.dead_band) >= 0 and np.min(drawn.latency) >= 0
+    assert 0 <= np.min(drawn.sensing_latency) and np.max(drawn.sensing_latency) <= 1
+
+
+# --- curriculum ------------------------------------------------------------------------------------
+
+
+def test_a_traced_scale_is_the_configured_one(hand):
+    """The scale may come from the training state: 0 is exactly nominal, and none of it recompiles."""
+    draw = jax.jit(lambda key, scale: sample(key, Randomization(), hand, **TIMES, scale=scale))
+    key = jax.random.key(5)
+    for scale in (0.0, 0.5, 1.0):
+        other = sample(key, Randomization(scale=scale), hand, **TIMES)
+        for ours, theirs in zip(jax.tree.leaves(draw(key, scale)), jax.tree.leaves(other), strict=True):
+            np.testing.assert_allclose(ours, theirs, rtol=1e-6, atol=1e-8)
+    nominal = draw(key, 0.0)
+    np.testing.assert_array_equal(nominal.actuator.stall_torque, hand.torque_limit)
+    np.testing.assert_array_equal(nominal.actuator.stiffness, np.full(12, 3.0, np.float32))
+    for zero in (nominal.latency, nominal.encoder_bias, nominal.actuator.coulomb_friction, nominal.actuator.ripple):
+        np.testing.assert_array_equal(zero, 0)
+    assert draw._cache_size() == 1
+
+
+def test_the_scale_follows_success():
+    rules = Curriculum(start=0.1, widen_above=0.8, narrow_below=0.4, step=0.25)
+    step = jax.jit(lambda scale, success: next_scale(scale, success, rules))
+    for scale, success, after in ((0.1, 0.8, 0.35), (0.35, 0.6, 0.35), (0.35, 0.39, 0.1), (0.1, 0.0, 0.0),
+                                  (0.9, 1.0, 1.0), (0.5, np.nan, 0.5)):
+        assert float(step(scale, success)) == pytest.approx(after)
+    with pytest.raises(ConfigError, match="Curriculum.narrow_below"):
+        Curriculum(narrow_below=0.9)
+
+
+# --- held out ----------------------------------------------------------------------------------------
+
+
+def test_held_out_hands_lie_outside_every_range(hand):
+    config = EVEN
+    keys = jax.random.split(jax.random.key(1), 64)
+    drawn = jax.vmap(lambda key: sample_outside(key, config, hand, **TIMES, stretch=1.4))(keys)
+    found = quantities(hand, drawn)
+    for name in found.keys() - {"ripple_count"}:
+        values = np.asarray(found[name], float)
+        span = getattr(config, name)
+        low, high = span if isinstance(span, tuple) else (-span, span)
+        nominal = 1.0 if name.endswith(("factor", "gain")) or name == "efficiency" else 0.0
+        slack = 0.5 * TIMES["timestep"] + 1e-9 if name == "latency" else 1e-6
+        assert np.all((values <= low + slack) | (values >= high - slack)), name
+        far = 1.4 * max(high - nominal, nominal - low) + slack
+        assert np.all(np.abs(values - nominal) <= far), name
+        if low < nominal < high:  # both ends are visited
+            assert 0.3 < np.mean(values > high - slack) < 0.7, name
+        # None at an end that is the nominal value itself.
+        assert np.all(np.abs(values - nominal) > 1e-4), name
