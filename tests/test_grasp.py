@@ -57,13 +57,13 @@ def make_moment(hand, **fields):
     joints = jnp.asarray((hand.joint_lower + hand.joint_upper) / 2)
     nothing = jnp.zeros((5, 120))
     values = {
-        "joint_position": joints, "joint_velocity": zero, "joint_torque": zero,
+        "target": None, "joint_position": joints, "joint_velocity": zero, "joint_torque": zero,
         "pose": forward_kinematics(hand, joints), "finger_force": jnp.zeros((5, 3)),
         "touch": tactile.Touch(nothing, nothing, nothing),
         "object_position": jnp.asarray(Grasp.reference), "object_quat": jnp.array([1.0, 0, 0, 0]),
         "object_velocity": jnp.zeros(3), "object_spin": jnp.zeros(3), "action": zero,
         "last_action": zero}
-    return Moment(**{name: jnp.asarray(value) if name not in ("pose", "touch") else value
+    return Moment(**{name: jnp.asarray(value) if name not in ("target", "pose", "touch") else value
                      for name, value in (values | fields).items()})
 
 

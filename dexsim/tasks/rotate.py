@@ -253,7 +253,8 @@ class Rotate:
         inside = (angle < config.goal_angle) & (distance < config.goal_distance)
         calm = jnp.abs(spin) <= config.goal_spin if config.goal_spin > 0 else True
         dwell = jnp.where(inside, goal.dwell + self._period, 0.0)
-        success = inside & calm & (dwell >= config.goal_dwell)
+        # Half a tick of slack: sums of ticks are not exact.
+        success = inside & calm & (dwell > config.goal_dwell - self._period / 2)
         return Progress(angle, distance, spin, goal.entered | inside, dwell, success)
 
     def update(self, key: jax.Array, goal: Goal, moment: Moment) -> Goal:

@@ -79,7 +79,7 @@ def lowest_point(target: ObjectParams, quat: jax.Array, position: jax.Array) -> 
         if kind == "box":
             far = jnp.sum(part * size)
         else:
-            far = size[0] * jnp.sqrt(jnp.maximum(1 - part[2] ** 2, 0.0)) + size[1] * part[2]
+            far = size[0] * jnp.hypot(part[0], part[1]) + size[1] * part[2]
         reach.append(far + jnp.sum(down * target.position[k]))
     return position[0] - jnp.max(jnp.stack(reach))
 
