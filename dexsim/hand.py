@@ -242,7 +242,7 @@ def load_hand(path: str | Path | None = None) -> Hand:
         name = table["fingers"][root.index(-1)]["root_joint"]
         raise AssetError(f"{path}: root_joint {name!r} is not among joints")
     finger_names = tuple(finger["name"] for finger in table["fingers"])
-    taxels = _read_taxels(path.parent / table["taxels"], finger_names, table["taxel_grid"])
+    taxels = read_taxels(path.parent / table["taxels"], finger_names, table["taxel_grid"])
     parent = np.array([row.get(int(model.body_parentid[b]), -1) for b in bodies])
     identity = np.eye(3)
 
@@ -347,7 +347,7 @@ def _read_toml(path: Path) -> dict:
         raise AssetError(f"{path}: {error}") from None
 
 
-def _read_taxels(path: Path, fingers: tuple[str, ...], grid: list[int]) -> np.ndarray:
+def read_taxels(path: Path, fingers: tuple[str, ...], grid: list[int]) -> np.ndarray:
     """[F, N, 7]: position, normal, area. Every finger must have columns * rows taxels."""
     try:
         with open(path, newline="") as file:
