@@ -41,8 +41,8 @@ class SafetyConfig:
 
     margin: float = setting(0.0, unit="rad", low=0.0, high=0.5)
     """Distance that commands keep from the joints' ends."""
-    speed: float = setting(8.0, unit="rad/s", low=0.01, high=100.0)
-    """Fastest change of a command."""
+    speed: float = setting(20.0, unit="rad/s", low=0.01, high=200.0)
+    """Fastest change of a command; a policy that moves targets by 0.2 rad at once needs 0.2 rad in a cycle."""
     reach: float = setting(0.6, unit="rad", low=0.01, high=4.0)
     """Largest distance of a command from the measured angle."""
     joint_speed: float = setting(20.0, unit="rad/s", low=0.1, high=1000.0)
@@ -112,13 +112,13 @@ class Safety:
         self.latched = ""  # why the motors are off for good
         self.anchor = 0  # grows when commands start anew from the measured pose
         self.counts: Counter[str] = Counter()  # cycles by reason
-        self._wish: tuple[float, np.ndarray] | None = None
+        self._wish: tuple[float, np.ndarray, str] | None = None
         self._held: np.ndarray | None = None
-        self._since = 0.0  # when the hold began
+        self._since = 0.0  # when its reason came up
         self._commanded: np.ndarray | None = None
         self._time = self._ramp_start = 0.0
         self._hot_current: float | None = None  # since when a current is too high
-        self._last = (Reaction.NONE, "")
+        self.last = (Reaction.NONE, "")  # reaction and reason of the newest decision
 
     def see(self, sample: Sample) -> None:
         """Take in a measurement; one with numbers that are not finite is no measurement."""
@@ -132,9 +132,9 @@ class Safety:
         high = bool(np.any(sample.measured.current > self.config.current))
         self._hot_current = (self._hot_current if self._hot_current is not None else sample.time) if high else None
 
-    def wish(self, position: np.ndarray, time: float) -> None:
-        """Where the policy wants the joints [J] rad, and when it said so."""
-        self._wish = time, np.array(position, np.float32)
+    def wish(self, position: np.ndarray, time: float, trouble: str = "") -> None:
+        """Where the policy wants the joints [J] rad, when it said so, and why not to heed it."""
+        self._wish = time, np.array(position, np.float32), trouble
 
     def engage(self) -> None:
         """Turn the motors on, at the pose measured last; does nothing once latched."""
@@ -158,7 +158,9 @@ class Safety:
         reason = self._reason_to_hold(now, sample)
         if reason:
             if self._held is None:
-                self._held, self._since = self._inside(sample.measured.joint_position), now
+                self._held = self._inside(sample.measured.joint_position)
+            if reason != self.last[1]:
+                self._since = now
             old = reason.startswith(("no measurement", "no wish"))
             if old and now - self._since > config.patience:
                 if reason.startswith("no wish"):
@@ -197,7 +199,7 @@ class Safety:
         # Before the first wish the start pose is the wish.
         if self._wish is not None and now - self._wish[0] > config.watchdog:
             return "no wish"
-        return ""
+        return self._wish[2] if self._wish is not None else ""
 
     def _start(self, now: float, sample: Sample) -> None:
         self._commanded = self._inside(sample.measured.joint_position)
@@ -234,8 +236,8 @@ class Safety:
     def _finish(self, now: float, reaction: Reaction, reason: str, position: np.ndarray) -> Decision:
         self._time = now
         self.counts[reason] += bool(reason)
-        if (reaction, reason) != self._last:
+        if (reaction, reason) != self.last:
             self._note(f"{reaction.name.lower()}: {reason}" if reason else "in command")
-            self._last = (reaction, reason)
+            self.last = (reaction, reason)
         mode = Mode.PASSIVE if reaction == Reaction.RELAX else Mode.POSITION
         return Decision(position, mode, reaction, reason)

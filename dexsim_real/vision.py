@@ -114,7 +114,7 @@ class HeightSensor:
         while self._newest is None:
             if time.monotonic() > until:
                 raise HandError("the camera does not see the object: check its light, the colour "
-                                "threshold (--camera.hsv-low, --camera.hsv-high) and min-area")
+                                "threshold (--optics.hsv-low, --optics.hsv-high) and min-area")
             time.sleep(0.01)
 
     def read(self) -> tuple[float, np.ndarray, np.ndarray]:

@@ -32,7 +32,7 @@ class Bench:
 
     def __init__(self, hand, **options):
         self.notes = []
-        self.safety = Safety(hand, SafetyConfig(**options), self.notes.append)
+        self.safety = Safety(hand, SafetyConfig(**{"speed": 8.0, **options}), self.notes.append)
         self.now, self.position = 10.0, MIDDLE
 
     def cycle(self, wish=None, fresh=True, follow=True, **measurement):
@@ -171,6 +171,20 @@ def test_a_silent_hand_is_held_then_relaxed_then_taken_up_where_it_is(bench):
     assert decision.mode == Mode.POSITION
     assert np.abs(decision.position - bench.position).max() <= 0.7 * CYCLE
     assert bench.safety.anchor > anchor
+
+
+def test_a_policy_that_waits_for_a_silent_hand_is_not_dead(bench):
+    bench.run(3.0, fresh=False)
+    assert not bench.safety.latched
+    bench.cycle()
+    assert not bench.safety.latched
+    assert bench.cycle(wish=MIDDLE).mode == Mode.POSITION
+
+
+def test_a_wish_with_a_reason_not_to_heed_it_holds(bench):
+    bench.safety.wish(MIDDLE + np.float32(0.1), bench.now, "the object is out of sight")
+    decision = bench.cycle()
+    assert (decision.reaction, decision.reason) == (Reaction.HOLD, "the object is out of sight")
 
 
 def test_a_reconnected_hand_starts_from_its_pose(bench):

@@ -1,0 +1,151 @@
+"""A policy on hardware: measurements in, action and joint targets out, in the simulation's order.
+
+One tick here is one `Env.step` of the simulation seen from outside: the readings carry the action
+that led to them, `observe` and the policy follow, and the action moves the joint targets by the same
+`move_target`.
+"""
+
+import dataclasses
+import math
+from typing import Any
+
+import jax
+import numpy as np
+
+from dexsim.config import from_dict
+from dexsim.control import move_target
+from dexsim.hand import Hand
+from dexsim.observation import Field, ObservationConfig, Readings, layout, observe
+from dexsim.tasks import TASKS
+from dexsim_ppo.policy import Policy
+from dexsim_real.hand import HandError
+from dexsim_real.imu import multiply
+from dexsim_real.sensing import Measured, ObjectEstimate, make_readings, sources_of
+
+IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+@dataclasses.dataclass(frozen=True)
+class Tick:
+    """What one tick saw and did; NumPy float32."""
+
+    readings: Readings
+    observation: np.ndarray
+    action: np.ndarray  # [J], zero where the policy's was not finite
+    target: np.ndarray  # [J] rad; not finite where the policy's action was not
+
+
+def make_observe(hand: Hand, names: tuple[str, ...], config: ObservationConfig) -> Any:
+    """The one jitted `observe` of a task: readings to observation."""
+    return jax.jit(lambda readings: observe(hand, readings, names, config))
+
+
+def load_task(name: str, config: dict[str, Any], hand: Hand) -> Any:
+    """The rules of a policy's task with the configuration it was trained with; no MJX.
+
+    Raises:
+      HandError: there is no such task.
+    """
+    if name not in TASKS:
+        raise HandError(f"the policy is of the task {name!r}; known are {', '.join(TASKS)}")
+    entry = TASKS[name]
+    return entry.task_class(from_dict(entry.config_class, config), hand)
+
+
+class Controller:
+    """The policy between readings and joint targets.
+
+    Raises:
+      HandError: the policy observes what its task does not give, or what no sensor can measure.
+    """
+
+    def __init__(self, policy: Policy, hand: Hand):
+        self.policy, self.hand = policy, hand
+        self.task = load_task(policy.task, policy.env_config, hand)
+        config = self.task.config
+        names = self.task.fields["actor"]
+        wanted = tuple(Field(f.name, f.size, f.scale) for f in policy.observation_layout)
+        if layout(hand, names, config.observation) != wanted:
+            raise HandError(f"the policy's observation does not fit this version's task {policy.task!r}")
+        self.sources = sources_of([field.name for field in wanted])
+        self.period = 1.0 / policy.control_rate
+        self._observe = make_observe(hand, names, config.observation)
+        self._move = jax.jit(lambda *arrays: move_target(config.control, hand, *arrays))
+        self.start(np.zeros(hand.num_joints, np.float32))
+
+    def warm(self) -> None:
+        """Compile everything, so that the first tick is as fast as the others."""
+        hand = self.hand
+        joints = np.zeros(hand.num_joints, np.float32)
+        nothing = Measured(joints, joints, np.zeros((hand.num_fingers, hand.num_taxels), np.float32), joints,
+                           np.zeros(1), np.zeros(1))
+        for _ in range(3):
+            self.tick(nothing, ObjectEstimate(np.zeros(3), np.zeros(3), IDENTITY), IDENTITY, 0.0)
+        self.start(joints)
+
+    def start(self, target: np.ndarray) -> None:
+        """Begin an episode with these joint targets [J] rad; no action has been."""
+        self.target = np.asarray(target, np.float32)
+        self.last_action = np.zeros(self.hand.num_joints, np.float32)
+
+    def anchor(self, position: np.ndarray) -> None:
+        """Go on from this pose [J] rad: the hand did not follow its targets for a while."""
+        self.target = np.asarray(position, np.float32)
+
+    def tick(self, measured: Measured, seen: ObjectEstimate, goal_quat: np.ndarray, command: float) -> Tick:
+        """Readings, observation, action, and the joint targets that follow."""
+        readings = make_readings(measured, seen, goal_quat, command, self.last_action)
+        observation = np.asarray(self._observe(readings))
+        action = np.clip(np.asarray(self.policy(observation)), -1.0, 1.0)
+        if np.isfinite(action).all():
+            target = np.asarray(self._move(self.target, action, measured.joint_position))
+            self.target = target
+        else:  # As in simulation it counts as no action; `Safety` sees the target and holds.
+            action, target = np.zeros_like(self.last_action), np.full_like(self.target, np.nan)
+        self.last_action = action
+        return Tick(readings, observation, action, target)
+
+
+class TurnGoals:
+    """Goals of the rotation task, followed with what the IMU says, by the task's own rules.
+
+    The simulation judges by the true spin and place of the object; here the spin is estimated from the
+    orientation (filtered over 0.1 s), and of the place only the measured coordinate counts.
+    """
+
+    _SMOOTH = 0.1  # s
+
+    def __init__(self, config: Any, reference: np.ndarray):
+        self._config, self._reference = config, np.asarray(reference)
+        self._axis = np.asarray(config.axis, float) / np.linalg.norm(config.axis)
+        self.successes, self.times = 0, []
+        self._last: tuple[float, np.ndarray] | None = None
+        self._spin, self._inside_since = 0.0, None
+        self.quat = self._goal()
+
+    def update(self, time: float, seen: ObjectEstimate) -> np.ndarray:
+        """The goal [4] that the readings of this tick carry; it has moved on if it was reached."""
+        config, quat = self._config, seen.quat
+        if self._last is not None and time > self._last[0]:
+            step = time - self._last[0]
+            turn = multiply(quat, self._last[1] * [1, -1, -1, -1])
+            rate = 2 * math.atan2(float(turn[1:] @ self._axis), float(turn[0])) / step
+            rate = (rate + math.pi / step) % (2 * math.pi / step) - math.pi / step
+            self._spin += step / (step + self._SMOOTH) * (rate - self._spin)
+        self._last = time, quat
+        away = 2 * math.acos(min(1.0, abs(float(quat @ self.quat))))
+        distance = np.linalg.norm(seen.position - self._reference)
+        inside = away < config.goal_angle and distance < config.goal_distance
+        self._inside_since = (self._inside_since or time) if inside else None
+        calm = config.goal_spin <= 0 or abs(self._spin) <= config.goal_spin
+        if inside and calm and time - self._inside_since >= config.goal_dwell:
+            self.successes += 1
+            self.times.append(time)
+            self._inside_since = None
+            self.quat = self._goal()
+        return self.quat
+
+    def _goal(self) -> np.ndarray:
+        config = self._config
+        angle = (self.successes + 1) * config.direction * config.goal_step % (2 * math.pi)
+        return np.concatenate([[math.cos(angle / 2)], math.sin(angle / 2) * self._axis])

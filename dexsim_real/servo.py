@@ -1,0 +1,165 @@
+"""The thread that owns the hand: one exchange a cycle, at absolute deadlines, through `Safety`.
+
+The policy runs elsewhere and slower. If it dies, this thread goes on and `Safety` acts; when this
+thread ends, for whatever reason, its last act is to turn the motors off.
+"""
+
+import threading
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from dexsim_real.frames import Mode
+from dexsim_real.hand import HandPort, Reply
+from dexsim_real.safety import Decision, Safety, Sample
+from dexsim_real.sensing import HandSensing, VelocityFilter
+
+
+class Timing:
+    """How late something was, in constant memory: a histogram of 10 us bins up to 50 ms."""
+
+    _BIN, _BINS = 1e-5, 5000
+
+    def __init__(self) -> None:
+        self._bins = np.zeros(self._BINS + 1, np.int64)
+        self.count, self.missed, self.worst = 0, 0, 0.0
+
+    def add(self, seconds: float) -> None:
+        """One more sample."""
+        self._bins[min(int(max(seconds, 0.0) / self._BIN), self._BINS)] += 1
+        self.count += 1
+        self.worst = max(self.worst, seconds)
+
+    def percentile(self, percent: float) -> float:
+        """Seconds below which this share of the samples lies."""
+        if not self.count:
+            return float("nan")
+        at = np.searchsorted(np.cumsum(self._bins), percent / 100 * self.count)
+        return min((int(at) + 1) * self._BIN, self.worst)
+
+    def summary(self) -> dict[str, float]:
+        """Percentiles in ms, and counts."""
+        return {"count": self.count, "missed": self.missed, "p50_ms": 1e3 * self.percentile(50),
+                "p99_ms": 1e3 * self.percentile(99), "max_ms": 1e3 * self.worst}
+
+
+class Pace:
+    """Absolute deadlines `start + k / rate`: what one cycle takes does not shift the next."""
+
+    def __init__(self, rate: float, clock: Callable[[], float] = time.monotonic,
+                 sleep: Callable[[float], None] = time.sleep):
+        self.period, self._clock, self._sleep = 1.0 / rate, clock, sleep
+        self.jitter = Timing()
+        self.next = clock() + self.period
+
+    def wait(self) -> None:
+        """Sleep until the next deadline; those that passed meanwhile are missed and left out."""
+        now = self._clock()
+        behind = int((now - self.next) / self.period) + 1 if now > self.next else 0
+        self.jitter.missed += behind
+        self.next += behind * self.period
+        self._sleep(max(self.next - now, 0.0))
+        self.jitter.add(self._clock() - self.next)
+        self.next += self.period
+
+
+class Servo:
+    """Runs exchanges until stopped.
+
+    Args:
+      port: connected; from now on only this thread touches it.
+      rate: exchanges per second.
+      passed: called with each answered exchange and the decision that it carried.
+    """
+
+    def __init__(self, port: HandPort, sensing: HandSensing, safety: Safety, rate: float,
+                 passed: Callable[[Reply, Decision], None] = lambda reply, decision: None):
+        self.port, self.sensing, self.safety, self._passed = port, sensing, safety, passed
+        self.pace = Pace(rate)
+        self.round_trip = Timing()
+        self.waited = 0  # deadlines missed because the hand was slow to answer
+        self.error: BaseException | None = None
+        self._filter = VelocityFilter(sensing.config.velocity_time)
+        self._stop = threading.Event()
+        self._engage = False
+        self._fresh = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="servo", daemon=True)
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def engage(self) -> None:
+        """Turn the motors on at the next cycle."""
+        self._engage = True
+
+    def alive(self) -> bool:
+        """Whether exchanges go on."""
+        return self._thread.is_alive()
+
+    def forget(self) -> None:
+        """Measure times anew, without those of starting up."""
+        self.pace.jitter, self.round_trip, self.waited = Timing(), Timing(), 0
+
+    def wait_fresh(self, seconds: float) -> Sample | None:
+        """The next sample that arrives, or None when none does in time."""
+        self._fresh.clear()
+        return self.safety.sample if self._fresh.wait(seconds) else None
+
+    def stop(self) -> None:
+        """Motors off, port closed; returns when both are done."""
+        self._stop.set()
+        if self._thread.ident is not None:
+            self._thread.join()
+        else:
+            self._rest()
+
+    def _run(self) -> None:
+        try:
+            self.pace.next = time.monotonic() + self.pace.period
+            while not self._stop.is_set():
+                self._cycle()
+                missed = self.pace.jitter.missed
+                self.pace.wait()
+                if self.pace.jitter.missed > missed and self._slow:
+                    self.waited += self.pace.jitter.missed - missed
+        except BaseException as error:  # Whatever it is, the motors go off; the main thread reports it.
+            self.error = error
+        finally:
+            self._rest()
+
+    def _cycle(self) -> None:
+        if self._engage:
+            self.safety.engage()
+            self._engage = False
+        decision = self.safety.decide(time.monotonic())
+        started = time.monotonic()
+        reply = self.port.exchange(self.sensing.command(decision.position, decision.mode))
+        took = time.monotonic() - started
+        self._slow = took > self.pace.period
+        if reply is None:
+            return
+        self.round_trip.add(reply.received - reply.sent)
+        self.safety.see(self._sample(reply))
+        self._fresh.set()
+        self._passed(reply, decision)
+
+    def _sample(self, reply: Reply) -> Sample:
+        measured = self.sensing.measure(reply.state)
+        before = self.safety.sample
+        if before is not None and before.generation != reply.generation:
+            self._filter.reset()
+        velocity = self.sensing.velocity(reply.state)
+        if velocity is None:
+            velocity = self._filter.update(reply.received, measured.joint_position)
+        return Sample(reply.received, reply.sequence, reply.generation, measured, velocity)
+
+    def _rest(self) -> None:
+        """Motors off: until the hand has confirmed it, or ten times."""
+        off = self.sensing.command(self.sensing.hand.joint_lower, Mode.PASSIVE)
+        try:
+            for _ in range(10):
+                if self.port.exchange(off) is not None:
+                    break
+        finally:
+            self.port.close()
