@@ -2,7 +2,9 @@
 
 RVC frames come unasked, 100 a second at 115200 baud: AA AA, index, yaw, pitch and roll in 0.01
 degree, three accelerations in mg, three more bytes, and the sum of all after the head (BNO080
-datasheet, 1.3.5.2). Yaw has no north: it is fixed once, against a known pose of the object.
+datasheet, 1.3.5.2). Yaw has no north: it is fixed once, against a known pose of the object. Yaw,
+pitch and roll are blind where the part's x points up or down, so the part's z belongs on the axis
+that stays upright: `UPRIGHT_X` is its mount in an object that turns about its x.
 """
 
 import math
@@ -19,6 +21,8 @@ HEAD = b"\xaa\xaa"
 SIZE = 19
 BAUD = 115200
 _BODY = struct.Struct("<B6h3B")
+UPRIGHT_X = (0.5**0.5, 0.0, 0.5**0.5, 0.0)
+"""Orientation of the part in the object: the part's z along the object's x."""
 
 
 def encode(index: int, quat: np.ndarray, acceleration: tuple[float, float, float] = (0.0, 0.0, 9.81)) -> bytes:
@@ -83,7 +87,7 @@ def align(sensed: np.ndarray, known: np.ndarray, up: np.ndarray) -> np.ndarray:
     """The rotation that takes the part's world to the palm frame.
 
     Gravity fixes two of its angles (`up` [3] is the vertical in the palm frame); only the heading is
-    taken from the `known` orientation that the object had when `sensed` was read.
+    taken from the `known` orientation that the part had in the palm frame when `sensed` was read.
     """
     up = np.asarray(up, float) / np.linalg.norm(up)
     # The shortest rotation from the part's z to the palm frame's vertical; half a turn about x if opposite.
@@ -101,10 +105,12 @@ class Imu:
     Args:
       port: serial port of the part.
       up: [3] the vertical in the palm frame.
+      mount: [4] orientation of the part in the object.
     """
 
-    def __init__(self, port: str, up: np.ndarray):
+    def __init__(self, port: str, up: np.ndarray, mount: tuple[float, ...] = UPRIGHT_X):
         self.port, self._up = port, up
+        self._mount = np.asarray(mount) / np.linalg.norm(mount)
         self._world: np.ndarray | None = None
         self._newest: tuple[float, np.ndarray] | None = None
         self._stop = threading.Event()
@@ -125,14 +131,14 @@ class Imu:
                 raise HandError(f"{self.port}: no orientation from the IMU; is "
                                 "it in UART-RVC mode (PS0 high, PS1 low)?")
             time.sleep(0.005)
-        self._world = align(self._newest[1], known, self._up)
+        self._world = align(self._newest[1], multiply(known, self._mount), self._up)
 
     def read(self) -> tuple[float, np.ndarray]:
         """When the newest sample came (s, monotonic) and the object's orientation [4]."""
         if self._newest is None or self._world is None:
             raise HandError(f"{self.port}: the IMU has not been calibrated")
         when, quat = self._newest
-        return when, multiply(self._world, quat)
+        return when, multiply(multiply(self._world, quat), conjugate(self._mount))
 
     def close(self) -> None:
         self._stop.set()

@@ -29,7 +29,7 @@ from dexsim_ppo.evaluate import load_policy
 from dexsim_real.control import IDENTITY, Controller, Tick, TurnGoals
 from dexsim_real.frames import Mode, empty_state
 from dexsim_real.hand import HandError, LinkConfig, open_port
-from dexsim_real.imu import Imu
+from dexsim_real.imu import UPRIGHT_X, Imu
 from dexsim_real.log import Kind, LogWriter
 from dexsim_real.safety import Safety, SafetyConfig
 from dexsim_real.sensing import HandSensing, HardwareConfig, ObjectEstimate
@@ -60,6 +60,8 @@ class RunArguments:
     """Run without a calibration, on guessed scales (`--hardware.current-scale`, `--hardware.force-per-count`)."""
     imu: str | None = None
     """Serial port of the IMU in the object."""
+    imu_mount: tuple[float, float, float, float] = setting(UPRIGHT_X, unit="1", low=-1.0, high=1.0)
+    """Orientation (w, x, y, z) of the IMU in the object; by default its z lies along the object's x."""
     camera: str | None = None
     """Mask source: camera number, video file, unix:PATH or MODULE:FUNCTION."""
     fixed_object: bool = False
@@ -115,7 +117,7 @@ class ObjectSensors:
                 self._camera = HeightSensor(open_masks(arguments.camera, arguments.optics), arguments.optics,
                                             self._reference, sensing.object_axes, sensing.velocity_filter)
             if arguments.imu:
-                self._imu = Imu(arguments.imu, -np.asarray(task.gravity))
+                self._imu = Imu(arguments.imu, -np.asarray(task.gravity), arguments.imu_mount)
                 # The object is put down squarely: its heading is zero now.
                 self._imu.calibrate(IDENTITY)
             if self._camera:
