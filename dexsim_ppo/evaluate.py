@@ -26,7 +26,7 @@ from dexsim.assets import asset_path
 from dexsim.config import from_dict
 from dexsim.errors import AssetError, CheckpointError, ConfigError
 from dexsim_ppo import cli
-from dexsim_ppo.compilation import jit
+from dexsim_ppo.compilation import collector_paused, jit
 from dexsim_ppo.policy import Policy, PolicyParams, act, layout_to_list
 from dexsim_ppo.types import Environment
 
@@ -58,8 +58,9 @@ class Evaluator:
           metrics. And the snapshots of the shown episodes, for `write_video`.
         """
         started = time.perf_counter()
-        chunks = [jax.device_get(self._run(params, jax.random.fold_in(jax.random.key(seed), i)))
-                  for i in range(math.ceil(episodes / self.chunk))]
+        with collector_paused():
+            chunks = [jax.device_get(self._run(params, jax.random.fold_in(jax.random.key(seed), i)))
+                      for i in range(math.ceil(episodes / self.chunk))]
         # Episodes are the last axis of all that is measured.
         measured = jax.tree.map(lambda *xs: np.concatenate(xs, axis=-1),
                                 *(measured for measured, _ in chunks))

@@ -1,6 +1,6 @@
 """How much to train, and how large, by the device found."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from dexsim_ppo.ppo import PPOConfig
 
@@ -39,3 +39,16 @@ PRESETS = {
         steps=0, minutes=8.0, evaluate_every=100, evaluation_chunk=1024, evaluation_episodes=1024,
         log_every=10),
 }
+
+
+def find_preset(name: str, task: str) -> Preset:
+    """The preset of a device, adapted to the task."""
+    preset = PRESETS.get(name, PRESETS["cpu"])
+    if not task.startswith("rotate"):
+        return preset
+    # Episodes of two minutes are long to evaluate, so that is done once, at the end; and a gait wants
+    # less noise than a grip that has to try out forces.
+    if preset is PRESETS["cpu"]:
+        return replace(preset, evaluation_chunk=16, evaluation_episodes=16)
+    return replace(preset, ppo=replace(preset.ppo, entropy_coefficient=0.001), minutes=7.0,
+                   evaluate_every=0)

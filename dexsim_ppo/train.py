@@ -25,7 +25,7 @@ from dexsim.config import from_dict
 from dexsim.errors import ConfigError
 from dexsim_ppo import checkpoint, cli
 from dexsim_ppo.ppo import PPOConfig
-from dexsim_ppo.presets import PRESETS, Preset
+from dexsim_ppo.presets import Preset, find_preset
 from dexsim_ppo.runlog import RunFolder
 from dexsim_ppo.trainer import Run, TrainArguments, printable
 
@@ -91,7 +91,7 @@ def preset_arguments(task: str, env_config: Any, name: str) -> TrainArguments:
     """The options' defaults under a preset."""
     if name == "auto":
         name = "gpu" if jax.default_backend() == "gpu" else "cpu"
-    preset = PRESETS.get(name, PRESETS["cpu"])
+    preset = find_preset(name, task)
     values = {f.name: getattr(preset, f.name) for f in dataclasses.fields(Preset)}
     return TrainArguments(env=env_config, task=task, **values)
 

@@ -17,6 +17,7 @@ import numpy as np
 from dexsim.config import setting, to_dict, validate
 from dexsim.errors import DexsimError
 from dexsim_ppo import checkpoint, cli
+from dexsim_ppo.compilation import collector_paused
 from dexsim_ppo.display import Display
 from dexsim_ppo.evaluate import Evaluator, print_report, write_video
 from dexsim_ppo.policy import Policy
@@ -143,8 +144,9 @@ class Run:
         skipped, evaluated = int(state.skipped_updates), iteration == 0
         while not stopped() and self._seconds_left(iteration, 1.0) > 0:
             call = time.perf_counter()
-            state, metrics = step(state)
-            metrics = jax.device_get(metrics)
+            with collector_paused():
+                state, metrics = step(state)
+                metrics = jax.device_get(metrics)
             now, iteration = time.perf_counter(), iteration + per_call
             if "first_update_s" not in self.clock:
                 self.clock["first_update_s"] = now - self.started

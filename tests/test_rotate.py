@@ -187,8 +187,16 @@ class TestReward:
 
 
 class TestDrop:
-    def test_beyond_9_cm(self, task, begun):
-        for distance, lost in ((0.089, False), (0.091, True)):
+    def test_tipped_over(self, task, begun):
+        for degrees, lost in ((55, False), (59, True), (180, True)):
+            tipped = Rotation.from_euler("y", degrees, degrees=True) * Rotation.from_euler("x", 1.0)
+            here = moment(task, object_quat=quat_of(tipped))
+            np.testing.assert_allclose(task._tilt(here), math.radians(degrees), atol=1e-3)
+            assert bool(task.dropped(begun, here)) == lost
+        assert not bool(task.dropped(begun, moment(task, object_quat=turned(170))))
+
+    def test_beyond_7_cm(self, task, begun):
+        for distance, lost in ((0.069, False), (0.071, True)):
             place = np.asarray(task.reference) + [0, 0, distance]
             assert bool(task.dropped(begun, moment(task, object_position=place))) == lost
 

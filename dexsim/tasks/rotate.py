@@ -43,16 +43,16 @@ class RotateReward:
     """How sharply it closes."""
     bonus: float = setting(250.0, unit="1", low=0.0, high=1e5)
     """Once for each goal reached."""
-    action: float = setting(-0.02, unit="1", low=-1000.0, high=0.0)
+    action: float = setting(-0.01, unit="1", low=-1000.0, high=0.0)
     """Squared change of the action."""
-    velocity: float = setting(-0.02, unit="s^2/rad^2", low=-1000.0, high=0.0)
+    velocity: float = setting(-0.015, unit="s^2/rad^2", low=-1000.0, high=0.0)
     """Squared joint velocity."""
     torque: float = setting(-0.1, unit="1/Nm^2", low=-1000.0, high=0.0)
     """Squared joint torque."""
-    spin: float = setting(0.5, unit="s/rad", low=0.0, high=1000.0)
+    spin: float = setting(1.0, unit="s/rad", low=0.0, high=1000.0)
     """Spin about the axis in the wanted direction, up to +-1 rad/s: a gradient before the first
     goal is ever reached."""
-    fingertips: float = setting(1.0, unit="1", low=0.0, high=1000.0)
+    fingertips: float = setting(0.5, unit="1", low=0.0, high=1000.0)
     """Share of `working_tips` fingertips that have done their share of touching lately."""
     working_tips: int = setting(3, unit="1", low=1, high=20)
     """Fingertips that are asked to take part."""
@@ -99,8 +99,11 @@ class RotateConfig(EnvConfig):
     reference: tuple[float, float, float] = setting((0.047, 0.0, 0.071), unit="m", low=-0.5,
                                                     high=0.5)
     """Where the object belongs."""
-    drop_distance: float = setting(0.09, unit="m", low=0.01, high=1.0)
-    """The object is lost when its centre is farther than this from the reference."""
+    drop_distance: float = setting(0.07, unit="m", low=0.01, high=1.0)
+    """The object is lost when its centre is farther than this from the reference ..."""
+    drop_tilt: float = setting(1.0, unit="rad", low=0.1, high=3.2)
+    """... or when it has tipped over: its own axis is farther than this from the axis of rotation,
+    and no goal can be reached any more."""
     clearance: float = setting(0.001, unit="m", low=0.0, high=0.05)
     """Smallest gap between palm and object with support "fingers"."""
     episode_seconds: float = setting(60.0, unit="s", low=0.2, high=3600.0)
@@ -142,7 +145,7 @@ class RotateConfig(EnvConfig):
 def paper() -> RotateConfig:
     """The paper's own weights and success test."""
     return RotateConfig(
-        goal_spin=0.0, control=Control(step=0.3),
+        goal_spin=0.0, drop_distance=0.09, drop_tilt=math.pi, control=Control(step=0.3),
         reward=RotateReward(action=-0.0002, velocity=0.0, torque=0.0, spin=0.0, fingertips=0.0,
                             drop=0.0))
 
@@ -155,7 +158,7 @@ def without_orientation() -> RotateConfig:
 def clear_of_palm() -> RotateConfig:
     """The object held clear of the palm by thumb and fingers, which point downhill."""
     return RotateConfig(
-        support="fingers", tilt=-0.6, reference=(0.058, 0.0, 0.086), squeeze=(0.1, 0.4),
+        reward=RotateReward(fingertips=0.0, spin=2.0), support="fingers", tilt=-0.6, reference=(0.058, 0.0, 0.086), squeeze=(0.1, 0.4),
         posture=(1.2, 0.4, 0.4, 0.0, 0.6, 0.5, 0.6, 0.5, 0.6, 0.5, 0.6, 0.5), posture_noise=0.25,
         curl=(-0.2, 0.2))
 
@@ -262,10 +265,9 @@ class Rotate:
         now, period = self.progress(goal, moment), self._period
         touching = self._touching(moment)
         clock = goal.clock + period
-        up = rotations.rotate(rotations.quat_to_matrix(moment.object_quat), self._axis)
         change = {"spin": now.spin, "joint_speed": jnp.mean(jnp.abs(moment.joint_velocity)),
                   "action_rate": jnp.mean(jnp.abs(moment.action - moment.last_action)),
-                  "tilt": jnp.arccos(jnp.clip(jnp.sum(up * self._axis), -1.0, 1.0)),
+                  "tilt": self._tilt(moment),
                   "touch": touching}
         return Goal(
             turns=goal.turns + now.success, entered=now.entered & ~now.success,
@@ -297,7 +299,7 @@ class Rotate:
     def dropped(self, goal: Goal, moment: Moment) -> jax.Array:
         del goal
         away = jnp.linalg.norm(moment.object_position - jnp.asarray(self.reference))
-        lost = away > self.config.drop_distance
+        lost = (away > self.config.drop_distance) | (self._tilt(moment) > self.config.drop_tilt)
         if self.config.support == "fingers":
             low = lowest_point(moment.target, moment.object_quat, moment.object_position)
             lost |= low < self._palm + self.config.clearance
@@ -338,6 +340,12 @@ class Rotate:
 
     def _quat(self, goal: Goal) -> jax.Array:
         return goal_quat(goal.turns, self._axis, self._step)
+
+    def _tilt(self, moment: Moment) -> jax.Array:
+        """Angle [] rad between the object's own axis and the axis of rotation."""
+        own = rotations.rotate(rotations.quat_to_matrix(moment.object_quat), self._axis)
+        across = jnp.linalg.norm(jnp.cross(own, self._axis) + 1e-12)
+        return jnp.arctan2(across, jnp.sum(own * self._axis))
 
     def _touching(self, moment: Moment) -> jax.Array:
         return (jnp.linalg.norm(moment.finger_force, axis=-1) > TOUCH).astype(jnp.float32)
