@@ -158,7 +158,8 @@ def without_orientation() -> RotateConfig:
 def clear_of_palm() -> RotateConfig:
     """The object held clear of the palm by thumb and fingers, which point downhill."""
     return RotateConfig(
-        reward=RotateReward(fingertips=0.0, spin=2.0), support="fingers", tilt=-0.6, reference=(0.058, 0.0, 0.086), squeeze=(0.1, 0.4),
+        reward=RotateReward(fingertips=0.0, spin=2.0), support="fingers", tilt=-0.6,
+        reference=(0.058, 0.0, 0.086), squeeze=(0.1, 0.4),
         posture=(1.2, 0.4, 0.4, 0.0, 0.6, 0.5, 0.6, 0.5, 0.6, 0.5, 0.6, 0.5), posture_noise=0.25,
         curl=(-0.2, 0.2))
 
