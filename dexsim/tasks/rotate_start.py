@@ -34,7 +34,7 @@ KINDS = {"cube": ("box",), "cylinder": ("cylinder",), "octagon": ("box", "box")}
 _SHAPE_INDEX = {"cube": "box", "cylinder": "cylinder", "octagon": "composition"}
 _UPRIGHT = (np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0)  # takes a cylinder's axis to the palm's normal
 _EIGHTH = (np.cos(np.pi / 8), np.sin(np.pi / 8), 0.0, 0.0)  # 45 degrees about the palm's normal
-_VERSION = 1  # of the procedure: raise it when older pools no longer hold
+_VERSION = 2  # of the procedure: raise it when older pools no longer hold
 _AT_REST = (0.05, 1.0)  # m/s, rad/s
 _LEVEL = 0.35  # rad, largest angle from upright
 
