@@ -23,6 +23,8 @@ from dexsim_real.imu import multiply
 from dexsim_real.sensing import Measured, ObjectEstimate, make_readings, sources_of
 
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
+SIMULATION = ("physics", "objects", "randomization", "skin", "reward")
+"""Parts of a task's configuration that a hand has no use for: a policy outlives changes in them."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,7 +43,7 @@ def make_observe(hand: Hand, names: tuple[str, ...], config: ObservationConfig) 
 
 
 def load_task(name: str, config: dict[str, Any], hand: Hand) -> Any:
-    """The rules of a policy's task with the configuration it was trained with; no MJX.
+    """The rules of a policy's task, configured as in training where a hand can tell; no MJX.
 
     Raises:
       HandError: there is no such task.
@@ -49,7 +51,8 @@ def load_task(name: str, config: dict[str, Any], hand: Hand) -> Any:
     if name not in TASKS:
         raise HandError(f"the policy is of the task {name!r}; known are {', '.join(TASKS)}")
     entry = TASKS[name]
-    return entry.task_class(from_dict(entry.config_class, config), hand)
+    needed = {key: value for key, value in config.items() if key not in SIMULATION}
+    return entry.task_class(from_dict(entry.config_class, needed), hand)
 
 
 class Controller:

@@ -278,6 +278,7 @@ class Run:
                 self._tick(now, sample)
                 self.compute.add(time.monotonic() - now)
             self.pace.wait()
+        self._check()
         return "time is over"
 
     def _tick(self, now: float, sample: Any) -> None:
