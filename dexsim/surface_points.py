@@ -130,7 +130,7 @@ def _scan(points: jax.Array, surface: SurfacePoints) -> jax.Array:
             best, index = jnp.where(better, score, best), jnp.where(better, start + k, index)
         return (best, index, start + surface.block), None
 
-    start = (jnp.full(x.shape, jnp.inf, table.dtype), jnp.zeros(x.shape, jnp.int32), jnp.int32(0))
+    start = (jnp.full(x.shape, jnp.inf, jnp.result_type(x, table)), jnp.zeros(x.shape, jnp.int32), jnp.int32(0))
     return jax.lax.scan(step, start, blocks)[0][1]
 
 
