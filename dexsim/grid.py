@@ -142,28 +142,30 @@ def cache_folder() -> Path:
 def _look_up(points: jax.Array, grid: Grid) -> tuple[jax.Array, list[jax.Array]]:
     """Distance and its gradient's three components. Component by component, so that XLA makes one kernel of it."""
     n = grid.nodes
-    origin, spacing = grid.origin[grid.index], grid.spacing[grid.index]
+    step = grid.spacing[grid.index] * grid.scale
+    start = grid.origin[grid.index] * grid.scale
+    # Without the barrier XLA would read and divide these few numbers anew for every point.
+    step, rate, start, base = jax.lax.optimization_barrier((step, 1.0 / step, start, grid.index * n**3))
     gaps, cells, parts, free = [], [], [], []
     for axis in range(3):
-        local = points[..., axis] / grid.scale
-        last = origin[axis] + (n - 1) * spacing[axis]
-        held = jnp.clip(local, origin[axis], last)
-        at = (held - origin[axis]) / spacing[axis]
-        cell = jnp.clip(jax.lax.stop_gradient(at).astype(jnp.int32), 0, n - 2)
-        gaps.append(local - held)
+        at = (points[..., axis] - start[axis]) * rate[axis]
+        held = jnp.clip(at, 0.0, n - 1.0)
+        cell = jnp.minimum(jax.lax.stop_gradient(held).astype(jnp.int32), n - 2)
+        gaps.append((at - held) * step[axis])
         cells.append(cell)
-        parts.append(at - cell)
-        free.append((local >= origin[axis]) & (local <= last))
-    first = ((grid.index * n + cells[0]) * n + cells[1]) * n + cells[2]
+        parts.append(held - cell)
+        free.append(at == held)
+    first = base + (cells[0] * n + cells[1]) * n + cells[2]
     if grid.interpolation == "linear":
         value, slope = _linear(_read_linear(grid, first), parts)
-        slope = [s / spacing[axis] for axis, s in enumerate(slope)]
     else:
-        value, slope = _quadratic(_read_quadratic(grid, first), parts, [spacing[axis] / _MILLI for axis in range(3)])
-        slope = [s / spacing[axis] for axis, s in enumerate(slope)]
+        spacing = step / (grid.scale * _MILLI)
+        value, slope = _quadratic(_read_quadratic(grid, first), parts, [spacing[axis] for axis in range(3)])
     way = jnp.sqrt(sum(g * g for g in gaps) + _TINY)
-    gradient = [jnp.where(f, s * _MILLI, 0.0) + g / way for f, s, g in zip(free, slope, gaps, strict=True)]
-    return grid.scale * (_MILLI * value + way - _TINY**0.5), gradient
+    unit = _MILLI * grid.scale
+    gradient = [jnp.where(f, unit * s * rate[axis], 0.0) + gaps[axis] / way
+                for axis, (f, s) in enumerate(zip(free, slope, strict=True))]
+    return unit * value + way - _TINY**0.5, gradient
 
 
 def _linear(corners: list[jax.Array], parts: list[jax.Array]) -> tuple[jax.Array, list[jax.Array]]:

@@ -109,6 +109,8 @@ def feel_links(hand: Hand, pose: HandPose, thing: Any, position: jax.Array, rota
     """
     turn = rotations.compose(jnp.swapaxes(rotation, -1, -2), pose.tip_rotation)
     shift = rotations.rotate_inverse(rotation, pose.body_position[hand.tip_body] - position)
+    # Without the barrier XLA would compose the rotations anew for every taxel.
+    turn, shift = jax.lax.optimization_barrier((turn, shift))
     taxel = [jnp.asarray(hand.taxel_position[..., axis]) for axis in range(3)]
     local = [sum(turn[:, row, axis, None] * taxel[axis] for axis in range(3)) + shift[:, row, None]
              for row in range(3)]
