@@ -7,6 +7,7 @@ that led to them, `observe` and the policy follow, and the action moves the join
 
 import dataclasses
 import math
+import os
 from typing import Any
 
 import jax
@@ -35,6 +36,16 @@ class Tick:
     observation: np.ndarray
     action: np.ndarray  # [J], zero where the policy's was not finite
     target: np.ndarray  # [J] rad; not finite where the policy's action was not
+
+
+def prepare_jax() -> None:
+    """JAX on the CPU, in the thread that calls it: waking others costs milliseconds on a busy machine.
+
+    To be called before anything is computed; a replay needs the same to give the same bits.
+    """
+    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_multi_thread_eigen=false".strip()
+    jax.config.update("jax_platforms", "cpu")
+    jax.config.update("jax_cpu_enable_async_dispatch", False)
 
 
 def make_observe(hand: Hand, names: tuple[str, ...], config: ObservationConfig) -> Any:

@@ -7,14 +7,12 @@ observation from the readings, by the code that ran on the hand: bit for bit the
 """
 
 import dataclasses
-import os
 import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
-import jax
 import numpy as np
 import tyro
 
@@ -24,7 +22,7 @@ from dexsim.config import from_dict
 from dexsim.observation import Readings
 from dexsim_ppo import cli
 from dexsim_real import frames
-from dexsim_real.control import load_task, make_observe
+from dexsim_real.control import load_task, make_observe, prepare_jax
 from dexsim_real.log import Kind, LogError, LogReader
 from dexsim_real.sensing import HandSensing, HardwareConfig, Measured
 
@@ -183,8 +181,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = cli.parse(ReplayArguments, sys.argv[1:] if argv is None else argv,
                           prog="python -m dexsim_real.replay",
                           description="Recompute and show the log of a run on the hand.")
-    os.environ.setdefault("JAX_PLATFORMS", "cpu")
-    jax.config.update("jax_platforms", "cpu")
+    prepare_jax()
     cli.enable_caches()
     run = replay(arguments.log)
     report = run.report

@@ -6,6 +6,7 @@ The policy is a file, or the name of a shipped one. Everything is compiled befor
 the motors come on at the measured pose and go off at the end, however the end comes.
 """
 
+import contextlib
 import dataclasses
 import gc
 import hashlib
@@ -26,14 +27,14 @@ from dexsim.calibration import load_calibration
 from dexsim.config import setting, to_dict, validate
 from dexsim_ppo import cli
 from dexsim_ppo.evaluate import load_policy
-from dexsim_real.control import IDENTITY, Controller, Tick, TurnGoals
+from dexsim_real.control import IDENTITY, Controller, Tick, TurnGoals, prepare_jax
 from dexsim_real.frames import Mode, empty_state
 from dexsim_real.hand import HandError, LinkConfig, open_port
 from dexsim_real.imu import UPRIGHT_X, Imu
 from dexsim_real.log import Kind, LogWriter
 from dexsim_real.safety import Safety, SafetyConfig
 from dexsim_real.sensing import HandSensing, HardwareConfig, ObjectEstimate
-from dexsim_real.servo import Pace, Servo, Timing
+from dexsim_real.servo import Pace, Servo, Timing, use_realtime
 from dexsim_real.view import View, summary_table
 from dexsim_real.vision import CameraConfig, HeightSensor, open_masks
 
@@ -76,6 +77,8 @@ class RunArguments:
     """Log file; by default a new one under runs/real."""
     output: Path | None = None
     """File for the summary as JSON."""
+    realtime: bool = True
+    """Ask for real-time priority; without the right to it the run goes on without."""
     quiet: bool = False
     """No live view."""
     link: LinkConfig = setting(LinkConfig())
@@ -157,6 +160,8 @@ class Run:
         config = arguments.safety
         config = dataclasses.replace(config, watchdog=max(config.watchdog, 2.5 * self.controller.period))
         self.safety = Safety(hand, config, self._react)
+        # From here on, since compiling in a real-time thread would starve the machine.
+        realtime = arguments.realtime and use_realtime()
         path = arguments.log or Path("runs/real") / time.strftime("%Y%m%d-%H%M%S.log")
         self.log = LogWriter(path)
         self.port = open_port(arguments.port, arguments.link, self._tap)
@@ -168,6 +173,8 @@ class Run:
         self.started = self.force = self.forces = 0.0
         self.tick: Tick | None = None
         self.end = "not started"
+        if arguments.realtime and not realtime:
+            self._note("without real-time priority: expect jitter on a busy machine (docs/hardware.md)")
 
     # --- stages ---------------------------------------------------------------------------------
 
@@ -214,6 +221,8 @@ class Run:
         self.log.add(Kind.END, self.summary())
         self.log.close()
         gc.unfreeze()
+        with contextlib.suppress(OSError, AttributeError):
+            os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
     def summary(self) -> dict[str, Any]:
         """What the run was like."""
@@ -355,8 +364,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """The command. Returns its exit code: 0, or 1 when `Safety` or a failure ended the run."""
     arguments = cli.parse(RunArguments, sys.argv[1:] if argv is None else argv,
                           prog="python -m dexsim_real.run", description="Run a policy on the hand.")
-    os.environ.setdefault("JAX_PLATFORMS", "cpu")
-    jax.config.update("jax_platforms", "cpu")
+    prepare_jax()
     cli.enable_caches()
     run = Run(arguments)
     before = {number: signal.signal(number, _terminate) for number in (signal.SIGTERM, signal.SIGHUP)}

@@ -4,6 +4,7 @@ The policy runs elsewhere and slower. If it dies, this thread goes on and `Safet
 thread ends, for whatever reason, its last act is to turn the motors off.
 """
 
+import os
 import threading
 import time
 from collections.abc import Callable
@@ -12,8 +13,21 @@ import numpy as np
 
 from dexsim_real.frames import Mode
 from dexsim_real.hand import HandPort, Reply
-from dexsim_real.safety import Decision, Safety, Sample
+from dexsim_real.safety import Safety, Sample
 from dexsim_real.sensing import HandSensing, VelocityFilter
+
+
+def use_realtime() -> bool:
+    """Give this thread, and those that it starts, precedence over ordinary programs.
+
+    All threads of the bridge should have it, since they share one interpreter lock. False where the
+    user may not (docs/hardware.md says how to allow it).
+    """
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(20))
+    except (OSError, AttributeError):
+        return False
+    return True
 
 
 class Timing:
@@ -70,12 +84,10 @@ class Servo:
     Args:
       port: connected; from now on only this thread touches it.
       rate: exchanges per second.
-      passed: called with each answered exchange and the decision that it carried.
     """
 
-    def __init__(self, port: HandPort, sensing: HandSensing, safety: Safety, rate: float,
-                 passed: Callable[[Reply, Decision], None] = lambda reply, decision: None):
-        self.port, self.sensing, self.safety, self._passed = port, sensing, safety, passed
+    def __init__(self, port: HandPort, sensing: HandSensing, safety: Safety, rate: float):
+        self.port, self.sensing, self.safety = port, sensing, safety
         self.pace = Pace(rate)
         self.round_trip = Timing()
         self.waited = 0  # deadlines missed because the hand was slow to answer
@@ -118,17 +130,21 @@ class Servo:
         try:
             self.pace.next = time.monotonic() + self.pace.period
             while not self._stop.is_set():
-                self._cycle()
-                missed = self.pace.jitter.missed
+                due = self.pace.next - self.pace.period
+                took = self._cycle()
+                own, missed = time.monotonic() - due - took, self.pace.jitter.missed
                 self.pace.wait()
-                if self.pace.jitter.missed > missed and self._slow:
-                    self.waited += self.pace.jitter.missed - missed
+                missed = self.pace.jitter.missed - missed
+                # Not ours if a usual answer would have left enough time.
+                if missed and own + self.round_trip.percentile(50) < self.pace.period:
+                    self.waited += missed
         except BaseException as error:  # Whatever it is, the motors go off; the main thread reports it.
             self.error = error
         finally:
             self._rest()
 
-    def _cycle(self) -> None:
+    def _cycle(self) -> float:
+        """One exchange; the seconds that it took."""
         if self._engage:
             self.safety.engage()
             self._engage = False
@@ -136,13 +152,12 @@ class Servo:
         started = time.monotonic()
         reply = self.port.exchange(self.sensing.command(decision.position, decision.mode))
         took = time.monotonic() - started
-        self._slow = took > self.pace.period
         if reply is None:
-            return
+            return took
         self.round_trip.add(reply.received - reply.sent)
         self.safety.see(self._sample(reply))
         self._fresh.set()
-        self._passed(reply, decision)
+        return took
 
     def _sample(self, reply: Reply) -> Sample:
         measured = self.sensing.measure(reply.state)

@@ -1,0 +1,158 @@
+"""The bridge's timing against a scripted hand on a pseudo-terminal: one JSON line per measurement.
+
+    python benchmarks/bridge.py --seconds 600
+
+The hand is a process of its own that answers 9.6 ms after each request, as the real one does over
+RS485. Measured are the whole command as a user runs it (exchanges at 83 Hz, the policy at its own rate,
+log and safety on) and, apart, observation and policy alone. `--port` measures another hand instead.
+"""
+
+import argparse
+import contextlib
+import json
+import os
+import select
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import tty
+from pathlib import Path
+
+import numpy as np
+
+EXCHANGE = 0.0096  # s, measured on the hand: mean and median of the round trip
+
+
+def peer() -> None:
+    """A hand that follows its targets; prints its port, and serves until its input closes."""
+    from dexsim_real import frames
+    from dexsim_real.frames import Command, Frame, Mode, Parser
+    from dexsim_real.servo import use_realtime
+
+    use_realtime()  # It stands for hardware, which waits for no scheduler.
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    print(os.ttyname(slave), flush=True)
+    parser, state = Parser(frames.HOST_REQUESTS), frames.empty_state()
+    state["joint"]["position"] = 0.3 * (np.arange(12) != 3)
+    while True:
+        ready, _, _ = select.select([master, sys.stdin], [], [])
+        if sys.stdin in ready:
+            return
+        due = time.monotonic() + EXCHANGE
+        for frame in parser.feed(os.read(master, 4096)):
+            if frame.command == Command.VERSION:
+                os.write(master, Frame(0x80, frames.HOST, Command.VERSION, b"bench").encode())
+            elif frame.command == Command.EXCHANGE:
+                command, joint = frames.decode_command(frame.data), state["joint"]
+                on = command["mode"] == Mode.POSITION
+                joint["position"] += np.where(on, (command["position"] - joint["position"]) / 3, 0)
+                state["tip"]["taxel"]["z"][:, 30:40] = np.random.default_rng().integers(0, 30, (5, 10))
+                reply = Frame(0x80, frames.HOST, Command.EXCHANGE, state.tobytes()).encode()
+                time.sleep(max(due - time.monotonic(), 0.0))
+                while reply:
+                    reply = reply[os.write(master, reply):]
+
+
+@contextlib.contextmanager
+def scripted_hand():
+    """The port of a scripted hand in its own process."""
+    process = subprocess.Popen([sys.executable, __file__, "--peer"], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+                               env={**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parent.parent)})
+    try:
+        yield process.stdout.readline().decode().strip()
+    finally:
+        process.stdin.close()
+        process.wait(5)
+
+
+def resident() -> float:
+    """Memory of this process, MiB."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+def measure_run(options: argparse.Namespace, port: str, folder: Path) -> dict:
+    """A whole run by the command, its own summary, and the memory over time."""
+    from dexsim_real import run
+
+    memory, done = [], threading.Event()
+
+    def watch() -> None:
+        while not done.wait(options.seconds / 20):
+            memory.append(resident())
+
+    arguments = [options.policy, "--port", port, "--uncalibrated", "--fixed-object", "--link.settle", "0.1", "--quiet",
+                 "--seconds", str(options.seconds), "--approach", "1", "--log", str(folder / "bridge.log"),
+                 "--output", str(folder / "bridge.json")]
+    threading.Thread(target=watch, daemon=True).start()
+    start = time.process_time()
+    code = run.main(arguments)
+    used = time.process_time() - start
+    done.set()
+    summary = json.loads((folder / "bridge.json").read_text())
+    exchanges, link = summary["exchange_jitter"], summary["link"]
+    return {
+        "exit": code, "seconds": summary["seconds"], "policy_loop": summary["policy_jitter"],
+        "exchange_loop": exchanges, "round_trip": summary["round_trip"], "tick": summary["policy_compute"],
+        "missed_by_us": exchanges["missed"] - summary["missed_for_the_hand"],
+        "missed_for_the_hand": summary["missed_for_the_hand"],
+        "unanswered": link["sent"] - link["answered"], "holds": summary["safety"],
+        "memory_mib": [round(m, 1) for m in memory[2::4]], "cpu_share": round(used / summary["seconds"], 3),
+        "log_mib": round((folder / "bridge.log").stat().st_size / 2**20, 1), "log_dropped": summary["log_dropped"]}
+
+
+def measure_compute(policy: str, ticks: int) -> dict:
+    """Observation and policy alone, from readings to action, and the whole tick from a state block."""
+    from dexsim import load_hand
+    from dexsim_ppo.evaluate import load_policy
+    from dexsim_real import frames
+    from dexsim_real.control import IDENTITY, Controller
+    from dexsim_real.sensing import HandSensing, HardwareConfig, ObjectEstimate
+
+    hand = load_hand()
+    controller, sensing = Controller(load_policy(policy), hand), HandSensing(hand, HardwareConfig())
+    controller.warm()
+    rng = np.random.default_rng(0)
+    seen = ObjectEstimate(np.zeros(3), np.zeros(3), IDENTITY)
+    both, whole = [], []
+    for _ in range(ticks):
+        state = frames.empty_state()
+        state["joint"]["position"] = rng.uniform(hand.joint_lower, hand.joint_upper)
+        state["tip"]["taxel"]["z"] = rng.integers(0, 30, (5, 120))
+        start = time.perf_counter()
+        tick = controller.tick(sensing.measure(state), seen, IDENTITY, 0.5)
+        middle = time.perf_counter()
+        np.asarray(controller.policy(np.asarray(controller._observe(tick.readings))))
+        both.append(time.perf_counter() - middle)
+        whole.append(middle - start)
+    return {name: {f"p{q}_ms": round(1e3 * float(np.percentile(times, q)), 4) for q in (50, 99)}
+            for name, times in (("observe_and_policy", both), ("whole_tick", whole))} | {"ticks": ticks}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--policy", default="grasp")
+    parser.add_argument("--port", help="a hand that is there already")
+    parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--ticks", type=int, default=5000)
+    parser.add_argument("--peer", action="store_true", help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.peer:
+        peer()
+        return
+    from dexsim_real.control import prepare_jax
+
+    prepare_jax()
+    common = {"policy": options.policy, "cores": len(os.sched_getaffinity(0)), "load": os.getloadavg()[0]}
+    print(json.dumps({"measure": "compute", **measure_compute(options.policy, options.ticks), **common}), flush=True)
+    with tempfile.TemporaryDirectory() as folder:
+        hand = contextlib.nullcontext(options.port) if options.port else scripted_hand()
+        with hand as port:
+            row = measure_run(options, port, Path(folder))
+        print(json.dumps({"measure": "run", **row, **common, "load": os.getloadavg()[0]}), flush=True)
+
+
+if __name__ == "__main__":
+    main()
