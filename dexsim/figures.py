@@ -105,10 +105,11 @@ def draw_taxels_3d(hand: Hand, joint_position: np.ndarray, taxel_force: np.ndarr
     for finger, tip in enumerate(tips):
         ax.plot(*np.stack([body[hand.tip_body[finger]], tip]).T, color="0.6", lw=2)
     order = np.argsort(force)  # the loaded ones last, on top
-    dots = ax.scatter(*taxels[order].T, c=force[order], s=6 + 20 * (force[order] > 0), cmap="inferno", vmin=0,
+    dots = ax.scatter(*taxels[order].T, c=force[order], s=4 + 22 * (force[order] > 0), cmap="YlOrRd", vmin=0,
                       vmax=force_range or float(force.max()) or 1.0, depthshade=False)
     ax.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
     ax.set_aspect("equal")
+    ax.locator_params(nbins=4)
     ax.view_init(elevation, azimuth)
     ax.figure.colorbar(dots, ax=ax, label="force per taxel [N]", shrink=0.6)
     if path is not None:
