@@ -19,9 +19,9 @@ from dexsim.hand import Hand
 from dexsim.observation import Field, ObservationConfig, Readings, layout, observe
 from dexsim.tasks import TASKS
 from dexsim_ppo.policy import Policy
-from dexsim_real.hand import HandError
 from dexsim_real.imu import multiply
 from dexsim_real.sensing import Measured, ObjectEstimate, make_readings, sources_of
+from dexsim_real.trouble import HandError
 
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 SIMULATION = ("physics", "objects", "randomization", "skin", "reward")
@@ -43,7 +43,9 @@ def prepare_jax() -> None:
 
     To be called before anything is computed; a replay needs the same to give the same bits.
     """
-    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_multi_thread_eigen=false".strip()
+    flags = os.environ.get("XLA_FLAGS", "")
+    if "--xla_cpu_multi_thread_eigen" not in flags:
+        os.environ["XLA_FLAGS"] = f"{flags} --xla_cpu_multi_thread_eigen=false".strip()
     jax.config.update("jax_platforms", "cpu")
     jax.config.update("jax_cpu_enable_async_dispatch", False)
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from dexsim_real.hand import HandError, explain
+from dexsim_real.trouble import HandError, explain
 
 HEAD = b"\xaa\xaa"
 SIZE = 19

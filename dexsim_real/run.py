@@ -6,358 +6,17 @@ The policy is a file, or the name of a shipped one. Everything is compiled befor
 the motors come on at the measured pose and go off at the end, however the end comes.
 """
 
-import contextlib
-import dataclasses
-import gc
-import hashlib
-import os
 import signal
 import sys
-import time
 from collections.abc import Sequence
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import jax
-import numpy as np
-import tyro
-
-from dexsim import load_hand
-from dexsim.calibration import load_calibration
-from dexsim.config import setting, to_dict, validate
 from dexsim_ppo import cli
-from dexsim_ppo.evaluate import load_policy
-from dexsim_real.control import IDENTITY, Controller, Tick, TurnGoals, prepare_jax
-from dexsim_real.frames import Mode, empty_state
-from dexsim_real.hand import HandError, LinkConfig, open_port
-from dexsim_real.imu import UPRIGHT_X, Imu
-from dexsim_real.log import Kind, LogWriter
-from dexsim_real.safety import Safety, SafetyConfig
-from dexsim_real.sensing import HandSensing, HardwareConfig, ObjectEstimate
-from dexsim_real.servo import Pace, Servo, Timing, use_realtime
-from dexsim_real.view import View, summary_table
-from dexsim_real.vision import CameraConfig, HeightSensor, open_masks
-
-_ZERO_SAMPLES = 30
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class RunArguments:
-    """Options of `python -m dexsim_real.run`."""
-
-    policy: Annotated[str, tyro.conf.Positional]
-    """A policy file, or the name of a shipped one ("grasp")."""
-    port: str
-    """Serial port of the hand (a name under /dev/serial/by-id stays the same), or sdk:MODULE:FUNCTION."""
-    command: float = setting(0.5, unit="1", low=0.0, high=1.0)
-    """Grip command in [0, 1]."""
-    seconds: float = setting(30.0, unit="s", low=0.1, high=86400.0)
-    """Length of the run, after the approach."""
-    motors_off: bool = False
-    """Read, compute and show everything, but leave the motors off."""
-    calibration: Path | None = None
-    """This hand's calibration file."""
-    uncalibrated: bool = False
-    """Run without a calibration, on guessed scales (`--hardware.current-scale`, `--hardware.force-per-count`)."""
-    imu: str | None = None
-    """Serial port of the IMU in the object."""
-    imu_mount: tuple[float, float, float, float] = setting(UPRIGHT_X, unit="1", low=-1.0, high=1.0)
-    """Orientation (w, x, y, z) of the IMU in the object; by default its z lies along the object's x."""
-    camera: str | None = None
-    """Mask source: camera number, video file, unix:PATH or MODULE:FUNCTION."""
-    fixed_object: bool = False
-    """Run without a camera: the object is taken to stay where it belongs."""
-    zero: bool = True
-    """Zero the taxels first; refused while a fingertip touches something."""
-    rate: float = setting(83.0, unit="Hz", low=1.0, high=1000.0)
-    """Exchanges with the hand per second; the policy keeps its own rate."""
-    approach: float = setting(2.0, unit="s", low=0.0, high=60.0)
-    """Time to move from the measured pose to the task's start posture; 0 stays there."""
-    log: Path | None = None
-    """Log file; by default a new one under runs/real."""
-    output: Path | None = None
-    """File for the summary as JSON."""
-    realtime: bool = True
-    """Ask for real-time priority; without the right to it the run goes on without."""
-    quiet: bool = False
-    """No live view."""
-    link: LinkConfig = setting(LinkConfig())
-    """The serial line."""
-    hardware: HardwareConfig = setting(HardwareConfig())
-    """Signs, scales and gains."""
-    safety: SafetyConfig = setting(SafetyConfig())
-    """Limits."""
-    optics: CameraConfig = setting(CameraConfig())
-    """The camera: where it is, and the object's colour."""
-
-    def __post_init__(self):
-        validate(self)
-        if self.calibration is None and not self.uncalibrated:
-            raise HandError("give --calibration FILE, or --uncalibrated to run on guessed scales")
-        if self.calibration is not None and self.uncalibrated:
-            raise HandError("give --calibration or --uncalibrated, not both")
-
-
-class ObjectSensors:
-    """Camera and IMU as far as the policy needs them; the rest is taken as fixed.
-
-    Raises:
-      HandError: the policy needs one that is not given.
-    """
-
-    def __init__(self, arguments: RunArguments, controller: Controller):
-        task, needed = controller.task, controller.sources
-        self._reference = np.asarray(task.reference, float)
-        self._camera: HeightSensor | None = None
-        self._imu: Imu | None = None
-        if "imu" in needed and not arguments.imu:
-            raise HandError("the policy observes the object's orientation: give the IMU's port with --imu")
-        if "camera" in needed and not (arguments.camera or arguments.fixed_object):
-            raise HandError("the policy observes the object's height: give --camera, or --fixed-object")
-        sensing = task.config.sensing
-        try:
-            if arguments.camera:
-                self._camera = HeightSensor(open_masks(arguments.camera, arguments.optics), arguments.optics,
-                                            self._reference, sensing.object_axes, sensing.velocity_filter)
-            if arguments.imu:
-                self._imu = Imu(arguments.imu, -np.asarray(task.gravity), arguments.imu_mount)
-                # The object is put down squarely: its heading is zero now.
-                self._imu.calibrate(IDENTITY)
-            if self._camera:
-                self._camera.wait()
-        except BaseException:
-            self.close()
-            raise
-
-    def read(self, now: float) -> tuple[ObjectEstimate, float, float]:
-        """The estimate, the age s of its oldest part, and the time of the newest orientation."""
-        position, velocity, quat, when, oldest = self._reference, np.zeros(3), IDENTITY, now, now
-        if self._camera:
-            seen, position, velocity = self._camera.read()
-            oldest = min(oldest, seen)
-        if self._imu:
-            when, quat = self._imu.read()
-            oldest = min(oldest, when)
-        return ObjectEstimate(position, velocity, quat), now - oldest, when
-
-    def close(self) -> None:
-        for sensor in (self._camera, self._imu):
-            if sensor:
-                sensor.close()
-
-
-class Run:
-    """One run: made with nothing open but files, `prepare`d with the motors off, then run."""
-
-    def __init__(self, arguments: RunArguments):
-        self.arguments = arguments
-        policy, hand = load_policy(arguments.policy), load_hand()
-        self.controller = Controller(policy, hand)
-        calibration = load_calibration(arguments.calibration, hand) if arguments.calibration else None
-        self.sensing = HandSensing(hand, arguments.hardware, calibration)
-        self.controller.warm()
-        self.sensing.measure(empty_state())
-        config = arguments.safety
-        config = dataclasses.replace(config, watchdog=max(config.watchdog, 2.5 * self.controller.period))
-        self.safety = Safety(hand, config, self._react)
-        # From here on, since compiling in a real-time thread would starve the machine.
-        realtime = arguments.realtime and use_realtime()
-        path = arguments.log or Path("runs/real") / time.strftime("%Y%m%d-%H%M%S.log")
-        self.log = LogWriter(path)
-        self.port = open_port(arguments.port, arguments.link, self._tap)
-        self.servo = Servo(self.port, self.sensing, self.safety, arguments.rate)
-        self.view = View(f"{policy.task} on {arguments.port}", self._status, arguments.quiet)
-        self.objects: ObjectSensors | None = None
-        self.goals: TurnGoals | None = None
-        self.compute, self.pace = Timing(), Pace(policy.control_rate)
-        self.started = self.force = self.forces = 0.0
-        self.tick: Tick | None = None
-        self.end = "not started"
-        if arguments.realtime and not realtime:
-            self._note("without real-time priority: expect jitter on a busy machine (docs/hardware.md)")
-
-    # --- stages ---------------------------------------------------------------------------------
-
-    def prepare(self) -> None:
-        """Connect with the motors off, zero the taxels, start camera and IMU.
-
-        Raises:
-          HandError: whatever is missing or does not answer.
-        """
-        self._note(self.port.connect())
-        for warning in getattr(self.port, "warnings", list)():
-            self._note(f"warning: {warning}")
-        if self.arguments.zero:
-            self._zero()
-        self._write_meta()
-        self.servo.start()
-        if self.servo.wait_fresh(1.0) is None:
-            raise HandError(f"{self.arguments.port}: the hand answered once and then no more")
-        self.objects = ObjectSensors(self.arguments, self.controller)
-        task = self.controller.task
-        if self.arguments.imu and hasattr(task.config, "goal_step"):
-            self.goals = TurnGoals(task.config, task.reference)
-
-    def run(self) -> None:
-        """Motors on, approach, and the policy until the time is over or `Safety` ends it."""
-        sys.setswitchinterval(2e-4)
-        gc.collect()
-        gc.freeze()
-        with self.view:
-            if not self.arguments.motors_off:
-                self.servo.engage()
-                self._approach()
-            self.controller.start(self._pose())
-            self._note("the policy begins")
-            self.end = self._loop()
-
-    def close(self, reason: str = "") -> None:
-        """Motors off and everything closed; safe to call at any stage."""
-        self.end = reason or self.end
-        self.servo.stop()
-        if self.objects:
-            self.objects.close()
-        self._note(f"end: {self.end}")
-        self.log.add(Kind.END, self.summary())
-        self.log.close()
-        gc.unfreeze()
-        with contextlib.suppress(OSError, AttributeError):
-            os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-
-    def summary(self) -> dict[str, Any]:
-        """What the run was like."""
-        servo, safety = self.servo, self.safety
-        summary = {
-            "end": self.end, "seconds": round(time.monotonic() - self.started, 3) if self.started else 0.0,
-            "command": self.arguments.command, "policy_jitter": self.pace.jitter.summary(),
-            "policy_compute": self.compute.summary(), "exchange_jitter": servo.pace.jitter.summary(),
-            "round_trip": servo.round_trip.summary(), "missed_for_the_hand": servo.waited,
-            "link": dataclasses.asdict(self.port.counts), "safety": dict(safety.counts),
-            "mean_finger_force": self.force / self.forces if self.forces else 0.0,
-            "log": str(self.log.path), "log_dropped": self.log.dropped}
-        if self.goals:
-            times = [t - self.started for t in self.goals.times]
-            summary |= {"successes": self.goals.successes, "success_times": times}
-        return summary
-
-    # --- pieces ---------------------------------------------------------------------------------
-
-    def _zero(self) -> None:
-        states, until = [], time.monotonic() + 5.0
-        while len(states) < _ZERO_SAMPLES and time.monotonic() < until:
-            reply = self.port.exchange(self.sensing.command(self.sensing.hand.joint_lower, Mode.PASSIVE))
-            if reply is not None:
-                states.append(reply.state)
-        if len(states) < _ZERO_SAMPLES:
-            raise HandError(f"{self.arguments.port}: only {len(states)} answers in 5 s; cannot zero the taxels")
-        self.sensing.zero(states)
-
-    def _approach(self) -> None:
-        posture = getattr(self.controller.task.config, "posture", None)
-        if posture is None or self.arguments.approach == 0:
-            return
-        start, goal = self._pose(), np.asarray(posture, np.float32)
-        begin, pace = time.monotonic(), Pace(self.arguments.rate)
-        while (now := time.monotonic()) < begin + self.arguments.approach:
-            share = (now - begin) / self.arguments.approach
-            self.safety.wish(start + np.float32(share * share * (3 - 2 * share)) * (goal - start), now)
-            self._check()
-            pace.wait()
-
-    def _pose(self) -> np.ndarray:
-        return self.safety.sample.measured.joint_position
-
-    def _check(self) -> None:
-        if self.servo.error is not None:
-            raise HandError(f"the exchange thread failed: {self.servo.error!r}")
-        if self.safety.latched:
-            raise HandError(f"stopped: {self.safety.latched}")
-
-    def _loop(self) -> str:
-        anchor, self.started = self.safety.anchor, time.monotonic()
-        self.servo.forget()
-        self.pace = Pace(self.controller.policy.control_rate)
-        while time.monotonic() < self.started + self.arguments.seconds:
-            self._check()
-            now, sample = time.monotonic(), self.safety.sample
-            if now - sample.time <= self.safety.config.stale:
-                if anchor != self.safety.anchor:
-                    anchor = self.safety.anchor
-                    self.controller.anchor(sample.measured.joint_position)
-                self._tick(now, sample)
-                self.compute.add(time.monotonic() - now)
-            self.pace.wait()
-        self._check()
-        return "time is over"
-
-    def _tick(self, now: float, sample: Any) -> None:
-        seen, age, when = self.objects.read(now)
-        goal = self.goals.update(when, seen) if self.goals else IDENTITY
-        if self.arguments.motors_off:
-            self.controller.anchor(sample.measured.joint_position)
-        tick = self.controller.tick(sample.measured, seen, goal, self.arguments.command)
-        trouble = "the object is out of sight" if age > self.safety.config.stale_object else ""
-        self.safety.wish(tick.target, now, trouble)
-        self.tick = tick
-        self.force += float(sample.measured.finger_force.sum())
-        self.forces += 1
-        readings = {field.name: getattr(tick.readings, field.name) for field in dataclasses.fields(tick.readings)}
-        self.log.add(Kind.TICK, {
-            "sequence": sample.sequence, "age": now - sample.time, "readings": readings,
-            "observation": tick.observation, "action": tick.action, "target": tick.target}, now)
-
-    def _tap(self, direction: str, data: bytes) -> None:
-        kind = Kind.SENT if direction == "tx" else Kind.RECEIVED
-        self.log.add(kind, (self.port.counts.sent, data))
-
-    def _note(self, text: str) -> None:
-        self.log.add(Kind.NOTE, text)
-        self.view.note(text)
-
-    def _react(self, text: str) -> None:
-        """A change of `Safety`'s reaction; clips are too frequent for the terminal."""
-        self.log.add(Kind.NOTE, text)
-        if text.startswith(("hold", "relax")) and self.safety.engaged:
-            self.view.note(text)
-
-    def _write_meta(self) -> None:
-        arguments, policy = self.arguments, self.controller.policy
-        text = arguments.calibration.read_text() if arguments.calibration else ""
-        digest = hashlib.sha256(b"".join(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(policy.params)))
-        self.log.add(Kind.META, {
-            "task": policy.task, "env_config": policy.env_config, "policy": arguments.policy,
-            "policy_sha256": digest.hexdigest(), "calibration": text, "tare": self.sensing.tare,
-            "hardware": to_dict(arguments.hardware), "safety": to_dict(self.safety.config),
-            "command": arguments.command, "control_rate": policy.control_rate, "clock": time.time(),
-            "environment": cli.environment_report()})
-
-    def _status(self) -> dict[str, str]:
-        sample, counts = self.safety.sample, self.port.counts
-        if sample is None:
-            return {"hand": "no measurement"}
-        force, heat = sample.measured.finger_force, sample.measured.temperature
-        reaction, reason = self.safety.last
-        rows = {
-            "time": f"{time.monotonic() - self.started if self.started else 0:.1f} s",
-            "safety": f"{reaction.name.lower()} {reason}".strip(),
-            "age": f"{1e3 * (time.monotonic() - sample.time):.1f} ms",
-            "policy": self._timing(self.pace.jitter, 1 / self.pace.period),
-            "exchanges": self._timing(self.servo.pace.jitter, 1 / self.servo.pace.period),
-            "round trip": f"p50 {1e3 * self.servo.round_trip.percentile(50):.2f} ms, "
-                          f"p99 {1e3 * self.servo.round_trip.percentile(99):.2f} ms",
-            "link": f"{counts.answered} answered, {counts.corrupt} corrupt, {counts.silent} silent, "
-                    f"{counts.late} late, {counts.reconnects} reconnects",
-            "force": f"{' '.join(f'{f:.1f}' for f in force)} N, sum {force.sum():.1f} N",
-            "command": f"{self.arguments.command:.2f}",
-            "heat": f"joints {heat[:12].max():.0f}, tips {heat[12:].max():.0f} degC"}
-        if self.goals:
-            rows["successes"] = str(self.goals.successes)
-        return rows
-
-    @staticmethod
-    def _timing(timing: Timing, rate: float) -> str:
-        return (f"{rate:.1f} Hz, late p50 {1e3 * timing.percentile(50):.2f} ms, "
-                f"p99 {1e3 * timing.percentile(99):.2f} ms, missed {timing.missed}")
+from dexsim_real.control import prepare_jax
+from dexsim_real.options import RunArguments
+from dexsim_real.session import Session
+from dexsim_real.trouble import HandError
+from dexsim_real.view import summary_table
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -366,15 +25,15 @@ def main(argv: Sequence[str] | None = None) -> int:
                           prog="python -m dexsim_real.run", description="Run a policy on the hand.")
     prepare_jax()
     cli.enable_caches()
-    run = Run(arguments)
+    session = Session(arguments)
     before = {number: signal.signal(number, _terminate) for number in (signal.SIGTERM, signal.SIGHUP)}
     reason, code = "", 0
     try:
-        run.prepare()
-        run.run()
+        session.prepare()
+        session.run()
     except HandError as error:
         reason, code = str(error), 1
-        if not run.started:
+        if not session.started:
             raise
     except KeyboardInterrupt:
         reason, code = "Ctrl-C", 130
@@ -384,12 +43,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         reason = f"failure: {error!r}"
         raise
     finally:
-        run.close(reason)
+        session.close(reason)
         for number, handler in before.items():
             signal.signal(number, handler)
-    summary = run.summary()
+    summary = session.summary()
     if not arguments.quiet:
-        run.view.console.print(summary_table(f"{run.controller.policy.task}: {run.end}", summary))
+        session.view.console.print(summary_table(f"{session.controller.policy.task}: {session.end}", summary))
     if arguments.output:
         cli.write_json(arguments.output, summary)
     return code

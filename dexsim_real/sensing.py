@@ -16,7 +16,7 @@ from dexsim.hand import Hand
 from dexsim.observation import Readings
 from dexsim_real import frames
 from dexsim_real.frames import Mode
-from dexsim_real.hand import HandError
+from dexsim_real.trouble import HandError
 
 _JOINTS = frames.JOINTS
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from dexsim.config import setting, validate
-from dexsim_real.hand import HandError
+from dexsim_real.trouble import HandError
 
 Masks = Callable[[], tuple[float, np.ndarray] | None]
 """Blocks until the next picture; gives its time (s, monotonic) and a bool mask [H, W], or None at the end."""

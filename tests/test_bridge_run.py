@@ -187,6 +187,13 @@ def test_an_action_that_is_not_finite_counts_as_none(hand):
 
 # --- runs ----------------------------------------------------------------------------------------
 
+@pytest.fixture(autouse=True)
+def jax_as_it_is(monkeypatch):
+    """Runs within the tests' process leave the flags that other tests compile with alone."""
+    monkeypatch.setattr(run, "prepare_jax", lambda: None)
+    monkeypatch.setattr(replay, "prepare_jax", lambda: None)
+
+
 class FollowingHand(PtyHand):
     """Joints that go a third of the way to their target at each exchange; it keeps what was asked of it."""
 
@@ -214,7 +221,7 @@ class FollowingHand(PtyHand):
 def arguments(peer, folder, *more):
     return ["grasp", "--port", peer.port, "--uncalibrated", "--fixed-object", "--link.settle", "0", "--link.margin",
             "0.03", "--approach", "0.4", "--log", str(folder / "run.log"), "--output", str(folder / "run.json"),
-            "--quiet", *more]
+            "--quiet", "--no-realtime", *more]
 
 
 def summary(folder):
@@ -401,9 +408,10 @@ def test_running_a_policy_needs_no_mjx(tmp_path):
     code = """
 import sys
 from dexsim import load_hand
+from dexsim_ppo.evaluate import load_policy
 from dexsim_real import run, replay
 from dexsim_real.control import Controller
-Controller(run.load_policy("grasp"), load_hand()).warm()
+Controller(load_policy("grasp"), load_hand()).warm()
 print([name for name in sys.modules if "mjx" in name or name in ("warp", "brax", "cv2", "serial")])
 """
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=120,

@@ -10,9 +10,10 @@ from pty_hand import PtyHand
 
 serial = pytest.importorskip("serial")
 
-from dexsim_real import frames, hand  # noqa: E402
+from dexsim_real import frames, hand, trouble  # noqa: E402
 from dexsim_real.frames import Command, Frame, Mode  # noqa: E402
-from dexsim_real.hand import HandError, LinkConfig, SerialHand  # noqa: E402
+from dexsim_real.hand import LinkConfig, SerialHand  # noqa: E402
+from dexsim_real.trouble import HandError  # noqa: E402
 
 QUICK = LinkConfig(settle=0.0, margin=0.04, handshake=0.1, backoff=(0.02, 0.05))
 
@@ -184,9 +185,9 @@ def test_messages_for_the_usual_troubles(tmp_path):
     file = tmp_path / "port"
     file.touch()
     group = __import__("grp").getgrgid(os.stat(file).st_gid).gr_name
-    text = hand.explain(str(file), PermissionError(errno.EACCES, "Permission denied"))
+    text = trouble.explain(str(file), PermissionError(errno.EACCES, "Permission denied"))
     assert f"usermod -aG {group}" in text and "\n" not in text
-    assert "another program" in hand.explain("/dev/x", OSError(errno.EBUSY, "busy"))
+    assert "another program" in trouble.explain("/dev/x", OSError(errno.EBUSY, "busy"))
     with pytest.raises(HandError, match="no_such_module"):
         hand.open_port("sdk:no_such_module:f", QUICK)
 
@@ -197,11 +198,11 @@ def test_the_latency_timer(tmp_path):
     device = tmp_path / "by-id"
     device.symlink_to("/dev/ttyUSB7")
     timer.write_text("16\n")
-    (text,) = hand.latency_warnings(str(device), tmp_path)
+    (text,) = trouble.latency_warnings(str(device), tmp_path)
     assert f"echo 1 | sudo tee {timer}" in text and "16 ms" in text
     timer.write_text("1\n")
-    assert hand.latency_warnings(str(device), tmp_path) == []
-    assert hand.latency_warnings("/dev/ttyACM0", tmp_path) == []
+    assert trouble.latency_warnings(str(device), tmp_path) == []
+    assert trouble.latency_warnings("/dev/ttyACM0", tmp_path) == []
 
 
 def test_the_deadline_follows_size_and_baud():

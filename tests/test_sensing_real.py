@@ -17,8 +17,8 @@ from dexsim.tasks.rotate import RotateConfig, goal_quat
 from dexsim_real import frames, imu, vision
 from dexsim_real.control import IDENTITY, TurnGoals
 from dexsim_real.frames import Mode
-from dexsim_real.hand import HandError
 from dexsim_real.sensing import HandSensing, HardwareConfig, ObjectEstimate, VelocityFilter, sources_of
+from dexsim_real.trouble import HandError
 from dexsim_real.vision import CameraConfig, HeightSensor, height_of
 
 
