@@ -22,6 +22,10 @@ class Control:
     """Weight of the newest target in the moving average (absolute)."""
     reach: float = setting(0.5, unit="rad", low=0.01, high=4.0)
     """Largest distance of a target from the measured angle: bounds windup and grip torque."""
+    recall: str = setting("action", choices=("action", "target"))
+    """What an observation's last action is: the action itself, or the joint targets that it led to,
+    as a place in each joint's range. A policy of steps that does not see its targets cannot know how
+    hard it presses."""
 
     def __post_init__(self):
         validate(self)
@@ -44,3 +48,11 @@ def move_target(control: Control, hand: Hand, target: jax.Array, action: jax.Arr
         target = target + control.smoothing * (wanted - target)
     target = jnp.clip(target, measured - control.reach, measured + control.reach)
     return jnp.clip(target, hand.joint_lower, hand.joint_upper)
+
+
+def recalled(control: Control, hand: Hand, action: jax.Array, target: jax.Array) -> jax.Array:
+    """The last action [J] in [-1, 1] as an observation shows it; `target` [J] rad is its outcome."""
+    if control.recall == "action":
+        return action
+    middle = (hand.joint_upper + hand.joint_lower) / 2
+    return (target - middle) / ((hand.joint_upper - hand.joint_lower) / 2)

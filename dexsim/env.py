@@ -19,7 +19,7 @@ import numpy as np
 
 from dexsim import actuator, observation, rotations, tactile
 from dexsim.config import setting, validate
-from dexsim.control import Control, move_target
+from dexsim.control import Control, move_target, recalled
 from dexsim.hand import Hand, HandPose, forward_kinematics, taxel_positions
 from dexsim.objects import ObjectConfig, ObjectParams
 from dexsim.observation import Motion, ObservationConfig, Readings
@@ -249,7 +249,9 @@ class Env:
         zero = jnp.zeros(hand.num_joints)
         place = start.qpos[self.physics.object_qpos]
         sample = Sample(joints, zero, jnp.zeros(hand.taxel_area.shape), place[:3], place[3:])
-        readings = self._read(noise_key, sample, sample, draw, sensor, goal, zero)
+        joint_target = joints if start.joint_target is None else start.joint_target
+        readings = self._read(noise_key, sample, sample, draw, sensor, goal,
+                              recalled(config.control, hand, zero, joint_target))
         physics = PhysicsState(start.qpos, start.qvel, jnp.zeros(self.physics.mj_model.nv))
         moment = self._moment(physics, start.target, zero, zero, zero,
                               jnp.zeros((hand.num_fingers, 3)))
@@ -257,7 +259,7 @@ class Env:
         _, metrics = self.task.reward(goal, moment, false)
         state = State(
             key=key, physics=physics, target=start.target, draw=draw, orientation_sensor=sensor,
-            goal=goal, joint_target=joints if start.joint_target is None else start.joint_target,
+            goal=goal, joint_target=joint_target,
             action=zero, sample=sample, object_velocity=jnp.zeros(3),
             readings=readings, finger_force=jnp.zeros(hand.num_fingers),
             tick=jnp.zeros((), jnp.int32), length=jnp.zeros((), jnp.int32),
@@ -292,7 +294,8 @@ class Env:
         sample = Sample(moment.joint_position, last / hand.torque_limit,
                         moment.touch.force, moment.object_position, moment.object_quat)
         readings = self._read(noise_key, sample, state.sample, draw, state.orientation_sensor,
-                              goal, action, state)
+                              goal, recalled(self.config.control, hand, action, joint_target),
+                              state)
         dropped = self.task.dropped(goal, moment) | ~finite
         reward, metrics = self.task.reward(state.goal, moment, dropped)
         tick = state.tick + 1
@@ -381,7 +384,7 @@ class Env:
             action=action, last_action=last_action)
 
     def _read(self, key: jax.Array, sample: Sample, before: Sample, draw: Draw,
-              sensor: SensorDraw, goal: Any, action: jax.Array,
+              sensor: SensorDraw, goal: Any, last_action: jax.Array,
               state: State | None = None) -> Readings:
         """Latency, noise and counts between the truth and the host; no `state` at a reset."""
         sensing, config = self.config.sensing, self.config
@@ -415,7 +418,7 @@ class Env:
                                    sample.object_quat, before.object_quat, held, self._up,
                                    self.control_period)
         return Readings(joints, torque, taxels, position, velocity, quat, goal_quat, command,
-                        action)
+                        last_action)
 
     def _observe(self, readings: Readings, moment: Moment, goal: Any) -> dict[str, jax.Array]:
         """The actor sees the readings; the critic the truth, in the same fields."""
@@ -423,7 +426,7 @@ class Env:
         truth = Readings(
             moment.joint_position, moment.joint_torque / self.hand.torque_limit,
             moment.touch.force, moment.object_position, moment.object_velocity,
-            moment.object_quat, goal_quat, command, moment.action)
+            moment.object_quat, goal_quat, command, readings.last_action)
         seen = {"actor": readings, "critic": truth}
         motion = Motion(moment.joint_velocity, moment.object_spin)
         return {group: observation.observe(self.hand, seen[group], names, self._seen[group], motion)

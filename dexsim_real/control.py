@@ -14,7 +14,7 @@ import jax
 import numpy as np
 
 from dexsim.config import from_dict
-from dexsim.control import move_target
+from dexsim.control import move_target, recalled
 from dexsim.hand import Hand
 from dexsim.observation import Field, ObservationConfig, Readings, layout, observe
 from dexsim.tasks import TASKS
@@ -87,6 +87,7 @@ class Controller:
         self.period = 1.0 / policy.control_rate
         self._observe = make_observe(hand, names, config.observation)
         self._move = jax.jit(lambda *arrays: move_target(config.control, hand, *arrays))
+        self._recall = jax.jit(lambda *arrays: recalled(config.control, hand, *arrays))
         self.start(np.zeros(hand.num_joints, np.float32))
 
     def warm(self) -> None:
@@ -110,7 +111,8 @@ class Controller:
 
     def tick(self, measured: Measured, seen: ObjectEstimate, goal_quat: np.ndarray, command: float) -> Tick:
         """Readings, observation, action, and the joint targets that follow."""
-        readings = make_readings(measured, seen, goal_quat, command, self.last_action)
+        last_action = np.asarray(self._recall(self.last_action, self.target))
+        readings = make_readings(measured, seen, goal_quat, command, last_action)
         observation = np.asarray(self._observe(readings))
         action = np.clip(np.asarray(self.policy(observation)), -1.0, 1.0)
         if np.isfinite(action).all():

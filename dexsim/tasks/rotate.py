@@ -72,7 +72,7 @@ class RotateConfig(EnvConfig):
     objects: ObjectConfig = setting(ObjectConfig(
         shapes=("box",), mass=(0.06, 0.15), friction=(0.6, 1.2), com_offset=0.003))
     """Mass, inertia, centre of mass, friction and contact of the object; its sizes are `edge`."""
-    control: Control = setting(Control(step=0.08))
+    control: Control = setting(Control(step=0.08, recall="target"))
     """From action to joint target."""
     object: str = setting("cube", choices=tuple(KINDS))
     """What is turned: a cube, an upright cylinder, or an eight-cornered union of two boxes."""
@@ -145,7 +145,7 @@ class RotateConfig(EnvConfig):
 def paper() -> RotateConfig:
     """The paper's own weights and success test."""
     return RotateConfig(
-        goal_spin=0.0, drop_distance=0.09, drop_tilt=math.pi, control=Control(step=0.3),
+        goal_spin=0.0, drop_distance=0.09, drop_tilt=math.pi, control=Control(step=0.3, recall="target"),
         reward=RotateReward(action=-0.0002, velocity=0.0, torque=0.0, spin=0.0, fingertips=0.0,
                             drop=0.0))
 
