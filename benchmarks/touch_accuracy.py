@@ -1,7 +1,7 @@
 """Accuracy of touch: distances against exact shapes, forces against closed forms, the paper's method against the grid.
 
 Called by `touch.py`. Every function returns rows (dictionaries) for its table. Needs no physics engine and no file but
-the shipped taxel layout.
+the shipped taxel layout; the one mesh is made by trimesh.
 """
 
 import dataclasses
@@ -10,8 +10,9 @@ from types import SimpleNamespace
 import jax
 import jax.numpy as jnp
 import numpy as np
+import trimesh
 
-from dexsim import grid, sdf, surface_points, tactile
+from dexsim import grid, mesh, sdf, surface_points, tactile
 from dexsim.assets import asset_path
 from dexsim.distance import signed_distance
 from dexsim.grid import GridConfig
@@ -22,7 +23,7 @@ from dexsim.tactile import Skin
 
 SHAPES = {"sphere": (0.0275, 0, 0), "box": (0.025, 0.02, 0.03), "capsule": (0.013, 0.025, 0),
           "cylinder": (0.02, 0.025, 0), "ellipsoid": (0.03, 0.02, 0.04)}
-SMOOTH = ("sphere", "capsule", "ellipsoid")
+SMOOTH = ("sphere", "capsule", "ellipsoid", "torus mesh")
 # Sampling error of the force (rms) that a lattice of that pitch [mm] makes at that depth [mm], ball of 10 mm.
 PITCH_BOUND = {(0.3, 0.8): 0.008, (0.3, 1.0): 0.007, (0.3, 1.5): 0.041, (0.3, 2.0): 0.063, (0.3, 3.0): 0.097,
                (0.5, 0.8): 0.002, (0.5, 1.0): 0.008, (0.5, 1.5): 0.022, (0.5, 2.0): 0.045, (0.5, 3.0): 0.122,
@@ -64,20 +65,28 @@ def distance_errors(quick: bool) -> list[dict]:
             yield f"points {count}", lambda s, n=count: surface_points.from_shape(s, PointsConfig(count=n, cells=24))
 
     rows, run = [], jax.jit(signed_distance)
-    for kind in SHAPES:
-        shape = turned_solid(kind)
-        box = sdf.bounds(shape)
+
+    def compare(kind, box, exact_at, things):
         points = np.random.default_rng(1).uniform(box[0] - 1e-3, box[1] + 1e-3, (100_000, 3)).astype(np.float32)
-        exact = np.asarray(run(points, shape))
+        exact = np.asarray(exact_at(points))
         near = (exact > -0.003) & (exact < 0.001)
         points, exact = points[near], exact[near]
-        for name, make in methods():
-            ours = np.asarray(run(points, make(shape)))
+        for name, thing in things:
+            ours = np.asarray(run(points, thing))
             error = 1e6 * np.abs(ours - exact)
             rows.append({"shape": kind, "method": name, "mean_um": error.mean(), "p95_um": np.quantile(error, 0.95),
                          "max_um": error.max(), "missed_%": 100 * np.mean((exact < 0) & (ours >= 0)),
                          "false_%": 100 * np.mean((exact >= 0) & (ours < 0)),
                          "ok": bool(error.mean() <= 10) if name == "grid 64" and kind in SMOOTH else None})
+
+    for kind in SHAPES:
+        shape = turned_solid(kind)
+        compare(kind, sdf.bounds(shape), lambda p, s=shape: run(p, s), ((n, make(shape)) for n, make in methods()))
+    ring = mesh.load_mesh(trimesh.creation.torus(0.022, 0.009, 96, 48))
+    compare("torus mesh", ring.bounds, lambda p: mesh.signed_distance(ring, p)[0], (
+        ("grid 64", grid.bake(ring, cache=False)),
+        ("grid 64 quadratic", grid.bake(ring, GridConfig(interpolation="quadratic"), cache=False)),
+        ("points 1024", surface_points.from_mesh(ring, PointsConfig(cells=24)))))
     return rows
 
 

@@ -25,6 +25,7 @@ from dexsim.config import setting, validate
 from dexsim.errors import ConfigError
 from dexsim.pytree import pytree_dataclass, static
 
+_ROUND = 4  # candidates of the table compared at a time
 _OUT_OF_THE_WAY = 10.0  # m, where a point that does not count is put
 
 
@@ -139,17 +140,19 @@ def _from_table(points: jax.Array, surface: SurfacePoints) -> jax.Array:
     for axis in range(3):
         at = (points[..., axis] - surface.origin[axis]) / surface.spacing[axis]
         row = row * n + jnp.clip(at, 0, n - 1).astype(jnp.int32)
-    best, index = None, None
-    for k in range(surface.table.shape[1]):
-        candidate = surface.table.at[row, k].get(mode="promise_in_bounds").astype(jnp.int32)
-        gap = 0.0
-        for axis in range(3):
-            at = surface.position.at[candidate, axis].get(mode="promise_in_bounds")
-            gap = gap + (points[..., axis] - at) ** 2
-        better = True if best is None else gap < best
-        best = gap if best is None else jnp.where(better, gap, best)
-        index = candidate if index is None else jnp.where(better, candidate, index)
-    return index
+
+    def step(start, carry):
+        best, index = carry
+        for k in range(_ROUND):
+            candidate = surface.table.at[row, start * _ROUND + k].get(mode="promise_in_bounds").astype(jnp.int32)
+            place = surface.position.at[candidate].get(mode="promise_in_bounds")
+            gap = sum((points[..., axis] - place[..., axis]) ** 2 for axis in range(3))
+            better = gap < best
+            best, index = jnp.where(better, gap, best), jnp.where(better, candidate, index)
+        return best, index
+
+    start = (jnp.full(row.shape, jnp.inf, points.dtype), jnp.zeros(row.shape, jnp.int32))
+    return jax.lax.fori_loop(0, surface.table.shape[1] // _ROUND, step, start)[1]
 
 
 def _build(position: jax.Array, normal: jax.Array, config: PointsConfig) -> SurfacePoints:
@@ -189,7 +192,10 @@ def _candidates(position: np.ndarray, config: PointsConfig) -> tuple[np.ndarray,
             break
         width *= 2
     longest = int(np.max(np.sum(gap[close] <= gap[close, :1] + diagonal, 1)))
-    return real[index[:, :longest]], low, spacing
+    longest = min(-(-longest // _ROUND) * _ROUND, width)
+    table = real[index[:, :longest]]
+    spare = np.repeat(table[:, :1], -longest % _ROUND, axis=1)
+    return np.concatenate([table, spare], 1), low, spacing
 
 
 def _spread(position: np.ndarray, count: int) -> np.ndarray:
