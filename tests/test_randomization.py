@@ -1,13 +1,17 @@
 """What is drawn at every episode start: ranges, the nominal hand, curriculum, held-out hands."""
 
+import copy
+import dataclasses
 import functools
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from dexsim.errors import ConfigError
 from dexsim.randomization import Curriculum, Randomization, next_scale, sample, sample_outside
+from dexsim.randomization_check import check, conclude, table
 
 TIMES = dict(timestep=0.005, control_period=0.03)
 
@@ -187,3 +191,81 @@ def test_held_out_hands_lie_outside_every_range(hand):
             assert 0.3 < np.mean(values > high - slack) < 0.7, name
         # None at an end that is the nominal value itself.
         assert np.all(np.abs(values - nominal) > 1e-4), name
+
+
+# --- the self-test -----------------------------------------------------------------------------------
+
+# What each range must reach, by the names of the drive's parameters and of the compiled model's fields.
+REACHES = {
+    "stiffness_factor": {"actuator.stiffness"}, "damping_factor": {"actuator.damping"},
+    "dead_band": {"actuator.dead_band"}, "torque_factor": {"actuator.stall_torque"},
+    "speed_factor": {"actuator.no_load_speed"}, "efficiency": {"actuator.efficiency"},
+    "latency": {"latency"}, "latency_spread": {"latency"}, "ripple": {"actuator.ripple"},
+    "ripple_count": {"actuator.ripple_count"}, "coulomb_friction": {"actuator.coulomb_friction"},
+    "viscous_friction": {"actuator.viscous_friction"}, "sensing_latency": {"sensing_latency"},
+    "encoder_bias": {"actuator.encoder_bias", "encoder_bias"}, "torque_gain": {"torque_gain"},
+    "taxel_gain": {"taxel_gain"}, "gravity_tilt": {"tilt"},
+    "mass": {"body_mass"}, "inertia_scale": {"body_inertia"}, "com_offset": {"body_ipos"},
+    "friction": {"pair_friction"}, "sphere_radius": {"geom_size"}, "box_half": {"geom_size"},
+}
+SENSED = ("sensing_latency", "torque_gain", "taxel_gain")  # seen in the readings, without effect on the motion
+
+
+@pytest.fixture(scope="module")
+def fresh(grasp_rollout):
+    return grasp_rollout.reset(jax.random.key(21))
+
+
+def test_every_range_reaches_the_model_and_the_motion(grasp_env, grasp_rollout, fresh):
+    effects = check(grasp_env, grasp_rollout.step, fresh, key=jax.random.key(0), ticks=9)
+    by_name = {effect.name.split(".")[-1]: effect for effect in effects}
+    assert len(by_name) == len(effects) >= 30 and by_name["push"].object > 0
+    for effect in effects:
+        assert effect.found and not effect.off, table([effect])
+    for name, leaves in REACHES.items():
+        found = by_name[name]
+        if name in {field.name for field in dataclasses.fields(Randomization)}:
+            assert set(found.changed) == leaves, name
+        else:
+            assert leaves <= set(found.changed), name
+        if name in SENSED:
+            assert found.joint == 0 and found.object == 0 and found.reading > 1e-3, name
+        else:
+            assert max(found.joint, found.object) > 1e-6, name
+    # Known size: an encoder that is off by up to 10 mrad turns the joint by less than that in two ticks.
+    early, = check(grasp_env, grasp_rollout.step, fresh, key=jax.random.key(0), ticks=2,
+                   names=("Randomization.encoder_bias",))
+    assert 0.2e-3 < early.joint < 10e-3
+
+
+def test_a_range_that_is_lost_is_found_out(grasp_env, grasp_rollout, fresh, monkeypatch, capsys):
+    """Lost between configuration and draw, and lost between draw and physics."""
+    def forgets_torque(*arguments, **options):
+        drawn = sample(*arguments, **options)
+        limit = jnp.asarray(arguments[2].torque_limit)
+        return dataclasses.replace(drawn, actuator=dataclasses.replace(drawn.actuator, stall_torque=limit))
+
+    def ignores_friction(states, action):
+        calm = dataclasses.replace(states.draw.actuator, viscous_friction=0 * states.draw.actuator.viscous_friction)
+        return grasp_rollout.step(dataclasses.replace(states, draw=dataclasses.replace(states.draw, actuator=calm)),
+                                  action)
+
+    monkeypatch.setattr("dexsim.randomization_check.sample", forgets_torque)
+    names = ("Randomization.torque_factor", "Randomization.viscous_friction", "Randomization.speed_factor")
+    effects = check(grasp_env, ignores_friction, fresh, key=jax.random.key(0), ticks=6, names=names)
+    assert [effect.found for effect in effects] == [False, False, True]
+    assert effects[0].changed == () and effects[1].changed == ("actuator.viscous_friction",)
+    assert conclude(effects) == 2
+    captured = capsys.readouterr()
+    assert "no effect on model or motion: Randomization.torque_factor, Randomization.viscous_friction" in captured.err
+    assert captured.out.count("NO EFFECT") == 2
+    assert conclude(effects[2:]) == 0
+
+
+def test_a_range_without_width_is_off_and_no_error(grasp_env, grasp_rollout, fresh):
+    config = dataclasses.replace(grasp_env.config, randomization=Randomization(ripple=(0.0, 0.0)))
+    still = copy.copy(grasp_env)
+    still.config = config
+    effect, = check(still, grasp_rollout.step, fresh, key=jax.random.key(0), ticks=1,
+                    names=("Randomization.ripple",))
+    assert effect.off and effect.found and "off" in table([effect])
