@@ -28,6 +28,11 @@ class Excitation:
     """First and last frequency of the chirp."""
     chirp_seconds: float = setting(4.0, unit="s", low=0.0, high=120.0)
     """Length of the chirp; its amplitude falls with the frequency to a quarter."""
+    chirp_parts: int = setting(6, unit="1", low=1, high=100)
+    """Parts that the chirp is cut into, with a pause after each: where the joint rests, an
+    identification can begin anew, and errors within a dead-band do not pile up."""
+    pause: float = setting(0.3, unit="s", low=0.0, high=10.0)
+    """Standing still between the parts of the chirp."""
     step_count: int = setting(6, unit="1", low=0, high=200)
     """Steps, of alternating sign and two sizes."""
     step_hold: float = setting(0.4, unit="s", low=0.05, high=10.0)
@@ -49,11 +54,11 @@ class Excitation:
 
 
 def chirp(seconds: float, period: float, frequency: tuple[float, float]) -> np.ndarray:
-    """[T] in [-1, 1]: a sine of linearly rising frequency, Hz, shrinking to a quarter."""
+    """[T] in [-1, 1]: a sine of linearly rising frequency, Hz."""
     time = np.arange(0.0, seconds, period)
     low, high = frequency
     phase = 2 * np.pi * (low * time + (high - low) * time**2 / (2 * max(seconds, period)))
-    return np.sin(phase) * np.interp(time, [0.0, seconds], [1.0, 0.25])
+    return np.sin(phase)
 
 
 def steps(count: int, hold: float, period: float) -> np.ndarray:
@@ -73,8 +78,13 @@ def joint_excitation(config: Excitation, middle: float, reach: float) -> np.ndar
     size, period = min(config.amplitude, reach), config.period
     small = min(config.reversal_amplitude, reach)
     rest = np.zeros(round(config.rest / period))
-    parts = [rest, size * chirp(config.chirp_seconds, period, config.chirp_frequency), rest,
-             size * steps(config.step_count, config.step_hold, period), rest,
+    ladder = np.linspace(*config.chirp_frequency, config.chirp_parts + 1)
+    fading = np.linspace(1.0, 0.25, config.chirp_parts + 1)
+    bursts = []
+    for first, second, strength in zip(ladder[:-1], ladder[1:], fading[:-1], strict=True):
+        wave = chirp(config.chirp_seconds / config.chirp_parts, period, (first, second))
+        bursts += [size * strength * wave, np.zeros(round(config.pause / period))]
+    parts = [rest, *bursts, rest, size * steps(config.step_count, config.step_hold, period), rest,
              size * triangles(config.slow_cycles, 4 * size / config.slow_speed, period), rest,
              small * triangles(config.reversal_cycles, 0.4, period), rest]
     return middle + np.concatenate(parts)

@@ -102,12 +102,12 @@ def check_log(log: JointLog) -> None:
     if max(np.abs(log.position).max(), np.abs(log.target).max()) > 2 * np.pi:
         raise CalibrationError(f"{log.name}: angles of {np.abs(log.position).max():.3g}: give rad, "
                                "not degrees or counts")
+    if min(asked, moved) > 1e-3 and not 1 / 20 < moved / asked < 20:
+        raise CalibrationError(f"{log.name}: commanded over {asked:.3g} rad, moved over {moved:.3g} "
+                               "rad: target and position are in different units")
     if asked < MIN_MOTION or moved < MIN_MOTION:
         raise CalibrationError(f"{log.name}: commanded over {asked:.3g} rad, moved over {moved:.3g} "
                                f"rad: at least {MIN_MOTION} rad of motion is needed")
-    if not 1 / 20 < moved / asked < 20:
-        raise CalibrationError(f"{log.name}: commanded over {asked:.3g} rad, moved over {moved:.3g} "
-                               "rad: target and position are in different units")
     if log.torque is not None:
         size = np.abs(log.torque)
         if size.max() > 50.0:
@@ -134,7 +134,7 @@ def _conclude(problem: Problem, latency: int, latencies: tuple[int, ...],
     null = [members[:count] for members in null if np.any(members[:count])]
     low, high = problem.low[:count], problem.high[:count]
     # Curvature at the best point, widened by what was seen to fit as well farther off.
-    least, largest = problem.plausible(latency)
+    least, largest = problem.plausible(latency, dead_band is not None)
     ends = np.stack([
         np.maximum(np.minimum(theta[:count] - 1.96 * deviation, least[:count]), low),
         np.minimum(np.maximum(theta[:count] + 1.96 * deviation, largest[:count]), high)], -1)

@@ -14,7 +14,7 @@ import numpy as np
 
 from dexsim.errors import CalibrationError
 from dexsim.identification_report import TYPICAL
-from dexsim.joint_model import JointLog, complete, segments, simulate
+from dexsim.joint_model import PARAMETERS, JointLog, complete, segments, simulate
 
 BOUNDS = {"stiffness": (0.01, 100.0), "damping": (0.0, 10.0), "stall_torque": (0.01, 10.0),
           "no_load_speed": (0.5, 100.0), "efficiency": (0.2, 1.5), "encoder_bias": (-0.2, 0.2),
@@ -29,40 +29,44 @@ CHI2 = 3.84  # 95 %, one parameter
 _THRESHOLD = 7.35  # 95 % for a threshold (Hansen 2000): the likelihood has a kink there
 
 
-@functools.partial(jax.jit, static_argnames=("names", "substeps", "blur"))
-def _readings(theta: jax.Array, starts: jax.Array, fixed: dict, names: tuple[str, ...],
-              target: jax.Array, segment: jax.Array, latency: jax.Array, timestep: jax.Array,
-              substeps: int, blur: float = 0.0) -> jax.Array:
-    """[2, T] angle and torque; `starts` [T], each sample's segment's."""
-    values = fixed | dict(zip(names, theta, strict=True)) | {"start": starts}
-    return jnp.stack(simulate(values, target, latency, timestep, substeps, segment, blur))
+# All parameters of the model but the starts, in the order of the arrays below: whatever is fitted,
+# the compiled programs are the same.
+_NAMES = tuple(name for name in PARAMETERS if name != "start")
 
 
-@functools.partial(jax.jit, static_argnames=("names", "substeps"))
-def _slopes(theta: jax.Array, starts: jax.Array, fixed: dict, names: tuple[str, ...],
-            target: jax.Array, segment: jax.Array, latency: jax.Array, timestep: jax.Array,
-            substeps: int) -> jax.Array:
-    """[2, T, P + 1] derivatives of `_readings` by theta and by the segment's start.
+@functools.partial(jax.jit, static_argnames=("substeps", "blur"))
+def _readings(values: jax.Array, starts: jax.Array, target: jax.Array, segment: jax.Array,
+              latency: jax.Array, timestep: jax.Array, substeps: int,
+              blur: float = 0.0) -> jax.Array:
+    """[2, T] angle and torque, from all parameters and each sample's segment's start [T]."""
+    named = dict(zip(_NAMES, values, strict=True)) | {"start": starts}
+    return jnp.stack(simulate(named, target, latency, timestep, substeps, segment, blur))
+
+
+@functools.partial(jax.jit, static_argnames="substeps")
+def _slopes(values: jax.Array, starts: jax.Array, target: jax.Array, segment: jax.Array,
+            latency: jax.Array, timestep: jax.Array, substeps: int) -> jax.Array:
+    """[2, T, P + 1] derivatives of `_readings` by all parameters and by the segment's start.
 
     The dead-band's edges are blurred: the exact gradient does not see that a parameter moves the
     instant at which the torque switches.
     """
-    def blurred(theta: jax.Array, shift: jax.Array) -> jax.Array:
-        return _readings(theta, starts + shift, fixed, names, target, segment, latency, timestep,
-                         substeps, blur=BLUR)
-    by_theta, by_start = jax.jacfwd(blurred, (0, 1))(theta, jnp.zeros(()))
-    return jnp.concatenate([by_theta, by_start[..., None]], -1)
+    def blurred(values: jax.Array, shift: jax.Array) -> jax.Array:
+        return _readings(values, starts + shift, target, segment, latency, timestep, substeps,
+                         blur=BLUR)
+    by_value, by_start = jax.jacfwd(blurred, (0, 1))(values, jnp.zeros(()))
+    return jnp.concatenate([by_value, by_start[..., None]], -1)
 
 
-@functools.partial(jax.jit, static_argnames=("names", "substeps"))
-def _crowd_costs(thetas: jax.Array, starts: jax.Array, fixed: dict, names: tuple[str, ...],
-                 target: jax.Array, segment: jax.Array, latency: jax.Array, timestep: jax.Array,
-                 substeps: int, measured: jax.Array, weight: jax.Array) -> jax.Array:
-    """Weighted sums of squares [N] for thetas [N, P]."""
-    def cost(theta: jax.Array) -> jax.Array:
-        out = _readings(theta, starts, fixed, names, target, segment, latency, timestep, substeps)
+@functools.partial(jax.jit, static_argnames="substeps")
+def _crowd_costs(crowd: jax.Array, starts: jax.Array, target: jax.Array, segment: jax.Array,
+                 latency: jax.Array, timestep: jax.Array, substeps: int, measured: jax.Array,
+                 weight: jax.Array) -> jax.Array:
+    """Weighted sums of squares [N] for parameters [N, P]."""
+    def cost(values: jax.Array) -> jax.Array:
+        out = _readings(values, starts, target, segment, latency, timestep, substeps)
         return jnp.sum(((out[:len(weight)] - measured) * weight[:, None]) ** 2)
-    return jax.vmap(cost)(thetas)
+    return jax.vmap(cost)(crowd)
 
 
 class Problem:
@@ -79,6 +83,8 @@ class Problem:
         self.fixed = complete(dict(start), log)
         self.segment, angle = segments(log)
         self.names = (*dict.fromkeys(fit), "dead_band")
+        self._index = np.array([_NAMES.index(name) for name in self.names])
+        self._values = np.array([float(self.fixed[name]) for name in _NAMES])
         begin = np.array([float(self.fixed[name]) for name in self.names])
         self.scale = np.maximum(np.abs(begin), [TYPICAL[name] for name in self.names])
         self.low, self.high = np.array([bounds[name] for name in self.names], float).T
@@ -98,9 +104,14 @@ class Problem:
         self.timestep = log.period / substeps
         self.best, self.latency_cost = np.inf, {}
 
+    def _all(self, theta: np.ndarray) -> jax.Array:
+        """All parameters [..., len(_NAMES)] from the fitted ones [..., P]."""
+        values = np.broadcast_to(self._values, (*theta.shape[:-1], len(_NAMES))).copy()
+        values[..., self._index] = theta
+        return jnp.asarray(values, jnp.float32)
+
     def _call(self, function, theta: np.ndarray, starts: np.ndarray, latency: int) -> np.ndarray:
-        out = function(jnp.asarray(theta, jnp.float32),
-                       jnp.asarray(starts[self.segment], jnp.float32), self.fixed, self.names,
+        out = function(self._all(theta), jnp.asarray(starts[self.segment], jnp.float32),
                        self.target, self.segment, jnp.int32(latency), jnp.float32(self.timestep),
                        self.substeps)
         out = np.nan_to_num(np.asarray(out, float), nan=1e3, posinf=1e3, neginf=-1e3)
@@ -116,7 +127,7 @@ class Problem:
         slope = self._call(_slopes, theta, starts, latency)
         slope = slope / self.noise[:len(slope), None, None]
         own = slope[..., -1:] * (self.segment[:, None] == np.arange(len(starts)))
-        slope = np.concatenate([slope[..., :-1], own], -1)
+        slope = np.concatenate([slope[..., self._index], own], -1)
         return slope.reshape(-1, slope.shape[-1])
 
     def solve(self, theta: np.ndarray, latency: int, evaluations: int,
@@ -174,13 +185,13 @@ class Problem:
                         options={"xatol": 2e-3 * (span[1] - span[0])})
 
     def explore(self, latency: int, with_band: bool, rounds: int = 6,
-                crowd: int = 192) -> None:
+                crowd: int = 256) -> None:
         """Cross-entropy search about the present solution, which a gradient cannot leave: a
         dead-band makes the sum of squares rugged at the scale of the parameters' own errors."""
         count = len(self.theta) - (not with_band)
         slope = self.jacobian(self.theta, self.starts, latency)[:, :count] * self.scale[:count]
         middle = self.theta[:count] / self.scale[:count]
-        spread = np.linalg.pinv(slope.T @ slope, rcond=1e-8) * 16.0 + 1e-8 * np.eye(count)
+        spread = np.linalg.pinv(slope.T @ slope, rcond=1e-8) * 25.0 + 1e-8 * np.eye(count)
         rng = np.random.default_rng(0)
         low, high = self.low[:count] / self.scale[:count], self.high[:count] / self.scale[:count]
         self.seen = []
@@ -197,10 +208,12 @@ class Problem:
             if self.attempt_from(thetas[order[0]], latency, with_band) is not None:
                 middle = self.theta[:count] / self.scale[:count]
 
-    def plausible(self, latency: int) -> tuple[np.ndarray, np.ndarray]:
-        """Least and largest of each parameter among all candidates that the data do not exclude."""
+    def plausible(self, latency: int, with_band: bool) -> tuple[np.ndarray, np.ndarray]:
+        """Least and largest of each parameter among all candidates that the data do not exclude;
+        with a dead-band, by the critical value of a threshold."""
         least = np.sum(self.residual(self.theta, self.starts, latency) ** 2)
-        limit = least * (1 + CHI2 / max(self.measured.size - len(self.theta), 1))
+        critical = _THRESHOLD if with_band else CHI2
+        limit = least * (1 + critical / max(self.measured.size - len(self.theta), 1))
         thetas, costs = (np.concatenate(parts) for parts in zip(*self.seen, strict=True))
         kept = np.concatenate([thetas[costs <= limit], self.theta[None]])
         return kept.min(0), kept.max(0)
@@ -209,9 +222,8 @@ class Problem:
         """Sums of squares [N] of many candidates at once."""
         starts = jnp.asarray(self.starts[self.segment], jnp.float32)
         weight = 1.0 / jnp.asarray(self.noise[:len(self.measured)], jnp.float32)
-        out = _crowd_costs(jnp.asarray(thetas, jnp.float32), starts, self.fixed, self.names,
-                           self.target, self.segment, jnp.int32(latency),
-                           jnp.float32(self.timestep), self.substeps,
+        out = _crowd_costs(self._all(thetas), starts, self.target, self.segment,
+                           jnp.int32(latency), jnp.float32(self.timestep), self.substeps,
                            jnp.asarray(self.measured, jnp.float32), weight)
         return np.nan_to_num(np.asarray(out, float), nan=np.inf)
 
@@ -230,13 +242,13 @@ class Problem:
         if with_band:
             self.attempt(latency, 30, with_band=True)
         if not last:
-            self.explore(latency, with_band, rounds=4)
+            self.explore(latency, with_band, rounds=6)
         left = self.residual(self.theta, self.starts, latency).reshape(len(self.measured), -1)
         self.noise = self.noise.copy()
         self.noise[:len(left)] *= np.maximum(np.sqrt(np.mean(left**2, -1)), 1e-6)
         if last:
             self.best = np.sum(self.residual(self.theta, self.starts, latency) ** 2)
-            self.explore(latency, with_band, rounds=12)
+            self.explore(latency, with_band, rounds=14)
 
     def dead_band_profile(self, latency: int, span: tuple[float, float]) -> tuple[float, float]:
         """Where the sum of squares, fitted anew, rises by the critical value of a threshold."""
