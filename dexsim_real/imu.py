@@ -119,18 +119,21 @@ class Imu:
         self._thread = threading.Thread(target=self._run, name="imu", daemon=True)
         self._thread.start()
 
-    def calibrate(self, known: np.ndarray, wait: float = 2.0) -> None:
-        """Fix the heading: the object lies now as `known` [4].
+    def wait(self, seconds: float = 2.0) -> None:
+        """Until the part sends.
 
         Raises:
-          HandError: nothing came within `wait` seconds.
+          HandError: nothing came in this time.
         """
-        until = time.monotonic() + wait
+        until = time.monotonic() + seconds
         while self._newest is None:
             if time.monotonic() > until:
                 raise HandError(f"{self.port}: no orientation from the IMU; is "
                                 "it in UART-RVC mode (PS0 high, PS1 low)?")
             time.sleep(0.005)
+
+    def calibrate(self, known: np.ndarray) -> None:
+        """Fix the heading: the object lies now as `known` [4]."""
         self._world = align(self._newest[1], multiply(known, self._mount), self._up)
 
     def read(self) -> tuple[float, np.ndarray]:
@@ -152,7 +155,9 @@ class Imu:
             except OSError:
                 return  # The sample grows old, and `Safety` acts on that.
             if quats:
-                self._newest = time.monotonic(), quats[-1]
+                before = self._newest[1] if self._newest else quats[-1]
+                # Of the two quaternions of an orientation the one nearer to the last, as in simulation.
+                self._newest = time.monotonic(), quats[-1] if quats[-1] @ before >= 0 else -quats[-1]
 
 
 def _open(port: str) -> Any:

@@ -47,6 +47,8 @@ class RunArguments:
     """Exchanges with the hand per second; the policy keeps its own rate."""
     approach: float = setting(2.0, unit="s", low=0.0, high=60.0)
     """Time to move from the measured pose to the task's start posture; 0 stays there."""
+    place: float = setting(0.0, unit="s", low=0.0, high=600.0)
+    """Pause in the start posture, to put the object into the hand: squarely, if the IMU is used."""
     log: Path | None = None
     """Log file; by default a new one under runs/real."""
     output: Path | None = None

@@ -32,6 +32,7 @@ from dexsim_real.view import View
 from dexsim_real.vision import HeightSensor, open_masks
 
 _ZERO_SAMPLES = 30
+_PATIENCE = 60.0  # s that the object may take to come into sight
 
 
 class ObjectSensors:
@@ -57,13 +58,18 @@ class ObjectSensors:
                                             self._reference, sensing.object_axes, sensing.velocity_filter)
             if arguments.imu:
                 self._imu = Imu(arguments.imu, -np.asarray(task.gravity), arguments.imu_mount)
-                # The object is put down squarely: its heading is zero now.
-                self._imu.calibrate(IDENTITY)
-            if self._camera:
-                self._camera.wait()
+                self._imu.wait()
         except BaseException:
             self.close()
             raise
+
+    def ready(self) -> bool:
+        """Whether the object is in sight; then it is taken to lie squarely, its heading zero."""
+        if self._camera and not self._camera.seen:
+            return False
+        if self._imu:
+            self._imu.calibrate(IDENTITY)
+        return True
 
     def read(self, now: float) -> tuple[ObjectEstimate, float, float]:
         """The estimate, the age s of its oldest part, and the time of the newest orientation."""
@@ -142,7 +148,7 @@ class Session:
         with self.view:
             if not self.arguments.motors_off:
                 self.servo.engage()
-                self._approach()
+            self._approach()
             self.controller.start(self._pose())
             self._note("the policy begins")
             self.end = self._loop()
@@ -189,13 +195,17 @@ class Session:
         self.sensing.zero(states)
 
     def _approach(self) -> None:
-        posture = getattr(self.controller.task.config, "posture", None)
-        if posture is None or self.arguments.approach == 0:
-            return
-        start, goal = self._pose(), np.asarray(posture, np.float32)
-        begin, pace = time.monotonic(), Pace(self.arguments.rate)
-        while (now := time.monotonic()) < begin + self.arguments.approach:
-            share = (now - begin) / self.arguments.approach
+        """To the start posture, and hold it until the object is there."""
+        arguments, start = self.arguments, self._pose()
+        goal = np.asarray(getattr(self.controller.task.config, "posture", start), np.float32)
+        goal = goal if arguments.approach > 0 else start
+        begin, pace = time.monotonic(), Pace(arguments.rate)
+        ready = begin + arguments.approach + arguments.place
+        while (now := time.monotonic()) < ready or not self.objects.ready():
+            if now > ready + _PATIENCE:
+                raise HandError("the camera does not see the object: check its light, the colour threshold "
+                                "(--optics.hsv-low, --optics.hsv-high) and --optics.min-area")
+            share = min((now - begin) / arguments.approach, 1.0) if arguments.approach > 0 else 1.0
             self.safety.wish(start + np.float32(share * share * (3 - 2 * share)) * (goal - start), now)
             self._check()
             pace.wait()

@@ -104,18 +104,10 @@ class HeightSensor:
         self._thread = threading.Thread(target=self._run, name="vision", daemon=True)
         self._thread.start()
 
-    def wait(self, seconds: float = 5.0) -> None:
-        """Until the object is seen.
-
-        Raises:
-          HandError: it is not, in this time.
-        """
-        until = time.monotonic() + seconds
-        while self._newest is None:
-            if time.monotonic() > until:
-                raise HandError("the camera does not see the object: check its light, the colour "
-                                "threshold (--optics.hsv-low, --optics.hsv-high) and min-area")
-            time.sleep(0.01)
+    @property
+    def seen(self) -> bool:
+        """Whether the object has come into sight."""
+        return self._newest is not None
 
     def read(self) -> tuple[float, np.ndarray, np.ndarray]:
         """Time of the newest sight (s, monotonic), position [3] m and filtered velocity [3] m/s."""

@@ -1,13 +1,17 @@
 """The bridge as a whole: the simulation's door and the hand's give the same observation in the same order, and a
 run ends with the motors off, however it ends."""
 
+import contextlib
 import dataclasses
 import json
+import math
 import os
 import signal
 import subprocess
 import sys
+import threading
 import time
+import tty
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -32,11 +36,15 @@ from dexsim.tasks.grasp import Grasp, GraspConfig
 from dexsim.tasks.rotate import Rotate, RotateConfig
 from dexsim.tasks.rotate_start import sample_target
 from dexsim_ppo.evaluate import load_policy
-from dexsim_real import control, frames, replay, run
+from dexsim_ppo.networks import Layer
+from dexsim_ppo.policy import Policy, PolicyParams
+from dexsim_ppo.running_stats import Normalizer
+from dexsim_real import control, frames, imu, replay, run
 from dexsim_real.control import Controller
 from dexsim_real.frames import Mode
 from dexsim_real.log import Kind, LogReader
 from dexsim_real.sensing import HandSensing, HardwareConfig, ObjectEstimate
+from dexsim_real.trouble import HandError
 
 ROOT = Path(__file__).resolve().parent.parent
 QUIET = Sensing(joint_noise=0.0, joint_resolution=0.0, torque_noise=0.0, object_noise=0.0,
@@ -422,3 +430,61 @@ print([name for name in sys.modules if "mjx" in name or name in ("warp", "brax",
 def test_the_shipped_policy_fits_the_bridge(hand):
     controller = Controller(load_policy("grasp"), hand)
     assert controller.sources == {"hand", "camera", "user"} and controller.period == pytest.approx(0.03)
+
+
+def rotate_policy(hand, path):
+    """A policy file of the rotation task with small random weights."""
+    config = RotateConfig(tilt=0.0)
+    fields = layout(hand, Rotate.fields["actor"], config.observation)
+    size = sum(field.size for field in fields)
+    rng = np.random.default_rng(0)
+    params = PolicyParams(
+        (Layer(jnp.asarray(0.05 * rng.normal(size=(size, 12)), jnp.float32), jnp.zeros(12)),),
+        Normalizer(jnp.zeros(size), jnp.ones(size)))
+    Policy(task="rotate", env_config=to_dict(config), observation_layout=fields, params=params,
+           control_rate=1 / config.physics.control_period).save(path)
+
+
+def test_a_rotation_policy_with_an_imu_counts_goals(hand, tmp_path):
+    """The object turns by 70 degrees a second about the palm's normal, as its IMU says."""
+    rotate_policy(hand, tmp_path / "turn.msgpack")
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    os.set_blocking(master, False)
+    stop, begin = threading.Event(), []
+
+    def turn():
+        index, start = 0, None
+        while not stop.wait(0.01):
+            sessions = [block for block in peer.commands[-1:] if np.all(block["mode"] == Mode.POSITION)]
+            start = time.monotonic() if start is None and len(peer.commands) > 110 and sessions else start
+            angle = 0.0 if start is None else math.radians(70) * (time.monotonic() - start)
+            # The part's z is up, and its heading unknown. Nobody may be reading yet.
+            with contextlib.suppress(BlockingIOError):
+                os.write(master, imu.encode(index, np.array([math.cos(angle / 2 + 1), 0, 0, math.sin(angle / 2 + 1)])))
+            index += 1
+        begin.append(start)
+
+    with FollowingHand() as peer:
+        thread = threading.Thread(target=turn, daemon=True)
+        thread.start()
+        options = [str(tmp_path / "turn.msgpack"), *arguments(peer, tmp_path, "--seconds", "4")[1:]]
+        with pytest.raises(HandError, match="give the IMU's port with --imu"):
+            run.main([options[0], *arguments(peer, tmp_path / "without")[1:]])
+        peer.commands.clear()
+        assert run.main([*options, "--imu", os.ttyname(slave)]) == 0
+        stop.set()
+        thread.join()
+    os.close(master)
+    os.close(slave)
+    ticks, report = records(tmp_path, Kind.TICK), summary(tmp_path)
+    # 280 degrees less the start: a success at 73 and 163, and perhaps at 253.
+    assert begin[0] is not None and report["successes"] in (2, 3)
+    quats = np.array([tick["readings"]["object_quat"] for tick in ticks])
+    turned = 2 * np.unwrap(np.arctan2(quats[:, 1], quats[:, 0]))
+    assert abs(turned[0]) < 0.2 and np.abs(quats[:, 2:]).max() < 1e-3
+    assert np.all(np.diff(turned) > -1e-3) and turned[-1] > math.radians(170)
+    goals = np.array([tick["readings"]["goal_quat"] for tick in ticks])
+    assert len(np.unique(goals, axis=0)) == report["successes"] + 1
+    again = replay.replay(tmp_path / "run.log").report
+    assert again["observations_same"] == again["ticks"] == len(ticks) > 80
