@@ -97,7 +97,7 @@ class Problem:
         inside = 0.05 * np.minimum(self.scale, self.high - self.low)
         self.theta = np.clip(begin, self.low + inside, self.high - inside)
         self.theta[-1] = begin[-1]
-        self.starts = angle - float(self.fixed["encoder_bias"])
+        self.starts = self.rests = angle - float(self.fixed["encoder_bias"])
         channels = [log.position] if log.torque is None else [log.position, log.torque]
         self.measured = np.stack(channels)
         self.target = jnp.asarray(log.target, jnp.float32)
@@ -235,20 +235,36 @@ class Problem:
         self.best, self.theta, self.starts = cost, theta, starts
         return cost
 
+    def start_over(self, latency: int, with_band: bool, tries: int) -> None:
+        """Solve again from about the present parameters, and from the angles as they were read:
+        a valley to which parameters and starts have settled together has no other way out."""
+        rng, best, starts = np.random.default_rng(1), self.theta, self.starts
+        for index in range(tries):
+            width = 0.02 * 3.0 ** (index % 3)  # 2, 6 and 18 %
+            theta = best + width * self.scale * rng.standard_normal(len(best))
+            theta[-1] = theta[-1] if with_band else best[-1]
+            self.starts = self.rests
+            found = self.solve(np.clip(theta, self.low, self.high), latency, 12, with_band)
+            if found[0] < self.best:
+                (self.best, best, starts) = found
+        self.theta, self.starts = best, starts
+
     def settle(self, latency: int, with_band: bool, last: bool) -> None:
         """Solve to the end, and take each channel's noise from what the fit leaves."""
         self.best = np.inf
         self.attempt(latency, 30)
         if with_band:
             self.attempt(latency, 30, with_band=True)
-        if not last:
+        # Without a dead-band there is next to nothing to get lost in.
+        self.start_over(latency, with_band, tries=(6 if last else 10) if with_band else 2)
+        if with_band and not last:
             self.explore(latency, with_band, rounds=6)
         left = self.residual(self.theta, self.starts, latency).reshape(len(self.measured), -1)
         self.noise = self.noise.copy()
         self.noise[:len(left)] *= np.maximum(np.sqrt(np.mean(left**2, -1)), 1e-6)
         if last:
             self.best = np.sum(self.residual(self.theta, self.starts, latency) ** 2)
-            self.explore(latency, with_band, rounds=14)
+            self.explore(latency, with_band, rounds=14 if with_band else 3)
 
     def dead_band_profile(self, latency: int, span: tuple[float, float]) -> tuple[float, float]:
         """Where the sum of squares, fitted anew, rises by the critical value of a threshold."""

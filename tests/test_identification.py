@@ -142,9 +142,9 @@ def recovered(seed):
 
 
 def test_parameters_come_back():
-    """Two more trials of `test_parameters_come_back_in_90_of_100`."""
-    inside = [recovered(seed) for seed in range(2)]
-    assert sum(sum(trial.values()) for trial in inside) >= 12  # of 14
+    """One trial like those of `test_parameters_come_back_in_90_of_100`."""
+    inside = recovered(0)
+    assert inside["latency"] and sum(inside.values()) >= 6, inside  # of 7
 
 
 @pytest.mark.slow
@@ -205,18 +205,18 @@ def c_log(truth, target, latency, timestep=5e-4, seed=0):
 
 
 def test_c_mujocos_joint_is_identified():
-    """Another engine, ten times finer steps: discretisation is a model error, so within 6 % and not
-    within the interval; friction within 10 %, latency exact."""
-    truth = dict(stiffness=3.0, damping=0.06, stall_torque=0.4, inertia=0.004, coulomb_friction=0.03,
+    """Another engine, six times finer steps: discretisation is a model error, so the gains within 5 %
+    and not within the interval, frictions within 8 and 20 %, latency exact."""
+    truth = dict(stiffness=3.0, damping=0.12, stall_torque=0.4, inertia=0.012, coulomb_friction=0.03,
                  viscous_friction=0.01)
-    log = c_log(truth, SHORT, latency=0.010)
-    guess = dict(stiffness=2.0, damping=0.1, stall_torque=0.5, no_load_speed=1e2, inertia=0.004)
-    found = identify(log, guess, dead_band=None, substeps=15, latencies=(8, 9, 10, 11))
-    assert found.latency == 10 and found.timestep == pytest.approx(1e-3)
-    for name, slack in (("stiffness", 0.02), ("damping", 0.06), ("stall_torque", 0.02),
-                        ("coulomb_friction", 0.05), ("viscous_friction", 0.1)):
+    log = c_log(truth, SHORT, latency=0.009)
+    guess = dict(stiffness=2.0, damping=0.2, stall_torque=0.5, no_load_speed=1e2, inertia=0.012)
+    found = identify(log, guess, dead_band=None, substeps=5, latencies=(2, 3, 4))
+    assert found.latency == 3 and found.timestep == pytest.approx(3e-3)
+    for name, slack in (("stiffness", 0.03), ("damping", 0.05), ("stall_torque", 0.02),
+                        ("coulomb_friction", 0.08), ("viscous_friction", 0.2)):
         assert found.values[name] == pytest.approx(truth[name], rel=slack), name
-    assert found.rmse < 0.0013
+    assert found.rmse < 0.002
 
 
 # --- what the data do not tell ----------------------------------------------------------------------------
