@@ -80,7 +80,7 @@ def press(motor: Motor, key: jax.Array, *, lever: float, peak: float = 8.0, cycl
     Args:
       motor: scalars.
       key: of the noise.
-      lever: m, joint torque per fingertip force.
+      lever: m, joint torque per fingertip force; negative where the joint presses by turning back.
       peak: N, largest force of the triangle wave.
       cycles, samples: presses in the recording, samples in all.
       travel: rad that the joint yields from no force to the peak (the ripple passes by).
@@ -91,7 +91,8 @@ def press(motor: Motor, key: jax.Array, *, lever: float, peak: float = 8.0, cycl
     force, way = peak * share, np.where(phase < 0.5, 1.0, -1.0)
     current_key, force_key = jax.random.split(key)
     current = read_current(current_key, motor,
-                           motor_current(motor, lever * force, way, travel * share))
+                           motor_current(motor, lever * force, way * np.sign(lever),
+                                         travel * share * np.sign(lever)))
     reading = force + force_noise * np.asarray(jax.random.normal(force_key, force.shape))
     if force_resolution > 0:
         reading = np.round(reading / force_resolution) * force_resolution

@@ -5,6 +5,7 @@ import math
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 import scipy.stats
@@ -22,6 +23,7 @@ from dexsim.calibration import (
 )
 from dexsim.calibration_fit import Press, calibrate, find_direction, fit_joint
 from dexsim.calibration_plot import plot_calibration
+from dexsim.calibration_sim import lever_arms, simulated_press
 from dexsim.errors import CalibrationError
 from dexsim.motor import Motor, press
 from dexsim.robust_line import fit_line, long_run, theil_sen
@@ -413,3 +415,49 @@ def test_the_figure_shows_what_was_recorded(fitted, tmp_path):
 
 def test_thresholds_are_what_the_messages_say():
     assert calibration_fit.MIN_SAMPLES == 20 and calibration_fit.MIN_FORCE_RANGE == 0.5
+
+
+# --- the simulation's side --------------------------------------------------------------------------
+
+
+def test_lever_arms_are_c_mujocos(hand):
+    """J^T n at a taxel, from mj_jac at the same point of the tip's body."""
+    rng = np.random.default_rng(6)
+    model = mujoco.MjModel.from_xml_path(str(hand.model_path))
+    data = mujoco.MjData(model)
+    for finger in range(5):
+        angle = rng.uniform(hand.joint_lower, hand.joint_upper)
+        taxel = int(rng.integers(hand.num_taxels))
+        data.qpos[[model.joint(name).qposadr[0] for name in hand.joint_names]] = angle
+        mujoco.mj_forward(model, data)
+        body = model.body(hand.body_names[hand.tip_body[finger]]).id
+        turn = data.xmat[body].reshape(3, 3)
+        point = data.xpos[body] + turn @ hand.taxel_position[finger, taxel]
+        jacobian = np.zeros((3, model.nv))
+        mujoco.mj_jac(model, data, jacobian, None, point, body)
+        torque = jacobian.T @ (turn @ hand.taxel_normal[finger, taxel])
+        wanted = torque[[model.joint(name).dofadr[0] for name in hand.joint_names]]
+        np.testing.assert_allclose(lever_arms(hand, angle, finger, taxel), wanted, atol=2e-6)
+
+
+def test_a_hand_pressed_finger_by_finger(hand):
+    """Both sides from the same presses: each joint's torque comes back through its current."""
+    posture = np.clip(np.full(12, 0.5), hand.joint_lower, hand.joint_upper)
+    triangle = 8 * (1 - np.abs(2 * (np.arange(600) / 200 % 1) - 1))
+    real, sim, arms = {}, {}, {}
+    for finger in hand.finger_names:
+        for name, data in simulated_press(hand, posture, finger, triangle).items():
+            arm = data.value[50] / data.force[50]
+            if name not in arms or abs(arm) > abs(arms[name]):
+                sim[name], arms[name] = data, arm
+                real[name] = press(MOTOR, jax.random.key(len(real)), lever=arm, force_noise=0.03)
+    assert len(arms) >= 10 and all(0.005 < abs(arm) < 0.12 for arm in arms.values())
+    found = calibrate(hand, real, sim, missing="class")
+    for name, arm in arms.items():
+        joint = hand.joint_names.index(name)
+        current = np.zeros(12)
+        current[joint] = 5.0 * arm / (0.9 * 0.8) + math.copysign(0.02, arm) + 0.004
+        direction = np.ones(12)
+        assert float(joint_torque(found, current, direction)[joint]) == pytest.approx(5.0 * arm, rel=0.06), name
+    with pytest.raises(CalibrationError, match="no finger 'toe'"):
+        simulated_press(hand, posture, "toe", triangle)

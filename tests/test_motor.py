@@ -70,6 +70,11 @@ def test_a_press_is_a_triangle_of_force_and_the_motors_current():
     np.testing.assert_allclose(data.value, exact * 0.06 / 0.5 + np.where(rising, 0.01, -0.01), atol=1e-6)
 
 
+def test_a_joint_that_presses_by_turning_back_draws_the_mirrored_current():
+    there, back = (press(MOTOR, jax.random.key(0), lever=lever) for lever in (0.06, -0.06))
+    np.testing.assert_allclose(back.value, -there.value, atol=1e-6)
+
+
 def test_gradients_reach_every_parameter():
     slope = jax.grad(lambda m: motor_current(m, 0.2, 1.0, 0.1))(
         Motor(*(jnp.float32(x) for x in (0.5, 0.8, 0.6, 0.03, 0.02, 20.0, 0.1, 0, 0, 0, 1))))
