@@ -6,8 +6,9 @@
 
 Needs neither a physics engine nor a mesh file; only `--step` (the share of a full step of the grasp task) and
 `--kinematics` load the hand's model. Costs are medians over repeats of a compiled loop whose every turn moves the
-objects; FLOPs and bytes are XLA's own count of one turn, the floor is the longer of bytes at the memory bandwidth and
-FLOPs at the arithmetic rate that this program measures on the same device.
+objects; FLOPs and bytes are XLA's own count of one turn (of a loop's body, as in the points' scan and table, it counts
+one round only); the floor is the longer of bytes at the memory bandwidth and FLOPs at the arithmetic rate that this
+program measures on the same device.
 """
 
 import argparse

@@ -5,6 +5,7 @@ the shipped taxel layout; the one mesh is made by trimesh.
 """
 
 import dataclasses
+import time
 from types import SimpleNamespace
 
 import jax
@@ -216,10 +217,11 @@ def _gradient(name: str, thing) -> dict:
         taxels, area = (np.asarray(x, np.float64) for x in pad(0.002, np.zeros((1, 2))))
         skin, step = Skin(margin=0.0, total="skin"), 1e-8
 
+        @jax.jit
         def total(position):
             return tactile.feel(taxels, area, thing, position, jnp.eye(3), jnp.ones(1), skin).force.sum()
         start = jnp.array([0.00071, -0.00043, 0.0193])
-        exact = np.asarray(jax.grad(total)(start))
+        exact = np.asarray(jax.jit(jax.grad(total))(start))
         numeric = [(total(start + step * e) - total(start - step * e)) / (2 * step) for e in jnp.eye(3)]
         error = float(np.abs(exact - np.asarray(numeric)).max() / np.abs(exact).max())
     return {"check": f"gradient against finite differences, {name}", "value": error, "bound": 1e-4, "ok": error <= 1e-4}
@@ -248,6 +250,7 @@ def random_grasps(shape: sdf.Shape, count: int, seed: int = 0) -> HandPose:
 
 def _frame(axis: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Rotations [..., 3, 3] with `axis` as third column and a random first one."""
+    axis = axis / np.linalg.norm(axis, axis=-1, keepdims=True)
     first = np.cross(axis, rng.normal(size=axis.shape))
     first /= np.linalg.norm(first, axis=-1, keepdims=True)
     return np.stack([first, np.cross(axis, first), axis], -1)
@@ -266,14 +269,23 @@ def grasps(quick: bool) -> list[dict]:
             def one(pose):
                 touch = tactile.feel_links(hand, pose, thing, jnp.zeros(3), jnp.eye(3), jnp.ones(5), skin)
                 return touch.depth, *tactile.reduce_touch_links(touch.force, hand, pose)
-            return [np.asarray(x) for x in jax.jit(jax.vmap(one))(pose)]
+            run = jax.jit(jax.vmap(one))
+            found = [np.asarray(x) for x in run(pose)]
+            seconds = []
+            for _ in range(3):
+                start = time.perf_counter()
+                jax.block_until_ready(run(pose))
+                seconds.append(time.perf_counter() - start)
+            return *found, 1e6 * min(seconds) / count
         found = {"closed form": feel(shape), "grid": feel(grid.bake(shape)),
+                 "grid quadratic": feel(grid.bake(shape, GridConfig(interpolation="quadratic"))),
                  "points 1024": feel(surface_points.from_shape(shape, config))}
         if not quick:
             found["points 4096"] = feel(surface_points.from_shape(shape, dataclasses.replace(config, count=4096)))
-        pairs = [("grid", "closed form"), *((name, "grid") for name in found if name.startswith("points"))]
+        pairs = [("grid", "closed form"), ("grid quadratic", "closed form")]
+        pairs += [(name, "grid") for name in found if name.startswith("points")]
         for name, base in pairs:
-            (depth, force, centre), (depth_b, force_b, centre_b) = found[name], found[base]
+            (depth, force, centre, cost), (depth_b, force_b, centre_b, _) = found[name], found[base]
             both = (force > 0) & (force_b > 0)
             apart = 1e3 * np.linalg.norm(centre - centre_b, axis=-1)[both]
             rows.append({"shape": kind, "method": name, "against": base,
@@ -281,5 +293,6 @@ def grasps(quick: bool) -> list[dict]:
                          "finger_contacts_same_%": 100 * np.mean((force > 0) == (force_b > 0)),
                          "force_diff_median_%": 100 * np.median(np.abs(force / np.where(both, force_b, 1) - 1)[both]),
                          "force_sum_diff_%": 100 * (force[both].sum() / force_b[both].sum() - 1),
-                         "centre_diff_median_mm": np.median(apart), "centre_diff_p95_mm": np.quantile(apart, 0.95)})
+                         "centre_diff_median_mm": np.median(apart), "centre_diff_p95_mm": np.quantile(apart, 0.95),
+                         "us_per_grasp": cost})
     return rows

@@ -1,9 +1,10 @@
 """Signed-distance grids: baked once from any closed mesh (or union of primitives), looked up by interpolation.
 
-Nodes hold the exact distance. `linear` interpolates the 8 nodes round a point; `quadratic` also keeps the gradient at
-every node and adds half of each node's first-order term, which is exact for second-order polynomials (the two errors
-of interpolating values and of extrapolating from nodes are opposite, one twice the other). The normal is the analytic
-gradient of the interpolant, from the same reads.
+Nodes hold the exact distance; where the surface is curved, `linear` by default lowers them by the mean overshoot of
+interpolation between the 8 nodes round a point. `quadratic` also keeps the gradient at every node and adds half of each
+node's first-order term, which is exact for second-order polynomials (the errors of interpolating values and of
+extrapolating from nodes are opposite, one twice the other). The normal is the analytic gradient of the interpolant,
+from the same reads.
 
 A grid holds one or several object classes; `index` says which, and may differ between environments under `vmap` while
 the values are shared. Beyond the grid the distance is that at the nearest point of its boundary plus the way there.
@@ -48,6 +49,9 @@ class GridConfig:
     """Storage. float16 needs half the memory traffic: two neighbours are read as one word."""
     interpolation: str = setting("linear", choices=INTERPOLATIONS)
     """linear: 8 values a query; quadratic: 32, for ten times less error on smooth shapes."""
+    unbiased: bool = setting(True)
+    """linear only: lower the nodes of curved parts by the mean by which interpolation between them
+    overshoots, a twelfth of the second differences. False keeps the nodes exact."""
 
     def __post_init__(self):
         validate(self)
@@ -94,6 +98,8 @@ def bake(source: meshes.Mesh | sdf.Shape, config: GridConfig | None = None, *, c
     channels = distance[:, None] / _MILLI
     if config.interpolation == "quadratic":
         channels = np.concatenate([channels, gradient], 1)
+    elif config.unbiased:
+        channels = channels - _overshoot(distance, axes)[:, None] / _MILLI
     return Grid(
         nodes=config.nodes, interpolation=config.interpolation, values=jnp.asarray(_pack(channels, config.dtype)),
         origin=jnp.asarray([[a[0] for a in axes]], jnp.float32),
@@ -231,6 +237,23 @@ def _pack(channels: np.ndarray, dtype: str) -> np.ndarray:
     if halves.shape[1] == 1:  # with the next node along z; the last of a row is never a lower corner
         halves = np.concatenate([halves, np.roll(halves, -1, axis=0)], 1)
     return np.ascontiguousarray(halves).view(np.uint32).reshape(-1)
+
+
+def _overshoot(distance: np.ndarray, axes: list[np.ndarray]) -> np.ndarray:
+    """Mean error of linear interpolation round each node [nodes], m; 0 at edges, where there is no second difference.
+
+    Between two nodes a curve lies above its chord by f'' h^2 t (1 - t) / 2, by f'' h^2 / 12 on average.
+    """
+    n = len(axes[0])
+    cube, total = distance.reshape(n, n, n).astype(np.float64), np.zeros((n, n, n))
+    smooth = np.ones((n, n, n), bool)
+    for k, axis in enumerate(axes):
+        line = np.moveaxis(cube, k, 0)
+        second = np.pad(line[2:] - 2 * line[1:-1] + line[:-2], ((1, 1), (0, 0), (0, 0)), mode="edge")
+        second = np.moveaxis(second, 0, k)
+        smooth &= np.abs(second) < 0.2 * (axis[1] - axis[0])
+        total += second / 12
+    return np.where(smooth, total, 0.0).reshape(-1)
 
 
 def _measured(mesh: meshes.Mesh, points: np.ndarray, config: GridConfig, cache: bool) -> tuple[np.ndarray, np.ndarray]:
