@@ -236,7 +236,7 @@ class SerialHand:
         try:
             options = {"exclusive": True} if local else {}
             self._serial = serial.serial_for_url(self.port, baudrate=self.config.baud, timeout=_POLL,
-                                                 write_timeout=1.0, **options)
+                                                 write_timeout=0.1, **options)
         except (OSError, ValueError) as error:
             raise HandError(explain(self.port, error)) from None
         if local:

@@ -32,6 +32,7 @@ from dexsim_real.view import View
 from dexsim_real.vision import HeightSensor, open_masks
 
 _ZERO_SAMPLES = 30
+_SWITCH = sys.getswitchinterval()
 _PATIENCE = 60.0  # s that the object may take to come into sight
 
 
@@ -163,6 +164,7 @@ class Session:
         self.log.add(Kind.END, self.summary())
         self.log.close()
         gc.unfreeze()
+        sys.setswitchinterval(_SWITCH)
         with contextlib.suppress(OSError, AttributeError):
             os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
