@@ -216,8 +216,9 @@ def test_the_imu_thread_reads_a_port():
     tty.setraw(slave)
     part = imu.Imu(os.ttyname(slave), np.array([1.0, 0, 0]))  # The part's z points up, along the palm's x.
     with pytest.raises(HandError, match="UART-RVC"):
-        part.calibrate(IDENTITY, wait=0.05)
+        part.wait(0.05)
     os.write(master, imu.encode(0, quat_of(40, 0, 0)))
+    part.wait()
     part.calibrate(IDENTITY)
     assert apart(part.read()[1], IDENTITY) < 2e-3
     os.write(master, b"\x00\xaa" + imu.encode(1, quat_of(70, 0, 0)))
@@ -335,10 +336,9 @@ def test_a_stream_of_masks_from_another_program(tmp_path):
     thread = threading.Thread(target=serve)
     thread.start()
     sensor = HeightSensor(vision.open_masks(f"unix:{path}", config), config, reference, (True, False, False), 0.5)
-    sensor.wait(2.0)
     thread.join()
     until = time.monotonic() + 2
-    while sensor.read()[0] < 5.0 and time.monotonic() < until:
+    while (not sensor.seen or sensor.read()[0] < 5.0) and time.monotonic() < until:
         time.sleep(0.01)
     when, position, _ = sensor.read()
     assert when == 5.0 and position[0] == pytest.approx(0.055 + 0.04, abs=6e-4)
