@@ -13,6 +13,7 @@ program measures on the same device.
 
 import argparse
 import dataclasses
+import functools
 import json
 import statistics
 import time
@@ -85,6 +86,12 @@ def cases(names: list[str] | None) -> list[Case]:
     return [make(name) for name, make in makers.items() if names is None or any(part in name for part in names)]
 
 
+@functools.lru_cache(maxsize=1)
+def box_grasps(num_envs: int):
+    """Fingertips that press a box; every case of one size sees the same."""
+    return accuracy.random_grasps(accuracy.turned_solid("box"), num_envs)
+
+
 def reader(case: Case, hand, kinematics: bool):
     """`read(thing, pose or joints, shift [3], index)` of one environment: taxel forces, finger forces, centres."""
     total = jnp.ones(5)
@@ -108,8 +115,7 @@ def reader(case: Case, hand, kinematics: bool):
 
 def measure(case: Case, num_envs: int, loops: int, repeats: int, hand, machine: dict, kinematics: bool) -> dict:
     """Time, counts and the machine's floor of one case."""
-    shape = accuracy.turned_solid("box")
-    pose = accuracy.random_grasps(shape, num_envs)
+    pose = box_grasps(num_envs)
     if kinematics:
         pose = jax.random.uniform(jax.random.key(0), (num_envs, hand.num_joints), minval=0.2, maxval=1.0)
     # With a model the fingers are where the joints put them: the object waits before the palm.

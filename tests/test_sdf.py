@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
 from dexsim import sdf
+from dexsim.errors import ConfigError
 
 EYE = np.eye(3, dtype=np.float32)
 SIZES = {"sphere": (0.031, 0, 0), "box": (0.02, 0.035, 0.012), "capsule": (0.013, 0.022, 0),
@@ -307,6 +308,18 @@ def test_union_inside_is_never_deeper_than_the_nearest_surface_allows():
     probe = np.random.default_rng(5).uniform(-0.02, 0.02, (200, 3))
     each = np.stack([reference(kind, size[k], (probe - position[k]) @ rotation[k]) for k, kind in enumerate(kinds)])
     np.testing.assert_allclose(distance(probe.astype(np.float32), shape), each.min(0), atol=3e-6)
+
+
+def test_bounds_touch_the_surface_on_every_side():
+    kinds, size, position, rotation, shape = posed_union(7)
+    skin = np.concatenate([surface_samples(kind, size[k]) @ rotation[k].T + position[k] for k, kind in enumerate(kinds)])
+    np.testing.assert_allclose(sdf.bounds(shape), [skin.min(0), skin.max(0)], atol=2e-4)
+    assert np.all(sdf.bounds(shape)[0] <= skin.min(0) + 1e-7) and np.all(sdf.bounds(shape)[1] >= skin.max(0) - 1e-7)
+    only = dataclasses.replace(shape, active=jnp.array([False, False, True, False]))
+    ellipsoid = surface_samples("ellipsoid", size[2]) @ rotation[2].T + position[2]
+    np.testing.assert_allclose(sdf.bounds(only), [ellipsoid.min(0), ellipsoid.max(0)], atol=2e-4)
+    with pytest.raises(ConfigError, match="no active primitive"):
+        sdf.bounds(dataclasses.replace(shape, active=jnp.zeros(4, bool)))
 
 
 def test_inactive_primitives_do_not_count():
