@@ -312,7 +312,8 @@ def test_union_inside_is_never_deeper_than_the_nearest_surface_allows():
 
 def test_bounds_touch_the_surface_on_every_side():
     kinds, size, position, rotation, shape = posed_union(7)
-    skin = np.concatenate([surface_samples(kind, size[k]) @ rotation[k].T + position[k] for k, kind in enumerate(kinds)])
+    skin = [surface_samples(kind, size[k]) @ rotation[k].T + position[k] for k, kind in enumerate(kinds)]
+    skin = np.concatenate(skin)
     np.testing.assert_allclose(sdf.bounds(shape), [skin.min(0), skin.max(0)], atol=2e-4)
     assert np.all(sdf.bounds(shape)[0] <= skin.min(0) + 1e-7) and np.all(sdf.bounds(shape)[1] >= skin.max(0) - 1e-7)
     only = dataclasses.replace(shape, active=jnp.array([False, False, True, False]))
