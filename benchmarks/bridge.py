@@ -131,7 +131,8 @@ def measure_compute(policy: str, ticks: int) -> dict:
         whole.append(middle - start)
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     return {name: {f"p{q}_ms": round(1e3 * float(np.percentile(times, q)), 4) for q in (50, 99)}
-            for name, times in (("observe_and_policy", both), ("whole_tick", whole))} | {"ticks": ticks, "realtime": realtime}
+            for name, times in (("observe_and_policy", both), ("whole_tick", whole))} | {
+                "ticks": ticks, "realtime": realtime}
 
 
 def main() -> None:
