@@ -195,6 +195,19 @@ class TestDrop:
             assert bool(task.dropped(begun, here)) == lost
         assert not bool(task.dropped(begun, moment(task, object_quat=turned(170))))
 
+    def test_patience_ends_training_episodes_only(self, hand):
+        task = Rotate(RotateConfig(patience=5 * PERIOD), hand)
+        _, waiting = task.evaluation_plan(1, np.zeros(4, int))
+        for goal, gives_up in ((task.begin(jax.random.key(0), None), True),
+                               (jax.tree.map(lambda x: x[0], waiting), False)):
+            lost = []
+            for tick in range(9):
+                here = moment(task, object_quat=turned(90 if tick == 2 else 30))
+                goal = task.update(jax.random.key(0), goal, here)
+                lost.append(bool(task.dropped(goal, here)))
+            # The goal of tick 2 starts the clock anew; the sixth tick after it is one too many.
+            assert lost == [False] * 8 + [gives_up]
+
     def test_beyond_7_cm(self, task, begun):
         for distance, lost in ((0.069, False), (0.071, True)):
             place = np.asarray(task.reference) + [0, 0, distance]

@@ -104,6 +104,9 @@ class RotateConfig(EnvConfig):
     drop_tilt: float = setting(1.0, unit="rad", low=0.1, high=3.2)
     """... or when it has tipped over: its own axis is farther than this from the axis of rotation,
     and no goal can be reached any more."""
+    patience: float = setting(8.0, unit="s", low=0.1, high=1e6)
+    """A training episode without a new goal for this long is given up, as a drop is: else policies
+    learn to turn once and then hold still. Evaluations wait for ever."""
     clearance: float = setting(0.001, unit="m", low=0.0, high=0.05)
     """Smallest gap between palm and object with support "fingers"."""
     episode_seconds: float = setting(60.0, unit="s", low=0.2, high=3600.0)
@@ -124,7 +127,7 @@ class RotateConfig(EnvConfig):
     """Added to all joints of the four fingers alike."""
     squeeze: tuple[float, float] = setting((0.0, 0.0), unit="rad", low=-1.0, high=1.0)
     """How far the joint targets of thumb and fingers lie beyond that posture: the grip."""
-    heading_noise: float = setting(0.3, unit="rad", low=0.0, high=math.pi)
+    heading_noise: float = setting(0.7, unit="rad", low=0.0, high=math.pi)
     """Largest turn of the object about the axis at the start."""
     place_noise: float = setting(0.006, unit="m", low=0.0, high=0.05)
     """Largest shift of the object along the palm at the start."""
@@ -145,7 +148,7 @@ class RotateConfig(EnvConfig):
 def paper() -> RotateConfig:
     """The paper's own weights and success test."""
     return RotateConfig(
-        goal_spin=0.0, drop_distance=0.09, drop_tilt=math.pi, control=Control(step=0.3, recall="target"),
+        goal_spin=0.0, drop_distance=0.09, drop_tilt=math.pi, patience=1e6, control=Control(step=0.3, recall="target"),
         reward=RotateReward(action=-0.0002, velocity=0.0, torque=0.0, spin=0.0, fingertips=0.0,
                             drop=0.0))
 
@@ -174,6 +177,7 @@ class Goal:
     dwell: jax.Array  # [] s inside the window
     clock: jax.Array  # [] s
     last_success: jax.Array  # [] s, clock at the last goal
+    patience: jax.Array  # [] s without a goal after which the episode is given up
     duty: jax.Array  # [F] share of time touching, lately
     since_touch: jax.Array  # [] s since any fingertip touched
     totals: dict[str, jax.Array]  # sums over ticks
@@ -244,7 +248,8 @@ class Rotate:
         zero, none = jnp.zeros(()), jnp.zeros((), jnp.int32)
         fingers = jnp.zeros(self.hand.num_fingers)
         return Goal(turns=none, entered=jnp.zeros((), bool), entries=none, dwell=zero, clock=zero,
-                    last_success=zero, duty=fingers, since_touch=jnp.full((), 10.0),
+                    last_success=zero, patience=jnp.asarray(self.config.patience), duty=fingers,
+                    since_touch=jnp.full((), 10.0),
                     totals={"spin": zero, "joint_speed": zero, "action_rate": zero,
                             "tilt": zero, "touch": fingers})
 
@@ -274,7 +279,7 @@ class Rotate:
             turns=goal.turns + now.success, entered=now.entered & ~now.success,
             entries=goal.entries + (now.entered & ~goal.entered),
             dwell=jnp.where(now.success, 0.0, now.dwell), clock=clock,
-            last_success=jnp.where(now.success, clock, goal.last_success),
+            last_success=jnp.where(now.success, clock, goal.last_success), patience=goal.patience,
             duty=goal.duty + period / _MEMORY * (touching - goal.duty),
             since_touch=jnp.where(jnp.any(touching > 0), 0.0, goal.since_touch + period),
             totals={name: goal.totals[name] + change[name] for name in goal.totals})
@@ -298,13 +303,12 @@ class Rotate:
         return jnp.where(hit, target.mass * speed / self._period, 0.0) * direction
 
     def dropped(self, goal: Goal, moment: Moment) -> jax.Array:
-        del goal
         away = jnp.linalg.norm(moment.object_position - jnp.asarray(self.reference))
         lost = (away > self.config.drop_distance) | (self._tilt(moment) > self.config.drop_tilt)
         if self.config.support == "fingers":
             low = lowest_point(moment.target, moment.object_quat, moment.object_position)
             lost |= low < self._palm + self.config.clearance
-        return lost
+        return lost | (goal.clock - goal.last_success > goal.patience)
 
     def reward(self, goal: Goal, moment: Moment,
                dropped: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
@@ -353,9 +357,12 @@ class Rotate:
 
     # --- evaluation ------------------------------------------------------------------------
 
-    def evaluation_plan(self, count: int, shape_index: np.ndarray) -> tuple[np.ndarray, None]:
-        """Rows [count] of the pool, evenly spread over it."""
-        return np.linspace(0, len(shape_index) - 1, count).round().astype(int), None
+    def evaluation_plan(self, count: int, shape_index: np.ndarray) -> tuple[np.ndarray, Goal]:
+        """Rows [count] of the pool, evenly spread over it; goals that wait for ever."""
+        goal = dataclasses.replace(self.begin(jax.random.key(0), None),
+                                   patience=jnp.asarray(jnp.inf))
+        goals = jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), goal)
+        return np.linspace(0, len(shape_index) - 1, count).round().astype(int), goals
 
     def summarize(self, metrics: dict[str, np.ndarray], lived: np.ndarray,
                   control_period: float) -> dict:
