@@ -52,16 +52,18 @@ class ObjectConfig:
     """Largest offset of the centre of mass, per axis."""
     friction: tuple[float, float] = setting((0.6, 1.2), unit="1", low=0.01, high=5.0)
     """Sliding friction between hand and object."""
-    contact_time: tuple[float, float] = setting((0.01, 0.02), unit="s", low=0.01, high=0.5)
-    """Time constant of the contact spring at critical damping: its softness."""
-    restitution: tuple[float, float] = setting((0.0, 0.2), unit="1", low=0.0, high=0.9)
-    """Coefficient of restitution of the contact spring: its damping."""
+    stiffness: tuple[float, float] = setting((1600.0, 1800.0), unit="N/m", low=10.0, high=1e6)
+    """Force over depth at rest of a fingertip's contact (`contact.BARE_SHARE` times that elsewhere).
+    It belongs to the skin: wide ranges part the solver's forces from what the taxels feel."""
+    restitution: tuple[float, float] = setting((0.03, 0.08), unit="1", low=0.0, high=0.9)
+    """Coefficient of restitution: the damping of the contact, which also slows creep. What lies
+    below 0.024 bounces as 0.024."""
 
     def __post_init__(self):
         validate(self)
         check_ranges(self, "sphere_radius", "box_half", "cylinder_radius", "cylinder_half",
                      "neck_radius", "neck_half", "mass", "inertia_scale", "friction",
-                     "contact_time", "restitution")
+                     "stiffness", "restitution")
         if not self.shapes:
             raise ConfigError("ObjectConfig.shapes is empty: name at least one shape")
 
@@ -106,7 +108,7 @@ class ObjectParams:
     inertia: jax.Array  # [3] kg m^2 about the centre of mass, along the object's axes
     com: jax.Array  # [3] m
     friction: jax.Array  # [] sliding
-    contact: jax.Array  # [2] time constant s, damping ratio of the contact spring
+    contact: jax.Array  # [2] stiffness N/m and damping ratio of a contact
     quat: jax.Array | None = None  # [K, 4] slot orientations in the object's frame; None: aligned
     kinds: tuple[str, ...] = static(default=SLOTS)
 
@@ -132,23 +134,38 @@ def sample_object(key: jax.Array, config: ObjectConfig,
     mass = _uniform(keys[2], config.mass)
     scale = _uniform(keys[3], config.inertia_scale) * mass / density_mass
     com = config.com_offset * jax.random.uniform(keys[4], (3,), minval=-1.0)
-    # MuJoCo's stiffness falls with (time constant * damping ratio)^2: divide, so that the bounce
-    # changes the damping alone.
-    ratio = damping_ratio(_uniform(keys[7], config.restitution))
-    contact = jnp.stack([_uniform(keys[6], config.contact_time) / ratio, ratio])
+    contact = jnp.stack([_uniform(keys[6], config.stiffness),
+                         damping_ratio(_uniform(keys[7], config.restitution))])
     return ObjectParams(shape_index.astype(jnp.int32), size, position, active, mass,
                         inertia * scale, com, _uniform(keys[5], config.friction), contact)
 
 
-def damping_ratio(restitution: jax.Array) -> jax.Array:
-    """Damping ratio of a linear spring-damper that bounces with this restitution.
+def restitution(ratio: np.ndarray) -> np.ndarray:
+    """Coefficient of restitution of a spring-damper that pushes but does not pull.
 
-    From e = exp(-pi z / sqrt(1 - z^2)); MuJoCo has no restitution parameter. A restitution
-    of 0 is critical damping.
+    e = exp(-2 z / sqrt(1 - z^2) atan(sqrt(1 - z^2) / z)), with the hyperbolic functions above 1:
+    contact ends when the force does, before the spring is back at its length (Schwager and
+    Poeschel, Granular Matter 9 (2007) 465).
     """
-    log = jnp.log(jnp.maximum(restitution, 1e-6))
-    ratio = -log / jnp.sqrt(jnp.pi**2 + log**2)
-    return jnp.where(restitution < 1e-3, 1.0, ratio)
+    ratio = np.asarray(ratio, float)
+    root = np.maximum(np.sqrt(np.abs(1 - ratio**2)), 1e-6)
+    angle = np.where(ratio < 1, np.arctan2(root, ratio),
+                     np.arctanh(np.minimum(root / np.maximum(ratio, 1.0), 1 - 1e-12)))
+    return np.exp(-2 * ratio / root * angle)
+
+
+# Closer together at the low end, where the restitution falls fast.
+_RATIOS = 3.0 * np.linspace(0.0, 1.0, 200) ** 2
+_RESTITUTIONS = restitution(_RATIOS)
+
+
+def damping_ratio(restitution: jax.Array) -> jax.Array:
+    """Damping ratio [...] of a contact that bounces with this restitution [...], at most 3.
+
+    MuJoCo has no restitution parameter; its contacts push but do not pull.
+    """
+    return jnp.interp(restitution, jnp.asarray(_RESTITUTIONS[::-1], jnp.float32),
+                      jnp.asarray(_RATIOS[::-1], jnp.float32))
 
 
 def _uniform(key: jax.Array, span: tuple[float, float], shape=()) -> jax.Array:

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from dexsim import contact
 from dexsim.config import setting, validate
 from dexsim.errors import AssetError, ConfigError
 from dexsim.hand import Hand
@@ -48,6 +49,11 @@ class PhysicsConfig:
     """Line-search iterations in each of them."""
     condim: int = setting(3, unit="1", low=1, high=6)
     """Contact dimension between hand and object: 3 sliding, 4 with torsion, 6 with rolling."""
+    cover: float = setting(0.003, unit="m", low=0.0, high=0.01)
+    """Rubber over the fingertips: their geoms, which follow the taxels, touch this far out. Keep it
+    equal to `Skin.margin`, so that solver and taxels begin to feel at the same distance."""
+    settling: float = setting(0.03, unit="s", low=0.005, high=0.2)
+    """Time scale on which a contact pushes out what lies in it (at least four time steps)."""
     palm: str = setting("face", choices=("face", "box"))
     """Palm as a half-space at its face (exact and cheap for every primitive) or as its box."""
     max_contacts: int = setting(16, unit="1", low=4, high=400)
@@ -62,6 +68,11 @@ class PhysicsConfig:
     def control_period(self) -> float:
         """One control tick, s."""
         return self.timestep * self.substeps
+
+    @property
+    def contact_period(self) -> float:
+        """`settling`, s, as far as the time step allows."""
+        return max(self.settling, 4 * self.timestep)
 
 
 @pytree_dataclass
@@ -123,6 +134,7 @@ class Physics:
         except NotImplementedError as error:
             raise AssetError(f"{hand.model_path}: backend {self.backend}: {error}") from None
         self._find_addresses()
+        self._find_pairs()
 
     def _find_addresses(self) -> None:
         model, hand = self.mj_model, self.hand
@@ -135,21 +147,26 @@ class Physics:
         self.object_body = model.body("object").id
         self.object_geoms = np.array([model.geom(f"object_{k}").id
                                       for k in range(len(self.slots))])
-        is_object = np.isin(model.pair_geom1, self.object_geoms)
-        is_object |= np.isin(model.pair_geom2, self.object_geoms)
-        self.object_pairs = np.flatnonzero(is_object)
         # finger_of_geom[g]: whose tip link a geom belongs to, -1 for none.
-        tips = {model.body(hand.body_names[b]).id: f for f, b in enumerate(hand.tip_body)}
+        tips = {int(body): f for f, body in enumerate(_tips(model, hand))}
         self._finger_of_geom = np.array([tips.get(int(b), -1) for b in model.geom_bodyid])
         self._is_object_geom = np.isin(np.arange(model.ngeom), self.object_geoms)
+
+    def _find_pairs(self) -> None:
+        self.object_pairs = contact.pairs_with(self.mj_model, self.object_geoms)
+        self._compliance, self._share = contact.pair_constants(
+            self.mj_model, self.object_pairs, self.object_geoms, _tips(self.mj_model, self.hand))
 
     def configure(self, target: ObjectParams) -> Any:
         """The MJX model with one environment's object and contact parameters put in."""
         model, geoms, body = self._model, self.object_geoms, self.object_body
         pair = self.object_pairs
         slide = jnp.broadcast_to(target.friction, (len(pair), 2))
-        # body_invweight0 keeps its template value on purpose: it sets the contact's stiffness,
-        # which belongs to the skin and must not change with the mass of what is touched.
+        # body_invweight0 keeps its template value on purpose: the contact's parameters are worked
+        # out from it, and stiffness must not change with the mass of what is touched.
+        solref, solimp = contact.spring(
+            self._compliance, self._share * target.contact[0], target.contact[1], target.friction,
+            period=self.config.contact_period, condim=self.config.condim)
         return model.replace(
             geom_size=model.geom_size.at[geoms].set(target.size),
             geom_rbound=model.geom_rbound.at[geoms].set(
@@ -161,7 +178,8 @@ class Physics:
             body_inertia=model.body_inertia.at[body].set(target.inertia),
             body_ipos=model.body_ipos.at[body].set(target.com),
             pair_friction=model.pair_friction.at[pair, :2].set(slide),
-            pair_solref=model.pair_solref.at[pair].set(target.contact),
+            pair_solref=model.pair_solref.at[pair].set(solref),
+            pair_solimp=model.pair_solimp.at[pair].set(solimp),
         )
 
     def advance(self, target: ObjectParams, state: PhysicsState,
@@ -219,8 +237,8 @@ class Physics:
 
     def _force_from_contacts(self, data: Any) -> jax.Array:
         """Sum the solver's forces per finger; the JAX backend has no body-matching sensor."""
-        contact = data._impl.contact
-        dim, address = np.asarray(contact.dim), np.asarray(contact.efc_address)
+        touch = data._impl.contact
+        dim, address = np.asarray(touch.dim), np.asarray(touch.efc_address)
         use = np.flatnonzero((dim == self.config.condim) & (address >= 0))
         width = 1 if self.config.condim == 1 else 2 * (self.config.condim - 1)
         edges = data._impl.efc_force[address[use][:, None] + np.arange(width)]
@@ -229,13 +247,13 @@ class Physics:
         if self.config.condim >= 3:  # pyramidal cone: opposite edges, see mju_decodePyramid
             for axis in (0, 1):
                 pair = edges[:, 2 * axis] - edges[:, 2 * axis + 1]
-                local[axis + 1] = pair * contact.friction[use, axis]
-        frame = contact.frame[use]  # rows are the axes; the normal points from geom1 to geom2
+                local[axis + 1] = pair * touch.friction[use, axis]
+        frame = touch.frame[use]  # rows are the axes; the normal points from geom1 to geom2
         force = jnp.sum(frame * jnp.stack(local, -1)[..., None], 1)
-        touching = (contact.dist[use] < contact.includemargin[use])[:, None]
+        touching = (touch.dist[use] < touch.includemargin[use])[:, None]
         force = jnp.where(touching, force, 0.0)
-        finger = jnp.asarray(self._finger_of_geom)[contact.geom[use]]
-        is_object = jnp.asarray(self._is_object_geom)[contact.geom[use]]
+        finger = jnp.asarray(self._finger_of_geom)[touch.geom[use]]
+        is_object = jnp.asarray(self._is_object_geom)[touch.geom[use]]
         # MuJoCo's contact force acts on geom2; geom1 feels the opposite.
         on_second = is_object[:, 0] * jax.nn.one_hot(finger[:, 1], self.hand.num_fingers).T
         on_first = is_object[:, 1] * jax.nn.one_hot(finger[:, 0], self.hand.num_fingers).T
@@ -264,6 +282,7 @@ def build_model(hand: Hand, slots: tuple[str, ...], largest: np.ndarray, config:
     palm = spec.body(hand.palm)
     palm.pos, palm.quat = [0, 0, 0], [1, 0, 0, 0]
     touching = _touching_geoms(spec, hand, config)
+    contact.cover_tips(spec, hand, config.cover)
     for geom in spec.geoms:
         geom.contype = geom.conaffinity = 0
 
@@ -276,7 +295,7 @@ def build_model(hand: Hand, slots: tuple[str, ...], largest: np.ndarray, config:
                       conaffinity=0, mass=0, group=3, rgba=[0.85, 0.55, 0.25, 1])
         for name in touching:
             spec.add_pair(geomname1=name, geomname2=f"object_{k}", condim=config.condim,
-                          friction=[0.9, 0.9, 0.005, 1e-4, 1e-4], solref=[0.02, 1.0])
+                          friction=[0.9, 0.9, 0.005, 1e-4, 1e-4])
     if backend == "warp":
         for b in hand.tip_body:
             # data: bit 1 is the force; reduce: 3 is the net force, in the world frame.
@@ -285,7 +304,18 @@ def build_model(hand: Hand, slots: tuple[str, ...], largest: np.ndarray, config:
                             reftype=mujoco.mjtObj.mjOBJ_BODY, refname="object",
                             intprm=[2, 3, 1], dim=3)
     _set_options(spec, config, gravity)
-    return spec.compile()
+    model = spec.compile()
+    geoms = np.flatnonzero(model.geom_bodyid == model.body("object").id)
+    pairs = contact.pairs_with(model, geoms)
+    compliance, share = contact.pair_constants(model, pairs, geoms, _tips(model, hand))
+    model.pair_solref[pairs], model.pair_solimp[pairs] = contact.spring(
+        compliance, share * 1700.0, 2.0, 0.9, period=config.contact_period, condim=config.condim)
+    return model
+
+
+def _tips(model: mujoco.MjModel, hand: Hand) -> np.ndarray:
+    """Body ids [F] of the fingertips."""
+    return np.array([model.body(hand.body_names[b]).id for b in hand.tip_body])
 
 
 def _touching_geoms(spec: mujoco.MjSpec, hand: Hand, config: PhysicsConfig) -> list[str]:

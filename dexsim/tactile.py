@@ -29,16 +29,17 @@ TOTALS = ("solver", "skin")
 class Skin:
     """The rubber over the taxels (two-term Mooney-Rivlin) and what the taxels notice of it."""
 
-    c10: float = setting(0.03e6, unit="Pa", low=0.0, high=1e8)
-    """First Mooney-Rivlin coefficient; the skin's own value is not published."""
+    c10: float = setting(0.002e6, unit="Pa", low=0.0, high=1e8)
+    """First Mooney-Rivlin coefficient; the skin's own value is not published. This one makes the
+    law's sum about equal to the solver's force."""
     c01: float = setting(0.0, unit="Pa", low=-1e8, high=1e8)
     """Second Mooney-Rivlin coefficient. Negative values (fits to tension alone) are refused where
     they would make the skin soften before `max_compression`."""
-    thickness: float = setting(0.002, unit="m", low=1e-4, high=0.02)
+    thickness: float = setting(0.003, unit="m", low=1e-4, high=0.02)
     """Thickness of the compressed layer."""
-    margin: float = setting(0.001, unit="m", low=0.0, high=0.01)
-    """How far above the object's surface a taxel already feels it: the solver's contact is
-    stiffer than the skin, so without it the taxels round a contact would feel nothing."""
+    margin: float = setting(0.003, unit="m", low=0.0, high=0.01)
+    """How far above the object's surface a taxel already feels it: the rubber over the lattice, and
+    what the solver's geoms stand out by (`PhysicsConfig.cover`)."""
     max_compression: float = setting(0.7, unit="1", low=0.05, high=0.95)
     """Compression beyond which the stress no longer grows."""
     law: str = setting("mooney_rivlin", choices=LAWS)

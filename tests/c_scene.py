@@ -13,26 +13,35 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from dexsim import rotations, tactile
+from dexsim.hand import forward_kinematics, taxel_positions
 from dexsim.objects import SHAPES
 
 GRAVITY = (9.81, 0.0, 0.0)
 # Solved to the end, so that what differs between engines is arithmetic and contact geometry.
 CONVERGED = {"iterations": 50, "line_search": 50}
+COVER = 0.003  # m, rubber over the pads
 KINDS = ("box", "capsule", "cylinder")  # the order of `dexsim.objects.SLOTS`
 
 
 def compile_scene(hand, target, *, gravity=GRAVITY, timestep=0.005, iterations=5,
-                  line_search=8, condim=3, margin=0.0, exact=False) -> mujoco.MjModel:
+                  line_search=8, condim=3, margin=0.0, exact=False,
+                  settling=0.03) -> mujoco.MjModel:
     """One object (`ObjectParams` of NumPy leaves) under the hand.
 
-    `margin` m lists contacts that far apart, for clearances. `exact` takes C MuJoCo's native convex
-    collisions, whose one contact of a capsule on a cylinder is right; the older ones, which box on
-    box needs, give up to five at once, some of them millimetres too deep.
+    Fingertips wear 3 mm of rubber and press with `target.contact[0]` newtons a metre of depth, on
+    boxes with 0.7 of that, other links and the palm with 2.5 of it. `margin` m lists contacts that
+    far apart, for clearances, which are those of the bare pads. `exact` takes C MuJoCo's native
+    convex collisions, whose one contact of a capsule on a cylinder is right; the older ones, which
+    box on box needs, give up to five at once, some of them millimetres too deep.
     """
     spec = mujoco.MjSpec.from_file(str(hand.model_path))
     for actuator in list(spec.actuators):
         spec.delete(actuator)
     names = [g.name for g in spec.geoms if (g.contype or g.conaffinity) and g.name != "palm"]
+    for geom in spec.geoms:
+        if "_pad" in geom.name and not margin:
+            geom.size = [geom.size[0] + COVER, *geom.size[1:]]
     for geom in spec.geoms:
         geom.contype = geom.conaffinity = 0
     body = spec.worldbody.add_body(name="object", mass=float(target.mass), explicitinertial=True,
@@ -44,8 +53,7 @@ def compile_scene(hand, target, *, gravity=GRAVITY, timestep=0.005, iterations=5
                       contype=0, conaffinity=0, mass=0)
         for name in names:
             spec.add_pair(geomname1=name, geomname2=KINDS[k], condim=condim, margin=margin,
-                          friction=[*[target.friction] * 2, 0.005, 1e-4, 1e-4],
-                          solref=target.contact)
+                          friction=[*[target.friction] * 2, 0.005, 1e-4, 1e-4])
     option = spec.option
     option.timestep, option.gravity = timestep, gravity
     option.iterations, option.ls_iterations = iterations, line_search
@@ -57,7 +65,30 @@ def compile_scene(hand, target, *, gravity=GRAVITY, timestep=0.005, iterations=5
     model = spec.compile()
     # Contact softness is the skin's: that of a 0.1 kg object with 5e-5 kg m^2, whatever is held.
     model.body_invweight0[model.body("object").id] = 1 / 0.1, 1 / 5e-5
+    _set_springs(model, target, condim, settling)
     return model
+
+
+def _set_springs(model: mujoco.MjModel, target, condim: int, settling: float) -> None:
+    """The contact's stiffness in MuJoCo's terms: N = K r with aref = r / settling^2."""
+    stiffness, ratio = (float(x) for x in target.contact)
+    mu, edges = float(target.friction), 2 * (condim - 1)
+    for pair in range(model.npair):
+        first, second = model.pair_geom1[pair], model.pair_geom2[pair]
+        if model.geom(second).name not in KINDS:
+            continue
+        if "_pad" in model.geom(first).name:
+            wanted = stiffness * (0.7 if model.geom(second).name == "box" else 1.0)
+        else:
+            wanted = 2.5 * stiffness
+        weight = sum(model.body_invweight0[model.geom_bodyid[g], 0] for g in (first, second))
+        # mj_diagApprox and mj_makeImpedance: every edge of the pyramid has R = regular (1 - d) / d.
+        regular = 2 * mu**2 * (1 + mu**2) * weight if edges else weight
+        # At rest N = edges aref / R (one "edge" without friction).
+        resistance = max(edges, 1) / (settling**2 * wanted)
+        d = regular / (regular + resistance)
+        model.pair_solref[pair] = -d / settling**2, -2 * ratio * d / settling
+        model.pair_solimp[pair] = d, d, 0.001, 0.5, 2
 
 
 def start(model: mujoco.MjModel, qpos, qvel, warmstart=None) -> mujoco.MjData:
@@ -88,6 +119,20 @@ def finger_force(model: mujoco.MjModel, data: mujoco.MjData, hand) -> np.ndarray
     return total
 
 
+def skin_law(hand, skin):
+    """`law(qpos [n, J + 7], target)`: the fingers' forces [n, F] N by the skin's law alone."""
+    area = jnp.asarray(hand.taxel_area)
+
+    def law(qpos, target):
+        taxels = taxel_positions(hand, forward_kinematics(hand, qpos[:hand.num_joints]))
+        place = qpos[hand.num_joints:]
+        touch = tactile.feel(taxels, area, target.shape(), place[:3],
+                             rotations.quat_to_matrix(place[3:]), jnp.ones(hand.num_fingers), skin)
+        return jnp.sum(touch.skin_force, -1)
+
+    return jax.jit(jax.vmap(law))
+
+
 # --- worlds to compare in ---------------------------------------------------------------------
 
 def row(tree, index):
@@ -110,7 +155,7 @@ def squeeze(hand, begun, rng: np.random.Generator, steps=100):
 
     Returns (model, qpos, qvel, warm start, joint torque), the numbers in single precision.
     """
-    model = compile_scene(hand, begun.target, **CONVERGED)
+    model = compile_scene(hand, begun.target, exact=bool(begun.target.active[2]), **CONVERGED)
     data = start(model, begun.qpos, 0 * begun.qvel)
     wanted = begun.qpos[:12] + rng.uniform(0.3, 0.8, 12) * (np.arange(12) > 3)
     wanted[1:3] += rng.uniform(0.0, 0.5, 2)

@@ -370,7 +370,7 @@ def test_gradient_in_single_precision_points_the_same_way(hand, taxels):
     """What training differentiates: float32, a sphere; pushing it into the fingers presses harder."""
     def total(position):
         return jnp.sum(feel(taxels, hand.taxel_area, solid("sphere", 0.03), position, EYE, jnp.ones(5),
-                            Skin(margin=0.001)).skin_force)
+                            Skin(margin=0.001, thickness=0.002)).skin_force)
     start, step = jnp.array([0.075, -0.005, 0.13]), 1e-4
     exact = np.asarray(jax.grad(total)(start))
     numeric = np.array([(total(start + step * axis) - total(start - step * axis)) / (2 * step) for axis in EYE])

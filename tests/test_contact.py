@@ -1,0 +1,85 @@
+"""Contact parameters against what C MuJoCo makes of them: weight at rest, bounce, rubber."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from dexsim import contact
+from dexsim.objects import OFF, SLOTS, ObjectConfig, damping_ratio
+from dexsim.physics import PhysicsConfig, build_model
+
+BALL = """
+<mujoco>
+  <option timestep="{step}" iterations="50"/>
+  <worldbody>
+    <geom name="floor" type="plane" size="1 1 1" contype="0" conaffinity="0"/>
+    <body name="ball" pos="0 0 {height}">
+      <freejoint/>
+      <inertial pos="0 0 0" mass="{mass}" diaginertia="5e-5 5e-5 5e-5"/>
+      <geom name="ball" size="0.03" contype="0" conaffinity="0"/>
+    </body>
+  </worldbody>
+  <contact><pair geom1="floor" geom2="ball" condim="{condim}" friction="{mu} {mu} .005 .0001 .0001"/></contact>
+</mujoco>
+"""
+
+
+def ball(*, stiffness=2000.0, ratio=1.0, mu=0.9, condim=3, mass=0.1, step=0.002, height=0.03):
+    """A ball of 30 mm over a floor; its mass, as in the hand's scene, is not what the contact was set up for."""
+    model = mujoco.MjModel.from_xml_string(
+        BALL.format(step=step, height=height, mass=mass, condim=condim, mu=mu))
+    model.body_invweight0[1] = 10.0, 2e4
+    pairs = contact.pairs_with(model, np.array([model.geom("ball").id]))
+    compliance, share = contact.pair_constants(model, pairs, np.array([model.geom("ball").id]), [0, 1])
+    np.testing.assert_array_equal([*compliance, *share], [10.0, 1.0])
+    model.pair_solref[:], model.pair_solimp[:] = contact.spring(
+        compliance, np.array([stiffness]), ratio, mu, period=0.03, condim=condim)
+    return model, mujoco.MjData(model)
+
+
+@pytest.mark.parametrize("condim", [1, 3, 4, 6])
+@pytest.mark.parametrize("mu, stiffness", [(0.3, 500.0), (0.6, 2000.0), (1.2, 2000.0), (0.9, 20000.0)])
+def test_depth_at_rest_is_weight_over_stiffness(condim, mu, stiffness):
+    """Whatever the friction; MuJoCo's own parameters would give depths that differ by 7 and more."""
+    model, data = ball(mu=mu, stiffness=stiffness, condim=condim, mass=0.5)
+    mujoco.mj_step(model, data, 1500)
+    assert np.abs(data.qvel).max() < 1e-6
+    assert 0.03 - data.qpos[2] == pytest.approx(0.5 * 9.81 / stiffness, rel=1e-3)
+
+
+@pytest.mark.parametrize("mass", [0.05, 0.2])
+@pytest.mark.parametrize("restitution", [0.03, 0.1, 0.3, 0.6])
+def test_a_ball_bounces_as_configured(restitution, mass):
+    """Within a tenth: the contact's own inertia, 2 to 3 kg, stands for the ball's."""
+    model, data = ball(ratio=float(damping_ratio(restitution)), mass=mass, step=5e-4, height=0.0301)
+    model.opt.gravity[:] = 0
+    data.qvel[2] = -0.5
+    while data.qvel[2] <= 0 or data.ncon and data.contact[0].dist < 0:
+        mujoco.mj_step(model, data)
+    assert data.qvel[2] / 0.5 == pytest.approx(restitution, rel=0.1)
+
+
+def test_only_fingertips_wear_rubber(hand):
+    bare, clad = (build_model(hand, SLOTS, np.full((3, 3), OFF), PhysicsConfig(cover=cover),
+                              (9.81, 0, 0), "jax") for cover in (0.0, 0.003))
+    tips = {bare.body(hand.body_names[b]).id for b in hand.tip_body}
+    touching = np.isin(np.arange(bare.ngeom), [bare.pair_geom1, bare.pair_geom2])
+    grown = clad.geom_size - bare.geom_size
+    for geom in range(bare.ngeom):
+        on_tip = touching[geom] and bare.geom_bodyid[geom] in tips and "core" not in bare.geom(geom).name
+        np.testing.assert_allclose(grown[geom], [0.003 * on_tip, 0, 0], atol=1e-9)
+    assert np.sum(grown[:, 0] > 0) == 6  # two on the thumb
+
+
+def test_who_is_how_stiff(hand):
+    """Fingertips 1, on boxes 0.7; other links and the palm 2.5."""
+    model = build_model(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(), (9.81, 0, 0), "jax")
+    geoms = np.array([model.geom(f"object_{k}").id for k in range(3)])
+    pairs = contact.pairs_with(model, geoms)
+    tips = [model.body(hand.body_names[b]).id for b in hand.tip_body]
+    _, share = contact.pair_constants(model, pairs, geoms, tips)
+    for pair, found in zip(pairs, share, strict=True):
+        link, other = (model.geom(g[pair]).name for g in (model.pair_geom1, model.pair_geom2))
+        pad = {"object_0": 0.7}.get(other, 1.0)
+        assert found == (pad if "_pad" in link else 2.5), (link, other)
+    assert set(share) == {0.7, 1.0, 2.5}
