@@ -2,7 +2,7 @@
 # virtual environment, installs what it needs, and does its job.
 #
 #   make train ARGS="--steps 2e6"     options of `python -m dexsim_ppo.train`
-#   make test ARGS="-k touch"         options of pytest
+#   make test ARGS="-k touch"         options of pytest (which runs on two processes)
 #   make PYTHON=python3.12 test       another interpreter (for a new .venv)
 #   make EXTRAS=cuda,warp train       other extras than the ones chosen by the device found
 
@@ -32,7 +32,7 @@ train: $(INSTALLED)
 	$(PY) -m dexsim_ppo.train --task grasp $(ARGS)
 
 test: $(TESTABLE)
-	$(PY) -m pytest $(ARGS)
+	$(PY) -m pytest -n 2 --dist loadfile $(ARGS)
 
 lint: $(LINTABLE)
 	$(PY) -m ruff check $(ARGS)

@@ -148,15 +148,16 @@ class TestTick:
             new = old + config.control.step * np.clip(np.asarray(action[world]), -1, 1)
             new = np.clip(new, q - config.control.reach, q + config.control.reach)
             new = np.clip(new, hand.joint_lower, hand.joint_upper)
-            drive, latency = c_scene.row(state.draw.actuator, world), int(state.draw.latency[world])
+            drive, latency = c_scene.row(state.draw.actuator, world), np.asarray(state.draw.latency[world])
+            inertia_rate = model.dof_M0[:12] / model.opt.timestep
             tilt = np.asarray(state.draw.tilt[world])
             down = np.array([1.0, -np.tan(tilt[1]), np.tan(tilt[0])])
             force = target.mass * 9.81 * (down / np.linalg.norm(down) - [1.0, 0, 0])
             data.xfrc_applied[model.body("object").id, :3] = force + np.asarray(push[world])
             for substep in range(config.physics.substeps):
-                wanted = old if substep < latency else new
+                wanted = np.where(substep < latency, old, new)
                 torque = plain_drive(drive, wanted, data.qpos[:12], data.qvel[:12])
-                data.qfrc_applied[:12] = torque
+                data.qfrc_applied[:12] = torque - plain_friction(drive, torque, data.qvel[:12], inertia_rate)
                 mujoco.mj_step(model, data)
             felt = np.linalg.norm(c_scene.finger_force(model, data, hand), axis=-1)
             strong += np.sum(felt > 0.5)
@@ -201,16 +202,28 @@ class TestTick:
 
 
 def plain_drive(drive, wanted, position, velocity):
-    """The paper's four equations, joint by joint."""
+    """The paper's four equations and the ripple, joint by joint; the loop sees the encoder."""
     torque = np.zeros(12)
     for j in range(12):
-        error = wanted[j] - position[j]
+        error = wanted[j] - (position[j] + drive.encoder_bias[j])
         if abs(error) < drive.dead_band[j]:
             continue
         limit = drive.stall_torque[j] * max(1 - abs(velocity[j]) / drive.no_load_speed[j], 0)
         command = drive.stiffness[j] * error - drive.damping[j] * velocity[j]
         torque[j] = drive.efficiency[j] * min(max(command, -limit), limit)
+        torque[j] *= 1 + drive.ripple[j] * np.sin(drive.ripple_count[j] * position[j] + drive.ripple_phase[j])
     return torque
+
+
+def plain_friction(drive, torque, velocity, inertia_rate):
+    """What stops the joint within the sub-step, but no more than the friction; then b times the new speed."""
+    lost = np.zeros(12)
+    for j in range(12):
+        momentum = inertia_rate[j] * velocity[j] + torque[j]
+        coulomb = min(abs(momentum), drive.coulomb_friction[j]) * np.sign(momentum)
+        speed = (momentum - coulomb) / (inertia_rate[j] + drive.viscous_friction[j])
+        lost[j] = coulomb + drive.viscous_friction[j] * speed
+    return lost
 
 
 class TestEpisodes:

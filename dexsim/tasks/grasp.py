@@ -69,7 +69,7 @@ class GraspConfig(EnvConfig):
     """Time limit of a training episode."""
     evaluation_seconds: float = setting(8.0, unit="s", low=0.2, high=3600.0)
     """Length of an evaluation episode: an object must be held this long."""
-    finger_force: tuple[float, float] = setting((1.5, 6.5), unit="N", low=0.05, high=40.0)
+    finger_force: tuple[float, float] = setting((2.0, 7.0), unit="N", low=0.05, high=40.0)
     """Target force of a touching finger at command 0 and 1."""
     max_force: float = setting(10.0, unit="N", low=0.5, high=200.0)
     """Calibrated maximum that forces are normalised by."""
