@@ -34,7 +34,7 @@ PRESETS = {
     # One large GPU: enough environments to fill it, few large minibatches.
     "gpu": Preset(
         ppo=PPOConfig(num_envs=16384, rollout_length=16, epochs=4, minibatches=8, kl_target=0.015,
-                      entropy_coefficient=0.003,
+                      entropy_coefficient=0.004,
                       actor_layers=(256, 256, 128), critic_layers=(256, 256, 128)),
         steps=0, minutes=8.0, evaluate_every=100, evaluation_chunk=1024, evaluation_episodes=1024,
         log_every=10),
@@ -50,5 +50,5 @@ def find_preset(name: str, task: str) -> Preset:
     # less noise than a grip that has to try out forces.
     if preset is PRESETS["cpu"]:
         return replace(preset, evaluation_chunk=16, evaluation_episodes=16)
-    return replace(preset, ppo=replace(preset.ppo, entropy_coefficient=0.001), minutes=7.0,
+    return replace(preset, ppo=replace(preset.ppo, entropy_coefficient=0.002), minutes=7.0,
                    evaluate_every=0)

@@ -9,7 +9,7 @@ from typing import Any
 from dexsim.errors import CheckpointError
 from dexsim_ppo.cli import plain
 
-CURVES = ("episode/return", "episode/success", "reward")
+CURVES = ("episode/return", "episode/success", "episode/goals_per_minute", "reward")
 
 
 class RunFolder:
