@@ -97,8 +97,8 @@ class TestSummary:
     @pytest.fixture(autouse=True)
     def few_draws(self, monkeypatch):
         """The intervals are tested above; here they only cost time."""
-        bootstrap = report._bootstrap
-        monkeypatch.setattr(report, "_bootstrap", lambda statistic, count, samples:
+        bootstrap = report.bootstrap
+        monkeypatch.setattr(report, "bootstrap", lambda statistic, count, samples:
                             bootstrap(statistic, count, min(samples, 10)))
 
     def test_a_perfect_follower(self):

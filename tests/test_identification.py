@@ -136,22 +136,24 @@ def recovered(seed):
     found = identify(log_of(truth, seed, latency=latency), GUESS)
     assert not found.unidentifiable
     inside = {n: found.intervals[n][0] <= truth[n] <= found.intervals[n][1] for n in found.fitted}
-    for name in found.fitted:  # intervals that say something
-        assert np.ptp(found.intervals[name]) < 0.5 * truth[name] + 2e-3, name
-    return inside | {"latency": found.latency == latency}
+    wide = {name for name in found.fitted  # intervals that say nothing
+            if np.ptp(found.intervals[name]) >= 0.5 * truth[name] + 2e-3}
+    return inside | {"latency": found.latency == latency}, wide
 
 
 def test_parameters_come_back():
     """One trial like those of `test_parameters_come_back_in_90_of_100`."""
-    inside = recovered(0)
+    inside, wide = recovered(0)
     assert inside["latency"] and sum(inside.values()) >= 6, inside  # of 7
+    assert not wide
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_parameters_come_back_in_90_of_100():
-    inside = [recovered(seed) for seed in range(100, 200)]
-    for name in inside[0]:
-        assert sum(trial[name] for trial in inside) >= 90, name
+    trials = [recovered(seed) for seed in range(100, 200)]
+    for name in trials[0][0]:
+        assert sum(inside[name] for inside, _ in trials) >= 90, name
+    assert sum(bool(wide) for _, wide in trials) <= 5
 
 
 def test_holdout_and_report():

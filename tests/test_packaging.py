@@ -64,7 +64,7 @@ def test_asset_path():
 def test_core_dependencies_are_only_the_listed_ones():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     names = {re.match(r"[\w-]+", requirement).group() for requirement in project["dependencies"]}
-    assert names == {"jax", "mujoco", "mujoco-mjx", "numpy", "trimesh", "msgpack", "tyro", "rich",
+    assert names == {"jax", "mujoco", "mujoco-mjx", "numpy", "scipy", "trimesh", "msgpack", "tyro", "rich",
                      "matplotlib", "pillow"}
     assert {"warp", "cuda", "real", "brax", "video"} <= set(project["optional-dependencies"])
 

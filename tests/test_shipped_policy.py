@@ -1,33 +1,53 @@
-"""The policy in assets/policies: loads without a simulator, fits today's task, and acts."""
+"""The policies in assets/policies: load without a simulator, fit today's tasks, and act."""
 
 import json
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from dexsim.assets import asset_path
 from dexsim.config import from_dict
-from dexsim.observation import GRASP, layout
-from dexsim.tasks.grasp import GraspConfig
+from dexsim.observation import GRASP, ROTATE, layout
+from dexsim.tasks import TASKS
 from dexsim_ppo.policy import Policy, layout_to_list
 
+SHIPPED = {"grasp": (GRASP, 66), "rotate": (ROTATE, 65)}
 
-def test_it_fits_the_task_and_the_hand(hand):
-    policy = Policy.load(asset_path("policies/grasp.msgpack"))
-    config = from_dict(GraspConfig, policy.env_config)
-    fields = layout(hand, GRASP, config.observation)
+
+def load(name):
+    return Policy.load(asset_path(f"policies/{name}.msgpack"))
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_it_fits_the_task_and_the_hand(hand, name):
+    policy, (names, size) = load(name), SHIPPED[name]
+    config = from_dict(TASKS[policy.task].config_class, policy.env_config)
+    fields = layout(hand, names, config.observation)
     assert layout_to_list(policy.observation_layout) == layout_to_list(fields)
-    size = sum(field.size for field in fields)
-    assert size == 66
-    low = np.asarray(policy(jnp.zeros(size)))
-    high = np.asarray(policy(jnp.zeros(size).at[-1].set(1.0)))
-    assert low.shape == (hand.num_joints,) and np.all(np.abs(low) <= 1.0)
-    assert np.max(np.abs(high - low)) > 1e-3  # the command is heard
+    assert sum(field.size for field in fields) == size
+    action = np.asarray(policy(jnp.zeros(size)))
+    assert action.shape == (hand.num_joints,) and np.all(np.abs(action) <= 1.0)
+    assert policy.control_rate == pytest.approx(1 / config.physics.control_period)
 
 
-def test_its_report_is_of_this_file_and_says_how_it_came_about():
-    report = json.loads(asset_path("policies/grasp.json").read_text())
-    policy = Policy.load(asset_path("policies/grasp.msgpack"))
+def test_the_command_is_heard():
+    low, high = (np.asarray(load("grasp")(jnp.zeros(66).at[-1].set(c))) for c in (0.0, 1.0))
+    assert np.max(np.abs(high - low)) > 1e-3
+
+
+def test_the_goal_is_seen():
+    fields = [field.name for field in load("rotate").observation_layout]
+    assert fields[1] == "relative_orientation"
+    near, far = (np.asarray(load("rotate")(jnp.zeros(65).at[12:18].set(jnp.array(sixd))))
+                 for sixd in ([1.0, 0, 0, 0, 1, 0], [1.0, 0, 0, 0, 0, 1]))
+    assert np.max(np.abs(near - far)) > 1e-3
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_its_report_is_of_this_file_and_says_how_it_came_about(name):
+    report = json.loads(asset_path(f"policies/{name}.json").read_text())
+    policy = load(name)
     assert report["origin"]["env_steps"] == policy.training["env_steps"]
     assert report["origin"]["seed"] == policy.training["seed"]
     for key in ("command", "hardware", "versions", "trained", "untrained"):

@@ -57,7 +57,7 @@ def summarize(metrics: dict[str, np.ndarray], alive: np.ndarray, control_period:
             "pearson_r": pearson(command[good], force[good]),
             "pearson_r_total": pearson(command[good], total[good]),
             "pearson_r_taxels": pearson(command[good], sensed[good]),
-            "rmse_n": _rmse(force[good], wanted[good])})
+            "rmse_n": rmse(force[good], wanted[good])})
 
     means = [row["total_force_n"]["mean"] for row in by_command]
     finger_means = [row["finger_force_n"]["mean"] for row in by_command]
@@ -69,7 +69,7 @@ def summarize(metrics: dict[str, np.ndarray], alive: np.ndarray, control_period:
         "held": proportion(held), "hold_time_s": mean(alive.sum(0) * control_period),
         "return": mean(returns), "pearson_r": pearson(command[held], force[held]),
         "pearson_r_total": pearson(command[held], total[held]),
-        "rmse_n": _rmse(force[held], wanted[held]),
+        "rmse_n": rmse(force[held], wanted[held]),
         "force_range": ratio, "total_force_monotone": monotone,
         "finger_force_by_command_n": finger_means, "total_force_by_command_n": means,
         "skin_correlation": _optional_pearson(metrics, alive),
@@ -95,7 +95,7 @@ def _optional_pearson(metrics: dict[str, np.ndarray], alive: np.ndarray) -> dict
     return pearson(metrics["skin_force"][keep], metrics["total_force"][keep], samples=0)
 
 
-def _rmse(values: np.ndarray, wanted: np.ndarray) -> dict:
+def rmse(values: np.ndarray, wanted: np.ndarray) -> dict:
     """Root mean square error with a bootstrap 95 % interval."""
     return statistic((values - wanted) ** 2, lambda square: np.sqrt(square.mean()), "mean")
 

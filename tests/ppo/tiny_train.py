@@ -7,7 +7,7 @@ from tiny_env import TinyConfig, TinyEnv
 import dexsim
 import dexsim.tasks
 
-ENTRY = types.SimpleNamespace(config_class=TinyConfig, env_class=TinyEnv)
+ENTRY = types.SimpleNamespace(config_class=TinyConfig, config=TinyConfig, env_class=TinyEnv)
 
 
 def make(task, config=None, *, backend="auto", num_envs=1):
