@@ -148,6 +148,7 @@ def test_parameters_come_back():
     assert not wide
 
 
+@pytest.mark.slow
 @pytest.mark.long
 def test_parameters_come_back_in_90_of_100():
     trials = [recovered(seed) for seed in range(100, 200)]
