@@ -143,7 +143,7 @@ def _make(key: jax.Array, hand: Hand, config: Any,
           gravity: tuple[float, float, float]) -> list[np.ndarray]:
     """Settle candidates until the pool is full: qpos, qvel, joint targets, object leaves."""
     draw = jax.jit(jax.vmap(lambda k: _candidate(k, hand, config)))
-    chunk, threads = 512, os.cpu_count() or 1
+    chunk, threads = 512, min(os.cpu_count() or 1, 16)
     kept, found, tried = [], 0, 0
     with ThreadPoolExecutor(threads) as pool:
         models = [_model(hand, config, gravity) for _ in range(threads)]
