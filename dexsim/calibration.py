@@ -13,8 +13,6 @@ Shapes: J joints, F fingers, N taxels a finger; a leading 2 is (loading, unloadi
 """
 
 import math
-import os
-import tempfile
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -24,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dexsim.errors import CalibrationError
+from dexsim.files import write_whole
 from dexsim.hand import Hand
 from dexsim.pytree import pytree_dataclass, static
 
@@ -161,7 +160,10 @@ def save_calibration(path: str | Path, calibration: Calibration) -> None:
             lines += [f"{field} = {_number(getattr(side, field)[joint])}" for field in _SINGLES]
         lines.append("")
     lines += ["[end]", "complete = true", ""]
-    _write_whole(path, "\n".join(lines))
+    try:
+        write_whole(path, ["\n".join(lines).encode()])
+    except OSError as error:
+        raise CalibrationError(f"{path}: cannot be written ({error.strerror})") from None
 
 
 def load_calibration(path: str | Path, hand: Hand | None = None) -> Calibration:
@@ -258,21 +260,3 @@ def _number(value: float) -> str:
 
 def _list(values: Any) -> str:
     return f"[{', '.join(_number(v) for v in np.asarray(values))}]"
-
-
-def _write_whole(path: Path, text: str) -> None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-        try:
-            with os.fdopen(handle, "w", encoding="utf-8") as file:
-                file.write(text)
-                file.flush()
-                os.fsync(file.fileno())
-            os.chmod(temporary, 0o644)
-            os.replace(temporary, path)
-        except BaseException:
-            Path(temporary).unlink(missing_ok=True)
-            raise
-    except OSError as error:
-        raise CalibrationError(f"{path}: cannot be written ({error.strerror})") from None

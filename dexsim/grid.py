@@ -14,10 +14,10 @@ Shapes: C classes, n nodes along each axis. Units: m.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
-import os
-import tempfile
+import io
 from pathlib import Path
 
 import jax
@@ -26,8 +26,10 @@ import numpy as np
 
 from dexsim import mesh as meshes
 from dexsim import sdf
+from dexsim.assets import cache_path
 from dexsim.config import setting, validate
 from dexsim.errors import ConfigError
+from dexsim.files import write_whole
 from dexsim.pytree import pytree_dataclass, static
 
 INTERPOLATIONS = ("linear", "quadratic")
@@ -142,7 +144,7 @@ def distance_and_normal(points: jax.Array, grid: Grid) -> tuple[jax.Array, jax.A
 
 def cache_folder() -> Path:
     """Where baked grids are kept: `sdf` in `$DEXSIM_CACHE`, or in `~/.cache/dexsim`."""
-    return Path(os.environ.get("DEXSIM_CACHE") or Path.home() / ".cache" / "dexsim") / "sdf"
+    return cache_path("sdf")
 
 
 def _look_up(points: jax.Array, grid: Grid) -> tuple[jax.Array, list[jax.Array]]:
@@ -283,11 +285,8 @@ def _load(path: Path, count: int) -> tuple[np.ndarray, np.ndarray] | None:
 
 
 def _store(path: Path, distance: np.ndarray, gradient: np.ndarray) -> None:
-    """Written aside and renamed, so that two programs may bake at once; a cache that cannot be written is no error."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".npz", delete=False) as file:
-            np.savez_compressed(file, distance=distance, gradient=gradient)
-        os.replace(file.name, path)
-    except OSError:
-        return
+    """Keep the grid; a cache that cannot be written is no error."""
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, distance=distance, gradient=gradient)
+    with contextlib.suppress(OSError):
+        write_whole(path, [buffer.getbuffer()])

@@ -85,15 +85,22 @@ def bounding_radius(size: jax.Array, kinds: tuple[str, ...] = SLOTS) -> jax.Arra
     return jnp.stack([radius[kind](size[k]) for k, kind in enumerate(kinds)])
 
 
-def extent(size: jax.Array, position: jax.Array, active: jax.Array,
-           direction: jax.Array) -> jax.Array:
-    """How far [] m the object reaches along a unit `direction` [3] of its own frame."""
-    along = jnp.abs(direction)
-    across = jnp.sqrt(jnp.maximum(1.0 - direction[2] ** 2, 0.0))
-    (a, b, c), (r, h, _), (cr, ch, _) = size
-    reach = jnp.stack([along[0] * a + along[1] * b + along[2] * c, r + h * along[2],
-                       cr * across + ch * along[2]])
-    return jnp.max(jnp.where(active, reach + jnp.sum(position * direction, -1), -jnp.inf))
+def extent(size: jax.Array, position: jax.Array, active: jax.Array, direction: jax.Array,
+           kinds: tuple[str, ...] = SLOTS, quat: jax.Array | None = None) -> jax.Array:
+    """How far [] m the object reaches along a unit `direction` [3] of its own frame.
+
+    The other arguments are those of `ObjectParams`.
+    """
+    reach = []
+    for k, kind in enumerate(kinds):
+        local = direction if quat is None else rotations.rotate_inverse(
+            rotations.quat_to_matrix(quat[k]), direction)
+        along, (a, b, c) = jnp.abs(local), size[k]
+        reach.append({"box": along[0] * a + along[1] * b + along[2] * c,
+                      "capsule": a + b * along[2],
+                      "cylinder": a * jnp.hypot(along[0], along[1]) + b * along[2]}[kind])
+    reach = jnp.stack(reach) + jnp.sum(position * direction, -1)
+    return jnp.max(jnp.where(active, reach, -jnp.inf))
 
 
 @pytree_dataclass

@@ -15,9 +15,7 @@ against the file's true length. Any altered, missing or added byte is found by o
 
 import hashlib
 import math
-import os
 import struct
-import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,6 +27,7 @@ import msgpack
 import numpy as np
 
 from dexsim.errors import CheckpointError
+from dexsim.files import write_whole
 
 Tree = TypeVar("Tree")
 
@@ -78,7 +77,7 @@ def save(path: str | Path, *, kind: str, task: str, content: Mapping[str, Any], 
                             "content": dict(content), "leaves": leaves, "sha256": digest.digest()})
     prefix = _HASHED_PREFIX.pack(MAGIC, FORMAT_VERSION, len(header))
     head = prefix + hashlib.sha256(prefix + header).digest() + header
-    _write_atomically(Path(path), [head, *map(_bytes, arrays)])
+    write_whole(Path(path), [head, *map(_bytes, arrays)])
 
 
 def load(path: str | Path, *, kind: str, task: str | None = None) -> Checkpoint:
@@ -129,27 +128,6 @@ def restore(checkpoint: Checkpoint, like: Tree) -> Tree:
 
 def _bytes(array: np.ndarray) -> memoryview:
     return memoryview(array.reshape(-1).view(np.uint8))
-
-
-def _write_atomically(path: Path, chunks: list[bytes | memoryview]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            for chunk in chunks:
-                file.write(chunk)
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
 
 
 def _open_envelope(path: Path, data: memoryview) -> tuple[dict[str, Any], memoryview]:

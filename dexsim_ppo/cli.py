@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 
 from dexsim.assets import cache_path
 from dexsim.errors import DexsimError
+from dexsim.files import write_whole
 
 T = TypeVar("T")
 
@@ -98,10 +99,7 @@ def environment_report() -> dict[str, Any]:
 
 def write_json(path: Path, data: Any) -> None:
     """Write JSON, whole or not at all; numbers that are not finite become null."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.tmp")
-    temporary.write_text(json.dumps(plain(data), indent=1) + "\n")
-    temporary.replace(path)
+    write_whole(path, [(json.dumps(plain(data), indent=1) + "\n").encode()])
 
 
 def plain(value: Any) -> Any:

@@ -4,12 +4,13 @@ Settling runs in C MuJoCo on the host's cores, once: it needs no compilation, an
 disk under the hash of the hand's files and the configuration. Training never waits for it again.
 """
 
+import contextlib
 import dataclasses
 import functools
 import hashlib
+import io
 import json
 import os
-import tempfile
 import zipfile
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -24,8 +25,9 @@ from dexsim import rotations
 from dexsim.assets import cache_path
 from dexsim.config import to_dict
 from dexsim.errors import ConfigError
+from dexsim.files import write_whole
 from dexsim.hand import Hand, flexion_joints
-from dexsim.objects import SHAPES, ObjectParams, sample_object
+from dexsim.objects import SHAPES, ObjectParams, extent, sample_object
 from dexsim.physics import build_model
 from dexsim.tasks.grasp_start import clearance, palm_height
 
@@ -71,17 +73,8 @@ def sample_target(key: jax.Array, config: Any) -> ObjectParams:
 def lowest_point(target: ObjectParams, quat: jax.Array, position: jax.Array) -> jax.Array:
     """Smallest coordinate [] m of the object along the palm's normal (x)."""
     down = rotations.rotate_inverse(rotations.quat_to_matrix(quat), jnp.array([-1.0, 0.0, 0.0]))
-    reach = []
-    for k, kind in enumerate(target.kinds):
-        local = down if target.quat is None else rotations.rotate_inverse(
-            rotations.quat_to_matrix(target.quat[k]), down)
-        size, part = target.size[k], jnp.abs(local)
-        if kind == "box":
-            far = jnp.sum(part * size)
-        else:
-            far = size[0] * jnp.hypot(part[0], part[1]) + size[1] * part[2]
-        reach.append(far + jnp.sum(down * target.position[k]))
-    return position[0] - jnp.max(jnp.stack(reach))
+    reach = extent(target.size, target.position, target.active, down, target.kinds, target.quat)
+    return position[0] - reach
 
 
 # --- the pool -----------------------------------------------------------------------------------
@@ -129,14 +122,11 @@ def _read(path: Path, count: int) -> list[np.ndarray] | None:
 
 
 def _write(path: Path, arrays: list[np.ndarray]) -> None:
-    """Write whole or not at all; a cache that cannot be written is no error."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".npz", delete=False) as file:
-            np.savez(file, **{f"a{i}": a for i, a in enumerate(arrays)})
-        os.replace(file.name, path)
-    except OSError:
-        pass
+    """Keep the arrays; a cache that cannot be written is no error."""
+    buffer = io.BytesIO()
+    np.savez(buffer, **{f"a{i}": a for i, a in enumerate(arrays)})
+    with contextlib.suppress(OSError):
+        write_whole(path, [buffer.getbuffer()])
 
 
 def _make(key: jax.Array, hand: Hand, config: Any,

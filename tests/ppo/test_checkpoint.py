@@ -139,7 +139,7 @@ def test_restore_names_what_does_not_fit(file):
 
 def test_a_failed_write_leaves_the_old_file(file, monkeypatch):
     before = file.read_bytes()
-    monkeypatch.setattr(checkpoint.os, "replace", lambda *_: 1 / 0)
+    monkeypatch.setattr("dexsim.files.os.replace", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         checkpoint.save(file, kind="train", task="other", content={}, tree=TREE)
     assert file.read_bytes() == before
