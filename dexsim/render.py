@@ -6,9 +6,10 @@ installed), `draw_taxels` is the matplotlib figure for notebooks. Pillow and mat
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -190,7 +191,8 @@ def _write_video(frame: Callable[[int], np.ndarray], count: int, path: Path, fps
     try:
         import imageio_ffmpeg
 
-        imageio_ffmpeg.get_ffmpeg_exe()
+        with _forks_quietly():
+            imageio_ffmpeg.get_ffmpeg_exe()
     except (ImportError, RuntimeError):  # the wheel of some platforms comes without the program
         return _write_gif(frame, count, path.with_suffix(".gif"), fps)
     path = path.with_suffix(".mp4")
@@ -198,9 +200,7 @@ def _write_video(frame: Callable[[int], np.ndarray], count: int, path: Path, fps
         str(path), size, fps=fps, codec="libx264", pix_fmt_out="yuv420p", macro_block_size=2,
         output_params=["-crf", "20", "-preset", "veryfast", "-movflags", "+faststart"], ffmpeg_log_level="error",
     )  # fmt: skip
-    with warnings.catch_warnings():
-        # The encoder is started by a fork that executes another program at once, which JAX's threads survive.
-        warnings.filterwarnings("ignore", "os.fork", RuntimeWarning)
+    with _forks_quietly():
         writer.send(None)
     try:
         for t in range(count):
@@ -208,6 +208,14 @@ def _write_video(frame: Callable[[int], np.ndarray], count: int, path: Path, fps
     finally:
         writer.close()
     return path
+
+
+@contextlib.contextmanager
+def _forks_quietly() -> Iterator[None]:
+    """The encoder is started by a fork that executes another program at once, which JAX's threads survive."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "os.fork", RuntimeWarning)
+        yield
 
 
 def _write_gif(frame: Callable[[int], np.ndarray], count: int, path: Path, fps: float) -> Path:

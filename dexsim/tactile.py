@@ -154,13 +154,9 @@ def reduce_touch(force: jax.Array, taxels: jax.Array,
 def reduce_touch_links(force: jax.Array, hand: Hand, pose: HandPose,
                        weighting: str = "force") -> tuple[jax.Array, jax.Array]:
     """`reduce_touch` in the links' frames: the mean first, then one transform a finger."""
-    weight = (force > 0).astype(force.dtype) if weighting == "none" else force
-    total = jnp.sum(weight, -1)
-    moment = jnp.stack([jnp.sum(weight * hand.taxel_position[..., axis], -1)
-                        for axis in range(3)], -1)
-    mean = moment / jnp.where(total > 0, total, 1.0)[:, None]
+    total, mean = reduce_touch(force, jnp.asarray(hand.taxel_position), weighting)
     centre = pose.body_position[hand.tip_body] + rotations.rotate(pose.tip_rotation, mean)
-    return jnp.sum(force, -1), jnp.where(total[:, None] > 0, centre, 0.0)
+    return total, jnp.where(total[:, None] > 0, centre, 0.0)
 
 
 def split_force(force: jax.Array, normals: jax.Array,

@@ -10,7 +10,6 @@ import dataclasses
 import math
 import sys
 import time
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -45,7 +44,7 @@ class Evaluator:
 
     def __init__(self, env: Environment, chunk: int):
         self.env, self.chunk = env, chunk
-        self.totals = getattr(env, "evaluation", "series") == "totals"
+        self.totals = env.evaluation == "totals"
         self._run = jit(self._episodes)
 
     def __call__(self, params: PolicyParams, *, episodes: int,
@@ -152,10 +151,7 @@ def write_video(env: Environment, snapshots: Any, path: Path) -> Path:
     """Render an evaluation's snapshots; returns the file written, a GIF's where MP4 cannot be."""
     from dexsim.render import render_episode
 
-    with warnings.catch_warnings():
-        # The encoder is started by a fork that executes it at once.
-        warnings.filterwarnings("ignore", "os.fork", RuntimeWarning)
-        return Path(render_episode(env, snapshots, path, 1.0 / env.control_period))
+    return Path(render_episode(env, snapshots, path, 1.0 / env.control_period))
 
 
 def load_policy(name: str) -> Policy:

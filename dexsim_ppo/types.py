@@ -47,6 +47,9 @@ class Environment(Protocol):
     evaluation_steps: int
     """Length of an evaluation episode in ticks."""
 
+    evaluation: str
+    """What `summarize` is given: "series" of every tick, or "totals" that the task keeps by itself."""
+
     def reset(self, key: jax.Array) -> Any: ...
 
     def step(self, state: Any, action: jax.Array) -> Any:
@@ -66,7 +69,8 @@ class Environment(Protocol):
         ...
 
     def summarize(self, metrics: Mapping[str, np.ndarray], alive: np.ndarray) -> dict[str, Any]:
-        """The task's report from evaluation metrics [T, N] and the mask [T, N] of live steps."""
+        """The task's report from evaluation metrics [T, N] and the mask [T, N] of live steps; with "totals"
+        from the metrics of each episode's last tick [N] and the ticks it lived [N]."""
         ...
 
     def snapshot(self, state: Any) -> Any:

@@ -21,6 +21,7 @@ from dexsim.objects import SLOTS, ObjectParams
 from dexsim.pytree import pytree_dataclass
 from dexsim.tasks.grasp_report import summarize
 from dexsim.tasks.grasp_start import make_pool
+from dexsim.tasks.terms import action_rate, joint_speed, random_push
 
 COMMANDS = (0.0, 0.25, 0.5, 0.75, 1.0)
 """The commands of an evaluation."""
@@ -153,16 +154,6 @@ def posture_distance(joints: jax.Array, centre: jax.Array) -> jax.Array:
     return jnp.sqrt(jnp.sum((joints - centre) ** 2) + 1e-12)
 
 
-def action_rate(action: jax.Array, last_action: jax.Array) -> jax.Array:
-    """R_action: squared change of the action."""
-    return jnp.sum((action - last_action) ** 2)
-
-
-def joint_speed(velocity: jax.Array) -> jax.Array:
-    """R_vel: squared joint velocity."""
-    return jnp.sum(velocity**2)
-
-
 class Grasp:
     """The rules of the task, for `dexsim.env.Env`."""
 
@@ -210,13 +201,8 @@ class Grasp:
 
     def push(self, key: jax.Array, target: ObjectParams) -> jax.Array:
         """Force [3] N that changes the object's velocity by up to `push_speed` in one tick."""
-        when, where, strength = jax.random.split(key, 3)
-        direction = jax.random.normal(where, (3,))
-        direction = direction / (jnp.linalg.norm(direction) + 1e-9)
-        speed = self.config.push_speed * jax.random.uniform(strength)
-        hit = jax.random.bernoulli(when, self.config.push_probability)
-        period = self.config.physics.control_period
-        return jnp.where(hit, target.mass * speed / period, 0.0) * direction
+        return random_push(key, target.mass, probability=self.config.push_probability,
+                           speed=self.config.push_speed, period=self.config.physics.control_period)
 
     def dropped(self, goal: Goal, moment: Moment) -> jax.Array:
         del goal

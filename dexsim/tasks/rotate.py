@@ -23,6 +23,7 @@ from dexsim.observation import ObservationConfig
 from dexsim.pytree import pytree_dataclass
 from dexsim.tasks.rotate_report import summarize
 from dexsim.tasks.rotate_start import KINDS, largest_size, load_pool, lowest_point, palm_height
+from dexsim.tasks.terms import action_rate, joint_speed, random_push
 
 TOUCH = 0.1  # N, force from which a fingertip counts as touching
 _MEMORY = 2.0  # s, over which a fingertip's share of work is averaged
@@ -268,13 +269,15 @@ class Rotate:
 
     def update(self, key: jax.Array, goal: Goal, moment: Moment) -> Goal:
         del key
+        return self._advance(goal, moment)
+
+    def _advance(self, goal: Goal, moment: Moment) -> Goal:
         now, period = self.progress(goal, moment), self._period
         touching = self._touching(moment)
         clock = goal.clock + period
         change = {"spin": now.spin, "joint_speed": jnp.mean(jnp.abs(moment.joint_velocity)),
                   "action_rate": jnp.mean(jnp.abs(moment.action - moment.last_action)),
-                  "tilt": self._tilt(moment),
-                  "touch": touching}
+                  "tilt": self._tilt(moment), "touch": touching}
         return Goal(
             turns=goal.turns + now.success, entered=now.entered & ~now.success,
             entries=goal.entries + (now.entered & ~goal.entered),
@@ -295,12 +298,8 @@ class Rotate:
 
     def push(self, key: jax.Array, target: ObjectParams) -> jax.Array:
         """Force [3] N that changes the object's velocity by up to `push_speed` in one tick."""
-        when, where, strength = jax.random.split(key, 3)
-        direction = jax.random.normal(where, (3,))
-        direction = direction / (jnp.linalg.norm(direction) + 1e-9)
-        speed = self.config.push_speed * jax.random.uniform(strength)
-        hit = jax.random.bernoulli(when, self.config.push_probability)
-        return jnp.where(hit, target.mass * speed / self._period, 0.0) * direction
+        return random_push(key, target.mass, probability=self.config.push_probability,
+                           speed=self.config.push_speed, period=self._period)
 
     def dropped(self, goal: Goal, moment: Moment) -> jax.Array:
         away = jnp.linalg.norm(moment.object_position - jnp.asarray(self.reference))
@@ -314,15 +313,15 @@ class Rotate:
                dropped: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
         """The reward of a tick and its terms; nothing but penalties once dropped."""
         weights, now, held = self.config.reward, self.progress(goal, moment), 1.0 - dropped
-        after = self.update(jax.random.key(0), goal, moment)
+        after = self._advance(goal, moment)
         terms = {
             "goal": held * weights.goal * goal_reward(now.angle, now.distance, weights),
             "bonus": held * weights.bonus * now.success,
             "spin": held * weights.spin * jnp.clip(now.spin, -1.0, 1.0),
             "fingertips": held * weights.fingertips * tips_at_work(
                 after.duty, weights.working_tips, weights.working_duty),
-            "action": weights.action * jnp.sum((moment.action - moment.last_action) ** 2),
-            "velocity": weights.velocity * jnp.sum(moment.joint_velocity**2),
+            "action": weights.action * action_rate(moment.action, moment.last_action),
+            "velocity": weights.velocity * joint_speed(moment.joint_velocity),
             "torque": weights.torque * jnp.sum(moment.joint_torque**2),
             "drop": weights.drop * dropped,
         }

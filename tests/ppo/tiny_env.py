@@ -58,6 +58,7 @@ class TinyEnv:
     action_size = 1
     control_period = 0.1
     evaluation_steps = 32
+    evaluation = "series"
     observation_layout = {
         group: (Field("position", 1, None), Field("target", 1, None), Field("touch", 1, 2.0))
         for group in ("actor", "critic")}
