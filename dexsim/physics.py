@@ -49,6 +49,11 @@ class PhysicsConfig:
     """Line-search iterations in each of them."""
     condim: int = setting(3, unit="1", low=1, high=6)
     """Contact dimension between hand and object: 3 sliding, 4 with torsion, 6 with rolling."""
+    cone: str = setting("elliptic", choices=("elliptic", "pyramidal"))
+    """Friction cone. A pyramid is a linear approximation, and what it holds creeps: at half of what
+    friction can bear by 12 to 25 mm/s here (tests/test_contact.py), through the fingers in seconds."""
+    friction_ratio: float = setting(20.0, unit="1", low=0.1, high=1000.0)
+    """How much harder an elliptic cone resists sliding than penetration (MuJoCo's impratio)."""
     cover: float = setting(0.003, unit="m", low=0.0, high=0.01)
     """Rubber over the fingertips: their geoms, which follow the taxels, touch this far out. Keep it
     equal to `Skin.margin`, so that solver and taxels begin to feel at the same distance."""
@@ -68,6 +73,11 @@ class PhysicsConfig:
     def control_period(self) -> float:
         """One control tick, s."""
         return self.timestep * self.substeps
+
+    @property
+    def pyramid_edges(self) -> int:
+        """Edges of a contact's friction pyramid; 0 for an elliptic cone, and without friction."""
+        return 2 * (self.condim - 1) if self.cone == "pyramidal" else 0
 
     @property
     def contact_period(self) -> float:
@@ -166,7 +176,7 @@ class Physics:
         # out from it, and stiffness must not change with the mass of what is touched.
         solref, solimp = contact.spring(
             self._compliance, self._share * target.contact[0], target.contact[1], target.friction,
-            period=self.config.contact_period, condim=self.config.condim)
+            period=self.config.contact_period, edges=self.config.pyramid_edges)
         return model.replace(
             geom_size=model.geom_size.at[geoms].set(target.size),
             geom_rbound=model.geom_rbound.at[geoms].set(
@@ -224,8 +234,8 @@ class Physics:
     @property
     def constraint_rows(self) -> int:
         """Constraint rows that Warp allocates for a world: contacts and joint limits."""
-        edges = max(2 * (self.config.condim - 1), 1)
-        return edges * 2 * self.config.max_contacts + self.hand.num_joints
+        rows = self.config.pyramid_edges or self.config.condim
+        return rows * 2 * self.config.max_contacts + self.hand.num_joints
 
     def _finger_force(self, data: Any) -> jax.Array:
         if self.backend == "warp":
@@ -240,14 +250,15 @@ class Physics:
         touch = data._impl.contact
         dim, address = np.asarray(touch.dim), np.asarray(touch.efc_address)
         use = np.flatnonzero((dim == self.config.condim) & (address >= 0))
-        width = 1 if self.config.condim == 1 else 2 * (self.config.condim - 1)
-        edges = data._impl.efc_force[address[use][:, None] + np.arange(width)]
-        normal = jnp.sum(edges, -1)
-        local = [normal, jnp.zeros_like(normal), jnp.zeros_like(normal)]
-        if self.config.condim >= 3:  # pyramidal cone: opposite edges, see mju_decodePyramid
-            for axis in (0, 1):
-                pair = edges[:, 2 * axis] - edges[:, 2 * axis + 1]
-                local[axis + 1] = pair * touch.friction[use, axis]
+        edges = self.config.pyramid_edges
+        rows = data._impl.efc_force[address[use][:, None] + np.arange(edges or self.config.condim)]
+        if edges:  # opposite edges, see mju_decodePyramid
+            slide = [(rows[:, 2 * axis] - rows[:, 2 * axis + 1]) * touch.friction[use, axis]
+                     for axis in (0, 1)]
+            local = [jnp.sum(rows, -1), *slide]
+        else:
+            local = [rows[:, axis] if axis < self.config.condim else jnp.zeros(len(use))
+                     for axis in range(3)]
         frame = touch.frame[use]  # rows are the axes; the normal points from geom1 to geom2
         force = jnp.sum(frame * jnp.stack(local, -1)[..., None], 1)
         touching = (touch.dist[use] < touch.includemargin[use])[:, None]
@@ -304,12 +315,16 @@ def build_model(hand: Hand, slots: tuple[str, ...], largest: np.ndarray, config:
                             reftype=mujoco.mjtObj.mjOBJ_BODY, refname="object",
                             intprm=[2, 3, 1], dim=3)
     _set_options(spec, config, gravity)
+    for pair in spec.pairs:
+        if pair.condim == 1 and spec.option.cone == mujoco.mjtCone.mjCONE_ELLIPTIC:
+            # MJX-JAX knows no frictionless contacts beside elliptic cones; this one slides as freely.
+            pair.condim, pair.friction = 3, [1e-3, 1e-3, 0.005, 1e-4, 1e-4]
     model = spec.compile()
     geoms = np.flatnonzero(model.geom_bodyid == model.body("object").id)
     pairs = contact.pairs_with(model, geoms)
     compliance, share = contact.pair_constants(model, pairs, geoms, _tips(model, hand))
     model.pair_solref[pairs], model.pair_solimp[pairs] = contact.spring(
-        compliance, share * 1700.0, 2.0, 0.9, period=config.contact_period, condim=config.condim)
+        compliance, share * 1700.0, 2.0, 0.9, period=config.contact_period, edges=config.pyramid_edges)
     return model
 
 
@@ -336,7 +351,11 @@ def _set_options(spec: mujoco.MjSpec, config: PhysicsConfig,
     option = spec.option
     option.timestep, option.gravity = config.timestep, gravity
     option.integrator = mujoco.mjtIntegrator.mjINT_EULER
-    option.solver, option.cone = mujoco.mjtSolver.mjSOL_NEWTON, mujoco.mjtCone.mjCONE_PYRAMIDAL
+    # Without friction the cone is a line, and the JAX backend knows it as a pyramid only.
+    elliptic = config.cone == "elliptic" and config.condim > 1
+    option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC if elliptic else mujoco.mjtCone.mjCONE_PYRAMIDAL
+    option.impratio = config.friction_ratio if elliptic else 1.0
     option.iterations, option.ls_iterations = config.iterations, config.line_search
     # Box-box has its own kernel only with nativeccd off; eulerdamp costs a factorisation more.
     option.disableflags |= (mujoco.mjtDisableBit.mjDSBL_EULERDAMP

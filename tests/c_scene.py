@@ -58,21 +58,23 @@ def compile_scene(hand, target, *, gravity=GRAVITY, timestep=0.005, iterations=5
     option.timestep, option.gravity = timestep, gravity
     option.iterations, option.ls_iterations = iterations, line_search
     option.integrator, option.solver = mujoco.mjtIntegrator.mjINT_EULER, mujoco.mjtSolver.mjSOL_NEWTON
-    option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
+    option.cone, option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, 20.0
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
     if not exact:
         option.disableflags |= mujoco.mjtDisableBit.mjDSBL_NATIVECCD
+    for pair in spec.pairs:
+        if pair.condim == 1:  # between fingers
+            pair.condim, pair.friction = 3, [1e-3, 1e-3, 0.005, 1e-4, 1e-4]
     model = spec.compile()
     # Contact softness is the skin's: that of a 0.1 kg object with 5e-5 kg m^2, whatever is held.
     model.body_invweight0[model.body("object").id] = 1 / 0.1, 1 / 5e-5
-    _set_springs(model, target, condim, settling)
+    _set_springs(model, target, settling)
     return model
 
 
-def _set_springs(model: mujoco.MjModel, target, condim: int, settling: float) -> None:
+def _set_springs(model: mujoco.MjModel, target, settling: float) -> None:
     """The contact's stiffness in MuJoCo's terms: N = K r with aref = r / settling^2."""
     stiffness, ratio = (float(x) for x in target.contact)
-    mu, edges = float(target.friction), 2 * (condim - 1)
     for pair in range(model.npair):
         first, second = model.pair_geom1[pair], model.pair_geom2[pair]
         if model.geom(second).name not in KINDS:
@@ -82,11 +84,8 @@ def _set_springs(model: mujoco.MjModel, target, condim: int, settling: float) ->
         else:
             wanted = 2.5 * stiffness
         weight = sum(model.body_invweight0[model.geom_bodyid[g], 0] for g in (first, second))
-        # mj_diagApprox and mj_makeImpedance: every edge of the pyramid has R = regular (1 - d) / d.
-        regular = 2 * mu**2 * (1 + mu**2) * weight if edges else weight
-        # At rest N = edges aref / R (one "edge" without friction).
-        resistance = max(edges, 1) / (settling**2 * wanted)
-        d = regular / (regular + resistance)
+        # mj_diagApprox and mj_makeImpedance: R = weight (1 - d) / d, and at rest N = aref / R.
+        d = weight / (weight + 1 / (settling**2 * wanted))
         model.pair_solref[pair] = -d / settling**2, -2 * ratio * d / settling
         model.pair_solimp[pair] = d, d, 0.001, 0.5, 2
 

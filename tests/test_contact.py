@@ -10,11 +10,11 @@ from dexsim.physics import PhysicsConfig, build_model
 
 BALL = """
 <mujoco>
-  <option timestep="{step}" iterations="50"/>
+  <option timestep="{step}" iterations="50" cone="{cone}" impratio="{impratio}"/>
   <worldbody>
     <geom name="floor" type="plane" size="1 1 1" contype="0" conaffinity="0"/>
     <body name="ball" pos="0 0 {height}">
-      <freejoint/>
+      {joint}
       <inertial pos="0 0 0" mass="{mass}" diaginertia="5e-5 5e-5 5e-5"/>
       <geom name="ball" size="0.03" contype="0" conaffinity="0"/>
     </body>
@@ -24,27 +24,47 @@ BALL = """
 """
 
 
-def ball(*, stiffness=2000.0, ratio=1.0, mu=0.9, condim=3, mass=0.1, step=0.002, height=0.03):
+def ball(*, stiffness=2000.0, ratio=1.0, mu=0.9, condim=3, mass=0.1, step=0.002, height=0.03,
+         cone="elliptic", impratio=20.0, joint="<freejoint/>"):
     """A ball of 30 mm over a floor; its mass, as in the hand's scene, is not what the contact was set up for."""
     model = mujoco.MjModel.from_xml_string(
-        BALL.format(step=step, height=height, mass=mass, condim=condim, mu=mu))
+        BALL.format(step=step, height=height, mass=mass, condim=condim, mu=mu, cone=cone, joint=joint,
+                    impratio=impratio if cone == "elliptic" else 1))
     model.body_invweight0[1] = 10.0, 2e4
     pairs = contact.pairs_with(model, np.array([model.geom("ball").id]))
     compliance, share = contact.pair_constants(model, pairs, np.array([model.geom("ball").id]), [0, 1])
     np.testing.assert_array_equal([*compliance, *share], [10.0, 1.0])
     model.pair_solref[:], model.pair_solimp[:] = contact.spring(
-        compliance, np.array([stiffness]), ratio, mu, period=0.03, condim=condim)
+        compliance, np.array([stiffness]), ratio, mu, period=0.03,
+        edges=2 * (condim - 1) if cone == "pyramidal" else 0)
     return model, mujoco.MjData(model)
 
 
+@pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
 @pytest.mark.parametrize("condim", [1, 3, 4, 6])
 @pytest.mark.parametrize("mu, stiffness", [(0.3, 500.0), (0.6, 2000.0), (1.2, 2000.0), (0.9, 20000.0)])
-def test_depth_at_rest_is_weight_over_stiffness(condim, mu, stiffness):
+def test_depth_at_rest_is_weight_over_stiffness(cone, condim, mu, stiffness):
     """Whatever the friction; MuJoCo's own parameters would give depths that differ by 7 and more."""
-    model, data = ball(mu=mu, stiffness=stiffness, condim=condim, mass=0.5)
+    model, data = ball(mu=mu, stiffness=stiffness, condim=condim, mass=0.5, cone=cone)
     mujoco.mj_step(model, data, 1500)
     assert np.abs(data.qvel).max() < 1e-6
     assert 0.03 - data.qpos[2] == pytest.approx(0.5 * 9.81 / stiffness, rel=1e-3)
+
+
+@pytest.mark.parametrize("cone, impratio, slowest, fastest", [
+    ("pyramidal", 1, 0.010, 0.030), ("elliptic", 1, 0.004, 0.010), ("elliptic", 20, 0.0, 0.0005)])
+@pytest.mark.parametrize("mu", [0.6, 1.2])
+def test_what_friction_holds_creeps_little(cone, impratio, slowest, fastest, mu):
+    """At half of what friction can bear: R f / b in m/s, by the documentation's solref and impratio.
+
+    A pyramid lets a ball creep by a fingertip's width in a second; rubber does not.
+    """
+    slides = "".join(f'<joint type="slide" axis="{axis}"/>' for axis in ("1 0 0", "0 1 0", "0 0 1"))
+    model, data = ball(stiffness=1700.0, ratio=2.0, mu=mu, cone=cone, impratio=impratio, joint=slides)
+    weight = model.body_mass[1] * 9.81
+    data.xfrc_applied[1, :3] = 0.5 * mu * 3.0, 0, weight - 3.0
+    mujoco.mj_step(model, data, 500)
+    assert slowest <= data.qvel[0] < fastest
 
 
 @pytest.mark.parametrize("mass", [0.05, 0.2])

@@ -168,7 +168,7 @@ class TestAgainstC:
             ours, theirs = found.force[touching], found.c_force[touching]
             cosine = np.sum(ours * theirs, -1) / np.linalg.norm(theirs, axis=-1)
             cosine /= np.maximum(np.linalg.norm(ours, axis=-1), 1e-9)
-            assert np.mean(cosine > 0.9) > 0.8, (shape, cosine)
+            assert np.mean(cosine > 0.75) > 0.8, (shape, cosine)
 
     @pytest.mark.parametrize("condim", [1, 3, 4, 6])
     def test_the_decoding_of_contact_forces(self, hand, condim):
