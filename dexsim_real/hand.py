@@ -6,99 +6,20 @@ methods; see `open_port`.
 """
 
 import contextlib
-import dataclasses
 import importlib
 import time
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
-from dexsim.config import check_ranges, setting, validate
 from dexsim_real import frames
 from dexsim_real.frames import Command, Frame, Mode
+from dexsim_real.link import HandPort, LinkConfig, LinkCounts, Reply
 from dexsim_real.trouble import HandError, explain, latency_warnings
 
-BITS_PER_BYTE = 10  # 8N1
 _POLL = 0.002  # s, longest wait of one read
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class LinkConfig:
-    """The serial line."""
-
-    baud: int = setting(3_000_000, unit="1/s", low=1200, high=20_000_000)
-    """Bits per second."""
-    hand_id: int = setting(0, unit="1", low=0, high=125)
-    """Id of the hand; its palm board answers at 0x80 + id."""
-    margin: float = setting(0.020, unit="s", low=0.0005, high=5.0)
-    """Time that an answer may take beyond its time on the wire. A USB adapter with its latency
-    timer at 16 ms needs most of this."""
-    settle: float = setting(1.0, unit="s", low=0.0, high=30.0)
-    """Pause after opening: the firmware answers damaged frames before."""
-    handshake: float = setting(1.0, unit="s", low=0.01, high=60.0)
-    """How long the hand is asked before it counts as silent."""
-    backoff: tuple[float, float] = setting((0.1, 3.0), unit="s", low=0.001, high=600.0)
-    """First and longest pause between attempts to reconnect; each is twice the one before."""
-
-    def __post_init__(self):
-        validate(self)
-        check_ranges(self, "backoff")
-
-    def deadline(self, request: int, reply: int) -> float:
-        """Seconds from sending `request` bytes until `reply` bytes must have come."""
-        return (request + reply) * BITS_PER_BYTE / self.baud + self.margin
-
-
-@dataclasses.dataclass
-class LinkCounts:
-    """Every request ends as exactly one of answered, corrupt, silent, refused or lost."""
-
-    sent: int = 0
-    answered: int = 0
-    corrupt: int = 0  # bytes came, but no sound answer
-    silent: int = 0  # nothing came in time
-    refused: int = 0  # the hand answered with an error
-    lost: int = 0  # the port failed
-    late: int = 0  # answers that came after their deadline and were thrown away
-    crc_errors: int = 0
-    resyncs: int = 0
-    reconnects: int = 0
-
-
-@dataclasses.dataclass(frozen=True)
-class Reply:
-    """An answered exchange."""
-
-    state: np.ndarray  # `frames.STATE_BLOCK`
-    sent: float  # s, monotonic clock
-    received: float  # s
-    sequence: int  # of this exchange since the port was made
-    generation: int  # handshakes so far: another number means that the hand was away
-
-
-class HandPort(Protocol):
-    """What the bridge needs of a hand. `exchange` is called from one thread only."""
-
-    counts: LinkCounts
-
-    def connect(self) -> str:
-        """Open, greet, and say in one line what was found. Motors stay off.
-
-        Raises:
-          HandError: what is wrong, and what helps.
-        """
-        ...
-
-    def exchange(self, command: np.ndarray) -> Reply | None:
-        """Send joint commands (`frames.COMMAND_BLOCK`); None when no sound answer came in time.
-
-        Never raises for trouble on the line. After a reconnection the command given is not sent:
-        the first reply of a new generation comes from a passive hand.
-        """
-        ...
-
-    def close(self) -> None: ...
+_QUIET = 0.004  # s without a byte, after which nothing more of a frame will come
 
 
 def passive_command() -> np.ndarray:
@@ -122,7 +43,7 @@ class SerialHand:
         self._tap = tap or (lambda direction, data: None)
         self._serial: Any = None
         self._parser = frames.Parser(frames.HAND_REPLIES)
-        self._received = 0  # bytes since the port was opened
+        self._received = 0  # bytes since the port was opened, without late answers
         self._generation = 0
         self._first: Reply | None = None
         self._retry_at, self._pause = 0.0, self.config.backoff[0]
@@ -146,8 +67,9 @@ class SerialHand:
         try:
             return self._exchange(command)
         except OSError:  # pyserial's errors are.
-            self.counts.lost += 1
-            self._drop()
+            self.close()
+            self._pause = self.config.backoff[0]
+            self._retry_at = time.monotonic() + self._pause
             return None
 
     def close(self) -> None:
@@ -177,16 +99,20 @@ class SerialHand:
 
     def _request(self, command: Command, data: bytes, reply: int) -> tuple[Frame | None, float]:
         """Send and wait for the answer to this command; and when it was sent."""
-        self._discard()
         request = Frame(frames.HOST, frames.palm_address(self.config.hand_id), command, data).encode()
         self.counts.sent += 1
-        self._tap("tx", request)
-        sent, before = time.monotonic(), self._received
-        self._serial.write(request)
-        deadline = sent + self.config.deadline(len(request), frames.OVERHEAD + reply)
-        answer = self._wait(command, deadline)
-        self.counts.crc_errors = self._parser.counts.crc_errors
-        self.counts.resyncs = self._parser.counts.resyncs
+        try:
+            self._discard()
+            self._tap("tx", request)
+            sent, before = time.monotonic(), self._received
+            self._serial.write(request)
+            answer = self._wait(command, sent, len(request), frames.OVERHEAD + reply)
+        except OSError:
+            self.counts.lost += 1
+            raise
+        finally:
+            self.counts.crc_errors = self._parser.counts.crc_errors
+            self.counts.resyncs = self._parser.counts.resyncs
         if answer is None:
             self.counts.corrupt += self._received > before
             self.counts.silent += self._received == before
@@ -197,14 +123,23 @@ class SerialHand:
             self.counts.answered += 1
         return answer, sent
 
-    def _wait(self, command: Command, deadline: float) -> Frame | None:
-        final = False
+    def _wait(self, command: Command, sent: float, request: int, reply: int) -> Frame | None:
+        """The answer. At the deadline a frame that is on its way may still arrive: on a line of two
+        wires nobody else could speak meanwhile."""
+        deadline = sent + self.config.deadline(request, reply)
+        final, heard = False, sent
         while not final:
-            final = time.monotonic() >= deadline
-            data = self._read()
+            data, now = self._read(), time.monotonic()
+            heard = now if data else heard
+            final = now > deadline and (now - heard > _QUIET or now > deadline + self.config.on_wire(reply))
             for frame in self._parser.feed(data) + (self._parser.expire() if final else []):
                 self._tap("rx", frame.encode())
-                if frame.command in (command, Command.ERROR):
+                if self.config.paced and now - sent < self.config.on_wire(
+                        request + frames.OVERHEAD + len(frame.data)):
+                    # It cannot be the answer to what has just been asked.
+                    self.counts.late += 1
+                    self._received -= frames.OVERHEAD + len(frame.data)
+                elif frame.command in (command, Command.ERROR):
                     return frame
         return None
 
@@ -216,10 +151,12 @@ class SerialHand:
         return data
 
     def _discard(self) -> None:
-        """Throw away what came too late: it must not pass for the next answer."""
-        found = []
-        while self._serial.in_waiting:
-            data = self._serial.read(self._serial.in_waiting)
+        """Throw away what came too late, to its end: it must not pass for the next answer."""
+        found, until = [], time.monotonic() + self.config.on_wire(frames.OVERHEAD + frames.STATE_BLOCK.itemsize)
+        while (self._serial.in_waiting or self._parser.pending) and time.monotonic() < until:
+            data = self._read()
+            if not data:
+                break
             found += self._parser.feed(data)
         found += self._parser.expire()
         self.counts.late += len(found)
@@ -266,15 +203,14 @@ class SerialHand:
         if not self._received:
             return (f"{self.port}: no answer. Is the hand powered, are A and B of RS485 swapped, is its "
                     f"id {self.config.hand_id}?")
+        if self.counts.late:
+            return (f"{self.port}: answers come sooner than {self.config.baud} baud allow; if this line is emulated "
+                    "and has no pace, say --link.no-paced")
         if not self._parser.counts.frames and not self._parser.counts.crc_errors:
             return (f"{self.port}: {self._received} bytes came and none make a frame: is the hand set to "
                     f"{self.config.baud} baud?")
         return (f"{self.port}: the hand answers, but not with a sound state ({self.counts.crc_errors} "
                 f"wrong checksums, {self.counts.refused} refusals): check cable and termination")
-
-    def _drop(self) -> None:
-        self.close()
-        self._retry_at, self._pause = time.monotonic() + self.config.backoff[0], self.config.backoff[0]
 
     def _reconnect(self) -> Reply | None:
         if time.monotonic() < self._retry_at:

@@ -230,8 +230,8 @@ class FollowingHand(PtyHand):
 
 def arguments(peer, folder, *more):
     """Patient with the peer, which shares this process and perhaps a busy machine."""
-    return ["grasp", "--port", peer.port, "--uncalibrated", "--fixed-object", "--link.settle", "0", "--link.margin",
-            "0.2", "--safety.stale", "1", "--approach", "0.4", "--log", str(folder / "run.log"),
+    return ["grasp", "--port", peer.port, "--uncalibrated", "--fixed-object", "--link.settle", "0", "--link.no-paced",
+            "--link.margin", "0.2", "--safety.stale", "1", "--approach", "0.4", "--log", str(folder / "run.log"),
             "--output", str(folder / "run.json"), "--quiet", "--no-realtime", *more]
 
 
@@ -397,8 +397,8 @@ def test_what_is_missing_is_said_in_one_line(tmp_path, capsys):
                 (["grasp", "--port", peer.port], "--calibration"),
                 (["grasp", "--port", str(tmp_path / "none"), "--uncalibrated", "--fixed-object", "--quiet", "--log",
                   str(tmp_path / "a.log")], "there is no such port"),
-                (["grasp", "--port", peer.port, "--uncalibrated", "--quiet", "--link.settle", "0", "--log",
-                  str(tmp_path / "b.log")], "--camera, or --fixed-object"),
+                (["grasp", "--port", peer.port, "--uncalibrated", "--quiet", "--link.settle", "0", "--link.no-paced",
+                  "--log", str(tmp_path / "b.log")], "--camera, or --fixed-object"),
                 (["grasp", "--port", peer.port, "--uncalibrated", "--calibration", "x.toml"], "not both"),
                 (["grasp", "--port", peer.port, "--uncalibrated", "--command", "1.5"], "between 0 and 1")):
             with pytest.raises(SystemExit) as stop:

@@ -1,7 +1,9 @@
 """The driver against a scripted peer on a pseudo-terminal: every fault is counted, none passes for an answer."""
 
+import dataclasses
 import errno
 import os
+import threading
 import time
 
 import numpy as np
@@ -12,10 +14,11 @@ serial = pytest.importorskip("serial")
 
 from dexsim_real import frames, hand, trouble  # noqa: E402
 from dexsim_real.frames import Command, Frame, Mode  # noqa: E402
-from dexsim_real.hand import LinkConfig, SerialHand  # noqa: E402
+from dexsim_real.hand import SerialHand  # noqa: E402
+from dexsim_real.link import LinkConfig, LinkCounts  # noqa: E402
 from dexsim_real.trouble import HandError  # noqa: E402
 
-QUICK = LinkConfig(settle=0.0, margin=0.12, handshake=0.1, backoff=(0.02, 0.05))
+QUICK = LinkConfig(settle=0.0, margin=0.12, handshake=0.1, backoff=(0.02, 0.05), paced=False)
 
 
 def command(position=0.5):
@@ -113,6 +116,115 @@ def test_a_late_answer_is_thrown_away():
         port.close()
 
 
+def test_an_answer_sooner_than_the_wire_allows_is_to_an_earlier_request():
+    asked = threading.Event()
+
+    def answer(index, block, state):
+        state["joint"]["position"] = index
+        if index == 0:
+            asked.wait(5)  # Until the next request is on its way.
+        else:
+            time.sleep(0.25)
+
+    with PtyHand(answer) as peer:
+        # 2514 bytes take 0.218 s at this rate.
+        config = dataclasses.replace(QUICK, baud=115200, margin=0.3, paced=True)
+        port = SerialHand(peer.port, config, tap=lambda way, data: port.counts.sent == 2 and asked.set())
+        port._open()
+        assert port.exchange(command()) is None
+        reply = port.exchange(command())
+        assert reply is not None and reply.state["joint"]["position"][0] == 1
+        assert port.counts == LinkCounts(sent=2, answered=1, silent=1, late=1)
+        port.close()
+
+
+def test_a_frame_that_is_on_its_way_at_the_deadline_still_arrives(monkeypatch):
+    monkeypatch.setattr(hand, "_QUIET", 0.05)
+
+    def answer(index, block, state):
+        whole = peer.whole()
+        for at in range(0, len(whole), 100):
+            os.write(peer.master, whole[at:at + 100])
+            time.sleep(0.001)
+        return b""
+
+    with PtyHand(answer) as peer:
+        port = SerialHand(peer.port, QUICK)
+        # The deadline is when it begins, and all of it may take 0.19 s beyond.
+        monkeypatch.setattr(LinkConfig, "deadline", lambda *_: 0.002)
+        monkeypatch.setattr(LinkConfig, "on_wire", lambda *_: 0.19)
+        port._open()
+        assert port.exchange(command()) is not None
+        port.close()
+
+
+def test_the_rest_of_a_late_answer_does_not_spoil_the_next(monkeypatch):
+    monkeypatch.setattr(hand, "_POLL", 0.2)
+    going = threading.Event()
+
+    def answer(index, block, state):
+        whole = peer.whole()
+        if index:
+            return whole
+        time.sleep(0.35)
+        os.write(peer.master, whole[:1500])
+        going.wait(5)
+        time.sleep(0.02)
+        return whole[1500:]
+
+    with PtyHand(answer) as peer:
+        port = SerialHand(peer.port, QUICK)
+        port._open()
+        assert port.exchange(command()) is None
+        while port._serial.in_waiting < 1500:
+            time.sleep(0.001)
+        going.set()
+        assert port.exchange(command()) is not None
+        assert port.counts == LinkCounts(sent=2, answered=1, silent=1, late=1)
+        port.close()
+
+
+def test_a_line_that_never_falls_silent_does_not_hold_the_driver(monkeypatch):
+    with PtyHand() as peer:
+        port = SerialHand(peer.port, QUICK)
+        port._open()
+        stop = threading.Event()
+
+        def babble():
+            while not stop.wait(0.0005):
+                os.write(peer.master, b"\x55" * 50)
+
+        thread = threading.Thread(target=babble)
+        thread.start()
+        time.sleep(0.01)
+        start = time.monotonic()
+        port.exchange(command())
+        assert time.monotonic() - start < 0.5
+        stop.set()
+        thread.join()
+        port.close()
+
+
+def test_a_port_that_fails_while_greeting_is_counted(monkeypatch):
+    with PtyHand() as peer:
+        port = SerialHand(peer.port, QUICK)
+        port.connect()
+
+        def fail(*_):
+            raise OSError("unplugged")
+
+        monkeypatch.setattr(port, "_wait", fail)
+        assert port.exchange(command()) is None
+        time.sleep(0.03)
+        assert port.exchange(command()) is None  # Opens again, and fails at once.
+        monkeypatch.undo()
+        time.sleep(0.1)
+        assert port.exchange(command()) is not None
+        assert (port.counts.lost, port.counts.reconnects) == (2, 1)
+        assert port.counts.sent == sum(outcomes(port.counts).values())
+        port.close()
+
+
 def test_an_answer_behind_a_false_head():
     def answer(index, block, state):
         # A false head that claims a whole frame: the answer lies inside what it claims.
@@ -161,6 +273,11 @@ def test_a_silent_hand_and_a_wrong_baud_rate_are_told_apart():
     broken = Frame(0x80, 0xFE, Command.ERROR, b"\x02").encode()
     with PtyHand(lambda *_: broken) as peer, pytest.raises(HandError, match="refusals"):
         SerialHand(peer.port, QUICK).connect()
+
+
+def test_an_emulated_line_without_pace_is_told_so():
+    with PtyHand() as peer, pytest.raises(HandError, match="sooner than 3000000 baud.*--link.no-paced"):
+        SerialHand(peer.port, dataclasses.replace(QUICK, paced=True)).connect()
 
 
 def test_a_hand_that_does_not_tell_its_version_is_still_a_hand():
