@@ -275,10 +275,8 @@ class Env:
         measured = state.physics.qpos[physics.joint_qpos]
         joint_target = self._joint_target(state.joint_target, action, measured)
 
-        torque = self._torque(state, joint_target)
-        net_torque = self._with_friction(draw, torque)
         push = self.task.push(push_key, state.target) + self._tilt_force(draw, state.target)
-        after, force = physics.advance(state.target, state.physics, net_torque, push)
+        after, force, torque = self._drive(state, joint_target, push)
         # A diverging solver passes through speeds that are finite and square to 1e27 in the reward.
         finite = (sound & jnp.all(jnp.isfinite(after.qpos)) & jnp.all(jnp.abs(after.qvel) < 1e3)
                   & jnp.all(jnp.isfinite(force)))
@@ -286,8 +284,7 @@ class Env:
         after = jax.tree.map(lambda new, old: jnp.where(finite, new, old), after, state.physics)
         force = jnp.where(finite, force, 0.0)
 
-        last = torque(jnp.asarray(self.config.physics.substeps), after.qpos[physics.joint_qpos],
-                      after.qvel[physics.joint_dof])
+        last = torque(after)
         moment = self._moment(after, state.target, last, action, state.action, force)
         goal = self.task.update(goal_key, state.goal, moment)
         sample = Sample(moment.joint_position, last / hand.torque_limit,
@@ -322,6 +319,20 @@ class Env:
         return dataclasses.replace(state, tick=tick.astype(jnp.int32))
 
     # --- pieces of a step -----------------------------------------------------------------
+
+    def _drive(self, state: State, joint_target: jax.Array, push: jax.Array
+               ) -> tuple[PhysicsState, jax.Array, Callable[[PhysicsState], jax.Array]]:
+        """A tick of physics under the motors.
+
+        Returns:
+          The state after it, the fingers' forces [F, 3] N, and a function of a state: the torque
+          [J] Nm that the motors give there, at the end of the tick.
+        """
+        seam, torque = self.physics, self._torque(state, joint_target)
+        after, force = seam.advance(state.target, state.physics,
+                                    self._with_friction(state.draw, torque), push)
+        return after, force, lambda at: torque(jnp.asarray(self.config.physics.substeps),
+                                               at.qpos[seam.joint_qpos], at.qvel[seam.joint_dof])
 
     def _torque(self, state: State, joint_target: jax.Array) -> Callable[..., jax.Array]:
         """The motors as `Physics.advance` wants them."""

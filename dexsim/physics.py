@@ -195,18 +195,33 @@ class Physics:
     def advance(self, target: ObjectParams, state: PhysicsState,
                 torque: Callable[[jax.Array, jax.Array, jax.Array], jax.Array],
                 push: jax.Array) -> tuple[PhysicsState, jax.Array]:
+        """Run one control tick with motors that remember nothing: `advance_motors` for all others.
+
+        Args:
+          torque: (sub-step, joint position [J], joint velocity [J]) to joint torque [J] Nm,
+            called before every sub-step.
+        """
+        after, force, _ = self.advance_motors(
+            target, state, lambda index, position, velocity, memory: (
+                torque(index, position, velocity), memory), None, push)
+        return after, force
+
+    def advance_motors(self, target: ObjectParams, state: PhysicsState,
+                       motors: Callable[..., tuple[jax.Array, Any]], memory: Any,
+                       push: jax.Array) -> tuple[PhysicsState, jax.Array, Any]:
         """Run one control tick.
 
         Args:
           target: the object.
           state: where to start from.
-          torque: (sub-step, joint position [J], joint velocity [J]) to joint torque [J] Nm,
-            called before every sub-step.
+          motors: (sub-step, joint position [J], joint velocity [J], memory) to joint torque [J] Nm
+            and the memory after it, called before every sub-step.
+          memory: what the motors carry from sub-step to sub-step; any pytree.
           push: [3] N, force on the object's centre of mass during the whole tick.
 
         Returns:
-          The state after the tick, and the contact force of the object on each finger's tip
-          link [F, 3] N in the palm frame, at the last sub-step.
+          The state after the tick, the contact force of the object on each finger's tip link
+          [F, 3] N in the palm frame, at the last sub-step, and the motors' memory.
         """
         model = self.configure(target)
         data = self._make_data().replace(qpos=state.qpos, qvel=state.qvel,
@@ -214,16 +229,18 @@ class Physics:
         wrench = jnp.zeros((self.mj_model.nbody, 6)).at[self.object_body, :3].set(push)
         data = data.replace(xfrc_applied=wrench)
 
-        def substep(data: Any, index: jax.Array) -> tuple[Any, None]:
-            tau = torque(index, data.qpos[self.joint_qpos], data.qvel[self.joint_dof])
+        def substep(carry: tuple[Any, Any], index: jax.Array) -> tuple[tuple[Any, Any], None]:
+            data, memory = carry
+            tau, memory = motors(index, data.qpos[self.joint_qpos], data.qvel[self.joint_dof],
+                                 memory)
             applied = jnp.zeros(self.mj_model.nv).at[self.joint_dof].set(tau)
-            return self._mjx.step(model, data.replace(qfrc_applied=applied)), None
+            return (self._mjx.step(model, data.replace(qfrc_applied=applied)), memory), None
 
         # Forces are read after the scan: stacking sensordata as a scan output more than doubled
         # the step and returned zeros on the GPU.
-        data, _ = jax.lax.scan(substep, data, jnp.arange(self.config.substeps))
+        (data, memory), _ = jax.lax.scan(substep, (data, memory), jnp.arange(self.config.substeps))
         after = PhysicsState(data.qpos, data.qvel, data.qacc_warmstart)
-        return after, self._finger_force(data)
+        return after, self._finger_force(data), memory
 
     def _make_data(self) -> Any:
         if self.backend == "jax":
