@@ -1,0 +1,282 @@
+"""A run on the emulated hand in virtual time: the bridge's own parts, in one process and without a clock.
+
+What `dexsim_real.session` does with threads and a serial port happens here event by event: exchanges at 83 Hz that
+take 9.6 ms, the policy at its own rate on the newest state, an IMU and a camera at theirs. Every exchange goes through
+the bytes of both frames and the emulated palm board, so counts, rounding and delays are the wire's.
+"""
+
+import dataclasses
+import heapq
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from dexsim.calibration import Calibration, Side
+from dexsim.hand import Hand
+from dexsim_real import frames
+from dexsim_real.control import IDENTITY, Controller, TurnGoals
+from dexsim_real.frames import Command, Frame, Mode, Parser
+from dexsim_real.imu import BAUD, UPRIGHT_X, RvcParser, align, conjugate, encode, multiply
+from dexsim_real.safety import Safety, SafetyConfig, Sample
+from dexsim_real.sensing import HandSensing, HardwareConfig, ObjectEstimate, VelocityFilter
+from dexsim_real.twin.assistant import POSTURES
+from dexsim_real.twin.firmware import Firmware, FirmwareConfig
+from dexsim_real.twin.motors import STALL_CURRENT
+from dexsim_real.twin.object_side import ObjectConfig, outline, silhouette
+from dexsim_real.twin.plant import EmulatedHand
+from dexsim_real.twin.shapes import matrix, turn
+from dexsim_real.vision import HeightSensor
+
+RATE = 83.0  # exchanges a second
+REQUEST, ROUND_TRIP = 0.001, 0.0096  # s from the host to the board; until the answer is there
+IMU_RATE, CAMERA_RATE = 100.0, 30.0  # Hz
+_APPROACH, _PLACE, _ZERO_SAMPLES = 2.0, 0.5, 30
+_SLACK = 5.0  # s beyond a trial's limit after which something is wrong
+
+
+def ideal_calibration(hand: Hand) -> Calibration:
+    """The calibration of an emulated hand whose motors are all nominal: what a press procedure finds on average.
+
+    Each trial's drawn errors of current and taxels are then errors of this calibration.
+    """
+    def side(gain: np.ndarray) -> Side:
+        both, one = np.broadcast_to(gain, (2, hand.num_joints)).astype(float), np.ones(hand.num_joints)
+        zero = np.zeros_like(both)
+        return Side(both, both, both, zero, zero, zero, zero, zero + 1, zero + 1, zero, zero, 0 * one, one, one)
+    return Calibration(
+        real=side(-STALL_CURRENT / hand.torque_limit), sim=side(np.ones(hand.num_joints)),
+        torque_scale=hand.torque_limit, force_per_count=np.full(hand.num_fingers, FirmwareConfig().force_per_count),
+        hand=hand.name, joint_names=hand.joint_names, finger_names=hand.finger_names)
+
+
+class Schedule:
+    """Events in virtual time."""
+
+    def __init__(self) -> None:
+        self._queue: list[tuple[float, int, Callable[[], None]]] = []
+        self._count = 0
+
+    def at(self, time: float, what: Callable[[], None]) -> None:
+        """Call `what` at a time in s."""
+        heapq.heappush(self._queue, (time, self._count, what))
+        self._count += 1
+
+    def pop(self) -> tuple[float, Callable[[], None]]:
+        """The next event."""
+        time, _, what = heapq.heappop(self._queue)
+        return time, what
+
+
+class VirtualImu:
+    """The part in the object and the bridge's way with it, without a port."""
+
+    def __init__(self, plant: EmulatedHand, nominal_up: np.ndarray):
+        self._plant, self._nominal_up = plant, nominal_up
+        self._mount = np.asarray(UPRIGHT_X)
+        self._parser, self._index = RvcParser(), 0
+        # The part's world has the true vertical as z and some heading.
+        up = plant.up
+        level = np.array([1.0 + up[2], up[1], -up[0], 0.0]) if up[2] > -1 + 1e-9 else np.array([0.0, 1, 0, 0])
+        self._level = multiply(turn((0, 0, 1), 1.0 + plant.seed), level / np.linalg.norm(level))
+        self._world: np.ndarray | None = None
+        self._sensed, self.time = IDENTITY, 0.0
+
+    def sample(self) -> bytes:
+        """The bytes about the orientation that the part shows now."""
+        _, quat, _ = self._plant.measure_object()
+        self._index += 1
+        return encode(self._index, multiply(self._level, multiply(quat, self._mount)))
+
+    def receive(self, time: float, data: bytes) -> None:
+        """The bridge reads them."""
+        for quat in self._parser.feed(data):
+            self._sensed = quat if quat @ self._sensed >= 0 else -quat
+            self.time = time
+
+    def calibrate(self) -> None:
+        """The object lies squarely now."""
+        self._world = align(self._sensed, multiply(IDENTITY, self._mount), self._nominal_up)
+
+    def read(self) -> np.ndarray:
+        """Orientation in the palm frame, as the bridge has it."""
+        if self._world is None:
+            return IDENTITY
+        return multiply(multiply(self._world, self._sensed), conjugate(self._mount))
+
+
+class VirtualCamera:
+    """Masks of the object and the bridge's height sensor, without a socket."""
+
+    def __init__(self, plant: EmulatedHand, controller: Controller):
+        sensing = controller.task.config.sensing
+        self._plant, self._config = plant, ObjectConfig()
+        self._parts = [outline(part) for part in plant.shape.parts]
+        self.sensor = HeightSensor(lambda: None, self._config.optics, np.asarray(controller.task.reference, float),
+                                   sensing.object_axes, sensing.velocity_filter)
+
+    def sample(self, time: float) -> None:
+        """One picture, which shows what is a while ago."""
+        place, quat, _ = self._plant.measure_object()
+        parts = [points @ matrix(quat).T + place for points in self._parts]
+        self.sensor.see(time, silhouette(parts, self._config.optics, self._config.picture))
+
+
+@dataclasses.dataclass(frozen=True)
+class RunOptions:
+    """One run."""
+
+    command: float = 0.5  # in [0, 1]
+    safety: bool = True
+    hardware: HardwareConfig = HardwareConfig()
+    limits: SafetyConfig = SafetyConfig()
+
+
+class VirtualRun:
+    """One trial of a policy on an emulated hand.
+
+    Args:
+      plant: fresh, with one trial to come.
+      controller: warmed; it is started anew.
+      calibration: of this hand.
+    """
+
+    def __init__(self, plant: EmulatedHand, controller: Controller, calibration: Calibration, options: RunOptions):
+        self.plant, self.controller, self.options = plant, controller, options
+        hand = controller.hand
+        self.firmware = Firmware(plant, FirmwareConfig())
+        self.sensing = HandSensing(hand, options.hardware, calibration)
+        limits = dataclasses.replace(options.limits, watchdog=max(options.limits.watchdog, 2.5 * controller.period))
+        self.safety = Safety(hand, limits)
+        self._filter = VelocityFilter(options.hardware.velocity_time)
+        self._requests, self._replies = Parser(frames.HOST_REQUESTS), Parser(frames.HAND_REPLIES)
+        self._schedule, self._now = Schedule(), 0.0
+        self._state: np.ndarray | None = None
+        self._mode, self._wish = Mode.PASSIVE, hand.joint_lower
+        self.imu = VirtualImu(plant, -np.asarray(controller.task.gravity))
+        self.camera = VirtualCamera(plant, controller) if "camera" in controller.sources else None
+        self.goals: TurnGoals | None = None
+        self.ticks, self.sums = 0, np.zeros(5)
+        self.trace: list[dict[str, Any]] | None = None
+
+    def run(self) -> dict[str, Any]:
+        """The referee's report, with what the bridge believed."""
+        trial, limit = self.plant.trial, self.plant.limit + _SLACK
+        self._schedule.at(0.0, self._exchange)
+        self._schedule.at(0.001, self._sense_orientation)
+        if self.camera:
+            self._schedule.at(0.002, self._take_picture)
+        self._zero()
+        self._mode = Mode.POSITION
+        self.safety.engage()
+        start, began = self._pose(), self._now
+        goal = np.asarray(POSTURES[self.plant.task], np.float32)
+        while self._now < began + _APPROACH + _PLACE:
+            share = np.float32(min((self._now - began) / _APPROACH, 1.0))
+            self._tell(start + share * share * (3 - 2 * share) * (goal - start))
+            self._until(self._now + 1 / RATE)
+        self.imu.calibrate()
+        task = self.controller.task
+        if hasattr(task.config, "goal_step"):
+            self.goals = TurnGoals(task.config, task.reference)
+        self.controller.start(self._pose())
+        anchor, began, tick = self.safety.anchor, self._now, 0
+        while self.plant.trial == trial and self._now < began + limit:
+            if anchor != self.safety.anchor:
+                anchor = self.safety.anchor
+                self.controller.anchor(self._pose())
+            self._tick()
+            tick += 1
+            self._until(began + tick * self.controller.period)
+        return self._summary(trial)
+
+    # --- the bridge's threads ---------------------------------------------------------------------
+
+    def _tick(self) -> None:
+        measured = self.safety.sample.measured
+        position, velocity = np.asarray(self.controller.task.reference, float), np.zeros(3)
+        if self.camera:
+            _, position, velocity = self.camera.sensor.read()
+        seen = ObjectEstimate(position, velocity, self.imu.read())
+        goal = self.goals.update(self.imu.time, seen) if self.goals else IDENTITY
+        tick = self.controller.tick(measured, seen, goal, self.options.command)
+        self._tell(tick.target)
+        self.sums += measured.finger_force
+        self.ticks += 1
+        if self.trace is not None:
+            self.trace.append({"time": self._now, "tick": tick, "measured": measured})
+
+    def _tell(self, target: np.ndarray) -> None:
+        self.safety.wish(target, self._now)
+        if np.isfinite(target).all():
+            self._wish = target
+
+    def _exchange(self) -> None:
+        """The servo thread's cycle: ask, and hear 9.6 ms later."""
+        position, mode = self._wish, self._mode
+        if self.safety.engaged and self.options.safety:
+            decision = self.safety.decide(self._now)
+            position, mode = decision.position, decision.mode
+        block = self.sensing.command(position, mode)
+        data = Frame(frames.HOST, frames.palm_address(0), Command.EXCHANGE, block.tobytes()).encode()
+        self._schedule.at(self._now + REQUEST, lambda: self._answer(data, self._now))
+        self._schedule.at(self._now + 1 / RATE, self._exchange)
+
+    def _answer(self, data: bytes, now: float) -> None:
+        for frame in self._requests.feed(data):
+            reply = self.firmware.answer(frame, now).encode()
+            self._schedule.at(self._now + ROUND_TRIP - REQUEST, lambda reply=reply: self._hear(reply))
+
+    def _hear(self, data: bytes) -> None:
+        for frame in self._replies.feed(data):
+            self._state = frames.decode_state(frame.data)
+            measured = self.sensing.measure(self._state)
+            velocity = self._filter.update(self._now, measured.joint_position)
+            self.safety.see(Sample(self._now, 0, 0, measured, velocity))
+
+    def _sense_orientation(self) -> None:
+        data = self.imu.sample()
+        there = self._now + 10 * len(data) / BAUD  # ten bits a byte
+        self._schedule.at(there, lambda: self.imu.receive(there, data))
+        self._schedule.at(self._now + 1 / IMU_RATE, self._sense_orientation)
+
+    def _take_picture(self) -> None:
+        self.camera.sample(self._now)
+        self._schedule.at(self._now + 1 / CAMERA_RATE, self._take_picture)
+
+    # --- pieces ---------------------------------------------------------------------------------
+
+    def _zero(self) -> None:
+        states: list[np.ndarray] = []
+        while len(states) < _ZERO_SAMPLES:
+            self._state = None
+            self._until(self._now + 1 / RATE)
+            states += [self._state] if self._state is not None else []
+        self.sensing.zero(states)
+
+    def _pose(self) -> np.ndarray:
+        return self.safety.sample.measured.joint_position
+
+    def _until(self, time: float) -> None:
+        """Let the world and the bridge's threads run to a time."""
+        while True:
+            when, what = self._schedule.pop()
+            if when > time:
+                self._schedule.at(when, what)
+                break
+            self._go(when)
+            what()
+        self._go(time)
+
+    def _go(self, time: float) -> None:
+        self.plant.advance(time - self._now)
+        self._now = time
+
+    def _summary(self, trial: int) -> dict[str, Any]:
+        report = next(r for r in self.plant.results() if r["trial"] == trial)
+        mean = self.sums / max(self.ticks, 1)
+        believed = {"ticks": self.ticks, "sensed_force": np.round(mean, 4).tolist(),
+                    "safety": dict(self.safety.counts), "latched": self.safety.latched,
+                    "successes": self.goals.successes if self.goals else None}
+        return report | {"command": self.options.command, "bridge": believed}
+
