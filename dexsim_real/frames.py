@@ -82,7 +82,7 @@ STATE_BLOCK = np.dtype([("joint", JOINT_STATE, JOINTS), ("tip", TIP_STATE, TIPS)
 HAND_REPLIES: dict[int, range] = {
     Command.EXCHANGE: range(STATE_BLOCK.itemsize, STATE_BLOCK.itemsize + 1),
     Command.ERROR: range(1, 65), Command.ACKNOWLEDGE: range(1, 65), Command.VERSION: range(1, 65),
-    Command.CLEAR_PRESSURE: range(2, 65), Command.READ_MODE: range(2, 65)}
+    Command.CLEAR_PRESSURE: range(2, 65), Command.READ_MODE: range(2, 65), Command.READ_REGISTER: range(5, 65)}
 """Data lengths that a host believes. None fits the host's own request, so an adapter that echoes
 what it sends cannot be taken for the hand."""
 HOST_REQUESTS: dict[int, range] = {

@@ -1,0 +1,1 @@
+"""The emulated hand: physics that no policy has trained on, behind the real hand's bytes."""

@@ -1,0 +1,95 @@
+"""An emulated hand: the real hand's bytes on a pseudo-terminal, physics that no policy has trained on behind them.
+
+    python -m dexsim_real.twin --task rotate
+
+It prints the command that runs a policy on it, and goes on until its trials are over or Ctrl-C.
+"""
+
+import importlib
+import shlex
+import signal
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+from dexsim.hand import Hand, load_hand
+from dexsim_ppo import cli
+from dexsim_real.servo import use_realtime
+from dexsim_real.trouble import HandError
+from dexsim_real.twin.loop import Twin
+from dexsim_real.twin.options import TwinArguments
+from dexsim_real.twin.types import Plant
+from dexsim_real.vision import CameraConfig
+
+
+def make_plant(arguments: TwinArguments, hand: Hand) -> Plant:
+    """The physics that the options ask for.
+
+    Raises:
+      HandError: a function of the user's own that cannot be found.
+    """
+    if arguments.plant:
+        module, _, function = arguments.plant.partition(":")
+        try:
+            return getattr(importlib.import_module(module), function or "make_plant")(arguments)
+        except (ImportError, AttributeError) as error:
+            raise HandError(f"{arguments.plant}: {error}") from None
+    from dexsim_real.twin.plant import EmulatedHand
+
+    return EmulatedHand(hand, arguments.task, arguments.seed, kind=arguments.draw, seconds=arguments.seconds,
+                        command=arguments.command, shapes=arguments.shapes or None)
+
+
+def runner_command(twin: Twin) -> list[str]:
+    """The command that runs a policy on this hand."""
+    arguments, line, board = twin.arguments, twin.arguments.line, twin.arguments.firmware
+    words = ["python", "-m", "dexsim_real.run", arguments.policy or arguments.task, "--port",
+             str(twin.line.terminal.name), "--uncalibrated"]
+    if arguments.command is not None:
+        words += ["--command", f"{arguments.command:g}"]
+    if twin.imu:
+        words += ["--imu", str(twin.imu.terminal.name)]
+        if arguments.object.imu_mount != type(arguments.object)().imu_mount:
+            words += ["--imu-mount", *(f"{v:g}" for v in arguments.object.imu_mount)]
+    if twin.masks and arguments.task == "grasp":
+        words += ["--camera", f"unix:{twin.masks.path}"]
+        for name in ("focal", "centre", "position", "forward", "down"):
+            value = getattr(arguments.object.optics, name)
+            if value != getattr(CameraConfig(), name):
+                words += [f"--optics.{name}", *(f"{v:g}" for v in value)]
+    words += ["--link.baud", str(line.baud)] if line.baud != type(line)().baud else []
+    words += ["--link.hand-id", str(board.hand_id)] if board.hand_id else []
+    return words
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command. Returns its exit code, 0."""
+    arguments = cli.parse(TwinArguments, sys.argv[1:] if argv is None else argv, prog="python -m dexsim_real.twin",
+                          description="Emulate a hand on a pseudo-terminal.")
+    hand = load_hand()
+    with tempfile.TemporaryDirectory(prefix="dexsim-twin-") as folder:
+        twin = Twin(arguments, hand, make_plant(arguments, hand), Path(folder),
+                    lambda text: print(text, flush=True))
+        before = {number: signal.signal(number, lambda *_: twin.stop()) for number in (signal.SIGTERM, signal.SIGINT)}
+
+        def write() -> None:
+            if arguments.output:
+                cli.write_json(arguments.output, twin.report())
+
+        try:
+            print(f"{arguments.task}: the emulated hand is at {twin.line.terminal.name}. Run a policy on it with\n"
+                  f"    {shlex.join(runner_command(twin))}", flush=True)
+            if arguments.realtime and not use_realtime():
+                twin.note("without real-time priority: expect jitter on a busy machine (docs/hardware.md)")
+            twin.run(write)
+        finally:
+            twin.close()
+            for number, handler in before.items():
+                signal.signal(number, handler)
+        write()
+    return 0
+
+
+if __name__ == "__main__":
+    cli.run(main)

@@ -1,0 +1,177 @@
+"""The emulated hand at work: one thread that serves wire, IMU and camera, and brings the physics along.
+
+Whatever is due on the wire comes first. Physics goes in slices of two milliseconds between, and follows the wall
+clock; a machine too slow for that lets time go, and says so.
+"""
+
+import select
+import time
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from dexsim.config import to_dict
+from dexsim.hand import Hand
+from dexsim_real.twin.check import CommandCheck
+from dexsim_real.twin.faults import Injector
+from dexsim_real.twin.firmware import Firmware
+from dexsim_real.twin.line import HandLine
+from dexsim_real.twin.object_side import ImuSide, MaskSide
+from dexsim_real.twin.options import TwinArguments
+from dexsim_real.twin.types import Plant
+
+_EVENTS = 20_000  # kept for the report
+
+
+class World:
+    """The plant beside the wall clock.
+
+    Args:
+      start: s, when its time begins.
+      note: called with one line when time is let go.
+    """
+
+    SLICE = 0.002  # s, simulated in one go
+    BEHIND = 0.1  # s, beyond which time is let go
+
+    def __init__(self, plant: Plant, start: float, note: Callable[[str], None] = lambda text: None):
+        self.plant, self._at, self._note = plant, start, note
+        self.let_go, self.simulated, self.spent = 0.0, 0.0, 0.0  # s
+        self.cost = 0.0  # s, what a slice takes
+        self._told = -1e9
+
+    @property
+    def due(self) -> float:
+        """When the next slice may be computed."""
+        return self._at + self.SLICE
+
+    def catch_up(self, now: float, most: float = 5 * SLICE) -> None:
+        """Bring the plant to this time, or nearer by `most` s."""
+        behind = now - self._at
+        if behind > self.BEHIND:
+            self._let_go(now, behind - most)
+        step = min(now - self._at, most)
+        if step <= 0:
+            return
+        begun = time.monotonic()
+        self.plant.advance(step)
+        took = time.monotonic() - begun
+        self._at += step
+        self.simulated += step
+        self.spent += took
+        self.cost += 0.05 * (took * self.SLICE / max(step, 1e-4) - self.cost)
+
+    def _let_go(self, now: float, seconds: float) -> None:
+        self._at += seconds
+        self.let_go += seconds
+        if now > self._told + 5.0:
+            self._told = now
+            share = self.spent / self.simulated if self.simulated else 0.0
+            self._note(f"this machine is too slow: {self.let_go:.2f} s of the physics let go so far "
+                       f"(a second of it takes {share:.2f} s)")
+
+    def report(self) -> dict[str, float]:
+        """How well it kept up."""
+        return {"simulated_s": round(self.simulated, 3), "let_go_s": round(self.let_go, 3),
+                "cpu_per_simulated_s": round(self.spent / self.simulated, 4) if self.simulated else 0.0}
+
+
+class Twin:
+    """Everything of one emulated hand.
+
+    Args:
+      folder: for the ports that have no name of their own.
+      show: called with each event's line.
+
+    Raises:
+      HandError: a port or socket cannot be made.
+    """
+
+    def __init__(self, arguments: TwinArguments, hand: Hand, plant: Plant, folder: Path,
+                 show: Callable[[str], None] = lambda text: None):
+        self.arguments, self.plant, self._show = arguments, plant, show
+        self.events: deque[tuple[float, str]] = deque(maxlen=_EVENTS)
+        self.start, seed = time.monotonic(), arguments.seed
+        self.world = World(plant, self.start, self.note)
+        self.firmware = Firmware(plant, arguments.firmware, self.note)
+        self.injector = Injector(arguments.faults, seed)
+        self.check = CommandCheck(hand.joint_lower, hand.joint_upper, arguments.limits)
+        self.line = HandLine(arguments.link or folder / "hand", plant, self.firmware, self.check, self.injector,
+                             arguments.line, seed=seed, catch_up=self.world.catch_up, note=self.note)
+        self.imu: ImuSide | None = None
+        self.masks: MaskSide | None = None
+        try:
+            if arguments.task == "rotate":
+                self.imu = ImuSide(arguments.imu_link or folder / "imu", plant, arguments.object, seed=seed,
+                                   start=self.start)
+            if arguments.task == "grasp" or arguments.mask_socket:
+                self.masks = MaskSide(arguments.mask_socket or folder / "masks", plant, arguments.object, seed=seed,
+                                      start=self.start)
+        except BaseException:
+            self.close()
+            raise
+        self._first = self._trial = plant.trial
+        self._stop = False
+
+    def stop(self) -> None:
+        """End soon; safe to call from a signal."""
+        self._stop = True
+
+    def run(self, trial_over: Callable[[], None] = lambda: None) -> None:
+        """Until all trials are over, or `stop`.
+
+        Args:
+          trial_over: called after each trial.
+        """
+        sides = [side for side in (self.imu, self.masks) if side]
+        while not self._stop:
+            now = time.monotonic()
+            self.line.serve(now)
+            free = self.line.due() - now
+            for side in sides:
+                # A picture takes a millisecond or so: it waits while the wire wants something soon.
+                if free > 0.002 or now > side.due + 0.01:
+                    side.serve(now)
+            if free > self.world.cost or now > self.world.due + 0.01:
+                if now >= self.world.due:
+                    self.world.catch_up(now, World.SLICE)
+                until = min(self.world.due, *(side.due for side in sides))
+            else:
+                until = now + free
+            if self.plant.trial != self._trial:
+                self._trial = self.plant.trial
+                self.note(f"trial {self._trial - self._first} of {self.arguments.trials} is over")
+                trial_over()
+                self._stop |= self._trial - self._first >= self.arguments.trials
+            pause = min(until, self.line.due()) - time.monotonic()
+            ports = [self.line.terminal] if self.line.terminal.plugged else []
+            select.select(ports, [], [], max(pause, 0.0))
+
+    def close(self) -> None:
+        """Take the ports away."""
+        for part in (self.line, self.imu, self.masks):
+            if part:
+                part.close()
+
+    def note(self, text: str) -> None:
+        """An event, for the report and whoever looks on."""
+        now = time.monotonic()
+        self.events.append((now, text))
+        self._show(f"{now - self.start:9.3f} s  {text}")
+
+    def report(self) -> dict[str, Any]:
+        """Results of the trials, and everything that was counted."""
+        arguments, firmware, line = self.arguments, self.firmware, self.line
+        return {
+            "task": arguments.task, "seed": arguments.seed, "draw": arguments.draw, "start": self.start,
+            "seconds": round(time.monotonic() - self.start, 3),
+            "trials": self.plant.results()[:arguments.trials],
+            "line": dict(line.counts), "firmware": dict(firmware.counts),
+            "faults": {"injected": dict(self.injector.injected), "expected": self.injector.expected(),
+                       "config": to_dict(arguments.faults)},
+            "commands": self.check.report(),
+            "watchdog": {"limit_s": arguments.firmware.watchdog, "trips": firmware.trips},
+            "physics": self.world.report(), "slowest_exchange_ms": round(1e3 * line.slowest, 3),
+            "late": line.lateness.summary(), "imu_frames": self.imu.sent if self.imu else 0,
+            "masks": dict(self.masks.counts) if self.masks else {}, "events": [list(event) for event in self.events]}

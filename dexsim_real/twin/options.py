@@ -1,0 +1,60 @@
+"""Options of `python -m dexsim_real.twin`, one dataclass with those of every part within."""
+
+import dataclasses
+from pathlib import Path
+
+from dexsim.config import setting, validate
+from dexsim_real.twin.check import LimitsConfig
+from dexsim_real.twin.draw import KINDS, TASKS
+from dexsim_real.twin.faults import FaultConfig
+from dexsim_real.twin.firmware import FirmwareConfig
+from dexsim_real.twin.line import LineConfig
+from dexsim_real.twin.object_side import ObjectConfig
+from dexsim_real.twin.shapes import SHAPES
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TwinArguments:
+    """Options of `python -m dexsim_real.twin`."""
+
+    task: str = setting("rotate", choices=TASKS)
+    """What the hand is mounted for: palm up with a cube, or upside down with objects to catch."""
+    policy: str | None = None
+    """The policy that will run on it, a file or a shipped name; by default that of the task's name."""
+    seed: int = setting(0, unit="1", low=0, high=2**31 - 1)
+    """Of everything random: parameters, objects, noise, faults."""
+    trials: int = setting(10, unit="1", low=1, high=100_000)
+    """Objects that are handed over before the program ends."""
+    seconds: float | None = setting(None, unit="s", low=0.1, high=86400.0)
+    """Time limit of a trial; the task's own by default (grasp 8, rotate 120)."""
+    draw: str = setting("outside", choices=KINDS)
+    """Parameters just outside the ranges of training, inside them, or nominal."""
+    shapes: tuple[str, ...] = setting((), choices=SHAPES)
+    """Objects of successive grasp trials; any by default."""
+    command: float | None = setting(None, unit="1", low=0.0, high=1.0)
+    """Grip command that the runner will be given; only noted in the results and in the command shown."""
+    link: Path | None = None
+    """Name of the hand's port; by default in a new folder under the system's temporary one."""
+    imu_link: Path | None = None
+    """Name of the IMU's port (rotate)."""
+    mask_socket: Path | None = None
+    """Unix socket of the camera's masks (grasp)."""
+    output: Path | None = None
+    """File for results, counters and events as JSON, written after each trial and at the end."""
+    realtime: bool = True
+    """Ask for real-time priority: it stands for hardware, which waits for no scheduler."""
+    plant: str | None = None
+    """MODULE:FUNCTION of your own that makes the physics (`dexsim_real.twin.types.Plant`) from these options."""
+    line: LineConfig = setting(LineConfig())
+    """Timing of the wire."""
+    firmware: FirmwareConfig = setting(FirmwareConfig())
+    """The palm board."""
+    limits: LimitsConfig = setting(LimitsConfig())
+    """What every command is held against."""
+    faults: FaultConfig = setting(FaultConfig())
+    """What goes wrong."""
+    object: ObjectConfig = setting(ObjectConfig())
+    """IMU and camera."""
+
+    def __post_init__(self):
+        validate(self)
