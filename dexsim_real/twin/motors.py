@@ -26,6 +26,7 @@ BACK_EMF = 0.1  # Nm s/rad, damping at kd = 0
 STALL_CURRENT = 1.0  # A at torque_max = 300, cold
 FULL_TORQUE_MAX = 300.0
 PERIOD = 0.001  # s of the firmware's loop
+_HEAT_STEPS = 10  # of them between two looks at the temperature
 _SPEED_TIME = 0.002  # s, the firmware's filter on the encoder's speed
 _FIELDS = ("position", "kp", "ki", "kd", "torque_max", "mode")
 _AT_REST = 0.05  # rad/s, speed over which the no-load current turns round
@@ -71,9 +72,11 @@ class Drives:
         zero = np.zeros(joints)
         self._board = np.zeros((len(_FIELDS), joints))  # what each joint's board was told last
         self.current = zero.copy()  # A, true
-        self._queue: collections.deque[tuple[float, np.ndarray]] = collections.deque()
+        self._queue: collections.deque[tuple[np.ndarray, np.ndarray]] = collections.deque()
+        self._next = np.inf  # s, when the next of them reaches a board
         self._integral, self._speed = zero.copy(), zero.copy()
         self._last: np.ndarray | None = None
+        self._on, self._limit, self._most = np.zeros(joints, bool), zero.copy(), zero.copy()
 
     def configure(self, draw: Draw) -> None:
         """Take a trial's parameters; heat and commands stay."""
@@ -83,12 +86,16 @@ class Drives:
         self.efficiency, self.coulomb = draw.efficiency, draw.coulomb_friction * self._stall
         self.ripple, self.ripple_count = draw.ripple, draw.ripple_count
         self.bias, self.no_load_current = draw.encoder_bias, float(draw.no_load_current)
+        self._loss = 1.0 - self.efficiency
         self.thermal = float(draw.thermal)
+        self._feel_heat()
         self.delay = np.maximum(float(draw.latency) - EXCHANGE_COMMAND, 0.0) + draw.latency_spread
 
     def order(self, time: float, motors: Motors) -> None:
         """A command that the palm board has received at `time`; the joints' boards get it later."""
-        self._queue.append((time, np.array([getattr(motors, name) for name in _FIELDS], float)))
+        there = time + self.delay - 1e-9
+        self._queue.append((there, np.array([getattr(motors, name) for name in _FIELDS], float)))
+        self._next = min(self._next, there.min())
 
     def step(self, time: float, rotor: np.ndarray, speed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """One firmware period.
@@ -100,51 +107,63 @@ class Drives:
         Returns:
           Torque on the rotors and what dry friction can hold against it, both [12] Nm.
         """
-        if self._queue:
+        if time >= self._next:
             self._receive(time)
         self.current = current = self._current(rotor, speed)
-        ripple = 1.0 + self.ripple * np.sin(self.ripple_count * rotor)
-        drag = self.no_load_current * np.clip(speed / _AT_REST, -1.0, 1.0) * (current != 0.0)
-        torque = self._warm_constant() * ripple * (current - drag)
-        self._warm_up(current)
-        return torque, self.coulomb + (1.0 - self.efficiency) * np.abs(torque)
+        drag = self.no_load_current * np.minimum(np.maximum(speed / _AT_REST, -1.0), 1.0) * (current != 0.0)
+        torque = self._warm * (1.0 + self.ripple * np.sin(self.ripple_count * rotor)) * (current - drag)
+        self._squares += current * current
+        self._steps += 1
+        if self._steps == _HEAT_STEPS:
+            self._warm_up()
+        return torque, self.coulomb + self._loss * np.abs(torque)
 
     def _receive(self, time: float) -> None:
         """Each board in its turn takes the newest command that has had time to reach it."""
-        for sent, motors in self._queue:
-            self._board = np.where(time >= sent + self.delay, motors, self._board)
-        while self._queue and time >= self._queue[0][0] + self.delay.max():
+        for there, motors in self._queue:
+            self._board = np.where(time >= there, motors, self._board)
+        while self._queue and time >= self._queue[0][0].max():
             self._queue.popleft()
+        waiting = [there[there > time].min() for there, _ in self._queue]
+        self._next = min(waiting, default=np.inf)
+        self._on = self._board[5] == Mode.POSITION
+        self._limit = self._board[4] / FULL_TORQUE_MAX * STALL_CURRENT
+        self._most = self._limit * self.constant
 
     def _current(self, rotor: np.ndarray, speed: np.ndarray) -> np.ndarray:
-        position, kp, ki, kd, torque_max, mode = self._board
-        constant = self.constant
+        if not self._on.any():
+            self._integral[:], self._last = 0.0, None
+            return np.zeros_like(speed)
+        position, kp, ki, kd, _, _ = self._board
         shown = rotor + self.bias
-        rate = speed if self._last is None else (shown - self._last) / PERIOD
-        self._last = shown
-        self._speed += PERIOD / (PERIOD + _SPEED_TIME) * (rate - self._speed)
         error = position - shown
-        on = mode == Mode.POSITION
-        limit = torque_max / FULL_TORQUE_MAX * STALL_CURRENT
-        self._integral = np.where(on, self._integral + PERIOD * INTEGRAL * ki * error, 0.0)
-        self._integral = np.clip(self._integral, -limit * constant, limit * constant)
-        # The back-EMF acts on the winding as it is, the firmware's damping on its own estimate.
-        torque = (self.stiffness * kp * error + self._integral
-                  - DAMPING * kd * self._speed - self.emf * speed)
+        torque = self.stiffness * kp * error - self.emf * speed
+        if ki.any():
+            self._integral = np.clip(self._integral + PERIOD * INTEGRAL * ki * error, -self._most, self._most)
+            torque += self._integral
+        if kd.any():  # The firmware's damping acts on its own estimate, the back-EMF on the winding as it is.
+            rate = speed if self._last is None else (shown - self._last) / PERIOD
+            self._last = shown
+            self._speed += PERIOD / (PERIOD + _SPEED_TIME) * (rate - self._speed)
+            torque -= DAMPING * kd * self._speed
         # What the supply can drive against the back-EMF: less in the sense of motion, more against it.
-        hot = 1.0 + self.thermal * self.heat.rise * (self.winding - self.heat.reference)
         share = speed / self.no_load_speed
-        highest = np.clip(STALL_CURRENT * (1.0 - share) / hot, 0.0, limit)
-        lowest = -np.clip(STALL_CURRENT * (1.0 + share) / hot, 0.0, limit)
-        return np.where(on, np.clip(torque / constant, lowest, highest), 0.0)
+        highest = np.minimum(np.maximum(self._stalled * (1.0 - share), 0.0), self._limit)
+        lowest = np.minimum(np.maximum(self._stalled * (1.0 + share), 0.0), self._limit)
+        return np.where(self._on, np.minimum(np.maximum(torque / self.constant, -lowest), highest), 0.0)
 
-    def _warm_constant(self) -> np.ndarray:
-        warmer = np.maximum(self.winding - self.heat.reference, 0.0)
-        return self.constant * (1.0 - np.minimum(self.thermal * self.heat.weakening * warmer, 0.5))
-
-    def _warm_up(self, current: np.ndarray) -> None:
-        heat = self.heat
-        loss = self.thermal * current**2 * heat.resistance * (1 + heat.rise * (self.winding - heat.reference))
+    def _warm_up(self) -> None:
+        """Heat since the last time, and what the new temperature does to the motors."""
+        heat, time = self.heat, self._steps * PERIOD
+        loss = self.thermal * self._squares / self._steps * heat.resistance
+        loss *= 1 + heat.rise * (self.winding - heat.reference)
         across = (self.winding - self.case) / heat.to_case
-        self.winding += PERIOD * (loss - across) / heat.winding
-        self.case += PERIOD * (across - (self.case - heat.air) / heat.to_air) / heat.case
+        self.winding += time * (loss - across) / heat.winding
+        self.case += time * (across - (self.case - heat.air) / heat.to_air) / heat.case
+        self._feel_heat()
+
+    def _feel_heat(self) -> None:
+        warmer = self.thermal * np.maximum(self.winding - self.heat.reference, 0.0)
+        self._warm = self.constant * (1.0 - np.minimum(self.heat.weakening * warmer, 0.5))
+        self._stalled = STALL_CURRENT / (1.0 + self.heat.rise * warmer)
+        self._squares, self._steps = np.zeros_like(self._stalled), 0

@@ -6,8 +6,7 @@ The palm frame is the world's. Everything follows from the seed and the commands
 """
 
 import collections
-import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -48,16 +47,13 @@ def tilted_gravity(task: str, tilt: np.ndarray) -> np.ndarray:
     return down
 
 
-@dataclasses.dataclass(frozen=True)
-class _Past:
-    """What the sensors saw at one time."""
+class _Past(NamedTuple):
+    """What the sensors saw at one time; copies of MuJoCo's own vectors, to be picked from."""
 
-    encoder: np.ndarray
-    speed: np.ndarray
+    qpos: np.ndarray
+    qvel: np.ndarray
+    acceleration: np.ndarray  # [3] of the object
     current: np.ndarray
-    position: np.ndarray
-    quat: np.ndarray
-    acceleration: np.ndarray
 
 
 class EmulatedHand:
@@ -112,9 +108,10 @@ class EmulatedHand:
         late = max(float(self.draw.sensing_latency) - EXCHANGE_SENSE, 0.0)
         past, rng = self._before(late), self._noise
         position, quat, acceleration = self.measure_object()
-        noise = self.draw.encoder_noise * rng.standard_normal(past.encoder.shape)
+        shown = past.qpos[self._scene.drive_qpos] + self._drives.bias
         return Measurement(
-            time=self.time, joint_position=past.encoder + noise, joint_velocity=past.speed,
+            time=self.time, joint_velocity=past.qvel[self._scene.drive_dof],
+            joint_position=shown + self.draw.encoder_noise * rng.standard_normal(shown.shape),
             current=self._shown_current(past), temperature=self._drives.case.copy(),
             taxel_force=self._skin.report(self._felt(late), rng), object_quat=quat, object_position=position,
             object_acceleration=acceleration)
@@ -123,16 +120,19 @@ class EmulatedHand:
         """Place [3] m as a camera's masks give it, orientation [4] and acceleration [3] m/s^2 as an IMU in the object
         does: late, noisy and biased as those are."""
         draw, rng = self.draw, self._object_noise
-        seen = self._before(float(draw.camera_delay))
-        position = seen.position + draw.camera_noise * rng.standard_normal(3)
+        at = self._scene.object_qpos
+        position = self._before(float(draw.camera_delay)).qpos[at:at + 3]
+        position = position + draw.camera_noise * rng.standard_normal(3)
+        past = self._before(max(float(getattr(draw, "imu_delay", 0.0)) - IMU_TRANSPORT, 0.0))
+        quat = past.qpos[at + 3:at + 7].copy()
+        felt = matrix(quat).T @ (past.acceleration - self._gravity)
         if self.task != "rotate":
-            return position, seen.quat, seen.acceleration
-        past = self._before(max(float(draw.imu_delay) - IMU_TRANSPORT, 0.0))
+            return position, quat, felt
         heading = turn(self.up, float(draw.imu_drift) * (self.time - self._began))
         error = draw.imu_bias + draw.imu_noise * rng.standard_normal(3)
         angle = float(np.linalg.norm(error))
         skew = turn(error / max(angle, 1e-12), angle)
-        return position, product(product(heading, past.quat), skew), past.acceleration
+        return position, product(product(heading, quat), skew), felt
 
     def warm(self, joint: int, degrees: float) -> None:
         """Heat one motor (a fault)."""
@@ -185,7 +185,7 @@ class EmulatedHand:
         self._assistant.begin(self.time)
         self._referee = Referee(self.task, self._seconds)
         self._began, self._hottest = self.time, 0.0
-        self._push_until, self._push = -1.0, np.zeros(3)
+        self._push_until, self._push_at = None, np.inf
         self._pin(self._assistant.shelf(place), place)
         mujoco.mj_forward(scene.model, self._data)
         self._tips, self._touches = np.zeros((5, 3)), []
@@ -216,14 +216,15 @@ class EmulatedHand:
         rotor, speed = data.qpos[scene.drive_qpos], data.qvel[scene.drive_dof]
         torque, friction = drives.step(self.time, rotor, speed)
         data.qfrc_applied[scene.drive_dof] = torque
-        scene.model.dof_frictionloss[scene.drive_dof] = np.maximum(friction, 1e-6)
+        scene.model.dof_frictionloss[scene.drive_dof] = friction
         if self.stage is Stage.FREE:
             self._shove()
-        for _ in range(_SUBSTEPS):
-            if self.stage is not Stage.FREE:
-                self._pin(self._place.position if self.stage is Stage.HOLD else
-                          self._assistant.shelf(self._place), self._place)
-            mujoco.mj_step(scene.model, data)
+            mujoco.mj_step(scene.model, data, _SUBSTEPS)
+        else:
+            held = self._place.position if self.stage is Stage.HOLD else self._assistant.shelf(self._place)
+            for _ in range(_SUBSTEPS):
+                self._pin(held, self._place)
+                mujoco.mj_step(scene.model, data)
         self._ticks += 1
         self.time = self._ticks * PERIOD
         self._remember()
@@ -256,6 +257,7 @@ class EmulatedHand:
         free = self._room() if self._assistant.curious(self.time) else None
         if self._assistant.watch(self.time, targets, self._joints(), free) is Stage.FREE and before is Stage.HOLD:
             put(scene, data, self._place.position, self._place.quat, self._place.velocity)
+            self._plan_push()
 
     def _room(self) -> bool:
         probe = mujoco.MjData(self._scene.model)
@@ -264,15 +266,21 @@ class EmulatedHand:
 
     def _shove(self) -> None:
         """Pushes at random times: a force on the object for a moment."""
-        rate, fastest = PUSHES[self.task]
+        force = self._data.xfrc_applied[self._scene.object_body]
+        if self._push_until is not None and self.time >= self._push_until:
+            force[:3], self._push_until = 0.0, None
+        if self.time < self._push_at:
+            return
         rng, lasts = self._pushing, float(self.draw.push_seconds)
-        if rng.random() < rate * float(self.draw.push_rate) * PERIOD and self.time >= self._push_until:
-            way = rng.standard_normal(3)
-            way /= np.linalg.norm(way)
-            self._push = float(self.draw.mass) * fastest * rng.random() / lasts * way
-            self._push_until = self.time + lasts
-        on = self.time < self._push_until
-        self._data.xfrc_applied[self._scene.object_body, :3] = self._push if on else 0.0
+        way = rng.standard_normal(3)
+        change = PUSHES[self.task][1] * rng.random() * way / np.linalg.norm(way)
+        force[:3] = float(self.draw.mass) * change / lasts
+        self._push_until = self.time + lasts
+        self._plan_push()
+
+    def _plan_push(self) -> None:
+        rate = PUSHES[self.task][0] * float(self.draw.push_rate)
+        self._push_at = self.time + self._pushing.exponential(1 / rate) if rate > 0 else np.inf
 
     # --- sensors --------------------------------------------------------------------------------
 
@@ -305,12 +313,9 @@ class EmulatedHand:
         self._samples.append((self.time, force))
 
     def _remember(self) -> None:
-        scene, data, drives = self._scene, self._data, self._drives
-        at, dof = scene.object_qpos, scene.object_dof
-        quat = data.qpos[at + 3:at + 7].copy()
-        felt = -self._gravity if self.stage is not Stage.FREE else data.qacc[dof:dof + 3] - self._gravity
-        self._past.append(_Past(data.qpos[scene.drive_qpos] + drives.bias, data.qvel[scene.drive_dof],
-                                drives.current, data.qpos[at:at + 3].copy(), quat, matrix(quat).T @ felt))
+        data, dof = self._data, self._scene.object_dof
+        acceleration = data.qacc[dof:dof + 3].copy() if self.stage is Stage.FREE else np.zeros(3)
+        self._past.append(_Past(data.qpos.copy(), data.qvel.copy(), acceleration, self._drives.current))
 
     def _before(self, age: float) -> _Past:
         """What was a while ago; the oldest that is remembered, if that is less."""
