@@ -21,6 +21,8 @@ from dexsim_real.trouble import HandError, explain, latency_warnings
 _POLL = 0.002  # s, longest wait of one read
 _QUIET = 0.004  # s without a byte, after which nothing more of a frame will come
 
+_LONGEST = frames.OVERHEAD + frames.STATE_BLOCK.itemsize  # bytes of the longest answer
+
 
 def passive_command() -> np.ndarray:
     """Joint commands that leave all motors off."""
@@ -131,16 +133,15 @@ class SerialHand:
         while not final:
             data, now = self._read(), time.monotonic()
             heard = now if data else heard
-            final = now > deadline and (now - heard > _QUIET or now > deadline + self.config.on_wire(reply))
+            final = now > deadline and (now - heard > _QUIET or now > deadline + self.config.on_wire(_LONGEST))
             for frame in self._parser.feed(data) + (self._parser.expire() if final else []):
                 self._tap("rx", frame.encode())
-                if self.config.paced and now - sent < self.config.on_wire(
-                        request + frames.OVERHEAD + len(frame.data)):
-                    # It cannot be the answer to what has just been asked.
-                    self.counts.late += 1
-                    self._received -= frames.OVERHEAD + len(frame.data)
-                elif frame.command in (command, Command.ERROR):
+                size = frames.OVERHEAD + len(frame.data)
+                possible = not self.config.paced or now - sent >= self.config.on_wire(request + size)
+                if possible and frame.command in (command, Command.ERROR):
                     return frame
+                self.counts.late += 1  # It answers something that was given up.
+                self._received -= size
         return None
 
     def _read(self) -> bytes:
@@ -152,7 +153,7 @@ class SerialHand:
 
     def _discard(self) -> None:
         """Throw away what came too late, to its end: it must not pass for the next answer."""
-        found, until = [], time.monotonic() + self.config.on_wire(frames.OVERHEAD + frames.STATE_BLOCK.itemsize)
+        found, until = [], time.monotonic() + self.config.on_wire(_LONGEST)
         while (self._serial.in_waiting or self._parser.pending) and time.monotonic() < until:
             data = self._read()
             if not data:

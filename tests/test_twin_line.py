@@ -211,7 +211,7 @@ class Bench:
     def __init__(self, folder, hand, *, line=None, seed=0):
         self.plant, self.notes = ScriptedPlant(), []
         self.board = Firmware(self.plant, FirmwareConfig(), self.notes.append)
-        self.line = HandLine(folder / "hand", self.plant, self.board, CommandCheck(
+        self.line = HandLine(Terminal(folder / "hand"), self.plant, self.board, CommandCheck(
             hand.joint_lower, hand.joint_upper, LimitsConfig()), Injector(FaultConfig(), seed), line or LineConfig(),
             seed=seed, note=self.notes.append)
         self.now = 100.0

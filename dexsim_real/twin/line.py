@@ -7,7 +7,6 @@ answer's bytes, handed on in pieces as a USB adapter does. With the default paus
 import dataclasses
 from collections import Counter, deque
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 
@@ -58,16 +57,16 @@ class HandLine:
     """Serves one terminal. Owns no clock: `serve` is called often, with the time, and whenever `due` has come.
 
     Args:
-      link: name of the terminal.
+      terminal: its own end of the cable.
       check: takes every command that arrives whole.
       catch_up: called with a time s before the hand acts, to bring the plant there.
       note: called with one line for what a user should know.
     """
 
-    def __init__(self, link: Path, plant: Plant, firmware: Firmware, check: CommandCheck, injector: Injector,
+    def __init__(self, terminal: Terminal, plant: Plant, firmware: Firmware, check: CommandCheck, injector: Injector,
                  config: LineConfig, *, seed: int = 0, catch_up: Callable[[float], None] = lambda now: None,
                  note: Callable[[str], None] = lambda text: None):
-        self.terminal, self.config = Terminal(link), config
+        self.terminal, self.config = terminal, config
         self.firmware, self.check, self.injector = firmware, check, injector
         self.counts: Counter[str] = Counter()
         self.slowest = 0.0  # s, longest exchange without a fault
@@ -81,7 +80,7 @@ class HandLine:
         self._back: float | None = None  # s, when the plug is put in again
         self._deaf = -np.inf  # s, until when nothing is heard
         self._heard_all = self._said_all = -np.inf  # s, end on the wire of the last request and answer
-        self._heard = -np.inf
+        self._heard = self._acted = -np.inf
         self._cooling: list[tuple[float, Fault]] = []
         self._strange: int | None = None
 
@@ -160,6 +159,9 @@ class HandLine:
         self._bodily(now, fault)
         damaged = fault is not None and fault.on_request
         self._catch_up(now)
+        if now - self._acted > _SILENCE:
+            self._parser.expire()  # Half a request from before the silence.
+        self._acted = now
         answers = []
         for frame in self._parser.feed(
                 self.injector.damage(fault, request.whole) if damaged else request.whole):

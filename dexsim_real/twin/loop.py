@@ -19,6 +19,7 @@ from dexsim_real.twin.firmware import Firmware
 from dexsim_real.twin.line import HandLine
 from dexsim_real.twin.object_side import ImuSide, MaskSide
 from dexsim_real.twin.options import TwinArguments
+from dexsim_real.twin.terminal import Terminal
 from dexsim_real.twin.types import Plant
 
 _EVENTS = 20_000  # kept for the report
@@ -97,8 +98,8 @@ class Twin:
         self.firmware = Firmware(plant, arguments.firmware, self.note)
         self.injector = Injector(arguments.faults, seed)
         self.check = CommandCheck(hand.joint_lower, hand.joint_upper, arguments.limits)
-        self.line = HandLine(arguments.link or folder / "hand", plant, self.firmware, self.check, self.injector,
-                             arguments.line, seed=seed, catch_up=self.world.catch_up, note=self.note)
+        self.line = HandLine(Terminal(arguments.link or folder / "hand"), plant, self.firmware, self.check,
+                             self.injector, arguments.line, seed=seed, catch_up=self.world.catch_up, note=self.note)
         self.imu: ImuSide | None = None
         self.masks: MaskSide | None = None
         try:
