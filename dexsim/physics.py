@@ -16,10 +16,10 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from dexsim import contact
+from dexsim import contact, rotations, tactile
 from dexsim.config import setting, validate
 from dexsim.errors import AssetError, ConfigError
-from dexsim.hand import Hand
+from dexsim.hand import Hand, forward_kinematics
 from dexsim.model_guard import check_model
 from dexsim.objects import ObjectParams, bounding_radius
 from dexsim.pytree import pytree_dataclass
@@ -39,13 +39,13 @@ _OVERFLOW = 1 | 2 | 4 | 8 | 16 | 64
 class PhysicsConfig:
     """Time step, solver and contact model."""
 
-    timestep: float = setting(0.005, unit="s", low=1e-4, high=0.02)
+    timestep: float = setting(0.006, unit="s", low=1e-4, high=0.02)
     """One physics sub-step."""
-    substeps: int = setting(6, unit="1", low=1, high=200)
+    substeps: int = setting(5, unit="1", low=1, high=200)
     """Sub-steps in one control tick; the control rate is 1 / (timestep * substeps)."""
-    iterations: int = setting(5, unit="1", low=1, high=100)
+    iterations: int = setting(3, unit="1", low=1, high=100)
     """Newton iterations of the contact solver."""
-    line_search: int = setting(8, unit="1", low=1, high=100)
+    line_search: int = setting(6, unit="1", low=1, high=100)
     """Line-search iterations in each of them."""
     condim: int = setting(3, unit="1", low=1, high=6)
     """Contact dimension between hand and object: 3 sliding, 4 with torsion, 6 with rolling."""
@@ -57,6 +57,11 @@ class PhysicsConfig:
     cover: float = setting(0.003, unit="m", low=0.0, high=0.01)
     """Rubber over the fingertips: their geoms, which follow the taxels, touch this far out. Keep it
     equal to `Skin.margin`, so that solver and taxels begin to feel at the same distance."""
+    pad_points: int = setting(3, unit="1", low=1, high=8)
+    """Spheres in a row that stand for each capsule of a fingertip against the object."""
+    tips: str = setting("skin", choices=("skin", "constant"))
+    """Stiffness of the fingertips: as the skin's law over the taxels has it, by the tick, which makes
+    edges softer than faces; or the same everywhere."""
     settling: float = setting(0.03, unit="s", low=0.005, high=0.2)
     """Time scale on which a contact pushes out what lies in it (at least four time steps)."""
     palm: str = setting("face", choices=("face", "box"))
@@ -114,7 +119,7 @@ class Physics:
 
     def __init__(self, hand: Hand, slots: tuple[str, ...], largest: np.ndarray,
                  config: PhysicsConfig, *, gravity: tuple[float, float, float],
-                 backend: str = "auto", num_envs: int = 1):
+                 backend: str = "auto", num_envs: int = 1, skin: tactile.Skin | None = None):
         """Compile.
 
         Args:
@@ -125,6 +130,7 @@ class Physics:
           gravity: m/s^2 in the palm frame, which is the world's.
           backend: "auto", "jax" or "warp".
           num_envs: batch size that Warp's contact buffer is sized for.
+          skin: of the fingertips, whose stiffness it sets; without one it is constant.
 
         Raises:
           AssetError: the model uses what the backend ignores or lacks.
@@ -132,6 +138,7 @@ class Physics:
         from mujoco import mjx
 
         self.hand, self.slots, self.config = hand, slots, config
+        self.skin = skin if config.tips == "skin" else None
         self._mjx = mjx
         self.backend = choose_backend(backend)
         # Warp shares one contact buffer among all worlds; the rest is per world.
@@ -163,19 +170,34 @@ class Physics:
         self._is_object_geom = np.isin(np.arange(model.ngeom), self.object_geoms)
 
     def _find_pairs(self) -> None:
-        self.object_pairs = contact.pairs_with(self.mj_model, self.object_geoms)
-        self._compliance, self._share = contact.pair_constants(
-            self.mj_model, self.object_pairs, self.object_geoms, _tips(self.mj_model, self.hand))
+        model, tips = self.mj_model, _tips(self.mj_model, self.hand)
+        self.object_pairs = contact.pairs_with(model, self.object_geoms)
+        self._compliance, self._share, self._finger_of_pair = contact.pair_constants(
+            model, self.object_pairs, tips)
+        self._pads = contact.find_pads(model, self.object_pairs, tips)
 
-    def configure(self, target: ObjectParams) -> Any:
-        """The MJX model with one environment's object and contact parameters put in."""
+    def tip_stiffness(self, target: ObjectParams, qpos: jax.Array) -> jax.Array:
+        """How much stiffer [F] than nominal the fingertips are where they press now."""
+        place = qpos[self.object_qpos]
+        turn = rotations.quat_to_matrix(place[3:] / jnp.linalg.norm(place[3:]))
+        pose = forward_kinematics(self.hand, qpos[self.joint_qpos])
+        return contact.follow_skin(self.hand, self._pads, self.skin, pose, target, place[:3], turn)
+
+    def configure(self, target: ObjectParams, tips: jax.Array | None = None) -> Any:
+        """The MJX model with one environment's object and contact parameters put in.
+
+        `tips` [F] is the fingertips' stiffness over the nominal one (`tip_stiffness`).
+        """
         model, geoms, body = self._model, self.object_geoms, self.object_body
         pair = self.object_pairs
         slide = jnp.broadcast_to(target.friction, (len(pair), 2))
         # body_invweight0 keeps its template value on purpose: the contact's parameters are worked
         # out from it, and stiffness must not change with the mass of what is touched.
+        share = jnp.asarray(self._share)
+        if tips is not None:
+            share *= jnp.append(tips, 1.0)[self._finger_of_pair]  # -1, no finger's: the last
         solref, solimp = contact.spring(
-            self._compliance, self._share * target.contact[0], target.contact[1], target.friction,
+            self._compliance, share * target.contact[0], target.contact[1], target.friction,
             period=self.config.contact_period, edges=self.config.pyramid_edges)
         return model.replace(
             geom_size=model.geom_size.at[geoms].set(target.size),
@@ -223,7 +245,8 @@ class Physics:
           The state after the tick, the contact force of the object on each finger's tip link
           [F, 3] N in the palm frame, at the last sub-step, and the motors' memory.
         """
-        model = self.configure(target)
+        tips = None if self.skin is None else self.tip_stiffness(target, state.qpos)
+        model = self.configure(target, tips)
         data = self._make_data().replace(qpos=state.qpos, qvel=state.qvel,
                                          qacc_warmstart=state.warmstart)
         wrench = jnp.zeros((self.mj_model.nbody, 6)).at[self.object_body, :3].set(push)
@@ -311,6 +334,7 @@ def build_model(hand: Hand, slots: tuple[str, ...], largest: np.ndarray, config:
     palm.pos, palm.quat = [0, 0, 0], [1, 0, 0, 0]
     touching = _touching_geoms(spec, hand, config)
     contact.cover_tips(spec, hand, config.cover)
+    touching = contact.split_pads(spec, hand, touching, config.pad_points)
     for geom in spec.geoms:
         geom.contype = geom.conaffinity = 0
 
@@ -331,7 +355,7 @@ def build_model(hand: Hand, slots: tuple[str, ...], largest: np.ndarray, config:
                             objtype=mujoco.mjtObj.mjOBJ_BODY, objname=hand.body_names[b],
                             reftype=mujoco.mjtObj.mjOBJ_BODY, refname="object",
                             intprm=[2, 3, 1], dim=3)
-    _set_options(spec, config, gravity)
+    _set_options(spec, config, gravity, backend)
     for pair in spec.pairs:
         if pair.condim == 1 and spec.option.cone == mujoco.mjtCone.mjCONE_ELLIPTIC:
             # MJX-JAX knows no frictionless contacts beside elliptic cones; this one slides as freely.
@@ -339,9 +363,9 @@ def build_model(hand: Hand, slots: tuple[str, ...], largest: np.ndarray, config:
     model = spec.compile()
     geoms = np.flatnonzero(model.geom_bodyid == model.body("object").id)
     pairs = contact.pairs_with(model, geoms)
-    compliance, share = contact.pair_constants(model, pairs, geoms, _tips(model, hand))
+    compliance, share, _ = contact.pair_constants(model, pairs, _tips(model, hand))
     model.pair_solref[pairs], model.pair_solimp[pairs] = contact.spring(
-        compliance, share * 1700.0, 2.0, 0.9, period=config.contact_period, edges=config.pyramid_edges)
+        compliance, share * contact.NOMINAL, 2.0, 0.9, period=config.contact_period, edges=config.pyramid_edges)
     return model
 
 
@@ -364,7 +388,7 @@ def _touching_geoms(spec: mujoco.MjSpec, hand: Hand, config: PhysicsConfig) -> l
 
 
 def _set_options(spec: mujoco.MjSpec, config: PhysicsConfig,
-                 gravity: tuple[float, float, float]) -> None:
+                 gravity: tuple[float, float, float], backend: str) -> None:
     option = spec.option
     option.timestep, option.gravity = config.timestep, gravity
     option.integrator = mujoco.mjtIntegrator.mjINT_EULER
@@ -373,6 +397,10 @@ def _set_options(spec: mujoco.MjSpec, config: PhysicsConfig,
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC if elliptic else mujoco.mjtCone.mjCONE_PYRAMIDAL
     option.impratio = config.friction_ratio if elliptic else 1.0
+    if elliptic and backend == "warp":
+        # Warp builds the Hessian of elliptic cones in one go only where the Jacobian is sparse: a
+        # third faster here, though a dense one would fit as well.
+        option.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
     option.iterations, option.ls_iterations = config.iterations, config.line_search
     # Box-box has its own kernel only with nativeccd off; eulerdamp costs a factorisation more.
     option.disableflags |= (mujoco.mjtDisableBit.mjDSBL_EULERDAMP

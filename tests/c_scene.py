@@ -21,27 +21,28 @@ GRAVITY = (9.81, 0.0, 0.0)
 # Solved to the end, so that what differs between engines is arithmetic and contact geometry.
 CONVERGED = {"iterations": 50, "line_search": 50}
 COVER = 0.003  # m, rubber over the pads
+ROW = 3  # spheres along a pad
 KINDS = ("box", "capsule", "cylinder")  # the order of `dexsim.objects.SLOTS`
 
 
-def compile_scene(hand, target, *, gravity=GRAVITY, timestep=0.005, iterations=5,
-                  line_search=8, condim=3, margin=0.0, exact=False,
+def compile_scene(hand, target, *, gravity=GRAVITY, timestep=0.006, iterations=3,
+                  line_search=6, condim=3, margin=0.0, exact=False,
                   settling=0.03) -> mujoco.MjModel:
     """One object (`ObjectParams` of NumPy leaves) under the hand.
 
-    Fingertips wear 3 mm of rubber and press with `target.contact[0]` newtons a metre of depth, on
-    boxes with 0.7 of that, other links and the palm with 2.5 of it. `margin` m lists contacts that
-    far apart, for clearances, which are those of the bare pads. `exact` takes C MuJoCo's native
-    convex collisions, whose one contact of a capsule on a cylinder is right; the older ones, which
-    box on box needs, give up to five at once, some of them millimetres too deep.
+    Fingertips wear 3 mm of rubber; each of their three spheres presses with half of
+    `target.contact[0]` newtons a metre of depth (see `follow_skin`), other links and the palm with
+    2.5 of it. `margin` m lists contacts that far apart, for clearances, which are those of the bare
+    pads. `exact` takes C MuJoCo's native convex collisions, whose one contact of a capsule on a
+    cylinder is right; the older ones, which box on box needs, give up to five at once, some of them
+    millimetres too deep.
     """
     spec = mujoco.MjSpec.from_file(str(hand.model_path))
     for actuator in list(spec.actuators):
         spec.delete(actuator)
     names = [g.name for g in spec.geoms if (g.contype or g.conaffinity) and g.name != "palm"]
-    for geom in spec.geoms:
-        if "_pad" in geom.name and not margin:
-            geom.size = [geom.size[0] + COVER, *geom.size[1:]]
+    if not margin:
+        names = [name for geom in names for name in _clad(spec, geom)]
     for geom in spec.geoms:
         geom.contype = geom.conaffinity = 0
     body = spec.worldbody.add_body(name="object", mass=float(target.mass), explicitinertial=True,
@@ -72,22 +73,51 @@ def compile_scene(hand, target, *, gravity=GRAVITY, timestep=0.005, iterations=5
     return model
 
 
-def _set_springs(model: mujoco.MjModel, target, settling: float) -> None:
+def _clad(spec: mujoco.MjSpec, name: str) -> list[str]:
+    """Rubber over a pad, and what of it meets the object: a row of spheres along its axis."""
+    if "_pad" not in name:
+        return [name]
+    pad = spec.geom(name)
+    radius, ends = pad.size[0] + COVER, np.reshape(pad.fromto, (2, 3))
+    pad.size = [radius, *pad.size[1:]]
+    for k in range(ROW):
+        share = k / (ROW - 1)
+        pad.parent.add_geom(name=f"{name}_{k}", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[radius, 0, 0],
+                            pos=(1 - share) * ends[0] + share * ends[1], mass=0)
+    return [f"{name}_{k}" for k in range(ROW)]
+
+
+def follow_skin(model: mujoco.MjModel, data: mujoco.MjData, hand, target, law, settling=0.03) -> None:
+    """Give each fingertip's springs the stiffness with which they press as the skin does: sum K r = S.
+
+    Depths r are those of C MuJoCo's own contacts; S is `law(qpos, target)` (`skin_law`).
+    """
+    mujoco.mj_fwdPosition(model, data)
+    felt = np.asarray(law(jnp.asarray(data.qpos, jnp.float32)[None],
+                          jax.tree.map(lambda leaf: np.asarray(leaf)[None], target)))[0]
+    tips = [model.body(hand.body_names[b]).id for b in hand.tip_body]
+    body = model.body("object").id
+    depth = np.zeros(len(tips))
+    for contact in data.contact:
+        first, second = model.geom_bodyid[contact.geom]
+        if second == body and first in tips:
+            depth[tips.index(first)] += max(-contact.dist, 0.0)
+    ratio = np.clip((felt + 0.425) / (850 * depth + 0.425), 0.25, 4)  # 850 N/m, 0.5 mm
+    _set_springs(model, target, settling, dict(zip(tips, ratio, strict=True)))
+
+
+def _set_springs(model: mujoco.MjModel, target, settling: float, tips=None) -> None:
     """The contact's stiffness in MuJoCo's terms: N = K r with aref = r / settling^2."""
     stiffness, ratio = (float(x) for x in target.contact)
-    for pair in range(model.npair):
-        first, second = model.pair_geom1[pair], model.pair_geom2[pair]
-        if model.geom(second).name not in KINDS:
-            continue
-        if "_pad" in model.geom(first).name:
-            wanted = stiffness * (0.7 if model.geom(second).name == "box" else 1.0)
-        else:
-            wanted = 2.5 * stiffness
-        weight = sum(model.body_invweight0[model.geom_bodyid[g], 0] for g in (first, second))
-        # mj_diagApprox and mj_makeImpedance: R = weight (1 - d) / d, and at rest N = aref / R.
-        d = weight / (weight + 1 / (settling**2 * wanted))
-        model.pair_solref[pair] = -d / settling**2, -2 * ratio * d / settling
-        model.pair_solimp[pair] = d, d, 0.001, 0.5, 2
+    pairs = np.flatnonzero(model.geom_bodyid[model.pair_geom2] == model.body("object").id)
+    links, first = model.geom_bodyid[model.pair_geom1[pairs]], model.geom_type[model.pair_geom1[pairs]]
+    pad = 0.5 if tips is None else np.array([0.5 * tips.get(body, 0.0) for body in links])
+    wanted = stiffness * np.where(first == mujoco.mjtGeom.mjGEOM_SPHERE, pad, 2.5)
+    weight = model.body_invweight0[links, 0] + model.body_invweight0[model.body("object").id, 0]
+    # mj_diagApprox and mj_makeImpedance: R = weight (1 - d) / d, and at rest N = aref / R.
+    d = weight / (weight + 1 / (settling**2 * wanted))
+    model.pair_solref[pairs] = np.stack([-d / settling**2, -2 * ratio * d / settling], -1)
+    model.pair_solimp[pairs] = np.stack([d, d, *np.tile([[0.001], [0.5], [2]], len(d))], -1)
 
 
 def start(model: mujoco.MjModel, qpos, qvel, warmstart=None) -> mujoco.MjData:
