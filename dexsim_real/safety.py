@@ -25,6 +25,8 @@ from dexsim.hand import Hand
 from dexsim_real.frames import Mode
 from dexsim_real.sensing import Measured
 
+_SILENT, _DEAD = "no measurement", "no wish"  # reasons that end in motors off when they last
+
 
 class Reaction(enum.IntEnum):
     """What was done to a wish, the harshest last."""
@@ -153,17 +155,18 @@ class Safety:
         if fatal:
             self.relax(fatal)
             return self._finish(now, Reaction.RELAX, fatal, self._rest())
-        if self._commanded is None:
-            self._start(now, sample)
         reason = self._reason_to_hold(now, sample)
+        # A hand that was silent may have turned its motors off: its pose may be another.
+        back = self.last[1] == _SILENT and reason != _SILENT
+        if self._commanded is None or back:
+            self._start(now, sample)
         if reason:
             if self._held is None:
                 self._held = self._inside(sample.measured.joint_position)
             if reason != self.last[1]:
                 self._since = now
-            old = reason.startswith(("no measurement", "no wish"))
-            if old and now - self._since > config.patience:
-                if reason.startswith("no wish"):
+            if reason in (_SILENT, _DEAD) and now - self._since > config.patience:
+                if reason == _DEAD:
                     self.relax(f"{reason} for {config.patience:g} s")
                 # Without news of the hand its pose is unknown: start from the measured one again.
                 self._commanded = None
@@ -171,7 +174,6 @@ class Safety:
             self._commanded = self._held
             return self._finish(now, Reaction.HOLD, reason, self._held)
         if self._held is not None:
-            self._held = None
             self._start(now, sample)
         return self._follow(now, sample)
 
@@ -189,7 +191,7 @@ class Safety:
     def _reason_to_hold(self, now: float, sample: Sample) -> str:
         config, force = self.config, sample.measured.finger_force
         if now - sample.time > config.stale:
-            return "no measurement"
+            return _SILENT
         if np.any(np.abs(sample.velocity) > config.joint_speed):
             return "a joint is too fast"
         if force.max() > config.finger_force or force.sum() > config.total_force:
@@ -198,11 +200,11 @@ class Safety:
             return "wish is not finite"
         # Before the first wish the start pose is the wish.
         if self._wish is not None and now - self._wish[0] > config.watchdog:
-            return "no wish"
+            return _DEAD
         return self._wish[2] if self._wish is not None else ""
 
     def _start(self, now: float, sample: Sample) -> None:
-        self._commanded = self._inside(sample.measured.joint_position)
+        self._commanded, self._held = self._inside(sample.measured.joint_position), None
         self._ramp_start = self._time = now
         self.anchor += 1
 

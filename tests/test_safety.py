@@ -195,6 +195,22 @@ def test_a_reconnected_hand_starts_from_its_pose(bench):
     assert bench.safety.anchor == anchor + 1
 
 
+@pytest.mark.parametrize("back", [{"generation": 2}, {}])
+def test_a_hand_that_was_away_during_a_hold_is_held_where_it_then_is(bench, back):
+    """Its motors were off meanwhile, by its own watchdog if not by a new connection: the pose of before is history."""
+    def unseen(**event):
+        bench.safety.wish(MIDDLE, bench.now, "the object is out of sight")
+        return bench.cycle(**event)
+
+    assert all(unseen().reason == "the object is out of sight" for _ in range(5))
+    assert [unseen(fresh=False).reason for _ in range(10)][-1] == "no measurement"
+    bench.position = MIDDLE - np.float32(0.4) * FREE
+    for _ in range(3):
+        decision = unseen(follow=False, **back)
+        assert (decision.reaction, decision.reason) == (Reaction.HOLD, "the object is out of sight")
+        np.testing.assert_array_equal(decision.position, bench.position)
+
+
 def test_changes_are_noted_once(bench):
     bench.notes.clear()
     bench.run(0.5, wish=MIDDLE, force=30.0)

@@ -2,6 +2,9 @@
 own counters."""
 
 import dataclasses
+import importlib.util
+import json
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -22,6 +25,8 @@ from dexsim_real.twin.check import CommandCheck, LimitsConfig
 from dexsim_real.twin.faults import BYTES, KINDS, Fault, FaultConfig, Injector, parse_fault
 from dexsim_real.twin.firmware import Firmware, FirmwareConfig
 from dexsim_real.twin.line import HandLine, LineConfig
+
+ROOT = Path(__file__).resolve().parent.parent
 
 
 @pytest.mark.parametrize(("line", "message"), [
@@ -298,3 +303,34 @@ def test_the_hand_is_safe_within_a_tenth_of_a_second_of_losing_its_host(hand, mo
 
 def test_parse_gives_time_kind_and_values():
     assert parse_fault("12.5 stall 0.2") == (12.5, "stall", ("0.2",)) and parse_fault("3 drop") == (3.0, "drop", ())
+
+
+# --- whole processes -----------------------------------------------------------------------------
+
+@pytest.fixture(scope="module")
+def soak():
+    spec = importlib.util.spec_from_file_location("soak", ROOT / "benchmarks" / "soak.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+PATIENT = ["--no-realtime", "--safe", "1", "--runner", "--link.margin 0.2 --safety.stale 0.6 --safety.watchdog 0.5",
+           "--twin", "--faults.late-seconds 0.4 0.5 --faults.stall-seconds 0.1 0.3 --firmware.watchdog 0.5"]
+"""For a machine that has other things to do."""
+
+
+@pytest.mark.slow
+def test_a_short_soak(soak, capsys):
+    code = soak.main(["--minutes", "0.14", "--kills", "0", "--scale", "4", *PATIENT])
+    row = json.loads(capsys.readouterr().out)
+    assert code == 0 and row["ok"], row
+    assert row["runs"] >= 1 and row["commands"] > 100 and sum(row["injected"].values()) > 5
+
+
+@pytest.mark.slow
+def test_two_runners_die(soak, capsys):
+    code = soak.main(["--minutes", "0", "--kills", "2", "--life", "4", "--seed", "1", *PATIENT])
+    row = json.loads(capsys.readouterr().out)
+    assert code == 0 and row["ok"], row
+    assert row["kills"] == 2 and row["commands"] > 50

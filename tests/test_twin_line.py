@@ -190,6 +190,7 @@ def test_commands_outside_limits_are_told_apart(hand):
     assert found(command()) == found(command(), command(REST + moved)) == found(off) == []
     assert found(command(), command(REST + 1.1 * moved)) == ["speed"]
     assert found(command(), command(REST + 1.1 * moved), step=0.014) == []
+    assert found(command(REST + 3 * moved), command()) == []  # It may always stop.
     assert found(off, command(REST + 0.04)) == [] and found(off, command(REST + 0.06)) == ["start"]
     assert found(command(REST - 0.01), command(np.where(np.arange(12) == 0, -0.01, REST)), step=1.0) == ["range"]
     beyond = hand.joint_upper + 2e-5
@@ -554,6 +555,8 @@ def test_it_ends_in_good_order_when_it_is_told_to(tmp_path):
 def test_what_is_wrong_is_said_in_one_line(tmp_path):
     for options, message in (
             (["--faults.script", "5 melt"], "no kind 'melt'"), (["--task", "juggle"], "choose from grasp, rotate"),
+            (["--policy", "grasp"], "of the task 'grasp', the hand is mounted for 'rotate'"),
+            (["--policy", "nobody"], "nobody: no such file"),
             (["--plant", "nowhere:make"], "No module named 'nowhere'"), (["--faults.flip", "2"], "between 0 and 1"),
             (["--plant", "twin_plant:make", "--link", str(tmp_path / "no" / "port")], "no pseudo-terminal"),
             (["--plant", "twin_plant:make", "--mask-socket", str(tmp_path / "no" / "m")], "no socket for masks")):

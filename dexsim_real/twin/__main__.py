@@ -13,6 +13,8 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
 from dexsim.hand import Hand, load_hand
 from dexsim_ppo import cli
 from dexsim_real.servo import use_realtime
@@ -37,8 +39,28 @@ def make_plant(arguments: TwinArguments, hand: Hand) -> Plant:
             raise HandError(f"{arguments.plant}: {error}") from None
     from dexsim_real.twin.plant import EmulatedHand
 
-    return EmulatedHand(hand, arguments.task, arguments.seed, kind=arguments.draw, seconds=arguments.seconds,
-                        command=arguments.command, shapes=arguments.shapes or None)
+    return EmulatedHand(hand, arguments.task, arguments.seed, trials=arguments.trials, kind=arguments.draw,
+                        seconds=arguments.seconds, command=arguments.command, first=arguments.first,
+                        shape=None if arguments.shape == "any" else arguments.shape)
+
+
+def check_policy(name: str, task: str, hand: Hand) -> None:
+    """A policy is for this task, and for a hand that is mounted as this one.
+
+    Raises:
+      HandError: it is not.
+    """
+    from dexsim_ppo.evaluate import load_policy
+    from dexsim_real.control import load_task
+    from dexsim_real.twin.plant import nominal_gravity
+
+    policy = load_policy(name)
+    if policy.task != task:
+        raise HandError(f"{name} is a policy of the task {policy.task!r}, the hand is mounted for {task!r}")
+    trained, mounted = load_task(task, policy.env_config, hand).gravity, nominal_gravity(task)
+    if np.abs(np.asarray(trained) - mounted).max() > 0.01:
+        raise HandError(f"{name} was trained with gravity {np.round(trained, 2).tolist()} m/s^2 in the palm's frame, "
+                        f"the emulated hand is mounted for {np.round(mounted, 2).tolist()}")
 
 
 def runner_command(twin: Twin) -> list[str]:
@@ -68,6 +90,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = cli.parse(TwinArguments, sys.argv[1:] if argv is None else argv, prog="python -m dexsim_real.twin",
                           description="Emulate a hand on a pseudo-terminal.")
     hand = load_hand()
+    if arguments.policy:
+        check_policy(arguments.policy, arguments.task, hand)
     with tempfile.TemporaryDirectory(prefix="dexsim-twin-") as folder:
         twin = Twin(arguments, hand, make_plant(arguments, hand), Path(folder),
                     lambda text: print(text, flush=True))

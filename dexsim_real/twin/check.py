@@ -1,7 +1,7 @@
 """What the emulated hand thinks of its orders: every one is held against limits, whatever the motors do with it."""
 
 import dataclasses
-from collections import Counter
+from collections import Counter, deque
 
 import numpy as np
 
@@ -14,7 +14,10 @@ class LimitsConfig:
     """What no command may exceed. The joints' own ranges come with the hand."""
 
     speed: float = setting(20.0, unit="rad/s", low=0.01, high=1000.0)
-    """Fastest change of a commanded angle: the bridge's own `--safety.speed`."""
+    """Fastest change of a commanded angle: the bridge's own `--safety.speed`. A joint may always be told to stop
+    where it is or has been in the last `recent` seconds."""
+    recent: float = setting(0.15, unit="s", low=0.0, high=10.0)
+    """How old the news of a joint may be by which the bridge stops it."""
     slack: float = setting(0.004, unit="s", low=0.0, high=1.0)
     """Time by which two commands may have come closer together than they were decided."""
     reach: float = setting(0.75, unit="rad", low=0.01, high=10.0)
@@ -46,6 +49,7 @@ class CommandCheck:
         self.wrong: Counter[str] = Counter()
         self.first: list[str] = []  # the first few, in words
         self._last: tuple[float, np.ndarray, np.ndarray] | None = None
+        self._shown: deque[tuple[float, np.ndarray]] = deque()  # what was reported lately
 
     def take(self, now: float, command: np.ndarray, reported: np.ndarray) -> list[str]:
         """What is wrong with joint commands [12] (`frames.JOINT_COMMAND`) received at `now` s.
@@ -63,6 +67,9 @@ class CommandCheck:
 
     def _find(self, now: float, command: np.ndarray, reported: np.ndarray) -> list[str]:
         config, position = self.config, command["position"].astype(float)
+        self._shown.append((now, reported))
+        while self._shown[0][0] < now - config.recent:
+            self._shown.popleft()
         on = command["mode"] != Mode.PASSIVE
         before, self._last = self._last, None
         if not np.isin(command["mode"], list(Mode)).all():
@@ -82,12 +89,19 @@ class CommandCheck:
         fresh = on if before is None else on & ~before[2]
         if np.any(fresh & (np.abs(position - reported) > config.start)):
             found.append("start")
-        if before is not None and np.any(on & before[2]):
-            speed = np.nanmax(np.abs(position - before[1])[on & before[2]]) / (now - before[0] + config.slack)
-            self.fastest = max(self.fastest, float(speed))
+        if before is not None:
+            step = np.where(on & before[2] & ~self._stops(position), np.abs(position - before[1]), 0.0)
+            speed = float(np.nanmax(step)) / (now - before[0] + config.slack)
+            self.fastest = max(self.fastest, speed)
             if speed > config.speed:
                 found.append("speed")
         return found
+
+    def _stops(self, position: np.ndarray) -> np.ndarray:
+        """Which joints [12] are told to be where they lately were."""
+        shown = np.stack([angles for _, angles in self._shown])
+        near = self.config.start
+        return (position >= shown.min(0) - near) & (position <= shown.max(0) + near)
 
     def report(self) -> dict[str, object]:
         """Counts for the summary."""

@@ -69,6 +69,7 @@ class Firmware:
         self.stuck: dict[tuple[int, int], int] = {}  # counts of a taxel (tip, number) that shows nothing else
         self.reported = np.zeros(frames.JOINTS)  # rad, angles of the last state sent
         self.trips: list[float] = []  # times s of the watchdog
+        self.longest = 0.0  # s, from the last exchange until it acted
         self._zero = np.zeros((frames.TIPS, frames.TAXELS, 3), np.int32)
         self._alive = -np.inf  # s, time of the last valid exchange
         self._hot = np.zeros(frames.JOINTS, bool)
@@ -90,6 +91,7 @@ class Firmware:
         if now < self.deadline:
             return False
         self.trips.append(now)
+        self.longest = max(self.longest, now - self._alive)
         self._abandoned = True
         self._drive(dataclasses.replace(self.motors, mode=np.zeros(frames.JOINTS, int)))
         self._note(f"watchdog: no exchange for {1e3 * (now - self._alive):.0f} ms, motors off")

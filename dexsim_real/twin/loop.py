@@ -172,7 +172,9 @@ class Twin:
             "faults": {"injected": dict(self.injector.injected), "expected": self.injector.expected(),
                        "config": to_dict(arguments.faults)},
             "commands": self.check.report(),
-            "watchdog": {"limit_s": arguments.firmware.watchdog, "trips": firmware.trips},
+            "stuck": [[*taxel, count] for taxel, count in firmware.stuck.items()],
+            "watchdog": {"limit_s": arguments.firmware.watchdog, "longest_s": firmware.longest,
+                         "trips": firmware.trips},
             "physics": self.world.report(), "slowest_exchange_ms": round(1e3 * line.slowest, 3),
             "late": line.lateness.summary(), "imu_frames": self.imu.sent if self.imu else 0,
             "masks": dict(self.masks.counts) if self.masks else {}, "events": [list(event) for event in self.events]}

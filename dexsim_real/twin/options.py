@@ -20,7 +20,8 @@ class TwinArguments:
     task: str = setting("rotate", choices=TASKS)
     """What the hand is mounted for: palm up with a cube, or upside down with objects to catch."""
     policy: str | None = None
-    """The policy that will run on it, a file or a shipped name; by default that of the task's name."""
+    """The policy that will run on it, a file or a shipped name, to see that it fits; by default that of the task's
+    name."""
     seed: int = setting(0, unit="1", low=0, high=2**31 - 1)
     """Of everything random: parameters, objects, noise, faults."""
     trials: int = setting(10, unit="1", low=1, high=100_000)
@@ -29,8 +30,10 @@ class TwinArguments:
     """Time limit of a trial; the task's own by default (grasp 8, rotate 120)."""
     draw: str = setting("outside", choices=KINDS)
     """Parameters just outside the ranges of training, inside them, or nominal."""
-    shapes: tuple[str, ...] = setting((), choices=SHAPES)
-    """Objects of successive grasp trials; any by default."""
+    first: int = setting(0, unit="1", low=0, high=100_000)
+    """Number of the first trial: a trial is the same whether others went before it or not."""
+    shape: str = setting("any", choices=("any", *SHAPES))
+    """Objects of grasp trials."""
     command: float | None = setting(None, unit="1", low=0.0, high=1.0)
     """Grip command that the runner will be given; only noted in the results and in the command shown."""
     link: Path | None = None
