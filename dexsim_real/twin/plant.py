@@ -68,16 +68,16 @@ class EmulatedHand:
       overrides: parameters that are not drawn but given.
       seconds: time limit of a trial; None for the task's.
       command: what the runner was asked for; only written into the results.
-      shapes: names of the objects of successive trials, over and over (grasp); None for random ones.
+      shape: name of the objects (grasp); None for random ones.
       first: number of the first trial: a trial is the same whether others went before it or not.
     """
 
     def __init__(self, hand: Hand, task: str, seed: int = 0, *, trials: int | None = None, kind: str = "outside",
                  overrides: dict[str, float] | None = None, seconds: float | None = None,
-                 command: float | None = None, shapes: tuple[str, ...] | None = None, first: int = 0):
+                 command: float | None = None, shape: str | None = None, first: int = 0):
         self.hand, self.task, self.seed, self.kind = hand, task, seed, kind
         self.command, self._end = command, None if trials is None else first + trials
-        self._overrides, self._seconds, self._shapes = overrides, seconds, shapes
+        self._overrides, self._seconds, self._shape = overrides, seconds, shape
         self._drives = Drives(hand.torque_limit, hand.speed_limit)
         self._skin, self._assistant = Skin(hand), Assistant(task)
         self._done: list[dict[str, Any]] = []
@@ -169,8 +169,7 @@ class EmulatedHand:
         joints = self._rest if self._data is None else self._joints()
         while True:  # Some objects fit nowhere between the fingers; nobody would put those there.
             self.draw: Draw = draw_trial(self.task, rng, self.kind, self._overrides)
-            name = self._shapes[self.trial % len(self._shapes)] if self._shapes else None
-            self.shape: Shape = draw_shape(self.draw, rng, name)
+            self.shape: Shape = draw_shape(self.draw, rng, self._shape)
             self._gravity = tilted_gravity(self.task, self.draw.gravity_tilt)
             scene = build_scene(self.hand, self.draw, self.shape, self._gravity)
             place = find_place(scene, self.draw, self.shape, rng)

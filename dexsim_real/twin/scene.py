@@ -18,6 +18,7 @@ from dexsim_real.twin.shapes import Shape
 TIMESTEP = 0.0005  # s
 ROTORS = (8e-4, 4e-4)  # kg m^2, inertia of the strong and the weak motors as seen at the joint
 STRONG = 0.8  # Nm, joints with more than this have strong motors
+END_STOP = 300.0  # Nm/rad
 _GREASE = 0.02  # Nm s/rad of a gear that nothing is known of
 _STIFF_FRICTION = (0.002, 1.0)  # solref of dry friction: what sticks creeps by less than 1e-3 rad/s
 _KINDS = {"sphere": mujoco.mjtGeom.mjGEOM_SPHERE, "box": mujoco.mjtGeom.mjGEOM_BOX,
@@ -227,6 +228,10 @@ def _set_springs(model: mujoco.MjModel, draw: Draw, skins: dict[str, bool]) -> N
             stiffness = float(draw.gear_stiffness)
             model.jnt_solref[j], model.jnt_solimp[j] = spring(
                 inverse_mass, stiffness, 2 * np.sqrt(stiffness / inverse_mass))
+        elif model.jnt_limited[j]:  # the drive's end stops
+            inverse_mass = float(model.dof_invweight0[model.jnt_dofadr[j]])
+            model.jnt_solref[j], model.jnt_solimp[j] = spring(
+                inverse_mass, END_STOP, 2 * np.sqrt(END_STOP / inverse_mass))
 
 
 def _index(model: mujoco.MjModel, hand: Hand) -> Scene:

@@ -1,0 +1,193 @@
+"""Shipped policies on the emulated hand, with no fine-tuning: the paper's metrics beside those in simulation.
+
+    python benchmarks/zero_shot.py --virtual --task rotate --trials 10
+    python benchmarks/zero_shot.py --virtual --task grasp --trials 50 --draw inside --set gear_play=0
+
+Virtual time: every exchange goes through the bytes of both frames and the emulated palm board, then the bridge's own
+sensing, safety and controller, but in one process and as fast as it computes (`dexsim_real.twin.virtual`). What is
+counted is the referee's truth, not what the bridge believes. Trial k of a seed is the same whatever runs beside it.
+"""
+
+import argparse
+import concurrent.futures
+import functools
+import json
+import multiprocessing
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+TARGETS = {"grasp": "held 90 %, r 0.8", "rotate": "25.1 successes, 3.36 s each, 84.3 s to fall"}
+COMMANDS = (0.0, 0.25, 0.5, 0.75, 1.0)
+
+
+@functools.lru_cache(maxsize=2)
+def load(policy: str) -> tuple[Any, Any, Any]:
+    """Hand, controller and calibration; once a process."""
+    from dexsim_real.control import Controller, prepare_jax
+
+    prepare_jax()
+    from dexsim import load_hand
+    from dexsim_ppo.evaluate import load_policy
+    from dexsim_real.twin.virtual import ideal_calibration
+
+    hand = load_hand()
+    controller = Controller(load_policy(policy), hand)
+    controller.warm()
+    return hand, controller, ideal_calibration(hand)
+
+
+def run_trial(options: dict[str, Any], number: int) -> dict[str, Any]:
+    """The referee's report of one trial."""
+    from dexsim_real.twin.plant import EmulatedHand
+    from dexsim_real.twin.shapes import SHAPES
+    from dexsim_real.twin.virtual import RunOptions, VirtualRun
+
+    hand, controller, calibration = load(options["policy"])
+    # As in the task's evaluation: five commands for each shape.
+    command, shape = COMMANDS[number % len(COMMANDS)], SHAPES[number // len(COMMANDS) % len(SHAPES)]
+    plant = EmulatedHand(hand, options["task"], options["seed"], kind=options["draw"], overrides=options["set"],
+                         seconds=options["seconds"], trials=1, first=number, shape=shape)
+    began = time.perf_counter()
+    report = VirtualRun(plant, controller, calibration,
+                        RunOptions(command=command, safety=options["safety"])).run()
+    return report | {"wall": round(time.perf_counter() - began, 2)}
+
+
+def run_all(options: dict[str, Any], trials: int, processes: int, show: bool) -> list[dict[str, Any]]:
+    """All trials, in order."""
+    trial = functools.partial(run_trial, options)
+    if processes <= 1:
+        return [_shown(trial(k), show) for k in range(trials)]
+    # JAX does not survive a fork.
+    with concurrent.futures.ProcessPoolExecutor(processes, multiprocessing.get_context("spawn")) as pool:
+        return [_shown(report, show) for report in pool.map(trial, range(trials))]
+
+
+def _shown(report: dict[str, Any], show: bool) -> dict[str, Any]:
+    if show:
+        told = (f"command {report['command']:.2f} {report['shape']:<11} fingers {report['finger_force']:6.2f} N"
+                if report["task"] == "grasp" else
+                f"{report['successes']:3d} successes ({report['paper_successes']} as the paper counts)")
+        print(f"{report['trial']:4d}  {told}  {report['seconds']:7.2f} s  {report['end']}  ({report['wall']:.0f} s)",
+              file=sys.stderr, flush=True)
+    return report
+
+
+# --- metrics -------------------------------------------------------------------------------------
+
+def grasp_metrics(reports: list[dict[str, Any]]) -> dict[str, Any]:
+    """Held, and how the forces of held objects follow the command."""
+    from dexsim.statistics import mean, proportion
+    from dexsim.tasks.grasp_report import pearson
+
+    held = np.array([r["held"] for r in reports])
+    command, force, total = (np.array([r[name] for r in reports], float)[held]
+                             for name in ("command", "finger_force", "total_force"))
+    by_command = [{"command": c, "held": proportion(held[[r["command"] == c for r in reports]]),
+                   "finger_force": mean(force[command == c]), "total_force": mean(total[command == c])}
+                  for c in sorted({r["command"] for r in reports})]
+    by_shape = [{"shape": s, "held": proportion(held[[r["shape"] == s for r in reports]])}
+                for s in sorted({r["shape"] for r in reports})]
+    return {"held": proportion(held), "pearson_r": pearson(command, force), "pearson_r_total": pearson(command, total),
+            "by_command": by_command, "by_shape": by_shape}
+
+
+def rotate_metrics(reports: list[dict[str, Any]]) -> dict[str, Any]:
+    """The paper's three, with the count of the task's rule (spin) and of the paper's."""
+    from dexsim.statistics import mean, median, proportion
+
+    count, paper, lived = (np.array([r[name] for r in reports], float)
+                           for name in ("successes", "paper_successes", "seconds_to_fall"))
+    pace = np.array([r["seconds_per_success"] for r in reports if r["successes"]], float)
+    return {"successes": mean(count) | median(count) | {"sorted": sorted(count.tolist())},
+            "paper_successes": mean(paper) | median(paper) | {"sorted": sorted(paper.tolist())},
+            "seconds_per_success": mean(pace), "seconds_to_fall": mean(lived),
+            "kept_to_the_end": proportion(np.array([not r["fell"] for r in reports])),
+            "joint_speed": mean(np.array([r["joint_speed"] for r in reports]))}
+
+
+def simulated(task: str, policy: str) -> dict[str, Any]:
+    """The same metrics of the policy's report in simulation; empty where there is none."""
+    from dexsim.assets import asset_path
+    from dexsim.errors import DexsimError
+
+    path = Path(policy).with_suffix(".json")
+    try:
+        path = path if path.is_file() else asset_path(f"policies/{Path(policy).stem}.json")
+        report = json.loads(path.read_text())["trained"]["task"]
+    except (OSError, KeyError, ValueError, DexsimError):
+        return {}
+    if task == "grasp":
+        return {name: report[name] for name in ("held", "pearson_r", "pearson_r_total", "by_command") if name in report}
+    counts = {name: report[name]["mean"] | report[name]["median"] for name in ("successes", "paper_successes")}
+    return counts | {name: report[name] for name in ("seconds_per_success", "seconds_to_fall", "kept_to_the_end")}
+
+
+def table(here: dict[str, Any], there: dict[str, Any]) -> str:
+    """Rows of metric, emulated hand, simulation."""
+    def cell(entry: Any) -> str:
+        if not isinstance(entry, dict):
+            return "-"
+        key = "r" if "r" in entry else "mean"
+        if entry.get(key) is None:
+            return "-"
+        span = f" ({entry['low']:.3g} to {entry['high']:.3g})" if entry.get("low") is not None else ""
+        middle = f", median {entry['median']:.3g}" if "median" in entry else ""
+        return f"{entry[key]:.3g}{span}{middle}"
+
+    names = [name for name in here if isinstance(here[name], dict)]
+    rows = [(name.replace("_", " "), cell(here[name]), cell(there.get(name))) for name in names]
+    for entry in here.get("by_command", []):
+        other = next((row for row in there.get("by_command", []) if row["command"] == entry["command"]), {})
+        rows.append((f"command {entry['command']:g}: held", cell(entry["held"]), cell(other.get("held"))))
+        rows.append((f"command {entry['command']:g}: finger force (N)", cell(entry["finger_force"]),
+                     cell(other.get("finger_force_n"))))
+    rows += [(f"{entry['shape']}: held", cell(entry["held"]), "") for entry in here.get("by_shape", [])]
+    rows = [("", "emulated hand", "simulation"), *rows]
+    widths = [max(len(row[k]) for row in rows) for k in range(3)]
+    return "\n".join("  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip()
+                     for row in rows)
+
+
+def arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--virtual", action="store_true", help="virtual time (the only mode here)")
+    parser.add_argument("--task", choices=("grasp", "rotate"), required=True)
+    parser.add_argument("--policy", help="policy file; by default the shipped one of the task")
+    parser.add_argument("--trials", type=int, default=10)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seconds", type=float, help="time limit of a trial; by default the task's (8 or 120)")
+    parser.add_argument("--draw", choices=("outside", "inside", "nominal"), default="outside",
+                        help="parameters outside training's ranges, inside them, or at their middle")
+    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE",
+                        help="fix a parameter of the emulated hand (dexsim_real/twin/draw.py), for ablations")
+    parser.add_argument("--no-safety", dest="safety", action="store_false", help="leave the bridge's limits out")
+    parser.add_argument("--processes", type=int, default=1)
+    parser.add_argument("--json", type=Path, help="file for everything")
+    return parser.parse_args()
+
+
+def main() -> None:
+    given = arguments()
+    if not given.virtual:
+        sys.exit("zero_shot.py: give --virtual")
+    options = {"task": given.task, "policy": given.policy or given.task, "seed": given.seed, "draw": given.draw,
+               "seconds": given.seconds, "safety": given.safety,
+               "set": {name: float(value) for name, value in (pair.split("=") for pair in given.set)}}
+    reports = run_all(options, given.trials, given.processes, show=True)
+    here = (grasp_metrics if given.task == "grasp" else rotate_metrics)(reports)
+    there = simulated(given.task, options["policy"])
+    print(f"{given.task}: {len(reports)} trials, parameters {given.draw}, seed {given.seed}; "
+          f"targets {TARGETS[given.task]}")
+    print(table(here, there))
+    if given.json:
+        given.json.write_text(json.dumps({"options": options, "metrics": here, "simulation": there,
+                                          "trials": reports}, indent=1))
+
+
+if __name__ == "__main__":
+    main()
