@@ -1,16 +1,34 @@
-"""Contacts of hand and object: their stiffness in MuJoCo's terms, and the rubber on the fingertips."""
+"""Contacts of hand and object: their stiffness in MuJoCo's terms, and the rubber on the fingertips.
+
+A spring of constant stiffness presses alike on a face, an edge and a corner; skin does not: at one depth
+an edge presses half of what a face does. So a fingertip's springs take their stiffness, tick by tick, from
+the skin's law over the taxels (`follow_skin`), and the solver's force is the skin's. For this a fingertip is
+a row of spheres (`split_pads`): a sphere meets a primitive in exactly one point, with every engine, at a
+depth that is known in closed form, where capsules have one or two points on a box and other ones by engine.
+"""
+
+import dataclasses
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from dexsim.hand import Hand
+from dexsim import rotations, sdf, tactile
+from dexsim.hand import Hand, HandPose
+from dexsim.objects import ObjectParams
 
-# A face meets a fingertip in up to two points, an edge in one: each is a little softer.
-BOX_SHARE = 0.7
+# One sphere's share of a fingertip's stiffness: two of a row lie in a dent, or three.
+ROW_SHARE = 0.5
 # What wears no rubber is stiffer: the palm carries the sum of the fingers.
 BARE_SHARE = 2.5
+# N/m, the stiffness of a fingertip that `ObjectParams.contact` scales: that of the template, too.
+NOMINAL = 1700.0
+# How far the skin may make a fingertip's springs softer and stiffer than that. The floor keeps corners,
+# which press next to no skin, from sinking in.
+SOFTEST, STIFFEST = 0.25, 4.0
+# m, depth below which springs are the nominal ones: there the skin's law is the lattice's coarseness.
+FIRST = 0.0005
 
 
 def spring(compliance: jax.Array, stiffness: jax.Array, ratio: jax.Array, friction: jax.Array, *,
@@ -48,18 +66,20 @@ def pairs_with(model: mujoco.MjModel, geoms: np.ndarray) -> np.ndarray:
     return np.flatnonzero(np.isin(model.pair_geom1, geoms) | np.isin(model.pair_geom2, geoms))
 
 
-def pair_constants(model: mujoco.MjModel, pairs: np.ndarray, geoms: np.ndarray,
-                   tips: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Inverse weights [P] 1/kg of pairs with one of `geoms`, and their share of the stiffness [P].
+def pair_constants(model: mujoco.MjModel, pairs: np.ndarray,
+                   tips: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Inverse weights [P] 1/kg of pairs, their share of the stiffness [P], and whose they are [P].
 
-    `tips` are the bodies of the fingertips.
+    `tips` are the bodies [F] of the fingertips; -1 is what belongs to none of them.
     """
     both = np.stack([model.pair_geom1[pairs], model.pair_geom2[pairs]])
     bodies = model.geom_bodyid[both]
-    box = np.isin(both, geoms) & (model.geom_type[both] == mujoco.mjtGeom.mjGEOM_BOX)
-    on_tip = np.where(box.any(0), BOX_SHARE, 1.0)
-    share = np.where(np.isin(bodies, tips).any(0), on_tip, BARE_SHARE)
-    return model.body_invweight0[bodies, 0].sum(0), share
+    ball = (np.isin(bodies, tips) & (model.geom_type[both] == mujoco.mjtGeom.mjGEOM_SPHERE)).any(0)
+    finger = np.full(len(pairs), -1)
+    for index, tip in enumerate(tips):
+        finger[(bodies == tip).any(0)] = index
+    share = np.where(finger < 0, BARE_SHARE, np.where(ball, ROW_SHARE, 1.0))
+    return model.body_invweight0[bodies, 0].sum(0), share, finger
 
 
 def cover_tips(spec: mujoco.MjSpec, hand: Hand, cover: float) -> None:
@@ -71,3 +91,73 @@ def cover_tips(spec: mujoco.MjSpec, hand: Hand, cover: float) -> None:
             size = np.array(geom.size)
             size[:1 if round_ else 3] += cover
             geom.size = size
+
+
+def split_pads(spec: mujoco.MjSpec, hand: Hand, touching: list[str], points: int) -> list[str]:
+    """Lay a row of `points` spheres into every capsule of a fingertip that touches.
+
+    The capsules stay for what they touch beside the object.
+
+    Returns:
+      The names of what meets the object: `touching` with the spheres in place of their capsules.
+    """
+    names = []
+    placed = {geom.name: geom for geom in hand.geoms}
+    for name in touching:
+        geom, place = spec.geom(name), placed[name]
+        if place.body not in hand.tip_body or place.kind != "capsule":
+            names.append(name)
+            continue
+        for index, along in enumerate(np.linspace(-1.0, 1.0, points) if points > 1 else [0.0]):
+            ball = geom.parent.add_geom(
+                name=f"{name}_{index}", type=mujoco.mjtGeom.mjGEOM_SPHERE, mass=0.0, group=geom.group,
+                pos=place.position + along * place.size[1] * place.rotation[:, 2],
+                size=[geom.size[0], 0, 0], rgba=geom.rgba)
+            names.append(ball.name)
+    return names
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Pads:
+    """The spheres of the fingertips, in the frames of their links; fingers with fewer have radii of 0."""
+
+    centre: np.ndarray  # [F, S, 3] m
+    radius: np.ndarray  # [F, S] m
+
+
+def find_pads(model: mujoco.MjModel, pairs: np.ndarray, tips: np.ndarray) -> Pads:
+    """The spheres on bodies `tips` [F] that are part of `pairs`."""
+    used = np.unique([model.pair_geom1[pairs], model.pair_geom2[pairs]])
+    used = used[model.geom_type[used] == mujoco.mjtGeom.mjGEOM_SPHERE]
+    rows = [used[model.geom_bodyid[used] == tip] for tip in tips]
+    longest = max(map(len, rows))
+    centre, radius = np.zeros((len(rows), longest, 3), np.float32), np.zeros((len(rows), longest), np.float32)
+    for finger, row in enumerate(rows):
+        centre[finger, :len(row)], radius[finger, :len(row)] = model.geom_pos[row], model.geom_size[row, 0]
+    return Pads(centre, radius)
+
+
+def follow_skin(hand: Hand, pads: Pads, skin: tactile.Skin, pose: HandPose, target: ObjectParams,
+                position: jax.Array, rotation: jax.Array) -> jax.Array:
+    """How much stiffer [F] than nominal a fingertip's springs are for their sum to be the skin's force.
+
+    The springs of a finger press with stiffness times the sum D of their depths, its skin with S: the
+    ratio is S / (NOMINAL ROW_SHARE D), and 1 where nothing touches yet, between `SOFTEST` and `STIFFEST`.
+    The first millimetre blends (`FIRST`).
+
+    Args:
+      pose: of the hand; `position` [3] and `rotation` [3, 3] are the object's, in the palm frame.
+    """
+    shape = target.shape()
+    touch = tactile.feel_links(hand, pose, shape, position, rotation, jnp.ones(hand.num_fingers), skin)
+    centre = pose.body_position[hand.tip_body][:, None] + rotations.rotate(
+        pose.tip_rotation[:, None], jnp.asarray(pads.centre))
+    local, depth = sdf.to_local(centre, position, rotation), 0.0
+    for k, kind in enumerate(shape.kinds):  # one spring for every primitive that a sphere is in
+        here = sdf.to_local(local, shape.position[k], shape.rotation[k])
+        gap = sdf.primitive_distance(kind, here, shape.size[k])
+        depth += jnp.where(shape.active[k], jnp.maximum(jnp.asarray(pads.radius) - gap, 0.0), 0.0)
+    nominal = NOMINAL * ROW_SHARE
+    ratio = (jnp.sum(touch.skin_force, -1) + nominal * FIRST) / (nominal * (jnp.sum(depth, -1) + FIRST))
+    has = jnp.asarray(pads.radius.any(-1))  # a fingertip that is no row of spheres keeps its stiffness
+    return jnp.where(has, jnp.clip(ratio, SOFTEST, STIFFEST), 1.0)

@@ -29,9 +29,9 @@ TOTALS = ("solver", "skin")
 class Skin:
     """The rubber over the taxels (two-term Mooney-Rivlin) and what the taxels notice of it."""
 
-    c10: float = setting(0.002e6, unit="Pa", low=0.0, high=1e8)
-    """First Mooney-Rivlin coefficient; the skin's own value is not published. This one makes the
-    law's sum about equal to the solver's force."""
+    c10: float = setting(0.003e6, unit="Pa", low=0.0, high=1e8)
+    """First Mooney-Rivlin coefficient; the skin's own value is not published. It is the fingertips'
+    stiffness in the physics, too (`contact.follow_skin`): some 2 N/mm on a face, 1 on an edge."""
     c01: float = setting(0.0, unit="Pa", low=-1e8, high=1e8)
     """Second Mooney-Rivlin coefficient. Negative values (fits to tension alone) are refused where
     they would make the skin soften before `max_compression`."""

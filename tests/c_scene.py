@@ -87,21 +87,16 @@ def _clad(spec: mujoco.MjSpec, name: str) -> list[str]:
     return [f"{name}_{k}" for k in range(ROW)]
 
 
-def follow_skin(model: mujoco.MjModel, data: mujoco.MjData, hand, target, law, settling=0.03) -> None:
+def follow_skin(model: mujoco.MjModel, data: mujoco.MjData, hand, target, felt, settling=0.03) -> None:
     """Give each fingertip's springs the stiffness with which they press as the skin does: sum K r = S.
 
-    Depths r are those of C MuJoCo's own contacts; S is `law(qpos, target)` (`skin_law`).
+    Depths r are those of C MuJoCo's own contacts; `felt` [F] N is S (`skin_law`).
     """
     mujoco.mj_fwdPosition(model, data)
-    felt = np.asarray(law(jnp.asarray(data.qpos, jnp.float32)[None],
-                          jax.tree.map(lambda leaf: np.asarray(leaf)[None], target)))[0]
     tips = [model.body(hand.body_names[b]).id for b in hand.tip_body]
-    body = model.body("object").id
-    depth = np.zeros(len(tips))
-    for contact in data.contact:
-        first, second = model.geom_bodyid[contact.geom]
-        if second == body and first in tips:
-            depth[tips.index(first)] += max(-contact.dist, 0.0)
+    first, second = model.geom_bodyid[data.contact.geom].reshape(-1, 2).T
+    deep = np.where(second == model.body("object").id, np.maximum(-data.contact.dist, 0.0), 0.0)
+    depth = np.array([deep[first == tip].sum() for tip in tips])
     ratio = np.clip((felt + 0.425) / (850 * depth + 0.425), 0.25, 4)  # 850 N/m, 0.5 mm
     _set_springs(model, target, settling, dict(zip(tips, ratio, strict=True)))
 

@@ -32,8 +32,8 @@ def ball(*, stiffness=2000.0, ratio=1.0, mu=0.9, condim=3, mass=0.1, step=0.002,
                     impratio=impratio if cone == "elliptic" else 1))
     model.body_invweight0[1] = 10.0, 2e4
     pairs = contact.pairs_with(model, np.array([model.geom("ball").id]))
-    compliance, share = contact.pair_constants(model, pairs, np.array([model.geom("ball").id]), [0, 1])
-    np.testing.assert_array_equal([*compliance, *share], [10.0, 1.0])
+    compliance, *_ = contact.pair_constants(model, pairs, np.array([0]))
+    np.testing.assert_array_equal(compliance, [10.0])
     model.pair_solref[:], model.pair_solimp[:] = contact.spring(
         compliance, np.array([stiffness]), ratio, mu, period=0.03,
         edges=2 * (condim - 1) if cone == "pyramidal" else 0)
@@ -83,23 +83,40 @@ def test_only_fingertips_wear_rubber(hand):
     bare, clad = (build_model(hand, SLOTS, np.full((3, 3), OFF), PhysicsConfig(cover=cover),
                               (9.81, 0, 0), "jax") for cover in (0.0, 0.003))
     tips = {bare.body(hand.body_names[b]).id for b in hand.tip_body}
-    touching = np.isin(np.arange(bare.ngeom), [bare.pair_geom1, bare.pair_geom2])
     grown = clad.geom_size - bare.geom_size
     for geom in range(bare.ngeom):
-        on_tip = touching[geom] and bare.geom_bodyid[geom] in tips and "core" not in bare.geom(geom).name
+        on_tip = bare.geom_bodyid[geom] in tips and "_pad" in bare.geom(geom).name
         np.testing.assert_allclose(grown[geom], [0.003 * on_tip, 0, 0], atol=1e-9)
-    assert np.sum(grown[:, 0] > 0) == 6  # two on the thumb
+    assert np.sum(grown[:, 0] > 0) == 6 * 4  # two on the thumb; the capsule and its three spheres
 
 
 def test_who_is_how_stiff(hand):
-    """Fingertips 1, on boxes 0.7; other links and the palm 2.5."""
+    """A fingertip's spheres 1/2, its capsules none; other links and the palm 2.5."""
     model = build_model(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(), (9.81, 0, 0), "jax")
     geoms = np.array([model.geom(f"object_{k}").id for k in range(3)])
     pairs = contact.pairs_with(model, geoms)
     tips = [model.body(hand.body_names[b]).id for b in hand.tip_body]
-    _, share = contact.pair_constants(model, pairs, geoms, tips)
-    for pair, found in zip(pairs, share, strict=True):
-        link, other = (model.geom(g[pair]).name for g in (model.pair_geom1, model.pair_geom2))
-        pad = {"object_0": 0.7}.get(other, 1.0)
-        assert found == (pad if "_pad" in link else 2.5), (link, other)
-    assert set(share) == {0.7, 1.0, 2.5}
+    _, share, finger = contact.pair_constants(model, pairs, np.array(tips))
+    for pair, found, whose in zip(pairs, share, finger, strict=True):
+        link = model.geom(model.pair_geom1[pair]).name
+        name, _, rest = link.partition("_pad")
+        assert found == (0.5 if rest else 2.5), link
+        assert whose == (hand.finger_names.index({"mid": "middle"}.get(name, name)) if rest else -1), link
+        assert not link.endswith(("pad", "left", "right")), link
+    assert np.bincount(finger + 1).tolist() == [3 * 6, 3 * 6, 9, 9, 9, 9]
+
+
+def test_a_row_of_spheres_fills_its_capsule(hand):
+    """Its ends are the capsule's; between them it is thinner by r - sqrt(r^2 - (l / 4)^2), below 0.8 mm."""
+    model = build_model(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(), (9.81, 0, 0), "jax")
+    for name in ("thumb_pad_left", "thumb_pad_right", "index_pad", "mid_pad", "ring_pad", "pinky_pad"):
+        pad = model.geom(name)
+        turn = np.zeros(9)
+        mujoco.mju_quat2Mat(turn, pad.quat)
+        half = pad.size[1] * turn.reshape(3, 3)[:, 2]
+        for k in range(3):
+            ball = model.geom(f"{name}_{k}")
+            assert ball.type == mujoco.mjtGeom.mjGEOM_SPHERE and ball.bodyid == pad.bodyid
+            np.testing.assert_allclose(ball.pos, pad.pos + (k - 1) * half, atol=1e-6)
+            assert ball.size[0] == pytest.approx(pad.size[0])
+        assert pad.size[0] - np.sqrt(pad.size[0]**2 - (pad.size[1] / 2)**2) < 8e-4

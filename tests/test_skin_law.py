@@ -1,7 +1,12 @@
 """The skin's law alone, before it is tied to the solver's total, against the solver's force.
 
-In C MuJoCo, whose contacts are the Warp backend's too, over 160 hands a shape: 40 objects, each closed
-on without weight and then held at four random strengths, up to 20 N on a finger (commands ask for 1-8 N).
+The springs of a fingertip follow the skin by the tick (`contact.follow_skin`), with one stiffness for
+the finger. What is left between the two: the tick's delay, friction, which the solver's force has and
+the law not, forces of one finger that point apart, and dents in which the springs are as soft or stiff as
+they may be.
+
+In C MuJoCo, whose contacts are the Warp backend's too, over 120 hands a shape: 30 objects, each closed
+on without weight and then held at four random strengths, up to 25 N on a finger (commands ask for 2-7 N).
 """
 
 import c_scene
@@ -16,14 +21,15 @@ from dexsim.tactile import Skin
 from dexsim.tasks.grasp import Grasp, GraspConfig
 from dexsim.tasks.grasp_start import make_pool
 
-OBJECTS, LEVELS = 40, 4
+OBJECTS, LEVELS = 30, 4
 
 
-def hold(hand, start, rng):
+def hold(hand, start, rng, law):
     """[(qpos, force on the fingers [5] N, deepest contact of a fingertip m)] of the levels at which it held."""
     exact = bool(start.target.active[SLOTS.index("cylinder")])
     model = c_scene.compile_scene(hand, start.target, exact=exact, iterations=20, line_search=30)
     data = c_scene.start(model, start.qpos, 0 * start.qvel)
+    known = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], start.target)
     close = rng.uniform(0.5, 1.0, 12) * (np.arange(12) > 3)
     close[1:3] = rng.uniform(0.3, 1.0, 2)
     found = []
@@ -35,7 +41,9 @@ def hold(hand, start, rng):
                 share = min(tick / 10, 1) if level == 0 else 1
                 here = data.qpos[:12].copy()
                 wanted = np.clip(start.qpos[:12] + share * close, here - grip, here + grip)
-            for _ in range(6):
+            felt = law(data.qpos[None].astype(np.float32), known)
+            c_scene.follow_skin(model, data, hand, start.target, np.asarray(felt)[0])
+            for _ in range(5):
                 torque = 3 * (wanted - data.qpos[:12]) - 0.1 * data.qvel[:12]
                 data.qfrc_applied[:12] = np.clip(torque, -hand.torque_limit, hand.torque_limit)
                 mujoco.mj_step(model, data)
@@ -57,7 +65,7 @@ def grips(hand):
     for shape in SHAPES:
         rows, held = [], []
         for row in c_scene.rows_of(pool, shape):
-            levels = hold(hand, c_scene.row(pool, row), rng)
+            levels = hold(hand, c_scene.row(pool, row), rng, law)
             held += levels
             rows += [row] * len(levels)
         qpos, force, depth = (np.stack(x) for x in zip(*held, strict=True))
@@ -66,25 +74,14 @@ def grips(hand):
     return found
 
 
-def pairs_of(grips, shape):
-    """[2, n, 5] of the hands in which no finger is jammed (a few in a hundred)."""
-    pairs = grips[shape][0]
-    free = pairs[0].max(1) < 20
-    assert free.mean() > 0.9
-    return pairs[:, free]
-
-
 def pearson(pairs):
     """r over the touching fingers."""
     return np.corrcoef(*pairs[:, pairs[0] > 0.01])[0, 1]
 
 
-@pytest.mark.parametrize("shape", [
-    pytest.param(shape, marks=pytest.mark.xfail(
-        strict=True, reason="faces press more skin than edges at the same force")
-        if shape == "box" else ()) for shape in SHAPES])
+@pytest.mark.parametrize("shape", SHAPES)
 def test_it_follows_the_solvers_force(grips, shape):
-    pairs, depth = pairs_of(grips, shape), 1e3 * np.percentile(grips[shape][1], [50, 90, 99])
+    pairs, depth = grips[shape][0], 1e3 * np.percentile(grips[shape][1], [50, 90, 99])
     force, felt = pairs[:, pairs[0] > 0.01]
     r_sum = np.corrcoef(*pairs.sum(-1))[0, 1]
     print(f"{shape}: r = {pearson(pairs):.3f} of {force.size} fingers, {r_sum:.3f} of "
@@ -96,17 +93,15 @@ def test_it_follows_the_solvers_force(grips, shape):
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_it_follows_for_every_shape_nearly(grips, shape):
-    """Also on boxes, and summed over the hand; with one gain near 1."""
-    pairs = pairs_of(grips, shape)
-    assert pearson(pairs) >= 0.87
+def test_hands_follow_with_one_gain(grips, shape):
+    pairs = grips[shape][0]
     assert np.corrcoef(*pairs.sum(-1))[0, 1] >= 0.9
-    assert 0.6 < np.sum(pairs[0] * pairs[1]) / np.sum(pairs[0] ** 2) < 1.4
+    assert 0.85 < np.sum(pairs[0] * pairs[1]) / np.sum(pairs[0] ** 2) < 1.1
 
 
 def test_no_finger_presses_unfelt(grips):
-    """A fingertip that presses with half a newton or more compresses taxels (95 of 100)."""
+    """A fingertip that presses with half a newton or more compresses taxels (98 of 100)."""
     force, felt = np.concatenate([grips[shape][0].reshape(2, -1) for shape in SHAPES], axis=1)
     unfelt = np.mean(felt[force > 0.5] == 0)
     print(f"unfelt: {unfelt:.3f}")
-    assert unfelt < 0.05
+    assert unfelt < 0.02
