@@ -1,10 +1,23 @@
 """Environment throughput: one JSON line per measurement, key `env_steps_per_s`.
 
     python benchmarks/throughput.py --backends warp jax --num-envs 4096 16384 32768
+    python benchmarks/throughput.py --leave-out actuator randomization      # their shares alone
+    python benchmarks/throughput.py --task rotate --split                   # where a training step goes
 
-Measures the full step of the task (action to observation, restarts included) under random
-actions, and again with touch, the actuator model and the observation left out one at a time:
-the difference is the share of each. `--train` measures PPO on top.
+The first measures the full step of the task (action to observation, restarts included) under random
+actions, and again with parts left out one at a time. All variants begin at the same states, take the
+same actions and are timed in turn, so that what else the machine does falls on all of them; `share` is
+the median over the rounds of 1 - (time without) / (time of the full step), with its quartiles.
+
+| left out | what runs instead |
+|---|---|
+| touch | no taxels |
+| observation | zeros |
+| actuator | the torques of the full step, recorded beforehand: the same motion and the same contacts |
+| redrawing | hands drawn once and kept: the same spread of hands, so the same contacts |
+| randomization | scale 0: one nominal hand, nothing is drawn; contacts may differ a little |
+
+`--train` measures PPO on top, `--split` the parts of a training step (see `throughput_split`).
 """
 
 import argparse
@@ -12,6 +25,8 @@ import dataclasses
 import json
 import statistics
 import time
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +34,8 @@ import jax.numpy as jnp
 import dexsim
 from dexsim.env import Env
 from dexsim.tasks import TASKS
+from dexsim_ppo.cli import enable_caches
+from dexsim_ppo.compilation import collector_paused, jit
 
 
 class WithoutObservation(Env):
@@ -29,55 +46,164 @@ class WithoutObservation(Env):
                 for group, fields in self.observation_layout.items()}
 
 
-class WithoutActuator(Env):
-    """The actuator model left out: a constant torque instead."""
+class WithoutRedrawing(Env):
+    """A restarted episode goes on with the hand of the one before."""
 
-    def _torque(self, state, joint_target):
-        return lambda substep, position, velocity: 0.05 * (joint_target - position)
+    _kept = None
+
+    def _draw(self, *keys):
+        return self._kept or super()._draw(*keys)
+
+    def restart(self, state, done):
+        self._kept = state.draw, state.orientation_sensor
+        try:
+            return super().restart(state, done)
+        finally:
+            self._kept = None
 
 
-VARIANTS = {"full": Env, "without touch": Env, "without observation": WithoutObservation,
-            "without actuator": WithoutActuator}
+class Recorder(Env):
+    """Keeps what a tick of physics was given, for the caller who is tracing `step` at the moment."""
+
+    tick = None  # object, physics state, push, joint torques [S + 1, J] Nm (the last: as read)
+
+    def _drive(self, state, joint_target, push):
+        torque = self._torque(state, joint_target)
+        net_torque, last = self._with_friction(state.draw, torque), self.config.physics.substeps
+
+        def motors(substep, position, velocity, tape):
+            tau = net_torque(substep, position, velocity)
+            return tau, tape.at[substep].set(tau)
+
+        tape = jnp.zeros((last + 1, self.hand.num_joints))
+        after, force, tape = self.physics.advance_motors(state.target, state.physics, motors, tape, push)
+        reading = torque(jnp.asarray(last), after.qpos[self.physics.joint_qpos],
+                         after.qvel[self.physics.joint_dof])
+        self.tick = state.target, state.physics, push, tape.at[last].set(reading)
+        return after, force, lambda at: reading
+
+    def recorded_step(self, state, action) -> tuple[Any, Any]:
+        """`step`, and the tick that went into physics."""
+        after = self.step(state, action)
+        tick, self.tick = self.tick, None
+        return after, tick
 
 
-def make(task: str, variant: str, backend: str, num_envs: int) -> Env:
-    """The environment, whole or with one room left out."""
+class Replay(Env):
+    """The actuator left out: joint torques from a tape."""
+
+    tape = None  # [S + 1, J] Nm, of the tick that is being traced
+
+    def _drive(self, state, joint_target, push):
+        tape = self.tape
+        after, force = self.physics.advance(
+            state.target, state.physics, lambda substep, position, velocity: tape[substep], push)
+        return after, force, lambda at: tape[-1]
+
+    def replayed_step(self, state, action, tape):
+        self.tape = tape
+        after, self.tape = self.step(state, action), None
+        return after
+
+
+CLASSES = {"observation": WithoutObservation, "actuator": Replay, "redrawing": WithoutRedrawing}
+PARTS = ("touch", "observation", "actuator", "redrawing", "randomization")
+
+
+def make(task: str, left_out: str, backend: str, num_envs: int, kind: type[Env] | None = None) -> Env:
+    """The environment, whole ("full") or with one part left out."""
     entry = TASKS[task]
     config = entry.config()
-    if variant == "without touch":
+    if left_out == "touch":
         config = dataclasses.replace(config, touch=False)
+    if left_out == "randomization":
+        config = dataclasses.replace(config, randomization=dataclasses.replace(
+            config.randomization, scale=0.0))
     hand = dexsim.load_hand()
-    return VARIANTS[variant](entry.task_class(config, hand), hand, backend=backend,
-                             num_envs=num_envs)
+    kind = kind or CLASSES.get(left_out, Env)
+    return kind(entry.task_class(config, hand), hand, backend=backend, num_envs=num_envs)
+
+
+def runner(env: Env, num_envs: int, steps: int, step: Callable | None = None) -> Callable:
+    """Compiled: states, key and a tape to states, share of environments in contact, new tape."""
+    step = step or (lambda state, action, tape: (env.step(state, action), tape))
+
+    def run(state, key, tape):
+        def body(carry, inputs):
+            key, tape = inputs
+            action = jax.random.uniform(key, (num_envs, env.action_size), minval=-1.0)
+            after, tape = jax.vmap(step)(carry, action, tape)
+            touched = jnp.mean(jnp.any(after.finger_force > 0, -1))
+            after = jax.vmap(env.restart)(after, after.terminated | after.truncated)
+            return after, (touched, tape)
+        state, (touched, tape) = jax.lax.scan(body, state, (jax.random.split(key, steps), tape))
+        return state, jnp.mean(touched), tape
+
+    return jit(run)
+
+
+def seconds(run: Callable, *arguments: Any) -> tuple[float, Any]:
+    """Time of a call, and its result."""
+    with collector_paused():
+        start = time.perf_counter()
+        result = jax.block_until_ready(run(*arguments))
+        return time.perf_counter() - start, result
+
+
+def started(env: Env, num_envs: int, steps: int) -> Any:
+    """States after some ticks, when hands and objects have met."""
+    state = jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), num_envs))
+    return runner(env, num_envs, steps)(state, jax.random.key(1), None)[0]
+
+
+def compare(task: str, backend: str, num_envs: int, parts: tuple[str, ...], steps: int,
+            repeats: int) -> list[dict]:
+    """A row for the full step and one for each part left out."""
+    full = make(task, "full", backend, num_envs)
+    state, key = started(full, num_envs, steps), jax.random.key(2)
+    cases = {"nothing": (runner(full, num_envs, steps), state, None)}
+    for part in parts:
+        env, tape, step = make(task, part, backend, num_envs), None, None
+        if part == "actuator":
+            recorder = make(task, "full", backend, num_envs, Recorder)
+            record = runner(recorder, num_envs, steps, lambda state, action, _, r=recorder: (
+                lambda after, tick: (after, tick[3]))(*r.recorded_step(state, action)))
+            tape = record(state, key, None)[2]
+            step = lambda state, action, tape, e=env: (e.replayed_step(state, action, tape), tape[:0])  # noqa: E731
+        begin = started(env, num_envs, steps) if part == "randomization" else state
+        cases[part] = (runner(env, num_envs, steps, step), begin, tape)
+    first, touched, times = {}, {}, {name: [] for name in cases}
+    for name, (run, begin, tape) in cases.items():
+        first[name], (_, touched[name], _) = seconds(run, begin, key, tape)
+    for _ in range(repeats):
+        for name, (run, begin, tape) in cases.items():
+            times[name].append(seconds(run, begin, key, tape)[0])
+    rows = []
+    for name in cases:
+        shares = sorted(1 - mine / whole for mine, whole in zip(times[name], times["nothing"], strict=True))
+        rows.append(
+            {"left_out": name, "backend": full.backend, "num_envs": num_envs}
+            | timing(times[name], num_envs * steps, steps)
+            | {"first_call_s": round(first[name], 2), "share_touching": round(float(touched[name]), 3)}
+            | ({} if name == "nothing" else {
+                "share": round(statistics.median(shares), 4),
+                "share_quartiles": [round(shares[len(shares) // 4], 4), round(shares[-1 - len(shares) // 4], 4)]}))
+    return rows
+
+
+def timing(times: list[float], env_steps: int, steps: int) -> dict:
+    """What every row says."""
+    median = statistics.median(times)
+    return {"env_steps_per_s": round(env_steps / median), "ms_per_step": round(1e3 * median / steps, 4),
+            "spread": round((max(times) - min(times)) / median, 4)}
 
 
 def measure(env: Env, num_envs: int, steps: int, repeats: int) -> dict:
-    """Median seconds of `steps` steps of a batch, and the compile time."""
-    def run(state, key):
-        def body(carry, key):
-            action = jax.random.uniform(key, (num_envs, env.action_size), minval=-1.0)
-            after = jax.vmap(env.step)(carry, action)
-            touched = jnp.mean(jnp.any(after.finger_force > 0, -1))
-            return jax.vmap(env.restart)(after, after.terminated | after.truncated), touched
-        return jax.lax.scan(body, state, jax.random.split(key, steps))
-
-    run = jax.jit(run, donate_argnums=0)
-    state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), num_envs))
-    start = time.perf_counter()
-    state, touched = run(state, jax.random.key(1))
-    jax.block_until_ready(touched)
-    first = time.perf_counter() - start
-    seconds = []
-    for index in range(repeats):
-        start = time.perf_counter()
-        state, touched = run(state, jax.random.key(2 + index))
-        jax.block_until_ready(touched)
-        seconds.append(time.perf_counter() - start)
-    median = statistics.median(seconds)
-    return {"env_steps_per_s": round(num_envs * steps / median),
-            "ms_per_step": round(1e3 * median / steps, 4),
-            "spread": round((max(seconds) - min(seconds)) / median, 4),
-            "first_call_s": round(first, 2), "share_touching": round(float(touched.mean()), 3)}
+    """The full step alone."""
+    run, state = runner(env, num_envs, steps), started(env, num_envs, steps)
+    seconds(run, state, jax.random.key(2), None)
+    return timing([seconds(run, state, jax.random.key(2), None)[0] for _ in range(repeats)],
+                  num_envs * steps, steps)
 
 
 def measure_training(task: str, backend: str, num_envs: int, iterations: int) -> dict:
@@ -87,41 +213,49 @@ def measure_training(task: str, backend: str, num_envs: int, iterations: int) ->
     env = dexsim.make(task, backend=backend, num_envs=num_envs)
     config = dataclasses.replace(PPOConfig(), num_envs=num_envs)
     init, train_step = make_train(env, config)
-    state = init(jax.random.key(0))
-    state, metrics = train_step(state)
+    state, metrics = train_step(init(jax.random.key(0)))
     jax.block_until_ready(metrics)
     start = time.perf_counter()
-    for _ in range(iterations):
-        state, metrics = train_step(state)
-    jax.block_until_ready(metrics)
-    seconds = time.perf_counter() - start
-    steps = iterations * num_envs * config.rollout_length
-    return {"env_steps_per_s": round(steps / seconds)}
+    with collector_paused():
+        for _ in range(iterations):
+            state, metrics = train_step(state)
+        jax.block_until_ready(metrics)
+    steps = iterations * config.steps_per_iteration
+    return {"env_steps_per_s": round(steps / (time.perf_counter() - start)), "backend": env.backend}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--task", default="grasp", choices=sorted(TASKS))
-    parser.add_argument("--backends", nargs="+", default=["auto"])
+    parser.add_argument("--backends", nargs="+", default=["auto"], choices=["auto", "jax", "warp"])
     parser.add_argument("--num-envs", nargs="+", type=int, default=[256])
-    parser.add_argument("--variants", nargs="+", default=list(VARIANTS), choices=list(VARIANTS))
+    parser.add_argument("--leave-out", nargs="*", default=list(PARTS), choices=PARTS)
     parser.add_argument("--steps", type=int, default=16)
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--train", type=int, default=0, metavar="ITERATIONS")
+    parser.add_argument("--split", action="store_true", help="the parts of a training step, and nothing else")
     options = parser.parse_args()
+    enable_caches()
     device = jax.devices()[0]
     common = {"task": options.task, "device": device.device_kind, "jax": jax.__version__}
+
+    def show(row: dict) -> None:
+        print(json.dumps(row | common), flush=True)
+
     for backend in options.backends:
         for num_envs in options.num_envs:
-            for variant in options.variants:
-                env = make(options.task, variant, backend, num_envs)
-                row = measure(env, num_envs, options.steps, options.repeats)
-                print(json.dumps({"measure": "env", "variant": variant, "backend": env.backend,
-                                  "num_envs": num_envs, **row, **common}), flush=True)
+            if options.split:
+                from throughput_split import split
+
+                for row in split(options.task, backend, num_envs, options.repeats):
+                    show({"measure": "split"} | row)
+                continue
+            for row in compare(options.task, backend, num_envs, tuple(options.leave_out), options.steps,
+                               options.repeats):
+                show({"measure": "env"} | row)
             if options.train:
-                row = measure_training(options.task, backend, num_envs, options.train)
-                print(json.dumps({"measure": "training", "backend": backend,
-                                  "num_envs": num_envs, **row, **common}), flush=True)
+                show({"measure": "training", "num_envs": num_envs}
+                     | measure_training(options.task, backend, num_envs, options.train))
 
 
 if __name__ == "__main__":

@@ -237,11 +237,7 @@ class Env:
         key, draw_key, goal_key, noise_key, sensor_key = jax.random.split(key, 5)
         start = jax.tree.map(lambda rows: jnp.asarray(rows)[index], self.pool)
         config, hand = self.config, self.hand
-        draw = sample_draw(draw_key, config.randomization, hand,
-                                    timestep=config.physics.timestep,
-                                    control_period=self.control_period)
-        sensor = draw_sensor(sensor_key, config.sensing.orientation, config.randomization.scale,
-                             self.control_period)
+        draw, sensor = self._draw(draw_key, sensor_key)
         if goal is None:
             goal = self.task.begin(goal_key, start)
         joints = start.qpos[self.physics.joint_qpos]
@@ -319,6 +315,15 @@ class Env:
         return dataclasses.replace(state, tick=tick.astype(jnp.int32))
 
     # --- pieces of a step -----------------------------------------------------------------
+
+    def _draw(self, hand_key: jax.Array, sensor_key: jax.Array) -> tuple[Draw, SensorDraw]:
+        """The hand and the object's IMU of one episode."""
+        config = self.config
+        draw = sample_draw(hand_key, config.randomization, self.hand,
+                           timestep=config.physics.timestep, control_period=self.control_period)
+        sensor = draw_sensor(sensor_key, config.sensing.orientation, config.randomization.scale,
+                             self.control_period)
+        return draw, sensor
 
     def _drive(self, state: State, joint_target: jax.Array, push: jax.Array
                ) -> tuple[PhysicsState, jax.Array, Callable[[PhysicsState], jax.Array]]:

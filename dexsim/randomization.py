@@ -103,13 +103,21 @@ def sample(key: jax.Array, config: Randomization, hand: Hand, *, timestep: float
       scale: [] in [0, 1], on top of `config.scale`; may be traced. 0 is the nominal hand, exactly.
     """
     width = config.scale * scale
+    off = isinstance(width, (int, float)) and width == 0  # known beforehand: nothing is drawn
 
     def draw(key: jax.Array, span: tuple[float, float], nominal: float,
              shape: tuple[int, ...]) -> jax.Array:
+        if off:
+            return jnp.full(shape, nominal, float)
         value = jax.random.uniform(key, shape, minval=span[0], maxval=span[1])
         return nominal + width * (value - nominal)
 
-    return _assemble(key, draw, config, hand, timestep, control_period)
+    drawn = _assemble(key, draw, config, hand, timestep, control_period)
+    if not off:
+        return drawn
+    still = jnp.zeros(hand.num_joints)  # a ripple of no height has no waves to place
+    return dataclasses.replace(drawn, actuator=dataclasses.replace(
+        drawn.actuator, ripple_count=still, ripple_phase=still))
 
 
 def sample_outside(key: jax.Array, config: Randomization, hand: Hand, *, timestep: float,

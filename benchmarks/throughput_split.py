@@ -1,0 +1,167 @@
+"""Where the time of a training step goes: physics, touch, the rest of the environment, policy, learner.
+
+One iteration of PPO is recorded, then its parts are run again alone, on the recorded inputs: physics meets
+the same contacts, touch the same fingertips, the learner the same experience. `share` is a part's time over
+that of the whole iteration; `environment rest` is what a step and its restart cost beside physics and touch
+(task, readings, observation, draws), `rest` what the parts do not explain (parts compiled together are not
+the sum of parts compiled apart).
+"""
+
+import dataclasses
+import statistics
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from throughput import Recorder, make, seconds, timing
+
+from dexsim import rotations, tactile
+from dexsim.env import Env
+from dexsim.hand import forward_kinematics, taxel_positions
+from dexsim_ppo import ppo
+from dexsim_ppo.compilation import jit
+from dexsim_ppo.distribution import log_prob, sample
+from dexsim_ppo.ppo import PPOConfig, TrainState, make_train
+from dexsim_ppo.presets import find_preset
+from dexsim_ppo.rollout import Rollout
+from dexsim_ppo.running_stats import update_stats
+
+
+def split(task: str, backend: str, num_envs: int, repeats: int) -> list[dict]:
+    """A row for a whole training iteration and one for each part."""
+    env, recorder = make(task, "full", backend, num_envs), make(task, "full", backend, num_envs, Recorder)
+    preset = find_preset("gpu" if jax.default_backend() == "gpu" else "cpu", task)
+    config = dataclasses.replace(preset.ppo, num_envs=num_envs, iterations_per_call=1)
+    training = make_train(env, config)
+    # Some iterations first: objects settle, episodes of all ages are under way.
+    state = training.init(jax.random.key(0))
+    for _ in range(3):
+        state, _ = training.step(state)
+    whole = jit(lambda state: ppo.train_iteration(env, config, state))
+    ticks, actions = jit(lambda state: record(recorder, config, state))(state)
+    rollout = jit(lambda state: experience(env, config, state))(state)[1]
+    # What a part works on is an argument: as constants, XLA would fold it or hold it twice.
+    cases: dict[str, tuple[Callable, tuple[Any, ...]]] = {
+        "training step": (whole, (state,)),
+        "rollout": (jit(lambda state: experience(env, config, state)), (state,)),
+        "environment": (jit(lambda begin, actions: environment(env, begin, actions)), (state.env_state, actions)),
+        "physics": (jit(lambda ticks: physics(env, ticks)), (ticks,)),
+        "touch": (jit(lambda ticks, key: touch(env, ticks, key)), (ticks, jax.random.key(1))),
+        "policy": (jit(lambda state, rollout: policy(env, config, state, rollout)), (state, rollout)),
+        "learner": (jit(lambda state, rollout: learn(env, config, state, rollout)), (state, rollout)),
+    }
+    times = {name: [] for name in cases}
+    for run, arguments in cases.values():
+        seconds(run, *arguments)
+    for _ in range(repeats):
+        for name, (run, arguments) in cases.items():
+            times[name].append(seconds(run, *arguments)[0])
+    return list(rows(times, env.backend, config))
+
+
+def rows(times: dict[str, list[float]], backend: str, config: PPOConfig):
+    """Rows of what was measured, and of the differences."""
+    middle = {name: statistics.median(values) for name, values in times.items()}
+    middle["environment rest"] = middle["environment"] - middle["physics"] - middle["touch"]
+    middle["rest"] = middle["training step"] - middle["environment"] - middle["policy"] - middle["learner"]
+    for name, value in middle.items():
+        measured = times.get(name)
+        row = (timing(measured, config.steps_per_iteration, config.rollout_length) if measured else {
+            "env_steps_per_s": round(config.steps_per_iteration / value) if value > 0 else None,
+            "ms_per_step": round(1e3 * value / config.rollout_length, 4)})
+        yield {"part": name, "backend": backend, "num_envs": config.num_envs,
+               "rollout_length": config.rollout_length} | row | {
+                   "share": round(value / middle["training step"], 4)}
+
+
+def experience(env: Env, config: PPOConfig, state: TrainState) -> tuple[Any, Rollout, dict]:
+    """The first half of an iteration, exactly as it is."""
+    _, collect_key, _ = jax.random.split(state.key, 3)
+    normalizers = ppo.make_normalizers(env, config, state.observation_stats)
+    return ppo.collect_rollout(env, config, state, normalizers, collect_key)
+
+
+def record(env: Recorder, config: PPOConfig, state: TrainState) -> tuple[Any, jax.Array]:
+    """The ticks [T, B] that physics gets under the policy, with what comes of them, and the actions."""
+    normalizers = ppo.make_normalizers(env, config, state.observation_stats)
+
+    def tick(env_state, key):
+        mean = ppo.actor_mean(config, state.params, normalizers, env_state.obs)
+        action = sample(key, mean, state.params.log_std)
+        after, given = jax.vmap(env.recorded_step)(env_state, action)
+        outcome = after.physics.qpos, after.finger_force
+        return jax.vmap(env.restart)(after, after.terminated | after.truncated), (*given, *outcome, action)
+
+    keys = jax.random.split(state.key, config.rollout_length)
+    *ticks, actions = jax.lax.scan(tick, state.env_state, keys)[1]
+    return tuple(ticks), actions
+
+
+def environment(env: Env, state: Any, actions: jax.Array) -> Any:
+    """Steps and restarts under recorded actions [T, B, A]."""
+    def tick(state, action):
+        after = jax.vmap(env.step)(state, action)
+        used = _used((after.obs, after.reward, after.metrics))
+        return jax.vmap(env.restart)(after, after.terminated | after.truncated), used
+    return jax.lax.scan(tick, state, actions)
+
+
+def physics(env: Env, ticks: Any) -> jax.Array:
+    """The recorded ticks, each from its own start."""
+    def tick(_, given):
+        target, state, push, tape, *_ = given
+        after, force = jax.vmap(lambda target, state, push, tape: env.physics.advance(
+            target, state, lambda substep, position, velocity: tape[substep], push))(target, state, push, tape)
+        return None, _used((after, force))
+    return jax.lax.scan(tick, None, ticks)[1]
+
+
+def touch(env: Env, ticks: Any, key: jax.Array) -> jax.Array:
+    """From poses and forces to taxels, readings, and force and centre of each finger, true and read."""
+    hand, config, seam = env.hand, env.config, env.physics
+
+    def feel(target, qpos, strength, key):
+        pose = forward_kinematics(hand, qpos[seam.joint_qpos])
+        taxels, place = taxel_positions(hand, pose), qpos[seam.object_qpos]
+        felt = tactile.feel(taxels, jnp.asarray(hand.taxel_area), target.shape(), place[:3],
+                            rotations.quat_to_matrix(place[3:]), strength, config.skin)
+        read = tactile.measure_taxels(felt.force, jnp.ones((hand.num_fingers, 1)), config.sensing.taxel, key)
+        weighting = config.observation.weighting
+        return [tactile.reduce_touch(force, taxels, weighting) for force in (felt.force, read)]
+
+    def tick(key, given):
+        target, _, _, _, qpos, strength = given
+        key, use = jax.random.split(key)
+        return key, _used(jax.vmap(feel)(target, qpos, strength, jax.random.split(use, len(qpos))))
+    return jax.lax.scan(tick, key, ticks)[1]
+
+
+def policy(env: Env, config: PPOConfig, state: TrainState, rollout: Rollout) -> jax.Array:
+    """An action and two values for every observation, as in a rollout."""
+    normalizers = ppo.make_normalizers(env, config, state.observation_stats)
+
+    def tick(key, obs):
+        key, use = jax.random.split(key)
+        mean = ppo.actor_mean(config, state.params, normalizers, obs)
+        action = sample(use, mean, state.params.log_std)
+        # The value after the step is that of another observation; here those of other rows stand for it.
+        values = [ppo.critic_value(config, state.params, normalizers, seen)
+                  for seen in (obs, jax.tree.map(lambda x: jnp.roll(x, 1, 0), obs))]
+        return key, _used((action, log_prob(action, mean, state.params.log_std), values))
+    return jax.lax.scan(tick, state.key, rollout.obs)[1]
+
+
+def learn(env: Env, config: PPOConfig, state: TrainState, rollout: Rollout) -> Any:
+    """Advantages, all epochs over all minibatches, statistics."""
+    normalizers = ppo.make_normalizers(env, config, state.observation_stats)
+    value_stats, params, samples = ppo.prepare(config, state.value_stats, state.params, rollout)
+    learner = ppo.Learner(params, state.adam, state.learning_rate, state.skipped_updates)
+    stats = {group: update_stats(state.observation_stats[group], rollout.obs[group])
+             for group in state.observation_stats}
+    return ppo.update(config, normalizers, samples, state.key, learner), value_stats, stats
+
+
+def _used(tree: Any) -> jax.Array:
+    """One number that depends on all leaves, so that none is left out."""
+    return sum(jnp.sum(leaf.astype(jnp.float32)) for leaf in jax.tree.leaves(tree))
