@@ -20,7 +20,7 @@ import numpy as np
 from dexsim import actuator, observation, rotations, tactile
 from dexsim.config import setting, validate
 from dexsim.control import Control, move_target, recalled
-from dexsim.hand import Hand, HandPose, forward_kinematics, taxel_positions
+from dexsim.hand import Hand, HandPose, forward_kinematics, taxel_normals, taxel_positions
 from dexsim.objects import ObjectConfig, ObjectParams
 from dexsim.observation import Motion, ObservationConfig, Readings
 from dexsim.orientation_sensor import (
@@ -201,7 +201,8 @@ class Env:
         self.hand = hand
         config = self.config
         self.physics = Physics(self.hand, task.slots, task.largest, config.physics,
-                               gravity=task.gravity, backend=backend, num_envs=num_envs)
+                               gravity=task.gravity, backend=backend, num_envs=num_envs,
+                               skin=config.skin)
         self.backend = self.physics.backend
         self.action_size = self.hand.num_joints
         # What is left out is left out of the actor; a critic may always look.
@@ -388,6 +389,8 @@ class Env:
             touch = tactile.feel(taxel_positions(hand, pose), jnp.asarray(hand.taxel_area),
                                  target.shape(), place[:3], rotations.quat_to_matrix(quat),
                                  strength, config.skin)
+            if config.skin.total == "pressing":
+                touch = tactile.press_only(touch, taxel_normals(hand, pose), force)
         else:
             nothing = jnp.zeros(hand.taxel_area.shape)
             touch = tactile.Touch(nothing, nothing, nothing)

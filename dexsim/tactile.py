@@ -22,7 +22,7 @@ from dexsim.pytree import pytree_dataclass
 
 WEIGHTINGS = ("force", "depth", "none")
 LAWS = ("mooney_rivlin", "linear")
-TOTALS = ("solver", "skin")
+TOTALS = ("solver", "pressing", "skin")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -45,8 +45,10 @@ class Skin:
     law: str = setting("mooney_rivlin", choices=LAWS)
     """linear: the slope at small strain throughout (Winkler's elastic foundation)."""
     total: str = setting("solver", choices=TOTALS)
-    """Where a finger's total comes from: the physics' contact force, spread by the skin's law, or
-    the skin itself, whose stress times area is then the force on each taxel."""
+    """Where a finger's total comes from: the physics' contact force, spread by the skin's law (solver:
+    its magnitude, friction included; pressing: the part that presses into the skin, which is all that
+    a taxel of one axis feels), or the skin itself, whose stress times area is then the force on each
+    taxel."""
 
     def __post_init__(self):
         validate(self)
@@ -178,6 +180,17 @@ def split_force(force: jax.Array, normals: jax.Array,
     inward = inward / jnp.sqrt(jnp.where(touching, square, 1.0))
     pressed = jnp.sum(finger_force * inward, -1)
     return pressed, jnp.where(touching, finger_force - pressed[:, None] * inward, 0.0)
+
+
+def press_only(touch: Touch, normals: jax.Array, finger_force: jax.Array) -> Touch:
+    """The same touch with only the pressing part of the fingers' forces shared among the taxels.
+
+    Args:
+      normals: [F, N, 3] outward taxel normals, palm frame.
+      finger_force: [F, 3] N, the physics' force vector on the finger, palm frame.
+    """
+    pressed, _ = split_force(touch.skin_force, normals, finger_force)
+    return dataclasses.replace(touch, force=spread(touch.skin_force, jnp.maximum(pressed, 0.0)))
 
 
 def taxel_vectors(force: jax.Array, finger_force: jax.Array) -> jax.Array:

@@ -1,12 +1,18 @@
 """Contact parameters against what C MuJoCo makes of them: weight at rest, bounce, rubber."""
 
+import c_scene
+import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
 from dexsim import contact
-from dexsim.objects import OFF, SLOTS, ObjectConfig, damping_ratio
-from dexsim.physics import PhysicsConfig, build_model
+from dexsim.objects import OFF, SHAPES, SLOTS, ObjectConfig, damping_ratio
+from dexsim.physics import Physics, PhysicsConfig, build_model
+from dexsim.tactile import Skin
+from dexsim.tasks.grasp import Grasp, GraspConfig
+from dexsim.tasks.grasp_start import make_pool
 
 BALL = """
 <mujoco>
@@ -120,3 +126,37 @@ def test_a_row_of_spheres_fills_its_capsule(hand):
             np.testing.assert_allclose(ball.pos, pad.pos + (k - 1) * half, atol=1e-6)
             assert ball.size[0] == pytest.approx(pad.size[0])
         assert pad.size[0] - np.sqrt(pad.size[0]**2 - (pad.size[1] / 2)**2) < 8e-4
+
+
+def test_springs_follow_the_skin(hand):
+    """In squeezed hands every pair gets the spring that the second scene works out from C MuJoCo's own contacts."""
+    law, rng = c_scene.skin_law(hand, Skin()), np.random.default_rng(4)
+    seam = Physics(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(), gravity=c_scene.GRAVITY, backend="jax",
+                   skin=Skin())
+    pool = make_pool(jax.random.key(3), hand, GraspConfig(pool_size=3 * len(SHAPES)), Grasp.reference)
+
+    @jax.jit
+    def configure(target, qpos):
+        model = seam.configure(target, seam.tip_stiffness(target, qpos))
+        return model.pair_solref, model.pair_solimp
+
+    first, second = ([seam.mj_model.geom(g).name for g in side[seam.object_pairs]]
+                     for side in (seam.mj_model.pair_geom1, seam.mj_model.pair_geom2))
+    changed = dict.fromkeys(SHAPES, 0)
+    for index in range(3 * len(SHAPES)):
+        start = c_scene.row(pool, index)
+        model, qpos, qvel, *_ = c_scene.squeeze(hand, start, rng)
+        nominal = model.pair_solref.copy()
+        felt = law(qpos[None], jax.tree.map(lambda leaf: leaf[None], start.target))
+        c_scene.follow_skin(model, c_scene.start(model, qpos, qvel), hand, start.target, np.asarray(felt)[0])
+        changed[SHAPES[start.target.shape_index]] += np.sum(model.pair_solref[:, 0] != nominal[:, 0])
+        solref, solimp = configure(start.target, jnp.asarray(qpos))
+        there = {(model.geom(a).name, model.geom(b).name): pair for pair, (a, b) in enumerate(
+            zip(model.pair_geom1, model.pair_geom2, strict=True))}
+        for pair, link, other in zip(seam.object_pairs, first, second, strict=True):
+            slot = int(other.removeprefix("object_"))
+            if start.target.active[slot]:
+                at = there[link, c_scene.KINDS[slot]]
+                np.testing.assert_allclose(solref[pair], model.pair_solref[at], rtol=2e-3)
+                np.testing.assert_allclose(solimp[pair], model.pair_solimp[at], rtol=2e-3)
+    assert min(changed.values()) >= 10, changed

@@ -375,3 +375,17 @@ def test_gradient_in_single_precision_points_the_same_way(hand, taxels):
     exact = np.asarray(jax.grad(total)(start))
     numeric = np.array([(total(start + step * axis) - total(start - step * axis)) / (2 * step) for axis in EYE])
     np.testing.assert_allclose(exact, numeric, rtol=0.02, atol=0.02 * np.abs(numeric).max())
+
+
+@pytest.mark.parametrize("direction, pressed", [((0, 0, -1), 5.0), ((0.6, 0, -0.8), 4.0), ((0, 0, 1), 0.0),
+                                                ((0, 1, 0), 0.0)])
+def test_taxels_of_one_axis_feel_only_what_presses(direction, pressed):
+    """A punch on a flat lattice whose force is askew: the part along the lattice's normal is shared."""
+    taxels, area = flat_lattice(10, 12, 0.002)
+    touch = feel(taxels, area, solid("box", 0.006, 0.004, 0.010), np.float32([0, 0, 0.0095]), EYE,
+                 np.float32([5.0]), Skin(margin=0.0))
+    normals = np.broadcast_to(np.float32([0, 0, 1]), taxels.shape)
+    only = tactile.press_only(touch, normals, 5 * np.float32([direction]))
+    assert float(only.force.sum()) == pytest.approx(pressed, abs=1e-5)
+    np.testing.assert_allclose(only.force, touch.force * pressed / 5, atol=1e-6)
+    np.testing.assert_array_equal(only.skin_force, touch.skin_force)
