@@ -31,7 +31,7 @@ from dexsim_real.vision import HeightSensor
 RATE = 83.0  # exchanges a second
 REQUEST, ROUND_TRIP = 0.001, 0.0096  # s from the host to the board; until the answer is there
 IMU_RATE, CAMERA_RATE = 100.0, 30.0  # Hz
-_APPROACH, _PLACE, _ZERO_SAMPLES = 2.0, 0.5, 30
+_ZERO_SAMPLES = 30
 _SLACK = 5.0  # s beyond a trial's limit after which something is wrong
 
 
@@ -128,6 +128,8 @@ class RunOptions:
 
     command: float = 0.5  # in [0, 1]
     safety: bool = True
+    approach: float = 2.0  # s to the start posture
+    place: float = 0.5  # s in it, before the policy begins
     hardware: HardwareConfig = HardwareConfig()
     limits: SafetyConfig = SafetyConfig()
 
@@ -163,7 +165,8 @@ class VirtualRun:
         """The referee's report, with what the bridge believed."""
         trial, limit = self.plant.trial, self.plant.limit + _SLACK
         self._schedule.at(0.0, self._exchange)
-        self._schedule.at(0.001, self._sense_orientation)
+        if "imu" in self.controller.sources:
+            self._schedule.at(0.001, self._sense_orientation)
         if self.camera:
             self._schedule.at(0.002, self._take_picture)
         self._zero()
@@ -171,11 +174,12 @@ class VirtualRun:
         self.safety.engage()
         start, began = self._pose(), self._now
         goal = np.asarray(POSTURES[self.plant.task], np.float32)
-        while self._now < began + _APPROACH + _PLACE:
-            share = np.float32(min((self._now - began) / _APPROACH, 1.0))
+        while self._now < began + self.options.approach + self.options.place:
+            share = np.float32(min((self._now - began) / self.options.approach, 1.0))
             self._tell(start + share * share * (3 - 2 * share) * (goal - start))
             self._until(self._now + 1 / RATE)
-        self.imu.calibrate()
+        if "imu" in self.controller.sources:
+            self.imu.calibrate()
         task = self.controller.task
         if hasattr(task.config, "goal_step"):
             self.goals = TurnGoals(task.config, task.reference)
