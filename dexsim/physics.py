@@ -66,7 +66,7 @@ class PhysicsConfig:
     """Time scale on which a contact pushes out what lies in it (at least four time steps)."""
     palm: str = setting("face", choices=("face", "box"))
     """Palm as a half-space at its face (exact and cheap for every primitive) or as its box."""
-    max_contacts: int = setting(16, unit="1", low=4, high=400)
+    max_contacts: int = setting(20, unit="1", low=4, high=400)
     """Contacts kept per environment (JAX backend: the deepest; Warp: mean over the batch)."""
 
     def __post_init__(self):

@@ -510,14 +510,13 @@ class TestSkinLaw:
 
     @pytest.mark.parametrize("shape", SHAPES)
     def test_it_follows_the_force_of_the_jax_backend(self, hand, grasp_env, grips, shape):
-        """Few grips, and MJX-JAX's cylinders (two points, up to 0.95 mm too shallow): see
-        `test_skin_law` for many of them, in contacts that are right."""
+        """Few grips, of the whole environment: see `test_skin_law` for many of them."""
         pairs = skin_pairs(hand, grasp_env, grips[shape])
         force, felt = pairs[:, pairs[0] > 0.01]
         assert force.size > 40 and np.ptp(force) > 5
         r, r_sum = np.corrcoef(force, felt)[0, 1], np.corrcoef(*pairs.sum(-1))[0, 1]
         print(f"{shape}: r = {r:.3f} of {force.size} fingers, {r_sum:.3f} of {pairs.shape[1]} hands")
-        assert r >= 0.8, f"{shape}: {r:.3f}"
+        assert r >= 0.9, f"{shape}: {r:.3f}"
 
 
 class TestTouch:
@@ -562,7 +561,8 @@ class TestTouch:
             data = c_scene.start(model, state.physics.qpos[world], state.physics.qvel[world])
             mujoco.mj_forward(model, data)
             names |= {model.geom(c.geom[0]).name for c in data.contact}
-        assert names == {"index_pad", "mid_pad", "ring_pad", "pinky_pad"}
+        pads = {"index_pad", "mid_pad", "ring_pad", "pinky_pad"}
+        assert {name.rpartition("_")[0] for name in names} == pads, names
 
         weight = mass * 9.81
         np.testing.assert_allclose(np.sum(state.finger_force, -1), weight, rtol=0.05)
