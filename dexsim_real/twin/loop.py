@@ -89,6 +89,8 @@ class Twin:
       HandError: a port or socket cannot be made.
     """
 
+    HICCUP = 0.01  # s
+
     def __init__(self, arguments: TwinArguments, hand: Hand, plant: Plant, folder: Path,
                  show: Callable[[str], None] = lambda text: None):
         self.arguments, self.plant, self._show = arguments, plant, show
@@ -113,21 +115,20 @@ class Twin:
             self.close()
             raise
         self._first = self._trial = plant.trial
+        self.hiccups = 0  # times that this machine let nothing happen for `HICCUP`
         self._stop = False
 
     def stop(self) -> None:
         """End soon; safe to call from a signal."""
         self._stop = True
 
-    def run(self, trial_over: Callable[[], None] = lambda: None) -> None:
-        """Until all trials are over, or `stop`.
-
-        Args:
-          trial_over: called after each trial.
-        """
+    def run(self) -> None:
+        """Until all trials are over, or `stop`."""
         sides = [side for side in (self.imu, self.masks) if side]
+        now = time.monotonic()
         while not self._stop:
-            now = time.monotonic()
+            before, now = now, time.monotonic()
+            self.hiccups += now - before > self.HICCUP
             self.line.serve(now)
             free = self.line.due() - now
             for side in sides:
@@ -142,9 +143,10 @@ class Twin:
                 until = now + free
             if self.plant.trial != self._trial:
                 self._trial = self.plant.trial
-                self.note(f"trial {self._trial - self._first} of {self.arguments.trials} is over")
-                trial_over()
-                self._stop |= self._trial - self._first >= self.arguments.trials
+                done = self._trial - self._first
+                end = self.plant.results()[done - 1].get("end", "")
+                self.note(f"trial {done} of {self.arguments.trials} is over: {end}")
+                self._stop |= done >= self.arguments.trials
             pause = min(until, self.line.due()) - time.monotonic()
             ports = [self.line.terminal] if self.line.terminal.plugged else []
             select.select(ports, [], [], max(pause, 0.0))
@@ -175,6 +177,7 @@ class Twin:
             "stuck": [[*taxel, count] for taxel, count in firmware.stuck.items()],
             "watchdog": {"limit_s": arguments.firmware.watchdog, "longest_s": firmware.longest,
                          "trips": firmware.trips},
-            "physics": self.world.report(), "slowest_exchange_ms": round(1e3 * line.slowest, 3),
-            "late": line.lateness.summary(), "imu_frames": self.imu.sent if self.imu else 0,
+            "hiccups": self.hiccups, "physics": self.world.report(),
+            "slowest_exchange_ms": round(1e3 * line.slowest, 3), "late": line.lateness.summary(),
+            "imu_frames": self.imu.sent if self.imu else 0,
             "masks": dict(self.masks.counts) if self.masks else {}, "events": [list(event) for event in self.events]}

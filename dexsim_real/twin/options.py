@@ -43,7 +43,7 @@ class TwinArguments:
     mask_socket: Path | None = None
     """Unix socket of the camera's masks (grasp)."""
     output: Path | None = None
-    """File for results, counters and events as JSON, written after each trial and at the end."""
+    """File for results, counters and events as JSON, written at the end."""
     realtime: bool = True
     """Ask for real-time priority: it stands for hardware, which waits for no scheduler."""
     plant: str | None = None
