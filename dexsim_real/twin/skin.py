@@ -13,7 +13,7 @@ from dexsim.hand import Hand
 from dexsim_real.twin.draw import Draw
 from dexsim_real.twin.shapes import Shape
 
-_FULLY, _NOT_AT_ALL = 0.004, 0.008  # m from a contact to the nearest taxel: within, it is felt; beyond, not
+_FULLY, _NOT_AT_ALL = 0.004, 0.008  # m along the skin from a contact to the nearest taxel: felt within, not beyond
 _LEFT = 0.15  # share of the rubber that no load squeezes away
 
 
@@ -22,7 +22,7 @@ class Skin:
 
     def __init__(self, hand: Hand):
         self._place, self._area = hand.taxel_position.astype(float), hand.taxel_area.astype(float)
-        self._grid = hand.taxel_grid
+        self._normal, self._grid = hand.taxel_normal.astype(float), hand.taxel_grid
         self._axes = _axes(self._place, hand.taxel_normal.astype(float), hand.taxel_grid)
 
     def configure(self, draw: Draw, rng: np.random.Generator) -> None:
@@ -47,10 +47,10 @@ class Skin:
         force = np.zeros((*self._area.shape, 3))
         for finger in {contact[0] for contact in contacts}:
             origin, frame = tips[0][finger], tips[1][finger]
-            taxels = origin + self._place[finger] @ frame.T
+            taxels, outward = origin + self._place[finger] @ frame.T, self._normal[finger] @ frame.T
             pressed, dragged = 0.0, np.zeros(3)
             for _, point, normal, tangent in (c for c in contacts if c[0] == finger):
-                gap = np.sqrt(((taxels - point) ** 2).sum(-1).min())
+                gap = self._gap(point - taxels, outward)
                 felt = np.clip((_NOT_AT_ALL - gap) / (_NOT_AT_ALL - _FULLY), 0.0, 1.0)
                 pressed += felt * float(np.linalg.norm(normal))
                 dragged += felt * tangent
@@ -66,6 +66,15 @@ class Skin:
         shown = mixed * self._gain[..., None] + self._noise * rng.standard_normal(force.shape)
         shown[..., 2] += self._bias
         return np.where(np.abs(shown) < self._threshold, 0.0, shown)
+
+    def _gap(self, away: np.ndarray, outward: np.ndarray) -> float:
+        """How far m along the skin a contact lies from the nearest taxel, given its vectors [N, 3] from all of them.
+
+        Up to the rubber's thickness, height above a taxel is no distance.
+        """
+        height = (away * outward).sum(-1)
+        along = ((away - height[:, None] * outward) ** 2).sum(-1)
+        return float(np.sqrt((along + np.maximum(np.abs(height) - self.thickness, 0.0) ** 2).min()))
 
     def _share(self, shape: Shape, points: np.ndarray, area: np.ndarray) -> np.ndarray:
         """Share [N] of the load on each taxel; zero where the object is out of all taxels' reach."""
