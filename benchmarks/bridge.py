@@ -4,7 +4,8 @@
 
 The hand is a process of its own that answers 9.6 ms after each request, as the real one does over
 RS485. Measured are the whole command as a user runs it (exchanges at 83 Hz, the policy at its own rate,
-log and safety on) and, apart, observation and policy alone. `--port` measures another hand instead.
+log and safety on) and, apart, observation and policy alone. `--twin` takes the emulated hand with its physics and the
+object's sensors in place of the scripted one, `--port` a hand that is there already.
 """
 
 import argparse
@@ -22,6 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
+ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parent.parent)}
 EXCHANGE = 0.0096  # s, measured on the hand: mean and median of the round trip
 
 
@@ -59,14 +61,30 @@ def peer() -> None:
 
 @contextlib.contextmanager
 def scripted_hand():
-    """The port of a scripted hand in its own process."""
+    """A runner's options for a scripted hand in its own process."""
     process = subprocess.Popen([sys.executable, __file__, "--peer"], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-                               env={**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parent.parent)})
+                               env=ENVIRONMENT)
     try:
-        yield process.stdout.readline().decode().strip()
+        yield ["--port", process.stdout.readline().decode().strip(), "--fixed-object"]
     finally:
         process.stdin.close()
         process.wait(5)
+
+
+@contextlib.contextmanager
+def emulated_hand(task: str, folder: Path):
+    """A runner's options for `python -m dexsim_real.twin`."""
+    port, imu, masks = (folder / name for name in ("hand", "imu", "masks"))
+    process = subprocess.Popen(
+        [sys.executable, "-m", "dexsim_real.twin", "--task", task, "--trials", "100000", "--link", str(port),
+         "--imu-link", str(imu), "--mask-socket", str(masks)], stdout=subprocess.PIPE, env=ENVIRONMENT)
+    try:
+        process.stdout.readline()
+        threading.Thread(target=process.stdout.read, daemon=True).start()
+        yield ["--port", str(port), *(["--imu", str(imu)] if task == "rotate" else ["--camera", f"unix:{masks}"])]
+    finally:
+        process.terminate()
+        process.wait(10)
 
 
 def resident() -> float:
@@ -74,7 +92,7 @@ def resident() -> float:
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
-def measure_run(options: argparse.Namespace, port: str, folder: Path) -> dict:
+def measure_run(options: argparse.Namespace, hand: list[str], folder: Path) -> dict:
     """A whole run by the command, its own summary, and the memory over time."""
     from dexsim_real import run
 
@@ -84,7 +102,7 @@ def measure_run(options: argparse.Namespace, port: str, folder: Path) -> dict:
         while not done.wait(options.seconds / 20):
             memory.append(resident())
 
-    arguments = [options.policy, "--port", port, "--uncalibrated", "--fixed-object", "--link.settle", "0.1", "--quiet",
+    arguments = [options.policy, *hand, "--uncalibrated", "--link.settle", "0.1", "--quiet",
                  "--seconds", str(options.seconds), "--approach", "1", "--log", str(folder / "bridge.log"),
                  "--output", str(folder / "bridge.json")]
     threading.Thread(target=watch, daemon=True).start()
@@ -140,6 +158,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--policy", default="grasp")
     parser.add_argument("--port", help="a hand that is there already")
+    parser.add_argument("--twin", choices=("grasp", "rotate"), help="the emulated hand, for a policy of this task")
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--ticks", type=int, default=5000)
     parser.add_argument("--peer", action="store_true", help=argparse.SUPPRESS)
@@ -150,12 +169,14 @@ def main() -> None:
     from dexsim_real.control import prepare_jax
 
     prepare_jax()
-    common = {"policy": options.policy, "cores": len(os.sched_getaffinity(0)), "load": os.getloadavg()[0]}
+    common = {"policy": options.policy, "hand": options.port or options.twin or "scripted",
+              "cores": len(os.sched_getaffinity(0)), "load": os.getloadavg()[0]}
     print(json.dumps({"measure": "compute", **measure_compute(options.policy, options.ticks), **common}), flush=True)
     with tempfile.TemporaryDirectory() as folder:
-        hand = contextlib.nullcontext(options.port) if options.port else scripted_hand()
-        with hand as port:
-            row = measure_run(options, port, Path(folder))
+        hand = (contextlib.nullcontext(["--port", options.port, "--fixed-object"]) if options.port
+                else emulated_hand(options.twin, Path(folder)) if options.twin else scripted_hand())
+        with hand as words:
+            row = measure_run(options, words, Path(folder))
         print(json.dumps({"measure": "run", **row, **common, "load": os.getloadavg()[0]}), flush=True)
 
 

@@ -55,6 +55,11 @@ def resident(pid: int) -> float:
     return float("nan")
 
 
+def stolen() -> float:
+    """Seconds that a virtual machine's processors were given to others so far."""
+    return int(Path("/proc/stat").read_text().split()[8]) / os.sysconf("SC_CLK_TCK")
+
+
 class TwinProcess:
     """An emulated hand of its own process, with its ports in a folder."""
 
@@ -103,7 +108,7 @@ def soak(options: argparse.Namespace) -> bool:
         folder = Path(name)
         rates = [word for kind, rate in RATES.items() for word in (f"--faults.{kind}", f"{options.scale * rate:g}")]
         twin = TwinProcess(folder, options, *rates, "--faults.stuck-count", "2", "4")
-        begun = time.monotonic()
+        begun, begun_stolen = time.monotonic(), stolen()
         while (left := options.minutes * 60 - (time.monotonic() - begun)) > 1:
             log = folder / f"{len(runs)}.log"
             process = start("-m", "dexsim_real.run", *runner_words(twin, options, log, min(left, options.run_seconds)),
@@ -144,7 +149,7 @@ def soak(options: argparse.Namespace) -> bool:
         "host_lost_hand": len(holds), "host_safe_ms": round(1e3 * max(holds, default=0.0), 1),
         "hot": len(heat), "hot_off_ms": round(1e3 * max(heat, default=0.0), 1),
         "slowest_exchange_ms": report["slowest_exchange_ms"], "hiccups": report["hiccups"],
-        "physics": report["physics"],
+        "stolen_s": round(stolen() - begun_stolen, 2), "physics": report["physics"],
         "runner_mib": [round(m, 1) for m in memory], "twin_mib": [round(m, 1) for m in twin_memory],
         "errors": [run["stderr"][-300:] for run in runs if run["code"] == 2][:5],
         "load": os.getloadavg()[0], "cores": len(os.sched_getaffinity(0))}, checks)
@@ -156,14 +161,14 @@ def inspect(path: Path, safe: float) -> dict:
     from dexsim_real.log import Kind, LogReader
 
     reader, link, end, state = LogReader(path), {}, "no end", None
-    states, notes, first_on, last_on = [], [], None, None
+    states, sent, notes = [], [], []
     for record in reader:
         if record.kind == Kind.RECEIVED and record.content[1][4] == frames.Command.EXCHANGE:
             states.append(record.time)
             state = record.content[1]
         elif record.kind == Kind.SENT and record.content[1][4] == frames.Command.EXCHANGE:
             if frames.decode_command(record.content[1][7:-2])["mode"][0] != frames.Mode.PASSIVE:
-                first_on, last_on = first_on or record.time, record.time
+                sent.append(record.time)
         elif record.kind == Kind.NOTE and record.content.startswith(("clip", "hold", "relax", "in command")):
             notes.append((record.time, record.content.startswith(("hold: no measurement", "relax"))))
         elif record.kind == Kind.END:
@@ -173,24 +178,23 @@ def inspect(path: Path, safe: float) -> dict:
         seen = frames.decode_state(state[7:-2])["tip"]["taxel"]["z"]
         return all(seen[tip, taxel] == count for tip, taxel, count in taxels)
 
-    holds = [] if first_on is None else list(reactions(states, notes, first_on, last_on, safe))
     return {"link": link, "end": end.split(":")[0] + (": " + end.split(":")[1].strip() if "stopped" in end else ""),
-            "damaged": reader.damaged, "holds": holds, "stuck": stuck}
+            "damaged": reader.damaged, "holds": list(reactions(states, sent, notes, safe)), "stuck": stuck}
 
 
-def reactions(states: list[float], notes: list[tuple[float, bool]], first: float, last: float,
-              safe: float) -> Iterator[float]:
-    """Seconds from the last news of the hand until the bridge held, for each silence longer than allowed.
+def reactions(states: list[float], sent: list[float], notes: list[tuple[float, bool]], safe: float) -> Iterator[float]:
+    """For each silence longer than allowed: how old the news was, s, when the last command before the hold was sent.
 
-    `notes` are the bridge's changes: when, and whether it then held or relaxed for want of news.
+    `notes` are the bridge's changes: when, and whether it then held or relaxed for want of news. A bridge that the
+    machine itself has stopped sends nothing, and that is safe.
     """
     for before, after in zip(states, states[1:], strict=False):
-        if after - before > safe and first <= before <= last:
-            held = [holds for when, holds in notes if when <= before][-1:] == [True]
-            later = [(when, holds) for when, holds in notes if before < when <= after]
-            # One that held already, and never stopped, was safe all the time.
-            yield 0.0 if held and not later else min((when - before for when, holds in later if holds),
-                                                     default=float("inf"))
+        if after - before <= safe or not sent or not sent[0] <= before <= sent[-1]:
+            continue
+        later = [(when, holds) for when, holds in notes if before < when <= after]
+        held = [holds for when, holds in notes if when <= before][-1:] == [True] and not later
+        alarm = before if held else min((when for when, holds in later if holds), default=after)
+        yield max((when - before for when in sent if before < when < alarm), default=0.0)
 
 
 def heat_reactions(report: dict) -> list[float]:

@@ -6,10 +6,12 @@ It prints the command that runs a policy on it, and goes on until its trials are
 """
 
 import importlib
+import queue
 import shlex
 import signal
 import sys
 import tempfile
+import threading
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -92,24 +94,33 @@ def main(argv: Sequence[str] | None = None) -> int:
     hand = load_hand()
     if arguments.policy:
         check_policy(arguments.policy, arguments.task, hand)
+    lines: queue.SimpleQueue = queue.SimpleQueue()
     with tempfile.TemporaryDirectory(prefix="dexsim-twin-") as folder:
-        twin = Twin(arguments, hand, make_plant(arguments, hand), Path(folder),
-                    lambda text: print(text, flush=True))
+        twin = Twin(arguments, hand, make_plant(arguments, hand), Path(folder), lines.put)
         before = {number: signal.signal(number, lambda *_: twin.stop()) for number in (signal.SIGTERM, signal.SIGINT)}
-
+        printer = threading.Thread(target=_print, args=(lines,), name="print", daemon=True)
+        printer.start()
         try:
-            print(f"{arguments.task}: the emulated hand is at {twin.line.terminal.name}. Run a policy on it with\n"
-                  f"    {shlex.join(runner_command(twin))}", flush=True)
+            lines.put(f"{arguments.task}: the emulated hand is at {twin.line.terminal.name}. Run a policy on it with\n"
+                      f"    {shlex.join(runner_command(twin))}")
             if arguments.realtime and not use_realtime():
                 twin.note("without real-time priority: expect jitter on a busy machine (docs/hardware.md)")
             twin.run()
         finally:
+            lines.put(None)
+            printer.join(2.0)
             twin.close()
             if arguments.output:
                 cli.write_json(arguments.output, twin.report())
             for number, handler in before.items():
                 signal.signal(number, handler)
     return 0
+
+
+def _print(lines: queue.SimpleQueue) -> None:
+    """From a thread of its own: the wire never waits for a terminal."""
+    for text in iter(lines.get, None):
+        print(text, flush=True)
 
 
 if __name__ == "__main__":

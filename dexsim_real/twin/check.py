@@ -51,13 +51,14 @@ class CommandCheck:
         self._last: tuple[float, np.ndarray, np.ndarray] | None = None
         self._shown: deque[tuple[float, np.ndarray]] = deque()  # what was reported lately
 
-    def take(self, now: float, command: np.ndarray, reported: np.ndarray) -> list[str]:
+    def take(self, now: float, command: np.ndarray, reported: np.ndarray, since: float | None = None) -> list[str]:
         """What is wrong with joint commands [12] (`frames.JOINT_COMMAND`) received at `now` s.
 
         Args:
           reported: [12] rad, angles of the last state that was sent.
+          since: s, the earliest time at which it may have come, where that is not `now`.
         """
-        found = self._find(now, command, reported)
+        found = self._find(now, now if since is None else since, command, reported)
         self.checked += 1
         self.wrong.update(found)
         if found and len(self.first) < self.WORDS:
@@ -65,7 +66,7 @@ class CommandCheck:
                               f"reported {np.round(reported, 4).tolist()}")
         return found
 
-    def _find(self, now: float, command: np.ndarray, reported: np.ndarray) -> list[str]:
+    def _find(self, now: float, since: float, command: np.ndarray, reported: np.ndarray) -> list[str]:
         config, position = self.config, command["position"].astype(float)
         self._shown.append((now, reported))
         while self._shown[0][0] < now - config.recent:
@@ -76,7 +77,7 @@ class CommandCheck:
             return ["mode"]
         if not np.isfinite(position).all():
             return ["not finite"]
-        self._last = now, np.where(on, position, np.nan), on
+        self._last = since, np.where(on, position, np.nan), on
         found = []
         outside = (position < self._lower - self._ROUNDING) | (position > self._upper + self._ROUNDING)
         if np.any(outside & on):

@@ -47,7 +47,8 @@ class LineConfig:
 
 @dataclasses.dataclass(frozen=True)
 class _Request:
-    read: float  # s, when it was found in the terminal
+    since: float  # s, when the terminal had been looked at before
+    read: float  # s, when it was found there
     heard: float  # s, when its last byte has come over the wire
     pause: float  # s, until its answer
     whole: bytes
@@ -80,7 +81,7 @@ class HandLine:
         self._back: float | None = None  # s, when the plug is put in again
         self._deaf = -np.inf  # s, until when nothing is heard
         self._heard_all = self._said_all = -np.inf  # s, end on the wire of the last request and answer
-        self._heard = self._acted = -np.inf
+        self._heard = self._acted = self._looked = -np.inf
         self._cooling: list[tuple[float, Fault]] = []
         self._strange: int | None = None
 
@@ -103,6 +104,7 @@ class HandLine:
             self._note("plugged in again")
         if self._back is None:
             self._listen(now)
+        self._looked = now
         if not self._requests:  # One that has come is an exchange, even if this machine is late to see to it.
             self.firmware.watch(now)
         # One thing after the other: no request is looked at while an answer is on its way.
@@ -139,7 +141,7 @@ class HandLine:
                 continue
             whole = frame.encode()
             self._heard_all = max(self._heard_all, now) + self._on_wire(len(whole))
-            self._requests.append(_Request(now, self._heard_all, self._pause(), whole))
+            self._requests.append(_Request(self._looked, now, self._heard_all, self._pause(), whole))
 
     def _turn(self, request: _Request) -> float:
         """When a request is answered."""
@@ -166,18 +168,19 @@ class HandLine:
         for frame in self._parser.feed(
                 self.injector.damage(fault, request.whole) if damaged else request.whole):
             if frame.command == Command.EXCHANGE:
-                self._inspect(now, frame)
+                self._inspect(request, frame)
             answers.append(self.firmware.answer(frame, now))
         self.counts["damaged requests"] += damaged
         for answer in filter(None, answers):
             self._reply(now, request, answer.encode(), fault)
 
-    def _inspect(self, now: float, frame: Frame) -> None:
+    def _inspect(self, request: _Request, frame: Frame) -> None:
         try:
             command = frames.decode_command(frame.data)
         except frames.FrameError:
             return
-        found, known = self.check.take(now, command, self.firmware.reported), len(self.check.first)
+        known = len(self.check.first)
+        found = self.check.take(request.read, command, self.firmware.reported, request.since)
         if found and known < CommandCheck.WORDS:
             self._note(f"command outside limits ({', '.join(found)})")
 
