@@ -21,6 +21,10 @@ from dexsim.pytree import pytree_dataclass, static
 SLOTS = ("box", "capsule", "cylinder")
 SHAPES = ("sphere", "box", "cylinder", "capsule", "composition")
 OFF = 1e-4  # m, size of a slot that is switched off: a speck at the object's centre
+SIZE_RANGES = ("sphere_radius", "box_half", "cylinder_radius", "cylinder_half", "neck_radius", "neck_half")
+BULK_RANGES = ("mass", "inertia_scale", "com_offset", "friction", "stiffness", "restitution")
+RANGES = (*SIZE_RANGES, *BULK_RANGES)
+"""Fields of `ObjectConfig` that are drawn for every object."""
 _SHORT = 1e-4  # m, half-length of a capsule that plays a sphere
 
 
@@ -61,9 +65,7 @@ class ObjectConfig:
 
     def __post_init__(self):
         validate(self)
-        check_ranges(self, "sphere_radius", "box_half", "cylinder_radius", "cylinder_half",
-                     "neck_radius", "neck_half", "mass", "inertia_scale", "friction",
-                     "stiffness", "restitution")
+        check_ranges(self, *(name for name in RANGES if name != "com_offset"))
         if not self.shapes:
             raise ConfigError("ObjectConfig.shapes is empty: name at least one shape")
 

@@ -112,12 +112,7 @@ def sample(key: jax.Array, config: Randomization, hand: Hand, *, timestep: float
         value = jax.random.uniform(key, shape, minval=span[0], maxval=span[1])
         return nominal + width * (value - nominal)
 
-    drawn = _assemble(key, draw, config, hand, timestep, control_period)
-    if not off:
-        return drawn
-    still = jnp.zeros(hand.num_joints)  # a ripple of no height has no waves to place
-    return dataclasses.replace(drawn, actuator=dataclasses.replace(
-        drawn.actuator, ripple_count=still, ripple_phase=still))
+    return _assemble(key, draw, config, hand, timestep, control_period)
 
 
 def sample_outside(key: jax.Array, config: Randomization, hand: Hand, *, timestep: float,

@@ -1,11 +1,13 @@
 """How this library compiles and runs its large programs."""
 
-import contextlib
-import gc
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import jax
+
+from dexsim.collector import collector_paused
+
+__all__ = ["collector_paused", "jit"]
 
 
 def jit(function: Callable, **options: Any) -> Any:
@@ -17,19 +19,3 @@ def jit(function: Callable, **options: Any) -> Any:
     if jax.default_backend() == "cpu":
         options["compiler_options"] = {"xla_backend_optimization_level": 1}
     return jax.jit(function, **options)
-
-
-@contextlib.contextmanager
-def collector_paused() -> Iterator[None]:
-    """No garbage collection inside.
-
-    Warp registers JAX's stream for each graph that it captures. A collection in the midst of that may
-    delete an earlier registration of the same stream, and the run ends with "unknown stream".
-    """
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if enabled:
-            gc.enable()

@@ -11,7 +11,8 @@ import pytest
 
 from dexsim.errors import ConfigError
 from dexsim.randomization import Curriculum, Randomization, next_scale, sample, sample_outside
-from dexsim.randomization_check import check, conclude, table
+from dexsim.randomization_check import conclude, table
+from dexsim.randomization_effects import check
 
 TIMES = dict(timestep=0.005, control_period=0.03)
 
@@ -250,7 +251,7 @@ def test_a_range_that_is_lost_is_found_out(grasp_env, grasp_rollout, fresh, monk
         return grasp_rollout.step(dataclasses.replace(states, draw=dataclasses.replace(states.draw, actuator=calm)),
                                   action)
 
-    monkeypatch.setattr("dexsim.randomization_check.sample", forgets_torque)
+    monkeypatch.setattr("dexsim.randomization_effects.sample", forgets_torque)
     names = ("Randomization.torque_factor", "Randomization.viscous_friction", "Randomization.speed_factor")
     effects = check(grasp_env, ignores_friction, fresh, key=jax.random.key(0), ticks=6, names=names)
     assert [effect.found for effect in effects] == [False, False, True]
@@ -260,6 +261,31 @@ def test_a_range_that_is_lost_is_found_out(grasp_env, grasp_rollout, fresh, monk
     assert "no effect on model or motion: Randomization.torque_factor, Randomization.viscous_friction" in captured.err
     assert captured.out.count("NO EFFECT") == 2
     assert conclude(effects[2:]) == 0
+
+
+def test_runs_that_differ_hide_no_range_and_invent_none(grasp_env, grasp_rollout, fresh):
+    """As on the Warp backend: no two runs are alike, and contacts let them part further with every tick."""
+    rng = np.random.default_rng(0)
+
+    def unsteady(states, action, forgetful=False):
+        drawn = states.draw
+        if forgetful:
+            calm = dataclasses.replace(drawn.actuator, viscous_friction=0 * drawn.actuator.viscous_friction)
+            states = dataclasses.replace(states, draw=dataclasses.replace(drawn, actuator=calm))
+        after = grasp_rollout.step(states, action)
+        noise = jnp.asarray(1e-6 * rng.standard_normal(after.physics.qvel.shape), jnp.float32)
+        physics = dataclasses.replace(after.physics, qvel=after.physics.qvel + noise * jnp.abs(after.physics.qvel))
+        return dataclasses.replace(after, physics=physics, draw=drawn)
+
+    noisy = copy.copy(grasp_env)
+    noisy.backend = "warp"
+    names = ("Randomization.viscous_friction", "Randomization.encoder_bias", "Randomization.torque_gain",
+             "ObjectConfig.com_offset")
+    effects = check(noisy, unsteady, fresh, key=jax.random.key(0), ticks=6, names=names)
+    assert all(effect.found and effect.changed for effect in effects), table(effects)
+    lost, = check(noisy, lambda *a: unsteady(*a, forgetful=True), fresh, key=jax.random.key(0), ticks=6,
+                  names=names[:1])
+    assert not lost.found and lost.changed == ("actuator.viscous_friction",), table([lost])
 
 
 def test_a_range_without_width_is_off_and_no_error(grasp_env, grasp_rollout, fresh):

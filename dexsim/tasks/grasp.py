@@ -17,7 +17,7 @@ from dexsim.config import check_ranges, setting, validate
 from dexsim.env import EnvConfig, Moment, Start
 from dexsim.errors import ConfigError
 from dexsim.hand import Hand, flexion_joints
-from dexsim.objects import SLOTS, ObjectParams
+from dexsim.objects import RANGES, SLOTS, ObjectParams, sample_object
 from dexsim.pytree import pytree_dataclass
 from dexsim.tasks.grasp_report import summarize
 from dexsim.tasks.grasp_start import make_pool
@@ -160,6 +160,7 @@ class Grasp:
     name = "grasp"
     slots = SLOTS
     evaluation = "series"
+    object_ranges = tuple(f"objects.{name}" for name in RANGES)
     fields = {"actor": observation.GRASP, "critic": observation.GRASP}
     gravity = (9.81, 0.0, 0.0)  # upside down: the palm's normal points to the ground
     reference = (0.055, -0.005, 0.090)  # m, between palm and half-closed fingers
@@ -180,6 +181,11 @@ class Grasp:
     def make_pool(self, key: jax.Array) -> Start:
         """Objects released below the palm, between the half-closed fingers."""
         return make_pool(key, self.hand, self.config, self.reference)
+
+    def draw_object(self, key: jax.Array, config: GraspConfig,
+                    shape_index: jax.Array | None = None) -> ObjectParams:
+        """One object of `config`, of a random or the given kind (index into SHAPES)."""
+        return sample_object(key, config.objects, shape_index)
 
     def begin(self, key: jax.Array, start: Start) -> Goal:
         del start

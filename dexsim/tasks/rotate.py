@@ -18,11 +18,18 @@ from dexsim.config import check_ranges, setting, validate
 from dexsim.env import Control, EnvConfig, Moment, Start
 from dexsim.errors import ConfigError
 from dexsim.hand import Hand
-from dexsim.objects import ObjectConfig, ObjectParams
+from dexsim.objects import BULK_RANGES, ObjectConfig, ObjectParams
 from dexsim.observation import ObservationConfig
 from dexsim.pytree import pytree_dataclass
 from dexsim.tasks.rotate_report import summarize
-from dexsim.tasks.rotate_start import KINDS, largest_size, load_pool, lowest_point, palm_height
+from dexsim.tasks.rotate_start import (
+    KINDS,
+    largest_size,
+    load_pool,
+    lowest_point,
+    palm_height,
+    sample_target,
+)
 from dexsim.tasks.terms import action_rate, joint_speed, random_push
 
 TOUCH = 0.1  # N, force from which a fingertip counts as touching
@@ -223,6 +230,7 @@ class Rotate:
     name = "rotate"
     fields = {"actor": observation.ROTATE, "critic": observation.ROTATE_CRITIC}
     evaluation = "totals"
+    object_ranges = ("edge", *(f"objects.{name}" for name in BULK_RANGES))
 
     def __init__(self, config: RotateConfig, hand: Hand):
         if len(config.posture) != hand.num_joints:
@@ -243,6 +251,12 @@ class Rotate:
     def make_pool(self, key: jax.Array) -> Start:
         """Objects that came to rest in random postures of the hand; see `rotate_start`."""
         return load_pool(key, self.hand, self.config, self.gravity)
+
+    def draw_object(self, key: jax.Array, config: RotateConfig,
+                    shape_index: jax.Array | None = None) -> ObjectParams:
+        """One object of `config`; there is only one kind."""
+        del shape_index
+        return sample_target(key, config)
 
     def begin(self, key: jax.Array, start: Start) -> Goal:
         del key, start
