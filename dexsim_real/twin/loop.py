@@ -29,7 +29,7 @@ class World:
     """The plant beside the wall clock.
 
     Args:
-      start: s, when its time begins.
+      start: s, the wall clock's time at which the plant's begins; `now` is where it has come to.
       note: called with one line when time is let go.
     """
 
@@ -37,7 +37,7 @@ class World:
     BEHIND = 0.1  # s, beyond which time is let go
 
     def __init__(self, plant: Plant, start: float, note: Callable[[str], None] = lambda text: None):
-        self.plant, self._at, self._note = plant, start, note
+        self.plant, self.now, self._note = plant, start, note
         self.let_go, self.simulated, self.spent = 0.0, 0.0, 0.0  # s
         self.cost = 0.0  # s, what a slice takes
         self._told = -1e9
@@ -45,26 +45,26 @@ class World:
     @property
     def due(self) -> float:
         """When the next slice may be computed."""
-        return self._at + self.SLICE
+        return self.now + self.SLICE
 
     def catch_up(self, now: float, most: float = 5 * SLICE) -> None:
         """Bring the plant to this time, or nearer by `most` s."""
-        behind = now - self._at
+        behind = now - self.now
         if behind > self.BEHIND:
             self._let_go(now, behind - most)
-        step = min(now - self._at, most)
+        step = min(now - self.now, most)
         if step <= 0:
             return
         begun = time.monotonic()
         self.plant.advance(step)
         took = time.monotonic() - begun
-        self._at += step
+        self.now += step
         self.simulated += step
         self.spent += took
         self.cost += 0.05 * (took * self.SLICE / max(step, 1e-4) - self.cost)
 
     def _let_go(self, now: float, seconds: float) -> None:
-        self._at += seconds
+        self.now += seconds
         self.let_go += seconds
         if now > self._told + 5.0:
             self._told = now
@@ -89,7 +89,7 @@ class Twin:
       HandError: a port or socket cannot be made.
     """
 
-    HICCUP = 0.01  # s
+    HICCUP = 0.02  # s, the bridge's usual patience beyond the wire's own time
 
     def __init__(self, arguments: TwinArguments, hand: Hand, plant: Plant, folder: Path,
                  show: Callable[[str], None] = lambda text: None):
@@ -125,7 +125,7 @@ class Twin:
     def run(self) -> None:
         """Until all trials are over, or `stop`."""
         sides = [side for side in (self.imu, self.masks) if side]
-        now = time.monotonic()
+        now = self.world.now = time.monotonic()
         while not self._stop:
             before, now = now, time.monotonic()
             self.hiccups += now - before > self.HICCUP
