@@ -1,0 +1,466 @@
+"""The calibration command: a hand of known truth gives its torque constants back, and whatever goes wrong leaves the
+motors off and files as they were."""
+
+import dataclasses
+import io
+import json
+import queue
+import re
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from press_bench import BenchHand, Plate
+from rich.console import Console
+
+from dexsim.calibration import joint_torque, load_calibration
+from dexsim.errors import CalibrationError, ConfigError
+from dexsim_real import calibrate
+from dexsim_real.calibrate_check import check_rest, dead_taxels, taxel_names
+from dexsim_real.calibrate_fit import fit
+from dexsim_real.calibrate_gauge import parse_reading
+from dexsim_real.calibrate_loop import Operator
+from dexsim_real.calibrate_options import CalibrateArguments, CheckConfig, PressConfig
+from dexsim_real.calibrate_plan import placements
+from dexsim_real.calibrate_read import read_logs
+from dexsim_real.calibrate_report import torque_constant_intervals, torque_constants
+from dexsim_real.frames import Mode
+from dexsim_real.log import Kind, LogError, LogReader, LogWriter
+from dexsim_real.safety import SafetyConfig
+from dexsim_real.trouble import HandError
+
+ROOT = Path(__file__).resolve().parent.parent
+SHORT = PressConfig(cycles=3, seconds=5.0, approach_speed=0.3, first_speed=0.08)
+QUICK = PressConfig(cycles=1, seconds=1.0, approach_speed=0.5, first_speed=0.2, pause=0.2)
+
+
+def plates(hand, *names):
+    """A spring before each named placement, which presses on twenty taxels or a dozen."""
+    found = []
+    for placement in placements(hand):
+        if names and placement.name not in names:
+            continue
+        columns = (3, 4, 5, 6) if placement.name.endswith("pad") else (7, 8, 9)
+        taxels = np.array([column * 12 + row for column in columns for row in range(3, 8)])
+        share = np.exp(-0.5 * ((taxels % 12 - 5) / 1.2) ** 2)
+        found.append(Plate(placement.finger, taxels, share / share.sum(), placement.posture, placement.joints))
+    return found
+
+
+def arguments(folder, **options):
+    options = {"port": "bench", "output": folder / "hand.toml", "log": folder / "hand.log", "yes": True,
+               "press": SHORT, "fingers": ("index",)} | options
+    return CalibrateArguments(**options)
+
+
+def operator():
+    return Operator(Console(file=io.StringIO(), width=200), silent=True)
+
+
+def record(bench, hand, options, who=None):
+    return calibrate.record(options, hand, who or operator(), port=bench, clock=bench.clock, sleep=bench.sleep)
+
+
+def off(bench):
+    return np.all(bench.commands[-1]["mode"] == Mode.PASSIVE)
+
+
+def on(bench):
+    return np.array([np.all(command["mode"] == Mode.POSITION) for command in bench.commands])
+
+
+# --- a known truth -------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def session(hand, tmp_path_factory):
+    """The index pressed with pad and side: bench, arguments, log, what the terminal showed."""
+    folder = tmp_path_factory.mktemp("press")
+    bench = BenchHand(hand, plates(hand, "index pad", "index side"), dead=((1, 52), (1, 110)))
+    options, who = arguments(folder, plot=folder / "hand.png", report=folder / "hand.json"), operator()
+    log = record(bench, hand, options, who)
+    calibrate.conclude(options, hand, [log], who)
+    return bench, options, log, who.console.file.getvalue()
+
+
+def test_torque_constants_come_back(hand, session):
+    bench, options, _, _ = session
+    calibration = load_calibration(options.output, hand)
+    # Positive currents open, positive torques close: the hand's sense is in the sign.
+    found, intervals = -torque_constants(calibration), -torque_constant_intervals(calibration)
+    truth = np.stack([bench.constant * bench.efficiency, bench.constant / bench.back])
+    joints = [hand.joint_names.index(name) for name in ("index_bend", "index_joint1", "index_joint2")]
+    np.testing.assert_allclose(found[:, joints], truth[:, joints], rtol=0.03)
+    assert np.mean(np.abs(found / truth - 1)[:, joints]) < 0.015
+    inside = (intervals.min(-1) <= truth) & (truth <= intervals.max(-1))
+    assert inside[:, joints].mean() >= 5 / 6
+    # Where a run knows the direction, currents become torques; the zero error of the reading is in the offset.
+    current = np.zeros(12)
+    current[4] = -(0.5 / truth[0, 4] + bench.idle[4] + bench.bias[4])
+    assert float(joint_torque(calibration, current, np.ones(12))[4]) == pytest.approx(0.5, rel=0.04)
+    # Half the gap between the lines in the middle of the forces, which reach from about 1 N to 8 N.
+    assert calibration.real.force_max[4] == pytest.approx(8.0, abs=0.5)
+    torque = 4.5 * bench.plates[0].arms[4]
+    gap = torque * (1 / truth[0, 4] - 1 / truth[1, 4]) / 2 + bench.idle[4]
+    assert calibration.real.friction[4] == pytest.approx(gap, rel=0.15)
+
+
+def test_the_file_says_what_is_not_known_and_the_report_has_it_all(hand, session):
+    _, options, _, shown = session
+    notes = "\n".join(load_calibration(options.output, hand).notes)
+    assert "ring_joint1: not recorded" in notes and "error of the force sensor" in notes
+    # Of the two that read nothing the one in the middle of the press is dead; the other lies beside it.
+    assert "index: dead: column 4 row 4:" in notes and "column 9 row 2" not in notes
+    assert "motors off, the currents read up to" in notes
+    report = json.loads(options.report.read_text())
+    joint = report["joints"]["index_joint1"]
+    assert joint["press"] == "index pad" and joint["loading"]["r_squared"] > 0.99
+    assert joint["loading"]["condition"] < 10 and joint["loading"]["samples"] > 20
+    assert report["joints"]["mid_joint1"]["press"] is None
+    assert report["newtons_per_count"] == dict.fromkeys(hand.finger_names, 0.1)
+    assert "Nm / A" in shown and "index side" in shown and f"calibration: {options.output}" in shown
+    assert options.plot.stat().st_size > 20_000
+
+
+def test_the_motors_come_on_late_stay_within_limits_and_go_off(hand, session):
+    bench, options, _, _ = session
+    motors = on(bench)
+    resting = round(options.check.seconds * options.rate)
+    assert not motors[:resting].any() and off(bench) and bench.closed
+    sent = np.array([command["position"] for command in bench.commands])[motors]
+    assert np.all(sent >= hand.joint_lower - 1e-6) and np.all(sent <= hand.joint_upper + 1e-6)
+    assert np.abs(np.diff(sent, axis=0)).max() <= 2.0 / options.rate * 1.2
+
+
+def test_a_log_gives_the_same_file_without_the_hand(hand, session, tmp_path):
+    _, options, log, _ = session
+    again = CalibrateArguments(from_log=(log,), output=tmp_path / "again.toml")
+    calibrate.conclude(again, hand, again.from_log, operator())
+    assert again.output.read_bytes() == options.output.read_bytes()
+
+
+def test_logs_add_up(hand, session, scale, tmp_path):
+    """What one session left out another has pressed."""
+    other = scale[1].log
+    both = fit(read_logs([session[2], other], hand), hand)
+    assert {both.source[name] for name in ("index_joint1", "mid_joint1", "index_bend")} == {
+        "index pad", "middle pad", "index side"}
+    assert both.sensors.keys() == {"middle"}
+    with pytest.raises(LogError, match="other --hardware options"):
+        path = tmp_path / "other.log"
+        with LogWriter(path) as log:
+            for entry in LogReader(other):
+                content = entry.content
+                if entry.kind == Kind.META and "hardware" in content:
+                    content = {**content, "hardware": {**content["hardware"], "taxel_floor": 2.0}}
+                log.add(entry.kind, content, entry.time)
+        read_logs([other, path], hand)
+
+
+class Typist(io.StringIO):
+    """A terminal and who sits at it: presses Enter when told to, types in what the scale shows."""
+
+    def __init__(self, bench):
+        super().__init__()
+        self.bench, self.lines, self.read = bench, queue.SimpleQueue(), 0
+
+    def write(self, text):
+        if "Enter presses" in text:
+            self.lines.put("\n")
+        elif "the gauge shows" in text:
+            self.read += 1
+            grams = 1e3 * self.bench.force[2] / 9.80665
+            # A slip of the finger first: it is asked for again.
+            self.lines.put("five\n" if self.read == 2 else f"{grams:.0f} g\n")
+        return super().write(text)
+
+    def __iter__(self):
+        return self
+
+    def __next__(self):
+        return self.lines.get()
+
+    def isatty(self):
+        return False
+
+
+@pytest.fixture(scope="module")
+def scale(hand, tmp_path_factory):
+    """The middle pressed on a kitchen scale; its taxels read 15 % too little."""
+    bench = BenchHand(hand, plates(hand, "middle pad"), taxel_gain=[1, 1, 0.85, 1, 1])
+    typist = Typist(bench)
+    who = Operator(Console(file=typist, width=200), stream=typist)
+    options = arguments(tmp_path_factory.mktemp("scale"), fingers=("middle",), gauge="ask", yes=False)
+    calibrate.conclude(options, hand, [record(bench, hand, options, who)], who)
+    return bench, options, typist
+
+
+def test_a_kitchen_scale_gives_the_newtons(hand, scale):
+    """Without the scale all torques would be 15 % too small."""
+    bench, options, typist = scale
+    assert typist.read == 12 and "'five' is no reading" in typist.getvalue()
+    calibration = load_calibration(options.output, hand)
+    truth = np.stack([bench.constant * bench.efficiency, bench.constant / bench.back])
+    np.testing.assert_allclose(-torque_constants(calibration)[:, 6:8], truth[:, 6:8], rtol=0.03)
+    # As a run sees them, counts below the floor are cut off, so that the slope is a little steeper than the taxels'.
+    assert calibration.force_per_count[2] == pytest.approx(0.1 / 0.85, rel=0.1)
+    notes = "\n".join(calibration.notes)
+    assert "middle pad:" in notes and "counts per newton by the gauge (11 readings)" in notes
+    assert "thumb: not compared with the gauge" in notes and "error of the force sensor" not in notes
+
+
+@pytest.mark.parametrize(("text", "newtons"), [
+    ("5.2", 5.2), ("5,2 N", 5.2), ("530 g", 5.197525), ("0.53kg", 5.197525), (" .5n ", 0.5), ("0", 0.0)])
+def test_readings_of_a_gauge(text, newtons):
+    assert parse_reading(text) == pytest.approx(newtons)
+
+
+@pytest.mark.parametrize("text", ["", "five", "5 lb", "-3", "1e3", "nan", "530", "5.2.1"])
+def test_what_is_no_reading(text):
+    with pytest.raises(HandError, match="no reading|grams need a g"):
+        parse_reading(text)
+
+
+# --- the plan --------------------------------------------------------------------------------------
+
+
+def test_every_joint_is_pressed_with_and_every_press_goes_outward(hand):
+    """Against C MuJoCo: advancing moves the pressed taxels along their normals, from a posture that can be reached."""
+    plan = placements(hand)
+    assert {joint for placement in plan for joint in placement.joints} == set(range(12))
+    model = mujoco.MjModel.from_xml_path(str(hand.model_path))
+    data = mujoco.MjData(model)
+    dofs = [model.joint(name).qposadr[0] for name in hand.joint_names]
+    for placement in plan:
+        assert np.abs(placement.direction).max() == 1.0
+
+        def places(advance, placement=placement):
+            data.qpos[dofs] = placement.posture + advance * placement.direction
+            mujoco.mj_kinematics(model, data)
+            body = model.body(hand.body_names[hand.tip_body[placement.finger]]).id
+            turn = data.xmat[body].reshape(3, 3)
+            taxels = list(placement.taxels)
+            return (data.xpos[body] + hand.taxel_position[placement.finger, taxels] @ turn.T,
+                    hand.taxel_normal[placement.finger, taxels] @ turn.T)
+
+        (before, normal), (after, _) = places(0.0), places(0.01)
+        moved = np.mean(np.sum((after - before) * normal, -1))
+        assert moved > 0.7 * 0.01 * 0.08, placement.name
+        assert np.all(placement.posture >= hand.joint_lower) and np.all(placement.posture <= hand.joint_upper)
+    assert {p.name for p in placements(hand, ("thumb",), sides=False)} == {"thumb pad"}
+    with pytest.raises(HandError, match="no finger 'toe'"):
+        placements(hand, ("toe",))
+
+
+# --- the taxels ------------------------------------------------------------------------------------
+
+
+def resting(seed=0, count=160):
+    rng = np.random.default_rng(seed)
+    counts = np.round(rng.uniform(0, 6, (5, 120)) + 0.4 * rng.standard_normal((count, 5, 120)))
+    return np.maximum(counts, 0), rng.normal(5, 2, (count, 12))
+
+
+def test_what_a_hand_at_rest_shows(hand):
+    counts, current = resting()
+    report = check_rest(hand, counts, current, CheckConfig(), 40.0, tuple(range(5)))
+    assert report.notes == ()
+    np.testing.assert_allclose(report.tare, counts.mean(0))
+    assert np.all(np.abs(report.current - 5) < 1)
+    noisy = counts.copy()
+    noisy[:, 2, 31] += 8 * (np.random.default_rng(1).random(len(counts)) < 0.5)
+    notes = check_rest(hand, noisy, current, CheckConfig(), 40.0, (2,)).notes
+    assert len(notes) == 1 and notes[0].startswith("middle: noisy: column 2 row 7 (up to 4")
+
+
+def test_a_touch_is_told_from_a_taxel_that_is_stuck(hand):
+    counts, current = resting()
+    stuck = counts.copy()
+    stuck[:, 4, 17] = 255
+    with pytest.raises(HandError, match="pinky: column 1 row 5 read 255 counts alone: stuck") as caught:
+        check_rest(hand, stuck, current, CheckConfig(), 40.0, ())
+    assert "\n" not in str(caught.value)
+    touched = counts.copy()
+    touched[:, 0, [40, 41, 52, 53]] += 60
+    with pytest.raises(HandError, match="4 taxels side by side on the thumb .* touches it") as caught:
+        check_rest(hand, touched, current, CheckConfig(), 40.0, ())
+    assert "\n" not in str(caught.value)
+    # A light touch hides among what is left at rest, unless it changes.
+    swaying = counts.copy()
+    swaying[:, 3, 50:60] += np.round(2 + 2 * np.sin(np.arange(len(counts)) / 25))[:, None]
+    with pytest.raises(HandError, match="ring's sum moved by .* touches it"):
+        check_rest(hand, swaying, current, CheckConfig(), 40.0, ())
+
+
+def test_dead_taxels_are_those_among_pressed_ones(hand):
+    rng = np.random.default_rng(0)
+    lattice = np.zeros((50, 10, 12))
+    lattice[:, 2:8, 3:9] = rng.uniform(5, 20, (50, 6, 6))
+    lattice[:, 4, 5] = lattice[:, 6, 7] = 0.0
+    dead = dead_taxels(hand, lattice.reshape(50, 120), 5.0)
+    assert taxel_names(hand, dead) == "column 4 row 5, column 6 row 7"
+
+
+def test_a_touched_hand_is_refused_before_the_motors_come_on(hand, tmp_path):
+    bench = BenchHand(hand, plates(hand, "index pad"))
+    bench.touched[2, [40, 41, 52, 53]] = 6.0
+    with pytest.raises(HandError, match="on the middle .* free the fingertips"):
+        record(bench, hand, arguments(tmp_path, press=QUICK))
+    assert not on(bench).any() and bench.closed and not (tmp_path / "hand.toml").exists()
+
+
+def test_a_finger_zeroed_under_load_is_found_out(hand, tmp_path):
+    """Somebody holds the index when it is zeroed, too lightly to be seen, and lets go during the press."""
+    bench = BenchHand(hand, plates(hand, "index pad"))
+    bench.touched[1, 30:60] = 0.3
+    exchange = bench.exchange
+
+    def let_go(command):
+        if bench.force[1] > 1.0:
+            bench.touched[:] = 0
+        return exchange(command)
+
+    bench.exchange = let_go
+    with pytest.raises(HandError, match="index pad: reads -.* it was touched while it was zeroed"):
+        record(bench, hand, arguments(tmp_path, press=QUICK))
+    assert off(bench) and bench.closed
+
+
+# --- what goes wrong -------------------------------------------------------------------------------
+
+
+class Interrupted(BenchHand):
+    """Something happens in the middle of the third second of pressing."""
+
+    def __init__(self, hand, event, **options):
+        super().__init__(hand, plates(hand, "index pad"), **options)
+        self.event, self.pressing = event, 0
+
+    def exchange(self, command):
+        self.pressing += self.force[1] > 0.5
+        if self.pressing == 60:
+            self.pressing += 1
+            answer = self.event(self)
+            if answer is not None:
+                return None
+        return super().exchange(command)
+
+
+def raises(error):
+    def event(bench):
+        raise error
+    return event
+
+
+def heat(bench):
+    bench.temperature = 95
+
+
+@pytest.mark.parametrize(("event", "error", "says"), [
+    (raises(KeyboardInterrupt()), KeyboardInterrupt, None), (raises(SystemExit(143)), SystemExit, "143"),
+    (raises(RuntimeError("broken")), RuntimeError, "broken"), (heat, HandError, "too hot: 95 degC")])
+def test_however_it_ends_the_motors_are_off_and_the_old_file_is_there(hand, tmp_path, event, error, says):
+    (tmp_path / "hand.toml").write_text("precious")
+    bench = Interrupted(hand, event)
+    with pytest.raises(error, match=says):
+        record(bench, hand, arguments(tmp_path, force=True, press=QUICK))
+    assert on(bench).any() and off(bench) and bench.closed
+    assert (tmp_path / "hand.toml").read_text() == "precious"
+    ends = [entry.content for entry in LogReader(tmp_path / "hand.log") if entry.kind == Kind.END]
+    assert len(ends) == 1 and ends[0]["end"]
+
+
+def test_a_silent_hand_ends_it(hand, tmp_path):
+    bench = Interrupted(hand, lambda bench: None)
+    deaf = [False]
+    exchange = bench.exchange
+
+    def answer(command):
+        if bench.pressing >= 60:
+            deaf[0] = True
+        reply = exchange(command)
+        return None if deaf[0] else reply
+
+    bench.exchange = answer
+    with pytest.raises(HandError, match="stopped: no measurement for 2 s"):
+        record(bench, hand, arguments(tmp_path, press=QUICK))
+    assert off(bench) and bench.closed
+
+
+def test_what_it_presses_on_is_missing_or_unfelt(hand, tmp_path):
+    with pytest.raises(HandError, match="index pad: met nothing within"):
+        record(BenchHand(hand, []), hand, arguments(tmp_path, press=QUICK, log=tmp_path / "a.log"))
+    numb = BenchHand(hand, plates(hand, "index pad"), taxel_gain=[1, 0, 1, 1, 1])
+    with pytest.raises(HandError, match="index pad: 0.8.* A and no taxel feels it"):
+        options = arguments(tmp_path, press=PressConfig(current=0.8, approach_speed=0.5), log=tmp_path / "b.log")
+        record(numb, hand, options)
+    assert off(numb)
+
+
+def test_motors_that_give_no_more_turn_round(hand, tmp_path):
+    """A current limit far below what 8 N need: the press ends where the force ends."""
+    hardware = dataclasses.replace(arguments(tmp_path).hardware, torque_max=90)  # 0.45 A on the bench
+    bench = BenchHand(hand, plates(hand, "index pad"))
+    options = arguments(tmp_path, hardware=hardware, sides=False)
+    log = record(bench, hand, options)
+    found = fit(read_logs([log], hand), hand)
+    # As much as the joint gives by itself, or, pushed by the other one, as much as it holds.
+    gives, holds = ((0.45 - 0.02) * bench.constant[4] * part / bench.plates[0].arms[4]
+                    for part in (bench.efficiency[4], 1.15 / bench.back[4]))
+    assert gives < found.calibration.real.force_max[4] < holds < 7
+    truth = bench.constant[4] * bench.efficiency[4]
+    assert -torque_constants(found.calibration)[0, 4] == pytest.approx(truth, rel=0.05)
+
+
+def test_nothing_is_overwritten(hand, session, tmp_path):
+    _, _, log, _ = session
+    path = tmp_path / "hand.toml"
+    options = arguments(tmp_path)
+    path.write_text("precious")
+    with pytest.raises(HandError, match="is there already: give another --output, or --force"):
+        arguments(tmp_path)
+    with pytest.raises(HandError, match=f"is there already: --from-log {re.escape(str(log))} fits these"):
+        calibrate.conclude(options, hand, [log], operator())  # It came while the hand was pressing.
+    assert path.read_text() == "precious"
+    calibrate.conclude(arguments(tmp_path, force=True), hand, [log], operator())
+    assert load_calibration(path, hand).joint_names == hand.joint_names
+
+
+def test_logs_that_are_none_of_presses(hand, tmp_path):
+    with LogWriter(tmp_path / "run.log") as log:
+        log.add(Kind.META, {"task": "grasp"})
+    with pytest.raises(LogError, match="is the log of something else .grasp."):
+        read_logs([tmp_path / "run.log"], hand)
+    with LogWriter(tmp_path / "early.log") as log:
+        log.add(Kind.NOTE, "end: no answer")
+    with pytest.raises(LogError, match="ends before the hand was ready"):
+        read_logs([tmp_path / "early.log"], hand)
+    with pytest.raises(CalibrationError, match="no press was recorded"):
+        bench = BenchHand(hand, [])
+        with pytest.raises(HandError, match="met nothing"):
+            record(bench, hand, arguments(tmp_path, press=QUICK))
+        fit(read_logs([tmp_path / "hand.log"], hand), hand)
+
+
+def test_options_that_do_not_go_together(tmp_path):
+    for options, says in (({"port": None}, "--port for a hand, or --from-log"),
+                          ({"from_log": (tmp_path / "a.log",)}, "--port for a hand, or --from-log"),
+                          ({"press": PressConfig(current=1.9)}, "must be below --safety.current"),
+                          ({"press": PressConfig(peak=20.0), "safety": SafetyConfig(finger_force=20.0)}, "well below")):
+        with pytest.raises(HandError, match=says):
+            arguments(tmp_path, **options)
+    with pytest.raises(ConfigError, match="PressConfig.peak"):
+        PressConfig(peak=60.0)
+    with pytest.raises(HandError, match="no_such_module"):
+        calibrate.Gauge("no_such_module:f", operator())
+    with pytest.raises(HandError, match="--gauge ask needs answers"):
+        calibrate.Gauge("ask", operator())
+
+
+def test_nobody_at_the_terminal(hand, tmp_path):
+    bench = BenchHand(hand, plates(hand, "index pad"))
+    who = Operator(Console(file=io.StringIO()), stream=io.StringIO(""))
+    with pytest.raises(HandError, match="standard input is closed .--yes asks nothing."):
+        record(bench, hand, arguments(tmp_path, yes=False, press=QUICK), who)
+    assert off(bench) and bench.closed
