@@ -164,7 +164,8 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--draw", choices=("outside", "inside", "nominal"), default="outside",
                         help="parameters outside training's ranges, inside them, or at their middle")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE",
-                        help="fix a parameter of the emulated hand (dexsim_real/twin/draw.py), for ablations")
+                        help="fix a parameter of the emulated hand (dexsim_real/twin/draw.py): a number, "
+                             "or outside, inside, nominal")
     parser.add_argument("--no-safety", dest="safety", action="store_false", help="leave the bridge's limits out")
     parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--json", type=Path, help="file for everything")
@@ -177,7 +178,8 @@ def main() -> None:
         sys.exit("zero_shot.py: give --virtual")
     options = {"task": given.task, "policy": given.policy or given.task, "seed": given.seed, "draw": given.draw,
                "seconds": given.seconds, "safety": given.safety,
-               "set": {name: float(value) for name, value in (pair.split("=") for pair in given.set)}}
+               "set": {name: value if value in ("outside", "inside", "nominal") else float(value)
+                       for name, value in (pair.split("=") for pair in given.set)}}
     reports = run_all(options, given.trials, given.processes, show=True)
     here = (grasp_metrics if given.task == "grasp" else rotate_metrics)(reports)
     there = simulated(given.task, options["policy"])

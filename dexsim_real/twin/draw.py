@@ -70,7 +70,7 @@ BANDS: dict[str, Band] = {
     "speed": Band(0.9, 1.1, "1", "randomization.speed_factor", 1.0, "joint"),
     "efficiency": Band(0.85, 1.0, "1", "randomization.efficiency", 1.0, "joint", "low"),
     "ripple": Band(0.0, 0.03, "1", "randomization.ripple", 0.0, "joint", "high"),
-    "ripple_count": Band(20.0, 200.0, "1/rad", "randomization.ripple_count", 100.0, "joint"),
+    "ripple_count": Band(20.0, 200.0, "1/rad", "randomization.ripple_count", 100.0, "joint", "high"),
     "coulomb_friction": Band(0.0, 0.03, "1", "randomization.coulomb_friction", 0.0, "joint", "high"),
     "viscous_friction": Band(0.0, 0.01, "Nm s/rad", "randomization.viscous_friction", 0.0, "joint", "high"),
     "latency": Band(0.0, 0.02, "s", "randomization.latency", 0.0, "trial", "high"),
@@ -102,7 +102,7 @@ TASK_BANDS: dict[str, dict[str, Band]] = {
         "cylinder_half": Band(0.020, 0.035, "m", "objects.cylinder_half", 0.027),
         "neck_radius": Band(0.010, 0.016, "m", "objects.neck_radius", 0.013),
         "neck_half": Band(0.008, 0.018, "m", "objects.neck_half", 0.013),
-        "gap": Band(0.001, 0.009, "m", "release_gap", 0.005),
+        "gap": Band(0.001, 0.009, "m", "release_gap", 0.005, "trial", "high"),
         "release_speed": Band(0.0, 0.1, "m/s", "release_speed", 0.0, "trial", "high"),
     },
     "rotate": {
@@ -172,25 +172,30 @@ def bands(task: str) -> dict[str, Band]:
 
 
 def draw_trial(task: str, rng: np.random.Generator, kind: str = "outside",
-               overrides: dict[str, float] | None = None) -> Draw:
+               overrides: dict[str, float | str] | None = None) -> Draw:
     """One trial's parameters.
 
     Args:
       task: "grasp" or "rotate".
       rng: of this trial.
       kind: one of `KINDS`.
-      overrides: values that replace what is drawn, for all joints or axes alike.
+      overrides: values that replace what is drawn, for all joints or axes alike; or a name in `KINDS`, of which this
+        one parameter shall be.
 
     Raises:
       HandError: there is no such task, kind or parameter.
     """
     if task not in TASKS or kind not in KINDS:
         raise HandError(f"draw {task!r} {kind!r}: tasks are {', '.join(TASKS)}, kinds {', '.join(KINDS)}")
-    table = bands(task)
-    value = {name: table[name].draw(rng, kind) for name in sorted(table)}
+    table, given = bands(task), overrides or {}
+    for name, number in given.items():
+        if name not in table and name not in STRUCTURE:
+            known = ", ".join(sorted([*table, *STRUCTURE]))
+            raise HandError(f"the emulated hand has no parameter {name!r}; there are {known}")
+        if isinstance(number, str) and (number not in KINDS or name not in table):
+            raise HandError(f"{name} = {number!r}: a number, or for what is drawn {', '.join(KINDS)}")
+    kinds = {name: number for name, number in given.items() if isinstance(number, str)}
+    value = {name: table[name].draw(rng, kinds.get(name, kind)) for name in sorted(table)}
     value |= {name: np.asarray(number, float) for name, number in STRUCTURE.items()}
-    for name, number in (overrides or {}).items():
-        if name not in value:
-            raise HandError(f"the emulated hand has no parameter {name!r}; there are {', '.join(sorted(value))}")
-        value[name] = np.full_like(np.asarray(value[name], float), number)
+    value |= {name: np.full_like(value[name], number) for name, number in given.items() if name not in kinds}
     return Draw(task, kind, value)

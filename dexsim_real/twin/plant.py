@@ -65,7 +65,7 @@ class EmulatedHand:
       seed: of everything random.
       trials: how many there shall be, after which the hand is left empty; None: no end.
       kind: "outside", "inside" or "nominal" (`draw`).
-      overrides: parameters that are not drawn but given.
+      overrides: parameters that are given, not drawn (`draw_trial`).
       seconds: time limit of a trial; None for the task's.
       command: what the runner was asked for; only written into the results.
       shape: name of the objects (grasp); None for random ones.
@@ -73,7 +73,7 @@ class EmulatedHand:
     """
 
     def __init__(self, hand: Hand, task: str, seed: int = 0, *, trials: int | None = None, kind: str = "outside",
-                 overrides: dict[str, float] | None = None, seconds: float | None = None,
+                 overrides: dict[str, float | str] | None = None, seconds: float | None = None,
                  command: float | None = None, shape: str | None = None, first: int = 0):
         self.hand, self.task, self.seed, self.kind = hand, task, seed, kind
         self.command, self._end = command, None if trials is None else first + trials
