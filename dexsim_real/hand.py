@@ -19,6 +19,7 @@ from dexsim_real.link import HandPort, LinkConfig, LinkCounts, Reply
 from dexsim_real.trouble import HandError, explain, latency_warnings
 
 _POLL = 0.002  # s, longest wait of one read
+_WRITE = 0.5  # s, longest write; also what this program may be held up in one before the port counts as failed
 _QUIET = 0.004  # s without a byte, after which nothing more of a frame will come
 
 _LONGEST = frames.OVERHEAD + frames.STATE_BLOCK.itemsize  # bytes of the longest answer
@@ -174,7 +175,7 @@ class SerialHand:
         try:
             options = {"exclusive": True} if local else {}
             self._serial = serial.serial_for_url(self.port, baudrate=self.config.baud, timeout=_POLL,
-                                                 write_timeout=0.1, **options)
+                                                 write_timeout=_WRITE, **options)
         except (OSError, ValueError) as error:
             raise HandError(explain(self.port, error)) from None
         if local:

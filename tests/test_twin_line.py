@@ -21,6 +21,7 @@ pytest.importorskip("serial")
 
 from twin_plant import REST, ScriptedPlant
 
+from dexsim.calibration import current_from_counts, load_calibration, normalised_torque
 from dexsim.errors import DexsimError
 from dexsim_real import frames, imu
 from dexsim_real.frames import HAND_REPLIES, Command, Frame, Mode, Parser
@@ -537,11 +538,21 @@ def test_the_command_shows_how_to_use_it_and_writes_its_results(tmp_path):
     assert process.returncode == 0, error
     shown = out.decode()
     assert "python -m dexsim_real.run grasp --port /tmp/dexsim-twin-" in shown and "--command 0.6" in shown
-    assert "--camera unix:/tmp/dexsim-twin-" in shown and "--optics.position 0.06 0.6 0.09" in shown
+    assert "--uncalibrated" in shown and "--camera unix:/tmp/dexsim-twin-" in shown
+    assert "--optics.position 0.06 0.6 0.09" in shown
     report = json.loads((tmp_path / "out.json").read_text())
     assert [row["trial"] for row in report["trials"]] == [0, 1] and report["commands"]["checked"] == 0
     assert not list(Path("/tmp").glob("dexsim-twin-*/hand*")) or shown.split("--port ")[1].split()[0] not in map(
         str, Path("/tmp").glob("dexsim-twin-*/hand"))
+
+
+def test_the_calibration_beside_the_port_is_one_of_this_hand(hand, tmp_path):
+    path = twin_command.write_calibration(tmp_path / "calibration.toml", hand)
+    calibration = load_calibration(path, hand)
+    np.testing.assert_allclose(calibration.force_per_count, FirmwareConfig().force_per_count)
+    counts = np.linspace(-800, 800, 12).astype(np.float32)
+    torque = np.asarray(normalised_torque(calibration, current_from_counts(calibration, counts)))
+    assert np.all(torque * counts < 0)  # The wire's current is positive when opening.
 
 
 def test_it_ends_in_good_order_when_it_is_told_to(tmp_path):

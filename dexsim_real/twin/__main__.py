@@ -65,11 +65,21 @@ def check_policy(name: str, task: str, hand: Hand) -> None:
                         f"the emulated hand is mounted for {np.round(mounted, 2).tolist()}")
 
 
-def runner_command(twin: Twin) -> list[str]:
+def write_calibration(path: Path, hand: Hand) -> Path:
+    """The calibration of an emulated hand whose motors are all nominal; each trial's own deviate from it."""
+    from dexsim.calibration import save_calibration
+    from dexsim_real.twin.virtual import ideal_calibration
+
+    save_calibration(path, ideal_calibration(hand))
+    return path
+
+
+def runner_command(twin: Twin, calibration: Path | None) -> list[str]:
     """The command that runs a policy on this hand."""
     arguments, line, board = twin.arguments, twin.arguments.line, twin.arguments.firmware
     words = ["python", "-m", "dexsim_real.run", arguments.policy or arguments.task, "--port",
-             str(twin.line.terminal.name), "--uncalibrated"]
+             str(twin.line.terminal.name),
+             *(["--calibration", str(calibration)] if calibration else ["--uncalibrated"])]
     if arguments.command is not None:
         words += ["--command", f"{arguments.command:g}"]
     if twin.imu:
@@ -98,11 +108,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     with tempfile.TemporaryDirectory(prefix="dexsim-twin-") as folder:
         twin = Twin(arguments, hand, make_plant(arguments, hand), Path(folder), lines.put)
         before = {number: signal.signal(number, lambda *_: twin.stop()) for number in (signal.SIGTERM, signal.SIGINT)}
+        calibration = arguments.calibration or (
+            None if arguments.plant else write_calibration(Path(folder) / "calibration.toml", hand))
         printer = threading.Thread(target=_print, args=(lines,), name="print", daemon=True)
         printer.start()
         try:
             lines.put(f"{arguments.task}: the emulated hand is at {twin.line.terminal.name}. Run a policy on it with\n"
-                      f"    {shlex.join(runner_command(twin))}")
+                      f"    {shlex.join(runner_command(twin, calibration))}")
             if arguments.realtime and not use_realtime():
                 twin.note("without real-time priority: expect jitter on a busy machine (docs/hardware.md)")
             twin.run()

@@ -191,6 +191,7 @@ class MaskSide(Clocked):
         self.path, self.counts = path, Counter()
         self._plant, self._config = plant, config
         self._rng = np.random.default_rng(seed)
+        silhouette([outline(Part("sphere", (0.03,)))], config.optics, config.picture)  # Imports what it needs: now.
         self._clients: dict[socket.socket, bytearray] = {}
         self._server = socket.socket(socket.AF_UNIX)
         try:

@@ -36,6 +36,9 @@ class TwinArguments:
     """Objects of grasp trials."""
     command: float | None = setting(None, unit="1", low=0.0, high=1.0)
     """Grip command that the runner will be given; only noted in the results and in the command shown."""
+    calibration: Path | None = None
+    """Calibration file for the command shown; by default that of a hand whose motors are all nominal, which is written
+    to a temporary folder. `python -m dexsim_real.calibrate` makes one as for a real hand."""
     link: Path | None = None
     """Name of the hand's port; by default in a new folder under the system's temporary one."""
     imu_link: Path | None = None
