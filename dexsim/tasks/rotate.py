@@ -53,7 +53,7 @@ class RotateReward:
     """Once for each goal reached."""
     action: float = setting(-0.01, unit="1", low=-1000.0, high=0.0)
     """Squared change of the action."""
-    velocity: float = setting(-0.015, unit="s^2/rad^2", low=-1000.0, high=0.0)
+    velocity: float = setting(-0.018, unit="s^2/rad^2", low=-1000.0, high=0.0)
     """Squared joint velocity."""
     torque: float = setting(-0.1, unit="1/Nm^2", low=-1000.0, high=0.0)
     """Squared joint torque."""
@@ -112,7 +112,7 @@ class RotateConfig(EnvConfig):
     drop_tilt: float = setting(1.0, unit="rad", low=0.1, high=3.2)
     """... or when it has tipped over: its own axis is farther than this from the axis of rotation,
     and no goal can be reached any more."""
-    patience: float = setting(8.0, unit="s", low=0.1, high=1e6)
+    patience: float = setting(4.0, unit="s", low=0.1, high=1e6)
     """A training episode without a new goal for this long is given up, as a drop is: else policies
     learn to turn once and then hold still. Evaluations wait for ever."""
     clearance: float = setting(0.001, unit="m", low=0.0, high=0.05)
