@@ -30,7 +30,7 @@ from dexsim_real.calibrate_options import CalibrateArguments
 from dexsim_real.calibrate_plan import placements
 from dexsim_real.calibrate_press import PressProcedure, placement_record
 from dexsim_real.calibrate_read import read_logs
-from dexsim_real.calibrate_report import report, table
+from dexsim_real.calibrate_report import grouped, report, table
 from dexsim_real.control import prepare_jax
 from dexsim_real.log import Kind
 from dexsim_real.trouble import HandError
@@ -74,7 +74,7 @@ def conclude(arguments: CalibrateArguments, hand: Hand, logs: Sequence[Path], op
     """
     found = fit(read_logs(logs, hand), hand)
     operator.console.print(table(found))
-    for note in found.calibration.notes:
+    for note in grouped(found.calibration.notes):
         operator.tell(f"note: {note}")
     if arguments.report:
         cli.write_json(arguments.report, report(found))

@@ -73,7 +73,9 @@ def record(arguments: CalibrateArguments, hand: Hand, operator: Operator, **benc
     operator.tell(f"the fingers move one after the other for {seconds / 60:.0f} minutes: keep everything clear of them")
     with Workbench(arguments, hand, operator, {"task": TASK}, **bench) as work:
         loop = work.loop
-        loop.collect(0.5)
+        # Else `Safety` would take what the taxels show at rest for a touch.
+        loop.sensing.zero([moment.state for moment in loop.collect(0.5)])
+        loop.step()
         if not operator.silent and operator.ask("  Enter begins, s stops:", loop.step).lower() in ("s", "stop"):
             raise HandError("stopped before anything moved")
         work.safety.engage()

@@ -58,7 +58,7 @@ def placements(hand: Hand, fingers: tuple[str, ...] = (), sides: bool = True) ->
     for finger in [i for i in chosen if sides and i in (0, 1)]:
         name, toward = hand.finger_names[finger], ("palm's normal", "thumb")[finger]
         found.append(_placement(hand, f"{name} side", finger, side, _spread(hand, finger),
-                                f"the same across the side of the {name}'s tip that faces the {toward}, 3 mm before it"))
+                                f"the same across the side of the {name} that faces the {toward}, 3 mm before it"))
     return found
 
 

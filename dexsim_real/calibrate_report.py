@@ -45,27 +45,34 @@ def report(fit: Fit) -> dict[str, Any]:
 
 
 def table(fit: Fit) -> Table:
-    """A table for the terminal: one row a joint, loading / unloading."""
+    """A table for the terminal, one row a joint: pressing on / giving way; the worse of the two where there is one."""
     calibration, real = fit.calibration, fit.calibration.real
     constants, intervals = torque_constants(calibration), torque_constant_intervals(calibration)
-    shown = Table("joint", "pressed with", "Nm / A", "95 %", "R2", "condition", "friction mA", "up to N",
-                  title="current to torque, loading / unloading", title_justify="left")
+    width = np.max(np.ptp(intervals, axis=-1) / 2 / np.abs(constants), 0)
+    shown = Table(box=None, padding=(0, 1, 0, 0), title="current to torque, pressing on / giving way",
+                  title_justify="left")
+    for head in ("joint", "pressed with", "Nm / A", "95 %", "R2", "cond.", "friction", "up to"):
+        shown.add_column(head, no_wrap=True)
     for joint, name in enumerate(calibration.joint_names):
-        width = np.ptp(intervals[:, joint], axis=-1) / 2 / np.abs(constants[:, joint])
         shown.add_row(
-            name, fit.source.get(name, "(taken over)"), _pair(constants[:, joint], "{:+.3f}"),
-            _pair(100 * width, "±{:.1f} %"), _pair(real.r_squared[:, joint], "{:.3f}"),
-            _pair(real.condition[:, joint], "{:.1f}"), f"{1e3 * real.friction[joint]:.0f}",
-            f"{real.force_max[joint]:.1f}")
+            name, fit.source.get(name, "(others)"), " / ".join(f"{value:+.3f}" for value in constants[:, joint]),
+            f"{100 * width[joint]:.1f} %", f"{np.min(real.r_squared[:, joint]):.3f}",
+            f"{np.max(real.condition[:, joint]):.1f}", f"{1e3 * real.friction[joint]:.0f} mA",
+            f"{real.force_max[joint]:.1f} N")
     return shown
 
 
-def _pair(values: np.ndarray, form: str) -> str:
-    return " / ".join(form.format(float(value)) for value in values)
+def grouped(notes: tuple[str, ...]) -> list[str]:
+    """Notes with those that say the same of several joints in one."""
+    joined: dict[str, list[str]] = {}
+    for note in notes:
+        name, colon, text = note.partition(": ")
+        joined.setdefault(text if colon else note, []).append(name if colon else "")
+    return [f"{', '.join(names)}: {text}" if names[0] else text for text, names in joined.items()]
 
 
 def _half(side: Side) -> np.ndarray:
     return (np.asarray(side.gain_high) - np.asarray(side.gain_low)) / 2
 
 
-__all__ = ["report", "table", "torque_constant_intervals", "torque_constants"]
+__all__ = ["grouped", "report", "table", "torque_constant_intervals", "torque_constants"]

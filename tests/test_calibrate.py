@@ -6,17 +6,23 @@ import io
 import json
 import queue
 import re
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import mujoco
 import numpy as np
+import press_bench
 import pytest
-from press_bench import BenchHand, Plate
+from press_bench import BenchHand, PlantPort, Plate
+from pty_hand import PtyHand
 from rich.console import Console
 
 from dexsim.calibration import joint_torque, load_calibration
 from dexsim.errors import CalibrationError, ConfigError
-from dexsim_real import calibrate
+from dexsim_real import calibrate, calibrate_identify
 from dexsim_real.calibrate_check import check_rest, dead_taxels, taxel_names
 from dexsim_real.calibrate_fit import fit
 from dexsim_real.calibrate_gauge import parse_reading
@@ -464,3 +470,144 @@ def test_nobody_at_the_terminal(hand, tmp_path):
     with pytest.raises(HandError, match="standard input is closed .--yes asks nothing."):
         record(bench, hand, arguments(tmp_path, yes=False, press=QUICK), who)
     assert off(bench) and bench.closed
+
+
+# --- the command over bytes --------------------------------------------------------------------------
+
+
+def command(*options):
+    """The command in this process, with its exit code and the last line on standard error."""
+    with pytest.raises(SystemExit) as stop:
+        calibrate.cli.run(lambda _: calibrate.main(list(options)))
+    return stop.value.code
+
+
+def test_the_command_refuses_a_touched_hand_in_one_line(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("serial")
+    monkeypatch.setattr(calibrate, "prepare_jax", lambda: None)
+    with PtyHand() as peer:
+        peer.state["tip"]["taxel"]["z"][3, 40:43] = 90
+        options = ["--port", peer.port, "--yes", "--output", str(tmp_path / "hand.toml"), "--log",
+                   str(tmp_path / "hand.log"), "--link.settle", "0", "--link.no-paced", "--check.seconds", "0.5"]
+        assert command(*options) == 2
+        assert all(np.all(block["mode"] == Mode.PASSIVE) for block in peer.commands)
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert "firmware 1.3.9" in lines[0]
+    assert lines[-1].startswith("error: cannot zero the taxels: 3 taxels side by side on the ring read above 40 counts")
+    assert not (tmp_path / "hand.toml").exists()
+    assert command("--port", "x", "--output", str(tmp_path / "hand.log")) == 2
+    assert "is there already" in capsys.readouterr().err
+
+
+# --- identification ----------------------------------------------------------------------------------
+
+
+def identifying(bench, hand, folder, monkeypatch, **options):
+    """Record with a fit that only keeps what it was given; the logs, by joint."""
+    kept = {}
+
+    def keep(log, start, **rest):
+        kept[log.name] = log, start, rest
+        raise CalibrationError("enough")
+
+    monkeypatch.setattr(calibrate_identify, "identify", keep)
+    options = arguments(folder, identify=True, output=folder / "hand.json", joints=("mid_joint1",), **options)
+    with pytest.raises(CalibrationError, match="enough"):
+        calibrate_identify.identify_hand(options, hand, operator(), port=bench, clock=bench.clock, sleep=bench.sleep)
+    return kept["mid_joint1"]
+
+
+def test_an_identification_gets_what_was_sent_and_answered(hand, tmp_path, monkeypatch):
+    sign, offset = np.ones(12), np.zeros(12)
+    sign[6], offset[6] = -1.0, 0.2
+    hardware = dataclasses.replace(arguments(tmp_path).hardware, joint_sign=tuple(sign), joint_offset=tuple(offset))
+    bench = BenchHand(hand, [])
+    bench.position[6] = -0.3
+    limits = dataclasses.replace(hand, joint_lower=np.full(12, -3.0), joint_upper=np.full(12, 3.0))
+    bench.hand, states, exchange = limits, [], bench.exchange
+
+    def lossy(command):
+        reply = exchange(command)
+        states.append(reply.state["joint"]["position"][6])
+        return None if len(states) % 150 == 0 else reply
+
+    bench.exchange = lossy
+    log, start, rest = identifying(bench, hand, tmp_path, monkeypatch, hardware=hardware)
+    assert off(bench) and bench.closed
+    sent = np.array([command["position"][6] for command in bench.commands]) * -1.0 + 0.2
+    answered = -np.array(states) + 0.2
+    # The longest stretch of the commands that is the log's: every sample is there, also where no answer came.
+    at = next(i for i in range(len(sent)) if np.allclose(sent[i:i + len(log.target)], log.target, atol=1e-6))
+    wanted, lost = answered[at:at + len(log.target)], np.arange(at + 1, at + len(log.target) + 1) % 150 == 0
+    np.testing.assert_allclose(log.position[~lost], wanted[~lost], atol=1e-6)
+    assert 0 < lost.sum() < 20 and np.abs(log.position - wanted)[lost].max() < 0.05
+    assert log.period == 1 / 83 and np.ptp(log.target) == pytest.approx(0.6, abs=0.01) and log.torque is None
+    assert rest["holdout"] is not None and rest["dead_band"] is None and rest["substeps"] == 2
+    # The inertia is the model's: a finger of 63 g and 56 mm with another link.
+    assert 2e-4 < start["inertia"] < 2e-3 and start["stall_torque"] == pytest.approx(1.1)
+
+
+def test_a_line_that_loses_too_much_identifies_nothing(hand, tmp_path):
+    bench, count = BenchHand(hand, []), [0]
+    exchange = bench.exchange
+
+    def lossy(command):
+        count[0] += 1
+        reply = exchange(command)
+        return None if count[0] % 20 == 0 else reply
+
+    bench.exchange = lossy
+    options = arguments(tmp_path, identify=True, output=tmp_path / "hand.json", joints=("mid_joint1",))
+    with pytest.raises(LogError, match="mid_joint1: .* exchanges are missing"):
+        calibrate_identify.identify_hand(options, hand, operator(), port=bench, clock=bench.clock, sleep=bench.sleep)
+    with pytest.raises(LogError, match="is the log of something else .identify."):
+        read_logs([options.log], hand)
+    with pytest.raises(HandError, match="no joint 'knee'"):
+        wrong = dataclasses.replace(options, joints=("knee",), log=tmp_path / "b.log")
+        calibrate_identify.identify_hand(wrong, hand, operator())
+
+
+# --- the emulated hand -------------------------------------------------------------------------------
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_emulated_hand_gives_its_torque_constants_back(hand, tmp_path, seed):
+    """Gears with play, ripple, heat, taxels with faults, parameters outside the ranges of training; a gauge."""
+    from dexsim_real.twin.press import PressBench
+
+    plant = PressBench(hand, seed)
+    bench, press_bench.GAUGE = PlantPort(plant), lambda: plant.tip_force
+    options = arguments(tmp_path, fingers=("middle",), press=PressConfig(), gauge="press_bench:read_gauge")
+    calibrate.conclude(options, hand, [record(bench, hand, options)], operator())
+    found, truth = -torque_constants(load_calibration(options.output, hand)), plant.truth()
+    error = np.array([found[0] / truth["loading_nm_per_a"], found[1] / truth["unloading_nm_per_a"]])[:, 6:8] - 1
+    # Its motors warm up by 15 K and so lose 1.5 %; ripple is 3 %; contact and taxels differ by a millimetre.
+    assert np.abs(error).max() < 0.08 and abs(error.mean()) < 0.05
+    # The scale of the taxels is drawn up to 13 % off, and is known afterwards.
+    scale = 0.1 / load_calibration(options.output, hand).force_per_count[2]
+    assert scale == pytest.approx(truth["taxel_gain"][2], rel=0.06)
+
+
+@pytest.mark.long
+def test_the_command_on_the_emulated_hand_through_the_bytes(hand, tmp_path):
+    """Two processes and a terminal between them."""
+    twin = subprocess.Popen([sys.executable, "-m", "dexsim_real.twin", "--plant", "dexsim_real.twin.press", "--link",
+                             str(tmp_path / "port"), "--imu-link", str(tmp_path / "imu"), "--draw", "nominal",
+                             "--output", str(tmp_path / "truth.json"), "--no-realtime"], cwd=ROOT)
+    try:
+        until = time.monotonic() + 60
+        while not (tmp_path / "port").exists() and time.monotonic() < until:
+            time.sleep(0.1)
+        done = subprocess.run([sys.executable, "-m", "dexsim_real.calibrate", "--port", str(tmp_path / "port"), "--yes",
+                               "--fingers", "middle", "--output", str(tmp_path / "hand.toml"), "--log",
+                               str(tmp_path / "hand.log")], cwd=ROOT, capture_output=True, text=True, timeout=300)
+        assert done.returncode == 0, done.stderr
+    finally:
+        twin.send_signal(signal.SIGINT)
+        twin.wait(30)
+    report = json.loads((tmp_path / "truth.json").read_text())
+    truth, found = report["trials"][0], -torque_constants(load_calibration(tmp_path / "hand.toml", hand))
+    error = np.array([found[0] / truth["loading_nm_per_a"], found[1] / truth["unloading_nm_per_a"]])[:, 6:8] - 1
+    assert np.abs(error).max() < 0.1
+    assert report["commands"]["outside_limits"] == 0
