@@ -1,6 +1,6 @@
 """The emulated hand at work: one thread that serves wire, IMU and camera, and brings the physics along.
 
-Whatever is due on the wire comes first. Physics goes in slices of two milliseconds between, and follows the wall
+Whatever is due on the wire comes first. Physics goes in slices of a millisecond between, and follows the wall
 clock; a machine too slow for that lets time go, and says so.
 """
 
@@ -33,7 +33,7 @@ class World:
       note: called with one line when time is let go.
     """
 
-    SLICE = 0.002  # s, simulated in one go
+    SLICE = 0.001  # s, simulated in one go
     BEHIND = 0.1  # s, beyond which time is let go
 
     def __init__(self, plant: Plant, start: float, note: Callable[[str], None] = lambda text: None):
@@ -47,7 +47,7 @@ class World:
         """When the next slice may be computed."""
         return self.now + self.SLICE
 
-    def catch_up(self, now: float, most: float = 5 * SLICE) -> None:
+    def catch_up(self, now: float, most: float = 0.01) -> None:
         """Bring the plant to this time, or nearer by `most` s."""
         behind = now - self.now
         if behind > self.BEHIND:
