@@ -393,7 +393,7 @@ def test_physics_follows_the_wall_clock_and_lets_go_what_it_cannot(hand):
         world.catch_up(now, World.SLICE)
     assert world.plant.time == pytest.approx(0.5, abs=0.003) and world.let_go == 0
     # Behind by less than the bound all of it is caught up, in slices; behind by more, the rest is let go.
-    for _ in range(50):
+    for _ in range(100):
         world.catch_up(10.58, World.SLICE)
     assert world.plant.time == pytest.approx(0.58, abs=1e-6)
     world.catch_up(13.0)
