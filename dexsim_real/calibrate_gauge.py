@@ -40,6 +40,7 @@ class Gauge:
 
     def __init__(self, source: str, operator: Operator):
         self._operator, self._function = operator, None
+        self.tireless = source != "ask"
         if source != "ask":
             self._function = _find(source)
         elif operator.silent:

@@ -107,7 +107,7 @@ class CalibrateArguments:
     """The serial line."""
     hardware: HardwareConfig = setting(HardwareConfig())
     """Signs, scales and gains."""
-    safety: SafetyConfig = setting(SafetyConfig(watchdog=0.3))
+    safety: SafetyConfig = setting(SafetyConfig(watchdog=0.3, stale=0.15))
     """Limits."""
 
     def __post_init__(self):

@@ -91,7 +91,8 @@ class PressProcedure:
             speed = max(self._advance, 0.01) / self.config.seconds
             self._unload(speed)
             self._aim(_LEAN[cycle % len(_LEAN)])
-        if self.gauge is not None:
+        # Nobody likes to type in more than they must: the sides go by the pads' scale.
+        if self.gauge is not None and (self.gauge.tireless or placement.name.endswith("pad")):
             self._climb(speed)
         self._back_off()
         return True
@@ -134,6 +135,7 @@ class PressProcedure:
         while True:
             moment = self._step(min(self._advance + speed * self.loop.pace.period, self.config.travel), LOADING)
             if moment is None:
+                forces.clear()  # What stops now does not show where the motors give no more.
                 continue
             forces.append(self._force(moment))
             positions.append(moment.sample.measured.joint_position.astype(float))
@@ -209,11 +211,15 @@ class PressProcedure:
         check_release(self._placement.name, sums, self.arguments.check)
 
     def _step(self, advance: float, phase: str) -> Moment | None:
-        """One exchange at this advance; in a phase it becomes a sample."""
-        self._advance = advance
+        """One exchange at this advance; in a phase it becomes a sample. None, and no advance, where the hand did not
+        answer or `Safety` had it wait."""
+        before, self._advance = self._advance, advance
         self.loop.recording = bool(phase)
         moment = self.loop.step(self._target())
-        if phase and moment is not None and moment.heeded:
+        if moment is None or not moment.heeded:
+            self._advance = before
+            return None
+        if phase:
             self.loop.mark({"press": self._placement.name, "phase": phase})
         return moment
 
