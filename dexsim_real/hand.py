@@ -20,7 +20,7 @@ from dexsim_real.trouble import HandError, explain, latency_warnings
 
 _POLL = 0.002  # s, longest wait of one read
 _WRITE = 0.5  # s, longest write; also what this program may be held up in one before the port counts as failed
-_QUIET = 0.004  # s without a byte, after which nothing more of a frame will come
+_QUIET = 0.006  # s without a byte, after which nothing more of a frame will come
 
 _LONGEST = frames.OVERHEAD + frames.STATE_BLOCK.itemsize  # bytes of the longest answer
 
@@ -130,8 +130,8 @@ class SerialHand:
         """The answer. At the deadline a frame that is on its way may still arrive: on a line of two
         wires nobody else could speak meanwhile."""
         deadline = sent + self.config.deadline(request, reply)
-        final, heard = False, sent
-        while not final:
+        answer, final, heard = None, False, sent
+        while answer is None and not final:
             data, now = self._read(), time.monotonic()
             heard = now if data else heard
             final = now > deadline and (now - heard > _QUIET or now > deadline + self.config.on_wire(_LONGEST))
@@ -140,10 +140,12 @@ class SerialHand:
                 size = frames.OVERHEAD + len(frame.data)
                 possible = not self.config.paced or now - sent >= self.config.on_wire(request + size)
                 if possible and frame.command in (command, Command.ERROR):
-                    return frame
-                self.counts.late += 1  # It answers something that was given up.
-                self._received -= size
-        return None
+                    self.counts.late += answer is not None  # Of two the newer is the answer.
+                    answer = frame
+                else:
+                    self.counts.late += 1  # It answers something that was given up.
+                    self._received -= size
+        return answer
 
     def _read(self) -> bytes:
         data = self._serial.read(1)
@@ -154,12 +156,9 @@ class SerialHand:
 
     def _discard(self) -> None:
         """Throw away what came too late, to its end: it must not pass for the next answer."""
-        found, until = [], time.monotonic() + self.config.on_wire(_LONGEST)
+        found, until = [], time.monotonic() + self.config.on_wire(_LONGEST) + _QUIET
         while (self._serial.in_waiting or self._parser.pending) and time.monotonic() < until:
-            data = self._read()
-            if not data:
-                break
-            found += self._parser.feed(data)
+            found += self._parser.feed(self._read())
         found += self._parser.expire()
         self.counts.late += len(found)
 

@@ -184,6 +184,30 @@ def test_the_rest_of_a_late_answer_does_not_spoil_the_next(monkeypatch):
         port.close()
 
 
+def test_of_two_answers_at_once_the_newer_is_taken():
+    def answer(index, block, state):
+        state["joint"]["position"] = 1
+        older = peer.whole()
+        state["joint"]["position"] = 2
+        return older + peer.whole()
+
+    with PtyHand(answer) as peer:
+        port = SerialHand(peer.port, QUICK)
+        port._open()
+        read = port._read
+
+        def both():
+            data = b""
+            while len(data) < 2 * len(peer.whole()):
+                data += read()
+            return data
+
+        port._read = both
+        assert port.exchange(command()).state["joint"]["position"][0] == 2
+        assert port.counts == LinkCounts(sent=1, answered=1, late=1)
+        port.close()
+
+
 def test_a_line_that_never_falls_silent_does_not_hold_the_driver(monkeypatch):
     with PtyHand() as peer:
         port = SerialHand(peer.port, QUICK)
