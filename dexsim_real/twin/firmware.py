@@ -30,7 +30,7 @@ class FirmwareConfig:
     """Id of the hand."""
     version: str = "1.3.9 emulated"
     """What it calls itself."""
-    watchdog: float = setting(0.09, unit="s", low=0.01, high=10.0)
+    watchdog: float = setting(0.08, unit="s", low=0.01, high=10.0)
     """Without a valid exchange for this long the motors go off."""
     encoder_bits: int = setting(12, unit="1", low=4, high=16)
     """Resolution of a full turn."""
