@@ -98,13 +98,13 @@ def grasp_metrics(reports: list[dict[str, Any]]) -> dict[str, Any]:
 
 def rotate_metrics(reports: list[dict[str, Any]]) -> dict[str, Any]:
     """The paper's three, with the count of the task's rule (spin) and of the paper's."""
-    from dexsim.statistics import mean, median, proportion
+    from dexsim.statistics import mean, proportion
 
     count, paper, lived = (np.array([r[name] for r in reports], float)
                            for name in ("successes", "paper_successes", "seconds_to_fall"))
     pace = np.array([r["seconds_per_success"] for r in reports if r["successes"]], float)
-    return {"successes": mean(count) | median(count) | {"sorted": sorted(count.tolist())},
-            "paper_successes": mean(paper) | median(paper) | {"sorted": sorted(paper.tolist())},
+    return {"successes": mean(count) | {"median": float(np.median(count)), "sorted": sorted(count.tolist())},
+            "paper_successes": mean(paper) | {"median": float(np.median(paper)), "sorted": sorted(paper.tolist())},
             "seconds_per_success": mean(pace), "seconds_to_fall": mean(lived),
             "kept_to_the_end": proportion(np.array([not r["fell"] for r in reports])),
             "joint_speed": mean(np.array([r["joint_speed"] for r in reports]))}
@@ -123,7 +123,8 @@ def simulated(task: str, policy: str) -> dict[str, Any]:
         return {}
     if task == "grasp":
         return {name: report[name] for name in ("held", "pearson_r", "pearson_r_total", "by_command") if name in report}
-    counts = {name: report[name]["mean"] | report[name]["median"] for name in ("successes", "paper_successes")}
+    counts = {name: report[name]["mean"] | {"median": report[name]["median"]["median"]}
+              for name in ("successes", "paper_successes")}
     return counts | {name: report[name] for name in ("seconds_per_success", "seconds_to_fall", "kept_to_the_end")}
 
 
