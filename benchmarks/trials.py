@@ -10,6 +10,7 @@ camera's masks. What is counted is the emulated hand's own truth. Trial k of a s
 """
 
 import argparse
+import contextlib
 import json
 import os
 import shlex
@@ -140,10 +141,13 @@ def arguments() -> argparse.Namespace:
 def main() -> None:
     options = arguments()
     reports = []
-    for number in range(options.first, options.first + options.trials):
-        with tempfile.TemporaryDirectory(prefix="dexsim-trial-") as folder:
-            reports.append(run_trial(options, number, Path(folder)))
-        print(line(reports[-1]), file=sys.stderr, flush=True)
+    with contextlib.suppress(KeyboardInterrupt):  # What is done by then is shown.
+        for number in range(options.first, options.first + options.trials):
+            with tempfile.TemporaryDirectory(prefix="dexsim-trial-") as folder:
+                reports.append(run_trial(options, number, Path(folder)))
+            print(line(reports[-1]), file=sys.stderr, flush=True)
+    if not reports:
+        sys.exit(130)
     here = (grasp_metrics if options.task == "grasp" else rotate_metrics)(reports)
     there = simulated(options.task, options.policy or options.task)
     print(f"{options.task}: {len(reports)} trials through the bytes, parameters {options.draw}, seed {options.seed}; "

@@ -1,5 +1,7 @@
 """A hand on the bench: port, log and limits of one procedure, opened together and closed with the motors off."""
 
+import contextlib
+import os
 import sys
 import time
 from collections.abc import Callable
@@ -15,6 +17,7 @@ from dexsim_real.hand import HandPort, open_port
 from dexsim_real.log import Kind, LogWriter
 from dexsim_real.safety import Safety
 from dexsim_real.sensing import HandSensing
+from dexsim_real.servo import use_realtime
 
 
 class Workbench:
@@ -39,6 +42,9 @@ class Workbench:
 
     def __enter__(self) -> "Workbench":
         try:
+            # Only from here to the end: what computes for long with it would starve the machine.
+            if self._arguments.realtime:
+                use_realtime()
             self._say(self.loop.port.connect())
             for warning in getattr(self.loop.port, "warnings", list)():
                 self._say(f"warning: {warning}")
@@ -61,6 +67,9 @@ class Workbench:
             self.log.add(Kind.NOTE, f"end: {end or 'done'}")
             self.log.add(Kind.END, {"end": end})
             self.log.close()
+            if self._arguments.realtime:
+                with contextlib.suppress(OSError, AttributeError):
+                    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
     def _react(self, text: str) -> None:
         self.log.add(Kind.NOTE, text)

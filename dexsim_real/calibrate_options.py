@@ -99,6 +99,8 @@ class CalibrateArguments:
     """Log file; by default a new one under runs/real."""
     rate: float = setting(83.0, unit="Hz", low=20.0, high=1000.0)
     """Exchanges with the hand per second."""
+    realtime: bool = True
+    """Ask for real-time priority; without the right to it the procedure goes on without."""
     press: PressConfig = setting(PressConfig())
     """Forces and speeds."""
     check: CheckConfig = setting(CheckConfig())

@@ -22,6 +22,7 @@ LOADING, UNLOADING, RELEASED, REST = "loading", "unloading", "released", "rest"
 """Phases that samples are marked with; "level K" is a force held for the gauge."""
 
 
+_ANSWERED = 0.5  # share of the exchanges that must be, at rest
 _LAST = 12  # samples that make an end of a press
 _STALL = 0.02  # of the peak force, by which force must grow in a second, or the motors give no more
 _LEAST_MOTION = 0.004  # rad that each joint should move in a press
@@ -55,11 +56,11 @@ class PressProcedure:
           HandError: too few answers, or a fingertip under load.
         """
         self.operator.tell("resting: let nothing touch the fingertips")
-        moments = self._record("", REST, self.arguments.check.seconds)
-        rate = self.arguments.rate
-        if len(moments) < 0.5 * rate * self.arguments.check.seconds:
-            raise HandError(f"only {len(moments)} answers in {self.arguments.check.seconds:g} s: the line "
-                            "loses too much")
+        seconds = self.arguments.check.seconds
+        moments = self._record("", REST, seconds)
+        if len(moments) < _ANSWERED * self.arguments.rate * seconds:
+            raise HandError(f"only {len(moments)} answers in {seconds:g} s: the line loses too much, or "
+                            "this machine is too busy")
         counts = np.array([self._raw(moment) for moment in moments])
         current = np.array([moment.state["joint"]["current"] for moment in moments], float)
         report = check_rest(self.hand, counts, current, self.arguments.check,

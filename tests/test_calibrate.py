@@ -56,7 +56,7 @@ def plates(hand, *names):
 
 def arguments(folder, **options):
     options = {"port": "bench", "output": folder / "hand.toml", "log": folder / "hand.log", "yes": True,
-               "press": SHORT, "fingers": ("index",)} | options
+               "press": SHORT, "fingers": ("index",), "realtime": False} | options
     return CalibrateArguments(**options)
 
 
@@ -488,7 +488,8 @@ def test_the_command_refuses_a_touched_hand_in_one_line(tmp_path, monkeypatch, c
     with PtyHand() as peer:
         peer.state["tip"]["taxel"]["z"][3, 40:43] = 90
         options = ["--port", peer.port, "--yes", "--output", str(tmp_path / "hand.toml"), "--log",
-                   str(tmp_path / "hand.log"), "--link.settle", "0", "--link.no-paced", "--check.seconds", "0.5"]
+                   str(tmp_path / "hand.log"), "--link.settle", "0", "--link.no-paced", "--check.seconds", "0.5",
+                   "--no-realtime"]
         assert command(*options) == 2
         assert all(np.all(block["mode"] == Mode.PASSIVE) for block in peer.commands)
     lines = capsys.readouterr().err.strip().splitlines()
@@ -594,7 +595,7 @@ def test_the_command_on_the_emulated_hand_through_the_bytes(hand, tmp_path):
     """Two processes and a terminal between them."""
     twin = subprocess.Popen([sys.executable, "-m", "dexsim_real.twin", "--plant", "dexsim_real.twin.press", "--link",
                              str(tmp_path / "port"), "--imu-link", str(tmp_path / "imu"), "--draw", "nominal",
-                             "--output", str(tmp_path / "truth.json"), "--no-realtime"], cwd=ROOT)
+                             "--output", str(tmp_path / "truth.json")], cwd=ROOT)
     try:
         until = time.monotonic() + 60
         while not (tmp_path / "port").exists() and time.monotonic() < until:
