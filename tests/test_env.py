@@ -121,9 +121,9 @@ class TestTick:
     def test_a_tick_equals_c_mujoco(self, hand, grasp_env, grasp_rollout):
         """Targets, latency, drive, push, tilt and contact of one tick, written down again.
 
-        Six sub-steps, with the shipped five solver iterations; spheres and capsules, on whose
-        contacts the engines agree. Errors of a sub-step (1e-3 rad/s) have six to grow in, and a
-        contact that opens a sub-step later moves a force by some tenths of a newton.
+        Spheres and capsules, on whose contacts the engines agree; C solves to the end. The shipped
+        three iterations leave light links up to 25 mrad away after five sub-steps of closing, and
+        single forces by newtons.
         """
         pool, config = grasp_env.pool, grasp_env.config
         rows = np.concatenate([c_scene.rows_of(pool, shape)[:4] for shape in ("sphere", "capsule")])
@@ -136,13 +136,14 @@ class TestTick:
         push = jax.vmap(lambda key, target: grasp_env.task.push(jax.random.split(key, 4)[1], target))(
             state.key, state.target)
 
-        strong = 0
+        strong, close = 0, []
+        skin = np.asarray(skin_law(hand, config.skin)(state.physics.qpos, state.target))
         for world in range(WORLDS):
             target = c_scene.row(state.target, world)
-            model = c_scene.compile_scene(hand, target, iterations=config.physics.iterations,
-                                          line_search=config.physics.line_search)
+            model = c_scene.compile_scene(hand, target, **c_scene.CONVERGED)
             data = c_scene.start(model, *(np.asarray(x[world]) for x in (
                 state.physics.qpos, state.physics.qvel, state.physics.warmstart)))
+            c_scene.follow_skin(model, data, hand, target, skin[world])
             old = np.asarray(state.joint_target[world], np.float64)
             q = data.qpos[:12].copy()
             new = old + config.control.step * np.clip(np.asarray(action[world]), -1, 1)
@@ -162,9 +163,11 @@ class TestTick:
             felt = np.linalg.norm(c_scene.finger_force(model, data, hand), axis=-1)
             strong += np.sum(felt > 0.5)
             np.testing.assert_allclose(after.joint_target[world], new, atol=1e-6)
-            np.testing.assert_allclose(after.physics.qpos[world], data.qpos, atol=2e-3)
-            np.testing.assert_allclose(after.finger_force[world], felt, atol=0.5, rtol=0.1)
+            np.testing.assert_allclose(after.physics.qpos[world], data.qpos, atol=4e-2)
+            np.testing.assert_allclose(after.physics.qpos[world, 12:15], data.qpos[12:15], atol=1e-3)
+            close += list(np.isclose(after.finger_force[world], felt, atol=0.5, rtol=0.15)[felt > 0.5])
         assert strong >= 5, "hardly a finger touches: the test tests nothing"
+        assert np.mean(close) > 0.6
 
     def test_torque_readings_are_the_drives(self, hand, history):
         """The torque that the motors would give at the end of the tick, over the stall torque."""

@@ -157,7 +157,7 @@ class TestAgainstC:
         target = dataclasses.replace(target, com=jnp.zeros((WORLDS, 3)))
         push = np.float32(np.random.default_rng(2).normal(size=(WORLDS, 3)))
         after, _ = physics_advance(target, state, jnp.zeros((WORLDS, 12)), jnp.asarray(push))
-        wanted = 0.005 * (push / np.asarray(target.mass)[:, None] + np.array(GRAVITY))
+        wanted = PhysicsConfig().timestep * (push / np.asarray(target.mass)[:, None] + np.array(GRAVITY))
         np.testing.assert_allclose(after.qvel[:, 12:15], wanted, rtol=1e-5, atol=1e-6)
 
     def test_forces_point_outwards(self, contact_steps):
