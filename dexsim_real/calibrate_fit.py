@@ -33,6 +33,7 @@ _ACTIVE = 2.0  # counts from which on a taxel takes part
 _STILL = 0.25  # of the usual speed, below which a joint is at rest
 _NOISE = 4.0  # standard deviations of a block's angle, the same
 _TOP, _TOP_BLOCKS = 0.97, 4  # share of the largest current, and for how long, that make it the motor's limit
+_READINGS = 8  # of the gauge that a fingertip needs
 _SHEAR = 0.1  # of the force, from which on a note is due
 
 
@@ -185,7 +186,9 @@ def _gauges(session: Session, hand: Hand,
     newtons, fits, notes = {}, {}, []
     for recording in sorted(pressed, key=lambda r: not r.name.endswith("pad")):
         levels = [level for level in recording.gauge if len(recording.samples(level))]
-        if not levels:
+        if len(levels) < _READINGS:
+            if levels:
+                notes.append(f"{recording.name}: {len(levels)} readings of the gauge do not count, {_READINGS} are needed")
             continue
         name, gauge = hand.finger_names[recording.finger], np.array([recording.gauge[k] for k in levels])
         every = np.array(recording.counts)

@@ -216,6 +216,15 @@ def test_a_kitchen_scale_gives_the_newtons(hand, scale):
     assert "thumb: not compared with the gauge" in notes and "error of the force sensor" not in notes
 
 
+def test_too_few_readings_do_not_count(hand, scale):
+    session = read_logs([scale[1].log], hand)
+    recording = session.recordings["middle pad"]
+    recording.gauge = dict(list(recording.gauge.items())[:7])
+    found = fit(session, hand)
+    assert not found.sensors and np.all(np.asarray(found.calibration.force_per_count) == 0.1)
+    assert any("middle pad: 7 readings of the gauge do not count" in note for note in found.calibration.notes)
+
+
 @pytest.mark.parametrize(("text", "newtons"), [
     ("5.2", 5.2), ("5,2 N", 5.2), ("530 g", 5.197525), ("0.53kg", 5.197525), (" .5n ", 0.5), ("0", 0.0)])
 def test_readings_of_a_gauge(text, newtons):
