@@ -188,7 +188,8 @@ def _gauges(session: Session, hand: Hand,
         levels = [level for level in recording.gauge if len(recording.samples(level))]
         if len(levels) < _READINGS:
             if levels:
-                notes.append(f"{recording.name}: {len(levels)} readings of the gauge do not count, {_READINGS} are needed")
+                notes.append(f"{recording.name}: {len(levels)} readings of the gauge do not count, "
+                             f"{_READINGS} are needed")
             continue
         name, gauge = hand.finger_names[recording.finger], np.array([recording.gauge[k] for k in levels])
         every = np.array(recording.counts)
