@@ -34,6 +34,8 @@ class ObjectConfig:
 
     shapes: tuple[str, ...] = setting(SHAPES, choices=SHAPES)
     """Kinds of object, drawn with equal probability."""
+    scale: float = setting(1.0, unit="1", low=0.0, high=1.0)
+    """Width of all ranges about their middles; 0 leaves one object of each kind."""
     sphere_radius: tuple[float, float] = setting((0.022, 0.035), unit="m", low=0.005, high=0.08)
     """Radius of a sphere."""
     box_half: tuple[float, float] = setting((0.020, 0.030), unit="m", low=0.005, high=0.08)
@@ -69,6 +71,17 @@ class ObjectConfig:
         if not self.shapes:
             raise ConfigError("ObjectConfig.shapes is empty: name at least one shape")
 
+    def narrowed(self) -> "ObjectConfig":
+        """The ranges as `scale` leaves them, and scale 1."""
+        if self.scale == 1.0:
+            return self
+
+        def narrow(span: tuple[float, float], middle: float) -> tuple[float, float]:
+            return tuple(middle + self.scale * (value - middle) for value in span)
+
+        values = {name: narrow(getattr(self, name), middle(self, name)) for name in RANGES if name != "com_offset"}
+        return dataclasses.replace(self, scale=1.0, com_offset=self.scale * self.com_offset, **values)
+
     @property
     def largest(self) -> np.ndarray:
         """Upper bound [K, 3] of every slot's size, for the compiled template."""
@@ -77,6 +90,11 @@ class ObjectConfig:
         body = max(self.composition_scale, 1.0)  # of the box or cylinder in a composition
         return np.array([[body * self.box_half[1]] * 3, [radius, half, 0.0],
                          [body * self.cylinder_radius[1], body * self.cylinder_half[1], 0.0]])
+
+
+def middle(config: ObjectConfig, name: str) -> float:
+    """The nominal value of a range of `ObjectConfig`."""
+    return 1.0 if name == "inertia_scale" else sum(getattr(config, name)) / 2
 
 
 def bounding_radius(size: jax.Array, kinds: tuple[str, ...] = SLOTS) -> jax.Array:
@@ -133,7 +151,7 @@ class ObjectParams:
 def sample_object(key: jax.Array, config: ObjectConfig,
                   shape_index: jax.Array | None = None) -> ObjectParams:
     """Draw one object, of a kind in `config.shapes` or of the given one (index into SHAPES)."""
-    keys = jax.random.split(key, 8)
+    config, keys = config.narrowed(), jax.random.split(key, 8)
     if shape_index is None:
         allowed = jnp.array([SHAPES.index(name) for name in config.shapes])
         shape_index = jax.random.choice(keys[0], allowed)
@@ -147,6 +165,37 @@ def sample_object(key: jax.Array, config: ObjectConfig,
                          damping_ratio(_uniform(keys[7], config.restitution))])
     return ObjectParams(shape_index.astype(jnp.int32), size, position, active, mass,
                         inertia * scale, com, _uniform(keys[5], config.friction), contact)
+
+
+def plain_inertia(target: ObjectParams) -> jax.Array:
+    """Inertia [3] m^2 of the union of SLOTS as a uniform solid of 1 kg, about its centre."""
+    mass, _, inertia = _mass_properties(target.size, target.position, target.active)
+    return inertia / mass
+
+
+def narrow(target: ObjectParams, config: ObjectConfig, plain: jax.Array,
+           scale: jax.Array) -> ObjectParams:
+    """A drawn object with its bulk nearer to nominal: mass, inertia, centre of mass, friction, contact.
+
+    Its size stays: start states were chosen for it.
+
+    Args:
+      config: the ranges that it was drawn from.
+      plain: [3] m^2, inertia of its shape as a uniform solid of 1 kg.
+      scale: [] in [0, 1]; 0 is nominal exactly, 1 leaves the object as it is.
+    """
+    config = config.narrowed()
+
+    def toward(name: str, value: jax.Array) -> jax.Array:
+        nominal = middle(config, name)
+        return nominal + scale * (value - nominal)
+
+    mass, drawn = toward("mass", target.mass), target.inertia / (target.mass * plain)
+    bounce = damping_ratio(jnp.asarray(middle(config, "restitution")))
+    contact = jnp.stack([toward("stiffness", target.contact[0]), bounce + scale * (target.contact[1] - bounce)])
+    return dataclasses.replace(
+        target, mass=mass, inertia=mass * plain * toward("inertia_scale", drawn), com=scale * target.com,
+        friction=toward("friction", target.friction), contact=contact)
 
 
 def restitution(ratio: np.ndarray) -> np.ndarray:

@@ -9,7 +9,16 @@ import pytest
 
 from dexsim import objects, sdf
 from dexsim.errors import ConfigError
-from dexsim.objects import SHAPES, SLOTS, ObjectConfig, bounding_radius, damping_ratio, extent, sample_object
+from dexsim.objects import (
+    SHAPES,
+    SLOTS,
+    ObjectConfig,
+    bounding_radius,
+    damping_ratio,
+    extent,
+    plain_inertia,
+    sample_object,
+)
 
 BOX, CAPSULE, CYLINDER = range(3)
 ACTIVE = {"sphere": {(0, 1, 0)}, "box": {(1, 0, 0)}, "cylinder": {(0, 0, 1)}, "capsule": {(0, 1, 0)},
@@ -304,3 +313,36 @@ def test_a_pool_holds_all_shapes_alike(hand, grasp_env):
     np.testing.assert_allclose(np.linalg.norm(pool.qpos[:, 15:], axis=1), 1, atol=1e-5)
     assert np.all(pool.qpos[:, :12] >= hand.joint_lower) and np.all(pool.qpos[:, :12] <= hand.joint_upper)
     assert len(np.unique(pool.target.mass)) == count  # each start has an object of its own
+
+
+class TestScale:
+    """`ObjectConfig.scale`: all ranges about their middles."""
+
+    def draw(self, scale, shape):
+        config, keys = ObjectConfig(scale=scale), jax.random.split(jax.random.key(0), 200)
+        return jax.vmap(lambda key: sample_object(key, config, jnp.int32(SHAPES.index(shape))))(keys)
+
+    @pytest.mark.parametrize("shape", ["sphere", "box", "cylinder", "capsule"])
+    def test_zero_leaves_one_object_of_each_kind(self, shape):
+        drawn, config = self.draw(0.0, shape), ObjectConfig()
+        for leaf in jax.tree.leaves(drawn):
+            np.testing.assert_allclose(leaf, np.broadcast_to(leaf[0], leaf.shape), rtol=1e-6)
+        np.testing.assert_allclose(drawn.mass[0], np.mean(config.mass), rtol=1e-6)
+        np.testing.assert_allclose(drawn.com[0], 0)
+        size = {"sphere": config.sphere_radius, "box": config.box_half, "cylinder": config.cylinder_radius,
+                "capsule": config.cylinder_radius}[shape]
+        slot = {"sphere": 1, "box": 0, "cylinder": 2, "capsule": 1}[shape]
+        np.testing.assert_allclose(drawn.size[0, slot, 0], np.mean(size), rtol=1e-6)
+
+    def test_half_is_half_as_wide(self):
+        for shape in ("box", "composition"):
+            half, full = self.draw(0.5, shape), self.draw(1.0, shape)
+            assert np.ptp(half.mass) == pytest.approx(np.ptp(full.mass) / 2, rel=1e-4)
+            np.testing.assert_allclose(half.friction, (np.mean(ObjectConfig().friction) + full.friction) / 2, rtol=1e-4)
+
+    def test_inertia_of_a_uniform_solid(self):
+        for shape in SHAPES:
+            one = jax.tree.map(lambda x: x[0], self.draw(1.0, shape))
+            ratio = np.asarray(one.inertia / (one.mass * plain_inertia(one)))
+            np.testing.assert_allclose(ratio, ratio[0], rtol=1e-4)
+            assert 0.8 <= ratio[0] <= 1.25

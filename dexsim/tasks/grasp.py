@@ -17,7 +17,7 @@ from dexsim.config import check_ranges, setting, validate
 from dexsim.env import EnvConfig, Moment, Start
 from dexsim.errors import ConfigError
 from dexsim.hand import Hand, flexion_joints
-from dexsim.objects import RANGES, SLOTS, ObjectParams, sample_object
+from dexsim.objects import RANGES, SLOTS, ObjectParams, plain_inertia, sample_object
 from dexsim.pytree import pytree_dataclass
 from dexsim.tasks.grasp_report import summarize
 from dexsim.tasks.grasp_start import make_pool
@@ -186,6 +186,10 @@ class Grasp:
                     shape_index: jax.Array | None = None) -> ObjectParams:
         """One object of `config`, of a random or the given kind (index into SHAPES)."""
         return sample_object(key, config.objects, shape_index)
+
+    def plain_inertia(self, target: ObjectParams) -> jax.Array:
+        """Inertia [3] m^2 of the object as a uniform solid of 1 kg."""
+        return plain_inertia(target)
 
     def begin(self, key: jax.Array, start: Start) -> Goal:
         del start

@@ -28,6 +28,7 @@ from dexsim.tasks.rotate_start import (
     load_pool,
     lowest_point,
     palm_height,
+    plain_inertia,
     sample_target,
 )
 from dexsim.tasks.terms import action_rate, joint_speed, random_push
@@ -257,6 +258,10 @@ class Rotate:
         """One object of `config`; there is only one kind."""
         del shape_index
         return sample_target(key, config)
+
+    def plain_inertia(self, target: ObjectParams) -> jax.Array:
+        """Inertia [3] m^2 of the object as a uniform solid of 1 kg."""
+        return plain_inertia(self.config.object, target.size[0, 0])
 
     def begin(self, key: jax.Array, start: Start) -> Goal:
         del key, start

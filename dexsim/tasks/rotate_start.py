@@ -52,22 +52,31 @@ def sample_target(key: jax.Array, config: Any) -> ObjectParams:
     edge_key, base_key, scale_key = jax.random.split(key, 3)
     kinds = KINDS[config.object]
     base = sample_object(base_key, config.objects, jnp.int32(SHAPES.index("box")))
-    half = jax.random.uniform(edge_key, minval=config.edge[0], maxval=config.edge[1]) / 2
-    low, high = config.objects.inertia_scale
+    shortest, longest = config.edge
+    if config.objects.scale != 1:
+        middle, reach = (shortest + longest) / 2, config.objects.scale * (longest - shortest) / 2
+        shortest, longest = middle - reach, middle + reach
+    half = jax.random.uniform(edge_key, minval=shortest, maxval=longest) / 2
+    low, high = config.objects.narrowed().inertia_scale
     scale = base.mass * jax.random.uniform(scale_key, minval=low, maxval=high)
-    if config.object == "cube":
-        quat, inertia = None, jnp.full(3, 2 / 3) * half**2
-    else:  # round about the palm's normal: the octagon as the cylinder between its circles
-        radius = half if config.object == "cylinder" else 1.05 * half
-        across = radius**2 / 4 + half**2 / 3
-        inertia = jnp.stack([radius**2 / 2, across, across])
-        turns = {"cylinder": [_UPRIGHT], "octagon": [(1.0, 0.0, 0.0, 0.0), _EIGHTH]}
-        quat = jnp.array(turns[config.object], jnp.float32)
+    turns = {"cube": None, "cylinder": [_UPRIGHT], "octagon": [(1.0, 0.0, 0.0, 0.0), _EIGHTH]}[config.object]
+    quat = None if turns is None else jnp.array(turns, jnp.float32)
+    inertia = plain_inertia(config.object, half)
     size = jnp.full((len(kinds), 3), half)
     return dataclasses.replace(
         base, shape_index=jnp.int32(SHAPES.index(_SHAPE_INDEX[config.object])),
         size=size, position=jnp.zeros((len(kinds), 3)), active=jnp.ones(len(kinds), bool),
         inertia=scale * inertia, quat=quat, kinds=kinds)
+
+
+def plain_inertia(name: str, half: jax.Array) -> jax.Array:
+    """Inertia [3] m^2 of a uniform solid of 1 kg, `half` m from its middle to its sides."""
+    if name == "cube":
+        return jnp.full(3, 2 / 3) * half**2
+    # Round about the palm's normal: the octagon as the cylinder between its circles.
+    radius = half if name == "cylinder" else 1.05 * half
+    across = radius**2 / 4 + half**2 / 3
+    return jnp.stack([radius**2 / 2, across, across])
 
 
 def lowest_point(target: ObjectParams, quat: jax.Array, position: jax.Array) -> jax.Array:
