@@ -83,29 +83,29 @@ class SensorNoise:
 
 @pytree_dataclass
 class SensorParams:
-    """One episode's array."""
+    """One episode's array; None for what is switched off."""
 
-    hysteresis: jax.Array  # [F, 1]
-    memory: jax.Array  # [F, 1], share of the late part that is still missing after a control step
-    crosstalk: jax.Array  # [F, 1]
-    gain: jax.Array  # [F, N]
-    bias: jax.Array  # [F, N] N
-    drift: jax.Array  # [F, 1] N a step
-    noise: jax.Array  # [F, 1] N
-    alive: jax.Array  # [F, N] bool
-    threshold: jax.Array  # [F, N] N
-    rate: jax.Array  # [] samples a control step
-    phase: jax.Array  # [] in [0, 1), of the array's clock at the first step
+    hysteresis: jax.Array | None  # [F, 1]
+    memory: jax.Array | None  # [F, 1], share of the late part that is still missing after a control step
+    crosstalk: jax.Array | None  # [F, 1]
+    gain: jax.Array | None  # [F, N]
+    bias: jax.Array | None  # [F, N] N
+    drift: jax.Array | None  # [F, 1] N a step
+    noise: jax.Array | None  # [F, 1] N
+    alive: jax.Array | None  # [F, N] bool
+    threshold: jax.Array | None  # [F, N] N
+    rate: jax.Array | None  # [] samples a control step
+    phase: jax.Array | None  # [] in [0, 1), of the array's clock at the first step
 
 
 @pytree_dataclass
 class SensorState:
-    """What the array remembers from step to step."""
+    """What the array remembers from step to step; None for what is switched off."""
 
-    late: jax.Array  # [F, N] N, the force as the late part sees it
-    walk: jax.Array  # [F, N] N, drift so far
-    held: jax.Array  # [F, N] N, the last sample
-    clock: jax.Array  # [] periods of the array since its last sample; below 0 before the first step
+    late: jax.Array | None  # [F, N] N, the force as the late part sees it
+    walk: jax.Array | None  # [F, N] N, drift so far
+    held: jax.Array | None  # [F, N] N, the last sample
+    clock: jax.Array | None  # [] periods of the array since its last sample; below 0 before the first step
 
 
 @dataclasses.dataclass(frozen=True)
@@ -122,33 +122,43 @@ class SensorModel:
         """(F, N)."""
         return self.fingers, self.grid[0] * self.grid[1]
 
-    def sample(self, key: jax.Array) -> SensorParams:
-        """Draw one episode's array."""
+    def sample(self, key: jax.Array, scale: jax.Array | float = 1.0) -> SensorParams:
+        """Draw one episode's array; `scale` [] is on top of the configuration's and may be traced."""
         c, keys = self.config, iter(jax.random.split(key, 13))
-        each, finger = self.shape, (self.fingers, 1)
+        each, finger, width = self.shape, (self.fingers, 1), self.config.scale * scale
 
-        def draw(span: Range | None, nominal: float, shape: tuple[int, ...]) -> jax.Array:
+        def draw(span: Range | None, nominal: float, shape: tuple[int, ...]) -> jax.Array | None:
             own = next(keys)
             if span is None:
-                return jnp.full(shape, nominal)
-            return nominal + c.scale * (jax.random.uniform(own, shape, minval=span[0], maxval=span[1]) - nominal)
+                return None
+            return nominal + width * (jax.random.uniform(own, shape, minval=span[0], maxval=span[1]) - nominal)
 
-        time = jax.random.uniform(next(keys), finger, minval=c.hysteresis_time[0], maxval=c.hysteresis_time[1])
-        rate = jnp.ones(())
-        if c.rate is not None:
-            rate = self.control_period * jax.random.uniform(next(keys), (), minval=c.rate[0], maxval=c.rate[1])
-        return SensorParams(
-            hysteresis=draw(c.hysteresis, 0.0, finger), memory=jnp.exp(-self.control_period / time),
+        time_key, rate_key = next(keys), next(keys)
+        time = jax.random.uniform(time_key, finger, minval=c.hysteresis_time[0], maxval=c.hysteresis_time[1])
+        params = SensorParams(
+            hysteresis=draw(c.hysteresis, 0.0, finger),
+            memory=None if c.hysteresis is None else jnp.exp(-self.control_period / time),
             crosstalk=draw(c.crosstalk, 0.0, finger), gain=draw(c.gain, 1.0, each), bias=draw(c.bias, 0.0, each),
-            drift=draw(c.drift, 0.0, finger) * self.control_period**0.5, noise=draw(c.noise, 0.0, finger),
-            alive=jax.random.uniform(next(keys), each) >= draw(c.dead, 0.0, ()),
-            threshold=draw(c.threshold, 0.0, each), rate=rate, phase=jax.random.uniform(next(keys), ()),
+            drift=draw(c.drift, 0.0, finger), noise=draw(c.noise, 0.0, finger), alive=draw(c.dead, 0.0, ()),
+            threshold=draw(c.threshold, 0.0, each), rate=None, phase=None,
         )  # fmt: skip
+        dead_key, phase_key = next(keys), next(keys)
+        found = {}
+        if c.drift is not None:
+            found["drift"] = params.drift * self.control_period**0.5
+        if c.dead is not None:
+            found["alive"] = jax.random.uniform(dead_key, each) >= params.alive
+        if c.rate is not None:
+            found["rate"] = self.control_period * jax.random.uniform(rate_key, (), minval=c.rate[0], maxval=c.rate[1])
+            found["phase"] = jax.random.uniform(phase_key, ())
+        return dataclasses.replace(params, **found)
 
     def init(self) -> SensorState:
         """Before the first step: nothing felt, nothing drifted."""
-        nothing = jnp.zeros(self.shape)
-        return SensorState(nothing, nothing, nothing, jnp.full((), -1.0))
+        c, nothing = self.config, jnp.zeros(self.shape)
+        slow = c.rate is not None
+        return SensorState(late=None if c.hysteresis is None else nothing, walk=None if c.drift is None else nothing,
+                           held=nothing if slow else None, clock=jnp.full((), -1.0) if slow else None)
 
     def apply(self, params: SensorParams, state: SensorState, key: jax.Array,
               force: jax.Array) -> tuple[SensorState, jax.Array]:
@@ -163,13 +173,17 @@ class SensorModel:
             value = value + params.hysteresis * (late - force)
         if c.crosstalk is not None:
             value = value + params.crosstalk / 4 * neighbour_difference(value, self.grid)
-        value = value * params.gain + params.bias
+        if c.gain is not None:
+            value = value * params.gain
+        if c.bias is not None:
+            value = value + params.bias
         if c.drift is not None:
             walk = walk + params.drift * jax.random.normal(keys[0], self.shape)
             value = value + walk
         if c.noise is not None:
             value = value + params.noise * jax.random.normal(keys[1], self.shape)
-        value = jnp.where(params.alive, value, 0.0)
+        if c.dead is not None:
+            value = jnp.where(params.alive, value, 0.0)
         if c.threshold is not None:
             value = jnp.where(jnp.abs(value) < params.threshold, 0.0, value)
         if c.counts != "none":
