@@ -51,8 +51,8 @@ class WithoutRedrawing(Env):
 
     _kept = None
 
-    def _draw(self, *keys):
-        return self._kept or super()._draw(*keys)
+    def _draw(self, *arguments):
+        return self._kept or super()._draw(*arguments)
 
     def restart(self, state, done):
         self._kept = state.draw, state.orientation_sensor
@@ -68,19 +68,22 @@ class Recorder(Env):
     tick = None  # object, physics state, push, joint torques [S + 1, J] Nm (the last: as read)
 
     def _drive(self, state, joint_target, push):
-        torque = self._torque(state, joint_target)
-        net_torque, last = self._with_friction(state.draw, torque), self.config.physics.substeps
+        motors, last = self.drive.motors(state.draw, state.joint_target, joint_target), self.config.physics.substeps
 
-        def motors(substep, position, velocity, tape):
-            tau = net_torque(substep, position, velocity)
-            return tau, tape.at[substep].set(tau)
+        def taped(substep, position, velocity, memory):
+            tape, gear = memory
+            torque, gear = motors(substep, position, velocity, gear)
+            return torque, (tape.at[substep].set(torque), gear)
 
-        tape = jnp.zeros((last + 1, self.hand.num_joints))
-        after, force, tape = self.physics.advance_motors(state.target, state.physics, motors, tape, push)
-        reading = torque(jnp.asarray(last), after.qpos[self.physics.joint_qpos],
-                         after.qvel[self.physics.joint_dof])
-        self.tick = state.target, state.physics, push, tape.at[last].set(reading)
-        return after, force, lambda at: reading
+        memory = jnp.zeros((last + 1, self.hand.num_joints)), state.gear
+        after, force, (tape, gear) = self.physics.advance_motors(state.target, state.physics, taped, memory, push)
+        self.tick = state.target, state.physics, push, tape
+        return after, force, gear
+
+    def _torque(self, *arguments):
+        torque, (*given, tape) = super()._torque(*arguments), self.tick
+        self.tick = *given, tape.at[-1].set(torque)
+        return torque
 
     def recorded_step(self, state, action) -> tuple[Any, Any]:
         """`step`, and the tick that went into physics."""
@@ -98,7 +101,10 @@ class Replay(Env):
         tape = self.tape
         after, force = self.physics.advance(
             state.target, state.physics, lambda substep, position, velocity: tape[substep], push)
-        return after, force, lambda at: tape[-1]
+        return after, force, state.gear
+
+    def _torque(self, *arguments):
+        return self.tape[-1]
 
     def replayed_step(self, state, action, tape):
         self.tape = tape

@@ -38,6 +38,15 @@ class Rotor:
     velocity: jax.Array  # w, rad/s
 
 
+@pytree_dataclass
+class GearState:
+    """A gear beside a physics engine: the rotor, and what the engine was given last."""
+
+    rotor: Rotor
+    velocity: jax.Array  # rad/s, of the link before the last sub-step
+    torque: jax.Array  # Nm, on the link during it
+
+
 def rotor_at(position: jax.Array, velocity: jax.Array) -> Rotor:
     """A rotor in the middle of the gap, moving with the link."""
     return Rotor(position, velocity)
@@ -88,3 +97,36 @@ def drive_with_play(actuator: Actuator, play: GearPlay, rotor: Rotor, target: ja
                          timestep=timestep, link_torque=link_torque)
     after = rotor.velocity + timestep * (motor - tooth) / play.rotor_inertia
     return tooth, Rotor(rotor.position + timestep * after, after)
+
+
+def gear_at(position: jax.Array, velocity: jax.Array) -> GearState:
+    """A gear without load whose rotor is in the middle of the gap and moves with the link."""
+    return GearState(rotor_at(position, velocity), velocity, jnp.zeros_like(position))
+
+
+def drive_beside(actuator: Actuator, play: GearPlay, gear: GearState, target: jax.Array,
+                 position: jax.Array, velocity: jax.Array, *, inertia: jax.Array, timestep: float,
+                 steps: int) -> tuple[jax.Array, GearState]:
+    """`drive_with_play` for a link that someone else moves, as a physics engine does.
+
+    What else acts on the link (contacts, weight, other joints) shows in how it moved during the
+    sub-step before, and is taken to go on. So in a static grip the tooth carries exactly the motor's
+    torque. The rotor is light and goes through the sub-step in several steps.
+
+    Args:
+      inertia: kg m^2, of the link about the joint as the engine has it, without the rotor. It holds
+        for the least that the joint can weigh: stable while the true one is at least 0.6 of it.
+      timestep: s, of the engine.
+      steps: of the rotor in one of those; damping * timestep / (steps * rotor_inertia) < 2.
+
+    Returns:
+      The mean torque [J] Nm on the link over the sub-step, and the gear after it.
+    """
+    load = inertia * (velocity - gear.velocity) / timestep - gear.torque
+    step, total, rotor, moved, speed = timestep / steps, 0.0, gear.rotor, position, velocity
+    for _ in range(steps):
+        torque, rotor = drive_with_play(actuator, play, rotor, target, moved, speed,
+                                        inertia=inertia, timestep=step, link_torque=load)
+        speed = speed + step * (torque + load) / inertia
+        moved, total = moved + step * speed, total + torque
+    return total / steps, GearState(rotor, velocity, total / steps)

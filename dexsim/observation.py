@@ -12,6 +12,7 @@ import jax.numpy as jnp
 
 from dexsim import rotations, tactile
 from dexsim.config import setting, validate
+from dexsim.errors import ConfigError
 from dexsim.hand import Hand, HandPose, forward_kinematics, taxel_positions
 from dexsim.pytree import pytree_dataclass
 
@@ -36,6 +37,13 @@ class Readings:
 
 
 @pytree_dataclass
+class ThreeAxisReadings(Readings):
+    """Readings of a hand whose taxels also feel along the skin."""
+
+    tangential_force: jax.Array  # [F, 3] N, sum over a finger's taxels, palm frame
+
+
+@pytree_dataclass
 class Motion:
     """What only a simulator knows: the critic's part of an observation."""
 
@@ -57,6 +65,15 @@ class Field:
     scale: float | None = None
 
 
+MEASURED_FIELDS = ("joint_position", "joint_torque", "object_position", "object_velocity",
+                   "contact_force", "contact_centre", "tangential_force", "fingertip_position",
+                   "fingertip_rotation", "command", "last_action", "relative_orientation",
+                   "object_orientation")
+"""What follows from readings."""
+TRUE_FIELDS = ("fingertip_velocity", "joint_velocity", "object_spin")
+"""What only a simulator knows."""
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ObservationConfig:
     """What of the touch and orientation signals the policy sees (the paper's ablations)."""
@@ -68,6 +85,11 @@ class ObservationConfig:
     leave_out: tuple[str, ...] = setting((), choices=("contact_force", "contact_centre",
                                                       "relative_orientation"))
     """Observation fields that the actor goes without."""
+    add: tuple[str, ...] = setting((), choices=(*MEASURED_FIELDS, *TRUE_FIELDS))
+    """Measured fields beyond the task's own, for actor and critic; `tangential_force` turns on
+    `Sensing.three_axis`."""
+    add_critic: tuple[str, ...] = setting((), choices=(*MEASURED_FIELDS, *TRUE_FIELDS))
+    """Fields that only the critic gets on top; those that only a simulator knows, too."""
 
     def __post_init__(self):
         validate(self)
@@ -119,6 +141,7 @@ _TERMS: dict[str, Callable[[Features], jax.Array]] = {
     "contact_force": lambda f: f.contact_force,
     "contact_centre": lambda f: f.contact_centre.ravel(),
     "fingertip_position": lambda f: f.tip_position.ravel(),
+    "tangential_force": lambda f: f.readings.tangential_force.ravel(),
     "command": lambda f: f.readings.command[None],
     "last_action": lambda f: f.readings.last_action,
     "fingertip_rotation": lambda f: rotations.matrix_to_6d(f.pose.tip_rotation).ravel(),
@@ -148,11 +171,30 @@ def layout(hand: Hand, names: tuple[str, ...], config: ObservationConfig) -> tup
             "fingertip_position": 3 * fingers, "command": 1, "last_action": joints,
             "relative_orientation": angles, "object_orientation": angles,
             "fingertip_rotation": 6 * fingers, "fingertip_velocity": 6 * fingers,
-            "joint_velocity": joints, "object_spin": 3}
+            "joint_velocity": joints, "object_spin": 3, "tangential_force": 3 * fingers}
     scale = {"contact_force": 5.0, "contact_centre": 0.1, "command": 0.5, "joint_torque": 0.3,
-             "last_action": 1.0}
-    return tuple(Field(name, size[name], scale.get(name)) for name in names
-                 if name not in config.leave_out)
+             "last_action": 1.0, "tangential_force": 2.0}
+    return tuple(Field(name, size[name], scale.get(name)) for name in chosen(names, config))
+
+
+def chosen(names: tuple[str, ...], config: ObservationConfig) -> tuple[str, ...]:
+    """The task's fields `names` as configured: those left out gone, those added behind them."""
+    names = tuple(name for name in names if name not in config.leave_out)
+    return (*names, *(name for name in dict.fromkeys(config.add) if name not in names))
+
+
+def views(config: ObservationConfig) -> tuple[ObservationConfig, ObservationConfig]:
+    """The configuration as it holds for the actor and for the critic, who may always look.
+
+    Raises:
+      ConfigError: the actor is to see what nothing measures.
+    """
+    true = [name for name in config.add if name in TRUE_FIELDS]
+    if true:
+        raise ConfigError(f"ObservationConfig.add = {true[0]!r}: no sensor measures it; "
+                          "name it in add_critic")
+    return config, dataclasses.replace(
+        config, leave_out=(), add=(*config.add, *config.add_critic), add_critic=())
 
 
 def observe(hand: Hand, readings: Readings, names: tuple[str, ...],
@@ -177,9 +219,7 @@ def observe(hand: Hand, readings: Readings, names: tuple[str, ...],
         readings, pose.tip_position, force, centre, pose, motion,
         lambda: _tip_twist(hand, readings.joint_position, motion.joint_velocity))
     parts = []
-    for name in names:
-        if name in config.leave_out:
-            continue
+    for name in chosen(names, config):
         if name in _ORIENTATIONS:
             parts.append(_ORIENTATIONS[name](features, config.orientation))
         else:

@@ -119,7 +119,8 @@ class Physics:
 
     def __init__(self, hand: Hand, slots: tuple[str, ...], largest: np.ndarray,
                  config: PhysicsConfig, *, gravity: tuple[float, float, float],
-                 backend: str = "auto", num_envs: int = 1, skin: tactile.Skin | None = None):
+                 backend: str = "auto", num_envs: int = 1, skin: tactile.Skin | None = None,
+                 rotor_share: float = 0.0):
         """Compile.
 
         Args:
@@ -131,6 +132,7 @@ class Physics:
           backend: "auto", "jax" or "warp".
           num_envs: batch size that Warp's contact buffer is sized for.
           skin: of the fingertips, whose stiffness it sets; without one it is constant.
+          rotor_share: share of the joints' armature that is left out of the scene.
 
         Raises:
           AssetError: the model uses what the backend ignores or lacks.
@@ -145,7 +147,8 @@ class Physics:
         # Candidates of the broad phase need more room than contacts: up to 15 a world were seen
         # against 16 contacts, and a full buffer ends episodes.
         self._contact_buffer = max(config.max_contacts * num_envs * 3 // 2, 256)
-        self.mj_model = build_model(hand, slots, largest, config, gravity, self.backend)
+        self.mj_model = build_model(hand, slots, largest, config, gravity, self.backend,
+                                    rotor_share=rotor_share)
         try:
             self._model = _quiet(self._mjx.put_model(self.mj_model, impl=self.backend), self.backend)
         except NotImplementedError as error:
@@ -321,7 +324,8 @@ def _quiet(model: Any, backend: str) -> Any:
 
 
 def build_model(hand: Hand, slots: tuple[str, ...], largest: np.ndarray, config: PhysicsConfig,
-                gravity: tuple[float, float, float], backend: str) -> mujoco.MjModel:
+                gravity: tuple[float, float, float], backend: str, *,
+                rotor_share: float = 0.0) -> mujoco.MjModel:
     """The scene as a C MuJoCo model: hand, free object, explicit pairs, force sensors.
 
     Also what the tests and the emulated hand compare against.
@@ -330,6 +334,8 @@ def build_model(hand: Hand, slots: tuple[str, ...], largest: np.ndarray, config:
     check_model(spec.compile(), backend, hand.model_path)
     for element in (*spec.actuators, *spec.sensors, *spec.keys):
         spec.delete(element)  # torques come from our actuator model, readings from our sensors
+    for joint in spec.joints:
+        joint.armature *= 1 - rotor_share
     palm = spec.body(hand.palm)
     palm.pos, palm.quat = [0, 0, 0], [1, 0, 0, 0]
     touching = _touching_geoms(spec, hand, config)

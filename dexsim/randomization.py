@@ -18,7 +18,7 @@ from dexsim.pytree import pytree_dataclass
 
 _FACTORS = ("stiffness_factor", "damping_factor", "torque_factor", "speed_factor", "efficiency",
             "torque_gain", "taxel_gain")
-_SPANS = (*_FACTORS, "dead_band", "latency", "latency_spread", "ripple", "ripple_count",
+_SPANS = (*_FACTORS, "dead_band", "gear_gap", "latency", "latency_spread", "ripple", "ripple_count",
           "coulomb_friction", "viscous_friction", "sensing_latency")
 
 
@@ -36,8 +36,16 @@ class Randomization:
     """Factor on k_p."""
     damping_factor: tuple[float, float] = setting((0.7, 1.3), unit="1", low=0.0, high=10.0)
     """Factor on k_d."""
+    backlash: str = setting("dead_band", choices=("dead_band", "gear_play"))
+    """The paper's dead-band, or a gear with play: a rotor with a state of its own before the gap."""
     dead_band: tuple[float, float] = setting((0.0, 0.01), unit="rad", low=0.0, high=0.2)
-    """Backlash threshold epsilon; nominal 0."""
+    """Backlash threshold epsilon; nominal 0. Not used with gear play."""
+    gear_gap: tuple[float, float] = setting((0.0, 0.02), unit="rad", low=0.0, high=0.2)
+    """Lost motion of a joint at a held rotor, end to end; nominal 0. Only with gear play."""
+    rotor_share: float = setting(0.3, unit="1", low=0.05, high=0.5)
+    """Share of a joint's armature that is the rotor, before the gap. Only with gear play."""
+    tooth_stiffness: float = setting(200.0, unit="Nm/rad", low=1.0, high=1e5)
+    """Stiffness of the gear at either end of the gap. Only with gear play."""
     torque_factor: tuple[float, float] = setting((0.9, 1.1), unit="1", low=0.05, high=5.0)
     """Factor on the stall torque."""
     speed_factor: tuple[float, float] = setting((0.9, 1.1), unit="1", low=0.05, high=5.0)
@@ -89,6 +97,7 @@ class Draw:
     torque_gain: jax.Array  # [J]
     taxel_gain: jax.Array  # [F, 1]
     tilt: jax.Array  # [2] rad
+    gear_gap: jax.Array | None = None  # [J] rad, with gear play
 
 
 def sample(key: jax.Array, config: Randomization, hand: Hand, *, timestep: float,
@@ -142,6 +151,9 @@ def _assemble(key: jax.Array, draw: Callable[..., jax.Array], config: Randomizat
     stiffness = config.stiffness * draw(next(keys), config.stiffness_factor, 1.0, joints)
     damping = config.damping * draw(next(keys), config.damping_factor, 1.0, joints)
     dead_band = draw(next(keys), config.dead_band, 0.0, joints)
+    geared = config.backlash == "gear_play"
+    if geared:
+        dead_band = jnp.zeros(joints)
     stall_torque = hand.torque_limit * draw(next(keys), config.torque_factor, 1.0, joints)
     no_load_speed = hand.speed_limit * draw(next(keys), config.speed_factor, 1.0, joints)
     efficiency = draw(next(keys), config.efficiency, 1.0, joints)
@@ -162,22 +174,28 @@ def _assemble(key: jax.Array, draw: Callable[..., jax.Array], config: Randomizat
         encoder_bias=encoder_bias,
         coulomb_friction=hand.torque_limit * draw(next(keys), config.coulomb_friction, 0.0, joints),
         viscous_friction=draw(next(keys), config.viscous_friction, 0.0, joints))
+    gap = draw(next(keys), config.gear_gap, 0.0, joints) if geared else None
     substeps = jnp.round(jnp.minimum(latency, control_period) / timestep).astype(jnp.int32)
     return Draw(actuator=actuator, latency=substeps, sensing_latency=jnp.clip(age, 0.0, 1.0),
                 encoder_bias=encoder_bias, torque_gain=torque_gain, taxel_gain=taxel_gain,
-                tilt=tilt)
+                tilt=tilt, gear_gap=gap)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Curriculum:
     """How the scale of the ranges follows success; the scale is part of the training state."""
 
+    on: bool = setting(False)
+    """Widen the ranges while training; off, they have their full width from the beginning."""
+    metric: str = setting("")
+    """What counts as success: by default the share of ended episodes that lived to their time limit,
+    else a metric of training by name, such as episode/goals_per_minute."""
     start: float = setting(0.1, unit="1", low=0.0, high=1.0)
     """Scale at the beginning."""
-    widen_above: float = setting(0.8, unit="1", low=0.0, high=1.0)
-    """Rate of success from which the ranges grow."""
-    narrow_below: float = setting(0.4, unit="1", low=0.0, high=1.0)
-    """Rate of success below which they shrink."""
+    widen_above: float = setting(0.8, unit="1", low=0.0, high=1e6)
+    """Success from which the ranges grow."""
+    narrow_below: float = setting(0.4, unit="1", low=0.0, high=1e6)
+    """Success below which they shrink."""
     step: float = setting(0.02, unit="1", low=0.0001, high=1.0)
     """Change of the scale at each update."""
 

@@ -23,7 +23,8 @@ NOMINAL = {"stiffness_factor": 1.0, "damping_factor": 1.0, "torque_factor": 1.0,
 """Nominal values that are not 0."""
 
 READINGS = ("joint_position", "joint_torque", "taxel_force", "object_position", "object_quat")
-_AIDS = {"ripple_count": {"ripple": (0.03, 0.03)}}  # what must be there for a range to show
+# What must be there for a range to show.
+_AIDS = {"ripple_count": {"ripple": (0.03, 0.03)}, "hysteresis_time": {"hysteresis": (0.3, 0.3)}}
 _SHAPE_OF = {"sphere": "sphere", "cylinder": "cylinder", "neck": "composition"}
 _WIDTHS = ("encoder_bias", "gravity_tilt", "com_offset", "bias", "drift")  # ranges given by one number
 
@@ -57,7 +58,8 @@ def check(env: Any, step: Callable, states: Any, *, key: jax.Array, ticks: int =
       states: a batch of fresh states.
       key: of the draws and actions.
       ticks: length of the comparison.
-      names: which ranges ("Randomization.x", "ObjectConfig.x", "push"); all by default.
+      names: which ranges ("Randomization.x", "ObjectConfig.x", "push"); by default all but those of the
+        model of backlash that is not chosen.
     """
     bench = _Bench(env, step, states, key, ticks)
     tests: dict[str, Callable[[], Effect]] = {}
@@ -65,19 +67,27 @@ def check(env: Any, step: Callable, states: Any, *, key: jax.Array, ticks: int =
         tests[f"Randomization.{name}"] = lambda n=name: bench.hand_range(n)
     for name in _ranges(env.config.sensing.orientation):
         tests[f"OrientationSensor.{name}"] = lambda n=name: bench.orientation_range(n)
+    for name in _ranges(env.config.sensing.array) if env.senses.array is not None else ():
+        tests[f"SensorNoise.{name}"] = lambda n=name: bench.array_range(n)
     for path in env.task.object_ranges:
         owner, name = _owner(env.config, path)
         tests[f"{type(owner).__name__}.{name}"] = lambda p=path: bench.object_range(p)
     tests["push"] = bench.push
-    return [tests[name]() for name in names or tests]
+    unused = f"Randomization.{_unused(env.config.randomization)}"
+    return [tests[name]() for name in names or (name for name in tests if name != unused)]
+
+
+def _unused(ranges: Any) -> str:
+    """The range of the model of backlash that is not chosen."""
+    return {"dead_band": "gear_gap", "gear_play": "dead_band"}[ranges.backlash]
 
 
 def _ranges(config: Any) -> list[str]:
     """Names of (low, high) pairs, and of largest deviations from 0."""
     def is_range(name: str) -> bool:
         value = getattr(config, name)
-        return name in _WIDTHS or (isinstance(value, tuple) and len(value) == 2 and all(
-            isinstance(v, (int, float)) for v in value))
+        return value is not None and (name in _WIDTHS or (isinstance(value, tuple) and len(value) == 2 and all(
+            isinstance(v, (int, float)) for v in value)))
     return [field.name for field in dataclasses.fields(config) if is_range(field.name)]
 
 
@@ -93,7 +103,8 @@ class _Bench:
         close = jnp.asarray([0.0 if low < 0 else 0.5 for low in env.hand.joint_lower])
         self.actions = jnp.clip(throw + close, -1.0, 1.0)
         self.states = dataclasses.replace(states, draw=self._draw(self._only()),
-                                          orientation_sensor=self._imu(_still_imu(env)))
+                                          orientation_sensor=self._imu(_still_imu(env)),
+                                          array_params=self._array())
         self.base = self._run(self.states)
         # On the Warp backend two runs of the same differ: what is not well above that is no effect.
         again = [self._distance(self._run(self.states)) for _ in range(1 if env.backend == "jax" else 3)]
@@ -118,6 +129,18 @@ class _Bench:
     def _imu(self, config: OrientationSensor) -> Any:
         return jax.vmap(lambda key: draw_sensor(key, config, 1.0, self.env.control_period))(
             jax.random.split(self.key, self.count))
+
+    def _array(self, *names: str, **aids: Any) -> Any:
+        """Taxels that are perfect but for these ranges, with the structure of the environment's."""
+        env = self.env
+        if env.senses.array is None:
+            return None
+        config = env.config.sensing.array
+        nominal = {"rate": 1 / env.control_period, "gain": 1.0, "hysteresis_time": config.hysteresis_time[0]}
+        fixed = {name: (nominal.get(name, 0.0),) * 2 for name in _ranges(config) if name not in names}
+        perfect = dataclasses.replace(config, scale=1.0, **fixed | aids).model(
+            env.hand.taxel_grid, fingers=env.hand.num_fingers, control_period=env.control_period)
+        return jax.vmap(perfect.sample)(jax.random.split(self.key, self.count))
 
     def _run(self, states: Any) -> dict[str, np.ndarray]:
         """Tracks [T, ...] of what is compared."""
@@ -150,8 +173,8 @@ class _Bench:
 
     def hand_range(self, name: str) -> Effect:
         """One field of `Randomization`."""
-        label = f"Randomization.{name}"
-        if _width(getattr(self.env.config.randomization, name)) == 0:
+        label, ranges = f"Randomization.{name}", self.env.config.randomization
+        if name == _unused(ranges) or _width(getattr(ranges, name)) == 0:
             return Effect(label, off=True)
         base, before = None, self.states.draw
         if name in _AIDS:
@@ -168,6 +191,18 @@ class _Bench:
         drawn = self._imu(dataclasses.replace(_still_imu(self.env), **{name: getattr(config, name)}))
         return self._effect(label, self.states.orientation_sensor, drawn,
                             dataclasses.replace(self.states, orientation_sensor=drawn))
+
+    def array_range(self, name: str) -> Effect:
+        """One field of `SensorNoise`."""
+        label, span = f"SensorNoise.{name}", getattr(self.env.config.sensing.array, name)
+        if _width(span) == 0:
+            return Effect(label, off=True)
+        base, before, aids = None, self.states.array_params, _AIDS.get(name, {})
+        if aids:
+            before = self._array(**aids)
+            base = self._run(dataclasses.replace(self.states, array_params=before))
+        drawn = self._array(name, **aids)
+        return self._effect(label, before, drawn, dataclasses.replace(self.states, array_params=drawn), base)
 
     def object_range(self, path: str) -> Effect:
         """One range of the object, on objects of a shape that has it."""
@@ -214,7 +249,7 @@ def changes(before: Any, after: Any) -> tuple[tuple[str, ...], float]:
     names, spreads = [], [0.0]
     pairs = zip(jax.tree_util.tree_flatten_with_path(before)[0], jax.tree.leaves(after), strict=True)
     for (path, old), new in pairs:
-        if not isinstance(old, (jax.Array, np.ndarray)) or not np.issubdtype(old.dtype, np.number):
+        if not isinstance(old, (jax.Array, np.ndarray)) or old.dtype.kind not in "biuf":
             continue
         old, new = np.asarray(old, float), np.asarray(new, float)
         if np.array_equal(old, new):

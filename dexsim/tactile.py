@@ -225,3 +225,28 @@ def measure_taxels(force: jax.Array, gain: jax.Array, sensor: TaxelSensor,
     if sensor.resolution > 0:
         reading = jnp.round(reading / sensor.resolution) * sensor.resolution
     return jnp.clip(reading, 0.0, sensor.saturation)
+
+
+def measure_tangential(tangential: jax.Array, force: jax.Array, gain: jax.Array,
+                       sensor: TaxelSensor, key: jax.Array) -> jax.Array:
+    """What three-axis taxels report of a finger's tangential force, summed over them.
+
+    Each taxel bears its share with noise and whole counts (a signed byte of them), so a load that
+    is spread thinly reads too low.
+
+    Args:
+      tangential: [F, 3] N, true.
+      force: [F, N] N, normal forces: how it is shared.
+      gain: [F, 1] or [F, N].
+      sensor: noise and resolution.
+      key: of the noise.
+
+    Returns:
+      [F, 3] N.
+    """
+    share = taxel_vectors(force, tangential) * gain[..., None]
+    share = share + sensor.noise * jax.random.normal(key, share.shape)
+    if sensor.resolution > 0:
+        counts = jnp.clip(jnp.round(share / sensor.resolution), -128.0, 127.0)
+        share = counts * sensor.resolution
+    return jnp.sum(share, -2)

@@ -18,6 +18,7 @@ from dexsim.hand import forward_kinematics, taxel_positions
 from dexsim.objects import SHAPES, SLOTS, ObjectConfig
 from dexsim.physics import PhysicsState
 from dexsim.randomization import Randomization
+from dexsim.sensing import Sensors
 from dexsim.tasks.grasp import COMMANDS, GraspConfig
 
 WORLDS = 8
@@ -448,8 +449,8 @@ class TestReadings:
         force = jnp.zeros((5, 120)).at[2, 40:44].set(jnp.array([0.013, 0.4, 1.26, 0.02]))
         sample = dataclasses.replace(state.sample, taxel_force=force,
                                      joint_torque=jnp.linspace(-1, 1, 12))
-        readings = env._read(jax.random.key(1), sample, state.sample, state.draw,
-                             state.orientation_sensor, state.goal, jnp.zeros(12))
+        readings, _ = env.senses.read(jax.random.key(1), sample, state.sample, Sensors.of(state),
+                                      state.goal, jnp.zeros(12))
         np.testing.assert_array_equal(readings.taxel_force, force)
         np.testing.assert_array_equal(readings.joint_torque, sample.joint_torque)
 
