@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from dexsim.config import setting, validate
 from dexsim.errors import ConfigError
 from dexsim.pytree import pytree_dataclass
+from dexsim.randomization import Curriculum, next_scale
 from dexsim_ppo import adam, distribution
 from dexsim_ppo.adam import AdamState
 from dexsim_ppo.compilation import jit
@@ -129,6 +130,7 @@ class TrainState:
     key: jax.Array
     iteration: jax.Array  # int32 []
     skipped_updates: jax.Array  # int32 [], minibatches left out since their gradient was not finite
+    scale: jax.Array | None = None  # [] width of the environments' ranges, with a curriculum
 
 
 class Training(NamedTuple):
@@ -150,14 +152,17 @@ class Samples:
     target: jax.Array  # normalised
 
 
-def make_train(env: Environment, config: PPOConfig) -> Training:
+def make_train(env: Environment, config: PPOConfig, curriculum: Curriculum | None = None) -> Training:
     """Compiled `init` and `step` for this environment."""
+    if curriculum is not None and not curriculum.on:
+        curriculum = None
+
     def init(key: jax.Array) -> TrainState:
-        return strong_types(init_state(env, config, key))
+        return strong_types(init_state(env, config, key, curriculum))
 
     def step(state: TrainState) -> tuple[TrainState, Metrics]:
-        state, metrics = jax.lax.scan(lambda s, _: train_iteration(env, config, s), state, None,
-                                      length=config.iterations_per_call)
+        state, metrics = jax.lax.scan(lambda s, _: train_iteration(env, config, s, curriculum), state,
+                                      None, length=config.iterations_per_call)
         return strong_types(state), metrics
 
     compiled_init = jax.jit(init)
@@ -167,25 +172,28 @@ def make_train(env: Environment, config: PPOConfig) -> Training:
                     step=jit(step, donate_argnums=0))
 
 
-def init_state(env: Environment, config: PPOConfig, key: jax.Array) -> TrainState:
+def init_state(env: Environment, config: PPOConfig, key: jax.Array,
+               curriculum: Curriculum | None = None) -> TrainState:
     """A fresh learner and freshly reset environments with staggered clocks."""
     params_key, reset_key, stagger_key, key = jax.random.split(key, 4)
     sizes = {group: layout_size(fields) for group, fields in env.observation_layout.items()}
     params = init_params(
         params_key, actor_sizes=(sizes["actor"], *config.actor_layers, env.action_size),
         critic_sizes=(sizes["critic"], *config.critic_layers, 1), initial_std=config.initial_std)
-    env_state = jax.vmap(env.reset)(jax.random.split(reset_key, config.num_envs))
+    scale = None if curriculum is None else jnp.float32(curriculum.start)
+    reset = env.reset if scale is None else lambda key: env.reset(key, scale)
+    env_state = jax.vmap(reset)(jax.random.split(reset_key, config.num_envs))
     env_state = jax.vmap(env.stagger)(env_state, jax.random.split(stagger_key, config.num_envs))
     return TrainState(
         params=params, adam=adam.init(params), learning_rate=jnp.float32(config.learning_rate),
         observation_stats={group: init_stats((size,)) for group, size in sizes.items()},
         value_stats=init_stats(()), env_state=env_state, key=key,
-        iteration=jnp.int32(0), skipped_updates=jnp.int32(0))
+        iteration=jnp.int32(0), skipped_updates=jnp.int32(0), scale=scale)
 
 
-def train_iteration(env: Environment, config: PPOConfig,
-                    state: TrainState) -> tuple[TrainState, Metrics]:
-    """Collect, estimate advantages, update."""
+def train_iteration(env: Environment, config: PPOConfig, state: TrainState,
+                    curriculum: Curriculum | None = None) -> tuple[TrainState, Metrics]:
+    """Collect, estimate advantages, update; with a curriculum, widen or narrow the ranges."""
     key, collect_key, update_key = jax.random.split(state.key, 3)
     # Collection and update share these, so the first minibatch's probability ratio is exactly one.
     normalizers = make_normalizers(env, config, state.observation_stats)
@@ -198,12 +206,33 @@ def train_iteration(env: Environment, config: PPOConfig,
         "explained_variance": 1 - jnp.var(samples.target - samples.value) / jnp.var(samples.target),
         "action_std": jnp.mean(jnp.exp(learner.params.log_std)),
         "learning_rate": learner.learning_rate, "skipped_updates": learner.skipped_updates}
+    scale = state.scale
+    if curriculum is not None:
+        scale, success = follow(curriculum, scale, metrics)
+        metrics |= {"curriculum/scale": scale, "curriculum/success": success}
+        env_state = jax.vmap(env.widen, (0, None))(env_state, scale)
     stats = {group: update_stats(state.observation_stats[group], rollout.obs[group])
              for group in state.observation_stats}
     return TrainState(
         params=learner.params, adam=learner.adam, learning_rate=learner.learning_rate,
         observation_stats=stats, value_stats=value_stats, env_state=env_state, key=key,
-        iteration=state.iteration + 1, skipped_updates=learner.skipped_updates), metrics
+        iteration=state.iteration + 1, skipped_updates=learner.skipped_updates, scale=scale), metrics
+
+
+def follow(curriculum: Curriculum, scale: jax.Array, metrics: Metrics) -> tuple[jax.Array, jax.Array]:
+    """The scale [] after an iteration with these metrics, and the success [] that it followed.
+
+    Raises:
+      ConfigError: there is no metric of that name.
+    """
+    if not curriculum.metric:
+        success = 1 - metrics["terminated_share"]
+    elif curriculum.metric in metrics:
+        success = metrics[curriculum.metric]
+    else:
+        raise ConfigError(f"Curriculum.metric = {curriculum.metric!r}: choose from "
+                          f"{', '.join(sorted(metrics))}")
+    return next_scale(scale, success, curriculum), success
 
 
 # --- collect ------------------------------------------------------------------------------------------

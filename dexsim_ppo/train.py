@@ -23,6 +23,7 @@ import jax
 
 from dexsim.config import from_dict
 from dexsim.errors import ConfigError
+from dexsim.randomization import Curriculum
 from dexsim_ppo import checkpoint, cli
 from dexsim_ppo.ppo import PPOConfig
 from dexsim_ppo.presets import Preset, find_preset
@@ -100,8 +101,10 @@ def arguments_from_dict(config_class: type, data: dict[str, Any]) -> TrainArgume
     """The options that a checkpoint holds."""
     data = dict(data)
     env, ppo = from_dict(config_class, data.pop("env")), from_dict(PPOConfig, data.pop("ppo"))
+    curriculum = from_dict(Curriculum, data.pop("curriculum", {}))
     known = {f.name for f in dataclasses.fields(TrainArguments)}
-    return TrainArguments(env=env, ppo=ppo, **{k: v for k, v in data.items() if k in known})
+    return TrainArguments(env=env, ppo=ppo, curriculum=curriculum,
+                          **{k: v for k, v in data.items() if k in known})
 
 
 def new_run_path(arguments: TrainArguments) -> Path:

@@ -16,6 +16,7 @@ import numpy as np
 
 from dexsim.config import setting, to_dict, validate
 from dexsim.errors import DexsimError
+from dexsim.randomization import Curriculum
 from dexsim_ppo import checkpoint, cli
 from dexsim_ppo.compilation import collector_paused
 from dexsim_ppo.display import Display
@@ -39,6 +40,8 @@ class TrainArguments(Generic[EnvConfig]):
     """The task's settings."""
     ppo: PPOConfig
     """The learner's settings; their defaults depend on the preset."""
+    curriculum: Curriculum = setting(Curriculum())
+    """Ranges of the randomisation that widen with success."""
     task: str = "grasp"
     """What to train."""
     seed: int = setting(0, low=0)
@@ -116,7 +119,8 @@ class Run:
 
     def _prepare(self, resumed: checkpoint.Checkpoint | None) -> tuple[TrainState, Callable]:
         """The state to start from and the compiled training step."""
-        training, key = make_train(self.env, self.config), jax.random.key(self.arguments.seed)
+        training = make_train(self.env, self.config, self.arguments.curriculum)
+        key = jax.random.key(self.arguments.seed)
         begin = time.perf_counter()
         shapes = jax.eval_shape(training.init, key)
         lowered = training.step.lower(shapes)

@@ -50,7 +50,9 @@ class Environment(Protocol):
     evaluation: str
     """What `summarize` is given: "series" of every tick, or "totals" that the task keeps by itself."""
 
-    def reset(self, key: jax.Array) -> Any: ...
+    def reset(self, key: jax.Array) -> Any:
+        """A new episode. One that can follow a curriculum also takes `scale` [] in [0, 1]."""
+        ...
 
     def step(self, state: Any, action: jax.Array) -> Any:
         """Advance by one control tick with an action [A], clipped to [-1, 1]; no automatic restart."""
@@ -58,6 +60,10 @@ class Environment(Protocol):
 
     def restart(self, state: Any, done: jax.Array) -> Any:
         """Begin a new episode where `done`, else return the state as it is."""
+        ...
+
+    def widen(self, state: Any, scale: jax.Array) -> Any:
+        """Let the next episodes be drawn from ranges of this width []; only with a curriculum."""
         ...
 
     def stagger(self, state: Any, key: jax.Array) -> Any:
