@@ -23,7 +23,7 @@ from dexsim.drive import Drive, rotor_share
 from dexsim.env_config import EnvConfig, Sensing
 from dexsim.episode import Moment, Sample, Start, State, Task, choose
 from dexsim.hand import Hand, forward_kinematics, taxel_normals, taxel_positions
-from dexsim.objects import ObjectParams, narrow
+from dexsim.objects import ObjectParams, load_mesh_object, narrow
 from dexsim.observation import Motion, Readings, ThreeAxisReadings
 from dexsim.orientation_sensor import SensorDraw
 from dexsim.physics import Physics, PhysicsState
@@ -68,6 +68,8 @@ class Env:
         self.senses = Senses(config, hand, task, (actor_view, critic_view))
         self.drive = Drive(config, hand, self.physics)
         self.primitive_kinds = task.slots
+        objects = config.objects
+        self._mesh = load_mesh_object(objects) if objects.mesh and objects.mesh_touch == "grid" else None
         self.pool = task.make_pool(jax.random.key(seed))
 
     @property
@@ -226,6 +228,10 @@ class Env:
         tilted = tilted / jnp.linalg.norm(tilted)
         return target.mass * jnp.linalg.norm(gravity) * (tilted - down)
 
+    def _felt(self, target: ObjectParams) -> Any:
+        """What the taxels feel of the object, as `dexsim.distance` takes it."""
+        return target.shape() if self._mesh is None else self._mesh.grid(target.size)
+
     def _moment(self, physics: PhysicsState, target: ObjectParams, torque: jax.Array,
                 action: jax.Array, last_action: jax.Array, force: jax.Array) -> Moment:
         seam, hand, config = self.physics, self.hand, self.config
@@ -236,7 +242,7 @@ class Env:
         strength = jnp.linalg.norm(force, axis=-1)
         if config.touch:
             touch = tactile.feel(taxel_positions(hand, pose), jnp.asarray(hand.taxel_area),
-                                 target.shape(), place[:3], rotations.quat_to_matrix(quat),
+                                 self._felt(target), place[:3], rotations.quat_to_matrix(quat),
                                  strength, config.skin)
             if config.skin.total == "pressing":
                 touch = tactile.press_only(touch, taxel_normals(hand, pose), force)

@@ -4,7 +4,8 @@ One compiled model has a fixed slot per primitive kind. An object switches slots
 them, so spheres, boxes, cylinders, capsules and compositions share one batch. Collision and
 touch read the same sizes.
 
-A sphere is the capsule slot with next to no length: a slot less to collide.
+A sphere is the capsule slot with next to no length: a slot less to collide. A mesh takes the place of
+all that (`ObjectConfig.mesh`): its slots are the boxes that follow it.
 """
 
 import dataclasses
@@ -13,18 +14,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dexsim import rotations, sdf
+from dexsim import object_mesh, rotations, sdf
 from dexsim.config import check_ranges, setting, validate
 from dexsim.errors import ConfigError
 from dexsim.pytree import pytree_dataclass, static
 
 SLOTS = ("box", "capsule", "cylinder")
 SHAPES = ("sphere", "box", "cylinder", "capsule", "composition")
+KINDS = (*SHAPES, "mesh")
+"""What `ObjectParams.shape_index` counts."""
 OFF = 1e-4  # m, size of a slot that is switched off: a speck at the object's centre
 SIZE_RANGES = ("sphere_radius", "box_half", "cylinder_radius", "cylinder_half", "neck_radius", "neck_half")
 BULK_RANGES = ("mass", "inertia_scale", "com_offset", "friction", "stiffness", "restitution")
 RANGES = (*SIZE_RANGES, *BULK_RANGES)
 """Fields of `ObjectConfig` that are drawn for every object."""
+MESH_RANGES = ("mesh_size", *BULK_RANGES)
+"""Those of a mesh."""
+_SPANS = tuple(name for name in (*RANGES, "mesh_size") if name != "com_offset")  # pairs (low, high)
 _SHORT = 1e-4  # m, half-length of a capsule that plays a sphere
 
 
@@ -36,6 +42,17 @@ class ObjectConfig:
     """Kinds of object, drawn with equal probability."""
     scale: float = setting(1.0, unit="1", low=0.0, high=1.0)
     """Width of all ranges about their middles; 0 leaves one object of each kind."""
+    mesh: str = setting("")
+    """File of a closed mesh (STL, OBJ, PLY, ...) that takes the place of `shapes`. Its z axis lies across
+    the fingers for a grasp, its x axis stands on the palm for a rotation."""
+    mesh_unit: float = setting(1.0, unit="m", low=1e-6, high=100.0)
+    """Length of that file's unit: 0.001 for millimetres."""
+    mesh_size: tuple[float, float] = setting((1.0, 1.0), unit="1", low=0.1, high=10.0)
+    """Factor on the mesh's size."""
+    mesh_parts: int = setting(6, unit="1", low=1, high=24)
+    """Boxes at most that follow the mesh in the solver, whose cost grows with them."""
+    mesh_touch: str = setting("boxes", choices=("boxes", "grid"))
+    """What the taxels feel of a mesh: the solver's boxes, or the mesh itself through a baked grid."""
     sphere_radius: tuple[float, float] = setting((0.022, 0.035), unit="m", low=0.005, high=0.08)
     """Radius of a sphere."""
     box_half: tuple[float, float] = setting((0.020, 0.030), unit="m", low=0.005, high=0.08)
@@ -67,7 +84,7 @@ class ObjectConfig:
 
     def __post_init__(self):
         validate(self)
-        check_ranges(self, *(name for name in RANGES if name != "com_offset"))
+        check_ranges(self, *_SPANS)
         if not self.shapes:
             raise ConfigError("ObjectConfig.shapes is empty: name at least one shape")
 
@@ -79,17 +96,43 @@ class ObjectConfig:
         def narrow(span: tuple[float, float], middle: float) -> tuple[float, float]:
             return tuple(middle + self.scale * (value - middle) for value in span)
 
-        values = {name: narrow(getattr(self, name), middle(self, name)) for name in RANGES if name != "com_offset"}
+        values = {name: narrow(getattr(self, name), middle(self, name)) for name in _SPANS}
         return dataclasses.replace(self, scale=1.0, com_offset=self.scale * self.com_offset, **values)
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """Names in KINDS of what is drawn."""
+        return ("mesh",) if self.mesh else self.shapes
+
+    @property
+    def ranges(self) -> tuple[str, ...]:
+        """Fields that are drawn for every object."""
+        return MESH_RANGES if self.mesh else RANGES
+
+    @property
+    def slots(self) -> tuple[str, ...]:
+        """Primitives of the compiled template."""
+        return load_mesh_object(self).kinds if self.mesh else SLOTS
 
     @property
     def largest(self) -> np.ndarray:
         """Upper bound [K, 3] of every slot's size, for the compiled template."""
+        if self.mesh:
+            return self.mesh_size[1] * load_mesh_object(self).boxes.size
         radius = max(self.cylinder_radius[1], self.sphere_radius[1], self.neck_radius[1])
         half = max(self.cylinder_half[1], self.neck_half[1])
         body = max(self.composition_scale, 1.0)  # of the box or cylinder in a composition
         return np.array([[body * self.box_half[1]] * 3, [radius, half, 0.0],
                          [body * self.cylinder_radius[1], body * self.cylinder_half[1], 0.0]])
+
+
+def load_mesh_object(config: ObjectConfig) -> object_mesh.MeshObject:
+    """The mesh of `config`, fitted.
+
+    Raises:
+      AssetError: see `object_mesh.load`.
+    """
+    return object_mesh.load(config.mesh, unit=config.mesh_unit, parts=config.mesh_parts)
 
 
 def middle(config: ObjectConfig, name: str) -> float:
@@ -150,8 +193,14 @@ class ObjectParams:
 
 def sample_object(key: jax.Array, config: ObjectConfig,
                   shape_index: jax.Array | None = None) -> ObjectParams:
-    """Draw one object, of a kind in `config.shapes` or of the given one (index into SHAPES)."""
+    """Draw one object, of a kind in `config.shapes` or of the given one (index into SHAPES), or the mesh.
+
+    Raises:
+      AssetError: the mesh is refused, see `object_mesh.load`.
+    """
     config, keys = config.narrowed(), jax.random.split(key, 8)
+    if config.mesh:
+        return _sample_mesh(keys, config)
     if shape_index is None:
         allowed = jnp.array([SHAPES.index(name) for name in config.shapes])
         shape_index = jax.random.choice(keys[0], allowed)
@@ -161,14 +210,31 @@ def sample_object(key: jax.Array, config: ObjectConfig,
     mass = _uniform(keys[2], config.mass)
     scale = _uniform(keys[3], config.inertia_scale) * mass / density_mass
     com = config.com_offset * jax.random.uniform(keys[4], (3,), minval=-1.0)
-    contact = jnp.stack([_uniform(keys[6], config.stiffness),
-                         damping_ratio(_uniform(keys[7], config.restitution))])
-    return ObjectParams(shape_index.astype(jnp.int32), size, position, active, mass,
-                        inertia * scale, com, _uniform(keys[5], config.friction), contact)
+    return ObjectParams(shape_index.astype(jnp.int32), size, position, active, mass, inertia * scale, com,
+                        _uniform(keys[5], config.friction), _sample_contact(keys, config))
 
 
-def plain_inertia(target: ObjectParams) -> jax.Array:
-    """Inertia [3] m^2 of the union of SLOTS as a uniform solid of 1 kg, about its centre."""
+def _sample_mesh(keys: jax.Array, config: ObjectConfig) -> ObjectParams:
+    thing = load_mesh_object(config)
+    factor, mass = _uniform(keys[1], config.mesh_size), _uniform(keys[2], config.mass)
+    size, position, quat = object_mesh.scaled_boxes(thing, factor)
+    inertia = mass * factor**2 * _uniform(keys[3], config.inertia_scale) * jnp.asarray(thing.inertia)
+    com = config.com_offset * jax.random.uniform(keys[4], (3,), minval=-1.0)
+    return ObjectParams(
+        jnp.int32(KINDS.index("mesh")), size, position, jnp.ones(len(size), bool), mass, inertia, com,
+        _uniform(keys[5], config.friction), _sample_contact(keys, config), quat, thing.kinds)
+
+
+def _sample_contact(keys: jax.Array, config: ObjectConfig) -> jax.Array:
+    return jnp.stack([_uniform(keys[6], config.stiffness),
+                      damping_ratio(_uniform(keys[7], config.restitution))])
+
+
+def plain_inertia(target: ObjectParams, config: ObjectConfig | None = None) -> jax.Array:
+    """Inertia [3] m^2 of an object of `config` as a uniform solid of 1 kg, about its centre."""
+    if config is not None and config.mesh:
+        thing = load_mesh_object(config)
+        return (target.size[0, 0] / thing.boxes.size[0, 0]) ** 2 * jnp.asarray(thing.inertia)
     mass, _, inertia = _mass_properties(target.size, target.position, target.active)
     return inertia / mass
 

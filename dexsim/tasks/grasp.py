@@ -17,7 +17,7 @@ from dexsim.config import check_ranges, setting, validate
 from dexsim.env import EnvConfig, Moment, Start
 from dexsim.errors import ConfigError
 from dexsim.hand import Hand, flexion_joints
-from dexsim.objects import RANGES, SLOTS, ObjectParams, plain_inertia, sample_object
+from dexsim.objects import ObjectParams, plain_inertia, sample_object
 from dexsim.pytree import pytree_dataclass
 from dexsim.tasks.grasp_report import summarize
 from dexsim.tasks.grasp_start import make_pool
@@ -158,9 +158,7 @@ class Grasp:
     """The rules of the task, for `dexsim.env.Env`."""
 
     name = "grasp"
-    slots = SLOTS
     evaluation = "series"
-    object_ranges = tuple(f"objects.{name}" for name in RANGES)
     fields = {"actor": observation.GRASP, "critic": observation.GRASP}
     gravity = (9.81, 0.0, 0.0)  # upside down: the palm's normal points to the ground
     reference = (0.055, -0.005, 0.090)  # m, between palm and half-closed fingers
@@ -169,7 +167,9 @@ class Grasp:
         if len(config.posture) != hand.num_joints:
             raise ConfigError(f"GraspConfig.posture has {len(config.posture)} angles, "
                               f"the hand {hand.num_joints} joints")
-        self.config, self.hand, self.largest = config, hand, config.objects.largest
+        self.config, self.hand = config, hand
+        self.slots, self.largest = config.objects.slots, config.objects.largest
+        self.object_ranges = tuple(f"objects.{name}" for name in config.objects.ranges)
         self._roots = hand.root_joint
         self._max_torque = jnp.asarray(hand.torque_limit[hand.root_joint])
         self._finger_joints = flexion_joints(hand, range(1, hand.num_fingers))
@@ -189,7 +189,7 @@ class Grasp:
 
     def plain_inertia(self, target: ObjectParams) -> jax.Array:
         """Inertia [3] m^2 of the object as a uniform solid of 1 kg."""
-        return plain_inertia(target)
+        return plain_inertia(target, self.config.objects)
 
     def begin(self, key: jax.Array, start: Start) -> Goal:
         del start

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from dexsim.objects import SHAPES
+from dexsim.objects import KINDS
 from dexsim.statistics import bootstrap, mean, proportion, statistic
 
 _SETTLE = 3.0  # s after release from which forces count
@@ -53,7 +53,7 @@ def summarize(metrics: dict[str, np.ndarray], alive: np.ndarray, control_period:
         mine = shape == index
         good = mine & held
         by_shape.append({
-            "shape": SHAPES[index], "episodes": int(mine.sum()), "held": proportion(held[mine]),
+            "shape": KINDS[index], "episodes": int(mine.sum()), "held": proportion(held[mine]),
             "pearson_r": pearson(command[good], force[good]),
             "pearson_r_total": pearson(command[good], total[good]),
             "pearson_r_taxels": pearson(command[good], sensed[good]),

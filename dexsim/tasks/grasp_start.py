@@ -9,7 +9,7 @@ import numpy as np
 from dexsim import rotations, sdf
 from dexsim.errors import ConfigError
 from dexsim.hand import Hand, flexion_joints, forward_kinematics
-from dexsim.objects import SHAPES, extent, sample_object
+from dexsim.objects import KINDS, extent, sample_object
 
 _OVERLAP = 0.001  # m, hand and object may start this deep in each other
 
@@ -23,7 +23,7 @@ def make_pool(key: jax.Array, hand: Hand, config: Any, reference: tuple[float, f
     Raises:
       ConfigError: next to no candidate of a shape is clear, so the ranges do not fit the hand.
     """
-    shapes = config.objects.shapes
+    shapes = config.objects.kinds
     share = -(-config.pool_size // len(shapes))
     chunk = max(min(2 * share, 4096), 64)
 
@@ -36,8 +36,8 @@ def make_pool(key: jax.Array, hand: Hand, config: Any, reference: tuple[float, f
     for name in shapes:
         kept, found = [], 0
         for trial in range(40):
-            shape_key = jax.random.fold_in(jax.random.fold_in(key, SHAPES.index(name)), trial)
-            starts, clear = draw(shape_key, jnp.int32(SHAPES.index(name)))
+            shape_key = jax.random.fold_in(jax.random.fold_in(key, KINDS.index(name)), trial)
+            starts, clear = draw(shape_key, jnp.int32(KINDS.index(name)))
             rows = np.flatnonzero(np.asarray(clear))[:share - found]
             kept.append(jax.tree.map(lambda x, rows=rows: np.asarray(x)[rows], starts))
             found += rows.size
@@ -75,7 +75,7 @@ def _candidate(key: jax.Array, shape_index: jax.Array, hand: Hand, config: Any,
     up = rotations.rotate_inverse(matrix, jnp.array([-1.0, 0.0, 0.0]))
     gap = jax.random.uniform(keys[3], minval=config.release_gap[0], maxval=config.release_gap[1])
     shift = 0.01 * jax.random.uniform(keys[4], (2,), minval=-1.0)
-    top = extent(target.size, target.position, target.active, up)
+    top = extent(target.size, target.position, target.active, up, target.kinds, target.quat)
     position = jnp.stack([palm_height(hand) + gap + top, reference[1] + shift[0],
                           reference[2] + shift[1]])
     speed = jax.random.uniform(keys[5], minval=config.release_speed[0],

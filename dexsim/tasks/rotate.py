@@ -13,12 +13,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dexsim import observation, rotations
+from dexsim import objects, observation, rotations
 from dexsim.config import check_ranges, setting, validate
 from dexsim.env import Control, EnvConfig, Moment, Start
 from dexsim.errors import ConfigError
 from dexsim.hand import Hand
-from dexsim.objects import BULK_RANGES, ObjectConfig, ObjectParams
+from dexsim.objects import BULK_RANGES, MESH_RANGES, ObjectConfig, ObjectParams
 from dexsim.observation import ObservationConfig
 from dexsim.pytree import pytree_dataclass
 from dexsim.tasks.rotate_report import summarize
@@ -30,6 +30,7 @@ from dexsim.tasks.rotate_start import (
     palm_height,
     plain_inertia,
     sample_target,
+    slots,
 )
 from dexsim.tasks.terms import action_rate, joint_speed, random_push
 
@@ -83,8 +84,8 @@ class RotateConfig(EnvConfig):
     """Mass, inertia, centre of mass, friction and contact of the object; its sizes are `edge`."""
     control: Control = setting(Control(step=0.08, recall="target"))
     """From action to joint target."""
-    object: str = setting("cube", choices=tuple(KINDS))
-    """What is turned: a cube, an upright cylinder, or an eight-cornered union of two boxes."""
+    object: str = setting("cube", choices=(*KINDS, "mesh"))
+    """What is turned: a cube, an upright cylinder, an eight-cornered union of two boxes, or `objects.mesh`."""
     edge: tuple[float, float] = setting((0.050, 0.060), unit="m", low=0.02, high=0.12)
     """Edge of the cube; width and height of the others."""
     axis: tuple[float, float, float] = setting((1.0, 0.0, 0.0), unit="1", low=-1.0, high=1.0)
@@ -152,6 +153,9 @@ class RotateConfig(EnvConfig):
             raise ConfigError("RotateConfig.direction = 0: must be +1 or -1")
         if np.linalg.norm(self.axis) < 1e-6:
             raise ConfigError("RotateConfig.axis is (0, 0, 0): give a direction")
+        if (self.object == "mesh") != bool(self.objects.mesh):
+            raise ConfigError(f"RotateConfig.object = {self.object!r} with ObjectConfig.mesh = {self.objects.mesh!r}: "
+                              "a mesh needs object 'mesh' and the name of its file")
 
 
 def paper() -> RotateConfig:
@@ -231,15 +235,15 @@ class Rotate:
     name = "rotate"
     fields = {"actor": observation.ROTATE, "critic": observation.ROTATE_CRITIC}
     evaluation = "totals"
-    object_ranges = ("edge", *(f"objects.{name}" for name in BULK_RANGES))
 
     def __init__(self, config: RotateConfig, hand: Hand):
         if len(config.posture) != hand.num_joints:
             raise ConfigError(f"RotateConfig.posture has {len(config.posture)} angles, "
                               f"the hand {hand.num_joints} joints")
         self.config, self.hand = config, hand
-        self.slots = KINDS[config.object]
-        self.largest = largest_size(config)
+        self.slots, self.largest = slots(config), largest_size(config)
+        drawn = ("edge", *(f"objects.{name}" for name in BULK_RANGES))
+        self.object_ranges = tuple(f"objects.{name}" for name in MESH_RANGES) if config.object == "mesh" else drawn
         # Palm up; the tilt lowers the wrist.
         self.gravity = (-9.81 * math.cos(config.tilt), 0.0, -9.81 * math.sin(config.tilt))
         self.reference, self._palm = config.reference, palm_height(hand)
@@ -261,6 +265,8 @@ class Rotate:
 
     def plain_inertia(self, target: ObjectParams) -> jax.Array:
         """Inertia [3] m^2 of the object as a uniform solid of 1 kg."""
+        if self.config.object == "mesh":
+            return objects.plain_inertia(target, self.config.objects)
         return plain_inertia(self.config.object, target.size[0, 0])
 
     def begin(self, key: jax.Array, start: Start) -> Goal:

@@ -27,12 +27,12 @@ from dexsim.config import to_dict
 from dexsim.errors import ConfigError
 from dexsim.files import write_whole
 from dexsim.hand import Hand, flexion_joints
-from dexsim.objects import SHAPES, ObjectParams, extent, sample_object
+from dexsim.objects import SHAPES, ObjectParams, extent, load_mesh_object, sample_object
 from dexsim.physics import build_model
 from dexsim.tasks.grasp_start import clearance, palm_height
 
 KINDS = {"cube": ("box",), "cylinder": ("cylinder",), "octagon": ("box", "box")}
-"""Objects that can be turned, and the primitives each consists of."""
+"""Objects that can be turned beside meshes, and the primitives each consists of."""
 _SHAPE_INDEX = {"cube": "box", "cylinder": "cylinder", "octagon": "composition"}
 _UPRIGHT = (np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0)  # takes a cylinder's axis to the palm's normal
 _EIGHTH = (np.cos(np.pi / 8), np.sin(np.pi / 8), 0.0, 0.0)  # 45 degrees about the palm's normal
@@ -41,14 +41,23 @@ _AT_REST = (0.05, 1.0)  # m/s, rad/s
 _LEVEL = 0.35  # rad, largest angle from upright
 
 
+def slots(config: Any) -> tuple[str, ...]:
+    """The primitives that the object consists of."""
+    return config.objects.slots if config.object == "mesh" else KINDS[config.object]
+
+
 def largest_size(config: Any) -> np.ndarray:
     """Upper bound [K, 3] m of each slot's size."""
+    if config.object == "mesh":
+        return config.objects.largest
     half = config.edge[1] / 2
     return np.full((len(KINDS[config.object]), 3), half)
 
 
 def sample_target(key: jax.Array, config: Any) -> ObjectParams:
     """Draw one object."""
+    if config.object == "mesh":
+        return sample_object(key, config.objects)
     edge_key, base_key, scale_key = jax.random.split(key, 3)
     kinds = KINDS[config.object]
     base = sample_object(base_key, config.objects, jnp.int32(SHAPES.index("box")))
@@ -118,6 +127,9 @@ def _fingerprint(key: jax.Array, hand: Hand, config: Any) -> str:
     digest.update(hand.model_path.read_bytes())
     digest.update(np.asarray(jax.random.key_data(key)).tobytes())
     digest.update(f"{_VERSION} {mujoco.__version__}".encode())
+    if config.object == "mesh":
+        boxes = load_mesh_object(config.objects).boxes
+        digest.update(b"".join(part.tobytes() for part in (boxes.size, boxes.position, boxes.quat)))
     return digest.hexdigest()[:16]
 
 
@@ -194,7 +206,7 @@ def _candidate(key: jax.Array, hand: Hand, config: Any) -> dict[str, Any]:
 
 def _model(hand: Hand, config: Any, gravity: tuple[float, float, float]) -> mujoco.MjModel:
     """The scene in C, with springs at the joints for the motors."""
-    model = build_model(hand, KINDS[config.object], largest_size(config), config.physics, gravity,
+    model = build_model(hand, slots(config), largest_size(config), config.physics, gravity,
                         "jax")
     dofs = [model.joint(name).dofadr[0] for name in hand.joint_names]
     model.jnt_stiffness[[model.joint(name).id for name in hand.joint_names]] = \
