@@ -81,7 +81,9 @@ def from_mesh(mesh: meshes.Mesh, parts: int) -> MeshObject:
     axes = principal_axes(tensor)
     own = meshes.Mesh(mesh.name, (mesh.vertices - origin) @ axes, mesh.faces)
     inertia = np.diag(axes.T @ tensor @ axes).astype(np.float32)
-    return MeshObject(own, fit_boxes(own, parts), inertia, axes, origin)
+    # An L has its bars along the axes of its file.
+    frames = () if np.array_equal(axes, np.eye(3)) else (axes.T,)
+    return MeshObject(own, fit_boxes(own, parts, frames=frames), inertia, axes, origin)
 
 
 def principal_axes(tensor: np.ndarray) -> np.ndarray:

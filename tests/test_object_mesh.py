@@ -61,11 +61,14 @@ class TestBoxes:
         np.testing.assert_array_equal(thing.axes, np.eye(3))
 
     def test_an_l_is_two_bars(self):
-        boxes = fit_boxes(mesh.load_mesh(ell()), 6)
+        """In the object's frame, which lies askew to them."""
+        thing = object_mesh.from_mesh(mesh.load_mesh(ell()), 6)
         points = close_to(BARS, np.random.default_rng(0))
         outside = sdf.signed_distance(points, BARS) > 0
-        error = np.abs(sdf.signed_distance(points, boxes.shape()) - sdf.signed_distance(points, BARS))[outside]
-        assert len(boxes.size) <= 3 and error.mean() < 1e-4 and error.max() < 1e-3
+        found = sdf.signed_distance((points - thing.origin) @ thing.axes, thing.boxes.shape())
+        error = np.abs(found - sdf.signed_distance(points, BARS))[outside]
+        assert len(thing.kinds) == 2 and error.mean() < 1e-5 and error.max() < 3e-4
+        assert 0.3 < np.arccos(thing.axes[0, 0]) < 0.8
 
     def test_what_is_round_is_followed_within_the_deviation_that_is_reported(self):
         radius, half = 0.02, 0.02
