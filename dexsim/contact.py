@@ -46,7 +46,7 @@ def spring(compliance: jax.Array, stiffness: jax.Array, ratio: jax.Array, fricti
       compliance: [P] 1/kg, inverse weights A of the two bodies of each pair.
       stiffness: [P] N/m.
       ratio: [] damping ratio.
-      friction: [] sliding.
+      friction: [P] (or [] for all) sliding.
       period: s, time scale on which a contact pushes out what lies in it.
       edges: of the friction pyramid; 0 for an elliptic cone, and without friction.
 

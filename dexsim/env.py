@@ -200,7 +200,10 @@ class Env:
         ranges = self.config.randomization
         draw = sample(hand_key, ranges, self.hand, timestep=self.config.physics.timestep,
                       control_period=self.control_period, scale=scale)
-        return draw, self.senses.draw_orientation(sensor_key, ranges.scale * scale)
+        sensor = self.senses.draw_orientation(sensor_key, ranges.scale * scale)
+        # An IMU's upright is the true one; the host takes it for that of a hand without tilt.
+        down, tilted = self._tilted(draw)
+        return draw, dataclasses.replace(sensor, bias=sensor.bias + jnp.cross(tilted, down))
 
     def _drive(self, state: State, joint_target: jax.Array,
                push: jax.Array) -> tuple[PhysicsState, jax.Array, GearState | None]:
@@ -218,15 +221,18 @@ class Env:
 
     def _tilt_force(self, draw: Draw, target: ObjectParams) -> jax.Array:
         """The object's share of a tilted gravity, N; the links' share is small and left out."""
-        gravity = jnp.asarray(self.task.gravity)
-        down = gravity / jnp.linalg.norm(gravity)
+        down, tilted = self._tilted(draw)
+        return target.mass * np.linalg.norm(self.task.gravity) * (tilted - down)
+
+    def _tilted(self, draw: Draw) -> tuple[jax.Array, jax.Array]:
+        """Directions [3] of gravity in the palm frame: as the host takes it, and as it is."""
+        down = jnp.asarray(self.task.gravity) / np.linalg.norm(self.task.gravity)
         side = jnp.array([down[1], down[2], down[0]])
         side = side - jnp.sum(side * down) * down
         side = side / jnp.linalg.norm(side)
         other = jnp.cross(down, side)
         tilted = down + jnp.tan(draw.tilt[0]) * side + jnp.tan(draw.tilt[1]) * other
-        tilted = tilted / jnp.linalg.norm(tilted)
-        return target.mass * jnp.linalg.norm(gravity) * (tilted - down)
+        return down, tilted / jnp.linalg.norm(tilted)
 
     def _felt(self, target: ObjectParams) -> Any:
         """What the taxels feel of the object, as `dexsim.distance` takes it."""
@@ -245,7 +251,9 @@ class Env:
                                  self._felt(target), place[:3], rotations.quat_to_matrix(quat),
                                  strength, config.skin)
             if config.skin.total == "pressing":
-                touch = tactile.press_only(touch, taxel_normals(hand, pose), force)
+                # In the links' frames, where the normals are constants.
+                local = rotations.rotate_inverse(pose.tip_rotation, force)
+                touch = tactile.press_only(touch, jnp.asarray(hand.taxel_normal), local)
         else:
             nothing = jnp.zeros(hand.taxel_area.shape)
             touch = tactile.Touch(nothing, nothing, nothing)

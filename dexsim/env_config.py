@@ -58,8 +58,8 @@ class EnvConfig:
     """From action to joint target."""
     sensing: Sensing = setting(Sensing())
     """From truth to readings."""
-    skin: tactile.Skin = setting(tactile.Skin())
-    """The rubber over the taxels."""
+    skin: tactile.Skin = setting(tactile.Skin(total="pressing"))
+    """The rubber over the taxels, which feel what presses into it and no friction."""
     observation: ObservationConfig = setting(ObservationConfig())
     """What the policy sees."""
     pool_size: int = setting(2048, unit="1", low=1, high=1_000_000)

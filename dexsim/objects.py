@@ -25,7 +25,7 @@ KINDS = (*SHAPES, "mesh")
 """What `ObjectParams.shape_index` counts."""
 OFF = 1e-4  # m, size of a slot that is switched off: a speck at the object's centre
 SIZE_RANGES = ("sphere_radius", "box_half", "cylinder_radius", "cylinder_half", "neck_radius", "neck_half")
-BULK_RANGES = ("mass", "inertia_scale", "com_offset", "friction", "stiffness", "restitution")
+BULK_RANGES = ("mass", "inertia_scale", "com_offset", "friction", "bare_friction", "stiffness", "restitution")
 RANGES = (*SIZE_RANGES, *BULK_RANGES)
 """Fields of `ObjectConfig` that are drawn for every object."""
 MESH_RANGES = ("mesh_size", *BULK_RANGES)
@@ -74,7 +74,9 @@ class ObjectConfig:
     com_offset: float = setting(0.003, unit="m", low=0.0, high=0.05)
     """Largest offset of the centre of mass, per axis."""
     friction: tuple[float, float] = setting((0.6, 1.2), unit="1", low=0.01, high=5.0)
-    """Sliding friction between hand and object."""
+    """Sliding friction between the fingertips' rubber and the object."""
+    bare_friction: tuple[float, float] = setting((0.6, 1.2), unit="1", low=0.01, high=5.0)
+    """Sliding friction between all else of the hand (palm, links) and the object."""
     stiffness: tuple[float, float] = setting((1600.0, 1800.0), unit="N/m", low=10.0, high=1e6)
     """Force over depth at rest of a fingertip's contact (`contact.BARE_SHARE` times that elsewhere).
     It belongs to the skin: wide ranges part the solver's forces from what the taxels feel."""
@@ -177,10 +179,16 @@ class ObjectParams:
     mass: jax.Array  # [] kg
     inertia: jax.Array  # [3] kg m^2 about the centre of mass, along the object's axes
     com: jax.Array  # [3] m
-    friction: jax.Array  # [] sliding
+    friction: jax.Array  # [] sliding on the fingertips
     contact: jax.Array  # [2] stiffness N/m and damping ratio of a contact
     quat: jax.Array | None = None  # [K, 4] slot orientations in the object's frame; None: aligned
+    bare_friction: jax.Array | None = None  # [] sliding on the rest of the hand; None: as `friction`
     kinds: tuple[str, ...] = static(default=SLOTS)
+
+    def pair_friction(self, rubber: np.ndarray) -> jax.Array:
+        """Sliding friction [P] of pairs of the object with a fingertip (`rubber` [P]) or the bare hand."""
+        bare = self.friction if self.bare_friction is None else self.bare_friction
+        return jnp.where(rubber, self.friction, bare)
 
     def shape(self) -> sdf.Shape:
         """The union of primitives, for the taxels."""
@@ -211,7 +219,8 @@ def sample_object(key: jax.Array, config: ObjectConfig,
     scale = _uniform(keys[3], config.inertia_scale) * mass / density_mass
     com = config.com_offset * jax.random.uniform(keys[4], (3,), minval=-1.0)
     return ObjectParams(shape_index.astype(jnp.int32), size, position, active, mass, inertia * scale, com,
-                        _uniform(keys[5], config.friction), _sample_contact(keys, config))
+                        _uniform(keys[5], config.friction), _sample_contact(keys, config),
+                        bare_friction=_sample_bare_friction(keys, config))
 
 
 def _sample_mesh(keys: jax.Array, config: ObjectConfig) -> ObjectParams:
@@ -222,7 +231,12 @@ def _sample_mesh(keys: jax.Array, config: ObjectConfig) -> ObjectParams:
     com = config.com_offset * jax.random.uniform(keys[4], (3,), minval=-1.0)
     return ObjectParams(
         jnp.int32(KINDS.index("mesh")), size, position, jnp.ones(len(size), bool), mass, inertia, com,
-        _uniform(keys[5], config.friction), _sample_contact(keys, config), quat, thing.kinds)
+        _uniform(keys[5], config.friction), _sample_contact(keys, config), quat,
+        _sample_bare_friction(keys, config), thing.kinds)
+
+
+def _sample_bare_friction(keys: jax.Array, config: ObjectConfig) -> jax.Array:
+    return _uniform(jax.random.fold_in(keys[5], 1), config.bare_friction)
 
 
 def _sample_contact(keys: jax.Array, config: ObjectConfig) -> jax.Array:
@@ -261,7 +275,9 @@ def narrow(target: ObjectParams, config: ObjectConfig, plain: jax.Array,
     contact = jnp.stack([toward("stiffness", target.contact[0]), bounce + scale * (target.contact[1] - bounce)])
     return dataclasses.replace(
         target, mass=mass, inertia=mass * plain * toward("inertia_scale", drawn), com=scale * target.com,
-        friction=toward("friction", target.friction), contact=contact)
+        friction=toward("friction", target.friction), contact=contact,
+        bare_friction=(None if target.bare_friction is None
+                       else toward("bare_friction", target.bare_friction)))
 
 
 def restitution(ratio: np.ndarray) -> np.ndarray:

@@ -38,7 +38,7 @@ class OrientationSensor:
 class SensorDraw:
     """One episode's sensor."""
 
-    bias: jax.Array  # [3] rad
+    bias: jax.Array  # [3] rad; misalignment, and a tilt of the hand that the host does not know
     drift: jax.Array  # [] rad/s
     delay: jax.Array  # [] fraction of a control tick
     phase: jax.Array  # [] fraction of a sampling period

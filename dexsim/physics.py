@@ -168,12 +168,12 @@ class Physics:
         self.object_geoms = np.array([model.geom(f"object_{k}").id
                                       for k in range(len(self.slots))])
         # finger_of_geom[g]: whose tip link a geom belongs to, -1 for none.
-        tips = {int(body): f for f, body in enumerate(_tips(model, hand))}
+        tips = {int(body): f for f, body in enumerate(tip_bodies(model, hand))}
         self._finger_of_geom = np.array([tips.get(int(b), -1) for b in model.geom_bodyid])
         self._is_object_geom = np.isin(np.arange(model.ngeom), self.object_geoms)
 
     def _find_pairs(self) -> None:
-        model, tips = self.mj_model, _tips(self.mj_model, self.hand)
+        model, tips = self.mj_model, tip_bodies(self.mj_model, self.hand)
         self.object_pairs = contact.pairs_with(model, self.object_geoms)
         self._compliance, self._share, self._finger_of_pair = contact.pair_constants(
             model, self.object_pairs, tips)
@@ -193,14 +193,14 @@ class Physics:
         """
         model, geoms, body = self._model, self.object_geoms, self.object_body
         pair = self.object_pairs
-        slide = jnp.broadcast_to(target.friction, (len(pair), 2))
+        friction = target.pair_friction(self._finger_of_pair >= 0)
         # body_invweight0 keeps its template value on purpose: the contact's parameters are worked
         # out from it, and stiffness must not change with the mass of what is touched.
         share = jnp.asarray(self._share)
         if tips is not None:
             share *= jnp.append(tips, 1.0)[self._finger_of_pair]  # -1, no finger's: the last
         solref, solimp = contact.spring(
-            self._compliance, share * target.contact[0], target.contact[1], target.friction,
+            self._compliance, share * target.contact[0], target.contact[1], friction,
             period=self.config.contact_period, edges=self.config.pyramid_edges)
         return model.replace(
             geom_size=model.geom_size.at[geoms].set(target.size),
@@ -212,7 +212,7 @@ class Physics:
             body_mass=model.body_mass.at[body].set(target.mass),
             body_inertia=model.body_inertia.at[body].set(target.inertia),
             body_ipos=model.body_ipos.at[body].set(target.com),
-            pair_friction=model.pair_friction.at[pair, :2].set(slide),
+            pair_friction=model.pair_friction.at[pair, :2].set(friction[:, None]),
             pair_solref=model.pair_solref.at[pair].set(solref),
             pair_solimp=model.pair_solimp.at[pair].set(solimp),
         )
@@ -369,13 +369,13 @@ def build_model(hand: Hand, slots: tuple[str, ...], largest: np.ndarray, config:
     model = spec.compile()
     geoms = np.flatnonzero(model.geom_bodyid == model.body("object").id)
     pairs = contact.pairs_with(model, geoms)
-    compliance, share, _ = contact.pair_constants(model, pairs, _tips(model, hand))
+    compliance, share, _ = contact.pair_constants(model, pairs, tip_bodies(model, hand))
     model.pair_solref[pairs], model.pair_solimp[pairs] = contact.spring(
         compliance, share * contact.NOMINAL, 2.0, 0.9, period=config.contact_period, edges=config.pyramid_edges)
     return model
 
 
-def _tips(model: mujoco.MjModel, hand: Hand) -> np.ndarray:
+def tip_bodies(model: mujoco.MjModel, hand: Hand) -> np.ndarray:
     """Body ids [F] of the fingertips."""
     return np.array([model.body(hand.body_names[b]).id for b in hand.tip_body])
 

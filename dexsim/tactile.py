@@ -186,8 +186,8 @@ def press_only(touch: Touch, normals: jax.Array, finger_force: jax.Array) -> Tou
     """The same touch with only the pressing part of the fingers' forces shared among the taxels.
 
     Args:
-      normals: [F, N, 3] outward taxel normals, palm frame.
-      finger_force: [F, 3] N, the physics' force vector on the finger, palm frame.
+      normals: [F, N, 3] outward taxel normals, in any frame.
+      finger_force: [F, 3] N, the physics' force vector on the finger, in the same one.
     """
     pressed, _ = split_force(touch.skin_force, normals, finger_force)
     return dataclasses.replace(touch, force=spread(touch.skin_force, jnp.maximum(pressed, 0.0)))
@@ -204,8 +204,8 @@ def taxel_vectors(force: jax.Array, finger_force: jax.Array) -> jax.Array:
 class TaxelSensor:
     """What the sensor does to the force on a taxel before the host reads it."""
 
-    noise: float = setting(0.01, unit="N", low=0.0, high=10.0)
-    """Standard deviation of white noise on each taxel."""
+    noise: float = setting(0.02, unit="N", low=0.0, high=10.0)
+    """Standard deviation of white noise on each taxel, with what is left of its zero after the tare."""
     threshold: float = setting(0.05, unit="N", low=0.0, high=10.0)
     """Readings below this are reported as zero."""
     resolution: float = setting(0.1, unit="N", low=0.0, high=10.0)

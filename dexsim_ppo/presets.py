@@ -33,7 +33,7 @@ PRESETS = {
         log_every=5),
     # One large GPU: enough environments to fill it, few large minibatches.
     "gpu": Preset(
-        ppo=PPOConfig(num_envs=16384, rollout_length=16, epochs=4, minibatches=8, kl_target=0.015,
+        ppo=PPOConfig(num_envs=32768, rollout_length=16, epochs=4, minibatches=16, kl_target=0.015,
                       entropy_coefficient=0.004, matmul_precision="default",
                       actor_layers=(256, 256, 128), critic_layers=(256, 256, 128)),
         steps=0, minutes=8.0, evaluate_every=100, evaluation_chunk=1024, evaluation_episodes=1024,

@@ -45,6 +45,7 @@ def compile_scene(hand, target, *, gravity=GRAVITY, timestep=0.006, iterations=3
         names = [name for geom in names for name in _clad(spec, geom)]
     for geom in spec.geoms:
         geom.contype = geom.conaffinity = 0
+    tips = {hand.body_names[body] for body in hand.tip_body}
     body = spec.worldbody.add_body(name="object", mass=float(target.mass), explicitinertial=True,
                                    ipos=target.com, inertia=target.inertia)
     body.add_freejoint()
@@ -53,8 +54,10 @@ def compile_scene(hand, target, *, gravity=GRAVITY, timestep=0.006, iterations=3
         body.add_geom(name=KINDS[k], type=kind, size=target.size[k], pos=target.position[k],
                       contype=0, conaffinity=0, mass=0)
         for name in names:
+            tip = spec.geom(name).parent.name in tips
+            slide = target.friction if tip or target.bare_friction is None else target.bare_friction
             spec.add_pair(geomname1=name, geomname2=KINDS[k], condim=condim, margin=margin,
-                          friction=[*[target.friction] * 2, 0.005, 1e-4, 1e-4])
+                          friction=[slide, slide, 0.005, 1e-4, 1e-4])
     option = spec.option
     option.timestep, option.gravity = timestep, gravity
     option.iterations, option.ls_iterations = iterations, line_search

@@ -80,6 +80,42 @@ def reads(env, state, forces, key=None):
     return seen, state
 
 
+def test_a_tilt_that_the_host_does_not_know_turns_what_its_imu_says(make):
+    """The IMU stands upright by true gravity; the host takes that for the upright of a level hand."""
+    env = make(randomization=Randomization(gravity_tilt=0.1))
+    for key in jax.random.split(jax.random.key(0), 4):
+        state = env.reset(key)
+        push = np.asarray(env._tilt_force(state.draw, state.target)) / float(state.target.mass)
+        true_up = -(np.array([9.81, 0.0, 0.0]) + push)
+        true_up /= np.linalg.norm(true_up)
+        assert 0.005 < np.arccos(-true_up[0]) < 0.15
+        error = np.asarray(state.orientation_sensor.bias)
+        angle = np.linalg.norm(error)
+        seen = rotations.rotate(rotations.quat_to_matrix(rotations.axis_angle_to_quat(
+            jnp.asarray(error / angle), jnp.asarray(angle))), jnp.asarray(true_up))
+        np.testing.assert_allclose(seen, [-1.0, 0.0, 0.0], atol=1e-3)
+
+
+def test_taxels_feel_no_friction(make):
+    """The default skin shares out what presses into it: the rest of the finger's force is along it."""
+    env = make()
+    state = env.reset(jax.random.key(1))
+    force = jnp.asarray(np.random.default_rng(0).normal(size=(5, 3)), jnp.float32)
+    zero = jnp.zeros(12)
+    qpos = state.physics.qpos
+    pose = forward_kinematics(env.hand, qpos[:12])
+    # The object where the first finger's pad is.
+    at = pose.body_position[env.hand.tip_body[1]]
+    moment = env._moment(dataclasses.replace(state.physics, qpos=qpos.at[12:15].set(at)), state.target,
+                         zero, zero, zero, force)
+    felt, normals = np.asarray(moment.touch.force[1]), np.asarray(taxel_normals(env.hand, pose))[1]
+    skin = np.asarray(moment.touch.skin_force[1])
+    inward = -(skin[:, None] * normals).sum(0)
+    inward /= np.linalg.norm(inward)
+    assert felt.sum() == pytest.approx(max(float(force[1] @ inward), 0.0), abs=1e-4)
+    assert felt.sum() < np.linalg.norm(force[1])
+
+
 class TestTaxels:
     def array(self, **effects):
         return dataclasses.replace(QUIET, array=dataclasses.replace(OFF, **effects))

@@ -207,7 +207,8 @@ REACHES = {
     "encoder_bias": {"actuator.encoder_bias", "encoder_bias"}, "torque_gain": {"torque_gain"},
     "taxel_gain": {"taxel_gain"}, "gravity_tilt": {"tilt"},
     "mass": {"body_mass"}, "inertia_scale": {"body_inertia"}, "com_offset": {"body_ipos"},
-    "friction": {"pair_friction"}, "sphere_radius": {"geom_size"}, "box_half": {"geom_size"},
+    "friction": {"pair_friction"}, "bare_friction": {"pair_friction"},
+    "sphere_radius": {"geom_size"}, "box_half": {"geom_size"},
 }
 SENSED = ("sensing_latency", "torque_gain", "taxel_gain")  # seen in the readings, without effect on the motion
 

@@ -277,7 +277,7 @@ class TestPool:
         half = pool.target.size[:, 0, 0]
         gap = pool.qpos[:, 12] - half - rotate_start.palm_height(hand)
         # On the palm, which gives way where a finger presses from above.
-        assert np.all(gap < 0.003) and np.all(gap > -0.006) and np.mean(np.abs(gap) < 0.001) > 0.8
+        assert np.all(gap < 0.003) and np.all(gap > -0.006) and np.mean(np.abs(gap) < 0.001) > 0.7
         assert np.ptp(half) > 0.003 and np.ptp(pool.target.friction) > 0.3
         again = task.make_pool(jax.random.key(0))
         jax.tree.map(np.testing.assert_array_equal, pool, again)

@@ -88,7 +88,7 @@ class GraspConfig(EnvConfig):
         (1.45, 0.15, 0.25, 0.0, 1.1, 0.8, 1.1, 0.8, 1.1, 0.8, 1.1, 0.8), unit="rad",
         low=-3.2, high=3.2)
     """Joint angles that episodes start near."""
-    posture_noise: float = setting(0.1, unit="rad", low=0.0, high=1.0)
+    posture_noise: float = setting(0.12, unit="rad", low=0.0, high=1.0)
     """Largest deviation from them."""
     curl: tuple[float, float] = setting((-0.3, 0.1), unit="rad", low=-3.0, high=3.0)
     """Added to all joints of the four fingers alike: how far closed they start."""
@@ -96,6 +96,14 @@ class GraspConfig(EnvConfig):
     """Gap between palm and object at release."""
     release_speed: tuple[float, float] = setting((0.0, 0.1), unit="m/s", low=0.0, high=3.0)
     """Speed of the object away from the palm at release."""
+    release_drift: float = setting(0.05, unit="m/s", low=0.0, high=3.0)
+    """Largest speed along the palm, in each direction, at release."""
+    release_spin: float = setting(1.0, unit="rad/s", low=0.0, high=30.0)
+    """Largest spin about each of the object's axes at release."""
+    place_noise: float = setting(0.012, unit="m", low=0.0, high=0.1)
+    """Largest shift of the object along the palm, in each direction."""
+    turn_noise: tuple[float, float] = setting((0.6, 0.3), unit="rad", low=0.0, high=3.2)
+    """Largest turn of an object about the palm's normal, and how far askew it lies; its roll is free."""
     reward: GraspReward = setting(GraspReward())
     """Reward weights."""
 

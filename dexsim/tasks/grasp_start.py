@@ -67,21 +67,24 @@ def _candidate(key: jax.Array, shape_index: jax.Array, hand: Hand, config: Any,
     # normal and a little askew; the roll about their own axis is free.
     roll, turn, askew = jax.random.uniform(keys[2], (3,), minval=-1.0)
     quat = rotations.axis_angle_to_quat(jnp.array([0.0, 0.0, 1.0]), roll * jnp.pi)
-    for axis, angle in (((1.0, 0.0, 0.0), -jnp.pi / 2), ((0.0, 0.0, 1.0), 0.2 * askew),
-                        ((1.0, 0.0, 0.0), 0.5 * turn)):
+    most = config.turn_noise
+    for axis, angle in (((1.0, 0.0, 0.0), -jnp.pi / 2), ((0.0, 0.0, 1.0), most[1] * askew),
+                        ((1.0, 0.0, 0.0), most[0] * turn)):
         quat = rotations.quat_multiply(rotations.axis_angle_to_quat(jnp.array(axis),
                                                                     jnp.asarray(angle)), quat)
     matrix = rotations.quat_to_matrix(quat)
     up = rotations.rotate_inverse(matrix, jnp.array([-1.0, 0.0, 0.0]))
     gap = jax.random.uniform(keys[3], minval=config.release_gap[0], maxval=config.release_gap[1])
-    shift = 0.01 * jax.random.uniform(keys[4], (2,), minval=-1.0)
+    shift = config.place_noise * jax.random.uniform(keys[4], (2,), minval=-1.0)
     top = extent(target.size, target.position, target.active, up, target.kinds, target.quat)
     position = jnp.stack([palm_height(hand) + gap + top, reference[1] + shift[0],
                           reference[2] + shift[1]])
     speed = jax.random.uniform(keys[5], minval=config.release_speed[0],
                                maxval=config.release_speed[1])
     qpos = jnp.concatenate([joints, position, quat])
-    qvel = jnp.zeros(hand.num_joints + 6).at[hand.num_joints].set(speed)
+    drift = config.release_drift * jax.random.uniform(jax.random.fold_in(keys[5], 1), (2,), minval=-1.0)
+    spin = config.release_spin * jax.random.uniform(jax.random.fold_in(keys[5], 2), (3,), minval=-1.0)
+    qvel = jnp.concatenate([jnp.zeros(hand.num_joints), speed[None], drift, spin])
     start = Start(qpos, qvel, target)
     return start, clearance(hand, joints, target.shape(), position, matrix) > -_OVERLAP
 

@@ -21,14 +21,14 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from dexsim import rotations
+from dexsim import contact, rotations
 from dexsim.assets import cache_path
 from dexsim.config import to_dict
 from dexsim.errors import ConfigError
 from dexsim.files import write_whole
 from dexsim.hand import Hand, flexion_joints
 from dexsim.objects import SHAPES, ObjectParams, extent, load_mesh_object, sample_object
-from dexsim.physics import build_model
+from dexsim.physics import build_model, tip_bodies
 from dexsim.tasks.grasp_start import clearance, palm_height
 
 KINDS = {"cube": ("box",), "cylinder": ("cylinder",), "octagon": ("box", "box")}
@@ -224,7 +224,8 @@ def _settle(model: mujoco.MjModel, rows: np.ndarray, *, hand: Hand, config: Any,
     geoms = [model.geom(f"object_{k}").id for k in range(len(target.kinds))]
     body = model.body("object").id
     springs = [model.joint(name).qposadr[0] for name in hand.joint_names]
-    pairs = np.isin(model.pair_geom1, geoms) | np.isin(model.pair_geom2, geoms)
+    pairs = contact.pairs_with(model, np.array(geoms))
+    rubber = contact.pair_constants(model, pairs, tip_bodies(model, hand))[2] >= 0
     ticks = max(round(config.settle_seconds / model.opt.timestep), 1)
     good, kept = [], []
     for row in rows:
@@ -234,7 +235,8 @@ def _settle(model: mujoco.MjModel, rows: np.ndarray, *, hand: Hand, config: Any,
             model.geom_quat[geoms] = target.quat[row]
         model.body_mass[body], model.body_inertia[body] = target.mass[row], target.inertia[row]
         model.body_ipos[body] = target.com[row]
-        model.pair_friction[pairs, :2] = target.friction[row]
+        slide = np.where(rubber, target.friction[row], target.bare_friction[row])
+        model.pair_friction[pairs, :2] = slide[:, None]
         mujoco.mj_resetData(model, data)
         data.qpos[:] = candidates["qpos"][row]
         model.qpos_spring[springs] = candidates["joint_target"][row]
