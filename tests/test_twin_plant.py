@@ -51,6 +51,8 @@ def drives(hand, heat=None, **overrides):
 # --- draws ---------------------------------------------------------------------------------------
 
 def _lookup(config, path):
+    if path == "objects.bare_friction" and "bare_friction" not in config["objects"]:
+        path = "objects.friction"  # a policy from before the palm had one of its own
     for name in path.split("."):
         config = config[name]
     return config
