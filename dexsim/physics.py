@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from dexsim import contact, rotations, tactile
+from dexsim import contact, rotations, substep, tactile
 from dexsim.config import setting, validate
 from dexsim.errors import AssetError, ConfigError
 from dexsim.hand import Hand, forward_kinematics
@@ -155,6 +155,10 @@ class Physics:
             raise AssetError(f"{hand.model_path}: backend {self.backend}: {error}") from None
         self._find_addresses()
         self._find_pairs()
+        self._stepper = None
+        if self.backend == "jax":
+            self._stepper = substep.find_stepper(mjx, self.mj_model, tip_bodies(self.mj_model, hand),
+                                                 most=config.max_contacts)
 
     def _find_addresses(self) -> None:
         model, hand = self.mj_model, self.hand
@@ -250,6 +254,8 @@ class Physics:
         """
         tips = None if self.skin is None else self.tip_stiffness(target, state.qpos)
         model = self.configure(target, tips)
+        if self._stepper is not None:
+            return self._advance_closed(model, state, motors, memory, push)
         data = self._make_data().replace(qpos=state.qpos, qvel=state.qvel,
                                          qacc_warmstart=state.warmstart)
         wrench = jnp.zeros((self.mj_model.nbody, 6)).at[self.object_body, :3].set(push)
@@ -267,6 +273,23 @@ class Physics:
         (data, memory), _ = jax.lax.scan(substep, (data, memory), jnp.arange(self.config.substeps))
         after = PhysicsState(data.qpos, data.qvel, data.qacc_warmstart)
         return after, self._finger_force(data), memory
+
+    def _advance_closed(self, model: Any, state: PhysicsState, motors: Callable[..., tuple[jax.Array, Any]],
+                        memory: Any, push: jax.Array) -> tuple[PhysicsState, jax.Array, Any]:
+        """`advance_motors` with our own contacts and solver (`dexsim.substep`)."""
+        data = self._make_data()
+
+        def run(carry: tuple[Any, ...], index: jax.Array) -> tuple[tuple[Any, ...], None]:
+            (qpos, qvel, warmstart), memory, _ = carry
+            tau, memory = motors(index, qpos[self.joint_qpos], qvel[self.joint_dof], memory)
+            applied = jnp.zeros(self.mj_model.nv).at[self.joint_dof].set(tau)
+            after, force = self._stepper.step(
+                model, data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart), applied, push)
+            return (after, memory, force), None
+
+        begin = ((state.qpos, state.qvel, state.warmstart), memory, jnp.zeros((self.hand.num_fingers, 3)))
+        (after, memory, force), _ = jax.lax.scan(run, begin, jnp.arange(self.config.substeps))
+        return PhysicsState(*after), force, memory
 
     def _make_data(self) -> Any:
         if self.backend == "jax":
