@@ -1,21 +1,6 @@
 """How this library compiles and runs its large programs."""
 
-from collections.abc import Callable
-from typing import Any
-
-import jax
-
 from dexsim.collector import collector_paused
+from dexsim.compilation import jit
 
 __all__ = ["collector_paused", "jit"]
-
-
-def jit(function: Callable, **options: Any) -> Any:
-    """`jax.jit`, but on a CPU LLVM optimises less.
-
-    A physics step is one very large program. On two cores its compilation takes half as long this
-    way, for a few per cent of speed; a short training run is mostly compilation otherwise.
-    """
-    if jax.default_backend() == "cpu":
-        options["compiler_options"] = {"xla_backend_optimization_level": 1}
-    return jax.jit(function, **options)

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dexsim import rotations, sdf
+from dexsim import compilation, rotations, sdf
 from dexsim.errors import ConfigError
 from dexsim.hand import Hand, flexion_joints, forward_kinematics
 from dexsim.objects import KINDS, extent, sample_object
@@ -27,7 +27,7 @@ def make_pool(key: jax.Array, hand: Hand, config: Any, reference: tuple[float, f
     share = -(-config.pool_size // len(shapes))
     chunk = max(min(2 * share, 4096), 64)
 
-    @jax.jit
+    @compilation.jit
     def draw(key: jax.Array, shape_index: jax.Array):
         keys = jax.random.split(key, chunk)
         return jax.vmap(lambda k: _candidate(k, shape_index, hand, config, reference))(keys)
