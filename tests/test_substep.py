@@ -1,0 +1,154 @@
+"""The JAX backend's own contacts and solver, against C MuJoCo's geometry and the conditions of a minimum."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from c_scene import GRAVITY
+
+from dexsim import collide, newton
+from dexsim.objects import SLOTS, ObjectConfig
+from dexsim.physics import Physics, PhysicsConfig
+
+SIZES = {"sphere": "0.02", "capsule": "0.012 0.02", "box": "0.02 0.015 0.03", "cylinder": "0.02 0.025"}
+
+
+def scene(first, second):
+    """Two geoms and their explicit pair; C MuJoCo's exact convex collisions."""
+    size = {"plane": "1 1 1"} | SIZES
+    joint = "" if first == "plane" else "<freejoint/>"
+    model = mujoco.MjModel.from_xml_string(f"""<mujoco><worldbody>
+      <body>{joint}<geom name="a" type="{first}" size="{size[first]}" contype="0" conaffinity="0"/></body>
+      <body><freejoint/><geom name="b" type="{second}" size="{size[second]}" contype="0" conaffinity="0"/></body>
+      </worldbody><contact><pair geom1="a" geom2="b"/></contact></mujoco>""")
+    return model, mujoco.MjData(model)
+
+
+def candidates(model, data):
+    gap, point, normal = collide.find_collider(model).touch(
+        *(jnp.asarray(x, jnp.float32) for x in (data.geom_xpos, data.geom_xmat.reshape(-1, 3, 3), model.geom_size)))
+    return np.asarray(gap), np.asarray(point), np.asarray(normal)
+
+
+@pytest.mark.parametrize("first, second", list(itertools.product(("sphere", "capsule"), SIZES)))
+def test_clearances_are_those_of_c(first, second):
+    """The nearest candidate is as far away, along the same normal, as C MuJoCo's own distance has it."""
+    model, data = scene(first, second)
+    rng, seen = np.random.default_rng(0), 0
+    for _ in range(15):
+        data.qpos[:] = rng.normal(size=model.nq)
+        data.qpos[:3] = 0
+        data.qpos[7:10] *= 0.06 / np.linalg.norm(data.qpos[7:10])
+        mujoco.mj_kinematics(model, data)
+        ends = np.zeros(6)
+        wanted = mujoco.mj_geomDistance(model, data, 0, 1, 1.0, ends)
+        if wanted < 1e-3:
+            continue
+        seen += 1
+        gap, point, normal = candidates(model, data)
+        near = gap.argmin()
+        assert gap[near] == pytest.approx(wanted, abs=2e-5)
+        way = ends[3:] - ends[:3]
+        np.testing.assert_allclose(normal[near], way / np.linalg.norm(way), atol=0.02)
+        # Where the two are parallel, points slide along one another without a change of distance.
+        assert abs(normal[near] @ (point[near] - ends.reshape(2, 3).mean(0))) < 2e-4
+    assert seen >= 8
+
+
+@pytest.mark.parametrize("second", SIZES)
+def test_the_palms_plane(second):
+    """Every contact of C MuJoCo's with a plane, at its depth and place."""
+    model, data = scene("plane", second)
+    rng = np.random.default_rng(1)
+    for trial in range(15):
+        data.qpos[:3] = 0, 0, 0.012
+        data.qpos[3:] = rng.normal(size=4) if trial > 2 else np.eye(4)[trial]
+        mujoco.mj_forward(model, data)
+        gap, point, normal = candidates(model, data)
+        assert data.ncon
+        for one in data.contact:
+            away = np.linalg.norm(point - one.pos, axis=-1) + np.abs(gap - one.dist)
+            if second != "cylinder" or one.dist == data.contact.dist.min():
+                assert away.min() < 1e-4, (trial, one.dist, one.pos)
+        assert gap.min() == pytest.approx(data.contact.dist.min(), abs=1e-5)
+        np.testing.assert_allclose(normal, np.broadcast_to([0, 0, 1], normal.shape), atol=1e-6)
+
+
+@pytest.mark.parametrize("second", ["box", "cylinder"])
+def test_a_capsule_that_lies_on_a_face(second):
+    """Two contacts at the ends of the stretch above the face, as deep as the capsule lies; on its edge one."""
+    model, data = scene("capsule", second)
+    half = float(SIZES[second].split()[-1])
+    data.qpos[:7] = 0, 0, half + 0.011, np.sqrt(0.5), 0, np.sqrt(0.5), 0
+    data.qpos[7:] = 0, 0, 0, 1, 0, 0, 0
+    mujoco.mj_kinematics(model, data)
+    gap, point, normal = candidates(model, data)
+    np.testing.assert_allclose(gap, -0.001, atol=1e-6)
+    np.testing.assert_allclose(np.sort(point[:, 0]), [-0.02, 0.02], atol=1e-4)
+    np.testing.assert_allclose(normal, [[0, 0, -1]] * 2, atol=1e-5)
+    data.qpos[3:7] = np.cos(0.6), 0, np.sin(0.6), 0
+    mujoco.mj_kinematics(model, data)
+    assert np.sum(candidates(model, data)[0] < 1.0) == 1
+
+
+def problem(rng, contacts=6, dofs=10):
+    root = rng.normal(size=(dofs, dofs))
+    weight = 10 ** rng.uniform(-1, 1, (contacts, 1)) * [1.0, 20.0, 20.0]
+    friction = rng.uniform(0.3, 1.2, (contacts, 1))
+    rows = newton.Rows(
+        jacobian=rng.normal(size=(contacts, 3, dofs)), wanted=rng.normal(size=(contacts, 3)) * [3, 0.3, 0.3],
+        weight=weight, scale=friction * [20**-0.5, 1.0, 1.0], limit_side=rng.choice([-1.0, 1.0], dofs),
+        limit_wanted=rng.normal(size=dofs), limit_weight=rng.uniform(0, 1, dofs) * (rng.random(dofs) < 0.5))
+    args = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), rows)
+    return rows, args, (root @ root.T + np.eye(dofs)).astype(np.float32), rng.normal(size=dofs).astype(np.float32)
+
+
+def test_the_solver_ends_where_forces_balance():
+    """M a = f + J' c + limits, with contact forces inside their cones."""
+    solve = jax.jit(lambda rows, mass, force: newton.solve(
+        rows, mass, force, jnp.zeros_like(force), iterations=30, line_search=10))
+    rng, sticking, sliding = np.random.default_rng(2), 0, 0
+    for _ in range(20):
+        rows, args, mass, force = problem(rng)
+        found = np.asarray(solve(args, mass, force), float)
+        press = np.asarray(newton.contact_force(args, jnp.asarray(found, jnp.float32)), float)
+        limit = -rows.limit_weight * np.minimum(rows.limit_side * found - rows.limit_wanted, 0) * rows.limit_side
+        balance = mass @ found - force - np.einsum("civ,ci->v", rows.jacobian, press) - limit
+        scale = np.abs(mass @ found).max() + np.abs(press).max()
+        assert np.abs(balance).max() < 2e-3 * scale
+        friction = rows.scale[:, 1]
+        slide = np.linalg.norm(press[:, 1:], axis=-1)
+        assert np.all(press[:, 0] >= -1e-5) and np.all(slide <= friction * press[:, 0] * 1.001 + 1e-5)
+        miss = np.einsum("civ,v->ci", rows.jacobian, found) - rows.wanted
+        stuck = (press[:, 0] > 0) & (slide < 0.99 * friction * press[:, 0])
+        np.testing.assert_allclose(press[stuck], (-rows.weight * miss)[stuck], rtol=1e-3, atol=1e-3)
+        sticking, sliding = sticking + stuck.sum(), sliding + np.sum((press[:, 0] > 1e-3) & ~stuck)
+    assert sticking > 10 and sliding > 10
+
+
+def test_a_solved_start_stays():
+    """The search along a step of no length keeps where it is, even to the last digit of float32."""
+    _, args, mass, force = problem(np.random.default_rng(3))
+    once = newton.solve(args, mass, force, jnp.zeros_like(force), iterations=20, line_search=6)
+    again = newton.solve(args, mass, force, once, iterations=20, line_search=6)
+    np.testing.assert_allclose(again, once, rtol=1e-4, atol=1e-4)
+
+
+def test_gradients_go_through_the_solver():
+    """Reverse mode agrees with a difference quotient of the force."""
+    _, args, mass, force = problem(np.random.default_rng(4))
+    probe = lambda f: jnp.sum(newton.solve(args, mass, f, jnp.zeros_like(f), iterations=12, line_search=6))  # noqa: E731
+    slope = jax.grad(probe)(jnp.asarray(force))
+    step = 1e-2 * jnp.eye(len(force))[0]
+    quotient = (probe(force + step) - probe(force - step)) / 2e-2
+    assert slope[0] == pytest.approx(float(quotient), rel=0.05, abs=5e-3)
+
+
+@pytest.mark.parametrize("change", [{"cone": "pyramidal"}, {"condim": 4}, {"condim": 1}])
+def test_other_cones_are_left_to_mjx(hand, change):
+    plain, other = (Physics(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(**extra), gravity=GRAVITY,
+                            backend="jax") for extra in ({}, change))
+    assert plain._stepper is not None and other._stepper is None
