@@ -99,8 +99,7 @@ def solve(rows: Rows, mass: jax.Array, force: jax.Array, guess: jax.Array, *, it
       mass: [V, V] inertia of the degrees of freedom.
       force: [V] all other forces.
       guess: [V] where to start from, unless the free acceleration is the better start.
-      iterations: Newton steps.
-      line_search: half the steps of the search along each: MJX's looks at three points in each of its own.
+      iterations: Newton steps; `line_search`: steps of the search along each.
     """
     free = _solve_positive(mass, force)
     better = _cost(rows, mass, force, guess) < _cost(rows, mass, force, free)
@@ -146,7 +145,7 @@ def _search(rows: Rows, miss: jax.Array, moved: jax.Array, limit: jax.Array, lim
         return jnp.where((newton >= low) & (newton <= high), newton, 0.5 * (low + high)), low, high
 
     start = (jnp.ones(()), jnp.zeros(()), jnp.full((), 1e6))
-    return jax.lax.fori_loop(0, 2 * steps, closer, start)[0]
+    return jax.lax.fori_loop(0, steps, closer, start)[0]
 
 
 def _solve_positive(matrix: jax.Array, vector: jax.Array) -> jax.Array:

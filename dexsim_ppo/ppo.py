@@ -165,7 +165,7 @@ def make_train(env: Environment, config: PPOConfig, curriculum: Curriculum | Non
                                       None, length=config.iterations_per_call)
         return strong_types(state), metrics
 
-    compiled_init = jit(init)
+    compiled_init = jax.jit(init)
     # Copies part leaves that share a buffer (actor and critic may see the same array): no buffer can be
     # donated twice.
     return Training(init=lambda key: jax.tree.map(jnp.copy, compiled_init(key)),
