@@ -22,7 +22,7 @@ from dexsim.control import Control, move_target, recalled
 from dexsim.drive import Drive, rotor_share
 from dexsim.env_config import EnvConfig, Sensing
 from dexsim.episode import Moment, Sample, Start, State, Task, choose
-from dexsim.hand import Hand, forward_kinematics, taxel_normals, taxel_positions
+from dexsim.hand import Hand, forward_kinematics, taxel_normals
 from dexsim.objects import ObjectParams, load_mesh_object, narrow
 from dexsim.observation import Motion, Readings, ThreeAxisReadings
 from dexsim.orientation_sensor import SensorDraw
@@ -247,9 +247,8 @@ class Env:
         quat = place[3:] / jnp.linalg.norm(place[3:])
         strength = jnp.linalg.norm(force, axis=-1)
         if config.touch:
-            touch = tactile.feel(taxel_positions(hand, pose), jnp.asarray(hand.taxel_area),
-                                 self._felt(target), place[:3], rotations.quat_to_matrix(quat),
-                                 strength, config.skin)
+            touch = tactile.feel_links(hand, pose, self._felt(target), place[:3],
+                                       rotations.quat_to_matrix(quat), strength, config.skin)
             if config.skin.total == "pressing":
                 # In the links' frames, where the normals are constants.
                 local = rotations.rotate_inverse(pose.tip_rotation, force)

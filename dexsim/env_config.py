@@ -8,7 +8,7 @@ from dexsim.control import Control
 from dexsim.objects import ObjectConfig
 from dexsim.observation import ObservationConfig
 from dexsim.orientation_sensor import OrientationSensor
-from dexsim.physics import PhysicsConfig
+from dexsim.physics_model import PhysicsConfig
 from dexsim.randomization import Randomization
 from dexsim.sensor_noise import SensorNoise
 

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from dexsim import rotations, tactile
 from dexsim.config import setting, validate
 from dexsim.errors import ConfigError
-from dexsim.hand import Hand, HandPose, forward_kinematics, taxel_positions
+from dexsim.hand import Hand, HandPose, forward_kinematics
 from dexsim.pytree import pytree_dataclass
 
 
@@ -213,8 +213,7 @@ def observe(hand: Hand, readings: Readings, names: tuple[str, ...],
       [sum of the layout's sizes] float32, not normalised.
     """
     pose = forward_kinematics(hand, readings.joint_position)
-    force, centre = tactile.reduce_touch(readings.taxel_force, taxel_positions(hand, pose),
-                                         config.weighting)
+    force, centre = tactile.reduce_touch_links(readings.taxel_force, hand, pose, config.weighting)
     features = Features(
         readings, pose.tip_position, force, centre, pose, motion,
         lambda: _tip_twist(hand, readings.joint_position, motion.joint_velocity))

@@ -8,7 +8,6 @@ paper. The output is written at the end, whole or not at all. `--from-log FILE` 
 """
 
 import dataclasses
-import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,7 +20,7 @@ from dexsim.calibration import save_calibration
 from dexsim.calibration_plot import plot_calibration
 from dexsim.hand import Hand
 from dexsim_ppo import cli
-from dexsim_real import calibrate_identify
+from dexsim_real import calibrate_identify, signals
 from dexsim_real.calibrate_bench import Workbench
 from dexsim_real.calibrate_fit import fit
 from dexsim_real.calibrate_gauge import Gauge
@@ -96,21 +95,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     cli.enable_caches()
     hand = load_hand()
     operator = Operator(Console(stderr=True), silent=arguments.yes)
-    before = {number: signal.signal(number, _terminate) for number in (signal.SIGTERM, signal.SIGHUP)}
-    try:
+    with signals.stopping():
         if arguments.identify:
             calibrate_identify.identify_hand(arguments, hand, operator)
         else:
             logs = arguments.from_log or (record(arguments, hand, operator),)
             conclude(arguments, hand, logs, operator)
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
     return 0
-
-
-def _terminate(number: int, frame: Any) -> None:
-    raise SystemExit(128 + number)
 
 
 if __name__ == "__main__":

@@ -6,12 +6,11 @@ The policy is a file, or the name of a shipped one. Everything is compiled befor
 the motors come on at the measured pose and go off at the end, however the end comes.
 """
 
-import signal
 import sys
 from collections.abc import Sequence
-from typing import Any
 
 from dexsim_ppo import cli
+from dexsim_real import signals
 from dexsim_real.control import prepare_jax
 from dexsim_real.options import RunArguments
 from dexsim_real.session import Session
@@ -26,36 +25,30 @@ def main(argv: Sequence[str] | None = None) -> int:
     prepare_jax()
     cli.enable_caches()
     session = Session(arguments)
-    before = {number: signal.signal(number, _terminate) for number in (signal.SIGTERM, signal.SIGHUP)}
     reason, code = "", 0
-    try:
-        session.prepare()
-        session.run()
-    except HandError as error:
-        reason, code = str(error), 1
-        if not session.started:
+    with signals.stopping():
+        try:
+            session.prepare()
+            session.run()
+        except HandError as error:
+            reason, code = str(error), 1
+            if not session.started:
+                raise
+        except KeyboardInterrupt:
+            reason, code = "Ctrl-C", 130
+        except SystemExit as stop:
+            reason, code = f"signal {stop.code - 128}", stop.code
+        except BaseException as error:
+            reason = f"failure: {error!r}"
             raise
-    except KeyboardInterrupt:
-        reason, code = "Ctrl-C", 130
-    except SystemExit as stop:
-        reason, code = f"signal {stop.code - 128}", stop.code
-    except BaseException as error:
-        reason = f"failure: {error!r}"
-        raise
-    finally:
-        session.close(reason)
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        finally:
+            session.close(reason)
     summary = session.summary()
     if not arguments.quiet:
         session.view.console.print(summary_table(f"{session.controller.policy.task}: {session.end}", summary))
     if arguments.output:
         cli.write_json(arguments.output, summary)
     return code
-
-
-def _terminate(number: int, frame: Any) -> None:
-    raise SystemExit(128 + number)
 
 
 if __name__ == "__main__":

@@ -412,13 +412,18 @@ def test_what_is_missing_is_said_in_one_line(tmp_path, capsys):
 def test_signals(tmp_path, number):
     with FollowingHand() as peer:
         command = [sys.executable, "-m", "dexsim_real.run", *arguments(peer, tmp_path, "--seconds", "60")]
-        process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE)
-        until = time.monotonic() + 60
-        while peer.on().sum() < 60 and process.poll() is None and time.monotonic() < until:
-            time.sleep(0.05)
-        sent = time.monotonic()
-        process.send_signal(number)
-        code = process.wait(20)
+        # As a shell starts what runs in the background: with Ctrl-C ignored.
+        process = subprocess.Popen(["sh", "-c", "trap '' INT; exec \"$@\"", "sh", *command], cwd=ROOT,
+                                   stderr=subprocess.PIPE)
+        try:
+            until = time.monotonic() + 60
+            while peer.on().sum() < 60 and process.poll() is None and time.monotonic() < until:
+                time.sleep(0.05)
+            sent = time.monotonic()
+            process.send_signal(number)
+            code = process.wait(20)
+        finally:
+            process.kill()
         time.sleep(0.1)
         on = peer.on()
     if number == signal.SIGKILL:

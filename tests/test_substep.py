@@ -1,7 +1,9 @@
 """The JAX backend's own contacts and solver, against C MuJoCo's geometry and the conditions of a minimum."""
 
+import dataclasses
 import itertools
 
+import c_scene
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -11,7 +13,7 @@ from c_scene import GRAVITY
 
 from dexsim import collide, newton
 from dexsim.objects import SLOTS, ObjectConfig
-from dexsim.physics import Physics, PhysicsConfig
+from dexsim.physics import Physics, PhysicsConfig, PhysicsState
 
 SIZES = {"sphere": "0.02", "capsule": "0.012 0.02", "box": "0.02 0.015 0.03", "cylinder": "0.02 0.025"}
 
@@ -147,8 +149,34 @@ def test_gradients_go_through_the_solver():
     assert slope[0] == pytest.approx(float(quotient), rel=0.05, abs=5e-3)
 
 
-@pytest.mark.parametrize("change", [{"cone": "pyramidal"}, {"condim": 4}, {"condim": 1}])
-def test_other_cones_are_left_to_mjx(hand, change):
+@pytest.mark.parametrize("change", [{"cone": "pyramidal"}, {"condim": 4}, {"condim": 1}, {"contacts": "mjx"}])
+def test_other_cones_and_whoever_asks_are_left_to_mjx(hand, change):
     plain, other = (Physics(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(**extra), gravity=GRAVITY,
                             backend="jax") for extra in ({}, change))
     assert plain._stepper is not None and other._stepper is None
+
+
+@pytest.mark.slow
+def test_mjx_step_agrees(hand, grasp_env):
+    """Both ways through a sub-step, converged, with capsules in closing hands: one answer."""
+    one = SLOTS.index("capsule")
+    worlds, rng = 4, np.random.default_rng(5)
+    starts = [c_scene.row(grasp_env.pool, i) for i in c_scene.rows_of(grasp_env.pool, "capsule")[:worlds]]
+    begun = [c_scene.squeeze(hand, start, rng) for start in starts]
+    qpos, qvel, warmstart, torque = (jnp.stack(x) for x in list(zip(*begun, strict=True))[1:])
+    target = c_scene.stack([start.target for start in starts])
+    alone = dataclasses.replace(target, kinds=("capsule",), **{
+        name: getattr(target, name)[:, one:one + 1] for name in ("size", "position", "active")})
+    found = []
+    for contacts in ("closed", "mjx"):
+        seam = Physics(hand, ("capsule",), ObjectConfig().largest[one:one + 1],
+                       PhysicsConfig(substeps=1, contacts=contacts, **c_scene.CONVERGED), gravity=GRAVITY,
+                       backend="jax")
+        found.append(jax.jit(jax.vmap(lambda target, state, torque, seam=seam: seam.advance(
+            target, state, lambda *_: torque, jnp.zeros(3))))(
+                alone, PhysicsState(qpos, qvel, warmstart), torque))
+    (ours, our_force), (theirs, force) = found
+    assert np.sum(np.linalg.norm(force, axis=-1).max(-1) > 0.5) >= 3
+    np.testing.assert_allclose(our_force, force, atol=0.02)
+    np.testing.assert_allclose(ours.qvel, theirs.qvel, atol=5e-3)
+    np.testing.assert_allclose(ours.qpos, theirs.qpos, atol=3e-5)

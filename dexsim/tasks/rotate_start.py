@@ -28,7 +28,7 @@ from dexsim.errors import ConfigError
 from dexsim.files import write_whole
 from dexsim.hand import Hand, flexion_joints
 from dexsim.objects import SHAPES, ObjectParams, extent, load_mesh_object, sample_object
-from dexsim.physics import build_model, tip_bodies
+from dexsim.physics_model import build_model, tip_bodies
 from dexsim.tasks.grasp_start import clearance, palm_height
 
 KINDS = {"cube": ("box",), "cylinder": ("cylinder",), "octagon": ("box", "box")}
