@@ -22,6 +22,7 @@ from dexsim.control import Control, move_target, recalled
 from dexsim.drive import Drive, rotor_share
 from dexsim.env_config import EnvConfig, Sensing
 from dexsim.episode import Moment, Sample, Start, State, Task, choose
+from dexsim.fingerprint import fingerprint
 from dexsim.hand import Hand, forward_kinematics, taxel_normals
 from dexsim.objects import ObjectParams, load_mesh_object, narrow
 from dexsim.observation import Motion, Readings, ThreeAxisReadings
@@ -81,6 +82,10 @@ class Env:
     def control_rate(self) -> float:
         """Control ticks per second, Hz."""
         return 1.0 / self.control_period
+
+    def fingerprint(self) -> str | None:
+        """A hash of what the compiled `reset` and `step` depend on; None if it cannot tell."""
+        return fingerprint(self)
 
     # --- life of an episode ---------------------------------------------------------------
 

@@ -144,7 +144,9 @@ def _search(rows: Rows, miss: jax.Array, moved: jax.Array, limit: jax.Array, lim
         newton = here - slope / jnp.maximum(curve, _TINY)
         return jnp.where((newton >= low) & (newton <= high), newton, 0.5 * (low + high)), low, high
 
-    start = (jnp.ones(()), jnp.zeros(()), jnp.full((), 1e6))
+    # Of each environment's own from the first, or vmap would trace the loops around this twice.
+    nothing = 0.0 * line[1]
+    start = (nothing + 1, nothing, nothing + 1e6)
     return jax.lax.fori_loop(0, steps, closer, start)[0]
 
 

@@ -215,17 +215,19 @@ class Physics:
         """`advance_motors` with our own contacts and solver (`dexsim.substep`)."""
         data = self._make_data()
 
-        def run(carry: tuple[Any, ...], index: jax.Array) -> tuple[tuple[Any, ...], None]:
-            (qpos, qvel, warmstart), memory, _ = carry
+        def run(carry: tuple[Any, ...], index: jax.Array) -> tuple[tuple[Any, ...], jax.Array]:
+            (qpos, qvel, warmstart), memory = carry
             tau, memory = motors(index, qpos[self.joint_qpos], qvel[self.joint_dof], memory)
             applied = jnp.zeros(self.mj_model.nv).at[self.joint_dof].set(tau)
             after, force = self._stepper.step(
                 model, data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart), applied, push)
-            return (after, memory, force), None
+            return (after, memory), force
 
-        begin = ((state.qpos, state.qvel, state.warmstart), memory, jnp.zeros((self.hand.num_fingers, 3)))
-        (after, memory, force), _ = jax.lax.scan(run, begin, jnp.arange(self.config.substeps))
-        return PhysicsState(*after), force, memory
+        # The force is no part of the carry: zeros to begin with, which no environment's own, would have
+        # vmap trace all of this twice.
+        begin = ((state.qpos, state.qvel, state.warmstart), memory)
+        (after, memory), forces = jax.lax.scan(run, begin, jnp.arange(self.config.substeps))
+        return PhysicsState(*after), forces[-1], memory
 
     def _make_data(self) -> Any:
         if self.backend == "jax":

@@ -137,6 +137,10 @@ class Training(NamedTuple):
     """The compiled functions of `make_train`."""
 
     init: Callable[[jax.Array], TrainState]
+    shapes: Callable[[jax.Array], TrainState]
+    """What `init` would return, as `jax.eval_shape` has it."""
+    plain_step: Callable[[TrainState], tuple[TrainState, Metrics]]
+    """`step` before it is jitted."""
     step: Callable[[TrainState], tuple[TrainState, Metrics]]
     """Takes over its argument's memory: do not use that state again. Metrics are [iterations_per_call]."""
 
@@ -165,10 +169,11 @@ def make_train(env: Environment, config: PPOConfig, curriculum: Curriculum | Non
                                       None, length=config.iterations_per_call)
         return strong_types(state), metrics
 
-    compiled_init = jax.jit(init)
+    compiled_init = jit(init, once=True)
     # Copies part leaves that share a buffer (actor and critic may see the same array): no buffer can be
     # donated twice.
     return Training(init=lambda key: jax.tree.map(jnp.copy, compiled_init(key)),
+                    shapes=lambda key: jax.eval_shape(init, key), plain_step=step,
                     step=jit(step, donate_argnums=0))
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from dexsim.config import setting, to_dict, validate
 from dexsim.errors import DexsimError
 from dexsim.randomization import Curriculum
-from dexsim_ppo import checkpoint, cli
+from dexsim_ppo import checkpoint, cli, programs
 from dexsim_ppo.compilation import collector_paused
 from dexsim_ppo.display import Display
 from dexsim_ppo.evaluate import Evaluator, print_report, write_video
@@ -122,23 +122,27 @@ class Run:
         training = make_train(self.env, self.config, self.arguments.curriculum)
         key = jax.random.key(self.arguments.seed)
         begin = time.perf_counter()
-        shapes = jax.eval_shape(training.init, key)
-        lowered = training.step.lower(shapes)
-        self.clock["trace_s"] = time.perf_counter() - begin
-        # The step compiles on one core while the first states are made on another.
-        with ThreadPoolExecutor(1) as compiler:
-            compiling = compiler.submit(lowered.compile)
+        shapes = training.shapes(key)
+        # The first states are compiled and made on one core while the step is traced on another.
+        with ThreadPoolExecutor(1) as aside:
             if resumed:
                 state = jax.tree.map(jnp.copy, checkpoint.restore(resumed, shapes))
                 progress = resumed.content["progress"]
                 self.best, self.seconds_before = progress["best"], progress["seconds"]
             else:
-                state = jax.block_until_ready(training.init(key))
+                beginning = aside.submit(lambda: jax.block_until_ready(training.init(key)))
+            step = programs.compile_step(training.plain_step, shapes, self._identity(), lambda: self.clock.update(
+                trace_s=time.perf_counter() - begin))
+            if not resumed:
+                state = beginning.result()
                 self._policy(state).save(self.folder.untrained)
-            self.clock["init_s"] = time.perf_counter() - begin
-            step = compiling.result()
         self.clock["compile_s"] = time.perf_counter() - begin
         return state, step
+
+    def _identity(self) -> Any:
+        """Which program the training step is; None for an environment that cannot say which it is."""
+        fingerprint = getattr(self.env, "fingerprint", lambda: None)()
+        return fingerprint and [fingerprint, to_dict(self.config), to_dict(self.arguments.curriculum)]
 
     def _loop(self, state: TrainState, step: Callable, display: Display, log: MetricsLog,
               stopped: Callable[[], int]) -> None:

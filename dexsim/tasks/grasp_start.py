@@ -1,5 +1,6 @@
 """Start states of the grasp task: an object below the palm, fingers half closed round it."""
 
+import functools
 from typing import Any
 
 import jax
@@ -27,7 +28,7 @@ def make_pool(key: jax.Array, hand: Hand, config: Any, reference: tuple[float, f
     share = -(-config.pool_size // len(shapes))
     chunk = max(min(2 * share, 4096), 64)
 
-    @compilation.jit
+    @functools.partial(compilation.jit, once=True)
     def draw(key: jax.Array, shape_index: jax.Array):
         keys = jax.random.split(key, chunk)
         return jax.vmap(lambda k: _candidate(k, shape_index, hand, config, reference))(keys)

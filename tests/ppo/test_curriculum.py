@@ -118,7 +118,7 @@ def test_a_checkpoint_keeps_the_scale_and_resumes_to_the_bit(tmp_path):
     straight, _ = training.step(state)
     resumed = make_train(WideEnv(), SMALL, RULES)
     again = checkpoint.restore(checkpoint.load(tmp_path / "c", kind="train"),
-                               jax.eval_shape(resumed.init, jax.random.key(5)))
+                               resumed.shapes(jax.random.key(5)))
     assert float(again.scale) == pytest.approx(0.7)
     again, _ = resumed.step(jax.tree.map(jnp.copy, again))
     for ours, theirs in zip(jax.tree.leaves(again), jax.tree.leaves(straight), strict=True):

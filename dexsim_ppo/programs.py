@@ -1,0 +1,137 @@
+"""Compiled training steps kept between runs, so that a second start need not even trace.
+
+JAX's own cache is asked for a program that was traced and lowered already, which in a training step takes
+longer than loading the program. Here the question is a hash of all that tracing depends on (`key`).
+"""
+
+import hashlib
+import json
+import os
+import pickle
+import platform
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+from jax.experimental import serialize_executable
+
+from dexsim.assets import cache_path
+from dexsim.fingerprint import python_sources
+from dexsim_ppo.cli import environment_report
+from dexsim_ppo.compilation import jit
+
+KEPT = 8  # of some 10 MB each, the newest
+_OPTIONS = ("jax_enable_x64", "jax_default_matmul_precision", "jax_default_prng_impl", "jax_debug_nans",
+            "jax_debug_infs", "jax_disable_jit", "jax_numpy_dtype_promotion", "jax_threefry_partitionable")
+
+
+class Program:
+    """A compiled `step(state) -> (state, metrics)`, whose state may hold typed keys."""
+
+    def __init__(self, compiled: Callable, like: Any, names: list[str]):
+        self._compiled, self._names = compiled, names
+        self._leaves = _Leaves(like)
+
+    def __call__(self, state: Any) -> tuple[Any, dict[str, jax.Array]]:
+        leaves, metrics = self._compiled(self._leaves.of(state))
+        return self._leaves.back(leaves), dict(zip(self._names, metrics, strict=True))
+
+
+def compile_step(step: Callable, shapes: Any, identity: Any, on_traced: Callable[[], None]) -> Callable:
+    """Compile a training step, or load it where it was compiled before.
+
+    Args:
+      step: state to (state, metrics), not jitted; it takes over the state's memory.
+      shapes: the state's shapes.
+      identity: what says which program this is, as JSON; None to keep nothing.
+      on_traced: called when tracing is over, where it was needed.
+    """
+    if identity is None or jax.default_backend() != "cpu":  # Warp's kernels are not in the program itself.
+        lowered = jit(step, donate_argnums=0).lower(shapes)
+        on_traced()
+        return lowered.compile()
+    path = cache_path("programs") / f"{key(identity, shapes)}.pkl"
+    return _load(path, shapes) or _compile(path, step, shapes, on_traced)
+
+
+def key(identity: Any, shapes: Any) -> str:
+    """The hash of a program: its identity, this package, versions, machine, and options of JAX."""
+    parts = [identity, environment_report(), _cpu_features(), os.environ.get("XLA_FLAGS", ""),
+             {name: str(getattr(jax.config, name, None)) for name in _OPTIONS},
+             [f"{path} {leaf.shape} {leaf.dtype}" for path, leaf in jax.tree.leaves_with_path(shapes)]]
+    digest = hashlib.sha256(json.dumps(parts, default=str).encode())
+    for source in python_sources(Path(__file__).resolve().parent):
+        digest.update(source.read_bytes())
+    return digest.hexdigest()
+
+
+class _Leaves:
+    """A tree as a list of plain arrays, which can be pickled where trees of our own classes cannot."""
+
+    def __init__(self, like: Any):
+        leaves, self._tree = jax.tree.flatten(like)
+        self._is_key = [jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key) for leaf in leaves]
+
+    def of(self, tree: Any) -> list[jax.Array]:
+        return [jax.random.key_data(leaf) if is_key else leaf
+                for leaf, is_key in zip(jax.tree.leaves(tree), self._is_key, strict=True)]
+
+    def back(self, leaves: list[jax.Array]) -> Any:
+        return jax.tree.unflatten(self._tree, [
+            jax.random.wrap_key_data(leaf) if is_key else leaf
+            for leaf, is_key in zip(leaves, self._is_key, strict=True)])
+
+
+def _compile(path: Path, step: Callable, shapes: Any, on_traced: Callable[[], None]) -> Program:
+    leaves, names = _Leaves(shapes), []
+
+    def flat(values: list[jax.Array]) -> tuple[list[jax.Array], list[jax.Array]]:
+        state, metrics = step(leaves.back(values))
+        names[:] = sorted(metrics)
+        return leaves.of(state), [metrics[name] for name in names]
+
+    lowered = jit(flat, donate_argnums=0).lower(jax.eval_shape(leaves.of, shapes))
+    on_traced()
+    compiled = lowered.compile()
+    _save(path, compiled, names)
+    return Program(compiled, shapes, names)
+
+
+def _save(path: Path, compiled: Any, names: list[str]) -> None:
+    """Keep a program; without room or leave to write, do without."""
+    part = path.with_suffix(f".{os.getpid()}")
+    try:
+        content = pickle.dumps((serialize_executable.serialize(compiled), names))
+        path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        part.write_bytes(content)
+        part.replace(path)
+        newest = sorted(path.parent.glob("*.pkl"), key=lambda p: p.stat().st_mtime, reverse=True)
+        for old in newest[KEPT:]:
+            old.unlink(missing_ok=True)
+    except (OSError, ValueError, TypeError, jax.errors.JaxRuntimeError):
+        part.unlink(missing_ok=True)
+
+
+def _load(path: Path, shapes: Any) -> Program | None:
+    try:
+        content = path.read_bytes()
+    except OSError:
+        return None
+    try:
+        serialized, names = pickle.loads(content)  # our own file, as JAX's cache is
+        program = Program(serialize_executable.deserialize_and_load(*serialized), shapes, names)
+        path.touch()
+    except Exception:  # cut short, or of a runtime that we cannot name: compile again
+        return None
+    return program
+
+
+def _cpu_features() -> str:
+    """What compiled code may use of this processor."""
+    try:
+        flags = re.search(r"^(flags|Features)\s*:(.*)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
+    except OSError:
+        flags = None
+    return flags[2] if flags else platform.processor()
