@@ -4,17 +4,22 @@ JAX's own cache is asked for a program that was traced and lowered already, whic
 longer than loading the program. Here the question is a hash of all that tracing depends on (`key`).
 """
 
+import contextlib
+import functools
 import hashlib
 import json
 import os
 import pickle
 import platform
 import re
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import jax
+import jax.monitoring
+import jax.numpy as jnp
 from jax.experimental import serialize_executable
 
 from dexsim.assets import cache_path
@@ -30,13 +35,25 @@ _OPTIONS = ("jax_enable_x64", "jax_default_matmul_precision", "jax_default_prng_
 class Program:
     """A compiled `step(state) -> (state, metrics)`, whose state may hold typed keys."""
 
-    def __init__(self, compiled: Callable, like: Any, names: list[str]):
-        self._compiled, self._names = compiled, names
+    def __init__(self, compiled: Callable, like: Any, names: list[str],
+                 instead: Callable[[], "Program"] | None = None):
+        """`instead` makes the program anew, should one that was kept not run."""
+        self._compiled, self._names, self._instead = compiled, names, instead
         self._leaves = _Leaves(like)
 
     def __call__(self, state: Any) -> tuple[Any, dict[str, jax.Array]]:
-        leaves, metrics = self._compiled(self._leaves.of(state))
-        return self._leaves.back(leaves), dict(zip(self._names, metrics, strict=True))
+        leaves = self._leaves.of(state)
+        if self._instead:
+            try:  # on a copy, since the program takes over its arguments' memory
+                done = jax.block_until_ready(self._compiled([jnp.copy(leaf) for leaf in leaves]))
+            except jax.errors.JaxRuntimeError:
+                program = self._instead()
+                self._compiled, self._names = program._compiled, program._names
+                done = self._compiled(leaves)
+            self._instead = None
+        else:
+            done = self._compiled(leaves)
+        return self._leaves.back(done[0]), dict(zip(self._names, done[1], strict=True))
 
 
 def compile_step(step: Callable, shapes: Any, identity: Any, on_traced: Callable[[], None]) -> Callable:
@@ -53,7 +70,8 @@ def compile_step(step: Callable, shapes: Any, identity: Any, on_traced: Callable
         on_traced()
         return lowered.compile()
     path = cache_path("programs") / f"{key(identity, shapes)}.pkl"
-    return _load(path, shapes) or _compile(path, step, shapes, on_traced)
+    anew = functools.partial(_compile, path, step, shapes, on_traced)
+    return _load(path, shapes, anew) or anew()
 
 
 def key(identity: Any, shapes: Any) -> str:
@@ -94,8 +112,10 @@ def _compile(path: Path, step: Callable, shapes: Any, on_traced: Callable[[], No
 
     lowered = jit(flat, donate_argnums=0).lower(jax.eval_shape(leaves.of, shapes))
     on_traced()
+    found = _HITS.count()
     compiled = lowered.compile()
-    _save(path, compiled, names)
+    if _HITS.count() == found:  # What comes from JAX's cache cannot be serialised again: it lacks its functions.
+        _save(path, compiled, names)
     return Program(compiled, shapes, names)
 
 
@@ -111,21 +131,40 @@ def _save(path: Path, compiled: Any, names: list[str]) -> None:
         for old in newest[KEPT:]:
             old.unlink(missing_ok=True)
     except (OSError, ValueError, TypeError, jax.errors.JaxRuntimeError):
-        part.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
 
 
-def _load(path: Path, shapes: Any) -> Program | None:
+def _load(path: Path, shapes: Any, anew: Callable[[], Program]) -> Program | None:
     try:
         content = path.read_bytes()
     except OSError:
         return None
     try:
         serialized, names = pickle.loads(content)  # our own file, as JAX's cache is
-        program = Program(serialize_executable.deserialize_and_load(*serialized), shapes, names)
+        program = Program(serialize_executable.deserialize_and_load(*serialized), shapes, names, anew)
         path.touch()
     except Exception:  # cut short, or of a runtime that we cannot name: compile again
         return None
     return program
+
+
+class _CacheHits:
+    """Counts, by thread, what JAX's own cache has answered."""
+
+    def __init__(self):
+        self._found = threading.local()
+        jax.monitoring.register_event_listener(self._listen)
+
+    def count(self) -> int:
+        return getattr(self._found, "count", 0)
+
+    def _listen(self, event: str, **_: Any) -> None:
+        if event == "/jax/compilation_cache/cache_hits":
+            self._found.count = self.count() + 1
+
+
+_HITS = _CacheHits()
 
 
 def _cpu_features() -> str:
