@@ -1,7 +1,7 @@
 """Shipped policies on the emulated hand, with no fine-tuning: the paper's metrics beside those in simulation.
 
-    python benchmarks/zero_shot.py --virtual --task rotate --trials 10
-    python benchmarks/zero_shot.py --virtual --task grasp --trials 50 --draw inside --set gear_play=0
+    python benchmarks/zero_shot.py --task rotate --trials 10
+    python benchmarks/zero_shot.py --task grasp --trials 50 --draw inside --set gear_play=0
 
 Virtual time: every exchange goes through the bytes of both frames and the emulated palm board, then the bridge's own
 sensing, safety and controller, but in one process and as fast as it computes (`dexsim_real.twin.virtual`). What is
@@ -156,7 +156,6 @@ def table(here: dict[str, Any], there: dict[str, Any]) -> str:
 
 def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--virtual", action="store_true", help="virtual time (the only mode here)")
     parser.add_argument("--task", choices=("grasp", "rotate"), required=True)
     parser.add_argument("--policy", help="policy file; by default the shipped one of the task")
     parser.add_argument("--trials", type=int, default=10)
@@ -175,8 +174,6 @@ def arguments() -> argparse.Namespace:
 
 def main() -> None:
     given = arguments()
-    if not given.virtual:
-        sys.exit("zero_shot.py: give --virtual")
     options = {"task": given.task, "policy": given.policy or given.task, "seed": given.seed, "draw": given.draw,
                "seconds": given.seconds, "safety": given.safety,
                "set": {name: value if value in ("outside", "inside", "nominal") else float(value)

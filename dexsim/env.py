@@ -24,7 +24,8 @@ from dexsim.env_config import EnvConfig, Sensing
 from dexsim.episode import Moment, Sample, Start, State, Task, choose
 from dexsim.fingerprint import fingerprint
 from dexsim.hand import Hand, forward_kinematics, taxel_normals
-from dexsim.objects import ObjectParams, load_mesh_object, narrow
+from dexsim.object_config import load_mesh_object
+from dexsim.objects import ObjectParams, narrow
 from dexsim.observation import Motion, Readings, ThreeAxisReadings
 from dexsim.orientation_sensor import SensorDraw
 from dexsim.physics import Physics, PhysicsState

@@ -5,7 +5,7 @@ import dataclasses
 from dexsim import tactile
 from dexsim.config import setting, validate
 from dexsim.control import Control
-from dexsim.objects import ObjectConfig
+from dexsim.object_config import ObjectConfig
 from dexsim.observation import ObservationConfig
 from dexsim.orientation_sensor import OrientationSensor
 from dexsim.physics_model import PhysicsConfig

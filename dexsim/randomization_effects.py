@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dexsim.collector import collector_paused
-from dexsim.objects import SHAPES
+from dexsim.object_config import SHAPES
 from dexsim.orientation_sensor import OrientationSensor, draw_sensor
 from dexsim.randomization import Randomization, sample
 

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 
-from dexsim_ppo.ppo import PPOConfig
+from dexsim_ppo.ppo_config import PPOConfig
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -25,7 +25,7 @@ from dexsim.config import from_dict
 from dexsim.errors import ConfigError
 from dexsim.randomization import Curriculum
 from dexsim_ppo import checkpoint, cli
-from dexsim_ppo.ppo import PPOConfig
+from dexsim_ppo.ppo_config import PPOConfig
 from dexsim_ppo.presets import Preset, find_preset
 from dexsim_ppo.runlog import RunFolder
 from dexsim_ppo.trainer import Run, TrainArguments, printable

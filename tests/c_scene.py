@@ -15,14 +15,14 @@ import numpy as np
 
 from dexsim import rotations, tactile
 from dexsim.hand import forward_kinematics, taxel_positions
-from dexsim.objects import SHAPES
+from dexsim.object_config import SHAPES
 
 GRAVITY = (9.81, 0.0, 0.0)
 # Solved to the end, so that what differs between engines is arithmetic and contact geometry.
 CONVERGED = {"iterations": 50, "line_search": 50}
 COVER = 0.003  # m, rubber over the pads
 ROW = 3  # spheres along a pad
-KINDS = ("box", "capsule", "cylinder")  # the order of `dexsim.objects.SLOTS`
+KINDS = ("box", "capsule", "cylinder")  # the order of `dexsim.object_config.SLOTS`
 
 
 def compile_scene(hand, target, *, gravity=GRAVITY, timestep=0.006, iterations=3,

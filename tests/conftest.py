@@ -95,7 +95,7 @@ def physics_advance(hand: Any) -> Callable[..., Any]:
     """
     from c_scene import CONVERGED, GRAVITY
 
-    from dexsim.objects import SLOTS, ObjectConfig
+    from dexsim.object_config import SLOTS, ObjectConfig
     from dexsim.physics import Physics, PhysicsConfig
 
     seam = Physics(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(substeps=1, **CONVERGED),

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from dexsim.config import check_ranges, from_dict, setting, to_dict, validate
 from dexsim.errors import ConfigError, DexsimError
-from dexsim.objects import ObjectConfig
+from dexsim.object_config import ObjectConfig
 from dexsim.physics import PhysicsConfig
 from dexsim.randomization import Randomization
 from dexsim.tactile import Skin, TaxelSensor

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from dexsim import contact
-from dexsim.objects import OFF, SHAPES, SLOTS, ObjectConfig, damping_ratio
+from dexsim.object_config import OFF, SHAPES, SLOTS, ObjectConfig
+from dexsim.objects import damping_ratio
 from dexsim.physics import Physics, PhysicsConfig, build_model
 from dexsim.tactile import Skin
 from dexsim.tasks.grasp import Grasp, GraspConfig

@@ -15,7 +15,7 @@ from dexsim import observation, rotations, tactile
 from dexsim.env import Control, EnvConfig, Sensing
 from dexsim.errors import ConfigError
 from dexsim.hand import forward_kinematics, taxel_positions
-from dexsim.objects import SHAPES, SLOTS, ObjectConfig
+from dexsim.object_config import SHAPES, SLOTS, ObjectConfig
 from dexsim.physics import PhysicsState
 from dexsim.randomization import Randomization
 from dexsim.sensing import Sensors

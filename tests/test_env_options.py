@@ -14,7 +14,7 @@ from dexsim import observation, rotations
 from dexsim.env import Sensing
 from dexsim.errors import ConfigError
 from dexsim.hand import forward_kinematics, taxel_normals
-from dexsim.objects import ObjectConfig
+from dexsim.object_config import ObjectConfig
 from dexsim.observation import ObservationConfig
 from dexsim.orientation_sensor import OrientationSensor
 from dexsim.randomization import Randomization

@@ -16,7 +16,7 @@ from dexsim import tactile
 from dexsim.env import Moment
 from dexsim.errors import ConfigError
 from dexsim.hand import forward_kinematics
-from dexsim.objects import SHAPES, ObjectConfig
+from dexsim.object_config import SHAPES, ObjectConfig
 from dexsim.physics import PhysicsConfig
 from dexsim.tasks import TASKS
 from dexsim.tasks.grasp import (

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from dexsim.objects import SHAPES
+from dexsim.object_config import SHAPES
 from dexsim.tasks import grasp_report as report
 
 PERIOD = 0.1  # s

@@ -13,10 +13,11 @@ import dexsim
 from dexsim import distance, mesh, object_mesh, rotations, sdf
 from dexsim.errors import AssetError, ConfigError
 from dexsim.mesh_fit import fit_boxes
-from dexsim.objects import KINDS, ObjectConfig, narrow, plain_inertia, sample_object
+from dexsim.object_config import KINDS, ObjectConfig
+from dexsim.objects import narrow, plain_inertia, sample_object
 from dexsim.randomization_effects import check
 from dexsim.tasks.grasp import GraspConfig
-from dexsim.tasks.rotate import RotateConfig
+from dexsim.tasks.rotate_config import RotateConfig
 
 WORLDS = 4
 BARS = sdf.Shape(("box", "box"), jnp.array([[0.03, 0.01, 0.015], [0.01, 0.025, 0.015]]),

@@ -9,16 +9,8 @@ import pytest
 
 from dexsim import objects, sdf
 from dexsim.errors import ConfigError
-from dexsim.objects import (
-    SHAPES,
-    SLOTS,
-    ObjectConfig,
-    bounding_radius,
-    damping_ratio,
-    extent,
-    plain_inertia,
-    sample_object,
-)
+from dexsim.object_config import SHAPES, SLOTS, ObjectConfig
+from dexsim.objects import bounding_radius, damping_ratio, extent, plain_inertia, sample_object
 
 BOX, CAPSULE, CYLINDER = range(3)
 ACTIVE = {"sphere": {(0, 1, 0)}, "box": {(1, 0, 0)}, "cylinder": {(0, 0, 1)}, "capsule": {(0, 1, 0)},

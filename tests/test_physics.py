@@ -17,7 +17,7 @@ from mujoco import mjx
 from dexsim.errors import AssetError, ConfigError
 from dexsim.hand import load_hand
 from dexsim.model_guard import check_model
-from dexsim.objects import SHAPES, SLOTS, ObjectConfig
+from dexsim.object_config import SHAPES, SLOTS, ObjectConfig
 from dexsim.physics import Physics, PhysicsConfig, PhysicsState, build_model, choose_backend
 
 WORLDS = 8
@@ -65,7 +65,7 @@ def error(found):
 class TestAgainstC:
     @pytest.mark.parametrize("shape", ["sphere", "capsule"])
     def test_a_sub_step_in_contact(self, contact_steps, shape):
-        """Contacts of capsules with capsules and the palm's plane have one answer.
+        """Contacts of spheres and capsules with capsules and the palm's plane have one answer.
 
         What is left is float32: contact depths of 1e-7 m under springs of some 1e4 N/m move
         forces by 1e-3 N, and velocities of 1e-5 kg m^2 links by 1e-3.
@@ -78,7 +78,7 @@ class TestAgainstC:
         np.testing.assert_allclose(found.position, found.c_position, atol=3e-5)
 
     def test_a_sub_step_in_contact_with_a_box(self, contact_steps):
-        """A capsule lies on a face along a line; the engines pick other pairs of points on it."""
+        """A link's capsule lies on a face along a line; the engines pick other pairs of points on it."""
         wrong, strength = error(contact_steps["box"])
         assert np.sum(strength > 0.5) >= 5
         assert np.mean(wrong < 0.02 + strength / 3) > 0.8, (wrong, strength)

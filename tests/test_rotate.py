@@ -17,8 +17,9 @@ from dexsim.errors import ConfigError
 from dexsim.hand import forward_kinematics
 from dexsim.orientation_sensor import OrientationSensor, draw_sensor, measure_orientation
 from dexsim.sdf import signed_distance
-from dexsim.tasks import rotate, rotate_report, rotate_start
-from dexsim.tasks.rotate import Rotate, RotateConfig, RotateReward
+from dexsim.tasks import rotate, rotate_config, rotate_report, rotate_start
+from dexsim.tasks.rotate import Rotate
+from dexsim.tasks.rotate_config import RotateConfig, RotateReward
 
 PERIOD = RotateConfig().physics.control_period
 
@@ -145,7 +146,7 @@ class TestReward:
                 np.testing.assert_allclose(found, expected, rtol=2e-4)
 
     def test_the_papers_reward_is_its_three_terms(self, hand):
-        task = Rotate(rotate.paper(), hand)
+        task = Rotate(rotate_config.paper(), hand)
         goal = task.begin(jax.random.key(0), None)
         action = np.linspace(-1, 1, 12).astype(np.float32)
         busy = dict(action=action, joint_velocity=np.full(12, 3.0), joint_torque=np.full(12, 0.5),
@@ -234,7 +235,7 @@ class TestDrop:
             np.testing.assert_allclose(found, low, atol=1e-6)
 
     def test_on_the_palm_is_dropped_when_held_by_fingers(self, hand):
-        task = Rotate(rotate.clear_of_palm(), hand)
+        task = Rotate(rotate_config.clear_of_palm(), hand)
         goal = task.begin(jax.random.key(0), None)
         here = moment(task)
         half = float(here.target.size[0, 0])

@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from dexsim.objects import SHAPES, SLOTS
+from dexsim.object_config import SHAPES, SLOTS
 from dexsim.tactile import Skin
 from dexsim.tasks.grasp import Grasp, GraspConfig
 from dexsim.tasks.grasp_start import make_pool

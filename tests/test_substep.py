@@ -12,7 +12,7 @@ import pytest
 from c_scene import GRAVITY
 
 from dexsim import collide, newton
-from dexsim.objects import SLOTS, ObjectConfig
+from dexsim.object_config import SLOTS, ObjectConfig
 from dexsim.physics import Physics, PhysicsConfig, PhysicsState
 
 SIZES = {"sphere": "0.02", "capsule": "0.012 0.02", "box": "0.02 0.015 0.03", "cylinder": "0.02 0.025"}

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from simple_physics import SimplePhysics
 
-from dexsim.objects import ObjectConfig
+from dexsim.object_config import ObjectConfig
 from dexsim.tasks import TASKS, TaskEntry
 from dexsim.tasks.grasp import Grasp, GraspConfig
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from c_scene import CONVERGED, GRAVITY, row, rows_of, squeeze, stack
 
-from dexsim.objects import SHAPES, SLOTS, ObjectConfig
+from dexsim.object_config import SHAPES, SLOTS, ObjectConfig
 from dexsim.physics import Physics, PhysicsConfig, PhysicsState
 
 pytest.importorskip("warp")

@@ -18,17 +18,18 @@ class TaskEntry:
 
 
 def _tasks() -> dict[str, TaskEntry]:
-    from dexsim.tasks import rotate
+    from dexsim.tasks import rotate_config
     from dexsim.tasks.grasp import Grasp, GraspConfig
+    from dexsim.tasks.rotate import Rotate
 
     def rotation(config: Callable[[], Any]) -> TaskEntry:
-        return TaskEntry(rotate.RotateConfig, rotate.Rotate, config)
+        return TaskEntry(rotate_config.RotateConfig, Rotate, config)
 
     return {"grasp": TaskEntry(GraspConfig, Grasp, GraspConfig),
-            "rotate": rotation(rotate.RotateConfig),
-            "rotate_paper": rotation(rotate.paper),
-            "rotate_without_orientation": rotation(rotate.without_orientation),
-            "rotate_clear": rotation(rotate.clear_of_palm)}
+            "rotate": rotation(rotate_config.RotateConfig),
+            "rotate_paper": rotation(rotate_config.paper),
+            "rotate_without_orientation": rotation(rotate_config.without_orientation),
+            "rotate_clear": rotation(rotate_config.clear_of_palm)}
 
 
 TASKS = _tasks()

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from dexsim.objects import KINDS
+from dexsim.object_config import KINDS
 from dexsim.statistics import bootstrap, mean, proportion, statistic
 
 _SETTLE = 3.0  # s after release from which forces count

@@ -10,7 +10,8 @@ import numpy as np
 from dexsim import compilation, rotations, sdf
 from dexsim.errors import ConfigError
 from dexsim.hand import Hand, flexion_joints, forward_kinematics
-from dexsim.objects import KINDS, extent, sample_object
+from dexsim.object_config import KINDS
+from dexsim.objects import extent, sample_object
 
 _OVERLAP = 0.001  # m, hand and object may start this deep in each other
 

@@ -27,7 +27,8 @@ from dexsim.config import to_dict
 from dexsim.errors import ConfigError
 from dexsim.files import write_whole
 from dexsim.hand import Hand, flexion_joints
-from dexsim.objects import SHAPES, ObjectParams, extent, load_mesh_object, sample_object
+from dexsim.object_config import SHAPES, load_mesh_object
+from dexsim.objects import ObjectParams, extent, sample_object
 from dexsim.physics_model import build_model, tip_bodies
 from dexsim.tasks.grasp_start import clearance, palm_height
 

@@ -13,7 +13,8 @@ from dexsim.errors import ConfigError
 from dexsim_ppo import adam, distribution, running_stats
 from dexsim_ppo.gae import compute_gae
 from dexsim_ppo.networks import apply_mlp, init_mlp, rescale_output
-from dexsim_ppo.ppo import PPOConfig, adapt_learning_rate
+from dexsim_ppo.ppo import adapt_learning_rate
+from dexsim_ppo.ppo_config import PPOConfig
 from dexsim_ppo.running_stats import RunningStats, init_stats, make_normalizer, normalize, update_stats
 from dexsim_ppo.types import Field
 

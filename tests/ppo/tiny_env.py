@@ -14,7 +14,7 @@ import numpy as np
 
 from dexsim.config import setting, validate
 from dexsim.pytree import pytree_dataclass
-from dexsim_ppo.ppo import PPOConfig
+from dexsim_ppo.ppo_config import PPOConfig
 from dexsim_ppo.types import Field
 
 # Learners: one that solves the task, and one that is quick to compile.

@@ -1,0 +1,154 @@
+"""Settings of the rotation task, and its variants by name."""
+
+import dataclasses
+import math
+
+import numpy as np
+
+from dexsim.config import check_ranges, setting, validate
+from dexsim.env import Control, EnvConfig
+from dexsim.errors import ConfigError
+from dexsim.object_config import ObjectConfig
+from dexsim.observation import ObservationConfig
+from dexsim.tasks.rotate_start import KINDS
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RotateReward:
+    """Weights of the reward terms, per control tick."""
+
+    goal: float = setting(1.0, unit="rad", low=0.0, high=1000.0)
+    """Close to goal: 1 / (d_rot + epsilon), gated by the distance from the reference."""
+    epsilon: float = setting(0.1, unit="rad", low=1e-3, high=10.0)
+    """Floor under the angle in it."""
+    gate: float = setting(0.05, unit="m", low=0.001, high=1.0)
+    """Distance from the reference at which the gate is half closed."""
+    gate_steepness: float = setting(400.0, unit="1/m", low=1.0, high=1e5)
+    """How sharply it closes."""
+    bonus: float = setting(250.0, unit="1", low=0.0, high=1e5)
+    """Once for each goal reached."""
+    action: float = setting(-0.01, unit="1", low=-1000.0, high=0.0)
+    """Squared change of the action."""
+    velocity: float = setting(-0.018, unit="s^2/rad^2", low=-1000.0, high=0.0)
+    """Squared joint velocity."""
+    torque: float = setting(-0.1, unit="1/Nm^2", low=-1000.0, high=0.0)
+    """Squared joint torque."""
+    spin: float = setting(1.0, unit="s/rad", low=0.0, high=1000.0)
+    """Spin about the axis in the wanted direction, up to +-1 rad/s: a gradient before the first
+    goal is ever reached."""
+    fingertips: float = setting(0.5, unit="1", low=0.0, high=1000.0)
+    """Share of `working_tips` fingertips that have done their share of touching lately."""
+    working_tips: int = setting(3, unit="1", low=1, high=20)
+    """Fingertips that are asked to take part."""
+    working_duty: float = setting(0.25, unit="1", low=0.001, high=1.0)
+    """Share of the time for which one has to touch to earn all of that."""
+    drop: float = setting(-50.0, unit="1", low=-10000.0, high=0.0)
+    """Once, when the object is lost."""
+
+    def __post_init__(self):
+        validate(self)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RotateConfig(EnvConfig):
+    """The rotation task."""
+
+    objects: ObjectConfig = setting(ObjectConfig(
+        shapes=("box",), mass=(0.06, 0.15), friction=(0.6, 1.2), com_offset=0.003))
+    """Mass, inertia, centre of mass, friction and contact of the object; its sizes are `edge`."""
+    control: Control = setting(Control(step=0.08, recall="target"))
+    """From action to joint target."""
+    object: str = setting("cube", choices=(*KINDS, "mesh"))
+    """What is turned: a cube, an upright cylinder, an eight-cornered union of two boxes, or `objects.mesh`."""
+    edge: tuple[float, float] = setting((0.050, 0.060), unit="m", low=0.02, high=0.12)
+    """Edge of the cube; width and height of the others."""
+    axis: tuple[float, float, float] = setting((1.0, 0.0, 0.0), unit="1", low=-1.0, high=1.0)
+    """Axis of rotation in the palm frame; (1, 0, 0) is the palm's normal."""
+    direction: int = setting(1, unit="1", low=-1, high=1)
+    """+1 or -1: sense of rotation about the axis."""
+    goal_step: float = setting(math.pi / 2, unit="rad", low=0.1, high=math.pi)
+    """Angle between two goals."""
+    goal_angle: float = setting(0.3, unit="rad", low=0.01, high=1.5)
+    """A goal is reached within this angle ..."""
+    goal_distance: float = setting(0.05, unit="m", low=0.001, high=0.5)
+    """... this far from the reference ..."""
+    goal_spin: float = setting(2.0, unit="rad/s", low=0.0, high=1000.0)
+    """... at no more than this spin about the axis (0: any) ..."""
+    goal_dwell: float = setting(0.0, unit="s", low=0.0, high=10.0)
+    """... held for this long."""
+    support: str = setting("palm", choices=("palm", "fingers"))
+    """Carried by the palm, or held clear of it by the fingers: then touching the palm is a drop."""
+    tilt: float = setting(0.2, unit="rad", low=-1.2, high=1.2)
+    """The hand's nominal pitch: positive lets the object slide toward the wrist."""
+    reference: tuple[float, float, float] = setting((0.047, 0.0, 0.071), unit="m", low=-0.5,
+                                                    high=0.5)
+    """Where the object belongs."""
+    drop_distance: float = setting(0.07, unit="m", low=0.01, high=1.0)
+    """The object is lost when its centre is farther than this from the reference ..."""
+    drop_tilt: float = setting(1.0, unit="rad", low=0.1, high=3.2)
+    """... or when it has tipped over: its own axis is farther than this from the axis of rotation,
+    and no goal can be reached any more."""
+    patience: float = setting(4.0, unit="s", low=0.1, high=1e6)
+    """A training episode without a new goal for this long is given up, as a drop is: else policies
+    learn to turn once and then hold still. Evaluations wait for ever."""
+    clearance: float = setting(0.001, unit="m", low=0.0, high=0.05)
+    """Smallest gap between palm and object with support "fingers"."""
+    episode_seconds: float = setting(60.0, unit="s", low=0.2, high=3600.0)
+    """Time limit of a training episode."""
+    evaluation_seconds: float = setting(120.0, unit="s", low=0.2, high=3600.0)
+    """Length of an evaluation episode."""
+    push_probability: float = setting(0.005, unit="1", low=0.0, high=1.0)
+    """Probability per tick of a push on the object."""
+    push_speed: float = setting(0.1, unit="m/s", low=0.0, high=5.0)
+    """Largest change of the object's speed by a push."""
+    posture: tuple[float, ...] = setting(
+        (1.0, 0.2, 0.3, 0.0, 0.8, 0.5, 0.8, 0.5, 0.8, 0.5, 0.8, 0.5), unit="rad",
+        low=-3.2, high=3.2)
+    """Joint angles that episodes start near."""
+    posture_noise: float = setting(0.15, unit="rad", low=0.0, high=1.0)
+    """Largest deviation from them."""
+    curl: tuple[float, float] = setting((0.0, 0.0), unit="rad", low=-2.0, high=2.0)
+    """Added to all joints of the four fingers alike."""
+    squeeze: tuple[float, float] = setting((0.0, 0.0), unit="rad", low=-1.0, high=1.0)
+    """How far the joint targets of thumb and fingers lie beyond that posture: the grip."""
+    heading_noise: float = setting(0.7, unit="rad", low=0.0, high=math.pi)
+    """Largest turn of the object about the axis at the start."""
+    place_noise: float = setting(0.006, unit="m", low=0.0, high=0.05)
+    """Largest shift of the object along the palm at the start."""
+    settle_seconds: float = setting(0.8, unit="s", low=0.05, high=10.0)
+    """Time that start states are given to come to rest; those that do not are left out."""
+    reward: RotateReward = setting(RotateReward())
+    """Reward weights."""
+
+    def __post_init__(self):
+        validate(self)
+        check_ranges(self, "edge", "curl", "squeeze")
+        if self.direction == 0:
+            raise ConfigError("RotateConfig.direction = 0: must be +1 or -1")
+        if np.linalg.norm(self.axis) < 1e-6:
+            raise ConfigError("RotateConfig.axis is (0, 0, 0): give a direction")
+        if (self.object == "mesh") != bool(self.objects.mesh):
+            raise ConfigError(f"RotateConfig.object = {self.object!r} with ObjectConfig.mesh = {self.objects.mesh!r}: "
+                              "a mesh needs object 'mesh' and the name of its file")
+
+
+def paper() -> RotateConfig:
+    """The paper's own weights and success test."""
+    return RotateConfig(
+        goal_spin=0.0, drop_distance=0.09, drop_tilt=math.pi, patience=1e6, control=Control(step=0.3, recall="target"),
+        reward=RotateReward(action=-0.0002, velocity=0.0, torque=0.0, spin=0.0, fingertips=0.0,
+                            drop=0.0))
+
+
+def without_orientation() -> RotateConfig:
+    """The paper's second policy: the object's orientation is not observed."""
+    return RotateConfig(observation=ObservationConfig(leave_out=("relative_orientation",)))
+
+
+def clear_of_palm() -> RotateConfig:
+    """The object held clear of the palm by thumb and fingers, which point downhill."""
+    return RotateConfig(
+        reward=RotateReward(fingertips=0.0, spin=2.0), support="fingers", tilt=-0.6,
+        reference=(0.058, 0.0, 0.086), squeeze=(0.1, 0.4),
+        posture=(1.2, 0.4, 0.4, 0.0, 0.6, 0.5, 0.6, 0.5, 0.6, 0.5, 0.6, 0.5), posture_noise=0.25,
+        curl=(-0.2, 0.2))
