@@ -6,6 +6,7 @@ its distance function says, and a capsule at the one or two ends of that stretch
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 
 import jax
@@ -26,19 +27,55 @@ _SLOPE, _SAME = 1e-3, 1e-3
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Group:
-    """Pairs of one kind of geom with one kind of primitive."""
+class Balls:
+    """Pairs of the hand's spheres and capsules with one kind of primitive.
 
-    find: Callable[..., tuple[jax.Array, jax.Array, jax.Array]]
-    first: np.ndarray  # [P] geoms of the hand
-    second: np.ndarray  # [P] primitives
+    A capsule is met as the balls at the ends of its nearest stretch, so all are balls in the end.
+    """
+
+    kind: str
+    sphere: np.ndarray  # [S, 2] geoms of the hand and primitives
+    capsule: np.ndarray  # [P, 2]
+
+    def find(self, position: jax.Array, rotation: jax.Array,
+             size: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Gaps [S + 2 P], points and normals [S + 2 P, 3]; see `Collider.touch`."""
+        mine, other = self.sphere.T
+        centre, radius, same = position[mine], size[mine, 0], np.zeros(len(mine), bool)
+        if len(self.capsule):
+            mine, theirs = self.capsule.T
+            ends, one = jax.vmap(functools.partial(_nearest_stretch, self.kind))(
+                position[mine], rotation[mine][:, :, 2], size[mine, 1], position[theirs], rotation[theirs],
+                size[theirs])
+            centre = jnp.concatenate([centre, ends.reshape(-1, 3)])
+            radius = jnp.concatenate([radius, jnp.repeat(size[mine, 0], 2)])
+            # A stretch that is a point has one end.
+            same = jnp.concatenate([same, jnp.stack([jnp.zeros_like(one), one], -1).reshape(-1)])
+            other = np.concatenate([other, np.repeat(theirs, 2)])
+        gap, point, normal = jax.vmap(functools.partial(_ball, self.kind))(
+            centre, radius, position[other], rotation[other], size[other])
+        return jnp.where(same, sdf.FAR, gap), point, normal
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Planes:
+    """Pairs of planes of the hand with one kind of primitive."""
+
+    meet: Callable[..., tuple[jax.Array, jax.Array, jax.Array]]
+    pairs: np.ndarray  # [P, 2] planes and primitives
+
+    def find(self, position: jax.Array, rotation: jax.Array,
+             size: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """As `Balls.find`."""
+        planes, others = ((position[g], rotation[g], size[g]) for g in self.pairs.T)
+        return tuple(part.reshape(-1, *part.shape[2:]) for part in jax.vmap(self.meet)(*planes, *others))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Collider:
     """What may touch what: `touch` finds the candidates, of which candidate c belongs to `pair[c]`."""
 
-    groups: tuple[Group, ...]
+    groups: tuple[Balls | Planes, ...]
     pair: np.ndarray  # [C] index of the explicit pair
 
     def touch(self, position: jax.Array, rotation: jax.Array,
@@ -52,58 +89,44 @@ class Collider:
           Distances [C] m (negative inside), points [C, 3] m midway between the surfaces, and unit
           normals [C, 3] from the pair's first geom to its second.
         """
-        found = []
-        for group in self.groups:
-            geoms = [(position[g], rotation[g], size[g]) for g in (group.first, group.second)]
-            parts = jax.vmap(group.find)(*geoms[0], *geoms[1])
-            found.append([part.reshape(-1, *part.shape[2:]) for part in parts])
+        found = [group.find(position, rotation, size) for group in self.groups]
         return tuple(jnp.concatenate(parts) for parts in zip(*found, strict=True))
 
 
 def find_collider(model: mujoco.MjModel) -> Collider | None:
     """The collider of a model's explicit pairs; None if one of them has no closed form here."""
-    pairs: dict[tuple[str, str], list[int]] = {}
+    rows: dict[tuple[str, str], list[int]] = {}
     for pair in range(model.npair):
         first, second = (KINDS.get(int(model.geom_type[geoms[pair]]), "")
                          for geoms in (model.pair_geom1, model.pair_geom2))
         if first not in ("plane", "sphere", "capsule") or second not in sdf.KINDS:
             return None
-        pairs.setdefault((first, second), []).append(pair)
+        rows.setdefault((first, second), []).append(pair)
+    geoms = np.stack([model.pair_geom1, model.pair_geom2], -1)
     groups, order = [], []
-    for (first, second), rows in pairs.items():
-        find, count = _finder(first, second)
-        groups.append(Group(find, model.pair_geom1[rows], model.pair_geom2[rows]))
-        order.append(np.repeat(rows, count))
+    for second in dict.fromkeys(second for _, second in rows):
+        plane, sphere, capsule = (np.array(rows.get((first, second), []), int)
+                                  for first in ("plane", "sphere", "capsule"))
+        if plane.size:
+            meet, count = _PLANE[second]
+            groups.append(Planes(meet, geoms[plane]))
+            order.append(np.repeat(plane, count))
+        if sphere.size or capsule.size:
+            groups.append(Balls(second, geoms[sphere], geoms[capsule]))
+            order += [sphere, np.repeat(capsule, 2)]
     return Collider(tuple(groups), np.concatenate(order)) if groups else None
 
 
-def _finder(first: str, second: str) -> tuple[Callable, int]:
-    """A function of one pair, and how many candidates it returns."""
-    if first == "plane":
-        return {"sphere": (_plane_sphere, 1), "capsule": (_plane_capsule, 2), "box": (_plane_box, 8),
-                "cylinder": (_plane_cylinder, 4), "ellipsoid": (_plane_ellipsoid, 1)}[second]
-
-    def sphere(centre, _, size, position, rotation, other):
-        return _balls(second, centre[None], size[0], position, rotation, other)
-
-    def capsule(centre, turn, size, position, rotation, other):
-        ends, same = _nearest_stretch(second, centre, turn[:, 2], size[1], position, rotation, other)
-        gap, point, normal = _balls(second, ends, size[0], position, rotation, other)
-        return gap.at[1].set(jnp.where(same, sdf.FAR, gap[1])), point, normal
-
-    return (sphere, 1) if first == "sphere" else (capsule, 2)
-
-
-def _balls(kind: str, centre: jax.Array, radius: jax.Array, position: jax.Array, rotation: jax.Array,
-           size: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Balls round `centre` [N, 3] against one primitive."""
-    local = sdf.to_local(centre, position, rotation)
+def _ball(kind: str, centre: jax.Array, radius: jax.Array, position: jax.Array, rotation: jax.Array,
+          size: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """A ball round `centre` [3] against one primitive."""
+    local = sdf.to_local(centre[None], position, rotation)
     gap, pullback = jax.vjp(lambda p: sdf.primitive_distance(kind, p, size), local)
     (outward,) = pullback(jnp.ones_like(gap))
-    outward = outward / jnp.sqrt(jnp.sum(outward**2, -1, keepdims=True) + 1e-12)
-    normal = -jnp.stack([sum(rotation[row, k] * outward[:, k] for k in range(3)) for row in range(3)], -1)
-    gap = gap - radius
-    return gap, centre + normal * (radius + 0.5 * gap)[:, None], normal
+    outward = outward[0] / jnp.sqrt(jnp.sum(outward[0] ** 2) + 1e-12)
+    normal = -jnp.stack([sum(rotation[row, k] * outward[k] for k in range(3)) for row in range(3)])
+    gap = gap[0] - radius
+    return gap, centre + normal * (radius + 0.5 * gap), normal
 
 
 def _nearest_stretch(kind: str, centre: jax.Array, axis: jax.Array, half: jax.Array, position: jax.Array,
@@ -173,3 +196,8 @@ def _plane_cylinder(position, rotation, _, centre, turn, size):
     axis = axis * size[1]
     points = jnp.stack([axis + down, down - axis, axis - 0.5 * down + side, axis - 0.5 * down - side])
     return _on_plane(position, rotation, centre + points)
+
+
+# How a plane meets a primitive, in how many points.
+_PLANE = {"sphere": (_plane_sphere, 1), "capsule": (_plane_capsule, 2), "box": (_plane_box, 8),
+          "cylinder": (_plane_cylinder, 4), "ellipsoid": (_plane_ellipsoid, 1)}

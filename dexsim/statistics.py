@@ -16,8 +16,9 @@ def proportion(hits: np.ndarray) -> dict:
     scale = 1 + _Z * _Z / n
     middle = (p + _Z * _Z / (2 * n)) / scale
     half = _Z * np.sqrt(p * (1 - p) / n + _Z * _Z / (4 * n * n)) / scale
-    return {"mean": p, "low": float(max(middle - half, 0.0)),
-            "high": float(min(middle + half, 1.0)), "count": n}
+    # None and all: the ends are exact, but for rounding.
+    low, high = 0.0 if p == 0 else middle - half, 1.0 if p == 1 else middle + half
+    return {"mean": p, "low": float(low), "high": float(high), "count": n}
 
 
 def mean(values: np.ndarray, samples: int = 500) -> dict:
