@@ -32,7 +32,7 @@ train: $(INSTALLED)
 	$(PY) -m dexsim_ppo.train --task grasp $(ARGS)
 
 test: $(TESTABLE)
-	$(PY) -m pytest -n 2 --dist loadfile $(ARGS)
+	$(PY) -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)
 
 lint: $(LINTABLE)
 	$(PY) -m ruff check $(ARGS)
