@@ -181,16 +181,15 @@ def test_ppo_trains_on_a_point():
 
 @pytest.mark.parametrize("physics", ["simple", pytest.param("mjx", marks=pytest.mark.long)])
 def test_ppo_runs_on_grasp(physics, grasp_env, monkeypatch):
-    """The task itself under brax's wrappers and learner; brax compiles it twice, which takes minutes for MJX."""
+    """The task itself under brax's wrappers and learner. Its evaluations compile the task once more: the point's do."""
     env = grasp_env
     if physics == "simple":
         monkeypatch.setattr("dexsim.env.Physics", SimplePhysics)
         env = dexsim.make("grasp", GraspConfig(pool_size=20), backend="jax")
     history, params = train(
         BraxEnv(env), num_timesteps=3 * 8 * 4, episode_length=8, num_envs=8, batch_size=4,
-        num_minibatches=2, unroll_length=4, num_eval_envs=8, discounting=0.97)
+        num_minibatches=2, unroll_length=4, run_evals=False, discounting=0.97)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(params))
-    assert np.isfinite(history[-1]["eval/episode_reward"])
     assert np.isfinite(history[-1]["training/total_loss"])
 
 
