@@ -255,7 +255,7 @@ def kills(options: argparse.Namespace) -> bool:
             time.sleep(2 * options.safe)
         report = twin.stop()
         rows = [autopsy(log, death) for log, death in zip(logs, deaths, strict=True)]
-    off = [motors_off(report, death) for death in deaths]
+    off = [motors_off(report, death, death + 2 * options.safe) for death in deaths]
     running = [delay for delay in off if delay is not None]
     lost, commands = [row["lost"] for row in rows], report["commands"]
     checks = {
@@ -293,15 +293,21 @@ def autopsy(path: Path, death: float) -> dict:
     return row
 
 
-def motors_off(report: dict, death: float) -> float | None:
-    """Seconds from a death until the watchdog had the motors off; None where they were off already."""
+def motors_off(report: dict, death: float, until: float = float("inf")) -> float | None:
+    """Seconds from a death until the motors were off; None where they were off already, infinity if not by `until`.
+
+    A request on the wire at the moment of death may still switch them on.
+    """
     on = False
     for when, text in report["events"]:
-        if when >= death and on:
-            return when - death if text.startswith("watchdog") else float("inf")
-        if when >= death:
-            return None
-        on = text == "motors on" or (on and not text.startswith(("motors off", "watchdog")))
+        if when >= until:
+            break
+        if text == "motors on":
+            on = True
+        elif text.startswith(("motors off", "watchdog")):
+            if on and when >= death:
+                return when - death
+            on = False
     return float("inf") if on else None
 
 

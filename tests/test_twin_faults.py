@@ -337,3 +337,15 @@ def test_two_runners_die(soak, capsys):
     row = json.loads(capsys.readouterr().out)
     assert code == 0, (row["failed"], row["first"], row)
     assert row["kills"] == 2 and row["commands"] > 50
+
+
+@pytest.mark.parametrize("events, wanted", [
+    ([(1.0, "motors on"), (5.07, "watchdog: no exchange for 80 ms, motors off")], 0.07),
+    ([(1.0, "motors on"), (5.01, "this machine is too slow"), (5.07, "watchdog: late, motors off")], 0.07),
+    ([(5.02, "motors on"), (5.09, "watchdog: late, motors off"), (6.0, "motors on")], 0.09),
+    ([(1.0, "motors on"), (2.0, "motors off"), (6.0, "motors on")], None),
+    ([(1.0, "motors on"), (5.3, "watchdog: late, motors off")], np.inf), ([(1.0, "motors on")], np.inf)])
+def test_when_the_motors_were_off(soak, events, wanted):
+    """A runner dies at 5 s, and 0.2 s later the next one may begin."""
+    found = soak.motors_off({"events": events}, 5.0, 5.2)
+    assert found == (wanted if wanted is None else pytest.approx(wanted))
