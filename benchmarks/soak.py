@@ -293,7 +293,7 @@ def autopsy(path: Path, death: float) -> dict:
     return row
 
 
-def motors_off(report: dict, death: float, until: float = float("inf")) -> float | None:
+def motors_off(report: dict, death: float, until: float) -> float | None:
     """Seconds from a death until the motors were off; None where they were off already, infinity if not by `until`.
 
     A request on the wire at the moment of death may still switch them on.

@@ -15,8 +15,8 @@ import numpy as np
 
 from dexsim import collide, newton, rotations
 
-# Newton steps beyond the configured ones, which are cheap here. Of 9,600 sub-steps of grips, half of them
-# disturbed, three steps leave 42 % more than 1 mrad/s from where the solver converges, six 7 %, ten 0.3 %.
+# Newton steps beyond the configured ones: they are cheap here, and with few of them some grips stay unsettled
+# between sticking and sliding, where rounding decides (docs/decisions.md).
 # MJX's line search looks at three points in each of its steps, this one at one.
 _MORE_STEPS = 7
 _JOINTS = (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)

@@ -25,8 +25,10 @@ os.environ.setdefault("MPLBACKEND", "agg")
 if not ON_GPU and "PYTEST_XDIST_WORKER" not in os.environ:
     # Each about halves the compilation of a physics step, which is most of what the suite does. XLA ends the
     # process over a flag that it does not know, and versions know different ones: a process that may end tries.
-    for flag in ("--xla_backend_optimization_level=1", "--xla_cpu_use_fusion_emitters=false"):
-        wanted = f"{os.environ.get('XLA_FLAGS', '')} {flag}".strip()
+    from dexsim.compilation import LIGHT
+
+    for option, value in LIGHT:
+        wanted = f"{os.environ.get('XLA_FLAGS', '')} --{option}={str(value).lower()}".strip()
         if not subprocess.run([sys.executable, "-c", "import jax; jax.devices()"], capture_output=True,
                               env={**os.environ, "XLA_FLAGS": wanted}).returncode:
             os.environ["XLA_FLAGS"] = wanted
