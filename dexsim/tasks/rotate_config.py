@@ -29,7 +29,7 @@ class RotateReward:
     """Once for each goal reached."""
     action: float = setting(-0.01, unit="1", low=-1000.0, high=0.0)
     """Squared change of the action."""
-    velocity: float = setting(-0.018, unit="s^2/rad^2", low=-1000.0, high=0.0)
+    velocity: float = setting(-0.022, unit="s^2/rad^2", low=-1000.0, high=0.0)
     """Squared joint velocity."""
     torque: float = setting(-0.1, unit="1/Nm^2", low=-1000.0, high=0.0)
     """Squared joint torque."""
@@ -78,7 +78,7 @@ class RotateConfig(EnvConfig):
     """... held for this long."""
     support: str = setting("palm", choices=("palm", "fingers"))
     """Carried by the palm, or held clear of it by the fingers: then touching the palm is a drop."""
-    tilt: float = setting(0.2, unit="rad", low=-1.2, high=1.2)
+    tilt: float = setting(-0.15, unit="rad", low=-1.2, high=1.2)
     """The hand's nominal pitch: positive lets the object slide toward the wrist."""
     reference: tuple[float, float, float] = setting((0.047, 0.0, 0.071), unit="m", low=-0.5,
                                                     high=0.5)
