@@ -197,12 +197,12 @@ class Rotate:
         """The reward of a tick and its terms; nothing but penalties once dropped."""
         weights, now, held = self.config.reward, self.progress(goal, moment), 1.0 - dropped
         after = self._advance(goal, moment)
+        work = tips_at_work(after.duty, weights.working_tips, weights.working_duty)
         terms = {
             "goal": held * weights.goal * goal_reward(now.angle, now.distance, weights),
-            "bonus": held * weights.bonus * now.success,
+            "bonus": held * weights.bonus * now.success * (1.0 - weights.bonus_tips * (1.0 - work)),
             "spin": held * weights.spin * jnp.clip(now.spin, -1.0, 1.0),
-            "fingertips": held * weights.fingertips * tips_at_work(
-                after.duty, weights.working_tips, weights.working_duty),
+            "fingertips": held * weights.fingertips * work,
             "action": weights.action * action_rate(moment.action, moment.last_action),
             "velocity": weights.velocity * joint_speed(moment.joint_velocity),
             "torque": weights.torque * jnp.sum(moment.joint_torque**2),

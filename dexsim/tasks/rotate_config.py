@@ -26,7 +26,10 @@ class RotateReward:
     gate_steepness: float = setting(400.0, unit="1/m", low=1.0, high=1e5)
     """How sharply it closes."""
     bonus: float = setting(250.0, unit="1", low=0.0, high=1e5)
-    """Once for each goal reached."""
+    """Once for each goal reached ..."""
+    bonus_tips: float = setting(0.5, unit="1", low=0.0, high=1.0)
+    """... of which this share is for `working_tips` fingertips that take part: unlike `fingertips`, nothing
+    that a hand can earn by standing still."""
     action: float = setting(-0.01, unit="1", low=-1000.0, high=0.0)
     """Squared change of the action."""
     velocity: float = setting(-0.022, unit="s^2/rad^2", low=-1000.0, high=0.0)
@@ -105,15 +108,15 @@ class RotateConfig(EnvConfig):
         (1.0, 0.2, 0.3, 0.0, 0.8, 0.5, 0.8, 0.5, 0.8, 0.5, 0.8, 0.5), unit="rad",
         low=-3.2, high=3.2)
     """Joint angles that episodes start near."""
-    posture_noise: float = setting(0.15, unit="rad", low=0.0, high=1.0)
-    """Largest deviation from them."""
+    posture_noise: float = setting(0.4, unit="rad", low=0.0, high=1.0)
+    """Largest deviation from them: wide, so that where one stroke ends is where another can begin."""
     curl: tuple[float, float] = setting((0.0, 0.0), unit="rad", low=-2.0, high=2.0)
     """Added to all joints of the four fingers alike."""
     squeeze: tuple[float, float] = setting((0.0, 0.0), unit="rad", low=-1.0, high=1.0)
     """How far the joint targets of thumb and fingers lie beyond that posture: the grip."""
     heading_noise: float = setting(0.7, unit="rad", low=0.0, high=math.pi)
     """Largest turn of the object about the axis at the start."""
-    place_noise: float = setting(0.006, unit="m", low=0.0, high=0.05)
+    place_noise: float = setting(0.012, unit="m", low=0.0, high=0.05)
     """Largest shift of the object along the palm at the start."""
     settle_seconds: float = setting(0.8, unit="s", low=0.05, high=10.0)
     """Time that start states are given to come to rest; those that do not are left out."""
@@ -137,7 +140,7 @@ def paper() -> RotateConfig:
     return RotateConfig(
         goal_spin=0.0, drop_distance=0.09, drop_tilt=math.pi, patience=1e6, control=Control(step=0.3, recall="target"),
         reward=RotateReward(action=-0.0002, velocity=0.0, torque=0.0, spin=0.0, fingertips=0.0,
-                            drop=0.0))
+                            bonus_tips=0.0, drop=0.0))
 
 
 def without_orientation() -> RotateConfig:
@@ -148,7 +151,7 @@ def without_orientation() -> RotateConfig:
 def clear_of_palm() -> RotateConfig:
     """The object held clear of the palm by thumb and fingers, which point downhill."""
     return RotateConfig(
-        reward=RotateReward(fingertips=0.0, spin=2.0), support="fingers", tilt=-0.6,
+        reward=RotateReward(fingertips=0.0, bonus_tips=0.0, spin=2.0), support="fingers", tilt=-0.6,
         reference=(0.058, 0.0, 0.086), squeeze=(0.1, 0.4),
         posture=(1.2, 0.4, 0.4, 0.0, 0.6, 0.5, 0.6, 0.5, 0.6, 0.5, 0.6, 0.5), posture_noise=0.25,
-        curl=(-0.2, 0.2))
+        place_noise=0.006, curl=(-0.2, 0.2))
