@@ -166,6 +166,21 @@ class TestReward:
             assert metrics["reward/bonus"] > last
             last = metrics["reward/bonus"]
 
+    def test_a_gait_too_fast_earns_less(self, task, begun):
+        limit, here = RotateReward().bonus_speed, moment(task, object_quat=turned(90))
+        busy = dataclasses.replace(begun, duty=jnp.ones(5))
+        for pace, share in ((0.5 * limit, 1.0), (limit, 1.0), (2 * limit, 0.25), (3 * limit, 1 / 9)):
+            # Of this tick's own speed: none.
+            goal = dataclasses.replace(busy, pace=jnp.float32(pace / (1 - PERIOD / 2.0)))
+            _, metrics = task.reward(goal, here, jnp.bool_(False))
+            np.testing.assert_allclose(metrics["reward/bonus"], 250 * share, rtol=1e-4)
+
+    def test_pace_is_a_leaky_mean(self, task, begun):
+        goal = begun
+        for _ in range(40):
+            goal = task.update(jax.random.key(0), goal, moment(task, joint_velocity=np.full(12, -3.0)))
+        np.testing.assert_allclose(goal.pace, 3 * (1 - (1 - PERIOD / 2.0) ** 40), rtol=1e-4)
+
     def test_a_lost_object_earns_nothing(self, task, begun):
         here = moment(task, object_quat=turned(90), object_spin=[1.0, 0, 0])
         reward, metrics = task.reward(begun, here, jnp.bool_(True))

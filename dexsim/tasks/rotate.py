@@ -34,7 +34,7 @@ from dexsim.tasks.rotate_start import (
 from dexsim.tasks.terms import action_rate, joint_speed, random_push
 
 TOUCH = 0.1  # N, force from which a fingertip counts as touching
-_MEMORY = 2.0  # s, over which a fingertip's share of work is averaged
+_MEMORY = 2.0  # s, over which a fingertip's share of work and the joints' speed are averaged
 _RECENT = 0.2  # s, a fingertip that touched within this time before a drop pushed the object out
 
 
@@ -50,6 +50,7 @@ class Goal:
     last_success: jax.Array  # [] s, clock at the last goal
     patience: jax.Array  # [] s without a goal after which the episode is given up
     duty: jax.Array  # [F] share of time touching, lately
+    pace: jax.Array  # [] rad/s, mean joint speed, lately
     since_touch: jax.Array  # [] s since any fingertip touched
     totals: dict[str, jax.Array]  # sums over ticks
 
@@ -132,7 +133,7 @@ class Rotate:
         zero, none = jnp.zeros(()), jnp.zeros((), jnp.int32)
         fingers = jnp.zeros(self.hand.num_fingers)
         return Goal(turns=none, entered=jnp.zeros((), bool), entries=none, dwell=zero, clock=zero,
-                    last_success=zero, patience=jnp.asarray(self.config.patience), duty=fingers,
+                    last_success=zero, patience=jnp.asarray(self.config.patience), duty=fingers, pace=zero,
                     since_touch=jnp.full((), 10.0),
                     totals={"spin": zero, "joint_speed": zero, "action_rate": zero,
                             "tilt": zero, "touch": fingers})
@@ -167,6 +168,7 @@ class Rotate:
             dwell=jnp.where(now.success, 0.0, now.dwell), clock=clock,
             last_success=jnp.where(now.success, clock, goal.last_success), patience=goal.patience,
             duty=goal.duty + period / _MEMORY * (touching - goal.duty),
+            pace=goal.pace + period / _MEMORY * (change["joint_speed"] - goal.pace),
             since_touch=jnp.where(jnp.any(touching > 0), 0.0, goal.since_touch + period),
             totals={name: goal.totals[name] + change[name] for name in goal.totals})
 
@@ -198,9 +200,11 @@ class Rotate:
         weights, now, held = self.config.reward, self.progress(goal, moment), 1.0 - dropped
         after = self._advance(goal, moment)
         work = tips_at_work(after.duty, weights.working_tips, weights.working_duty)
+        calm = jnp.minimum(weights.bonus_speed / jnp.maximum(after.pace, 1e-6), 1.0) ** 2
+        share = calm * (1.0 - weights.bonus_tips * (1.0 - work))
         terms = {
             "goal": held * weights.goal * goal_reward(now.angle, now.distance, weights),
-            "bonus": held * weights.bonus * now.success * (1.0 - weights.bonus_tips * (1.0 - work)),
+            "bonus": held * weights.bonus * now.success * share,
             "spin": held * weights.spin * jnp.clip(now.spin, -1.0, 1.0),
             "fingertips": held * weights.fingertips * work,
             "action": weights.action * action_rate(moment.action, moment.last_action),

@@ -28,18 +28,21 @@ class RotateReward:
     bonus: float = setting(250.0, unit="1", low=0.0, high=1e5)
     """Once for each goal reached ..."""
     bonus_tips: float = setting(0.5, unit="1", low=0.0, high=1.0)
-    """... of which this share is for `working_tips` fingertips that take part: unlike `fingertips`, nothing
-    that a hand can earn by standing still."""
+    """... of which this share is for `working_tips` fingertips that take part, which no hand can earn by
+    standing still ..."""
+    bonus_speed: float = setting(0.9, unit="rad/s", low=0.01, high=1e6)
+    """... and which falls with the square of the joint speed (mean of all joints, lately) beyond this."""
     action: float = setting(-0.01, unit="1", low=-1000.0, high=0.0)
     """Squared change of the action."""
-    velocity: float = setting(-0.022, unit="s^2/rad^2", low=-1000.0, high=0.0)
+    velocity: float = setting(-0.018, unit="s^2/rad^2", low=-1000.0, high=0.0)
     """Squared joint velocity."""
-    torque: float = setting(-0.1, unit="1/Nm^2", low=-1000.0, high=0.0)
-    """Squared joint torque."""
+    torque: float = setting(-0.5, unit="1/Nm^2", low=-1000.0, high=0.0)
+    """Squared joint torque: a price on clamping the object where a stroke has ended, which is where
+    policies got stuck."""
     spin: float = setting(1.0, unit="s/rad", low=0.0, high=1000.0)
     """Spin about the axis in the wanted direction, up to +-1 rad/s: a gradient before the first
     goal is ever reached."""
-    fingertips: float = setting(0.5, unit="1", low=0.0, high=1000.0)
+    fingertips: float = setting(0.0, unit="1", low=0.0, high=1000.0)
     """Share of `working_tips` fingertips that have done their share of touching lately."""
     working_tips: int = setting(3, unit="1", low=1, high=20)
     """Fingertips that are asked to take part."""
@@ -116,7 +119,7 @@ class RotateConfig(EnvConfig):
     """How far the joint targets of thumb and fingers lie beyond that posture: the grip."""
     heading_noise: float = setting(0.7, unit="rad", low=0.0, high=math.pi)
     """Largest turn of the object about the axis at the start."""
-    place_noise: float = setting(0.012, unit="m", low=0.0, high=0.05)
+    place_noise: float = setting(0.016, unit="m", low=0.0, high=0.05)
     """Largest shift of the object along the palm at the start."""
     settle_seconds: float = setting(0.8, unit="s", low=0.05, high=10.0)
     """Time that start states are given to come to rest; those that do not are left out."""
@@ -139,8 +142,8 @@ def paper() -> RotateConfig:
     """The paper's own weights and success test."""
     return RotateConfig(
         goal_spin=0.0, drop_distance=0.09, drop_tilt=math.pi, patience=1e6, control=Control(step=0.3, recall="target"),
-        reward=RotateReward(action=-0.0002, velocity=0.0, torque=0.0, spin=0.0, fingertips=0.0,
-                            bonus_tips=0.0, drop=0.0))
+        reward=RotateReward(action=-0.0002, velocity=0.0, torque=0.0, spin=0.0, bonus_tips=0.0,
+                            bonus_speed=1e6, drop=0.0))
 
 
 def without_orientation() -> RotateConfig:
@@ -151,7 +154,7 @@ def without_orientation() -> RotateConfig:
 def clear_of_palm() -> RotateConfig:
     """The object held clear of the palm by thumb and fingers, which point downhill."""
     return RotateConfig(
-        reward=RotateReward(fingertips=0.0, bonus_tips=0.0, spin=2.0), support="fingers", tilt=-0.6,
+        reward=RotateReward(torque=-0.1, bonus_tips=0.0, spin=2.0), support="fingers", tilt=-0.6,
         reference=(0.058, 0.0, 0.086), squeeze=(0.1, 0.4),
         posture=(1.2, 0.4, 0.4, 0.0, 0.6, 0.5, 0.6, 0.5, 0.6, 0.5, 0.6, 0.5), posture_noise=0.25,
         place_noise=0.006, curl=(-0.2, 0.2))
