@@ -64,7 +64,7 @@ class ObjectConfig:
     """Largest offset of the centre of mass, per axis."""
     friction: tuple[float, float] = setting((0.6, 1.2), unit="1", low=0.01, high=5.0)
     """Sliding friction between the fingertips' rubber and the object."""
-    bare_friction: tuple[float, float] = setting((0.3, 0.7), unit="1", low=0.01, high=5.0)
+    bare_friction: tuple[float, float] = setting((0.6, 1.2), unit="1", low=0.01, high=5.0)
     """Sliding friction between all else of the hand (palm, links) and the object."""
     stiffness: tuple[float, float] = setting((1600.0, 1800.0), unit="N/m", low=10.0, high=1e6)
     """Force over depth at rest of a fingertip's contact (`contact.BARE_SHARE` times that elsewhere). Where

@@ -151,7 +151,10 @@ def write_video(env: Environment, snapshots: Any, path: Path) -> Path:
     """Render an evaluation's snapshots; returns the file written, a GIF's where MP4 cannot be."""
     from dexsim.render import render_episode
 
-    return Path(render_episode(env, snapshots, path, 1.0 / env.control_period))
+    ticks = jax.tree.leaves(snapshots)[0].shape[0]
+    # Eight pictures a second at least, or a gait cannot be followed.
+    frames = max(400, round(8 * ticks * env.control_period))
+    return Path(render_episode(env, snapshots, path, 1.0 / env.control_period, max_frames=frames))
 
 
 def load_policy(name: str) -> Policy:

@@ -60,8 +60,9 @@ class RotateConfig(EnvConfig):
     """The rotation task."""
 
     objects: ObjectConfig = setting(ObjectConfig(
-        shapes=("box",), mass=(0.06, 0.15), friction=(0.6, 1.2), com_offset=0.003))
-    """Mass, inertia, centre of mass, friction and contact of the object; its sizes are `edge`."""
+        shapes=("box",), mass=(0.06, 0.15), friction=(0.6, 1.2), bare_friction=(0.3, 0.7), com_offset=0.003))
+    """Mass, inertia, centre of mass, friction and contact of the object; its sizes are `edge`. The bare hand
+    is plastic: where it grips as rubber does, random strokes carry the object onto the thumb and over."""
     control: Control = setting(Control(step=0.08, recall="target"))
     """From action to joint target."""
     object: str = setting("cube", choices=(*KINDS, "mesh"))
