@@ -5,10 +5,12 @@
 The hand is a process of its own that answers 9.6 ms after each request, as the real one does over
 RS485. Measured are the whole command as a user runs it (exchanges at 83 Hz, the policy at its own rate,
 log and safety on) and, apart, observation and policy alone. `--twin` takes the emulated hand with its physics and the
-object's sensors in place of the scripted one, `--port` a hand that is there already.
+object's sensors in place of the scripted one, `--port` a hand that is there already. `own` is the same timing without
+the cycles during which the machine took a core from everybody (`machine`): what is left is the bridge's.
 """
 
 import argparse
+import collections
 import contextlib
 import json
 import os
@@ -94,27 +96,50 @@ def resident() -> float:
 
 def measure_run(options: argparse.Namespace, hand: list[str], folder: Path) -> dict:
     """A whole run by the command, its own summary, and the memory over time."""
-    from dexsim_real import run
+    from machine import Away, own_timing
 
-    memory, done = [], threading.Event()
+    from dexsim_real import run, servo
+
+    memory, done, wait, cycle = [], threading.Event(), servo.Pace.wait, servo.Servo._cycle
+    ticks, waited = collections.defaultdict(list), collections.defaultdict(list)
 
     def watch() -> None:
         while not done.wait(options.seconds / 20):
             memory.append(resident())
 
+    def noted(pace: servo.Pace) -> None:
+        wait(pace)
+        ticks[pace].append((pace.next - pace.period, time.monotonic()))
+
+    def counted(loop: servo.Servo) -> float:
+        waited[loop.pace].append(loop.waited)
+        return cycle(loop)
+
     arguments = [options.policy, *hand, "--uncalibrated", "--link.settle", "0.1", "--quiet",
                  "--seconds", str(options.seconds), "--approach", "1", "--log", str(folder / "bridge.log"),
                  "--output", str(folder / "bridge.json")]
     threading.Thread(target=watch, daemon=True).start()
+    servo.Pace.wait, servo.Servo._cycle = noted, counted
     start = time.process_time()
-    code = run.main(arguments)
+    with Away() as away:
+        code = run.main(arguments)
     used = time.process_time() - start
     done.set()
+    servo.Pace.wait, servo.Servo._cycle = wait, cycle
+    # The two loops of the run, without their first second; shorter ones belong to starting up.
+    own = {}
+    for pace, times in sorted(ticks.items(), key=lambda x: len(x[1]))[-2:]:
+        first, (due, met) = round(1 / pace.period), np.array(times).T
+        # What the loop had waited for the hand before each cycle; starting up ends with a fresh count.
+        known = np.array([*waited[pace], 0][:len(due) + 1] if pace in waited else np.zeros(len(due) + 1, int))
+        own["exchange_loop" if pace in waited else "policy_loop"] = own_timing(
+            due[first:], met[first:], pace.period, away.intervals, np.maximum(np.diff(known), 0)[first:])
     summary = json.loads((folder / "bridge.json").read_text())
     exchanges, link = summary["exchange_jitter"], summary["link"]
     return {
         "exit": code, "seconds": summary["seconds"], "policy_loop": summary["policy_jitter"],
         "exchange_loop": exchanges, "round_trip": summary["round_trip"], "tick": summary["policy_compute"],
+        "own": own, "machine_away": away.summary(),
         "missed_by_us": exchanges["missed"] - summary["missed_for_the_hand"],
         "missed_for_the_hand": summary["missed_for_the_hand"],
         "unanswered": link["sent"] - link["answered"], "holds": summary["safety"],
