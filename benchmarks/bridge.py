@@ -10,6 +10,7 @@ the cycles during which the machine took a core from everybody (`machine`): what
 """
 
 import argparse
+import array
 import collections
 import contextlib
 import json
@@ -101,7 +102,7 @@ def measure_run(options: argparse.Namespace, hand: list[str], folder: Path) -> d
     from dexsim_real import run, servo
 
     memory, done, wait, cycle = [], threading.Event(), servo.Pace.wait, servo.Servo._cycle
-    ticks, waited = collections.defaultdict(list), collections.defaultdict(list)
+    ticks, waited = (collections.defaultdict(lambda: array.array("d")) for _ in range(2))  # 8 bytes a number
 
     def watch() -> None:
         while not done.wait(options.seconds / 20):
@@ -109,7 +110,7 @@ def measure_run(options: argparse.Namespace, hand: list[str], folder: Path) -> d
 
     def noted(pace: servo.Pace) -> None:
         wait(pace)
-        ticks[pace].append((pace.next - pace.period, time.monotonic()))
+        ticks[pace].extend((pace.next - pace.period, time.monotonic()))
 
     def counted(loop: servo.Servo) -> float:
         waited[loop.pace].append(loop.waited)
@@ -129,9 +130,9 @@ def measure_run(options: argparse.Namespace, hand: list[str], folder: Path) -> d
     # The two loops of the run, without their first second; shorter ones belong to starting up.
     own = {}
     for pace, times in sorted(ticks.items(), key=lambda x: len(x[1]))[-2:]:
-        first, (due, met) = round(1 / pace.period), np.array(times).T
+        first, (due, met) = round(1 / pace.period), np.reshape(times, (-1, 2)).T
         # What the loop had waited for the hand before each cycle; starting up ends with a fresh count.
-        known = np.array([*waited[pace], 0][:len(due) + 1] if pace in waited else np.zeros(len(due) + 1, int))
+        known = np.array([*waited[pace], 0][:len(due) + 1] if pace in waited else np.zeros(len(due) + 1), int)
         own["exchange_loop" if pace in waited else "policy_loop"] = own_timing(
             due[first:], met[first:], pace.period, away.intervals, np.maximum(np.diff(known), 0)[first:])
     summary = json.loads((folder / "bridge.json").read_text())

@@ -107,6 +107,7 @@ class LogWriter:
             with contextlib.suppress(queue.Empty):
                 while True:
                     batch.append(encode(*self._queue.get_nowait()))
+                    time.sleep(0)  # Gives up the interpreter at once to a thread that waits for it.
             try:
                 _write_all(self._file, b"".join(batch))
                 if last or time.monotonic() - synced > _FORCE:

@@ -44,7 +44,8 @@ class RunArguments:
     zero: bool = True
     """Zero the taxels first; refused while a fingertip touches something."""
     rate: float = setting(83.0, unit="Hz", low=1.0, high=1000.0)
-    """Exchanges with the hand per second; the policy keeps its own rate."""
+    """Exchanges with the hand per second, moved by up to 1 % so that the policy, which keeps its own rate,
+    computes while an answer is under way."""
     approach: float = setting(2.0, unit="s", low=0.0, high=60.0)
     """Time to move from the measured pose to the task's start posture; 0 stays there."""
     place: float = setting(0.0, unit="s", low=0.0, high=600.0)

@@ -78,6 +78,15 @@ class Pace:
         self.next += self.period
 
 
+def keep_phase(rate: float, other: float, share: float = 0.01) -> float:
+    """`rate`, or the nearest multiple of half of `other` if that is no farther than this share of it.
+
+    Two loops whose rates are in that ratio meet at the same one or two phases for ever.
+    """
+    near = max(round(2 * rate / other), 1) * other / 2
+    return near if abs(near - rate) <= share * rate else rate
+
+
 class Servo:
     """Runs exchanges until stopped.
 
@@ -112,6 +121,11 @@ class Servo:
     def forget(self) -> None:
         """Measure times anew, without those of starting up."""
         self.pace.jitter, self.round_trip, self.waited = Timing(), Timing(), 0
+
+    def free(self, now: float) -> float:
+        """The next time at which an exchange has just gone out: the interpreter has nothing to do until its answer."""
+        lead, period = 0.001, self.pace.period
+        return now + (self.pace.next + lead - now) % period
 
     def wait_fresh(self, seconds: float) -> Sample | None:
         """The next sample that arrives, or None when none does in time."""

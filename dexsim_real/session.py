@@ -26,7 +26,7 @@ from dexsim_real.objects import ObjectSensors
 from dexsim_real.options import RunArguments
 from dexsim_real.safety import Safety
 from dexsim_real.sensing import HandSensing
-from dexsim_real.servo import Pace, Servo, Timing, use_realtime
+from dexsim_real.servo import Pace, Servo, Timing, keep_phase, use_realtime
 from dexsim_real.trouble import HandError
 from dexsim_real.view import View
 
@@ -54,7 +54,8 @@ class Session:
         path = arguments.log or Path("runs/real") / time.strftime("%Y%m%d-%H%M%S.log")
         self.log = LogWriter(path)
         self.port = open_port(arguments.port, arguments.link, self._tap)
-        self.servo = Servo(self.port, self.sensing, self.safety, arguments.rate)
+        rate = keep_phase(arguments.rate, policy.control_rate)
+        self.servo = Servo(self.port, self.sensing, self.safety, rate)
         self.view = View(f"{policy.task} on {arguments.port}", self._status, arguments.quiet)
         self.objects: ObjectSensors | None = None
         self.goals: TurnGoals | None = None
@@ -171,6 +172,8 @@ class Session:
         anchor, self.started = self.safety.anchor, time.monotonic()
         self.servo.forget()
         self.pace = Pace(self.controller.policy.control_rate)
+        # The policy computes while the line is busy, and never when an answer is to be read and the next command sent.
+        self.pace.next = self.servo.free(self.pace.next)
         while time.monotonic() < self.started + self.arguments.seconds:
             self._check()
             now, sample = time.monotonic(), self.safety.sample

@@ -302,7 +302,7 @@ def test_motors_off_means_off_and_the_view_says_what_is_read(tmp_path, monkeypat
         assert not peer.on().any()
     assert len(records(tmp_path, Kind.TICK)) >= 15
     shown = capsys.readouterr().err
-    for text in ("firmware 1.3.9", "the policy begins", "policy 33.3 Hz", "exchanges 83.0 Hz", "0 corrupt", "joints 30",
+    for text in ("firmware 1.3.9", "the policy begins", "policy 33.3 Hz", "exchanges 83.3 Hz", "0 corrupt", "joints 30",
                  "sum 0.0 N", "end: time is over", "policy jitter"):
         assert text in shown, text
 

@@ -1,4 +1,4 @@
-"""Safety: every limit and its reaction, over scripted and over random courses of events."""
+"""Safety: every limit and its reaction, over scripted and over random courses of events; the two loops' phases."""
 
 import dataclasses
 
@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from dexsim.errors import ConfigError
 from dexsim_real.frames import Mode
 from dexsim_real.safety import Reaction, Safety, SafetyConfig, Sample
-from dexsim_real.sensing import Measured
+from dexsim_real.sensing import HandSensing, HardwareConfig, Measured
+from dexsim_real.servo import Servo, keep_phase
 
 CYCLE = 0.012
 FREE = np.array([1, 1, 1, 0] + [1] * 8, np.float32)  # All but the joint whose range is small.
@@ -254,3 +255,23 @@ def test_limits_have_ranges():
     with pytest.raises(ConfigError, match=r"SafetyConfig\.temperature = 500 degC"):
         SafetyConfig(temperature=500.0)
     assert dataclasses.replace(SafetyConfig(), stale=0.1).stale == 0.1
+
+
+@pytest.mark.parametrize(("rate", "policy", "expected"), [
+    (83.0, 100 / 3, 250 / 3), (83.0, 25.0, 83.0), (99.5, 25.0, 100.0), (83.0, 83.0, 83.0), (40.0, 1000.0, 40.0),
+    (12.4, 25.0, 12.5)])
+def test_exchanges_keep_their_phase_with_the_policy(rate, policy, expected):
+    kept = keep_phase(rate, policy)
+    assert kept == pytest.approx(expected)
+    if kept != rate:  # At the policy's deadlines an exchange is in one of at most two phases.
+        phases = np.arange(40) / policy * kept % 1
+        assert len({round(float(phase), 3) % 1 for phase in phases}) <= 2
+
+
+def test_the_policy_begins_while_the_line_is_busy(hand):
+    servo = Servo(None, HandSensing(hand, HardwareConfig()), None, 250 / 3)
+    for now in np.linspace(0, 0.2, 41) + servo.pace.next - 0.05:
+        begin = servo.free(now)
+        assert now <= begin < now + servo.pace.period + 1e-9
+        since = (begin - servo.pace.next) % servo.pace.period
+        assert since == pytest.approx(0.001, abs=1e-6)
