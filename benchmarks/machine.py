@@ -22,12 +22,17 @@ PRIORITY = 90
 class Away:
     """Watches every core of this process while the block runs; then `intervals` [N, 2] s (monotonic clock), merged.
 
-    Raises:
-      PermissionError: real-time priority is not allowed (docs/hardware.md).
+    Where real-time priority is not `allowed` (docs/hardware.md) it watches nothing, and every fault is the program's.
     """
 
     def __enter__(self) -> "Away":
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))  # May we? The sentinels inherit it.
+        self._sentinels, self._begin = [], 0.0
+        try:
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))  # The sentinels inherit it.
+        except OSError:
+            self.allowed = False
+            return self
+        self.allowed = True
         try:
             self._sentinels = [subprocess.Popen([sys.executable, __file__, str(core)], stdout=subprocess.PIPE)
                                for core in sorted(os.sched_getaffinity(0))]
@@ -48,7 +53,7 @@ class Away:
     def summary(self) -> dict[str, float]:
         """How often and how long."""
         lengths = self.intervals[:, 1] - self.intervals[:, 0]
-        return {"times": len(lengths), "seconds": round(float(lengths.sum()), 3),
+        return {"watched": self.allowed, "times": len(lengths), "seconds": round(float(lengths.sum()), 3),
                 "longest_ms": round(1e3 * float(lengths.max(initial=0.0)), 1)}
 
 
