@@ -95,9 +95,30 @@ def resident() -> float:
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
+def own_loops(ticks: dict, waited: dict, intervals: np.ndarray) -> dict[str, dict]:
+    """The two loops' timing while the machine let them run.
+
+    Args:
+      ticks: by loop, deadlines and when they were met, alternating, s.
+      waited: by loop, deadlines missed for the hand before each cycle; the policy's has none.
+      intervals: [N, 2] s, when the machine was away.
+    """
+    from machine import own_timing
+
+    own = {}
+    # Without their first second; shorter loops belong to starting up.
+    for pace, times in sorted(ticks.items(), key=lambda x: len(x[1]))[-2:]:
+        first, (due, met) = round(1 / pace.period), np.reshape(times, (-1, 2)).T
+        # Starting up ends with a fresh count.
+        known = np.array([*waited[pace], 0][:len(due) + 1] if pace in waited else np.zeros(len(due) + 1), int)
+        own["exchange_loop" if pace in waited else "policy_loop"] = own_timing(
+            due[first:], met[first:], pace.period, intervals, np.maximum(np.diff(known), 0)[first:])
+    return own
+
+
 def measure_run(options: argparse.Namespace, hand: list[str], folder: Path) -> dict:
     """A whole run by the command, its own summary, and the memory over time."""
-    from machine import Away, own_timing
+    from machine import Away
 
     from dexsim_real import run, servo
 
@@ -127,20 +148,12 @@ def measure_run(options: argparse.Namespace, hand: list[str], folder: Path) -> d
     used = time.process_time() - start
     done.set()
     servo.Pace.wait, servo.Servo._cycle = wait, cycle
-    # The two loops of the run, without their first second; shorter ones belong to starting up.
-    own = {}
-    for pace, times in sorted(ticks.items(), key=lambda x: len(x[1]))[-2:]:
-        first, (due, met) = round(1 / pace.period), np.reshape(times, (-1, 2)).T
-        # What the loop had waited for the hand before each cycle; starting up ends with a fresh count.
-        known = np.array([*waited[pace], 0][:len(due) + 1] if pace in waited else np.zeros(len(due) + 1), int)
-        own["exchange_loop" if pace in waited else "policy_loop"] = own_timing(
-            due[first:], met[first:], pace.period, away.intervals, np.maximum(np.diff(known), 0)[first:])
     summary = json.loads((folder / "bridge.json").read_text())
     exchanges, link = summary["exchange_jitter"], summary["link"]
     return {
         "exit": code, "seconds": summary["seconds"], "policy_loop": summary["policy_jitter"],
         "exchange_loop": exchanges, "round_trip": summary["round_trip"], "tick": summary["policy_compute"],
-        "own": own, "machine_away": away.summary(),
+        "own": own_loops(ticks, waited, away.intervals), "machine_away": away.summary(),
         "missed_by_us": exchanges["missed"] - summary["missed_for_the_hand"],
         "missed_for_the_hand": summary["missed_for_the_hand"],
         "unanswered": link["sent"] - link["answered"], "holds": summary["safety"],

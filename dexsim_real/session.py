@@ -172,7 +172,7 @@ class Session:
         anchor, self.started = self.safety.anchor, time.monotonic()
         self.servo.forget()
         self.pace = Pace(self.controller.policy.control_rate)
-        # The policy computes while the line is busy, and never when an answer is to be read and the next command sent.
+        # The policy begins when a request has just gone out, and at rates that keep their phase always does.
         self.pace.next = self.servo.free(self.pace.next)
         while time.monotonic() < self.started + self.arguments.seconds:
             self._check()
