@@ -325,6 +325,7 @@ def test_a_gear_with_play_loses_that_much_motion(hand, monkeypatch):
     play, load = 0.02, 0.05
     plant = world(hand, gear_play=play, gear_stiffness=150.0)
     plant._scene.model.opt.gravity[:] = 0.0
+    free(plant, (0.5, 0.0, 0.0))  # out of the fingers' way
     posture = np.array(POSTURES["rotate"])
     plant._data.qpos[plant._scene.drive_qpos] = posture
     plant.drive(motors(posture))

@@ -85,11 +85,12 @@ class RotateConfig(EnvConfig):
     """... held for this long."""
     support: str = setting("palm", choices=("palm", "fingers"))
     """Carried by the palm, or held clear of it by the fingers: then touching the palm is a drop."""
-    tilt: float = setting(-0.15, unit="rad", low=-1.2, high=1.2)
-    """The hand's nominal pitch: positive lets the object slide toward the wrist."""
-    reference: tuple[float, float, float] = setting((0.047, 0.0, 0.071), unit="m", low=-0.5,
+    tilt: float = setting(-0.3, unit="rad", low=-1.2, high=1.2)
+    """The hand's nominal pitch: positive lets the object slide toward the wrist, where no finger reaches it.
+    Leaning toward the fingers brings it back to them."""
+    reference: tuple[float, float, float] = setting((0.047, 0.010, 0.087), unit="m", low=-0.5,
                                                     high=0.5)
-    """Where the object belongs."""
+    """Where the object belongs: where thumb and fingers meet, in front of the palm's middle."""
     drop_distance: float = setting(0.07, unit="m", low=0.01, high=1.0)
     """The object is lost when its centre is farther than this from the reference ..."""
     drop_tilt: float = setting(1.0, unit="rad", low=0.1, high=3.2)
@@ -112,7 +113,7 @@ class RotateConfig(EnvConfig):
         (1.0, 0.2, 0.3, 0.0, 0.8, 0.5, 0.8, 0.5, 0.8, 0.5, 0.8, 0.5), unit="rad",
         low=-3.2, high=3.2)
     """Joint angles that episodes start near."""
-    posture_noise: float = setting(0.4, unit="rad", low=0.0, high=1.0)
+    posture_noise: float = setting(0.3, unit="rad", low=0.0, high=1.0)
     """Largest deviation from them: wide, so that where one stroke ends is where another can begin."""
     curl: tuple[float, float] = setting((0.0, 0.0), unit="rad", low=-2.0, high=2.0)
     """Added to all joints of the four fingers alike."""
@@ -120,12 +121,12 @@ class RotateConfig(EnvConfig):
     """How far the joint targets of thumb and fingers lie beyond that posture: the grip."""
     heading_noise: float = setting(0.7, unit="rad", low=0.0, high=math.pi)
     """Largest turn of the object about the axis at the start."""
-    place_noise: float = setting(0.016, unit="m", low=0.0, high=0.05)
+    place_noise: float = setting(0.010, unit="m", low=0.0, high=0.05)
     """Largest shift of the object along the palm at the start."""
     settle_seconds: float = setting(0.8, unit="s", low=0.05, high=10.0)
     """Time that start states are given to come to rest; those that do not are left out."""
-    reward: RotateReward = setting(RotateReward())
-    """Reward weights."""
+    reward: RotateReward = setting(RotateReward(gate=0.04))
+    """Reward weights. The gate closes before a goal no longer counts: from there on nothing reaches the object."""
 
     def __post_init__(self):
         validate(self)

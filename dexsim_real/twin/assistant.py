@@ -22,8 +22,10 @@ POSTURES = {
     "grasp": (1.45, 0.15, 0.25, 0.0, 1.1, 0.8, 1.1, 0.8, 1.1, 0.8, 1.1, 0.8),
     "rotate": (1.0, 0.2, 0.3, 0.0, 0.8, 0.5, 0.8, 0.5, 0.8, 0.5, 0.8, 0.5)}
 """Joint angles rad at which a run begins."""
-REFERENCES = {"grasp": (0.055, -0.005, 0.090), "rotate": (0.047, 0.0, 0.071)}
+REFERENCES = {"grasp": (0.055, -0.005, 0.090), "rotate": (0.047, 0.010, 0.087)}
 """Where the object belongs, m."""
+PLACES = REFERENCES | {"rotate": (0.047, 0.008, 0.076)}
+"""Where it is put: a cube where the fingers of the start posture leave it room, as the task's start states have it."""
 PALM_FACE = 0.020  # m, x of the palm's surface
 _ARRIVED, _LEFT = 0.002, 0.005  # rad, targets off the start posture: arrived within, gone beyond
 _NEAR = 0.3  # rad, joints off it: the hand stands there as well as its gears let it
@@ -51,7 +53,7 @@ class Place:
 
 def draw_place(draw: Draw, shape: Shape, rng: np.random.Generator) -> Place:
     """A place to let go of the object, whether the fingers leave it free or not."""
-    reference = np.array(REFERENCES[draw.task])
+    middle = PLACES[draw.task][1:]
     if draw.task == "rotate":
         quat = turn((1.0, 0.0, 0.0), float(draw.heading_error) * rng.uniform(-1, 1))
         shift = float(draw.place_error) * rng.uniform(-1, 1, 2)
@@ -65,7 +67,7 @@ def draw_place(draw: Draw, shape: Shape, rng: np.random.Generator) -> Place:
         shift = 0.01 * rng.uniform(-1, 1, 2)
         gap, speed = float(draw.gap), float(draw.release_speed)
     up = shapes.matrix(quat).T @ np.array([-1.0, 0.0, 0.0])
-    position = np.array([PALM_FACE + gap + shape.reach(up), *(reference[1:] + shift)])
+    position = np.array([PALM_FACE + gap + shape.reach(up), *(middle + shift)])
     return Place(position, quat, np.array([speed, 0.0, 0.0]))
 
 

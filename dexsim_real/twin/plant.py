@@ -22,7 +22,7 @@ from dexsim_real.twin.shapes import Shape, draw_shape, matrix, product, turn
 from dexsim_real.twin.skin import Skin
 from dexsim_real.twin.types import Measurement, Motors
 
-TILT = {"grasp": None, "rotate": -0.15}
+TILT = {"grasp": None, "rotate": -0.3}
 """Nominal pitch of the hand, rad: None for upside down, else palm up with the wrist lowered (or raised, below zero)."""
 GRAVITY = 9.81
 IMU_TRANSPORT = 0.0017  # s of an orientation's bytes
