@@ -18,12 +18,12 @@ from dexsim.tasks import TASKS as TRAINED
 from dexsim_real.frames import Mode
 from dexsim_real.trouble import HandError
 from dexsim_real.twin import assistant, referee, scene, shapes
-from dexsim_real.twin.assistant import POSTURES, REFERENCES, Assistant, Stage, put
+from dexsim_real.twin.assistant import POSTURES, REFERENCES, Assistant, Stage, find_place, put
 from dexsim_real.twin.draw import BANDS, FAR, NEAR, PUSHES, TASKS, bands, draw_trial
 from dexsim_real.twin.motors import BACK_EMF, PERIOD, STALL_CURRENT, STIFFNESS, Drives, Heat
 from dexsim_real.twin.plant import GRAVITY, EmulatedHand, nominal_gravity, tilted_gravity
 from dexsim_real.twin.referee import GoalCount, Referee
-from dexsim_real.twin.shapes import Part, Shape, matrix, product, turn
+from dexsim_real.twin.shapes import Part, Shape, draw_shape, matrix, product, turn
 from dexsim_real.twin.types import Motors
 
 QUIET = {"taxel_noise": 0.0, "taxel_bias": 0.0, "taxel_spread": 0.0, "taxel_threshold": 0.0}
@@ -86,6 +86,16 @@ def test_rules_and_places_are_those_of_the_tasks(hand):
     config = rules.config
     assert (referee.GOAL_STEP, referee.GOAL_ANGLE, referee.GOAL_DISTANCE, referee.GOAL_SPIN, referee.TIPPED) == \
         pytest.approx((config.goal_step, config.goal_angle, config.goal_distance, config.goal_spin, config.drop_tilt))
+
+
+def test_the_fingers_leave_room_where_a_cube_is_put(hand):
+    """Hands around which no cube fits are drawn anew, which must not choose among them."""
+    for trial in range(30):
+        rng = np.random.default_rng([7, trial])
+        draw = draw_trial("rotate", rng, "outside", {})
+        shape = draw_shape(draw, rng, None)
+        built = scene.build_scene(hand, draw, shape, tilted_gravity("rotate", draw.gravity_tilt))
+        assert find_place(built, draw, shape, rng) is not None
 
 
 @pytest.mark.parametrize("task", TASKS)

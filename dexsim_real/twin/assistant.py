@@ -24,9 +24,9 @@ POSTURES = {
 """Joint angles rad at which a run begins."""
 REFERENCES = {"grasp": (0.055, -0.005, 0.090), "rotate": (0.047, 0.010, 0.087)}
 """Where the object belongs, m."""
-PLACES = REFERENCES | {"rotate": (0.047, 0.002, 0.074)}
-"""Where it is put: a cube between thumb and fingers of the start posture. Nearer to the thumb the first stroke at
-times pushes it out, in simulation too (`docs/hardware.md` tells users so)."""
+PLACES = {"grasp": REFERENCES["grasp"][1:], "rotate": (0.002, 0.074)}
+"""Where along the palm (y, z) it is put, m: a cube between thumb and fingers of the start posture. Nearer to the
+thumb the first stroke at times pushes it out, in simulation too (`docs/hardware.md` tells users so)."""
 PALM_FACE = 0.020  # m, x of the palm's surface
 _ARRIVED, _LEFT = 0.002, 0.005  # rad, targets off the start posture: arrived within, gone beyond
 _NEAR = 0.3  # rad, joints off it: the hand stands there as well as its gears let it
@@ -54,7 +54,6 @@ class Place:
 
 def draw_place(draw: Draw, shape: Shape, rng: np.random.Generator) -> Place:
     """A place to let go of the object, whether the fingers leave it free or not."""
-    middle = PLACES[draw.task][1:]
     if draw.task == "rotate":
         quat = turn((1.0, 0.0, 0.0), float(draw.heading_error) * rng.uniform(-1, 1))
         shift = float(draw.place_error) * rng.uniform(-1, 1, 2)
@@ -68,7 +67,7 @@ def draw_place(draw: Draw, shape: Shape, rng: np.random.Generator) -> Place:
         shift = 0.01 * rng.uniform(-1, 1, 2)
         gap, speed = float(draw.gap), float(draw.release_speed)
     up = shapes.matrix(quat).T @ np.array([-1.0, 0.0, 0.0])
-    position = np.array([PALM_FACE + gap + shape.reach(up), *(middle + shift)])
+    position = np.array([PALM_FACE + gap + shape.reach(up), *(PLACES[draw.task] + shift)])
     return Place(position, quat, np.array([speed, 0.0, 0.0]))
 
 
