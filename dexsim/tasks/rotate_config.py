@@ -126,7 +126,7 @@ class RotateConfig(EnvConfig):
     settle_seconds: float = setting(0.8, unit="s", low=0.05, high=10.0)
     """Time that start states are given to come to rest; those that do not are left out."""
     reward: RotateReward = setting(RotateReward(gate=0.04))
-    """Reward weights. The gate closes before a goal no longer counts: from there on nothing reaches the object."""
+    """Reward weights. The gate closes short of `goal_distance`, about which nothing reaches the object any more."""
 
     def __post_init__(self):
         validate(self)
