@@ -27,7 +27,7 @@ class RotateReward:
     """How sharply it closes."""
     bonus: float = setting(250.0, unit="1", low=0.0, high=1e5)
     """Once for each goal reached ..."""
-    bonus_tips: float = setting(0.5, unit="1", low=0.0, high=1.0)
+    bonus_tips: float = setting(0.9, unit="1", low=0.0, high=1.0)
     """... of which this share is for `working_tips` fingertips that take part, which no hand can earn by
     standing still ..."""
     bonus_speed: float = setting(0.9, unit="rad/s", low=0.01, high=1e6)
@@ -121,8 +121,11 @@ class RotateConfig(EnvConfig):
     """How far the joint targets of thumb and fingers lie beyond that posture: the grip."""
     heading_noise: float = setting(0.7, unit="rad", low=0.0, high=math.pi)
     """Largest turn of the object about the axis at the start."""
+    start_offset: tuple[float, float] = setting((-0.008, -0.013), unit="m", low=-0.1, high=0.1)
+    """Where the object is put at the start, across and along the palm (y, z) from the reference: a little
+    toward the fingers' side, since beside the thumb the first stroke often fails ..."""
     place_noise: float = setting(0.010, unit="m", low=0.0, high=0.05)
-    """Largest shift of the object along the palm at the start."""
+    """... and the largest shift from there."""
     settle_seconds: float = setting(0.8, unit="s", low=0.05, high=10.0)
     """Time that start states are given to come to rest; those that do not are left out."""
     reward: RotateReward = setting(RotateReward(gate=0.04))
@@ -159,4 +162,4 @@ def clear_of_palm() -> RotateConfig:
         reward=RotateReward(torque=-0.1, bonus_tips=0.0, spin=2.0), support="fingers", tilt=-0.6,
         reference=(0.058, 0.0, 0.086), squeeze=(0.1, 0.4),
         posture=(1.2, 0.4, 0.4, 0.0, 0.6, 0.5, 0.6, 0.5, 0.6, 0.5, 0.6, 0.5), posture_noise=0.25,
-        place_noise=0.006, curl=(-0.2, 0.2))
+        start_offset=(0.0, 0.0), place_noise=0.006, curl=(-0.2, 0.2))

@@ -192,7 +192,7 @@ def _candidate(key: jax.Array, hand: Hand, config: Any) -> dict[str, Any]:
     heading = config.heading_noise * jax.random.uniform(keys[2], minval=-1.0)
     quat = rotations.axis_angle_to_quat(jnp.array([1.0, 0.0, 0.0]), heading)
     shift = config.place_noise * jax.random.uniform(keys[3], (2,), minval=-1.0)
-    place = jnp.asarray(config.reference) + jnp.concatenate([jnp.zeros(1), shift])
+    place = jnp.asarray(config.reference).at[1:].add(jnp.asarray(config.start_offset) + shift)
     if config.support == "palm":
         floor = palm_height(hand) + 0.001 - lowest_point(target, quat, jnp.zeros(3))
         place = place.at[0].set(floor)
