@@ -201,7 +201,8 @@ class Rotate:
         after = self._advance(goal, moment)
         work = tips_at_work(after.duty, weights.working_tips, weights.working_duty)
         calm = jnp.minimum(weights.bonus_speed / jnp.maximum(after.pace, 1e-6), 1.0) ** 2
-        share = calm * (1.0 - weights.bonus_tips * (1.0 - work))
+        asked = weights.bonus_tips * (goal.turns >= weights.tips_after)
+        share = calm * (1.0 - asked * (1.0 - work))
         terms = {
             "goal": held * weights.goal * goal_reward(now.angle, now.distance, weights),
             "bonus": held * weights.bonus * now.success * share,

@@ -27,9 +27,12 @@ class RotateReward:
     """How sharply it closes."""
     bonus: float = setting(250.0, unit="1", low=0.0, high=1e5)
     """Once for each goal reached ..."""
-    bonus_tips: float = setting(0.9, unit="1", low=0.0, high=1.0)
+    bonus_tips: float = setting(0.8, unit="1", low=0.0, high=1.0)
     """... of which this share is for `working_tips` fingertips that take part, which no hand can earn by
     standing still ..."""
+    tips_after: int = setting(2, unit="1", low=0, high=1000)
+    """... once this many goals have been reached in the episode: asked for from the first goal on, it teaches
+    policies that have found one stroke to clamp the object with all fingers ..."""
     bonus_speed: float = setting(0.9, unit="rad/s", low=0.01, high=1e6)
     """... and which falls with the square of the joint speed (mean of all joints, lately) beyond this."""
     action: float = setting(-0.01, unit="1", low=-1000.0, high=0.0)
@@ -121,9 +124,9 @@ class RotateConfig(EnvConfig):
     """How far the joint targets of thumb and fingers lie beyond that posture: the grip."""
     heading_noise: float = setting(0.7, unit="rad", low=0.0, high=math.pi)
     """Largest turn of the object about the axis at the start."""
-    start_offset: tuple[float, float] = setting((-0.008, -0.013), unit="m", low=-0.1, high=0.1)
-    """Where the object is put at the start, across and along the palm (y, z) from the reference: a little
-    toward the fingers' side, since beside the thumb the first stroke often fails ..."""
+    start_offset: tuple[float, float] = setting((-0.005, -0.007), unit="m", low=-0.1, high=0.1)
+    """Where the object is put at the start, across and along the palm (y, z) from the reference: a little away
+    from thumb and fingertips, beside which the first stroke often fails ..."""
     place_noise: float = setting(0.010, unit="m", low=0.0, high=0.05)
     """... and the largest shift from there."""
     settle_seconds: float = setting(0.8, unit="s", low=0.05, high=10.0)
