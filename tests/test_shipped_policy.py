@@ -12,7 +12,7 @@ from dexsim.observation import GRASP, ROTATE, layout
 from dexsim.tasks import TASKS
 from dexsim_ppo.policy import Policy, layout_to_list
 
-SHIPPED = {"grasp": (GRASP, 66), "rotate": (ROTATE, 65)}
+SHIPPED = {"grasp": (GRASP, 66), "rotate": (ROTATE, 65), "rotate_without_orientation": (ROTATE, 59)}
 
 
 def load(name):
