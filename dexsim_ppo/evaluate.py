@@ -196,6 +196,8 @@ class EvaluateArguments:
     """Episodes run side by side; 0 chooses by the device."""
     seconds: float = 0.0
     """Length of an evaluation episode; 0 for the task's own."""
+    blind: tuple[str, ...] = ()
+    """Readings that the policy does without ("contact_force contact_centre"): it gets their mean in training."""
     output: Path | None = None
     """File for the report as JSON."""
     video: Path | None = None
@@ -214,7 +216,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                           prog="python -m dexsim_ppo.evaluate",
                           description="Measure a policy over fixed, seeded episodes.")
     cli.enable_caches()
-    policy = load_policy(arguments.policy)
+    policy = load_policy(arguments.policy).blind(*arguments.blind)
     chunk = min(arguments.chunk or (1024 if jax.default_backend() == "gpu" else 64),
                 arguments.episodes)
     if arguments.seconds:
@@ -223,7 +225,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     env = make_env(policy, backend=arguments.backend, num_envs=chunk)
     report, snapshots = Evaluator(env, chunk)(policy.params, episodes=arguments.episodes,
                                               seed=arguments.seed)
-    report |= {"policy": arguments.policy, "backend": env.backend} | cli.environment_report()
+    report |= {"policy": arguments.policy, "blind": list(arguments.blind), "backend": env.backend}
+    report |= cli.environment_report()
     if arguments.output:
         cli.write_json(arguments.output, report)
     print_report(report, title=f"{policy.task}: {arguments.policy}")

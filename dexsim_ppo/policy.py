@@ -11,9 +11,10 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from dexsim.config import to_dict
-from dexsim.errors import CheckpointError
+from dexsim.errors import CheckpointError, ConfigError
 from dexsim.pytree import pytree_dataclass, static
 from dexsim_ppo import checkpoint
 from dexsim_ppo.networks import MLP, Layer, apply_mlp
@@ -58,6 +59,22 @@ class Policy:
     def __call__(self, obs: jax.Array) -> jax.Array:
         """Action `[..., A]` for an actor observation `[..., n]`."""
         return _act(self.params, obs)
+
+    def blind(self, *names: str) -> "Policy":
+        """This policy without some of its readings, which it takes for their mean in training from then on.
+
+        Tells what a policy relies on. It is not what a policy trained without them would do.
+
+        Raises:
+          ConfigError: it has no such reading.
+        """
+        fields = sorted(field.name for field in self.observation_layout)
+        if unknown := sorted(set(names) - set(fields)):
+            raise ConfigError(f"the policy does not observe {', '.join(unknown)}; it observes {', '.join(fields)}")
+        kept = np.concatenate([np.full(field.size, field.name not in names) for field in self.observation_layout])
+        first, *others = self.params.layers
+        first = dataclasses.replace(first, kernel=jnp.where(kept[:, None], first.kernel, 0.0))
+        return dataclasses.replace(self, params=dataclasses.replace(self.params, layers=(first, *others)))
 
     def save(self, path: str | Path) -> None:
         """Write to a file, whole or not at all."""

@@ -8,6 +8,7 @@ import pytest
 
 from dexsim.assets import asset_path
 from dexsim.config import from_dict
+from dexsim.errors import ConfigError
 from dexsim.observation import GRASP, ROTATE, layout
 from dexsim.tasks import TASKS
 from dexsim_ppo.policy import Policy, layout_to_list
@@ -52,3 +53,18 @@ def test_its_report_is_of_this_file_and_says_how_it_came_about(name):
     assert report["origin"]["seed"] == policy.training["seed"]
     for key in ("command", "hardware", "versions", "trained", "untrained"):
         assert report[key]
+
+
+def test_a_blinded_policy_takes_the_mean_of_what_it_does_not_see():
+    policy = load("rotate")
+    names = ("contact_force", "relative_orientation")
+    hidden = np.concatenate([np.full(f.size, f.name in names) for f in policy.observation_layout])
+    obs = np.random.default_rng(0).normal(size=(20, 65)).astype(np.float32)
+    mean = np.asarray(policy.params.normalizer.mean)
+    blind = policy.blind(*names)
+    np.testing.assert_allclose(blind(obs), policy(np.where(hidden, mean, obs)), atol=2e-5)
+    np.testing.assert_array_equal(blind(obs), blind(np.where(hidden, 9.0, obs)))
+    assert np.max(np.abs(np.asarray(blind(obs)) - np.asarray(policy(obs)))) > 0.1
+    np.testing.assert_array_equal(policy.blind()(obs), policy(obs))
+    with pytest.raises(ConfigError, match="does not observe colour; it observes .*joint_position"):
+        policy.blind("colour")
