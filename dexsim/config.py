@@ -4,9 +4,11 @@ The same dataclasses are the command line (tyro), the checkpoint header and the 
 """
 
 import dataclasses
+import json
 import math
 import types
 import typing
+from collections.abc import Iterable
 from typing import Any, TypeVar
 
 from dexsim.errors import ConfigError
@@ -95,6 +97,34 @@ def from_dict(cls: type[T], data: dict[str, Any]) -> T:
             raise ConfigError(f"{cls.__name__} has no field {name!r}")
     return cls(**{name: _rebuild(hints[name], value, f"{cls.__name__}.{name}")
                   for name, value in data.items()})
+
+
+def override(data: dict[str, Any], settings: Iterable[str]) -> dict[str, Any]:
+    """`to_dict`'s output with some fields replaced, each as "object.corners=1" or "edge=[0.05, 0.06]".
+
+    Values are JSON, and words without quotes. `from_dict` tells whether the fields exist and the values fit.
+
+    Raises:
+      ConfigError: a setting without a name or a value.
+    """
+    for entry in settings:
+        path, _, text = entry.partition("=")
+        if not (path and text):
+            raise ConfigError(f"{entry!r}: expected NAME=VALUE, such as randomization.scale=0.5")
+        try:
+            change = json.loads(text)
+        except ValueError:
+            change = text
+        for name in reversed(path.split(".")):
+            change = {name: change}
+        data = _merge(data, change)
+    return data
+
+
+def _merge(data: Any, change: dict[str, Any]) -> dict[str, Any]:
+    before = data if isinstance(data, dict) else {}
+    return before | {name: _merge(before.get(name), value) if isinstance(value, dict) else value
+                     for name, value in change.items()}
 
 
 def _rebuild(hint: Any, value: Any, where: str) -> Any:

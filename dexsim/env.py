@@ -30,6 +30,7 @@ from dexsim.observation import Motion, Readings, ThreeAxisReadings
 from dexsim.orientation_sensor import SensorDraw
 from dexsim.physics import Physics, PhysicsState
 from dexsim.randomization import Draw, sample
+from dexsim.ranges import draw_corner
 from dexsim.render import Snapshot
 from dexsim.sensing import Senses, Sensors
 
@@ -206,7 +207,8 @@ class Env:
         ranges = self.config.randomization
         draw = sample(hand_key, ranges, self.hand, timestep=self.config.physics.timestep,
                       control_period=self.control_period, scale=scale)
-        sensor = self.senses.draw_orientation(sensor_key, ranges.scale * scale)
+        corner = draw_corner(hand_key, ranges.corners)  # the one that `sample` draws
+        sensor = self.senses.draw_orientation(sensor_key, ranges.scale * scale, corner)
         # An IMU's upright is the true one; the host takes it for that of a hand without tilt.
         down, tilted = self._tilted(draw)
         return draw, dataclasses.replace(sensor, bias=sensor.bias + jnp.cross(tilted, down))

@@ -73,6 +73,8 @@ class ObjectConfig:
     restitution: tuple[float, float] = setting((0.03, 0.08), unit="1", low=0.0, high=0.9)
     """Coefficient of restitution: the damping of the contact, which also slows creep. What lies
     below 0.024 bounces as 0.024."""
+    corners: float = setting(0.0, unit="1", low=0.0, high=1.0)
+    """Share of objects with every value at an end of its range; see `dexsim.ranges`."""
 
     def __post_init__(self):
         validate(self)

@@ -17,6 +17,7 @@ import numpy as np
 from dexsim import object_mesh, rotations, sdf
 from dexsim.object_config import KINDS, OFF, SHAPES, SHORT, SLOTS, ObjectConfig, load_mesh_object, middle
 from dexsim.pytree import pytree_dataclass, static
+from dexsim.ranges import draw_corner, uniform
 
 
 def bounding_radius(size: jax.Array, kinds: tuple[str, ...] = SLOTS) -> jax.Array:
@@ -83,42 +84,42 @@ def sample_object(key: jax.Array, config: ObjectConfig,
     Raises:
       AssetError: the mesh is refused, see `object_mesh.load`.
     """
-    config, keys = config.narrowed(), jax.random.split(key, 8)
+    config, keys, corner = config.narrowed(), jax.random.split(key, 8), draw_corner(key, config.corners)
     if config.mesh:
-        return _sample_mesh(keys, config)
+        return _sample_mesh(keys, config, corner)
     if shape_index is None:
         allowed = jnp.array([SHAPES.index(name) for name in config.shapes])
         shape_index = jax.random.choice(keys[0], allowed)
-    size, position, active = _sample_slots(keys[1], shape_index, config)
+    size, position, active = _sample_slots(keys[1], shape_index, config, corner)
     density_mass, com, inertia = _mass_properties(size, position, active)
     position = position - com  # the origin is the centre of a uniform solid
-    mass = _uniform(keys[2], config.mass)
-    scale = _uniform(keys[3], config.inertia_scale) * mass / density_mass
-    com = config.com_offset * jax.random.uniform(keys[4], (3,), minval=-1.0)
+    mass = uniform(keys[2], config.mass, corner)
+    scale = uniform(keys[3], config.inertia_scale, corner) * mass / density_mass
+    com = config.com_offset * uniform(keys[4], (-1.0, 1.0), corner, (3,))
     return ObjectParams(shape_index.astype(jnp.int32), size, position, active, mass, inertia * scale, com,
-                        _uniform(keys[5], config.friction), _sample_contact(keys, config),
-                        bare_friction=_sample_bare_friction(keys, config))
+                        uniform(keys[5], config.friction, corner), _sample_contact(keys, config, corner),
+                        bare_friction=_sample_bare_friction(keys, config, corner))
 
 
-def _sample_mesh(keys: jax.Array, config: ObjectConfig) -> ObjectParams:
+def _sample_mesh(keys: jax.Array, config: ObjectConfig, corner: jax.Array | None) -> ObjectParams:
     thing = load_mesh_object(config)
-    factor, mass = _uniform(keys[1], config.mesh_size), _uniform(keys[2], config.mass)
+    factor, mass = uniform(keys[1], config.mesh_size, corner), uniform(keys[2], config.mass, corner)
     size, position, quat = object_mesh.scaled_boxes(thing, factor)
-    inertia = mass * factor**2 * _uniform(keys[3], config.inertia_scale) * jnp.asarray(thing.inertia)
-    com = config.com_offset * jax.random.uniform(keys[4], (3,), minval=-1.0)
+    inertia = mass * factor**2 * uniform(keys[3], config.inertia_scale, corner) * jnp.asarray(thing.inertia)
+    com = config.com_offset * uniform(keys[4], (-1.0, 1.0), corner, (3,))
     return ObjectParams(
         jnp.int32(KINDS.index("mesh")), size, position, jnp.ones(len(size), bool), mass, inertia, com,
-        _uniform(keys[5], config.friction), _sample_contact(keys, config), quat,
-        _sample_bare_friction(keys, config), thing.kinds)
+        uniform(keys[5], config.friction, corner), _sample_contact(keys, config, corner), quat,
+        _sample_bare_friction(keys, config, corner), thing.kinds)
 
 
-def _sample_bare_friction(keys: jax.Array, config: ObjectConfig) -> jax.Array:
-    return _uniform(jax.random.fold_in(keys[5], 1), config.bare_friction)
+def _sample_bare_friction(keys: jax.Array, config: ObjectConfig, corner: jax.Array | None) -> jax.Array:
+    return uniform(jax.random.fold_in(keys[5], 1), config.bare_friction, corner)
 
 
-def _sample_contact(keys: jax.Array, config: ObjectConfig) -> jax.Array:
-    return jnp.stack([_uniform(keys[6], config.stiffness),
-                      damping_ratio(_uniform(keys[7], config.restitution))])
+def _sample_contact(keys: jax.Array, config: ObjectConfig, corner: jax.Array | None) -> jax.Array:
+    return jnp.stack([uniform(keys[6], config.stiffness, corner),
+                      damping_ratio(uniform(keys[7], config.restitution, corner))])
 
 
 def plain_inertia(target: ObjectParams, config: ObjectConfig | None = None) -> jax.Array:
@@ -185,20 +186,16 @@ def damping_ratio(restitution: jax.Array) -> jax.Array:
                       jnp.asarray(_RATIOS[::-1], jnp.float32))
 
 
-def _uniform(key: jax.Array, span: tuple[float, float], shape=()) -> jax.Array:
-    return jax.random.uniform(key, shape, minval=span[0], maxval=span[1])
-
-
-def _sample_slots(key: jax.Array, shape_index: jax.Array,
-                  config: ObjectConfig) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _sample_slots(key: jax.Array, shape_index: jax.Array, config: ObjectConfig,
+                  corner: jax.Array | None) -> tuple[jax.Array, jax.Array, jax.Array]:
     keys = jax.random.split(key, 7)
     is_sphere, is_box, is_cylinder, is_capsule, is_union = (shape_index == i for i in range(5))
     part = jnp.where(is_union, config.composition_scale, 1.0)
-    half = part * _uniform(keys[0], config.box_half, (3,))
-    radius = part * _uniform(keys[1], config.cylinder_radius)
-    length = part * _uniform(keys[2], config.cylinder_half)
-    ball = _uniform(keys[3], config.sphere_radius)
-    neck, neck_half = _uniform(keys[4], config.neck_radius), _uniform(keys[5], config.neck_half)
+    half = part * uniform(keys[0], config.box_half, corner, (3,))
+    radius = part * uniform(keys[1], config.cylinder_radius, corner)
+    length = part * uniform(keys[2], config.cylinder_half, corner)
+    ball = uniform(keys[3], config.sphere_radius, corner)
+    neck, neck_half = uniform(keys[4], config.neck_radius, corner), uniform(keys[5], config.neck_half, corner)
     box_body = jax.random.bernoulli(keys[6])
 
     # A composition is a box or a cylinder with a capsule jutting out along its axis.

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from dexsim import rotations
 from dexsim.config import check_ranges, setting, validate
 from dexsim.pytree import pytree_dataclass
+from dexsim.ranges import to_end
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -44,14 +45,20 @@ class SensorDraw:
     phase: jax.Array  # [] fraction of a sampling period
 
 
-def draw_sensor(key: jax.Array, config: OrientationSensor, scale: float,
-                control_period: float) -> SensorDraw:
-    """Draw one episode's sensor; `scale` 0 gives one without bias, drift and delay."""
-    keys = jax.random.split(key, 4)
+def draw_sensor(key: jax.Array, config: OrientationSensor, scale: float, control_period: float,
+                corner: jax.Array | None = None) -> SensorDraw:
+    """Draw one episode's sensor; `scale` 0 gives one without bias, drift and delay.
+
+    Where `corner` [] is true, all three are at an end of their ranges (`dexsim.ranges`).
+    """
+    keys, sides = jax.random.split(key, 4), (-1.0, 1.0)
     delay = jax.random.uniform(keys[2], minval=config.delay[0], maxval=config.delay[1])
+    delay = to_end(delay, config.delay, 0.0, corner)
+    bias = to_end(jax.random.uniform(keys[0], (3,), minval=-1.0), sides, 0.0, corner)
+    drift = to_end(jax.random.uniform(keys[1], minval=-1.0), sides, 0.0, corner)
     return SensorDraw(
-        bias=scale * config.bias * jax.random.uniform(keys[0], (3,), minval=-1.0),
-        drift=scale * config.drift * jax.random.uniform(keys[1], minval=-1.0),
+        bias=scale * config.bias * bias,
+        drift=scale * config.drift * drift,
         delay=jnp.clip(scale * delay / control_period, 0.0, 1.0),
         phase=jax.random.uniform(keys[3]))
 

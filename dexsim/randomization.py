@@ -15,6 +15,7 @@ from dexsim.config import check_ranges, setting, validate
 from dexsim.errors import ConfigError
 from dexsim.hand import Hand
 from dexsim.pytree import pytree_dataclass
+from dexsim.ranges import draw_corner, to_end
 
 _FACTORS = ("stiffness_factor", "damping_factor", "torque_factor", "speed_factor", "efficiency",
             "torque_gain", "taxel_gain")
@@ -75,6 +76,9 @@ class Randomization:
     """Factor on a finger's taxel readings."""
     gravity_tilt: float = setting(0.1, unit="rad", low=0.0, high=1.6)
     """Largest tilt of the hand against gravity, about each horizontal axis."""
+    corners: float = setting(0.0, unit="1", low=0.0, high=1.0)
+    """Share of hands (and of their IMUs) with every value at an end of its range, but for the ripples' number
+    and phase; see `dexsim.ranges`."""
 
     def __post_init__(self):
         validate(self)
@@ -113,12 +117,13 @@ def sample(key: jax.Array, config: Randomization, hand: Hand, *, timestep: float
     """
     width = config.scale * scale
     off = isinstance(width, (int, float)) and width == 0  # known beforehand: nothing is drawn
+    corner = draw_corner(key, config.corners)
 
     def draw(key: jax.Array, span: tuple[float, float], nominal: float,
              shape: tuple[int, ...]) -> jax.Array:
         if off:
             return jnp.full(shape, nominal, float)
-        value = jax.random.uniform(key, shape, minval=span[0], maxval=span[1])
+        value = to_end(jax.random.uniform(key, shape, minval=span[0], maxval=span[1]), span, nominal, corner)
         return nominal + width * (value - nominal)
 
     return _assemble(key, draw, config, hand, timestep, control_period)

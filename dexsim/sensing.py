@@ -47,9 +47,9 @@ class Senses:
         self.array = _array(config, hand)
         self._up = -jnp.asarray(task.gravity) / np.linalg.norm(task.gravity)
 
-    def draw_orientation(self, key: jax.Array, scale: jax.Array | float) -> SensorDraw:
-        """One episode's IMU."""
-        return draw_sensor(key, self.config.sensing.orientation, scale, self.period)
+    def draw_orientation(self, key: jax.Array, scale: jax.Array | float, corner: jax.Array | None) -> SensorDraw:
+        """One episode's IMU; see `draw_sensor`."""
+        return draw_sensor(key, self.config.sensing.orientation, scale, self.period, corner)
 
     def draw_array(self, key: jax.Array, scale: jax.Array | float
                    ) -> tuple[SensorParams | None, SensorState | None]:

@@ -22,7 +22,7 @@ import tyro
 
 from dexsim import statistics
 from dexsim.assets import asset_path
-from dexsim.config import from_dict
+from dexsim.config import from_dict, override
 from dexsim.errors import AssetError, CheckpointError, ConfigError
 from dexsim_ppo import cli
 from dexsim_ppo.compilation import collector_paused, jit
@@ -198,6 +198,8 @@ class EvaluateArguments:
     """Length of an evaluation episode; 0 for the task's own."""
     blind: tuple[str, ...] = ()
     """Readings that the policy does without ("contact_force contact_centre"): it gets their mean in training."""
+    set: tuple[str, ...] = ()
+    """Fields of the task's configuration to change ("randomization.corners=1 edge=[0.05,0.05]")."""
     output: Path | None = None
     """File for the report as JSON."""
     video: Path | None = None
@@ -219,13 +221,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     policy = load_policy(arguments.policy).blind(*arguments.blind)
     chunk = min(arguments.chunk or (1024 if jax.default_backend() == "gpu" else 64),
                 arguments.episodes)
-    if arguments.seconds:
-        policy = dataclasses.replace(policy, env_config=policy.env_config | {
-            "evaluation_seconds": arguments.seconds})
+    seconds = [f"evaluation_seconds={arguments.seconds}"] if arguments.seconds else []
+    policy = dataclasses.replace(policy, env_config=override(policy.env_config, (*seconds, *arguments.set)))
     env = make_env(policy, backend=arguments.backend, num_envs=chunk)
     report, snapshots = Evaluator(env, chunk)(policy.params, episodes=arguments.episodes,
                                               seed=arguments.seed)
-    report |= {"policy": arguments.policy, "blind": list(arguments.blind), "backend": env.backend}
+    report |= {"policy": arguments.policy, "blind": list(arguments.blind), "set": list(arguments.set),
+               "backend": env.backend}
     report |= cli.environment_report()
     if arguments.output:
         cli.write_json(arguments.output, report)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dexsim.config import check_ranges, from_dict, setting, to_dict, validate
+from dexsim.config import check_ranges, from_dict, override, setting, to_dict, validate
 from dexsim.errors import ConfigError, DexsimError
 from dexsim.object_config import ObjectConfig
 from dexsim.physics import PhysicsConfig
@@ -182,3 +182,25 @@ def test_a_whole_number_serves_as_a_real_one():
 def test_units_and_ranges_are_there_for_the_command_line_and_the_documents():
     field = next(f for f in dataclasses.fields(Spring) if f.name == "stiffness")
     assert dict(field.metadata) == {"unit": "N/m", "low": 0.5, "high": 8.0, "choices": None}
+
+
+def test_override_replaces_fields_by_their_path():
+    plain = to_dict(GraspConfig())
+    before = json.dumps(plain)
+    changed = override(plain, ["objects.corners=0.5", "objects.shapes=[\"box\"]", "randomization.backlash=gear_play",
+                               "randomization.latency=[0, 0.01]", "episode_seconds=3"])
+    config = from_dict(GraspConfig, changed)
+    assert json.dumps(plain) == before
+    wanted = dataclasses.replace(
+        GraspConfig(), episode_seconds=3.0, objects=dataclasses.replace(ObjectConfig(), corners=0.5, shapes=("box",)),
+        randomization=dataclasses.replace(Randomization(), backlash="gear_play", latency=(0.0, 0.01)))
+    assert config == wanted
+    # A field that the file does not have yet.
+    assert from_dict(GraspConfig, override({}, ["objects.corners=1"])).objects.corners == 1.0
+    for entry, said in (("objects.corner=1", "ObjectConfig has no field 'corner'"),
+                        ("objects.corners=7", "between 0 and 1"),
+                        ("objects.corners=much", "expected float"), ("objects=1", "expected a table"),
+                        ("episode_seconds.x=1", "expected float"), ("corners", "expected NAME=VALUE"),
+                        ("=1", "expected NAME=VALUE"), ("corners=", "expected NAME=VALUE")):
+        with pytest.raises(ConfigError, match=said):
+            from_dict(GraspConfig, override(plain, [entry]))

@@ -9,10 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import dexsim
 from dexsim.errors import ConfigError
+from dexsim.object_config import ObjectConfig
+from dexsim.objects import sample_object
 from dexsim.randomization import Curriculum, Randomization, next_scale, sample, sample_outside
 from dexsim.randomization_check import conclude, table
 from dexsim.randomization_effects import check
+from dexsim.tasks.rotate_config import RotateConfig
+from dexsim.tasks.rotate_start import sample_target
 
 TIMES = dict(timestep=0.005, control_period=0.03)
 
@@ -192,6 +197,75 @@ def test_held_out_hands_lie_outside_every_range(hand):
             assert 0.3 < np.mean(values > high - slack) < 0.7, name
         # None at an end that is the nominal value itself.
         assert np.all(np.abs(values - nominal) > 1e-4), name
+
+
+# --- corners -----------------------------------------------------------------------------------------
+
+
+def test_a_share_of_hands_stands_in_corners_and_the_others_do_not(hand):
+    config = dataclasses.replace(EVEN, corners=0.3)
+    drawn = draws(hand, config)
+    plain = draws(hand, EVEN)
+    at_end = {}
+    for name, values in quantities(hand, drawn).items():
+        if name == "ripple_count":
+            continue
+        span = getattr(config, name)
+        low, high = span if isinstance(span, tuple) else (-span, span)
+        nominal = 1.0 if name.endswith(("factor", "gain")) or name == "efficiency" else 0.0
+        ends = [end for end in (low, high) if end != nominal]
+        values = np.asarray(values, float)
+        near = np.min([np.abs(values - end) for end in ends], 0) < 1e-6 * max(1.0, abs(high))
+        if name != "latency":  # in whole sub-steps
+            at_end[name] = near.all(1)
+            assert near[at_end[name]].all()
+            sides = [np.mean(np.abs(values[at_end[name]] - end) < 1e-5) for end in ends]
+            assert min(sides) > (0.4 if len(ends) == 2 else 0.99), name
+        # Elsewhere the draw is what it is without corners.
+        others = ~at_end["stiffness_factor"]
+        np.testing.assert_array_equal(values[others], np.asarray(quantities(hand, plain)[name], float)[others])
+    assert 0.25 < np.mean(at_end["stiffness_factor"]) < 0.35
+    for name, rows in at_end.items():
+        np.testing.assert_array_equal(rows, at_end["stiffness_factor"], err_msg=name)
+
+
+def test_corners_narrow_with_the_scale(hand):
+    one = jax.tree.map(lambda x: np.asarray(x[0]), draws(hand, dataclasses.replace(EVEN, corners=1.0, scale=0.5)))
+    assert np.all(np.isin(one.torque_gain.round(5), np.float32([0.95, 1.05])))
+    np.testing.assert_allclose(one.actuator.efficiency, 0.925, rtol=1e-5)
+
+
+def test_the_imu_of_a_hand_in_a_corner_is_in_one_too():
+    config = RotateConfig(pool_size=16, randomization=dataclasses.replace(EVEN, corners=0.5, gravity_tilt=0.0))
+    env = dexsim.make("rotate", config, backend="jax")
+    keys = jax.random.split(jax.random.key(0), (64, 2))
+    drawn, imu = jax.vmap(lambda two: env._draw(*two))(keys)
+    corner = np.all(np.isin(np.asarray(drawn.torque_gain).round(5), np.float32([0.9, 1.1])), axis=1)
+    ranges = config.sensing.orientation
+    for values, end in ((imu.bias, ranges.bias), (imu.drift[:, None], ranges.drift),
+                        (imu.delay[:, None], ranges.delay[1] / env.control_period)):
+        np.testing.assert_array_equal(np.all(np.abs(np.abs(values) - end) < 1e-6 + 1e-4 * end, axis=1), corner)
+    assert 0.3 < np.mean(corner) < 0.7 and len(np.unique(np.sign(imu.bias[corner]), axis=0)) == 8
+
+
+@pytest.mark.parametrize("config", [ObjectConfig(corners=1.0), RotateConfig(objects=ObjectConfig(
+    shapes=("box",), corners=1.0))], ids=["grasp", "rotate"])
+def test_objects_in_corners(config):
+    draw, ranges = sample_object, config
+    if isinstance(config, RotateConfig):
+        draw, ranges = sample_target, config.objects
+    drawn = jax.vmap(lambda key: draw(key, config))(jax.random.split(jax.random.key(0), 200))
+    at = {name: np.asarray(getattr(drawn, name)) for name in ("mass", "friction", "bare_friction")}
+    at["stiffness"], at["com_offset"] = np.asarray(drawn.contact[:, 0]), np.asarray(drawn.com)
+    for name, values in at.items():
+        span = getattr(ranges, name)
+        low, high = span if isinstance(span, tuple) else (-span, span)
+        for end in (low, high):
+            assert 0.35 < np.mean(np.abs(values - end) < 1e-5 * max(1, abs(end))) < 0.65, name
+        assert np.all((np.abs(values - low) < 1e-5 * max(1, low)) | (np.abs(values - high) < 1e-5 * high)), name
+    if draw is sample_target:
+        edges = 2 * np.asarray(drawn.size[:, 0, 0])
+        assert np.all(np.isin(edges.round(5), np.float32(config.edge).round(5))) and 0.4 < np.mean(edges > 0.055) < 0.6
 
 
 # --- the self-test -----------------------------------------------------------------------------------

@@ -30,6 +30,7 @@ from dexsim.hand import Hand, flexion_joints
 from dexsim.object_config import SHAPES, load_mesh_object
 from dexsim.objects import ObjectParams, extent, sample_object
 from dexsim.physics_model import build_model, tip_bodies
+from dexsim.ranges import draw_corner, uniform
 from dexsim.tasks.grasp_start import clearance, palm_height
 
 KINDS = {"cube": ("box",), "cylinder": ("cylinder",), "octagon": ("box", "box")}
@@ -66,9 +67,9 @@ def sample_target(key: jax.Array, config: Any) -> ObjectParams:
     if config.objects.scale != 1:
         middle, reach = (shortest + longest) / 2, config.objects.scale * (longest - shortest) / 2
         shortest, longest = middle - reach, middle + reach
-    half = jax.random.uniform(edge_key, minval=shortest, maxval=longest) / 2
-    low, high = config.objects.narrowed().inertia_scale
-    scale = base.mass * jax.random.uniform(scale_key, minval=low, maxval=high)
+    corner = draw_corner(base_key, config.objects.corners)  # the one that `sample_object` draws
+    half = uniform(edge_key, (shortest, longest), corner) / 2
+    scale = base.mass * uniform(scale_key, config.objects.narrowed().inertia_scale, corner)
     turns = {"cube": None, "cylinder": [_UPRIGHT], "octagon": [(1.0, 0.0, 0.0, 0.0), _EIGHTH]}[config.object]
     quat = None if turns is None else jnp.array(turns, jnp.float32)
     inertia = plain_inertia(config.object, half)
