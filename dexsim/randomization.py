@@ -79,15 +79,19 @@ class Randomization:
     corners: float = setting(0.0, unit="1", low=0.0, high=1.0)
     """Share of hands (and of their IMUs) with every value at an end of its range, but for the ripples' number
     and phase; see `dexsim.ranges`."""
+    beyond: float = setting(0.0, unit="1", low=0.0, high=3.0)
+    """How far outside its range a hand in a corner has its values: up to this share of the end's distance from
+    nominal. For evaluation on hands that training never had: `corners` 1 and `beyond` above 0."""
 
     def __post_init__(self):
         validate(self)
         check_ranges(self, *_SPANS)
+        width = self.scale * (1 + self.beyond)
         for name in _FACTORS:
             low, high = getattr(self, name)
-            if min(1 + self.scale * (low - 1), 1 + self.scale * (high - 1)) < 0:
-                raise ConfigError(f"Randomization.{name} = ({low:g}, {high:g}) at scale "
-                                  f"{self.scale:g} reaches below 0: narrow one or the other")
+            if min(1 + width * (low - 1), 1 + width * (high - 1)) < 0:
+                raise ConfigError(f"Randomization.{name} = ({low:g}, {high:g}) at scale {self.scale:g} and beyond "
+                                  f"{self.beyond:g} reaches below 0: narrow one or the other")
 
 
 @pytree_dataclass
@@ -123,27 +127,10 @@ def sample(key: jax.Array, config: Randomization, hand: Hand, *, timestep: float
              shape: tuple[int, ...]) -> jax.Array:
         if off:
             return jnp.full(shape, nominal, float)
-        value = to_end(jax.random.uniform(key, shape, minval=span[0], maxval=span[1]), span, nominal, corner)
+        value = jax.random.uniform(key, shape, minval=span[0], maxval=span[1])
+        far = jax.random.uniform(jax.random.fold_in(key, 1), shape, minval=1.0, maxval=1.0 + config.beyond)
+        value = to_end(value, span, nominal, corner, far if config.beyond else 1.0)
         return nominal + width * (value - nominal)
-
-    return _assemble(key, draw, config, hand, timestep, control_period)
-
-
-def sample_outside(key: jax.Array, config: Randomization, hand: Hand, *, timestep: float,
-                   control_period: float, stretch: float = 1.5) -> Draw:
-    """Draw a hand that lies outside the ranges in every parameter: for held-out evaluation.
-
-    Each value lies beyond one end of its range, up to `stretch` times as far from nominal as that
-    end. Ranges that begin at nominal are left at their far end only.
-    """
-    def draw(key: jax.Array, span: tuple[float, float], nominal: float,
-             shape: tuple[int, ...]) -> jax.Array:
-        low, high = span[0] - nominal, span[1] - nominal
-        which, how_far = jax.random.split(key)
-        odds = abs(high) / max(abs(low) + abs(high), 1e-30)
-        end = jnp.where(jax.random.uniform(which, shape) < odds, high, low)
-        far = jax.random.uniform(how_far, shape, minval=1.0, maxval=stretch)
-        return nominal + config.scale * far * end
 
     return _assemble(key, draw, config, hand, timestep, control_period)
 

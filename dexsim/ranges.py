@@ -15,12 +15,17 @@ def draw_corner(key: jax.Array, share: float) -> jax.Array | None:
     return None if share == 0 else jax.random.bernoulli(jax.random.fold_in(key, _CORNER), share)
 
 
-def to_end(value: jax.Array, span: tuple[float, float], nominal: float, corner: jax.Array | None) -> jax.Array:
+def to_end(value: jax.Array, span: tuple[float, float], nominal: float, corner: jax.Array | None,
+           far: jax.Array | float = 1.0) -> jax.Array:
     """`value` [...] of a range (low, high), or at a corner the end of it on the value's side of nominal.
 
-    A range that begins at its nominal value has its far end only.
+    A range that begins at its nominal value has its far end only. `far` is the distance from nominal in units
+    of that end's: beyond 1 the corner lies outside the range.
     """
-    return value if corner is None else jnp.where(corner, jnp.where(value >= nominal, span[1], span[0]), value)
+    if corner is None:
+        return value
+    end = jnp.where(value >= nominal, span[1], span[0])
+    return jnp.where(corner, nominal + far * (end - nominal), value)
 
 
 def uniform(key: jax.Array, span: tuple[float, float], corner: jax.Array | None,
