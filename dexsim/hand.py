@@ -7,6 +7,7 @@ files under `assets/hand/` knows which hand it is.
 import csv
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -57,62 +58,19 @@ def load_hand(path: str | Path | None = None) -> Hand:
     Raises:
       AssetError: a file is missing or broken, or the three do not fit together.
     """
-    import mujoco
-
     path = Path(path) if path is not None else asset_path("hand/xhand_right.toml")
     table = _read_toml(path)
     _check_table(path, table)
     model_path = path.parent / table["model"]
-    if not model_path.is_file():
-        raise AssetError(f"{model_path}: no such file (model of {path})")
-    try:
-        model = mujoco.MjModel.from_xml_path(str(model_path))
-    except ValueError as error:
-        raise AssetError(f"{model_path}: {' '.join(str(error).split())}") from None
-    _check_finite(model, model_path)
-
-    def find(kind: str, name: str) -> int:
-        index = mujoco.mj_name2id(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), name)
-        if index < 0:
-            raise AssetError(f"{path}: {model_path.name} has no {kind} {name!r}")
-        return index
-
-    joints = [find("joint", name) for name in table["joints"]]
-    if len(set(joints)) != model.njnt or model.nq != model.njnt:
-        raise AssetError(f"{path}: joints lists {len(set(joints))} of the {model.njnt} joints of "
-                         f"{model_path.name}; every joint must be listed once and be a hinge")
-    if np.any(model.jnt_type != mujoco.mjtJoint.mjJNT_HINGE):
-        raise AssetError(f"{model_path}: only hinge joints are supported")
-    if len(table["speed_limits"]) != len(joints):
-        raise AssetError(f"{path}: {len(table['speed_limits'])} speed_limits "
-                         f"for {len(joints)} joints")
-    limit = model.jnt_actfrcrange[joints, 1]
-    if not np.all(model.jnt_limited[joints]) or np.any(limit <= 0):
-        bad = next(n for n, j, t in zip(table["joints"], joints, limit, strict=True)
-                   if not model.jnt_limited[j] or t <= 0)
-        raise AssetError(f"{model_path}: joint {bad!r} needs a range and an actuatorfrcrange")
-
-    palm = find("body", table["palm"])
+    model = _load_model(path, model_path)
+    joints = _find_joints(path, model_path, model, table)
+    palm = _find(path, model_path, model, "body", table["palm"])
     bodies = [b for b in range(1, model.nbody) if _is_below(model.body_parentid, b, palm)]
     row = {body: i for i, body in enumerate(bodies)}
-    body_joint = np.full(len(bodies), -1, np.int32)
-    for index, joint in enumerate(joints):
-        body = int(model.jnt_bodyid[joint])
-        if body not in row or body == palm or body_joint[row[body]] >= 0:
-            raise AssetError(f"{model_path}: joint {table['joints'][index]!r} must be the only "
-                             f"joint of a body below {table['palm']!r}")
-        body_joint[row[body]] = index
+    body_joint = _joints_of_bodies(model_path, model, table, joints, palm, row)
     at = np.array([joints[j] if j >= 0 else -1 for j in body_joint])
     has = at >= 0
-    tips = [find("site", finger["tip"]) for finger in table["fingers"]]
-    for finger, site in zip(table["fingers"], tips, strict=True):
-        if int(model.site_bodyid[site]) not in row:
-            raise AssetError(f"{path}: tip {finger['tip']!r} is on no body of {table['palm']!r}")
-    root = [table["joints"].index(finger["root_joint"])
-            if finger["root_joint"] in table["joints"] else -1 for finger in table["fingers"]]
-    if -1 in root:
-        name = table["fingers"][root.index(-1)]["root_joint"]
-        raise AssetError(f"{path}: root_joint {name!r} is not among joints")
+    tips, root = _find_fingers(path, model_path, model, table, row)
     finger_names = tuple(finger["name"] for finger in table["fingers"])
     taxels = read_taxels(path.parent / table["taxels"], finger_names, table["taxel_grid"])
     parent = np.array([row.get(int(model.body_parentid[b]), -1) for b in bodies])
@@ -122,7 +80,7 @@ def load_hand(path: str | Path | None = None) -> Hand:
         name=table.get("name", path.stem), model_path=model_path, palm=table["palm"],
         joint_names=tuple(table["joints"]),
         joint_lower=_f32(model.jnt_range[joints, 0]), joint_upper=_f32(model.jnt_range[joints, 1]),
-        torque_limit=_f32(limit), speed_limit=_f32(table["speed_limits"]),
+        torque_limit=_f32(model.jnt_actfrcrange[joints, 1]), speed_limit=_f32(table["speed_limits"]),
         body_names=tuple(model.body(b).name for b in bodies), body_parent=parent,
         body_position=_f32([np.zeros(3) if b == palm else model.body_pos[b] for b in bodies]),
         body_rotation=_f32([identity if b == palm else _matrix(model.body_quat[b])
@@ -138,6 +96,75 @@ def load_hand(path: str | Path | None = None) -> Hand:
         taxel_position=taxels[..., 0:3], taxel_normal=taxels[..., 3:6], taxel_area=taxels[..., 6],
         geoms=_read_geoms(model, row),
     )
+
+
+def _load_model(path: Path, model_path: Path) -> Any:
+    import mujoco
+
+    if not model_path.is_file():
+        raise AssetError(f"{model_path}: no such file (model of {path})")
+    try:
+        model = mujoco.MjModel.from_xml_path(str(model_path))
+    except ValueError as error:
+        raise AssetError(f"{model_path}: {' '.join(str(error).split())}") from None
+    _check_finite(model, model_path)
+    return model
+
+
+def _find(path: Path, model_path: Path, model: Any, kind: str, name: str) -> int:
+    """Index of a joint, body or site."""
+    import mujoco
+
+    index = mujoco.mj_name2id(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), name)
+    if index < 0:
+        raise AssetError(f"{path}: {model_path.name} has no {kind} {name!r}")
+    return index
+
+
+def _find_joints(path: Path, model_path: Path, model: Any, table: dict) -> list[int]:
+    """The model's joints in the order of the TOML."""
+    import mujoco
+
+    joints = [_find(path, model_path, model, "joint", name) for name in table["joints"]]
+    if len(set(joints)) != model.njnt or model.nq != model.njnt:
+        raise AssetError(f"{path}: joints lists {len(set(joints))} of the {model.njnt} joints of "
+                         f"{model_path.name}; every joint must be listed once and be a hinge")
+    if np.any(model.jnt_type != mujoco.mjtJoint.mjJNT_HINGE):
+        raise AssetError(f"{model_path}: only hinge joints are supported")
+    if len(table["speed_limits"]) != len(joints):
+        raise AssetError(f"{path}: {len(table['speed_limits'])} speed_limits "
+                         f"for {len(joints)} joints")
+    limit = model.jnt_actfrcrange[joints, 1]
+    if not np.all(model.jnt_limited[joints]) or np.any(limit <= 0):
+        bad = next(n for n, j, t in zip(table["joints"], joints, limit, strict=True)
+                   if not model.jnt_limited[j] or t <= 0)
+        raise AssetError(f"{model_path}: joint {bad!r} needs a range and an actuatorfrcrange")
+    return joints
+
+
+def _joints_of_bodies(model_path: Path, model: Any, table: dict, joints: list[int], palm: int,
+                      row: dict[int, int]) -> np.ndarray:
+    """The joint [B] that moves each body, as an index into the TOML's; -1 for none."""
+    body_joint = np.full(len(row), -1, np.int32)
+    for index, joint in enumerate(joints):
+        body = int(model.jnt_bodyid[joint])
+        if body not in row or body == palm or body_joint[row[body]] >= 0:
+            raise AssetError(f"{model_path}: joint {table['joints'][index]!r} must be the only "
+                             f"joint of a body below {table['palm']!r}")
+        body_joint[row[body]] = index
+    return body_joint
+
+
+def _find_fingers(path: Path, model_path: Path, model: Any, table: dict,
+                  row: dict[int, int]) -> tuple[list[int], list[int]]:
+    """Each finger's tip site and its first joint, as an index into the TOML's."""
+    tips = [_find(path, model_path, model, "site", finger["tip"]) for finger in table["fingers"]]
+    for finger, site in zip(table["fingers"], tips, strict=True):
+        if int(model.site_bodyid[site]) not in row:
+            raise AssetError(f"{path}: tip {finger['tip']!r} is on no body of {table['palm']!r}")
+        if finger["root_joint"] not in table["joints"]:
+            raise AssetError(f"{path}: root_joint {finger['root_joint']!r} is not among joints")
+    return tips, [table["joints"].index(finger["root_joint"]) for finger in table["fingers"]]
 
 
 def _check_table(path: Path, table: dict) -> None:
