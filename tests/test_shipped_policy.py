@@ -12,6 +12,7 @@ from dexsim.errors import ConfigError
 from dexsim.observation import GRASP, ROTATE, layout
 from dexsim.tasks import TASKS
 from dexsim_ppo.policy import Policy, layout_to_list
+from dexsim_real.sensing import sources_of
 
 SHIPPED = {"grasp": (GRASP, 66), "rotate": (ROTATE, 65), "rotate_without_orientation": (ROTATE, 59)}
 
@@ -43,6 +44,13 @@ def test_the_goal_is_seen():
     near, far = (np.asarray(load("rotate")(jnp.zeros(65).at[12:18].set(jnp.array(sixd))))
                  for sixd in ([1.0, 0, 0, 0, 1, 0], [1.0, 0, 0, 0, 0, 1]))
     assert np.max(np.abs(near - far)) > 1e-3
+
+
+@pytest.mark.parametrize(("name", "sources"), [
+    ("grasp", {"hand", "camera", "user"}), ("rotate", {"hand", "imu", "policy"}),
+    ("rotate_without_orientation", {"hand", "policy"})])
+def test_the_sensors_it_needs(name, sources):
+    assert sources_of([field.name for field in load(name).observation_layout]) == sources
 
 
 @pytest.mark.parametrize("name", SHIPPED)
