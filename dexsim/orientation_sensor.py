@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from dexsim import rotations
 from dexsim.config import check_ranges, setting, validate
 from dexsim.pytree import pytree_dataclass
-from dexsim.ranges import to_end
+from dexsim.ranges import uniform
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -52,13 +52,10 @@ def draw_sensor(key: jax.Array, config: OrientationSensor, scale: float, control
     Where `corner` [] is true, all three are at an end of their ranges (`dexsim.ranges`).
     """
     keys, sides = jax.random.split(key, 4), (-1.0, 1.0)
-    delay = jax.random.uniform(keys[2], minval=config.delay[0], maxval=config.delay[1])
-    delay = to_end(delay, config.delay, 0.0, corner)
-    bias = to_end(jax.random.uniform(keys[0], (3,), minval=-1.0), sides, 0.0, corner)
-    drift = to_end(jax.random.uniform(keys[1], minval=-1.0), sides, 0.0, corner)
+    delay = uniform(keys[2], config.delay, corner, nominal=0.0)
     return SensorDraw(
-        bias=scale * config.bias * bias,
-        drift=scale * config.drift * drift,
+        bias=scale * config.bias * uniform(keys[0], sides, corner, (3,)),
+        drift=scale * config.drift * uniform(keys[1], sides, corner),
         delay=jnp.clip(scale * delay / control_period, 0.0, 1.0),
         phase=jax.random.uniform(keys[3]))
 

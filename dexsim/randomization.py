@@ -15,7 +15,7 @@ from dexsim.config import check_ranges, setting, validate
 from dexsim.errors import ConfigError
 from dexsim.hand import Hand
 from dexsim.pytree import pytree_dataclass
-from dexsim.ranges import draw_corner, to_end
+from dexsim.ranges import draw_corner, uniform
 
 _FACTORS = ("stiffness_factor", "damping_factor", "torque_factor", "speed_factor", "efficiency",
             "torque_gain", "taxel_gain")
@@ -127,9 +127,7 @@ def sample(key: jax.Array, config: Randomization, hand: Hand, *, timestep: float
              shape: tuple[int, ...]) -> jax.Array:
         if off:
             return jnp.full(shape, nominal, float)
-        value = jax.random.uniform(key, shape, minval=span[0], maxval=span[1])
-        far = jax.random.uniform(jax.random.fold_in(key, 1), shape, minval=1.0, maxval=1.0 + config.beyond)
-        value = to_end(value, span, nominal, corner, far if config.beyond else 1.0)
+        value = uniform(key, span, corner, shape, nominal=nominal, beyond=config.beyond)
         return nominal + width * (value - nominal)
 
     return _assemble(key, draw, config, hand, timestep, control_period)

@@ -15,21 +15,24 @@ def draw_corner(key: jax.Array, share: float) -> jax.Array | None:
     return None if share == 0 else jax.random.bernoulli(jax.random.fold_in(key, _CORNER), share)
 
 
-def to_end(value: jax.Array, span: tuple[float, float], nominal: float, corner: jax.Array | None,
-           far: jax.Array | float = 1.0) -> jax.Array:
-    """`value` [...] of a range (low, high), or at a corner the end of it on the value's side of nominal.
+def uniform(key: jax.Array, span: tuple[float, float], corner: jax.Array | None, shape: tuple[int, ...] = (), *,
+            nominal: float | None = None, beyond: float = 0.0) -> jax.Array:
+    """A value [*shape] of a range (low, high), or at a corner the end of it on that value's side of nominal.
 
-    A range that begins at its nominal value has its far end only. `far` is the distance from nominal in units
-    of that end's: beyond 1 the corner lies outside the range.
+    Args:
+      key: of this value.
+      span: the range. One that begins at its nominal value has its far end only.
+      corner: [] bool, or None for no corners; see `draw_corner`.
+      nominal: by default the middle of the range.
+      beyond: a corner lies up to this share of the end's distance from nominal outside the range.
     """
+    value = jax.random.uniform(key, shape, minval=span[0], maxval=span[1])
     if corner is None:
         return value
+    if nominal is None:
+        nominal = (span[0] + span[1]) / 2
     end = jnp.where(value >= nominal, span[1], span[0])
-    return jnp.where(corner, nominal + far * (end - nominal), value)
-
-
-def uniform(key: jax.Array, span: tuple[float, float], corner: jax.Array | None,
-            shape: tuple[int, ...] = ()) -> jax.Array:
-    """A value [*shape] of a range (low, high) whose nominal value is its middle."""
-    value = jax.random.uniform(key, shape, minval=span[0], maxval=span[1])
-    return to_end(value, span, (span[0] + span[1]) / 2, corner)
+    if beyond:
+        far = jax.random.uniform(jax.random.fold_in(key, 1), shape, minval=1.0, maxval=1.0 + beyond)
+        end = nominal + far * (end - nominal)
+    return jnp.where(corner, end, value)
