@@ -82,10 +82,10 @@ def goal_reward(angle: jax.Array, distance: jax.Array, weights: RotateReward) ->
     return gate / (jnp.abs(angle) + weights.epsilon)
 
 
-def tips_at_work(duty: jax.Array, count: int, enough: float) -> jax.Array:
-    """Mean over the `count` busiest fingertips of min(duty / enough, 1)."""
-    busiest = jnp.sort(duty)[::-1][:count]
-    return jnp.sum(jnp.minimum(busiest / enough, 1.0)) / count
+def tips_at_work(duty: jax.Array, count: int, enough: float, by: str = "mean") -> jax.Array:
+    """min(duty / enough, 1) of the `count` busiest fingertips: their mean, or the least of them."""
+    busiest = jnp.minimum(jnp.sort(duty)[::-1][:count] / enough, 1.0)
+    return jnp.sum(busiest) / count if by == "mean" else busiest[-1]
 
 
 class Rotate:
@@ -199,7 +199,8 @@ class Rotate:
         """The reward of a tick and its terms; nothing but penalties once dropped."""
         weights, now, held = self.config.reward, self.progress(goal, moment), 1.0 - dropped
         after = self._advance(goal, moment)
-        work = tips_at_work(after.duty, weights.working_tips, weights.working_duty)
+        work = tips_at_work(after.duty, weights.working_tips, weights.working_duty,
+                            weights.tips_by)
         calm = jnp.minimum(weights.bonus_speed / jnp.maximum(after.pace, 1e-6), 1.0) ** 2
         asked = weights.bonus_tips * (goal.turns >= weights.tips_after)
         share = calm * (1.0 - asked * (1.0 - work))

@@ -51,6 +51,8 @@ class RotateReward:
     """Fingertips that are asked to take part."""
     working_duty: float = setting(0.25, unit="1", low=0.001, high=1.0)
     """Share of the time for which one has to touch to earn all of that."""
+    tips_by: str = setting("mean", choices=("mean", "last"))
+    """What counts as taking part: the mean of those fingertips, or the least busy of them."""
     drop: float = setting(-50.0, unit="1", low=-10000.0, high=0.0)
     """Once, when the object is lost."""
 
