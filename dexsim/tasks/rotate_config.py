@@ -10,6 +10,7 @@ from dexsim.env import Control, EnvConfig
 from dexsim.errors import ConfigError
 from dexsim.object_config import ObjectConfig
 from dexsim.observation import ObservationConfig
+from dexsim.randomization import Randomization
 from dexsim.tasks.rotate_start import KINDS
 
 
@@ -65,9 +66,12 @@ class RotateConfig(EnvConfig):
     """The rotation task."""
 
     objects: ObjectConfig = setting(ObjectConfig(
-        shapes=("box",), mass=(0.06, 0.15), friction=(0.6, 1.2), bare_friction=(0.3, 0.7), com_offset=0.003))
+        shapes=("box",), mass=(0.06, 0.15), friction=(0.6, 1.2), bare_friction=(0.3, 0.7), com_offset=0.003,
+        corners=0.3))
     """Mass, inertia, centre of mass, friction and contact of the object; its sizes are `edge`. The bare hand
     is plastic: where it grips as rubber does, random strokes carry the object onto the thumb and over."""
+    randomization: Randomization = setting(Randomization(corners=0.3))
+    """A share of hands and objects in corners of their ranges: policies without those halve their goals there."""
     control: Control = setting(Control(step=0.08, recall="target"))
     """From action to joint target."""
     object: str = setting("cube", choices=(*KINDS, "mesh"))
@@ -126,7 +130,7 @@ class RotateConfig(EnvConfig):
     """How far the joint targets of thumb and fingers lie beyond that posture: the grip."""
     heading_noise: float = setting(0.7, unit="rad", low=0.0, high=math.pi)
     """Largest turn of the object about the axis at the start."""
-    start_offset: tuple[float, float] = setting((-0.005, -0.007), unit="m", low=-0.1, high=0.1)
+    start_offset: tuple[float, float] = setting((-0.004, 0.0), unit="m", low=-0.1, high=0.1)
     """Where the object is put at the start, across and along the palm (y, z) from the reference: a little away
     from thumb and fingertips, beside which the first stroke often fails ..."""
     place_noise: float = setting(0.010, unit="m", low=0.0, high=0.05)
