@@ -124,19 +124,11 @@ class Controller:
         return Tick(readings, observation, action, target)
 
 
-def _twist(quat: np.ndarray, axis: np.ndarray) -> float:
-    """The turn rad about `axis` [3] that a rotation [4] contains, in (-pi, pi]."""
-    angle = 2 * math.atan2(float(quat[1:] @ axis), float(quat[0]))
-    return math.pi - (math.pi - angle) % (2 * math.pi)
-
-
 class TurnGoals:
     """Goals of the rotation task, followed with what the IMU says, by the task's own rules.
 
-    The simulation judges by the true orientation, spin and place of the object. Here only the turn about the
-    axis counts of the orientation: how far the object is tipped, the host knows no better than how the hand itself
-    is tilted, and with both errors in it the angle of an object that is where it should be can stay above the
-    limit for ever. The spin is estimated (filtered over 0.1 s); of the place the measured coordinate counts.
+    The simulation judges by the true spin and place of the object; here the spin is estimated from the
+    orientation (filtered over 0.1 s), and of the place only the measured coordinate counts.
     """
 
     _SMOOTH = 0.1  # s
@@ -154,12 +146,14 @@ class TurnGoals:
         config, quat = self._config, seen.quat
         if self._last is not None and time > self._last[0]:
             step = time - self._last[0]
-            rate = _twist(multiply(quat, self._last[1] * [1, -1, -1, -1]), self._axis) / step
+            turn = multiply(quat, self._last[1] * [1, -1, -1, -1])
+            rate = 2 * math.atan2(float(turn[1:] @ self._axis), float(turn[0])) / step
+            rate = (rate + math.pi / step) % (2 * math.pi / step) - math.pi / step
             self._spin += step / (step + self._SMOOTH) * (rate - self._spin)
         self._last = time, quat
-        away = _twist(multiply(quat, self.quat * [1, -1, -1, -1]), self._axis)
+        away = 2 * math.acos(min(1.0, abs(float(quat @ self.quat))))
         distance = np.linalg.norm(seen.position - self._reference)
-        inside = abs(away) < config.goal_angle and distance < config.goal_distance
+        inside = away < config.goal_angle and distance < config.goal_distance
         self._inside_since = (self._inside_since or time) if inside else None
         calm = config.goal_spin <= 0 or abs(self._spin) <= config.goal_spin
         if inside and calm and time - self._inside_since >= config.goal_dwell:
