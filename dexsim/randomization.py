@@ -86,6 +86,9 @@ class Randomization:
     def __post_init__(self):
         validate(self)
         check_ranges(self, *_SPANS)
+        if self.beyond and not self.corners:
+            raise ConfigError(f"Randomization.beyond = {self.beyond:g} with corners = 0: only hands in a corner have "
+                              "values beyond their ranges; set corners, too")
         width = self.scale * (1 + self.beyond)
         for name in _FACTORS:
             low, high = getattr(self, name)

@@ -137,6 +137,11 @@ def test_a_scale_that_would_turn_a_motor_round_is_refused(name):
         Randomization(scale=3.0, **{name: (0.5, 1.0)})
 
 
+def test_beyond_the_ranges_without_corners_is_refused():
+    with pytest.raises(ConfigError, match=r"beyond = 0\.2 with corners = 0"):
+        Randomization(beyond=0.2)
+
+
 def test_the_widest_scale_keeps_the_motors_the_right_way_round(hand):
     drawn = draws(hand, Randomization(scale=3.0))
     for name in ("ripple", "coulomb_friction", "viscous_friction"):
