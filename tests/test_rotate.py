@@ -208,6 +208,8 @@ class TestReward:
         duty = jnp.array([0.5, 0.0, 0.125, 0.05, 0.0])
         np.testing.assert_allclose(rotate.tips_at_work(duty, 3, 0.25), (1 + 0.5 + 0.2) / 3, rtol=1e-6)
         assert rotate.tips_at_work(jnp.full(5, 0.3), 3, 0.25) == 1
+        np.testing.assert_allclose(rotate.tips_at_work(duty, 3, 0.25, "last"), 0.2, rtol=1e-6)
+        assert rotate.tips_at_work(duty, 4, 0.25, "last") == 0 and rotate.tips_at_work(duty, 1, 0.25, "last") == 1
 
     def test_duty_is_a_leaky_mean(self, task, begun):
         force = np.zeros((5, 3))
