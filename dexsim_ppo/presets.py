@@ -22,6 +22,8 @@ class Preset:
     """Episodes of the final evaluation."""
     log_every: int
     """Iterations between lines of metrics."""
+    corners: float = 0.0
+    """Share of training's hands and objects with every value at an end of its range."""
 
 
 PRESETS = {
@@ -52,4 +54,4 @@ def find_preset(name: str, task: str) -> Preset:
         return replace(preset, evaluation_chunk=16, evaluation_episodes=16)
     # Half the environments: twice the updates for the same experience, which a gait is found with.
     ppo = replace(preset.ppo, num_envs=16384, minibatches=8, entropy_coefficient=0.001)
-    return replace(preset, ppo=ppo, minutes=7.5, evaluate_every=0)
+    return replace(preset, ppo=ppo, minutes=7.5, evaluate_every=0, corners=0.3)

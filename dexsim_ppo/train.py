@@ -28,7 +28,7 @@ from dexsim_ppo import checkpoint, cli
 from dexsim_ppo.ppo_config import PPOConfig
 from dexsim_ppo.presets import Preset, find_preset
 from dexsim_ppo.runlog import RunFolder
-from dexsim_ppo.trainer import Run, TrainArguments, printable
+from dexsim_ppo.trainer import Run, TrainArguments, printable, training_config
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -40,7 +40,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     path = resumed.path.parent.parent if resumed else new_run_path(arguments)
     import dexsim
 
-    env = dexsim.make(arguments.task, arguments.env, backend=arguments.backend,
+    env = dexsim.make(arguments.task, training_config(arguments), backend=arguments.backend,
                       num_envs=arguments.ppo.num_envs)
     folder = RunFolder(path)
     if not resumed:

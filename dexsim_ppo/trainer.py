@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dexsim.config import setting, to_dict, validate
-from dexsim.errors import DexsimError
+from dexsim.errors import ConfigError, DexsimError
 from dexsim.randomization import Curriculum
 from dexsim_ppo import checkpoint, cli, programs
 from dexsim_ppo.compilation import collector_paused
@@ -42,6 +42,9 @@ class TrainArguments(Generic[EnvConfig]):
     """The learner's settings; their defaults depend on the preset."""
     curriculum: Curriculum = setting(Curriculum())
     """Ranges of the randomisation that widen with success."""
+    corners: float = setting(0.0, unit="1", low=0.0, high=1.0)
+    """Share of training's hands, and of its objects, with every value at an end of its range (`dexsim.ranges`).
+    Evaluations, and the policy's file, keep to what `env` says."""
     task: str = "grasp"
     """What to train."""
     seed: int = setting(0, low=0)
@@ -77,6 +80,18 @@ class TrainArguments(Generic[EnvConfig]):
         validate(self)
 
 
+def training_config(arguments: TrainArguments) -> Any:
+    """The task's settings with the corners that training asks for."""
+    env, share = arguments.env, arguments.corners
+    if not share:
+        return env
+    if not (hasattr(env, "randomization") and hasattr(env, "objects")):
+        raise ConfigError(f"--corners {share:g}: the settings of task {arguments.task!r} have no randomization and objects")
+    return dataclasses.replace(
+        env, randomization=dataclasses.replace(env.randomization, corners=share),
+        objects=dataclasses.replace(env.objects, corners=share))
+
+
 def printable(arguments: TrainArguments) -> dict[str, Any]:
     """The options as plain data, without those that only say where this process reads and writes."""
     data = to_dict(dataclasses.replace(arguments, run_dir=None, resume=None))
@@ -95,12 +110,12 @@ class Run:
         self.clock = {"setup_s": time.perf_counter() - started}
 
     def _evaluation_env(self) -> Environment:
-        """Warp sizes its buffers by the batch, so evaluation there has an environment of its own."""
-        if self.env.backend != "warp":
+        """Warp sizes its buffers by the batch, and corners are for training only: then evaluation has its own."""
+        if self.env.backend != "warp" and not self.arguments.corners:
             return self.env
         import dexsim
 
-        return dexsim.make(self.arguments.task, self.arguments.env, backend="warp",
+        return dexsim.make(self.arguments.task, self.arguments.env, backend=self.env.backend,
                            num_envs=self.arguments.evaluation_chunk)
 
     def train(self, resumed: checkpoint.Checkpoint | None, stopped: Callable[[], int]) -> None:
@@ -216,7 +231,7 @@ class Run:
         return skipped
 
     def _policy(self, state: TrainState) -> Policy:
-        return Policy.from_training(self.env, self.config, state, {
+        return Policy.from_training(self.evaluator.env, self.config, state, {
             "seed": self.arguments.seed, "iteration": int(state.iteration),
             "env_steps": int(state.iteration) * self.config.steps_per_iteration,
             "backend": self.env.backend, "ppo": to_dict(self.config)})
@@ -269,7 +284,7 @@ class Run:
         print_report(reports["trained"], title=f"{arguments.task}: {chosen}")
         if arguments.video:
             begin = time.perf_counter()
-            video = write_video(self.env, films["trained"], folder.path / "policy.mp4")
+            video = write_video(self.evaluator.env, films["trained"], folder.path / "policy.mp4")
             self.clock["video_s"] = time.perf_counter() - begin
             print(f"video: {video}")
         self.clock["total_s"] = time.perf_counter() - self.started

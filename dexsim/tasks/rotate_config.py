@@ -10,7 +10,6 @@ from dexsim.env import Control, EnvConfig
 from dexsim.errors import ConfigError
 from dexsim.object_config import ObjectConfig
 from dexsim.observation import ObservationConfig
-from dexsim.randomization import Randomization
 from dexsim.tasks.rotate_start import KINDS
 
 
@@ -66,12 +65,9 @@ class RotateConfig(EnvConfig):
     """The rotation task."""
 
     objects: ObjectConfig = setting(ObjectConfig(
-        shapes=("box",), mass=(0.06, 0.15), friction=(0.6, 1.2), bare_friction=(0.3, 0.7), com_offset=0.003,
-        corners=0.3))
+        shapes=("box",), mass=(0.06, 0.15), friction=(0.6, 1.2), bare_friction=(0.3, 0.7), com_offset=0.003))
     """Mass, inertia, centre of mass, friction and contact of the object; its sizes are `edge`. The bare hand
     is plastic: where it grips as rubber does, random strokes carry the object onto the thumb and over."""
-    randomization: Randomization = setting(Randomization(corners=0.3))
-    """A share of hands and objects in corners of their ranges: policies without those halve their goals there."""
     control: Control = setting(Control(step=0.08, recall="target"))
     """From action to joint target."""
     object: str = setting("cube", choices=(*KINDS, "mesh"))
