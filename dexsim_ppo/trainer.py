@@ -86,7 +86,7 @@ def training_config(arguments: TrainArguments) -> Any:
     if not share:
         return env
     if not (hasattr(env, "randomization") and hasattr(env, "objects")):
-        raise ConfigError(f"--corners {share:g}: the settings of task {arguments.task!r} have no randomization and objects")
+        raise ConfigError(f"--corners {share:g}: task {arguments.task!r} has no ranges to stand in corners of")
     return dataclasses.replace(
         env, randomization=dataclasses.replace(env.randomization, corners=share),
         objects=dataclasses.replace(env.objects, corners=share))
