@@ -159,7 +159,8 @@ class TestReward:
 
     def test_fingertips_at_work_earn_the_rest_of_the_bonus(self, task, begun):
         last, tips = 0.0, RotateReward().bonus_tips
-        for duty, share in (((0, 0, 0, 0, 0), 1 - tips), ((1, 0, 0, 0, 0), 1 - tips * 2 / 3), ((1, 1, 0, 0, 1), 1.0)):
+        half = 0.5 * RotateReward().working_duty / (1 - PERIOD / 2.0)  # less this tick, in which nothing touches
+        for duty, share in (((1, 1, 0, 0, 0), 1 - tips), ((1, 1, 0, 0, half), 1 - tips / 2), ((1, 1, 0, 0, 1), 1.0)):
             goal = dataclasses.replace(begun, duty=jnp.asarray(duty, jnp.float32), turns=jnp.int32(2))
             here = moment(task, object_quat=turned(270))
             _, metrics = task.reward(goal, here, jnp.bool_(False))

@@ -49,10 +49,11 @@ class RotateReward:
     """Share of `working_tips` fingertips that have done their share of touching lately."""
     working_tips: int = setting(3, unit="1", low=1, high=20)
     """Fingertips that are asked to take part."""
-    working_duty: float = setting(0.25, unit="1", low=0.001, high=1.0)
+    working_duty: float = setting(0.12, unit="1", low=0.001, high=1.0)
     """Share of the time for which one has to touch to earn all of that."""
-    tips_by: str = setting("mean", choices=("mean", "last"))
-    """What counts as taking part: the mean of those fingertips, or the least busy of them."""
+    tips_by: str = setting("last", choices=("mean", "last"))
+    """What counts as taking part: the mean of those fingertips, or the least busy of them. By the mean,
+    two that are busy earn most of it, and gaits of two fingertips lose the object more often."""
     drop: float = setting(-50.0, unit="1", low=-10000.0, high=0.0)
     """Once, when the object is lost."""
 

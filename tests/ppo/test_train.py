@@ -17,7 +17,7 @@ from tiny_env import TinyEnv
 
 import dexsim
 import dexsim.tasks
-from dexsim_ppo import cli, evaluate, train
+from dexsim_ppo import cli, evaluate, train, trainer
 from dexsim_ppo.policy import Policy
 from dexsim_ppo.runlog import RunFolder, read_metrics
 
@@ -143,6 +143,7 @@ BAD = {
     "wrong type": (["--ppo.discount", "much"], "could not convert"),
     "out of range": (["--ppo.discount", "1.5"], "PPOConfig.discount = 1.5: must be between 0 and 1"),
     "environment value out of range": (["--env.gain", "7"], "TinyConfig.gain = 7 m: must be between"),
+    "corners of no ranges": (["--corners", "0.3"], "--corners 0.3: task 'tiny' has no ranges"),
     "unknown preset": (["--preset", "tpu"], "tpu"),
     "nothing to resume": (["--resume", "/nonexistent/run"], "no checkpoint to resume from"),
 }
@@ -157,6 +158,19 @@ def test_bad_options_are_one_line(arguments, tmp_path, monkeypatch, capsys):
     error = capsys.readouterr().err
     assert said in error and error.count("\n") == 1 and error.startswith("error: "), error
     assert not list(tmp_path.iterdir()), "nothing is written"
+
+
+def test_corners_are_for_training_alone():
+    from dexsim.tasks.rotate_config import RotateConfig
+
+    plain, _ = train.parse_arguments(["--task", "rotate", "--preset", "gpu"])
+    assert plain.corners == 0.3 and plain.env == RotateConfig()
+    asked = trainer.training_config(plain)
+    assert asked.randomization.corners == asked.objects.corners == 0.3
+    without = dataclasses.replace(asked, randomization=plain.env.randomization, objects=plain.env.objects)
+    assert without == plain.env
+    off, _ = train.parse_arguments(["--task", "rotate", "--preset", "gpu", "--corners", "0"])
+    assert trainer.training_config(off) == RotateConfig()
 
 
 def test_files_are_never_overwritten_or_mistaken(finished, tmp_path, monkeypatch, capsys):
