@@ -172,7 +172,7 @@ class Run:
                 metrics = jax.device_get(metrics)
             now, iteration = time.perf_counter(), iteration + per_call
             if "first_update_s" not in self.clock:
-                self.clock["first_update_s"] = now - self.started
+                self.clock |= {"first_update_s": now - self.started, "first_call_s": now - call}
                 display.note(f"first update {self.clock['first_update_s']:.1f} s after the start, "
                              f"{now - call:.1f} s of it for itself")
             skipped = self._check(metrics, skipped)
@@ -189,9 +189,10 @@ class Run:
             spent_elsewhere += time.perf_counter() - now
         self.clock["training_s"] = time.perf_counter() - begin
         self.clock["step_s"] = self.clock["training_s"] - spent_elsewhere
-        steps = (iteration - first) * self.config.steps_per_iteration
         self.clock["env_steps"] = iteration * self.config.steps_per_iteration
-        self.clock["env_steps_per_s"] = steps / max(self.clock["step_s"], 1e-9)
+        # Warp compiles its kernels in the first call, which says nothing about the rate.
+        steps = max(iteration - first - per_call, 0) * self.config.steps_per_iteration
+        self.clock["env_steps_per_s"] = steps / max(self.clock["step_s"] - self.clock.get("first_call_s", 0.0), 1e-9)
         if arguments.evaluate_every and not stopped() and not evaluated:
             self._evaluate(state, iteration, display)
         self._save(state, iteration)
