@@ -257,6 +257,32 @@ def test_classes_share_one_array_and_scale():
         grid.stack([baked[0], grid.bake(kinds[0], GridConfig(nodes=16))])
 
 
+@pytest.mark.parametrize("classes", [1, 3])
+def test_rows_of_corners_are_the_same_grid(classes):
+    """Values, normals and automatic gradients, inside and beyond the grid, for one class and for one an environment."""
+    kinds = [solid("sphere", 0.02), solid("box", 0.02, 0.03, 0.02), solid("capsule", 0.015, 0.02)][:classes]
+    baked = [grid.bake(kind, COARSE) for kind in kinds]
+    flat = grid.stack(baked)
+    rows = grid._in_rows(flat)
+    assert rows.values.shape == (classes * 24**3, 8) and rows.classes == classes
+    points = np.random.default_rng(8).uniform(-0.05, 0.05, (4, 500, 3)).astype(np.float32)
+    index, scale = jnp.arange(4) % classes, jnp.array([1.0, 1.2, 0.8, 1.1])
+
+    def felt(points, index, scale, thing):
+        own = grid.select(thing, index, scale)
+        automatic = jax.grad(lambda p: grid.signed_distance(p, own).sum())(points)
+        return *grid.distance_and_normal(points, own), automatic
+    run = jax.jit(jax.vmap(felt, (0, 0, 0, None)))
+    expected = run(points, index, scale, flat)
+    for thing in (rows, grid.stack([grid._in_rows(one) for one in baked])):
+        for ours, theirs in zip(run(points, index, scale, thing), expected, strict=True):
+            np.testing.assert_allclose(ours, theirs, rtol=1e-6, atol=1e-6 * np.abs(theirs).max())
+    with pytest.raises(ConfigError, match="one configuration"):
+        grid.stack([flat, rows])
+    with pytest.raises(ConfigError, match="rows"):
+        grid._in_rows(grid.bake(kinds[0], dataclasses.replace(COARSE, dtype="float16")))
+
+
 def test_a_mesh_is_baked_once(monkeypatch, tmp_path):
     box = trimesh.creation.box(2 * BOX)
     first = distance.prepare(box, distance.DistanceConfig(grid=COARSE))
