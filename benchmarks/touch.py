@@ -74,12 +74,10 @@ def cases(names: list[str] | None) -> list[Case]:
         "closed box, palm frame": lambda n: Case(n, box, path="taxels"),
         "closed union of 4": lambda n: Case(n, union()),
         "grid float32": lambda n: Case(n, grid.bake(box)),
-        "grid float32, rows": lambda n: Case(n, grid._in_rows(grid.bake(box))),
         "grid float16": lambda n: Case(n, grid.bake(box, GridConfig(dtype="float16"))),
         "grid quadratic float16": lambda n: Case(n, grid.bake(box, GridConfig(dtype="float16",
                                                                             interpolation="quadratic"))),
         f"grid float32, {CLASSES} classes": lambda n: Case(n, classes("float32"), own_class),
-        f"grid float32, rows, {CLASSES} classes": lambda n: Case(n, grid._in_rows(classes("float32")), own_class),
         f"grid float16, {CLASSES} classes": lambda n: Case(n, classes("float16"), own_class),
         "points 1024, scan": lambda n: Case(n, points),
         "points 1024, table": lambda n: Case(n, surface_points.from_shape(box)),
@@ -226,8 +224,6 @@ def costs(options, hand, file) -> None:
         by = {row["case"]: row["ms"] for row in rows}
         show(f"cost, {num_envs} environments x 600 taxels" + (f", step {step:.2f} ms" if step else ""), rows, file)
         for top, bottom in ((f"grid float32, {CLASSES} classes", "grid float32"),
-                            ("grid float32, rows", "grid float32"),
-                            (f"grid float32, rows, {CLASSES} classes", f"grid float32, {CLASSES} classes"),
                             (f"grid float16, {CLASSES} classes", "grid float16"),
                             ("points 1024, brute force", "points 1024, scan"),
                             ("points 1024, brute force", "points 1024, table")):

@@ -8,7 +8,7 @@
 | method | object | cost a query | error |
 |---|---|---|---|
 | `closed_form` | `sdf.Shape` | 20-50 FLOP a primitive | exact |
-| `grid` | `grid.Grid` | 8 reads | 64 nodes: 1.5 to 6 um mean on smooth shapes |
+| `grid` | `grid.Grid` | one read of 32 bytes | 64 nodes: 1.5 to 6 um mean on smooth shapes |
 | `surface_points` | `surface_points.SurfacePoints` | all points, or a few with a table | 30 um mean with 1024 points |
 """
 

@@ -48,7 +48,8 @@ class GridConfig:
     pad: float = setting(0.004, unit="m", low=0.0005, high=0.1)
     """Room round the object; must exceed the skin's margin."""
     dtype: str = setting("float32", choices=DTYPES)
-    """Storage. float16 needs half the memory traffic: two neighbours are read as one word."""
+    """Storage. Linear: float32 keeps the 8 corners of each cell side by side, one read of 32 bytes a query; float16 two
+    neighbours a word, 4 reads in an eighth of the memory. Quadratic: float16 halves both."""
     interpolation: str = setting("linear", choices=INTERPOLATIONS)
     """linear: 8 values a query; quadratic: 32, for ten times less error on smooth shapes."""
     unbiased: bool = setting(True)
@@ -66,8 +67,9 @@ class Grid:
     nodes: int = static()
     interpolation: str = static()
     values: jax.Array
-    """Flat over [C, n, n, n, channel]; channels: distance in mm, then its gradient where quadratic. float32, or uint32
-    words of two float16 (linear: a node and the next along z; quadratic: two channels). Or rows (`_in_rows`)."""
+    """Linear float32: [C n^3, 8] mm, each row the corners of the cell that begins at this node, side by side: 8 MB a
+    class at 64 nodes, 64 MB for 8 classes. Else flat over [C, n, n, n, channel]; channels: distance in mm, then its
+    gradient where quadratic; float32, or uint32 words of two float16 (linear: a node and the next along z)."""
     origin: jax.Array  # [C, 3] m, the first node
     spacing: jax.Array  # [C, 3] m
     index: jax.Array  # [] int32, the class of this object
@@ -103,7 +105,7 @@ def bake(source: meshes.Mesh | sdf.Shape, config: GridConfig | None = None, *, c
     elif config.unbiased:
         channels = channels - _overshoot(distance, axes)[:, None] / _MILLI
     return Grid(
-        nodes=config.nodes, interpolation=config.interpolation, values=jnp.asarray(_pack(channels, config.dtype)),
+        nodes=config.nodes, interpolation=config.interpolation, values=jnp.asarray(_pack(channels, config)),
         origin=jnp.asarray([[a[0] for a in axes]], jnp.float32),
         spacing=jnp.asarray([[a[1] - a[0] for a in axes]], jnp.float32),
         index=jnp.zeros((), jnp.int32), scale=jnp.ones(()),
@@ -116,13 +118,11 @@ def stack(grids: list[Grid]) -> Grid:
     Raises:
       ConfigError: they differ in resolution, interpolation or storage.
     """
-    kinds = {(g.nodes, g.interpolation, g.values.dtype, g.values.shape[1:]) for g in grids}
+    kinds = {(g.nodes, g.interpolation, g.values.dtype) for g in grids}
     if len(kinds) != 1:
         raise ConfigError(f"stack: grids of one configuration expected, found {len(kinds)}")
-    return dataclasses.replace(
-        grids[0], values=jnp.concatenate([g.values for g in grids]),
-        origin=jnp.concatenate([g.origin for g in grids]), spacing=jnp.concatenate([g.spacing for g in grids]),
-    )  # fmt: skip
+    joined = {name: jnp.concatenate([getattr(g, name) for g in grids]) for name in ("values", "origin", "spacing")}
+    return dataclasses.replace(grids[0], **joined)
 
 
 def select(grid: Grid, index: jax.Array, scale: jax.Array | float = 1.0) -> Grid:
@@ -165,8 +165,7 @@ def _look_up(points: jax.Array, grid: Grid) -> tuple[jax.Array, list[jax.Array]]
         free.append(at == held)
     first = base + (cells[0] * n + cells[1]) * n + cells[2]
     if grid.interpolation == "linear":
-        corners = _read_rows(grid, first, cells) if grid.values.ndim == 2 else _read_linear(grid, first)
-        value, slope = _linear(corners, parts)
+        value, slope = _linear(_read_linear(grid, first, cells), parts)
     else:
         spacing = step / (grid.scale * _MILLI)
         value, slope = _quadratic(_read_quadratic(grid, first), parts, [spacing[axis] for axis in range(3)])
@@ -207,65 +206,44 @@ def _corner_offsets(n: int) -> list[int]:
     return [(x * n + y) * n + z for x in (0, 1) for y in (0, 1) for z in (0, 1)]
 
 
-def _read(values: jax.Array, *index: jax.Array) -> jax.Array:
+def _read(values: jax.Array, *index: jax.Array) -> list[jax.Array]:
+    """The number there, or the two float16 of the word there, as float32."""
     # No index is negative: without saying so, each read costs a comparison, an addition and a choice more.
-    return values.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
+    word = values.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
+    if values.dtype == jnp.float32:
+        return [word]
+    halves = (word.astype(jnp.uint16), (word >> 16).astype(jnp.uint16))
+    return [jax.lax.bitcast_convert_type(half, jnp.float16).astype(jnp.float32) for half in halves]
 
 
-def _halves(words: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The two float16 of a word as float32."""
-    low = jax.lax.bitcast_convert_type(words.astype(jnp.uint16), jnp.float16)
-    high = jax.lax.bitcast_convert_type((words >> 16).astype(jnp.uint16), jnp.float16)
-    return low.astype(jnp.float32), high.astype(jnp.float32)
-
-
-def _read_linear(grid: Grid, first: jax.Array) -> list[jax.Array]:
-    offsets = _corner_offsets(grid.nodes)
-    if grid.values.dtype == jnp.float32:
-        return [_read(grid.values, first + k) for k in offsets]
-    return [half for k in offsets[::2] for half in _halves(_read(grid.values, first + k))]
-
-
-def _in_rows(grid: Grid) -> Grid:
-    """The same grid (linear, float32), each cell's 8 corners side by side: `values` [C n^3, 8] mm.
-
-    A query then reads one aligned sector of 32 bytes, in two wide loads on a GPU, instead of 8 words of 4 lines. It
-    takes 8 times the memory (8 MB a class at 64 nodes), made here, on the device: the cache on disk does not grow.
-    """
-    if grid.interpolation != "linear" or grid.values.dtype != jnp.float32:
-        raise ConfigError("rows of corners: a linear float32 grid expected")
-    # The last nodes along an axis begin no cell: what is rolled into their rows is never read.
-    corners = [jnp.roll(grid.values, -k) for k in _corner_offsets(grid.nodes)]
-    return dataclasses.replace(grid, values=jnp.stack(corners, -1))
-
-
-def _read_rows(grid: Grid, first: jax.Array, cells: list[jax.Array]) -> list[jax.Array]:
-    """The corners as `_read_linear` gives them, from one gather; its slices stay in the kernel that uses them."""
-    n = grid.nodes
+def _read_linear(grid: Grid, first: jax.Array, cells: list[jax.Array]) -> list[jax.Array]:
+    n, values = grid.nodes, grid.values
+    if values.dtype != jnp.float32:
+        return [half for k in _corner_offsets(n)[::2] for half in _read(values, first + k)]
+    # One aligned sector of 32 bytes, whose slices stay in the kernel that uses them. Read by one index, XLA (JAX 0.10)
+    # writes every point's index to memory in a kernel of its own, by two it does not; with several classes vice versa.
+    at = (first,)
     if grid.classes == 1:
-        # By one index XLA (JAX 0.10, thousands of environments) makes a kernel of its own that writes the index of each
-        # point to memory; by two it makes one kernel of all. With a class per environment it is the other way round.
-        row = _read(grid.values.reshape(-1, n * n, 8), grid.index * n + cells[0], cells[1] * n + cells[2])
-    else:
-        row = _read(grid.values, first)
+        values, at = values.reshape(-1, n * n, 8), (grid.index * n + cells[0], cells[1] * n + cells[2])
+    (row,) = _read(values, *at)
     return [row[..., k] for k in range(8)]
 
 
 def _read_quadratic(grid: Grid, first: jax.Array) -> list[list[jax.Array]]:
-    offsets = _corner_offsets(grid.nodes)
-    if grid.values.dtype == jnp.float32:
-        return [[_read(grid.values, 4 * (first + k) + c) for c in range(4)] for k in offsets]
-    return [[half for c in range(2) for half in _halves(_read(grid.values, 2 * (first + k) + c))] for k in offsets]
+    words = 4 if grid.values.dtype == jnp.float32 else 2
+    return [[x for word in range(words) for x in _read(grid.values, words * (first + k) + word)]
+            for k in _corner_offsets(grid.nodes)]
 
 
-def _pack(channels: np.ndarray, dtype: str) -> np.ndarray:
-    """[nodes, 1 or 4] as `Grid.values`."""
-    if dtype == "float32":
-        return channels.astype(np.float32).reshape(-1)
-    halves = channels.astype(np.float16)
-    if halves.shape[1] == 1:  # with the next node along z; the last of a row is never a lower corner
-        halves = np.concatenate([halves, np.roll(halves, -1, axis=0)], 1)
-    return np.ascontiguousarray(halves).view(np.uint32).reshape(-1)
+def _pack(channels: np.ndarray, config: GridConfig) -> np.ndarray:
+    """[nodes, 1 or 4] as `Grid.values`. No cell begins at an axis' last node: what is rolled there is never read."""
+    kept = channels.astype(config.dtype)
+    if config.interpolation == "linear":
+        beside = _corner_offsets(config.nodes)[: 8 if config.dtype == "float32" else 2]
+        kept = np.concatenate([np.roll(kept, -k, axis=0) for k in beside], 1)
+    if config.dtype == "float16":
+        kept = np.ascontiguousarray(kept).view(np.uint32)
+    return kept if kept.shape[1] == 8 else kept.reshape(-1)
 
 
 def _overshoot(distance: np.ndarray, axes: list[np.ndarray]) -> np.ndarray:
@@ -289,10 +267,8 @@ def _measured(mesh: meshes.Mesh, points: np.ndarray, config: GridConfig, cache: 
     """Exact distance and gradient at the nodes, from the cache where it is there."""
     key = hashlib.sha256(f"{mesh.fingerprint} {config.nodes} {config.pad!r} {_VERSION}".encode()).hexdigest()[:32]
     path = cache_folder() / f"{key}.npz"
-    if cache:
-        found = _load(path, len(points))
-        if found is not None:
-            return found
+    if cache and (found := _load(path, len(points))) is not None:
+        return found
     meshes.check_sign(mesh)
     distance, gradient = meshes.signed_distance(mesh, points)
     distance, gradient = distance.astype(np.float32), gradient.astype(np.float32)

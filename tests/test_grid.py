@@ -241,7 +241,7 @@ def test_classes_share_one_array_and_scale():
     kinds = [solid("sphere", 0.02), solid("box", 0.02, 0.03, 0.02), solid("capsule", 0.015, 0.02)]
     baked = [grid.bake(kind, COARSE) for kind in kinds]
     both = grid.stack(baked)
-    assert both.classes == 3
+    assert both.classes == 3 and both.values.shape == (3 * 24**3, 8)
     points = np.random.default_rng(6).uniform(-0.05, 0.05, (200, 3)).astype(np.float32)
     index, scale = jnp.array([2, 0, 1, 2]), jnp.array([1.0, 1.2, 0.8, 1.1])
 
@@ -257,30 +257,60 @@ def test_classes_share_one_array_and_scale():
         grid.stack([baked[0], grid.bake(kinds[0], GridConfig(nodes=16))])
 
 
-@pytest.mark.parametrize("classes", [1, 3])
-def test_rows_of_corners_are_the_same_grid(classes):
-    """Values, normals and automatic gradients, inside and beyond the grid, for one class and for one an environment."""
-    kinds = [solid("sphere", 0.02), solid("box", 0.02, 0.03, 0.02), solid("capsule", 0.015, 0.02)][:classes]
-    baked = [grid.bake(kind, COARSE) for kind in kinds]
-    flat = grid.stack(baked)
-    rows = grid._in_rows(flat)
-    assert rows.values.shape == (classes * 24**3, 8) and rows.classes == classes
-    points = np.random.default_rng(8).uniform(-0.05, 0.05, (4, 500, 3)).astype(np.float32)
-    index, scale = jnp.arange(4) % classes, jnp.array([1.0, 1.2, 0.8, 1.1])
+def trilinear(points, distance, origin, step):
+    """Distance and gradient in float64 from a cube of nodes [n, n, n] by the formula: weights of 8 corners, one at a
+    time; beyond the cube the distance at its nearest point plus the way there."""
+    n = len(distance)
+    at = (points - origin) / step
+    held = np.clip(at, 0, n - 1)
+    cell = np.minimum(held.astype(int), n - 2)
+    part, gap = held - cell, (at - held) * step
+    value, gradient = np.zeros(len(points)), np.zeros(points.shape)
+    for corner in np.ndindex(2, 2, 2):
+        node = distance[tuple((cell + corner).T)]
+        weight = np.where(corner, part, 1 - part)
+        value += node * weight.prod(1)
+        for axis in range(3):
+            others = np.delete(weight, axis, 1).prod(1)
+            gradient[:, axis] += node * others * (1 if corner[axis] else -1) / step[axis]
+    way = np.linalg.norm(gap, axis=1)
+    return value + way, np.where(at == held, gradient, 0) + gap / np.maximum(way, 1e-30)[:, None]
 
-    def felt(points, index, scale, thing):
-        own = grid.select(thing, index, scale)
+
+@pytest.mark.parametrize("dtype", grid.DTYPES)
+@pytest.mark.parametrize("classes", [1, 3])
+def test_values_normals_and_gradients_are_trilinear(classes, dtype):
+    """However the corners lie in memory: nodes at random, in every cell, on its faces and beyond the grid; one class or
+    one an environment. Nodes that float16 holds, and powers of two, so that arithmetic in float32 errs by little."""
+    n, rng = 10, np.random.default_rng(8)
+    config = GridConfig(nodes=n, dtype=dtype)
+    slope = np.einsum("kijl,k->ijl", np.indices((n, n, n)), [1.0, -0.5, 0.75])
+    cubes = [(slope + rng.uniform(-0.3, 0.3, slope.shape)).astype("float16") for _ in range(classes)]  # mm
+    origin, step = -np.array([4.0, 2, 6]) / 512, np.array([1.0, 0.5, 2]) / 512
+    shelf = grid.stack([grid.Grid(
+        nodes=n, interpolation="linear", values=jnp.asarray(grid._pack(cube.reshape(-1, 1), config)),
+        origin=jnp.asarray([size * origin]), spacing=jnp.asarray([size * step]), index=jnp.int32(0),
+        scale=jnp.ones(())) for size, cube in zip((1.0, 2.0, 0.5), cubes, strict=False)])
+    assert shelf.values.shape == ((classes * n**3, 8) if dtype == "float32" else (classes * n**3,))
+    index, scale = np.arange(4) % classes, np.array([1.0, 2.0, 0.5, 4.0])
+    at = np.concatenate([np.indices((n, n, n)).reshape(3, -1).T, rng.integers(-96, 32 * (n + 3), (3000, 3)) / 32])
+    start, spacing = np.float64(shelf.origin)[index], np.float64(shelf.spacing)[index]
+    smooth = np.all((at != 0) & (at != n - 1), 1)  # on the outermost faces JAX's clip halves its derivative
+    points = start[:, None] + at * spacing[:, None]
+
+    def felt(points, index, scale):
+        own = grid.select(shelf, index, scale)
         automatic = jax.grad(lambda p: grid.signed_distance(p, own).sum())(points)
         return *grid.distance_and_normal(points, own), automatic
-    run = jax.jit(jax.vmap(felt, (0, 0, 0, None)))
-    expected = run(points, index, scale, flat)
-    for thing in (rows, grid.stack([grid._in_rows(one) for one in baked])):
-        for ours, theirs in zip(run(points, index, scale, thing), expected, strict=True):
-            np.testing.assert_allclose(ours, theirs, rtol=1e-6, atol=1e-6 * np.abs(theirs).max())
-    with pytest.raises(ConfigError, match="one configuration"):
-        grid.stack([flat, rows])
-    with pytest.raises(ConfigError, match="rows"):
-        grid._in_rows(grid.bake(kinds[0], dataclasses.replace(COARSE, dtype="float16")))
+    ours = jax.jit(jax.vmap(felt))(np.float32(scale[:, None, None] * points), index, scale)
+    for env, (value, normal, automatic) in enumerate(zip(*ours, strict=True)):
+        wanted, gradient = trilinear(points[env], 1e-3 * np.float64(cubes[index[env]]), start[env], spacing[env])
+        clear = np.linalg.norm(gradient, axis=1) > 0.1  # a shorter one has no direction to speak of
+        direction = gradient / np.linalg.norm(gradient, axis=1, keepdims=True)
+        np.testing.assert_allclose(value, scale[env] * wanted, rtol=1e-6, atol=1e-9)
+        np.testing.assert_allclose(automatic[smooth], gradient[smooth], rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(normal[clear], direction[clear], rtol=1e-6, atol=1e-6)
+        assert clear.mean() > 0.99
 
 
 def test_a_mesh_is_baked_once(monkeypatch, tmp_path):
