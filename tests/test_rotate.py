@@ -269,7 +269,7 @@ class TestDrop:
             np.testing.assert_allclose(found, low, atol=1e-6)
 
     def test_on_the_palm_is_dropped_when_held_by_fingers(self, hand):
-        task = Rotate(rotate_config.clear_of_palm(), hand)
+        task = Rotate(RotateConfig(support="fingers"), hand)
         goal = task.begin(jax.random.key(0), None)
         here = moment(task)
         half = float(here.target.size[0, 0])
@@ -319,6 +319,29 @@ class TestPool:
         (file,) = (tmp_path / "pools").iterdir()
         file.write_bytes(file.read_bytes()[:1000])  # a damaged cache is made again
         jax.tree.map(np.testing.assert_array_equal, pool, task.make_pool(jax.random.key(0)))
+
+    def test_held_by_fingers_none_is_a_drop_from_the_beginning(self, hand, monkeypatch, tmp_path):
+        monkeypatch.setenv("DEXSIM_CACHE", str(tmp_path))
+        config = dataclasses.replace(rotate_config.clear_of_palm(), pool_size=12)
+        pool = Rotate(config, hand).make_pool(jax.random.key(0))
+        axis = np.asarray(config.axis) / np.linalg.norm(config.axis)
+        stand = Rotation.align_vectors([axis], [[1.0, 0, 0]])[0]  # Its face on the axis, up to a turn about it.
+        for k in range(12):
+            # The eight corners of the cube as the pool has it, in the palm frame.
+            half, slot = pool.target.size[k, 0], Rotation.from_quat(np.roll(pool.target.quat[k, 0], -1))
+            np.testing.assert_allclose(slot.apply([1.0, 0, 0]), stand.apply([1.0, 0, 0]), atol=1e-6)
+            corners = half * np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
+            turn = Rotation.from_quat(np.roll(pool.qpos[k, 15:19], -1))
+            low = (turn * slot).apply(corners)[:, 0].min() + pool.qpos[k, 12]
+            assert low > rotate_start.palm_height(hand) + config.clearance - 1e-6
+            assert np.arccos(turn.apply(axis) @ axis) < 0.35
+
+    @pytest.mark.parametrize("axis", [(0.6, 0.0, -0.8), (0.0, 2.0, 0.0), (-1.0, 0.0, 0.0), (0.3, -0.5, 0.4)])
+    def test_a_cube_stands_on_any_axis(self, axis):
+        quat = rotate_start.upright(axis)
+        np.testing.assert_allclose(Rotation.from_quat(np.roll(quat, -1)).apply([1.0, 0, 0]),
+                                   np.asarray(axis) / np.linalg.norm(axis), atol=1e-6)
+        assert rotate_start.upright((2.0, 0.0, 0.0)) is None
 
     def test_another_object_is_another_pool(self, hand):
         key, config = jax.random.key(0), RotateConfig()

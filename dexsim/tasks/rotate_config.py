@@ -163,9 +163,10 @@ def without_orientation() -> RotateConfig:
 
 
 def clear_of_palm() -> RotateConfig:
-    """The object held clear of the palm by thumb and fingers, which point downhill."""
+    """The object held clear of the palm: it lies in the curled fingers, which point downhill, and turns about what is
+    upright there."""
     return RotateConfig(
-        reward=RotateReward(torque=-0.1, bonus_tips=0.0, spin=2.0), support="fingers", tilt=-0.6,
-        reference=(0.058, 0.0, 0.086), squeeze=(0.1, 0.4),
-        posture=(1.2, 0.4, 0.4, 0.0, 0.6, 0.5, 0.6, 0.5, 0.6, 0.5, 0.6, 0.5), posture_noise=0.25,
-        start_offset=(0.0, 0.0), place_noise=0.006, curl=(-0.2, 0.2))
+        reward=RotateReward(torque=-0.1, bonus_tips=0.0, spin=2.0, gate=0.04), support="fingers", tilt=-1.1,
+        axis=(0.6, 0.0, -0.8), reference=(0.072, 0.005, 0.098), squeeze=(0.0, 0.2),
+        posture=(1.2, 0.3, 0.3, 0.0, 0.8, 0.6, 0.8, 0.6, 0.8, 0.6, 0.8, 0.6), posture_noise=0.2,
+        start_offset=(0.0, 0.0), place_noise=0.006, curl=(-0.1, 0.1))

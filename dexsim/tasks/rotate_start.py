@@ -36,9 +36,9 @@ from dexsim.tasks.grasp_start import clearance, palm_height
 KINDS = {"cube": ("box",), "cylinder": ("cylinder",), "octagon": ("box", "box")}
 """Objects that can be turned beside meshes, and the primitives each consists of."""
 _SHAPE_INDEX = {"cube": "box", "cylinder": "cylinder", "octagon": "composition"}
-_UPRIGHT = (np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0)  # takes a cylinder's axis to the palm's normal
-_EIGHTH = (np.cos(np.pi / 8), np.sin(np.pi / 8), 0.0, 0.0)  # 45 degrees about the palm's normal
-_VERSION = 2  # of the procedure: raise it when older pools no longer hold
+_UPRIGHT = (np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0)  # takes a cylinder's axis to x
+_EIGHTH = (np.cos(np.pi / 8), np.sin(np.pi / 8), 0.0, 0.0)  # 45 degrees about x
+_VERSION = 3  # of the procedure: raise it when older pools no longer hold
 _AT_REST = (0.05, 1.0)  # m/s, rad/s
 _LEVEL = 0.35  # rad, largest angle from upright
 
@@ -70,7 +70,9 @@ def sample_target(key: jax.Array, config: Any) -> ObjectParams:
     corner = draw_corner(base_key, config.objects.corners)  # the one that `sample_object` draws
     half = uniform(edge_key, (shortest, longest), corner) / 2
     scale = base.mass * uniform(scale_key, config.objects.narrowed().inertia_scale, corner)
-    turns = {"cube": None, "cylinder": [_UPRIGHT], "octagon": [(1.0, 0.0, 0.0, 0.0), _EIGHTH]}[config.object]
+    stand = upright(config.axis)
+    turns = {"cube": None if stand is None else [stand], "cylinder": [_UPRIGHT],
+             "octagon": [(1.0, 0.0, 0.0, 0.0), _EIGHTH]}[config.object]
     quat = None if turns is None else jnp.array(turns, jnp.float32)
     inertia = plain_inertia(config.object, half)
     size = jnp.full((len(kinds), 3), half)
@@ -78,6 +80,17 @@ def sample_target(key: jax.Array, config: Any) -> ObjectParams:
         base, shape_index=jnp.int32(SHAPES.index(_SHAPE_INDEX[config.object])),
         size=size, position=jnp.zeros((len(kinds), 3)), active=jnp.ones(len(kinds), bool),
         inertia=scale * inertia, quat=quat, kinds=kinds)
+
+
+def upright(axis: tuple[float, float, float]) -> np.ndarray | None:
+    """The shortest turn [4] that takes x to the axis of rotation, on which a face of a cube stands; None for x."""
+    unit = np.asarray(axis, float) / np.linalg.norm(axis)
+    if unit[0] > 1 - 1e-9:
+        return None
+    if unit[0] < -1 + 1e-9:
+        return np.array([0.0, 0.0, 0.0, 1.0], np.float32)
+    half = np.array([1 + unit[0], 0.0, -unit[2], unit[1]])  # (1 + x . unit, x cross unit)
+    return (half / np.linalg.norm(half)).astype(np.float32)
 
 
 def plain_inertia(name: str, half: jax.Array) -> jax.Array:
@@ -169,6 +182,7 @@ def _make(key: jax.Array, hand: Hand, config: Any,
             settled = list(pool.map(settle, models, parts))
             good, qpos = (np.concatenate(x) for x in zip(*settled, strict=True))
             order = np.argsort(good)
+            order = order[_clear_of_palm(hand, config, candidates["target"], good[order], qpos[order])]
             good, qpos = good[order], qpos[order]
             kept.append([qpos, np.zeros((len(good), hand.num_joints + 6), np.float32),
                          candidates["joint_target"][good],
@@ -191,7 +205,8 @@ def _candidate(key: jax.Array, hand: Hand, config: Any) -> dict[str, Any]:
     joints = jnp.clip(jnp.asarray(config.posture) + noise + curl * flexion, hand.joint_lower,
                       hand.joint_upper)
     heading = config.heading_noise * jax.random.uniform(keys[2], minval=-1.0)
-    quat = rotations.axis_angle_to_quat(jnp.array([1.0, 0.0, 0.0]), heading)
+    axis = jnp.asarray(config.axis) / np.linalg.norm(config.axis)
+    quat = rotations.axis_angle_to_quat(axis, heading)
     shift = config.place_noise * jax.random.uniform(keys[3], (2,), minval=-1.0)
     place = jnp.asarray(config.reference).at[1:].add(jnp.asarray(config.start_offset) + shift)
     if config.support == "palm":
@@ -249,13 +264,21 @@ def _settle(model: mujoco.MjModel, rows: np.ndarray, *, hand: Hand, config: Any,
     return np.array(good, int), np.reshape(np.array(kept, np.float32), (len(kept), model.nq))
 
 
+def _clear_of_palm(hand: Hand, config: Any, target: ObjectParams, rows: np.ndarray, qpos: np.ndarray) -> np.ndarray:
+    """Which [N] of these rows are no drop from the beginning, where touching the palm is one."""
+    if config.support == "palm" or not len(rows):
+        return np.ones(len(rows), bool)
+    low = jax.vmap(lowest_point)(jax.tree.map(lambda leaf: leaf[rows], target), qpos[:, -4:], qpos[:, -7:-4])
+    return np.asarray(low) > palm_height(hand) + config.clearance
+
+
 def _stays(model: mujoco.MjModel, hand: Hand, config: Any, data: mujoco.MjData) -> bool:
     free = model.joint("object")
     place = data.qpos[free.qposadr[0]:][:7]
     motion = data.qvel[free.dofadr[0]:][:6]
-    upright = np.empty(9)
-    mujoco.mju_quat2Mat(upright, place[3:])
-    tilt = np.arccos(np.clip(upright[0], -1.0, 1.0))
+    turned, axis = np.empty(3), np.asarray(config.axis, float) / np.linalg.norm(config.axis)
+    mujoco.mju_rotVecQuat(turned, axis, place[3:])
+    tilt = np.arccos(np.clip(turned @ axis, -1.0, 1.0))
     near = np.linalg.norm(place[:3] - config.reference) < 0.6 * config.goal_distance
     rest = (np.linalg.norm(motion[:3]) < _AT_REST[0]) & (np.linalg.norm(motion[3:]) < _AT_REST[1])
     sound = np.all(np.isfinite(data.qpos)) and not np.any(data.warning.number)
