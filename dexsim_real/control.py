@@ -135,7 +135,7 @@ class TurnGoals:
 
     def __init__(self, config: Any, reference: np.ndarray):
         self._config, self._reference = config, np.asarray(reference)
-        self._axis = np.asarray(config.axis, float) / np.linalg.norm(config.axis)
+        self._axis = config.unit_axis
         self.successes, self.times = 0, []
         self._last: tuple[float, np.ndarray] | None = None
         self._spin, self._inside_since = 0.0, None

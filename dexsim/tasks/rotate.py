@@ -106,7 +106,7 @@ class Rotate:
         # Palm up; the tilt lowers the wrist.
         self.gravity = (-9.81 * math.cos(config.tilt), 0.0, -9.81 * math.sin(config.tilt))
         self.reference, self._palm = config.reference, palm_height(hand)
-        self._axis = jnp.asarray(config.axis) / np.linalg.norm(config.axis)
+        self._axis = jnp.asarray(config.unit_axis)
         self._step = config.direction * config.goal_step
         self._period = config.physics.control_period
         self.episode_ticks = max(round(config.episode_seconds / self._period), 1)

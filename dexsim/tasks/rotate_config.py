@@ -53,7 +53,7 @@ class RotateReward:
     """Share of the time for which one has to touch to earn all of that."""
     tips_by: str = setting("last", choices=("mean", "last"))
     """What counts as taking part: the mean of those fingertips, or the least busy of them. By the mean,
-    two that are busy earn most of it, and gaits of two fingertips lose the object more often."""
+    two that are busy earn most of it, and some seeds keep to two."""
     drop: float = setting(-50.0, unit="1", low=-10000.0, high=0.0)
     """Once, when the object is lost."""
 
@@ -147,6 +147,11 @@ class RotateConfig(EnvConfig):
         if (self.object == "mesh") != bool(self.objects.mesh):
             raise ConfigError(f"RotateConfig.object = {self.object!r} with ObjectConfig.mesh = {self.objects.mesh!r}: "
                               "a mesh needs object 'mesh' and the name of its file")
+
+    @property
+    def unit_axis(self) -> np.ndarray:
+        """The axis of rotation [3], of length one."""
+        return np.asarray(self.axis, float) / np.linalg.norm(self.axis)
 
 
 def paper() -> RotateConfig:

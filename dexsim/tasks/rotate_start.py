@@ -70,7 +70,7 @@ def sample_target(key: jax.Array, config: Any) -> ObjectParams:
     corner = draw_corner(base_key, config.objects.corners)  # the one that `sample_object` draws
     half = uniform(edge_key, (shortest, longest), corner) / 2
     scale = base.mass * uniform(scale_key, config.objects.narrowed().inertia_scale, corner)
-    stand = upright(config.axis)
+    stand = upright(config.unit_axis)
     turns = {"cube": None if stand is None else [stand], "cylinder": [_UPRIGHT],
              "octagon": [(1.0, 0.0, 0.0, 0.0), _EIGHTH]}[config.object]
     quat = None if turns is None else jnp.array(turns, jnp.float32)
@@ -82,14 +82,13 @@ def sample_target(key: jax.Array, config: Any) -> ObjectParams:
         inertia=scale * inertia, quat=quat, kinds=kinds)
 
 
-def upright(axis: tuple[float, float, float]) -> np.ndarray | None:
-    """The shortest turn [4] that takes x to the axis of rotation, on which a face of a cube stands; None for x."""
-    unit = np.asarray(axis, float) / np.linalg.norm(axis)
-    if unit[0] > 1 - 1e-9:
+def upright(axis: np.ndarray) -> np.ndarray | None:
+    """The shortest turn [4] that takes x to this unit vector, on which a face of a cube stands; None for x."""
+    if axis[0] > 1 - 1e-9:
         return None
-    if unit[0] < -1 + 1e-9:
+    if axis[0] < -1 + 1e-9:
         return np.array([0.0, 0.0, 0.0, 1.0], np.float32)
-    half = np.array([1 + unit[0], 0.0, -unit[2], unit[1]])  # (1 + x . unit, x cross unit)
+    half = np.array([1 + axis[0], 0.0, -axis[2], axis[1]])  # (1 + x . axis, x cross axis)
     return (half / np.linalg.norm(half)).astype(np.float32)
 
 
@@ -205,8 +204,7 @@ def _candidate(key: jax.Array, hand: Hand, config: Any) -> dict[str, Any]:
     joints = jnp.clip(jnp.asarray(config.posture) + noise + curl * flexion, hand.joint_lower,
                       hand.joint_upper)
     heading = config.heading_noise * jax.random.uniform(keys[2], minval=-1.0)
-    axis = jnp.asarray(config.axis) / np.linalg.norm(config.axis)
-    quat = rotations.axis_angle_to_quat(axis, heading)
+    quat = rotations.axis_angle_to_quat(jnp.asarray(config.unit_axis), heading)
     shift = config.place_noise * jax.random.uniform(keys[3], (2,), minval=-1.0)
     place = jnp.asarray(config.reference).at[1:].add(jnp.asarray(config.start_offset) + shift)
     if config.support == "palm":
@@ -258,7 +256,7 @@ def _settle(model: mujoco.MjModel, rows: np.ndarray, *, hand: Hand, config: Any,
         data.qpos[:] = candidates["qpos"][row]
         model.qpos_spring[springs] = candidates["joint_target"][row]
         mujoco.mj_step(model, data, ticks)
-        if _stays(model, hand, config, data):
+        if _stays(model, config, data):
             good.append(row)
             kept.append(data.qpos.astype(np.float32))
     return np.array(good, int), np.reshape(np.array(kept, np.float32), (len(kept), model.nq))
@@ -272,17 +270,14 @@ def _clear_of_palm(hand: Hand, config: Any, target: ObjectParams, rows: np.ndarr
     return np.asarray(low) > palm_height(hand) + config.clearance
 
 
-def _stays(model: mujoco.MjModel, hand: Hand, config: Any, data: mujoco.MjData) -> bool:
+def _stays(model: mujoco.MjModel, config: Any, data: mujoco.MjData) -> bool:
     free = model.joint("object")
     place = data.qpos[free.qposadr[0]:][:7]
     motion = data.qvel[free.dofadr[0]:][:6]
-    turned, axis = np.empty(3), np.asarray(config.axis, float) / np.linalg.norm(config.axis)
-    mujoco.mju_rotVecQuat(turned, axis, place[3:])
-    tilt = np.arccos(np.clip(turned @ axis, -1.0, 1.0))
+    turned = np.empty(3)
+    mujoco.mju_rotVecQuat(turned, config.unit_axis, place[3:])
+    tilt = np.arccos(np.clip(turned @ config.unit_axis, -1.0, 1.0))
     near = np.linalg.norm(place[:3] - config.reference) < 0.6 * config.goal_distance
     rest = (np.linalg.norm(motion[:3]) < _AT_REST[0]) & (np.linalg.norm(motion[3:]) < _AT_REST[1])
     sound = np.all(np.isfinite(data.qpos)) and not np.any(data.warning.number)
-    if config.support == "fingers":
-        palm = model.body(hand.palm).id
-        sound &= not any(palm in model.geom_bodyid[c.geom] for c in data.contact)
     return bool(near and rest and sound and tilt < _LEVEL)
