@@ -29,7 +29,7 @@ from dexsim.objects import ObjectParams, narrow
 from dexsim.observation import Motion, Readings, ThreeAxisReadings
 from dexsim.orientation_sensor import SensorDraw
 from dexsim.physics import Physics, PhysicsState
-from dexsim.randomization import Draw, sample
+from dexsim.randomization import Draw, sample, tilted_down
 from dexsim.ranges import draw_corner
 from dexsim.render import Snapshot
 from dexsim.sensing import Senses, Sensors
@@ -234,13 +234,8 @@ class Env:
 
     def _tilted(self, draw: Draw) -> tuple[jax.Array, jax.Array]:
         """Directions [3] of gravity in the palm frame: as the host takes it, and as it is."""
-        down = jnp.asarray(self.task.gravity) / np.linalg.norm(self.task.gravity)
-        side = jnp.array([down[1], down[2], down[0]])
-        side = side - jnp.sum(side * down) * down
-        side = side / jnp.linalg.norm(side)
-        other = jnp.cross(down, side)
-        tilted = down + jnp.tan(draw.tilt[0]) * side + jnp.tan(draw.tilt[1]) * other
-        return down, tilted / jnp.linalg.norm(tilted)
+        down = np.asarray(self.task.gravity, float) / np.linalg.norm(self.task.gravity)
+        return jnp.asarray(down), tilted_down(down, draw.tilt)
 
     def _felt(self, target: ObjectParams) -> Any:
         """What the taxels feel of the object, as `dexsim.distance` takes it."""

@@ -9,6 +9,7 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from dexsim.actuator import Actuator
 from dexsim.config import check_ranges, setting, validate
@@ -75,7 +76,7 @@ class Randomization:
     taxel_gain: tuple[float, float] = setting((0.9, 1.1), unit="1", low=0.05, high=5.0)
     """Factor on a finger's taxel readings."""
     gravity_tilt: float = setting(0.1, unit="rad", low=0.0, high=1.6)
-    """Largest tilt of the hand against gravity, about each horizontal axis."""
+    """Largest tilt of the hand against gravity: pitch and roll (`tilted_down`)."""
     corners: float = setting(0.0, unit="1", low=0.0, high=1.0)
     """Share of hands (and of their IMUs) with every value at an end of its range, but for the ripples' number
     and phase; see `dexsim.ranges`."""
@@ -172,6 +173,24 @@ def _assemble(key: jax.Array, draw: Callable[..., jax.Array], config: Randomizat
     return Draw(actuator=actuator, latency=substeps, sensing_latency=jnp.clip(age, 0.0, 1.0),
                 encoder_bias=encoder_bias, torque_gain=torque_gain, taxel_gain=taxel_gain,
                 tilt=tilt, gear_gap=gap)
+
+
+def tilted_down(down: np.ndarray, tilt: jax.Array) -> jax.Array:
+    """Where gravity points for a hand whose mount is off.
+
+    Args:
+      down: [3] unit vector, where it should point in the palm frame.
+      tilt: [2] rad, about the palm's own y axis, made level, and about the level axis across it: how far a mount is
+        off is known by pitch and roll, and the ends of their ranges lie there.
+
+    Returns:
+      [3] unit vector.
+    """
+    lateral = np.eye(3)[1 if abs(down[1]) < 0.9 else 2]
+    ahead = np.cross(down, lateral)
+    ahead /= np.linalg.norm(ahead)
+    off = down + jnp.tan(tilt[0]) * ahead + jnp.tan(tilt[1]) * np.cross(down, ahead)
+    return off / jnp.linalg.norm(off)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -54,4 +54,4 @@ def find_preset(name: str, task: str) -> Preset:
         return replace(preset, evaluation_chunk=16, evaluation_episodes=16)
     # Half the environments: twice the updates for the same experience, which a gait is found with.
     ppo = replace(preset.ppo, num_envs=16384, minibatches=8, entropy_coefficient=0.001)
-    return replace(preset, ppo=ppo, minutes=7.5, evaluate_every=0)
+    return replace(preset, ppo=ppo, minutes=7.5, evaluate_every=0, corners=0.6)

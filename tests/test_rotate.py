@@ -136,6 +136,14 @@ class TestGoal:
         np.testing.assert_allclose(goal.totals["spin"], 1 + 4 + 4 + 0.5 + 0.5 + 1 + 1 + 1, rtol=1e-5)
 
 
+@pytest.mark.parametrize(("tilt", "roll"), [(0.0, 0.0), (-0.3, 0.0), (-0.3, -0.2), (0.4, 0.3)])
+def test_gravity_in_a_hand_that_is_pitched_and_rolled(hand, tilt, roll):
+    """The roll turns the palm-up hand about the axis along its fingers, then the tilt about the one across them."""
+    mount = Rotation.from_euler("y", -tilt) * Rotation.from_euler("z", -roll)
+    found = np.array(Rotate(RotateConfig(tilt=tilt, roll=roll), hand).gravity)
+    np.testing.assert_allclose(found, mount.apply([-9.81, 0.0, 0.0]), atol=1e-6)
+
+
 class TestReward:
     def test_the_composite_on_a_grid(self):
         """1 / (|d_rot| + eps) * 1 / (1 + exp(400 (d_goal - 0.05)))"""
@@ -186,6 +194,12 @@ class TestReward:
             goal = dataclasses.replace(busy, pace=jnp.float32(pace / (1 - PERIOD / 2.0)))
             _, metrics = task.reward(goal, here, jnp.bool_(False))
             np.testing.assert_allclose(metrics["reward/bonus"], 250 * share, rtol=1e-4)
+
+    def test_standing_still_earns_less_than_turning(self, task, begun):
+        """Else policies hold the object where their first stroke ended."""
+        still, turning = (float(task.reward(begun, moment(task, object_quat=turned(0), object_spin=[spin, 0, 0]),
+                                            jnp.bool_(False))[0]) for spin in (0.0, 0.3))
+        assert 0 < still < turning - still
 
     def test_pace_is_a_leaky_mean(self, task, begun):
         goal = begun
@@ -314,10 +328,15 @@ class TestPool:
         pool = task.make_pool(jax.random.key(0))
         assert pool.qpos.shape == (48, 19) and np.all(pool.qvel == 0)
         half = pool.target.size[:, 0, 0]
-        gap = pool.qpos[:, 12] - half - rotate_start.palm_height(hand)
+        corners = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
+        turns = Rotation.from_quat(np.roll(pool.qpos[:, 15:19], -1, axis=1)).as_matrix()
+        lowest = np.min((corners @ turns.transpose(0, 2, 1))[..., 0], axis=1) * half
+        gap = pool.qpos[:, 12] + lowest - rotate_start.palm_height(hand)
         # On the palm, which gives way where a finger presses from above.
         assert np.all(gap < 0.003) and np.all(gap > -0.006) and np.mean(np.abs(gap) < 0.001) > 0.7
-        assert np.ptp(half) > 0.003 and np.ptp(pool.target.friction) > 0.3
+        assert np.ptp(pool.target.friction) > 0.3
+        # Each size has its share, though large cubes fit between the fingers in far fewer postures.
+        assert np.all(np.histogram(2 * half, 3, config.edge)[0] > 9)
         again = task.make_pool(jax.random.key(0))
         jax.tree.map(np.testing.assert_array_equal, pool, again)
         (file,) = (tmp_path / "pools").iterdir()
@@ -359,7 +378,7 @@ class TestPool:
     def test_no_start_state_is_one_clear_line(self, hand, monkeypatch, tmp_path):
         monkeypatch.setenv("DEXSIM_CACHE", str(tmp_path))
         config = RotateConfig(tilt=1.2, reference=(0.3, 0.0, 0.3), support="fingers", pool_size=4)
-        with pytest.raises(ConfigError, match="start states stayed in the hand"):
+        with pytest.raises(ConfigError, match=r"only 0 of 4 objects have a start state that stayed in the hand \(\d+ tried\)"):
             Rotate(config, hand).make_pool(jax.random.key(0))
 
 

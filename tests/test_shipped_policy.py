@@ -14,7 +14,8 @@ from dexsim.tasks import TASKS
 from dexsim_ppo.policy import Policy, layout_to_list
 from dexsim_real.sensing import sources_of
 
-SHIPPED = {"grasp": (GRASP, 66), "rotate": (ROTATE, 65), "rotate_without_orientation": (ROTATE, 59)}
+SHIPPED = {"grasp": (GRASP, 66), "rotate": (ROTATE, 65), "rotate_without_orientation": (ROTATE, 59),
+           "rotate_clear": (ROTATE, 65)}
 
 
 def load(name):

@@ -6,6 +6,7 @@ import json
 import math
 from pathlib import Path
 
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ import dexsim_real.twin
 from dexsim import load_hand
 from dexsim.assets import asset_path
 from dexsim.config import to_dict
+from dexsim.randomization import tilted_down
 from dexsim.tasks import TASKS as TRAINED
 from dexsim_real.frames import Mode
 from dexsim_real.trouble import HandError
@@ -287,6 +289,18 @@ def test_tilt_turns_gravity_and_keeps_its_size():
         nominal, tilted = nominal_gravity(task), tilted_gravity(task, np.array([0.12, 0.0]))
         assert np.linalg.norm(tilted) == pytest.approx(GRAVITY)
         assert math.acos(nominal @ tilted / GRAVITY**2) == pytest.approx(0.12)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_the_ends_of_trainings_tilts_are_those_of_a_mount(task):
+    """Pitch and roll on both sides, each in its own way; which sign is which says nothing."""
+    down = nominal_gravity(task) / GRAVITY
+    for pitch, roll in ((0.1, 0.1), (0.1, 0.0), (0.0, 0.1)):
+        angles = np.array([(a * pitch, b * roll) for a in (-1, 1) for b in (-1, 1)])
+        trained = np.stack([tilted_down(down, jnp.asarray(both)) for both in angles])
+        mounted = np.stack([tilted_gravity(task, both) for both in angles]) / GRAVITY
+        apart = np.linalg.norm(trained[:, None] - mounted, axis=-1)
+        assert np.all(apart.min(0) < 1e-3) and np.all(apart.min(1) < 1e-3)
 
 
 def test_an_object_on_the_fingertips_weighs_what_it_weighs(hand):

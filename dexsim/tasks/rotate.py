@@ -103,8 +103,9 @@ class Rotate:
         self.slots, self.largest = slots(config), largest_size(config)
         drawn = ("edge", *(f"objects.{name}" for name in BULK_RANGES))
         self.object_ranges = tuple(f"objects.{name}" for name in MESH_RANGES) if config.object == "mesh" else drawn
-        # Palm up; the tilt lowers the wrist.
-        self.gravity = (-9.81 * math.cos(config.tilt), 0.0, -9.81 * math.sin(config.tilt))
+        # Palm up; the tilt lowers the wrist, the roll the thumb's side.
+        level = 9.81 * math.cos(config.roll)
+        self.gravity = (-level * math.cos(config.tilt), 9.81 * math.sin(config.roll), -level * math.sin(config.tilt))
         self.reference, self._palm = config.reference, palm_height(hand)
         self._axis = jnp.asarray(config.unit_axis)
         self._step = config.direction * config.goal_step

@@ -17,8 +17,9 @@ from dexsim.tasks.rotate_start import KINDS
 class RotateReward:
     """Weights of the reward terms, per control tick."""
 
-    goal: float = setting(1.0, unit="rad", low=0.0, high=1000.0)
-    """Close to goal: 1 / (d_rot + epsilon), gated by the distance from the reference."""
+    goal: float = setting(0.2, unit="rad", low=0.0, high=1000.0)
+    """Close to goal: 1 / (d_rot + epsilon), gated by the distance from the reference. The paper's weight, 1, pays for
+    holding still where a stroke ended."""
     epsilon: float = setting(0.1, unit="rad", low=1e-3, high=10.0)
     """Floor under the angle in it."""
     gate: float = setting(0.05, unit="m", low=0.001, high=1.0)
@@ -42,7 +43,7 @@ class RotateReward:
     torque: float = setting(-0.5, unit="1/Nm^2", low=-1000.0, high=0.0)
     """Squared joint torque: a price on clamping the object where a stroke has ended, which is where
     policies got stuck."""
-    spin: float = setting(1.0, unit="s/rad", low=0.0, high=1000.0)
+    spin: float = setting(2.0, unit="s/rad", low=0.0, high=1000.0)
     """Spin about the axis in the wanted direction, up to +-1 rad/s: a gradient before the first
     goal is ever reached."""
     fingertips: float = setting(0.0, unit="1", low=0.0, high=1000.0)
@@ -94,6 +95,8 @@ class RotateConfig(EnvConfig):
     tilt: float = setting(-0.3, unit="rad", low=-1.2, high=1.2)
     """The hand's nominal pitch: positive lets the object slide toward the wrist, where no finger reaches it.
     Leaning toward the fingers brings it back to them."""
+    roll: float = setting(0.0, unit="rad", low=-1.2, high=1.2)
+    """The hand's nominal roll: positive lets the object slide toward the thumb, beside which it falls most easily."""
     reference: tuple[float, float, float] = setting((0.047, 0.010, 0.087), unit="m", low=-0.5,
                                                     high=0.5)
     """Where the object belongs: where thumb and fingers meet, in front of the palm's middle."""
@@ -107,8 +110,8 @@ class RotateConfig(EnvConfig):
     learn to turn once and then hold still. Evaluations wait for ever."""
     clearance: float = setting(0.001, unit="m", low=0.0, high=0.05)
     """Smallest gap between palm and object with support "fingers"."""
-    episode_seconds: float = setting(60.0, unit="s", low=0.2, high=3600.0)
-    """Time limit of a training episode."""
+    episode_seconds: float = setting(20.0, unit="s", low=0.2, high=3600.0)
+    """Time limit of a training episode: short, as most that is lost is lost with the first strokes."""
     evaluation_seconds: float = setting(120.0, unit="s", low=0.2, high=3600.0)
     """Length of an evaluation episode."""
     push_probability: float = setting(0.005, unit="1", low=0.0, high=1.0)
@@ -158,8 +161,8 @@ def paper() -> RotateConfig:
     """The paper's own weights and success test."""
     return RotateConfig(
         goal_spin=0.0, drop_distance=0.09, drop_tilt=math.pi, patience=1e6, control=Control(step=0.3, recall="target"),
-        reward=RotateReward(action=-0.0002, velocity=0.0, torque=0.0, spin=0.0, bonus_tips=0.0,
-                            bonus_speed=1e6, drop=0.0))
+        episode_seconds=60.0, reward=RotateReward(goal=1.0, action=-0.0002, velocity=0.0, torque=0.0, spin=0.0,
+                                                  bonus_tips=0.0, bonus_speed=1e6, drop=0.0))
 
 
 def without_orientation() -> RotateConfig:
@@ -171,7 +174,7 @@ def clear_of_palm() -> RotateConfig:
     """The object held clear of the palm: it lies in the curled fingers, which point downhill, and turns about what is
     upright there."""
     return RotateConfig(
-        reward=RotateReward(torque=-0.1, bonus_tips=0.0, spin=2.0, gate=0.04), support="fingers", tilt=-1.1,
+        reward=RotateReward(goal=1.0, torque=-0.1, bonus_tips=0.0, gate=0.04), support="fingers", tilt=-1.1,
         axis=(0.6, 0.0, -0.8), reference=(0.072, 0.005, 0.098), squeeze=(0.0, 0.2),
         posture=(1.2, 0.3, 0.3, 0.0, 0.8, 0.6, 0.8, 0.6, 0.8, 0.6, 0.8, 0.6), posture_noise=0.2,
         start_offset=(0.0, 0.0), place_noise=0.006, curl=(-0.1, 0.1))

@@ -38,7 +38,8 @@ KINDS = {"cube": ("box",), "cylinder": ("cylinder",), "octagon": ("box", "box")}
 _SHAPE_INDEX = {"cube": "box", "cylinder": "cylinder", "octagon": "composition"}
 _UPRIGHT = (np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0)  # takes a cylinder's axis to x
 _EIGHTH = (np.cos(np.pi / 8), np.sin(np.pi / 8), 0.0, 0.0)  # 45 degrees about x
-_VERSION = 3  # of the procedure: raise it when older pools no longer hold
+_TRIALS = 300  # rounds of candidates in which every object should find a posture
+_VERSION = 4  # of the procedure: raise it when older pools no longer hold
 _AT_REST = (0.05, 1.0)  # m/s, rad/s
 _LEVEL = 0.35  # rad, largest angle from upright
 
@@ -166,52 +167,60 @@ def _write(path: Path, arrays: list[np.ndarray]) -> None:
 
 def _make(key: jax.Array, hand: Hand, config: Any,
           gravity: tuple[float, float, float]) -> list[np.ndarray]:
-    """Settle candidates until the pool is full: qpos, qvel, joint targets, object leaves."""
-    draw = jax.jit(jax.vmap(lambda k: _candidate(k, hand, config)))
-    chunk, threads = 512, min(os.cpu_count() or 1, 16)
-    kept, found, tried = [], 0, 0
+    """A start state for each of `pool_size` objects: qpos, qvel, joint targets, object leaves.
+
+    Objects are drawn first, and each is tried in posture after posture until it stays: large ones fit into few, and
+    where whatever stays is kept they are all but left out.
+    """
+    size, chunk, threads = config.pool_size, 1024, min(os.cpu_count() or 1, 16)
+    object_key, key = jax.random.split(key)
+    targets = jax.device_get(jax.jit(jax.vmap(lambda k: sample_target(k, config)))(jax.random.split(object_key, size)))
+    draw = jax.jit(jax.vmap(lambda k, target: _candidate(k, target, hand, config)))
+    starts, waiting, tried = {}, np.arange(size), 0
     with ThreadPoolExecutor(threads) as pool:
         models = [_model(hand, config, gravity) for _ in range(threads)]
-        while found < config.pool_size:
-            candidates = jax.device_get(draw(jax.random.split(jax.random.fold_in(key, tried),
-                                                              chunk)))
-            rows = np.arange(chunk)[candidates["clear"]]
-            parts = [rows[i::threads] for i in range(threads)]
+        for trial in range(_TRIALS):
+            which = np.resize(waiting, chunk)
+            candidates = jax.device_get(draw(jax.random.split(jax.random.fold_in(key, trial), chunk),
+                                             jax.tree.map(lambda leaf, which=which: leaf[which], targets)))
+            rows = np.flatnonzero(candidates["clear"])
+            rows = rows[np.unique(which[rows], return_index=True)[1]]  # one posture for each object
             settle = functools.partial(_settle, hand=hand, config=config, candidates=candidates)
-            settled = list(pool.map(settle, models, parts))
+            settled = list(pool.map(settle, models, [rows[i::threads] for i in range(threads)]))
             good, qpos = (np.concatenate(x) for x in zip(*settled, strict=True))
-            order = np.argsort(good)
-            order = order[_clear_of_palm(hand, config, candidates["target"], good[order], qpos[order])]
-            good, qpos = good[order], qpos[order]
-            kept.append([qpos, np.zeros((len(good), hand.num_joints + 6), np.float32),
-                         candidates["joint_target"][good],
-                         *(leaf[good] for leaf in jax.tree.leaves(candidates["target"]))])
-            found, tried = found + len(good), tried + 1
-            if tried >= 8 and found < tried * chunk / 200:
-                raise ConfigError(f"RotateConfig: only {found} of {tried * chunk} start states "
-                                  "stayed in the hand; change posture, tilt, edge or support")
-    return [np.concatenate(x)[:config.pool_size] for x in zip(*kept, strict=True)]
+            for k in _clear_of_palm(hand, config, candidates["target"], good, qpos):
+                starts[which[good[k]]] = qpos[k], candidates["joint_target"][good[k]]
+            waiting, tried = np.setdiff1d(waiting, list(starts)), tried + len(rows)
+            if not len(waiting) or tried > 1000 and len(starts) < tried / 200:
+                break
+    if len(waiting) > size / 20:
+        raise ConfigError(f"RotateConfig: only {len(starts)} of {size} objects have a start state that stayed "
+                          f"in the hand ({tried} tried); change posture, tilt, edge or support")
+    # The few that fit nowhere leave their rows to others.
+    chosen = np.array(sorted(starts))
+    chosen = np.concatenate([chosen, chosen[:size - len(chosen)]])
+    return [np.stack([starts[k][0] for k in chosen]), np.zeros((size, hand.num_joints + 6), np.float32),
+            np.stack([starts[k][1] for k in chosen]), *(leaf[chosen] for leaf in jax.tree.leaves(targets))]
 
 
-def _candidate(key: jax.Array, hand: Hand, config: Any) -> dict[str, Any]:
-    """An object just above where it will rest, in a random posture."""
-    keys = jax.random.split(key, 6)
-    target = sample_target(keys[0], config)
-    noise = config.posture_noise * jax.random.uniform(keys[1], (hand.num_joints,), minval=-1.0)
+def _candidate(key: jax.Array, target: ObjectParams, hand: Hand, config: Any) -> dict[str, Any]:
+    """This object just above where it will rest, in a random posture."""
+    keys = jax.random.split(key, 5)
+    noise = config.posture_noise * jax.random.uniform(keys[0], (hand.num_joints,), minval=-1.0)
     flexion = np.zeros(hand.num_joints, np.float32)
     flexion[flexion_joints(hand, range(1, hand.num_fingers))] = 1.0
-    curl = jax.random.uniform(keys[4], minval=config.curl[0], maxval=config.curl[1])
+    curl = jax.random.uniform(keys[3], minval=config.curl[0], maxval=config.curl[1])
     joints = jnp.clip(jnp.asarray(config.posture) + noise + curl * flexion, hand.joint_lower,
                       hand.joint_upper)
-    heading = config.heading_noise * jax.random.uniform(keys[2], minval=-1.0)
+    heading = config.heading_noise * jax.random.uniform(keys[1], minval=-1.0)
     quat = rotations.axis_angle_to_quat(jnp.asarray(config.unit_axis), heading)
-    shift = config.place_noise * jax.random.uniform(keys[3], (2,), minval=-1.0)
+    shift = config.place_noise * jax.random.uniform(keys[2], (2,), minval=-1.0)
     place = jnp.asarray(config.reference).at[1:].add(jnp.asarray(config.start_offset) + shift)
     if config.support == "palm":
         floor = palm_height(hand) + 0.001 - lowest_point(target, quat, jnp.zeros(3))
         place = place.at[0].set(floor)
     overlap = clearance(hand, joints, target.shape(), place, rotations.quat_to_matrix(quat))
-    squeeze = jax.random.uniform(keys[5], minval=config.squeeze[0], maxval=config.squeeze[1])
+    squeeze = jax.random.uniform(keys[4], minval=config.squeeze[0], maxval=config.squeeze[1])
     closed = np.array(flexion)
     closed[flexion_joints(hand, range(1))] = 1.0
     joint_target = jnp.clip(joints + squeeze * closed, hand.joint_lower, hand.joint_upper)
@@ -263,11 +272,11 @@ def _settle(model: mujoco.MjModel, rows: np.ndarray, *, hand: Hand, config: Any,
 
 
 def _clear_of_palm(hand: Hand, config: Any, target: ObjectParams, rows: np.ndarray, qpos: np.ndarray) -> np.ndarray:
-    """Which [N] of these rows are no drop from the beginning, where touching the palm is one."""
+    """Which of these rows, by their place in `rows`, are no drop from the beginning, where touching the palm is one."""
     if config.support == "palm" or not len(rows):
-        return np.ones(len(rows), bool)
+        return np.arange(len(rows))
     low = jax.vmap(lowest_point)(jax.tree.map(lambda leaf: leaf[rows], target), qpos[:, -4:], qpos[:, -7:-4])
-    return np.asarray(low) > palm_height(hand) + config.clearance
+    return np.flatnonzero(np.asarray(low) > palm_height(hand) + config.clearance)
 
 
 def _stays(model: mujoco.MjModel, config: Any, data: mujoco.MjData) -> bool:

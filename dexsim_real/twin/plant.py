@@ -22,8 +22,9 @@ from dexsim_real.twin.shapes import Shape, draw_shape, matrix, product, turn
 from dexsim_real.twin.skin import Skin
 from dexsim_real.twin.types import Measurement, Motors
 
-TILT = {"grasp": None, "rotate": -0.3}
-"""Nominal pitch of the hand, rad: None for upside down, else palm up with the wrist lowered (or raised, below zero)."""
+MOUNT = {"grasp": None, "rotate": (-0.3, 0.0)}
+"""Nominal pitch and roll of the hand, rad: None for upside down, else palm up with the wrist lowered (or raised, below
+zero), and the thumb's side."""
 GRAVITY = 9.81
 IMU_TRANSPORT = 0.0017  # s of an orientation's bytes
 _SUBSTEPS = round(PERIOD / TIMESTEP)
@@ -33,9 +34,10 @@ _MEMORY = 0.2  # s of the past that sensors may show
 
 def nominal_gravity(task: str) -> np.ndarray:
     """Gravity [3] m/s^2 in the palm frame of a hand that is mounted as it should be."""
-    tilt = TILT[task]
-    down = np.array([1.0, 0.0, 0.0]) if tilt is None else np.array([-np.cos(tilt), 0.0, -np.sin(tilt)])
-    return GRAVITY * down
+    if MOUNT[task] is None:
+        return GRAVITY * np.array([1.0, 0.0, 0.0])
+    pitch, roll = MOUNT[task]
+    return GRAVITY * np.array([-np.cos(pitch) * np.cos(roll), np.sin(roll), -np.sin(pitch) * np.cos(roll)])
 
 
 def tilted_gravity(task: str, tilt: np.ndarray) -> np.ndarray:
