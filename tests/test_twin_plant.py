@@ -6,6 +6,7 @@ import json
 import math
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -20,7 +21,7 @@ from dexsim.tasks import TASKS as TRAINED
 from dexsim_real.frames import Mode
 from dexsim_real.trouble import HandError
 from dexsim_real.twin import assistant, referee, scene, shapes
-from dexsim_real.twin.assistant import POSTURES, REFERENCES, Assistant, Stage, find_place, put
+from dexsim_real.twin.assistant import PLACES, POSTURES, REFERENCES, Assistant, Stage, find_place, put
 from dexsim_real.twin.draw import BANDS, FAR, NEAR, PUSHES, TASKS, bands, draw_trial
 from dexsim_real.twin.motors import BACK_EMF, PERIOD, STALL_CURRENT, STIFFNESS, Drives, Heat
 from dexsim_real.twin.plant import GRAVITY, EmulatedHand, nominal_gravity, tilted_gravity
@@ -88,6 +89,14 @@ def test_rules_and_places_are_those_of_the_tasks(hand):
     config = rules.config
     assert (referee.GOAL_STEP, referee.GOAL_ANGLE, referee.GOAL_DISTANCE, referee.GOAL_SPIN, referee.TIPPED) == \
         pytest.approx((config.goal_step, config.goal_angle, config.goal_distance, config.goal_spin, config.drop_tilt))
+
+
+def test_a_cube_is_put_in_the_middle_of_trainings_starts(hand, monkeypatch, tmp_path):
+    monkeypatch.setenv("DEXSIM_CACHE", str(tmp_path))
+    entry = TRAINED["rotate"]
+    rules = entry.task_class(dataclasses.replace(entry.config_class(), pool_size=64), hand)
+    starts = rules.make_pool(jax.random.key(0)).qpos[:, 13:15]
+    assert np.all(np.abs(starts.mean(0) - PLACES["rotate"]) < 0.6 * starts.std(0))
 
 
 def test_the_fingers_leave_room_where_a_cube_is_put(hand):
