@@ -26,7 +26,7 @@ REFERENCES = {"grasp": (0.055, -0.005, 0.090), "rotate": (0.047, 0.010, 0.087)}
 """Where the object belongs, m."""
 PLACES = {"grasp": REFERENCES["grasp"][1:], "rotate": (0.007, 0.079)}
 """Where along the palm (y, z) it is put, m: in the middle of training's start states. 5 mm nearer to the wrist is where
-none of them lies, and a policy's first strokes may miss it there (`docs/hardware.md` tells users so)."""
+hardly any of them lies, and a policy's first strokes may miss it there (`docs/hardware.md` tells users so)."""
 PALM_FACE = 0.020  # m, x of the palm's surface
 _ARRIVED, _LEFT = 0.002, 0.005  # rad, targets off the start posture: arrived within, gone beyond
 _NEAR = 0.3  # rad, joints off it: the hand stands there as well as its gears let it
