@@ -167,9 +167,9 @@ def test_corners_are_for_training_alone():
     from dexsim.tasks.rotate_config import RotateConfig
 
     plain, _ = train.parse_arguments(["--task", "rotate", "--preset", "gpu"])
-    assert plain.corners == 0.3 and plain.env == RotateConfig()
+    assert plain.corners == 0.6 and plain.env == RotateConfig()
     asked = trainer.training_config(plain)
-    assert asked.randomization.corners == asked.objects.corners == 0.3
+    assert asked.randomization.corners == asked.objects.corners == 0.6
     without = dataclasses.replace(asked, randomization=plain.env.randomization, objects=plain.env.objects)
     assert without == plain.env
     off, _ = train.parse_arguments(["--task", "rotate", "--preset", "gpu", "--corners", "0"])
