@@ -22,6 +22,7 @@ from dexsim.tasks.rotate import Rotate
 from dexsim.tasks.rotate_config import RotateConfig, RotateReward
 
 PERIOD = RotateConfig().physics.control_period
+CORNERS = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T  # of a cube from -1 to 1
 
 
 def quat_of(rotation: Rotation) -> np.ndarray:
@@ -269,7 +270,7 @@ class TestDrop:
     def test_lowest_corner_of_a_tilted_cube(self, task):
         target = rotate_start.sample_target(jax.random.key(3), task.config)
         half, place = float(target.size[0, 0]), np.array([0.06, 0.0, 0.08])
-        corners = half * np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
+        corners = half * CORNERS
         for seed in range(5):
             rotation = Rotation.random(random_state=seed)
             low = np.min(rotation.apply(corners)[:, 0]) + place[0]
@@ -328,9 +329,8 @@ class TestPool:
         pool = task.make_pool(jax.random.key(0))
         assert pool.qpos.shape == (48, 19) and np.all(pool.qvel == 0)
         half = pool.target.size[:, 0, 0]
-        corners = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
         turns = Rotation.from_quat(np.roll(pool.qpos[:, 15:19], -1, axis=1)).as_matrix()
-        lowest = np.min((corners @ turns.transpose(0, 2, 1))[..., 0], axis=1) * half
+        lowest = np.min((CORNERS @ turns.transpose(0, 2, 1))[..., 0], axis=1) * half
         gap = pool.qpos[:, 12] + lowest - rotate_start.palm_height(hand)
         # On the palm, which gives way where a finger presses from above.
         assert np.all(gap < 0.003) and np.all(gap > -0.006) and np.mean(np.abs(gap) < 0.001) > 0.7
@@ -353,7 +353,7 @@ class TestPool:
             # The eight corners of the cube as the pool has it, in the palm frame.
             half, slot = pool.target.size[k, 0], Rotation.from_quat(np.roll(pool.target.quat[k, 0], -1))
             np.testing.assert_allclose(slot.apply([1.0, 0, 0]), stand.apply([1.0, 0, 0]), atol=1e-6)
-            corners = half * np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
+            corners = half * CORNERS
             turn = Rotation.from_quat(np.roll(pool.qpos[k, 15:19], -1))
             low = (turn * slot).apply(corners)[:, 0].min() + pool.qpos[k, 12]
             assert low > rotate_start.palm_height(hand) + config.clearance - 1e-6
