@@ -17,6 +17,10 @@ GEOM_TYPES = {"sphere": mujoco.mjtGeom.mjGEOM_SPHERE, "box": mujoco.mjtGeom.mjGE
               "ellipsoid": mujoco.mjtGeom.mjGEOM_ELLIPSOID}
 
 
+# Primitives that meet a box in closed form with every engine.
+_MEETS_BOXES = {"sphere", "capsule", "box"}
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PhysicsConfig:
     """Time step, solver and contact model."""
@@ -46,8 +50,9 @@ class PhysicsConfig:
     edges softer than faces; or the same everywhere."""
     settling: float = setting(0.03, unit="s", low=0.005, high=0.2)
     """Time scale on which a contact pushes out what lies in it (at least four time steps)."""
-    palm: str = setting("face", choices=("face", "box"))
-    """Palm as a half-space at its face (exact and cheap for every primitive) or as its box."""
+    palm: str = setting("auto", choices=("auto", "face", "box"))
+    """Palm as its box, or as a half-space at its face, which carries an object beside the palm, too, but meets every
+    primitive in closed form. auto: the box where the object has no cylinder or ellipsoid."""
     contacts: str = setting("closed", choices=("closed", "mjx"))
     """JAX backend only. closed: MJX's rigid bodies with our closed-form contacts and solver, where the
     scene allows (`dexsim.substep`); mjx: `mjx.step` throughout, some six times slower on a CPU."""
@@ -90,7 +95,7 @@ def build_model(hand: Hand, slots: tuple[str, ...], largest: np.ndarray, config:
         joint.armature *= 1 - rotor_share
     palm = spec.body(hand.palm)
     palm.pos, palm.quat = [0, 0, 0], [1, 0, 0, 0]
-    touching = _touching_geoms(spec, hand, config)
+    touching = _touching_geoms(hand, slots, config)
     contact.cover_tips(spec, hand, config.cover)
     touching = contact.split_pads(spec, hand, touching, config.pad_points)
     for geom in spec.geoms:
@@ -132,13 +137,13 @@ def tip_bodies(model: mujoco.MjModel, hand: Hand) -> np.ndarray:
     return np.array([model.body(hand.body_names[b]).id for b in hand.tip_body])
 
 
-def _touching_geoms(spec: mujoco.MjSpec, hand: Hand, config: PhysicsConfig) -> list[str]:
+def _touching_geoms(hand: Hand, slots: tuple[str, ...], config: PhysicsConfig) -> list[str]:
     geoms = [g for g in hand.geoms if g.touches]
     palm = hand.body_names.index(hand.palm)
-    planes = [g for g in geoms if g.body == palm and g.kind == "plane"]
-    if planes:
-        use_plane = config.palm == "face"
-        geoms = [g for g in geoms if g.body != palm or (g.kind == "plane") == use_plane]
+    kinds = {g.kind for g in geoms if g.body == palm}
+    if "plane" in kinds:
+        use_box = config.palm == "box" or (config.palm == "auto" and "box" in kinds and set(slots) <= _MEETS_BOXES)
+        geoms = [g for g in geoms if g.body != palm or (g.kind != "plane") == use_box]
     if not geoms or any(not g.name for g in geoms):
         raise AssetError(f"{hand.model_path}: every geom that touches the object (contype or "
                          "conaffinity not 0) needs a name, and there must be at least one")

@@ -80,7 +80,7 @@ def test_config_errors_are_the_librarys():
     (TaxelSensor, dict(saturation=0.0), ("TaxelSensor.saturation", "0 N", "0.1 and 1000 N")),
     (PhysicsConfig, dict(timestep=0.5), ("PhysicsConfig.timestep", "0.5 s", "0.0001 and 0.02 s")),
     (PhysicsConfig, dict(condim=2), ("PhysicsConfig.condim", "2", "1, 3, 4 or 6")),
-    (PhysicsConfig, dict(palm="fist"), ("PhysicsConfig.palm", "'fist'", "face, box")),
+    (PhysicsConfig, dict(palm="fist"), ("PhysicsConfig.palm", "'fist'", "auto, face, box")),
     (ObjectConfig, dict(mass=(0.3, 0.1)), ("ObjectConfig.mass", "0.3, 0.1")),
     (Randomization, dict(latency=(0.0, 1.0)), ("Randomization.latency", "1 s", "0 and 0.2 s")),
     (GraspReward, dict(drop=3.0), ("GraspReward.drop", "3", "-10000 and 0")),

@@ -243,7 +243,7 @@ class TestConstruction:
 
     @pytest.mark.parametrize("field, value, message", [
         ("condim", 2, "1, 3, 4 or 6"), ("timestep", 0.5, "0.5 s: must be between 0.0001 and 0.02 s"),
-        ("substeps", 0, "substeps = 0"), ("palm", "flat", "choose from face, box")])
+        ("substeps", 0, "substeps = 0"), ("palm", "flat", "choose from auto, face, box")])
     def test_configuration(self, field, value, message):
         with pytest.raises(ConfigError, match=message):
             PhysicsConfig(**{field: value})

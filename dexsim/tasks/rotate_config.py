@@ -92,11 +92,12 @@ class RotateConfig(EnvConfig):
     """... held for this long."""
     support: str = setting("palm", choices=("palm", "fingers"))
     """Carried by the palm, or held clear of it by the fingers: then touching the palm is a drop."""
-    tilt: float = setting(-0.3, unit="rad", low=-1.2, high=1.2)
+    tilt: float = setting(-0.2, unit="rad", low=-1.2, high=1.2)
     """The hand's nominal pitch: positive lets the object slide toward the wrist, where no finger reaches it.
     Leaning toward the fingers brings it back to them."""
-    roll: float = setting(0.0, unit="rad", low=-1.2, high=1.2)
-    """The hand's nominal roll: positive lets the object slide toward the thumb, beside which it falls most easily."""
+    roll: float = setting(-0.2, unit="rad", low=-1.2, high=1.2)
+    """The hand's nominal roll: positive lets the object slide toward the thumb, beside which it falls over the palm's
+    edge most easily."""
     reference: tuple[float, float, float] = setting((0.047, 0.010, 0.087), unit="m", low=-0.5,
                                                     high=0.5)
     """Where the object belongs: where thumb and fingers meet, in front of the palm's middle."""
@@ -174,7 +175,7 @@ def clear_of_palm() -> RotateConfig:
     """The object held clear of the palm: it lies in the curled fingers, which point downhill, and turns about what is
     upright there."""
     return RotateConfig(
-        reward=RotateReward(goal=1.0, torque=-0.1, bonus_tips=0.0, gate=0.04), support="fingers", tilt=-1.1,
+        reward=RotateReward(goal=1.0, torque=-0.1, bonus_tips=0.0, gate=0.04), support="fingers", tilt=-1.1, roll=0.0,
         axis=(0.6, 0.0, -0.8), reference=(0.072, 0.005, 0.098), squeeze=(0.0, 0.2),
         posture=(1.2, 0.3, 0.3, 0.0, 0.8, 0.6, 0.8, 0.6, 0.8, 0.6, 0.8, 0.6), posture_noise=0.2,
         start_offset=(0.0, 0.0), place_noise=0.006, curl=(-0.1, 0.1))

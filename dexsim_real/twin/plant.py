@@ -22,7 +22,7 @@ from dexsim_real.twin.shapes import Shape, draw_shape, matrix, product, turn
 from dexsim_real.twin.skin import Skin
 from dexsim_real.twin.types import Measurement, Motors
 
-MOUNT = {"grasp": None, "rotate": (-0.3, 0.0)}
+MOUNT = {"grasp": None, "rotate": (-0.2, -0.2)}
 """Nominal pitch and roll of the hand, rad: None for upside down, else palm up with the wrist lowered (or raised, below
 zero), and the thumb's side."""
 GRAVITY = 9.81
