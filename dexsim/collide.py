@@ -16,6 +16,7 @@ import mujoco
 import numpy as np
 
 from dexsim import sdf
+from dexsim.collide_boxes import POINTS, box_box
 
 _BOXES = ("box", "box")
 KINDS = {int(mujoco.mjtGeom.mjGEOM_SPHERE): "sphere", int(mujoco.mjtGeom.mjGEOM_BOX): "box",
@@ -109,7 +110,7 @@ def find_collider(model: mujoco.MjModel) -> Collider | None:
     for second in dict.fromkeys(second for _, second in rows):
         plane, sphere, capsule, box = (np.array(rows.get((first, second), []), int)
                                        for first in ("plane", "sphere", "capsule", "box"))
-        for flat, (meet, count) in ((plane, _PLANE[second]), (box, (_box_box, 12))):
+        for flat, (meet, count) in ((plane, _PLANE[second]), (box, (box_box, POINTS))):
             if flat.size:
                 groups.append(Patches(meet, geoms[flat]))
                 order.append(np.repeat(flat, count))
@@ -203,78 +204,3 @@ def _plane_cylinder(position, rotation, _, centre, turn, size):
 # How a plane meets a primitive, in how many points.
 _PLANE = {"sphere": (_plane_sphere, 1), "capsule": (_plane_capsule, 2), "box": (_plane_box, 8),
           "cylinder": (_plane_cylinder, 4), "ellipsoid": (_plane_ellipsoid, 1)}
-
-
-# --- boxes with boxes ------------------------------------------------------------------------------
-
-def _box_box(position: jax.Array, rotation: jax.Array, size: jax.Array, centre: jax.Array, turn: jax.Array,
-             other: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Twelve points at most of two boxes: where a face of one, the reference, meets the opposite face of the other.
-
-    The reference is the face, of all twelve, along whose normal the boxes are farthest apart, or overlap least. Two
-    edges that cross in the air meet by the nearer of their faces.
-    """
-    mine = _apart(position, rotation, size, centre, turn, other)
-    theirs = _apart(centre, turn, other, position, rotation, size)
-    first = mine.max() >= theirs.max() - 1e-6
-    pick = lambda a, b: jax.tree.map(functools.partial(jnp.where, first), a, b)  # noqa: E731
-    (position, rotation, size), incident = (pick(a, b) for a, b in (
-        ((position, rotation, size), (centre, turn, other)), ((centre, turn, other), (position, rotation, size))))
-    gap, point, normal = _clip(position, rotation, size, *incident, pick(mine, theirs).argmax())
-    return gap, point, jnp.broadcast_to(jnp.where(first, normal, -normal), point.shape)
-
-
-def _apart(position: jax.Array, rotation: jax.Array, size: jax.Array, centre: jax.Array, turn: jax.Array,
-           other: jax.Array) -> jax.Array:
-    """Gap [6] along each of a box's face normals (+x, +y, +z, -x, -y, -z) to another box."""
-    place = jnp.sum(rotation * (centre - position)[:, None], 0)
-    reach = size + jnp.sum(jnp.abs(jnp.sum(rotation[:, :, None] * turn[:, None, :], 0)) * other, -1)
-    return jnp.concatenate([place - reach, -place - reach])
-
-
-def _clip(position: jax.Array, rotation: jax.Array, size: jax.Array, centre: jax.Array, turn: jax.Array,
-          other: jax.Array, face: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Gaps [12], points [12, 3] and the normal [3] of that part of the incident face which lies over a box's `face`.
-
-    Its corners are ends of the incident face's edges, where those are cut off at the rim, and corners of the
-    reference face.
-    """
-    # The face in its own frame: x and y along it, z outward.
-    order = (face + jnp.array([1, 2, 0])) % 3
-    along = rotation[:, order].T * jnp.stack([1.0, 1.0, jnp.where(face < 3, 1.0, -1.0)])[:, None]
-    half = size[order]
-    local = jnp.sum(along * (centre - position), 1) - half * jnp.array([0.0, 0.0, 1.0])
-    axes = jnp.sum(along[:, :, None] * turn[None], 1)  # columns: the other box's axes there
-
-    # The face of the other box that looks most against the normal, as a ring of corners.
-    down = jnp.argmax(jnp.abs(axes[2]))
-    against = jnp.where(axes[2, down] > 0, -1.0, 1.0)
-    pick = (down + jnp.array([1, 2, 0])) % 3  # two edges' directions, then the normal's
-    edges, wide = axes[:, pick], other[pick]
-    middle = local + against * wide[2] * edges[:, 2]
-    ring = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]], np.float32)
-    corner = middle + (ring[:, :1] * wide[0]) * edges[:, 0] + (ring[:, 1:] * wide[1]) * edges[:, 1]
-    way = jnp.roll(corner, -1, 0) - corner
-
-    # Which stretch of each edge lies over the reference face.
-    flat = jnp.where(jnp.abs(way[:, :2]) < 1e-9, 1e-9, way[:, :2])
-    one, two = (-half[:2] - corner[:, :2]) / flat, (half[:2] - corner[:, :2]) / flat
-    begin = jnp.clip(jnp.minimum(one, two).max(1), 0.0, None)
-    end = jnp.clip(jnp.maximum(one, two).min(1), None, 1.0)
-    over = begin <= end
-    started, ended = (corner + t[:, None] * way for t in (begin, end))
-    # The reference face's own corners, where they lie under the incident face.
-    rim = ring * half[:2]
-    normal = edges[:, 2]
-    steep = jnp.where(jnp.abs(normal[2]) < 1e-6, 1e-6, normal[2])
-    height = middle[2] - jnp.sum((rim - middle[:2]) * normal[:2], -1) / steep
-    inner = jnp.concatenate([rim, height[:, None]], -1)
-    place = (inner - middle) @ edges[:, :2]
-    under = jnp.all(jnp.abs(place) < wide[:2] - 1e-7, -1)
-
-    points = jnp.concatenate([started, ended, inner])
-    # An edge that ends over the face ends where the next begins.
-    gap = jnp.where(jnp.concatenate([over, over & (end < 1.0), under]), points[:, 2], sdf.FAR)
-    found = points - 0.5 * points[:, 2:] * jnp.array([0.0, 0.0, 1.0])
-    world = position + sum(found[:, k, None] * along[k] for k in range(3)) + half[2] * along[2]
-    return gap, world, along[2]

@@ -500,6 +500,12 @@ def rotate_env():
 
 
 class TestEnvironment:
+    def test_the_palm_ends_where_the_hand_does(self, rotate_env):
+        """As a box, where a half-space would carry what lies beside it; how that falls: `test_warp`."""
+        model = rotate_env.physics.mj_model
+        names = {model.geom(g).name for g in model.pair_geom1}
+        assert "palm" in names and "palm_face" not in names
+
     def test_lives_through_an_episode(self, rotate_env):
         """A still hand keeps the cube; counts start anew with the next episode."""
         env = rotate_env

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 from c_scene import GRAVITY
+from scipy.spatial.transform import Rotation
 
 from dexsim import collide, newton
 from dexsim.object_config import SLOTS, ObjectConfig
@@ -94,6 +95,81 @@ def test_a_capsule_that_lies_on_a_face(second):
     data.qpos[3:7] = np.cos(0.6), 0, np.sin(0.6), 0
     mujoco.mj_kinematics(model, data)
     assert np.sum(candidates(model, data)[0] < 1.0) == 1
+
+
+PALM, CUBE = np.array([0.02, 0.0455, 0.0535]), np.array([0.0275, 0.0275, 0.0275])
+
+
+@pytest.fixture(scope="module")
+def boxes():
+    """A palm and a cube; C MuJoCo's own contacts of boxes, not its convex ones."""
+    model = mujoco.MjModel.from_xml_string(f"""<mujoco><option><flag nativeccd="disable"/></option><worldbody>
+      <body><freejoint/><geom name="a" type="box" size="{' '.join(map(str, PALM))}" contype="0" conaffinity="0"/></body>
+      <body><freejoint/><geom name="b" type="box" size="{' '.join(map(str, CUBE))}" contype="0" conaffinity="0"/></body>
+      </worldbody><contact><pair geom1="a" geom2="b"/></contact></mujoco>""")
+    touch = jax.jit(collide.find_collider(model).touch)
+
+    def meet(place, turn, stand):
+        """Contacts of C and ours: depths, points and normals of what overlaps; the palm stands anywhere."""
+        data = mujoco.MjData(model)
+        data.qpos[:3], data.qpos[3:7] = stand.apply([0.1, -0.2, 0.3]), np.roll(stand.as_quat(), 1)
+        data.qpos[7:10] = stand.apply(np.array([0.1, -0.2, 0.3]) + place)
+        data.qpos[10:] = np.roll((stand * turn).as_quat(), 1)
+        mujoco.mj_forward(model, data)
+        gap, point, normal = (np.asarray(x) for x in touch(*(jnp.asarray(x, jnp.float32) for x in (
+            data.geom_xpos, data.geom_xmat.reshape(-1, 3, 3), model.geom_size))))
+        mine = gap < 0
+        frames = data.geom_xmat.reshape(2, 3, 3)
+        found = data.contact.dist, data.contact.pos, data.contact.frame[:, :3]
+        return found, (gap[mine], point[mine], normal[mine]), frames
+
+    return meet
+
+
+def test_a_cube_on_a_box(boxes):
+    """Where C MuJoCo has a face's normal: as many contacts, as deep, at the same places, over the edges as well."""
+    rng, counts = np.random.default_rng(0), []
+    for trial in range(150):
+        # Flat, turned, leaning a little or much; on the face, over one edge or two, or clear of all.
+        lean = rng.normal(size=3) * [2.0, *[(0.0, 0.05, 0.5)[trial % 3]] * 2]
+        place = [PALM[0] + CUBE[0] + rng.uniform(-0.003, 0.002), *rng.uniform(-1, 1, 2) * [0.075, 0.085]]
+        stand = Rotation.random(random_state=trial) if trial % 2 else Rotation.identity()
+        (depth, point, normal), (gap, mine, ours), frames = boxes(place, Rotation.from_rotvec(lean), stand)
+        if not len(depth):
+            assert not len(gap), trial
+            continue
+        along = np.abs(np.einsum("k,bkj->bj", normal[0], frames)).max()
+        if along < 1 - 1e-10 or depth.min() > -1e-5:
+            continue  # Two edges cross, or hardly touch.
+        counts.append(len(depth))
+        assert len(gap) == len(depth), trial
+        for d, p in zip(depth, point, strict=True):
+            assert (np.linalg.norm(mine - p, axis=-1) + np.abs(gap - d)).min() < 1e-4, (trial, d, p)
+        np.testing.assert_allclose(ours, np.broadcast_to(normal[0], ours.shape), atol=1e-4)
+    assert len(counts) > 40 and {1, 2, 3, 4, 5} <= set(counts), counts
+
+
+def test_boxes_whose_edges_cross(boxes):
+    """As C MuJoCo has it, or by faces which overlap hardly more."""
+    rng, by_faces, by_edges = np.random.default_rng(1), 0, 0
+    for trial in range(1500):
+        turn = Rotation.from_rotvec(rng.normal(size=3) * [2.0, 0.5, 0.5])
+        place = [PALM[0] + rng.uniform(1.2, 1.6) * CUBE[0], *rng.uniform(-1, 1, 2) * [0.06, 0.07]]
+        (depth, point, normal), (gap, mine, ours), frames = boxes(place, turn, Rotation.identity())
+        assert bool(len(depth)) == bool(len(gap)), trial
+        if len(depth) != 1 or np.abs(np.einsum("k,bkj->bj", normal[0], frames)).max() > 1 - 1e-10:
+            continue
+        if np.abs(np.einsum("k,bkj->bj", ours[0], frames)).max() > 1 - 1e-5:
+            if depth[0] > -0.001:  # Nothing sinks in deeper here.
+                by_faces += 1
+                assert depth[0] + 1e-4 > gap.min() > depth[0] - 0.0005, (trial, depth, gap)
+                assert ours[gap.argmin()] @ normal[0] > 0.8
+        else:
+            by_edges += 1
+            np.testing.assert_allclose(gap, depth, atol=1e-5)
+            np.testing.assert_allclose(mine, point, atol=1e-4)
+            np.testing.assert_allclose(ours, normal, atol=1e-3)
+    assert by_edges > 50, (by_faces, by_edges)
 
 
 def problem(rng, contacts=6, dofs=10):

@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 from c_scene import CONVERGED, GRAVITY, row, rows_of, squeeze, stack
 
+import dexsim
 from dexsim.object_config import SHAPES, SLOTS, ObjectConfig
 from dexsim.physics import Physics, PhysicsConfig, PhysicsState
+from dexsim.tasks.rotate_config import RotateConfig
 
 pytest.importorskip("warp")
 pytestmark = [pytest.mark.slow]
@@ -88,3 +90,8 @@ def test_a_full_buffer_is_loud(hand, worlds, monkeypatch):
     broken = np.isnan(np.asarray(force)).all((1, 2))
     assert np.any(broken)
     assert np.all(np.isfinite(np.asarray(force)[~broken]))
+
+
+def test_the_palm_ends_where_the_hand_does():
+    """Boxes on boxes have another kernel."""
+    c_scene.check_the_palms_edge(dexsim.make("rotate", RotateConfig(pool_size=16), backend="warp", num_envs=8))
