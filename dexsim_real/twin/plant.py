@@ -43,8 +43,10 @@ def nominal_gravity(task: str) -> np.ndarray:
 def tilted_gravity(task: str, tilt: np.ndarray) -> np.ndarray:
     """Gravity [3] of a hand whose mount is off by angles [2] rad about two axes across the vertical."""
     down = nominal_gravity(task)
-    across = np.cross(down / GRAVITY, [0.0, 1.0, 0.0])
-    for axis, angle in (((0.0, 1.0, 0.0), tilt[0]), (across, tilt[1])):
+    way = down / GRAVITY
+    side = np.array([0.0, 1.0, 0.0]) - way[1] * way  # the palm's y, made level
+    side = side / np.linalg.norm(side)
+    for axis, angle in ((side, tilt[0]), (np.cross(way, side), tilt[1])):
         down = matrix(turn(axis, float(angle))) @ down
     return down
 
