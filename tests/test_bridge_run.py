@@ -460,7 +460,7 @@ def test_the_shipped_policy_fits_the_bridge(hand):
 
 def rotate_policy(hand, path):
     """A policy file of the rotation task with small random weights."""
-    config = RotateConfig(tilt=0.0)
+    config = RotateConfig(tilt=0.0, roll=0.0)
     fields = layout(hand, Rotate.fields["actor"], config.observation)
     size = sum(field.size for field in fields)
     rng = np.random.default_rng(0)
