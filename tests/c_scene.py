@@ -1,12 +1,11 @@
 """The grasp scene in C MuJoCo, written down a second time: what the physics seam is held against.
 
-Nothing of the scene comes from `dexsim.physics`. The object is compiled with its true sizes, places and
+Nothing here comes from `dexsim.physics`. The object is compiled with its true sizes, places and
 inertia (C MuJoCo ignores geom offsets that are set on a compiled model whose geoms lie at their
 body's origin), only its active primitives exist, and forces are summed from `mj_contactForce`.
 """
 
 import contextlib
-import dataclasses
 from collections.abc import Iterator
 
 import jax
@@ -17,7 +16,6 @@ import numpy as np
 from dexsim import rotations, tactile
 from dexsim.hand import forward_kinematics, taxel_positions
 from dexsim.object_config import SHAPES
-from dexsim.physics import PhysicsState
 
 GRAVITY = (9.81, 0.0, 0.0)
 # Solved to the end, so that what differs between engines is arithmetic and contact geometry.
@@ -207,30 +205,3 @@ def double_precision() -> Iterator[None]:
     with jax.enable_x64(True):
         yield
     jax.clear_caches()
-
-
-def check_the_palms_edge(env) -> None:
-    """A cube over the palm's edge stays as long as its weight's line meets the palm, and falls beyond.
-
-    `env` is the rotation task over 8 environments.
-    """
-    half, down = 0.0275, np.asarray(env.task.gravity)
-    palm = next(g for g in env.hand.geoms if g.name == "palm")
-    edge = palm.position[1] + palm.size[1]
-    past = np.array([-0.006, -0.004, -0.002, -0.001, 0.001, 0.002, 0.004, 0.006])  # m, of the line's foot
-    target = jax.tree.map(lambda x: jnp.repeat(jnp.asarray(x)[:1], 8, 0), env.pool.target)
-    target = dataclasses.replace(target, size=jnp.full_like(target.size, half), com=jnp.zeros((8, 3)),
-                                 bare_friction=jnp.full(8, 0.7))
-    qpos = np.zeros((8, 19), np.float32)
-    qpos[:, :12] = np.clip(0, env.hand.joint_lower, env.hand.joint_upper)  # thumb and fingers out of the way
-    qpos[:, 12:16] = palm.position[0] + palm.size[0] + half, 0, 0.085, 1
-    qpos[:, 13] = edge - half * down[1] / -down[0] + past
-    state = PhysicsState(jnp.asarray(qpos), jnp.zeros((8, 18)), jnp.zeros((8, 18)))
-    advance = jax.jit(jax.vmap(lambda target, state: env.physics.advance(
-        target, state, lambda index, position, velocity: jnp.zeros(12), jnp.zeros(3))[0]))
-    for _ in range(20):
-        state = advance(target, state)
-        state = dataclasses.replace(state, qpos=state.qpos.at[:, :12].set(qpos[:, :12]),
-                                    qvel=state.qvel.at[:, :12].set(0.0))
-    moved = np.linalg.norm(np.asarray(state.qpos[:, 12:15]) - qpos[:, 12:15], axis=-1)
-    assert np.all(moved[past < 0] < 1e-3) and np.all(moved[past > 0] > 0.1), moved
