@@ -262,10 +262,14 @@ class TestDrop:
             # The goal of tick 2 starts the clock anew; the sixth tick after it is one too many.
             assert lost == [False] * 8 + [gives_up]
 
-    def test_beyond_7_cm(self, task, begun):
-        for distance, lost in ((0.069, False), (0.071, True)):
-            place = np.asarray(task.reference) + [0, 0, distance]
-            assert bool(task.dropped(begun, moment(task, object_position=place))) == lost
+    def test_too_far_away_training_on_a_leash(self, task, begun, hand):
+        _, waiting = task.evaluation_plan(1, np.zeros(4, int))
+        free = Rotate(RotateConfig(leash=1.0), hand)
+        for rules, goal, limit in ((task, begun, 0.055), (task, jax.tree.map(lambda x: x[0], waiting), 0.07),
+                                   (free, free.begin(jax.random.key(0), None), 0.07)):
+            for distance, lost in ((limit - 0.001, False), (limit + 0.001, True)):
+                place = np.asarray(task.reference) + [0, 0, distance]
+                assert bool(rules.dropped(goal, moment(task, object_position=place))) == lost
 
     def test_lowest_corner_of_a_tilted_cube(self, task):
         target = rotate_start.sample_target(jax.random.key(3), task.config)

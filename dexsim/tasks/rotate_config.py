@@ -98,9 +98,9 @@ class RotateConfig(EnvConfig):
     roll: float = setting(-0.2, unit="rad", low=-1.2, high=1.2)
     """The hand's nominal roll: positive lets the object slide toward the thumb, beside which it falls over the palm's
     edge most easily."""
-    reference: tuple[float, float, float] = setting((0.047, 0.010, 0.087), unit="m", low=-0.5,
+    reference: tuple[float, float, float] = setting((0.047, 0.024, 0.088), unit="m", low=-0.5,
                                                     high=0.5)
-    """Where the object belongs: where thumb and fingers meet, in front of the palm's middle."""
+    """Where the object belongs: where thumb and fingers meet, and where the gaits that keep it carry it."""
     drop_distance: float = setting(0.07, unit="m", low=0.01, high=1.0)
     """The object is lost when its centre is farther than this from the reference ..."""
     drop_tilt: float = setting(1.0, unit="rad", low=0.1, high=3.2)
@@ -109,6 +109,9 @@ class RotateConfig(EnvConfig):
     patience: float = setting(4.0, unit="s", low=0.1, high=1e6)
     """A training episode without a new goal for this long is given up, as a drop is: else policies
     learn to turn once and then hold still. Evaluations wait for ever."""
+    leash: float = setting(0.055, unit="m", low=0.01, high=1.0)
+    """A training episode whose object is farther than this from the reference is given up likewise: else some policies
+    learn gaits that roam over the palm, and lose it over the edge. Evaluations end with `drop_distance`."""
     clearance: float = setting(0.001, unit="m", low=0.0, high=0.05)
     """Smallest gap between palm and object with support "fingers"."""
     episode_seconds: float = setting(20.0, unit="s", low=0.2, high=3600.0)
@@ -131,7 +134,7 @@ class RotateConfig(EnvConfig):
     """How far the joint targets of thumb and fingers lie beyond that posture: the grip."""
     heading_noise: float = setting(0.7, unit="rad", low=0.0, high=math.pi)
     """Largest turn of the object about the axis at the start."""
-    start_offset: tuple[float, float] = setting((-0.004, 0.0), unit="m", low=-0.1, high=0.1)
+    start_offset: tuple[float, float] = setting((-0.018, -0.001), unit="m", low=-0.1, high=0.1)
     """Where the object is put at the start, across and along the palm (y, z) from the reference: a little away
     from thumb and fingertips, beside which the first stroke often fails ..."""
     place_noise: float = setting(0.010, unit="m", low=0.0, high=0.05)
@@ -161,9 +164,10 @@ class RotateConfig(EnvConfig):
 def paper() -> RotateConfig:
     """The paper's own weights and success test."""
     return RotateConfig(
-        goal_spin=0.0, drop_distance=0.09, drop_tilt=math.pi, patience=1e6, control=Control(step=0.3, recall="target"),
-        episode_seconds=60.0, reward=RotateReward(goal=1.0, action=-0.0002, velocity=0.0, torque=0.0, spin=0.0,
-                                                  bonus_tips=0.0, bonus_speed=1e6, drop=0.0))
+        goal_spin=0.0, drop_distance=0.09, drop_tilt=math.pi, patience=1e6, leash=1.0,
+        control=Control(step=0.3, recall="target"), episode_seconds=60.0,
+        reward=RotateReward(goal=1.0, action=-0.0002, velocity=0.0, torque=0.0, spin=0.0, bonus_tips=0.0,
+                            bonus_speed=1e6, drop=0.0))
 
 
 def without_orientation() -> RotateConfig:
@@ -176,6 +180,6 @@ def clear_of_palm() -> RotateConfig:
     upright there."""
     return RotateConfig(
         reward=RotateReward(goal=1.0, torque=-0.1, bonus_tips=0.0, gate=0.04), support="fingers", tilt=-1.1, roll=0.0,
-        axis=(0.6, 0.0, -0.8), reference=(0.072, 0.005, 0.098), squeeze=(0.0, 0.2),
+        leash=1.0, axis=(0.6, 0.0, -0.8), reference=(0.072, 0.005, 0.098), squeeze=(0.0, 0.2),
         posture=(1.2, 0.3, 0.3, 0.0, 0.8, 0.6, 0.8, 0.6, 0.8, 0.6, 0.8, 0.6), posture_noise=0.2,
         start_offset=(0.0, 0.0), place_noise=0.006, curl=(-0.1, 0.1))

@@ -22,7 +22,7 @@ POSTURES = {
     "grasp": (1.45, 0.15, 0.25, 0.0, 1.1, 0.8, 1.1, 0.8, 1.1, 0.8, 1.1, 0.8),
     "rotate": (1.0, 0.2, 0.3, 0.0, 0.8, 0.5, 0.8, 0.5, 0.8, 0.5, 0.8, 0.5)}
 """Joint angles rad at which a run begins."""
-REFERENCES = {"grasp": (0.055, -0.005, 0.090), "rotate": (0.047, 0.010, 0.087)}
+REFERENCES = {"grasp": (0.055, -0.005, 0.090), "rotate": (0.047, 0.024, 0.088)}
 """Where the object belongs, m."""
 PLACES = {"grasp": REFERENCES["grasp"][1:], "rotate": (0.007, 0.079)}
 """Where along the palm (y, z) it is put, m: in the middle of training's start states. 5 mm nearer to the wrist is where
