@@ -80,19 +80,22 @@ def _shown(report: dict[str, Any], show: bool) -> dict[str, Any]:
 # --- metrics -------------------------------------------------------------------------------------
 
 def grasp_metrics(reports: list[dict[str, Any]]) -> dict[str, Any]:
-    """Held, and how the forces of held objects follow the command."""
+    """Held, and how the forces of held objects follow the command: with friction, and pressing alone, as the paper's
+    hand and this one measure it."""
     from dexsim.statistics import mean, proportion
     from dexsim.tasks.grasp_report import pearson
 
     held = np.array([r["held"] for r in reports])
-    command, force, total = (np.array([r[name] for r in reports], float)[held]
-                             for name in ("command", "finger_force", "total_force"))
+    command, force, pressing, total = (np.array([r[name] for r in reports], float)[held]
+                                       for name in ("command", "finger_force", "finger_pressing", "total_force"))
     by_command = [{"command": c, "held": proportion(held[[r["command"] == c for r in reports]]),
-                   "finger_force": mean(force[command == c]), "total_force": mean(total[command == c])}
+                   "finger_force": mean(force[command == c]),
+                   "finger_pressing": mean(pressing[command == c]), "total_force": mean(total[command == c])}
                   for c in sorted({r["command"] for r in reports})]
     by_shape = [{"shape": s, "held": proportion(held[[r["shape"] == s for r in reports]])}
                 for s in sorted({r["shape"] for r in reports})]
-    return {"held": proportion(held), "pearson_r": pearson(command, force), "pearson_r_total": pearson(command, total),
+    return {"held": proportion(held), "pearson_r": pearson(command, force),
+            "pearson_r_pressing": pearson(command, pressing), "pearson_r_total": pearson(command, total),
             "by_command": by_command, "by_shape": by_shape}
 
 
@@ -122,7 +125,8 @@ def simulated(task: str, policy: str) -> dict[str, Any]:
     except (OSError, KeyError, ValueError, DexsimError):
         return {}
     if task == "grasp":
-        return {name: report[name] for name in ("held", "pearson_r", "pearson_r_total", "by_command") if name in report}
+        names = "held", "pearson_r", "pearson_r_pressing", "pearson_r_total", "by_command"
+        return {name: report[name] for name in names if name in report}
     counts = {name: report[name]["mean"] | {"median": report[name]["median"]["median"]}
               for name in ("successes", "paper_successes")}
     return counts | {name: report[name] for name in ("seconds_per_success", "seconds_to_fall", "kept_to_the_end")}

@@ -137,7 +137,7 @@ class TestReward:
         velocity, action, before = np.zeros(12), np.zeros(12), np.zeros(12)
         velocity[2], action[5], before[5] = 2.0, 0.5, -0.5
         felt = np.zeros((5, 120))
-        felt[1, :4] = 1.25
+        felt[1, :4], felt[0, :2] = 1.0, 0.5
         moment = make_moment(
             hand, finger_force=force, joint_torque=torque, joint_position=position,
             joint_velocity=velocity, action=action, last_action=before,
@@ -159,7 +159,7 @@ class TestReward:
             assert float(metrics[f"reward/{name}"]) == pytest.approx(value, rel=1e-4, abs=1e-6), name
         assert {n for n in metrics if n.startswith("reward/")} == {f"reward/{n}" for n in wanted}
         assert float(reward) == pytest.approx(sum(wanted.values()), rel=1e-4)
-        known = {"success": 1.0, "command": 0.5, "finger_force": 5.0, "force_error": 1.0,
+        known = {"success": 1.0, "command": 0.5, "finger_force": 5.0, "finger_pressing": 4.0, "force_error": 1.0,
                  "total_force": 7.005, "taxel_force": 5.0, "skin_force": 2.5, "thumb_force": 2.0,
                  "touching": 2.0, "joint_speed": 2.0 / 12, "action_rate": 1.0 / 12,
                  "force/0": 2.0, "force/1": 5.0, "force/2": 0.0, "force/3": 0.005, "force/4": 0.0}

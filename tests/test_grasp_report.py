@@ -29,7 +29,7 @@ def evaluation(ticks=60, repeats=8, noise=0.0, slope=4.0, lost=(), settle_force=
     alive = np.ones((ticks, count), bool)
     alive[20:, list(lost)] = False
     flat = np.ones((ticks, count))
-    metrics = {"command": flat * command, "shape": flat * shape, "finger_force": force,
+    metrics = {"command": flat * command, "shape": flat * shape, "finger_force": force, "finger_pressing": force**2,
                "total_force": 3 * force, "taxel_force": 2 * force, "thumb_force": flat * 0.5,
                "touching": flat * 3, "reward": flat * 0.25, "return": flat * 7.0,
                "joint_speed": flat * 0.1, "non_finite": flat * 0}
@@ -154,6 +154,8 @@ class TestSummary:
         assert found["headline"]["Pearson r (worst shape)"] == by_name[SHAPES[3]]
         wrong = stats.pearsonr(metrics["command"][0], metrics["finger_force"][-1]).statistic
         assert found["pearson_r"]["r"] == pytest.approx(wrong)
+        pressing = stats.pearsonr(metrics["command"][0], metrics["finger_pressing"][-1]).statistic
+        assert found["pearson_r_pressing"]["r"] == pytest.approx(pressing)
 
     def test_a_dip_is_not_monotone(self):
         metrics, alive = evaluation()

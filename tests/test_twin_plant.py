@@ -325,6 +325,8 @@ def test_an_object_on_the_fingertips_weighs_what_it_weighs(hand):
     shown = plant.measure().taxel_force
     weight = float(plant.draw.mass) * GRAVITY
     assert shown[..., 2].sum() == pytest.approx(weight, rel=0.05)
+    plant._contacts()
+    assert plant._pressing == pytest.approx(shown[..., 2].sum(-1), rel=0.02, abs=0.01 * weight)
     assert np.count_nonzero(shown[..., 2].sum(-1) > 0.05 * weight) >= 2
     assert shown[0].sum() == 0 and shown[..., 2].min() >= 0
 
@@ -536,7 +538,8 @@ def watched(task, positions, *, seconds=None, tips=0.0, quat=(1.0, 0, 0, 0)):
     force = np.zeros((5, 3))
     for k, position in enumerate(positions):
         force[:, 0] = tips(k) if callable(tips) else tips
-        judge.watch(0.01, np.asarray(position, float), np.asarray(quat, float), np.zeros(3), force, np.full(12, 0.5))
+        judge.watch(0.01, np.asarray(position, float), np.asarray(quat, float), np.zeros(3), force, np.zeros(5),
+                    np.full(12, 0.5))
     return judge
 
 
@@ -559,10 +562,11 @@ def test_forces_of_a_grasp_are_means_from_three_seconds_on():
     for k in range(801):
         force = np.zeros((5, 3))
         force[:, 1] = (9.0, 1.0, 2.0, 0.0, 3.0) if k >= 300 else 50.0
-        judge.watch(0.01, place, np.array([1.0, 0, 0, 0]), np.zeros(3), force, np.zeros(12))
+        judge.watch(0.01, place, np.array([1.0, 0, 0, 0]), np.zeros(3), force, 0.8 * force[:, 1], np.zeros(12))
     report = judge.report()
     assert report["held"] and report["force"] == pytest.approx([9.0, 1.0, 2.0, 0.0, 3.0])
     assert report["finger_force"] == pytest.approx(2.0) and report["total_force"] == pytest.approx(15.0)
+    assert report["finger_pressing"] == pytest.approx(1.6)
     lost = watched("grasp", [place + (0.121, 0, 0)]).report()
     assert not lost["held"] and lost["end"].startswith("dropped")
 

@@ -174,10 +174,13 @@ def test_metrics_of_rotations(benchmark):
 
 
 def test_metrics_of_grasps_count_only_what_was_held(benchmark):
-    reports = [{"held": held, "command": c, "finger_force": 2 + 5 * c, "total_force": 9 + c, "shape": shape}
+    reports = [{"held": held, "command": c, "finger_force": 2 + 5 * c, "finger_pressing": (1 + c) ** 2,
+                "total_force": 9 + c, "shape": shape}
                for c in (0.0, 0.5, 1.0) for shape, held in (("box", True), ("sphere", c < 1))]
     metrics = benchmark.grasp_metrics(reports)
     assert metrics["held"]["mean"] == pytest.approx(5 / 6)
     assert metrics["pearson_r"]["r"] == pytest.approx(1.0)
+    command = np.array([0.0, 0.0, 0.5, 0.5, 1.0])
+    assert metrics["pearson_r_pressing"]["r"] == pytest.approx(np.corrcoef(command, (1 + command) ** 2)[0, 1])
     assert [row["held"]["mean"] for row in metrics["by_command"]] == [1.0, 1.0, 0.5]
     assert "command 0.5: finger force (N)" in benchmark.table(metrics, benchmark.simulated("grasp", "grasp"))

@@ -255,15 +255,17 @@ class Grasp:
         # The command speaks to the four fingers; the thumb balances them.
         inner = jnp.sum(contact[1:])
         mean_force = jnp.sum(jnp.where(contact[1:], force[1:], 0.0)) / jnp.maximum(inner, 1)
-        sensed = jnp.sum(moment.touch.force)
+        pressing = jnp.sum(moment.touch.force, -1)
+        mean_pressing = jnp.sum(jnp.where(contact[1:], pressing[1:], 0.0)) / jnp.maximum(inner, 1)
         return reward, {
             **{f"reward/{name}": value for name, value in terms.items()},
             "success": held,
             "command": goal.command,
             "force_error": jnp.abs(mean_force - wanted),
             "finger_force": mean_force,
+            "finger_pressing": mean_pressing,
             "total_force": jnp.sum(force),
-            "taxel_force": sensed,
+            "taxel_force": jnp.sum(pressing),
             "skin_force": jnp.sum(moment.touch.skin_force),
             "thumb_force": force[0],
             "touching": jnp.sum(contact).astype(jnp.float32),

@@ -21,15 +21,17 @@ def summarize(metrics: dict[str, np.ndarray], alive: np.ndarray, control_period:
     Returns:
       A JSON-able dict. Forces are averaged over the ticks from 3 s after release (from the
       middle of shorter episodes), for episodes held to the end. "finger_force" is the solver's
-      force per touching finger among those commanded (all but the thumb), "total_force" the
-      sum over all fingers, "taxel_force" that sum as the taxels feel it. Intervals are 95 %:
-      Wilson's for proportions, else bootstrap over episodes.
+      force per touching finger among those commanded (all but the thumb), friction included, "total_force" the
+      sum over all fingers, "taxel_force" that sum as the taxels feel it. "pearson_r" goes by "finger_force",
+      "pearson_r_pressing" by what the taxels feel of it: the normal forces, which the paper's hand measures.
+      Intervals are 95 %: Wilson's for proportions, else bootstrap over episodes.
     """
     ticks, episodes = alive.shape
     held = alive[-1]
     late = slice(min(round(_SETTLE / control_period), ticks // 2), None)
     command, shape = metrics["command"][0], metrics["shape"][0].astype(int)
     force = metrics["finger_force"][late].mean(0)
+    pressing = metrics["finger_pressing"][late].mean(0)
     total = metrics["total_force"][late].mean(0)
     sensed = metrics["taxel_force"][late].mean(0)
     thumb = metrics["thumb_force"][late].mean(0)
@@ -55,6 +57,7 @@ def summarize(metrics: dict[str, np.ndarray], alive: np.ndarray, control_period:
         by_shape.append({
             "shape": KINDS[index], "episodes": int(mine.sum()), "held": proportion(held[mine]),
             "pearson_r": pearson(command[good], force[good]),
+            "pearson_r_pressing": pearson(command[good], pressing[good]),
             "pearson_r_total": pearson(command[good], total[good]),
             "pearson_r_taxels": pearson(command[good], sensed[good]),
             "rmse_n": rmse(force[good], wanted[good])})
@@ -68,6 +71,7 @@ def summarize(metrics: dict[str, np.ndarray], alive: np.ndarray, control_period:
         "episodes": episodes, "seconds": ticks * control_period,
         "held": proportion(held), "hold_time_s": mean(alive.sum(0) * control_period),
         "return": mean(returns), "pearson_r": pearson(command[held], force[held]),
+        "pearson_r_pressing": pearson(command[held], pressing[held]),
         "pearson_r_total": pearson(command[held], total[held]),
         "rmse_n": rmse(force[held], wanted[held]),
         "force_range": ratio, "total_force_monotone": monotone,

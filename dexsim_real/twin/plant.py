@@ -191,7 +191,7 @@ class EmulatedHand:
         self._push_until, self._push_at = None, np.inf
         self._pin(self._assistant.shelf(place), place)
         mujoco.mj_forward(scene.model, self._data)
-        self._tips, self._touches = np.zeros((5, 3)), []
+        self._tips, self._pressing, self._touches = np.zeros((5, 3)), np.zeros(5), []
         self._past: collections.deque[_Past] = collections.deque(maxlen=round(_MEMORY / PERIOD))
         self._samples: collections.deque = collections.deque(maxlen=round(_MEMORY / float(self.draw.taxel_period)) + 2)
         self._next_sample = self.time
@@ -245,7 +245,7 @@ class EmulatedHand:
             quat = data.qpos[at + 3:at + 7]
             spin = matrix(quat) @ data.qvel[dof + 3:dof + 6]
             self._referee.watch(_LOOK * PERIOD, data.qpos[at:at + 3].copy(), quat.copy(), spin, self._tips,
-                                data.qvel[scene.drive_dof])
+                                self._pressing, data.qvel[scene.drive_dof])
             self._hottest = max(self._hottest, float(self._drives.case.max()))
             if not np.isfinite(data.qpos).all() or data.warning.number.any():
                 self._referee.end = "dropped: the physics failed"
@@ -290,7 +290,7 @@ class EmulatedHand:
     def _contacts(self) -> None:
         """Forces of the object on the fingertips as they are now."""
         scene, data = self._scene, self._data
-        self._tips, self._touches = np.zeros((5, 3)), []
+        self._tips, self._pressing, self._touches = np.zeros((5, 3)), np.zeros(5), []
         wrench = np.zeros(6)
         for i in range(data.ncon):
             first, second = data.contact.geom[i]
@@ -303,6 +303,7 @@ class EmulatedHand:
             sign = 1.0 if scene.is_object[first] else -1.0
             normal, tangent = sign * wrench[0] * frame[0], sign * wrench[1:3] @ frame[1:]
             self._tips[finger] += normal + tangent
+            self._pressing[finger] += abs(wrench[0])
             self._touches.append((int(finger), data.contact.pos[i].copy(), normal, tangent))
 
     def _sample_skin(self) -> None:

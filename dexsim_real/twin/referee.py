@@ -39,7 +39,7 @@ class Referee:
         self._reference = np.array(REFERENCES[task])
         self._touched = -math.inf
         self._counted, self._weight = 0, 0.0
-        self._force, self._finger, self._total = np.zeros(5), 0.0, 0.0
+        self._force, self._finger, self._pressing, self._total = np.zeros(5), 0.0, 0.0, 0.0
         self._duty, self._speed = np.zeros(5), 0.0
         self.goals = None if task == "grasp" else {"task": GoalCount(GOAL_SPIN), "paper": GoalCount(math.inf)}
 
@@ -49,13 +49,14 @@ class Referee:
         return bool(self.end)
 
     def watch(self, step: float, position: np.ndarray, quat: np.ndarray, spin: np.ndarray, tips: np.ndarray,
-              joint_speed: np.ndarray) -> None:
+              pressing: np.ndarray, joint_speed: np.ndarray) -> None:
         """One more look.
 
         Args:
           step: s since the last one.
           position, quat, spin: of the object in the palm frame; m, -, rad/s.
           tips: [5, 3] N, the solver's force on each fingertip.
+          pressing: [5] N, the sum of its contacts' normal forces, which is what taxels can feel of it.
           joint_speed: [12] rad/s.
         """
         if self.over:
@@ -77,15 +78,17 @@ class Referee:
             for count in self.goals.values():
                 count.watch(self.time, quat, away, float(spin @ _AXIS))
         elif self.time > min(_SETTLE, self.limit / 2):
-            self._grip(strength)
+            self._grip(strength, pressing)
         if self.time >= self.limit - 1e-9:
             self.end = "time limit"
 
-    def _grip(self, strength: np.ndarray) -> None:
+    def _grip(self, strength: np.ndarray, pressing: np.ndarray) -> None:
         """The command speaks to the four fingers; the thumb balances them."""
-        inner = strength[1:][strength[1:] > _GRIP]
+        touching = strength[1:] > _GRIP
+        inner = strength[1:][touching]
         self._force += strength
         self._finger += float(inner.mean()) if inner.size else 0.0
+        self._pressing += float(pressing[1:][touching].mean()) if inner.size else 0.0
         self._total += float(strength.sum())
         self._counted += 1
 
@@ -98,7 +101,8 @@ class Referee:
         if self.goals is None:
             return report | {
                 "held": self.end == "time limit", "force": np.round(self._force / count, 4).tolist(),
-                "finger_force": round(self._finger / count, 4), "total_force": round(self._total / count, 4)}
+                "finger_force": round(self._finger / count, 4), "finger_pressing": round(self._pressing / count, 4),
+                "total_force": round(self._total / count, 4)}
         task, paper = self.goals["task"], self.goals["paper"]
         return report | {
             "successes": task.count, "paper_successes": paper.count, "success_times": task.times,
