@@ -4,6 +4,7 @@ The policy runs elsewhere and slower. If it dies, this thread goes on and `Safet
 thread ends, for whatever reason, its last act is to turn the motors off.
 """
 
+import math
 import os
 import threading
 import time
@@ -58,6 +59,9 @@ class Timing:
                 "p99_ms": 1e3 * self.percentile(99), "max_ms": 1e3 * self.worst}
 
 
+GRACE = 0.001  # s, how late a cycle may begin rather than be left out
+
+
 class Pace:
     """Absolute deadlines `start + k / rate`: what one cycle takes does not shift the next."""
 
@@ -68,9 +72,10 @@ class Pace:
         self.next = clock() + self.period
 
     def wait(self) -> None:
-        """Sleep until the next deadline; those that passed meanwhile are missed and left out."""
+        """Sleep until the next deadline. One that has just passed is kept, late; earlier ones are missed and left out."""
         now = self._clock()
-        behind = int((now - self.next) / self.period) + 1 if now > self.next else 0
+        # An exchange fills most of its period: left out for a hair's breadth, the next would cost a whole one.
+        behind = math.ceil((now - self.next - GRACE) / self.period) if now > self.next + GRACE else 0
         self.jitter.missed += behind
         self.next += behind * self.period
         self._sleep(max(self.next - now, 0.0))

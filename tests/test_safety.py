@@ -11,7 +11,7 @@ from dexsim.errors import ConfigError
 from dexsim_real.frames import Mode
 from dexsim_real.safety import Reaction, Safety, SafetyConfig, Sample
 from dexsim_real.sensing import HandSensing, HardwareConfig, Measured
-from dexsim_real.servo import Servo, keep_phase
+from dexsim_real.servo import GRACE, Pace, Servo, keep_phase
 
 CYCLE = 0.012
 FREE = np.array([1, 1, 1, 0] + [1] * 8, np.float32)  # All but the joint whose range is small.
@@ -266,6 +266,30 @@ def test_exchanges_keep_their_phase_with_the_policy(rate, policy, expected):
     if kept != rate:  # At the policy's deadlines an exchange is in one of at most two phases.
         phases = np.arange(40) / policy * kept % 1
         assert len({round(float(phase), 3) % 1 for phase in phases}) <= 2
+
+
+@given(st.lists(st.one_of(st.floats(0.0, 0.05), st.floats(0.0119, 0.0132)), min_size=1, max_size=60))
+def test_a_cycle_begins_at_a_deadline_or_a_little_after_and_skips_what_is_past(durations):
+    clock = [0.0]
+
+    def sleep(seconds):
+        clock[0] += seconds
+
+    pace, last, missed = Pace(250 / 3, lambda: clock[0], sleep), 0, 0
+    for duration in durations:
+        clock[0] += duration
+        ready = clock[0]
+        # The first deadline after the last one that is still to come, or has passed by the grace at most.
+        index = last + 1
+        while ready > index * CYCLE + GRACE:
+            index += 1
+        if abs(ready - index * CYCLE - GRACE) < 1e-9 or abs(ready - (index - 1) * CYCLE - GRACE) < 1e-9:
+            return  # On the brink: rounding decides.
+        pace.wait()
+        assert clock[0] == pytest.approx(max(ready, index * CYCLE), abs=1e-9)
+        missed, last = missed + index - last - 1, index
+        assert pace.jitter.missed == missed and pace.jitter.worst <= GRACE + 1e-9
+    assert pace.jitter.count == len(durations)
 
 
 def test_the_policy_begins_while_the_line_is_busy(hand):
