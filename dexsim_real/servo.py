@@ -72,7 +72,7 @@ class Pace:
         self.next = clock() + self.period
 
     def wait(self) -> None:
-        """Sleep until the next deadline. One that has just passed is kept, late; earlier ones are missed and left out."""
+        """Sleep until the next deadline. One that has just passed is kept, late; earlier ones are missed."""
         now = self._clock()
         # An exchange fills most of its period: left out for a hair's breadth, the next would cost a whole one.
         behind = math.ceil((now - self.next - GRACE) / self.period) if now > self.next + GRACE else 0
