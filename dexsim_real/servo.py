@@ -75,7 +75,7 @@ class Pace:
         """Sleep until the next deadline. One that has just passed is kept, late; earlier ones are missed."""
         now = self._clock()
         # An exchange fills most of its period: left out for a hair's breadth, the next would cost a whole one.
-        behind = math.ceil((now - self.next - GRACE) / self.period) if now > self.next + GRACE else 0
+        behind = max(math.ceil((now - self.next - GRACE) / self.period), 0)
         self.jitter.missed += behind
         self.next += behind * self.period
         self._sleep(max(self.next - now, 0.0))

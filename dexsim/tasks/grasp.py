@@ -21,7 +21,7 @@ from dexsim.objects import ObjectParams, plain_inertia, sample_object
 from dexsim.pytree import pytree_dataclass
 from dexsim.tasks.grasp_report import summarize
 from dexsim.tasks.grasp_start import make_pool
-from dexsim.tasks.terms import action_rate, joint_speed, random_push
+from dexsim.tasks.terms import action_rate, joint_speed, mean_where, random_push
 
 COMMANDS = (0.0, 0.25, 0.5, 0.75, 1.0)
 """The commands of an evaluation."""
@@ -253,17 +253,15 @@ class Grasp:
         }
         reward = sum(terms.values())
         # The command speaks to the four fingers; the thumb balances them.
-        inner = jnp.sum(contact[1:])
-        mean_force = jnp.sum(jnp.where(contact[1:], force[1:], 0.0)) / jnp.maximum(inner, 1)
+        mean_force = mean_where(contact[1:], force[1:])
         pressing = jnp.sum(moment.touch.force, -1)
-        mean_pressing = jnp.sum(jnp.where(contact[1:], pressing[1:], 0.0)) / jnp.maximum(inner, 1)
         return reward, {
             **{f"reward/{name}": value for name, value in terms.items()},
             "success": held,
             "command": goal.command,
             "force_error": jnp.abs(mean_force - wanted),
             "finger_force": mean_force,
-            "finger_pressing": mean_pressing,
+            "finger_pressing": mean_where(contact[1:], pressing[1:]),
             "total_force": jnp.sum(force),
             "taxel_force": jnp.sum(pressing),
             "skin_force": jnp.sum(moment.touch.skin_force),

@@ -48,8 +48,7 @@ class Goal:
     dwell: jax.Array  # [] s inside the window
     clock: jax.Array  # [] s
     last_success: jax.Array  # [] s, clock at the last goal
-    patience: jax.Array  # [] s without a goal after which the episode is given up
-    leash: jax.Array  # [] m from the reference beyond which it is given up
+    gives_up: jax.Array  # [] bool, whether `patience` and `leash` end the episode
     duty: jax.Array  # [F] share of time touching, lately
     pace: jax.Array  # [] rad/s, mean joint speed, lately
     since_touch: jax.Array  # [] s since any fingertip touched
@@ -135,8 +134,8 @@ class Rotate:
         zero, none = jnp.zeros(()), jnp.zeros((), jnp.int32)
         fingers = jnp.zeros(self.hand.num_fingers)
         return Goal(turns=none, entered=jnp.zeros((), bool), entries=none, dwell=zero, clock=zero,
-                    last_success=zero, patience=jnp.asarray(self.config.patience), leash=jnp.asarray(self.config.leash),
-                    duty=fingers, pace=zero, since_touch=jnp.full((), 10.0),
+                    last_success=zero, gives_up=jnp.ones((), bool), duty=fingers, pace=zero,
+                    since_touch=jnp.full((), 10.0),
                     totals={"spin": zero, "joint_speed": zero, "action_rate": zero,
                             "tilt": zero, "touch": fingers})
 
@@ -168,7 +167,7 @@ class Rotate:
             turns=goal.turns + now.success, entered=now.entered & ~now.success,
             entries=goal.entries + (now.entered & ~goal.entered),
             dwell=jnp.where(now.success, 0.0, now.dwell), clock=clock,
-            last_success=jnp.where(now.success, clock, goal.last_success), patience=goal.patience, leash=goal.leash,
+            last_success=jnp.where(now.success, clock, goal.last_success), gives_up=goal.gives_up,
             duty=goal.duty + period / _MEMORY * (touching - goal.duty),
             pace=goal.pace + period / _MEMORY * (change["joint_speed"] - goal.pace),
             since_touch=jnp.where(jnp.any(touching > 0), 0.0, goal.since_touch + period),
@@ -190,12 +189,12 @@ class Rotate:
 
     def dropped(self, goal: Goal, moment: Moment) -> jax.Array:
         away = jnp.linalg.norm(moment.object_position - jnp.asarray(self.reference))
-        lost = away > jnp.minimum(self.config.drop_distance, goal.leash)
-        lost |= self._tilt(moment) > self.config.drop_tilt
+        lost = (away > self.config.drop_distance) | (self._tilt(moment) > self.config.drop_tilt)
         if self.config.support == "fingers":
             low = lowest_point(moment.target, moment.object_quat, moment.object_position)
             lost |= low < self._palm + self.config.clearance
-        return lost | (goal.clock - goal.last_success > goal.patience)
+        hopeless = (away > self.config.leash) | (goal.clock - goal.last_success > self.config.patience)
+        return lost | (goal.gives_up & hopeless)
 
     def reward(self, goal: Goal, moment: Moment,
                dropped: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
@@ -249,9 +248,8 @@ class Rotate:
     # --- evaluation ------------------------------------------------------------------------
 
     def evaluation_plan(self, count: int, shape_index: np.ndarray) -> tuple[np.ndarray, Goal]:
-        """Rows [count] of the pool, evenly spread over it; goals that wait for ever, and end with a drop only."""
-        never = jnp.asarray(jnp.inf)
-        goal = dataclasses.replace(self.begin(jax.random.key(0), None), patience=never, leash=never)
+        """Rows [count] of the pool, evenly spread over it; goals that end with a drop only."""
+        goal = dataclasses.replace(self.begin(jax.random.key(0), None), gives_up=jnp.zeros((), bool))
         goals = jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), goal)
         return np.linspace(0, len(shape_index) - 1, count).round().astype(int), goals
 

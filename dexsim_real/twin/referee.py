@@ -85,10 +85,10 @@ class Referee:
     def _grip(self, strength: np.ndarray, pressing: np.ndarray) -> None:
         """The command speaks to the four fingers; the thumb balances them."""
         touching = strength[1:] > _GRIP
-        inner = strength[1:][touching]
+        if touching.any():
+            self._finger += float(strength[1:][touching].mean())
+            self._pressing += float(pressing[1:][touching].mean())
         self._force += strength
-        self._finger += float(inner.mean()) if inner.size else 0.0
-        self._pressing += float(pressing[1:][touching].mean()) if inner.size else 0.0
         self._total += float(strength.sum())
         self._counted += 1
 
