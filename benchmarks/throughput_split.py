@@ -24,7 +24,7 @@ from dexsim_ppo.compilation import jit
 from dexsim_ppo.distribution import log_prob, sample
 from dexsim_ppo.ppo import PPOConfig, TrainState, make_train
 from dexsim_ppo.presets import find_preset
-from dexsim_ppo.rollout import Rollout
+from dexsim_ppo.rollout import Rollout, restart_done
 from dexsim_ppo.running_stats import update_stats
 
 
@@ -91,7 +91,7 @@ def record(env: Recorder, config: PPOConfig, state: TrainState) -> tuple[Any, ja
         action = sample(key, mean, state.params.log_std)
         after, given = jax.vmap(env.recorded_step)(env_state, action)
         outcome = after.physics.qpos, after.finger_force
-        return jax.vmap(env.restart)(after, after.terminated | after.truncated), (*given, *outcome, action)
+        return restart_done(env, after, after.terminated | after.truncated), (*given, *outcome, action)
 
     keys = jax.random.split(state.key, config.rollout_length)
     *ticks, actions = jax.lax.scan(tick, state.env_state, keys)[1]
@@ -103,7 +103,7 @@ def environment(env: Env, state: Any, actions: jax.Array) -> Any:
     def tick(state, action):
         after = jax.vmap(env.step)(state, action)
         used = _used((after.obs, after.reward, after.metrics))
-        return jax.vmap(env.restart)(after, after.terminated | after.truncated), used
+        return restart_done(env, after, after.terminated | after.truncated), used
     return jax.lax.scan(tick, state, actions)
 
 

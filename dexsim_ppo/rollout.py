@@ -53,7 +53,7 @@ def collect(env: Environment, state: Any, key: jax.Array, act: Act, value: Value
       steps, `episode/<name>` the mean of the last step's value over the episodes that ended (NaN if
       none did), `episodes` their number.
     """
-    step_env, restart = jax.vmap(env.step), jax.vmap(env.restart)
+    step_env = jax.vmap(env.step)
 
     def step(state, key):
         obs = dict(state.obs)
@@ -71,7 +71,7 @@ def collect(env: Environment, state: Any, key: jax.Array, act: Act, value: Value
                 "nonfinite_rewards": jnp.sum((~finite).astype(jnp.float32)),
                 "step": {k: _sum(v, jnp.ones_like(done)) for k, v in after.metrics.items()},
                 "episode": {k: _sum(v, done) for k, v in after.metrics.items()}}
-        return restart(after, done), (record, sums)
+        return restart_done(env, after, done), (record, sums)
 
     state, (rollout, sums) = jax.lax.scan(step, state, jax.random.split(key, length))
     sums = jax.tree.map(lambda x: jnp.sum(x, axis=0), sums)
@@ -82,6 +82,26 @@ def collect(env: Environment, state: Any, key: jax.Array, act: Act, value: Value
     metrics |= {f"step/{k}": v / steps for k, v in sums["step"].items()}
     metrics |= {f"episode/{k}": v / episodes for k, v in sums["episode"].items()}
     return state, rollout, metrics
+
+
+def restart_done(env: Environment, state: Any, done: jax.Array) -> Any:
+    """A new episode in the rows of `state` [B] that are `done` [B]; the others stay as they are.
+
+    What `jax.vmap(env.restart)` does, but that computes a new episode for every row and throws nearly all of
+    them away: few episodes end in any one step. Here the done rows are restarted a few at a time.
+    """
+    size = done.shape[0]
+    count = min(max(size // 32, 8), size)
+
+    def restart_some(carry):
+        state, left = carry
+        rows = jnp.nonzero(left, size=count, fill_value=size)[0]
+        some = jax.tree.map(lambda x: x.at[rows].get(mode="clip"), state)
+        fresh = jax.vmap(env.restart)(some, rows < size)
+        state = jax.tree.map(lambda x, new: x.at[rows].set(new, mode="drop"), state, fresh)
+        return state, left.at[rows].set(False, mode="drop")
+
+    return jax.lax.while_loop(lambda carry: jnp.any(carry[1]), restart_some, (state, done))[0]
 
 
 def _sum(x: jax.Array, mask: jax.Array) -> jax.Array:

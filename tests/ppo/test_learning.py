@@ -1,6 +1,7 @@
 """PPO end to end on the tiny environment."""
 
 import dataclasses
+import functools
 import time
 
 import jax
@@ -12,6 +13,7 @@ from tiny_env import CONFIG, SMALL, TinyEnv
 from dexsim_ppo import ppo
 from dexsim_ppo.distribution import log_prob as gaussian_log_prob
 from dexsim_ppo.ppo import Learner, make_train
+from dexsim_ppo.rollout import restart_done
 
 
 @pytest.mark.slow
@@ -150,3 +152,19 @@ def test_next_value_is_that_of_the_true_final_observation():
     np.testing.assert_allclose(rollout.next_value, expected, rtol=1e-4, atol=1e-5)
     assert float(metrics["episodes"]) == config.steps_per_iteration
     assert bool((jnp.abs(rollout.obs["critic"][1:, :, 0]) <= 1).all()), "restarted before the next step"
+
+
+@pytest.mark.parametrize("size", [1, 7, 300])
+@pytest.mark.parametrize("share", [0.0, 0.05, 1.0])
+def test_restarts_what_is_done_and_nothing_else(size, share):
+    """Each row as the environment restarts it alone, whether fewer or more are done than are taken at a time."""
+    env = TinyEnv()
+    states = jax.vmap(env.reset)(jax.random.split(jax.random.key(size), size))
+    done = np.random.default_rng(size).random(size) < share
+    begun = jax.jit(functools.partial(restart_done, env))(states, jnp.asarray(done))
+    alone = [env.restart(jax.tree.map(lambda x, i=i: x[i], states), jnp.bool_(True)) if done[i]
+             else jax.tree.map(lambda x, i=i: x[i], states) for i in range(size)]
+    expected = jax.tree.map(lambda *rows: jnp.stack(rows), *alone)
+    for got, want in zip(jax.tree.leaves(begun), jax.tree.leaves(expected), strict=True):
+        got, want = (jax.random.key_data(x) if x.dtype == jax.random.key(0).dtype else x for x in (got, want))
+        np.testing.assert_array_equal(got, want)
