@@ -97,7 +97,8 @@ def restart_done(env: Environment, state: Any, done: jax.Array) -> Any:
         state, left = carry
         rows = jnp.nonzero(left, size=count, fill_value=size)[0]
         some = jax.tree.map(lambda x: x.at[rows].get(mode="clip"), state)
-        fresh = jax.vmap(env.restart)(some, rows < size)
+        # All are told that they are done, those that fill up, too: what nobody reads need not be fetched.
+        fresh = jax.vmap(env.restart)(some, jnp.ones(count, bool))
         state = jax.tree.map(lambda x, new: x.at[rows].set(new, mode="drop"), state, fresh)
         return state, left.at[rows].set(False, mode="drop")
 
