@@ -34,7 +34,7 @@ def peer() -> None:
     """A hand that follows its targets; prints its port, and serves until its input closes."""
     from dexsim_real import frames
     from dexsim_real.frames import Command, Frame, Mode, Parser
-    from dexsim_real.servo import use_realtime
+    from dexsim_real.realtime import use_realtime
 
     use_realtime()  # It stands for hardware, which waits for no scheduler.
     master, slave = os.openpty()
@@ -167,8 +167,8 @@ def measure_compute(policy: str, ticks: int) -> dict:
     from dexsim_ppo.evaluate import load_policy
     from dexsim_real import frames
     from dexsim_real.control import IDENTITY, Controller
+    from dexsim_real.realtime import use_realtime
     from dexsim_real.sensing import HandSensing, HardwareConfig, ObjectEstimate
-    from dexsim_real.servo import use_realtime
 
     hand = load_hand()
     controller, sensing = Controller(load_policy(policy), hand), HandSensing(hand, HardwareConfig())

@@ -83,10 +83,11 @@ def own_timing(due: np.ndarray, met: np.ndarray, period: float, intervals: np.nd
     Args:
       due: [K] s, deadlines that the loop kept, in order.
       met: [K] s, when it went on after each.
-      intervals: [N, 2] s, when a core was away; a cycle that meets one is left out, and counted in `left_out`.
+      intervals: [N, 2] s, when a core was away; a cycle that meets one, or should have begun in one, is left out, and
+        counted in `left_out`.
       others: [K] how many of the deadlines missed before each are another's fault.
     """
-    held_up = overlaps(met[:-1], met[1:], intervals)
+    held_up = overlaps(np.minimum(due, met)[:-1], met[1:], intervals)
     late, missed = (met - due)[1:], np.rint(np.diff(due) / period).astype(int) - 1
     if others is not None:
         missed = missed - others[1:]

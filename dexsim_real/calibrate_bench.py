@@ -15,9 +15,9 @@ from dexsim_real.calibrate_loop import HandLoop, Operator
 from dexsim_real.calibrate_options import CalibrateArguments
 from dexsim_real.hand import HandPort, open_port
 from dexsim_real.log import Kind, LogWriter
+from dexsim_real.realtime import use_realtime
 from dexsim_real.safety import Safety
 from dexsim_real.sensing import HandSensing
-from dexsim_real.servo import use_realtime
 
 
 class Workbench:

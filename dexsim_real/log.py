@@ -24,6 +24,7 @@ import msgpack
 import numpy as np
 
 from dexsim.errors import DexsimError
+from dexsim_real.realtime import stand_back
 
 MAGIC = b"DXSLOG1\n"
 SYNC = b"\xd5\x0c\xa7\x1e"
@@ -100,6 +101,7 @@ class LogWriter:
             os.close(self._file)
 
     def _run(self) -> None:
+        stand_back()
         synced = time.monotonic()
         while True:
             last = self._stop.wait(_WAIT)

@@ -5,7 +5,6 @@ thread ends, for whatever reason, its last act is to turn the motors off.
 """
 
 import math
-import os
 import threading
 import time
 from collections.abc import Callable
@@ -14,21 +13,9 @@ import numpy as np
 
 from dexsim_real.frames import Mode
 from dexsim_real.hand import HandPort, Reply
+from dexsim_real.realtime import come_first
 from dexsim_real.safety import Safety, Sample
 from dexsim_real.sensing import HandSensing, VelocityFilter
-
-
-def use_realtime() -> bool:
-    """Give this thread, and those that it starts, precedence over ordinary programs.
-
-    All threads of the bridge should have it, since they share one interpreter lock. False where the
-    user may not (docs/hardware.md says how to allow it).
-    """
-    try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(20))
-    except (OSError, AttributeError):
-        return False
-    return True
 
 
 class Timing:
@@ -146,6 +133,7 @@ class Servo:
             self._rest()
 
     def _run(self) -> None:
+        come_first()
         try:
             self.pace.next = time.monotonic() + self.pace.period
             while not self._stop.is_set():

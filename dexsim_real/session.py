@@ -24,9 +24,10 @@ from dexsim_real.hand import open_port
 from dexsim_real.log import Kind, LogWriter
 from dexsim_real.objects import ObjectSensors
 from dexsim_real.options import RunArguments
+from dexsim_real.realtime import use_realtime
 from dexsim_real.safety import Safety
 from dexsim_real.sensing import HandSensing
-from dexsim_real.servo import Pace, Servo, Timing, keep_phase, use_realtime
+from dexsim_real.servo import Pace, Servo, Timing, keep_phase
 from dexsim_real.trouble import HandError
 from dexsim_real.view import View
 

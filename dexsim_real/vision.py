@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from dexsim.config import setting, validate
+from dexsim_real.realtime import stand_back
 from dexsim_real.trouble import HandError
 
 Masks = Callable[[], tuple[float, np.ndarray] | None]
@@ -133,6 +134,7 @@ class HeightSensor:
         self._thread.join(1.0)
 
     def _run(self) -> None:
+        stand_back()
         while not self._stop.is_set():
             picture = self._masks()
             if picture is None:

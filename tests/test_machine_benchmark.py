@@ -56,6 +56,8 @@ def test_a_loop_is_not_blamed_for_the_machine(machine):
     own = machine.own_timing(due, met, period, machine.merged([(0.03, 0.045)]))
     assert own["missed"] == 1 and own["count"] == 6 and own["max_ms"] == pytest.approx(0.4)
     assert own["left_out"] == pytest.approx(1 / 7, abs=1e-4)
+    late = met + np.array([0, 0, 62, 0, 0, 0, 0, 0]) * 1e-4  # woken late by the machine, which so cost what came after
+    assert machine.own_timing(due, late, period, machine.merged([(0.0202, 0.0261)]))["missed"] == 1
     hand = np.array([0, 0, 0, 1, 0, 0, 1, 0])  # one of the two and the other one: the hand was slow to answer
     assert machine.own_timing(due, met, period, machine.merged([]), hand)["missed"] == 1
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from dexsim.hand import Hand, load_hand
 from dexsim_ppo import cli
-from dexsim_real.servo import use_realtime
+from dexsim_real.realtime import use_realtime
 from dexsim_real.trouble import HandError
 from dexsim_real.twin.loop import Twin
 from dexsim_real.twin.options import TwinArguments

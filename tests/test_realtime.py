@@ -1,0 +1,69 @@
+"""Which of the bridge's threads the machine runs first."""
+
+import os
+import threading
+
+import pytest
+
+from dexsim import load_hand
+from dexsim_real import realtime
+from dexsim_real.log import LogWriter
+from dexsim_real.safety import Safety, SafetyConfig
+from dexsim_real.sensing import HandSensing, HardwareConfig
+from dexsim_real.servo import Servo
+
+
+class Silent:
+    """A port at which nothing answers until told to end."""
+
+    def __init__(self):
+        self.asked, self.end = threading.Event(), threading.Event()
+
+    def exchange(self, command):
+        del command
+        self.asked.set()
+        self.end.wait(5)
+
+    def close(self):
+        pass
+
+
+def in_thread(work):
+    """What `work` returns in a thread of its own, whose priority ends with it."""
+    result = []
+    thread = threading.Thread(target=lambda: result.append(work()))
+    thread.start()
+    thread.join()
+    return result[0]
+
+
+def priorities(folder):
+    """Of the thread that exchanges, of this one and of the log's."""
+    if not realtime.use_realtime():
+        return None
+    hand, port = load_hand(), Silent()
+    with LogWriter(folder / "run.log") as log:
+        servo = Servo(port, HandSensing(hand, HardwareConfig()), Safety(hand, SafetyConfig(), lambda text: None), 83.0)
+        servo.start()
+        assert port.asked.wait(5)
+        found = [os.sched_getparam(thread).sched_priority
+                 for thread in (servo._thread.native_id, 0, log._thread.native_id)]
+        port.end.set()
+        servo.stop()
+    return found
+
+
+def test_exchanges_come_first_and_the_log_last(tmp_path):
+    found = in_thread(lambda: priorities(tmp_path))
+    if found is None:
+        pytest.skip("real-time priority is not allowed here")
+    assert found[0] > found[1] > found[2] > 0
+
+
+def test_ordinary_threads_stay_ordinary():
+    def shifted():
+        realtime.come_first()
+        realtime.stand_back()
+        return os.sched_getscheduler(0)
+
+    assert in_thread(shifted) == os.SCHED_OTHER
