@@ -15,7 +15,7 @@ import time
 import numpy as np
 
 STEP = 0.0005  # s between two looks
-GAP = 0.001  # s, lateness of a look from which the core counts as away
+GAP = 0.0003  # s, lateness of a look from which the core counts as away; several together must not fill a cycle's slack
 PRIORITY = 90
 
 

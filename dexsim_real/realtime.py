@@ -29,7 +29,8 @@ def stand_back() -> None:
     """Put this thread behind the bridge's others, still before ordinary programs; without real-time
     priority it has no effect.
 
-    Threads of one priority do not interrupt each other: an exchange would wait for the kernel to end a write to the disk.
+    Threads of one priority do not interrupt each other: an exchange would wait for the kernel to end a
+    write to the disk.
     """
     _shift(-_STEP)
 
