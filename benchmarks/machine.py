@@ -87,7 +87,7 @@ def own_timing(due: np.ndarray, met: np.ndarray, period: float, intervals: np.nd
         counted in `left_out`.
       others: [K] how many of the deadlines missed before each are another's fault.
     """
-    held_up = overlaps(np.minimum(due, met)[:-1], met[1:], intervals)
+    held_up = overlaps(due[:-1], met[1:], intervals)
     late, missed = (met - due)[1:], np.rint(np.diff(due) / period).astype(int) - 1
     if others is not None:
         missed = missed - others[1:]
