@@ -36,7 +36,7 @@ from dexsim.env import Env
 from dexsim.tasks import TASKS
 from dexsim_ppo.cli import enable_caches
 from dexsim_ppo.compilation import collector_paused, jit
-from dexsim_ppo.rollout import restart_done
+from dexsim_ppo.rollout import scan_restarting
 
 
 class WithoutObservation(Env):
@@ -141,8 +141,8 @@ def runner(env: Env, num_envs: int, steps: int, step: Callable | None = None) ->
             action = jax.random.uniform(key, (num_envs, env.action_size), minval=-1.0)
             after, tape = jax.vmap(step)(carry, action, tape)
             touched = jnp.mean(jnp.any(after.finger_force > 0, -1))
-            return restart_done(env, after, after.terminated | after.truncated), (touched, tape)
-        state, (touched, tape) = jax.lax.scan(body, state, (jax.random.split(key, steps), tape))
+            return after, (touched, tape)
+        state, (touched, tape) = scan_restarting(env, body, state, (jax.random.split(key, steps), tape))
         return state, jnp.mean(touched), tape
 
     return jit(run)

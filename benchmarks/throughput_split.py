@@ -24,7 +24,7 @@ from dexsim_ppo.compilation import jit
 from dexsim_ppo.distribution import log_prob, sample
 from dexsim_ppo.ppo import PPOConfig, TrainState, make_train
 from dexsim_ppo.presets import find_preset
-from dexsim_ppo.rollout import Rollout, restart_done
+from dexsim_ppo.rollout import Rollout, scan_restarting
 from dexsim_ppo.running_stats import update_stats
 
 
@@ -91,10 +91,10 @@ def record(env: Recorder, config: PPOConfig, state: TrainState) -> tuple[Any, ja
         action = sample(key, mean, state.params.log_std)
         after, given = jax.vmap(env.recorded_step)(env_state, action)
         outcome = after.physics.qpos, after.finger_force
-        return restart_done(env, after, after.terminated | after.truncated), (*given, *outcome, action)
+        return after, (*given, *outcome, action)
 
     keys = jax.random.split(state.key, config.rollout_length)
-    *ticks, actions = jax.lax.scan(tick, state.env_state, keys)[1]
+    *ticks, actions = scan_restarting(env, tick, state.env_state, keys)[1]
     return tuple(ticks), actions
 
 
@@ -102,9 +102,8 @@ def environment(env: Env, state: Any, actions: jax.Array) -> Any:
     """Steps and restarts under recorded actions [T, B, A]."""
     def tick(state, action):
         after = jax.vmap(env.step)(state, action)
-        used = _used((after.obs, after.reward, after.metrics))
-        return restart_done(env, after, after.terminated | after.truncated), used
-    return jax.lax.scan(tick, state, actions)
+        return after, _used((after.obs, after.reward, after.metrics))
+    return scan_restarting(env, tick, state, actions)
 
 
 def physics(env: Env, ticks: Any) -> jax.Array:

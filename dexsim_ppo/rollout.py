@@ -1,13 +1,17 @@
 """Collects experience: `T` steps of `B` environments under one `lax.scan`, policy inside."""
 
+import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
+from dexsim.episode import choose
 from dexsim.pytree import pytree_dataclass
 from dexsim_ppo.types import Environment
+
+_RESERVE_STEPS = 16  # short beside an episode, long beside the cost of computing a batch of new ones
 
 
 @pytree_dataclass
@@ -59,53 +63,61 @@ def collect(env: Environment, state: Any, key: jax.Array, act: Act, value: Value
         obs = dict(state.obs)
         decision, action = act(key, obs)
         after = step_env(state, action)
-        done = after.terminated | after.truncated
-        finite = jnp.isfinite(after.reward)
         record = Rollout(
-            obs=obs, decision=decision, value=value(obs), next_value=value(after.obs),
-            reward=jnp.where(finite, after.reward, 0.0),
-            terminated=after.terminated, truncated=after.truncated & ~after.terminated,
-        )
-        sums = {"episodes": jnp.sum(done.astype(jnp.float32)),
-                "terminated": jnp.sum(after.terminated.astype(jnp.float32)),
-                "nonfinite_rewards": jnp.sum((~finite).astype(jnp.float32)),
-                "step": {k: _sum(v, jnp.ones_like(done)) for k, v in after.metrics.items()},
-                "episode": {k: _sum(v, done) for k, v in after.metrics.items()}}
-        return restart_done(env, after, done), (record, sums)
+            obs=obs, decision=decision, value=value(obs), next_value=value(after.obs), reward=after.reward,
+            terminated=after.terminated, truncated=after.truncated & ~after.terminated)
+        return after, (record, dict(after.metrics))
 
-    state, (rollout, sums) = jax.lax.scan(step, state, jax.random.split(key, length))
-    sums = jax.tree.map(lambda x: jnp.sum(x, axis=0), sums)
-    episodes, steps = sums["episodes"], rollout.reward.size
+    state, (rollout, told) = scan_restarting(env, step, state, jax.random.split(key, length))
+    # All sums are taken here: within the scan each would be a reduction of few numbers, which GPUs are slow at.
+    finite, done = jnp.isfinite(rollout.reward), rollout.terminated | rollout.truncated
+    rollout = dataclasses.replace(rollout, reward=jnp.where(finite, rollout.reward, 0.0))
+    episodes, steps = _sum(done, done), done.size
     metrics = {"reward": jnp.mean(rollout.reward), "episodes": episodes,
-               "terminated_share": sums["terminated"] / episodes,
-               "nonfinite_rewards": sums["nonfinite_rewards"]}
-    metrics |= {f"step/{k}": v / steps for k, v in sums["step"].items()}
-    metrics |= {f"episode/{k}": v / episodes for k, v in sums["episode"].items()}
+               "terminated_share": _sum(rollout.terminated, done) / episodes,
+               "nonfinite_rewards": _sum(~finite, ~finite)}
+    metrics |= {f"step/{k}": _sum(v, jnp.ones_like(done)) / steps for k, v in told.items()}
+    metrics |= {f"episode/{k}": _sum(v, done) / episodes for k, v in told.items()}
     return state, rollout, metrics
 
 
-def restart_done(env: Environment, state: Any, done: jax.Array) -> Any:
-    """A new episode in the rows of `state` [B] that are `done` [B]; the others stay as they are.
+def scan_restarting(env: Environment, step: Callable[[Any, Any], tuple[Any, Any]], state: Any,
+                    inputs: Any) -> tuple[Any, Any]:
+    """`jax.lax.scan`, with a new episode after each step wherever one ended.
 
-    What `jax.vmap(env.restart)` does, but that computes a new episode for every row and throws nearly all of
-    them away: few episodes end in any one step. Here the done rows are restarted a few at a time.
+    `jax.vmap(env.restart)` after each step would compute a new episode for every environment and throw nearly
+    all of them away. So one for each is kept in reserve, renewed every 16 steps at most: an environment whose
+    episode ends twice in that time begins both times alike. Restarting just the rows that ended, in a loop,
+    would have a GPU wait for the host at every step.
+
+    Args:
+      step: `(states [B], input) -> (states after it, output)`; it does not restart.
+      inputs: pytree [T, ...].
+
+    Returns:
+      The last states and the outputs [T, ...].
     """
-    size = done.shape[0]
-    count = min(max(size // 32, 8), size)
+    length = jax.tree.leaves(inputs)[0].shape[0]
+    block = max(n for n in range(1, _RESERVE_STEPS + 1) if length % n == 0)
+    restart = jax.jit(jax.vmap(env.restart))
 
-    def restart_some(carry):
-        state, left = carry
-        rows = jnp.nonzero(left, size=count, fill_value=size)[0]
-        some = jax.tree.map(lambda x: x.at[rows].get(mode="clip"), state)
-        # All are told that they are done, those that fill up, too: what nobody reads need not be fetched.
-        fresh = jax.vmap(env.restart)(some, jnp.ones(count, bool))
-        state = jax.tree.map(lambda x, new: x.at[rows].set(new, mode="drop"), state, fresh)
-        return state, left.at[rows].set(False, mode="drop")
+    def run_block(state, inputs):
+        everyone = jnp.ones(state.reward.shape[0], bool)
+        # The second call moves the random keys on that the first has used.
+        fresh, state = restart(state, everyone), restart(state, ~everyone)
 
-    return jax.lax.while_loop(lambda carry: jnp.any(carry[1]), restart_some, (state, done))[0]
+        def run_step(state, given):
+            after, output = step(state, given)
+            return jax.vmap(choose)(after.terminated | after.truncated, fresh, after), output
+
+        return jax.lax.scan(run_step, state, inputs)
+
+    blocks = jax.tree.map(lambda x: x.reshape(length // block, block, *x.shape[1:]), inputs)
+    state, outputs = jax.lax.scan(run_block, state, blocks)
+    return state, jax.tree.map(lambda x: x.reshape(length, *x.shape[2:]), outputs)
 
 
 def _sum(x: jax.Array, mask: jax.Array) -> jax.Array:
-    """Sum of the finite elements of `x` [B] where `mask`."""
+    """Sum of the finite elements of `x` [T, B] where `mask`."""
     x = x.astype(jnp.float32)
     return jnp.sum(jnp.where(mask & jnp.isfinite(x), x, 0.0))

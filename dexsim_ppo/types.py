@@ -59,7 +59,7 @@ class Environment(Protocol):
         ...
 
     def restart(self, state: Any, done: jax.Array) -> Any:
-        """Begin a new episode where `done`, else return the state as it is."""
+        """Begin a new episode where `done`, else return the state as it is, but for random keys."""
         ...
 
     def widen(self, state: Any, scale: jax.Array) -> Any:

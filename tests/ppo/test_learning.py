@@ -1,7 +1,6 @@
 """PPO end to end on the tiny environment."""
 
 import dataclasses
-import functools
 import time
 
 import jax
@@ -10,10 +9,11 @@ import numpy as np
 import pytest
 from tiny_env import CONFIG, SMALL, TinyEnv
 
+from dexsim.episode import choose
 from dexsim_ppo import ppo
 from dexsim_ppo.distribution import log_prob as gaussian_log_prob
 from dexsim_ppo.ppo import Learner, make_train
-from dexsim_ppo.rollout import restart_done
+from dexsim_ppo.rollout import Decision, collect, scan_restarting
 
 
 @pytest.mark.slow
@@ -117,8 +117,9 @@ class BadRewards(TinyEnv):
         state = super().step(state, action)
         diverged = state.metrics["length"] % 5 == 0
         poison = lambda x: jnp.where(diverged, jnp.nan, x)  # noqa: E731
+        metrics = state.metrics | {"error": poison(state.metrics["error"])}
         return dataclasses.replace(state, reward=poison(state.reward), obs=jax.tree.map(
-            poison, state.obs), terminated=diverged)
+            poison, state.obs), metrics=metrics, terminated=diverged)
 
 
 def test_a_diverging_environment_does_not_poison_the_learner():
@@ -154,17 +155,83 @@ def test_next_value_is_that_of_the_true_final_observation():
     assert bool((jnp.abs(rollout.obs["critic"][1:, :, 0]) <= 1).all()), "restarted before the next step"
 
 
-@pytest.mark.parametrize("size", [1, 7, 300])
-@pytest.mark.parametrize("share", [0.0, 0.05, 1.0])
-def test_restarts_what_is_done_and_nothing_else(size, share):
-    """Each row as the environment restarts it alone, whether fewer or more are done than are taken at a time."""
-    env = TinyEnv()
-    states = jax.vmap(env.reset)(jax.random.split(jax.random.key(size), size))
-    done = np.random.default_rng(size).random(size) < share
-    begun = jax.jit(functools.partial(restart_done, env))(states, jnp.asarray(done))
-    alone = [env.restart(jax.tree.map(lambda x, i=i: x[i], states), jnp.bool_(True)) if done[i]
-             else jax.tree.map(lambda x, i=i: x[i], states) for i in range(size)]
-    expected = jax.tree.map(lambda *rows: jnp.stack(rows), *alone)
-    for got, want in zip(jax.tree.leaves(begun), jax.tree.leaves(expected), strict=True):
-        got, want = (jax.random.key_data(x) if x.dtype == jax.random.key(0).dtype else x for x in (got, want))
-        np.testing.assert_array_equal(got, want)
+class Keyed(TinyEnv):
+    """As `dexsim.Env` does it: whoever is asked to restart moves the key on, also where nothing is done."""
+
+    def restart(self, state, done):
+        key, fresh_key = jax.random.split(state.key)
+        return choose(done, self._start(fresh_key), dataclasses.replace(state, key=key))
+
+
+@pytest.mark.parametrize("length, block", [(1, 1), (7, 7), (16, 16), (17, 1), (34, 2), (40, 10)])
+@pytest.mark.parametrize("share", [0.0, 0.1, 1.0])
+def test_restarts_what_ended_and_nothing_else(length, block, share):
+    """Against a loop over environments and steps: who ended goes on from the start drawn for it last."""
+    env, count = Keyed(), 5
+    states = jax.vmap(env.reset)(jax.random.split(jax.random.key(length), count))
+    ends = np.random.default_rng(length).random((length, count)) < share
+
+    def step(state, given):
+        number, ended = given
+        after = dataclasses.replace(state, x=state.x + number, terminated=ended & (number % 2 == 0),
+                                    truncated=ended & (number % 2 == 1))
+        return after, (state.x, after.x)
+
+    numbers = jnp.arange(length)
+    last, (before, after) = jax.jit(lambda *given: scan_restarting(env, step, *given))(
+        states, (numbers, jnp.asarray(ends)))
+    for row in range(count):
+        state = jax.tree.map(lambda x, row=row: x[row], states)
+        for tick in range(length):
+            if tick % block == 0:
+                fresh = env.restart(state, jnp.bool_(True))
+                state = env.restart(state, jnp.bool_(False))
+            assert float(before[tick, row]) == float(state.x)
+            state = fresh if ends[tick, row] else dataclasses.replace(state, x=state.x + tick)
+            if not ends[tick, row]:
+                assert float(after[tick, row]) == float(state.x)
+        assert float(last.x[row]) == float(state.x)
+        np.testing.assert_array_equal(jax.random.key_data(last.key[row]), jax.random.key_data(state.key))
+
+
+def test_starts_differ_between_environments_and_blocks():
+    """Every environment ends at every step: within a block it begins alike, in the next one anew."""
+    env, count, length = Keyed(), 4, 32
+    states = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), count))
+
+    def step(state, _):
+        return dataclasses.replace(state, terminated=jnp.ones(count, bool)), state.x
+
+    _, begun = scan_restarting(env, step, states, jnp.arange(length))
+    assert len(np.unique(begun)) == count * 3, "the first states, and one start for each of two blocks"
+    np.testing.assert_array_equal(begun[2:17], np.broadcast_to(begun[1], (15, count)))
+
+
+def test_metrics_are_those_of_a_plain_loop():
+    """Means over all steps, and over the last steps of episodes; what is not finite is left out and counted."""
+    env, count, length = BadRewards(), 6, 16
+    states = jax.vmap(env.reset)(jax.random.split(jax.random.key(3), count))
+    states = dataclasses.replace(states, metrics=states.metrics | {"length": jnp.arange(count) * 2.0})
+    decide = lambda key, obs: (Decision(*[jnp.zeros((count, 1))] * 2, jnp.zeros(count)),  # noqa: E731
+                               jax.random.normal(key, (count, 1)))
+    _, rollout, metrics = jax.jit(lambda state: collect(
+        env, state, jax.random.key(4), decide, lambda obs: obs["critic"][..., 0], length))(states)
+    everywhere, ended, final, broken, reward = [], 0, [], 0, []
+    fresh = jax.vmap(env.restart)(states, jnp.ones(count, bool))
+    state = jax.vmap(env.restart)(states, jnp.zeros(count, bool))
+    for key in jax.random.split(jax.random.key(4), length):
+        state = jax.vmap(env.step)(state, decide(key, state.obs)[1])
+        for row in range(count):
+            value = float(state.reward[row])
+            broken, reward = broken + (not np.isfinite(value)), [*reward, value if np.isfinite(value) else 0.0]
+            error = float(state.metrics["error"][row])
+            everywhere.append(error if np.isfinite(error) else 0.0)
+            if state.terminated[row] or state.truncated[row]:
+                ended, final = ended + 1, [*final, float(state.metrics["length"][row])]
+        state = jax.vmap(choose)(state.terminated | state.truncated, fresh, state)
+    assert ended > 3 and broken > 3, "the test tests less than it says"
+    assert float(metrics["episodes"]) == ended and float(metrics["nonfinite_rewards"]) == broken
+    np.testing.assert_allclose(metrics["step/error"], np.mean(everywhere), rtol=1e-4)
+    np.testing.assert_allclose(metrics["episode/length"], np.mean(final), rtol=1e-5)
+    np.testing.assert_allclose(metrics["reward"], np.mean(reward), rtol=1e-4)
+    np.testing.assert_allclose(rollout.reward.reshape(-1), reward, rtol=1e-4, atol=1e-5)
