@@ -86,9 +86,9 @@ def scan_restarting(env: Environment, step: Callable[[Any, Any], tuple[Any, Any]
     """`jax.lax.scan`, with a new episode after each step wherever one ended.
 
     `jax.vmap(env.restart)` after each step would compute a new episode for every environment and throw nearly
-    all of them away. So one for each is kept in reserve, renewed every 16 steps at most: an environment whose
-    episode ends twice in that time begins both times alike. Restarting just the rows that ended, in a loop,
-    would have a GPU wait for the host at every step.
+    all of them away. So one for each is kept in reserve and renewed after at most 16 steps: an environment
+    whose episode ends twice in between begins both times alike. Restarting just the rows that ended, in a
+    loop, would have a GPU wait for the host at every step.
 
     Args:
       step: `(states [B], input) -> (states after it, output)`; it does not restart.
