@@ -39,7 +39,7 @@ PRESETS = {
                       entropy_coefficient=0.004, matmul_precision="default",
                       actor_layers=(256, 256, 128), critic_layers=(256, 256, 128)),
         steps=0, minutes=8.0, evaluate_every=100, evaluation_chunk=1024, evaluation_episodes=1024,
-        log_every=10, corners=0.3),
+        log_every=10, corners=0.6),
 }
 
 
@@ -54,4 +54,4 @@ def find_preset(name: str, task: str) -> Preset:
         return replace(preset, evaluation_chunk=16, evaluation_episodes=16)
     # Half the environments: twice the updates for the same experience, which a gait is found with.
     ppo = replace(preset.ppo, num_envs=16384, minibatches=8, entropy_coefficient=0.001)
-    return replace(preset, ppo=ppo, minutes=7.5, evaluate_every=0, corners=0.6)
+    return replace(preset, ppo=ppo, minutes=7.5, evaluate_every=0)

@@ -72,10 +72,10 @@ def collect(env: Environment, state: Any, key: jax.Array, act: Act, value: Value
     # All sums are taken here: within the scan each would be a reduction of few numbers, which GPUs are slow at.
     finite, done = jnp.isfinite(rollout.reward), rollout.terminated | rollout.truncated
     rollout = dataclasses.replace(rollout, reward=jnp.where(finite, rollout.reward, 0.0))
-    episodes, steps = _sum(done, done), done.size
+    episodes, steps = jnp.sum(done, dtype=jnp.float32), done.size
     metrics = {"reward": jnp.mean(rollout.reward), "episodes": episodes,
-               "terminated_share": _sum(rollout.terminated, done) / episodes,
-               "nonfinite_rewards": _sum(~finite, ~finite)}
+               "terminated_share": jnp.sum(rollout.terminated, dtype=jnp.float32) / episodes,
+               "nonfinite_rewards": jnp.sum(~finite, dtype=jnp.float32)}
     metrics |= {f"step/{k}": _sum(v, jnp.ones_like(done)) / steps for k, v in told.items()}
     metrics |= {f"episode/{k}": _sum(v, done) / episodes for k, v in told.items()}
     return state, rollout, metrics
