@@ -18,6 +18,7 @@ import numpy as np
 
 from dexsim import observation, rotations, tactile
 from dexsim.backlash import GearState
+from dexsim.bare_skin import taxels_only, whole_surface
 from dexsim.control import Control, move_target, recalled
 from dexsim.drive import Drive, rotor_share
 from dexsim.env_config import EnvConfig, Sensing
@@ -70,6 +71,7 @@ class Env:
             for group, names in task.fields.items()}
         self.senses = Senses(config, hand, task, (actor_view, critic_view))
         self.drive = Drive(config, hand, self.physics)
+        self._surface = whole_surface(hand, config.skin.thickness) if config.skin.bare else taxels_only(hand)
         self.primitive_kinds = task.slots
         objects = config.objects
         self._mesh = load_mesh_object(objects) if objects.mesh and objects.mesh_touch == "grid" else None
@@ -250,12 +252,14 @@ class Env:
         quat = place[3:] / jnp.linalg.norm(place[3:])
         strength = jnp.linalg.norm(force, axis=-1)
         if config.touch:
+            surface = self._surface
             touch = tactile.feel_links(hand, pose, self._felt(target), place[:3],
-                                       rotations.quat_to_matrix(quat), strength, config.skin)
+                                       rotations.quat_to_matrix(quat), strength, config.skin, surface)
             if config.skin.total == "pressing":
                 # In the links' frames, where the normals are constants.
                 local = rotations.rotate_inverse(pose.tip_rotation, force)
-                touch = tactile.press_only(touch, jnp.asarray(hand.taxel_normal), local)
+                touch = tactile.press_only(touch, jnp.asarray(surface.normal), local)
+            touch = jax.tree.map(lambda x: x[:, : hand.num_taxels], touch)
         else:
             nothing = jnp.zeros(hand.taxel_area.shape)
             touch = tactile.Touch(nothing, nothing, nothing)

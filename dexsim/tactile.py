@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 
 from dexsim import materials, rotations, sdf
+from dexsim.bare_skin import Surface, taxels_only
 from dexsim.config import setting, validate
 from dexsim.distance import signed_distance
 from dexsim.hand import Hand, HandPose
@@ -49,6 +50,9 @@ class Skin:
     its magnitude, friction included; pressing: the part that presses into the skin, which is all that
     a taxel of one axis feels), or the skin itself, whose stress times area is then the force on each
     taxel."""
+    bare: bool = False
+    """Whether the fingertips' skin beyond the taxels bears its share of a finger's total, which nothing reads
+    (`dexsim.bare_skin`), or all of it lies on taxels that are near, as in the paper."""
 
     def __post_init__(self):
         validate(self)
@@ -105,19 +109,21 @@ def feel(taxels: jax.Array, area: jax.Array, thing: Any, position: jax.Array,
 
 
 def feel_links(hand: Hand, pose: HandPose, thing: Any, position: jax.Array, rotation: jax.Array,
-               finger_force: jax.Array, skin: Skin) -> Touch:
-    """`feel` for all taxels of a posed hand, straight from the links' frames to the object's.
+               finger_force: jax.Array, skin: Skin, surface: Surface | None = None) -> Touch:
+    """`feel` for all taxels of a posed hand, or other points of its fingertips' skin.
 
-    One transform a finger instead of two a taxel, and no taxel position in memory.
+    Straight from the links' frames to the object's: one transform a finger instead of two a taxel, and no taxel
+    position in memory.
     """
+    surface = surface or taxels_only(hand)
     turn = rotations.compose(jnp.swapaxes(rotation, -1, -2), pose.tip_rotation)
     shift = rotations.rotate_inverse(rotation, pose.body_position[hand.tip_body] - position)
     # Without the barrier XLA would compose the rotations anew for every taxel.
     turn, shift = jax.lax.optimization_barrier((turn, shift))
-    taxel = [jnp.asarray(hand.taxel_position[..., axis]) for axis in range(3)]
+    taxel = [jnp.asarray(surface.position[..., axis]) for axis in range(3)]
     local = [sum(turn[:, row, axis, None] * taxel[axis] for axis in range(3)) + shift[:, row, None]
              for row in range(3)]
-    return _press(jnp.stack(local, -1), jnp.asarray(hand.taxel_area), thing, finger_force, skin)
+    return _press(jnp.stack(local, -1), jnp.asarray(surface.area), thing, finger_force, skin)
 
 
 def _press(points: jax.Array, area: jax.Array, thing: Any, finger_force: jax.Array,
