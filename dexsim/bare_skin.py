@@ -64,5 +64,6 @@ def _beyond(hand: Hand, finger: int, reach: float) -> np.ndarray:
     count = np.bincount(cell.ravel())
     rows = np.stack([np.bincount(cell.ravel(), weights=x) for x in np.concatenate([points, normal], 1).T], 1)
     rows[:, :3] /= count[:, None]
-    rows[:, 3:] /= np.linalg.norm(rows[:, 3:], axis=1, keepdims=True)
+    # The two sides of a thin part may share a cell.
+    rows[:, 3:] /= np.maximum(np.linalg.norm(rows[:, 3:], axis=1, keepdims=True), 1e-9)
     return np.column_stack([rows, count * _STEP**2]).astype(np.float32)

@@ -132,3 +132,17 @@ def test_an_environment_reads_no_more_than_without(hand):
 
 def test_it_can_be_asked_for_by_name():
     assert override(to_dict(GraspConfig()), ("skin.bare=true",))["skin"]["bare"] is True
+
+
+def test_fingertips_of_other_shapes(hand):
+    """Boxes by their faces' area; a finger without primitives has its taxels alone."""
+    taxels = hand.taxel_position - np.float32([0, 0, 1.0])  # far from all of it
+    sides = np.float32([0.006, 0.0004, 0.010])  # a blade: both faces in one cell
+    blade = dataclasses.replace(hand.geoms[0], kind="box", size=sides, position=np.zeros(3, np.float32),
+                                rotation=np.eye(3, dtype=np.float32), body=int(hand.tip_body[0]), touches=True)
+    other = dataclasses.replace(hand, geoms=(blade,), taxel_position=taxels)
+    skin = whole_surface(other, REACH)
+    n = hand.num_taxels
+    a, b, c = 2e3 * sides
+    assert skin.area[0, n:].sum() * 1e6 == pytest.approx(2 * (a * b + b * c + a * c), rel=0.15)
+    assert np.isfinite(skin.normal).all() and not skin.area[1:, n:].any()
