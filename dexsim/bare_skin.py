@@ -45,11 +45,9 @@ def whole_surface(hand: Hand, reach: float) -> Surface:
 
 def _beyond(hand: Hand, finger: int, reach: float) -> np.ndarray:
     """Rows [M, 7] of position, normal and area on a fingertip's primitives that touch, beyond `reach` of its taxels."""
-    parts = [g for g in hand.geoms if g.body == hand.tip_body[finger] and g.touches and g.kind in sdf.KINDS]
-    if not parts:
+    shape = sdf.of_geoms(g for g in hand.geoms if g.body == hand.tip_body[finger] and g.touches)
+    if shape is None:
         return np.zeros((0, 7), np.float32)
-    shape = sdf.Shape(tuple(g.kind for g in parts), *(np.stack([getattr(g, what) for g in parts]) for what in
-                                                      ("size", "position", "rotation")), np.ones(len(parts), bool))
     low, high = sdf.bounds(shape)
     axes = [np.arange(a - _STEP, b + 2 * _STEP, _STEP) for a, b in zip(low, high, strict=True)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3).astype(np.float32)

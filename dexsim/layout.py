@@ -168,11 +168,9 @@ def check_hand(hand: Any, *, tolerance: float = 1.5e-3) -> None:
     from dexsim import sdf
 
     for finger, name in enumerate(hand.finger_names):
-        parts = [g for g in hand.geoms if g.body == hand.tip_body[finger] and g.kind in sdf.KINDS]
-        if not parts:
+        thing = sdf.of_geoms(g for g in hand.geoms if g.body == hand.tip_body[finger])
+        if thing is None:
             continue
-        thing = sdf.Shape(tuple(g.kind for g in parts), *(np.stack([getattr(g, what) for g in parts]) for what in
-                                                          ("size", "position", "rotation")), np.ones(len(parts), bool))
         patch = Patch(hand.taxel_grid, hand.taxel_position[finger], hand.taxel_normal[finger], hand.taxel_area[finger])
         check_outside(patch, thing, tolerance=tolerance, name=f"finger {name!r}")
 

@@ -6,7 +6,8 @@ for points inside an overlap of several primitives, where a union gives the dept
 nearest of their surfaces, not below the outer one.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -112,6 +113,16 @@ def to_local(points: jax.Array, position: jax.Array, rotation: jax.Array) -> jax
     arm = [p - position[axis] for axis, p in enumerate(_split(points))]
     return jnp.stack([sum(rotation[row, axis] * arm[row] for row in range(3))
                       for axis in range(3)], -1)
+
+
+def of_geoms(geoms: Iterable[Any]) -> Shape | None:
+    """The union of a link's primitives (`hand.Geom`), in its frame; None if none is of a kind in `KINDS`."""
+    parts = [g for g in geoms if g.kind in KINDS]
+    if not parts:
+        return None
+    return Shape(tuple(g.kind for g in parts), *(np.stack([getattr(g, name) for g in parts])
+                                                 for name in ("size", "position", "rotation")),
+                 np.ones(len(parts), bool))
 
 
 def bounds(shape: Shape) -> np.ndarray:
