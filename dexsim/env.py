@@ -259,9 +259,10 @@ class Env:
                 # In the links' frames, where the normals are constants.
                 local = rotations.rotate_inverse(pose.tip_rotation, force)
                 touch = tactile.press_only(touch, jnp.asarray(surface.normal), local)
+            share = tactile.taxel_share(touch.skin_force, hand.num_taxels) if config.skin.bare else 1.0
             touch = jax.tree.map(lambda x: x[:, : hand.num_taxels], touch)
         else:
-            nothing = jnp.zeros(hand.taxel_area.shape)
+            nothing, share = jnp.zeros(hand.taxel_area.shape), 1.0
             touch = tactile.Touch(nothing, nothing, nothing)
         return Moment(
             target=target, joint_position=joints, joint_velocity=physics.qvel[seam.joint_dof],
@@ -269,7 +270,7 @@ class Env:
             object_position=place[:3], object_quat=quat, object_velocity=motion[:3],
             object_spin=rotations.rotate(rotations.quat_to_matrix(quat), motion[3:]),
             action=action, last_action=last_action,
-            tangential_force=(tactile.split_force(touch.force, taxel_normals(hand, pose), force)[1]
+            tangential_force=(tactile.split_force(touch.force, taxel_normals(hand, pose), share * force)[1]
                               if self.senses.three_axis else None))
 
     def _observe(self, readings: Readings, moment: Moment, goal: Any) -> dict[str, jax.Array]:

@@ -57,7 +57,7 @@ class Moment:
     object_spin: jax.Array  # [3] rad/s
     action: jax.Array  # [J]
     last_action: jax.Array  # [J]
-    tangential_force: jax.Array | None = None  # [F, 3] N of `finger_force`, along the skin
+    tangential_force: jax.Array | None = None  # [F, 3] N of `finger_force`, along the taxels
 
 
 @pytree_dataclass

@@ -141,6 +141,12 @@ def spread(skin_force: jax.Array, finger_force: jax.Array) -> jax.Array:
     return finger_force[:, None] * skin_force / jnp.where(total > 0, total, 1.0)
 
 
+def taxel_share(skin_force: jax.Array, taxels: int) -> jax.Array:
+    """What part [F, 1] of each finger's load rests on the first `taxels` of its points [F, P]; 0 without touch."""
+    borne = jnp.sum(skin_force, -1, keepdims=True)
+    return jnp.sum(skin_force[:, :taxels], -1, keepdims=True) / jnp.where(borne > 0, borne, 1.0)
+
+
 def reduce_touch(force: jax.Array, taxels: jax.Array,
                  weighting: str = "force") -> tuple[jax.Array, jax.Array]:
     """Per-finger total force and contact centre, the same for simulated and measured taxels.

@@ -11,6 +11,7 @@ import dexsim
 from dexsim import sdf, tactile
 from dexsim.bare_skin import taxels_only, whole_surface
 from dexsim.config import override, to_dict
+from dexsim.env_config import Sensing
 from dexsim.hand import forward_kinematics
 from dexsim.object_config import ObjectConfig
 from dexsim.tasks.grasp import GraspConfig
@@ -103,31 +104,54 @@ def test_round_the_pad_less_and_less_is_felt(hand, surface, finger):
     assert all(x == 0.0 or x == pytest.approx(5.0, rel=1e-4) for x in alone)
 
 
-def test_an_environment_reads_no_more_than_without(hand):
-    """The same state with and without: taxels are as deep, and each finger reads at most as much."""
-    plain = GraspConfig(pool_size=64, objects=ObjectConfig(shapes=("sphere",)))
+@pytest.fixture(scope="module")
+def environments():
+    """The same grasp without and with bare skin, and a first state."""
+    plain = GraspConfig(pool_size=64, objects=ObjectConfig(shapes=("sphere",)), sensing=Sensing(three_axis=True))
     bare = dataclasses.replace(plain, skin=dataclasses.replace(plain.skin, bare=True))
     first, second = (dexsim.make("grasp", config, backend="jax") for config in (plain, bare))
     assert first.fingerprint() != second.fingerprint()
-    state = first.reset(jax.random.key(0))
-    # The object where the index finger's pad meets it, and a force into the pad.
-    pose = forward_kinematics(hand, state.physics.qpos[first.physics.joint_qpos])
-    radius, _, centre, _ = pad(hand, 1)
-    normal = np.asarray(hand.taxel_normal[1].mean(0))
-    normal /= np.linalg.norm(normal)
-    direction = pose.tip_rotation[1] @ jnp.asarray(normal, jnp.float32)
+    return first, second, first.reset(jax.random.key(0))
+
+
+def touched(environments, hand, angle):
+    """What both feel of a ball at an angle from the middle of the index finger's pad, 3 N into it, 1.5 N across."""
+    *both, state = environments
+    pose = forward_kinematics(hand, state.physics.qpos[both[0].physics.joint_qpos])
+    radius, _, centre, axis = pad(hand, 1)
+    front = hand.taxel_normal[1].mean(0)
+    front = front - axis * (front @ axis)
+    front /= np.linalg.norm(front)
+    direction = np.cos(angle) * front + np.sin(angle) * np.cross(axis, front)
+    direction = pose.tip_rotation[1] @ jnp.asarray(direction, jnp.float32)
     size = float(state.target.size[np.flatnonzero(np.asarray(state.target.active))[0], 0])
-    place = pose.body_position[hand.tip_body[1]] + pose.tip_rotation[1] @ jnp.asarray(centre) + direction * (
-        radius + size)
+    place = (pose.body_position[hand.tip_body[1]] + pose.tip_rotation[1] @ jnp.asarray(centre)
+             + direction * (radius + size))
     physics = dataclasses.replace(
-        state.physics, qpos=state.physics.qpos.at[first.physics.object_qpos[:3]].set(place))
-    force = jnp.zeros((hand.num_fingers, 3)).at[1].set(-3.0 * direction)
+        state.physics, qpos=state.physics.qpos.at[both[0].physics.object_qpos[:3]].set(place))
+    along = pose.tip_rotation[1] @ jnp.asarray(axis, jnp.float32)
+    force = jnp.zeros((hand.num_fingers, 3)).at[1].set(-3.0 * direction + 1.5 * along)
     zero = jnp.zeros(hand.num_joints)
-    read = [env._moment(physics, state.target, zero, zero, zero, force).touch for env in (first, second)]
-    assert read[0].force.shape == read[1].force.shape == (hand.num_fingers, hand.num_taxels)
-    np.testing.assert_array_equal(read[0].depth, read[1].depth)
-    sums = [np.asarray(touch.force.sum(-1)) for touch in read]
+    return [env._moment(physics, state.target, zero, zero, zero, force) for env in both]
+
+
+def test_an_environment_reads_no_more_than_without(environments, hand):
+    """The same state with and without: taxels are as deep, and each finger reads at most as much."""
+    plain, bare = touched(environments, hand, 0.0)
+    assert plain.touch.force.shape == bare.touch.force.shape == (hand.num_fingers, hand.num_taxels)
+    np.testing.assert_array_equal(plain.touch.depth, bare.touch.depth)
+    sums = [np.asarray(moment.touch.force.sum(-1)) for moment in (plain, bare)]
     assert sums[0][1] > 1.0 and np.all(sums[1] <= sums[0] + 1e-4)
+
+
+@pytest.mark.parametrize("angle, least, most", [(0.0, 0.99, 1.0), (1.4, 0.05, 0.9), (2.8, 0.0, 0.0)])
+def test_what_rests_on_taxels_drags_along_them(environments, hand, angle, least, most):
+    """As much of the tangential force as of the load: all of it, a part, nothing."""
+    plain, bare = touched(environments, hand, angle)
+    share = float(bare.touch.force[1].sum() / jnp.maximum(plain.touch.force[1].sum(), 1e-6))
+    assert least <= share <= most + 1e-5
+    np.testing.assert_allclose(bare.tangential_force[1], share * plain.tangential_force[1], atol=1e-4)
+    assert share == 0 or float(jnp.linalg.norm(plain.tangential_force[1])) > 0.5
 
 
 def test_it_can_be_asked_for_by_name():
