@@ -247,7 +247,7 @@ def update(config: PPOConfig, normalizers: dict[str, Normalizer], samples: Sampl
     keys = jax.random.split(key, config.epochs)
     order = jax.vmap(lambda key: jax.random.permutation(key, rows))(keys)
     order = order.reshape(config.epochs * config.minibatches, rows // config.minibatches)
-    old_log_std = learner.params.log_std
+    old_log_std, moves = learner.params.log_std, actor_learns(config, learner)
 
     def minibatch(learner, indices):
         batch = jax.tree.map(lambda x: x[indices], samples)
@@ -260,6 +260,8 @@ def update(config: PPOConfig, normalizers: dict[str, Normalizer], samples: Sampl
     last_epoch = metrics["kl"][-config.minibatches:]
     metrics = jax.tree.map(jnp.nanmean, metrics) | {"kl": jnp.nanmean(last_epoch)}
     rate = adapt_learning_rate(config, learner.learning_rate, metrics["kl"])
+    if config.critic_first:  # A policy that stands still says nothing about the rate.
+        rate = jnp.where(moves, rate, learner.learning_rate)
     return learner._replace(learning_rate=rate), metrics
 
 
@@ -301,17 +303,27 @@ def apply_gradients(config: PPOConfig, learner: Learner,
     actor_grads, actor_norm = adam.clip_by_global_norm((grads.actor, grads.log_std),
                                                        config.max_grad_norm)
     critic_grads, critic_norm = adam.clip_by_global_norm(grads.critic, config.max_grad_norm)
-    params, moments = adam.update(Params(*actor_grads, critic_grads), learner.adam, learner.params,
-                                  learner.learning_rate)
+    rate, moves = learner.learning_rate, actor_learns(config, learner)
+    if config.critic_first:
+        rate = jnp.where(moves, rate, config.learning_rate_max)
+    params, moments = adam.update(Params(*actor_grads, critic_grads), learner.adam, learner.params, rate)
     # Projected rather than clipped where it is used: a clip has no gradient to come back with.
     log_std = jnp.clip(params.log_std, jnp.log(config.std_min), jnp.log(config.std_max))
     params = Params(params.actor, log_std, params.critic)
+    if config.critic_first:  # The moments follow the gradient all the same, so the actor's first step is no leap.
+        held = jax.tree.map(functools.partial(jnp.where, moves), params, learner.params)
+        params = Params(held.actor, held.log_std, params.critic)
     ok = jnp.isfinite(actor_norm) & jnp.isfinite(critic_norm)
     new = learner._replace(params=params, adam=moments)
     learner = jax.tree.map(functools.partial(jnp.where, ok), new, learner)
     skipped = learner.skipped_updates + (1 - ok.astype(jnp.int32))
     return learner._replace(skipped_updates=skipped), {"actor_grad_norm": actor_norm,
                                                        "critic_grad_norm": critic_norm}
+
+
+def actor_learns(config: PPOConfig, learner: Learner) -> jax.Array:
+    """Whether the critic has had its iterations alone, []."""
+    return learner.adam.count >= config.critic_first * config.epochs * config.minibatches
 
 
 def adapt_learning_rate(config: PPOConfig, rate: jax.Array, kl: jax.Array) -> jax.Array:

@@ -49,6 +49,9 @@ class PPOConfig:
     """Policy change in one iteration that the learning rate adapts to; 0 keeps the rate fixed."""
     distribution: Literal["gaussian", "tanh"] = setting("gaussian", choices=("gaussian", "tanh"))
     """Gaussian clipped by the environment, or squashed by tanh."""
+    critic_first: int = setting(0, unit="iterations", low=0)
+    """First iterations, in which only the critic learns, at the cap of the learning rate: for an actor that knows
+    more than its critic."""
     initial_std: float = setting(0.6, low=1e-3, high=10.0)
     """Standard deviation of the first policy's actions, of a range [-1, 1]."""
     std_min: float = setting(0.05, low=1e-4, high=10.0)

@@ -25,10 +25,12 @@ from dexsim.config import from_dict
 from dexsim.errors import ConfigError
 from dexsim.randomization import Curriculum
 from dexsim_ppo import checkpoint, cli
+from dexsim_ppo.evaluate import load_policy
 from dexsim_ppo.ppo_config import PPOConfig
 from dexsim_ppo.presets import Preset, find_preset
 from dexsim_ppo.runlog import RunFolder
 from dexsim_ppo.trainer import Run, TrainArguments, printable, training_config
+from dexsim_ppo.warm_start import check_fit, learner_settings
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -44,6 +46,8 @@ def main(argv: Sequence[str] | None = None) -> int:
                       num_envs=arguments.ppo.num_envs)
     folder = RunFolder(path)
     if not resumed:
+        if arguments.policy:
+            check_fit(load_policy(arguments.policy), env, arguments.ppo)
         folder.checkpoints.mkdir(parents=True)
         command = shlex.join(["python", "-m", "dexsim_ppo.train", *argv])
         cli.write_json(folder.config, {"command": command, "arguments": printable(arguments)}
@@ -65,7 +69,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def parse_arguments(argv: list[str]) -> tuple[TrainArguments, checkpoint.Checkpoint | None]:
     """Options, on top of the preset's or of the resumed run's; and that run's checkpoint."""
     early = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
-    for name in ("--task", "--preset", "--resume"):
+    for name in ("--task", "--preset", "--resume", "--policy"):
         early.add_argument(name, nargs="?")
     known, _ = early.parse_known_args(argv)
     resumed = None
@@ -73,13 +77,19 @@ def parse_arguments(argv: list[str]) -> tuple[TrainArguments, checkpoint.Checkpo
         path = Path(known.resume)
         file = path if path.is_file() else RunFolder(path).latest_checkpoint()
         resumed = checkpoint.load(file, kind="train", task=known.task)
-    task = resumed.task if resumed else known.task or "grasp"
+    policy = load_policy(known.policy) if known.policy and not resumed else None
+    task = resumed.task if resumed else known.task or (policy.task if policy else "grasp")
+    if policy and policy.task != task:
+        raise ConfigError(f"--policy {known.policy}: is of the task {policy.task!r}, not {task!r}")
     entry = cli.find_task(task)
     config_class = entry.config_class
     if resumed:
         default = arguments_from_dict(config_class, resumed.content["arguments"])
     else:
         default = preset_arguments(task, entry.config(), known.preset or "auto")
+        if policy:
+            default = dataclasses.replace(default, env=from_dict(config_class, policy.env_config),
+                                          ppo=learner_settings(policy, default.ppo))
     given = {argument.split("=")[0] for argument in argv}
     if "--steps" in given and "--minutes" not in given:
         default = dataclasses.replace(default, minutes=0.0)

@@ -20,11 +20,12 @@ from dexsim.randomization import Curriculum
 from dexsim_ppo import checkpoint, cli, programs
 from dexsim_ppo.compilation import collector_paused
 from dexsim_ppo.display import Display
-from dexsim_ppo.evaluate import Evaluator, print_report, write_video
+from dexsim_ppo.evaluate import Evaluator, load_policy, print_report, write_video
 from dexsim_ppo.policy import Policy
 from dexsim_ppo.ppo import PPOConfig, TrainState, make_train
 from dexsim_ppo.runlog import MetricsLog, RunFolder, draw_curve, read_metrics
 from dexsim_ppo.types import Environment
+from dexsim_ppo.warm_start import start_from
 
 EnvConfig = TypeVar("EnvConfig")
 # Evaluations that choose the best policy and the final one see different episodes.
@@ -61,6 +62,9 @@ class TrainArguments(Generic[EnvConfig]):
     """Folder to write to; must not exist yet. Default: runs/<task>-<time>."""
     resume: Path | None = None
     """Folder of a run (or one of its checkpoints) to go on with."""
+    policy: str = ""
+    """Policy to go on from, on whatever has changed since: a file, or the name of a shipped one. Its task and
+    configuration are the defaults."""
     video: bool = True
     """Render a video at the end."""
     log_every: int = setting(1, unit="iterations", low=1)
@@ -150,6 +154,8 @@ class Run:
                 trace_s=time.perf_counter() - begin))
             if not resumed:
                 state = beginning.result()
+                if self.arguments.policy:
+                    state = start_from(load_policy(self.arguments.policy), self.config, state)
                 self._policy(state).save(self.folder.untrained)
         self.clock["compile_s"] = time.perf_counter() - begin
         return state, step

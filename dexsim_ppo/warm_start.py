@@ -1,0 +1,58 @@
+"""Training that goes on from a finished policy, on objects, motors or sensors that have changed."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+
+from dexsim.errors import ConfigError
+from dexsim_ppo.policy import Policy, layout_to_list
+from dexsim_ppo.ppo import TrainState
+from dexsim_ppo.ppo_config import PPOConfig
+from dexsim_ppo.running_stats import MEMORY, RunningStats
+from dexsim_ppo.types import Environment
+
+
+def learner_settings(policy: Policy, config: PPOConfig) -> PPOConfig:
+    """`config` with the policy's network, little noise, small steps, and some iterations for the critic alone.
+
+    A policy's file holds neither its critic nor its noise. The first policy's noise would undo what it knows, and a
+    critic that has not settled would lead it astray: its errors all point the same way.
+    """
+    return dataclasses.replace(
+        config, actor_layers=tuple(layer.kernel.shape[1] for layer in policy.params.layers[:-1]),
+        distribution=policy.params.squash, learning_rate=3e-5, learning_rate_max=5e-4, kl_target=0.002,
+        initial_std=0.2, critic_first=100)
+
+
+def check_fit(policy: Policy, env: Environment, config: PPOConfig) -> None:
+    """Whether a learner with this configuration can go on from the policy.
+
+    Raises:
+      ConfigError: the policy observes something else than the environment offers, or has another network.
+    """
+    theirs, mine = (layout_to_list(fields) for fields in (policy.observation_layout, env.observation_layout["actor"]))
+    if theirs != mine:
+        odd = [name for name, *_ in (*(f for f in theirs if f not in mine), *(f for f in mine if f not in theirs))]
+        raise ConfigError(f"the policy does not observe what this configuration offers: {', '.join(odd) or 'order'}")
+    layers = tuple(layer.kernel.shape[1] for layer in policy.params.layers)
+    if layers != (*config.actor_layers, env.action_size) or policy.params.squash != config.distribution:
+        raise ConfigError(f"the policy's network has layers {layers} and is {policy.params.squash!r}; leave "
+                          "ppo.actor_layers and ppo.distribution as they are")
+
+
+def start_from(policy: Policy, config: PPOConfig, state: TrainState) -> TrainState:
+    """A fresh learner's state with the policy's actor and observation statistics.
+
+    The statistics count as ones of many samples: they scarcely move, so that the network goes on seeing what it
+    was trained with.
+    """
+    normalizer, old = policy.params.normalizer, state.observation_stats["actor"]
+    # Fields of a fixed scale are not normalised by statistics: theirs say nothing.
+    moving = jnp.asarray([not field.scale for field in policy.observation_layout for _ in range(field.size)])
+    variance = jnp.maximum(normalizer.std**2 - config.observation_std_floor**2, 0.0)
+    stats = RunningStats(count=jnp.full_like(old.count, MEMORY), mean=jnp.where(moving, normalizer.mean, old.mean),
+                         variance=jnp.where(moving, variance, old.variance))
+    actor = jax.tree.map(jnp.copy, policy.params.layers)
+    return dataclasses.replace(state, params=dataclasses.replace(state.params, actor=actor),
+                               observation_stats=state.observation_stats | {"actor": stats})
