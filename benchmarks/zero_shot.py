@@ -2,6 +2,7 @@
 
     python benchmarks/zero_shot.py --task rotate --trials 10
     python benchmarks/zero_shot.py --task grasp --trials 50 --draw inside --set gear_play=0
+    python benchmarks/zero_shot.py --task grasp --trials 50 --seed 0 1 2 3 --processes 2
 
 Virtual time: every exchange goes through the bytes of both frames and the emulated palm board, then the bridge's own
 sensing, safety and controller, but in one process and as fast as it computes (`dexsim_real.twin.virtual`). What is
@@ -40,7 +41,7 @@ def load(policy: str) -> tuple[Any, Any, Any]:
     return hand, controller, ideal_calibration(hand)
 
 
-def run_trial(options: dict[str, Any], number: int) -> dict[str, Any]:
+def run_trial(options: dict[str, Any], seed: int, number: int) -> dict[str, Any]:
     """The referee's report of one trial."""
     from dexsim_real.twin.plant import EmulatedHand
     from dexsim_real.twin.shapes import SHAPES
@@ -49,7 +50,7 @@ def run_trial(options: dict[str, Any], number: int) -> dict[str, Any]:
     hand, controller, calibration = load(options["policy"])
     # As in the task's evaluation: five commands for each shape.
     command, shape = COMMANDS[number % len(COMMANDS)], SHAPES[number // len(COMMANDS) % len(SHAPES)]
-    plant = EmulatedHand(hand, options["task"], options["seed"], kind=options["draw"], overrides=options["set"],
+    plant = EmulatedHand(hand, options["task"], seed, kind=options["draw"], overrides=options["set"],
                          seconds=options["seconds"], trials=1, first=number, shape=shape)
     began = time.perf_counter()
     report = VirtualRun(plant, controller, calibration,
@@ -58,13 +59,14 @@ def run_trial(options: dict[str, Any], number: int) -> dict[str, Any]:
 
 
 def run_all(options: dict[str, Any], trials: int, processes: int, show: bool) -> list[dict[str, Any]]:
-    """All trials, in order."""
+    """All trials, seed by seed and in order."""
     trial = functools.partial(run_trial, options)
+    seeds, numbers = zip(*((seed, k) for seed in options["seed"] for k in range(trials)), strict=True)
     if processes <= 1:
-        return [_shown(trial(k), show) for k in range(trials)]
+        return [_shown(report, show) for report in map(trial, seeds, numbers)]
     # JAX does not survive a fork.
     with concurrent.futures.ProcessPoolExecutor(processes, multiprocessing.get_context("spawn")) as pool:
-        return [_shown(report, show) for report in pool.map(trial, range(trials))]
+        return [_shown(report, show) for report in pool.map(trial, seeds, numbers)]
 
 
 def _shown(report: dict[str, Any], show: bool) -> dict[str, Any]:
@@ -162,8 +164,8 @@ def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--task", choices=("grasp", "rotate"), required=True)
     parser.add_argument("--policy", help="policy file; by default the shipped one of the task")
-    parser.add_argument("--trials", type=int, default=10)
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--trials", type=int, default=10, help="of each seed")
+    parser.add_argument("--seed", type=int, nargs="+", default=[0], help="the metrics are over the trials of all seeds")
     parser.add_argument("--seconds", type=float, help="time limit of a trial; by default the task's (8 or 120)")
     parser.add_argument("--draw", choices=("outside", "inside", "nominal"), default="outside",
                         help="parameters outside training's ranges, inside them, or at their middle")
@@ -185,7 +187,7 @@ def main() -> None:
     reports = run_all(options, given.trials, given.processes, show=True)
     here = (grasp_metrics if given.task == "grasp" else rotate_metrics)(reports)
     there = simulated(given.task, options["policy"])
-    print(f"{given.task}: {len(reports)} trials, parameters {given.draw}, seed {given.seed}; "
+    print(f"{given.task}: {len(reports)} trials, parameters {given.draw}, seed {' '.join(map(str, given.seed))}; "
           f"targets {TARGETS[given.task]}")
     print(table(here, there))
     if given.json:
