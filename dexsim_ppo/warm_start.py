@@ -16,13 +16,14 @@ from dexsim_ppo.types import Environment
 def learner_settings(policy: Policy, config: PPOConfig) -> PPOConfig:
     """`config` with the policy's network, little noise, small steps, and some iterations for the critic alone.
 
-    A policy's file holds neither its critic nor its noise. The first policy's noise would undo what it knows, and a
-    critic that has not settled would lead it astray: its errors all point the same way.
+    A policy's file holds neither its critic nor its noise. The first policy's noise would undo what it knows, a
+    critic that has not settled would lead it astray, for its errors all point the same way, and the steps of a first
+    training are too large for what little is left to gain.
     """
     return dataclasses.replace(
         config, actor_layers=tuple(layer.kernel.shape[1] for layer in policy.params.layers[:-1]),
-        distribution=policy.params.squash, learning_rate=3e-5, learning_rate_max=5e-4, kl_target=0.002,
-        initial_std=0.2, critic_first=100)
+        distribution=policy.params.squash, learning_rate=1e-5, learning_rate_min=1e-6, learning_rate_max=5e-4,
+        kl_target=2e-4, initial_std=0.2, critic_first=100)
 
 
 def check_fit(policy: Policy, env: Environment, config: PPOConfig) -> None:

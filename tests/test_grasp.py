@@ -37,7 +37,7 @@ from dexsim.tasks.grasp import (
 # Pinned: the shipped defaults are tuned, the rules below are not.
 WEIGHTS = GraspReward(force=2.0, torque=0.2, alive=0.5, spread=-0.5, outer=-0.05, action=-0.02,
                       velocity=-0.002, drop=-20.0, sigma=0.1, tail_sigma=0.4, tail=0.4,
-                      thumb="loose")
+                      thumb="loose", overload=-2.0, margin=0.4)
 CONFIG = GraspConfig(finger_force=(1.0, 7.0), max_force=10.0, force_per_torque=19.0,
                      push_probability=0.02, push_speed=0.3, drop_distance=0.12, reward=WEIGHTS)
 
@@ -154,7 +154,7 @@ class TestReward:
             "torque": 0.2 * (gauss(0.1 - goal, 0.4) + torque_track) / 5,
             "alive": 0.5, "spread": -0.5 * np.var([0.1, -0.1, 0.3, 0.1]),
             "outer": -0.05 * math.sqrt(0.01 + 0.01 + 0.09 + 0.01), "action": -0.02 * 1.0,
-            "velocity": -0.002 * 4.0, "drop": 0.0}
+            "velocity": -0.002 * 4.0, "drop": 0.0, "overload": -2.0 * (5.0 - 4.0 - 0.4) / 10}
         for name, value in wanted.items():
             assert float(metrics[f"reward/{name}"]) == pytest.approx(value, rel=1e-4, abs=1e-6), name
         assert {n for n in metrics if n.startswith("reward/")} == {f"reward/{n}" for n in wanted}
@@ -178,6 +178,15 @@ class TestReward:
         assert float(lost["success"]) == 0.0
         penalties = sum(float(lost[f"reward/{n}"]) for n in ("spread", "outer", "action", "velocity"))
         assert float(reward) == pytest.approx(-20.0 + penalties)
+
+    def test_overload_counts_the_four_fingers_and_only_above(self, hand, task):
+        force = np.zeros((5, 3))
+        force[:, 1] = 20.0, 4.3, 3.0, 6.4, 0.0  # targets 4 N; the thumb is free to balance them
+        _, metrics = task.reward(goal_of(0.5), make_moment(hand, finger_force=force), jnp.zeros((), bool))
+        assert float(metrics["reward/overload"]) == pytest.approx(-2.0 * 2.0 / 10, rel=1e-5)
+        _, lost = task.reward(goal_of(0.5), make_moment(hand, finger_force=force), jnp.ones((), bool))
+        assert float(lost["reward/overload"]) == 0.0
+        assert GraspReward().overload == 0.0, "the shipped policy was trained without"
 
     def test_the_torque_target_goes_with_the_force_target(self, hand, task):
         """At force_per_torque = 19 N/Nm a finger on its force target is on its torque target."""

@@ -53,6 +53,11 @@ class GraspReward:
     """Width of the wide Gaussian that carries a gradient far from the target."""
     tail: float = setting(0.4, unit="1", low=0.0, high=1.0)
     """Share of the wide Gaussian."""
+    overload: float = setting(0.0, unit="1", low=-1000.0, high=0.0)
+    """What the four fingers press beyond `margin` above their target, over `max_force`. The Gaussians are flat there:
+    a finger that bears an object nearly alone gains nothing by letting go a little."""
+    margin: float = setting(1.5, unit="N", low=0.0, high=100.0)
+    """Force above the target that `overload` leaves alone."""
     thumb: str = setting("loose", choices=("loose", "track", "binary"))
     """Thumb: it opposes all other fingers, so a balanced grasp needs more of it than of each of
     them. "loose": only the wide Gaussian; "track": like the fingers; "binary": the paper's, any
@@ -245,6 +250,8 @@ class Grasp:
                 torque / self._max_torque, wanted / config.force_per_torque / self._max_torque,
                 contact & (torque >= 0.01), (0.0, 1.0), 1.0, weights),
             "alive": held * weights.alive,
+            "overload": held * weights.overload * jnp.sum(
+                jnp.maximum(force[1:] - wanted - weights.margin, 0.0)) / config.max_force,
             "spread": weights.spread * joint_spread(moment.joint_position[self._roots[1:]]),
             "outer": weights.outer * posture_distance(
                 moment.joint_position[fingers], self._centre[fingers]),
