@@ -241,7 +241,8 @@ class Run:
         return Policy.from_training(self.evaluator.env, self.config, state, {
             "seed": self.arguments.seed, "iteration": int(state.iteration),
             "env_steps": int(state.iteration) * self.config.steps_per_iteration,
-            "backend": self.env.backend, "ppo": to_dict(self.config)})
+            "backend": self.env.backend, "ppo": to_dict(self.config)}
+            | ({"policy": self.arguments.policy} if self.arguments.policy else {}))
 
     def _evaluate(self, state: TrainState, iteration: int, display: Display) -> dict[str, float]:
         """Measure the policy, and keep the very one measured if its return is the best so far."""

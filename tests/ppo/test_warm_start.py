@@ -95,6 +95,7 @@ def test_from_the_command_line(policy, tiny_task, tmp_path):
     folder = RunFolder(tmp_path / "a")
     began, ended = Policy.load(folder.untrained), Policy.load(folder.last)
     assert ended.env_config["gain"] == 0.2, "the policy's configuration is the default"
+    assert ended.training["policy"] == str(file)
     obs = jax.random.normal(jax.random.key(2), (64, 3))
     np.testing.assert_allclose(began(obs), policy(obs), atol=1e-5)
     assert len(read_metrics(folder.metrics)) == 2
