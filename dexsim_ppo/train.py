@@ -77,7 +77,9 @@ def parse_arguments(argv: list[str]) -> tuple[TrainArguments, checkpoint.Checkpo
         path = Path(known.resume)
         file = path if path.is_file() else RunFolder(path).latest_checkpoint()
         resumed = checkpoint.load(file, kind="train", task=known.task)
-    policy = load_policy(known.policy) if known.policy and not resumed else None
+    if resumed and known.policy:
+        raise ConfigError("--policy begins a run and --resume goes on with one: give one of them")
+    policy = load_policy(known.policy) if known.policy else None
     task = resumed.task if resumed else known.task or (policy.task if policy else "grasp")
     if policy and policy.task != task:
         raise ConfigError(f"--policy {known.policy}: is of the task {policy.task!r}, not {task!r}")

@@ -100,6 +100,7 @@ def test_from_the_command_line(policy, tiny_task, tmp_path):
     np.testing.assert_allclose(began(obs), policy(obs), atol=1e-5)
     assert len(read_metrics(folder.metrics)) == 2
     assert train.main(["--resume", str(tmp_path / "a"), "--steps", str(3 * 128)]) == 0, "resumes like any other"
+    assert exit_code(train.main, ["--resume", str(tmp_path / "a"), "--policy", str(file)]) == 2
 
 
 def test_what_does_not_fit_is_refused(policy, tiny_task, tmp_path, monkeypatch, capsys):
