@@ -12,6 +12,7 @@ counted is the referee's truth, not what the bridge believes. Trial k of a seed 
 import argparse
 import concurrent.futures
 import functools
+import itertools
 import json
 import multiprocessing
 import sys
@@ -61,7 +62,7 @@ def run_trial(options: dict[str, Any], seed: int, number: int) -> dict[str, Any]
 def run_all(options: dict[str, Any], trials: int, processes: int, show: bool) -> list[dict[str, Any]]:
     """All trials, seed by seed and in order."""
     trial = functools.partial(run_trial, options)
-    seeds, numbers = zip(*((seed, k) for seed in options["seed"] for k in range(trials)), strict=True)
+    seeds, numbers = zip(*itertools.product(options["seed"], range(trials)), strict=True)
     if processes <= 1:
         return [_shown(report, show) for report in map(trial, seeds, numbers)]
     # JAX does not survive a fork.

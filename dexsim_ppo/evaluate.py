@@ -157,12 +157,12 @@ def write_video(env: Environment, snapshots: Any, path: Path) -> Path:
     return Path(render_episode(env, snapshots, path, 1.0 / env.control_period, max_frames=frames))
 
 
-def load_policy(name: str) -> Policy:
-    """A policy from a file, or a shipped one by its name."""
+def load_policy(name: str, *, task: str | None = None) -> Policy:
+    """A policy from a file, or a shipped one by its name; of that task, if one is given."""
     if Path(name).exists() or "/" in name or name.endswith(".msgpack"):
-        return Policy.load(name)
+        return Policy.load(name, task=task)
     try:
-        return Policy.load(asset_path(f"policies/{name}.msgpack"))
+        return Policy.load(asset_path(f"policies/{name}.msgpack"), task=task)
     except AssetError:
         raise CheckpointError(f"{name}: no such file, and no shipped policy has that name") from None
 

@@ -72,6 +72,15 @@ def make_normalizer(stats: RunningStats, fields: Fields, *, std_floor: float,
                       clip=clip)
 
 
+def recover_stats(normalizer: Normalizer, *, std_floor: float) -> RunningStats:
+    """Statistics that `make_normalizer` makes this normaliser of, for fields that have no fixed scale.
+
+    They count as ones of many samples: they scarcely move.
+    """
+    return RunningStats(count=jnp.int32(MEMORY), mean=jnp.copy(normalizer.mean),
+                        variance=jnp.maximum(normalizer.std**2 - std_floor**2, 0.0))
+
+
 def normalize(normalizer: Normalizer, x: jax.Array) -> jax.Array:
     """Normalised and clipped `x` [..., n]."""
     z = (x - normalizer.mean) / normalizer.std

@@ -26,6 +26,7 @@ from dexsim.errors import ConfigError
 from dexsim.randomization import Curriculum
 from dexsim_ppo import checkpoint, cli
 from dexsim_ppo.evaluate import load_policy
+from dexsim_ppo.policy import Policy
 from dexsim_ppo.ppo_config import PPOConfig
 from dexsim_ppo.presets import Preset, find_preset
 from dexsim_ppo.runlog import RunFolder
@@ -38,7 +39,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     started = time.perf_counter()
     argv = list(sys.argv[1:] if argv is None else argv)
     cli.enable_caches()
-    arguments, resumed = parse_arguments(argv)
+    arguments, begun = parse_arguments(argv)
+    resumed = begun if isinstance(begun, checkpoint.Checkpoint) else None
     path = resumed.path.parent.parent if resumed else new_run_path(arguments)
     import dexsim
 
@@ -46,15 +48,15 @@ def main(argv: Sequence[str] | None = None) -> int:
                       num_envs=arguments.ppo.num_envs)
     folder = RunFolder(path)
     if not resumed:
-        if arguments.policy:
-            check_fit(load_policy(arguments.policy), env, arguments.ppo)
+        if begun:
+            check_fit(begun, env, arguments.ppo)
         folder.checkpoints.mkdir(parents=True)
         command = shlex.join(["python", "-m", "dexsim_ppo.train", *argv])
         cli.write_json(folder.config, {"command": command, "arguments": printable(arguments)}
                        | cli.environment_report())
     run = Run(env, arguments, folder, started)
     with stop_on_signals() as stopped:
-        run.train(resumed, stopped)
+        run.train(begun, stopped)
     if stopped():
         print(f"stopped by {signal.Signals(stopped()).name}; go on with: "
               f"python -m dexsim_ppo.train --resume {shlex.quote(str(folder.path))}")
@@ -66,8 +68,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 # --- options ------------------------------------------------------------------------------------------
 
 
-def parse_arguments(argv: list[str]) -> tuple[TrainArguments, checkpoint.Checkpoint | None]:
-    """Options, on top of the preset's or of the resumed run's; and that run's checkpoint."""
+def parse_arguments(argv: list[str]) -> tuple[TrainArguments, checkpoint.Checkpoint | Policy | None]:
+    """Options, on top of the preset's or of the resumed run's; and what there is to go on with: that run's
+    checkpoint or a finished policy."""
     early = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     for name in ("--task", "--preset", "--resume", "--policy"):
         early.add_argument(name, nargs="?")
@@ -79,10 +82,9 @@ def parse_arguments(argv: list[str]) -> tuple[TrainArguments, checkpoint.Checkpo
         resumed = checkpoint.load(file, kind="train", task=known.task)
     if resumed and known.policy:
         raise ConfigError("--policy begins a run and --resume goes on with one: give one of them")
-    policy = load_policy(known.policy) if known.policy else None
-    task = resumed.task if resumed else known.task or (policy.task if policy else "grasp")
-    if policy and policy.task != task:
-        raise ConfigError(f"--policy {known.policy}: is of the task {policy.task!r}, not {task!r}")
+    policy = load_policy(known.policy, task=known.task) if known.policy else None
+    begun = resumed or policy
+    task = begun.task if begun else known.task or "grasp"
     entry = cli.find_task(task)
     config_class = entry.config_class
     if resumed:
@@ -97,7 +99,7 @@ def parse_arguments(argv: list[str]) -> tuple[TrainArguments, checkpoint.Checkpo
         default = dataclasses.replace(default, minutes=0.0)
     arguments = cli.parse(TrainArguments[config_class], argv, default=default,
                           prog="python -m dexsim_ppo.train", description="Train a task.")
-    return arguments, resumed
+    return arguments, begun
 
 
 def preset_arguments(task: str, env_config: Any, name: str) -> TrainArguments:

@@ -20,7 +20,7 @@ from dexsim.randomization import Curriculum
 from dexsim_ppo import checkpoint, cli, programs
 from dexsim_ppo.compilation import collector_paused
 from dexsim_ppo.display import Display
-from dexsim_ppo.evaluate import Evaluator, load_policy, print_report, write_video
+from dexsim_ppo.evaluate import Evaluator, print_report, write_video
 from dexsim_ppo.policy import Policy
 from dexsim_ppo.ppo import PPOConfig, TrainState, make_train
 from dexsim_ppo.runlog import MetricsLog, RunFolder, draw_curve, read_metrics
@@ -122,13 +122,13 @@ class Run:
         return dexsim.make(self.arguments.task, self.arguments.env, backend=self.env.backend,
                            num_envs=self.arguments.evaluation_chunk)
 
-    def train(self, resumed: checkpoint.Checkpoint | None, stopped: Callable[[], int]) -> None:
-        """The training loop; leaves a checkpoint and the last policy behind."""
+    def train(self, begun: checkpoint.Checkpoint | Policy | None, stopped: Callable[[], int]) -> None:
+        """The training loop, from what was begun before; leaves a checkpoint and the last policy behind."""
         arguments, device = self.arguments, jax.devices()[0]
         with Display(f"{arguments.task} on {device.device_kind}, {self.env.backend}") as display:
             display.note(f"{self.folder.path}: {arguments.task}, {self.config.num_envs} environments, "
                          f"{self.env.backend} physics on {device.device_kind}; compiling")
-            state, step = self._prepare(resumed)
+            state, step = self._prepare(begun)
             display.note(f"compiled in {self.clock['compile_s']:.1f} s")
             log = MetricsLog(self.folder, int(state.iteration))
             try:
@@ -136,17 +136,17 @@ class Run:
             finally:
                 log.close()
 
-    def _prepare(self, resumed: checkpoint.Checkpoint | None) -> tuple[TrainState, Callable]:
+    def _prepare(self, begun: checkpoint.Checkpoint | Policy | None) -> tuple[TrainState, Callable]:
         """The state to start from and the compiled training step."""
         training = make_train(self.env, self.config, self.arguments.curriculum)
-        key = jax.random.key(self.arguments.seed)
+        key, resumed = jax.random.key(self.arguments.seed), isinstance(begun, checkpoint.Checkpoint)
         begin = time.perf_counter()
         shapes = training.shapes(key)
         # The first states are compiled and made on one core while the step is traced on another.
         with ThreadPoolExecutor(1) as aside:
             if resumed:
-                state = jax.tree.map(jnp.copy, checkpoint.restore(resumed, shapes))
-                progress = resumed.content["progress"]
+                state = jax.tree.map(jnp.copy, checkpoint.restore(begun, shapes))
+                progress = begun.content["progress"]
                 self.best, self.seconds_before = progress["best"], progress["seconds"]
             else:
                 beginning = aside.submit(lambda: jax.block_until_ready(training.init(key)))
@@ -154,8 +154,8 @@ class Run:
                 trace_s=time.perf_counter() - begin))
             if not resumed:
                 state = beginning.result()
-                if self.arguments.policy:
-                    state = start_from(load_policy(self.arguments.policy), self.config, state)
+                if begun:
+                    state = start_from(begun, self.config, state)
                 self._policy(state).save(self.folder.untrained)
         self.clock["compile_s"] = time.perf_counter() - begin
         return state, step

@@ -9,7 +9,7 @@ from dexsim.errors import ConfigError
 from dexsim_ppo.policy import Policy, layout_to_list
 from dexsim_ppo.ppo import TrainState
 from dexsim_ppo.ppo_config import PPOConfig
-from dexsim_ppo.running_stats import MEMORY, RunningStats
+from dexsim_ppo.running_stats import recover_stats
 from dexsim_ppo.types import Environment
 
 
@@ -43,17 +43,9 @@ def check_fit(policy: Policy, env: Environment, config: PPOConfig) -> None:
 
 
 def start_from(policy: Policy, config: PPOConfig, state: TrainState) -> TrainState:
-    """A fresh learner's state with the policy's actor and observation statistics.
-
-    The statistics count as ones of many samples: they scarcely move, so that the network goes on seeing what it
-    was trained with.
-    """
-    normalizer, old = policy.params.normalizer, state.observation_stats["actor"]
-    # Fields of a fixed scale are not normalised by statistics: theirs say nothing.
-    moving = jnp.asarray([not field.scale for field in policy.observation_layout for _ in range(field.size)])
-    variance = jnp.maximum(normalizer.std**2 - config.observation_std_floor**2, 0.0)
-    stats = RunningStats(count=jnp.full_like(old.count, MEMORY), mean=jnp.where(moving, normalizer.mean, old.mean),
-                         variance=jnp.where(moving, variance, old.variance))
-    actor = jax.tree.map(jnp.copy, policy.params.layers)
-    return dataclasses.replace(state, params=dataclasses.replace(state.params, actor=actor),
-                               observation_stats=state.observation_stats | {"actor": stats})
+    """A fresh learner's state with the policy's actor and observation statistics, so that the network goes on seeing
+    what it was trained with."""
+    stats = recover_stats(policy.params.normalizer, std_floor=config.observation_std_floor)
+    return dataclasses.replace(
+        state, params=dataclasses.replace(state.params, actor=jax.tree.map(jnp.copy, policy.params.layers)),
+        observation_stats=state.observation_stats | {"actor": stats})

@@ -31,6 +31,15 @@ def pad(hand, finger):
     return float(part.size[0]), float(part.size[1]), part.position, part.rotation[:, 2]
 
 
+def facing(hand, finger):
+    """Where an outer finger's taxels look, across its pad's axis, and the direction across both."""
+    axis = pad(hand, finger)[3]
+    front = hand.taxel_normal[finger].mean(0)
+    front = front - axis * (front @ axis)
+    front /= np.linalg.norm(front)
+    return front, np.cross(axis, front)
+
+
 def test_area_of_a_capsule(hand):
     everything = whole_surface(hand, -1.0)  # no taxel covers anything
     for finger in range(1, hand.num_fingers):
@@ -83,11 +92,8 @@ def test_in_the_middle_of_the_pad_taxels_bear_everything(hand, surface):
 
 @pytest.mark.parametrize("finger", [1, 4])
 def test_round_the_pad_less_and_less_is_felt(hand, surface, finger):
-    radius, _, centre, axis = pad(hand, finger)
-    front = hand.taxel_normal[finger].mean(0)
-    front -= axis * (front @ axis)
-    front /= np.linalg.norm(front)
-    side = np.cross(axis, front)
+    radius, _, centre, _ = pad(hand, finger)
+    front, side = facing(hand, finger)
     felt, everything = [], []
     for angle in np.linspace(0, np.pi, 13):
         normal = np.cos(angle) * front + np.sin(angle) * side
@@ -120,10 +126,8 @@ def touched(environments, hand, angle):
     *both, state = environments
     pose = forward_kinematics(hand, state.physics.qpos[both[0].physics.joint_qpos])
     radius, _, centre, axis = pad(hand, 1)
-    front = hand.taxel_normal[1].mean(0)
-    front = front - axis * (front @ axis)
-    front /= np.linalg.norm(front)
-    direction = np.cos(angle) * front + np.sin(angle) * np.cross(axis, front)
+    front, side = facing(hand, 1)
+    direction = np.cos(angle) * front + np.sin(angle) * side
     direction = pose.tip_rotation[1] @ jnp.asarray(direction, jnp.float32)
     size = float(state.target.size[np.flatnonzero(np.asarray(state.target.active))[0], 0])
     place = (pose.body_position[hand.tip_body[1]] + pose.tip_rotation[1] @ jnp.asarray(centre)

@@ -158,6 +158,11 @@ def command_reward(value: jax.Array, goal: jax.Array, contact: jax.Array, bounds
     return jnp.sum(jnp.where(valid, match, 0.0)) / value.shape[0]
 
 
+def overload(force: jax.Array, limit: jax.Array) -> jax.Array:
+    """Forces [F] N beyond a limit [] N, summed."""
+    return jnp.sum(jnp.maximum(force - limit, 0.0))
+
+
 def joint_spread(first_joints: jax.Array) -> jax.Array:
     """R_diff: variance of the inner fingers' first joint angles."""
     return jnp.var(first_joints)
@@ -250,8 +255,7 @@ class Grasp:
                 torque / self._max_torque, wanted / config.force_per_torque / self._max_torque,
                 contact & (torque >= 0.01), (0.0, 1.0), 1.0, weights),
             "alive": held * weights.alive,
-            "overload": held * weights.overload * jnp.sum(
-                jnp.maximum(force[1:] - wanted - weights.margin, 0.0)) / config.max_force,
+            "overload": held * weights.overload * overload(force[1:], wanted + weights.margin) / config.max_force,
             "spread": weights.spread * joint_spread(moment.joint_position[self._roots[1:]]),
             "outer": weights.outer * posture_distance(
                 moment.joint_position[fingers], self._centre[fingers]),

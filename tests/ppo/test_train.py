@@ -15,8 +15,6 @@ import pytest
 import tiny_train
 from tiny_env import TinyEnv
 
-import dexsim
-import dexsim.tasks
 from dexsim_ppo import cli, evaluate, train, trainer
 from dexsim_ppo.policy import Policy
 from dexsim_ppo.runlog import RunFolder, read_metrics
@@ -30,8 +28,7 @@ PER_ITERATION = 16 * 8
 
 @pytest.fixture(autouse=True)
 def tiny_task(monkeypatch):
-    monkeypatch.setitem(dexsim.tasks.TASKS, "tiny", tiny_train.ENTRY)
-    monkeypatch.setattr(dexsim, "make", tiny_train.make, raising=False)
+    tiny_train.install(monkeypatch)
 
 
 @pytest.fixture(scope="module")
@@ -39,8 +36,7 @@ def finished(tmp_path_factory):
     """A finished run of six iterations."""
     path = tmp_path_factory.mktemp("runs") / "a"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(dexsim.tasks.TASKS, "tiny", tiny_train.ENTRY)
-        patch.setattr(dexsim, "make", tiny_train.make, raising=False)
+        tiny_train.install(patch)
         assert train.main([*QUICK, "--steps", str(6 * PER_ITERATION), "--run-dir", str(path)]) == 0
     return RunFolder(path)
 

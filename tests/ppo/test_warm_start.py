@@ -10,8 +10,6 @@ import tiny_train
 from test_train import QUICK, exit_code
 from tiny_env import CONFIG, SMALL, TinyConfig, TinyEnv
 
-import dexsim
-import dexsim.tasks
 from dexsim_ppo import evaluate, train
 from dexsim_ppo.policy import Policy
 from dexsim_ppo.ppo import make_train
@@ -31,8 +29,7 @@ def policy():
 
 @pytest.fixture
 def tiny_task(monkeypatch):
-    monkeypatch.setitem(dexsim.tasks.TASKS, "tiny", tiny_train.ENTRY)
-    monkeypatch.setattr(dexsim, "make", tiny_train.make, raising=False)
+    tiny_train.install(monkeypatch)
 
 
 def started(policy, config, env=None):

@@ -15,6 +15,12 @@ def make(task, config=None, *, backend="auto", num_envs=1):
     return TinyEnv(config, backend=backend, num_envs=num_envs)
 
 
+def install(patch):
+    """Put the task among the tasks for as long as a `pytest.MonkeyPatch` lasts."""
+    patch.setitem(dexsim.tasks.TASKS, "tiny", ENTRY)
+    patch.setattr(dexsim, "make", make, raising=False)
+
+
 if __name__ == "__main__":
     from dexsim_ppo import cli, train
 
