@@ -93,8 +93,8 @@ def dead_taxels(hand: Hand, counts: np.ndarray, threshold: float) -> np.ndarray:
     """
     most = counts.max(0).reshape(hand.taxel_grid)
     padded = np.pad(most, 1, constant_values=np.nan)
-    rows, columns = hand.taxel_grid
-    around = np.stack([padded[1 + i:1 + i + rows, 1 + j:1 + j + columns]
+    columns, rows = hand.taxel_grid
+    around = np.stack([padded[1 + i:1 + i + columns, 1 + j:1 + j + rows]
                        for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)])
     # At least half of those around must read: beside the edge of a press nothing is no fault.
     pressed = (np.nanmean(around, 0) >= threshold) & (np.nanmedian(around, 0) > 0.25 * threshold)

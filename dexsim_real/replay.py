@@ -19,11 +19,12 @@ import tyro
 from dexsim import load_hand
 from dexsim.calibration import load_calibration
 from dexsim.config import from_dict
-from dexsim.observation import Readings
+from dexsim.observation import Field, Readings, layout
 from dexsim_ppo import cli
 from dexsim_real import frames
 from dexsim_real.control import load_task, make_observe, prepare_jax
 from dexsim_real.log import Kind, LogError, LogReader
+from dexsim_real.replay_view import plot, show_rerun
 from dexsim_real.sensing import HandSensing, HardwareConfig, Measured
 
 MEASURED = ("joint_position", "joint_torque", "taxel_force")
@@ -36,9 +37,11 @@ class ReplayArguments:
     log: Annotated[Path, tyro.conf.Positional]
     """A log of `dexsim_real.run`."""
     plot: Path | None = None
-    """File for a figure of angles, forces and timing (matplotlib)."""
+    """File for a figure of angles, forces, timing and the observation (matplotlib)."""
     rerun: bool = False
-    """Show it in the rerun viewer (extra: pip install rerun-sdk)."""
+    """Show it in the rerun viewer, taxels as pictures (extra: pip install 'dexsim[rerun]')."""
+    rrd: Path | None = None
+    """File for the rerun viewer, to be opened on another machine."""
     output: Path | None = None
     """File for the report as JSON."""
 
@@ -51,6 +54,8 @@ class Replay:
     time: np.ndarray  # [T] s since the first tick
     measured: list[Measured]  # by tick
     ticks: list[dict[str, Any]]  # as logged
+    observation: np.ndarray  # [T, n] recomputed
+    fields: tuple[Field, ...]  # of the observation
 
 
 def replay(path: Path) -> Replay:
@@ -61,13 +66,14 @@ def replay(path: Path) -> Replay:
     """
     reader = LogReader(path)
     states: dict[int, bytes] = {}
-    times, measured, ticks, notes = [], [], [], []
+    times, measured, ticks, observations, notes = [], [], [], [], []
+    fields: tuple[Field, ...] = ()
     counts = dict.fromkeys(("frames", "readings_same", "observations_same", "without_frame"), 0)
     first, meta, end = "", None, None
     for record in reader:
         if record.kind == Kind.META:
             meta = record.content
-            sensing, observe = _rebuild(meta)
+            sensing, observe, fields = _rebuild(meta)
         elif record.kind == Kind.RECEIVED:
             number, frame = record.content
             counts["frames"] += 1
@@ -92,6 +98,7 @@ def replay(path: Path) -> Replay:
             times.append(record.time)
             measured.append(now)
             ticks.append(tick)
+            observations.append(observation)
         elif record.kind == Kind.NOTE:
             notes.append(f"{record.time:.3f} {record.content}")
         elif record.kind == Kind.END:
@@ -102,11 +109,11 @@ def replay(path: Path) -> Replay:
               "seconds": times[-1] - times[0] if times else 0.0, "first_difference": first or None,
               "damaged_bytes": reader.damaged, "ended": end["end"] if end else "cut off", "notes": notes,
               "recorded_on": meta["environment"]}
-    return Replay(report, np.array(times) - (times[0] if times else 0.0), measured, ticks)
+    return Replay(report, np.array(times) - (times[0] if times else 0.0), measured, ticks, np.array(observations), fields)
 
 
-def _rebuild(meta: dict[str, Any]) -> tuple[HandSensing, Any]:
-    """The sensing and the observation of a logged run."""
+def _rebuild(meta: dict[str, Any]) -> tuple[HandSensing, Any, tuple[Field, ...]]:
+    """The sensing of a logged run, its observation, and the fields of that."""
     hand, calibration = load_hand(), None
     if meta["calibration"]:
         with tempfile.TemporaryDirectory() as folder:
@@ -116,64 +123,13 @@ def _rebuild(meta: dict[str, Any]) -> tuple[HandSensing, Any]:
     sensing = HandSensing(hand, from_dict(HardwareConfig, meta["hardware"]), calibration)
     sensing.tare = np.array(meta["tare"], np.float32)
     task = load_task(meta["task"], meta["env_config"], hand)
-    return sensing, make_observe(hand, task.fields["actor"], task.config.observation)
+    names, config = task.fields["actor"], task.config.observation
+    return sensing, make_observe(hand, names, config), layout(hand, names, config)
 
 
 def _same(a: np.ndarray, b: np.ndarray) -> bool:
     """Equal bit for bit."""
     return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
-
-
-def plot(run: Replay, path: Path) -> None:
-    """A figure: joint angles against targets, finger forces and command, ages."""
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(3, 1, figsize=(10, 9), sharex=True, constrained_layout=True)
-    hand = load_hand()
-    angle = np.array([m.joint_position for m in run.measured])
-    target = np.array([tick["target"] for tick in run.ticks])
-    for joint, name in enumerate(hand.joint_names):
-        (line,) = axes[0].plot(run.time, angle[:, joint], lw=1, label=name.removeprefix("right_hand_"))
-        axes[0].plot(run.time, target[:, joint], lw=0.6, ls=":", color=line.get_color())
-    axes[0].set_ylabel("joint angle, target (dotted) / rad")
-    axes[0].legend(fontsize=6, ncols=4)
-    force = np.array([m.finger_force for m in run.measured])
-    for finger, name in enumerate(hand.finger_names):
-        axes[1].plot(run.time, force[:, finger], lw=1, label=name)
-    axes[1].set_ylabel("fingertip force / N")
-    axes[1].legend(fontsize=7, ncols=5)
-    command = axes[1].twinx()
-    command.plot(run.time, [float(tick["readings"]["command"]) for tick in run.ticks], "k--", lw=0.8)
-    command.set_ylabel("command / 1")
-    axes[2].plot(run.time, [1e3 * tick["age"] for tick in run.ticks], lw=0.8)
-    axes[2].set_ylabel("age of the measurement / ms")
-    axes[2].set_xlabel("time / s")
-    figure.savefig(path, dpi=120)
-    plt.close(figure)
-
-
-def show_rerun(run: Replay) -> None:
-    """The same in the rerun viewer, with taxels as images.
-
-    Raises:
-      LogError: rerun is not installed.
-    """
-    try:
-        import rerun
-    except ImportError:
-        raise LogError("the rerun viewer is missing: pip install rerun-sdk (or use --plot)") from None
-    hand = load_hand()
-    columns, rows = hand.taxel_grid
-    rerun.init("dexsim", spawn=True)
-    for at, now, tick in zip(run.time, run.measured, run.ticks, strict=True):
-        rerun.set_time("run", duration=float(at))
-        for joint, name in enumerate(hand.joint_names):
-            rerun.log(f"angle/{name}", rerun.Scalars(float(now.joint_position[joint])))
-            rerun.log(f"target/{name}", rerun.Scalars(float(tick["target"][joint])))
-        for finger, name in enumerate(hand.finger_names):
-            rerun.log(f"force/{name}", rerun.Scalars(float(now.finger_force[finger])))
-            rerun.log(f"taxels/{name}", rerun.Tensor(now.taxel_force[finger].reshape(columns, rows)))
-        rerun.log("command", rerun.Scalars(float(tick["readings"]["command"])))
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -198,8 +154,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments.plot and run.ticks:
         plot(run, arguments.plot)
         print(f"figure: {arguments.plot}")
-    if arguments.rerun:
+    if arguments.rerun and run.ticks:
         show_rerun(run)
+    if arguments.rrd and run.ticks:
+        show_rerun(run, arguments.rrd)
+        print(f"for the rerun viewer: {arguments.rrd}")
     return 0 if same else 1
 
 

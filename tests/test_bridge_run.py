@@ -271,6 +271,78 @@ def test_a_run_from_the_measured_pose_to_motors_off_and_its_replay(hand, tmp_pat
     assert replay.main([str(tmp_path / "run.log"), "--plot", str(tmp_path / "run.png")]) == 0
     assert (tmp_path / "run.png").stat().st_size > 10_000
     forged(tmp_path)
+    seen_in_rerun(tmp_path)
+
+
+class Rerun:
+    """Stands in for the rerun package, which is an extra of 170 MB: keeps what is sent to the viewer."""
+
+    class RecordingStream:
+        def __init__(self, name):
+            self.columns, self.pictures, self.names, self.saved = {}, [], {}, None
+            Rerun.last = self
+
+        def save(self, path):
+            self.saved = path
+
+        def set_time(self, timeline, duration):
+            self.now = duration
+
+        def log(self, entity, what, static=False):
+            self.names.update({entity: what}) if static else self.pictures.append((self.now, entity, what))
+
+        def send_columns(self, entity, indexes, columns):
+            self.columns[entity] = indexes[0], columns
+
+        def disconnect(self):
+            pass
+
+    class Scalars:
+        @staticmethod
+        def columns(scalars):
+            return scalars
+
+    @staticmethod
+    def SeriesLines(names):
+        return names
+
+    @staticmethod
+    def TimeColumn(timeline, duration):
+        return duration
+
+    @staticmethod
+    def DepthImage(picture, **_):
+        return picture
+
+
+def seen_in_rerun(folder):
+    """What goes to the viewer is what the log says, under the names of joints, fingers and fields."""
+    path = folder / "run.log"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(sys.modules, "rerun", None)
+        with pytest.raises(LogError, match=r"pip install 'dexsim\[rerun\]'"):
+            replay.show_rerun(replay.replay(path), folder / "run.rrd")
+        patch.setitem(sys.modules, "rerun", Rerun)
+        assert replay.main([str(path), "--rrd", str(folder / "run.rrd")]) == 0
+    sent, ticks = Rerun.last, records(folder, Kind.TICK)
+    assert sent.saved == folder / "run.rrd"
+    for entity, key in (("angle", "joint_position"), ("observation/joint_position", "joint_position")):
+        np.testing.assert_array_equal(sent.columns[entity][1], [tick["readings"][key] for tick in ticks])
+    whole = np.concatenate([values for entity, (_, values) in sent.columns.items() if "observation/" in entity], 1)
+    np.testing.assert_array_equal(whole, [tick["observation"] for tick in ticks])
+    for entity, (times, values) in sent.columns.items():
+        assert values.shape == (len(times), len(sent.names[entity])) and len(times) == len(ticks), entity
+        assert times[0] == 0 and np.all(np.diff(times) > 0)
+    assert len(sent.pictures) == 5 * len(ticks) and {picture.shape for *_, picture in sent.pictures} == {(12, 10)}
+
+
+def test_the_real_viewer_takes_a_replay(tmp_path):
+    """Not in the suite's environment: `pip install rerun-sdk` first."""
+    pytest.importorskip("rerun")
+    with FollowingHand() as peer:
+        assert run.main(arguments(peer, tmp_path, "--seconds", "0.5")) == 0
+    assert replay.main([str(tmp_path / "run.log"), "--rrd", str(tmp_path / "run.rrd")]) == 0
+    assert (tmp_path / "run.rrd").read_bytes()[:3] == b"RRF"
 
 
 def forged(folder):
