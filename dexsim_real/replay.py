@@ -109,7 +109,8 @@ def replay(path: Path) -> Replay:
               "seconds": times[-1] - times[0] if times else 0.0, "first_difference": first or None,
               "damaged_bytes": reader.damaged, "ended": end["end"] if end else "cut off", "notes": notes,
               "recorded_on": meta["environment"]}
-    return Replay(report, np.array(times) - (times[0] if times else 0.0), measured, ticks, np.array(observations), fields)
+    since = np.array(times) - (times[0] if times else 0.0)
+    return Replay(report, since, measured, ticks, np.array(observations), fields)
 
 
 def _rebuild(meta: dict[str, Any]) -> tuple[HandSensing, Any, tuple[Field, ...]]:

@@ -44,7 +44,7 @@ from dexsim_ppo.running_stats import Normalizer
 from dexsim_real import control, frames, imu, replay, run, view
 from dexsim_real.control import Controller
 from dexsim_real.frames import Mode
-from dexsim_real.log import Kind, LogReader
+from dexsim_real.log import Kind, LogError, LogReader
 from dexsim_real.sensing import HandSensing, HardwareConfig, ObjectEstimate
 from dexsim_real.trouble import HandError
 

@@ -186,7 +186,7 @@ class TestReward:
         assert float(metrics["reward/overload"]) == pytest.approx(-2.0 * 2.0 / 10, rel=1e-5)
         _, lost = task.reward(goal_of(0.5), make_moment(hand, finger_force=force), jnp.ones((), bool))
         assert float(lost["reward/overload"]) == 0.0
-        assert GraspReward().overload == 0.0, "the shipped policy was trained without"
+        assert GraspReward().overload == 0.0, "off unless asked for"
 
     def test_the_torque_target_goes_with_the_force_target(self, hand, task):
         """At force_per_torque = 19 N/Nm a finger on its force target is on its torque target."""

@@ -62,6 +62,8 @@ def test_its_report_is_of_this_file_and_says_how_it_came_about(name):
     assert report["origin"]["seed"] == policy.training["seed"]
     for key in ("command", "hardware", "versions", "trained", "untrained"):
         assert report[key]
+    # Else what the emulated hand draws outside the ranges would not be outside for it.
+    assert not report["arguments"]["env"]["randomization"].get("beyond") and "beyond" not in report["command"]
 
 
 def test_a_blinded_policy_takes_the_mean_of_what_it_does_not_see():
