@@ -31,6 +31,10 @@ def run(main: Callable[[Sequence[str] | None], int]) -> None:
     except DexsimError as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         code = 2
+    except OSError as error:  # A file, a folder or a disk.
+        where = f"{error.filename}: " if error.filename else ""
+        print(f"error: {where}{error.strerror or error}", file=sys.stderr)
+        code = 2
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         code = 130

@@ -48,6 +48,7 @@ def plot(run: Replay, path: Path) -> None:
     axes[3].invert_yaxis()
     axes[3].set_title("observation, each entry in standard deviations from its mean", fontsize=9)
     axes[3].set_xlabel("time / s")
+    path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=120)
     plt.close(figure)
 
@@ -58,6 +59,7 @@ def show_rerun(run: Replay, path: Path | None = None) -> None:
 
     Raises:
       LogError: rerun is not installed.
+      OSError: the file cannot be written.
     """
     try:
         import rerun
@@ -75,7 +77,12 @@ def show_rerun(run: Replay, path: Path | None = None) -> None:
            for field, values in zip(run.fields, np.split(run.observation, edges, 1), strict=True)},
     }
     recording = rerun.RecordingStream("dexsim")
-    recording.spawn() if path is None else recording.save(path)
+    if path is None:
+        recording.spawn()
+    else:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()  # Where that fails it says which file; rerun would not.
+        recording.save(path)
     for entity, (names, values) in series.items():
         recording.log(entity, rerun.SeriesLines(names=list(names)), static=True)
         recording.send_columns(entity, [rerun.TimeColumn("run", duration=run.time)],

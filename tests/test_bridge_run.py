@@ -323,9 +323,9 @@ def seen_in_rerun(folder):
         with pytest.raises(LogError, match=r"pip install 'dexsim\[rerun\]'"):
             replay.show_rerun(replay.replay(path), folder / "run.rrd")
         patch.setitem(sys.modules, "rerun", Rerun)
-        assert replay.main([str(path), "--rrd", str(folder / "run.rrd")]) == 0
+        assert replay.main([str(path), "--rrd", str(folder / "new" / "run.rrd")]) == 0
     sent, ticks = Rerun.last, records(folder, Kind.TICK)
-    assert sent.saved == folder / "run.rrd"
+    assert sent.saved == folder / "new" / "run.rrd"
     for entity, key in (("angle", "joint_position"), ("observation/joint_position", "joint_position")):
         np.testing.assert_array_equal(sent.columns[entity][1], [tick["readings"][key] for tick in ticks])
     whole = np.concatenate([values for entity, (_, values) in sent.columns.items() if "observation/" in entity], 1)

@@ -196,6 +196,14 @@ def test_files_are_never_overwritten_or_mistaken(finished, tmp_path, monkeypatch
     assert before == {p: p.read_bytes() for p in finished.path.rglob("*") if p.is_file()}
 
 
+def test_a_file_that_cannot_be_written_is_one_line(tmp_path, capsys):
+    (tmp_path / "taken").write_text("")
+    assert exit_code(lambda path: Path(path).mkdir(), str(tmp_path / "taken")) == 2
+    assert capsys.readouterr().err == f"error: {tmp_path / 'taken'}: File exists\n"
+    assert exit_code(lambda _: (_ for _ in ()).throw(OSError("no room left")), None) == 2
+    assert capsys.readouterr().err == "error: no room left\n"
+
+
 def exit_code(main, arguments):
     with pytest.raises(SystemExit) as stop:
         cli.run(lambda _: main(arguments))
