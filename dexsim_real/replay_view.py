@@ -15,28 +15,34 @@ if TYPE_CHECKING:
     from dexsim_real.replay import Replay
 
 
+def signals(run: Replay) -> dict[str, np.ndarray]:
+    """What both show, [T, n] each: angles and their targets (rad), forces (N), command (1), age of the reading (s)."""
+    return {"angle": np.array([now.joint_position for now in run.measured]),
+            "target": np.array([tick["target"] for tick in run.ticks]),
+            "force": np.array([now.finger_force for now in run.measured]),
+            "command": np.array([[float(tick["readings"]["command"])] for tick in run.ticks]),
+            "age": np.array([[tick["age"]] for tick in run.ticks])}
+
+
 def plot(run: Replay, path: Path) -> None:
     """A figure: joint angles against targets, finger forces and command, ages, and what the policy saw."""
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(4, 1, figsize=(10, 13), sharex=True, constrained_layout=True)
-    hand = load_hand()
-    angle = np.array([m.joint_position for m in run.measured])
-    target = np.array([tick["target"] for tick in run.ticks])
+    hand, seen = load_hand(), signals(run)
     for joint, name in enumerate(hand.joint_names):
-        (line,) = axes[0].plot(run.time, angle[:, joint], lw=1, label=name.removeprefix("right_hand_"))
-        axes[0].plot(run.time, target[:, joint], lw=0.6, ls=":", color=line.get_color())
+        (line,) = axes[0].plot(run.time, seen["angle"][:, joint], lw=1, label=name.removeprefix("right_hand_"))
+        axes[0].plot(run.time, seen["target"][:, joint], lw=0.6, ls=":", color=line.get_color())
     axes[0].set_ylabel("joint angle, target (dotted) / rad")
     axes[0].legend(fontsize=6, ncols=4)
-    force = np.array([m.finger_force for m in run.measured])
     for finger, name in enumerate(hand.finger_names):
-        axes[1].plot(run.time, force[:, finger], lw=1, label=name)
+        axes[1].plot(run.time, seen["force"][:, finger], lw=1, label=name)
     axes[1].set_ylabel("fingertip force / N")
     axes[1].legend(fontsize=7, ncols=5)
     command = axes[1].twinx()
-    command.plot(run.time, [float(tick["readings"]["command"]) for tick in run.ticks], "k--", lw=0.8)
+    command.plot(run.time, seen["command"], "k--", lw=0.8)
     command.set_ylabel("command / 1")
-    axes[2].plot(run.time, [1e3 * tick["age"] for tick in run.ticks], lw=0.8)
+    axes[2].plot(run.time, 1e3 * seen["age"], lw=0.8)
     axes[2].set_ylabel("age of the measurement / ms")
     # Entries differ in unit and size, so each is shown by how far it is from its own mean.
     spread = np.maximum(run.observation.std(0), 1e-6)
@@ -67,12 +73,9 @@ def show_rerun(run: Replay, path: Path | None = None) -> None:
         raise LogError("the rerun viewer is missing: pip install 'dexsim[rerun]' (or use --plot)") from None
     hand = load_hand()
     edges = np.cumsum([field.size for field in run.fields])[:-1]
+    names = {"angle": hand.joint_names, "target": hand.joint_names, "force": hand.finger_names}
     series = {
-        "angle": (hand.joint_names, np.array([m.joint_position for m in run.measured])),
-        "target": (hand.joint_names, np.array([tick["target"] for tick in run.ticks])),
-        "force": (hand.finger_names, np.array([m.finger_force for m in run.measured])),
-        "command": (("command",), np.array([[float(tick["readings"]["command"])] for tick in run.ticks])),
-        "age": (("age",), np.array([[tick["age"]] for tick in run.ticks])),
+        **{name: (names.get(name, (name,)), values) for name, values in signals(run).items()},
         **{f"observation/{field.name}": (tuple(f"{field.name} {i}" for i in range(field.size)), values)
            for field, values in zip(run.fields, np.split(run.observation, edges, 1), strict=True)},
     }
@@ -83,8 +86,8 @@ def show_rerun(run: Replay, path: Path | None = None) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.touch()  # Where that fails it says which file; rerun would not.
         recording.save(path)
-    for entity, (names, values) in series.items():
-        recording.log(entity, rerun.SeriesLines(names=list(names)), static=True)
+    for entity, (labels, values) in series.items():
+        recording.log(entity, rerun.SeriesLines(names=list(labels)), static=True)
         recording.send_columns(entity, [rerun.TimeColumn("run", duration=run.time)],
                                rerun.Scalars.columns(scalars=values))
     top = max(float(np.max([m.taxel_force for m in run.measured])), 1e-3)

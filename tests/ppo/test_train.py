@@ -200,8 +200,12 @@ def test_a_file_that_cannot_be_written_is_one_line(tmp_path, capsys):
     (tmp_path / "taken").write_text("")
     assert exit_code(lambda path: Path(path).mkdir(), str(tmp_path / "taken")) == 2
     assert capsys.readouterr().err == f"error: {tmp_path / 'taken'}: File exists\n"
-    assert exit_code(lambda _: (_ for _ in ()).throw(OSError("no room left")), None) == 2
+    assert exit_code(full_disk, None) == 2
     assert capsys.readouterr().err == "error: no room left\n"
+
+
+def full_disk(_):
+    raise OSError("no room left")
 
 
 def exit_code(main, arguments):
