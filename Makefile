@@ -36,6 +36,7 @@ test: $(TESTABLE)
 
 lint: $(LINTABLE)
 	$(PY) -m ruff check $(ARGS)
+	$(PY) -m ruff format --check
 
 clean:
 	rm -rf $(VENV) dist .pytest_cache .ruff_cache

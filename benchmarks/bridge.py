@@ -59,14 +59,15 @@ def peer() -> None:
                 reply = Frame(0x80, frames.HOST, Command.EXCHANGE, state.tobytes()).encode()
                 time.sleep(max(due - time.monotonic(), 0.0))
                 while reply:
-                    reply = reply[os.write(master, reply):]
+                    reply = reply[os.write(master, reply) :]
 
 
 @contextlib.contextmanager
 def scripted_hand():
     """A runner's options for a scripted hand in its own process."""
-    process = subprocess.Popen([sys.executable, __file__, "--peer"], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-                               env=ENVIRONMENT)
+    process = subprocess.Popen(
+        [sys.executable, __file__, "--peer"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=ENVIRONMENT
+    )
     try:
         yield ["--port", process.stdout.readline().decode().strip(), "--fixed-object"]
     finally:
@@ -79,8 +80,24 @@ def emulated_hand(task: str, folder: Path):
     """A runner's options for `python -m dexsim_real.twin`."""
     port, imu, masks = (folder / name for name in ("hand", "imu", "masks"))
     process = subprocess.Popen(
-        [sys.executable, "-m", "dexsim_real.twin", "--task", task, "--trials", "100000", "--link", str(port),
-         "--imu-link", str(imu), "--mask-socket", str(masks)], stdout=subprocess.PIPE, env=ENVIRONMENT)
+        [
+            sys.executable,
+            "-m",
+            "dexsim_real.twin",
+            "--task",
+            task,
+            "--trials",
+            "100000",
+            "--link",
+            str(port),
+            "--imu-link",
+            str(imu),
+            "--mask-socket",
+            str(masks),
+        ],
+        stdout=subprocess.PIPE,
+        env=ENVIRONMENT,
+    )
     try:
         process.stdout.readline()
         threading.Thread(target=process.stdout.read, daemon=True).start()
@@ -110,9 +127,10 @@ def own_loops(ticks: dict, waited: dict, intervals: np.ndarray) -> dict[str, dic
     for pace, times in sorted(ticks.items(), key=lambda x: len(x[1]))[-2:]:
         first, (due, met) = round(1 / pace.period), np.reshape(times, (-1, 2)).T
         # Starting up ends with a fresh count.
-        known = np.array([*waited[pace], 0][:len(due) + 1] if pace in waited else np.zeros(len(due) + 1), int)
+        known = np.array([*waited[pace], 0][: len(due) + 1] if pace in waited else np.zeros(len(due) + 1), int)
         own["exchange_loop" if pace in waited else "policy_loop"] = own_timing(
-            due[first:], met[first:], pace.period, intervals, np.maximum(np.diff(known), 0)[first:])
+            due[first:], met[first:], pace.period, intervals, np.maximum(np.diff(known), 0)[first:]
+        )
     return own
 
 
@@ -137,9 +155,22 @@ def measure_run(options: argparse.Namespace, hand: list[str], folder: Path) -> d
         waited[loop.pace].append(loop.waited)
         return cycle(loop)
 
-    arguments = [options.policy, *hand, "--uncalibrated", "--link.settle", "0.1", "--quiet",
-                 "--seconds", str(options.seconds), "--approach", "1", "--log", str(folder / "bridge.log"),
-                 "--output", str(folder / "bridge.json")]
+    arguments = [
+        options.policy,
+        *hand,
+        "--uncalibrated",
+        "--link.settle",
+        "0.1",
+        "--quiet",
+        "--seconds",
+        str(options.seconds),
+        "--approach",
+        "1",
+        "--log",
+        str(folder / "bridge.log"),
+        "--output",
+        str(folder / "bridge.json"),
+    ]
     threading.Thread(target=watch, daemon=True).start()
     servo.Pace.wait, servo.Servo._cycle = noted, counted
     start = time.process_time()
@@ -151,14 +182,23 @@ def measure_run(options: argparse.Namespace, hand: list[str], folder: Path) -> d
     summary = json.loads((folder / "bridge.json").read_text())
     exchanges, link = summary["exchange_jitter"], summary["link"]
     return {
-        "exit": code, "seconds": summary["seconds"], "policy_loop": summary["policy_jitter"],
-        "exchange_loop": exchanges, "round_trip": summary["round_trip"], "tick": summary["policy_compute"],
-        "own": own_loops(ticks, waited, away.intervals), "machine_away": away.summary(),
+        "exit": code,
+        "seconds": summary["seconds"],
+        "policy_loop": summary["policy_jitter"],
+        "exchange_loop": exchanges,
+        "round_trip": summary["round_trip"],
+        "tick": summary["policy_compute"],
+        "own": own_loops(ticks, waited, away.intervals),
+        "machine_away": away.summary(),
         "missed_by_us": exchanges["missed"] - summary["missed_for_the_hand"],
         "missed_for_the_hand": summary["missed_for_the_hand"],
-        "unanswered": link["sent"] - link["answered"], "holds": summary["safety"],
-        "memory_mib": [round(m, 1) for m in memory[2::4]], "cpu_share": round(used / summary["seconds"], 3),
-        "log_mib": round((folder / "bridge.log").stat().st_size / 2**20, 1), "log_dropped": summary["log_dropped"]}
+        "unanswered": link["sent"] - link["answered"],
+        "holds": summary["safety"],
+        "memory_mib": [round(m, 1) for m in memory[2::4]],
+        "cpu_share": round(used / summary["seconds"], 3),
+        "log_mib": round((folder / "bridge.log").stat().st_size / 2**20, 1),
+        "log_dropped": summary["log_dropped"],
+    }
 
 
 def measure_compute(policy: str, ticks: int) -> dict:
@@ -188,9 +228,10 @@ def measure_compute(policy: str, ticks: int) -> dict:
         both.append(time.perf_counter() - middle)
         whole.append(middle - start)
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-    return {name: {f"p{q}_ms": round(1e3 * float(np.percentile(times, q)), 4) for q in (50, 99)}
-            for name, times in (("observe_and_policy", both), ("whole_tick", whole))} | {
-                "ticks": ticks, "realtime": realtime}
+    return {
+        name: {f"p{q}_ms": round(1e3 * float(np.percentile(times, q)), 4) for q in (50, 99)}
+        for name, times in (("observe_and_policy", both), ("whole_tick", whole))
+    } | {"ticks": ticks, "realtime": realtime}
 
 
 def main() -> None:
@@ -208,12 +249,21 @@ def main() -> None:
     from dexsim_real.control import prepare_jax
 
     prepare_jax()
-    common = {"policy": options.policy, "hand": options.port or options.twin or "scripted",
-              "cores": len(os.sched_getaffinity(0)), "load": os.getloadavg()[0]}
+    common = {
+        "policy": options.policy,
+        "hand": options.port or options.twin or "scripted",
+        "cores": len(os.sched_getaffinity(0)),
+        "load": os.getloadavg()[0],
+    }
     print(json.dumps({"measure": "compute", **measure_compute(options.policy, options.ticks), **common}), flush=True)
     with tempfile.TemporaryDirectory() as folder:
-        hand = (contextlib.nullcontext(["--port", options.port, "--fixed-object"]) if options.port
-                else emulated_hand(options.twin, Path(folder)) if options.twin else scripted_hand())
+        hand = (
+            contextlib.nullcontext(["--port", options.port, "--fixed-object"])
+            if options.port
+            else emulated_hand(options.twin, Path(folder))
+            if options.twin
+            else scripted_hand()
+        )
         with hand as words:
             row = measure_run(options, words, Path(folder))
         print(json.dumps({"measure": "run", **row, **common, "load": os.getloadavg()[0]}), flush=True)

@@ -34,8 +34,10 @@ class Away:
             return self
         self.allowed = True
         try:
-            self._sentinels = [subprocess.Popen([sys.executable, __file__, str(core)], stdout=subprocess.PIPE)
-                               for core in sorted(os.sched_getaffinity(0))]
+            self._sentinels = [
+                subprocess.Popen([sys.executable, __file__, str(core)], stdout=subprocess.PIPE)
+                for core in sorted(os.sched_getaffinity(0))
+            ]
         finally:
             os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
         for process in self._sentinels:
@@ -53,8 +55,12 @@ class Away:
     def summary(self) -> dict[str, float]:
         """How often and how long."""
         lengths = self.intervals[:, 1] - self.intervals[:, 0]
-        return {"watched": self.allowed, "times": len(lengths), "seconds": round(float(lengths.sum()), 3),
-                "longest_ms": round(1e3 * float(lengths.max(initial=0.0)), 1)}
+        return {
+            "watched": self.allowed,
+            "times": len(lengths),
+            "seconds": round(float(lengths.sum()), 3),
+            "longest_ms": round(1e3 * float(lengths.max(initial=0.0)), 1),
+        }
 
 
 def merged(intervals: list) -> np.ndarray:
@@ -76,8 +82,9 @@ def overlaps(begin: np.ndarray, end: np.ndarray, intervals: np.ndarray) -> np.nd
     return starts[first] <= end
 
 
-def own_timing(due: np.ndarray, met: np.ndarray, period: float, intervals: np.ndarray,
-               others: np.ndarray | None = None) -> dict[str, float]:
+def own_timing(
+    due: np.ndarray, met: np.ndarray, period: float, intervals: np.ndarray, others: np.ndarray | None = None
+) -> dict[str, float]:
     """A loop's lateness and missed deadlines while the machine let it run.
 
     Args:
@@ -92,9 +99,13 @@ def own_timing(due: np.ndarray, met: np.ndarray, period: float, intervals: np.nd
     if others is not None:
         missed = missed - others[1:]
     mine = late[~held_up]
-    return {"count": len(mine), "left_out": round(float(np.mean(held_up)), 4), "missed": int(missed[~held_up].sum()),
-            **{f"p{q}_ms": round(1e3 * float(np.percentile(mine, q)), 3) for q in (50, 99)},
-            "max_ms": round(1e3 * float(mine.max()), 3)}
+    return {
+        "count": len(mine),
+        "left_out": round(float(np.mean(held_up)), 4),
+        "missed": int(missed[~held_up].sum()),
+        **{f"p{q}_ms": round(1e3 * float(np.percentile(mine, q)), 3) for q in (50, 99)},
+        "max_ms": round(1e3 * float(mine.max()), 3),
+    }
 
 
 def watch(core: int) -> None:

@@ -25,8 +25,16 @@ from pathlib import Path
 import numpy as np
 
 ROOT = Path(__file__).resolve().parent.parent
-RATES = {"flip": 0.01, "drop": 0.01, "duplicate": 0.01, "late": 0.002, "stall": 0.002, "disconnect": 0.0007,
-         "heat": 0.0002, "stuck": 0.0003}
+RATES = {
+    "flip": 0.01,
+    "drop": 0.01,
+    "duplicate": 0.01,
+    "late": 0.002,
+    "stall": 0.002,
+    "disconnect": 0.0007,
+    "heat": 0.0002,
+    "stuck": 0.0003,
+}
 """Shares of all exchanges, of which there are 83 a second."""
 GATED = """
 import sys
@@ -68,9 +76,26 @@ class TwinProcess:
         self.port, self.masks, self._report = folder / "hand", folder / "masks", folder / "twin.json"
         self._shown = (folder / "twin.txt").open("w")
         self.process = start(
-            "-m", "dexsim_real.twin", "--task", "grasp", "--trials", "100000", "--seed", str(options.seed), "--link",
-            str(self.port), "--mask-socket", str(self.masks), "--output", str(self._report), *options.twin.split(),
-            *([] if options.realtime else ["--no-realtime"]), *words, stdout=self._shown, stderr=subprocess.STDOUT)
+            "-m",
+            "dexsim_real.twin",
+            "--task",
+            "grasp",
+            "--trials",
+            "100000",
+            "--seed",
+            str(options.seed),
+            "--link",
+            str(self.port),
+            "--mask-socket",
+            str(self.masks),
+            "--output",
+            str(self._report),
+            *options.twin.split(),
+            *([] if options.realtime else ["--no-realtime"]),
+            *words,
+            stdout=self._shown,
+            stderr=subprocess.STDOUT,
+        )
         until = time.monotonic() + 60
         while not self.masks.exists():
             if self.process.poll() is not None or time.monotonic() > until:
@@ -87,9 +112,25 @@ class TwinProcess:
 
 def runner_words(twin: TwinProcess, options: argparse.Namespace, log: Path, seconds: float) -> list[str]:
     """Options of the runner."""
-    return ["grasp", "--port", str(twin.port), "--camera", f"unix:{twin.masks}", "--uncalibrated", "--quiet",
-            "--link.settle", "0.1", "--approach", "1", "--seconds", f"{seconds:g}", "--log", str(log),
-            *options.runner.split(), *([] if options.realtime else ["--no-realtime"])]
+    return [
+        "grasp",
+        "--port",
+        str(twin.port),
+        "--camera",
+        f"unix:{twin.masks}",
+        "--uncalibrated",
+        "--quiet",
+        "--link.settle",
+        "0.1",
+        "--approach",
+        "1",
+        "--seconds",
+        f"{seconds:g}",
+        "--log",
+        str(log),
+        *options.runner.split(),
+        *([] if options.realtime else ["--no-realtime"]),
+    ]
 
 
 def report_line(row: dict, checks: dict[str, bool]) -> bool:
@@ -101,6 +142,7 @@ def report_line(row: dict, checks: dict[str, bool]) -> bool:
 
 # --- soak ----------------------------------------------------------------------------------------
 
+
 def soak(options: argparse.Namespace) -> bool:
     """Runs with every fault, until the time is over; whether all was as it should be."""
     runs, memory, twin_memory = [], [], []
@@ -111,14 +153,19 @@ def soak(options: argparse.Namespace) -> bool:
         begun, begun_stolen = time.monotonic(), stolen()
         while (left := options.minutes * 60 - (time.monotonic() - begun)) > 1:
             log = folder / f"{len(runs)}.log"
-            process = start("-m", "dexsim_real.run", *runner_words(twin, options, log, min(left, options.run_seconds)),
-                            stderr=subprocess.PIPE)
+            process = start(
+                "-m",
+                "dexsim_real.run",
+                *runner_words(twin, options, log, min(left, options.run_seconds)),
+                stderr=subprocess.PIPE,
+            )
             largest = 0.0
             while process.poll() is None:
                 time.sleep(0.5)
                 largest = max(largest, np.nan_to_num(resident(process.pid)))
-            runs.append({"code": process.returncode, "stderr": process.stderr.read().decode(),
-                         **inspect(log, options.safe)})
+            runs.append(
+                {"code": process.returncode, "stderr": process.stderr.read().decode(), **inspect(log, options.safe)}
+            )
             memory.append(largest)
             twin_memory.append(resident(twin.process.pid))
             log.unlink()
@@ -131,7 +178,8 @@ def soak(options: argparse.Namespace) -> bool:
         "no crash": all(run["code"] in (0, 1, 2) and "Traceback" not in run["stderr"] for run in runs),
         "every run that began ended as it should": all(
             run["end"] == "time is over" or run["end"].startswith("stopped: too hot") or run["code"] == 2
-            for run in runs),
+            for run in runs
+        ),
         "logs whole": not any(run["damaged"] for run in runs),
         "commands within limits": commands["checked"] > 0 and not commands["outside_limits"],
         "host safe in time": max(holds, default=0.0) <= options.safe,
@@ -139,20 +187,39 @@ def soak(options: argparse.Namespace) -> bool:
         "hot motors off in time": max(heat, default=0.0) <= options.safe,
         "stuck taxels seen": all(run["stuck"](report["stuck"]) for run in runs[-1:]),
         # Where the machine itself held the hand up, an answer may have been late without any fault.
-        **{f"counters: {name}": abs(found - made) <= report["hiccups"] for name, (found, made) in both.items()}}
-    return report_line({
-        "measure": "soak", "minutes": round(seconds / 60, 2), "runs": len(runs),
-        "ends": dict(Counter(run["end"] for run in runs)), "injected": report["faults"]["injected"],
-        "host": dict(host), "host_against_injected": both, "exchanges": report["line"].get("requests", 0),
-        "commands": commands["checked"], "outside_limits": commands["outside_limits"], "first": commands["first"][:3],
-        "hand_lost_host": len(watchdog["trips"]), "hand_safe_ms": round(1e3 * watchdog["longest_s"], 1),
-        "host_lost_hand": len(holds), "host_safe_ms": round(1e3 * max(holds, default=0.0), 1),
-        "hot": len(heat), "hot_off_ms": round(1e3 * max(heat, default=0.0), 1),
-        "slowest_exchange_ms": report["slowest_exchange_ms"], "hiccups": report["hiccups"],
-        "stolen_s": round(stolen() - begun_stolen, 2), "physics": report["physics"],
-        "runner_mib": [round(m, 1) for m in memory], "twin_mib": [round(m, 1) for m in twin_memory],
-        "errors": [run["stderr"][-300:] for run in runs if run["code"] == 2][:5],
-        "load": os.getloadavg()[0], "cores": len(os.sched_getaffinity(0))}, checks)
+        **{f"counters: {name}": abs(found - made) <= report["hiccups"] for name, (found, made) in both.items()},
+    }
+    return report_line(
+        {
+            "measure": "soak",
+            "minutes": round(seconds / 60, 2),
+            "runs": len(runs),
+            "ends": dict(Counter(run["end"] for run in runs)),
+            "injected": report["faults"]["injected"],
+            "host": dict(host),
+            "host_against_injected": both,
+            "exchanges": report["line"].get("requests", 0),
+            "commands": commands["checked"],
+            "outside_limits": commands["outside_limits"],
+            "first": commands["first"][:3],
+            "hand_lost_host": len(watchdog["trips"]),
+            "hand_safe_ms": round(1e3 * watchdog["longest_s"], 1),
+            "host_lost_hand": len(holds),
+            "host_safe_ms": round(1e3 * max(holds, default=0.0), 1),
+            "hot": len(heat),
+            "hot_off_ms": round(1e3 * max(heat, default=0.0), 1),
+            "slowest_exchange_ms": report["slowest_exchange_ms"],
+            "hiccups": report["hiccups"],
+            "stolen_s": round(stolen() - begun_stolen, 2),
+            "physics": report["physics"],
+            "runner_mib": [round(m, 1) for m in memory],
+            "twin_mib": [round(m, 1) for m in twin_memory],
+            "errors": [run["stderr"][-300:] for run in runs if run["code"] == 2][:5],
+            "load": os.getloadavg()[0],
+            "cores": len(os.sched_getaffinity(0)),
+        },
+        checks,
+    )
 
 
 def inspect(path: Path, safe: float) -> dict:
@@ -178,8 +245,13 @@ def inspect(path: Path, safe: float) -> dict:
         seen = frames.decode_state(state[7:-2])["tip"]["taxel"]["z"]
         return all(seen[tip, taxel] == count for tip, taxel, count in taxels)
 
-    return {"link": link, "end": end.split(":")[0] + (": " + end.split(":")[1].strip() if "stopped" in end else ""),
-            "damaged": reader.damaged, "holds": list(reactions(states, sent, notes, safe)), "stuck": stuck}
+    return {
+        "link": link,
+        "end": end.split(":")[0] + (": " + end.split(":")[1].strip() if "stopped" in end else ""),
+        "damaged": reader.damaged,
+        "holds": list(reactions(states, sent, notes, safe)),
+        "stuck": stuck,
+    }
 
 
 def reactions(states: list[float], sent: list[float], notes: list[tuple[float, bool]], safe: float) -> Iterator[float]:
@@ -216,15 +288,18 @@ def agreement(host: Counter, report: dict) -> dict[str, tuple[int, int]]:
     line, made, expected = Counter(report["line"]), Counter(report["faults"]["injected"]), report["faults"]["expected"]
     damaged_requests = sum(made[f"{kind} request"] for kind in ("flip", "drop", "duplicate"))
     return {
-        "corrupt": (host["corrupt"], expected["corrupt"]), "lost": (host["lost"], expected["lost"]),
+        "corrupt": (host["corrupt"], expected["corrupt"]),
+        "lost": (host["lost"], expected["lost"]),
         # What the hand never answered, and what came too late.
         "silent": (host["silent"], damaged_requests + line["ignored"] + host["late"]),
         "answered": (host["answered"] + host["refused"] + host["late"], line["answers"]),
         "sent": (host["sent"], line["requests"]),
-        "each has one end": (host["sent"], sum(host[k] for k in ("answered", "corrupt", "silent", "refused", "lost")))}
+        "each has one end": (host["sent"], sum(host[k] for k in ("answered", "corrupt", "silent", "refused", "lost"))),
+    }
 
 
 # --- kills ---------------------------------------------------------------------------------------
+
 
 def kills(options: argparse.Namespace) -> bool:
     """Runners that die at random moments; whether every log opened and the hand was off in time."""
@@ -236,8 +311,9 @@ def kills(options: argparse.Namespace) -> bool:
         def prepare(number: int) -> tuple[subprocess.Popen, Path]:
             log = folder / f"{number}.log"
             words = runner_words(twin, options, log, 3600)
-            return start("-c", GATED, *words, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-                         stderr=subprocess.DEVNULL), log
+            return start(
+                "-c", GATED, *words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+            ), log
 
         waiting = prepare(0)
         for number in range(options.kills):
@@ -263,15 +339,28 @@ def kills(options: argparse.Namespace) -> bool:
         "every log replayed": all(row["same"] for row in rows),
         "logs up to the last second": max(lost) < 1.0,
         "hand off by its own watchdog in time": max(running, default=0.0) <= options.safe,
-        "commands within limits": not commands["outside_limits"]}
-    return report_line({
-        "measure": "kills", "kills": len(deaths), "with_motors_on": len(running),
-        "hand_off_ms": {"mean": round(1e3 * float(np.mean(running or [0])), 1),
-                        "max": round(1e3 * max(running, default=0.0), 1)},
-        "log_lost_ms": {"median": round(1e3 * float(np.median(lost)), 1), "max": round(1e3 * max(lost), 1)},
-        "ticks_replayed": sum(row["ticks"] for row in rows), "torn_bytes": sum(row["damaged"] for row in rows),
-        "commands": commands["checked"], "outside_limits": commands["outside_limits"], "first": commands["first"][:3],
-        "load": os.getloadavg()[0], "cores": len(os.sched_getaffinity(0))}, checks)
+        "commands within limits": not commands["outside_limits"],
+    }
+    return report_line(
+        {
+            "measure": "kills",
+            "kills": len(deaths),
+            "with_motors_on": len(running),
+            "hand_off_ms": {
+                "mean": round(1e3 * float(np.mean(running or [0])), 1),
+                "max": round(1e3 * max(running, default=0.0), 1),
+            },
+            "log_lost_ms": {"median": round(1e3 * float(np.median(lost)), 1), "max": round(1e3 * max(lost), 1)},
+            "ticks_replayed": sum(row["ticks"] for row in rows),
+            "torn_bytes": sum(row["damaged"] for row in rows),
+            "commands": commands["checked"],
+            "outside_limits": commands["outside_limits"],
+            "first": commands["first"][:3],
+            "load": os.getloadavg()[0],
+            "cores": len(os.sched_getaffinity(0)),
+        },
+        checks,
+    )
 
 
 def autopsy(path: Path, death: float) -> dict:
@@ -284,9 +373,14 @@ def autopsy(path: Path, death: float) -> dict:
         records = list(reader)
     except LogError:
         return {"opened": False, "same": False, "lost": float("inf"), "damaged": 0, "ticks": 0}
-    row = {"opened": True, "same": True, "damaged": reader.damaged, "ticks": 0,
-           # Exchanges are recorded from the handshake on: before that there is nothing to lose.
-           "lost": death - records[-1].time if any(record.kind == Kind.RECEIVED for record in records) else 0.0}
+    row = {
+        "opened": True,
+        "same": True,
+        "damaged": reader.damaged,
+        "ticks": 0,
+        # Exchanges are recorded from the handshake on: before that there is nothing to lose.
+        "lost": death - records[-1].time if any(record.kind == Kind.RECEIVED for record in records) else 0.0,
+    }
     if any(record.kind == Kind.META for record in records):
         again = replay(path).report
         row |= {"ticks": again["ticks"], "same": again["observations_same"] == again["readings_same"] == again["ticks"]}

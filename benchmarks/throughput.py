@@ -43,8 +43,9 @@ class WithoutObservation(Env):
     """`observe` left out: what follows sees zeros."""
 
     def _observe(self, readings, moment, goal):
-        return {group: jnp.zeros(sum(field.size for field in fields))
-                for group, fields in self.observation_layout.items()}
+        return {
+            group: jnp.zeros(sum(field.size for field in fields)) for group, fields in self.observation_layout.items()
+        }
 
 
 class WithoutRedrawing(Env):
@@ -101,7 +102,8 @@ class Replay(Env):
     def _drive(self, state, joint_target, push):
         tape = self.tape
         after, force = self.physics.advance(
-            state.target, state.physics, lambda substep, position, velocity: tape[substep], push)
+            state.target, state.physics, lambda substep, position, velocity: tape[substep], push
+        )
         return after, force, state.gear
 
     def _torque(self, *arguments):
@@ -124,8 +126,7 @@ def make(task: str, left_out: str, backend: str, num_envs: int, kind: type[Env] 
     if left_out == "touch":
         config = dataclasses.replace(config, touch=False)
     if left_out == "randomization":
-        config = dataclasses.replace(config, randomization=dataclasses.replace(
-            config.randomization, scale=0.0))
+        config = dataclasses.replace(config, randomization=dataclasses.replace(config.randomization, scale=0.0))
     hand = dexsim.load_hand()
     kind = kind or CLASSES.get(left_out, Env)
     return kind(entry.task_class(config, hand), hand, backend=backend, num_envs=num_envs)
@@ -142,6 +143,7 @@ def runner(env: Env, num_envs: int, steps: int, step: Callable | None = None) ->
             after, tape = jax.vmap(step)(carry, action, tape)
             touched = jnp.mean(jnp.any(after.finger_force > 0, -1))
             return after, (touched, tape)
+
         state, (touched, tape) = scan_restarting(env, body, state, (jax.random.split(key, steps), tape))
         return state, jnp.mean(touched), tape
 
@@ -162,8 +164,7 @@ def started(env: Env, num_envs: int, steps: int) -> Any:
     return runner(env, num_envs, steps)(state, jax.random.key(1), None)[0]
 
 
-def compare(task: str, backend: str, num_envs: int, parts: tuple[str, ...], steps: int,
-            repeats: int) -> list[dict]:
+def compare(task: str, backend: str, num_envs: int, parts: tuple[str, ...], steps: int, repeats: int) -> list[dict]:
     """A row for the full step and one for each part left out."""
     full = make(task, "full", backend, num_envs)
     state, key = started(full, num_envs, steps), jax.random.key(2)
@@ -172,8 +173,14 @@ def compare(task: str, backend: str, num_envs: int, parts: tuple[str, ...], step
         env, tape, step = make(task, part, backend, num_envs), None, None
         if part == "actuator":
             recorder = make(task, "full", backend, num_envs, Recorder)
-            record = runner(recorder, num_envs, steps, lambda state, action, _, r=recorder: (
-                lambda after, tick: (after, tick[3]))(*r.recorded_step(state, action)))
+            record = runner(
+                recorder,
+                num_envs,
+                steps,
+                lambda state, action, _, r=recorder: (lambda after, tick: (after, tick[3]))(
+                    *r.recorded_step(state, action)
+                ),
+            )
             tape = record(state, key, None)[2]
             step = lambda state, action, tape, e=env: (e.replayed_step(state, action, tape), tape[:0])  # noqa: E731
         begin = started(env, num_envs, steps) if part == "randomization" else state
@@ -191,25 +198,33 @@ def compare(task: str, backend: str, num_envs: int, parts: tuple[str, ...], step
             {"left_out": name, "backend": full.backend, "num_envs": num_envs}
             | timing(times[name], num_envs * steps, steps)
             | {"first_call_s": round(first[name], 2), "share_touching": round(float(touched[name]), 3)}
-            | ({} if name == "nothing" else {
-                "share": round(statistics.median(shares), 4),
-                "share_quartiles": [round(shares[len(shares) // 4], 4), round(shares[-1 - len(shares) // 4], 4)]}))
+            | (
+                {}
+                if name == "nothing"
+                else {
+                    "share": round(statistics.median(shares), 4),
+                    "share_quartiles": [round(shares[len(shares) // 4], 4), round(shares[-1 - len(shares) // 4], 4)],
+                }
+            )
+        )
     return rows
 
 
 def timing(times: list[float], env_steps: int, steps: int) -> dict:
     """What every row says."""
     median = statistics.median(times)
-    return {"env_steps_per_s": round(env_steps / median), "ms_per_step": round(1e3 * median / steps, 4),
-            "spread": round((max(times) - min(times)) / median, 4)}
+    return {
+        "env_steps_per_s": round(env_steps / median),
+        "ms_per_step": round(1e3 * median / steps, 4),
+        "spread": round((max(times) - min(times)) / median, 4),
+    }
 
 
 def measure(env: Env, num_envs: int, steps: int, repeats: int) -> dict:
     """The full step alone."""
     run, state = runner(env, num_envs, steps), started(env, num_envs, steps)
     seconds(run, state, jax.random.key(2), None)
-    return timing([seconds(run, state, jax.random.key(2), None)[0] for _ in range(repeats)],
-                  num_envs * steps, steps)
+    return timing([seconds(run, state, jax.random.key(2), None)[0] for _ in range(repeats)], num_envs * steps, steps)
 
 
 def measure_training(task: str, backend: str, num_envs: int, iterations: int) -> dict:
@@ -256,12 +271,15 @@ def main() -> None:
                 for row in split(options.task, backend, num_envs, options.repeats):
                     show({"measure": "split"} | row)
                 continue
-            for row in compare(options.task, backend, num_envs, tuple(options.leave_out), options.steps,
-                               options.repeats):
+            for row in compare(
+                options.task, backend, num_envs, tuple(options.leave_out), options.steps, options.repeats
+            ):
                 show({"measure": "env"} | row)
             if options.train:
-                show({"measure": "training", "num_envs": num_envs}
-                     | measure_training(options.task, backend, num_envs, options.train))
+                show(
+                    {"measure": "training", "num_envs": num_envs}
+                    | measure_training(options.task, backend, num_envs, options.train)
+                )
 
 
 if __name__ == "__main__":

@@ -67,12 +67,19 @@ def rows(times: dict[str, list[float]], backend: str, config: PPOConfig):
     middle["rest"] = middle["training step"] - middle["environment"] - middle["policy"] - middle["learner"]
     for name, value in middle.items():
         measured = times.get(name)
-        row = (timing(measured, config.steps_per_iteration, config.rollout_length) if measured else {
-            "env_steps_per_s": round(config.steps_per_iteration / value) if value > 0 else None,
-            "ms_per_step": round(1e3 * value / config.rollout_length, 4)})
-        yield {"part": name, "backend": backend, "num_envs": config.num_envs,
-               "rollout_length": config.rollout_length} | row | {
-                   "share": round(value / middle["training step"], 4)}
+        row = (
+            timing(measured, config.steps_per_iteration, config.rollout_length)
+            if measured
+            else {
+                "env_steps_per_s": round(config.steps_per_iteration / value) if value > 0 else None,
+                "ms_per_step": round(1e3 * value / config.rollout_length, 4),
+            }
+        )
+        yield (
+            {"part": name, "backend": backend, "num_envs": config.num_envs, "rollout_length": config.rollout_length}
+            | row
+            | {"share": round(value / middle["training step"], 4)}
+        )
 
 
 def experience(env: Env, config: PPOConfig, state: TrainState) -> tuple[Any, Rollout, dict]:
@@ -100,19 +107,26 @@ def record(env: Recorder, config: PPOConfig, state: TrainState) -> tuple[Any, ja
 
 def environment(env: Env, state: Any, actions: jax.Array) -> Any:
     """Steps and restarts under recorded actions [T, B, A]."""
+
     def tick(state, action):
         after = jax.vmap(env.step)(state, action)
         return after, _used((after.obs, after.reward, after.metrics))
+
     return scan_restarting(env, tick, state, actions)
 
 
 def physics(env: Env, ticks: Any) -> jax.Array:
     """The recorded ticks, each from its own start."""
+
     def tick(_, given):
         target, state, push, tape, *_ = given
-        after, force = jax.vmap(lambda target, state, push, tape: env.physics.advance(
-            target, state, lambda substep, position, velocity: tape[substep], push))(target, state, push, tape)
+        after, force = jax.vmap(
+            lambda target, state, push, tape: env.physics.advance(
+                target, state, lambda substep, position, velocity: tape[substep], push
+            )
+        )(target, state, push, tape)
         return None, _used((after, force))
+
     return jax.lax.scan(tick, None, ticks)[1]
 
 
@@ -123,8 +137,15 @@ def touch(env: Env, ticks: Any, key: jax.Array) -> jax.Array:
     def feel(target, qpos, strength, key):
         pose = forward_kinematics(hand, qpos[seam.joint_qpos])
         taxels, place = taxel_positions(hand, pose), qpos[seam.object_qpos]
-        felt = tactile.feel(taxels, jnp.asarray(hand.taxel_area), target.shape(), place[:3],
-                            rotations.quat_to_matrix(place[3:]), strength, config.skin)
+        felt = tactile.feel(
+            taxels,
+            jnp.asarray(hand.taxel_area),
+            target.shape(),
+            place[:3],
+            rotations.quat_to_matrix(place[3:]),
+            strength,
+            config.skin,
+        )
         read = tactile.measure_taxels(felt.force, jnp.ones((hand.num_fingers, 1)), config.sensing.taxel, key)
         weighting = config.observation.weighting
         return [tactile.reduce_touch(force, taxels, weighting) for force in (felt.force, read)]
@@ -133,6 +154,7 @@ def touch(env: Env, ticks: Any, key: jax.Array) -> jax.Array:
         target, _, _, _, qpos, strength = given
         key, use = jax.random.split(key)
         return key, _used(jax.vmap(feel)(target, qpos, strength, jax.random.split(use, len(qpos))))
+
     return jax.lax.scan(tick, key, ticks)[1]
 
 
@@ -145,9 +167,12 @@ def policy(env: Env, config: PPOConfig, state: TrainState, rollout: Rollout) -> 
         mean = ppo.actor_mean(config, state.params, normalizers, obs)
         action = sample(use, mean, state.params.log_std)
         # The value after the step is that of another observation; here those of other rows stand for it.
-        values = [ppo.critic_value(config, state.params, normalizers, seen)
-                  for seen in (obs, jax.tree.map(lambda x: jnp.roll(x, 1, 0), obs))]
+        values = [
+            ppo.critic_value(config, state.params, normalizers, seen)
+            for seen in (obs, jax.tree.map(lambda x: jnp.roll(x, 1, 0), obs))
+        ]
         return key, _used((action, log_prob(action, mean, state.params.log_std), values))
+
     return jax.lax.scan(tick, state.key, rollout.obs)[1]
 
 
@@ -156,8 +181,9 @@ def learn(env: Env, config: PPOConfig, state: TrainState, rollout: Rollout) -> A
     normalizers = ppo.make_normalizers(env, config, state.observation_stats)
     value_stats, params, samples = ppo.prepare(config, state.value_stats, state.params, rollout)
     learner = ppo.Learner(params, state.adam, state.learning_rate, state.skipped_updates)
-    stats = {group: update_stats(state.observation_stats[group], rollout.obs[group])
-             for group in state.observation_stats}
+    stats = {
+        group: update_stats(state.observation_stats[group], rollout.obs[group]) for group in state.observation_stats
+    }
     return ppo.update(config, normalizers, samples, state.key, learner), value_stats, stats
 
 

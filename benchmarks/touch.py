@@ -37,8 +37,9 @@ def union() -> sdf.Shape:
     """Four primitives, one of each collision kind and a sphere."""
     size = jnp.array([[0.02, 0.02, 0.025], [0.012, 0.015, 0], [0.015, 0.03, 0], [0.02, 0, 0]])
     position = jnp.array([[0, 0, 0], [0, 0, 0.03], [0, 0.01, 0], [0.01, 0, -0.01]])
-    return sdf.Shape(("box", "capsule", "cylinder", "sphere"), size, position, jnp.tile(jnp.eye(3), (4, 1, 1)),
-                     jnp.ones(4, bool))
+    return sdf.Shape(
+        ("box", "capsule", "cylinder", "sphere"), size, position, jnp.tile(jnp.eye(3), (4, 1, 1)), jnp.ones(4, bool)
+    )
 
 
 def brute_distance(points: jax.Array, surface: surface_points.SurfacePoints) -> jax.Array:
@@ -69,14 +70,16 @@ def cases(names: list[str] | None) -> list[Case]:
 
     def own_class(thing, index):
         return grid.select(thing, index % CLASSES)
+
     makers = {
         "closed box": lambda n: Case(n, box),
         "closed box, palm frame": lambda n: Case(n, box, path="taxels"),
         "closed union of 4": lambda n: Case(n, union()),
         "grid float32": lambda n: Case(n, grid.bake(box)),
         "grid float16": lambda n: Case(n, grid.bake(box, GridConfig(dtype="float16"))),
-        "grid quadratic float16": lambda n: Case(n, grid.bake(box, GridConfig(dtype="float16",
-                                                                            interpolation="quadratic"))),
+        "grid quadratic float16": lambda n: Case(
+            n, grid.bake(box, GridConfig(dtype="float16", interpolation="quadratic"))
+        ),
         f"grid float32, {CLASSES} classes": lambda n: Case(n, classes("float32"), own_class),
         f"grid float16, {CLASSES} classes": lambda n: Case(n, classes("float16"), own_class),
         "points 1024, scan": lambda n: Case(n, points),
@@ -110,6 +113,7 @@ def reader(case: Case, hand, kinematics: bool):
         skin_force = tactile.skin_stress(depth / SKIN.thickness, SKIN) * hand.taxel_area
         force = tactile.spread(skin_force, total)
         return force, *tactile.reduce_touch(force, taxels)
+
     return read
 
 
@@ -133,6 +137,7 @@ def measure(case: Case, num_envs: int, loops: int, repeats: int, hand, machine: 
     def loop(thing, pose, shift):
         force = jnp.zeros((num_envs, *hand.taxel_area.shape))
         return jax.lax.scan(lambda c, x: turn(c, x, thing, pose), (shift, force), None, length=loops)[0]
+
     shift = jnp.tile(base, (num_envs, 1))
     run = jax.jit(loop)
     jax.block_until_ready(run(case.thing, pose, shift))
@@ -149,12 +154,19 @@ def measure(case: Case, num_envs: int, loops: int, repeats: int, hand, machine: 
     queries = num_envs * hand.taxel_area.size
     floor = max(moved / machine["bytes_per_s"], flops / machine["flops_per_s"])
     memory = once.memory_analysis()
-    return {"case": case.name + (" + kinematics" if kinematics else ""), "num_envs": num_envs,
-            "ms": 1e3 * seconds_median, "spread": (max(seconds) - min(seconds)) / seconds_median,
-            "Gqueries_per_s": 1e-9 * queries / seconds_median, "GFLOP": 1e-9 * flops, "GB": 1e-9 * moved,
-            "temp_MB": 1e-6 * memory.temp_size_in_bytes if memory else None,
-            "bytes_per_query": moved / queries, "flops_per_query": flops / queries,
-            "times_floor": seconds_median / floor if floor else None}
+    return {
+        "case": case.name + (" + kinematics" if kinematics else ""),
+        "num_envs": num_envs,
+        "ms": 1e3 * seconds_median,
+        "spread": (max(seconds) - min(seconds)) / seconds_median,
+        "Gqueries_per_s": 1e-9 * queries / seconds_median,
+        "GFLOP": 1e-9 * flops,
+        "GB": 1e-9 * moved,
+        "temp_MB": 1e-6 * memory.temp_size_in_bytes if memory else None,
+        "bytes_per_query": moved / queries,
+        "flops_per_query": flops / queries,
+        "times_floor": seconds_median / floor if floor else None,
+    }
 
 
 def machine_limits() -> dict:
@@ -165,6 +177,7 @@ def machine_limits() -> dict:
         jax.block_until_ready(run(x))
         best = min(_seconds(run, x) for _ in range(5))
         return work / best
+
     ones = jnp.ones(large, jnp.float32)
     moved = rate(jax.jit(lambda x: x + 1), ones, 8 * large)
 
@@ -172,6 +185,7 @@ def machine_limits() -> dict:
         for _ in range(512):
             x = x * 1.0001 + 0.5
         return x
+
     count = large // 16
     return {"bytes_per_s": moved, "flops_per_s": rate(jax.jit(chain), ones[:count], 1024 * count)}
 
@@ -194,12 +208,14 @@ def show(title: str, rows: list[dict], file) -> None:
     """A table for people, and a JSON line per row in `file`."""
     print(f"\n{title}")
     if rows:
+
         def text(value):
             if value is None:
                 return "-"
             if isinstance(value, (bool, np.bool_)):
                 return "yes" if value else "NO"
             return f"{value:.4g}" if isinstance(value, (float, np.floating)) else str(value)
+
         keys = list(rows[0])
         lines = [keys] + [[text(row[key]) for key in keys] for row in rows]
         width = [max(len(line[k]) for line in lines) for k in range(len(keys))]
@@ -223,10 +239,12 @@ def costs(options, hand, file) -> None:
             rows.append(row)
         by = {row["case"]: row["ms"] for row in rows}
         show(f"cost, {num_envs} environments x 600 taxels" + (f", step {step:.2f} ms" if step else ""), rows, file)
-        for top, bottom in ((f"grid float32, {CLASSES} classes", "grid float32"),
-                            (f"grid float16, {CLASSES} classes", "grid float16"),
-                            ("points 1024, brute force", "points 1024, scan"),
-                            ("points 1024, brute force", "points 1024, table")):
+        for top, bottom in (
+            (f"grid float32, {CLASSES} classes", "grid float32"),
+            (f"grid float16, {CLASSES} classes", "grid float16"),
+            ("points 1024, brute force", "points 1024, scan"),
+            ("points 1024, brute force", "points 1024, table"),
+        ):
             suffix = " + kinematics" if options.kinematics else ""
             if top + suffix in by and bottom + suffix in by:
                 print(f"  {top} / {bottom}: {by[top + suffix] / by[bottom + suffix]:.2f}")

@@ -22,13 +22,32 @@ from dexsim.layout import lattice, on_surface, read_layout
 from dexsim.surface_points import PointsConfig
 from dexsim.tactile import Skin
 
-SHAPES = {"sphere": (0.0275, 0, 0), "box": (0.025, 0.02, 0.03), "capsule": (0.013, 0.025, 0),
-          "cylinder": (0.02, 0.025, 0), "ellipsoid": (0.03, 0.02, 0.04)}
+SHAPES = {
+    "sphere": (0.0275, 0, 0),
+    "box": (0.025, 0.02, 0.03),
+    "capsule": (0.013, 0.025, 0),
+    "cylinder": (0.02, 0.025, 0),
+    "ellipsoid": (0.03, 0.02, 0.04),
+}
 SMOOTH = ("sphere", "capsule", "ellipsoid", "torus mesh")
 # Sampling error of the force (rms) that a lattice of that pitch [mm] makes at that depth [mm], ball of 10 mm.
-PITCH_BOUND = {(0.3, 0.8): 0.008, (0.3, 1.0): 0.007, (0.3, 1.5): 0.041, (0.3, 2.0): 0.063, (0.3, 3.0): 0.097,
-               (0.5, 0.8): 0.002, (0.5, 1.0): 0.008, (0.5, 1.5): 0.022, (0.5, 2.0): 0.045, (0.5, 3.0): 0.122,
-               (1.0, 0.8): 0.001, (1.0, 1.0): 0.002, (1.0, 1.5): 0.005, (1.0, 2.0): 0.019, (1.0, 3.0): 0.042}
+PITCH_BOUND = {
+    (0.3, 0.8): 0.008,
+    (0.3, 1.0): 0.007,
+    (0.3, 1.5): 0.041,
+    (0.3, 2.0): 0.063,
+    (0.3, 3.0): 0.097,
+    (0.5, 0.8): 0.002,
+    (0.5, 1.0): 0.008,
+    (0.5, 1.5): 0.022,
+    (0.5, 2.0): 0.045,
+    (0.5, 3.0): 0.122,
+    (1.0, 0.8): 0.001,
+    (1.0, 1.0): 0.002,
+    (1.0, 1.5): 0.005,
+    (1.0, 2.0): 0.019,
+    (1.0, 3.0): 0.042,
+}
 WINKLER = Skin(margin=0.0, thickness=0.02, law="linear", total="skin", c10=0.1e6)
 
 
@@ -36,27 +55,40 @@ def turned_solid(kind: str, seed: int = 0) -> sdf.Shape:
     """One primitive turned against the axes, so that no grid lies along its faces."""
     turn = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]
     turn = turn * np.sign(np.linalg.det(turn))
-    return sdf.Shape((kind,), jnp.asarray([SHAPES[kind]], jnp.float32), jnp.zeros((1, 3)),
-                     jnp.asarray(turn[None], jnp.float32), jnp.array([True]))
+    return sdf.Shape(
+        (kind,),
+        jnp.asarray([SHAPES[kind]], jnp.float32),
+        jnp.zeros((1, 3)),
+        jnp.asarray(turn[None], jnp.float32),
+        jnp.array([True]),
+    )
 
 
 def upright(kind: str, *size: float) -> sdf.Shape:
     """One primitive along the axes."""
-    return sdf.Shape((kind,), jnp.asarray([(*size, 0, 0)[:3]], jnp.float32), jnp.zeros((1, 3)), jnp.eye(3)[None],
-                     jnp.array([True]))
+    return sdf.Shape(
+        (kind,), jnp.asarray([(*size, 0, 0)[:3]], jnp.float32), jnp.zeros((1, 3)), jnp.eye(3)[None], jnp.array([True])
+    )
 
 
 def shipped_skin() -> SimpleNamespace:
     """The shipped layout with what `tactile.feel_links` asks of a hand, without reading a model."""
     patches = read_layout(asset_path("hand/taxels.csv"))
-    stack = {name: np.stack([getattr(p, name) for p in patches.values()]).astype(np.float32)
-             for name in ("position", "normal", "area")}
-    return SimpleNamespace(tip_body=np.arange(len(patches)), taxel_position=stack["position"],
-                           taxel_normal=stack["normal"], taxel_area=stack["area"])
+    stack = {
+        name: np.stack([getattr(p, name) for p in patches.values()]).astype(np.float32)
+        for name in ("position", "normal", "area")
+    }
+    return SimpleNamespace(
+        tip_body=np.arange(len(patches)),
+        taxel_position=stack["position"],
+        taxel_normal=stack["normal"],
+        taxel_area=stack["area"],
+    )
 
 
 def distance_errors(quick: bool) -> list[dict]:
     """Depth error of each method within -3 to +1 mm of each shape's surface."""
+
     def methods():
         for nodes in (32, 64) if quick else (32, 64, 128):
             yield f"grid {nodes}", lambda s, n=nodes: grid.bake(s, GridConfig(nodes=n))
@@ -75,19 +107,33 @@ def distance_errors(quick: bool) -> list[dict]:
         for name, thing in things:
             ours = np.asarray(run(points, thing))
             error = 1e6 * np.abs(ours - exact)
-            rows.append({"shape": kind, "method": name, "mean_um": error.mean(), "p95_um": np.quantile(error, 0.95),
-                         "max_um": error.max(), "missed_%": 100 * np.mean((exact < 0) & (ours >= 0)),
-                         "false_%": 100 * np.mean((exact >= 0) & (ours < 0)),
-                         "ok": bool(error.mean() <= 10) if name == "grid 64" and kind in SMOOTH else None})
+            rows.append(
+                {
+                    "shape": kind,
+                    "method": name,
+                    "mean_um": error.mean(),
+                    "p95_um": np.quantile(error, 0.95),
+                    "max_um": error.max(),
+                    "missed_%": 100 * np.mean((exact < 0) & (ours >= 0)),
+                    "false_%": 100 * np.mean((exact >= 0) & (ours < 0)),
+                    "ok": bool(error.mean() <= 10) if name == "grid 64" and kind in SMOOTH else None,
+                }
+            )
 
     for kind in SHAPES:
         shape = turned_solid(kind)
         compare(kind, sdf.bounds(shape), lambda p, s=shape: run(p, s), ((n, make(shape)) for n, make in methods()))
     ring = mesh.load_mesh(trimesh.creation.torus(0.022, 0.009, 96, 48))
-    compare("torus mesh", ring.bounds, lambda p: mesh.signed_distance(ring, p)[0], (
-        ("grid 64", grid.bake(ring, cache=False)),
-        ("grid 64 quadratic", grid.bake(ring, GridConfig(interpolation="quadratic"), cache=False)),
-        ("points 1024", surface_points.from_mesh(ring, PointsConfig(cells=24)))))
+    compare(
+        "torus mesh",
+        ring.bounds,
+        lambda p: mesh.signed_distance(ring, p)[0],
+        (
+            ("grid 64", grid.bake(ring, cache=False)),
+            ("grid 64 quadratic", grid.bake(ring, GridConfig(interpolation="quadratic"), cache=False)),
+            ("points 1024", surface_points.from_mesh(ring, PointsConfig(cells=24))),
+        ),
+    )
     return rows
 
 
@@ -133,17 +179,33 @@ def forces(quick: bool) -> list[dict]:
             off = 1e3 * np.linalg.norm(np.asarray(centre)[:, :2], axis=1)
             # 1.25 and 0.1 % allow for the 200 phases drawn here.
             rms = float(np.sqrt(np.mean(error**2)))
-            rows.append({"object": "sphere", "depth_mm": 1e3 * depth, "pitch_mm": 1e3 * pitch, "force_rms_%": 100 * rms,
-                         "bound_%": 100 * bound, "centre_rms_mm": float(np.sqrt(np.mean(off**2))),
-                         "ok": rms <= 1.25 * bound + 1e-3 and (depth < 5e-4 or bool(np.sqrt(np.mean(off**2)) <= 0.15))})
+            rows.append(
+                {
+                    "object": "sphere",
+                    "depth_mm": 1e3 * depth,
+                    "pitch_mm": 1e3 * pitch,
+                    "force_rms_%": 100 * rms,
+                    "bound_%": 100 * bound,
+                    "centre_rms_mm": float(np.sqrt(np.mean(off**2))),
+                    "ok": rms <= 1.25 * bound + 1e-3 and (depth < 5e-4 or bool(np.sqrt(np.mean(off**2)) <= 0.15)),
+                }
+            )
             bar = press(taxels, area, upright("cylinder", radius, 0.1), (0, 0, radius - depth), WINKLER, upended)
             length = round(0.024 / pitch) * pitch
             error = np.asarray(bar.force.sum(1)) / (modulus * segment * length) - 1
             rms = float(np.sqrt(np.mean(error**2)))
             bound = _ridge_sampling(half, pitch)
-            rows.append({"object": "cylinder", "depth_mm": 1e3 * depth, "pitch_mm": 1e3 * pitch,
-                         "force_rms_%": 100 * rms, "bound_%": 100 * bound, "centre_rms_mm": None,
-                         "ok": rms <= 1.25 * bound + 1e-3})
+            rows.append(
+                {
+                    "object": "cylinder",
+                    "depth_mm": 1e3 * depth,
+                    "pitch_mm": 1e3 * pitch,
+                    "force_rms_%": 100 * rms,
+                    "bound_%": 100 * bound,
+                    "centre_rms_mm": None,
+                    "ok": rms <= 1.25 * bound + 1e-3,
+                }
+            )
     return rows
 
 
@@ -163,8 +225,12 @@ def checks() -> list[dict]:
 
 def _things() -> dict:
     ball = upright("sphere", 0.02)
-    return {"closed form": ball, "grid": grid.bake(ball), "grid quadratic": grid.bake(ball, GridConfig(
-        interpolation="quadratic")), "points": surface_points.from_shape(ball, PointsConfig(block=16, table=False))}
+    return {
+        "closed form": ball,
+        "grid": grid.bake(ball),
+        "grid quadratic": grid.bake(ball, GridConfig(interpolation="quadratic")),
+        "points": surface_points.from_shape(ball, PointsConfig(block=16, table=False)),
+    }
 
 
 def _punch() -> dict:
@@ -176,8 +242,12 @@ def _punch() -> dict:
     stretch = 1 - depth / skin.thickness
     wanted = np.where(covered, 2 * (stretch**-2 - stretch) * (skin.c10 + skin.c01 / stretch) * 4e-6, 0)
     error = float(np.abs(np.asarray(touch.force[0]) - wanted).max() / wanted.max())
-    return {"check": "flat punch: equal force where covered, 0 elsewhere", "value": error, "bound": 1e-4,
-            "ok": error <= 1e-4}
+    return {
+        "check": "flat punch: equal force where covered, 0 elsewhere",
+        "value": error,
+        "bound": 1e-4,
+        "ok": error <= 1e-4,
+    }
 
 
 def _loads() -> list[dict]:
@@ -192,8 +262,14 @@ def _loads() -> list[dict]:
         shift = np.random.default_rng(3).uniform(-pitch / 2, pitch / 2, (200, 2))
         touch = press(*pad(pitch, shift), upright("sphere", radius), (0, 0, radius - depth), skin)
         error = float(np.sqrt(np.mean((np.asarray(touch.force.sum(1)) / weight - 1) ** 2)))
-        rows.append({"check": f"load of 0.1 kg on a ball, {1e3 * depth:.2f} mm deep, pitch {1e3 * pitch:g} mm",
-                     "value": error, "bound": 0.05, "ok": error <= 0.05})
+        rows.append(
+            {
+                "check": f"load of 0.1 kg on a ball, {1e3 * depth:.2f} mm deep, pitch {1e3 * pitch:g} mm",
+                "value": error,
+                "bound": 0.05,
+                "ok": error <= 0.05,
+            }
+        )
     return rows
 
 
@@ -202,13 +278,19 @@ def _monotone(name: str, thing) -> dict:
     skin = Skin(margin=0.0, total="skin", thickness=0.004)
 
     def total(depth):
-        touch = tactile.feel(taxels, area, thing, jnp.stack([0.0007, -0.0004, 0.02 - depth]), jnp.eye(3), jnp.ones(1),
-                             skin)
+        touch = tactile.feel(
+            taxels, area, thing, jnp.stack([0.0007, -0.0004, 0.02 - depth]), jnp.eye(3), jnp.ones(1), skin
+        )
         return touch.force.sum()
+
     force = np.asarray(jax.jit(jax.vmap(total))(jnp.linspace(0, 0.002, 201)))
     fall = float(-np.diff(force).min() / force.max())
-    return {"check": f"force grows with depth, {name}: largest fall in 201 steps", "value": abs(max(fall, 0.0)),
-            "bound": 1e-5, "ok": fall <= 1e-5}
+    return {
+        "check": f"force grows with depth, {name}: largest fall in 201 steps",
+        "value": abs(max(fall, 0.0)),
+        "bound": 1e-5,
+        "ok": fall <= 1e-5,
+    }
 
 
 def _gradient(name: str, thing) -> dict:
@@ -220,6 +302,7 @@ def _gradient(name: str, thing) -> dict:
         @jax.jit
         def total(position):
             return tactile.feel(taxels, area, thing, position, jnp.eye(3), jnp.ones(1), skin).force.sum()
+
         start = jnp.array([0.00071, -0.00043, 0.0193])
         exact = np.asarray(jax.jit(jax.grad(total))(start))
         numeric = [(total(start + step * e) - total(start - step * e)) / (2 * step) for e in jnp.eye(3)]
@@ -269,6 +352,7 @@ def grasps(quick: bool) -> list[dict]:
             def one(pose):
                 touch = tactile.feel_links(hand, pose, thing, jnp.zeros(3), jnp.eye(3), jnp.ones(5), skin)
                 return touch.depth, *tactile.reduce_touch_links(touch.force, hand, pose)
+
             run = jax.jit(jax.vmap(one))
             found = [np.asarray(x) for x in run(pose)]
             seconds = []
@@ -277,9 +361,13 @@ def grasps(quick: bool) -> list[dict]:
                 jax.block_until_ready(run(pose))
                 seconds.append(time.perf_counter() - start)
             return *found, 1e6 * min(seconds) / count
-        found = {"closed form": feel(shape), "grid": feel(grid.bake(shape)),
-                 "grid quadratic": feel(grid.bake(shape, GridConfig(interpolation="quadratic"))),
-                 "points 1024": feel(surface_points.from_shape(shape, config))}
+
+        found = {
+            "closed form": feel(shape),
+            "grid": feel(grid.bake(shape)),
+            "grid quadratic": feel(grid.bake(shape, GridConfig(interpolation="quadratic"))),
+            "points 1024": feel(surface_points.from_shape(shape, config)),
+        }
         if not quick:
             found["points 4096"] = feel(surface_points.from_shape(shape, dataclasses.replace(config, count=4096)))
         pairs = [("grid", "closed form"), ("grid quadratic", "closed form")]
@@ -288,11 +376,18 @@ def grasps(quick: bool) -> list[dict]:
             (depth, force, centre, cost), (depth_b, force_b, centre_b, _) = found[name], found[base]
             both = (force > 0) & (force_b > 0)
             apart = 1e3 * np.linalg.norm(centre - centre_b, axis=-1)[both]
-            rows.append({"shape": kind, "method": name, "against": base,
-                         "taxel_contacts_same_%": 100 * np.mean((depth > 0) == (depth_b > 0)),
-                         "finger_contacts_same_%": 100 * np.mean((force > 0) == (force_b > 0)),
-                         "force_diff_median_%": 100 * np.median(np.abs(force / np.where(both, force_b, 1) - 1)[both]),
-                         "force_sum_diff_%": 100 * (force[both].sum() / force_b[both].sum() - 1),
-                         "centre_diff_median_mm": np.median(apart), "centre_diff_p95_mm": np.quantile(apart, 0.95),
-                         "us_per_grasp": cost})
+            rows.append(
+                {
+                    "shape": kind,
+                    "method": name,
+                    "against": base,
+                    "taxel_contacts_same_%": 100 * np.mean((depth > 0) == (depth_b > 0)),
+                    "finger_contacts_same_%": 100 * np.mean((force > 0) == (force_b > 0)),
+                    "force_diff_median_%": 100 * np.median(np.abs(force / np.where(both, force_b, 1) - 1)[both]),
+                    "force_sum_diff_%": 100 * (force[both].sum() / force_b[both].sum() - 1),
+                    "centre_diff_median_mm": np.median(apart),
+                    "centre_diff_p95_mm": np.quantile(apart, 0.95),
+                    "us_per_grasp": cost,
+                }
+            )
     return rows

@@ -32,20 +32,43 @@ _START, _AFTER = 90.0, 60.0  # s until a process is up; beyond a trial's limit
 def start(words: list[str], **options: Any) -> subprocess.Popen:
     """Python with these words, in the repository."""
     path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH", "")]))
-    return subprocess.Popen([sys.executable, *words], cwd=ROOT, env={**os.environ, "PYTHONPATH": path}, text=True,
-                            **options)
+    return subprocess.Popen(
+        [sys.executable, *words], cwd=ROOT, env={**os.environ, "PYTHONPATH": path}, text=True, **options
+    )
 
 
 def twin_words(options: argparse.Namespace, number: int, folder: Path) -> list[str]:
     """The emulated hand with trial `number`; commands and shapes as in `zero_shot.py`."""
     from dexsim_real.twin.shapes import SHAPES
 
-    words = ["-m", "dexsim_real.twin", "--task", options.task, "--seed", str(options.seed), "--draw", options.draw,
-             "--first", str(number), "--trials", "1", "--link", str(folder / "hand"), "--output",
-             str(folder / "twin.json"), *options.twin.split()]
+    words = [
+        "-m",
+        "dexsim_real.twin",
+        "--task",
+        options.task,
+        "--seed",
+        str(options.seed),
+        "--draw",
+        options.draw,
+        "--first",
+        str(number),
+        "--trials",
+        "1",
+        "--link",
+        str(folder / "hand"),
+        "--output",
+        str(folder / "twin.json"),
+        *options.twin.split(),
+    ]
     if options.task == "grasp":
-        words += ["--mask-socket", str(folder / "masks"), "--command", f"{COMMANDS[number % len(COMMANDS)]:g}",
-                  "--shape", SHAPES[number // len(COMMANDS) % len(SHAPES)]]
+        words += [
+            "--mask-socket",
+            str(folder / "masks"),
+            "--command",
+            f"{COMMANDS[number % len(COMMANDS)]:g}",
+            "--shape",
+            SHAPES[number // len(COMMANDS) % len(SHAPES)],
+        ]
     else:
         words += ["--imu-link", str(folder / "imu")]
     words += ["--policy", options.policy] if options.policy else []
@@ -59,7 +82,7 @@ def shown_command(twin: subprocess.Popen) -> list[str]:
     for line in twin.stdout:
         words = shlex.split(line) if "dexsim_real.run" in line else []
         if words:
-            return words[words.index("-m"):]
+            return words[words.index("-m") :]
         if time.monotonic() > until:
             break
     raise SystemExit(f"the emulated hand did not start (exit code {twin.poll()})")
@@ -73,9 +96,20 @@ def run_trial(options: argparse.Namespace, number: int, folder: Path) -> dict[st
         twin = start(twin_words(options, number, folder), stdout=subprocess.PIPE, stderr=errors)
         runner = None
         try:
-            words = [*shown_command(twin), "--seconds", f"{limit + _AFTER:g}", "--place", "1", "--quiet", "--log",
-                     str(folder / "run.log"), "--output", str(folder / "run.json"), *options.runner.split(),
-                     *([] if options.realtime else ["--no-realtime"])]
+            words = [
+                *shown_command(twin),
+                "--seconds",
+                f"{limit + _AFTER:g}",
+                "--place",
+                "1",
+                "--quiet",
+                "--log",
+                str(folder / "run.log"),
+                "--output",
+                str(folder / "run.json"),
+                *options.runner.split(),
+                *([] if options.realtime else ["--no-realtime"]),
+            ]
             runner = start(words, stdout=shown, stderr=subprocess.STDOUT)
             until = time.monotonic() + _START + limit + _AFTER
             # The emulated hand ends with its trial; a runner that ends before it has failed.
@@ -103,22 +137,36 @@ def _collect(folder: Path, code: int, wall: float) -> dict[str, Any]:
         raise SystemExit(f"no results: the runner ended with {code}: {(folder / 'run.txt').read_text()[-500:]}")
     twin, bridge = (json.loads((folder / name).read_text()) for name in ("twin.json", "run.json"))
     link = bridge["link"]
-    return twin["trials"][0] | {"wall": round(wall, 1), "bridge": {
-        "exit": code, "end": bridge["end"], "believed_successes": bridge.get("successes"),
-        "exchanges": link["sent"], "unanswered": link["sent"] - link["answered"], "safety": bridge["safety"],
-        "policy_jitter": bridge["policy_jitter"], "round_trip": bridge["round_trip"],
-        "outside_limits": twin["commands"]["outside_limits"], "let_go_s": twin["physics"]["let_go_s"]}}
+    return twin["trials"][0] | {
+        "wall": round(wall, 1),
+        "bridge": {
+            "exit": code,
+            "end": bridge["end"],
+            "believed_successes": bridge.get("successes"),
+            "exchanges": link["sent"],
+            "unanswered": link["sent"] - link["answered"],
+            "safety": bridge["safety"],
+            "policy_jitter": bridge["policy_jitter"],
+            "round_trip": bridge["round_trip"],
+            "outside_limits": twin["commands"]["outside_limits"],
+            "let_go_s": twin["physics"]["let_go_s"],
+        },
+    }
 
 
 def line(report: dict[str, Any]) -> str:
     """One trial for people."""
-    told = (f"command {report['command']:.2f} {report['shape']:<11} fingers {report['finger_force']:6.2f} N"
-            if report["task"] == "grasp" else
-            f"{report['successes']:3d} successes ({report['paper_successes']} as the paper counts)")
+    told = (
+        f"command {report['command']:.2f} {report['shape']:<11} fingers {report['finger_force']:6.2f} N"
+        if report["task"] == "grasp"
+        else f"{report['successes']:3d} successes ({report['paper_successes']} as the paper counts)"
+    )
     bridge = report["bridge"]
-    return (f"{report['trial']:4d}  {told}  {report['seconds']:7.2f} s  {report['end']}  ({report['wall']:.0f} s; "
-            f"{bridge['unanswered']} of {bridge['exchanges']} exchanges unanswered, policy late p99 "
-            f"{bridge['policy_jitter']['p99_ms']:.1f} ms, physics let go {bridge['let_go_s']:.2f} s)")
+    return (
+        f"{report['trial']:4d}  {told}  {report['seconds']:7.2f} s  {report['end']}  ({report['wall']:.0f} s; "
+        f"{bridge['unanswered']} of {bridge['exchanges']} exchanges unanswered, policy late p99 "
+        f"{bridge['policy_jitter']['p99_ms']:.1f} ms, physics let go {bridge['let_go_s']:.2f} s)"
+    )
 
 
 def arguments() -> argparse.Namespace:
@@ -129,8 +177,12 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--first", type=int, default=0, help="number of the first trial")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--seconds", type=float, help="time limit of a trial; by default the task's (8 or 120)")
-    parser.add_argument("--draw", choices=("outside", "inside", "nominal"), default="outside",
-                        help="parameters outside training's ranges, inside them, or at their middle")
+    parser.add_argument(
+        "--draw",
+        choices=("outside", "inside", "nominal"),
+        default="outside",
+        help="parameters outside training's ranges, inside them, or at their middle",
+    )
     parser.add_argument("--twin", default="", help="more options of `dexsim_real.twin`, in one word")
     parser.add_argument("--runner", default="", help="more options of `dexsim_real.run`, in one word")
     parser.add_argument("--no-realtime", dest="realtime", action="store_false")
@@ -150,12 +202,23 @@ def main() -> None:
         sys.exit(130)
     here = (grasp_metrics if options.task == "grasp" else rotate_metrics)(reports)
     there = simulated(options.task, options.policy or options.task)
-    print(f"{options.task}: {len(reports)} trials through the bytes, parameters {options.draw}, seed {options.seed}; "
-          f"targets {TARGETS[options.task]}")
+    print(
+        f"{options.task}: {len(reports)} trials through the bytes, parameters {options.draw}, seed {options.seed}; "
+        f"targets {TARGETS[options.task]}"
+    )
     print(table(here, there))
     if options.json:
-        options.json.write_text(json.dumps({"options": {k: str(v) for k, v in vars(options).items()}, "metrics": here,
-                                            "simulation": there, "trials": reports}, indent=1))
+        options.json.write_text(
+            json.dumps(
+                {
+                    "options": {k: str(v) for k, v in vars(options).items()},
+                    "metrics": here,
+                    "simulation": there,
+                    "trials": reports,
+                },
+                indent=1,
+            )
+        )
 
 
 if __name__ == "__main__":

@@ -51,11 +51,19 @@ def run_trial(options: dict[str, Any], seed: int, number: int) -> dict[str, Any]
     hand, controller, calibration = load(options["policy"])
     # As in the task's evaluation: five commands for each shape.
     command, shape = COMMANDS[number % len(COMMANDS)], SHAPES[number // len(COMMANDS) % len(SHAPES)]
-    plant = EmulatedHand(hand, options["task"], seed, kind=options["draw"], overrides=options["set"],
-                         seconds=options["seconds"], trials=1, first=number, shape=shape)
+    plant = EmulatedHand(
+        hand,
+        options["task"],
+        seed,
+        kind=options["draw"],
+        overrides=options["set"],
+        seconds=options["seconds"],
+        trials=1,
+        first=number,
+        shape=shape,
+    )
     began = time.perf_counter()
-    report = VirtualRun(plant, controller, calibration,
-                        RunOptions(command=command, safety=options["safety"])).run()
+    report = VirtualRun(plant, controller, calibration, RunOptions(command=command, safety=options["safety"])).run()
     return report | {"wall": round(time.perf_counter() - began, 2)}
 
 
@@ -72,15 +80,21 @@ def run_all(options: dict[str, Any], trials: int, processes: int, show: bool) ->
 
 def _shown(report: dict[str, Any], show: bool) -> dict[str, Any]:
     if show:
-        told = (f"command {report['command']:.2f} {report['shape']:<11} fingers {report['finger_force']:6.2f} N"
-                if report["task"] == "grasp" else
-                f"{report['successes']:3d} successes ({report['paper_successes']} as the paper counts)")
-        print(f"{report['trial']:4d}  {told}  {report['seconds']:7.2f} s  {report['end']}  ({report['wall']:.0f} s)",
-              file=sys.stderr, flush=True)
+        told = (
+            f"command {report['command']:.2f} {report['shape']:<11} fingers {report['finger_force']:6.2f} N"
+            if report["task"] == "grasp"
+            else f"{report['successes']:3d} successes ({report['paper_successes']} as the paper counts)"
+        )
+        print(
+            f"{report['trial']:4d}  {told}  {report['seconds']:7.2f} s  {report['end']}  ({report['wall']:.0f} s)",
+            file=sys.stderr,
+            flush=True,
+        )
     return report
 
 
 # --- metrics -------------------------------------------------------------------------------------
+
 
 def grasp_metrics(reports: list[dict[str, Any]]) -> dict[str, Any]:
     """Held, and how the forces of held objects follow the command: with friction, and pressing alone, as the paper's
@@ -89,31 +103,50 @@ def grasp_metrics(reports: list[dict[str, Any]]) -> dict[str, Any]:
     from dexsim.tasks.grasp_report import pearson
 
     held = np.array([r["held"] for r in reports])
-    command, force, pressing, total = (np.array([r[name] for r in reports], float)[held]
-                                       for name in ("command", "finger_force", "finger_pressing", "total_force"))
-    by_command = [{"command": c, "held": proportion(held[[r["command"] == c for r in reports]]),
-                   "finger_force": mean(force[command == c]),
-                   "finger_pressing": mean(pressing[command == c]), "total_force": mean(total[command == c])}
-                  for c in sorted({r["command"] for r in reports})]
-    by_shape = [{"shape": s, "held": proportion(held[[r["shape"] == s for r in reports]])}
-                for s in sorted({r["shape"] for r in reports})]
-    return {"held": proportion(held), "pearson_r": pearson(command, force),
-            "pearson_r_pressing": pearson(command, pressing), "pearson_r_total": pearson(command, total),
-            "by_command": by_command, "by_shape": by_shape}
+    command, force, pressing, total = (
+        np.array([r[name] for r in reports], float)[held]
+        for name in ("command", "finger_force", "finger_pressing", "total_force")
+    )
+    by_command = [
+        {
+            "command": c,
+            "held": proportion(held[[r["command"] == c for r in reports]]),
+            "finger_force": mean(force[command == c]),
+            "finger_pressing": mean(pressing[command == c]),
+            "total_force": mean(total[command == c]),
+        }
+        for c in sorted({r["command"] for r in reports})
+    ]
+    by_shape = [
+        {"shape": s, "held": proportion(held[[r["shape"] == s for r in reports]])}
+        for s in sorted({r["shape"] for r in reports})
+    ]
+    return {
+        "held": proportion(held),
+        "pearson_r": pearson(command, force),
+        "pearson_r_pressing": pearson(command, pressing),
+        "pearson_r_total": pearson(command, total),
+        "by_command": by_command,
+        "by_shape": by_shape,
+    }
 
 
 def rotate_metrics(reports: list[dict[str, Any]]) -> dict[str, Any]:
     """The paper's three, with the count of the task's rule (spin) and of the paper's."""
     from dexsim.statistics import mean, proportion
 
-    count, paper, lived = (np.array([r[name] for r in reports], float)
-                           for name in ("successes", "paper_successes", "seconds_to_fall"))
+    count, paper, lived = (
+        np.array([r[name] for r in reports], float) for name in ("successes", "paper_successes", "seconds_to_fall")
+    )
     pace = np.array([r["seconds_per_success"] for r in reports if r["successes"]], float)
-    return {"successes": mean(count) | {"median": float(np.median(count)), "sorted": sorted(count.tolist())},
-            "paper_successes": mean(paper) | {"median": float(np.median(paper)), "sorted": sorted(paper.tolist())},
-            "seconds_per_success": mean(pace), "seconds_to_fall": mean(lived),
-            "kept_to_the_end": proportion(np.array([not r["fell"] for r in reports])),
-            "joint_speed": mean(np.array([r["joint_speed"] for r in reports]))}
+    return {
+        "successes": mean(count) | {"median": float(np.median(count)), "sorted": sorted(count.tolist())},
+        "paper_successes": mean(paper) | {"median": float(np.median(paper)), "sorted": sorted(paper.tolist())},
+        "seconds_per_success": mean(pace),
+        "seconds_to_fall": mean(lived),
+        "kept_to_the_end": proportion(np.array([not r["fell"] for r in reports])),
+        "joint_speed": mean(np.array([r["joint_speed"] for r in reports])),
+    }
 
 
 def simulated(task: str, policy: str) -> dict[str, Any]:
@@ -130,13 +163,16 @@ def simulated(task: str, policy: str) -> dict[str, Any]:
     if task == "grasp":
         names = "held", "pearson_r", "pearson_r_pressing", "pearson_r_total", "by_command"
         return {name: report[name] for name in names if name in report}
-    counts = {name: report[name]["mean"] | {"median": report[name]["median"]["median"]}
-              for name in ("successes", "paper_successes")}
+    counts = {
+        name: report[name]["mean"] | {"median": report[name]["median"]["median"]}
+        for name in ("successes", "paper_successes")
+    }
     return counts | {name: report[name] for name in ("seconds_per_success", "seconds_to_fall", "kept_to_the_end")}
 
 
 def table(here: dict[str, Any], there: dict[str, Any]) -> str:
     """Rows of metric, emulated hand, simulation."""
+
     def cell(entry: Any) -> str:
         if not isinstance(entry, dict):
             return "-"
@@ -152,13 +188,19 @@ def table(here: dict[str, Any], there: dict[str, Any]) -> str:
     for entry in here.get("by_command", []):
         other = next((row for row in there.get("by_command", []) if row["command"] == entry["command"]), {})
         rows.append((f"command {entry['command']:g}: held", cell(entry["held"]), cell(other.get("held"))))
-        rows.append((f"command {entry['command']:g}: finger force (N)", cell(entry["finger_force"]),
-                     cell(other.get("finger_force_n"))))
+        rows.append(
+            (
+                f"command {entry['command']:g}: finger force (N)",
+                cell(entry["finger_force"]),
+                cell(other.get("finger_force_n")),
+            )
+        )
     rows += [(f"{entry['shape']}: held", cell(entry["held"]), "") for entry in here.get("by_shape", [])]
     rows = [("", "emulated hand", "simulation"), *rows]
     widths = [max(len(row[k]) for row in rows) for k in range(3)]
-    return "\n".join("  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip()
-                     for row in rows)
+    return "\n".join(
+        "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows
+    )
 
 
 def arguments() -> argparse.Namespace:
@@ -168,11 +210,19 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--trials", type=int, default=10, help="of each seed")
     parser.add_argument("--seed", type=int, nargs="+", default=[0], help="the metrics are over the trials of all seeds")
     parser.add_argument("--seconds", type=float, help="time limit of a trial; by default the task's (8 or 120)")
-    parser.add_argument("--draw", choices=("outside", "inside", "nominal"), default="outside",
-                        help="parameters outside training's ranges, inside them, or at their middle")
-    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE",
-                        help="fix a parameter of the emulated hand (dexsim_real/twin/draw.py): a number, "
-                             "or outside, inside, nominal")
+    parser.add_argument(
+        "--draw",
+        choices=("outside", "inside", "nominal"),
+        default="outside",
+        help="parameters outside training's ranges, inside them, or at their middle",
+    )
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="fix a parameter of the emulated hand (dexsim_real/twin/draw.py): a number, or outside, inside, nominal",
+    )
     parser.add_argument("--no-safety", dest="safety", action="store_false", help="leave the bridge's limits out")
     parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--json", type=Path, help="file for everything")
@@ -181,19 +231,30 @@ def arguments() -> argparse.Namespace:
 
 def main() -> None:
     given = arguments()
-    options = {"task": given.task, "policy": given.policy or given.task, "seed": given.seed, "draw": given.draw,
-               "seconds": given.seconds, "safety": given.safety,
-               "set": {name: value if value in ("outside", "inside", "nominal") else float(value)
-                       for name, value in (pair.split("=") for pair in given.set)}}
+    options = {
+        "task": given.task,
+        "policy": given.policy or given.task,
+        "seed": given.seed,
+        "draw": given.draw,
+        "seconds": given.seconds,
+        "safety": given.safety,
+        "set": {
+            name: value if value in ("outside", "inside", "nominal") else float(value)
+            for name, value in (pair.split("=") for pair in given.set)
+        },
+    }
     reports = run_all(options, given.trials, given.processes, show=True)
     here = (grasp_metrics if given.task == "grasp" else rotate_metrics)(reports)
     there = simulated(given.task, options["policy"])
-    print(f"{given.task}: {len(reports)} trials, parameters {given.draw}, seed {' '.join(map(str, given.seed))}; "
-          f"targets {TARGETS[given.task]}")
+    print(
+        f"{given.task}: {len(reports)} trials, parameters {given.draw}, seed {' '.join(map(str, given.seed))}; "
+        f"targets {TARGETS[given.task]}"
+    )
     print(table(here, there))
     if given.json:
-        given.json.write_text(json.dumps({"options": options, "metrics": here, "simulation": there,
-                                          "trials": reports}, indent=1))
+        given.json.write_text(
+            json.dumps({"options": options, "metrics": here, "simulation": there, "trials": reports}, indent=1)
+        )
 
 
 if __name__ == "__main__":

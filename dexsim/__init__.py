@@ -1,9 +1,9 @@
 """dexsim: force-aware, tactile dexterous hands in JAX, from simulation to the hand.
 
-    import dexsim
-    env = dexsim.make("grasp")
-    state = env.reset(jax.random.key(0))
-    state = env.step(state, action)
+import dexsim
+env = dexsim.make("grasp")
+state = env.reset(jax.random.key(0))
+state = env.step(state, action)
 """
 
 from typing import Any

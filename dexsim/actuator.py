@@ -34,27 +34,26 @@ class Actuator:
     viscous_friction: jax.Array | None = None  # b, Nm s/rad
 
 
-def pd_torque(actuator: Actuator, target: jax.Array, target_velocity: jax.Array,
-              position: jax.Array, velocity: jax.Array) -> jax.Array:
+def pd_torque(
+    actuator: Actuator, target: jax.Array, target_velocity: jax.Array, position: jax.Array, velocity: jax.Array
+) -> jax.Array:
     """tau_c = k_p (q_ref - q) + k_d (qd_ref - qd), Nm."""
-    return (actuator.stiffness * (target - position)
-            + actuator.damping * (target_velocity - velocity))
+    return actuator.stiffness * (target - position) + actuator.damping * (target_velocity - velocity)
 
 
-def dead_band(actuator: Actuator, torque: jax.Array, target: jax.Array,
-              position: jax.Array) -> jax.Array:
+def dead_band(actuator: Actuator, torque: jax.Array, target: jax.Array, position: jax.Array) -> jax.Array:
     """tau_b = 0 where |q_ref - q| < epsilon, else tau_c."""
     return jnp.where(jnp.abs(target - position) < actuator.dead_band, 0.0, torque)
 
 
 def torque_limit(actuator: Actuator, velocity: jax.Array) -> jax.Array:
     """tau_sat = tau_0 (1 - |qd| / qd_max), not below zero beyond the no-load speed, Nm."""
-    return actuator.stall_torque * jnp.maximum(
-        1.0 - jnp.abs(velocity) / actuator.no_load_speed, 0.0)
+    return actuator.stall_torque * jnp.maximum(1.0 - jnp.abs(velocity) / actuator.no_load_speed, 0.0)
 
 
-def joint_torque(actuator: Actuator, target: jax.Array, target_velocity: jax.Array,
-                 position: jax.Array, velocity: jax.Array) -> jax.Array:
+def joint_torque(
+    actuator: Actuator, target: jax.Array, target_velocity: jax.Array, position: jax.Array, velocity: jax.Array
+) -> jax.Array:
     """Torque of one joint's motor, Nm: eta clip(tau_b, -tau_sat, tau_sat) (1 + r sin(n q + phase)).
 
     The PD law and the dead-band see the measured angle, position + encoder bias. This is the
@@ -77,8 +76,7 @@ drive = jax.vmap(joint_torque)
 """`joint_torque` over joints: an `Actuator` of [J] leaves and arrays [J] to torques [J] Nm."""
 
 
-def apply_friction(actuator: Actuator, torque: jax.Array, velocity: jax.Array,
-                   inertia_rate: jax.Array) -> jax.Array:
+def apply_friction(actuator: Actuator, torque: jax.Array, velocity: jax.Array, inertia_rate: jax.Array) -> jax.Array:
     """What Coulomb and viscous friction leave of a torque, Nm: one backward Euler step.
 
     The joint alone, without contacts, would end the sub-step at the momentum rate
@@ -101,8 +99,7 @@ def apply_friction(actuator: Actuator, torque: jax.Array, velocity: jax.Array,
     return torque - held - (rate - held) * (viscous / (inertia_rate + viscous))
 
 
-def delayed_target(substep: jax.Array, latency: jax.Array, previous: jax.Array,
-                   target: jax.Array) -> jax.Array:
+def delayed_target(substep: jax.Array, latency: jax.Array, previous: jax.Array, target: jax.Array) -> jax.Array:
     """The target [J] that acts at a sub-step: the previous one for the first `latency` of them.
 
     `latency` [] or [J]; one control tick at most is modelled.

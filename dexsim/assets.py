@@ -18,8 +18,7 @@ def assets_root() -> Path:
     for root in (_PACKAGE / "_assets", _PACKAGE.parent / "assets"):
         if root.is_dir():
             return root.resolve()
-    raise AssetError(f"no assets found in {_PACKAGE / '_assets'} or {_PACKAGE.parent / 'assets'}: "
-                     "install dexsim again")
+    raise AssetError(f"no assets found in {_PACKAGE / '_assets'} or {_PACKAGE.parent / 'assets'}: install dexsim again")
 
 
 def asset_path(name: str) -> Path:

@@ -52,9 +52,17 @@ def rotor_at(position: jax.Array, velocity: jax.Array) -> Rotor:
     return Rotor(position, velocity)
 
 
-def tooth_torque(play: GearPlay, rotor: Rotor, motor_torque: jax.Array, position: jax.Array,
-                 velocity: jax.Array, *, inertia: jax.Array, timestep: float,
-                 link_torque: jax.Array | float = 0.0) -> jax.Array:
+def tooth_torque(
+    play: GearPlay,
+    rotor: Rotor,
+    motor_torque: jax.Array,
+    position: jax.Array,
+    velocity: jax.Array,
+    *,
+    inertia: jax.Array,
+    timestep: float,
+    link_torque: jax.Array | float = 0.0,
+) -> jax.Array:
     """Torque through the gear on the link, Nm, at the end of a sub-step.
 
     Args:
@@ -67,10 +75,8 @@ def tooth_torque(play: GearPlay, rotor: Rotor, motor_torque: jax.Array, position
       link_torque: Nm, other torques on the link, where known.
     """
     reduced = play.rotor_inertia * inertia / (play.rotor_inertia + inertia)
-    damping = (2.0 * jnp.sqrt(play.tooth_stiffness * reduced) if play.tooth_damping is None
-               else play.tooth_damping)
-    slip = rotor.velocity - velocity + timestep * (motor_torque / play.rotor_inertia
-                                                   - link_torque / inertia)
+    damping = 2.0 * jnp.sqrt(play.tooth_stiffness * reduced) if play.tooth_damping is None else play.tooth_damping
+    slip = rotor.velocity - velocity + timestep * (motor_torque / play.rotor_inertia - link_torque / inertia)
     offset = rotor.position - position + timestep * slip  # both as without a tooth torque
     depth = jnp.abs(offset) - play.gap / 2
     way = jnp.sign(offset)
@@ -79,10 +85,18 @@ def tooth_torque(play: GearPlay, rotor: Rotor, motor_torque: jax.Array, position
     return jnp.where(depth > 0, jnp.maximum(push, 0.0), 0.0) * way
 
 
-def drive_with_play(actuator: Actuator, play: GearPlay, rotor: Rotor, target: jax.Array,
-                    position: jax.Array, velocity: jax.Array, *, inertia: jax.Array,
-                    timestep: float, link_torque: jax.Array | float = 0.0
-                    ) -> tuple[jax.Array, Rotor]:
+def drive_with_play(
+    actuator: Actuator,
+    play: GearPlay,
+    rotor: Rotor,
+    target: jax.Array,
+    position: jax.Array,
+    velocity: jax.Array,
+    *,
+    inertia: jax.Array,
+    timestep: float,
+    link_torque: jax.Array | float = 0.0,
+) -> tuple[jax.Array, Rotor]:
     """`dexsim.actuator.joint_torque` through a gear with play.
 
     The PD law, the envelope and the friction act on the rotor, where the encoder and the motor
@@ -93,8 +107,9 @@ def drive_with_play(actuator: Actuator, play: GearPlay, rotor: Rotor, target: ja
     """
     motor = joint_torque(actuator, target, jnp.zeros_like(target), rotor.position, rotor.velocity)
     motor = apply_friction(actuator, motor, rotor.velocity, play.rotor_inertia / timestep)
-    tooth = tooth_torque(play, rotor, motor, position, velocity, inertia=inertia,
-                         timestep=timestep, link_torque=link_torque)
+    tooth = tooth_torque(
+        play, rotor, motor, position, velocity, inertia=inertia, timestep=timestep, link_torque=link_torque
+    )
     after = rotor.velocity + timestep * (motor - tooth) / play.rotor_inertia
     return tooth, Rotor(rotor.position + timestep * after, after)
 
@@ -104,9 +119,18 @@ def gear_at(position: jax.Array, velocity: jax.Array) -> GearState:
     return GearState(rotor_at(position, velocity), velocity, jnp.zeros_like(position))
 
 
-def drive_beside(actuator: Actuator, play: GearPlay, gear: GearState, target: jax.Array,
-                 position: jax.Array, velocity: jax.Array, *, inertia: jax.Array, timestep: float,
-                 steps: int) -> tuple[jax.Array, GearState]:
+def drive_beside(
+    actuator: Actuator,
+    play: GearPlay,
+    gear: GearState,
+    target: jax.Array,
+    position: jax.Array,
+    velocity: jax.Array,
+    *,
+    inertia: jax.Array,
+    timestep: float,
+    steps: int,
+) -> tuple[jax.Array, GearState]:
     """`drive_with_play` for a link that someone else moves, as a physics engine does.
 
     What else acts on the link (contacts, weight, other joints) shows in how it moved during the
@@ -125,8 +149,9 @@ def drive_beside(actuator: Actuator, play: GearPlay, gear: GearState, target: ja
     load = inertia * (velocity - gear.velocity) / timestep - gear.torque
     step, total, rotor, moved, speed = timestep / steps, 0.0, gear.rotor, position, velocity
     for _ in range(steps):
-        torque, rotor = drive_with_play(actuator, play, rotor, target, moved, speed,
-                                        inertia=inertia, timestep=step, link_torque=load)
+        torque, rotor = drive_with_play(
+            actuator, play, rotor, target, moved, speed, inertia=inertia, timestep=step, link_torque=load
+        )
         speed = speed + step * (torque + load) / inertia
         moved, total = moved + step * speed, total + torque
     return total / steps, GearState(rotor, velocity, total / steps)

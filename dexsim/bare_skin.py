@@ -38,9 +38,11 @@ def whole_surface(hand: Hand, reach: float) -> Surface:
     bare = [_beyond(hand, finger, reach) for finger in range(hand.num_fingers)]
     most = max(len(rows) for rows in bare)
     bare = np.stack([np.concatenate([rows, np.zeros((most - len(rows), 7), np.float32)]) for rows in bare])
-    return Surface(np.concatenate([hand.taxel_position, bare[..., :3]], 1),
-                   np.concatenate([hand.taxel_normal, bare[..., 3:6]], 1),
-                   np.concatenate([hand.taxel_area, bare[..., 6]], 1))
+    return Surface(
+        np.concatenate([hand.taxel_position, bare[..., :3]], 1),
+        np.concatenate([hand.taxel_normal, bare[..., 3:6]], 1),
+        np.concatenate([hand.taxel_area, bare[..., 6]], 1),
+    )
 
 
 def _beyond(hand: Hand, finger: int, reach: float) -> np.ndarray:

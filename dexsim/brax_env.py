@@ -35,8 +35,7 @@ def _put_replicated(tree: Any, devices: list[jax.Device]) -> Any:
     """`tree` with a leading axis over `devices`: JAX 0.10 took it out, brax 0.14 still calls it."""
     mesh = jax.sharding.Mesh(np.array(devices), ("device",))
     sharding = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("device"))
-    return jax.tree.map(
-        lambda leaf: jax.device_put(jnp.stack([jnp.asarray(leaf)] * len(devices)), sharding), tree)
+    return jax.tree.map(lambda leaf: jax.device_put(jnp.stack([jnp.asarray(leaf)] * len(devices)), sharding), tree)
 
 
 if not hasattr(jax, "device_put_replicated"):
@@ -61,8 +60,7 @@ class BraxEnv(Env):
     def __init__(self, env: Any, observation_group: str | None = None):
         groups = env.observation_layout
         if observation_group is not None and observation_group not in groups:
-            raise ConfigError(f"no observation group {observation_group!r}: "
-                              f"choose from {', '.join(groups)}")
+            raise ConfigError(f"no observation group {observation_group!r}: choose from {', '.join(groups)}")
         self.env = env
         self._group = observation_group
         # Tells which leaves are random keys: brax cannot carry typed keys through its trainer.
@@ -81,13 +79,16 @@ class BraxEnv(Env):
     def restart(self, state: State, done: jax.Array) -> State:
         """Begin a new episode where `done`; reward, done and metrics stay the last step's."""
         begun = self._to_brax(self.env.restart(self._to_dexsim(state), done.astype(bool)), state)
-        return begun.replace(reward=state.reward, done=state.done, metrics=state.metrics,
-                             info={**begun.info, "time_limit": state.info["time_limit"]})
+        return begun.replace(
+            reward=state.reward,
+            done=state.done,
+            metrics=state.metrics,
+            info={**begun.info, "time_limit": state.info["time_limit"]},
+        )
 
     @property
     def observation_size(self) -> int | dict[str, tuple[int, ...]]:
-        sizes = {group: sum(field.size for field in fields)
-                 for group, fields in self.env.observation_layout.items()}
+        sizes = {group: sum(field.size for field in fields) for group, fields in self.env.observation_layout.items()}
         if self._group is not None:
             return sizes[self._group]
         return {group: (size,) for group, size in sizes.items()}
@@ -118,8 +119,10 @@ class BraxEnv(Env):
         """Pictures uint8 `[height, width, 3]` of brax states without a batch axis."""
         from dexsim.render import render_frame
 
-        return [render_frame(self.env.hand, self.env.primitive_kinds, self.snapshot(state),
-                             size=(width, height)) for state in trajectory]
+        return [
+            render_frame(self.env.hand, self.env.primitive_kinds, self.snapshot(state), size=(width, height))
+            for state in trajectory
+        ]
 
     def _to_brax(self, state: Any, last: State | None = None) -> State:
         # brax's wrappers keep entries of their own in `metrics` and `info`: they stay.
@@ -131,8 +134,10 @@ class BraxEnv(Env):
             obs=dict(state.obs) if self._group is None else state.obs[self._group],
             reward=state.reward.astype(jnp.float32),
             done=terminated,
-            metrics=carried | {name: value.astype(jnp.float32) for name, value
-                               in state.metrics.items() if name not in _RUNNING_METRICS},
+            metrics=carried
+            | {
+                name: value.astype(jnp.float32) for name, value in state.metrics.items() if name not in _RUNNING_METRICS
+            },
             info={**info, "key": jax.random.key_data(state.key), "time_limit": time_limit},
         )
 
@@ -149,11 +154,9 @@ class TimeLimit(EpisodeWrapper):
     def step(self, state: State, action: jax.Array) -> State:
         state = super().step(state, action)
         terminated = state.done * (1 - state.info["truncation"])
-        truncation = jnp.maximum(state.info["truncation"],
-                                 state.info["time_limit"] * (1 - terminated))
+        truncation = jnp.maximum(state.info["truncation"], state.info["time_limit"] * (1 - terminated))
         done = jnp.maximum(state.done, truncation)
-        return state.replace(done=done, info={**state.info, "truncation": truncation,
-                                              "episode_done": done})
+        return state.replace(done=done, info={**state.info, "truncation": truncation, "episode_done": done})
 
 
 class Restart(Wrapper):
@@ -166,8 +169,7 @@ class Restart(Wrapper):
         return jax.vmap(self.unwrapped.restart)(state, state.done)
 
 
-def wrap(env: BraxEnv, episode_length: int, action_repeat: int = 1,
-         randomization_fn: Any = None) -> Wrapper:
+def wrap(env: BraxEnv, episode_length: int, action_repeat: int = 1, randomization_fn: Any = None) -> Wrapper:
     """For the argument `wrap_env_fn` of brax's trainers: vmap, time limit, restart.
 
     Args:
@@ -177,8 +179,10 @@ def wrap(env: BraxEnv, episode_length: int, action_repeat: int = 1,
       ConfigError: `randomization_fn` is given; our environments randomise themselves.
     """
     if randomization_fn is not None:
-        raise ConfigError("randomization_fn: the task draws new parameters at every episode start "
-                          "by itself; set its `randomization` config instead")
+        raise ConfigError(
+            "randomization_fn: the task draws new parameters at every episode start "
+            "by itself; set its `randomization` config instead"
+        )
     return Restart(TimeLimit(VmapWrapper(env), episode_length, action_repeat))
 
 

@@ -18,10 +18,14 @@ import numpy as np
 from dexsim.brax_env import BraxEnv
 from dexsim.hand import forward_kinematics
 
-_TYPES = {"sphere": mujoco.mjtGeom.mjGEOM_SPHERE, "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
-          "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER, "box": mujoco.mjtGeom.mjGEOM_BOX,
-          # The viewer knows no ellipsoids: a ball of the largest axis stands in.
-          "ellipsoid": mujoco.mjtGeom.mjGEOM_SPHERE}
+_TYPES = {
+    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
+    "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
+    "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
+    "box": mujoco.mjtGeom.mjGEOM_BOX,
+    # The viewer knows no ellipsoids: a ball of the largest axis stands in.
+    "ellipsoid": mujoco.mjtGeom.mjGEOM_SPHERE,
+}
 _HAND, _OBJECT = (0.30, 0.32, 0.36, 1.0), (0.85, 0.55, 0.25, 1.0)
 
 
@@ -33,22 +37,35 @@ def brax_scene(env: BraxEnv, trajectory: Sequence[Any]) -> tuple[Any, list[Any]]
     """
     hand = env.env.hand
     frames = [env.snapshot(state) for state in trajectory]
-    rows = [(geom.kind, geom.size, geom.body, geom.position, geom.rotation, _HAND)
-            for geom in hand.geoms if geom.kind in _TYPES]
+    rows = [
+        (geom.kind, geom.size, geom.body, geom.position, geom.rotation, _HAND)
+        for geom in hand.geoms
+        if geom.kind in _TYPES
+    ]
     first = frames[0]
-    rows += [(kind, first.primitive_size[k], len(hand.body_names), first.primitive_position[k],
-              first.primitive_rotation[k], _OBJECT)
-             for k, kind in enumerate(env.env.primitive_kinds) if first.primitive_active[k]]
+    rows += [
+        (
+            kind,
+            first.primitive_size[k],
+            len(hand.body_names),
+            first.primitive_position[k],
+            first.primitive_rotation[k],
+            _OBJECT,
+        )
+        for k, kind in enumerate(env.env.primitive_kinds)
+        if first.primitive_active[k]
+    ]
     kinds, sizes, links, positions, rotations, colours = zip(*rows, strict=True)
-    sizes = [np.max(size).repeat(3) if kind == "ellipsoid" else size
-             for kind, size in zip(kinds, sizes, strict=True)]
+    sizes = [np.max(size).repeat(3) if kind == "ellipsoid" else size for kind, size in zip(kinds, sizes, strict=True)]
     system = SimpleNamespace(
         opt=SimpleNamespace(timestep=env.dt),
         link_names=[*hand.body_names, "object"],
         ngeom=len(rows),
         geom_type=[int(_TYPES[kind]) for kind in kinds],
         geom_bodyid=np.array(links) + 1,  # 0 is the world
-        geom_pos=np.array(positions), geom_quat=_quats(rotations), geom_size=np.array(sizes),
+        geom_pos=np.array(positions),
+        geom_quat=_quats(rotations),
+        geom_size=np.array(sizes),
         mj_model=SimpleNamespace(geom_rgba=np.array(colours)),
     )
     kinematics = jax.jit(lambda joints: forward_kinematics(hand, joints))

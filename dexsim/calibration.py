@@ -74,13 +74,13 @@ class Calibration:
 
 # --- run time -------------------------------------------------------------------------------
 
+
 def current_from_counts(calibration: Calibration, counts: jax.Array) -> jax.Array:
     """Currents [J] A from what the hand reports [J] counts."""
     return jnp.asarray(counts) * calibration.current_per_count
 
 
-def joint_torque(calibration: Calibration, current: jax.Array,
-                 direction: jax.Array | float = 0.0) -> jax.Array:
+def joint_torque(calibration: Calibration, current: jax.Array, direction: jax.Array | float = 0.0) -> jax.Array:
     """Joint torques [..., J] Nm, in the simulation's sense, from motor currents [..., J] A.
 
     Args:
@@ -102,8 +102,7 @@ def joint_torque(calibration: Calibration, current: jax.Array,
     return gain * force + offset
 
 
-def normalised_torque(calibration: Calibration, current: jax.Array,
-                      direction: jax.Array | float = 0.0) -> jax.Array:
+def normalised_torque(calibration: Calibration, current: jax.Array, direction: jax.Array | float = 0.0) -> jax.Array:
     """`joint_torque` over the joints' torque limits: `Readings.joint_torque`. Not clipped."""
     return joint_torque(calibration, current, direction) / jnp.asarray(calibration.torque_scale)
 
@@ -114,11 +113,12 @@ def taxel_force(calibration: Calibration, counts: jax.Array) -> jax.Array:
     return jnp.maximum(jnp.asarray(counts) * scale, 0.0)
 
 
-def normalise(side: Side, joint: int, force: np.ndarray,
-              value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def normalise(side: Side, joint: int, force: np.ndarray, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Force and |value| of one joint's recording over their maxima: the paper's [0, 1] axes."""
-    return (np.asarray(force) / float(side.force_max[joint]),
-            np.asarray(value) * np.sign(float(side.gain[0, joint])) / float(side.value_max[joint]))
+    return (
+        np.asarray(force) / float(side.force_max[joint]),
+        np.asarray(value) * np.sign(float(side.gain[0, joint])) / float(side.value_max[joint]),
+    )
 
 
 def alignment(calibration: Calibration) -> np.ndarray:
@@ -126,33 +126,56 @@ def alignment(calibration: Calibration) -> np.ndarray:
 
     1 where aligning by the maxima, as in the paper, gives the same torque as the lines do.
     """
-    slopes = [np.abs(np.mean(side.gain, 0)) * side.force_max / side.value_max
-              for side in (calibration.real, calibration.sim)]
+    slopes = [
+        np.abs(np.mean(side.gain, 0)) * side.force_max / side.value_max for side in (calibration.real, calibration.sim)
+    ]
     return np.asarray(slopes[0] / slopes[1])
 
 
 # --- file -----------------------------------------------------------------------------------
 
-_PAIRS = ("gain", "gain_low", "gain_high", "offset", "offset_low", "offset_high", "noise",
-          "r_squared", "condition", "samples", "outliers")
+_PAIRS = (
+    "gain",
+    "gain_low",
+    "gain_high",
+    "offset",
+    "offset_low",
+    "offset_high",
+    "noise",
+    "r_squared",
+    "condition",
+    "samples",
+    "outliers",
+)
 _SINGLES = ("friction", "value_max", "force_max")
 
 
 def save_calibration(path: str | Path, calibration: Calibration) -> None:
     """Write a calibration as TOML; a crash leaves the old file or the new one, never half of it."""
     path = Path(path)
-    lines = [f"format = {_text(FORMAT)}", f"version = {VERSION}",
-             f"hand = {_text(calibration.hand)}", f"serial = {_text(calibration.serial)}",
-             f"created = {_text(calibration.created)}",
-             f"current_per_count = {_number(calibration.current_per_count)}  # A",
-             f"finger_names = [{', '.join(map(_text, calibration.finger_names))}]",
-             f"force_per_count = {_list(calibration.force_per_count)}  # N", "notes = ["]
+    lines = [
+        f"format = {_text(FORMAT)}",
+        f"version = {VERSION}",
+        f"hand = {_text(calibration.hand)}",
+        f"serial = {_text(calibration.serial)}",
+        f"created = {_text(calibration.created)}",
+        f"current_per_count = {_number(calibration.current_per_count)}  # A",
+        f"finger_names = [{', '.join(map(_text, calibration.finger_names))}]",
+        f"force_per_count = {_list(calibration.force_per_count)}  # N",
+        "notes = [",
+    ]
     lines += [f"  {_text(note)}," for note in calibration.notes] + ["]", ""]
-    lines += ["# Lines value = gain * force + offset; pairs are [loading, unloading].",
-              "# real: value in A. sim: value in Nm. Force in N. Intervals are of 95 %.", ""]
+    lines += [
+        "# Lines value = gain * force + offset; pairs are [loading, unloading].",
+        "# real: value in A. sim: value in Nm. Force in N. Intervals are of 95 %.",
+        "",
+    ]
     for joint, name in enumerate(calibration.joint_names):
-        lines += ["[[joint]]", f"name = {_text(name)}",
-                  f"torque_scale = {_number(calibration.torque_scale[joint])}  # Nm"]
+        lines += [
+            "[[joint]]",
+            f"name = {_text(name)}",
+            f"torque_scale = {_number(calibration.torque_scale[joint])}  # Nm",
+        ]
         for key in ("real", "sim"):
             side = getattr(calibration, key)
             lines.append(f"[joint.{key}]")
@@ -180,8 +203,9 @@ def load_calibration(path: str | Path, hand: Hand | None = None) -> Calibration:
     table = _read(path)
     names = tuple(_field(path, entry, "name", str) for entry in table["joint"])
     if hand is not None and (table["hand"], names) != (hand.name, hand.joint_names):
-        raise CalibrationError(f"{path}: is of hand {table['hand']!r} with {len(names)} joints, "
-                               f"not of {hand.name!r}: calibrate this hand")
+        raise CalibrationError(
+            f"{path}: is of hand {table['hand']!r} with {len(names)} joints, not of {hand.name!r}: calibrate this hand"
+        )
     sides = [_side(path, table["joint"], key) for key in ("real", "sim")]
     fingers = tuple(_field(path, table, "finger_names", list))
     per_count = np.array(_numbers(path, table, "force_per_count", len(fingers)))
@@ -189,10 +213,17 @@ def load_calibration(path: str | Path, hand: Hand | None = None) -> Calibration:
     if not (np.all(scale > 0) and np.all(per_count > 0)):
         raise CalibrationError(f"{path}: torque_scale and force_per_count must be above 0")
     return Calibration(
-        *sides, scale, per_count, hand=table["hand"], joint_names=names, finger_names=fingers,
+        *sides,
+        scale,
+        per_count,
+        hand=table["hand"],
+        joint_names=names,
+        finger_names=fingers,
         current_per_count=_numbers(path, table, "current_per_count")[0],
-        serial=_field(path, table, "serial", str), created=_field(path, table, "created", str),
-        notes=tuple(_field(path, table, "notes", list)))
+        serial=_field(path, table, "serial", str),
+        created=_field(path, table, "created", str),
+        notes=tuple(_field(path, table, "notes", list)),
+    )
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -206,8 +237,7 @@ def _read(path: Path) -> dict[str, Any]:
         raise CalibrationError(f"{path}: not a calibration file")
     version = _field(path, table, "version", int)
     if version > VERSION:
-        raise CalibrationError(f"{path}: is of version {version}, this library reads up to "
-                               f"{VERSION}: upgrade dexsim")
+        raise CalibrationError(f"{path}: is of version {version}, this library reads up to {VERSION}: upgrade dexsim")
     if table.get("end") != {"complete": True} or not table.get("joint"):
         raise CalibrationError(f"{path}: cut off: its end is missing")
     _field(path, table, "hand", str)
@@ -218,11 +248,11 @@ def _side(path: Path, joints: list[dict], key: str) -> Side:
     columns = []
     for entry in joints:
         lines = _field(path, entry, key, dict)
-        columns.append([_numbers(path, lines, name, 2) for name in _PAIRS]
-                       + [_numbers(path, lines, name) for name in _SINGLES])
+        columns.append(
+            [_numbers(path, lines, name, 2) for name in _PAIRS] + [_numbers(path, lines, name) for name in _SINGLES]
+        )
     pairs = {name: np.array([column[i] for column in columns]).T for i, name in enumerate(_PAIRS)}
-    singles = {name: np.array([column[len(_PAIRS) + i][0] for column in columns])
-               for i, name in enumerate(_SINGLES)}
+    singles = {name: np.array([column[len(_PAIRS) + i][0] for column in columns]) for i, name in enumerate(_SINGLES)}
     side = Side(**pairs, **singles)
     for name in ("gain", "offset", "value_max", "force_max"):
         if not np.all(np.isfinite(getattr(side, name))):
@@ -242,8 +272,7 @@ def _field(path: Path, table: dict, name: str, kind: type) -> Any:
 def _numbers(path: Path, table: dict, name: str, count: int = 1) -> list[float]:
     value = table.get(name)
     values = value if isinstance(value, list) else [value]
-    if len(values) != count or not all(
-            isinstance(v, (int, float)) and not isinstance(v, bool) for v in values):
+    if len(values) != count or not all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in values):
         raise CalibrationError(f"{path}: field {name!r} must hold {count} number(s)")
     return [float(v) for v in values]
 

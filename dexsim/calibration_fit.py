@@ -43,9 +43,17 @@ class JointLines:
     notes: tuple[str, ...]
 
 
-def calibrate(hand: Hand, real: Mapping[str, Press], sim: Mapping[str, Press], *,
-              force_per_count: float | np.ndarray = 0.1, current_per_count: float = 0.001,
-              missing: str = "refuse", serial: str = "", created: str | None = None) -> Calibration:
+def calibrate(
+    hand: Hand,
+    real: Mapping[str, Press],
+    sim: Mapping[str, Press],
+    *,
+    force_per_count: float | np.ndarray = 0.1,
+    current_per_count: float = 0.001,
+    missing: str = "refuse",
+    serial: str = "",
+    created: str | None = None,
+) -> Calibration:
     """Fit all joints of a hand.
 
     Args:
@@ -69,26 +77,42 @@ def calibrate(hand: Hand, real: Mapping[str, Press], sim: Mapping[str, Press], *
     fits: list[tuple[JointLines, JointLines] | None] = []
     for name in hand.joint_names:
         if name in real and name in sim:
-            fits.append((fit_joint(real[name], "A", where=f"{name} on the hand"),
-                         fit_joint(sim[name], "Nm", where=f"{name} in simulation")))
+            fits.append(
+                (
+                    fit_joint(real[name], "A", where=f"{name} on the hand"),
+                    fit_joint(sim[name], "Nm", where=f"{name} in simulation"),
+                )
+            )
         elif missing == "refuse":
             side = "hand" if name not in real else "simulation"
-            raise CalibrationError(f"{name}: no recording on the {side} side: press its fingertip, "
-                                   "or take over its torque class with missing='class'")
+            raise CalibrationError(
+                f"{name}: no recording on the {side} side: press its fingertip, "
+                "or take over its torque class with missing='class'"
+            )
         else:
             fits.append(None)
     notes = _GENERAL + tuple(
-        f"{name}: {note}" for name, fit in zip(hand.joint_names, fits, strict=True) if fit
-        for lines in fit for note in lines.notes)
+        f"{name}: {note}"
+        for name, fit in zip(hand.joint_names, fits, strict=True)
+        if fit
+        for lines in fit
+        for note in lines.notes
+    )
     sides, taken = zip(*(_gather(hand, fits, k) for k in (0, 1)), strict=True)
-    notes += tuple(f"{name}: not recorded, mean of the joints of its torque limit"
-                   for name in taken[0])
+    notes += tuple(f"{name}: not recorded, mean of the joints of its torque limit" for name in taken[0])
     scale = np.broadcast_to(np.asarray(force_per_count, float), (hand.num_fingers,)).copy()
     calibration = Calibration(
-        *sides, np.round(np.asarray(hand.torque_limit, float), 6), scale, hand=hand.name,
-        joint_names=hand.joint_names, finger_names=hand.finger_names,
-        current_per_count=current_per_count, serial=serial,
-        created=created if created is not None else datetime.date.today().isoformat(), notes=notes)
+        *sides,
+        np.round(np.asarray(hand.torque_limit, float), 6),
+        scale,
+        hand=hand.name,
+        joint_names=hand.joint_names,
+        finger_names=hand.finger_names,
+        current_per_count=current_per_count,
+        serial=serial,
+        created=created if created is not None else datetime.date.today().isoformat(),
+        notes=notes,
+    )
     return dataclasses.replace(calibration, notes=notes + _compare(calibration))
 
 
@@ -97,7 +121,8 @@ _GENERAL = (
     "every press, scales all torques and cannot be seen in these data",
     "torque constant, lever arm and gear efficiency enter as one product; the ratio of the gains "
     "unloading / loading is the product of the two directions' efficiencies, not either alone",
-    "one posture: a weight on the joint and a zero error of the current are both in the offset")
+    "one posture: a weight on the joint and a zero error of the current are both in the offset",
+)
 
 
 def fit_joint(press: Press, unit: str, where: str = "recording") -> JointLines:
@@ -113,29 +138,34 @@ def fit_joint(press: Press, unit: str, where: str = "recording") -> JointLines:
         the value does not follow the force.
     """
     force, value = _checked(press, unit, where)
-    direction = (find_direction(force) if press.direction is None
-                 else np.sign(np.asarray(press.direction)).astype(int))
+    direction = find_direction(force) if press.direction is None else np.sign(np.asarray(press.direction)).astype(int)
     free, clipped = _not_saturated(force, value, where)
     notes = [f"{clipped} saturated samples left out ({unit})"] if clipped else []
     lines = []
     for sign, name in ((1, "loading"), (-1, "unloading")):
         keep = free & (direction == sign)
-        lines.append(_fit_direction(force[keep], value[keep], f"{where}, {name}")
-                     if np.sum(keep) >= MIN_SAMPLES else None)
+        lines.append(
+            _fit_direction(force[keep], value[keep], f"{where}, {name}") if np.sum(keep) >= MIN_SAMPLES else None
+        )
     if lines == [None, None]:
         counts = [int(np.sum(free & (direction == sign))) for sign in (1, -1)]
-        raise CalibrationError(f"{where}: {counts[0]} samples loading and {counts[1]} unloading: "
-                               f"at least {MIN_SAMPLES} in a direction are needed")
-    if lines[0] is not None and lines[1] is not None \
-            and lines[0].gain * lines[1].gain < 0:
-        raise CalibrationError(f"{where}: rises with force while loading and falls while "
-                               "unloading: are two joints or fingers mixed up?")
+        raise CalibrationError(
+            f"{where}: {counts[0]} samples loading and {counts[1]} unloading: "
+            f"at least {MIN_SAMPLES} in a direction are needed"
+        )
+    if lines[0] is not None and lines[1] is not None and lines[0].gain * lines[1].gain < 0:
+        raise CalibrationError(
+            f"{where}: rises with force while loading and falls while unloading: are two joints or fingers mixed up?"
+        )
     notes += _line_notes(lines, unit)
-    sound = free & np.any([np.abs(value - line(force)) <= 4.685 * line.noise
-                           for line in lines if line is not None], 0)
-    return JointLines(*lines, _friction(lines, force[sound]),
-                      float(np.max(np.abs(value[sound]))), float(np.max(force[sound])),
-                      tuple(notes))
+    sound = free & np.any([np.abs(value - line(force)) <= 4.685 * line.noise for line in lines if line is not None], 0)
+    return JointLines(
+        *lines,
+        _friction(lines, force[sound]),
+        float(np.max(np.abs(value[sound]))),
+        float(np.max(force[sound])),
+        tuple(notes),
+    )
 
 
 def find_direction(force: np.ndarray, trim: float = 0.1) -> np.ndarray:
@@ -177,30 +207,34 @@ def _turns(smooth: np.ndarray, step: float) -> tuple[list[int], int]:
 
 def _checked(press: Press, unit: str, where: str) -> tuple[np.ndarray, np.ndarray]:
     force, value = np.asarray(press.force, float), np.asarray(press.value, float)
-    if force.ndim != 1 or force.shape != value.shape or (
-            press.direction is not None and np.shape(press.direction) != force.shape):
-        raise CalibrationError(f"{where}: force {force.shape}, value {value.shape}: give arrays "
-                               "of one length")
+    if (
+        force.ndim != 1
+        or force.shape != value.shape
+        or (press.direction is not None and np.shape(press.direction) != force.shape)
+    ):
+        raise CalibrationError(f"{where}: force {force.shape}, value {value.shape}: give arrays of one length")
     if len(force) < MIN_SAMPLES:
-        raise CalibrationError(f"{where}: {len(force)} samples: at least {MIN_SAMPLES} in a "
-                               "direction are needed")
+        raise CalibrationError(f"{where}: {len(force)} samples: at least {MIN_SAMPLES} in a direction are needed")
     bad = np.flatnonzero(~(np.isfinite(force) & np.isfinite(value)))
     if len(bad):
-        raise CalibrationError(f"{where}: sample {bad[0]} is not a number ({len(bad)} of "
-                               f"{len(force)}): leave out the reads that failed")
+        raise CalibrationError(
+            f"{where}: sample {bad[0]} is not a number ({len(bad)} of {len(force)}): leave out the reads that failed"
+        )
     for name, array, limit in (("force", force, "N"), ("value", value, unit)):
         typical = float(np.quantile(np.abs(array), 0.75))
         if typical > _LARGEST[limit]:
-            raise CalibrationError(f"{where}: {name} of {typical:g} {limit}: give it in {limit}, "
-                                   "not in counts or thousandths")
+            raise CalibrationError(
+                f"{where}: {name} of {typical:g} {limit}: give it in {limit}, not in counts or thousandths"
+            )
     _refuse_mixed_units(force, value, where)
     low, high = np.quantile(force, [0.05, 0.95])
     if high - low < MIN_FORCE_RANGE:
-        raise CalibrationError(f"{where}: force stays between {low:.3g} and {high:.3g} N: press "
-                               f"from contact up over at least {MIN_FORCE_RANGE} N")
+        raise CalibrationError(
+            f"{where}: force stays between {low:.3g} and {high:.3g} N: press "
+            f"from contact up over at least {MIN_FORCE_RANGE} N"
+        )
     if low < -MIN_FORCE_RANGE:
-        raise CalibrationError(f"{where}: force of {low:.3g} N: forces are magnitudes, tare the "
-                               "taxels first")
+        raise CalibrationError(f"{where}: force of {low:.3g} N: forces are magnitudes, tare the taxels first")
     return force, value
 
 
@@ -213,8 +247,10 @@ def _refuse_mixed_units(force: np.ndarray, value: np.ndarray, where: str) -> Non
         return
     inner = np.diff(ratio)[margin:-margin]
     if np.max(inner, initial=0.0) > 1.5:
-        raise CalibrationError(f"{where}: two groups of samples {10 ** np.max(inner):.0f} times "
-                               "apart: units are mixed, give all in A, Nm and N")
+        raise CalibrationError(
+            f"{where}: two groups of samples {10 ** np.max(inner):.0f} times "
+            "apart: units are mixed, give all in A, Nm and N"
+        )
 
 
 def _not_saturated(force: np.ndarray, value: np.ndarray, where: str) -> tuple[np.ndarray, int]:
@@ -228,22 +264,27 @@ def _not_saturated(force: np.ndarray, value: np.ndarray, where: str) -> tuple[np
         if crowd and np.sum(top) > 3 * neighbours:
             free &= ~top
             if np.sum(top) > 0.5 * len(array):
-                raise CalibrationError(f"{where}: {name} sits at its maximum {np.max(array):.3g} in "
-                                       f"{np.sum(top)} of {len(array)} samples: saturated, press "
-                                       "more gently or raise the limit")
+                raise CalibrationError(
+                    f"{where}: {name} sits at its maximum {np.max(array):.3g} in "
+                    f"{np.sum(top)} of {len(array)} samples: saturated, press "
+                    "more gently or raise the limit"
+                )
     return free, int(np.sum(~free))
 
 
 def _fit_direction(force: np.ndarray, value: np.ndarray, where: str) -> Line:
     low, high = np.quantile(force, [0.05, 0.95])
     if high - low < MIN_FORCE_RANGE:
-        raise CalibrationError(f"{where}: force only between {low:.3g} and {high:.3g} N: press "
-                               f"over at least {MIN_FORCE_RANGE} N")
+        raise CalibrationError(
+            f"{where}: force only between {low:.3g} and {high:.3g} N: press over at least {MIN_FORCE_RANGE} N"
+        )
     line = fit_line(force, value)
     if line.gain_interval[0] <= 0.0 <= line.gain_interval[1]:
-        raise CalibrationError(f"{where}: does not follow the force (gain {line.gain:.3g}, 95 % "
-                               f"{line.gain_interval[0]:.3g} to {line.gain_interval[1]:.3g}): "
-                               "check joint and finger, press harder or longer")
+        raise CalibrationError(
+            f"{where}: does not follow the force (gain {line.gain:.3g}, 95 % "
+            f"{line.gain_interval[0]:.3g} to {line.gain_interval[1]:.3g}): "
+            "check joint and finger, press harder or longer"
+        )
     return line
 
 
@@ -256,18 +297,20 @@ def _friction(lines: list[Line | None], force: np.ndarray) -> float:
 
 def _line_notes(lines: list[Line | None], unit: str) -> list[str]:
     notes = []
-    for line, name, other in zip(lines, ("loading", "unloading"), ("unloading", "loading"),
-                                 strict=True):
+    for line, name, other in zip(lines, ("loading", "unloading"), ("unloading", "loading"), strict=True):
         if line is None:
-            notes.append(f"no {name} recorded ({unit}): friction and offset are not apart, the "
-                         f"{other} line stands for both")
+            notes.append(
+                f"no {name} recorded ({unit}): friction and offset are not apart, the {other} line stands for both"
+            )
             continue
         width = (line.gain_interval[1] - line.gain_interval[0]) / 2
         if width > 0.1 * abs(line.gain):
             notes.append(f"{name} gain known to {100 * width / abs(line.gain):.0f} % only ({unit})")
         if line.condition > 20:
-            notes.append(f"{name}: forces lie close together (condition {line.condition:.0f}): "
-                         f"gain and offset trade off ({unit})")
+            notes.append(
+                f"{name}: forces lie close together (condition {line.condition:.0f}): "
+                f"gain and offset trade off ({unit})"
+            )
         if line.outliers > 0.1 * line.samples:
             notes.append(f"{name}: {line.outliers} of {line.samples} samples are outliers ({unit})")
         if line.r_squared < 0.9:
@@ -282,11 +325,14 @@ def _gather(hand: Hand, fits: list, side: int) -> tuple[Side, list[str]]:
     for joint, row in enumerate(rows):
         if row is not None:
             continue
-        same = [r for j, r in enumerate(rows) if fits[j] is not None
-                and hand.torque_limit[j] == hand.torque_limit[joint]]
+        same = [
+            r for j, r in enumerate(rows) if fits[j] is not None and hand.torque_limit[j] == hand.torque_limit[joint]
+        ]
         if not same:
-            raise CalibrationError(f"{hand.joint_names[joint]}: no recording of any joint with "
-                                   f"{hand.torque_limit[joint]:g} Nm to take over")
+            raise CalibrationError(
+                f"{hand.joint_names[joint]}: no recording of any joint with "
+                f"{hand.torque_limit[joint]:g} Nm to take over"
+            )
         taken.append(hand.joint_names[joint])
         rows[joint] = {key: np.mean([r[key] for r in same], 0) for key in same[0]}
         rows[joint]["samples"] = rows[joint]["outliers"] = np.zeros(2)
@@ -297,21 +343,28 @@ def _row(lines: JointLines) -> dict[str, np.ndarray]:
     """The fields of `Side` for one joint; a missing line is the other one with 0 samples."""
     both = [lines.loading or lines.unloading, lines.unloading or lines.loading]
     measured = np.array([lines.loading is not None, lines.unloading is not None])
-    row = {name: np.array([getattr(line, name) for line in both], float)
-           for name in ("gain", "offset", "noise", "r_squared", "condition", "samples", "outliers")}
+    row = {
+        name: np.array([getattr(line, name) for line in both], float)
+        for name in ("gain", "offset", "noise", "r_squared", "condition", "samples", "outliers")
+    }
     row["samples"], row["outliers"] = row["samples"] * measured, row["outliers"] * measured
     for name in ("gain", "offset"):
         interval = np.array([getattr(line, f"{name}_interval") for line in both])
         row[f"{name}_low"], row[f"{name}_high"] = interval.T
-    return row | {"friction": np.array(lines.friction), "value_max": np.array(lines.value_max),
-                  "force_max": np.array(lines.force_max)}
+    return row | {
+        "friction": np.array(lines.friction),
+        "value_max": np.array(lines.value_max),
+        "force_max": np.array(lines.force_max),
+    }
 
 
 def _compare(calibration: Calibration) -> tuple[str, ...]:
     notes = []
     for name, ratio in zip(calibration.joint_names, alignment(calibration), strict=True):
         if not 0.9 < ratio < 1.1:
-            notes.append(f"{name}: aligning by the maxima alone would be off by "
-                         f"{100 * abs(ratio - 1):.0f} %: the two sessions ended at different "
-                         "places on their lines")
+            notes.append(
+                f"{name}: aligning by the maxima alone would be off by "
+                f"{100 * abs(ratio - 1):.0f} %: the two sessions ended at different "
+                "places on their lines"
+            )
     return tuple(notes)

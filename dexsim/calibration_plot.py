@@ -13,8 +13,13 @@ _COLOURS = ("tab:blue", "tab:orange")
 _WAYS = ("loading", "unloading")
 
 
-def plot_calibration(path: str | Path, calibration: Calibration, real: Mapping[str, Press],
-                     sim: Mapping[str, Press], joints: tuple[str, ...] | None = None) -> None:
+def plot_calibration(
+    path: str | Path,
+    calibration: Calibration,
+    real: Mapping[str, Press],
+    sim: Mapping[str, Press],
+    joints: tuple[str, ...] | None = None,
+) -> None:
     """Write a figure with one row a joint: the hand, the simulation, both normalised.
 
     Args:
@@ -63,8 +68,10 @@ def _draw_side(axes, side: Side, joint: int, press: Press, label: str) -> None:
 
 
 def _draw_normalised(axes, calibration: Calibration, joint: int, real: Press, sim: Press) -> None:
-    for side, press, colour, label in ((calibration.real, real, "tab:green", "current (hand)"),
-                                       (calibration.sim, sim, "tab:red", "torque (simulation)")):
+    for side, press, colour, label in (
+        (calibration.real, real, "tab:green", "current (hand)"),
+        (calibration.sim, sim, "tab:red", "torque (simulation)"),
+    ):
         force, value = normalise(side, joint, press.force, press.value)
         axes.plot(force, value, ".", ms=2, alpha=0.3, color=colour)
         sign = np.sign(float(side.gain[0, joint]))

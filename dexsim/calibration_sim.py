@@ -39,8 +39,9 @@ def _lever_arms(hand: Hand, at: jax.Array, finger: jax.Array, taxel: jax.Array) 
     return jnp.sum(jax.jacfwd(place)(at) * normal[:, None], 0)
 
 
-def simulated_press(hand: Hand, joint_position: np.ndarray, finger: str, force: np.ndarray,
-                    taxel: int | None = None) -> dict[str, Press]:
+def simulated_press(
+    hand: Hand, joint_position: np.ndarray, finger: str, force: np.ndarray, taxel: int | None = None
+) -> dict[str, Press]:
     """Recordings, by joint name, of the joints that feel a press of one fingertip.
 
     Args:
@@ -57,5 +58,8 @@ def simulated_press(hand: Hand, joint_position: np.ndarray, finger: str, force: 
     columns, rows = hand.taxel_grid
     taxel = columns // 2 * rows + rows // 2 if taxel is None else taxel
     arms = lever_arms(hand, joint_position, hand.finger_names.index(finger), taxel)
-    return {name: Press(np.asarray(force, float), np.asarray(force, float) * arm)
-            for name, arm in zip(hand.joint_names, arms, strict=True) if abs(arm) >= MIN_LEVER}
+    return {
+        name: Press(np.asarray(force, float), np.asarray(force, float) * arm)
+        for name, arm in zip(hand.joint_names, arms, strict=True)
+        if abs(arm) >= MIN_LEVER
+    }

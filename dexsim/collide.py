@@ -19,9 +19,14 @@ from dexsim import sdf
 from dexsim.collide_boxes import POINTS, box_box
 
 _BOXES = ("box", "box")
-KINDS = {int(mujoco.mjtGeom.mjGEOM_SPHERE): "sphere", int(mujoco.mjtGeom.mjGEOM_BOX): "box",
-         int(mujoco.mjtGeom.mjGEOM_CAPSULE): "capsule", int(mujoco.mjtGeom.mjGEOM_CYLINDER): "cylinder",
-         int(mujoco.mjtGeom.mjGEOM_ELLIPSOID): "ellipsoid", int(mujoco.mjtGeom.mjGEOM_PLANE): "plane"}
+KINDS = {
+    int(mujoco.mjtGeom.mjGEOM_SPHERE): "sphere",
+    int(mujoco.mjtGeom.mjGEOM_BOX): "box",
+    int(mujoco.mjtGeom.mjGEOM_CAPSULE): "capsule",
+    int(mujoco.mjtGeom.mjGEOM_CYLINDER): "cylinder",
+    int(mujoco.mjtGeom.mjGEOM_ELLIPSOID): "ellipsoid",
+    int(mujoco.mjtGeom.mjGEOM_PLANE): "plane",
+}
 # Bisections for the nearest point of a capsule's axis: a 4,096th of its length.
 _HALVINGS = 12
 # Distances along an axis that change by less than this share of the way count as equal, and ends of
@@ -40,23 +45,23 @@ class Balls:
     sphere: np.ndarray  # [S, 2] geoms of the hand and primitives
     capsule: np.ndarray  # [P, 2]
 
-    def find(self, position: jax.Array, rotation: jax.Array,
-             size: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    def find(self, position: jax.Array, rotation: jax.Array, size: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Gaps [S + 2 P], points and normals [S + 2 P, 3]; see `Collider.touch`."""
         mine, other = self.sphere.T
         centre, radius, same = position[mine], size[mine, 0], np.zeros(len(mine), bool)
         if len(self.capsule):
             mine, theirs = self.capsule.T
             ends, one = jax.vmap(functools.partial(_nearest_stretch, self.kind))(
-                position[mine], rotation[mine][:, :, 2], size[mine, 1], position[theirs], rotation[theirs],
-                size[theirs])
+                position[mine], rotation[mine][:, :, 2], size[mine, 1], position[theirs], rotation[theirs], size[theirs]
+            )
             centre = jnp.concatenate([centre, ends.reshape(-1, 3)])
             radius = jnp.concatenate([radius, jnp.repeat(size[mine, 0], 2)])
             # A stretch that is a point has one end.
             same = jnp.concatenate([same, jnp.stack([jnp.zeros_like(one), one], -1).reshape(-1)])
             other = np.concatenate([other, np.repeat(theirs, 2)])
         gap, point, normal = jax.vmap(functools.partial(_ball, self.kind))(
-            centre, radius, position[other], rotation[other], size[other])
+            centre, radius, position[other], rotation[other], size[other]
+        )
         return jnp.where(same, sdf.FAR, gap), point, normal
 
 
@@ -67,8 +72,7 @@ class Patches:
     meet: Callable[..., tuple[jax.Array, jax.Array, jax.Array]]
     pairs: np.ndarray  # [P, 2] planes (or boxes) and primitives
 
-    def find(self, position: jax.Array, rotation: jax.Array,
-             size: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    def find(self, position: jax.Array, rotation: jax.Array, size: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         """As `Balls.find`."""
         planes, others = ((position[g], rotation[g], size[g]) for g in self.pairs.T)
         return tuple(part.reshape(-1, *part.shape[2:]) for part in jax.vmap(self.meet)(*planes, *others))
@@ -81,8 +85,9 @@ class Collider:
     groups: tuple[Balls | Patches, ...]
     pair: np.ndarray  # [C] index of the explicit pair
 
-    def touch(self, position: jax.Array, rotation: jax.Array,
-              size: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    def touch(
+        self, position: jax.Array, rotation: jax.Array, size: jax.Array
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
         """All candidates.
 
         Args:
@@ -100,16 +105,18 @@ def find_collider(model: mujoco.MjModel) -> Collider | None:
     """The collider of a model's explicit pairs; None if one of them has no closed form here."""
     rows: dict[tuple[str, str], list[int]] = {}
     for pair in range(model.npair):
-        first, second = (KINDS.get(int(model.geom_type[geoms[pair]]), "")
-                         for geoms in (model.pair_geom1, model.pair_geom2))
+        first, second = (
+            KINDS.get(int(model.geom_type[geoms[pair]]), "") for geoms in (model.pair_geom1, model.pair_geom2)
+        )
         if second not in sdf.KINDS or (first not in ("plane", "sphere", "capsule") and (first, second) != _BOXES):
             return None
         rows.setdefault((first, second), []).append(pair)
     geoms = np.stack([model.pair_geom1, model.pair_geom2], -1)
     groups, order = [], []
     for second in dict.fromkeys(second for _, second in rows):
-        plane, sphere, capsule, box = (np.array(rows.get((first, second), []), int)
-                                       for first in ("plane", "sphere", "capsule", "box"))
+        plane, sphere, capsule, box = (
+            np.array(rows.get((first, second), []), int) for first in ("plane", "sphere", "capsule", "box")
+        )
         for flat, (meet, count) in ((plane, _PLANE[second]), (box, (box_box, POINTS))):
             if flat.size:
                 groups.append(Patches(meet, geoms[flat]))
@@ -120,8 +127,9 @@ def find_collider(model: mujoco.MjModel) -> Collider | None:
     return Collider(tuple(groups), np.concatenate(order)) if groups else None
 
 
-def _ball(kind: str, centre: jax.Array, radius: jax.Array, position: jax.Array, rotation: jax.Array,
-          size: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _ball(
+    kind: str, centre: jax.Array, radius: jax.Array, position: jax.Array, rotation: jax.Array, size: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
     """A ball round `centre` [3] against one primitive."""
     local = sdf.to_local(centre[None], position, rotation)
     gap, pullback = jax.vjp(lambda p: sdf.primitive_distance(kind, p, size), local)
@@ -132,8 +140,15 @@ def _ball(kind: str, centre: jax.Array, radius: jax.Array, position: jax.Array, 
     return gap, centre + normal * (radius + 0.5 * gap), normal
 
 
-def _nearest_stretch(kind: str, centre: jax.Array, axis: jax.Array, half: jax.Array, position: jax.Array,
-                     rotation: jax.Array, size: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _nearest_stretch(
+    kind: str,
+    centre: jax.Array,
+    axis: jax.Array,
+    half: jax.Array,
+    position: jax.Array,
+    rotation: jax.Array,
+    size: jax.Array,
+) -> tuple[jax.Array, jax.Array]:
     """The ends [2, 3] of that part of a segment which is nearest to a convex primitive, and whether they are one.
 
     Along a line the distance to what is convex is convex: bisection on its slope.
@@ -146,8 +161,9 @@ def _nearest_stretch(kind: str, centre: jax.Array, axis: jax.Array, half: jax.Ar
         low, high = bracket
         middle = 0.5 * (low + high)
         points = start + middle[:, None] * along
-        _, slope = jax.jvp(lambda p: sdf.primitive_distance(kind, p, size), (points,),
-                           (jnp.broadcast_to(along, points.shape),))
+        _, slope = jax.jvp(
+            lambda p: sdf.primitive_distance(kind, p, size), (points,), (jnp.broadcast_to(along, points.shape),)
+        )
         rising = slope + tilt > 0
         return jnp.where(rising, low, middle), jnp.where(rising, middle, high)
 
@@ -158,8 +174,7 @@ def _nearest_stretch(kind: str, centre: jax.Array, axis: jax.Array, half: jax.Ar
     return centre + place[:, None] * axis, jnp.abs(place[1] - place[0]) < _SAME
 
 
-def _on_plane(position: jax.Array, rotation: jax.Array,
-              points: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _on_plane(position: jax.Array, rotation: jax.Array, points: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Lowest points [N, 3] of a body against a plane."""
     normal = rotation[:, 2]
     gap = sum((points[:, k] - position[k]) * normal[k] for k in range(3))
@@ -202,5 +217,10 @@ def _plane_cylinder(position, rotation, _, centre, turn, size):
 
 
 # How a plane meets a primitive, in how many points.
-_PLANE = {"sphere": (_plane_sphere, 1), "capsule": (_plane_capsule, 2), "box": (_plane_box, 8),
-          "cylinder": (_plane_cylinder, 4), "ellipsoid": (_plane_ellipsoid, 1)}
+_PLANE = {
+    "sphere": (_plane_sphere, 1),
+    "capsule": (_plane_capsule, 2),
+    "box": (_plane_box, 8),
+    "cylinder": (_plane_cylinder, 4),
+    "ellipsoid": (_plane_ellipsoid, 1),
+}

@@ -15,8 +15,9 @@ _BETTER, _LESS = 0.8, 1e-4
 _EDGES = np.array([(i, j) for i in range(3) for j in range(3)])  # an axis of the one box, one of the other
 
 
-def box_box(position: jax.Array, rotation: jax.Array, size: jax.Array, centre: jax.Array, turn: jax.Array,
-            other: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+def box_box(
+    position: jax.Array, rotation: jax.Array, size: jax.Array, centre: jax.Array, turn: jax.Array, other: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Gaps [13] m, points [13, 3] m midway and normals [13, 3] from the first box to the second; `sdf.FAR` where there
     is no contact.
 
@@ -32,8 +33,13 @@ def box_box(position: jax.Array, rotation: jax.Array, size: jax.Array, centre: j
     theirs = _apart(centre, turn, other, position, rotation, size)
     first = mine.max() >= theirs.max() - 1e-6
     pick = lambda a, b: jax.tree.map(functools.partial(jnp.where, first), a, b)  # noqa: E731
-    (position, rotation, size), incident = (pick(a, b) for a, b in (
-        ((position, rotation, size), (centre, turn, other)), ((centre, turn, other), (position, rotation, size))))
+    (position, rotation, size), incident = (
+        pick(a, b)
+        for a, b in (
+            ((position, rotation, size), (centre, turn, other)),
+            ((centre, turn, other), (position, rotation, size)),
+        )
+    )
     gap, point, normal = _clip(position, rotation, size, *incident, pick(mine, theirs).argmax())
     normal = jnp.broadcast_to(jnp.where(first, normal, -normal), point.shape)
     overlap = jnp.maximum(mine.max(), theirs.max())
@@ -42,8 +48,9 @@ def box_box(position: jax.Array, rotation: jax.Array, size: jax.Array, centre: j
     return gap, jnp.concatenate([point, edges[1][None]]), jnp.concatenate([normal, edges[2][None]])
 
 
-def _cross(position: jax.Array, rotation: jax.Array, size: jax.Array, centre: jax.Array, turn: jax.Array,
-           other: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _cross(
+    position: jax.Array, rotation: jax.Array, size: jax.Array, centre: jax.Array, turn: jax.Array, other: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Gap [], point [3] and normal [3] of the two edges along whose common normal the boxes are farthest apart."""
     away = centre - position
     one, two = rotation.T[_EDGES[:, 0]], turn.T[_EDGES[:, 1]]
@@ -65,16 +72,24 @@ def _cross(position: jax.Array, rotation: jax.Array, size: jax.Array, centre: ja
     return gaps[best], start + along * one[best] + 0.5 * gaps[best] * way, way
 
 
-def _apart(position: jax.Array, rotation: jax.Array, size: jax.Array, centre: jax.Array, turn: jax.Array,
-           other: jax.Array) -> jax.Array:
+def _apart(
+    position: jax.Array, rotation: jax.Array, size: jax.Array, centre: jax.Array, turn: jax.Array, other: jax.Array
+) -> jax.Array:
     """Gap [6] along each of a box's face normals (+x, +y, +z, -x, -y, -z) to another box."""
     place = jnp.sum(rotation * (centre - position)[:, None], 0)
     reach = size + jnp.sum(jnp.abs(jnp.sum(rotation[:, :, None] * turn[:, None, :], 0)) * other, -1)
     return jnp.concatenate([place - reach, -place - reach])
 
 
-def _clip(position: jax.Array, rotation: jax.Array, size: jax.Array, centre: jax.Array, turn: jax.Array,
-          other: jax.Array, face: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _clip(
+    position: jax.Array,
+    rotation: jax.Array,
+    size: jax.Array,
+    centre: jax.Array,
+    turn: jax.Array,
+    other: jax.Array,
+    face: jax.Array,
+) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Gaps [12], points [12, 3] and the normal [3] of that part of the incident face which lies over a box's `face`.
 
     Its corners are ends of the incident face's edges, where those are cut off at the rim, and corners of the

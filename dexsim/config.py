@@ -16,8 +16,14 @@ from dexsim.errors import ConfigError
 T = TypeVar("T")
 
 
-def setting(default: Any, *, unit: str = "", low: float | None = None,
-            high: float | None = None, choices: tuple[str, ...] | None = None) -> Any:
+def setting(
+    default: Any,
+    *,
+    unit: str = "",
+    low: float | None = None,
+    high: float | None = None,
+    choices: tuple[str, ...] | None = None,
+) -> Any:
     """A configuration field with its unit and allowed range, checked by `validate`.
 
     Numbers inside a tuple are each held to the range.
@@ -49,8 +55,13 @@ def validate(config: Any) -> None:
             if (low is not None and number < low) or (high is not None and number > high):
                 unit = field.metadata.get("unit")
                 unit = f" {unit}" if unit else ""
-                span = (f"between {low:g} and {high:g}" if low is not None and high is not None
-                        else f"at least {low:g}" if low is not None else f"at most {high:g}")
+                span = (
+                    f"between {low:g} and {high:g}"
+                    if low is not None and high is not None
+                    else f"at least {low:g}"
+                    if low is not None
+                    else f"at most {high:g}"
+                )
                 raise ConfigError(f"{where} = {number:g}{unit}: must be {span}{unit}")
 
 
@@ -59,8 +70,9 @@ def check_ranges(config: Any, *names: str) -> None:
     for name in names:
         low, high = getattr(config, name)
         if low > high:
-            raise ConfigError(f"{type(config).__name__}.{name} = ({low:g}, {high:g}): "
-                              "the first must not exceed the second")
+            raise ConfigError(
+                f"{type(config).__name__}.{name} = ({low:g}, {high:g}): the first must not exceed the second"
+            )
 
 
 def _numbers(value: Any) -> list[float]:
@@ -75,10 +87,12 @@ def _numbers(value: Any) -> list[float]:
 
 def to_dict(config: Any) -> dict[str, Any]:
     """A config dataclass as nested plain dicts and lists (JSON and msgpack friendly)."""
+
     def plain(value: Any) -> Any:
         if dataclasses.is_dataclass(value):
             return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
         return [plain(item) for item in value] if isinstance(value, (tuple, list)) else value
+
     return plain(config)
 
 
@@ -95,8 +109,7 @@ def from_dict(cls: type[T], data: dict[str, Any]) -> T:
     for name in data:
         if name not in known:
             raise ConfigError(f"{cls.__name__} has no field {name!r}")
-    return cls(**{name: _rebuild(hints[name], value, f"{cls.__name__}.{name}")
-                  for name, value in data.items()})
+    return cls(**{name: _rebuild(hints[name], value, f"{cls.__name__}.{name}") for name, value in data.items()})
 
 
 def override(data: dict[str, Any], settings: Iterable[str]) -> dict[str, Any]:
@@ -123,8 +136,9 @@ def override(data: dict[str, Any], settings: Iterable[str]) -> dict[str, Any]:
 
 def _merge(data: Any, change: dict[str, Any]) -> dict[str, Any]:
     before = data if isinstance(data, dict) else {}
-    return before | {name: _merge(before.get(name), value) if isinstance(value, dict) else value
-                     for name, value in change.items()}
+    return before | {
+        name: _merge(before.get(name), value) if isinstance(value, dict) else value for name, value in change.items()
+    }
 
 
 def _rebuild(hint: Any, value: Any, where: str) -> Any:
@@ -145,7 +159,6 @@ def _rebuild(hint: Any, value: Any, where: str) -> Any:
         return tuple(_rebuild(a, item, where) for a, item in zip(arguments, value, strict=True))
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
-    if isinstance(hint, type) and (not isinstance(value, hint)
-                                   or (hint is int and isinstance(value, bool))):
+    if isinstance(hint, type) and (not isinstance(value, hint) or (hint is int and isinstance(value, bool))):
         raise ConfigError(f"{where} = {value!r}: expected {hint.__name__}")
     return value

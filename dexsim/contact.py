@@ -31,8 +31,9 @@ SOFTEST, STIFFEST = 0.25, 4.0
 FIRST = 0.0005
 
 
-def spring(compliance: jax.Array, stiffness: jax.Array, ratio: jax.Array, friction: jax.Array, *,
-           period: float, edges: int = 0) -> tuple[jax.Array, jax.Array]:
+def spring(
+    compliance: jax.Array, stiffness: jax.Array, ratio: jax.Array, friction: jax.Array, *, period: float, edges: int = 0
+) -> tuple[jax.Array, jax.Array]:
     """MuJoCo's parameters for contacts that press with `stiffness` times depth at rest.
 
     MuJoCo's own parameters fix accelerations instead. The force at rest is N = k d^2 r / (A (1 - d))
@@ -66,8 +67,9 @@ def pairs_with(model: mujoco.MjModel, geoms: np.ndarray) -> np.ndarray:
     return np.flatnonzero(np.isin(model.pair_geom1, geoms) | np.isin(model.pair_geom2, geoms))
 
 
-def pair_constants(model: mujoco.MjModel, pairs: np.ndarray,
-                   tips: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def pair_constants(
+    model: mujoco.MjModel, pairs: np.ndarray, tips: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Inverse weights [P] 1/kg of pairs, their share of the stiffness [P], and whose they are [P].
 
     `tips` are the bodies [F] of the fingertips; -1 is what belongs to none of them.
@@ -89,7 +91,7 @@ def cover_tips(spec: mujoco.MjSpec, hand: Hand, cover: float) -> None:
         if geom.parent.name in tips and (geom.contype or geom.conaffinity):
             round_ = geom.type in (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE)
             size = np.array(geom.size)
-            size[:1 if round_ else 3] += cover
+            size[: 1 if round_ else 3] += cover
             geom.size = size
 
 
@@ -110,9 +112,14 @@ def split_pads(spec: mujoco.MjSpec, hand: Hand, touching: list[str], points: int
             continue
         for index, along in enumerate(np.linspace(-1.0, 1.0, points) if points > 1 else [0.0]):
             ball = geom.parent.add_geom(
-                name=f"{name}_{index}", type=mujoco.mjtGeom.mjGEOM_SPHERE, mass=0.0, group=geom.group,
+                name=f"{name}_{index}",
+                type=mujoco.mjtGeom.mjGEOM_SPHERE,
+                mass=0.0,
+                group=geom.group,
                 pos=place.position + along * place.size[1] * place.rotation[:, 2],
-                size=[geom.size[0], 0, 0], rgba=geom.rgba)
+                size=[geom.size[0], 0, 0],
+                rgba=geom.rgba,
+            )
             names.append(ball.name)
     return names
 
@@ -133,12 +140,19 @@ def find_pads(model: mujoco.MjModel, pairs: np.ndarray, tips: np.ndarray) -> Pad
     longest = max(map(len, rows))
     centre, radius = np.zeros((len(rows), longest, 3), np.float32), np.zeros((len(rows), longest), np.float32)
     for finger, row in enumerate(rows):
-        centre[finger, :len(row)], radius[finger, :len(row)] = model.geom_pos[row], model.geom_size[row, 0]
+        centre[finger, : len(row)], radius[finger, : len(row)] = model.geom_pos[row], model.geom_size[row, 0]
     return Pads(centre, radius)
 
 
-def follow_skin(hand: Hand, pads: Pads, skin: tactile.Skin, pose: HandPose, target: ObjectParams,
-                position: jax.Array, rotation: jax.Array) -> jax.Array:
+def follow_skin(
+    hand: Hand,
+    pads: Pads,
+    skin: tactile.Skin,
+    pose: HandPose,
+    target: ObjectParams,
+    position: jax.Array,
+    rotation: jax.Array,
+) -> jax.Array:
     """How much stiffer [F] than nominal a fingertip's springs are for their sum to be the skin's force.
 
     The springs of a finger press with stiffness times the sum D of their depths, its skin with S: the
@@ -151,7 +165,8 @@ def follow_skin(hand: Hand, pads: Pads, skin: tactile.Skin, pose: HandPose, targ
     shape = target.shape()
     touch = tactile.feel_links(hand, pose, shape, position, rotation, jnp.ones(hand.num_fingers), skin)
     centre = pose.body_position[hand.tip_body][:, None] + rotations.rotate(
-        pose.tip_rotation[:, None], jnp.asarray(pads.centre))
+        pose.tip_rotation[:, None], jnp.asarray(pads.centre)
+    )
     local, depth = sdf.to_local(centre, position, rotation), 0.0
     for k, kind in enumerate(shape.kinds):  # one spring for every primitive that a sphere is in
         here = sdf.to_local(local, shape.position[k], shape.rotation[k])

@@ -31,8 +31,7 @@ class Control:
         validate(self)
 
 
-def move_target(control: Control, hand: Hand, target: jax.Array, action: jax.Array,
-                measured: jax.Array) -> jax.Array:
+def move_target(control: Control, hand: Hand, target: jax.Array, action: jax.Array, measured: jax.Array) -> jax.Array:
     """The next joint targets [J] rad.
 
     Args:

@@ -37,8 +37,9 @@ class Method(NamedTuple):
 METHODS: dict[str, Method] = {
     "closed_form": Method(sdf.Shape, sdf.signed_distance, sdf.distance_and_normal),
     "grid": Method(grid.Grid, grid.signed_distance, grid.distance_and_normal),
-    "surface_points": Method(surface_points.SurfacePoints, surface_points.signed_distance,
-                             surface_points.distance_and_normal),
+    "surface_points": Method(
+        surface_points.SurfacePoints, surface_points.signed_distance, surface_points.distance_and_normal
+    ),
 }
 
 
@@ -71,8 +72,9 @@ def prepare(source: Any, config: DistanceConfig | None = None, *, scale: float =
     config = config or DistanceConfig()
     if isinstance(source, (grid.Grid, surface_points.SurfacePoints)):
         if config.method not in ("auto", method_of(source)):
-            raise ConfigError(f"DistanceConfig.method = {config.method!r}: the object was prepared for "
-                              f"{method_of(source)!r}")
+            raise ConfigError(
+                f"DistanceConfig.method = {config.method!r}: the object was prepared for {method_of(source)!r}"
+            )
         return source
     if isinstance(source, sdf.Shape):
         if config.method in ("auto", "closed_form"):

@@ -49,13 +49,15 @@ class Drive:
         """What the encoders [J] rad turn with: the joint, or the rotor before the gap."""
         return joints if gear is None else gear.rotor.position
 
-    def tick(self, state: State, joint_target: jax.Array, push: jax.Array
-             ) -> tuple[PhysicsState, jax.Array, GearState | None]:
+    def tick(
+        self, state: State, joint_target: jax.Array, push: jax.Array
+    ) -> tuple[PhysicsState, jax.Array, GearState | None]:
         """A tick of physics under the motors: the state after it, forces [F, 3] N, gears."""
         motors = self.motors(state.draw, state.joint_target, joint_target)
         if not self.gear_play:
             after, force = self.physics.advance(
-                state.target, state.physics, lambda *inputs: motors(*inputs, None)[0], push)
+                state.target, state.physics, lambda *inputs: motors(*inputs, None)[0], push
+            )
             return after, force, None
         return self.physics.advance_motors(state.target, state.physics, motors, state.gear, push)
 
@@ -64,25 +66,37 @@ class Drive:
         if self.gear_play:
             return self._geared(draw, before, target)
 
-        def motors(substep: jax.Array, position: jax.Array, velocity: jax.Array,
-                   gear: None) -> tuple[jax.Array, None]:
+        def motors(substep: jax.Array, position: jax.Array, velocity: jax.Array, gear: None) -> tuple[jax.Array, None]:
             wanted = actuator.delayed_target(substep, draw.latency, before, target)
             torque = actuator.drive(draw.actuator, wanted, jnp.zeros_like(wanted), position, velocity)
             return actuator.apply_friction(draw.actuator, torque, velocity, self._inertia_rate), None
+
         return motors
 
     def _geared(self, draw: Draw, before: jax.Array, target: jax.Array) -> Motors:
         play = GearPlay(draw.gear_gap, self._rotor_inertia, self._tooth_stiffness)
 
-        def motors(substep: jax.Array, position: jax.Array, velocity: jax.Array,
-                   gear: GearState) -> tuple[jax.Array, GearState]:
+        def motors(
+            substep: jax.Array, position: jax.Array, velocity: jax.Array, gear: GearState
+        ) -> tuple[jax.Array, GearState]:
             wanted = actuator.delayed_target(substep, draw.latency, before, target)
-            return drive_beside(draw.actuator, play, gear, wanted, position, velocity,
-                                inertia=self._link_inertia, timestep=self._timestep, steps=self._steps)
+            return drive_beside(
+                draw.actuator,
+                play,
+                gear,
+                wanted,
+                position,
+                velocity,
+                inertia=self._link_inertia,
+                timestep=self._timestep,
+                steps=self._steps,
+            )
+
         return motors
 
-    def reading(self, draw: Draw, before: jax.Array, target: jax.Array, physics: PhysicsState,
-                gear: GearState | None) -> jax.Array:
+    def reading(
+        self, draw: Draw, before: jax.Array, target: jax.Array, physics: PhysicsState, gear: GearState | None
+    ) -> jax.Array:
         """The torque [J] Nm that the motors' currents tell of at the end of a tick, before friction."""
         position, velocity = (physics.qpos[self.physics.joint_qpos], physics.qvel[self.physics.joint_dof])
         if gear is not None:
@@ -104,7 +118,9 @@ def _rotors(ranges: Randomization, model: Any, dofs: np.ndarray) -> tuple[np.nda
     """
     rotor = model.dof_armature[dofs] * ranges.rotor_share / (1 - ranges.rotor_share)
     if np.any(rotor <= 0):
-        raise ConfigError("Randomization.backlash = 'gear_play': every joint of the hand's MJCF needs an "
-                          "armature, of which rotor_share is the rotor")
+        raise ConfigError(
+            "Randomization.backlash = 'gear_play': every joint of the hand's MJCF needs an "
+            "armature, of which rotor_share is the rotor"
+        )
     most = ranges.damping * max(1.0, 1 + ranges.scale * (ranges.damping_factor[1] - 1))
     return np.asarray(rotor, np.float32), max(int(np.ceil(most * model.opt.timestep / rotor.min())), 1)

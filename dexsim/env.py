@@ -41,8 +41,7 @@ __all__ = ["Control", "Env", "EnvConfig", "Moment", "Sample", "Sensing", "Start"
 class Env:
     """A task on a hand: `reset(key)`, `step(state, action)`, `restart(state, done)`."""
 
-    def __init__(self, task: Task, hand: Hand, *, backend: str = "auto", num_envs: int = 1,
-                 seed: int = 0):
+    def __init__(self, task: Task, hand: Hand, *, backend: str = "auto", num_envs: int = 1, seed: int = 0):
         """Compile the scene and fill the pool of start states.
 
         Args:
@@ -58,17 +57,24 @@ class Env:
         self.task, self.name, self.config = task, task.name, task.config
         self.hand = hand
         config = self.config
-        self.physics = Physics(self.hand, task.slots, task.largest, config.physics,
-                               gravity=task.gravity, backend=backend, num_envs=num_envs,
-                               skin=config.skin, rotor_share=rotor_share(config.randomization))
+        self.physics = Physics(
+            self.hand,
+            task.slots,
+            task.largest,
+            config.physics,
+            gravity=task.gravity,
+            backend=backend,
+            num_envs=num_envs,
+            skin=config.skin,
+            rotor_share=rotor_share(config.randomization),
+        )
         self.backend = self.physics.backend
         self.action_size = self.hand.num_joints
         actor_view, critic_view = observation.views(config.observation)
-        self._seen = {group: actor_view if group == "actor" else critic_view
-                      for group in task.fields}
+        self._seen = {group: actor_view if group == "actor" else critic_view for group in task.fields}
         self.observation_layout = {
-            group: observation.layout(self.hand, names, self._seen[group])
-            for group, names in task.fields.items()}
+            group: observation.layout(self.hand, names, self._seen[group]) for group, names in task.fields.items()
+        }
         self.senses = Senses(config, hand, task, (actor_view, critic_view))
         self.drive = Drive(config, hand, self.physics)
         self._surface = whole_surface(hand, config.skin.thickness) if config.skin.bare else taxels_only(hand)
@@ -102,41 +108,64 @@ class Env:
         count = self.pool.qpos.shape[0]
         return self.reset_to(key, jax.random.randint(pick, (), 0, count), scale=scale)
 
-    def reset_to(self, key: jax.Array, index: jax.Array, goal: Any = None,
-                 scale: jax.Array | None = None) -> State:
+    def reset_to(self, key: jax.Array, index: jax.Array, goal: Any = None, scale: jax.Array | None = None) -> State:
         """A new episode from row `index` of the pool, with the task's goal or the given one."""
         key, draw_key, goal_key, noise_key, sensor_key = jax.random.split(key, 5)
         start = jax.tree.map(lambda rows: jnp.asarray(rows)[index], self.pool)
         config, hand, senses = self.config, self.hand, self.senses
         if scale is not None:
-            start = dataclasses.replace(start, target=narrow(
-                start.target, config.objects, self.task.plain_inertia(start.target), scale))
+            start = dataclasses.replace(
+                start, target=narrow(start.target, config.objects, self.task.plain_inertia(start.target), scale)
+            )
         draw, orientation = self._draw(draw_key, sensor_key, 1.0 if scale is None else scale)
-        array_params, array = senses.draw_array(jax.random.fold_in(sensor_key, 1),
-                                                1.0 if scale is None else scale)
+        array_params, array = senses.draw_array(jax.random.fold_in(sensor_key, 1), 1.0 if scale is None else scale)
         if goal is None:
             goal = self.task.begin(goal_key, start)
         joints, place = start.qpos[self.physics.joint_qpos], start.qpos[self.physics.object_qpos]
         joint_target = joints if start.joint_target is None else start.joint_target
         zero, nothing = jnp.zeros(hand.num_joints), jnp.zeros((hand.num_fingers, 3))
-        sample = Sample(joints, zero, jnp.zeros(hand.taxel_area.shape), place[:3], place[3:],
-                        nothing if senses.three_axis else None)
+        sample = Sample(
+            joints, zero, jnp.zeros(hand.taxel_area.shape), place[:3], place[3:], nothing if senses.three_axis else None
+        )
         readings, array = senses.read(
-            noise_key, sample, sample, Sensors(draw, orientation, array_params, array), goal,
-            recalled(config.control, hand, zero, joint_target))
+            noise_key,
+            sample,
+            sample,
+            Sensors(draw, orientation, array_params, array),
+            goal,
+            recalled(config.control, hand, zero, joint_target),
+        )
         physics = PhysicsState(start.qpos, start.qvel, jnp.zeros(self.physics.mj_model.nv))
         moment = self._moment(physics, start.target, zero, zero, zero, nothing)
         false = jnp.zeros((), bool)
         _, metrics = self.task.reward(goal, moment, false)
         state = State(
-            key=key, physics=physics, target=start.target, draw=draw,
-            orientation_sensor=orientation, goal=goal, joint_target=joint_target, action=zero,
-            sample=sample, object_velocity=jnp.zeros(3), readings=readings,
-            finger_force=jnp.zeros(hand.num_fingers), tick=jnp.zeros((), jnp.int32),
-            length=jnp.zeros((), jnp.int32), episode_return=jnp.zeros(()),
-            obs=self._observe(readings, moment, goal), reward=jnp.zeros(()), terminated=false,
-            truncated=false, metrics={}, array_params=array_params, array=array,
-            gear=self.drive.begin(joints), tangential_force=moment.tangential_force, scale=scale)
+            key=key,
+            physics=physics,
+            target=start.target,
+            draw=draw,
+            orientation_sensor=orientation,
+            goal=goal,
+            joint_target=joint_target,
+            action=zero,
+            sample=sample,
+            object_velocity=jnp.zeros(3),
+            readings=readings,
+            finger_force=jnp.zeros(hand.num_fingers),
+            tick=jnp.zeros((), jnp.int32),
+            length=jnp.zeros((), jnp.int32),
+            episode_return=jnp.zeros(()),
+            obs=self._observe(readings, moment, goal),
+            reward=jnp.zeros(()),
+            terminated=false,
+            truncated=false,
+            metrics={},
+            array_params=array_params,
+            array=array,
+            gear=self.drive.begin(joints),
+            tangential_force=moment.tangential_force,
+            scale=scale,
+        )
         return dataclasses.replace(state, metrics=self._metrics(state, metrics))
 
     def step(self, state: State, action: jax.Array) -> State:
@@ -151,8 +180,12 @@ class Env:
         push = self.task.push(push_key, state.target) + self._tilt_force(state.draw, state.target)
         after, force, gear = self._drive(state, joint_target, push)
         # A diverging solver passes through speeds that are finite and square to 1e27 in the reward.
-        finite = (sound & jnp.all(jnp.isfinite(after.qpos)) & jnp.all(jnp.abs(after.qvel) < 1e3)
-                  & jnp.all(jnp.isfinite(force)))
+        finite = (
+            sound
+            & jnp.all(jnp.isfinite(after.qpos))
+            & jnp.all(jnp.abs(after.qvel) < 1e3)
+            & jnp.all(jnp.isfinite(force))
+        )
         # A world that has blown up ends its episode here; its numbers must not spread.
         after, gear = choose(finite, (after, gear), (state.physics, state.gear))
         force = jnp.where(finite, force, 0.0)
@@ -160,26 +193,53 @@ class Env:
         torque = self._torque(state, joint_target, after, gear)
         moment = self._moment(after, state.target, torque, action, state.action, force)
         goal = self.task.update(goal_key, state.goal, moment)
-        sample = Sample(self.drive.encoder(moment.joint_position, gear), torque / hand.torque_limit,
-                        moment.touch.force, moment.object_position, moment.object_quat,
-                        moment.tangential_force)
+        sample = Sample(
+            self.drive.encoder(moment.joint_position, gear),
+            torque / hand.torque_limit,
+            moment.touch.force,
+            moment.object_position,
+            moment.object_quat,
+            moment.tangential_force,
+        )
         readings, array = self.senses.read(
-            noise_key, sample, state.sample, Sensors.of(state), goal,
-            recalled(self.config.control, hand, action, joint_target), state)
+            noise_key,
+            sample,
+            state.sample,
+            Sensors.of(state),
+            goal,
+            recalled(self.config.control, hand, action, joint_target),
+            state,
+        )
         dropped = self.task.dropped(goal, moment) | ~finite
         reward, metrics = self.task.reward(state.goal, moment, dropped)
         tick = state.tick + 1
         state = State(
-            key=key, physics=after, target=state.target, draw=state.draw,
-            orientation_sensor=state.orientation_sensor, goal=goal,
-            joint_target=joint_target, action=action, sample=sample,
-            object_velocity=readings.object_velocity, readings=readings,
-            finger_force=jnp.linalg.norm(force, axis=-1), tick=tick, length=state.length + 1,
+            key=key,
+            physics=after,
+            target=state.target,
+            draw=state.draw,
+            orientation_sensor=state.orientation_sensor,
+            goal=goal,
+            joint_target=joint_target,
+            action=action,
+            sample=sample,
+            object_velocity=readings.object_velocity,
+            readings=readings,
+            finger_force=jnp.linalg.norm(force, axis=-1),
+            tick=tick,
+            length=state.length + 1,
             episode_return=state.episode_return + reward,
-            obs=self._observe(readings, moment, goal), reward=reward, terminated=dropped,
-            truncated=(tick >= self.task.episode_ticks) & ~dropped, metrics={},
-            array_params=state.array_params, array=array, gear=gear,
-            tangential_force=moment.tangential_force, scale=state.scale)
+            obs=self._observe(readings, moment, goal),
+            reward=reward,
+            terminated=dropped,
+            truncated=(tick >= self.task.episode_ticks) & ~dropped,
+            metrics={},
+            array_params=state.array_params,
+            array=array,
+            gear=gear,
+            tangential_force=moment.tangential_force,
+            scale=state.scale,
+        )
         return dataclasses.replace(state, metrics=self._metrics(state, metrics, finite))
 
     def restart(self, state: State, done: jax.Array) -> State:
@@ -203,30 +263,36 @@ class Env:
 
     # --- pieces of a step -----------------------------------------------------------------
 
-    def _draw(self, hand_key: jax.Array, sensor_key: jax.Array,
-              scale: jax.Array | float = 1.0) -> tuple[Draw, SensorDraw]:
+    def _draw(
+        self, hand_key: jax.Array, sensor_key: jax.Array, scale: jax.Array | float = 1.0
+    ) -> tuple[Draw, SensorDraw]:
         """The hand and the object's IMU of one episode."""
         ranges = self.config.randomization
-        draw = sample(hand_key, ranges, self.hand, timestep=self.config.physics.timestep,
-                      control_period=self.control_period, scale=scale)
+        draw = sample(
+            hand_key,
+            ranges,
+            self.hand,
+            timestep=self.config.physics.timestep,
+            control_period=self.control_period,
+            scale=scale,
+        )
         corner = draw_corner(hand_key, ranges.corners)  # the one that `sample` draws
         sensor = self.senses.draw_orientation(sensor_key, ranges.scale * scale, corner)
         # An IMU's upright is the true one; the host takes it for that of a hand without tilt.
         down, tilted = self._tilted(draw)
         return draw, dataclasses.replace(sensor, bias=sensor.bias + jnp.cross(tilted, down))
 
-    def _drive(self, state: State, joint_target: jax.Array,
-               push: jax.Array) -> tuple[PhysicsState, jax.Array, GearState | None]:
+    def _drive(
+        self, state: State, joint_target: jax.Array, push: jax.Array
+    ) -> tuple[PhysicsState, jax.Array, GearState | None]:
         """A tick of physics under the motors: the state after it, forces [F, 3] N, gears."""
         return self.drive.tick(state, joint_target, push)
 
-    def _torque(self, state: State, joint_target: jax.Array, after: PhysicsState,
-                gear: GearState | None) -> jax.Array:
+    def _torque(self, state: State, joint_target: jax.Array, after: PhysicsState, gear: GearState | None) -> jax.Array:
         """The torque [J] Nm that the motors give at the end of the tick."""
         return self.drive.reading(state.draw, state.joint_target, joint_target, after, gear)
 
-    def _joint_target(self, target: jax.Array, action: jax.Array,
-                      measured: jax.Array) -> jax.Array:
+    def _joint_target(self, target: jax.Array, action: jax.Array, measured: jax.Array) -> jax.Array:
         return move_target(self.config.control, self.hand, target, action, measured)
 
     def _tilt_force(self, draw: Draw, target: ObjectParams) -> jax.Array:
@@ -243,8 +309,15 @@ class Env:
         """What the taxels feel of the object, as `dexsim.distance` takes it."""
         return target.shape() if self._mesh is None else self._mesh.grid(target.size)
 
-    def _moment(self, physics: PhysicsState, target: ObjectParams, torque: jax.Array,
-                action: jax.Array, last_action: jax.Array, force: jax.Array) -> Moment:
+    def _moment(
+        self,
+        physics: PhysicsState,
+        target: ObjectParams,
+        torque: jax.Array,
+        action: jax.Array,
+        last_action: jax.Array,
+        force: jax.Array,
+    ) -> Moment:
         seam, hand, config = self.physics, self.hand, self.config
         joints = physics.qpos[seam.joint_qpos]
         place, motion = physics.qpos[seam.object_qpos], physics.qvel[seam.object_dof]
@@ -253,8 +326,16 @@ class Env:
         strength = jnp.linalg.norm(force, axis=-1)
         if config.touch:
             surface = self._surface
-            touch = tactile.feel_links(hand, pose, self._felt(target), place[:3],
-                                       rotations.quat_to_matrix(quat), strength, config.skin, surface)
+            touch = tactile.feel_links(
+                hand,
+                pose,
+                self._felt(target),
+                place[:3],
+                rotations.quat_to_matrix(quat),
+                strength,
+                config.skin,
+                surface,
+            )
             if config.skin.total == "pressing":
                 # In the links' frames, where the normals are constants.
                 local = rotations.rotate_inverse(pose.tip_rotation, force)
@@ -265,37 +346,69 @@ class Env:
             nothing, share = jnp.zeros(hand.taxel_area.shape), 1.0
             touch = tactile.Touch(nothing, nothing, nothing)
         return Moment(
-            target=target, joint_position=joints, joint_velocity=physics.qvel[seam.joint_dof],
-            joint_torque=torque, pose=pose, finger_force=force, touch=touch,
-            object_position=place[:3], object_quat=quat, object_velocity=motion[:3],
+            target=target,
+            joint_position=joints,
+            joint_velocity=physics.qvel[seam.joint_dof],
+            joint_torque=torque,
+            pose=pose,
+            finger_force=force,
+            touch=touch,
+            object_position=place[:3],
+            object_quat=quat,
+            object_velocity=motion[:3],
             object_spin=rotations.rotate(rotations.quat_to_matrix(quat), motion[3:]),
-            action=action, last_action=last_action,
-            tangential_force=(tactile.split_force(touch.force, taxel_normals(hand, pose), share * force)[1]
-                              if self.senses.three_axis else None))
+            action=action,
+            last_action=last_action,
+            tangential_force=(
+                tactile.split_force(touch.force, taxel_normals(hand, pose), share * force)[1]
+                if self.senses.three_axis
+                else None
+            ),
+        )
 
     def _observe(self, readings: Readings, moment: Moment, goal: Any) -> dict[str, jax.Array]:
         """The actor sees the readings; the critic the truth, in the same fields."""
         command, goal_quat = self.task.goal_readings(goal)
-        known = (moment.joint_position, moment.joint_torque / self.hand.torque_limit,
-                 moment.touch.force, moment.object_position, moment.object_velocity,
-                 moment.object_quat, goal_quat, command, readings.last_action)
-        truth = (ThreeAxisReadings(*known, moment.tangential_force)
-                 if isinstance(readings, ThreeAxisReadings) else Readings(*known))
+        known = (
+            moment.joint_position,
+            moment.joint_torque / self.hand.torque_limit,
+            moment.touch.force,
+            moment.object_position,
+            moment.object_velocity,
+            moment.object_quat,
+            goal_quat,
+            command,
+            readings.last_action,
+        )
+        truth = (
+            ThreeAxisReadings(*known, moment.tangential_force)
+            if isinstance(readings, ThreeAxisReadings)
+            else Readings(*known)
+        )
         seen = {"actor": readings, "critic": truth}
         motion = Motion(moment.joint_velocity, moment.object_spin)
-        return {group: observation.observe(self.hand, seen[group], names, self._seen[group], motion)
-                for group, names in self.task.fields.items()}
+        return {
+            group: observation.observe(self.hand, seen[group], names, self._seen[group], motion)
+            for group, names in self.task.fields.items()
+        }
 
-    def _metrics(self, state: State, terms: dict[str, jax.Array],
-                 finite: jax.Array | bool = True) -> dict[str, jax.Array]:
+    def _metrics(
+        self, state: State, terms: dict[str, jax.Array], finite: jax.Array | bool = True
+    ) -> dict[str, jax.Array]:
         if state.tangential_force is not None:
             along = jnp.linalg.norm(state.tangential_force, axis=-1)
-            terms = {**terms, "tangential_force": jnp.sum(along),
-                     **{f"tangential/{i}": along[i] for i in range(along.shape[0])}}
-        return {**terms, "return": state.episode_return,
-                "length": state.length.astype(jnp.float32),
-                "shape": state.target.shape_index.astype(jnp.float32),
-                "non_finite": 1.0 - jnp.asarray(finite, jnp.float32)}
+            terms = {
+                **terms,
+                "tangential_force": jnp.sum(along),
+                **{f"tangential/{i}": along[i] for i in range(along.shape[0])},
+            }
+        return {
+            **terms,
+            "return": state.episode_return,
+            "length": state.length.astype(jnp.float32),
+            "shape": state.target.shape_index.astype(jnp.float32),
+            "non_finite": 1.0 - jnp.asarray(finite, jnp.float32),
+        }
 
     # --- evaluation and pictures ----------------------------------------------------------
 
@@ -329,8 +442,14 @@ class Env:
         shape = state.target.shape()
         return Snapshot(
             joint_position=state.physics.qpos[self.physics.joint_qpos],
-            object_position=place[:3], object_rotation=rotations.quat_to_matrix(place[3:]),
-            primitive_size=shape.size, primitive_position=shape.position,
-            primitive_rotation=shape.rotation, primitive_active=shape.active,
-            taxel_force=state.readings.taxel_force, command=state.readings.command,
-            target_force=self.task.target_force(state.goal), finger_force=state.finger_force)
+            object_position=place[:3],
+            object_rotation=rotations.quat_to_matrix(place[3:]),
+            primitive_size=shape.size,
+            primitive_position=shape.position,
+            primitive_rotation=shape.rotation,
+            primitive_active=shape.active,
+            taxel_force=state.readings.taxel_force,
+            command=state.readings.command,
+            target_force=self.task.target_force(state.goal),
+            finger_force=state.finger_force,
+        )

@@ -84,14 +84,23 @@ def joint_excitation(config: Excitation, middle: float, reach: float) -> np.ndar
     for first, second, strength in zip(ladder[:-1], ladder[1:], fading[:-1], strict=True):
         wave = chirp(config.chirp_seconds / config.chirp_parts, period, (first, second))
         bursts += [size * strength * wave, np.zeros(round(config.pause / period))]
-    parts = [rest, *bursts, rest, size * steps(config.step_count, config.step_hold, period), rest,
-             size * triangles(config.slow_cycles, 4 * size / config.slow_speed, period), rest,
-             small * triangles(config.reversal_cycles, 0.4, period), rest]
+    parts = [
+        rest,
+        *bursts,
+        rest,
+        size * steps(config.step_count, config.step_hold, period),
+        rest,
+        size * triangles(config.slow_cycles, 4 * size / config.slow_speed, period),
+        rest,
+        small * triangles(config.reversal_cycles, 0.4, period),
+        rest,
+    ]
     return middle + np.concatenate(parts)
 
 
-def excitation(hand: Hand, config: Excitation, posture: np.ndarray | None = None,
-               joints: tuple[str, ...] | None = None) -> dict[str, np.ndarray]:
+def excitation(
+    hand: Hand, config: Excitation, posture: np.ndarray | None = None, joints: tuple[str, ...] | None = None
+) -> dict[str, np.ndarray]:
     """Targets of the whole hand while one joint after the other is moved.
 
     Args:
@@ -118,8 +127,10 @@ def excitation(hand: Hand, config: Excitation, posture: np.ndarray | None = None
         joint = hand.joint_names.index(name)
         reach = min(posture[joint] - low[joint], high[joint] - posture[joint])
         if reach < 0.02:
-            raise ConfigError(f"{name}: {posture[joint]:.3g} rad lies {max(reach, 0):.2g} rad from "
-                              f"the end of its range less the margin: too close to move")
+            raise ConfigError(
+                f"{name}: {posture[joint]:.3g} rad lies {max(reach, 0):.2g} rad from "
+                f"the end of its range less the margin: too close to move"
+            )
         moving = joint_excitation(config, posture[joint], reach)
         targets[name] = np.tile(posture, (len(moving), 1))
         targets[name][:, joint] = moving

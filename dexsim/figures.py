@@ -43,12 +43,20 @@ def draw_comparison(
     sources = [np.asarray(source, float) for source in (first, second)]
     shape = (hand.num_fingers, hand.num_taxels)
     if sources[0].shape != sources[1].shape or sources[0].shape[-2:] != shape or sources[0].ndim not in (2, 3):
-        raise ValueError(f"draw_comparison: forces {sources[0].shape} and {sources[1].shape}, expected two of "
-                         f"[{shape[0]}, {shape[1]}] or [T, {shape[0]}, {shape[1]}]")
+        raise ValueError(
+            f"draw_comparison: forces {sources[0].shape} and {sources[1].shape}, expected two of "
+            f"[{shape[0]}, {shape[1]}] or [T, {shape[0]}, {shape[1]}]"
+        )
     sources = [source.reshape(-1, *shape) for source in sources]
     largest = max(float(source.sum(-1).max(initial=0)) for source in sources) or 1.0
-    figure, axes = plt.subplots(2, shape[0], figsize=(2.1 * shape[0], 5.2), layout="constrained", sharey="row",
-                                gridspec_kw={"height_ratios": (3, 2)})
+    figure, axes = plt.subplots(
+        2,
+        shape[0],
+        figsize=(2.1 * shape[0], 5.2),
+        layout="constrained",
+        sharey="row",
+        gridspec_kw={"height_ratios": (3, 2)},
+    )
     plt.close(figure)
     columns, rows = hand.taxel_grid
     lattice = np.stack(np.divmod(np.arange(columns * rows), rows), -1)
@@ -60,8 +68,16 @@ def draw_comparison(
             force, centre = lattice_centre(source[:, finger], hand.taxel_grid)
             centres.append(centre)
             felt = force > 0
-            above.scatter(*centre[felt].T, s=_LARGEST * force[felt] / largest, color=color, alpha=0.45, lw=0.8,
-                          edgecolor=color, zorder=3, label=label)
+            above.scatter(
+                *centre[felt].T,
+                s=_LARGEST * force[felt] / largest,
+                color=color,
+                alpha=0.45,
+                lw=0.8,
+                edgecolor=color,
+                zorder=3,
+                label=label,
+            )
             _draw_forces(below, force, times, color, label)
         for start, end in zip(*centres, strict=True):
             above.plot(*np.stack([start, end]).T, color="0.35", lw=0.6, zorder=2)
@@ -75,8 +91,17 @@ def draw_comparison(
     return figure
 
 
-def draw_taxels_3d(hand: Hand, joint_position: np.ndarray, taxel_force: np.ndarray, *, ax: Any = None,
-                   force_range: float | None = None, elevation: float = 20.0, azimuth: float = 25.0, path: Any = None):
+def draw_taxels_3d(
+    hand: Hand,
+    joint_position: np.ndarray,
+    taxel_force: np.ndarray,
+    *,
+    ax: Any = None,
+    force_range: float | None = None,
+    elevation: float = 20.0,
+    azimuth: float = 25.0,
+    path: Any = None,
+):
     """The posed hand's taxels in space, coloured by force, over a skeleton of its links.
 
     Args:
@@ -105,8 +130,15 @@ def draw_taxels_3d(hand: Hand, joint_position: np.ndarray, taxel_force: np.ndarr
     for finger, tip in enumerate(tips):
         ax.plot(*np.stack([body[hand.tip_body[finger]], tip]).T, color="0.6", lw=2)
     order = np.argsort(force)  # the loaded ones last, on top
-    dots = ax.scatter(*taxels[order].T, c=force[order], s=4 + 22 * (force[order] > 0), cmap="YlOrRd", vmin=0,
-                      vmax=force_range or float(force.max()) or 1.0, depthshade=False)
+    dots = ax.scatter(
+        *taxels[order].T,
+        c=force[order],
+        s=4 + 22 * (force[order] > 0),
+        cmap="YlOrRd",
+        vmin=0,
+        vmax=force_range or float(force.max()) or 1.0,
+        depthshade=False,
+    )
     ax.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
     ax.set_aspect("equal")
     ax.locator_params(nbins=4)

@@ -171,8 +171,10 @@ def _look_up(points: jax.Array, grid: Grid) -> tuple[jax.Array, list[jax.Array]]
         value, slope = _quadratic(_read_quadratic(grid, first), parts, [spacing[axis] for axis in range(3)])
     way = jnp.sqrt(sum(g * g for g in gaps) + _TINY)
     unit = _MILLI * grid.scale
-    gradient = [jnp.where(f, unit * s * rate[axis], 0.0) + gaps[axis] / way
-                for axis, (f, s) in enumerate(zip(free, slope, strict=True))]
+    gradient = [
+        jnp.where(f, unit * s * rate[axis], 0.0) + gaps[axis] / way
+        for axis, (f, s) in enumerate(zip(free, slope, strict=True))
+    ]
     return unit * value + way - _TINY**0.5, gradient
 
 
@@ -231,8 +233,10 @@ def _read_linear(grid: Grid, first: jax.Array, cells: list[jax.Array]) -> list[j
 
 def _read_quadratic(grid: Grid, first: jax.Array) -> list[list[jax.Array]]:
     words = 4 if grid.values.dtype == jnp.float32 else 2
-    return [[x for word in range(words) for x in _read(grid.values, words * (first + k) + word)]
-            for k in _corner_offsets(grid.nodes)]
+    return [
+        [x for word in range(words) for x in _read(grid.values, words * (first + k) + word)]
+        for k in _corner_offsets(grid.nodes)
+    ]
 
 
 def _pack(channels: np.ndarray, config: GridConfig) -> np.ndarray:

@@ -23,8 +23,19 @@ from dexsim.kinematics import (
     taxel_positions,
 )
 
-__all__ = ["TAXEL_COLUMNS", "Geom", "Hand", "HandPose", "flexion_joints", "forward_kinematics", "lattice_frame",
-           "load_hand", "read_taxels", "taxel_normals", "taxel_positions"]
+__all__ = [
+    "TAXEL_COLUMNS",
+    "Geom",
+    "Hand",
+    "HandPose",
+    "flexion_joints",
+    "forward_kinematics",
+    "lattice_frame",
+    "load_hand",
+    "read_taxels",
+    "taxel_normals",
+    "taxel_positions",
+]
 
 TAXEL_COLUMNS = ("finger", "column", "row", "x", "y", "z", "nx", "ny", "nz", "area")
 
@@ -77,23 +88,30 @@ def load_hand(path: str | Path | None = None) -> Hand:
     identity = np.eye(3)
 
     return Hand(
-        name=table.get("name", path.stem), model_path=model_path, palm=table["palm"],
+        name=table.get("name", path.stem),
+        model_path=model_path,
+        palm=table["palm"],
         joint_names=tuple(table["joints"]),
-        joint_lower=_f32(model.jnt_range[joints, 0]), joint_upper=_f32(model.jnt_range[joints, 1]),
-        torque_limit=_f32(model.jnt_actfrcrange[joints, 1]), speed_limit=_f32(table["speed_limits"]),
-        body_names=tuple(model.body(b).name for b in bodies), body_parent=parent,
+        joint_lower=_f32(model.jnt_range[joints, 0]),
+        joint_upper=_f32(model.jnt_range[joints, 1]),
+        torque_limit=_f32(model.jnt_actfrcrange[joints, 1]),
+        speed_limit=_f32(table["speed_limits"]),
+        body_names=tuple(model.body(b).name for b in bodies),
+        body_parent=parent,
         body_position=_f32([np.zeros(3) if b == palm else model.body_pos[b] for b in bodies]),
-        body_rotation=_f32([identity if b == palm else _matrix(model.body_quat[b])
-                            for b in bodies]),
+        body_rotation=_f32([identity if b == palm else _matrix(model.body_quat[b]) for b in bodies]),
         body_joint=body_joint,
         joint_axis=_f32(np.where(has[:, None], model.jnt_axis[at], [0, 0, 1])),
         joint_anchor=_f32(np.where(has[:, None], model.jnt_pos[at], 0)),
         joint_reference=_f32(np.where(has, model.qpos0[model.jnt_qposadr[at]], 0)),
         finger_names=finger_names,
         tip_body=np.array([row[int(model.site_bodyid[s])] for s in tips], np.int32),
-        tip_offset=_f32(model.site_pos[tips]), root_joint=np.array(root, np.int32),
+        tip_offset=_f32(model.site_pos[tips]),
+        root_joint=np.array(root, np.int32),
         taxel_grid=tuple(table["taxel_grid"]),
-        taxel_position=taxels[..., 0:3], taxel_normal=taxels[..., 3:6], taxel_area=taxels[..., 6],
+        taxel_position=taxels[..., 0:3],
+        taxel_normal=taxels[..., 3:6],
+        taxel_area=taxels[..., 6],
         geoms=_read_geoms(model, row),
     )
 
@@ -127,36 +145,42 @@ def _find_joints(path: Path, model_path: Path, model: Any, table: dict) -> list[
 
     joints = [_find(path, model_path, model, "joint", name) for name in table["joints"]]
     if len(set(joints)) != model.njnt or model.nq != model.njnt:
-        raise AssetError(f"{path}: joints lists {len(set(joints))} of the {model.njnt} joints of "
-                         f"{model_path.name}; every joint must be listed once and be a hinge")
+        raise AssetError(
+            f"{path}: joints lists {len(set(joints))} of the {model.njnt} joints of "
+            f"{model_path.name}; every joint must be listed once and be a hinge"
+        )
     if np.any(model.jnt_type != mujoco.mjtJoint.mjJNT_HINGE):
         raise AssetError(f"{model_path}: only hinge joints are supported")
     if len(table["speed_limits"]) != len(joints):
-        raise AssetError(f"{path}: {len(table['speed_limits'])} speed_limits "
-                         f"for {len(joints)} joints")
+        raise AssetError(f"{path}: {len(table['speed_limits'])} speed_limits for {len(joints)} joints")
     limit = model.jnt_actfrcrange[joints, 1]
     if not np.all(model.jnt_limited[joints]) or np.any(limit <= 0):
-        bad = next(n for n, j, t in zip(table["joints"], joints, limit, strict=True)
-                   if not model.jnt_limited[j] or t <= 0)
+        bad = next(
+            n for n, j, t in zip(table["joints"], joints, limit, strict=True) if not model.jnt_limited[j] or t <= 0
+        )
         raise AssetError(f"{model_path}: joint {bad!r} needs a range and an actuatorfrcrange")
     return joints
 
 
-def _joints_of_bodies(model_path: Path, model: Any, table: dict, joints: list[int], palm: int,
-                      row: dict[int, int]) -> np.ndarray:
+def _joints_of_bodies(
+    model_path: Path, model: Any, table: dict, joints: list[int], palm: int, row: dict[int, int]
+) -> np.ndarray:
     """The joint [B] that moves each body, as an index into the TOML's; -1 for none."""
     body_joint = np.full(len(row), -1, np.int32)
     for index, joint in enumerate(joints):
         body = int(model.jnt_bodyid[joint])
         if body not in row or body == palm or body_joint[row[body]] >= 0:
-            raise AssetError(f"{model_path}: joint {table['joints'][index]!r} must be the only "
-                             f"joint of a body below {table['palm']!r}")
+            raise AssetError(
+                f"{model_path}: joint {table['joints'][index]!r} must be the only "
+                f"joint of a body below {table['palm']!r}"
+            )
         body_joint[row[body]] = index
     return body_joint
 
 
-def _find_fingers(path: Path, model_path: Path, model: Any, table: dict,
-                  row: dict[int, int]) -> tuple[list[int], list[int]]:
+def _find_fingers(
+    path: Path, model_path: Path, model: Any, table: dict, row: dict[int, int]
+) -> tuple[list[int], list[int]]:
     """Each finger's tip site and its first joint, as an index into the TOML's."""
     tips = [_find(path, model_path, model, "site", finger["tip"]) for finger in table["fingers"]]
     for finger, site in zip(table["fingers"], tips, strict=True):
@@ -169,14 +193,20 @@ def _find_fingers(path: Path, model_path: Path, model: Any, table: dict,
 
 def _check_table(path: Path, table: dict) -> None:
     """Entries and their types; names are checked against the model by `load_hand`."""
-    kinds = {"model": str, "taxels": str, "taxel_grid": list, "palm": str, "joints": list,
-             "speed_limits": list, "fingers": list}
+    kinds = {
+        "model": str,
+        "taxels": str,
+        "taxel_grid": list,
+        "palm": str,
+        "joints": list,
+        "speed_limits": list,
+        "fingers": list,
+    }
     for key, kind in kinds.items():
         if key not in table:
             raise AssetError(f"{path}: no entry {key!r}")
         if not isinstance(table[key], kind):
-            raise AssetError(f"{path}: {key} = {table[key]!r}: expected a "
-                             f"{'string' if kind is str else 'list'}")
+            raise AssetError(f"{path}: {key} = {table[key]!r}: expected a {'string' if kind is str else 'list'}")
     grid, speeds = table["taxel_grid"], table["speed_limits"]
     if len(grid) != 2 or any(type(n) is not int or n < 1 for n in grid):
         raise AssetError(f"{path}: taxel_grid = {grid}: expected two whole numbers above 0")
@@ -192,8 +222,12 @@ def _check_table(path: Path, table: dict) -> None:
 
 def _check_finite(model, path: Path) -> None:
     """MuJoCo only warns of a NaN in the XML."""
-    fields = {"body": ("pos", "quat", "ipos", "mass", "inertia"), "geom": ("pos", "quat", "size"),
-              "jnt": ("pos", "axis", "range", "actfrcrange"), "site": ("pos", "quat")}
+    fields = {
+        "body": ("pos", "quat", "ipos", "mass", "inertia"),
+        "geom": ("pos", "quat", "size"),
+        "jnt": ("pos", "axis", "range", "actfrcrange"),
+        "site": ("pos", "quat"),
+    }
     for kind, names in fields.items():
         for name in names:
             values = getattr(model, f"{kind}_{name}")
@@ -230,9 +264,17 @@ def _read_geoms(model, row: dict[int, int]) -> tuple[Geom, ...]:
         kind = names.get(int(model.geom_type[g]))
         if int(model.geom_bodyid[g]) in row and kind is not None:
             touches = bool(model.geom_contype[g] | model.geom_conaffinity[g])
-            geoms.append(Geom(model.geom(g).name, kind, row[int(model.geom_bodyid[g])],
-                              _f32(model.geom_size[g]), _f32(model.geom_pos[g]),
-                              _f32(_matrix(model.geom_quat[g])), touches))
+            geoms.append(
+                Geom(
+                    model.geom(g).name,
+                    kind,
+                    row[int(model.geom_bodyid[g])],
+                    _f32(model.geom_size[g]),
+                    _f32(model.geom_pos[g]),
+                    _f32(_matrix(model.geom_quat[g])),
+                    touches,
+                )
+            )
     return tuple(geoms)
 
 
@@ -261,28 +303,30 @@ def read_taxels(path: Path, fingers: tuple[str, ...], grid: list[int]) -> np.nda
     table = np.full((len(fingers), columns * length, 7), np.nan, np.float32)
     for line, entry in enumerate(rows, start=2):
         if entry["finger"] not in fingers:
-            raise AssetError(f"{path}:{line}: no finger {entry['finger']!r}; "
-                             f"the hand has {', '.join(fingers)}")
+            raise AssetError(f"{path}:{line}: no finger {entry['finger']!r}; the hand has {', '.join(fingers)}")
         try:
             column, at = int(entry["column"]), int(entry["row"])
             values = [float(entry[name]) for name in TAXEL_COLUMNS[3:]]
             if None in entry:  # more values than columns
                 raise ValueError
         except (TypeError, ValueError):
-            raise AssetError(f"{path}:{line}: not ten values with numbers from column 2 on"
-                             ) from None
+            raise AssetError(f"{path}:{line}: not ten values with numbers from column 2 on") from None
         if not (0 <= column < columns and 0 <= at < length) or not np.all(np.isfinite(values)):
-            raise AssetError(f"{path}:{line}: column {column}, row {at} or a number in the line "
-                             f"is outside the {columns} x {length} grid or not finite")
+            raise AssetError(
+                f"{path}:{line}: column {column}, row {at} or a number in the line "
+                f"is outside the {columns} x {length} grid or not finite"
+            )
         if abs(np.linalg.norm(values[3:6]) - 1) > 0.01 or values[6] <= 0:
             raise AssetError(f"{path}:{line}: the normal must be of length 1 and the area above 0")
         table[fingers.index(entry["finger"]), column * length + at] = values
     count = np.sum(np.isfinite(table[..., 0]), axis=1)
     if np.any(count != columns * length):
         worst = int(np.argmin(count))
-        raise AssetError(f"{path}: finger {fingers[worst]!r} has {count[worst]} taxels, "
-                         f"the grid asks for {columns * length}")
+        raise AssetError(
+            f"{path}: finger {fingers[worst]!r} has {count[worst]} taxels, the grid asks for {columns * length}"
+        )
     if len(rows) != table.shape[0] * table.shape[1]:
-        raise AssetError(f"{path}: {len(rows)} taxels, expected {table.shape[0] * table.shape[1]} "
-                         "(a column and row is given twice)")
+        raise AssetError(
+            f"{path}: {len(rows)} taxels, expected {table.shape[0] * table.shape[1]} (a column and row is given twice)"
+        )
     return table

@@ -24,12 +24,19 @@ FIT = ("stiffness", "damping", "coulomb_friction", "viscous_friction", "stall_to
 """What is fitted by default, apart from latency, dead-band and the angles where it rests."""
 
 
-def identify(log: JointLog, start: Mapping[str, float], *, fit: tuple[str, ...] = FIT,
-             substeps: int = 3, latencies: tuple[int, ...] = tuple(range(9)),
-             dead_band: tuple[float, float] | None = (0.0, 0.03),
-             bounds: Mapping[str, tuple[float, float]] | None = None,
-             position_noise: float = 0.002, torque_noise: float = 0.02,
-             holdout: JointLog | None = None) -> Identification:
+def identify(
+    log: JointLog,
+    start: Mapping[str, float],
+    *,
+    fit: tuple[str, ...] = FIT,
+    substeps: int = 3,
+    latencies: tuple[int, ...] = tuple(range(9)),
+    dead_band: tuple[float, float] | None = (0.0, 0.03),
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    position_noise: float = 0.002,
+    torque_noise: float = 0.02,
+    holdout: JointLog | None = None,
+) -> Identification:
     """Fit one joint.
 
     Args:
@@ -60,8 +67,7 @@ def identify(log: JointLog, start: Mapping[str, float], *, fit: tuple[str, ...] 
     return _conclude(problem, latency, latencies, dead_band, holdout)
 
 
-def evaluate(log: JointLog, values: Mapping[str, float], *, latency: int,
-             substeps: int) -> tuple[float, float]:
+def evaluate(log: JointLog, values: Mapping[str, float], *, latency: int, substeps: int) -> tuple[float, float]:
     """Root mean square errors of the angle, rad, and of the torque, Nm (NaN without), on a log.
 
     Where the joint rests, the simulation begins anew from the angle in the log (`segments`).
@@ -69,11 +75,19 @@ def evaluate(log: JointLog, values: Mapping[str, float], *, latency: int,
     segment, angle = segments(log)
     full = complete(dict(values), log)
     full["start"] = jnp.asarray(angle[segment], jnp.float32) - full["encoder_bias"]
-    readings = simulate(full, jnp.asarray(log.target, jnp.float32), jnp.int32(latency),
-                        jnp.float32(log.period / substeps), substeps, segment)
+    readings = simulate(
+        full,
+        jnp.asarray(log.target, jnp.float32),
+        jnp.int32(latency),
+        jnp.float32(log.period / substeps),
+        substeps,
+        segment,
+    )
     measured = (log.position, np.nan if log.torque is None else log.torque)
-    return tuple(float(np.sqrt(np.mean((np.asarray(ours, float) - theirs) ** 2)))
-                 for ours, theirs in zip(readings, measured, strict=True))
+    return tuple(
+        float(np.sqrt(np.mean((np.asarray(ours, float) - theirs) ** 2)))
+        for ours, theirs in zip(readings, measured, strict=True)
+    )
 
 
 def check_log(log: JointLog) -> None:
@@ -82,44 +96,59 @@ def check_log(log: JointLog) -> None:
     Raises:
       CalibrationError: too short, not numbers, mixed units, no motion, saturated throughout.
     """
-    channels = {"target": log.target, "position": log.position} | (
-        {} if log.torque is None else {"torque": log.torque})
+    channels = {"target": log.target, "position": log.position} | ({} if log.torque is None else {"torque": log.torque})
     for name, values in channels.items():
         if np.shape(values) != np.shape(log.target) or np.ndim(values) != 1:
-            raise CalibrationError(f"{log.name}: {name} has shape {np.shape(values)}, target "
-                                   f"{np.shape(log.target)}: give arrays of one length")
+            raise CalibrationError(
+                f"{log.name}: {name} has shape {np.shape(values)}, target "
+                f"{np.shape(log.target)}: give arrays of one length"
+            )
         bad = np.flatnonzero(~np.isfinite(values))
         if len(bad):
-            raise CalibrationError(f"{log.name}: {name} is not a number at sample {bad[0]}: cut "
-                                   "the log there, samples must follow each other without gaps")
+            raise CalibrationError(
+                f"{log.name}: {name} is not a number at sample {bad[0]}: cut "
+                "the log there, samples must follow each other without gaps"
+            )
     if len(log.target) < MIN_SAMPLES:
-        raise CalibrationError(f"{log.name}: {len(log.target)} samples: at least {MIN_SAMPLES} of "
-                               "chirp, steps, slow triangles and small reversals are needed")
+        raise CalibrationError(
+            f"{log.name}: {len(log.target)} samples: at least {MIN_SAMPLES} of "
+            "chirp, steps, slow triangles and small reversals are needed"
+        )
     if not 1e-4 <= log.period <= 0.2:
-        raise CalibrationError(f"{log.name}: period of {log.period:g} s: give seconds, from 0.0001 "
-                               "to 0.2")
+        raise CalibrationError(f"{log.name}: period of {log.period:g} s: give seconds, from 0.0001 to 0.2")
     moved, asked = np.ptp(log.position), np.ptp(log.target)
     if max(np.abs(log.position).max(), np.abs(log.target).max()) > 2 * np.pi:
-        raise CalibrationError(f"{log.name}: angles of {np.abs(log.position).max():.3g}: give rad, "
-                               "not degrees or counts")
+        raise CalibrationError(
+            f"{log.name}: angles of {np.abs(log.position).max():.3g}: give rad, not degrees or counts"
+        )
     if min(asked, moved) > 1e-3 and not 1 / 20 < moved / asked < 20:
-        raise CalibrationError(f"{log.name}: commanded over {asked:.3g} rad, moved over {moved:.3g} "
-                               "rad: target and position are in different units")
+        raise CalibrationError(
+            f"{log.name}: commanded over {asked:.3g} rad, moved over {moved:.3g} "
+            "rad: target and position are in different units"
+        )
     if asked < MIN_MOTION or moved < MIN_MOTION:
-        raise CalibrationError(f"{log.name}: commanded over {asked:.3g} rad, moved over {moved:.3g} "
-                               f"rad: at least {MIN_MOTION} rad of motion is needed")
+        raise CalibrationError(
+            f"{log.name}: commanded over {asked:.3g} rad, moved over {moved:.3g} "
+            f"rad: at least {MIN_MOTION} rad of motion is needed"
+        )
     if log.torque is not None:
         size = np.abs(log.torque)
         if size.max() > 50.0:
             raise CalibrationError(f"{log.name}: torque of {size.max():.3g} Nm: give Nm")
         if np.mean(size > 0.97 * size.max()) > 0.6:
-            raise CalibrationError(f"{log.name}: torque sits at {size.max():.3g} Nm in most "
-                                   "samples: saturated, give smaller or slower commands")
+            raise CalibrationError(
+                f"{log.name}: torque sits at {size.max():.3g} Nm in most "
+                "samples: saturated, give smaller or slower commands"
+            )
 
 
-def _conclude(problem: Problem, latency: int, latencies: tuple[int, ...],
-              dead_band: tuple[float, float] | None,
-              holdout: JointLog | None) -> Identification:
+def _conclude(
+    problem: Problem,
+    latency: int,
+    latencies: tuple[int, ...],
+    dead_band: tuple[float, float] | None,
+    holdout: JointLog | None,
+) -> Identification:
     log, theta, samples = problem.log, problem.theta, len(problem.log.target)
     fitted = problem.names if dead_band is not None else problem.names[:-1]
     count = len(fitted)
@@ -128,16 +157,20 @@ def _conclude(problem: Problem, latency: int, latencies: tuple[int, ...],
     columns = np.r_[np.arange(count), np.arange(len(theta), jacobian.shape[1])]
     size = np.maximum(np.abs(theta), [TYPICAL[name] for name in problem.names])[:count]
     deviation, correlation, condition, null = uncertainty(
-        jacobian[:, columns], residual, np.append(size, np.full(len(problem.starts), 0.05)),
-        samples)
+        jacobian[:, columns], residual, np.append(size, np.full(len(problem.starts), 0.05)), samples
+    )
     deviation, correlation = deviation[:count], correlation[:count, :count]
     null = [members[:count] for members in null if np.any(members[:count])]
     low, high = problem.low[:count], problem.high[:count]
     # Curvature at the best point, widened by what was seen to fit as well farther off.
     least, largest = problem.plausible(latency, dead_band is not None)
-    ends = np.stack([
-        np.maximum(np.minimum(theta[:count] - 1.96 * deviation, least[:count]), low),
-        np.minimum(np.maximum(theta[:count] + 1.96 * deviation, largest[:count]), high)], -1)
+    ends = np.stack(
+        [
+            np.maximum(np.minimum(theta[:count] - 1.96 * deviation, least[:count]), low),
+            np.minimum(np.maximum(theta[:count] + 1.96 * deviation, largest[:count]), high),
+        ],
+        -1,
+    )
     intervals = {name: (float(a), float(b)) for name, (a, b) in zip(fitted, ends, strict=True)}
     if dead_band is not None:
         profile = problem.dead_band_profile(latency, dead_band)
@@ -149,8 +182,7 @@ def _conclude(problem: Problem, latency: int, latencies: tuple[int, ...],
     touching = (theta[:count] <= low + 1e-3 * size) | (theta[:count] >= high - 1e-3 * size)
     at_bound = tuple(n for n, hit in zip(fitted, touching, strict=True) if hit)
     found = groups(fitted, null, correlation, deviation, size)
-    errors = residual.reshape(len(problem.measured), -1) * problem.noise[:len(problem.measured),
-                                                                         None]
+    errors = residual.reshape(len(problem.measured), -1) * problem.noise[: len(problem.measured), None]
     rmse = np.sqrt(np.mean(errors**2, -1))
     cost, best = problem.latency_cost, problem.latency_cost[latency]
     slack = CHI2 / max(residual.size - count, 1)
@@ -161,28 +193,48 @@ def _conclude(problem: Problem, latency: int, latencies: tuple[int, ...],
         before = evaluate(holdout, first, latency=latency, substeps=problem.substeps)[0]
         after = evaluate(holdout, values, latency=latency, substeps=problem.substeps)[0]
     return Identification(
-        joint=log.name, values=values, fitted=fitted, intervals=intervals, correlation=correlation,
-        condition=condition, latency=latency,
+        joint=log.name,
+        values=values,
+        fitted=fitted,
+        intervals=intervals,
+        correlation=correlation,
+        condition=condition,
+        latency=latency,
         latency_cost={lag: cost[lag] / best - 1.0 for lag in sorted(cost)},
         latency_plausible=tuple(lag for lag in sorted(cost) if cost[lag] <= best * (1 + slack)),
-        timestep=problem.timestep, unidentifiable=found, at_bound=at_bound, rmse=float(rmse[0]),
-        torque_rmse=float(rmse[1]) if len(rmse) > 1 else float("nan"), holdout_rmse=after,
+        timestep=problem.timestep,
+        unidentifiable=found,
+        at_bound=at_bound,
+        rmse=float(rmse[0]),
+        torque_rmse=float(rmse[1]) if len(rmse) > 1 else float("nan"),
+        holdout_rmse=after,
         holdout_rmse_before=before,
-        notes=tuple(_notes(log, latency, latencies, found, at_bound, before, after)))
+        notes=tuple(_notes(log, latency, latencies, found, at_bound, before, after)),
+    )
 
 
-def _notes(log: JointLog, latency: int, latencies: tuple[int, ...],
-           found: tuple[tuple[str, ...], ...], at_bound: tuple[str, ...], before: float,
-           after: float) -> list[str]:
+def _notes(
+    log: JointLog,
+    latency: int,
+    latencies: tuple[int, ...],
+    found: tuple[tuple[str, ...], ...],
+    at_bound: tuple[str, ...],
+    before: float,
+    after: float,
+) -> list[str]:
     notes = advice(found)
     notes += [f"{name} ran into its bound: its interval is one-sided" for name in at_bound]
     if len(latencies) > 1 and latency == max(latencies):
         notes.append("latency is the largest that was tried: try more")
     speed = np.gradient(log.position)
-    if min(np.mean(speed > 0), np.mean(speed < 0)) < 0.1 or np.all(np.diff(log.target) >= 0) \
-            or np.all(np.diff(log.target) <= 0):
+    if (
+        min(np.mean(speed > 0), np.mean(speed < 0)) < 0.1
+        or np.all(np.diff(log.target) >= 0)
+        or np.all(np.diff(log.target) <= 0)
+    ):
         notes.append("the joint went one way only: friction and offsets are not apart")
     if np.isfinite(after) and after > 0.9 * before:
-        notes.append(f"hold-out error hardly fell ({1e3 * before:.2f} to {1e3 * after:.2f} mrad): "
-                     "the fit is of little use")
+        notes.append(
+            f"hold-out error hardly fell ({1e3 * before:.2f} to {1e3 * after:.2f} mrad): the fit is of little use"
+        )
     return notes

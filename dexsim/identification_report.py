@@ -7,29 +7,40 @@ import numpy as np
 from dexsim.joint_model import PARAMETERS
 from dexsim.robust_line import long_run
 
-TYPICAL = {"stiffness": 1.0, "damping": 0.05, "dead_band": 0.005, "stall_torque": 0.4,
-           "no_load_speed": 10.0, "efficiency": 0.5, "encoder_bias": 0.01,
-           "coulomb_friction": 0.01, "viscous_friction": 0.005, "inertia": 1e-3,
-           "gravity_cos": 0.01, "gravity_sin": 0.01}
+TYPICAL = {
+    "stiffness": 1.0,
+    "damping": 0.05,
+    "dead_band": 0.005,
+    "stall_torque": 0.4,
+    "no_load_speed": 10.0,
+    "efficiency": 0.5,
+    "encoder_bias": 0.01,
+    "coulomb_friction": 0.01,
+    "viscous_friction": 0.005,
+    "inertia": 1e-3,
+    "gravity_cos": 0.01,
+    "gravity_sin": 0.01,
+}
 """Sizes below which a parameter hardly matters on this kind of hand; they make relative errors."""
 
 _ADVICE = {
     frozenset({"stiffness", "efficiency"}): "efficiency and gains enter as products: keep one fixed",
     frozenset({"stall_torque", "efficiency"}): "efficiency and stall torque enter as a product",
     frozenset({"stiffness", "inertia"}): "angles alone fix torques over inertia only: record the "
-                                         "torque, or keep the inertia of the model",
+    "torque, or keep the inertia of the model",
     frozenset({"damping", "viscous_friction"}): "the drive's damping and the gear's look alike in "
-                                                "angles: record the torque",
+    "angles: record the torque",
     frozenset({"dead_band", "coulomb_friction"}): "both hold the joint near its target: add small "
-                                                  "reversals, record the torque",
+    "reversals, record the torque",
     frozenset({"stall_torque", "no_load_speed"}): "the envelope was touched at one speed only: add "
-                                                  "larger steps, some held back by hand",
+    "larger steps, some held back by hand",
 }
-_ALONE = {"stall_torque": "the drive never reached its limit: add larger steps",
-          "no_load_speed": "the drive never reached its limit at speed: add larger steps",
-          "encoder_bias": "angles alone cannot show the encoder's zero: run the joint against its "
-                          "stop",
-          "dead_band": "add small reversals, record the torque"}
+_ALONE = {
+    "stall_torque": "the drive never reached its limit: add larger steps",
+    "no_load_speed": "the drive never reached its limit at speed: add larger steps",
+    "encoder_bias": "angles alone cannot show the encoder's zero: run the joint against its stop",
+    "dead_band": "add small reversals, record the torque",
+}
 
 NULL = 1e-4  # singular values below this share of the largest are none: the Jacobian is float32
 CORRELATED, VAGUE = 0.97, 0.5
@@ -74,22 +85,26 @@ class Identification:
     def report(self) -> str:
         """A table for people."""
         head = f"{'parameter':18}{'value':>12}{'95 % from':>12}{'to':>12}  unit"
-        rows = [f"{self.joint}: rmse {1e3 * self.rmse:.2f} mrad, hold-out "
-                f"{1e3 * self.holdout_rmse:.2f} mrad (before {1e3 * self.holdout_rmse_before:.2f})",
-                head]
+        rows = [
+            f"{self.joint}: rmse {1e3 * self.rmse:.2f} mrad, hold-out "
+            f"{1e3 * self.holdout_rmse:.2f} mrad (before {1e3 * self.holdout_rmse_before:.2f})",
+            head,
+        ]
         for name in self.fitted:
             low, high = self.intervals[name]
             mark = " at its bound" if name in self.at_bound else ""
-            rows.append(f"{name:18}{self.values[name]:12.5g}{low:12.5g}{high:12.5g}  "
-                        f"{PARAMETERS[name]}{mark}")
+            rows.append(f"{name:18}{self.values[name]:12.5g}{low:12.5g}{high:12.5g}  {PARAMETERS[name]}{mark}")
         others = ", ".join(str(lag) for lag in self.latency_plausible if lag != self.latency)
-        rows.append(f"{'latency':18}{self.latency:12d} sub-steps of {1e3 * self.timestep:g} ms"
-                    + (f" (not excluded: {others})" if others else ""))
+        rows.append(
+            f"{'latency':18}{self.latency:12d} sub-steps of {1e3 * self.timestep:g} ms"
+            + (f" (not excluded: {others})" if others else "")
+        )
         return "\n".join(rows + [f"note: {note}" for note in self.notes])
 
 
-def uncertainty(jacobian: np.ndarray, residual: np.ndarray, size: np.ndarray,
-                samples: int) -> tuple[np.ndarray, np.ndarray, float, list[np.ndarray]]:
+def uncertainty(
+    jacobian: np.ndarray, residual: np.ndarray, size: np.ndarray, samples: int
+) -> tuple[np.ndarray, np.ndarray, float, list[np.ndarray]]:
     """Standard deviations and correlations from a least-squares solution.
 
     Args:
@@ -121,8 +136,9 @@ def uncertainty(jacobian: np.ndarray, residual: np.ndarray, size: np.ndarray,
     return deviation, correlation, condition, null
 
 
-def groups(names: tuple[str, ...], null: list[np.ndarray], correlation: np.ndarray,
-           deviation: np.ndarray, size: np.ndarray) -> tuple[tuple[str, ...], ...]:
+def groups(
+    names: tuple[str, ...], null: list[np.ndarray], correlation: np.ndarray, deviation: np.ndarray, size: np.ndarray
+) -> tuple[tuple[str, ...], ...]:
     """Which parameters the data do not separate, or do not see."""
     found = [tuple(n for n, m in zip(names, members, strict=True) if m) for members in null]
     inside = {name for group in found for name in group}

@@ -16,10 +16,19 @@ from dexsim.errors import CalibrationError
 from dexsim.identification_report import TYPICAL
 from dexsim.joint_model import PARAMETERS, JointLog, complete, segments, simulate
 
-BOUNDS = {"stiffness": (0.01, 100.0), "damping": (0.0, 10.0), "stall_torque": (0.01, 10.0),
-          "no_load_speed": (0.5, 100.0), "efficiency": (0.2, 1.5), "encoder_bias": (-0.2, 0.2),
-          "coulomb_friction": (0.0, 1.0), "viscous_friction": (0.0, 1.0),
-          "inertia": (1e-5, 0.1), "gravity_cos": (-1.0, 1.0), "gravity_sin": (-1.0, 1.0)}
+BOUNDS = {
+    "stiffness": (0.01, 100.0),
+    "damping": (0.0, 10.0),
+    "stall_torque": (0.01, 10.0),
+    "no_load_speed": (0.5, 100.0),
+    "efficiency": (0.2, 1.5),
+    "encoder_bias": (-0.2, 0.2),
+    "coulomb_friction": (0.0, 1.0),
+    "viscous_friction": (0.0, 1.0),
+    "inertia": (1e-5, 0.1),
+    "gravity_cos": (-1.0, 1.0),
+    "gravity_sin": (-1.0, 1.0),
+}
 """Default bounds of the search."""
 
 BLUR = 2e-3
@@ -35,50 +44,84 @@ _NAMES = tuple(name for name in PARAMETERS if name != "start")
 
 
 @functools.partial(jax.jit, static_argnames=("substeps", "blur"))
-def _readings(values: jax.Array, starts: jax.Array, target: jax.Array, segment: jax.Array,
-              latency: jax.Array, timestep: jax.Array, substeps: int,
-              blur: float = 0.0) -> jax.Array:
+def _readings(
+    values: jax.Array,
+    starts: jax.Array,
+    target: jax.Array,
+    segment: jax.Array,
+    latency: jax.Array,
+    timestep: jax.Array,
+    substeps: int,
+    blur: float = 0.0,
+) -> jax.Array:
     """[2, T] angle and torque, from all parameters and each sample's segment's start [T]."""
     named = dict(zip(_NAMES, values, strict=True)) | {"start": starts}
     return jnp.stack(simulate(named, target, latency, timestep, substeps, segment, blur))
 
 
 @functools.partial(jax.jit, static_argnames="substeps")
-def _slopes(values: jax.Array, starts: jax.Array, target: jax.Array, segment: jax.Array,
-            latency: jax.Array, timestep: jax.Array, substeps: int) -> jax.Array:
+def _slopes(
+    values: jax.Array,
+    starts: jax.Array,
+    target: jax.Array,
+    segment: jax.Array,
+    latency: jax.Array,
+    timestep: jax.Array,
+    substeps: int,
+) -> jax.Array:
     """[2, T, P + 1] derivatives of `_readings` by all parameters and by the segment's start.
 
     The dead-band's edges are blurred: the exact gradient does not see that a parameter moves the
     instant at which the torque switches.
     """
+
     def blurred(values: jax.Array, shift: jax.Array) -> jax.Array:
-        return _readings(values, starts + shift, target, segment, latency, timestep, substeps,
-                         blur=BLUR)
+        return _readings(values, starts + shift, target, segment, latency, timestep, substeps, blur=BLUR)
+
     by_value, by_start = jax.jacfwd(blurred, (0, 1))(values, jnp.zeros(()))
     return jnp.concatenate([by_value, by_start[..., None]], -1)
 
 
 @functools.partial(jax.jit, static_argnames="substeps")
-def _crowd_costs(crowd: jax.Array, starts: jax.Array, target: jax.Array, segment: jax.Array,
-                 latency: jax.Array, timestep: jax.Array, substeps: int, measured: jax.Array,
-                 weight: jax.Array) -> jax.Array:
+def _crowd_costs(
+    crowd: jax.Array,
+    starts: jax.Array,
+    target: jax.Array,
+    segment: jax.Array,
+    latency: jax.Array,
+    timestep: jax.Array,
+    substeps: int,
+    measured: jax.Array,
+    weight: jax.Array,
+) -> jax.Array:
     """Weighted sums of squares [N] for parameters [N, P]."""
+
     def cost(values: jax.Array) -> jax.Array:
         out = _readings(values, starts, target, segment, latency, timestep, substeps)
-        return jnp.sum(((out[:len(weight)] - measured) * weight[:, None]) ** 2)
+        return jnp.sum(((out[: len(weight)] - measured) * weight[:, None]) ** 2)
+
     return jax.vmap(cost)(crowd)
 
 
 class Problem:
     """One log's least squares: theta (what is fitted, the dead-band last) and the starts [S]."""
 
-    def __init__(self, log: JointLog, start: Mapping[str, float], fit: tuple[str, ...],
-                 substeps: int, bounds: Mapping[str, tuple[float, float]], noise: np.ndarray):
+    def __init__(
+        self,
+        log: JointLog,
+        start: Mapping[str, float],
+        fit: tuple[str, ...],
+        substeps: int,
+        bounds: Mapping[str, tuple[float, float]],
+        noise: np.ndarray,
+    ):
         odd = [name for name in fit if name not in bounds or name == "dead_band"]
         if odd:
-            raise CalibrationError(f"{odd[0]} cannot be named in fit: choose from "
-                                   f"{', '.join(BOUNDS)}; the dead-band and the latency are "
-                                   "searched by their own arguments")
+            raise CalibrationError(
+                f"{odd[0]} cannot be named in fit: choose from "
+                f"{', '.join(BOUNDS)}; the dead-band and the latency are "
+                "searched by their own arguments"
+            )
         self.log, self.substeps, self.noise = log, substeps, noise
         self.fixed = complete(dict(start), log)
         self.segment, angle = segments(log)
@@ -91,8 +134,9 @@ class Problem:
         outside = (begin < self.low) | (begin > self.high)
         if np.any(outside):
             name = self.names[int(np.argmax(outside))]
-            raise CalibrationError(f"{log.name}: {name} starts at {float(self.fixed[name]):g}, "
-                                   f"outside its bounds {bounds[name]}")
+            raise CalibrationError(
+                f"{log.name}: {name} starts at {float(self.fixed[name]):g}, outside its bounds {bounds[name]}"
+            )
         # From a bound, where a friction's gradient may vanish, the search would not set off.
         inside = 0.05 * np.minimum(self.scale, self.high - self.low)
         self.theta = np.clip(begin, self.low + inside, self.high - inside)
@@ -111,27 +155,34 @@ class Problem:
         return jnp.asarray(values, jnp.float32)
 
     def _call(self, function, theta: np.ndarray, starts: np.ndarray, latency: int) -> np.ndarray:
-        out = function(self._all(theta), jnp.asarray(starts[self.segment], jnp.float32),
-                       self.target, self.segment, jnp.int32(latency), jnp.float32(self.timestep),
-                       self.substeps)
+        out = function(
+            self._all(theta),
+            jnp.asarray(starts[self.segment], jnp.float32),
+            self.target,
+            self.segment,
+            jnp.int32(latency),
+            jnp.float32(self.timestep),
+            self.substeps,
+        )
         out = np.nan_to_num(np.asarray(out, float), nan=1e3, posinf=1e3, neginf=-1e3)
-        return out[:len(self.measured)]
+        return out[: len(self.measured)]
 
     def residual(self, theta: np.ndarray, starts: np.ndarray, latency: int) -> np.ndarray:
         """Weighted residuals [channels * T]."""
         error = self._call(_readings, theta, starts, latency) - self.measured
-        return (error / self.noise[:len(error), None]).ravel()
+        return (error / self.noise[: len(error), None]).ravel()
 
     def jacobian(self, theta: np.ndarray, starts: np.ndarray, latency: int) -> np.ndarray:
         """Of `residual`, [channels * T, P + S], in the parameters' own units."""
         slope = self._call(_slopes, theta, starts, latency)
-        slope = slope / self.noise[:len(slope), None, None]
+        slope = slope / self.noise[: len(slope), None, None]
         own = slope[..., -1:] * (self.segment[:, None] == np.arange(len(starts)))
         slope = np.concatenate([slope[..., self._index], own], -1)
         return slope.reshape(-1, slope.shape[-1])
 
-    def solve(self, theta: np.ndarray, latency: int, evaluations: int,
-              with_band: bool = False) -> tuple[float, np.ndarray, np.ndarray]:
+    def solve(
+        self, theta: np.ndarray, latency: int, evaluations: int, with_band: bool = False
+    ) -> tuple[float, np.ndarray, np.ndarray]:
         """Sum of squares, theta and starts of the fit by gradient; the dead-band stays if asked."""
         from scipy.optimize import least_squares
 
@@ -149,12 +200,16 @@ class Problem:
             lambda x: self.residual(*split(x), latency),
             np.concatenate([theta[:count], self.starts]) / scale,
             jac=lambda x: self.jacobian(*split(x), latency)[:, columns] * scale,
-            bounds=(low, high), method="trf", xtol=1e-6, ftol=1e-7, gtol=1e-10,
-            max_nfev=evaluations)
+            bounds=(low, high),
+            method="trf",
+            xtol=1e-6,
+            ftol=1e-7,
+            gtol=1e-10,
+            max_nfev=evaluations,
+        )
         return 2.0 * float(result.cost), *split(result.x)
 
-    def attempt(self, latency: int, evaluations: int, width: float | None = None,
-                with_band: bool = False) -> float:
+    def attempt(self, latency: int, evaluations: int, width: float | None = None, with_band: bool = False) -> float:
         """Sum of squares at this latency and dead-band; keeps the solution if it is the best."""
         theta = self.theta.copy()
         theta[-1] = theta[-1] if width is None else width
@@ -175,17 +230,22 @@ class Problem:
         from scipy.optimize import minimize_scalar
 
         cell = (span[1] - span[0]) / 10
-        grid = np.linspace(*span, 11) if not fine else np.clip(
-            self.theta[-1] + np.array([-0.6, -0.3, 0.0, 0.3, 0.6]) * cell, *span)
+        grid = (
+            np.linspace(*span, 11)
+            if not fine
+            else np.clip(self.theta[-1] + np.array([-0.6, -0.3, 0.0, 0.3, 0.6]) * cell, *span)
+        )
         self.best = np.inf
         costs = [self.attempt(latency, 5, width) for width in grid]
         at, last = int(np.argmin(costs)), len(grid) - 1
-        minimize_scalar(lambda width: self.attempt(latency, 5, width), method="bounded",
-                        bounds=(grid[max(at - 1, 0)], grid[min(at + 1, last)]),
-                        options={"xatol": 2e-3 * (span[1] - span[0])})
+        minimize_scalar(
+            lambda width: self.attempt(latency, 5, width),
+            method="bounded",
+            bounds=(grid[max(at - 1, 0)], grid[min(at + 1, last)]),
+            options={"xatol": 2e-3 * (span[1] - span[0])},
+        )
 
-    def explore(self, latency: int, with_band: bool, rounds: int = 6,
-                crowd: int = 256) -> None:
+    def explore(self, latency: int, with_band: bool, rounds: int = 6, crowd: int = 256) -> None:
         """Cross-entropy search about the present solution, which a gradient cannot leave: a
         dead-band makes the sum of squares rugged at the scale of the parameters' own errors."""
         count = len(self.theta) - (not with_band)
@@ -203,7 +263,7 @@ class Problem:
             costs = self._costs(thetas, latency)
             order = np.argsort(costs)
             self.seen += [(thetas, costs)]
-            elite = tries[order[:crowd // 8]]
+            elite = tries[order[: crowd // 8]]
             middle, spread = elite[0], 2.0 * np.cov(elite.T) + 1e-12 * np.eye(count)
             if self.attempt_from(thetas[order[0]], latency, with_band) is not None:
                 middle = self.theta[:count] / self.scale[:count]
@@ -221,10 +281,18 @@ class Problem:
     def _costs(self, thetas: np.ndarray, latency: int) -> np.ndarray:
         """Sums of squares [N] of many candidates at once."""
         starts = jnp.asarray(self.starts[self.segment], jnp.float32)
-        weight = 1.0 / jnp.asarray(self.noise[:len(self.measured)], jnp.float32)
-        out = _crowd_costs(self._all(thetas), starts, self.target, self.segment,
-                           jnp.int32(latency), jnp.float32(self.timestep), self.substeps,
-                           jnp.asarray(self.measured, jnp.float32), weight)
+        weight = 1.0 / jnp.asarray(self.noise[: len(self.measured)], jnp.float32)
+        out = _crowd_costs(
+            self._all(thetas),
+            starts,
+            self.target,
+            self.segment,
+            jnp.int32(latency),
+            jnp.float32(self.timestep),
+            self.substeps,
+            jnp.asarray(self.measured, jnp.float32),
+            weight,
+        )
         return np.nan_to_num(np.asarray(out, float), nan=np.inf)
 
     def attempt_from(self, theta: np.ndarray, latency: int, with_band: bool) -> float | None:
@@ -261,7 +329,7 @@ class Problem:
             self.explore(latency, with_band, rounds=6)
         left = self.residual(self.theta, self.starts, latency).reshape(len(self.measured), -1)
         self.noise = self.noise.copy()
-        self.noise[:len(left)] *= np.maximum(np.sqrt(np.mean(left**2, -1)), 1e-6)
+        self.noise[: len(left)] *= np.maximum(np.sqrt(np.mean(left**2, -1)), 1e-6)
         if last:
             self.best = np.sum(self.residual(self.theta, self.starts, latency) ** 2)
             self.explore(latency, with_band, rounds=14 if with_band else 3)

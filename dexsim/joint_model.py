@@ -20,18 +20,44 @@ from dexsim.actuator import Actuator, apply_friction
 from dexsim.errors import CalibrationError
 
 PARAMETERS = {
-    "stiffness": "Nm/rad", "damping": "Nm s/rad", "dead_band": "rad", "stall_torque": "Nm",
-    "no_load_speed": "rad/s", "efficiency": "1", "encoder_bias": "rad",
-    "coulomb_friction": "Nm", "viscous_friction": "Nm s/rad", "inertia": "kg m^2",
-    "gravity_cos": "Nm", "gravity_sin": "Nm", "start": "rad"}
+    "stiffness": "Nm/rad",
+    "damping": "Nm s/rad",
+    "dead_band": "rad",
+    "stall_torque": "Nm",
+    "no_load_speed": "rad/s",
+    "efficiency": "1",
+    "encoder_bias": "rad",
+    "coulomb_friction": "Nm",
+    "viscous_friction": "Nm s/rad",
+    "inertia": "kg m^2",
+    "gravity_cos": "Nm",
+    "gravity_sin": "Nm",
+    "start": "rad",
+}
 """What the model knows, and the units; `start` is the true angle at the first sample."""
 
-NOMINAL = {"dead_band": 0.0, "efficiency": 1.0, "encoder_bias": 0.0, "coulomb_friction": 0.0,
-           "viscous_friction": 0.0, "gravity_cos": 0.0, "gravity_sin": 0.0}
+NOMINAL = {
+    "dead_band": 0.0,
+    "efficiency": 1.0,
+    "encoder_bias": 0.0,
+    "coulomb_friction": 0.0,
+    "viscous_friction": 0.0,
+    "gravity_cos": 0.0,
+    "gravity_sin": 0.0,
+}
 """Values of parameters that nobody gave."""
 
-_DRIVE = ("stiffness", "damping", "dead_band", "stall_torque", "no_load_speed", "efficiency",
-          "encoder_bias", "coulomb_friction", "viscous_friction")
+_DRIVE = (
+    "stiffness",
+    "damping",
+    "dead_band",
+    "stall_torque",
+    "no_load_speed",
+    "efficiency",
+    "encoder_bias",
+    "coulomb_friction",
+    "viscous_friction",
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,9 +72,15 @@ class JointLog:
 
 
 @functools.partial(jax.jit, static_argnames=("substeps", "blur"))
-def simulate(values: dict[str, jax.Array], target: jax.Array, latency: jax.Array,
-             timestep: jax.Array, substeps: int, segment: jax.Array | None = None,
-             blur: float = 0.0) -> tuple[jax.Array, jax.Array]:
+def simulate(
+    values: dict[str, jax.Array],
+    target: jax.Array,
+    latency: jax.Array,
+    timestep: jax.Array,
+    substeps: int,
+    segment: jax.Array | None = None,
+    blur: float = 0.0,
+) -> tuple[jax.Array, jax.Array]:
     """Readings of the joint at each command.
 
     Args:
@@ -81,12 +113,10 @@ def simulate(values: dict[str, jax.Array], target: jax.Array, latency: jax.Array
         position, velocity = state
         wanted, last, begin, start = inputs
         position, velocity = jnp.where(begin, start, position), jnp.where(begin, 0.0, velocity)
-        reading = (position + values["encoder_bias"],
-                   motor(drive, last, position, velocity))
+        reading = (position + values["encoder_bias"], motor(drive, last, position, velocity))
         for substep in range(substeps):
             torque = motor(drive, wanted[substep], position, velocity)
-            torque = torque - (values["gravity_cos"] * jnp.cos(position)
-                               + values["gravity_sin"] * jnp.sin(position))
+            torque = torque - (values["gravity_cos"] * jnp.cos(position) + values["gravity_sin"] * jnp.sin(position))
             velocity = velocity + apply_friction(drive, torque, velocity, rate) / rate
             position = position + timestep * velocity
         return (position, velocity), reading
@@ -95,13 +125,13 @@ def simulate(values: dict[str, jax.Array], target: jax.Array, latency: jax.Array
     return jax.lax.scan(tick, rest, (acting, before, begins, starts))[1]
 
 
-def _torque(drive: Actuator, target: jax.Array, position: jax.Array,
-            velocity: jax.Array) -> jax.Array:
+def _torque(drive: Actuator, target: jax.Array, position: jax.Array, velocity: jax.Array) -> jax.Array:
     return actuator.joint_torque(drive, target, 0.0, position, velocity)
 
 
-def _blurred_torque(blur: float, drive: Actuator, target: jax.Array, position: jax.Array,
-                    velocity: jax.Array) -> jax.Array:
+def _blurred_torque(
+    blur: float, drive: Actuator, target: jax.Array, position: jax.Array, velocity: jax.Array
+) -> jax.Array:
     """`joint_torque` with a dead-band that fades in over `blur` rad."""
     error = target - (position + drive.encoder_bias)
     share = jax.nn.sigmoid((jnp.abs(error) - drive.dead_band) * (4.0 / blur))
@@ -128,19 +158,18 @@ def segments(log: JointLog, before: int = 8, least: int = 15) -> tuple[np.ndarra
         if not still or first - firsts[-1] < least or len(position) - first < least:
             continue
         half = before // 2
-        drift = np.mean(position[first:first + half]) - np.mean(position[change - half:change])
+        drift = np.mean(position[first : first + half]) - np.mean(position[change - half : change])
         if abs(drift) < 4.0 * noise / np.sqrt(half / 2):
             firsts.append(first)
     segment = np.zeros(len(position), np.int32)
     segment[firsts[1:]] = 1
-    angles = [np.mean(position[first:first + max(_still(log, first, before), 1)])
-              for first in firsts]
+    angles = [np.mean(position[first : first + max(_still(log, first, before), 1)]) for first in firsts]
     return np.cumsum(segment, dtype=np.int32), np.array(angles)
 
 
 def _still(log: JointLog, first: int, most: int) -> int:
     """Samples from `first` on, `most` at most, whose target is the same."""
-    same = log.target[first:first + most] == log.target[first]
+    same = log.target[first : first + most] == log.target[first]
     return int(np.argmin(np.append(same, False)))
 
 
@@ -160,10 +189,20 @@ def complete(values: dict[str, float], log: JointLog) -> dict[str, jax.Array]:
     return {name: jnp.float32(full[name]) for name in PARAMETERS}
 
 
-def synthetic_log(key: jax.Array, values: dict[str, float], target: np.ndarray, *, period: float,
-                  substeps: int, latency: int = 0, position_noise: float = 0.0,
-                  position_resolution: float = 0.0, torque_noise: float = 0.0,
-                  with_torque: bool = True, name: str = "joint") -> JointLog:
+def synthetic_log(
+    key: jax.Array,
+    values: dict[str, float],
+    target: np.ndarray,
+    *,
+    period: float,
+    substeps: int,
+    latency: int = 0,
+    position_noise: float = 0.0,
+    position_resolution: float = 0.0,
+    torque_noise: float = 0.0,
+    with_torque: bool = True,
+    name: str = "joint",
+) -> JointLog:
     """A log of the model itself: known truth with the noise of a real one.
 
     Args:
@@ -174,12 +213,16 @@ def synthetic_log(key: jax.Array, values: dict[str, float], target: np.ndarray, 
     target = np.asarray(target, float)
     values = {"start": float(target[0])} | values
     blank = JointLog(period, target, target, name=name)
-    position, torque = simulate(complete(values, blank), jnp.asarray(target, jnp.float32),
-                                jnp.int32(latency), jnp.float32(period / substeps), substeps)
+    position, torque = simulate(
+        complete(values, blank),
+        jnp.asarray(target, jnp.float32),
+        jnp.int32(latency),
+        jnp.float32(period / substeps),
+        substeps,
+    )
     keys = jax.random.split(key)
     position = np.asarray(position + position_noise * jax.random.normal(keys[0], position.shape))
     if position_resolution > 0:
         position = np.round(position / position_resolution) * position_resolution
     torque = np.asarray(torque + torque_noise * jax.random.normal(keys[1], torque.shape))
-    return JointLog(period, target, position.astype(float),
-                    torque.astype(float) if with_torque else None, name)
+    return JointLog(period, target, position.astype(float), torque.astype(float) if with_torque else None, name)

@@ -113,8 +113,7 @@ def forward_kinematics(hand: Hand, joint_position: jax.Array) -> HandPose:
     back = np.argsort(order).astype(np.int32)
     position, rotation = position[back], rotation[back]
     tip_rotation = rotation[hand.tip_body]
-    tip_position = position[hand.tip_body] + rotations.rotate(tip_rotation,
-                                                              jnp.asarray(hand.tip_offset))
+    tip_position = position[hand.tip_body] + rotations.rotate(tip_rotation, jnp.asarray(hand.tip_offset))
     return HandPose(position, rotation, tip_position, tip_rotation)
 
 

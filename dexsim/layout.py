@@ -66,8 +66,9 @@ def lattice(columns: int, rows: int, *, pitch: float | tuple[float, float], kind
         along = across * np.sqrt(3) / 2
     column, row = (x.ravel() for x in np.meshgrid(np.arange(columns), np.arange(rows), indexing="ij"))
     shift = 0.25 * np.where(row % 2, 1, -1) if kind == "hex" else 0.0
-    return Lattice((columns, rows), across * (column - (columns - 1) / 2 + shift), along * (row - (rows - 1) / 2),
-                   across * along)
+    return Lattice(
+        (columns, rows), across * (column - (columns - 1) / 2 + shift), along * (row - (rows - 1) / 2), across * along
+    )
 
 
 def on_surface(kind: str, points: Lattice, *, radius: float = 0.0, half_length: float = 0.0) -> Patch:
@@ -84,16 +85,19 @@ def on_surface(kind: str, points: Lattice, *, radius: float = 0.0, half_length: 
     u, v = points.u, points.v
     if kind == "plane":
         position = np.stack([u, v, 0 * u], -1)
-        return Patch(points.grid, position, np.broadcast_to([0.0, 0.0, 1.0], position.shape).copy(),
-                     np.full(len(u), points.cell))
+        return Patch(
+            points.grid, position, np.broadcast_to([0.0, 0.0, 1.0], position.shape).copy(), np.full(len(u), points.cell)
+        )
     if kind not in SURFACES:
         raise ConfigError(f"surface {kind!r}: choose from {', '.join(SURFACES)}")
     if radius <= 0:
         raise ConfigError(f"surface {kind!r}: radius = {radius} m, must be above 0")
     angle = u / radius
     if np.ptp(u) >= 2 * np.pi * radius:
-        raise ConfigError(f"surface {kind!r}: the lattice is {np.ptp(u):.4g} m wide and laps itself on a girth of "
-                          f"{2 * np.pi * radius:.4g} m")
+        raise ConfigError(
+            f"surface {kind!r}: the lattice is {np.ptp(u):.4g} m wide and laps itself on a girth of "
+            f"{2 * np.pi * radius:.4g} m"
+        )
     straight = {"cylinder": np.inf, "capsule": half_length, "sphere": 0.0}[kind]
     over = np.sign(v) * np.maximum(np.abs(v) - straight, 0.0)
     polar = over / radius
@@ -120,22 +124,27 @@ def on_mesh(mesh: Any, points: Lattice, *, origin: Any, facing: Any, along: Any)
     rows = points.grid[1]
     if np.any(face < 0):
         bad = int(np.argmax(face < 0))
-        raise AssetError(f"{mesh.name}: the ray of taxel column {bad // rows}, row {bad % rows} misses the mesh "
-                         f"({np.sum(face < 0)} of {len(face)} do); make the lattice smaller or move its origin")
+        raise AssetError(
+            f"{mesh.name}: the ray of taxel column {bad // rows}, row {bad % rows} misses the mesh "
+            f"({np.sum(face < 0)} of {len(face)} do); make the lattice smaller or move its origin"
+        )
     normal = mesh.normals[face]
     cosine = normal @ facing
     if np.any(cosine < np.sin(np.radians(10))):
         bad = int(cosine.argmin())
-        raise AssetError(f"{mesh.name}: the surface under taxel column {bad // rows}, row {bad % rows} is too steep "
-                         "for this direction; turn `facing` or make the lattice smaller")
+        raise AssetError(
+            f"{mesh.name}: the surface under taxel column {bad // rows}, row {bad % rows} is too steep "
+            "for this direction; turn `facing` or make the lattice smaller"
+        )
     return Patch(points.grid, position, normal, points.cell / cosine)
 
 
 def placed(patch: Patch, *, position: Any = (0, 0, 0), rotation: Any = None) -> Patch:
     """The patch moved by a rotation matrix [3, 3] and then a shift [3] m."""
     turn = np.eye(3) if rotation is None else np.asarray(rotation, float)
-    return dataclasses.replace(patch, position=patch.position @ turn.T + np.asarray(position, float),
-                               normal=patch.normal @ turn.T)
+    return dataclasses.replace(
+        patch, position=patch.position @ turn.T + np.asarray(position, float), normal=patch.normal @ turn.T
+    )
 
 
 def check_outside(patch: Patch, thing: Any, *, tolerance: float = 1e-4, name: str = "patch") -> None:
@@ -153,8 +162,10 @@ def check_outside(patch: Patch, thing: Any, *, tolerance: float = 1e-4, name: st
     worst = int(distance.argmin())
     if distance[worst] < -tolerance:
         column, row = divmod(worst, patch.grid[1])
-        raise AssetError(f"{name}: taxel column {column}, row {row} lies {-1e3 * distance[worst]:.2g} mm inside "
-                         f"its link ({np.sum(distance < -tolerance)} of {len(distance)} do)")
+        raise AssetError(
+            f"{name}: taxel column {column}, row {row} lies {-1e3 * distance[worst]:.2g} mm inside "
+            f"its link ({np.sum(distance < -tolerance)} of {len(distance)} do)"
+        )
 
 
 def check_hand(hand: Any, *, tolerance: float = 1.5e-3) -> None:
@@ -192,8 +203,16 @@ def write_layout(path: str | Path, patches: dict[str, Patch]) -> Path:
                 raise ConfigError(f"layout {name!r}: normals must be of length 1 and areas above 0")
             for index in range(len(patch.position)):
                 column, row = divmod(index, patch.grid[1])
-                out.writerow([name, column, row, *(f"{x:.6f}" for x in patch.position[index]),
-                              *(f"{x:.6f}" for x in patch.normal[index]), f"{patch.area[index]:.6g}"])
+                out.writerow(
+                    [
+                        name,
+                        column,
+                        row,
+                        *(f"{x:.6f}" for x in patch.position[index]),
+                        *(f"{x:.6f}" for x in patch.normal[index]),
+                        f"{patch.area[index]:.6g}",
+                    ]
+                )
     return path
 
 
@@ -216,8 +235,10 @@ def read_layout(path: str | Path) -> dict[str, Patch]:
     except (OSError, KeyError, TypeError, ValueError) as error:
         raise AssetError(f"{path}: not a taxel layout ({error})") from None
     table = read_taxels(path, fingers, grid).astype(np.float64)
-    return {name: Patch(tuple(grid), rows[:, 0:3], rows[:, 3:6], rows[:, 6])
-            for name, rows in zip(fingers, table, strict=True)}
+    return {
+        name: Patch(tuple(grid), rows[:, 0:3], rows[:, 3:6], rows[:, 6])
+        for name, rows in zip(fingers, table, strict=True)
+    }
 
 
 def _direction(vector: Any) -> np.ndarray:

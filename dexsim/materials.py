@@ -87,5 +87,7 @@ def check_stiffness(c10: float, c01: float, max_compression: float) -> None:
     """
     limit = stable_compression(c10, c01)
     if limit <= max_compression:
-        raise ConfigError(f"Skin.c01 = {c01:g} Pa: with c10 = {c10:g} Pa the skin has no positive stiffness beyond "
-                          f"{limit:.0%} compression, max_compression is {max_compression:.0%}")
+        raise ConfigError(
+            f"Skin.c01 = {c01:g} Pa: with c10 = {c10:g} Pa the skin has no positive stiffness beyond "
+            f"{limit:.0%} compression, max_compression is {max_compression:.0%}"
+        )

@@ -106,8 +106,10 @@ def load_mesh(source: Any, *, scale: float = 1.0, name: str | None = None) -> Me
     vertices = vertices * scale
     size = float(np.ptp(vertices, axis=0).max())
     if not SMALLEST <= size <= LARGEST:
-        raise AssetError(f"{name}: {size:.3g} m across, expected {SMALLEST:g} to {LARGEST:g} m; coordinates are "
-                         "metres, pass scale=0.001 for a file in millimetres")
+        raise AssetError(
+            f"{name}: {size:.3g} m across, expected {SMALLEST:g} to {LARGEST:g} m; coordinates are "
+            "metres, pass scale=0.001 for a file in millimetres"
+        )
     vertices, faces = _merge(vertices, faces, 1e-7 * size)
     _check_closed(name, vertices, faces, size)
     return Mesh(name, vertices, faces)
@@ -162,8 +164,10 @@ def check_sign(mesh: Mesh, count: int = 400) -> None:
         raise AssetError(f"{mesh.name}: cannot be signed: no interior point found in {len(points)}")
     wrong = clear & ((inside != (distance < 0)) | (np.abs(winding - inside) > 0.1))
     if np.any(wrong):
-        raise AssetError(f"{mesh.name}: cannot be signed: inside and outside disagree at {wrong.sum()} of "
-                         f"{len(points)} random points; the surface cuts through itself or a part is inside out")
+        raise AssetError(
+            f"{mesh.name}: cannot be signed: inside and outside disagree at {wrong.sum()} of "
+            f"{len(points)} random points; the surface cuts through itself or a part is inside out"
+        )
 
 
 def sample_surface(mesh: Mesh, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -199,8 +203,9 @@ def _read(source: Any) -> tuple[np.ndarray, np.ndarray, str]:
         vertices, faces = source.vertices, source.faces
     vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces)
     if vertices.ndim != 2 or vertices.shape[1:] != (3,) or (faces.size and (faces.ndim != 2 or faces.shape[1] != 3)):
-        raise AssetError(f"{name}: expected vertices [V, 3] and triangles [T, 3], found {vertices.shape} "
-                         f"and {faces.shape}")
+        raise AssetError(
+            f"{name}: expected vertices [V, 3] and triangles [T, 3], found {vertices.shape} and {faces.shape}"
+        )
     return vertices, faces.astype(np.int64), name
 
 
@@ -227,8 +232,10 @@ def _check_closed(name: str, vertices: np.ndarray, faces: np.ndarray, size: floa
     balance = np.zeros(len(count), np.int64)
     np.add.at(balance, which.reshape(-1), np.where(edge[:, 0] == low, 1, -1))
     if np.any(balance):
-        raise AssetError(f"{name}: normals point both ways, {np.sum(balance != 0)} edges join triangles of opposite "
-                         "winding; trimesh.repair.fix_winding makes them agree")
+        raise AssetError(
+            f"{name}: normals point both ways, {np.sum(balance != 0)} edges join triangles of opposite "
+            "winding; trimesh.repair.fix_winding makes them agree"
+        )
     volume = _volume(vertices[faces])
     if abs(volume) < 1e-6 * size**3:
         raise AssetError(f"{name}: encloses no volume ({volume:.3g} m^3 for a size of {size:.3g} m)")

@@ -47,8 +47,13 @@ class Boxes:
     def shape(self) -> sdf.Shape:
         """The union, for distances."""
         count = len(self.size)
-        return sdf.Shape(("box",) * count, jnp.asarray(self.size), jnp.asarray(self.position),
-                         rotations.quat_to_matrix(jnp.asarray(self.quat)), jnp.ones(count, bool))
+        return sdf.Shape(
+            ("box",) * count,
+            jnp.asarray(self.size),
+            jnp.asarray(self.position),
+            rotations.quat_to_matrix(jnp.asarray(self.quat)),
+            jnp.ones(count, bool),
+        )
 
 
 def fit_boxes(mesh: meshes.Mesh, parts: int, *, frames: Sequence[np.ndarray] = (), cache: bool = True) -> Boxes:
@@ -70,16 +75,19 @@ def fit_boxes(mesh: meshes.Mesh, parts: int, *, frames: Sequence[np.ndarray] = (
         boxes = _fit(mesh, parts, frames)
         if cache:
             buffer = io.BytesIO()
-            np.savez(buffer, size=boxes.size, position=boxes.position, quat=boxes.quat,
-                     deviation=np.array(boxes.deviation))
+            np.savez(
+                buffer, size=boxes.size, position=boxes.position, quat=boxes.quat, deviation=np.array(boxes.deviation)
+            )
             with contextlib.suppress(OSError):
                 write_whole(path, [buffer.getbuffer()])
     extent = float(np.ptp(mesh.vertices, axis=0).max())
     if any(off > share * extent for off, share in zip(boxes.deviation, _WORST, strict=True)):
         mean, most = (1e3 * off for off in boxes.deviation)
-        raise AssetError(f"{mesh.name}: {len(boxes.size)} boxes do not follow its surface, {mean:.2g} mm off on "
-                         f"average, {most:.2g} mm at worst, of {1e3 * extent:.3g} mm; allow more "
-                         "(ObjectConfig.mesh_parts)")
+        raise AssetError(
+            f"{mesh.name}: {len(boxes.size)} boxes do not follow its surface, {mean:.2g} mm off on "
+            f"average, {most:.2g} mm at worst, of {1e3 * extent:.3g} mm; allow more "
+            "(ObjectConfig.mesh_parts)"
+        )
     return boxes
 
 
@@ -96,8 +104,12 @@ def _fit(mesh: meshes.Mesh, parts: int, frames: Sequence[np.ndarray]) -> Boxes:
     rng = np.random.default_rng(0)
     extent = float(np.ptp(mesh.vertices, axis=0).max())
     skin, normal, _ = meshes.sample_surface(mesh, 3000, rng)
-    points = np.concatenate([skin + rng.normal(0, 0.03 * extent, (3000, 1)) * normal,
-                             rng.uniform(*(mesh.bounds + [[-0.03 * extent], [0.03 * extent]]), (1500, 3))])
+    points = np.concatenate(
+        [
+            skin + rng.normal(0, 0.03 * extent, (3000, 1)) * normal,
+            rng.uniform(*(mesh.bounds + [[-0.03 * extent], [0.03 * extent]]), (1500, 3)),
+        ]
+    )
     distance, _ = meshes.signed_distance(mesh, points)
     candidates = []
     for frame in frames:
@@ -105,8 +117,10 @@ def _fit(mesh: meshes.Mesh, parts: int, frames: Sequence[np.ndarray]) -> Boxes:
         refined = _refine(start, jnp.asarray(points, jnp.float32), jnp.asarray(distance, jnp.float32), extent)
         candidates += [_boxes(mesh, found, rng) for found in (start, refined)]
     # Among fits that are as good, the one with fewer boxes.
-    return min(candidates, key=lambda boxes: (round(boxes.deviation[0] / (_ALIKE * extent)), len(boxes.size),
-                                              boxes.deviation[0]))
+    return min(
+        candidates,
+        key=lambda boxes: (round(boxes.deviation[0] / (_ALIKE * extent)), len(boxes.size), boxes.deviation[0]),
+    )
 
 
 def _start(mesh: meshes.Mesh, frame: np.ndarray, parts: int, rng: np.random.Generator) -> dict[str, jax.Array]:
@@ -114,8 +128,11 @@ def _start(mesh: meshes.Mesh, frame: np.ndarray, parts: int, rng: np.random.Gene
     low, high = _grow(meshes.Mesh(mesh.name, mesh.vertices @ frame, mesh.faces), parts, rng)
     quat = np.empty(4)
     mujoco.mju_mat2Quat(quat, np.ascontiguousarray(frame, np.float64).ravel())
-    values = {"position": (low + high) / 2 @ frame.T, "size": np.log((high - low) / 2),
-              "quat": np.tile(quat, (len(low), 1))}
+    values = {
+        "position": (low + high) / 2 @ frame.T,
+        "size": np.log((high - low) / 2),
+        "quat": np.tile(quat, (len(low), 1)),
+    }
     return {name: jnp.asarray(value, jnp.float32) for name, value in values.items()}
 
 
@@ -173,14 +190,20 @@ def _grow_one(inside: np.ndarray, seed: np.ndarray, rng: np.random.Generator) ->
 
 def _union(params: dict[str, jax.Array], points: jax.Array) -> jax.Array:
     quat = params["quat"] / jnp.linalg.norm(params["quat"], axis=-1, keepdims=True)
-    return jnp.min(jax.vmap(lambda position, size, quat: sdf.box(
-        sdf.to_local(points, position, rotations.quat_to_matrix(quat)), jnp.exp(size)))(
-            params["position"], params["size"], quat), 0)
+    return jnp.min(
+        jax.vmap(
+            lambda position, size, quat: sdf.box(
+                sdf.to_local(points, position, rotations.quat_to_matrix(quat)), jnp.exp(size)
+            )
+        )(params["position"], params["size"], quat),
+        0,
+    )
 
 
 @jax.jit
-def _refine(params: dict[str, jax.Array], points: jax.Array, distance: jax.Array,
-            extent: jax.Array) -> dict[str, jax.Array]:
+def _refine(
+    params: dict[str, jax.Array], points: jax.Array, distance: jax.Array, extent: jax.Array
+) -> dict[str, jax.Array]:
     """Adam on the difference of the two distances, which count up to 8 % of the size from the surface."""
     band = 0.08 * extent
 
@@ -196,8 +219,11 @@ def _refine(params: dict[str, jax.Array], points: jax.Array, distance: jax.Array
         first = jax.tree.map(lambda m, g: 0.9 * m + 0.1 * g, first, slope)
         second = jax.tree.map(lambda v, g: 0.99 * v + 0.01 * g * g, second, slope)
         fade, at = 1 - index / _STEPS, index + 1.0
-        params = {name: params[name] - fade * pace[name] * (first[name] / (1 - 0.9**at)) / (
-            jnp.sqrt(second[name] / (1 - 0.99**at)) + 1e-12) for name in params}
+        params = {
+            name: params[name]
+            - fade * pace[name] * (first[name] / (1 - 0.9**at)) / (jnp.sqrt(second[name] / (1 - 0.99**at)) + 1e-12)
+            for name in params
+        }
         return (params, first, second), None
 
     zero = jax.tree.map(jnp.zeros_like, params)
@@ -209,8 +235,11 @@ def _boxes(mesh: meshes.Mesh, params: dict[str, jax.Array], rng: np.random.Gener
     quat /= np.linalg.norm(quat, axis=1, keepdims=True)
     size, position = np.exp(np.asarray(params["size"], np.float64)), np.asarray(params["position"], np.float64)
     boxes = Boxes(size.astype(np.float32), position.astype(np.float32), quat.astype(np.float32), (0.0, 0.0))
-    there = np.abs(np.asarray(sdf.signed_distance(
-        jnp.asarray(meshes.sample_surface(mesh, 2000, rng)[0], jnp.float32), boxes.shape())))
+    there = np.abs(
+        np.asarray(
+            sdf.signed_distance(jnp.asarray(meshes.sample_surface(mesh, 2000, rng)[0], jnp.float32), boxes.shape())
+        )
+    )
     back = np.abs(meshes.signed_distance(mesh, _on_surface(boxes, 2000, rng))[0])
     both = np.concatenate([there, back])
     return dataclasses.replace(boxes, deviation=(float(both.mean()), float(np.percentile(both, 99))))

@@ -97,6 +97,7 @@ def _closest(points: jax.Array, corners: jax.Array) -> tuple[jax.Array, jax.Arra
 
 def _squared(point: jax.Array, corners: jax.Array) -> jax.Array:
     """Squared distance [...] of points [..., 3] from triangles [..., 3, 3]: the least of face and edges."""
+
     def dot(x, y):
         return x[..., 0] * y[..., 0] + x[..., 1] * y[..., 1] + x[..., 2] * y[..., 2]
 
@@ -121,6 +122,7 @@ def _squared(point: jax.Array, corners: jax.Array) -> jax.Array:
 
 def _barycentric(p: np.ndarray, a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
     """Weights [..., 3] of a, b, c at the point of the triangle nearest to p (Ericson 2005, 5.1.5)."""
+
     def dot(x, y):
         return np.einsum("...d,...d->...", x, y)
 

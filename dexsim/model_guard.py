@@ -13,8 +13,10 @@ import numpy as np
 from dexsim.errors import AssetError
 
 _UNSUPPORTED_COLLISIONS = {
-    ("cylinder", "box"), ("cylinder", "mesh"),
-    ("ellipsoid", "box"), ("ellipsoid", "mesh"),
+    ("cylinder", "box"),
+    ("cylinder", "mesh"),
+    ("ellipsoid", "box"),
+    ("ellipsoid", "mesh"),
 }
 
 
@@ -39,15 +41,16 @@ def _ignored(model: mujoco.MjModel) -> list[str]:
         if rows.size:
             found.append(f"{feature} ({kind} {_names(model, kind, rows)})")
 
-    note("actuator", "actuator delay", (model.actuator_delay > 0)
-         | (model.actuator_history[:, 0] > 0))
+    note("actuator", "actuator delay", (model.actuator_delay > 0) | (model.actuator_history[:, 0] > 0))
     note("actuator", "actuator armature", model.actuator_armature != 0)
-    note("actuator", "actuator damping", (model.actuator_damping != 0)
-         | _any_row(model.actuator_dampingpoly))
+    note("actuator", "actuator damping", (model.actuator_damping != 0) | _any_row(model.actuator_dampingpoly))
     for kind, value in (("dcmotor", mujoco.mjtDyn.mjDYN_DCMOTOR), ("pid", mujoco.mjtDyn.mjDYN_PID)):
         note("actuator", f"{kind} actuator", model.actuator_dyntype == value)
-    note("sensor", "sensor delay or interval", (model.sensor_delay > 0)
-         | (model.sensor_history[:, 0] > 0) | _any_row(model.sensor_interval))
+    note(
+        "sensor",
+        "sensor delay or interval",
+        (model.sensor_delay > 0) | (model.sensor_history[:, 0] > 0) | _any_row(model.sensor_interval),
+    )
     note("sensor", "tactile sensor", model.sensor_type == mujoco.mjtSensor.mjSENS_TACTILE)
     note("sensor", "plugin sensor", model.sensor_type == mujoco.mjtSensor.mjSENS_PLUGIN)
     note("joint", "polynomial joint stiffness", _any_row(model.jnt_stiffnesspoly))
@@ -72,11 +75,12 @@ def _lacking_jax(model: mujoco.MjModel) -> list[str]:
     found = []
     contact = model.sensor_type == mujoco.mjtSensor.mjSENS_CONTACT
     body_like = (mujoco.mjtObj.mjOBJ_BODY, mujoco.mjtObj.mjOBJ_XBODY, mujoco.mjtObj.mjOBJ_SITE)
-    matched = contact & (np.isin(model.sensor_objtype, body_like)
-                         | np.isin(model.sensor_reftype, body_like))
+    matched = contact & (np.isin(model.sensor_objtype, body_like) | np.isin(model.sensor_reftype, body_like))
     net = contact & (model.sensor_intprm[:, 1] == 3)
-    for feature, mask in (("contact sensor that matches bodies", matched),
-                          ("contact sensor with reduce=netforce", net)):
+    for feature, mask in (
+        ("contact sensor that matches bodies", matched),
+        ("contact sensor with reduce=netforce", net),
+    ):
         rows = np.flatnonzero(mask)
         if rows.size:
             found.append(f"{feature} (sensor {_names(model, 'sensor', rows)})")
@@ -104,4 +108,5 @@ def _any_row(values: np.ndarray) -> np.ndarray:
 def _colliding_kinds(model: mujoco.MjModel) -> set[tuple[str, str]]:
     def kind(geom: int) -> str:
         return mujoco.mjtGeom(model.geom_type[geom]).name.removeprefix("mjGEOM_").lower()
+
     return {(kind(a), kind(b)) for a, b in zip(model.pair_geom1, model.pair_geom2, strict=True)}

@@ -34,8 +34,7 @@ class Motor:
     limit: jax.Array | float = jnp.inf  # A, largest current that the driver gives or reports
 
 
-def motor_current(motor: Motor, torque: jax.Array, velocity: jax.Array,
-                  position: jax.Array | float = 0.0) -> jax.Array:
+def motor_current(motor: Motor, torque: jax.Array, velocity: jax.Array, position: jax.Array | float = 0.0) -> jax.Array:
     """Current, A, of a motor that holds `torque` Nm at the joint.
 
     Args:
@@ -46,8 +45,7 @@ def motor_current(motor: Motor, torque: jax.Array, velocity: jax.Array,
     """
     way = jnp.sign(velocity)
     power = torque * way
-    loss = jnp.where(power > 0, 1.0 / motor.efficiency,
-                     jnp.where(power < 0, motor.back_efficiency, 1.0))
+    loss = jnp.where(power > 0, 1.0 / motor.efficiency, jnp.where(power < 0, motor.back_efficiency, 1.0))
     ripple = 1.0 + motor.ripple * jnp.sin(motor.ripple_count * position + motor.ripple_phase)
     return torque / (motor.torque_constant * ripple) * loss + motor.no_load_current * way
 
@@ -61,20 +59,30 @@ def read_current(key: jax.Array, motor: Motor, current: jax.Array) -> jax.Array:
     return jnp.clip(jnp.where(step > 0, rounded, reading), -motor.limit, motor.limit)
 
 
-def torque_from_current(motor: Motor, current: jax.Array, velocity: jax.Array,
-                        position: jax.Array | float = 0.0) -> jax.Array:
+def torque_from_current(
+    motor: Motor, current: jax.Array, velocity: jax.Array, position: jax.Array | float = 0.0
+) -> jax.Array:
     """Torque on the joint, Nm, from the true current: the inverse of `motor_current`."""
     way = jnp.sign(velocity)
     ideal = current - motor.no_load_current * way
-    loss = jnp.where(ideal * way > 0, motor.efficiency,
-                     jnp.where(ideal * way < 0, 1.0 / motor.back_efficiency, 1.0))
+    loss = jnp.where(ideal * way > 0, motor.efficiency, jnp.where(ideal * way < 0, 1.0 / motor.back_efficiency, 1.0))
     ripple = 1.0 + motor.ripple * jnp.sin(motor.ripple_count * position + motor.ripple_phase)
     return ideal * motor.torque_constant * ripple * loss
 
 
-def press(motor: Motor, key: jax.Array, *, lever: float, peak: float = 8.0, cycles: int = 3,
-          samples: int = 600, travel: float = 0.05, force_noise: float = 0.0,
-          force_resolution: float = 0.0, force_limit: float = np.inf) -> Press:
+def press(
+    motor: Motor,
+    key: jax.Array,
+    *,
+    lever: float,
+    peak: float = 8.0,
+    cycles: int = 3,
+    samples: int = 600,
+    travel: float = 0.05,
+    force_noise: float = 0.0,
+    force_resolution: float = 0.0,
+    force_limit: float = np.inf,
+) -> Press:
     """Press one joint's fingertip slowly, up and down: what a recording of the hand looks like.
 
     Args:
@@ -90,9 +98,9 @@ def press(motor: Motor, key: jax.Array, *, lever: float, peak: float = 8.0, cycl
     share = 1.0 - np.abs(2.0 * phase - 1.0)
     force, way = peak * share, np.where(phase < 0.5, 1.0, -1.0)
     current_key, force_key = jax.random.split(key)
-    current = read_current(current_key, motor,
-                           motor_current(motor, lever * force, way * np.sign(lever),
-                                         travel * share * np.sign(lever)))
+    current = read_current(
+        current_key, motor, motor_current(motor, lever * force, way * np.sign(lever), travel * share * np.sign(lever))
+    )
     reading = force + force_noise * np.asarray(jax.random.normal(force_key, force.shape))
     if force_resolution > 0:
         reading = np.round(reading / force_resolution) * force_resolution

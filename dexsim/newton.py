@@ -72,8 +72,7 @@ def _hessian(rows: Rows, cone: _Cone) -> jax.Array:
     mu, length = rows.scale[:, 0], cone.length
     unit = cone.slide / length[:, None]
     across = mu * cone.normal / length
-    block = (across[:, None, None] * unit[:, :, None] * unit[:, None, :]
-             + (mu**2 - across)[:, None, None] * jnp.eye(2))
+    block = across[:, None, None] * unit[:, :, None] * unit[:, None, :] + (mu**2 - across)[:, None, None] * jnp.eye(2)
     edge = -mu[:, None] * unit
     top = jnp.concatenate([jnp.ones_like(mu)[:, None], edge], -1)[:, None, :]
     full = jnp.concatenate([top, jnp.concatenate([edge[:, :, None], block], -1)], 1)
@@ -86,13 +85,17 @@ def _cost(rows: Rows, mass: jax.Array, force: jax.Array, acceleration: jax.Array
     miss = jnp.sum(rows.jacobian * acceleration, -1) - rows.wanted
     cone = _cone(rows, miss)
     limit = jnp.minimum(rows.limit_side * acceleration - rows.limit_wanted, 0.0)
-    return 0.5 * (jnp.dot(acceleration, mass @ acceleration - 2 * force)
-                  + jnp.sum(rows.limit_weight * limit**2) + jnp.sum(cone.stiff * cone.short**2)
-                  + jnp.sum(jnp.where(cone.bottom, jnp.sum(rows.weight * miss**2, -1), 0.0)))
+    return 0.5 * (
+        jnp.dot(acceleration, mass @ acceleration - 2 * force)
+        + jnp.sum(rows.limit_weight * limit**2)
+        + jnp.sum(cone.stiff * cone.short**2)
+        + jnp.sum(jnp.where(cone.bottom, jnp.sum(rows.weight * miss**2, -1), 0.0))
+    )
 
 
-def solve(rows: Rows, mass: jax.Array, force: jax.Array, guess: jax.Array, *, iterations: int,
-          line_search: int) -> jax.Array:
+def solve(
+    rows: Rows, mass: jax.Array, force: jax.Array, guess: jax.Array, *, iterations: int, line_search: int
+) -> jax.Array:
     """The acceleration [V] under contacts and limits.
 
     Args:
@@ -113,8 +116,7 @@ def solve(rows: Rows, mass: jax.Array, force: jax.Array, guess: jax.Array, *, it
         push = _force(rows, miss, cone).reshape(-1) @ flat - pressed * limit * rows.limit_side
         unbalanced = mass @ now - force
         blocks = jnp.sum(_hessian(rows, cone)[:, :, :, None] * rows.jacobian[:, None, :, :], 2)
-        curvature = (mass + flat.T @ blocks.reshape(flat.shape)
-                     + jnp.diag(pressed * rows.limit_side**2))
+        curvature = mass + flat.T @ blocks.reshape(flat.shape) + jnp.diag(pressed * rows.limit_side**2)
         step = -_solve_positive(curvature, unbalanced - push)
         moved = (flat @ step).reshape(rows.wanted.shape)
         line = (jnp.dot(step, unbalanced), jnp.dot(step, mass @ step))
@@ -123,8 +125,15 @@ def solve(rows: Rows, mass: jax.Array, force: jax.Array, guess: jax.Array, *, it
     return jax.lax.fori_loop(0, iterations, improve, jnp.where(better, guess, free))
 
 
-def _search(rows: Rows, miss: jax.Array, moved: jax.Array, limit: jax.Array, limit_moved: jax.Array,
-            line: tuple[jax.Array, jax.Array], steps: int) -> jax.Array:
+def _search(
+    rows: Rows,
+    miss: jax.Array,
+    moved: jax.Array,
+    limit: jax.Array,
+    limit_moved: jax.Array,
+    line: tuple[jax.Array, jax.Array],
+    steps: int,
+) -> jax.Array:
     """How far [] along a Newton step the cost is least: Newton's method on its slope, which only rises."""
     mu, v = rows.scale[:, 0], moved * rows.scale
 
@@ -136,10 +145,19 @@ def _search(rows: Rows, miss: jax.Array, moved: jax.Array, limit: jax.Array, lim
         rate = v[:, 0] - mu * along
         stuck = jnp.where(cone.bottom[:, None], rows.weight * moved, 0.0)
         limited = jnp.where(limit + here * limit_moved < 0, rows.limit_weight * limit_moved, 0.0)
-        slope = (line[0] + here * line[1] + jnp.sum(stuck * (miss + here * moved))
-                 + jnp.sum(limited * (limit + here * limit_moved)) + jnp.sum(cone.stiff * cone.short * rate))
-        curve = (line[1] + jnp.sum(stuck * moved) + jnp.sum(limited * limit_moved)
-                 + jnp.sum(cone.stiff * (rate**2 - cone.short * mu * bend)))
+        slope = (
+            line[0]
+            + here * line[1]
+            + jnp.sum(stuck * (miss + here * moved))
+            + jnp.sum(limited * (limit + here * limit_moved))
+            + jnp.sum(cone.stiff * cone.short * rate)
+        )
+        curve = (
+            line[1]
+            + jnp.sum(stuck * moved)
+            + jnp.sum(limited * limit_moved)
+            + jnp.sum(cone.stiff * (rate**2 - cone.short * mu * bend))
+        )
         low, high = jnp.where(slope < 0, here, low), jnp.where(slope < 0, high, here)
         newton = here - slope / jnp.maximum(curve, _TINY)
         return jnp.where((newton >= low) & (newton <= high), newton, 0.5 * (low + high)), low, high

@@ -116,8 +116,13 @@ class ObjectConfig:
         radius = max(self.cylinder_radius[1], self.sphere_radius[1], self.neck_radius[1])
         half = max(self.cylinder_half[1], self.neck_half[1])
         body = max(self.composition_scale, 1.0)  # of the box or cylinder in a composition
-        return np.array([[body * self.box_half[1]] * 3, [radius, half, 0.0],
-                         [body * self.cylinder_radius[1], body * self.cylinder_half[1], 0.0]])
+        return np.array(
+            [
+                [body * self.box_half[1]] * 3,
+                [radius, half, 0.0],
+                [body * self.cylinder_radius[1], body * self.cylinder_half[1], 0.0],
+            ]
+        )
 
 
 def load_mesh_object(config: ObjectConfig) -> object_mesh.MeshObject:

@@ -22,26 +22,39 @@ from dexsim.ranges import draw_corner, uniform
 
 def bounding_radius(size: jax.Array, kinds: tuple[str, ...] = SLOTS) -> jax.Array:
     """Radius [K] of the sphere round each slot's primitive, for the broad phase."""
-    radius = {"sphere": lambda s: s[0], "box": lambda s: jnp.sqrt(jnp.sum(s * s)),
-              "capsule": lambda s: s[0] + s[1], "cylinder": lambda s: jnp.hypot(s[0], s[1]),
-              "ellipsoid": jnp.max}
+    radius = {
+        "sphere": lambda s: s[0],
+        "box": lambda s: jnp.sqrt(jnp.sum(s * s)),
+        "capsule": lambda s: s[0] + s[1],
+        "cylinder": lambda s: jnp.hypot(s[0], s[1]),
+        "ellipsoid": jnp.max,
+    }
     return jnp.stack([radius[kind](size[k]) for k, kind in enumerate(kinds)])
 
 
-def extent(size: jax.Array, position: jax.Array, active: jax.Array, direction: jax.Array,
-           kinds: tuple[str, ...] = SLOTS, quat: jax.Array | None = None) -> jax.Array:
+def extent(
+    size: jax.Array,
+    position: jax.Array,
+    active: jax.Array,
+    direction: jax.Array,
+    kinds: tuple[str, ...] = SLOTS,
+    quat: jax.Array | None = None,
+) -> jax.Array:
     """How far [] m the object reaches along a unit `direction` [3] of its own frame.
 
     The other arguments are those of `ObjectParams`.
     """
     reach = []
     for k, kind in enumerate(kinds):
-        local = direction if quat is None else rotations.rotate_inverse(
-            rotations.quat_to_matrix(quat[k]), direction)
+        local = direction if quat is None else rotations.rotate_inverse(rotations.quat_to_matrix(quat[k]), direction)
         along, (a, b, c) = jnp.abs(local), size[k]
-        reach.append({"box": along[0] * a + along[1] * b + along[2] * c,
-                      "capsule": a + b * along[2],
-                      "cylinder": a * jnp.hypot(along[0], along[1]) + b * along[2]}[kind])
+        reach.append(
+            {
+                "box": along[0] * a + along[1] * b + along[2] * c,
+                "capsule": a + b * along[2],
+                "cylinder": a * jnp.hypot(along[0], along[1]) + b * along[2],
+            }[kind]
+        )
     reach = jnp.stack(reach) + jnp.sum(position * direction, -1)
     return jnp.max(jnp.where(active, reach, -jnp.inf))
 
@@ -77,8 +90,7 @@ class ObjectParams:
         return sdf.Shape(self.kinds, self.size, self.position, rotation, self.active)
 
 
-def sample_object(key: jax.Array, config: ObjectConfig,
-                  shape_index: jax.Array | None = None) -> ObjectParams:
+def sample_object(key: jax.Array, config: ObjectConfig, shape_index: jax.Array | None = None) -> ObjectParams:
     """Draw one object, of a kind in `config.shapes` or of the given one (index into SHAPES), or the mesh.
 
     Raises:
@@ -96,9 +108,18 @@ def sample_object(key: jax.Array, config: ObjectConfig,
     mass = uniform(keys[2], config.mass, corner)
     scale = uniform(keys[3], config.inertia_scale, corner) * mass / density_mass
     com = config.com_offset * uniform(keys[4], (-1.0, 1.0), corner, (3,))
-    return ObjectParams(shape_index.astype(jnp.int32), size, position, active, mass, inertia * scale, com,
-                        uniform(keys[5], config.friction, corner), _sample_contact(keys, config, corner),
-                        bare_friction=_sample_bare_friction(keys, config, corner))
+    return ObjectParams(
+        shape_index.astype(jnp.int32),
+        size,
+        position,
+        active,
+        mass,
+        inertia * scale,
+        com,
+        uniform(keys[5], config.friction, corner),
+        _sample_contact(keys, config, corner),
+        bare_friction=_sample_bare_friction(keys, config, corner),
+    )
 
 
 def _sample_mesh(keys: jax.Array, config: ObjectConfig, corner: jax.Array | None) -> ObjectParams:
@@ -108,9 +129,19 @@ def _sample_mesh(keys: jax.Array, config: ObjectConfig, corner: jax.Array | None
     inertia = mass * factor**2 * uniform(keys[3], config.inertia_scale, corner) * jnp.asarray(thing.inertia)
     com = config.com_offset * uniform(keys[4], (-1.0, 1.0), corner, (3,))
     return ObjectParams(
-        jnp.int32(KINDS.index("mesh")), size, position, jnp.ones(len(size), bool), mass, inertia, com,
-        uniform(keys[5], config.friction, corner), _sample_contact(keys, config, corner), quat,
-        _sample_bare_friction(keys, config, corner), thing.kinds)
+        jnp.int32(KINDS.index("mesh")),
+        size,
+        position,
+        jnp.ones(len(size), bool),
+        mass,
+        inertia,
+        com,
+        uniform(keys[5], config.friction, corner),
+        _sample_contact(keys, config, corner),
+        quat,
+        _sample_bare_friction(keys, config, corner),
+        thing.kinds,
+    )
 
 
 def _sample_bare_friction(keys: jax.Array, config: ObjectConfig, corner: jax.Array | None) -> jax.Array:
@@ -118,8 +149,9 @@ def _sample_bare_friction(keys: jax.Array, config: ObjectConfig, corner: jax.Arr
 
 
 def _sample_contact(keys: jax.Array, config: ObjectConfig, corner: jax.Array | None) -> jax.Array:
-    return jnp.stack([uniform(keys[6], config.stiffness, corner),
-                      damping_ratio(uniform(keys[7], config.restitution, corner))])
+    return jnp.stack(
+        [uniform(keys[6], config.stiffness, corner), damping_ratio(uniform(keys[7], config.restitution, corner))]
+    )
 
 
 def plain_inertia(target: ObjectParams, config: ObjectConfig | None = None) -> jax.Array:
@@ -131,8 +163,7 @@ def plain_inertia(target: ObjectParams, config: ObjectConfig | None = None) -> j
     return inertia / mass
 
 
-def narrow(target: ObjectParams, config: ObjectConfig, plain: jax.Array,
-           scale: jax.Array) -> ObjectParams:
+def narrow(target: ObjectParams, config: ObjectConfig, plain: jax.Array, scale: jax.Array) -> ObjectParams:
     """A drawn object with its bulk nearer to nominal: mass, inertia, centre of mass, friction, contact.
 
     Its size stays: start states were chosen for it.
@@ -152,10 +183,14 @@ def narrow(target: ObjectParams, config: ObjectConfig, plain: jax.Array,
     bounce = damping_ratio(jnp.asarray(middle(config, "restitution")))
     contact = jnp.stack([toward("stiffness", target.contact[0]), bounce + scale * (target.contact[1] - bounce)])
     return dataclasses.replace(
-        target, mass=mass, inertia=mass * plain * toward("inertia_scale", drawn), com=scale * target.com,
-        friction=toward("friction", target.friction), contact=contact,
-        bare_friction=(None if target.bare_friction is None
-                       else toward("bare_friction", target.bare_friction)))
+        target,
+        mass=mass,
+        inertia=mass * plain * toward("inertia_scale", drawn),
+        com=scale * target.com,
+        friction=toward("friction", target.friction),
+        contact=contact,
+        bare_friction=(None if target.bare_friction is None else toward("bare_friction", target.bare_friction)),
+    )
 
 
 def restitution(ratio: np.ndarray) -> np.ndarray:
@@ -167,8 +202,9 @@ def restitution(ratio: np.ndarray) -> np.ndarray:
     """
     ratio = np.asarray(ratio, float)
     root = np.maximum(np.sqrt(np.abs(1 - ratio**2)), 1e-6)
-    angle = np.where(ratio < 1, np.arctan2(root, ratio),
-                     np.arctanh(np.minimum(root / np.maximum(ratio, 1.0), 1 - 1e-12)))
+    angle = np.where(
+        ratio < 1, np.arctan2(root, ratio), np.arctanh(np.minimum(root / np.maximum(ratio, 1.0), 1 - 1e-12))
+    )
     return np.exp(-2 * ratio / root * angle)
 
 
@@ -182,12 +218,14 @@ def damping_ratio(restitution: jax.Array) -> jax.Array:
 
     MuJoCo has no restitution parameter; its contacts push but do not pull.
     """
-    return jnp.interp(restitution, jnp.asarray(_RESTITUTIONS[::-1], jnp.float32),
-                      jnp.asarray(_RATIOS[::-1], jnp.float32))
+    return jnp.interp(
+        restitution, jnp.asarray(_RESTITUTIONS[::-1], jnp.float32), jnp.asarray(_RATIOS[::-1], jnp.float32)
+    )
 
 
-def _sample_slots(key: jax.Array, shape_index: jax.Array, config: ObjectConfig,
-                  corner: jax.Array | None) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _sample_slots(
+    key: jax.Array, shape_index: jax.Array, config: ObjectConfig, corner: jax.Array | None
+) -> tuple[jax.Array, jax.Array, jax.Array]:
     keys = jax.random.split(key, 7)
     is_sphere, is_box, is_cylinder, is_capsule, is_union = (shape_index == i for i in range(5))
     part = jnp.where(is_union, config.composition_scale, 1.0)
@@ -200,20 +238,22 @@ def _sample_slots(key: jax.Array, shape_index: jax.Array, config: ObjectConfig,
 
     # A composition is a box or a cylinder with a capsule jutting out along its axis.
     body_half = jnp.where(box_body, half[2], length)
-    capsule = jnp.where(is_sphere, jnp.stack([ball, SHORT]),
-                        jnp.where(is_union, jnp.stack([neck, neck_half]),
-                                  jnp.stack([radius, length])))
+    capsule = jnp.where(
+        is_sphere,
+        jnp.stack([ball, SHORT]),
+        jnp.where(is_union, jnp.stack([neck, neck_half]), jnp.stack([radius, length])),
+    )
     zero = jnp.zeros(())
     size = jnp.stack([half, jnp.stack([*capsule, zero]), jnp.stack([radius, length, zero])])
-    active = jnp.stack([is_box | (is_union & box_body), is_sphere | is_capsule | is_union,
-                        is_cylinder | (is_union & ~box_body)])
+    active = jnp.stack(
+        [is_box | (is_union & box_body), is_sphere | is_capsule | is_union, is_cylinder | (is_union & ~box_body)]
+    )
     jut = jnp.where(is_union, body_half + neck_half, 0.0)
     position = jnp.zeros((3, 3)).at[1, 2].set(jut)
     return jnp.where(active[:, None], size, OFF), position, active
 
 
-def _mass_properties(size: jax.Array, position: jax.Array,
-                     active: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _mass_properties(size: jax.Array, position: jax.Array, active: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Mass, centre and inertia (about the centre) of the union at unit density.
 
     Overlaps count twice; the drawn mass and inertia scale absorb it.
@@ -222,19 +262,20 @@ def _mass_properties(size: jax.Array, position: jax.Array,
     box_mass = 8 * a * b * c
     box_inertia = box_mass / 3 * jnp.stack([b * b + c * c, a * a + c * c, a * a + b * b])
     tube, ball = 2 * jnp.pi * r * r * h, 4 / 3 * jnp.pi * r**3
-    side = (tube * (r * r / 4 + h * h / 3)
-            + ball * (2 / 5 * r * r + h * h + 3 / 4 * r * h))
+    side = tube * (r * r / 4 + h * h / 3) + ball * (2 / 5 * r * r + h * h + 3 / 4 * r * h)
     capsule_inertia = jnp.stack([side, side, tube * r * r / 2 + ball * 2 / 5 * r * r])
     cylinder_mass = 2 * jnp.pi * cr * cr * ch
     side = cylinder_mass * (cr * cr / 4 + ch * ch / 3)
     cylinder_inertia = jnp.stack([side, side, cylinder_mass * cr * cr / 2])
 
     mass = jnp.where(active, jnp.stack([box_mass, tube + ball, cylinder_mass]), 0.0)
-    inertia = jnp.where(active[:, None],
-                        jnp.stack([box_inertia, capsule_inertia, cylinder_inertia]), 0.0)
+    inertia = jnp.where(active[:, None], jnp.stack([box_inertia, capsule_inertia, cylinder_inertia]), 0.0)
     z = jnp.where(active, position[:, 2], 0.0)
     total = jnp.sum(mass)
     centre = jnp.sum(mass * z) / total
     shift = jnp.sum(mass * (z - centre) ** 2)
-    return (total, jnp.stack([jnp.zeros(()), jnp.zeros(()), centre]),
-            jnp.sum(inertia, 0) + shift * jnp.array([1.0, 1.0, 0.0]))
+    return (
+        total,
+        jnp.stack([jnp.zeros(()), jnp.zeros(()), centre]),
+        jnp.sum(inertia, 0) + shift * jnp.array([1.0, 1.0, 0.0]),
+    )

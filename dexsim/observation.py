@@ -65,10 +65,21 @@ class Field:
     scale: float | None = None
 
 
-MEASURED_FIELDS = ("joint_position", "joint_torque", "object_position", "object_velocity",
-                   "contact_force", "contact_centre", "tangential_force", "fingertip_position",
-                   "fingertip_rotation", "command", "last_action", "relative_orientation",
-                   "object_orientation")
+MEASURED_FIELDS = (
+    "joint_position",
+    "joint_torque",
+    "object_position",
+    "object_velocity",
+    "contact_force",
+    "contact_centre",
+    "tangential_force",
+    "fingertip_position",
+    "fingertip_rotation",
+    "command",
+    "last_action",
+    "relative_orientation",
+    "object_orientation",
+)
 """What follows from readings."""
 TRUE_FIELDS = ("fingertip_velocity", "joint_velocity", "object_spin")
 """What only a simulator knows."""
@@ -82,8 +93,7 @@ class ObservationConfig:
     """Contact centre weighted by taxel force, or the plain mean of the active taxels."""
     orientation: str = setting("6d", choices=("6d", "quaternion"))
     """Encoding of the relative target orientation."""
-    leave_out: tuple[str, ...] = setting((), choices=("contact_force", "contact_centre",
-                                                      "relative_orientation"))
+    leave_out: tuple[str, ...] = setting((), choices=("contact_force", "contact_centre", "relative_orientation"))
     """Observation fields that the actor goes without."""
     add: tuple[str, ...] = setting((), choices=(*MEASURED_FIELDS, *TRUE_FIELDS))
     """Measured fields beyond the task's own, for actor and critic; `tangential_force` turns on
@@ -110,6 +120,7 @@ class Features:
 
 def _tip_twist(hand: Hand, joint_position: jax.Array, joint_velocity: jax.Array) -> jax.Array:
     """Linear and angular velocity [F, 6] of the finger tips, m/s and rad/s in the palm frame."""
+
     def tips(joints: jax.Array) -> tuple[jax.Array, jax.Array]:
         pose = forward_kinematics(hand, joints)
         return pose.tip_position, pose.tip_rotation
@@ -128,8 +139,7 @@ def _encode(quat: jax.Array, encoding: str) -> jax.Array:
 
 def _relative_orientation(f: Features, encoding: str) -> jax.Array:
     """Rotation that takes the object to its goal, in the palm frame."""
-    relative = rotations.quat_multiply(f.readings.goal_quat,
-                                       rotations.quat_conjugate(f.readings.object_quat))
+    relative = rotations.quat_multiply(f.readings.goal_quat, rotations.quat_conjugate(f.readings.object_quat))
     return _encode(relative, encoding)
 
 
@@ -154,26 +164,65 @@ _ORIENTATIONS = {
     "object_orientation": lambda f, encoding: _encode(f.readings.object_quat, encoding),
 }
 
-GRASP = ("joint_position", "joint_torque", "object_position", "object_velocity",
-         "contact_force", "contact_centre", "fingertip_position", "command")
-ROTATE = ("joint_position", "relative_orientation", "last_action", "contact_centre",
-          "contact_force", "fingertip_position")
-ROTATE_CRITIC = (*ROTATE, "object_orientation", "fingertip_velocity", "fingertip_rotation",
-                 "joint_velocity", "object_velocity", "object_spin")
+GRASP = (
+    "joint_position",
+    "joint_torque",
+    "object_position",
+    "object_velocity",
+    "contact_force",
+    "contact_centre",
+    "fingertip_position",
+    "command",
+)
+ROTATE = (
+    "joint_position",
+    "relative_orientation",
+    "last_action",
+    "contact_centre",
+    "contact_force",
+    "fingertip_position",
+)
+ROTATE_CRITIC = (
+    *ROTATE,
+    "object_orientation",
+    "fingertip_velocity",
+    "fingertip_rotation",
+    "joint_velocity",
+    "object_velocity",
+    "object_spin",
+)
 
 
 def layout(hand: Hand, names: tuple[str, ...], config: ObservationConfig) -> tuple[Field, ...]:
     """Names, sizes and scales of an observation's fields, in order."""
     joints, fingers = hand.num_joints, hand.num_fingers
     angles = 4 if config.orientation == "quaternion" else 6
-    size = {"joint_position": joints, "joint_torque": joints, "object_position": 3,
-            "object_velocity": 3, "contact_force": fingers, "contact_centre": 3 * fingers,
-            "fingertip_position": 3 * fingers, "command": 1, "last_action": joints,
-            "relative_orientation": angles, "object_orientation": angles,
-            "fingertip_rotation": 6 * fingers, "fingertip_velocity": 6 * fingers,
-            "joint_velocity": joints, "object_spin": 3, "tangential_force": 3 * fingers}
-    scale = {"contact_force": 5.0, "contact_centre": 0.1, "command": 0.5, "joint_torque": 0.3,
-             "last_action": 1.0, "tangential_force": 2.0}
+    size = {
+        "joint_position": joints,
+        "joint_torque": joints,
+        "object_position": 3,
+        "object_velocity": 3,
+        "contact_force": fingers,
+        "contact_centre": 3 * fingers,
+        "fingertip_position": 3 * fingers,
+        "command": 1,
+        "last_action": joints,
+        "relative_orientation": angles,
+        "object_orientation": angles,
+        "fingertip_rotation": 6 * fingers,
+        "fingertip_velocity": 6 * fingers,
+        "joint_velocity": joints,
+        "object_spin": 3,
+        "tangential_force": 3 * fingers,
+    }
+    scale = {
+        "contact_force": 5.0,
+        "contact_centre": 0.1,
+        "command": 0.5,
+        "joint_torque": 0.3,
+        "last_action": 1.0,
+        "tangential_force": 2.0,
+    }
     return tuple(Field(name, size[name], scale.get(name)) for name in chosen(names, config))
 
 
@@ -191,14 +240,13 @@ def views(config: ObservationConfig) -> tuple[ObservationConfig, ObservationConf
     """
     true = [name for name in config.add if name in TRUE_FIELDS]
     if true:
-        raise ConfigError(f"ObservationConfig.add = {true[0]!r}: no sensor measures it; "
-                          "name it in add_critic")
-    return config, dataclasses.replace(
-        config, leave_out=(), add=(*config.add, *config.add_critic), add_critic=())
+        raise ConfigError(f"ObservationConfig.add = {true[0]!r}: no sensor measures it; name it in add_critic")
+    return config, dataclasses.replace(config, leave_out=(), add=(*config.add, *config.add_critic), add_critic=())
 
 
-def observe(hand: Hand, readings: Readings, names: tuple[str, ...],
-            config: ObservationConfig, motion: Motion | None = None) -> jax.Array:
+def observe(
+    hand: Hand, readings: Readings, names: tuple[str, ...], config: ObservationConfig, motion: Motion | None = None
+) -> jax.Array:
     """The observation vector: the only road from measurements to a policy.
 
     Args:
@@ -215,8 +263,14 @@ def observe(hand: Hand, readings: Readings, names: tuple[str, ...],
     pose = forward_kinematics(hand, readings.joint_position)
     force, centre = tactile.reduce_touch_links(readings.taxel_force, hand, pose, config.weighting)
     features = Features(
-        readings, pose.tip_position, force, centre, pose, motion,
-        lambda: _tip_twist(hand, readings.joint_position, motion.joint_velocity))
+        readings,
+        pose.tip_position,
+        force,
+        centre,
+        pose,
+        motion,
+        lambda: _tip_twist(hand, readings.joint_position, motion.joint_velocity),
+    )
     parts = []
     for name in chosen(names, config):
         if name in _ORIENTATIONS:

@@ -45,8 +45,9 @@ class SensorDraw:
     phase: jax.Array  # [] fraction of a sampling period
 
 
-def draw_sensor(key: jax.Array, config: OrientationSensor, scale: float, control_period: float,
-                corner: jax.Array | None = None) -> SensorDraw:
+def draw_sensor(
+    key: jax.Array, config: OrientationSensor, scale: float, control_period: float, corner: jax.Array | None = None
+) -> SensorDraw:
     """Draw one episode's sensor; `scale` 0 gives one without bias, drift and delay.
 
     Where `corner` [] is true, all three are at an end of their ranges (`dexsim.ranges`).
@@ -57,12 +58,21 @@ def draw_sensor(key: jax.Array, config: OrientationSensor, scale: float, control
         bias=scale * config.bias * uniform(keys[0], sides, corner, (3,)),
         drift=scale * config.drift * uniform(keys[1], sides, corner),
         delay=jnp.clip(scale * delay / control_period, 0.0, 1.0),
-        phase=jax.random.uniform(keys[3]))
+        phase=jax.random.uniform(keys[3]),
+    )
 
 
-def measure_orientation(key: jax.Array, config: OrientationSensor, draw: SensorDraw,
-                        tick: jax.Array, now: jax.Array, before: jax.Array, held: jax.Array,
-                        up: jax.Array, control_period: float) -> jax.Array:
+def measure_orientation(
+    key: jax.Array,
+    config: OrientationSensor,
+    draw: SensorDraw,
+    tick: jax.Array,
+    now: jax.Array,
+    before: jax.Array,
+    held: jax.Array,
+    up: jax.Array,
+    control_period: float,
+) -> jax.Array:
     """The orientation [4] that the host reads.
 
     Args:
@@ -81,6 +91,5 @@ def measure_orientation(key: jax.Array, config: OrientationSensor, draw: SensorD
     angle = jnp.sqrt(jnp.sum(error**2) + 1e-20)
     fresh = rotations.quat_multiply(rotations.axis_angle_to_quat(error / angle, angle), late)
     per_tick = config.rate * control_period
-    sampled = jnp.floor(tick * per_tick + draw.phase) > jnp.floor(
-        (tick - 1) * per_tick + draw.phase)
+    sampled = jnp.floor(tick * per_tick + draw.phase) > jnp.floor((tick - 1) * per_tick + draw.phase)
     return jnp.where(sampled, fresh, held)

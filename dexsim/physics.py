@@ -53,10 +53,19 @@ def choose_backend(backend: str) -> str:
 class Physics:
     """The compiled scene. Immutable; its methods are pure and written for one environment."""
 
-    def __init__(self, hand: Hand, slots: tuple[str, ...], largest: np.ndarray,
-                 config: PhysicsConfig, *, gravity: tuple[float, float, float],
-                 backend: str = "auto", num_envs: int = 1, skin: tactile.Skin | None = None,
-                 rotor_share: float = 0.0):
+    def __init__(
+        self,
+        hand: Hand,
+        slots: tuple[str, ...],
+        largest: np.ndarray,
+        config: PhysicsConfig,
+        *,
+        gravity: tuple[float, float, float],
+        backend: str = "auto",
+        num_envs: int = 1,
+        skin: tactile.Skin | None = None,
+        rotor_share: float = 0.0,
+    ):
         """Compile.
 
         Args:
@@ -83,8 +92,7 @@ class Physics:
         # Candidates of the broad phase need more room than contacts: up to 15 a world were seen
         # against 16 contacts, and a full buffer ends episodes.
         self._contact_buffer = max(config.max_contacts * num_envs * 3 // 2, 256)
-        self.mj_model = build_model(hand, slots, largest, config, gravity, self.backend,
-                                    rotor_share=rotor_share)
+        self.mj_model = build_model(hand, slots, largest, config, gravity, self.backend, rotor_share=rotor_share)
         try:
             self._model = _quiet(self._mjx.put_model(self.mj_model, impl=self.backend), self.backend)
         except NotImplementedError as error:
@@ -93,8 +101,9 @@ class Physics:
         self._find_pairs()
         self._stepper = None
         if self.backend == "jax" and config.contacts == "closed":
-            self._stepper = substep.find_stepper(mjx, self.mj_model, tip_bodies(self.mj_model, hand),
-                                                 most=config.max_contacts)
+            self._stepper = substep.find_stepper(
+                mjx, self.mj_model, tip_bodies(self.mj_model, hand), most=config.max_contacts
+            )
 
     def _find_addresses(self) -> None:
         model, hand = self.mj_model, self.hand
@@ -105,8 +114,7 @@ class Physics:
         self.object_qpos = np.arange(free.qposadr[0], free.qposadr[0] + 7)
         self.object_dof = np.arange(free.dofadr[0], free.dofadr[0] + 6)
         self.object_body = model.body("object").id
-        self.object_geoms = np.array([model.geom(f"object_{k}").id
-                                      for k in range(len(self.slots))])
+        self.object_geoms = np.array([model.geom(f"object_{k}").id for k in range(len(self.slots))])
         # finger_of_geom[g]: whose tip link a geom belongs to, -1 for none.
         tips = {int(body): f for f, body in enumerate(tip_bodies(model, hand))}
         self._finger_of_geom = np.array([tips.get(int(b), -1) for b in model.geom_bodyid])
@@ -115,8 +123,7 @@ class Physics:
     def _find_pairs(self) -> None:
         model, tips = self.mj_model, tip_bodies(self.mj_model, self.hand)
         self.object_pairs = contact.pairs_with(model, self.object_geoms)
-        self._compliance, self._share, self._finger_of_pair = contact.pair_constants(
-            model, self.object_pairs, tips)
+        self._compliance, self._share, self._finger_of_pair = contact.pair_constants(model, self.object_pairs, tips)
         self._pads = contact.find_pads(model, self.object_pairs, tips)
 
     def tip_stiffness(self, target: ObjectParams, qpos: jax.Array) -> jax.Array:
@@ -140,15 +147,18 @@ class Physics:
         if tips is not None:
             share *= jnp.append(tips, 1.0)[self._finger_of_pair]  # -1, no finger's: the last
         solref, solimp = contact.spring(
-            self._compliance, share * target.contact[0], target.contact[1], friction,
-            period=self.config.contact_period, edges=self.config.pyramid_edges)
+            self._compliance,
+            share * target.contact[0],
+            target.contact[1],
+            friction,
+            period=self.config.contact_period,
+            edges=self.config.pyramid_edges,
+        )
         return model.replace(
             geom_size=model.geom_size.at[geoms].set(target.size),
-            geom_rbound=model.geom_rbound.at[geoms].set(
-                bounding_radius(target.size, self.slots)),
+            geom_rbound=model.geom_rbound.at[geoms].set(bounding_radius(target.size, self.slots)),
             geom_pos=model.geom_pos.at[geoms].set(target.position),
-            geom_quat=(model.geom_quat if target.quat is None
-                       else model.geom_quat.at[geoms].set(target.quat)),
+            geom_quat=(model.geom_quat if target.quat is None else model.geom_quat.at[geoms].set(target.quat)),
             body_mass=model.body_mass.at[body].set(target.mass),
             body_inertia=model.body_inertia.at[body].set(target.inertia),
             body_ipos=model.body_ipos.at[body].set(target.com),
@@ -157,9 +167,13 @@ class Physics:
             pair_solimp=model.pair_solimp.at[pair].set(solimp),
         )
 
-    def advance(self, target: ObjectParams, state: PhysicsState,
-                torque: Callable[[jax.Array, jax.Array, jax.Array], jax.Array],
-                push: jax.Array) -> tuple[PhysicsState, jax.Array]:
+    def advance(
+        self,
+        target: ObjectParams,
+        state: PhysicsState,
+        torque: Callable[[jax.Array, jax.Array, jax.Array], jax.Array],
+        push: jax.Array,
+    ) -> tuple[PhysicsState, jax.Array]:
         """Run one control tick with motors that remember nothing: `advance_motors` for all others.
 
         Args:
@@ -167,13 +181,22 @@ class Physics:
             called before every sub-step.
         """
         after, force, _ = self.advance_motors(
-            target, state, lambda index, position, velocity, memory: (
-                torque(index, position, velocity), memory), None, push)
+            target,
+            state,
+            lambda index, position, velocity, memory: (torque(index, position, velocity), memory),
+            None,
+            push,
+        )
         return after, force
 
-    def advance_motors(self, target: ObjectParams, state: PhysicsState,
-                       motors: Callable[..., tuple[jax.Array, Any]], memory: Any,
-                       push: jax.Array) -> tuple[PhysicsState, jax.Array, Any]:
+    def advance_motors(
+        self,
+        target: ObjectParams,
+        state: PhysicsState,
+        motors: Callable[..., tuple[jax.Array, Any]],
+        memory: Any,
+        push: jax.Array,
+    ) -> tuple[PhysicsState, jax.Array, Any]:
         """Run one control tick.
 
         Args:
@@ -192,15 +215,13 @@ class Physics:
         model = self.configure(target, tips)
         if self._stepper is not None:
             return self._advance_closed(model, state, motors, memory, push)
-        data = self._make_data().replace(qpos=state.qpos, qvel=state.qvel,
-                                         qacc_warmstart=state.warmstart)
+        data = self._make_data().replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.warmstart)
         wrench = jnp.zeros((self.mj_model.nbody, 6)).at[self.object_body, :3].set(push)
         data = data.replace(xfrc_applied=wrench)
 
         def substep(carry: tuple[Any, Any], index: jax.Array) -> tuple[tuple[Any, Any], None]:
             data, memory = carry
-            tau, memory = motors(index, data.qpos[self.joint_qpos], data.qvel[self.joint_dof],
-                                 memory)
+            tau, memory = motors(index, data.qpos[self.joint_qpos], data.qvel[self.joint_dof], memory)
             applied = jnp.zeros(self.mj_model.nv).at[self.joint_dof].set(tau)
             return (self._mjx.step(model, data.replace(qfrc_applied=applied)), memory), None
 
@@ -210,8 +231,14 @@ class Physics:
         after = PhysicsState(data.qpos, data.qvel, data.qacc_warmstart)
         return after, self._finger_force(data), memory
 
-    def _advance_closed(self, model: Any, state: PhysicsState, motors: Callable[..., tuple[jax.Array, Any]],
-                        memory: Any, push: jax.Array) -> tuple[PhysicsState, jax.Array, Any]:
+    def _advance_closed(
+        self,
+        model: Any,
+        state: PhysicsState,
+        motors: Callable[..., tuple[jax.Array, Any]],
+        memory: Any,
+        push: jax.Array,
+    ) -> tuple[PhysicsState, jax.Array, Any]:
         """`advance_motors` with our own contacts and solver (`dexsim.substep`)."""
         data = self._make_data()
 
@@ -220,7 +247,8 @@ class Physics:
             tau, memory = motors(index, qpos[self.joint_qpos], qvel[self.joint_dof], memory)
             applied = jnp.zeros(self.mj_model.nv).at[self.joint_dof].set(tau)
             after, force = self._stepper.step(
-                model, data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart), applied, push)
+                model, data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart), applied, push
+            )
             return (after, memory), force
 
         # The force is no part of the carry: zeros to begin with, which no environment's own, would have
@@ -232,8 +260,13 @@ class Physics:
     def _make_data(self) -> Any:
         if self.backend == "jax":
             return self._mjx.make_data(self._model)
-        return self._mjx.make_data(self.mj_model, impl="warp", naconmax=self._contact_buffer,
-                             naccdmax=self._contact_buffer, njmax=self.constraint_rows)
+        return self._mjx.make_data(
+            self.mj_model,
+            impl="warp",
+            naconmax=self._contact_buffer,
+            naccdmax=self._contact_buffer,
+            njmax=self.constraint_rows,
+        )
 
     @property
     def constraint_rows(self) -> int:
@@ -257,12 +290,10 @@ class Physics:
         edges = self.config.pyramid_edges
         rows = data._impl.efc_force[address[use][:, None] + np.arange(edges or self.config.condim)]
         if edges:  # opposite edges, see mju_decodePyramid
-            slide = [(rows[:, 2 * axis] - rows[:, 2 * axis + 1]) * touch.friction[use, axis]
-                     for axis in (0, 1)]
+            slide = [(rows[:, 2 * axis] - rows[:, 2 * axis + 1]) * touch.friction[use, axis] for axis in (0, 1)]
             local = [jnp.sum(rows, -1), *slide]
         else:
-            local = [rows[:, axis] if axis < self.config.condim else jnp.zeros(len(use))
-                     for axis in range(3)]
+            local = [rows[:, axis] if axis < self.config.condim else jnp.zeros(len(use)) for axis in range(3)]
         frame = touch.frame[use]  # rows are the axes; the normal points from geom1 to geom2
         force = jnp.sum(frame * jnp.stack(local, -1)[..., None], 1)
         touching = (touch.dist[use] < touch.includemargin[use])[:, None]

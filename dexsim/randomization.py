@@ -18,10 +18,27 @@ from dexsim.hand import Hand
 from dexsim.pytree import pytree_dataclass
 from dexsim.ranges import draw_corner, uniform
 
-_FACTORS = ("stiffness_factor", "damping_factor", "torque_factor", "speed_factor", "efficiency",
-            "torque_gain", "taxel_gain")
-_SPANS = (*_FACTORS, "dead_band", "gear_gap", "latency", "latency_spread", "ripple", "ripple_count",
-          "coulomb_friction", "viscous_friction", "sensing_latency")
+_FACTORS = (
+    "stiffness_factor",
+    "damping_factor",
+    "torque_factor",
+    "speed_factor",
+    "efficiency",
+    "torque_gain",
+    "taxel_gain",
+)
+_SPANS = (
+    *_FACTORS,
+    "dead_band",
+    "gear_gap",
+    "latency",
+    "latency_spread",
+    "ripple",
+    "ripple_count",
+    "coulomb_friction",
+    "viscous_friction",
+    "sensing_latency",
+)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -88,14 +105,18 @@ class Randomization:
         validate(self)
         check_ranges(self, *_SPANS)
         if self.beyond and not self.corners:
-            raise ConfigError(f"Randomization.beyond = {self.beyond:g} with corners = 0: only hands in a corner have "
-                              "values beyond their ranges; set corners, too")
+            raise ConfigError(
+                f"Randomization.beyond = {self.beyond:g} with corners = 0: only hands in a corner have "
+                "values beyond their ranges; set corners, too"
+            )
         width = self.scale * (1 + self.beyond)
         for name in _FACTORS:
             low, high = getattr(self, name)
             if min(1 + width * (low - 1), 1 + width * (high - 1)) < 0:
-                raise ConfigError(f"Randomization.{name} = ({low:g}, {high:g}) at scale {self.scale:g} and beyond "
-                                  f"{self.beyond:g} reaches below 0: narrow one or the other")
+                raise ConfigError(
+                    f"Randomization.{name} = ({low:g}, {high:g}) at scale {self.scale:g} and beyond "
+                    f"{self.beyond:g} reaches below 0: narrow one or the other"
+                )
 
 
 @pytree_dataclass
@@ -112,8 +133,15 @@ class Draw:
     gear_gap: jax.Array | None = None  # [J] rad, with gear play
 
 
-def sample(key: jax.Array, config: Randomization, hand: Hand, *, timestep: float,
-           control_period: float, scale: jax.Array | float = 1.0) -> Draw:
+def sample(
+    key: jax.Array,
+    config: Randomization,
+    hand: Hand,
+    *,
+    timestep: float,
+    control_period: float,
+    scale: jax.Array | float = 1.0,
+) -> Draw:
     """Draw one episode's hand.
 
     Args:
@@ -127,8 +155,7 @@ def sample(key: jax.Array, config: Randomization, hand: Hand, *, timestep: float
     off = isinstance(width, (int, float)) and width == 0  # known beforehand: nothing is drawn
     corner = draw_corner(key, config.corners)
 
-    def draw(key: jax.Array, span: tuple[float, float], nominal: float,
-             shape: tuple[int, ...]) -> jax.Array:
+    def draw(key: jax.Array, span: tuple[float, float], nominal: float, shape: tuple[int, ...]) -> jax.Array:
         if off:
             return jnp.full(shape, nominal, float)
         value = uniform(key, span, corner, shape, nominal=nominal, beyond=config.beyond)
@@ -137,8 +164,14 @@ def sample(key: jax.Array, config: Randomization, hand: Hand, *, timestep: float
     return _assemble(key, draw, config, hand, timestep, control_period)
 
 
-def _assemble(key: jax.Array, draw: Callable[..., jax.Array], config: Randomization, hand: Hand,
-              timestep: float, control_period: float) -> Draw:
+def _assemble(
+    key: jax.Array,
+    draw: Callable[..., jax.Array],
+    config: Randomization,
+    hand: Hand,
+    timestep: float,
+    control_period: float,
+) -> Draw:
     keys = iter(jax.random.split(key, 20))
     joints, fingers = (hand.num_joints,), (hand.num_fingers, 1)
     bias, tilt = ((-reach, reach) for reach in (config.encoder_bias, config.gravity_tilt))
@@ -160,19 +193,31 @@ def _assemble(key: jax.Array, draw: Callable[..., jax.Array], config: Randomizat
     latency = latency + draw(next(keys), config.latency_spread, 0.0, joints)
     low, high = config.ripple_count
     actuator = Actuator(
-        stiffness=stiffness, damping=damping, dead_band=dead_band, stall_torque=stall_torque,
-        no_load_speed=no_load_speed, efficiency=efficiency,
+        stiffness=stiffness,
+        damping=damping,
+        dead_band=dead_band,
+        stall_torque=stall_torque,
+        no_load_speed=no_load_speed,
+        efficiency=efficiency,
         ripple=draw(next(keys), config.ripple, 0.0, joints),
         ripple_count=jax.random.uniform(next(keys), joints, minval=low, maxval=high),
         ripple_phase=jax.random.uniform(next(keys), joints, maxval=2 * jnp.pi),
         encoder_bias=encoder_bias,
         coulomb_friction=hand.torque_limit * draw(next(keys), config.coulomb_friction, 0.0, joints),
-        viscous_friction=draw(next(keys), config.viscous_friction, 0.0, joints))
+        viscous_friction=draw(next(keys), config.viscous_friction, 0.0, joints),
+    )
     gap = draw(next(keys), config.gear_gap, 0.0, joints) if geared else None
     substeps = jnp.round(jnp.minimum(latency, control_period) / timestep).astype(jnp.int32)
-    return Draw(actuator=actuator, latency=substeps, sensing_latency=jnp.clip(age, 0.0, 1.0),
-                encoder_bias=encoder_bias, torque_gain=torque_gain, taxel_gain=taxel_gain,
-                tilt=tilt, gear_gap=gap)
+    return Draw(
+        actuator=actuator,
+        latency=substeps,
+        sensing_latency=jnp.clip(age, 0.0, 1.0),
+        encoder_bias=encoder_bias,
+        torque_gain=torque_gain,
+        taxel_gain=taxel_gain,
+        tilt=tilt,
+        gear_gap=gap,
+    )
 
 
 def tilted_down(down: np.ndarray, tilt: jax.Array) -> jax.Array:
@@ -214,8 +259,9 @@ class Curriculum:
     def __post_init__(self):
         validate(self)
         if self.narrow_below > self.widen_above:
-            raise ConfigError(f"Curriculum.narrow_below = {self.narrow_below:g}: must not exceed "
-                              f"widen_above = {self.widen_above:g}")
+            raise ConfigError(
+                f"Curriculum.narrow_below = {self.narrow_below:g}: must not exceed widen_above = {self.widen_above:g}"
+            )
 
 
 def next_scale(scale: jax.Array, success: jax.Array, curriculum: Curriculum) -> jax.Array:
@@ -223,6 +269,9 @@ def next_scale(scale: jax.Array, success: jax.Array, curriculum: Curriculum) -> 
 
     A rate that is not a number (no episode has ended) leaves the scale as it is.
     """
-    step = jnp.where(success >= curriculum.widen_above, curriculum.step,
-                     jnp.where(success < curriculum.narrow_below, -curriculum.step, 0.0))
+    step = jnp.where(
+        success >= curriculum.widen_above,
+        curriculum.step,
+        jnp.where(success < curriculum.narrow_below, -curriculum.step, 0.0),
+    )
     return jnp.clip(scale + step, 0.0, 1.0)

@@ -24,11 +24,13 @@ def table(effects: Sequence[Effect]) -> str:
     """For people."""
     rows = [f"{'range':34}{'spread':>8}{'joints':>11}{'object':>10}{'reading':>9}  what changed"]
     for effect in effects:
-        verdict = ("off: no width" if effect.off else ", ".join(effect.changed) or "nothing")
+        verdict = "off: no width" if effect.off else ", ".join(effect.changed) or "nothing"
         if not effect.found:
             verdict = f"NO EFFECT ({verdict})"
-        rows.append(f"{effect.name:34}{effect.spread:8.3f}{1e3 * effect.joint:8.3f} mrad"
-                    f"{1e3 * effect.object:7.3f} mm{effect.reading:9.4f}  {verdict}")
+        rows.append(
+            f"{effect.name:34}{effect.spread:8.3f}{1e3 * effect.joint:8.3f} mrad"
+            f"{1e3 * effect.object:7.3f} mm{effect.reading:9.4f}  {verdict}"
+        )
     return "\n".join(rows)
 
 
@@ -67,19 +69,23 @@ def main(argv: Sequence[str] | None = None) -> int:
     import dexsim
     from dexsim.tasks import TASKS
 
-    arguments = tyro.cli(CheckArguments, args=argv, prog="python -m dexsim.randomization_check",
-                         description="Show that every range of the randomisation has an effect.")
+    arguments = tyro.cli(
+        CheckArguments,
+        args=argv,
+        prog="python -m dexsim.randomization_check",
+        description="Show that every range of the randomisation has an effect.",
+    )
     try:
         if arguments.task not in TASKS:
             raise DexsimError(f"no task {arguments.task!r}: choose from {', '.join(TASKS)}")
         config = dataclasses.replace(TASKS[arguments.task].config(), pool_size=80)
-        env = dexsim.make(arguments.task, config, backend=arguments.backend,
-                          num_envs=arguments.num_envs)
+        env = dexsim.make(arguments.task, config, backend=arguments.backend, num_envs=arguments.num_envs)
         keys = jax.random.split(jax.random.key(arguments.seed), arguments.num_envs)
         with collector_paused():
             states = jax.block_until_ready(jax.jit(jax.vmap(env.reset))(keys))
-        effects = check(env, jax.jit(jax.vmap(env.step)), states,
-                        key=jax.random.key(arguments.seed + 1), ticks=arguments.ticks)
+        effects = check(
+            env, jax.jit(jax.vmap(env.step)), states, key=jax.random.key(arguments.seed + 1), ticks=arguments.ticks
+        )
     except DexsimError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

@@ -18,8 +18,15 @@ from dexsim.object_config import SHAPES
 from dexsim.orientation_sensor import OrientationSensor, draw_sensor
 from dexsim.randomization import Randomization, sample
 
-NOMINAL = {"stiffness_factor": 1.0, "damping_factor": 1.0, "torque_factor": 1.0,
-           "speed_factor": 1.0, "efficiency": 1.0, "torque_gain": 1.0, "taxel_gain": 1.0}
+NOMINAL = {
+    "stiffness_factor": 1.0,
+    "damping_factor": 1.0,
+    "torque_factor": 1.0,
+    "speed_factor": 1.0,
+    "efficiency": 1.0,
+    "torque_gain": 1.0,
+    "taxel_gain": 1.0,
+}
 """Nominal values that are not 0."""
 
 READINGS = ("joint_position", "joint_torque", "taxel_force", "object_position", "object_quat")
@@ -48,8 +55,9 @@ class Effect:
         return self.off or (bool(self.changed) and max(self.joint, self.object, self.reading) > 0)
 
 
-def check(env: Any, step: Callable, states: Any, *, key: jax.Array, ticks: int = 12,
-          names: Sequence[str] | None = None) -> list[Effect]:
+def check(
+    env: Any, step: Callable, states: Any, *, key: jax.Array, ticks: int = 12, names: Sequence[str] | None = None
+) -> list[Effect]:
     """Draw every range by itself and compare the motion.
 
     Args:
@@ -84,10 +92,14 @@ def _unused(ranges: Any) -> str:
 
 def _ranges(config: Any) -> list[str]:
     """Names of (low, high) pairs, and of largest deviations from 0."""
+
     def is_range(name: str) -> bool:
         value = getattr(config, name)
-        return value is not None and (name in _WIDTHS or (isinstance(value, tuple) and len(value) == 2 and all(
-            isinstance(v, (int, float)) for v in value)))
+        return value is not None and (
+            name in _WIDTHS
+            or (isinstance(value, tuple) and len(value) == 2 and all(isinstance(v, (int, float)) for v in value))
+        )
+
     return [field.name for field in dataclasses.fields(config) if is_range(field.name)]
 
 
@@ -102,9 +114,12 @@ class _Bench:
         throw = jax.random.uniform(action_key, (ticks, self.count, env.action_size), minval=-1.0)
         close = jnp.asarray([0.0 if low < 0 else 0.5 for low in env.hand.joint_lower])
         self.actions = jnp.clip(throw + close, -1.0, 1.0)
-        self.states = dataclasses.replace(states, draw=self._draw(self._only()),
-                                          orientation_sensor=self._imu(_still_imu(env)),
-                                          array_params=self._array())
+        self.states = dataclasses.replace(
+            states,
+            draw=self._draw(self._only()),
+            orientation_sensor=self._imu(_still_imu(env)),
+            array_params=self._array(),
+        )
         self.base = self._run(self.states)
         # On the Warp backend two runs of the same differ: what is not well above that is no effect.
         again = [self._distance(self._run(self.states)) for _ in range(1 if env.backend == "jax" else 3)]
@@ -122,13 +137,20 @@ class _Bench:
         return dataclasses.replace(config, scale=1.0, **fixed)
 
     def _draw(self, config: Randomization) -> Any:
-        return jax.vmap(lambda key: sample(
-            key, config, self.env.hand, timestep=self.env.config.physics.timestep,
-            control_period=self.env.control_period))(jax.random.split(self.key, self.count))
+        return jax.vmap(
+            lambda key: sample(
+                key,
+                config,
+                self.env.hand,
+                timestep=self.env.config.physics.timestep,
+                control_period=self.env.control_period,
+            )
+        )(jax.random.split(self.key, self.count))
 
     def _imu(self, config: OrientationSensor) -> Any:
         return jax.vmap(lambda key: draw_sensor(key, config, 1.0, self.env.control_period))(
-            jax.random.split(self.key, self.count))
+            jax.random.split(self.key, self.count)
+        )
 
     def _array(self, *names: str, **aids: Any) -> Any:
         """Taxels that are perfect but for these ranges, with the structure of the environment's."""
@@ -139,7 +161,8 @@ class _Bench:
         nominal = {"rate": 1 / env.control_period, "gain": 1.0, "hysteresis_time": config.hysteresis_time[0]}
         fixed = {name: (nominal.get(name, 0.0),) * 2 for name in _ranges(config) if name not in names}
         perfect = dataclasses.replace(config, scale=1.0, **fixed | aids).model(
-            env.hand.taxel_grid, fingers=env.hand.num_fingers, control_period=env.control_period)
+            env.hand.taxel_grid, fingers=env.hand.num_fingers, control_period=env.control_period
+        )
         return jax.vmap(perfect.sample)(jax.random.split(self.key, self.count))
 
     def _run(self, states: Any) -> dict[str, np.ndarray]:
@@ -149,23 +172,33 @@ class _Bench:
             with collector_paused():
                 states = jax.block_until_ready(self.step(states, action))
             qpos = np.asarray(states.physics.qpos, float)
-            rows.append({"joint": qpos[:, physics.joint_qpos], "object": qpos[:, physics.object_qpos[:3]],
-                         **{name: np.asarray(getattr(states.readings, name), float) for name in READINGS}})
+            rows.append(
+                {
+                    "joint": qpos[:, physics.joint_qpos],
+                    "object": qpos[:, physics.object_qpos[:3]],
+                    **{name: np.asarray(getattr(states.readings, name), float) for name in READINGS},
+                }
+            )
         return {name: np.stack([row[name] for row in rows]) for name in rows[0]}
 
-    def _distance(self, track: dict[str, np.ndarray],
-                  base: dict[str, np.ndarray] | None = None) -> dict[str, np.ndarray]:
+    def _distance(
+        self, track: dict[str, np.ndarray], base: dict[str, np.ndarray] | None = None
+    ) -> dict[str, np.ndarray]:
         """Root mean square [T] over batch and components, by quantity."""
         base = self.base if base is None else base
-        return {name: np.sqrt(np.mean((track[name] - base[name]) ** 2, (1, 2) if track[name].ndim == 3 else (1, 2, 3)))
-                for name in base}
+        return {
+            name: np.sqrt(np.mean((track[name] - base[name]) ** 2, (1, 2) if track[name].ndim == 3 else (1, 2, 3)))
+            for name in base
+        }
 
-    def _effect(self, name: str, before: Any, after: Any, states: Any,
-                base: dict[str, np.ndarray] | None = None) -> Effect:
+    def _effect(
+        self, name: str, before: Any, after: Any, states: Any, base: dict[str, np.ndarray] | None = None
+    ) -> Effect:
         changed, spread = changes(before, after)
         distance = self._distance(self._run(states), base)
-        largest = {name: float(np.max(value, where=value > self.floor[name], initial=0.0))
-                   for name, value in distance.items()}
+        largest = {
+            name: float(np.max(value, where=value > self.floor[name], initial=0.0)) for name, value in distance.items()
+        }
         size = {name: float(np.sqrt(np.mean(self.base[name] ** 2))) or 1.0 for name in READINGS}
         readings = {name: largest[name] / size[name] for name in READINGS}
         most = max(readings, key=readings.__getitem__)
@@ -189,8 +222,9 @@ class _Bench:
         if _width(getattr(config, name)) == 0:
             return Effect(label, off=True)
         drawn = self._imu(dataclasses.replace(_still_imu(self.env), **{name: getattr(config, name)}))
-        return self._effect(label, self.states.orientation_sensor, drawn,
-                            dataclasses.replace(self.states, orientation_sensor=drawn))
+        return self._effect(
+            label, self.states.orientation_sensor, drawn, dataclasses.replace(self.states, orientation_sensor=drawn)
+        )
 
     def array_range(self, name: str) -> Effect:
         """One field of `SensorNoise`."""
@@ -217,8 +251,10 @@ class _Bench:
             nominal = _with(nominal, other, centre)
         shape = jnp.int32(SHAPES.index(_SHAPE_OF.get(name.split("_")[0], "box")))
         keys = jax.random.split(self.key, self.count)
-        before, after = (jax.vmap(lambda key, c=c: env.task.draw_object(key, c, shape))(keys)
-                         for c in (nominal, _with(nominal, path, getattr(owner, name))))
+        before, after = (
+            jax.vmap(lambda key, c=c: env.task.draw_object(key, c, shape))(keys)
+            for c in (nominal, _with(nominal, path, getattr(owner, name)))
+        )
         base = self._run(dataclasses.replace(self.states, target=before))
         effect = self._effect(label, before, after, dataclasses.replace(self.states, target=after), base)
         # What the physics is given must differ too, not only what was drawn.
@@ -228,20 +264,30 @@ class _Bench:
     def push(self) -> Effect:
         """Pushes by the task: starts whose first tick has one, against starts whose has none."""
         keys = jax.random.split(self.key, 8192)
-        forces = np.asarray(jax.vmap(lambda key: self.env.task.push(
-            jax.random.split(key, 4)[1], jax.tree.map(lambda leaf: leaf[0], self.states.target)))(keys))
+        forces = np.asarray(
+            jax.vmap(
+                lambda key: self.env.task.push(
+                    jax.random.split(key, 4)[1], jax.tree.map(lambda leaf: leaf[0], self.states.target)
+                )
+            )(keys)
+        )
         hit = np.any(forces != 0, -1)
         if not np.any(hit):
             return Effect("push", off=True)
         tracks = []
         for rows in (np.flatnonzero(~hit), np.flatnonzero(hit)):
             with collector_paused():
-                state = jax.block_until_ready(self.step(dataclasses.replace(
-                    self.states, key=keys[np.resize(rows, self.count)]), self.actions[0]))
+                state = jax.block_until_ready(
+                    self.step(dataclasses.replace(self.states, key=keys[np.resize(rows, self.count)]), self.actions[0])
+                )
             tracks.append(np.asarray(state.physics.qpos, float)[:, self.env.physics.object_qpos[:3]])
         moved = float(np.sqrt(np.mean((tracks[1] - tracks[0]) ** 2)))
-        return Effect("push", ("xfrc_applied",), float(np.std(forces[hit])),
-                      object=moved if moved > self.floor["object"][0] else 0.0)
+        return Effect(
+            "push",
+            ("xfrc_applied",),
+            float(np.std(forces[hit])),
+            object=moved if moved > self.floor["object"][0] else 0.0,
+        )
 
 
 def changes(before: Any, after: Any) -> tuple[tuple[str, ...], float]:

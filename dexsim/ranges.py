@@ -15,8 +15,15 @@ def draw_corner(key: jax.Array, share: float) -> jax.Array | None:
     return None if share == 0 else jax.random.bernoulli(jax.random.fold_in(key, _CORNER), share)
 
 
-def uniform(key: jax.Array, span: tuple[float, float], corner: jax.Array | None, shape: tuple[int, ...] = (), *,
-            nominal: float | None = None, beyond: float = 0.0) -> jax.Array:
+def uniform(
+    key: jax.Array,
+    span: tuple[float, float],
+    corner: jax.Array | None,
+    shape: tuple[int, ...] = (),
+    *,
+    nominal: float | None = None,
+    beyond: float = 0.0,
+) -> jax.Array:
     """A value [*shape] of a range (low, high), or at a corner the end of it on that value's side of nominal.
 
     Args:

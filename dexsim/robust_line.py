@@ -61,11 +61,16 @@ def fit_line(x: np.ndarray, y: np.ndarray, *, seed: int = 0) -> Line:
     centred = y[kept] - np.average(y[kept], weights=weight[kept])
     unexplained = np.sum(weight * residual**2) / max(np.sum(weight[kept] * centred**2), 1e-300)
     return Line(
-        gain=float(gain), offset=float(offset),
+        gain=float(gain),
+        offset=float(offset),
         gain_interval=(float(gain - half[1]), float(gain + half[1])),
         offset_interval=(float(offset - half[0]), float(offset + half[0])),
-        noise=float(scale), r_squared=float(1.0 - unexplained),
-        condition=float(np.linalg.cond(design)), samples=len(x), outliers=int(np.sum(~kept)))
+        noise=float(scale),
+        r_squared=float(1.0 - unexplained),
+        condition=float(np.linalg.cond(design)),
+        samples=len(x),
+        outliers=int(np.sum(~kept)),
+    )
 
 
 def theil_sen(x: np.ndarray, y: np.ndarray, seed: int = 0) -> tuple[float, float]:
@@ -81,8 +86,7 @@ def theil_sen(x: np.ndarray, y: np.ndarray, seed: int = 0) -> tuple[float, float
     return float(np.median(y - gain * x)), gain
 
 
-def _reweight(design: np.ndarray, y: np.ndarray,
-              start: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
+def _reweight(design: np.ndarray, y: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
     """Parameters, residual scale and weights: Huber to convergence, then bisquare."""
     guess = start
     floor = 1e-12 * max(float(np.max(np.abs(y))), 1e-300)
@@ -110,8 +114,7 @@ def _bisquare_weight(u: np.ndarray) -> np.ndarray:
     return np.where(np.abs(u) < 1.0, (1.0 - u**2) ** 2, 0.0)
 
 
-def _half_widths(design: np.ndarray, residual: np.ndarray, weight: np.ndarray,
-                 scale: float) -> np.ndarray:
+def _half_widths(design: np.ndarray, residual: np.ndarray, weight: np.ndarray, scale: float) -> np.ndarray:
     """Half the 95 % interval of each parameter of the bisquare fit."""
     u = residual / (_BISQUARE * scale)
     slope = np.where(np.abs(u) < 1.0, (1.0 - u**2) * (1.0 - 5.0 * u**2), 0.0)  # psi'

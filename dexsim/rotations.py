@@ -57,8 +57,15 @@ def quat_multiply(left: jax.Array, right: jax.Array) -> jax.Array:
     """The Hamilton product of quaternions [..., 4]."""
     a, b, c, d = (left[..., i] for i in range(4))
     e, f, g, h = (right[..., i] for i in range(4))
-    return jnp.stack([a * e - b * f - c * g - d * h, a * f + b * e + c * h - d * g,
-                      a * g - b * h + c * e + d * f, a * h + b * g - c * f + d * e], -1)
+    return jnp.stack(
+        [
+            a * e - b * f - c * g - d * h,
+            a * f + b * e + c * h - d * g,
+            a * g - b * h + c * e + d * f,
+            a * h + b * g - c * f + d * e,
+        ],
+        -1,
+    )
 
 
 def quat_conjugate(quat: jax.Array) -> jax.Array:

@@ -84,7 +84,10 @@ def ellipsoid(point: jax.Array, size: jax.Array) -> jax.Array:
 
 
 _DISTANCE: dict[str, Callable[[jax.Array, jax.Array], jax.Array]] = {
-    "sphere": sphere, "box": box, "capsule": capsule, "cylinder": cylinder,
+    "sphere": sphere,
+    "box": box,
+    "capsule": capsule,
+    "cylinder": cylinder,
     "ellipsoid": ellipsoid,
 }
 
@@ -111,8 +114,7 @@ def to_local(points: jax.Array, position: jax.Array, rotation: jax.Array) -> jax
     axis of three would each write their result to memory.
     """
     arm = [p - position[axis] for axis, p in enumerate(_split(points))]
-    return jnp.stack([sum(rotation[row, axis] * arm[row] for row in range(3))
-                      for axis in range(3)], -1)
+    return jnp.stack([sum(rotation[row, axis] * arm[row] for row in range(3)) for axis in range(3)], -1)
 
 
 def of_geoms(geoms: Iterable[Any]) -> Shape | None:
@@ -120,9 +122,11 @@ def of_geoms(geoms: Iterable[Any]) -> Shape | None:
     parts = [g for g in geoms if g.kind in KINDS]
     if not parts:
         return None
-    return Shape(tuple(g.kind for g in parts), *(np.stack([getattr(g, name) for g in parts])
-                                                 for name in ("size", "position", "rotation")),
-                 np.ones(len(parts), bool))
+    return Shape(
+        tuple(g.kind for g in parts),
+        *(np.stack([getattr(g, name) for g in parts]) for name in ("size", "position", "rotation")),
+        np.ones(len(parts), bool),
+    )
 
 
 def bounds(shape: Shape) -> np.ndarray:
@@ -135,8 +139,9 @@ def bounds(shape: Shape) -> np.ndarray:
     if not active.size:
         raise ConfigError("bounds: no active primitive")
     position = np.asarray(shape.position, float)[active]
-    reach = np.stack([_reach(shape.kinds[k], np.asarray(shape.size[k], float),
-                             np.asarray(shape.rotation[k], float)) for k in active])
+    reach = np.stack(
+        [_reach(shape.kinds[k], np.asarray(shape.size[k], float), np.asarray(shape.rotation[k], float)) for k in active]
+    )
     return np.stack([(position - reach).min(0), (position + reach).max(0)])
 
 

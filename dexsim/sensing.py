@@ -42,8 +42,9 @@ class Senses:
         """`views`: what the groups observe, which may ask for three axes of touch."""
         self.config, self.hand, self.task = config, hand, task
         self.period = config.physics.control_period
-        self.three_axis = config.touch and (config.sensing.three_axis or any(
-            "tangential_force" in view.add for view in views))
+        self.three_axis = config.touch and (
+            config.sensing.three_axis or any("tangential_force" in view.add for view in views)
+        )
         self.array = _array(config, hand)
         self._up = -jnp.asarray(task.gravity) / np.linalg.norm(task.gravity)
 
@@ -51,15 +52,22 @@ class Senses:
         """One episode's IMU; see `draw_sensor`."""
         return draw_sensor(key, self.config.sensing.orientation, scale, self.period, corner)
 
-    def draw_array(self, key: jax.Array, scale: jax.Array | float
-                   ) -> tuple[SensorParams | None, SensorState | None]:
+    def draw_array(self, key: jax.Array, scale: jax.Array | float) -> tuple[SensorParams | None, SensorState | None]:
         """One episode's taxels, and their memory before the first tick."""
         if self.array is None:
             return None, None
         return self.array.sample(key, scale), self.array.init()
 
-    def read(self, key: jax.Array, sample: Sample, before: Sample, sensors: Sensors, goal: Any,
-             last_action: jax.Array, state: State | None = None) -> tuple[Readings, SensorState | None]:
+    def read(
+        self,
+        key: jax.Array,
+        sample: Sample,
+        before: Sample,
+        sensors: Sensors,
+        goal: Any,
+        last_action: jax.Array,
+        state: State | None = None,
+    ) -> tuple[Readings, SensorState | None]:
         """What the host gets to know of `sample`.
 
         Args:
@@ -85,8 +93,9 @@ class Senses:
         torque = torque + sensing.torque_noise * jax.random.normal(keys[1], torque.shape)
         taxels, array = self._read_taxels(keys[2], late, sensors)
         noise = sensing.object_noise * jax.random.normal(keys[3], (3,))
-        position = jnp.where(jnp.array(sensing.object_axes), late.object_position + noise,
-                             jnp.asarray(self.task.reference))
+        position = jnp.where(
+            jnp.array(sensing.object_axes), late.object_position + noise, jnp.asarray(self.task.reference)
+        )
         velocity = jnp.zeros(3)
         if state is not None:
             step = (position - state.readings.object_position) / self.period
@@ -94,18 +103,26 @@ class Senses:
             velocity = velocity + sensing.velocity_filter * (step - velocity)
         command, goal_quat = self.task.goal_readings(goal)
         # At a reset the sensor has just read for the first time.
-        length, held = (jnp.zeros(()), sample.object_quat) if state is None else (
-            state.length + 1.0, state.readings.object_quat)
-        quat = measure_orientation(keys[4], sensing.orientation, sensors.orientation, length,
-                                   sample.object_quat, before.object_quat, held, self._up,
-                                   self.period)
+        length, held = (
+            (jnp.zeros(()), sample.object_quat) if state is None else (state.length + 1.0, state.readings.object_quat)
+        )
+        quat = measure_orientation(
+            keys[4],
+            sensing.orientation,
+            sensors.orientation,
+            length,
+            sample.object_quat,
+            before.object_quat,
+            held,
+            self._up,
+            self.period,
+        )
         known = (joints, torque, taxels, position, velocity, quat, goal_quat, command, last_action)
         if not self.three_axis:
             return Readings(*known), array
         return ThreeAxisReadings(*known, self._read_tangential(keys[2], late, sensors)), array
 
-    def _read_taxels(self, key: jax.Array, late: Sample,
-                     sensors: Sensors) -> tuple[jax.Array, SensorState | None]:
+    def _read_taxels(self, key: jax.Array, late: Sample, sensors: Sensors) -> tuple[jax.Array, SensorState | None]:
         force, gain = late.taxel_force, sensors.draw.taxel_gain
         if self.array is not None:
             array, taxels = self.array.apply(sensors.array_params, sensors.array, key, force * gain)
@@ -121,8 +138,9 @@ class Senses:
             gain = gain * params.gain
         if params is not None and params.alive is not None:
             gain = gain * params.alive
-        return tactile.measure_tangential(late.tangential_force, late.taxel_force, gain,
-                                          self.config.sensing.taxel, jax.random.fold_in(key, 1))
+        return tactile.measure_tangential(
+            late.tangential_force, late.taxel_force, gain, self.config.sensing.taxel, jax.random.fold_in(key, 1)
+        )
 
 
 def _array(config: EnvConfig, hand: Hand) -> SensorModel | None:
@@ -130,5 +148,4 @@ def _array(config: EnvConfig, hand: Hand) -> SensorModel | None:
     noise = config.sensing.array
     if noise.scale == 0 or not config.touch:
         return None
-    return noise.model(hand.taxel_grid, fingers=hand.num_fingers,
-                       control_period=config.physics.control_period)
+    return noise.model(hand.taxel_grid, fingers=hand.num_fingers, control_period=config.physics.control_period)

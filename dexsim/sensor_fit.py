@@ -71,8 +71,14 @@ class FingerFit:
         return np.where(np.asarray(reading) == 0, 0.0, force)
 
 
-def fit_finger(press: Press, *, thickness: float | None = None, two_terms: bool = False,
-               saturation: float | None = None, seed: int = 0) -> FingerFit:
+def fit_finger(
+    press: Press,
+    *,
+    thickness: float | None = None,
+    two_terms: bool = False,
+    saturation: float | None = None,
+    seed: int = 0,
+) -> FingerFit:
     """Fit one finger.
 
     Args:
@@ -142,8 +148,10 @@ def _checked(press: Press) -> tuple[np.ndarray, np.ndarray]:
     if not (np.all(np.isfinite(force)) and np.all(np.isfinite(reading))):
         raise DexsimError("sensor fit: a force or a reading is not finite")
     if len(force) < _LEAST or np.ptp(force) <= 0:
-        raise DexsimError(f"sensor fit: {len(force)} samples between {force.min(initial=0):g} and "
-                          f"{force.max(initial=0):g} N; at least {_LEAST} at different forces needed")
+        raise DexsimError(
+            f"sensor fit: {len(force)} samples between {force.min(initial=0):g} and "
+            f"{force.max(initial=0):g} N; at least {_LEAST} at different forces needed"
+        )
     return force, reading
 
 
@@ -194,21 +202,26 @@ def _huber(design: np.ndarray, target: np.ndarray, rounds: int = 20) -> np.ndarr
     return answer / scale[:, 0]
 
 
-def _material(press: Press, keep: np.ndarray, thickness: float | None, two_terms: bool,
-              rng: np.random.Generator) -> tuple[Estimate, Estimate, list[str]]:
+def _material(
+    press: Press, keep: np.ndarray, thickness: float | None, two_terms: bool, rng: np.random.Generator
+) -> tuple[Estimate, Estimate, list[str]]:
     """Mooney-Rivlin coefficients from depth and gauge force: the force is linear in both."""
     depth = np.asarray(press.depth, float)
     if press.area is None or thickness is None:
         raise DexsimError("sensor fit: the material needs the taxels' areas and the skin's thickness beside the depth")
     if depth.shape != np.shape(press.reading) or np.shape(press.area) != depth.shape[1:]:
-        raise DexsimError(f"sensor fit: depth {depth.shape} and area {np.shape(press.area)} do not go with readings "
-                          f"{np.shape(press.reading)}")
+        raise DexsimError(
+            f"sensor fit: depth {depth.shape} and area {np.shape(press.area)} do not go with readings "
+            f"{np.shape(press.reading)}"
+        )
     depth, force = depth[keep], np.asarray(press.force, float)[keep]
     deepest = float(depth.max()) / thickness
     touching = depth.max(1) > 0
     if touching.sum() < _LEAST or deepest >= 1:
-        raise DexsimError(f"sensor fit: {touching.sum()} samples touch, deepest compression {deepest:.0%}; at least "
-                          f"{_LEAST} below 100 % needed")
+        raise DexsimError(
+            f"sensor fit: {touching.sum()} samples touch, deepest compression {deepest:.0%}; at least "
+            f"{_LEAST} below 100 % needed"
+        )
     stretch = 1 - np.maximum(depth[touching], 0) / thickness
     rise = 2 * (stretch**-2 - stretch) * press.area
     basis = np.stack([rise.sum(1), (rise / stretch).sum(1)], 1)
@@ -219,6 +232,7 @@ def _material(press: Press, keep: np.ndarray, thickness: float | None, two_terms
     width = max(c10.high - c10.low, c01.high - c01.low)
     if width > 0.5 * max(abs(c10.value + c01.value), 1e-300):
         total = _bootstrap(basis.mean(1, keepdims=True), force[touching], rng)[0]
-        notes.append(f"C10 and C01 cannot be told apart up to {deepest:.0%} compression; their sum is about "
-                     f"{total.value:.4g} Pa")
+        notes.append(
+            f"C10 and C01 cannot be told apart up to {deepest:.0%} compression; their sum is about {total.value:.4g} Pa"
+        )
     return c10, c01, notes

@@ -68,13 +68,17 @@ class SensorNoise:
         names = [f.name for f in dataclasses.fields(self) if isinstance(getattr(self, f.name), tuple)]
         check_ranges(self, *names)
         if self.gain is not None and min(1 + self.scale * (g - 1) for g in self.gain) < 0:
-            raise ConfigError(f"SensorNoise.gain = ({self.gain[0]:g}, {self.gain[1]:g}) at scale {self.scale:g} "
-                              "reaches below 0: narrow one or the other")
+            raise ConfigError(
+                f"SensorNoise.gain = ({self.gain[0]:g}, {self.gain[1]:g}) at scale {self.scale:g} "
+                "reaches below 0: narrow one or the other"
+            )
         for name, most in (("hysteresis", 1.0), ("crosstalk", 0.8), ("dead", 1.0)):
             span = getattr(self, name)
             if span is not None and self.scale * span[1] > most:
-                raise ConfigError(f"SensorNoise.{name} = ({span[0]:g}, {span[1]:g}) at scale {self.scale:g} exceeds "
-                                  f"{most:g}: narrow one or the other")
+                raise ConfigError(
+                    f"SensorNoise.{name} = ({span[0]:g}, {span[1]:g}) at scale {self.scale:g} exceeds "
+                    f"{most:g}: narrow one or the other"
+                )
 
     def model(self, grid: tuple[int, int], *, fingers: int, control_period: float) -> SensorModel:
         """This sensor on a lattice of (columns, rows) on each finger, read every `control_period` s."""
@@ -157,11 +161,16 @@ class SensorModel:
         """Before the first step: nothing felt, nothing drifted."""
         c, nothing = self.config, jnp.zeros(self.shape)
         slow = c.rate is not None
-        return SensorState(late=None if c.hysteresis is None else nothing, walk=None if c.drift is None else nothing,
-                           held=nothing if slow else None, clock=jnp.full((), -1.0) if slow else None)
+        return SensorState(
+            late=None if c.hysteresis is None else nothing,
+            walk=None if c.drift is None else nothing,
+            held=nothing if slow else None,
+            clock=jnp.full((), -1.0) if slow else None,
+        )
 
-    def apply(self, params: SensorParams, state: SensorState, key: jax.Array,
-              force: jax.Array) -> tuple[SensorState, jax.Array]:
+    def apply(
+        self, params: SensorParams, state: SensorState, key: jax.Array, force: jax.Array
+    ) -> tuple[SensorState, jax.Array]:
         """One control step: true forces [F, N] N in, readings [F, N] N out."""
         c = self.config
         if c.scale == 0:

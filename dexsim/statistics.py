@@ -39,8 +39,7 @@ def statistic(values: np.ndarray, function: Callable, name: str, samples: int = 
     return {name: float(function(values)), "low": low, "high": high}
 
 
-def bootstrap(function: Callable[[np.ndarray], float], count: int,
-              samples: int) -> tuple[float, float]:
+def bootstrap(function: Callable[[np.ndarray], float], count: int, samples: int) -> tuple[float, float]:
     """The 95 % interval of `function(rows)` over resampled rows of `count`."""
     rng = np.random.default_rng(0)
     draws = [function(rng.integers(0, count, count)) for _ in range(samples)]

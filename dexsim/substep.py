@@ -43,8 +43,9 @@ class Stepper:
     scalar: np.ndarray  # [Q', 2] addresses in qpos and qvel of hinges and slides
     free: np.ndarray  # [N, 2] addresses of free joints
 
-    def step(self, model: Any, data: Any, applied: jax.Array,
-             push: jax.Array) -> tuple[tuple[jax.Array, jax.Array, jax.Array], jax.Array]:
+    def step(
+        self, model: Any, data: Any, applied: jax.Array, push: jax.Array
+    ) -> tuple[tuple[jax.Array, jax.Array, jax.Array], jax.Array]:
         """A sub-step under generalised forces [V] and a force [3] N on the object's centre of mass.
 
         `data` holds the state. Returns (qpos, qvel, acceleration) and the force of the object on each
@@ -54,8 +55,9 @@ class Stepper:
         with jax.default_matmul_precision("highest"):
             return self._step(model, data, applied, push)
 
-    def _step(self, model: Any, data: Any, applied: jax.Array,
-              push: jax.Array) -> tuple[tuple[jax.Array, jax.Array, jax.Array], jax.Array]:
+    def _step(
+        self, model: Any, data: Any, applied: jax.Array, push: jax.Array
+    ) -> tuple[tuple[jax.Array, jax.Array, jax.Array], jax.Array]:
         for part in ("kinematics", "com_pos", "crb", "com_vel", "passive", "rne"):
             data = getattr(self.mjx, part)(model, data)
         # Motion of each degree of freedom at the world's origin; MJX has it at its tree's centre of mass.
@@ -66,15 +68,17 @@ class Stepper:
         force = data.qfrc_passive - data.qfrc_bias + applied + pushed
         rows, frame, finger = self._rows(model, data, turn, shift)
         mass = self.mjx.full_m(model, data)
-        acceleration = newton.solve(rows, mass, force, data.qacc_warmstart, iterations=self.iterations,
-                                    line_search=self.line_search)
+        acceleration = newton.solve(
+            rows, mass, force, data.qacc_warmstart, iterations=self.iterations, line_search=self.line_search
+        )
         press = newton.contact_force(rows, acceleration)
         world = jnp.sum(frame * press[:, :, None], 1)  # on the second geom; the first feels the opposite
         on_finger = -jnp.sum(finger[:, :, None] * world[:, None, :], 0)
         return (*self._integrate(data, acceleration), acceleration), on_finger
 
-    def _rows(self, model: Any, data: Any, turn: jax.Array,
-              shift: jax.Array) -> tuple[newton.Rows, jax.Array, jax.Array]:
+    def _rows(
+        self, model: Any, data: Any, turn: jax.Array, shift: jax.Array
+    ) -> tuple[newton.Rows, jax.Array, jax.Array]:
         """The constraints, frames [C, 3, 3] of the contacts, and whose finger they press [C, F]."""
         gap, point, normal = self.collider.touch(data.geom_xpos, data.geom_xmat, model.geom_size)
         count, dofs, fingers = min(self.most, len(self.collider.pair)), turn.shape[0], self.finger.shape[1]
@@ -82,10 +86,18 @@ class Stepper:
         gap = gap - model.pair_margin[pair]
         _, best = jax.lax.top_k(-gap, count)
         # One table, one gather.
-        table = jnp.concatenate([self.moves, self.compliance[:, None], self.finger, model.pair_friction[:, :2],
-                                 model.pair_solref, model.pair_solimp], -1)[pair[best]]
-        moves, compliance, finger, friction, solref, solimp = jnp.split(
-            table, np.cumsum([dofs, 1, fingers, 2, 2]), -1)
+        table = jnp.concatenate(
+            [
+                self.moves,
+                self.compliance[:, None],
+                self.finger,
+                model.pair_friction[:, :2],
+                model.pair_solref,
+                model.pair_solimp,
+            ],
+            -1,
+        )[pair[best]]
+        moves, compliance, finger, friction, solref, solimp = jnp.split(table, np.cumsum([dofs, 1, fingers, 2, 2]), -1)
         picked = jnp.concatenate([gap[:, None], point, normal], -1)[best]
         gap, point, frame = picked[:, 0], picked[:, 1:4], _frame(picked[:, 4:])
         # n.(shift + turn x p) = n.shift + (p x n).turn
@@ -101,9 +113,12 @@ class Stepper:
         along = weight * self.impratio
         across = along * friction[:, 1] ** 2 / friction[:, 0] ** 2
         rows = newton.Rows(
-            jacobian=jacobian, wanted=wanted, weight=jnp.stack([weight, along, across], -1),
+            jacobian=jacobian,
+            wanted=wanted,
+            weight=jnp.stack([weight, along, across], -1),
             scale=jnp.concatenate([friction[:, :1] / np.sqrt(self.impratio), friction], -1),
-            **self._limits(data.qpos, data.qvel))
+            **self._limits(data.qpos, data.qvel),
+        )
         return rows, frame, finger
 
     def _limits(self, qpos: jax.Array, qvel: jax.Array) -> dict[str, jax.Array]:
@@ -123,12 +138,13 @@ class Stepper:
         if len(self.scalar):
             qpos = qpos.at[self.scalar[:, 0]].add(step * qvel[self.scalar[:, 1]])
         for place, motion in self.free:
-            qpos = qpos.at[place:place + 3].add(step * qvel[motion:motion + 3])
-            spin = qvel[motion + 3:motion + 6]
+            qpos = qpos.at[place : place + 3].add(step * qvel[motion : motion + 3])
+            spin = qvel[motion + 3 : motion + 6]
             speed = jnp.sqrt(jnp.sum(spin**2) + 1e-20)
-            turned = rotations.quat_multiply(qpos[place + 3:place + 7],
-                                             rotations.axis_angle_to_quat(spin / speed, step * speed))
-            qpos = qpos.at[place + 3:place + 7].set(turned / jnp.sqrt(jnp.sum(turned**2)))
+            turned = rotations.quat_multiply(
+                qpos[place + 3 : place + 7], rotations.axis_angle_to_quat(spin / speed, step * speed)
+            )
+            qpos = qpos.at[place + 3 : place + 7].set(turned / jnp.sqrt(jnp.sum(turned**2)))
         return qpos, qvel
 
 
@@ -140,11 +156,15 @@ def find_stepper(mjx: Any, model: mujoco.MjModel, tips: np.ndarray, *, most: int
       most: contacts kept in each environment.
     """
     option = model.opt
-    plain = (option.cone == mujoco.mjtCone.mjCONE_ELLIPTIC and option.integrator == mujoco.mjtIntegrator.mjINT_EULER
-             and option.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP
-             and np.isin(model.jnt_type, _JOINTS).all() and not (model.neq or model.ntendon or model.nu)
-             and not (model.dof_frictionloss.any() or model.geom_contype.any() or model.geom_conaffinity.any())
-             and (model.pair_dim == 3).all())
+    plain = (
+        option.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
+        and option.integrator == mujoco.mjtIntegrator.mjINT_EULER
+        and option.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP
+        and np.isin(model.jnt_type, _JOINTS).all()
+        and not (model.neq or model.ntendon or model.nu)
+        and not (model.dof_frictionloss.any() or model.geom_contype.any() or model.geom_conaffinity.any())
+        and (model.pair_dim == 3).all()
+    )
     collider = collide.find_collider(model) if plain else None
     if collider is None:
         return None
@@ -157,12 +177,23 @@ def find_stepper(mjx: Any, model: mujoco.MjModel, tips: np.ndarray, *, most: int
     scalar, free = kinds != mujoco.mjtJoint.mjJNT_FREE, kinds == mujoco.mjtJoint.mjJNT_FREE
     address = np.stack([model.jnt_qposadr, model.jnt_dofadr], -1)
     return Stepper(
-        mjx=mjx, collider=collider, most=most, iterations=int(option.iterations) + _MORE_STEPS,
-        line_search=2 * int(option.ls_iterations), timestep=float(option.timestep), impratio=float(option.impratio),
+        mjx=mjx,
+        collider=collider,
+        most=most,
+        iterations=int(option.iterations) + _MORE_STEPS,
+        line_search=2 * int(option.ls_iterations),
+        timestep=float(option.timestep),
+        impratio=float(option.impratio),
         moves=np.float32(moves[bodies[1]]) - np.float32(moves[bodies[0]]),
-        compliance=np.float32(model.body_invweight0[bodies, 0].sum(0)), finger=finger,
-        root=model.body_rootid[model.dof_bodyid], push=np.float32(moves[held]), object_body=held,
-        limit=_limit_constants(model), scalar=address[scalar], free=address[free])
+        compliance=np.float32(model.body_invweight0[bodies, 0].sum(0)),
+        finger=finger,
+        root=model.body_rootid[model.dof_bodyid],
+        push=np.float32(moves[held]),
+        object_body=held,
+        limit=_limit_constants(model),
+        scalar=address[scalar],
+        free=address[free],
+    )
 
 
 def _moved(model: mujoco.MjModel) -> np.ndarray:
@@ -171,7 +202,7 @@ def _moved(model: mujoco.MjModel) -> np.ndarray:
     for body in range(1, model.nbody):
         moves[body] = moves[model.body_parentid[body]]
         first = model.body_dofadr[body]
-        moves[body, first:first + model.body_dofnum[body]] = True
+        moves[body, first : first + model.body_dofnum[body]] = True
     return moves
 
 
@@ -181,9 +212,12 @@ def _limit_constants(model: mujoco.MjModel) -> dict[str, np.ndarray]:
     far = 1e6
     constants = {
         "low": np.where(limited, model.jnt_range[joints, 0], -far),
-        "high": np.where(limited, model.jnt_range[joints, 1], far), "margin": model.jnt_margin[joints],
-        "solref": model.jnt_solref[joints], "solimp": model.jnt_solimp[joints],
-        "compliance": model.dof_invweight0}
+        "high": np.where(limited, model.jnt_range[joints, 1], far),
+        "margin": model.jnt_margin[joints],
+        "solref": model.jnt_solref[joints],
+        "solimp": model.jnt_solimp[joints],
+        "compliance": model.dof_invweight0,
+    }
     return {"address": model.jnt_qposadr[joints]} | {name: np.float32(x) for name, x in constants.items()}
 
 
@@ -198,8 +232,9 @@ def _frame(normal: jax.Array) -> jax.Array:
     return jnp.stack([normal, side, jnp.cross(normal, side)], 1)
 
 
-def _spring(solref: jax.Array, solimp: jax.Array, gap: jax.Array,
-            timestep: float) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _spring(
+    solref: jax.Array, solimp: jax.Array, gap: jax.Array, timestep: float
+) -> tuple[jax.Array, jax.Array, jax.Array]:
     """MuJoCo's stiffness 1/s^2, damping 1/s and impedance from solref [N, 2], solimp [N, 5] and gaps [N] m."""
     low, high = (jnp.clip(solimp[:, k], 1e-4, 0.9999) for k in (0, 1))
     width, middle = jnp.maximum(solimp[:, 2], 1e-15), jnp.clip(solimp[:, 3], 1e-4, 0.9999)

@@ -161,8 +161,15 @@ def _build(position: jax.Array, normal: jax.Array, config: PointsConfig) -> Surf
     if known:
         cells = config.cells
         table, origin, spacing = _candidates(np.asarray(position, np.float64), config)
-    return SurfacePoints(config.block, cells, position, normal, jnp.asarray(table, jnp.int16),
-                         jnp.asarray(origin, jnp.float32), jnp.asarray(spacing, jnp.float32))
+    return SurfacePoints(
+        config.block,
+        cells,
+        position,
+        normal,
+        jnp.asarray(table, jnp.int16),
+        jnp.asarray(origin, jnp.float32),
+        jnp.asarray(spacing, jnp.float32),
+    )
 
 
 def _candidates(position: np.ndarray, config: PointsConfig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -247,11 +254,15 @@ def _cylinder_points(count: int, size: jax.Array) -> tuple[jax.Array, jax.Array]
     rise = jnp.asarray((2 * np.arange(side) + 1) / side - 1, jnp.float32)
     round_ = jnp.stack([jnp.cos(turn), jnp.sin(turn), 0 * turn], -1)
     disc = np.sqrt((np.arange(end) + 0.5) / end)[:, None] * np.stack(
-        [np.cos(np.arange(end) * golden), np.sin(np.arange(end) * golden)], -1)
+        [np.cos(np.arange(end) * golden), np.sin(np.arange(end) * golden)], -1
+    )
     disc = jnp.asarray(np.concatenate([disc, np.zeros((end, 1))], 1), jnp.float32)
     up = jnp.array([0.0, 0.0, 1.0])
-    position = [size[0] * round_ + (size[1] * rise)[:, None] * up, size[0] * disc + size[1] * up,
-                size[0] * disc - size[1] * up]
+    position = [
+        size[0] * round_ + (size[1] * rise)[:, None] * up,
+        size[0] * disc + size[1] * up,
+        size[0] * disc - size[1] * up,
+    ]
     return jnp.concatenate(position), jnp.concatenate([round_, jnp.tile(up, (end, 1)), jnp.tile(-up, (end, 1))])
 
 
@@ -268,5 +279,10 @@ def _box_points(count: int, size: jax.Array) -> tuple[jax.Array, jax.Array]:
     return jnp.asarray(unit, jnp.float32) * size, jnp.asarray(out, jnp.float32)
 
 
-_TEMPLATES = {"sphere": _sphere_points, "box": _box_points, "capsule": _capsule_points,
-              "cylinder": _cylinder_points, "ellipsoid": _ellipsoid_points}
+_TEMPLATES = {
+    "sphere": _sphere_points,
+    "box": _box_points,
+    "capsule": _capsule_points,
+    "cylinder": _cylinder_points,
+    "ellipsoid": _ellipsoid_points,
+}

@@ -90,8 +90,15 @@ def skin_stress(compression: jax.Array, skin: Skin) -> jax.Array:
     return 2.0 * (stretch**-2 - stretch) * (skin.c10 + skin.c01 / stretch)
 
 
-def feel(taxels: jax.Array, area: jax.Array, thing: Any, position: jax.Array,
-         rotation: jax.Array, finger_force: jax.Array, skin: Skin) -> Touch:
+def feel(
+    taxels: jax.Array,
+    area: jax.Array,
+    thing: Any,
+    position: jax.Array,
+    rotation: jax.Array,
+    finger_force: jax.Array,
+    skin: Skin,
+) -> Touch:
     """Taxel forces from the geometry of the contact and the finger's total force.
 
     Args:
@@ -108,8 +115,16 @@ def feel(taxels: jax.Array, area: jax.Array, thing: Any, position: jax.Array,
     return _press(sdf.to_local(taxels, position, rotation), area, thing, finger_force, skin)
 
 
-def feel_links(hand: Hand, pose: HandPose, thing: Any, position: jax.Array, rotation: jax.Array,
-               finger_force: jax.Array, skin: Skin, surface: Surface | None = None) -> Touch:
+def feel_links(
+    hand: Hand,
+    pose: HandPose,
+    thing: Any,
+    position: jax.Array,
+    rotation: jax.Array,
+    finger_force: jax.Array,
+    skin: Skin,
+    surface: Surface | None = None,
+) -> Touch:
     """`feel` for all taxels of a posed hand, or other points of its fingertips' skin.
 
     Straight from the links' frames to the object's: one transform a finger instead of two a taxel, and no taxel
@@ -121,13 +136,11 @@ def feel_links(hand: Hand, pose: HandPose, thing: Any, position: jax.Array, rota
     # Without the barrier XLA would compose the rotations anew for every taxel.
     turn, shift = jax.lax.optimization_barrier((turn, shift))
     taxel = [jnp.asarray(surface.position[..., axis]) for axis in range(3)]
-    local = [sum(turn[:, row, axis, None] * taxel[axis] for axis in range(3)) + shift[:, row, None]
-             for row in range(3)]
+    local = [sum(turn[:, row, axis, None] * taxel[axis] for axis in range(3)) + shift[:, row, None] for row in range(3)]
     return _press(jnp.stack(local, -1), jnp.asarray(surface.area), thing, finger_force, skin)
 
 
-def _press(points: jax.Array, area: jax.Array, thing: Any, finger_force: jax.Array,
-           skin: Skin) -> Touch:
+def _press(points: jax.Array, area: jax.Array, thing: Any, finger_force: jax.Array, skin: Skin) -> Touch:
     """`feel` for points [F, N, 3] in the object's frame."""
     depth = jnp.maximum(skin.margin - signed_distance(points, thing), 0.0)
     skin_force = skin_stress(depth / skin.thickness, skin) * area
@@ -147,8 +160,7 @@ def taxel_share(skin_force: jax.Array, taxels: int) -> jax.Array:
     return jnp.sum(skin_force[:, :taxels], -1, keepdims=True) / jnp.where(borne > 0, borne, 1.0)
 
 
-def reduce_touch(force: jax.Array, taxels: jax.Array,
-                 weighting: str = "force") -> tuple[jax.Array, jax.Array]:
+def reduce_touch(force: jax.Array, taxels: jax.Array, weighting: str = "force") -> tuple[jax.Array, jax.Array]:
     """Per-finger total force and contact centre, the same for simulated and measured taxels.
 
     Args:
@@ -165,16 +177,16 @@ def reduce_touch(force: jax.Array, taxels: jax.Array,
     return jnp.sum(force, -1), centre
 
 
-def reduce_touch_links(force: jax.Array, hand: Hand, pose: HandPose,
-                       weighting: str = "force") -> tuple[jax.Array, jax.Array]:
+def reduce_touch_links(
+    force: jax.Array, hand: Hand, pose: HandPose, weighting: str = "force"
+) -> tuple[jax.Array, jax.Array]:
     """`reduce_touch` in the links' frames: the mean first, then one transform a finger."""
     total, mean = reduce_touch(force, jnp.asarray(hand.taxel_position), weighting)
     centre = pose.body_position[hand.tip_body] + rotations.rotate(pose.tip_rotation, mean)
     return total, jnp.where(total[:, None] > 0, centre, 0.0)
 
 
-def split_force(force: jax.Array, normals: jax.Array,
-                finger_force: jax.Array) -> tuple[jax.Array, jax.Array]:
+def split_force(force: jax.Array, normals: jax.Array, finger_force: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Each finger's force along and across the contact, for three-axis touch.
 
     Args:
@@ -229,8 +241,7 @@ class TaxelSensor:
         validate(self)
 
 
-def measure_taxels(force: jax.Array, gain: jax.Array, sensor: TaxelSensor,
-                   key: jax.Array) -> jax.Array:
+def measure_taxels(force: jax.Array, gain: jax.Array, sensor: TaxelSensor, key: jax.Array) -> jax.Array:
     """Measured taxel forces [F, N] N from true ones: gain [F, 1], noise, threshold, counts."""
     reading = force * gain + sensor.noise * jax.random.normal(key, force.shape)
     reading = jnp.where(reading < sensor.threshold, 0.0, reading)
@@ -239,8 +250,9 @@ def measure_taxels(force: jax.Array, gain: jax.Array, sensor: TaxelSensor,
     return jnp.clip(reading, 0.0, sensor.saturation)
 
 
-def measure_tangential(tangential: jax.Array, force: jax.Array, gain: jax.Array,
-                       sensor: TaxelSensor, key: jax.Array) -> jax.Array:
+def measure_tangential(
+    tangential: jax.Array, force: jax.Array, gain: jax.Array, sensor: TaxelSensor, key: jax.Array
+) -> jax.Array:
     """What three-axis taxels report of a finger's tangential force, summed over them.
 
     Each taxel bears its share with noise and whole counts (a signed byte of them), so a load that

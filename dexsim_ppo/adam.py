@@ -21,12 +21,22 @@ class AdamState:
 
 def init(params: Tree) -> AdamState:
     """Zero moments."""
-    return AdamState(count=jnp.zeros((), jnp.int32), mean=jax.tree.map(jnp.zeros_like, params),
-                     variance=jax.tree.map(jnp.zeros_like, params))
+    return AdamState(
+        count=jnp.zeros((), jnp.int32),
+        mean=jax.tree.map(jnp.zeros_like, params),
+        variance=jax.tree.map(jnp.zeros_like, params),
+    )
 
 
-def update(grads: Tree, state: AdamState, params: Tree, learning_rate: jax.Array | float, *,
-           decay: tuple[float, float] = (0.9, 0.999), epsilon: float = 1e-5) -> tuple[Tree, AdamState]:
+def update(
+    grads: Tree,
+    state: AdamState,
+    params: Tree,
+    learning_rate: jax.Array | float,
+    *,
+    decay: tuple[float, float] = (0.9, 0.999),
+    epsilon: float = 1e-5,
+) -> tuple[Tree, AdamState]:
     """One step down the gradient; returns the new parameters and moments."""
     b1, b2 = decay
     count = state.count + 1

@@ -36,8 +36,21 @@ FORMAT_VERSION = 1
 LIBRARY_VERSION = "0.1.0"
 _PREFIX = struct.Struct("<6sHQ32s")
 _HASHED_PREFIX = struct.Struct("<6sHQ")
-_DTYPES = ("bool", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64", "float16",
-           "bfloat16", "float32", "float64")
+_DTYPES = (
+    "bool",
+    "int8",
+    "int16",
+    "int32",
+    "int64",
+    "uint8",
+    "uint16",
+    "uint32",
+    "uint64",
+    "float16",
+    "bfloat16",
+    "float32",
+    "float64",
+)
 
 
 @dataclass(frozen=True)
@@ -68,13 +81,27 @@ def save(path: str | Path, *, kind: str, task: str, content: Mapping[str, Any], 
             prng, leaf = str(jax.random.key_impl(leaf)), jax.random.key_data(leaf)
         array = np.asarray(jax.device_get(leaf))
         arrays.append(array if array.flags.c_contiguous else array.copy(order="C"))
-        leaves.append({"path": jax.tree_util.keystr(tree_path), "dtype": array.dtype.name,
-                       "shape": list(array.shape), "prng": prng})
+        leaves.append(
+            {
+                "path": jax.tree_util.keystr(tree_path),
+                "dtype": array.dtype.name,
+                "shape": list(array.shape),
+                "prng": prng,
+            }
+        )
     digest = hashlib.sha256()
     for array in arrays:
         digest.update(_bytes(array))
-    header = msgpack.packb({"kind": kind, "task": task, "library": LIBRARY_VERSION,
-                            "content": dict(content), "leaves": leaves, "sha256": digest.digest()})
+    header = msgpack.packb(
+        {
+            "kind": kind,
+            "task": task,
+            "library": LIBRARY_VERSION,
+            "content": dict(content),
+            "leaves": leaves,
+            "sha256": digest.digest(),
+        }
+    )
     prefix = _HASHED_PREFIX.pack(MAGIC, FORMAT_VERSION, len(header))
     head = prefix + hashlib.sha256(prefix + header).digest() + header
     write_whole(Path(path), [head, *map(_bytes, arrays)])
@@ -101,8 +128,14 @@ def load(path: str | Path, *, kind: str, task: str | None = None) -> Checkpoint:
         raise CheckpointError(f"{path}: is a {header['kind']!r} file, not a {kind!r} file")
     if task is not None and header["task"] != task:
         raise CheckpointError(f"{path}: is of the task {header['task']!r}, not {task!r}")
-    return Checkpoint(path, header["kind"], header["task"], header["library"], header["content"],
-                      _read_leaves(path, header["leaves"], payload))
+    return Checkpoint(
+        path,
+        header["kind"],
+        header["task"],
+        header["library"],
+        header["content"],
+        _read_leaves(path, header["leaves"], payload),
+    )
 
 
 def restore(checkpoint: Checkpoint, like: Tree) -> Tree:
@@ -115,14 +148,17 @@ def restore(checkpoint: Checkpoint, like: Tree) -> Tree:
     paths = [jax.tree_util.keystr(tree_path) for tree_path, _ in wanted]
     for name in (*paths, *checkpoint.leaves):
         if (name in checkpoint.leaves) != (name in set(paths)):
-            raise CheckpointError(f"{checkpoint.path}: does not fit this configuration: {name} is "
-                                  f"{'not expected' if name in checkpoint.leaves else 'missing'}")
+            raise CheckpointError(
+                f"{checkpoint.path}: does not fit this configuration: {name} is "
+                f"{'not expected' if name in checkpoint.leaves else 'missing'}"
+            )
     for name, (_, leaf) in zip(paths, wanted, strict=True):
         found = checkpoint.leaves[name]
         if found.shape != leaf.shape or found.dtype != leaf.dtype:
             raise CheckpointError(
                 f"{checkpoint.path}: does not fit this configuration: {name} is "
-                f"{found.dtype}{list(found.shape)}, expected {leaf.dtype}{list(leaf.shape)}")
+                f"{found.dtype}{list(found.shape)}, expected {leaf.dtype}{list(leaf.shape)}"
+            )
     return jax.tree_util.tree_unflatten(structure, [checkpoint.leaves[name] for name in paths])
 
 
@@ -132,32 +168,34 @@ def _bytes(array: np.ndarray) -> memoryview:
 
 def _open_envelope(path: Path, data: memoryview) -> tuple[dict[str, Any], memoryview]:
     """Header and payload of a file whose hashes are right."""
-    if bytes(data[:len(MAGIC)]) != MAGIC:
+    if bytes(data[: len(MAGIC)]) != MAGIC:
         raise CheckpointError(f"{path}: is not a dexsim checkpoint or policy")
     if len(data) < _PREFIX.size:
         raise CheckpointError(f"{path}: is cut short")
-    _, version, header_size, digest = _PREFIX.unpack(data[:_PREFIX.size])
+    _, version, header_size, digest = _PREFIX.unpack(data[: _PREFIX.size])
     if version > FORMAT_VERSION:
-        raise CheckpointError(f"{path}: has format version {version}, and this dexsim reads up to "
-                              f"{FORMAT_VERSION}: update dexsim")
+        raise CheckpointError(
+            f"{path}: has format version {version}, and this dexsim reads up to {FORMAT_VERSION}: update dexsim"
+        )
     if header_size > len(data) - _PREFIX.size:
         raise CheckpointError(f"{path}: is cut short")
-    header_bytes = data[_PREFIX.size:_PREFIX.size + header_size]
-    if hashlib.sha256(bytes(data[:_HASHED_PREFIX.size]) + header_bytes).digest() != digest:
+    header_bytes = data[_PREFIX.size : _PREFIX.size + header_size]
+    if hashlib.sha256(bytes(data[: _HASHED_PREFIX.size]) + header_bytes).digest() != digest:
         raise CheckpointError(f"{path}: is damaged (the header's checksum is wrong)")
     try:
         header = msgpack.unpackb(header_bytes)
         size = sum(_leaf_size(leaf) for leaf in header["leaves"])
-        for name, kind in (("kind", str), ("task", str), ("library", str), ("content", dict),
-                           ("sha256", bytes)):
+        for name, kind in (("kind", str), ("task", str), ("library", str), ("content", dict), ("sha256", bytes)):
             if not isinstance(header[name], kind):
                 raise TypeError(f"{name} is not a {kind.__name__}")
     except Exception as error:  # Hashed, so a faulty writer rather than damage.
         raise CheckpointError(f"{path}: has a header that makes no sense ({error})") from None
-    payload = data[_PREFIX.size + header_size:]
+    payload = data[_PREFIX.size + header_size :]
     if len(payload) != size:
-        raise CheckpointError(f"{path}: is {'cut short' if len(payload) < size else 'too long'}: "
-                              f"{len(payload)} bytes of arrays, expected {size}")
+        raise CheckpointError(
+            f"{path}: is {'cut short' if len(payload) < size else 'too long'}: "
+            f"{len(payload)} bytes of arrays, expected {size}"
+        )
     if hashlib.sha256(payload).digest() != header["sha256"]:
         raise CheckpointError(f"{path}: is damaged (the arrays' checksum is wrong)")
     return header, payload
@@ -179,8 +217,7 @@ def _read_leaves(path: Path, specs: list[dict[str, Any]], payload: memoryview) -
         array = np.frombuffer(payload, dtype, math.prod(spec["shape"]), offset).reshape(spec["shape"])
         offset += array.nbytes
         try:
-            leaves[spec["path"]] = (jax.random.wrap_key_data(array, impl=spec["prng"])
-                                    if spec["prng"] else array)
+            leaves[spec["path"]] = jax.random.wrap_key_data(array, impl=spec["prng"]) if spec["prng"] else array
         except Exception as error:
             raise CheckpointError(f"{path}: {spec['path']} is no PRNG key ({error})") from None
     return leaves

@@ -41,8 +41,7 @@ def run(main: Callable[[Sequence[str] | None], int]) -> None:
     sys.exit(code)
 
 
-def parse(cls: type[T], argv: Sequence[str], *, prog: str, description: str,
-          default: T | None = None) -> T:
+def parse(cls: type[T], argv: Sequence[str], *, prog: str, description: str, default: T | None = None) -> T:
     """Options of a dataclass, through tyro; its boxed messages become one line.
 
     Raises:
@@ -71,8 +70,7 @@ def _one_line(box: str) -> str:
     parts = re.split(r"\n[-─]{4,}\n", "\n".join(lines).strip())
     message = parts[0] if "╭" in box else parts[min(1, len(parts) - 1)]
     meant = re.search(r"Perhaps you meant:?\s+(--[\w.-]+)", "\n".join(lines))
-    return (" ".join(message.split()).rstrip(".")
-            + (f" (perhaps {meant[1]})" if meant else "") + "; see --help")
+    return " ".join(message.split()).rstrip(".") + (f" (perhaps {meant[1]})" if meant else "") + "; see --help"
 
 
 def enable_caches() -> None:
@@ -95,10 +93,16 @@ def environment_report() -> dict[str, Any]:
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
             versions[name] = importlib.metadata.version(name)
     devices = jax.devices()
-    return {"versions": versions,
-            "hardware": {"platform": devices[0].platform, "device": devices[0].device_kind,
-                         "devices": len(devices), "cpu_cores": os.cpu_count(),
-                         "machine": platform.machine()}}
+    return {
+        "versions": versions,
+        "hardware": {
+            "platform": devices[0].platform,
+            "device": devices[0].device_kind,
+            "devices": len(devices),
+            "cpu_cores": os.cpu_count(),
+            "machine": platform.machine(),
+        },
+    }
 
 
 def write_json(path: Path, data: Any) -> None:

@@ -8,10 +8,16 @@ from rich.live import Live
 from rich.table import Table
 
 # (heading, metric, format); a metric that the task does not have is left out.
-COLUMNS = (("return", "episode/return", ".2f"), ("success", "episode/success", ".1%"),
-           ("goals/min", "episode/goals_per_minute", ".1f"),
-           ("length", "episode/length", ".0f"), ("reward", "reward", ".3f"), ("KL", "kl", ".4f"),
-           ("lr", "learning_rate", ".1e"), ("std", "action_std", ".2f"))
+COLUMNS = (
+    ("return", "episode/return", ".2f"),
+    ("success", "episode/success", ".1%"),
+    ("goals/min", "episode/goals_per_minute", ".1f"),
+    ("length", "episode/length", ".0f"),
+    ("reward", "reward", ".3f"),
+    ("KL", "kl", ".4f"),
+    ("lr", "learning_rate", ".1e"),
+    ("std", "action_std", ".2f"),
+)
 
 
 class Display:
@@ -53,8 +59,12 @@ class Display:
 
     @staticmethod
     def _cells(row: dict[str, Any]) -> dict[str, str]:
-        cells = {"iteration": f"{row['iteration']}", "steps": count(row["env_steps"]),
-                 "steps/s": count(row["env_steps_per_s"]), "left": duration(row["seconds_left"])}
+        cells = {
+            "iteration": f"{row['iteration']}",
+            "steps": count(row["env_steps"]),
+            "steps/s": count(row["env_steps_per_s"]),
+            "left": duration(row["seconds_left"]),
+        }
         errors = sorted(k for k in row if k.startswith("step/") and k.endswith("error"))
         extra = tuple((k.removeprefix("step/").replace("_", " "), k, ".3f") for k in errors[:1])
         for heading, name, style in (*COLUMNS[:4], *extra, *COLUMNS[4:]):

@@ -27,8 +27,7 @@ def entropy(log_std: jax.Array) -> jax.Array:
     return jnp.sum(log_std + 0.5 * math.log(2 * math.pi * math.e), axis=-1)
 
 
-def kl_divergence(mean_p: jax.Array, log_std_p: jax.Array, mean_q: jax.Array,
-                  log_std_q: jax.Array) -> jax.Array:
+def kl_divergence(mean_p: jax.Array, log_std_p: jax.Array, mean_q: jax.Array, log_std_q: jax.Array) -> jax.Array:
     """KL(p || q) in nats, summed over the last axis."""
     variance_ratio = jnp.exp(2 * (log_std_p - log_std_q))
     distance = ((mean_p - mean_q) * jnp.exp(-log_std_q)) ** 2

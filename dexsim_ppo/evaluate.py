@@ -47,8 +47,7 @@ class Evaluator:
         self.totals = env.evaluation == "totals"
         self._run = jit(self._episodes)
 
-    def __call__(self, params: PolicyParams, *, episodes: int,
-                 seed: int) -> tuple[dict[str, Any], Any]:
+    def __call__(self, params: PolicyParams, *, episodes: int, seed: int) -> tuple[dict[str, Any], Any]:
         """Measure over at least `episodes` episodes, rounded up to whole chunks.
 
         Returns:
@@ -58,13 +57,16 @@ class Evaluator:
         """
         started = time.perf_counter()
         with collector_paused():
-            chunks = [jax.device_get(self._run(params, jax.random.fold_in(jax.random.key(seed), i)))
-                      for i in range(math.ceil(episodes / self.chunk))]
+            chunks = [
+                jax.device_get(self._run(params, jax.random.fold_in(jax.random.key(seed), i)))
+                for i in range(math.ceil(episodes / self.chunk))
+            ]
         # Episodes are the last axis of all that is measured.
-        measured = jax.tree.map(lambda *xs: np.concatenate(xs, axis=-1),
-                                *(measured for measured, _ in chunks))
+        measured = jax.tree.map(lambda *xs: np.concatenate(xs, axis=-1), *(measured for measured, _ in chunks))
         report = (summarize_totals if self.totals else summarize)(self.env, *measured) | {
-            "seed": seed, "seconds": time.perf_counter() - started}
+            "seed": seed,
+            "seconds": time.perf_counter() - started,
+        }
         return report, self._film(*chunks[0][1])
 
     def _episodes(self, params: PolicyParams, key: jax.Array):
@@ -88,7 +90,8 @@ class Evaluator:
         state = self.env.evaluation_starts(key, self.chunk)
         last = (dict(state.metrics), jnp.zeros(self.chunk, jnp.int32), jnp.zeros(self.chunk, bool))
         (_, last), (series, film) = jax.lax.scan(
-            step, (state, last if self.totals else None), None, length=self.env.evaluation_steps)
+            step, (state, last if self.totals else None), None, length=self.env.evaluation_steps
+        )
         return (last[:2] if self.totals else series), film
 
     def _film(self, frames: Any, terminated: np.ndarray) -> Any:
@@ -96,12 +99,10 @@ class Evaluator:
         after, longest = (round(s / self.env.control_period) for s in (0.5, self.SHOWN_SECONDS))
         ends = [int(np.argmax(t)) + after if t.any() else len(t) for t in terminated.T]
         ends = [min(end, longest) for end in ends]
-        return jax.tree.map(lambda x: np.concatenate([x[:end, i] for i, end in enumerate(ends)]),
-                            frames)
+        return jax.tree.map(lambda x: np.concatenate([x[:end, i] for i, end in enumerate(ends)]), frames)
 
 
-def summarize(env: Environment, metrics: dict[str, np.ndarray],
-              terminated: np.ndarray) -> dict[str, Any]:
+def summarize(env: Environment, metrics: dict[str, np.ndarray], terminated: np.ndarray) -> dict[str, Any]:
     """Report of episodes from their metrics `[T, N]` and termination flags `[T, N]`.
 
     An episode lives up to, and not including, its first terminated step. That step's reward belongs to
@@ -113,18 +114,27 @@ def summarize(env: Environment, metrics: dict[str, np.ndarray],
     last = np.minimum(steps_held, steps - 1)
     returns = metrics["return"][last, np.arange(episodes)]
     masked = {name: np.where(alive, values, 0) for name, values in metrics.items()}
-    return {"episodes": episodes, "steps": steps, "held": proportion(alive[-1]),
-            "return": mean_interval(returns), "steps_held": mean_interval(steps_held),
-            "task": env.summarize(masked, alive)}
+    return {
+        "episodes": episodes,
+        "steps": steps,
+        "held": proportion(alive[-1]),
+        "return": mean_interval(returns),
+        "steps_held": mean_interval(steps_held),
+        "task": env.summarize(masked, alive),
+    }
 
 
-def summarize_totals(env: Environment, metrics: dict[str, np.ndarray],
-                     lived: np.ndarray) -> dict[str, Any]:
+def summarize_totals(env: Environment, metrics: dict[str, np.ndarray], lived: np.ndarray) -> dict[str, Any]:
     """Report of episodes from the metrics of their last tick [N] and the ticks they lived [N]."""
     held = lived == env.evaluation_steps
-    return {"episodes": int(lived.size), "steps": env.evaluation_steps, "held": proportion(held),
-            "return": mean_interval(metrics["return"]), "steps_held": mean_interval(lived),
-            "task": env.summarize(metrics, lived)}
+    return {
+        "episodes": int(lived.size),
+        "steps": env.evaluation_steps,
+        "held": proportion(held),
+        "return": mean_interval(metrics["return"]),
+        "steps_held": mean_interval(lived),
+        "task": env.summarize(metrics, lived),
+    }
 
 
 def _follow(last: tuple, metrics: dict[str, jax.Array], terminated: jax.Array) -> tuple:
@@ -172,11 +182,12 @@ def make_env(policy: Policy, *, backend: str, num_envs: int) -> Environment:
     import dexsim
 
     entry = cli.find_task(policy.task)
-    env = dexsim.make(policy.task, from_dict(entry.config_class, policy.env_config), backend=backend,
-                      num_envs=num_envs)
+    env = dexsim.make(policy.task, from_dict(entry.config_class, policy.env_config), backend=backend, num_envs=num_envs)
     if layout_to_list(env.observation_layout["actor"]) != layout_to_list(policy.observation_layout):
-        raise CheckpointError(f"the policy observes {layout_to_list(policy.observation_layout)}, and "
-                              f"{env.name} gives {layout_to_list(env.observation_layout['actor'])}")
+        raise CheckpointError(
+            f"the policy observes {layout_to_list(policy.observation_layout)}, and "
+            f"{env.name} gives {layout_to_list(env.observation_layout['actor'])}"
+        )
     return env
 
 
@@ -214,20 +225,25 @@ class EvaluateArguments:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """The command. Returns its exit code."""
-    arguments = cli.parse(EvaluateArguments, sys.argv[1:] if argv is None else argv,
-                          prog="python -m dexsim_ppo.evaluate",
-                          description="Measure a policy over fixed, seeded episodes.")
+    arguments = cli.parse(
+        EvaluateArguments,
+        sys.argv[1:] if argv is None else argv,
+        prog="python -m dexsim_ppo.evaluate",
+        description="Measure a policy over fixed, seeded episodes.",
+    )
     cli.enable_caches()
     policy = load_policy(arguments.policy).blind(*arguments.blind)
-    chunk = min(arguments.chunk or (1024 if jax.default_backend() == "gpu" else 64),
-                arguments.episodes)
+    chunk = min(arguments.chunk or (1024 if jax.default_backend() == "gpu" else 64), arguments.episodes)
     seconds = [f"evaluation_seconds={arguments.seconds}"] if arguments.seconds else []
     policy = dataclasses.replace(policy, env_config=override(policy.env_config, (*seconds, *arguments.set)))
     env = make_env(policy, backend=arguments.backend, num_envs=chunk)
-    report, snapshots = Evaluator(env, chunk)(policy.params, episodes=arguments.episodes,
-                                              seed=arguments.seed)
-    report |= {"policy": arguments.policy, "blind": list(arguments.blind), "set": list(arguments.set),
-               "backend": env.backend}
+    report, snapshots = Evaluator(env, chunk)(policy.params, episodes=arguments.episodes, seed=arguments.seed)
+    report |= {
+        "policy": arguments.policy,
+        "blind": list(arguments.blind),
+        "set": list(arguments.set),
+        "backend": env.backend,
+    }
     report |= cli.environment_report()
     if arguments.output:
         cli.write_json(arguments.output, report)
@@ -250,8 +266,7 @@ def print_report(report: dict[str, Any], *, title: str) -> None:
         if name not in report:  # With its interval it is in the table already.
             table.add_row(name, "-" if value is None else f"{value:.4g}", "")
     Console().print(table)
-    print(f"{report['episodes']} episodes of {report['steps']} steps, seed {report['seed']}, "
-          f"{report['seconds']:.1f} s")
+    print(f"{report['episodes']} episodes of {report['steps']} steps, seed {report['seed']}, {report['seconds']:.1f} s")
 
 
 if __name__ == "__main__":

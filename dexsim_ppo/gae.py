@@ -4,9 +4,16 @@ import jax
 import jax.numpy as jnp
 
 
-def compute_gae(reward: jax.Array, value: jax.Array, next_value: jax.Array, terminated: jax.Array,
-                truncated: jax.Array, *, discount: float,
-                gae_lambda: float) -> tuple[jax.Array, jax.Array]:
+def compute_gae(
+    reward: jax.Array,
+    value: jax.Array,
+    next_value: jax.Array,
+    terminated: jax.Array,
+    truncated: jax.Array,
+    *,
+    discount: float,
+    gae_lambda: float,
+) -> tuple[jax.Array, jax.Array]:
     """Advantages and value targets, all arrays `[T, B]`, time first.
 
     A step that ends its episode for either reason cuts the sum over later steps. Only a terminated one
@@ -30,6 +37,5 @@ def compute_gae(reward: jax.Array, value: jax.Array, next_value: jax.Array, term
         advantage = delta_t + carry_t * advantage
         return advantage, advantage
 
-    _, advantage = jax.lax.scan(backward, jnp.zeros_like(delta[0]), (delta, carry_on), reverse=True,
-                                unroll=8)
+    _, advantage = jax.lax.scan(backward, jnp.zeros_like(delta[0]), (delta, carry_on), reverse=True, unroll=8)
     return advantage, advantage + value

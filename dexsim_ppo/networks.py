@@ -53,8 +53,9 @@ def apply_mlp(layers: MLP, x: jax.Array, precision: str = "highest") -> jax.Arra
     return x
 
 
-def init_params(key: jax.Array, *, actor_sizes: tuple[int, ...], critic_sizes: tuple[int, ...],
-                initial_std: float) -> Params:
+def init_params(
+    key: jax.Array, *, actor_sizes: tuple[int, ...], critic_sizes: tuple[int, ...], initial_std: float
+) -> Params:
     """Parameters of both networks; the small actor gain makes the first actions nearly the noise's.
 
     Args:
@@ -69,8 +70,7 @@ def init_params(key: jax.Array, *, actor_sizes: tuple[int, ...], critic_sizes: t
     )
 
 
-def rescale_output(layers: MLP, mean: jax.Array, std: jax.Array, new_mean: jax.Array,
-                   new_std: jax.Array) -> MLP:
+def rescale_output(layers: MLP, mean: jax.Array, std: jax.Array, new_mean: jax.Array, new_std: jax.Array) -> MLP:
     """Change the last layer so that `new_std * out + new_mean` is what `std * out + mean` was.
 
     Keeps the critic's predictions when the value normaliser moves (PopArt, van Hasselt et al. 2016).

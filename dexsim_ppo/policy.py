@@ -79,10 +79,14 @@ class Policy:
     def save(self, path: str | Path) -> None:
         """Write to a file, whole or not at all."""
         content = {
-            "env_config": self.env_config, "control_rate": self.control_rate,
+            "env_config": self.env_config,
+            "control_rate": self.control_rate,
             "observation_layout": layout_to_list(self.observation_layout),
-            "squash": self.params.squash, "clip": self.params.normalizer.clip,
-            "layers": len(self.params.layers), "training": self.training}
+            "squash": self.params.squash,
+            "clip": self.params.normalizer.clip,
+            "layers": len(self.params.layers),
+            "training": self.training,
+        }
         checkpoint.save(path, kind="policy", task=self.task, content=content, tree=self.params)
 
     @classmethod
@@ -102,8 +106,9 @@ class Policy:
             raise CheckpointError(f"{path}: is not a sound policy ({error!r})") from None
 
     @classmethod
-    def from_training(cls, env: Environment, config: Any, state: Any,
-                      training: dict[str, Any] | None = None) -> "Policy":
+    def from_training(
+        cls, env: Environment, config: Any, state: Any, training: dict[str, Any] | None = None
+    ) -> "Policy":
         """The policy that a learner's state stands for.
 
         Args:
@@ -112,33 +117,48 @@ class Policy:
           training: what to remember of its origin.
         """
         fields = env.observation_layout["actor"]
-        normalizer = make_normalizer(state.observation_stats["actor"], fields,
-                                     std_floor=config.observation_std_floor,
-                                     clip=config.observation_clip)
+        normalizer = make_normalizer(
+            state.observation_stats["actor"],
+            fields,
+            std_floor=config.observation_std_floor,
+            clip=config.observation_clip,
+        )
         params = PolicyParams(state.params.actor, normalizer, config.distribution)
-        return cls(task=env.name, env_config=to_dict(env.config),
-                   observation_layout=tuple(Field(f.name, f.size, f.scale) for f in fields),
-                   params=jax.tree.map(jnp.copy, params),
-                   control_rate=1.0 / env.control_period, training=training or {})
+        return cls(
+            task=env.name,
+            env_config=to_dict(env.config),
+            observation_layout=tuple(Field(f.name, f.size, f.scale) for f in fields),
+            params=jax.tree.map(jnp.copy, params),
+            control_rate=1.0 / env.control_period,
+            training=training or {},
+        )
 
     @classmethod
     def _from_file(cls, file: checkpoint.Checkpoint) -> "Policy":
         content, leaves = file.content, file.leaves
         layout = tuple(Field(*field) for field in content["observation_layout"])
-        layers = tuple(Layer(leaves[f".layers[{i}].kernel"], leaves[f".layers[{i}].bias"])
-                       for i in range(content["layers"]))
-        normalizer = Normalizer(leaves[".normalizer.mean"], leaves[".normalizer.std"],
-                                content["clip"])
+        layers = tuple(
+            Layer(leaves[f".layers[{i}].kernel"], leaves[f".layers[{i}].bias"]) for i in range(content["layers"])
+        )
+        normalizer = Normalizer(leaves[".normalizer.mean"], leaves[".normalizer.std"], content["clip"])
         sizes = [layout_size(layout), *(layer.kernel.shape[1] for layer in layers)]
         shapes = [(layer.kernel.shape, layer.bias.shape) for layer in layers]
         wanted = [((n, m), (m,)) for n, m in zip(sizes[:-1], sizes[1:], strict=True)]
-        if (len(leaves) != 2 * len(layers) + 2 or shapes != wanted
-                or not normalizer.mean.shape == normalizer.std.shape == (sizes[0],)):
+        if (
+            len(leaves) != 2 * len(layers) + 2
+            or shapes != wanted
+            or not normalizer.mean.shape == normalizer.std.shape == (sizes[0],)
+        ):
             raise ValueError(f"layer shapes {shapes} for {sizes[0]} observations")
         params = PolicyParams(layers, normalizer, content["squash"])
-        return cls(task=file.task, env_config=content["env_config"], observation_layout=layout,
-                   params=jax.tree.map(jnp.asarray, params),
-                   control_rate=content["control_rate"], training=content["training"])
+        return cls(
+            task=file.task,
+            env_config=content["env_config"],
+            observation_layout=layout,
+            params=jax.tree.map(jnp.asarray, params),
+            control_rate=content["control_rate"],
+            training=content["training"],
+        )
 
 
 def layout_to_list(fields: Fields) -> list[list[Any]]:

@@ -68,20 +68,25 @@ class PPOConfig:
     """Smallest deviation that a running observation normaliser divides by."""
     observation_clip: float = setting(5.0, low=0.1)
     """Bound on the magnitude of normalised observations."""
-    matmul_precision: Literal["default", "high", "highest"] = setting(
-        "highest", choices=("default", "high", "highest"))
+    matmul_precision: Literal["default", "high", "highest"] = setting("highest", choices=("default", "high", "highest"))
     """Of the networks' matrix products; on NVIDIA GPUs `default` is TF32."""
 
     def __post_init__(self) -> None:
         validate(self)
         if self.num_envs * self.rollout_length % self.minibatches:
-            raise ConfigError(f"PPOConfig.minibatches = {self.minibatches}: must divide num_envs * "
-                              f"rollout_length = {self.num_envs * self.rollout_length}")
-        for low, mid, high in (("learning_rate_min", "learning_rate", "learning_rate_max"),
-                               ("std_min", "initial_std", "std_max")):
+            raise ConfigError(
+                f"PPOConfig.minibatches = {self.minibatches}: must divide num_envs * "
+                f"rollout_length = {self.num_envs * self.rollout_length}"
+            )
+        for low, mid, high in (
+            ("learning_rate_min", "learning_rate", "learning_rate_max"),
+            ("std_min", "initial_std", "std_max"),
+        ):
             if not getattr(self, low) <= getattr(self, mid) <= getattr(self, high):
-                raise ConfigError(f"PPOConfig.{mid} = {getattr(self, mid):g}: must be between {low} "
-                                  f"= {getattr(self, low):g} and {high} = {getattr(self, high):g}")
+                raise ConfigError(
+                    f"PPOConfig.{mid} = {getattr(self, mid):g}: must be between {low} "
+                    f"= {getattr(self, low):g} and {high} = {getattr(self, high):g}"
+                )
 
     @property
     def steps_per_iteration(self) -> int:

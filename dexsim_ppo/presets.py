@@ -29,17 +29,37 @@ class Preset:
 PRESETS = {
     # Two cores: simulation is nearly all of the time, so small networks and many passes over little data.
     "cpu": Preset(
-        ppo=PPOConfig(num_envs=256, rollout_length=16, epochs=5, minibatches=4,
-                      actor_layers=(128, 128), critic_layers=(128, 128)),
-        steps=0, minutes=6.5, evaluate_every=0, evaluation_chunk=50, evaluation_episodes=150,
-        log_every=5),
+        ppo=PPOConfig(
+            num_envs=256, rollout_length=16, epochs=5, minibatches=4, actor_layers=(128, 128), critic_layers=(128, 128)
+        ),
+        steps=0,
+        minutes=6.5,
+        evaluate_every=0,
+        evaluation_chunk=50,
+        evaluation_episodes=150,
+        log_every=5,
+    ),
     # One large GPU: enough environments to fill it, few large minibatches.
     "gpu": Preset(
-        ppo=PPOConfig(num_envs=32768, rollout_length=16, epochs=4, minibatches=16, kl_target=0.015,
-                      entropy_coefficient=0.004, matmul_precision="default",
-                      actor_layers=(256, 256, 128), critic_layers=(256, 256, 128)),
-        steps=0, minutes=8.0, evaluate_every=100, evaluation_chunk=1024, evaluation_episodes=1024,
-        log_every=10, corners=0.6),
+        ppo=PPOConfig(
+            num_envs=32768,
+            rollout_length=16,
+            epochs=4,
+            minibatches=16,
+            kl_target=0.015,
+            entropy_coefficient=0.004,
+            matmul_precision="default",
+            actor_layers=(256, 256, 128),
+            critic_layers=(256, 256, 128),
+        ),
+        steps=0,
+        minutes=8.0,
+        evaluate_every=100,
+        evaluation_chunk=1024,
+        evaluation_episodes=1024,
+        log_every=10,
+        corners=0.6,
+    ),
 }
 
 

@@ -28,15 +28,22 @@ from dexsim_ppo.cli import environment_report
 from dexsim_ppo.compilation import jit
 
 KEPT = 8  # of some 10 MB each, the newest
-_OPTIONS = ("jax_enable_x64", "jax_default_matmul_precision", "jax_default_prng_impl", "jax_debug_nans",
-            "jax_debug_infs", "jax_disable_jit", "jax_numpy_dtype_promotion", "jax_threefry_partitionable")
+_OPTIONS = (
+    "jax_enable_x64",
+    "jax_default_matmul_precision",
+    "jax_default_prng_impl",
+    "jax_debug_nans",
+    "jax_debug_infs",
+    "jax_disable_jit",
+    "jax_numpy_dtype_promotion",
+    "jax_threefry_partitionable",
+)
 
 
 class Program:
     """A compiled `step(state) -> (state, metrics)`, whose state may hold typed keys."""
 
-    def __init__(self, compiled: Callable, like: Any, names: list[str],
-                 instead: Callable[[], "Program"] | None = None):
+    def __init__(self, compiled: Callable, like: Any, names: list[str], instead: Callable[[], "Program"] | None = None):
         """`instead` makes the program anew, should one that was kept not run."""
         self._compiled, self._names, self._instead = compiled, names, instead
         self._leaves = _Leaves(like)
@@ -76,9 +83,14 @@ def compile_step(step: Callable, shapes: Any, identity: Any, on_traced: Callable
 
 def key(identity: Any, shapes: Any) -> str:
     """The hash of a program: its identity, this package, versions, machine, and options of JAX."""
-    parts = [identity, environment_report(), _cpu_features(), os.environ.get("XLA_FLAGS", ""),
-             {name: str(getattr(jax.config, name, None)) for name in _OPTIONS},
-             [f"{path} {leaf.shape} {leaf.dtype}" for path, leaf in jax.tree.leaves_with_path(shapes)]]
+    parts = [
+        identity,
+        environment_report(),
+        _cpu_features(),
+        os.environ.get("XLA_FLAGS", ""),
+        {name: str(getattr(jax.config, name, None)) for name in _OPTIONS},
+        [f"{path} {leaf.shape} {leaf.dtype}" for path, leaf in jax.tree.leaves_with_path(shapes)],
+    ]
     digest = hashlib.sha256(json.dumps(parts, default=str).encode())
     for source in python_sources(Path(__file__).resolve().parent):
         digest.update(source.read_bytes())
@@ -93,13 +105,19 @@ class _Leaves:
         self._is_key = [jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key) for leaf in leaves]
 
     def of(self, tree: Any) -> list[jax.Array]:
-        return [jax.random.key_data(leaf) if is_key else leaf
-                for leaf, is_key in zip(jax.tree.leaves(tree), self._is_key, strict=True)]
+        return [
+            jax.random.key_data(leaf) if is_key else leaf
+            for leaf, is_key in zip(jax.tree.leaves(tree), self._is_key, strict=True)
+        ]
 
     def back(self, leaves: list[jax.Array]) -> Any:
-        return jax.tree.unflatten(self._tree, [
-            jax.random.wrap_key_data(leaf) if is_key else leaf
-            for leaf, is_key in zip(leaves, self._is_key, strict=True)])
+        return jax.tree.unflatten(
+            self._tree,
+            [
+                jax.random.wrap_key_data(leaf) if is_key else leaf
+                for leaf, is_key in zip(leaves, self._is_key, strict=True)
+            ],
+        )
 
 
 def _compile(path: Path, step: Callable, shapes: Any, on_traced: Callable[[], None]) -> Program:

@@ -42,8 +42,9 @@ Value = Callable[[Mapping[str, jax.Array]], jax.Array]
 """`value(obs) -> [B]`"""
 
 
-def collect(env: Environment, state: Any, key: jax.Array, act: Act, value: Value,
-            length: int) -> tuple[Any, Rollout, dict[str, jax.Array]]:
+def collect(
+    env: Environment, state: Any, key: jax.Array, act: Act, value: Value, length: int
+) -> tuple[Any, Rollout, dict[str, jax.Array]]:
     """Run the policy for `length` steps.
 
     The order is: act, step, record, restart. So the recorded flags, metrics and `next_value` belong to
@@ -64,8 +65,14 @@ def collect(env: Environment, state: Any, key: jax.Array, act: Act, value: Value
         decision, action = act(key, obs)
         after = step_env(state, action)
         record = Rollout(
-            obs=obs, decision=decision, value=value(obs), next_value=value(after.obs), reward=after.reward,
-            terminated=after.terminated, truncated=after.truncated & ~after.terminated)
+            obs=obs,
+            decision=decision,
+            value=value(obs),
+            next_value=value(after.obs),
+            reward=after.reward,
+            terminated=after.terminated,
+            truncated=after.truncated & ~after.terminated,
+        )
         return after, (record, dict(after.metrics))
 
     state, (rollout, told) = scan_restarting(env, step, state, jax.random.split(key, length))
@@ -73,16 +80,20 @@ def collect(env: Environment, state: Any, key: jax.Array, act: Act, value: Value
     finite, done = jnp.isfinite(rollout.reward), rollout.terminated | rollout.truncated
     rollout = dataclasses.replace(rollout, reward=jnp.where(finite, rollout.reward, 0.0))
     episodes, steps = jnp.sum(done, dtype=jnp.float32), done.size
-    metrics = {"reward": jnp.mean(rollout.reward), "episodes": episodes,
-               "terminated_share": jnp.sum(rollout.terminated, dtype=jnp.float32) / episodes,
-               "nonfinite_rewards": jnp.sum(~finite, dtype=jnp.float32)}
+    metrics = {
+        "reward": jnp.mean(rollout.reward),
+        "episodes": episodes,
+        "terminated_share": jnp.sum(rollout.terminated, dtype=jnp.float32) / episodes,
+        "nonfinite_rewards": jnp.sum(~finite, dtype=jnp.float32),
+    }
     metrics |= {f"step/{k}": _sum(v, jnp.ones_like(done)) / steps for k, v in told.items()}
     metrics |= {f"episode/{k}": _sum(v, done) / episodes for k, v in told.items()}
     return state, rollout, metrics
 
 
-def scan_restarting(env: Environment, step: Callable[[Any, Any], tuple[Any, Any]], state: Any,
-                    inputs: Any) -> tuple[Any, Any]:
+def scan_restarting(
+    env: Environment, step: Callable[[Any, Any], tuple[Any, Any]], state: Any, inputs: Any
+) -> tuple[Any, Any]:
     """`jax.lax.scan`, with a new episode after each step wherever one ended.
 
     `jax.vmap(env.restart)` after each step would compute a new episode for every environment and throw nearly

@@ -29,8 +29,7 @@ class RunFolder:
 
     def existing_checkpoints(self) -> list[Path]:
         """Oldest first."""
-        return sorted(p for p in self.checkpoints.glob("*.msgpack")
-                      if re.fullmatch(r"\d{8}\.msgpack", p.name))
+        return sorted(p for p in self.checkpoints.glob("*.msgpack") if re.fullmatch(r"\d{8}\.msgpack", p.name))
 
     def latest_checkpoint(self) -> Path:
         """The newest checkpoint.
@@ -99,23 +98,23 @@ def _tensorboard_writer(path: Path) -> Any:
 def draw_curve(rows: list[dict[str, Any]], path: Path, title: str) -> None:
     """Learning curves over environment steps as a PNG."""
     import matplotlib
+
     matplotlib.use("agg")
     import matplotlib.pyplot as plt
 
     names = [name for name in CURVES if any(row.get(name) is not None for row in rows)]
-    names += sorted({name for row in rows for name in row
-                     if name.startswith("step/") and name.endswith("error")})[:1]
+    names += sorted({name for row in rows for name in row if name.startswith("step/") and name.endswith("error")})[:1]
     if not names:
         return
-    figure, axes = plt.subplots(len(names), 1, figsize=(7, 2.2 * len(names)), sharex=True,
-                                squeeze=False, layout="constrained")
+    figure, axes = plt.subplots(
+        len(names), 1, figsize=(7, 2.2 * len(names)), sharex=True, squeeze=False, layout="constrained"
+    )
     for ax, name in zip(axes[:, 0], names, strict=True):
         points = [(row["env_steps"], row[name]) for row in rows if row.get(name) is not None]
         ax.plot(*zip(*points, strict=True), lw=1.2)
         ax.set_ylabel(name)
         ax.grid(alpha=0.3)
-    held = [(row["env_steps"], row["evaluation/return"]) for row in rows
-            if row.get("evaluation/return") is not None]
+    held = [(row["env_steps"], row["evaluation/return"]) for row in rows if row.get("evaluation/return") is not None]
     if held and names[0] == "episode/return":
         axes[0, 0].plot(*zip(*held, strict=True), "o", ms=4, label="evaluation")
         axes[0, 0].legend()

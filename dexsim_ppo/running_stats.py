@@ -32,8 +32,7 @@ class Normalizer:
 
 def init_stats(shape: tuple[int, ...]) -> RunningStats:
     """Statistics before the first sample: mean 0, variance 1."""
-    return RunningStats(count=jnp.zeros((), jnp.int32), mean=jnp.zeros(shape),
-                        variance=jnp.ones(shape))
+    return RunningStats(count=jnp.zeros((), jnp.int32), mean=jnp.zeros(shape), variance=jnp.ones(shape))
 
 
 def update_stats(stats: RunningStats, batch: jax.Array) -> RunningStats:
@@ -45,15 +44,14 @@ def update_stats(stats: RunningStats, batch: jax.Array) -> RunningStats:
     weight = size / count.astype(jnp.float32)
     delta = batch_mean - stats.mean
     mean = stats.mean + weight * delta
-    variance = ((1 - weight) * stats.variance + weight * batch_variance
-                + weight * (1 - weight) * delta**2)
+    variance = (1 - weight) * stats.variance + weight * batch_variance + weight * (1 - weight) * delta**2
     ok = jnp.isfinite(mean) & jnp.isfinite(variance)
-    return RunningStats(count=count, mean=jnp.where(ok, mean, stats.mean),
-                        variance=jnp.where(ok, variance, stats.variance))
+    return RunningStats(
+        count=count, mean=jnp.where(ok, mean, stats.mean), variance=jnp.where(ok, variance, stats.variance)
+    )
 
 
-def make_normalizer(stats: RunningStats, fields: Fields, *, std_floor: float,
-                    clip: float) -> Normalizer:
+def make_normalizer(stats: RunningStats, fields: Fields, *, std_floor: float, clip: float) -> Normalizer:
     """Normaliser of one observation group.
 
     Fields with a fixed scale are only divided by it: running statistics of a channel that is silent
@@ -68,8 +66,7 @@ def make_normalizer(stats: RunningStats, fields: Fields, *, std_floor: float,
         raise ValueError(f"layout of {scale.size} elements for statistics of {stats.mean.shape}")
     std = jnp.sqrt(stats.variance + std_floor**2)
     fixed = scale > 0
-    return Normalizer(mean=jnp.where(fixed, 0.0, stats.mean), std=jnp.where(fixed, scale, std),
-                      clip=clip)
+    return Normalizer(mean=jnp.where(fixed, 0.0, stats.mean), std=jnp.where(fixed, scale, std), clip=clip)
 
 
 def recover_stats(normalizer: Normalizer, *, std_floor: float) -> RunningStats:
@@ -77,8 +74,11 @@ def recover_stats(normalizer: Normalizer, *, std_floor: float) -> RunningStats:
 
     They count as ones of many samples: they scarcely move.
     """
-    return RunningStats(count=jnp.int32(MEMORY), mean=jnp.copy(normalizer.mean),
-                        variance=jnp.maximum(normalizer.std**2 - std_floor**2, 0.0))
+    return RunningStats(
+        count=jnp.int32(MEMORY),
+        mean=jnp.copy(normalizer.mean),
+        variance=jnp.maximum(normalizer.std**2 - std_floor**2, 0.0),
+    )
 
 
 def normalize(normalizer: Normalizer, x: jax.Array) -> jax.Array:

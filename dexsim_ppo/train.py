@@ -44,22 +44,26 @@ def main(argv: Sequence[str] | None = None) -> int:
     path = resumed.path.parent.parent if resumed else new_run_path(arguments)
     import dexsim
 
-    env = dexsim.make(arguments.task, training_config(arguments), backend=arguments.backend,
-                      num_envs=arguments.ppo.num_envs)
+    env = dexsim.make(
+        arguments.task, training_config(arguments), backend=arguments.backend, num_envs=arguments.ppo.num_envs
+    )
     folder = RunFolder(path)
     if not resumed:
         if begun:
             check_fit(begun, env, arguments.ppo)
         folder.checkpoints.mkdir(parents=True)
         command = shlex.join(["python", "-m", "dexsim_ppo.train", *argv])
-        cli.write_json(folder.config, {"command": command, "arguments": printable(arguments)}
-                       | cli.environment_report())
+        cli.write_json(
+            folder.config, {"command": command, "arguments": printable(arguments)} | cli.environment_report()
+        )
     run = Run(env, arguments, folder, started)
     with stop_on_signals() as stopped:
         run.train(begun, stopped)
     if stopped():
-        print(f"stopped by {signal.Signals(stopped()).name}; go on with: "
-              f"python -m dexsim_ppo.train --resume {shlex.quote(str(folder.path))}")
+        print(
+            f"stopped by {signal.Signals(stopped()).name}; go on with: "
+            f"python -m dexsim_ppo.train --resume {shlex.quote(str(folder.path))}"
+        )
         return 128 + stopped()
     run.finish()
     return 0
@@ -92,13 +96,19 @@ def parse_arguments(argv: list[str]) -> tuple[TrainArguments, checkpoint.Checkpo
     else:
         default = preset_arguments(task, entry.config(), known.preset or "auto")
         if policy:
-            default = dataclasses.replace(default, env=from_dict(config_class, policy.env_config),
-                                          ppo=learner_settings(policy, default.ppo))
+            default = dataclasses.replace(
+                default, env=from_dict(config_class, policy.env_config), ppo=learner_settings(policy, default.ppo)
+            )
     given = {argument.split("=")[0] for argument in argv}
     if "--steps" in given and "--minutes" not in given:
         default = dataclasses.replace(default, minutes=0.0)
-    arguments = cli.parse(TrainArguments[config_class], argv, default=default,
-                          prog="python -m dexsim_ppo.train", description="Train a task.")
+    arguments = cli.parse(
+        TrainArguments[config_class],
+        argv,
+        default=default,
+        prog="python -m dexsim_ppo.train",
+        description="Train a task.",
+    )
     return arguments, begun
 
 
@@ -117,16 +127,16 @@ def arguments_from_dict(config_class: type, data: dict[str, Any]) -> TrainArgume
     env, ppo = from_dict(config_class, data.pop("env")), from_dict(PPOConfig, data.pop("ppo"))
     curriculum = from_dict(Curriculum, data.pop("curriculum", {}))
     known = {f.name for f in dataclasses.fields(TrainArguments)}
-    return TrainArguments(env=env, ppo=ppo, curriculum=curriculum,
-                          **{k: v for k, v in data.items() if k in known})
+    return TrainArguments(env=env, ppo=ppo, curriculum=curriculum, **{k: v for k, v in data.items() if k in known})
 
 
 def new_run_path(arguments: TrainArguments) -> Path:
     """A folder that does not exist yet."""
     if arguments.run_dir:
         if arguments.run_dir.exists():
-            raise ConfigError(f"--run-dir {arguments.run_dir}: exists already; choose another, or go "
-                              "on with it through --resume")
+            raise ConfigError(
+                f"--run-dir {arguments.run_dir}: exists already; choose another, or go on with it through --resume"
+            )
         return arguments.run_dir
     stem = Path("runs") / f"{arguments.task}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
     return next(p for i in range(1000) if not (p := Path(f"{stem}-{i}" if i else stem)).exists())

@@ -92,8 +92,10 @@ def training_config(arguments: TrainArguments) -> Any:
     if not (hasattr(env, "randomization") and hasattr(env, "objects")):
         raise ConfigError(f"--corners {share:g}: task {arguments.task!r} has no ranges to stand in corners of")
     return dataclasses.replace(
-        env, randomization=dataclasses.replace(env.randomization, corners=share),
-        objects=dataclasses.replace(env.objects, corners=share))
+        env,
+        randomization=dataclasses.replace(env.randomization, corners=share),
+        objects=dataclasses.replace(env.objects, corners=share),
+    )
 
 
 def printable(arguments: TrainArguments) -> dict[str, Any]:
@@ -119,15 +121,18 @@ class Run:
             return self.env
         import dexsim
 
-        return dexsim.make(self.arguments.task, self.arguments.env, backend=self.env.backend,
-                           num_envs=self.arguments.evaluation_chunk)
+        return dexsim.make(
+            self.arguments.task, self.arguments.env, backend=self.env.backend, num_envs=self.arguments.evaluation_chunk
+        )
 
     def train(self, begun: checkpoint.Checkpoint | Policy | None, stopped: Callable[[], int]) -> None:
         """The training loop, from what was begun before; leaves a checkpoint and the last policy behind."""
         arguments, device = self.arguments, jax.devices()[0]
         with Display(f"{arguments.task} on {device.device_kind}, {self.env.backend}") as display:
-            display.note(f"{self.folder.path}: {arguments.task}, {self.config.num_envs} environments, "
-                         f"{self.env.backend} physics on {device.device_kind}; compiling")
+            display.note(
+                f"{self.folder.path}: {arguments.task}, {self.config.num_envs} environments, "
+                f"{self.env.backend} physics on {device.device_kind}; compiling"
+            )
             state, step = self._prepare(begun)
             display.note(f"compiled in {self.clock['compile_s']:.1f} s")
             log = MetricsLog(self.folder, int(state.iteration))
@@ -150,8 +155,12 @@ class Run:
                 self.best, self.seconds_before = progress["best"], progress["seconds"]
             else:
                 beginning = aside.submit(lambda: jax.block_until_ready(training.init(key)))
-            step = programs.compile_step(training.plain_step, shapes, self._identity(), lambda: self.clock.update(
-                trace_s=time.perf_counter() - begin))
+            step = programs.compile_step(
+                training.plain_step,
+                shapes,
+                self._identity(),
+                lambda: self.clock.update(trace_s=time.perf_counter() - begin),
+            )
             if not resumed:
                 state = beginning.result()
                 if begun:
@@ -165,8 +174,9 @@ class Run:
         fingerprint = getattr(self.env, "fingerprint", lambda: None)()
         return fingerprint and [fingerprint, to_dict(self.config), to_dict(self.arguments.curriculum)]
 
-    def _loop(self, state: TrainState, step: Callable, display: Display, log: MetricsLog,
-              stopped: Callable[[], int]) -> None:
+    def _loop(
+        self, state: TrainState, step: Callable, display: Display, log: MetricsLog, stopped: Callable[[], int]
+    ) -> None:
         arguments, per_call = self.arguments, self.config.iterations_per_call
         iteration = first = int(state.iteration)
         begin, spent_elsewhere = time.perf_counter(), 0.0
@@ -179,8 +189,10 @@ class Run:
             now, iteration = time.perf_counter(), iteration + per_call
             if "first_update_s" not in self.clock:
                 self.clock |= {"first_update_s": now - self.started, "first_call_s": now - call}
-                display.note(f"first update {self.clock['first_update_s']:.1f} s after the start, "
-                             f"{now - call:.1f} s of it for itself")
+                display.note(
+                    f"first update {self.clock['first_update_s']:.1f} s after the start, "
+                    f"{now - call:.1f} s of it for itself"
+                )
             skipped = self._check(metrics, skipped)
             row = {name: _mean(values) for name, values in metrics.items()}
             row |= self._progress(iteration, now - call)
@@ -223,9 +235,13 @@ class Run:
 
     def _progress(self, iteration: int, call_s: float) -> dict[str, float]:
         rate = self.config.iterations_per_call * self.config.steps_per_iteration / call_s
-        return {"iteration": iteration, "env_steps": iteration * self.config.steps_per_iteration,
-                "seconds": self._seconds(), "env_steps_per_s": rate,
-                "seconds_left": self._seconds_left(iteration, rate)}
+        return {
+            "iteration": iteration,
+            "env_steps": iteration * self.config.steps_per_iteration,
+            "seconds": self._seconds(),
+            "env_steps_per_s": rate,
+            "seconds_left": self._seconds_left(iteration, rate),
+        }
 
     def _check(self, metrics: dict[str, np.ndarray], skipped_before: int) -> int:
         """Stop a run in which no gradient has been finite for several calls."""
@@ -233,37 +249,54 @@ class Run:
         updates = self.config.iterations_per_call * self.config.epochs * self.config.minibatches
         self.bad_calls = self.bad_calls + 1 if skipped - skipped_before == updates else 0
         if self.bad_calls >= DIVERGED_AFTER:
-            raise DexsimError(f"training diverged: no finite gradient in the last {self.bad_calls} "
-                              f"calls; the checkpoints in {self.folder.checkpoints} are from before")
+            raise DexsimError(
+                f"training diverged: no finite gradient in the last {self.bad_calls} "
+                f"calls; the checkpoints in {self.folder.checkpoints} are from before"
+            )
         return skipped
 
     def _policy(self, state: TrainState) -> Policy:
-        return Policy.from_training(self.evaluator.env, self.config, state, {
-            "seed": self.arguments.seed, "iteration": int(state.iteration),
-            "env_steps": int(state.iteration) * self.config.steps_per_iteration,
-            "backend": self.env.backend, "ppo": to_dict(self.config)}
-            | ({"policy": self.arguments.policy} if self.arguments.policy else {}))
+        return Policy.from_training(
+            self.evaluator.env,
+            self.config,
+            state,
+            {
+                "seed": self.arguments.seed,
+                "iteration": int(state.iteration),
+                "env_steps": int(state.iteration) * self.config.steps_per_iteration,
+                "backend": self.env.backend,
+                "ppo": to_dict(self.config),
+            }
+            | ({"policy": self.arguments.policy} if self.arguments.policy else {}),
+        )
 
     def _evaluate(self, state: TrainState, iteration: int, display: Display) -> dict[str, float]:
         """Measure the policy, and keep the very one measured if its return is the best so far."""
         policy = self._policy(state)
-        report, _ = self.evaluator(policy.params, episodes=self.arguments.evaluation_chunk,
-                                   seed=SELECTION_SEED)
+        report, _ = self.evaluator(policy.params, episodes=self.arguments.evaluation_chunk, seed=SELECTION_SEED)
         score, held = report["return"]["value"], report["held"]["value"]
         better = self.best["return"] is None or score > self.best["return"]
         if better:
             self.best = {"return": score, "iteration": iteration}
             policy.save(self.folder.best)
-        display.note(f"evaluation at iteration {iteration}: held {held:.1%}, return {score:.2f}"
-                     f"{', the best so far' if better else ''} ({report['seconds']:.1f} s)")
+        display.note(
+            f"evaluation at iteration {iteration}: held {held:.1%}, return {score:.2f}"
+            f"{', the best so far' if better else ''} ({report['seconds']:.1f} s)"
+        )
         return {"evaluation/return": score, "evaluation/held": held}
 
     def _save(self, state: TrainState, iteration: int) -> None:
         """A checkpoint from which training goes on exactly, and the policy as it stands."""
         checkpoint.save(
-            self.folder.checkpoint(iteration), kind="train", task=self.arguments.task, tree=state,
-            content={"arguments": printable(self.arguments),
-                     "progress": {"best": self.best, "seconds": self._seconds()}})
+            self.folder.checkpoint(iteration),
+            kind="train",
+            task=self.arguments.task,
+            tree=state,
+            content={
+                "arguments": printable(self.arguments),
+                "progress": {"best": self.best, "seconds": self._seconds()},
+            },
+        )
         self.folder.prune(self.arguments.keep_checkpoints)
         self._policy(state).save(self.folder.last)
 
@@ -277,16 +310,25 @@ class Run:
         reports, films = {}, {}
         for name, policy in (("trained", trained), ("untrained", untrained)):
             reports[name], films[name] = self.evaluator(
-                policy.params, episodes=arguments.evaluation_episodes, seed=REPORT_SEED)
+                policy.params, episodes=arguments.evaluation_episodes, seed=REPORT_SEED
+            )
         self.clock["evaluation_s"] = time.perf_counter() - begin
         draw_curve(read_metrics(folder.metrics), folder.path / "curve.png", arguments.task)
         report = {
-            "task": arguments.task, "policy": chosen.name, "origin": trained.training,
-            "backend": self.env.backend, "seed": arguments.seed, **reports,
-            "better": {name: reports["trained"][name]["low"] > reports["untrained"][name]["high"]
-                       for name in ("held", "return", "steps_held")},
+            "task": arguments.task,
+            "policy": chosen.name,
+            "origin": trained.training,
+            "backend": self.env.backend,
+            "seed": arguments.seed,
+            **reports,
+            "better": {
+                name: reports["trained"][name]["low"] > reports["untrained"][name]["high"]
+                for name in ("held", "return", "steps_held")
+            },
             "command": shlex.join(["python", "-m", "dexsim_ppo.train", *sys.argv[1:]]),
-            "arguments": printable(arguments), "timing": self.clock} | cli.environment_report()
+            "arguments": printable(arguments),
+            "timing": self.clock,
+        } | cli.environment_report()
         cli.write_json(folder.report, report)
         print_report(reports["untrained"], title=f"{arguments.task}: untrained")
         print_report(reports["trained"], title=f"{arguments.task}: {chosen}")

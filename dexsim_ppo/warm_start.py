@@ -21,9 +21,16 @@ def learner_settings(policy: Policy, config: PPOConfig) -> PPOConfig:
     training are too large for what little is left to gain.
     """
     return dataclasses.replace(
-        config, actor_layers=tuple(layer.kernel.shape[1] for layer in policy.params.layers[:-1]),
-        distribution=policy.params.squash, learning_rate=1e-5, learning_rate_min=1e-6, learning_rate_max=5e-4,
-        kl_target=2e-4, initial_std=0.2, critic_first=100)
+        config,
+        actor_layers=tuple(layer.kernel.shape[1] for layer in policy.params.layers[:-1]),
+        distribution=policy.params.squash,
+        learning_rate=1e-5,
+        learning_rate_min=1e-6,
+        learning_rate_max=5e-4,
+        kl_target=2e-4,
+        initial_std=0.2,
+        critic_first=100,
+    )
 
 
 def check_fit(policy: Policy, env: Environment, config: PPOConfig) -> None:
@@ -38,8 +45,10 @@ def check_fit(policy: Policy, env: Environment, config: PPOConfig) -> None:
         raise ConfigError(f"the policy does not observe what this configuration offers: {', '.join(odd) or 'order'}")
     layers = tuple(layer.kernel.shape[1] for layer in policy.params.layers)
     if layers != (*config.actor_layers, env.action_size) or policy.params.squash != config.distribution:
-        raise ConfigError(f"the policy's network has layers {layers} and is {policy.params.squash!r}; leave "
-                          "ppo.actor_layers and ppo.distribution as they are")
+        raise ConfigError(
+            f"the policy's network has layers {layers} and is {policy.params.squash!r}; leave "
+            "ppo.actor_layers and ppo.distribution as they are"
+        )
 
 
 def start_from(policy: Policy, config: PPOConfig, state: TrainState) -> TrainState:
@@ -47,5 +56,7 @@ def start_from(policy: Policy, config: PPOConfig, state: TrainState) -> TrainSta
     what it was trained with."""
     stats = recover_stats(policy.params.normalizer, std_floor=config.observation_std_floor)
     return dataclasses.replace(
-        state, params=dataclasses.replace(state.params, actor=jax.tree.map(jnp.copy, policy.params.layers)),
-        observation_stats=state.observation_stats | {"actor": stats})
+        state,
+        params=dataclasses.replace(state.params, actor=jax.tree.map(jnp.copy, policy.params.layers)),
+        observation_stats=state.observation_stats | {"actor": stats},
+    )

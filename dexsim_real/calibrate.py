@@ -60,8 +60,9 @@ def record(arguments: CalibrateArguments, hand: Hand, operator: Operator, **benc
         except HandError as error:
             if not pressed:
                 raise
-            raise HandError(f"{error} (the {pressed} presses before are in {work.log.path}: --from-log fits them)"
-                            ) from None
+            raise HandError(
+                f"{error} (the {pressed} presses before are in {work.log.path}: --from-log fits them)"
+            ) from None
     return work.log.path
 
 
@@ -81,16 +82,22 @@ def conclude(arguments: CalibrateArguments, hand: Hand, logs: Sequence[Path], op
         plot_calibration(arguments.plot, found.calibration, found.real, found.sim)
         operator.tell(f"figure: {arguments.plot}")
     if arguments.destination.exists() and not arguments.force:  # It may have come meanwhile.
-        raise HandError(f"{arguments.destination} is there already: --from-log {' '.join(map(str, logs))} fits these "
-                        "presses again, into another --output")
+        raise HandError(
+            f"{arguments.destination} is there already: --from-log {' '.join(map(str, logs))} fits these "
+            "presses again, into another --output"
+        )
     save_calibration(arguments.destination, found.calibration)
     operator.tell(f"calibration: {arguments.destination}")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """The command. Returns its exit code."""
-    arguments = cli.parse(CalibrateArguments, sys.argv[1:] if argv is None else argv,
-                          prog="python -m dexsim_real.calibrate", description=__doc__.splitlines()[0])
+    arguments = cli.parse(
+        CalibrateArguments,
+        sys.argv[1:] if argv is None else argv,
+        prog="python -m dexsim_real.calibrate",
+        description=__doc__.splitlines()[0],
+    )
     prepare_jax()
     cli.enable_caches()
     hand = load_hand()

@@ -28,9 +28,17 @@ class Workbench:
       clock, sleep: in place of the machine's.
     """
 
-    def __init__(self, arguments: CalibrateArguments, hand: Hand, operator: Operator, meta: dict[str, Any], *,
-                 port: HandPort | None = None, clock: Callable[[], float] = time.monotonic,
-                 sleep: Callable[[float], None] = time.sleep):
+    def __init__(
+        self,
+        arguments: CalibrateArguments,
+        hand: Hand,
+        operator: Operator,
+        meta: dict[str, Any],
+        *,
+        port: HandPort | None = None,
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+    ):
         self._operator, self._meta = operator, meta
         self._arguments = arguments
         sensing = HandSensing(hand, arguments.hardware)
@@ -48,12 +56,23 @@ class Workbench:
             self._say(self.loop.port.connect())
             for warning in getattr(self.loop.port, "warnings", list)():
                 self._say(f"warning: {warning}")
-            self.log.add(Kind.META, {
-                "env_config": {}, "policy": "", "calibration": "", "serial": self._arguments.serial,
-                "hardware": to_dict(self._arguments.hardware), "safety": to_dict(self._arguments.safety),
-                "check": to_dict(self._arguments.check), "press": to_dict(self._arguments.press),
-                "rate": self._arguments.rate, "clock": time.time(), "environment": cli.environment_report(),
-                **self._meta})
+            self.log.add(
+                Kind.META,
+                {
+                    "env_config": {},
+                    "policy": "",
+                    "calibration": "",
+                    "serial": self._arguments.serial,
+                    "hardware": to_dict(self._arguments.hardware),
+                    "safety": to_dict(self._arguments.safety),
+                    "check": to_dict(self._arguments.check),
+                    "press": to_dict(self._arguments.press),
+                    "rate": self._arguments.rate,
+                    "clock": time.time(),
+                    "environment": cli.environment_report(),
+                    **self._meta,
+                },
+            )
         except BaseException:
             self.__exit__(*sys.exc_info())
             raise

@@ -33,8 +33,9 @@ def raw_sensing(hand: Hand, hardware: HardwareConfig) -> HandSensing:
     return HandSensing(hand, dataclasses.replace(hardware, force_per_count=1.0, taxel_floor=0.0))
 
 
-def check_rest(hand: Hand, counts: np.ndarray, current: np.ndarray, config: CheckConfig, limit: float,
-               fingers: tuple[int, ...]) -> RestReport:
+def check_rest(
+    hand: Hand, counts: np.ndarray, current: np.ndarray, config: CheckConfig, limit: float, fingers: tuple[int, ...]
+) -> RestReport:
     """Look at a reading with the motors off and nothing touched.
 
     Args:
@@ -52,15 +53,21 @@ def check_rest(hand: Hand, counts: np.ndarray, current: np.ndarray, config: Chec
         high = mean[finger] > limit
         patch = _largest_patch(high.reshape(hand.taxel_grid))
         if patch >= _TOUCH:
-            raise HandError(f"cannot zero the taxels: {patch} taxels side by side on the {name} read above "
-                            f"{limit:.0f} counts: something touches it; free the fingertips")
+            raise HandError(
+                f"cannot zero the taxels: {patch} taxels side by side on the {name} read above "
+                f"{limit:.0f} counts: something touches it; free the fingertips"
+            )
         if high.any():
-            raise HandError(f"{name}: {taxel_names(hand, high)} read {mean[finger].max():.0f} counts alone: stuck; "
-                            "power-cycle the hand, or raise --hardware.tare-limit here and in every run")
+            raise HandError(
+                f"{name}: {taxel_names(hand, high)} read {mean[finger].max():.0f} counts alone: stuck; "
+                "power-cycle the hand, or raise --hardware.tare-limit here and in every run"
+            )
         drift, usual = _drift(counts[:, finger].sum(-1))
         if drift > config.drift + usual:
-            raise HandError(f"cannot zero the taxels: the {name}'s sum moved by {drift:.0f} counts while it should "
-                            "rest: something touches it; let it come to rest")
+            raise HandError(
+                f"cannot zero the taxels: the {name}'s sum moved by {drift:.0f} counts while it should "
+                "rest: something touches it; let it come to rest"
+            )
         restless = noise[finger] > config.noise
         if restless.any():
             notes.append(f"{name}: noisy: {taxel_names(hand, restless)} (up to {noise[finger].max():.1f} counts)")
@@ -80,8 +87,10 @@ def check_release(name: str, sums: np.ndarray, config: CheckConfig) -> None:
     """
     left = float(np.median(sums))
     if left < -config.release:
-        raise HandError(f"{name}: reads {left:.0f} counts after the press: it was touched while it was zeroed; "
-                        "free the fingertip and begin again")
+        raise HandError(
+            f"{name}: reads {left:.0f} counts after the press: it was touched while it was zeroed; "
+            "free the fingertip and begin again"
+        )
 
 
 def dead_taxels(hand: Hand, counts: np.ndarray, threshold: float) -> np.ndarray:
@@ -94,8 +103,14 @@ def dead_taxels(hand: Hand, counts: np.ndarray, threshold: float) -> np.ndarray:
     most = counts.max(0).reshape(hand.taxel_grid)
     padded = np.pad(most, 1, constant_values=np.nan)
     columns, rows = hand.taxel_grid
-    around = np.stack([padded[1 + i:1 + i + columns, 1 + j:1 + j + rows]
-                       for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)])
+    around = np.stack(
+        [
+            padded[1 + i : 1 + i + columns, 1 + j : 1 + j + rows]
+            for i in (-1, 0, 1)
+            for j in (-1, 0, 1)
+            if (i, j) != (0, 0)
+        ]
+    )
     # At least half of those around must read: beside the edge of a press nothing is no fault.
     pressed = (np.nanmean(around, 0) >= threshold) & (np.nanmedian(around, 0) > 0.25 * threshold)
     return ((most <= 0) & pressed).ravel()
@@ -108,7 +123,7 @@ def fill_dead(hand: Hand, counts: np.ndarray, dead: np.ndarray) -> np.ndarray:
     lattice = counts.reshape(-1, columns, rows)
     for index in np.flatnonzero(dead):
         column, row = divmod(int(index), rows)
-        here = np.s_[max(column - 1, 0):column + 2, max(row - 1, 0):row + 2]
+        here = np.s_[max(column - 1, 0) : column + 2, max(row - 1, 0) : row + 2]
         near = lattice[:, *here][:, sound[here]]
         if near.size:
             filled[:, index] = near.mean(1)

@@ -89,16 +89,26 @@ def fit(session: Session, hand: Hand, created: str | None = None) -> Fit:
             way = _direction(blocks.speed[:, joint], recording, joint) * int(np.sign(lever[joint]))
             way[_at_limit(blocks.current[:, joint], blocks.run)] = 0
             if max(np.sum(way > 0), np.sum(way < 0)) < MIN_SAMPLES:
-                notes.append(f"{label}: hardly moved while the {recording.name} was pressed, friction held it: press "
-                             "on something softer, or more often")
+                notes.append(
+                    f"{label}: hardly moved while the {recording.name} was pressed, friction held it: press "
+                    "on something softer, or more often"
+                )
                 continue
             reach[label], source[label] = abs(lever[joint]), recording.name
             real[label] = Press(force, blocks.current[:, joint], way)
             sim[label] = Press(force, torque[:, joint], way)
         notes += _press_notes(session, hand, recording, blocks, dead)
     try:
-        result = calibrate(hand, real, sim, force_per_count=per_count, current_per_count=1e-3, missing="class",
-                           serial=session.serial, created=created)
+        result = calibrate(
+            hand,
+            real,
+            sim,
+            force_per_count=per_count,
+            current_per_count=1e-3,
+            missing="class",
+            serial=session.serial,
+            created=created,
+        )
     except CalibrationError as error:
         raise CalibrationError("; ".join([str(error), *(note for note in notes if "hardly moved" in note)])) from None
     notes += _zero_note(session, hand)
@@ -111,8 +121,11 @@ def make_blocks(recording: Recording, grid: tuple[int, int]) -> Blocks:
     """Means over blocks of time within a phase; what is left over at a phase's end is not used."""
     size = max(round(_BLOCK * recording.rate), 1)
     phase = np.array(recording.phase)
-    runs = [[np.arange(size) + at for at in range(first, last - size + 1, size)]
-            for first, last in _runs(phase) if phase[first] in (LOADING, UNLOADING)]
+    runs = [
+        [np.arange(size) + at for at in range(first, last - size + 1, size)]
+        for first, last in _runs(phase)
+        if phase[first] in (LOADING, UNLOADING)
+    ]
     runs = [np.array(run) for run in runs if len(run) > 1]  # One block has no speed.
     if not runs:
         raise CalibrationError(f"{recording.name}: no press lasted for {2 * _BLOCK:g} s: press more slowly")
@@ -124,9 +137,14 @@ def make_blocks(recording: Recording, grid: tuple[int, int]) -> Blocks:
     counts = np.array(recording.counts)[rows].mean(1)
     active = (counts.max(0) >= _ACTIVE).reshape(grid)
     counts = counts * binary_dilation(active, np.ones((3, 3))).ravel()
-    return Blocks(counts, np.array(recording.current)[rows].mean(1), position, speed,
-                  np.array(recording.shear)[rows].mean(1),
-                  np.repeat(np.arange(len(runs)), [len(run) for run in runs]))
+    return Blocks(
+        counts,
+        np.array(recording.current)[rows].mean(1),
+        position,
+        speed,
+        np.array(recording.shear)[rows].mean(1),
+        np.repeat(np.arange(len(runs)), [len(run) for run in runs]),
+    )
 
 
 def taxel_torque(hand: Hand, position: np.ndarray, finger: int, force: np.ndarray) -> np.ndarray:
@@ -135,8 +153,10 @@ def taxel_torque(hand: Hand, position: np.ndarray, finger: int, force: np.ndarra
     All forces of a fingertip point the same way, along their mean normal: the skin lies flat on what it is pressed
     against, and a fingertip's force is the sum over its taxels, as in simulation.
     """
-    rows = [_torque(hand, np.int32(finger), np.float32(at), np.float32(push))
-            for at, push in zip(position, force, strict=True)]
+    rows = [
+        _torque(hand, np.int32(finger), np.float32(at), np.float32(push))
+        for at, push in zip(position, force, strict=True)
+    ]
     return np.array(rows, float)
 
 
@@ -176,8 +196,9 @@ def _runs(phase: np.ndarray) -> list[tuple[int, int]]:
 # --- the gauge, the notes ------------------------------------------------------------------------------
 
 
-def _gauges(session: Session, hand: Hand,
-            pressed: list[Recording]) -> tuple[np.ndarray, dict[str, Any], dict, list[str]]:
+def _gauges(
+    session: Session, hand: Hand, pressed: list[Recording]
+) -> tuple[np.ndarray, dict[str, Any], dict, list[str]]:
     """Newtons per count [F] for a run; newtons = gain counts + offset by press, for the joints; fits; notes.
 
     For the joints a press goes by its own comparison, or by that of the finger's other press.
@@ -188,8 +209,9 @@ def _gauges(session: Session, hand: Hand,
         levels = [level for level in recording.gauge if len(recording.samples(level))]
         if len(levels) < _READINGS:
             if levels:
-                notes.append(f"{recording.name}: {len(levels)} readings of the gauge do not count, "
-                             f"{_READINGS} are needed")
+                notes.append(
+                    f"{recording.name}: {len(levels)} readings of the gauge do not count, {_READINGS} are needed"
+                )
             continue
         name, gauge = hand.finger_names[recording.finger], np.array([recording.gauge[k] for k in levels])
         every = np.array(recording.counts)
@@ -198,15 +220,23 @@ def _gauges(session: Session, hand: Hand,
         shown = np.array([np.mean(np.array(recording.shown)[recording.samples(k)]) for k in levels])
         whole, found = (_against(gauge, part, recording.name) for part in ((counts * active).sum(-1), shown))
         newtons[recording.name] = 1.0 / whole.gain.value, -whole.offset.value / whole.gain.value
-        notes.append(f"{recording.name}: {found.gain} counts per newton by the gauge ({found.samples} readings), "
-                     f"{found.offset} counts at none")
+        notes.append(
+            f"{recording.name}: {found.gain} counts per newton by the gauge ({found.samples} readings), "
+            f"{found.offset} counts at none"
+        )
         if name not in fits:
             fits[name], per_count[recording.finger] = found, 1.0 / found.gain.value
     if fits:
-        per_count = np.where(np.isin(hand.finger_names, list(fits)), per_count,
-                             np.mean([1.0 / found.gain.value for found in fits.values()]))
-        notes += [f"{name}: not compared with the gauge, mean of the other fingers"
-                  for name in hand.finger_names if name not in fits]
+        per_count = np.where(
+            np.isin(hand.finger_names, list(fits)),
+            per_count,
+            np.mean([1.0 / found.gain.value for found in fits.values()]),
+        )
+        notes += [
+            f"{name}: not compared with the gauge, mean of the other fingers"
+            for name in hand.finger_names
+            if name not in fits
+        ]
     rest = {r.name: (float(per_count[r.finger]), 0.0) for r in pressed}
     return per_count, rest | newtons, fits, notes
 
@@ -218,19 +248,22 @@ def _against(gauge: np.ndarray, counts: np.ndarray, name: str) -> sensor_fit.Fin
         raise CalibrationError(f"{name}, gauge: {error}") from None
 
 
-def _press_notes(session: Session, hand: Hand, recording: Recording, blocks: Blocks,
-                 dead: np.ndarray) -> list[str]:
+def _press_notes(session: Session, hand: Hand, recording: Recording, blocks: Blocks, dead: np.ndarray) -> list[str]:
     """Dead taxels, shear and drift of one press."""
     notes, finger = [], hand.finger_names[recording.finger]
     if dead.any():
-        notes.append(f"{finger}: dead: {taxel_names(hand, dead)}: nothing where those around were pressed; here "
-                     "their mean stands in for it, a run does without")
+        notes.append(
+            f"{finger}: dead: {taxel_names(hand, dead)}: nothing where those around were pressed; here "
+            "their mean stands in for it, a run does without"
+        )
     sums = blocks.counts.sum(-1)
     high = sums > 0.5 * sums.max()
     share = float(np.median(np.linalg.norm(blocks.shear[high], axis=-1) / sums[high]))
     if share > _SHEAR:
-        notes.append(f"{recording.name}: shear of {100 * share:.0f} % of the force by the taxels' x and y: it loads "
-                     "the joints and is not in their lines; press on something that slides, rolls or is soft")
+        notes.append(
+            f"{recording.name}: shear of {100 * share:.0f} % of the force by the taxels' x and y: it loads "
+            "the joints and is not in their lines; press on something that slides, rolls or is soft"
+        )
     left = np.array(recording.counts)[recording.samples(RELEASED)].sum(-1)
     if len(left) and np.median(left) > session.check.release:
         notes.append(f"{recording.name}: {np.median(left):.0f} counts are left after the press: the zero drifts")
@@ -242,5 +275,7 @@ def _zero_note(session: Session, hand: Hand) -> list[str]:
         return []
     zero = session.rest_current.mean(0)
     worst = int(np.abs(zero).argmax())
-    return [f"motors off, the currents read up to {1e3 * abs(zero[worst]):.0f} mA ({hand.joint_names[worst]}): that "
-            "much of the offsets is the reading's zero error"]
+    return [
+        f"motors off, the currents read up to {1e3 * abs(zero[worst]):.0f} mA ({hand.joint_names[worst]}): that "
+        "much of the offsets is the reading's zero error"
+    ]

@@ -31,7 +31,9 @@ from dexsim_real.trouble import HandError
 TASK = "identify"
 STIFFNESS, DAMPING = 3.0, 0.1  # Nm/rad, Nm s/rad: first guesses
 _SIGNALS = {
-    "fit": {}, "hold-out": {"amplitude": 0.2, "chirp_frequency": (0.5, 2.5), "chirp_seconds": 3.0, "step_count": 3}}
+    "fit": {},
+    "hold-out": {"amplitude": 0.2, "chirp_frequency": (0.5, 2.5), "chirp_seconds": 3.0, "step_count": 3},
+}
 _TIMESTEP = 0.006  # s, near that of the simulation
 _LOST = 0.02  # share of the exchanges that may be missing
 
@@ -52,10 +54,23 @@ def identify_hand(arguments: CalibrateArguments, hand: Hand, operator: Operator,
         if arguments.joints and name not in arguments.joints:
             continue
         joint = hand.joint_names.index(name)
-        start = {"stiffness": STIFFNESS, "damping": DAMPING, "stall_torque": float(hand.torque_limit[joint]),
-                 "no_load_speed": float(hand.speed_limit[joint]), "inertia": float(_inertia(hand)[joint])}
-        found.append(identify(log, start, fit=FIT, substeps=max(round(log.period / _TIMESTEP), 1),
-                              dead_band=(0.0, 0.03) if arguments.dead_band else None, holdout=check))
+        start = {
+            "stiffness": STIFFNESS,
+            "damping": DAMPING,
+            "stall_torque": float(hand.torque_limit[joint]),
+            "no_load_speed": float(hand.speed_limit[joint]),
+            "inertia": float(_inertia(hand)[joint]),
+        }
+        found.append(
+            identify(
+                log,
+                start,
+                fit=FIT,
+                substeps=max(round(log.period / _TIMESTEP), 1),
+                dead_band=(0.0, 0.03) if arguments.dead_band else None,
+                holdout=check,
+            )
+        )
         operator.tell(found[-1].report())
     if not found:
         raise HandError("none of these joints is in the log")
@@ -67,8 +82,10 @@ def identify_hand(arguments: CalibrateArguments, hand: Hand, operator: Operator,
 def record(arguments: CalibrateArguments, hand: Hand, operator: Operator, **bench: Any) -> Path:
     """Move the joints; returns the log."""
     period = 1.0 / arguments.rate
-    signals = {label: excitation(hand, Excitation(period=period, **options), _open(hand), arguments.joints or None)
-               for label, options in _SIGNALS.items()}
+    signals = {
+        label: excitation(hand, Excitation(period=period, **options), _open(hand), arguments.joints or None)
+        for label, options in _SIGNALS.items()
+    }
     seconds = sum(len(part) * period + 1.5 for signal in signals.values() for part in signal.values())
     operator.tell(f"the fingers move one after the other for {seconds / 60:.0f} minutes: keep everything clear of them")
     with Workbench(arguments, hand, operator, {"task": TASK}, **bench) as work:
@@ -91,8 +108,9 @@ def record(arguments: CalibrateArguments, hand: Hand, operator: Operator, **benc
     return work.log.path
 
 
-def read_logs(paths: Iterable[Path], hand: Hand,
-              calibration: Calibration | None) -> dict[str, tuple[JointLog, JointLog | None]]:
+def read_logs(
+    paths: Iterable[Path], hand: Hand, calibration: Calibration | None
+) -> dict[str, tuple[JointLog, JointLog | None]]:
     """By joint, the log to fit and the one to test on.
 
     Raises:
@@ -113,22 +131,24 @@ def read_logs(paths: Iterable[Path], hand: Hand,
                 received = content
             elif record.kind == Kind.TICK and task == TASK:
                 parts.setdefault((content["joint"], content["signal"]), []).append(
-                    (content["sequence"], sent, received))
+                    (content["sequence"], sent, received)
+                )
         if task != TASK:
             raise LogError(f"{path}: is no log of an identification: {task or 'it ends before the hand was ready'}")
     logs = {key: _joint_log(key[0], rows, hand, hardware, calibration, period) for key, rows in parts.items()}
     return {name: (logs[name, "fit"], logs.get((name, "hold-out"))) for name, label in logs if label == "fit"}
 
 
-def _joint_log(name: str, rows: list, hand: Hand, hardware: HardwareConfig, calibration: Calibration | None,
-               period: float) -> JointLog:
+def _joint_log(
+    name: str, rows: list, hand: Hand, hardware: HardwareConfig, calibration: Calibration | None, period: float
+) -> JointLog:
     joint = hand.joint_names.index(name)
     sign, offset = hardware.joint_sign[joint], hardware.joint_offset[joint]
     lost = np.array([number != received[0] for number, _, received in rows])
     if np.mean(lost) > _LOST:
         raise LogError(f"{name}: {np.sum(lost)} of {len(lost)} exchanges are missing: mend the line and record again")
-    state = np.array([frames.decode_state(received[1][frames.HEADER.size:-2])["joint"] for _, _, received in rows])
-    command = np.array([frames.decode_command(sent[1][frames.HEADER.size:-2])["position"] for _, sent, _ in rows])
+    state = np.array([frames.decode_state(received[1][frames.HEADER.size : -2])["joint"] for _, _, received in rows])
+    command = np.array([frames.decode_command(sent[1][frames.HEADER.size : -2])["position"] for _, sent, _ in rows])
     target, position = (part[:, joint].astype(float) * sign + offset for part in (command, state["position"]))
     # What was not answered is filled in: a line through few of many samples.
     time = np.arange(len(rows))

@@ -45,8 +45,17 @@ class HandLoop:
       log: gets every frame while `marks` is set, and what `mark` is given.
     """
 
-    def __init__(self, port: HandPort, sensing: HandSensing, safety: Safety, log: LogWriter, rate: float, *,
-                 clock: Callable[[], float] = time.monotonic, sleep: Callable[[float], None] = time.sleep):
+    def __init__(
+        self,
+        port: HandPort,
+        sensing: HandSensing,
+        safety: Safety,
+        log: LogWriter,
+        rate: float,
+        *,
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+    ):
         self.port, self.sensing, self.safety, self.log = port, sensing, safety, log
         self.clock, self.pace = clock, Pace(rate, clock, sleep)
         self.recording = False

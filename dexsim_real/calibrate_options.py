@@ -119,11 +119,14 @@ class CalibrateArguments:
         if self.destination.exists() and not self.force:
             raise HandError(f"{self.destination} is there already: give another --output, or --force to overwrite it")
         if self.press.current >= self.safety.current:
-            raise HandError(f"--press.current {self.press.current:g} A must be below --safety.current "
-                            f"{self.safety.current:g} A")
+            raise HandError(
+                f"--press.current {self.press.current:g} A must be below --safety.current {self.safety.current:g} A"
+            )
         if self.press.peak >= 0.9 * self.safety.finger_force:
-            raise HandError(f"--press.peak {self.press.peak:g} N must be well below --safety.finger-force "
-                            f"{self.safety.finger_force:g} N")
+            raise HandError(
+                f"--press.peak {self.press.peak:g} N must be well below --safety.finger-force "
+                f"{self.safety.finger_force:g} N"
+            )
 
     @property
     def destination(self) -> Path:

@@ -53,12 +53,28 @@ def placements(hand: Hand, fingers: tuple[str, ...] = (), sides: bool = True) ->
     found = []
     for finger in [*[i for i in chosen if i], *[i for i in chosen if not i]]:
         name = hand.finger_names[finger]
-        found.append(_placement(hand, f"{name} pad", finger, middle, _bent(hand, finger),
-                                f"hold a round pen, backed by foam, across the {name}'s pad, 1 cm before it"))
+        found.append(
+            _placement(
+                hand,
+                f"{name} pad",
+                finger,
+                middle,
+                _bent(hand, finger),
+                f"hold a round pen, backed by foam, across the {name}'s pad, 1 cm before it",
+            )
+        )
     for finger in [i for i in chosen if sides and i in (0, 1)]:
         name, toward = hand.finger_names[finger], ("palm's normal", "thumb")[finger]
-        found.append(_placement(hand, f"{name} side", finger, side, _spread(hand, finger),
-                                f"the same across the side of the {name} that faces the {toward}, 3 mm before it"))
+        found.append(
+            _placement(
+                hand,
+                f"{name} side",
+                finger,
+                side,
+                _spread(hand, finger),
+                f"the same across the side of the {name} that faces the {toward}, 3 mm before it",
+            )
+        )
     return found
 
 
@@ -85,7 +101,7 @@ def _bent(hand: Hand, finger: int) -> np.ndarray:
         posture[:3] = 0.3, 0.3, 0.2
     else:
         first = int(hand.root_joint[finger])
-        posture[first:first + 2] = 0.35, 0.2
+        posture[first : first + 2] = 0.35, 0.2
     return posture
 
 

@@ -59,12 +59,14 @@ class PressProcedure:
         seconds = self.arguments.check.seconds
         moments = self._record("", REST, seconds)
         if len(moments) < _ANSWERED * self.arguments.rate * seconds:
-            raise HandError(f"only {len(moments)} answers in {seconds:g} s: the line loses too much, or "
-                            "this machine is too busy")
+            raise HandError(
+                f"only {len(moments)} answers in {seconds:g} s: the line loses too much, or this machine is too busy"
+            )
         counts = np.array([self._raw(moment) for moment in moments])
         current = np.array([moment.state["joint"]["current"] for moment in moments], float)
-        report = check_rest(self.hand, counts, current, self.arguments.check,
-                            self.loop.sensing.config.tare_limit, fingers)
+        report = check_rest(
+            self.hand, counts, current, self.arguments.check, self.loop.sensing.config.tare_limit, fingers
+        )
         for note in report.notes:
             self.operator.tell(f"  {note}")
         self._tare(report.tare)
@@ -123,8 +125,10 @@ class PressProcedure:
             if self._force(moment) >= self._touch:
                 break
             if self._current(moment) >= self.config.current:
-                raise HandError(f"{name}: {self._current(moment):.2f} A and no taxel feels it: it does not press "
-                                "with the taxels, or their sensor is not connected")
+                raise HandError(
+                    f"{name}: {self._current(moment):.2f} A and no taxel feels it: it does not press "
+                    "with the taxels, or their sensor is not connected"
+                )
             if self._advance >= self.config.travel:
                 raise HandError(f"{name}: met nothing within {self.config.travel:g} rad: put it closer")
         self._base, self._advance = self._target(), 0.0
@@ -141,14 +145,18 @@ class PressProcedure:
             forces.append(self._force(moment))
             positions.append(moment.sample.measured.joint_position.astype(float))
             back = round(self.arguments.rate)
-            stalled = (len(forces) > 2 * back and np.mean(forces[-_LAST:]) - np.mean(forces[-back - _LAST:-back])
-                       < _STALL * self.config.peak)
+            stalled = (
+                len(forces) > 2 * back
+                and np.mean(forces[-_LAST:]) - np.mean(forces[-back - _LAST : -back]) < _STALL * self.config.peak
+            )
             if forces[-1] >= self.config.peak or self._current(moment) >= self.config.current:
                 break
             if self._advance >= self.config.travel or stalled:
                 if forces[-1] < 4 * self._touch:
-                    raise HandError(f"{self._placement.name}: no more than {forces[-1]:.1f} N: what it presses on "
-                                    "gives way, or --hardware.torque-max is too low")
+                    raise HandError(
+                        f"{self._placement.name}: no more than {forces[-1]:.1f} N: what it presses on "
+                        "gives way, or --hardware.torque-max is too low"
+                    )
                 break
         self._held = (self._target() - first, np.mean(positions[-_LAST:], 0) - begin)
 

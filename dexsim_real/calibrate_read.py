@@ -95,8 +95,9 @@ class _Reader:
         if meta["task"] != "calibrate":
             raise LogError(f"{path}: is the log of something else ({meta['task']}), not of presses")
         hardware = from_dict(HardwareConfig, meta["hardware"])
-        self.session = Session(hardware, from_dict(CheckConfig, meta["check"]), meta["serial"], meta["rate"], {},
-                               np.empty(0))
+        self.session = Session(
+            hardware, from_dict(CheckConfig, meta["check"]), meta["serial"], meta["rate"], {}, np.empty(0)
+        )
         self._sensing, self._raw = HandSensing(self._hand, hardware), raw_sensing(self._hand, hardware)
 
     def _configure(self, content: dict[str, Any]) -> None:
@@ -105,7 +106,8 @@ class _Reader:
         if "placement" in content:
             placement = content["placement"]
             self.session.recordings[placement["name"]] = Recording(
-                placement["name"], placement["finger"], tuple(placement["joints"]), self.session.rate)
+                placement["name"], placement["finger"], tuple(placement["joints"]), self.session.rate
+            )
 
     def _sample(self, time: float, tick: dict[str, Any], rest: list[np.ndarray]) -> None:
         recording = self.session.recordings.get(tick["press"])
@@ -114,7 +116,7 @@ class _Reader:
             return
         if tick["sequence"] != self._number:
             return
-        state = frames.decode_state(self._frame[frames.HEADER.size:-2])
+        state = frames.decode_state(self._frame[frames.HEADER.size : -2])
         current = state["joint"]["current"].astype(float) * 1e-3
         if tick["phase"] == REST:
             rest.append(current)

@@ -31,17 +31,35 @@ def report(fit: Fit) -> dict[str, Any]:
     constants, intervals = torque_constants(calibration), torque_constant_intervals(calibration)
     joints = {}
     for joint, name in enumerate(calibration.joint_names):
-        lines = {way: {"nm_per_a": constants[k, joint], "nm_per_a_95": intervals[k, joint],
-                       "a_per_n": real.gain[k, joint], "offset_a": real.offset[k, joint],
-                       "r_squared": real.r_squared[k, joint], "condition": real.condition[k, joint],
-                       "samples": int(real.samples[k, joint]), "outliers": int(real.outliers[k, joint])}
-                 for k, way in enumerate(_WAYS)}
-        joints[name] = {"press": fit.source.get(name), "friction_a": real.friction[joint],
-                        "force_max_n": real.force_max[joint], "current_max_a": real.value_max[joint], **lines}
-    return {"hand": calibration.hand, "serial": calibration.serial, "created": calibration.created,
-            "newtons_per_count": dict(zip(calibration.finger_names, calibration.force_per_count, strict=True)),
-            "gauge": {name: to_dict(found) for name, found in fit.sensors.items()},
-            "joints": joints, "notes": list(calibration.notes)}
+        lines = {
+            way: {
+                "nm_per_a": constants[k, joint],
+                "nm_per_a_95": intervals[k, joint],
+                "a_per_n": real.gain[k, joint],
+                "offset_a": real.offset[k, joint],
+                "r_squared": real.r_squared[k, joint],
+                "condition": real.condition[k, joint],
+                "samples": int(real.samples[k, joint]),
+                "outliers": int(real.outliers[k, joint]),
+            }
+            for k, way in enumerate(_WAYS)
+        }
+        joints[name] = {
+            "press": fit.source.get(name),
+            "friction_a": real.friction[joint],
+            "force_max_n": real.force_max[joint],
+            "current_max_a": real.value_max[joint],
+            **lines,
+        }
+    return {
+        "hand": calibration.hand,
+        "serial": calibration.serial,
+        "created": calibration.created,
+        "newtons_per_count": dict(zip(calibration.finger_names, calibration.force_per_count, strict=True)),
+        "gauge": {name: to_dict(found) for name, found in fit.sensors.items()},
+        "joints": joints,
+        "notes": list(calibration.notes),
+    }
 
 
 def table(fit: Fit) -> Table:
@@ -49,16 +67,22 @@ def table(fit: Fit) -> Table:
     calibration, real = fit.calibration, fit.calibration.real
     constants, intervals = torque_constants(calibration), torque_constant_intervals(calibration)
     width = np.max(np.ptp(intervals, axis=-1) / 2 / np.abs(constants), 0)
-    shown = Table(box=None, padding=(0, 1, 0, 0), title="current to torque, pressing on / giving way",
-                  title_justify="left")
+    shown = Table(
+        box=None, padding=(0, 1, 0, 0), title="current to torque, pressing on / giving way", title_justify="left"
+    )
     for head in ("joint", "pressed with", "Nm / A", "95 %", "R2", "cond.", "friction", "up to"):
         shown.add_column(head, no_wrap=True)
     for joint, name in enumerate(calibration.joint_names):
         shown.add_row(
-            name, fit.source.get(name, "(others)"), " / ".join(f"{value:+.3f}" for value in constants[:, joint]),
-            f"{100 * width[joint]:.1f} %", f"{np.min(real.r_squared[:, joint]):.3f}",
-            f"{np.max(real.condition[:, joint]):.1f}", f"{1e3 * real.friction[joint]:.0f} mA",
-            f"{real.force_max[joint]:.1f} N")
+            name,
+            fit.source.get(name, "(others)"),
+            " / ".join(f"{value:+.3f}" for value in constants[:, joint]),
+            f"{100 * width[joint]:.1f} %",
+            f"{np.min(real.r_squared[:, joint]):.3f}",
+            f"{np.max(real.condition[:, joint]):.1f}",
+            f"{1e3 * real.friction[joint]:.0f} mA",
+            f"{real.force_max[joint]:.1f} N",
+        )
     return shown
 
 

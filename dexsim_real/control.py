@@ -94,8 +94,9 @@ class Controller:
         """Compile everything, so that the first tick is as fast as the others."""
         hand = self.hand
         joints = np.zeros(hand.num_joints, np.float32)
-        nothing = Measured(joints, joints, np.zeros((hand.num_fingers, hand.num_taxels), np.float32), joints,
-                           np.zeros(1), np.zeros(1))
+        nothing = Measured(
+            joints, joints, np.zeros((hand.num_fingers, hand.num_taxels), np.float32), joints, np.zeros(1), np.zeros(1)
+        )
         for _ in range(3):
             self.tick(nothing, ObjectEstimate(np.zeros(3), np.zeros(3), IDENTITY), IDENTITY, 0.0)
         self.start(joints)

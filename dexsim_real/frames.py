@@ -55,40 +55,63 @@ class Mode(enum.IntEnum):
     FORCE = 5  # refused by some units
 
 
-JOINT_COMMAND = np.dtype([
-    ("id", "<u2"), ("kp", "<i2"), ("ki", "<i2"), ("kd", "<i2"),
-    ("position", "<f4"),  # rad
-    ("torque_max", "<i2"),  # mA
-    ("mode", "<u2"), ("reserved", "<u2", 4)])
+JOINT_COMMAND = np.dtype(
+    [
+        ("id", "<u2"),
+        ("kp", "<i2"),
+        ("ki", "<i2"),
+        ("kd", "<i2"),
+        ("position", "<f4"),  # rad
+        ("torque_max", "<i2"),  # mA
+        ("mode", "<u2"),
+        ("reserved", "<u2", 4),
+    ]
+)
 COMMAND_BLOCK = np.dtype((JOINT_COMMAND, JOINTS))
 """Data of an `EXCHANGE` from the host, 288 bytes."""
 
-JOINT_STATE = np.dtype([
-    ("id", "u1"), ("sensor_id", "u1"),
-    ("position", "<f4"),  # rad
-    ("current", "<i2"),  # mA; vendor headers call it torque
-    ("raw_position", "<u2"),  # bits 0-3 mode, 4-15 encoder
-    ("temperature", "<u2"),  # degC: low byte joint board, high byte palm board
-    ("palm_error", "<u2"), ("joint_error", "<u2"), ("tip_error", "<u2"),  # bit fields
-    ("velocity", "<i2"),  # 1e-3 rad/s on newer firmware, undefined on older
-    ("reserved", "<u2", 2)])
+JOINT_STATE = np.dtype(
+    [
+        ("id", "u1"),
+        ("sensor_id", "u1"),
+        ("position", "<f4"),  # rad
+        ("current", "<i2"),  # mA; vendor headers call it torque
+        ("raw_position", "<u2"),  # bits 0-3 mode, 4-15 encoder
+        ("temperature", "<u2"),  # degC: low byte joint board, high byte palm board
+        ("palm_error", "<u2"),
+        ("joint_error", "<u2"),
+        ("tip_error", "<u2"),  # bit fields
+        ("velocity", "<i2"),  # 1e-3 rad/s on newer firmware, undefined on older
+        ("reserved", "<u2", 2),
+    ]
+)
 FORCE = np.dtype([("x", "i1"), ("y", "i1"), ("z", "u1")])  # counts; z presses into the tip
-TIP_STATE = np.dtype([
-    ("total", FORCE), ("taxel", FORCE, TAXELS),
-    ("taxel_temperature", "u1", 20), ("temperature", "u1")])  # degC
+TIP_STATE = np.dtype(
+    [("total", FORCE), ("taxel", FORCE, TAXELS), ("taxel_temperature", "u1", 20), ("temperature", "u1")]
+)  # degC
 STATE_BLOCK = np.dtype([("joint", JOINT_STATE, JOINTS), ("tip", TIP_STATE, TIPS)])
 """Data of an `EXCHANGE` from the hand, 2208 bytes."""
 
 HAND_REPLIES: dict[int, range] = {
     Command.EXCHANGE: range(STATE_BLOCK.itemsize, STATE_BLOCK.itemsize + 1),
-    Command.ERROR: range(1, 65), Command.ACKNOWLEDGE: range(1, 65), Command.VERSION: range(1, 65),
-    Command.CLEAR_PRESSURE: range(2, 65), Command.READ_MODE: range(2, 65), Command.READ_REGISTER: range(5, 65)}
+    Command.ERROR: range(1, 65),
+    Command.ACKNOWLEDGE: range(1, 65),
+    Command.VERSION: range(1, 65),
+    Command.CLEAR_PRESSURE: range(2, 65),
+    Command.READ_MODE: range(2, 65),
+    Command.READ_REGISTER: range(5, 65),
+}
 """Data lengths that a host believes. None fits the host's own request, so an adapter that echoes
 what it sends cannot be taken for the hand."""
 HOST_REQUESTS: dict[int, range] = {
     Command.EXCHANGE: range(COMMAND_BLOCK.itemsize, COMMAND_BLOCK.itemsize + 1),
-    Command.VERSION: range(0, 1), Command.READ_MODE: range(0, 2), Command.SET_MODE: range(1, 33),
-    Command.CLEAR_PRESSURE: range(0, 2), Command.RESET: range(0, 2), Command.READ_REGISTER: range(1, 5)}
+    Command.VERSION: range(0, 1),
+    Command.READ_MODE: range(0, 2),
+    Command.SET_MODE: range(1, 33),
+    Command.CLEAR_PRESSURE: range(0, 2),
+    Command.RESET: range(0, 2),
+    Command.READ_REGISTER: range(1, 5),
+}
 """Data lengths that a hand believes."""
 
 
@@ -189,7 +212,7 @@ class Parser:
             elif self._sound(at, end):
                 self._skip(at - kept)
                 _, source, target, command, size = HEADER.unpack_from(buffer, at)
-                data = bytes(buffer[at + HEADER.size:at + HEADER.size + size])
+                data = bytes(buffer[at + HEADER.size : at + HEADER.size + size])
                 frames.append(Frame(source, target, command, data))
                 self.counts.frames += 1
                 self._searching = False
@@ -216,7 +239,7 @@ class Parser:
     def _sound(self, at: int, end: int) -> bool:
         self.counts.checked += end - at
         with memoryview(self._buffer) as view:
-            return crc16(view[at:end - 2]) == int.from_bytes(view[end - 2:end], "little")
+            return crc16(view[at : end - 2]) == int.from_bytes(view[end - 2 : end], "little")
 
     def _skip(self, count: int) -> None:
         if count:
@@ -225,15 +248,27 @@ class Parser:
             self._searching = True
 
 
-def command_block(position: np.ndarray, *, kp: np.ndarray | int, ki: np.ndarray | int,
-                  kd: np.ndarray | int, torque_max: np.ndarray | int,
-                  mode: np.ndarray | int = Mode.POSITION) -> np.ndarray:
+def command_block(
+    position: np.ndarray,
+    *,
+    kp: np.ndarray | int,
+    ki: np.ndarray | int,
+    kd: np.ndarray | int,
+    torque_max: np.ndarray | int,
+    mode: np.ndarray | int = Mode.POSITION,
+) -> np.ndarray:
     """Joint commands, `COMMAND_BLOCK`: angles [12] rad, gains in the firmware's units, current
     limit in mA; scalars hold for all joints."""
     block = np.zeros((), COMMAND_BLOCK)
     block["id"] = np.arange(JOINTS)
-    for name, value in (("position", position), ("kp", kp), ("ki", ki), ("kd", kd),
-                        ("torque_max", torque_max), ("mode", mode)):
+    for name, value in (
+        ("position", position),
+        ("kp", kp),
+        ("ki", ki),
+        ("kd", kd),
+        ("torque_max", torque_max),
+        ("mode", mode),
+    ):
         block[name] = value
     return block
 

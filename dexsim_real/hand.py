@@ -27,8 +27,7 @@ _LONGEST = frames.OVERHEAD + frames.STATE_BLOCK.itemsize  # bytes of the longest
 
 def passive_command() -> np.ndarray:
     """Joint commands that leave all motors off."""
-    return frames.command_block(np.zeros(frames.JOINTS), kp=0, ki=0, kd=0, torque_max=0,
-                                mode=Mode.PASSIVE)
+    return frames.command_block(np.zeros(frames.JOINTS), kp=0, ki=0, kd=0, torque_max=0, mode=Mode.PASSIVE)
 
 
 class SerialHand:
@@ -39,8 +38,7 @@ class SerialHand:
       tap: called with ("tx" or "rx", bytes) for every frame, from the thread that exchanges.
     """
 
-    def __init__(self, port: str, config: LinkConfig | None = None, *,
-                 tap: Callable[[str, bytes], None] | None = None):
+    def __init__(self, port: str, config: LinkConfig | None = None, *, tap: Callable[[str, bytes], None] | None = None):
         self.port, self.config = port, config or LinkConfig()
         self.counts = LinkCounts()
         self._tap = tap or (lambda direction, data: None)
@@ -173,8 +171,9 @@ class SerialHand:
         local = "://" not in self.port
         try:
             options = {"exclusive": True} if local else {}
-            self._serial = serial.serial_for_url(self.port, baudrate=self.config.baud, timeout=_POLL,
-                                                 write_timeout=_WRITE, **options)
+            self._serial = serial.serial_for_url(
+                self.port, baudrate=self.config.baud, timeout=_POLL, write_timeout=_WRITE, **options
+            )
         except (OSError, ValueError) as error:
             raise HandError(explain(self.port, error)) from None
         if local:
@@ -202,16 +201,24 @@ class SerialHand:
 
     def _silence(self) -> str:
         if not self._received:
-            return (f"{self.port}: no answer. Is the hand powered, are A and B of RS485 swapped, is its "
-                    f"id {self.config.hand_id}?")
+            return (
+                f"{self.port}: no answer. Is the hand powered, are A and B of RS485 swapped, is its "
+                f"id {self.config.hand_id}?"
+            )
         if self.counts.late:
-            return (f"{self.port}: answers come sooner than {self.config.baud} baud allow; if this line is emulated "
-                    "and has no pace, say --link.no-paced")
+            return (
+                f"{self.port}: answers come sooner than {self.config.baud} baud allow; if this line is emulated "
+                "and has no pace, say --link.no-paced"
+            )
         if not self._parser.counts.frames and not self._parser.counts.crc_errors:
-            return (f"{self.port}: {self._received} bytes came and none make a frame: is the hand set to "
-                    f"{self.config.baud} baud?")
-        return (f"{self.port}: the hand answers, but not with a sound state ({self.counts.crc_errors} "
-                f"wrong checksums, {self.counts.refused} refusals): check cable and termination")
+            return (
+                f"{self.port}: {self._received} bytes came and none make a frame: is the hand set to "
+                f"{self.config.baud} baud?"
+            )
+        return (
+            f"{self.port}: the hand answers, but not with a sound state ({self.counts.crc_errors} "
+            f"wrong checksums, {self.counts.refused} refusals): check cable and termination"
+        )
 
     def _reconnect(self) -> Reply | None:
         if time.monotonic() < self._retry_at:

@@ -38,7 +38,7 @@ def encode(index: int, quat: np.ndarray, acceleration: tuple[float, float, float
 
 def decode(frame: bytes) -> np.ndarray | None:
     """Orientation (w, x, y, z) of a frame, or None where it is damaged."""
-    body = frame[len(HEAD):-1]
+    body = frame[len(HEAD) : -1]
     if len(frame) != SIZE or frame[:2] != HEAD or sum(body) & 0xFF != frame[-1]:
         return None
     _, yaw, pitch, roll, *_ = _BODY.unpack(body)
@@ -46,8 +46,14 @@ def decode(frame: bytes) -> np.ndarray | None:
         return None
     half = [math.radians(angle / 100) / 2 for angle in (roll, pitch, yaw)]
     (cr, cp, cy), (sr, sp, sy) = map(math.cos, half), map(math.sin, half)
-    return np.array([cr * cp * cy + sr * sp * sy, sr * cp * cy - cr * sp * sy,
-                     cr * sp * cy + sr * cp * sy, cr * cp * sy - sr * sp * cy])
+    return np.array(
+        [
+            cr * cp * cy + sr * sp * sy,
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+        ]
+    )
 
 
 class RvcParser:
@@ -62,13 +68,13 @@ class RvcParser:
         self._buffer += data
         found, at = [], 0
         while (at := self._buffer.find(HEAD, at)) >= 0 and at + SIZE <= len(self._buffer):
-            quat = decode(bytes(self._buffer[at:at + SIZE]))
+            quat = decode(bytes(self._buffer[at : at + SIZE]))
             if quat is None:
                 self.damaged += 1
             else:
                 found.append(quat)
             at += SIZE if quat is not None else 1
-        del self._buffer[:at if at >= 0 else max(len(self._buffer) - 1, 0)]
+        del self._buffer[: at if at >= 0 else max(len(self._buffer) - 1, 0)]
         return found
 
 
@@ -128,8 +134,9 @@ class Imu:
         until = time.monotonic() + seconds
         while self._newest is None:
             if time.monotonic() > until:
-                raise HandError(f"{self.port}: no orientation from the IMU; is "
-                                "it in UART-RVC mode (PS0 high, PS1 low)?")
+                raise HandError(
+                    f"{self.port}: no orientation from the IMU; is it in UART-RVC mode (PS0 high, PS1 low)?"
+                )
             time.sleep(0.005)
 
     def calibrate(self, known: np.ndarray) -> None:

@@ -168,13 +168,13 @@ def _decode(data: bytes, at: int) -> tuple[Record | None, int]:
     if at + _HEAD.size > len(data):
         return None, 0
     sync, kind, when, length, check = _HEAD.unpack_from(data, at)
-    payload = data[at + _HEAD.size:at + _HEAD.size + length]
+    payload = data[at + _HEAD.size : at + _HEAD.size + length]
     if sync != SYNC or len(payload) != length or kind not in set(Kind):
         return None, 0
     if zlib.crc32(payload, zlib.crc32(_HEAD.pack(sync, kind, when, length, 0))) != check:
         return None, 0
     if kind in (Kind.SENT, Kind.RECEIVED):
-        content: Any = (*_SEQUENCE.unpack_from(payload), payload[_SEQUENCE.size:])
+        content: Any = (*_SEQUENCE.unpack_from(payload), payload[_SEQUENCE.size :])
     elif kind == Kind.NOTE:
         content = payload.decode()
     else:
@@ -196,4 +196,4 @@ def _unpack_array(value: dict) -> Any:
 def _write_all(file: int, data: bytes) -> None:
     view = memoryview(data)
     while view:
-        view = view[os.write(file, view):]
+        view = view[os.write(file, view) :]

@@ -29,8 +29,13 @@ class ObjectSensors:
         sensing = task.config.sensing
         try:
             if arguments.camera:
-                self._camera = HeightSensor(open_masks(arguments.camera, arguments.optics), arguments.optics,
-                                            self._reference, sensing.object_axes, sensing.velocity_filter)
+                self._camera = HeightSensor(
+                    open_masks(arguments.camera, arguments.optics),
+                    arguments.optics,
+                    self._reference,
+                    sensing.object_axes,
+                    sensing.velocity_filter,
+                )
             if arguments.imu:
                 self._imu = Imu(arguments.imu, -np.asarray(task.gravity), arguments.imu_mount)
                 self._imu.wait()

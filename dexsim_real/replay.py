@@ -85,7 +85,7 @@ def replay(path: Path) -> Replay:
             if frame is None:
                 counts["without_frame"] += 1
                 continue
-            now = sensing.measure(frames.decode_state(frame[frames.HEADER.size:-2]))
+            now = sensing.measure(frames.decode_state(frame[frames.HEADER.size : -2]))
             same = all(_same(getattr(now, name), tick["readings"][name]) for name in MEASURED)
             # What the hand measures is taken as recomputed; camera, goal and command as logged.
             again = {**tick["readings"], **{name: getattr(now, name) for name in MEASURED}}
@@ -105,10 +105,19 @@ def replay(path: Path) -> Replay:
             end = record.content
     if meta is None:
         raise LogError(f"{path}: ends before the hand was ready; its notes: {'; '.join(notes) or 'none'}")
-    report = {"log": str(path), "task": meta["task"], "policy": meta["policy"], "ticks": len(ticks), **counts,
-              "seconds": times[-1] - times[0] if times else 0.0, "first_difference": first or None,
-              "damaged_bytes": reader.damaged, "ended": end["end"] if end else "cut off", "notes": notes,
-              "recorded_on": meta["environment"]}
+    report = {
+        "log": str(path),
+        "task": meta["task"],
+        "policy": meta["policy"],
+        "ticks": len(ticks),
+        **counts,
+        "seconds": times[-1] - times[0] if times else 0.0,
+        "first_difference": first or None,
+        "damaged_bytes": reader.damaged,
+        "ended": end["end"] if end else "cut off",
+        "notes": notes,
+        "recorded_on": meta["environment"],
+    }
     since = np.array(times) - (times[0] if times else 0.0)
     return Replay(report, since, measured, ticks, np.array(observations), fields)
 
@@ -135,9 +144,12 @@ def _same(a: np.ndarray, b: np.ndarray) -> bool:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """The command. Returns its exit code: 0, or 1 when something was not the same."""
-    arguments = cli.parse(ReplayArguments, sys.argv[1:] if argv is None else argv,
-                          prog="python -m dexsim_real.replay",
-                          description="Recompute and show the log of a run on the hand.")
+    arguments = cli.parse(
+        ReplayArguments,
+        sys.argv[1:] if argv is None else argv,
+        prog="python -m dexsim_real.replay",
+        description="Recompute and show the log of a run on the hand.",
+    )
     prepare_jax()
     cli.enable_caches()
     run = replay(arguments.log)
@@ -145,11 +157,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     for note in report["notes"]:
         print(note)
     same = report["readings_same"] == report["observations_same"] == report["ticks"]
-    print(f"{report['ticks']} ticks in {report['seconds']:.2f} s, {report['frames']} frames, "
-          f"{report['damaged_bytes']} bytes damaged, ended: {report['ended']}")
-    print("every observation is the same, bit for bit" if same else
-          f"{report['observations_same']} observations of {report['ticks']} are the same; the first that is not: "
-          f"{report['first_difference']}")
+    print(
+        f"{report['ticks']} ticks in {report['seconds']:.2f} s, {report['frames']} frames, "
+        f"{report['damaged_bytes']} bytes damaged, ended: {report['ended']}"
+    )
+    print(
+        "every observation is the same, bit for bit"
+        if same
+        else f"{report['observations_same']} observations of {report['ticks']} are the same; the first that is not: "
+        f"{report['first_difference']}"
+    )
     if arguments.output:
         cli.write_json(arguments.output, report)
     if arguments.plot and run.ticks:

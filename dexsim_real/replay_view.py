@@ -17,11 +17,13 @@ if TYPE_CHECKING:
 
 def signals(run: Replay) -> dict[str, np.ndarray]:
     """What both show, [T, n] each: angles and their targets (rad), forces (N), command (1), age of the reading (s)."""
-    return {"angle": np.array([now.joint_position for now in run.measured]),
-            "target": np.array([tick["target"] for tick in run.ticks]),
-            "force": np.array([now.finger_force for now in run.measured]),
-            "command": np.array([[float(tick["readings"]["command"])] for tick in run.ticks]),
-            "age": np.array([[tick["age"]] for tick in run.ticks])}
+    return {
+        "angle": np.array([now.joint_position for now in run.measured]),
+        "target": np.array([tick["target"] for tick in run.ticks]),
+        "force": np.array([now.finger_force for now in run.measured]),
+        "command": np.array([[float(tick["readings"]["command"])] for tick in run.ticks]),
+        "age": np.array([[tick["age"]] for tick in run.ticks]),
+    }
 
 
 def plot(run: Replay, path: Path) -> None:
@@ -47,8 +49,16 @@ def plot(run: Replay, path: Path) -> None:
     # Entries differ in unit and size, so each is shown by how far it is from its own mean.
     spread = np.maximum(run.observation.std(0), 1e-6)
     edges = np.cumsum([0] + [field.size for field in run.fields])
-    axes[3].pcolormesh(run.time, np.arange(edges[-1]) + 0.5, ((run.observation - run.observation.mean(0)) / spread).T,
-                       cmap="coolwarm", vmin=-3, vmax=3, shading="nearest", rasterized=True)
+    axes[3].pcolormesh(
+        run.time,
+        np.arange(edges[-1]) + 0.5,
+        ((run.observation - run.observation.mean(0)) / spread).T,
+        cmap="coolwarm",
+        vmin=-3,
+        vmax=3,
+        shading="nearest",
+        rasterized=True,
+    )
     axes[3].set_yticks((edges[:-1] + edges[1:]) / 2, [field.name for field in run.fields], fontsize=7)
     axes[3].hlines(edges[1:-1], run.time[0], run.time[-1], color="k", lw=0.5)
     axes[3].invert_yaxis()
@@ -76,8 +86,10 @@ def show_rerun(run: Replay, path: Path | None = None) -> None:
     names = {"angle": hand.joint_names, "target": hand.joint_names, "force": hand.finger_names}
     series = {
         **{name: (names.get(name, (name,)), values) for name, values in signals(run).items()},
-        **{f"observation/{field.name}": (tuple(f"{field.name} {i}" for i in range(field.size)), values)
-           for field, values in zip(run.fields, np.split(run.observation, edges, 1), strict=True)},
+        **{
+            f"observation/{field.name}": (tuple(f"{field.name} {i}" for i in range(field.size)), values)
+            for field, values in zip(run.fields, np.split(run.observation, edges, 1), strict=True)
+        },
     }
     recording = rerun.RecordingStream("dexsim")
     if path is None:
@@ -88,8 +100,9 @@ def show_rerun(run: Replay, path: Path | None = None) -> None:
         recording.save(path)
     for entity, (labels, values) in series.items():
         recording.log(entity, rerun.SeriesLines(names=list(labels)), static=True)
-        recording.send_columns(entity, [rerun.TimeColumn("run", duration=run.time)],
-                               rerun.Scalars.columns(scalars=values))
+        recording.send_columns(
+            entity, [rerun.TimeColumn("run", duration=run.time)], rerun.Scalars.columns(scalars=values)
+        )
     top = max(float(np.max([m.taxel_force for m in run.measured])), 1e-3)
     for at, now in zip(run.time, run.measured, strict=True):
         recording.set_time("run", duration=float(at))

@@ -20,8 +20,12 @@ from dexsim_real.view import summary_table
 
 def main(argv: Sequence[str] | None = None) -> int:
     """The command. Returns its exit code: 0, or 1 when `Safety` or a failure ended the run."""
-    arguments = cli.parse(RunArguments, sys.argv[1:] if argv is None else argv,
-                          prog="python -m dexsim_real.run", description="Run a policy on the hand.")
+    arguments = cli.parse(
+        RunArguments,
+        sys.argv[1:] if argv is None else argv,
+        prog="python -m dexsim_real.run",
+        description="Run a policy on the hand.",
+    )
     prepare_jax()
     cli.enable_caches()
     session = Session(arguments)

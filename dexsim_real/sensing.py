@@ -87,8 +87,11 @@ class Measured:
 
     def finite(self) -> bool:
         """Whether every number is."""
-        return bool(np.isfinite(self.joint_position).all() and np.isfinite(self.joint_torque).all()
-                    and np.isfinite(self.taxel_force).all())
+        return bool(
+            np.isfinite(self.joint_position).all()
+            and np.isfinite(self.joint_torque).all()
+            and np.isfinite(self.taxel_force).all()
+        )
 
 
 class HandSensing:
@@ -104,8 +107,10 @@ class HandSensing:
 
     def __init__(self, hand: Hand, config: HardwareConfig, calibration: Calibration | None = None):
         if (hand.num_joints, hand.num_fingers, hand.num_taxels) != (_JOINTS, frames.TIPS, frames.TAXELS):
-            raise HandError(f"{hand.name}: {hand.num_joints} joints and {hand.num_fingers} x {hand.num_taxels} "
-                            f"taxels do not fit the frames' {_JOINTS} and {frames.TIPS} x {frames.TAXELS}")
+            raise HandError(
+                f"{hand.name}: {hand.num_joints} joints and {hand.num_fingers} x {hand.num_taxels} "
+                f"taxels do not fit the frames' {_JOINTS} and {frames.TIPS} x {frames.TAXELS}"
+            )
         self.hand, self.config, self.calibration = hand, config, calibration
         self._sign = np.array(config.joint_sign, np.float32)
         self._offset = np.array(config.joint_offset, np.float32)
@@ -116,8 +121,9 @@ class HandSensing:
             self._torque = lambda counts: counts * scale
         else:
             self._per_count = np.asarray(calibration.force_per_count, np.float32)[:, None]
-            self._torque = jax.jit(lambda counts: normalised_torque(
-                calibration, current_from_counts(calibration, counts)))
+            self._torque = jax.jit(
+                lambda counts: normalised_torque(calibration, current_from_counts(calibration, counts))
+            )
 
     def measure(self, state: np.ndarray) -> Measured:
         """SI units of a `frames.STATE_BLOCK`."""
@@ -131,7 +137,8 @@ class HandSensing:
             taxel_force=counts * self._per_count,
             current=np.abs(joint["current"].astype(np.float32)) * np.float32(1e-3),
             temperature=np.concatenate([board, tip["temperature"]]).astype(np.float32),
-            errors=np.stack([joint["palm_error"], joint["joint_error"], joint["tip_error"]], -1))
+            errors=np.stack([joint["palm_error"], joint["joint_error"], joint["tip_error"]], -1),
+        )
 
     def zero(self, states: Sequence[np.ndarray]) -> None:
         """Take the taxels' mean over these states as zero.
@@ -143,16 +150,23 @@ class HandSensing:
         worst = counts.max(1)
         if np.any(worst > self.config.tare_limit):
             names = [self.hand.finger_names[i] for i in np.flatnonzero(worst > self.config.tare_limit)]
-            raise HandError(f"cannot zero the taxels: {', '.join(names)} read up to {worst.max():.0f} counts "
-                            f"(limit {self.config.tare_limit:.0f}); free the fingertips, or power-cycle the hand")
+            raise HandError(
+                f"cannot zero the taxels: {', '.join(names)} read up to {worst.max():.0f} counts "
+                f"(limit {self.config.tare_limit:.0f}); free the fingertips, or power-cycle the hand"
+            )
         self.tare = counts
 
     def command(self, position: np.ndarray, mode: Mode) -> np.ndarray:
         """A `frames.COMMAND_BLOCK` for joint angles [J] rad of the model; all off unless in `POSITION`."""
         config, on = self.config, mode == Mode.POSITION
-        return frames.command_block((np.asarray(position) - self._offset) * self._sign,
-                                    kp=np.array(config.kp) * on, ki=np.array(config.ki) * on,
-                                    kd=np.array(config.kd) * on, torque_max=config.torque_max * on, mode=mode)
+        return frames.command_block(
+            (np.asarray(position) - self._offset) * self._sign,
+            kp=np.array(config.kp) * on,
+            ki=np.array(config.ki) * on,
+            kd=np.array(config.kd) * on,
+            torque_max=config.torque_max * on,
+            mode=mode,
+        )
 
     def velocity(self, state: np.ndarray) -> np.ndarray | None:
         """Joint velocities [J] rad/s as reported; None when they are to be estimated."""
@@ -192,10 +206,20 @@ class VelocityFilter:
 
 # --- readings ------------------------------------------------------------------------------------
 
-SOURCES = {"joint_position": "hand", "joint_torque": "hand", "contact_force": "hand", "contact_centre": "hand",
-           "fingertip_position": "hand", "fingertip_rotation": "hand", "last_action": "policy", "command": "user",
-           "object_position": "camera", "object_velocity": "camera", "relative_orientation": "imu",
-           "object_orientation": "imu"}
+SOURCES = {
+    "joint_position": "hand",
+    "joint_torque": "hand",
+    "contact_force": "hand",
+    "contact_centre": "hand",
+    "fingertip_position": "hand",
+    "fingertip_rotation": "hand",
+    "last_action": "policy",
+    "command": "user",
+    "object_position": "camera",
+    "object_velocity": "camera",
+    "relative_orientation": "imu",
+    "object_orientation": "imu",
+}
 """Who measures each field of an observation on hardware."""
 
 
@@ -220,15 +244,22 @@ def sources_of(names: Sequence[str]) -> set[str]:
     return {SOURCES[name] for name in names}
 
 
-def make_readings(measured: Measured, seen: ObjectEstimate, goal_quat: np.ndarray, command: float,
-                  last_action: np.ndarray) -> Readings:
+def make_readings(
+    measured: Measured, seen: ObjectEstimate, goal_quat: np.ndarray, command: float, last_action: np.ndarray
+) -> Readings:
     """One tick of measurements, filled by name; float32, as in simulation.
 
     `last_action` is the action that led to these measurements.
     """
-    known = {"joint_position": measured.joint_position, "joint_torque": measured.joint_torque,
-             "taxel_force": measured.taxel_force, "object_position": seen.position,
-             "object_velocity": seen.velocity, "object_quat": seen.quat, "goal_quat": goal_quat,
-             "command": command, "last_action": last_action}
-    return Readings(**{field.name: np.asarray(known[field.name], np.float32)
-                       for field in dataclasses.fields(Readings)})
+    known = {
+        "joint_position": measured.joint_position,
+        "joint_torque": measured.joint_torque,
+        "taxel_force": measured.taxel_force,
+        "object_position": seen.position,
+        "object_velocity": seen.velocity,
+        "object_quat": seen.quat,
+        "goal_quat": goal_quat,
+        "command": command,
+        "last_action": last_action,
+    }
+    return Readings(**{field.name: np.asarray(known[field.name], np.float32) for field in dataclasses.fields(Readings)})

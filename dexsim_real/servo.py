@@ -42,8 +42,13 @@ class Timing:
 
     def summary(self) -> dict[str, float]:
         """Percentiles in ms, and counts."""
-        return {"count": self.count, "missed": self.missed, "p50_ms": 1e3 * self.percentile(50),
-                "p99_ms": 1e3 * self.percentile(99), "max_ms": 1e3 * self.worst}
+        return {
+            "count": self.count,
+            "missed": self.missed,
+            "p50_ms": 1e3 * self.percentile(50),
+            "p99_ms": 1e3 * self.percentile(99),
+            "max_ms": 1e3 * self.worst,
+        }
 
 
 GRACE = 0.001  # s, how late a cycle may begin rather than be left out
@@ -52,8 +57,9 @@ GRACE = 0.001  # s, how late a cycle may begin rather than be left out
 class Pace:
     """Absolute deadlines `start + k / rate`: what one cycle takes does not shift the next."""
 
-    def __init__(self, rate: float, clock: Callable[[], float] = time.monotonic,
-                 sleep: Callable[[float], None] = time.sleep):
+    def __init__(
+        self, rate: float, clock: Callable[[], float] = time.monotonic, sleep: Callable[[float], None] = time.sleep
+    ):
         self.period, self._clock, self._sleep = 1.0 / rate, clock, sleep
         self.jitter = Timing()
         self.next = clock() + self.period

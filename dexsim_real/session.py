@@ -120,13 +120,20 @@ class Session:
         """What the run was like."""
         servo, safety = self.servo, self.safety
         summary = {
-            "end": self.end, "seconds": round(time.monotonic() - self.started, 3) if self.started else 0.0,
-            "command": self.arguments.command, "policy_jitter": self.pace.jitter.summary(),
-            "policy_compute": self.compute.summary(), "exchange_jitter": servo.pace.jitter.summary(),
-            "round_trip": servo.round_trip.summary(), "missed_for_the_hand": servo.waited,
-            "link": dataclasses.asdict(self.port.counts), "safety": dict(safety.counts),
+            "end": self.end,
+            "seconds": round(time.monotonic() - self.started, 3) if self.started else 0.0,
+            "command": self.arguments.command,
+            "policy_jitter": self.pace.jitter.summary(),
+            "policy_compute": self.compute.summary(),
+            "exchange_jitter": servo.pace.jitter.summary(),
+            "round_trip": servo.round_trip.summary(),
+            "missed_for_the_hand": servo.waited,
+            "link": dataclasses.asdict(self.port.counts),
+            "safety": dict(safety.counts),
             "mean_finger_force": self.force / self.forces if self.forces else 0.0,
-            "log": str(self.log.path), "log_dropped": self.log.dropped}
+            "log": str(self.log.path),
+            "log_dropped": self.log.dropped,
+        }
         if self.goals:
             times = [t - self.started for t in self.goals.times]
             summary |= {"successes": self.goals.successes, "success_times": times}
@@ -153,8 +160,10 @@ class Session:
         ready = begin + arguments.approach + arguments.place
         while (now := time.monotonic()) < ready or not self.objects.ready():
             if now > ready + _PATIENCE:
-                raise HandError("the camera does not see the object: check its light, the colour threshold "
-                                "(--optics.hsv-low, --optics.hsv-high) and --optics.min-area")
+                raise HandError(
+                    "the camera does not see the object: check its light, the colour threshold "
+                    "(--optics.hsv-low, --optics.hsv-high) and --optics.min-area"
+                )
             share = min((now - begin) / arguments.approach, 1.0) if arguments.approach > 0 else 1.0
             self.safety.wish(start + np.float32(share * share * (3 - 2 * share)) * (goal - start), now)
             self._check()
@@ -200,9 +209,18 @@ class Session:
         self.force += float(sample.measured.finger_force.sum())
         self.forces += 1
         readings = {field.name: getattr(tick.readings, field.name) for field in dataclasses.fields(tick.readings)}
-        self.log.add(Kind.TICK, {
-            "sequence": sample.sequence, "age": now - sample.time, "readings": readings,
-            "observation": tick.observation, "action": tick.action, "target": tick.target}, now)
+        self.log.add(
+            Kind.TICK,
+            {
+                "sequence": sample.sequence,
+                "age": now - sample.time,
+                "readings": readings,
+                "observation": tick.observation,
+                "action": tick.action,
+                "target": tick.target,
+            },
+            now,
+        )
 
     def _tap(self, direction: str, data: bytes) -> None:
         kind = Kind.SENT if direction == "tx" else Kind.RECEIVED
@@ -222,12 +240,23 @@ class Session:
         arguments, policy = self.arguments, self.controller.policy
         text = arguments.calibration.read_text() if arguments.calibration else ""
         digest = hashlib.sha256(b"".join(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(policy.params)))
-        self.log.add(Kind.META, {
-            "task": policy.task, "env_config": policy.env_config, "policy": arguments.policy,
-            "policy_sha256": digest.hexdigest(), "calibration": text, "tare": self.sensing.tare,
-            "hardware": to_dict(arguments.hardware), "safety": to_dict(self.safety.config),
-            "command": arguments.command, "control_rate": policy.control_rate, "clock": time.time(),
-            "environment": cli.environment_report()})
+        self.log.add(
+            Kind.META,
+            {
+                "task": policy.task,
+                "env_config": policy.env_config,
+                "policy": arguments.policy,
+                "policy_sha256": digest.hexdigest(),
+                "calibration": text,
+                "tare": self.sensing.tare,
+                "hardware": to_dict(arguments.hardware),
+                "safety": to_dict(self.safety.config),
+                "command": arguments.command,
+                "control_rate": policy.control_rate,
+                "clock": time.time(),
+                "environment": cli.environment_report(),
+            },
+        )
 
     def _status(self) -> dict[str, str]:
         sample, counts = self.safety.sample, self.port.counts
@@ -242,17 +271,20 @@ class Session:
             "policy": self._timing(self.pace.jitter, 1 / self.pace.period),
             "exchanges": self._timing(self.servo.pace.jitter, 1 / self.servo.pace.period),
             "round trip": f"p50 {1e3 * self.servo.round_trip.percentile(50):.2f} ms, "
-                          f"p99 {1e3 * self.servo.round_trip.percentile(99):.2f} ms",
+            f"p99 {1e3 * self.servo.round_trip.percentile(99):.2f} ms",
             "link": f"{counts.answered} answered, {counts.corrupt} corrupt, {counts.silent} silent, "
-                    f"{counts.late} late, {counts.reconnects} reconnects",
+            f"{counts.late} late, {counts.reconnects} reconnects",
             "force": f"{' '.join(f'{f:.1f}' for f in force)} N, sum {force.sum():.1f} N",
             "command": f"{self.arguments.command:.2f}",
-            "heat": f"joints {heat[:12].max():.0f}, tips {heat[12:].max():.0f} degC"}
+            "heat": f"joints {heat[:12].max():.0f}, tips {heat[12:].max():.0f} degC",
+        }
         if self.goals:
             rows["successes"] = str(self.goals.successes)
         return rows
 
     @staticmethod
     def _timing(timing: Timing, rate: float) -> str:
-        return (f"{rate:.1f} Hz, late p50 {1e3 * timing.percentile(50):.2f} ms, "
-                f"p99 {1e3 * timing.percentile(99):.2f} ms, missed {timing.missed}")
+        return (
+            f"{rate:.1f} Hz, late p50 {1e3 * timing.percentile(50):.2f} ms, "
+            f"p99 {1e3 * timing.percentile(99):.2f} ms, missed {timing.missed}"
+        )

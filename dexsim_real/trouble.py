@@ -16,8 +16,10 @@ def explain(port: str, error: Exception) -> str:
     """One line about a port that does not open: the reason, and what helps."""
     number = getattr(error, "errno", None)
     if number == errno.EACCES:
-        return (f"{port}: permission denied. It belongs to the group {_group(port)!r}: run "
-                f"`sudo usermod -aG {_group(port)} $USER`, then log out and in again")
+        return (
+            f"{port}: permission denied. It belongs to the group {_group(port)!r}: run "
+            f"`sudo usermod -aG {_group(port)} $USER`, then log out and in again"
+        )
     if number in (errno.EBUSY, errno.EAGAIN) or "exclusively lock" in str(error):
         return f"{port}: another program has it open (`fuser -v {port}` names it): close that first"
     if number in (errno.ENOENT, errno.ENXIO, errno.ENODEV):
@@ -36,9 +38,11 @@ def latency_warnings(port: str, sysfs: Path = Path("/sys/bus/usb-serial/devices"
         return []
     if value <= 1:
         return []
-    return [f"{port}: the adapter waits {value} ms before it passes on short packets. Now: "
-            f"`echo 1 | sudo tee {timer}`. For good, as /etc/udev/rules.d/99-dexsim.rules: "
-            'ACTION=="add", SUBSYSTEM=="usb-serial", DRIVER=="ftdi_sio", ATTR{latency_timer}="1"']
+    return [
+        f"{port}: the adapter waits {value} ms before it passes on short packets. Now: "
+        f"`echo 1 | sudo tee {timer}`. For good, as /etc/udev/rules.d/99-dexsim.rules: "
+        'ACTION=="add", SUBSYSTEM=="usb-serial", DRIVER=="ftdi_sio", ATTR{latency_timer}="1"'
+    ]
 
 
 def _group(port: str) -> str:

@@ -24,8 +24,11 @@ class View:
     def __init__(self, title: str, status: Callable[[], dict[str, str]], quiet: bool = False):
         self.console = Console(stderr=True, quiet=quiet)
         self._title, self._status = title, status
-        self._live = Live(console=self.console, auto_refresh=False, transient=True) if (
-            self.console.is_terminal and not quiet) else None
+        self._live = (
+            Live(console=self.console, auto_refresh=False, transient=True)
+            if (self.console.is_terminal and not quiet)
+            else None
+        )
         self._notes: deque[str] = deque(maxlen=1000)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="view", daemon=True)

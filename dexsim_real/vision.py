@@ -72,8 +72,11 @@ def height_of(mask: np.ndarray, config: CameraConfig, reference: np.ndarray, axi
     rows, columns = np.nonzero(mask)
     if rows.size < config.min_area:
         return None
-    pixel = [(columns.mean() - config.centre[0]) / config.focal[0],
-             (rows.mean() - config.centre[1]) / config.focal[1], 1.0]
+    pixel = [
+        (columns.mean() - config.centre[0]) / config.focal[0],
+        (rows.mean() - config.centre[1]) / config.focal[1],
+        1.0,
+    ]
     ray = np.asarray(pixel) @ camera_axes(config)
     ray /= np.linalg.norm(ray)
     line = np.eye(3)[axis]
@@ -94,8 +97,9 @@ class HeightSensor:
       weight: of the newest difference in the velocity (`Sensing.velocity_filter`).
     """
 
-    def __init__(self, masks: Masks, config: CameraConfig, reference: np.ndarray,
-                 axes: tuple[bool, bool, bool], weight: float):
+    def __init__(
+        self, masks: Masks, config: CameraConfig, reference: np.ndarray, axes: tuple[bool, bool, bool], weight: float
+    ):
         if sum(axes) != 1:
             raise HandError(f"the policy wants the object's coordinates {axes}; one camera measures one of them")
         self._masks, self._config, self._weight = masks, config, weight
@@ -143,6 +147,7 @@ class HeightSensor:
 
 
 # --- sources of masks ----------------------------------------------------------------------------
+
 
 def open_masks(spec: str, config: CameraConfig) -> Masks:
     """A mask source by name: a camera number or video file, `unix:PATH`, or `MODULE:FUNCTION`.
@@ -198,6 +203,7 @@ def _stream(path: str) -> Masks:
             return None
         mask = np.unpackbits(np.frombuffer(bits, np.uint8), count=width * height)
         return when, mask.reshape(height, width).astype(bool)
+
     return read
 
 
@@ -210,6 +216,7 @@ def _camera(spec: str, segment: Callable[[np.ndarray], np.ndarray]) -> Masks:
     def read() -> tuple[float, np.ndarray] | None:
         sound, picture = capture.read()
         return (time.monotonic(), segment(picture)) if sound else None
+
     return read
 
 

@@ -25,9 +25,19 @@ ROW = 3  # spheres along a pad
 KINDS = ("box", "capsule", "cylinder")  # the order of `dexsim.object_config.SLOTS`
 
 
-def compile_scene(hand, target, *, gravity=GRAVITY, timestep=0.006, iterations=3,
-                  line_search=6, condim=3, margin=0.0, exact=False,
-                  settling=0.03) -> mujoco.MjModel:
+def compile_scene(
+    hand,
+    target,
+    *,
+    gravity=GRAVITY,
+    timestep=0.006,
+    iterations=3,
+    line_search=6,
+    condim=3,
+    margin=0.0,
+    exact=False,
+    settling=0.03,
+) -> mujoco.MjModel:
     """One object (`ObjectParams` of NumPy leaves) under the hand.
 
     Fingertips wear 3 mm of rubber; each of their three spheres presses with half of
@@ -46,18 +56,25 @@ def compile_scene(hand, target, *, gravity=GRAVITY, timestep=0.006, iterations=3
     for geom in spec.geoms:
         geom.contype = geom.conaffinity = 0
     tips = {hand.body_names[body] for body in hand.tip_body}
-    body = spec.worldbody.add_body(name="object", mass=float(target.mass), explicitinertial=True,
-                                   ipos=target.com, inertia=target.inertia)
+    body = spec.worldbody.add_body(
+        name="object", mass=float(target.mass), explicitinertial=True, ipos=target.com, inertia=target.inertia
+    )
     body.add_freejoint()
     for k in np.flatnonzero(target.active):
         kind = getattr(mujoco.mjtGeom, f"mjGEOM_{KINDS[k].upper()}")
-        body.add_geom(name=KINDS[k], type=kind, size=target.size[k], pos=target.position[k],
-                      contype=0, conaffinity=0, mass=0)
+        body.add_geom(
+            name=KINDS[k], type=kind, size=target.size[k], pos=target.position[k], contype=0, conaffinity=0, mass=0
+        )
         for name in names:
             tip = spec.geom(name).parent.name in tips
             slide = target.friction if tip or target.bare_friction is None else target.bare_friction
-            spec.add_pair(geomname1=name, geomname2=KINDS[k], condim=condim, margin=margin,
-                          friction=[slide, slide, 0.005, 1e-4, 1e-4])
+            spec.add_pair(
+                geomname1=name,
+                geomname2=KINDS[k],
+                condim=condim,
+                margin=margin,
+                friction=[slide, slide, 0.005, 1e-4, 1e-4],
+            )
     option = spec.option
     option.timestep, option.gravity = timestep, gravity
     option.iterations, option.ls_iterations = iterations, line_search
@@ -85,8 +102,13 @@ def _clad(spec: mujoco.MjSpec, name: str) -> list[str]:
     pad.size = [radius, *pad.size[1:]]
     for k in range(ROW):
         share = k / (ROW - 1)
-        pad.parent.add_geom(name=f"{name}_{k}", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[radius, 0, 0],
-                            pos=(1 - share) * ends[0] + share * ends[1], mass=0)
+        pad.parent.add_geom(
+            name=f"{name}_{k}",
+            type=mujoco.mjtGeom.mjGEOM_SPHERE,
+            size=[radius, 0, 0],
+            pos=(1 - share) * ends[0] + share * ends[1],
+            mass=0,
+        )
     return [f"{name}_{k}" for k in range(ROW)]
 
 
@@ -151,16 +173,24 @@ def skin_law(hand, skin):
     area = jnp.asarray(hand.taxel_area)
 
     def law(qpos, target):
-        taxels = taxel_positions(hand, forward_kinematics(hand, qpos[:hand.num_joints]))
-        place = qpos[hand.num_joints:]
-        touch = tactile.feel(taxels, area, target.shape(), place[:3],
-                             rotations.quat_to_matrix(place[3:]), jnp.ones(hand.num_fingers), skin)
+        taxels = taxel_positions(hand, forward_kinematics(hand, qpos[: hand.num_joints]))
+        place = qpos[hand.num_joints :]
+        touch = tactile.feel(
+            taxels,
+            area,
+            target.shape(),
+            place[:3],
+            rotations.quat_to_matrix(place[3:]),
+            jnp.ones(hand.num_fingers),
+            skin,
+        )
         return jnp.sum(touch.skin_force, -1)
 
     return jax.jit(jax.vmap(law))
 
 
 # --- worlds to compare in ---------------------------------------------------------------------
+
 
 def row(tree, index):
     """One row of a batch, as NumPy."""

@@ -29,8 +29,11 @@ if not ON_GPU and "PYTEST_XDIST_WORKER" not in os.environ:
 
     for option, value in LIGHT:
         wanted = f"{os.environ.get('XLA_FLAGS', '')} --{option}={str(value).lower()}".strip()
-        if not subprocess.run([sys.executable, "-c", "import jax; jax.devices()"], capture_output=True,
-                              env={**os.environ, "XLA_FLAGS": wanted}).returncode:
+        if not subprocess.run(
+            [sys.executable, "-c", "import jax; jax.devices()"],
+            capture_output=True,
+            env={**os.environ, "XLA_FLAGS": wanted},
+        ).returncode:
             os.environ["XLA_FLAGS"] = wanted
 
 import hypothesis  # noqa: E402
@@ -41,8 +44,20 @@ hypothesis.settings.register_profile("dexsim", deadline=None, max_examples=20, d
 hypothesis.settings.load_profile("dexsim")
 
 # These begin: two processes share the files, and the longest would otherwise be what one of them ends alone with.
-LONGEST = ("test_notebook", "test_env", "test_brax", "test_warp", "test_rotate", "test_substep", "test_env_options",
-           "test_skin_law", "test_randomization", "test_object_mesh", "test_learning", "test_physics")
+LONGEST = (
+    "test_notebook",
+    "test_env",
+    "test_brax",
+    "test_warp",
+    "test_rotate",
+    "test_substep",
+    "test_env_options",
+    "test_skin_law",
+    "test_randomization",
+    "test_object_mesh",
+    "test_learning",
+    "test_physics",
+)
 # The size of the batch that the tests share. Another batch is another compilation: use this one.
 NUM_ENVS = 8
 
@@ -112,7 +127,19 @@ def physics_advance(hand: Any) -> Callable[..., Any]:
     from dexsim.object_config import SLOTS, ObjectConfig
     from dexsim.physics import Physics, PhysicsConfig
 
-    seam = Physics(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(substeps=1, **CONVERGED),
-                   gravity=GRAVITY, backend="jax", num_envs=NUM_ENVS)
-    return jax.jit(jax.vmap(lambda target, state, torque, push: seam.advance(
-        target, state, lambda index, position, velocity: torque, push)))
+    seam = Physics(
+        hand,
+        SLOTS,
+        ObjectConfig().largest,
+        PhysicsConfig(substeps=1, **CONVERGED),
+        gravity=GRAVITY,
+        backend="jax",
+        num_envs=NUM_ENVS,
+    )
+    return jax.jit(
+        jax.vmap(
+            lambda target, state, torque, push: seam.advance(
+                target, state, lambda index, position, velocity: torque, push
+            )
+        )
+    )

@@ -72,8 +72,11 @@ class BenchHand:
         self.commands.append(command)
         sent = self.time
         on = np.all(command["mode"] == Mode.POSITION)
-        self.held = [plate for plate in self.plates if on and np.all(
-            np.abs(np.delete(command["position"] - plate.contact, plate.joints)) < 0.03)]
+        self.held = [
+            plate
+            for plate in self.plates
+            if on and np.all(np.abs(np.delete(command["position"] - plate.contact, plate.joints)) < 0.03)
+        ]
         for plate in self.held:
             if self.force[plate.finger] > 0:
                 plate.arms = self._arms(plate, self.position)
@@ -112,8 +115,9 @@ class BenchHand:
         load = self._load()
         ahead, behind = (self._torque(way) for way in (1.0, -1.0))
         speed = np.where(ahead > load, ahead - load, np.where(behind < load, behind - load, 0.0)) / 0.4
-        self.position = np.clip(self.position + size * np.clip(speed, -8, 8),
-                                self.hand.joint_lower, self.hand.joint_upper)
+        self.position = np.clip(
+            self.position + size * np.clip(speed, -8, 8), self.hand.joint_lower, self.hand.joint_upper
+        )
 
     def _torque(self, way):
         """On the joints, if they move this way: losses are against the motion."""
@@ -140,8 +144,10 @@ class BenchHand:
         mujoco.mj_comPos(model, data)
         body = model.body(self.hand.body_names[self.hand.tip_body[plate.finger]]).id
         turn, jacobian = data.xmat[body].reshape(3, 3), np.zeros((3, model.nv))
-        place, normal = (plate.share @ part[plate.finger, plate.taxels]
-                         for part in (self.hand.taxel_position, self.hand.taxel_normal))
+        place, normal = (
+            plate.share @ part[plate.finger, plate.taxels]
+            for part in (self.hand.taxel_position, self.hand.taxel_normal)
+        )
         mujoco.mj_jac(model, data, jacobian, None, data.xpos[body] + turn @ place, body)
         return (jacobian.T @ (turn @ normal / np.linalg.norm(normal)))[self.dofs]
 

@@ -67,7 +67,7 @@ class PtyHand:
                 reply = self._reply(frame)
                 while reply and not self._stop.is_set():  # The kernel's buffer holds 4 KiB.
                     if select.select([], [self.master], [], 0.01)[1]:
-                        reply = reply[os.write(self.master, reply[:1024]):]
+                        reply = reply[os.write(self.master, reply[:1024]) :]
 
     def _reply(self, frame: Frame) -> bytes:
         if frame.command == Command.VERSION:

@@ -21,8 +21,12 @@ class SimplePhysics:
         armature = ARMATURE * (1 - options.get("rotor_share", 0.0))
         self.inertia = 5e-4 + armature
         self.mj_model = SimpleNamespace(
-            nv=18, dof_M0=np.full(18, self.inertia), dof_armature=np.full(18, armature),
-            dof_invweight0=np.full(18, 1 / self.inertia), opt=SimpleNamespace(timestep=config.timestep))
+            nv=18,
+            dof_M0=np.full(18, self.inertia),
+            dof_armature=np.full(18, armature),
+            dof_invweight0=np.full(18, 1 / self.inertia),
+            opt=SimpleNamespace(timestep=config.timestep),
+        )
 
     def advance(self, target, state, torque, push):
         motors = lambda index, position, velocity, memory: (torque(index, position, velocity), memory)  # noqa: E731
@@ -35,8 +39,9 @@ class SimplePhysics:
             speed = qvel[:12] + self.config.timestep / self.inertia * (tau - 0.02 * qvel[:12])
             fall = qvel[12:15] + self.config.timestep * (jnp.array([9.81, 0, 0]) + push / target.mass)
             qvel = jnp.concatenate([speed, fall, qvel[15:]])
-            moved = jnp.concatenate([qpos[:12] + self.config.timestep * speed,
-                                     qpos[12:15] + self.config.timestep * fall, qpos[15:]])
+            moved = jnp.concatenate(
+                [qpos[:12] + self.config.timestep * speed, qpos[12:15] + self.config.timestep * fall, qpos[15:]]
+            )
             return (moved, qvel, memory), None
 
         steps = jnp.arange(self.config.substeps)

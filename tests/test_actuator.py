@@ -33,11 +33,19 @@ def reference(kp, kd, band, stall, top_speed, efficiency, target, target_velocit
 def random_drives(count, seed=0):
     rng = np.random.default_rng(seed)
     drives = Actuator(
-        stiffness=rng.uniform(0.1, 10, count), damping=rng.uniform(0, 0.5, count),
-        dead_band=rng.uniform(0, 0.05, count), stall_torque=rng.uniform(0.3, 1.2, count),
-        no_load_speed=rng.uniform(8, 15, count), efficiency=rng.uniform(0.7, 1.0, count))
-    state = (rng.uniform(-0.3, 0.3, count), rng.uniform(-1, 1, count), rng.uniform(-0.3, 0.3, count),
-             rng.uniform(-20, 20, count) * rng.uniform(0, 1, count) ** 2)
+        stiffness=rng.uniform(0.1, 10, count),
+        damping=rng.uniform(0, 0.5, count),
+        dead_band=rng.uniform(0, 0.05, count),
+        stall_torque=rng.uniform(0.3, 1.2, count),
+        no_load_speed=rng.uniform(8, 15, count),
+        efficiency=rng.uniform(0.7, 1.0, count),
+    )
+    state = (
+        rng.uniform(-0.3, 0.3, count),
+        rng.uniform(-1, 1, count),
+        rng.uniform(-0.3, 0.3, count),
+        rng.uniform(-20, 20, count) * rng.uniform(0, 1, count) ** 2,
+    )
     cast = lambda x: np.asarray(x, np.float32)  # noqa: E731
     return jax.tree.map(cast, drives), tuple(cast(x) for x in state)
 
@@ -63,8 +71,13 @@ def test_ten_thousand_random_drives():
     # All regimes occur: within the band, free, and held by the envelope on either side, beyond the no-load speed.
     limit = drives.stall_torque * np.maximum(1 - np.abs(state[3]) / drives.no_load_speed, 0)
     held = np.isclose(np.abs(wanted), drives.efficiency * limit, rtol=1e-6) & (limit > 0)
-    regimes = [np.abs(state[0] - state[2]) < drives.dead_band, ~held & (wanted != 0), held & (wanted > 0),
-               held & (wanted < 0), limit == 0]
+    regimes = [
+        np.abs(state[0] - state[2]) < drives.dead_band,
+        ~held & (wanted != 0),
+        held & (wanted > 0),
+        held & (wanted < 0),
+        limit == 0,
+    ]
     assert all(regime.sum() > 200 for regime in regimes)
 
 
@@ -127,9 +140,12 @@ def test_delay_is_exact_to_the_substep():
 
 def test_delay_within_a_scan_of_substeps():
     """The sub-step at which the target starts to act, seen from inside a tick, for each environment of a batch."""
+
     def tick(latency):
-        return jax.lax.scan(lambda carry, k: (carry, actuator.delayed_target(k, latency, jnp.zeros(2), jnp.ones(2))),
-                            0, jnp.arange(6))[1]
+        return jax.lax.scan(
+            lambda carry, k: (carry, actuator.delayed_target(k, latency, jnp.zeros(2), jnp.ones(2))), 0, jnp.arange(6)
+        )[1]
+
     seen = jax.jit(jax.vmap(tick))(jnp.arange(7))
     np.testing.assert_array_equal(seen[..., 0].sum(1), [6, 5, 4, 3, 2, 1, 0])
     np.testing.assert_array_equal(np.argmax(seen[:6, :, 0], 1), np.arange(6))
@@ -191,6 +207,7 @@ def slide(torque, *, coulomb=0.0, viscous=0.0, inertia=1e-3, timestep=1e-3, velo
         net = actuator.apply_friction(rubbing, tau, speed, inertia / timestep)
         speed = speed + timestep / inertia * net
         return speed, speed
+
     return np.asarray(jax.lax.scan(body, jnp.float32(velocity), wanted)[1])
 
 
@@ -286,8 +303,9 @@ def test_gradients_where_the_envelope_holds():
 
 
 def test_gradients_are_finite_in_the_band_and_beyond_the_no_load_speed():
-    for drives, state in ((motor(dead_band=0.1), (0.0, 0.0, 0.0, 0.0)), (motor(), (1.0, 0.0, 0.0, 9.0)),
-                          (motor(), (1.0, 0.0, 0.0, 8.63))):
+    for drives, state in (
+        (motor(dead_band=0.1), (0.0, 0.0, 0.0, 0.0)),
+        (motor(), (1.0, 0.0, 0.0, 9.0)),
+        (motor(), (1.0, 0.0, 0.0, 8.63)),
+    ):
         assert all(np.isfinite(leaf) for leaf in jax.tree.leaves(gradient(drives, *state)))
-
-

@@ -19,6 +19,7 @@ def motor(**changes):
 
 def pushed(play, motor_torque, load, timestep, start=(0.0, 0.0, 0.0, 0.0)):
     """Rotor and link under given torques [T]: rows (theta, w, q, v)."""
+
     def body(state, torques):
         theta, w, q, v = state
         tau, outside = torques
@@ -171,6 +172,7 @@ def test_every_parameter_carries_a_gradient():
             v = v + 2e-3 * tau / LINK
             q = q + 2e-3 * v
         return q
+
     play = GearPlay(*(jnp.float32(x) for x in (0.01, ROTOR, 50.0, 0.1)))
     slope = jax.grad(end)(play)
     assert all(np.isfinite(leaf) and leaf != 0 for leaf in jax.tree.leaves(slope))
@@ -187,8 +189,9 @@ def test_in_a_static_grip_the_tooth_carries_the_motors_torque():
     """A link that is held, by what the drive is never told: gap / 2 and torque / stiffness ahead of it."""
     play = GearPlay(gap=0.02, rotor_inertia=LIGHT, tooth_stiffness=200.0)
     gear, link = gear_at(jnp.float32(0.5), jnp.zeros(())), jnp.float32(0.5)
-    advance = jax.jit(lambda gear: drive_beside(motor(), play, gear, jnp.float32(0.7), link, jnp.zeros(()),
-                                                inertia=4e-4, **BESIDE))
+    advance = jax.jit(
+        lambda gear: drive_beside(motor(), play, gear, jnp.float32(0.7), link, jnp.zeros(()), inertia=4e-4, **BESIDE)
+    )
     for _ in range(300):
         torque, gear = advance(gear)
     expected = float(joint_torque(motor(), jnp.float32(0.7), 0.0, gear.rotor.position, 0.0))
@@ -218,8 +221,9 @@ def test_beside_an_engine_it_is_the_same_gear(stop, inertia):
                 tau, gear = drive_beside(motor(), play, gear, target, q, v, inertia=believed, **BESIDE)
             else:
                 known = weight - rub * v - (0.0 if stop is None else stiff * (q - stop))
-                tau, rotor = drive_with_play(motor(), play, gear.rotor, target, q, v, inertia=link, timestep=dt,
-                                             link_torque=known)
+                tau, rotor = drive_with_play(
+                    motor(), play, gear.rotor, target, q, v, inertia=link, timestep=dt, link_torque=known
+                )
                 gear = gear_at(*(rotor.position, rotor.velocity))
             pull = tau + weight - (0.0 if stop is None else stiff * (q - stop))
             v = (v + dt / link * pull) / (1 + dt / link * rub + dt**2 / link * stiff)  # as an engine's contact
@@ -232,7 +236,7 @@ def test_beside_an_engine_it_is_the_same_gear(stop, inertia):
         return track if coarse else track[:, 59::60]
 
     coarse, fine = run(True), run(False)
-    error = coarse[:, :fine.shape[1]] - fine[:, :coarse.shape[1]]
+    error = coarse[:, : fine.shape[1]] - fine[:, : coarse.shape[1]]
     # It moves through 0.6 rad; a link of 25 times the inertia swings, and the drive does not know it.
     assert np.sqrt(np.mean(error**2)) < (0.016 if inertia < 5 else 0.045)
     assert np.ptp(fine[1]) > (0.45 if stop else 0.55)

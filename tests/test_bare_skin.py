@@ -63,8 +63,11 @@ def test_points_lie_on_the_surface_and_look_outward(hand, surface):
 
 def test_taxels_come_first_and_keep_their_place(hand, surface):
     n = hand.num_taxels
-    for mine, theirs in ((surface.position, hand.taxel_position), (surface.normal, hand.taxel_normal),
-                         (surface.area, hand.taxel_area)):
+    for mine, theirs in (
+        (surface.position, hand.taxel_position),
+        (surface.normal, hand.taxel_normal),
+        (surface.area, hand.taxel_area),
+    ):
         np.testing.assert_array_equal(mine[:, :n], theirs)
     for finger in range(hand.num_fingers):
         bare = surface.position[finger, n:][surface.area[finger, n:] > 0]
@@ -105,16 +108,22 @@ def test_round_the_pad_less_and_less_is_felt(hand, surface, finger):
     assert np.all(np.diff(felt) < 0.25)
     assert any(0.5 < x < 4.5 for x in felt), felt
     # By the taxels alone, as in the paper, it is all or nothing.
-    alone = [press(hand, taxels_only(hand), finger, centre + radius * n, n)[0]
-             for n in (np.cos(a) * front + np.sin(a) * side for a in np.linspace(0, np.pi, 13))]
+    alone = [
+        press(hand, taxels_only(hand), finger, centre + radius * n, n)[0]
+        for n in (np.cos(a) * front + np.sin(a) * side for a in np.linspace(0, np.pi, 13))
+    ]
     assert all(x == 0.0 or x == pytest.approx(5.0, rel=1e-4) for x in alone)
 
 
 @pytest.fixture(scope="module")
 def environments():
     """The same grasp without and with bare skin, and a first state."""
-    plain = GraspConfig(pool_size=64, objects=ObjectConfig(shapes=("sphere",)), sensing=Sensing(three_axis=True),
-                        skin=tactile.Skin(total="solver"))
+    plain = GraspConfig(
+        pool_size=64,
+        objects=ObjectConfig(shapes=("sphere",)),
+        sensing=Sensing(three_axis=True),
+        skin=tactile.Skin(total="solver"),
+    )
     bare = dataclasses.replace(plain, skin=dataclasses.replace(plain.skin, bare=True))
     first, second = (dexsim.make("grasp", config, backend="jax") for config in (plain, bare))
     assert first.fingerprint() != second.fingerprint()
@@ -130,10 +139,10 @@ def touched(environments, hand, angle):
     direction = np.cos(angle) * front + np.sin(angle) * side
     direction = pose.tip_rotation[1] @ jnp.asarray(direction, jnp.float32)
     size = float(state.target.size[np.flatnonzero(np.asarray(state.target.active))[0], 0])
-    place = (pose.body_position[hand.tip_body[1]] + pose.tip_rotation[1] @ jnp.asarray(centre)
-             + direction * (radius + size))
-    physics = dataclasses.replace(
-        state.physics, qpos=state.physics.qpos.at[both[0].physics.object_qpos[:3]].set(place))
+    place = (
+        pose.body_position[hand.tip_body[1]] + pose.tip_rotation[1] @ jnp.asarray(centre) + direction * (radius + size)
+    )
+    physics = dataclasses.replace(state.physics, qpos=state.physics.qpos.at[both[0].physics.object_qpos[:3]].set(place))
     along = pose.tip_rotation[1] @ jnp.asarray(axis, jnp.float32)
     force = jnp.zeros((hand.num_fingers, 3)).at[1].set(-3.0 * direction + 1.5 * along)
     zero = jnp.zeros(hand.num_joints)
@@ -167,8 +176,15 @@ def test_fingertips_of_other_shapes(hand):
     """Boxes by their faces' area; a finger without primitives has its taxels alone."""
     taxels = hand.taxel_position - np.float32([0, 0, 1.0])  # far from all of it
     sides = np.float32([0.006, 0.0004, 0.010])  # a blade: both faces in one cell
-    blade = dataclasses.replace(hand.geoms[0], kind="box", size=sides, position=np.zeros(3, np.float32),
-                                rotation=np.eye(3, dtype=np.float32), body=int(hand.tip_body[0]), touches=True)
+    blade = dataclasses.replace(
+        hand.geoms[0],
+        kind="box",
+        size=sides,
+        position=np.zeros(3, np.float32),
+        rotation=np.eye(3, dtype=np.float32),
+        body=int(hand.tip_body[0]),
+        touches=True,
+    )
     other = dataclasses.replace(hand, geoms=(blade,), taxel_position=taxels)
     skin = whole_surface(other, REACH)
     n = hand.num_taxels

@@ -45,8 +45,7 @@ class PointEnv:
     """A point on a line that terminates when it leaves (-1, 1) and is truncated after 6 ticks."""
 
     action_size, name, backend, evaluation_steps = 1, "point", "jax", 6
-    observation_layout = {"actor": (Field("position", 1),),
-                          "critic": (Field("position", 1), Field("clock", 1))}
+    observation_layout = {"actor": (Field("position", 1),), "critic": (Field("position", 1), Field("clock", 1))}
 
     def reset(self, key):
         key, draw = jax.random.split(key)
@@ -62,13 +61,17 @@ class PointEnv:
         return jax.tree.map(lambda new, old: jnp.where(done, new, old), begun, state)
 
     def _state(self, key, position, clock):
-        reward = -position**2
+        reward = -(position**2)
         return PointState(
             obs={"actor": position[None], "critic": jnp.stack([position, clock / 6.0])},
-            reward=reward, terminated=jnp.abs(position) > 1, truncated=clock >= 6,
-            metrics={"reward/centre": reward, "success": jnp.abs(position) < 0.1,
-                     "return": reward, "length": clock},
-            key=key, position=position, clock=clock)
+            reward=reward,
+            terminated=jnp.abs(position) > 1,
+            truncated=clock >= 6,
+            metrics={"reward/centre": reward, "success": jnp.abs(position) < 0.1, "return": reward, "length": clock},
+            key=key,
+            position=position,
+            clock=clock,
+        )
 
 
 def keys(count):
@@ -159,20 +162,40 @@ def train(env, num_timesteps, **options):
 
     history = []
     factory = functools.partial(
-        networks.make_ppo_networks, policy_obs_key="actor", value_obs_key="critic",
-        policy_hidden_layer_sizes=(16,), value_hidden_layer_sizes=(16,))
+        networks.make_ppo_networks,
+        policy_obs_key="actor",
+        value_obs_key="critic",
+        policy_hidden_layer_sizes=(16,),
+        value_hidden_layer_sizes=(16,),
+    )
     _, params, _ = ppo.train(
-        env, num_timesteps=num_timesteps, wrap_env_fn=wrap, normalize_observations=True,
-        num_updates_per_batch=2, network_factory=factory, num_evals=2,
-        progress_fn=lambda step, metrics: history.append(metrics), **options)
+        env,
+        num_timesteps=num_timesteps,
+        wrap_env_fn=wrap,
+        normalize_observations=True,
+        num_updates_per_batch=2,
+        network_factory=factory,
+        num_evals=2,
+        progress_fn=lambda step, metrics: history.append(metrics),
+        **options,
+    )
     return history, params
 
 
 @pytest.mark.slow
 def test_ppo_trains_on_a_point():
     history, params = train(
-        BraxEnv(PointEnv()), num_timesteps=40_000, episode_length=6, num_envs=64, batch_size=64,
-        num_minibatches=2, unroll_length=6, num_eval_envs=64, discounting=0.95, learning_rate=3e-3)
+        BraxEnv(PointEnv()),
+        num_timesteps=40_000,
+        episode_length=6,
+        num_envs=64,
+        batch_size=64,
+        num_minibatches=2,
+        unroll_length=6,
+        num_eval_envs=64,
+        discounting=0.95,
+        learning_rate=3e-3,
+    )
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(params))
     first, last = (metrics["eval/episode_reward"] for metrics in (history[0], history[-1]))
     assert last > first and np.isfinite(last)
@@ -187,8 +210,16 @@ def test_ppo_runs_on_grasp(physics, grasp_env, monkeypatch):
         monkeypatch.setattr("dexsim.env.Physics", SimplePhysics)
         env = dexsim.make("grasp", GraspConfig(pool_size=20), backend="jax")
     history, params = train(
-        BraxEnv(env), num_timesteps=3 * 8 * 4, episode_length=8, num_envs=8, batch_size=4,
-        num_minibatches=2, unroll_length=4, run_evals=False, discounting=0.97)
+        BraxEnv(env),
+        num_timesteps=3 * 8 * 4,
+        episode_length=8,
+        num_envs=8,
+        batch_size=4,
+        num_minibatches=2,
+        unroll_length=4,
+        run_evals=False,
+        discounting=0.97,
+    )
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(params))
     assert np.isfinite(history[-1]["training/total_loss"])
 
@@ -204,11 +235,18 @@ def test_viewer_and_pictures(hand):
 
         def snapshot(self, state):
             return Snapshot(
-                joint_position=np.full(12, 0.3), object_position=np.array([0.06, 0, 0.1]),
-                object_rotation=np.eye(3), primitive_size=np.full((3, 3), 0.02),
-                primitive_position=np.zeros((3, 3)), primitive_rotation=np.stack([np.eye(3)] * 3),
-                primitive_active=np.array([True, True, False]), taxel_force=np.zeros((5, 120)),
-                command=np.zeros(1), target_force=np.zeros(()), finger_force=np.zeros(5))
+                joint_position=np.full(12, 0.3),
+                object_position=np.array([0.06, 0, 0.1]),
+                object_rotation=np.eye(3),
+                primitive_size=np.full((3, 3), 0.02),
+                primitive_position=np.zeros((3, 3)),
+                primitive_rotation=np.stack([np.eye(3)] * 3),
+                primitive_active=np.array([True, True, False]),
+                taxel_force=np.zeros((5, 120)),
+                command=np.zeros(1),
+                target_force=np.zeros(()),
+                finger_force=np.zeros(5),
+            )
 
     ours = Posed()
     ours.hand = hand

@@ -49,9 +49,14 @@ from dexsim_real.sensing import HandSensing, HardwareConfig, ObjectEstimate
 from dexsim_real.trouble import HandError
 
 ROOT = Path(__file__).resolve().parent.parent
-QUIET = Sensing(joint_noise=0.0, joint_resolution=0.0, torque_noise=0.0, object_noise=0.0,
-                orientation=OrientationSensor(noise=0.0, bias=0.0, drift=0.0, delay=(0.0, 0.0), rate=10000.0),
-                taxel=TaxelSensor(noise=0.0))
+QUIET = Sensing(
+    joint_noise=0.0,
+    joint_resolution=0.0,
+    torque_noise=0.0,
+    object_noise=0.0,
+    orientation=OrientationSensor(noise=0.0, bias=0.0, drift=0.0, delay=(0.0, 0.0), rate=10000.0),
+    taxel=TaxelSensor(noise=0.0),
+)
 
 
 class FakePhysics:
@@ -118,10 +123,15 @@ def test_one_frame_gives_the_same_observation_through_both_doors_bit_for_bit(han
     env._seen = dict.fromkeys(task.fields, config.observation)
 
     def door(readings, goal):
-        moment = SimpleNamespace(**dict.fromkeys(
-            ("joint_torque", "joint_velocity", "action"), jnp.zeros(12)), joint_position=readings.joint_position,
-            touch=SimpleNamespace(force=readings.taxel_force), object_position=readings.object_position,
-            object_velocity=readings.object_velocity, object_quat=readings.object_quat, object_spin=jnp.zeros(3))
+        moment = SimpleNamespace(
+            **dict.fromkeys(("joint_torque", "joint_velocity", "action"), jnp.zeros(12)),
+            joint_position=readings.joint_position,
+            touch=SimpleNamespace(force=readings.taxel_force),
+            object_position=readings.object_position,
+            object_velocity=readings.object_velocity,
+            object_quat=readings.object_quat,
+            object_spin=jnp.zeros(3),
+        )
         return env._observe(readings, moment, goal)["actor"]
 
     door = jax.jit(door)
@@ -141,8 +151,13 @@ def test_one_frame_gives_the_same_observation_through_both_doors_bit_for_bit(han
 def test_a_golden_trace_pins_the_order_of_action_and_sensing(hand, monkeypatch):
     """The real `Env.step` over simple physics, and the bridge fed with frames of what that hand measured."""
     monkeypatch.setattr("dexsim.env.Physics", FakePhysics)
-    config = RotateConfig(sensing=QUIET, randomization=Randomization(scale=0.0), pool_size=1, edge=(0.11, 0.11),
-                          control=Control(step=0.08))
+    config = RotateConfig(
+        sensing=QUIET,
+        randomization=Randomization(scale=0.0),
+        pool_size=1,
+        edge=(0.11, 0.11),
+        control=Control(step=0.08),
+    )
     task = StillRotate(config, hand)
     weights = np.random.default_rng(0).normal(size=(65, 12)).astype(np.float32) * 0.3
 
@@ -165,7 +180,7 @@ def test_a_golden_trace_pins_the_order_of_action_and_sensing(hand, monkeypatch):
         seen = ObjectEstimate(readings.object_position, readings.object_velocity, readings.object_quat)
         tick = controller.tick(sensing.measure(block), seen, readings.goal_quat, 0.0)
         # The action in the observation is the one that led to this measurement, not the one it leads to.
-        np.testing.assert_array_equal(tick.observation[begin:begin + 12], actions[-1])
+        np.testing.assert_array_equal(tick.observation[begin : begin + 12], actions[-1])
         np.testing.assert_array_equal(tick.readings.last_action, actions[-1])
         np.testing.assert_allclose(tick.readings.last_action, readings.last_action, atol=1e-5)
         np.testing.assert_allclose(tick.observation, state.obs["actor"], atol=2e-5)
@@ -196,6 +211,7 @@ def test_an_action_that_is_not_finite_counts_as_none(hand):
 
 
 # --- runs ----------------------------------------------------------------------------------------
+
 
 @pytest.fixture(autouse=True)
 def jax_as_it_is(monkeypatch):
@@ -230,9 +246,29 @@ class FollowingHand(PtyHand):
 
 def arguments(peer, folder, *more):
     """Patient with the peer, which shares this process and perhaps a busy machine."""
-    return ["grasp", "--port", peer.port, "--uncalibrated", "--fixed-object", "--link.settle", "0", "--link.no-paced",
-            "--link.margin", "0.2", "--safety.stale", "1", "--approach", "0.4", "--log", str(folder / "run.log"),
-            "--output", str(folder / "run.json"), "--quiet", "--no-realtime", *more]
+    return [
+        "grasp",
+        "--port",
+        peer.port,
+        "--uncalibrated",
+        "--fixed-object",
+        "--link.settle",
+        "0",
+        "--link.no-paced",
+        "--link.margin",
+        "0.2",
+        "--safety.stale",
+        "1",
+        "--approach",
+        "0.4",
+        "--log",
+        str(folder / "run.log"),
+        "--output",
+        str(folder / "run.json"),
+        "--quiet",
+        "--no-realtime",
+        *more,
+    ]
 
 
 def summary(folder):
@@ -374,8 +410,17 @@ def test_motors_off_means_off_and_the_view_says_what_is_read(tmp_path, monkeypat
         assert not peer.on().any()
     assert len(records(tmp_path, Kind.TICK)) >= 15
     shown = capsys.readouterr().err
-    for text in ("firmware 1.3.9", "the policy begins", "policy 33.3 Hz", "exchanges 83.3 Hz", "0 corrupt", "joints 30",
-                 "sum 0.0 N", "end: time is over", "policy jitter"):
+    for text in (
+        "firmware 1.3.9",
+        "the policy begins",
+        "policy 33.3 Hz",
+        "exchanges 83.3 Hz",
+        "0 corrupt",
+        "joints 30",
+        "sum 0.0 N",
+        "end: time is over",
+        "policy jitter",
+    ):
         assert text in shown, text
 
 
@@ -450,7 +495,7 @@ def test_a_line_full_of_faults_does_not_end_the_run(hand, tmp_path):
         if rng.random() < 0.5:
             whole[int(rng.integers(len(whole)))] ^= 1 << int(rng.integers(8))
         else:
-            del whole[int(rng.integers(len(whole))):]
+            del whole[int(rng.integers(len(whole))) :]
         return bytes(whole)
 
     with FollowingHand(trouble) as peer:
@@ -466,13 +511,38 @@ def test_a_line_full_of_faults_does_not_end_the_run(hand, tmp_path):
 def test_what_is_missing_is_said_in_one_line(tmp_path, capsys):
     with FollowingHand() as peer:
         for options, message in (
-                (["grasp", "--port", peer.port], "--calibration"),
-                (["grasp", "--port", str(tmp_path / "none"), "--uncalibrated", "--fixed-object", "--quiet", "--log",
-                  str(tmp_path / "a.log")], "there is no such port"),
-                (["grasp", "--port", peer.port, "--uncalibrated", "--quiet", "--link.settle", "0", "--link.no-paced",
-                  "--log", str(tmp_path / "b.log")], "--camera, or --fixed-object"),
-                (["grasp", "--port", peer.port, "--uncalibrated", "--calibration", "x.toml"], "not both"),
-                (["grasp", "--port", peer.port, "--uncalibrated", "--command", "1.5"], "between 0 and 1")):
+            (["grasp", "--port", peer.port], "--calibration"),
+            (
+                [
+                    "grasp",
+                    "--port",
+                    str(tmp_path / "none"),
+                    "--uncalibrated",
+                    "--fixed-object",
+                    "--quiet",
+                    "--log",
+                    str(tmp_path / "a.log"),
+                ],
+                "there is no such port",
+            ),
+            (
+                [
+                    "grasp",
+                    "--port",
+                    peer.port,
+                    "--uncalibrated",
+                    "--quiet",
+                    "--link.settle",
+                    "0",
+                    "--link.no-paced",
+                    "--log",
+                    str(tmp_path / "b.log"),
+                ],
+                "--camera, or --fixed-object",
+            ),
+            (["grasp", "--port", peer.port, "--uncalibrated", "--calibration", "x.toml"], "not both"),
+            (["grasp", "--port", peer.port, "--uncalibrated", "--command", "1.5"], "between 0 and 1"),
+        ):
             with pytest.raises(SystemExit) as stop:
                 run.cli.run(lambda _, options=options: run.main(options))
             error = capsys.readouterr().err.strip().splitlines()[-1]
@@ -485,8 +555,9 @@ def test_signals(tmp_path, number):
     with FollowingHand() as peer:
         command = [sys.executable, "-m", "dexsim_real.run", *arguments(peer, tmp_path, "--seconds", "60")]
         # As a shell starts what runs in the background: with Ctrl-C ignored.
-        process = subprocess.Popen(["sh", "-c", "trap '' INT; exec \"$@\"", "sh", *command], cwd=ROOT,
-                                   stderr=subprocess.PIPE)
+        process = subprocess.Popen(
+            ["sh", "-c", "trap '' INT; exec \"$@\"", "sh", *command], cwd=ROOT, stderr=subprocess.PIPE
+        )
         try:
             until = time.monotonic() + 60
             while peer.on().sum() < 60 and process.poll() is None and time.monotonic() < until:
@@ -520,8 +591,14 @@ from dexsim_real.control import Controller
 Controller(load_policy("grasp"), load_hand()).warm()
 print([name for name in sys.modules if "mjx" in name or name in ("warp", "brax", "cv2", "serial")])
 """
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=120,
-                          env={**os.environ, "JAX_PLATFORMS": "cpu"})
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        env={**os.environ, "JAX_PLATFORMS": "cpu"},
+    )
     assert done.stdout.strip() == "[]", done.stderr
 
 
@@ -538,9 +615,15 @@ def rotate_policy(hand, path):
     rng = np.random.default_rng(0)
     params = PolicyParams(
         (Layer(jnp.asarray(0.05 * rng.normal(size=(size, 12)), jnp.float32), jnp.zeros(12)),),
-        Normalizer(jnp.zeros(size), jnp.ones(size)))
-    Policy(task="rotate", env_config=to_dict(config), observation_layout=fields, params=params,
-           control_rate=1 / config.physics.control_period).save(path)
+        Normalizer(jnp.zeros(size), jnp.ones(size)),
+    )
+    Policy(
+        task="rotate",
+        env_config=to_dict(config),
+        observation_layout=fields,
+        params=params,
+        control_rate=1 / config.physics.control_period,
+    ).save(path)
 
 
 def test_a_rotation_policy_with_an_imu_counts_goals(hand, tmp_path):

@@ -55,8 +55,15 @@ def plates(hand, *names):
 
 
 def arguments(folder, **options):
-    options = {"port": "bench", "output": folder / "hand.toml", "log": folder / "hand.log", "yes": True,
-               "press": SHORT, "fingers": ("index",), "realtime": False} | options
+    options = {
+        "port": "bench",
+        "output": folder / "hand.toml",
+        "log": folder / "hand.log",
+        "yes": True,
+        "press": SHORT,
+        "fingers": ("index",),
+        "realtime": False,
+    } | options
     return CalibrateArguments(**options)
 
 
@@ -151,7 +158,10 @@ def test_logs_add_up(hand, session, scale, tmp_path):
     other = scale[1].log
     both = fit(read_logs([session[2], other], hand), hand)
     assert {both.source[name] for name in ("index_joint1", "mid_joint1", "index_bend")} == {
-        "index pad", "middle pad", "index side"}
+        "index pad",
+        "middle pad",
+        "index side",
+    }
     assert both.sensors.keys() == {"middle"}
     with pytest.raises(LogError, match="other --hardware options"):
         path = tmp_path / "other.log"
@@ -225,8 +235,10 @@ def test_too_few_readings_do_not_count(hand, scale):
     assert any("middle pad: 7 readings of the gauge do not count" in note for note in found.calibration.notes)
 
 
-@pytest.mark.parametrize(("text", "newtons"), [
-    ("5.2", 5.2), ("5,2 N", 5.2), ("530 g", 5.197525), ("0.53kg", 5.197525), (" .5n ", 0.5), ("0", 0.0)])
+@pytest.mark.parametrize(
+    ("text", "newtons"),
+    [("5.2", 5.2), ("5,2 N", 5.2), ("530 g", 5.197525), ("0.53kg", 5.197525), (" .5n ", 0.5), ("0", 0.0)],
+)
 def test_readings_of_a_gauge(text, newtons):
     assert parse_reading(text) == pytest.approx(newtons)
 
@@ -256,8 +268,10 @@ def test_every_joint_is_pressed_with_and_every_press_goes_outward(hand):
             body = model.body(hand.body_names[hand.tip_body[placement.finger]]).id
             turn = data.xmat[body].reshape(3, 3)
             taxels = list(placement.taxels)
-            return (data.xpos[body] + hand.taxel_position[placement.finger, taxels] @ turn.T,
-                    hand.taxel_normal[placement.finger, taxels] @ turn.T)
+            return (
+                data.xpos[body] + hand.taxel_position[placement.finger, taxels] @ turn.T,
+                hand.taxel_normal[placement.finger, taxels] @ turn.T,
+            )
 
         (before, normal), (after, _) = places(0.0), places(0.01)
         moved = np.mean(np.sum((after - before) * normal, -1))
@@ -365,6 +379,7 @@ class Interrupted(BenchHand):
 def raises(error):
     def event(bench):
         raise error
+
     return event
 
 
@@ -372,9 +387,15 @@ def heat(bench):
     bench.temperature = 95
 
 
-@pytest.mark.parametrize(("event", "error", "says"), [
-    (raises(KeyboardInterrupt()), KeyboardInterrupt, None), (raises(SystemExit(143)), SystemExit, "143"),
-    (raises(RuntimeError("broken")), RuntimeError, "broken"), (heat, HandError, "too hot: 95 degC")])
+@pytest.mark.parametrize(
+    ("event", "error", "says"),
+    [
+        (raises(KeyboardInterrupt()), KeyboardInterrupt, None),
+        (raises(SystemExit(143)), SystemExit, "143"),
+        (raises(RuntimeError("broken")), RuntimeError, "broken"),
+        (heat, HandError, "too hot: 95 degC"),
+    ],
+)
 def test_however_it_ends_the_motors_are_off_and_the_old_file_is_there(hand, tmp_path, event, error, says):
     (tmp_path / "hand.toml").write_text("precious")
     bench = Interrupted(hand, event)
@@ -421,8 +442,10 @@ def test_motors_that_give_no_more_turn_round(hand, tmp_path):
     log = record(bench, hand, options)
     found = fit(read_logs([log], hand), hand)
     # As much as the joint gives by itself, or, pushed by the other one, as much as it holds.
-    gives, holds = ((0.45 - 0.02) * bench.constant[4] * part / bench.plates[0].arms[4]
-                    for part in (bench.efficiency[4], 1.15 / bench.back[4]))
+    gives, holds = (
+        (0.45 - 0.02) * bench.constant[4] * part / bench.plates[0].arms[4]
+        for part in (bench.efficiency[4], 1.15 / bench.back[4])
+    )
     assert gives < found.calibration.real.force_max[4] < holds < 7
     truth = bench.constant[4] * bench.efficiency[4]
     assert -torque_constants(found.calibration)[0, 4] == pytest.approx(truth, rel=0.05)
@@ -459,10 +482,12 @@ def test_logs_that_are_none_of_presses(hand, tmp_path):
 
 
 def test_options_that_do_not_go_together(tmp_path):
-    for options, says in (({"port": None}, "--port for a hand, or --from-log"),
-                          ({"from_log": (tmp_path / "a.log",)}, "--port for a hand, or --from-log"),
-                          ({"press": PressConfig(current=1.9)}, "must be below --safety.current"),
-                          ({"press": PressConfig(peak=20.0), "safety": SafetyConfig(finger_force=20.0)}, "well below")):
+    for options, says in (
+        ({"port": None}, "--port for a hand, or --from-log"),
+        ({"from_log": (tmp_path / "a.log",)}, "--port for a hand, or --from-log"),
+        ({"press": PressConfig(current=1.9)}, "must be below --safety.current"),
+        ({"press": PressConfig(peak=20.0), "safety": SafetyConfig(finger_force=20.0)}, "well below"),
+    ):
         with pytest.raises(HandError, match=says):
             arguments(tmp_path, **options)
     with pytest.raises(ConfigError, match="PressConfig.peak"):
@@ -496,9 +521,21 @@ def test_the_command_refuses_a_touched_hand_in_one_line(tmp_path, monkeypatch, c
     monkeypatch.setattr(calibrate, "prepare_jax", lambda: None)
     with PtyHand() as peer:
         peer.state["tip"]["taxel"]["z"][3, 40:43] = 90
-        options = ["--port", peer.port, "--yes", "--output", str(tmp_path / "hand.toml"), "--log",
-                   str(tmp_path / "hand.log"), "--link.settle", "0", "--link.no-paced", "--check.seconds", "0.5",
-                   "--no-realtime"]
+        options = [
+            "--port",
+            peer.port,
+            "--yes",
+            "--output",
+            str(tmp_path / "hand.toml"),
+            "--log",
+            str(tmp_path / "hand.log"),
+            "--link.settle",
+            "0",
+            "--link.no-paced",
+            "--check.seconds",
+            "0.5",
+            "--no-realtime",
+        ]
         assert command(*options) == 2
         assert all(np.all(block["mode"] == Mode.PASSIVE) for block in peer.commands)
     lines = capsys.readouterr().err.strip().splitlines()
@@ -547,8 +584,8 @@ def test_an_identification_gets_what_was_sent_and_answered(hand, tmp_path, monke
     sent = np.array([command["position"][6] for command in bench.commands]) * -1.0 + 0.2
     answered = -np.array(states) + 0.2
     # The longest stretch of the commands that is the log's: every sample is there, also where no answer came.
-    at = next(i for i in range(len(sent)) if np.allclose(sent[i:i + len(log.target)], log.target, atol=1e-6))
-    wanted, lost = answered[at:at + len(log.target)], np.arange(at + 1, at + len(log.target) + 1) % 150 == 0
+    at = next(i for i in range(len(sent)) if np.allclose(sent[i : i + len(log.target)], log.target, atol=1e-6))
+    wanted, lost = answered[at : at + len(log.target)], np.arange(at + 1, at + len(log.target) + 1) % 150 == 0
     np.testing.assert_allclose(log.position[~lost], wanted[~lost], atol=1e-6)
     assert 0 < lost.sum() < 20 and np.abs(log.position - wanted)[lost].max() < 0.05
     assert log.period == 1 / 83 and np.ptp(log.target) == pytest.approx(0.6, abs=0.01) and log.torque is None
@@ -602,16 +639,48 @@ def test_the_emulated_hand_gives_its_torque_constants_back(hand, tmp_path, seed)
 @pytest.mark.long
 def test_the_command_on_the_emulated_hand_through_the_bytes(hand, tmp_path):
     """Two processes and a terminal between them."""
-    twin = subprocess.Popen([sys.executable, "-m", "dexsim_real.twin", "--plant", "dexsim_real.twin.press", "--link",
-                             str(tmp_path / "port"), "--imu-link", str(tmp_path / "imu"), "--draw", "nominal",
-                             "--output", str(tmp_path / "truth.json")], cwd=ROOT)
+    twin = subprocess.Popen(
+        [
+            sys.executable,
+            "-m",
+            "dexsim_real.twin",
+            "--plant",
+            "dexsim_real.twin.press",
+            "--link",
+            str(tmp_path / "port"),
+            "--imu-link",
+            str(tmp_path / "imu"),
+            "--draw",
+            "nominal",
+            "--output",
+            str(tmp_path / "truth.json"),
+        ],
+        cwd=ROOT,
+    )
     try:
         until = time.monotonic() + 60
         while not (tmp_path / "port").exists() and time.monotonic() < until:
             time.sleep(0.1)
-        done = subprocess.run([sys.executable, "-m", "dexsim_real.calibrate", "--port", str(tmp_path / "port"), "--yes",
-                               "--fingers", "middle", "--output", str(tmp_path / "hand.toml"), "--log",
-                               str(tmp_path / "hand.log")], cwd=ROOT, capture_output=True, text=True, timeout=300)
+        done = subprocess.run(
+            [
+                sys.executable,
+                "-m",
+                "dexsim_real.calibrate",
+                "--port",
+                str(tmp_path / "port"),
+                "--yes",
+                "--fingers",
+                "middle",
+                "--output",
+                str(tmp_path / "hand.toml"),
+                "--log",
+                str(tmp_path / "hand.log"),
+            ],
+            cwd=ROOT,
+            capture_output=True,
+            text=True,
+            timeout=300,
+        )
         assert done.returncode == 0, done.stderr
     finally:
         twin.send_signal(signal.SIGINT)

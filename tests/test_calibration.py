@@ -80,8 +80,10 @@ def test_intervals_hold_the_truth(rho, least):
     for _ in range(300):
         y = 0.05 * x + 0.3 + 0.02 * ar1(rng, 400, rho)
         line = fit_line(x, y)
-        hits += [line.gain_interval[0] <= 0.05 <= line.gain_interval[1],
-                 line.offset_interval[0] <= 0.3 <= line.offset_interval[1]]
+        hits += [
+            line.gain_interval[0] <= 0.05 <= line.gain_interval[1],
+            line.offset_interval[0] <= 0.3 <= line.offset_interval[1],
+        ]
     assert np.all(hits / 300 >= least) and np.all(hits / 300 <= 0.985)
 
 
@@ -112,8 +114,17 @@ def test_gain_within_two_percent_at_five_percent_outliers(kind):
 
 # --- a motor of known truth --------------------------------------------------------------------
 
-MOTOR = Motor(torque_constant=0.9, efficiency=0.8, back_efficiency=0.7, no_load_current=0.02, ripple=0.02,
-              ripple_count=300.0, bias=0.004, noise=0.004, resolution=0.001)
+MOTOR = Motor(
+    torque_constant=0.9,
+    efficiency=0.8,
+    back_efficiency=0.7,
+    no_load_current=0.02,
+    ripple=0.02,
+    ripple_count=300.0,
+    bias=0.004,
+    noise=0.004,
+    resolution=0.001,
+)
 LEVER = 0.06
 
 
@@ -162,11 +173,15 @@ def test_run_time_torque_is_the_motors(hand, fitted):
     np.testing.assert_allclose(joint_torque(calibration, loading, 1.0), torque, rtol=0.03, atol=0.004)
     np.testing.assert_allclose(joint_torque(calibration, unloading, -1.0), torque, rtol=0.03, atol=0.004)
     unknown = np.asarray(joint_torque(calibration, loading))
-    band = np.asarray(calibration.real.friction) * np.abs(np.mean(calibration.sim.gain, 0)
-                                                           / np.mean(calibration.real.gain, 0))
+    band = np.asarray(calibration.real.friction) * np.abs(
+        np.mean(calibration.sim.gain, 0) / np.mean(calibration.real.gain, 0)
+    )
     assert np.all(np.abs(unknown - torque) < 2 * band + 0.005)
-    np.testing.assert_allclose(normalised_torque(calibration, loading, 1.0),
-                               joint_torque(calibration, loading, 1.0) / hand.torque_limit, rtol=1e-5)
+    np.testing.assert_allclose(
+        normalised_torque(calibration, loading, 1.0),
+        joint_torque(calibration, loading, 1.0) / hand.torque_limit,
+        rtol=1e-5,
+    )
 
 
 def test_a_hand_that_counts_backwards(hand):
@@ -279,9 +294,11 @@ def broken(**changes):
     data = recording()
     force, value = data.force.copy(), data.value.copy()
     for name, change in changes.items():
-        force, value = {"force": lambda f, v, c=change: (c(f), v),
-                        "value": lambda f, v, c=change: (f, c(v)),
-                        "both": lambda f, v, c=change: (c(f), c(v))}[name](force, value)
+        force, value = {
+            "force": lambda f, v, c=change: (c(f), v),
+            "value": lambda f, v, c=change: (f, c(v)),
+            "both": lambda f, v, c=change: (c(f), c(v)),
+        }[name](force, value)
     return Press(force, value)
 
 
@@ -289,25 +306,32 @@ def put(index, number):
     def change(array):
         array[index] = number
         return array
+
     return change
 
 
-@pytest.mark.parametrize(("changes", "says"), [
-    ({"both": lambda a: a[:10]}, "10 samples: at least 20"),
-    ({"both": lambda a: a[:21]}, "18 samples loading and 0 unloading: at least 20"),
-    ({"force": lambda f: f[:-1]}, "one length"),
-    ({"value": put(17, np.nan)}, "sample 17 is not a number .*leave out"),
-    ({"force": put(3, np.inf)}, "sample 3 is not a number"),
-    ({"force": lambda f: 4 + 0.02 * f}, "force stays between 4.* press"),
-    ({"value": lambda v: 0 * v + 0.1 + np.random.default_rng(0).normal(0, 0.01, v.shape)}, "does not follow the force"),
-    ({"value": lambda v: np.minimum(v, 0.05)}, "saturated"),
-    ({"force": lambda f: np.minimum(f, 2.0)}, "saturated"),
-    ({"value": lambda v: 1000 * v}, "give it in A"),
-    ({"value": lambda v: np.where(np.arange(600) < 200, 1000 * v, v)}, "give it in A|mixed"),
-    ({"value": lambda v: np.where(np.arange(600) < 90, 1000 * v, v)}, "mixed"),
-    ({"force": lambda f: 1000 * f}, "force of .* N: give it in N"),
-    ({"force": lambda f: f - 5}, "tare"),
-])
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"both": lambda a: a[:10]}, "10 samples: at least 20"),
+        ({"both": lambda a: a[:21]}, "18 samples loading and 0 unloading: at least 20"),
+        ({"force": lambda f: f[:-1]}, "one length"),
+        ({"value": put(17, np.nan)}, "sample 17 is not a number .*leave out"),
+        ({"force": put(3, np.inf)}, "sample 3 is not a number"),
+        ({"force": lambda f: 4 + 0.02 * f}, "force stays between 4.* press"),
+        (
+            {"value": lambda v: 0 * v + 0.1 + np.random.default_rng(0).normal(0, 0.01, v.shape)},
+            "does not follow the force",
+        ),
+        ({"value": lambda v: np.minimum(v, 0.05)}, "saturated"),
+        ({"force": lambda f: np.minimum(f, 2.0)}, "saturated"),
+        ({"value": lambda v: 1000 * v}, "give it in A"),
+        ({"value": lambda v: np.where(np.arange(600) < 200, 1000 * v, v)}, "give it in A|mixed"),
+        ({"value": lambda v: np.where(np.arange(600) < 90, 1000 * v, v)}, "mixed"),
+        ({"force": lambda f: 1000 * f}, "force of .* N: give it in N"),
+        ({"force": lambda f: f - 5}, "tare"),
+    ],
+)
 def test_bad_recordings_are_refused_in_one_line(changes, says):
     with pytest.raises(CalibrationError, match=says) as caught:
         fit_joint(broken(**changes), "A", where="thumb_bend on the hand")
@@ -361,16 +385,19 @@ def test_cut_anywhere_it_is_refused(hand, fitted, tmp_path):
         assert str(path) in str(caught.value) and "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(("old", "new", "says"), [
-    ("version = 1", "version = 2", "is of version 2, this library reads up to 1: upgrade"),
-    ('hand = "xhand_right"', 'hand = "xhand_left"', "is of hand 'xhand_left'.*not of 'xhand_right'"),
-    ('format = "dexsim calibration"', 'format = "other"', "not a calibration file"),
-    ('name = "thumb_bend"', 'name = "thumb_bent"', "calibrate this hand"),
-    ("torque_scale = 1.1", "torque_scale = 0.0", "above 0"),
-    ("torque_scale = 1.1", "torque_scale = true", "must hold 1 number"),
-    ("friction = ", "fiction = ", "'friction' must hold 1 number"),
-    ("complete = true", "complete = false", "cut off"),
-])
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ("version = 1", "version = 2", "is of version 2, this library reads up to 1: upgrade"),
+        ('hand = "xhand_right"', 'hand = "xhand_left"', "is of hand 'xhand_left'.*not of 'xhand_right'"),
+        ('format = "dexsim calibration"', 'format = "other"', "not a calibration file"),
+        ('name = "thumb_bend"', 'name = "thumb_bent"', "calibrate this hand"),
+        ("torque_scale = 1.1", "torque_scale = 0.0", "above 0"),
+        ("torque_scale = 1.1", "torque_scale = true", "must hold 1 number"),
+        ("friction = ", "fiction = ", "'friction' must hold 1 number"),
+        ("complete = true", "complete = false", "cut off"),
+    ],
+)
 def test_other_files_are_refused_in_one_line(hand, fitted, tmp_path, old, new, says):
     path = tmp_path / "c.toml"
     save_calibration(path, fitted[0])

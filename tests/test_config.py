@@ -48,19 +48,22 @@ def message(build, *arguments, **keywords):
     return text
 
 
-@pytest.mark.parametrize(("fields", "wanted"), [
-    (dict(stiffness=9.0), "Spring.stiffness = 9 N/m: must be between 0.5 and 8 N/m"),
-    (dict(stiffness=0.25), "Spring.stiffness = 0.25 N/m: must be between 0.5 and 8 N/m"),
-    (dict(turns=0), "Spring.turns = 0: must be at least 1"),
-    (dict(rest=0.2), "Spring.rest = 0.2 m: must be at most 0.1 m"),
-    (dict(span=(0.0, 3.0)), "Spring.span = 3 m: must be between -1 and 2 m"),
-    (dict(span=(1.0, 0.5)), "Spring.span = (1, 0.5): the first must not exceed the second"),
-    (dict(wire="tin"), "Spring.wire = 'tin': choose from steel, brass"),
-    (dict(marks=("red", "green")), "Spring.marks = 'green': choose from red, blue"),
-    (dict(stiffness=math.nan), "Spring.stiffness = nan: must be a finite number"),
-    (dict(rest=-math.inf), "Spring.rest = -inf: must be a finite number"),
-    (dict(span=(0.0, math.nan)), "Spring.span = nan: must be a finite number"),
-])
+@pytest.mark.parametrize(
+    ("fields", "wanted"),
+    [
+        (dict(stiffness=9.0), "Spring.stiffness = 9 N/m: must be between 0.5 and 8 N/m"),
+        (dict(stiffness=0.25), "Spring.stiffness = 0.25 N/m: must be between 0.5 and 8 N/m"),
+        (dict(turns=0), "Spring.turns = 0: must be at least 1"),
+        (dict(rest=0.2), "Spring.rest = 0.2 m: must be at most 0.1 m"),
+        (dict(span=(0.0, 3.0)), "Spring.span = 3 m: must be between -1 and 2 m"),
+        (dict(span=(1.0, 0.5)), "Spring.span = (1, 0.5): the first must not exceed the second"),
+        (dict(wire="tin"), "Spring.wire = 'tin': choose from steel, brass"),
+        (dict(marks=("red", "green")), "Spring.marks = 'green': choose from red, blue"),
+        (dict(stiffness=math.nan), "Spring.stiffness = nan: must be a finite number"),
+        (dict(rest=-math.inf), "Spring.rest = -inf: must be a finite number"),
+        (dict(span=(0.0, math.nan)), "Spring.span = nan: must be a finite number"),
+    ],
+)
 def test_a_refusal_says_what_where_and_which_range(fields, wanted):
     assert message(Spring, **fields) == wanted
 
@@ -75,18 +78,21 @@ def test_config_errors_are_the_librarys():
     assert issubclass(ConfigError, DexsimError)
 
 
-@pytest.mark.parametrize(("build", "fields", "words"), [
-    (Skin, dict(thickness=0.0), ("Skin.thickness", "0 m", "0.0001 and 0.02 m")),
-    (TaxelSensor, dict(saturation=0.0), ("TaxelSensor.saturation", "0 N", "0.1 and 1000 N")),
-    (PhysicsConfig, dict(timestep=0.5), ("PhysicsConfig.timestep", "0.5 s", "0.0001 and 0.02 s")),
-    (PhysicsConfig, dict(condim=2), ("PhysicsConfig.condim", "2", "1, 3, 4 or 6")),
-    (PhysicsConfig, dict(palm="fist"), ("PhysicsConfig.palm", "'fist'", "auto, face, box")),
-    (ObjectConfig, dict(mass=(0.3, 0.1)), ("ObjectConfig.mass", "0.3, 0.1")),
-    (Randomization, dict(latency=(0.0, 1.0)), ("Randomization.latency", "1 s", "0 and 0.2 s")),
-    (GraspReward, dict(drop=3.0), ("GraspReward.drop", "3", "-10000 and 0")),
-    (GraspConfig, dict(finger_force=(5.0, 2.0)), ("GraspConfig.finger_force", "5, 2")),
-    (GraspConfig, dict(pool_size=0), ("GraspConfig.pool_size", "0", "1 and 1e+06")),
-])
+@pytest.mark.parametrize(
+    ("build", "fields", "words"),
+    [
+        (Skin, dict(thickness=0.0), ("Skin.thickness", "0 m", "0.0001 and 0.02 m")),
+        (TaxelSensor, dict(saturation=0.0), ("TaxelSensor.saturation", "0 N", "0.1 and 1000 N")),
+        (PhysicsConfig, dict(timestep=0.5), ("PhysicsConfig.timestep", "0.5 s", "0.0001 and 0.02 s")),
+        (PhysicsConfig, dict(condim=2), ("PhysicsConfig.condim", "2", "1, 3, 4 or 6")),
+        (PhysicsConfig, dict(palm="fist"), ("PhysicsConfig.palm", "'fist'", "auto, face, box")),
+        (ObjectConfig, dict(mass=(0.3, 0.1)), ("ObjectConfig.mass", "0.3, 0.1")),
+        (Randomization, dict(latency=(0.0, 1.0)), ("Randomization.latency", "1 s", "0 and 0.2 s")),
+        (GraspReward, dict(drop=3.0), ("GraspReward.drop", "3", "-10000 and 0")),
+        (GraspConfig, dict(finger_force=(5.0, 2.0)), ("GraspConfig.finger_force", "5, 2")),
+        (GraspConfig, dict(pool_size=0), ("GraspConfig.pool_size", "0", "1 and 1e+06")),
+    ],
+)
 def test_the_librarys_own_configs_refuse_alike(build, fields, words):
     text = message(build, **fields)
     assert all(word in text for word in words), text
@@ -123,10 +129,17 @@ def test_every_number_of_the_grasp_config_has_a_range_that_is_enforced():
 
 
 def test_the_round_trip_of_the_grasp_config():
-    for config in (GraspConfig(), GraspConfig(
-            finger_force=(0.5, 9.0), pool_size=17, reward=GraspReward(sigma=0.2, thumb="binary"),
-            objects=ObjectConfig(shapes=("box",), mass=(0.1, 0.1)), physics=PhysicsConfig(timestep=0.004),
-            randomization=Randomization(scale=0.5))):
+    for config in (
+        GraspConfig(),
+        GraspConfig(
+            finger_force=(0.5, 9.0),
+            pool_size=17,
+            reward=GraspReward(sigma=0.2, thumb="binary"),
+            objects=ObjectConfig(shapes=("box",), mass=(0.1, 0.1)),
+            physics=PhysicsConfig(timestep=0.004),
+            randomization=Randomization(scale=0.5),
+        ),
+    ):
         plain = to_dict(config)
         again = from_dict(GraspConfig, json.loads(json.dumps(plain)))
         assert again == config and type(again.reward) is GraspReward
@@ -139,37 +152,49 @@ def test_fields_left_out_keep_their_default():
     assert config == dataclasses.replace(GraspConfig(), reward=GraspReward(sigma=0.3))
 
 
-@given(st.floats(0.5, 8.0), st.integers(1, 99), st.floats(-1, 0), st.floats(0, 2), st.sampled_from(["steel", "brass"]),
-       st.lists(st.sampled_from(["red", "blue"]), max_size=3), st.none() | st.text(max_size=5), st.booleans())
+@given(
+    st.floats(0.5, 8.0),
+    st.integers(1, 99),
+    st.floats(-1, 0),
+    st.floats(0, 2),
+    st.sampled_from(["steel", "brass"]),
+    st.lists(st.sampled_from(["red", "blue"]), max_size=3),
+    st.none() | st.text(max_size=5),
+    st.booleans(),
+)
 def test_any_config_survives_the_round_trip(stiffness, turns, low, high, wire, marks, name, wound):
-    spring = Spring(stiffness=stiffness, turns=turns, span=(low, high), wire=wire, marks=tuple(marks), name=name,
-                    wound=wound)
+    spring = Spring(
+        stiffness=stiffness, turns=turns, span=(low, high), wire=wire, marks=tuple(marks), name=name, wound=wound
+    )
     chair = Chair(seat=spring, legs=3)
     assert from_dict(Chair, to_dict(chair)) == chair
     assert from_dict(Chair, json.loads(json.dumps(to_dict(chair)))) == chair
 
 
-@pytest.mark.parametrize(("data", "wanted"), [
-    ({"backs": 1}, "Chair has no field 'backs'"),
-    ({"seat": {"colour": "red"}}, "Spring has no field 'colour'"),
-    ({"legs": "four"}, "Chair.legs = 'four': expected int"),
-    ({"legs": 4.5}, "Chair.legs = 4.5: expected int"),
-    ({"legs": True}, "Chair.legs = True: expected int"),
-    ({"legs": None}, "Chair.legs = None: expected int"),
-    ({"seat": 3}, "Spring: expected a table of fields, found int"),
-    ({"seat": {"stiffness": "hard"}}, "Spring.stiffness = 'hard': expected float"),
-    ({"seat": {"stiffness": False}}, "Spring.stiffness = False: expected float"),
-    ({"seat": {"stiffness": 99.0}}, "Spring.stiffness = 99 N/m: must be between 0.5 and 8 N/m"),
-    ({"seat": {"wire": 3}}, "Spring.wire = 3: expected str"),
-    ({"seat": {"wound": 1}}, "Spring.wound = 1: expected bool"),
-    ({"seat": {"span": [1.0]}}, "Spring.span: expected 2 values, found 1"),
-    ({"seat": {"span": 1.0}}, "Spring.span = 1.0: expected a list"),
-    ({"seat": {"span": [0.0, "far"]}}, "Spring.span = 'far': expected float"),
-    ({"seat": {"marks": "red"}}, "Spring.marks = 'red': expected a list"),
-    ({"seat": {"marks": [1]}}, "Spring.marks = 1: expected str"),
-    ({"seat": {"name": 4}}, "Spring.name = 4: expected str"),
-    ([], "Chair: expected a table of fields, found list"),
-])
+@pytest.mark.parametrize(
+    ("data", "wanted"),
+    [
+        ({"backs": 1}, "Chair has no field 'backs'"),
+        ({"seat": {"colour": "red"}}, "Spring has no field 'colour'"),
+        ({"legs": "four"}, "Chair.legs = 'four': expected int"),
+        ({"legs": 4.5}, "Chair.legs = 4.5: expected int"),
+        ({"legs": True}, "Chair.legs = True: expected int"),
+        ({"legs": None}, "Chair.legs = None: expected int"),
+        ({"seat": 3}, "Spring: expected a table of fields, found int"),
+        ({"seat": {"stiffness": "hard"}}, "Spring.stiffness = 'hard': expected float"),
+        ({"seat": {"stiffness": False}}, "Spring.stiffness = False: expected float"),
+        ({"seat": {"stiffness": 99.0}}, "Spring.stiffness = 99 N/m: must be between 0.5 and 8 N/m"),
+        ({"seat": {"wire": 3}}, "Spring.wire = 3: expected str"),
+        ({"seat": {"wound": 1}}, "Spring.wound = 1: expected bool"),
+        ({"seat": {"span": [1.0]}}, "Spring.span: expected 2 values, found 1"),
+        ({"seat": {"span": 1.0}}, "Spring.span = 1.0: expected a list"),
+        ({"seat": {"span": [0.0, "far"]}}, "Spring.span = 'far': expected float"),
+        ({"seat": {"marks": "red"}}, "Spring.marks = 'red': expected a list"),
+        ({"seat": {"marks": [1]}}, "Spring.marks = 1: expected str"),
+        ({"seat": {"name": 4}}, "Spring.name = 4: expected str"),
+        ([], "Chair: expected a table of fields, found list"),
+    ],
+)
 def test_a_bad_dictionary_is_refused_by_name(data, wanted):
     assert message(from_dict, Chair, data) == wanted
 
@@ -187,20 +212,36 @@ def test_units_and_ranges_are_there_for_the_command_line_and_the_documents():
 def test_override_replaces_fields_by_their_path():
     plain = to_dict(GraspConfig())
     before = json.dumps(plain)
-    changed = override(plain, ["objects.corners=0.5", "objects.shapes=[\"box\"]", "randomization.backlash=gear_play",
-                               "randomization.latency=[0, 0.01]", "episode_seconds=3"])
+    changed = override(
+        plain,
+        [
+            "objects.corners=0.5",
+            'objects.shapes=["box"]',
+            "randomization.backlash=gear_play",
+            "randomization.latency=[0, 0.01]",
+            "episode_seconds=3",
+        ],
+    )
     config = from_dict(GraspConfig, changed)
     assert json.dumps(plain) == before
     wanted = dataclasses.replace(
-        GraspConfig(), episode_seconds=3.0, objects=dataclasses.replace(ObjectConfig(), corners=0.5, shapes=("box",)),
-        randomization=dataclasses.replace(Randomization(), backlash="gear_play", latency=(0.0, 0.01)))
+        GraspConfig(),
+        episode_seconds=3.0,
+        objects=dataclasses.replace(ObjectConfig(), corners=0.5, shapes=("box",)),
+        randomization=dataclasses.replace(Randomization(), backlash="gear_play", latency=(0.0, 0.01)),
+    )
     assert config == wanted
     # A field that the file does not have yet.
     assert from_dict(GraspConfig, override({}, ["objects.corners=1"])).objects.corners == 1.0
-    for entry, said in (("objects.corner=1", "ObjectConfig has no field 'corner'"),
-                        ("objects.corners=7", "between 0 and 1"),
-                        ("objects.corners=much", "expected float"), ("objects=1", "expected a table"),
-                        ("episode_seconds.x=1", "expected float"), ("corners", "expected NAME=VALUE"),
-                        ("=1", "expected NAME=VALUE"), ("corners=", "expected NAME=VALUE")):
+    for entry, said in (
+        ("objects.corner=1", "ObjectConfig has no field 'corner'"),
+        ("objects.corners=7", "between 0 and 1"),
+        ("objects.corners=much", "expected float"),
+        ("objects=1", "expected a table"),
+        ("episode_seconds.x=1", "expected float"),
+        ("corners", "expected NAME=VALUE"),
+        ("=1", "expected NAME=VALUE"),
+        ("corners=", "expected NAME=VALUE"),
+    ):
         with pytest.raises(ConfigError, match=said):
             from_dict(GraspConfig, override(plain, [entry]))

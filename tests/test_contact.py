@@ -31,19 +31,39 @@ BALL = """
 """
 
 
-def ball(*, stiffness=2000.0, ratio=1.0, mu=0.9, condim=3, mass=0.1, step=0.002, height=0.03,
-         cone="elliptic", impratio=20.0, joint="<freejoint/>"):
+def ball(
+    *,
+    stiffness=2000.0,
+    ratio=1.0,
+    mu=0.9,
+    condim=3,
+    mass=0.1,
+    step=0.002,
+    height=0.03,
+    cone="elliptic",
+    impratio=20.0,
+    joint="<freejoint/>",
+):
     """A ball of 30 mm over a floor; its mass, as in the hand's scene, is not what the contact was set up for."""
     model = mujoco.MjModel.from_xml_string(
-        BALL.format(step=step, height=height, mass=mass, condim=condim, mu=mu, cone=cone, joint=joint,
-                    impratio=impratio if cone == "elliptic" else 1))
+        BALL.format(
+            step=step,
+            height=height,
+            mass=mass,
+            condim=condim,
+            mu=mu,
+            cone=cone,
+            joint=joint,
+            impratio=impratio if cone == "elliptic" else 1,
+        )
+    )
     model.body_invweight0[1] = 10.0, 2e4
     pairs = contact.pairs_with(model, np.array([model.geom("ball").id]))
     compliance, *_ = contact.pair_constants(model, pairs, np.array([0]))
     np.testing.assert_array_equal(compliance, [10.0])
     model.pair_solref[:], model.pair_solimp[:] = contact.spring(
-        compliance, np.array([stiffness]), ratio, mu, period=0.03,
-        edges=2 * (condim - 1) if cone == "pyramidal" else 0)
+        compliance, np.array([stiffness]), ratio, mu, period=0.03, edges=2 * (condim - 1) if cone == "pyramidal" else 0
+    )
     return model, mujoco.MjData(model)
 
 
@@ -58,8 +78,10 @@ def test_depth_at_rest_is_weight_over_stiffness(cone, condim, mu, stiffness):
     assert 0.03 - data.qpos[2] == pytest.approx(0.5 * 9.81 / stiffness, rel=1e-3)
 
 
-@pytest.mark.parametrize("cone, impratio, slowest, fastest", [
-    ("pyramidal", 1, 0.010, 0.030), ("elliptic", 1, 0.004, 0.010), ("elliptic", 20, 0.0, 0.0005)])
+@pytest.mark.parametrize(
+    "cone, impratio, slowest, fastest",
+    [("pyramidal", 1, 0.010, 0.030), ("elliptic", 1, 0.004, 0.010), ("elliptic", 20, 0.0, 0.0005)],
+)
 @pytest.mark.parametrize("mu", [0.6, 1.2])
 def test_what_friction_holds_creeps_little(cone, impratio, slowest, fastest, mu):
     """At half of what friction can bear: R f / b in m/s, by the documentation's solref and impratio.
@@ -87,8 +109,10 @@ def test_a_ball_bounces_as_configured(restitution, mass):
 
 
 def test_only_fingertips_wear_rubber(hand):
-    bare, clad = (build_model(hand, SLOTS, np.full((3, 3), OFF), PhysicsConfig(cover=cover),
-                              (9.81, 0, 0), "jax") for cover in (0.0, 0.003))
+    bare, clad = (
+        build_model(hand, SLOTS, np.full((3, 3), OFF), PhysicsConfig(cover=cover), (9.81, 0, 0), "jax")
+        for cover in (0.0, 0.003)
+    )
     tips = {bare.body(hand.body_names[b]).id for b in hand.tip_body}
     grown = clad.geom_size - bare.geom_size
     for geom in range(bare.ngeom):
@@ -126,14 +150,15 @@ def test_a_row_of_spheres_fills_its_capsule(hand):
             assert ball.type == mujoco.mjtGeom.mjGEOM_SPHERE and ball.bodyid == pad.bodyid
             np.testing.assert_allclose(ball.pos, pad.pos + (k - 1) * half, atol=1e-6)
             assert ball.size[0] == pytest.approx(pad.size[0])
-        assert pad.size[0] - np.sqrt(pad.size[0]**2 - (pad.size[1] / 2)**2) < 8e-4
+        assert pad.size[0] - np.sqrt(pad.size[0] ** 2 - (pad.size[1] / 2) ** 2) < 8e-4
 
 
 def test_springs_follow_the_skin(hand):
     """In squeezed hands every pair gets the spring that the second scene works out from C MuJoCo's own contacts."""
     law, rng = c_scene.skin_law(hand, Skin()), np.random.default_rng(4)
-    seam = Physics(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(), gravity=c_scene.GRAVITY, backend="jax",
-                   skin=Skin())
+    seam = Physics(
+        hand, SLOTS, ObjectConfig().largest, PhysicsConfig(), gravity=c_scene.GRAVITY, backend="jax", skin=Skin()
+    )
     pool = make_pool(jax.random.key(3), hand, GraspConfig(pool_size=3 * len(SHAPES)), Grasp.reference)
 
     @jax.jit
@@ -141,8 +166,10 @@ def test_springs_follow_the_skin(hand):
         model = seam.configure(target, seam.tip_stiffness(target, qpos))
         return model.pair_solref, model.pair_solimp
 
-    first, second = ([seam.mj_model.geom(g).name for g in side[seam.object_pairs]]
-                     for side in (seam.mj_model.pair_geom1, seam.mj_model.pair_geom2))
+    first, second = (
+        [seam.mj_model.geom(g).name for g in side[seam.object_pairs]]
+        for side in (seam.mj_model.pair_geom1, seam.mj_model.pair_geom2)
+    )
     changed = dict.fromkeys(SHAPES, 0)
     for index in range(3 * len(SHAPES)):
         start = c_scene.row(pool, index)
@@ -152,8 +179,10 @@ def test_springs_follow_the_skin(hand):
         c_scene.follow_skin(model, c_scene.start(model, qpos, qvel), hand, start.target, np.asarray(felt)[0])
         changed[SHAPES[start.target.shape_index]] += np.sum(model.pair_solref[:, 0] != nominal[:, 0])
         solref, solimp = configure(start.target, jnp.asarray(qpos))
-        there = {(model.geom(a).name, model.geom(b).name): pair for pair, (a, b) in enumerate(
-            zip(model.pair_geom1, model.pair_geom2, strict=True))}
+        there = {
+            (model.geom(a).name, model.geom(b).name): pair
+            for pair, (a, b) in enumerate(zip(model.pair_geom1, model.pair_geom2, strict=True))
+        }
         for pair, link, other in zip(seam.object_pairs, first, second, strict=True):
             slot = int(other.removeprefix("object_"))
             if start.target.active[slot]:

@@ -30,9 +30,12 @@ def row(tree, index):
 
 def leaves(tree):
     """All leaves by path, keys as their data."""
-    return {jax.tree_util.keystr(path): np.asarray(
-                jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf)
-            for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]}
+    return {
+        jax.tree_util.keystr(path): np.asarray(
+            jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
+        )
+        for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]
+    }
 
 
 def assert_same(first, second, rows=slice(None)):
@@ -46,12 +49,16 @@ def placed(rollout, seed, qpos, qvel, target, joint_target=None):
     """A reset batch with its hands and objects put elsewhere."""
     state = rollout.reset(jax.random.key(seed))
     qpos, qvel = jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32)
-    sample = dataclasses.replace(state.sample, joint_position=qpos[:, :12],
-                                 object_position=qpos[:, 12:15], object_quat=qpos[:, 15:])
+    sample = dataclasses.replace(
+        state.sample, joint_position=qpos[:, :12], object_position=qpos[:, 12:15], object_quat=qpos[:, 15:]
+    )
     return dataclasses.replace(
-        state, physics=PhysicsState(qpos, qvel, jnp.zeros((WORLDS, 18))), sample=sample,
+        state,
+        physics=PhysicsState(qpos, qvel, jnp.zeros((WORLDS, 18))),
+        sample=sample,
         target=jax.tree.map(lambda new, old: jnp.asarray(new, old.dtype), target, state.target),
-        joint_target=qpos[:, :12] if joint_target is None else jnp.asarray(joint_target, jnp.float32))
+        joint_target=qpos[:, :12] if joint_target is None else jnp.asarray(joint_target, jnp.float32),
+    )
 
 
 def actions(seed, scale=1.0):
@@ -104,12 +111,13 @@ class TestPure:
                 # Accelerations of hundreds of rad/s^2, to a thousandth of the largest; positions to 50 micrometres.
                 fast = 1e-3 * max(100.0, np.abs(alone[".physics.warmstart"]).max())
                 bounds = {".physics.warmstart": (2e-3, fast), ".physics.qpos": (1e-7, 5e-5)}
-                close = {path: np.allclose(value, batch[path][world], *bounds.get(path, (2e-3, 5e-3)))
-                         for path, value in alone.items()}
+                close = {
+                    path: np.allclose(value, batch[path][world], *bounds.get(path, (2e-3, 5e-3)))
+                    for path, value in alone.items()
+                }
                 equal.append(all(close.values()))
                 np.testing.assert_array_equal(alone[".key"], batch[".key"][world])
-                np.testing.assert_allclose(alone[".physics.qpos"], batch[".physics.qpos"][world],
-                                           atol=5e-3)
+                np.testing.assert_allclose(alone[".physics.qpos"], batch[".physics.qpos"][world], atol=5e-3)
         # A solver stopped after so many iterations passes rounding on where it has not converged: the one
         # world in some hundreds where a contact has not settled between sticking and sliding.
         assert np.mean(equal) >= 0.8, equal
@@ -117,8 +125,10 @@ class TestPure:
     def test_dtypes_are_stable(self, history):
         """A step's output goes into the next step as it is: a `scan` over steps needs that."""
         state, _, following = history[0]
-        kinds = [jax.tree.map(lambda x: (x.shape, x.dtype, getattr(x, "weak_type", False)), tree)
-                 for tree in (state, following)]
+        kinds = [
+            jax.tree.map(lambda x: (x.shape, x.dtype, getattr(x, "weak_type", False)), tree)
+            for tree in (state, following)
+        ]
         assert kinds[0] == kinds[1]
 
     def test_everything_is_finite(self, history):
@@ -143,15 +153,18 @@ class TestTick:
         action = actions(3)
         after = grasp_rollout.step(state, action)
         push = jax.vmap(lambda key, target: grasp_env.task.push(jax.random.split(key, 4)[1], target))(
-            state.key, state.target)
+            state.key, state.target
+        )
 
         strong, close = 0, []
         skin = np.asarray(skin_law(hand, config.skin)(state.physics.qpos, state.target))
         for world in range(WORLDS):
             target = c_scene.row(state.target, world)
             model = c_scene.compile_scene(hand, target, **c_scene.CONVERGED)
-            data = c_scene.start(model, *(np.asarray(x[world]) for x in (
-                state.physics.qpos, state.physics.qvel, state.physics.warmstart)))
+            data = c_scene.start(
+                model,
+                *(np.asarray(x[world]) for x in (state.physics.qpos, state.physics.qvel, state.physics.warmstart)),
+            )
             c_scene.follow_skin(model, data, hand, target, skin[world])
             old = np.asarray(state.joint_target[world], np.float64)
             q = data.qpos[:12].copy()
@@ -182,12 +195,13 @@ class TestTick:
         """The torque that the motors would give at the end of the tick, over the stall torque."""
         _, _, after = history[5]
         for world in range(WORLDS):
-            torque = plain_drive(c_scene.row(after.draw.actuator, world),
-                                 np.asarray(after.joint_target[world]),
-                                 np.asarray(after.physics.qpos[world, :12]),
-                                 np.asarray(after.physics.qvel[world, :12]))
-            np.testing.assert_allclose(after.sample.joint_torque[world] * hand.torque_limit, torque,
-                                       atol=2e-5)
+            torque = plain_drive(
+                c_scene.row(after.draw.actuator, world),
+                np.asarray(after.joint_target[world]),
+                np.asarray(after.physics.qpos[world, :12]),
+                np.asarray(after.physics.qvel[world, :12]),
+            )
+            np.testing.assert_allclose(after.sample.joint_torque[world] * hand.torque_limit, torque, atol=2e-5)
 
     @pytest.mark.parametrize("factor", [1.0, 3.0])
     def test_actions_are_clipped(self, grasp_rollout, history, factor):
@@ -204,8 +218,9 @@ class TestTick:
     def test_absolute_targets(self, hand, grasp_env):
         """The other way to read an action: a place in the joint's range, smoothed."""
         control = Control(mode="absolute", smoothing=0.25, reach=4.0)
-        other = dexsim.make("grasp", GraspConfig(
-            control=control, pool_size=1, objects=ObjectConfig(shapes=("sphere",))), backend="jax")
+        other = dexsim.make(
+            "grasp", GraspConfig(control=control, pool_size=1, objects=ObjectConfig(shapes=("sphere",))), backend="jax"
+        )
         start = jnp.asarray(hand.joint_lower)
         for value, share in ((1.0, 1.0), (-1.0, 0.0), (0.0, 0.5)):
             target = other._joint_target(start, jnp.full(12, value), start)
@@ -289,8 +304,7 @@ class TestEpisodes:
         state, everyone = history[-1][2], jnp.ones(WORLDS, bool)
         first = grasp_rollout.restart(state, everyone)
         second = grasp_rollout.restart(first, everyone)
-        assert np.all(np.any(np.asarray(first.draw.encoder_bias)
-                             != np.asarray(second.draw.encoder_bias), axis=-1))
+        assert np.all(np.any(np.asarray(first.draw.encoder_bias) != np.asarray(second.draw.encoder_bias), axis=-1))
 
     def test_stagger(self, grasp_env, history):
         state = history[0][0]
@@ -301,7 +315,8 @@ class TestEpisodes:
         assert np.all((spread.tick >= 0) & (spread.tick < limit))
         assert_same(dataclasses.replace(spread, tick=state.tick), state)
         many = jax.vmap(lambda key: grasp_env.stagger(row(state, 0), key).tick)(
-            jax.random.split(jax.random.key(6), 4000))
+            jax.random.split(jax.random.key(6), 4000)
+        )
         assert np.histogram(many, 4, (0, limit))[0].min() > 850
 
     def test_evaluation_starts(self, grasp_env):
@@ -324,11 +339,15 @@ class TestTrouble:
         state, action, following = history[3]
         target = dataclasses.replace(state.target, mass=state.target.mass.at[2].set(jnp.nan))
         motors = dataclasses.replace(
-            state.draw.actuator, **{name: getattr(state.draw.actuator, name).at[5].set(value)
-                                    for name, value in (("stiffness", 1e3), ("stall_torque", 1e3),
-                                                        ("no_load_speed", 1e30))})
-        after = grasp_rollout.step(dataclasses.replace(
-            state, target=target, draw=dataclasses.replace(state.draw, actuator=motors)), action)
+            state.draw.actuator,
+            **{
+                name: getattr(state.draw.actuator, name).at[5].set(value)
+                for name, value in (("stiffness", 1e3), ("stall_torque", 1e3), ("no_load_speed", 1e30))
+            },
+        )
+        after = grasp_rollout.step(
+            dataclasses.replace(state, target=target, draw=dataclasses.replace(state.draw, actuator=motors)), action
+        )
         bad, good = np.array([2, 5]), np.array([0, 1, 3, 4, 6, 7])
         assert np.all(after.terminated[bad]) and not np.any(after.truncated[bad])
         assert np.all(after.metrics["non_finite"][bad] == 1)
@@ -352,12 +371,16 @@ class TestTrouble:
             for path, value in leaves(getattr(after, name)).items():
                 assert np.all(np.isfinite(value)), (name, path)
 
-    @pytest.mark.parametrize("make, message", [
-        (lambda: Control(mode="torque"), "Control.mode = 'torque': choose from delta, absolute"),
-        (lambda: Control(step=5.0), "Control.step = 5 rad: must be between 0.001 and 1 rad"),
-        (lambda: Sensing(joint_noise=-1.0), "Sensing.joint_noise = -1 rad"),
-        (lambda: EnvConfig(pool_size=0), "EnvConfig.pool_size|pool_size = 0"),
-        (lambda: Randomization(latency=(0.02, 0.01)), "Randomization.latency")])
+    @pytest.mark.parametrize(
+        "make, message",
+        [
+            (lambda: Control(mode="torque"), "Control.mode = 'torque': choose from delta, absolute"),
+            (lambda: Control(step=5.0), "Control.step = 5 rad: must be between 0.001 and 1 rad"),
+            (lambda: Sensing(joint_noise=-1.0), "Sensing.joint_noise = -1 rad"),
+            (lambda: EnvConfig(pool_size=0), "EnvConfig.pool_size|pool_size = 0"),
+            (lambda: Randomization(latency=(0.02, 0.01)), "Randomization.latency"),
+        ],
+    )
     def test_configurations_out_of_range(self, make, message):
         with pytest.raises(ConfigError, match=message):
             config = make()
@@ -368,12 +391,12 @@ class TestTrouble:
 class TestReadings:
     def test_the_observation_is_observe_of_the_readings(self, hand, grasp_env, history):
         after = history[-1][2]
-        seen = jax.vmap(lambda readings: observation.observe(
-            hand, readings, observation.GRASP, grasp_env.config.observation))(after.readings)
+        seen = jax.vmap(
+            lambda readings: observation.observe(hand, readings, observation.GRASP, grasp_env.config.observation)
+        )(after.readings)
         np.testing.assert_allclose(after.obs["actor"], seen, rtol=1e-5, atol=1e-5)
         assert after.obs["actor"].shape == (WORLDS, 66)
-        sizes = {name: sum(field.size for field in fields)
-                 for name, fields in grasp_env.observation_layout.items()}
+        sizes = {name: sum(field.size for field in fields) for name, fields in grasp_env.observation_layout.items()}
         assert sizes == {"actor": 66, "critic": 66}
 
     def test_the_critic_sees_the_truth(self, hand, grasp_env, history):
@@ -381,14 +404,13 @@ class TestReadings:
         critic, at = np.asarray(after.obs["critic"]), 0
         fields = {}
         for field in grasp_env.observation_layout["critic"]:
-            fields[field.name] = critic[:, at:at + field.size]
+            fields[field.name] = critic[:, at : at + field.size]
             at += field.size
         np.testing.assert_allclose(fields["joint_position"], after.physics.qpos[:, :12], atol=1e-6)
         np.testing.assert_allclose(fields["object_position"], after.physics.qpos[:, 12:15], atol=1e-6)
         np.testing.assert_allclose(fields["object_velocity"], after.physics.qvel[:, 12:15], atol=1e-6)
         np.testing.assert_allclose(fields["joint_torque"], after.sample.joint_torque, atol=1e-6)
-        np.testing.assert_allclose(fields["contact_force"], after.sample.taxel_force.sum(-1),
-                                   rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(fields["contact_force"], after.sample.taxel_force.sum(-1), rtol=1e-5, atol=1e-5)
         tips = jax.vmap(lambda q: forward_kinematics(hand, q).tip_position)(after.physics.qpos[:, :12])
         np.testing.assert_allclose(fields["fingertip_position"], tips.reshape(WORLDS, 15), atol=1e-6)
         np.testing.assert_allclose(fields["command"][:, 0], after.goal.command)
@@ -402,10 +424,20 @@ class TestReadings:
 
         Joints turn by some 0.1 rad a tick; noise of 3 mrad over 12 x 12 samples leaves 0.01.
         """
-        old, new, read = (np.stack(x) for x in zip(*(
-            (before.sample.joint_position, after.sample.joint_position,
-             after.readings.joint_position - after.draw.encoder_bias)
-            for before, after in ((s, f) for s, _, f in history)), strict=True))
+        old, new, read = (
+            np.stack(x)
+            for x in zip(
+                *(
+                    (
+                        before.sample.joint_position,
+                        after.sample.joint_position,
+                        after.readings.joint_position - after.draw.encoder_bias,
+                    )
+                    for before, after in ((s, f) for s, _, f in history)
+                ),
+                strict=True,
+            )
+        )
         change = old - new
         age = np.sum((read - new) * change, axis=(0, 2)) / np.sum(change**2, axis=(0, 2))
         wanted = np.asarray(history[0][0].draw.sensing_latency)
@@ -417,8 +449,9 @@ class TestReadings:
         for before, _, after in history:
             age = np.asarray(after.draw.sensing_latency)[:, None]
             for name, into in (("joint_position", errors), ("object_position", places)):
-                mixed = (1 - age) * np.asarray(getattr(after.sample, name)) \
-                    + age * np.asarray(getattr(before.sample, name))
+                mixed = (1 - age) * np.asarray(getattr(after.sample, name)) + age * np.asarray(
+                    getattr(before.sample, name)
+                )
                 into.append(np.asarray(getattr(after.readings, name)) - mixed)
         bias = np.asarray(history[0][0].draw.encoder_bias)
         errors = np.stack(errors) - bias
@@ -428,35 +461,47 @@ class TestReadings:
         places = np.stack(places)[..., 0]
         assert np.std(places) == pytest.approx(sensing.object_noise, rel=0.25)
         reference = np.array(grasp_env.task.reference)[1:]
-        np.testing.assert_allclose(history[-1][2].readings.object_position[:, 1:],
-                                   np.broadcast_to(reference, (WORLDS, 2)))
+        np.testing.assert_allclose(
+            history[-1][2].readings.object_position[:, 1:], np.broadcast_to(reference, (WORLDS, 2))
+        )
 
     def test_the_velocity_estimate_is_filtered_differences(self, grasp_env, history):
         weight, period = grasp_env.config.sensing.velocity_filter, grasp_env.control_period
         for before, _, after in history:
             step = (after.readings.object_position - before.readings.object_position) / period
-            wanted = before.readings.object_velocity + weight * (
-                step - before.readings.object_velocity)
+            wanted = before.readings.object_velocity + weight * (step - before.readings.object_velocity)
             np.testing.assert_allclose(after.readings.object_velocity, wanted, atol=1e-4)
 
     def test_a_quiet_hand_reads_the_truth(self):
         """Without noise, draws and counts the readings are the state itself."""
-        sensing = Sensing(joint_noise=0.0, joint_resolution=0.0, torque_noise=0.0, object_noise=0.0,
-                          object_axes=(True, True, True),
-                          taxel=tactile.TaxelSensor(noise=0.0, threshold=0.0, resolution=0.0))
-        env = dexsim.make("grasp", GraspConfig(
-            sensing=sensing, randomization=Randomization(scale=0.0), pool_size=4,
-            objects=ObjectConfig(shapes=("sphere",))), backend="jax")
+        sensing = Sensing(
+            joint_noise=0.0,
+            joint_resolution=0.0,
+            torque_noise=0.0,
+            object_noise=0.0,
+            object_axes=(True, True, True),
+            taxel=tactile.TaxelSensor(noise=0.0, threshold=0.0, resolution=0.0),
+        )
+        env = dexsim.make(
+            "grasp",
+            GraspConfig(
+                sensing=sensing,
+                randomization=Randomization(scale=0.0),
+                pool_size=4,
+                objects=ObjectConfig(shapes=("sphere",)),
+            ),
+            backend="jax",
+        )
         state = jax.jit(env.reset)(jax.random.key(0))
         np.testing.assert_array_equal(state.readings.joint_position, state.physics.qpos[:12])
         np.testing.assert_array_equal(state.readings.object_position, state.physics.qpos[12:15])
         np.testing.assert_array_equal(state.readings.taxel_force, np.zeros((5, 120)))
         # A pressed moment goes through the same door.
         force = jnp.zeros((5, 120)).at[2, 40:44].set(jnp.array([0.013, 0.4, 1.26, 0.02]))
-        sample = dataclasses.replace(state.sample, taxel_force=force,
-                                     joint_torque=jnp.linspace(-1, 1, 12))
-        readings, _ = env.senses.read(jax.random.key(1), sample, state.sample, Sensors.of(state),
-                                      state.goal, jnp.zeros(12))
+        sample = dataclasses.replace(state.sample, taxel_force=force, joint_torque=jnp.linspace(-1, 1, 12))
+        readings, _ = env.senses.read(
+            jax.random.key(1), sample, state.sample, Sensors.of(state), state.goal, jnp.zeros(12)
+        )
         np.testing.assert_array_equal(readings.taxel_force, force)
         np.testing.assert_array_equal(readings.joint_torque, sample.joint_torque)
 
@@ -488,14 +533,13 @@ def grips(hand, grasp_env, grasp_rollout):
                     wanted = np.clip(start.qpos[:12] + share * close, here - grip, here + grip)
                     for _ in range(6):
                         torque = 3 * (wanted - data.qpos[:12]) - 0.1 * data.qvel[:12]
-                        data.qfrc_applied[:12] = np.clip(torque, -hand.torque_limit,
-                                                         hand.torque_limit)
+                        data.qfrc_applied[:12] = np.clip(torque, -hand.torque_limit, hand.torque_limit)
                         mujoco.mj_step(model, data)
                 if np.linalg.norm(data.qpos[12:15] - grasp_env.task.reference) < 0.1:
                     held.append((pool_row, data.qpos.copy(), data.qvel.copy(), wanted))
         found[shape] = []
         for begin in range(0, len(held), WORLDS):
-            part = held[begin:begin + WORLDS]
+            part = held[begin : begin + WORLDS]
             rows, *values = zip(*(part * WORLDS)[:WORLDS], strict=True)
             qpos, qvel, wanted = (np.stack(value) for value in values)
             target = c_scene.row(grasp_env.pool.target, list(rows))
@@ -565,9 +609,14 @@ class TestTouch:
             grasp_rollout.reset(jax.random.key(0)).target,
             shape_index=np.full(WORLDS, SHAPES.index("box")),
             size=np.tile(np.stack([half, speck, speck]), (WORLDS, 1, 1)),
-            position=np.zeros((WORLDS, 3, 3)), active=np.tile([True, False, False], (WORLDS, 1)),
-            mass=mass, inertia=inertia, com=np.zeros((WORLDS, 3)), friction=np.full(WORLDS, 0.9),
-            contact=np.tile([1700.0, 2.0], (WORLDS, 1)))
+            position=np.zeros((WORLDS, 3, 3)),
+            active=np.tile([True, False, False], (WORLDS, 1)),
+            mass=mass,
+            inertia=inertia,
+            com=np.zeros((WORLDS, 3)),
+            friction=np.full(WORLDS, 0.9),
+            contact=np.tile([1700.0, 2.0], (WORLDS, 1)),
+        )
         fist = np.array([0, 0, 0, 0, *[1.57] * 8])
         qpos = np.tile([*fist, 0.039, -0.005, 0.0795, 1, 0, 0, 0], (WORLDS, 1))
         state = placed(grasp_rollout, 0, qpos, np.zeros((WORLDS, 18)), target)
@@ -603,10 +652,10 @@ class TestTouch:
         def force(taxels, shape, place, pose):
             position, turn = pose[:3], pose[3:]
             angle = jnp.sqrt(jnp.sum(turn**2) + 1e-24)
-            rotation = rotations.compose(rotations.axis_angle_to_matrix(turn / angle, angle),
-                                         rotations.quat_to_matrix(place[3:]))
-            touch = tactile.feel(taxels, area, shape, place[:3] + position, rotation,
-                                 jnp.ones(5), skin)
+            rotation = rotations.compose(
+                rotations.axis_angle_to_matrix(turn / angle, angle), rotations.quat_to_matrix(place[3:])
+            )
+            touch = tactile.feel(taxels, area, shape, place[:3] + position, rotation, jnp.ones(5), skin)
             return jnp.sum(touch.skin_force)
 
         with c_scene.double_precision():
@@ -614,29 +663,41 @@ class TestTouch:
             for world in worlds:
                 joints = jnp.asarray(np.asarray(after.physics.qpos[world, :12], np.float64))
                 taxels = taxel_positions(hand, forward_kinematics(hand, joints))
-                target = jax.tree.map(lambda x: jnp.asarray(x, jnp.float64) if x.dtype == np.float32
-                                      else jnp.asarray(x), c_scene.row(after.target, world))
+                target = jax.tree.map(
+                    lambda x: jnp.asarray(x, jnp.float64) if x.dtype == np.float32 else jnp.asarray(x),
+                    c_scene.row(after.target, world),
+                )
                 shape = target.shape()
                 place = np.asarray(after.physics.qpos[world, 12:], np.float64)
                 place[3:] /= np.linalg.norm(place[3:])
                 pose, step = np.full(6, 1e-6), 1e-8
                 _, gradient = both(taxels, shape, place, pose)
-                numeric = [(both(taxels, shape, place, pose + step * axis)[0]
-                            - both(taxels, shape, place, pose - step * axis)[0]) / (2 * step)
-                           for axis in np.eye(6)]
+                numeric = [
+                    (
+                        both(taxels, shape, place, pose + step * axis)[0]
+                        - both(taxels, shape, place, pose - step * axis)[0]
+                    )
+                    / (2 * step)
+                    for axis in np.eye(6)
+                ]
                 assert np.all(np.isfinite(gradient))
                 assert np.linalg.norm(gradient[:3]) > 100  # N/m
-                np.testing.assert_allclose(gradient, numeric, rtol=1e-4,
-                                           atol=1e-4 * np.abs(numeric).max())
+                np.testing.assert_allclose(gradient, numeric, rtol=1e-4, atol=1e-4 * np.abs(numeric).max())
 
     def test_gradients_through_the_whole_batch_are_finite(self, hand, grasp_env, grips):
         after = grips["composition"][0][0]
 
         def total(position, world):
             taxels = taxel_positions(hand, forward_kinematics(hand, world.physics.qpos[:12]))
-            touch = tactile.feel(taxels, jnp.asarray(hand.taxel_area), world.target.shape(), position,
-                                 rotations.quat_to_matrix(world.physics.qpos[15:]),
-                                 world.finger_force, grasp_env.config.skin)
+            touch = tactile.feel(
+                taxels,
+                jnp.asarray(hand.taxel_area),
+                world.target.shape(),
+                position,
+                rotations.quat_to_matrix(world.physics.qpos[15:]),
+                world.finger_force,
+                grasp_env.config.skin,
+            )
             force, centre = tactile.reduce_touch(touch.force, taxels)
             return jnp.sum(force) + jnp.sum(centre)
 

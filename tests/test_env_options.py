@@ -26,15 +26,38 @@ from dexsim.tasks.grasp import GraspConfig
 from dexsim_ppo.train import parse_arguments
 
 WORLDS = 4
-OFF = SensorNoise(hysteresis=None, crosstalk=None, gain=None, bias=None, drift=None, noise=None, dead=None,
-                  threshold=None, counts="none", rate=None)
-QUIET = Sensing(joint_noise=0.0, joint_resolution=0.0, torque_noise=0.0, object_noise=0.0,
-                orientation=OrientationSensor(noise=0.0, bias=0.0, drift=0.0, delay=(0.0, 0.0)),
-                taxel=TaxelSensor(noise=0.0, threshold=0.0, resolution=0.0))
+OFF = SensorNoise(
+    hysteresis=None,
+    crosstalk=None,
+    gain=None,
+    bias=None,
+    drift=None,
+    noise=None,
+    dead=None,
+    threshold=None,
+    counts="none",
+    rate=None,
+)
+QUIET = Sensing(
+    joint_noise=0.0,
+    joint_resolution=0.0,
+    torque_noise=0.0,
+    object_noise=0.0,
+    orientation=OrientationSensor(noise=0.0, bias=0.0, drift=0.0, delay=(0.0, 0.0)),
+    taxel=TaxelSensor(noise=0.0, threshold=0.0, resolution=0.0),
+)
 
 
-GEARED = Randomization(backlash="gear_play", gear_gap=(0.01, 0.02), encoder_bias=0.0, sensing_latency=(0.0, 0.0),
-                       torque_gain=(1.0, 1.0), taxel_gain=(1.0, 1.0), latency=(0.0, 0.0), latency_spread=(0.0, 0.0))
+GEARED = Randomization(
+    backlash="gear_play",
+    gear_gap=(0.01, 0.02),
+    encoder_bias=0.0,
+    sensing_latency=(0.0, 0.0),
+    torque_gain=(1.0, 1.0),
+    taxel_gain=(1.0, 1.0),
+    latency=(0.0, 0.0),
+    latency_spread=(0.0, 0.0),
+)
 
 
 @pytest.fixture(scope="module")
@@ -44,9 +67,18 @@ def make():
     patch.setattr("dexsim.env.Physics", SimplePhysics)
 
     def build(sensing=QUIET, randomization=None, observation=None):
-        return dexsim.make("grasp", GraspConfig(
-            sensing=sensing, randomization=randomization or Randomization(scale=0.0), pool_size=4,
-            observation=observation or ObservationConfig(), objects=ObjectConfig(shapes=("sphere",))), backend="jax")
+        return dexsim.make(
+            "grasp",
+            GraspConfig(
+                sensing=sensing,
+                randomization=randomization or Randomization(scale=0.0),
+                pool_size=4,
+                observation=observation or ObservationConfig(),
+                objects=ObjectConfig(shapes=("sphere",)),
+            ),
+            backend="jax",
+        )
+
     yield build
     patch.undo()
 
@@ -91,8 +123,10 @@ def test_a_tilt_that_the_host_does_not_know_turns_what_its_imu_says(make):
         assert 0.005 < np.arccos(-true_up[0]) < 0.15
         error = np.asarray(state.orientation_sensor.bias)
         angle = np.linalg.norm(error)
-        seen = rotations.rotate(rotations.quat_to_matrix(rotations.axis_angle_to_quat(
-            jnp.asarray(error / angle), jnp.asarray(angle))), jnp.asarray(true_up))
+        seen = rotations.rotate(
+            rotations.quat_to_matrix(rotations.axis_angle_to_quat(jnp.asarray(error / angle), jnp.asarray(angle))),
+            jnp.asarray(true_up),
+        )
         np.testing.assert_allclose(seen, [-1.0, 0.0, 0.0], atol=1e-3)
 
 
@@ -106,8 +140,9 @@ def test_taxels_feel_no_friction(make):
     pose = forward_kinematics(env.hand, qpos[:12])
     # The object where the first finger's pad is.
     at = pose.body_position[env.hand.tip_body[1]]
-    moment = env._moment(dataclasses.replace(state.physics, qpos=qpos.at[12:15].set(at)), state.target,
-                         zero, zero, zero, force)
+    moment = env._moment(
+        dataclasses.replace(state.physics, qpos=qpos.at[12:15].set(at)), state.target, zero, zero, zero, force
+    )
     felt, normals = np.asarray(moment.touch.force[1]), np.asarray(taxel_normals(env.hand, pose))[1]
     skin = np.asarray(moment.touch.skin_force[1])
     inward = -(skin[:, None] * normals).sum(0)
@@ -184,7 +219,8 @@ def touching(env, seed=0):
     pose = forward_kinematics(env.hand, joints)
     normal = taxel_normals(env.hand, pose)[1, 66]
     taxel = pose.body_position[env.hand.tip_body[1]] + rotations.rotate(
-        pose.tip_rotation[1], jnp.asarray(env.hand.taxel_position[1, 66]))
+        pose.tip_rotation[1], jnp.asarray(env.hand.taxel_position[1, 66])
+    )
     place = taxel + normal * (state.target.size[1, 0] + 0.001)  # inside the rubber over the taxels
     physics = dataclasses.replace(state.physics, qpos=jnp.concatenate([joints, place, jnp.array([1.0, 0, 0, 0])]))
     force = jnp.asarray(np.random.default_rng(seed).normal(0, 2, (5, 3)), jnp.float32) - 3 * normal
@@ -213,12 +249,17 @@ class TestThreeAxes:
                 continue
             inward = -weights[finger].sum(0) / np.linalg.norm(weights[finger].sum(0))
             assert abs(tangential[finger] @ inward) < 1e-4
-            np.testing.assert_allclose(tangential[finger] + (np.asarray(force)[finger] @ inward) * inward,
-                                       force[finger], atol=1e-4)
+            np.testing.assert_allclose(
+                tangential[finger] + (np.asarray(force)[finger] @ inward) * inward, force[finger], atol=1e-4
+            )
 
-    @pytest.mark.parametrize("config, groups", [
-        (ObservationConfig(add=("tangential_force",)), ("actor", "critic")),
-        (ObservationConfig(add_critic=("tangential_force", "joint_velocity")), ("critic",))])
+    @pytest.mark.parametrize(
+        "config, groups",
+        [
+            (ObservationConfig(add=("tangential_force",)), ("actor", "critic")),
+            (ObservationConfig(add_critic=("tangential_force", "joint_velocity")), ("critic",)),
+        ],
+    )
     def test_it_is_observed_by_whom_the_configuration_says(self, make, hand, config, groups):
         env = make(observation=config)
         assert env.senses.three_axis
@@ -229,8 +270,9 @@ class TestThreeAxes:
         state, physics, force = touching(env)
         zero = jnp.zeros(12)
         moment = env._moment(physics, state.target, zero, zero, zero, force)
-        sample = dataclasses.replace(state.sample, taxel_force=moment.touch.force,
-                                     tangential_force=moment.tangential_force)
+        sample = dataclasses.replace(
+            state.sample, taxel_force=moment.touch.force, tangential_force=moment.tangential_force
+        )
         readings, _ = env.senses.read(jax.random.key(0), sample, sample, Sensors.of(state), state.goal, zero, state)
         np.testing.assert_allclose(readings.tangential_force, moment.tangential_force, atol=1e-5)
         obs = env._observe(readings, moment, state.goal)
@@ -239,7 +281,7 @@ class TestThreeAxes:
             for field in env.observation_layout[group]:
                 if field.name == "tangential_force":
                     assert field.size == 15 and field.scale
-                    np.testing.assert_allclose(obs[group][at:at + 15], moment.tangential_force.ravel(), atol=1e-5)
+                    np.testing.assert_allclose(obs[group][at : at + 15], moment.tangential_force.ravel(), atol=1e-5)
                 at += field.size
             assert at == len(obs[group])
 
@@ -251,8 +293,9 @@ class TestThreeAxes:
         for taxels, read in ((1, 2.0), (100, 0.0)):
             force = jnp.zeros((5, 120)).at[:, :taxels].set(1.0)
             sample = dataclasses.replace(state.sample, taxel_force=force, tangential_force=tangential)
-            readings, _ = env.senses.read(jax.random.key(0), sample, sample, Sensors.of(state), state.goal,
-                                          jnp.zeros(12), state)
+            readings, _ = env.senses.read(
+                jax.random.key(0), sample, sample, Sensors.of(state), state.goal, jnp.zeros(12), state
+            )
             np.testing.assert_allclose(readings.tangential_force[:, 2], read, atol=1e-5)
 
     def test_in_state_and_metrics(self, busy):
@@ -314,15 +357,25 @@ class TestGearPlay:
         whole = build_model(hand, ("box",), np.full((1, 3), 0.02), config.physics, (0, 0, -9.81), "jax")
         seam = object.__new__(Physics)
         seam.hand, seam.slots, seam.config = hand, ("box",), config.physics
-        seam.mj_model = build_model(hand, ("box",), np.full((1, 3), 0.02), config.physics, (0, 0, -9.81), "jax",
-                                    rotor_share=rotor_share(config.randomization))
+        seam.mj_model = build_model(
+            hand,
+            ("box",),
+            np.full((1, 3), 0.02),
+            config.physics,
+            (0, 0, -9.81),
+            "jax",
+            rotor_share=rotor_share(config.randomization),
+        )
         seam._find_addresses()
         drive, dofs = Drive(config, hand, seam), seam.joint_dof
-        np.testing.assert_allclose(drive._rotor_inertia + seam.mj_model.dof_armature[dofs], whole.dof_armature[dofs],
-                                   rtol=1e-5)
+        np.testing.assert_allclose(
+            drive._rotor_inertia + seam.mj_model.dof_armature[dofs], whole.dof_armature[dofs], rtol=1e-5
+        )
         assert drive._steps >= 4
-        bare = SimpleNamespace(dof_armature=0 * whole.dof_armature, **{name: getattr(whole, name) for name in (
-            "opt", "dof_M0", "dof_invweight0")})
+        bare = SimpleNamespace(
+            dof_armature=0 * whole.dof_armature,
+            **{name: getattr(whole, name) for name in ("opt", "dof_M0", "dof_invweight0")},
+        )
         with pytest.raises(ConfigError, match="needs an armature"):
             Drive(config, hand, SimpleNamespace(mj_model=bare, joint_dof=dofs))
 
@@ -342,12 +395,19 @@ class TestScale:
         env, states = drawn
         state, objects = states[0.0], env.config.objects
         for value, nominal in (
-                (state.draw.actuator.stall_torque, hand.torque_limit), (state.draw.encoder_bias, 0),
-                (state.draw.tilt, 0),
-                (state.orientation_sensor.bias, 0), (state.array_params.gain, 1), (state.array_params.bias, 0),
-                (state.array_params.crosstalk, 0), (state.array_params.alive, True),
-                (state.target.mass, np.mean(objects.mass)), (state.target.friction, np.mean(objects.friction)),
-                (state.target.com, 0), (state.target.contact[:, 0], np.mean(objects.stiffness))):
+            (state.draw.actuator.stall_torque, hand.torque_limit),
+            (state.draw.encoder_bias, 0),
+            (state.draw.tilt, 0),
+            (state.orientation_sensor.bias, 0),
+            (state.array_params.gain, 1),
+            (state.array_params.bias, 0),
+            (state.array_params.crosstalk, 0),
+            (state.array_params.alive, True),
+            (state.target.mass, np.mean(objects.mass)),
+            (state.target.friction, np.mean(objects.friction)),
+            (state.target.com, 0),
+            (state.target.contact[:, 0], np.mean(objects.stiffness)),
+        ):
             np.testing.assert_array_equal(value, np.broadcast_to(np.float32(nominal), value.shape))
         assert len(np.unique(state.target.contact[:, 1])) == 1
         radius = np.asarray(state.target.size[:, 1, 0])
@@ -362,8 +422,13 @@ class TestScale:
         rows = {tuple(q): row for row, q in enumerate(np.asarray(env.pool.qpos))}
         at = [rows[tuple(q)] for q in np.asarray(state.physics.qpos)]
         for name in ("mass", "inertia", "com", "friction", "contact"):
-            np.testing.assert_allclose(getattr(state.target, name), np.asarray(getattr(env.pool.target, name))[at],
-                                       rtol=1e-4, atol=1e-7, err_msg=name)
+            np.testing.assert_allclose(
+                getattr(state.target, name),
+                np.asarray(getattr(env.pool.target, name))[at],
+                rtol=1e-4,
+                atol=1e-7,
+                err_msg=name,
+            )
 
     def test_half_is_half_way(self, drawn):
         _, states = drawn
@@ -387,12 +452,35 @@ class TestScale:
 
 
 def test_all_of_it_is_reached_from_the_command_line():
-    arguments, _ = parse_arguments([
-        "--task", "grasp", "--env.sensing.array.scale", "1", "--env.sensing.array.hysteresis", "0.1", "0.2",
-        "--env.sensing.array.drift", "0", "0.01", "--env.sensing.array.crosstalk", "None",
-        "--env.sensing.array.rate", "8", "20", "--env.sensing.three-axis",
-        "--env.observation.add", "tangential_force", "--env.observation.add-critic", "object_spin",
-        "--env.randomization.backlash", "gear_play", "--env.randomization.gear-gap", "0", "0.03"])
+    arguments, _ = parse_arguments(
+        [
+            "--task",
+            "grasp",
+            "--env.sensing.array.scale",
+            "1",
+            "--env.sensing.array.hysteresis",
+            "0.1",
+            "0.2",
+            "--env.sensing.array.drift",
+            "0",
+            "0.01",
+            "--env.sensing.array.crosstalk",
+            "None",
+            "--env.sensing.array.rate",
+            "8",
+            "20",
+            "--env.sensing.three-axis",
+            "--env.observation.add",
+            "tangential_force",
+            "--env.observation.add-critic",
+            "object_spin",
+            "--env.randomization.backlash",
+            "gear_play",
+            "--env.randomization.gear-gap",
+            "0",
+            "0.03",
+        ]
+    )
     array = arguments.env.sensing.array
     assert (array.scale, array.hysteresis, array.drift) == (1.0, (0.1, 0.2), (0.0, 0.01))
     assert array.crosstalk is None and array.rate == (8.0, 20.0) and arguments.env.sensing.three_axis
@@ -405,10 +493,26 @@ def test_all_of_it_is_reached_from_the_command_line():
 def test_the_self_test_finds_every_range_of_gears_and_taxels(make):
     env = make(Sensing(array=SensorNoise(rate=(8.0, 20.0), counts="none")), GEARED)
     states = jax.jit(lambda key: jax.vmap(env.reset)(jax.random.split(key, WORLDS)))(jax.random.key(0))
-    names = ("hysteresis", "hysteresis_time", "crosstalk", "gain", "bias", "drift", "noise", "dead", "threshold",
-             "rate")
-    effects = check(env, jax.jit(jax.vmap(env.step)), states, key=jax.random.key(1), ticks=10, names=[
-        "Randomization.gear_gap", "Randomization.dead_band", *(f"SensorNoise.{name}" for name in names)])
+    names = (
+        "hysteresis",
+        "hysteresis_time",
+        "crosstalk",
+        "gain",
+        "bias",
+        "drift",
+        "noise",
+        "dead",
+        "threshold",
+        "rate",
+    )
+    effects = check(
+        env,
+        jax.jit(jax.vmap(env.step)),
+        states,
+        key=jax.random.key(1),
+        ticks=10,
+        names=["Randomization.gear_gap", "Randomization.dead_band", *(f"SensorNoise.{name}" for name in names)],
+    )
     gap, band, *taxels = effects
     assert gap.changed == ("gear_gap",) and gap.joint > 1e-4 and band.off
     for name, effect in zip(names, taxels, strict=True):
@@ -420,8 +524,11 @@ def test_the_self_test_finds_every_range_of_gears_and_taxels(make):
 def test_everything_at_once_on_the_real_physics():
     """A hand that grips and shakes, then holds still, with play in its gears and poor taxels: sober numbers."""
     config = GraspConfig(
-        pool_size=80, sensing=Sensing(array=SensorNoise(rate=(10.0, 30.0)), three_axis=True),
-        observation=ObservationConfig(add=("tangential_force",)), randomization=Randomization(backlash="gear_play"))
+        pool_size=80,
+        sensing=Sensing(array=SensorNoise(rate=(10.0, 30.0)), three_axis=True),
+        observation=ObservationConfig(add=("tangential_force",)),
+        randomization=Randomization(backlash="gear_play"),
+    )
     env = dexsim.make("grasp", config, backend="jax", num_envs=8)
     state = jax.jit(lambda key: jax.vmap(env.reset)(jax.random.split(key, 8)))(jax.random.key(0))
     step, restart = jax.jit(jax.vmap(env.step)), jax.jit(jax.vmap(env.restart))

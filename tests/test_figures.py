@@ -26,8 +26,9 @@ def test_lattice_centre_by_hand():
 
 def test_comparison_shows_both_centres_and_forces(hand, tmp_path):
     first, second = presses(0), presses(1)
-    figure = draw_comparison(hand, first, second, labels=("sim", "log"), times=0.1 * np.arange(6),
-                             path=tmp_path / "comparison.png")
+    figure = draw_comparison(
+        hand, first, second, labels=("sim", "log"), times=0.1 * np.arange(6), path=tmp_path / "comparison.png"
+    )
     assert (tmp_path / "comparison.png").stat().st_size > 5000
     axes = np.array(figure.axes).reshape(2, 5)
     for finger, name in enumerate(hand.finger_names):

@@ -42,7 +42,8 @@ def test_the_published_check_value():
 def test_a_version_request_byte_for_byte():
     wanted = bytes.fromhex("55 AA FE 80 13 00 00")
     assert Frame(frames.HOST, frames.palm_address(0), Command.VERSION).encode() == (
-        wanted + crc_by_definition(wanted).to_bytes(2, "little"))
+        wanted + crc_by_definition(wanted).to_bytes(2, "little")
+    )
 
 
 def test_a_command_block_byte_for_byte():
@@ -57,10 +58,19 @@ def test_a_command_block_byte_for_byte():
 
 
 def test_a_state_block_byte_for_byte():
-    joints = [struct.pack("<BBfhHHHHHhHH", i, 17 * (i == 2), 0.1 * i, -100 * i, (i << 4) | 3, (40 << 8) | i, 1, 2, 3,
-                          -7 * i, 0, 0) for i in range(12)]
-    tips = [struct.pack("<bbB", -i, i, 200 + i) + b"".join(struct.pack("<bbB", -t, t, 2 * t) for t in range(120))
-            + bytes(range(20)) + bytes([30 + i]) for i in range(5)]
+    joints = [
+        struct.pack(
+            "<BBfhHHHHHhHH", i, 17 * (i == 2), 0.1 * i, -100 * i, (i << 4) | 3, (40 << 8) | i, 1, 2, 3, -7 * i, 0, 0
+        )
+        for i in range(12)
+    ]
+    tips = [
+        struct.pack("<bbB", -i, i, 200 + i)
+        + b"".join(struct.pack("<bbB", -t, t, 2 * t) for t in range(120))
+        + bytes(range(20))
+        + bytes([30 + i])
+        for i in range(5)
+    ]
     data = b"".join(joints + tips)
     assert len(data) == 12 * 24 + 5 * 384 == 2208
     state = frames.decode_state(data)
@@ -94,8 +104,11 @@ def test_blocks_that_cannot_be_right_are_refused():
 @given(st.lists(st.sampled_from(["state", "version", "error"]), max_size=5), st.integers(0, 2**32 - 1))
 def test_any_chunking_gives_the_same_frames(kinds, seed):
     rng = np.random.default_rng(seed)
-    make = {"state": state_frame, "version": lambda r: Frame(0x80, 0xFE, Command.VERSION, r.bytes(7)),
-            "error": lambda r: Frame(0x80, 0xFE, Command.ERROR, r.bytes(4))}
+    make = {
+        "state": state_frame,
+        "version": lambda r: Frame(0x80, 0xFE, Command.VERSION, r.bytes(7)),
+        "error": lambda r: Frame(0x80, 0xFE, Command.ERROR, r.bytes(4)),
+    }
     sent = [make[kind](rng) for kind in kinds]
     stream = b"".join(frame.encode() for frame in sent)
     parser, got = Parser(HAND_REPLIES), []
@@ -109,9 +122,15 @@ def test_any_chunking_gives_the_same_frames(kinds, seed):
 
 def test_a_host_does_not_take_its_own_echo_for_an_answer():
     block = frames.command_block(np.zeros(12), kp=1, ki=0, kd=0, torque_max=1)
-    echo = b"".join(Frame(0xFE, 0x80, command, data).encode() for command, data in (
-        (Command.EXCHANGE, block.tobytes()), (Command.VERSION, b""), (Command.CLEAR_PRESSURE, b"\x11"),
-        (Command.READ_MODE, b"")))
+    echo = b"".join(
+        Frame(0xFE, 0x80, command, data).encode()
+        for command, data in (
+            (Command.EXCHANGE, block.tobytes()),
+            (Command.VERSION, b""),
+            (Command.CLEAR_PRESSURE, b"\x11"),
+            (Command.READ_MODE, b""),
+        )
+    )
     parser = Parser(HAND_REPLIES)
     assert parser.feed(echo) + parser.expire() == []
     assert len(Parser(HOST_REQUESTS).feed(echo)) == 4
@@ -131,22 +150,23 @@ def _damage(rng, data):
         for bit in rng.choice(8 * len(data), int(rng.integers(1, 4)), replace=False):
             data[bit >> 3] ^= 1 << (bit & 7)
     elif kind == 1:  # lost bytes
-        del data[at:at + int(rng.integers(1, 40))]
+        del data[at : at + int(rng.integers(1, 40))]
     elif kind == 2:  # doubled bytes
-        data[at:at] = data[at:at + int(rng.integers(1, 40))]
+        data[at:at] = data[at : at + int(rng.integers(1, 40))]
     elif kind == 3:  # cut off
         del data[at:]
     elif kind == 4:  # strange bytes within
         data[at:at] = rng.bytes(int(rng.integers(1, 60)))
     else:  # overwritten in two bytes: a burst that the checksum is sure to find
-        first = bytes(data[at:at + 2])
-        while bytes(data[at:at + 2]) == first:
-            data[at:at + 2] = rng.bytes(len(first))
+        first = bytes(data[at : at + 2])
+        while bytes(data[at : at + 2]) == first:
+            data[at : at + 2] = rng.bytes(len(first))
     return bytes(data)
 
 
-HEADS = tuple(bytes.fromhex(text) for text in (
-    "55", "AA", "55AA", "55AAFE", "55AA80FE02A008", "55AAFE80022001", "55AA80FE021020"))
+HEADS = tuple(
+    bytes.fromhex(text) for text in ("55", "AA", "55AA", "55AAFE", "55AA80FE02A008", "55AAFE80022001", "55AA80FE021020")
+)
 
 
 def between(rng):
@@ -211,7 +231,7 @@ def test_noise_alone_is_nothing_and_hides_nothing(parts, size):
     sent = Frame(0x80, 0xFE, Command.VERSION, b"1.3.9")
     parser = Parser(HAND_REPLIES)
     stream = noise + sent.encode()
-    got = [frame for i in range(0, len(stream), size) for frame in parser.feed(stream[i:i + size])]
+    got = [frame for i in range(0, len(stream), size) for frame in parser.feed(stream[i : i + size])]
     assert got + parser.expire() == [sent]
     assert parser.pending == 0 and parser.counts.skipped == len(noise)
 
@@ -222,7 +242,7 @@ def test_the_worst_stream_costs_bounded_work():
     parser = Parser(HAND_REPLIES)
     start = time.perf_counter()
     for i in range(0, len(stream), 512):
-        assert parser.feed(stream[i:i + 512]) == []
+        assert parser.feed(stream[i : i + 512]) == []
         assert parser.pending <= 2217 + 512
     parser.expire()
     assert parser.counts.checked <= len(stream) * 2217 / 7

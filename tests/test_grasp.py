@@ -35,11 +35,31 @@ from dexsim.tasks.grasp import (
 )
 
 # Pinned: the shipped defaults are tuned, the rules below are not.
-WEIGHTS = GraspReward(force=2.0, torque=0.2, alive=0.5, spread=-0.5, outer=-0.05, action=-0.02,
-                      velocity=-0.002, drop=-20.0, sigma=0.1, tail_sigma=0.4, tail=0.4,
-                      thumb="loose", overload=-2.0, margin=0.4)
-CONFIG = GraspConfig(finger_force=(1.0, 7.0), max_force=10.0, force_per_torque=19.0,
-                     push_probability=0.02, push_speed=0.3, drop_distance=0.12, reward=WEIGHTS)
+WEIGHTS = GraspReward(
+    force=2.0,
+    torque=0.2,
+    alive=0.5,
+    spread=-0.5,
+    outer=-0.05,
+    action=-0.02,
+    velocity=-0.002,
+    drop=-20.0,
+    sigma=0.1,
+    tail_sigma=0.4,
+    tail=0.4,
+    thumb="loose",
+    overload=-2.0,
+    margin=0.4,
+)
+CONFIG = GraspConfig(
+    finger_force=(1.0, 7.0),
+    max_force=10.0,
+    force_per_torque=19.0,
+    push_probability=0.02,
+    push_speed=0.3,
+    drop_distance=0.12,
+    reward=WEIGHTS,
+)
 
 
 @pytest.fixture(scope="module")
@@ -57,14 +77,26 @@ def make_moment(hand, **fields):
     joints = jnp.asarray((hand.joint_lower + hand.joint_upper) / 2)
     nothing = jnp.zeros((5, 120))
     values = {
-        "target": None, "joint_position": joints, "joint_velocity": zero, "joint_torque": zero,
-        "pose": forward_kinematics(hand, joints), "finger_force": jnp.zeros((5, 3)),
+        "target": None,
+        "joint_position": joints,
+        "joint_velocity": zero,
+        "joint_torque": zero,
+        "pose": forward_kinematics(hand, joints),
+        "finger_force": jnp.zeros((5, 3)),
         "touch": tactile.Touch(nothing, nothing, nothing),
-        "object_position": jnp.asarray(Grasp.reference), "object_quat": jnp.array([1.0, 0, 0, 0]),
-        "object_velocity": jnp.zeros(3), "object_spin": jnp.zeros(3), "action": zero,
-        "last_action": zero}
-    return Moment(**{name: jnp.asarray(value) if name not in ("target", "pose", "touch") else value
-                     for name, value in (values | fields).items()})
+        "object_position": jnp.asarray(Grasp.reference),
+        "object_quat": jnp.array([1.0, 0, 0, 0]),
+        "object_velocity": jnp.zeros(3),
+        "object_spin": jnp.zeros(3),
+        "action": zero,
+        "last_action": zero,
+    }
+    return Moment(
+        **{
+            name: jnp.asarray(value) if name not in ("target", "pose", "touch") else value
+            for name, value in (values | fields).items()
+        }
+    )
 
 
 def goal_of(command):
@@ -77,7 +109,8 @@ class TestTerms:
     def test_tailed_gaussian(self, error, tail):
         found = tailed_gaussian(jnp.float32(error), 0.1, 0.4, tail)
         assert float(found) == pytest.approx(
-            (1 - tail) * gauss(error, 0.1) + tail * gauss(error, 0.4), rel=1e-5, abs=1e-7)
+            (1 - tail) * gauss(error, 0.1) + tail * gauss(error, 0.4), rel=1e-5, abs=1e-7
+        )
 
     def test_there_is_a_gradient_far_from_the_target(self):
         """What the wide Gaussian is for: 5 N from the target a newton still counts."""
@@ -92,31 +125,30 @@ class TestTerms:
         contact = jnp.array([True, False, False, False, False])
         found = command_reward(jnp.full(5, value), 4.0, contact, (0.01, 200.0), 10.0, weights)
         error = (value - 4.0) / 10.0
-        match = {"loose": gauss(error, 0.4), "binary": 1.0,
-                 "track": 0.6 * gauss(error, 0.1) + 0.4 * gauss(error, 0.4)}[thumb]
+        match = {"loose": gauss(error, 0.4), "binary": 1.0, "track": 0.6 * gauss(error, 0.1) + 0.4 * gauss(error, 0.4)}[
+            thumb
+        ]
         wanted = match / 5 if 0.01 <= value <= 200.0 else 0.0
         assert float(found) == pytest.approx(wanted, rel=1e-5, abs=1e-7)
 
     def test_command_reward_counts_touching_fingers_within_bounds(self):
         value = jnp.array([0.2, 0.3, 1.5, 0.0, 0.4])
         contact = jnp.array([True, True, True, True, False])
-        found = command_reward(value, 0.3, contact, (0.01, 1.0), 1.0,
-                               dataclasses.replace(WEIGHTS, thumb="track"))
+        found = command_reward(value, 0.3, contact, (0.01, 1.0), 1.0, dataclasses.replace(WEIGHTS, thumb="track"))
         # thumb off by 0.1, index exact, middle above the bounds, ring below, pinky not touching
-        assert float(found) == pytest.approx(
-            (0.6 * math.exp(-0.5) + 0.4 * math.exp(-1 / 32) + 1.0) / 5, rel=1e-5)
+        assert float(found) == pytest.approx((0.6 * math.exp(-0.5) + 0.4 * math.exp(-1 / 32) + 1.0) / 5, rel=1e-5)
 
     def test_the_papers_reward_is_a_choice(self):
         """sigma 0.1 without a tail, thumb within bounds: R_force of the paper."""
         weights = dataclasses.replace(WEIGHTS, thumb="binary", tail=0.0)
-        found = command_reward(jnp.array([50.0, 4.0, 5.0, 6.0, 0.0]), 5.0, jnp.ones(5, bool),
-                               (0.01, 200.0), 10.0, weights)
+        found = command_reward(
+            jnp.array([50.0, 4.0, 5.0, 6.0, 0.0]), 5.0, jnp.ones(5, bool), (0.01, 200.0), 10.0, weights
+        )
         assert float(found) == pytest.approx((1 + 2 * math.exp(-0.5) + 1) / 5, rel=1e-5)
 
     def test_penalties(self):
         assert float(joint_spread(jnp.array([0.0, 1.0, 2.0, 3.0]))) == pytest.approx(1.25)
-        assert float(posture_distance(jnp.array([3.0, 0.0]), jnp.array([0.0, 4.0]))) == \
-            pytest.approx(5.0)
+        assert float(posture_distance(jnp.array([3.0, 0.0]), jnp.array([0.0, 4.0]))) == pytest.approx(5.0)
         assert float(action_rate(jnp.array([1.0, -1.0]), jnp.array([0.0, 1.0]))) == 5.0
         assert float(joint_speed(jnp.array([3.0, -4.0]))) == 25.0
         assert jnp.isfinite(jax.grad(posture_distance)(jnp.ones(3), jnp.ones(3))).all()
@@ -139,9 +171,15 @@ class TestReward:
         felt = np.zeros((5, 120))
         felt[1, :4], felt[0, :2] = 1.0, 0.5
         moment = make_moment(
-            hand, finger_force=force, joint_torque=torque, joint_position=position,
-            joint_velocity=velocity, action=action, last_action=before,
-            touch=tactile.Touch(jnp.asarray(felt), jnp.asarray(0.5 * felt), jnp.asarray(felt)))
+            hand,
+            finger_force=force,
+            joint_torque=torque,
+            joint_position=position,
+            joint_velocity=velocity,
+            action=action,
+            last_action=before,
+            touch=tactile.Touch(jnp.asarray(felt), jnp.asarray(0.5 * felt), jnp.asarray(felt)),
+        )
         reward, metrics = task.reward(goal_of(0.5), moment, jnp.zeros((), bool))
 
         # Target 4 N; thumb 2 N (loose), index 5 N (tracks), ring 5 mN (no contact).
@@ -152,17 +190,37 @@ class TestReward:
         wanted = {
             "force": 2.0 * (gauss(0.2, 0.4) + track) / 5,
             "torque": 0.2 * (gauss(0.1 - goal, 0.4) + torque_track) / 5,
-            "alive": 0.5, "spread": -0.5 * np.var([0.1, -0.1, 0.3, 0.1]),
-            "outer": -0.05 * math.sqrt(0.01 + 0.01 + 0.09 + 0.01), "action": -0.02 * 1.0,
-            "velocity": -0.002 * 4.0, "drop": 0.0, "overload": -2.0 * (5.0 - 4.0 - 0.4) / 10}
+            "alive": 0.5,
+            "spread": -0.5 * np.var([0.1, -0.1, 0.3, 0.1]),
+            "outer": -0.05 * math.sqrt(0.01 + 0.01 + 0.09 + 0.01),
+            "action": -0.02 * 1.0,
+            "velocity": -0.002 * 4.0,
+            "drop": 0.0,
+            "overload": -2.0 * (5.0 - 4.0 - 0.4) / 10,
+        }
         for name, value in wanted.items():
             assert float(metrics[f"reward/{name}"]) == pytest.approx(value, rel=1e-4, abs=1e-6), name
         assert {n for n in metrics if n.startswith("reward/")} == {f"reward/{n}" for n in wanted}
         assert float(reward) == pytest.approx(sum(wanted.values()), rel=1e-4)
-        known = {"success": 1.0, "command": 0.5, "finger_force": 5.0, "finger_pressing": 4.0, "force_error": 1.0,
-                 "total_force": 7.005, "taxel_force": 5.0, "skin_force": 2.5, "thumb_force": 2.0,
-                 "touching": 2.0, "joint_speed": 2.0 / 12, "action_rate": 1.0 / 12,
-                 "force/0": 2.0, "force/1": 5.0, "force/2": 0.0, "force/3": 0.005, "force/4": 0.0}
+        known = {
+            "success": 1.0,
+            "command": 0.5,
+            "finger_force": 5.0,
+            "finger_pressing": 4.0,
+            "force_error": 1.0,
+            "total_force": 7.005,
+            "taxel_force": 5.0,
+            "skin_force": 2.5,
+            "thumb_force": 2.0,
+            "touching": 2.0,
+            "joint_speed": 2.0 / 12,
+            "action_rate": 1.0 / 12,
+            "force/0": 2.0,
+            "force/1": 5.0,
+            "force/2": 0.0,
+            "force/3": 0.005,
+            "force/4": 0.0,
+        }
         for name, value in known.items():
             assert float(metrics[name]) == pytest.approx(value, rel=1e-4, abs=1e-6), name
 
@@ -173,8 +231,7 @@ class TestReward:
         _, held = task.reward(goal_of(0.2), moment, jnp.zeros((), bool))
         reward, lost = task.reward(goal_of(0.2), moment, jnp.ones((), bool))
         assert float(held["reward/force"]) > 0 and float(held["reward/drop"]) == 0
-        assert [float(lost[f"reward/{n}"]) for n in ("force", "torque", "alive", "drop")] == \
-            [0.0, 0.0, 0.0, -20.0]
+        assert [float(lost[f"reward/{n}"]) for n in ("force", "torque", "alive", "drop")] == [0.0, 0.0, 0.0, -20.0]
         assert float(lost["success"]) == 0.0
         penalties = sum(float(lost[f"reward/{n}"]) for n in ("spread", "outer", "action", "velocity"))
         assert float(reward) == pytest.approx(-20.0 + penalties)
@@ -201,9 +258,17 @@ class TestReward:
             assert float(metrics["reward/torque"]) == pytest.approx(0.2, rel=1e-3)
             assert float(metrics["force_error"]) == pytest.approx(0.0, abs=1e-4)
 
-    @pytest.mark.parametrize("offset, dropped", [
-        ((0, 0, 0), False), ((0.119, 0, 0), False), ((0.121, 0, 0), True), ((0, -0.121, 0), True),
-        ((0.08, 0.08, 0), False), ((0.08, 0.08, 0.08), True)])
+    @pytest.mark.parametrize(
+        "offset, dropped",
+        [
+            ((0, 0, 0), False),
+            ((0.119, 0, 0), False),
+            ((0.121, 0, 0), True),
+            ((0, -0.121, 0), True),
+            ((0.08, 0.08, 0), False),
+            ((0.08, 0.08, 0.08), True),
+        ],
+    )
     def test_dropped(self, hand, task, offset, dropped):
         moment = make_moment(hand, object_position=np.array(Grasp.reference) + offset)
         assert bool(task.dropped(goal_of(0.0), moment)) is dropped
@@ -240,8 +305,7 @@ class TestChance:
     def test_the_command_changes_as_often_as_configured(self, hand):
         task = Grasp(GraspConfig(command_change=0.03), hand)
         keys = jax.random.split(jax.random.key(1), self.KEYS)
-        new = np.asarray(jax.jit(jax.vmap(
-            lambda key: task.update(key, goal_of(2.0), None).command))(keys))
+        new = np.asarray(jax.jit(jax.vmap(lambda key: task.update(key, goal_of(2.0), None).command))(keys))
         changed = new != 2.0
         assert changed.mean() == pytest.approx(0.03, abs=4 * math.sqrt(0.03 * 0.97 / self.KEYS))
         assert 0 <= new[changed].min() and new[changed].max() < 1
@@ -260,8 +324,10 @@ class TestChance:
         assert not np.any(goals.fixed)
 
     def test_clocks(self, hand):
-        task = Grasp(GraspConfig(episode_seconds=2.0, evaluation_seconds=1.5,
-                                 physics=PhysicsConfig(timestep=0.005, substeps=6)), hand)
+        task = Grasp(
+            GraspConfig(episode_seconds=2.0, evaluation_seconds=1.5, physics=PhysicsConfig(timestep=0.005, substeps=6)),
+            hand,
+        )
         assert (task.episode_ticks, task.evaluation_ticks) == (67, 50)  # of 0.03 s
 
 
@@ -272,8 +338,9 @@ class TestEvaluationPlan:
         index, goal = task.evaluation_plan(count, shape_index)
         command = np.asarray(goal.command)
         assert index.shape == command.shape == (count,) and np.all(np.asarray(goal.fixed))
-        cells = np.array([[np.sum((command == c) & (shape_index[index] == s)) for s in range(5)]
-                          for c in np.float32(COMMANDS)])
+        cells = np.array(
+            [[np.sum((command == c) & (shape_index[index] == s)) for s in range(5)] for c in np.float32(COMMANDS)]
+        )
         assert cells.sum() == count and np.ptp(cells) <= 1
         assert np.ptp(cells.sum(1)) <= 1
 
@@ -332,8 +399,11 @@ class TestPool:
         low, high = config.release_speed
         assert np.all((pool.qvel[:, 12] >= low) & (pool.qvel[:, 12] <= high))
         assert not np.any(pool.qvel[:, :12])
-        for moved, most in ((pool.qvel[:, 13:15], config.release_drift), (pool.qvel[:, 15:], config.release_spin),
-                            (pool.qpos[:, 13:15] - np.array(Grasp.reference[1:]), config.place_noise)):
+        for moved, most in (
+            (pool.qvel[:, 13:15], config.release_drift),
+            (pool.qvel[:, 15:], config.release_spin),
+            (pool.qpos[:, 13:15] - np.array(Grasp.reference[1:]), config.place_noise),
+        ):
             assert 0.8 * most < np.max(np.abs(moved)) <= most + 1e-6
 
     def test_one_seed_is_one_pool(self, hand):
@@ -350,22 +420,31 @@ class TestPool:
 
 
 class TestConfig:
-    @pytest.mark.parametrize("values, message", [
-        ({"drop_distance": 5.0}, r"GraspConfig.drop_distance = 5 m: must be between 0.02 and 1 m"),
-        ({"finger_force": (3.0, 1.0)}, r"finger_force = \(3, 1\): the first must not exceed"),
-        ({"finger_force": (0.0, 1.0)}, "finger_force = 0 N"),
-        ({"curl": (0.2, 0.1)}, "curl"),
-        ({"release_gap": (0.2, 0.3)}, "release_gap = 0.2 m"),
-        ({"push_probability": 1.5}, "push_probability = 1.5"),
-        ({"episode_seconds": float("nan")}, "episode_seconds = nan: must be a finite number"),
-        ({"posture": (4.0,) * 12}, "posture = 4 rad")])
+    @pytest.mark.parametrize(
+        "values, message",
+        [
+            ({"drop_distance": 5.0}, r"GraspConfig.drop_distance = 5 m: must be between 0.02 and 1 m"),
+            ({"finger_force": (3.0, 1.0)}, r"finger_force = \(3, 1\): the first must not exceed"),
+            ({"finger_force": (0.0, 1.0)}, "finger_force = 0 N"),
+            ({"curl": (0.2, 0.1)}, "curl"),
+            ({"release_gap": (0.2, 0.3)}, "release_gap = 0.2 m"),
+            ({"push_probability": 1.5}, "push_probability = 1.5"),
+            ({"episode_seconds": float("nan")}, "episode_seconds = nan: must be a finite number"),
+            ({"posture": (4.0,) * 12}, "posture = 4 rad"),
+        ],
+    )
     def test_values_out_of_range(self, values, message):
         with pytest.raises(ConfigError, match=message):
             GraspConfig(**values)
 
-    @pytest.mark.parametrize("values, message", [
-        ({"drop": 5.0}, "GraspReward.drop = 5"), ({"sigma": 0.0}, "sigma = 0"),
-        ({"thumb": "none"}, "thumb = 'none': choose from loose, track, binary")])
+    @pytest.mark.parametrize(
+        "values, message",
+        [
+            ({"drop": 5.0}, "GraspReward.drop = 5"),
+            ({"sigma": 0.0}, "sigma = 0"),
+            ({"thumb": "none"}, "thumb = 'none': choose from loose, track, binary"),
+        ],
+    )
     def test_reward_weights_out_of_range(self, values, message):
         with pytest.raises(ConfigError, match=message):
             GraspReward(**values)
@@ -386,14 +465,13 @@ class TestConfig:
     def test_every_number_has_a_unit(self):
         def walk(cls):
             for field in dataclasses.fields(cls):
-                value = field.default if field.default is not dataclasses.MISSING \
-                    else field.default_factory()
+                value = field.default if field.default is not dataclasses.MISSING else field.default_factory()
                 if dataclasses.is_dataclass(value):
                     yield from walk(type(value))
                 elif isinstance(value, float | int) and not isinstance(value, bool):
                     yield cls.__name__, field
+
         fields = list(walk(GraspConfig))
         assert len(fields) > 40
-        missing = [f"{owner}.{field.name}" for owner, field in fields
-                   if not field.metadata.get("unit")]
+        missing = [f"{owner}.{field.name}" for owner, field in fields if not field.metadata.get("unit")]
         assert missing == []

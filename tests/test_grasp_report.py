@@ -21,18 +21,27 @@ def evaluation(ticks=60, repeats=8, noise=0.0, slope=4.0, lost=(), settle_force=
     `settle_force` before. Episodes in `lost` end at tick 20.
     """
     rng = np.random.default_rng(seed)
-    command, shape, _ = (a.ravel() for a in np.meshgrid(
-        COMMANDS, np.arange(5), np.arange(repeats), indexing="ij"))
+    command, shape, _ = (a.ravel() for a in np.meshgrid(COMMANDS, np.arange(5), np.arange(repeats), indexing="ij"))
     count = command.size
     force = np.where(np.arange(ticks)[:, None] < 30, settle_force, 1.0 + slope * command)
     force = force + noise * rng.normal(size=count)
     alive = np.ones((ticks, count), bool)
     alive[20:, list(lost)] = False
     flat = np.ones((ticks, count))
-    metrics = {"command": flat * command, "shape": flat * shape, "finger_force": force, "finger_pressing": force**2,
-               "total_force": 3 * force, "taxel_force": 2 * force, "thumb_force": flat * 0.5,
-               "touching": flat * 3, "reward": flat * 0.25, "return": flat * 7.0,
-               "joint_speed": flat * 0.1, "non_finite": flat * 0}
+    metrics = {
+        "command": flat * command,
+        "shape": flat * shape,
+        "finger_force": force,
+        "finger_pressing": force**2,
+        "total_force": 3 * force,
+        "taxel_force": 2 * force,
+        "thumb_force": flat * 0.5,
+        "touching": flat * 3,
+        "reward": flat * 0.25,
+        "return": flat * 7.0,
+        "joint_speed": flat * 0.1,
+        "non_finite": flat * 0,
+    }
     return metrics, alive
 
 
@@ -51,8 +60,7 @@ class TestProportion:
         assert (round(found["low"], 4), round(found["high"], 4)) == (0.2553, 0.3662)
 
     def test_of_nothing(self):
-        assert report.proportion(np.zeros(0, bool)) == {
-            "mean": None, "low": None, "high": None, "count": 0}
+        assert report.proportion(np.zeros(0, bool)) == {"mean": None, "low": None, "high": None, "count": 0}
 
 
 class TestStatistics:
@@ -65,17 +73,16 @@ class TestStatistics:
         interval = stats.pearsonr(x, y).confidence_interval(0.95)  # Fisher's: another method
         assert (found["low"], found["high"]) == pytest.approx(tuple(interval), abs=0.03)
 
-    @pytest.mark.parametrize("x, y", [([1, 1, 1, 1], [1, 2, 3, 4]), ([1, 2, 3], [5, 5, 5]),
-                                      ([1, 2], [1, 2]), ([], [])])
+    @pytest.mark.parametrize("x, y", [([1, 1, 1, 1], [1, 2, 3, 4]), ([1, 2, 3], [5, 5, 5]), ([1, 2], [1, 2]), ([], [])])
     def test_pearson_undefined(self, x, y):
-        assert report.pearson(np.array(x, float), np.array(y, float)) == {
-            "r": None, "low": None, "high": None}
+        assert report.pearson(np.array(x, float), np.array(y, float)) == {"r": None, "low": None, "high": None}
 
     def test_mean_and_its_bootstrap(self):
         values = np.random.default_rng(2).exponential(size=300)
         found = report.mean(values, samples=2000)
-        known = stats.bootstrap((values,), np.mean, method="percentile", n_resamples=2000,
-                                random_state=np.random.default_rng(3)).confidence_interval
+        known = stats.bootstrap(
+            (values,), np.mean, method="percentile", n_resamples=2000, random_state=np.random.default_rng(3)
+        ).confidence_interval
         assert found["mean"] == pytest.approx(values.mean())
         assert (found["low"], found["high"]) == pytest.approx(tuple(known), abs=0.02)
 
@@ -98,8 +105,9 @@ class TestSummary:
     def few_draws(self, monkeypatch):
         """The intervals are tested above; here they only cost time."""
         bootstrap = report.bootstrap
-        monkeypatch.setattr(report, "bootstrap", lambda statistic, count, samples:
-                            bootstrap(statistic, count, min(samples, 10)))
+        monkeypatch.setattr(
+            report, "bootstrap", lambda statistic, count, samples: bootstrap(statistic, count, min(samples, 10))
+        )
 
     def test_a_perfect_follower(self):
         found = report.summarize(*evaluation(noise=1e-3), PERIOD, SPAN)

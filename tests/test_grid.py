@@ -25,8 +25,9 @@ def own_cache(tmp_path, monkeypatch):
 
 
 def solid(kind, *size):
-    return sdf.Shape((kind,), jnp.asarray([(*size, 0, 0)[:3]], jnp.float32), jnp.zeros((1, 3)), jnp.eye(3)[None],
-                     jnp.array([True]))
+    return sdf.Shape(
+        (kind,), jnp.asarray([(*size, 0, 0)[:3]], jnp.float32), jnp.zeros((1, 3)), jnp.eye(3)[None], jnp.array([True])
+    )
 
 
 def box_distance(points, half=BOX):
@@ -52,8 +53,9 @@ def test_distance_to_a_box_mesh_is_the_closed_form():
     value, gradient = mesh.signed_distance(box, points)
     np.testing.assert_allclose(value, box_distance(points), atol=1e-12)
     step = 1e-7
-    numeric = np.stack([(box_distance(points + step * e) - box_distance(points - step * e)) / (2 * step)
-                        for e in np.eye(3)], -1)
+    numeric = np.stack(
+        [(box_distance(points + step * e) - box_distance(points - step * e)) / (2 * step) for e in np.eye(3)], -1
+    )
     smooth = np.abs(np.linalg.norm(numeric, axis=1) - 1) < 1e-4
     np.testing.assert_allclose(gradient[smooth], numeric[smooth], atol=1e-4)
     assert box.volume == pytest.approx(8 * BOX.prod())
@@ -98,19 +100,29 @@ def test_bad_meshes_are_refused_in_one_line():
     mixed = faces.copy()
     mixed[4] = mixed[4][::-1]
     ball = trimesh.creation.icosphere(subdivisions=2, radius=0.02)
-    cases = [((vertices, faces[:-1]), "open, 3 edges belong to one triangle only"),
-             (turned(box.copy()), "normals point inward"), ((vertices, mixed), "normals point both ways"),
-             (flat(box.copy()), "encloses no volume"), ((nan, faces), "vertex 3 is not finite"),
-             ((1000 * vertices, faces), "60 m across.*scale=0.001"), ((1e-3 * vertices, faces), "6e-05 m across"),
-             ((vertices, faces[:0]), "no triangles"), ((vertices, faces + 4), "names vertex 11"),
-             ((vertices[:, :2], faces), r"\[V, 3\]"), ("nowhere.stl", "no such file"), (3, "no triangle mesh")]
+    cases = [
+        ((vertices, faces[:-1]), "open, 3 edges belong to one triangle only"),
+        (turned(box.copy()), "normals point inward"),
+        ((vertices, mixed), "normals point both ways"),
+        (flat(box.copy()), "encloses no volume"),
+        ((nan, faces), "vertex 3 is not finite"),
+        ((1000 * vertices, faces), "60 m across.*scale=0.001"),
+        ((1e-3 * vertices, faces), "6e-05 m across"),
+        ((vertices, faces[:0]), "no triangles"),
+        ((vertices, faces + 4), "names vertex 11"),
+        ((vertices[:, :2], faces), r"\[V, 3\]"),
+        ("nowhere.stl", "no such file"),
+        (3, "no triangle mesh"),
+    ]
     overlapping = trimesh.util.concatenate([ball, ball.copy().apply_translation((0.02, 0, 0))])
     for source, words in cases:
         with pytest.raises(AssetError, match=words) as caught:
             mesh.load_mesh(source)
         assert "\n" not in str(caught.value)
-    for bad in (overlapping, trimesh.util.concatenate([ball, turned(ball.copy().apply_translation((0.09, 0, 0)))
-                                                       .apply_scale(0.5)])):
+    for bad in (
+        overlapping,
+        trimesh.util.concatenate([ball, turned(ball.copy().apply_translation((0.09, 0, 0))).apply_scale(0.5)]),
+    ):
         with pytest.raises(AssetError, match="cannot be signed: inside and outside disagree at") as caught:
             mesh.check_sign(mesh.load_mesh(bad))
         assert "\n" not in str(caught.value)
@@ -158,8 +170,9 @@ def test_unbiased_nodes_take_the_mean_error_away(kind):
     """Interpolation between exact nodes always overshoots a convex shape; lowered nodes err to both sides, and less."""
     shape = solid(kind, *SMOOTH[kind])
     points, value, _ = shell(shape)
-    raw, ours = (np.asarray(signed_distance(points, grid.bake(shape, GridConfig(unbiased=u)))) - value
-                 for u in (False, True))
+    raw, ours = (
+        np.asarray(signed_distance(points, grid.bake(shape, GridConfig(unbiased=u)))) - value for u in (False, True)
+    )
     assert raw.min() > -1e-6 and raw.mean() > 4e-6
     assert abs(ours.mean()) < 0.15 * raw.mean() and np.abs(ours).mean() < 0.5 * np.abs(raw).mean()
 
@@ -189,9 +202,11 @@ def test_interpolation_by_hand():
 
     def truth(p):
         return np.linalg.norm(p, axis=1) - 0.02
+
     np.testing.assert_allclose(signed_distance(np.float32(node), baked), truth(node), atol=2e-8)
-    np.testing.assert_allclose(signed_distance(np.float32((node + nearby) / 2), baked),
-                               (truth(node) + truth(nearby)) / 2, atol=2e-8)
+    np.testing.assert_allclose(
+        signed_distance(np.float32((node + nearby) / 2), baked), (truth(node) + truth(nearby)) / 2, atol=2e-8
+    )
     out = np.float32([[origin[0] + 23 * step[0] + 0.05, 0.001, 0.002]])
     held = np.float32([[origin[0] + 23 * step[0], 0.001, 0.002]])
     np.testing.assert_allclose(signed_distance(out, baked), signed_distance(held, baked) + 0.05, atol=1e-7)
@@ -211,10 +226,17 @@ def test_quadratics_are_met_exactly():
 
     def polynomial(x):
         return np.einsum("pi,ij,pj->p", x, bend, x) + x @ tilt
+
     channels = np.concatenate([1e3 * polynomial(nodes)[:, None], 2 * nodes @ bend + tilt], 1)
-    made = grid.Grid(nodes=n, interpolation="quadratic", values=jnp.asarray(channels.reshape(-1), jnp.float32),
-                     origin=jnp.zeros((1, 3)), spacing=jnp.full((1, 3), 1 / (n - 1)), index=jnp.int32(0),
-                     scale=jnp.ones(()))
+    made = grid.Grid(
+        nodes=n,
+        interpolation="quadratic",
+        values=jnp.asarray(channels.reshape(-1), jnp.float32),
+        origin=jnp.zeros((1, 3)),
+        spacing=jnp.full((1, 3), 1 / (n - 1)),
+        index=jnp.int32(0),
+        scale=jnp.ones(()),
+    )
     points = rng.uniform(0, 1, (300, 3))
     value, gradient = (np.asarray(x) for x in jax.jit(grid._look_up)(np.float32(points), made))
     np.testing.assert_allclose(value, polynomial(points), atol=3e-6)
@@ -224,13 +246,15 @@ def test_quadratics_are_met_exactly():
 @pytest.mark.parametrize("interpolation", grid.INTERPOLATIONS)
 @pytest.mark.parametrize("dtype", grid.DTYPES)
 def test_the_analytic_gradient_is_the_automatic_one(interpolation, dtype):
-    baked = grid.bake(solid("ellipsoid", *SMOOTH["ellipsoid"]), dataclasses.replace(
-        COARSE, interpolation=interpolation, dtype=dtype))
+    baked = grid.bake(
+        solid("ellipsoid", *SMOOTH["ellipsoid"]), dataclasses.replace(COARSE, interpolation=interpolation, dtype=dtype)
+    )
     points = np.random.default_rng(5).uniform(-0.05, 0.05, (400, 3)).astype(np.float32)  # inside and beyond
 
     def both(p):
         value, gradient = grid._look_up(p, baked)
         return value, jnp.stack(gradient, -1)
+
     _, analytic = jax.jit(both)(points)
     automatic = jax.jit(jax.grad(lambda p: grid.signed_distance(p, baked).sum()))(points)
     np.testing.assert_allclose(analytic, automatic, atol=2e-5)
@@ -247,6 +271,7 @@ def test_classes_share_one_array_and_scale():
 
     def felt(index, scale):
         return grid.signed_distance(points, grid.select(both, index, scale))
+
     run = jax.jit(jax.vmap(felt))
     together = np.asarray(run(index, scale))
     for row, k, s in zip(together, index, scale, strict=True):
@@ -287,10 +312,20 @@ def test_values_normals_and_gradients_are_trilinear(classes, dtype):
     slope = np.einsum("kijl,k->ijl", np.indices((n, n, n)), [1.0, -0.5, 0.75])
     cubes = [(slope + rng.uniform(-0.3, 0.3, slope.shape)).astype("float16") for _ in range(classes)]  # mm
     origin, step = -np.array([4.0, 2, 6]) / 512, np.array([1.0, 0.5, 2]) / 512
-    shelf = grid.stack([grid.Grid(
-        nodes=n, interpolation="linear", values=jnp.asarray(grid._pack(cube.reshape(-1, 1), config)),
-        origin=jnp.asarray([size * origin]), spacing=jnp.asarray([size * step]), index=jnp.int32(0),
-        scale=jnp.ones(())) for size, cube in zip((1.0, 2.0, 0.5), cubes, strict=False)])
+    shelf = grid.stack(
+        [
+            grid.Grid(
+                nodes=n,
+                interpolation="linear",
+                values=jnp.asarray(grid._pack(cube.reshape(-1, 1), config)),
+                origin=jnp.asarray([size * origin]),
+                spacing=jnp.asarray([size * step]),
+                index=jnp.int32(0),
+                scale=jnp.ones(()),
+            )
+            for size, cube in zip((1.0, 2.0, 0.5), cubes, strict=False)
+        ]
+    )
     assert shelf.values.shape == ((classes * n**3, 8) if dtype == "float32" else (classes * n**3,))
     index, scale = np.arange(4) % classes, np.array([1.0, 2.0, 0.5, 4.0])
     at = np.concatenate([np.indices((n, n, n)).reshape(3, -1).T, rng.integers(-96, 32 * (n + 3), (3000, 3)) / 32])
@@ -302,6 +337,7 @@ def test_values_normals_and_gradients_are_trilinear(classes, dtype):
         own = grid.select(shelf, index, scale)
         automatic = jax.grad(lambda p: grid.signed_distance(p, own).sum())(points)
         return *grid.distance_and_normal(points, own), automatic
+
     ours = jax.jit(jax.vmap(felt))(np.float32(scale[:, None, None] * points), index, scale)
     for env, (value, normal, automatic) in enumerate(zip(*ours, strict=True)):
         wanted, gradient = trilinear(points[env], 1e-3 * np.float64(cubes[index[env]]), start[env], spacing[env])
@@ -323,6 +359,7 @@ def test_a_mesh_is_baked_once(monkeypatch, tmp_path):
 
     def refuse(*_):
         raise AssertionError("baked again")
+
     with monkeypatch.context() as patch:
         patch.setattr(mesh, "signed_distance", refuse)
         again = distance.prepare(box, distance.DistanceConfig(grid=COARSE))

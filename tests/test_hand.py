@@ -16,31 +16,58 @@ from dexsim.hand import flexion_joints, forward_kinematics, lattice_frame, load_
 
 # Tip positions (m) in the palm frame, computed from the published joint table.
 TIPS_AT_ZERO = {
-    "thumb": (0.02211, 0.15684, 0.02872), "index": (0.0065, 0.0265, 0.20575),
-    "middle": (0.0065, 0.004, 0.20625), "ring": (0.0065, -0.016, 0.20325),
-    "pinky": (0.0065, -0.036, 0.20025)}
+    "thumb": (0.02211, 0.15684, 0.02872),
+    "index": (0.0065, 0.0265, 0.20575),
+    "middle": (0.0065, 0.004, 0.20625),
+    "ring": (0.0065, -0.016, 0.20325),
+    "pinky": (0.0065, -0.036, 0.20025),
+}
 TIPS_AT_HALF = {  # all joints 0.5 rad, but index_bend 0.1
-    "thumb": (0.08472, 0.09962, 0.09515), "index": (0.0688, 0.03544, 0.17905),
-    "middle": (0.0688, 0.004, 0.18), "ring": (0.0688, -0.016, 0.177),
-    "pinky": (0.0688, -0.036, 0.174)}
+    "thumb": (0.08472, 0.09962, 0.09515),
+    "index": (0.0688, 0.03544, 0.17905),
+    "middle": (0.0688, 0.004, 0.18),
+    "ring": (0.0688, -0.016, 0.177),
+    "pinky": (0.0688, -0.036, 0.174),
+}
 # id: name, lower, upper (rad), stall torque (Nm), no-load speed (rad/s)
 JOINTS = (
-    ("thumb_bend", 0, 1.832, 1.1, 8.63), ("thumb_rota1", -0.698, 1.57, 1.1, 8.63),
-    ("thumb_rota2", 0, 1.57, 0.4, 14.38), ("index_bend", -0.174, 0.174, 0.4, 14.38),
-    ("index_joint1", 0, 1.919, 1.1, 8.63), ("index_joint2", 0, 1.919, 0.4, 14.38),
-    ("mid_joint1", 0, 1.919, 1.1, 8.63), ("mid_joint2", 0, 1.919, 0.4, 14.38),
-    ("ring_joint1", 0, 1.919, 1.1, 8.63), ("ring_joint2", 0, 1.919, 0.4, 14.38),
-    ("pinky_joint1", 0, 1.919, 1.1, 8.63), ("pinky_joint2", 0, 1.919, 0.4, 14.38))
+    ("thumb_bend", 0, 1.832, 1.1, 8.63),
+    ("thumb_rota1", -0.698, 1.57, 1.1, 8.63),
+    ("thumb_rota2", 0, 1.57, 0.4, 14.38),
+    ("index_bend", -0.174, 0.174, 0.4, 14.38),
+    ("index_joint1", 0, 1.919, 1.1, 8.63),
+    ("index_joint2", 0, 1.919, 0.4, 14.38),
+    ("mid_joint1", 0, 1.919, 1.1, 8.63),
+    ("mid_joint2", 0, 1.919, 0.4, 14.38),
+    ("ring_joint1", 0, 1.919, 1.1, 8.63),
+    ("ring_joint2", 0, 1.919, 0.4, 14.38),
+    ("pinky_joint1", 0, 1.919, 1.1, 8.63),
+    ("pinky_joint2", 0, 1.919, 0.4, 14.38),
+)
 # (column, row) counted from 1 as published: position in mm, tip link frame.
 FINGER_TAXELS = {
-    (1, 1): (0.40, -8.32, 18.09), (1, 12): (-1.20, -5.66, 40.11), (2, 7): (2.79, -7.90, 31.49),
-    (3, 4): (8.34, -6.69, 25.77), (4, 10): (5.29, -4.03, 39.58), (5, 1): (10.94, -1.30, 18.94),
-    (5, 12): (1.35, -0.89, 42.08), (6, 12): (1.35, 0.89, 42.08), (8, 4): (8.34, 6.69, 25.77),
-    (10, 1): (0.40, 8.32, 18.09)}
+    (1, 1): (0.40, -8.32, 18.09),
+    (1, 12): (-1.20, -5.66, 40.11),
+    (2, 7): (2.79, -7.90, 31.49),
+    (3, 4): (8.34, -6.69, 25.77),
+    (4, 10): (5.29, -4.03, 39.58),
+    (5, 1): (10.94, -1.30, 18.94),
+    (5, 12): (1.35, -0.89, 42.08),
+    (6, 12): (1.35, 0.89, 42.08),
+    (8, 4): (8.34, 6.69, 25.77),
+    (10, 1): (0.40, 8.32, 18.09),
+}
 THUMB_TAXELS = {
-    (1, 1): (-14.88, 19.84, -1.34), (1, 12): (-12.45, 41.64, -2.91), (2, 9): (-12.51, 39.76, 0.39),
-    (3, 6): (-10.32, 34.98, 6.37), (4, 11): (-3.95, 49.69, 0.01), (5, 12): (-0.86, 50.87, -2.71),
-    (6, 12): (0.86, 50.87, -2.71), (9, 9): (12.51, 39.76, 0.39), (10, 1): (14.88, 19.84, -1.34)}
+    (1, 1): (-14.88, 19.84, -1.34),
+    (1, 12): (-12.45, 41.64, -2.91),
+    (2, 9): (-12.51, 39.76, 0.39),
+    (3, 6): (-10.32, 34.98, 6.37),
+    (4, 11): (-3.95, 49.69, 0.01),
+    (5, 12): (-0.86, 50.87, -2.71),
+    (6, 12): (0.86, 50.87, -2.71),
+    (9, 9): (12.51, 39.76, 0.39),
+    (10, 1): (14.88, 19.84, -1.34),
+}
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +90,12 @@ def test_finger_and_joint_tables(hand):
     ours = np.stack([hand.joint_lower, hand.joint_upper, hand.torque_limit, hand.speed_limit], 1)
     np.testing.assert_allclose(ours, table, rtol=1e-6)
     assert [hand.joint_names[j] for j in hand.root_joint] == [
-        "thumb_rota1", "index_joint1", "mid_joint1", "ring_joint1", "pinky_joint1"]
+        "thumb_rota1",
+        "index_joint1",
+        "mid_joint1",
+        "ring_joint1",
+        "pinky_joint1",
+    ]
     assert (hand.num_joints, hand.num_fingers, hand.num_taxels) == (12, 5, 120)
 
 
@@ -114,8 +146,10 @@ def check_against_mujoco(hand, kinematics, count=50):
         np.testing.assert_allclose(ours.tip_rotation, owners, atol=2e-6)
 
 
-TIP_SITES = {"xhand_right": ("thumb_tip", "index_tip", "mid_tip", "ring_tip", "pinky_tip"),
-             "pinch": ("left_tip", "right_tip")}
+TIP_SITES = {
+    "xhand_right": ("thumb_tip", "index_tip", "mid_tip", "ring_tip", "pinky_tip"),
+    "pinch": ("left_tip", "right_tip"),
+}
 
 
 def test_kinematics_equal_mujoco(hand, kinematics):
@@ -127,9 +161,17 @@ def test_kinematics_are_differentiable(hand, kinematics):
     joints = jnp.asarray((hand.joint_lower + hand.joint_upper) / 2)
     exact = np.asarray(jax.jacfwd(lambda q: kinematics(q).tip_position[1])(joints))
     step = 1e-2
-    numeric = np.stack([(np.asarray(kinematics(joints.at[j].add(step)).tip_position[1])
-                         - np.asarray(kinematics(joints.at[j].add(-step)).tip_position[1])) / (2 * step)
-                        for j in range(12)], 1)
+    numeric = np.stack(
+        [
+            (
+                np.asarray(kinematics(joints.at[j].add(step)).tip_position[1])
+                - np.asarray(kinematics(joints.at[j].add(-step)).tip_position[1])
+            )
+            / (2 * step)
+            for j in range(12)
+        ],
+        1,
+    )
     np.testing.assert_allclose(exact, numeric, atol=2e-5)
     assert np.all(exact[:, [0, 1, 2, 6, 7, 8, 9, 10, 11]] == 0)  # other fingers' joints
     assert np.all(np.linalg.norm(exact[:, 3:6], axis=0) > 0.01)
@@ -143,8 +185,9 @@ def test_taxels_are_the_published_lattice(hand, finger):
     table = THUMB_TAXELS if finger == 0 else FINGER_TAXELS
     assert hand.taxel_grid == (10, 12) and hand.taxel_position.shape == (5, 120, 3)
     for (column, row), millimetres in table.items():
-        np.testing.assert_allclose(hand.taxel_position[finger, (column - 1) * 12 + row - 1] * 1e3,
-                                   millimetres, atol=1e-3)
+        np.testing.assert_allclose(
+            hand.taxel_position[finger, (column - 1) * 12 + row - 1] * 1e3, millimetres, atol=1e-3
+        )
 
 
 @pytest.mark.parametrize("finger", range(5))
@@ -162,8 +205,11 @@ def test_normals_are_unit_and_point_out_of_the_finger(hand):
     np.testing.assert_allclose(np.linalg.norm(hand.taxel_normal, axis=-1), 1.0, atol=2e-5)
     for finger in range(5):
         # Away from a segment along the middle of the distal link, fitted by eye.
-        start, end = ((np.array([0, 0.015, -0.004]), np.array([0, 0.038, -0.004])) if finger == 0 else
-                      (np.array([0.002, 0, 0.010]), np.array([0.001, 0, 0.033])))
+        start, end = (
+            (np.array([0, 0.015, -0.004]), np.array([0, 0.038, -0.004]))
+            if finger == 0
+            else (np.array([0.002, 0, 0.010]), np.array([0.001, 0, 0.033]))
+        )
         along = np.clip((hand.taxel_position[finger] - start) @ (end - start) / np.sum((end - start) ** 2), 0, 1)
         away = hand.taxel_position[finger] - (start + along[:, None] * (end - start))
         away /= np.linalg.norm(away, axis=-1, keepdims=True)
@@ -177,8 +223,9 @@ def test_areas_add_up_to_the_lattice(hand):
     for finger, wanted in ((0, 1244e-6), (1, 719e-6), (2, 719e-6), (3, 719e-6), (4, 719e-6)):
         grid = hand.taxel_position[finger].reshape(10, 12, 3).astype(float)
         a, b, c, d = grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]
-        triangles = (np.linalg.norm(np.cross(b - a, c - a), axis=-1)
-                     + np.linalg.norm(np.cross(c - a, d - a), axis=-1)) / 2
+        triangles = (
+            np.linalg.norm(np.cross(b - a, c - a), axis=-1) + np.linalg.norm(np.cross(c - a, d - a), axis=-1)
+        ) / 2
         assert triangles.sum() == pytest.approx(wanted, rel=0.005)
         assert hand.taxel_area[finger].sum() == pytest.approx(wanted, rel=0.005)
         assert np.all(hand.taxel_area[finger] > 0)
@@ -217,8 +264,7 @@ def test_taxels_move_with_their_link(hand, kinematics):
     for finger, taxel in ((0, 0), (1, 37), (4, 119)):
         turn = np.asarray(pose.body_rotation[hand.tip_body[finger]], float)
         origin = np.asarray(pose.body_position[hand.tip_body[finger]], float)
-        np.testing.assert_allclose(where[finger, taxel], origin + turn @ hand.taxel_position[finger, taxel],
-                                   atol=1e-6)
+        np.testing.assert_allclose(where[finger, taxel], origin + turn @ hand.taxel_position[finger, taxel], atol=1e-6)
         np.testing.assert_allclose(out[finger, taxel], turn @ hand.taxel_normal[finger, taxel], atol=1e-6)
 
 
@@ -278,7 +324,10 @@ root_joint = "right_b"
 """
 PINCH_CSV = "finger,column,row,x,y,z,nx,ny,nz,area\n" + "".join(
     f"{finger},{column},{row},{0.001 * column},{0.002 * row},0.01,0,0,1,2e-06\n"
-    for finger in ("right", "left") for row in range(4) for column in range(3))
+    for finger in ("right", "left")
+    for row in range(4)
+    for column in range(3)
+)
 
 
 def write_pinch(folder, mjcf=PINCH_MJCF, layout=PINCH_CSV, table=PINCH_TOML):
@@ -300,7 +349,10 @@ def test_another_hand_loads(tmp_path):
     assert hand.taxel_position.shape == (2, 12, 3)  # written row by row and right first
     np.testing.assert_allclose(hand.taxel_position[1, 2 * 4 + 3], [0.002, 0.006, 0.01], rtol=1e-6)
     assert {(g.name, g.kind) for g in hand.geoms if g.touches} == {
-        ("base", "box"), ("right_pad", "sphere"), ("left_pad", "sphere")}
+        ("base", "box"),
+        ("right_pad", "sphere"),
+        ("left_pad", "sphere"),
+    }
 
 
 def test_another_hands_kinematics_equal_mujoco(tmp_path):
@@ -345,28 +397,54 @@ BAD_MODELS = [
     bad("missing", "pinch.xml", "no such file", mjcf=None),
     bad("cut short", "pinch.xml", "XML", mjcf=PINCH_MJCF[:700]),
     bad("empty", "pinch.xml", "empty", mjcf=""),
-    bad("unknown element", "pinch.xml", "fingertip",
-        mjcf=mjcf('<site name="left_tip" pos="0 0 .01"/>', "<fingertip/>")),
-    bad("not a number in a position", "pinch.xml", "left2",
-        mjcf=mjcf('name="left2" pos="0 0 .03"', 'name="left2" pos="nan 0 .03"')),
-    bad("not a number in an axis", "pinch.xml", "left_b",
-        mjcf=mjcf('"left_b" axis="0 1 0"', '"left_b" axis="0 nan 0"')),
+    bad(
+        "unknown element", "pinch.xml", "fingertip", mjcf=mjcf('<site name="left_tip" pos="0 0 .01"/>', "<fingertip/>")
+    ),
+    bad(
+        "not a number in a position",
+        "pinch.xml",
+        "left2",
+        mjcf=mjcf('name="left2" pos="0 0 .03"', 'name="left2" pos="nan 0 .03"'),
+    ),
+    bad(
+        "not a number in an axis", "pinch.xml", "left_b", mjcf=mjcf('"left_b" axis="0 1 0"', '"left_b" axis="0 nan 0"')
+    ),
     bad("not a number in a size", "pinch.xml", "nan size", mjcf=mjcf('size=".02 .02 .01"', 'size="nan .02 .01"')),
     bad("slide joint", "pinch.xml", "hinge", mjcf=mjcf('"left_b"', '"left_b" type="slide"')),
     bad("ball joint", "pinch.toml", "hinge", mjcf=mjcf(LEFT_B, '<joint name="left_b" type="ball" range="0 80"/>')),
-    bad("no range", "pinch.xml", ("left_b", "range"),
-        mjcf=mjcf(LEFT_B, LEFT_B.replace('range="-10 80"', 'limited="false"'))),
-    bad("no torque limit", "pinch.xml", ("left_b", "actuatorfrcrange"),
-        mjcf=mjcf(LEFT_B, LEFT_B.replace("-.3 .3", "0 0"))),
-    bad("two joints in a body", "pinch.xml", "left_c",
+    bad(
+        "no range",
+        "pinch.xml",
+        ("left_b", "range"),
+        mjcf=mjcf(LEFT_B, LEFT_B.replace('range="-10 80"', 'limited="false"')),
+    ),
+    bad(
+        "no torque limit",
+        "pinch.xml",
+        ("left_b", "actuatorfrcrange"),
+        mjcf=mjcf(LEFT_B, LEFT_B.replace("-.3 .3", "0 0")),
+    ),
+    bad(
+        "two joints in a body",
+        "pinch.xml",
+        "left_c",
         mjcf=mjcf(LEFT_B, LEFT_B + '<joint name="left_c" axis="1 0 0"/>'),
-        table=PINCH_TOML.replace('"left_b"]', '"left_b", "left_c"]').replace("3, 4]\n[[", "3, 4, 5]\n[[")),
-    bad("palm that moves", "pinch.xml", ("wrist", "base"),
+        table=PINCH_TOML.replace('"left_b"]', '"left_b", "left_c"]').replace("3, 4]\n[[", "3, 4, 5]\n[["),
+    ),
+    bad(
+        "palm that moves",
+        "pinch.xml",
+        ("wrist", "base"),
         mjcf=mjcf('<geom name="base"', '<joint name="wrist" axis="1 0 0"/><geom name="base"'),
-        table=PINCH_TOML.replace('"left_b"]', '"left_b", "wrist"]').replace("3, 4]\n[[", "3, 4, 5]\n[[")),
-    bad("joint outside of the hand", "pinch.xml", "lever",
+        table=PINCH_TOML.replace('"left_b"]', '"left_b", "wrist"]').replace("3, 4]\n[[", "3, 4, 5]\n[["),
+    ),
+    bad(
+        "joint outside of the hand",
+        "pinch.xml",
+        "lever",
         mjcf=mjcf('<geom name="stand"', '<joint name="lever" axis="1 0 0"/><geom name="stand"'),
-        table=PINCH_TOML.replace('"left_b"]', '"left_b", "lever"]').replace("3, 4]\n[[", "3, 4, 5]\n[[")),
+        table=PINCH_TOML.replace('"left_b"]', '"left_b", "lever"]').replace("3, 4]\n[[", "3, 4, 5]\n[["),
+    ),
 ]
 BAD_TABLES = [
     bad("missing", "pinch.toml", "no such file", table=None),

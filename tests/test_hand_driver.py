@@ -52,8 +52,14 @@ def test_one_request_one_answer():
     assert port.counts.sent == 3 == port.counts.answered
 
 
-FAULTS = {"flip": "corrupt", "cut": "corrupt", "noise": "corrupt", "nothing": "silent", "error": "refused",
-          "ids": "corrupt"}
+FAULTS = {
+    "flip": "corrupt",
+    "cut": "corrupt",
+    "noise": "corrupt",
+    "nothing": "silent",
+    "error": "refused",
+    "ids": "corrupt",
+}
 
 
 def test_every_fault_is_counted_as_what_it_is_and_the_next_answer_is_sound():
@@ -144,7 +150,7 @@ def test_a_frame_that_is_on_its_way_at_the_deadline_still_arrives(monkeypatch):
     def answer(index, block, state):
         whole = peer.whole()
         for at in range(0, len(whole), 100):
-            os.write(peer.master, whole[at:at + 100])
+            os.write(peer.master, whole[at : at + 100])
             time.sleep(0.001)
         return b""
 

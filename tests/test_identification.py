@@ -16,20 +16,35 @@ from dexsim.identification_report import uncertainty
 from dexsim.joint_model import JointLog, complete, segments, simulate, synthetic_log
 
 PERIOD, SUBSTEPS = 0.015, 3
-TRUTH = dict(stiffness=3.0, damping=0.1, stall_torque=0.4, no_load_speed=12.0, inertia=0.0012,
-             coulomb_friction=0.015, viscous_friction=0.005, dead_band=0.006)
+TRUTH = dict(
+    stiffness=3.0,
+    damping=0.1,
+    stall_torque=0.4,
+    no_load_speed=12.0,
+    inertia=0.0012,
+    coulomb_friction=0.015,
+    viscous_friction=0.005,
+    dead_band=0.006,
+)
 GUESS = dict(stiffness=3.5, damping=0.13, stall_torque=0.45, no_load_speed=12.0, inertia=0.0012)
 TARGET = joint_excitation(Excitation(period=PERIOD), 0.9, 0.8)
-SHORT = joint_excitation(Excitation(period=PERIOD, chirp_seconds=2.0, chirp_parts=3, step_count=4, slow_speed=1.0,
-                                    reversal_cycles=2, rest=0.3), 0.9, 0.8)
-HOLDOUT = joint_excitation(Excitation(period=PERIOD, amplitude=0.2, chirp_frequency=(0.5, 2.5), step_count=3,
-                                      chirp_seconds=3.0), 1.0, 0.8)
+SHORT = joint_excitation(
+    Excitation(
+        period=PERIOD, chirp_seconds=2.0, chirp_parts=3, step_count=4, slow_speed=1.0, reversal_cycles=2, rest=0.3
+    ),
+    0.9,
+    0.8,
+)
+HOLDOUT = joint_excitation(
+    Excitation(period=PERIOD, amplitude=0.2, chirp_frequency=(0.5, 2.5), step_count=3, chirp_seconds=3.0), 1.0, 0.8
+)
 
 
 def log_of(truth, seed=0, target=TARGET, latency=2, **options):
     options = dict(position_noise=0.001, position_resolution=0.0005, torque_noise=0.01) | options
-    return synthetic_log(jax.random.key(seed), truth, target, period=PERIOD, substeps=SUBSTEPS, latency=latency,
-                         **options)
+    return synthetic_log(
+        jax.random.key(seed), truth, target, period=PERIOD, substeps=SUBSTEPS, latency=latency, **options
+    )
 
 
 # --- excitation ----------------------------------------------------------------------------------
@@ -73,16 +88,31 @@ def test_the_hand_stays_within_its_limits(hand):
 def plain_simulation(truth, target, latency):
     """The same joint written down again, sub-step by sub-step, with the drive's public functions."""
     full = {"efficiency": 1.0, "gravity_cos": 0.0, "gravity_sin": 0.0, "encoder_bias": 0.0} | truth
-    drive = Actuator(*(jnp.float32(full[n]) for n in ("stiffness", "damping", "dead_band", "stall_torque",
-                                                     "no_load_speed", "efficiency")),
-                     encoder_bias=jnp.float32(full["encoder_bias"]),
-                     coulomb_friction=jnp.float32(full["coulomb_friction"]),
-                     viscous_friction=jnp.float32(full["viscous_friction"]))
-    dt, substep_of = PERIOD / SUBSTEPS, jax.jit(
-        lambda wanted, q, v: (joint_torque(drive, wanted, 0.0, q, v),
-                              apply_friction(drive, joint_torque(drive, wanted, 0.0, q, v)
-                                             - full["gravity_cos"] * jnp.cos(q) - full["gravity_sin"] * jnp.sin(q),
-                                             v, full["inertia"] / dt)))
+    drive = Actuator(
+        *(
+            jnp.float32(full[n])
+            for n in ("stiffness", "damping", "dead_band", "stall_torque", "no_load_speed", "efficiency")
+        ),
+        encoder_bias=jnp.float32(full["encoder_bias"]),
+        coulomb_friction=jnp.float32(full["coulomb_friction"]),
+        viscous_friction=jnp.float32(full["viscous_friction"]),
+    )
+    dt, substep_of = (
+        PERIOD / SUBSTEPS,
+        jax.jit(
+            lambda wanted, q, v: (
+                joint_torque(drive, wanted, 0.0, q, v),
+                apply_friction(
+                    drive,
+                    joint_torque(drive, wanted, 0.0, q, v)
+                    - full["gravity_cos"] * jnp.cos(q)
+                    - full["gravity_sin"] * jnp.sin(q),
+                    v,
+                    full["inertia"] / dt,
+                ),
+            )
+        ),
+    )
     q, v, rows, active = np.float32(target[0] - full["encoder_bias"]), np.float32(0), [], target[0]
     for k in range(len(target)):
         rows.append((q + full["encoder_bias"], float(substep_of(active, q, v)[0])))
@@ -125,9 +155,16 @@ def test_segments_begin_where_the_joint_rests():
 
 def random_truth(seed):
     rng = np.random.default_rng(seed)
-    return dict(stiffness=rng.uniform(2, 4), damping=rng.uniform(0.06, 0.15), stall_torque=rng.uniform(0.35, 0.45),
-                no_load_speed=12.0, inertia=0.0012, coulomb_friction=rng.uniform(0.005, 0.03),
-                viscous_friction=rng.uniform(0.002, 0.01), dead_band=rng.uniform(0.002, 0.012)), int(rng.integers(5))
+    return dict(
+        stiffness=rng.uniform(2, 4),
+        damping=rng.uniform(0.06, 0.15),
+        stall_torque=rng.uniform(0.35, 0.45),
+        no_load_speed=12.0,
+        inertia=0.0012,
+        coulomb_friction=rng.uniform(0.005, 0.03),
+        viscous_friction=rng.uniform(0.002, 0.01),
+        dead_band=rng.uniform(0.002, 0.012),
+    ), int(rng.integers(5))
 
 
 def recovered(seed):
@@ -136,8 +173,11 @@ def recovered(seed):
     found = identify(log_of(truth, seed, latency=latency), GUESS)
     assert not found.unidentifiable
     inside = {n: found.intervals[n][0] <= truth[n] <= found.intervals[n][1] for n in found.fitted}
-    wide = {name for name in found.fitted  # intervals that say nothing
-            if np.ptp(found.intervals[name]) >= 0.5 * truth[name] + 2e-3}
+    wide = {
+        name
+        for name in found.fitted  # intervals that say nothing
+        if np.ptp(found.intervals[name]) >= 0.5 * truth[name] + 2e-3
+    }
     return inside | {"latency": found.latency == latency}, wide
 
 
@@ -186,12 +226,12 @@ def c_log(truth, target, latency, timestep=5e-4, seed=0):
     """A log from C MuJoCo: hinge with frictionloss and damping, the PD law in its actuator, finer steps."""
     model = mujoco.MjModel.from_xml_string(f"""<mujoco>
       <option timestep="{timestep}" integrator="Euler" gravity="0 0 0" iterations="100" tolerance="1e-12"/>
-      <worldbody><body><joint name="j" axis="0 0 1" armature="{truth['inertia']}"
-        frictionloss="{truth['coulomb_friction']}" damping="{truth['viscous_friction']}"
+      <worldbody><body><joint name="j" axis="0 0 1" armature="{truth["inertia"]}"
+        frictionloss="{truth["coulomb_friction"]}" damping="{truth["viscous_friction"]}"
         solreffriction="{2.1 * timestep} 1" solimpfriction="0.9999 0.9999 0.001"/>
       <inertial mass="0.001" pos="0 0 0" diaginertia="1e-9 1e-9 1e-9"/></body></worldbody>
-      <actuator><position joint="j" kp="{truth['stiffness']}" kv="{truth['damping']}"
-        forcerange="{-truth['stall_torque']} {truth['stall_torque']}"/></actuator></mujoco>""")
+      <actuator><position joint="j" kp="{truth["stiffness"]}" kv="{truth["damping"]}"
+        forcerange="{-truth["stall_torque"]} {truth["stall_torque"]}"/></actuator></mujoco>""")
     data, rng = mujoco.MjData(model), np.random.default_rng(seed)
     data.qpos[0] = data.ctrl[0] = target[0]
     per_tick, rows = round(PERIOD / timestep), []
@@ -203,21 +243,32 @@ def c_log(truth, target, latency, timestep=5e-4, seed=0):
             data.ctrl[0] = target[max(index, 0)]
             mujoco.mj_step(model, data)
     position, torque = np.array(rows).T
-    return JointLog(PERIOD, target, position + 0.001 * rng.standard_normal(len(target)),
-                    torque + 0.01 * rng.standard_normal(len(target)), "c_hinge")
+    return JointLog(
+        PERIOD,
+        target,
+        position + 0.001 * rng.standard_normal(len(target)),
+        torque + 0.01 * rng.standard_normal(len(target)),
+        "c_hinge",
+    )
 
 
 def test_c_mujocos_joint_is_identified():
     """Another engine, six times finer steps: discretisation is a model error, so the gains within 5 %
     and not within the interval, frictions within 8 and 20 %, latency exact."""
-    truth = dict(stiffness=3.0, damping=0.12, stall_torque=0.4, inertia=0.012, coulomb_friction=0.03,
-                 viscous_friction=0.01)
+    truth = dict(
+        stiffness=3.0, damping=0.12, stall_torque=0.4, inertia=0.012, coulomb_friction=0.03, viscous_friction=0.01
+    )
     log = c_log(truth, SHORT, latency=0.009)
     guess = dict(stiffness=2.0, damping=0.2, stall_torque=0.5, no_load_speed=1e2, inertia=0.012)
     found = identify(log, guess, dead_band=None, substeps=5, latencies=(2, 3, 4))
     assert found.latency == 3 and found.timestep == pytest.approx(3e-3)
-    for name, slack in (("stiffness", 0.03), ("damping", 0.05), ("stall_torque", 0.02),
-                        ("coulomb_friction", 0.08), ("viscous_friction", 0.2)):
+    for name, slack in (
+        ("stiffness", 0.03),
+        ("damping", 0.05),
+        ("stall_torque", 0.02),
+        ("coulomb_friction", 0.08),
+        ("viscous_friction", 0.2),
+    ):
         assert found.values[name] == pytest.approx(truth[name], rel=slack), name
     assert found.rmse < 0.002
 
@@ -240,8 +291,11 @@ def group_with(found, *names):
 
 
 def test_efficiency_is_lost_in_the_gains(smooth_log):
-    found = quick(smooth_log, ("stiffness", "damping", "stall_torque", "efficiency", "coulomb_friction",
-                               "viscous_friction"), start=GUESS | {"efficiency": 0.9})
+    found = quick(
+        smooth_log,
+        ("stiffness", "damping", "stall_torque", "efficiency", "coulomb_friction", "viscous_friction"),
+        start=GUESS | {"efficiency": 0.9},
+    )
     assert group_with(found, "stiffness", "damping", "stall_torque", "efficiency")
     assert not group_with(found, "coulomb_friction")
     for name in ("stiffness", "efficiency"):
@@ -265,11 +319,14 @@ def test_an_encoders_zero_needs_a_stop(smooth_log):
 
 
 def test_a_limit_that_was_never_reached():
-    gentle = joint_excitation(Excitation(period=PERIOD, amplitude=0.04, chirp_frequency=(0.3, 2.0), chirp_seconds=2.0),
-                              0.9, 0.8)
-    gentle = np.concatenate([gentle, np.full(len(SHORT), 0.9)])[:len(SHORT)]
-    found = quick(log_of(TRUTH | {"dead_band": 0.0}, target=gentle),
-                  ("stiffness", "damping", "coulomb_friction", "stall_torque", "no_load_speed"))
+    gentle = joint_excitation(
+        Excitation(period=PERIOD, amplitude=0.04, chirp_frequency=(0.3, 2.0), chirp_seconds=2.0), 0.9, 0.8
+    )
+    gentle = np.concatenate([gentle, np.full(len(SHORT), 0.9)])[: len(SHORT)]
+    found = quick(
+        log_of(TRUTH | {"dead_band": 0.0}, target=gentle),
+        ("stiffness", "damping", "coulomb_friction", "stall_torque", "no_load_speed"),
+    )
     for name in ("stall_torque", "no_load_speed"):
         assert group_with(found, name)
     assert any("larger steps" in note for note in found.notes)
@@ -302,19 +359,25 @@ def test_intervals_of_a_linear_problem_are_the_textbooks():
 # --- refusals ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("changes", "says"), [
-    (dict(target=TARGET[:100], position=TARGET[:100]), "100 samples: at least 200"),
-    (dict(position=TARGET[:-1]), "one length"),
-    (dict(position=np.where(np.arange(len(TARGET)) == 40, np.nan, TARGET)), "position is not a number at sample 40"),
-    (dict(torque=np.full(len(TARGET), np.inf)), "torque is not a number at sample 0"),
-    (dict(period=15.0), "period of 15 s: give seconds"),
-    (dict(position=np.rad2deg(TARGET), target=np.rad2deg(TARGET)), "give rad"),
-    (dict(target=TARGET / 57.3), "different units"),
-    (dict(target=0 * TARGET + 0.9), "commanded over 0 rad"),
-    (dict(position=0 * TARGET + 0.9), "moved over 0 rad"),
-    (dict(torque=0.4 * np.sign(TARGET - 0.9) + 0.0), "saturated"),
-    (dict(torque=1e3 * np.sin(np.arange(len(TARGET)))), "give Nm"),
-])
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        (dict(target=TARGET[:100], position=TARGET[:100]), "100 samples: at least 200"),
+        (dict(position=TARGET[:-1]), "one length"),
+        (
+            dict(position=np.where(np.arange(len(TARGET)) == 40, np.nan, TARGET)),
+            "position is not a number at sample 40",
+        ),
+        (dict(torque=np.full(len(TARGET), np.inf)), "torque is not a number at sample 0"),
+        (dict(period=15.0), "period of 15 s: give seconds"),
+        (dict(position=np.rad2deg(TARGET), target=np.rad2deg(TARGET)), "give rad"),
+        (dict(target=TARGET / 57.3), "different units"),
+        (dict(target=0 * TARGET + 0.9), "commanded over 0 rad"),
+        (dict(position=0 * TARGET + 0.9), "moved over 0 rad"),
+        (dict(torque=0.4 * np.sign(TARGET - 0.9) + 0.0), "saturated"),
+        (dict(torque=1e3 * np.sin(np.arange(len(TARGET)))), "give Nm"),
+    ],
+)
 def test_logs_that_cannot_tell_are_refused_in_one_line(changes, says):
     log = dataclasses.replace(JointLog(PERIOD, TARGET, TARGET + 0.01, None, "thumb_bend"), **changes)
     if says == "saturated":
@@ -324,13 +387,16 @@ def test_logs_that_cannot_tell_are_refused_in_one_line(changes, says):
     assert str(caught.value).startswith("thumb_bend") and "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(("options", "says"), [
-    (dict(fit=("dead_band",)), "dead_band cannot be named in fit"),
-    (dict(fit=("mass",)), "mass cannot be named in fit"),
-    (dict(start=GUESS | {"mass": 1.0}), "no parameter 'mass'"),
-    (dict(start={"stiffness": 3.0}), "no value for damping"),
-    (dict(start=GUESS | {"stiffness": 500.0}), "stiffness starts at 500, outside its bounds"),
-])
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (dict(fit=("dead_band",)), "dead_band cannot be named in fit"),
+        (dict(fit=("mass",)), "mass cannot be named in fit"),
+        (dict(start=GUESS | {"mass": 1.0}), "no parameter 'mass'"),
+        (dict(start={"stiffness": 3.0}), "no value for damping"),
+        (dict(start=GUESS | {"stiffness": 500.0}), "stiffness starts at 500, outside its bounds"),
+    ],
+)
 def test_questions_that_make_no_sense_are_refused(smooth_log, options, says):
     options = {"start": GUESS} | options
     with pytest.raises(CalibrationError, match=says):

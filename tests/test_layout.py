@@ -15,8 +15,9 @@ from dexsim.mesh import load_mesh
 
 
 def solid(kind, *size):
-    return sdf.Shape((kind,), jnp.asarray([(*size, 0, 0)[:3]], jnp.float32), jnp.zeros((1, 3)), jnp.eye(3)[None],
-                     jnp.array([True]))
+    return sdf.Shape(
+        (kind,), jnp.asarray([(*size, 0, 0)[:3]], jnp.float32), jnp.zeros((1, 3)), jnp.eye(3)[None], jnp.array([True])
+    )
 
 
 @pytest.mark.parametrize("kind", ["rect", "hex"])
@@ -32,10 +33,15 @@ def test_neighbours_are_a_pitch_apart(kind):
     assert points.cell == pytest.approx(0.002**2 * (np.sqrt(3) / 2 if kind == "hex" else 1))
 
 
-@pytest.mark.parametrize(("kind", "sizes", "shape"), [
-    ("plane", {}, None), ("cylinder", {"radius": 0.008}, solid("cylinder", 0.008, 0.1)),
-    ("capsule", {"radius": 0.008, "half_length": 0.006}, solid("capsule", 0.008, 0.006)),
-    ("sphere", {"radius": 0.012}, solid("sphere", 0.012))])
+@pytest.mark.parametrize(
+    ("kind", "sizes", "shape"),
+    [
+        ("plane", {}, None),
+        ("cylinder", {"radius": 0.008}, solid("cylinder", 0.008, 0.1)),
+        ("capsule", {"radius": 0.008, "half_length": 0.006}, solid("capsule", 0.008, 0.006)),
+        ("sphere", {"radius": 0.012}, solid("sphere", 0.012)),
+    ],
+)
 def test_patches_lie_on_their_surface(kind, sizes, shape):
     patch = layout.on_surface(kind, layout.lattice(7, 9, pitch=0.002), **sizes)
     np.testing.assert_allclose(np.linalg.norm(patch.normal, axis=1), 1, rtol=1e-12)
@@ -120,13 +126,21 @@ def test_taxels_inside_the_link_are_refused(hand):
         layout.check_outside(sunk, finger, name="tip")
 
 
-@pytest.mark.parametrize(("make", "words"), [
-    (lambda: layout.lattice(0, 3, pitch=0.002), "0 x 3"), (lambda: layout.lattice(2, 3, pitch=-1.0), "above 0"),
-    (lambda: layout.lattice(2, 2, pitch=0.002, kind="round"), "rect or hex"),
-    (lambda: layout.on_surface("cone", layout.lattice(2, 2, pitch=0.002), radius=0.01), "'cone': choose from plane"),
-    (lambda: layout.on_surface("sphere", layout.lattice(2, 2, pitch=0.002)), "radius"),
-    (lambda: layout.on_surface("cylinder", layout.lattice(20, 2, pitch=0.002), radius=0.005), "laps itself"),
-    (lambda: layout.on_surface("sphere", layout.lattice(2, 20, pitch=0.002), radius=0.01), "beyond the pole")])
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: layout.lattice(0, 3, pitch=0.002), "0 x 3"),
+        (lambda: layout.lattice(2, 3, pitch=-1.0), "above 0"),
+        (lambda: layout.lattice(2, 2, pitch=0.002, kind="round"), "rect or hex"),
+        (
+            lambda: layout.on_surface("cone", layout.lattice(2, 2, pitch=0.002), radius=0.01),
+            "'cone': choose from plane",
+        ),
+        (lambda: layout.on_surface("sphere", layout.lattice(2, 2, pitch=0.002)), "radius"),
+        (lambda: layout.on_surface("cylinder", layout.lattice(20, 2, pitch=0.002), radius=0.005), "laps itself"),
+        (lambda: layout.on_surface("sphere", layout.lattice(2, 20, pitch=0.002), radius=0.01), "beyond the pole"),
+    ],
+)
 def test_refusals(make, words):
     with pytest.raises(ConfigError, match=words) as caught:
         make()
@@ -141,5 +155,10 @@ def test_broken_layout_files(tmp_path):
     with pytest.raises(AssetError, match="not a taxel layout"):
         layout.read_layout(path)
     with pytest.raises(ConfigError, match="one grid"):
-        layout.write_layout(path, {"a": layout.on_surface("plane", layout.lattice(2, 2, pitch=0.01)),
-                                   "b": layout.on_surface("plane", layout.lattice(2, 3, pitch=0.01))})
+        layout.write_layout(
+            path,
+            {
+                "a": layout.on_surface("plane", layout.lattice(2, 2, pitch=0.01)),
+                "b": layout.on_surface("plane", layout.lattice(2, 3, pitch=0.01)),
+            },
+        )

@@ -23,8 +23,15 @@ def contents():
     for i in range(200):
         yield Kind.RECEIVED, (i, rng.bytes(int(rng.integers(0, 300))))
         yield Kind.NOTE, f"line {i} with ä"
-        yield Kind.TICK, {"sequence": i, "readings": {"force": rng.normal(size=(5, 120)).astype(np.float32)},
-                          "action": rng.normal(size=12).astype(np.float32), "command": np.float32(0.5)}
+        yield (
+            Kind.TICK,
+            {
+                "sequence": i,
+                "readings": {"force": rng.normal(size=(5, 120)).astype(np.float32)},
+                "action": rng.normal(size=12).astype(np.float32),
+                "command": np.float32(0.5),
+            },
+        )
 
 
 def same(a, b):
@@ -48,8 +55,10 @@ def test_what_goes_in_comes_out_in_order(tmp_path):
 
 def test_threads_share_a_log(tmp_path):
     with LogWriter(tmp_path / "run.log") as log:
-        threads = [threading.Thread(target=lambda name=name: [log.add(Kind.NOTE, f"{name} {i}") for i in range(500)])
-                   for name in "abcd"]
+        threads = [
+            threading.Thread(target=lambda name=name: [log.add(Kind.NOTE, f"{name} {i}") for i in range(500)])
+            for name in "abcd"
+        ]
         [t.start() for t in threads]
         [t.join() for t in threads]
     lines = [record.content for record in LogReader(tmp_path / "run.log")]

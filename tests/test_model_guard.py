@@ -7,8 +7,17 @@ from dexsim.errors import AssetError
 from dexsim.model_guard import check_model
 
 
-def scene(*, actuator="", sensor="", joint="", geom='type="sphere" size=".01"', block='type="box" size=".01 .01 .01"',
-          option="", extra="", world=""):
+def scene(
+    *,
+    actuator="",
+    sensor="",
+    joint="",
+    geom='type="sphere" size=".01"',
+    block='type="box" size=".01 .01 .01"',
+    option="",
+    extra="",
+    world="",
+):
     """A link that may meet a free block."""
     return f"""
     <mujoco>
@@ -30,19 +39,25 @@ def motor(attributes):
 
 PAIR = '<contact><pair geom1="tip" geom2="block"/></contact>'
 MESH = '<asset><mesh name="wedge" vertex="0 0 0  .01 0 0  0 .01 0  0 0 .01"/></asset>'
-CLOTH = ('<flexcomp name="cloth" type="grid" count="3 3 1" spacing=".01 .01 .01" mass=".1" dim="2" radius=".001">'
-         '<edge equality="true"/></flexcomp>')
+CLOTH = (
+    '<flexcomp name="cloth" type="grid" count="3 3 1" spacing=".01 .01 .01" mass=".1" dim="2" radius=".001">'
+    '<edge equality="true"/></flexcomp>'
+)
 
 # What both backends, or our own actuator model in their place, would drop without a word.
 IGNORED = {
     "actuator delay": (scene(actuator=motor('delay=".03" nsample="20"')), "tendon"),
     "actuator armature": (scene(actuator=motor('armature=".01"')), "tendon"),
     "actuator damping": (scene(actuator=motor('damping=".01"')), "tendon"),
-    "dcmotor actuator": (scene(actuator='<dcmotor name="tendon" joint="knuckle" motorconst=".1" resistance="1"/>'),
-                         "tendon"),
+    "dcmotor actuator": (
+        scene(actuator='<dcmotor name="tendon" joint="knuckle" motorconst=".1" resistance="1"/>'),
+        "tendon",
+    ),
     "pid actuator": (scene(actuator='<pid name="tendon" joint="knuckle" kp="1" ki="1"/>'), "tendon"),
-    "sensor delay or interval": (scene(sensor='<jointpos name="angle" joint="knuckle" delay=".03" nsample="20"/>'),
-                                 "angle"),
+    "sensor delay or interval": (
+        scene(sensor='<jointpos name="angle" joint="knuckle" delay=".03" nsample="20"/>'),
+        "angle",
+    ),
     "tactile sensor": (scene(extra=MESH, sensor='<tactile name="skin" geom="tip" mesh="wedge"/>'), "skin"),
     "polynomial joint damping": (scene(joint='damping=".1 .2"'), "knuckle"),
     "polynomial joint stiffness": (scene(joint='stiffness=".1 .2"'), "knuckle"),
@@ -61,12 +76,16 @@ JAX_LACKS = {
     "contact sensor that matches bodies": (scene(sensor='<contact name="touch" body1="link" body2="thing"/>'), "touch"),
     "contact sensor that matches bodies ": (scene(sensor='<contact name="touch" site="patch"/>'), "touch"),
     "contact sensor with reduce=netforce": (
-        scene(sensor='<contact name="touch" geom1="tip" geom2="block" reduce="netforce"/>'), "touch"),
+        scene(sensor='<contact name="touch" geom1="tip" geom2="block" reduce="netforce"/>'),
+        "touch",
+    ),
     "integrator discrete": (scene(option='integrator="discrete"'), ""),
     "collision cylinder-box": (scene(extra=PAIR, geom='type="cylinder" size=".01 .02"'), ""),
     "collision ellipsoid-box": (scene(extra=PAIR, geom='type="ellipsoid" size=".01 .02 .01"'), ""),
-    "collision ellipsoid-mesh": (scene(extra=PAIR + MESH, geom='type="ellipsoid" size=".01 .02 .01"',
-                                       block='type="mesh" mesh="wedge"'), ""),
+    "collision ellipsoid-mesh": (
+        scene(extra=PAIR + MESH, geom='type="ellipsoid" size=".01 .02 .01"', block='type="mesh" mesh="wedge"'),
+        "",
+    ),
 }
 
 
@@ -108,26 +127,49 @@ def test_the_pgs_solver_is_refused():
 
 
 def test_all_problems_are_named_at_once():
-    xml = scene(actuator=motor('delay=".03" nsample="20" armature=".01"') + '<motor joint="knuckle" armature=".1"/>',
-                joint='damping=".1 .2"', option='density="1.2"')
+    xml = scene(
+        actuator=motor('delay=".03" nsample="20" armature=".01"') + '<motor joint="knuckle" armature=".1"/>',
+        joint='damping=".1 .2"',
+        option='density="1.2"',
+    )
     text = refusal(xml, "jax")
-    for word in ("actuator delay (actuator tendon)", "actuator armature (actuator tendon, #1)",
-                 "polynomial joint damping (joint knuckle)", "fluid forces"):
+    for word in (
+        "actuator delay (actuator tendon)",
+        "actuator armature (actuator tendon, #1)",
+        "polynomial joint damping (joint knuckle)",
+        "fluid forces",
+    ):
         assert word in text
 
 
 @pytest.mark.parametrize("backend", ["jax", "warp"])
-@pytest.mark.parametrize("xml", [
-    scene(),
-    scene(actuator=motor('gear="2"'), sensor='<jointpos name="angle" joint="knuckle"/>',
-          joint='damping=".1" stiffness=".1" armature=".01" frictionloss=".01"'),
-    scene(sensor='<contact name="touch" geom1="tip" geom2="block"/>'),
-    scene(extra=PAIR), scene(extra=PAIR, block='type="capsule" size=".01 .02"'),
-    scene(extra=PAIR, block='type="cylinder" size=".01 .02"'),
-    scene(extra=PAIR, geom='type="capsule" size=".01 .02"', block='type="cylinder" size=".01 .02"'),
-    scene(geom='type="cylinder" size=".01 .02"'),  # no explicit pair: it meets nothing in our scenes
-], ids=["plain", "drive and sensor", "contact by geom", "sphere-box", "sphere-capsule", "sphere-cylinder",
-        "capsule-cylinder", "cylinder without a pair"])
+@pytest.mark.parametrize(
+    "xml",
+    [
+        scene(),
+        scene(
+            actuator=motor('gear="2"'),
+            sensor='<jointpos name="angle" joint="knuckle"/>',
+            joint='damping=".1" stiffness=".1" armature=".01" frictionloss=".01"',
+        ),
+        scene(sensor='<contact name="touch" geom1="tip" geom2="block"/>'),
+        scene(extra=PAIR),
+        scene(extra=PAIR, block='type="capsule" size=".01 .02"'),
+        scene(extra=PAIR, block='type="cylinder" size=".01 .02"'),
+        scene(extra=PAIR, geom='type="capsule" size=".01 .02"', block='type="cylinder" size=".01 .02"'),
+        scene(geom='type="cylinder" size=".01 .02"'),  # no explicit pair: it meets nothing in our scenes
+    ],
+    ids=[
+        "plain",
+        "drive and sensor",
+        "contact by geom",
+        "sphere-box",
+        "sphere-capsule",
+        "sphere-cylinder",
+        "capsule-cylinder",
+        "cylinder without a pair",
+    ],
+)
 def test_what_the_backends_can_is_let_through(xml, backend):
     check_model(mujoco.MjModel.from_xml_string(xml), backend)
 

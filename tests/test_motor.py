@@ -10,13 +10,18 @@ from dexsim.motor import Motor, motor_current, press, read_current, torque_from_
 MOTOR = Motor(torque_constant=0.5, efficiency=0.8, back_efficiency=0.6, no_load_current=0.03)
 
 
-@pytest.mark.parametrize(("torque", "velocity", "current"), [
-    (0.2, 1.0, 0.2 / 0.5 / 0.8 + 0.03),  # motoring forwards
-    (-0.2, -1.0, -0.2 / 0.5 / 0.8 - 0.03),  # motoring backwards
-    (0.2, -1.0, 0.2 / 0.5 * 0.6 - 0.03),  # driven back
-    (-0.2, 1.0, -0.2 / 0.5 * 0.6 + 0.03),
-    (0.2, 0.0, 0.4), (0.0, 2.0, 0.03), (0.0, 0.0, 0.0),
-])
+@pytest.mark.parametrize(
+    ("torque", "velocity", "current"),
+    [
+        (0.2, 1.0, 0.2 / 0.5 / 0.8 + 0.03),  # motoring forwards
+        (-0.2, -1.0, -0.2 / 0.5 / 0.8 - 0.03),  # motoring backwards
+        (0.2, -1.0, 0.2 / 0.5 * 0.6 - 0.03),  # driven back
+        (-0.2, 1.0, -0.2 / 0.5 * 0.6 + 0.03),
+        (0.2, 0.0, 0.4),
+        (0.0, 2.0, 0.03),
+        (0.0, 0.0, 0.0),
+    ],
+)
 def test_the_four_quadrants(torque, velocity, current):
     assert float(motor_current(MOTOR, torque, velocity)) == pytest.approx(current, abs=1e-6)
 
@@ -61,8 +66,16 @@ def test_the_reading_has_bias_noise_steps_and_an_end():
 
 
 def test_a_press_is_a_triangle_of_force_and_the_motors_current():
-    data = press(Motor(torque_constant=0.5, no_load_current=0.01), jax.random.key(0), lever=0.06, peak=6.0,
-                 cycles=2, samples=400, force_resolution=0.1, force_limit=5.0)
+    data = press(
+        Motor(torque_constant=0.5, no_load_current=0.01),
+        jax.random.key(0),
+        lever=0.06,
+        peak=6.0,
+        cycles=2,
+        samples=400,
+        force_resolution=0.1,
+        force_limit=5.0,
+    )
     assert data.force.max() == 5.0 and data.force.min() == 0.0
     np.testing.assert_allclose(data.force * 10, np.round(data.force * 10), atol=1e-6)
     rising = np.arange(400) % 200 < 100
@@ -77,6 +90,7 @@ def test_a_joint_that_presses_by_turning_back_draws_the_mirrored_current():
 
 def test_gradients_reach_every_parameter():
     slope = jax.grad(lambda m: motor_current(m, 0.2, 1.0, 0.1))(
-        Motor(*(jnp.float32(x) for x in (0.5, 0.8, 0.6, 0.03, 0.02, 20.0, 0.1, 0, 0, 0, 1))))
+        Motor(*(jnp.float32(x) for x in (0.5, 0.8, 0.6, 0.03, 0.02, 20.0, 0.1, 0, 0, 0, 1)))
+    )
     assert float(slope.torque_constant) < 0 and float(slope.efficiency) < 0 and float(slope.no_load_current) == 1
     assert float(slope.ripple) != 0 and float(slope.back_efficiency) == 0

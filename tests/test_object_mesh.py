@@ -20,9 +20,13 @@ from dexsim.tasks.grasp import GraspConfig
 from dexsim.tasks.rotate_config import RotateConfig
 
 WORLDS = 4
-BARS = sdf.Shape(("box", "box"), jnp.array([[0.03, 0.01, 0.015], [0.01, 0.025, 0.015]]),
-                 jnp.array([[0.03, 0.01, 0.015], [0.01, 0.025, 0.015]]), jnp.stack([jnp.eye(3)] * 2),
-                 jnp.ones(2, bool))
+BARS = sdf.Shape(
+    ("box", "box"),
+    jnp.array([[0.03, 0.01, 0.015], [0.01, 0.025, 0.015]]),
+    jnp.array([[0.03, 0.01, 0.015], [0.01, 0.025, 0.015]]),
+    jnp.stack([jnp.eye(3)] * 2),
+    jnp.ones(2, bool),
+)
 """The L below as what it is."""
 
 
@@ -97,19 +101,24 @@ class TestBoxes:
 class TestErrors:
     """One clear line each."""
 
-    @pytest.mark.parametrize(("name", "parts", "message"), [
-        ("none.stl", 6, "none.stl: no such file"),
-        ("open.stl", 6, "the surface is open, 3 edges belong to one triangle only"),
-        ("ring.stl", 1, "1 boxes do not follow its surface, .* mm at worst, of 120 mm; allow more"),
-        ("large.stl", 6, "pass scale=0.001 for a file in millimetres")])
+    @pytest.mark.parametrize(
+        ("name", "parts", "message"),
+        [
+            ("none.stl", 6, "none.stl: no such file"),
+            ("open.stl", 6, "the surface is open, 3 edges belong to one triangle only"),
+            ("ring.stl", 1, "1 boxes do not follow its surface, .* mm at worst, of 120 mm; allow more"),
+            ("large.stl", 6, "pass scale=0.001 for a file in millimetres"),
+        ],
+    )
     def test_a_mesh_that_will_not_do(self, hand, tmp_path, name, parts, message):
         cube = trimesh.creation.box((0.05, 0.05, 0.05))
         trimesh.Trimesh(cube.vertices, cube.faces[1:], process=False).export(tmp_path / "open.stl")
         trimesh.creation.torus(0.05, 0.01, major_sections=24, minor_sections=8).export(tmp_path / "ring.stl")
         trimesh.creation.box((50, 50, 50)).export(tmp_path / "large.stl")
         with pytest.raises(AssetError, match=message) as caught:
-            dexsim.make("grasp", GraspConfig(objects=ObjectConfig(mesh=str(tmp_path / name), mesh_parts=parts)),
-                        hand=hand)
+            dexsim.make(
+                "grasp", GraspConfig(objects=ObjectConfig(mesh=str(tmp_path / name), mesh_parts=parts)), hand=hand
+            )
         assert "\n" not in str(caught.value)
 
     @pytest.mark.parametrize("change", [{"object": "mesh"}, {"objects": ObjectConfig(mesh="mug.stl")}])
@@ -140,8 +149,11 @@ class TestDraw:
         bare = narrow(one, config, plain_inertia(one, config), jnp.float32(0.0))
         sides = 2 * np.asarray(one.size[0])
         np.testing.assert_allclose(bare.inertia, np.mean(config.mass) / 12 * (np.sum(sides**2) - sides**2), rtol=1e-4)
-        np.testing.assert_allclose(sample_object(jax.random.key(1), dataclasses.replace(config, scale=0.0)).size[0],
-                                   [0.025, 0.018, 0.032], rtol=1e-4)
+        np.testing.assert_allclose(
+            sample_object(jax.random.key(1), dataclasses.replace(config, scale=0.0)).size[0],
+            [0.025, 0.018, 0.032],
+            rtol=1e-4,
+        )
 
 
 @pytest.fixture
@@ -178,8 +190,11 @@ def test_a_mesh_is_turned_like_the_cube_that_it_is(simple, folder):
     """Start states settle in C MuJoCo: a mesh of a cube comes to rest where the cube of that edge does."""
     nominal = ObjectConfig(mass=(0.1, 0.1), friction=(0.9, 0.9), com_offset=0.0)
     cubes = dexsim.make("rotate", RotateConfig(objects=nominal, edge=(0.055, 0.055), pool_size=64), backend="jax")
-    env = dexsim.make("rotate", RotateConfig(object="mesh", pool_size=64, objects=dataclasses.replace(
-        nominal, mesh=str(folder / "cube.stl"))), backend="jax")
+    env = dexsim.make(
+        "rotate",
+        RotateConfig(object="mesh", pool_size=64, objects=dataclasses.replace(nominal, mesh=str(folder / "cube.stl"))),
+        backend="jax",
+    )
     height = [np.asarray(e.pool.qpos)[:, 12] for e in (cubes, env)]
     assert abs(np.mean(height[0]) - np.mean(height[1])) < 0.001
     target = jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], env.pool.target)
@@ -192,7 +207,7 @@ def test_an_l_is_dropped_on_the_real_physics(folder):
     env = dexsim.make("grasp", config, backend="jax", num_envs=8)
     state = jax.jit(lambda key: jax.vmap(env.reset)(jax.random.split(key, 8)))(jax.random.key(0))
     step, force, taxels = jax.jit(jax.vmap(env.step)), 0, 0
-    size, = check(env, step, state, key=jax.random.key(1), ticks=9, names=["ObjectConfig.mesh_size"])
+    (size,) = check(env, step, state, key=jax.random.key(1), ticks=9, names=["ObjectConfig.mesh_size"])
     assert {"geom_size", "geom_pos"} <= set(size.changed) and max(size.object, size.joint) > 1e-6
     for _ in range(40):
         state = step(state, jnp.ones((8, 12)))

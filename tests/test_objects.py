@@ -13,8 +13,13 @@ from dexsim.object_config import SHAPES, SLOTS, ObjectConfig
 from dexsim.objects import bounding_radius, damping_ratio, extent, plain_inertia, sample_object
 
 BOX, CAPSULE, CYLINDER = range(3)
-ACTIVE = {"sphere": {(0, 1, 0)}, "box": {(1, 0, 0)}, "cylinder": {(0, 0, 1)}, "capsule": {(0, 1, 0)},
-          "composition": {(1, 1, 0), (0, 1, 1)}}
+ACTIVE = {
+    "sphere": {(0, 1, 0)},
+    "box": {(1, 0, 0)},
+    "cylinder": {(0, 0, 1)},
+    "capsule": {(0, 1, 0)},
+    "composition": {(1, 1, 0), (0, 1, 1)},
+}
 # As they stand: no scatter of inertia or of the centre of mass.
 UNIFORM = ObjectConfig(inertia_scale=(1.0, 1.0), com_offset=0.0)
 
@@ -85,10 +90,20 @@ def test_inertia_is_that_of_the_solid(name):
 
 def test_inertias_by_hand():
     """Cube, ball, rod: the textbook's formulas, through fixed ranges."""
-    config = ObjectConfig(inertia_scale=(1, 1), com_offset=0, mass=(0.2, 0.2), box_half=(0.02, 0.02),
-                          sphere_radius=(0.03, 0.03), cylinder_radius=(0.01, 0.01), cylinder_half=(0.06, 0.06))
-    cases = (("box", [2 / 3 * 0.02**2] * 3), ("sphere", [2 / 5 * 0.03**2] * 3),
-             ("cylinder", [0.01**2 / 4 + 0.12**2 / 12] * 2 + [0.01**2 / 2]))
+    config = ObjectConfig(
+        inertia_scale=(1, 1),
+        com_offset=0,
+        mass=(0.2, 0.2),
+        box_half=(0.02, 0.02),
+        sphere_radius=(0.03, 0.03),
+        cylinder_radius=(0.01, 0.01),
+        cylinder_half=(0.06, 0.06),
+    )
+    cases = (
+        ("box", [2 / 3 * 0.02**2] * 3),
+        ("sphere", [2 / 5 * 0.03**2] * 3),
+        ("cylinder", [0.01**2 / 4 + 0.12**2 / 12] * 2 + [0.01**2 / 2]),
+    )
     for name, wanted in cases:
         one = row(draw(config, name), 0)
         np.testing.assert_allclose(one.inertia, 0.2 * np.array(wanted), rtol=0.01, err_msg=name)
@@ -115,8 +130,11 @@ def is_inside(one, points):
         a, b, _ = one.size[slot]
         local = points - one.position[slot]
         across, along = np.hypot(local[:, 0], local[:, 1]), np.abs(local[:, 2])
-        within = (np.all(np.abs(local) < one.size[slot], axis=1), np.hypot(across, np.maximum(along - b, 0)) < a,
-                  (across < a) & (along < b))[slot]
+        within = (
+            np.all(np.abs(local) < one.size[slot], axis=1),
+            np.hypot(across, np.maximum(along - b, 0)) < a,
+            (across < a) & (along < b),
+        )[slot]
         inside |= within & one.active[slot]
     return inside
 
@@ -148,8 +166,14 @@ def within(values, span, scale=1.0):
 
 def test_sizes_fill_their_ranges():
     # No two ranges alike, so that none can be taken for another.
-    config = ObjectConfig(sphere_radius=(0.04, 0.05), box_half=(0.02, 0.025), cylinder_radius=(0.03, 0.035),
-                          cylinder_half=(0.06, 0.07), neck_radius=(0.01, 0.012), neck_half=(0.014, 0.018))
+    config = ObjectConfig(
+        sphere_radius=(0.04, 0.05),
+        box_half=(0.02, 0.025),
+        cylinder_radius=(0.03, 0.035),
+        cylinder_half=(0.06, 0.07),
+        neck_radius=(0.01, 0.012),
+        neck_half=(0.014, 0.018),
+    )
     ball, box, cylinder, capsule, union = (draw(config, name) for name in SHAPES)
     within(ball.size[:, CAPSULE, 0], config.sphere_radius)
     assert np.all(ball.size[:, CAPSULE, 1] <= 1e-4)  # a capsule of next to no length
@@ -233,8 +257,11 @@ def hull(one):
     corners = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), -1).reshape(-1, 3)
     a, b, _ = one.size[CAPSULE]
     r, h, _ = one.size[CYLINDER]
-    points = (corners * one.size[BOX], np.concatenate([a * globe + [0, 0, s * b] for s in (1, -1)]),
-              np.concatenate([r * rim + [0, 0, s * h] for s in (1, -1)]))
+    points = (
+        corners * one.size[BOX],
+        np.concatenate([a * globe + [0, 0, s * b] for s in (1, -1)]),
+        np.concatenate([r * rim + [0, 0, s * h] for s in (1, -1)]),
+    )
     return np.concatenate([p + c for p, c, on in zip(points, one.position, one.active, strict=True) if on])
 
 
@@ -245,7 +272,8 @@ def test_extent_is_the_farthest_surface_point():
     directions[:, 0], directions[:, 1] = [0, 0, 1], [0, 0, -1]
     directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
     reach = jax.jit(jax.vmap(lambda s, p, a, ds: jax.vmap(lambda d: extent(s, p, a, d))(ds)))(
-        drawn.size, drawn.position, drawn.active, np.float32(directions))
+        drawn.size, drawn.position, drawn.active, np.float32(directions)
+    )
     for at in range(40):
         sampled = (hull(row(drawn, at)) @ directions[at].T).max(0)
         np.testing.assert_allclose(reach[at], sampled, atol=2e-5)
@@ -321,8 +349,12 @@ class TestScale:
             np.testing.assert_allclose(leaf, np.broadcast_to(leaf[0], leaf.shape), rtol=1e-6)
         np.testing.assert_allclose(drawn.mass[0], np.mean(config.mass), rtol=1e-6)
         np.testing.assert_allclose(drawn.com[0], 0)
-        size = {"sphere": config.sphere_radius, "box": config.box_half, "cylinder": config.cylinder_radius,
-                "capsule": config.cylinder_radius}[shape]
+        size = {
+            "sphere": config.sphere_radius,
+            "box": config.box_half,
+            "cylinder": config.cylinder_radius,
+            "capsule": config.cylinder_radius,
+        }[shape]
         slot = {"sphere": 1, "box": 0, "cylinder": 2, "capsule": 1}[shape]
         np.testing.assert_allclose(drawn.size[0, slot, 0], np.mean(size), rtol=1e-6)
 

@@ -27,9 +27,16 @@ def readings(hand):
     force = rng.uniform(0.1, 2, (5, 120)) * (rng.random((5, 120)) < 0.1)
     force[3] = 0
     values = Readings(
-        joint_position=rng.uniform(hand.joint_lower, hand.joint_upper), joint_torque=rng.uniform(-1, 1, 12),
-        taxel_force=force, object_position=rng.normal(size=3), object_velocity=rng.normal(size=3),
-        object_quat=unit(rng), goal_quat=unit(rng), command=np.array(0.37), last_action=rng.uniform(-1, 1, 12))
+        joint_position=rng.uniform(hand.joint_lower, hand.joint_upper),
+        joint_torque=rng.uniform(-1, 1, 12),
+        taxel_force=force,
+        object_position=rng.normal(size=3),
+        object_velocity=rng.normal(size=3),
+        object_quat=unit(rng),
+        goal_quat=unit(rng),
+        command=np.array(0.37),
+        last_action=rng.uniform(-1, 1, 12),
+    )
     return jax.tree.map(lambda x: np.asarray(x, np.float32), values)
 
 
@@ -57,12 +64,19 @@ def truth(hand, readings):
     mujoco.mju_quat2Mat(matrix, relative)
     matrix = matrix.reshape(3, 3)
     return {
-        "joint_position": readings.joint_position, "joint_torque": readings.joint_torque,
-        "object_position": readings.object_position, "object_velocity": readings.object_velocity,
-        "contact_force": readings.taxel_force.sum(1), "contact_centre": np.ravel(centre),
-        "fingertip_position": np.ravel(tip), "command": [0.37], "last_action": readings.last_action,
+        "joint_position": readings.joint_position,
+        "joint_torque": readings.joint_torque,
+        "object_position": readings.object_position,
+        "object_velocity": readings.object_velocity,
+        "contact_force": readings.taxel_force.sum(1),
+        "contact_centre": np.ravel(centre),
+        "fingertip_position": np.ravel(tip),
+        "command": [0.37],
+        "last_action": readings.last_action,
         "relative_orientation": np.concatenate([matrix[:, 0], matrix[:, 1]]),
-        "relative_quaternion": relative, "plain_centre": np.ravel(plain)}
+        "relative_quaternion": relative,
+        "plain_centre": np.ravel(plain),
+    }
 
 
 def check(hand, readings, names, config, wanted):
@@ -71,8 +85,9 @@ def check(hand, readings, names, config, wanted):
     assert vector.dtype == np.float32 and vector.shape == (sum(f.size for f in fields),)
     at = 0
     for field in fields:
-        np.testing.assert_allclose(vector[at:at + field.size], wanted[field.name], atol=2e-6, rtol=1e-5,
-                                   err_msg=field.name)
+        np.testing.assert_allclose(
+            vector[at : at + field.size], wanted[field.name], atol=2e-6, rtol=1e-5, err_msg=field.name
+        )
         at += field.size
     return fields
 
@@ -80,16 +95,28 @@ def check(hand, readings, names, config, wanted):
 def test_the_grasp_observation_is_66_values_in_the_papers_order(hand, readings, truth):
     fields = check(hand, readings, GRASP, ObservationConfig(), truth)
     assert [(f.name, f.size) for f in fields] == [
-        ("joint_position", 12), ("joint_torque", 12), ("object_position", 3), ("object_velocity", 3),
-        ("contact_force", 5), ("contact_centre", 15), ("fingertip_position", 15), ("command", 1)]
+        ("joint_position", 12),
+        ("joint_torque", 12),
+        ("object_position", 3),
+        ("object_velocity", 3),
+        ("contact_force", 5),
+        ("contact_centre", 15),
+        ("fingertip_position", 15),
+        ("command", 1),
+    ]
     assert sum(f.size for f in fields) == 66
 
 
 def test_the_rotate_observation_is_65_values_in_the_papers_order(hand, readings, truth):
     fields = check(hand, readings, ROTATE, ObservationConfig(), truth)
     assert [(f.name, f.size) for f in fields] == [
-        ("joint_position", 12), ("relative_orientation", 6), ("last_action", 12), ("contact_centre", 15),
-        ("contact_force", 5), ("fingertip_position", 15)]
+        ("joint_position", 12),
+        ("relative_orientation", 6),
+        ("last_action", 12),
+        ("contact_centre", 15),
+        ("contact_force", 5),
+        ("fingertip_position", 15),
+    ]
     assert sum(f.size for f in fields) == 65
 
 
@@ -101,13 +128,21 @@ def test_quaternion_instead_of_six_d(hand, readings, truth):
 
 def test_unweighted_centre(hand, readings, truth):
     assert np.abs(truth["plain_centre"] - truth["contact_centre"]).max() > 1e-3
-    check(hand, readings, GRASP, ObservationConfig(weighting="none"),
-          {**truth, "contact_centre": truth["plain_centre"]})
+    check(
+        hand, readings, GRASP, ObservationConfig(weighting="none"), {**truth, "contact_centre": truth["plain_centre"]}
+    )
 
 
-@pytest.mark.parametrize(("names", "leave_out", "size"), [
-    (GRASP, ("contact_force",), 61), (GRASP, ("contact_centre",), 51), (GRASP, ("contact_force", "contact_centre"), 46),
-    (ROTATE, ("relative_orientation",), 59), (ROTATE, ("contact_centre", "contact_force"), 45)])
+@pytest.mark.parametrize(
+    ("names", "leave_out", "size"),
+    [
+        (GRASP, ("contact_force",), 61),
+        (GRASP, ("contact_centre",), 51),
+        (GRASP, ("contact_force", "contact_centre"), 46),
+        (ROTATE, ("relative_orientation",), 59),
+        (ROTATE, ("contact_centre", "contact_force"), 45),
+    ],
+)
 def test_ablations_leave_their_fields_out(hand, readings, truth, names, leave_out, size):
     fields = check(hand, readings, names, ObservationConfig(leave_out=leave_out), truth)
     assert [f.name for f in fields] == [name for name in names if name not in leave_out]
@@ -117,7 +152,7 @@ def test_ablations_leave_their_fields_out(hand, readings, truth, names, leave_ou
 def test_a_finger_that_touches_nothing_has_its_centre_at_zero(hand, readings):
     vector = np.asarray(observe(hand, readings, GRASP, ObservationConfig()))
     np.testing.assert_array_equal(vector[30 + 3], 0)
-    np.testing.assert_array_equal(vector[35 + 9:35 + 12], 0)
+    np.testing.assert_array_equal(vector[35 + 9 : 35 + 12], 0)
     silent = dataclasses.replace(readings, taxel_force=np.zeros((5, 120), np.float32))
     vector = np.asarray(observe(hand, silent, GRASP, ObservationConfig()))
     np.testing.assert_array_equal(vector[30:50], 0)
@@ -159,9 +194,13 @@ def test_every_reading_matters(hand, readings):
         value = getattr(readings, field.name)
         changed = value[..., ::-1] if field.name.endswith("quat") else value + np.float32(0.05)
         other = dataclasses.replace(readings, **{field.name: np.array(changed)})
-        assert any(np.any(np.asarray(observe(hand, other, names, ObservationConfig()))
-                          != np.asarray(observe(hand, readings, names, ObservationConfig())))
-                   for names in (GRASP, ROTATE)), field.name
+        assert any(
+            np.any(
+                np.asarray(observe(hand, other, names, ObservationConfig()))
+                != np.asarray(observe(hand, readings, names, ObservationConfig()))
+            )
+            for names in (GRASP, ROTATE)
+        ), field.name
 
 
 def test_unknown_options_are_refused():

@@ -22,8 +22,9 @@ in_checkout = pytest.mark.skipif(not (ROOT / "pyproject.toml").exists(), reason=
 def run_python(code: str, cwd: Path, path: Path | None = None) -> str:
     """Run `code` in a fresh interpreter, with `path` in front of everything importable."""
     start = f"import sys; sys.path.insert(0, {str(path)!r})\n" if path else ""
-    done = subprocess.run([sys.executable, "-P", "-c", start + code], cwd=cwd,
-                          capture_output=True, text=True, timeout=120)
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", start + code], cwd=cwd, capture_output=True, text=True, timeout=120
+    )
     assert done.returncode == 0, done.stderr
     return done.stdout
 
@@ -31,7 +32,8 @@ def run_python(code: str, cwd: Path, path: Path | None = None) -> str:
 @pytest.mark.parametrize("package", PACKAGES)
 def test_import_needs_no_optional_library(package, tmp_path):
     # A finder in front of all others sees every attempt, also at a library that is not installed.
-    attempts = run_python(f"""
+    attempts = run_python(
+        f"""
 import sys
 class Watch:
     seen = []
@@ -42,13 +44,19 @@ sys.meta_path.insert(0, Watch())
 import {package}
 loaded = [name for name in {FORBIDDEN!r} if name in sys.modules]
 print(*sorted(set(Watch.seen + loaded)))
-""", tmp_path, ROOT)
+""",
+        tmp_path,
+        ROOT,
+    )
     assert attempts.split() == []
 
 
 def test_real_needs_no_physics(tmp_path):
-    loaded = run_python("import sys, dexsim_real; print(*(name for name in "
-                        "('mujoco', 'mujoco.mjx') if name in sys.modules))", tmp_path, ROOT)
+    loaded = run_python(
+        "import sys, dexsim_real; print(*(name for name in ('mujoco', 'mujoco.mjx') if name in sys.modules))",
+        tmp_path,
+        ROOT,
+    )
     assert loaded.split() == []
 
 
@@ -64,8 +72,19 @@ def test_asset_path():
 def test_core_dependencies_are_only_the_listed_ones():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     names = {re.match(r"[\w-]+", requirement).group() for requirement in project["dependencies"]}
-    assert names == {"jax", "mujoco", "mujoco-mjx", "numpy", "scipy", "trimesh", "msgpack", "tyro", "rich",
-                     "matplotlib", "pillow"}
+    assert names == {
+        "jax",
+        "mujoco",
+        "mujoco-mjx",
+        "numpy",
+        "scipy",
+        "trimesh",
+        "msgpack",
+        "tyro",
+        "rich",
+        "matplotlib",
+        "pillow",
+    }
     assert {"warp", "cuda", "real", "brax", "video"} <= set(project["optional-dependencies"])
 
 
@@ -81,8 +100,7 @@ def test_checkpoints_name_the_version_of_the_distribution():
 def test_warp_is_the_version_that_mjx_names():
     from importlib.metadata import requires
 
-    named = [line.partition(";")[0].strip() for line in requires("mujoco-mjx")
-             if line.startswith("warp-lang")]
+    named = [line.partition(";")[0].strip() for line in requires("mujoco-mjx") if line.startswith("warp-lang")]
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert project["optional-dependencies"]["warp"] == named
 
@@ -96,13 +114,13 @@ def test_the_commands_of_the_readme_are_make_targets():
 
 
 @in_checkout
-@pytest.mark.parametrize("page", [path.relative_to(ROOT).as_posix() for path in
-                                  (*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"))])
+@pytest.mark.parametrize(
+    "page", [path.relative_to(ROOT).as_posix() for path in (*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"))]
+)
 def test_links_lead_somewhere(page):
     text = (ROOT / page).read_text()
     links = re.findall(r"\]\(([^)#\s]+)", text)
-    missing = [link for link in links if "://" not in link
-               and not ((ROOT / page).parent / link).exists()]
+    missing = [link for link in links if "://" not in link and not ((ROOT / page).parent / link).exists()]
     assert missing == []
 
 
@@ -112,8 +130,13 @@ def wheel(tmp_path_factory) -> Path:
     if not (ROOT / "pyproject.toml").exists():
         pytest.skip("needs a checkout")
     out = tmp_path_factory.mktemp("wheel")
-    subprocess.run([sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir",
-                    str(out), str(ROOT)], check=True, capture_output=True, text=True, timeout=300)
+    subprocess.run(
+        [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(out), str(ROOT)],
+        check=True,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
     (built,) = out.glob("*.whl")
     return built
 
@@ -123,11 +146,13 @@ def test_wheel_holds_packages_assets_and_licence(wheel):
         names = archive.namelist()
     for package in PACKAGES:
         assert f"{package}/__init__.py" in names and f"{package}/py.typed" in names
-    shipped = {name.removeprefix("dexsim/_assets/") for name in names
-               if name.startswith("dexsim/_assets/")}
+    shipped = {name.removeprefix("dexsim/_assets/") for name in names if name.startswith("dexsim/_assets/")}
     assets = ROOT / "assets"
-    assert shipped == {str(path.relative_to(assets)) for path in assets.rglob("*")
-                       if path.is_file() and "__pycache__" not in path.parts}
+    assert shipped == {
+        str(path.relative_to(assets))
+        for path in assets.rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts
+    }
     assert any(name.endswith(".dist-info/licenses/LICENSE") for name in names)
     tops = {name.split("/")[0] for name in names if ".dist-info/" not in name}
     assert tops == set(PACKAGES)
@@ -137,15 +162,33 @@ def test_wheel_holds_packages_assets_and_licence(wheel):
 def test_installed_wheel_works_from_another_directory(wheel, tmp_path):
     site, elsewhere = tmp_path / "site", tmp_path / "elsewhere"
     elsewhere.mkdir()
-    subprocess.run([sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index",
-                    "--target", str(site), str(wheel)], check=True, capture_output=True,
-                   timeout=300)
-    found = run_python("""
+    subprocess.run(
+        [
+            sys.executable,
+            "-m",
+            "pip",
+            "install",
+            "--quiet",
+            "--no-deps",
+            "--no-index",
+            "--target",
+            str(site),
+            str(wheel),
+        ],
+        check=True,
+        capture_output=True,
+        timeout=300,
+    )
+    found = run_python(
+        """
 import dexsim, dexsim_ppo, dexsim_real
 from dexsim.assets import asset_path
 from dexsim.hand import load_hand
 load_hand()
 print(*(module.__file__ for module in (dexsim, dexsim_ppo, dexsim_real)))
 print(asset_path("hand/xhand_right.xml"))
-""", elsewhere, site)
+""",
+        elsewhere,
+        site,
+    )
     assert all(Path(name).is_relative_to(site) for name in found.split()), found

@@ -23,7 +23,6 @@ from dexsim.physics import Physics, PhysicsConfig, PhysicsState, build_model, ch
 WORLDS = 8
 
 
-
 class Steps(NamedTuple):
     """The same sub-step in both engines, over worlds [W]."""
 
@@ -43,16 +42,21 @@ def contact_steps(hand, grasp_env, physics_advance):
         starts = [row(grasp_env.pool, i) for i in rows_of(grasp_env.pool, shape)[:WORLDS]]
         begun = [squeeze(hand, start, rng) for start in starts]
         qpos, qvel, warmstart, torque = (jnp.stack(x) for x in list(zip(*begun, strict=True))[1:])
-        after, force = physics_advance(stack([s.target for s in starts]),
-                               PhysicsState(qpos, qvel, warmstart), torque, jnp.zeros((WORLDS, 3)))
+        after, force = physics_advance(
+            stack([s.target for s in starts]), PhysicsState(qpos, qvel, warmstart), torque, jnp.zeros((WORLDS, 3))
+        )
         c_rows = []
         for _, (model, *state, applied) in zip(starts, begun, strict=True):
             data = c_scene.start(model, *state)
             data.qfrc_applied[:12] = applied
             mujoco.mj_step(model, data)
             c_rows.append((data.qvel, data.qpos, c_scene.finger_force(model, data, hand)))
-        found[shape] = Steps(np.asarray(after.qvel), np.asarray(after.qpos), np.asarray(force),
-                             *(np.stack(x) for x in zip(*c_rows, strict=True)))
+        found[shape] = Steps(
+            np.asarray(after.qvel),
+            np.asarray(after.qpos),
+            np.asarray(force),
+            *(np.stack(x) for x in zip(*c_rows, strict=True)),
+        )
     return found
 
 
@@ -85,8 +89,7 @@ class TestAgainstC:
 
     def test_every_shape_on_the_palm(self, hand, grasp_env, physics_advance):
         """Pressed against the palm's plane, whose contacts have one answer for every primitive."""
-        starts = [row(grasp_env.pool, rows_of(grasp_env.pool, shape)[i])
-                  for shape in SHAPES for i in (0, 1)]
+        starts = [row(grasp_env.pool, rows_of(grasp_env.pool, shape)[i]) for shape in SHAPES for i in (0, 1)]
         begun, references = [], []
         for start in starts:
             model = c_scene.compile_scene(hand, start.target, gravity=(-9.81, 0, 0), **CONVERGED)
@@ -106,8 +109,12 @@ class TestAgainstC:
             references.append((data.qpos.copy(), data.qvel.copy()))
         for part in (slice(0, WORLDS), slice(len(starts) - WORLDS, None)):
             qpos, qvel, warmstart, push = (jnp.stack(x) for x in zip(*begun[part], strict=True))
-            after, force = physics_advance(stack([s.target for s in starts[part]]),
-                                   PhysicsState(qpos, qvel, warmstart), jnp.zeros((WORLDS, 12)), push)
+            after, force = physics_advance(
+                stack([s.target for s in starts[part]]),
+                PhysicsState(qpos, qvel, warmstart),
+                jnp.zeros((WORLDS, 12)),
+                push,
+            )
             c_position, c_velocity = (np.stack(x) for x in zip(*references[part], strict=True))
             # Spin is the worst: contacts of 2 N at 3 cm turn a body of 1e-5 kg m^2.
             np.testing.assert_allclose(after.qvel[:, 12:15], c_velocity[:, 12:15], atol=1e-4)
@@ -121,7 +128,7 @@ class TestAgainstC:
         300 sub-steps of float32 (6e-8 a step, against numbers below 10) add up to some 1e-5.
         """
         starts = [row(grasp_env.pool, rows_of(grasp_env.pool, shape)[0]) for shape in SHAPES]
-        starts += starts[:WORLDS - len(starts)]
+        starts += starts[: WORLDS - len(starts)]
         rng = np.random.default_rng(1)
         middle = (hand.joint_lower + hand.joint_upper) / 2
         middle[:3] = 0.2, 0.0, 0.3  # the thumb clear of the fingers
@@ -195,8 +202,10 @@ class TestAgainstC:
             frame = np.array([c.frame.reshape(3, 3) for c in data.contact])
             if flip:
                 geom, frame = geom[:, ::-1], -frame
-            column = {name: np.array([getattr(c, name) for c in data.contact])
-                      for name in ("dim", "efc_address", "friction", "dist", "includemargin")}
+            column = {
+                name: np.array([getattr(c, name) for c in data.contact])
+                for name in ("dim", "efc_address", "friction", "dist", "includemargin")
+            }
             contact = SimpleNamespace(**column, geom=geom, frame=jnp.asarray(frame))
             impl = SimpleNamespace(contact=contact, efc_force=jnp.asarray(data.efc_force))
             return np.asarray(seam._force_from_contacts(SimpleNamespace(_impl=impl)))
@@ -241,9 +250,15 @@ class TestConstruction:
         monkeypatch.setattr("importlib.util.find_spec", lambda name: object())
         assert choose_backend("auto") == choose_backend("warp") == "warp"
 
-    @pytest.mark.parametrize("field, value, message", [
-        ("condim", 2, "1, 3, 4 or 6"), ("timestep", 0.5, "0.5 s: must be between 0.0001 and 0.02 s"),
-        ("substeps", 0, "substeps = 0"), ("palm", "flat", "choose from auto, face, box")])
+    @pytest.mark.parametrize(
+        "field, value, message",
+        [
+            ("condim", 2, "1, 3, 4 or 6"),
+            ("timestep", 0.5, "0.5 s: must be between 0.0001 and 0.02 s"),
+            ("substeps", 0, "substeps = 0"),
+            ("palm", "flat", "choose from auto, face, box"),
+        ],
+    )
     def test_configuration(self, field, value, message):
         with pytest.raises(ConfigError, match=message):
             PhysicsConfig(**{field: value})
@@ -256,16 +271,21 @@ class TestConstruction:
         path = tmp_path / hand.model_path.name
         path.write_text(path.read_text().replace('name="index_link1" class', "class"))
         with pytest.raises(AssetError, match=f"{path}.*needs a name"):
-            Physics(load_hand(tmp_path / "xhand_right.toml"), SLOTS, ObjectConfig().largest,
-                    PhysicsConfig(), gravity=GRAVITY, backend="jax")
+            Physics(
+                load_hand(tmp_path / "xhand_right.toml"),
+                SLOTS,
+                ObjectConfig().largest,
+                PhysicsConfig(),
+                gravity=GRAVITY,
+                backend="jax",
+            )
 
     def test_a_model_that_needs_what_the_backend_drops(self, hand, tmp_path):
         text = hand.model_path.read_text().replace("<worldbody>", "<option density='1.2'/><worldbody>")
         broken = dataclasses.replace(hand, model_path=tmp_path / "hand.xml")
         broken.model_path.write_text(text)
         with pytest.raises(AssetError, match="hand.xml: backend jax cannot simulate: fluid forces"):
-            Physics(broken, SLOTS, ObjectConfig().largest, PhysicsConfig(), gravity=GRAVITY,
-                    backend="jax")
+            Physics(broken, SLOTS, ObjectConfig().largest, PhysicsConfig(), gravity=GRAVITY, backend="jax")
 
     def test_what_mjx_itself_refuses(self, hand, monkeypatch):
         def refuse(model, impl):
@@ -273,18 +293,17 @@ class TestConstruction:
 
         monkeypatch.setattr(mjx, "put_model", refuse)
         with pytest.raises(AssetError, match="backend jax: no such joint"):
-            Physics(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(), gravity=GRAVITY,
-                    backend="jax")
+            Physics(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(), gravity=GRAVITY, backend="jax")
 
     def test_the_box_palm_needs_warp_for_cylinders(self, hand):
         with pytest.raises(AssetError, match="BOX"):
-            Physics(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(palm="box"),
-                    gravity=GRAVITY, backend="jax")
+            Physics(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(palm="box"), gravity=GRAVITY, backend="jax")
 
     def test_warps_buffers_hold_the_worst_grip(self, hand, grasp_env):
         """Hands that squeeze as hard as they can need less than the rows that are allocated."""
-        seam = Physics(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(), gravity=GRAVITY,
-                       backend="jax", num_envs=WORLDS)
+        seam = Physics(
+            hand, SLOTS, ObjectConfig().largest, PhysicsConfig(), gravity=GRAVITY, backend="jax", num_envs=WORLDS
+        )
         rng, rows, contacts = np.random.default_rng(3), [], []
         for shape in SHAPES:
             for index in rows_of(grasp_env.pool, shape)[:6]:
@@ -306,7 +325,8 @@ def test_the_guards_list_of_collisions_is_mjxs_own(first, second):
               contype="0" conaffinity="0"/></body>"""
     model = mujoco.MjModel.from_xml_string(
         f"""<mujoco><worldbody>{body.format(x=0, kind=first)}{body.format(x=1, kind=second)}
-            </worldbody><contact><pair geom1="0" geom2="1"/></contact></mujoco>""")
+            </worldbody><contact><pair geom1="0" geom2="1"/></contact></mujoco>"""
+    )
     try:
         mjx.put_model(model, impl="jax")
     except NotImplementedError:

@@ -42,34 +42,64 @@ def test_scale_zero_is_the_nominal_hand(hand):
         np.testing.assert_array_equal(one.torque_gain, np.ones(12))
         np.testing.assert_array_equal(one.taxel_gain, np.ones((5, 1)))
         motors = one.actuator
-        for zero in (motors.dead_band, motors.ripple, motors.coulomb_friction, motors.viscous_friction,
-                     motors.encoder_bias, one.latency, one.sensing_latency, one.encoder_bias, one.tilt):
+        for zero in (
+            motors.dead_band,
+            motors.ripple,
+            motors.coulomb_friction,
+            motors.viscous_friction,
+            motors.encoder_bias,
+            one.latency,
+            one.sensing_latency,
+            one.encoder_bias,
+            one.tilt,
+        ):
             np.testing.assert_array_equal(zero, 0)
 
 
 def quantities(hand, drawn):
     """Each drawn quantity as the config names its range, one row per draw."""
     motors = drawn.actuator
-    return {"stiffness_factor": motors.stiffness / 3.0, "damping_factor": motors.damping / 0.1,
-            "dead_band": motors.dead_band, "torque_factor": motors.stall_torque / hand.torque_limit,
-            "speed_factor": motors.no_load_speed / hand.speed_limit, "efficiency": motors.efficiency,
-            "ripple": motors.ripple, "ripple_count": motors.ripple_count,
-            "coulomb_friction": motors.coulomb_friction / hand.torque_limit,
-            "viscous_friction": motors.viscous_friction,
-            "latency": drawn.latency[:, :1] * TIMES["timestep"],
-            "sensing_latency": drawn.sensing_latency[:, None] * TIMES["control_period"],
-            "encoder_bias": drawn.encoder_bias, "torque_gain": drawn.torque_gain,
-            "taxel_gain": drawn.taxel_gain[..., 0], "gravity_tilt": drawn.tilt}
+    return {
+        "stiffness_factor": motors.stiffness / 3.0,
+        "damping_factor": motors.damping / 0.1,
+        "dead_band": motors.dead_band,
+        "torque_factor": motors.stall_torque / hand.torque_limit,
+        "speed_factor": motors.no_load_speed / hand.speed_limit,
+        "efficiency": motors.efficiency,
+        "ripple": motors.ripple,
+        "ripple_count": motors.ripple_count,
+        "coulomb_friction": motors.coulomb_friction / hand.torque_limit,
+        "viscous_friction": motors.viscous_friction,
+        "latency": drawn.latency[:, :1] * TIMES["timestep"],
+        "sensing_latency": drawn.sensing_latency[:, None] * TIMES["control_period"],
+        "encoder_bias": drawn.encoder_bias,
+        "torque_gain": drawn.torque_gain,
+        "taxel_gain": drawn.taxel_gain[..., 0],
+        "gravity_tilt": drawn.tilt,
+    }
 
 
 # No two alike, so that none can be taken for another.
 EVEN = Randomization(latency_spread=(0.0, 0.0))  # so that the common latency shows
-DISTINCT = Randomization(ripple=(0.05, 0.06), ripple_count=(300.0, 310.0), coulomb_friction=(0.2, 0.21),
-                         viscous_friction=(0.002, 0.003), latency_spread=(0.0, 0.0),
-                         stiffness_factor=(0.5, 0.7), damping_factor=(1.5, 1.9), dead_band=(0.03, 0.04),
-                         torque_factor=(0.75, 0.85), speed_factor=(1.1, 1.3), efficiency=(0.6, 0.65),
-                         latency=(0.01, 0.025), sensing_latency=(0.005, 0.01), encoder_bias=0.02,
-                         torque_gain=(1.3, 1.5), taxel_gain=(0.3, 0.4), gravity_tilt=0.5)
+DISTINCT = Randomization(
+    ripple=(0.05, 0.06),
+    ripple_count=(300.0, 310.0),
+    coulomb_friction=(0.2, 0.21),
+    viscous_friction=(0.002, 0.003),
+    latency_spread=(0.0, 0.0),
+    stiffness_factor=(0.5, 0.7),
+    damping_factor=(1.5, 1.9),
+    dead_band=(0.03, 0.04),
+    torque_factor=(0.75, 0.85),
+    speed_factor=(1.1, 1.3),
+    efficiency=(0.6, 0.65),
+    latency=(0.01, 0.025),
+    sensing_latency=(0.005, 0.01),
+    encoder_bias=0.02,
+    torque_gain=(1.3, 1.5),
+    taxel_gain=(0.3, 0.4),
+    gravity_tilt=0.5,
+)
 
 
 @pytest.mark.parametrize("config", [EVEN, DISTINCT], ids=["default", "distinct"])
@@ -88,8 +118,9 @@ def test_a_thousand_draws_fill_their_ranges_and_leave_none(hand, config):
 
 
 def test_quantities_are_drawn_apart_from_one_another(hand):
-    columns = np.stack([np.asarray(v, float).reshape(1000, -1)[:, 0]
-                        for v in quantities(hand, draws(hand, Randomization())).values()])
+    columns = np.stack(
+        [np.asarray(v, float).reshape(1000, -1)[:, 0] for v in quantities(hand, draws(hand, Randomization())).values()]
+    )
     assert np.abs(np.corrcoef(columns) - np.eye(len(columns))).max() < 0.15
 
 
@@ -128,8 +159,10 @@ def test_a_range_the_wrong_way_round_is_refused():
         Randomization(latency=(-0.1, 0.01))
 
 
-@pytest.mark.parametrize("name", ["stiffness_factor", "damping_factor", "torque_factor", "speed_factor", "efficiency",
-                                  "torque_gain", "taxel_gain"])
+@pytest.mark.parametrize(
+    "name",
+    ["stiffness_factor", "damping_factor", "torque_factor", "speed_factor", "efficiency", "torque_gain", "taxel_gain"],
+)
 def test_a_scale_that_would_turn_a_motor_round_is_refused(name):
     """A factor of 0.5 at scale 3 would be 1 - 1.5: a negative gain, torque or speed."""
     Randomization(**{name: (0.5, 1.0)})
@@ -174,8 +207,14 @@ def test_a_traced_scale_is_the_configured_one(hand):
 def test_the_scale_follows_success():
     rules = Curriculum(start=0.1, widen_above=0.8, narrow_below=0.4, step=0.25)
     step = jax.jit(lambda scale, success: next_scale(scale, success, rules))
-    for scale, success, after in ((0.1, 0.8, 0.35), (0.35, 0.6, 0.35), (0.35, 0.39, 0.1), (0.1, 0.0, 0.0),
-                                  (0.9, 1.0, 1.0), (0.5, np.nan, 0.5)):
+    for scale, success, after in (
+        (0.1, 0.8, 0.35),
+        (0.35, 0.6, 0.35),
+        (0.35, 0.39, 0.1),
+        (0.1, 0.0, 0.0),
+        (0.9, 1.0, 1.0),
+        (0.5, np.nan, 0.5),
+    ):
         assert float(step(scale, success)) == pytest.approx(after)
     with pytest.raises(ConfigError, match="Curriculum.narrow_below"):
         Curriculum(narrow_below=0.9)
@@ -245,14 +284,20 @@ def test_the_imu_of_a_hand_in_a_corner_is_in_one_too():
     drawn, imu = jax.vmap(lambda two: env._draw(*two))(keys)
     corner = np.all(np.isin(np.asarray(drawn.torque_gain).round(5), np.float32([0.9, 1.1])), axis=1)
     ranges = config.sensing.orientation
-    for values, end in ((imu.bias, ranges.bias), (imu.drift[:, None], ranges.drift),
-                        (imu.delay[:, None], ranges.delay[1] / env.control_period)):
+    for values, end in (
+        (imu.bias, ranges.bias),
+        (imu.drift[:, None], ranges.drift),
+        (imu.delay[:, None], ranges.delay[1] / env.control_period),
+    ):
         np.testing.assert_array_equal(np.all(np.abs(np.abs(values) - end) < 1e-6 + 1e-4 * end, axis=1), corner)
     assert 0.3 < np.mean(corner) < 0.7 and len(np.unique(np.sign(imu.bias[corner]), axis=0)) == 8
 
 
-@pytest.mark.parametrize("config", [ObjectConfig(corners=1.0), RotateConfig(objects=ObjectConfig(
-    shapes=("box",), corners=1.0))], ids=["grasp", "rotate"])
+@pytest.mark.parametrize(
+    "config",
+    [ObjectConfig(corners=1.0), RotateConfig(objects=ObjectConfig(shapes=("box",), corners=1.0))],
+    ids=["grasp", "rotate"],
+)
 def test_objects_in_corners(config):
     draw, ranges = sample_object, config
     if isinstance(config, RotateConfig):
@@ -275,17 +320,30 @@ def test_objects_in_corners(config):
 
 # What each range must reach, by the names of the drive's parameters and of the compiled model's fields.
 REACHES = {
-    "stiffness_factor": {"actuator.stiffness"}, "damping_factor": {"actuator.damping"},
-    "dead_band": {"actuator.dead_band"}, "torque_factor": {"actuator.stall_torque"},
-    "speed_factor": {"actuator.no_load_speed"}, "efficiency": {"actuator.efficiency"},
-    "latency": {"latency"}, "latency_spread": {"latency"}, "ripple": {"actuator.ripple"},
-    "ripple_count": {"actuator.ripple_count"}, "coulomb_friction": {"actuator.coulomb_friction"},
-    "viscous_friction": {"actuator.viscous_friction"}, "sensing_latency": {"sensing_latency"},
-    "encoder_bias": {"actuator.encoder_bias", "encoder_bias"}, "torque_gain": {"torque_gain"},
-    "taxel_gain": {"taxel_gain"}, "gravity_tilt": {"tilt"},
-    "mass": {"body_mass"}, "inertia_scale": {"body_inertia"}, "com_offset": {"body_ipos"},
-    "friction": {"pair_friction"}, "bare_friction": {"pair_friction"},
-    "sphere_radius": {"geom_size"}, "box_half": {"geom_size"},
+    "stiffness_factor": {"actuator.stiffness"},
+    "damping_factor": {"actuator.damping"},
+    "dead_band": {"actuator.dead_band"},
+    "torque_factor": {"actuator.stall_torque"},
+    "speed_factor": {"actuator.no_load_speed"},
+    "efficiency": {"actuator.efficiency"},
+    "latency": {"latency"},
+    "latency_spread": {"latency"},
+    "ripple": {"actuator.ripple"},
+    "ripple_count": {"actuator.ripple_count"},
+    "coulomb_friction": {"actuator.coulomb_friction"},
+    "viscous_friction": {"actuator.viscous_friction"},
+    "sensing_latency": {"sensing_latency"},
+    "encoder_bias": {"actuator.encoder_bias", "encoder_bias"},
+    "torque_gain": {"torque_gain"},
+    "taxel_gain": {"taxel_gain"},
+    "gravity_tilt": {"tilt"},
+    "mass": {"body_mass"},
+    "inertia_scale": {"body_inertia"},
+    "com_offset": {"body_ipos"},
+    "friction": {"pair_friction"},
+    "bare_friction": {"pair_friction"},
+    "sphere_radius": {"geom_size"},
+    "box_half": {"geom_size"},
 }
 SENSED = ("sensing_latency", "torque_gain", "taxel_gain")  # seen in the readings, without effect on the motion
 
@@ -312,13 +370,15 @@ def test_every_range_reaches_the_model_and_the_motion(grasp_env, grasp_rollout, 
         else:
             assert max(found.joint, found.object) > 1e-6, name
     # Known size: an encoder that is off by up to 10 mrad turns the joint by less than that in two ticks.
-    early, = check(grasp_env, grasp_rollout.step, fresh, key=jax.random.key(0), ticks=2,
-                   names=("Randomization.encoder_bias",))
+    (early,) = check(
+        grasp_env, grasp_rollout.step, fresh, key=jax.random.key(0), ticks=2, names=("Randomization.encoder_bias",)
+    )
     assert 0.2e-3 < early.joint < 10e-3
 
 
 def test_a_range_that_is_lost_is_found_out(grasp_env, grasp_rollout, fresh, monkeypatch, capsys):
     """Lost between configuration and draw, and lost between draw and physics."""
+
     def forgets_torque(*arguments, **options):
         drawn = sample(*arguments, **options)
         limit = jnp.asarray(arguments[2].torque_limit)
@@ -326,8 +386,9 @@ def test_a_range_that_is_lost_is_found_out(grasp_env, grasp_rollout, fresh, monk
 
     def ignores_friction(states, action):
         calm = dataclasses.replace(states.draw.actuator, viscous_friction=0 * states.draw.actuator.viscous_friction)
-        return grasp_rollout.step(dataclasses.replace(states, draw=dataclasses.replace(states.draw, actuator=calm)),
-                                  action)
+        return grasp_rollout.step(
+            dataclasses.replace(states, draw=dataclasses.replace(states.draw, actuator=calm)), action
+        )
 
     monkeypatch.setattr("dexsim.randomization_effects.sample", forgets_torque)
     names = ("Randomization.torque_factor", "Randomization.viscous_friction", "Randomization.speed_factor")
@@ -357,12 +418,17 @@ def test_runs_that_differ_hide_no_range_and_invent_none(grasp_env, grasp_rollout
 
     noisy = copy.copy(grasp_env)
     noisy.backend = "warp"
-    names = ("Randomization.viscous_friction", "Randomization.encoder_bias", "Randomization.torque_gain",
-             "ObjectConfig.com_offset")
+    names = (
+        "Randomization.viscous_friction",
+        "Randomization.encoder_bias",
+        "Randomization.torque_gain",
+        "ObjectConfig.com_offset",
+    )
     effects = check(noisy, unsteady, fresh, key=jax.random.key(0), ticks=6, names=names)
     assert all(effect.found and effect.changed for effect in effects), table(effects)
-    lost, = check(noisy, lambda *a: unsteady(*a, forgetful=True), fresh, key=jax.random.key(0), ticks=6,
-                  names=names[:1])
+    (lost,) = check(
+        noisy, lambda *a: unsteady(*a, forgetful=True), fresh, key=jax.random.key(0), ticks=6, names=names[:1]
+    )
     assert not lost.found and lost.changed == ("actuator.viscous_friction",), table([lost])
 
 
@@ -370,6 +436,5 @@ def test_a_range_without_width_is_off_and_no_error(grasp_env, grasp_rollout, fre
     config = dataclasses.replace(grasp_env.config, randomization=Randomization(ripple=(0.0, 0.0)))
     still = copy.copy(grasp_env)
     still.config = config
-    effect, = check(still, grasp_rollout.step, fresh, key=jax.random.key(0), ticks=1,
-                    names=("Randomization.ripple",))
+    (effect,) = check(still, grasp_rollout.step, fresh, key=jax.random.key(0), ticks=1, names=("Randomization.ripple",))
     assert effect.off and effect.found and "off" in table([effect])

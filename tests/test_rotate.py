@@ -36,12 +36,19 @@ def moment(task: Rotate, **changes) -> Moment:
     none = jnp.zeros((5, 120))
     values = {
         "target": rotate_start.sample_target(jax.random.key(0), task.config),
-        "joint_position": joints, "joint_velocity": joints, "joint_torque": joints,
-        "pose": forward_kinematics(task.hand, joints), "finger_force": jnp.zeros((5, 3)),
+        "joint_position": joints,
+        "joint_velocity": joints,
+        "joint_torque": joints,
+        "pose": forward_kinematics(task.hand, joints),
+        "finger_force": jnp.zeros((5, 3)),
         "touch": tactile.Touch(none, none, none),
-        "object_position": jnp.asarray(task.reference), "object_quat": jnp.array([1.0, 0, 0, 0]),
-        "object_velocity": jnp.zeros(3), "object_spin": jnp.zeros(3), "action": joints,
-        "last_action": joints}
+        "object_position": jnp.asarray(task.reference),
+        "object_quat": jnp.array([1.0, 0, 0, 0]),
+        "object_velocity": jnp.zeros(3),
+        "object_spin": jnp.zeros(3),
+        "action": joints,
+        "last_action": joints,
+    }
     return Moment(**{**values, **{name: jnp.asarray(v) for name, v in changes.items()}})
 
 
@@ -73,9 +80,9 @@ class TestGoal:
         ahead = rotate.goal_quat(jnp.int32(turns), axis, math.pi / 2)
         back = rotate.goal_quat(jnp.int32(turns), axis, -math.pi / 2)
         other = rotate.goal_quat(jnp.int32(turns), -axis, math.pi / 2)
-        product = (Rotation.from_quat(np.roll(ahead, -1)) * Rotation.from_quat(np.roll(back, -1)))
+        product = Rotation.from_quat(np.roll(ahead, -1)) * Rotation.from_quat(np.roll(back, -1))
         assert product.magnitude() < 1e-3
-        same = (Rotation.from_quat(np.roll(back, -1)).inv() * Rotation.from_quat(np.roll(other, -1)))
+        same = Rotation.from_quat(np.roll(back, -1)).inv() * Rotation.from_quat(np.roll(other, -1))
         assert same.magnitude() < 1e-3
 
     def test_the_mirrored_task_succeeds_on_the_mirrored_motion(self, hand):
@@ -83,10 +90,8 @@ class TestGoal:
         back = Rotate(RotateConfig(direction=-1), hand)
         for degrees in (-90, -60, 0, 75, 90):
             goal = ahead.begin(jax.random.key(0), None)
-            one = ahead.progress(goal, moment(ahead, object_quat=turned(degrees),
-                                              object_spin=[0.5, 0, 0]))
-            two = back.progress(goal, moment(back, object_quat=turned(-degrees),
-                                             object_spin=[-0.5, 0, 0]))
+            one = ahead.progress(goal, moment(ahead, object_quat=turned(degrees), object_spin=[0.5, 0, 0]))
+            two = back.progress(goal, moment(back, object_quat=turned(-degrees), object_spin=[-0.5, 0, 0]))
             assert bool(one.success) == bool(two.success) == (abs(degrees - 90) < 17.2)
             np.testing.assert_allclose(one.angle, two.angle, atol=1e-5)
             np.testing.assert_allclose(one.spin, two.spin, atol=1e-6)
@@ -99,8 +104,11 @@ class TestGoal:
 
     def test_too_far_off_too_fast_or_tilted_is_not(self, task, begun):
         def reached(**changes):
-            return bool(task.progress(begun, moment(task, object_quat=changes.pop(
-                "object_quat", turned(90)), **changes)).success)
+            return bool(
+                task.progress(
+                    begun, moment(task, object_quat=changes.pop("object_quat", turned(90)), **changes)
+                ).success
+            )
 
         place = np.asarray(task.reference)
         assert reached()
@@ -125,10 +133,10 @@ class TestGoal:
     def test_counts_over_an_episode(self, task, begun):
         """A whip through the window counts for the paper; only a calm one moves the goal on."""
         goal, turns, entries = begun, [], []
-        for degrees, spin in ((45, 1), (90, 4), (150, 4), (90, 0.5), (100, 0.5), (180, 1), (270, 1),
-                              (0, 1)):
-            goal = task.update(jax.random.key(0), goal, moment(
-                task, object_quat=turned(degrees), object_spin=[spin, 0, 0]))
+        for degrees, spin in ((45, 1), (90, 4), (150, 4), (90, 0.5), (100, 0.5), (180, 1), (270, 1), (0, 1)):
+            goal = task.update(
+                jax.random.key(0), goal, moment(task, object_quat=turned(degrees), object_spin=[spin, 0, 0])
+            )
             turns.append(int(goal.turns))
             entries.append(int(goal.entries))
         assert turns == [0, 0, 0, 1, 1, 2, 3, 4]
@@ -158,8 +166,13 @@ class TestReward:
         task = Rotate(rotate_config.paper(), hand)
         goal = task.begin(jax.random.key(0), None)
         action = np.linspace(-1, 1, 12).astype(np.float32)
-        busy = dict(action=action, joint_velocity=np.full(12, 3.0), joint_torque=np.full(12, 0.5),
-                    finger_force=np.full((5, 3), 2.0), object_spin=[9.0, 0, 0])
+        busy = dict(
+            action=action,
+            joint_velocity=np.full(12, 3.0),
+            joint_torque=np.full(12, 0.5),
+            finger_force=np.full((5, 3), 2.0),
+            object_spin=[9.0, 0, 0],
+        )
         cost = -0.0002 * float(np.sum(action**2))
         reward, _ = task.reward(goal, moment(task, object_quat=turned(45), **busy), jnp.bool_(False))
         np.testing.assert_allclose(reward, 1 / (math.pi / 4 + 0.1) + cost, rtol=1e-4)
@@ -171,8 +184,10 @@ class TestReward:
         last, tips = 0.0, RotateReward().bonus_tips
         task = Rotate(RotateConfig(reward=RotateReward(tips_by=by)), hand)
         half = 0.5 * RotateReward().working_duty / (1 - PERIOD / 2.0)  # less this tick, in which nothing touches
-        cases = {"mean": (((0, 0, 0, 0, 0), 1 - tips), ((1, 0, 0, 0, 0), 1 - tips * 2 / 3), ((1, 1, 0, 0, 1), 1.0)),
-                 "last": (((1, 1, 0, 0, 0), 1 - tips), ((1, 1, 0, 0, half), 1 - tips / 2), ((1, 1, 0, 0, 1), 1.0))}
+        cases = {
+            "mean": (((0, 0, 0, 0, 0), 1 - tips), ((1, 0, 0, 0, 0), 1 - tips * 2 / 3), ((1, 1, 0, 0, 1), 1.0)),
+            "last": (((1, 1, 0, 0, 0), 1 - tips), ((1, 1, 0, 0, half), 1 - tips / 2), ((1, 1, 0, 0, 1), 1.0)),
+        }
         for duty, share in cases[by]:
             goal = dataclasses.replace(begun, duty=jnp.asarray(duty, jnp.float32), turns=jnp.int32(2))
             here = moment(task, object_quat=turned(270))
@@ -198,8 +213,12 @@ class TestReward:
 
     def test_standing_still_earns_less_than_turning(self, task, begun):
         """Else policies hold the object where their first stroke ended."""
-        still, turning = (float(task.reward(begun, moment(task, object_quat=turned(0), object_spin=[spin, 0, 0]),
-                                            jnp.bool_(False))[0]) for spin in (0.0, 0.3))
+        still, turning = (
+            float(
+                task.reward(begun, moment(task, object_quat=turned(0), object_spin=[spin, 0, 0]), jnp.bool_(False))[0]
+            )
+            for spin in (0.0, 0.3)
+        )
         assert 0 < still < turning - still
 
     def test_pace_is_a_leaky_mean(self, task, begun):
@@ -252,8 +271,10 @@ class TestDrop:
     def test_patience_ends_training_episodes_only(self, hand):
         task = Rotate(RotateConfig(patience=5 * PERIOD), hand)
         _, waiting = task.evaluation_plan(1, np.zeros(4, int))
-        for goal, gives_up in ((task.begin(jax.random.key(0), None), True),
-                               (jax.tree.map(lambda x: x[0], waiting), False)):
+        for goal, gives_up in (
+            (task.begin(jax.random.key(0), None), True),
+            (jax.tree.map(lambda x: x[0], waiting), False),
+        ):
             lost = []
             for tick in range(9):
                 here = moment(task, object_quat=turned(90 if tick == 2 else 30))
@@ -265,8 +286,11 @@ class TestDrop:
     def test_too_far_away_training_on_a_leash(self, task, begun, hand):
         _, waiting = task.evaluation_plan(1, np.zeros(4, int))
         free = Rotate(RotateConfig(leash=1.0), hand)
-        for rules, goal, limit in ((task, begun, 0.055), (task, jax.tree.map(lambda x: x[0], waiting), 0.07),
-                                   (free, free.begin(jax.random.key(0), None), 0.07)):
+        for rules, goal, limit in (
+            (task, begun, 0.055),
+            (task, jax.tree.map(lambda x: x[0], waiting), 0.07),
+            (free, free.begin(jax.random.key(0), None), 0.07),
+        ):
             for distance, lost in ((limit - 0.001, False), (limit + 0.001, True)):
                 place = np.asarray(task.reference) + [0, 0, distance]
                 assert bool(rules.dropped(goal, moment(task, object_position=place))) == lost
@@ -279,8 +303,8 @@ class TestDrop:
             rotation = Rotation.random(random_state=seed)
             low = np.min(rotation.apply(corners)[:, 0]) + place[0]
             np.testing.assert_allclose(
-                rotate_start.lowest_point(target, quat_of(rotation), jnp.asarray(place)), low,
-                atol=1e-6)
+                rotate_start.lowest_point(target, quat_of(rotation), jnp.asarray(place)), low, atol=1e-6
+            )
 
     def test_lowest_point_of_an_upright_cylinder(self, hand):
         target = rotate_start.sample_target(jax.random.key(3), RotateConfig(object="cylinder"))
@@ -310,19 +334,20 @@ class TestObjects:
         shape = rotate_start.sample_target(jax.random.key(0), config).shape()
         angles = np.radians(np.arange(0, 360, 45))
         ring = 0.1 * np.stack([0 * angles, np.cos(angles), np.sin(angles)], -1)
-        reach = {"cube": np.where(np.arange(8) % 2, 0.05 / math.sqrt(2), 0.025),
-                 "cylinder": np.full(8, 0.025), "octagon": np.full(8, 0.05 / math.sqrt(2))}[kind]
+        reach = {
+            "cube": np.where(np.arange(8) % 2, 0.05 / math.sqrt(2), 0.025),
+            "cylinder": np.full(8, 0.025),
+            "octagon": np.full(8, 0.05 / math.sqrt(2)),
+        }[kind]
         np.testing.assert_allclose(signed_distance(jnp.asarray(ring), shape), 0.1 - reach, atol=1e-6)
         np.testing.assert_allclose(signed_distance(jnp.array([0.1, 0, 0]), shape), 0.075, atol=1e-6)
 
     def test_inertia_of_a_cube(self):
         config = RotateConfig()
-        config = dataclasses.replace(config, objects=dataclasses.replace(
-            config.objects, inertia_scale=(1.0, 1.0)))
+        config = dataclasses.replace(config, objects=dataclasses.replace(config.objects, inertia_scale=(1.0, 1.0)))
         target = rotate_start.sample_target(jax.random.key(1), config)
         edge = 2 * float(target.size[0, 0])
-        np.testing.assert_allclose(target.inertia, np.full(3, float(target.mass) * edge**2 / 6),
-                                   rtol=1e-5)
+        np.testing.assert_allclose(target.inertia, np.full(3, float(target.mass) * edge**2 / 6), rtol=1e-5)
 
 
 class TestPool:
@@ -366,15 +391,23 @@ class TestPool:
     @pytest.mark.parametrize("axis", [(0.6, 0.0, -0.8), (0.0, 0.5, 0.0), (-1.0, 0.0, 0.0), (0.3, -0.5, 0.4)])
     def test_a_cube_stands_on_any_axis(self, axis):
         quat = rotate_start.upright(RotateConfig(axis=axis).unit_axis)
-        np.testing.assert_allclose(Rotation.from_quat(np.roll(quat, -1)).apply([1.0, 0, 0]),
-                                   np.asarray(axis) / np.linalg.norm(axis), atol=1e-6)
+        np.testing.assert_allclose(
+            Rotation.from_quat(np.roll(quat, -1)).apply([1.0, 0, 0]), np.asarray(axis) / np.linalg.norm(axis), atol=1e-6
+        )
         assert rotate_start.upright(RotateConfig(axis=(0.5, 0.0, 0.0)).unit_axis) is None
 
     def test_another_object_is_another_pool(self, hand):
         key, config = jax.random.key(0), RotateConfig()
-        names = {rotate_start._fingerprint(key, hand, c) for c in (
-            config, RotateConfig(edge=(0.05, 0.055)), RotateConfig(tilt=0.1),
-            RotateConfig(support="fingers"), RotateConfig(object="cylinder"))}
+        names = {
+            rotate_start._fingerprint(key, hand, c)
+            for c in (
+                config,
+                RotateConfig(edge=(0.05, 0.055)),
+                RotateConfig(tilt=0.1),
+                RotateConfig(support="fingers"),
+                RotateConfig(object="cylinder"),
+            )
+        }
         assert len(names) == 5
         same = dataclasses.replace(config, reward=RotateReward(bonus=1.0), episode_seconds=5.0)
         assert rotate_start._fingerprint(key, hand, same) in names
@@ -393,13 +426,17 @@ class TestObservation:
         actor = observation.layout(hand, observation.ROTATE, config)
         critic = observation.layout(hand, observation.ROTATE_CRITIC, config)
         assert sum(f.size for f in actor) == 65 and sum(f.size for f in critic) == 149
-        assert critic[:len(actor)] == actor
-        assert {f.name: f.size for f in critic[len(actor):]} == {
-            "object_orientation": 6, "fingertip_velocity": 30, "fingertip_rotation": 30,
-            "joint_velocity": 12, "object_velocity": 3, "object_spin": 3}
+        assert critic[: len(actor)] == actor
+        assert {f.name: f.size for f in critic[len(actor) :]} == {
+            "object_orientation": 6,
+            "fingertip_velocity": 30,
+            "fingertip_rotation": 30,
+            "joint_velocity": 12,
+            "object_velocity": 3,
+            "object_spin": 3,
+        }
 
-    @pytest.mark.parametrize("name, size", [("contact_centre", 15), ("contact_force", 5),
-                                            ("relative_orientation", 6)])
+    @pytest.mark.parametrize("name, size", [("contact_centre", 15), ("contact_force", 5), ("relative_orientation", 6)])
     def test_what_is_left_out_is_gone(self, hand, name, size):
         config = observation.ObservationConfig(leave_out=(name,))
         fields = observation.layout(hand, observation.ROTATE, config)
@@ -410,8 +447,10 @@ class TestObservation:
         joints, speed = rng.uniform(0, 1, 12), rng.normal(size=12)
         with double_precision():
             twist = np.asarray(observation._tip_twist(hand, jnp.asarray(joints), jnp.asarray(speed)))
-            poses = [jax.tree.map(np.asarray, forward_kinematics(
-                hand, jnp.asarray(joints + s * speed * 1e-6))) for s in (-1, 1)]
+            poses = [
+                jax.tree.map(np.asarray, forward_kinematics(hand, jnp.asarray(joints + s * speed * 1e-6)))
+                for s in (-1, 1)
+            ]
         linear = (poses[1].tip_position - poses[0].tip_position) / 2e-6
         np.testing.assert_allclose(twist[:, :3], linear, atol=1e-5)
         turn = [Rotation.from_matrix(np.asarray(p.tip_rotation)) for p in poses]
@@ -423,42 +462,41 @@ class TestOrientationSensor:
     UP = jnp.array([1.0, 0.0, 0.0])
 
     def read(self, sensor, draw, tick, now, before, held, key=0):
-        return measure_orientation(jax.random.key(key), sensor, draw, jnp.float32(tick), now, before,
-                                   held, self.UP, PERIOD)
+        return measure_orientation(
+            jax.random.key(key), sensor, draw, jnp.float32(tick), now, before, held, self.UP, PERIOD
+        )
 
     def test_a_perfect_one_reads_the_truth(self):
         sensor = OrientationSensor(noise=0.0)
         draw = draw_sensor(jax.random.key(0), sensor, 0.0, PERIOD)
         now = turned(40, (0, 0, 1))
-        np.testing.assert_allclose(self.read(sensor, draw, 5, now, turned(10), turned(0)), now,
-                                   atol=1e-6)
+        np.testing.assert_allclose(self.read(sensor, draw, 5, now, turned(10), turned(0)), now, atol=1e-6)
 
     def test_delay_drift_and_bias(self):
         sensor = OrientationSensor(noise=0.0, rate=1000.0)
         draw = draw_sensor(jax.random.key(0), sensor, 0.0, PERIOD)
         late = dataclasses.replace(draw, delay=jnp.float32(0.5))
         read = self.read(sensor, late, 5, turned(10), turned(8), turned(0))
-        assert Rotation.from_quat(np.roll(read, -1)).magnitude() == pytest.approx(
-            math.radians(9), abs=1e-4)
+        assert Rotation.from_quat(np.roll(read, -1)).magnitude() == pytest.approx(math.radians(9), abs=1e-4)
         # q and -q are one orientation: their mean is not a turn.
         read = self.read(sensor, late, 5, turned(10), -turned(8), turned(0))
-        assert Rotation.from_quat(np.roll(read, -1)).magnitude() == pytest.approx(
-            math.radians(9), abs=1e-4)
+        assert Rotation.from_quat(np.roll(read, -1)).magnitude() == pytest.approx(math.radians(9), abs=1e-4)
         drifting = dataclasses.replace(draw, drift=jnp.float32(0.01))
         read = self.read(sensor, drifting, 100, turned(10), turned(10), turned(0))
         expected = math.radians(10) + 0.01 * 100 * PERIOD
         assert Rotation.from_quat(np.roll(read, -1)).magnitude() == pytest.approx(expected, abs=1e-4)
         crooked = dataclasses.replace(draw, bias=jnp.array([0.0, 0.03, 0.0]))
         read = self.read(sensor, crooked, 1, turned(0), turned(0), turned(0))
-        np.testing.assert_allclose(Rotation.from_quat(np.roll(read, -1)).as_rotvec(), [0, 0.03, 0],
-                                   atol=1e-5)
+        np.testing.assert_allclose(Rotation.from_quat(np.roll(read, -1)).as_rotvec(), [0, 0.03, 0], atol=1e-5)
 
     def test_noise_has_the_stated_deviation(self):
         sensor = OrientationSensor(noise=0.05)
         draw = draw_sensor(jax.random.key(0), sensor, 0.0, PERIOD)
-        reads = jax.vmap(lambda k: measure_orientation(
-            k, sensor, draw, jnp.float32(1), turned(0), turned(0), turned(0), self.UP, PERIOD))(
-            jax.random.split(jax.random.key(1), 4000))
+        reads = jax.vmap(
+            lambda k: measure_orientation(
+                k, sensor, draw, jnp.float32(1), turned(0), turned(0), turned(0), self.UP, PERIOD
+            )
+        )(jax.random.split(jax.random.key(1), 4000))
         vectors = Rotation.from_quat(np.roll(reads, -1, axis=1)).as_rotvec()
         np.testing.assert_allclose(vectors.std(0), 0.05, rtol=0.05)
 
@@ -481,11 +519,20 @@ class TestReport:
         n = 4
         zero = np.zeros(n)
         metrics = {
-            "successes": np.array([0.0, 10, 20, 30]), "paper_successes": np.array([1.0, 11, 20, 30]),
-            "time_at_last_success": np.array([0.0, 20, 30, 60]), "spin": np.full(n, np.pi),
-            "joint_speed": np.full(n, 0.5), "action_rate": zero, "tilt": zero,
-            "pushed_out": np.array([1.0, 0, 0, 0]), "slipped": np.array([0.0, 1, 0, 0]),
-            "non_finite": zero, "duty/0": np.full(n, 0.2), "duty/1": zero, "duty/2": np.full(n, 0.05)}
+            "successes": np.array([0.0, 10, 20, 30]),
+            "paper_successes": np.array([1.0, 11, 20, 30]),
+            "time_at_last_success": np.array([0.0, 20, 30, 60]),
+            "spin": np.full(n, np.pi),
+            "joint_speed": np.full(n, 0.5),
+            "action_rate": zero,
+            "tilt": zero,
+            "pushed_out": np.array([1.0, 0, 0, 0]),
+            "slipped": np.array([0.0, 1, 0, 0]),
+            "non_finite": zero,
+            "duty/0": np.full(n, 0.2),
+            "duty/1": zero,
+            "duty/2": np.full(n, 0.05),
+        }
         report = rotate_report.summarize(metrics, np.array([100, 1000, 4000, 4000]), 0.03, 4000)
         assert report["successes"]["mean"]["mean"] == 15
         assert report["successes"]["median"]["median"] == 15
@@ -523,8 +570,7 @@ class TestEnvironment:
         # The cube turned by hand to its first goal: one success, and the clock of goals moves on.
         qpos = np.array(state.physics.qpos)
         qpos[:, 15:] = turned(90)
-        physics = dataclasses.replace(state.physics, qpos=jnp.asarray(qpos),
-                                      qvel=jnp.zeros_like(state.physics.qvel))
+        physics = dataclasses.replace(state.physics, qpos=jnp.asarray(qpos), qvel=jnp.zeros_like(state.physics.qvel))
         after = step(dataclasses.replace(state, physics=physics), jnp.zeros((8, 12)))
         calm = np.abs(np.asarray(after.physics.qvel[:, 15])) < 1.5
         assert calm.sum() >= 4

@@ -62,13 +62,17 @@ def test_quaternion_product_and_inverse_are_mujocos():
 
 def test_products_broadcast_like_matmul():
     matrix, vector = RNG.normal(size=(5, 1, 3, 3)), RNG.normal(size=(4, 3))
-    np.testing.assert_allclose(rotations.rotate(f32(matrix), f32(vector)),
-                               np.einsum("aoij,bj->abi", matrix, vector), rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(rotations.rotate_inverse(f32(matrix), f32(vector)),
-                               np.einsum("aoij,bi->abj", matrix, vector), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(
+        rotations.rotate(f32(matrix), f32(vector)), np.einsum("aoij,bj->abi", matrix, vector), rtol=1e-5, atol=1e-6
+    )
+    np.testing.assert_allclose(
+        rotations.rotate_inverse(f32(matrix), f32(vector)),
+        np.einsum("aoij,bi->abj", matrix, vector),
+        rtol=1e-5,
+        atol=1e-6,
+    )
     other = RNG.normal(size=(4, 3, 3))
-    np.testing.assert_allclose(rotations.compose(f32(matrix), f32(other)), matrix @ other,
-                               rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(rotations.compose(f32(matrix), f32(other)), matrix @ other, rtol=1e-5, atol=1e-6)
 
 
 def test_a_quarter_turn_by_hand():
@@ -104,8 +108,7 @@ def test_six_d_is_two_columns_and_comes_back():
 
 def test_six_d_of_any_two_vectors_is_a_rotation():
     matrix = np.asarray(rotations.matrix_from_6d(f32(RNG.normal(size=(64, 6)) * 3)), float)
-    np.testing.assert_allclose(matrix @ matrix.transpose(0, 2, 1), np.tile(np.eye(3), (64, 1, 1)),
-                               atol=1e-5)
+    np.testing.assert_allclose(matrix @ matrix.transpose(0, 2, 1), np.tile(np.eye(3), (64, 1, 1)), atol=1e-5)
     np.testing.assert_allclose(np.linalg.det(matrix), 1.0, atol=1e-5)
 
 

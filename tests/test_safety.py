@@ -22,9 +22,13 @@ def sample(time, position=MIDDLE, *, velocity=0.0, force=0.0, current=0.1, tempe
     taxels = np.zeros((5, 120), np.float32)
     taxels[:, 0] = force
     measured = Measured(
-        joint_position=np.array(position, np.float32), joint_torque=np.zeros(12, np.float32), taxel_force=taxels,
-        current=np.full(12, current, np.float32), temperature=np.full(17, temperature, np.float32),
-        errors=np.zeros((12, 3), np.uint16))
+        joint_position=np.array(position, np.float32),
+        joint_torque=np.zeros(12, np.float32),
+        taxel_force=taxels,
+        current=np.full(12, current, np.float32),
+        temperature=np.full(17, temperature, np.float32),
+        errors=np.zeros((12, 3), np.uint16),
+    )
     return Sample(time, 0, generation, measured, np.full(12, velocity, np.float32))
 
 
@@ -199,6 +203,7 @@ def test_a_reconnected_hand_starts_from_its_pose(bench):
 @pytest.mark.parametrize("back", [{"generation": 2}, {}])
 def test_a_hand_that_was_away_during_a_hold_is_held_where_it_then_is(bench, back):
     """Its motors were off meanwhile, by its own watchdog if not by a new connection: the pose of before is history."""
+
     def unseen(**event):
         bench.safety.wish(MIDDLE, bench.now, "the object is out of sight")
         return bench.cycle(**event)
@@ -220,11 +225,20 @@ def test_changes_are_noted_once(bench):
     assert bench.safety.counts["a fingertip presses too hard"] == round(0.5 / CYCLE)
 
 
-EVENT = st.fixed_dictionaries({
-    "wish": st.one_of(st.none(), st.floats(width=32), st.lists(st.floats(-20, 20, width=32), min_size=12, max_size=12)),
-    "fresh": st.booleans(), "velocity": st.sampled_from([0.0, 5.0, 50.0]), "force": st.sampled_from([0.0, 5.0, 30.0]),
-    "current": st.sampled_from([0.1, 3.0]), "temperature": st.sampled_from([30.0] * 9 + [80.0]),
-    "generation": st.sampled_from([1, 1, 1, 2]), "follow": st.booleans()})
+EVENT = st.fixed_dictionaries(
+    {
+        "wish": st.one_of(
+            st.none(), st.floats(width=32), st.lists(st.floats(-20, 20, width=32), min_size=12, max_size=12)
+        ),
+        "fresh": st.booleans(),
+        "velocity": st.sampled_from([0.0, 5.0, 50.0]),
+        "force": st.sampled_from([0.0, 5.0, 30.0]),
+        "current": st.sampled_from([0.1, 3.0]),
+        "temperature": st.sampled_from([30.0] * 9 + [80.0]),
+        "generation": st.sampled_from([1, 1, 1, 2]),
+        "follow": st.booleans(),
+    }
+)
 
 
 @settings(max_examples=60)
@@ -257,9 +271,17 @@ def test_limits_have_ranges():
     assert dataclasses.replace(SafetyConfig(), stale=0.1).stale == 0.1
 
 
-@pytest.mark.parametrize(("rate", "policy", "expected"), [
-    (83.0, 100 / 3, 250 / 3), (83.0, 25.0, 83.0), (99.5, 25.0, 100.0), (83.0, 83.0, 83.0), (40.0, 1000.0, 40.0),
-    (12.4, 25.0, 12.5)])
+@pytest.mark.parametrize(
+    ("rate", "policy", "expected"),
+    [
+        (83.0, 100 / 3, 250 / 3),
+        (83.0, 25.0, 83.0),
+        (99.5, 25.0, 100.0),
+        (83.0, 83.0, 83.0),
+        (40.0, 1000.0, 40.0),
+        (12.4, 25.0, 12.5),
+    ],
+)
 def test_exchanges_keep_their_phase_with_the_policy(rate, policy, expected):
     kept = keep_phase(rate, policy)
     assert kept == pytest.approx(expected)

@@ -14,8 +14,13 @@ from dexsim import sdf
 from dexsim.errors import ConfigError
 
 EYE = np.eye(3, dtype=np.float32)
-SIZES = {"sphere": (0.031, 0, 0), "box": (0.02, 0.035, 0.012), "capsule": (0.013, 0.022, 0),
-         "cylinder": (0.024, 0.017, 0), "ellipsoid": (0.037, 0.016, 0.025)}
+SIZES = {
+    "sphere": (0.031, 0, 0),
+    "box": (0.02, 0.035, 0.012),
+    "capsule": (0.013, 0.022, 0),
+    "cylinder": (0.024, 0.017, 0),
+    "ellipsoid": (0.037, 0.016, 0.025),
+}
 
 
 # --- an independent reference: the surface in patches, float64 -----------------------------------
@@ -74,8 +79,11 @@ def nearest_point(kind, size, points):
                 face[:, axis] = side * size[axis]
                 patches.append(face)
     elif kind == "cylinder":
-        patches = [radial(points, np.full(len(points), a), np.clip(points[:, 2], -b, b)),
-                   radial(points, np.minimum(across, a), b), radial(points, np.minimum(across, a), -b)]
+        patches = [
+            radial(points, np.full(len(points), a), np.clip(points[:, 2], -b, b)),
+            radial(points, np.minimum(across, a), b),
+            radial(points, np.minimum(across, a), -b),
+        ]
     else:  # capsule; beyond the tube's ends only the half of a ball that looks outwards is surface
         patches = [radial(points, np.full(len(points), a), np.clip(points[:, 2], -b, b))]
         for side in (-1, 1):
@@ -88,11 +96,13 @@ def nearest_point(kind, size, points):
 def is_inside(kind, size, points):
     a, b, _ = size
     across, z = np.linalg.norm(points[:, :2], axis=1), np.abs(points[:, 2])
-    return {"sphere": lambda: np.hypot(across, z) < a,
-            "box": lambda: np.all(np.abs(points) < size, axis=1),
-            "cylinder": lambda: (across < a) & (z < b),
-            "capsule": lambda: np.hypot(across, np.maximum(z - b, 0)) < a,
-            "ellipsoid": lambda: np.sum((points / size) ** 2, axis=1) < 1}[kind]()
+    return {
+        "sphere": lambda: np.hypot(across, z) < a,
+        "box": lambda: np.all(np.abs(points) < size, axis=1),
+        "cylinder": lambda: (across < a) & (z < b),
+        "capsule": lambda: np.hypot(across, np.maximum(z - b, 0)) < a,
+        "ellipsoid": lambda: np.sum((points / size) ** 2, axis=1) < 1,
+    }[kind]()
 
 
 def reference(kind, size, points):
@@ -142,8 +152,13 @@ def one(kind, size, position=(0, 0, 0), rotation=EYE):
     count, at = len(sdf.KINDS), sdf.KINDS.index(kind)
     sizes = np.full((count, 3), 1e-4, np.float32)
     sizes[at] = size
-    return sdf.Shape(sdf.KINDS, sizes, np.tile(np.float32(position), (count, 1)),
-                     np.tile(np.float32(rotation), (count, 1, 1)), np.arange(count) == at)
+    return sdf.Shape(
+        sdf.KINDS,
+        sizes,
+        np.tile(np.float32(position), (count, 1)),
+        np.tile(np.float32(rotation), (count, 1, 1)),
+        np.arange(count) == at,
+    )
 
 
 def random_rotation(rng):
@@ -174,10 +189,20 @@ def test_ellipsoids_of_all_proportions(size):
 
 
 def test_distances_by_hand():
-    cases = (("sphere", (0, 0, 0.05), 0.019), ("box", (0.05, 0, 0), 0.03), ("box", (0, 0, 0), -0.012),
-             ("box", (0.023, 0.039, 0), 0.005), ("capsule", (0, 0, 0.05), 0.015), ("capsule", (0.02, 0, 0.01), 0.007),
-             ("cylinder", (0, 0, 0.02), 0.003), ("cylinder", (0.027, 0, 0.021), 0.005), ("cylinder", (0, 0, 0), -0.017),
-             ("ellipsoid", (0.04, 0, 0), 0.003), ("ellipsoid", (0, 0, 0), -0.016), ("ellipsoid", (0, 0.015, 0), -0.001))
+    cases = (
+        ("sphere", (0, 0, 0.05), 0.019),
+        ("box", (0.05, 0, 0), 0.03),
+        ("box", (0, 0, 0), -0.012),
+        ("box", (0.023, 0.039, 0), 0.005),
+        ("capsule", (0, 0, 0.05), 0.015),
+        ("capsule", (0.02, 0, 0.01), 0.007),
+        ("cylinder", (0, 0, 0.02), 0.003),
+        ("cylinder", (0.027, 0, 0.021), 0.005),
+        ("cylinder", (0, 0, 0), -0.017),
+        ("ellipsoid", (0.04, 0, 0), 0.003),
+        ("ellipsoid", (0, 0, 0), -0.016),
+        ("ellipsoid", (0, 0.015, 0), -0.001),
+    )
     for kind, point, wanted in cases:
         ours = distance(np.float32([point]), one(kind, SIZES[kind]))
         np.testing.assert_allclose(ours, [wanted], atol=1e-6, err_msg=f"{kind} {point}")
@@ -203,8 +228,7 @@ def test_normals_are_the_gradient_of_the_distance(kind):
     points = (np.where(size > 0, size, size.max()) * rng.uniform(-1.5, 1.5, (150, 3))).astype(np.float32)
     shape, step = one(kind, SIZES[kind]), 1e-4
     middle, normal = distance_and_normal(points, shape)
-    ahead, behind = (np.stack([distance(points + sign * step * axis, shape) for axis in EYE], -1)
-                     for sign in (1, -1))
+    ahead, behind = (np.stack([distance(points + sign * step * axis, shape) for axis in EYE], -1) for sign in (1, -1))
     # Where the two one-sided slopes differ lies a ridge (equally near to two faces): no gradient there.
     smooth = np.all(np.abs(ahead + behind - 2 * np.asarray(middle)[:, None]) < 0.02 * step, axis=1)
     assert smooth.mean() > 0.8 and (np.asarray(middle)[smooth] < 0).sum() > 10
@@ -223,8 +247,10 @@ def test_gradients_are_finite_at_the_centre_and_on_the_axes(kind):
 @jax.jit
 def pose_gradients(points, shape):
     """Gradient of the sum of distances in points, sizes, positions and rotations."""
+
     def total(points, size, position, rotation):
         return jnp.sum(sdf.signed_distance(points, sdf.Shape(shape.kinds, size, position, rotation, shape.active)))
+
     return jax.grad(total, argnums=(0, 1, 2, 3))(points, shape.size, shape.position, shape.rotation)
 
 
@@ -234,8 +260,13 @@ def test_size_gradients(kind):
     pole = np.zeros((1, 3), np.float32)
     pole[0, 2] = 0.06
     gradient = pose_gradients(np.tile(pole, (10, 1)), one(kind, SIZES[kind]))[1][sdf.KINDS.index(kind)] / 10
-    wanted = {"sphere": [-1, 0, 0], "box": [0, 0, -1], "capsule": [-1, -1, 0], "cylinder": [0, -1, 0],
-              "ellipsoid": [0, 0, -1]}[kind]
+    wanted = {
+        "sphere": [-1, 0, 0],
+        "box": [0, 0, -1],
+        "capsule": [-1, -1, 0],
+        "cylinder": [0, -1, 0],
+        "ellipsoid": [0, 0, -1],
+    }[kind]
     np.testing.assert_allclose(gradient, wanted, atol=1e-4)
 
 
@@ -276,8 +307,7 @@ def posed_union(seed):
     position = rng.uniform(-0.02, 0.02, (4, 3))
     position[3] += 0.2
     rotation = np.stack([random_rotation(rng) for _ in kinds])
-    shape = sdf.Shape(kinds, *(jnp.asarray(x, jnp.float32) for x in (size, position, rotation)),
-                      jnp.ones(4, bool))
+    shape = sdf.Shape(kinds, *(jnp.asarray(x, jnp.float32) for x in (size, position, rotation)), jnp.ones(4, bool))
     return kinds, size, position, rotation, shape
 
 
@@ -293,8 +323,9 @@ def test_union_is_exact_outside(seed):
                 points = points[~is_inside(name, size[other], (points - position[other]) @ rotation[other])]
         skin.append(points)
     probe = np.random.default_rng(seed + 10).uniform(-0.09, 0.09, (400, 3))
-    inside = np.any([is_inside(kind, size[k], (probe - position[k]) @ rotation[k])
-                     for k, kind in enumerate(kinds)], axis=0)
+    inside = np.any(
+        [is_inside(kind, size[k], (probe - position[k]) @ rotation[k]) for k, kind in enumerate(kinds)], axis=0
+    )
     ours = np.asarray(distance(probe.astype(np.float32), shape))
     assert np.array_equal(ours < 0, inside) and inside.sum() > 3
     gap = cKDTree(np.concatenate(skin)).query(probe[~inside])[0]
@@ -339,8 +370,10 @@ def test_distance_of_a_batch_is_the_loop(hand):
     points = jnp.asarray(hand.taxel_position[1])
 
     def shape(size):
-        return sdf.Shape(("box", "ellipsoid"), size, jnp.zeros((2, 3)), jnp.tile(jnp.eye(3), (2, 1, 1)),
-                         jnp.array([True, True]))
+        return sdf.Shape(
+            ("box", "ellipsoid"), size, jnp.zeros((2, 3)), jnp.tile(jnp.eye(3), (2, 1, 1)), jnp.array([True, True])
+        )
+
     batch = jax.jit(jax.vmap(lambda size: sdf.signed_distance(points, shape(size))))(sizes)
     for row, size in zip(batch, sizes, strict=True):
         np.testing.assert_allclose(row, distance(points, shape(size)), atol=1e-7)

@@ -31,6 +31,7 @@ def state(**joint):
 
 # --- the hand ------------------------------------------------------------------------------------
 
+
 def test_angles_have_sign_and_offset_both_ways(hand):
     sign = np.where(np.arange(12) == 3, -1.0, 1.0)
     offset = np.linspace(-0.1, 0.1, 12)
@@ -91,13 +92,33 @@ def test_current_without_and_with_a_calibration(hand, tmp_path):
 
     def side(gain, offset):
         pair = np.ones((2, 12))
-        return Side(pair * gain, pair, pair, pair * offset, pair, pair, pair, pair, pair, pair, pair,
-                    np.ones(12), np.ones(12), np.ones(12))
+        return Side(
+            pair * gain,
+            pair,
+            pair,
+            pair * offset,
+            pair,
+            pair,
+            pair,
+            pair,
+            pair,
+            pair,
+            pair,
+            np.ones(12),
+            np.ones(12),
+            np.ones(12),
+        )
 
     # current = -0.05 F - 0.02 A and torque = 0.04 F Nm, so torque = -0.8 (current + 0.02).
     calibration = Calibration(
-        side(-0.05, -0.02), side(0.04, 0.0), hand.torque_limit, np.full(5, 0.2), hand=hand.name,
-        joint_names=hand.joint_names, finger_names=hand.finger_names)
+        side(-0.05, -0.02),
+        side(0.04, 0.0),
+        hand.torque_limit,
+        np.full(5, 0.2),
+        hand=hand.name,
+        joint_names=hand.joint_names,
+        finger_names=hand.finger_names,
+    )
     save_calibration(tmp_path / "hand.toml", calibration)
     sensing = HandSensing(hand, HardwareConfig(), load_calibration(tmp_path / "hand.toml", hand))
     block = state(current=counts)
@@ -176,13 +197,15 @@ def test_orientations_survive_the_wire(yaw, pitch, roll, index):
 
 
 @settings(max_examples=50)
-@given(st.lists(st.one_of(st.binary(max_size=30), st.just(b"\xaa"), st.just(DATASHEET[:9])), max_size=20),
-       st.integers(1, 40))
+@given(
+    st.lists(st.one_of(st.binary(max_size=30), st.just(b"\xaa"), st.just(DATASHEET[:9])), max_size=20),
+    st.integers(1, 40),
+)
 def test_the_imu_parser_recovers_from_noise(parts, size):
     stream = b"".join(parts) + 4 * DATASHEET
     parser, found = imu.RvcParser(), []
     for at in range(0, len(stream), size):
-        found += parser.feed(stream[at:at + size])
+        found += parser.feed(stream[at : at + size])
         assert len(parser._buffer) <= imu.SIZE + size
     # One in 256 false heads passes the checksum, and then takes the next frame's beginning with it.
     assert len(found) >= 3 and all(apart(quat, imu.decode(DATASHEET)) < 1e-6 for quat in found[-3:])
@@ -198,8 +221,10 @@ def test_alignment_takes_heading_from_the_known_pose_and_tilt_from_gravity(headi
     axis = np.cross([0, 0, 1.0], up)
     axis /= np.linalg.norm(axis)
     half = math.acos(up[2]) / 2
-    world = imu.multiply(np.array([math.cos(half), *(math.sin(half) * axis)]),
-                         np.array([math.cos(heading / 2), 0, 0, math.sin(heading / 2)]))
+    world = imu.multiply(
+        np.array([math.cos(half), *(math.sin(half) * axis)]),
+        np.array([math.cos(heading / 2), 0, 0, math.sin(heading / 2)]),
+    )
     truth = np.array([1.0, 0, 0, 0])
     found = imu.align(imu.multiply(imu.conjugate(world), truth), truth, up)
     turned = np.array([math.cos(later / 2), *(math.sin(later / 2) * up)])
@@ -235,6 +260,7 @@ def test_the_imu_thread_reads_a_port():
 
 # --- goals ---------------------------------------------------------------------------------------
 
+
 def seen(angle, axis=(1.0, 0, 0), place=(0.048, 0.0, 0.085)):
     quat = np.array([math.cos(angle / 2), *(math.sin(angle / 2) * np.array(axis))])
     return ObjectEstimate(np.array(place), np.zeros(3), quat)
@@ -267,25 +293,30 @@ def test_a_goal_passed_at_speed_or_far_away_does_not_count():
 
 # --- camera --------------------------------------------------------------------------------------
 
+
 def project(point, config):
     right, down, forward = vision.camera_axes(config)
     at = np.asarray(point) - np.asarray(config.position)
     depth = at @ forward
     return config.centre[0] + config.focal[0] * (at @ right) / depth, config.centre[1] + config.focal[1] * (
-        at @ down) / depth
+        at @ down
+    ) / depth
 
 
 def picture(point, config, radius=9, shape=(480, 640)):
     column, row = project(point, config)
-    rows, columns = np.mgrid[:shape[0], :shape[1]]
+    rows, columns = np.mgrid[: shape[0], : shape[1]]
     return (rows - row) ** 2 + (columns - column) ** 2 <= radius**2
 
 
 @settings(max_examples=25)
 @given(st.floats(0.0, 0.12), st.floats(-0.3, 0.3), st.floats(-0.2, 0.2))
 def test_height_from_a_mask(height, yaw, pitch):
-    config = CameraConfig(position=(0.05 + 0.4 * math.sin(pitch), 0.5, 0.1 + 0.3 * math.sin(yaw)),
-                          forward=(-math.sin(pitch), -1.0, -math.sin(yaw) * 0.6), down=(1.0, 0.2, 0.1))
+    config = CameraConfig(
+        position=(0.05 + 0.4 * math.sin(pitch), 0.5, 0.1 + 0.3 * math.sin(yaw)),
+        forward=(-math.sin(pitch), -1.0, -math.sin(yaw) * 0.6),
+        down=(1.0, 0.2, 0.1),
+    )
     reference = np.array([0.055, -0.005, 0.09])
     truth = reference.copy()
     truth[0] = height

@@ -96,13 +96,14 @@ def test_fits_are_kept_in_a_file(tmp_path):
 def test_useless_recordings_are_refused():
     good = recording(7)
     for press, words in (
-            (Press(force=good.force[:5], reading=good.reading[:5]), "5 samples"),
-            (Press(force=np.full(150, 2.0), reading=good.reading), "different forces"),
-            (Press(force=good.force, reading=good.reading[:20]), r"expected \[T\]"),
-            (Press(force=good.force, reading=0 * good.reading), "above the activation threshold"),
-            (Press(force=good.force, reading=100 - good.reading), "do not rise"),
-            (Press(force=np.where(good.force > 7, np.nan, good.force), reading=good.reading), "not finite"),
-            (Press(force=good.force, reading=good.reading, depth=good.reading), "areas")):
+        (Press(force=good.force[:5], reading=good.reading[:5]), "5 samples"),
+        (Press(force=np.full(150, 2.0), reading=good.reading), "different forces"),
+        (Press(force=good.force, reading=good.reading[:20]), r"expected \[T\]"),
+        (Press(force=good.force, reading=0 * good.reading), "above the activation threshold"),
+        (Press(force=good.force, reading=100 - good.reading), "do not rise"),
+        (Press(force=np.where(good.force > 7, np.nan, good.force), reading=good.reading), "not finite"),
+        (Press(force=good.force, reading=good.reading, depth=good.reading), "areas"),
+    ):
         with pytest.raises(DexsimError, match=words) as caught:
             fit_finger(press)
         assert "\n" not in str(caught.value)

@@ -14,8 +14,18 @@ from dexsim.sensor_noise import SensorNoise, neighbour_difference
 GRID, FINGERS, PERIOD = (10, 12), 5, 0.02
 SHAPE = (FINGERS, GRID[0] * GRID[1])
 KEY = jax.random.key(0)
-OFF = SensorNoise(hysteresis=None, crosstalk=None, gain=None, bias=None, drift=None, noise=None, dead=None,
-                  threshold=None, counts="none", rate=None)
+OFF = SensorNoise(
+    hysteresis=None,
+    crosstalk=None,
+    gain=None,
+    bias=None,
+    drift=None,
+    noise=None,
+    dead=None,
+    threshold=None,
+    counts="none",
+    rate=None,
+)
 
 
 def model(**effects):
@@ -33,6 +43,7 @@ def run(sensor, force, key=KEY):
 
     def step(state, inputs):
         return sensor.apply(params, state, *inputs)
+
     keys = jax.random.split(jax.random.fold_in(key, 1), len(force))
     return np.asarray(jax.jit(lambda: jax.lax.scan(step, sensor.init(), (keys, jnp.asarray(force))))()[1]), params
 
@@ -188,9 +199,12 @@ def test_all_at_once_under_vmap():
 def test_settings_survive_the_round_trip_and_bad_ones_are_refused():
     config = dataclasses.replace(SensorNoise(), rate=(20.0, 30.0), dead=None)
     assert from_dict(SensorNoise, to_dict(config)) == config
-    for fields, words in (({"gain": (1.2, 0.8)}, r"SensorNoise\.gain"), ({"dead": (0.0, 1.5)}, r"SensorNoise\.dead"),
-                          ({"counts": "int4"}, r"SensorNoise\.counts"),
-                          ({"gain": (0.05, 1.0), "scale": 2.0}, "reaches below 0"),
-                          ({"hysteresis": (0.0, 0.9), "scale": 2.0}, "exceeds 1")):
+    for fields, words in (
+        ({"gain": (1.2, 0.8)}, r"SensorNoise\.gain"),
+        ({"dead": (0.0, 1.5)}, r"SensorNoise\.dead"),
+        ({"counts": "int4"}, r"SensorNoise\.counts"),
+        ({"gain": (0.05, 1.0), "scale": 2.0}, "reaches below 0"),
+        ({"hysteresis": (0.0, 0.9), "scale": 2.0}, "exceeds 1"),
+    ):
         with pytest.raises(ConfigError, match=words):
             SensorNoise(**fields)

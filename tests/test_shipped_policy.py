@@ -14,8 +14,12 @@ from dexsim.tasks import TASKS
 from dexsim_ppo.policy import Policy, layout_to_list
 from dexsim_real.sensing import sources_of
 
-SHIPPED = {"grasp": (GRASP, 66), "rotate": (ROTATE, 65), "rotate_without_orientation": (ROTATE, 59),
-           "rotate_clear": (ROTATE, 65)}
+SHIPPED = {
+    "grasp": (GRASP, 66),
+    "rotate": (ROTATE, 65),
+    "rotate_without_orientation": (ROTATE, 59),
+    "rotate_clear": (ROTATE, 65),
+}
 
 
 def load(name):
@@ -42,14 +46,21 @@ def test_the_command_is_heard():
 def test_the_goal_is_seen():
     fields = [field.name for field in load("rotate").observation_layout]
     assert fields[1] == "relative_orientation"
-    near, far = (np.asarray(load("rotate")(jnp.zeros(65).at[12:18].set(jnp.array(sixd))))
-                 for sixd in ([1.0, 0, 0, 0, 1, 0], [1.0, 0, 0, 0, 0, 1]))
+    near, far = (
+        np.asarray(load("rotate")(jnp.zeros(65).at[12:18].set(jnp.array(sixd))))
+        for sixd in ([1.0, 0, 0, 0, 1, 0], [1.0, 0, 0, 0, 0, 1])
+    )
     assert np.max(np.abs(near - far)) > 1e-3
 
 
-@pytest.mark.parametrize(("name", "sources"), [
-    ("grasp", {"hand", "camera", "user"}), ("rotate", {"hand", "imu", "policy"}),
-    ("rotate_without_orientation", {"hand", "policy"})])
+@pytest.mark.parametrize(
+    ("name", "sources"),
+    [
+        ("grasp", {"hand", "camera", "user"}),
+        ("rotate", {"hand", "imu", "policy"}),
+        ("rotate_without_orientation", {"hand", "policy"}),
+    ],
+)
 def test_the_sensors_it_needs(name, sources):
     assert sources_of([field.name for field in load(name).observation_layout]) == sources
 

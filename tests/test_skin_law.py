@@ -50,8 +50,11 @@ def hold(hand, start, rng, law):
         mujoco.mj_forward(model, data)
         if np.linalg.norm(data.qpos[12:15] - Grasp.reference) < 0.1:
             force = np.linalg.norm(c_scene.finger_force(model, data, hand), axis=-1)
-            pads = [-c.dist for c in data.contact if "_pad" in model.geom(c.geom[0]).name
-                    and model.geom(c.geom[1]).name in c_scene.KINDS]
+            pads = [
+                -c.dist
+                for c in data.contact
+                if "_pad" in model.geom(c.geom[0]).name and model.geom(c.geom[1]).name in c_scene.KINDS
+            ]
             found.append((data.qpos.copy(), force, max(pads, default=0.0)))
     return found
 
@@ -59,8 +62,7 @@ def hold(hand, start, rng, law):
 @pytest.fixture(scope="module")
 def grips(hand):
     """By shape: (force by the solver, by the skin's law) [2, n, 5] N, and the deepest contacts [n] m."""
-    pool = make_pool(jax.random.key(11), hand, GraspConfig(pool_size=OBJECTS * len(SHAPES)),
-                     Grasp.reference)
+    pool = make_pool(jax.random.key(11), hand, GraspConfig(pool_size=OBJECTS * len(SHAPES)), Grasp.reference)
     law, rng, found = c_scene.skin_law(hand, Skin()), np.random.default_rng(5), {}
     for shape in SHAPES:
         rows, held = [], []
@@ -84,10 +86,12 @@ def test_it_follows_the_solvers_force(grips, shape):
     pairs, depth = grips[shape][0], 1e3 * np.percentile(grips[shape][1], [50, 90, 99])
     force, felt = pairs[:, pairs[0] > 0.01]
     r_sum = np.corrcoef(*pairs.sum(-1))[0, 1]
-    print(f"{shape}: r = {pearson(pairs):.3f} of {force.size} fingers, {r_sum:.3f} of "
-          f"{pairs.shape[1]} hands, gain {np.sum(force * felt) / np.sum(force**2):.2f}, "
-          f"median and largest force {np.median(force):.1f} and {force.max():.1f} N, "
-          f"deepest contact of a hand {depth.round(1)} mm (50, 90, 99 %)")
+    print(
+        f"{shape}: r = {pearson(pairs):.3f} of {force.size} fingers, {r_sum:.3f} of "
+        f"{pairs.shape[1]} hands, gain {np.sum(force * felt) / np.sum(force**2):.2f}, "
+        f"median and largest force {np.median(force):.1f} and {force.max():.1f} N, "
+        f"deepest contact of a hand {depth.round(1)} mm (50, 90, 99 %)"
+    )
     assert force.size > 150 and np.ptp(force) > 10
     assert pearson(pairs) >= 0.9
 

@@ -32,7 +32,8 @@ def scene(first, second):
 
 def candidates(model, data):
     gap, point, normal = collide.find_collider(model).touch(
-        *(jnp.asarray(x, jnp.float32) for x in (data.geom_xpos, data.geom_xmat.reshape(-1, 3, 3), model.geom_size)))
+        *(jnp.asarray(x, jnp.float32) for x in (data.geom_xpos, data.geom_xmat.reshape(-1, 3, 3), model.geom_size))
+    )
     return np.asarray(gap), np.asarray(point), np.asarray(normal)
 
 
@@ -104,8 +105,8 @@ PALM, CUBE = np.array([0.02, 0.0455, 0.0535]), np.array([0.0275, 0.0275, 0.0275]
 def boxes():
     """A palm and a cube; C MuJoCo's own contacts of boxes, not its convex ones."""
     model = mujoco.MjModel.from_xml_string(f"""<mujoco><option><flag nativeccd="disable"/></option><worldbody>
-      <body><freejoint/><geom name="a" type="box" size="{' '.join(map(str, PALM))}" contype="0" conaffinity="0"/></body>
-      <body><freejoint/><geom name="b" type="box" size="{' '.join(map(str, CUBE))}" contype="0" conaffinity="0"/></body>
+      <body><freejoint/><geom name="a" type="box" size="{" ".join(map(str, PALM))}" contype="0" conaffinity="0"/></body>
+      <body><freejoint/><geom name="b" type="box" size="{" ".join(map(str, CUBE))}" contype="0" conaffinity="0"/></body>
       </worldbody><contact><pair geom1="a" geom2="b"/></contact></mujoco>""")
     touch = jax.jit(collide.find_collider(model).touch)
 
@@ -116,8 +117,15 @@ def boxes():
         data.qpos[7:10] = stand.apply(np.array([0.1, -0.2, 0.3]) + place)
         data.qpos[10:] = np.roll((stand * turn).as_quat(), 1)
         mujoco.mj_forward(model, data)
-        gap, point, normal = (np.asarray(x) for x in touch(*(jnp.asarray(x, jnp.float32) for x in (
-            data.geom_xpos, data.geom_xmat.reshape(-1, 3, 3), model.geom_size))))
+        gap, point, normal = (
+            np.asarray(x)
+            for x in touch(
+                *(
+                    jnp.asarray(x, jnp.float32)
+                    for x in (data.geom_xpos, data.geom_xmat.reshape(-1, 3, 3), model.geom_size)
+                )
+            )
+        )
         mine = gap < 0
         frames = data.geom_xmat.reshape(2, 3, 3)
         found = data.contact.dist, data.contact.pos, data.contact.frame[:, :3]
@@ -177,17 +185,23 @@ def problem(rng, contacts=6, dofs=10):
     weight = 10 ** rng.uniform(-1, 1, (contacts, 1)) * [1.0, 20.0, 20.0]
     friction = rng.uniform(0.3, 1.2, (contacts, 1))
     rows = newton.Rows(
-        jacobian=rng.normal(size=(contacts, 3, dofs)), wanted=rng.normal(size=(contacts, 3)) * [3, 0.3, 0.3],
-        weight=weight, scale=friction * [20**-0.5, 1.0, 1.0], limit_side=rng.choice([-1.0, 1.0], dofs),
-        limit_wanted=rng.normal(size=dofs), limit_weight=rng.uniform(0, 1, dofs) * (rng.random(dofs) < 0.5))
+        jacobian=rng.normal(size=(contacts, 3, dofs)),
+        wanted=rng.normal(size=(contacts, 3)) * [3, 0.3, 0.3],
+        weight=weight,
+        scale=friction * [20**-0.5, 1.0, 1.0],
+        limit_side=rng.choice([-1.0, 1.0], dofs),
+        limit_wanted=rng.normal(size=dofs),
+        limit_weight=rng.uniform(0, 1, dofs) * (rng.random(dofs) < 0.5),
+    )
     args = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), rows)
     return rows, args, (root @ root.T + np.eye(dofs)).astype(np.float32), rng.normal(size=dofs).astype(np.float32)
 
 
 def test_the_solver_ends_where_forces_balance():
     """M a = f + J' c + limits, with contact forces inside their cones."""
-    solve = jax.jit(lambda rows, mass, force: newton.solve(
-        rows, mass, force, jnp.zeros_like(force), iterations=30, line_search=10))
+    solve = jax.jit(
+        lambda rows, mass, force: newton.solve(rows, mass, force, jnp.zeros_like(force), iterations=30, line_search=10)
+    )
     rng, sticking, sliding = np.random.default_rng(2), 0, 0
     for _ in range(20):
         rows, args, mass, force = problem(rng)
@@ -227,8 +241,10 @@ def test_gradients_go_through_the_solver():
 
 @pytest.mark.parametrize("change", [{"cone": "pyramidal"}, {"condim": 4}, {"condim": 1}, {"contacts": "mjx"}])
 def test_other_cones_and_whoever_asks_are_left_to_mjx(hand, change):
-    plain, other = (Physics(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(**extra), gravity=GRAVITY,
-                            backend="jax") for extra in ({}, change))
+    plain, other = (
+        Physics(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(**extra), gravity=GRAVITY, backend="jax")
+        for extra in ({}, change)
+    )
     assert plain._stepper is not None and other._stepper is None
 
 
@@ -241,16 +257,30 @@ def test_mjx_step_agrees(hand, grasp_env):
     begun = [c_scene.squeeze(hand, start, rng) for start in starts]
     qpos, qvel, warmstart, torque = (jnp.stack(x) for x in list(zip(*begun, strict=True))[1:])
     target = c_scene.stack([start.target for start in starts])
-    alone = dataclasses.replace(target, kinds=("capsule",), **{
-        name: getattr(target, name)[:, one:one + 1] for name in ("size", "position", "active")})
+    alone = dataclasses.replace(
+        target,
+        kinds=("capsule",),
+        **{name: getattr(target, name)[:, one : one + 1] for name in ("size", "position", "active")},
+    )
     found = []
     for contacts in ("closed", "mjx"):
-        seam = Physics(hand, ("capsule",), ObjectConfig().largest[one:one + 1],
-                       PhysicsConfig(substeps=1, contacts=contacts, **c_scene.CONVERGED), gravity=GRAVITY,
-                       backend="jax")
-        found.append(jax.jit(jax.vmap(lambda target, state, torque, seam=seam: seam.advance(
-            target, state, lambda *_: torque, jnp.zeros(3))))(
-                alone, PhysicsState(qpos, qvel, warmstart), torque))
+        seam = Physics(
+            hand,
+            ("capsule",),
+            ObjectConfig().largest[one : one + 1],
+            PhysicsConfig(substeps=1, contacts=contacts, **c_scene.CONVERGED),
+            gravity=GRAVITY,
+            backend="jax",
+        )
+        found.append(
+            jax.jit(
+                jax.vmap(
+                    lambda target, state, torque, seam=seam: seam.advance(
+                        target, state, lambda *_: torque, jnp.zeros(3)
+                    )
+                )
+            )(alone, PhysicsState(qpos, qvel, warmstart), torque)
+        )
     (ours, our_force), (theirs, force) = found
     assert np.sum(np.linalg.norm(force, axis=-1).max(-1) > 0.5) >= 3
     np.testing.assert_allclose(our_force, force, atol=0.02)

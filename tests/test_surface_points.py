@@ -11,22 +11,32 @@ from dexsim.distance import DistanceConfig
 from dexsim.errors import ConfigError
 from dexsim.surface_points import PointsConfig
 
-SIZES = {"sphere": (0.03, 0, 0), "box": (0.025, 0.02, 0.03), "capsule": (0.013, 0.025, 0), "cylinder": (0.02, 0.025, 0),
-         "ellipsoid": (0.03, 0.02, 0.04)}
+SIZES = {
+    "sphere": (0.03, 0, 0),
+    "box": (0.025, 0.02, 0.03),
+    "capsule": (0.013, 0.025, 0),
+    "cylinder": (0.02, 0.025, 0),
+    "ellipsoid": (0.03, 0.02, 0.04),
+}
 FEW = {"count": 300, "block": 16, "cells": 24}
 nearest = jax.jit(surface_points.nearest)
 
 
 def solid(kind, *size):
-    return sdf.Shape((kind,), jnp.asarray([(*size, 0, 0)[:3]], jnp.float32), jnp.zeros((1, 3)), jnp.eye(3)[None],
-                     jnp.array([True]))
+    return sdf.Shape(
+        (kind,), jnp.asarray([(*size, 0, 0)[:3]], jnp.float32), jnp.zeros((1, 3)), jnp.eye(3)[None], jnp.array([True])
+    )
 
 
 def union():
     """A box with a capsule jutting out, and a primitive that is switched off."""
-    return sdf.Shape(("box", "capsule", "sphere"), jnp.array([[0.02, 0.02, 0.02], [0.01, 0.015, 0], [0.05, 0, 0]]),
-                     jnp.array([[0, 0, 0], [0, 0, 0.03], [0.2, 0, 0]]), jnp.tile(jnp.eye(3), (3, 1, 1)),
-                     jnp.array([True, True, False]))
+    return sdf.Shape(
+        ("box", "capsule", "sphere"),
+        jnp.array([[0.02, 0.02, 0.02], [0.01, 0.015, 0], [0.05, 0, 0]]),
+        jnp.array([[0, 0, 0], [0, 0, 0.03], [0.2, 0, 0]]),
+        jnp.tile(jnp.eye(3), (3, 1, 1)),
+        jnp.array([True, True, False]),
+    )
 
 
 def probes(shape, count=2000, room=0.004, seed=0):
@@ -45,8 +55,13 @@ def test_points_lie_on_the_surface_and_look_outward(kind):
     np.testing.assert_allclose(normal, surface.normal, atol=2e-2)
     # Evenly: no point of the surface is farther from its nearest one than a few mean spacings.
     dense = mesh_like(kind)
-    area = {"sphere": 4 * np.pi * 0.03**2, "box": 8 * (0.025 * 0.02 + 0.02 * 0.03 + 0.03 * 0.025),
-            "capsule": 4 * np.pi * 0.013 * 0.038, "cylinder": 2 * np.pi * 0.02 * 0.07, "ellipsoid": 0.0112}[kind]
+    area = {
+        "sphere": 4 * np.pi * 0.03**2,
+        "box": 8 * (0.025 * 0.02 + 0.02 * 0.03 + 0.03 * 0.025),
+        "capsule": 4 * np.pi * 0.013 * 0.038,
+        "cylinder": 2 * np.pi * 0.02 * 0.07,
+        "ellipsoid": 0.0112,
+    }[kind]
     gap = cKDTree(np.asarray(surface.position)).query(dense)[0]
     assert gap.max() < 2.2 * np.sqrt(area / 500)
 
@@ -89,8 +104,9 @@ def test_points_of_inactive_and_buried_parts_do_not_count():
 
 def test_depth_is_the_offset_along_the_normal():
     """By hand: one point at the origin that looks up."""
-    surface = surface_points.SurfacePoints(4, 0, jnp.zeros((1, 3)), jnp.array([[0.0, 0, 1]]),
-                                           jnp.zeros((1, 1), jnp.int16), jnp.zeros(3), jnp.ones(3))
+    surface = surface_points.SurfacePoints(
+        4, 0, jnp.zeros((1, 3)), jnp.array([[0.0, 0, 1]]), jnp.zeros((1, 1), jnp.int16), jnp.zeros(3), jnp.ones(3)
+    )
     value, normal = surface_points.distance_and_normal(jnp.array([[0.01, 0, -0.002], [0.0, 0.03, 0.004]]), surface)
     np.testing.assert_allclose(value, [-0.002, 0.004], atol=1e-9)
     np.testing.assert_array_equal(normal, [[0, 0, 1], [0, 0, 1]])
@@ -102,6 +118,7 @@ def test_sizes_may_be_traced_and_differ_between_environments():
 
     def felt(radius):
         return surface_points.signed_distance(points, surface_points.from_shape(solid("sphere", radius), config))
+
     radii = jnp.array([0.02, 0.03])
     together = jax.jit(jax.vmap(felt))(radii)
     for row, radius in zip(together, radii, strict=True):

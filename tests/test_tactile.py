@@ -27,14 +27,16 @@ IDEAL = TaxelSensor(noise=0.0, threshold=0.0, resolution=0.0, saturation=1000.0)
 
 def solid(kind, *size):
     size = (*size, 0, 0)[:3]
-    return sdf.Shape((kind,), jnp.asarray([size], jnp.float32), jnp.zeros((1, 3)), jnp.eye(3)[None],
-                     jnp.array([True]))
+    return sdf.Shape((kind,), jnp.asarray([size], jnp.float32), jnp.zeros((1, 3)), jnp.eye(3)[None], jnp.array([True]))
 
 
 def flat_lattice(columns, rows, pitch, shift=(0.0, 0.0)):
     """Taxels [1, N, 3] in the plane z = 0 and their areas [1, N]."""
-    x, y = np.meshgrid((np.arange(columns) - (columns - 1) / 2) * pitch + shift[0],
-                       (np.arange(rows) - (rows - 1) / 2) * pitch + shift[1], indexing="ij")
+    x, y = np.meshgrid(
+        (np.arange(columns) - (columns - 1) / 2) * pitch + shift[0],
+        (np.arange(rows) - (rows - 1) / 2) * pitch + shift[1],
+        indexing="ij",
+    )
     points = np.stack([x, y, 0 * x], -1).reshape(1, -1, 3)
     return points.astype(np.float32), np.full(points.shape[:2], pitch**2, np.float32)
 
@@ -90,8 +92,7 @@ def test_flat_punch():
     taxels, area = flat_lattice(10, 12, 0.002)  # odd multiples of a millimetre
     depth, skin = 0.0005, Skin(margin=0.0, thickness=0.002, c10=3e4)
     half = np.float32([0.006, 0.004, 0.010])
-    touch = feel(taxels, area, solid("box", *half), np.float32([0, 0, half[2] - depth]), EYE,
-                 np.float32([7.5]), skin)
+    touch = feel(taxels, area, solid("box", *half), np.float32([0, 0, half[2] - depth]), EYE, np.float32([7.5]), skin)
     covered = np.all(np.abs(taxels[0, :, :2]) < half[:2], axis=1)
     assert covered.sum() == 6 * 4
     np.testing.assert_allclose(touch.depth[0], np.where(covered, depth, 0), atol=1e-8)
@@ -111,8 +112,9 @@ def test_flat_punch_off_centre_and_turned():
     shift = np.float32([0.1, -0.05, 0.02])
     at = np.float32([0.003, -0.002, 0.0095])
     moved = (taxels @ turn.T + shift).astype(np.float32)
-    touch = feel(moved, area, solid("box", 0.0045, 0.0035, 0.010), turn @ at + shift, turn, np.float32([3.0]),
-                 Skin(margin=0.0))
+    touch = feel(
+        moved, area, solid("box", 0.0045, 0.0035, 0.010), turn @ at + shift, turn, np.float32([3.0]), Skin(margin=0.0)
+    )
     covered = np.all(np.abs(taxels[0, :, :2] - at[:2]) < [0.0045, 0.0035], axis=1)
     np.testing.assert_array_equal(np.asarray(touch.force[0]) > 1e-3, covered)
     _, centre = reduce_touch(touch.force, moved)
@@ -156,8 +158,10 @@ def test_sphere_in_a_box_face(spacing, bound):
     assert across[felt].max() <= np.sqrt(2 * radius * depth - depth**2) + 1e-6
 
 
-@pytest.mark.parametrize(("depth", "pitch", "bound"), [(0.0003, 0.0008, 0.03), (0.0005, 0.0008, 0.02),
-                                                        (0.0003, 0.002, 0.15), (0.0005, 0.002, 0.10)])
+@pytest.mark.parametrize(
+    ("depth", "pitch", "bound"),
+    [(0.0003, 0.0008, 0.03), (0.0005, 0.0008, 0.02), (0.0003, 0.002, 0.15), (0.0005, 0.002, 0.10)],
+)
 def test_spherical_object_on_a_flat_lattice(depth, pitch, bound):
     """A ball of 10 mm on flat skin, rms over lattice phases, within about twice what a lattice of that pitch costs."""
     radius, skin = 0.010, Skin(margin=0.0, thickness=0.02)
@@ -165,8 +169,15 @@ def test_spherical_object_on_a_flat_lattice(depth, pitch, bound):
     shifts = rng.uniform(-pitch / 2, pitch / 2, (24, 2))
     lattices = [flat_lattice(14, 14, pitch, shift) for shift in shifts]
     taxels, area = (np.concatenate(x) for x in zip(*lattices, strict=True))
-    touch = feel(taxels, area, solid("sphere", radius), np.float32([0, 0, radius - depth]), EYE,
-                 np.ones(len(taxels), np.float32), skin)
+    touch = feel(
+        taxels,
+        area,
+        solid("sphere", radius),
+        np.float32([0, 0, radius - depth]),
+        EYE,
+        np.ones(len(taxels), np.float32),
+        skin,
+    )
     error = np.asarray(touch.skin_force.sum(1)) / winkler(skin, radius, depth) - 1
     assert np.sqrt(np.mean(error**2)) < bound
 
@@ -175,8 +186,20 @@ def test_force_grows_with_the_square_of_depth():
     taxels, area = sphere_lattice(0.01, 0.0003)
     skin = Skin(margin=0.0, thickness=0.02)
     depth = np.array([0.0001, 0.0002, 0.0004])
-    total = [float(feel(taxels, area, solid("box", 0.03, 0.03, 0.02), np.float32([0, 0, d - 0.03]), EYE,
-                        np.ones(1, np.float32), skin).skin_force.sum()) for d in depth]
+    total = [
+        float(
+            feel(
+                taxels,
+                area,
+                solid("box", 0.03, 0.03, 0.02),
+                np.float32([0, 0, d - 0.03]),
+                EYE,
+                np.ones(1, np.float32),
+                skin,
+            ).skin_force.sum()
+        )
+        for d in depth
+    ]
     slope = np.diff(np.log(total)) / np.diff(np.log(depth))
     np.testing.assert_allclose(slope, 2.0, atol=0.06)
 
@@ -184,8 +207,15 @@ def test_force_grows_with_the_square_of_depth():
 def test_the_margin_feels_what_is_near():
     """With a margin of 1 mm a taxel 0.4 mm above a face is compressed by 0.6 mm, one 1.1 mm above by nothing."""
     taxels = np.float32([[[0, 0, 0.0004], [0.001, 0, 0.0011], [0.002, 0, -0.0003]]])
-    touch = feel(taxels, np.full((1, 3), 4e-6, np.float32), solid("box", 0.02, 0.02, 0.01),
-                 np.float32([0, 0, -0.01]), EYE, np.ones(1, np.float32), Skin(margin=0.001))
+    touch = feel(
+        taxels,
+        np.full((1, 3), 4e-6, np.float32),
+        solid("box", 0.02, 0.02, 0.01),
+        np.float32([0, 0, -0.01]),
+        EYE,
+        np.ones(1, np.float32),
+        Skin(margin=0.001),
+    )
     np.testing.assert_allclose(touch.depth[0], [0.0006, 0, 0.0013], atol=1e-8)
 
 
@@ -201,8 +231,15 @@ def taxels(hand):
 
 def grasp(hand, taxels, position=(0.075, -0.005, 0.13)):
     """What the half closed hand feels of a ball before the palm."""
-    return feel(taxels, hand.taxel_area, solid("sphere", 0.03), np.float32(position), EYE,
-                np.float32([4.0, 1.0, 2.5, 0.5, 3.0]), Skin())
+    return feel(
+        taxels,
+        hand.taxel_area,
+        solid("sphere", 0.03),
+        np.float32(position),
+        EYE,
+        np.float32([4.0, 1.0, 2.5, 0.5, 3.0]),
+        Skin(),
+    )
 
 
 def test_taxels_add_up_to_the_fingers_force(hand, taxels):
@@ -214,8 +251,12 @@ def test_taxels_add_up_to_the_fingers_force(hand, taxels):
     assert np.all(np.asarray(touch.force) >= 0)
     # The spread follows the skin's law: shares are in the same proportion.
     for finger in np.flatnonzero(felt):
-        np.testing.assert_allclose(touch.force[finger] * touch.skin_force[finger].sum(),
-                                   touch.skin_force[finger] * wanted[finger], rtol=1e-4, atol=1e-9)
+        np.testing.assert_allclose(
+            touch.force[finger] * touch.skin_force[finger].sum(),
+            touch.skin_force[finger] * wanted[finger],
+            rtol=1e-4,
+            atol=1e-9,
+        )
 
 
 @given(st.integers(0, 10**6))
@@ -235,8 +276,12 @@ def test_a_finger_that_touches_nothing_reads_zero(hand, taxels):
         np.testing.assert_array_equal(value, 0)
 
     def total(position):
-        return jnp.sum(reduce_touch(feel(taxels, hand.taxel_area, solid("sphere", 0.03), position, EYE,
-                                         jnp.ones(5), Skin()).force, taxels)[1])
+        return jnp.sum(
+            reduce_touch(
+                feel(taxels, hand.taxel_area, solid("sphere", 0.03), position, EYE, jnp.ones(5), Skin()).force, taxels
+            )[1]
+        )
+
     np.testing.assert_array_equal(jax.grad(total)(jnp.array([0.5, 0.0, 0.0])), 0)
 
 
@@ -323,8 +368,13 @@ def test_noise_has_its_width_and_gain_is_the_fingers_own():
 
 # --- gradients -----------------------------------------------------------------------------------
 
-SHAPES = {"sphere": (0.030, 0, 0), "box": (0.027, 0.03, 0.024), "capsule": (0.028, 0.02, 0),
-          "cylinder": (0.029, 0.026, 0), "ellipsoid": (0.034, 0.026, 0.03)}
+SHAPES = {
+    "sphere": (0.030, 0, 0),
+    "box": (0.027, 0.03, 0.024),
+    "capsule": (0.028, 0.02, 0),
+    "cylinder": (0.029, 0.026, 0),
+    "ellipsoid": (0.034, 0.026, 0.03),
+}
 
 
 @pytest.fixture(scope="module")
@@ -337,14 +387,25 @@ def pose_response(hand, taxels):
     def felt(pose, active):
         """Pose: a shift and a small turn about each axis."""
         count = len(sdf.KINDS)
-        shape = sdf.Shape(sdf.KINDS, jnp.asarray(np.where(size > 0, size, 1e-4)), jnp.zeros((count, 3)),
-                          jnp.tile(jnp.eye(3), (count, 1, 1)), active)
+        shape = sdf.Shape(
+            sdf.KINDS,
+            jnp.asarray(np.where(size > 0, size, 1e-4)),
+            jnp.zeros((count, 3)),
+            jnp.tile(jnp.eye(3), (count, 1, 1)),
+            active,
+        )
         turn = axis_angle_to_matrix(jnp.array([0.48, 0.6, 0.64]), jnp.asarray(0.7))
         for axis, angle in zip(jnp.eye(3), pose[3:], strict=True):
             turn = compose(axis_angle_to_matrix(axis, angle), turn)
-        touch = tactile.feel(taxels, np.asarray(hand.taxel_area, np.float64), shape,
-                             jnp.array([0.075, -0.005, 0.13]) + pose[:3], turn,
-                             jnp.array([4.0, 1.0, 2.5, 0.5, 3.0]), Skin())
+        touch = tactile.feel(
+            taxels,
+            np.asarray(hand.taxel_area, np.float64),
+            shape,
+            jnp.array([0.075, -0.005, 0.13]) + pose[:3],
+            turn,
+            jnp.array([4.0, 1.0, 2.5, 0.5, 3.0]),
+            Skin(),
+        )
         _, centre = tactile.reduce_touch(touch.force, taxels)
         return jnp.stack([jnp.sum(touch.skin_force), jnp.sum(centre * weight)])
 
@@ -368,22 +429,41 @@ def test_gradient_of_touch_with_respect_to_the_objects_pose(pose_response, kind)
 
 def test_gradient_in_single_precision_points_the_same_way(hand, taxels):
     """What training differentiates: float32, a sphere; pushing it into the fingers presses harder."""
+
     def total(position):
-        return jnp.sum(feel(taxels, hand.taxel_area, solid("sphere", 0.03), position, EYE, jnp.ones(5),
-                            Skin(margin=0.001, thickness=0.002)).skin_force)
+        return jnp.sum(
+            feel(
+                taxels,
+                hand.taxel_area,
+                solid("sphere", 0.03),
+                position,
+                EYE,
+                jnp.ones(5),
+                Skin(margin=0.001, thickness=0.002),
+            ).skin_force
+        )
+
     start, step = jnp.array([0.075, -0.005, 0.13]), 1e-4
     exact = np.asarray(jax.grad(total)(start))
     numeric = np.array([(total(start + step * axis) - total(start - step * axis)) / (2 * step) for axis in EYE])
     np.testing.assert_allclose(exact, numeric, rtol=0.02, atol=0.02 * np.abs(numeric).max())
 
 
-@pytest.mark.parametrize("direction, pressed", [((0, 0, -1), 5.0), ((0.6, 0, -0.8), 4.0), ((0, 0, 1), 0.0),
-                                                ((0, 1, 0), 0.0)])
+@pytest.mark.parametrize(
+    "direction, pressed", [((0, 0, -1), 5.0), ((0.6, 0, -0.8), 4.0), ((0, 0, 1), 0.0), ((0, 1, 0), 0.0)]
+)
 def test_taxels_of_one_axis_feel_only_what_presses(direction, pressed):
     """A punch on a flat lattice whose force is askew: the part along the lattice's normal is shared."""
     taxels, area = flat_lattice(10, 12, 0.002)
-    touch = feel(taxels, area, solid("box", 0.006, 0.004, 0.010), np.float32([0, 0, 0.0095]), EYE,
-                 np.float32([5.0]), Skin(margin=0.0))
+    touch = feel(
+        taxels,
+        area,
+        solid("box", 0.006, 0.004, 0.010),
+        np.float32([0, 0, 0.0095]),
+        EYE,
+        np.float32([5.0]),
+        Skin(margin=0.0),
+    )
     normals = np.broadcast_to(np.float32([0, 0, 1]), taxels.shape)
     only = tactile.press_only(touch, normals, 5 * np.float32([direction]))
     assert float(only.force.sum()) == pytest.approx(pressed, abs=1e-5)

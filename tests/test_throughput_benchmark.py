@@ -53,8 +53,10 @@ def equal(first, second):
 def test_replayed_torques_give_the_same_motion_and_contacts(benchmarks, simple):
     """With friction, latency, ripple, restarts: the tape holds all that the drive did, and readings of its torque."""
     throughput, _ = benchmarks
-    envs = [throughput.make("grasp", "full", "jax", WORLDS, kind)
-            for kind in (throughput.Env, throughput.Recorder, throughput.Replay)]
+    envs = [
+        throughput.make("grasp", "full", "jax", WORLDS, kind)
+        for kind in (throughput.Env, throughput.Recorder, throughput.Replay)
+    ]
     full, recorder, replay = envs
     state = throughput.started(full, WORLDS, 20)
     after, touched, _ = run(throughput, full, state)
@@ -67,8 +69,13 @@ def test_replayed_torques_give_the_same_motion_and_contacts(benchmarks, simple):
     assert tape.shape == (STEPS, WORLDS, full.config.physics.substeps + 1, 12) and np.all(np.std(tape, (0, 1)) > 1e-3)
     assert touched > 0 and np.any(after.length < STEPS), "no restart: the test tests less than it says"
     equal(after.physics, same.physics)
-    again, _, _ = run(throughput, replay, state, lambda state, action, tape: (
-        replay.replayed_step(state, action, tape), tape[:0]), tape)
+    again, _, _ = run(
+        throughput,
+        replay,
+        state,
+        lambda state, action, tape: (replay.replayed_step(state, action, tape), tape[:0]),
+        tape,
+    )
     for name in ("physics", "sample", "reward", "obs", "metrics"):
         pairs = zip(*(jax.tree.leaves(getattr(state, name)) for state in (again, after)), strict=True)
         for ours, theirs in pairs:
@@ -87,16 +94,32 @@ def test_hands_are_kept_or_nominal(benchmarks, simple, hand):
     drawn, _ = nominal._draw(jax.random.key(0), jax.random.key(0))
     np.testing.assert_array_equal(drawn.actuator.stall_torque, hand.torque_limit)
     # Known beforehand, so nothing is drawn: the program has no random bits but for what it needs elsewhere.
-    text = [jax.jit(lambda k, e=env: e._draw(k, k)[0]).lower(jax.random.key(0)).as_text()
-            for env in (nominal, throughput.make("grasp", "full", "jax", WORLDS))]
+    text = [
+        jax.jit(lambda k, e=env: e._draw(k, k)[0]).lower(jax.random.key(0)).as_text()
+        for env in (nominal, throughput.make("grasp", "full", "jax", WORLDS))
+    ]
     assert text[0].count("threefry") < text[1].count("threefry")
 
 
 @pytest.mark.long
 def test_rows_are_json_with_a_share(benchmarks, simple, capsys, monkeypatch):
     throughput, _ = benchmarks
-    monkeypatch.setattr(sys, "argv", ["throughput.py", "--num-envs", str(WORLDS), "--steps", "4", "--repeats", "2",
-                                      "--leave-out", "actuator", "redrawing"])
+    monkeypatch.setattr(
+        sys,
+        "argv",
+        [
+            "throughput.py",
+            "--num-envs",
+            str(WORLDS),
+            "--steps",
+            "4",
+            "--repeats",
+            "2",
+            "--leave-out",
+            "actuator",
+            "redrawing",
+        ],
+    )
     monkeypatch.setattr(throughput, "enable_caches", lambda: None)
     throughput.main()
     rows = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
@@ -109,8 +132,17 @@ def test_rows_are_json_with_a_share(benchmarks, simple, capsys, monkeypatch):
 def test_the_parts_of_a_training_step(benchmarks, simple):
     _, split = benchmarks
     rows = {row["part"]: row for row in split.split("grasp", "jax", WORLDS, 1)}
-    assert list(rows) == ["training step", "rollout", "environment", "physics", "touch", "policy", "learner",
-                          "environment rest", "rest"]
+    assert list(rows) == [
+        "training step",
+        "rollout",
+        "environment",
+        "physics",
+        "touch",
+        "policy",
+        "learner",
+        "environment rest",
+        "rest",
+    ]
     whole = rows["training step"]
     assert whole["share"] == 1 and whole["env_steps_per_s"] > 0
     parts = sum(rows[name]["share"] for name in ("physics", "touch", "environment rest", "policy", "learner", "rest"))

@@ -34,6 +34,7 @@ def links(hand):
     def feel(thing, skin):
         touch = tactile.feel_links(hand, pose, thing, PLACE, TURN, TOTAL, skin)
         return touch, *tactile.reduce_touch_links(touch.force, hand, pose)
+
     return jax.jit(feel, static_argnames="skin"), pose, taxel_positions(hand, pose), taxel_normals(hand, pose)
 
 
@@ -76,9 +77,11 @@ def test_600_forces_differentiate_through_a_mesh(hand, links):
     @jax.jit
     def total(place):
         return tactile.feel_links(hand, pose, ball, place, jnp.eye(3), jnp.zeros(5), skin).force.sum()
+
     exact, step = np.asarray(jax.jit(jax.grad(total))(PLACE)), 2e-5
-    numeric = np.array([(total(PLACE + step * e) - total(PLACE - step * e)) / (2 * step)
-                        for e in np.eye(3, dtype=np.float32)])
+    numeric = np.array(
+        [(total(PLACE + step * e) - total(PLACE - step * e)) / (2 * step) for e in np.eye(3, dtype=np.float32)]
+    )
     assert np.abs(numeric).max() > 0.1 * float(total(PLACE)) / 0.001
     np.testing.assert_allclose(exact, numeric, rtol=0.03, atol=0.03 * np.abs(numeric).max())
 
@@ -110,9 +113,11 @@ def test_the_linear_law_is_the_slope_at_small_strain():
 
 def slope(compression, c10, c01):
     """Finite differences of the stress, in double precision and written anew."""
+
     def stress(e):
         stretch = 1 - e
         return 2 * (stretch**-2 - stretch) * (c10 + c01 / stretch)
+
     return (stress(compression + 1e-6) - stress(compression - 1e-6)) / 2e-6
 
 
@@ -146,8 +151,12 @@ def test_named_materials(name):
 
 def test_known_moduli():
     """Young's moduli of the fits, MPa; Dragon Skin 30 fitted to tension alone fails short of half its length."""
-    for name, modulus in (("ecoflex_00_30_tension", 0.038), ("dragon_skin_20_tension", 0.25), ("rtv615_tension", 0.91),
-                          ("sortaclear_40_tension", 0.80)):
+    for name, modulus in (
+        ("ecoflex_00_30_tension", 0.038),
+        ("dragon_skin_20_tension", 0.25),
+        ("rtv615_tension", 0.91),
+        ("sortaclear_40_tension", 0.80),
+    ):
         assert materials.material(name).modulus == pytest.approx(modulus * 1e6, rel=0.02)
     c10, c01 = materials.material("dragon_skin_30_tension")
     assert 0.3 < materials.stable_compression(c10, c01) < 0.5
@@ -178,8 +187,9 @@ def test_three_axes_keep_the_fingers_force(links):
     touch, force, _ = feel(BALL, Skin(margin=0.001))
     vector = np.random.default_rng(0).normal(size=(5, 3)).astype(np.float32)
     felt = np.asarray(force) > 0
-    np.testing.assert_allclose(tactile.taxel_vectors(touch.force, vector).sum(1), np.where(felt[:, None], vector, 0),
-                               atol=1e-5)
+    np.testing.assert_allclose(
+        tactile.taxel_vectors(touch.force, vector).sum(1), np.where(felt[:, None], vector, 0), atol=1e-5
+    )
     pressed, tangential = (np.asarray(x) for x in tactile.split_force(touch.force, normals, vector))
     length = np.sum(vector**2, 1)
     np.testing.assert_allclose((pressed**2 + np.sum(tangential**2, 1))[felt], length[felt], rtol=1e-4)

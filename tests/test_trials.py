@@ -18,10 +18,31 @@ def test_one_short_trial_through_the_bytes(tmp_path):
     """A grasp at full command: the hand that is emulated is the judge of it."""
     path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH", "")]))
     done = subprocess.run(
-        [sys.executable, "benchmarks/trials.py", "--task", "grasp", "--first", "4", "--trials", "1", "--seconds", "1.5",
-         "--draw", "nominal", "--no-realtime", "--json", str(tmp_path / "trials.json"), "--runner",
-         "--safety.stale 1 --link.margin 0.2 --approach 1 --link.settle 0"],
-        cwd=ROOT, env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True, timeout=240)
+        [
+            sys.executable,
+            "benchmarks/trials.py",
+            "--task",
+            "grasp",
+            "--first",
+            "4",
+            "--trials",
+            "1",
+            "--seconds",
+            "1.5",
+            "--draw",
+            "nominal",
+            "--no-realtime",
+            "--json",
+            str(tmp_path / "trials.json"),
+            "--runner",
+            "--safety.stale 1 --link.margin 0.2 --approach 1 --link.settle 0",
+        ],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        timeout=240,
+    )
     assert done.returncode == 0, done.stderr
     result = json.loads((tmp_path / "trials.json").read_text())
     (trial,) = result["trials"]

@@ -29,11 +29,22 @@ from dexsim_real.twin.line import HandLine, LineConfig
 ROOT = Path(__file__).resolve().parent.parent
 
 
-@pytest.mark.parametrize(("line", "message"), [
-    ("5 melt", "no kind 'melt'; there are flip"), ("soon stall", "expected a time in s"), ("", "expected a time"),
-    ("5 stall 1 2", "expected a time"), ("5 flip both", "expected"), ("5 heat 12 60 1", "expected"),
-    ("5 stuck 0 120 9", "expected"), ("5 stuck 0 119 256", "expected"), ("-1 stall", "at least 0"),
-    ("5 stall -1", "expected"), ("nan drop", "at least 0")])
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("5 melt", "no kind 'melt'; there are flip"),
+        ("soon stall", "expected a time in s"),
+        ("", "expected a time"),
+        ("5 stall 1 2", "expected a time"),
+        ("5 flip both", "expected"),
+        ("5 heat 12 60 1", "expected"),
+        ("5 stuck 0 120 9", "expected"),
+        ("5 stuck 0 119 256", "expected"),
+        ("-1 stall", "at least 0"),
+        ("5 stall -1", "expected"),
+        ("nan drop", "at least 0"),
+    ],
+)
 def test_a_script_that_cannot_be_meant_is_refused_in_one_line(line, message):
     with pytest.raises(HandError, match=message) as found:
         FaultConfig(script=(line,))
@@ -47,12 +58,17 @@ def test_rates_must_fit_into_one():
 
 
 def test_scripted_faults_come_at_their_time_in_order():
-    injector = Injector(FaultConfig(script=("2 stuck 4 7 88", "0.5 drop request", "2 heat 3 40 1.5", "1 disconnect 0.7",
-                                            "9 late")), 0)
+    injector = Injector(
+        FaultConfig(script=("2 stuck 4 7 88", "0.5 drop request", "2 heat 3 40 1.5", "1 disconnect 0.7", "9 late")), 0
+    )
     found = [(k * 0.1, injector.draw(50 + k * 0.1)) for k in range(30)]
     found = [(round(when, 1), fault) for when, fault in found if fault]
     assert [(when, fault.kind) for when, fault in found] == [
-        (0.5, "drop"), (1.0, "disconnect"), (2.0, "heat"), (2.1, "stuck")]
+        (0.5, "drop"),
+        (1.0, "disconnect"),
+        (2.0, "heat"),
+        (2.1, "stuck"),
+    ]
     assert found[0][1].on_request and found[1][1].seconds == 0.7
     assert (found[2][1].joint, found[2][1].degrees, found[2][1].seconds) == (3, 40, 1.5)
     assert (found[3][1].taxel, found[3][1].count) == ((4, 7), 88)
@@ -61,8 +77,17 @@ def test_scripted_faults_come_at_their_time_in_order():
 
 
 def test_random_faults_have_their_rates_and_the_seed_repeats_them():
-    config = FaultConfig(flip=0.05, drop=0.04, duplicate=0.03, late=0.02, stall=0.015, disconnect=0.01, heat=0.008,
-                         stuck=0.006, on_request=0.25)
+    config = FaultConfig(
+        flip=0.05,
+        drop=0.04,
+        duplicate=0.03,
+        late=0.02,
+        stall=0.015,
+        disconnect=0.01,
+        heat=0.008,
+        stuck=0.006,
+        on_request=0.25,
+    )
     runs = []
     for seed in (1, 1, 2):
         injector = Injector(config, seed)
@@ -73,8 +98,9 @@ def test_random_faults_have_their_rates_and_the_seed_repeats_them():
         share = sum(made[name] for name in made if name.startswith(kind)) / 20_000
         rate = getattr(config, kind)
         assert share == pytest.approx(rate, abs=5 * np.sqrt(rate / 20_000)), kind
-    requests = sum(made[f"{kind} request"] for kind in BYTES) / sum(made[f"{k} {s}"] for k in BYTES for s in
-                                                                    ("request", "answer"))
+    requests = sum(made[f"{kind} request"] for kind in BYTES) / sum(
+        made[f"{k} {s}"] for k in BYTES for s in ("request", "answer")
+    )
     assert requests == pytest.approx(0.25, abs=0.05)
     assert sum(made.values()) == sum(fault is not None for fault in runs[0][0])
 
@@ -101,6 +127,7 @@ def test_no_damage_leaves_a_frame_that_passes(seed, kind, request):
 
 
 # --- on the wire, in virtual time ------------------------------------------------------------------
+
 
 class Cable:
     """Both ends of a cable in memory: a `Terminal` for the hand, pyserial's port for the host, and their clock."""
@@ -186,8 +213,9 @@ class Pair:
         self.board = Firmware(self.plant, FirmwareConfig(), self.notes.append)
         self.check = CommandCheck(hand.joint_lower, hand.joint_upper, LimitsConfig())
         self.injector = Injector(faults, seed)
-        self.line = cable.line = HandLine(cable, self.plant, self.board, self.check, self.injector, LineConfig(),
-                                          seed=seed, note=self.notes.append)
+        self.line = cable.line = HandLine(
+            cable, self.plant, self.board, self.check, self.injector, LineConfig(), seed=seed, note=self.notes.append
+        )
         self.port = SerialHand("loop://", LinkConfig(settle=0.0, backoff=(0.02, 0.1), **link))
         self.port.connect()
 
@@ -220,20 +248,32 @@ class Pair:
         expected = self.injector.expected()
         damaged_requests = sum(made[f"{kind} request"] for kind in BYTES)
         return {
-            "corrupt": (counts.corrupt, expected["corrupt"]), "lost": (counts.lost, expected["lost"]),
+            "corrupt": (counts.corrupt, expected["corrupt"]),
+            "lost": (counts.lost, expected["lost"]),
             # What the hand never answered, and what came too late.
             "silent": (counts.silent, damaged_requests + line["ignored"] + counts.late),
             "answered": (counts.answered + counts.refused + counts.late, line["answers"]),
             "sent": (counts.sent, line["requests"]),
             "ends": (counts.sent, counts.answered + counts.corrupt + counts.silent + counts.refused + counts.lost),
-            "damaged": (line["damaged answers"] + line["damaged requests"], expected["corrupt"] + damaged_requests)}
+            "damaged": (line["damaged answers"] + line["damaged requests"], expected["corrupt"] + damaged_requests),
+        }
 
 
 @pytest.mark.parametrize("seed", range(2))
 def test_every_injected_fault_is_found_in_the_hosts_counters(hand, monkeypatch, seed):
     """Half of all exchanges go wrong in one way or another."""
-    faults = FaultConfig(flip=0.1, drop=0.1, duplicate=0.1, late=0.04, stall=0.04, disconnect=0.04, stuck=0.05,
-                         heat=0.03, stall_seconds=(0.005, 0.2), away_seconds=(0.01, 0.2))
+    faults = FaultConfig(
+        flip=0.1,
+        drop=0.1,
+        duplicate=0.1,
+        late=0.04,
+        stall=0.04,
+        disconnect=0.04,
+        stuck=0.05,
+        heat=0.03,
+        stall_seconds=(0.005, 0.2),
+        away_seconds=(0.01, 0.2),
+    )
     pair = Pair(hand, monkeypatch, faults, seed)
     answers = pair.run(40)
     pair.settle()
@@ -250,10 +290,20 @@ def test_every_injected_fault_is_found_in_the_hosts_counters(hand, monkeypatch, 
     np.testing.assert_allclose(heat, 35.0)  # Every motor that was heated has cooled.
 
 
-@pytest.mark.parametrize(("name", "counter"), [
-    ("flip answer", "corrupt"), ("drop answer", "corrupt"), ("duplicate answer", "corrupt"), ("flip request", "silent"),
-    ("drop request", "silent"), ("duplicate request", "silent"), ("late 0.1", "silent"), ("stall 0.2", "silent"),
-    ("disconnect 0.1", "lost")])
+@pytest.mark.parametrize(
+    ("name", "counter"),
+    [
+        ("flip answer", "corrupt"),
+        ("drop answer", "corrupt"),
+        ("duplicate answer", "corrupt"),
+        ("flip request", "silent"),
+        ("drop request", "silent"),
+        ("duplicate request", "silent"),
+        ("late 0.1", "silent"),
+        ("stall 0.2", "silent"),
+        ("disconnect 0.1", "lost"),
+    ],
+)
 def test_each_fault_alone_has_its_effect_and_passes(hand, monkeypatch, name, counter):
     pair = Pair(hand, monkeypatch, FaultConfig(script=(f"1 {name}",)))
     pair.run(0.99)
@@ -261,8 +311,11 @@ def test_each_fault_alone_has_its_effect_and_passes(hand, monkeypatch, name, cou
     assert good.sent == good.answered
     while pair.exchange() is not None:
         pass
-    changed = {key: value - getattr(good, key) for key, value in dataclasses.asdict(pair.port.counts).items()
-               if key not in ("sent", "answered", "crc_errors", "resyncs") and value != getattr(good, key)}
+    changed = {
+        key: value - getattr(good, key)
+        for key, value in dataclasses.asdict(pair.port.counts).items()
+        if key not in ("sent", "answered", "crc_errors", "resyncs") and value != getattr(good, key)
+    }
     assert changed == {counter: 1}
     start = pair.cable.now
     while pair.exchange() is None:
@@ -307,6 +360,7 @@ def test_parse_gives_time_kind_and_values():
 
 # --- whole processes -----------------------------------------------------------------------------
 
+
 @pytest.fixture
 def soak(monkeypatch):
     # The flags that other tests compile with stay as they are.
@@ -317,9 +371,16 @@ def soak(monkeypatch):
     return module
 
 
-PATIENT = ["--no-realtime", "--safe", "1", "--runner", "--link.margin 0.2 --safety.stale 0.6 --safety.watchdog 0.5",
-           "--twin", "--faults.late-seconds 0.4 0.5 --faults.stall-seconds 0.1 0.3 --firmware.watchdog 0.5 "
-           "--limits.recent 1 --limits.start 0.2 --limits.reach 1.2"]
+PATIENT = [
+    "--no-realtime",
+    "--safe",
+    "1",
+    "--runner",
+    "--link.margin 0.2 --safety.stale 0.6 --safety.watchdog 0.5",
+    "--twin",
+    "--faults.late-seconds 0.4 0.5 --faults.stall-seconds 0.1 0.3 --firmware.watchdog 0.5 "
+    "--limits.recent 1 --limits.start 0.2 --limits.reach 1.2",
+]
 """For a machine that has other things to do: the bridge may act on older news."""
 
 
@@ -339,12 +400,17 @@ def test_two_runners_die(soak, capsys):
     assert row["kills"] == 2 and row["commands"] > 50
 
 
-@pytest.mark.parametrize("events, wanted", [
-    ([(1.0, "motors on"), (5.07, "watchdog: no exchange for 80 ms, motors off")], 0.07),
-    ([(1.0, "motors on"), (5.01, "this machine is too slow"), (5.07, "watchdog: late, motors off")], 0.07),
-    ([(5.02, "motors on"), (5.09, "watchdog: late, motors off"), (6.0, "motors on")], 0.09),
-    ([(1.0, "motors on"), (2.0, "motors off"), (6.0, "motors on")], None),
-    ([(1.0, "motors on"), (5.3, "watchdog: late, motors off")], np.inf), ([(1.0, "motors on")], np.inf)])
+@pytest.mark.parametrize(
+    "events, wanted",
+    [
+        ([(1.0, "motors on"), (5.07, "watchdog: no exchange for 80 ms, motors off")], 0.07),
+        ([(1.0, "motors on"), (5.01, "this machine is too slow"), (5.07, "watchdog: late, motors off")], 0.07),
+        ([(5.02, "motors on"), (5.09, "watchdog: late, motors off"), (6.0, "motors on")], 0.09),
+        ([(1.0, "motors on"), (2.0, "motors off"), (6.0, "motors on")], None),
+        ([(1.0, "motors on"), (5.3, "watchdog: late, motors off")], np.inf),
+        ([(1.0, "motors on")], np.inf),
+    ],
+)
 def test_when_the_motors_were_off(soak, events, wanted):
     """A runner dies at 5 s, and 0.2 s later the next one may begin."""
     found = soak.motors_off({"events": events}, 5.0, 5.2)

@@ -57,11 +57,18 @@ def ask(board, kind, data=b"", now=0.0, target=0x80):
 
 # --- the palm board ------------------------------------------------------------------------------
 
+
 def test_every_command_that_a_host_knows_is_answered_in_a_form_that_a_host_believes():
     board = Firmware(ScriptedPlant(), FirmwareConfig())
-    requests = {Command.EXCHANGE: command().tobytes(), Command.VERSION: b"", Command.SET_MODE: b"\x03",
-                Command.READ_MODE: b"", Command.CLEAR_PRESSURE: b"\x11", Command.RESET: b"",
-                Command.READ_REGISTER: (21).to_bytes(2, "little")}
+    requests = {
+        Command.EXCHANGE: command().tobytes(),
+        Command.VERSION: b"",
+        Command.SET_MODE: b"\x03",
+        Command.READ_MODE: b"",
+        Command.CLEAR_PRESSURE: b"\x11",
+        Command.RESET: b"",
+        Command.READ_REGISTER: (21).to_bytes(2, "little"),
+    }
     assert set(requests) == set(frames.HOST_REQUESTS)
     parser = Parser(HAND_REPLIES)
     for kind, data in requests.items():
@@ -81,10 +88,15 @@ def test_what_is_asked_wrongly_is_refused_with_the_hands_own_numbers():
     broken = command()
     broken["position"][2] = np.nan
     for kind, data, number in (
-            (Command.EXCHANGE, ids.tobytes(), 1), (Command.EXCHANGE, broken.tobytes(), 30),
-            (Command.EXCHANGE, command(mode=7).tobytes(), 67), (Command.EXCHANGE, command(mode=5).tobytes(), 81),
-            (Command.SET_MODE, b"\x09", 67), (Command.SET_MODE, b"\x03\x03", 30),
-            (Command.CLEAR_PRESSURE, b"\x10", 1), (Command.READ_REGISTER, b"\x63\x00", 30)):
+        (Command.EXCHANGE, ids.tobytes(), 1),
+        (Command.EXCHANGE, broken.tobytes(), 30),
+        (Command.EXCHANGE, command(mode=7).tobytes(), 67),
+        (Command.EXCHANGE, command(mode=5).tobytes(), 81),
+        (Command.SET_MODE, b"\x09", 67),
+        (Command.SET_MODE, b"\x03\x03", 30),
+        (Command.CLEAR_PRESSURE, b"\x10", 1),
+        (Command.READ_REGISTER, b"\x63\x00", 30),
+    ):
         answer = ask(board, kind, data)
         assert answer.command == Command.ERROR
         assert int.from_bytes(answer.data, "little") == 1501000 + number
@@ -181,6 +193,7 @@ def test_without_an_exchange_the_motors_go_off():
 
 # --- commands within limits ----------------------------------------------------------------------
 
+
 def test_commands_outside_limits_are_told_apart(hand):
     def found(*commands, reported=REST, step=0.012, **options):
         check = CommandCheck(hand.joint_lower, hand.joint_upper, LimitsConfig(slack=0.0, speed=8.0, **options))
@@ -207,15 +220,23 @@ def test_commands_outside_limits_are_told_apart(hand):
 
 # --- timing, in virtual time ---------------------------------------------------------------------
 
+
 class Bench:
     """A line, and a host that writes and reads in virtual time."""
 
     def __init__(self, folder, hand, *, line=None, seed=0):
         self.plant, self.notes = ScriptedPlant(), []
         self.board = Firmware(self.plant, FirmwareConfig(), self.notes.append)
-        self.line = HandLine(Terminal(folder / "hand"), self.plant, self.board, CommandCheck(
-            hand.joint_lower, hand.joint_upper, LimitsConfig()), Injector(FaultConfig(), seed), line or LineConfig(),
-            seed=seed, note=self.notes.append)
+        self.line = HandLine(
+            Terminal(folder / "hand"),
+            self.plant,
+            self.board,
+            CommandCheck(hand.joint_lower, hand.joint_upper, LimitsConfig()),
+            Injector(FaultConfig(), seed),
+            line or LineConfig(),
+            seed=seed,
+            note=self.notes.append,
+        )
         self.now = 100.0
         import serial
 
@@ -339,6 +360,7 @@ def test_noise_on_the_line_is_answered_with_silence(hand, noise):
 
 # --- the bridge's own driver on it ---------------------------------------------------------------
 
+
 class Running:
     """A twin that runs in a thread."""
 
@@ -428,6 +450,7 @@ def test_a_terminal_keeps_its_name(tmp_path):
 
 # --- the object's side ---------------------------------------------------------------------------
 
+
 def rotation_by_axis(axis, angle):
     """Rodrigues' formula."""
     x, y, z = np.asarray(axis) / np.linalg.norm(axis)
@@ -438,16 +461,17 @@ def rotation_by_axis(axis, angle):
 @given(st.floats(-3.1, 3.1), st.floats(-1.5, 1.5), st.floats(-3.1, 3.1))
 def test_an_rvc_frame_says_yaw_pitch_and_roll(yaw, pitch, roll):
     """Turned about z, then the new y, then the new x; against the bridge's reader as well."""
-    rotation = (rotation_by_axis([0, 0, 1], yaw) @ rotation_by_axis([0, 1, 0], pitch)
-                @ rotation_by_axis([1, 0, 0], roll))
+    rotation = rotation_by_axis([0, 0, 1], yaw) @ rotation_by_axis([0, 1, 0], pitch) @ rotation_by_axis([1, 0, 0], roll)
     frame = object_side.rvc_frame(7, rotation, np.array([0.0, 0.5 * 9.80665, 9.80665]))
     assert len(frame) == 19 and frame[:3] == b"\xaa\xaa\x07" and sum(frame[2:18]) % 256 == frame[18]
     words = struct.unpack_from("<6h", frame, 3)
     np.testing.assert_allclose(words[:3], np.degrees([yaw, pitch, roll]) * 100, atol=0.51)
     assert words[3:] == (0, 500, 1000)
     w, x, y, z = imu.decode(frame)
-    read = np.eye(3) + 2 * (w * np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-                            + np.linalg.matrix_power(np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]), 2))
+    read = np.eye(3) + 2 * (
+        w * np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        + np.linalg.matrix_power(np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]), 2)
+    )
     np.testing.assert_allclose(read, rotation, atol=4e-4)
 
 
@@ -493,9 +517,15 @@ def test_the_silhouette_of_a_sphere_and_of_a_box():
     assert object_side.silhouette([flat], OPTICS, (640, 480)).sum() < 100
 
 
-@pytest.mark.parametrize("part", [
-    Part("cylinder", (0.02, 0.03)), Part("capsule", (0.02, 0.03)), Part("sphere", (0.03,)),
-    Part("box", (0.01, 0.02, 0.03), (0.01, 0.0, -0.02))])
+@pytest.mark.parametrize(
+    "part",
+    [
+        Part("cylinder", (0.02, 0.03)),
+        Part("capsule", (0.02, 0.03)),
+        Part("sphere", (0.03,)),
+        Part("box", (0.01, 0.02, 0.03), (0.01, 0.0, -0.02)),
+    ],
+)
 def test_outlines_reach_as_far_as_the_exact_shape(part):
     shape, points = Shape("one", (part,)), object_side.outline(part)
     rng = np.random.default_rng(0)
@@ -525,15 +555,34 @@ def test_the_bridges_camera_sees_the_object(hand, tmp_path):
 
 # --- the command ---------------------------------------------------------------------------------
 
+
 def start(*options):
     return subprocess.Popen(
-        [sys.executable, "-m", "dexsim_real.twin", "--plant", "twin_plant:make", "--no-realtime", *options], cwd=ROOT,
-        env={**os.environ, "PYTHONPATH": f"{ROOT}:{ROOT / 'tests'}"}, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+        [sys.executable, "-m", "dexsim_real.twin", "--plant", "twin_plant:make", "--no-realtime", *options],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": f"{ROOT}:{ROOT / 'tests'}"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
 
 
 def test_the_command_shows_how_to_use_it_and_writes_its_results(tmp_path):
-    process = start("--task", "grasp", "--trials", "2", "--seconds", "0.4", "--command", "0.6", "--output",
-                    str(tmp_path / "out.json"), "--object.optics.position", "0.06", "0.6", "0.09")
+    process = start(
+        "--task",
+        "grasp",
+        "--trials",
+        "2",
+        "--seconds",
+        "0.4",
+        "--command",
+        "0.6",
+        "--output",
+        str(tmp_path / "out.json"),
+        "--object.optics.position",
+        "0.06",
+        "0.6",
+        "0.09",
+    )
     out, error = process.communicate(timeout=60)
     assert process.returncode == 0, error
     shown = out.decode()
@@ -543,7 +592,8 @@ def test_the_command_shows_how_to_use_it_and_writes_its_results(tmp_path):
     report = json.loads((tmp_path / "out.json").read_text())
     assert [row["trial"] for row in report["trials"]] == [0, 1] and report["commands"]["checked"] == 0
     assert not list(Path("/tmp").glob("dexsim-twin-*/hand*")) or shown.split("--port ")[1].split()[0] not in map(
-        str, Path("/tmp").glob("dexsim-twin-*/hand"))
+        str, Path("/tmp").glob("dexsim-twin-*/hand")
+    )
 
 
 def test_the_calibration_beside_the_port_is_one_of_this_hand(hand, tmp_path):
@@ -565,12 +615,15 @@ def test_it_ends_in_good_order_when_it_is_told_to(tmp_path):
 
 def test_what_is_wrong_is_said_in_one_line(tmp_path):
     for options, message in (
-            (["--faults.script", "5 melt"], "no kind 'melt'"), (["--task", "juggle"], "choose from grasp, rotate"),
-            (["--policy", "grasp"], "of the task 'grasp', the hand is mounted for 'rotate'"),
-            (["--policy", "nobody"], "nobody: no such file"),
-            (["--plant", "nowhere:make"], "No module named 'nowhere'"), (["--faults.flip", "2"], "between 0 and 1"),
-            (["--plant", "twin_plant:make", "--link", str(tmp_path / "no" / "port")], "no pseudo-terminal"),
-            (["--plant", "twin_plant:make", "--mask-socket", str(tmp_path / "no" / "m")], "no socket for masks")):
+        (["--faults.script", "5 melt"], "no kind 'melt'"),
+        (["--task", "juggle"], "choose from grasp, rotate"),
+        (["--policy", "grasp"], "of the task 'grasp', the hand is mounted for 'rotate'"),
+        (["--policy", "nobody"], "nobody: no such file"),
+        (["--plant", "nowhere:make"], "No module named 'nowhere'"),
+        (["--faults.flip", "2"], "between 0 and 1"),
+        (["--plant", "twin_plant:make", "--link", str(tmp_path / "no" / "port")], "no pseudo-terminal"),
+        (["--plant", "twin_plant:make", "--mask-socket", str(tmp_path / "no" / "m")], "no socket for masks"),
+    ):
         with pytest.raises(DexsimError, match=message) as found:
             twin_command.main([*options, "--no-realtime"])
         assert "\n" not in str(found.value)

@@ -30,8 +30,17 @@ from dexsim_real.twin.shapes import Part, Shape, draw_shape, matrix, product, tu
 from dexsim_real.twin.types import Motors
 
 QUIET = {"taxel_noise": 0.0, "taxel_bias": 0.0, "taxel_spread": 0.0, "taxel_threshold": 0.0}
-IDEAL = {"coulomb_friction": 0.0, "viscous_friction": 0.0, "no_load_current": 0.0, "efficiency": 1.0, "ripple": 0.0,
-         "encoder_bias": 0.0, "latency": 0.0, "latency_spread": 0.0, "thermal": 0.0}
+IDEAL = {
+    "coulomb_friction": 0.0,
+    "viscous_friction": 0.0,
+    "no_load_current": 0.0,
+    "efficiency": 1.0,
+    "ripple": 0.0,
+    "encoder_bias": 0.0,
+    "latency": 0.0,
+    "latency_spread": 0.0,
+    "thermal": 0.0,
+}
 
 
 @pytest.fixture(scope="module")
@@ -42,6 +51,7 @@ def hand():
 def motors(position, *, kp=100.0, ki=0.0, kd=0.0, torque_max=300.0, mode=Mode.POSITION):
     def full(value):
         return np.broadcast_to(np.asarray(value, float), 12).copy()
+
     return Motors(full(position), full(kp), full(ki), full(kd), full(torque_max), full(int(mode)))
 
 
@@ -52,6 +62,7 @@ def drives(hand, heat=None, **overrides):
 
 
 # --- draws ---------------------------------------------------------------------------------------
+
 
 def _lookup(config, path):
     if path == "objects.bare_friction" and "bare_friction" not in config["objects"]:
@@ -70,12 +81,16 @@ def test_bands_repeat_the_ranges_of_the_tasks_and_of_the_shipped_policies(task):
     for config in (to_dict(TRAINED[task].config_class()), load_policy(task).env_config):
         for name, band in bands(task).items():
             trained = _lookup(config, band.origin)
-            low, high = trained if isinstance(trained, (tuple, list)) else (
-                (-trained, trained) if band.low < 0 else (trained, trained))
+            low, high = (
+                trained
+                if isinstance(trained, (tuple, list))
+                else ((-trained, trained) if band.low < 0 else (trained, trained))
+            )
             assert (band.low, band.high) == pytest.approx((low, high)), name
         assert PUSHES[task][1] == config["push_speed"]
         assert PUSHES[task][0] == pytest.approx(
-            config["push_probability"] / config["physics"]["timestep"] / config["physics"]["substeps"])
+            config["push_probability"] / config["physics"]["timestep"] / config["physics"]["substeps"]
+        )
         assert POSTURES[task] == pytest.approx(config["posture"])
         assert referee.LOST[task] == config["drop_distance"]
         assert referee.LIMITS[task] == config["evaluation_seconds"]
@@ -87,8 +102,13 @@ def test_rules_and_places_are_those_of_the_tasks(hand):
         assert REFERENCES[task] == pytest.approx(rules.reference)
         assert nominal_gravity(task) == pytest.approx(rules.gravity)
     config = rules.config
-    assert (referee.GOAL_STEP, referee.GOAL_ANGLE, referee.GOAL_DISTANCE, referee.GOAL_SPIN, referee.TIPPED) == \
-        pytest.approx((config.goal_step, config.goal_angle, config.goal_distance, config.goal_spin, config.drop_tilt))
+    assert (
+        referee.GOAL_STEP,
+        referee.GOAL_ANGLE,
+        referee.GOAL_DISTANCE,
+        referee.GOAL_SPIN,
+        referee.TIPPED,
+    ) == pytest.approx((config.goal_step, config.goal_angle, config.goal_distance, config.goal_spin, config.drop_tilt))
 
 
 def test_a_cube_is_put_in_the_middle_of_trainings_starts(hand, monkeypatch, tmp_path):
@@ -153,8 +173,13 @@ def test_the_physics_shares_no_code_with_training():
     for name in ours:
         path = Path(dexsim_real.twin.__file__).parent / f"{name}.py"
         for node in ast.walk(ast.parse(path.read_text())):
-            found = ([alias.name for alias in node.names] if isinstance(node, ast.Import) else
-                     [node.module] if isinstance(node, ast.ImportFrom) else [])
+            found = (
+                [alias.name for alias in node.names]
+                if isinstance(node, ast.Import)
+                else [node.module]
+                if isinstance(node, ast.ImportFrom)
+                else []
+            )
             for module in found:
                 assert module.split(".")[0] not in ("jax", "dexsim_ppo"), f"{name} imports {module}"
                 assert "mjx" not in module
@@ -163,11 +188,15 @@ def test_the_physics_shares_no_code_with_training():
                     assert [alias.name for alias in node.names] == ["Hand"]
             if module_of_bridge := [m for m in found if m.startswith("dexsim_real.")]:
                 assert set(module_of_bridge) <= {
-                    "dexsim_real.frames", "dexsim_real.trouble", *(f"dexsim_real.twin.{n}" for n in ours),
-                    "dexsim_real.twin"}, f"{name} imports {module_of_bridge}"
+                    "dexsim_real.frames",
+                    "dexsim_real.trouble",
+                    *(f"dexsim_real.twin.{n}" for n in ours),
+                    "dexsim_real.twin",
+                }, f"{name} imports {module_of_bridge}"
 
 
 # --- motors --------------------------------------------------------------------------------------
+
 
 def test_a_step_follows_the_second_order_closed_form(hand):
     made, inertia, step = drives(hand), 2e-3, 0.05
@@ -179,8 +208,9 @@ def test_a_step_follows_the_second_order_closed_form(hand):
     ring = omega * math.sqrt(1 - zeta**2)
     for k in range(300):
         time = k * PERIOD
-        expected = step * (1 - math.exp(-zeta * omega * time) * (
-            math.cos(ring * time) + zeta * omega / ring * math.sin(ring * time)))
+        expected = step * (
+            1 - math.exp(-zeta * omega * time) * (math.cos(ring * time) + zeta * omega / ring * math.sin(ring * time))
+        )
         assert angle == pytest.approx(np.full(12, expected), abs=0.03 * step), k
         torque, friction = made.step(time, angle, speed)
         assert np.all(friction == 0)
@@ -209,8 +239,14 @@ def test_current_at_a_static_torque_and_its_limits(hand):
     assert torque == pytest.approx(np.full(12, 0.3))
     assert made.current == pytest.approx(0.3 / hand.torque_limit * STALL_CURRENT)
     # Stalled: the whole torque at 300, half of it at 150; none at the no-load speed, all of it when braking.
-    for torque_max, speed, share in ((300, 0.0, 1.0), (150, 0.0, 0.5), (600, 0.0, 1.0), (600, 0.5, 0.5),
-                                     (300, 1.0, 0.0), (300, -0.5, 1.0)):
+    for torque_max, speed, share in (
+        (300, 0.0, 1.0),
+        (150, 0.0, 0.5),
+        (600, 0.0, 1.0),
+        (600, 0.5, 0.5),
+        (300, 1.0, 0.0),
+        (300, -0.5, 1.0),
+    ):
         made = drives(hand)
         made.order(0.0, motors(1.5 + 2 * (speed > 0), torque_max=torque_max))
         torque, _ = made.step(0.0, np.zeros(12), speed * hand.speed_limit)
@@ -265,6 +301,7 @@ def test_heat_settles_where_loss_and_flow_balance(hand):
 
 # --- the world -----------------------------------------------------------------------------------
 
+
 def world(hand, task="rotate", **overrides):
     return EmulatedHand(hand, task, 0, kind="nominal", overrides=QUIET | IDEAL | {"push_rate": 0.0} | overrides)
 
@@ -283,7 +320,7 @@ def test_free_fall(hand):
     free(plant, (0.5, 0.0, 0.0))
     plant.advance(0.2)
     at = plant._scene.object_qpos
-    fallen = plant._data.qpos[at:at + 3] - (0.5, 0.0, 0.0)
+    fallen = plant._data.qpos[at : at + 3] - (0.5, 0.0, 0.0)
     assert fallen == pytest.approx([0.5 * GRAVITY * 0.2**2, 0.0, 0.0], abs=1e-3)
     # An accelerometer in free fall feels nothing; held, it feels the ground push back.
     assert plant.measure_object()[2] == pytest.approx(np.zeros(3), abs=1e-6)
@@ -320,7 +357,7 @@ def test_an_object_on_the_fingertips_weighs_what_it_weighs(hand):
     plant.advance(0.1)
     free(plant, (0.0215 + 0.0275, -0.006, 0.183))
     plant.advance(1.5)
-    speed = np.linalg.norm(plant._data.qvel[plant._scene.object_dof:][:3])
+    speed = np.linalg.norm(plant._data.qvel[plant._scene.object_dof :][:3])
     assert speed < 1e-3
     shown = plant.measure().taxel_force
     weight = float(plant.draw.mass) * GRAVITY
@@ -338,20 +375,24 @@ def test_contacts_are_springs_of_the_stiffness_and_bounce_asked_for(stiffness):
         spec.option.timestep, spec.option.gravity = scene.TIMESTEP, [0, 0, -gravity]
         spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-        spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_BOX, size=[1, 1, 0.1], pos=[0, 0, -0.1],
-                                contype=0, conaffinity=0)
+        spec.worldbody.add_geom(
+            name="floor", type=mujoco.mjtGeom.mjGEOM_BOX, size=[1, 1, 0.1], pos=[0, 0, -0.1], contype=0, conaffinity=0
+        )
         body = spec.worldbody.add_body(pos=[0, 0, 0.03])
         body.add_freejoint()
-        body.add_geom(name="ball", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.03, 0, 0], mass=0.1, contype=0,
-                      conaffinity=0)
+        body.add_geom(
+            name="ball", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.03, 0, 0], mass=0.1, contype=0, conaffinity=0
+        )
         spec.add_pair(geomname1="floor", geomname2="ball", condim=4)
         model = spec.compile()
         model.pair_solref[0], model.pair_solimp[0] = scene.spring(
-            model.body_invweight0[:, 0].sum(), stiffness, scene.damping_of(0.08, stiffness, 0.1))
+            model.body_invweight0[:, 0].sum(), stiffness, scene.damping_of(0.08, stiffness, 0.1)
+        )
         data = mujoco.MjData(model)
         data.qvel[2] = -speed
         mujoco.mj_step(model, data, 4000)
         return data
+
     assert drop(0.3, 0.0).qvel[2] / 0.3 == pytest.approx(0.08, rel=0.15)
     assert 0.03 - drop(0.0, GRAVITY).qpos[2] == pytest.approx(0.1 * GRAVITY / stiffness, rel=0.01)
 
@@ -408,6 +449,7 @@ def test_a_run_is_repeated_by_its_seed_and_by_no_other(hand):
         plant.advance(0.3)
         shown = plant.measure()
         return np.concatenate([np.ravel(getattr(shown, f.name)) for f in dataclasses.fields(shown)]), plant.results()
+
     (first, result), (again, same), (other, _), (later, _) = run(0), run(0), run(1), run(0, 3)
     assert result[0]["stage"] == "free"
     assert np.array_equal(first, again) and result == same
@@ -416,6 +458,7 @@ def test_a_run_is_repeated_by_its_seed_and_by_no_other(hand):
 
 
 # --- assistant and trials ------------------------------------------------------------------------
+
 
 def test_the_object_is_held_until_the_targets_move_on(hand):
     plant = EmulatedHand(hand, "rotate", 2, trials=1)
@@ -427,9 +470,9 @@ def test_the_object_is_held_until_the_targets_move_on(hand):
     plant.drive(motors(posture))
     plant.advance(0.5)
     assert plant.stage is Stage.HOLD
-    held = plant._data.qpos[at:at + 7].copy()
+    held = plant._data.qpos[at : at + 7].copy()
     plant.advance(1.0)
-    assert plant._data.qpos[at:at + 7] == pytest.approx(held, abs=1e-4)
+    assert plant._data.qpos[at : at + 7] == pytest.approx(held, abs=1e-4)
     plant.drive(motors(posture + 0.01))
     plant.advance(0.05)
     assert plant.stage is Stage.FREE
@@ -473,14 +516,26 @@ def test_places_are_clear_of_the_hand(hand):
 
 # --- shapes --------------------------------------------------------------------------------------
 
-@pytest.mark.parametrize("part", [Part("sphere", (0.03,)), Part("box", (0.02, 0.03, 0.025)),
-                                  Part("cylinder", (0.02, 0.03), (0.01, 0.0, 0.0)), Part("capsule", (0.015, 0.02))])
+
+@pytest.mark.parametrize(
+    "part",
+    [
+        Part("sphere", (0.03,)),
+        Part("box", (0.02, 0.03, 0.025)),
+        Part("cylinder", (0.02, 0.03), (0.01, 0.0, 0.0)),
+        Part("capsule", (0.015, 0.02)),
+    ],
+)
 def test_distances_agree_with_mujoco(part):
     spec = mujoco.MjSpec()
     spec.worldbody.add_geom(name="part", type=scene._KINDS[part.kind], size=scene._three(part.size), pos=part.place)
     for k in range(200):
-        spec.worldbody.add_geom(name=f"p{k}", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[1e-5, 0, 0],
-                                pos=np.random.default_rng(k).uniform(-0.06, 0.06, 3))
+        spec.worldbody.add_geom(
+            name=f"p{k}",
+            type=mujoco.mjtGeom.mjGEOM_SPHERE,
+            size=[1e-5, 0, 0],
+            pos=np.random.default_rng(k).uniform(-0.06, 0.06, 3),
+        )
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
@@ -499,11 +554,13 @@ def test_distances_agree_with_mujoco(part):
 def test_mass_properties_of_a_box():
     mass, centre, inertia = scene.mass_properties(Shape("box", (Part("box", (0.02, 0.03, 0.04)),)), 0.3)
     assert mass == 0.3 and centre == pytest.approx(np.zeros(3))
-    assert np.diag(inertia) == pytest.approx([0.1 * (0.03**2 + 0.04**2), 0.1 * (0.02**2 + 0.04**2),
-                                              0.1 * (0.02**2 + 0.03**2)])
+    assert np.diag(inertia) == pytest.approx(
+        [0.1 * (0.03**2 + 0.04**2), 0.1 * (0.02**2 + 0.04**2), 0.1 * (0.02**2 + 0.03**2)]
+    )
 
 
 # --- referee -------------------------------------------------------------------------------------
+
 
 def spinning(rate, seconds, heading=0.05, fastest=2.0, step=0.01):
     count = GoalCount(fastest)
@@ -538,8 +595,15 @@ def watched(task, positions, *, seconds=None, tips=0.0, quat=(1.0, 0, 0, 0)):
     force = np.zeros((5, 3))
     for k, position in enumerate(positions):
         force[:, 0] = tips(k) if callable(tips) else tips
-        judge.watch(0.01, np.asarray(position, float), np.asarray(quat, float), np.zeros(3), force, np.zeros(5),
-                    np.full(12, 0.5))
+        judge.watch(
+            0.01,
+            np.asarray(position, float),
+            np.asarray(quat, float),
+            np.zeros(3),
+            force,
+            np.zeros(5),
+            np.full(12, 0.5),
+        )
     return judge
 
 

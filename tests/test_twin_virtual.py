@@ -57,8 +57,13 @@ class Scripted:
 def virtual(hand, task, script, *, sources=("imu",), seconds=0.5, safety=True, **overrides):
     plant = EmulatedHand(hand, task, 4, kind="nominal", trials=1, seconds=seconds, overrides=CALM | overrides)
     controller = Scripted(hand, task, script, sources)
-    return VirtualRun(plant, controller, ideal_calibration(hand),
-                      RunOptions(command=0.25, safety=safety, approach=0.4, place=0.2)), plant, controller
+    return (
+        VirtualRun(
+            plant, controller, ideal_calibration(hand), RunOptions(command=0.25, safety=safety, approach=0.4, place=0.2)
+        ),
+        plant,
+        controller,
+    )
 
 
 def test_a_run_goes_through_the_wire_and_is_judged_by_the_referee(hand):
@@ -103,8 +108,9 @@ def test_an_unsafe_wish_is_clipped_unless_the_limits_are_left_out(hand):
 
 def test_the_imu_shows_the_orientation_up_to_the_mounts_tilt(hand):
     for tilt, limit in ((0.0, 0.0005), (0.1, 0.15)):
-        plant = EmulatedHand(hand, "rotate", 1, kind="nominal",
-                             overrides=CALM | {"imu_noise": 0.0, "gravity_tilt": tilt})
+        plant = EmulatedHand(
+            hand, "rotate", 1, kind="nominal", overrides=CALM | {"imu_noise": 0.0, "gravity_tilt": tilt}
+        )
         imu = VirtualImu(plant, -nominal_gravity("rotate"))
         for step in range(3):
             plant.advance(0.03)
@@ -121,7 +127,7 @@ def test_the_camera_measures_the_height(hand):
         controller = Scripted(hand, "grasp", lambda k, target: target, {"camera"})
         camera = VirtualCamera(plant, controller)
         reference = np.array(controller.task.reference)
-        place = plant._data.qpos[plant._scene.object_qpos:][:3]
+        place = plant._data.qpos[plant._scene.object_qpos :][:3]
         place[:] = reference + (0.01, 0.0, 0.0)
         plant.advance(0.0)
         plant._remember()
@@ -144,12 +150,14 @@ def test_events_come_in_order_of_time_then_of_asking():
 def test_the_ideal_calibration_reads_torque_over_its_limit(hand):
     calibration = ideal_calibration(hand)
     counts = -1000.0 * 0.5 * np.ones(12)  # mA, closing, half of what stalls
-    assert np.asarray(normalised_torque(calibration, current_from_counts(calibration, counts))) == \
-        pytest.approx(np.full(12, 0.5), abs=1e-6)
+    assert np.asarray(normalised_torque(calibration, current_from_counts(calibration, counts))) == pytest.approx(
+        np.full(12, 0.5), abs=1e-6
+    )
     assert HardwareConfig().current_sign < 0
 
 
 # --- the benchmark's tables ----------------------------------------------------------------------
+
 
 @pytest.fixture(scope="module")
 def benchmark():
@@ -161,9 +169,17 @@ def benchmark():
 
 
 def test_metrics_of_rotations(benchmark):
-    reports = [{"successes": s, "paper_successes": s + 1, "seconds_per_success": 2.0 if s else None,
-                "seconds_to_fall": t, "fell": t < 120, "joint_speed": 0.5}
-               for s, t in ((0, 3.0), (10, 60.0), (50, 120.0))]
+    reports = [
+        {
+            "successes": s,
+            "paper_successes": s + 1,
+            "seconds_per_success": 2.0 if s else None,
+            "seconds_to_fall": t,
+            "fell": t < 120,
+            "joint_speed": 0.5,
+        }
+        for s, t in ((0, 3.0), (10, 60.0), (50, 120.0))
+    ]
     metrics = benchmark.rotate_metrics(reports)
     assert metrics["successes"]["mean"] == 20.0 and metrics["successes"]["median"] == 10.0
     assert metrics["seconds_per_success"]["mean"] == 2.0 and metrics["seconds_to_fall"]["mean"] == 61.0
@@ -174,9 +190,18 @@ def test_metrics_of_rotations(benchmark):
 
 
 def test_metrics_of_grasps_count_only_what_was_held(benchmark):
-    reports = [{"held": held, "command": c, "finger_force": 2 + 5 * c, "finger_pressing": (1 + c) ** 2,
-                "total_force": 9 + c, "shape": shape}
-               for c in (0.0, 0.5, 1.0) for shape, held in (("box", True), ("sphere", c < 1))]
+    reports = [
+        {
+            "held": held,
+            "command": c,
+            "finger_force": 2 + 5 * c,
+            "finger_pressing": (1 + c) ** 2,
+            "total_force": 9 + c,
+            "shape": shape,
+        }
+        for c in (0.0, 0.5, 1.0)
+        for shape, held in (("box", True), ("sphere", c < 1))
+    ]
     metrics = benchmark.grasp_metrics(reports)
     assert metrics["held"]["mean"] == pytest.approx(5 / 6)
     assert metrics["pearson_r"]["r"] == pytest.approx(1.0)

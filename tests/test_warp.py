@@ -25,10 +25,14 @@ WORLDS = 4
 
 
 def compile_advance(hand, config):
-    seam = Physics(hand, SLOTS, ObjectConfig().largest, config, gravity=GRAVITY, backend="warp",
-                   num_envs=WORLDS)
-    return jax.jit(jax.vmap(lambda target, state, torque: seam.advance(
-        target, state, lambda index, position, velocity: torque, jnp.zeros(3))))
+    seam = Physics(hand, SLOTS, ObjectConfig().largest, config, gravity=GRAVITY, backend="warp", num_envs=WORLDS)
+    return jax.jit(
+        jax.vmap(
+            lambda target, state, torque: seam.advance(
+                target, state, lambda index, position, velocity: torque, jnp.zeros(3)
+            )
+        )
+    )
 
 
 @pytest.fixture(scope="module")
@@ -53,8 +57,7 @@ def worlds(hand, grasp_env):
         assert len(inputs) == WORLDS, shape
         targets, qpos, qvel, warmstart, torque = zip(*inputs, strict=True)
         state = PhysicsState(*(jnp.stack(x) for x in (qpos, qvel, warmstart)))
-        found[shape] = ((stack(targets), state, jnp.stack(torque)),
-                        *(np.stack(x) for x in zip(*wanted, strict=True)))
+        found[shape] = ((stack(targets), state, jnp.stack(torque)), *(np.stack(x) for x in zip(*wanted, strict=True)))
     return found
 
 
@@ -105,18 +108,25 @@ def test_the_palm_ends_where_the_hand_does():
     edge = palm.position[1] + palm.size[1]
     past = np.array([-0.006, -0.004, -0.002, -0.001, 0.001, 0.002, 0.004, 0.006])  # m, of the line's foot
     target = jax.tree.map(lambda x: jnp.repeat(jnp.asarray(x)[:1], 8, 0), env.pool.target)
-    target = dataclasses.replace(target, size=jnp.full_like(target.size, half), com=jnp.zeros((8, 3)),
-                                 bare_friction=jnp.full(8, 0.7))
+    target = dataclasses.replace(
+        target, size=jnp.full_like(target.size, half), com=jnp.zeros((8, 3)), bare_friction=jnp.full(8, 0.7)
+    )
     qpos = np.zeros((8, 19), np.float32)
     qpos[:, :12] = np.clip(0, env.hand.joint_lower, env.hand.joint_upper)  # thumb and fingers out of the way
     qpos[:, 12:16] = palm.position[0] + palm.size[0] + half, 0, 0.085, 1
     qpos[:, 13] = edge - half * down[1] / -down[0] + past
     state = PhysicsState(jnp.asarray(qpos), jnp.zeros((8, 18)), jnp.zeros((8, 18)))
-    advance = jax.jit(jax.vmap(lambda target, state: env.physics.advance(
-        target, state, lambda index, position, velocity: jnp.zeros(12), jnp.zeros(3))[0]))
+    advance = jax.jit(
+        jax.vmap(
+            lambda target, state: env.physics.advance(
+                target, state, lambda index, position, velocity: jnp.zeros(12), jnp.zeros(3)
+            )[0]
+        )
+    )
     for _ in range(20):
         state = advance(target, state)
-        state = dataclasses.replace(state, qpos=state.qpos.at[:, :12].set(qpos[:, :12]),
-                                    qvel=state.qvel.at[:, :12].set(0.0))
+        state = dataclasses.replace(
+            state, qpos=state.qpos.at[:, :12].set(qpos[:, :12]), qvel=state.qvel.at[:, :12].set(0.0)
+        )
     moved = np.linalg.norm(np.asarray(state.qpos[:, 12:15]) - qpos[:, 12:15], axis=-1)
     assert np.all(moved[past < 0] < 1e-3) and np.all(moved[past > 0] > 0.1), moved

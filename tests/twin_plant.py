@@ -52,9 +52,16 @@ class ScriptedPlant:
         force[:, 40:50, 2] = 0.25 * np.maximum(self.angle[[2, 5, 7, 9, 11]], 0)[:, None]
         force[:, 40:50, 0] = -0.5 * force[:, 40:50, 2]
         return Measurement(
-            time=self.time, joint_position=self.angle.copy(), joint_velocity=self.velocity.copy(),
-            current=-100.0 * self.velocity, temperature=self.heat.copy(), taxel_force=force, object_quat=quat,
-            object_position=position, object_acceleration=acceleration)
+            time=self.time,
+            joint_position=self.angle.copy(),
+            joint_velocity=self.velocity.copy(),
+            current=-100.0 * self.velocity,
+            temperature=self.heat.copy(),
+            taxel_force=force,
+            object_quat=quat,
+            object_position=position,
+            object_acceleration=acceleration,
+        )
 
     def measure_object(self):
         half = 0.5 * self.turn * self.time

@@ -25,18 +25,21 @@ def _tasks() -> dict[str, TaskEntry]:
     def rotation(config: Callable[[], Any]) -> TaskEntry:
         return TaskEntry(rotate_config.RotateConfig, Rotate, config)
 
-    return {"grasp": TaskEntry(GraspConfig, Grasp, GraspConfig),
-            "rotate": rotation(rotate_config.RotateConfig),
-            "rotate_paper": rotation(rotate_config.paper),
-            "rotate_without_orientation": rotation(rotate_config.without_orientation),
-            "rotate_clear": rotation(rotate_config.clear_of_palm)}
+    return {
+        "grasp": TaskEntry(GraspConfig, Grasp, GraspConfig),
+        "rotate": rotation(rotate_config.RotateConfig),
+        "rotate_paper": rotation(rotate_config.paper),
+        "rotate_without_orientation": rotation(rotate_config.without_orientation),
+        "rotate_clear": rotation(rotate_config.clear_of_palm),
+    }
 
 
 TASKS = _tasks()
 
 
-def make(task: str, config: Any = None, *, backend: str = "auto", num_envs: int = 1,
-         hand: Any = None, seed: int = 0) -> Any:
+def make(
+    task: str, config: Any = None, *, backend: str = "auto", num_envs: int = 1, hand: Any = None, seed: int = 0
+) -> Any:
     """An environment.
 
     Args:
@@ -58,7 +61,6 @@ def make(task: str, config: Any = None, *, backend: str = "auto", num_envs: int 
     entry = TASKS[task]
     config = entry.config() if config is None else config
     if not isinstance(config, entry.config_class):
-        raise ConfigError(f"task {task!r} takes a {entry.config_class.__name__}, "
-                          f"not a {type(config).__name__}")
+        raise ConfigError(f"task {task!r} takes a {entry.config_class.__name__}, not a {type(config).__name__}")
     hand = load_hand() if hand is None else hand
     return Env(entry.task_class(config, hand), hand, backend=backend, num_envs=num_envs, seed=seed)

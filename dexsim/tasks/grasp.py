@@ -91,8 +91,8 @@ class GraspConfig(EnvConfig):
     drop_distance: float = setting(0.12, unit="m", low=0.02, high=1.0)
     """The object is lost when its centre is farther than this from the grasp centre."""
     posture: tuple[float, ...] = setting(
-        (1.45, 0.15, 0.25, 0.0, 1.1, 0.8, 1.1, 0.8, 1.1, 0.8, 1.1, 0.8), unit="rad",
-        low=-3.2, high=3.2)
+        (1.45, 0.15, 0.25, 0.0, 1.1, 0.8, 1.1, 0.8, 1.1, 0.8, 1.1, 0.8), unit="rad", low=-3.2, high=3.2
+    )
     """Joint angles that episodes start near."""
     posture_noise: float = setting(0.12, unit="rad", low=0.0, high=1.0)
     """Largest deviation from them."""
@@ -128,6 +128,7 @@ class Goal:
 
 # --- reward terms: small pure functions ------------------------------------------------------
 
+
 def target_force(command: jax.Array, span: tuple[float, float]) -> jax.Array:
     """Force [] N that each touching finger should press with."""
     return span[0] + command * (span[1] - span[0])
@@ -140,16 +141,16 @@ def tailed_gaussian(error: jax.Array, sigma: float, tail_sigma: float, tail: flo
     return (1 - tail) * narrow + tail * wide
 
 
-def command_reward(value: jax.Array, goal: jax.Array, contact: jax.Array, bounds: tuple,
-                   scale: float, weights: GraspReward) -> jax.Array:
+def command_reward(
+    value: jax.Array, goal: jax.Array, contact: jax.Array, bounds: tuple, scale: float, weights: GraspReward
+) -> jax.Array:
     """Sum over touching fingers of the match between `value` [F] and `goal`, over F.
 
     R_force and R_torque of the paper: zero outside `bounds` and without contact. The first
     finger is the thumb; see `GraspReward.thumb`.
     """
     valid = contact & (value >= bounds[0]) & (value <= bounds[1])
-    match = tailed_gaussian((value - goal) / scale, weights.sigma, weights.tail_sigma,
-                            weights.tail)
+    match = tailed_gaussian((value - goal) / scale, weights.sigma, weights.tail_sigma, weights.tail)
     if weights.thumb == "binary":
         match = match.at[0].set(1.0)
     elif weights.thumb == "loose":
@@ -184,8 +185,9 @@ class Grasp:
 
     def __init__(self, config: GraspConfig, hand: Hand):
         if len(config.posture) != hand.num_joints:
-            raise ConfigError(f"GraspConfig.posture has {len(config.posture)} angles, "
-                              f"the hand {hand.num_joints} joints")
+            raise ConfigError(
+                f"GraspConfig.posture has {len(config.posture)} angles, the hand {hand.num_joints} joints"
+            )
         self.config, self.hand = config, hand
         self.slots, self.largest = config.objects.slots, config.objects.largest
         self.object_ranges = tuple(f"objects.{name}" for name in config.objects.ranges)
@@ -201,8 +203,7 @@ class Grasp:
         """Objects released below the palm, between the half-closed fingers."""
         return make_pool(key, self.hand, self.config, self.reference)
 
-    def draw_object(self, key: jax.Array, config: GraspConfig,
-                    shape_index: jax.Array | None = None) -> ObjectParams:
+    def draw_object(self, key: jax.Array, config: GraspConfig, shape_index: jax.Array | None = None) -> ObjectParams:
         """One object of `config`, of a random or the given kind (index into SHAPES)."""
         return sample_object(key, config.objects, shape_index)
 
@@ -218,8 +219,7 @@ class Grasp:
         del moment
         when, what = jax.random.split(key)
         change = jax.random.bernoulli(when, self.config.command_change) & ~goal.fixed
-        return dataclasses.replace(
-            goal, command=jnp.where(change, jax.random.uniform(what), goal.command))
+        return dataclasses.replace(goal, command=jnp.where(change, jax.random.uniform(what), goal.command))
 
     def goal_readings(self, goal: Goal) -> tuple[jax.Array, jax.Array]:
         """Command and target orientation, as `Readings` carry them."""
@@ -230,16 +230,20 @@ class Grasp:
 
     def push(self, key: jax.Array, target: ObjectParams) -> jax.Array:
         """Force [3] N that changes the object's velocity by up to `push_speed` in one tick."""
-        return random_push(key, target.mass, probability=self.config.push_probability,
-                           speed=self.config.push_speed, period=self.config.physics.control_period)
+        return random_push(
+            key,
+            target.mass,
+            probability=self.config.push_probability,
+            speed=self.config.push_speed,
+            period=self.config.physics.control_period,
+        )
 
     def dropped(self, goal: Goal, moment: Moment) -> jax.Array:
         del goal
         away = jnp.linalg.norm(moment.object_position - jnp.asarray(self.reference))
         return away > self.config.drop_distance
 
-    def reward(self, goal: Goal, moment: Moment,
-               dropped: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
+    def reward(self, goal: Goal, moment: Moment, dropped: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
         """The reward of a tick and its terms; zero for all but the penalties once dropped."""
         config, weights = self.config, self.config.reward
         force = jnp.linalg.norm(moment.finger_force, axis=-1)
@@ -249,16 +253,23 @@ class Grasp:
         held = 1.0 - dropped
         fingers = self._finger_joints
         terms = {
-            "force": held * weights.force * command_reward(
-                force, wanted, contact, (0.01, 200.0), config.max_force, weights),
-            "torque": held * weights.torque * command_reward(
-                torque / self._max_torque, wanted / config.force_per_torque / self._max_torque,
-                contact & (torque >= 0.01), (0.0, 1.0), 1.0, weights),
+            "force": held
+            * weights.force
+            * command_reward(force, wanted, contact, (0.01, 200.0), config.max_force, weights),
+            "torque": held
+            * weights.torque
+            * command_reward(
+                torque / self._max_torque,
+                wanted / config.force_per_torque / self._max_torque,
+                contact & (torque >= 0.01),
+                (0.0, 1.0),
+                1.0,
+                weights,
+            ),
             "alive": held * weights.alive,
             "overload": held * weights.overload * overload(force[1:], wanted + weights.margin) / config.max_force,
             "spread": weights.spread * joint_spread(moment.joint_position[self._roots[1:]]),
-            "outer": weights.outer * posture_distance(
-                moment.joint_position[fingers], self._centre[fingers]),
+            "outer": weights.outer * posture_distance(moment.joint_position[fingers], self._centre[fingers]),
             "action": weights.action * action_rate(moment.action, moment.last_action),
             "velocity": weights.velocity * joint_speed(moment.joint_velocity),
             "drop": weights.drop * dropped,
@@ -297,14 +308,10 @@ class Grasp:
         for shape in present:
             of_shape = np.flatnonzero(shape_index == shape)
             mine = wanted == shape
-            index[mine] = of_shape[(turn[mine] * len(COMMANDS)
-                                    + rows[mine] % len(COMMANDS)) % len(of_shape)]
-        goal = Goal(jnp.asarray(command @ np.asarray(COMMANDS), jnp.float32),
-                    jnp.ones(count, bool))
+            index[mine] = of_shape[(turn[mine] * len(COMMANDS) + rows[mine] % len(COMMANDS)) % len(of_shape)]
+        goal = Goal(jnp.asarray(command @ np.asarray(COMMANDS), jnp.float32), jnp.ones(count, bool))
         return index, goal
 
-    def summarize(self, metrics: dict[str, np.ndarray], alive: np.ndarray,
-                  control_period: float) -> dict:
+    def summarize(self, metrics: dict[str, np.ndarray], alive: np.ndarray, control_period: float) -> dict:
         """The report of an evaluation; see `grasp_report`."""
         return summarize(metrics, alive, control_period, self.config.finger_force)
-

@@ -40,20 +40,23 @@ def make_pool(key: jax.Array, hand: Hand, config: Any, reference: tuple[float, f
         for trial in range(40):
             shape_key = jax.random.fold_in(jax.random.fold_in(key, KINDS.index(name)), trial)
             starts, clear = draw(shape_key, jnp.int32(KINDS.index(name)))
-            rows = np.flatnonzero(np.asarray(clear))[:share - found]
+            rows = np.flatnonzero(np.asarray(clear))[: share - found]
             kept.append(jax.tree.map(lambda x, rows=rows: np.asarray(x)[rows], starts))
             found += rows.size
             if found == share:
                 break
         if found < share:
-            raise ConfigError(f"{type(config).__name__}: only {found} of {share} start states of "
-                              f"shape {name!r} are free of overlap; open the posture or shrink it")
+            raise ConfigError(
+                f"{type(config).__name__}: only {found} of {share} start states of "
+                f"shape {name!r} are free of overlap; open the posture or shrink it"
+            )
         pools.append(jax.tree.map(lambda *parts: np.concatenate(parts), *kept))
-    return jax.tree.map(lambda *parts: np.concatenate(parts)[:config.pool_size], *pools)
+    return jax.tree.map(lambda *parts: np.concatenate(parts)[: config.pool_size], *pools)
 
 
-def _candidate(key: jax.Array, shape_index: jax.Array, hand: Hand, config: Any,
-               reference: tuple[float, float, float]) -> tuple[Any, jax.Array]:
+def _candidate(
+    key: jax.Array, shape_index: jax.Array, hand: Hand, config: Any, reference: tuple[float, float, float]
+) -> tuple[Any, jax.Array]:
     from dexsim.env import Start
 
     keys = jax.random.split(key, 7)
@@ -70,19 +73,19 @@ def _candidate(key: jax.Array, shape_index: jax.Array, hand: Hand, config: Any,
     roll, turn, askew = jax.random.uniform(keys[2], (3,), minval=-1.0)
     quat = rotations.axis_angle_to_quat(jnp.array([0.0, 0.0, 1.0]), roll * jnp.pi)
     most = config.turn_noise
-    for axis, angle in (((1.0, 0.0, 0.0), -jnp.pi / 2), ((0.0, 0.0, 1.0), most[1] * askew),
-                        ((1.0, 0.0, 0.0), most[0] * turn)):
-        quat = rotations.quat_multiply(rotations.axis_angle_to_quat(jnp.array(axis),
-                                                                    jnp.asarray(angle)), quat)
+    for axis, angle in (
+        ((1.0, 0.0, 0.0), -jnp.pi / 2),
+        ((0.0, 0.0, 1.0), most[1] * askew),
+        ((1.0, 0.0, 0.0), most[0] * turn),
+    ):
+        quat = rotations.quat_multiply(rotations.axis_angle_to_quat(jnp.array(axis), jnp.asarray(angle)), quat)
     matrix = rotations.quat_to_matrix(quat)
     up = rotations.rotate_inverse(matrix, jnp.array([-1.0, 0.0, 0.0]))
     gap = jax.random.uniform(keys[3], minval=config.release_gap[0], maxval=config.release_gap[1])
     shift = config.place_noise * jax.random.uniform(keys[4], (2,), minval=-1.0)
     top = extent(target.size, target.position, target.active, up, target.kinds, target.quat)
-    position = jnp.stack([palm_height(hand) + gap + top, reference[1] + shift[0],
-                          reference[2] + shift[1]])
-    speed = jax.random.uniform(keys[5], minval=config.release_speed[0],
-                               maxval=config.release_speed[1])
+    position = jnp.stack([palm_height(hand) + gap + top, reference[1] + shift[0], reference[2] + shift[1]])
+    speed = jax.random.uniform(keys[5], minval=config.release_speed[0], maxval=config.release_speed[1])
     qpos = jnp.concatenate([joints, position, quat])
     drift = config.release_drift * jax.random.uniform(jax.random.fold_in(keys[5], 1), (2,), minval=-1.0)
     spin = config.release_spin * jax.random.uniform(jax.random.fold_in(keys[5], 2), (3,), minval=-1.0)
@@ -99,17 +102,14 @@ def palm_height(hand: Hand) -> float:
     return float(max(faces, default=0.0))
 
 
-def clearance(hand: Hand, joints: jax.Array, shape: sdf.Shape, position: jax.Array,
-              rotation: jax.Array) -> jax.Array:
+def clearance(hand: Hand, joints: jax.Array, shape: sdf.Shape, position: jax.Array, rotation: jax.Array) -> jax.Array:
     """Smallest distance [] m from the object to the hand's capsules, at seven points of each."""
     pose = forward_kinematics(hand, joints)
     capsules = [g for g in hand.geoms if g.touches and g.kind == "capsule"]
     steps = np.linspace(-1.0, 1.0, 7)
-    local = np.stack([g.position + np.outer(steps * g.size[1], g.rotation[:, 2])
-                      for g in capsules]).astype(np.float32)
+    local = np.stack([g.position + np.outer(steps * g.size[1], g.rotation[:, 2]) for g in capsules]).astype(np.float32)
     body = np.array([g.body for g in capsules])
     radius = np.array([g.size[0] for g in capsules])[:, None]
-    points = pose.body_position[body][:, None] + rotations.rotate(
-        pose.body_rotation[body][:, None], jnp.asarray(local))
+    points = pose.body_position[body][:, None] + rotations.rotate(pose.body_rotation[body][:, None], jnp.asarray(local))
     points = rotations.rotate_inverse(rotation, points - position)
     return jnp.min(sdf.signed_distance(points, shape) - radius)

@@ -69,6 +69,7 @@ class Progress:
 
 # --- small pure functions ----------------------------------------------------------------------
 
+
 def goal_quat(turns: jax.Array, axis: jax.Array, angle: jax.Array) -> jax.Array:
     """Orientation [4] of the goal after `turns` goals: (turns + 1) steps of `angle` about `axis`."""
     # Angles are taken modulo a full turn, so that single precision lasts for any number of goals.
@@ -97,8 +98,9 @@ class Rotate:
 
     def __init__(self, config: RotateConfig, hand: Hand):
         if len(config.posture) != hand.num_joints:
-            raise ConfigError(f"RotateConfig.posture has {len(config.posture)} angles, "
-                              f"the hand {hand.num_joints} joints")
+            raise ConfigError(
+                f"RotateConfig.posture has {len(config.posture)} angles, the hand {hand.num_joints} joints"
+            )
         self.config, self.hand = config, hand
         self.slots, self.largest = slots(config), largest_size(config)
         drawn = ("edge", *(f"objects.{name}" for name in BULK_RANGES))
@@ -117,8 +119,7 @@ class Rotate:
         """Objects that came to rest in random postures of the hand; see `rotate_start`."""
         return load_pool(key, self.hand, self.config, self.gravity)
 
-    def draw_object(self, key: jax.Array, config: RotateConfig,
-                    shape_index: jax.Array | None = None) -> ObjectParams:
+    def draw_object(self, key: jax.Array, config: RotateConfig, shape_index: jax.Array | None = None) -> ObjectParams:
         """One object of `config`; there is only one kind."""
         del shape_index
         return sample_target(key, config)
@@ -133,11 +134,19 @@ class Rotate:
         del key, start
         zero, none = jnp.zeros(()), jnp.zeros((), jnp.int32)
         fingers = jnp.zeros(self.hand.num_fingers)
-        return Goal(turns=none, entered=jnp.zeros((), bool), entries=none, dwell=zero, clock=zero,
-                    last_success=zero, gives_up=jnp.ones((), bool), duty=fingers, pace=zero,
-                    since_touch=jnp.full((), 10.0),
-                    totals={"spin": zero, "joint_speed": zero, "action_rate": zero,
-                            "tilt": zero, "touch": fingers})
+        return Goal(
+            turns=none,
+            entered=jnp.zeros((), bool),
+            entries=none,
+            dwell=zero,
+            clock=zero,
+            last_success=zero,
+            gives_up=jnp.ones((), bool),
+            duty=fingers,
+            pace=zero,
+            since_touch=jnp.full((), 10.0),
+            totals={"spin": zero, "joint_speed": zero, "action_rate": zero, "tilt": zero, "touch": fingers},
+        )
 
     def progress(self, goal: Goal, moment: Moment) -> Progress:
         """Where the object is with respect to the goal."""
@@ -160,18 +169,26 @@ class Rotate:
         now, period = self.progress(goal, moment), self._period
         touching = self._touching(moment)
         clock = goal.clock + period
-        change = {"spin": now.spin, "joint_speed": jnp.mean(jnp.abs(moment.joint_velocity)),
-                  "action_rate": jnp.mean(jnp.abs(moment.action - moment.last_action)),
-                  "tilt": self._tilt(moment), "touch": touching}
+        change = {
+            "spin": now.spin,
+            "joint_speed": jnp.mean(jnp.abs(moment.joint_velocity)),
+            "action_rate": jnp.mean(jnp.abs(moment.action - moment.last_action)),
+            "tilt": self._tilt(moment),
+            "touch": touching,
+        }
         return Goal(
-            turns=goal.turns + now.success, entered=now.entered & ~now.success,
+            turns=goal.turns + now.success,
+            entered=now.entered & ~now.success,
             entries=goal.entries + (now.entered & ~goal.entered),
-            dwell=jnp.where(now.success, 0.0, now.dwell), clock=clock,
-            last_success=jnp.where(now.success, clock, goal.last_success), gives_up=goal.gives_up,
+            dwell=jnp.where(now.success, 0.0, now.dwell),
+            clock=clock,
+            last_success=jnp.where(now.success, clock, goal.last_success),
+            gives_up=goal.gives_up,
             duty=goal.duty + period / _MEMORY * (touching - goal.duty),
             pace=goal.pace + period / _MEMORY * (change["joint_speed"] - goal.pace),
             since_touch=jnp.where(jnp.any(touching > 0), 0.0, goal.since_touch + period),
-            totals={name: goal.totals[name] + change[name] for name in goal.totals})
+            totals={name: goal.totals[name] + change[name] for name in goal.totals},
+        )
 
     def goal_readings(self, goal: Goal) -> tuple[jax.Array, jax.Array]:
         """Command (unused) and target orientation, as `Readings` carry them."""
@@ -184,8 +201,13 @@ class Rotate:
 
     def push(self, key: jax.Array, target: ObjectParams) -> jax.Array:
         """Force [3] N that changes the object's velocity by up to `push_speed` in one tick."""
-        return random_push(key, target.mass, probability=self.config.push_probability,
-                           speed=self.config.push_speed, period=self._period)
+        return random_push(
+            key,
+            target.mass,
+            probability=self.config.push_probability,
+            speed=self.config.push_speed,
+            period=self._period,
+        )
 
     def dropped(self, goal: Goal, moment: Moment) -> jax.Array:
         away = jnp.linalg.norm(moment.object_position - jnp.asarray(self.reference))
@@ -196,13 +218,11 @@ class Rotate:
         hopeless = (away > self.config.leash) | (goal.clock - goal.last_success > self.config.patience)
         return lost | (goal.gives_up & hopeless)
 
-    def reward(self, goal: Goal, moment: Moment,
-               dropped: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
+    def reward(self, goal: Goal, moment: Moment, dropped: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
         """The reward of a tick and its terms; nothing but penalties once dropped."""
         weights, now, held = self.config.reward, self.progress(goal, moment), 1.0 - dropped
         after = self._advance(goal, moment)
-        work = tips_at_work(after.duty, weights.working_tips, weights.working_duty,
-                            weights.tips_by)
+        work = tips_at_work(after.duty, weights.working_tips, weights.working_duty, weights.tips_by)
         calm = jnp.minimum(weights.bonus_speed / jnp.maximum(after.pace, 1e-6), 1.0) ** 2
         asked = weights.bonus_tips * (goal.turns >= weights.tips_after)
         share = calm * (1.0 - asked * (1.0 - work))
@@ -222,13 +242,17 @@ class Rotate:
         return sum(terms.values()), {
             **{f"reward/{name}": value for name, value in terms.items()},
             "goals_per_minute": turns / jnp.maximum(after.clock, self._period) * 60.0,
-            "successes": turns, "paper_successes": after.entries.astype(jnp.float32),
+            "successes": turns,
+            "paper_successes": after.entries.astype(jnp.float32),
             "time_at_last_success": after.last_success,
-            "angle_error": now.angle, "distance": now.distance,
+            "angle_error": now.angle,
+            "distance": now.distance,
             "pushed_out": (dropped & recent).astype(jnp.float32),
             "slipped": (dropped & ~recent).astype(jnp.float32),
-            "spin": mean["spin"], "joint_speed": mean["joint_speed"],
-            "action_rate": mean["action_rate"], "tilt": mean["tilt"],
+            "spin": mean["spin"],
+            "joint_speed": mean["joint_speed"],
+            "action_rate": mean["action_rate"],
+            "tilt": mean["tilt"],
             "taxel_force": jnp.sum(moment.touch.force),
             **{f"duty/{i}": mean["touch"][i] for i in range(self.hand.num_fingers)},
         }
@@ -253,7 +277,6 @@ class Rotate:
         goals = jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), goal)
         return np.linspace(0, len(shape_index) - 1, count).round().astype(int), goals
 
-    def summarize(self, metrics: dict[str, np.ndarray], lived: np.ndarray,
-                  control_period: float) -> dict:
+    def summarize(self, metrics: dict[str, np.ndarray], lived: np.ndarray, control_period: float) -> dict:
         """The report of an evaluation; see `rotate_report`."""
         return summarize(metrics, lived, control_period, self.evaluation_ticks)

@@ -66,8 +66,11 @@ class RotateReward:
 class RotateConfig(EnvConfig):
     """The rotation task."""
 
-    objects: ObjectConfig = setting(ObjectConfig(
-        shapes=("box",), mass=(0.06, 0.15), friction=(0.6, 1.2), bare_friction=(0.3, 0.7), com_offset=0.003))
+    objects: ObjectConfig = setting(
+        ObjectConfig(
+            shapes=("box",), mass=(0.06, 0.15), friction=(0.6, 1.2), bare_friction=(0.3, 0.7), com_offset=0.003
+        )
+    )
     """Mass, inertia, centre of mass, friction and contact of the object; its sizes are `edge`. The bare hand
     is plastic: where it grips as rubber does, random strokes carry the object onto the thumb and over."""
     control: Control = setting(Control(step=0.08, recall="target"))
@@ -98,8 +101,7 @@ class RotateConfig(EnvConfig):
     roll: float = setting(-0.2, unit="rad", low=-1.2, high=1.2)
     """The hand's nominal roll: positive lets the object slide toward the thumb, beside which it falls over the palm's
     edge most easily."""
-    reference: tuple[float, float, float] = setting((0.047, 0.024, 0.088), unit="m", low=-0.5,
-                                                    high=0.5)
+    reference: tuple[float, float, float] = setting((0.047, 0.024, 0.088), unit="m", low=-0.5, high=0.5)
     """Where the object belongs: where thumb and fingers meet, and where the gaits that keep it carry it."""
     drop_distance: float = setting(0.07, unit="m", low=0.01, high=1.0)
     """The object is lost when its centre is farther than this from the reference ..."""
@@ -123,8 +125,8 @@ class RotateConfig(EnvConfig):
     push_speed: float = setting(0.1, unit="m/s", low=0.0, high=5.0)
     """Largest change of the object's speed by a push."""
     posture: tuple[float, ...] = setting(
-        (1.0, 0.2, 0.3, 0.0, 0.8, 0.5, 0.8, 0.5, 0.8, 0.5, 0.8, 0.5), unit="rad",
-        low=-3.2, high=3.2)
+        (1.0, 0.2, 0.3, 0.0, 0.8, 0.5, 0.8, 0.5, 0.8, 0.5, 0.8, 0.5), unit="rad", low=-3.2, high=3.2
+    )
     """Joint angles that episodes start near."""
     posture_noise: float = setting(0.3, unit="rad", low=0.0, high=1.0)
     """Largest deviation from them: wide, so that where one stroke ends is where another can begin."""
@@ -152,8 +154,10 @@ class RotateConfig(EnvConfig):
         if np.linalg.norm(self.axis) < 1e-6:
             raise ConfigError("RotateConfig.axis is (0, 0, 0): give a direction")
         if (self.object == "mesh") != bool(self.objects.mesh):
-            raise ConfigError(f"RotateConfig.object = {self.object!r} with ObjectConfig.mesh = {self.objects.mesh!r}: "
-                              "a mesh needs object 'mesh' and the name of its file")
+            raise ConfigError(
+                f"RotateConfig.object = {self.object!r} with ObjectConfig.mesh = {self.objects.mesh!r}: "
+                "a mesh needs object 'mesh' and the name of its file"
+            )
 
     @property
     def unit_axis(self) -> np.ndarray:
@@ -164,10 +168,17 @@ class RotateConfig(EnvConfig):
 def paper() -> RotateConfig:
     """The paper's own weights and success test."""
     return RotateConfig(
-        goal_spin=0.0, drop_distance=0.09, drop_tilt=math.pi, patience=1e6, leash=1.0,
-        control=Control(step=0.3, recall="target"), episode_seconds=60.0,
-        reward=RotateReward(goal=1.0, action=-0.0002, velocity=0.0, torque=0.0, spin=0.0, bonus_tips=0.0,
-                            bonus_speed=1e6, drop=0.0))
+        goal_spin=0.0,
+        drop_distance=0.09,
+        drop_tilt=math.pi,
+        patience=1e6,
+        leash=1.0,
+        control=Control(step=0.3, recall="target"),
+        episode_seconds=60.0,
+        reward=RotateReward(
+            goal=1.0, action=-0.0002, velocity=0.0, torque=0.0, spin=0.0, bonus_tips=0.0, bonus_speed=1e6, drop=0.0
+        ),
+    )
 
 
 def without_orientation() -> RotateConfig:
@@ -179,7 +190,17 @@ def clear_of_palm() -> RotateConfig:
     """The object held clear of the palm: it lies in the curled fingers, which point downhill, and turns about what is
     upright there."""
     return RotateConfig(
-        reward=RotateReward(goal=1.0, torque=-0.1, bonus_tips=0.0, gate=0.04), support="fingers", tilt=-1.1, roll=0.0,
-        leash=1.0, axis=(0.6, 0.0, -0.8), reference=(0.072, 0.005, 0.098), squeeze=(0.0, 0.2),
-        posture=(1.2, 0.3, 0.3, 0.0, 0.8, 0.6, 0.8, 0.6, 0.8, 0.6, 0.8, 0.6), posture_noise=0.2,
-        start_offset=(0.0, 0.0), place_noise=0.006, curl=(-0.1, 0.1))
+        reward=RotateReward(goal=1.0, torque=-0.1, bonus_tips=0.0, gate=0.04),
+        support="fingers",
+        tilt=-1.1,
+        roll=0.0,
+        leash=1.0,
+        axis=(0.6, 0.0, -0.8),
+        reference=(0.072, 0.005, 0.098),
+        squeeze=(0.0, 0.2),
+        posture=(1.2, 0.3, 0.3, 0.0, 0.8, 0.6, 0.8, 0.6, 0.8, 0.6, 0.8, 0.6),
+        posture_noise=0.2,
+        start_offset=(0.0, 0.0),
+        place_noise=0.006,
+        curl=(-0.1, 0.1),
+    )

@@ -7,8 +7,7 @@ from dexsim import statistics
 _PERCENTILES = (1, 5, 10, 25, 50, 75, 90, 95, 99)
 
 
-def summarize(metrics: dict[str, np.ndarray], lived: np.ndarray, control_period: float,
-              ticks: int) -> dict:
+def summarize(metrics: dict[str, np.ndarray], lived: np.ndarray, control_period: float, ticks: int) -> dict:
     """Reduce an evaluation to a report.
 
     Args:
@@ -31,23 +30,29 @@ def summarize(metrics: dict[str, np.ndarray], lived: np.ndarray, control_period:
     duty = np.stack([metrics[name] for name in sorted(metrics) if name.startswith("duty/")], -1)
     minutes = np.maximum(seconds, control_period) / 60
     report = {
-        "episodes": int(lived.size), "seconds": ticks * control_period,
-        "successes": _counts(successes), "paper_successes": _counts(metrics["paper_successes"]),
+        "episodes": int(lived.size),
+        "seconds": ticks * control_period,
+        "successes": _counts(successes),
+        "paper_successes": _counts(metrics["paper_successes"]),
         "without_success": statistics.proportion(~some),
         "seconds_per_success": statistics.mean(pace),
-        "seconds_to_fall": statistics.mean(seconds) | {
-            "median": float(np.median(seconds)), "longest": float(seconds.max())},
+        "seconds_to_fall": statistics.mean(seconds)
+        | {"median": float(np.median(seconds)), "longest": float(seconds.max())},
         "kept_to_the_end": statistics.proportion(kept),
-        "rotations_per_minute": statistics.mean(
-            metrics["spin"] * 60 / (2 * np.pi)),
+        "rotations_per_minute": statistics.mean(metrics["spin"] * 60 / (2 * np.pi)),
         "goals_per_minute": statistics.mean(successes / minutes),
-        "end": {"pushed_out": int(np.sum(metrics["pushed_out"] > 0)),
-                "slipped": int(np.sum(metrics["slipped"] > 0)), "timeout": int(np.sum(kept))},
-        "gait": {"joint_speed_rad_s": statistics.mean(metrics["joint_speed"]),
-                 "action_rate": statistics.mean(metrics["action_rate"]),
-                 "spin_rad_s": statistics.mean(metrics["spin"]),
-                 "tilt_rad": statistics.mean(metrics["tilt"]),
-                 "fingertip_duty": [float(x) for x in duty.mean(0)]},
+        "end": {
+            "pushed_out": int(np.sum(metrics["pushed_out"] > 0)),
+            "slipped": int(np.sum(metrics["slipped"] > 0)),
+            "timeout": int(np.sum(kept)),
+        },
+        "gait": {
+            "joint_speed_rad_s": statistics.mean(metrics["joint_speed"]),
+            "action_rate": statistics.mean(metrics["action_rate"]),
+            "spin_rad_s": statistics.mean(metrics["spin"]),
+            "tilt_rad": statistics.mean(metrics["tilt"]),
+            "fingertip_duty": [float(x) for x in duty.mean(0)],
+        },
         "non_finite": int(np.sum(metrics["non_finite"] > 0)),
     }
     report["headline"] = {
@@ -59,14 +64,18 @@ def summarize(metrics: dict[str, np.ndarray], lived: np.ndarray, control_period:
         "s per success": report["seconds_per_success"]["mean"],
         "s to fall (mean)": report["seconds_to_fall"]["mean"],
         "joint speed (rad/s)": report["gait"]["joint_speed_rad_s"]["mean"],
-        "fingertips at work (duty over 10 %)": int(np.sum(duty.mean(0) > 0.1))}
+        "fingertips at work (duty over 10 %)": int(np.sum(duty.mean(0) > 0.1)),
+    }
     return report
 
 
 def _counts(values: np.ndarray) -> dict:
-    return {"mean": statistics.mean(values), "median": statistics.median(values),
-            "percentiles": {str(q): float(np.percentile(values, q)) for q in _PERCENTILES},
-            "sorted": _ordered(values)}
+    return {
+        "mean": statistics.mean(values),
+        "median": statistics.median(values),
+        "percentiles": {str(q): float(np.percentile(values, q)) for q in _PERCENTILES},
+        "sorted": _ordered(values),
+    }
 
 
 def _ordered(values: np.ndarray) -> list[float]:

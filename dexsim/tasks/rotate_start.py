@@ -72,15 +72,24 @@ def sample_target(key: jax.Array, config: Any) -> ObjectParams:
     half = uniform(edge_key, (shortest, longest), corner) / 2
     scale = base.mass * uniform(scale_key, config.objects.narrowed().inertia_scale, corner)
     stand = upright(config.unit_axis)
-    turns = {"cube": None if stand is None else [stand], "cylinder": [_UPRIGHT],
-             "octagon": [(1.0, 0.0, 0.0, 0.0), _EIGHTH]}[config.object]
+    turns = {
+        "cube": None if stand is None else [stand],
+        "cylinder": [_UPRIGHT],
+        "octagon": [(1.0, 0.0, 0.0, 0.0), _EIGHTH],
+    }[config.object]
     quat = None if turns is None else jnp.array(turns, jnp.float32)
     inertia = plain_inertia(config.object, half)
     size = jnp.full((len(kinds), 3), half)
     return dataclasses.replace(
-        base, shape_index=jnp.int32(SHAPES.index(_SHAPE_INDEX[config.object])),
-        size=size, position=jnp.zeros((len(kinds), 3)), active=jnp.ones(len(kinds), bool),
-        inertia=scale * inertia, quat=quat, kinds=kinds)
+        base,
+        shape_index=jnp.int32(SHAPES.index(_SHAPE_INDEX[config.object])),
+        size=size,
+        position=jnp.zeros((len(kinds), 3)),
+        active=jnp.ones(len(kinds), bool),
+        inertia=scale * inertia,
+        quat=quat,
+        kinds=kinds,
+    )
 
 
 def upright(axis: np.ndarray) -> np.ndarray | None:
@@ -112,6 +121,7 @@ def lowest_point(target: ObjectParams, quat: jax.Array, position: jax.Array) -> 
 
 # --- the pool -----------------------------------------------------------------------------------
 
+
 def load_pool(key: jax.Array, hand: Hand, config: Any, gravity: tuple[float, float, float]) -> Any:
     """The pool of start states, from disk if it has been made before.
 
@@ -134,9 +144,24 @@ def load_pool(key: jax.Array, hand: Hand, config: Any, gravity: tuple[float, flo
 def _fingerprint(key: jax.Array, hand: Hand, config: Any) -> str:
     """What the pool depends on; rewards, sensing and observation do not belong to it."""
     settings = to_dict(config)
-    for name in ("reward", "sensing", "observation", "skin", "control", "touch", "randomization",
-                 "goal_step", "goal_angle", "goal_distance", "goal_spin", "goal_dwell",
-                 "episode_seconds", "evaluation_seconds", "push_probability", "push_speed"):
+    for name in (
+        "reward",
+        "sensing",
+        "observation",
+        "skin",
+        "control",
+        "touch",
+        "randomization",
+        "goal_step",
+        "goal_angle",
+        "goal_distance",
+        "goal_spin",
+        "goal_dwell",
+        "episode_seconds",
+        "evaluation_seconds",
+        "push_probability",
+        "push_speed",
+    ):
         settings.pop(name, None)
     digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode())
     digest.update(hand.model_path.read_bytes())
@@ -165,8 +190,7 @@ def _write(path: Path, arrays: list[np.ndarray]) -> None:
         write_whole(path, [buffer.getbuffer()])
 
 
-def _make(key: jax.Array, hand: Hand, config: Any,
-          gravity: tuple[float, float, float]) -> list[np.ndarray]:
+def _make(key: jax.Array, hand: Hand, config: Any, gravity: tuple[float, float, float]) -> list[np.ndarray]:
     """A start state for each of `pool_size` objects: qpos, qvel, joint targets, object leaves.
 
     Objects are drawn first, and each is tried in posture after posture until it stays: large ones fit into few, and
@@ -181,8 +205,12 @@ def _make(key: jax.Array, hand: Hand, config: Any,
         models = [_model(hand, config, gravity) for _ in range(threads)]
         for trial in range(_TRIALS):
             which = np.resize(waiting, chunk)
-            candidates = jax.device_get(draw(jax.random.split(jax.random.fold_in(key, trial), chunk),
-                                             jax.tree.map(lambda leaf, which=which: leaf[which], targets)))
+            candidates = jax.device_get(
+                draw(
+                    jax.random.split(jax.random.fold_in(key, trial), chunk),
+                    jax.tree.map(lambda leaf, which=which: leaf[which], targets),
+                )
+            )
             rows = np.flatnonzero(candidates["clear"])
             rows = rows[np.unique(which[rows], return_index=True)[1]]  # one posture for each object
             settle = functools.partial(_settle, hand=hand, config=config, candidates=candidates)
@@ -194,13 +222,19 @@ def _make(key: jax.Array, hand: Hand, config: Any,
             if not len(waiting) or tried > 1000 and len(starts) < tried / 200:
                 break
     if len(waiting) > size / 20:
-        raise ConfigError(f"RotateConfig: only {len(starts)} of {size} objects have a start state that stayed "
-                          f"in the hand ({tried} tried); change posture, tilt, edge or support")
+        raise ConfigError(
+            f"RotateConfig: only {len(starts)} of {size} objects have a start state that stayed "
+            f"in the hand ({tried} tried); change posture, tilt, edge or support"
+        )
     # The few that fit nowhere leave their rows to others.
     chosen = np.array(sorted(starts))
-    chosen = np.concatenate([chosen, chosen[:size - len(chosen)]])
-    return [np.stack([starts[k][0] for k in chosen]), np.zeros((size, hand.num_joints + 6), np.float32),
-            np.stack([starts[k][1] for k in chosen]), *(leaf[chosen] for leaf in jax.tree.leaves(targets))]
+    chosen = np.concatenate([chosen, chosen[: size - len(chosen)]])
+    return [
+        np.stack([starts[k][0] for k in chosen]),
+        np.zeros((size, hand.num_joints + 6), np.float32),
+        np.stack([starts[k][1] for k in chosen]),
+        *(leaf[chosen] for leaf in jax.tree.leaves(targets)),
+    ]
 
 
 def _candidate(key: jax.Array, target: ObjectParams, hand: Hand, config: Any) -> dict[str, Any]:
@@ -210,8 +244,7 @@ def _candidate(key: jax.Array, target: ObjectParams, hand: Hand, config: Any) ->
     flexion = np.zeros(hand.num_joints, np.float32)
     flexion[flexion_joints(hand, range(1, hand.num_fingers))] = 1.0
     curl = jax.random.uniform(keys[3], minval=config.curl[0], maxval=config.curl[1])
-    joints = jnp.clip(jnp.asarray(config.posture) + noise + curl * flexion, hand.joint_lower,
-                      hand.joint_upper)
+    joints = jnp.clip(jnp.asarray(config.posture) + noise + curl * flexion, hand.joint_lower, hand.joint_upper)
     heading = config.heading_noise * jax.random.uniform(keys[1], minval=-1.0)
     quat = rotations.axis_angle_to_quat(jnp.asarray(config.unit_axis), heading)
     shift = config.place_noise * jax.random.uniform(keys[2], (2,), minval=-1.0)
@@ -224,25 +257,28 @@ def _candidate(key: jax.Array, target: ObjectParams, hand: Hand, config: Any) ->
     closed = np.array(flexion)
     closed[flexion_joints(hand, range(1))] = 1.0
     joint_target = jnp.clip(joints + squeeze * closed, hand.joint_lower, hand.joint_upper)
-    return {"qpos": jnp.concatenate([joints, place, quat]), "joint_target": joint_target,
-            "target": target, "clear": overlap > -0.001}
+    return {
+        "qpos": jnp.concatenate([joints, place, quat]),
+        "joint_target": joint_target,
+        "target": target,
+        "clear": overlap > -0.001,
+    }
 
 
 def _model(hand: Hand, config: Any, gravity: tuple[float, float, float]) -> mujoco.MjModel:
     """The scene in C, with springs at the joints for the motors."""
-    model = build_model(hand, slots(config), largest_size(config), config.physics, gravity,
-                        "jax")
+    model = build_model(hand, slots(config), largest_size(config), config.physics, gravity, "jax")
     dofs = [model.joint(name).dofadr[0] for name in hand.joint_names]
-    model.jnt_stiffness[[model.joint(name).id for name in hand.joint_names]] = \
-        config.randomization.stiffness
+    model.jnt_stiffness[[model.joint(name).id for name in hand.joint_names]] = config.randomization.stiffness
     model.dof_damping[dofs] += config.randomization.damping
     # C MuJoCo takes shortcuts for frames that coincided when it compiled; sizes change here.
     model.geom_sameframe[:] = model.body_sameframe[:] = 0
     return model
 
 
-def _settle(model: mujoco.MjModel, rows: np.ndarray, *, hand: Hand, config: Any,
-            candidates: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+def _settle(
+    model: mujoco.MjModel, rows: np.ndarray, *, hand: Hand, config: Any, candidates: dict[str, Any]
+) -> tuple[np.ndarray, np.ndarray]:
     """Rows that came to rest where they belong, and their qpos."""
     data, target = mujoco.MjData(model), candidates["target"]
     geoms = [model.geom(f"object_{k}").id for k in range(len(target.kinds))]
@@ -281,8 +317,8 @@ def _clear_of_palm(hand: Hand, config: Any, target: ObjectParams, rows: np.ndarr
 
 def _stays(model: mujoco.MjModel, config: Any, data: mujoco.MjData) -> bool:
     free = model.joint("object")
-    place = data.qpos[free.qposadr[0]:][:7]
-    motion = data.qvel[free.dofadr[0]:][:6]
+    place = data.qpos[free.qposadr[0] :][:7]
+    motion = data.qvel[free.dofadr[0] :][:6]
     turned = np.empty(3)
     mujoco.mju_rotVecQuat(turned, config.unit_axis, place[3:])
     tilt = np.arccos(np.clip(turned @ config.unit_axis, -1.0, 1.0))

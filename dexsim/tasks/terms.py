@@ -19,8 +19,7 @@ def mean_where(chosen: jax.Array, values: jax.Array) -> jax.Array:
     return jnp.sum(jnp.where(chosen, values, 0.0)) / jnp.maximum(jnp.sum(chosen), 1)
 
 
-def random_push(key: jax.Array, mass: jax.Array, *, probability: float, speed: float,
-                period: float) -> jax.Array:
+def random_push(key: jax.Array, mass: jax.Array, *, probability: float, speed: float, period: float) -> jax.Array:
     """Force [3] N that, with this probability, acts for a tick of `period` s.
 
     It changes the velocity of `mass` kg by up to `speed` m/s in a random direction.

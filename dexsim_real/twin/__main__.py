@@ -41,9 +41,17 @@ def make_plant(arguments: TwinArguments, hand: Hand) -> Plant:
             raise HandError(f"{arguments.plant}: {error}") from None
     from dexsim_real.twin.plant import EmulatedHand
 
-    return EmulatedHand(hand, arguments.task, arguments.seed, trials=arguments.trials, kind=arguments.draw,
-                        seconds=arguments.seconds, command=arguments.command, first=arguments.first,
-                        shape=None if arguments.shape == "any" else arguments.shape)
+    return EmulatedHand(
+        hand,
+        arguments.task,
+        arguments.seed,
+        trials=arguments.trials,
+        kind=arguments.draw,
+        seconds=arguments.seconds,
+        command=arguments.command,
+        first=arguments.first,
+        shape=None if arguments.shape == "any" else arguments.shape,
+    )
 
 
 def check_policy(name: str, task: str, hand: Hand) -> None:
@@ -61,8 +69,10 @@ def check_policy(name: str, task: str, hand: Hand) -> None:
         raise HandError(f"{name} is a policy of the task {policy.task!r}, the hand is mounted for {task!r}")
     trained, mounted = load_task(task, policy.env_config, hand).gravity, nominal_gravity(task)
     if np.abs(np.asarray(trained) - mounted).max() > 0.01:
-        raise HandError(f"{name} was trained with gravity {np.round(trained, 2).tolist()} m/s^2 in the palm's frame, "
-                        f"the emulated hand is mounted for {np.round(mounted, 2).tolist()}")
+        raise HandError(
+            f"{name} was trained with gravity {np.round(trained, 2).tolist()} m/s^2 in the palm's frame, "
+            f"the emulated hand is mounted for {np.round(mounted, 2).tolist()}"
+        )
 
 
 def write_calibration(path: Path, hand: Hand) -> Path:
@@ -77,9 +87,15 @@ def write_calibration(path: Path, hand: Hand) -> Path:
 def runner_command(twin: Twin, calibration: Path | None) -> list[str]:
     """The command that runs a policy on this hand."""
     arguments, line, board = twin.arguments, twin.arguments.line, twin.arguments.firmware
-    words = ["python", "-m", "dexsim_real.run", arguments.policy or arguments.task, "--port",
-             str(twin.line.terminal.name),
-             *(["--calibration", str(calibration)] if calibration else ["--uncalibrated"])]
+    words = [
+        "python",
+        "-m",
+        "dexsim_real.run",
+        arguments.policy or arguments.task,
+        "--port",
+        str(twin.line.terminal.name),
+        *(["--calibration", str(calibration)] if calibration else ["--uncalibrated"]),
+    ]
     if arguments.command is not None:
         words += ["--command", f"{arguments.command:g}"]
     if twin.imu:
@@ -99,8 +115,12 @@ def runner_command(twin: Twin, calibration: Path | None) -> list[str]:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """The command. Returns its exit code, 0."""
-    arguments = cli.parse(TwinArguments, sys.argv[1:] if argv is None else argv, prog="python -m dexsim_real.twin",
-                          description="Emulate a hand on a pseudo-terminal.")
+    arguments = cli.parse(
+        TwinArguments,
+        sys.argv[1:] if argv is None else argv,
+        prog="python -m dexsim_real.twin",
+        description="Emulate a hand on a pseudo-terminal.",
+    )
     hand = load_hand()
     if arguments.policy:
         check_policy(arguments.policy, arguments.task, hand)
@@ -109,12 +129,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         twin = Twin(arguments, hand, make_plant(arguments, hand), Path(folder), lines.put)
         before = {number: signal.signal(number, lambda *_: twin.stop()) for number in (signal.SIGTERM, signal.SIGINT)}
         calibration = arguments.calibration or (
-            None if arguments.plant else write_calibration(Path(folder) / "calibration.toml", hand))
+            None if arguments.plant else write_calibration(Path(folder) / "calibration.toml", hand)
+        )
         printer = threading.Thread(target=_print, args=(lines,), name="print", daemon=True)
         printer.start()
         try:
-            lines.put(f"{arguments.task}: the emulated hand is at {twin.line.terminal.name}. Run a policy on it with\n"
-                      f"    {shlex.join(runner_command(twin, calibration))}")
+            lines.put(
+                f"{arguments.task}: the emulated hand is at {twin.line.terminal.name}. Run a policy on it with\n"
+                f"    {shlex.join(runner_command(twin, calibration))}"
+            )
             if arguments.realtime and not use_realtime():
                 twin.note("without real-time priority: expect jitter on a busy machine (docs/hardware.md)")
             twin.run()

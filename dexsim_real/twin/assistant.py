@@ -20,7 +20,8 @@ from dexsim_real.twin.shapes import Shape, product, turn
 
 POSTURES = {
     "grasp": (1.45, 0.15, 0.25, 0.0, 1.1, 0.8, 1.1, 0.8, 1.1, 0.8, 1.1, 0.8),
-    "rotate": (1.0, 0.2, 0.3, 0.0, 0.8, 0.5, 0.8, 0.5, 0.8, 0.5, 0.8, 0.5)}
+    "rotate": (1.0, 0.2, 0.3, 0.0, 0.8, 0.5, 0.8, 0.5, 0.8, 0.5, 0.8, 0.5),
+}
 """Joint angles rad at which a run begins."""
 REFERENCES = {"grasp": (0.055, -0.005, 0.090), "rotate": (0.047, 0.024, 0.088)}
 """Where the object belongs, m."""
@@ -91,14 +92,15 @@ def clear(scene: Scene, data: mujoco.MjData, place: Place) -> bool:
     return bool(np.all(data.contact.dist[touching] > -_OVERLAP))
 
 
-def put(scene: Scene, data: mujoco.MjData, position: np.ndarray, quat: np.ndarray,
-        velocity: np.ndarray | None = None) -> None:
+def put(
+    scene: Scene, data: mujoco.MjData, position: np.ndarray, quat: np.ndarray, velocity: np.ndarray | None = None
+) -> None:
     """Place the object, at rest or with a velocity [3] m/s."""
     at, dof = scene.object_qpos, scene.object_dof
-    data.qpos[at:at + 3], data.qpos[at + 3:at + 7] = position, quat
-    data.qvel[dof:dof + 6] = 0.0
+    data.qpos[at : at + 3], data.qpos[at + 3 : at + 7] = position, quat
+    data.qvel[dof : dof + 6] = 0.0
     if velocity is not None:
-        data.qvel[dof:dof + 3] = velocity
+        data.qvel[dof : dof + 3] = velocity
 
 
 class Assistant:

@@ -62,8 +62,10 @@ class CommandCheck:
         self.checked += 1
         self.wrong.update(found)
         if found and len(self.first) < self.WORDS:
-            self.first.append(f"{now:.4f} {', '.join(found)}: {np.round(command['position'], 4).tolist()}, "
-                              f"reported {np.round(reported, 4).tolist()}")
+            self.first.append(
+                f"{now:.4f} {', '.join(found)}: {np.round(command['position'], 4).tolist()}, "
+                f"reported {np.round(reported, 4).tolist()}"
+            )
         return found
 
     def _find(self, now: float, since: float, command: np.ndarray, reported: np.ndarray) -> list[str]:
@@ -106,5 +108,10 @@ class CommandCheck:
 
     def report(self) -> dict[str, object]:
         """Counts for the summary."""
-        return {"checked": self.checked, "outside_limits": sum(self.wrong.values()), "by_limit": dict(self.wrong),
-                "fastest_rad_s": round(self.fastest, 3), "first": self.first}
+        return {
+            "checked": self.checked,
+            "outside_limits": sum(self.wrong.values()),
+            "by_limit": dict(self.wrong),
+            "fastest_rad_s": round(self.fastest, 3),
+            "first": self.first,
+        }

@@ -172,8 +172,9 @@ def bands(task: str) -> dict[str, Band]:
     return BANDS | TASK_BANDS[task]
 
 
-def draw_trial(task: str, rng: np.random.Generator, kind: str = "outside",
-               overrides: dict[str, float | str] | None = None) -> Draw:
+def draw_trial(
+    task: str, rng: np.random.Generator, kind: str = "outside", overrides: dict[str, float | str] | None = None
+) -> Draw:
     """One trial's parameters.
 
     Args:

@@ -106,8 +106,9 @@ def parse_fault(line: str) -> tuple[float, str, tuple[str, ...]]:
             raise HandError(f"fault {line!r}: no kind {kind!r}; there are {', '.join(KINDS)}")
         _with_values(Fault(kind), values)
     except (IndexError, ValueError):
-        raise HandError(f"fault {line!r}: expected a time in s, a kind and its values, "
-                        "such as '12.5 stall 0.2'") from None
+        raise HandError(
+            f"fault {line!r}: expected a time in s, a kind and its values, such as '12.5 stall 0.2'"
+        ) from None
     if not 0 <= when < 1e9:
         raise HandError(f"fault {line!r}: its time must be at least 0 s")
     return when, kind, values
@@ -155,13 +156,21 @@ class Injector:
 
     def _drawn(self, kind: str) -> Fault:
         rng, config = self._rng, self.config
-        spans = {"late": config.late_seconds, "stall": config.stall_seconds, "disconnect": config.away_seconds,
-                 "heat": (config.heat_seconds, config.heat_seconds)}
+        spans = {
+            "late": config.late_seconds,
+            "stall": config.stall_seconds,
+            "disconnect": config.away_seconds,
+            "heat": (config.heat_seconds, config.heat_seconds),
+        }
         return Fault(
-            kind, bool(kind in BYTES and rng.random() < config.on_request),
-            float(rng.uniform(*spans[kind])) if kind in spans else 0.0, int(rng.integers(frames.JOINTS)),
-            config.heat_degrees, (int(rng.integers(frames.TIPS)), int(rng.integers(frames.TAXELS))),
-            int(rng.integers(config.stuck_count[0], config.stuck_count[1] + 1)))
+            kind,
+            bool(kind in BYTES and rng.random() < config.on_request),
+            float(rng.uniform(*spans[kind])) if kind in spans else 0.0,
+            int(rng.integers(frames.JOINTS)),
+            config.heat_degrees,
+            (int(rng.integers(frames.TIPS)), int(rng.integers(frames.TAXELS))),
+            int(rng.integers(config.stuck_count[0], config.stuck_count[1] + 1)),
+        )
 
     def _damage(self, kind: str, data: bytearray) -> bytes:
         rng, at = self._rng, int(self._rng.integers(len(data)))
@@ -169,9 +178,9 @@ class Injector:
             for bit in rng.choice(8 * len(data), int(rng.integers(1, 4)), replace=False):
                 data[bit >> 3] ^= 1 << (bit & 7)
         elif kind == "drop":
-            del data[at:at + int(rng.integers(1, min(_RUN, len(data) - 1) + 1))]
+            del data[at : at + int(rng.integers(1, min(_RUN, len(data) - 1) + 1))]
         else:
-            data[at:at] = data[at:at + int(rng.integers(1, _RUN + 1))]
+            data[at:at] = data[at : at + int(rng.integers(1, _RUN + 1))]
         return bytes(data)
 
 

@@ -102,9 +102,15 @@ class Firmware:
         if frame.target not in (frames.palm_address(self.config.hand_id), frames.BROADCAST):
             self.counts["for another"] += 1
             return None
-        act = {Command.EXCHANGE: self._exchange, Command.VERSION: self._version, Command.SET_MODE: self._set_mode,
-               Command.READ_MODE: self._read_mode, Command.CLEAR_PRESSURE: self._clear, Command.RESET: self._reset,
-               Command.READ_REGISTER: self._register}[Command(frame.command)]
+        act = {
+            Command.EXCHANGE: self._exchange,
+            Command.VERSION: self._version,
+            Command.SET_MODE: self._set_mode,
+            Command.READ_MODE: self._read_mode,
+            Command.CLEAR_PRESSURE: self._clear,
+            Command.RESET: self._reset,
+            Command.READ_REGISTER: self._register,
+        }[Command(frame.command)]
         command, data = act(frame.data, now)
         self.counts[Command(frame.command).name.lower() if command != Command.ERROR else "refused"] += 1
         return Frame(frames.palm_address(self.config.hand_id), frame.source, command, data)
@@ -121,8 +127,11 @@ class Firmware:
         raw = (np.round(ticks * 2.0 ** (12 - config.encoder_bits)).astype(int) + 2048) & 0xFFF
         joint["raw_position"] = raw << 4 | self.motors.mode
         joint["temperature"] = config.palm_temperature << 8 | _whole(measured.temperature, np.uint8).astype(np.uint16)
-        joint["joint_error"] = (OVERHEATED * self._hot + OVERLOADED * (measured.time > self._overload_since + 0.5)
-                                + ABANDONED * self._abandoned)
+        joint["joint_error"] = (
+            OVERHEATED * self._hot
+            + OVERLOADED * (measured.time > self._overload_since + 0.5)
+            + ABANDONED * self._abandoned
+        )
         counts = self._counts(measured) - self._zero
         for (finger, taxel), value in self.stuck.items():
             counts[finger, taxel] = 0, 0, value
@@ -146,8 +155,12 @@ class Firmware:
         measured = self.plant.measure()
         self._protect(measured)
         was_on, self._alive, self._abandoned = self.on, now, False
-        self._drive(Motors(*(block[name].astype(float) for name in ("position", "kp", "ki", "kd", "torque_max")),
-                           mode=np.where(self._hot, int(Mode.PASSIVE), block["mode"].astype(int))))
+        self._drive(
+            Motors(
+                *(block[name].astype(float) for name in ("position", "kp", "ki", "kd", "torque_max")),
+                mode=np.where(self._hot, int(Mode.PASSIVE), block["mode"].astype(int)),
+            )
+        )
         if was_on != self.on:
             self._note("motors on" if self.on else "motors off")
         state = self.state(measured)
@@ -207,8 +220,9 @@ class Firmware:
         """Which motors are too hot or loaded for too long."""
         hot, limit = measured.temperature, self.config.shutdown
         self._hot = (hot > limit) | (self._hot & (hot > limit - 10.0))
-        self._overload_since = np.where(np.abs(measured.current) > self.config.overload,
-                                        np.minimum(self._overload_since, measured.time), np.inf)
+        self._overload_since = np.where(
+            np.abs(measured.current) > self.config.overload, np.minimum(self._overload_since, measured.time), np.inf
+        )
 
     @staticmethod
     def _refusal(mode: np.ndarray) -> int:

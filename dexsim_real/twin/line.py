@@ -64,9 +64,19 @@ class HandLine:
       note: called with one line for what a user should know.
     """
 
-    def __init__(self, terminal: Terminal, plant: Plant, firmware: Firmware, check: CommandCheck, injector: Injector,
-                 config: LineConfig, *, seed: int = 0, catch_up: Callable[[float], None] = lambda now: None,
-                 note: Callable[[str], None] = lambda text: None):
+    def __init__(
+        self,
+        terminal: Terminal,
+        plant: Plant,
+        firmware: Firmware,
+        check: CommandCheck,
+        injector: Injector,
+        config: LineConfig,
+        *,
+        seed: int = 0,
+        catch_up: Callable[[float], None] = lambda now: None,
+        note: Callable[[str], None] = lambda text: None,
+    ):
         self.terminal, self.config = terminal, config
         self.firmware, self.check, self.injector = firmware, check, injector
         self.counts: Counter[str] = Counter()
@@ -165,8 +175,7 @@ class HandLine:
             self._parser.expire()  # Half a request from before the silence.
         self._acted = now
         answers = []
-        for frame in self._parser.feed(
-                self.injector.damage(fault, request.whole) if damaged else request.whole):
+        for frame in self._parser.feed(self.injector.damage(fault, request.whole) if damaged else request.whole):
             if frame.command == Command.EXCHANGE:
                 self._inspect(request, frame)
             answers.append(self.firmware.answer(frame, now))
@@ -196,7 +205,7 @@ class HandLine:
         data = self.injector.damage(fault, whole) if damaged else whole
         self.counts["damaged answers" if damaged else "answers"] += 1
         for at in range(0, len(data), self.config.piece):
-            piece = data[at:at + self.config.piece]
+            piece = data[at : at + self.config.piece]
             self._answers.append((start + self._on_wire(at + len(piece)), piece))
         self._said_all = start + self._on_wire(len(data))
 

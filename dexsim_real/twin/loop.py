@@ -69,13 +69,18 @@ class World:
         if now > self._told + 5.0:
             self._told = now
             share = self.spent / self.simulated if self.simulated else 0.0
-            self._note(f"this machine is too slow: {self.let_go:.2f} s of the physics let go so far "
-                       f"(a second of it takes {share:.2f} s)")
+            self._note(
+                f"this machine is too slow: {self.let_go:.2f} s of the physics let go so far "
+                f"(a second of it takes {share:.2f} s)"
+            )
 
     def report(self) -> dict[str, float]:
         """How well it kept up."""
-        return {"simulated_s": round(self.simulated, 3), "let_go_s": round(self.let_go, 3),
-                "cpu_per_simulated_s": round(self.spent / self.simulated, 4) if self.simulated else 0.0}
+        return {
+            "simulated_s": round(self.simulated, 3),
+            "let_go_s": round(self.let_go, 3),
+            "cpu_per_simulated_s": round(self.spent / self.simulated, 4) if self.simulated else 0.0,
+        }
 
 
 class Twin:
@@ -91,8 +96,14 @@ class Twin:
 
     HICCUP = 0.02  # s, the bridge's usual patience beyond the wire's own time
 
-    def __init__(self, arguments: TwinArguments, hand: Hand, plant: Plant, folder: Path,
-                 show: Callable[[str], None] = lambda text: None):
+    def __init__(
+        self,
+        arguments: TwinArguments,
+        hand: Hand,
+        plant: Plant,
+        folder: Path,
+        show: Callable[[str], None] = lambda text: None,
+    ):
         self.arguments, self.plant, self._show = arguments, plant, show
         self.events: deque[tuple[float, str]] = deque(maxlen=_EVENTS)
         self.start, seed = time.monotonic(), arguments.seed
@@ -100,17 +111,28 @@ class Twin:
         self.firmware = Firmware(plant, arguments.firmware, self.note)
         self.injector = Injector(arguments.faults, seed)
         self.check = CommandCheck(hand.joint_lower, hand.joint_upper, arguments.limits)
-        self.line = HandLine(Terminal(arguments.link or folder / "hand"), plant, self.firmware, self.check,
-                             self.injector, arguments.line, seed=seed, catch_up=self.world.catch_up, note=self.note)
+        self.line = HandLine(
+            Terminal(arguments.link or folder / "hand"),
+            plant,
+            self.firmware,
+            self.check,
+            self.injector,
+            arguments.line,
+            seed=seed,
+            catch_up=self.world.catch_up,
+            note=self.note,
+        )
         self.imu: ImuSide | None = None
         self.masks: MaskSide | None = None
         try:
             if arguments.task == "rotate":
-                self.imu = ImuSide(arguments.imu_link or folder / "imu", plant, arguments.object, seed=seed,
-                                   start=self.start)
+                self.imu = ImuSide(
+                    arguments.imu_link or folder / "imu", plant, arguments.object, seed=seed, start=self.start
+                )
             if arguments.task == "grasp" or arguments.mask_socket:
-                self.masks = MaskSide(arguments.mask_socket or folder / "masks", plant, arguments.object, seed=seed,
-                                      start=self.start)
+                self.masks = MaskSide(
+                    arguments.mask_socket or folder / "masks", plant, arguments.object, seed=seed, start=self.start
+                )
         except BaseException:
             self.close()
             raise
@@ -167,17 +189,31 @@ class Twin:
         """Results of the trials, and everything that was counted."""
         arguments, firmware, line = self.arguments, self.firmware, self.line
         return {
-            "task": arguments.task, "seed": arguments.seed, "draw": arguments.draw, "start": self.start,
+            "task": arguments.task,
+            "seed": arguments.seed,
+            "draw": arguments.draw,
+            "start": self.start,
             "seconds": round(time.monotonic() - self.start, 3),
-            "trials": self.plant.results()[:arguments.trials],
-            "line": dict(line.counts), "firmware": dict(firmware.counts),
-            "faults": {"injected": dict(self.injector.injected), "expected": self.injector.expected(),
-                       "config": to_dict(arguments.faults)},
+            "trials": self.plant.results()[: arguments.trials],
+            "line": dict(line.counts),
+            "firmware": dict(firmware.counts),
+            "faults": {
+                "injected": dict(self.injector.injected),
+                "expected": self.injector.expected(),
+                "config": to_dict(arguments.faults),
+            },
             "commands": self.check.report(),
             "stuck": [[*taxel, count] for taxel, count in firmware.stuck.items()],
-            "watchdog": {"limit_s": arguments.firmware.watchdog, "longest_s": firmware.longest,
-                         "trips": firmware.trips},
-            "hiccups": self.hiccups, "physics": self.world.report(),
-            "slowest_exchange_ms": round(1e3 * line.slowest, 3), "late": line.lateness.summary(),
+            "watchdog": {
+                "limit_s": arguments.firmware.watchdog,
+                "longest_s": firmware.longest,
+                "trips": firmware.trips,
+            },
+            "hiccups": self.hiccups,
+            "physics": self.world.report(),
+            "slowest_exchange_ms": round(1e3 * line.slowest, 3),
+            "late": line.lateness.summary(),
             "imu_frames": self.imu.sent if self.imu else 0,
-            "masks": dict(self.masks.counts) if self.masks else {}, "events": [list(event) for event in self.events]}
+            "masks": dict(self.masks.counts) if self.masks else {},
+            "events": [list(event) for event in self.events],
+        }

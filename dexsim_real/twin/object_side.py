@@ -30,8 +30,9 @@ class ObjectConfig:
 
     imu_rate: float = setting(100.0, unit="Hz", low=1.0, high=1000.0)
     """Samples per second."""
-    imu_mount: tuple[float, float, float, float] = setting((0.70710678, 0.0, 0.70710678, 0.0), unit="1", low=-1.0,
-                                                           high=1.0)
+    imu_mount: tuple[float, float, float, float] = setting(
+        (0.70710678, 0.0, 0.70710678, 0.0), unit="1", low=-1.0, high=1.0
+    )
     """Orientation (w, x, y, z) of the part in the object: its z along the object's x."""
     camera_rate: float = setting(30.0, unit="Hz", low=1.0, high=200.0)
     """Pictures per second."""
@@ -63,6 +64,7 @@ class Clocked:
 
 
 # --- IMU -----------------------------------------------------------------------------------------
+
 
 def rvc_frame(index: int, rotation: np.ndarray, acceleration: np.ndarray) -> bytes:
     """The 19 bytes about a part that is turned by `rotation` [3, 3] in its level world and feels `acceleration` [3]
@@ -125,6 +127,7 @@ def _level(up: np.ndarray) -> np.ndarray:
 
 # --- camera --------------------------------------------------------------------------------------
 
+
 def outline(part: Part) -> np.ndarray:
     """Points [N, 3] m of a primitive, in the object's frame, whose hull looks like it."""
     round_ = np.linspace(0, 2 * np.pi, 24, endpoint=False)
@@ -158,8 +161,9 @@ def silhouette(parts: list[np.ndarray], optics: CameraConfig, size: tuple[int, i
         x, y, depth = axes @ (points - optics.position).T
         if depth.min() < 1e-3:
             continue
-        pixels = np.stack([optics.focal[0] * x / depth + optics.centre[0], optics.focal[1] * y / depth
-                           + optics.centre[1]], 1)
+        pixels = np.stack(
+            [optics.focal[0] * x / depth + optics.centre[0], optics.focal[1] * y / depth + optics.centre[1]], 1
+        )
         with contextlib.suppress(QhullError):  # A body that is seen as a line covers no pixel.
             _fill(mask, pixels, ConvexHull(pixels).equations)
     return mask
@@ -173,7 +177,7 @@ def _fill(mask: np.ndarray, pixels: np.ndarray, sides: np.ndarray) -> None:
     inside = np.ones((len(rows), len(columns)), bool)
     for a, b, c in sides:
         inside &= a * columns + (b * rows + c)[:, None] <= 0
-    mask[low[1]:high[1], low[0]:high[0]] |= inside
+    mask[low[1] : high[1], low[0] : high[0]] |= inside
 
 
 class MaskSide(Clocked):
@@ -218,8 +222,7 @@ class MaskSide(Clocked):
             return
         place, quat, _ = self._plant.measure_object()
         turn, parts = _matrix(quat), self._plant.shape.parts if self._rng.random() >= self._config.lost else ()
-        mask = silhouette([outline(part) @ turn.T + place for part in parts], self._config.optics,
-                          self._config.picture)
+        mask = silhouette([outline(part) @ turn.T + place for part in parts], self._config.optics, self._config.picture)
         self.counts["pictures"] += 1
         self._send(encode_mask(now, mask))
 
@@ -230,7 +233,7 @@ class MaskSide(Clocked):
             else:
                 self.counts["left out"] += 1
             try:
-                del waiting[:client.send(waiting)]
+                del waiting[: client.send(waiting)]
             except BlockingIOError:
                 pass
             except OSError:  # It has gone.

@@ -76,9 +76,20 @@ class EmulatedHand:
       first: number of the first trial: a trial is the same whether others went before it or not.
     """
 
-    def __init__(self, hand: Hand, task: str, seed: int = 0, *, trials: int | None = None, kind: str = "outside",
-                 overrides: dict[str, float | str] | None = None, seconds: float | None = None,
-                 command: float | None = None, shape: str | None = None, first: int = 0):
+    def __init__(
+        self,
+        hand: Hand,
+        task: str,
+        seed: int = 0,
+        *,
+        trials: int | None = None,
+        kind: str = "outside",
+        overrides: dict[str, float | str] | None = None,
+        seconds: float | None = None,
+        command: float | None = None,
+        shape: str | None = None,
+        first: int = 0,
+    ):
         self.hand, self.task, self.seed, self.kind = hand, task, seed, kind
         self.command, self._end = command, None if trials is None else first + trials
         self._overrides, self._seconds, self._shape = overrides, seconds, shape
@@ -114,21 +125,26 @@ class EmulatedHand:
         position, quat, acceleration = self.measure_object()
         shown = past.qpos[self._scene.drive_qpos] + self._drives.bias
         return Measurement(
-            time=self.time, joint_velocity=past.qvel[self._scene.drive_dof],
+            time=self.time,
+            joint_velocity=past.qvel[self._scene.drive_dof],
             joint_position=shown + self.draw.encoder_noise * rng.standard_normal(shown.shape),
-            current=self._shown_current(past), temperature=self._drives.case.copy(),
-            taxel_force=self._skin.report(self._felt(late), rng), object_quat=quat, object_position=position,
-            object_acceleration=acceleration)
+            current=self._shown_current(past),
+            temperature=self._drives.case.copy(),
+            taxel_force=self._skin.report(self._felt(late), rng),
+            object_quat=quat,
+            object_position=position,
+            object_acceleration=acceleration,
+        )
 
     def measure_object(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Place [3] m as a camera's masks give it, orientation [4] and acceleration [3] m/s^2 as an IMU in the object
         does: late, noisy and biased as those are."""
         draw, rng = self.draw, self._object_noise
         at = self._scene.object_qpos
-        position = self._before(float(draw.camera_delay)).qpos[at:at + 3]
+        position = self._before(float(draw.camera_delay)).qpos[at : at + 3]
         position = position + draw.camera_noise * rng.standard_normal(3)
         past = self._before(max(float(getattr(draw, "imu_delay", 0.0)) - IMU_TRANSPORT, 0.0))
-        quat = past.qpos[at + 3:at + 7].copy()
+        quat = past.qpos[at + 3 : at + 7].copy()
         felt = matrix(quat).T @ (past.acceleration - self._gravity)
         if self.task != "rotate":
             return position, quat, felt
@@ -208,9 +224,18 @@ class EmulatedHand:
         put(self._scene, self._data, position, place.quat)
 
     def _report(self) -> dict[str, Any]:
-        return {"trial": self.trial, "task": self.task, "seed": self.seed, "draw": self.kind,
-                "command": self.command, "shape": self.shape.name, "stage": self.stage.value,
-                "hottest": round(self._hottest, 2), **self._referee.report(), "parameters": self.draw.summary()}
+        return {
+            "trial": self.trial,
+            "task": self.task,
+            "seed": self.seed,
+            "draw": self.kind,
+            "command": self.command,
+            "shape": self.shape.name,
+            "stage": self.stage.value,
+            "hottest": round(self._hottest, 2),
+            **self._referee.report(),
+            "parameters": self.draw.summary(),
+        }
 
     # --- one firmware period --------------------------------------------------------------------
 
@@ -242,10 +267,17 @@ class EmulatedHand:
         dof, at = scene.object_dof, scene.object_qpos
         if self.stage is Stage.FREE:
             self._contacts()
-            quat = data.qpos[at + 3:at + 7]
-            spin = matrix(quat) @ data.qvel[dof + 3:dof + 6]
-            self._referee.watch(_LOOK * PERIOD, data.qpos[at:at + 3].copy(), quat.copy(), spin, self._tips,
-                                self._pressing, data.qvel[scene.drive_dof])
+            quat = data.qpos[at + 3 : at + 7]
+            spin = matrix(quat) @ data.qvel[dof + 3 : dof + 6]
+            self._referee.watch(
+                _LOOK * PERIOD,
+                data.qpos[at : at + 3].copy(),
+                quat.copy(),
+                spin,
+                self._tips,
+                self._pressing,
+                data.qvel[scene.drive_dof],
+            )
             self._hottest = max(self._hottest, float(self._drives.case.max()))
             if not np.isfinite(data.qpos).all() or data.warning.number.any():
                 self._referee.end = "dropped: the physics failed"
@@ -312,13 +344,18 @@ class EmulatedHand:
         force = np.zeros((5, self.hand.num_taxels, 3))
         if self._touches:
             tips = data.xpos[scene.tip_body], data.xmat[scene.tip_body].reshape(-1, 3, 3)
-            force = self._skin.load(self.shape, data.xpos[scene.object_body],
-                                    data.xmat[scene.object_body].reshape(3, 3), tips, self._touches)
+            force = self._skin.load(
+                self.shape,
+                data.xpos[scene.object_body],
+                data.xmat[scene.object_body].reshape(3, 3),
+                tips,
+                self._touches,
+            )
         self._samples.append((self.time, force))
 
     def _remember(self) -> None:
         data, dof = self._data, self._scene.object_dof
-        acceleration = data.qacc[dof:dof + 3].copy() if self.stage is Stage.FREE else np.zeros(3)
+        acceleration = data.qacc[dof : dof + 3].copy() if self.stage is Stage.FREE else np.zeros(3)
         self._past.append(_Past(data.qpos.copy(), data.qvel.copy(), acceleration, self._drives.current))
 
     def _before(self, age: float) -> _Past:

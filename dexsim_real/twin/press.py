@@ -53,8 +53,15 @@ class _Holder:
 class PressBench(EmulatedHand):
     """An emulated hand with a pen on foam in place of an object; one trial without end."""
 
-    def __init__(self, hand: Hand, seed: int = 0, *, kind: str = "outside",
-                 overrides: dict[str, float] | None = None, foam: Foam = Foam()):
+    def __init__(
+        self,
+        hand: Hand,
+        seed: int = 0,
+        *,
+        kind: str = "outside",
+        overrides: dict[str, float] | None = None,
+        foam: Foam = Foam(),
+    ):
         self._plan, self._foam = placements(hand), foam
         super().__init__(hand, "grasp", seed, kind=kind, overrides={**_SOLID, **(overrides or {})})
 
@@ -72,10 +79,14 @@ class PressBench(EmulatedHand):
         draw, drives = self.draw, self._drives
         constant = drives.constant / draw.current_gain
         loss = 1.0 - drives.efficiency
-        return {"joints": list(self.hand.joint_names), "loading_nm_per_a": (constant * (1 - loss)).tolist(),
-                "unloading_nm_per_a": (constant * (1 + loss)).tolist(),
-                "friction_nm": np.asarray(drives.coulomb).tolist(), "stall_a": STALL_CURRENT,
-                "taxel_gain": draw.taxel_gain.tolist()}
+        return {
+            "joints": list(self.hand.joint_names),
+            "loading_nm_per_a": (constant * (1 - loss)).tolist(),
+            "unloading_nm_per_a": (constant * (1 + loss)).tolist(),
+            "friction_nm": np.asarray(drives.coulomb).tolist(),
+            "stall_a": STALL_CURRENT,
+            "taxel_gain": draw.taxel_gain.tolist(),
+        }
 
     # --- the pen --------------------------------------------------------------------------------
 
@@ -98,17 +109,17 @@ class PressBench(EmulatedHand):
         """The foam holds the pen by springs."""
         scene, data, foam = self._scene, self._data, self._foam
         at, dof, mass = scene.object_qpos, scene.object_dof, float(self.draw.mass)
-        shift, speed = data.qpos[at:at + 3] - self._place.position, data.qvel[dof:dof + 3]
+        shift, speed = data.qpos[at : at + 3] - self._place.position, data.qvel[dof : dof + 3]
         along = np.outer(self._normal, self._normal)
         across = np.eye(3) - along
         force = -(foam.stiffness * along + foam.shear * across) @ shift
         force -= 2 * _RATIO * (np.sqrt(foam.stiffness * mass) * along + np.sqrt(foam.shear * mass) * across) @ speed
         skew = np.empty(3)
-        mujoco.mju_subQuat(skew, data.qpos[at + 3:at + 7], self._place.quat)
+        mujoco.mju_subQuat(skew, data.qpos[at + 3 : at + 7], self._place.quat)
         inertia = float(scene.model.body_inertia[scene.object_body].max())
-        torque = -_TURN * skew - 2 * _RATIO * np.sqrt(_TURN * inertia) * data.qvel[dof + 3:dof + 6]
+        torque = -_TURN * skew - 2 * _RATIO * np.sqrt(_TURN * inertia) * data.qvel[dof + 3 : dof + 6]
         wrench = data.xfrc_applied[scene.object_body]
-        wrench[:3], wrench[3:] = force - mass * self._gravity, matrix(data.qpos[at + 3:at + 7]) @ torque
+        wrench[:3], wrench[3:] = force - mass * self._gravity, matrix(data.qpos[at + 3 : at + 7]) @ torque
         self._spring = force
         super()._tick()
 

@@ -48,8 +48,16 @@ class Referee:
         """Whether the trial has ended."""
         return bool(self.end)
 
-    def watch(self, step: float, position: np.ndarray, quat: np.ndarray, spin: np.ndarray, tips: np.ndarray,
-              pressing: np.ndarray, joint_speed: np.ndarray) -> None:
+    def watch(
+        self,
+        step: float,
+        position: np.ndarray,
+        quat: np.ndarray,
+        spin: np.ndarray,
+        tips: np.ndarray,
+        pressing: np.ndarray,
+        joint_speed: np.ndarray,
+    ) -> None:
         """One more look.
 
         Args:
@@ -96,19 +104,29 @@ class Referee:
         """What has been seen so far; JSON-able."""
         lived, count = max(self.time, 1e-9), max(self._counted, 1)
         report: dict[str, Any] = {
-            "seconds": round(self.time, 4), "end": self.end or "running",
-            "duty": np.round(self._duty / lived, 4).tolist(), "joint_speed": round(self._speed / lived, 4)}
+            "seconds": round(self.time, 4),
+            "end": self.end or "running",
+            "duty": np.round(self._duty / lived, 4).tolist(),
+            "joint_speed": round(self._speed / lived, 4),
+        }
         if self.goals is None:
             return report | {
-                "held": self.end == "time limit", "force": np.round(self._force / count, 4).tolist(),
-                "finger_force": round(self._finger / count, 4), "finger_pressing": round(self._pressing / count, 4),
-                "total_force": round(self._total / count, 4)}
+                "held": self.end == "time limit",
+                "force": np.round(self._force / count, 4).tolist(),
+                "finger_force": round(self._finger / count, 4),
+                "finger_pressing": round(self._pressing / count, 4),
+                "total_force": round(self._total / count, 4),
+            }
         task, paper = self.goals["task"], self.goals["paper"]
         return report | {
-            "successes": task.count, "paper_successes": paper.count, "success_times": task.times,
+            "successes": task.count,
+            "paper_successes": paper.count,
+            "success_times": task.times,
             "seconds_per_success": task.times[-1] / task.count if task.count else None,
-            "seconds_to_fall": round(self.time, 4), "fell": self.over and self.end != "time limit",
-            "turned": round(task.angle, 4)}
+            "seconds_to_fall": round(self.time, 4),
+            "fell": self.over and self.end != "time limit",
+            "turned": round(task.angle, 4),
+        }
 
 
 class GoalCount:

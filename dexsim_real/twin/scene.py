@@ -21,8 +21,12 @@ STRONG = 0.8  # Nm, joints with more than this have strong motors
 END_STOP = 300.0  # Nm/rad
 _GREASE = 0.02  # Nm s/rad of a gear that nothing is known of
 _STIFF_FRICTION = (0.002, 1.0)  # solref of dry friction: what sticks creeps by less than 1e-3 rad/s
-_KINDS = {"sphere": mujoco.mjtGeom.mjGEOM_SPHERE, "box": mujoco.mjtGeom.mjGEOM_BOX,
-          "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER, "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE}
+_KINDS = {
+    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
+    "box": mujoco.mjtGeom.mjGEOM_BOX,
+    "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
+    "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,8 +82,14 @@ def _add_play(spec: mujoco.MjSpec, hand: Hand, draw: Draw) -> None:
         drive.frictionloss = 1e-4  # So that it has a row in the solver; the drive sets it at each step.
         drive.solref_friction, drive.solimp_friction[:2] = _STIFF_FRICTION, (0.99, 0.99)
         half = max(float(draw.gear_play[j]), 1e-6) / 2
-        play = drive.parent.add_joint(name=f"{name}_play", type=mujoco.mjtJoint.mjJNT_HINGE, axis=drive.axis,
-                                      pos=drive.pos, range=[-half, half], armature=float(draw.gear_inertia))
+        play = drive.parent.add_joint(
+            name=f"{name}_play",
+            type=mujoco.mjtJoint.mjJNT_HINGE,
+            axis=drive.axis,
+            pos=drive.pos,
+            range=[-half, half],
+            armature=float(draw.gear_inertia),
+        )
         play.damping = _fill(play.damping, 2e-4)
 
 
@@ -117,8 +127,15 @@ def _add_object(spec: mujoco.MjSpec, draw: Draw, shape: Shape | None) -> None:
     # Diagonal by the shapes' symmetry.
     body.inertia = np.diag(inertia) * float(draw.inertia_scale)
     for k, part in enumerate(shape.parts):
-        body.add_geom(name=f"object_{k}", type=_KINDS[part.kind], size=_three(part.size), pos=part.place,
-                      contype=0, conaffinity=0, mass=0)
+        body.add_geom(
+            name=f"object_{k}",
+            type=_KINDS[part.kind],
+            size=_three(part.size),
+            pos=part.place,
+            contype=0,
+            conaffinity=0,
+            mass=0,
+        )
 
 
 def _three(size: tuple[float, ...]) -> list[float]:
@@ -152,11 +169,16 @@ def _add_pairs(spec: mujoco.MjSpec, shape: Shape | None, draw: Draw, skins: dict
             slide = float(draw.friction if rubber else draw.bare_friction)
             twist = float(draw.torsion) * slide if rubber else 1e-4
             roll = float(draw.rolling) * slide if rubber else 1e-5
-            spec.add_pair(geomname1=name, geomname2=f"object_{k}", condim=6 if rubber else 4,
-                          friction=[slide, slide, twist, roll, roll])
+            spec.add_pair(
+                geomname1=name,
+                geomname2=f"object_{k}",
+                condim=6 if rubber else 4,
+                friction=[slide, slide, twist, roll, roll],
+            )
 
 
 # --- stiffness -----------------------------------------------------------------------------------
+
 
 def spring(inverse_mass: float, stiffness: float, damping: float) -> tuple[np.ndarray, np.ndarray]:
     """solref and solimp of a constraint that pushes back with `stiffness` r at rest.
@@ -178,8 +200,10 @@ def spring(inverse_mass: float, stiffness: float, damping: float) -> tuple[np.nd
     soft = inverse_mass * loss / impedance
     damping = min(damping / loss**0.5, 0.7 / (impedance * soft * TIMESTEP))
     # In the direct format these are divided by the impedance, the first twice, and d k r has one of its own.
-    return (np.array([-stiffness * soft * impedance, -damping * soft * impedance]),
-            np.array([impedance, impedance, 0.001, 0.5, 2.0]))
+    return (
+        np.array([-stiffness * soft * impedance, -damping * soft * impedance]),
+        np.array([impedance, impedance, 0.001, 0.5, 2.0]),
+    )
 
 
 @functools.lru_cache(maxsize=1)
@@ -227,11 +251,13 @@ def _set_springs(model: mujoco.MjModel, draw: Draw, skins: dict[str, bool]) -> N
             inverse_mass = float(model.dof_invweight0[model.jnt_dofadr[j]])
             stiffness = float(draw.gear_stiffness)
             model.jnt_solref[j], model.jnt_solimp[j] = spring(
-                inverse_mass, stiffness, 2 * np.sqrt(stiffness / inverse_mass))
+                inverse_mass, stiffness, 2 * np.sqrt(stiffness / inverse_mass)
+            )
         elif model.jnt_limited[j]:  # the drive's end stops
             inverse_mass = float(model.dof_invweight0[model.jnt_dofadr[j]])
             model.jnt_solref[j], model.jnt_solimp[j] = spring(
-                inverse_mass, END_STOP, 2 * np.sqrt(END_STOP / inverse_mass))
+                inverse_mass, END_STOP, 2 * np.sqrt(END_STOP / inverse_mass)
+            )
 
 
 def _index(model: mujoco.MjModel, hand: Hand) -> Scene:
@@ -242,8 +268,14 @@ def _index(model: mujoco.MjModel, hand: Hand) -> Scene:
     free, body = model.joint("object"), model.body("object").id
     return Scene(
         model=model,
-        drive_qpos=np.array([j.qposadr[0] for j in drives]), drive_dof=np.array([j.dofadr[0] for j in drives]),
-        play_qpos=np.array([j.qposadr[0] for j in plays]), play_dof=np.array([j.dofadr[0] for j in plays]),
-        object_qpos=int(free.qposadr[0]), object_dof=int(free.dofadr[0]), object_body=body, tip_body=tips,
+        drive_qpos=np.array([j.qposadr[0] for j in drives]),
+        drive_dof=np.array([j.dofadr[0] for j in drives]),
+        play_qpos=np.array([j.qposadr[0] for j in plays]),
+        play_dof=np.array([j.dofadr[0] for j in plays]),
+        object_qpos=int(free.qposadr[0]),
+        object_dof=int(free.dofadr[0]),
+        object_body=body,
+        tip_body=tips,
         finger_of_geom=np.array([finger.get(int(b), -1) for b in model.geom_bodyid]),
-        is_object=model.geom_bodyid == body)
+        is_object=model.geom_bodyid == body,
+    )

@@ -68,9 +68,14 @@ _DISTANCE = {"sphere": _sphere, "box": _box, "cylinder": _cylinder, "capsule": _
 def _reach(part: Part, direction: np.ndarray) -> float:
     x, y, z = np.abs(direction)
     size, across = part.size, float(np.hypot(x, y))
-    return float({"sphere": lambda: size[0], "box": lambda: np.dot(size, (x, y, z)),
-                  "cylinder": lambda: size[0] * across + size[1] * z,
-                  "capsule": lambda: size[0] + size[1] * z}[part.kind]())
+    return float(
+        {
+            "sphere": lambda: size[0],
+            "box": lambda: np.dot(size, (x, y, z)),
+            "cylinder": lambda: size[0] * across + size[1] * z,
+            "capsule": lambda: size[0] + size[1] * z,
+        }[part.kind]()
+    )
 
 
 def draw_shape(draw: Draw, rng: np.random.Generator, name: str | None = None) -> Shape:
@@ -99,6 +104,7 @@ def _composition(draw: Draw, kind: str, size: tuple[float, ...]) -> Shape:
 
 # --- rotations -----------------------------------------------------------------------------------
 
+
 def turn(axis: tuple[float, float, float], angle: float) -> np.ndarray:
     """Quaternion (w, x, y, z) of a rotation about a unit axis."""
     return np.array([np.cos(angle / 2), *(np.sin(angle / 2) * np.asarray(axis, float))])
@@ -113,6 +119,10 @@ def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def matrix(quat: np.ndarray) -> np.ndarray:
     """Rotation matrix [3, 3] of a unit quaternion."""
     w, x, y, z = quat
-    return np.array([[1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-                     [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-                     [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]])
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )

@@ -34,8 +34,14 @@ class Skin:
         self._noise, self._threshold = float(draw.taxel_noise), float(draw.taxel_threshold)
         self._crosstalk = float(draw.taxel_crosstalk)
 
-    def load(self, shape: Shape, place: np.ndarray, turn: np.ndarray, tips: tuple[np.ndarray, np.ndarray],
-             contacts: list[tuple[int, np.ndarray, np.ndarray, np.ndarray]]) -> np.ndarray:
+    def load(
+        self,
+        shape: Shape,
+        place: np.ndarray,
+        turn: np.ndarray,
+        tips: tuple[np.ndarray, np.ndarray],
+        contacts: list[tuple[int, np.ndarray, np.ndarray, np.ndarray]],
+    ) -> np.ndarray:
         """Forces [F, N, 3] N on the taxels along their own axes, before the array's faults.
 
         Args:

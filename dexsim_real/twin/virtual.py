@@ -40,14 +40,21 @@ def ideal_calibration(hand: Hand) -> Calibration:
 
     Each trial's drawn errors of current and taxels are then errors of this calibration.
     """
+
     def side(gain: np.ndarray) -> Side:
         both, one = np.broadcast_to(gain, (2, hand.num_joints)).astype(float), np.ones(hand.num_joints)
         zero = np.zeros_like(both)
         return Side(both, both, both, zero, zero, zero, zero, zero + 1, zero + 1, zero, zero, 0 * one, one, one)
+
     return Calibration(
-        real=side(-STALL_CURRENT / hand.torque_limit), sim=side(np.ones(hand.num_joints)),
-        torque_scale=hand.torque_limit, force_per_count=np.full(hand.num_fingers, FirmwareConfig().force_per_count),
-        hand=hand.name, joint_names=hand.joint_names, finger_names=hand.finger_names)
+        real=side(-STALL_CURRENT / hand.torque_limit),
+        sim=side(np.ones(hand.num_joints)),
+        torque_scale=hand.torque_limit,
+        force_per_count=np.full(hand.num_fingers, FirmwareConfig().force_per_count),
+        hand=hand.name,
+        joint_names=hand.joint_names,
+        finger_names=hand.finger_names,
+    )
 
 
 class Schedule:
@@ -112,8 +119,13 @@ class VirtualCamera:
         sensing = controller.task.config.sensing
         self._plant, self._config = plant, ObjectConfig()
         self._parts = [outline(part) for part in plant.shape.parts]
-        self.sensor = HeightSensor(lambda: None, self._config.optics, np.asarray(controller.task.reference, float),
-                                   sensing.object_axes, sensing.velocity_filter)
+        self.sensor = HeightSensor(
+            lambda: None,
+            self._config.optics,
+            np.asarray(controller.task.reference, float),
+            sensing.object_axes,
+            sensing.velocity_filter,
+        )
 
     def sample(self, time: float) -> None:
         """One picture, which shows what is a while ago."""
@@ -279,8 +291,11 @@ class VirtualRun:
     def _summary(self, trial: int) -> dict[str, Any]:
         report = next(r for r in self.plant.results() if r["trial"] == trial)
         mean = self.sums / max(self.ticks, 1)
-        believed = {"ticks": self.ticks, "sensed_force": np.round(mean, 4).tolist(),
-                    "safety": dict(self.safety.counts), "latched": self.safety.latched,
-                    "successes": self.goals.successes if self.goals else None}
+        believed = {
+            "ticks": self.ticks,
+            "sensed_force": np.round(mean, 4).tolist(),
+            "safety": dict(self.safety.counts),
+            "latched": self.safety.latched,
+            "successes": self.goals.successes if self.goals else None,
+        }
         return report | {"command": self.options.command, "bridge": believed}
-

@@ -17,9 +17,15 @@ from dexsim_ppo import checkpoint
 from dexsim_ppo.policy import Policy, act
 from dexsim_ppo.ppo import make_train
 
-TREE = {"x": jnp.arange(6, dtype=jnp.float32).reshape(2, 3), "empty": jnp.zeros((0, 4)),
-        "flag": jnp.bool_(True), "half": jnp.ones(3, jnp.bfloat16), "key": jax.random.key(7),
-        "keys": jax.random.split(jax.random.key(1), 3), "n": (jnp.int32(-5), jnp.uint32(2**31))}
+TREE = {
+    "x": jnp.arange(6, dtype=jnp.float32).reshape(2, 3),
+    "empty": jnp.zeros((0, 4)),
+    "flag": jnp.bool_(True),
+    "half": jnp.ones(3, jnp.bfloat16),
+    "key": jax.random.key(7),
+    "keys": jax.random.split(jax.random.key(1), 3),
+    "n": (jnp.int32(-5), jnp.uint32(2**31)),
+}
 
 
 @pytest.fixture(scope="module")
@@ -41,8 +47,10 @@ def equal(a, b):
         if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
             x, y = jax.random.key_data(x), jax.random.key_data(y)
         assert x.dtype == y.dtype
-        np.testing.assert_array_equal(np.asarray(x).view(np.uint8) if x.ndim else x,
-                                      np.asarray(y).view(np.uint8) if y.ndim else y)
+        np.testing.assert_array_equal(
+            np.asarray(x).view(np.uint8) if x.ndim else x, np.asarray(y).view(np.uint8) if y.ndim else y
+        )
+
     jax.tree.map(leaf, a, b)
 
 
@@ -70,8 +78,12 @@ def test_a_flipped_bit_is_found(file, place, bit):
 def test_a_changed_length_is_found(file, place, how):
     data = file.read_bytes()
     at = int(place * len(data))
-    data = {"cut": data[:at], "extend": data + data[:at + 1], "drop": data[:at] + data[at + 1:],
-            "repeat": data[:at + 1] + data[at:]}[how]
+    data = {
+        "cut": data[:at],
+        "extend": data + data[: at + 1],
+        "drop": data[:at] + data[at + 1 :],
+        "repeat": data[: at + 1] + data[at:],
+    }[how]
     damaged = file.with_name("damaged")
     damaged.write_bytes(data)
     try:
@@ -87,20 +99,25 @@ def forge(path, **changes):
 
     data = path.read_bytes()
     size = struct.unpack("<Q", data[8:16])[0]
-    header = msgpack.unpackb(data[48:48 + size]) | changes
+    header = msgpack.unpackb(data[48 : 48 + size]) | changes
     packed = msgpack.packb(header)
     prefix = data[:8] + struct.pack("<Q", len(packed))
     forged = path.with_name("forged")
-    forged.write_bytes(prefix + hashlib.sha256(prefix + packed).digest() + packed + data[48 + size:])
+    forged.write_bytes(prefix + hashlib.sha256(prefix + packed).digest() + packed + data[48 + size :])
     return forged
 
 
-@pytest.mark.parametrize("leaf", [
-    {"path": "x", "dtype": "float32", "shape": [2**39, 2**39], "prng": ""},
-    {"path": "x", "dtype": "float32", "shape": [-1], "prng": ""},
-    {"path": "x", "dtype": "object", "shape": [1], "prng": ""},
-    {"path": "x", "dtype": "float32", "shape": [1.5], "prng": ""},
-    {"path": "x"}, 7])
+@pytest.mark.parametrize(
+    "leaf",
+    [
+        {"path": "x", "dtype": "float32", "shape": [2**39, 2**39], "prng": ""},
+        {"path": "x", "dtype": "float32", "shape": [-1], "prng": ""},
+        {"path": "x", "dtype": "object", "shape": [1], "prng": ""},
+        {"path": "x", "dtype": "float32", "shape": [1.5], "prng": ""},
+        {"path": "x"},
+        7,
+    ],
+)
 def test_impossible_leaves_are_refused_before_allocation(file, leaf):
     forged = forge(file, leaves=[leaf])
     with pytest.raises(CheckpointError):
@@ -129,8 +146,10 @@ def test_other_task_kind_version_and_no_checkpoint(file, tmp_path):
 
 def test_restore_names_what_does_not_fit(file):
     loaded = checkpoint.load(file, kind="train")
-    for change, said in (({"x": jnp.zeros((2, 4))}, r"\['x'\] is float32\[2, 3\], expected"),
-                         ({"y": jnp.zeros(1)}, r"\['y'\] is missing")):
+    for change, said in (
+        ({"x": jnp.zeros((2, 4))}, r"\['x'\] is float32\[2, 3\], expected"),
+        ({"y": jnp.zeros(1)}, r"\['y'\] is missing"),
+    ):
         with pytest.raises(CheckpointError, match=said):
             checkpoint.restore(loaded, TREE | change)
     with pytest.raises(CheckpointError, match=r"\['x'\] is not expected"):
@@ -197,9 +216,11 @@ def test_policies_load_without_the_simulator(trained, tmp_path):
 
     env, state = trained
     Policy.from_training(env, SMALL, state).save(tmp_path / "p.msgpack")
-    code = (f"from dexsim_ppo import Policy; import jax.numpy as jnp, sys; "
-            f"p = Policy.load({str(tmp_path / 'p.msgpack')!r}); print(p(jnp.zeros(3)).shape); "
-            "bad = {'mujoco', 'warp', 'tyro', 'matplotlib', 'trimesh'} & set(sys.modules); "
-            "assert not bad, bad")
+    code = (
+        f"from dexsim_ppo import Policy; import jax.numpy as jnp, sys; "
+        f"p = Policy.load({str(tmp_path / 'p.msgpack')!r}); print(p(jnp.zeros(3)).shape); "
+        "bad = {'mujoco', 'warp', 'tyro', 'matplotlib', 'trimesh'} & set(sys.modules); "
+        "assert not bad, bad"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.stdout.strip() == "(1,)", done.stderr

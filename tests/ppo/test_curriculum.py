@@ -49,8 +49,12 @@ class WideEnv(TinyEnv):
     def step(self, state, action):
         inner = super().step(state.inner, action)
         done = inner.metrics["length"] >= self.lives
-        inner = dataclasses.replace(inner, terminated=done & self.fails, truncated=done & (not self.fails),
-                                    metrics=inner.metrics | {"drawn": state.drawn})
+        inner = dataclasses.replace(
+            inner,
+            terminated=done & self.fails,
+            truncated=done & (not self.fails),
+            metrics=inner.metrics | {"drawn": state.drawn},
+        )
         return dataclasses.replace(state, inner=inner)
 
     def restart(self, state, done):
@@ -117,8 +121,7 @@ def test_a_checkpoint_keeps_the_scale_and_resumes_to_the_bit(tmp_path):
     checkpoint.save(tmp_path / "c", kind="train", task="tiny", content={}, tree=state)
     straight, _ = training.step(state)
     resumed = make_train(WideEnv(), SMALL, RULES)
-    again = checkpoint.restore(checkpoint.load(tmp_path / "c", kind="train"),
-                               resumed.shapes(jax.random.key(5)))
+    again = checkpoint.restore(checkpoint.load(tmp_path / "c", kind="train"), resumed.shapes(jax.random.key(5)))
     assert float(again.scale) == pytest.approx(0.7)
     again, _ = resumed.step(jax.tree.map(jnp.copy, again))
     for ours, theirs in zip(jax.tree.leaves(again), jax.tree.leaves(straight), strict=True):

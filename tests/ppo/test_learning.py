@@ -118,8 +118,13 @@ class BadRewards(TinyEnv):
         diverged = state.metrics["length"] % 5 == 0
         poison = lambda x: jnp.where(diverged, jnp.nan, x)  # noqa: E731
         metrics = state.metrics | {"error": poison(state.metrics["error"])}
-        return dataclasses.replace(state, reward=poison(state.reward), obs=jax.tree.map(
-            poison, state.obs), metrics=metrics, terminated=diverged)
+        return dataclasses.replace(
+            state,
+            reward=poison(state.reward),
+            obs=jax.tree.map(poison, state.obs),
+            metrics=metrics,
+            terminated=diverged,
+        )
 
 
 def test_a_diverging_environment_does_not_poison_the_learner():
@@ -138,8 +143,9 @@ class TrueFinal(TinyEnv):
 
     def step(self, state, action):
         state = super().step(state, action)
-        return dataclasses.replace(self._observe(dataclasses.replace(state, x=jnp.float32(7.0))),
-                                   truncated=jnp.bool_(True))
+        return dataclasses.replace(
+            self._observe(dataclasses.replace(state, x=jnp.float32(7.0))), truncated=jnp.bool_(True)
+        )
 
 
 def test_next_value_is_that_of_the_true_final_observation():
@@ -173,13 +179,15 @@ def test_restarts_what_ended_and_nothing_else(length, block, share):
 
     def step(state, given):
         number, ended = given
-        after = dataclasses.replace(state, x=state.x + number, terminated=ended & (number % 2 == 0),
-                                    truncated=ended & (number % 2 == 1))
+        after = dataclasses.replace(
+            state, x=state.x + number, terminated=ended & (number % 2 == 0), truncated=ended & (number % 2 == 1)
+        )
         return after, (state.x, after.x)
 
     numbers = jnp.arange(length)
     last, (before, after) = jax.jit(lambda *given: scan_restarting(env, step, *given))(
-        states, (numbers, jnp.asarray(ends)))
+        states, (numbers, jnp.asarray(ends))
+    )
     for row in range(count):
         state = jax.tree.map(lambda x, row=row: x[row], states)
         for tick in range(length):
@@ -212,10 +220,13 @@ def test_metrics_are_those_of_a_plain_loop():
     env, count, length = BadRewards(), 6, 16
     states = jax.vmap(env.reset)(jax.random.split(jax.random.key(3), count))
     states = dataclasses.replace(states, metrics=states.metrics | {"length": jnp.arange(count) * 2.0})
-    decide = lambda key, obs: (Decision(*[jnp.zeros((count, 1))] * 2, jnp.zeros(count)),  # noqa: E731
-                               jax.random.normal(key, (count, 1)))
-    _, rollout, metrics = jax.jit(lambda state: collect(
-        env, state, jax.random.key(4), decide, lambda obs: obs["critic"][..., 0], length))(states)
+    decide = lambda key, obs: (
+        Decision(*[jnp.zeros((count, 1))] * 2, jnp.zeros(count)),  # noqa: E731
+        jax.random.normal(key, (count, 1)),
+    )
+    _, rollout, metrics = jax.jit(
+        lambda state: collect(env, state, jax.random.key(4), decide, lambda obs: obs["critic"][..., 0], length)
+    )(states)
     everywhere, ended, final, broken, reward = [], 0, [], 0, []
     fresh = jax.vmap(env.restart)(states, jnp.ones(count, bool))
     state = jax.vmap(env.restart)(states, jnp.zeros(count, bool))

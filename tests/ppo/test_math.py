@@ -23,8 +23,14 @@ def gae(reward, value, next_value, terminated, truncated, discount=0.5, gae_lamb
     """`compute_gae` of one environment."""
     column = lambda x, dtype: jnp.asarray(x, dtype)[:, None]  # noqa: E731
     advantage, target = compute_gae(
-        column(reward, jnp.float32), column(value, jnp.float32), column(next_value, jnp.float32),
-        column(terminated, bool), column(truncated, bool), discount=discount, gae_lambda=gae_lambda)
+        column(reward, jnp.float32),
+        column(value, jnp.float32),
+        column(next_value, jnp.float32),
+        column(terminated, bool),
+        column(truncated, bool),
+        discount=discount,
+        gae_lambda=gae_lambda,
+    )
     np.testing.assert_allclose(target[:, 0], advantage[:, 0] + np.asarray(value), rtol=1e-6)
     return np.asarray(advantage[:, 0])
 
@@ -60,16 +66,14 @@ class TestGAE:
             delta = reward[t] + 0.9 * next_value[t] * ~terminated[t] - value[t]
             carry = delta + 0.9 * 0.8 * carry * ~(terminated[t] | truncated[t])
             expected[t] = carry
-        advantage, _ = compute_gae(reward, value, next_value, terminated, truncated, discount=0.9,
-                                   gae_lambda=0.8)
+        advantage, _ = compute_gae(reward, value, next_value, terminated, truncated, discount=0.9, gae_lambda=0.8)
         np.testing.assert_allclose(advantage, expected, rtol=1e-5, atol=1e-6)
 
 
 class TestDistribution:
     def test_log_prob_and_entropy(self):
         # Standard deviations 1 and 2 at distances of 1 and 2 deviations.
-        value = distribution.log_prob(jnp.array([1.0, 5.0]), jnp.array([0.0, 1.0]),
-                                      jnp.log(jnp.array([1.0, 2.0])))
+        value = distribution.log_prob(jnp.array([1.0, 5.0]), jnp.array([0.0, 1.0]), jnp.log(jnp.array([1.0, 2.0])))
         assert float(value) == pytest.approx(-0.5 - 2.0 - np.log(2) - np.log(2 * np.pi), rel=1e-6)
         entropy = distribution.entropy(jnp.log(jnp.array([1.0, 2.0])))
         assert float(entropy) == pytest.approx(np.log(2) + np.log(2 * np.pi * np.e), rel=1e-6)
@@ -148,8 +152,7 @@ class TestAdam:
             for k, g in grad.items():
                 m, v = (0.9 * moments[k][0] + 0.1 * g, 0.999 * moments[k][1] + 0.001 * g**2)
                 moments[k] = m, v
-                params[k] = params[k] - 0.01 * (m / (1 - 0.9**t)) / (
-                    np.sqrt(v / (1 - 0.999**t)) + 1e-5)
+                params[k] = params[k] - 0.01 * (m / (1 - 0.9**t)) / (np.sqrt(v / (1 - 0.999**t)) + 1e-5)
         for k in params:
             np.testing.assert_allclose(got[k], params[k], rtol=1e-5, atol=1e-6)
 
@@ -164,18 +167,22 @@ class TestAdam:
 
 class TestConfig:
     def test_learning_rate_adapts_within_its_band(self):
-        config = PPOConfig(learning_rate=1e-3, learning_rate_min=9e-4, learning_rate_max=1.2e-3,
-                           kl_target=0.01)
+        config = PPOConfig(learning_rate=1e-3, learning_rate_min=9e-4, learning_rate_max=1.2e-3, kl_target=0.01)
         rate = lambda kl: float(adapt_learning_rate(config, jnp.float32(1e-3), jnp.float32(kl)))  # noqa: E731
-        assert [rate(kl) for kl in (0.0, 0.006, 0.01, 0.021)] == pytest.approx(
-            [1.2e-3, 1e-3, 1e-3, 9e-4])
+        assert [rate(kl) for kl in (0.0, 0.006, 0.01, 0.021)] == pytest.approx([1.2e-3, 1e-3, 1e-3, 9e-4])
         fixed = dataclasses.replace(config, kl_target=0.0)
         assert float(adapt_learning_rate(fixed, jnp.float32(1e-3), jnp.float32(9.0))) == pytest.approx(1e-3)
 
-    @pytest.mark.parametrize(("values", "said"), [
-        ({"discount": 1.5}, "discount"), ({"minibatches": 7}, "minibatches"),
-        ({"learning_rate": 0.5}, "learning_rate"), ({"std_min": 0.9}, "initial_std"),
-        ({"distribution": "beta"}, "distribution")])
+    @pytest.mark.parametrize(
+        ("values", "said"),
+        [
+            ({"discount": 1.5}, "discount"),
+            ({"minibatches": 7}, "minibatches"),
+            ({"learning_rate": 0.5}, "learning_rate"),
+            ({"std_min": 0.9}, "initial_std"),
+            ({"distribution": "beta"}, "distribution"),
+        ],
+    )
     def test_bad_values_are_named(self, values, said):
         with pytest.raises(ConfigError, match=f"PPOConfig.{said} = "):
             PPOConfig(num_envs=16, rollout_length=8, **values)

@@ -81,7 +81,7 @@ def test_what_tells_programs_apart(monkeypatch):
     assert key(["x"], SHAPES) != base
 
 
-@pytest.mark.parametrize("harm", [lambda content: content[:len(content) // 2], lambda content: b"x" * 99])
+@pytest.mark.parametrize("harm", [lambda content: content[: len(content) // 2], lambda content: b"x" * 99])
 def test_a_damaged_file_is_compiled_again(folder, harm):
     good, _ = run("one")
     (path,) = folder.glob("*.pkl")

@@ -19,10 +19,29 @@ from dexsim_ppo import cli, evaluate, train, trainer
 from dexsim_ppo.policy import Policy
 from dexsim_ppo.runlog import RunFolder, read_metrics
 
-QUICK = ["--task", "tiny", "--preset", "cpu", "--no-video", "--ppo.num-envs", "16",
-         "--ppo.rollout-length", "8", "--ppo.actor-layers", "8", "--ppo.critic-layers", "8",
-         "--evaluation-chunk", "16", "--evaluation-episodes", "32", "--evaluate-every", "4",
-         "--log-every", "1"]
+QUICK = [
+    "--task",
+    "tiny",
+    "--preset",
+    "cpu",
+    "--no-video",
+    "--ppo.num-envs",
+    "16",
+    "--ppo.rollout-length",
+    "8",
+    "--ppo.actor-layers",
+    "8",
+    "--ppo.critic-layers",
+    "8",
+    "--evaluation-chunk",
+    "16",
+    "--evaluation-episodes",
+    "32",
+    "--evaluate-every",
+    "4",
+    "--log-every",
+    "1",
+]
 PER_ITERATION = 16 * 8
 
 
@@ -42,8 +61,15 @@ def finished(tmp_path_factory):
 
 
 def test_a_run_leaves_its_files(finished):
-    for path in (finished.config, finished.metrics, finished.best, finished.last, finished.untrained,
-                 finished.report, finished.path / "curve.png"):
+    for path in (
+        finished.config,
+        finished.metrics,
+        finished.best,
+        finished.last,
+        finished.untrained,
+        finished.report,
+        finished.path / "curve.png",
+    ):
         assert path.stat().st_size > 0
     rows = read_metrics(finished.metrics)
     assert [row["iteration"] for row in rows] == [1, 2, 3, 4, 5, 6]
@@ -88,8 +114,7 @@ def test_resumed_run_equals_an_uninterrupted_one(finished, tmp_path):
 
 
 def test_evaluate_command(finished, tmp_path, capsys):
-    arguments = [str(finished.best), "--episodes", "32", "--chunk", "16", "--output",
-                 str(tmp_path / "report.json")]
+    arguments = [str(finished.best), "--episodes", "32", "--chunk", "16", "--output", str(tmp_path / "report.json")]
     assert evaluate.main(arguments) == 0
     first = json.loads((tmp_path / "report.json").read_text())
     assert evaluate.main(arguments) == 0
@@ -119,8 +144,10 @@ def test_film_shows_the_first_and_last_episode_to_half_a_second_after_its_end(fi
 def test_episodes_end_at_their_first_termination():
     # Episode 0 terminates at step 1 (with a reward of 10 counted in), and "lives" again later.
     terminated = np.array([[0, 0], [1, 0], [0, 0]], bool)
-    metrics = {"return": np.array([[1.0, 1], [11, 2], [99, 3]]), "error": np.array(
-        [[1.0, 1], [np.nan, 1], [np.nan, 4]])}
+    metrics = {
+        "return": np.array([[1.0, 1], [11, 2], [99, 3]]),
+        "error": np.array([[1.0, 1], [np.nan, 1], [np.nan, 4]]),
+    }
     report = evaluate.summarize(TinyEnv(), metrics, terminated)
     assert report["held"]["value"] == 0.5
     assert report["return"]["value"] == pytest.approx((11 + 3) / 2)
@@ -179,17 +206,18 @@ def test_files_are_never_overwritten_or_mistaken(finished, tmp_path, monkeypatch
     broken.write_bytes(finished.best.read_bytes()[:-9])
     run = str(finished.path)
     for main, arguments, said in (
-            (train.main, [*QUICK, "--run-dir", run], "exists already"),
-            (train.main, ["--task", "grasp", "--resume", run], "of the task 'tiny', not 'grasp'"),
-            (train.main, ["--resume", run, "--ppo.num-envs", "32"], "does not fit this configuration"),
-            (train.main, ["--resume", str(finished.best)], "'policy' file, not a 'train' file"),
-            (evaluate.main, [str(broken)], "cut short"),
-            (evaluate.main, ["no-such-policy"], "no shipped policy has that name"),
-            (evaluate.main, [str(finished.best), "--episodes", "0"], "at least 1"),
-            (evaluate.main, [str(finished.best), "--set", "colour=red"], "has no field 'colour'"),
-            (evaluate.main, [str(finished.best), "--set", "colour"], "'colour': expected NAME=VALUE"),
-            (evaluate.main, [str(finished.best), "--blind", "colour"], "does not observe colour"),
-            (evaluate.main, [], "policy")):
+        (train.main, [*QUICK, "--run-dir", run], "exists already"),
+        (train.main, ["--task", "grasp", "--resume", run], "of the task 'tiny', not 'grasp'"),
+        (train.main, ["--resume", run, "--ppo.num-envs", "32"], "does not fit this configuration"),
+        (train.main, ["--resume", str(finished.best)], "'policy' file, not a 'train' file"),
+        (evaluate.main, [str(broken)], "cut short"),
+        (evaluate.main, ["no-such-policy"], "no shipped policy has that name"),
+        (evaluate.main, [str(finished.best), "--episodes", "0"], "at least 1"),
+        (evaluate.main, [str(finished.best), "--set", "colour=red"], "has no field 'colour'"),
+        (evaluate.main, [str(finished.best), "--set", "colour"], "'colour': expected NAME=VALUE"),
+        (evaluate.main, [str(finished.best), "--blind", "colour"], "does not observe colour"),
+        (evaluate.main, [], "policy"),
+    ):
         assert exit_code(main, arguments) == 2
         error = capsys.readouterr().err
         assert said.lower() in error.lower() and error.count("\n") == 1, error
@@ -217,11 +245,19 @@ def exit_code(main, arguments):
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_saves_and_says_how_to_go_on(number, tmp_path):
-    command = [sys.executable, str(Path(__file__).with_name("tiny_train.py")), *QUICK,
-               "--minutes", "5", "--run-dir", str(tmp_path / "a")]
+    command = [
+        sys.executable,
+        str(Path(__file__).with_name("tiny_train.py")),
+        *QUICK,
+        "--minutes",
+        "5",
+        "--run-dir",
+        str(tmp_path / "a"),
+    ]
     path = os.pathsep.join([str(Path(cli.__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True,
-                               env=os.environ | {"PYTHONPATH": path.strip(os.pathsep)})
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, text=True, env=os.environ | {"PYTHONPATH": path.strip(os.pathsep)}
+    )
     metrics, deadline = tmp_path / "a" / "metrics.jsonl", time.time() + 120
     while time.time() < deadline and not (metrics.exists() and metrics.stat().st_size):
         time.sleep(0.1)

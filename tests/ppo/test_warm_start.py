@@ -71,8 +71,11 @@ def test_what_it_knows_survives_and_grows(policy):
     config = dataclasses.replace(learner_settings(policy, CONFIG), critic_first=200)
     _, training, state = started(policy, config, env)
     measure = evaluate.Evaluator(env, 256)
-    score = lambda state: measure(Policy.from_training(env, config, state).params,  # noqa: E731
-                                  episodes=256, seed=1)[0]["return"]["value"]
+    score = lambda state: measure(
+        Policy.from_training(env, config, state).params,  # noqa: E731
+        episodes=256,
+        seed=1,
+    )[0]["return"]["value"]
     first = score(state)
     assert first > score(training.init(jax.random.key(1))) + 3
     scores = []
@@ -103,15 +106,17 @@ def test_from_the_command_line(policy, tiny_task, tmp_path):
 def test_what_does_not_fit_is_refused(policy, tiny_task, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     policy.save("policy.msgpack")
-    other = dataclasses.replace(policy, observation_layout=tuple(
-        field._replace(name=field.name + "_2") for field in policy.observation_layout))
+    other = dataclasses.replace(
+        policy, observation_layout=tuple(field._replace(name=field.name + "_2") for field in policy.observation_layout)
+    )
     other.save("other.msgpack")
     before = sorted(tmp_path.iterdir())
     for arguments, said in (
-            (["--task", "grasp", "--policy", "policy.msgpack"], "of the task 'tiny', not 'grasp'"),
-            (["--policy", "nothing.msgpack"], "cannot be read"),
-            (["--policy", "other.msgpack"], "does not observe"),
-            (["--policy", "policy.msgpack", "--ppo.actor-layers", "7"], "leave ppo.actor_layers")):
+        (["--task", "grasp", "--policy", "policy.msgpack"], "of the task 'tiny', not 'grasp'"),
+        (["--policy", "nothing.msgpack"], "cannot be read"),
+        (["--policy", "other.msgpack"], "does not observe"),
+        (["--policy", "policy.msgpack", "--ppo.actor-layers", "7"], "leave ppo.actor_layers"),
+    ):
         assert exit_code(train.main, [*arguments, "--steps", "128"]) == 2
         error = capsys.readouterr().err
         assert said in error and error.count("\n") == 1, error

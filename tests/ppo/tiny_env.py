@@ -18,10 +18,26 @@ from dexsim_ppo.ppo_config import PPOConfig
 from dexsim_ppo.types import Field
 
 # Learners: one that solves the task, and one that is quick to compile.
-CONFIG = PPOConfig(num_envs=64, rollout_length=16, minibatches=4, epochs=4, actor_layers=(32, 32),
-                   critic_layers=(32, 32), discount=0.95, iterations_per_call=10)
-SMALL = dataclasses.replace(CONFIG, num_envs=8, rollout_length=8, minibatches=2, epochs=2,
-                            actor_layers=(8,), critic_layers=(8,), iterations_per_call=1)
+CONFIG = PPOConfig(
+    num_envs=64,
+    rollout_length=16,
+    minibatches=4,
+    epochs=4,
+    actor_layers=(32, 32),
+    critic_layers=(32, 32),
+    discount=0.95,
+    iterations_per_call=10,
+)
+SMALL = dataclasses.replace(
+    CONFIG,
+    num_envs=8,
+    rollout_length=8,
+    minibatches=2,
+    epochs=2,
+    actor_layers=(8,),
+    critic_layers=(8,),
+    iterations_per_call=1,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,7 +77,8 @@ class TinyEnv:
     evaluation = "series"
     observation_layout = {
         group: (Field("position", 1, None), Field("target", 1, None), Field("touch", 1, 2.0))
-        for group in ("actor", "critic")}
+        for group in ("actor", "critic")
+    }
 
     def __init__(self, config: TinyConfig | None = None, *, backend: str = "jax", num_envs: int = 1):
         del num_envs
@@ -91,11 +108,22 @@ class TinyEnv:
         x = state.x + self.config.gain * jnp.clip(action[0], -1.0, 1.0)
         error = jnp.abs(x - state.target)
         length = state.metrics["length"] + 1
-        metrics = {"return": state.metrics["return"] + 1 - error, "length": length,
-                   "success": (error < 0.1).astype(jnp.float32), "error": error}
-        return self._observe(dataclasses.replace(
-            state, x=x, reward=1 - error, metrics=metrics, terminated=jnp.abs(x) > self.config.wall,
-            truncated=length >= self.config.horizon))
+        metrics = {
+            "return": state.metrics["return"] + 1 - error,
+            "length": length,
+            "success": (error < 0.1).astype(jnp.float32),
+            "error": error,
+        }
+        return self._observe(
+            dataclasses.replace(
+                state,
+                x=x,
+                reward=1 - error,
+                metrics=metrics,
+                terminated=jnp.abs(x) > self.config.wall,
+                truncated=length >= self.config.horizon,
+            )
+        )
 
     def restart(self, state: TinyState, done: jax.Array) -> TinyState:
         return jax.tree.map(lambda new, old: jnp.where(done, new, old), self._start(state.key), state)
