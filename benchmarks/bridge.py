@@ -32,9 +32,9 @@ EXCHANGE = 0.0096  # s, measured on the hand: mean and median of the round trip
 
 def peer() -> None:
     """A hand that follows its targets; prints its port, and serves until its input closes."""
-    from dexsim_real import frames
-    from dexsim_real.frames import Command, Frame, Mode, Parser
-    from dexsim_real.realtime import use_realtime
+    from dexsim_real.core.process import use_realtime
+    from dexsim_real.wire import frames
+    from dexsim_real.wire.frames import Command, Frame, Mode, Parser
 
     use_realtime()  # It stands for hardware, which waits for no scheduler.
     master, slave = os.openpty()
@@ -138,16 +138,18 @@ def measure_run(options: argparse.Namespace, hand: list[str], folder: Path) -> d
     """A whole run by the command, its own summary, and the memory over time."""
     from machine import Away
 
-    from dexsim_real import run, servo
+    from dexsim_real.control import servo
+    from dexsim_real.core.timing import Pace
+    from dexsim_real.run import __main__ as run
 
-    memory, done, wait, cycle = [], threading.Event(), servo.Pace.wait, servo.Servo._cycle
+    memory, done, wait, cycle = [], threading.Event(), Pace.wait, servo.Servo._cycle
     ticks, waited = (collections.defaultdict(lambda: array.array("d")) for _ in range(2))  # 8 bytes a number
 
     def watch() -> None:
         while not done.wait(options.seconds / 20):
             memory.append(resident())
 
-    def noted(pace: servo.Pace) -> None:
+    def noted(pace: Pace) -> None:
         wait(pace)
         ticks[pace].extend((pace.next - pace.period, time.monotonic()))
 
@@ -172,13 +174,13 @@ def measure_run(options: argparse.Namespace, hand: list[str], folder: Path) -> d
         str(folder / "bridge.json"),
     ]
     threading.Thread(target=watch, daemon=True).start()
-    servo.Pace.wait, servo.Servo._cycle = noted, counted
+    Pace.wait, servo.Servo._cycle = noted, counted
     start = time.process_time()
     with Away() as away:
         code = run.main(arguments)
     used = time.process_time() - start
     done.set()
-    servo.Pace.wait, servo.Servo._cycle = wait, cycle
+    Pace.wait, servo.Servo._cycle = wait, cycle
     summary = json.loads((folder / "bridge.json").read_text())
     exchanges, link = summary["exchange_jitter"], summary["link"]
     return {
@@ -204,11 +206,12 @@ def measure_run(options: argparse.Namespace, hand: list[str], folder: Path) -> d
 def measure_compute(policy: str, ticks: int) -> dict:
     """Observation and policy alone, from readings to action, and the whole tick from a state block."""
     from dexsim import load_hand
-    from dexsim_ppo.evaluate import load_policy
-    from dexsim_real import frames
-    from dexsim_real.control import IDENTITY, Controller
-    from dexsim_real.realtime import use_realtime
-    from dexsim_real.sensing import HandSensing, HardwareConfig, ObjectEstimate
+    from dexsim_ppo.policy import load_policy
+    from dexsim_real.control.controller import IDENTITY, Controller
+    from dexsim_real.core.process import use_realtime
+    from dexsim_real.sensors.hand import HandSensing, HardwareConfig
+    from dexsim_real.sensors.readings import ObjectEstimate
+    from dexsim_real.wire import frames
 
     hand = load_hand()
     controller, sensing = Controller(load_policy(policy), hand), HandSensing(hand, HardwareConfig())
@@ -246,7 +249,7 @@ def main() -> None:
     if options.peer:
         peer()
         return
-    from dexsim_real.control import prepare_jax
+    from dexsim_real.control.controller import prepare_jax
 
     prepare_jax()
     common = {

@@ -224,8 +224,8 @@ def soak(options: argparse.Namespace) -> bool:
 
 def inspect(path: Path, safe: float) -> dict:
     """What a log tells: counters at the end, and how soon each loss of the hand was noticed."""
-    from dexsim_real import frames
-    from dexsim_real.log import Kind, LogReader
+    from dexsim_real.core.log import Kind, LogReader
+    from dexsim_real.wire import frames
 
     reader, link, end, state = LogReader(path), {}, "no end", None
     states, sent, notes = [], [], []
@@ -365,8 +365,8 @@ def kills(options: argparse.Namespace) -> bool:
 
 def autopsy(path: Path, death: float) -> dict:
     """A dead runner's log: whether it opens and replays, and seconds between its last record and the end."""
-    from dexsim_real.log import Kind, LogError, LogReader
-    from dexsim_real.replay import replay
+    from dexsim_real.core.log import Kind, LogError, LogReader
+    from dexsim_real.replay.replay import replay
 
     try:
         reader = LogReader(path)
@@ -419,7 +419,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--runner", default="", help="more options of the runner")
     options = parser.parse_args(argv)
     sys.path.insert(0, str(ROOT))
-    from dexsim_real.control import prepare_jax
+    from dexsim_real.control.controller import prepare_jax
 
     prepare_jax()
     sound = [soak(options)] if options.minutes > 0 else []

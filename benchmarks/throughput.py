@@ -32,11 +32,11 @@ import jax
 import jax.numpy as jnp
 
 import dexsim
-from dexsim.env import Env
+from dexsim.core.cli import enable_caches
+from dexsim.core.compilation import collector_paused, jit
+from dexsim.env.env import Env
 from dexsim.tasks import TASKS
-from dexsim_ppo.cli import enable_caches
-from dexsim_ppo.compilation import collector_paused, jit
-from dexsim_ppo.rollout import scan_restarting
+from dexsim_ppo.learner.rollout import scan_restarting
 
 
 class WithoutObservation(Env):
@@ -229,7 +229,8 @@ def measure(env: Env, num_envs: int, steps: int, repeats: int) -> dict:
 
 def measure_training(task: str, backend: str, num_envs: int, iterations: int) -> dict:
     """Env-steps per second of PPO's train step, compile excluded."""
-    from dexsim_ppo.ppo import PPOConfig, make_train
+    from dexsim_ppo.learner.config import PPOConfig
+    from dexsim_ppo.learner.ppo import make_train
 
     env = dexsim.make(task, backend=backend, num_envs=num_envs)
     config = dataclasses.replace(PPOConfig(), num_envs=num_envs)

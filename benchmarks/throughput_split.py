@@ -16,16 +16,20 @@ import jax
 import jax.numpy as jnp
 from throughput import Recorder, make, seconds, timing
 
-from dexsim import rotations, tactile
-from dexsim.env import Env
-from dexsim.hand import forward_kinematics, taxel_positions
-from dexsim_ppo import ppo
-from dexsim_ppo.compilation import jit
-from dexsim_ppo.distribution import log_prob, sample
-from dexsim_ppo.ppo import PPOConfig, TrainState, make_train
-from dexsim_ppo.presets import find_preset
-from dexsim_ppo.rollout import Rollout, scan_restarting
-from dexsim_ppo.running_stats import update_stats
+from dexsim.core.compilation import jit
+from dexsim.env.env import Env
+from dexsim.geometry import rotations
+from dexsim.hand.kinematics import forward_kinematics, taxel_positions
+from dexsim.sensing.taxel_reading import measure_taxels
+from dexsim.touch import feel as tactile
+from dexsim.touch.reduce import reduce_touch
+from dexsim_ppo.learner import ppo
+from dexsim_ppo.learner.config import PPOConfig
+from dexsim_ppo.learner.distribution import log_prob, sample
+from dexsim_ppo.learner.ppo import TrainState, make_train
+from dexsim_ppo.learner.rollout import Rollout, scan_restarting
+from dexsim_ppo.learner.running_stats import update_stats
+from dexsim_ppo.training.presets import find_preset
 
 
 def split(task: str, backend: str, num_envs: int, repeats: int) -> list[dict]:
@@ -146,9 +150,9 @@ def touch(env: Env, ticks: Any, key: jax.Array) -> jax.Array:
             strength,
             config.skin,
         )
-        read = tactile.measure_taxels(felt.force, jnp.ones((hand.num_fingers, 1)), config.sensing.taxel, key)
+        read = measure_taxels(felt.force, jnp.ones((hand.num_fingers, 1)), config.sensing.taxel, key)
         weighting = config.observation.weighting
-        return [tactile.reduce_touch(force, taxels, weighting) for force in (felt.force, read)]
+        return [reduce_touch(force, taxels, weighting) for force in (felt.force, read)]
 
     def tick(key, given):
         target, _, _, _, qpos, strength = given

@@ -23,11 +23,13 @@ import jax.numpy as jnp
 import numpy as np
 import touch_accuracy as accuracy
 
-from dexsim import grid, sdf, surface_points, tactile
-from dexsim.grid import GridConfig
-from dexsim.hand import forward_kinematics, taxel_positions
-from dexsim.surface_points import PointsConfig
-from dexsim.tactile import Skin
+from dexsim.geometry import grid, sdf, surface_points
+from dexsim.geometry.grid import GridConfig
+from dexsim.geometry.surface_points import PointsConfig
+from dexsim.hand.kinematics import forward_kinematics, taxel_positions
+from dexsim.touch.feel import feel, feel_links, spread
+from dexsim.touch.reduce import reduce_touch, reduce_touch_links
+from dexsim.touch.skin import Skin, skin_stress
 
 SKIN = Skin()
 CLASSES = 8
@@ -103,16 +105,16 @@ def reader(case: Case, hand, kinematics: bool):
         thing = case.per_env(thing, index) if case.per_env else thing
         pose = forward_kinematics(hand, pose) if kinematics else pose
         if case.path == "links":
-            touch = tactile.feel_links(hand, pose, thing, shift, jnp.eye(3), total, SKIN)
-            return touch.force, *tactile.reduce_touch_links(touch.force, hand, pose)
+            touch = feel_links(hand, pose, thing, shift, jnp.eye(3), total, SKIN)
+            return touch.force, *reduce_touch_links(touch.force, hand, pose)
         taxels = taxel_positions(hand, pose)
         if case.path == "taxels":
-            touch = tactile.feel(taxels, jnp.asarray(hand.taxel_area), thing, shift, jnp.eye(3), total, SKIN)
-            return touch.force, *tactile.reduce_touch(touch.force, taxels)
+            touch = feel(taxels, jnp.asarray(hand.taxel_area), thing, shift, jnp.eye(3), total, SKIN)
+            return touch.force, *reduce_touch(touch.force, taxels)
         depth = jnp.maximum(SKIN.margin - brute_distance(taxels - shift, thing), 0.0)
-        skin_force = tactile.skin_stress(depth / SKIN.thickness, SKIN) * hand.taxel_area
-        force = tactile.spread(skin_force, total)
-        return force, *tactile.reduce_touch(force, taxels)
+        skin_force = skin_stress(depth / SKIN.thickness, SKIN) * hand.taxel_area
+        force = spread(skin_force, total)
+        return force, *reduce_touch(force, taxels)
 
     return read
 
@@ -278,7 +280,7 @@ def main() -> None:
         show("random grasps", accuracy.grasps(options.quick), file)
     if "cost" in options.tables:
         if options.kinematics:
-            from dexsim.hand import load_hand
+            from dexsim.hand.load import load_hand
 
             hand = load_hand()
         else:

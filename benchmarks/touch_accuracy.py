@@ -13,14 +13,17 @@ import jax.numpy as jnp
 import numpy as np
 import trimesh
 
-from dexsim import grid, mesh, sdf, surface_points, tactile
-from dexsim.assets import asset_path
-from dexsim.distance import signed_distance
-from dexsim.grid import GridConfig
-from dexsim.hand import HandPose
-from dexsim.layout import lattice, on_surface, read_layout
-from dexsim.surface_points import PointsConfig
-from dexsim.tactile import Skin
+from dexsim.core.assets import asset_path
+from dexsim.geometry import grid, mesh, sdf, surface_points
+from dexsim.geometry.distance import signed_distance
+from dexsim.geometry.grid import GridConfig
+from dexsim.geometry.surface_points import PointsConfig
+from dexsim.hand.kinematics import HandPose
+from dexsim.hand.layout import lattice, on_surface, read_layout
+from dexsim.touch import feel as tactile
+from dexsim.touch.feel import Touch, feel_links
+from dexsim.touch.reduce import reduce_touch, reduce_touch_links
+from dexsim.touch.skin import Skin
 
 SHAPES = {
     "sphere": (0.0275, 0, 0),
@@ -146,7 +149,7 @@ def pad(pitch: float, shift: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return taxels, np.broadcast_to(patch.area.astype(np.float32), taxels.shape[:2])
 
 
-def press(taxels, area, thing, position, skin, turn=None) -> tactile.Touch:
+def press(taxels, area, thing, position, skin, turn=None) -> Touch:
     """What lattices feel of an object above them."""
     force = np.ones(len(taxels), np.float32)
     turn = np.eye(3, dtype=np.float32) if turn is None else turn
@@ -175,7 +178,7 @@ def forces(quick: bool) -> list[dict]:
             ball = press(taxels, area, upright("sphere", radius), (0, 0, radius - depth), WINKLER)
             wanted = modulus * np.pi * depth**2 * (radius - 2 * depth / 3)
             error = np.asarray(ball.force.sum(1)) / wanted - 1
-            _, centre = tactile.reduce_touch(ball.force, taxels)
+            _, centre = reduce_touch(ball.force, taxels)
             off = 1e3 * np.linalg.norm(np.asarray(centre)[:, :2], axis=1)
             # 1.25 and 0.1 % allow for the 200 phases drawn here.
             rms = float(np.sqrt(np.mean(error**2)))
@@ -350,8 +353,8 @@ def grasps(quick: bool) -> list[dict]:
 
         def feel(thing, pose=pose):
             def one(pose):
-                touch = tactile.feel_links(hand, pose, thing, jnp.zeros(3), jnp.eye(3), jnp.ones(5), skin)
-                return touch.depth, *tactile.reduce_touch_links(touch.force, hand, pose)
+                touch = feel_links(hand, pose, thing, jnp.zeros(3), jnp.eye(3), jnp.ones(5), skin)
+                return touch.depth, *reduce_touch_links(touch.force, hand, pose)
 
             run = jax.jit(jax.vmap(one))
             found = [np.asarray(x) for x in run(pose)]

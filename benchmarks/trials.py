@@ -39,7 +39,7 @@ def start(words: list[str], **options: Any) -> subprocess.Popen:
 
 def twin_words(options: argparse.Namespace, number: int, folder: Path) -> list[str]:
     """The emulated hand with trial `number`; commands and shapes as in `zero_shot.py`."""
-    from dexsim_real.twin.shapes import SHAPES
+    from dexsim_real.twin.plant.shapes import SHAPES
 
     words = [
         "-m",

@@ -29,11 +29,11 @@ COMMANDS = (0.0, 0.25, 0.5, 0.75, 1.0)
 @functools.lru_cache(maxsize=2)
 def load(policy: str) -> tuple[Any, Any, Any]:
     """Hand, controller and calibration; once a process."""
-    from dexsim_real.control import Controller, prepare_jax
+    from dexsim_real.control.controller import Controller, prepare_jax
 
     prepare_jax()
     from dexsim import load_hand
-    from dexsim_ppo.evaluate import load_policy
+    from dexsim_ppo.policy import load_policy
     from dexsim_real.twin.virtual import ideal_calibration
 
     hand = load_hand()
@@ -44,8 +44,8 @@ def load(policy: str) -> tuple[Any, Any, Any]:
 
 def run_trial(options: dict[str, Any], seed: int, number: int) -> dict[str, Any]:
     """The referee's report of one trial."""
-    from dexsim_real.twin.plant import EmulatedHand
-    from dexsim_real.twin.shapes import SHAPES
+    from dexsim_real.twin.plant.plant import EmulatedHand
+    from dexsim_real.twin.plant.shapes import SHAPES
     from dexsim_real.twin.virtual import RunOptions, VirtualRun
 
     hand, controller, calibration = load(options["policy"])
@@ -99,8 +99,8 @@ def _shown(report: dict[str, Any], show: bool) -> dict[str, Any]:
 def grasp_metrics(reports: list[dict[str, Any]]) -> dict[str, Any]:
     """Held, and how the forces of held objects follow the command: with friction, and pressing alone, as the paper's
     hand and this one measure it."""
-    from dexsim.statistics import mean, proportion
-    from dexsim.tasks.grasp_report import pearson
+    from dexsim.core.statistics import mean, proportion
+    from dexsim.tasks.grasp.report import pearson
 
     held = np.array([r["held"] for r in reports])
     command, force, pressing, total = (
@@ -133,7 +133,7 @@ def grasp_metrics(reports: list[dict[str, Any]]) -> dict[str, Any]:
 
 def rotate_metrics(reports: list[dict[str, Any]]) -> dict[str, Any]:
     """The paper's three, with the count of the task's rule (spin) and of the paper's."""
-    from dexsim.statistics import mean, proportion
+    from dexsim.core.statistics import mean, proportion
 
     count, paper, lived = (
         np.array([r[name] for r in reports], float) for name in ("successes", "paper_successes", "seconds_to_fall")
@@ -151,8 +151,8 @@ def rotate_metrics(reports: list[dict[str, Any]]) -> dict[str, Any]:
 
 def simulated(task: str, policy: str) -> dict[str, Any]:
     """The same metrics of the policy's report in simulation; empty where there is none."""
-    from dexsim.assets import asset_path
-    from dexsim.errors import DexsimError
+    from dexsim.core.assets import asset_path
+    from dexsim.core.errors import DexsimError
 
     path = Path(policy).with_suffix(".json")
     try:

@@ -8,7 +8,7 @@ state = env.step(state, action)
 
 from typing import Any
 
-from dexsim.errors import AssetError, CheckpointError, ConfigError, DexsimError
+from dexsim.core.errors import AssetError, CheckpointError, ConfigError, DexsimError
 
 __version__ = "0.1.0"
 __all__ = ["AssetError", "CheckpointError", "ConfigError", "DexsimError", "load_hand", "make"]
@@ -22,7 +22,7 @@ def make(task: str, config: Any = None, **options: Any) -> Any:
 
 
 def load_hand(path: Any = None) -> Any:
-    """A hand from its TOML; see `dexsim.hand.load_hand`."""
-    from dexsim.hand import load_hand as load
+    """A hand from its TOML; see `dexsim.hand.load.load_hand`."""
+    from dexsim.hand.load import load_hand as load
 
     return load(path)

@@ -5,8 +5,8 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from dexsim.config import setting, validate
-from dexsim.hand import Hand
+from dexsim.core.config import setting, validate
+from dexsim.hand.kinematics import Hand
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -10,11 +10,12 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
-from dexsim import rotations, tactile
-from dexsim.config import setting, validate
-from dexsim.errors import ConfigError
-from dexsim.hand import Hand, HandPose, forward_kinematics
-from dexsim.pytree import pytree_dataclass
+from dexsim.core.config import setting, validate
+from dexsim.core.errors import ConfigError
+from dexsim.core.pytree import pytree_dataclass
+from dexsim.geometry import rotations
+from dexsim.hand.kinematics import Hand, HandPose, forward_kinematics
+from dexsim.touch.reduce import reduce_touch_links
 
 
 @pytree_dataclass
@@ -261,7 +262,7 @@ def observe(
       [sum of the layout's sizes] float32, not normalised.
     """
     pose = forward_kinematics(hand, readings.joint_position)
-    force, centre = tactile.reduce_touch_links(readings.taxel_force, hand, pose, config.weighting)
+    force, centre = reduce_touch_links(readings.taxel_force, hand, pose, config.weighting)
     features = Features(
         readings,
         pose.tip_position,

@@ -1,6 +1,7 @@
 """PPO in pure JAX: train an environment, save a policy, run it anywhere."""
 
-from dexsim_ppo.policy import Policy, act
-from dexsim_ppo.ppo import PPOConfig, TrainState, make_train
+from dexsim_ppo.learner.config import PPOConfig
+from dexsim_ppo.learner.ppo import TrainState, make_train
+from dexsim_ppo.policy import Policy, act, load_policy
 
-__all__ = ["PPOConfig", "Policy", "TrainState", "act", "make_train"]
+__all__ = ["PPOConfig", "Policy", "TrainState", "act", "load_policy", "make_train"]

@@ -26,8 +26,8 @@ import jax.numpy as jnp
 import msgpack
 import numpy as np
 
-from dexsim.errors import CheckpointError
-from dexsim.files import write_whole
+from dexsim.core.errors import CheckpointError
+from dexsim.core.files import write_whole
 
 Tree = TypeVar("Tree")
 

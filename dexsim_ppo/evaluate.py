@@ -20,14 +20,12 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from dexsim import statistics
-from dexsim.assets import asset_path
-from dexsim.config import from_dict, override
-from dexsim.errors import AssetError, CheckpointError, ConfigError
-from dexsim_ppo import cli
-from dexsim_ppo.compilation import collector_paused, jit
-from dexsim_ppo.policy import Policy, PolicyParams, act, layout_to_list
-from dexsim_ppo.types import Environment
+from dexsim.core import cli, statistics
+from dexsim.core.compilation import collector_paused, jit
+from dexsim.core.config import override
+from dexsim.core.errors import ConfigError
+from dexsim_ppo.learner.types import Environment
+from dexsim_ppo.policy import PolicyParams, act, load_policy, make_env
 
 
 class Evaluator:
@@ -159,36 +157,12 @@ def proportion(x: np.ndarray) -> dict[str, float]:
 
 def write_video(env: Environment, snapshots: Any, path: Path) -> Path:
     """Render an evaluation's snapshots; returns the file written, a GIF's where MP4 cannot be."""
-    from dexsim.render import render_episode
+    from dexsim.render.render import render_episode
 
     ticks = jax.tree.leaves(snapshots)[0].shape[0]
     # Eight pictures a second at least, or a gait cannot be followed.
     frames = max(400, round(8 * ticks * env.control_period))
     return Path(render_episode(env, snapshots, path, 1.0 / env.control_period, max_frames=frames))
-
-
-def load_policy(name: str, *, task: str | None = None) -> Policy:
-    """A policy from a file, or a shipped one by its name; of that task, if one is given."""
-    if Path(name).exists() or "/" in name or name.endswith(".msgpack"):
-        return Policy.load(name, task=task)
-    try:
-        return Policy.load(asset_path(f"policies/{name}.msgpack"), task=task)
-    except AssetError:
-        raise CheckpointError(f"{name}: no such file, and no shipped policy has that name") from None
-
-
-def make_env(policy: Policy, *, backend: str, num_envs: int) -> Environment:
-    """The environment that a policy was trained in."""
-    import dexsim
-
-    entry = cli.find_task(policy.task)
-    env = dexsim.make(policy.task, from_dict(entry.config_class, policy.env_config), backend=backend, num_envs=num_envs)
-    if layout_to_list(env.observation_layout["actor"]) != layout_to_list(policy.observation_layout):
-        raise CheckpointError(
-            f"the policy observes {layout_to_list(policy.observation_layout)}, and "
-            f"{env.name} gives {layout_to_list(env.observation_layout['actor'])}"
-        )
-    return env
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,13 +13,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dexsim.config import to_dict
-from dexsim.errors import CheckpointError, ConfigError
-from dexsim.pytree import pytree_dataclass, static
+from dexsim.core import cli
+from dexsim.core.assets import asset_path
+from dexsim.core.config import from_dict, to_dict
+from dexsim.core.errors import AssetError, CheckpointError, ConfigError
+from dexsim.core.pytree import pytree_dataclass, static
 from dexsim_ppo import checkpoint
-from dexsim_ppo.networks import MLP, Layer, apply_mlp
-from dexsim_ppo.running_stats import Normalizer, make_normalizer, normalize
-from dexsim_ppo.types import Environment, Field, Fields, layout_size
+from dexsim_ppo.learner.networks import MLP, Layer, apply_mlp
+from dexsim_ppo.learner.running_stats import Normalizer, make_normalizer, normalize
+from dexsim_ppo.learner.types import Environment, Field, Fields, layout_size
 
 
 @pytree_dataclass
@@ -47,7 +49,7 @@ class Policy:
 
     task: str
     env_config: dict[str, Any]
-    """The task's configuration, as `dexsim.config.to_dict` gives it."""
+    """The task's configuration, as `dexsim.core.config.to_dict` gives it."""
     observation_layout: tuple[Field, ...]
     """Fields of the actor's observation."""
     params: PolicyParams
@@ -164,3 +166,27 @@ class Policy:
 def layout_to_list(fields: Fields) -> list[list[Any]]:
     """Fields as plain lists, `[name, size, scale]`."""
     return [[field.name, field.size, field.scale] for field in fields]
+
+
+def load_policy(name: str, *, task: str | None = None) -> Policy:
+    """A policy from a file, or a shipped one by its name; of that task, if one is given."""
+    if Path(name).exists() or "/" in name or name.endswith(".msgpack"):
+        return Policy.load(name, task=task)
+    try:
+        return Policy.load(asset_path(f"policies/{name}.msgpack"), task=task)
+    except AssetError:
+        raise CheckpointError(f"{name}: no such file, and no shipped policy has that name") from None
+
+
+def make_env(policy: Policy, *, backend: str, num_envs: int) -> Environment:
+    """The environment that a policy was trained in."""
+    import dexsim
+
+    entry = cli.find_task(policy.task)
+    env = dexsim.make(policy.task, from_dict(entry.config_class, policy.env_config), backend=backend, num_envs=num_envs)
+    if layout_to_list(env.observation_layout["actor"]) != layout_to_list(policy.observation_layout):
+        raise CheckpointError(
+            f"the policy observes {layout_to_list(policy.observation_layout)}, and "
+            f"{env.name} gives {layout_to_list(env.observation_layout['actor'])}"
+        )
+    return env

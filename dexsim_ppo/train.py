@@ -21,17 +21,17 @@ from typing import Any
 
 import jax
 
-from dexsim.config import from_dict
-from dexsim.errors import ConfigError
-from dexsim.randomization import Curriculum
-from dexsim_ppo import checkpoint, cli
-from dexsim_ppo.evaluate import load_policy
-from dexsim_ppo.policy import Policy
-from dexsim_ppo.ppo_config import PPOConfig
-from dexsim_ppo.presets import Preset, find_preset
-from dexsim_ppo.runlog import RunFolder
-from dexsim_ppo.trainer import Run, TrainArguments, printable, training_config
-from dexsim_ppo.warm_start import check_fit, learner_settings
+from dexsim.core import cli
+from dexsim.core.config import from_dict
+from dexsim.core.errors import ConfigError
+from dexsim_ppo import checkpoint
+from dexsim_ppo.learner.config import PPOConfig
+from dexsim_ppo.learner.curriculum import Curriculum
+from dexsim_ppo.policy import Policy, load_policy
+from dexsim_ppo.training.presets import Preset, find_preset
+from dexsim_ppo.training.runlog import RunFolder
+from dexsim_ppo.training.trainer import Run, TrainArguments, printable, training_config
+from dexsim_ppo.training.warm_start import check_fit, learner_settings
 
 
 def main(argv: Sequence[str] | None = None) -> int:

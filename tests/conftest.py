@@ -25,7 +25,7 @@ os.environ.setdefault("MPLBACKEND", "agg")
 if not ON_GPU and "PYTEST_XDIST_WORKER" not in os.environ:
     # Each about halves the compilation of a physics step, which is most of what the suite does. XLA ends the
     # process over a flag that it does not know, and versions know different ones: a process that may end tries.
-    from dexsim.compilation import LIGHT
+    from dexsim.core.compilation import LIGHT
 
     for option, value in LIGHT:
         wanted = f"{os.environ.get('XLA_FLAGS', '')} --{option}={str(value).lower()}".strip()
@@ -89,7 +89,7 @@ class Rollout(NamedTuple):
 @pytest.fixture(scope="session")
 def hand() -> Any:
     """The XHand as shipped."""
-    from dexsim.hand import load_hand
+    from dexsim.hand.load import load_hand
 
     return load_hand()
 
@@ -98,7 +98,7 @@ def hand() -> Any:
 def grasp_env() -> Any:
     """The grasp task on the `jax` backend: the defaults, but for a small pool (16 of each shape)."""
     import dexsim
-    from dexsim.tasks.grasp import GraspConfig
+    from dexsim.tasks.grasp.config import GraspConfig
 
     return dexsim.make("grasp", GraspConfig(pool_size=80), backend="jax", num_envs=NUM_ENVS)
 
@@ -124,8 +124,9 @@ def physics_advance(hand: Any) -> Callable[..., Any]:
     """
     from c_scene import CONVERGED, GRAVITY
 
-    from dexsim.object_config import SLOTS, ObjectConfig
-    from dexsim.physics import Physics, PhysicsConfig
+    from dexsim.objects.config import SLOTS, ObjectConfig
+    from dexsim.physics.config import PhysicsConfig
+    from dexsim.physics.seam import Physics
 
     seam = Physics(
         hand,

@@ -2,12 +2,12 @@
 
 import base64
 import io
-from pathlib import Path
 
 import numpy as np
 import pytest
+from paths import ROOT
 
-NOTEBOOK = Path(__file__).resolve().parent.parent / "notebooks" / "quickstart.ipynb"
+NOTEBOOK = ROOT / "notebooks" / "quickstart.ipynb"
 
 
 @pytest.mark.slow

@@ -8,11 +8,11 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from paths import ROOT
 
-from dexsim.assets import asset_path
-from dexsim.errors import AssetError
+from dexsim.core.assets import asset_path
+from dexsim.core.errors import AssetError
 
-ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("dexsim", "dexsim_ppo", "dexsim_real")
 FORBIDDEN = ("optax", "flax", "orbax", "brax", "warp", "serial")
 

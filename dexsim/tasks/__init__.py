@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
-from dexsim.errors import ConfigError
+from dexsim.core.errors import ConfigError
 
 
 @dataclasses.dataclass(frozen=True)
@@ -18,19 +18,20 @@ class TaskEntry:
 
 
 def _tasks() -> dict[str, TaskEntry]:
-    from dexsim.tasks import rotate_config
-    from dexsim.tasks.grasp import Grasp, GraspConfig
-    from dexsim.tasks.rotate import Rotate
+    from dexsim.tasks.grasp.config import GraspConfig
+    from dexsim.tasks.grasp.task import Grasp
+    from dexsim.tasks.rotate.config import RotateConfig, clear_of_palm, paper, without_orientation
+    from dexsim.tasks.rotate.task import Rotate
 
     def rotation(config: Callable[[], Any]) -> TaskEntry:
-        return TaskEntry(rotate_config.RotateConfig, Rotate, config)
+        return TaskEntry(RotateConfig, Rotate, config)
 
     return {
         "grasp": TaskEntry(GraspConfig, Grasp, GraspConfig),
-        "rotate": rotation(rotate_config.RotateConfig),
-        "rotate_paper": rotation(rotate_config.paper),
-        "rotate_without_orientation": rotation(rotate_config.without_orientation),
-        "rotate_clear": rotation(rotate_config.clear_of_palm),
+        "rotate": rotation(RotateConfig),
+        "rotate_paper": rotation(paper),
+        "rotate_without_orientation": rotation(without_orientation),
+        "rotate_clear": rotation(clear_of_palm),
     }
 
 
@@ -53,8 +54,8 @@ def make(
     Raises:
       ConfigError: unknown task, or a config of another task.
     """
-    from dexsim.env import Env
-    from dexsim.hand import load_hand
+    from dexsim.env.env import Env
+    from dexsim.hand.load import load_hand
 
     if task not in TASKS:
         raise ConfigError(f"unknown task {task!r}: choose from {', '.join(sorted(TASKS))}")

@@ -17,14 +17,15 @@ from pathlib import Path
 
 import numpy as np
 
-from dexsim.hand import Hand, load_hand
-from dexsim_ppo import cli
-from dexsim_real.realtime import use_realtime
-from dexsim_real.trouble import HandError
+from dexsim.core import cli
+from dexsim.hand.kinematics import Hand
+from dexsim.hand.load import load_hand
+from dexsim_real.core.errors import HandError
+from dexsim_real.core.process import use_realtime
+from dexsim_real.sensors.camera import CameraConfig
 from dexsim_real.twin.loop import Twin
 from dexsim_real.twin.options import TwinArguments
 from dexsim_real.twin.types import Plant
-from dexsim_real.vision import CameraConfig
 
 
 def make_plant(arguments: TwinArguments, hand: Hand) -> Plant:
@@ -39,7 +40,7 @@ def make_plant(arguments: TwinArguments, hand: Hand) -> Plant:
             return getattr(importlib.import_module(module), function or "make_plant")(arguments)
         except (ImportError, AttributeError) as error:
             raise HandError(f"{arguments.plant}: {error}") from None
-    from dexsim_real.twin.plant import EmulatedHand
+    from dexsim_real.twin.plant.plant import EmulatedHand
 
     return EmulatedHand(
         hand,
@@ -60,9 +61,9 @@ def check_policy(name: str, task: str, hand: Hand) -> None:
     Raises:
       HandError: it is not.
     """
-    from dexsim_ppo.evaluate import load_policy
-    from dexsim_real.control import load_task
-    from dexsim_real.twin.plant import nominal_gravity
+    from dexsim_ppo.policy import load_policy
+    from dexsim_real.control.controller import load_task
+    from dexsim_real.twin.plant.plant import nominal_gravity
 
     policy = load_policy(name)
     if policy.task != task:
@@ -77,7 +78,7 @@ def check_policy(name: str, task: str, hand: Hand) -> None:
 
 def write_calibration(path: Path, hand: Hand) -> Path:
     """The calibration of an emulated hand whose motors are all nominal; each trial's own deviate from it."""
-    from dexsim.calibration import save_calibration
+    from dexsim.calibration.maps import save_calibration
     from dexsim_real.twin.virtual import ideal_calibration
 
     save_calibration(path, ideal_calibration(hand))

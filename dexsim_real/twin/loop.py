@@ -11,16 +11,16 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from dexsim.config import to_dict
-from dexsim.hand import Hand
-from dexsim_real.twin.check import CommandCheck
-from dexsim_real.twin.faults import Injector
-from dexsim_real.twin.firmware import Firmware
-from dexsim_real.twin.line import HandLine
-from dexsim_real.twin.object_side import ImuSide, MaskSide
+from dexsim.core.config import to_dict
+from dexsim.hand.kinematics import Hand
 from dexsim_real.twin.options import TwinArguments
-from dexsim_real.twin.terminal import Terminal
 from dexsim_real.twin.types import Plant
+from dexsim_real.twin.wire.check import CommandCheck
+from dexsim_real.twin.wire.faults import Injector
+from dexsim_real.twin.wire.firmware import Firmware
+from dexsim_real.twin.wire.line import HandLine
+from dexsim_real.twin.wire.object_side import ImuSide, MaskSide
+from dexsim_real.twin.wire.terminal import Terminal
 
 _EVENTS = 20_000  # kept for the report
 

@@ -3,14 +3,14 @@
 import dataclasses
 from pathlib import Path
 
-from dexsim.config import setting, validate
-from dexsim_real.twin.check import LimitsConfig
-from dexsim_real.twin.draw import KINDS, TASKS
-from dexsim_real.twin.faults import FaultConfig
-from dexsim_real.twin.firmware import FirmwareConfig
-from dexsim_real.twin.line import LineConfig
-from dexsim_real.twin.object_side import ObjectConfig
-from dexsim_real.twin.shapes import SHAPES
+from dexsim.core.config import setting, validate
+from dexsim_real.twin.plant.draw import KINDS, TASKS
+from dexsim_real.twin.plant.shapes import SHAPES
+from dexsim_real.twin.wire.check import LimitsConfig
+from dexsim_real.twin.wire.faults import FaultConfig
+from dexsim_real.twin.wire.firmware import FirmwareConfig
+from dexsim_real.twin.wire.line import LineConfig
+from dexsim_real.twin.wire.object_side import ObjectConfig
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -1,6 +1,6 @@
 """What the emulated hand's physics and its wire agree on.
 
-`Plant` is the world: joints, motors, skin and object, in C MuJoCo. The wire (`dexsim_real.twin.line`) turns
+`Plant` is the world: joints, motors, skin and object, in C MuJoCo. The wire (`dexsim_real.twin.wire.line`) turns
 bytes into calls of it, at the pace of the wall clock, and knows nothing of physics.
 """
 
@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from dexsim_real.twin.shapes import Shape
+from dexsim_real.twin.plant.shapes import Shape
 
 
 @dataclasses.dataclass(frozen=True)

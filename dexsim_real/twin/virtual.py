@@ -1,6 +1,6 @@
 """A run on the emulated hand in virtual time: the bridge's own parts, in one process and without a clock.
 
-What `dexsim_real.session` does with threads and a serial port happens here event by event: exchanges at 83 Hz that
+What `dexsim_real.run.session` does with threads and a serial port happens here event by event: exchanges at 83 Hz that
 take 9.6 ms, the policy at its own rate on the newest state, an IMU and a camera at theirs. Every exchange goes through
 the bytes of both frames and the emulated palm board, so counts, rounding and delays are the wire's.
 """
@@ -12,21 +12,23 @@ from typing import Any
 
 import numpy as np
 
-from dexsim.calibration import Calibration, Side
-from dexsim.hand import Hand
-from dexsim_real import frames
-from dexsim_real.control import IDENTITY, Controller, TurnGoals
-from dexsim_real.frames import Command, Frame, Mode, Parser
-from dexsim_real.imu import BAUD, UPRIGHT_X, RvcParser, align, conjugate, encode, multiply
-from dexsim_real.safety import Safety, SafetyConfig, Sample
-from dexsim_real.sensing import HandSensing, HardwareConfig, ObjectEstimate, VelocityFilter
-from dexsim_real.twin.assistant import POSTURES
-from dexsim_real.twin.firmware import Firmware, FirmwareConfig
-from dexsim_real.twin.motors import STALL_CURRENT
-from dexsim_real.twin.object_side import ObjectConfig, outline, silhouette
-from dexsim_real.twin.plant import EmulatedHand
-from dexsim_real.twin.shapes import matrix, turn
-from dexsim_real.vision import HeightSensor
+from dexsim.calibration.maps import Calibration, Side
+from dexsim.hand.kinematics import Hand
+from dexsim_real.control.controller import IDENTITY, Controller
+from dexsim_real.control.goals import TurnGoals
+from dexsim_real.control.safety import Safety, SafetyConfig, Sample
+from dexsim_real.sensors.camera import HeightSensor
+from dexsim_real.sensors.hand import HandSensing, HardwareConfig, VelocityFilter
+from dexsim_real.sensors.imu import BAUD, UPRIGHT_X, RvcParser, align, conjugate, encode, multiply
+from dexsim_real.sensors.readings import ObjectEstimate
+from dexsim_real.twin.plant.assistant import POSTURES
+from dexsim_real.twin.plant.motors import STALL_CURRENT
+from dexsim_real.twin.plant.plant import EmulatedHand
+from dexsim_real.twin.plant.shapes import matrix, turn
+from dexsim_real.twin.wire.firmware import Firmware, FirmwareConfig
+from dexsim_real.twin.wire.object_side import ObjectConfig, outline, silhouette
+from dexsim_real.wire import frames
+from dexsim_real.wire.frames import Command, Frame, Mode, Parser
 
 RATE = 83.0  # exchanges a second
 REQUEST, ROUND_TRIP = 0.001, 0.0096  # s from the host to the board; until the answer is there

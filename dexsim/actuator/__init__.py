@@ -1,0 +1,1 @@
+"""One joint's drive: torque, gear play, motor current."""

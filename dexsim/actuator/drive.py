@@ -1,0 +1,107 @@
+"""The joint drive: PD law, backlash dead-band, torque-speed envelope, efficiency, latency.
+
+The four equations of the paper (section Actuator Model Randomization), evaluated at every
+physics sub-step, and beside them what the paper's text names and leaves out: torque ripple, an
+encoder that is off, friction in the gear. Every parameter is a pytree leaf, so it can be drawn
+per joint and per episode, differentiated and fitted. `dexsim.actuator.gear_play` has the other model of
+gear play, with its own state.
+"""
+
+import jax
+import jax.numpy as jnp
+
+from dexsim.core.pytree import pytree_dataclass
+
+
+@pytree_dataclass
+class Actuator:
+    """Parameters of one joint's drive (scalars) or of all of them ([J]).
+
+    Those that may be None are not modelled then; 0 gives the same numbers, bit for bit.
+    """
+
+    stiffness: jax.Array  # k_p, Nm/rad
+    damping: jax.Array  # k_d, Nm s/rad
+    dead_band: jax.Array  # epsilon, rad
+    stall_torque: jax.Array  # tau_0, Nm
+    no_load_speed: jax.Array  # qd_max, rad/s
+    efficiency: jax.Array  # eta, 1
+    ripple: jax.Array | None = None  # r, share of the torque
+    ripple_count: jax.Array | None = None  # n, ripples per radian of the joint
+    ripple_phase: jax.Array | None = None  # rad
+    encoder_bias: jax.Array | None = None  # rad, measured minus true angle, inside the loop too
+    coulomb_friction: jax.Array | None = None  # c, Nm
+    viscous_friction: jax.Array | None = None  # b, Nm s/rad
+
+
+def pd_torque(
+    actuator: Actuator, target: jax.Array, target_velocity: jax.Array, position: jax.Array, velocity: jax.Array
+) -> jax.Array:
+    """tau_c = k_p (q_ref - q) + k_d (qd_ref - qd), Nm."""
+    return actuator.stiffness * (target - position) + actuator.damping * (target_velocity - velocity)
+
+
+def dead_band(actuator: Actuator, torque: jax.Array, target: jax.Array, position: jax.Array) -> jax.Array:
+    """tau_b = 0 where |q_ref - q| < epsilon, else tau_c."""
+    return jnp.where(jnp.abs(target - position) < actuator.dead_band, 0.0, torque)
+
+
+def torque_limit(actuator: Actuator, velocity: jax.Array) -> jax.Array:
+    """tau_sat = tau_0 (1 - |qd| / qd_max), not below zero beyond the no-load speed, Nm."""
+    return actuator.stall_torque * jnp.maximum(1.0 - jnp.abs(velocity) / actuator.no_load_speed, 0.0)
+
+
+def joint_torque(
+    actuator: Actuator, target: jax.Array, target_velocity: jax.Array, position: jax.Array, velocity: jax.Array
+) -> jax.Array:
+    """Torque of one joint's motor, Nm: eta clip(tau_b, -tau_sat, tau_sat) (1 + r sin(n q + phase)).
+
+    The PD law and the dead-band see the measured angle, position + encoder bias. This is the
+    torque that the motor's current tells of; `apply_friction` takes off what the gear keeps.
+
+    Args: scalars, or arrays that broadcast; `drive` is this, vmapped over the joints.
+    """
+    measured = position if actuator.encoder_bias is None else position + actuator.encoder_bias
+    torque = pd_torque(actuator, target, target_velocity, measured, velocity)
+    torque = dead_band(actuator, torque, target, measured)
+    limit = torque_limit(actuator, velocity)
+    torque = actuator.efficiency * jnp.clip(torque, -limit, limit)
+    if actuator.ripple is None:
+        return torque
+    angle = actuator.ripple_count * position + actuator.ripple_phase
+    return torque * (1.0 + actuator.ripple * jnp.sin(angle))
+
+
+drive = jax.vmap(joint_torque)
+"""`joint_torque` over joints: an `Actuator` of [J] leaves and arrays [J] to torques [J] Nm."""
+
+
+def apply_friction(actuator: Actuator, torque: jax.Array, velocity: jax.Array, inertia_rate: jax.Array) -> jax.Array:
+    """What Coulomb and viscous friction leave of a torque, Nm: one backward Euler step.
+
+    The joint alone, without contacts, would end the sub-step at the momentum rate
+    p = I qd / dt + tau. Coulomb friction takes up to c of it, so it stops the joint and then
+    holds it, and cannot turn it round; viscous friction shrinks the rest by 1 / (1 + b dt / I).
+    Stable for any friction. A load that is not in `torque` (contact, gravity) is not held but
+    creeps at load dt / I.
+
+    Args:
+      torque: Nm, of the drive.
+      velocity: rad/s, before the sub-step.
+      inertia_rate: Nm s/rad, the joint's inertia over the sub-step, I / dt.
+    """
+    if actuator.coulomb_friction is None and actuator.viscous_friction is None:
+        return torque
+    rate = inertia_rate * velocity + torque
+    coulomb = 0.0 if actuator.coulomb_friction is None else actuator.coulomb_friction
+    viscous = 0.0 if actuator.viscous_friction is None else actuator.viscous_friction
+    held = jnp.clip(rate, -coulomb, coulomb)
+    return torque - held - (rate - held) * (viscous / (inertia_rate + viscous))
+
+
+def delayed_target(substep: jax.Array, latency: jax.Array, previous: jax.Array, target: jax.Array) -> jax.Array:
+    """The target [J] that acts at a sub-step: the previous one for the first `latency` of them.
+
+    `latency` [] or [J]; one control tick at most is modelled.
+    """
+    return jnp.where(substep < latency, previous, target)

@@ -1,0 +1,1 @@
+"""Motor current to joint torque, taxel counts to newtons."""

@@ -1,0 +1,291 @@
+"""From motor current to the joint torque of the simulation, without torque sensors.
+
+Each fingertip is pressed with a varying force, on the hand and in simulation. Both relations are
+lines, current = g_real F + o_real and torque = g_sim F + o_sim, so the force drops out:
+
+    torque = g_sim (current - o_real) / g_real + o_sim
+
+(paper, section Current-torque Calibration). The paper aligns the two by their maxima; that is the
+same line when both sessions end at the same force, and `alignment` says how far they are apart.
+`dexsim.calibration.fit` makes a `Calibration` from recordings; this module keeps and applies it.
+
+Shapes: J joints, F fingers, N taxels a finger; a leading 2 is (loading, unloading).
+"""
+
+import math
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dexsim.core.errors import CalibrationError
+from dexsim.core.files import write_whole
+from dexsim.core.pytree import pytree_dataclass, static
+from dexsim.hand.kinematics import Hand
+
+FORMAT = "dexsim calibration"
+VERSION = 1
+
+
+@pytree_dataclass
+class Side:
+    """Lines value = gain force + offset of all joints: of the hand (value A) or of the
+    simulation (value Nm). Intervals are of 95 %."""
+
+    gain: jax.Array  # [2, J] value/N
+    gain_low: jax.Array  # [2, J]
+    gain_high: jax.Array  # [2, J]
+    offset: jax.Array  # [2, J] value
+    offset_low: jax.Array  # [2, J]
+    offset_high: jax.Array  # [2, J]
+    noise: jax.Array  # [2, J] value, robust standard deviation about the line
+    r_squared: jax.Array  # [2, J]
+    condition: jax.Array  # [2, J]
+    samples: jax.Array  # [2, J]; 0 where the line was not measured but taken over
+    outliers: jax.Array  # [2, J]
+    friction: jax.Array  # [J] value, half the gap between the two lines; NaN where one is missing
+    value_max: jax.Array  # [J] largest |value| recorded
+    force_max: jax.Array  # [J] N, largest force recorded
+
+    def middle(self) -> tuple[jax.Array, jax.Array]:
+        """Gain [J] and offset [J] of the line half way between loading and unloading."""
+        return jnp.mean(self.gain, 0), jnp.mean(self.offset, 0)
+
+
+@pytree_dataclass
+class Calibration:
+    """One hand's current-to-torque and count-to-newton maps. A pytree of NumPy arrays."""
+
+    real: Side  # A against N
+    sim: Side  # Nm against N
+    torque_scale: jax.Array  # [J] Nm that read as 1: the hand's torque limits, as in `Env`
+    force_per_count: jax.Array  # [F] N
+    hand: str = static()
+    joint_names: tuple[str, ...] = static()
+    finger_names: tuple[str, ...] = static()
+    current_per_count: float = static(default=0.001)  # A; the XHand reports mA
+    serial: str = static(default="")
+    created: str = static(default="")
+    notes: tuple[str, ...] = static(default=())
+
+
+# --- run time -------------------------------------------------------------------------------
+
+
+def current_from_counts(calibration: Calibration, counts: jax.Array) -> jax.Array:
+    """Currents [J] A from what the hand reports [J] counts."""
+    return jnp.asarray(counts) * calibration.current_per_count
+
+
+def joint_torque(calibration: Calibration, current: jax.Array, direction: jax.Array | float = 0.0) -> jax.Array:
+    """Joint torques [..., J] Nm, in the simulation's sense, from motor currents [..., J] A.
+
+    Args:
+      calibration: closed over or passed through jit.
+      current: A, with the hand's own sign.
+      direction: [..., J] or scalar: 1 where the joint is known to press on (loading line), -1
+        where it yields (unloading line), 0 where unknown: the line half way between, wrong by at
+        most the friction band `calibration.real.friction`.
+    """
+    real = calibration.real
+    middle_gain, middle_offset = real.middle()
+
+    def pick(lines: jax.Array, middle: jax.Array) -> jax.Array:
+        loading, unloading = jnp.asarray(lines)[0], jnp.asarray(lines)[1]
+        return jnp.where(direction > 0, loading, jnp.where(direction < 0, unloading, middle))
+
+    force = (current - pick(real.offset, middle_offset)) / pick(real.gain, middle_gain)
+    gain, offset = calibration.sim.middle()
+    return gain * force + offset
+
+
+def normalised_torque(calibration: Calibration, current: jax.Array, direction: jax.Array | float = 0.0) -> jax.Array:
+    """`joint_torque` over the joints' torque limits: `Readings.joint_torque`. Not clipped."""
+    return joint_torque(calibration, current, direction) / jnp.asarray(calibration.torque_scale)
+
+
+def taxel_force(calibration: Calibration, counts: jax.Array) -> jax.Array:
+    """Taxel forces [..., F, N] N from counts [..., F, N] after taring; negative ones read 0."""
+    scale = jnp.asarray(calibration.force_per_count)[..., None]
+    return jnp.maximum(jnp.asarray(counts) * scale, 0.0)
+
+
+def normalise(side: Side, joint: int, force: np.ndarray, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Force and |value| of one joint's recording over their maxima: the paper's [0, 1] axes."""
+    return (
+        np.asarray(force) / float(side.force_max[joint]),
+        np.asarray(value) * np.sign(float(side.gain[0, joint])) / float(side.value_max[joint]),
+    )
+
+
+def alignment(calibration: Calibration) -> np.ndarray:
+    """Slope [J] of the hand's normalised line over that of the simulation's.
+
+    1 where aligning by the maxima, as in the paper, gives the same torque as the lines do.
+    """
+    slopes = [
+        np.abs(np.mean(side.gain, 0)) * side.force_max / side.value_max for side in (calibration.real, calibration.sim)
+    ]
+    return np.asarray(slopes[0] / slopes[1])
+
+
+# --- file -----------------------------------------------------------------------------------
+
+_PAIRS = (
+    "gain",
+    "gain_low",
+    "gain_high",
+    "offset",
+    "offset_low",
+    "offset_high",
+    "noise",
+    "r_squared",
+    "condition",
+    "samples",
+    "outliers",
+)
+_SINGLES = ("friction", "value_max", "force_max")
+
+
+def save_calibration(path: str | Path, calibration: Calibration) -> None:
+    """Write a calibration as TOML; a crash leaves the old file or the new one, never half of it."""
+    path = Path(path)
+    lines = [
+        f"format = {_text(FORMAT)}",
+        f"version = {VERSION}",
+        f"hand = {_text(calibration.hand)}",
+        f"serial = {_text(calibration.serial)}",
+        f"created = {_text(calibration.created)}",
+        f"current_per_count = {_number(calibration.current_per_count)}  # A",
+        f"finger_names = [{', '.join(map(_text, calibration.finger_names))}]",
+        f"force_per_count = {_list(calibration.force_per_count)}  # N",
+        "notes = [",
+    ]
+    lines += [f"  {_text(note)}," for note in calibration.notes] + ["]", ""]
+    lines += [
+        "# Lines value = gain * force + offset; pairs are [loading, unloading].",
+        "# real: value in A. sim: value in Nm. Force in N. Intervals are of 95 %.",
+        "",
+    ]
+    for joint, name in enumerate(calibration.joint_names):
+        lines += [
+            "[[joint]]",
+            f"name = {_text(name)}",
+            f"torque_scale = {_number(calibration.torque_scale[joint])}  # Nm",
+        ]
+        for key in ("real", "sim"):
+            side = getattr(calibration, key)
+            lines.append(f"[joint.{key}]")
+            lines += [f"{field} = {_list(getattr(side, field)[:, joint])}" for field in _PAIRS]
+            lines += [f"{field} = {_number(getattr(side, field)[joint])}" for field in _SINGLES]
+        lines.append("")
+    lines += ["[end]", "complete = true", ""]
+    try:
+        write_whole(path, ["\n".join(lines).encode()])
+    except OSError as error:
+        raise CalibrationError(f"{path}: cannot be written ({error.strerror})") from None
+
+
+def load_calibration(path: str | Path, hand: Hand | None = None) -> Calibration:
+    """Read a calibration.
+
+    Args:
+      path: written by `save_calibration`.
+      hand: if given, the hand that it must belong to.
+
+    Raises:
+      CalibrationError: missing, cut, not a calibration, of a newer version or of another hand.
+    """
+    path = Path(path)
+    table = _read(path)
+    names = tuple(_field(path, entry, "name", str) for entry in table["joint"])
+    if hand is not None and (table["hand"], names) != (hand.name, hand.joint_names):
+        raise CalibrationError(
+            f"{path}: is of hand {table['hand']!r} with {len(names)} joints, not of {hand.name!r}: calibrate this hand"
+        )
+    sides = [_side(path, table["joint"], key) for key in ("real", "sim")]
+    fingers = tuple(_field(path, table, "finger_names", list))
+    per_count = np.array(_numbers(path, table, "force_per_count", len(fingers)))
+    scale = np.array([_numbers(path, entry, "torque_scale")[0] for entry in table["joint"]])
+    if not (np.all(scale > 0) and np.all(per_count > 0)):
+        raise CalibrationError(f"{path}: torque_scale and force_per_count must be above 0")
+    return Calibration(
+        *sides,
+        scale,
+        per_count,
+        hand=table["hand"],
+        joint_names=names,
+        finger_names=fingers,
+        current_per_count=_numbers(path, table, "current_per_count")[0],
+        serial=_field(path, table, "serial", str),
+        created=_field(path, table, "created", str),
+        notes=tuple(_field(path, table, "notes", list)),
+    )
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise CalibrationError(f"{path}: cannot be read ({error.strerror})") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise CalibrationError(f"{path}: damaged or cut off ({error})") from None
+    if table.get("format") != FORMAT:
+        raise CalibrationError(f"{path}: not a calibration file")
+    version = _field(path, table, "version", int)
+    if version > VERSION:
+        raise CalibrationError(f"{path}: is of version {version}, this library reads up to {VERSION}: upgrade dexsim")
+    if table.get("end") != {"complete": True} or not table.get("joint"):
+        raise CalibrationError(f"{path}: cut off: its end is missing")
+    _field(path, table, "hand", str)
+    return table
+
+
+def _side(path: Path, joints: list[dict], key: str) -> Side:
+    columns = []
+    for entry in joints:
+        lines = _field(path, entry, key, dict)
+        columns.append(
+            [_numbers(path, lines, name, 2) for name in _PAIRS] + [_numbers(path, lines, name) for name in _SINGLES]
+        )
+    pairs = {name: np.array([column[i] for column in columns]).T for i, name in enumerate(_PAIRS)}
+    singles = {name: np.array([column[len(_PAIRS) + i][0] for column in columns]) for i, name in enumerate(_SINGLES)}
+    side = Side(**pairs, **singles)
+    for name in ("gain", "offset", "value_max", "force_max"):
+        if not np.all(np.isfinite(getattr(side, name))):
+            raise CalibrationError(f"{path}: {key}.{name} must be finite numbers")
+    if np.any(side.gain == 0):
+        raise CalibrationError(f"{path}: {key}.gain is 0: torque would not follow")
+    return side
+
+
+def _field(path: Path, table: dict, name: str, kind: type) -> Any:
+    value = table.get(name)
+    if not isinstance(value, kind):
+        raise CalibrationError(f"{path}: field {name!r} is missing or not a {kind.__name__}")
+    return value
+
+
+def _numbers(path: Path, table: dict, name: str, count: int = 1) -> list[float]:
+    value = table.get(name)
+    values = value if isinstance(value, list) else [value]
+    if len(values) != count or not all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in values):
+        raise CalibrationError(f"{path}: field {name!r} must hold {count} number(s)")
+    return [float(v) for v in values]
+
+
+def _text(value: str) -> str:
+    escaped = value.replace("\\", "\\\\").replace('"', '\\"').replace("\n", " ")
+    return f'"{escaped}"'
+
+
+def _number(value: float) -> str:
+    value = float(value)
+    return "nan" if math.isnan(value) else repr(value)
+
+
+def _list(values: Any) -> str:
+    return f"[{', '.join(_number(v) for v in np.asarray(values))}]"

@@ -1,0 +1,44 @@
+"""A virtual press: what a recording of one fingertip against something firm looks like."""
+
+import jax
+import numpy as np
+
+from dexsim.actuator.current import Motor, motor_current, read_current
+from dexsim.calibration.fit import Press
+
+
+def press(
+    motor: Motor,
+    key: jax.Array,
+    *,
+    lever: float,
+    peak: float = 8.0,
+    cycles: int = 3,
+    samples: int = 600,
+    travel: float = 0.05,
+    force_noise: float = 0.0,
+    force_resolution: float = 0.0,
+    force_limit: float = np.inf,
+) -> Press:
+    """Press one joint's fingertip slowly, up and down: what a recording of the hand looks like.
+
+    Args:
+      motor: scalars.
+      key: of the noise.
+      lever: m, joint torque per fingertip force; negative where the joint presses by turning back.
+      peak: N, largest force of the triangle wave.
+      cycles, samples: presses in the recording, samples in all.
+      travel: rad that the joint yields from no force to the peak (the ripple passes by).
+      force_noise, force_resolution, force_limit: N, of the tactile reading.
+    """
+    phase = np.arange(samples) / samples * cycles % 1.0
+    share = 1.0 - np.abs(2.0 * phase - 1.0)
+    force, way = peak * share, np.where(phase < 0.5, 1.0, -1.0)
+    current_key, force_key = jax.random.split(key)
+    current = read_current(
+        current_key, motor, motor_current(motor, lever * force, way * np.sign(lever), travel * share * np.sign(lever))
+    )
+    reading = force + force_noise * np.asarray(jax.random.normal(force_key, force.shape))
+    if force_resolution > 0:
+        reading = np.round(reading / force_resolution) * force_resolution
+    return Press(np.clip(reading, 0.0, force_limit), np.asarray(current, float))

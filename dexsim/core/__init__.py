@@ -1,0 +1,1 @@
+"""Foundations that know nothing of hands: configuration, files, errors, pytrees, compilation, statistics."""

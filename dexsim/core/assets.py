@@ -1,0 +1,48 @@
+"""Finds the files of `assets/`, beside the packages in a checkout, in `dexsim` when installed; and
+the folder for what is kept between runs."""
+
+import os
+from pathlib import Path
+
+from dexsim.core.errors import AssetError
+
+_PACKAGE = Path(__file__).resolve().parents[1]
+
+
+def assets_root() -> Path:
+    """The folder that holds `hand/`, `policies/` and the other assets.
+
+    Raises:
+      AssetError: neither a checkout nor an installed copy with assets.
+    """
+    for root in (_PACKAGE / "_assets", _PACKAGE.parent / "assets"):
+        if root.is_dir():
+            return root.resolve()
+    raise AssetError(f"no assets found in {_PACKAGE / '_assets'} or {_PACKAGE.parent / 'assets'}: install dexsim again")
+
+
+def asset_path(name: str) -> Path:
+    """Absolute path of an asset, from its name relative to `assets/`.
+
+    Args:
+      name: such as `"hand/xhand_right.xml"`; folders are allowed.
+
+    Raises:
+      AssetError: the name leads outside of `assets/`, or there is no such file.
+    """
+    root = assets_root()
+    path = (root / name).resolve()
+    if not path.is_relative_to(root):
+        raise AssetError(f"asset {name!r} lies outside of {root}")
+    if not path.exists():
+        raise AssetError(f"no asset {name!r} in {root}")
+    return path
+
+
+def cache_path(name: str) -> Path:
+    """Where `name` (a kind of file) is kept between runs: in `$DEXSIM_CACHE`, else `~/.cache/dexsim`.
+
+    Everything there can be deleted at any time; it is made again. The folder may not exist yet.
+    """
+    root = os.environ.get("DEXSIM_CACHE")
+    return (Path(root) if root else Path.home() / ".cache" / "dexsim") / name

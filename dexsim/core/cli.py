@@ -1,0 +1,137 @@
+"""What the two commands share: options from dataclasses, one-line errors, compilation caches."""
+
+import contextlib
+import importlib.metadata
+import io
+import json
+import math
+import os
+import platform
+import re
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+from dexsim.core.assets import cache_path
+from dexsim.core.errors import DexsimError
+from dexsim.core.files import write_whole
+
+T = TypeVar("T")
+
+
+class UsageError(DexsimError):
+    """An option is unknown or has a value of the wrong type."""
+
+
+def run(main: Callable[[Sequence[str] | None], int]) -> None:
+    """Run a command and exit: 2 and one line on standard error for whatever the user can mend."""
+    try:
+        code = main(None)
+    except DexsimError as error:
+        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        code = 2
+    except OSError as error:  # A file, a folder or a disk.
+        where = f"{error.filename}: " if error.filename else ""
+        print(f"error: {where}{error.strerror or error}", file=sys.stderr)
+        code = 2
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        code = 130
+    sys.exit(code)
+
+
+def parse(cls: type[T], argv: Sequence[str], *, prog: str, description: str, default: T | None = None) -> T:
+    """Options of a dataclass, through tyro; its boxed messages become one line.
+
+    Raises:
+      UsageError: an unknown option or a value that does not parse.
+    """
+    import tyro
+
+    stderr = io.StringIO()
+    kwargs: dict[str, Any] = {} if default is None else {"default": default}
+    try:
+        with contextlib.redirect_stderr(stderr):
+            return tyro.cli(cls, args=list(argv), prog=prog, description=description, **kwargs)
+    except SystemExit as stop:
+        if not stop.code:
+            raise
+        raise UsageError(_one_line(stderr.getvalue())) from None
+
+
+def _one_line(box: str) -> str:
+    """The message of tyro's box, and the option it thinks was meant.
+
+    The box has a title, then the message and hints between rules; drawn in plain ASCII where the output
+    is not UTF-8, with the title as a part of its own.
+    """
+    lines = [re.sub(r"[│|╭╮╰╯]", " ", line).strip() for line in box.splitlines() if "╭" not in line]
+    parts = re.split(r"\n[-─]{4,}\n", "\n".join(lines).strip())
+    message = parts[0] if "╭" in box else parts[min(1, len(parts) - 1)]
+    meant = re.search(r"Perhaps you meant:?\s+(--[\w.-]+)", "\n".join(lines))
+    return " ".join(message.split()).rstrip(".") + (f" (perhaps {meant[1]})" if meant else "") + "; see --help"
+
+
+def enable_caches() -> None:
+    """Keep compiled programs between runs, in `$DEXSIM_CACHE` or else `~/.cache/dexsim`."""
+    import jax
+
+    path = os.environ.get("JAX_COMPILATION_CACHE_DIR") or cache_path("xla")
+    jax.config.update("jax_compilation_cache_dir", str(path))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    os.environ.setdefault("WARP_CACHE_PATH", str(cache_path("warp")))
+
+
+def environment_report() -> dict[str, Any]:
+    """Hardware and library versions, for reports."""
+    import jax
+
+    versions = {"python": platform.python_version()}
+    for name in ("dexsim", "jax", "jaxlib", "mujoco", "mujoco-mjx", "warp-lang", "numpy"):
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            versions[name] = importlib.metadata.version(name)
+    devices = jax.devices()
+    return {
+        "versions": versions,
+        "hardware": {
+            "platform": devices[0].platform,
+            "device": devices[0].device_kind,
+            "devices": len(devices),
+            "cpu_cores": os.cpu_count(),
+            "machine": platform.machine(),
+        },
+    }
+
+
+def write_json(path: Path, data: Any) -> None:
+    """Write JSON, whole or not at all; numbers that are not finite become null."""
+    write_whole(path, [(json.dumps(plain(data), indent=1) + "\n").encode()])
+
+
+def plain(value: Any) -> Any:
+    """Nested data as JSON has it: numbers of NumPy as Python's, NaN and infinities as None."""
+    if isinstance(value, dict):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(v) for v in value]
+    if hasattr(value, "tolist"):
+        return plain(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def find_task(name: str) -> Any:
+    """The task's entry, with `config_class`.
+
+    Raises:
+      ConfigError: there is no such task; names those that exist.
+    """
+    import dexsim.tasks
+    from dexsim.core.errors import ConfigError
+
+    if name not in dexsim.tasks.TASKS:
+        raise ConfigError(f"unknown task {name!r}: choose from {', '.join(dexsim.tasks.TASKS)}")
+    return dexsim.tasks.TASKS[name]

@@ -1,0 +1,164 @@
+"""Configuration: frozen dataclasses with a unit and a range on each number.
+
+The same dataclasses are the command line (tyro), the checkpoint header and the documentation.
+"""
+
+import dataclasses
+import json
+import math
+import types
+import typing
+from collections.abc import Iterable
+from typing import Any, TypeVar
+
+from dexsim.core.errors import ConfigError
+
+T = TypeVar("T")
+
+
+def setting(
+    default: Any,
+    *,
+    unit: str = "",
+    low: float | None = None,
+    high: float | None = None,
+    choices: tuple[str, ...] | None = None,
+) -> Any:
+    """A configuration field with its unit and allowed range, checked by `validate`.
+
+    Numbers inside a tuple are each held to the range.
+    """
+    metadata = {"unit": unit, "low": low, "high": high, "choices": choices}
+    if dataclasses.is_dataclass(default) or isinstance(default, (list, dict)):
+        return dataclasses.field(default_factory=lambda: default, metadata=metadata)
+    return dataclasses.field(default=default, metadata=metadata)
+
+
+def validate(config: Any) -> None:
+    """Check every field of a config dataclass against its metadata; call from `__post_init__`.
+
+    Raises:
+      ConfigError: names the class, the field, the value, the unit and the range.
+    """
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        where = f"{type(config).__name__}.{field.name}"
+        choices = field.metadata.get("choices")
+        if choices is not None:
+            for item in value if isinstance(value, tuple) else (value,):
+                if item not in choices:
+                    raise ConfigError(f"{where} = {item!r}: choose from {', '.join(choices)}")
+        low, high = field.metadata.get("low"), field.metadata.get("high")
+        for number in _numbers(value):
+            if not math.isfinite(number):
+                raise ConfigError(f"{where} = {number}: must be a finite number")
+            if (low is not None and number < low) or (high is not None and number > high):
+                unit = field.metadata.get("unit")
+                unit = f" {unit}" if unit else ""
+                span = (
+                    f"between {low:g} and {high:g}"
+                    if low is not None and high is not None
+                    else f"at least {low:g}"
+                    if low is not None
+                    else f"at most {high:g}"
+                )
+                raise ConfigError(f"{where} = {number:g}{unit}: must be {span}{unit}")
+
+
+def check_ranges(config: Any, *names: str) -> None:
+    """Require that each named `(low, high)` field is ordered."""
+    for name in names:
+        low, high = getattr(config, name)
+        if low > high:
+            raise ConfigError(
+                f"{type(config).__name__}.{name} = ({low:g}, {high:g}): the first must not exceed the second"
+            )
+
+
+def _numbers(value: Any) -> list[float]:
+    if isinstance(value, bool) or value is None or isinstance(value, str):
+        return []
+    if isinstance(value, (int, float)):
+        return [float(value)]
+    if isinstance(value, tuple):
+        return [number for item in value for number in _numbers(item)]
+    return []
+
+
+def to_dict(config: Any) -> dict[str, Any]:
+    """A config dataclass as nested plain dicts and lists (JSON and msgpack friendly)."""
+
+    def plain(value: Any) -> Any:
+        if dataclasses.is_dataclass(value):
+            return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        return [plain(item) for item in value] if isinstance(value, (tuple, list)) else value
+
+    return plain(config)
+
+
+def from_dict(cls: type[T], data: dict[str, Any]) -> T:
+    """Rebuild a config dataclass from `to_dict`'s output; fields left out keep their default.
+
+    Raises:
+      ConfigError: an unknown field, or a value of the wrong type or out of range.
+    """
+    if not isinstance(data, dict):
+        raise ConfigError(f"{cls.__name__}: expected a table of fields, found {type(data).__name__}")
+    hints = typing.get_type_hints(cls)
+    known = {field.name for field in dataclasses.fields(cls)}
+    for name in data:
+        if name not in known:
+            raise ConfigError(f"{cls.__name__} has no field {name!r}")
+    return cls(**{name: _rebuild(hints[name], value, f"{cls.__name__}.{name}") for name, value in data.items()})
+
+
+def override(data: dict[str, Any], settings: Iterable[str]) -> dict[str, Any]:
+    """`to_dict`'s output with some fields replaced, each as "object.corners=1" or "edge=[0.05, 0.06]".
+
+    Values are JSON, and words without quotes. `from_dict` tells whether the fields exist and the values fit.
+
+    Raises:
+      ConfigError: a setting without a name or a value.
+    """
+    for entry in settings:
+        path, _, text = entry.partition("=")
+        if not (path and text):
+            raise ConfigError(f"{entry!r}: expected NAME=VALUE, such as randomization.scale=0.5")
+        try:
+            change = json.loads(text)
+        except ValueError:
+            change = text
+        for name in reversed(path.split(".")):
+            change = {name: change}
+        data = _merge(data, change)
+    return data
+
+
+def _merge(data: Any, change: dict[str, Any]) -> dict[str, Any]:
+    before = data if isinstance(data, dict) else {}
+    return before | {
+        name: _merge(before.get(name), value) if isinstance(value, dict) else value for name, value in change.items()
+    }
+
+
+def _rebuild(hint: Any, value: Any, where: str) -> Any:
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if dataclasses.is_dataclass(hint):
+        return from_dict(hint, value)
+    if origin in (typing.Union, types.UnionType):
+        if value is None and type(None) in arguments:
+            return None
+        return _rebuild(next(a for a in arguments if a is not type(None)), value, where)
+    if origin is tuple:
+        if not isinstance(value, (list, tuple)):
+            raise ConfigError(f"{where} = {value!r}: expected a list")
+        if len(arguments) == 2 and arguments[1] is Ellipsis:
+            return tuple(_rebuild(arguments[0], item, where) for item in value)
+        if len(value) != len(arguments):
+            raise ConfigError(f"{where}: expected {len(arguments)} values, found {len(value)}")
+        return tuple(_rebuild(a, item, where) for a, item in zip(arguments, value, strict=True))
+    if hint is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if isinstance(hint, type) and (not isinstance(value, hint) or (hint is int and isinstance(value, bool))):
+        raise ConfigError(f"{where} = {value!r}: expected {hint.__name__}")
+    return value

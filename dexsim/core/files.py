@@ -1,0 +1,40 @@
+"""What an environment's compiled program depends on, as one hash."""
+
+import os
+import tempfile
+from collections.abc import Iterable
+from pathlib import Path
+
+
+def python_sources(package: Path) -> Iterable[Path]:
+    """The modules below a folder, in order."""
+    return sorted(package.rglob("*.py"))
+
+
+def write_whole(path: Path, chunks: Iterable[bytes | memoryview]) -> None:
+    """Write `chunks` one after another to `path`; its folder is made if need be.
+
+    They go to a file beside it, which takes the name only once everything is on the disk. So neither a
+    crash nor another program ever sees half a file, and a file that was there stays until then.
+
+    Raises:
+      OSError: the file cannot be written; what was there before is untouched.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            for chunk in chunks:
+                file.write(chunk)
+            file.flush()
+            os.fsync(file.fileno())
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)

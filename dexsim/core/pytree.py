@@ -1,0 +1,32 @@
+"""What an environment carries and what it hands to a task: start states, moments, the state, the task's rules."""
+
+import dataclasses
+from typing import Any, TypeVar, dataclass_transform
+
+import jax
+import jax.numpy as jnp
+
+
+def choose(done: jax.Array, new: Any, old: Any) -> Any:
+    """`new` where `done` [], else `old`: two states, their random keys included."""
+
+    def leaf(new: jax.Array, old: jax.Array) -> jax.Array:
+        if jnp.issubdtype(old.dtype, jax.dtypes.prng_key):
+            return jax.random.wrap_key_data(jnp.where(done, jax.random.key_data(new), jax.random.key_data(old)))
+        return jnp.where(done, new, old)
+
+    return jax.tree.map(leaf, new, old)
+
+
+T = TypeVar("T")
+
+
+def static(**kwargs: Any) -> Any:
+    """A field that is part of the tree's structure (hashable, never traced)."""
+    return dataclasses.field(metadata={"static": True}, **kwargs)
+
+
+@dataclass_transform(frozen_default=True, field_specifiers=(static, dataclasses.field))
+def pytree_dataclass(cls: type[T]) -> type[T]:
+    """A frozen dataclass whose fields are pytree children, but for those marked `static()`."""
+    return jax.tree_util.register_dataclass(dataclasses.dataclass(frozen=True)(cls))

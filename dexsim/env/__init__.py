@@ -1,0 +1,1 @@
+"""The environment: rooms composed into pure `reset` and `step` functions."""

@@ -1,0 +1,36 @@
+"""What every task configures: from physics to what the policy sees."""
+
+import dataclasses
+
+from dexsim.control import Control
+from dexsim.core.config import setting
+from dexsim.objects.config import ObjectConfig
+from dexsim.observation import ObservationConfig
+from dexsim.physics.config import PhysicsConfig
+from dexsim.randomization import Randomization
+from dexsim.sensing.config import Sensing
+from dexsim.touch.skin import Skin
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class EnvConfig:
+    """What every task configures."""
+
+    physics: PhysicsConfig = setting(PhysicsConfig())
+    """Time step, solver and contact model."""
+    objects: ObjectConfig = setting(ObjectConfig())
+    """What is held."""
+    randomization: Randomization = setting(Randomization())
+    """What is drawn at every episode start."""
+    control: Control = setting(Control())
+    """From action to joint target."""
+    sensing: Sensing = setting(Sensing())
+    """From truth to readings."""
+    skin: Skin = setting(Skin(total="pressing"))
+    """The rubber over the taxels, which feel what presses into it and no friction."""
+    observation: ObservationConfig = setting(ObservationConfig())
+    """What the policy sees."""
+    pool_size: int = setting(2048, unit="1", low=1, high=1_000_000)
+    """Start states generated once; every episode starts from one of them."""
+    touch: bool = setting(True)
+    """Feel with the taxels; off only to measure their cost."""

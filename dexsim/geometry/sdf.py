@@ -1,0 +1,176 @@
+"""Signed distances to closed-form primitives and their unions.
+
+Sizes are MuJoCo's: box half-extents; capsule and cylinder (radius, half-length, -) along z;
+sphere (radius, -, -); ellipsoid semi-axes. Distances are negative inside. They are exact, but
+for points inside an overlap of several primitives, where a union gives the depth below the
+nearest of their surfaces, not below the outer one.
+"""
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dexsim.core.errors import ConfigError
+from dexsim.core.pytree import pytree_dataclass, static
+
+KINDS = ("sphere", "box", "capsule", "cylinder", "ellipsoid")
+FAR = 1e3  # m, the distance to a primitive that is switched off
+_TINY = 1e-20  # keeps the gradient of a norm finite at zero
+
+
+@pytree_dataclass
+class Shape:
+    """A union of K primitives in the object's frame; `kinds` is fixed, all else may be traced."""
+
+    kinds: tuple[str, ...] = static()
+    size: jax.Array  # [K, 3] m
+    position: jax.Array  # [K, 3] m
+    rotation: jax.Array  # [K, 3, 3]
+    active: jax.Array  # [K] bool
+
+
+def sphere(point: jax.Array, size: jax.Array) -> jax.Array:
+    x, y, z = _split(point)
+    return _length(x, y, z) - size[0]
+
+
+def box(point: jax.Array, size: jax.Array) -> jax.Array:
+    x, y, z = (jnp.abs(p) - size[axis] for axis, p in enumerate(_split(point)))
+    outside = _length(jnp.maximum(x, 0.0), jnp.maximum(y, 0.0), jnp.maximum(z, 0.0))
+    return outside + jnp.minimum(jnp.maximum(jnp.maximum(x, y), z), 0.0)
+
+
+def capsule(point: jax.Array, size: jax.Array) -> jax.Array:
+    x, y, z = _split(point)
+    return _length(x, y, z - jnp.clip(z, -size[1], size[1])) - size[0]
+
+
+def cylinder(point: jax.Array, size: jax.Array) -> jax.Array:
+    x, y, z = _split(point)
+    radial = _length(x, y) - size[0]
+    axial = jnp.abs(z) - size[1]
+    outside = _length(jnp.maximum(radial, 0.0), jnp.maximum(axial, 0.0))
+    return outside + jnp.minimum(jnp.maximum(radial, axial), 0.0)
+
+
+def ellipsoid(point: jax.Array, size: jax.Array) -> jax.Array:
+    """Exact distance by Newton's method for the nearest surface point.
+
+    The nearest point is q = s^2 p / (t + s^2) with t the largest root of
+    g(t) = sum (s p / (t + s^2))^2 - 1. g is convex and falling there, so Newton from the left
+    converges monotonically. The unknown is u = t + min(s)^2: deep inside t is all but -min(s)^2
+    and the sum would cancel. The distance n.(p - q), with n and the unit vector q / s held
+    fixed, has the exact gradient in point and size (envelope theorem).
+    """
+    p = jax.lax.stop_gradient(jnp.abs(point)) + 1e-9
+    s = jax.lax.stop_gradient(size)
+    least = jnp.min(s)
+    gap = (s - least) * (s + least)
+    # Each term alone must not exceed one at the root, so this start lies left of it.
+    u = jnp.max(s * p - gap, axis=-1)
+    for _ in range(12):
+        shift = u[..., None] + gap
+        term = s * p / shift
+        value = jnp.sum(term**2, -1) - 1.0
+        u = u + 0.5 * value / jnp.sum(term**2 / shift, -1)
+    unit = s * p / (u[..., None] + gap)
+    normal = unit / s
+    normal = normal / _norm(normal)[..., None]
+    sign = jnp.where(jax.lax.stop_gradient(point) < 0, -1.0, 1.0)
+    return jnp.sum(normal * (sign * point - size * unit), -1)
+
+
+_DISTANCE: dict[str, Callable[[jax.Array, jax.Array], jax.Array]] = {
+    "sphere": sphere,
+    "box": box,
+    "capsule": capsule,
+    "cylinder": cylinder,
+    "ellipsoid": ellipsoid,
+}
+
+
+def primitive_distance(kind: str, points: jax.Array, size: jax.Array) -> jax.Array:
+    """Distance [...] m from `points` [..., 3] to one primitive in its own frame."""
+    return _DISTANCE[kind](points, size)
+
+
+def signed_distance(points: jax.Array, shape: Shape) -> jax.Array:
+    """Distance [...] m from `points` [..., 3] (object frame) to the union."""
+    distance = None
+    for k, kind in enumerate(shape.kinds):
+        local = to_local(points, shape.position[k], shape.rotation[k])
+        d = jnp.where(shape.active[k], primitive_distance(kind, local, shape.size[k]), FAR)
+        distance = d if distance is None else jnp.minimum(distance, d)
+    return distance
+
+
+def to_local(points: jax.Array, position: jax.Array, rotation: jax.Array) -> jax.Array:
+    """Points [..., 3] in the frame at `position` [3], `rotation` [3, 3].
+
+    Component by component: XLA then makes one kernel of transform and distance, where sums over an
+    axis of three would each write their result to memory.
+    """
+    arm = [p - position[axis] for axis, p in enumerate(_split(points))]
+    return jnp.stack([sum(rotation[row, axis] * arm[row] for row in range(3)) for axis in range(3)], -1)
+
+
+def of_geoms(geoms: Iterable[Any]) -> Shape | None:
+    """The union of a link's primitives (`hand.Geom`), in its frame; None if none is of a kind in `KINDS`."""
+    parts = [g for g in geoms if g.kind in KINDS]
+    if not parts:
+        return None
+    return Shape(
+        tuple(g.kind for g in parts),
+        *(np.stack([getattr(g, name) for g in parts]) for name in ("size", "position", "rotation")),
+        np.ones(len(parts), bool),
+    )
+
+
+def bounds(shape: Shape) -> np.ndarray:
+    """Lowest and highest corner [2, 3] m of the active primitives' bounding boxes.
+
+    Raises:
+      ConfigError: nothing is active.
+    """
+    active = np.flatnonzero(np.asarray(shape.active))
+    if not active.size:
+        raise ConfigError("bounds: no active primitive")
+    position = np.asarray(shape.position, float)[active]
+    reach = np.stack(
+        [_reach(shape.kinds[k], np.asarray(shape.size[k], float), np.asarray(shape.rotation[k], float)) for k in active]
+    )
+    return np.stack([(position - reach).min(0), (position + reach).max(0)])
+
+
+def _reach(kind: str, size: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    """Half the sides [3] of the axis-aligned box round one turned primitive."""
+    along = np.minimum(np.abs(turn[:, 2]), 1.0)
+    if kind == "box":
+        return np.abs(turn) @ size
+    if kind == "ellipsoid":
+        return np.linalg.norm(turn * size, axis=1)
+    if kind == "cylinder":
+        return size[0] * np.sqrt(1 - along**2) + size[1] * along
+    return size[0] + (size[1] * along if kind == "capsule" else np.zeros(3))
+
+
+def distance_and_normal(points: jax.Array, shape: Shape) -> tuple[jax.Array, jax.Array]:
+    """Distance [...] m and outward unit normal [..., 3] of the nearest surface, object frame."""
+    distance, pullback = jax.vjp(lambda p: signed_distance(p, shape), points)
+    (normal,) = pullback(jnp.ones_like(distance))
+    return distance, normal
+
+
+def _split(point: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    return point[..., 0], point[..., 1], point[..., 2]
+
+
+def _length(*parts: jax.Array) -> jax.Array:
+    return jnp.sqrt(sum(part * part for part in parts) + _TINY)
+
+
+def _norm(vector: jax.Array) -> jax.Array:
+    return jnp.sqrt(jnp.sum(vector * vector, -1) + _TINY)

@@ -1,0 +1,1 @@
+"""The hand: kinematics, files, taxel lattices."""

@@ -1,0 +1,148 @@
+"""The hand as a static description, and its kinematics in pure JAX.
+
+`forward_kinematics` is the one kinematics that simulation and hardware share. `dexsim.hand.load.load_hand`
+reads a `Hand` from files.
+
+Shapes: J joints, B bodies, F fingers, N taxels a finger. Frames: poses are in the palm frame
+(fingers +z, palm normal +x, thumb side +y).
+"""
+
+import dataclasses
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dexsim.core.pytree import pytree_dataclass
+from dexsim.geometry import rotations
+
+
+@dataclasses.dataclass(frozen=True)
+class Geom:
+    """One primitive of the hand in its link's frame; `size` as in MuJoCo, `touches` the object."""
+
+    name: str
+    kind: str
+    body: int
+    size: np.ndarray
+    position: np.ndarray
+    rotation: np.ndarray
+    touches: bool
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Hand:
+    """What is fixed about a hand. Arrays are NumPy, so it can be closed over by jitted code."""
+
+    name: str
+    model_path: Path
+    palm: str
+    joint_names: tuple[str, ...]
+    joint_lower: np.ndarray  # [J] rad
+    joint_upper: np.ndarray  # [J] rad
+    torque_limit: np.ndarray  # [J] Nm, stall torque
+    speed_limit: np.ndarray  # [J] rad/s, no-load speed
+    body_names: tuple[str, ...]
+    body_parent: np.ndarray  # [B], -1 for the palm
+    body_position: np.ndarray  # [B, 3] m, in the parent's frame
+    body_rotation: np.ndarray  # [B, 3, 3]
+    body_joint: np.ndarray  # [B] index into joint_names, -1 where rigid
+    joint_axis: np.ndarray  # [B, 3], of the body's joint
+    joint_anchor: np.ndarray  # [B, 3] m
+    joint_reference: np.ndarray  # [B] rad, angle at which the body is as drawn
+    finger_names: tuple[str, ...]
+    tip_body: np.ndarray  # [F]
+    tip_offset: np.ndarray  # [F, 3] m, in the tip body's frame
+    root_joint: np.ndarray  # [F] the joint whose torque stands for the finger's
+    taxel_grid: tuple[int, int]  # columns, rows; index = column * rows + row
+    taxel_position: np.ndarray  # [F, N, 3] m, in the tip body's frame
+    taxel_normal: np.ndarray  # [F, N, 3] outward
+    taxel_area: np.ndarray  # [F, N] m^2
+    geoms: tuple[Geom, ...]
+
+    @property
+    def num_joints(self) -> int:
+        return len(self.joint_names)
+
+    @property
+    def num_fingers(self) -> int:
+        return len(self.finger_names)
+
+    @property
+    def num_taxels(self) -> int:
+        """Taxels of one finger."""
+        return self.taxel_position.shape[1]
+
+
+@pytree_dataclass
+class HandPose:
+    """Poses of all links and finger tips in the palm frame."""
+
+    body_position: jax.Array  # [B, 3] m
+    body_rotation: jax.Array  # [B, 3, 3]
+    tip_position: jax.Array  # [F, 3] m
+    tip_rotation: jax.Array  # [F, 3, 3]
+
+
+def forward_kinematics(hand: Hand, joint_position: jax.Array) -> HandPose:
+    """Poses of every link from joint angles [J] rad.
+
+    Bodies of equal depth in the tree move together, so the unrolled program has a few wide
+    operations instead of many small ones.
+    """
+    moving = hand.body_joint >= 0
+    angle = jnp.where(moving, joint_position[np.maximum(hand.body_joint, 0)], 0.0)
+    angle = angle - hand.joint_reference
+    turn = rotations.axis_angle_to_matrix(jnp.asarray(hand.joint_axis), angle)
+    local_rotation = rotations.compose(jnp.asarray(hand.body_rotation), turn)
+    lever = hand.joint_anchor - rotations.rotate(turn, jnp.asarray(hand.joint_anchor))
+    local_position = hand.body_position + rotations.rotate(jnp.asarray(hand.body_rotation), lever)
+
+    order, position, rotation = [], None, None
+    for level in _levels(hand.body_parent):
+        if position is None:
+            position, rotation = local_position[level], local_rotation[level]
+        else:
+            rows = np.array([order.index(p) for p in hand.body_parent[level]], np.int32)
+            new_position = position[rows] + rotations.rotate(rotation[rows], local_position[level])
+            new_rotation = rotations.compose(rotation[rows], local_rotation[level])
+            position = jnp.concatenate([position, new_position])
+            rotation = jnp.concatenate([rotation, new_rotation])
+        order += list(level)
+    back = np.argsort(order).astype(np.int32)
+    position, rotation = position[back], rotation[back]
+    tip_rotation = rotation[hand.tip_body]
+    tip_position = position[hand.tip_body] + rotations.rotate(tip_rotation, jnp.asarray(hand.tip_offset))
+    return HandPose(position, rotation, tip_position, tip_rotation)
+
+
+def taxel_positions(hand: Hand, pose: HandPose) -> jax.Array:
+    """Taxel positions [F, N, 3] m in the palm frame."""
+    rotation, origin = pose.tip_rotation[:, None], pose.body_position[hand.tip_body][:, None]
+    return origin + rotations.rotate(rotation, jnp.asarray(hand.taxel_position))
+
+
+def taxel_normals(hand: Hand, pose: HandPose) -> jax.Array:
+    """Outward taxel normals [F, N, 3] in the palm frame."""
+    return rotations.rotate(pose.tip_rotation[:, None], jnp.asarray(hand.taxel_normal))
+
+
+def _levels(parent: np.ndarray) -> list[np.ndarray]:
+    """Body indices grouped by depth; every body comes after its parent."""
+    depth = np.zeros(len(parent), int)
+    for body, above in enumerate(parent):
+        depth[body] = 0 if above < 0 else depth[above] + 1
+    return [np.flatnonzero(depth == level).astype(np.int32) for level in range(depth.max() + 1)]
+
+
+def flexion_joints(hand: Hand, fingers: range) -> np.ndarray:
+    """Joint indices of these fingers from their root joint to the tip."""
+    joints = []
+    for finger in fingers:
+        body, joint = int(hand.tip_body[finger]), -1
+        while body >= 0 and joint != hand.root_joint[finger]:
+            joint = int(hand.body_joint[body])
+            joints += [joint] if joint >= 0 else []
+            body = int(hand.body_parent[body])
+    return np.array(sorted(joints))

@@ -1,0 +1,272 @@
+"""Taxel layouts for any hand or pad: lattices on primitives and mesh patches, the layout file, and its checks.
+
+    patch = on_surface("cylinder", lattice(10, 12, pitch=0.0022), radius=0.008)
+    patch = placed(patch, position=(0, 0, 0.02), rotation=turn)       # in the link's frame
+    check_outside(patch, thing)                                       # no taxel inside the link
+    write_layout("taxels.csv", {"index": patch, "thumb": other})
+
+The file is the one that a hand's TOML names as `taxels` (`hand.load_hand`); `finger` in it stands for the link that
+carries the taxels. Taxel index = column * rows + row. Shapes: N taxels. Units: m, m^2.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dexsim.core.errors import AssetError, ConfigError
+
+SURFACES = ("plane", "cylinder", "capsule", "sphere")
+COLUMNS = ("finger", "column", "row", "x", "y", "z", "nx", "ny", "nz", "area")
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Lattice:
+    """Points of a lattice in arc length, before they are laid on a surface."""
+
+    grid: tuple[int, int]  # columns, rows
+    u: np.ndarray  # [N] m, across the columns
+    v: np.ndarray  # [N] m, along the rows
+    cell: float  # m^2
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Patch:
+    """Taxels of one link, in its frame."""
+
+    grid: tuple[int, int]  # columns, rows
+    position: np.ndarray  # [N, 3] m
+    normal: np.ndarray  # [N, 3] unit, outward
+    area: np.ndarray  # [N] m^2
+
+
+def lattice(columns: int, rows: int, *, pitch: float | tuple[float, float], kind: str = "rect") -> Lattice:
+    """A lattice centred on zero.
+
+    Args:
+      columns, rows: how many.
+      pitch: distance of neighbours; for "rect" also (across, along).
+      kind: "rect", or "hex" with every other row shifted by half a pitch and rows sqrt(3)/2 pitches apart.
+
+    Raises:
+      ConfigError: no taxels, no pitch or an unknown kind.
+    """
+    across, along = (pitch, pitch) if np.isscalar(pitch) else pitch
+    if kind not in ("rect", "hex"):
+        raise ConfigError(f"lattice kind {kind!r}: choose rect or hex")
+    if columns < 1 or rows < 1 or not (across > 0 and along > 0):
+        raise ConfigError(f"lattice of {columns} x {rows} at a pitch of {pitch} m: all must be above 0")
+    if kind == "hex":
+        if across != along:
+            raise ConfigError(f"hex lattice: one pitch expected, found {pitch}")
+        along = across * np.sqrt(3) / 2
+    column, row = (x.ravel() for x in np.meshgrid(np.arange(columns), np.arange(rows), indexing="ij"))
+    shift = 0.25 * np.where(row % 2, 1, -1) if kind == "hex" else 0.0
+    return Lattice(
+        (columns, rows), across * (column - (columns - 1) / 2 + shift), along * (row - (rows - 1) / 2), across * along
+    )
+
+
+def on_surface(kind: str, points: Lattice, *, radius: float = 0.0, half_length: float = 0.0) -> Patch:
+    """Lay a lattice on a primitive without stretching it along the rows.
+
+    plane: z = 0, facing +z, u along x, v along y. cylinder (radius, axis z): u round the axis from +x, v along z.
+    capsule (radius, half_length of the straight part): like a cylinder, rows beyond the straight part go over the
+    caps. sphere (radius): u along the equator from +x, v along the meridian. Where meridians draw together, areas
+    shrink with them.
+
+    Raises:
+      ConfigError: an unknown kind, no radius, or a lattice that does not fit on the surface.
+    """
+    u, v = points.u, points.v
+    if kind == "plane":
+        position = np.stack([u, v, 0 * u], -1)
+        return Patch(
+            points.grid, position, np.broadcast_to([0.0, 0.0, 1.0], position.shape).copy(), np.full(len(u), points.cell)
+        )
+    if kind not in SURFACES:
+        raise ConfigError(f"surface {kind!r}: choose from {', '.join(SURFACES)}")
+    if radius <= 0:
+        raise ConfigError(f"surface {kind!r}: radius = {radius} m, must be above 0")
+    angle = u / radius
+    if np.ptp(u) >= 2 * np.pi * radius:
+        raise ConfigError(
+            f"surface {kind!r}: the lattice is {np.ptp(u):.4g} m wide and laps itself on a girth of "
+            f"{2 * np.pi * radius:.4g} m"
+        )
+    straight = {"cylinder": np.inf, "capsule": half_length, "sphere": 0.0}[kind]
+    over = np.sign(v) * np.maximum(np.abs(v) - straight, 0.0)
+    polar = over / radius
+    if np.any(np.abs(polar) >= np.pi / 2 - 1e-6):
+        raise ConfigError(f"surface {kind!r}: rows reach {np.abs(v).max():.4g} m from the middle, beyond the pole")
+    normal = np.stack([np.cos(polar) * np.cos(angle), np.cos(polar) * np.sin(angle), np.sin(polar)], -1)
+    position = radius * normal + np.stack([0 * v, 0 * v, v - over], -1)
+    return Patch(points.grid, position, normal, points.cell * np.cos(polar))
+
+
+def on_mesh(mesh: Any, points: Lattice, *, origin: Any, facing: Any, along: Any) -> Patch:
+    """Drop a lattice onto a mesh: from a plane at `origin`, against the direction `facing`, rows running `along`.
+
+    Each taxel is where its ray first meets the mesh, with that triangle's normal, and stands for the surface that lies
+    under its cell.
+
+    Raises:
+      AssetError: a ray misses the mesh or grazes it (below 10 degrees).
+    """
+    facing, along = _direction(facing), np.asarray(along, float)
+    along = _direction(along - (along @ facing) * facing)
+    start = np.asarray(origin, float) + points.u[:, None] * np.cross(along, facing) + points.v[:, None] * along
+    position, face = _first_hit(mesh.corners, start, -facing)
+    rows = points.grid[1]
+    if np.any(face < 0):
+        bad = int(np.argmax(face < 0))
+        raise AssetError(
+            f"{mesh.name}: the ray of taxel column {bad // rows}, row {bad % rows} misses the mesh "
+            f"({np.sum(face < 0)} of {len(face)} do); make the lattice smaller or move its origin"
+        )
+    normal = mesh.normals[face]
+    cosine = normal @ facing
+    if np.any(cosine < np.sin(np.radians(10))):
+        bad = int(cosine.argmin())
+        raise AssetError(
+            f"{mesh.name}: the surface under taxel column {bad // rows}, row {bad % rows} is too steep "
+            "for this direction; turn `facing` or make the lattice smaller"
+        )
+    return Patch(points.grid, position, normal, points.cell / cosine)
+
+
+def placed(patch: Patch, *, position: Any = (0, 0, 0), rotation: Any = None) -> Patch:
+    """The patch moved by a rotation matrix [3, 3] and then a shift [3] m."""
+    turn = np.eye(3) if rotation is None else np.asarray(rotation, float)
+    return dataclasses.replace(
+        patch, position=patch.position @ turn.T + np.asarray(position, float), normal=patch.normal @ turn.T
+    )
+
+
+def check_outside(patch: Patch, thing: Any, *, tolerance: float = 1e-4, name: str = "patch") -> None:
+    """Require that no taxel lies deeper than `tolerance` inside the link it sits on.
+
+    Args:
+      thing: the link's surface in its frame, as `distance.prepare` gives it.
+
+    Raises:
+      AssetError: one does; names it and its depth.
+    """
+    from dexsim.geometry.distance import signed_distance
+
+    distance = np.asarray(signed_distance(np.asarray(patch.position, np.float32), thing))
+    worst = int(distance.argmin())
+    if distance[worst] < -tolerance:
+        column, row = divmod(worst, patch.grid[1])
+        raise AssetError(
+            f"{name}: taxel column {column}, row {row} lies {-1e3 * distance[worst]:.2g} mm inside "
+            f"its link ({np.sum(distance < -tolerance)} of {len(distance)} do)"
+        )
+
+
+def check_hand(hand: Any, *, tolerance: float = 1.5e-3) -> None:
+    """`check_outside` for every finger of a hand against the primitives of the link that carries its taxels.
+
+    The default tolerance allows for pads that are capsules fitted to the real skin.
+
+    Raises:
+      AssetError: a taxel lies inside its link.
+    """
+    from dexsim.geometry import sdf
+
+    for finger, name in enumerate(hand.finger_names):
+        thing = sdf.of_geoms(g for g in hand.geoms if g.body == hand.tip_body[finger])
+        if thing is None:
+            continue
+        patch = Patch(hand.taxel_grid, hand.taxel_position[finger], hand.taxel_normal[finger], hand.taxel_area[finger])
+        check_outside(patch, thing, tolerance=tolerance, name=f"finger {name!r}")
+
+
+def write_layout(path: str | Path, patches: dict[str, Patch]) -> Path:
+    """Write the taxels of named fingers (or links) as a layout file; all must have the same grid.
+
+    Raises:
+      ConfigError: grids differ or a normal is not of length 1.
+    """
+    if len({patch.grid for patch in patches.values()}) != 1:
+        raise ConfigError(f"layout: one grid for all fingers expected, found {[p.grid for p in patches.values()]}")
+    path = Path(path)
+    with open(path, "w", newline="") as file:
+        out = csv.writer(file, lineterminator="\n")
+        out.writerow(COLUMNS)
+        for name, patch in patches.items():
+            if np.any(np.abs(np.linalg.norm(patch.normal, axis=-1) - 1) > 1e-3) or np.any(patch.area <= 0):
+                raise ConfigError(f"layout {name!r}: normals must be of length 1 and areas above 0")
+            for index in range(len(patch.position)):
+                column, row = divmod(index, patch.grid[1])
+                out.writerow(
+                    [
+                        name,
+                        column,
+                        row,
+                        *(f"{x:.6f}" for x in patch.position[index]),
+                        *(f"{x:.6f}" for x in patch.normal[index]),
+                        f"{patch.area[index]:.6g}",
+                    ]
+                )
+    return path
+
+
+def read_layout(path: str | Path) -> dict[str, Patch]:
+    """The patches of a layout file by finger, in the file's order; the grid is found from its columns and rows.
+
+    Raises:
+      AssetError: missing or broken file, with the line.
+    """
+    from dexsim.hand.load import read_taxels
+
+    path = Path(path)
+    try:
+        with open(path, newline="") as file:
+            entries = list(csv.DictReader(file))
+        fingers = tuple(dict.fromkeys(entry["finger"] for entry in entries))
+        grid = [1 + max(int(entry[name]) for entry in entries) for name in ("column", "row")]
+    except FileNotFoundError:
+        raise AssetError(f"{path}: no such file") from None
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise AssetError(f"{path}: not a taxel layout ({error})") from None
+    table = read_taxels(path, fingers, grid).astype(np.float64)
+    return {
+        name: Patch(tuple(grid), rows[:, 0:3], rows[:, 3:6], rows[:, 6])
+        for name, rows in zip(fingers, table, strict=True)
+    }
+
+
+def _direction(vector: Any) -> np.ndarray:
+    vector = np.asarray(vector, float)
+    length = np.linalg.norm(vector)
+    if not np.isfinite(length) or length < 1e-9:
+        raise ConfigError(f"direction {vector.tolist()}: must have a length")
+    return vector / length
+
+
+def _first_hit(corners: np.ndarray, start: np.ndarray, ray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where rays from start [N, 3] along `ray` [3] first meet triangles [T, 3, 3], and which; face -1 where none does.
+
+    Moeller and Trumbore 1997.
+    """
+    a, b, c = np.moveaxis(corners, 1, 0)
+    ab, ac = b - a, c - a
+    across = np.cross(ray, ac)
+    volume = np.einsum("td,td->t", ab, across)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        arm = start[:, None] - a
+        u = np.einsum("ntd,td->nt", arm, across) / volume
+        over = np.cross(arm, ab)
+        v = over @ ray / volume
+        along = np.einsum("ntd,td->nt", over, ac) / volume
+        hit = (np.abs(volume) > 1e-18) & (u >= -1e-9) & (v >= -1e-9) & (u + v <= 1 + 1e-9) & (along > 0)
+    along = np.where(hit, along, np.inf)
+    face = along.argmin(1)
+    reach = along[np.arange(len(start)), face]
+    found = np.isfinite(reach)
+    return start + np.where(found, reach, 0.0)[:, None] * ray, np.where(found, face, -1)

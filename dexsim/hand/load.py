@@ -1,0 +1,332 @@
+"""The hand, read from files; its description and kinematics are those of `dexsim.hand.kinematics`.
+
+`load_hand` reads an MJCF, a taxel layout and a short TOML, so nothing in the library but the
+files under `assets/hand/` knows which hand it is.
+"""
+
+import csv
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dexsim.core.assets import asset_path
+from dexsim.core.errors import AssetError
+from dexsim.hand.kinematics import (
+    Geom,
+    Hand,
+    HandPose,
+    flexion_joints,
+    forward_kinematics,
+    taxel_normals,
+    taxel_positions,
+)
+
+__all__ = [
+    "TAXEL_COLUMNS",
+    "Geom",
+    "Hand",
+    "HandPose",
+    "flexion_joints",
+    "forward_kinematics",
+    "lattice_frame",
+    "load_hand",
+    "read_taxels",
+    "taxel_normals",
+    "taxel_positions",
+]
+
+TAXEL_COLUMNS = ("finger", "column", "row", "x", "y", "z", "nx", "ny", "nz", "area")
+
+
+def lattice_frame(position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Outward normals [C, R, 3] and areas [C, R] of a lattice of points [C, R, 3] on a surface.
+
+    The normal is the cross product of the two lattice tangents (central differences), turned
+    away from the lattice's centroid. Each cell's area goes in equal parts to its four corners.
+    """
+    along = np.gradient(position, axis=1)
+    around = np.gradient(position, axis=0)
+    normal = np.cross(around, along)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    outward = position - position.mean((0, 1))
+    if np.sum(normal * outward) < 0:
+        normal = -normal
+    a, b = position[:-1, :-1], position[1:, :-1]
+    c, d = position[1:, 1:], position[:-1, 1:]
+    cell = 0.5 * np.linalg.norm(np.cross(c - a, d - b), axis=-1)
+    area = np.zeros(position.shape[:2])
+    for rows in (slice(None, -1), slice(1, None)):
+        for columns in (slice(None, -1), slice(1, None)):
+            area[rows, columns] += cell / 4
+    return normal, area
+
+
+def load_hand(path: str | Path | None = None) -> Hand:
+    """Read a hand from its TOML (the shipped hand when `path` is None).
+
+    Raises:
+      AssetError: a file is missing or broken, or the three do not fit together.
+    """
+    path = Path(path) if path is not None else asset_path("hand/xhand_right.toml")
+    table = _read_toml(path)
+    _check_table(path, table)
+    model_path = path.parent / table["model"]
+    model = _load_model(path, model_path)
+    joints = _find_joints(path, model_path, model, table)
+    palm = _find(path, model_path, model, "body", table["palm"])
+    bodies = [b for b in range(1, model.nbody) if _is_below(model.body_parentid, b, palm)]
+    row = {body: i for i, body in enumerate(bodies)}
+    body_joint = _joints_of_bodies(model_path, model, table, joints, palm, row)
+    at = np.array([joints[j] if j >= 0 else -1 for j in body_joint])
+    has = at >= 0
+    tips, root = _find_fingers(path, model_path, model, table, row)
+    finger_names = tuple(finger["name"] for finger in table["fingers"])
+    taxels = read_taxels(path.parent / table["taxels"], finger_names, table["taxel_grid"])
+    parent = np.array([row.get(int(model.body_parentid[b]), -1) for b in bodies])
+    identity = np.eye(3)
+
+    return Hand(
+        name=table.get("name", path.stem),
+        model_path=model_path,
+        palm=table["palm"],
+        joint_names=tuple(table["joints"]),
+        joint_lower=_f32(model.jnt_range[joints, 0]),
+        joint_upper=_f32(model.jnt_range[joints, 1]),
+        torque_limit=_f32(model.jnt_actfrcrange[joints, 1]),
+        speed_limit=_f32(table["speed_limits"]),
+        body_names=tuple(model.body(b).name for b in bodies),
+        body_parent=parent,
+        body_position=_f32([np.zeros(3) if b == palm else model.body_pos[b] for b in bodies]),
+        body_rotation=_f32([identity if b == palm else _matrix(model.body_quat[b]) for b in bodies]),
+        body_joint=body_joint,
+        joint_axis=_f32(np.where(has[:, None], model.jnt_axis[at], [0, 0, 1])),
+        joint_anchor=_f32(np.where(has[:, None], model.jnt_pos[at], 0)),
+        joint_reference=_f32(np.where(has, model.qpos0[model.jnt_qposadr[at]], 0)),
+        finger_names=finger_names,
+        tip_body=np.array([row[int(model.site_bodyid[s])] for s in tips], np.int32),
+        tip_offset=_f32(model.site_pos[tips]),
+        root_joint=np.array(root, np.int32),
+        taxel_grid=tuple(table["taxel_grid"]),
+        taxel_position=taxels[..., 0:3],
+        taxel_normal=taxels[..., 3:6],
+        taxel_area=taxels[..., 6],
+        geoms=_read_geoms(model, row),
+    )
+
+
+def _load_model(path: Path, model_path: Path) -> Any:
+    import mujoco
+
+    if not model_path.is_file():
+        raise AssetError(f"{model_path}: no such file (model of {path})")
+    try:
+        model = mujoco.MjModel.from_xml_path(str(model_path))
+    except ValueError as error:
+        raise AssetError(f"{model_path}: {' '.join(str(error).split())}") from None
+    _check_finite(model, model_path)
+    return model
+
+
+def _find(path: Path, model_path: Path, model: Any, kind: str, name: str) -> int:
+    """Index of a joint, body or site."""
+    import mujoco
+
+    index = mujoco.mj_name2id(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), name)
+    if index < 0:
+        raise AssetError(f"{path}: {model_path.name} has no {kind} {name!r}")
+    return index
+
+
+def _find_joints(path: Path, model_path: Path, model: Any, table: dict) -> list[int]:
+    """The model's joints in the order of the TOML."""
+    import mujoco
+
+    joints = [_find(path, model_path, model, "joint", name) for name in table["joints"]]
+    if len(set(joints)) != model.njnt or model.nq != model.njnt:
+        raise AssetError(
+            f"{path}: joints lists {len(set(joints))} of the {model.njnt} joints of "
+            f"{model_path.name}; every joint must be listed once and be a hinge"
+        )
+    if np.any(model.jnt_type != mujoco.mjtJoint.mjJNT_HINGE):
+        raise AssetError(f"{model_path}: only hinge joints are supported")
+    if len(table["speed_limits"]) != len(joints):
+        raise AssetError(f"{path}: {len(table['speed_limits'])} speed_limits for {len(joints)} joints")
+    limit = model.jnt_actfrcrange[joints, 1]
+    if not np.all(model.jnt_limited[joints]) or np.any(limit <= 0):
+        bad = next(
+            n for n, j, t in zip(table["joints"], joints, limit, strict=True) if not model.jnt_limited[j] or t <= 0
+        )
+        raise AssetError(f"{model_path}: joint {bad!r} needs a range and an actuatorfrcrange")
+    return joints
+
+
+def _joints_of_bodies(
+    model_path: Path, model: Any, table: dict, joints: list[int], palm: int, row: dict[int, int]
+) -> np.ndarray:
+    """The joint [B] that moves each body, as an index into the TOML's; -1 for none."""
+    body_joint = np.full(len(row), -1, np.int32)
+    for index, joint in enumerate(joints):
+        body = int(model.jnt_bodyid[joint])
+        if body not in row or body == palm or body_joint[row[body]] >= 0:
+            raise AssetError(
+                f"{model_path}: joint {table['joints'][index]!r} must be the only "
+                f"joint of a body below {table['palm']!r}"
+            )
+        body_joint[row[body]] = index
+    return body_joint
+
+
+def _find_fingers(
+    path: Path, model_path: Path, model: Any, table: dict, row: dict[int, int]
+) -> tuple[list[int], list[int]]:
+    """Each finger's tip site and its first joint, as an index into the TOML's."""
+    tips = [_find(path, model_path, model, "site", finger["tip"]) for finger in table["fingers"]]
+    for finger, site in zip(table["fingers"], tips, strict=True):
+        if int(model.site_bodyid[site]) not in row:
+            raise AssetError(f"{path}: tip {finger['tip']!r} is on no body of {table['palm']!r}")
+        if finger["root_joint"] not in table["joints"]:
+            raise AssetError(f"{path}: root_joint {finger['root_joint']!r} is not among joints")
+    return tips, [table["joints"].index(finger["root_joint"]) for finger in table["fingers"]]
+
+
+def _check_table(path: Path, table: dict) -> None:
+    """Entries and their types; names are checked against the model by `load_hand`."""
+    kinds = {
+        "model": str,
+        "taxels": str,
+        "taxel_grid": list,
+        "palm": str,
+        "joints": list,
+        "speed_limits": list,
+        "fingers": list,
+    }
+    for key, kind in kinds.items():
+        if key not in table:
+            raise AssetError(f"{path}: no entry {key!r}")
+        if not isinstance(table[key], kind):
+            raise AssetError(f"{path}: {key} = {table[key]!r}: expected a {'string' if kind is str else 'list'}")
+    grid, speeds = table["taxel_grid"], table["speed_limits"]
+    if len(grid) != 2 or any(type(n) is not int or n < 1 for n in grid):
+        raise AssetError(f"{path}: taxel_grid = {grid}: expected two whole numbers above 0")
+    if any(type(v) not in (int, float) or not 0 < v < np.inf for v in speeds):
+        raise AssetError(f"{path}: speed_limits = {speeds}: expected numbers above 0, rad/s")
+    if any(type(name) is not str for name in table["joints"]) or not table["fingers"]:
+        raise AssetError(f"{path}: joints must list names, and there must be a finger")
+    for number, finger in enumerate(table["fingers"], start=1):
+        for key in ("name", "tip", "root_joint"):
+            if not isinstance(finger, dict) or not isinstance(finger.get(key), str):
+                raise AssetError(f"{path}: finger {number} has no entry {key!r}")
+
+
+def _check_finite(model, path: Path) -> None:
+    """MuJoCo only warns of a NaN in the XML."""
+    fields = {
+        "body": ("pos", "quat", "ipos", "mass", "inertia"),
+        "geom": ("pos", "quat", "size"),
+        "jnt": ("pos", "axis", "range", "actfrcrange"),
+        "site": ("pos", "quat"),
+    }
+    for kind, names in fields.items():
+        for name in names:
+            values = getattr(model, f"{kind}_{name}")
+            bad = np.flatnonzero(~np.all(np.isfinite(values.reshape(len(values), -1)), axis=1))
+            if bad.size:
+                element = getattr(model, kind)(int(bad[0])).name
+                raise AssetError(f"{path}: {kind} {element!r}: {name} is not a finite number")
+
+
+def _f32(values) -> np.ndarray:
+    return np.asarray(values, np.float32)
+
+
+def _matrix(quat: np.ndarray) -> np.ndarray:
+    import mujoco
+
+    matrix = np.zeros(9)
+    mujoco.mju_quat2Mat(matrix, quat)
+    return matrix.reshape(3, 3)
+
+
+def _is_below(parent: np.ndarray, body: int, ancestor: int) -> bool:
+    while body > 0:
+        if body == ancestor:
+            return True
+        body = int(parent[body])
+    return False
+
+
+def _read_geoms(model, row: dict[int, int]) -> tuple[Geom, ...]:
+    names = {2: "sphere", 3: "capsule", 4: "ellipsoid", 5: "cylinder", 6: "box", 0: "plane"}
+    geoms = []
+    for g in range(model.ngeom):
+        kind = names.get(int(model.geom_type[g]))
+        if int(model.geom_bodyid[g]) in row and kind is not None:
+            touches = bool(model.geom_contype[g] | model.geom_conaffinity[g])
+            geoms.append(
+                Geom(
+                    model.geom(g).name,
+                    kind,
+                    row[int(model.geom_bodyid[g])],
+                    _f32(model.geom_size[g]),
+                    _f32(model.geom_pos[g]),
+                    _f32(_matrix(model.geom_quat[g])),
+                    touches,
+                )
+            )
+    return tuple(geoms)
+
+
+def _read_toml(path: Path) -> dict:
+    try:
+        with open(path, "rb") as file:
+            return tomllib.load(file)
+    except FileNotFoundError:
+        raise AssetError(f"{path}: no such file") from None
+    except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise AssetError(f"{path}: {error}") from None
+
+
+def read_taxels(path: Path, fingers: tuple[str, ...], grid: list[int]) -> np.ndarray:
+    """[F, N, 7]: position, normal, area. Every finger must have columns * rows taxels."""
+    try:
+        with open(path, newline="") as file:
+            rows = list(csv.DictReader(file))
+    except FileNotFoundError:
+        raise AssetError(f"{path}: no such file") from None
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise AssetError(f"{path}: {error}") from None
+    if not rows or tuple(rows[0]) != TAXEL_COLUMNS:
+        raise AssetError(f"{path}: the first line must read {','.join(TAXEL_COLUMNS)}")
+    columns, length = grid
+    table = np.full((len(fingers), columns * length, 7), np.nan, np.float32)
+    for line, entry in enumerate(rows, start=2):
+        if entry["finger"] not in fingers:
+            raise AssetError(f"{path}:{line}: no finger {entry['finger']!r}; the hand has {', '.join(fingers)}")
+        try:
+            column, at = int(entry["column"]), int(entry["row"])
+            values = [float(entry[name]) for name in TAXEL_COLUMNS[3:]]
+            if None in entry:  # more values than columns
+                raise ValueError
+        except (TypeError, ValueError):
+            raise AssetError(f"{path}:{line}: not ten values with numbers from column 2 on") from None
+        if not (0 <= column < columns and 0 <= at < length) or not np.all(np.isfinite(values)):
+            raise AssetError(
+                f"{path}:{line}: column {column}, row {at} or a number in the line "
+                f"is outside the {columns} x {length} grid or not finite"
+            )
+        if abs(np.linalg.norm(values[3:6]) - 1) > 0.01 or values[6] <= 0:
+            raise AssetError(f"{path}:{line}: the normal must be of length 1 and the area above 0")
+        table[fingers.index(entry["finger"]), column * length + at] = values
+    count = np.sum(np.isfinite(table[..., 0]), axis=1)
+    if np.any(count != columns * length):
+        worst = int(np.argmin(count))
+        raise AssetError(
+            f"{path}: finger {fingers[worst]!r} has {count[worst]} taxels, the grid asks for {columns * length}"
+        )
+    if len(rows) != table.shape[0] * table.shape[1]:
+        raise AssetError(
+            f"{path}: {len(rows)} taxels, expected {table.shape[0] * table.shape[1]} (a column and row is given twice)"
+        )
+    return table

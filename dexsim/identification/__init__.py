@@ -1,0 +1,1 @@
+"""Actuator parameters from logs."""

@@ -1,0 +1,137 @@
+"""Joint targets that make an actuator show its parameters, safe for the hand.
+
+Chirps show inertia, damping and delay; steps the torque-speed envelope; slow triangles friction;
+small reversals backlash. `excitation` strings them together for one joint after the other, within
+the joint limits. Everything is NumPy, made once, before a recording.
+"""
+
+import dataclasses
+
+import numpy as np
+
+from dexsim.core.config import check_ranges, setting, validate
+from dexsim.core.errors import ConfigError
+from dexsim.hand.kinematics import Hand
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Excitation:
+    """A recording's signals, in the order in which they come."""
+
+    period: float = setting(0.015, unit="s", low=0.001, high=0.1)
+    """From one command to the next."""
+    rest: float = setting(0.5, unit="s", low=0.0, high=10.0)
+    """Standing still at the beginning and between the signals."""
+    amplitude: float = setting(0.3, unit="rad", low=0.005, high=1.5)
+    """Of chirp, steps and slow triangles about the middle posture; cut to the joint's range."""
+    chirp_frequency: tuple[float, float] = setting((0.3, 4.0), unit="Hz", low=0.01, high=50.0)
+    """First and last frequency of the chirp."""
+    chirp_seconds: float = setting(4.0, unit="s", low=0.0, high=120.0)
+    """Length of the chirp; its amplitude falls with the frequency to a quarter."""
+    chirp_parts: int = setting(6, unit="1", low=1, high=100)
+    """Parts that the chirp is cut into, with a pause after each: where the joint rests, an
+    identification can begin anew, and errors within a dead-band do not pile up."""
+    pause: float = setting(0.3, unit="s", low=0.0, high=10.0)
+    """Standing still between the parts of the chirp."""
+    step_count: int = setting(6, unit="1", low=0, high=200)
+    """Steps, of alternating sign and two sizes."""
+    step_hold: float = setting(0.4, unit="s", low=0.05, high=10.0)
+    """Time at each step."""
+    slow_cycles: int = setting(1, unit="1", low=0, high=50)
+    """Slow triangles."""
+    slow_speed: float = setting(0.5, unit="rad/s", low=0.01, high=5.0)
+    """Speed of the slow triangles."""
+    reversal_amplitude: float = setting(0.02, unit="rad", low=0.001, high=0.3)
+    """Of the small reversals."""
+    reversal_cycles: int = setting(4, unit="1", low=0, high=200)
+    """Small reversals, once up and down in 0.4 s each."""
+    margin: float = setting(0.05, unit="rad", low=0.0, high=0.5)
+    """Kept from the joint's limits."""
+
+    def __post_init__(self):
+        validate(self)
+        check_ranges(self, "chirp_frequency")
+
+
+def chirp(seconds: float, period: float, frequency: tuple[float, float]) -> np.ndarray:
+    """[T] in [-1, 1]: a sine of linearly rising frequency, Hz."""
+    time = np.arange(0.0, seconds, period)
+    low, high = frequency
+    phase = 2 * np.pi * (low * time + (high - low) * time**2 / (2 * max(seconds, period)))
+    return np.sin(phase)
+
+
+def steps(count: int, hold: float, period: float) -> np.ndarray:
+    """[T] in [-1, 1]: `count` steps to either side, full and a third in turn, `hold` s each."""
+    size = np.array([(1.0, -1.0, 1 / 3, -1 / 3)[index % 4] for index in range(count)])
+    return np.repeat(size, max(round(hold / period), 1))
+
+
+def triangles(cycles: int, cycle_seconds: float, period: float) -> np.ndarray:
+    """[T] in [-1, 1]: triangle waves from 0 up, down and back."""
+    phase = np.arange(0.0, cycles * cycle_seconds, period) / cycle_seconds % 1.0
+    return 1.0 - np.abs(4.0 * ((phase + 0.25) % 1.0) - 2.0)
+
+
+def joint_excitation(config: Excitation, middle: float, reach: float) -> np.ndarray:
+    """Targets [T] rad of one joint about `middle`, no farther than `reach` from it."""
+    size, period = min(config.amplitude, reach), config.period
+    small = min(config.reversal_amplitude, reach)
+    rest = np.zeros(round(config.rest / period))
+    ladder = np.linspace(*config.chirp_frequency, config.chirp_parts + 1)
+    fading = np.linspace(1.0, 0.25, config.chirp_parts + 1)
+    bursts = []
+    for first, second, strength in zip(ladder[:-1], ladder[1:], fading[:-1], strict=True):
+        wave = chirp(config.chirp_seconds / config.chirp_parts, period, (first, second))
+        bursts += [size * strength * wave, np.zeros(round(config.pause / period))]
+    parts = [
+        rest,
+        *bursts,
+        rest,
+        size * steps(config.step_count, config.step_hold, period),
+        rest,
+        size * triangles(config.slow_cycles, 4 * size / config.slow_speed, period),
+        rest,
+        small * triangles(config.reversal_cycles, 0.4, period),
+        rest,
+    ]
+    return middle + np.concatenate(parts)
+
+
+def excitation(
+    hand: Hand, config: Excitation, posture: np.ndarray | None = None, joints: tuple[str, ...] | None = None
+) -> dict[str, np.ndarray]:
+    """Targets of the whole hand while one joint after the other is moved.
+
+    Args:
+      hand: names and limits.
+      config: the signals.
+      posture: [J] rad, where joints rest and about which they move; the middle of their ranges by
+        default. An open hand keeps fingers from touching each other.
+      joints: which to move; all by default.
+
+    Returns:
+      By the name of the moving joint, targets [T, J] rad, every `config.period`.
+
+    Raises:
+      ConfigError: an unknown joint, or a posture too close to a limit to move.
+    """
+    if posture is None:
+        posture = (hand.joint_lower + hand.joint_upper) / 2
+    posture = np.asarray(posture, float)
+    low, high = hand.joint_lower + config.margin, hand.joint_upper - config.margin
+    targets = {}
+    for name in joints or hand.joint_names:
+        if name not in hand.joint_names:
+            raise ConfigError(f"no joint {name!r} in hand {hand.name}")
+        joint = hand.joint_names.index(name)
+        reach = min(posture[joint] - low[joint], high[joint] - posture[joint])
+        if reach < 0.02:
+            raise ConfigError(
+                f"{name}: {posture[joint]:.3g} rad lies {max(reach, 0):.2g} rad from "
+                f"the end of its range less the margin: too close to move"
+            )
+        moving = joint_excitation(config, posture[joint], reach)
+        targets[name] = np.tile(posture, (len(moving), 1))
+        targets[name][:, joint] = moving
+    return targets

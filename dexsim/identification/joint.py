@@ -1,0 +1,227 @@
+"""One joint with its drive, simulated from commanded targets: what identification fits.
+
+    I qdd = friction(drive(target delayed, q, qd)) - g_cos cos(q) - g_sin sin(q)
+
+The joint alone: its inertia about the axis is constant (the diagonal of the hand's mass matrix,
+rotor included), the other joints stand still, nothing touches, gravity goes with the angle.
+Integrated as the physics does, semi-implicit Euler at the physics' time step, with the same
+`dexsim.actuator.drive` code, so that what is fitted here means the same there.
+"""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dexsim.actuator.drive import Actuator, apply_friction, joint_torque, pd_torque, torque_limit
+from dexsim.core.errors import CalibrationError
+
+PARAMETERS = {
+    "stiffness": "Nm/rad",
+    "damping": "Nm s/rad",
+    "dead_band": "rad",
+    "stall_torque": "Nm",
+    "no_load_speed": "rad/s",
+    "efficiency": "1",
+    "encoder_bias": "rad",
+    "coulomb_friction": "Nm",
+    "viscous_friction": "Nm s/rad",
+    "inertia": "kg m^2",
+    "gravity_cos": "Nm",
+    "gravity_sin": "Nm",
+    "start": "rad",
+}
+"""What the model knows, and the units; `start` is the true angle at the first sample."""
+
+NOMINAL = {
+    "dead_band": 0.0,
+    "efficiency": 1.0,
+    "encoder_bias": 0.0,
+    "coulomb_friction": 0.0,
+    "viscous_friction": 0.0,
+    "gravity_cos": 0.0,
+    "gravity_sin": 0.0,
+}
+"""Values of parameters that nobody gave."""
+
+_DRIVE = (
+    "stiffness",
+    "damping",
+    "dead_band",
+    "stall_torque",
+    "no_load_speed",
+    "efficiency",
+    "encoder_bias",
+    "coulomb_friction",
+    "viscous_friction",
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class JointLog:
+    """A recording of one joint that moved alone, a sample every `period` s."""
+
+    period: float  # s
+    target: np.ndarray  # [T] rad, commanded at each sample
+    position: np.ndarray  # [T] rad, measured at the same instants
+    torque: np.ndarray | None = None  # [T] Nm, of the motor by its calibrated current
+    name: str = "joint"
+
+
+@functools.partial(jax.jit, static_argnames=("substeps", "blur"))
+def simulate(
+    values: dict[str, jax.Array],
+    target: jax.Array,
+    latency: jax.Array,
+    timestep: jax.Array,
+    substeps: int,
+    segment: jax.Array | None = None,
+    blur: float = 0.0,
+) -> tuple[jax.Array, jax.Array]:
+    """Readings of the joint at each command.
+
+    Args:
+      values: every name in `PARAMETERS`, scalars; `start` may be [T], that of each sample's
+        segment.
+      target: [T] rad, a new one every `substeps` sub-steps; at rest before the first.
+      latency: [] int, sub-steps until a target acts.
+      timestep: s, of a sub-step.
+      substeps: sub-steps between samples.
+      segment: [T] int, which segment a sample belongs to: at the first of each the joint is put
+        to its `start` and to rest. None is one segment.
+      blur: rad, width of the dead-band's edges, for a gradient that sees it; 0 is the true model.
+
+    Returns:
+      Measured angle [T] rad (encoder bias included) and motor torque [T] Nm, before noise.
+    """
+    drive = Actuator(**{name: values[name] for name in _DRIVE})
+    count = target.shape[0]
+    index = jnp.arange(count * substeps) - latency
+    acting = target[jnp.clip(index // substeps, 0)].reshape(count, substeps)
+    before = jnp.concatenate([acting[:1, 0], acting[:-1, -1]])
+    rate = values["inertia"] / timestep
+    motor = functools.partial(_blurred_torque, blur) if blur > 0 else _torque
+
+    segment = jnp.zeros(count, jnp.int32) if segment is None else segment
+    begins = jnp.concatenate([jnp.ones(1, bool), segment[1:] != segment[:-1]])
+    starts = jnp.broadcast_to(values["start"], (count,))
+
+    def tick(state: tuple, inputs: tuple) -> tuple[tuple, tuple]:
+        position, velocity = state
+        wanted, last, begin, start = inputs
+        position, velocity = jnp.where(begin, start, position), jnp.where(begin, 0.0, velocity)
+        reading = (position + values["encoder_bias"], motor(drive, last, position, velocity))
+        for substep in range(substeps):
+            torque = motor(drive, wanted[substep], position, velocity)
+            torque = torque - (values["gravity_cos"] * jnp.cos(position) + values["gravity_sin"] * jnp.sin(position))
+            velocity = velocity + apply_friction(drive, torque, velocity, rate) / rate
+            position = position + timestep * velocity
+        return (position, velocity), reading
+
+    rest = (starts[0], jnp.zeros_like(starts[0]))
+    return jax.lax.scan(tick, rest, (acting, before, begins, starts))[1]
+
+
+def _torque(drive: Actuator, target: jax.Array, position: jax.Array, velocity: jax.Array) -> jax.Array:
+    return joint_torque(drive, target, 0.0, position, velocity)
+
+
+def _blurred_torque(
+    blur: float, drive: Actuator, target: jax.Array, position: jax.Array, velocity: jax.Array
+) -> jax.Array:
+    """`joint_torque` with a dead-band that fades in over `blur` rad."""
+    error = target - (position + drive.encoder_bias)
+    share = jax.nn.sigmoid((jnp.abs(error) - drive.dead_band) * (4.0 / blur))
+    torque = share * pd_torque(drive, error, 0.0, 0.0, velocity)
+    limit = torque_limit(drive, velocity)
+    return drive.efficiency * jnp.clip(torque, -limit, limit)
+
+
+def segments(log: JointLog, before: int = 8, least: int = 15) -> tuple[np.ndarray, np.ndarray]:
+    """Where a log may be begun anew because the joint rests: segment [T] int32, angle [S] rad.
+
+    A joint in a dead-band or held by friction remembers where it came to rest; a simulation that
+    misses that place by a little goes astray from there on. So each time the target has stood
+    still for `before` samples, and the joint too, a segment of at least `least` samples begins.
+    The angle is the mean of the resting samples, encoder bias included.
+    """
+    position = np.asarray(log.position, float)
+    noise = 1.4826 * np.median(np.abs(np.diff(position, 2))) / np.sqrt(6) + 1e-5
+    changes = np.flatnonzero(np.diff(log.target) != 0) + 1
+    firsts = [0]
+    for change in changes:
+        first = change - before
+        still = first >= 0 and np.all(log.target[first:change] == log.target[first])
+        if not still or first - firsts[-1] < least or len(position) - first < least:
+            continue
+        half = before // 2
+        drift = np.mean(position[first : first + half]) - np.mean(position[change - half : change])
+        if abs(drift) < 4.0 * noise / np.sqrt(half / 2):
+            firsts.append(first)
+    segment = np.zeros(len(position), np.int32)
+    segment[firsts[1:]] = 1
+    angles = [np.mean(position[first : first + max(_still(log, first, before), 1)]) for first in firsts]
+    return np.cumsum(segment, dtype=np.int32), np.array(angles)
+
+
+def _still(log: JointLog, first: int, most: int) -> int:
+    """Samples from `first` on, `most` at most, whose target is the same."""
+    same = log.target[first : first + most] == log.target[first]
+    return int(np.argmin(np.append(same, False)))
+
+
+def complete(values: dict[str, float], log: JointLog) -> dict[str, jax.Array]:
+    """All parameters, with nominal values for those left out.
+
+    Raises:
+      CalibrationError: a name that the model does not know, or one that has no nominal value.
+    """
+    unknown = sorted(set(values) - set(PARAMETERS))
+    if unknown:
+        raise CalibrationError(f"no parameter {unknown[0]!r}: choose from {', '.join(PARAMETERS)}")
+    full = NOMINAL | {"start": float(log.position[0]) - values.get("encoder_bias", 0.0)} | values
+    missing = [name for name in PARAMETERS if name not in full]
+    if missing:
+        raise CalibrationError(f"{log.name}: no value for {missing[0]}")
+    return {name: jnp.float32(full[name]) for name in PARAMETERS}
+
+
+def synthetic_log(
+    key: jax.Array,
+    values: dict[str, float],
+    target: np.ndarray,
+    *,
+    period: float,
+    substeps: int,
+    latency: int = 0,
+    position_noise: float = 0.0,
+    position_resolution: float = 0.0,
+    torque_noise: float = 0.0,
+    with_torque: bool = True,
+    name: str = "joint",
+) -> JointLog:
+    """A log of the model itself: known truth with the noise of a real one.
+
+    Args:
+      values: the truth; the joint starts at the first target unless `start` is given.
+      position_noise, torque_noise: rad, Nm, standard deviations.
+      position_resolution: rad, step of the encoder.
+    """
+    target = np.asarray(target, float)
+    values = {"start": float(target[0])} | values
+    blank = JointLog(period, target, target, name=name)
+    position, torque = simulate(
+        complete(values, blank),
+        jnp.asarray(target, jnp.float32),
+        jnp.int32(latency),
+        jnp.float32(period / substeps),
+        substeps,
+    )
+    keys = jax.random.split(key)
+    position = np.asarray(position + position_noise * jax.random.normal(keys[0], position.shape))
+    if position_resolution > 0:
+        position = np.round(position / position_resolution) * position_resolution
+    torque = np.asarray(torque + torque_noise * jax.random.normal(keys[1], torque.shape))
+    return JointLog(period, target, position.astype(float), torque.astype(float) if with_torque else None, name)

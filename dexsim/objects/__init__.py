@@ -1,0 +1,1 @@
+"""What is grasped or turned: configuration, random draws, meshes."""

@@ -1,0 +1,139 @@
+"""Which objects are drawn, and from which ranges."""
+
+import dataclasses
+
+import numpy as np
+
+from dexsim.core.config import check_ranges, setting, validate
+from dexsim.core.errors import ConfigError
+from dexsim.objects.mesh import MeshObject, load
+
+SLOTS = ("box", "capsule", "cylinder")
+SHAPES = ("sphere", "box", "cylinder", "capsule", "composition")
+KINDS = (*SHAPES, "mesh")
+"""What `ObjectParams.shape_index` counts."""
+OFF = 1e-4  # m, size of a slot that is switched off: a speck at the object's centre
+SIZE_RANGES = ("sphere_radius", "box_half", "cylinder_radius", "cylinder_half", "neck_radius", "neck_half")
+BULK_RANGES = ("mass", "inertia_scale", "com_offset", "friction", "bare_friction", "stiffness", "restitution")
+RANGES = (*SIZE_RANGES, *BULK_RANGES)
+"""Fields of `ObjectConfig` that are drawn for every object."""
+MESH_RANGES = ("mesh_size", *BULK_RANGES)
+"""Those of a mesh."""
+_SPANS = tuple(name for name in (*RANGES, "mesh_size") if name != "com_offset")  # pairs (low, high)
+SHORT = 1e-4  # m, half-length of a capsule that plays a sphere
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ObjectConfig:
+    """Which objects are drawn, and their ranges (low, high). Resampled at every episode start."""
+
+    shapes: tuple[str, ...] = setting(SHAPES, choices=SHAPES)
+    """Kinds of object, drawn with equal probability."""
+    scale: float = setting(1.0, unit="1", low=0.0, high=1.0)
+    """Width of all ranges about their middles; 0 leaves one object of each kind."""
+    mesh: str = setting("")
+    """File of a closed mesh (STL, OBJ, PLY, ...) that takes the place of `shapes`. Its z axis lies across
+    the fingers for a grasp, its x axis stands on the palm for a rotation."""
+    mesh_unit: float = setting(1.0, unit="m", low=1e-6, high=100.0)
+    """Length of that file's unit: 0.001 for millimetres."""
+    mesh_size: tuple[float, float] = setting((1.0, 1.0), unit="1", low=0.1, high=10.0)
+    """Factor on the mesh's size."""
+    mesh_parts: int = setting(6, unit="1", low=1, high=24)
+    """Boxes at most that follow the mesh in the solver, whose cost grows with them."""
+    mesh_touch: str = setting("boxes", choices=("boxes", "grid"))
+    """What the taxels feel of a mesh: the solver's boxes, or the mesh itself through a baked grid."""
+    sphere_radius: tuple[float, float] = setting((0.022, 0.035), unit="m", low=0.005, high=0.08)
+    """Radius of a sphere."""
+    box_half: tuple[float, float] = setting((0.020, 0.030), unit="m", low=0.005, high=0.08)
+    """Each half-extent of a box."""
+    cylinder_radius: tuple[float, float] = setting((0.020, 0.030), unit="m", low=0.005, high=0.08)
+    """Radius of a cylinder or capsule."""
+    cylinder_half: tuple[float, float] = setting((0.020, 0.035), unit="m", low=0.002, high=0.10)
+    """Half-length of a cylinder, or of a capsule's straight part."""
+    neck_radius: tuple[float, float] = setting((0.010, 0.016), unit="m", low=0.003, high=0.05)
+    """Radius of the capsule that juts out of a composition."""
+    neck_half: tuple[float, float] = setting((0.008, 0.018), unit="m", low=0.002, high=0.10)
+    """Half-length of that capsule's straight part."""
+    composition_scale: float = setting(0.8, unit="1", low=0.1, high=2.0)
+    """Size of a composition's box or cylinder, relative to one that stands alone."""
+    mass: tuple[float, float] = setting((0.05, 0.20), unit="kg", low=0.001, high=5.0)
+    """Mass of the object."""
+    inertia_scale: tuple[float, float] = setting((0.8, 1.25), unit="1", low=0.05, high=20.0)
+    """Factor on the inertia of a uniform solid."""
+    com_offset: float = setting(0.003, unit="m", low=0.0, high=0.05)
+    """Largest offset of the centre of mass, per axis."""
+    friction: tuple[float, float] = setting((0.6, 1.2), unit="1", low=0.01, high=5.0)
+    """Sliding friction between the fingertips' rubber and the object."""
+    bare_friction: tuple[float, float] = setting((0.6, 1.2), unit="1", low=0.01, high=5.0)
+    """Sliding friction between all else of the hand (palm, links) and the object."""
+    stiffness: tuple[float, float] = setting((1600.0, 1800.0), unit="N/m", low=10.0, high=1e6)
+    """Force over depth at rest of a fingertip's contact (`contact.BARE_SHARE` times that elsewhere). Where
+    fingertips follow their skin (`PhysicsConfig.tips`), the middle of the default is the skin as it is, and other
+    values make it that much stiffer: wide ranges part the solver's forces from what the taxels feel."""
+    restitution: tuple[float, float] = setting((0.03, 0.08), unit="1", low=0.0, high=0.9)
+    """Coefficient of restitution: the damping of the contact, which also slows creep. What lies
+    below 0.024 bounces as 0.024."""
+    corners: float = setting(0.0, unit="1", low=0.0, high=1.0)
+    """Share of objects with every value at an end of its range; see `dexsim.core.ranges`."""
+
+    def __post_init__(self):
+        validate(self)
+        check_ranges(self, *_SPANS)
+        if not self.shapes:
+            raise ConfigError("ObjectConfig.shapes is empty: name at least one shape")
+
+    def narrowed(self) -> "ObjectConfig":
+        """The ranges as `scale` leaves them, and scale 1."""
+        if self.scale == 1.0:
+            return self
+
+        def narrow(span: tuple[float, float], middle: float) -> tuple[float, float]:
+            return tuple(middle + self.scale * (value - middle) for value in span)
+
+        values = {name: narrow(getattr(self, name), middle(self, name)) for name in _SPANS}
+        return dataclasses.replace(self, scale=1.0, com_offset=self.scale * self.com_offset, **values)
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """Names in KINDS of what is drawn."""
+        return ("mesh",) if self.mesh else self.shapes
+
+    @property
+    def ranges(self) -> tuple[str, ...]:
+        """Fields that are drawn for every object."""
+        return MESH_RANGES if self.mesh else RANGES
+
+    @property
+    def slots(self) -> tuple[str, ...]:
+        """Primitives of the compiled template."""
+        return load_mesh_object(self).kinds if self.mesh else SLOTS
+
+    @property
+    def largest(self) -> np.ndarray:
+        """Upper bound [K, 3] of every slot's size, for the compiled template."""
+        if self.mesh:
+            return self.mesh_size[1] * load_mesh_object(self).boxes.size
+        radius = max(self.cylinder_radius[1], self.sphere_radius[1], self.neck_radius[1])
+        half = max(self.cylinder_half[1], self.neck_half[1])
+        body = max(self.composition_scale, 1.0)  # of the box or cylinder in a composition
+        return np.array(
+            [
+                [body * self.box_half[1]] * 3,
+                [radius, half, 0.0],
+                [body * self.cylinder_radius[1], body * self.cylinder_half[1], 0.0],
+            ]
+        )
+
+
+def load_mesh_object(config: ObjectConfig) -> MeshObject:
+    """The mesh of `config`, fitted.
+
+    Raises:
+      AssetError: see `object_mesh.load`.
+    """
+    return load(config.mesh, unit=config.mesh_unit, parts=config.mesh_parts)
+
+
+def middle(config: ObjectConfig, name: str) -> float:
+    """The nominal value of a range of `ObjectConfig`."""
+    return 1.0 if name == "inertia_scale" else sum(getattr(config, name)) / 2

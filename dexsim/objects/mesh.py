@@ -1,0 +1,109 @@
+"""A mesh as the object of a task: boxes for the solver, mass properties, and a grid for the taxels.
+
+The object's frame lies in the mesh's centre of mass, along the axes of the file where those are its
+principal axes, else along the principal axes, turned as little as possible.
+"""
+
+import dataclasses
+import itertools
+from functools import cached_property, lru_cache
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dexsim.geometry import grid
+from dexsim.geometry import mesh as meshes
+from dexsim.objects.boxes import Boxes, fit_boxes
+
+_ALIGNED = 0.01  # products of inertia below this share of the mean moment are none
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class MeshObject:
+    """A mesh of size 1 in its own frame. Make it with `load`."""
+
+    mesh: meshes.Mesh
+    boxes: Boxes
+    inertia: np.ndarray  # [3] m^2, of a uniform solid of 1 kg
+    axes: np.ndarray  # [3, 3], the frame's axes in the file's, in columns
+    origin: np.ndarray  # [3] m, the frame's origin in the file's
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """The primitives that it consists of."""
+        return ("box",) * len(self.boxes.size)
+
+    @cached_property
+    def _baked(self) -> grid.Grid:
+        with jax.ensure_compile_time_eval():  # whoever asks first may be compiling
+            return grid.bake(self.mesh)
+
+    def grid(self, size: jax.Array) -> grid.Grid:
+        """Its signed distance, where the boxes have these sizes [K, 3] m.
+
+        Raises:
+          AssetError: the mesh cannot be signed.
+        """
+        return grid.select(self._baked, 0, size[0, 0] / self.boxes.size[0, 0])
+
+
+def load(path: str, *, unit: float, parts: int) -> MeshObject:
+    """The object of a mesh file; fitted once and kept on disk.
+
+    Args:
+      path: any format that trimesh reads.
+      unit: m, length of the file's unit.
+      parts: boxes at most.
+
+    Raises:
+      AssetError: no such file, not closed, or not to be followed by so many boxes.
+    """
+    file = Path(path).expanduser()
+    changed = file.stat().st_mtime_ns if file.is_file() else 0
+    return _load(str(file), changed, unit, parts)
+
+
+@lru_cache(maxsize=8)
+def _load(path: str, changed: int, unit: float, parts: int) -> MeshObject:
+    del changed
+    with jax.ensure_compile_time_eval():  # whoever asks first may be compiling
+        return from_mesh(meshes.load_mesh(path, scale=unit), parts)
+
+
+def from_mesh(mesh: meshes.Mesh, parts: int) -> MeshObject:
+    """The object of a mesh that has been checked; see `load`."""
+    import trimesh
+
+    known = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).mass_properties
+    tensor, origin = np.asarray(known.inertia) / known.mass, np.asarray(known.center_mass)
+    axes = principal_axes(tensor)
+    own = meshes.Mesh(mesh.name, (mesh.vertices - origin) @ axes, mesh.faces)
+    inertia = np.diag(axes.T @ tensor @ axes).astype(np.float32)
+    # An L has its bars along the axes of its file.
+    frames = () if np.array_equal(axes, np.eye(3)) else (axes.T,)
+    return MeshObject(own, fit_boxes(own, parts, frames=frames), inertia, axes, origin)
+
+
+def principal_axes(tensor: np.ndarray) -> np.ndarray:
+    """Principal axes [3, 3] of an inertia tensor [3, 3], in columns: the ones nearest to the given axes."""
+    products = tensor - np.diag(np.diag(tensor))
+    if np.abs(products).max() <= _ALIGNED * np.trace(tensor) / 3:
+        return np.eye(3)
+    vectors = np.linalg.eigh(tensor)[1]
+
+    def turned(order: tuple[int, ...]) -> np.ndarray:
+        axes = vectors[:, order]
+        axes = axes * np.where(np.diag(axes) < 0, -1.0, 1.0)
+        if np.linalg.det(axes) < 0:
+            axes[:, np.argmin(np.abs(np.diag(axes)))] *= -1
+        return axes
+
+    return max(map(turned, itertools.permutations(range(3))), key=np.trace)
+
+
+def scaled_boxes(thing: MeshObject, factor: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Sizes [K, 3] m, places [K, 3] m and orientations [K, 4] of its boxes at `factor` times its size."""
+    boxes = thing.boxes
+    return factor * jnp.asarray(boxes.size), factor * jnp.asarray(boxes.position), jnp.asarray(boxes.quat)

@@ -1,0 +1,282 @@
+"""What is grasped: unions of a few primitives whose sizes are drawn at every episode start.
+
+One compiled model has a fixed slot per primitive kind. An object switches slots on and sizes
+them, so spheres, boxes, cylinders, capsules and compositions share one batch. Collision and
+touch read the same sizes.
+
+A sphere is the capsule slot with next to no length: a slot less to collide. A mesh takes the place of
+all that (`ObjectConfig.mesh`): its slots are the boxes that follow it.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dexsim.core.pytree import pytree_dataclass, static
+from dexsim.core.ranges import draw_corner, uniform
+from dexsim.geometry import rotations, sdf
+from dexsim.objects.config import KINDS, OFF, SHAPES, SHORT, SLOTS, ObjectConfig, load_mesh_object, middle
+from dexsim.objects.mesh import scaled_boxes
+
+
+def bounding_radius(size: jax.Array, kinds: tuple[str, ...] = SLOTS) -> jax.Array:
+    """Radius [K] of the sphere round each slot's primitive, for the broad phase."""
+    radius = {
+        "sphere": lambda s: s[0],
+        "box": lambda s: jnp.sqrt(jnp.sum(s * s)),
+        "capsule": lambda s: s[0] + s[1],
+        "cylinder": lambda s: jnp.hypot(s[0], s[1]),
+        "ellipsoid": jnp.max,
+    }
+    return jnp.stack([radius[kind](size[k]) for k, kind in enumerate(kinds)])
+
+
+def extent(
+    size: jax.Array,
+    position: jax.Array,
+    active: jax.Array,
+    direction: jax.Array,
+    kinds: tuple[str, ...] = SLOTS,
+    quat: jax.Array | None = None,
+) -> jax.Array:
+    """How far [] m the object reaches along a unit `direction` [3] of its own frame.
+
+    The other arguments are those of `ObjectParams`.
+    """
+    reach = []
+    for k, kind in enumerate(kinds):
+        local = direction if quat is None else rotations.rotate_inverse(rotations.quat_to_matrix(quat[k]), direction)
+        along, (a, b, c) = jnp.abs(local), size[k]
+        reach.append(
+            {
+                "box": along[0] * a + along[1] * b + along[2] * c,
+                "capsule": a + b * along[2],
+                "cylinder": a * jnp.hypot(along[0], along[1]) + b * along[2],
+            }[kind]
+        )
+    reach = jnp.stack(reach) + jnp.sum(position * direction, -1)
+    return jnp.max(jnp.where(active, reach, -jnp.inf))
+
+
+@pytree_dataclass
+class ObjectParams:
+    """One drawn object; every leaf may differ between environments."""
+
+    shape_index: jax.Array  # [] int32, into SHAPES
+    size: jax.Array  # [K, 3] m
+    position: jax.Array  # [K, 3] m, slot centres in the object's frame
+    active: jax.Array  # [K] bool
+    mass: jax.Array  # [] kg
+    inertia: jax.Array  # [3] kg m^2 about the centre of mass, along the object's axes
+    com: jax.Array  # [3] m
+    friction: jax.Array  # [] sliding on the fingertips
+    contact: jax.Array  # [2] stiffness N/m and damping ratio of a contact
+    quat: jax.Array | None = None  # [K, 4] slot orientations in the object's frame; None: aligned
+    bare_friction: jax.Array | None = None  # [] sliding on the rest of the hand; None: as `friction`
+    kinds: tuple[str, ...] = static(default=SLOTS)
+
+    def pair_friction(self, rubber: np.ndarray) -> jax.Array:
+        """Sliding friction [P] of pairs of the object with a fingertip (`rubber` [P]) or the bare hand."""
+        bare = self.friction if self.bare_friction is None else self.bare_friction
+        return jnp.where(rubber, self.friction, bare)
+
+    def shape(self) -> sdf.Shape:
+        """The union of primitives, for the taxels."""
+        if self.quat is None:
+            rotation = jnp.broadcast_to(jnp.eye(3), (len(self.kinds), 3, 3))
+        else:
+            rotation = rotations.quat_to_matrix(self.quat)
+        return sdf.Shape(self.kinds, self.size, self.position, rotation, self.active)
+
+
+def sample_object(key: jax.Array, config: ObjectConfig, shape_index: jax.Array | None = None) -> ObjectParams:
+    """Draw one object, of a kind in `config.shapes` or of the given one (index into SHAPES), or the mesh.
+
+    Raises:
+      AssetError: the mesh is refused, see `object_mesh.load`.
+    """
+    config, keys, corner = config.narrowed(), jax.random.split(key, 8), draw_corner(key, config.corners)
+    if config.mesh:
+        return _sample_mesh(keys, config, corner)
+    if shape_index is None:
+        allowed = jnp.array([SHAPES.index(name) for name in config.shapes])
+        shape_index = jax.random.choice(keys[0], allowed)
+    size, position, active = _sample_slots(keys[1], shape_index, config, corner)
+    density_mass, com, inertia = _mass_properties(size, position, active)
+    position = position - com  # the origin is the centre of a uniform solid
+    mass = uniform(keys[2], config.mass, corner)
+    scale = uniform(keys[3], config.inertia_scale, corner) * mass / density_mass
+    com = config.com_offset * uniform(keys[4], (-1.0, 1.0), corner, (3,))
+    return ObjectParams(
+        shape_index.astype(jnp.int32),
+        size,
+        position,
+        active,
+        mass,
+        inertia * scale,
+        com,
+        uniform(keys[5], config.friction, corner),
+        _sample_contact(keys, config, corner),
+        bare_friction=_sample_bare_friction(keys, config, corner),
+    )
+
+
+def _sample_mesh(keys: jax.Array, config: ObjectConfig, corner: jax.Array | None) -> ObjectParams:
+    thing = load_mesh_object(config)
+    factor, mass = uniform(keys[1], config.mesh_size, corner), uniform(keys[2], config.mass, corner)
+    size, position, quat = scaled_boxes(thing, factor)
+    inertia = mass * factor**2 * uniform(keys[3], config.inertia_scale, corner) * jnp.asarray(thing.inertia)
+    com = config.com_offset * uniform(keys[4], (-1.0, 1.0), corner, (3,))
+    return ObjectParams(
+        jnp.int32(KINDS.index("mesh")),
+        size,
+        position,
+        jnp.ones(len(size), bool),
+        mass,
+        inertia,
+        com,
+        uniform(keys[5], config.friction, corner),
+        _sample_contact(keys, config, corner),
+        quat,
+        _sample_bare_friction(keys, config, corner),
+        thing.kinds,
+    )
+
+
+def _sample_bare_friction(keys: jax.Array, config: ObjectConfig, corner: jax.Array | None) -> jax.Array:
+    return uniform(jax.random.fold_in(keys[5], 1), config.bare_friction, corner)
+
+
+def _sample_contact(keys: jax.Array, config: ObjectConfig, corner: jax.Array | None) -> jax.Array:
+    return jnp.stack(
+        [uniform(keys[6], config.stiffness, corner), damping_ratio(uniform(keys[7], config.restitution, corner))]
+    )
+
+
+def plain_inertia(target: ObjectParams, config: ObjectConfig | None = None) -> jax.Array:
+    """Inertia [3] m^2 of an object of `config` as a uniform solid of 1 kg, about its centre."""
+    if config is not None and config.mesh:
+        thing = load_mesh_object(config)
+        return (target.size[0, 0] / thing.boxes.size[0, 0]) ** 2 * jnp.asarray(thing.inertia)
+    mass, _, inertia = _mass_properties(target.size, target.position, target.active)
+    return inertia / mass
+
+
+def narrow(target: ObjectParams, config: ObjectConfig, plain: jax.Array, scale: jax.Array) -> ObjectParams:
+    """A drawn object with its bulk nearer to nominal: mass, inertia, centre of mass, friction, contact.
+
+    Its size stays: start states were chosen for it.
+
+    Args:
+      config: the ranges that it was drawn from.
+      plain: [3] m^2, inertia of its shape as a uniform solid of 1 kg.
+      scale: [] in [0, 1]; 0 is nominal exactly, 1 leaves the object as it is.
+    """
+    config = config.narrowed()
+
+    def toward(name: str, value: jax.Array) -> jax.Array:
+        nominal = middle(config, name)
+        return nominal + scale * (value - nominal)
+
+    mass, drawn = toward("mass", target.mass), target.inertia / (target.mass * plain)
+    bounce = damping_ratio(jnp.asarray(middle(config, "restitution")))
+    contact = jnp.stack([toward("stiffness", target.contact[0]), bounce + scale * (target.contact[1] - bounce)])
+    return dataclasses.replace(
+        target,
+        mass=mass,
+        inertia=mass * plain * toward("inertia_scale", drawn),
+        com=scale * target.com,
+        friction=toward("friction", target.friction),
+        contact=contact,
+        bare_friction=(None if target.bare_friction is None else toward("bare_friction", target.bare_friction)),
+    )
+
+
+def restitution(ratio: np.ndarray) -> np.ndarray:
+    """Coefficient of restitution of a spring-damper that pushes but does not pull.
+
+    e = exp(-2 z / sqrt(1 - z^2) atan(sqrt(1 - z^2) / z)), with the hyperbolic functions above 1:
+    contact ends when the force does, before the spring is back at its length (Schwager and
+    Poeschel, Granular Matter 9 (2007) 465).
+    """
+    ratio = np.asarray(ratio, float)
+    root = np.maximum(np.sqrt(np.abs(1 - ratio**2)), 1e-6)
+    angle = np.where(
+        ratio < 1, np.arctan2(root, ratio), np.arctanh(np.minimum(root / np.maximum(ratio, 1.0), 1 - 1e-12))
+    )
+    return np.exp(-2 * ratio / root * angle)
+
+
+# Closer together at the low end, where the restitution falls fast.
+_RATIOS = 3.0 * np.linspace(0.0, 1.0, 200) ** 2
+_RESTITUTIONS = restitution(_RATIOS)
+
+
+def damping_ratio(restitution: jax.Array) -> jax.Array:
+    """Damping ratio [...] of a contact that bounces with this restitution [...], at most 3.
+
+    MuJoCo has no restitution parameter; its contacts push but do not pull.
+    """
+    return jnp.interp(
+        restitution, jnp.asarray(_RESTITUTIONS[::-1], jnp.float32), jnp.asarray(_RATIOS[::-1], jnp.float32)
+    )
+
+
+def _sample_slots(
+    key: jax.Array, shape_index: jax.Array, config: ObjectConfig, corner: jax.Array | None
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    keys = jax.random.split(key, 7)
+    is_sphere, is_box, is_cylinder, is_capsule, is_union = (shape_index == i for i in range(5))
+    part = jnp.where(is_union, config.composition_scale, 1.0)
+    half = part * uniform(keys[0], config.box_half, corner, (3,))
+    radius = part * uniform(keys[1], config.cylinder_radius, corner)
+    length = part * uniform(keys[2], config.cylinder_half, corner)
+    ball = uniform(keys[3], config.sphere_radius, corner)
+    neck, neck_half = uniform(keys[4], config.neck_radius, corner), uniform(keys[5], config.neck_half, corner)
+    box_body = jax.random.bernoulli(keys[6])
+
+    # A composition is a box or a cylinder with a capsule jutting out along its axis.
+    body_half = jnp.where(box_body, half[2], length)
+    capsule = jnp.where(
+        is_sphere,
+        jnp.stack([ball, SHORT]),
+        jnp.where(is_union, jnp.stack([neck, neck_half]), jnp.stack([radius, length])),
+    )
+    zero = jnp.zeros(())
+    size = jnp.stack([half, jnp.stack([*capsule, zero]), jnp.stack([radius, length, zero])])
+    active = jnp.stack(
+        [is_box | (is_union & box_body), is_sphere | is_capsule | is_union, is_cylinder | (is_union & ~box_body)]
+    )
+    jut = jnp.where(is_union, body_half + neck_half, 0.0)
+    position = jnp.zeros((3, 3)).at[1, 2].set(jut)
+    return jnp.where(active[:, None], size, OFF), position, active
+
+
+def _mass_properties(size: jax.Array, position: jax.Array, active: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Mass, centre and inertia (about the centre) of the union at unit density.
+
+    Overlaps count twice; the drawn mass and inertia scale absorb it.
+    """
+    (a, b, c), (r, h, _), (cr, ch, _) = size
+    box_mass = 8 * a * b * c
+    box_inertia = box_mass / 3 * jnp.stack([b * b + c * c, a * a + c * c, a * a + b * b])
+    tube, ball = 2 * jnp.pi * r * r * h, 4 / 3 * jnp.pi * r**3
+    side = tube * (r * r / 4 + h * h / 3) + ball * (2 / 5 * r * r + h * h + 3 / 4 * r * h)
+    capsule_inertia = jnp.stack([side, side, tube * r * r / 2 + ball * 2 / 5 * r * r])
+    cylinder_mass = 2 * jnp.pi * cr * cr * ch
+    side = cylinder_mass * (cr * cr / 4 + ch * ch / 3)
+    cylinder_inertia = jnp.stack([side, side, cylinder_mass * cr * cr / 2])
+
+    mass = jnp.where(active, jnp.stack([box_mass, tube + ball, cylinder_mass]), 0.0)
+    inertia = jnp.where(active[:, None], jnp.stack([box_inertia, capsule_inertia, cylinder_inertia]), 0.0)
+    z = jnp.where(active, position[:, 2], 0.0)
+    total = jnp.sum(mass)
+    centre = jnp.sum(mass * z) / total
+    shift = jnp.sum(mass * (z - centre) ** 2)
+    return (
+        total,
+        jnp.stack([jnp.zeros(()), jnp.zeros(()), centre]),
+        jnp.sum(inertia, 0) + shift * jnp.array([1.0, 1.0, 0.0]),
+    )

@@ -1,0 +1,1 @@
+"""The physics seam: one scene, several backends."""

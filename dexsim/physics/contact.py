@@ -1,0 +1,180 @@
+"""Contacts of hand and object: their stiffness in MuJoCo's terms, and the rubber on the fingertips.
+
+A spring of constant stiffness presses alike on a face, an edge and a corner; skin does not: at one depth
+an edge presses half of what a face does. So a fingertip's springs take their stiffness, tick by tick, from
+the skin's law over the taxels (`follow_skin`), and the solver's force is the skin's. For this a fingertip is
+a row of spheres (`split_pads`): a sphere meets a primitive in exactly one point, with every engine, at a
+depth that is known in closed form, where capsules have one or two points on a box and other ones by engine.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from dexsim.geometry import rotations, sdf
+from dexsim.hand.kinematics import Hand, HandPose
+from dexsim.objects.params import ObjectParams
+from dexsim.touch.feel import feel_links
+from dexsim.touch.skin import Skin
+
+# One sphere's share of a fingertip's stiffness: two of a row lie in a dent, or three.
+ROW_SHARE = 0.5
+# What wears no rubber is stiffer: the palm carries the sum of the fingers.
+BARE_SHARE = 2.5
+# N/m, the stiffness of a fingertip that `ObjectParams.contact` scales: that of the template, too.
+NOMINAL = 1700.0
+# How far the skin may make a fingertip's springs softer and stiffer than that. The floor keeps corners,
+# which press next to no skin, from sinking in.
+SOFTEST, STIFFEST = 0.25, 4.0
+# m, depth below which springs are the nominal ones: there the skin's law is the lattice's coarseness.
+FIRST = 0.0005
+
+
+def spring(
+    compliance: jax.Array, stiffness: jax.Array, ratio: jax.Array, friction: jax.Array, *, period: float, edges: int = 0
+) -> tuple[jax.Array, jax.Array]:
+    """MuJoCo's parameters for contacts that press with `stiffness` times depth at rest.
+
+    MuJoCo's own parameters fix accelerations instead. The force at rest is N = k d^2 r / (A (1 - d))
+    for a depth r, an impedance d, a reference stiffness k and the inverse weights A of the two bodies;
+    with a pyramid of E edges instead of the elliptic cone it is N = E k d^2 r / (2 mu^2 (1 + mu^2) A
+    (1 - d)) (documentation, chapter Computation, section Constraint model; mj_diagApprox and
+    mj_makeImpedance): at one solref it changes sevenfold between a friction of 0.6 and 1.2. Here
+    k = 1 / (period^2 d), and d follows from N = stiffness r.
+
+    Args:
+      compliance: [P] 1/kg, inverse weights A of the two bodies of each pair.
+      stiffness: [P] N/m.
+      ratio: [] damping ratio.
+      friction: [P] (or [] for all) sliding.
+      period: s, time scale on which a contact pushes out what lies in it.
+      edges: of the friction pyramid; 0 for an elliptic cone, and without friction.
+
+    Returns:
+      solref [P, 2] (direct format) and solimp [P, 5].
+    """
+    cone = 2 * friction**2 * (1 + friction**2) / edges if edges else 1.0
+    load = stiffness * cone * compliance * period**2
+    impedance = jnp.clip(load / (1 + load), 1e-3, 0.9999)
+    solref = jnp.stack([-impedance / period**2, -2 * ratio / period * impedance], -1)
+    flat = jnp.broadcast_to(jnp.array([0.001, 0.5, 2.0]), (*impedance.shape, 3))
+    return solref, jnp.concatenate([impedance[:, None], impedance[:, None], flat], -1)
+
+
+def pairs_with(model: mujoco.MjModel, geoms: np.ndarray) -> np.ndarray:
+    """Indices of the explicit pairs that one of `geoms` is part of."""
+    return np.flatnonzero(np.isin(model.pair_geom1, geoms) | np.isin(model.pair_geom2, geoms))
+
+
+def pair_constants(
+    model: mujoco.MjModel, pairs: np.ndarray, tips: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Inverse weights [P] 1/kg of pairs, their share of the stiffness [P], and whose they are [P].
+
+    `tips` are the bodies [F] of the fingertips; -1 is what belongs to none of them.
+    """
+    both = np.stack([model.pair_geom1[pairs], model.pair_geom2[pairs]])
+    bodies = model.geom_bodyid[both]
+    ball = (np.isin(bodies, tips) & (model.geom_type[both] == mujoco.mjtGeom.mjGEOM_SPHERE)).any(0)
+    finger = np.full(len(pairs), -1)
+    for index, tip in enumerate(tips):
+        finger[(bodies == tip).any(0)] = index
+    share = np.where(finger < 0, BARE_SHARE, np.where(ball, ROW_SHARE, 1.0))
+    return model.body_invweight0[bodies, 0].sum(0), share, finger
+
+
+def cover_tips(spec: mujoco.MjSpec, hand: Hand, cover: float) -> None:
+    """Let the geoms of the fingertips that touch stand out by `cover` m."""
+    tips = {hand.body_names[b] for b in hand.tip_body}
+    for geom in spec.geoms:
+        if geom.parent.name in tips and (geom.contype or geom.conaffinity):
+            round_ = geom.type in (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE)
+            size = np.array(geom.size)
+            size[: 1 if round_ else 3] += cover
+            geom.size = size
+
+
+def split_pads(spec: mujoco.MjSpec, hand: Hand, touching: list[str], points: int) -> list[str]:
+    """Lay a row of `points` spheres into every capsule of a fingertip that touches.
+
+    The capsules stay for what they touch beside the object.
+
+    Returns:
+      The names of what meets the object: `touching` with the spheres in place of their capsules.
+    """
+    names = []
+    placed = {geom.name: geom for geom in hand.geoms}
+    for name in touching:
+        geom, place = spec.geom(name), placed[name]
+        if place.body not in hand.tip_body or place.kind != "capsule":
+            names.append(name)
+            continue
+        for index, along in enumerate(np.linspace(-1.0, 1.0, points) if points > 1 else [0.0]):
+            ball = geom.parent.add_geom(
+                name=f"{name}_{index}",
+                type=mujoco.mjtGeom.mjGEOM_SPHERE,
+                mass=0.0,
+                group=geom.group,
+                pos=place.position + along * place.size[1] * place.rotation[:, 2],
+                size=[geom.size[0], 0, 0],
+                rgba=geom.rgba,
+            )
+            names.append(ball.name)
+    return names
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Pads:
+    """The spheres of the fingertips, in the frames of their links; fingers with fewer have radii of 0."""
+
+    centre: np.ndarray  # [F, S, 3] m
+    radius: np.ndarray  # [F, S] m
+
+
+def find_pads(model: mujoco.MjModel, pairs: np.ndarray, tips: np.ndarray) -> Pads:
+    """The spheres on bodies `tips` [F] that are part of `pairs`."""
+    used = np.unique([model.pair_geom1[pairs], model.pair_geom2[pairs]])
+    used = used[model.geom_type[used] == mujoco.mjtGeom.mjGEOM_SPHERE]
+    rows = [used[model.geom_bodyid[used] == tip] for tip in tips]
+    longest = max(map(len, rows))
+    centre, radius = np.zeros((len(rows), longest, 3), np.float32), np.zeros((len(rows), longest), np.float32)
+    for finger, row in enumerate(rows):
+        centre[finger, : len(row)], radius[finger, : len(row)] = model.geom_pos[row], model.geom_size[row, 0]
+    return Pads(centre, radius)
+
+
+def follow_skin(
+    hand: Hand,
+    pads: Pads,
+    skin: Skin,
+    pose: HandPose,
+    target: ObjectParams,
+    position: jax.Array,
+    rotation: jax.Array,
+) -> jax.Array:
+    """How much stiffer [F] than nominal a fingertip's springs are for their sum to be the skin's force.
+
+    The springs of a finger press with stiffness times the sum D of their depths, its skin with S: the
+    ratio is S / (NOMINAL ROW_SHARE D), and 1 where nothing touches yet, between `SOFTEST` and `STIFFEST`.
+    The first millimetre blends (`FIRST`).
+
+    Args:
+      pose: of the hand; `position` [3] and `rotation` [3, 3] are the object's, in the palm frame.
+    """
+    shape = target.shape()
+    touch = feel_links(hand, pose, shape, position, rotation, jnp.ones(hand.num_fingers), skin)
+    centre = pose.body_position[hand.tip_body][:, None] + rotations.rotate(
+        pose.tip_rotation[:, None], jnp.asarray(pads.centre)
+    )
+    local, depth = sdf.to_local(centre, position, rotation), 0.0
+    for k, kind in enumerate(shape.kinds):  # one spring for every primitive that a sphere is in
+        here = sdf.to_local(local, shape.position[k], shape.rotation[k])
+        gap = sdf.primitive_distance(kind, here, shape.size[k])
+        depth += jnp.where(shape.active[k], jnp.maximum(jnp.asarray(pads.radius) - gap, 0.0), 0.0)
+    nominal = NOMINAL * ROW_SHARE
+    ratio = (jnp.sum(touch.skin_force, -1) + nominal * FIRST) / (nominal * (jnp.sum(depth, -1) + FIRST))
+    has = jnp.asarray(pads.radius.any(-1))  # a fingertip that is no row of spheres keeps its stiffness
+    return jnp.where(has, jnp.clip(ratio, SOFTEST, STIFFEST), 1.0)

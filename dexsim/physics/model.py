@@ -1,0 +1,136 @@
+"""The scene that the physics runs: hand, object and explicit contact pairs in one MuJoCo model."""
+
+import mujoco
+import numpy as np
+
+from dexsim.core.errors import AssetError
+from dexsim.hand.kinematics import Hand
+from dexsim.physics import contact
+from dexsim.physics.config import PhysicsConfig
+from dexsim.physics.guard import check_model
+
+GEOM_TYPES = {
+    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
+    "box": mujoco.mjtGeom.mjGEOM_BOX,
+    "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
+    "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
+    "ellipsoid": mujoco.mjtGeom.mjGEOM_ELLIPSOID,
+}
+# Primitives that meet a box in closed form with every engine.
+_MEETS_BOXES = {"sphere", "capsule", "box"}
+
+
+def build_model(
+    hand: Hand,
+    slots: tuple[str, ...],
+    largest: np.ndarray,
+    config: PhysicsConfig,
+    gravity: tuple[float, float, float],
+    backend: str,
+    *,
+    rotor_share: float = 0.0,
+) -> mujoco.MjModel:
+    """The scene as a C MuJoCo model: hand, free object, explicit pairs, force sensors.
+
+    Also what the tests and the emulated hand compare against.
+    """
+    spec = mujoco.MjSpec.from_file(str(hand.model_path))
+    check_model(spec.compile(), backend, hand.model_path)
+    for element in (*spec.actuators, *spec.sensors, *spec.keys):
+        spec.delete(element)  # torques come from our actuator model, readings from our sensors
+    for joint in spec.joints:
+        joint.armature *= 1 - rotor_share
+    palm = spec.body(hand.palm)
+    palm.pos, palm.quat = [0, 0, 0], [1, 0, 0, 0]
+    touching = _touching_geoms(hand, slots, config)
+    contact.cover_tips(spec, hand, config.cover)
+    touching = contact.split_pads(spec, hand, touching, config.pad_points)
+    for geom in spec.geoms:
+        geom.contype = geom.conaffinity = 0
+
+    # A template of middling mass: its invweight0 sets the contact stiffness for all objects.
+    body = spec.worldbody.add_body(
+        name="object", mass=0.1, inertia=[5e-5] * 3, explicitinertial=True, pos=[0.1, 0, 0.1]
+    )
+    body.add_freejoint(name="object")
+    for k, kind in enumerate(slots):
+        body.add_geom(
+            name=f"object_{k}",
+            type=GEOM_TYPES[kind],
+            size=largest[k],
+            contype=0,
+            conaffinity=0,
+            mass=0,
+            group=3,
+            rgba=[0.85, 0.55, 0.25, 1],
+        )
+        for name in touching:
+            spec.add_pair(
+                geomname1=name, geomname2=f"object_{k}", condim=config.condim, friction=[0.9, 0.9, 0.005, 1e-4, 1e-4]
+            )
+    if backend == "warp":
+        for b in hand.tip_body:
+            # data: bit 1 is the force; reduce: 3 is the net force, in the world frame.
+            spec.add_sensor(
+                type=mujoco.mjtSensor.mjSENS_CONTACT,
+                objtype=mujoco.mjtObj.mjOBJ_BODY,
+                objname=hand.body_names[b],
+                reftype=mujoco.mjtObj.mjOBJ_BODY,
+                refname="object",
+                intprm=[2, 3, 1],
+                dim=3,
+            )
+    _set_options(spec, config, gravity, backend)
+    for pair in spec.pairs:
+        if pair.condim == 1 and spec.option.cone == mujoco.mjtCone.mjCONE_ELLIPTIC:
+            # MJX-JAX knows no frictionless contacts beside elliptic cones; this one slides as freely.
+            pair.condim, pair.friction = 3, [1e-3, 1e-3, 0.005, 1e-4, 1e-4]
+    model = spec.compile()
+    geoms = np.flatnonzero(model.geom_bodyid == model.body("object").id)
+    pairs = contact.pairs_with(model, geoms)
+    compliance, share, _ = contact.pair_constants(model, pairs, tip_bodies(model, hand))
+    model.pair_solref[pairs], model.pair_solimp[pairs] = contact.spring(
+        compliance, share * contact.NOMINAL, 2.0, 0.9, period=config.contact_period, edges=config.pyramid_edges
+    )
+    return model
+
+
+def tip_bodies(model: mujoco.MjModel, hand: Hand) -> np.ndarray:
+    """Body ids [F] of the fingertips."""
+    return np.array([model.body(hand.body_names[b]).id for b in hand.tip_body])
+
+
+def _touching_geoms(hand: Hand, slots: tuple[str, ...], config: PhysicsConfig) -> list[str]:
+    geoms = [g for g in hand.geoms if g.touches]
+    palm = hand.body_names.index(hand.palm)
+    kinds = {g.kind for g in geoms if g.body == palm}
+    if "plane" in kinds:
+        use_box = config.palm == "box" or (config.palm == "auto" and "box" in kinds and set(slots) <= _MEETS_BOXES)
+        geoms = [g for g in geoms if g.body != palm or (g.kind != "plane") == use_box]
+    if not geoms or any(not g.name for g in geoms):
+        raise AssetError(
+            f"{hand.model_path}: every geom that touches the object (contype or "
+            "conaffinity not 0) needs a name, and there must be at least one"
+        )
+    return [g.name for g in geoms]
+
+
+def _set_options(spec: mujoco.MjSpec, config: PhysicsConfig, gravity: tuple[float, float, float], backend: str) -> None:
+    option = spec.option
+    option.timestep, option.gravity = config.timestep, gravity
+    option.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    # Without friction the cone is a line, and the JAX backend knows it as a pyramid only.
+    elliptic = config.cone == "elliptic" and config.condim > 1
+    option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC if elliptic else mujoco.mjtCone.mjCONE_PYRAMIDAL
+    option.impratio = config.friction_ratio if elliptic else 1.0
+    if elliptic and backend == "warp":
+        # Warp builds the Hessian of elliptic cones in one go only where the Jacobian is sparse: a
+        # third faster here, though a dense one would fit as well.
+        option.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
+    option.iterations, option.ls_iterations = config.iterations, config.line_search
+    # Box-box has its own kernel only with nativeccd off; eulerdamp costs a factorisation more.
+    option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP | mujoco.mjtDisableBit.mjDSBL_NATIVECCD
+    # MJX also offers max_geom_pairs, a cull by bounding spheres. It drops touching pairs of long
+    # capsules, one tick this finger, the next tick that one, so it stays off.
+    spec.add_numeric(name="max_contact_points", data=[float(config.max_contacts)], size=1)

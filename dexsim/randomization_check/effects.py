@@ -1,0 +1,328 @@
+"""What drawing a range changes: in the drive or the compiled model, and then in motion and readings.
+
+Every range is drawn by itself, all others at their nominal values, and the same starts and actions are
+run with and without it. Two runs of the same differ on the Warp backend, and ever more with every tick,
+so a difference counts only in ticks in which it is larger than that.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dexsim.core.compilation import collector_paused
+from dexsim.objects.config import SHAPES
+from dexsim.randomization import Randomization, sample
+from dexsim.sensing.imu import OrientationSensor, draw_sensor
+
+NOMINAL = {
+    "stiffness_factor": 1.0,
+    "damping_factor": 1.0,
+    "torque_factor": 1.0,
+    "speed_factor": 1.0,
+    "efficiency": 1.0,
+    "torque_gain": 1.0,
+    "taxel_gain": 1.0,
+}
+"""Nominal values that are not 0."""
+
+READINGS = ("joint_position", "joint_torque", "taxel_force", "object_position", "object_quat")
+# What must be there for a range to show.
+_AIDS = {"ripple_count": {"ripple": (0.03, 0.03)}, "hysteresis_time": {"hysteresis": (0.3, 0.3)}}
+_SHAPE_OF = {"sphere": "sphere", "cylinder": "cylinder", "neck": "composition"}
+_WIDTHS = ("encoder_bias", "gravity_tilt", "com_offset", "bias", "drift")  # ranges given by one number
+
+
+@dataclasses.dataclass(frozen=True)
+class Effect:
+    """What drawing one range does."""
+
+    name: str
+    changed: tuple[str, ...] = ()  # leaves of the draw, fields of the compiled model
+    spread: float = 0.0  # largest standard deviation of such a leaf over the batch, over its size
+    joint: float = 0.0  # rad, root mean square over batch and joints, in the tick where it is largest
+    object: float = 0.0  # m, likewise
+    reading: float = 0.0  # root mean square change of the readings it moves most, over their size
+    which: str = ""  # that reading
+    off: bool = False  # the range has no width: nothing to see
+
+    @property
+    def found(self) -> bool:
+        """It reaches the drive or the model, and after it the motion or what is measured."""
+        return self.off or (bool(self.changed) and max(self.joint, self.object, self.reading) > 0)
+
+
+def check(
+    env: Any, step: Callable, states: Any, *, key: jax.Array, ticks: int = 12, names: Sequence[str] | None = None
+) -> list[Effect]:
+    """Draw every range by itself and compare the motion.
+
+    Args:
+      env: an environment of `dexsim.env.env`.
+      step: its compiled `step` over a batch.
+      states: a batch of fresh states.
+      key: of the draws and actions.
+      ticks: length of the comparison.
+      names: which ranges ("Randomization.x", "ObjectConfig.x", "push"); by default all but those of the
+        model of backlash that is not chosen.
+    """
+    bench = _Bench(env, step, states, key, ticks)
+    tests: dict[str, Callable[[], Effect]] = {}
+    for name in _ranges(env.config.randomization):
+        tests[f"Randomization.{name}"] = lambda n=name: bench.hand_range(n)
+    for name in _ranges(env.config.sensing.orientation):
+        tests[f"OrientationSensor.{name}"] = lambda n=name: bench.orientation_range(n)
+    for name in _ranges(env.config.sensing.array) if env.senses.array is not None else ():
+        tests[f"SensorNoise.{name}"] = lambda n=name: bench.array_range(n)
+    for path in env.task.object_ranges:
+        owner, name = _owner(env.config, path)
+        tests[f"{type(owner).__name__}.{name}"] = lambda p=path: bench.object_range(p)
+    tests["push"] = bench.push
+    unused = f"Randomization.{_unused(env.config.randomization)}"
+    return [tests[name]() for name in names or (name for name in tests if name != unused)]
+
+
+def _unused(ranges: Any) -> str:
+    """The range of the model of backlash that is not chosen."""
+    return {"dead_band": "gear_gap", "gear_play": "dead_band"}[ranges.backlash]
+
+
+def _ranges(config: Any) -> list[str]:
+    """Names of (low, high) pairs, and of largest deviations from 0."""
+
+    def is_range(name: str) -> bool:
+        value = getattr(config, name)
+        return value is not None and (
+            name in _WIDTHS
+            or (isinstance(value, tuple) and len(value) == 2 and all(isinstance(v, (int, float)) for v in value))
+        )
+
+    return [field.name for field in dataclasses.fields(config) if is_range(field.name)]
+
+
+class _Bench:
+    """The same starts and actions for all ranges."""
+
+    def __init__(self, env: Any, step: Callable, states: Any, key: jax.Array, ticks: int):
+        self.env, self.step = env, step
+        self.count = len(states.tick)
+        self.key, action_key = jax.random.split(key)
+        # Fingers close, and all joints are thrown about: contact, full torque and speed occur.
+        throw = jax.random.uniform(action_key, (ticks, self.count, env.action_size), minval=-1.0)
+        close = jnp.asarray([0.0 if low < 0 else 0.5 for low in env.hand.joint_lower])
+        self.actions = jnp.clip(throw + close, -1.0, 1.0)
+        self.states = dataclasses.replace(
+            states,
+            draw=self._draw(self._only()),
+            orientation_sensor=self._imu(_still_imu(env)),
+            array_params=self._array(),
+        )
+        self.base = self._run(self.states)
+        # On the Warp backend two runs of the same differ: what is not well above that is no effect.
+        again = [self._distance(self._run(self.states)) for _ in range(1 if env.backend == "jax" else 3)]
+        self.floor = {name: 3.0 * np.max([run[name] for run in again], 0) for name in self.base}
+
+    def _only(self, *names: str) -> Randomization:
+        """The ranges with all but these at their nominal values."""
+        config, fixed = self.env.config.randomization, {}
+        for name in _ranges(config):
+            if name not in names:
+                centre = NOMINAL.get(name, 0.0)
+                fixed[name] = (centre, centre) if isinstance(getattr(config, name), tuple) else 0.0
+        for name in names:
+            fixed |= _AIDS.get(name, {})
+        return dataclasses.replace(config, scale=1.0, **fixed)
+
+    def _draw(self, config: Randomization) -> Any:
+        return jax.vmap(
+            lambda key: sample(
+                key,
+                config,
+                self.env.hand,
+                timestep=self.env.config.physics.timestep,
+                control_period=self.env.control_period,
+            )
+        )(jax.random.split(self.key, self.count))
+
+    def _imu(self, config: OrientationSensor) -> Any:
+        return jax.vmap(lambda key: draw_sensor(key, config, 1.0, self.env.control_period))(
+            jax.random.split(self.key, self.count)
+        )
+
+    def _array(self, *names: str, **aids: Any) -> Any:
+        """Taxels that are perfect but for these ranges, with the structure of the environment's."""
+        env = self.env
+        if env.senses.array is None:
+            return None
+        config = env.config.sensing.array
+        nominal = {"rate": 1 / env.control_period, "gain": 1.0, "hysteresis_time": config.hysteresis_time[0]}
+        fixed = {name: (nominal.get(name, 0.0),) * 2 for name in _ranges(config) if name not in names}
+        perfect = dataclasses.replace(config, scale=1.0, **fixed | aids).model(
+            env.hand.taxel_grid, fingers=env.hand.num_fingers, control_period=env.control_period
+        )
+        return jax.vmap(perfect.sample)(jax.random.split(self.key, self.count))
+
+    def _run(self, states: Any) -> dict[str, np.ndarray]:
+        """Tracks [T, ...] of what is compared."""
+        physics, rows = self.env.physics, []
+        for action in self.actions:
+            with collector_paused():
+                states = jax.block_until_ready(self.step(states, action))
+            qpos = np.asarray(states.physics.qpos, float)
+            rows.append(
+                {
+                    "joint": qpos[:, physics.joint_qpos],
+                    "object": qpos[:, physics.object_qpos[:3]],
+                    **{name: np.asarray(getattr(states.readings, name), float) for name in READINGS},
+                }
+            )
+        return {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+
+    def _distance(
+        self, track: dict[str, np.ndarray], base: dict[str, np.ndarray] | None = None
+    ) -> dict[str, np.ndarray]:
+        """Root mean square [T] over batch and components, by quantity."""
+        base = self.base if base is None else base
+        return {
+            name: np.sqrt(np.mean((track[name] - base[name]) ** 2, (1, 2) if track[name].ndim == 3 else (1, 2, 3)))
+            for name in base
+        }
+
+    def _effect(
+        self, name: str, before: Any, after: Any, states: Any, base: dict[str, np.ndarray] | None = None
+    ) -> Effect:
+        changed, spread = changes(before, after)
+        distance = self._distance(self._run(states), base)
+        largest = {
+            name: float(np.max(value, where=value > self.floor[name], initial=0.0)) for name, value in distance.items()
+        }
+        size = {name: float(np.sqrt(np.mean(self.base[name] ** 2))) or 1.0 for name in READINGS}
+        readings = {name: largest[name] / size[name] for name in READINGS}
+        most = max(readings, key=readings.__getitem__)
+        return Effect(name, changed, spread, largest["joint"], largest["object"], readings[most], most)
+
+    def hand_range(self, name: str) -> Effect:
+        """One field of `Randomization`."""
+        label, ranges = f"Randomization.{name}", self.env.config.randomization
+        if name == _unused(ranges) or _width(getattr(ranges, name)) == 0:
+            return Effect(label, off=True)
+        base, before = None, self.states.draw
+        if name in _AIDS:
+            before = self._draw(dataclasses.replace(self._only(), **_AIDS[name]))
+            base = self._run(dataclasses.replace(self.states, draw=before))
+        draw = self._draw(self._only(name))
+        return self._effect(label, before, draw, dataclasses.replace(self.states, draw=draw), base)
+
+    def orientation_range(self, name: str) -> Effect:
+        """One field of `OrientationSensor`."""
+        label, config = f"OrientationSensor.{name}", self.env.config.sensing.orientation
+        if _width(getattr(config, name)) == 0:
+            return Effect(label, off=True)
+        drawn = self._imu(dataclasses.replace(_still_imu(self.env), **{name: getattr(config, name)}))
+        return self._effect(
+            label, self.states.orientation_sensor, drawn, dataclasses.replace(self.states, orientation_sensor=drawn)
+        )
+
+    def array_range(self, name: str) -> Effect:
+        """One field of `SensorNoise`."""
+        label, span = f"SensorNoise.{name}", getattr(self.env.config.sensing.array, name)
+        if _width(span) == 0:
+            return Effect(label, off=True)
+        base, before, aids = None, self.states.array_params, _AIDS.get(name, {})
+        if aids:
+            before = self._array(**aids)
+            base = self._run(dataclasses.replace(self.states, array_params=before))
+        drawn = self._array(name, **aids)
+        return self._effect(label, before, drawn, dataclasses.replace(self.states, array_params=drawn), base)
+
+    def object_range(self, path: str) -> Effect:
+        """One range of the object, on objects of a shape that has it."""
+        env, (owner, name) = self.env, _owner(self.env.config, path)
+        label = f"{type(owner).__name__}.{name}"
+        if _width(getattr(owner, name)) == 0:
+            return Effect(label, off=True)
+        nominal = env.config
+        for other in env.task.object_ranges:
+            holder, field = _owner(nominal, other)
+            centre = 0.0 if field in _WIDTHS else (float(np.mean(getattr(holder, field))),) * 2
+            nominal = _with(nominal, other, centre)
+        shape = jnp.int32(SHAPES.index(_SHAPE_OF.get(name.split("_")[0], "box")))
+        keys = jax.random.split(self.key, self.count)
+        before, after = (
+            jax.vmap(lambda key, c=c: env.task.draw_object(key, c, shape))(keys)
+            for c in (nominal, _with(nominal, path, getattr(owner, name)))
+        )
+        base = self._run(dataclasses.replace(self.states, target=before))
+        effect = self._effect(label, before, after, dataclasses.replace(self.states, target=after), base)
+        # What the physics is given must differ too, not only what was drawn.
+        models = [env.physics.configure(jax.tree.map(lambda leaf: leaf[0], target)) for target in (before, after)]
+        return dataclasses.replace(effect, changed=changes(*models)[0])
+
+    def push(self) -> Effect:
+        """Pushes by the task: starts whose first tick has one, against starts whose has none."""
+        keys = jax.random.split(self.key, 8192)
+        forces = np.asarray(
+            jax.vmap(
+                lambda key: self.env.task.push(
+                    jax.random.split(key, 4)[1], jax.tree.map(lambda leaf: leaf[0], self.states.target)
+                )
+            )(keys)
+        )
+        hit = np.any(forces != 0, -1)
+        if not np.any(hit):
+            return Effect("push", off=True)
+        tracks = []
+        for rows in (np.flatnonzero(~hit), np.flatnonzero(hit)):
+            with collector_paused():
+                state = jax.block_until_ready(
+                    self.step(dataclasses.replace(self.states, key=keys[np.resize(rows, self.count)]), self.actions[0])
+                )
+            tracks.append(np.asarray(state.physics.qpos, float)[:, self.env.physics.object_qpos[:3]])
+        moved = float(np.sqrt(np.mean((tracks[1] - tracks[0]) ** 2)))
+        return Effect(
+            "push",
+            ("xfrc_applied",),
+            float(np.std(forces[hit])),
+            object=moved if moved > self.floor["object"][0] else 0.0,
+        )
+
+
+def changes(before: Any, after: Any) -> tuple[tuple[str, ...], float]:
+    """Names of the leaves that differ, and the largest of their relative spreads."""
+    names, spreads = [], [0.0]
+    pairs = zip(jax.tree_util.tree_flatten_with_path(before)[0], jax.tree.leaves(after), strict=True)
+    for (path, old), new in pairs:
+        if not isinstance(old, (jax.Array, np.ndarray)) or old.dtype.kind not in "biuf":
+            continue
+        old, new = np.asarray(old, float), np.asarray(new, float)
+        if np.array_equal(old, new):
+            continue
+        names.append(jax.tree_util.keystr(path).lstrip("."))
+        size = np.sqrt(np.mean(new**2, 0))
+        spreads.append(float(np.max(np.std(new - old, 0) / np.where(size > 0, size, 1.0))))
+    return tuple(names), max(spreads)
+
+
+def _width(span: float | tuple[float, float]) -> float:
+    return span[1] - span[0] if isinstance(span, tuple) else span
+
+
+def _still_imu(env: Any) -> OrientationSensor:
+    return dataclasses.replace(env.config.sensing.orientation, bias=0.0, drift=0.0, delay=(0.0, 0.0))
+
+
+def _owner(config: Any, path: str) -> tuple[Any, str]:
+    """The dataclass that holds a dotted path, and the last name."""
+    *parents, name = path.split(".")
+    for parent in parents:
+        config = getattr(config, parent)
+    return config, name
+
+
+def _with(config: Any, path: str, value: Any) -> Any:
+    """`config` with a value at a dotted path."""
+    head, _, rest = path.partition(".")
+    return dataclasses.replace(config, **{head: _with(getattr(config, head), rest, value) if rest else value})

@@ -1,0 +1,214 @@
+"""Frames, videos and taxel maps: the hand, the object and what 600 taxels feel, drawn without OpenGL.
+
+`render_frame` draws one `Snapshot`, `render_episode` a stack of them into an MP4 (or a GIF where no encoder is
+installed), `draw_taxels` is the matplotlib figure for notebooks. Pillow and matplotlib are imported when first used.
+"""
+
+import contextlib
+import dataclasses
+import warnings
+from collections.abc import Callable, Iterator
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from dexsim.hand.kinematics import Hand, forward_kinematics, taxel_normals, taxel_positions
+from dexsim.hand.load import load_hand
+from dexsim.render.panel import draw_panel, force_color, make_layout, taxel_image
+from dexsim.render.picture import Pose, draw_scene
+from dexsim.render.raycast import Camera
+from dexsim.render.snapshot import Snapshot
+
+CAMERAS = {
+    "grasp": Camera(azimuth=100.0, elevation=-20.0, distance=0.43, target=(0.048, 0.010, 0.092), up=(-1.0, 0.0, 0.0)),
+    "rotate": Camera(azimuth=-130.0, elevation=35.0, distance=0.50, target=(0.040, 0.010, 0.100), up=(1.0, 0.0, 0.0)),
+}
+"""The hand held palm down, and palm up."""
+
+
+def render_frame(
+    hand: Hand,
+    kinds: tuple[str, ...],
+    snapshot: Snapshot,
+    *,
+    camera: Camera | str = "grasp",
+    size: tuple[int, int] = (640, 480),
+    force_range: float | None = None,
+    finger_range: float | None = None,
+) -> np.ndarray:
+    """One picture, uint8 [H, W, 3]: the scene at the left, the taxel maps in a panel of half the height's width.
+
+    Args:
+      kinds: the kinds of the object's K primitives.
+      camera: a `Camera` or the name of a preset in `CAMERAS`.
+      size: (width, height) in pixels, even, wider than half the height.
+      force_range: force of the hottest taxel colour [N]; the snapshot's largest taxel force when left out.
+      finger_range: force of a full bar [N]; the larger of the snapshot's target and largest finger force when left out.
+
+    Raises:
+      ValueError: an unknown camera, a size without room for the scene, or kinds that do not match the snapshot.
+    """
+    frame = _finite(snapshot)
+    draw = _painter(hand, tuple(kinds), frame, camera, size, force_range, finger_range)
+    return draw(frame, _poses(hand, frame.joint_position[None])[0])
+
+
+def render_episode(
+    env: Any,
+    snapshots: Snapshot,
+    path: str | Path,
+    fps: float,
+    *,
+    camera: Camera | str | None = None,
+    size: tuple[int, int] = (640, 480),
+    max_frames: int = 400,
+) -> Path:
+    """Write snapshots stacked along T as a video that plays `fps` of them a second; return the path written.
+
+    MP4 where imageio-ffmpeg (extra `video`) can be imported, else GIF with the suffix changed. Longer episodes than
+    `max_frames` are thinned evenly and keep their duration. The camera is the preset named like the task.
+    """
+    snapshots = _finite(snapshots)
+    total = len(snapshots.joint_position)
+    if total == 0:
+        raise ValueError("render_episode: no snapshots to draw")
+    stride = -(-total // max_frames)
+    snapshots = jax.tree.map(lambda x: x[::stride], snapshots)
+    hand = getattr(env, "hand", None) or load_hand()
+    if camera is None:
+        camera = env.name if env.name in CAMERAS else "grasp"
+    # One scale for the whole video, so that colours compare across frames; single spikes may saturate.
+    loaded = snapshots.taxel_force[snapshots.taxel_force > 0]
+    force_range = float(np.quantile(loaded, 0.995)) if loaded.size else None
+    targets = snapshots.target_force[np.isfinite(snapshots.target_force)]
+    finger_range = max(float(np.quantile(snapshots.finger_force, 0.995)), float(targets.max(initial=0)))
+    draw = _painter(hand, tuple(env.primitive_kinds), snapshots, camera, size, force_range, finger_range or None)
+    poses = _poses(hand, snapshots.joint_position)
+
+    def frame(t: int) -> np.ndarray:
+        return draw(jax.tree.map(lambda x: x[t], snapshots), poses[t])
+
+    return _write_video(frame, len(poses), Path(path), fps / stride, size)
+
+
+def draw_taxels(hand: Hand, taxel_force: np.ndarray, ax: Any = None):
+    """A matplotlib figure of the unrolled taxel maps: one per finger, tip at the top, one colour scale in N.
+
+    Args:
+      taxel_force: [F, N] N.
+      ax: a sequence of F axes to draw into; a new figure when left out.
+    """
+    import matplotlib.pyplot as plt
+
+    force = np.asarray(taxel_force)
+    if ax is None:
+        figure, ax = plt.subplots(1, len(hand.finger_names), figsize=(9, 2.9), layout="constrained")
+        plt.close(figure)  # a notebook shows what the cell returns; left open it would be shown twice
+    top = float(force.max()) or 1.0
+    columns, rows = hand.taxel_grid
+    for axis, name, values in zip(ax, hand.finger_names, force, strict=True):
+        extent = (-0.5, columns - 0.5, -0.5, rows - 0.5)
+        image = axis.imshow(
+            taxel_image(values, hand.taxel_grid), cmap="inferno", vmin=0, vmax=top, extent=extent, aspect="equal"
+        )
+        axis.set(title=f"{name}  {values.sum():.2f} N", xlabel="column")
+    ax[0].set_ylabel("row (tip at the top)")
+    ax[0].figure.colorbar(image, ax=list(ax), label="force per taxel [N]", shrink=0.85)
+    return ax[0].figure
+
+
+def _painter(hand, kinds, snapshot, camera, size, force_range, finger_range) -> Callable[[Snapshot, Pose], np.ndarray]:
+    """A function that draws frames of one size from one camera, with what stays the same computed once."""
+    width, height = size
+    panel_width = height // 2
+    if isinstance(camera, str) and camera not in CAMERAS:
+        raise ValueError(f"camera: no preset {camera!r}, the presets are {', '.join(CAMERAS)}")
+    if width % 2 or height % 2 or width - panel_width < height // 4 or height < 120:
+        raise ValueError(f"size: {width}x{height} must be even, at least 120 high and 0.75 times as wide as high")
+    if np.shape(snapshot.primitive_size)[-2] != len(kinds):
+        raise ValueError(f"kinds: {len(kinds)} given, the snapshot has {np.shape(snapshot.primitive_size)[-2]}")
+    camera = CAMERAS[camera] if isinstance(camera, str) else camera
+    layout = make_layout(panel_width, height, hand.taxel_grid, len(hand.finger_names))
+    force_range = force_range or float(np.max(snapshot.taxel_force)) or 1.0
+    finger_range = finger_range or float(np.nanmax(np.append(snapshot.finger_force, snapshot.target_force))) or 1.0
+
+    def draw(frame: Snapshot, pose: Pose) -> np.ndarray:
+        scene = draw_scene(hand, kinds, frame, pose, camera, (width - panel_width, height), force_range)
+        panel = draw_panel(
+            layout, hand.finger_names, frame.taxel_force, frame.finger_force, frame.command,
+            float(frame.target_force), force_range, finger_range,
+        )  # fmt: skip
+        return np.concatenate([scene, panel], 1)
+
+    return draw
+
+
+@lru_cache(maxsize=4)
+def _kinematics(hand: Hand) -> Callable[[jax.Array], tuple]:
+    def pose(joint_position):
+        links = forward_kinematics(hand, joint_position)
+        return (links.body_position, links.body_rotation, taxel_positions(hand, links), taxel_normals(hand, links))
+
+    return jax.jit(jax.vmap(pose))
+
+
+def _poses(hand: Hand, joint_position: np.ndarray) -> list[Pose]:
+    """Poses of T frames from joint angles [T, J], in one compiled call."""
+    arrays = [np.asarray(x) for x in _kinematics(hand)(joint_position)]
+    return [Pose(*(x[t] for x in arrays)) for t in range(len(joint_position))]
+
+
+def _finite(snapshot: Snapshot) -> Snapshot:
+    """NumPy arrays with zeros for what is not finite (a broken simulation must still be shown), but for the target."""
+    arrays = jax.tree.map(np.asarray, snapshot)
+    clean = jax.tree.map(lambda x: np.nan_to_num(x, posinf=0, neginf=0) if x.dtype.kind == "f" else x, arrays)
+    return dataclasses.replace(clean, target_force=arrays.target_force)
+
+
+def _write_video(frame: Callable[[int], np.ndarray], count: int, path: Path, fps: float, size: tuple[int, int]) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        import imageio_ffmpeg
+
+        with _forks_quietly():
+            imageio_ffmpeg.get_ffmpeg_exe()
+    except (ImportError, RuntimeError):  # the wheel of some platforms comes without the program
+        return _write_gif(frame, count, path.with_suffix(".gif"), fps)
+    path = path.with_suffix(".mp4")
+    writer = imageio_ffmpeg.write_frames(
+        str(path), size, fps=fps, codec="libx264", pix_fmt_out="yuv420p", macro_block_size=2,
+        output_params=["-crf", "20", "-preset", "veryfast", "-movflags", "+faststart"], ffmpeg_log_level="error",
+    )  # fmt: skip
+    with _forks_quietly():
+        writer.send(None)
+    try:
+        for t in range(count):
+            writer.send(np.ascontiguousarray(frame(t)))
+    finally:
+        writer.close()
+    return path
+
+
+@contextlib.contextmanager
+def _forks_quietly() -> Iterator[None]:
+    """The encoder is started by a fork that executes another program at once, which JAX's threads survive."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "os.fork", RuntimeWarning)
+        yield
+
+
+def _write_gif(frame: Callable[[int], np.ndarray], count: int, path: Path, fps: float) -> Path:
+    from PIL import Image
+
+    # One palette for all frames: quantising to a given palette is fast and nothing flickers. A quarter of it is kept
+    # for the colours of force, which cover few pixels; the rest is drawn from frames throughout the video.
+    some = np.concatenate([frame(t) for t in np.linspace(0, count - 1, min(count, 5)).astype(int)])
+    scene = Image.fromarray(some).quantize(192, Image.Quantize.MEDIANCUT).getpalette()[: 3 * 192]
+    palette = Image.new("P", (1, 1))
+    palette.putpalette(scene + force_color(np.linspace(0, 1, 64), 1.0).reshape(-1).tolist())
+    images = [Image.fromarray(frame(t)).quantize(palette=palette, dither=Image.Dither.NONE) for t in range(count)]
+    images[0].save(path, save_all=True, append_images=images[1:], duration=round(1000 / fps), loop=0)
+    return path

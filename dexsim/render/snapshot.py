@@ -1,0 +1,22 @@
+"""What one frame of video shows."""
+
+from typing import Any
+
+from dexsim.core.pytree import pytree_dataclass
+
+
+@pytree_dataclass
+class Snapshot:
+    """What a picture needs to know. K primitives (object frame), F fingers of N taxels; stack along T for a video."""
+
+    joint_position: Any  # [J] rad
+    object_position: Any  # [3] m, palm frame
+    object_rotation: Any  # [3, 3]
+    primitive_size: Any  # [K, 3] m
+    primitive_position: Any  # [K, 3] m
+    primitive_rotation: Any  # [K, 3, 3]
+    primitive_active: Any  # [K] bool
+    taxel_force: Any  # [F, N] N
+    command: Any  # any shape
+    target_force: Any  # [] N
+    finger_force: Any  # [F] N

@@ -1,0 +1,95 @@
+"""A low-cost IMU inside the object: what its orientation reading does to the truth.
+
+White noise, a constant misalignment, a slow heading drift (no magnetometer), a sampling rate and a
+delay. Defaults are of the order that makers of fused 6-axis parts state.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+
+from dexsim.core.config import check_ranges, setting, validate
+from dexsim.core.pytree import pytree_dataclass
+from dexsim.core.ranges import uniform
+from dexsim.geometry import rotations
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class OrientationSensor:
+    """Errors of the object's orientation reading; ranges are drawn at every episode start."""
+
+    noise: float = setting(0.02, unit="rad", low=0.0, high=1.0)
+    """Standard deviation of white noise, per axis."""
+    bias: float = setting(0.04, unit="rad", low=0.0, high=1.0)
+    """Largest constant misalignment, per axis."""
+    drift: float = setting(0.0005, unit="rad/s", low=0.0, high=0.1)
+    """Largest drift of the heading about the vertical."""
+    rate: float = setting(100.0, unit="Hz", low=1.0, high=10000.0)
+    """Samples per second; between two samples the last one is read again."""
+    delay: tuple[float, float] = setting((0.0, 0.02), unit="s", low=0.0, high=0.2)
+    """Age of a sample. At most one control tick is modelled."""
+
+    def __post_init__(self):
+        validate(self)
+        check_ranges(self, "delay")
+
+
+@pytree_dataclass
+class SensorDraw:
+    """One episode's sensor."""
+
+    bias: jax.Array  # [3] rad; misalignment, and a tilt of the hand that the host does not know
+    drift: jax.Array  # [] rad/s
+    delay: jax.Array  # [] fraction of a control tick
+    phase: jax.Array  # [] fraction of a sampling period
+
+
+def draw_sensor(
+    key: jax.Array, config: OrientationSensor, scale: float, control_period: float, corner: jax.Array | None = None
+) -> SensorDraw:
+    """Draw one episode's sensor; `scale` 0 gives one without bias, drift and delay.
+
+    Where `corner` [] is true, all three are at an end of their ranges (`dexsim.core.ranges`).
+    """
+    keys, sides = jax.random.split(key, 4), (-1.0, 1.0)
+    delay = uniform(keys[2], config.delay, corner, nominal=0.0)
+    return SensorDraw(
+        bias=scale * config.bias * uniform(keys[0], sides, corner, (3,)),
+        drift=scale * config.drift * uniform(keys[1], sides, corner),
+        delay=jnp.clip(scale * delay / control_period, 0.0, 1.0),
+        phase=jax.random.uniform(keys[3]),
+    )
+
+
+def measure_orientation(
+    key: jax.Array,
+    config: OrientationSensor,
+    draw: SensorDraw,
+    tick: jax.Array,
+    now: jax.Array,
+    before: jax.Array,
+    held: jax.Array,
+    up: jax.Array,
+    control_period: float,
+) -> jax.Array:
+    """The orientation [4] that the host reads.
+
+    Args:
+      tick: [] control ticks since the sensor was switched on.
+      now, before: [4] true orientation at this tick and the one before.
+      held: [4] the last reading.
+      up: [3] the vertical in the palm frame, about which the heading drifts.
+      control_period: s.
+    """
+    # Neighbours on the sphere of quaternions may have opposite signs.
+    before = jnp.where(jnp.sum(now * before) < 0, -before, before)
+    late = (1 - draw.delay) * now + draw.delay * before
+    late = late / jnp.linalg.norm(late)
+    error = draw.bias + config.noise * jax.random.normal(key, (3,))
+    error = error + draw.drift * tick * control_period * up
+    angle = jnp.sqrt(jnp.sum(error**2) + 1e-20)
+    fresh = rotations.quat_multiply(rotations.axis_angle_to_quat(error / angle, angle), late)
+    per_tick = config.rate * control_period
+    sampled = jnp.floor(tick * per_tick + draw.phase) > jnp.floor((tick - 1) * per_tick + draw.phase)
+    return jnp.where(sampled, fresh, held)

@@ -1,0 +1,1 @@
+"""Grasp: catch a falling object and hold it at a commanded force."""

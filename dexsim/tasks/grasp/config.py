@@ -1,0 +1,97 @@
+"""Settings of the grasp task."""
+
+import dataclasses
+
+from dexsim.core.config import check_ranges, setting, validate
+from dexsim.env.config import EnvConfig
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class GraspReward:
+    """Weights and widths of the reward terms, per control tick."""
+
+    force: float = setting(2.0, unit="1", low=0.0, high=1000.0)
+    """R_force: each touching finger's force against its target."""
+    torque: float = setting(0.2, unit="1", low=0.0, high=1000.0)
+    """R_torque: each touching finger's root-joint torque against its target."""
+    alive: float = setting(0.5, unit="1", low=0.0, high=1000.0)
+    """Each tick that the object is held."""
+    spread: float = setting(-0.5, unit="1/rad^2", low=-1000.0, high=0.0)
+    """R_diff: variance of the four inner fingers' first joint angles."""
+    outer: float = setting(-0.05, unit="1/rad", low=-1000.0, high=0.0)
+    """R_outer: distance of the four fingers' joints from their centre posture."""
+    action: float = setting(-0.02, unit="1", low=-1000.0, high=0.0)
+    """R_action: squared change of the action."""
+    velocity: float = setting(-0.002, unit="s^2/rad^2", low=-1000.0, high=0.0)
+    """R_vel: squared joint velocity."""
+    drop: float = setting(-20.0, unit="1", low=-10000.0, high=0.0)
+    """Once, when the object is lost."""
+    sigma: float = setting(0.10, unit="1", low=0.001, high=10.0)
+    """Width of the Gaussians, on quantities over their maxima (the paper's value)."""
+    tail_sigma: float = setting(0.40, unit="1", low=0.001, high=10.0)
+    """Width of the wide Gaussian that carries a gradient far from the target."""
+    tail: float = setting(0.4, unit="1", low=0.0, high=1.0)
+    """Share of the wide Gaussian."""
+    overload: float = setting(0.0, unit="1", low=-1000.0, high=0.0)
+    """What the four fingers press beyond `margin` above their target, over `max_force`. The Gaussians are flat there:
+    a finger that bears an object nearly alone gains nothing by letting go a little."""
+    margin: float = setting(1.5, unit="N", low=0.0, high=100.0)
+    """Force above the target that `overload` leaves alone."""
+    thumb: str = setting("loose", choices=("loose", "track", "binary"))
+    """Thumb: it opposes all other fingers, so a balanced grasp needs more of it than of each of
+    them. "loose": only the wide Gaussian; "track": like the fingers; "binary": the paper's, any
+    force within the bounds."""
+
+    def __post_init__(self):
+        validate(self)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class GraspConfig(EnvConfig):
+    """The grasp task."""
+
+    episode_seconds: float = setting(6.0, unit="s", low=0.2, high=3600.0)
+    """Time limit of a training episode. Short, for objects are lost while they are caught, and longer than 3 s, from
+    where forces count: at 4 s the force follows the command less well."""
+    evaluation_seconds: float = setting(8.0, unit="s", low=0.2, high=3600.0)
+    """Length of an evaluation episode: an object must be held this long."""
+    finger_force: tuple[float, float] = setting((2.0, 7.0), unit="N", low=0.05, high=40.0)
+    """Target force of a touching finger at command 0 and 1."""
+    max_force: float = setting(10.0, unit="N", low=0.5, high=200.0)
+    """Calibrated maximum that forces are normalised by."""
+    force_per_torque: float = setting(19.0, unit="N/Nm", low=1.0, high=200.0)
+    """Finger force per root-joint torque; ties the torque target to the force target."""
+    command_change: float = setting(0.005, unit="1", low=0.0, high=1.0)
+    """Probability per tick that the command is drawn anew within an episode."""
+    push_probability: float = setting(0.015, unit="1", low=0.0, high=1.0)
+    """Probability per tick of a push on the object."""
+    push_speed: float = setting(0.3, unit="m/s", low=0.0, high=5.0)
+    """Largest change of the object's speed by a push."""
+    drop_distance: float = setting(0.12, unit="m", low=0.02, high=1.0)
+    """The object is lost when its centre is farther than this from the grasp centre."""
+    posture: tuple[float, ...] = setting(
+        (1.45, 0.15, 0.25, 0.0, 1.1, 0.8, 1.1, 0.8, 1.1, 0.8, 1.1, 0.8), unit="rad", low=-3.2, high=3.2
+    )
+    """Joint angles that episodes start near."""
+    posture_noise: float = setting(0.12, unit="rad", low=0.0, high=1.0)
+    """Largest deviation from them."""
+    curl: tuple[float, float] = setting((-0.3, 0.1), unit="rad", low=-3.0, high=3.0)
+    """Added to all joints of the four fingers alike: how far closed they start."""
+    release_gap: tuple[float, float] = setting((0.001, 0.009), unit="m", low=0.0, high=0.1)
+    """Gap between palm and object at release."""
+    release_speed: tuple[float, float] = setting((0.0, 0.1), unit="m/s", low=0.0, high=3.0)
+    """Speed of the object away from the palm at release."""
+    release_drift: float = setting(0.05, unit="m/s", low=0.0, high=3.0)
+    """Largest speed along the palm, in each direction, at release."""
+    release_spin: float = setting(1.0, unit="rad/s", low=0.0, high=30.0)
+    """Largest spin about each of the object's axes at release."""
+    place_noise: float = setting(0.012, unit="m", low=0.0, high=0.1)
+    """Largest shift of the object along the palm, in each direction."""
+    turn_noise: tuple[float, float] = setting((0.6, 0.3), unit="rad", low=0.0, high=3.2)
+    """Largest turn of an object about the palm's normal, and how far askew it lies; its roll is free."""
+    reward: GraspReward = setting(GraspReward())
+    """Reward weights."""
+
+    def __post_init__(self):
+        validate(self)
+        check_ranges(self, "finger_force", "curl", "release_gap", "release_speed")

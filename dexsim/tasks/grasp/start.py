@@ -1,0 +1,96 @@
+"""Start states of the grasp task: an object below the palm, fingers half closed round it."""
+
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dexsim.core import compilation
+from dexsim.core.errors import ConfigError
+from dexsim.geometry import rotations
+from dexsim.hand.kinematics import Hand, flexion_joints
+from dexsim.objects.config import KINDS
+from dexsim.objects.params import extent, sample_object
+from dexsim.tasks.placement import clearance, palm_height
+
+_OVERLAP = 0.001  # m, hand and object may start this deep in each other
+
+
+def make_pool(key: jax.Array, hand: Hand, config: Any, reference: tuple[float, float, float]):
+    """Draw candidates and keep those in which the hand is clear of the object.
+
+    Every shape gets an equal share of the pool: large boxes overlap far more often than small
+    spheres, and a plain rejection would all but leave them out of training.
+
+    Raises:
+      ConfigError: next to no candidate of a shape is clear, so the ranges do not fit the hand.
+    """
+    shapes = config.objects.kinds
+    share = -(-config.pool_size // len(shapes))
+    chunk = max(min(2 * share, 4096), 64)
+
+    @functools.partial(compilation.jit, once=True)
+    def draw(key: jax.Array, shape_index: jax.Array):
+        keys = jax.random.split(key, chunk)
+        return jax.vmap(lambda k: _candidate(k, shape_index, hand, config, reference))(keys)
+
+    pools = []
+    for name in shapes:
+        kept, found = [], 0
+        for trial in range(40):
+            shape_key = jax.random.fold_in(jax.random.fold_in(key, KINDS.index(name)), trial)
+            starts, clear = draw(shape_key, jnp.int32(KINDS.index(name)))
+            rows = np.flatnonzero(np.asarray(clear))[: share - found]
+            kept.append(jax.tree.map(lambda x, rows=rows: np.asarray(x)[rows], starts))
+            found += rows.size
+            if found == share:
+                break
+        if found < share:
+            raise ConfigError(
+                f"{type(config).__name__}: only {found} of {share} start states of "
+                f"shape {name!r} are free of overlap; open the posture or shrink it"
+            )
+        pools.append(jax.tree.map(lambda *parts: np.concatenate(parts), *kept))
+    return jax.tree.map(lambda *parts: np.concatenate(parts)[: config.pool_size], *pools)
+
+
+def _candidate(
+    key: jax.Array, shape_index: jax.Array, hand: Hand, config: Any, reference: tuple[float, float, float]
+) -> tuple[Any, jax.Array]:
+    from dexsim.env.state import Start
+
+    keys = jax.random.split(key, 7)
+    target = sample_object(keys[0], config.objects, shape_index)
+    noise = config.posture_noise * jax.random.uniform(keys[1], (hand.num_joints,), minval=-1.0)
+    curl = jax.random.uniform(keys[6], minval=config.curl[0], maxval=config.curl[1])
+    flexion = np.zeros(hand.num_joints, np.float32)
+    flexion[flexion_joints(hand, range(1, hand.num_fingers))] = 1.0
+    joints = jnp.asarray(config.posture) + noise + curl * flexion
+    joints = jnp.clip(joints, hand.joint_lower, hand.joint_upper)
+
+    # Long objects lie across the fingers (their z along the palm's y), turned about the palm's
+    # normal and a little askew; the roll about their own axis is free.
+    roll, turn, askew = jax.random.uniform(keys[2], (3,), minval=-1.0)
+    quat = rotations.axis_angle_to_quat(jnp.array([0.0, 0.0, 1.0]), roll * jnp.pi)
+    most = config.turn_noise
+    for axis, angle in (
+        ((1.0, 0.0, 0.0), -jnp.pi / 2),
+        ((0.0, 0.0, 1.0), most[1] * askew),
+        ((1.0, 0.0, 0.0), most[0] * turn),
+    ):
+        quat = rotations.quat_multiply(rotations.axis_angle_to_quat(jnp.array(axis), jnp.asarray(angle)), quat)
+    matrix = rotations.quat_to_matrix(quat)
+    up = rotations.rotate_inverse(matrix, jnp.array([-1.0, 0.0, 0.0]))
+    gap = jax.random.uniform(keys[3], minval=config.release_gap[0], maxval=config.release_gap[1])
+    shift = config.place_noise * jax.random.uniform(keys[4], (2,), minval=-1.0)
+    top = extent(target.size, target.position, target.active, up, target.kinds, target.quat)
+    position = jnp.stack([palm_height(hand) + gap + top, reference[1] + shift[0], reference[2] + shift[1]])
+    speed = jax.random.uniform(keys[5], minval=config.release_speed[0], maxval=config.release_speed[1])
+    qpos = jnp.concatenate([joints, position, quat])
+    drift = config.release_drift * jax.random.uniform(jax.random.fold_in(keys[5], 1), (2,), minval=-1.0)
+    spin = config.release_spin * jax.random.uniform(jax.random.fold_in(keys[5], 2), (3,), minval=-1.0)
+    qvel = jnp.concatenate([jnp.zeros(hand.num_joints), speed[None], drift, spin])
+    start = Start(qpos, qvel, target)
+    return start, clearance(hand, joints, target.shape(), position, matrix) > -_OVERLAP

@@ -1,0 +1,29 @@
+"""Where an object can be put: the palm below it, and how far it is from every link."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dexsim.geometry import rotations, sdf
+from dexsim.hand.kinematics import Hand, forward_kinematics
+
+
+def palm_height(hand: Hand) -> float:
+    """x of the palm's face."""
+    palm = [g for g in hand.geoms if g.body == hand.body_names.index(hand.palm) and g.touches]
+    faces = [g.position[0] for g in palm if g.kind == "plane"]
+    faces += [g.position[0] + g.size[0] for g in palm if g.kind == "box"]
+    return float(max(faces, default=0.0))
+
+
+def clearance(hand: Hand, joints: jax.Array, shape: sdf.Shape, position: jax.Array, rotation: jax.Array) -> jax.Array:
+    """Smallest distance [] m from the object to the hand's capsules, at seven points of each."""
+    pose = forward_kinematics(hand, joints)
+    capsules = [g for g in hand.geoms if g.touches and g.kind == "capsule"]
+    steps = np.linspace(-1.0, 1.0, 7)
+    local = np.stack([g.position + np.outer(steps * g.size[1], g.rotation[:, 2]) for g in capsules]).astype(np.float32)
+    body = np.array([g.body for g in capsules])
+    radius = np.array([g.size[0] for g in capsules])[:, None]
+    points = pose.body_position[body][:, None] + rotations.rotate(pose.body_rotation[body][:, None], jnp.asarray(local))
+    points = rotations.rotate_inverse(rotation, points - position)
+    return jnp.min(sdf.signed_distance(points, shape) - radius)

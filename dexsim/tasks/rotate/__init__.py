@@ -1,0 +1,1 @@
+"""Rotate: turn an object in the hand, again and again."""

@@ -1,0 +1,207 @@
+"""Settings of the rotation task, and its variants by name."""
+
+import dataclasses
+import math
+
+import numpy as np
+
+from dexsim.control import Control
+from dexsim.core.config import check_ranges, setting, validate
+from dexsim.core.errors import ConfigError
+from dexsim.env.config import EnvConfig
+from dexsim.objects.config import ObjectConfig
+from dexsim.observation import ObservationConfig
+from dexsim.tasks.rotate.objects import KINDS
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RotateReward:
+    """Weights of the reward terms, per control tick."""
+
+    goal: float = setting(0.2, unit="rad", low=0.0, high=1000.0)
+    """Close to goal: 1 / (d_rot + epsilon), gated by the distance from the reference. The paper's weight, 1, pays for
+    holding still where a stroke ended."""
+    epsilon: float = setting(0.1, unit="rad", low=1e-3, high=10.0)
+    """Floor under the angle in it."""
+    gate: float = setting(0.05, unit="m", low=0.001, high=1.0)
+    """Distance from the reference at which the gate is half closed."""
+    gate_steepness: float = setting(400.0, unit="1/m", low=1.0, high=1e5)
+    """How sharply it closes."""
+    bonus: float = setting(250.0, unit="1", low=0.0, high=1e5)
+    """Once for each goal reached ..."""
+    bonus_tips: float = setting(0.8, unit="1", low=0.0, high=1.0)
+    """... of which this share is for `working_tips` fingertips that take part, which no hand can earn by
+    standing still ..."""
+    tips_after: int = setting(2, unit="1", low=0, high=1000)
+    """... once this many goals have been reached in the episode: asked for from the first goal on, it teaches
+    policies that have found one stroke to clamp the object with all fingers ..."""
+    bonus_speed: float = setting(0.9, unit="rad/s", low=0.01, high=1e6)
+    """... and which falls with the square of the joint speed (mean of all joints, lately) beyond this."""
+    action: float = setting(-0.01, unit="1", low=-1000.0, high=0.0)
+    """Squared change of the action."""
+    velocity: float = setting(-0.018, unit="s^2/rad^2", low=-1000.0, high=0.0)
+    """Squared joint velocity."""
+    torque: float = setting(-0.5, unit="1/Nm^2", low=-1000.0, high=0.0)
+    """Squared joint torque: a price on clamping the object where a stroke has ended, which is where
+    policies got stuck."""
+    spin: float = setting(2.0, unit="s/rad", low=0.0, high=1000.0)
+    """Spin about the axis in the wanted direction, up to +-1 rad/s: a gradient before the first
+    goal is ever reached."""
+    fingertips: float = setting(0.0, unit="1", low=0.0, high=1000.0)
+    """Share of `working_tips` fingertips that have done their share of touching lately."""
+    working_tips: int = setting(3, unit="1", low=1, high=20)
+    """Fingertips that are asked to take part."""
+    working_duty: float = setting(0.12, unit="1", low=0.001, high=1.0)
+    """Share of the time for which one has to touch to earn all of that."""
+    tips_by: str = setting("last", choices=("mean", "last"))
+    """What counts as taking part: the mean of those fingertips, or the least busy of them. By the mean,
+    two that are busy earn most of it, and some seeds keep to two."""
+    drop: float = setting(-50.0, unit="1", low=-10000.0, high=0.0)
+    """Once, when the object is lost."""
+
+    def __post_init__(self):
+        validate(self)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RotateConfig(EnvConfig):
+    """The rotation task."""
+
+    objects: ObjectConfig = setting(
+        ObjectConfig(
+            shapes=("box",), mass=(0.06, 0.15), friction=(0.6, 1.2), bare_friction=(0.3, 0.7), com_offset=0.003
+        )
+    )
+    """Mass, inertia, centre of mass, friction and contact of the object; its sizes are `edge`. The bare hand
+    is plastic: where it grips as rubber does, random strokes carry the object onto the thumb and over."""
+    control: Control = setting(Control(step=0.08, recall="target"))
+    """From action to joint target."""
+    object: str = setting("cube", choices=(*KINDS, "mesh"))
+    """What is turned: a cube, an upright cylinder, an eight-cornered union of two boxes, or `objects.mesh`."""
+    edge: tuple[float, float] = setting((0.050, 0.060), unit="m", low=0.02, high=0.12)
+    """Edge of the cube; width and height of the others."""
+    axis: tuple[float, float, float] = setting((1.0, 0.0, 0.0), unit="1", low=-1.0, high=1.0)
+    """Axis of rotation in the palm frame; (1, 0, 0) is the palm's normal."""
+    direction: int = setting(1, unit="1", low=-1, high=1)
+    """+1 or -1: sense of rotation about the axis."""
+    goal_step: float = setting(math.pi / 2, unit="rad", low=0.1, high=math.pi)
+    """Angle between two goals."""
+    goal_angle: float = setting(0.3, unit="rad", low=0.01, high=1.5)
+    """A goal is reached within this angle ..."""
+    goal_distance: float = setting(0.05, unit="m", low=0.001, high=0.5)
+    """... this far from the reference ..."""
+    goal_spin: float = setting(2.0, unit="rad/s", low=0.0, high=1000.0)
+    """... at no more than this spin about the axis (0: any) ..."""
+    goal_dwell: float = setting(0.0, unit="s", low=0.0, high=10.0)
+    """... held for this long."""
+    support: str = setting("palm", choices=("palm", "fingers"))
+    """Carried by the palm, or held clear of it by the fingers: then touching the palm is a drop."""
+    tilt: float = setting(-0.2, unit="rad", low=-1.2, high=1.2)
+    """The hand's nominal pitch: positive lets the object slide toward the wrist, where no finger reaches it.
+    Leaning toward the fingers brings it back to them."""
+    roll: float = setting(-0.2, unit="rad", low=-1.2, high=1.2)
+    """The hand's nominal roll: positive lets the object slide toward the thumb, beside which it falls over the palm's
+    edge most easily."""
+    reference: tuple[float, float, float] = setting((0.047, 0.024, 0.088), unit="m", low=-0.5, high=0.5)
+    """Where the object belongs: where thumb and fingers meet, and where the gaits that keep it carry it."""
+    drop_distance: float = setting(0.07, unit="m", low=0.01, high=1.0)
+    """The object is lost when its centre is farther than this from the reference ..."""
+    drop_tilt: float = setting(1.0, unit="rad", low=0.1, high=3.2)
+    """... or when it has tipped over: its own axis is farther than this from the axis of rotation,
+    and no goal can be reached any more."""
+    patience: float = setting(4.0, unit="s", low=0.1, high=1e6)
+    """A training episode without a new goal for this long is given up, as a drop is: else policies
+    learn to turn once and then hold still. Evaluations wait for ever."""
+    leash: float = setting(0.055, unit="m", low=0.01, high=1.0)
+    """A training episode whose object is farther than this from the reference is given up likewise: else some policies
+    learn gaits that roam over the palm, and lose it over the edge. Evaluations end with `drop_distance`."""
+    clearance: float = setting(0.001, unit="m", low=0.0, high=0.05)
+    """Smallest gap between palm and object with support "fingers"."""
+    episode_seconds: float = setting(20.0, unit="s", low=0.2, high=3600.0)
+    """Time limit of a training episode: short, as most that is lost is lost with the first strokes."""
+    evaluation_seconds: float = setting(120.0, unit="s", low=0.2, high=3600.0)
+    """Length of an evaluation episode."""
+    push_probability: float = setting(0.005, unit="1", low=0.0, high=1.0)
+    """Probability per tick of a push on the object."""
+    push_speed: float = setting(0.1, unit="m/s", low=0.0, high=5.0)
+    """Largest change of the object's speed by a push."""
+    posture: tuple[float, ...] = setting(
+        (1.0, 0.2, 0.3, 0.0, 0.8, 0.5, 0.8, 0.5, 0.8, 0.5, 0.8, 0.5), unit="rad", low=-3.2, high=3.2
+    )
+    """Joint angles that episodes start near."""
+    posture_noise: float = setting(0.3, unit="rad", low=0.0, high=1.0)
+    """Largest deviation from them: wide, so that where one stroke ends is where another can begin."""
+    curl: tuple[float, float] = setting((0.0, 0.0), unit="rad", low=-2.0, high=2.0)
+    """Added to all joints of the four fingers alike."""
+    squeeze: tuple[float, float] = setting((0.0, 0.0), unit="rad", low=-1.0, high=1.0)
+    """How far the joint targets of thumb and fingers lie beyond that posture: the grip."""
+    heading_noise: float = setting(0.7, unit="rad", low=0.0, high=math.pi)
+    """Largest turn of the object about the axis at the start."""
+    start_offset: tuple[float, float] = setting((-0.018, -0.001), unit="m", low=-0.1, high=0.1)
+    """Where the object is put at the start, across and along the palm (y, z) from the reference: a little away
+    from thumb and fingertips, beside which the first stroke often fails ..."""
+    place_noise: float = setting(0.010, unit="m", low=0.0, high=0.05)
+    """... and the largest shift from there."""
+    settle_seconds: float = setting(0.8, unit="s", low=0.05, high=10.0)
+    """Time that start states are given to come to rest; those that do not are left out."""
+    reward: RotateReward = setting(RotateReward(gate=0.04))
+    """Reward weights. The gate closes short of `goal_distance`, about which nothing reaches the object any more."""
+
+    def __post_init__(self):
+        validate(self)
+        check_ranges(self, "edge", "curl", "squeeze")
+        if self.direction == 0:
+            raise ConfigError("RotateConfig.direction = 0: must be +1 or -1")
+        if np.linalg.norm(self.axis) < 1e-6:
+            raise ConfigError("RotateConfig.axis is (0, 0, 0): give a direction")
+        if (self.object == "mesh") != bool(self.objects.mesh):
+            raise ConfigError(
+                f"RotateConfig.object = {self.object!r} with ObjectConfig.mesh = {self.objects.mesh!r}: "
+                "a mesh needs object 'mesh' and the name of its file"
+            )
+
+    @property
+    def unit_axis(self) -> np.ndarray:
+        """The axis of rotation [3], of length one."""
+        return np.asarray(self.axis, float) / np.linalg.norm(self.axis)
+
+
+def paper() -> RotateConfig:
+    """The paper's own weights and success test."""
+    return RotateConfig(
+        goal_spin=0.0,
+        drop_distance=0.09,
+        drop_tilt=math.pi,
+        patience=1e6,
+        leash=1.0,
+        control=Control(step=0.3, recall="target"),
+        episode_seconds=60.0,
+        reward=RotateReward(
+            goal=1.0, action=-0.0002, velocity=0.0, torque=0.0, spin=0.0, bonus_tips=0.0, bonus_speed=1e6, drop=0.0
+        ),
+    )
+
+
+def without_orientation() -> RotateConfig:
+    """The paper's second policy: the object's orientation is not observed."""
+    return RotateConfig(observation=ObservationConfig(leave_out=("relative_orientation",)))
+
+
+def clear_of_palm() -> RotateConfig:
+    """The object held clear of the palm: it lies in the curled fingers, which point downhill, and turns about what is
+    upright there."""
+    return RotateConfig(
+        reward=RotateReward(goal=1.0, torque=-0.1, bonus_tips=0.0, gate=0.04),
+        support="fingers",
+        tilt=-1.1,
+        roll=0.0,
+        leash=1.0,
+        axis=(0.6, 0.0, -0.8),
+        reference=(0.072, 0.005, 0.098),
+        squeeze=(0.0, 0.2),
+        posture=(1.2, 0.3, 0.3, 0.0, 0.8, 0.6, 0.8, 0.6, 0.8, 0.6, 0.8, 0.6),
+        posture_noise=0.2,
+        start_offset=(0.0, 0.0),
+        place_noise=0.006,
+        curl=(-0.1, 0.1),
+    )

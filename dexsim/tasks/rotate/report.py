@@ -1,0 +1,86 @@
+"""The rotation task's evaluation report: the paper's metrics, and how the hand moved."""
+
+import numpy as np
+
+from dexsim.core import statistics
+
+_PERCENTILES = (1, 5, 10, 25, 50, 75, 90, 95, 99)
+
+
+def summarize(metrics: dict[str, np.ndarray], lived: np.ndarray, control_period: float, ticks: int) -> dict:
+    """Reduce an evaluation to a report.
+
+    Args:
+      metrics: [N] of each episode's last tick, as the environment returns them.
+      lived: [N] ticks before the object was lost.
+      control_period: s.
+      ticks: length of an episode that nothing ended.
+
+    Returns:
+      A JSON-able dict. "successes" are consecutive by nature: a drop ends the episode. They count goals
+      reached under the configured test (spin and dwell), "paper_successes" those under the paper's.
+      "seconds_per_success" is the time at the last goal over their number, of episodes with one or
+      more. "seconds_to_fall" is cut at the episode's length where the object stayed. Intervals are 95 %:
+      Wilson's for proportions, else bootstrap over episodes.
+    """
+    seconds, successes = lived * control_period, metrics["successes"]
+    some = successes > 0
+    pace = metrics["time_at_last_success"][some] / successes[some]
+    kept = lived >= ticks
+    duty = np.stack([metrics[name] for name in sorted(metrics) if name.startswith("duty/")], -1)
+    minutes = np.maximum(seconds, control_period) / 60
+    report = {
+        "episodes": int(lived.size),
+        "seconds": ticks * control_period,
+        "successes": _counts(successes),
+        "paper_successes": _counts(metrics["paper_successes"]),
+        "without_success": statistics.proportion(~some),
+        "seconds_per_success": statistics.mean(pace),
+        "seconds_to_fall": statistics.mean(seconds)
+        | {"median": float(np.median(seconds)), "longest": float(seconds.max())},
+        "kept_to_the_end": statistics.proportion(kept),
+        "rotations_per_minute": statistics.mean(metrics["spin"] * 60 / (2 * np.pi)),
+        "goals_per_minute": statistics.mean(successes / minutes),
+        "end": {
+            "pushed_out": int(np.sum(metrics["pushed_out"] > 0)),
+            "slipped": int(np.sum(metrics["slipped"] > 0)),
+            "timeout": int(np.sum(kept)),
+        },
+        "gait": {
+            "joint_speed_rad_s": statistics.mean(metrics["joint_speed"]),
+            "action_rate": statistics.mean(metrics["action_rate"]),
+            "spin_rad_s": statistics.mean(metrics["spin"]),
+            "tilt_rad": statistics.mean(metrics["tilt"]),
+            "fingertip_duty": [float(x) for x in duty.mean(0)],
+        },
+        "non_finite": int(np.sum(metrics["non_finite"] > 0)),
+    }
+    report["headline"] = {
+        "successes (median)": report["successes"]["median"]["median"],
+        "successes (mean)": report["successes"]["mean"]["mean"],
+        "successes (10th percentile)": report["successes"]["percentiles"]["10"],
+        "paper's successes (mean)": report["paper_successes"]["mean"]["mean"],
+        "episodes without": report["without_success"]["mean"],
+        "s per success": report["seconds_per_success"]["mean"],
+        "s to fall (mean)": report["seconds_to_fall"]["mean"],
+        "joint speed (rad/s)": report["gait"]["joint_speed_rad_s"]["mean"],
+        "fingertips at work (duty over 10 %)": int(np.sum(duty.mean(0) > 0.1)),
+    }
+    return report
+
+
+def _counts(values: np.ndarray) -> dict:
+    return {
+        "mean": statistics.mean(values),
+        "median": statistics.median(values),
+        "percentiles": {str(q): float(np.percentile(values, q)) for q in _PERCENTILES},
+        "sorted": _ordered(values),
+    }
+
+
+def _ordered(values: np.ndarray) -> list[float]:
+    """All values in order, or of very many an even selection of 100."""
+    ordered = np.sort(values)
+    if ordered.size > 100:
+        ordered = ordered[np.linspace(0, ordered.size - 1, 100).round().astype(int)]
+    return [float(x) for x in ordered]

@@ -1,0 +1,245 @@
+"""Start states of the rotation task: objects that came to rest in random postures of the hand.
+
+Settling runs in C MuJoCo on the host's cores, once: it needs no compilation, and the pool is kept on
+disk under the hash of the hand's files and the configuration. Training never waits for it again.
+"""
+
+import contextlib
+import functools
+import hashlib
+import io
+import json
+import os
+import zipfile
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from dexsim.core.assets import cache_path
+from dexsim.core.config import to_dict
+from dexsim.core.errors import ConfigError
+from dexsim.core.files import write_whole
+from dexsim.geometry import rotations
+from dexsim.hand.kinematics import Hand, flexion_joints
+from dexsim.objects.config import load_mesh_object
+from dexsim.objects.params import ObjectParams
+from dexsim.physics import contact
+from dexsim.physics.model import build_model, tip_bodies
+from dexsim.tasks.placement import clearance, palm_height
+from dexsim.tasks.rotate.objects import largest_size, lowest_point, sample_target, slots
+
+_TRIALS = 300  # rounds of candidates in which every object should find a posture
+_VERSION = 4  # of the procedure: raise it when older pools no longer hold
+_AT_REST = (0.05, 1.0)  # m/s, rad/s
+_LEVEL = 0.35  # rad, largest angle from upright
+
+
+def load_pool(key: jax.Array, hand: Hand, config: Any, gravity: tuple[float, float, float]) -> Any:
+    """The pool of start states, from disk if it has been made before.
+
+    Raises:
+      ConfigError: next to nothing stays in the hand.
+    """
+    from dexsim.env.state import Start
+
+    path = cache_path("pools") / f"rotate-{_fingerprint(key, hand, config)}.npz"
+    template = jax.eval_shape(lambda: sample_target(key, config))
+    leaves, structure = jax.tree.flatten(template)
+    stored = _read(path, len(leaves))
+    if stored is None:
+        stored = _make(key, hand, config, gravity)
+        _write(path, stored)
+    qpos, qvel, joint_target, *rows = stored
+    return Start(qpos, qvel, jax.tree.unflatten(structure, rows), joint_target)
+
+
+def _fingerprint(key: jax.Array, hand: Hand, config: Any) -> str:
+    """What the pool depends on; rewards, sensing and observation do not belong to it."""
+    settings = to_dict(config)
+    for name in (
+        "reward",
+        "sensing",
+        "observation",
+        "skin",
+        "control",
+        "touch",
+        "randomization",
+        "goal_step",
+        "goal_angle",
+        "goal_distance",
+        "goal_spin",
+        "goal_dwell",
+        "episode_seconds",
+        "evaluation_seconds",
+        "push_probability",
+        "push_speed",
+    ):
+        settings.pop(name, None)
+    digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode())
+    digest.update(hand.model_path.read_bytes())
+    digest.update(np.asarray(jax.random.key_data(key)).tobytes())
+    digest.update(f"{_VERSION} {mujoco.__version__}".encode())
+    if config.object == "mesh":
+        boxes = load_mesh_object(config.objects).boxes
+        digest.update(b"".join(part.tobytes() for part in (boxes.size, boxes.position, boxes.quat)))
+    return digest.hexdigest()[:16]
+
+
+def _read(path: Path, count: int) -> list[np.ndarray] | None:
+    """The arrays of a pool file; None if it is missing, damaged or of another layout."""
+    try:
+        with np.load(path) as file:
+            return [file[f"a{i}"] for i in range(count + 3)]
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return None
+
+
+def _write(path: Path, arrays: list[np.ndarray]) -> None:
+    """Keep the arrays; a cache that cannot be written is no error."""
+    buffer = io.BytesIO()
+    np.savez(buffer, **{f"a{i}": a for i, a in enumerate(arrays)})
+    with contextlib.suppress(OSError):
+        write_whole(path, [buffer.getbuffer()])
+
+
+def _make(key: jax.Array, hand: Hand, config: Any, gravity: tuple[float, float, float]) -> list[np.ndarray]:
+    """A start state for each of `pool_size` objects: qpos, qvel, joint targets, object leaves.
+
+    Objects are drawn first, and each is tried in posture after posture until it stays: large ones fit into few, and
+    where whatever stays is kept they are all but left out.
+    """
+    size, chunk, threads = config.pool_size, 1024, min(os.cpu_count() or 1, 16)
+    object_key, key = jax.random.split(key)
+    targets = jax.device_get(jax.jit(jax.vmap(lambda k: sample_target(k, config)))(jax.random.split(object_key, size)))
+    draw = jax.jit(jax.vmap(lambda k, target: _candidate(k, target, hand, config)))
+    starts, waiting, tried = {}, np.arange(size), 0
+    with ThreadPoolExecutor(threads) as pool:
+        models = [_model(hand, config, gravity) for _ in range(threads)]
+        for trial in range(_TRIALS):
+            which = np.resize(waiting, chunk)
+            candidates = jax.device_get(
+                draw(
+                    jax.random.split(jax.random.fold_in(key, trial), chunk),
+                    jax.tree.map(lambda leaf, which=which: leaf[which], targets),
+                )
+            )
+            rows = np.flatnonzero(candidates["clear"])
+            rows = rows[np.unique(which[rows], return_index=True)[1]]  # one posture for each object
+            settle = functools.partial(_settle, hand=hand, config=config, candidates=candidates)
+            settled = list(pool.map(settle, models, [rows[i::threads] for i in range(threads)]))
+            good, qpos = (np.concatenate(x) for x in zip(*settled, strict=True))
+            for k in _clear_of_palm(hand, config, candidates["target"], good, qpos):
+                starts[which[good[k]]] = qpos[k], candidates["joint_target"][good[k]]
+            waiting, tried = np.setdiff1d(waiting, list(starts)), tried + len(rows)
+            if not len(waiting) or tried > 1000 and len(starts) < tried / 200:
+                break
+    if len(waiting) > size / 20:
+        raise ConfigError(
+            f"RotateConfig: only {len(starts)} of {size} objects have a start state that stayed "
+            f"in the hand ({tried} tried); change posture, tilt, edge or support"
+        )
+    # The few that fit nowhere leave their rows to others.
+    chosen = np.array(sorted(starts))
+    chosen = np.concatenate([chosen, chosen[: size - len(chosen)]])
+    return [
+        np.stack([starts[k][0] for k in chosen]),
+        np.zeros((size, hand.num_joints + 6), np.float32),
+        np.stack([starts[k][1] for k in chosen]),
+        *(leaf[chosen] for leaf in jax.tree.leaves(targets)),
+    ]
+
+
+def _candidate(key: jax.Array, target: ObjectParams, hand: Hand, config: Any) -> dict[str, Any]:
+    """This object just above where it will rest, in a random posture."""
+    keys = jax.random.split(key, 5)
+    noise = config.posture_noise * jax.random.uniform(keys[0], (hand.num_joints,), minval=-1.0)
+    flexion = np.zeros(hand.num_joints, np.float32)
+    flexion[flexion_joints(hand, range(1, hand.num_fingers))] = 1.0
+    curl = jax.random.uniform(keys[3], minval=config.curl[0], maxval=config.curl[1])
+    joints = jnp.clip(jnp.asarray(config.posture) + noise + curl * flexion, hand.joint_lower, hand.joint_upper)
+    heading = config.heading_noise * jax.random.uniform(keys[1], minval=-1.0)
+    quat = rotations.axis_angle_to_quat(jnp.asarray(config.unit_axis), heading)
+    shift = config.place_noise * jax.random.uniform(keys[2], (2,), minval=-1.0)
+    place = jnp.asarray(config.reference).at[1:].add(jnp.asarray(config.start_offset) + shift)
+    if config.support == "palm":
+        floor = palm_height(hand) + 0.001 - lowest_point(target, quat, jnp.zeros(3))
+        place = place.at[0].set(floor)
+    overlap = clearance(hand, joints, target.shape(), place, rotations.quat_to_matrix(quat))
+    squeeze = jax.random.uniform(keys[4], minval=config.squeeze[0], maxval=config.squeeze[1])
+    closed = np.array(flexion)
+    closed[flexion_joints(hand, range(1))] = 1.0
+    joint_target = jnp.clip(joints + squeeze * closed, hand.joint_lower, hand.joint_upper)
+    return {
+        "qpos": jnp.concatenate([joints, place, quat]),
+        "joint_target": joint_target,
+        "target": target,
+        "clear": overlap > -0.001,
+    }
+
+
+def _model(hand: Hand, config: Any, gravity: tuple[float, float, float]) -> mujoco.MjModel:
+    """The scene in C, with springs at the joints for the motors."""
+    model = build_model(hand, slots(config), largest_size(config), config.physics, gravity, "jax")
+    dofs = [model.joint(name).dofadr[0] for name in hand.joint_names]
+    model.jnt_stiffness[[model.joint(name).id for name in hand.joint_names]] = config.randomization.stiffness
+    model.dof_damping[dofs] += config.randomization.damping
+    # C MuJoCo takes shortcuts for frames that coincided when it compiled; sizes change here.
+    model.geom_sameframe[:] = model.body_sameframe[:] = 0
+    return model
+
+
+def _settle(
+    model: mujoco.MjModel, rows: np.ndarray, *, hand: Hand, config: Any, candidates: dict[str, Any]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rows that came to rest where they belong, and their qpos."""
+    data, target = mujoco.MjData(model), candidates["target"]
+    geoms = [model.geom(f"object_{k}").id for k in range(len(target.kinds))]
+    body = model.body("object").id
+    springs = [model.joint(name).qposadr[0] for name in hand.joint_names]
+    pairs = contact.pairs_with(model, np.array(geoms))
+    rubber = contact.pair_constants(model, pairs, tip_bodies(model, hand))[2] >= 0
+    ticks = max(round(config.settle_seconds / model.opt.timestep), 1)
+    good, kept = [], []
+    for row in rows:
+        model.geom_size[geoms] = target.size[row]
+        model.geom_pos[geoms] = target.position[row]
+        if target.quat is not None:
+            model.geom_quat[geoms] = target.quat[row]
+        model.body_mass[body], model.body_inertia[body] = target.mass[row], target.inertia[row]
+        model.body_ipos[body] = target.com[row]
+        slide = np.where(rubber, target.friction[row], target.bare_friction[row])
+        model.pair_friction[pairs, :2] = slide[:, None]
+        mujoco.mj_resetData(model, data)
+        data.qpos[:] = candidates["qpos"][row]
+        model.qpos_spring[springs] = candidates["joint_target"][row]
+        mujoco.mj_step(model, data, ticks)
+        if _stays(model, config, data):
+            good.append(row)
+            kept.append(data.qpos.astype(np.float32))
+    return np.array(good, int), np.reshape(np.array(kept, np.float32), (len(kept), model.nq))
+
+
+def _clear_of_palm(hand: Hand, config: Any, target: ObjectParams, rows: np.ndarray, qpos: np.ndarray) -> np.ndarray:
+    """Which of these rows, by their place in `rows`, are no drop from the beginning, where touching the palm is one."""
+    if config.support == "palm" or not len(rows):
+        return np.arange(len(rows))
+    low = jax.vmap(lowest_point)(jax.tree.map(lambda leaf: leaf[rows], target), qpos[:, -4:], qpos[:, -7:-4])
+    return np.flatnonzero(np.asarray(low) > palm_height(hand) + config.clearance)
+
+
+def _stays(model: mujoco.MjModel, config: Any, data: mujoco.MjData) -> bool:
+    free = model.joint("object")
+    place = data.qpos[free.qposadr[0] :][:7]
+    motion = data.qvel[free.dofadr[0] :][:6]
+    turned = np.empty(3)
+    mujoco.mju_rotVecQuat(turned, config.unit_axis, place[3:])
+    tilt = np.arccos(np.clip(turned @ config.unit_axis, -1.0, 1.0))
+    near = np.linalg.norm(place[:3] - config.reference) < 0.6 * config.goal_distance
+    rest = (np.linalg.norm(motion[:3]) < _AT_REST[0]) & (np.linalg.norm(motion[3:]) < _AT_REST[1])
+    sound = np.all(np.isfinite(data.qpos)) and not np.any(data.warning.number)
+    return bool(near and rest and sound and tilt < _LEVEL)

@@ -1,0 +1,279 @@
+"""Rotate: turn an object in the palm-up hand by 90 degree goals about one axis, again and again.
+
+Reward and success follow the paper (section Task Setup). Its weights alone give a policy that bats
+the cube round, so the default configuration adds what makes a gait that a hand can follow: penalties
+on speed and torque, a reward for fingertips that take part, and a limit on the spin at which a goal
+counts. `paper()` is the paper's own configuration.
+"""
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dexsim import observation
+from dexsim.core.errors import ConfigError
+from dexsim.core.pytree import pytree_dataclass
+from dexsim.env.state import Start
+from dexsim.env.task import Moment
+from dexsim.geometry import rotations
+from dexsim.hand.kinematics import Hand
+from dexsim.objects import params
+from dexsim.objects.config import BULK_RANGES, MESH_RANGES
+from dexsim.objects.params import ObjectParams
+from dexsim.tasks.placement import palm_height
+from dexsim.tasks.rotate.config import RotateConfig, RotateReward
+from dexsim.tasks.rotate.objects import largest_size, lowest_point, plain_inertia, sample_target, slots
+from dexsim.tasks.rotate.report import summarize
+from dexsim.tasks.rotate.start import load_pool
+from dexsim.tasks.terms import action_rate, joint_speed, random_push
+
+TOUCH = 0.1  # N, force from which a fingertip counts as touching
+_MEMORY = 2.0  # s, over which a fingertip's share of work and the joints' speed are averaged
+_RECENT = 0.2  # s, a fingertip that touched within this time before a drop pushed the object out
+
+
+@pytree_dataclass
+class Goal:
+    """The target, and what has happened since the episode began."""
+
+    turns: jax.Array  # [] int32 goals reached
+    entered: jax.Array  # [] bool, inside the paper's window since this goal was set
+    entries: jax.Array  # [] int32 goals reached as the paper counts
+    dwell: jax.Array  # [] s inside the window
+    clock: jax.Array  # [] s
+    last_success: jax.Array  # [] s, clock at the last goal
+    gives_up: jax.Array  # [] bool, whether `patience` and `leash` end the episode
+    duty: jax.Array  # [F] share of time touching, lately
+    pace: jax.Array  # [] rad/s, mean joint speed, lately
+    since_touch: jax.Array  # [] s since any fingertip touched
+    totals: dict[str, jax.Array]  # sums over ticks
+
+
+@pytree_dataclass
+class Progress:
+    """What a tick did for the goal."""
+
+    angle: jax.Array  # [] rad, from the target orientation
+    distance: jax.Array  # [] m, from the reference
+    spin: jax.Array  # [] rad/s about the axis, positive in the wanted direction
+    entered: jax.Array  # [] bool
+    dwell: jax.Array  # [] s
+    success: jax.Array  # [] bool
+
+
+# --- small pure functions ----------------------------------------------------------------------
+
+
+def goal_quat(turns: jax.Array, axis: jax.Array, angle: jax.Array) -> jax.Array:
+    """Orientation [4] of the goal after `turns` goals: (turns + 1) steps of `angle` about `axis`."""
+    # Angles are taken modulo a full turn, so that single precision lasts for any number of goals.
+    total = jnp.remainder((turns + 1) * angle, 2 * jnp.pi)
+    return rotations.axis_angle_to_quat(axis, total)
+
+
+def goal_reward(angle: jax.Array, distance: jax.Array, weights: RotateReward) -> jax.Array:
+    """1 / (|d_rot| + epsilon) / (1 + exp(400 (d_goal - 0.05)))."""
+    gate = jax.nn.sigmoid(weights.gate_steepness * (weights.gate - distance))
+    return gate / (jnp.abs(angle) + weights.epsilon)
+
+
+def tips_at_work(duty: jax.Array, count: int, enough: float, by: str = "mean") -> jax.Array:
+    """min(duty / enough, 1) of the `count` busiest fingertips: their mean, or the least of them."""
+    busiest = jnp.minimum(jnp.sort(duty)[::-1][:count] / enough, 1.0)
+    return jnp.sum(busiest) / count if by == "mean" else busiest[-1]
+
+
+class Rotate:
+    """The rules of the task, for `dexsim.env.env.Env`."""
+
+    name = "rotate"
+    fields = {"actor": observation.ROTATE, "critic": observation.ROTATE_CRITIC}
+    evaluation = "totals"
+
+    def __init__(self, config: RotateConfig, hand: Hand):
+        if len(config.posture) != hand.num_joints:
+            raise ConfigError(
+                f"RotateConfig.posture has {len(config.posture)} angles, the hand {hand.num_joints} joints"
+            )
+        self.config, self.hand = config, hand
+        self.slots, self.largest = slots(config), largest_size(config)
+        drawn = ("edge", *(f"objects.{name}" for name in BULK_RANGES))
+        self.object_ranges = tuple(f"objects.{name}" for name in MESH_RANGES) if config.object == "mesh" else drawn
+        # Palm up; the tilt lowers the wrist, the roll the thumb's side.
+        level = 9.81 * math.cos(config.roll)
+        self.gravity = (-level * math.cos(config.tilt), 9.81 * math.sin(config.roll), -level * math.sin(config.tilt))
+        self.reference, self._palm = config.reference, palm_height(hand)
+        self._axis = jnp.asarray(config.unit_axis)
+        self._step = config.direction * config.goal_step
+        self._period = config.physics.control_period
+        self.episode_ticks = max(round(config.episode_seconds / self._period), 1)
+        self.evaluation_ticks = max(round(config.evaluation_seconds / self._period), 1)
+
+    def make_pool(self, key: jax.Array) -> Start:
+        """Objects that came to rest in random postures of the hand; see `rotate_start`."""
+        return load_pool(key, self.hand, self.config, self.gravity)
+
+    def draw_object(self, key: jax.Array, config: RotateConfig, shape_index: jax.Array | None = None) -> ObjectParams:
+        """One object of `config`; there is only one kind."""
+        del shape_index
+        return sample_target(key, config)
+
+    def plain_inertia(self, target: ObjectParams) -> jax.Array:
+        """Inertia [3] m^2 of the object as a uniform solid of 1 kg."""
+        if self.config.object == "mesh":
+            return params.plain_inertia(target, self.config.objects)
+        return plain_inertia(self.config.object, target.size[0, 0])
+
+    def begin(self, key: jax.Array, start: Start) -> Goal:
+        del key, start
+        zero, none = jnp.zeros(()), jnp.zeros((), jnp.int32)
+        fingers = jnp.zeros(self.hand.num_fingers)
+        return Goal(
+            turns=none,
+            entered=jnp.zeros((), bool),
+            entries=none,
+            dwell=zero,
+            clock=zero,
+            last_success=zero,
+            gives_up=jnp.ones((), bool),
+            duty=fingers,
+            pace=zero,
+            since_touch=jnp.full((), 10.0),
+            totals={"spin": zero, "joint_speed": zero, "action_rate": zero, "tilt": zero, "touch": fingers},
+        )
+
+    def progress(self, goal: Goal, moment: Moment) -> Progress:
+        """Where the object is with respect to the goal."""
+        config = self.config
+        angle = rotations.quat_angle(self._quat(goal), moment.object_quat)
+        distance = jnp.linalg.norm(moment.object_position - jnp.asarray(self.reference))
+        spin = config.direction * jnp.sum(moment.object_spin * self._axis)
+        inside = (angle < config.goal_angle) & (distance < config.goal_distance)
+        calm = jnp.abs(spin) <= config.goal_spin if config.goal_spin > 0 else True
+        dwell = jnp.where(inside, goal.dwell + self._period, 0.0)
+        # Half a tick of slack: sums of ticks are not exact.
+        success = inside & calm & (dwell > config.goal_dwell - self._period / 2)
+        return Progress(angle, distance, spin, goal.entered | inside, dwell, success)
+
+    def update(self, key: jax.Array, goal: Goal, moment: Moment) -> Goal:
+        del key
+        return self._advance(goal, moment)
+
+    def _advance(self, goal: Goal, moment: Moment) -> Goal:
+        now, period = self.progress(goal, moment), self._period
+        touching = self._touching(moment)
+        clock = goal.clock + period
+        change = {
+            "spin": now.spin,
+            "joint_speed": jnp.mean(jnp.abs(moment.joint_velocity)),
+            "action_rate": jnp.mean(jnp.abs(moment.action - moment.last_action)),
+            "tilt": self._tilt(moment),
+            "touch": touching,
+        }
+        return Goal(
+            turns=goal.turns + now.success,
+            entered=now.entered & ~now.success,
+            entries=goal.entries + (now.entered & ~goal.entered),
+            dwell=jnp.where(now.success, 0.0, now.dwell),
+            clock=clock,
+            last_success=jnp.where(now.success, clock, goal.last_success),
+            gives_up=goal.gives_up,
+            duty=goal.duty + period / _MEMORY * (touching - goal.duty),
+            pace=goal.pace + period / _MEMORY * (change["joint_speed"] - goal.pace),
+            since_touch=jnp.where(jnp.any(touching > 0), 0.0, goal.since_touch + period),
+            totals={name: goal.totals[name] + change[name] for name in goal.totals},
+        )
+
+    def goal_readings(self, goal: Goal) -> tuple[jax.Array, jax.Array]:
+        """Command (unused) and target orientation, as `Readings` carry them."""
+        return jnp.zeros(()), self._quat(goal)
+
+    def target_force(self, goal: Goal) -> jax.Array:
+        """No force is asked for."""
+        del goal
+        return jnp.zeros(())
+
+    def push(self, key: jax.Array, target: ObjectParams) -> jax.Array:
+        """Force [3] N that changes the object's velocity by up to `push_speed` in one tick."""
+        return random_push(
+            key,
+            target.mass,
+            probability=self.config.push_probability,
+            speed=self.config.push_speed,
+            period=self._period,
+        )
+
+    def dropped(self, goal: Goal, moment: Moment) -> jax.Array:
+        away = jnp.linalg.norm(moment.object_position - jnp.asarray(self.reference))
+        lost = (away > self.config.drop_distance) | (self._tilt(moment) > self.config.drop_tilt)
+        if self.config.support == "fingers":
+            low = lowest_point(moment.target, moment.object_quat, moment.object_position)
+            lost |= low < self._palm + self.config.clearance
+        hopeless = (away > self.config.leash) | (goal.clock - goal.last_success > self.config.patience)
+        return lost | (goal.gives_up & hopeless)
+
+    def reward(self, goal: Goal, moment: Moment, dropped: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """The reward of a tick and its terms; nothing but penalties once dropped."""
+        weights, now, held = self.config.reward, self.progress(goal, moment), 1.0 - dropped
+        after = self._advance(goal, moment)
+        work = tips_at_work(after.duty, weights.working_tips, weights.working_duty, weights.tips_by)
+        calm = jnp.minimum(weights.bonus_speed / jnp.maximum(after.pace, 1e-6), 1.0) ** 2
+        asked = weights.bonus_tips * (goal.turns >= weights.tips_after)
+        share = calm * (1.0 - asked * (1.0 - work))
+        terms = {
+            "goal": held * weights.goal * goal_reward(now.angle, now.distance, weights),
+            "bonus": held * weights.bonus * now.success * share,
+            "spin": held * weights.spin * jnp.clip(now.spin, -1.0, 1.0),
+            "fingertips": held * weights.fingertips * work,
+            "action": weights.action * action_rate(moment.action, moment.last_action),
+            "velocity": weights.velocity * joint_speed(moment.joint_velocity),
+            "torque": weights.torque * jnp.sum(moment.joint_torque**2),
+            "drop": weights.drop * dropped,
+        }
+        ticks = jnp.maximum(after.clock / self._period, 1.0)
+        mean = {name: total / ticks for name, total in after.totals.items()}
+        turns, recent = after.turns.astype(jnp.float32), after.since_touch <= _RECENT
+        return sum(terms.values()), {
+            **{f"reward/{name}": value for name, value in terms.items()},
+            "goals_per_minute": turns / jnp.maximum(after.clock, self._period) * 60.0,
+            "successes": turns,
+            "paper_successes": after.entries.astype(jnp.float32),
+            "time_at_last_success": after.last_success,
+            "angle_error": now.angle,
+            "distance": now.distance,
+            "pushed_out": (dropped & recent).astype(jnp.float32),
+            "slipped": (dropped & ~recent).astype(jnp.float32),
+            "spin": mean["spin"],
+            "joint_speed": mean["joint_speed"],
+            "action_rate": mean["action_rate"],
+            "tilt": mean["tilt"],
+            "taxel_force": jnp.sum(moment.touch.force),
+            **{f"duty/{i}": mean["touch"][i] for i in range(self.hand.num_fingers)},
+        }
+
+    def _quat(self, goal: Goal) -> jax.Array:
+        return goal_quat(goal.turns, self._axis, self._step)
+
+    def _tilt(self, moment: Moment) -> jax.Array:
+        """Angle [] rad between the object's own axis and the axis of rotation."""
+        own = rotations.rotate(rotations.quat_to_matrix(moment.object_quat), self._axis)
+        across = jnp.linalg.norm(jnp.cross(own, self._axis) + 1e-12)
+        return jnp.arctan2(across, jnp.sum(own * self._axis))
+
+    def _touching(self, moment: Moment) -> jax.Array:
+        return (jnp.linalg.norm(moment.finger_force, axis=-1) > TOUCH).astype(jnp.float32)
+
+    # --- evaluation ------------------------------------------------------------------------
+
+    def evaluation_plan(self, count: int, shape_index: np.ndarray) -> tuple[np.ndarray, Goal]:
+        """Rows [count] of the pool, evenly spread over it; goals that end with a drop only."""
+        goal = dataclasses.replace(self.begin(jax.random.key(0), None), gives_up=jnp.zeros((), bool))
+        goals = jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), goal)
+        return np.linspace(0, len(shape_index) - 1, count).round().astype(int), goals
+
+    def summarize(self, metrics: dict[str, np.ndarray], lived: np.ndarray, control_period: float) -> dict:
+        """The report of an evaluation; see `rotate_report`."""
+        return summarize(metrics, lived, control_period, self.evaluation_ticks)

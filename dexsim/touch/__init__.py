@@ -1,0 +1,1 @@
+"""Touch: the skin's law, what taxels feel, force and centre per finger."""

@@ -1,0 +1,200 @@
+"""Our environments as brax environments, for brax's trainers and wrappers (extra `brax`).
+
+    from brax.training.agents.ppo import networks, train as ppo
+    env = BraxEnv(dexsim.make("grasp"))
+    factory = functools.partial(networks.make_ppo_networks,
+                                policy_obs_key="actor", value_obs_key="critic")
+    ppo.train(env, wrap_env_fn=wrap, episode_length=env.episode_length,
+              network_factory=factory, ...)
+
+brax knows one `done`. Its convention, kept here: the environment reports `done` only where the task
+*terminated*, and the time limit is a wrapper's, which marks those steps in `info["truncation"]` so
+that the trainer does not take them for failures. With `wrap` the task's own time limit does that.
+brax's standard wrappers work too, with their own limit (`episode_length`) and their own restart:
+every environment returns to the one start state it was first given (random numbers move on).
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dexsim.core.errors import ConfigError
+
+try:
+    from brax.envs.base import Env, State, Wrapper
+    from brax.envs.wrappers.training import EpisodeWrapper, VmapWrapper
+except ImportError as error:
+    raise ImportError("dexsim.wrappers.brax needs brax: pip install 'dexsim[brax]'") from error
+
+
+def _put_replicated(tree: Any, devices: list[jax.Device]) -> Any:
+    """`tree` with a leading axis over `devices`: JAX 0.10 took it out, brax 0.14 still calls it."""
+    mesh = jax.sharding.Mesh(np.array(devices), ("device",))
+    sharding = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("device"))
+    return jax.tree.map(lambda leaf: jax.device_put(jnp.stack([jnp.asarray(leaf)] * len(devices)), sharding), tree)
+
+
+if not hasattr(jax, "device_put_replicated"):
+    jax.device_put_replicated = _put_replicated
+
+# brax sums each metric over the episode and keeps its own return and length.
+_RUNNING_METRICS = ("return", "length")
+
+
+class BraxEnv(Env):
+    """A dexsim environment behind brax's interface.
+
+    The brax state holds our state, with random keys as raw data, in `pipeline_state`, and in `info`
+    the key and `time_limit` (1 where the task's time limit was reached and it did not terminate).
+
+    Args:
+      env: what `dexsim.make` returns.
+      observation_group: `"actor"` or `"critic"` for a plain array; None (default) for a dictionary
+        with an array for each group, chosen from by brax's `policy_obs_key` and `value_obs_key`.
+    """
+
+    def __init__(self, env: Any, observation_group: str | None = None):
+        groups = env.observation_layout
+        if observation_group is not None and observation_group not in groups:
+            raise ConfigError(f"no observation group {observation_group!r}: choose from {', '.join(groups)}")
+        self.env = env
+        self._group = observation_group
+        # Tells which leaves are random keys: brax cannot carry typed keys through its trainer.
+        self._template = jax.eval_shape(env.reset, jax.random.key(0))
+
+    def reset(self, rng: jax.Array) -> State:
+        """The start of an episode. `rng`: a raw key, as brax uses, or a typed one."""
+        if not jnp.issubdtype(rng.dtype, jax.dtypes.prng_key):
+            rng = jax.random.wrap_key_data(rng)
+        return self._to_brax(self.env.reset(rng))
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """One control step. `action`: `[A]` in [-1, 1]."""
+        return self._to_brax(self.env.step(self._to_dexsim(state), action), last=state)
+
+    def restart(self, state: State, done: jax.Array) -> State:
+        """Begin a new episode where `done`; reward, done and metrics stay the last step's."""
+        begun = self._to_brax(self.env.restart(self._to_dexsim(state), done.astype(bool)), state)
+        return begun.replace(
+            reward=state.reward,
+            done=state.done,
+            metrics=state.metrics,
+            info={**begun.info, "time_limit": state.info["time_limit"]},
+        )
+
+    @property
+    def observation_size(self) -> int | dict[str, tuple[int, ...]]:
+        sizes = {group: sum(field.size for field in fields) for group, fields in self.env.observation_layout.items()}
+        if self._group is not None:
+            return sizes[self._group]
+        return {group: (size,) for group, size in sizes.items()}
+
+    @property
+    def action_size(self) -> int:
+        return self.env.action_size
+
+    @property
+    def backend(self) -> str:
+        return self.env.backend
+
+    @property
+    def episode_length(self) -> int:
+        """Ticks of an evaluation episode."""
+        return self.env.evaluation_steps
+
+    @property
+    def dt(self) -> float:
+        """One control tick, s."""
+        return 1.0 / self.env.control_rate
+
+    def snapshot(self, state: State) -> Any:
+        """What a picture of a state needs (`dexsim.render.snapshot.Snapshot`)."""
+        return self.env.snapshot(self._to_dexsim(state))
+
+    def render(self, trajectory: Sequence[State], height: int = 480, width: int = 640) -> list[np.ndarray]:
+        """Pictures uint8 `[height, width, 3]` of brax states without a batch axis."""
+        from dexsim.render.render import render_frame
+
+        return [
+            render_frame(self.env.hand, self.env.primitive_kinds, self.snapshot(state), size=(width, height))
+            for state in trajectory
+        ]
+
+    def _to_brax(self, state: Any, last: State | None = None) -> State:
+        # brax's wrappers keep entries of their own in `metrics` and `info`: they stay.
+        carried, info = (last.metrics, last.info) if last is not None else ({}, {})
+        terminated = state.terminated.astype(jnp.float32)
+        time_limit = state.truncated.astype(jnp.float32) * (1 - terminated)
+        return State(
+            pipeline_state=jax.tree.map(_raw, state),
+            obs=dict(state.obs) if self._group is None else state.obs[self._group],
+            reward=state.reward.astype(jnp.float32),
+            done=terminated,
+            metrics=carried
+            | {
+                name: value.astype(jnp.float32) for name, value in state.metrics.items() if name not in _RUNNING_METRICS
+            },
+            info={**info, "key": jax.random.key_data(state.key), "time_limit": time_limit},
+        )
+
+    def _to_dexsim(self, state: State) -> Any:
+        """Our state. The key is `info`'s, since brax's restart rewinds `pipeline_state`."""
+        typed = jax.tree.map(_typed, self._template, state.pipeline_state)
+        key = _typed(self._template.key, state.info["key"])
+        return dataclasses.replace(typed, key=key)
+
+
+class TimeLimit(EpisodeWrapper):
+    """brax's episode bookkeeping, ending episodes at the task's own time limit as well."""
+
+    def step(self, state: State, action: jax.Array) -> State:
+        state = super().step(state, action)
+        terminated = state.done * (1 - state.info["truncation"])
+        truncation = jnp.maximum(state.info["truncation"], state.info["time_limit"] * (1 - terminated))
+        done = jnp.maximum(state.done, truncation)
+        return state.replace(done=done, info={**state.info, "truncation": truncation, "episode_done": done})
+
+
+class Restart(Wrapper):
+    """Starts finished episodes anew from the task's distribution of start states."""
+
+    def step(self, state: State, action: jax.Array) -> State:
+        steps = jnp.where(state.done, 0, state.info["steps"])
+        state = state.replace(done=jnp.zeros_like(state.done), info={**state.info, "steps": steps})
+        state = self.env.step(state, action)
+        return jax.vmap(self.unwrapped.restart)(state, state.done)
+
+
+def wrap(env: BraxEnv, episode_length: int, action_repeat: int = 1, randomization_fn: Any = None) -> Wrapper:
+    """For the argument `wrap_env_fn` of brax's trainers: vmap, time limit, restart.
+
+    Args:
+      episode_length: the longest episode in ticks; the task's own time limit may come before it.
+
+    Raises:
+      ConfigError: `randomization_fn` is given; our environments randomise themselves.
+    """
+    if randomization_fn is not None:
+        raise ConfigError(
+            "randomization_fn: the task draws new parameters at every episode start "
+            "by itself; set its `randomization` config instead"
+        )
+    return Restart(TimeLimit(VmapWrapper(env), episode_length, action_repeat))
+
+
+def _is_key(leaf: Any) -> bool:
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def _raw(leaf: jax.Array) -> jax.Array:
+    return jax.random.key_data(leaf) if _is_key(leaf) else leaf
+
+
+def _typed(template: Any, leaf: jax.Array) -> jax.Array:
+    if not _is_key(template):
+        return leaf
+    return jax.random.wrap_key_data(leaf, impl=jax.random.key_impl(jax.random.key(0)))

@@ -1,0 +1,133 @@
+"""Collects experience: `T` steps of `B` environments under one `lax.scan`, policy inside."""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from dexsim.core.pytree import choose, pytree_dataclass
+from dexsim_ppo.learner.types import Environment
+
+_RESERVE_STEPS = 16  # short beside an episode, long beside the cost of computing a batch of new ones
+
+
+@pytree_dataclass
+class Decision:
+    """What the policy did in one state; arrays [B, ...]."""
+
+    action: jax.Array  # [B, A] the Gaussian sample, before any squashing
+    mean: jax.Array  # [B, A]
+    log_prob: jax.Array  # [B]
+
+
+@pytree_dataclass
+class Rollout:
+    """Experience [T, B, ...]. Observations are raw: not normalised."""
+
+    obs: dict[str, jax.Array]
+    decision: Decision
+    value: jax.Array  # [T, B] of `obs`
+    next_value: jax.Array  # [T, B] of the observation after the step, before any restart
+    reward: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
+
+
+Act = Callable[[jax.Array, Mapping[str, jax.Array]], tuple[Decision, jax.Array]]
+"""`act(key, obs) -> (decision, action for the environment [B, A])`"""
+Value = Callable[[Mapping[str, jax.Array]], jax.Array]
+"""`value(obs) -> [B]`"""
+
+
+def collect(
+    env: Environment, state: Any, key: jax.Array, act: Act, value: Value, length: int
+) -> tuple[Any, Rollout, dict[str, jax.Array]]:
+    """Run the policy for `length` steps.
+
+    The order is: act, step, record, restart. So the recorded flags, metrics and `next_value` belong to
+    the true final state of an episode, and the next step starts from a fresh one.
+
+    Args:
+      state: batch [B] of environment states.
+
+    Returns:
+      The states to go on from, the experience, and scalar metrics: `step/<name>` is a mean over all
+      steps, `episode/<name>` the mean of the last step's value over the episodes that ended (NaN if
+      none did), `episodes` their number.
+    """
+    step_env = jax.vmap(env.step)
+
+    def step(state, key):
+        obs = dict(state.obs)
+        decision, action = act(key, obs)
+        after = step_env(state, action)
+        record = Rollout(
+            obs=obs,
+            decision=decision,
+            value=value(obs),
+            next_value=value(after.obs),
+            reward=after.reward,
+            terminated=after.terminated,
+            truncated=after.truncated & ~after.terminated,
+        )
+        return after, (record, dict(after.metrics))
+
+    state, (rollout, told) = scan_restarting(env, step, state, jax.random.split(key, length))
+    # All sums are taken here: within the scan each would be a reduction of few numbers, which GPUs are slow at.
+    finite, done = jnp.isfinite(rollout.reward), rollout.terminated | rollout.truncated
+    rollout = dataclasses.replace(rollout, reward=jnp.where(finite, rollout.reward, 0.0))
+    episodes, steps = jnp.sum(done, dtype=jnp.float32), done.size
+    metrics = {
+        "reward": jnp.mean(rollout.reward),
+        "episodes": episodes,
+        "terminated_share": jnp.sum(rollout.terminated, dtype=jnp.float32) / episodes,
+        "nonfinite_rewards": jnp.sum(~finite, dtype=jnp.float32),
+    }
+    metrics |= {f"step/{k}": _sum(v, jnp.ones_like(done)) / steps for k, v in told.items()}
+    metrics |= {f"episode/{k}": _sum(v, done) / episodes for k, v in told.items()}
+    return state, rollout, metrics
+
+
+def scan_restarting(
+    env: Environment, step: Callable[[Any, Any], tuple[Any, Any]], state: Any, inputs: Any
+) -> tuple[Any, Any]:
+    """`jax.lax.scan`, with a new episode after each step wherever one ended.
+
+    `jax.vmap(env.restart)` after each step would compute a new episode for every environment and throw nearly
+    all of them away. So one for each is kept in reserve and renewed after at most 16 steps: an environment
+    whose episode ends twice in between begins both times alike. Restarting just the rows that ended, in a
+    loop, would have a GPU wait for the host at every step.
+
+    Args:
+      step: `(states [B], input) -> (states after it, output)`; it does not restart.
+      inputs: pytree [T, ...].
+
+    Returns:
+      The last states and the outputs [T, ...].
+    """
+    length = jax.tree.leaves(inputs)[0].shape[0]
+    block = max(n for n in range(1, _RESERVE_STEPS + 1) if length % n == 0)
+    restart = jax.jit(jax.vmap(env.restart))
+
+    def run_block(state, inputs):
+        everyone = jnp.ones(state.reward.shape[0], bool)
+        # The second call moves the random keys on that the first has used.
+        fresh, state = restart(state, everyone), restart(state, ~everyone)
+
+        def run_step(state, given):
+            after, output = step(state, given)
+            return jax.vmap(choose)(after.terminated | after.truncated, fresh, after), output
+
+        return jax.lax.scan(run_step, state, inputs)
+
+    blocks = jax.tree.map(lambda x: x.reshape(length // block, block, *x.shape[1:]), inputs)
+    state, outputs = jax.lax.scan(run_block, state, blocks)
+    return state, jax.tree.map(lambda x: x.reshape(length, *x.shape[2:]), outputs)
+
+
+def _sum(x: jax.Array, mask: jax.Array) -> jax.Array:
+    """Sum of the finite elements of `x` [T, B] where `mask`."""
+    x = x.astype(jnp.float32)
+    return jnp.sum(jnp.where(mask & jnp.isfinite(x), x, 0.0))

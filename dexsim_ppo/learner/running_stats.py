@@ -1,0 +1,92 @@
+"""Running mean and variance, and the normalisers made from them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dexsim.core.pytree import pytree_dataclass, static
+from dexsim_ppo.learner.types import Fields, layout_size
+
+# The count stops here, and what was a mean over all samples becomes an exponential one over about this
+# many. A float32 count would freeze at 2**24 and an int32 one overflow after an hour on a GPU.
+MEMORY = 2**27
+
+
+@pytree_dataclass
+class RunningStats:
+    """Mean and population variance of vectors [n], over `count` samples."""
+
+    count: jax.Array  # int32 []
+    mean: jax.Array  # [n]
+    variance: jax.Array  # [n]
+
+
+@pytree_dataclass
+class Normalizer:
+    """The map `clip((x - mean) / std)` on vectors [n]."""
+
+    mean: jax.Array
+    std: jax.Array
+    clip: float = static(default=5.0)
+
+
+def init_stats(shape: tuple[int, ...]) -> RunningStats:
+    """Statistics before the first sample: mean 0, variance 1."""
+    return RunningStats(count=jnp.zeros((), jnp.int32), mean=jnp.zeros(shape), variance=jnp.ones(shape))
+
+
+def update_stats(stats: RunningStats, batch: jax.Array) -> RunningStats:
+    """Merge a batch [..., n] (Chan et al. 1979); elements whose batch is not finite stay as they are."""
+    axes = tuple(range(batch.ndim - stats.mean.ndim))
+    size = int(np.prod([batch.shape[axis] for axis in axes]))
+    batch_mean, batch_variance = jnp.mean(batch, axes), jnp.var(batch, axes)
+    count = jnp.minimum(stats.count, MEMORY) + size
+    weight = size / count.astype(jnp.float32)
+    delta = batch_mean - stats.mean
+    mean = stats.mean + weight * delta
+    variance = (1 - weight) * stats.variance + weight * batch_variance + weight * (1 - weight) * delta**2
+    ok = jnp.isfinite(mean) & jnp.isfinite(variance)
+    return RunningStats(
+        count=count, mean=jnp.where(ok, mean, stats.mean), variance=jnp.where(ok, variance, stats.variance)
+    )
+
+
+def make_normalizer(stats: RunningStats, fields: Fields, *, std_floor: float, clip: float) -> Normalizer:
+    """Normaliser of one observation group.
+
+    Fields with a fixed scale are only divided by it: running statistics of a channel that is silent
+    until first contact would turn that contact into an outlier. The floor guards the other fields.
+
+    Args:
+      stats: over vectors [n], n being the sum of the fields' sizes.
+      std_floor: smallest standard deviation, in the observation's own units.
+    """
+    scale = np.concatenate([np.full(f.size, f.scale or 0.0, np.float32) for f in fields])
+    if scale.size != layout_size(fields) or scale.shape != stats.mean.shape:
+        raise ValueError(f"layout of {scale.size} elements for statistics of {stats.mean.shape}")
+    std = jnp.sqrt(stats.variance + std_floor**2)
+    fixed = scale > 0
+    return Normalizer(mean=jnp.where(fixed, 0.0, stats.mean), std=jnp.where(fixed, scale, std), clip=clip)
+
+
+def recover_stats(normalizer: Normalizer, *, std_floor: float) -> RunningStats:
+    """Statistics that `make_normalizer` makes this normaliser of, for fields that have no fixed scale.
+
+    They count as ones of many samples: they scarcely move.
+    """
+    return RunningStats(
+        count=jnp.int32(MEMORY),
+        mean=jnp.copy(normalizer.mean),
+        variance=jnp.maximum(normalizer.std**2 - std_floor**2, 0.0),
+    )
+
+
+def normalize(normalizer: Normalizer, x: jax.Array) -> jax.Array:
+    """Normalised and clipped `x` [..., n]."""
+    z = (x - normalizer.mean) / normalizer.std
+    return jnp.clip(z, -normalizer.clip, normalizer.clip)
+
+
+def value_std(stats: RunningStats) -> jax.Array:
+    """Standard deviation of returns [], kept away from zero."""
+    return jnp.sqrt(stats.variance + 1e-6)

@@ -1,0 +1,77 @@
+"""How much to train, and how large, by the device found."""
+
+from dataclasses import dataclass, replace
+
+from dexsim_ppo.learner.config import PPOConfig
+
+
+@dataclass(frozen=True, kw_only=True)
+class Preset:
+    """Defaults of the training command; each can be set by its own option."""
+
+    ppo: PPOConfig
+    steps: int
+    """Environment steps; 0 for no limit."""
+    minutes: float
+    """Wall-clock of the training loop, compilation included; 0 for no limit."""
+    evaluate_every: int
+    """Iterations between evaluations."""
+    evaluation_chunk: int
+    """Episodes evaluated side by side; an evaluation during training is one chunk."""
+    evaluation_episodes: int
+    """Episodes of the final evaluation."""
+    log_every: int
+    """Iterations between lines of metrics."""
+    corners: float = 0.0
+    """Share of training's hands and objects with every value at an end of its range."""
+
+
+PRESETS = {
+    # Two cores: simulation is nearly all of the time, so small networks and many passes over little data.
+    "cpu": Preset(
+        ppo=PPOConfig(
+            num_envs=256, rollout_length=16, epochs=5, minibatches=4, actor_layers=(128, 128), critic_layers=(128, 128)
+        ),
+        steps=0,
+        minutes=6.5,
+        evaluate_every=0,
+        evaluation_chunk=50,
+        evaluation_episodes=150,
+        log_every=5,
+    ),
+    # One large GPU: enough environments to fill it, few large minibatches.
+    "gpu": Preset(
+        ppo=PPOConfig(
+            num_envs=32768,
+            rollout_length=16,
+            epochs=4,
+            minibatches=16,
+            kl_target=0.015,
+            entropy_coefficient=0.004,
+            matmul_precision="default",
+            actor_layers=(256, 256, 128),
+            critic_layers=(256, 256, 128),
+        ),
+        steps=0,
+        minutes=8.0,
+        evaluate_every=100,
+        evaluation_chunk=1024,
+        evaluation_episodes=1024,
+        log_every=10,
+        corners=0.6,
+    ),
+}
+
+
+def find_preset(name: str, task: str) -> Preset:
+    """The preset of a device, adapted to the task."""
+    preset = PRESETS.get(name, PRESETS["cpu"])
+    if not task.startswith("rotate"):
+        return preset
+    # Episodes of two minutes are long to evaluate, so that is done once, at the end; and a gait wants
+    # less noise than a grip that has to try out forces.
+    if preset is PRESETS["cpu"]:
+        return replace(preset, evaluation_chunk=16, evaluation_episodes=16)
+    # Half the environments: twice the updates for the same experience, which a gait is found with.
+    ppo = replace(preset.ppo, num_envs=16384, minibatches=8, entropy_coefficient=0.001)
+    return replace(preset, ppo=ppo, minutes=7.5, evaluate_every=0)

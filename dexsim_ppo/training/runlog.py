@@ -1,0 +1,124 @@
+"""A run's folder: configuration, metrics, checkpoints, policies and the learning curve."""
+
+import importlib.util
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+from dexsim.core.cli import plain
+from dexsim.core.errors import CheckpointError
+
+CURVES = ("episode/return", "episode/success", "episode/goals_per_minute", "reward")
+
+
+class RunFolder:
+    """`runs/<task>-<time>/` and its files."""
+
+    def __init__(self, path: Path):
+        self.path = path
+        self.checkpoints = path / "checkpoints"
+        self.metrics = path / "metrics.jsonl"
+        self.best, self.last = path / "best.msgpack", path / "last.msgpack"
+        self.untrained = path / "untrained.msgpack"
+        self.report, self.config = path / "report.json", path / "config.json"
+
+    def checkpoint(self, iteration: int) -> Path:
+        """File of the checkpoint after this many iterations."""
+        return self.checkpoints / f"{iteration:08d}.msgpack"
+
+    def existing_checkpoints(self) -> list[Path]:
+        """Oldest first."""
+        return sorted(p for p in self.checkpoints.glob("*.msgpack") if re.fullmatch(r"\d{8}\.msgpack", p.name))
+
+    def latest_checkpoint(self) -> Path:
+        """The newest checkpoint.
+
+        Raises:
+          CheckpointError: there is none.
+        """
+        found = self.existing_checkpoints()
+        if not found:
+            raise CheckpointError(f"{self.path}: holds no checkpoint to resume from")
+        return found[-1]
+
+    def prune(self, keep: int) -> None:
+        """Delete all but the newest `keep` checkpoints."""
+        for path in self.existing_checkpoints()[:-keep]:
+            path.unlink()
+
+
+class MetricsLog:
+    """Appends a line of JSON per logged iteration, and TensorBoard events if a writer is installed."""
+
+    def __init__(self, folder: RunFolder, first_iteration: int):
+        rows = [row for row in read_metrics(folder.metrics) if row["iteration"] <= first_iteration]
+        # A resumed run goes on from its checkpoint: what came after that is run again.
+        folder.metrics.write_text("".join(json.dumps(row) + "\n" for row in rows))
+        self._file = folder.metrics.open("a", buffering=1)
+        self._writer = _tensorboard_writer(folder.path)
+
+    def write(self, row: dict[str, Any]) -> None:
+        """Log one iteration: `"iteration"`, `"env_steps"` and any scalars."""
+        self._file.write(json.dumps(plain(row)) + "\n")
+        if self._writer:
+            for name, value in row.items():
+                if name not in ("iteration", "env_steps") and value == value:
+                    self._writer.add_scalar(name, value, row["env_steps"])
+
+    def close(self) -> None:
+        """Flush to disk."""
+        self._file.close()
+        if self._writer:
+            self._writer.close()
+
+
+def read_metrics(path: Path) -> list[dict[str, Any]]:
+    """Rows of a metrics file; a last line that was cut short is left out."""
+    rows = []
+    for line in path.read_text().splitlines() if path.exists() else []:
+        try:
+            rows.append(json.loads(line))
+        except json.JSONDecodeError:
+            break
+    return rows
+
+
+def _tensorboard_writer(path: Path) -> Any:
+    for module in ("tensorboardX", "torch.utils.tensorboard"):
+        if importlib.util.find_spec(module.split(".")[0]) is None:
+            continue
+        try:
+            return importlib.import_module(module).SummaryWriter(str(path / "tensorboard"))
+        except ImportError:
+            continue
+    return None
+
+
+def draw_curve(rows: list[dict[str, Any]], path: Path, title: str) -> None:
+    """Learning curves over environment steps as a PNG."""
+    import matplotlib
+
+    matplotlib.use("agg")
+    import matplotlib.pyplot as plt
+
+    names = [name for name in CURVES if any(row.get(name) is not None for row in rows)]
+    names += sorted({name for row in rows for name in row if name.startswith("step/") and name.endswith("error")})[:1]
+    if not names:
+        return
+    figure, axes = plt.subplots(
+        len(names), 1, figsize=(7, 2.2 * len(names)), sharex=True, squeeze=False, layout="constrained"
+    )
+    for ax, name in zip(axes[:, 0], names, strict=True):
+        points = [(row["env_steps"], row[name]) for row in rows if row.get(name) is not None]
+        ax.plot(*zip(*points, strict=True), lw=1.2)
+        ax.set_ylabel(name)
+        ax.grid(alpha=0.3)
+    held = [(row["env_steps"], row["evaluation/return"]) for row in rows if row.get("evaluation/return") is not None]
+    if held and names[0] == "episode/return":
+        axes[0, 0].plot(*zip(*held, strict=True), "o", ms=4, label="evaluation")
+        axes[0, 0].legend()
+    axes[0, 0].set_title(title)
+    axes[-1, 0].set_xlabel("environment steps")
+    figure.savefig(path, dpi=120)
+    plt.close(figure)

@@ -1,0 +1,1 @@
+"""`python -m dexsim_real.calibrate`: press, fit, identify."""

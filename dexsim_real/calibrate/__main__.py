@@ -1,0 +1,116 @@
+"""Calibrates a hand: currents to torques, counts to newtons, by pressing its fingertips on something firm.
+
+    python -m dexsim_real.calibrate --port /dev/serial/by-id/usb-FTDI_... --output hand.toml
+
+First the taxels are checked and zeroed with the motors off; then one fingertip after the other is pressed, slowly, up
+and down. With `--gauge ask` a kitchen scale or force gauge is the reference; without, the taxels are, as in the
+paper. The output is written at the end, whole or not at all. `--from-log FILE` fits a recorded session again.
+"""
+
+import dataclasses
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from dexsim import load_hand
+from dexsim.calibration.maps import save_calibration
+from dexsim.calibration.plot import plot_calibration
+from dexsim.core import cli
+from dexsim.hand.kinematics import Hand
+from dexsim_real.calibrate.bench import Workbench
+from dexsim_real.calibrate.fit import fit
+from dexsim_real.calibrate.gauge import Gauge
+from dexsim_real.calibrate.identify import identify_hand
+from dexsim_real.calibrate.loop import Operator
+from dexsim_real.calibrate.options import CalibrateArguments
+from dexsim_real.calibrate.plan import placements
+from dexsim_real.calibrate.press import PressProcedure, placement_record
+from dexsim_real.calibrate.read import read_logs
+from dexsim_real.calibrate.report import grouped, report, table
+from dexsim_real.control.controller import prepare_jax
+from dexsim_real.core.errors import HandError
+from dexsim_real.core.log import Kind
+from dexsim_real.core.process import stopping
+
+_SPEED = 2.0  # rad/s of the commands at most
+
+
+def record(arguments: CalibrateArguments, hand: Hand, operator: Operator, **bench: Any) -> Path:
+    """The press procedure; returns its log.
+
+    Raises:
+      HandError: what went wrong; the motors are off.
+    """
+    plan = placements(hand, arguments.fingers, arguments.sides)
+    gauge = Gauge(arguments.gauge, operator) if arguments.gauge else None
+    # Nothing here needs to be fast.
+    slow = dataclasses.replace(arguments.safety, speed=min(arguments.safety.speed, _SPEED))
+    arguments = dataclasses.replace(arguments, safety=slow)
+    with Workbench(arguments, hand, operator, {"task": "calibrate"}, **bench) as work:
+        procedure = PressProcedure(work.loop, arguments, operator, gauge)
+        pressed = 0
+        try:
+            procedure.check(tuple(placement.finger for placement in plan))
+            work.safety.engage()
+            for placement in plan:
+                work.log.add(Kind.META, {"placement": placement_record(placement)})
+                pressed += procedure.press(placement)
+        except HandError as error:
+            if not pressed:
+                raise
+            raise HandError(
+                f"{error} (the {pressed} presses before are in {work.log.path}: --from-log fits them)"
+            ) from None
+    return work.log.path
+
+
+def conclude(arguments: CalibrateArguments, hand: Hand, logs: Sequence[Path], operator: Operator) -> None:
+    """Fit, show, and write what was asked for; the calibration last.
+
+    Raises:
+      DexsimError: the recordings cannot tell, or a file cannot be written.
+    """
+    found = fit(read_logs(logs, hand), hand)
+    operator.console.print(table(found))
+    for note in grouped(found.calibration.notes):
+        operator.tell(f"note: {note}")
+    if arguments.report:
+        cli.write_json(arguments.report, report(found))
+    if arguments.plot:
+        plot_calibration(arguments.plot, found.calibration, found.real, found.sim)
+        operator.tell(f"figure: {arguments.plot}")
+    if arguments.destination.exists() and not arguments.force:  # It may have come meanwhile.
+        raise HandError(
+            f"{arguments.destination} is there already: --from-log {' '.join(map(str, logs))} fits these "
+            "presses again, into another --output"
+        )
+    save_calibration(arguments.destination, found.calibration)
+    operator.tell(f"calibration: {arguments.destination}")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command. Returns its exit code."""
+    arguments = cli.parse(
+        CalibrateArguments,
+        sys.argv[1:] if argv is None else argv,
+        prog="python -m dexsim_real.calibrate",
+        description=__doc__.splitlines()[0],
+    )
+    prepare_jax()
+    cli.enable_caches()
+    hand = load_hand()
+    operator = Operator(Console(stderr=True), silent=arguments.yes)
+    with stopping():
+        if arguments.identify:
+            identify_hand(arguments, hand, operator)
+        else:
+            logs = arguments.from_log or (record(arguments, hand, operator),)
+            conclude(arguments, hand, logs, operator)
+    return 0
+
+
+if __name__ == "__main__":
+    cli.run(main)

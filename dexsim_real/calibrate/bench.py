@@ -1,0 +1,101 @@
+"""A hand on the bench: port, log and limits of one procedure, opened together and closed with the motors off."""
+
+import contextlib
+import os
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from dexsim.core import cli
+from dexsim.core.config import to_dict
+from dexsim.hand.kinematics import Hand
+from dexsim_real.calibrate.loop import HandLoop, Operator
+from dexsim_real.calibrate.options import CalibrateArguments
+from dexsim_real.control.safety import Safety
+from dexsim_real.core.log import Kind, LogWriter
+from dexsim_real.core.process import use_realtime
+from dexsim_real.sensors.hand import HandSensing
+from dexsim_real.wire.link import HandPort
+from dexsim_real.wire.serial_hand import open_port
+
+
+class Workbench:
+    """A hand with its log and limits for one procedure; a context manager that ends with the motors off.
+
+    Args:
+      port: in place of the one that the arguments name.
+      clock, sleep: in place of the machine's.
+    """
+
+    def __init__(
+        self,
+        arguments: CalibrateArguments,
+        hand: Hand,
+        operator: Operator,
+        meta: dict[str, Any],
+        *,
+        port: HandPort | None = None,
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+    ):
+        self._operator, self._meta = operator, meta
+        self._arguments = arguments
+        sensing = HandSensing(hand, arguments.hardware)
+        path = arguments.log or Path("runs/real") / time.strftime("calibrate-%Y%m%d-%H%M%S.log")
+        port = port or open_port(arguments.port, arguments.link)
+        self.log = LogWriter(path)
+        self.safety = Safety(hand, arguments.safety, self._react)
+        self.loop = HandLoop(port, sensing, self.safety, self.log, arguments.rate, clock=clock, sleep=sleep)
+
+    def __enter__(self) -> "Workbench":
+        try:
+            # Only from here to the end: what computes for long with it would starve the machine.
+            if self._arguments.realtime:
+                use_realtime()
+            self._say(self.loop.port.connect())
+            for warning in getattr(self.loop.port, "warnings", list)():
+                self._say(f"warning: {warning}")
+            self.log.add(
+                Kind.META,
+                {
+                    "env_config": {},
+                    "policy": "",
+                    "calibration": "",
+                    "serial": self._arguments.serial,
+                    "hardware": to_dict(self._arguments.hardware),
+                    "safety": to_dict(self._arguments.safety),
+                    "check": to_dict(self._arguments.check),
+                    "press": to_dict(self._arguments.press),
+                    "rate": self._arguments.rate,
+                    "clock": time.time(),
+                    "environment": cli.environment_report(),
+                    **self._meta,
+                },
+            )
+        except BaseException:
+            self.__exit__(*sys.exc_info())
+            raise
+        return self
+
+    def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
+        try:
+            self.loop.close()
+        finally:
+            end = "" if error is None else str(error) or kind.__name__
+            self.log.add(Kind.NOTE, f"end: {end or 'done'}")
+            self.log.add(Kind.END, {"end": end})
+            self.log.close()
+            if self._arguments.realtime:
+                with contextlib.suppress(OSError, AttributeError):
+                    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+
+    def _react(self, text: str) -> None:
+        self.log.add(Kind.NOTE, text)
+        if text.startswith(("hold", "relax")) and self.safety.engaged:
+            self._operator.tell(f"  {text}")
+
+    def _say(self, text: str) -> None:
+        self.log.add(Kind.NOTE, text)
+        self._operator.tell(text)

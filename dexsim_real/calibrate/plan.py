@@ -1,0 +1,115 @@
+"""Which fingertip presses how: postures, and the way in which targets advance.
+
+A press loads the joints that have a lever arm at the pressed place. Targets advance in proportion to these
+arms: joints with equal gains then push along the skin's normal, and what is pressed upon feels little shear.
+The pads load the flexing joints of a finger; the joints that spread thumb and index need their sides.
+
+A finger is almost straight when it presses, because there the pad lies close to the line through its joints,
+and a shear force, which taxels of unknown axes do not tell, has a short arm.
+"""
+
+import dataclasses
+
+import numpy as np
+
+from dexsim.calibration.press import lever_arms
+from dexsim.hand.kinematics import Hand
+from dexsim_real.core.errors import HandError
+
+_OPEN, _OPEN_THUMB = 0.1, (0.1, 0.1, 0.1)  # rad, of the joints that do not press
+_SHARE = 0.3  # of the longest lever arm, from which on a joint takes part
+
+
+@dataclasses.dataclass(frozen=True)
+class Placement:
+    """One fingertip, one place on it."""
+
+    name: str  # "index pad"
+    finger: int
+    taxels: tuple[int, ...]  # in the middle of the pressed place
+    joints: tuple[int, ...]  # that press
+    posture: np.ndarray  # [J] rad, where contact is expected
+    direction: np.ndarray  # [J] rad of targets for each rad of advance; the largest is 1
+    task: str  # for the user
+
+
+def placements(hand: Hand, fingers: tuple[str, ...] = (), sides: bool = True) -> list[Placement]:
+    """All presses, pads first.
+
+    Args:
+      fingers: names; all by default.
+      sides: thumb and index with their sides as well.
+
+    Raises:
+      HandError: no such finger.
+    """
+    for name in fingers:
+        if name not in hand.finger_names:
+            raise HandError(f"no finger {name!r}: choose from {', '.join(hand.finger_names)}")
+    chosen = [i for i, name in enumerate(hand.finger_names) if name in (fingers or hand.finger_names)]
+    columns, rows = hand.taxel_grid
+    middle = [c * rows + r for c in (columns // 2 - 1, columns // 2) for r in (rows // 2 - 2, rows // 2 - 1)]
+    side = [(columns - 2) * rows + r for r in (rows // 2 - 2, rows // 2 - 1)]
+    found = []
+    for finger in [*[i for i in chosen if i], *[i for i in chosen if not i]]:
+        name = hand.finger_names[finger]
+        found.append(
+            _placement(
+                hand,
+                f"{name} pad",
+                finger,
+                middle,
+                _bent(hand, finger),
+                f"hold a round pen, backed by foam, across the {name}'s pad, 1 cm before it",
+            )
+        )
+    for finger in [i for i in chosen if sides and i in (0, 1)]:
+        name, toward = hand.finger_names[finger], ("palm's normal", "thumb")[finger]
+        found.append(
+            _placement(
+                hand,
+                f"{name} side",
+                finger,
+                side,
+                _spread(hand, finger),
+                f"the same across the side of the {name} that faces the {toward}, 3 mm before it",
+            )
+        )
+    return found
+
+
+def _placement(hand: Hand, name: str, finger: int, taxels: list[int], posture: np.ndarray, task: str) -> Placement:
+    arms = np.mean([lever_arms(hand, posture, finger, taxel) for taxel in taxels], 0)
+    longest = np.max(np.abs(arms))
+    joints = np.flatnonzero(np.abs(arms) > _SHARE * longest)
+    direction = np.zeros(hand.num_joints)
+    direction[joints] = arms[joints] / longest
+    return Placement(name, finger, tuple(taxels), tuple(int(j) for j in joints), posture, direction, task)
+
+
+def _opened(hand: Hand) -> np.ndarray:
+    posture = np.full(hand.num_joints, _OPEN)
+    posture[:3] = _OPEN_THUMB
+    posture[3] = 0.0
+    return np.clip(posture, hand.joint_lower, hand.joint_upper)
+
+
+def _bent(hand: Hand, finger: int) -> np.ndarray:
+    """The pressing finger a little further than the others."""
+    posture = _opened(hand)
+    if finger == 0:
+        posture[:3] = 0.3, 0.3, 0.2
+    else:
+        first = int(hand.root_joint[finger])
+        posture[first : first + 2] = 0.35, 0.2
+    return posture
+
+
+def _spread(hand: Hand, finger: int) -> np.ndarray:
+    posture = _opened(hand)
+    if finger == 0:
+        posture[0] = 0.4
+    else:
+        posture[3] = -0.1
+        posture[4:6] = 0.35, 0.1
+    return posture

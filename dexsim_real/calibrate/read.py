@@ -1,0 +1,134 @@
+"""The log of a press session, as arrays: one `Recording` a press."""
+
+import dataclasses
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dexsim.core.config import from_dict
+from dexsim.hand.kinematics import Hand
+from dexsim_real.calibrate.check import raw_sensing
+from dexsim_real.calibrate.options import CheckConfig
+from dexsim_real.calibrate.press import REST
+from dexsim_real.core.log import Kind, LogError, LogReader
+from dexsim_real.sensors.hand import HandSensing, HardwareConfig
+from dexsim_real.wire import frames
+
+
+@dataclasses.dataclass
+class Recording:
+    """One press; lists of [T] samples in the order of time."""
+
+    name: str
+    finger: int
+    joints: tuple[int, ...]  # that pressed
+    rate: float  # samples per second
+    tare: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(frames.TAXELS))  # [N] counts
+    phase: list[str] = dataclasses.field(default_factory=list)
+    time: list[float] = dataclasses.field(default_factory=list)  # s
+    counts: list[np.ndarray] = dataclasses.field(default_factory=list)  # [N] zeroed, below zero as well
+    shown: list[float] = dataclasses.field(default_factory=list)  # counts of the fingertip as a run sees it
+    shear: list[np.ndarray] = dataclasses.field(default_factory=list)  # [2] counts, sums of the taxels' x and y
+    current: list[np.ndarray] = dataclasses.field(default_factory=list)  # [J] A, with the hand's sign
+    position: list[np.ndarray] = dataclasses.field(default_factory=list)  # [J] rad
+    gauge: dict[str, float] = dataclasses.field(default_factory=dict)  # N by phase
+
+    def samples(self, *phases: str) -> np.ndarray:
+        """Which samples are of these phases."""
+        return np.flatnonzero(np.isin(self.phase, phases))
+
+
+@dataclasses.dataclass
+class Session:
+    """All that a log, or several, say."""
+
+    hardware: HardwareConfig
+    check: CheckConfig
+    serial: str
+    rate: float
+    recordings: dict[str, Recording]
+    rest_current: np.ndarray  # [T, J] A, motors off
+
+
+def read_logs(paths: Iterable[Path], hand: Hand) -> Session:
+    """The presses in logs of `dexsim_real.calibrate`; of a press in several the last counts.
+
+    Raises:
+      LogError: not such a log, or of a hand with other settings than the one before.
+    """
+    session = None
+    for path in paths:
+        found = _Reader(Path(path), hand).session
+        if session is None:
+            session = found
+        elif (found.hardware, found.rate) != (session.hardware, session.rate):
+            raise LogError(f"{path}: was recorded with other --hardware options or another --rate than the logs before")
+        else:
+            session.recordings.update(found.recordings)
+    return session
+
+
+class _Reader:
+    def __init__(self, path: Path, hand: Hand):
+        self.session: Session | None = None
+        self._hand, self._number, self._frame = hand, -1, b""
+        rest: list[np.ndarray] = []
+        for record in LogReader(path):
+            content = record.content
+            if record.kind == Kind.META and "task" in content:
+                self._begin(path, content)
+            elif self.session is None:
+                continue
+            elif record.kind == Kind.META:
+                self._configure(content)
+            elif record.kind == Kind.RECEIVED:
+                self._number, self._frame = content
+            elif record.kind == Kind.TICK:
+                self._sample(record.time, content, rest)
+        if self.session is None:
+            raise LogError(f"{path}: ends before the hand was ready")
+        self.session.rest_current = np.array(rest)
+
+    def _begin(self, path: Path, meta: dict[str, Any]) -> None:
+        if meta["task"] != "calibrate":
+            raise LogError(f"{path}: is the log of something else ({meta['task']}), not of presses")
+        hardware = from_dict(HardwareConfig, meta["hardware"])
+        self.session = Session(
+            hardware, from_dict(CheckConfig, meta["check"]), meta["serial"], meta["rate"], {}, np.empty(0)
+        )
+        self._sensing, self._raw = HandSensing(self._hand, hardware), raw_sensing(self._hand, hardware)
+
+    def _configure(self, content: dict[str, Any]) -> None:
+        if "tare" in content:
+            self._sensing.tare = np.array(content["tare"], np.float32)
+        if "placement" in content:
+            placement = content["placement"]
+            self.session.recordings[placement["name"]] = Recording(
+                placement["name"], placement["finger"], tuple(placement["joints"]), self.session.rate
+            )
+
+    def _sample(self, time: float, tick: dict[str, Any], rest: list[np.ndarray]) -> None:
+        recording = self.session.recordings.get(tick["press"])
+        if recording is not None and "gauge" in tick:
+            recording.gauge[tick["phase"]] = tick["gauge"]
+            return
+        if tick["sequence"] != self._number:
+            return
+        state = frames.decode_state(self._frame[frames.HEADER.size : -2])
+        current = state["joint"]["current"].astype(float) * 1e-3
+        if tick["phase"] == REST:
+            rest.append(current)
+        if recording is None:
+            return
+        measured, finger = self._sensing.measure(state), recording.finger
+        taxel = state["tip"]["taxel"][finger]
+        recording.tare = self._sensing.tare[finger].astype(float)
+        recording.phase.append(tick["phase"])
+        recording.time.append(time)
+        recording.counts.append(self._raw.measure(state).taxel_force[finger].astype(float) - recording.tare)
+        recording.shown.append(float(measured.taxel_force[finger].sum()) / self.session.hardware.force_per_count)
+        recording.shear.append(np.array([taxel[axis].sum(dtype=float) for axis in "xy"]))
+        recording.current.append(current)
+        recording.position.append(measured.joint_position.astype(float))

@@ -1,0 +1,102 @@
+"""What a calibration found, for people and as plain data."""
+
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+
+from dexsim.calibration.maps import Calibration, Side
+from dexsim.core.config import to_dict
+from dexsim_real.calibrate.fit import Fit
+
+_WAYS = ("loading", "unloading")
+
+
+def torque_constants(calibration: Calibration) -> np.ndarray:
+    """[2, J] Nm at the joint for each ampere more, pressing on and giving way: the ratio of the gains."""
+    return np.asarray(calibration.sim.gain) / np.asarray(calibration.real.gain)
+
+
+def torque_constant_intervals(calibration: Calibration) -> np.ndarray:
+    """[2, J, 2] 95 % intervals of `torque_constants`; the widths of both sides are added in quadrature."""
+    real, sim = calibration.real, calibration.sim
+    share = np.hypot(_half(real) / np.abs(real.gain), _half(sim) / np.abs(sim.gain))
+    value = torque_constants(calibration)[..., None]
+    return value + np.abs(value) * share[..., None] * np.array([-1.0, 1.0])
+
+
+def report(fit: Fit) -> dict[str, Any]:
+    """Everything as plain data."""
+    calibration, real = fit.calibration, fit.calibration.real
+    constants, intervals = torque_constants(calibration), torque_constant_intervals(calibration)
+    joints = {}
+    for joint, name in enumerate(calibration.joint_names):
+        lines = {
+            way: {
+                "nm_per_a": constants[k, joint],
+                "nm_per_a_95": intervals[k, joint],
+                "a_per_n": real.gain[k, joint],
+                "offset_a": real.offset[k, joint],
+                "r_squared": real.r_squared[k, joint],
+                "condition": real.condition[k, joint],
+                "samples": int(real.samples[k, joint]),
+                "outliers": int(real.outliers[k, joint]),
+            }
+            for k, way in enumerate(_WAYS)
+        }
+        joints[name] = {
+            "press": fit.source.get(name),
+            "friction_a": real.friction[joint],
+            "force_max_n": real.force_max[joint],
+            "current_max_a": real.value_max[joint],
+            **lines,
+        }
+    return {
+        "hand": calibration.hand,
+        "serial": calibration.serial,
+        "created": calibration.created,
+        "newtons_per_count": dict(zip(calibration.finger_names, calibration.force_per_count, strict=True)),
+        "gauge": {name: to_dict(found) for name, found in fit.sensors.items()},
+        "joints": joints,
+        "notes": list(calibration.notes),
+    }
+
+
+def table(fit: Fit) -> Table:
+    """A table for the terminal, one row a joint: pressing on / giving way; the worse of the two where there is one."""
+    calibration, real = fit.calibration, fit.calibration.real
+    constants, intervals = torque_constants(calibration), torque_constant_intervals(calibration)
+    width = np.max(np.ptp(intervals, axis=-1) / 2 / np.abs(constants), 0)
+    shown = Table(
+        box=None, padding=(0, 1, 0, 0), title="current to torque, pressing on / giving way", title_justify="left"
+    )
+    for head in ("joint", "pressed with", "Nm / A", "95 %", "R2", "cond.", "friction", "up to"):
+        shown.add_column(head, no_wrap=True)
+    for joint, name in enumerate(calibration.joint_names):
+        shown.add_row(
+            name,
+            fit.source.get(name, "(others)"),
+            " / ".join(f"{value:+.3f}" for value in constants[:, joint]),
+            f"{100 * width[joint]:.1f} %",
+            f"{np.min(real.r_squared[:, joint]):.3f}",
+            f"{np.max(real.condition[:, joint]):.1f}",
+            f"{1e3 * real.friction[joint]:.0f} mA",
+            f"{real.force_max[joint]:.1f} N",
+        )
+    return shown
+
+
+def grouped(notes: tuple[str, ...]) -> list[str]:
+    """Notes with those that say the same of several joints in one."""
+    joined: dict[str, list[str]] = {}
+    for note in notes:
+        name, colon, text = note.partition(": ")
+        joined.setdefault(text if colon else note, []).append(name if colon else "")
+    return [f"{', '.join(names)}: {text}" if names[0] else text for text, names in joined.items()]
+
+
+def _half(side: Side) -> np.ndarray:
+    return (np.asarray(side.gain_high) - np.asarray(side.gain_low)) / 2
+
+
+__all__ = ["grouped", "report", "table", "torque_constant_intervals", "torque_constants"]

@@ -1,0 +1,1 @@
+"""The policy, its goals, and the safety limits."""

@@ -1,0 +1,124 @@
+"""A policy on hardware: measurements in, action and joint targets out, in the simulation's order.
+
+One tick here is one `Env.step` of the simulation seen from outside: the readings carry the action
+that led to them, `observe` and the policy follow, and the action moves the joint targets by the same
+`move_target`.
+"""
+
+import dataclasses
+import os
+from typing import Any
+
+import jax
+import numpy as np
+
+from dexsim.control import move_target, recalled
+from dexsim.core.config import from_dict
+from dexsim.hand.kinematics import Hand
+from dexsim.observation import Field, ObservationConfig, Readings, layout, observe
+from dexsim.tasks import TASKS
+from dexsim_ppo.policy import Policy
+from dexsim_real.core.errors import HandError
+from dexsim_real.sensors.hand import Measured
+from dexsim_real.sensors.readings import ObjectEstimate, make_readings, sources_of
+
+IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
+SIMULATION = ("physics", "objects", "randomization", "skin", "reward")
+"""Parts of a task's configuration that a hand has no use for: a policy outlives changes in them."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Tick:
+    """What one tick saw and did; NumPy float32."""
+
+    readings: Readings
+    observation: np.ndarray
+    action: np.ndarray  # [J], zero where the policy's was not finite
+    target: np.ndarray  # [J] rad; not finite where the policy's action was not
+
+
+def prepare_jax() -> None:
+    """JAX on the CPU, in the thread that calls it: waking others costs milliseconds on a busy machine.
+
+    To be called before anything is computed; a replay needs the same to give the same bits.
+    """
+    flags = os.environ.get("XLA_FLAGS", "")
+    if "--xla_cpu_multi_thread_eigen" not in flags:
+        os.environ["XLA_FLAGS"] = f"{flags} --xla_cpu_multi_thread_eigen=false".strip()
+    jax.config.update("jax_platforms", "cpu")
+    jax.config.update("jax_cpu_enable_async_dispatch", False)
+
+
+def make_observe(hand: Hand, names: tuple[str, ...], config: ObservationConfig) -> Any:
+    """The one jitted `observe` of a task: readings to observation."""
+    return jax.jit(lambda readings: observe(hand, readings, names, config))
+
+
+def load_task(name: str, config: dict[str, Any], hand: Hand) -> Any:
+    """The rules of a policy's task, configured as in training where a hand can tell; no MJX.
+
+    Raises:
+      HandError: there is no such task.
+    """
+    if name not in TASKS:
+        raise HandError(f"the policy is of the task {name!r}; known are {', '.join(TASKS)}")
+    entry = TASKS[name]
+    needed = {key: value for key, value in config.items() if key not in SIMULATION}
+    return entry.task_class(from_dict(entry.config_class, needed), hand)
+
+
+class Controller:
+    """The policy between readings and joint targets.
+
+    Raises:
+      HandError: the policy observes what its task does not give, or what no sensor can measure.
+    """
+
+    def __init__(self, policy: Policy, hand: Hand):
+        self.policy, self.hand = policy, hand
+        self.task = load_task(policy.task, policy.env_config, hand)
+        config = self.task.config
+        names = self.task.fields["actor"]
+        wanted = tuple(Field(f.name, f.size, f.scale) for f in policy.observation_layout)
+        if layout(hand, names, config.observation) != wanted:
+            raise HandError(f"the policy's observation does not fit this version's task {policy.task!r}")
+        self.sources = sources_of([field.name for field in wanted])
+        self.period = 1.0 / policy.control_rate
+        self._observe = make_observe(hand, names, config.observation)
+        self._move = jax.jit(lambda *arrays: move_target(config.control, hand, *arrays))
+        self._recall = jax.jit(lambda *arrays: recalled(config.control, hand, *arrays))
+        self.start(np.zeros(hand.num_joints, np.float32))
+
+    def warm(self) -> None:
+        """Compile everything, so that the first tick is as fast as the others."""
+        hand = self.hand
+        joints = np.zeros(hand.num_joints, np.float32)
+        nothing = Measured(
+            joints, joints, np.zeros((hand.num_fingers, hand.num_taxels), np.float32), joints, np.zeros(1), np.zeros(1)
+        )
+        for _ in range(3):
+            self.tick(nothing, ObjectEstimate(np.zeros(3), np.zeros(3), IDENTITY), IDENTITY, 0.0)
+        self.start(joints)
+
+    def start(self, target: np.ndarray) -> None:
+        """Begin an episode with these joint targets [J] rad; no action has been."""
+        self.target = np.asarray(target, np.float32)
+        self.last_action = np.zeros(self.hand.num_joints, np.float32)
+
+    def anchor(self, position: np.ndarray) -> None:
+        """Go on from this pose [J] rad: the hand did not follow its targets for a while."""
+        self.target = np.asarray(position, np.float32)
+
+    def tick(self, measured: Measured, seen: ObjectEstimate, goal_quat: np.ndarray, command: float) -> Tick:
+        """Readings, observation, action, and the joint targets that follow."""
+        last_action = np.asarray(self._recall(self.last_action, self.target))
+        readings = make_readings(measured, seen, goal_quat, command, last_action)
+        observation = np.asarray(self._observe(readings))
+        action = np.clip(np.asarray(self.policy(observation)), -1.0, 1.0)
+        if np.isfinite(action).all():
+            target = np.asarray(self._move(self.target, action, measured.joint_position))
+            self.target = target
+        else:  # As in simulation it counts as no action; `Safety` sees the target and holds.
+            action, target = np.zeros_like(self.last_action), np.full_like(self.target, np.nan)
+        self.last_action = action
+        return Tick(readings, observation, action, target)

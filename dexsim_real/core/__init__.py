@@ -1,0 +1,1 @@
+"""Foundations of the bridge: errors, the log, timing, the process."""

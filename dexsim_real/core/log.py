@@ -1,0 +1,199 @@
+"""The log of a run: append-only records, written by a thread of its own, readable after any crash.
+
+    DXSLOG1\\n, then records: sync (4 bytes) | kind | time | length | CRC-32 | payload
+
+What has been handed over reaches the kernel within a tenth of a second, where it survives the end of
+the program; once a second it is forced to the disk. A record torn off at the end, or damaged within,
+costs only itself.
+"""
+
+import contextlib
+import dataclasses
+import enum
+import os
+import queue
+import struct
+import threading
+import time
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import numpy as np
+
+from dexsim.core.errors import DexsimError
+from dexsim_real.core.process import stand_back
+
+MAGIC = b"DXSLOG1\n"
+SYNC = b"\xd5\x0c\xa7\x1e"
+_HEAD = struct.Struct("<4sBdII")
+_SEQUENCE = struct.Struct("<Q")
+_WAIT = 0.05  # s between two writes
+_FORCE = 1.0  # s between two syncs to the disk
+_ROOM = 50_000  # records that may wait for a slow disk
+
+
+class LogError(DexsimError):
+    """A log cannot be written, or a file is not one."""
+
+
+class Kind(enum.IntEnum):
+    """What a record holds."""
+
+    META = 1  # configuration of the run
+    SENT = 2  # number of the exchange, then the frame
+    RECEIVED = 3
+    TICK = 4  # readings, observation, action, target of one control tick
+    NOTE = 5  # one line of text
+    END = 6  # summary
+
+
+@dataclasses.dataclass(frozen=True)
+class Record:
+    """One entry. `content` is a dict with NumPy arrays, a text, or (number, frame)."""
+
+    kind: Kind
+    time: float  # s, monotonic clock of the machine that wrote it
+    content: Any
+
+
+class LogWriter:
+    """Takes records from any thread without waiting; a context manager.
+
+    A full disk ends the log, not the run: `failure` says so, and `dropped` counts what was lost.
+    """
+
+    def __init__(self, path: str | Path):
+        self.path = Path(path)
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o644)
+            os.write(self._file, MAGIC)
+        except OSError as error:
+            raise LogError(f"{self.path}: the log cannot be written ({error.strerror})") from None
+        self.failure = ""
+        self.dropped = 0
+        self._queue: queue.SimpleQueue = queue.SimpleQueue()
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="log", daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> "LogWriter":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def add(self, kind: Kind, content: Any, when: float | None = None) -> None:
+        """Hand over a record; its arrays must not change afterwards."""
+        if self.failure or self._queue.qsize() > _ROOM:
+            self.dropped += 1
+            return
+        self._queue.put((kind, time.monotonic() if when is None else when, content))
+
+    def close(self) -> None:
+        """Write what waits, and close the file."""
+        if not self._stop.is_set():
+            self._stop.set()
+            self._thread.join()
+            os.close(self._file)
+
+    def _run(self) -> None:
+        stand_back()
+        synced = time.monotonic()
+        while True:
+            last = self._stop.wait(_WAIT)
+            batch = []
+            with contextlib.suppress(queue.Empty):
+                while True:
+                    batch.append(encode(*self._queue.get_nowait()))
+                    time.sleep(0)  # Gives up the interpreter at once to a thread that waits for it.
+            try:
+                _write_all(self._file, b"".join(batch))
+                if last or time.monotonic() - synced > _FORCE:
+                    os.fdatasync(self._file)
+                    synced = time.monotonic()
+            except OSError as error:
+                self.failure = f"{self.path}: {error.strerror}"
+                self.dropped += len(batch)
+            if last:
+                return
+
+
+def encode(kind: Kind, when: float, content: Any) -> bytes:
+    """A record's bytes."""
+    if isinstance(content, tuple):
+        payload = _SEQUENCE.pack(content[0]) + content[1]
+    elif isinstance(content, str):
+        payload = content.encode()
+    else:
+        payload = msgpack.packb(content, default=_pack_array)
+    check = zlib.crc32(payload, zlib.crc32(_HEAD.pack(SYNC, kind, when, len(payload), 0)))
+    return _HEAD.pack(SYNC, kind, when, len(payload), check) + payload
+
+
+class LogReader:
+    """Iterates over a log's sound records; `damaged` counts the bytes left out so far.
+
+    Raises:
+      LogError: missing, or not a log.
+    """
+
+    def __init__(self, path: str | Path):
+        self.path, self.damaged = Path(path), 0
+        try:
+            self._data = self.path.read_bytes()
+        except OSError as error:
+            raise LogError(f"{self.path}: cannot be read ({error.strerror})") from None
+        if not self._data.startswith(MAGIC):
+            raise LogError(f"{self.path}: is not a log of a run")
+
+    def __iter__(self) -> Iterator[Record]:
+        at, data, self.damaged = len(MAGIC), self._data, 0
+        while at < len(data):
+            record, size = _decode(data, at)
+            if record is None:
+                following = data.find(SYNC, at + 1)
+                following = len(data) if following < 0 else following
+                self.damaged += following - at
+                at = following
+            else:
+                at += size
+                yield record
+
+
+def _decode(data: bytes, at: int) -> tuple[Record | None, int]:
+    if at + _HEAD.size > len(data):
+        return None, 0
+    sync, kind, when, length, check = _HEAD.unpack_from(data, at)
+    payload = data[at + _HEAD.size : at + _HEAD.size + length]
+    if sync != SYNC or len(payload) != length or kind not in set(Kind):
+        return None, 0
+    if zlib.crc32(payload, zlib.crc32(_HEAD.pack(sync, kind, when, length, 0))) != check:
+        return None, 0
+    if kind in (Kind.SENT, Kind.RECEIVED):
+        content: Any = (*_SEQUENCE.unpack_from(payload), payload[_SEQUENCE.size :])
+    elif kind == Kind.NOTE:
+        content = payload.decode()
+    else:
+        content = msgpack.unpackb(payload, object_hook=_unpack_array, strict_map_key=False)
+    return Record(Kind(kind), when, content), _HEAD.size + length
+
+
+def _pack_array(value: Any) -> Any:
+    array = np.asarray(value)
+    return {"__array__": array.dtype.str, "shape": list(array.shape), "data": array.tobytes()}
+
+
+def _unpack_array(value: dict) -> Any:
+    if "__array__" not in value:
+        return value
+    return np.frombuffer(value["data"], value["__array__"]).reshape(value["shape"])
+
+
+def _write_all(file: int, data: bytes) -> None:
+    view = memoryview(data)
+    while view:
+        view = view[os.write(file, view) :]

@@ -1,0 +1,74 @@
+"""Absolute deadlines, and how late things are."""
+
+import math
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+
+class Timing:
+    """How late something was, in constant memory: a histogram of 10 us bins up to 50 ms."""
+
+    _BIN, _BINS = 1e-5, 5000
+
+    def __init__(self) -> None:
+        self._bins = np.zeros(self._BINS + 1, np.int64)
+        self.count, self.missed, self.worst = 0, 0, 0.0
+
+    def add(self, seconds: float) -> None:
+        """One more sample."""
+        self._bins[min(int(max(seconds, 0.0) / self._BIN), self._BINS)] += 1
+        self.count += 1
+        self.worst = max(self.worst, seconds)
+
+    def percentile(self, percent: float) -> float:
+        """Seconds below which this share of the samples lies."""
+        if not self.count:
+            return float("nan")
+        at = np.searchsorted(np.cumsum(self._bins), percent / 100 * self.count)
+        return min((int(at) + 1) * self._BIN, self.worst)
+
+    def summary(self) -> dict[str, float]:
+        """Percentiles in ms, and counts."""
+        return {
+            "count": self.count,
+            "missed": self.missed,
+            "p50_ms": 1e3 * self.percentile(50),
+            "p99_ms": 1e3 * self.percentile(99),
+            "max_ms": 1e3 * self.worst,
+        }
+
+
+GRACE = 0.001  # s, how late a cycle may begin rather than be left out
+
+
+class Pace:
+    """Absolute deadlines `start + k / rate`: what one cycle takes does not shift the next."""
+
+    def __init__(
+        self, rate: float, clock: Callable[[], float] = time.monotonic, sleep: Callable[[float], None] = time.sleep
+    ):
+        self.period, self._clock, self._sleep = 1.0 / rate, clock, sleep
+        self.jitter = Timing()
+        self.next = clock() + self.period
+
+    def wait(self) -> None:
+        """Sleep until the next deadline. One that has just passed is kept, late; earlier ones are missed."""
+        now = self._clock()
+        # An exchange fills most of its period: left out for a hair's breadth, the next would cost a whole one.
+        behind = max(math.ceil((now - self.next - GRACE) / self.period), 0)
+        self.jitter.missed += behind
+        self.next += behind * self.period
+        self._sleep(max(self.next - now, 0.0))
+        self.jitter.add(self._clock() - self.next)
+        self.next += self.period
+
+
+def keep_phase(rate: float, other: float, share: float = 0.01) -> float:
+    """`rate`, or the nearest multiple of half of `other` if that is no farther than this share of it.
+
+    Two loops whose rates are in that ratio meet at the same one or two phases for ever.
+    """
+    near = max(round(2 * rate / other), 1) * other / 2
+    return near if abs(near - rate) <= share * rate else rate

@@ -1,0 +1,1 @@
+"""`python -m dexsim_real.replay`: a run's log, recomputed and shown."""

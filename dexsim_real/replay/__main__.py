@@ -1,0 +1,75 @@
+"""Shows a run's log, and proves that the policy saw what its frames say.
+
+python -m dexsim_real.replay runs/real/....log --plot run.png
+"""
+
+import dataclasses
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from dexsim.core import cli
+from dexsim_real.control.controller import prepare_jax
+from dexsim_real.replay.replay import replay
+from dexsim_real.replay.view import plot, show_rerun
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ReplayArguments:
+    """Options of `python -m dexsim_real.replay`."""
+
+    log: Annotated[Path, tyro.conf.Positional]
+    """A log of `dexsim_real.run`."""
+    plot: Path | None = None
+    """File for a figure of angles, forces, timing and the observation (matplotlib)."""
+    rerun: bool = False
+    """Show it in the rerun viewer, taxels as pictures (extra: pip install 'dexsim[rerun]')."""
+    rrd: Path | None = None
+    """File for the rerun viewer, to be opened on another machine."""
+    output: Path | None = None
+    """File for the report as JSON."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command. Returns its exit code: 0, or 1 when something was not the same."""
+    arguments = cli.parse(
+        ReplayArguments,
+        sys.argv[1:] if argv is None else argv,
+        prog="python -m dexsim_real.replay",
+        description="Recompute and show the log of a run on the hand.",
+    )
+    prepare_jax()
+    cli.enable_caches()
+    run = replay(arguments.log)
+    report = run.report
+    for note in report["notes"]:
+        print(note)
+    same = report["readings_same"] == report["observations_same"] == report["ticks"]
+    print(
+        f"{report['ticks']} ticks in {report['seconds']:.2f} s, {report['frames']} frames, "
+        f"{report['damaged_bytes']} bytes damaged, ended: {report['ended']}"
+    )
+    print(
+        "every observation is the same, bit for bit"
+        if same
+        else f"{report['observations_same']} observations of {report['ticks']} are the same; the first that is not: "
+        f"{report['first_difference']}"
+    )
+    if arguments.output:
+        cli.write_json(arguments.output, report)
+    if arguments.plot and run.ticks:
+        plot(run, arguments.plot)
+        print(f"figure: {arguments.plot}")
+    if arguments.rerun and run.ticks:
+        show_rerun(run)
+    if arguments.rrd and run.ticks:
+        show_rerun(run, arguments.rrd)
+        print(f"for the rerun viewer: {arguments.rrd}")
+    return 0 if same else 1
+
+
+if __name__ == "__main__":
+    cli.run(main)

@@ -1,0 +1,1 @@
+"""`python -m dexsim_real.run`: a policy on the hand."""

@@ -1,0 +1,59 @@
+"""Runs a policy on the hand.
+
+    python -m dexsim_real.run grasp --port /dev/serial/by-id/usb-FTDI_... --command 0.6
+
+The policy is a file, or the name of a shipped one. Everything is compiled before the port is opened;
+the motors come on at the measured pose and go off at the end, however the end comes.
+"""
+
+import sys
+from collections.abc import Sequence
+
+from dexsim.core import cli
+from dexsim_real.control.controller import prepare_jax
+from dexsim_real.core.errors import HandError
+from dexsim_real.core.process import stopping
+from dexsim_real.run.options import RunArguments
+from dexsim_real.run.session import Session
+from dexsim_real.run.view import summary_table
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command. Returns its exit code: 0, or 1 when `Safety` or a failure ended the run."""
+    arguments = cli.parse(
+        RunArguments,
+        sys.argv[1:] if argv is None else argv,
+        prog="python -m dexsim_real.run",
+        description="Run a policy on the hand.",
+    )
+    prepare_jax()
+    cli.enable_caches()
+    session = Session(arguments)
+    reason, code = "", 0
+    with stopping():
+        try:
+            session.prepare()
+            session.run()
+        except HandError as error:
+            reason, code = str(error), 1
+            if not session.started:
+                raise
+        except KeyboardInterrupt:
+            reason, code = "Ctrl-C", 130
+        except SystemExit as stop:
+            reason, code = f"signal {stop.code - 128}", stop.code
+        except BaseException as error:
+            reason = f"failure: {error!r}"
+            raise
+        finally:
+            session.close(reason)
+    summary = session.summary()
+    if not arguments.quiet:
+        session.view.console.print(summary_table(f"{session.controller.policy.task}: {session.end}", summary))
+    if arguments.output:
+        cli.write_json(arguments.output, summary)
+    return code
+
+
+if __name__ == "__main__":
+    cli.run(main)

@@ -1,0 +1,292 @@
+"""One run on the hand: connect, zero, sense, approach, follow the policy, and end with the motors off."""
+
+import contextlib
+import dataclasses
+import gc
+import hashlib
+import os
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from dexsim import load_hand
+from dexsim.calibration.maps import load_calibration
+from dexsim.core import cli
+from dexsim.core.config import to_dict
+from dexsim_ppo.policy import load_policy
+from dexsim_real.control.controller import IDENTITY, Controller, Tick
+from dexsim_real.control.goals import TurnGoals
+from dexsim_real.control.safety import Safety
+from dexsim_real.control.servo import Servo
+from dexsim_real.core.errors import HandError
+from dexsim_real.core.log import Kind, LogWriter
+from dexsim_real.core.process import use_realtime
+from dexsim_real.core.timing import Pace, Timing, keep_phase
+from dexsim_real.run.options import RunArguments
+from dexsim_real.run.view import View
+from dexsim_real.sensors.hand import HandSensing
+from dexsim_real.sensors.objects import ObjectSensors
+from dexsim_real.wire.frames import Mode, empty_state
+from dexsim_real.wire.serial_hand import open_port
+
+_ZERO_SAMPLES = 30
+_SWITCH = sys.getswitchinterval()
+_PATIENCE = 60.0  # s that the object may take to come into sight
+
+
+class Session:
+    """One run: made with nothing open but files, `prepare`d with the motors off, then run."""
+
+    def __init__(self, arguments: RunArguments):
+        self.arguments = arguments
+        policy, hand = load_policy(arguments.policy), load_hand()
+        self.controller = Controller(policy, hand)
+        calibration = load_calibration(arguments.calibration, hand) if arguments.calibration else None
+        self.sensing = HandSensing(hand, arguments.hardware, calibration)
+        self.controller.warm()
+        self.sensing.measure(empty_state())
+        config = arguments.safety
+        config = dataclasses.replace(config, watchdog=max(config.watchdog, 2.5 * self.controller.period))
+        self.safety = Safety(hand, config, self._react)
+        # From here on, since compiling in a real-time thread would starve the machine.
+        realtime = arguments.realtime and use_realtime()
+        path = arguments.log or Path("runs/real") / time.strftime("%Y%m%d-%H%M%S.log")
+        self.log = LogWriter(path)
+        self.port = open_port(arguments.port, arguments.link, self._tap)
+        rate = keep_phase(arguments.rate, policy.control_rate)
+        self.servo = Servo(self.port, self.sensing, self.safety, rate)
+        self.view = View(f"{policy.task} on {arguments.port}", self._status, arguments.quiet)
+        self.objects: ObjectSensors | None = None
+        self.goals: TurnGoals | None = None
+        self.compute, self.pace = Timing(), Pace(policy.control_rate)
+        self.started = self.force = self.forces = 0.0
+        self.tick: Tick | None = None
+        self.end = "not started"
+        if arguments.realtime and not realtime:
+            self._note("without real-time priority: expect jitter on a busy machine (docs/hardware.md)")
+
+    # --- stages ---------------------------------------------------------------------------------
+
+    def prepare(self) -> None:
+        """Connect with the motors off, zero the taxels, start camera and IMU.
+
+        Raises:
+          HandError: whatever is missing or does not answer.
+        """
+        self._note(self.port.connect())
+        for warning in getattr(self.port, "warnings", list)():
+            self._note(f"warning: {warning}")
+        if self.arguments.zero:
+            self._zero()
+        self._write_meta()
+        self.servo.start()
+        if self.servo.wait_fresh(1.0) is None:
+            raise HandError(f"{self.arguments.port}: the hand answered once and then no more")
+        self.objects = ObjectSensors(self.arguments, self.controller)
+        task = self.controller.task
+        if self.arguments.imu and hasattr(task.config, "goal_step"):
+            self.goals = TurnGoals(task.config, task.reference)
+
+    def run(self) -> None:
+        """Motors on, approach, and the policy until the time is over or `Safety` ends it."""
+        sys.setswitchinterval(2e-4)
+        gc.collect()
+        gc.freeze()
+        with self.view:
+            if not self.arguments.motors_off:
+                self.servo.engage()
+            self._approach()
+            self.controller.start(self._pose())
+            self._note("the policy begins")
+            self.end = self._loop()
+
+    def close(self, reason: str = "") -> None:
+        """Motors off and everything closed; safe to call at any stage."""
+        self.end = reason or self.end
+        self.servo.stop()
+        if self.objects:
+            self.objects.close()
+        self._note(f"end: {self.end}")
+        self.log.add(Kind.END, self.summary())
+        self.log.close()
+        gc.unfreeze()
+        sys.setswitchinterval(_SWITCH)
+        with contextlib.suppress(OSError, AttributeError):
+            os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+
+    def summary(self) -> dict[str, Any]:
+        """What the run was like."""
+        servo, safety = self.servo, self.safety
+        summary = {
+            "end": self.end,
+            "seconds": round(time.monotonic() - self.started, 3) if self.started else 0.0,
+            "command": self.arguments.command,
+            "policy_jitter": self.pace.jitter.summary(),
+            "policy_compute": self.compute.summary(),
+            "exchange_jitter": servo.pace.jitter.summary(),
+            "round_trip": servo.round_trip.summary(),
+            "missed_for_the_hand": servo.waited,
+            "link": dataclasses.asdict(self.port.counts),
+            "safety": dict(safety.counts),
+            "mean_finger_force": self.force / self.forces if self.forces else 0.0,
+            "log": str(self.log.path),
+            "log_dropped": self.log.dropped,
+        }
+        if self.goals:
+            times = [t - self.started for t in self.goals.times]
+            summary |= {"successes": self.goals.successes, "success_times": times}
+        return summary
+
+    # --- pieces ---------------------------------------------------------------------------------
+
+    def _zero(self) -> None:
+        states, until = [], time.monotonic() + 5.0
+        while len(states) < _ZERO_SAMPLES and time.monotonic() < until:
+            reply = self.port.exchange(self.sensing.command(self.sensing.hand.joint_lower, Mode.PASSIVE))
+            if reply is not None:
+                states.append(reply.state)
+        if len(states) < _ZERO_SAMPLES:
+            raise HandError(f"{self.arguments.port}: only {len(states)} answers in 5 s; cannot zero the taxels")
+        self.sensing.zero(states)
+
+    def _approach(self) -> None:
+        """To the start posture, and hold it until the object is there."""
+        arguments, start = self.arguments, self._pose()
+        goal = np.asarray(getattr(self.controller.task.config, "posture", start), np.float32)
+        goal = goal if arguments.approach > 0 else start
+        begin, pace = time.monotonic(), Pace(arguments.rate)
+        ready = begin + arguments.approach + arguments.place
+        while (now := time.monotonic()) < ready or not self.objects.ready():
+            if now > ready + _PATIENCE:
+                raise HandError(
+                    "the camera does not see the object: check its light, the colour threshold "
+                    "(--optics.hsv-low, --optics.hsv-high) and --optics.min-area"
+                )
+            share = min((now - begin) / arguments.approach, 1.0) if arguments.approach > 0 else 1.0
+            self.safety.wish(start + np.float32(share * share * (3 - 2 * share)) * (goal - start), now)
+            self._check()
+            pace.wait()
+
+    def _pose(self) -> np.ndarray:
+        return self.safety.sample.measured.joint_position
+
+    def _check(self) -> None:
+        if self.servo.error is not None:
+            raise HandError(f"the exchange thread failed: {self.servo.error!r}")
+        if self.safety.latched:
+            raise HandError(f"stopped: {self.safety.latched}")
+
+    def _loop(self) -> str:
+        anchor, self.started = self.safety.anchor, time.monotonic()
+        self.servo.forget()
+        self.pace = Pace(self.controller.policy.control_rate)
+        # The policy begins when a request has just gone out, and at rates that keep their phase always does.
+        self.pace.next = self.servo.free(self.pace.next)
+        while time.monotonic() < self.started + self.arguments.seconds:
+            self._check()
+            now, sample = time.monotonic(), self.safety.sample
+            if now - sample.time <= self.safety.config.stale:
+                if anchor != self.safety.anchor:
+                    anchor = self.safety.anchor
+                    self.controller.anchor(sample.measured.joint_position)
+                self._tick(now, sample)
+                self.compute.add(time.monotonic() - now)
+            self.pace.wait()
+        self._check()
+        return "time is over"
+
+    def _tick(self, now: float, sample: Any) -> None:
+        seen, age, when = self.objects.read(now)
+        goal = self.goals.update(when, seen) if self.goals else IDENTITY
+        if self.arguments.motors_off:
+            self.controller.anchor(sample.measured.joint_position)
+        tick = self.controller.tick(sample.measured, seen, goal, self.arguments.command)
+        trouble = "the object is out of sight" if age > self.safety.config.stale_object else ""
+        self.safety.wish(tick.target, now, trouble)
+        self.tick = tick
+        self.force += float(sample.measured.finger_force.sum())
+        self.forces += 1
+        readings = {field.name: getattr(tick.readings, field.name) for field in dataclasses.fields(tick.readings)}
+        self.log.add(
+            Kind.TICK,
+            {
+                "sequence": sample.sequence,
+                "age": now - sample.time,
+                "readings": readings,
+                "observation": tick.observation,
+                "action": tick.action,
+                "target": tick.target,
+            },
+            now,
+        )
+
+    def _tap(self, direction: str, data: bytes) -> None:
+        kind = Kind.SENT if direction == "tx" else Kind.RECEIVED
+        self.log.add(kind, (self.port.counts.sent, data))
+
+    def _note(self, text: str) -> None:
+        self.log.add(Kind.NOTE, text)
+        self.view.note(text)
+
+    def _react(self, text: str) -> None:
+        """A change of `Safety`'s reaction; clips are too frequent for the terminal."""
+        self.log.add(Kind.NOTE, text)
+        if text.startswith(("hold", "relax")) and self.safety.engaged:
+            self.view.note(text)
+
+    def _write_meta(self) -> None:
+        arguments, policy = self.arguments, self.controller.policy
+        text = arguments.calibration.read_text() if arguments.calibration else ""
+        digest = hashlib.sha256(b"".join(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(policy.params)))
+        self.log.add(
+            Kind.META,
+            {
+                "task": policy.task,
+                "env_config": policy.env_config,
+                "policy": arguments.policy,
+                "policy_sha256": digest.hexdigest(),
+                "calibration": text,
+                "tare": self.sensing.tare,
+                "hardware": to_dict(arguments.hardware),
+                "safety": to_dict(self.safety.config),
+                "command": arguments.command,
+                "control_rate": policy.control_rate,
+                "clock": time.time(),
+                "environment": cli.environment_report(),
+            },
+        )
+
+    def _status(self) -> dict[str, str]:
+        sample, counts = self.safety.sample, self.port.counts
+        if sample is None:
+            return {"hand": "no measurement"}
+        force, heat = sample.measured.finger_force, sample.measured.temperature
+        reaction, reason = self.safety.last
+        rows = {
+            "time": f"{time.monotonic() - self.started if self.started else 0:.1f} s",
+            "safety": f"{reaction.name.lower()} {reason}".strip(),
+            "age": f"{1e3 * (time.monotonic() - sample.time):.1f} ms",
+            "policy": self._timing(self.pace.jitter, 1 / self.pace.period),
+            "exchanges": self._timing(self.servo.pace.jitter, 1 / self.servo.pace.period),
+            "round trip": f"p50 {1e3 * self.servo.round_trip.percentile(50):.2f} ms, "
+            f"p99 {1e3 * self.servo.round_trip.percentile(99):.2f} ms",
+            "link": f"{counts.answered} answered, {counts.corrupt} corrupt, {counts.silent} silent, "
+            f"{counts.late} late, {counts.reconnects} reconnects",
+            "force": f"{' '.join(f'{f:.1f}' for f in force)} N, sum {force.sum():.1f} N",
+            "command": f"{self.arguments.command:.2f}",
+            "heat": f"joints {heat[:12].max():.0f}, tips {heat[12:].max():.0f} degC",
+        }
+        if self.goals:
+            rows["successes"] = str(self.goals.successes)
+        return rows
+
+    @staticmethod
+    def _timing(timing: Timing, rate: float) -> str:
+        return (
+            f"{rate:.1f} Hz, late p50 {1e3 * timing.percentile(50):.2f} ms, "
+            f"p99 {1e3 * timing.percentile(99):.2f} ms, missed {timing.missed}"
+        )

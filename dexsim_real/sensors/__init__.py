@@ -1,0 +1,1 @@
+"""From bytes and pictures to `Readings`."""

@@ -1,0 +1,228 @@
+"""The object's height from a camera: mask, centroid, ray, and the nearest point of a line.
+
+As in the paper the object's other coordinates are taken as fixed, so the centroid's ray and the
+line along the measured axis meet in one height. Where masks come from is open: `Masks` is any
+callable; built in are a colour threshold (OpenCV) and a stream from another program.
+"""
+
+import dataclasses
+import importlib
+import socket
+import struct
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from dexsim.core.config import setting, validate
+from dexsim_real.core.errors import HandError
+from dexsim_real.core.process import stand_back
+
+Masks = Callable[[], tuple[float, np.ndarray] | None]
+"""Blocks until the next picture; gives its time (s, monotonic) and a bool mask [H, W], or None at the end."""
+
+_STREAM = struct.Struct("<4sHHd")
+_MAGIC = b"MASK"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CameraConfig:
+    """A pinhole camera in the palm frame, and the colour of the object."""
+
+    focal: tuple[float, float] = setting((600.0, 600.0), unit="px", low=1.0, high=1e5)
+    """Focal lengths along columns and rows."""
+    centre: tuple[float, float] = setting((320.0, 240.0), unit="px", low=-1e4, high=1e5)
+    """Principal point: column and row."""
+    position: tuple[float, float, float] = setting((0.06, 0.5, 0.09), unit="m", low=-10.0, high=10.0)
+    """Place of the camera in the palm frame."""
+    forward: tuple[float, float, float] = setting((0.0, -1.0, 0.0), unit="1", low=-1.0, high=1.0)
+    """Where it looks, palm frame."""
+    down: tuple[float, float, float] = setting((1.0, 0.0, 0.0), unit="1", low=-1.0, high=1.0)
+    """Where the rows of its picture grow, palm frame."""
+    hsv_low: tuple[int, int, int] = setting((40, 80, 60), unit="1", low=0, high=255)
+    """Colour threshold, OpenCV's hue (0 to 179), saturation and value."""
+    hsv_high: tuple[int, int, int] = setting((85, 255, 255), unit="1", low=0, high=255)
+    """Its upper end."""
+    min_area: int = setting(60, unit="px", low=1, high=10_000_000)
+    """Smaller masks are taken for none."""
+
+    def __post_init__(self):
+        validate(self)
+        forward, down = (np.asarray(v, float) for v in (self.forward, self.down))
+        if np.linalg.norm(np.cross(forward, down)) < 1e-3:
+            raise HandError("CameraConfig: forward and down must not be parallel")
+
+
+def camera_axes(config: CameraConfig) -> np.ndarray:
+    """Rows [3, 3]: the picture's right, down and forward in the palm frame, orthonormal."""
+    forward = np.asarray(config.forward, float) / np.linalg.norm(config.forward)
+    down = np.asarray(config.down, float) - forward * (np.asarray(config.down) @ forward)
+    down /= np.linalg.norm(down)
+    return np.stack([np.cross(down, forward), down, forward])
+
+
+def height_of(mask: np.ndarray, config: CameraConfig, reference: np.ndarray, axis: int) -> float | None:
+    """Coordinate m of the object along the palm frame's `axis`, the others being `reference`'s.
+
+    The point of the line nearest to the ray through the mask's centroid. None where the mask is too
+    small or the ray runs along the line.
+    """
+    rows, columns = np.nonzero(mask)
+    if rows.size < config.min_area:
+        return None
+    pixel = [
+        (columns.mean() - config.centre[0]) / config.focal[0],
+        (rows.mean() - config.centre[1]) / config.focal[1],
+        1.0,
+    ]
+    ray = np.asarray(pixel) @ camera_axes(config)
+    ray /= np.linalg.norm(ray)
+    line = np.eye(3)[axis]
+    across = 1.0 - ray[axis] ** 2  # squared sine of the angle between ray and line
+    if across < 1e-4:
+        return None
+    gap = np.asarray(config.position) - reference
+    along = (gap[axis] - ray[axis] * (gap @ ray)) / across
+    return float((reference + along * line)[axis])
+
+
+class HeightSensor:
+    """Follows the object from its own thread; `read` gives the newest position and velocity.
+
+    Args:
+      masks: where masks come from.
+      axes: which coordinates are measured (`Sensing.object_axes`): exactly one.
+      weight: of the newest difference in the velocity (`Sensing.velocity_filter`).
+    """
+
+    def __init__(
+        self, masks: Masks, config: CameraConfig, reference: np.ndarray, axes: tuple[bool, bool, bool], weight: float
+    ):
+        if sum(axes) != 1:
+            raise HandError(f"the policy wants the object's coordinates {axes}; one camera measures one of them")
+        self._masks, self._config, self._weight = masks, config, weight
+        self._reference, self._axis = np.asarray(reference, float), axes.index(True)
+        self._newest: tuple[float, np.ndarray, np.ndarray] | None = None
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="vision", daemon=True)
+        self._thread.start()
+
+    @property
+    def seen(self) -> bool:
+        """Whether the object has come into sight."""
+        return self._newest is not None
+
+    def read(self) -> tuple[float, np.ndarray, np.ndarray]:
+        """Time of the newest sight (s, monotonic), position [3] m and filtered velocity [3] m/s."""
+        if self._newest is None:
+            raise HandError("the camera has not seen the object")
+        return self._newest
+
+    def see(self, when: float, mask: np.ndarray) -> None:
+        """Take in one mask."""
+        height = height_of(mask, self._config, self._reference, self._axis)
+        if height is None:
+            return
+        position = self._reference.copy()
+        position[self._axis] = height
+        velocity = np.zeros(3)
+        if self._newest is not None and when > self._newest[0]:
+            before, place, velocity = self._newest
+            velocity = velocity + self._weight * ((position - place) / (when - before) - velocity)
+        self._newest = when, position, velocity
+
+    def close(self) -> None:
+        self._stop.set()
+        self._thread.join(1.0)
+
+    def _run(self) -> None:
+        stand_back()
+        while not self._stop.is_set():
+            picture = self._masks()
+            if picture is None:
+                return
+            self.see(*picture)
+
+
+# --- sources of masks ----------------------------------------------------------------------------
+
+
+def open_masks(spec: str, config: CameraConfig) -> Masks:
+    """A mask source by name: a camera number or video file, `unix:PATH`, or `MODULE:FUNCTION`.
+
+    A function takes a BGR picture [H, W, 3] uint8 and gives a bool mask [H, W]; it gets its pictures from
+    camera 0. `unix:PATH` connects to a program that sends `encode_mask`'s records.
+
+    Raises:
+      HandError: it cannot be opened.
+    """
+    if spec.startswith("unix:"):
+        return _stream(spec.removeprefix("unix:"))
+    if ":" in spec and not spec.startswith(("/", "rtsp:", "http")):
+        module, _, function = spec.partition(":")
+        try:
+            return _camera("0", getattr(importlib.import_module(module), function))
+        except (ImportError, AttributeError) as error:
+            raise HandError(f"{spec}: {error}") from None
+    return _camera(spec, lambda picture: colour_mask(picture, config))
+
+
+def colour_mask(picture: np.ndarray, config: CameraConfig) -> np.ndarray:
+    """Pixels [H, W] of a BGR picture whose colour is within the threshold, specks removed."""
+    cv2 = _opencv()
+    hsv = cv2.cvtColor(picture, cv2.COLOR_BGR2HSV)
+    mask = cv2.inRange(hsv, np.array(config.hsv_low, np.uint8), np.array(config.hsv_high, np.uint8))
+    return cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
+
+
+def encode_mask(when: float, mask: np.ndarray) -> bytes:
+    """A mask [H, W] as one record of a stream: magic, width, height, time, packed bits."""
+    height, width = mask.shape
+    return _STREAM.pack(_MAGIC, width, height, when) + np.packbits(mask).tobytes()
+
+
+def _stream(path: str) -> Masks:
+    link = socket.socket(socket.AF_UNIX)
+    try:
+        link.connect(path)
+    except OSError as error:
+        raise HandError(f"{path}: no program sends masks here ({error.strerror})") from None
+    file = link.makefile("rb")
+
+    def read() -> tuple[float, np.ndarray] | None:
+        head = file.read(_STREAM.size)
+        if len(head) < _STREAM.size:
+            return None
+        magic, width, height, when = _STREAM.unpack(head)
+        if magic != _MAGIC:
+            return None
+        bits = file.read((width * height + 7) // 8)
+        if len(bits) < (width * height + 7) // 8:
+            return None
+        mask = np.unpackbits(np.frombuffer(bits, np.uint8), count=width * height)
+        return when, mask.reshape(height, width).astype(bool)
+
+    return read
+
+
+def _camera(spec: str, segment: Callable[[np.ndarray], np.ndarray]) -> Masks:
+    cv2 = _opencv()
+    capture = cv2.VideoCapture(int(spec) if spec.isdigit() else spec)
+    if not capture.isOpened():
+        raise HandError(f"{spec}: the camera cannot be opened")
+
+    def read() -> tuple[float, np.ndarray] | None:
+        sound, picture = capture.read()
+        return (time.monotonic(), segment(picture)) if sound else None
+
+    return read
+
+
+def _opencv() -> Any:
+    try:
+        import cv2
+    except ImportError:
+        raise HandError("OpenCV is missing: pip install 'dexsim[vision]'") from None
+    return cv2

@@ -1,0 +1,199 @@
+"""From what the hand reports to SI units: calibration, zeroing, dead taxels, filtered speeds."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import jax
+import numpy as np
+
+from dexsim.calibration.maps import Calibration, current_from_counts, normalised_torque
+from dexsim.core.config import setting, validate
+from dexsim.hand.kinematics import Hand
+from dexsim_real.core.errors import HandError
+from dexsim_real.wire import frames
+from dexsim_real.wire.frames import Mode
+
+_JOINTS = frames.JOINTS
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class HardwareConfig:
+    """What no public source proves about the hand, and what its firmware is told.
+
+    Check these on your own unit before the motors are on; docs/hardware.md says how.
+    """
+
+    joint_sign: tuple[float, ...] = setting((1.0,) * _JOINTS, unit="1", low=-1.0, high=1.0)
+    """Sense of each joint against the model. Public descriptions disagree about joint 3 (splay of
+    the index); here positive is toward the thumb."""
+    joint_offset: tuple[float, ...] = setting((0.0,) * _JOINTS, unit="rad", low=-1.0, high=1.0)
+    """Added to the reported angle after the sign."""
+    kp: tuple[int, ...] = setting((100,) * _JOINTS, unit="1", low=0, high=5000)
+    """Position gain, in a unit that the maker does not publish; 80 to 225 are in use."""
+    ki: tuple[int, ...] = setting((0,) * _JOINTS, unit="1", low=-3000, high=3000)
+    """Integral gain, unit unknown."""
+    kd: tuple[int, ...] = setting((0,) * _JOINTS, unit="1", low=0, high=12000)
+    """Damping gain, unit unknown: sources say 0 to 5000 and use 12000."""
+    torque_max: int = setting(300, unit="mA", low=0, high=1200)
+    """Current limit sent with every command. Reported currents far above it have been seen, so it
+    is not the only guard: see `SafetyConfig.current`."""
+    force_per_count: float = setting(0.1, unit="N", low=1e-4, high=10.0)
+    """Force of one taxel count without a calibration; the vendor says 0.1 N, no measurement does."""
+    taxel_axes: str = setting("z", choices=("z", "norm"))
+    """What stands for a taxel's force: the pressing component, or the length of all three."""
+    taxel_floor: float = setting(1.0, unit="count", low=0.0, high=255.0)
+    """Tared counts below this read as zero; in use elsewhere are 2, and 5 to 30 are left after a
+    reset."""
+    tare_limit: float = setting(40.0, unit="count", low=0.0, high=255.0)
+    """A taxel above this when taring means that the hand is touching something."""
+    current_sign: float = setting(-1.0, unit="1", low=-1.0, high=1.0)
+    """Sense of the current without a calibration: reported positive when opening."""
+    current_scale: float = setting(1000.0, unit="mA", low=1.0, high=20000.0)
+    """Current that reads as torque 1 without a calibration: a guess."""
+    reported_velocity: bool = setting(False)
+    """Use the velocity that newer firmware reports instead of differences of the angle."""
+    velocity_time: float = setting(0.02, unit="s", low=0.0, high=1.0)
+    """Time constant of the filter on differences of the angle."""
+
+    def __post_init__(self):
+        validate(self)
+        for name in ("joint_sign", "joint_offset", "kp", "ki", "kd"):
+            if len(getattr(self, name)) != _JOINTS:
+                raise HandError(f"HardwareConfig.{name}: {len(getattr(self, name))} values for {_JOINTS} joints")
+        if any(abs(sign) != 1.0 for sign in self.joint_sign):
+            raise HandError("HardwareConfig.joint_sign: every value must be 1 or -1")
+
+
+@dataclasses.dataclass(frozen=True)
+class Measured:
+    """What one state block says, in SI units; float32 throughout."""
+
+    joint_position: np.ndarray  # [J] rad
+    joint_torque: np.ndarray  # [J] 1
+    taxel_force: np.ndarray  # [F, N] N
+    current: np.ndarray  # [J] A, magnitude
+    temperature: np.ndarray  # [J + F] degC, joint boards and tips
+    errors: np.ndarray  # [J, 3] the hand's error bits: palm, joint and tip board
+
+    @property
+    def finger_force(self) -> np.ndarray:
+        """Force [F] N of each fingertip."""
+        return self.taxel_force.sum(-1)
+
+    def finite(self) -> bool:
+        """Whether every number is."""
+        return bool(
+            np.isfinite(self.joint_position).all()
+            and np.isfinite(self.joint_torque).all()
+            and np.isfinite(self.taxel_force).all()
+        )
+
+
+class HandSensing:
+    """Both directions between the hand's blocks and SI units.
+
+    Args:
+      hand: the model whose joints and fingers these are.
+      calibration: of this very hand; without one, `HardwareConfig` guesses.
+
+    Raises:
+      HandError: the model is not of a hand that these frames can carry.
+    """
+
+    def __init__(self, hand: Hand, config: HardwareConfig, calibration: Calibration | None = None):
+        if (hand.num_joints, hand.num_fingers, hand.num_taxels) != (_JOINTS, frames.TIPS, frames.TAXELS):
+            raise HandError(
+                f"{hand.name}: {hand.num_joints} joints and {hand.num_fingers} x {hand.num_taxels} "
+                f"taxels do not fit the frames' {_JOINTS} and {frames.TIPS} x {frames.TAXELS}"
+            )
+        self.hand, self.config, self.calibration = hand, config, calibration
+        self._sign = np.array(config.joint_sign, np.float32)
+        self._offset = np.array(config.joint_offset, np.float32)
+        self.tare = np.zeros((frames.TIPS, frames.TAXELS), np.float32)
+        if calibration is None:
+            self._per_count = np.full((frames.TIPS, 1), config.force_per_count, np.float32)
+            scale = np.float32(config.current_sign / config.current_scale)
+            self._torque = lambda counts: counts * scale
+        else:
+            self._per_count = np.asarray(calibration.force_per_count, np.float32)[:, None]
+            self._torque = jax.jit(
+                lambda counts: normalised_torque(calibration, current_from_counts(calibration, counts))
+            )
+
+    def measure(self, state: np.ndarray) -> Measured:
+        """SI units of a `frames.STATE_BLOCK`."""
+        joint, tip = state["joint"], state["tip"]
+        counts = np.maximum(self._counts(state) - self.tare, 0.0)
+        counts = np.where(counts < self.config.taxel_floor, np.float32(0), counts)
+        board = joint["temperature"] & 0xFF
+        return Measured(
+            joint_position=joint["position"] * self._sign + self._offset,
+            joint_torque=np.asarray(self._torque(joint["current"].astype(np.float32)), np.float32),
+            taxel_force=counts * self._per_count,
+            current=np.abs(joint["current"].astype(np.float32)) * np.float32(1e-3),
+            temperature=np.concatenate([board, tip["temperature"]]).astype(np.float32),
+            errors=np.stack([joint["palm_error"], joint["joint_error"], joint["tip_error"]], -1),
+        )
+
+    def zero(self, states: Sequence[np.ndarray]) -> None:
+        """Take the taxels' mean over these states as zero.
+
+        Raises:
+          HandError: a fingertip touches something.
+        """
+        counts = np.mean([self._counts(state) for state in states], axis=0, dtype=np.float32)
+        worst = counts.max(1)
+        if np.any(worst > self.config.tare_limit):
+            names = [self.hand.finger_names[i] for i in np.flatnonzero(worst > self.config.tare_limit)]
+            raise HandError(
+                f"cannot zero the taxels: {', '.join(names)} read up to {worst.max():.0f} counts "
+                f"(limit {self.config.tare_limit:.0f}); free the fingertips, or power-cycle the hand"
+            )
+        self.tare = counts
+
+    def command(self, position: np.ndarray, mode: Mode) -> np.ndarray:
+        """A `frames.COMMAND_BLOCK` for joint angles [J] rad of the model; all off unless in `POSITION`."""
+        config, on = self.config, mode == Mode.POSITION
+        return frames.command_block(
+            (np.asarray(position) - self._offset) * self._sign,
+            kp=np.array(config.kp) * on,
+            ki=np.array(config.ki) * on,
+            kd=np.array(config.kd) * on,
+            torque_max=config.torque_max * on,
+            mode=mode,
+        )
+
+    def velocity(self, state: np.ndarray) -> np.ndarray | None:
+        """Joint velocities [J] rad/s as reported; None when they are to be estimated."""
+        if not self.config.reported_velocity:
+            return None
+        return state["joint"]["velocity"].astype(np.float32) * np.float32(1e-3) * self._sign
+
+    def _counts(self, state: np.ndarray) -> np.ndarray:
+        taxel = state["tip"]["taxel"]
+        if self.config.taxel_axes == "z":
+            return taxel["z"].astype(np.float32)
+        return np.sqrt(sum(taxel[axis].astype(np.float32) ** 2 for axis in "xyz"))
+
+
+class VelocityFilter:
+    """Differences of the joint angles through a first-order filter."""
+
+    def __init__(self, time_constant: float):
+        self._constant = time_constant
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget what was before."""
+        self._last: tuple[float, np.ndarray] | None = None
+        self.velocity = np.zeros(_JOINTS, np.float32)
+
+    def update(self, time: float, position: np.ndarray) -> np.ndarray:
+        """Velocities [J] rad/s after one more measurement [J] rad at a time in s."""
+        if self._last is not None and time > self._last[0]:
+            step = time - self._last[0]
+            weight = step / (step + self._constant)
+            rate = (position - self._last[1]) / step
+            self.velocity = (self.velocity + weight * (rate - self.velocity)).astype(np.float32)
+        self._last = time, position
+        return self.velocity

@@ -1,0 +1,178 @@
+"""The IMU inside the object: BNO08x parts in their UART-RVC mode, and their frame in the palm's.
+
+RVC frames come unasked, 100 a second at 115200 baud: AA AA, index, yaw, pitch and roll in 0.01
+degree, three accelerations in mg, three more bytes, and the sum of all after the head (BNO080
+datasheet, 1.3.5.2). Yaw has no north: it is fixed once, against a known pose of the object. Yaw,
+pitch and roll are blind where the part's x points up or down, so the part's z belongs on the axis
+that stays upright: `UPRIGHT_X` is its mount in an object that turns about its x.
+"""
+
+import math
+import struct
+import threading
+import time
+from typing import Any
+
+import numpy as np
+
+from dexsim_real.core.errors import HandError, explain
+
+HEAD = b"\xaa\xaa"
+SIZE = 19
+BAUD = 115200
+_BODY = struct.Struct("<B6h3B")
+UPRIGHT_X = (0.5**0.5, 0.0, 0.5**0.5, 0.0)
+"""Orientation of the part in the object: the part's z along the object's x."""
+
+
+def encode(index: int, quat: np.ndarray, acceleration: tuple[float, float, float] = (0.0, 0.0, 9.81)) -> bytes:
+    """The frame of an orientation (w, x, y, z) of the part in its world, z up; acceleration in m/s^2."""
+    w, x, y, z = (float(v) for v in quat)
+    yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    pitch = math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x))))
+    roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    angles = (round(math.degrees(a) * 100) for a in (yaw, pitch, roll))
+    body = _BODY.pack(index & 0xFF, *angles, *(round(a / 9.80665e-3) for a in acceleration), 0, 0, 0)
+    return HEAD + body + bytes([sum(body) & 0xFF])
+
+
+def decode(frame: bytes) -> np.ndarray | None:
+    """Orientation (w, x, y, z) of a frame, or None where it is damaged."""
+    body = frame[len(HEAD) : -1]
+    if len(frame) != SIZE or frame[:2] != HEAD or sum(body) & 0xFF != frame[-1]:
+        return None
+    _, yaw, pitch, roll, *_ = _BODY.unpack(body)
+    if abs(yaw) > 18000 or abs(pitch) > 9000 or abs(roll) > 18000:
+        return None
+    half = [math.radians(angle / 100) / 2 for angle in (roll, pitch, yaw)]
+    (cr, cp, cy), (sr, sp, sy) = map(math.cos, half), map(math.sin, half)
+    return np.array(
+        [
+            cr * cp * cy + sr * sp * sy,
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+        ]
+    )
+
+
+class RvcParser:
+    """Orientations out of a stream of bytes; damaged frames are counted and left out."""
+
+    def __init__(self) -> None:
+        self._buffer = bytearray()
+        self.damaged = 0
+
+    def feed(self, data: bytes) -> list[np.ndarray]:
+        """Orientations that these bytes complete."""
+        self._buffer += data
+        found, at = [], 0
+        while (at := self._buffer.find(HEAD, at)) >= 0 and at + SIZE <= len(self._buffer):
+            quat = decode(bytes(self._buffer[at : at + SIZE]))
+            if quat is None:
+                self.damaged += 1
+            else:
+                found.append(quat)
+            at += SIZE if quat is not None else 1
+        del self._buffer[: at if at >= 0 else max(len(self._buffer) - 1, 0)]
+        return found
+
+
+def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Product of two quaternions."""
+    w, v = a[0] * b[0] - a[1:] @ b[1:], a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:])
+    return np.concatenate([[w], v])
+
+
+def conjugate(a: np.ndarray) -> np.ndarray:
+    """The inverse of a unit quaternion."""
+    return a * np.array([1.0, -1.0, -1.0, -1.0])
+
+
+def align(sensed: np.ndarray, known: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """The rotation that takes the part's world to the palm frame.
+
+    Gravity fixes two of its angles (`up` [3] is the vertical in the palm frame); only the heading is
+    taken from the `known` orientation that the part had in the palm frame when `sensed` was read.
+    """
+    up = np.asarray(up, float) / np.linalg.norm(up)
+    # The shortest rotation from the part's z to the palm frame's vertical; half a turn about x if opposite.
+    level = np.array([1.0 + up[2], -up[1], up[0], 0.0]) if up[2] > -1 + 1e-9 else np.array([0.0, 1.0, 0.0, 0.0])
+    level /= np.linalg.norm(level)
+    error = multiply(known, conjugate(multiply(level, sensed)))
+    heading = np.array([error[0], *(up * (error[1:] @ up))])
+    size = np.linalg.norm(heading)
+    return multiply(heading / size if size > 1e-9 else np.array([1.0, 0, 0, 0]), level)
+
+
+class Imu:
+    """Reads the part from its own thread; `read` gives the newest orientation in the palm frame.
+
+    Args:
+      port: serial port of the part.
+      up: [3] the vertical in the palm frame.
+      mount: [4] orientation of the part in the object.
+    """
+
+    def __init__(self, port: str, up: np.ndarray, mount: tuple[float, ...] = UPRIGHT_X):
+        self.port, self._up = port, up
+        self._mount = np.asarray(mount) / np.linalg.norm(mount)
+        self._world: np.ndarray | None = None
+        self._newest: tuple[float, np.ndarray] | None = None
+        self._stop = threading.Event()
+        self.parser = RvcParser()
+        self._serial = _open(port)
+        self._thread = threading.Thread(target=self._run, name="imu", daemon=True)
+        self._thread.start()
+
+    def wait(self, seconds: float = 2.0) -> None:
+        """Until the part sends.
+
+        Raises:
+          HandError: nothing came in this time.
+        """
+        until = time.monotonic() + seconds
+        while self._newest is None:
+            if time.monotonic() > until:
+                raise HandError(
+                    f"{self.port}: no orientation from the IMU; is it in UART-RVC mode (PS0 high, PS1 low)?"
+                )
+            time.sleep(0.005)
+
+    def calibrate(self, known: np.ndarray) -> None:
+        """Fix the heading: the object lies now as `known` [4]."""
+        self._world = align(self._newest[1], multiply(known, self._mount), self._up)
+
+    def read(self) -> tuple[float, np.ndarray]:
+        """When the newest sample came (s, monotonic) and the object's orientation [4]."""
+        if self._newest is None or self._world is None:
+            raise HandError(f"{self.port}: the IMU has not been calibrated")
+        when, quat = self._newest
+        return when, multiply(multiply(self._world, quat), conjugate(self._mount))
+
+    def close(self) -> None:
+        self._stop.set()
+        self._thread.join(1.0)
+        self._serial.close()
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            try:
+                quats = self.parser.feed(self._serial.read(SIZE))
+            except OSError:
+                return  # The sample grows old, and `Safety` acts on that.
+            if quats:
+                before = self._newest[1] if self._newest else quats[-1]
+                # Of the two quaternions of an orientation the one nearer to the last, as in simulation.
+                self._newest = time.monotonic(), quats[-1] if quats[-1] @ before >= 0 else -quats[-1]
+
+
+def _open(port: str) -> Any:
+    try:
+        import serial
+    except ImportError:
+        raise HandError("pyserial is missing: pip install 'dexsim[real]'") from None
+    try:
+        return serial.Serial(port, BAUD, timeout=0.05, exclusive=True)
+    except (OSError, ValueError) as error:
+        raise HandError(explain(port, error)) from None

@@ -1,0 +1,1 @@
+"""The emulated hand's physics, which shares no code with the simulation."""

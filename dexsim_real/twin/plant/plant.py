@@ -1,0 +1,375 @@
+"""The emulated hand's physics: `Plant` of `types`, one trial after another.
+
+The world is C MuJoCo at half a millisecond (`scene`); each millisecond the firmware runs (`motors`); every
+hundredth of a second the fingertips sample (`skin`) and the referee looks. An assistant hands over the objects.
+The palm frame is the world's. Everything follows from the seed and the commands, bit for bit.
+"""
+
+import collections
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+
+from dexsim.hand.kinematics import Hand
+from dexsim_real.twin.plant.assistant import Assistant, Place, Stage, clear, find_place, put
+from dexsim_real.twin.plant.draw import EXCHANGE_SENSE, PUSHES, Draw, draw_trial
+from dexsim_real.twin.plant.motors import PERIOD, Drives
+from dexsim_real.twin.plant.referee import Referee
+from dexsim_real.twin.plant.scene import TIMESTEP, build_scene
+from dexsim_real.twin.plant.shapes import Shape, draw_shape, matrix, product, turn
+from dexsim_real.twin.plant.skin import Skin
+from dexsim_real.twin.types import Measurement, Motors
+from dexsim_real.wire.frames import Mode
+
+MOUNT = {"grasp": None, "rotate": (-0.2, -0.2)}
+"""Nominal pitch and roll of the hand, rad: None for upside down, else palm up with the wrist lowered (or raised, below
+zero), and the thumb's side."""
+GRAVITY = 9.81
+IMU_TRANSPORT = 0.0017  # s of an orientation's bytes
+_SUBSTEPS = round(PERIOD / TIMESTEP)
+_LOOK = 10  # firmware periods between two looks of the referee
+_MEMORY = 0.2  # s of the past that sensors may show
+
+
+def nominal_gravity(task: str) -> np.ndarray:
+    """Gravity [3] m/s^2 in the palm frame of a hand that is mounted as it should be."""
+    if MOUNT[task] is None:
+        return GRAVITY * np.array([1.0, 0.0, 0.0])
+    pitch, roll = MOUNT[task]
+    return GRAVITY * np.array([-np.cos(pitch) * np.cos(roll), np.sin(roll), -np.sin(pitch) * np.cos(roll)])
+
+
+def tilted_gravity(task: str, tilt: np.ndarray) -> np.ndarray:
+    """Gravity [3] of a hand whose mount is off by angles [2] rad about two axes across the vertical."""
+    down = nominal_gravity(task)
+    way = down / GRAVITY
+    side = np.array([0.0, 1.0, 0.0]) - way[1] * way  # the palm's y, made level
+    side = side / np.linalg.norm(side)
+    for axis, angle in ((side, tilt[0]), (np.cross(way, side), tilt[1])):
+        down = matrix(turn(axis, float(angle))) @ down
+    return down
+
+
+class _Past(NamedTuple):
+    """What the sensors saw at one time; copies of MuJoCo's own vectors, to be picked from."""
+
+    qpos: np.ndarray
+    qvel: np.ndarray
+    acceleration: np.ndarray  # [3] of the object
+    current: np.ndarray
+
+
+class EmulatedHand:
+    """A hand with an object, trial after trial.
+
+    Args:
+      hand: geometry.
+      task: "grasp" or "rotate".
+      seed: of everything random.
+      trials: how many there shall be, after which the hand is left empty; None: no end.
+      kind: "outside", "inside" or "nominal" (`draw`).
+      overrides: parameters that are given, not drawn (`draw_trial`).
+      seconds: time limit of a trial; None for the task's.
+      command: what the runner was asked for; only written into the results.
+      shape: name of the objects (grasp); None for random ones.
+      first: number of the first trial: a trial is the same whether others went before it or not.
+    """
+
+    def __init__(
+        self,
+        hand: Hand,
+        task: str,
+        seed: int = 0,
+        *,
+        trials: int | None = None,
+        kind: str = "outside",
+        overrides: dict[str, float | str] | None = None,
+        seconds: float | None = None,
+        command: float | None = None,
+        shape: str | None = None,
+        first: int = 0,
+    ):
+        self.hand, self.task, self.seed, self.kind = hand, task, seed, kind
+        self.command, self._end = command, None if trials is None else first + trials
+        self._overrides, self._seconds, self._shape = overrides, seconds, shape
+        self._drives = Drives(hand.torque_limit, hand.speed_limit)
+        self._skin, self._assistant = Skin(hand), Assistant(task)
+        self._done: list[dict[str, Any]] = []
+        self.time, self._ticks, self._due = 0.0, 0, 0.0
+        self._told: Motors | None = None
+        # A hand that nobody drives lies with its fingers slightly bent.
+        self._rest = np.clip(0.3, hand.joint_lower, hand.joint_upper).astype(float)
+        self._data: mujoco.MjData | None = None
+        self.trial = first - 1
+        self._next_trial()
+
+    # --- the interface --------------------------------------------------------------------------
+
+    def drive(self, motors: Motors) -> None:
+        """New commands, effective from now."""
+        self._told = motors
+        self._drives.order(self.time, motors)
+
+    def advance(self, seconds: float) -> None:
+        """Let this much time pass; what is less than a millisecond is kept for the next time."""
+        self._due += seconds
+        while self._due >= PERIOD - 1e-12:
+            self._due -= PERIOD
+            self._tick()
+
+    def measure(self) -> Measurement:
+        """What the hand's sensors show; each shows the past."""
+        late = max(float(self.draw.sensing_latency) - EXCHANGE_SENSE, 0.0)
+        past, rng = self._before(late), self._noise
+        position, quat, acceleration = self.measure_object()
+        shown = past.qpos[self._scene.drive_qpos] + self._drives.bias
+        return Measurement(
+            time=self.time,
+            joint_velocity=past.qvel[self._scene.drive_dof],
+            joint_position=shown + self.draw.encoder_noise * rng.standard_normal(shown.shape),
+            current=self._shown_current(past),
+            temperature=self._drives.case.copy(),
+            taxel_force=self._skin.report(self._felt(late), rng),
+            object_quat=quat,
+            object_position=position,
+            object_acceleration=acceleration,
+        )
+
+    def measure_object(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Place [3] m as a camera's masks give it, orientation [4] and acceleration [3] m/s^2 as an IMU in the object
+        does: late, noisy and biased as those are."""
+        draw, rng = self.draw, self._object_noise
+        at = self._scene.object_qpos
+        position = self._before(float(draw.camera_delay)).qpos[at : at + 3]
+        position = position + draw.camera_noise * rng.standard_normal(3)
+        past = self._before(max(float(getattr(draw, "imu_delay", 0.0)) - IMU_TRANSPORT, 0.0))
+        quat = past.qpos[at + 3 : at + 7].copy()
+        felt = matrix(quat).T @ (past.acceleration - self._gravity)
+        if self.task != "rotate":
+            return position, quat, felt
+        heading = turn(self.up, float(draw.imu_drift) * (self.time - self._began))
+        error = draw.imu_bias + draw.imu_noise * rng.standard_normal(3)
+        angle = float(np.linalg.norm(error))
+        skew = turn(error / max(angle, 1e-12), angle)
+        return position, product(product(heading, quat), skew), felt
+
+    def warm(self, joint: int, degrees: float) -> None:
+        """Heat one motor (a fault)."""
+        self._drives.winding[joint] += degrees
+        self._drives.case[joint] += degrees
+
+    def results(self) -> list[dict[str, Any]]:
+        """The truth about every trial so far, the current one included."""
+        return [*self._done] if self._finished else [*self._done, self._report()]
+
+    @property
+    def up(self) -> np.ndarray:
+        """[3] the true vertical in the palm frame."""
+        return -self._gravity / GRAVITY
+
+    @property
+    def limit(self) -> float:
+        """Seconds of a trial that nothing ends."""
+        return self._referee.limit
+
+    @property
+    def stage(self) -> Stage:
+        """Where the object is."""
+        return self._assistant.stage
+
+    # --- trials ---------------------------------------------------------------------------------
+
+    def _next_trial(self) -> None:
+        self.trial += 1
+        if self._finished:
+            self._assistant.begin(self.time)
+            return
+        rng = np.random.default_rng([self.seed, self.trial])
+        joints = self._rest if self._data is None else self._joints()
+        while True:  # Some objects fit nowhere between the fingers; nobody would put those there.
+            self.draw: Draw = draw_trial(self.task, rng, self.kind, self._overrides)
+            self.shape: Shape = draw_shape(self.draw, rng, self._shape)
+            self._gravity = tilted_gravity(self.task, self.draw.gravity_tilt)
+            scene = build_scene(self.hand, self.draw, self.shape, self._gravity)
+            place = find_place(scene, self.draw, self.shape, rng)
+            if place is not None:
+                break
+        self._scene, self._place = scene, place
+        self._noise, self._object_noise, self._pushing = rng.spawn(3)
+        self._drives.configure(self.draw)
+        self._skin.configure(self.draw, rng)
+        self._data = mujoco.MjData(scene.model)
+        self._data.qpos[scene.drive_qpos] = joints
+        self._assistant.begin(self.time)
+        self._referee = Referee(self.task, self._seconds)
+        self._began, self._hottest = self.time, 0.0
+        self._push_until, self._push_at = None, np.inf
+        self._pin(self._assistant.shelf(place), place)
+        mujoco.mj_forward(scene.model, self._data)
+        self._tips, self._pressing, self._touches = np.zeros((5, 3)), np.zeros(5), []
+        self._past: collections.deque[_Past] = collections.deque(maxlen=round(_MEMORY / PERIOD))
+        self._samples: collections.deque = collections.deque(maxlen=round(_MEMORY / float(self.draw.taxel_period)) + 2)
+        self._next_sample = self.time
+        self._remember()
+
+    @property
+    def _finished(self) -> bool:
+        return self._end is not None and self.trial >= self._end
+
+    def _joints(self) -> np.ndarray:
+        return self._data.qpos[self._scene.drive_qpos].copy()
+
+    def _pin(self, position: np.ndarray, place: Place) -> None:
+        put(self._scene, self._data, position, place.quat)
+
+    def _report(self) -> dict[str, Any]:
+        return {
+            "trial": self.trial,
+            "task": self.task,
+            "seed": self.seed,
+            "draw": self.kind,
+            "command": self.command,
+            "shape": self.shape.name,
+            "stage": self.stage.value,
+            "hottest": round(self._hottest, 2),
+            **self._referee.report(),
+            "parameters": self.draw.summary(),
+        }
+
+    # --- one firmware period --------------------------------------------------------------------
+
+    def _tick(self) -> None:
+        scene, data, drives = self._scene, self._data, self._drives
+        rotor, speed = data.qpos[scene.drive_qpos], data.qvel[scene.drive_dof]
+        torque, friction = drives.step(self.time, rotor, speed)
+        data.qfrc_applied[scene.drive_dof] = torque
+        scene.model.dof_frictionloss[scene.drive_dof] = friction
+        if self.stage is Stage.FREE:
+            self._shove()
+            mujoco.mj_step(scene.model, data, _SUBSTEPS)
+        else:
+            held = self._place.position if self.stage is Stage.HOLD else self._assistant.shelf(self._place)
+            for _ in range(_SUBSTEPS):
+                self._pin(held, self._place)
+                mujoco.mj_step(scene.model, data)
+        self._ticks += 1
+        self.time = self._ticks * PERIOD
+        self._remember()
+        if self.time >= self._next_sample - 1e-9:
+            self._next_sample += float(self.draw.taxel_period)
+            self._sample_skin()
+        if self._ticks % _LOOK == 0:
+            self._look()
+
+    def _look(self) -> None:
+        scene, data = self._scene, self._data
+        dof, at = scene.object_dof, scene.object_qpos
+        if self.stage is Stage.FREE:
+            self._contacts()
+            quat = data.qpos[at + 3 : at + 7]
+            spin = matrix(quat) @ data.qvel[dof + 3 : dof + 6]
+            self._referee.watch(
+                _LOOK * PERIOD,
+                data.qpos[at : at + 3].copy(),
+                quat.copy(),
+                spin,
+                self._tips,
+                self._pressing,
+                data.qvel[scene.drive_dof],
+            )
+            self._hottest = max(self._hottest, float(self._drives.case.max()))
+            if not np.isfinite(data.qpos).all() or data.warning.number.any():
+                self._referee.end = "dropped: the physics failed"
+            if self._referee.over:
+                self._done.append(self._report())
+                self._next_trial()
+            return
+        before, told = self.stage, self._told
+        targets = told.position if told is not None and np.all(told.mode == Mode.POSITION) else None
+        if self._finished:
+            return
+        free = self._room() if self._assistant.curious(self.time) else None
+        if self._assistant.watch(self.time, targets, self._joints(), free) is Stage.FREE and before is Stage.HOLD:
+            put(scene, data, self._place.position, self._place.quat, self._place.velocity)
+            self._plan_push()
+
+    def _room(self) -> bool:
+        probe = mujoco.MjData(self._scene.model)
+        probe.qpos[:] = self._data.qpos
+        return clear(self._scene, probe, self._place)
+
+    def _shove(self) -> None:
+        """Pushes at random times: a force on the object for a moment."""
+        force = self._data.xfrc_applied[self._scene.object_body]
+        if self._push_until is not None and self.time >= self._push_until:
+            force[:3], self._push_until = 0.0, None
+        if self.time < self._push_at:
+            return
+        rng, lasts = self._pushing, float(self.draw.push_seconds)
+        way = rng.standard_normal(3)
+        change = PUSHES[self.task][1] * rng.random() * way / np.linalg.norm(way)
+        force[:3] = float(self.draw.mass) * change / lasts
+        self._push_until = self.time + lasts
+        self._plan_push()
+
+    def _plan_push(self) -> None:
+        rate = PUSHES[self.task][0] * float(self.draw.push_rate)
+        self._push_at = self.time + self._pushing.exponential(1 / rate) if rate > 0 else np.inf
+
+    # --- sensors --------------------------------------------------------------------------------
+
+    def _contacts(self) -> None:
+        """Forces of the object on the fingertips as they are now."""
+        scene, data = self._scene, self._data
+        self._tips, self._pressing, self._touches = np.zeros((5, 3)), np.zeros(5), []
+        wrench = np.zeros(6)
+        for i in range(data.ncon):
+            first, second = data.contact.geom[i]
+            finger = max(scene.finger_of_geom[first], scene.finger_of_geom[second])
+            if finger < 0 or not (scene.is_object[first] or scene.is_object[second]):
+                continue
+            mujoco.mj_contactForce(scene.model, data, i, wrench)
+            # The frame's first row points from the first geom to the second, which feels the force.
+            frame = data.contact.frame[i].reshape(3, 3)
+            sign = 1.0 if scene.is_object[first] else -1.0
+            normal, tangent = sign * wrench[0] * frame[0], sign * wrench[1:3] @ frame[1:]
+            self._tips[finger] += normal + tangent
+            self._pressing[finger] += abs(wrench[0])
+            self._touches.append((int(finger), data.contact.pos[i].copy(), normal, tangent))
+
+    def _sample_skin(self) -> None:
+        self._contacts()
+        scene, data = self._scene, self._data
+        force = np.zeros((5, self.hand.num_taxels, 3))
+        if self._touches:
+            tips = data.xpos[scene.tip_body], data.xmat[scene.tip_body].reshape(-1, 3, 3)
+            force = self._skin.load(
+                self.shape,
+                data.xpos[scene.object_body],
+                data.xmat[scene.object_body].reshape(3, 3),
+                tips,
+                self._touches,
+            )
+        self._samples.append((self.time, force))
+
+    def _remember(self) -> None:
+        data, dof = self._data, self._scene.object_dof
+        acceleration = data.qacc[dof : dof + 3].copy() if self.stage is Stage.FREE else np.zeros(3)
+        self._past.append(_Past(data.qpos.copy(), data.qvel.copy(), acceleration, self._drives.current))
+
+    def _before(self, age: float) -> _Past:
+        """What was a while ago; the oldest that is remembered, if that is less."""
+        back = min(round(age / PERIOD), len(self._past) - 1)
+        return self._past[-1 - back]
+
+    def _felt(self, late: float) -> np.ndarray:
+        for time, force in reversed(self._samples):
+            if time <= self.time - late + 1e-9:
+                return force
+        return np.zeros((5, self.hand.num_taxels, 3))
+
+    def _shown_current(self, past: _Past) -> np.ndarray:
+        """mA, positive when opening."""
+        noise = float(self.draw.current_noise) * self._noise.standard_normal(past.current.shape)
+        return -1000.0 * (past.current * self.draw.current_gain + noise)

@@ -1,0 +1,156 @@
+"""The truth about a trial on the emulated hand: what the paper counts, from the world's own state.
+
+No sensor, calibration or goal of the runner enters here. Rules are those of the tasks: an object that is grasped is
+lost farther than 0.12 m from its place; a cube that is turned has reached a goal within 0.3 rad and 0.05 m of it
+(the paper's count) at no more than 2 rad/s (the task's count), is lost 0.07 m away, or tipped by 1 rad.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from dexsim_real.twin.plant.assistant import REFERENCES
+from dexsim_real.twin.plant.shapes import matrix, product, turn
+
+LIMITS = {"grasp": 8.0, "rotate": 120.0}
+"""Seconds of a trial that nothing ends."""
+LOST = {"grasp": 0.12, "rotate": 0.07}  # m
+GOAL_STEP, GOAL_ANGLE, GOAL_DISTANCE, GOAL_SPIN = math.pi / 2, 0.3, 0.05, 2.0  # rad, rad, m, rad/s
+TIPPED = 1.0  # rad
+TOUCH = 0.1  # N from which a fingertip counts as touching (grasp: `_GRIP`)
+_GRIP = 0.01  # N
+_SETTLE = 3.0  # s after release from which forces count
+_RECENT = 0.2  # s, a fingertip that touched within it before a drop pushed the object out
+_AXIS = np.array([1.0, 0.0, 0.0])
+
+
+class Referee:
+    """Watches one trial from release to end.
+
+    Args:
+      task: "grasp" or "rotate".
+      seconds: time limit; None for the task's.
+    """
+
+    def __init__(self, task: str, seconds: float | None = None):
+        self.task, self.limit = task, LIMITS[task] if seconds is None else seconds
+        self.time, self.end = 0.0, ""
+        self._reference = np.array(REFERENCES[task])
+        self._touched = -math.inf
+        self._counted, self._weight = 0, 0.0
+        self._force, self._finger, self._pressing, self._total = np.zeros(5), 0.0, 0.0, 0.0
+        self._duty, self._speed = np.zeros(5), 0.0
+        self.goals = None if task == "grasp" else {"task": GoalCount(GOAL_SPIN), "paper": GoalCount(math.inf)}
+
+    @property
+    def over(self) -> bool:
+        """Whether the trial has ended."""
+        return bool(self.end)
+
+    def watch(
+        self,
+        step: float,
+        position: np.ndarray,
+        quat: np.ndarray,
+        spin: np.ndarray,
+        tips: np.ndarray,
+        pressing: np.ndarray,
+        joint_speed: np.ndarray,
+    ) -> None:
+        """One more look.
+
+        Args:
+          step: s since the last one.
+          position, quat, spin: of the object in the palm frame; m, -, rad/s.
+          tips: [5, 3] N, the solver's force on each fingertip.
+          pressing: [5] N, the sum of its contacts' normal forces, which is what taxels can feel of it.
+          joint_speed: [12] rad/s.
+        """
+        if self.over:
+            return
+        self.time += step
+        strength = np.linalg.norm(tips, axis=-1)
+        self._speed += step * float(np.mean(np.abs(joint_speed)))
+        self._duty += step * (strength > TOUCH)
+        if np.any(strength > TOUCH):
+            self._touched = self.time
+        away = float(np.linalg.norm(position - self._reference))
+        tilt = math.acos(float(np.clip(matrix(quat)[:, 0] @ _AXIS, -1.0, 1.0)))
+        if away > LOST[self.task] or (self.goals and tilt > TIPPED):
+            pushed = self.time - self._touched <= _RECENT
+            kind = "tipped" if away <= LOST[self.task] else "pushed out" if pushed else "slipped"
+            self.end = f"dropped: {kind}"
+            return
+        if self.goals:
+            for count in self.goals.values():
+                count.watch(self.time, quat, away, float(spin @ _AXIS))
+        elif self.time > min(_SETTLE, self.limit / 2):
+            self._grip(strength, pressing)
+        if self.time >= self.limit - 1e-9:
+            self.end = "time limit"
+
+    def _grip(self, strength: np.ndarray, pressing: np.ndarray) -> None:
+        """The command speaks to the four fingers; the thumb balances them."""
+        touching = strength[1:] > _GRIP
+        if touching.any():
+            self._finger += float(strength[1:][touching].mean())
+            self._pressing += float(pressing[1:][touching].mean())
+        self._force += strength
+        self._total += float(strength.sum())
+        self._counted += 1
+
+    def report(self) -> dict[str, Any]:
+        """What has been seen so far; JSON-able."""
+        lived, count = max(self.time, 1e-9), max(self._counted, 1)
+        report: dict[str, Any] = {
+            "seconds": round(self.time, 4),
+            "end": self.end or "running",
+            "duty": np.round(self._duty / lived, 4).tolist(),
+            "joint_speed": round(self._speed / lived, 4),
+        }
+        if self.goals is None:
+            return report | {
+                "held": self.end == "time limit",
+                "force": np.round(self._force / count, 4).tolist(),
+                "finger_force": round(self._finger / count, 4),
+                "finger_pressing": round(self._pressing / count, 4),
+                "total_force": round(self._total / count, 4),
+            }
+        task, paper = self.goals["task"], self.goals["paper"]
+        return report | {
+            "successes": task.count,
+            "paper_successes": paper.count,
+            "success_times": task.times,
+            "seconds_per_success": task.times[-1] / task.count if task.count else None,
+            "seconds_to_fall": round(self.time, 4),
+            "fell": self.over and self.end != "time limit",
+            "turned": round(task.angle, 4),
+        }
+
+
+class GoalCount:
+    """Consecutive goals 90 degrees apart about the palm's normal, from the heading of the first look.
+
+    Args:
+      fastest: rad/s about the axis at which a goal still counts.
+    """
+
+    def __init__(self, fastest: float):
+        self._fastest = fastest
+        self.count, self.times, self.angle = 0, [], 0.0
+        self._start: float | None = None
+        self._heading = 0.0
+
+    def watch(self, time: float, quat: np.ndarray, away: float, spin: float) -> None:
+        """One more look: orientation [4], distance m from the object's place, spin rad/s."""
+        heading = 2 * math.atan2(quat[1], quat[0])  # the turn about x that is nearest to the orientation
+        if self._start is None:
+            self._start = self._heading = heading
+        self.angle += (heading - self._heading + math.pi) % (2 * math.pi) - math.pi
+        self._heading = heading
+        goal = turn((1.0, 0.0, 0.0), self._start + (self.count + 1) * GOAL_STEP)
+        apart = 2 * math.acos(min(1.0, abs(float(product(goal * [1, -1, -1, -1], quat)[0]))))
+        if apart < GOAL_ANGLE and away < GOAL_DISTANCE and abs(spin) <= self._fastest:
+            self.count += 1
+            self.times.append(round(time, 4))

@@ -1,0 +1,128 @@
+"""Objects of the emulated hand: unions of primitives, their exact distance, and how they are drawn.
+
+Written for this hand alone, in NumPy; what training collides and feels with is other code.
+Axes of capsules and cylinders are their own z.
+"""
+
+import dataclasses
+
+import numpy as np
+
+from dexsim_real.twin.plant.draw import Draw
+
+SHAPES = ("sphere", "box", "cylinder", "capsule", "composition")
+BODY_SHARE = 0.8  # size of a composition's body against one that stands alone
+
+
+@dataclasses.dataclass(frozen=True)
+class Part:
+    """One primitive, aligned with the object's axes."""
+
+    kind: str  # "sphere", "box", "cylinder", "capsule"
+    size: tuple[float, ...]  # radius; half extents; radius, half length
+    place: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Shape:
+    """A union of parts."""
+
+    name: str
+    parts: tuple[Part, ...]
+
+    def distance(self, points: np.ndarray) -> np.ndarray:
+        """Signed distance [...] m of points [..., 3] in the object's frame, negative inside.
+
+        Inside a union it is a bound: the depth below the nearer part's surface.
+        """
+        return np.min([_DISTANCE[part.kind](points - part.place, part.size) for part in self.parts], axis=0)
+
+    def reach(self, direction: np.ndarray) -> float:
+        """How far m the object extends along a unit direction [3] of its frame, from its origin."""
+        return max(_reach(part, direction) + float(np.dot(part.place, direction)) for part in self.parts)
+
+
+def _sphere(points: np.ndarray, size: tuple[float, ...]) -> np.ndarray:
+    return np.linalg.norm(points, axis=-1) - size[0]
+
+
+def _box(points: np.ndarray, size: tuple[float, ...]) -> np.ndarray:
+    beyond = np.abs(points) - size
+    outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=-1)
+    return outside + np.minimum(beyond.max(-1), 0.0)
+
+
+def _cylinder(points: np.ndarray, size: tuple[float, ...]) -> np.ndarray:
+    beyond = np.stack([np.hypot(points[..., 0], points[..., 1]) - size[0], np.abs(points[..., 2]) - size[1]], -1)
+    return np.linalg.norm(np.maximum(beyond, 0.0), axis=-1) + np.minimum(beyond.max(-1), 0.0)
+
+
+def _capsule(points: np.ndarray, size: tuple[float, ...]) -> np.ndarray:
+    along = points[..., 2] - np.clip(points[..., 2], -size[1], size[1])
+    return np.sqrt(points[..., 0] ** 2 + points[..., 1] ** 2 + along**2) - size[0]
+
+
+_DISTANCE = {"sphere": _sphere, "box": _box, "cylinder": _cylinder, "capsule": _capsule}
+
+
+def _reach(part: Part, direction: np.ndarray) -> float:
+    x, y, z = np.abs(direction)
+    size, across = part.size, float(np.hypot(x, y))
+    return float(
+        {
+            "sphere": lambda: size[0],
+            "box": lambda: np.dot(size, (x, y, z)),
+            "cylinder": lambda: size[0] * across + size[1] * z,
+            "capsule": lambda: size[0] + size[1] * z,
+        }[part.kind]()
+    )
+
+
+def draw_shape(draw: Draw, rng: np.random.Generator, name: str | None = None) -> Shape:
+    """The object of a trial: a cube to rotate, any of `SHAPES` to grasp (or the one of that name)."""
+    which, body = rng.choice(SHAPES), rng.random() < 0.5
+    if draw.task == "rotate":
+        half = float(draw.edge) / 2
+        return Shape("box", (Part("box", (half, half, half)),))
+    name = name or str(which)
+    half = tuple(float(h) for h in draw.box_half)
+    tube = float(draw.cylinder_radius), float(draw.cylinder_half)
+    if name == "composition":
+        return _composition(draw, "box" if body else "cylinder", half if body else tube)
+    size = {"sphere": (float(draw.sphere_radius),), "box": half, "cylinder": tube, "capsule": tube}[name]
+    return Shape(name, (Part(name, size),))
+
+
+def _composition(draw: Draw, kind: str, size: tuple[float, ...]) -> Shape:
+    """A smaller box or cylinder with a capsule jutting out along z; the origin in its middle."""
+    body = tuple(BODY_SHARE * s for s in size)
+    neck = float(draw.neck_radius), float(draw.neck_half)
+    out = body[-1] + neck[1]
+    shift = (out + neck[1] + neck[0] - body[-1]) / 2
+    return Shape("composition", (Part(kind, body, (0.0, 0.0, -shift)), Part("capsule", neck, (0.0, 0.0, out - shift))))
+
+
+# --- rotations -----------------------------------------------------------------------------------
+
+
+def turn(axis: tuple[float, float, float], angle: float) -> np.ndarray:
+    """Quaternion (w, x, y, z) of a rotation about a unit axis."""
+    return np.array([np.cos(angle / 2), *(np.sin(angle / 2) * np.asarray(axis, float))])
+
+
+def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """a after b."""
+    w, x, y, z = a
+    return np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]) @ b
+
+
+def matrix(quat: np.ndarray) -> np.ndarray:
+    """Rotation matrix [3, 3] of a unit quaternion."""
+    w, x, y, z = quat
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )

@@ -1,0 +1,112 @@
+"""The emulated fingertips: what 5 x 120 taxels report of the solver's contacts.
+
+A taxel lies under rubber. Where the object's surface comes nearer than the rubber is thick, the rubber is squeezed,
+and pushes back the harder the less of it is left. That law shares out the load among the taxels; how large the load
+is, the solver's contacts say: a fingertip's skin carries their normal force, as a scale under it would. Contacts that
+lie off the lattice (the nail's side) load no taxel. Shear is shared in the same proportion and shown along the
+taxel's own axes. Then come the array's faults: crosstalk, gains, zero errors, noise, a threshold.
+"""
+
+import numpy as np
+
+from dexsim.hand.kinematics import Hand
+from dexsim_real.twin.plant.draw import Draw
+from dexsim_real.twin.plant.shapes import Shape
+
+_FULLY, _NOT_AT_ALL = 0.004, 0.008  # m along the skin from a contact to the nearest taxel: felt within, not beyond
+_LEFT = 0.15  # share of the rubber that no load squeezes away
+
+
+class Skin:
+    """The taxels of five fingertips; F fingers, N taxels."""
+
+    def __init__(self, hand: Hand):
+        self._place, self._area = hand.taxel_position.astype(float), hand.taxel_area.astype(float)
+        self._normal, self._grid = hand.taxel_normal.astype(float), hand.taxel_grid
+        self._axes = _axes(self._place, hand.taxel_normal.astype(float), hand.taxel_grid)
+
+    def configure(self, draw: Draw, rng: np.random.Generator) -> None:
+        """Take a trial's parameters and array."""
+        shape = self._area.shape
+        self.thickness = float(draw.rubber)
+        self._gain = draw.taxel_gain[:, None] * np.maximum(1 + draw.taxel_spread * rng.standard_normal(shape), 0.1)
+        self._bias = draw.taxel_bias * rng.standard_normal(shape)
+        self._noise, self._threshold = float(draw.taxel_noise), float(draw.taxel_threshold)
+        self._crosstalk = float(draw.taxel_crosstalk)
+
+    def load(
+        self,
+        shape: Shape,
+        place: np.ndarray,
+        turn: np.ndarray,
+        tips: tuple[np.ndarray, np.ndarray],
+        contacts: list[tuple[int, np.ndarray, np.ndarray, np.ndarray]],
+    ) -> np.ndarray:
+        """Forces [F, N, 3] N on the taxels along their own axes, before the array's faults.
+
+        Args:
+          shape, place [3], turn [3, 3]: the object.
+          tips: positions [F, 3] and rotations [F, 3, 3] of the fingertips' frames.
+          contacts: for each contact of object and fingertip (finger, point [3], normal force [3],
+            tangential force [3]), forces on the finger.
+        """
+        force = np.zeros((*self._area.shape, 3))
+        for finger in {contact[0] for contact in contacts}:
+            origin, frame = tips[0][finger], tips[1][finger]
+            taxels, outward = origin + self._place[finger] @ frame.T, self._normal[finger] @ frame.T
+            pressed, dragged = 0.0, np.zeros(3)
+            for _, point, normal, tangent in (c for c in contacts if c[0] == finger):
+                gap = self._gap(point - taxels, outward)
+                felt = np.clip((_NOT_AT_ALL - gap) / (_NOT_AT_ALL - _FULLY), 0.0, 1.0)
+                pressed += felt * float(np.linalg.norm(normal))
+                dragged += felt * tangent
+            share = self._share(shape, (taxels - place) @ turn, self._area[finger])
+            axes = np.einsum("ij,nkj->nki", frame, self._axes[finger])
+            force[finger] = share[:, None] * (axes @ dragged)
+            force[finger, :, 2] = share * pressed
+        return force
+
+    def report(self, force: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """What the array makes of forces [F, N, 3] N."""
+        mixed = force + self._crosstalk / 4 * _spill(force, self._grid)
+        shown = mixed * self._gain[..., None] + self._noise * rng.standard_normal(force.shape)
+        shown[..., 2] += self._bias
+        return np.where(np.abs(shown) < self._threshold, 0.0, shown)
+
+    def _gap(self, away: np.ndarray, outward: np.ndarray) -> float:
+        """How far m along the skin a contact lies from the nearest taxel, given its vectors [N, 3] from all of them.
+
+        Up to the rubber's thickness, height above a taxel is no distance.
+        """
+        height = (away * outward).sum(-1)
+        along = ((away - height[:, None] * outward) ** 2).sum(-1)
+        return float(np.sqrt((along + np.maximum(np.abs(height) - self.thickness, 0.0) ** 2).min()))
+
+    def _share(self, shape: Shape, points: np.ndarray, area: np.ndarray) -> np.ndarray:
+        """Share [N] of the load on each taxel; zero where the object is out of all taxels' reach."""
+        squeeze = np.clip((self.thickness - shape.distance(points)) / self.thickness, 0.0, 1 - _LEFT)
+        push = squeeze / (1.0 - squeeze) * area
+        total = push.sum()
+        return push / total if total > 0 else push
+
+
+def _axes(place: np.ndarray, normal: np.ndarray, grid: tuple[int, int]) -> np.ndarray:
+    """Rows [F, N, 3, 3]: x across the finger, y along it to the tip, z into it; unit vectors of the tip's frame."""
+    lattice = place.reshape(len(place), *grid, 3)
+    along = np.gradient(lattice, axis=2).reshape(place.shape)
+    along -= (along * normal).sum(-1, keepdims=True) * normal
+    along /= np.linalg.norm(along, axis=-1, keepdims=True)
+    return np.stack([np.cross(along, -normal), along, -normal], 2)
+
+
+def _spill(force: np.ndarray, grid: tuple[int, int]) -> np.ndarray:
+    """What the four neighbours on the lattice lend a taxel less what it lends them [F, N, 3]."""
+    field = force.reshape(len(force), *grid, 3)
+    out = np.zeros_like(field)
+    for axis in (1, 2):
+        step = np.diff(field, axis=axis)
+        first = tuple(slice(None, -1) if a == axis else slice(None) for a in range(4))
+        last = tuple(slice(1, None) if a == axis else slice(None) for a in range(4))
+        out[first] += step
+        out[last] -= step
+    return out.reshape(force.shape)

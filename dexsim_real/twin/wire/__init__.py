@@ -1,0 +1,1 @@
+"""The emulated hand's end of the wire."""

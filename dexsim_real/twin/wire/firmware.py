@@ -1,0 +1,242 @@
+"""The emulated palm board: what each frame does, what it answers, and what it does when nobody asks any more.
+
+Answers have the layouts of `dexsim_real.wire.frames`. What no public source tells (the payload of the rare commands,
+the meaning of the error bits) is this board's own, and said where it is made up.
+"""
+
+import dataclasses
+from collections import Counter
+from collections.abc import Callable
+
+import numpy as np
+
+from dexsim.core.config import setting, validate
+from dexsim_real.twin.types import Measurement, Motors, Plant
+from dexsim_real.wire import frames
+from dexsim_real.wire.frames import Command, Frame, Mode
+
+OVERHEATED, OVERLOADED, ABANDONED = 1, 2, 4
+"""Error bits of a joint, this board's own: too hot and off, too much current for long, no host."""
+_COMMUNICATION, _ID, _PARAMETER, _MODE, _FORCE_MODE = 2, 1, 30, 67, 81
+_ERROR_BASE = 1501000
+_SERIAL, _HAND_ID, _NAME = 21, 53, 54  # registers
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FirmwareConfig:
+    """The palm board."""
+
+    hand_id: int = setting(0, unit="1", low=0, high=125)
+    """Id of the hand."""
+    version: str = "1.3.9 emulated"
+    """What it calls itself."""
+    watchdog: float = setting(0.08, unit="s", low=0.01, high=10.0)
+    """Without a valid exchange for this long the motors go off."""
+    encoder_bits: int = setting(12, unit="1", low=4, high=16)
+    """Resolution of a full turn."""
+    force_per_count: float = setting(0.1, unit="N", low=1e-3, high=10.0)
+    """Force of one taxel count."""
+    palm_temperature: int = setting(38, unit="degC", low=0, high=120)
+    """Of the palm board, with which a joint's own travels in one number."""
+    tip_temperature: int = setting(31, unit="degC", low=0, high=120)
+    """Of the fingertips."""
+    shutdown: float = setting(95.0, unit="degC", low=30.0, high=200.0)
+    """A motor above this goes off by itself until it is 10 K cooler."""
+    overload: float = setting(1800.0, unit="mA", low=10.0, high=30000.0)
+    """Current that sets an error bit when it lasts for half a second."""
+
+    def __post_init__(self):
+        validate(self)
+
+
+def idle_motors() -> Motors:
+    """What the board has been told before anybody spoke: everything off."""
+    nothing = np.zeros(frames.JOINTS)
+    return Motors(*(nothing.copy() for _ in range(5)), mode=np.full(frames.JOINTS, int(Mode.PASSIVE)))
+
+
+class Firmware:
+    """Executes frames on a plant.
+
+    Args:
+      note: called with one line when the motors change hands.
+    """
+
+    def __init__(self, plant: Plant, config: FirmwareConfig, note: Callable[[str], None] = lambda text: None):
+        self.plant, self.config, self._note = plant, config, note
+        self.counts: Counter[str] = Counter()  # by what was done
+        self.motors = idle_motors()
+        self.stuck: dict[tuple[int, int], int] = {}  # counts of a taxel (tip, number) that shows nothing else
+        self.reported = np.zeros(frames.JOINTS)  # rad, angles of the last state sent
+        self.trips: list[float] = []  # times s of the watchdog
+        self.longest = 0.0  # s, from the last exchange until it acted
+        self._zero = np.zeros((frames.TIPS, frames.TAXELS, 3), np.int32)
+        self._alive = -np.inf  # s, time of the last valid exchange
+        self._hot = np.zeros(frames.JOINTS, bool)
+        self._overload_since: np.ndarray = np.full(frames.JOINTS, np.inf)
+        self._abandoned = False
+
+    @property
+    def on(self) -> bool:
+        """Whether any motor is."""
+        return bool(np.any(self.motors.mode != Mode.PASSIVE))
+
+    @property
+    def deadline(self) -> float:
+        """When the watchdog acts unless somebody asks; never while the motors are off."""
+        return self._alive + self.config.watchdog if self.on else np.inf
+
+    def watch(self, now: float) -> bool:
+        """Motors off if nobody has asked for too long; whether that was now."""
+        if now < self.deadline:
+            return False
+        self.trips.append(now)
+        self.longest = max(self.longest, now - self._alive)
+        self._abandoned = True
+        self._drive(dataclasses.replace(self.motors, mode=np.zeros(frames.JOINTS, int)))
+        self._note(f"watchdog: no exchange for {1e3 * (now - self._alive):.0f} ms, motors off")
+        return True
+
+    def answer(self, frame: Frame, now: float) -> Frame | None:
+        """Do what a frame asks, and the answer to it; None for one that is for somebody else."""
+        if frame.target not in (frames.palm_address(self.config.hand_id), frames.BROADCAST):
+            self.counts["for another"] += 1
+            return None
+        act = {
+            Command.EXCHANGE: self._exchange,
+            Command.VERSION: self._version,
+            Command.SET_MODE: self._set_mode,
+            Command.READ_MODE: self._read_mode,
+            Command.CLEAR_PRESSURE: self._clear,
+            Command.RESET: self._reset,
+            Command.READ_REGISTER: self._register,
+        }[Command(frame.command)]
+        command, data = act(frame.data, now)
+        self.counts[Command(frame.command).name.lower() if command != Command.ERROR else "refused"] += 1
+        return Frame(frames.palm_address(self.config.hand_id), frame.source, command, data)
+
+    def state(self, measured: Measurement) -> np.ndarray:
+        """A `frames.STATE_BLOCK` of what is measured, in the wire's few bits."""
+        config, block = self.config, frames.empty_state()
+        joint, tip = block["joint"], block["tip"]
+        step = 2 * np.pi / 2**config.encoder_bits
+        ticks = np.round(measured.joint_position / step)
+        joint["position"] = ticks * step
+        joint["current"] = _whole(measured.current, np.int16)
+        joint["velocity"] = _whole(1e3 * measured.joint_velocity, np.int16)
+        raw = (np.round(ticks * 2.0 ** (12 - config.encoder_bits)).astype(int) + 2048) & 0xFFF
+        joint["raw_position"] = raw << 4 | self.motors.mode
+        joint["temperature"] = config.palm_temperature << 8 | _whole(measured.temperature, np.uint8).astype(np.uint16)
+        joint["joint_error"] = (
+            OVERHEATED * self._hot
+            + OVERLOADED * (measured.time > self._overload_since + 0.5)
+            + ABANDONED * self._abandoned
+        )
+        counts = self._counts(measured) - self._zero
+        for (finger, taxel), value in self.stuck.items():
+            counts[finger, taxel] = 0, 0, value
+        for axis, name in enumerate("xyz"):
+            kind = np.uint8 if name == "z" else np.int8
+            tip["taxel"][name] = _whole(counts[..., axis], kind)
+            tip["total"][name] = _whole(counts[..., axis].sum(-1), kind)
+        tip["taxel_temperature"] = tip["temperature"] = config.tip_temperature
+        return block
+
+    # --- commands: data and time to the answer's command and data -----------------------------------
+
+    def _exchange(self, data: bytes, now: float) -> tuple[Command, bytes]:
+        try:
+            block = frames.decode_command(data)
+        except frames.FrameError:
+            return self._error(_ID)
+        refusal = self._refusal(block["mode"])
+        if refusal or not np.isfinite(block["position"]).all():
+            return self._error(refusal or _PARAMETER)
+        measured = self.plant.measure()
+        self._protect(measured)
+        was_on, self._alive, self._abandoned = self.on, now, False
+        self._drive(
+            Motors(
+                *(block[name].astype(float) for name in ("position", "kp", "ki", "kd", "torque_max")),
+                mode=np.where(self._hot, int(Mode.PASSIVE), block["mode"].astype(int)),
+            )
+        )
+        if was_on != self.on:
+            self._note("motors on" if self.on else "motors off")
+        state = self.state(measured)
+        self.reported = state["joint"]["position"].astype(float)
+        return Command.EXCHANGE, state.tobytes()
+
+    def _version(self, data: bytes, now: float) -> tuple[Command, bytes]:
+        return Command.VERSION, self.config.version.encode("ascii", "replace")[:64] or b"?"
+
+    def _set_mode(self, data: bytes, now: float) -> tuple[Command, bytes]:
+        """One mode for all joints, or twelve."""
+        if len(data) not in (1, frames.JOINTS):
+            return self._error(_PARAMETER)
+        mode = np.broadcast_to(np.frombuffer(data, np.uint8).astype(int), frames.JOINTS).copy()
+        if refusal := self._refusal(mode):
+            return self._error(refusal)
+        self._alive = now
+        self._drive(dataclasses.replace(self.motors, mode=mode))
+        return Command.ACKNOWLEDGE, bytes([Command.SET_MODE, 0])
+
+    def _read_mode(self, data: bytes, now: float) -> tuple[Command, bytes]:
+        return Command.READ_MODE, self.motors.mode.astype(np.uint8).tobytes()
+
+    def _clear(self, data: bytes, now: float) -> tuple[Command, bytes]:
+        """What the taxels of one tip, or of all, show now is their zero."""
+        tips = list(frames.TIP_IDS) if not data else list(data)
+        if not set(tips) <= set(frames.TIP_IDS):
+            return self._error(_ID)
+        counts = self._counts(self.plant.measure())
+        for tip in tips:
+            self._zero[tip - frames.TIP_IDS[0]] = counts[tip - frames.TIP_IDS[0]]
+        return Command.CLEAR_PRESSURE, bytes([tips[0] if data else 0, 0])
+
+    def _reset(self, data: bytes, now: float) -> tuple[Command, bytes]:
+        self._zero[:] = 0
+        self._drive(idle_motors())
+        return Command.ACKNOWLEDGE, bytes([Command.RESET, 0])
+
+    def _register(self, data: bytes, now: float) -> tuple[Command, bytes]:
+        """Two bytes of number and 32 of content."""
+        number = int.from_bytes(data[:2], "little")
+        known = {_SERIAL: b"2R32EMULATED", _HAND_ID: bytes([self.config.hand_id]), _NAME: b"emulated"}
+        if number not in known:
+            return self._error(_PARAMETER)
+        return Command.READ_REGISTER, number.to_bytes(2, "little") + known[number].ljust(32, b"\0")
+
+    # --- pieces ---------------------------------------------------------------------------------
+
+    def _drive(self, motors: Motors) -> None:
+        self.motors = motors
+        self.plant.drive(motors)
+
+    def _counts(self, measured: Measurement) -> np.ndarray:
+        return np.round(measured.taxel_force / self.config.force_per_count).astype(np.int32)
+
+    def _protect(self, measured: Measurement) -> None:
+        """Which motors are too hot or loaded for too long."""
+        hot, limit = measured.temperature, self.config.shutdown
+        self._hot = (hot > limit) | (self._hot & (hot > limit - 10.0))
+        self._overload_since = np.where(
+            np.abs(measured.current) > self.config.overload, np.minimum(self._overload_since, measured.time), np.inf
+        )
+
+    @staticmethod
+    def _refusal(mode: np.ndarray) -> int:
+        """Error of a mode that the board does not know or does not have; 0 for none."""
+        if not np.isin(mode, list(Mode)).all():
+            return _MODE
+        return _FORCE_MODE if np.any(mode == Mode.FORCE) else 0
+
+    @staticmethod
+    def _error(number: int) -> tuple[Command, bytes]:
+        return Command.ERROR, (_ERROR_BASE + number).to_bytes(4, "little")
+
+
+def _whole(values: np.ndarray, kind: type) -> np.ndarray:
+    """Rounded and held within the range of an integer type."""
+    span = np.iinfo(kind)
+    return np.clip(np.round(values), span.min, span.max).astype(kind)

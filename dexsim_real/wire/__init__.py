@@ -1,0 +1,1 @@
+"""The hand's wire format and its serial port."""

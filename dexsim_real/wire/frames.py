@@ -1,0 +1,308 @@
+"""The hand's wire format on RS485: frames, their checksum, the two big blocks, a parser.
+
+    55 AA | source | target | command | length, low byte first | data | CRC, low byte first
+
+The CRC is CRC-16/XMODEM over everything before it. Both ends of the line are here: a host sends
+`EXCHANGE` with twelve joint commands and gets back the whole state, and an emulated hand does the
+reverse. Layouts are from public drivers and headers; docs/hardware.md says how sure each is.
+"""
+
+import binascii
+import dataclasses
+import enum
+import struct
+from collections.abc import Mapping
+
+import numpy as np
+
+from dexsim.core.errors import DexsimError
+
+HEAD = b"\x55\xaa"
+HEADER = struct.Struct("<2sBBBH")
+OVERHEAD = HEADER.size + 2  # bytes of a frame without data
+MAX_DATA = 8192 + 32
+HOST = 0xFE
+BROADCAST = 0xFF
+JOINTS, TIPS, TAXELS = 12, 5, 120
+TIP_JOINTS = (2, 5, 7, 9, 11)
+"""Joints whose state names a tip sensor, thumb to pinky."""
+TIP_IDS = (0x11, 0x12, 0x13, 0x14, 0x15)
+
+
+class FrameError(DexsimError):
+    """A block has the wrong size or cannot be what it claims to be."""
+
+
+class Command(enum.IntEnum):
+    """What a frame asks for, or answers."""
+
+    ERROR = 0x00
+    EXCHANGE = 0x02  # joint commands out, whole state back
+    SET_MODE = 0x08
+    READ_MODE = 0x09
+    CLEAR_PRESSURE = 0x12  # zero the taxels of one tip
+    VERSION = 0x13
+    RESET = 0x14
+    READ_REGISTER = 0x15
+    ACKNOWLEDGE = 0xB0
+
+
+class Mode(enum.IntEnum):
+    """What a joint does with its command."""
+
+    PASSIVE = 0  # relaxed; on some firmware not fully limp
+    POSITION = 3
+    FORCE = 5  # refused by some units
+
+
+JOINT_COMMAND = np.dtype(
+    [
+        ("id", "<u2"),
+        ("kp", "<i2"),
+        ("ki", "<i2"),
+        ("kd", "<i2"),
+        ("position", "<f4"),  # rad
+        ("torque_max", "<i2"),  # mA
+        ("mode", "<u2"),
+        ("reserved", "<u2", 4),
+    ]
+)
+COMMAND_BLOCK = np.dtype((JOINT_COMMAND, JOINTS))
+"""Data of an `EXCHANGE` from the host, 288 bytes."""
+
+JOINT_STATE = np.dtype(
+    [
+        ("id", "u1"),
+        ("sensor_id", "u1"),
+        ("position", "<f4"),  # rad
+        ("current", "<i2"),  # mA; vendor headers call it torque
+        ("raw_position", "<u2"),  # bits 0-3 mode, 4-15 encoder
+        ("temperature", "<u2"),  # degC: low byte joint board, high byte palm board
+        ("palm_error", "<u2"),
+        ("joint_error", "<u2"),
+        ("tip_error", "<u2"),  # bit fields
+        ("velocity", "<i2"),  # 1e-3 rad/s on newer firmware, undefined on older
+        ("reserved", "<u2", 2),
+    ]
+)
+FORCE = np.dtype([("x", "i1"), ("y", "i1"), ("z", "u1")])  # counts; z presses into the tip
+TIP_STATE = np.dtype(
+    [("total", FORCE), ("taxel", FORCE, TAXELS), ("taxel_temperature", "u1", 20), ("temperature", "u1")]
+)  # degC
+STATE_BLOCK = np.dtype([("joint", JOINT_STATE, JOINTS), ("tip", TIP_STATE, TIPS)])
+"""Data of an `EXCHANGE` from the hand, 2208 bytes."""
+
+HAND_REPLIES: dict[int, range] = {
+    Command.EXCHANGE: range(STATE_BLOCK.itemsize, STATE_BLOCK.itemsize + 1),
+    Command.ERROR: range(1, 65),
+    Command.ACKNOWLEDGE: range(1, 65),
+    Command.VERSION: range(1, 65),
+    Command.CLEAR_PRESSURE: range(2, 65),
+    Command.READ_MODE: range(2, 65),
+    Command.READ_REGISTER: range(5, 65),
+}
+"""Data lengths that a host believes. None fits the host's own request, so an adapter that echoes
+what it sends cannot be taken for the hand."""
+HOST_REQUESTS: dict[int, range] = {
+    Command.EXCHANGE: range(COMMAND_BLOCK.itemsize, COMMAND_BLOCK.itemsize + 1),
+    Command.VERSION: range(0, 1),
+    Command.READ_MODE: range(0, 2),
+    Command.SET_MODE: range(1, 33),
+    Command.CLEAR_PRESSURE: range(0, 2),
+    Command.RESET: range(0, 2),
+    Command.READ_REGISTER: range(1, 5),
+}
+"""Data lengths that a hand believes."""
+
+
+def crc16(data: bytes | bytearray | memoryview) -> int:
+    """CRC-16/XMODEM: polynomial 0x1021, start 0, not reflected; 0x31C3 for b"123456789"."""
+    return binascii.crc_hqx(data, 0)
+
+
+def palm_address(hand_id: int) -> int:
+    """Address of a hand's palm board."""
+    return hand_id | 0x80
+
+
+@dataclasses.dataclass(frozen=True)
+class Frame:
+    """One frame without head and checksum."""
+
+    source: int
+    target: int
+    command: int
+    data: bytes = b""
+
+    def encode(self) -> bytes:
+        """The bytes on the wire.
+
+        Raises:
+          FrameError: more data than a frame can carry.
+        """
+        if len(self.data) > MAX_DATA:
+            raise FrameError(f"{len(self.data)} bytes of data, a frame carries at most {MAX_DATA}")
+        body = HEADER.pack(HEAD, self.source, self.target, self.command, len(self.data)) + self.data
+        return body + crc16(body).to_bytes(2, "little")
+
+
+@dataclasses.dataclass
+class ParserCounts:
+    """What a parser has seen."""
+
+    received: int = 0  # bytes
+    frames: int = 0  # accepted
+    crc_errors: int = 0  # believable headers with a wrong checksum
+    resyncs: int = 0  # times that bytes had to be skipped to find a frame
+    skipped: int = 0  # bytes that belong to no accepted frame
+    checked: int = 0  # bytes that went through the checksum
+
+
+class Parser:
+    """Frames out of a stream of bytes, whatever happens to the stream.
+
+    A header is believed only with a known command and a length that this command can have; the
+    checksum decides. When it fails, the search goes on one byte after that header, so no frame
+    that lies intact in the stream is lost. A false header delays what follows by at most one frame.
+
+    Memory is bounded by one frame and one chunk. Each byte is searched once for the head, and goes
+    through the checksum at most once for each believable header in the longest frame before it.
+
+    Args:
+      lengths: possible data lengths of each command, `HAND_REPLIES` or `HOST_REQUESTS`.
+    """
+
+    def __init__(self, lengths: Mapping[int, range]):
+        self._lengths = {int(command): span for command, span in lengths.items()}
+        self._buffer = bytearray()
+        self._searching = False  # between the last accepted frame and the next
+        self.counts = ParserCounts()
+
+    def feed(self, data: bytes) -> list[Frame]:
+        """Take bytes as they arrive; returns the frames that they complete."""
+        self.counts.received += len(data)
+        self._buffer += data
+        return self._scan(final=False)
+
+    def expire(self) -> list[Frame]:
+        """The line has gone silent: what waits is no frame, but a frame may lie within it."""
+        return self._scan(final=True)
+
+    @property
+    def pending(self) -> int:
+        """Bytes that wait for the rest of their frame."""
+        return len(self._buffer)
+
+    def _scan(self, final: bool) -> list[Frame]:
+        buffer, frames, at, kept = self._buffer, [], 0, 0
+        while True:
+            found = buffer.find(HEAD, at)
+            if found < 0:
+                # The last byte may be the first half of a head.
+                at = len(buffer) - (not final and buffer.endswith(HEAD[:1]) and len(buffer) > at)
+                break
+            at = found
+            end = self._frame_end(at)
+            if end is None:
+                at += 1
+            elif end > len(buffer):
+                if not final:
+                    break
+                at += 1
+            elif self._sound(at, end):
+                self._skip(at - kept)
+                _, source, target, command, size = HEADER.unpack_from(buffer, at)
+                data = bytes(buffer[at + HEADER.size : at + HEADER.size + size])
+                frames.append(Frame(source, target, command, data))
+                self.counts.frames += 1
+                self._searching = False
+                at = kept = end
+            else:
+                self.counts.crc_errors += 1
+                at += 1
+        self._skip(at - kept)
+        del buffer[:at]
+        return frames
+
+    def _frame_end(self, at: int) -> int | None:
+        """Where the frame whose head is here ends, as far as its header has arrived.
+
+        None: no such frame exists.
+        """
+        buffer = self._buffer
+        if len(buffer) < at + HEADER.size:
+            return at + OVERHEAD
+        _, _, _, command, size = HEADER.unpack_from(buffer, at)
+        span = self._lengths.get(command)
+        return at + OVERHEAD + size if span is not None and size in span else None
+
+    def _sound(self, at: int, end: int) -> bool:
+        self.counts.checked += end - at
+        with memoryview(self._buffer) as view:
+            return crc16(view[at : end - 2]) == int.from_bytes(view[end - 2 : end], "little")
+
+    def _skip(self, count: int) -> None:
+        if count:
+            self.counts.resyncs += not self._searching
+            self.counts.skipped += count
+            self._searching = True
+
+
+def command_block(
+    position: np.ndarray,
+    *,
+    kp: np.ndarray | int,
+    ki: np.ndarray | int,
+    kd: np.ndarray | int,
+    torque_max: np.ndarray | int,
+    mode: np.ndarray | int = Mode.POSITION,
+) -> np.ndarray:
+    """Joint commands, `COMMAND_BLOCK`: angles [12] rad, gains in the firmware's units, current
+    limit in mA; scalars hold for all joints."""
+    block = np.zeros((), COMMAND_BLOCK)
+    block["id"] = np.arange(JOINTS)
+    for name, value in (
+        ("position", position),
+        ("kp", kp),
+        ("ki", ki),
+        ("kd", kd),
+        ("torque_max", torque_max),
+        ("mode", mode),
+    ):
+        block[name] = value
+    return block
+
+
+def empty_state() -> np.ndarray:
+    """A `STATE_BLOCK` of zeros with its ids filled in."""
+    block = np.zeros((), STATE_BLOCK)
+    block["joint"]["id"] = np.arange(JOINTS)
+    block["joint"]["sensor_id"][list(TIP_JOINTS)] = TIP_IDS
+    return block
+
+
+def decode_command(data: bytes) -> np.ndarray:
+    """Joint commands [12] from the data of a host's `EXCHANGE`.
+
+    Raises:
+      FrameError: wrong size, or ids that are not 0 to 11.
+    """
+    return _decode(data, COMMAND_BLOCK, "command", lambda block: block["id"])
+
+
+def decode_state(data: bytes) -> np.ndarray:
+    """The state from the data of a hand's `EXCHANGE`.
+
+    Raises:
+      FrameError: wrong size, or joint ids that are not 0 to 11.
+    """
+    return _decode(data, STATE_BLOCK, "state", lambda block: block["joint"]["id"])
+
+
+def _decode(data: bytes, dtype: np.dtype, what: str, ids) -> np.ndarray:
+    if len(data) != dtype.itemsize:
+        raise FrameError(f"{what} block of {len(data)} bytes, expected {dtype.itemsize}")
+    block = np.frombuffer(data, dtype.base).reshape(dtype.shape).copy()
+    if not np.array_equal(ids(block), np.arange(JOINTS)):
+        raise FrameError(f"{what} block with joint ids {ids(block).tolist()}")
+    return block

@@ -1,0 +1,259 @@
+"""The hand behind a serial port: one request, one answer, a deadline, and a count of everything.
+
+`SerialHand` speaks `dexsim_real.wire.frames` over pyserial, to a USB adapter or to a pseudo-terminal.
+Whatever else can move a hand (a vendor's SDK that the user has installed) needs only `HandPort`'s few
+methods; see `open_port`.
+"""
+
+import contextlib
+import importlib
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from dexsim_real.core.errors import HandError, explain, latency_warnings
+from dexsim_real.wire import frames
+from dexsim_real.wire.frames import Command, Frame, Mode
+from dexsim_real.wire.link import HandPort, LinkConfig, LinkCounts, Reply
+
+_POLL = 0.002  # s, longest wait of one read
+_WRITE = 0.5  # s, longest write; also what this program may be held up in one before the port counts as failed
+_QUIET = 0.006  # s without a byte, after which nothing more of a frame will come
+
+_LONGEST = frames.OVERHEAD + frames.STATE_BLOCK.itemsize  # bytes of the longest answer
+
+
+def passive_command() -> np.ndarray:
+    """Joint commands that leave all motors off."""
+    return frames.command_block(np.zeros(frames.JOINTS), kp=0, ki=0, kd=0, torque_max=0, mode=Mode.PASSIVE)
+
+
+class SerialHand:
+    """`HandPort` over a serial port.
+
+    Args:
+      port: device, by-id link, pseudo-terminal or pyserial URL.
+      tap: called with ("tx" or "rx", bytes) for every frame, from the thread that exchanges.
+    """
+
+    def __init__(self, port: str, config: LinkConfig | None = None, *, tap: Callable[[str, bytes], None] | None = None):
+        self.port, self.config = port, config or LinkConfig()
+        self.counts = LinkCounts()
+        self._tap = tap or (lambda direction, data: None)
+        self._serial: Any = None
+        self._parser = frames.Parser(frames.HAND_REPLIES)
+        self._received = 0  # bytes since the port was opened, without late answers
+        self._generation = 0
+        self._first: Reply | None = None
+        self._retry_at, self._pause = 0.0, self.config.backoff[0]
+
+    def connect(self) -> str:
+        self._open()
+        try:
+            time.sleep(self.config.settle)
+            version = self._greet(self.config.handshake)
+        except HandError:
+            self.close()
+            raise
+        except OSError as error:
+            self.close()
+            raise HandError(f"{self.port}: failed while greeting the hand ({error})") from None
+        return f"{self.port}: hand {self.config.hand_id}, firmware {version}"
+
+    def exchange(self, command: np.ndarray) -> Reply | None:
+        if self._serial is None:
+            return self._reconnect()
+        try:
+            return self._exchange(command)
+        except OSError:  # pyserial's errors are.
+            self.close()
+            self._pause = self.config.backoff[0]
+            self._retry_at = time.monotonic() + self._pause
+            return None
+
+    def close(self) -> None:
+        if self._serial is not None:
+            with contextlib.suppress(OSError):
+                self._serial.close()
+            self._serial = None
+
+    def warnings(self) -> list[str]:
+        """What slows this port down, with the remedy."""
+        return latency_warnings(self.port)
+
+    # --- one exchange ---------------------------------------------------------------------
+
+    def _exchange(self, command: np.ndarray) -> Reply | None:
+        data = command.tobytes()
+        frame, sent = self._request(Command.EXCHANGE, data, frames.STATE_BLOCK.itemsize)
+        if frame is None:
+            return None
+        try:
+            state = frames.decode_state(frame.data)
+        except frames.FrameError:
+            self.counts.answered -= 1
+            self.counts.corrupt += 1
+            return None
+        return Reply(state, sent, time.monotonic(), self.counts.sent, self._generation)
+
+    def _request(self, command: Command, data: bytes, reply: int) -> tuple[Frame | None, float]:
+        """Send and wait for the answer to this command; and when it was sent."""
+        request = Frame(frames.HOST, frames.palm_address(self.config.hand_id), command, data).encode()
+        self.counts.sent += 1
+        try:
+            self._discard()
+            self._tap("tx", request)
+            sent, before = time.monotonic(), self._received
+            self._serial.write(request)
+            answer = self._wait(command, sent, len(request), frames.OVERHEAD + reply)
+        except OSError:
+            self.counts.lost += 1
+            raise
+        finally:
+            self.counts.crc_errors = self._parser.counts.crc_errors
+            self.counts.resyncs = self._parser.counts.resyncs
+        if answer is None:
+            self.counts.corrupt += self._received > before
+            self.counts.silent += self._received == before
+        elif answer.command == Command.ERROR:
+            self.counts.refused += 1
+            answer = None
+        else:
+            self.counts.answered += 1
+        return answer, sent
+
+    def _wait(self, command: Command, sent: float, request: int, reply: int) -> Frame | None:
+        """The answer. At the deadline a frame that is on its way may still arrive: on a line of two
+        wires nobody else could speak meanwhile."""
+        deadline = sent + self.config.deadline(request, reply)
+        answer, final, heard = None, False, sent
+        while answer is None and not final:
+            data, now = self._read(), time.monotonic()
+            heard = now if data else heard
+            final = now > deadline and (now - heard > _QUIET or now > deadline + self.config.on_wire(_LONGEST))
+            for frame in self._parser.feed(data) + (self._parser.expire() if final else []):
+                self._tap("rx", frame.encode())
+                size = frames.OVERHEAD + len(frame.data)
+                possible = not self.config.paced or now - sent >= self.config.on_wire(request + size)
+                if possible and frame.command in (command, Command.ERROR):
+                    self.counts.late += answer is not None  # Of two the newer is the answer.
+                    answer = frame
+                else:
+                    self.counts.late += 1  # It answers something that was given up.
+                    self._received -= size
+        return answer
+
+    def _read(self) -> bytes:
+        data = self._serial.read(1)
+        if data:
+            data += self._serial.read(self._serial.in_waiting)
+        self._received += len(data)
+        return data
+
+    def _discard(self) -> None:
+        """Throw away what came too late, to its end: it must not pass for the next answer."""
+        found, until = [], time.monotonic() + self.config.on_wire(_LONGEST) + _QUIET
+        while (self._serial.in_waiting or self._parser.pending) and time.monotonic() < until:
+            found += self._parser.feed(self._read())
+        found += self._parser.expire()
+        self.counts.late += len(found)
+
+    # --- opening and reopening --------------------------------------------------------------
+
+    def _open(self) -> None:
+        try:
+            import serial
+        except ImportError:
+            raise HandError("pyserial is missing: pip install 'dexsim[real]'") from None
+        self.close()
+        local = "://" not in self.port
+        try:
+            options = {"exclusive": True} if local else {}
+            self._serial = serial.serial_for_url(
+                self.port, baudrate=self.config.baud, timeout=_POLL, write_timeout=_WRITE, **options
+            )
+        except (OSError, ValueError) as error:
+            raise HandError(explain(self.port, error)) from None
+        if local:
+            # Only real adapters have it. The FTDI driver then sets its latency timer to 1 ms.
+            with contextlib.suppress(OSError, ValueError, AttributeError, NotImplementedError):
+                self._serial.set_low_latency_mode(True)
+        self._parser = frames.Parser(frames.HAND_REPLIES)
+        self._parser.counts.crc_errors = self.counts.crc_errors
+        self._parser.counts.resyncs = self.counts.resyncs
+        self._received = 0
+
+    def _greet(self, patience: float) -> str:
+        """Ask for the version and for one passive state; the version may stay unknown."""
+        until, version = time.monotonic() + patience, "unknown"
+        self._generation += 1
+        while True:
+            frame, _ = self._request(Command.VERSION, b"", 64)
+            if frame is not None:
+                version = _printable(frame.data)
+            self._first = self._exchange(passive_command())
+            if self._first is not None:
+                return version
+            if time.monotonic() > until:
+                raise HandError(self._silence())
+
+    def _silence(self) -> str:
+        if not self._received:
+            return (
+                f"{self.port}: no answer. Is the hand powered, are A and B of RS485 swapped, is its "
+                f"id {self.config.hand_id}?"
+            )
+        if self.counts.late:
+            return (
+                f"{self.port}: answers come sooner than {self.config.baud} baud allow; if this line is emulated "
+                "and has no pace, say --link.no-paced"
+            )
+        if not self._parser.counts.frames and not self._parser.counts.crc_errors:
+            return (
+                f"{self.port}: {self._received} bytes came and none make a frame: is the hand set to "
+                f"{self.config.baud} baud?"
+            )
+        return (
+            f"{self.port}: the hand answers, but not with a sound state ({self.counts.crc_errors} "
+            f"wrong checksums, {self.counts.refused} refusals): check cable and termination"
+        )
+
+    def _reconnect(self) -> Reply | None:
+        if time.monotonic() < self._retry_at:
+            time.sleep(_POLL)
+            return None
+        try:
+            self._open()
+            self._greet(0.0)
+        except (HandError, OSError):
+            self.close()
+            self._pause = min(2 * self._pause, self.config.backoff[1])
+            self._retry_at = time.monotonic() + self._pause
+            return None
+        self.counts.reconnects += 1
+        return self._first
+
+
+def open_port(spec: str, config: LinkConfig, tap: Callable[[str, bytes], None] | None = None) -> HandPort:
+    """A hand by its name: a serial port, or `sdk:MODULE:FUNCTION`.
+
+    The function is the user's own, and gives a `HandPort` that drives a vendor's SDK; it is called
+    with the `LinkConfig`.
+
+    Raises:
+      HandError: the module or function cannot be found.
+    """
+    if not spec.startswith("sdk:"):
+        return SerialHand(spec, config, tap=tap)
+    module, _, function = spec.removeprefix("sdk:").partition(":")
+    try:
+        return getattr(importlib.import_module(module), function or "open_hand")(config)
+    except (ImportError, AttributeError) as error:
+        raise HandError(f"{spec}: {error}") from None
+
+
+def _printable(data: bytes) -> str:
+    text = data.rstrip(b"\x00").decode("ascii", "replace")
+    return text if text.isprintable() and text else data.hex(" ")

@@ -1,0 +1,55 @@
+"""Trials through the bytes: the emulated hand and the runner as processes of their own, one short trial."""
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+from paths import ROOT
+
+pytest.importorskip("serial")
+
+
+@pytest.mark.slow
+def test_one_short_trial_through_the_bytes(tmp_path):
+    """A grasp at full command: the hand that is emulated is the judge of it."""
+    path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH", "")]))
+    done = subprocess.run(
+        [
+            sys.executable,
+            "benchmarks/trials.py",
+            "--task",
+            "grasp",
+            "--first",
+            "4",
+            "--trials",
+            "1",
+            "--seconds",
+            "1.5",
+            "--draw",
+            "nominal",
+            "--no-realtime",
+            "--json",
+            str(tmp_path / "trials.json"),
+            "--runner",
+            "--safety.stale 1 --link.margin 0.2 --approach 1 --link.settle 0",
+        ],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        timeout=240,
+    )
+    assert done.returncode == 0, done.stderr
+    result = json.loads((tmp_path / "trials.json").read_text())
+    (trial,) = result["trials"]
+    assert (trial["task"], trial["command"], trial["shape"], trial["trial"]) == ("grasp", 1.0, "sphere", 4)
+    # It ended by the referee's rules, and within the commands' limits as the other end saw them.
+    assert trial["end"] == "time limit" or trial["end"].startswith("dropped")
+    assert trial["seconds"] <= 1.5 + 1e-6 and trial["bridge"]["outside_limits"] == 0
+    assert trial["bridge"]["exchanges"] > 100
+    assert result["metrics"]["held"]["mean"] == float(trial["held"])
+    lines = done.stdout.splitlines()
+    assert "1 trials through the bytes" in lines[0] and "emulated hand" in lines[1] and "simulation" in lines[1]
+    assert any(line.startswith("held") for line in lines) and "command 1.00 sphere" in done.stderr

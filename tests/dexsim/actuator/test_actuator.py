@@ -1,0 +1,311 @@
+"""The joint drive against a plain-Python reference, closed forms and C MuJoCo."""
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from dexsim.actuator import drive as actuator
+from dexsim.actuator.drive import Actuator, apply_friction, delayed_target
+
+joint_torque = jax.jit(actuator.joint_torque)
+drive = jax.jit(actuator.drive)
+
+
+def reference(kp, kd, band, stall, top_speed, efficiency, target, target_velocity, position, velocity):
+    """The four equations one joint at a time, in double precision."""
+    error = target - position
+    if -band < error < band:
+        wanted = 0.0
+    else:
+        wanted = kp * error + kd * (target_velocity - velocity)
+    share = math.fabs(velocity) / top_speed
+    available = 0.0 if share >= 1.0 else stall * (1.0 - share)
+    if math.fabs(wanted) > available:
+        wanted = math.copysign(available, wanted)
+    return efficiency * wanted
+
+
+def random_drives(count, seed=0):
+    rng = np.random.default_rng(seed)
+    drives = Actuator(
+        stiffness=rng.uniform(0.1, 10, count),
+        damping=rng.uniform(0, 0.5, count),
+        dead_band=rng.uniform(0, 0.05, count),
+        stall_torque=rng.uniform(0.3, 1.2, count),
+        no_load_speed=rng.uniform(8, 15, count),
+        efficiency=rng.uniform(0.7, 1.0, count),
+    )
+    state = (
+        rng.uniform(-0.3, 0.3, count),
+        rng.uniform(-1, 1, count),
+        rng.uniform(-0.3, 0.3, count),
+        rng.uniform(-20, 20, count) * rng.uniform(0, 1, count) ** 2,
+    )
+    cast = lambda x: np.asarray(x, np.float32)  # noqa: E731
+    return jax.tree.map(cast, drives), tuple(cast(x) for x in state)
+
+
+EXTRAS = ("ripple", "ripple_count", "ripple_phase", "encoder_bias", "coulomb_friction", "viscous_friction")
+
+
+def with_extras(drives, value):
+    return dataclasses.replace(drives, **dict.fromkeys(EXTRAS, value))
+
+
+def motor(**changes):
+    values = dict(stiffness=3.0, damping=0.1, dead_band=0.0, stall_torque=1.1, no_load_speed=8.63, efficiency=1.0)
+    return Actuator(**{name: jnp.float32(value) for name, value in {**values, **changes}.items()})
+
+
+def test_ten_thousand_random_drives():
+    drives, state = random_drives(10_000)
+    ours = np.asarray(drive(drives, *state))
+    leaves = [getattr(drives, f.name) for f in dataclasses.fields(drives)[:6]]
+    wanted = np.array([reference(*map(float, row)) for row in zip(*leaves, *state, strict=True)])
+    np.testing.assert_allclose(ours, wanted, rtol=1e-5, atol=1e-6)
+    # All regimes occur: within the band, free, and held by the envelope on either side, beyond the no-load speed.
+    limit = drives.stall_torque * np.maximum(1 - np.abs(state[3]) / drives.no_load_speed, 0)
+    held = np.isclose(np.abs(wanted), drives.efficiency * limit, rtol=1e-6) & (limit > 0)
+    regimes = [
+        np.abs(state[0] - state[2]) < drives.dead_band,
+        ~held & (wanted != 0),
+        held & (wanted > 0),
+        held & (wanted < 0),
+        limit == 0,
+    ]
+    assert all(regime.sum() > 200 for regime in regimes)
+
+
+@pytest.mark.parametrize("push", [1, -1])
+@pytest.mark.parametrize("turn", [1, -1])
+def test_four_quadrants(push, turn):
+    """Driving and braking alike are held to tau_0 (1 - |qd| / qd_max), with the sign of what is asked for."""
+    velocity = turn * 8.63 / 4
+    torque = joint_torque(motor(), push * 10.0, 0.0, 0.0, velocity)
+    assert float(torque) == pytest.approx(push * 1.1 * 0.75, rel=1e-6)
+
+
+@pytest.mark.parametrize("velocity", [8.63, 8.64, 20.0, 1e6])
+def test_no_torque_from_the_no_load_speed_on(velocity):
+    for sign in (1, -1):
+        assert float(joint_torque(motor(), 10.0, 0.0, 0.0, sign * velocity)) == 0
+        assert float(joint_torque(motor(), -10.0, 0.0, 0.0, sign * velocity)) == 0
+
+
+def test_the_edges_of_the_dead_band():
+    """|error| < epsilon is dead, |error| = epsilon is not; on exact binary fractions."""
+    sticky = motor(dead_band=0.125, damping=0.0)
+    just_below = np.nextafter(np.float32(0.125), np.float32(0))
+    for sign in (1, -1):
+        assert float(joint_torque(sticky, sign * 0.125, 0.0, 0.0, 0.0)) == pytest.approx(sign * 0.375)
+        assert float(joint_torque(sticky, sign * just_below, 0.0, 0.0, 0.0)) == 0
+    # The whole PD law is cut off, damping too.
+    assert float(joint_torque(motor(dead_band=0.125), 0.1, 0.0, 0.0, 3.0)) == 0
+    # No band: nothing is cut off, not even at zero error.
+    assert float(joint_torque(motor(), 0.0, 0.0, 0.0, 3.0)) == pytest.approx(-0.3)
+
+
+def test_efficiency_comes_after_the_limit():
+    assert float(joint_torque(motor(efficiency=0.5), 10.0, 0.0, 0.0, 0.0)) == pytest.approx(0.55)
+    assert float(joint_torque(motor(efficiency=0.5), 0.1, 0.0, 0.0, 0.0)) == pytest.approx(0.15)
+
+
+def test_target_velocity_enters_the_damping():
+    assert float(joint_torque(motor(), 0.0, 2.0, 0.0, 0.5)) == pytest.approx(0.1 * 1.5)
+
+
+def test_vmapped_drive_is_the_scalar_one():
+    drives, state = random_drives(32, seed=1)
+    together = np.asarray(drive(drives, *state))
+    for row in range(32):
+        alone = joint_torque(jax.tree.map(lambda x, row=row: x[row], drives), *(x[row] for x in state))
+        assert float(alone) == together[row]
+
+
+# --- latency -------------------------------------------------------------------------------------
+
+
+def test_delay_is_exact_to_the_substep():
+    previous, target = jnp.full(12, -1.0), jnp.arange(12.0)
+    for latency in range(8):
+        for substep in range(6):
+            acts = delayed_target(jnp.int32(substep), jnp.int32(latency), previous, target)
+            np.testing.assert_array_equal(acts, previous if substep < latency else target)
+
+
+def test_delay_within_a_scan_of_substeps():
+    """The sub-step at which the target starts to act, seen from inside a tick, for each environment of a batch."""
+
+    def tick(latency):
+        return jax.lax.scan(
+            lambda carry, k: (carry, delayed_target(k, latency, jnp.zeros(2), jnp.ones(2))), 0, jnp.arange(6)
+        )[1]
+
+    seen = jax.jit(jax.vmap(tick))(jnp.arange(7))
+    np.testing.assert_array_equal(seen[..., 0].sum(1), [6, 5, 4, 3, 2, 1, 0])
+    np.testing.assert_array_equal(np.argmax(seen[:6, :, 0], 1), np.arange(6))
+
+
+def test_delay_of_each_joint_by_itself():
+    previous, target, latency = jnp.full(12, -1.0), jnp.arange(12.0), jnp.arange(12) % 7
+    for substep in range(6):
+        acts = delayed_target(jnp.int32(substep), latency, previous, target)
+        np.testing.assert_array_equal(acts, np.where(substep < np.arange(12) % 7, -1.0, np.arange(12.0)))
+
+
+# --- ripple, encoder, friction ----------------------------------------------------------------------
+
+
+def test_parameters_that_are_zero_change_no_bit():
+    """What is not modelled and what is modelled with 0 give the same numbers, friction included."""
+    drives, state = random_drives(10_000, seed=2)
+    zeros = with_extras(drives, np.zeros(10_000, np.float32))
+    plain = np.asarray(drive(drives, *state))
+    np.testing.assert_array_equal(drive(zeros, *state), plain)
+    rate = np.float32(0.2)
+
+    @jax.jit
+    def net(drives, *state):
+        torque = actuator.drive(drives, *state)
+        return apply_friction(drives, torque, state[3], rate)
+
+    np.testing.assert_array_equal(net(zeros, *state), plain)
+    np.testing.assert_array_equal(net(drives, *state), plain)
+
+
+def test_ripple_is_a_wave_over_the_angle():
+    """Twenty waves a radian, of 5 % of the torque, whatever the torque; envelope and all."""
+    wavy = motor(ripple=0.05, ripple_count=20.0, ripple_phase=0.4)
+    position = np.linspace(0, 2, 400).astype(np.float32)
+    for target in (0.1, 5.0):
+        at = position + np.float32(target)
+        bare = joint_torque(motor(), at, 0.0, position, 1.0)
+        share = np.asarray(joint_torque(wavy, at, 0.0, position, 1.0)) / np.asarray(bare)
+        np.testing.assert_allclose(share, 1 + 0.05 * np.sin(20 * position + 0.4), atol=2e-6)
+
+
+def test_the_loop_sees_the_encoder():
+    """With a bias the joint comes to rest where the reading, not the joint, is at its target."""
+    biased = motor(encoder_bias=0.25, dead_band=0.125, damping=0.0)
+    assert float(joint_torque(biased, 1.0, 0.0, 0.75, 0.0)) == 0
+    assert float(joint_torque(biased, 1.0, 0.0, 1.0, 0.0)) == pytest.approx(-3 * 0.25)
+    assert float(joint_torque(biased, 1.0, 0.0, 0.5, 0.0)) == pytest.approx(3 * 0.25)
+    assert float(joint_torque(biased, 1.0, 0.0, 0.6875, 0.0)) == 0  # within the band of the reading
+
+
+def slide(torque, *, coulomb=0.0, viscous=0.0, inertia=1e-3, timestep=1e-3, velocity=0.0, steps=1000):
+    """Velocities of a joint with nothing but friction, semi-implicit as the physics."""
+    rubbing = motor(coulomb_friction=coulomb, viscous_friction=viscous)
+    wanted = jnp.broadcast_to(jnp.asarray(torque, jnp.float32), (steps,))
+
+    def body(speed, tau):
+        net = apply_friction(rubbing, tau, speed, inertia / timestep)
+        speed = speed + timestep / inertia * net
+        return speed, speed
+
+    return np.asarray(jax.lax.scan(body, jnp.float32(velocity), wanted)[1])
+
+
+def test_coulomb_friction_stops_in_time_and_holds():
+    """v(t) = v0 - c t / I, exactly 0 from v0 I / c on; held up to c, let go beyond."""
+    for sign in (1, -1):
+        speed = slide(0.0, coulomb=0.02, velocity=sign * 4.0)
+        times = 1e-3 * np.arange(1, 1001)
+        np.testing.assert_allclose(speed, sign * np.maximum(4.0 - 20.0 * times, 0), atol=2e-4)
+        assert np.all(speed[201:] == 0)
+        assert np.all(slide(sign * 0.0199, coulomb=0.02) == 0)
+        np.testing.assert_allclose(slide(sign * 0.03, coulomb=0.02)[-1], sign * 10.0, rtol=1e-4)
+
+
+def test_viscous_friction_settles_at_torque_over_b():
+    speed = slide(0.03, coulomb=0.01, viscous=0.02, steps=2000)
+    np.testing.assert_allclose(speed[-1], (0.03 - 0.01) / 0.02, rtol=1e-5)
+    times = 1e-3 * np.arange(1, 2001)  # backward Euler of v' = (tau - c - b v) / I
+    np.testing.assert_allclose(speed, 1 - (1 + 1e-3 * 0.02 / 1e-3) ** -np.arange(1, 2001), atol=1e-4)
+    np.testing.assert_allclose(speed, 1 - np.exp(-0.02 / 1e-3 * times), atol=0.01)
+
+
+@pytest.mark.parametrize("viscous", [1.0, 1e3])
+def test_no_friction_is_too_much_for_the_time_step(viscous):
+    speed = slide(0.0, coulomb=1.0, viscous=viscous, velocity=5.0, steps=50, timestep=0.005)
+    assert np.all(speed >= 0) and speed[-1] == 0
+    speed = slide(0.0, viscous=viscous, velocity=5.0, steps=50, timestep=0.005)
+    assert np.all(np.diff(speed) <= 0) and np.all(speed >= 0)
+
+
+def c_hinge(coulomb, viscous, torque, timestep=5e-4):
+    """Angles and speeds of a hinge with frictionloss and damping in C MuJoCo."""
+    model = mujoco.MjModel.from_xml_string(f"""<mujoco>
+      <option timestep="{timestep}" integrator="Euler" gravity="0 0 0" iterations="100" tolerance="1e-12"/>
+      <worldbody><body><joint type="hinge" axis="0 0 1" armature="0.001" frictionloss="{coulomb}" damping="{viscous}"
+        solreffriction="{2.1 * timestep} 1" solimpfriction="0.9999 0.9999 0.001"/>
+      <inertial mass="0.001" pos="0 0 0" diaginertia="1e-9 1e-9 1e-9"/></body></worldbody></mujoco>""")
+    data, track = mujoco.MjData(model), []
+    for tau in torque:
+        data.qfrc_applied[0] = tau
+        mujoco.mj_step(model, data)
+        track.append((data.qpos[0], data.qvel[0]))
+    return np.array(track)
+
+
+@pytest.mark.parametrize(("coulomb", "viscous"), [(0.02, 0.0), (0.0, 0.01), (0.02, 0.005)])
+def test_friction_is_c_mujocos(coulomb, viscous):
+    """A second of a torque that pushes, holds still below the friction, and reverses."""
+    times = 5e-4 * np.arange(2000)
+    torque = 0.05 * np.sin(2 * np.pi * 2.3 * times) * (1 + 0.4 * np.sin(2 * np.pi * 0.7 * times))
+    reference = c_hinge(coulomb, viscous, torque)
+    speed = slide(torque, coulomb=coulomb, viscous=viscous, timestep=5e-4, steps=2000)
+    assert np.max(np.abs(reference[:, 1])) > 2
+    np.testing.assert_allclose(speed, reference[:, 1], atol=0.01)
+    np.testing.assert_allclose(np.cumsum(speed) * 5e-4, reference[:, 0], atol=2e-3)
+    if coulomb:
+        assert np.mean(speed == 0) > 0.02
+
+
+# --- every parameter is a leaf -------------------------------------------------------------------
+
+
+def test_every_parameter_is_a_leaf_and_none_is_none():
+    drives, _ = random_drives(12)
+    leaves = jax.tree.leaves(drives)
+    assert len(leaves) == 6
+    assert len(jax.tree.leaves(with_extras(drives, np.zeros(12)))) == len(dataclasses.fields(Actuator)) == 12
+    assert all(leaf.shape == (12,) for leaf in leaves)
+    doubled = jax.tree.map(lambda x: 2 * x, drives)
+    np.testing.assert_array_equal(doubled.efficiency, 2 * drives.efficiency)
+
+
+def gradient(drive, *state):
+    return jax.jit(jax.grad(actuator.joint_torque))(drive, *(jnp.float32(x) for x in state))
+
+
+def test_gradients_where_the_motor_is_free():
+    """tau = eta (kp e - kd qd): e = 0.1, qd = 1."""
+    slope = gradient(motor(efficiency=0.9), 0.1, 0.0, 0.0, 1.0)
+    assert float(slope.stiffness) == pytest.approx(0.9 * 0.1, rel=1e-5)
+    assert float(slope.damping) == pytest.approx(-0.9, rel=1e-5)
+    assert float(slope.efficiency) == pytest.approx(3 * 0.1 - 0.1, rel=1e-5)
+    assert float(slope.stall_torque) == float(slope.no_load_speed) == float(slope.dead_band) == 0
+
+
+def test_gradients_where_the_envelope_holds():
+    """tau = eta tau_0 (1 - qd / qd_max): qd = 2."""
+    slope = gradient(motor(efficiency=0.9), 2.0, 0.0, 0.0, 2.0)
+    assert float(slope.stall_torque) == pytest.approx(0.9 * (1 - 2 / 8.63), rel=1e-5)
+    assert float(slope.no_load_speed) == pytest.approx(0.9 * 1.1 * 2 / 8.63**2, rel=1e-5)
+    assert float(slope.efficiency) == pytest.approx(1.1 * (1 - 2 / 8.63), rel=1e-5)
+    assert float(slope.stiffness) == float(slope.damping) == 0
+
+
+def test_gradients_are_finite_in_the_band_and_beyond_the_no_load_speed():
+    for drives, state in (
+        (motor(dead_band=0.1), (0.0, 0.0, 0.0, 0.0)),
+        (motor(), (1.0, 0.0, 0.0, 9.0)),
+        (motor(), (1.0, 0.0, 0.0, 8.63)),
+    ):
+        assert all(np.isfinite(leaf) for leaf in jax.tree.leaves(gradient(drives, *state)))

@@ -1,0 +1,97 @@
+"""The motor current of the simulated hand, against its equations written down for each quadrant."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dexsim.actuator.current import Motor, motor_current, read_current, torque_from_current
+from dexsim.calibration.virtual_press import press
+
+MOTOR = Motor(torque_constant=0.5, efficiency=0.8, back_efficiency=0.6, no_load_current=0.03)
+
+
+@pytest.mark.parametrize(
+    ("torque", "velocity", "current"),
+    [
+        (0.2, 1.0, 0.2 / 0.5 / 0.8 + 0.03),  # motoring forwards
+        (-0.2, -1.0, -0.2 / 0.5 / 0.8 - 0.03),  # motoring backwards
+        (0.2, -1.0, 0.2 / 0.5 * 0.6 - 0.03),  # driven back
+        (-0.2, 1.0, -0.2 / 0.5 * 0.6 + 0.03),
+        (0.2, 0.0, 0.4),
+        (0.0, 2.0, 0.03),
+        (0.0, 0.0, 0.0),
+    ],
+)
+def test_the_four_quadrants(torque, velocity, current):
+    assert float(motor_current(MOTOR, torque, velocity)) == pytest.approx(current, abs=1e-6)
+
+
+def test_an_ideal_motor_is_its_torque_constant():
+    torque = jnp.linspace(-1, 1, 9)
+    np.testing.assert_array_equal(motor_current(Motor(torque_constant=0.5), torque, 1.0), torque / 0.5)
+
+
+def test_no_power_comes_from_nowhere():
+    """Motoring: electrical power K i qd is at least the mechanical; driven back: less comes out."""
+    for torque, velocity in ((0.3, 2.0), (-0.3, -2.0), (0.3, -2.0), (-0.3, 2.0)):
+        electrical = 0.5 * float(motor_current(MOTOR, torque, velocity)) * velocity
+        assert electrical > torque * velocity
+
+
+def test_ripple_goes_round_with_the_joint():
+    motor = Motor(torque_constant=0.5, ripple=0.1, ripple_count=20.0, ripple_phase=0.3)
+    position = jnp.linspace(0, 2 * jnp.pi, 1001)
+    constant = 0.2 / np.asarray(motor_current(motor, 0.2, 0.0, position), float)
+    np.testing.assert_allclose(constant, 0.5 * (1 + 0.1 * np.sin(20 * np.asarray(position) + 0.3)), rtol=1e-4)
+
+
+def test_torque_comes_back_from_the_current():
+    rng = np.random.default_rng(0)
+    torque, velocity, position = rng.uniform(-1, 1, 500), rng.uniform(-2, 2, 500), rng.uniform(0, 1, 500)
+    motor = Motor(torque_constant=0.5, efficiency=0.8, back_efficiency=0.6, no_load_current=0.0, ripple=0.05)
+    current = motor_current(motor, torque, velocity, position)
+    np.testing.assert_allclose(torque_from_current(motor, current, velocity, position), torque, atol=1e-5)
+
+
+def test_the_reading_has_bias_noise_steps_and_an_end():
+    motor = Motor(torque_constant=0.5, bias=0.1, noise=0.02)
+    reading = np.asarray(read_current(jax.random.key(0), motor, jnp.zeros(20_000)))
+    assert reading.mean() == pytest.approx(0.1, abs=1e-3) and reading.std() == pytest.approx(0.02, rel=0.03)
+    steps = Motor(torque_constant=0.5, noise=0.02, resolution=0.005, limit=0.03)
+    reading = np.asarray(read_current(jax.random.key(0), steps, jnp.zeros(20_000)), float)
+    np.testing.assert_allclose(reading / 0.005, np.round(reading / 0.005), atol=1e-3)
+    assert np.abs(reading).max() == pytest.approx(0.03)
+    quiet = Motor(torque_constant=0.5)
+    assert float(read_current(jax.random.key(0), quiet, jnp.float32(0.123))) == pytest.approx(0.123, rel=1e-6)
+
+
+def test_a_press_is_a_triangle_of_force_and_the_motors_current():
+    data = press(
+        Motor(torque_constant=0.5, no_load_current=0.01),
+        jax.random.key(0),
+        lever=0.06,
+        peak=6.0,
+        cycles=2,
+        samples=400,
+        force_resolution=0.1,
+        force_limit=5.0,
+    )
+    assert data.force.max() == 5.0 and data.force.min() == 0.0
+    np.testing.assert_allclose(data.force * 10, np.round(data.force * 10), atol=1e-6)
+    rising = np.arange(400) % 200 < 100
+    exact = 6.0 * (1 - np.abs(2 * (np.arange(400) / 200 % 1) - 1))
+    np.testing.assert_allclose(data.value, exact * 0.06 / 0.5 + np.where(rising, 0.01, -0.01), atol=1e-6)
+
+
+def test_a_joint_that_presses_by_turning_back_draws_the_mirrored_current():
+    there, back = (press(MOTOR, jax.random.key(0), lever=lever) for lever in (0.06, -0.06))
+    np.testing.assert_allclose(back.value, -there.value, atol=1e-6)
+
+
+def test_gradients_reach_every_parameter():
+    slope = jax.grad(lambda m: motor_current(m, 0.2, 1.0, 0.1))(
+        Motor(*(jnp.float32(x) for x in (0.5, 0.8, 0.6, 0.03, 0.02, 20.0, 0.1, 0, 0, 0, 1)))
+    )
+    assert float(slope.torque_constant) < 0 and float(slope.efficiency) < 0 and float(slope.no_load_current) == 1
+    assert float(slope.ripple) != 0 and float(slope.back_efficiency) == 0

@@ -1,0 +1,490 @@
+"""Current to torque: robust lines against references, a motor of known truth, the file, refusals."""
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+import scipy.stats
+
+from dexsim.actuator.current import Motor
+from dexsim.calibration.fit import MIN_FORCE_RANGE, MIN_SAMPLES, Press, calibrate, find_direction, fit_joint
+from dexsim.calibration.maps import (
+    alignment,
+    current_from_counts,
+    joint_torque,
+    load_calibration,
+    normalise,
+    normalised_torque,
+    save_calibration,
+    taxel_force,
+)
+from dexsim.calibration.plot import plot_calibration
+from dexsim.calibration.press import lever_arms, simulated_press
+from dexsim.calibration.virtual_press import press
+from dexsim.core.errors import CalibrationError
+from dexsim.core.robust_line import fit_line, long_run, theil_sen
+
+# --- lines -----------------------------------------------------------------------------------
+
+
+def test_a_line_without_noise_is_found_exactly():
+    x = np.linspace(0, 8, 50)
+    line = fit_line(x, -0.03 * x + 0.2)
+    assert line.gain == pytest.approx(-0.03, rel=1e-12) and line.offset == pytest.approx(0.2, rel=1e-12)
+    assert line.r_squared == pytest.approx(1.0) and line.outliers == 0
+    assert np.ptp(line.gain_interval) < 1e-9
+
+
+def test_theil_sen_is_scipys():
+    rng = np.random.default_rng(0)
+    x = rng.uniform(0, 8, 120)
+    y = 0.05 * x + 0.3 + rng.standard_t(2, 120) * 0.02
+    offset, gain = theil_sen(x, y)
+    reference = scipy.stats.theilslopes(y, x)
+    # Ours leaves out pairs closer than a tenth of the range.
+    assert gain == pytest.approx(reference.slope, rel=0.01)
+    assert offset == pytest.approx(np.median(y - gain * x), abs=1e-12)
+
+
+def test_on_clean_data_it_is_least_squares_and_so_are_its_intervals():
+    rng = np.random.default_rng(1)
+    x = rng.uniform(0, 8, 4000)
+    y = 0.05 * x + 0.3 + 0.02 * rng.standard_normal(4000)
+    line, reference = fit_line(x, y), scipy.stats.linregress(x, y)
+    assert abs(line.gain - reference.slope) < 0.5 * reference.stderr
+    half = np.ptp(line.gain_interval) / 2
+    assert half == pytest.approx(1.96 * reference.stderr / math.sqrt(0.95), rel=0.08)  # 95 % efficiency
+    assert line.noise == pytest.approx(0.02, rel=0.05)
+    assert line.r_squared == pytest.approx(reference.rvalue**2, abs=0.005)
+    assert line.condition == pytest.approx(np.linalg.cond(np.stack([np.ones(4000), x / x.max()], 1)))
+
+
+def ar1(rng, count, rho):
+    white = rng.standard_normal(count) * math.sqrt(1 - rho**2)
+    series = np.empty(count)
+    series[0] = rng.standard_normal()
+    for t in range(1, count):
+        series[t] = rho * series[t - 1] + white[t]
+    return series
+
+
+@pytest.mark.parametrize(("rho", "least"), [(0.0, 0.92), (0.7, 0.9)])
+def test_intervals_hold_the_truth(rho, least):
+    """300 recordings of 400 samples; autocorrelation at a rising force is the hard case."""
+    rng, hits = np.random.default_rng(2), np.zeros(2)
+    x = np.linspace(0, 8, 400)
+    for _ in range(300):
+        y = 0.05 * x + 0.3 + 0.02 * ar1(rng, 400, rho)
+        line = fit_line(x, y)
+        hits += [
+            line.gain_interval[0] <= 0.05 <= line.gain_interval[1],
+            line.offset_interval[0] <= 0.3 <= line.offset_interval[1],
+        ]
+    assert np.all(hits / 300 >= least) and np.all(hits / 300 <= 0.985)
+
+
+def test_the_long_run_variance_of_an_ar1_series():
+    """Known: (1 + rho) / (1 - rho) times that of white noise."""
+    rng = np.random.default_rng(3)
+    series = np.array([ar1(rng, 4000, 0.5) for _ in range(20)])
+    found = np.mean([long_run(s[:, None])[0, 0] / 4000 for s in series])
+    assert found == pytest.approx(3.0, rel=0.12)
+
+
+@pytest.mark.parametrize("kind", ["random", "one-sided", "dropped"])
+def test_gain_within_two_percent_at_five_percent_outliers(kind):
+    """100 recordings each; outliers of up to 20 times the noise, all to one side, or reads of 0."""
+    rng, worst = np.random.default_rng(4), 0.0
+    x = np.linspace(0.5, 8, 300)
+    for _ in range(100):
+        y = 0.05 * x + 0.02 + 0.01 * rng.standard_normal(300)
+        bad = rng.permutation(300)[:15]
+        if kind == "dropped":
+            y[bad] = 0.0
+        else:
+            spike = rng.uniform(0.05, 0.2, 15)
+            y[bad] += spike if kind == "one-sided" else spike * rng.choice([-1, 1], 15)
+        worst = max(worst, abs(fit_line(x, y).gain / 0.05 - 1))
+    assert worst < 0.02
+
+
+# --- a motor of known truth --------------------------------------------------------------------
+
+MOTOR = Motor(
+    torque_constant=0.9,
+    efficiency=0.8,
+    back_efficiency=0.7,
+    no_load_current=0.02,
+    ripple=0.02,
+    ripple_count=300.0,
+    bias=0.004,
+    noise=0.004,
+    resolution=0.001,
+)
+LEVER = 0.06
+
+
+def recording(seed=0, motor=MOTOR, **options):
+    options = {"lever": LEVER, "force_noise": 0.03, **options}
+    return press(motor, jax.random.key(seed), **options)
+
+
+def test_both_lines_of_a_motor_with_losses():
+    """Loading: F lever / (K eta_f) + i0 + bias; unloading: F lever eta_b / K - i0 + bias."""
+    hits, runs = np.zeros(4), 60
+    for seed in range(runs):
+        phase = seed * 2.399963  # rad, the ripple's place at the start differs from day to day
+        fit = fit_joint(recording(seed, dataclasses.replace(MOTOR, ripple_phase=phase)), "A")
+        truth = {"loading": (LEVER / (0.9 * 0.8), 0.024), "unloading": (LEVER * 0.7 / 0.9, -0.016)}
+        for k, name in enumerate(truth):
+            line, (gain, offset) = getattr(fit, name), truth[name]
+            assert line.gain == pytest.approx(gain, rel=0.02)
+            hits[2 * k] += line.gain_interval[0] <= gain <= line.gain_interval[1]
+            hits[2 * k + 1] += line.offset_interval[0] <= offset <= line.offset_interval[1]
+        # Half the gap at the middle force: half of the difference of the lines there.
+        gap = 4.0 * (truth["loading"][0] - truth["unloading"][0]) / 2 + 0.02
+        assert fit.friction == pytest.approx(gap, rel=0.05)
+    assert np.all(hits >= 0.9 * runs), hits
+
+
+def calibrated(hand, motor=MOTOR, names=None, **options):
+    names = names or hand.joint_names
+    real = {name: recording(k, motor) for k, name in enumerate(names)}
+    ideal = Motor(torque_constant=1.0, noise=5e-4)  # torque read as a current at 1 Nm/A
+    sim = {name: recording(100 + k, ideal, force_noise=0.0) for k, name in enumerate(names)}
+    return calibrate(hand, real, sim, created="2026-01-01", **options), real, sim
+
+
+@pytest.fixture(scope="module")
+def fitted(hand):
+    return calibrated(hand)
+
+
+def test_run_time_torque_is_the_motors(hand, fitted):
+    """The current that a known motor draws while pressing comes back as the torque on the joint."""
+    calibration = fitted[0]
+    torque = np.linspace(0.02, 0.45, 12)
+    loading = torque / (0.9 * 0.8) + 0.024
+    unloading = torque * 0.7 / 0.9 - 0.016
+    np.testing.assert_allclose(joint_torque(calibration, loading, 1.0), torque, rtol=0.03, atol=0.004)
+    np.testing.assert_allclose(joint_torque(calibration, unloading, -1.0), torque, rtol=0.03, atol=0.004)
+    unknown = np.asarray(joint_torque(calibration, loading))
+    band = np.asarray(calibration.real.friction) * np.abs(
+        np.mean(calibration.sim.gain, 0) / np.mean(calibration.real.gain, 0)
+    )
+    assert np.all(np.abs(unknown - torque) < 2 * band + 0.005)
+    np.testing.assert_allclose(
+        normalised_torque(calibration, loading, 1.0),
+        joint_torque(calibration, loading, 1.0) / hand.torque_limit,
+        rtol=1e-5,
+    )
+
+
+def test_a_hand_that_counts_backwards(hand):
+    """Currents negative while closing, as the XHand's: torques positive all the same."""
+    calibration, real, sim = calibrated(hand)
+    turned = {name: Press(p.force, -p.value) for name, p in real.items()}
+    other = calibrate(hand, turned, sim, created="2026-01-01")
+    current = jnp.linspace(0.05, 0.6, 12)
+    np.testing.assert_allclose(joint_torque(other, -current), joint_torque(calibration, current), rtol=1e-4)
+    force, value = normalise(other.real, 0, turned["thumb_bend"].force, turned["thumb_bend"].value)
+    assert np.quantile(value, 0.99) > 0.9
+
+
+def test_maps_under_jit_and_vmap(fitted):
+    calibration = fitted[0]
+    current = jnp.asarray(np.random.default_rng(0).uniform(-0.5, 0.5, (7, 12)), jnp.float32)
+    plain = normalised_torque(calibration, current)
+    closed = jax.jit(lambda c: normalised_torque(calibration, c))(current)
+    passed = jax.jit(jax.vmap(normalised_torque, (None, 0)))(calibration, current)
+    np.testing.assert_allclose(closed, plain, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(passed, plain, rtol=1e-5, atol=1e-6)
+    slope = jax.grad(lambda c: joint_torque(calibration, c)[3])(current[0])
+    gain = np.mean(calibration.sim.gain, 0) / np.mean(calibration.real.gain, 0)
+    np.testing.assert_allclose(slope, np.where(np.arange(12) == 3, gain, 0), rtol=1e-5)
+    np.testing.assert_allclose(current_from_counts(calibration, jnp.array([250.0])), 0.25)
+
+
+def test_taxel_counts_become_newtons(hand, fitted):
+    calibration = dataclasses.replace(fitted[0], force_per_count=np.array([0.1, 0.2, 0.1, 0.1, 0.3]))
+    counts = np.arange(5)[:, None] + np.array([[-7, 0, 10]])
+    expected = np.maximum(counts * calibration.force_per_count[:, None], 0)
+    np.testing.assert_allclose(taxel_force(calibration, counts), expected, rtol=1e-6)
+
+
+def test_both_sides_are_normalised_to_the_unit_square(fitted):
+    calibration, real, sim = fitted
+    for joint, name in enumerate(calibration.joint_names):
+        for side, data in ((calibration.real, real), (calibration.sim, sim)):
+            force, value = normalise(side, joint, data[name].force, data[name].value)
+            assert force.max() == pytest.approx(1.0, abs=0.02) and value.max() == pytest.approx(1.0, abs=0.02)
+            assert force.min() >= 0 and value.min() > -0.1
+
+
+def test_alignment_tells_where_the_papers_maxima_mislead(hand):
+    """Pressed twice as hard in simulation: with proportional lines the maxima still align; with an
+    offset of a quarter of the maximum they do not, by that share."""
+    plain = Motor(torque_constant=1.0)
+    biased = Motor(torque_constant=1.0, bias=LEVER * 8.0 / 3)
+    names = hand.joint_names
+    sim = {n: recording(0, plain, peak=16.0, force_noise=0.0) for n in names}
+    for motor, ratio in ((plain, 1.0), (biased, 0.75)):
+        real = {n: recording(0, motor, force_noise=0.0) for n in names}
+        found = calibrate(hand, real, sim)
+        np.testing.assert_allclose(alignment(found), ratio, rtol=0.01)
+        assert any("maxima" in note for note in found.notes) == (ratio != 1.0)
+
+
+def test_joints_without_a_recording_take_their_class(hand):
+    some = ("thumb_bend", "thumb_rota2", "index_joint1", "index_joint2")
+    with pytest.raises(CalibrationError, match="thumb_rota1: no recording on the hand side"):
+        calibrated(hand, names=some)
+    calibration, *_ = calibrated(hand, names=some, missing="class")
+    strong, weak = [0, 4], [2, 5]
+    for joint, name in enumerate(hand.joint_names):
+        if name not in some:
+            mates = strong if hand.torque_limit[joint] > 1 else weak
+            np.testing.assert_allclose(calibration.real.gain[:, joint], calibration.real.gain[:, mates].mean(1))
+            assert np.all(calibration.real.samples[:, joint] == 0)
+            assert any(note.startswith(f"{name}: not recorded") for note in calibration.notes)
+
+
+def test_what_the_data_cannot_separate_is_said(fitted):
+    notes = " ".join(fitted[0].notes)
+    for words in ("force sensor", "product", "offset"):
+        assert words in notes
+    data = recording()
+    only = Press(data.force, data.value, np.where(find_direction(data.force) > 0, 1, 0))
+    one_way = fit_joint(only, "A")
+    assert one_way.unloading is None and math.isnan(one_way.friction)
+    assert any("friction and offset are not apart" in note for note in one_way.notes)
+    force = np.linspace(8.0, 8.8, 400)
+    narrow = fit_joint(Press(force, 0.05 * force + 1e-4 * np.random.default_rng(0).standard_normal(400)), "A")
+    assert any("gain and offset trade off" in note for note in narrow.notes)
+
+
+# --- loading and unloading ----------------------------------------------------------------------
+
+
+def test_directions_of_a_noisy_triangle():
+    rng = np.random.default_rng(5)
+    phase = np.arange(600) / 600 * 3 % 1
+    force = 8 * (1 - np.abs(2 * phase - 1)) + 0.1 * rng.standard_normal(600)
+    force[rng.permutation(600)[:20]] = 0.0  # dropped reads
+    found = find_direction(force)
+    truth = np.where(phase < 0.5, 1, -1)
+    assert np.mean(found[found != 0] == truth[found != 0]) > 0.99
+    assert 0.02 < np.mean(found == 0) < 0.2
+    assert set(np.unique(find_direction(-force + 8))) == {-1, 0, 1}
+
+
+def test_a_single_ramp_is_one_direction():
+    found = find_direction(np.linspace(5, 0, 100))
+    assert np.all(found[15:-1] == -1)
+
+
+# --- refusals -----------------------------------------------------------------------------------
+
+
+def broken(**changes):
+    data = recording()
+    force, value = data.force.copy(), data.value.copy()
+    for name, change in changes.items():
+        force, value = {
+            "force": lambda f, v, c=change: (c(f), v),
+            "value": lambda f, v, c=change: (f, c(v)),
+            "both": lambda f, v, c=change: (c(f), c(v)),
+        }[name](force, value)
+    return Press(force, value)
+
+
+def put(index, number):
+    def change(array):
+        array[index] = number
+        return array
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"both": lambda a: a[:10]}, "10 samples: at least 20"),
+        ({"both": lambda a: a[:21]}, "18 samples loading and 0 unloading: at least 20"),
+        ({"force": lambda f: f[:-1]}, "one length"),
+        ({"value": put(17, np.nan)}, "sample 17 is not a number .*leave out"),
+        ({"force": put(3, np.inf)}, "sample 3 is not a number"),
+        ({"force": lambda f: 4 + 0.02 * f}, "force stays between 4.* press"),
+        (
+            {"value": lambda v: 0 * v + 0.1 + np.random.default_rng(0).normal(0, 0.01, v.shape)},
+            "does not follow the force",
+        ),
+        ({"value": lambda v: np.minimum(v, 0.05)}, "saturated"),
+        ({"force": lambda f: np.minimum(f, 2.0)}, "saturated"),
+        ({"value": lambda v: 1000 * v}, "give it in A"),
+        ({"value": lambda v: np.where(np.arange(600) < 200, 1000 * v, v)}, "give it in A|mixed"),
+        ({"value": lambda v: np.where(np.arange(600) < 90, 1000 * v, v)}, "mixed"),
+        ({"force": lambda f: 1000 * f}, "force of .* N: give it in N"),
+        ({"force": lambda f: f - 5}, "tare"),
+    ],
+)
+def test_bad_recordings_are_refused_in_one_line(changes, says):
+    with pytest.raises(CalibrationError, match=says) as caught:
+        fit_joint(broken(**changes), "A", where="thumb_bend on the hand")
+    assert "\n" not in str(caught.value) and str(caught.value).startswith("thumb_bend on the hand")
+
+
+def test_a_few_saturated_samples_are_left_out():
+    data = recording(seed=1, motor=dataclasses.replace(MOTOR, limit=0.55))
+    fit = fit_joint(data, "A")
+    assert any("saturated samples left out" in note for note in fit.notes)
+    assert fit.loading.gain == pytest.approx(LEVER / (0.9 * 0.8), rel=0.02)
+    unclipped = fit_joint(recording(seed=1), "A")
+    assert not any("saturated" in note for note in unclipped.notes)
+
+
+def test_names_that_the_hand_does_not_have(hand):
+    with pytest.raises(CalibrationError, match="no joint 'elbow'"):
+        calibrate(hand, {"elbow": recording()}, {})
+
+
+# --- file ---------------------------------------------------------------------------------------
+
+
+def test_a_file_keeps_every_bit(hand, fitted, tmp_path):
+    path = tmp_path / "policy" / "calibration.toml"
+    original = dataclasses.replace(fitted[0], serial='left "A"\\3')
+    save_calibration(path, original)
+    back = load_calibration(path, hand)
+    assert jax.tree.structure(back) == jax.tree.structure(original)
+    for ours, theirs in zip(jax.tree.leaves(back), jax.tree.leaves(original), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+    text = path.read_text()
+    assert 'name = "thumb_bend"' in text and "# A" in text  # for people too
+
+
+def test_a_missing_direction_survives_the_file(hand, fitted, tmp_path):
+    nan = np.full(12, np.nan)
+    one_way = dataclasses.replace(fitted[0], real=dataclasses.replace(fitted[0].real, friction=nan))
+    save_calibration(tmp_path / "c.toml", one_way)
+    assert np.all(np.isnan(load_calibration(tmp_path / "c.toml", hand).real.friction))
+
+
+def test_cut_anywhere_it_is_refused(hand, fitted, tmp_path):
+    path = tmp_path / "c.toml"
+    save_calibration(path, fitted[0])
+    whole = path.read_bytes()
+    for length in [*range(0, len(whole) - 1, 97), *range(len(whole) - 30, len(whole) - 1)]:
+        path.write_bytes(whole[:length])
+        with pytest.raises(CalibrationError) as caught:
+            load_calibration(path, hand)
+        assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ("version = 1", "version = 2", "is of version 2, this library reads up to 1: upgrade"),
+        ('hand = "xhand_right"', 'hand = "xhand_left"', "is of hand 'xhand_left'.*not of 'xhand_right'"),
+        ('format = "dexsim calibration"', 'format = "other"', "not a calibration file"),
+        ('name = "thumb_bend"', 'name = "thumb_bent"', "calibrate this hand"),
+        ("torque_scale = 1.1", "torque_scale = 0.0", "above 0"),
+        ("torque_scale = 1.1", "torque_scale = true", "must hold 1 number"),
+        ("friction = ", "fiction = ", "'friction' must hold 1 number"),
+        ("complete = true", "complete = false", "cut off"),
+    ],
+)
+def test_other_files_are_refused_in_one_line(hand, fitted, tmp_path, old, new, says):
+    path = tmp_path / "c.toml"
+    save_calibration(path, fitted[0])
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+    with pytest.raises(CalibrationError, match=says) as caught:
+        load_calibration(path, hand)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_file_and_a_place_that_cannot_be_written(fitted, tmp_path):
+    with pytest.raises(CalibrationError, match="cannot be read"):
+        load_calibration(tmp_path / "none.toml")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(CalibrationError, match="cannot be written"):
+        save_calibration(tmp_path / "file" / "c.toml", fitted[0])
+
+
+def test_a_failed_write_leaves_the_old_file(fitted, tmp_path, monkeypatch):
+    path = tmp_path / "c.toml"
+    save_calibration(path, fitted[0])
+    before = path.read_bytes()
+    monkeypatch.setattr("os.fsync", lambda handle: (_ for _ in ()).throw(OSError(28, "No space left on device")))
+    with pytest.raises(CalibrationError, match="No space left"):
+        save_calibration(path, dataclasses.replace(fitted[0], serial="new"))
+    assert path.read_bytes() == before and [p.name for p in tmp_path.iterdir()] == ["c.toml"]
+
+
+def test_the_figure_shows_what_was_recorded(fitted, tmp_path):
+    calibration, real, sim = fitted
+    path = tmp_path / "c.png"
+    plot_calibration(path, calibration, real, sim, ("thumb_bend", "index_joint1"))
+    from PIL import Image
+
+    picture = np.asarray(Image.open(path).convert("RGB"), int)
+    colourful = np.mean(np.ptp(picture, axis=-1) > 60)
+    assert picture.shape[1] > 800 and colourful > 0.003
+    with pytest.raises(CalibrationError, match="nothing to draw"):
+        plot_calibration(path, calibration, {}, sim)
+
+
+def test_thresholds_are_what_the_messages_say():
+    assert MIN_SAMPLES == 20 and MIN_FORCE_RANGE == 0.5
+
+
+# --- the simulation's side --------------------------------------------------------------------------
+
+
+def test_lever_arms_are_c_mujocos(hand):
+    """J^T n at a taxel, from mj_jac at the same point of the tip's body."""
+    rng = np.random.default_rng(6)
+    model = mujoco.MjModel.from_xml_path(str(hand.model_path))
+    data = mujoco.MjData(model)
+    for finger in range(5):
+        angle = rng.uniform(hand.joint_lower, hand.joint_upper)
+        taxel = int(rng.integers(hand.num_taxels))
+        data.qpos[[model.joint(name).qposadr[0] for name in hand.joint_names]] = angle
+        mujoco.mj_forward(model, data)
+        body = model.body(hand.body_names[hand.tip_body[finger]]).id
+        turn = data.xmat[body].reshape(3, 3)
+        point = data.xpos[body] + turn @ hand.taxel_position[finger, taxel]
+        jacobian = np.zeros((3, model.nv))
+        mujoco.mj_jac(model, data, jacobian, None, point, body)
+        torque = jacobian.T @ (turn @ hand.taxel_normal[finger, taxel])
+        wanted = torque[[model.joint(name).dofadr[0] for name in hand.joint_names]]
+        np.testing.assert_allclose(lever_arms(hand, angle, finger, taxel), wanted, atol=2e-6)
+
+
+def test_a_hand_pressed_finger_by_finger(hand):
+    """Both sides from the same presses: each joint's torque comes back through its current."""
+    posture = np.clip(np.full(12, 0.5), hand.joint_lower, hand.joint_upper)
+    triangle = 8 * (1 - np.abs(2 * (np.arange(600) / 200 % 1) - 1))
+    real, sim, arms = {}, {}, {}
+    for finger in hand.finger_names:
+        for name, data in simulated_press(hand, posture, finger, triangle).items():
+            arm = data.value[50] / data.force[50]
+            if name not in arms or abs(arm) > abs(arms[name]):
+                sim[name], arms[name] = data, arm
+                real[name] = press(MOTOR, jax.random.key(len(real)), lever=arm, force_noise=0.03)
+    assert len(arms) >= 10 and all(0.005 < abs(arm) < 0.12 for arm in arms.values())
+    found = calibrate(hand, real, sim, missing="class")
+    for name, arm in arms.items():
+        joint = hand.joint_names.index(name)
+        current = np.zeros(12)
+        current[joint] = 5.0 * arm / (0.9 * 0.8) + math.copysign(0.02, arm) + 0.004
+        direction = np.ones(12)
+        assert float(joint_torque(found, current, direction)[joint]) == pytest.approx(5.0 * arm, rel=0.06), name
+    with pytest.raises(CalibrationError, match="no finger 'toe'"):
+        simulated_press(hand, posture, "toe", triangle)

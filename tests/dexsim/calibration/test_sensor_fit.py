@@ -1,0 +1,109 @@
+"""Known sensors are found again, within intervals that keep their promise; useless recordings are refused."""
+
+import numpy as np
+import pytest
+
+from dexsim.calibration.sensor import Press, fit_finger, load_fit, save_fit
+from dexsim.core.errors import AssetError, DexsimError
+
+TAXELS, AREA = 40, np.full(40, 4e-6)
+
+
+def recording(seed, *, gain=9.0, offset=1.5, threshold=0.3, noise=0.4, count=150, outliers=0):
+    """A finger read in counts: silent below `threshold` N, then gain * force + offset, spread over the taxels."""
+    rng = np.random.default_rng(seed)
+    force = rng.uniform(0, 8, count)
+    total = np.round(gain * force + offset + noise * rng.normal(size=count))
+    total[force < threshold] = 0
+    total[rng.choice(count, outliers, replace=False)] += 60
+    share = np.zeros((count, TAXELS))
+    share[:, :10] = 0.1
+    return Press(force=force, reading=total[:, None] * share)
+
+
+def test_gain_offset_and_threshold_are_found():
+    fit = fit_finger(recording(0))
+    assert fit.gain.value == pytest.approx(9.0, rel=0.01) and fit.offset.value == pytest.approx(1.5, abs=0.3)
+    assert fit.threshold.value == pytest.approx(0.3, abs=0.1)
+    assert fit.residual == pytest.approx(np.hypot(0.4, 1 / np.sqrt(12)), rel=0.2)
+    assert fit.gain.low < fit.gain.value < fit.gain.high
+    np.testing.assert_allclose(fit.correct(np.array([0.0, 46.5])), [0.0, 5.0], atol=0.05)
+
+
+def test_intervals_cover_the_truth():
+    """Of 95 % intervals over 40 recordings about 38 hold; fewer than 33 has a probability below 1 in 1000."""
+    fits = [fit_finger(recording(seed, count=60)) for seed in range(40)]
+    for name, truth in (("gain", 9.0), ("offset", 1.5)):
+        held = sum(getattr(f, name).low <= truth <= getattr(f, name).high for f in fits)
+        assert held >= 33
+    held = sum(f.threshold.low - 0.1 <= 0.3 <= f.threshold.high + 0.1 for f in fits)
+    assert held >= 33
+
+
+def test_outliers_do_not_bend_the_line():
+    fit = fit_finger(recording(1, outliers=12))
+    assert fit.gain.value == pytest.approx(9.0, rel=0.02) and fit.offset.value == pytest.approx(1.5, abs=0.5)
+    plain = recording(1, outliers=12)
+    least_squares = np.polyfit(plain.force, plain.reading.sum(1), 1)[1]
+    assert abs(fit.offset.value - 1.5) < 0.2 * abs(least_squares - 1.5)
+
+
+def test_saturated_samples_are_left_out():
+    press = recording(2)
+    clipped = Press(force=press.force, reading=np.minimum(press.reading, 5.0))
+    assert fit_finger(clipped).gain.value < 8.0
+    fit = fit_finger(clipped, saturation=5.0)
+    assert fit.gain.value == pytest.approx(9.0, rel=0.02) and "saturated" in fit.notes[0]
+
+
+def plate(seed, c10, c01, deepest, noise=0.02):
+    """A flat plate on 24 of 40 taxels, 2 mm of skin, pushed in steps."""
+    rng = np.random.default_rng(seed)
+    depth = np.zeros((80, TAXELS))
+    depth[:, :24] = rng.uniform(0.02, deepest, 80)[:, None] * 0.002
+    stretch = 1 - depth / 0.002
+    force = np.sum(2 * (stretch**-2 - stretch) * (c10 + c01 / stretch) * AREA, 1)
+    reading = force[:, None] * depth / np.maximum(depth.sum(1, keepdims=True), 1e-12)
+    force = force * (1 + noise * rng.normal(size=80))
+    return Press(force=force, reading=reading, depth=depth, area=AREA)
+
+
+def test_the_material_is_found():
+    fit = fit_finger(plate(3, 0.1e6, 0.0, 0.5), thickness=0.002)
+    assert fit.c10.value == pytest.approx(0.1e6, rel=0.02) and fit.c10.low <= 0.1e6 <= fit.c10.high
+    assert fit.c01.value == 0
+
+
+def test_two_terms_need_deep_presses():
+    deep = fit_finger(plate(4, 0.06e6, 0.04e6, 0.7, noise=0.002), thickness=0.002, two_terms=True)
+    assert deep.c10.value == pytest.approx(0.06e6, rel=0.15) and deep.c01.value == pytest.approx(0.04e6, rel=0.15)
+    assert deep.c01.low <= 0.04e6 <= deep.c01.high and not deep.notes
+    shallow = fit_finger(plate(5, 0.06e6, 0.04e6, 0.1, noise=0.1), thickness=0.002, two_terms=True)
+    assert "cannot be told apart" in shallow.notes[0]
+    assert float(shallow.notes[0].split()[-2]) == pytest.approx(0.1e6, rel=0.1)
+
+
+def test_fits_are_kept_in_a_file(tmp_path):
+    fits = {"thumb": fit_finger(recording(6)), "index": fit_finger(plate(6, 0.1e6, 0.0, 0.5), thickness=0.002)}
+    assert load_fit(save_fit(tmp_path / "sensor.json", fits)) == fits
+    with pytest.raises(AssetError, match="no such file"):
+        load_fit(tmp_path / "other.json")
+    (tmp_path / "other.json").write_text('{"thumb": {"gain": 3}}')
+    with pytest.raises(AssetError, match="not a sensor fit"):
+        load_fit(tmp_path / "other.json")
+
+
+def test_useless_recordings_are_refused():
+    good = recording(7)
+    for press, words in (
+        (Press(force=good.force[:5], reading=good.reading[:5]), "5 samples"),
+        (Press(force=np.full(150, 2.0), reading=good.reading), "different forces"),
+        (Press(force=good.force, reading=good.reading[:20]), r"expected \[T\]"),
+        (Press(force=good.force, reading=0 * good.reading), "above the activation threshold"),
+        (Press(force=good.force, reading=100 - good.reading), "do not rise"),
+        (Press(force=np.where(good.force > 7, np.nan, good.force), reading=good.reading), "not finite"),
+        (Press(force=good.force, reading=good.reading, depth=good.reading), "areas"),
+    ):
+        with pytest.raises(DexsimError, match=words) as caught:
+            fit_finger(press)
+        assert "\n" not in str(caught.value)

@@ -1,0 +1,550 @@
+"""What an environment does beyond its defaults: imperfect taxels, three axes of touch, gear play."""
+
+import dataclasses
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from simple_physics import SimplePhysics
+
+import dexsim
+from dexsim import observation
+from dexsim.core.errors import ConfigError
+from dexsim.env.senses import Sensors
+from dexsim.geometry import rotations
+from dexsim.hand.kinematics import forward_kinematics, taxel_normals
+from dexsim.objects.config import ObjectConfig
+from dexsim.observation import ObservationConfig
+from dexsim.randomization import Randomization
+from dexsim.randomization_check.effects import check
+from dexsim.sensing.config import Sensing
+from dexsim.sensing.imu import OrientationSensor
+from dexsim.sensing.taxel_reading import TaxelSensor
+from dexsim.sensing.taxels import SensorNoise
+from dexsim.tasks.grasp.config import GraspConfig
+from dexsim_ppo.train import parse_arguments
+
+WORLDS = 4
+OFF = SensorNoise(
+    hysteresis=None,
+    crosstalk=None,
+    gain=None,
+    bias=None,
+    drift=None,
+    noise=None,
+    dead=None,
+    threshold=None,
+    counts="none",
+    rate=None,
+)
+QUIET = Sensing(
+    joint_noise=0.0,
+    joint_resolution=0.0,
+    torque_noise=0.0,
+    object_noise=0.0,
+    orientation=OrientationSensor(noise=0.0, bias=0.0, drift=0.0, delay=(0.0, 0.0)),
+    taxel=TaxelSensor(noise=0.0, threshold=0.0, resolution=0.0),
+)
+
+
+GEARED = Randomization(
+    backlash="gear_play",
+    gear_gap=(0.01, 0.02),
+    encoder_bias=0.0,
+    sensing_latency=(0.0, 0.0),
+    torque_gain=(1.0, 1.0),
+    taxel_gain=(1.0, 1.0),
+    latency=(0.0, 0.0),
+    latency_spread=(0.0, 0.0),
+)
+
+
+@pytest.fixture(scope="module")
+def make():
+    """An environment over simple physics, quiet and nominal but for what is asked for."""
+    patch = pytest.MonkeyPatch()
+    patch.setattr("dexsim.env.env.Physics", SimplePhysics)
+
+    def build(sensing=QUIET, randomization=None, observation=None):
+        return dexsim.make(
+            "grasp",
+            GraspConfig(
+                sensing=sensing,
+                randomization=randomization or Randomization(scale=0.0),
+                pool_size=4,
+                observation=observation or ObservationConfig(),
+                objects=ObjectConfig(shapes=("sphere",)),
+            ),
+            backend="jax",
+        )
+
+    yield build
+    patch.undo()
+
+
+@pytest.fixture(scope="module")
+def busy(make):
+    """All of it at once, compiled once: the environment, states from a reset and 40 ticks on, and a restart."""
+    env = make(dataclasses.replace(QUIET, three_axis=True, array=dataclasses.replace(OFF, gain=(0.5, 1.5))), GEARED)
+    history = [jax.jit(lambda key: jax.vmap(env.reset)(jax.random.split(key, WORLDS)))(jax.random.key(0))]
+    step, rng = jax.jit(jax.vmap(env.step)), np.random.default_rng(0)
+    for _ in range(40):
+        history.append(step(history[-1], jnp.asarray(rng.uniform(-1, 1, (WORLDS, 12)), jnp.float32)))
+    begun = jax.jit(jax.vmap(env.restart))(history[-1], jnp.array([True, False, True, False]))
+    return env, history, begun
+
+
+def press(seed, scale=2.0):
+    rng = np.random.default_rng(seed)
+    return jnp.asarray(scale * rng.random((5, 120)) * (rng.random((5, 120)) < 0.3), jnp.float32)
+
+
+def reads(env, state, forces, key=None):
+    """Readings of taxel forces tick by tick, and the state with the memory after them."""
+    seen = []
+    for tick, force in enumerate(forces):
+        sample = dataclasses.replace(state.sample, taxel_force=force)
+        tick_key = jax.random.fold_in(jax.random.key(9) if key is None else key, tick)
+        readings, array = env.senses.read(tick_key, sample, sample, Sensors.of(state), state.goal, jnp.zeros(12), state)
+        state = dataclasses.replace(state, array=array, readings=readings)
+        seen.append(np.asarray(readings.taxel_force))
+    return seen, state
+
+
+def test_a_tilt_that_the_host_does_not_know_turns_what_its_imu_says(make):
+    """The IMU stands upright by true gravity; the host takes that for the upright of a level hand."""
+    env = make(randomization=Randomization(gravity_tilt=0.1))
+    for key in jax.random.split(jax.random.key(0), 4):
+        state = env.reset(key)
+        push = np.asarray(env._tilt_force(state.draw, state.target)) / float(state.target.mass)
+        true_up = -(np.array([9.81, 0.0, 0.0]) + push)
+        true_up /= np.linalg.norm(true_up)
+        assert 0.005 < np.arccos(-true_up[0]) < 0.15
+        error = np.asarray(state.orientation_sensor.bias)
+        angle = np.linalg.norm(error)
+        seen = rotations.rotate(
+            rotations.quat_to_matrix(rotations.axis_angle_to_quat(jnp.asarray(error / angle), jnp.asarray(angle))),
+            jnp.asarray(true_up),
+        )
+        np.testing.assert_allclose(seen, [-1.0, 0.0, 0.0], atol=1e-3)
+
+
+def test_taxels_feel_no_friction(make):
+    """The default skin shares out what presses into it: the rest of the finger's force is along it."""
+    env = make()
+    state = env.reset(jax.random.key(1))
+    force = jnp.asarray(np.random.default_rng(0).normal(size=(5, 3)), jnp.float32)
+    zero = jnp.zeros(12)
+    qpos = state.physics.qpos
+    pose = forward_kinematics(env.hand, qpos[:12])
+    # The object where the first finger's pad is.
+    at = pose.body_position[env.hand.tip_body[1]]
+    moment = env._moment(
+        dataclasses.replace(state.physics, qpos=qpos.at[12:15].set(at)), state.target, zero, zero, zero, force
+    )
+    felt, normals = np.asarray(moment.touch.force[1]), np.asarray(taxel_normals(env.hand, pose))[1]
+    skin = np.asarray(moment.touch.skin_force[1])
+    inward = -(skin[:, None] * normals).sum(0)
+    inward /= np.linalg.norm(inward)
+    assert felt.sum() == pytest.approx(max(float(force[1] @ inward), 0.0), abs=1e-4)
+    assert felt.sum() < np.linalg.norm(force[1])
+
+
+class TestTaxels:
+    def array(self, **effects):
+        return dataclasses.replace(QUIET, array=dataclasses.replace(OFF, **effects))
+
+    def test_off_by_default_and_then_not_there(self, make):
+        env = make()
+        state = jax.eval_shape(env.reset, jax.random.key(0))
+        assert env.senses.array is None and state.array is None and state.array_params is None
+        assert GraspConfig().sensing.array.scale == 0
+
+    def test_gains_are_drawn_anew_for_an_episode_and_stay_in_it(self, busy):
+        env, (state, *_, last), begun = busy
+        gain = np.asarray(state.array_params.gain)
+        assert gain.shape == (WORLDS, 5, 120) and 0.5 <= gain.min() < 0.55 and 1.45 < gain.max() <= 1.5
+        assert np.abs(np.corrcoef(gain.reshape(WORLDS, -1)) - np.eye(WORLDS)).max() < 0.2
+        np.testing.assert_array_equal(last.array_params.gain, gain)
+        same = np.all(np.asarray(begun.array_params.gain) == gain, (1, 2))
+        assert same.tolist() == [False, True, False, True]
+        force, one = press(0), jax.tree.map(lambda x: x[1], last)
+        np.testing.assert_allclose(reads(env, one, [force])[0][0], force * gain[1], rtol=1e-6)
+
+    def test_creep_is_remembered_from_tick_to_tick(self, make):
+        """A step of force comes in by 1 - a exp(-t / tau); the memory is in the state."""
+        env = make(self.array(hysteresis=(0.4, 0.4), hysteresis_time=(0.1, 0.1)))
+        state = env.reset(jax.random.key(0))
+        assert float(jnp.abs(state.array.late).max()) == 0
+        force = press(1)
+        seen, state = reads(env, state, [force] * 6)
+        memory = np.exp(-env.control_period / 0.1)
+        for tick, reading in enumerate(seen, start=1):
+            np.testing.assert_allclose(reading, force * (1 - 0.4 * memory**tick), rtol=1e-4, atol=1e-6)
+        assert np.asarray(state.array.late).max() > 0.5
+
+    def test_a_slow_array_repeats_itself(self, make):
+        """At 8 Hz under 33 Hz control four or five ticks see each sample."""
+        env = make(self.array(rate=(8.0, 8.0)))
+        forces = [press(2, 1.0 + tick) for tick in range(34)]
+        seen, _ = reads(env, env.reset(jax.random.key(0)), forces)
+        values = [float(s.max()) for s in seen]
+        runs = np.diff(np.flatnonzero(np.diff(values, prepend=-1.0)))
+        assert set(runs[1:].tolist()) <= {4, 5} and len(runs) >= 6  # the first is cut by the array's own clock
+
+    def test_crosstalk_drift_and_counts(self, make):
+        still = [jnp.zeros((5, 120)).at[:, 65].set(2.0)] * 40
+        env = make(self.array(crosstalk=(0.2, 0.2)))
+        spread = reads(env, env.reset(jax.random.key(0)), still[:1])[0][0]
+        np.testing.assert_allclose(spread.sum(-1), 2.0, rtol=1e-5)
+        np.testing.assert_allclose(spread[:, 65], 1.6, rtol=1e-5)
+        assert np.all((spread > 0).sum(-1) == 5)
+        env = make(self.array(drift=(0.5, 0.5)))
+        drifting = np.stack(reads(env, env.reset(jax.random.key(0)), still)[0])
+        # A walk: the deviation grows with the square root of time.
+        for ticks in (4, 36):
+            expected = 0.5 * np.sqrt(ticks * env.control_period)
+            assert np.std(drifting[ticks - 1] - still[0]) == pytest.approx(expected, rel=0.15)
+        env = make(self.array(counts="uint8"))
+        counted = reads(env, env.reset(jax.random.key(0)), [20 * press(3)])[0][0]
+        np.testing.assert_allclose(counted, np.clip(np.round(20 * press(3) / 0.1), 0, 255) * 0.1, atol=1e-5)
+        assert counted.max() == pytest.approx(25.5)
+
+
+def touching(env, seed=0):
+    """A hand with a sphere pushed into the index fingertip, and forces on all fingers."""
+    state = env.reset(jax.random.key(seed))
+    joints = jnp.asarray(np.random.default_rng(seed).uniform(0.2, 0.9, 12), jnp.float32)
+    pose = forward_kinematics(env.hand, joints)
+    normal = taxel_normals(env.hand, pose)[1, 66]
+    taxel = pose.body_position[env.hand.tip_body[1]] + rotations.rotate(
+        pose.tip_rotation[1], jnp.asarray(env.hand.taxel_position[1, 66])
+    )
+    place = taxel + normal * (state.target.size[1, 0] + 0.001)  # inside the rubber over the taxels
+    physics = dataclasses.replace(state.physics, qpos=jnp.concatenate([joints, place, jnp.array([1.0, 0, 0, 0])]))
+    force = jnp.asarray(np.random.default_rng(seed).normal(0, 2, (5, 3)), jnp.float32) - 3 * normal
+    return state, physics, force
+
+
+class TestThreeAxes:
+    def test_off_by_default_and_then_not_there(self, make):
+        state = jax.eval_shape(make().reset, jax.random.key(0))
+        assert state.tangential_force is None and state.sample.tangential_force is None
+        assert not any(name.startswith("tangential") for name in state.metrics)
+
+    @pytest.mark.parametrize("seed", range(3))
+    def test_what_presses_and_what_shears_make_up_the_solvers_force(self, make, seed):
+        env = make(dataclasses.replace(QUIET, three_axis=True))
+        state, physics, force = touching(env, seed)
+        zero = jnp.zeros(12)
+        moment = env._moment(physics, state.target, zero, zero, zero, force)
+        felt = np.asarray(moment.touch.force.sum(-1)) > 0
+        assert felt[1] and not felt.all()
+        weights = np.asarray(moment.touch.force)[..., None] * np.asarray(taxel_normals(env.hand, moment.pose))
+        tangential = np.asarray(moment.tangential_force)
+        for finger in range(5):
+            if not felt[finger]:
+                assert np.all(tangential[finger] == 0)
+                continue
+            inward = -weights[finger].sum(0) / np.linalg.norm(weights[finger].sum(0))
+            assert abs(tangential[finger] @ inward) < 1e-4
+            np.testing.assert_allclose(
+                tangential[finger] + (np.asarray(force)[finger] @ inward) * inward, force[finger], atol=1e-4
+            )
+
+    @pytest.mark.parametrize(
+        "config, groups",
+        [
+            (ObservationConfig(add=("tangential_force",)), ("actor", "critic")),
+            (ObservationConfig(add_critic=("tangential_force", "joint_velocity")), ("critic",)),
+        ],
+    )
+    def test_it_is_observed_by_whom_the_configuration_says(self, make, hand, config, groups):
+        env = make(observation=config)
+        assert env.senses.three_axis
+        for group in ("actor", "critic"):
+            fields = {field.name: field for field in env.observation_layout[group]}
+            assert ("tangential_force" in fields) == (group in groups)
+            assert ("joint_velocity" in fields) == ("joint_velocity" in config.add_critic and group == "critic")
+        state, physics, force = touching(env)
+        zero = jnp.zeros(12)
+        moment = env._moment(physics, state.target, zero, zero, zero, force)
+        sample = dataclasses.replace(
+            state.sample, taxel_force=moment.touch.force, tangential_force=moment.tangential_force
+        )
+        readings, _ = env.senses.read(jax.random.key(0), sample, sample, Sensors.of(state), state.goal, zero, state)
+        np.testing.assert_allclose(readings.tangential_force, moment.tangential_force, atol=1e-5)
+        obs = env._observe(readings, moment, state.goal)
+        for group in groups:
+            at = 0
+            for field in env.observation_layout[group]:
+                if field.name == "tangential_force":
+                    assert field.size == 15 and field.scale
+                    np.testing.assert_allclose(obs[group][at : at + 15], moment.tangential_force.ravel(), atol=1e-5)
+                at += field.size
+            assert at == len(obs[group])
+
+    def test_thinly_spread_shear_is_lost_in_the_counts(self, make):
+        """0.1 N a count: 2 N of shear on one taxel is read, on a hundred taxels it is not."""
+        env = make(dataclasses.replace(QUIET, three_axis=True, taxel=TaxelSensor(noise=0.0, threshold=0.0)))
+        state = env.reset(jax.random.key(0))
+        tangential = jnp.zeros((5, 3)).at[:, 2].set(2.04)
+        for taxels, read in ((1, 2.0), (100, 0.0)):
+            force = jnp.zeros((5, 120)).at[:, :taxels].set(1.0)
+            sample = dataclasses.replace(state.sample, taxel_force=force, tangential_force=tangential)
+            readings, _ = env.senses.read(
+                jax.random.key(0), sample, sample, Sensors.of(state), state.goal, jnp.zeros(12), state
+            )
+            np.testing.assert_allclose(readings.tangential_force[:, 2], read, atol=1e-5)
+
+    def test_in_state_and_metrics(self, busy):
+        _, (_, *_, after), _ = busy
+        assert after.tangential_force.shape == (WORLDS, 5, 3)
+        along = np.linalg.norm(after.tangential_force, axis=-1)
+        np.testing.assert_allclose(after.metrics["tangential_force"], along.sum(-1), rtol=1e-6)
+        np.testing.assert_allclose(np.stack([after.metrics[f"tangential/{i}"] for i in range(5)], 1), along, rtol=1e-6)
+
+    def test_an_actor_cannot_see_what_nothing_measures(self, make):
+        with pytest.raises(ConfigError, match="ObservationConfig.add = 'object_spin': no sensor measures it"):
+            make(observation=ObservationConfig(add=("object_spin",)))
+
+    def test_added_fields_stand_behind_the_tasks_own_once(self, hand):
+        config = ObservationConfig(leave_out=("contact_force",), add=("joint_torque", "last_action", "last_action"))
+        names = [field.name for field in observation.layout(hand, observation.GRASP, config)]
+        assert names == [*(n for n in observation.GRASP if n != "contact_force"), "last_action"]
+
+
+class TestGearPlay:
+    def test_off_by_default_and_then_not_there(self, make):
+        env = make()
+        state = jax.eval_shape(env.reset, jax.random.key(0))
+        assert state.gear is None and state.draw.gear_gap is None and not env.drive.gear_play
+
+    def test_the_encoder_sits_on_the_rotor_and_the_link_lags_within_the_gap(self, busy):
+        _, (state, *history), begun = busy
+        gap = np.asarray(state.draw.gear_gap)
+        assert np.all((gap >= 0.01) & (gap <= 0.02)) and np.ptp(gap) > 0.005
+        np.testing.assert_array_equal(state.draw.actuator.dead_band, 0)
+        np.testing.assert_array_equal(state.gear.rotor.position, state.physics.qpos[:, :12])
+        apart = []
+        for state in history:
+            np.testing.assert_allclose(state.readings.joint_position, state.gear.rotor.position, atol=1e-6)
+            apart.append(np.asarray(state.gear.rotor.position - state.physics.qpos[:, :12]))
+        apart = np.abs(np.stack(apart))
+        assert np.all(apart <= gap / 2 + 0.04)  # the tooth gives, and more so to a coarse step
+        assert np.mean(apart > 0.8 * gap / 2) > 0.3, "the gaps are hardly ever crossed"
+        np.testing.assert_array_equal(begun.gear.rotor.position[::2], begun.physics.qpos[::2, :12])
+        np.testing.assert_array_equal(begun.gear.rotor.position[1::2], state.gear.rotor.position[1::2])
+        assert np.any(begun.draw.gear_gap[::2] != gap[::2]) and np.all(begun.draw.gear_gap[1::2] == gap[1::2])
+
+    def test_motors_are_told_the_angle_of_the_encoder(self, busy):
+        """Targets stay within reach of what the encoder reads."""
+        env, history, _ = busy
+        for before, after in zip(history, history[1:], strict=False):
+            wanted = np.asarray(after.joint_target - before.gear.rotor.position)
+            assert np.all(np.abs(wanted) <= env.config.control.reach + 1e-6)
+
+    def test_scale_zero_has_no_gap(self, make):
+        env = make(randomization=dataclasses.replace(GEARED, scale=0.0))
+        np.testing.assert_array_equal(env.reset(jax.random.key(0)).draw.gear_gap, 0)
+
+    def test_the_rotor_takes_its_inertia_from_the_joint(self, hand):
+        from dexsim.env.motors import Drive, rotor_share
+        from dexsim.physics.model import build_model
+        from dexsim.physics.seam import Physics
+
+        config = GraspConfig(randomization=GEARED)
+        whole = build_model(hand, ("box",), np.full((1, 3), 0.02), config.physics, (0, 0, -9.81), "jax")
+        seam = object.__new__(Physics)
+        seam.hand, seam.slots, seam.config = hand, ("box",), config.physics
+        seam.mj_model = build_model(
+            hand,
+            ("box",),
+            np.full((1, 3), 0.02),
+            config.physics,
+            (0, 0, -9.81),
+            "jax",
+            rotor_share=rotor_share(config.randomization),
+        )
+        seam._find_addresses()
+        drive, dofs = Drive(config, hand, seam), seam.joint_dof
+        np.testing.assert_allclose(
+            drive._rotor_inertia + seam.mj_model.dof_armature[dofs], whole.dof_armature[dofs], rtol=1e-5
+        )
+        assert drive._steps >= 4
+        bare = SimpleNamespace(
+            dof_armature=0 * whole.dof_armature,
+            **{name: getattr(whole, name) for name in ("opt", "dof_M0", "dof_invweight0")},
+        )
+        with pytest.raises(ConfigError, match="needs an armature"):
+            Drive(config, hand, SimpleNamespace(mj_model=bare, joint_dof=dofs))
+
+
+@pytest.fixture(scope="module")
+def drawn(make):
+    """An environment and 64 resets at three scales."""
+    env = make(dataclasses.replace(QUIET, array=SensorNoise(), orientation=OrientationSensor()), Randomization())
+    draw = jax.jit(lambda key, scale: jax.vmap(lambda k: env.reset(k, scale))(jax.random.split(key, 64)))
+    return env, {scale: draw(jax.random.key(0), jnp.float32(scale)) for scale in (0.0, 0.5, 1.0)}
+
+
+class TestScale:
+    """A width of the ranges that is part of the state: 0 is nominal exactly, for hand, sensors and object."""
+
+    def test_zero_is_nominal(self, drawn, hand):
+        env, states = drawn
+        state, objects = states[0.0], env.config.objects
+        for value, nominal in (
+            (state.draw.actuator.stall_torque, hand.torque_limit),
+            (state.draw.encoder_bias, 0),
+            (state.draw.tilt, 0),
+            (state.orientation_sensor.bias, 0),
+            (state.array_params.gain, 1),
+            (state.array_params.bias, 0),
+            (state.array_params.crosstalk, 0),
+            (state.array_params.alive, True),
+            (state.target.mass, np.mean(objects.mass)),
+            (state.target.friction, np.mean(objects.friction)),
+            (state.target.com, 0),
+            (state.target.contact[:, 0], np.mean(objects.stiffness)),
+        ):
+            np.testing.assert_array_equal(value, np.broadcast_to(np.float32(nominal), value.shape))
+        assert len(np.unique(state.target.contact[:, 1])) == 1
+        radius = np.asarray(state.target.size[:, 1, 0])
+        assert len(np.unique(radius)) > 1  # sizes stay as the pool has them
+        ball = np.mean(objects.mass) * 0.4 * radius**2
+        # A sphere is a capsule with a straight part of 0.2 mm.
+        np.testing.assert_allclose(state.target.inertia, np.repeat(ball[:, None], 3, 1), rtol=0.01)
+
+    def test_one_is_what_the_pool_holds(self, drawn):
+        env, states = drawn
+        state = states[1.0]
+        rows = {tuple(q): row for row, q in enumerate(np.asarray(env.pool.qpos))}
+        at = [rows[tuple(q)] for q in np.asarray(state.physics.qpos)]
+        for name in ("mass", "inertia", "com", "friction", "contact"):
+            np.testing.assert_allclose(
+                getattr(state.target, name),
+                np.asarray(getattr(env.pool.target, name))[at],
+                rtol=1e-4,
+                atol=1e-7,
+                err_msg=name,
+            )
+
+    def test_half_is_half_way(self, drawn):
+        _, states = drawn
+        for name in ("mass", "com", "friction", "contact"):
+            low, half, high = (np.asarray(getattr(states[scale].target, name)) for scale in (0.0, 0.5, 1.0))
+            np.testing.assert_allclose(half, (low + high) / 2, rtol=1e-4, atol=1e-6, err_msg=name)
+        low, half, high = (np.asarray(states[scale].draw.encoder_bias) for scale in (0.0, 0.5, 1.0))
+        np.testing.assert_allclose(half, (low + high) / 2, atol=1e-7)
+
+    def test_restarts_draw_at_the_states_scale(self, drawn):
+        env, states = drawn
+        state = jax.vmap(env.widen, (0, None))(states[1.0], jnp.float32(0.0))
+        np.testing.assert_array_equal(state.draw.encoder_bias, states[1.0].draw.encoder_bias)
+        begun = jax.jit(jax.vmap(env.restart))(state, jnp.arange(64) < 32)
+        assert np.all(np.asarray(begun.draw.encoder_bias)[:32] == 0) and np.all(np.asarray(begun.scale) == 0)
+        np.testing.assert_array_equal(begun.draw.encoder_bias[32:], state.draw.encoder_bias[32:])
+        np.testing.assert_array_equal(begun.target.mass[:32], np.float32(np.mean(env.config.objects.mass)))
+
+    def test_without_one_there_is_none(self, make):
+        assert jax.eval_shape(make().reset, jax.random.key(0)).scale is None
+
+
+def test_all_of_it_is_reached_from_the_command_line():
+    arguments, _ = parse_arguments(
+        [
+            "--task",
+            "grasp",
+            "--env.sensing.array.scale",
+            "1",
+            "--env.sensing.array.hysteresis",
+            "0.1",
+            "0.2",
+            "--env.sensing.array.drift",
+            "0",
+            "0.01",
+            "--env.sensing.array.crosstalk",
+            "None",
+            "--env.sensing.array.rate",
+            "8",
+            "20",
+            "--env.sensing.three-axis",
+            "--env.observation.add",
+            "tangential_force",
+            "--env.observation.add-critic",
+            "object_spin",
+            "--env.randomization.backlash",
+            "gear_play",
+            "--env.randomization.gear-gap",
+            "0",
+            "0.03",
+        ]
+    )
+    array = arguments.env.sensing.array
+    assert (array.scale, array.hysteresis, array.drift) == (1.0, (0.1, 0.2), (0.0, 0.01))
+    assert array.crosstalk is None and array.rate == (8.0, 20.0) and arguments.env.sensing.three_axis
+    assert arguments.env.observation.add == ("tangential_force",)
+    assert arguments.env.randomization.backlash == "gear_play"
+    assert arguments.env.randomization.gear_gap == (0.0, 0.03)
+
+
+@pytest.mark.long
+def test_the_self_test_finds_every_range_of_gears_and_taxels(make):
+    env = make(Sensing(array=SensorNoise(rate=(8.0, 20.0), counts="none")), GEARED)
+    states = jax.jit(lambda key: jax.vmap(env.reset)(jax.random.split(key, WORLDS)))(jax.random.key(0))
+    names = (
+        "hysteresis",
+        "hysteresis_time",
+        "crosstalk",
+        "gain",
+        "bias",
+        "drift",
+        "noise",
+        "dead",
+        "threshold",
+        "rate",
+    )
+    effects = check(
+        env,
+        jax.jit(jax.vmap(env.step)),
+        states,
+        key=jax.random.key(1),
+        ticks=10,
+        names=["Randomization.gear_gap", "Randomization.dead_band", *(f"SensorNoise.{name}" for name in names)],
+    )
+    gap, band, *taxels = effects
+    assert gap.changed == ("gear_gap",) and gap.joint > 1e-4 and band.off
+    for name, effect in zip(names, taxels, strict=True):
+        leaf = {"hysteresis_time": "memory", "dead": "alive"}.get(name, name)
+        assert effect.changed == (leaf,) and effect.found and effect.which == "taxel_force" and effect.joint == 0
+
+
+@pytest.mark.long
+def test_everything_at_once_on_the_real_physics():
+    """A hand that grips and shakes, then holds still, with play in its gears and poor taxels: sober numbers."""
+    config = GraspConfig(
+        pool_size=80,
+        sensing=Sensing(array=SensorNoise(rate=(10.0, 30.0)), three_axis=True),
+        observation=ObservationConfig(add=("tangential_force",)),
+        randomization=Randomization(backlash="gear_play"),
+    )
+    env = dexsim.make("grasp", config, backend="jax", num_envs=8)
+    state = jax.jit(lambda key: jax.vmap(env.reset)(jax.random.split(key, 8)))(jax.random.key(0))
+    step, restart = jax.jit(jax.vmap(env.step)), jax.jit(jax.vmap(env.restart))
+    rng, gripped, sheared, beyond = np.random.default_rng(0), 0, 0, []
+    for tick in range(60):
+        action = np.clip(rng.uniform(-1, 1, (8, 12)) + 0.6 * (np.arange(12) > 3), -1, 1) * (tick < 30)
+        state = step(state, jnp.asarray(action, jnp.float32))
+        assert not np.any(state.metrics["non_finite"])
+        apart = np.abs(np.asarray(state.gear.rotor.position - state.physics.qpos[:, :12]))
+        beyond.append(np.maximum(apart - np.asarray(state.draw.gear_gap) / 2, 0))
+        gripped += np.sum(np.asarray(state.finger_force) > 1)
+        sheared += np.sum(np.linalg.norm(state.tangential_force, axis=-1) > 0.3)
+        assert np.all(np.isfinite(state.obs["actor"])) and state.obs["actor"].shape == (8, 66 + 15)
+        state = restart(state, state.terminated | state.truncated)
+    assert gripped > 100 and sheared > 100
+    # Teeth give by torque over stiffness, up to 5 mrad; more only in impacts, which last shorter than a sub-step.
+    assert np.mean(beyond) < 3e-3 and np.max(beyond[40:]) < 8e-3 and np.max(beyond) < 0.1

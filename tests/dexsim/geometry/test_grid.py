@@ -1,0 +1,374 @@
+"""Meshes against closed forms and brute force; baked grids against exact distances; what is refused, and why."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dexsim.core.errors import AssetError, ConfigError
+from dexsim.geometry import distance, grid, mesh, sdf
+from dexsim.geometry.grid import GridConfig
+
+trimesh = pytest.importorskip("trimesh")
+BOX = np.array([0.025, 0.02, 0.03])
+COARSE = GridConfig(nodes=24)
+signed_distance = jax.jit(grid.signed_distance)
+distance_and_normal = jax.jit(grid.distance_and_normal)
+exact = jax.jit(sdf.distance_and_normal)
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("DEXSIM_CACHE", str(tmp_path / "cache"))
+
+
+def solid(kind, *size):
+    return sdf.Shape(
+        (kind,), jnp.asarray([(*size, 0, 0)[:3]], jnp.float32), jnp.zeros((1, 3)), jnp.eye(3)[None], jnp.array([True])
+    )
+
+
+def box_distance(points, half=BOX):
+    q = np.abs(points) - half
+    return np.linalg.norm(np.maximum(q, 0), axis=-1) + np.minimum(q.max(-1), 0)
+
+
+def shell(shape, count=20000, low=-0.003, high=0.001, seed=0):
+    """Points [P, 3] within `low` to `high` of the surface, with exact distance and normal."""
+    box = sdf.bounds(shape)
+    points = np.random.default_rng(seed).uniform(box[0] - high, box[1] + high, (10 * count, 3)).astype(np.float32)
+    value, normal = (np.asarray(x) for x in exact(points, shape))
+    keep = np.flatnonzero((value > low) & (value < high))[:count]
+    return points[keep], value[keep], normal[keep]
+
+
+# --- meshes --------------------------------------------------------------------------------------
+
+
+def test_distance_to_a_box_mesh_is_the_closed_form():
+    box = mesh.load_mesh(trimesh.creation.box(2 * BOX))
+    points = np.random.default_rng(0).uniform(-0.05, 0.05, (3000, 3))
+    value, gradient = mesh.signed_distance(box, points)
+    np.testing.assert_allclose(value, box_distance(points), atol=1e-12)
+    step = 1e-7
+    numeric = np.stack(
+        [(box_distance(points + step * e) - box_distance(points - step * e)) / (2 * step) for e in np.eye(3)], -1
+    )
+    smooth = np.abs(np.linalg.norm(numeric, axis=1) - 1) < 1e-4
+    np.testing.assert_allclose(gradient[smooth], numeric[smooth], atol=1e-4)
+    assert box.volume == pytest.approx(8 * BOX.prod())
+
+
+def test_nearest_triangle_is_the_nearest_of_all():
+    """Against all triangles by dense sampling, on a shape with a hole and concave parts."""
+    ring = mesh.load_mesh(trimesh.creation.torus(0.03, 0.01, 32, 16))
+    points = np.random.default_rng(1).uniform(-0.06, 0.06, (200, 3))
+    value, _ = mesh.signed_distance(ring, points)
+    weight = np.array([[i, j, 12 - i - j] for i in range(13) for j in range(13 - i)]) / 12
+    samples = np.einsum("wc,tcd->twd", weight, ring.corners).reshape(-1, 3)
+    found = np.array([np.linalg.norm(samples - p, axis=1).min() for p in points])
+    assert np.all(found >= np.abs(value) - 1e-9) and np.all(found - np.abs(value) < 2.5e-4)
+    # The sign is that of the ring itself, but for the sliver between facets and curve.
+    across = np.hypot(np.linalg.norm(points[:, :2], axis=1) - 0.03, points[:, 2]) - 0.01
+    clear = np.abs(across) > 6e-4
+    assert np.all((value < 0)[clear] == (across < 0)[clear]) and (value < 0).sum() > 5
+
+
+def test_the_winding_number_counts():
+    box = mesh.load_mesh(trimesh.creation.box(2 * BOX))
+    points = np.random.default_rng(2).uniform(-0.05, 0.05, (500, 3))
+    np.testing.assert_allclose(mesh.winding_number(box, points), box_distance(points) < 0, atol=1e-9)
+
+
+def turned(part):
+    part.invert()
+    return part
+
+
+def flat(part):
+    part.apply_scale([1, 1, 1e-9])
+    return part
+
+
+def test_bad_meshes_are_refused_in_one_line():
+    box = trimesh.creation.box(2 * BOX)
+    vertices, faces = np.array(box.vertices), np.array(box.faces)
+    nan = vertices.copy()
+    nan[3, 1] = np.nan
+    mixed = faces.copy()
+    mixed[4] = mixed[4][::-1]
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.02)
+    cases = [
+        ((vertices, faces[:-1]), "open, 3 edges belong to one triangle only"),
+        (turned(box.copy()), "normals point inward"),
+        ((vertices, mixed), "normals point both ways"),
+        (flat(box.copy()), "encloses no volume"),
+        ((nan, faces), "vertex 3 is not finite"),
+        ((1000 * vertices, faces), "60 m across.*scale=0.001"),
+        ((1e-3 * vertices, faces), "6e-05 m across"),
+        ((vertices, faces[:0]), "no triangles"),
+        ((vertices, faces + 4), "names vertex 11"),
+        ((vertices[:, :2], faces), r"\[V, 3\]"),
+        ("nowhere.stl", "no such file"),
+        (3, "no triangle mesh"),
+    ]
+    overlapping = trimesh.util.concatenate([ball, ball.copy().apply_translation((0.02, 0, 0))])
+    for source, words in cases:
+        with pytest.raises(AssetError, match=words) as caught:
+            mesh.load_mesh(source)
+        assert "\n" not in str(caught.value)
+    for bad in (
+        overlapping,
+        trimesh.util.concatenate([ball, turned(ball.copy().apply_translation((0.09, 0, 0))).apply_scale(0.5)]),
+    ):
+        with pytest.raises(AssetError, match="cannot be signed: inside and outside disagree at") as caught:
+            mesh.check_sign(mesh.load_mesh(bad))
+        assert "\n" not in str(caught.value)
+
+
+def test_files_are_read_in_their_unit(tmp_path):
+    path = tmp_path / "box.stl"
+    trimesh.creation.box(2000 * BOX).export(path)
+    box = mesh.load_mesh(path, scale=0.001)
+    assert len(box.vertices) == 8  # an STL repeats every vertex
+    np.testing.assert_allclose(box.bounds, [-BOX, BOX], rtol=1e-6)
+    path.write_bytes(b"solid nothing")
+    with pytest.raises(AssetError, match="box.stl"):
+        mesh.load_mesh(path)
+
+
+def test_a_hollow_ball_is_signed_right():
+    """A cavity: an inner surface with its normals toward the hollow."""
+    outer, inner = (trimesh.creation.icosphere(subdivisions=3, radius=r) for r in (0.03, 0.02))
+    hollow = mesh.load_mesh(trimesh.util.concatenate([outer, turned(inner)]))
+    mesh.check_sign(hollow)
+    value, _ = mesh.signed_distance(hollow, np.array([[0.0, 0, 0], [0.025, 0, 0], [0.035, 0, 0]]))
+    np.testing.assert_allclose(value, [0.02, -0.005, 0.005], atol=3e-4)
+
+
+# --- grids ---------------------------------------------------------------------------------------
+
+SMOOTH = {"sphere": (0.03,), "capsule": (0.013, 0.025), "ellipsoid": (0.03, 0.02, 0.04)}
+
+
+@pytest.mark.parametrize("kind", SMOOTH)
+@pytest.mark.parametrize("dtype", grid.DTYPES)
+def test_64_nodes_are_within_ten_micrometres_on_smooth_shapes(kind, dtype):
+    shape = solid(kind, *SMOOTH[kind])
+    points, value, normal = shell(shape)
+    ours, ours_normal = distance_and_normal(points, grid.bake(shape, GridConfig(dtype=dtype)))
+    error = np.abs(np.asarray(ours) - value)
+    assert error.mean() <= 10e-6 and error.max() < 40e-6
+    assert np.mean((np.asarray(ours) < 0) != (value < 0)) < 0.004
+    assert np.degrees(np.arccos(np.clip(np.sum(ours_normal * normal, -1), -1, 1))).mean() < 1.0
+
+
+@pytest.mark.parametrize("kind", SMOOTH)
+def test_unbiased_nodes_take_the_mean_error_away(kind):
+    """Interpolation between exact nodes always overshoots a convex shape; lowered nodes err to both sides, and less."""
+    shape = solid(kind, *SMOOTH[kind])
+    points, value, _ = shell(shape)
+    raw, ours = (
+        np.asarray(signed_distance(points, grid.bake(shape, GridConfig(unbiased=u)))) - value for u in (False, True)
+    )
+    assert raw.min() > -1e-6 and raw.mean() > 4e-6
+    assert abs(ours.mean()) < 0.15 * raw.mean() and np.abs(ours).mean() < 0.5 * np.abs(raw).mean()
+
+
+@pytest.mark.parametrize("kind", SMOOTH)
+def test_quadratic_is_ten_times_closer(kind):
+    shape = solid(kind, *SMOOTH[kind])
+    points, value, _ = shell(shape)
+    error = np.abs(np.asarray(signed_distance(points, grid.bake(shape, GridConfig(interpolation="quadratic")))) - value)
+    assert error.mean() < 0.5e-6 and error.max() < 10e-6
+
+
+def test_edges_cost_no_more_than_a_cell():
+    shape = solid("box", *BOX)
+    points, value, _ = shell(shape)
+    error = np.abs(np.asarray(signed_distance(points, grid.bake(shape))) - value)
+    assert error.mean() <= 10e-6 and np.quantile(error, 0.95) < 50e-6 and error.max() < 0.5e-3
+
+
+def test_interpolation_by_hand():
+    """Trilinear: nodes exactly, and half way between two of them their mean; beyond the grid the way there is added."""
+    shape = solid("sphere", 0.02)
+    baked = grid.bake(shape, dataclasses.replace(COARSE, unbiased=False))
+    origin, step = np.asarray(baked.origin[0]), np.asarray(baked.spacing[0])
+    cells = np.random.default_rng(3).integers(0, 23, (100, 3))
+    node, nearby = origin + cells * step, origin + (cells + [0, 1, 0]) * step
+
+    def truth(p):
+        return np.linalg.norm(p, axis=1) - 0.02
+
+    np.testing.assert_allclose(signed_distance(np.float32(node), baked), truth(node), atol=2e-8)
+    np.testing.assert_allclose(
+        signed_distance(np.float32((node + nearby) / 2), baked), (truth(node) + truth(nearby)) / 2, atol=2e-8
+    )
+    out = np.float32([[origin[0] + 23 * step[0] + 0.05, 0.001, 0.002]])
+    held = np.float32([[origin[0] + 23 * step[0], 0.001, 0.002]])
+    np.testing.assert_allclose(signed_distance(out, baked), signed_distance(held, baked) + 0.05, atol=1e-7)
+    assert float(signed_distance(out, baked)[0]) == pytest.approx(truth(out)[0], abs=2e-4)
+    _, normal = distance_and_normal(out, baked)
+    np.testing.assert_allclose(normal, [[1, 0, 0]], atol=0.1)
+
+
+def test_quadratics_are_met_exactly():
+    """Half of the nodes' first-order terms cancels the curvature: any second-order polynomial comes out exact."""
+    rng = np.random.default_rng(4)
+    bend = rng.normal(size=(3, 3))
+    bend, tilt = bend + bend.T, rng.normal(size=3)
+    n = 8
+    axis = np.arange(n) / (n - 1.0)
+    nodes = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
+
+    def polynomial(x):
+        return np.einsum("pi,ij,pj->p", x, bend, x) + x @ tilt
+
+    channels = np.concatenate([1e3 * polynomial(nodes)[:, None], 2 * nodes @ bend + tilt], 1)
+    made = grid.Grid(
+        nodes=n,
+        interpolation="quadratic",
+        values=jnp.asarray(channels.reshape(-1), jnp.float32),
+        origin=jnp.zeros((1, 3)),
+        spacing=jnp.full((1, 3), 1 / (n - 1)),
+        index=jnp.int32(0),
+        scale=jnp.ones(()),
+    )
+    points = rng.uniform(0, 1, (300, 3))
+    value, gradient = (np.asarray(x) for x in jax.jit(grid._look_up)(np.float32(points), made))
+    np.testing.assert_allclose(value, polynomial(points), atol=3e-6)
+    np.testing.assert_allclose(np.stack(gradient, -1), 2 * points @ bend + tilt, atol=1e-4)
+
+
+@pytest.mark.parametrize("interpolation", grid.INTERPOLATIONS)
+@pytest.mark.parametrize("dtype", grid.DTYPES)
+def test_the_analytic_gradient_is_the_automatic_one(interpolation, dtype):
+    baked = grid.bake(
+        solid("ellipsoid", *SMOOTH["ellipsoid"]), dataclasses.replace(COARSE, interpolation=interpolation, dtype=dtype)
+    )
+    points = np.random.default_rng(5).uniform(-0.05, 0.05, (400, 3)).astype(np.float32)  # inside and beyond
+
+    def both(p):
+        value, gradient = grid._look_up(p, baked)
+        return value, jnp.stack(gradient, -1)
+
+    _, analytic = jax.jit(both)(points)
+    automatic = jax.jit(jax.grad(lambda p: grid.signed_distance(p, baked).sum()))(points)
+    np.testing.assert_allclose(analytic, automatic, atol=2e-5)
+
+
+def test_classes_share_one_array_and_scale():
+    """Under vmap each environment reads its own class at its own size, as if alone; the values are not copied."""
+    kinds = [solid("sphere", 0.02), solid("box", 0.02, 0.03, 0.02), solid("capsule", 0.015, 0.02)]
+    baked = [grid.bake(kind, COARSE) for kind in kinds]
+    both = grid.stack(baked)
+    assert both.classes == 3 and both.values.shape == (3 * 24**3, 8)
+    points = np.random.default_rng(6).uniform(-0.05, 0.05, (200, 3)).astype(np.float32)
+    index, scale = jnp.array([2, 0, 1, 2]), jnp.array([1.0, 1.2, 0.8, 1.1])
+
+    def felt(index, scale):
+        return grid.signed_distance(points, grid.select(both, index, scale))
+
+    run = jax.jit(jax.vmap(felt))
+    together = np.asarray(run(index, scale))
+    for row, k, s in zip(together, index, scale, strict=True):
+        np.testing.assert_allclose(row, s * signed_distance(points / np.float32(s), baked[int(k)]), atol=1e-7)
+    # No intermediate is as large as a copy of the values per environment.
+    assert run.lower(index, scale).compile().memory_analysis().temp_size_in_bytes < 4 * both.values.size
+    with pytest.raises(ConfigError, match="one configuration"):
+        grid.stack([baked[0], grid.bake(kinds[0], GridConfig(nodes=16))])
+
+
+def trilinear(points, distance, origin, step):
+    """Distance and gradient in float64 from a cube of nodes [n, n, n] by the formula: weights of 8 corners, one at a
+    time; beyond the cube the distance at its nearest point plus the way there."""
+    n = len(distance)
+    at = (points - origin) / step
+    held = np.clip(at, 0, n - 1)
+    cell = np.minimum(held.astype(int), n - 2)
+    part, gap = held - cell, (at - held) * step
+    value, gradient = np.zeros(len(points)), np.zeros(points.shape)
+    for corner in np.ndindex(2, 2, 2):
+        node = distance[tuple((cell + corner).T)]
+        weight = np.where(corner, part, 1 - part)
+        value += node * weight.prod(1)
+        for axis in range(3):
+            others = np.delete(weight, axis, 1).prod(1)
+            gradient[:, axis] += node * others * (1 if corner[axis] else -1) / step[axis]
+    way = np.linalg.norm(gap, axis=1)
+    return value + way, np.where(at == held, gradient, 0) + gap / np.maximum(way, 1e-30)[:, None]
+
+
+@pytest.mark.parametrize("dtype", grid.DTYPES)
+@pytest.mark.parametrize("classes", [1, 3])
+def test_values_normals_and_gradients_are_trilinear(classes, dtype):
+    """However the corners lie in memory: nodes at random, in every cell, on its faces and beyond the grid; one class or
+    one an environment. Nodes that float16 holds, and powers of two, so that arithmetic in float32 errs by little."""
+    n, rng = 10, np.random.default_rng(8)
+    config = GridConfig(nodes=n, dtype=dtype)
+    slope = np.einsum("kijl,k->ijl", np.indices((n, n, n)), [1.0, -0.5, 0.75])
+    cubes = [(slope + rng.uniform(-0.3, 0.3, slope.shape)).astype("float16") for _ in range(classes)]  # mm
+    origin, step = -np.array([4.0, 2, 6]) / 512, np.array([1.0, 0.5, 2]) / 512
+    shelf = grid.stack(
+        [
+            grid.Grid(
+                nodes=n,
+                interpolation="linear",
+                values=jnp.asarray(grid._pack(cube.reshape(-1, 1), config)),
+                origin=jnp.asarray([size * origin]),
+                spacing=jnp.asarray([size * step]),
+                index=jnp.int32(0),
+                scale=jnp.ones(()),
+            )
+            for size, cube in zip((1.0, 2.0, 0.5), cubes, strict=False)
+        ]
+    )
+    assert shelf.values.shape == ((classes * n**3, 8) if dtype == "float32" else (classes * n**3,))
+    index, scale = np.arange(4) % classes, np.array([1.0, 2.0, 0.5, 4.0])
+    at = np.concatenate([np.indices((n, n, n)).reshape(3, -1).T, rng.integers(-96, 32 * (n + 3), (3000, 3)) / 32])
+    start, spacing = np.float64(shelf.origin)[index], np.float64(shelf.spacing)[index]
+    smooth = np.all((at != 0) & (at != n - 1), 1)  # on the outermost faces JAX's clip halves its derivative
+    points = start[:, None] + at * spacing[:, None]
+
+    def felt(points, index, scale):
+        own = grid.select(shelf, index, scale)
+        automatic = jax.grad(lambda p: grid.signed_distance(p, own).sum())(points)
+        return *grid.distance_and_normal(points, own), automatic
+
+    ours = jax.jit(jax.vmap(felt))(np.float32(scale[:, None, None] * points), index, scale)
+    for env, (value, normal, automatic) in enumerate(zip(*ours, strict=True)):
+        wanted, gradient = trilinear(points[env], 1e-3 * np.float64(cubes[index[env]]), start[env], spacing[env])
+        clear = np.linalg.norm(gradient, axis=1) > 0.1  # a shorter one has no direction to speak of
+        direction = gradient / np.linalg.norm(gradient, axis=1, keepdims=True)
+        np.testing.assert_allclose(value, scale[env] * wanted, rtol=1e-6, atol=1e-9)
+        np.testing.assert_allclose(automatic[smooth], gradient[smooth], rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(normal[clear], direction[clear], rtol=1e-6, atol=1e-6)
+        assert clear.mean() > 0.99
+
+
+def test_a_mesh_is_baked_once(monkeypatch, tmp_path):
+    box = trimesh.creation.box(2 * BOX)
+    first = distance.prepare(box, distance.DistanceConfig(grid=COARSE))
+    points = np.random.default_rng(7).uniform(-0.03, 0.03, (500, 3)).astype(np.float32)
+    baked = grid.bake(solid("box", *BOX), COARSE)
+    np.testing.assert_allclose(signed_distance(points, first), signed_distance(points, baked), atol=1e-6)
+    (kept,) = grid.cache_folder().glob("*.npz")
+
+    def refuse(*_):
+        raise AssertionError("baked again")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(mesh, "signed_distance", refuse)
+        again = distance.prepare(box, distance.DistanceConfig(grid=COARSE))
+        np.testing.assert_array_equal(again.values, first.values)
+        half = dataclasses.replace(COARSE, dtype="float16")  # storage is no reason to bake again
+        assert distance.prepare(box, distance.DistanceConfig(grid=half)).values.dtype == jnp.uint32
+        with pytest.raises(AssertionError, match="baked again"):
+            distance.prepare(box, distance.DistanceConfig(grid=dataclasses.replace(COARSE, pad=0.005)))
+    kept.write_bytes(kept.read_bytes()[:1000])  # damaged: baked again without a word
+    np.testing.assert_array_equal(distance.prepare(box, distance.DistanceConfig(grid=COARSE)).values, first.values)
+    monkeypatch.setenv("DEXSIM_CACHE", "/proc/nowhere")  # not writable: no error
+    np.testing.assert_array_equal(distance.prepare(box, distance.DistanceConfig(grid=COARSE)).values, first.values)

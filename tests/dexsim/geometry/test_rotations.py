@@ -1,0 +1,120 @@
+"""Rotations against C MuJoCo, NumPy and hand-made cases."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dexsim.geometry import rotations
+
+RNG = np.random.default_rng(0)
+QUATS = RNG.normal(size=(64, 4))
+QUATS /= np.linalg.norm(QUATS, axis=1, keepdims=True)
+AXES = RNG.normal(size=(64, 3))
+AXES /= np.linalg.norm(AXES, axis=1, keepdims=True)
+ANGLES = RNG.uniform(-7, 7, 64)
+
+
+def mujoco_matrix(quat):
+    out = np.zeros(9)
+    mujoco.mju_quat2Mat(out, np.asarray(quat, float))
+    return out.reshape(3, 3)
+
+
+def f32(x):
+    return np.asarray(x, np.float32)
+
+
+@jax.jit
+def turned_angle(start, axis, angle):
+    """Angle between `start` and `start` turned."""
+    return rotations.quat_angle(start, rotations.quat_multiply(rotations.axis_angle_to_quat(axis, angle), start))
+
+
+def test_quaternion_to_matrix_is_mujocos():
+    ours = rotations.quat_to_matrix(f32(QUATS))
+    np.testing.assert_allclose(ours, [mujoco_matrix(q) for q in QUATS], atol=1e-6)
+    np.testing.assert_allclose(rotations.quat_to_matrix(-f32(QUATS)), ours, atol=0)
+
+
+def test_axis_angle_both_ways_is_mujocos():
+    wanted = np.zeros((64, 4))
+    for row, axis, angle in zip(wanted, AXES, ANGLES, strict=True):
+        mujoco.mju_axisAngle2Quat(row, axis, angle)
+    quat = rotations.axis_angle_to_quat(f32(AXES), f32(ANGLES))
+    np.testing.assert_allclose(quat, wanted, atol=1e-6)
+    matrix = rotations.axis_angle_to_matrix(f32(AXES), f32(ANGLES))
+    np.testing.assert_allclose(matrix, [mujoco_matrix(q) for q in wanted], atol=2e-6)
+
+
+def test_quaternion_product_and_inverse_are_mujocos():
+    left, right = QUATS, QUATS[::-1]
+    wanted = np.zeros((64, 4))
+    for row, a, b in zip(wanted, left, right, strict=True):
+        mujoco.mju_mulQuat(row, a, b)
+    np.testing.assert_allclose(rotations.quat_multiply(f32(left), f32(right)), wanted, atol=1e-6)
+    unit = rotations.quat_multiply(rotations.quat_conjugate(f32(left)), f32(left))
+    np.testing.assert_allclose(unit, np.tile([1, 0, 0, 0], (64, 1)), atol=1e-6)
+
+
+def test_products_broadcast_like_matmul():
+    matrix, vector = RNG.normal(size=(5, 1, 3, 3)), RNG.normal(size=(4, 3))
+    np.testing.assert_allclose(
+        rotations.rotate(f32(matrix), f32(vector)), np.einsum("aoij,bj->abi", matrix, vector), rtol=1e-5, atol=1e-6
+    )
+    np.testing.assert_allclose(
+        rotations.rotate_inverse(f32(matrix), f32(vector)),
+        np.einsum("aoij,bi->abj", matrix, vector),
+        rtol=1e-5,
+        atol=1e-6,
+    )
+    other = RNG.normal(size=(4, 3, 3))
+    np.testing.assert_allclose(rotations.compose(f32(matrix), f32(other)), matrix @ other, rtol=1e-5, atol=1e-6)
+
+
+def test_a_quarter_turn_by_hand():
+    quarter = rotations.axis_angle_to_quat(jnp.array([0.0, 0.0, 1.0]), jnp.pi / 2)
+    np.testing.assert_allclose(quarter, [np.sqrt(0.5), 0, 0, np.sqrt(0.5)], atol=1e-6)
+    turned = rotations.rotate(rotations.quat_to_matrix(quarter), jnp.array([1.0, 0.0, 0.0]))
+    np.testing.assert_allclose(turned, [0, 1, 0], atol=1e-6)
+
+
+@given(st.floats(1e-5, np.pi - 1e-3), st.integers(0, 63), st.integers(0, 63))
+def test_angle_between_orientations(angle, at, about):
+    # Unit quaternions in float32 are good for about 1e-7, so an angle of 1e-5 for a few percent.
+    assert float(turned_angle(f32(QUATS[at]), f32(AXES[about]), f32(angle))) == pytest.approx(angle, abs=1e-6, rel=1e-5)
+
+
+def test_a_quaternion_and_its_negative_are_one_orientation():
+    assert float(np.max(rotations.quat_angle(f32(QUATS), -f32(QUATS)))) < 1e-6
+
+
+def test_angle_has_a_finite_gradient_at_zero():
+    quat = f32(QUATS[0])
+    assert float(rotations.quat_angle(quat, quat)) < 1e-6
+    assert np.all(np.isfinite(jax.grad(rotations.quat_angle)(quat, quat)))
+
+
+def test_six_d_is_two_columns_and_comes_back():
+    matrix = np.array([mujoco_matrix(q) for q in QUATS])
+    sixd = rotations.matrix_to_6d(f32(matrix))
+    np.testing.assert_allclose(sixd[:, :3], matrix[:, :, 0], atol=1e-6)
+    np.testing.assert_allclose(sixd[:, 3:], matrix[:, :, 1], atol=1e-6)
+    np.testing.assert_allclose(rotations.matrix_from_6d(sixd), matrix, atol=1e-6)
+
+
+def test_six_d_of_any_two_vectors_is_a_rotation():
+    matrix = np.asarray(rotations.matrix_from_6d(f32(RNG.normal(size=(64, 6)) * 3)), float)
+    np.testing.assert_allclose(matrix @ matrix.transpose(0, 2, 1), np.tile(np.eye(3), (64, 1, 1)), atol=1e-5)
+    np.testing.assert_allclose(np.linalg.det(matrix), 1.0, atol=1e-5)
+
+
+def test_random_orientations_are_uniform():
+    quat = np.asarray(jax.vmap(rotations.random_quat)(jax.random.split(jax.random.key(0), 4000)))
+    np.testing.assert_allclose(np.linalg.norm(quat, axis=1), 1.0, atol=1e-6)
+    # Uniform on the 3-sphere: E[q] = 0 and E[q q'] = I / 4.
+    np.testing.assert_allclose(quat.mean(0), 0, atol=0.03)
+    np.testing.assert_allclose(quat.T @ quat / len(quat), np.eye(4) / 4, atol=0.02)

@@ -1,0 +1,379 @@
+"""Signed distances against the nearest point of a densely searched surface."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial import cKDTree
+
+from dexsim.core.errors import ConfigError
+from dexsim.geometry import sdf
+
+EYE = np.eye(3, dtype=np.float32)
+SIZES = {
+    "sphere": (0.031, 0, 0),
+    "box": (0.02, 0.035, 0.012),
+    "capsule": (0.013, 0.022, 0),
+    "cylinder": (0.024, 0.017, 0),
+    "ellipsoid": (0.037, 0.016, 0.025),
+}
+
+
+# --- an independent reference: the surface in patches, float64 -----------------------------------
+
+
+def fibonacci(count):
+    """Directions [count, 3] spread evenly over the sphere."""
+    z = 1 - (2 * np.arange(count) + 1) / count
+    turn = np.arange(count) * np.pi * (3 - np.sqrt(5))
+    return np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z], -1)
+
+
+def radial(points, radius, height):
+    """Points at this distance from the z axis, in the direction in which `points` lie."""
+    across = points[:, :2] / np.maximum(np.linalg.norm(points[:, :2], axis=1, keepdims=True), 1e-300)
+    across = np.where(np.linalg.norm(across, axis=1, keepdims=True) > 0.5, across, [1.0, 0.0])
+    return np.column_stack([across * np.reshape(radius, (-1, 1)), np.broadcast_to(height, len(points))])
+
+
+def ball(points, centre, radius):
+    seen = points - centre
+    length = np.linalg.norm(seen, axis=1, keepdims=True)
+    out = [0.0, 0.0, -1.0 if centre[2] < 0 else 1.0]
+    return centre + radius * np.where(length > 0, seen / np.maximum(length, 1e-300), out)
+
+
+def ellipsoid_point(size, points):
+    """By a dense search, then by ever smaller random steps from the best three."""
+    rng = np.random.default_rng(0)
+    best = fibonacci(3000)
+    gap = np.linalg.norm(points[:, None] - best * size, axis=-1)
+    best = best[np.argpartition(gap, 3, axis=1)[:, :3]]  # [P, 3, 3]
+    for spread in 0.1 * 0.75 ** np.arange(60):
+        steps = spread * rng.normal(size=(*best.shape[:2], 16, 3))
+        steps[..., 0, :] = 0
+        tries = best[:, :, None] + steps
+        tries /= np.linalg.norm(tries, axis=-1, keepdims=True)
+        gap = np.linalg.norm(points[:, None, None] - tries * size, axis=-1)
+        best = np.take_along_axis(tries, gap.argmin(-1)[..., None, None], 2)[..., 0, :]
+    return [best[:, start] * size for start in range(3)]
+
+
+def nearest_point(kind, size, points):
+    """The nearest point [P, 3] of the surface: of the nearest points of each of its patches, the nearest."""
+    a, b, _ = (float(s) for s in size)
+    across = np.linalg.norm(points[:, :2], axis=1)
+    if kind == "sphere":
+        patches = [ball(points, np.zeros(3), a)]
+    elif kind == "ellipsoid":
+        patches = ellipsoid_point(np.asarray(size, float), points)
+    elif kind == "box":
+        patches = []
+        for axis in range(3):
+            for side in (-1, 1):
+                face = np.clip(points, -np.asarray(size, float), size)
+                face[:, axis] = side * size[axis]
+                patches.append(face)
+    elif kind == "cylinder":
+        patches = [
+            radial(points, np.full(len(points), a), np.clip(points[:, 2], -b, b)),
+            radial(points, np.minimum(across, a), b),
+            radial(points, np.minimum(across, a), -b),
+        ]
+    else:  # capsule; beyond the tube's ends only the half of a ball that looks outwards is surface
+        patches = [radial(points, np.full(len(points), a), np.clip(points[:, 2], -b, b))]
+        for side in (-1, 1):
+            cap = ball(points, np.array([0, 0, side * b]), a)
+            patches.append(np.where(side * cap[:, 2:] >= b, cap, np.inf))
+    gap = np.linalg.norm(points - np.array(patches), axis=-1)
+    return np.array(patches)[gap.argmin(0), np.arange(len(points))]
+
+
+def is_inside(kind, size, points):
+    a, b, _ = size
+    across, z = np.linalg.norm(points[:, :2], axis=1), np.abs(points[:, 2])
+    return {
+        "sphere": lambda: np.hypot(across, z) < a,
+        "box": lambda: np.all(np.abs(points) < size, axis=1),
+        "cylinder": lambda: (across < a) & (z < b),
+        "capsule": lambda: np.hypot(across, np.maximum(z - b, 0)) < a,
+        "ellipsoid": lambda: np.sum((points / size) ** 2, axis=1) < 1,
+    }[kind]()
+
+
+def reference(kind, size, points):
+    gap = np.linalg.norm(points - nearest_point(kind, size, points), axis=-1)
+    return np.where(is_inside(kind, size, points), -gap, gap)
+
+
+def surface_samples(kind, size, step=4e-4):
+    """Points all over the surface, about `step` apart, edges included."""
+    a, b, c = (float(s) for s in size)
+    if kind == "box":
+        faces = []
+        for axis in range(3):
+            u, v = (np.linspace(-s, s, int(2 * s / step) + 2) for s in np.delete(size, axis))
+            face = np.stack(np.meshgrid(u, v), -1).reshape(-1, 2)
+            faces += [np.insert(face, axis, side * size[axis], axis=1) for side in (-1, 1)]
+        return np.concatenate(faces)
+    if kind in ("sphere", "ellipsoid"):
+        return fibonacci(120_000) * (size if kind == "ellipsoid" else a)
+    rim = np.linspace(0, 2 * np.pi, int(2 * np.pi * a / step) + 2)
+    rim = np.stack([np.cos(rim), np.sin(rim), 0 * rim], -1)
+    rise = np.linspace(-b, b, int(2 * b / step) + 2)[:, None, None] * [0, 0, 1]
+    tube = (a * rim + rise).reshape(-1, 3)
+    if kind == "cylinder":
+        disc = (np.linspace(0, a, int(a / step) + 2)[:, None, None] * rim).reshape(-1, 3)
+        return np.concatenate([tube, disc + [0, 0, b], disc - [0, 0, b]])
+    ends = a * fibonacci(40_000)
+    return np.concatenate([tube, ends + np.sign(ends[:, 2:]) * [0, 0, b]])
+
+
+def probes(size, count=150, seed=0):
+    """Points inside, near and outside, on axes and on symmetry planes, and the centre."""
+    rng = np.random.default_rng(seed)
+    reach = np.where(np.array(size) > 0, size, max(size))
+    points = reach * rng.uniform(-2.2, 2.2, (count, 3))
+    points[: count // 3] *= 0.3
+    points[::5, rng.integers(3)] = 0
+    points[1::10, :2] = 0
+    points[2::10, 1:] = 0
+    points[3::10, 2] *= 1e-6
+    points[0] = 0
+    return points.astype(np.float32)
+
+
+def one(kind, size, position=(0, 0, 0), rotation=EYE):
+    """A single primitive. All kinds are there and the others switched off, so that all share a compilation."""
+    count, at = len(sdf.KINDS), sdf.KINDS.index(kind)
+    sizes = np.full((count, 3), 1e-4, np.float32)
+    sizes[at] = size
+    return sdf.Shape(
+        sdf.KINDS,
+        sizes,
+        np.tile(np.float32(position), (count, 1)),
+        np.tile(np.float32(rotation), (count, 1, 1)),
+        np.arange(count) == at,
+    )
+
+
+def random_rotation(rng):
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    return turn * np.sign(np.linalg.det(turn))
+
+
+distance = jax.jit(sdf.signed_distance)
+distance_and_normal = jax.jit(sdf.distance_and_normal)
+
+
+# --- single primitives ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", sdf.KINDS)
+def test_distance_to_the_nearest_surface_point(kind):
+    points = probes(SIZES[kind])
+    wanted = reference(kind, SIZES[kind], points.astype(float))
+    assert (wanted < -1e-3).sum() > 10 and (wanted > 1e-3).sum() > 10
+    np.testing.assert_allclose(distance(points, one(kind, SIZES[kind])), wanted, atol=2e-6)
+
+
+@pytest.mark.parametrize("size", [(0.02, 0.02, 0.02), (0.05, 0.01, 0.01), (0.03, 0.03, 0.01), (0.011, 0.05, 0.012)])
+def test_ellipsoids_of_all_proportions(size):
+    points = probes(size, seed=1)
+    wanted = reference("ellipsoid", size, points.astype(float))
+    np.testing.assert_allclose(distance(points, one("ellipsoid", size)), wanted, atol=1e-5)
+
+
+def test_distances_by_hand():
+    cases = (
+        ("sphere", (0, 0, 0.05), 0.019),
+        ("box", (0.05, 0, 0), 0.03),
+        ("box", (0, 0, 0), -0.012),
+        ("box", (0.023, 0.039, 0), 0.005),
+        ("capsule", (0, 0, 0.05), 0.015),
+        ("capsule", (0.02, 0, 0.01), 0.007),
+        ("cylinder", (0, 0, 0.02), 0.003),
+        ("cylinder", (0.027, 0, 0.021), 0.005),
+        ("cylinder", (0, 0, 0), -0.017),
+        ("ellipsoid", (0.04, 0, 0), 0.003),
+        ("ellipsoid", (0, 0, 0), -0.016),
+        ("ellipsoid", (0, 0.015, 0), -0.001),
+    )
+    for kind, point, wanted in cases:
+        ours = distance(np.float32([point]), one(kind, SIZES[kind]))
+        np.testing.assert_allclose(ours, [wanted], atol=1e-6, err_msg=f"{kind} {point}")
+
+
+@pytest.mark.parametrize("kind", sdf.KINDS)
+def test_normals_are_unit_and_point_from_the_nearest_point(kind):
+    points = probes(SIZES[kind], seed=2).astype(float)
+    nearest = nearest_point(kind, SIZES[kind], points)
+    gap = np.linalg.norm(points - nearest, axis=1, keepdims=True)
+    _, normal = distance_and_normal(points.astype(np.float32), one(kind, SIZES[kind]))
+    outside = ~is_inside(kind, SIZES[kind], points)
+    far = outside & (gap[:, 0] > 1e-3)
+    assert far.sum() > 50
+    np.testing.assert_allclose(np.linalg.norm(normal, axis=1)[outside], 1.0, atol=1e-5)
+    np.testing.assert_allclose(np.asarray(normal)[far], ((points - nearest) / gap)[far], atol=2e-3)
+
+
+@pytest.mark.parametrize("kind", sdf.KINDS)
+def test_normals_are_the_gradient_of_the_distance(kind):
+    rng = np.random.default_rng(3)
+    size = np.array(SIZES[kind])
+    points = (np.where(size > 0, size, size.max()) * rng.uniform(-1.5, 1.5, (150, 3))).astype(np.float32)
+    shape, step = one(kind, SIZES[kind]), 1e-4
+    middle, normal = distance_and_normal(points, shape)
+    ahead, behind = (np.stack([distance(points + sign * step * axis, shape) for axis in EYE], -1) for sign in (1, -1))
+    # Where the two one-sided slopes differ lies a ridge (equally near to two faces): no gradient there.
+    smooth = np.all(np.abs(ahead + behind - 2 * np.asarray(middle)[:, None]) < 0.02 * step, axis=1)
+    assert smooth.mean() > 0.8 and (np.asarray(middle)[smooth] < 0).sum() > 10
+    np.testing.assert_allclose(np.asarray(normal)[smooth], ((ahead - behind) / (2 * step))[smooth], atol=2e-2)
+    np.testing.assert_allclose(np.linalg.norm(normal, axis=1)[smooth], 1.0, atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", sdf.KINDS)
+def test_gradients_are_finite_at_the_centre_and_on_the_axes(kind):
+    size = np.array(SIZES[kind])
+    points = np.concatenate([np.zeros((1, 3)), 0.01 * EYE, -0.05 * EYE, np.diag(size)]).astype(np.float32)
+    for gradient in pose_gradients(points, one(kind, size)):
+        assert np.all(np.isfinite(gradient))
+
+
+@jax.jit
+def pose_gradients(points, shape):
+    """Gradient of the sum of distances in points, sizes, positions and rotations."""
+
+    def total(points, size, position, rotation):
+        return jnp.sum(sdf.signed_distance(points, sdf.Shape(shape.kinds, size, position, rotation, shape.active)))
+
+    return jax.grad(total, argnums=(0, 1, 2, 3))(points, shape.size, shape.position, shape.rotation)
+
+
+@pytest.mark.parametrize("kind", sdf.KINDS)
+def test_size_gradients(kind):
+    """The distance above a pole falls as the semi-axis there grows, one to one, and knows no other size."""
+    pole = np.zeros((1, 3), np.float32)
+    pole[0, 2] = 0.06
+    gradient = pose_gradients(np.tile(pole, (10, 1)), one(kind, SIZES[kind]))[1][sdf.KINDS.index(kind)] / 10
+    wanted = {
+        "sphere": [-1, 0, 0],
+        "box": [0, 0, -1],
+        "capsule": [-1, -1, 0],
+        "cylinder": [0, -1, 0],
+        "ellipsoid": [0, 0, -1],
+    }[kind]
+    np.testing.assert_allclose(gradient, wanted, atol=1e-4)
+
+
+# --- invariances -----------------------------------------------------------------------------------
+
+
+@given(st.sampled_from(sdf.KINDS), st.floats(0.3, 3.0), st.integers(0, 10**6))
+def test_distance_scales_with_the_object(kind, factor, seed):
+    rng = np.random.default_rng(seed)
+    size = rng.uniform(0.01, 0.04, 3).astype(np.float32)
+    points = rng.uniform(-0.08, 0.08, (150, 3)).astype(np.float32)
+    factor = np.float32(factor)
+    small, large = distance(points, one(kind, size)), distance(points * factor, one(kind, size * factor))
+    np.testing.assert_allclose(large, np.asarray(small) * factor, atol=1e-6, rtol=1e-5)
+
+
+@given(st.sampled_from(sdf.KINDS), st.integers(0, 10**6))
+def test_distance_knows_no_frame(kind, seed):
+    rng = np.random.default_rng(seed)
+    size = rng.uniform(0.01, 0.04, 3).astype(np.float32)
+    points = rng.uniform(-0.08, 0.08, (150, 3))
+    turn, shift = random_rotation(rng), rng.uniform(-0.2, 0.2, 3)
+    before, normal = distance_and_normal(np.float32(points), one(kind, size))
+    after, turned = distance_and_normal(np.float32(points @ turn.T + shift), one(kind, size, shift, turn))
+    np.testing.assert_allclose(after, before, atol=1e-6)
+    smooth = np.linalg.norm(normal, axis=1) > 0.999
+    np.testing.assert_allclose((np.asarray(turned) @ turn)[smooth], np.asarray(normal)[smooth], atol=2e-2)
+
+
+# --- unions ----------------------------------------------------------------------------------------
+
+
+def posed_union(seed):
+    """Three overlapping primitives at random poses, and a fourth far away, as arrays and as a `Shape`."""
+    rng = np.random.default_rng(seed)
+    kinds = ("box", "capsule", "ellipsoid", "cylinder")
+    size = np.array([SIZES[k] for k in kinds])
+    position = rng.uniform(-0.02, 0.02, (4, 3))
+    position[3] += 0.2
+    rotation = np.stack([random_rotation(rng) for _ in kinds])
+    shape = sdf.Shape(kinds, *(jnp.asarray(x, jnp.float32) for x in (size, position, rotation)), jnp.ones(4, bool))
+    return kinds, size, position, rotation, shape
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_union_is_exact_outside(seed):
+    """Against samples of the outer surface only: of each primitive, those outside of all the others."""
+    kinds, size, position, rotation, shape = posed_union(seed)
+    skin = []
+    for k, kind in enumerate(kinds):
+        points = surface_samples(kind, size[k]) @ rotation[k].T + position[k]
+        for other, name in enumerate(kinds):
+            if other != k:
+                points = points[~is_inside(name, size[other], (points - position[other]) @ rotation[other])]
+        skin.append(points)
+    probe = np.random.default_rng(seed + 10).uniform(-0.09, 0.09, (400, 3))
+    inside = np.any(
+        [is_inside(kind, size[k], (probe - position[k]) @ rotation[k]) for k, kind in enumerate(kinds)], axis=0
+    )
+    ours = np.asarray(distance(probe.astype(np.float32), shape))
+    assert np.array_equal(ours < 0, inside) and inside.sum() > 3
+    gap = cKDTree(np.concatenate(skin)).query(probe[~inside])[0]
+    # Samples lie up to 0.4 mm apart, so they can only be farther, and by less than that.
+    assert np.all(gap - ours[~inside] > -2e-6) and np.all(gap - ours[~inside] < 4e-4)
+    assert np.median(gap - ours[~inside]) < 1e-5
+
+
+def test_union_inside_is_never_deeper_than_the_nearest_surface_allows():
+    kinds, size, position, rotation, shape = posed_union(4)
+    probe = np.random.default_rng(5).uniform(-0.02, 0.02, (200, 3))
+    each = np.stack([reference(kind, size[k], (probe - position[k]) @ rotation[k]) for k, kind in enumerate(kinds)])
+    np.testing.assert_allclose(distance(probe.astype(np.float32), shape), each.min(0), atol=3e-6)
+
+
+def test_bounds_touch_the_surface_on_every_side():
+    kinds, size, position, rotation, shape = posed_union(7)
+    skin = [surface_samples(kind, size[k]) @ rotation[k].T + position[k] for k, kind in enumerate(kinds)]
+    skin = np.concatenate(skin)
+    np.testing.assert_allclose(sdf.bounds(shape), [skin.min(0), skin.max(0)], atol=2e-4)
+    assert np.all(sdf.bounds(shape)[0] <= skin.min(0) + 1e-7) and np.all(sdf.bounds(shape)[1] >= skin.max(0) - 1e-7)
+    only = dataclasses.replace(shape, active=jnp.array([False, False, True, False]))
+    ellipsoid = surface_samples("ellipsoid", size[2]) @ rotation[2].T + position[2]
+    np.testing.assert_allclose(sdf.bounds(only), [ellipsoid.min(0), ellipsoid.max(0)], atol=2e-4)
+    with pytest.raises(ConfigError, match="no active primitive"):
+        sdf.bounds(dataclasses.replace(shape, active=jnp.zeros(4, bool)))
+
+
+def test_inactive_primitives_do_not_count():
+    kinds, size, position, rotation, shape = posed_union(6)
+    points = np.random.default_rng(7).uniform(-0.08, 0.08, (50, 3)).astype(np.float32)
+    only = dataclasses.replace(shape, active=jnp.array([False, True, False, False]))
+    alone = sdf.Shape(kinds[1:2], shape.size[1:2], shape.position[1:2], shape.rotation[1:2], jnp.array([True]))
+    np.testing.assert_array_equal(distance(points, only), distance(points, alone))
+    none = dataclasses.replace(shape, active=jnp.zeros(4, bool))
+    np.testing.assert_array_equal(distance(points, none), sdf.FAR)
+
+
+def test_distance_of_a_batch_is_the_loop(hand):
+    """vmap over objects of different sizes, as in a batch of environments."""
+    sizes = jnp.asarray(np.random.default_rng(8).uniform(0.01, 0.04, (6, 2, 3)), jnp.float32)
+    points = jnp.asarray(hand.taxel_position[1])
+
+    def shape(size):
+        return sdf.Shape(
+            ("box", "ellipsoid"), size, jnp.zeros((2, 3)), jnp.tile(jnp.eye(3), (2, 1, 1)), jnp.array([True, True])
+        )
+
+    batch = jax.jit(jax.vmap(lambda size: sdf.signed_distance(points, shape(size))))(sizes)
+    for row, size in zip(batch, sizes, strict=True):
+        np.testing.assert_allclose(row, distance(points, shape(size)), atol=1e-7)

@@ -1,0 +1,185 @@
+"""Nearest oriented points against a k-d tree; points lie on their surface; the three methods behind one signature."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from dexsim.core.errors import ConfigError
+from dexsim.geometry import distance, grid, mesh, sdf, surface_points
+from dexsim.geometry.distance import DistanceConfig
+from dexsim.geometry.surface_points import PointsConfig
+
+SIZES = {
+    "sphere": (0.03, 0, 0),
+    "box": (0.025, 0.02, 0.03),
+    "capsule": (0.013, 0.025, 0),
+    "cylinder": (0.02, 0.025, 0),
+    "ellipsoid": (0.03, 0.02, 0.04),
+}
+FEW = {"count": 300, "block": 16, "cells": 24}
+nearest = jax.jit(surface_points.nearest)
+
+
+def solid(kind, *size):
+    return sdf.Shape(
+        (kind,), jnp.asarray([(*size, 0, 0)[:3]], jnp.float32), jnp.zeros((1, 3)), jnp.eye(3)[None], jnp.array([True])
+    )
+
+
+def union():
+    """A box with a capsule jutting out, and a primitive that is switched off."""
+    return sdf.Shape(
+        ("box", "capsule", "sphere"),
+        jnp.array([[0.02, 0.02, 0.02], [0.01, 0.015, 0], [0.05, 0, 0]]),
+        jnp.array([[0, 0, 0], [0, 0, 0.03], [0.2, 0, 0]]),
+        jnp.tile(jnp.eye(3), (3, 1, 1)),
+        jnp.array([True, True, False]),
+    )
+
+
+def probes(shape, count=2000, room=0.004, seed=0):
+    low, high = sdf.bounds(shape)
+    return np.random.default_rng(seed).uniform(low - room, high + room, (count, 3)).astype(np.float32)
+
+
+@pytest.mark.parametrize("kind", SIZES)
+def test_points_lie_on_the_surface_and_look_outward(kind):
+    shape = solid(kind, *SIZES[kind])
+    surface = surface_points.from_shape(shape, PointsConfig(table=False, count=500))
+    assert surface.position.shape == (500, 3)
+    outside = surface.position + 1e-4 * surface.normal
+    value, normal = sdf.distance_and_normal(outside, shape)
+    np.testing.assert_allclose(value, 1e-4, atol=1e-6)
+    np.testing.assert_allclose(normal, surface.normal, atol=2e-2)
+    # Evenly: no point of the surface is farther from its nearest one than a few mean spacings.
+    dense = mesh_like(kind)
+    area = {
+        "sphere": 4 * np.pi * 0.03**2,
+        "box": 8 * (0.025 * 0.02 + 0.02 * 0.03 + 0.03 * 0.025),
+        "capsule": 4 * np.pi * 0.013 * 0.038,
+        "cylinder": 2 * np.pi * 0.02 * 0.07,
+        "ellipsoid": 0.0112,
+    }[kind]
+    gap = cKDTree(np.asarray(surface.position)).query(dense)[0]
+    assert gap.max() < 2.2 * np.sqrt(area / 500)
+
+
+def mesh_like(kind):
+    """Many random points of the surface: random ones nearby, moved along the gradient."""
+    shape = solid(kind, *SIZES[kind])
+    points = jnp.asarray(probes(shape, 4000, seed=1))
+    for _ in range(3):
+        value, normal = sdf.distance_and_normal(points, shape)
+        points = points - value[:, None] * normal
+    return np.asarray(points)[np.abs(sdf.signed_distance(points, shape)) < 1e-6]
+
+
+@pytest.mark.parametrize("table", [False, True])
+def test_the_search_finds_the_nearest(table):
+    """Against a k-d tree; 300 points do not fill the last block. The table is complete near the surface only."""
+    shape = union()
+    surface = surface_points.from_shape(shape, PointsConfig(table=table, **FEW))
+    points = probes(shape)
+    real = np.asarray(surface.position)
+    gap, wanted = cKDTree(real.astype(float)).query(points.astype(float), k=2)
+    found = np.asarray(nearest(points, surface))
+    ours = np.linalg.norm(points - real[found], axis=1)
+    near = gap[:, 0] < 0.006
+    assert near.sum() > 300
+    np.testing.assert_allclose(ours[near], gap[near, 0], atol=1e-6)
+    np.testing.assert_allclose(ours, gap[:, 0], atol=2e-3 if table else 1e-6)
+    sure = near & (gap[:, 1] - gap[:, 0] > 1e-6)
+    np.testing.assert_array_equal(found[sure], wanted[sure, 0])
+
+
+def test_points_of_inactive_and_buried_parts_do_not_count():
+    surface = surface_points.from_shape(union(), PointsConfig(table=False, **FEW))
+    real = np.asarray(surface.position)
+    real = real[np.abs(real).max(1) < 1]
+    np.testing.assert_allclose(sdf.signed_distance(jnp.asarray(real), union()), 0, atol=1e-6)
+    assert 300 < len(real) < 590
+
+
+def test_depth_is_the_offset_along_the_normal():
+    """By hand: one point at the origin that looks up."""
+    surface = surface_points.SurfacePoints(
+        4, 0, jnp.zeros((1, 3)), jnp.array([[0.0, 0, 1]]), jnp.zeros((1, 1), jnp.int16), jnp.zeros(3), jnp.ones(3)
+    )
+    value, normal = surface_points.distance_and_normal(jnp.array([[0.01, 0, -0.002], [0.0, 0.03, 0.004]]), surface)
+    np.testing.assert_allclose(value, [-0.002, 0.004], atol=1e-9)
+    np.testing.assert_array_equal(normal, [[0, 0, 1], [0, 0, 1]])
+
+
+def test_sizes_may_be_traced_and_differ_between_environments():
+    points = jnp.asarray(probes(solid("sphere", 0.03), 200))
+    config = PointsConfig(count=300, block=16)
+
+    def felt(radius):
+        return surface_points.signed_distance(points, surface_points.from_shape(solid("sphere", radius), config))
+
+    radii = jnp.array([0.02, 0.03])
+    together = jax.jit(jax.vmap(felt))(radii)
+    for row, radius in zip(together, radii, strict=True):
+        np.testing.assert_allclose(row, np.linalg.norm(points, axis=1) - radius, atol=2e-3)
+    slope = jax.jit(jax.grad(lambda r: felt(r).mean()))(0.03)
+    assert float(slope) == pytest.approx(-1, abs=0.02)
+
+
+def test_taxels_times_points_never_reach_memory():
+    """2,048 points, 60,000 taxels: the matrix would be 491 MB; the program needs a few numbers a taxel."""
+    config = PointsConfig(count=2048, table=False, block=16)
+    surface = surface_points.from_shape(solid("sphere", 0.03), config)
+    points = jax.ShapeDtypeStruct((60000, 3), jnp.float32)
+    plan = jax.jit(surface_points.signed_distance).lower(points, surface).compile().memory_analysis()
+    assert plan.temp_size_in_bytes < 60000 * 4 * 16
+
+
+def test_points_of_a_mesh():
+    trimesh = pytest.importorskip("trimesh")
+    ball = mesh.load_mesh(trimesh.creation.icosphere(subdivisions=4, radius=0.03))
+    surface = surface_points.from_mesh(ball, PointsConfig(**FEW))
+    gap = cKDTree(np.asarray(surface.position)).query(np.asarray(surface.position), k=2)[0][:, 1]
+    assert gap.min() > 0.5 * gap.max()  # far from each other
+    points = probes(solid("sphere", 0.03))
+    value = jax.jit(surface_points.signed_distance)(points, surface)
+    truth = np.linalg.norm(points, axis=1) - 0.03
+    near = np.abs(truth) < 0.003
+    assert np.abs(value - truth)[near].mean() < 2e-4
+
+
+# --- by name -------------------------------------------------------------------------------------
+
+
+def test_one_signature_for_all():
+    shape = solid("sphere", 0.03)
+    points = probes(shape, 500)
+    truth = np.linalg.norm(points, axis=1) - 0.03
+    near = np.abs(truth) < 0.003
+    for name, bound in (("closed_form", 1e-7), ("grid", 1.5e-5), ("surface_points", 2e-4)):
+        points_config = PointsConfig(block=16, table=False)
+        thing = distance.prepare(shape, DistanceConfig(method=name, points=points_config))
+        assert distance.method_of(thing) == name and isinstance(thing, distance.METHODS[name].kind)
+        value, normal = jax.jit(distance.distance_and_normal)(points, thing)
+        np.testing.assert_array_equal(jax.jit(distance.signed_distance)(points, thing), value)
+        assert np.abs(value - truth)[near].max() < bound
+        outward = points / np.linalg.norm(points, axis=1, keepdims=True)
+        assert np.sum(normal * outward, -1)[near].min() > 0.99
+        assert distance.prepare(thing) is thing
+
+
+def test_the_method_is_chosen_by_the_object():
+    trimesh = pytest.importorskip("trimesh")
+    box = trimesh.creation.box((0.04, 0.04, 0.04))
+    small = DistanceConfig(grid=grid.GridConfig(nodes=8), points=PointsConfig(count=32, table=False))
+    assert distance.method_of(distance.prepare(solid("sphere", 0.03))) == "closed_form"
+    assert distance.method_of(distance.prepare(box, small)) == "grid"
+    forced = DistanceConfig(method="surface_points", points=small.points)
+    assert distance.method_of(distance.prepare(box, forced)) == "surface_points"
+    with pytest.raises(ConfigError, match="is a mesh, choose grid or surface_points"):
+        distance.prepare(box, DistanceConfig(method="closed_form"))
+    with pytest.raises(ConfigError, match="prepared for 'grid'"):
+        distance.prepare(distance.prepare(box, small), forced)
+    with pytest.raises(ConfigError, match="prepare it first"):
+        distance.signed_distance(np.zeros((1, 3)), box)

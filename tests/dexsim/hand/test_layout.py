@@ -1,0 +1,165 @@
+"""Lattices on surfaces against their geometry; the layout file as the hand reads it; refusals."""
+
+import shutil
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from dexsim.core.assets import asset_path
+from dexsim.core.errors import AssetError, ConfigError
+from dexsim.geometry import sdf
+from dexsim.geometry.mesh import load_mesh
+from dexsim.hand import layout
+from dexsim.hand.load import load_hand
+
+
+def solid(kind, *size):
+    return sdf.Shape(
+        (kind,), jnp.asarray([(*size, 0, 0)[:3]], jnp.float32), jnp.zeros((1, 3)), jnp.eye(3)[None], jnp.array([True])
+    )
+
+
+@pytest.mark.parametrize("kind", ["rect", "hex"])
+def test_neighbours_are_a_pitch_apart(kind):
+    points = layout.lattice(9, 8, pitch=0.002, kind=kind)
+    flat = np.stack([points.u, points.v], -1)
+    gap = cKDTree(flat).query(flat, k=7)[0][:, 1:]
+    np.testing.assert_allclose(gap[:, 0], 0.002, rtol=1e-9)
+    neighbours = np.sum(np.isclose(gap, 0.002), 1)
+    assert neighbours.max() == (6 if kind == "hex" else 4)
+    np.testing.assert_allclose(flat.mean(0), 0, atol=1e-12)
+    # A cell's area: the hexagon of that pitch, or the square.
+    assert points.cell == pytest.approx(0.002**2 * (np.sqrt(3) / 2 if kind == "hex" else 1))
+
+
+@pytest.mark.parametrize(
+    ("kind", "sizes", "shape"),
+    [
+        ("plane", {}, None),
+        ("cylinder", {"radius": 0.008}, solid("cylinder", 0.008, 0.1)),
+        ("capsule", {"radius": 0.008, "half_length": 0.006}, solid("capsule", 0.008, 0.006)),
+        ("sphere", {"radius": 0.012}, solid("sphere", 0.012)),
+    ],
+)
+def test_patches_lie_on_their_surface(kind, sizes, shape):
+    patch = layout.on_surface(kind, layout.lattice(7, 9, pitch=0.002), **sizes)
+    np.testing.assert_allclose(np.linalg.norm(patch.normal, axis=1), 1, rtol=1e-12)
+    if shape is None:
+        np.testing.assert_array_equal(patch.position[:, 2], 0)
+        return
+    above = patch.position + 1e-5 * patch.normal
+    distance, normal = sdf.distance_and_normal(jnp.asarray(above, jnp.float32), shape)
+    np.testing.assert_allclose(distance, 1e-5, atol=1e-8)
+    np.testing.assert_allclose(normal, patch.normal, atol=1e-5)
+    # Rows keep their pitch in arc length everywhere, columns on the straight part.
+    grid = patch.position.reshape(7, 9, 3)
+    middle = grid[3]
+    radius = sizes["radius"]
+    chord = np.linalg.norm(np.diff(middle, axis=0), axis=1)
+    assert np.all((chord > 2 * radius * np.sin(0.001 / radius) - 1e-9) & (chord < 0.002 + 1e-9))
+    across = np.linalg.norm(np.diff(grid[:, 4], axis=0), axis=1)
+    np.testing.assert_allclose(across, 2 * radius * np.sin(0.001 / radius), rtol=1e-9)
+
+
+def test_areas_add_up_to_the_surface():
+    """A fine lattice round a whole zone of a sphere: 2 pi R times its height (Archimedes)."""
+    radius, columns = 0.01, 120
+    pitch = 2 * np.pi * radius / columns
+    points = layout.lattice(columns, 40, pitch=pitch * (1 - 1e-9))
+    patch = layout.on_surface("sphere", points, radius=radius)
+    height = 2 * radius * np.sin(20 * pitch / radius)
+    assert patch.area.sum() == pytest.approx(2 * np.pi * radius * height, rel=1e-3)
+
+
+def test_a_patch_of_a_mesh():
+    """On a fine ball the rays meet the sphere, and the areas are those of the surface below the cells."""
+    trimesh = pytest.importorskip("trimesh")
+    ball = load_mesh(trimesh.creation.icosphere(subdivisions=4, radius=0.02))
+    points = layout.lattice(9, 7, pitch=0.002)
+    patch = layout.on_mesh(ball, points, origin=(0.03, 0, 0), facing=(1, 0, 0), along=(0, 0, 1))
+    np.testing.assert_allclose(np.linalg.norm(patch.position, axis=1), 0.02, atol=6e-5)
+    np.testing.assert_allclose(patch.position[:, 2], points.v, atol=1e-12)
+    np.testing.assert_allclose(np.sort(np.unique(np.round(patch.position[:, 1], 9))), np.unique(np.round(points.u, 9)))
+    # Columns run so that (across, along, outward) is right-handed, as on the primitives.
+    across = patch.position[-7] - patch.position[0]
+    assert np.cross(across, [0, 0, 1]) @ [1, 0, 0] > 0
+    cosine = np.sqrt(1 - (points.u**2 + points.v**2) / 0.02**2)
+    np.testing.assert_allclose(patch.area, 0.002**2 / cosine, rtol=0.03)
+    with pytest.raises(AssetError, match=r"column 0, row 0 misses the mesh"):
+        layout.on_mesh(ball, layout.lattice(9, 7, pitch=0.01), origin=(0.03, 0, 0), facing=(1, 0, 0), along=(0, 0, 1))
+    with pytest.raises(AssetError, match="too steep"):
+        layout.on_mesh(ball, layout.lattice(2, 2, pitch=0.0279), origin=(0.03, 0, 0), facing=(1, 0, 0), along=(0, 0, 1))
+
+
+def test_the_hand_reads_what_was_written(tmp_path):
+    """A new skin for the shipped hand: 6 x 8 hexagonal taxels on capsules instead of its own."""
+    for name in ("xhand_right.xml", "xhand_right.toml"):
+        shutil.copy(asset_path(f"hand/{name}"), tmp_path / name)
+    toml = tmp_path / "xhand_right.toml"
+    toml.write_text(toml.read_text().replace("taxel_grid = [10, 12]", "taxel_grid = [6, 8]"))
+    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    points = layout.lattice(6, 8, pitch=0.0022, kind="hex")
+    patch = layout.on_surface("capsule", points, radius=0.009, half_length=0.006)
+    patch = layout.placed(patch, position=(0, 0, 0.025), rotation=turn)
+    patches = dict.fromkeys(("thumb", "index", "middle", "ring", "pinky"), patch)
+    path = layout.write_layout(tmp_path / "taxels.csv", patches)
+    hand = load_hand(toml)
+    assert hand.taxel_position.shape == (5, 48, 3) and hand.taxel_grid == (6, 8)
+    for finger in range(5):
+        np.testing.assert_allclose(hand.taxel_position[finger], patch.position, atol=6e-7)
+        np.testing.assert_allclose(hand.taxel_normal[finger], patch.normal, atol=2e-6)
+        np.testing.assert_allclose(hand.taxel_area[finger], patch.area, rtol=1e-5)
+    again = layout.read_layout(path)
+    assert list(again) == list(patches) and again["ring"].grid == (6, 8)
+    np.testing.assert_allclose(again["ring"].position, patch.position, atol=6e-7)
+
+
+def test_taxels_inside_the_link_are_refused(hand):
+    layout.check_hand(hand)
+    finger = solid("capsule", 0.008, 0.006)
+    patch = layout.on_surface("capsule", layout.lattice(5, 6, pitch=0.002), radius=0.008, half_length=0.006)
+    layout.check_outside(patch, finger)
+    sunk = layout.placed(patch, position=(-0.002, 0, 0))
+    words = r"^tip: taxel column \d, row \d lies 2(\.0)? mm inside its link \(\d+ of 30 do\)$"
+    with pytest.raises(AssetError, match=words):
+        layout.check_outside(sunk, finger, name="tip")
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: layout.lattice(0, 3, pitch=0.002), "0 x 3"),
+        (lambda: layout.lattice(2, 3, pitch=-1.0), "above 0"),
+        (lambda: layout.lattice(2, 2, pitch=0.002, kind="round"), "rect or hex"),
+        (
+            lambda: layout.on_surface("cone", layout.lattice(2, 2, pitch=0.002), radius=0.01),
+            "'cone': choose from plane",
+        ),
+        (lambda: layout.on_surface("sphere", layout.lattice(2, 2, pitch=0.002)), "radius"),
+        (lambda: layout.on_surface("cylinder", layout.lattice(20, 2, pitch=0.002), radius=0.005), "laps itself"),
+        (lambda: layout.on_surface("sphere", layout.lattice(2, 20, pitch=0.002), radius=0.01), "beyond the pole"),
+    ],
+)
+def test_refusals(make, words):
+    with pytest.raises(ConfigError, match=words) as caught:
+        make()
+    assert "\n" not in str(caught.value)
+
+
+def test_broken_layout_files(tmp_path):
+    path = tmp_path / "taxels.csv"
+    with pytest.raises(AssetError, match="no such file"):
+        layout.read_layout(path)
+    path.write_text("finger,column\nthumb,0\n")
+    with pytest.raises(AssetError, match="not a taxel layout"):
+        layout.read_layout(path)
+    with pytest.raises(ConfigError, match="one grid"):
+        layout.write_layout(
+            path,
+            {
+                "a": layout.on_surface("plane", layout.lattice(2, 2, pitch=0.01)),
+                "b": layout.on_surface("plane", layout.lattice(2, 3, pitch=0.01)),
+            },
+        )

@@ -1,0 +1,372 @@
+"""Objects: mass properties by numerical integration, ranges, reach, and the contact spring's restitution."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dexsim.core.errors import ConfigError
+from dexsim.geometry import sdf
+from dexsim.objects.config import OFF, SHAPES, SLOTS, ObjectConfig
+from dexsim.objects.params import bounding_radius, damping_ratio, extent, plain_inertia, sample_object
+
+BOX, CAPSULE, CYLINDER = range(3)
+ACTIVE = {
+    "sphere": {(0, 1, 0)},
+    "box": {(1, 0, 0)},
+    "cylinder": {(0, 0, 1)},
+    "capsule": {(0, 1, 0)},
+    "composition": {(1, 1, 0), (0, 1, 1)},
+}
+# As they stand: no scatter of inertia or of the centre of mass.
+UNIFORM = ObjectConfig(inertia_scale=(1.0, 1.0), com_offset=0.0)
+
+
+def draw(config=ObjectConfig(), name=None, seed=0):  # noqa: B008
+    """200 objects. Not jitted as a whole: a config is a constant, so each would be another compilation."""
+    keys = jax.random.split(jax.random.key(seed), 200)
+    index = None if name is None else jnp.int32(SHAPES.index(name))
+    return jax.tree.map(np.asarray, jax.vmap(lambda key: sample_object(key, config, index))(keys))
+
+
+@functools.cache
+def default(name=None):
+    return draw(name=name)
+
+
+def row(drawn, at):
+    return jax.tree.map(lambda x: x[at], drawn)
+
+
+# --- an independent account of the solids: thin slices along z ------------------------------------
+
+
+def slices(kind, size, count=20_001):
+    """Heights, areas and second moments (x, y) of a primitive's cross-sections, from its own centre."""
+    a, b, c = (float(s) for s in size)
+    if kind == "box":
+        z = np.linspace(-c, c, count)
+        area = np.full(count, 4 * a * b)
+        return z, area, area * a * a / 3, area * b * b / 3
+    if kind == "cylinder":
+        z = np.linspace(-b, b, count)
+        radius = np.full(count, a)
+    else:
+        z = np.linspace(-a - b, a + b, count)
+        radius = np.sqrt(np.maximum(a * a - np.maximum(np.abs(z) - b, 0) ** 2, 0))
+    area = np.pi * radius**2
+    return z, area, area * radius**2 / 4, area * radius**2 / 4
+
+
+def integrate(drawn):
+    """Mass, centre [3] and inertia [3] about it, of the active primitives at density one."""
+    parts = []
+    for slot in range(3):
+        if drawn.active[slot]:
+            z, area, xx, yy = slices(SLOTS[slot], drawn.size[slot])
+            z = z + float(drawn.position[slot, 2])
+            parts.append([np.trapezoid(v, z) for v in (area, area * z, area * z * z, xx, yy)])
+    mass, first, zz, xx, yy = np.sum(parts, axis=0)
+    centre = first / mass
+    zz -= mass * centre**2
+    return mass, centre, np.array([yy + zz, xx + zz, xx + yy])
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_inertia_is_that_of_the_solid(name):
+    drawn = draw(UNIFORM, name)
+    seen = set()
+    for at in range(40):
+        one = row(drawn, at)
+        mass, centre, inertia = integrate(one)
+        np.testing.assert_allclose(one.inertia, inertia * one.mass / mass, rtol=2e-4)
+        assert abs(centre) < 1e-6  # the object's origin is its centre of mass
+        np.testing.assert_array_equal(one.position[:, :2], 0)
+        seen.add(tuple(one.active.astype(int)))
+    assert seen == ACTIVE[name]
+
+
+def test_inertias_by_hand():
+    """Cube, ball, rod: the textbook's formulas, through fixed ranges."""
+    config = ObjectConfig(
+        inertia_scale=(1, 1),
+        com_offset=0,
+        mass=(0.2, 0.2),
+        box_half=(0.02, 0.02),
+        sphere_radius=(0.03, 0.03),
+        cylinder_radius=(0.01, 0.01),
+        cylinder_half=(0.06, 0.06),
+    )
+    cases = (
+        ("box", [2 / 3 * 0.02**2] * 3),
+        ("sphere", [2 / 5 * 0.03**2] * 3),
+        ("cylinder", [0.01**2 / 4 + 0.12**2 / 12] * 2 + [0.01**2 / 2]),
+    )
+    for name, wanted in cases:
+        one = row(draw(config, name), 0)
+        np.testing.assert_allclose(one.inertia, 0.2 * np.array(wanted), rtol=0.01, err_msg=name)
+
+
+def test_counting_an_overlap_twice_matters_little():
+    """A composition's parts overlap; against the true union by Monte Carlo, the error is within the drawn scatter."""
+    drawn, rng = draw(UNIFORM, "composition"), np.random.default_rng(0)
+    low, high = ObjectConfig().inertia_scale
+    for at in range(12):
+        one = row(drawn, at)
+        points = rng.uniform(-0.06, 0.06, (200_000, 3))
+        points = points[is_inside(one, points)]
+        centre = points.mean(0)
+        assert np.abs(centre[:2]).max() < 5e-4 and abs(centre[2]) < 0.004
+        x, y, z = ((points - centre) ** 2).mean(0)
+        ratio = one.inertia / (one.mass * np.array([y + z, x + z, x + y]))
+        assert np.all((ratio > low) & (ratio < high)), ratio
+
+
+def is_inside(one, points):
+    inside = np.zeros(len(points), bool)
+    for slot in range(3):
+        a, b, _ = one.size[slot]
+        local = points - one.position[slot]
+        across, along = np.hypot(local[:, 0], local[:, 1]), np.abs(local[:, 2])
+        within = (
+            np.all(np.abs(local) < one.size[slot], axis=1),
+            np.hypot(across, np.maximum(along - b, 0)) < a,
+            (across < a) & (along < b),
+        )[slot]
+        inside |= within & one.active[slot]
+    return inside
+
+
+def test_scatter_of_inertia_and_centre_of_mass():
+    assert (ObjectConfig().inertia_scale, ObjectConfig().com_offset) == ((0.8, 1.25), 0.003)
+    drawn = default("cylinder")
+    scale = []
+    for at in range(200):
+        one = row(drawn, at)
+        mass, _, inertia = integrate(one)
+        ratio = one.inertia / (inertia * one.mass / mass)
+        assert np.ptp(ratio) < 1e-3  # one factor for all three axes keeps it a possible body
+        scale.append(ratio[0])
+    assert 0.8 - 1e-3 < min(scale) < 0.83 and 1.2 < max(scale) < 1.25 + 1e-3
+    assert np.abs(drawn.com).max() <= 0.003 and np.all(np.abs(drawn.com).max(0) > 0.0028)
+
+
+# --- ranges ----------------------------------------------------------------------------------------
+
+
+def within(values, span, scale=1.0):
+    values = np.asarray(values)
+    low, high = (scale * s for s in span)
+    width = max(high - low, 1e-9)
+    assert values.min() >= low - 1e-6 and values.max() <= high + 1e-6
+    assert values.min() < low + 0.1 * width and values.max() > high - 0.1 * width
+
+
+def test_sizes_fill_their_ranges():
+    # No two ranges alike, so that none can be taken for another.
+    config = ObjectConfig(
+        sphere_radius=(0.04, 0.05),
+        box_half=(0.02, 0.025),
+        cylinder_radius=(0.03, 0.035),
+        cylinder_half=(0.06, 0.07),
+        neck_radius=(0.01, 0.012),
+        neck_half=(0.014, 0.018),
+    )
+    ball, box, cylinder, capsule, union = (draw(config, name) for name in SHAPES)
+    within(ball.size[:, CAPSULE, 0], config.sphere_radius)
+    assert np.all(ball.size[:, CAPSULE, 1] <= 1e-4)  # a capsule of next to no length
+    within(box.size[:, BOX], config.box_half)
+    for drawn, slot in ((cylinder, CYLINDER), (capsule, CAPSULE)):
+        within(drawn.size[:, slot, 0], config.cylinder_radius)
+        within(drawn.size[:, slot, 1], config.cylinder_half)
+    within(union.size[:, CAPSULE, 0], config.neck_radius)
+    within(union.size[:, CAPSULE, 1], config.neck_half)
+    boxy = union.active[:, BOX]
+    assert 0.3 < boxy.mean() < 0.7
+    within(union.size[boxy, BOX], config.box_half, config.composition_scale)
+    within(union.size[~boxy, CYLINDER, 0], config.cylinder_radius, config.composition_scale)
+    within(union.size[~boxy, CYLINDER, 1], config.cylinder_half, config.composition_scale)
+
+
+def test_a_box_has_three_sizes_of_its_own():
+    size = default("box").size[:, BOX]
+    assert np.abs(np.corrcoef(size.T) - np.eye(3)).max() < 0.2
+
+
+def test_the_neck_stands_on_the_body():
+    drawn = default("composition")
+    for at in range(len(drawn.mass)):
+        one = row(drawn, at)
+        body = BOX if one.active[BOX] else CYLINDER
+        half = one.size[BOX, 2] if body == BOX else one.size[CYLINDER, 1]
+        rise = one.position[CAPSULE, 2] - one.position[body, 2]
+        assert rise == pytest.approx(half + one.size[CAPSULE, 1], abs=1e-6)
+
+
+def test_physical_parameters_fill_their_ranges():
+    config = ObjectConfig()
+    drawn = default()
+    within(drawn.mass, config.mass)
+    within(drawn.friction, config.friction)
+    ratio = [float(damping_ratio(jnp.float32(e))) for e in config.restitution[::-1]]
+    within(drawn.contact[:, 1], ratio)
+    within(drawn.contact[:, 0], config.stiffness)
+    parameters = [drawn.mass, drawn.friction, *drawn.contact.T]
+    assert np.abs(np.corrcoef(parameters) - np.eye(4)).max() < 0.2
+
+
+def test_all_shapes_come_and_only_those_asked_for():
+    assert np.bincount(default().shape_index, minlength=5).min() > 25
+    few = ObjectConfig(shapes=("capsule", "box"))
+    index = draw(few).shape_index
+    assert set(index) == {SHAPES.index("capsule"), SHAPES.index("box")}
+    with pytest.raises(ConfigError, match=r"shapes.*pyramid.*sphere, box"):
+        ObjectConfig(shapes=("pyramid",))
+    with pytest.raises(ConfigError, match="at least one"):
+        ObjectConfig(shapes=())
+
+
+def test_slots_that_are_off_are_specks_inside_the_object():
+    drawn = default()
+    for at in range(100):
+        one = row(drawn, at)
+        off = ~one.active
+        assert np.all(one.size[off] == OFF)
+        assert np.all(is_inside(one, one.position[off]))
+
+
+@pytest.mark.parametrize("scale", [0.8, 2.0])
+def test_nothing_is_larger_than_the_template(scale):
+    config = ObjectConfig(composition_scale=scale, neck_radius=(0.03, 0.04), neck_half=(0.03, 0.05))
+    for name in SHAPES:
+        drawn = draw(config, name)
+        assert np.all((drawn.size <= config.largest + 1e-6)[drawn.active]), name
+
+
+# --- reach -------------------------------------------------------------------------------------------
+
+
+def hull(one):
+    """Points of the object's surface, dense where a support point may lie."""
+    turn = np.linspace(0, 2 * np.pi, 721)
+    rim = np.stack([np.cos(turn), np.sin(turn), 0 * turn], -1)
+    tilt = np.linspace(-np.pi / 2, np.pi / 2, 181)[:, None, None]
+    globe = (np.cos(tilt) * rim + np.sin(tilt) * [0, 0, 1]).reshape(-1, 3)
+    corners = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), -1).reshape(-1, 3)
+    a, b, _ = one.size[CAPSULE]
+    r, h, _ = one.size[CYLINDER]
+    points = (
+        corners * one.size[BOX],
+        np.concatenate([a * globe + [0, 0, s * b] for s in (1, -1)]),
+        np.concatenate([r * rim + [0, 0, s * h] for s in (1, -1)]),
+    )
+    return np.concatenate([p + c for p, c, on in zip(points, one.position, one.active, strict=True) if on])
+
+
+def test_extent_is_the_farthest_surface_point():
+    drawn = row(default(), slice(40))
+    rng = np.random.default_rng(1)
+    directions = rng.normal(size=(40, 6, 3))
+    directions[:, 0], directions[:, 1] = [0, 0, 1], [0, 0, -1]
+    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    reach = jax.jit(jax.vmap(lambda s, p, a, ds: jax.vmap(lambda d: extent(s, p, a, d))(ds)))(
+        drawn.size, drawn.position, drawn.active, np.float32(directions)
+    )
+    for at in range(40):
+        sampled = (hull(row(drawn, at)) @ directions[at].T).max(0)
+        np.testing.assert_allclose(reach[at], sampled, atol=2e-5)
+
+
+def test_bounding_radius_holds_every_slot():
+    drawn = row(default(), slice(40))
+    radius = jax.jit(jax.vmap(bounding_radius))(drawn.size)
+    for at in range(40):
+        one = row(drawn, at)
+        for slot in np.flatnonzero(one.active):
+            alone = type(one)(**{**vars(one), "position": np.zeros((3, 3)), "active": np.arange(3) == slot})
+            assert np.linalg.norm(hull(alone), axis=1).max() == pytest.approx(float(radius[at, slot]), abs=2e-6)
+
+
+def test_collision_and_touch_share_one_shape():
+    """The signed distance of `shape()` is negative just where the solid is."""
+    drawn = row(default(), slice(40))
+    points = np.random.default_rng(2).uniform(-0.06, 0.06, (400, 3)).astype(np.float32)
+    distance = jax.jit(jax.vmap(lambda one: sdf.signed_distance(points, one.shape())))(drawn)
+    for at in range(40):
+        clear = np.abs(distance[at]) > 1e-6
+        np.testing.assert_array_equal((distance[at] < 0)[clear], is_inside(row(drawn, at), points)[clear])
+
+
+# --- the contact's damping -----------------------------------------------------------------------------
+
+
+def bounce(ratio, step=1e-5):
+    """Speed after over speed before contact with x'' = -2 z x' - x, which ends when that no longer pushes."""
+    x, v = 0.0, -1.0
+    while (push := -2 * ratio * v - x) > 0:
+        v += step * push
+        x += step * v
+    return v
+
+
+@pytest.mark.parametrize("restitution", [0.03, 0.06, 0.2, 0.5, 0.9])
+def test_damping_ratio_bounces_as_it_should(restitution):
+    ratio = float(damping_ratio(jnp.float32(restitution)))
+    assert bounce(ratio) == pytest.approx(restitution, rel=0.01)
+
+
+def test_damping_falls_as_the_bounce_grows_and_is_bounded():
+    ratio = np.asarray(damping_ratio(jnp.linspace(0.0, 0.9, 50)))
+    assert ratio[0] == 3.0 and np.all(ratio > 0)
+    assert np.all(np.diff(ratio[2:]) < 0)
+
+
+# --- the pool of start states -----------------------------------------------------------------------------
+
+
+def test_a_pool_holds_all_shapes_alike(hand, grasp_env):
+    pool, count = grasp_env.pool, grasp_env.config.pool_size
+    assert np.ptp(np.bincount(pool.target.shape_index, minlength=5)) <= 1
+    assert pool.qpos.shape == (count, 19) and np.all(np.isfinite(pool.qpos))
+    np.testing.assert_allclose(np.linalg.norm(pool.qpos[:, 15:], axis=1), 1, atol=1e-5)
+    assert np.all(pool.qpos[:, :12] >= hand.joint_lower) and np.all(pool.qpos[:, :12] <= hand.joint_upper)
+    assert len(np.unique(pool.target.mass)) == count  # each start has an object of its own
+
+
+class TestScale:
+    """`ObjectConfig.scale`: all ranges about their middles."""
+
+    def draw(self, scale, shape):
+        config, keys = ObjectConfig(scale=scale), jax.random.split(jax.random.key(0), 200)
+        return jax.vmap(lambda key: sample_object(key, config, jnp.int32(SHAPES.index(shape))))(keys)
+
+    @pytest.mark.parametrize("shape", ["sphere", "box", "cylinder", "capsule"])
+    def test_zero_leaves_one_object_of_each_kind(self, shape):
+        drawn, config = self.draw(0.0, shape), ObjectConfig()
+        for leaf in jax.tree.leaves(drawn):
+            np.testing.assert_allclose(leaf, np.broadcast_to(leaf[0], leaf.shape), rtol=1e-6)
+        np.testing.assert_allclose(drawn.mass[0], np.mean(config.mass), rtol=1e-6)
+        np.testing.assert_allclose(drawn.com[0], 0)
+        size = {
+            "sphere": config.sphere_radius,
+            "box": config.box_half,
+            "cylinder": config.cylinder_radius,
+            "capsule": config.cylinder_radius,
+        }[shape]
+        slot = {"sphere": 1, "box": 0, "cylinder": 2, "capsule": 1}[shape]
+        np.testing.assert_allclose(drawn.size[0, slot, 0], np.mean(size), rtol=1e-6)
+
+    def test_half_is_half_as_wide(self):
+        for shape in ("box", "composition"):
+            half, full = self.draw(0.5, shape), self.draw(1.0, shape)
+            assert np.ptp(half.mass) == pytest.approx(np.ptp(full.mass) / 2, rel=1e-4)
+            np.testing.assert_allclose(half.friction, (np.mean(ObjectConfig().friction) + full.friction) / 2, rtol=1e-4)
+
+    def test_inertia_of_a_uniform_solid(self):
+        for shape in SHAPES:
+            one = jax.tree.map(lambda x: x[0], self.draw(1.0, shape))
+            ratio = np.asarray(one.inertia / (one.mass * plain_inertia(one)))
+            np.testing.assert_allclose(ratio, ratio[0], rtol=1e-4)
+            assert 0.8 <= ratio[0] <= 1.25

@@ -1,0 +1,195 @@
+"""Contact parameters against what C MuJoCo makes of them: weight at rest, bounce, rubber."""
+
+import c_scene
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from dexsim.objects.config import OFF, SHAPES, SLOTS, ObjectConfig
+from dexsim.objects.params import damping_ratio
+from dexsim.physics import contact
+from dexsim.physics.config import PhysicsConfig
+from dexsim.physics.model import build_model
+from dexsim.physics.seam import Physics
+from dexsim.tasks.grasp.config import GraspConfig
+from dexsim.tasks.grasp.start import make_pool
+from dexsim.tasks.grasp.task import Grasp
+from dexsim.touch.skin import Skin
+
+BALL = """
+<mujoco>
+  <option timestep="{step}" iterations="50" cone="{cone}" impratio="{impratio}"/>
+  <worldbody>
+    <geom name="floor" type="plane" size="1 1 1" contype="0" conaffinity="0"/>
+    <body name="ball" pos="0 0 {height}">
+      {joint}
+      <inertial pos="0 0 0" mass="{mass}" diaginertia="5e-5 5e-5 5e-5"/>
+      <geom name="ball" size="0.03" contype="0" conaffinity="0"/>
+    </body>
+  </worldbody>
+  <contact><pair geom1="floor" geom2="ball" condim="{condim}" friction="{mu} {mu} .005 .0001 .0001"/></contact>
+</mujoco>
+"""
+
+
+def ball(
+    *,
+    stiffness=2000.0,
+    ratio=1.0,
+    mu=0.9,
+    condim=3,
+    mass=0.1,
+    step=0.002,
+    height=0.03,
+    cone="elliptic",
+    impratio=20.0,
+    joint="<freejoint/>",
+):
+    """A ball of 30 mm over a floor; its mass, as in the hand's scene, is not what the contact was set up for."""
+    model = mujoco.MjModel.from_xml_string(
+        BALL.format(
+            step=step,
+            height=height,
+            mass=mass,
+            condim=condim,
+            mu=mu,
+            cone=cone,
+            joint=joint,
+            impratio=impratio if cone == "elliptic" else 1,
+        )
+    )
+    model.body_invweight0[1] = 10.0, 2e4
+    pairs = contact.pairs_with(model, np.array([model.geom("ball").id]))
+    compliance, *_ = contact.pair_constants(model, pairs, np.array([0]))
+    np.testing.assert_array_equal(compliance, [10.0])
+    model.pair_solref[:], model.pair_solimp[:] = contact.spring(
+        compliance, np.array([stiffness]), ratio, mu, period=0.03, edges=2 * (condim - 1) if cone == "pyramidal" else 0
+    )
+    return model, mujoco.MjData(model)
+
+
+@pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
+@pytest.mark.parametrize("condim", [1, 3, 4, 6])
+@pytest.mark.parametrize("mu, stiffness", [(0.3, 500.0), (0.6, 2000.0), (1.2, 2000.0), (0.9, 20000.0)])
+def test_depth_at_rest_is_weight_over_stiffness(cone, condim, mu, stiffness):
+    """Whatever the friction; MuJoCo's own parameters would give depths that differ by 7 and more."""
+    model, data = ball(mu=mu, stiffness=stiffness, condim=condim, mass=0.5, cone=cone)
+    mujoco.mj_step(model, data, 1500)
+    assert np.abs(data.qvel).max() < 1e-6
+    assert 0.03 - data.qpos[2] == pytest.approx(0.5 * 9.81 / stiffness, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    "cone, impratio, slowest, fastest",
+    [("pyramidal", 1, 0.010, 0.030), ("elliptic", 1, 0.004, 0.010), ("elliptic", 20, 0.0, 0.0005)],
+)
+@pytest.mark.parametrize("mu", [0.6, 1.2])
+def test_what_friction_holds_creeps_little(cone, impratio, slowest, fastest, mu):
+    """At half of what friction can bear: R f / b in m/s, by the documentation's solref and impratio.
+
+    A pyramid lets a ball creep by a fingertip's width in a second; rubber does not.
+    """
+    slides = "".join(f'<joint type="slide" axis="{axis}"/>' for axis in ("1 0 0", "0 1 0", "0 0 1"))
+    model, data = ball(stiffness=1700.0, ratio=2.0, mu=mu, cone=cone, impratio=impratio, joint=slides)
+    weight = model.body_mass[1] * 9.81
+    data.xfrc_applied[1, :3] = 0.5 * mu * 3.0, 0, weight - 3.0
+    mujoco.mj_step(model, data, 500)
+    assert slowest <= data.qvel[0] < fastest
+
+
+@pytest.mark.parametrize("mass", [0.05, 0.2])
+@pytest.mark.parametrize("restitution", [0.03, 0.1, 0.3, 0.6])
+def test_a_ball_bounces_as_configured(restitution, mass):
+    """Within a tenth: the contact's own inertia, 2 to 3 kg, stands for the ball's."""
+    model, data = ball(ratio=float(damping_ratio(restitution)), mass=mass, step=5e-4, height=0.0301)
+    model.opt.gravity[:] = 0
+    data.qvel[2] = -0.5
+    while data.qvel[2] <= 0 or data.ncon and data.contact[0].dist < 0:
+        mujoco.mj_step(model, data)
+    assert data.qvel[2] / 0.5 == pytest.approx(restitution, rel=0.1)
+
+
+def test_only_fingertips_wear_rubber(hand):
+    bare, clad = (
+        build_model(hand, SLOTS, np.full((3, 3), OFF), PhysicsConfig(cover=cover), (9.81, 0, 0), "jax")
+        for cover in (0.0, 0.003)
+    )
+    tips = {bare.body(hand.body_names[b]).id for b in hand.tip_body}
+    grown = clad.geom_size - bare.geom_size
+    for geom in range(bare.ngeom):
+        on_tip = bare.geom_bodyid[geom] in tips and "_pad" in bare.geom(geom).name
+        np.testing.assert_allclose(grown[geom], [0.003 * on_tip, 0, 0], atol=1e-9)
+    assert np.sum(grown[:, 0] > 0) == 6 * 4  # two on the thumb; the capsule and its three spheres
+
+
+def test_who_is_how_stiff(hand):
+    """A fingertip's spheres 1/2, its capsules none; other links and the palm 2.5."""
+    model = build_model(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(), (9.81, 0, 0), "jax")
+    geoms = np.array([model.geom(f"object_{k}").id for k in range(3)])
+    pairs = contact.pairs_with(model, geoms)
+    tips = [model.body(hand.body_names[b]).id for b in hand.tip_body]
+    _, share, finger = contact.pair_constants(model, pairs, np.array(tips))
+    for pair, found, whose in zip(pairs, share, finger, strict=True):
+        link = model.geom(model.pair_geom1[pair]).name
+        name, _, rest = link.partition("_pad")
+        assert found == (0.5 if rest else 2.5), link
+        assert whose == (hand.finger_names.index({"mid": "middle"}.get(name, name)) if rest else -1), link
+        assert not link.endswith(("pad", "left", "right")), link
+    assert np.bincount(finger + 1).tolist() == [3 * 6, 3 * 6, 9, 9, 9, 9]
+
+
+def test_a_row_of_spheres_fills_its_capsule(hand):
+    """Its ends are the capsule's; between them it is thinner by r - sqrt(r^2 - (l / 4)^2), below 0.8 mm."""
+    model = build_model(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(), (9.81, 0, 0), "jax")
+    for name in ("thumb_pad_left", "thumb_pad_right", "index_pad", "mid_pad", "ring_pad", "pinky_pad"):
+        pad = model.geom(name)
+        turn = np.zeros(9)
+        mujoco.mju_quat2Mat(turn, pad.quat)
+        half = pad.size[1] * turn.reshape(3, 3)[:, 2]
+        for k in range(3):
+            ball = model.geom(f"{name}_{k}")
+            assert ball.type == mujoco.mjtGeom.mjGEOM_SPHERE and ball.bodyid == pad.bodyid
+            np.testing.assert_allclose(ball.pos, pad.pos + (k - 1) * half, atol=1e-6)
+            assert ball.size[0] == pytest.approx(pad.size[0])
+        assert pad.size[0] - np.sqrt(pad.size[0] ** 2 - (pad.size[1] / 2) ** 2) < 8e-4
+
+
+def test_springs_follow_the_skin(hand):
+    """In squeezed hands every pair gets the spring that the second scene works out from C MuJoCo's own contacts."""
+    law, rng = c_scene.skin_law(hand, Skin()), np.random.default_rng(4)
+    seam = Physics(
+        hand, SLOTS, ObjectConfig().largest, PhysicsConfig(), gravity=c_scene.GRAVITY, backend="jax", skin=Skin()
+    )
+    pool = make_pool(jax.random.key(3), hand, GraspConfig(pool_size=3 * len(SHAPES)), Grasp.reference)
+
+    @jax.jit
+    def configure(target, qpos):
+        model = seam.configure(target, seam.tip_stiffness(target, qpos))
+        return model.pair_solref, model.pair_solimp
+
+    first, second = (
+        [seam.mj_model.geom(g).name for g in side[seam.object_pairs]]
+        for side in (seam.mj_model.pair_geom1, seam.mj_model.pair_geom2)
+    )
+    changed = dict.fromkeys(SHAPES, 0)
+    for index in range(3 * len(SHAPES)):
+        start = c_scene.row(pool, index)
+        model, qpos, qvel, *_ = c_scene.squeeze(hand, start, rng)
+        nominal = model.pair_solref.copy()
+        felt = law(qpos[None], jax.tree.map(lambda leaf: leaf[None], start.target))
+        c_scene.follow_skin(model, c_scene.start(model, qpos, qvel), hand, start.target, np.asarray(felt)[0])
+        changed[SHAPES[start.target.shape_index]] += np.sum(model.pair_solref[:, 0] != nominal[:, 0])
+        solref, solimp = configure(start.target, jnp.asarray(qpos))
+        there = {
+            (model.geom(a).name, model.geom(b).name): pair
+            for pair, (a, b) in enumerate(zip(model.pair_geom1, model.pair_geom2, strict=True))
+        }
+        for pair, link, other in zip(seam.object_pairs, first, second, strict=True):
+            slot = int(other.removeprefix("object_"))
+            if start.target.active[slot]:
+                at = there[link, c_scene.KINDS[slot]]
+                np.testing.assert_allclose(solref[pair], model.pair_solref[at], rtol=2e-3)
+                np.testing.assert_allclose(solimp[pair], model.pair_solimp[at], rtol=2e-3)
+    assert min(changed.values()) >= 10, changed

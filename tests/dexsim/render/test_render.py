@@ -1,0 +1,329 @@
+"""The renderer: geometry against the pinhole formula, colours, where heat-map cells lie, and readable video files."""
+
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import jax
+import numpy as np
+import pytest
+
+from dexsim.hand.load import load_hand
+from dexsim.render import render
+from dexsim.render.panel import cell_box, draw_panel, force_color, make_layout, taxel_image
+from dexsim.render.raycast import FAR, Camera, Primitives, cast, look, normals, project, samples
+from dexsim.render.snapshot import Snapshot
+
+KINDS = ("sphere", "box", "cylinder", "capsule", "ellipsoid")
+SIZES = {
+    "sphere": [0.03, 0, 0],
+    "box": [0.02, 0.03, 0.025],
+    "cylinder": [0.02, 0.03, 0],
+    "capsule": [0.015, 0.02, 0],
+    "ellipsoid": [0.02, 0.03, 0.025],
+}
+SMALL = (320, 240)
+
+
+def primitives(*entries):
+    """(kind, size, position) of each, unturned."""
+    kind, size, position = zip(*entries, strict=True)
+    turn = np.tile(np.eye(3), (len(kind), 1, 1))
+    color = np.full((len(kind), 3), 0.5, np.float32)
+    return Primitives(kind, np.asarray(size, np.float64), np.asarray(position, np.float64), turn, color)
+
+
+def turned(seed):
+    return np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]
+
+
+@pytest.fixture(scope="module")
+def hand():
+    return load_hand()
+
+
+def snapshot(hand, *, active="sphere", force=None):
+    """A loosely closed hand over an object in front of the palm; touch only where `force` [F, N] says so."""
+    count = len(KINDS)
+    force = np.zeros(hand.taxel_position.shape[:2], np.float32) if force is None else force
+    return Snapshot(
+        joint_position=np.float32([1.4, 0.2, 0.3, 0.0] + [0.8, 0.5] * 4),
+        object_position=np.float32([0.055, 0.0, 0.12]),
+        object_rotation=np.eye(3, dtype=np.float32),
+        primitive_size=np.float32([SIZES[kind] for kind in KINDS]),
+        primitive_position=np.zeros((count, 3), np.float32),
+        primitive_rotation=np.tile(np.eye(3, dtype=np.float32), (count, 1, 1)),
+        primitive_active=np.array([kind == active for kind in KINDS]),
+        taxel_force=force,
+        command=np.float32([0.5]),
+        target_force=np.float32(3.0),
+        finger_force=force.sum(1),
+    )
+
+
+def test_camera_looks_at_its_target_with_gravity_down():
+    camera = Camera(azimuth=35, elevation=25, distance=0.7, target=(0.01, 0.02, 0.03), up=(-1, 0, 0))
+    view = look(camera, (200, 100))
+    pixel, depth = project(view, np.array([camera.target, np.array(camera.target) + [-0.05, 0, 0]]))
+    np.testing.assert_allclose(pixel[0], [100, 50], atol=1e-9)
+    np.testing.assert_allclose(depth[0], 0.7, atol=1e-12)
+    np.testing.assert_allclose(pixel[1, 0], 100, atol=1e-9)  # against gravity is straight up in the picture
+    assert pixel[1, 1] < 50
+    np.testing.assert_allclose(view.axes @ view.axes.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(view.axes) > 0
+
+
+def test_sphere_projects_where_the_pinhole_formula_says():
+    camera = Camera(azimuth=0, elevation=0, distance=0.5, up=(-1, 0, 0), field_of_view=40)
+    view = look(camera, (300, 200))  # from +z, with -x up: right is +y x ... checked by the offsets below
+    centre, radius = np.array([0.03, -0.02, 0.05]), 0.02
+    surface = cast(primitives(("sphere", [radius, 0, 0], centre)), view)
+    rows, columns = np.nonzero(surface.index == 0)
+    focal, distance = 100 / np.tan(np.deg2rad(20)), 0.5 - 0.05
+    # right = up x back = (-1, 0, 0) x (0, 0, 1) = (0, 1, 0)
+    expected = 150 + focal * centre[1] / distance, 100 + focal * centre[0] / distance
+    np.testing.assert_allclose([columns.mean() + 0.5, rows.mean() + 0.5], expected, atol=0.7)
+    seen_radius = focal * radius / np.sqrt(distance**2 - radius**2)
+    np.testing.assert_allclose(np.sqrt(len(rows) / np.pi), seen_radius, rtol=0.02)
+    np.testing.assert_allclose(surface.depth.min(), distance - radius, rtol=1e-3)
+
+
+def test_box_projects_where_the_pinhole_formula_says():
+    view = look(Camera(azimuth=0, elevation=0, distance=0.4, up=(-1, 0, 0), field_of_view=40), (200, 200))
+    surface = cast(primitives(("box", [0.03, 0.05, 0.02], [0, 0, 0])), view)
+    rows, columns = np.nonzero(surface.index == 0)
+    focal = 100 / np.tan(np.deg2rad(20))
+    for found, half in ((columns, 0.05), (rows, 0.03)):
+        edge = focal * half / (0.4 - 0.02)  # the front face is the nearest and the largest
+        np.testing.assert_allclose([found.min(), found.max() + 1], [100 - edge, 100 + edge], atol=1)
+    np.testing.assert_allclose(surface.depth[100, 100], 0.38, rtol=1e-5)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_ray_hits_lie_on_the_surface_and_normals_point_outward(kind):
+    size, turn = np.asarray(SIZES[kind]), turned(3)
+    scene = primitives((kind, size, [0.01, -0.02, 0.03]))._replace(rotation=turn[None])
+    view = look(Camera(azimuth=40, elevation=30, distance=0.3), (120, 120))
+    found = samples(view, cast(scene, view), 1)
+    assert len(found.pixel) > 300
+    p = (found.points.T - scene.position[0]) @ turn
+    if kind == "sphere":
+        distance = np.linalg.norm(p, axis=-1) - size[0]
+    elif kind == "box":
+        distance = np.max(np.abs(p) - size, -1)
+    elif kind == "capsule":
+        distance = np.linalg.norm(p - np.clip(p, [0, 0, -size[1]], [0, 0, size[1]]), axis=-1) - size[0]
+    elif kind == "cylinder":
+        distance = np.maximum(np.hypot(p[:, 0], p[:, 1]) - size[0], np.abs(p[:, 2]) - size[1])
+    else:
+        distance = (np.linalg.norm(p / size, axis=-1) - 1) * size.min()
+    np.testing.assert_allclose(distance, 0, atol=2e-5)
+    normal = normals(scene, found.index, found.points)
+    np.testing.assert_allclose(np.linalg.norm(normal, axis=0), 1, atol=1e-5)
+    toward = view.origin[:, None] - found.points
+    assert np.mean(np.sum(normal * toward, 0) > 0) > 0.98  # bevelled edges may lean a little past the silhouette
+
+
+def test_the_screen_window_holds_the_whole_primitive():
+    """Casting into a view of a part of the picture gives that part of the picture."""
+    for kind in KINDS:
+        scene = primitives((kind, SIZES[kind], [0, 0, 0]))._replace(rotation=turned(5)[None])
+        view = look(
+            Camera(azimuth=10, elevation=50, distance=0.12, field_of_view=70), (160, 160)
+        )  # close: strong perspective
+        whole = cast(scene, view).index
+        # The same rays without windows: a primitive that reaches behind the camera is tried at every pixel.
+        from dexsim.render import raycast
+
+        original = raycast.screen_boxes
+        raycast.screen_boxes = lambda view, scene: np.tile([0, view.size[0], 0, view.size[1]], (len(scene.kind), 1))
+        try:
+            np.testing.assert_array_equal(cast(scene, view).index, whole)
+        finally:
+            raycast.screen_boxes = original
+
+
+def test_nearer_occludes_farther_whatever_the_order():
+    view = look(Camera(azimuth=0, elevation=0, distance=0.5), (100, 100))
+    near, far = ("sphere", [0.02, 0, 0], [0, 0, 0.1]), ("box", [0.05, 0.05, 0.01], [0, 0, 0])
+    assert cast(primitives(near, far), view).index[50, 50] == 0
+    assert cast(primitives(far, near), view).index[50, 50] == 1
+    assert cast(primitives(near, far), view).index[50, 68] == 1  # beside the sphere, on the box
+    assert cast(primitives(near, far), view).depth[0, 0] == FAR
+
+
+def test_samples_weigh_every_covered_ray_once():
+    view = look(Camera(azimuth=0, elevation=0, distance=0.5), (60, 40), 2)
+    surface = cast(primitives(("sphere", [0.05, 0, 0], [0, 0, 0]), ("sphere", [0.03, 0, 0], [0, 0.05, 0.01])), view)
+    found = samples(view, surface, 2)
+    covered = (surface.index >= 0).reshape(40, 2, 60, 2).mean((1, 3))
+    np.testing.assert_allclose(np.bincount(found.pixel, found.weight, 2400), covered.reshape(-1), atol=1e-6)
+
+
+def test_more_force_is_hotter():
+    force = np.linspace(0, 2, 50)
+    brightness = force_color(force, 2.0).astype(int) @ [299, 587, 114]
+    assert np.all(np.diff(brightness) >= 0) and brightness[-1] > 3 * brightness[0]
+    np.testing.assert_array_equal(force_color(np.array([2.0, 9.0]), 2.0)[0], force_color(np.array([9.0]), 2.0)[0])
+    assert force_color(np.array(np.nan), 1.0).shape == (3,)
+
+
+def test_heat_map_cell_lies_where_documented():
+    layout = make_layout(240, 480, (10, 12), 5)
+    names = ("thumb", "index", "middle", "ring", "pinky")
+    for finger, column, row in ((0, 0, 0), (2, 9, 0), (3, 4, 11), (4, 7, 5)):
+        force = np.zeros((5, 120), np.float32)
+        force[finger, column * 12 + row] = 1.0
+        panel = draw_panel(layout, names, force, force.sum(1), np.zeros(0), np.nan, 1.0, 1.0)
+        left, top, right, bottom = cell_box(layout, finger, column, row)
+        hot = force_color(np.array(1.0), 1.0)
+        assert np.all(panel[top:bottom, left:right] == hot)
+        lit = np.all(panel == hot, -1)
+        x, y = layout.slots[-1]
+        lit[y:, x:] = False  # the colour scale
+        assert lit.sum() == (right - left) * (bottom - top)
+    base, tip = cell_box(layout, 1, 0, 0), cell_box(layout, 1, 0, 11)
+    assert tip[1] < base[1] and tip[0] == base[0]  # the tip is at the top
+    assert cell_box(layout, 1, 9, 0)[0] > base[0]  # columns go right
+    image = taxel_image(np.arange(120), (10, 12))
+    assert image.shape == (12, 10) and image[0, 0] == 11 and image[11, 0] == 0 and image[11, 1] == 12
+
+
+@pytest.mark.parametrize("size", [(160, 120), (320, 240), (640, 480), (960, 540)])
+def test_panel_fits(size):
+    layout = make_layout(size[1] // 2, size[1], (10, 12), 5)
+    boxes = [cell_box(layout, f, c, r) for f in range(5) for c in (0, 9) for r in (0, 11)]
+    assert min(min(box) for box in boxes) >= 0
+    assert max(box[2] for box in boxes) <= layout.width and max(box[3] for box in boxes) <= layout.height
+
+
+@pytest.mark.parametrize("active", [*KINDS, None])
+def test_frame_of_every_kind(hand, active):
+    frame = render.render_frame(hand, KINDS, snapshot(hand, active=active), size=SMALL)
+    assert frame.shape == (240, 320, 3) and frame.dtype == np.uint8
+    bare = render.render_frame(hand, KINDS, snapshot(hand, active=None), size=SMALL)
+    changed = np.any(frame[:, :200] != bare[:, :200], -1).mean()
+    assert (changed > 0.01) == (active is not None)
+
+
+def test_a_loaded_taxel_shows_on_the_finger(hand):
+    """Of two pictures that differ in one taxel's force, the pixels around that taxel differ and turn hot."""
+    cold = snapshot(hand, active=None)
+    pose = render._poses(hand, cold.joint_position[None])[0]
+    size = (640, 480)
+    view = look(render.CAMERAS["grasp"], (400, 480))
+    facing = np.sum(pose.taxel_normal * (view.origin - pose.taxel_position), -1)
+    finger, taxel = np.unravel_index(np.argmax(np.where(np.arange(5)[:, None] == 0, facing, -1)), facing.shape)
+    force = np.zeros_like(cold.taxel_force)
+    force[finger, taxel] = 2.0
+    hot = snapshot(hand, active=None, force=force)
+    frames = [render.render_frame(hand, KINDS, s, size=size, force_range=2.0)[:, :400].astype(int) for s in (cold, hot)]
+    rows, columns = np.nonzero(np.any(frames[0] != frames[1], -1))
+    assert 3 <= len(rows) < 200
+    pixel, _ = project(view, pose.taxel_position[finger, taxel])
+    np.testing.assert_allclose([columns.mean() + 0.5, rows.mean() + 0.5], pixel, atol=2)
+    assert frames[1][rows, columns].sum() > frames[0][rows, columns].sum()
+
+
+def test_frame_is_deterministic_and_both_cameras_work(hand):
+    one, two = (render.render_frame(hand, KINDS, snapshot(hand), size=SMALL) for _ in range(2))
+    np.testing.assert_array_equal(one, two)
+    other = render.render_frame(hand, KINDS, snapshot(hand), size=SMALL, camera="rotate")
+    assert np.any(other != one)
+    away = Camera(distance=0.3, target=(0.0, 0.0, 5.0), azimuth=180)  # the scene is behind it
+    assert render.render_frame(hand, KINDS, snapshot(hand), size=SMALL, camera=away).shape == (240, 320, 3)
+
+
+def test_broken_numbers_still_make_a_frame(hand):
+    bad = jax.tree.map(lambda x: np.full_like(x, np.nan) if x.dtype.kind == "f" else x, snapshot(hand))
+    assert render.render_frame(hand, KINDS, bad, size=SMALL).shape == (240, 320, 3)
+
+
+def test_bad_arguments_are_named(hand):
+    with pytest.raises(ValueError, match="grasp, rotate"):
+        render.render_frame(hand, KINDS, snapshot(hand), camera="side")
+    with pytest.raises(ValueError, match="size: 321x240"):
+        render.render_frame(hand, KINDS, snapshot(hand), size=(321, 240))
+    with pytest.raises(ValueError, match="kinds: 1 given, the snapshot has 5"):
+        render.render_frame(hand, ("box",), snapshot(hand))
+
+
+def episode(hand, length):
+    force = np.zeros(hand.taxel_position.shape[:2], np.float32)
+    force[1, 30:60] = 0.2
+    steps = []
+    for t in range(length):
+        step = snapshot(hand, force=force * t)
+        steps.append(jax.tree.map(np.asarray, step))
+        steps[-1].object_position[0] += 0.002 * t
+    env = SimpleNamespace(name="grasp", hand=hand, primitive_kinds=KINDS)
+    return env, jax.tree.map(lambda *x: np.stack(x), *steps)
+
+
+def test_gif_is_written_and_readable(hand, tmp_path, monkeypatch):
+    from PIL import Image
+
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)  # as if not installed
+    env, steps = episode(hand, 6)
+    path = render.render_episode(env, steps, tmp_path / "new" / "video.mp4", fps=20, size=SMALL)
+    assert path == tmp_path / "new" / "video.gif" and path.is_file()
+    with Image.open(path) as image:
+        assert image.size == SMALL and image.n_frames == 6 and image.info["duration"] == 50
+        # The heat of the last frame survives the palette.
+        image.seek(5)
+        assert (np.asarray(image.convert("RGB")).astype(int) @ [2, 0, -1]).max() > 250
+
+
+def test_mp4_is_written_and_readable(hand, tmp_path):
+    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    env, steps = episode(hand, 5)
+    path = render.render_episode(env, steps, tmp_path / "video.mp4", fps=25, size=SMALL)
+    assert path.suffix == ".mp4"
+    with render._forks_quietly():
+        frames, seconds = ffmpeg.count_frames_and_secs(str(path))
+        reader = ffmpeg.read_frames(str(path))
+        assert next(reader)["size"] == SMALL
+    assert frames == 5 and abs(seconds - 0.2) < 0.05
+    first = np.frombuffer(next(reader), np.uint8).reshape(240, 320, 3).astype(int)
+    reader.close()
+    drawn = render.render_frame(hand, KINDS, jax.tree.map(lambda x: x[0], steps), size=SMALL, force_range=1.0)
+    assert np.abs(first[:, :200] - drawn[:, :200]).mean() < 4  # what lossy compression leaves
+
+
+def test_long_episodes_are_thinned(hand, tmp_path, monkeypatch):
+    from PIL import Image
+
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    env, steps = episode(hand, 9)
+    path = render.render_episode(env, steps, tmp_path / "video.gif", fps=30, size=(160, 120), max_frames=4)
+    with Image.open(path) as image:
+        assert image.n_frames == 3 and image.info["duration"] == 100  # every third, three times as long
+    empty = jax.tree.map(lambda x: x[:0], steps)
+    with pytest.raises(ValueError, match="no snapshots"):
+        render.render_episode(env, empty, tmp_path / "none.gif", fps=30)
+
+
+def test_notebook_figure_of_the_taxels(hand):
+    import matplotlib
+
+    matplotlib.use("agg")
+    force = np.zeros((5, 120), np.float32)
+    force[1, 3 * 12 + 7] = 0.5
+    figure = render.draw_taxels(hand, force)
+    maps = [axis for axis in figure.axes if axis.images]
+    assert [axis.get_title().split()[0] for axis in maps] == list(hand.finger_names)
+    image = maps[1].images[0]
+    left, right, bottom, top = image.get_extent()
+    row, column = np.unravel_index(np.argmax(image.get_array()), (12, 10))
+    assert column == 3 and 11 - row == 7 and (left, right, bottom, top) == (-0.5, 9.5, -0.5, 11.5)
+    figure.canvas.draw()
+
+
+def test_rendering_needs_no_opengl_and_no_pyplot():
+    code = (
+        "import sys, dexsim.render.render as r; assert not {'matplotlib', 'PIL'} & set(sys.modules);"
+        "import numpy as np; from dexsim.panel import force_color; force_color(np.ones(1), 1.0);"
+        "bad = {'OpenGL', 'glfw', 'matplotlib.pyplot', 'pyglet', 'mujoco.egl', 'imageio_ffmpeg'} & set(sys.modules);"
+        "assert not bad, bad"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)

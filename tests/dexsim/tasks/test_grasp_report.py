@@ -1,0 +1,215 @@
+"""The grasp report on synthetic evaluations: arrays [T, N] whose answers are known beforehand."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from dexsim.objects.config import SHAPES
+from dexsim.tasks.grasp import report
+
+PERIOD = 0.1  # s
+SPAN = (1.0, 5.0)  # N at command 0 and 1
+COMMANDS = (0.0, 0.25, 0.5, 0.75, 1.0)
+
+
+def evaluation(ticks=60, repeats=8, noise=0.0, slope=4.0, lost=(), settle_force=99.0, seed=0):
+    """Metrics and `alive` of 5 commands x 5 shapes x `repeats` episodes of 60 ticks (6 s).
+
+    A touching finger presses with 1 + slope * command N from tick 30 (3 s) on, and with
+    `settle_force` before. Episodes in `lost` end at tick 20.
+    """
+    rng = np.random.default_rng(seed)
+    command, shape, _ = (a.ravel() for a in np.meshgrid(COMMANDS, np.arange(5), np.arange(repeats), indexing="ij"))
+    count = command.size
+    force = np.where(np.arange(ticks)[:, None] < 30, settle_force, 1.0 + slope * command)
+    force = force + noise * rng.normal(size=count)
+    alive = np.ones((ticks, count), bool)
+    alive[20:, list(lost)] = False
+    flat = np.ones((ticks, count))
+    metrics = {
+        "command": flat * command,
+        "shape": flat * shape,
+        "finger_force": force,
+        "finger_pressing": force**2,
+        "total_force": 3 * force,
+        "taxel_force": 2 * force,
+        "thumb_force": flat * 0.5,
+        "touching": flat * 3,
+        "reward": flat * 0.25,
+        "return": flat * 7.0,
+        "joint_speed": flat * 0.1,
+        "non_finite": flat * 0,
+    }
+    return metrics, alive
+
+
+class TestProportion:
+    @pytest.mark.parametrize("hits, count", [(0, 10), (1, 10), (10, 10), (81, 263), (1004, 1024)])
+    def test_wilson_interval(self, hits, count):
+        found = report.proportion(np.arange(count) < hits)
+        known = stats.binomtest(hits, count).proportion_ci(0.95, method="wilson")
+        assert found["mean"] == pytest.approx(hits / count)
+        assert (found["low"], found["high"]) == pytest.approx((known.low, known.high), abs=1e-7)
+        assert found["count"] == count
+
+    def test_published_values(self):
+        # Newcombe (1998), Statistics in Medicine 17, table I: 81 of 263, Wilson's score.
+        found = report.proportion(np.arange(263) < 81)
+        assert (round(found["low"], 4), round(found["high"], 4)) == (0.2553, 0.3662)
+
+    def test_of_nothing(self):
+        assert report.proportion(np.zeros(0, bool)) == {"mean": None, "low": None, "high": None, "count": 0}
+
+
+class TestStatistics:
+    def test_pearson(self):
+        rng = np.random.default_rng(1)
+        x = rng.normal(size=200)
+        y = 0.6 * x + rng.normal(size=200)
+        found = report.pearson(x, y, samples=2000)
+        assert found["r"] == pytest.approx(stats.pearsonr(x, y).statistic, abs=1e-12)
+        interval = stats.pearsonr(x, y).confidence_interval(0.95)  # Fisher's: another method
+        assert (found["low"], found["high"]) == pytest.approx(tuple(interval), abs=0.03)
+
+    @pytest.mark.parametrize("x, y", [([1, 1, 1, 1], [1, 2, 3, 4]), ([1, 2, 3], [5, 5, 5]), ([1, 2], [1, 2]), ([], [])])
+    def test_pearson_undefined(self, x, y):
+        assert report.pearson(np.array(x, float), np.array(y, float)) == {"r": None, "low": None, "high": None}
+
+    def test_mean_and_its_bootstrap(self):
+        values = np.random.default_rng(2).exponential(size=300)
+        found = report.mean(values, samples=2000)
+        known = stats.bootstrap(
+            (values,), np.mean, method="percentile", n_resamples=2000, random_state=np.random.default_rng(3)
+        ).confidence_interval
+        assert found["mean"] == pytest.approx(values.mean())
+        assert (found["low"], found["high"]) == pytest.approx(tuple(known), abs=0.02)
+
+    def test_rmse(self):
+        found = report.rmse(np.array([1.0, 2.0, 5.0]), np.array([1.0, 4.0, 4.0]))
+        assert found["mean"] == pytest.approx(np.sqrt(5 / 3))
+        assert 0 <= found["low"] <= found["mean"] <= found["high"] <= 2
+
+    def test_the_bootstrap_is_repeatable(self):
+        values = np.random.default_rng(4).normal(size=50)
+        assert report.mean(values) == report.mean(values)
+
+    def test_of_nothing(self):
+        empty = np.zeros(0)
+        assert report.mean(empty)["mean"] is None and report.rmse(empty, empty)["mean"] is None
+
+
+class TestSummary:
+    @pytest.fixture(autouse=True)
+    def few_draws(self, monkeypatch):
+        """The intervals are tested above; here they only cost time."""
+        bootstrap = report.bootstrap
+        monkeypatch.setattr(
+            report, "bootstrap", lambda statistic, count, samples: bootstrap(statistic, count, min(samples, 10))
+        )
+
+    def test_a_perfect_follower(self):
+        found = report.summarize(*evaluation(noise=1e-3), PERIOD, SPAN)
+        assert found["episodes"] == 200 and found["seconds"] == pytest.approx(6.0)
+        assert found["held"]["mean"] == 1.0 and found["hold_time_s"]["mean"] == pytest.approx(6.0)
+        assert found["pearson_r"]["r"] > 0.9999 and found["rmse_n"]["mean"] < 2e-3
+        assert found["total_force_monotone"] is True
+        assert found["force_range"] == pytest.approx(5.0, rel=2e-3)
+        assert found["return"]["mean"] == pytest.approx(60 * 0.25)
+        assert found["non_finite"] == 0
+
+    def test_only_settled_ticks_count(self):
+        """The force before 3 s is 99 N; none of it may enter a mean."""
+        found = report.summarize(*evaluation(), PERIOD, SPAN)
+        wanted = [1.0, 2.0, 3.0, 4.0, 5.0]
+        assert found["finger_force_by_command_n"] == pytest.approx(wanted)
+        assert found["total_force_by_command_n"] == pytest.approx([3 * w for w in wanted])
+        for row, target in zip(found["by_command"], wanted, strict=True):
+            assert row["target_force_n"] == pytest.approx(target)
+            assert row["taxel_force_n"]["mean"] == pytest.approx(2 * target)
+            assert row["thumb_force_n"]["mean"] == pytest.approx(0.5)
+            assert row["touching_fingers"]["mean"] == pytest.approx(3.0)
+
+    def test_short_episodes_count_from_the_middle(self):
+        metrics, alive = evaluation(ticks=40)  # 4 s: the middle is tick 20, where it is still 99 N
+        found = report.summarize(metrics, alive, PERIOD, SPAN)
+        assert found["finger_force_by_command_n"][0] == pytest.approx((10 * 99 + 10 * 1) / 20)
+
+    def test_lost_episodes(self):
+        """Every 4th episode is lost at 2 s; nothing they felt counts."""
+        metrics, alive = evaluation(lost=range(0, 200, 4))
+        for name in ("finger_force", "total_force", "taxel_force"):
+            metrics[name][:, ::4] = 1e6
+        found = report.summarize(metrics, alive, PERIOD, SPAN)
+        assert found["held"]["mean"] == 0.75
+        assert found["hold_time_s"]["mean"] == pytest.approx(0.75 * 6 + 0.25 * 2)
+        assert found["return"]["mean"] == pytest.approx(0.25 * (0.75 * 60 + 0.25 * 20))
+        assert found["finger_force_by_command_n"] == pytest.approx([1, 2, 3, 4, 5])
+        for row in found["by_shape"] + found["by_command"]:
+            assert row["episodes"] == 40 and row["held"]["mean"] == 0.75
+
+    def test_shapes_are_told_apart(self):
+        metrics, alive = evaluation(noise=0.1)
+        worst = metrics["shape"][0] == 3
+        rng = np.random.default_rng(5)
+        metrics["finger_force"][:, worst] = rng.uniform(1, 5, worst.sum())
+        found = report.summarize(metrics, alive, PERIOD, SPAN)
+        by_name = {row["shape"]: row["pearson_r"]["r"] for row in found["by_shape"]}
+        assert list(by_name) == list(SHAPES)
+        assert all(r > 0.99 for name, r in by_name.items() if name != SHAPES[3])
+        assert abs(by_name[SHAPES[3]]) < 0.5
+        assert found["headline"]["Pearson r (worst shape)"] == by_name[SHAPES[3]]
+        wrong = stats.pearsonr(metrics["command"][0], metrics["finger_force"][-1]).statistic
+        assert found["pearson_r"]["r"] == pytest.approx(wrong)
+        pressing = stats.pearsonr(metrics["command"][0], metrics["finger_pressing"][-1]).statistic
+        assert found["pearson_r_pressing"]["r"] == pytest.approx(pressing)
+
+    def test_a_dip_is_not_monotone(self):
+        metrics, alive = evaluation()
+        metrics["total_force"][:, metrics["command"][0] == 0.75] = 8.9  # between 9 and 15
+        found = report.summarize(metrics, alive, PERIOD, SPAN)
+        assert found["total_force_monotone"] is False
+        assert found["force_range"] == pytest.approx(5.0)
+
+    def test_a_flat_force_is_not_monotone(self):
+        found = report.summarize(*evaluation(slope=0.0), PERIOD, SPAN)
+        assert found["total_force_monotone"] is False
+        assert found["force_range"] == pytest.approx(1.0)
+        assert found["pearson_r"]["r"] is None
+
+    def test_a_command_without_held_episodes(self):
+        metrics, alive = evaluation(lost=range(40, 80))  # all of command 0.25
+        found = report.summarize(metrics, alive, PERIOD, SPAN)
+        assert found["by_command"][1]["held"]["mean"] == 0.0
+        assert found["finger_force_by_command_n"][1] is None
+        assert found["total_force_monotone"] is False and found["force_range"] is None
+        assert found["headline"]["held at worst command"] == 0.0
+
+    def test_nothing_held(self):
+        found = report.summarize(*evaluation(lost=range(200)), PERIOD, SPAN)
+        assert found["held"]["mean"] == 0.0 and 0 < found["held"]["high"] < 0.03
+        assert found["hold_time_s"]["mean"] == pytest.approx(2.0)
+        assert found["pearson_r"]["r"] is None and found["rmse_n"]["mean"] is None
+        assert found["headline"]["Pearson r (worst shape)"] is None
+        assert found["force_range"] is None
+
+    def test_diverged_worlds_are_counted(self):
+        metrics, alive = evaluation()
+        metrics["non_finite"][7, 3] = metrics["non_finite"][9, 5] = 1.0
+        assert report.summarize(metrics, alive, PERIOD, SPAN)["non_finite"] == 2
+
+    def test_skin_correlation_counts_only_what_lives_and_touches(self):
+        metrics, alive = evaluation(noise=0.5, lost=range(0, 200, 4), settle_force=2.0)
+        metrics["skin_force"] = 0.7 * metrics["total_force"] + 0.1
+        metrics["skin_force"][20:, ::4] = -1e3
+        metrics["total_force"][:5], metrics["skin_force"][:5] = 0.0, 50.0
+        found = report.summarize(metrics, alive, PERIOD, SPAN)
+        assert found["skin_correlation"]["r"] == pytest.approx(1.0)
+        del metrics["skin_force"]
+        assert report.summarize(metrics, alive, PERIOD, SPAN)["skin_correlation"] is None
+
+    @pytest.mark.parametrize("lost", [(), range(40, 80), range(200)])
+    def test_goes_through_json(self, lost):
+        found = report.summarize(*evaluation(lost=lost), PERIOD, SPAN)
+        assert json.loads(json.dumps(found, allow_nan=False)) == found

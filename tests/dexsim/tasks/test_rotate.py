@@ -1,0 +1,583 @@
+"""The rotation task: goals, reward, counting, start states, report."""
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from c_scene import double_precision
+from scipy.spatial.transform import Rotation
+
+import dexsim
+from dexsim import observation
+from dexsim.core.errors import ConfigError
+from dexsim.env.task import Moment
+from dexsim.geometry.sdf import signed_distance
+from dexsim.hand.kinematics import forward_kinematics
+from dexsim.sensing.imu import OrientationSensor, draw_sensor, measure_orientation
+from dexsim.tasks.placement import palm_height
+from dexsim.tasks.rotate.config import RotateConfig, RotateReward, clear_of_palm, paper
+from dexsim.tasks.rotate.objects import KINDS, lowest_point, sample_target, upright
+from dexsim.tasks.rotate.report import summarize
+from dexsim.tasks.rotate.start import _fingerprint
+from dexsim.tasks.rotate.task import Rotate, goal_quat, goal_reward, tips_at_work
+from dexsim.touch.feel import Touch
+
+PERIOD = RotateConfig().physics.control_period
+CORNERS = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T  # of a cube from -1 to 1
+
+
+def quat_of(rotation: Rotation) -> np.ndarray:
+    """(w, x, y, z)"""
+    return np.roll(rotation.as_quat(), 1).astype(np.float32)
+
+
+def moment(task: Rotate, **changes) -> Moment:
+    """The cube at the reference, aligned and at rest, in an open hand that touches nothing."""
+    joints = jnp.zeros(12)
+    none = jnp.zeros((5, 120))
+    values = {
+        "target": sample_target(jax.random.key(0), task.config),
+        "joint_position": joints,
+        "joint_velocity": joints,
+        "joint_torque": joints,
+        "pose": forward_kinematics(task.hand, joints),
+        "finger_force": jnp.zeros((5, 3)),
+        "touch": Touch(none, none, none),
+        "object_position": jnp.asarray(task.reference),
+        "object_quat": jnp.array([1.0, 0, 0, 0]),
+        "object_velocity": jnp.zeros(3),
+        "object_spin": jnp.zeros(3),
+        "action": joints,
+        "last_action": joints,
+    }
+    return Moment(**{**values, **{name: jnp.asarray(v) for name, v in changes.items()}})
+
+
+def turned(degrees: float, axis=(1, 0, 0)) -> np.ndarray:
+    return quat_of(Rotation.from_rotvec(np.radians(degrees) * np.asarray(axis)))
+
+
+@pytest.fixture(scope="module")
+def task(hand) -> Rotate:
+    return Rotate(RotateConfig(), hand)
+
+
+@pytest.fixture(scope="module")
+def begun(task):
+    return task.begin(jax.random.key(0), None)
+
+
+class TestGoal:
+    @pytest.mark.parametrize("turns", [0, 1, 2, 3, 4, 1000])
+    def test_each_goal_is_a_quarter_turn_further(self, turns):
+        found = goal_quat(jnp.int32(turns), jnp.array([1.0, 0, 0]), math.pi / 2)
+        expected = Rotation.from_rotvec([math.pi / 2 * ((turns + 1) % 4), 0, 0])
+        got = Rotation.from_quat(np.roll(found, -1))
+        assert (got.inv() * expected).magnitude() < 1e-3
+
+    @pytest.mark.parametrize("turns", range(5))
+    def test_the_mirrored_sense_has_the_mirrored_goals(self, hand, turns):
+        axis = jnp.array([1.0, 0, 0])
+        ahead = goal_quat(jnp.int32(turns), axis, math.pi / 2)
+        back = goal_quat(jnp.int32(turns), axis, -math.pi / 2)
+        other = goal_quat(jnp.int32(turns), -axis, math.pi / 2)
+        product = Rotation.from_quat(np.roll(ahead, -1)) * Rotation.from_quat(np.roll(back, -1))
+        assert product.magnitude() < 1e-3
+        same = Rotation.from_quat(np.roll(back, -1)).inv() * Rotation.from_quat(np.roll(other, -1))
+        assert same.magnitude() < 1e-3
+
+    def test_the_mirrored_task_succeeds_on_the_mirrored_motion(self, hand):
+        ahead = Rotate(RotateConfig(), hand)
+        back = Rotate(RotateConfig(direction=-1), hand)
+        for degrees in (-90, -60, 0, 75, 90):
+            goal = ahead.begin(jax.random.key(0), None)
+            one = ahead.progress(goal, moment(ahead, object_quat=turned(degrees), object_spin=[0.5, 0, 0]))
+            two = back.progress(goal, moment(back, object_quat=turned(-degrees), object_spin=[-0.5, 0, 0]))
+            assert bool(one.success) == bool(two.success) == (abs(degrees - 90) < 17.2)
+            np.testing.assert_allclose(one.angle, two.angle, atol=1e-5)
+            np.testing.assert_allclose(one.spin, two.spin, atol=1e-6)
+
+    @pytest.mark.parametrize("degrees", [72.5, 73.5, 90, 106.5, 107.5])
+    def test_within_0_3_rad_is_reached(self, task, begun, degrees):
+        now = task.progress(begun, moment(task, object_quat=turned(degrees)))
+        np.testing.assert_allclose(now.angle, abs(math.radians(degrees) - math.pi / 2), atol=1e-4)
+        assert bool(now.success) == (abs(math.radians(degrees) - math.pi / 2) < 0.3)
+
+    def test_too_far_off_too_fast_or_tilted_is_not(self, task, begun):
+        def reached(**changes):
+            return bool(
+                task.progress(
+                    begun, moment(task, object_quat=changes.pop("object_quat", turned(90)), **changes)
+                ).success
+            )
+
+        place = np.asarray(task.reference)
+        assert reached()
+        assert reached(object_position=place + [0, 0.049, 0])
+        assert not reached(object_position=place + [0, 0.051, 0])
+        assert reached(object_spin=[1.9, 5, 5])
+        assert not reached(object_spin=[2.1, 0, 0])
+        assert not reached(object_spin=[-2.1, 0, 0])
+        tilted = Rotation.from_euler("y", 20, degrees=True) * Rotation.from_euler("x", 90, degrees=True)
+        assert not reached(object_quat=quat_of(tilted))
+
+    def test_a_dwell_has_to_be_held_without_a_break(self, hand):
+        task = Rotate(RotateConfig(goal_dwell=3 * PERIOD), hand)
+        goal, reached = task.begin(jax.random.key(0), None), []
+        for degrees in (90, 90, 0, 90, 90, 90, 90):
+            now = moment(task, object_quat=turned(degrees))
+            reached.append(bool(task.progress(goal, now).success))
+            goal = task.update(jax.random.key(0), goal, now)
+        assert reached == [False, False, False, False, False, True, False]
+        assert int(goal.turns) == 1 and int(goal.entries) == 1
+
+    def test_counts_over_an_episode(self, task, begun):
+        """A whip through the window counts for the paper; only a calm one moves the goal on."""
+        goal, turns, entries = begun, [], []
+        for degrees, spin in ((45, 1), (90, 4), (150, 4), (90, 0.5), (100, 0.5), (180, 1), (270, 1), (0, 1)):
+            goal = task.update(
+                jax.random.key(0), goal, moment(task, object_quat=turned(degrees), object_spin=[spin, 0, 0])
+            )
+            turns.append(int(goal.turns))
+            entries.append(int(goal.entries))
+        assert turns == [0, 0, 0, 1, 1, 2, 3, 4]
+        assert entries == [0, 1, 1, 1, 1, 2, 3, 4]
+        np.testing.assert_allclose(goal.last_success, 8 * PERIOD, rtol=1e-5)
+        np.testing.assert_allclose(goal.totals["spin"], 1 + 4 + 4 + 0.5 + 0.5 + 1 + 1 + 1, rtol=1e-5)
+
+
+@pytest.mark.parametrize(("tilt", "roll"), [(0.0, 0.0), (-0.3, 0.0), (-0.3, -0.2), (0.4, 0.3)])
+def test_gravity_in_a_hand_that_is_pitched_and_rolled(hand, tilt, roll):
+    """The roll turns the palm-up hand about the axis along its fingers, then the tilt about the one across them."""
+    mount = Rotation.from_euler("y", -tilt) * Rotation.from_euler("z", -roll)
+    found = np.array(Rotate(RotateConfig(tilt=tilt, roll=roll), hand).gravity)
+    np.testing.assert_allclose(found, mount.apply([-9.81, 0.0, 0.0]), atol=1e-6)
+
+
+class TestReward:
+    def test_the_composite_on_a_grid(self):
+        """1 / (|d_rot| + eps) * 1 / (1 + exp(400 (d_goal - 0.05)))"""
+        for angle in (0.0, 0.1, 0.3, 1.0, 3.1):
+            for distance in (0.0, 0.03, 0.05, 0.06, 0.09):
+                expected = 1 / (angle + 0.1) / (1 + math.exp(400 * (distance - 0.05)))
+                found = goal_reward(jnp.float32(angle), jnp.float32(distance), RotateReward())
+                np.testing.assert_allclose(found, expected, rtol=2e-4)
+
+    def test_the_papers_reward_is_its_three_terms(self, hand):
+        task = Rotate(paper(), hand)
+        goal = task.begin(jax.random.key(0), None)
+        action = np.linspace(-1, 1, 12).astype(np.float32)
+        busy = dict(
+            action=action,
+            joint_velocity=np.full(12, 3.0),
+            joint_torque=np.full(12, 0.5),
+            finger_force=np.full((5, 3), 2.0),
+            object_spin=[9.0, 0, 0],
+        )
+        cost = -0.0002 * float(np.sum(action**2))
+        reward, _ = task.reward(goal, moment(task, object_quat=turned(45), **busy), jnp.bool_(False))
+        np.testing.assert_allclose(reward, 1 / (math.pi / 4 + 0.1) + cost, rtol=1e-4)
+        reward, _ = task.reward(goal, moment(task, object_quat=turned(90), **busy), jnp.bool_(False))
+        np.testing.assert_allclose(reward, 250 + 1 / 0.1 + cost, rtol=1e-4)
+
+    @pytest.mark.parametrize("by", ["mean", "last"])
+    def test_fingertips_at_work_earn_the_rest_of_the_bonus(self, hand, begun, by):
+        last, tips = 0.0, RotateReward().bonus_tips
+        task = Rotate(RotateConfig(reward=RotateReward(tips_by=by)), hand)
+        half = 0.5 * RotateReward().working_duty / (1 - PERIOD / 2.0)  # less this tick, in which nothing touches
+        cases = {
+            "mean": (((0, 0, 0, 0, 0), 1 - tips), ((1, 0, 0, 0, 0), 1 - tips * 2 / 3), ((1, 1, 0, 0, 1), 1.0)),
+            "last": (((1, 1, 0, 0, 0), 1 - tips), ((1, 1, 0, 0, half), 1 - tips / 2), ((1, 1, 0, 0, 1), 1.0)),
+        }
+        for duty, share in cases[by]:
+            goal = dataclasses.replace(begun, duty=jnp.asarray(duty, jnp.float32), turns=jnp.int32(2))
+            here = moment(task, object_quat=turned(270))
+            _, metrics = task.reward(goal, here, jnp.bool_(False))
+            np.testing.assert_allclose(metrics["reward/bonus"], 250 * share, rtol=1e-5)
+            assert metrics["reward/bonus"] > last
+            last = metrics["reward/bonus"]
+
+    def test_the_first_goals_do_not_ask_for_fingertips(self, task, begun):
+        for turns, angle in ((0, 90), (1, 180)):
+            goal = dataclasses.replace(begun, turns=jnp.int32(turns))
+            _, metrics = task.reward(goal, moment(task, object_quat=turned(angle)), jnp.bool_(False))
+            np.testing.assert_allclose(metrics["reward/bonus"], 250, rtol=1e-5)
+
+    def test_a_gait_too_fast_earns_less(self, task, begun):
+        limit, here = RotateReward().bonus_speed, moment(task, object_quat=turned(90))
+        busy = dataclasses.replace(begun, duty=jnp.ones(5))
+        for pace, share in ((0.5 * limit, 1.0), (limit, 1.0), (2 * limit, 0.25), (3 * limit, 1 / 9)):
+            # Of this tick's own speed: none.
+            goal = dataclasses.replace(busy, pace=jnp.float32(pace / (1 - PERIOD / 2.0)))
+            _, metrics = task.reward(goal, here, jnp.bool_(False))
+            np.testing.assert_allclose(metrics["reward/bonus"], 250 * share, rtol=1e-4)
+
+    def test_standing_still_earns_less_than_turning(self, task, begun):
+        """Else policies hold the object where their first stroke ended."""
+        still, turning = (
+            float(
+                task.reward(begun, moment(task, object_quat=turned(0), object_spin=[spin, 0, 0]), jnp.bool_(False))[0]
+            )
+            for spin in (0.0, 0.3)
+        )
+        assert 0 < still < turning - still
+
+    def test_pace_is_a_leaky_mean(self, task, begun):
+        goal = begun
+        for _ in range(40):
+            goal = task.update(jax.random.key(0), goal, moment(task, joint_velocity=np.full(12, -3.0)))
+        np.testing.assert_allclose(goal.pace, 3 * (1 - (1 - PERIOD / 2.0) ** 40), rtol=1e-4)
+
+    def test_a_lost_object_earns_nothing(self, task, begun):
+        here = moment(task, object_quat=turned(90), object_spin=[1.0, 0, 0])
+        reward, metrics = task.reward(begun, here, jnp.bool_(True))
+        assert float(reward) == RotateReward().drop
+        assert float(metrics["slipped"]) == 1 and float(metrics["pushed_out"]) == 0
+
+    def test_a_finger_that_just_touched_pushed_it_out(self, task, begun):
+        force = np.zeros((5, 3))
+        force[3, 1] = 1.0
+        goal = task.update(jax.random.key(0), begun, moment(task, finger_force=force))
+        for ticks, pushed in ((3, True), (10, False)):
+            for _ in range(ticks):
+                goal = task.update(jax.random.key(0), goal, moment(task))
+            _, metrics = task.reward(goal, moment(task), jnp.bool_(True))
+            assert bool(metrics["pushed_out"]) == pushed != bool(metrics["slipped"])
+
+    def test_tips_at_work(self):
+        duty = jnp.array([0.5, 0.0, 0.125, 0.05, 0.0])
+        np.testing.assert_allclose(tips_at_work(duty, 3, 0.25), (1 + 0.5 + 0.2) / 3, rtol=1e-6)
+        assert tips_at_work(jnp.full(5, 0.3), 3, 0.25) == 1
+        np.testing.assert_allclose(tips_at_work(duty, 3, 0.25, "last"), 0.2, rtol=1e-6)
+        assert tips_at_work(duty, 4, 0.25, "last") == 0 and tips_at_work(duty, 1, 0.25, "last") == 1
+
+    def test_duty_is_a_leaky_mean(self, task, begun):
+        force = np.zeros((5, 3))
+        force[2] = 1.0
+        goal = begun
+        for _ in range(40):
+            goal = task.update(jax.random.key(0), goal, moment(task, finger_force=force))
+        np.testing.assert_allclose(goal.duty, [0, 0, 1 - (1 - PERIOD / 2.0) ** 40, 0, 0], rtol=1e-4)
+
+
+class TestDrop:
+    def test_tipped_over(self, task, begun):
+        for degrees, lost in ((55, False), (59, True), (180, True)):
+            tipped = Rotation.from_euler("y", degrees, degrees=True) * Rotation.from_euler("x", 1.0)
+            here = moment(task, object_quat=quat_of(tipped))
+            np.testing.assert_allclose(task._tilt(here), math.radians(degrees), atol=1e-3)
+            assert bool(task.dropped(begun, here)) == lost
+        assert not bool(task.dropped(begun, moment(task, object_quat=turned(170))))
+
+    def test_patience_ends_training_episodes_only(self, hand):
+        task = Rotate(RotateConfig(patience=5 * PERIOD), hand)
+        _, waiting = task.evaluation_plan(1, np.zeros(4, int))
+        for goal, gives_up in (
+            (task.begin(jax.random.key(0), None), True),
+            (jax.tree.map(lambda x: x[0], waiting), False),
+        ):
+            lost = []
+            for tick in range(9):
+                here = moment(task, object_quat=turned(90 if tick == 2 else 30))
+                goal = task.update(jax.random.key(0), goal, here)
+                lost.append(bool(task.dropped(goal, here)))
+            # The goal of tick 2 starts the clock anew; the sixth tick after it is one too many.
+            assert lost == [False] * 8 + [gives_up]
+
+    def test_too_far_away_training_on_a_leash(self, task, begun, hand):
+        _, waiting = task.evaluation_plan(1, np.zeros(4, int))
+        free = Rotate(RotateConfig(leash=1.0), hand)
+        for rules, goal, limit in (
+            (task, begun, 0.055),
+            (task, jax.tree.map(lambda x: x[0], waiting), 0.07),
+            (free, free.begin(jax.random.key(0), None), 0.07),
+        ):
+            for distance, lost in ((limit - 0.001, False), (limit + 0.001, True)):
+                place = np.asarray(task.reference) + [0, 0, distance]
+                assert bool(rules.dropped(goal, moment(task, object_position=place))) == lost
+
+    def test_lowest_corner_of_a_tilted_cube(self, task):
+        target = sample_target(jax.random.key(3), task.config)
+        half, place = float(target.size[0, 0]), np.array([0.06, 0.0, 0.08])
+        corners = half * CORNERS
+        for seed in range(5):
+            rotation = Rotation.random(random_state=seed)
+            low = np.min(rotation.apply(corners)[:, 0]) + place[0]
+            np.testing.assert_allclose(lowest_point(target, quat_of(rotation), jnp.asarray(place)), low, atol=1e-6)
+
+    def test_lowest_point_of_an_upright_cylinder(self, hand):
+        target = sample_target(jax.random.key(3), RotateConfig(object="cylinder"))
+        half = float(target.size[0, 0])
+        for tilt in (0.0, 0.3, 1.2):  # about y: the rim's lowest point
+            quat = quat_of(Rotation.from_euler("y", tilt))
+            low = 0.05 - half * (math.cos(tilt) + math.sin(tilt))
+            found = lowest_point(target, quat, jnp.array([0.05, 0.0, 0.0]))
+            np.testing.assert_allclose(found, low, atol=1e-6)
+
+    def test_on_the_palm_is_dropped_when_held_by_fingers(self, hand):
+        task = Rotate(RotateConfig(support="fingers"), hand)
+        goal = task.begin(jax.random.key(0), None)
+        here = moment(task)
+        half = float(here.target.size[0, 0])
+        palm = palm_height(hand)
+        for gap, lost in ((0.0005, True), (0.0015, False)):
+            place = np.asarray(task.reference) * [0, 1, 1] + [palm + half + gap, 0, 0]
+            assert bool(task.dropped(goal, moment(task, object_position=place))) == lost
+
+
+class TestObjects:
+    @pytest.mark.parametrize("kind", list(KINDS))
+    def test_touch_sees_the_object_that_is_meant(self, kind):
+        """Distances along the axis and across it: the sides of a cube, the rim of a cylinder."""
+        config = RotateConfig(object=kind, edge=(0.05, 0.05))
+        shape = sample_target(jax.random.key(0), config).shape()
+        angles = np.radians(np.arange(0, 360, 45))
+        ring = 0.1 * np.stack([0 * angles, np.cos(angles), np.sin(angles)], -1)
+        reach = {
+            "cube": np.where(np.arange(8) % 2, 0.05 / math.sqrt(2), 0.025),
+            "cylinder": np.full(8, 0.025),
+            "octagon": np.full(8, 0.05 / math.sqrt(2)),
+        }[kind]
+        np.testing.assert_allclose(signed_distance(jnp.asarray(ring), shape), 0.1 - reach, atol=1e-6)
+        np.testing.assert_allclose(signed_distance(jnp.array([0.1, 0, 0]), shape), 0.075, atol=1e-6)
+
+    def test_inertia_of_a_cube(self):
+        config = RotateConfig()
+        config = dataclasses.replace(config, objects=dataclasses.replace(config.objects, inertia_scale=(1.0, 1.0)))
+        target = sample_target(jax.random.key(1), config)
+        edge = 2 * float(target.size[0, 0])
+        np.testing.assert_allclose(target.inertia, np.full(3, float(target.mass) * edge**2 / 6), rtol=1e-5)
+
+
+class TestPool:
+    def test_start_states_rest_where_they_should(self, hand, monkeypatch, tmp_path):
+        monkeypatch.setenv("DEXSIM_CACHE", str(tmp_path))
+        config = RotateConfig(pool_size=48)
+        task = Rotate(config, hand)
+        pool = task.make_pool(jax.random.key(0))
+        assert pool.qpos.shape == (48, 19) and np.all(pool.qvel == 0)
+        half = pool.target.size[:, 0, 0]
+        turns = Rotation.from_quat(np.roll(pool.qpos[:, 15:19], -1, axis=1)).as_matrix()
+        lowest = np.min((CORNERS @ turns.transpose(0, 2, 1))[..., 0], axis=1) * half
+        gap = pool.qpos[:, 12] + lowest - palm_height(hand)
+        # On the palm, which gives way where a finger presses from above.
+        assert np.all(gap < 0.003) and np.all(gap > -0.006) and np.mean(np.abs(gap) < 0.001) > 0.7
+        assert np.ptp(pool.target.friction) > 0.3
+        # Each size has its share, though large cubes fit between the fingers in far fewer postures.
+        assert np.all(np.histogram(2 * half, 3, config.edge)[0] > 9)
+        again = task.make_pool(jax.random.key(0))
+        jax.tree.map(np.testing.assert_array_equal, pool, again)
+        (file,) = (tmp_path / "pools").iterdir()
+        file.write_bytes(file.read_bytes()[:1000])  # a damaged cache is made again
+        jax.tree.map(np.testing.assert_array_equal, pool, task.make_pool(jax.random.key(0)))
+
+    def test_held_by_fingers_none_is_a_drop_from_the_beginning(self, hand, monkeypatch, tmp_path):
+        monkeypatch.setenv("DEXSIM_CACHE", str(tmp_path))
+        config = dataclasses.replace(clear_of_palm(), pool_size=12)
+        pool = Rotate(config, hand).make_pool(jax.random.key(0))
+        axis = np.asarray(config.axis) / np.linalg.norm(config.axis)
+        stand = Rotation.align_vectors([axis], [[1.0, 0, 0]])[0]  # Its face on the axis, up to a turn about it.
+        for k in range(12):
+            # The eight corners of the cube as the pool has it, in the palm frame.
+            half, slot = pool.target.size[k, 0], Rotation.from_quat(np.roll(pool.target.quat[k, 0], -1))
+            np.testing.assert_allclose(slot.apply([1.0, 0, 0]), stand.apply([1.0, 0, 0]), atol=1e-6)
+            corners = half * CORNERS
+            turn = Rotation.from_quat(np.roll(pool.qpos[k, 15:19], -1))
+            low = (turn * slot).apply(corners)[:, 0].min() + pool.qpos[k, 12]
+            assert low > palm_height(hand) + config.clearance - 1e-6
+            assert np.arccos(turn.apply(axis) @ axis) < 0.35
+
+    @pytest.mark.parametrize("axis", [(0.6, 0.0, -0.8), (0.0, 0.5, 0.0), (-1.0, 0.0, 0.0), (0.3, -0.5, 0.4)])
+    def test_a_cube_stands_on_any_axis(self, axis):
+        quat = upright(RotateConfig(axis=axis).unit_axis)
+        np.testing.assert_allclose(
+            Rotation.from_quat(np.roll(quat, -1)).apply([1.0, 0, 0]), np.asarray(axis) / np.linalg.norm(axis), atol=1e-6
+        )
+        assert upright(RotateConfig(axis=(0.5, 0.0, 0.0)).unit_axis) is None
+
+    def test_another_object_is_another_pool(self, hand):
+        key, config = jax.random.key(0), RotateConfig()
+        names = {
+            _fingerprint(key, hand, c)
+            for c in (
+                config,
+                RotateConfig(edge=(0.05, 0.055)),
+                RotateConfig(tilt=0.1),
+                RotateConfig(support="fingers"),
+                RotateConfig(object="cylinder"),
+            )
+        }
+        assert len(names) == 5
+        same = dataclasses.replace(config, reward=RotateReward(bonus=1.0), episode_seconds=5.0)
+        assert _fingerprint(key, hand, same) in names
+
+    def test_no_start_state_is_one_clear_line(self, hand, monkeypatch, tmp_path):
+        monkeypatch.setenv("DEXSIM_CACHE", str(tmp_path))
+        config = RotateConfig(tilt=1.2, reference=(0.3, 0.0, 0.3), support="fingers", pool_size=4)
+        told = r"only 0 of 4 objects have a start state that stayed in the hand \(\d+ tried\)"
+        with pytest.raises(ConfigError, match=told):
+            Rotate(config, hand).make_pool(jax.random.key(0))
+
+
+class TestObservation:
+    def test_the_layouts(self, hand):
+        config = observation.ObservationConfig()
+        actor = observation.layout(hand, observation.ROTATE, config)
+        critic = observation.layout(hand, observation.ROTATE_CRITIC, config)
+        assert sum(f.size for f in actor) == 65 and sum(f.size for f in critic) == 149
+        assert critic[: len(actor)] == actor
+        assert {f.name: f.size for f in critic[len(actor) :]} == {
+            "object_orientation": 6,
+            "fingertip_velocity": 30,
+            "fingertip_rotation": 30,
+            "joint_velocity": 12,
+            "object_velocity": 3,
+            "object_spin": 3,
+        }
+
+    @pytest.mark.parametrize("name, size", [("contact_centre", 15), ("contact_force", 5), ("relative_orientation", 6)])
+    def test_what_is_left_out_is_gone(self, hand, name, size):
+        config = observation.ObservationConfig(leave_out=(name,))
+        fields = observation.layout(hand, observation.ROTATE, config)
+        assert name not in [f.name for f in fields] and sum(f.size for f in fields) == 65 - size
+
+    def test_fingertip_twist_against_finite_differences(self, hand):
+        rng = np.random.default_rng(0)
+        joints, speed = rng.uniform(0, 1, 12), rng.normal(size=12)
+        with double_precision():
+            twist = np.asarray(observation._tip_twist(hand, jnp.asarray(joints), jnp.asarray(speed)))
+            poses = [
+                jax.tree.map(np.asarray, forward_kinematics(hand, jnp.asarray(joints + s * speed * 1e-6)))
+                for s in (-1, 1)
+            ]
+        linear = (poses[1].tip_position - poses[0].tip_position) / 2e-6
+        np.testing.assert_allclose(twist[:, :3], linear, atol=1e-5)
+        turn = [Rotation.from_matrix(np.asarray(p.tip_rotation)) for p in poses]
+        angular = (turn[1] * turn[0].inv()).as_rotvec() / 2e-6
+        np.testing.assert_allclose(twist[:, 3:], angular, atol=1e-4)
+
+
+class TestOrientationSensor:
+    UP = jnp.array([1.0, 0.0, 0.0])
+
+    def read(self, sensor, draw, tick, now, before, held, key=0):
+        return measure_orientation(
+            jax.random.key(key), sensor, draw, jnp.float32(tick), now, before, held, self.UP, PERIOD
+        )
+
+    def test_a_perfect_one_reads_the_truth(self):
+        sensor = OrientationSensor(noise=0.0)
+        draw = draw_sensor(jax.random.key(0), sensor, 0.0, PERIOD)
+        now = turned(40, (0, 0, 1))
+        np.testing.assert_allclose(self.read(sensor, draw, 5, now, turned(10), turned(0)), now, atol=1e-6)
+
+    def test_delay_drift_and_bias(self):
+        sensor = OrientationSensor(noise=0.0, rate=1000.0)
+        draw = draw_sensor(jax.random.key(0), sensor, 0.0, PERIOD)
+        late = dataclasses.replace(draw, delay=jnp.float32(0.5))
+        read = self.read(sensor, late, 5, turned(10), turned(8), turned(0))
+        assert Rotation.from_quat(np.roll(read, -1)).magnitude() == pytest.approx(math.radians(9), abs=1e-4)
+        # q and -q are one orientation: their mean is not a turn.
+        read = self.read(sensor, late, 5, turned(10), -turned(8), turned(0))
+        assert Rotation.from_quat(np.roll(read, -1)).magnitude() == pytest.approx(math.radians(9), abs=1e-4)
+        drifting = dataclasses.replace(draw, drift=jnp.float32(0.01))
+        read = self.read(sensor, drifting, 100, turned(10), turned(10), turned(0))
+        expected = math.radians(10) + 0.01 * 100 * PERIOD
+        assert Rotation.from_quat(np.roll(read, -1)).magnitude() == pytest.approx(expected, abs=1e-4)
+        crooked = dataclasses.replace(draw, bias=jnp.array([0.0, 0.03, 0.0]))
+        read = self.read(sensor, crooked, 1, turned(0), turned(0), turned(0))
+        np.testing.assert_allclose(Rotation.from_quat(np.roll(read, -1)).as_rotvec(), [0, 0.03, 0], atol=1e-5)
+
+    def test_noise_has_the_stated_deviation(self):
+        sensor = OrientationSensor(noise=0.05)
+        draw = draw_sensor(jax.random.key(0), sensor, 0.0, PERIOD)
+        reads = jax.vmap(
+            lambda k: measure_orientation(
+                k, sensor, draw, jnp.float32(1), turned(0), turned(0), turned(0), self.UP, PERIOD
+            )
+        )(jax.random.split(jax.random.key(1), 4000))
+        vectors = Rotation.from_quat(np.roll(reads, -1, axis=1)).as_rotvec()
+        np.testing.assert_allclose(vectors.std(0), 0.05, rtol=0.05)
+
+    def test_a_slow_sensor_is_read_again(self):
+        """At 10 Hz under 33 Hz control, three or four ticks see each sample."""
+        sensor = OrientationSensor(noise=0.0, rate=10.0)
+        draw = draw_sensor(jax.random.key(0), sensor, 0.0, PERIOD)
+        held, seen = turned(0), []
+        for tick in range(1, 34):
+            now = turned(float(tick))
+            held = self.read(sensor, draw, tick, now, now, held)
+            seen.append(round(np.degrees(Rotation.from_quat(np.roll(held, -1)).magnitude()), 2))
+        samples = sorted(set(seen[4:]))
+        assert all(2 < b - a < 5 for a, b in zip(samples, samples[1:], strict=False))
+        assert 8 <= len(samples) <= 10
+
+
+class TestReport:
+    def test_hand_computed(self):
+        n = 4
+        zero = np.zeros(n)
+        metrics = {
+            "successes": np.array([0.0, 10, 20, 30]),
+            "paper_successes": np.array([1.0, 11, 20, 30]),
+            "time_at_last_success": np.array([0.0, 20, 30, 60]),
+            "spin": np.full(n, np.pi),
+            "joint_speed": np.full(n, 0.5),
+            "action_rate": zero,
+            "tilt": zero,
+            "pushed_out": np.array([1.0, 0, 0, 0]),
+            "slipped": np.array([0.0, 1, 0, 0]),
+            "non_finite": zero,
+            "duty/0": np.full(n, 0.2),
+            "duty/1": zero,
+            "duty/2": np.full(n, 0.05),
+        }
+        report = summarize(metrics, np.array([100, 1000, 4000, 4000]), 0.03, 4000)
+        assert report["successes"]["mean"]["mean"] == 15
+        assert report["successes"]["median"]["median"] == 15
+        assert report["successes"]["sorted"] == [0, 10, 20, 30]
+        assert report["without_success"]["mean"] == 0.25
+        assert report["seconds_per_success"]["mean"] == pytest.approx((2 + 1.5 + 2) / 3)
+        assert report["seconds_to_fall"]["mean"] == pytest.approx((3 + 30 + 120 + 120) / 4)
+        assert report["end"] == {"pushed_out": 1, "slipped": 1, "timeout": 2}
+        assert report["rotations_per_minute"]["mean"] == pytest.approx(30)
+        assert report["gait"]["fingertip_duty"] == pytest.approx([0.2, 0, 0.05])
+        assert report["headline"]["fingertips at work (duty over 10 %)"] == 1
+
+
+@pytest.fixture(scope="module")
+def rotate_env():
+    return dexsim.make("rotate", RotateConfig(pool_size=16), backend="jax", num_envs=8)
+
+
+class TestEnvironment:
+    def test_the_palm_ends_where_the_hand_does(self, rotate_env):
+        """As a box, where a half-space would carry what lies beside it; how that falls: `test_warp`."""
+        model = rotate_env.physics.mj_model
+        names = {model.geom(g).name for g in model.pair_geom1}
+        assert "palm" in names and "palm_face" not in names
+
+    def test_lives_through_an_episode(self, rotate_env):
+        """A still hand keeps the cube; counts start anew with the next episode."""
+        env = rotate_env
+        state = jax.jit(lambda key: jax.vmap(env.reset)(jax.random.split(key, 8)))(jax.random.key(0))
+        assert state.obs["actor"].shape == (8, 65) and state.obs["critic"].shape == (8, 149)
+        step, restart = jax.jit(jax.vmap(env.step)), jax.jit(jax.vmap(env.restart))
+        for _ in range(30):
+            state = step(state, jnp.zeros((8, 12)))
+        assert not np.any(state.terminated) and np.all(np.isfinite(state.reward))
+        # The cube turned by hand to its first goal: one success, and the clock of goals moves on.
+        qpos = np.array(state.physics.qpos)
+        qpos[:, 15:] = turned(90)
+        physics = dataclasses.replace(state.physics, qpos=jnp.asarray(qpos), qvel=jnp.zeros_like(state.physics.qvel))
+        after = step(dataclasses.replace(state, physics=physics), jnp.zeros((8, 12)))
+        calm = np.abs(np.asarray(after.physics.qvel[:, 15])) < 1.5
+        assert calm.sum() >= 4
+        np.testing.assert_array_equal(np.asarray(after.goal.turns)[calm], 1)
+        np.testing.assert_allclose(np.asarray(after.metrics["reward/bonus"])[calm], 250, rtol=1e-5)
+        fresh = restart(after, jnp.arange(8) < 4)
+        np.testing.assert_array_equal(fresh.goal.turns[:4], 0)
+        np.testing.assert_array_equal(fresh.goal.turns[4:], after.goal.turns[4:])

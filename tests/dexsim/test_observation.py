@@ -1,0 +1,214 @@
+"""Observations: sizes, order and content of every field, the ablations, and bitwise sameness."""
+
+import dataclasses
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+
+from dexsim import observation
+from dexsim.core.errors import ConfigError
+from dexsim.observation import GRASP, ROTATE, Field, ObservationConfig, Readings, layout
+
+TIPS = ("thumb_tip", "index_tip", "mid_tip", "ring_tip", "pinky_tip")
+observe = jax.jit(observation.observe, static_argnums=(0, 2, 3))
+
+
+def unit(rng):
+    quat = rng.normal(size=4)
+    return quat / np.linalg.norm(quat)
+
+
+@pytest.fixture(scope="module")
+def readings(hand):
+    """One tick in which every number is different; the ring finger touches nothing."""
+    rng = np.random.default_rng(0)
+    force = rng.uniform(0.1, 2, (5, 120)) * (rng.random((5, 120)) < 0.1)
+    force[3] = 0
+    values = Readings(
+        joint_position=rng.uniform(hand.joint_lower, hand.joint_upper),
+        joint_torque=rng.uniform(-1, 1, 12),
+        taxel_force=force,
+        object_position=rng.normal(size=3),
+        object_velocity=rng.normal(size=3),
+        object_quat=unit(rng),
+        goal_quat=unit(rng),
+        command=np.array(0.37),
+        last_action=rng.uniform(-1, 1, 12),
+    )
+    return jax.tree.map(lambda x: np.asarray(x, np.float32), values)
+
+
+@pytest.fixture(scope="module")
+def truth(hand, readings):
+    """What each field ought to hold, by C MuJoCo and loops."""
+    model = mujoco.MjModel.from_xml_path(str(hand.model_path))
+    data = mujoco.MjData(model)
+    for name, angle in zip(hand.joint_names, readings.joint_position, strict=True):
+        data.qpos[model.joint(name).qposadr[0]] = angle
+    mujoco.mj_forward(model, data)
+    tip, centre, plain = [], [], []
+    for finger, site in enumerate(TIPS):
+        at = model.site(site).id
+        tip.append(data.site_xpos[at])
+        body = model.site_bodyid[at]
+        taxels = hand.taxel_position[finger] @ data.xmat[body].reshape(3, 3).T + data.xpos[body]
+        force = readings.taxel_force[finger].astype(float)
+        centre.append(force @ taxels / force.sum() if force.sum() else np.zeros(3))
+        plain.append(taxels[force > 0].mean(0) if force.any() else np.zeros(3))
+    # The turn that takes the object to its goal: goal = relative * object.
+    back, relative, matrix = np.zeros(4), np.zeros(4), np.zeros(9)
+    mujoco.mju_negQuat(back, readings.object_quat.astype(float))
+    mujoco.mju_mulQuat(relative, readings.goal_quat.astype(float), back)
+    mujoco.mju_quat2Mat(matrix, relative)
+    matrix = matrix.reshape(3, 3)
+    return {
+        "joint_position": readings.joint_position,
+        "joint_torque": readings.joint_torque,
+        "object_position": readings.object_position,
+        "object_velocity": readings.object_velocity,
+        "contact_force": readings.taxel_force.sum(1),
+        "contact_centre": np.ravel(centre),
+        "fingertip_position": np.ravel(tip),
+        "command": [0.37],
+        "last_action": readings.last_action,
+        "relative_orientation": np.concatenate([matrix[:, 0], matrix[:, 1]]),
+        "relative_quaternion": relative,
+        "plain_centre": np.ravel(plain),
+    }
+
+
+def check(hand, readings, names, config, wanted):
+    vector = np.asarray(observe(hand, readings, names, config))
+    fields = layout(hand, names, config)
+    assert vector.dtype == np.float32 and vector.shape == (sum(f.size for f in fields),)
+    at = 0
+    for field in fields:
+        np.testing.assert_allclose(
+            vector[at : at + field.size], wanted[field.name], atol=2e-6, rtol=1e-5, err_msg=field.name
+        )
+        at += field.size
+    return fields
+
+
+def test_the_grasp_observation_is_66_values_in_the_papers_order(hand, readings, truth):
+    fields = check(hand, readings, GRASP, ObservationConfig(), truth)
+    assert [(f.name, f.size) for f in fields] == [
+        ("joint_position", 12),
+        ("joint_torque", 12),
+        ("object_position", 3),
+        ("object_velocity", 3),
+        ("contact_force", 5),
+        ("contact_centre", 15),
+        ("fingertip_position", 15),
+        ("command", 1),
+    ]
+    assert sum(f.size for f in fields) == 66
+
+
+def test_the_rotate_observation_is_65_values_in_the_papers_order(hand, readings, truth):
+    fields = check(hand, readings, ROTATE, ObservationConfig(), truth)
+    assert [(f.name, f.size) for f in fields] == [
+        ("joint_position", 12),
+        ("relative_orientation", 6),
+        ("last_action", 12),
+        ("contact_centre", 15),
+        ("contact_force", 5),
+        ("fingertip_position", 15),
+    ]
+    assert sum(f.size for f in fields) == 65
+
+
+def test_quaternion_instead_of_six_d(hand, readings, truth):
+    config = ObservationConfig(orientation="quaternion")
+    fields = check(hand, readings, ROTATE, config, {**truth, "relative_orientation": truth["relative_quaternion"]})
+    assert sum(f.size for f in fields) == 63
+
+
+def test_unweighted_centre(hand, readings, truth):
+    assert np.abs(truth["plain_centre"] - truth["contact_centre"]).max() > 1e-3
+    check(
+        hand, readings, GRASP, ObservationConfig(weighting="none"), {**truth, "contact_centre": truth["plain_centre"]}
+    )
+
+
+@pytest.mark.parametrize(
+    ("names", "leave_out", "size"),
+    [
+        (GRASP, ("contact_force",), 61),
+        (GRASP, ("contact_centre",), 51),
+        (GRASP, ("contact_force", "contact_centre"), 46),
+        (ROTATE, ("relative_orientation",), 59),
+        (ROTATE, ("contact_centre", "contact_force"), 45),
+    ],
+)
+def test_ablations_leave_their_fields_out(hand, readings, truth, names, leave_out, size):
+    fields = check(hand, readings, names, ObservationConfig(leave_out=leave_out), truth)
+    assert [f.name for f in fields] == [name for name in names if name not in leave_out]
+    assert sum(f.size for f in fields) == size
+
+
+def test_a_finger_that_touches_nothing_has_its_centre_at_zero(hand, readings):
+    vector = np.asarray(observe(hand, readings, GRASP, ObservationConfig()))
+    np.testing.assert_array_equal(vector[30 + 3], 0)
+    np.testing.assert_array_equal(vector[35 + 9 : 35 + 12], 0)
+    silent = dataclasses.replace(readings, taxel_force=np.zeros((5, 120), np.float32))
+    vector = np.asarray(observe(hand, silent, GRASP, ObservationConfig()))
+    np.testing.assert_array_equal(vector[30:50], 0)
+    assert np.all(np.isfinite(vector))
+
+
+def test_touch_and_command_have_a_fixed_scale(hand):
+    """A running normaliser over a signal that is mostly zero explodes at the first contact."""
+    for names in (GRASP, ROTATE):
+        scale = {f.name: f.scale for f in layout(hand, names, ObservationConfig())}
+        for name in ("contact_force", "contact_centre", "command", "last_action"):
+            assert name not in scale or scale[name] > 0
+        assert scale["joint_position"] is None and scale["fingertip_position"] is None
+
+
+def test_one_frame_is_one_observation_bit_for_bit(hand, readings):
+    """Compiled twice, apart: what simulation and hardware each do with the same function."""
+    config = ObservationConfig()
+    for names in (GRASP, ROTATE):
+        doors = [jax.jit(lambda frame, names=names: observation.observe(hand, frame, names, config)) for _ in range(2)]
+        first, second = (np.asarray(door(readings)) for door in doors)
+        np.testing.assert_array_equal(first.view(np.uint32), second.view(np.uint32))
+        again = np.asarray(doors[0](jax.tree.map(lambda x: np.array(x), readings)))
+        np.testing.assert_array_equal(again.view(np.uint32), first.view(np.uint32))
+
+
+def test_a_batch_is_the_loop(hand, readings):
+    rng = np.random.default_rng(1)
+    batch = jax.tree.map(lambda x: np.float32(x + 0.01 * rng.normal(size=(4, *np.shape(x)))), readings)
+    together = jax.jit(jax.vmap(lambda r: observation.observe(hand, r, GRASP, ObservationConfig())))(batch)
+    for at in range(4):
+        alone = observe(hand, jax.tree.map(lambda x, at=at: x[at], batch), GRASP, ObservationConfig())
+        np.testing.assert_allclose(together[at], alone, atol=1e-5)
+
+
+def test_every_reading_matters(hand, readings):
+    """A change in any reading changes one of the two observations: no field is forgotten."""
+    for field in dataclasses.fields(Readings):
+        value = getattr(readings, field.name)
+        changed = value[..., ::-1] if field.name.endswith("quat") else value + np.float32(0.05)
+        other = dataclasses.replace(readings, **{field.name: np.array(changed)})
+        assert any(
+            np.any(
+                np.asarray(observe(hand, other, names, ObservationConfig()))
+                != np.asarray(observe(hand, readings, names, ObservationConfig()))
+            )
+            for names in (GRASP, ROTATE)
+        ), field.name
+
+
+def test_unknown_options_are_refused():
+    with pytest.raises(ConfigError, match=r"ObservationConfig\.orientation = 'euler': choose from 6d, quaternion"):
+        ObservationConfig(orientation="euler")
+    with pytest.raises(ConfigError, match=r"ObservationConfig\.leave_out = 'smell'"):
+        ObservationConfig(leave_out=("smell",))
+
+
+def test_fields_are_hashable():
+    assert hash(Field("command", 1, 0.5)) == hash(Field("command", 1, 0.5))

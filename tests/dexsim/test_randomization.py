@@ -1,0 +1,441 @@
+"""What is drawn at every episode start: ranges, the nominal hand, curriculum, held-out hands."""
+
+import copy
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dexsim
+from dexsim.core.errors import ConfigError
+from dexsim.objects.config import ObjectConfig
+from dexsim.objects.params import sample_object
+from dexsim.randomization import Randomization, sample
+from dexsim.randomization_check.__main__ import conclude, table
+from dexsim.randomization_check.effects import check
+from dexsim.tasks.rotate.config import RotateConfig
+from dexsim.tasks.rotate.objects import sample_target
+from dexsim_ppo.learner.curriculum import Curriculum, next_scale
+
+TIMES = dict(timestep=0.005, control_period=0.03)
+
+
+@functools.cache
+def draws(hand, config, seed=0):
+    """1,000 draws. Not jitted as a whole: a config is a constant, so each would be another compilation."""
+    keys = jax.random.split(jax.random.key(seed), 1000)
+    return jax.vmap(lambda key: sample(key, config, hand, **TIMES))(keys)
+
+
+def test_scale_zero_is_the_nominal_hand(hand):
+    config = Randomization(scale=0.0)
+    drawn = draws(hand, config)
+    for row in range(4):
+        one = jax.tree.map(lambda x, row=row: np.asarray(x[row]), drawn)
+        np.testing.assert_array_equal(one.actuator.stiffness, np.full(12, 3.0, np.float32))
+        np.testing.assert_array_equal(one.actuator.damping, np.full(12, 0.1, np.float32))
+        np.testing.assert_array_equal(one.actuator.stall_torque, hand.torque_limit)
+        np.testing.assert_array_equal(one.actuator.no_load_speed, hand.speed_limit)
+        np.testing.assert_array_equal(one.actuator.efficiency, np.ones(12))
+        np.testing.assert_array_equal(one.torque_gain, np.ones(12))
+        np.testing.assert_array_equal(one.taxel_gain, np.ones((5, 1)))
+        motors = one.actuator
+        for zero in (
+            motors.dead_band,
+            motors.ripple,
+            motors.coulomb_friction,
+            motors.viscous_friction,
+            motors.encoder_bias,
+            one.latency,
+            one.sensing_latency,
+            one.encoder_bias,
+            one.tilt,
+        ):
+            np.testing.assert_array_equal(zero, 0)
+
+
+def quantities(hand, drawn):
+    """Each drawn quantity as the config names its range, one row per draw."""
+    motors = drawn.actuator
+    return {
+        "stiffness_factor": motors.stiffness / 3.0,
+        "damping_factor": motors.damping / 0.1,
+        "dead_band": motors.dead_band,
+        "torque_factor": motors.stall_torque / hand.torque_limit,
+        "speed_factor": motors.no_load_speed / hand.speed_limit,
+        "efficiency": motors.efficiency,
+        "ripple": motors.ripple,
+        "ripple_count": motors.ripple_count,
+        "coulomb_friction": motors.coulomb_friction / hand.torque_limit,
+        "viscous_friction": motors.viscous_friction,
+        "latency": drawn.latency[:, :1] * TIMES["timestep"],
+        "sensing_latency": drawn.sensing_latency[:, None] * TIMES["control_period"],
+        "encoder_bias": drawn.encoder_bias,
+        "torque_gain": drawn.torque_gain,
+        "taxel_gain": drawn.taxel_gain[..., 0],
+        "gravity_tilt": drawn.tilt,
+    }
+
+
+# No two alike, so that none can be taken for another.
+EVEN = Randomization(latency_spread=(0.0, 0.0))  # so that the common latency shows
+DISTINCT = Randomization(
+    ripple=(0.05, 0.06),
+    ripple_count=(300.0, 310.0),
+    coulomb_friction=(0.2, 0.21),
+    viscous_friction=(0.002, 0.003),
+    latency_spread=(0.0, 0.0),
+    stiffness_factor=(0.5, 0.7),
+    damping_factor=(1.5, 1.9),
+    dead_band=(0.03, 0.04),
+    torque_factor=(0.75, 0.85),
+    speed_factor=(1.1, 1.3),
+    efficiency=(0.6, 0.65),
+    latency=(0.01, 0.025),
+    sensing_latency=(0.005, 0.01),
+    encoder_bias=0.02,
+    torque_gain=(1.3, 1.5),
+    taxel_gain=(0.3, 0.4),
+    gravity_tilt=0.5,
+)
+
+
+@pytest.mark.parametrize("config", [EVEN, DISTINCT], ids=["default", "distinct"])
+def test_a_thousand_draws_fill_their_ranges_and_leave_none(hand, config):
+    for name, values in quantities(hand, draws(hand, config)).items():
+        span = getattr(config, name)
+        low, high = span if isinstance(span, tuple) else (-span, span)
+        values, width = np.asarray(values, float), high - low
+        assert values.min() >= low - 1e-5 and values.max() <= high + 1e-5, name
+        assert values.min() < low + 0.02 * width and values.max() > high - 0.02 * width, name
+        assert values.mean() == pytest.approx((low + high) / 2, abs=0.05 * width), name
+        columns = values.reshape(len(values), -1)
+        if columns.shape[1] > 1:  # joints and fingers are drawn apart
+            correlation = np.corrcoef(columns.T) - np.eye(columns.shape[1])
+            assert np.abs(correlation).max() < 0.15, name
+
+
+def test_quantities_are_drawn_apart_from_one_another(hand):
+    columns = np.stack(
+        [np.asarray(v, float).reshape(1000, -1)[:, 0] for v in quantities(hand, draws(hand, Randomization())).values()]
+    )
+    assert np.abs(np.corrcoef(columns) - np.eye(len(columns))).max() < 0.15
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_scale_shrinks_all_ranges_about_the_nominal_hand(hand, seed):
+    """The same key at half the scale lands half way to nominal."""
+    nominal, half, full = (quantities(hand, draws(hand, Randomization(scale=s), seed)) for s in (0.0, 0.5, 1.0))
+    for name in full.keys() - {"latency", "ripple_count"}:  # whole sub-steps; no nominal value
+        wanted = (np.asarray(full[name]) + np.asarray(nominal[name])) / 2
+        np.testing.assert_allclose(half[name], wanted, atol=1e-5, err_msg=name)
+
+
+def test_latency_is_whole_substeps_and_reaches_its_bound(hand):
+    latency = np.asarray(draws(hand, EVEN).latency)
+    assert latency.dtype == np.int32 and set(latency.ravel()) == {0, 1, 2, 3, 4}
+    assert np.all(latency == latency[:, :1])  # common to all joints
+    fixed = draws(hand, Randomization(latency=(0.015, 0.015), latency_spread=(0.0, 0.0)))
+    np.testing.assert_array_equal(fixed.latency, 3)
+
+
+def test_joints_are_late_by_themselves_too(hand):
+    latency = np.asarray(draws(hand, Randomization(latency=(0.005, 0.005), latency_spread=(0.0, 0.01))).latency)
+    assert latency.shape == (1000, 12) and set(latency.ravel()) == {1, 2, 3}
+    assert np.abs(np.corrcoef(latency.T) - np.eye(12)).max() < 0.15
+
+
+def test_latency_ends_at_one_tick(hand):
+    latency = np.asarray(draws(hand, Randomization(latency=(0.02, 0.08))).latency)
+    assert latency.max() == 6 and np.mean(latency == 6) > 0.7
+
+
+def test_a_range_the_wrong_way_round_is_refused():
+    with pytest.raises(ConfigError, match=r"Randomization\.efficiency = \(1, 0\.8\)"):
+        Randomization(efficiency=(1.0, 0.8))
+    with pytest.raises(ConfigError, match=r"Randomization\.latency = -0\.1 s: must be between 0 and 0\.2 s"):
+        Randomization(latency=(-0.1, 0.01))
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["stiffness_factor", "damping_factor", "torque_factor", "speed_factor", "efficiency", "torque_gain", "taxel_gain"],
+)
+def test_a_scale_that_would_turn_a_motor_round_is_refused(name):
+    """A factor of 0.5 at scale 3 would be 1 - 1.5: a negative gain, torque or speed."""
+    Randomization(**{name: (0.5, 1.0)})
+    with pytest.raises(ConfigError, match=f"{name}.*scale"):
+        Randomization(scale=3.0, **{name: (0.5, 1.0)})
+
+
+def test_beyond_the_ranges_without_corners_is_refused():
+    with pytest.raises(ConfigError, match=r"beyond = 0\.2 with corners = 0"):
+        Randomization(beyond=0.2)
+
+
+def test_the_widest_scale_keeps_the_motors_the_right_way_round(hand):
+    drawn = draws(hand, Randomization(scale=3.0))
+    for name in ("ripple", "coulomb_friction", "viscous_friction"):
+        assert np.min(getattr(drawn.actuator, name)) >= 0, name
+    for name in ("stiffness", "damping", "stall_torque", "no_load_speed", "efficiency"):
+        assert np.min(getattr(drawn.actuator, name)) > 0, name
+    assert np.min(drawn.actuator.dead_band) >= 0 and np.min(drawn.latency) >= 0
+    assert 0 <= np.min(drawn.sensing_latency) and np.max(drawn.sensing_latency) <= 1
+
+
+# --- curriculum ------------------------------------------------------------------------------------
+
+
+def test_a_traced_scale_is_the_configured_one(hand):
+    """The scale may come from the training state: 0 is exactly nominal, and none of it recompiles."""
+    draw = jax.jit(lambda key, scale: sample(key, Randomization(), hand, **TIMES, scale=scale))
+    key = jax.random.key(5)
+    for scale in (0.0, 0.5, 1.0):
+        other = sample(key, Randomization(scale=scale), hand, **TIMES)
+        for ours, theirs in zip(jax.tree.leaves(draw(key, scale)), jax.tree.leaves(other), strict=True):
+            np.testing.assert_allclose(ours, theirs, rtol=1e-6, atol=1e-8)
+    nominal = draw(key, 0.0)
+    np.testing.assert_array_equal(nominal.actuator.stall_torque, hand.torque_limit)
+    np.testing.assert_array_equal(nominal.actuator.stiffness, np.full(12, 3.0, np.float32))
+    for zero in (nominal.latency, nominal.encoder_bias, nominal.actuator.coulomb_friction, nominal.actuator.ripple):
+        np.testing.assert_array_equal(zero, 0)
+    assert draw._cache_size() == 1
+
+
+def test_the_scale_follows_success():
+    rules = Curriculum(start=0.1, widen_above=0.8, narrow_below=0.4, step=0.25)
+    step = jax.jit(lambda scale, success: next_scale(scale, success, rules))
+    for scale, success, after in (
+        (0.1, 0.8, 0.35),
+        (0.35, 0.6, 0.35),
+        (0.35, 0.39, 0.1),
+        (0.1, 0.0, 0.0),
+        (0.9, 1.0, 1.0),
+        (0.5, np.nan, 0.5),
+    ):
+        assert float(step(scale, success)) == pytest.approx(after)
+    with pytest.raises(ConfigError, match="Curriculum.narrow_below"):
+        Curriculum(narrow_below=0.9)
+
+
+# --- held out ----------------------------------------------------------------------------------------
+
+
+def test_held_out_hands_lie_outside_every_range(hand):
+    config = dataclasses.replace(EVEN, corners=1.0, beyond=0.4)
+    found = quantities(hand, draws(hand, config))
+    for name in found.keys() - {"ripple_count"}:
+        values = np.asarray(found[name], float)
+        span = getattr(config, name)
+        low, high = span if isinstance(span, tuple) else (-span, span)
+        nominal = 1.0 if name.endswith(("factor", "gain")) or name == "efficiency" else 0.0
+        slack = 0.5 * TIMES["timestep"] + 1e-9 if name == "latency" else 1e-6
+        assert np.all((values <= low + slack) | (values >= high - slack)), name
+        far = 1.4 * max(high - nominal, nominal - low) + slack
+        assert np.all(np.abs(values - nominal) <= far), name
+        if low < nominal < high:  # both ends are visited
+            assert 0.3 < np.mean(values > high - slack) < 0.7, name
+        # None at an end that is the nominal value itself.
+        assert np.all(np.abs(values - nominal) > 1e-4), name
+
+
+# --- corners -----------------------------------------------------------------------------------------
+
+
+def test_a_share_of_hands_stands_in_corners_and_the_others_do_not(hand):
+    config = dataclasses.replace(EVEN, corners=0.3)
+    drawn = draws(hand, config)
+    plain = draws(hand, EVEN)
+    at_end = {}
+    for name, values in quantities(hand, drawn).items():
+        if name == "ripple_count":
+            continue
+        span = getattr(config, name)
+        low, high = span if isinstance(span, tuple) else (-span, span)
+        nominal = 1.0 if name.endswith(("factor", "gain")) or name == "efficiency" else 0.0
+        ends = [end for end in (low, high) if end != nominal]
+        values = np.asarray(values, float)
+        near = np.min([np.abs(values - end) for end in ends], 0) < 1e-6 * max(1.0, abs(high))
+        if name != "latency":  # in whole sub-steps
+            at_end[name] = near.all(1)
+            assert near[at_end[name]].all()
+            sides = [np.mean(np.abs(values[at_end[name]] - end) < 1e-5) for end in ends]
+            assert min(sides) > (0.4 if len(ends) == 2 else 0.99), name
+        # Elsewhere the draw is what it is without corners.
+        others = ~at_end["stiffness_factor"]
+        np.testing.assert_array_equal(values[others], np.asarray(quantities(hand, plain)[name], float)[others])
+    assert 0.25 < np.mean(at_end["stiffness_factor"]) < 0.35
+    for name, rows in at_end.items():
+        np.testing.assert_array_equal(rows, at_end["stiffness_factor"], err_msg=name)
+
+
+def test_corners_narrow_with_the_scale(hand):
+    one = jax.tree.map(lambda x: np.asarray(x[0]), draws(hand, dataclasses.replace(EVEN, corners=1.0, scale=0.5)))
+    assert np.all(np.isin(one.torque_gain.round(5), np.float32([0.95, 1.05])))
+    np.testing.assert_allclose(one.actuator.efficiency, 0.925, rtol=1e-5)
+
+
+def test_the_imu_of_a_hand_in_a_corner_is_in_one_too():
+    config = RotateConfig(pool_size=16, randomization=dataclasses.replace(EVEN, corners=0.5, gravity_tilt=0.0))
+    env = dexsim.make("rotate", config, backend="jax")
+    keys = jax.random.split(jax.random.key(0), (64, 2))
+    drawn, imu = jax.vmap(lambda two: env._draw(*two))(keys)
+    corner = np.all(np.isin(np.asarray(drawn.torque_gain).round(5), np.float32([0.9, 1.1])), axis=1)
+    ranges = config.sensing.orientation
+    for values, end in (
+        (imu.bias, ranges.bias),
+        (imu.drift[:, None], ranges.drift),
+        (imu.delay[:, None], ranges.delay[1] / env.control_period),
+    ):
+        np.testing.assert_array_equal(np.all(np.abs(np.abs(values) - end) < 1e-6 + 1e-4 * end, axis=1), corner)
+    assert 0.3 < np.mean(corner) < 0.7 and len(np.unique(np.sign(imu.bias[corner]), axis=0)) == 8
+
+
+@pytest.mark.parametrize(
+    "config",
+    [ObjectConfig(corners=1.0), RotateConfig(objects=ObjectConfig(shapes=("box",), corners=1.0))],
+    ids=["grasp", "rotate"],
+)
+def test_objects_in_corners(config):
+    draw, ranges = sample_object, config
+    if isinstance(config, RotateConfig):
+        draw, ranges = sample_target, config.objects
+    drawn = jax.vmap(lambda key: draw(key, config))(jax.random.split(jax.random.key(0), 200))
+    at = {name: np.asarray(getattr(drawn, name)) for name in ("mass", "friction", "bare_friction")}
+    at["stiffness"], at["com_offset"] = np.asarray(drawn.contact[:, 0]), np.asarray(drawn.com)
+    for name, values in at.items():
+        span = getattr(ranges, name)
+        low, high = span if isinstance(span, tuple) else (-span, span)
+        for end in (low, high):
+            assert 0.35 < np.mean(np.abs(values - end) < 1e-5 * max(1, abs(end))) < 0.65, name
+        assert np.all((np.abs(values - low) < 1e-5 * max(1, low)) | (np.abs(values - high) < 1e-5 * high)), name
+    if draw is sample_target:
+        edges = 2 * np.asarray(drawn.size[:, 0, 0])
+        assert np.all(np.isin(edges.round(5), np.float32(config.edge).round(5))) and 0.4 < np.mean(edges > 0.055) < 0.6
+
+
+# --- the self-test -----------------------------------------------------------------------------------
+
+# What each range must reach, by the names of the drive's parameters and of the compiled model's fields.
+REACHES = {
+    "stiffness_factor": {"actuator.stiffness"},
+    "damping_factor": {"actuator.damping"},
+    "dead_band": {"actuator.dead_band"},
+    "torque_factor": {"actuator.stall_torque"},
+    "speed_factor": {"actuator.no_load_speed"},
+    "efficiency": {"actuator.efficiency"},
+    "latency": {"latency"},
+    "latency_spread": {"latency"},
+    "ripple": {"actuator.ripple"},
+    "ripple_count": {"actuator.ripple_count"},
+    "coulomb_friction": {"actuator.coulomb_friction"},
+    "viscous_friction": {"actuator.viscous_friction"},
+    "sensing_latency": {"sensing_latency"},
+    "encoder_bias": {"actuator.encoder_bias", "encoder_bias"},
+    "torque_gain": {"torque_gain"},
+    "taxel_gain": {"taxel_gain"},
+    "gravity_tilt": {"tilt"},
+    "mass": {"body_mass"},
+    "inertia_scale": {"body_inertia"},
+    "com_offset": {"body_ipos"},
+    "friction": {"pair_friction"},
+    "bare_friction": {"pair_friction"},
+    "sphere_radius": {"geom_size"},
+    "box_half": {"geom_size"},
+}
+SENSED = ("sensing_latency", "torque_gain", "taxel_gain")  # seen in the readings, without effect on the motion
+
+
+@pytest.fixture(scope="module")
+def fresh(grasp_rollout):
+    return grasp_rollout.reset(jax.random.key(21))
+
+
+def test_every_range_reaches_the_model_and_the_motion(grasp_env, grasp_rollout, fresh):
+    effects = check(grasp_env, grasp_rollout.step, fresh, key=jax.random.key(0), ticks=9)
+    by_name = {effect.name.split(".")[-1]: effect for effect in effects}
+    assert len(by_name) == len(effects) >= 30 and by_name["push"].object > 0
+    for effect in effects:
+        assert effect.found and not effect.off, table([effect])
+    for name, leaves in REACHES.items():
+        found = by_name[name]
+        if name in {field.name for field in dataclasses.fields(Randomization)}:
+            assert set(found.changed) == leaves, name
+        else:
+            assert leaves <= set(found.changed), name
+        if name in SENSED:
+            assert found.joint == 0 and found.object == 0 and found.reading > 1e-3, name
+        else:
+            assert max(found.joint, found.object) > 1e-6, name
+    # Known size: an encoder that is off by up to 10 mrad turns the joint by less than that in two ticks.
+    (early,) = check(
+        grasp_env, grasp_rollout.step, fresh, key=jax.random.key(0), ticks=2, names=("Randomization.encoder_bias",)
+    )
+    assert 0.2e-3 < early.joint < 10e-3
+
+
+def test_a_range_that_is_lost_is_found_out(grasp_env, grasp_rollout, fresh, monkeypatch, capsys):
+    """Lost between configuration and draw, and lost between draw and physics."""
+
+    def forgets_torque(*arguments, **options):
+        drawn = sample(*arguments, **options)
+        limit = jnp.asarray(arguments[2].torque_limit)
+        return dataclasses.replace(drawn, actuator=dataclasses.replace(drawn.actuator, stall_torque=limit))
+
+    def ignores_friction(states, action):
+        calm = dataclasses.replace(states.draw.actuator, viscous_friction=0 * states.draw.actuator.viscous_friction)
+        return grasp_rollout.step(
+            dataclasses.replace(states, draw=dataclasses.replace(states.draw, actuator=calm)), action
+        )
+
+    monkeypatch.setattr("dexsim.randomization_check.effects.sample", forgets_torque)
+    names = ("Randomization.torque_factor", "Randomization.viscous_friction", "Randomization.speed_factor")
+    effects = check(grasp_env, ignores_friction, fresh, key=jax.random.key(0), ticks=6, names=names)
+    assert [effect.found for effect in effects] == [False, False, True]
+    assert effects[0].changed == () and effects[1].changed == ("actuator.viscous_friction",)
+    assert conclude(effects) == 2
+    captured = capsys.readouterr()
+    assert "no effect on model or motion: Randomization.torque_factor, Randomization.viscous_friction" in captured.err
+    assert captured.out.count("NO EFFECT") == 2
+    assert conclude(effects[2:]) == 0
+
+
+def test_runs_that_differ_hide_no_range_and_invent_none(grasp_env, grasp_rollout, fresh):
+    """As on the Warp backend: no two runs are alike, and contacts let them part further with every tick."""
+    rng = np.random.default_rng(0)
+
+    def unsteady(states, action, forgetful=False):
+        drawn = states.draw
+        if forgetful:
+            calm = dataclasses.replace(drawn.actuator, viscous_friction=0 * drawn.actuator.viscous_friction)
+            states = dataclasses.replace(states, draw=dataclasses.replace(drawn, actuator=calm))
+        after = grasp_rollout.step(states, action)
+        noise = jnp.asarray(1e-6 * rng.standard_normal(after.physics.qvel.shape), jnp.float32)
+        physics = dataclasses.replace(after.physics, qvel=after.physics.qvel + noise * jnp.abs(after.physics.qvel))
+        return dataclasses.replace(after, physics=physics, draw=drawn)
+
+    noisy = copy.copy(grasp_env)
+    noisy.backend = "warp"
+    names = (
+        "Randomization.viscous_friction",
+        "Randomization.encoder_bias",
+        "Randomization.torque_gain",
+        "ObjectConfig.com_offset",
+    )
+    effects = check(noisy, unsteady, fresh, key=jax.random.key(0), ticks=6, names=names)
+    assert all(effect.found and effect.changed for effect in effects), table(effects)
+    (lost,) = check(
+        noisy, lambda *a: unsteady(*a, forgetful=True), fresh, key=jax.random.key(0), ticks=6, names=names[:1]
+    )
+    assert not lost.found and lost.changed == ("actuator.viscous_friction",), table([lost])
+
+
+def test_a_range_without_width_is_off_and_no_error(grasp_env, grasp_rollout, fresh):
+    config = dataclasses.replace(grasp_env.config, randomization=Randomization(ripple=(0.0, 0.0)))
+    still = copy.copy(grasp_env)
+    still.config = config
+    (effect,) = check(still, grasp_rollout.step, fresh, key=jax.random.key(0), ticks=1, names=("Randomization.ripple",))
+    assert effect.off and effect.found and "off" in table([effect])

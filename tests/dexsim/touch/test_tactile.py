@@ -1,0 +1,477 @@
+"""Touch against closed forms: Mooney-Rivlin, flat punch, Winkler's sphere; reduction; the sensor; gradients."""
+
+import dataclasses
+
+import c_scene
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dexsim.core.errors import ConfigError
+from dexsim.geometry import sdf
+from dexsim.geometry.rotations import axis_angle_to_matrix, compose
+from dexsim.hand.kinematics import forward_kinematics, taxel_positions
+from dexsim.sensing import taxel_reading
+from dexsim.sensing.taxel_reading import TaxelSensor
+from dexsim.touch import feel as touch_feel
+from dexsim.touch import reduce as touch_reduce
+from dexsim.touch import skin as touch_skin
+from dexsim.touch.feel import press_only
+from dexsim.touch.skin import Skin
+
+EYE = np.eye(3, dtype=np.float32)
+feel = jax.jit(touch_feel.feel, static_argnames="skin")
+measure_taxels = jax.jit(taxel_reading.measure_taxels, static_argnames="sensor")
+reduce_touch = jax.jit(touch_reduce.reduce_touch, static_argnames="weighting")
+skin_stress = jax.jit(touch_skin.skin_stress, static_argnames="skin")
+spread = jax.jit(touch_feel.spread)
+IDEAL = TaxelSensor(noise=0.0, threshold=0.0, resolution=0.0, saturation=1000.0)
+
+
+def solid(kind, *size):
+    size = (*size, 0, 0)[:3]
+    return sdf.Shape((kind,), jnp.asarray([size], jnp.float32), jnp.zeros((1, 3)), jnp.eye(3)[None], jnp.array([True]))
+
+
+def flat_lattice(columns, rows, pitch, shift=(0.0, 0.0)):
+    """Taxels [1, N, 3] in the plane z = 0 and their areas [1, N]."""
+    x, y = np.meshgrid(
+        (np.arange(columns) - (columns - 1) / 2) * pitch + shift[0],
+        (np.arange(rows) - (rows - 1) / 2) * pitch + shift[1],
+        indexing="ij",
+    )
+    points = np.stack([x, y, 0 * x], -1).reshape(1, -1, 3)
+    return points.astype(np.float32), np.full(points.shape[:2], pitch**2, np.float32)
+
+
+# --- the skin's law ------------------------------------------------------------------------------
+
+# True compression stress over 6 (C10 + C01) eps, at stretch 1 - eps.
+STRETCH = (0.95, 0.9, 0.8, 0.7, 0.6, 0.5)
+RATIO_C10 = (1.054, 1.115, 1.271, 1.490, 1.815, 2.333)
+RATIO_C01 = (1.109, 1.239, 1.589, 2.128, 3.025, 4.667)
+
+
+@pytest.mark.parametrize(("c10", "c01", "ratio"), [(3e4, 0.0, RATIO_C10), (0.0, 2e4, RATIO_C01)])
+def test_stress_over_hooke(c10, c01, ratio):
+    strain = 1 - np.array(STRETCH, np.float32)
+    stress = skin_stress(strain, Skin(c10=c10, c01=c01))
+    np.testing.assert_allclose(stress / (6 * (c10 + c01) * strain), ratio, atol=1e-3)
+
+
+def test_the_two_terms_add():
+    strain = np.linspace(0, 0.7, 30, dtype=np.float32)
+    both = skin_stress(strain, Skin(c10=3e4, c01=1e4))
+    apart = skin_stress(strain, Skin(c10=3e4, c01=0.0)) + skin_stress(strain, Skin(c10=0.0, c01=1e4))
+    np.testing.assert_allclose(both, apart, rtol=1e-5)
+
+
+@given(st.floats(1e3, 1e6), st.floats(0, 1e6))
+def test_the_skin_stiffens(c10, c01):
+    stress = np.asarray(skin_stress(np.linspace(0, 0.7, 60, dtype=np.float32), Skin(c10=c10, c01=c01)), float)
+    assert stress[0] == 0
+    slope = np.diff(stress)
+    assert np.all(slope > 0) and np.all(np.diff(slope) > -1e-5 * stress[-1])
+
+
+def test_stress_is_bounded_and_never_pulls():
+    skin = Skin(max_compression=0.6)
+    stress = np.asarray(skin_stress(np.float32([-0.5, 0.0, 0.6, 0.9, 5.0]), skin))
+    assert stress[0] == 0 and stress[1] == 0
+    np.testing.assert_array_equal(stress[3:], stress[2])
+    assert np.all(np.isfinite(stress))
+
+
+def test_a_skin_fitted_to_tension_only_is_refused():
+    with pytest.raises(ConfigError, match=r"Skin\.c01 = -75000 Pa"):
+        Skin(c10=1.5e5, c01=-7.5e4)
+
+
+# --- contact geometry ----------------------------------------------------------------------------
+
+
+def test_flat_punch():
+    """A box pressed 0.5 mm into a flat lattice: equal force on covered taxels, none elsewhere."""
+    taxels, area = flat_lattice(10, 12, 0.002)  # odd multiples of a millimetre
+    depth, skin = 0.0005, Skin(margin=0.0, thickness=0.002, c10=3e4)
+    half = np.float32([0.006, 0.004, 0.010])
+    touch = feel(taxels, area, solid("box", *half), np.float32([0, 0, half[2] - depth]), EYE, np.float32([7.5]), skin)
+    covered = np.all(np.abs(taxels[0, :, :2]) < half[:2], axis=1)
+    assert covered.sum() == 6 * 4
+    np.testing.assert_allclose(touch.depth[0], np.where(covered, depth, 0), atol=1e-8)
+    stretch = 1 - depth / 0.002
+    pressure = 2 * (stretch**-2 - stretch) * 3e4
+    np.testing.assert_allclose(touch.skin_force[0], np.where(covered, pressure * 0.002**2, 0), rtol=1e-4)
+    np.testing.assert_allclose(touch.force[0], np.where(covered, 7.5 / 24, 0), rtol=1e-4)
+    force, centre = reduce_touch(touch.force, taxels)
+    assert float(force[0]) == pytest.approx(7.5, rel=1e-5)
+    np.testing.assert_allclose(centre[0], 0, atol=1e-6)
+
+
+def test_flat_punch_off_centre_and_turned():
+    """The same punch with the whole scene moved: the centre of pressure moves with it."""
+    taxels, area = flat_lattice(10, 12, 0.002)
+    turn = np.asarray(axis_angle_to_matrix(jnp.array([0.6, 0.0, 0.8]), jnp.float32(1.1)))
+    shift = np.float32([0.1, -0.05, 0.02])
+    at = np.float32([0.003, -0.002, 0.0095])
+    moved = (taxels @ turn.T + shift).astype(np.float32)
+    touch = feel(
+        moved, area, solid("box", 0.0045, 0.0035, 0.010), turn @ at + shift, turn, np.float32([3.0]), Skin(margin=0.0)
+    )
+    covered = np.all(np.abs(taxels[0, :, :2] - at[:2]) < [0.0045, 0.0035], axis=1)
+    np.testing.assert_array_equal(np.asarray(touch.force[0]) > 1e-3, covered)
+    _, centre = reduce_touch(touch.force, moved)
+    np.testing.assert_allclose(centre[0], turn @ taxels[0, covered].mean(0) + shift, atol=1e-5)
+
+
+def winkler(skin, radius, depth):
+    """Force of a rigid sphere on an elastic foundation, Johnson section 4.3: pi K R d^2 / h."""
+    return np.pi * 6 * (skin.c10 + skin.c01) * radius * depth**2 / skin.thickness
+
+
+def sphere_lattice(radius, spacing):
+    """The lower half of a sphere of taxels, evenly spread."""
+    count = int(4 * np.pi * radius**2 / spacing**2)
+    z = 1 - (2 * np.arange(count) + 1) / count
+    turn = np.arange(count) * np.pi * (3 - np.sqrt(5))
+    points = radius * np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z], -1)
+    low = points[:, 2] < 0
+    return points[None, low].astype(np.float32), np.full((1, low.sum()), 4 * np.pi * radius**2 / count, np.float32)
+
+
+@pytest.mark.parametrize(("spacing", "bound"), [(0.0003, 0.02), (0.0008, 0.10)])
+def test_sphere_in_a_box_face(spacing, bound):
+    """A spherical fingertip pressed into the face of a box, at 1 % compression, against Winkler.
+
+    Exact for a fine lattice: the depth below the face is d - R (1 - cos), and the integral over
+    the sphere is Winkler's. A coarse lattice adds sampling noise that grows with its pitch.
+    """
+    radius, depth, skin = 0.010, 0.0002, Skin(margin=0.0, thickness=0.02)
+    taxels, area = sphere_lattice(radius, spacing)
+    face = np.float32([0, 0, -radius + depth - 0.02])  # centre of a box whose top face is `depth` inside
+    touch = feel(taxels, area, solid("box", 0.03, 0.03, 0.02), face, EYE, np.float32([1.0]), skin)
+    total = float(touch.skin_force.sum())
+    assert total == pytest.approx(winkler(skin, radius, depth), rel=bound)
+    _, centre = reduce_touch(touch.force, taxels)
+    np.testing.assert_allclose(centre[0, :2], 0, atol=5 * spacing * bound)
+    assert centre[0, 2] == pytest.approx(-radius, abs=depth)
+    # Nothing feels beyond the contact radius sqrt(2 R d - d^2).
+    across = np.linalg.norm(taxels[0, :, :2], axis=1)
+    felt = np.asarray(touch.force[0]) > 0
+    assert across[felt].max() <= np.sqrt(2 * radius * depth - depth**2) + 1e-6
+
+
+@pytest.mark.parametrize(
+    ("depth", "pitch", "bound"),
+    [(0.0003, 0.0008, 0.03), (0.0005, 0.0008, 0.02), (0.0003, 0.002, 0.15), (0.0005, 0.002, 0.10)],
+)
+def test_spherical_object_on_a_flat_lattice(depth, pitch, bound):
+    """A ball of 10 mm on flat skin, rms over lattice phases, within about twice what a lattice of that pitch costs."""
+    radius, skin = 0.010, Skin(margin=0.0, thickness=0.02)
+    rng = np.random.default_rng(0)
+    shifts = rng.uniform(-pitch / 2, pitch / 2, (24, 2))
+    lattices = [flat_lattice(14, 14, pitch, shift) for shift in shifts]
+    taxels, area = (np.concatenate(x) for x in zip(*lattices, strict=True))
+    touch = feel(
+        taxels,
+        area,
+        solid("sphere", radius),
+        np.float32([0, 0, radius - depth]),
+        EYE,
+        np.ones(len(taxels), np.float32),
+        skin,
+    )
+    error = np.asarray(touch.skin_force.sum(1)) / winkler(skin, radius, depth) - 1
+    assert np.sqrt(np.mean(error**2)) < bound
+
+
+def test_force_grows_with_the_square_of_depth():
+    taxels, area = sphere_lattice(0.01, 0.0003)
+    skin = Skin(margin=0.0, thickness=0.02)
+    depth = np.array([0.0001, 0.0002, 0.0004])
+    total = [
+        float(
+            feel(
+                taxels,
+                area,
+                solid("box", 0.03, 0.03, 0.02),
+                np.float32([0, 0, d - 0.03]),
+                EYE,
+                np.ones(1, np.float32),
+                skin,
+            ).skin_force.sum()
+        )
+        for d in depth
+    ]
+    slope = np.diff(np.log(total)) / np.diff(np.log(depth))
+    np.testing.assert_allclose(slope, 2.0, atol=0.06)
+
+
+def test_the_margin_feels_what_is_near():
+    """With a margin of 1 mm a taxel 0.4 mm above a face is compressed by 0.6 mm, one 1.1 mm above by nothing."""
+    taxels = np.float32([[[0, 0, 0.0004], [0.001, 0, 0.0011], [0.002, 0, -0.0003]]])
+    touch = feel(
+        taxels,
+        np.full((1, 3), 4e-6, np.float32),
+        solid("box", 0.02, 0.02, 0.01),
+        np.float32([0, 0, -0.01]),
+        EYE,
+        np.ones(1, np.float32),
+        Skin(margin=0.001),
+    )
+    np.testing.assert_allclose(touch.depth[0], [0.0006, 0, 0.0013], atol=1e-8)
+
+
+# --- the finger's total --------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def taxels(hand):
+    """Taxels [F, N, 3] of a half closed hand."""
+    joints = np.float32([1.45, 0.15, 0.25, 0.0, 1.1, 0.8, 1.1, 0.8, 1.1, 0.8, 1.1, 0.8])
+    return jax.jit(lambda q: taxel_positions(hand, forward_kinematics(hand, q)))(joints)
+
+
+def grasp(hand, taxels, position=(0.075, -0.005, 0.13)):
+    """What the half closed hand feels of a ball before the palm."""
+    return feel(
+        taxels,
+        hand.taxel_area,
+        solid("sphere", 0.03),
+        np.float32(position),
+        EYE,
+        np.float32([4.0, 1.0, 2.5, 0.5, 3.0]),
+        Skin(),
+    )
+
+
+def test_taxels_add_up_to_the_fingers_force(hand, taxels):
+    touch = grasp(hand, taxels)
+    felt = np.asarray(touch.skin_force.sum(1)) > 0
+    assert felt.sum() >= 2 and not felt.all()
+    wanted = np.where(felt, [4.0, 1.0, 2.5, 0.5, 3.0], 0)
+    np.testing.assert_allclose(touch.force.sum(1), wanted, rtol=1e-5, atol=0)
+    assert np.all(np.asarray(touch.force) >= 0)
+    # The spread follows the skin's law: shares are in the same proportion.
+    for finger in np.flatnonzero(felt):
+        np.testing.assert_allclose(
+            touch.force[finger] * touch.skin_force[finger].sum(),
+            touch.skin_force[finger] * wanted[finger],
+            rtol=1e-4,
+            atol=1e-9,
+        )
+
+
+@given(st.integers(0, 10**6))
+def test_spread_keeps_the_total(seed):
+    rng = np.random.default_rng(seed)
+    skin_force = rng.uniform(0, 1, (5, 120)) * (rng.random((5, 120)) < 0.1) * 10 ** rng.uniform(-6, 1)
+    skin_force = skin_force.astype(np.float32)
+    finger_force = rng.uniform(0, 20, 5).astype(np.float32)
+    total = np.asarray(spread(skin_force, finger_force)).sum(1)
+    np.testing.assert_allclose(total, np.where(skin_force.sum(1) > 0, finger_force, 0), rtol=1e-5)
+
+
+def test_a_finger_that_touches_nothing_reads_zero(hand, taxels):
+    touch = grasp(hand, taxels, position=(0.5, 0, 0))
+    force, centre = reduce_touch(touch.force, taxels)
+    for value in (touch.depth, touch.skin_force, touch.force, force, centre):
+        np.testing.assert_array_equal(value, 0)
+
+    def total(position):
+        return jnp.sum(
+            reduce_touch(
+                feel(taxels, hand.taxel_area, solid("sphere", 0.03), position, EYE, jnp.ones(5), Skin()).force, taxels
+            )[1]
+        )
+
+    np.testing.assert_array_equal(jax.grad(total)(jnp.array([0.5, 0.0, 0.0])), 0)
+
+
+# --- reduction -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("weighting", ["force", "depth", "none"])
+def test_reduction_by_loops(weighting):
+    rng = np.random.default_rng(2)
+    force = rng.uniform(0, 2, (5, 120)) * (rng.random((5, 120)) < 0.2)
+    force[3] = 0
+    taxels = rng.uniform(-0.1, 0.1, (5, 120, 3))
+    ours, centre = reduce_touch(np.float32(force), np.float32(taxels), weighting)
+    for finger in range(5):
+        total, moment, active = 0.0, np.zeros(3), 0.0
+        for taxel in range(120):
+            total += force[finger, taxel]
+            weight = float(force[finger, taxel] > 0) if weighting == "none" else force[finger, taxel]
+            moment += weight * taxels[finger, taxel]
+            active += weight
+        assert float(ours[finger]) == pytest.approx(total, rel=1e-5)
+        np.testing.assert_allclose(centre[finger], moment / active if active else np.zeros(3), atol=1e-6)
+
+
+def test_the_unweighted_centre_ignores_how_hard():
+    taxels = np.float32([[[0, 0, 0], [0.01, 0, 0], [0.02, 0, 0]]])
+    for force, weighted in (([1, 0, 3], 0.015), ([3, 0, 1], 0.005)):
+        _, centre = reduce_touch(np.float32([force]), taxels)
+        assert float(centre[0, 0]) == pytest.approx(weighted)
+        _, plain = reduce_touch(np.float32([force]), taxels, "none")
+        assert float(plain[0, 0]) == pytest.approx(0.01)
+
+
+def test_the_centre_lies_among_the_taxels_that_feel(hand, taxels):
+    touch = grasp(hand, taxels)
+    force, centre = reduce_touch(touch.force, taxels)
+    for finger in np.flatnonzero(np.asarray(force) > 0):
+        felt = np.asarray(taxels[finger])[np.asarray(touch.force[finger]) > 0]
+        assert np.all(centre[finger] >= felt.min(0) - 1e-6) and np.all(centre[finger] <= felt.max(0) + 1e-6)
+
+
+# --- the sensor ----------------------------------------------------------------------------------
+
+KEY = jax.random.key(0)
+UNIT = np.ones((1, 1), np.float32)
+
+
+def test_an_ideal_sensor_reads_the_truth():
+    force = np.random.default_rng(3).uniform(0, 30, (5, 120)).astype(np.float32)
+    np.testing.assert_array_equal(measure_taxels(force, np.ones((5, 1), np.float32), IDEAL, KEY), force)
+
+
+def test_threshold_counts_and_saturation():
+    sensor = TaxelSensor(noise=0.0, threshold=0.25, resolution=0.1, saturation=25.5)
+    force = np.float32([[0.0, 0.1, 0.24, 0.26, 0.31, 0.36, 1.04, 25.46, 25.7, 300.0]])
+    wanted = [[0.0, 0.0, 0.0, 0.3, 0.3, 0.4, 1.0, 25.5, 25.5, 25.5]]
+    np.testing.assert_allclose(measure_taxels(force, UNIT, sensor, KEY), wanted, atol=1e-5)
+
+
+def test_readings_are_whole_counts():
+    force = np.random.default_rng(4).uniform(0, 30, (5, 120)).astype(np.float32)
+    counts = np.asarray(measure_taxels(force, np.ones((5, 1), np.float32), TaxelSensor(), KEY)) / 0.1
+    np.testing.assert_allclose(counts, np.round(counts), atol=1e-4)
+    assert counts.max() == pytest.approx(255) and counts.min() >= 0
+
+
+def test_noise_never_makes_a_reading_negative():
+    sensor = TaxelSensor(noise=0.5, threshold=0.0, resolution=0.0)
+    reading = np.asarray(measure_taxels(np.zeros((5, 2000), np.float32), np.ones((5, 1), np.float32), sensor, KEY))
+    assert reading.min() == 0 and 0.4 < np.mean(reading > 0) < 0.6
+    # Half of a normal distribution: its mean is sigma / sqrt(2 pi).
+    assert reading.mean() == pytest.approx(0.5 / np.sqrt(2 * np.pi), rel=0.05)
+
+
+def test_noise_has_its_width_and_gain_is_the_fingers_own():
+    sensor = dataclasses.replace(IDEAL, noise=0.2)
+    gain = np.float32([[0.9], [1.1]])
+    reading = np.asarray(measure_taxels(np.full((2, 5000), 10, np.float32), gain, sensor, KEY))
+    np.testing.assert_allclose(reading.mean(1), [9, 11], atol=0.02)
+    np.testing.assert_allclose(reading.std(1), 0.2, rtol=0.05)
+    other = np.asarray(measure_taxels(np.full((2, 5000), 10, np.float32), gain, sensor, jax.random.key(1)))
+    assert np.all(reading != other) or np.mean(reading == other) < 0.01
+
+
+# --- gradients -----------------------------------------------------------------------------------
+
+SHAPES = {
+    "sphere": (0.030, 0, 0),
+    "box": (0.027, 0.03, 0.024),
+    "capsule": (0.028, 0.02, 0),
+    "cylinder": (0.029, 0.026, 0),
+    "ellipsoid": (0.034, 0.026, 0.03),
+}
+
+
+@pytest.fixture(scope="module")
+def pose_response(hand, taxels):
+    """Skin force and contact centre at poses about a grasp, and their Jacobian at the first, in double precision."""
+    taxels = np.asarray(taxels, np.float64)
+    weight = np.random.default_rng(5).normal(size=(5, 3))
+    size = np.array([SHAPES[kind] for kind in sdf.KINDS])
+
+    def felt(pose, active):
+        """Pose: a shift and a small turn about each axis."""
+        count = len(sdf.KINDS)
+        shape = sdf.Shape(
+            sdf.KINDS,
+            jnp.asarray(np.where(size > 0, size, 1e-4)),
+            jnp.zeros((count, 3)),
+            jnp.tile(jnp.eye(3), (count, 1, 1)),
+            active,
+        )
+        turn = axis_angle_to_matrix(jnp.array([0.48, 0.6, 0.64]), jnp.asarray(0.7))
+        for axis, angle in zip(jnp.eye(3), pose[3:], strict=True):
+            turn = compose(axis_angle_to_matrix(axis, angle), turn)
+        touch = touch_feel.feel(
+            taxels,
+            np.asarray(hand.taxel_area, np.float64),
+            shape,
+            jnp.array([0.075, -0.005, 0.13]) + pose[:3],
+            turn,
+            jnp.array([4.0, 1.0, 2.5, 0.5, 3.0]),
+            Skin(),
+        )
+        _, centre = touch_reduce.reduce_touch(touch.force, taxels)
+        return jnp.stack([jnp.sum(touch.skin_force), jnp.sum(centre * weight)])
+
+    return jax.jit(lambda poses, active: (jax.vmap(felt, (0, None))(poses, active), jax.jacrev(felt)(poses[0], active)))
+
+
+@pytest.mark.parametrize("kind", sdf.KINDS)
+def test_gradient_of_touch_with_respect_to_the_objects_pose(pose_response, kind):
+    """Against central differences, with the shipped hand's taxels round an askew object."""
+    step = 1e-7
+    with c_scene.double_precision():
+        poses = np.concatenate([np.zeros((1, 6)), step * np.eye(6), -step * np.eye(6)])
+        value, exact = pose_response(poses, np.array([kind == other for other in sdf.KINDS]))
+        value, exact = np.asarray(value), np.asarray(exact)
+    assert value.dtype == np.float64 and value[0, 0] > 0.1
+    numeric = ((value[1:7] - value[7:]) / (2 * step)).T
+    scale = np.abs(numeric).max(axis=1, keepdims=True)
+    np.testing.assert_allclose(exact / scale, numeric / scale, atol=2e-4)
+    assert np.all(np.abs(numeric[0, :3]) > 1e-3 * scale[0])
+
+
+def test_gradient_in_single_precision_points_the_same_way(hand, taxels):
+    """What training differentiates: float32, a sphere; pushing it into the fingers presses harder."""
+
+    def total(position):
+        return jnp.sum(
+            feel(
+                taxels,
+                hand.taxel_area,
+                solid("sphere", 0.03),
+                position,
+                EYE,
+                jnp.ones(5),
+                Skin(margin=0.001, thickness=0.002),
+            ).skin_force
+        )
+
+    start, step = jnp.array([0.075, -0.005, 0.13]), 1e-4
+    exact = np.asarray(jax.grad(total)(start))
+    numeric = np.array([(total(start + step * axis) - total(start - step * axis)) / (2 * step) for axis in EYE])
+    np.testing.assert_allclose(exact, numeric, rtol=0.02, atol=0.02 * np.abs(numeric).max())
+
+
+@pytest.mark.parametrize(
+    "direction, pressed", [((0, 0, -1), 5.0), ((0.6, 0, -0.8), 4.0), ((0, 0, 1), 0.0), ((0, 1, 0), 0.0)]
+)
+def test_taxels_of_one_axis_feel_only_what_presses(direction, pressed):
+    """A punch on a flat lattice whose force is askew: the part along the lattice's normal is shared."""
+    taxels, area = flat_lattice(10, 12, 0.002)
+    touch = feel(
+        taxels,
+        area,
+        solid("box", 0.006, 0.004, 0.010),
+        np.float32([0, 0, 0.0095]),
+        EYE,
+        np.float32([5.0]),
+        Skin(margin=0.0),
+    )
+    normals = np.broadcast_to(np.float32([0, 0, 1]), taxels.shape)
+    only = press_only(touch, normals, 5 * np.float32([direction]))
+    assert float(only.force.sum()) == pytest.approx(pressed, abs=1e-5)
+    np.testing.assert_allclose(only.force, touch.force * pressed / 5, atol=1e-6)
+    np.testing.assert_array_equal(only.skin_force, touch.skin_force)

@@ -1,0 +1,138 @@
+"""The curriculum: ranges that widen with success, carried in the training state."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tiny_env import SMALL, TinyEnv
+
+from dexsim.core.errors import ConfigError
+from dexsim.core.pytree import pytree_dataclass
+from dexsim_ppo import checkpoint
+from dexsim_ppo.learner.curriculum import Curriculum
+from dexsim_ppo.learner.ppo import follow, make_train
+from dexsim_ppo.train import arguments_from_dict, parse_arguments
+from dexsim_ppo.training.trainer import printable
+
+RULES = Curriculum(on=True, start=0.5, widen_above=0.9, narrow_below=0.3, step=0.1)
+
+
+@pytree_dataclass
+class WidthState:
+    """`TinyState` and the width of the next episode's start positions."""
+
+    inner: object
+    scale: jax.Array
+    drawn: jax.Array  # the width that this episode was drawn at
+
+    def __getattr__(self, name):
+        return getattr(object.__getattribute__(self, "inner"), name)
+
+
+class WideEnv(TinyEnv):
+    """Starts spread by `scale`; every episode ends after `lives` steps, by failure or by the time limit."""
+
+    def __init__(self, lives=4, fails=False):
+        super().__init__()
+        self.lives, self.fails = lives, fails
+
+    def reset(self, key, scale=None):
+        assert scale is not None, "a reset without the curriculum's scale"
+        scale, inner = jnp.asarray(scale, jnp.float32), self._start(key)
+        return WidthState(dataclasses.replace(inner, metrics=inner.metrics | {"drawn": scale}), scale, scale)
+
+    def stagger(self, state, key):
+        return state
+
+    def step(self, state, action):
+        inner = super().step(state.inner, action)
+        done = inner.metrics["length"] >= self.lives
+        inner = dataclasses.replace(
+            inner,
+            terminated=done & self.fails,
+            truncated=done & (not self.fails),
+            metrics=inner.metrics | {"drawn": state.drawn},
+        )
+        return dataclasses.replace(state, inner=inner)
+
+    def restart(self, state, done):
+        fresh = self.reset(state.inner.key, state.scale)
+        return jax.tree.map(lambda new, old: jnp.where(done, new, old), fresh, state)
+
+    def widen(self, state, scale):
+        return dataclasses.replace(state, scale=scale)
+
+
+def run(env, rules, iterations):
+    training = make_train(env, SMALL, rules)
+    state, rows = training.init(jax.random.key(0)), []
+    for _ in range(iterations):
+        state, metrics = training.step(state)
+        rows.append({name: float(value[0]) for name, value in metrics.items()})
+    assert training.step._cache_size() == 1
+    return state, rows
+
+
+def test_ranges_widen_with_success_and_episodes_follow():
+    state, rows = run(WideEnv(), RULES, 7)
+    np.testing.assert_allclose([row["curriculum/scale"] for row in rows], [0.6, 0.7, 0.8, 0.9, 1, 1, 1], rtol=1e-5)
+    assert all(row["curriculum/success"] == 1 for row in rows)
+    np.testing.assert_allclose(state.scale, 1.0)
+    np.testing.assert_array_equal(state.env_state.scale, np.ones(SMALL.num_envs, np.float32))
+    # Two episodes of four steps in an iteration of eight: both are drawn at the scale that it began with.
+    np.testing.assert_allclose([row["step/drawn"] for row in rows[1:5]], [0.55, 0.65, 0.75, 0.85], atol=1e-5)
+
+
+def test_ranges_narrow_with_failure():
+    _, rows = run(WideEnv(fails=True), RULES, 7)
+    np.testing.assert_allclose([row["curriculum/scale"] for row in rows], [0.4, 0.3, 0.2, 0.1, 0, 0, 0], atol=1e-5)
+    assert all(row["curriculum/success"] == 0 for row in rows)
+
+
+def test_no_ended_episode_says_nothing():
+    _, (row,) = run(WideEnv(lives=100), RULES, 1)
+    assert np.isnan(row["curriculum/success"]) and row["curriculum/scale"] == 0.5
+
+
+def test_success_may_be_a_metric_by_name():
+    metrics = {"terminated_share": jnp.float32(1.0), "episode/goals": jnp.float32(7.0)}
+    rules = dataclasses.replace(RULES, metric="episode/goals", widen_above=6.0, narrow_below=2.0)
+    scale, success = follow(rules, jnp.float32(0.5), metrics)
+    assert float(scale) == pytest.approx(0.6) and float(success) == 7
+    with pytest.raises(ConfigError, match="Curriculum.metric = 'step/luck': choose from episode/goals"):
+        follow(dataclasses.replace(rules, metric="step/luck"), scale, metrics)
+
+
+def test_off_it_is_not_there():
+    """Neither in the state, nor in the metrics, nor at the environment's door (`TinyEnv.reset` knows no scale)."""
+    training = make_train(TinyEnv(), SMALL, Curriculum())
+    state = training.init(jax.random.key(0))
+    assert state.scale is None
+    assert not any("curriculum" in name for name in training.step(state)[1])
+
+
+def test_a_checkpoint_keeps_the_scale_and_resumes_to_the_bit(tmp_path):
+    training = make_train(WideEnv(), SMALL, RULES)
+    state = training.init(jax.random.key(0))
+    for _ in range(2):
+        state, _ = training.step(state)
+    checkpoint.save(tmp_path / "c", kind="train", task="tiny", content={}, tree=state)
+    straight, _ = training.step(state)
+    resumed = make_train(WideEnv(), SMALL, RULES)
+    again = checkpoint.restore(checkpoint.load(tmp_path / "c", kind="train"), resumed.shapes(jax.random.key(5)))
+    assert float(again.scale) == pytest.approx(0.7)
+    again, _ = resumed.step(jax.tree.map(jnp.copy, again))
+    for ours, theirs in zip(jax.tree.leaves(again), jax.tree.leaves(straight), strict=True):
+        if not jnp.issubdtype(ours.dtype, jax.dtypes.prng_key):
+            np.testing.assert_array_equal(ours, theirs)
+
+
+def test_options_of_the_command_line_and_of_older_checkpoints():
+    arguments, _ = parse_arguments(["--task", "grasp", "--curriculum.on", "--curriculum.start", "0.2"])
+    assert arguments.curriculum == Curriculum(on=True, start=0.2)
+    data = printable(arguments)
+    assert arguments_from_dict(type(arguments.env), data).curriculum == arguments.curriculum
+    data.pop("curriculum")
+    assert arguments_from_dict(type(arguments.env), data).curriculum == Curriculum()

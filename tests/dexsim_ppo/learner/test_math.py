@@ -1,0 +1,198 @@
+"""Each formula of the learner against hand-computed values or a NumPy reference."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dexsim.core.errors import ConfigError
+from dexsim_ppo.learner import adam, distribution, running_stats
+from dexsim_ppo.learner.config import PPOConfig
+from dexsim_ppo.learner.gae import compute_gae
+from dexsim_ppo.learner.networks import apply_mlp, init_mlp, rescale_output
+from dexsim_ppo.learner.ppo import adapt_learning_rate
+from dexsim_ppo.learner.running_stats import RunningStats, init_stats, make_normalizer, normalize, update_stats
+from dexsim_ppo.learner.types import Field
+
+
+def gae(reward, value, next_value, terminated, truncated, discount=0.5, gae_lambda=0.5):
+    """`compute_gae` of one environment."""
+    column = lambda x, dtype: jnp.asarray(x, dtype)[:, None]  # noqa: E731
+    advantage, target = compute_gae(
+        column(reward, jnp.float32),
+        column(value, jnp.float32),
+        column(next_value, jnp.float32),
+        column(terminated, bool),
+        column(truncated, bool),
+        discount=discount,
+        gae_lambda=gae_lambda,
+    )
+    np.testing.assert_allclose(target[:, 0], advantage[:, 0] + np.asarray(value), rtol=1e-6)
+    return np.asarray(advantage[:, 0])
+
+
+class TestGAE:
+    """discount = lambda = 1/2, so the sum over later steps shrinks by 1/4."""
+
+    def test_goes_on_at_the_boundary(self):
+        # deltas: 1 + .5 * 4 - 2 = 1;  2 + .5 * 6 - 4 = 1
+        assert gae([1, 2], [2, 4], [4, 6], [0, 0], [0, 0]) == pytest.approx([1.25, 1])
+
+    def test_terminated_has_nothing_after_it(self):
+        # deltas: 1 - 2 = -1 (cut);  2 + 3 - 4 = 1
+        assert gae([1, 2], [2, 4], [9, 6], [1, 0], [0, 0]) == pytest.approx([-1, 1])
+
+    def test_truncated_in_the_middle_counts_the_final_observation(self):
+        # 9 is the value of the true final observation, 4 that of the next episode's first.
+        # deltas: 1 + .5 * 9 - 2 = 3.5 (cut);  2 + 3 - 4 = 1
+        assert gae([1, 2], [2, 4], [9, 6], [0, 0], [1, 0]) == pytest.approx([3.5, 1])
+
+    def test_terminated_wins_over_truncated(self):
+        assert gae([1, 2], [2, 4], [9, 6], [1, 0], [1, 0]) == pytest.approx([-1, 1])
+
+    def test_value_of_a_diverged_final_state_is_ignored(self):
+        assert gae([1, 2], [2, 4], [np.nan, 6], [1, 0], [0, 0]) == pytest.approx([-1, 1])
+
+    def test_against_a_loop(self):
+        rng = np.random.default_rng(0)
+        reward, value, next_value = rng.normal(size=(3, 23, 5)).astype(np.float32)
+        terminated, truncated = rng.random((2, 23, 5)) < 0.2
+        expected, carry = np.zeros_like(reward), np.zeros(5)
+        for t in reversed(range(23)):
+            delta = reward[t] + 0.9 * next_value[t] * ~terminated[t] - value[t]
+            carry = delta + 0.9 * 0.8 * carry * ~(terminated[t] | truncated[t])
+            expected[t] = carry
+        advantage, _ = compute_gae(reward, value, next_value, terminated, truncated, discount=0.9, gae_lambda=0.8)
+        np.testing.assert_allclose(advantage, expected, rtol=1e-5, atol=1e-6)
+
+
+class TestDistribution:
+    def test_log_prob_and_entropy(self):
+        # Standard deviations 1 and 2 at distances of 1 and 2 deviations.
+        value = distribution.log_prob(jnp.array([1.0, 5.0]), jnp.array([0.0, 1.0]), jnp.log(jnp.array([1.0, 2.0])))
+        assert float(value) == pytest.approx(-0.5 - 2.0 - np.log(2) - np.log(2 * np.pi), rel=1e-6)
+        entropy = distribution.entropy(jnp.log(jnp.array([1.0, 2.0])))
+        assert float(entropy) == pytest.approx(np.log(2) + np.log(2 * np.pi * np.e), rel=1e-6)
+
+    def test_kl_against_closed_form(self):
+        # KL(N(0, 1) || N(1, 2^2)) = ln 2 + (1 + 1) / 8 - 1/2, and zero for equal ones.
+        zero, one, log2 = jnp.zeros(1), jnp.ones(1), jnp.log(jnp.full(1, 2.0))
+        kl = distribution.kl_divergence(zero, zero, one, log2)
+        assert float(kl) == pytest.approx(np.log(2) - 0.25, rel=1e-5)
+        assert float(distribution.kl_divergence(one, log2, one, log2)) == 0
+
+    def test_bounds_loss_at_three_points(self):
+        loss = [float(distribution.bounds_loss(jnp.array([mean]))) for mean in (0.0, 2.0, -2.0)]
+        assert loss == pytest.approx([0, 0.81, 0.81], rel=1e-5)
+
+    def test_tanh_log_det(self):
+        x = jnp.array([0.3, -1.2])
+        exact = np.sum(np.log(1 - np.tanh(np.asarray(x, np.float64)) ** 2))
+        assert float(distribution.tanh_log_det(x)) == pytest.approx(exact, rel=1e-5)
+        assert np.isfinite(distribution.tanh_log_det(jnp.array([50.0, -50.0])))
+
+
+class TestRunningStats:
+    def test_against_numpy(self):
+        data = np.random.default_rng(0).normal(3.0, [0.1, 1.0, 20.0], (7, 11, 3)).astype(np.float32)
+        stats = init_stats((3,))
+        for batch in data:
+            stats = update_stats(stats, jnp.asarray(batch))
+        flat = data.reshape(-1, 3)
+        assert int(stats.count) == 77
+        np.testing.assert_allclose(stats.mean, flat.mean(0), rtol=1e-5)
+        np.testing.assert_allclose(stats.variance, flat.var(0), rtol=1e-4)
+
+    def test_a_full_count_neither_overflows_nor_freezes(self):
+        full = RunningStats(jnp.int32(running_stats.MEMORY), jnp.zeros(()), jnp.ones(()))
+
+        def step(stats, _):
+            return update_stats(stats, jnp.full((64, 1024), 2.0)), None
+
+        stats, _ = jax.lax.scan(step, full, None, length=10_000)
+        assert int(stats.count) > 0
+        assert float(stats.mean) == pytest.approx(2.0, rel=0.02)
+
+    def test_non_finite_batches_leave_their_elements_alone(self):
+        stats = update_stats(init_stats((2,)), jnp.array([[1.0, 2.0], [3.0, jnp.nan]]))
+        np.testing.assert_allclose(stats.mean, [2, 0])
+        np.testing.assert_allclose(stats.variance, [1, 1])
+
+    def test_fixed_scale_floor_and_clip(self):
+        fields = (Field("angle", 1, None), Field("touch", 1, 4.0), Field("still", 1, None))
+        stats = RunningStats(jnp.int32(9), jnp.array([1.0, 7.0, 3.0]), jnp.array([4.0, 0.1, 0.0]))
+        normalizer = make_normalizer(stats, fields, std_floor=0.01, clip=5.0)
+        z = normalize(normalizer, jnp.array([3.0, 8.0, 3.005]))
+        np.testing.assert_allclose(z, [1, 2, 0.5], rtol=1e-3)
+        np.testing.assert_allclose(normalize(normalizer, jnp.array([-99.0, 99.0, 4.0])), [-5, 5, 5])
+
+    def test_moving_the_value_normaliser_keeps_the_values(self):
+        layers = init_mlp(jax.random.key(0), (3, 8, 1), output_gain=1.0)
+        x = jax.random.normal(jax.random.key(1), (5, 3))
+        old, new = (jnp.float32(2.0), jnp.float32(3.0)), (jnp.float32(-1.0), jnp.float32(0.5))
+        before = old[0] + old[1] * apply_mlp(layers, x)
+        after = new[0] + new[1] * apply_mlp(rescale_output(layers, *old, *new), x)
+        np.testing.assert_allclose(after, before, rtol=1e-5, atol=1e-5)
+
+
+class TestAdam:
+    def test_against_numpy(self):
+        rng = np.random.default_rng(0)
+        params = {"a": rng.normal(size=3), "b": rng.normal(size=(2, 2))}
+        grads = [{k: rng.normal(size=v.shape) for k, v in params.items()} for _ in range(5)]
+        single = lambda tree: jax.tree.map(jnp.float32, tree)  # noqa: E731
+        state, got = adam.init(single(params)), single(params)
+        moments = {k: (np.zeros_like(v), np.zeros_like(v)) for k, v in params.items()}
+        for t, grad in enumerate(grads, start=1):
+            got, state = adam.update(single(grad), state, got, 0.01, epsilon=1e-5)
+            for k, g in grad.items():
+                m, v = (0.9 * moments[k][0] + 0.1 * g, 0.999 * moments[k][1] + 0.001 * g**2)
+                moments[k] = m, v
+                params[k] = params[k] - 0.01 * (m / (1 - 0.9**t)) / (np.sqrt(v / (1 - 0.999**t)) + 1e-5)
+        for k in params:
+            np.testing.assert_allclose(got[k], params[k], rtol=1e-5, atol=1e-6)
+
+    def test_clip_by_global_norm(self):
+        grads = {"a": jnp.array([3.0]), "b": jnp.array([4.0])}
+        clipped, norm = adam.clip_by_global_norm(grads, 1.0)
+        assert float(norm) == pytest.approx(5)
+        np.testing.assert_allclose([clipped["a"][0], clipped["b"][0]], [0.6, 0.8], rtol=1e-6)
+        same, _ = adam.clip_by_global_norm(grads, 10.0)
+        np.testing.assert_allclose(same["a"], grads["a"])
+
+
+class TestConfig:
+    def test_learning_rate_adapts_within_its_band(self):
+        config = PPOConfig(learning_rate=1e-3, learning_rate_min=9e-4, learning_rate_max=1.2e-3, kl_target=0.01)
+        rate = lambda kl: float(adapt_learning_rate(config, jnp.float32(1e-3), jnp.float32(kl)))  # noqa: E731
+        assert [rate(kl) for kl in (0.0, 0.006, 0.01, 0.021)] == pytest.approx([1.2e-3, 1e-3, 1e-3, 9e-4])
+        fixed = dataclasses.replace(config, kl_target=0.0)
+        assert float(adapt_learning_rate(fixed, jnp.float32(1e-3), jnp.float32(9.0))) == pytest.approx(1e-3)
+
+    @pytest.mark.parametrize(
+        ("values", "said"),
+        [
+            ({"discount": 1.5}, "discount"),
+            ({"minibatches": 7}, "minibatches"),
+            ({"learning_rate": 0.5}, "learning_rate"),
+            ({"std_min": 0.9}, "initial_std"),
+            ({"distribution": "beta"}, "distribution"),
+        ],
+    )
+    def test_bad_values_are_named(self, values, said):
+        with pytest.raises(ConfigError, match=f"PPOConfig.{said} = "):
+            PPOConfig(num_envs=16, rollout_length=8, **values)
+
+
+@given(st.integers(1, 6), st.integers(1, 40))
+def test_any_split_into_batches_gives_the_same_statistics(parts, size):
+    data = np.random.default_rng(size).normal(size=(parts * size, 2)).astype(np.float32)
+    stats = init_stats((2,))
+    for batch in np.split(data, parts):
+        stats = update_stats(stats, batch)
+    np.testing.assert_allclose(stats.mean, data.mean(0), rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(stats.variance, data.var(0), rtol=1e-3, atol=1e-5)

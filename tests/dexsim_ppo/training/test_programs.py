@@ -1,0 +1,150 @@
+"""Compiled training steps kept between runs."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.experimental.compilation_cache.compilation_cache import reset_cache
+
+from dexsim.env.fingerprint import fingerprint
+from dexsim_ppo.training import programs
+from dexsim_ppo.training.programs import compile_step, key
+
+KEY = jax.random.key(3)
+SHAPES = jax.eval_shape(lambda: {"key": KEY, "keys": jax.random.split(KEY, 4), "total": jnp.zeros(3)})
+
+
+def fresh():
+    return {"key": jax.random.key(3), "keys": jax.random.split(jax.random.key(4), 4), "total": jnp.arange(3.0)}
+
+
+def step(state):
+    key, use = jax.random.split(state["key"])
+    noise = jax.vmap(jax.random.normal)(state["keys"])
+    total = state["total"] + jax.random.normal(use, (3,)) + noise.sum()
+    return state | {"key": key, "total": total}, {"norm": jnp.linalg.norm(total), "a": total[0]}
+
+
+@pytest.fixture(autouse=True)
+def no_compilation_cache():
+    """What JAX's own cache holds is not kept again, so these tests do without."""
+    before = jax.config.jax_compilation_cache_dir
+    jax.config.update("jax_compilation_cache_dir", None)
+    reset_cache()
+    yield
+    jax.config.update("jax_compilation_cache_dir", before)
+    reset_cache()
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("DEXSIM_CACHE", str(tmp_path))
+    return tmp_path / "programs"
+
+
+def run(identity, steps=2):
+    """(what two steps give, whether the step was traced)."""
+    traced, state = [], fresh()
+    program = compile_step(step, SHAPES, identity, lambda: traced.append(1))
+    for _ in range(steps):
+        state, metrics = program(state)
+    return (*jax.device_get((state["total"], metrics)), jax.random.key_data(state["key"])), bool(traced)
+
+
+def test_the_second_start_traces_nothing_and_does_the_same(folder):
+    state = fresh()
+    for _ in range(2):
+        state, metrics = jax.jit(step)(state)
+    first, traced = run("one")
+    again, traced_again = run("one")
+    assert traced and not traced_again
+    for found in (first, again):
+        np.testing.assert_allclose(found[0], state["total"], rtol=1e-6)
+        assert found[1] == {name: pytest.approx(float(value), rel=1e-6) for name, value in metrics.items()}
+        np.testing.assert_array_equal(found[2], jax.random.key_data(state["key"]))
+
+
+def test_another_program_is_not_taken_for_this_one(folder, monkeypatch):
+    run("one")
+    assert run("two")[1]
+    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=false")
+    assert run("one")[1]
+
+
+def test_what_tells_programs_apart(monkeypatch):
+    base = key(["x"], SHAPES)
+    assert key(["x"], SHAPES) == base != key(["y"], SHAPES)
+    assert key(["x"], SHAPES | {"total": jax.ShapeDtypeStruct((4,), jnp.float32)}) != base
+    with jax.enable_x64(True):
+        assert key(["x"], SHAPES) != base
+    monkeypatch.setattr(programs, "_cpu_features", lambda: "another processor")
+    assert key(["x"], SHAPES) != base
+
+
+@pytest.mark.parametrize("harm", [lambda content: content[: len(content) // 2], lambda content: b"x" * 99])
+def test_a_damaged_file_is_compiled_again(folder, harm):
+    good, _ = run("one")
+    (path,) = folder.glob("*.pkl")
+    path.write_bytes(harm(path.read_bytes()))
+    again, traced = run("one")
+    assert traced
+    np.testing.assert_array_equal(again[0], good[0])
+    assert not run("one")[1]
+
+
+def test_what_jax_kept_is_not_kept_again(folder, tmp_path):
+    """XLA serialises such a program without its functions."""
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path / "xla"))
+    reset_cache()
+    good, _ = run("one")
+    (path,) = folder.glob("*.pkl")
+    assert list((tmp_path / "xla").iterdir())
+    path.unlink()
+    again, traced = run("one")
+    assert traced and not list(folder.glob("*"))
+    np.testing.assert_array_equal(again[0], good[0])
+
+
+def test_a_program_that_does_not_run_is_made_again(folder, monkeypatch):
+    good, _ = run("one")
+
+    def broken(leaves):
+        raise jax.errors.JaxRuntimeError("INTERNAL: Function add_fusion not found")
+
+    monkeypatch.setattr(programs.serialize_executable, "deserialize_and_load", lambda *_: broken)
+    again, traced = run("one")
+    assert traced
+    np.testing.assert_array_equal(again[0], good[0])
+
+
+def test_without_a_place_to_write_it_runs_all_the_same(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("DEXSIM_CACHE", str(tmp_path / "file"))
+    assert run("one")[1] and run("one")[1]
+
+
+def test_an_environment_without_an_identity_keeps_nothing(folder):
+    assert run(None)[1] and not folder.exists()
+
+
+def test_the_oldest_go(folder, monkeypatch):
+    monkeypatch.setattr(programs, "KEPT", 2)
+    for name in ("a", "b", "c"):
+        run(name)
+    assert len(list(folder.glob("*"))) == 2
+
+
+def test_fingerprints(grasp_env, monkeypatch):
+    import copy
+    import dataclasses
+
+    base = fingerprint(grasp_env)
+    assert base == fingerprint(grasp_env) == grasp_env.fingerprint()
+    other = copy.copy(grasp_env)
+    other.config = dataclasses.replace(grasp_env.config, pool_size=grasp_env.config.pool_size + 1)
+    assert fingerprint(other) not in (base, None)
+    other = copy.copy(grasp_env)
+    other.pool = jax.tree.map(lambda x: x + 1 if np.issubdtype(np.asarray(x).dtype, np.floating) else x, grasp_env.pool)
+    assert fingerprint(other) not in (base, None)
+    other.task = type("Mine", (), {})()  # its sources are not this package's
+    assert fingerprint(other) is None

@@ -1,0 +1,271 @@
+"""The two commands on the tiny task: what they write, how they resume, how they refuse."""
+
+import dataclasses
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+import tiny_train
+from paths import ROOT
+from tiny_env import TinyEnv
+
+from dexsim.core import cli
+from dexsim_ppo import evaluate, train
+from dexsim_ppo.policy import Policy
+from dexsim_ppo.training import trainer
+from dexsim_ppo.training.runlog import RunFolder, read_metrics
+
+QUICK = [
+    "--task",
+    "tiny",
+    "--preset",
+    "cpu",
+    "--no-video",
+    "--ppo.num-envs",
+    "16",
+    "--ppo.rollout-length",
+    "8",
+    "--ppo.actor-layers",
+    "8",
+    "--ppo.critic-layers",
+    "8",
+    "--evaluation-chunk",
+    "16",
+    "--evaluation-episodes",
+    "32",
+    "--evaluate-every",
+    "4",
+    "--log-every",
+    "1",
+]
+PER_ITERATION = 16 * 8
+
+
+@pytest.fixture(autouse=True)
+def tiny_task(monkeypatch):
+    tiny_train.install(monkeypatch)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A finished run of six iterations."""
+    path = tmp_path_factory.mktemp("runs") / "a"
+    with pytest.MonkeyPatch.context() as patch:
+        tiny_train.install(patch)
+        assert train.main([*QUICK, "--steps", str(6 * PER_ITERATION), "--run-dir", str(path)]) == 0
+    return RunFolder(path)
+
+
+def test_a_run_leaves_its_files(finished):
+    for path in (
+        finished.config,
+        finished.metrics,
+        finished.best,
+        finished.last,
+        finished.untrained,
+        finished.report,
+        finished.path / "curve.png",
+    ):
+        assert path.stat().st_size > 0
+    rows = read_metrics(finished.metrics)
+    assert [row["iteration"] for row in rows] == [1, 2, 3, 4, 5, 6]
+    assert rows[-1]["env_steps"] == 6 * PER_ITERATION
+    assert rows[3]["evaluation/return"] is not None
+    config = json.loads(finished.config.read_text())
+    assert config["arguments"]["ppo"]["num_envs"] == 16 and config["arguments"]["env"]["gain"] == 0.25
+
+
+def test_the_report_compares_with_the_untrained_policy(finished):
+    report = json.loads(finished.report.read_text())
+    for name in ("trained", "untrained"):
+        held = report[name]["held"]
+        assert held["low"] <= held["value"] <= held["high"]
+        assert report[name]["episodes"] == 32 and report[name]["seed"] == 0
+    assert report["timing"]["compile_s"] > 0 and report["timing"]["first_update_s"] > 0
+    clock = report["timing"]  # the rate is that of the five calls after the first, in which Warp would compile
+    assert 0 < clock["first_call_s"] < clock["step_s"] <= clock["training_s"]
+    assert clock["env_steps_per_s"] == pytest.approx(5 * PER_ITERATION / (clock["step_s"] - clock["first_call_s"]))
+    assert report["hardware"]["cpu_cores"] and report["versions"]["jax"]
+    assert "dexsim_ppo.train" in report["command"]
+
+
+def test_the_best_policy_is_the_one_that_was_measured(finished):
+    rows = [r for r in read_metrics(finished.metrics) if r.get("evaluation/return") is not None]
+    policy = Policy.load(finished.best, task="tiny")
+    report, _ = evaluate.Evaluator(TinyEnv(), 16)(policy.params, episodes=16, seed=1)
+    if policy.training["iteration"] == rows[0]["iteration"]:
+        assert report["return"]["value"] == pytest.approx(rows[0]["evaluation/return"], rel=1e-5)
+    last = Policy.load(finished.last).params
+    last, _ = evaluate.Evaluator(TinyEnv(), 16)(last, episodes=16, seed=1)
+    assert report["return"]["value"] >= last["return"]["value"] - 1e-4
+
+
+def test_resumed_run_equals_an_uninterrupted_one(finished, tmp_path):
+    path = tmp_path / "b"
+    assert train.main([*QUICK, "--steps", str(3 * PER_ITERATION), "--run-dir", str(path)]) == 0
+    assert train.main(["--resume", str(path), "--steps", str(6 * PER_ITERATION)]) == 0
+    a, b = Policy.load(finished.last), Policy.load(RunFolder(path).last)
+    jax.tree.map(np.testing.assert_array_equal, a.params, b.params)
+    assert [r["iteration"] for r in read_metrics(RunFolder(path).metrics)] == [1, 2, 3, 4, 5, 6]
+
+
+def test_evaluate_command(finished, tmp_path, capsys):
+    arguments = [str(finished.best), "--episodes", "32", "--chunk", "16", "--output", str(tmp_path / "report.json")]
+    assert evaluate.main(arguments) == 0
+    first = json.loads((tmp_path / "report.json").read_text())
+    assert evaluate.main(arguments) == 0
+    second = json.loads((tmp_path / "report.json").read_text())
+    assert first["return"] == second["return"] and first["episodes"] == 32
+    report = json.loads(finished.report.read_text())
+    assert first["return"]["value"] == pytest.approx(report["trained"]["return"]["value"], rel=1e-5)
+    assert "held" in capsys.readouterr().out
+
+
+class Drops(TinyEnv):
+    """Terminates every episode at step 7."""
+
+    def step(self, state, action):
+        state = super().step(state, action)
+        return dataclasses.replace(state, terminated=state.metrics["length"] == 7)
+
+
+def test_film_shows_the_first_and_last_episode_to_half_a_second_after_its_end(finished):
+    params = Policy.load(finished.best).params
+    _, film = evaluate.Evaluator(TinyEnv(), 4)(params, episodes=4, seed=0)
+    assert film["x"].shape == (2 * 32,)
+    _, film = evaluate.Evaluator(Drops(), 4)(params, episodes=4, seed=0)
+    assert film["x"].shape == (2 * (6 + 5),)
+
+
+def test_episodes_end_at_their_first_termination():
+    # Episode 0 terminates at step 1 (with a reward of 10 counted in), and "lives" again later.
+    terminated = np.array([[0, 0], [1, 0], [0, 0]], bool)
+    metrics = {
+        "return": np.array([[1.0, 1], [11, 2], [99, 3]]),
+        "error": np.array([[1.0, 1], [np.nan, 1], [np.nan, 4]]),
+    }
+    report = evaluate.summarize(TinyEnv(), metrics, terminated)
+    assert report["held"]["value"] == 0.5
+    assert report["return"]["value"] == pytest.approx((11 + 3) / 2)
+    assert report["steps_held"]["value"] == pytest.approx((1 + 3) / 2)
+    assert report["task"]["error"] == pytest.approx((1 + 1 + 1 + 4) / 4)
+
+
+def test_intervals():
+    entry = evaluate.proportion(np.array([True] * 8 + [False] * 2))
+    assert (entry["low"], entry["high"]) == pytest.approx((0.4902, 0.9433), abs=2e-4)  # Wilson
+    entry = evaluate.mean_interval(np.array([1.0, 2, 3, 4]))
+    assert entry["value"] == 2.5
+    assert entry["high"] - 2.5 == pytest.approx(1.96 * np.sqrt(5 / 3) / 2)
+
+
+BAD = {
+    "unknown option": (["--ppo.number-envs", "3"], "--ppo.number-envs"),
+    "unknown task": (["--task", "juggle"], "unknown task 'juggle'"),
+    "wrong type": (["--ppo.discount", "much"], "could not convert"),
+    "out of range": (["--ppo.discount", "1.5"], "PPOConfig.discount = 1.5: must be between 0 and 1"),
+    "environment value out of range": (["--env.gain", "7"], "TinyConfig.gain = 7 m: must be between"),
+    "corners of no ranges": (["--corners", "0.3"], "--corners 0.3: task 'tiny' has no ranges"),
+    "unknown preset": (["--preset", "tpu"], "tpu"),
+    "nothing to resume": (["--resume", "/nonexistent/run"], "no checkpoint to resume from"),
+}
+
+
+@pytest.mark.parametrize("arguments", BAD, ids=str)
+def test_bad_options_are_one_line(arguments, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    given, said = BAD[arguments]
+    task = [] if given[0] == "--task" else ["--task", "tiny"]
+    assert exit_code(train.main, [*task, *given]) == 2
+    error = capsys.readouterr().err
+    assert said in error and error.count("\n") == 1 and error.startswith("error: "), error
+    assert not list(tmp_path.iterdir()), "nothing is written"
+
+
+def test_corners_are_for_training_alone():
+    from dexsim.tasks.rotate.config import RotateConfig
+
+    plain, _ = train.parse_arguments(["--task", "rotate", "--preset", "gpu"])
+    assert plain.corners == 0.6 and plain.env == RotateConfig()
+    asked = trainer.training_config(plain)
+    assert asked.randomization.corners == asked.objects.corners == 0.6
+    without = dataclasses.replace(asked, randomization=plain.env.randomization, objects=plain.env.objects)
+    assert without == plain.env
+    off, _ = train.parse_arguments(["--task", "rotate", "--preset", "gpu", "--corners", "0"])
+    assert trainer.training_config(off) == RotateConfig()
+
+
+def test_files_are_never_overwritten_or_mistaken(finished, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    before = {p: p.read_bytes() for p in finished.path.rglob("*") if p.is_file()}
+    broken = tmp_path / "broken.msgpack"
+    broken.write_bytes(finished.best.read_bytes()[:-9])
+    run = str(finished.path)
+    for main, arguments, said in (
+        (train.main, [*QUICK, "--run-dir", run], "exists already"),
+        (train.main, ["--task", "grasp", "--resume", run], "of the task 'tiny', not 'grasp'"),
+        (train.main, ["--resume", run, "--ppo.num-envs", "32"], "does not fit this configuration"),
+        (train.main, ["--resume", str(finished.best)], "'policy' file, not a 'train' file"),
+        (evaluate.main, [str(broken)], "cut short"),
+        (evaluate.main, ["no-such-policy"], "no shipped policy has that name"),
+        (evaluate.main, [str(finished.best), "--episodes", "0"], "at least 1"),
+        (evaluate.main, [str(finished.best), "--set", "colour=red"], "has no field 'colour'"),
+        (evaluate.main, [str(finished.best), "--set", "colour"], "'colour': expected NAME=VALUE"),
+        (evaluate.main, [str(finished.best), "--blind", "colour"], "does not observe colour"),
+        (evaluate.main, [], "policy"),
+    ):
+        assert exit_code(main, arguments) == 2
+        error = capsys.readouterr().err
+        assert said.lower() in error.lower() and error.count("\n") == 1, error
+    assert before == {p: p.read_bytes() for p in finished.path.rglob("*") if p.is_file()}
+
+
+def test_a_file_that_cannot_be_written_is_one_line(tmp_path, capsys):
+    (tmp_path / "taken").write_text("")
+    assert exit_code(lambda path: Path(path).mkdir(), str(tmp_path / "taken")) == 2
+    assert capsys.readouterr().err == f"error: {tmp_path / 'taken'}: File exists\n"
+    assert exit_code(full_disk, None) == 2
+    assert capsys.readouterr().err == "error: no room left\n"
+
+
+def full_disk(_):
+    raise OSError("no room left")
+
+
+def exit_code(main, arguments):
+    with pytest.raises(SystemExit) as stop:
+        cli.run(lambda _: main(arguments))
+    return stop.value.code
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_saves_and_says_how_to_go_on(number, tmp_path):
+    command = [
+        sys.executable,
+        tiny_train.__file__,
+        *QUICK,
+        "--minutes",
+        "5",
+        "--run-dir",
+        str(tmp_path / "a"),
+    ]
+    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, text=True, env=os.environ | {"PYTHONPATH": path.strip(os.pathsep)}
+    )
+    metrics, deadline = tmp_path / "a" / "metrics.jsonl", time.time() + 120
+    while time.time() < deadline and not (metrics.exists() and metrics.stat().st_size):
+        time.sleep(0.1)
+    process.send_signal(number)
+    out, _ = process.communicate(timeout=60)
+    assert process.returncode == 128 + number
+    assert f"--resume {tmp_path / 'a'}" in out.splitlines()[-1]
+    assert RunFolder(tmp_path / "a").latest_checkpoint().exists()

@@ -1,0 +1,165 @@
+"""The log: what goes in comes out, whatever happens to the program or to the file."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from paths import ROOT
+
+from dexsim_real.core.log import MAGIC, Kind, LogError, LogReader, LogWriter, encode
+
+
+def contents():
+    rng = np.random.default_rng(0)
+    for i in range(200):
+        yield Kind.RECEIVED, (i, rng.bytes(int(rng.integers(0, 300))))
+        yield Kind.NOTE, f"line {i} with ä"
+        yield (
+            Kind.TICK,
+            {
+                "sequence": i,
+                "readings": {"force": rng.normal(size=(5, 120)).astype(np.float32)},
+                "action": rng.normal(size=12).astype(np.float32),
+                "command": np.float32(0.5),
+            },
+        )
+
+
+def same(a, b):
+    if isinstance(a, dict):
+        return a.keys() == b.keys() and all(same(a[k], b[k]) for k in a)
+    if isinstance(a, (np.ndarray, np.generic)):
+        return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
+    return a == b
+
+
+def test_what_goes_in_comes_out_in_order(tmp_path):
+    path = tmp_path / "deep" / "run.log"
+    with LogWriter(path) as log:
+        for at, (kind, content) in enumerate(contents()):
+            log.add(kind, content, when=float(at))
+    records = list(LogReader(path))
+    assert len(records) == 600
+    for at, (record, (kind, content)) in enumerate(zip(records, contents(), strict=True)):
+        assert (record.kind, record.time) == (kind, float(at)) and same(content, record.content)
+
+
+def test_threads_share_a_log(tmp_path):
+    with LogWriter(tmp_path / "run.log") as log:
+        threads = [
+            threading.Thread(target=lambda name=name: [log.add(Kind.NOTE, f"{name} {i}") for i in range(500)])
+            for name in "abcd"
+        ]
+        [t.start() for t in threads]
+        [t.join() for t in threads]
+    lines = [record.content for record in LogReader(tmp_path / "run.log")]
+    for name in "abcd":
+        assert [line for line in lines if line.startswith(name)] == [f"{name} {i}" for i in range(500)]
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    path = tmp_path_factory.mktemp("log") / "run.log"
+    with LogWriter(path) as log:
+        for i in range(20):
+            log.add(Kind.NOTE, f"note {i}", when=float(i))
+    return path.read_bytes()
+
+
+@given(st.integers(0, 1000))
+def test_cut_anywhere_the_whole_records_remain(small, tmp_path_factory, share):
+    cut = len(MAGIC) + (len(small) - len(MAGIC)) * share // 1000
+    path = tmp_path_factory.mktemp("cut") / "run.log"
+    path.write_bytes(small[:cut])
+    size = len(encode(Kind.NOTE, 0.0, "note 0"))
+    got = [record.content for record in LogReader(path)]
+    assert got == [f"note {i}" for i in range(len(got))]
+    whole = min((cut - len(MAGIC)) // size, 10)  # The first ten records are of one size.
+    assert len(got) >= whole
+
+
+@given(st.data())
+def test_damage_costs_the_damaged_record_only(small, tmp_path_factory, data):
+    at = data.draw(st.integers(len(MAGIC), len(small) - 1))
+    bad = bytearray(small)
+    bad[at] ^= data.draw(st.integers(1, 255))
+    path = tmp_path_factory.mktemp("bad") / "run.log"
+    path.write_bytes(bad)
+    reader = LogReader(path)
+    got = {record.content for record in reader}
+    assert got <= {f"note {i}" for i in range(20)} and len(got) == 19 and reader.damaged > 0
+
+
+def test_files_that_are_no_log(tmp_path):
+    with pytest.raises(LogError, match="cannot be read"):
+        LogReader(tmp_path / "none")
+    (tmp_path / "text").write_text("hello")
+    with pytest.raises(LogError, match="not a log"):
+        LogReader(tmp_path / "text")
+    (tmp_path / "file").touch()
+    with pytest.raises(LogError, match="cannot be written"):
+        LogWriter(tmp_path / "file")  # A log is never overwritten.
+
+
+def test_a_full_disk_ends_the_log_and_not_the_run(tmp_path, monkeypatch):
+    log = LogWriter(tmp_path / "run.log")
+    real = os.write
+
+    def full(file, data):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "write", full)
+    log.add(Kind.NOTE, "lost")
+    time.sleep(0.2)
+    log.add(Kind.NOTE, "lost too")
+    monkeypatch.setattr(os, "write", real)
+    log.close()
+    assert "No space left" in log.failure and log.dropped == 2
+
+
+def test_adding_does_not_wait_for_the_disk(tmp_path, monkeypatch):
+    release = threading.Event()
+    monkeypatch.setattr(os, "fdatasync", lambda file: release.wait(5))
+    with LogWriter(tmp_path / "run.log") as log:
+        start = time.perf_counter()
+        for i in range(2000):
+            log.add(Kind.RECEIVED, (i, bytes(2217)))
+        took = time.perf_counter() - start
+        release.set()
+    assert took < 0.2
+    assert len(list(LogReader(tmp_path / "run.log"))) == 2000
+
+
+def test_killed_at_any_moment_all_but_the_last_moment_is_there(tmp_path):
+    """SIGKILL, again and again: every log opens, and lacks at most half a second."""
+    code = """
+import sys, time
+from dexsim_real.log import Kind, LogWriter
+log = LogWriter(sys.argv[1])
+print("ready", flush=True)
+while True:
+    log.add(Kind.NOTE, repr(time.monotonic()))
+    log.add(Kind.RECEIVED, (1, bytes(2217)))
+    time.sleep(0.005)
+"""
+    rng = np.random.default_rng(5)
+    started = []
+    for i in range(4):
+        path = tmp_path / f"{i}.log"
+        process = subprocess.Popen([sys.executable, "-c", code, str(path)], cwd=ROOT, stdout=subprocess.PIPE)
+        started.append((path, process))
+    for path, process in started:
+        assert process.stdout.readline() == b"ready\n"
+        time.sleep(float(rng.uniform(0.2, 0.7)))
+        killed = time.monotonic()
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        notes = [float(record.content) for record in LogReader(path) if record.kind == Kind.NOTE]
+        assert notes == sorted(notes) and killed - notes[-1] < 0.5

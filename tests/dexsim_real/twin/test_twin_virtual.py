@@ -1,0 +1,211 @@
+"""Runs in virtual time: the bridge's parts against the emulated hand, event by event."""
+
+import importlib.util
+import json
+import math
+
+import numpy as np
+import pytest
+from paths import ROOT
+
+from dexsim import load_hand
+from dexsim.calibration.maps import current_from_counts, normalised_torque
+from dexsim.tasks import TASKS
+from dexsim_real.control.controller import Tick
+from dexsim_real.sensors.hand import HardwareConfig
+from dexsim_real.twin.plant.plant import EmulatedHand, nominal_gravity
+from dexsim_real.twin.plant.shapes import SHAPES, product
+from dexsim_real.twin.virtual import (
+    RATE,
+    RunOptions,
+    Schedule,
+    VirtualCamera,
+    VirtualImu,
+    VirtualRun,
+    ideal_calibration,
+)
+
+CALM = {"camera_noise": 0.0, "camera_delay": 0.0, "push_rate": 0.0, "heading_error": 0.0, "place_error": 0.0}
+
+
+@pytest.fixture(scope="module")
+def hand():
+    return load_hand()
+
+
+class Scripted:
+    """A controller whose targets are a function of the tick's number."""
+
+    period = 0.03
+
+    def __init__(self, hand, task, script, sources=()):
+        self.hand, self.task = hand, TASKS[task].task_class(TASKS[task].config_class(), hand)
+        self.sources, self._script, self.seen = set(sources), script, []
+
+    def start(self, target):
+        self.target = np.array(target)
+
+    def anchor(self, target):
+        self.target = np.array(target)
+
+    def tick(self, measured, seen, goal, command):
+        self.seen.append((measured, seen, goal, command))
+        target = self._script(len(self.seen), self.target).astype(np.float32)
+        return Tick(None, None, None, target)
+
+
+def virtual(hand, task, script, *, sources=("imu",), seconds=0.5, safety=True, **overrides):
+    plant = EmulatedHand(hand, task, 4, kind="nominal", trials=1, seconds=seconds, overrides=CALM | overrides)
+    controller = Scripted(hand, task, script, sources)
+    return (
+        VirtualRun(
+            plant, controller, ideal_calibration(hand), RunOptions(command=0.25, safety=safety, approach=0.4, place=0.2)
+        ),
+        plant,
+        controller,
+    )
+
+
+def test_a_run_goes_through_the_wire_and_is_judged_by_the_referee(hand):
+    run, plant, controller = virtual(hand, "rotate", lambda k, target: target + 0.02 * min(k, 4))
+    report = run.run()
+    assert report["end"] == "time limit" and report["seconds"] == pytest.approx(0.5) and report["command"] == 0.25
+    assert report["bridge"]["successes"] == run.goals.successes == 0
+    assert abs(len(controller.seen) * controller.period - 0.5) < 0.15
+    exchanges = run.firmware.counts["exchange"]
+    assert exchanges == pytest.approx(plant.time * RATE, abs=3)
+    measured = controller.seen[-1][0]
+    # What the policy sees has the wire's steps: 12 bits a turn, 0.1 N, 1 mA.
+    steps = measured.joint_position / (2 * math.pi / 4096)
+    assert steps == pytest.approx(np.round(steps), abs=1e-2)
+    assert measured.taxel_force * 10 == pytest.approx(np.round(measured.taxel_force * 10), abs=1e-4)
+    assert measured.current * 1000 == pytest.approx(np.round(measured.current * 1000), abs=1e-3)
+    assert json.loads(json.dumps(report)) == report
+
+
+def test_measurements_are_as_old_as_the_exchange_makes_them(hand):
+    """An exchange begins every 12 ms, and its answer is there 9.6 ms later."""
+    run, plant, _ = virtual(hand, "rotate", lambda k, target: target + 0.01, seconds=0.1)
+    heard = []
+    see = run.safety.see
+    run.safety.see = lambda sample: (heard.append((sample.time, plant.time)), see(sample))
+    run.run()
+    times = np.array([time for time, _ in heard])
+    assert np.diff(times) == pytest.approx(np.full(len(times) - 1, 1 / RATE), abs=1e-9)
+    assert times[0] == pytest.approx(0.0096)
+
+
+def test_an_unsafe_wish_is_clipped_unless_the_limits_are_left_out(hand):
+    def jump(k, target):
+        return target + 0.8 * (np.arange(12) == 4)
+
+    for safety in (True, False):
+        run, _, _ = virtual(hand, "rotate", jump, seconds=0.15, safety=safety)
+        run.run()
+        clipped = [name for name in run.safety.counts if name.startswith("wish beyond a limit")]
+        assert bool(clipped) == safety
+
+
+def test_the_imu_shows_the_orientation_up_to_the_mounts_tilt(hand):
+    for tilt, limit in ((0.0, 0.0005), (0.1, 0.15)):
+        plant = EmulatedHand(
+            hand, "rotate", 1, kind="nominal", overrides=CALM | {"imu_noise": 0.0, "gravity_tilt": tilt}
+        )
+        imu = VirtualImu(plant, -nominal_gravity("rotate"))
+        for step in range(3):
+            plant.advance(0.03)
+            imu.receive(0.03 * step, imu.sample())
+        imu.calibrate()
+        true = plant.measure_object()[1]
+        apart = 2 * math.acos(min(1.0, abs(float(product(imu.read() * [1, -1, -1, -1], true)[0]))))
+        assert apart < limit and (tilt == 0 or apart > 0.1)
+
+
+def test_the_camera_measures_the_height(hand):
+    for shape in SHAPES:
+        plant = EmulatedHand(hand, "grasp", 3, kind="nominal", overrides=CALM, shape=shape)
+        controller = Scripted(hand, "grasp", lambda k, target: target, {"camera"})
+        camera = VirtualCamera(plant, controller)
+        reference = np.array(controller.task.reference)
+        place = plant._data.qpos[plant._scene.object_qpos :][:3]
+        place[:] = reference + (0.01, 0.0, 0.0)
+        plant.advance(0.0)
+        plant._remember()
+        camera.sample(0.1)
+        _, position, _ = camera.sensor.read()
+        assert position[1:] == pytest.approx(reference[1:])
+        # A composition's outline has another middle than the composition.
+        assert position[0] == pytest.approx(place[0], abs=0.001 if shape != "composition" else 0.006)
+
+
+def test_events_come_in_order_of_time_then_of_asking():
+    schedule, called = Schedule(), []
+    for name, time in (("c", 2.0), ("a", 1.0), ("b", 1.0)):
+        schedule.at(time, lambda name=name: called.append(name))
+    for _ in range(3):
+        schedule.pop()[1]()
+    assert called == ["a", "b", "c"]
+
+
+def test_the_ideal_calibration_reads_torque_over_its_limit(hand):
+    calibration = ideal_calibration(hand)
+    counts = -1000.0 * 0.5 * np.ones(12)  # mA, closing, half of what stalls
+    assert np.asarray(normalised_torque(calibration, current_from_counts(calibration, counts))) == pytest.approx(
+        np.full(12, 0.5), abs=1e-6
+    )
+    assert HardwareConfig().current_sign < 0
+
+
+# --- the benchmark's tables ----------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def benchmark():
+    path = ROOT / "benchmarks" / "zero_shot.py"
+    spec = importlib.util.spec_from_file_location("zero_shot", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_metrics_of_rotations(benchmark):
+    reports = [
+        {
+            "successes": s,
+            "paper_successes": s + 1,
+            "seconds_per_success": 2.0 if s else None,
+            "seconds_to_fall": t,
+            "fell": t < 120,
+            "joint_speed": 0.5,
+        }
+        for s, t in ((0, 3.0), (10, 60.0), (50, 120.0))
+    ]
+    metrics = benchmark.rotate_metrics(reports)
+    assert metrics["successes"]["mean"] == 20.0 and metrics["successes"]["median"] == 10.0
+    assert metrics["seconds_per_success"]["mean"] == 2.0 and metrics["seconds_to_fall"]["mean"] == 61.0
+    assert metrics["kept_to_the_end"]["mean"] == pytest.approx(1 / 3)
+    there = benchmark.simulated("rotate", "rotate")
+    text = benchmark.table(metrics, there)
+    assert "emulated hand" in text and "seconds to fall" in text and len(text.splitlines()) == 7
+
+
+def test_metrics_of_grasps_count_only_what_was_held(benchmark):
+    reports = [
+        {
+            "held": held,
+            "command": c,
+            "finger_force": 2 + 5 * c,
+            "finger_pressing": (1 + c) ** 2,
+            "total_force": 9 + c,
+            "shape": shape,
+        }
+        for c in (0.0, 0.5, 1.0)
+        for shape, held in (("box", True), ("sphere", c < 1))
+    ]
+    metrics = benchmark.grasp_metrics(reports)
+    assert metrics["held"]["mean"] == pytest.approx(5 / 6)
+    assert metrics["pearson_r"]["r"] == pytest.approx(1.0)
+    command = np.array([0.0, 0.0, 0.5, 0.5, 1.0])
+    assert metrics["pearson_r_pressing"]["r"] == pytest.approx(np.corrcoef(command, (1 + command) ** 2)[0, 1])
+    assert [row["held"]["mean"] for row in metrics["by_command"]] == [1.0, 1.0, 0.5]
+    assert "command 0.5: finger force (N)" in benchmark.table(metrics, benchmark.simulated("grasp", "grasp"))

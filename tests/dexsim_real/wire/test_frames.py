@@ -1,0 +1,266 @@
+"""The wire format: layouts against `struct`, the checksum against its definition, and a parser that
+loses no intact frame and accepts no damaged one, whatever the line does."""
+
+import struct
+import time
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dexsim_real.wire import frames
+from dexsim_real.wire.frames import HAND_REPLIES, HOST_REQUESTS, Command, Frame, FrameError, Mode, Parser
+
+
+def crc_by_definition(data):
+    """Polynomial division bit by bit: x^16 + x^12 + x^5 + 1, start 0."""
+    register = 0
+    for byte in data:
+        for bit in range(8):
+            out = (register >> 15) ^ (byte >> (7 - bit) & 1)
+            register = (register << 1 & 0xFFFF) ^ (0x1021 if out else 0)
+    return register
+
+
+def state_frame(rng):
+    """A reply with random content and sound ids."""
+    state = np.frombuffer(rng.bytes(2208), frames.STATE_BLOCK).copy()
+    state["joint"]["id"] = np.arange(12)
+    return Frame(0x80, frames.HOST, Command.EXCHANGE, state.tobytes())
+
+
+@given(st.binary(max_size=64))
+def test_the_checksum_is_xmodem(data):
+    assert frames.crc16(data) == crc_by_definition(data)
+
+
+def test_the_published_check_value():
+    assert frames.crc16(b"123456789") == 0x31C3
+
+
+def test_a_version_request_byte_for_byte():
+    wanted = bytes.fromhex("55 AA FE 80 13 00 00")
+    assert Frame(frames.HOST, frames.palm_address(0), Command.VERSION).encode() == (
+        wanted + crc_by_definition(wanted).to_bytes(2, "little")
+    )
+
+
+def test_a_command_block_byte_for_byte():
+    block = frames.command_block(np.linspace(-1, 1, 12), kp=100, ki=-5, kd=12000, torque_max=300)
+    block["mode"][3] = Mode.PASSIVE
+    data = block.tobytes()
+    assert len(data) == 288
+    for joint, angle in enumerate(np.linspace(-1, 1, 12)):
+        row = struct.unpack_from("<HhhhfhH4H", data, 24 * joint)
+        assert row == (joint, 100, -5, 12000, np.float32(angle), 300, 0 if joint == 3 else 3, 0, 0, 0, 0)
+    np.testing.assert_array_equal(frames.decode_command(data), block)
+
+
+def test_a_state_block_byte_for_byte():
+    joints = [
+        struct.pack(
+            "<BBfhHHHHHhHH", i, 17 * (i == 2), 0.1 * i, -100 * i, (i << 4) | 3, (40 << 8) | i, 1, 2, 3, -7 * i, 0, 0
+        )
+        for i in range(12)
+    ]
+    tips = [
+        struct.pack("<bbB", -i, i, 200 + i)
+        + b"".join(struct.pack("<bbB", -t, t, 2 * t) for t in range(120))
+        + bytes(range(20))
+        + bytes([30 + i])
+        for i in range(5)
+    ]
+    data = b"".join(joints + tips)
+    assert len(data) == 12 * 24 + 5 * 384 == 2208
+    state = frames.decode_state(data)
+    joint, tip = state["joint"], state["tip"]
+    np.testing.assert_array_equal(joint["position"], (0.1 * np.arange(12)).astype(np.float32))
+    np.testing.assert_array_equal(joint["current"], -100 * np.arange(12))
+    np.testing.assert_array_equal(joint["raw_position"] >> 4, np.arange(12))
+    np.testing.assert_array_equal(joint["temperature"] & 0xFF, np.arange(12))
+    np.testing.assert_array_equal(joint["velocity"], -7 * np.arange(12))
+    assert joint["sensor_id"][2] == 17
+    np.testing.assert_array_equal(tip["taxel"]["z"], np.tile(2 * np.arange(120), (5, 1)))
+    np.testing.assert_array_equal(tip["taxel"]["x"], np.tile(-np.arange(120), (5, 1)))
+    np.testing.assert_array_equal(tip["total"]["z"], 200 + np.arange(5))
+    np.testing.assert_array_equal(tip["temperature"], 30 + np.arange(5))
+    assert state.tobytes() == data
+
+
+def test_blocks_that_cannot_be_right_are_refused():
+    with pytest.raises(FrameError, match="2207 bytes"):
+        frames.decode_state(bytes(2207))
+    state = frames.empty_state()
+    state["joint"]["id"][4] = 9
+    with pytest.raises(FrameError, match="joint ids"):
+        frames.decode_state(state.tobytes())
+    with pytest.raises(FrameError, match="joint ids"):
+        frames.decode_command(bytes(288))
+    with pytest.raises(FrameError, match="at most"):
+        Frame(1, 2, 3, bytes(frames.MAX_DATA + 1)).encode()
+
+
+@given(st.lists(st.sampled_from(["state", "version", "error"]), max_size=5), st.integers(0, 2**32 - 1))
+def test_any_chunking_gives_the_same_frames(kinds, seed):
+    rng = np.random.default_rng(seed)
+    make = {
+        "state": state_frame,
+        "version": lambda r: Frame(0x80, 0xFE, Command.VERSION, r.bytes(7)),
+        "error": lambda r: Frame(0x80, 0xFE, Command.ERROR, r.bytes(4)),
+    }
+    sent = [make[kind](rng) for kind in kinds]
+    stream = b"".join(frame.encode() for frame in sent)
+    parser, got = Parser(HAND_REPLIES), []
+    while stream:
+        size = int(rng.integers(1, 1500))
+        got += parser.feed(stream[:size])
+        stream = stream[size:]
+    assert got == sent and parser.pending == 0
+    assert parser.counts.frames == len(sent) and parser.counts.skipped == parser.counts.resyncs == 0
+
+
+def test_a_host_does_not_take_its_own_echo_for_an_answer():
+    block = frames.command_block(np.zeros(12), kp=1, ki=0, kd=0, torque_max=1)
+    echo = b"".join(
+        Frame(0xFE, 0x80, command, data).encode()
+        for command, data in (
+            (Command.EXCHANGE, block.tobytes()),
+            (Command.VERSION, b""),
+            (Command.CLEAR_PRESSURE, b"\x11"),
+            (Command.READ_MODE, b""),
+        )
+    )
+    parser = Parser(HAND_REPLIES)
+    assert parser.feed(echo) + parser.expire() == []
+    assert len(Parser(HOST_REQUESTS).feed(echo)) == 4
+
+
+def damage(rng, sent):
+    """One frame's bytes after one fault, the whole frame nowhere among them."""
+    while sent in (bad := _damage(rng, bytearray(sent))):
+        pass
+    return bad
+
+
+def _damage(rng, data):
+    at = int(rng.integers(len(data)))
+    kind = rng.integers(6)
+    if kind == 0:  # up to three flipped bits
+        for bit in rng.choice(8 * len(data), int(rng.integers(1, 4)), replace=False):
+            data[bit >> 3] ^= 1 << (bit & 7)
+    elif kind == 1:  # lost bytes
+        del data[at : at + int(rng.integers(1, 40))]
+    elif kind == 2:  # doubled bytes
+        data[at:at] = data[at : at + int(rng.integers(1, 40))]
+    elif kind == 3:  # cut off
+        del data[at:]
+    elif kind == 4:  # strange bytes within
+        data[at:at] = rng.bytes(int(rng.integers(1, 60)))
+    else:  # overwritten in two bytes: a burst that the checksum is sure to find
+        first = bytes(data[at : at + 2])
+        while bytes(data[at : at + 2]) == first:
+            data[at : at + 2] = rng.bytes(len(first))
+    return bytes(data)
+
+
+HEADS = tuple(
+    bytes.fromhex(text) for text in ("55", "AA", "55AA", "55AAFE", "55AA80FE02A008", "55AAFE80022001", "55AA80FE021020")
+)
+
+
+def between(rng):
+    """What lies between two frames: nothing, noise, or what looks like the beginning of a frame."""
+    kind = rng.integers(4)
+    return b"" if kind < 2 else rng.bytes(int(rng.integers(1, 30))) if kind == 2 else HEADS[rng.integers(len(HEADS))]
+
+
+def fuzz(seed, total, lengths, make):
+    """Feed at least `total` bytes of whole and damaged frames; check what comes out.
+
+    Every intact frame must come out, in order, before the frame after the next has been fed; nothing else may.
+    """
+    rng = np.random.default_rng(seed)
+    parser, fed, waiting, wrong = Parser(lengths), 0, [], []
+    longest = frames.OVERHEAD + max(span[-1] for span in lengths.values())
+    overhang = 0  # bytes fed since the oldest waiting frame ended
+    while fed < total:
+        sent = make(rng)
+        data = sent.encode()
+        intact = rng.random() < 0.6
+        stream = between(rng) + (data if intact else damage(rng, data))
+        if intact:
+            waiting.append(sent)
+        fed += len(stream)
+        overhang = overhang + len(stream) if len(waiting) > intact else 0
+        while stream:
+            size = int(rng.choice([1, 7, 62, 512, 4096]))
+            for frame in parser.feed(stream[:size]):
+                if waiting and frame == waiting[0]:
+                    waiting.pop(0)
+                    overhang = 0
+                else:
+                    wrong.append(frame)
+            stream = stream[size:]
+        assert overhang <= longest, "an intact frame is held back for more than a frame"
+        assert parser.pending < longest
+    for frame in parser.expire():
+        assert waiting and frame == waiting.pop(0)
+    assert not wrong and not waiting
+    assert parser.counts.received == fed
+    return parser.counts
+
+
+def command_frame(rng):
+    block = frames.command_block(rng.normal(size=12), kp=100, ki=0, kd=int(rng.integers(100)), torque_max=300)
+    return Frame(frames.HOST, 0x80, Command.EXCHANGE, block.tobytes())
+
+
+@settings(max_examples=15)
+@given(st.integers(0, 2**31))
+def test_damage_costs_only_the_damaged_frames(seed):
+    counts = fuzz(seed, 40_000, HAND_REPLIES, state_frame)
+    assert counts.resyncs > 0
+    fuzz(seed, 10_000, HOST_REQUESTS, command_frame)
+
+
+@settings(max_examples=60)
+@given(st.lists(st.one_of(st.binary(max_size=40), st.sampled_from(HEADS)), max_size=40), st.integers(1, 20))
+def test_noise_alone_is_nothing_and_hides_nothing(parts, size):
+    noise = b"".join(parts)
+    sent = Frame(0x80, 0xFE, Command.VERSION, b"1.3.9")
+    parser = Parser(HAND_REPLIES)
+    stream = noise + sent.encode()
+    got = [frame for i in range(0, len(stream), size) for frame in parser.feed(stream[i : i + size])]
+    assert got + parser.expire() == [sent]
+    assert parser.pending == 0 and parser.counts.skipped == len(noise)
+
+
+def test_the_worst_stream_costs_bounded_work():
+    # Nothing but believable headers: each asks for a checksum over a whole frame.
+    stream = bytes.fromhex("55AA80FE02A008") * 6000
+    parser = Parser(HAND_REPLIES)
+    start = time.perf_counter()
+    for i in range(0, len(stream), 512):
+        assert parser.feed(stream[i : i + 512]) == []
+        assert parser.pending <= 2217 + 512
+    parser.expire()
+    assert parser.counts.checked <= len(stream) * 2217 / 7
+    assert time.perf_counter() - start < 5
+
+
+def test_counts_tell_what_happened():
+    rng = np.random.default_rng(3)
+    good, bad = state_frame(rng), bytearray(state_frame(rng).encode())
+    bad[100] ^= 0x10
+    parser = Parser(HAND_REPLIES)
+    assert parser.feed(b"\x00" * 5 + good.encode() + bytes(bad) + good.encode()) == [good, good]
+    assert (parser.counts.frames, parser.counts.crc_errors, parser.counts.resyncs) == (2, 1, 2)
+    assert parser.counts.skipped == 5 + len(bad)
+
+
+def test_ten_million_bytes_of_damage():
+    state = fuzz(20, 9_000_000, HAND_REPLIES, state_frame)
+    command = fuzz(21, 1_000_000, HOST_REQUESTS, command_frame)
+    assert state.received + command.received >= 10_000_000
+    assert state.checked < 3 * state.received and command.checked < 3 * command.received

@@ -1,0 +1,369 @@
+"""The driver against a scripted peer on a pseudo-terminal: every fault is counted, none passes for an answer."""
+
+import dataclasses
+import errno
+import os
+import threading
+import time
+
+import numpy as np
+import pytest
+from pty_hand import PtyHand
+
+from dexsim_real.core.errors import (
+    HandError,
+    explain,
+    latency_warnings,
+)
+from dexsim_real.wire import frames, serial_hand
+from dexsim_real.wire.frames import (
+    Command,
+    Frame,
+    Mode,
+)
+from dexsim_real.wire.link import (
+    LinkConfig,
+    LinkCounts,
+)
+from dexsim_real.wire.serial_hand import SerialHand, open_port
+
+serial = pytest.importorskip("serial")
+
+QUICK = LinkConfig(settle=0.0, margin=0.12, handshake=0.1, backoff=(0.02, 0.05), paced=False)
+
+
+def command(position=0.5):
+    return frames.command_block(np.full(12, position), kp=100, ki=0, kd=0, torque_max=300)
+
+
+def outcomes(counts):
+    return {name: getattr(counts, name) for name in ("answered", "corrupt", "silent", "refused", "lost")}
+
+
+def test_one_request_one_answer():
+    seen = []
+
+    def answer(index, block, state):
+        state["joint"]["position"] = block["position"] + 0.25
+
+    with PtyHand(answer) as peer:
+        port = SerialHand(peer.port, QUICK, tap=lambda way, data: seen.append((way, bytes(data))))
+        assert "firmware 1.3.9" in port.connect()
+        reply = port.exchange(command(0.5))
+        np.testing.assert_array_equal(reply.state["joint"]["position"], np.full(12, 0.75, np.float32))
+        assert 0 <= reply.received - reply.sent < 0.12 and reply.generation == 1
+        np.testing.assert_array_equal(peer.commands[-1], command(0.5))
+        port.close()
+    # The motors are off until the caller says otherwise.
+    assert set(peer.commands[0]["mode"].tolist()) == {Mode.PASSIVE} and not peer.commands[0]["torque_max"].any()
+    # Every frame is seen whole, in order: version, passive state, exchange.
+    assert [way for way, _ in seen] == ["tx", "rx"] * 3
+    assert seen[-2][1] == Frame(0xFE, 0x80, Command.EXCHANGE, command(0.5).tobytes()).encode()
+    assert seen[-1][1] == peer.whole()
+    assert port.counts.sent == 3 == port.counts.answered
+
+
+FAULTS = {
+    "flip": "corrupt",
+    "cut": "corrupt",
+    "noise": "corrupt",
+    "nothing": "silent",
+    "error": "refused",
+    "ids": "corrupt",
+}
+
+
+def test_every_fault_is_counted_as_what_it_is_and_the_next_answer_is_sound():
+    plan = [name for name in FAULTS for _ in range(2)]
+
+    def answer(index, block, state):
+        if index == 0 or index > 2 * len(plan) or index % 2 == 0:
+            state["joint"]["position"] = index
+            return None
+        fault = plan[index // 2]
+        whole = bytearray(peer.whole())
+        if fault == "flip":
+            whole[1000] ^= 4
+        elif fault == "cut":
+            del whole[700:760]
+        elif fault == "noise":
+            whole = bytearray(b"\x55\xaa" * 50)
+        elif fault == "nothing":
+            whole = bytearray()
+        elif fault == "error":
+            whole = bytearray(Frame(0x80, 0xFE, Command.ERROR, b"\x46\x00").encode())
+        else:
+            bad = state.copy()
+            bad["joint"]["id"][5] = 4
+            whole = bytearray(Frame(0x80, 0xFE, Command.EXCHANGE, bad.tobytes()).encode())
+        return bytes(whole)
+
+    with PtyHand(answer) as peer:
+        port = SerialHand(peer.port, QUICK)
+        port.connect()
+        before = outcomes(port.counts)
+        wanted = dict.fromkeys(before, 0)
+        for index, fault in enumerate(plan):
+            assert port.exchange(command()) is None, fault
+            reply = port.exchange(command())
+            assert reply is not None and reply.state["joint"]["position"][0] == 2 * index + 2, fault
+            wanted[FAULTS[fault]] += 1
+            wanted["answered"] += 1
+        after = outcomes(port.counts)
+        assert {name: after[name] - before[name] for name in after} == wanted
+        assert port.counts.sent == sum(after.values())
+        assert port.counts.crc_errors == 2  # The flips; a cut frame never gets as far as its checksum.
+        port.close()
+
+
+def test_a_late_answer_is_thrown_away():
+    def answer(index, block, state):
+        state["joint"]["position"] = index
+        if index == 1:
+            time.sleep(0.25)
+
+    with PtyHand(answer) as peer:
+        port = SerialHand(peer.port, QUICK)
+        port.connect()
+        assert port.exchange(command()) is None
+        time.sleep(0.4)  # Now it is there, and must not pass for the answer to the next request.
+        reply = port.exchange(command())
+        assert reply.state["joint"]["position"][0] == 2
+        assert (port.counts.silent, port.counts.late) == (1, 1)
+        port.close()
+
+
+def test_an_answer_sooner_than_the_wire_allows_is_to_an_earlier_request():
+    asked = threading.Event()
+
+    def answer(index, block, state):
+        state["joint"]["position"] = index
+        if index == 0:
+            asked.wait(5)  # Until the next request is on its way.
+        else:
+            time.sleep(0.25)
+
+    with PtyHand(answer) as peer:
+        # 2514 bytes take 0.218 s at this rate.
+        config = dataclasses.replace(QUICK, baud=115200, margin=0.3, paced=True)
+        port = SerialHand(peer.port, config, tap=lambda way, data: port.counts.sent == 2 and asked.set())
+        port._open()
+        assert port.exchange(command()) is None
+        reply = port.exchange(command())
+        assert reply is not None and reply.state["joint"]["position"][0] == 1
+        assert port.counts == LinkCounts(sent=2, answered=1, silent=1, late=1)
+        port.close()
+
+
+def test_a_frame_that_is_on_its_way_at_the_deadline_still_arrives(monkeypatch):
+    monkeypatch.setattr(serial_hand, "_QUIET", 0.05)
+
+    def answer(index, block, state):
+        whole = peer.whole()
+        for at in range(0, len(whole), 100):
+            os.write(peer.master, whole[at : at + 100])
+            time.sleep(0.001)
+        return b""
+
+    with PtyHand(answer) as peer:
+        port = SerialHand(peer.port, QUICK)
+        # The deadline is when it begins, and all of it may take 0.19 s beyond.
+        monkeypatch.setattr(LinkConfig, "deadline", lambda *_: 0.002)
+        monkeypatch.setattr(LinkConfig, "on_wire", lambda *_: 0.19)
+        port._open()
+        assert port.exchange(command()) is not None
+        port.close()
+
+
+def test_the_rest_of_a_late_answer_does_not_spoil_the_next(monkeypatch):
+    monkeypatch.setattr(serial_hand, "_POLL", 0.2)
+    going = threading.Event()
+
+    def answer(index, block, state):
+        whole = peer.whole()
+        if index:
+            return whole
+        time.sleep(0.35)
+        os.write(peer.master, whole[:1500])
+        going.wait(5)
+        time.sleep(0.02)
+        return whole[1500:]
+
+    with PtyHand(answer) as peer:
+        port = SerialHand(peer.port, QUICK)
+        port._open()
+        assert port.exchange(command()) is None
+        while port._serial.in_waiting < 1500:
+            time.sleep(0.001)
+        going.set()
+        assert port.exchange(command()) is not None
+        assert port.counts == LinkCounts(sent=2, answered=1, silent=1, late=1)
+        port.close()
+
+
+def test_of_two_answers_at_once_the_newer_is_taken():
+    def answer(index, block, state):
+        state["joint"]["position"] = 1
+        older = peer.whole()
+        state["joint"]["position"] = 2
+        return older + peer.whole()
+
+    with PtyHand(answer) as peer:
+        port = SerialHand(peer.port, QUICK)
+        port._open()
+        read = port._read
+
+        def both():
+            data = b""
+            while len(data) < 2 * len(peer.whole()):
+                data += read()
+            return data
+
+        port._read = both
+        assert port.exchange(command()).state["joint"]["position"][0] == 2
+        assert port.counts == LinkCounts(sent=1, answered=1, late=1)
+        port.close()
+
+
+def test_a_line_that_never_falls_silent_does_not_hold_the_driver(monkeypatch):
+    with PtyHand() as peer:
+        port = SerialHand(peer.port, QUICK)
+        port._open()
+        stop = threading.Event()
+
+        def babble():
+            while not stop.wait(0.0005):
+                os.write(peer.master, b"\x55" * 50)
+
+        thread = threading.Thread(target=babble)
+        thread.start()
+        time.sleep(0.01)
+        start = time.monotonic()
+        port.exchange(command())
+        assert time.monotonic() - start < 0.5
+        stop.set()
+        thread.join()
+        port.close()
+
+
+def test_a_port_that_fails_while_greeting_is_counted(monkeypatch):
+    with PtyHand() as peer:
+        port = SerialHand(peer.port, QUICK)
+        port.connect()
+
+        def fail(*_):
+            raise OSError("unplugged")
+
+        monkeypatch.setattr(port, "_wait", fail)
+        assert port.exchange(command()) is None
+        time.sleep(0.03)
+        assert port.exchange(command()) is None  # Opens again, and fails at once.
+        monkeypatch.undo()
+        time.sleep(0.1)
+        assert port.exchange(command()) is not None
+        assert (port.counts.lost, port.counts.reconnects) == (2, 1)
+        assert port.counts.sent == sum(outcomes(port.counts).values())
+        port.close()
+
+
+def test_an_answer_behind_a_false_head():
+    def answer(index, block, state):
+        # A false head that claims a whole frame: the answer lies inside what it claims.
+        return bytes.fromhex("55AA80FE02A008") + peer.whole() if index else None
+
+    with PtyHand(answer) as peer:
+        port = SerialHand(peer.port, QUICK)
+        port.connect()
+        for _ in range(3):
+            assert port.exchange(command()) is not None
+        assert port.counts.late == 0
+        port.close()
+
+
+def test_the_hand_goes_and_comes_back(tmp_path):
+    link = str(tmp_path / "hand")
+    peer = PtyHand()
+    peer.open(link)
+    port = SerialHand(link, QUICK)
+    port.connect()
+    assert port.exchange(command()).generation == 1
+    peer.close()
+    start = time.monotonic()
+    for _ in range(8):
+        assert port.exchange(command()) is None
+    assert port.counts.lost == 1 and time.monotonic() - start < 1
+    peer.commands.clear()
+    peer.open(link)
+    reply = None
+    while reply is None and time.monotonic() - start < 3:
+        reply = port.exchange(command())
+    # The first answer of the new generation is from a passive hand: its pose may have changed.
+    assert reply.generation > 1 and port.counts.reconnects == 1
+    assert all(np.all(block["mode"] == Mode.PASSIVE) for block in peer.commands)
+    assert port.exchange(command()) is not None
+    np.testing.assert_array_equal(peer.commands[-1], command())
+    port.close()
+    peer.close()
+
+
+def test_a_silent_hand_and_a_wrong_baud_rate_are_told_apart():
+    with PtyHand(lambda *_: b"", version=None) as peer, pytest.raises(HandError, match="no answer.*powered"):
+        SerialHand(peer.port, QUICK).connect()
+    with PtyHand(lambda *_: b"\x13\x37" * 40, version=None) as peer, pytest.raises(HandError, match="3000000 baud"):
+        SerialHand(peer.port, QUICK).connect()
+    broken = Frame(0x80, 0xFE, Command.ERROR, b"\x02").encode()
+    with PtyHand(lambda *_: broken) as peer, pytest.raises(HandError, match="refusals"):
+        SerialHand(peer.port, QUICK).connect()
+
+
+def test_an_emulated_line_without_pace_is_told_so():
+    with PtyHand() as peer, pytest.raises(HandError, match="sooner than 3000000 baud.*--link.no-paced"):
+        SerialHand(peer.port, dataclasses.replace(QUICK, paced=True)).connect()
+
+
+def test_a_hand_that_does_not_tell_its_version_is_still_a_hand():
+    with PtyHand(version=None) as peer:
+        port = SerialHand(peer.port, QUICK)
+        assert "firmware unknown" in port.connect()
+        port.close()
+
+
+def test_two_programs_do_not_share_a_port():
+    with PtyHand() as peer:
+        first = SerialHand(peer.port, QUICK)
+        first.connect()
+        with pytest.raises(HandError, match="another program has it open"):
+            SerialHand(peer.port, QUICK).connect()
+        first.close()
+
+
+def test_messages_for_the_usual_troubles(tmp_path):
+    with pytest.raises(HandError, match="there is no such port"):
+        SerialHand(str(tmp_path / "none"), QUICK).connect()
+    file = tmp_path / "port"
+    file.touch()
+    group = __import__("grp").getgrgid(os.stat(file).st_gid).gr_name
+    text = explain(str(file), PermissionError(errno.EACCES, "Permission denied"))
+    assert f"usermod -aG {group}" in text and "\n" not in text
+    assert "another program" in explain("/dev/x", OSError(errno.EBUSY, "busy"))
+    with pytest.raises(HandError, match="no_such_module"):
+        open_port("sdk:no_such_module:f", QUICK)
+
+
+def test_the_latency_timer(tmp_path):
+    timer = tmp_path / "ttyUSB7" / "latency_timer"
+    timer.parent.mkdir()
+    device = tmp_path / "by-id"
+    device.symlink_to("/dev/ttyUSB7")
+    timer.write_text("16\n")
+    (text,) = latency_warnings(str(device), tmp_path)
+    assert f"echo 1 | sudo tee {timer}" in text and "16 ms" in text
+    timer.write_text("1\n")
+    assert latency_warnings(str(device), tmp_path) == []
+    assert latency_warnings("/dev/ttyACM0", tmp_path) == []
+
+
+def test_the_deadline_follows_size_and_baud():
+    # 297 + 2217 bytes of ten bits at 3 Mbaud are 8.38 ms.
+    assert LinkConfig(margin=0.001).deadline(297, 2217) == pytest.approx(0.00838 + 0.001, abs=1e-5)
+    assert LinkConfig(baud=115200, margin=0.001).deadline(297, 2217) == pytest.approx(0.2192, abs=1e-4)

@@ -1,0 +1,84 @@
+"""A scripted hand at the other end of a pseudo-terminal: what each answer is, the test decides."""
+
+import contextlib
+import os
+import select
+import threading
+import tty
+from collections.abc import Callable
+
+import numpy as np
+
+from dexsim_real.wire import frames
+from dexsim_real.wire.frames import HOST_REQUESTS, Command, Frame, Parser
+
+
+class PtyHand:
+    """Answers every request from a thread; use as a context manager.
+
+    Args:
+      answer: (number of the exchange, command block [12], state block) to the bytes to send; None for the
+        whole, sound answer. It may change the state in place.
+      version: what a version request is answered with; None for silence.
+    """
+
+    def __init__(self, answer: Callable | None = None, version: bytes | None = b"1.3.9"):
+        self.answer, self.version = answer, version
+        self.state = frames.empty_state()
+        self.state["joint"]["temperature"] = 30
+        self.commands: list[np.ndarray] = []
+        self.master = self.slave = -1
+        self.port = ""
+
+    def __enter__(self):
+        self.open()
+        return self
+
+    def __exit__(self, *_):
+        self.close()
+
+    def open(self, link: str | None = None):
+        """Make the terminal, and a link to it under a name that outlives it."""
+        self.master, self.slave = os.openpty()
+        tty.setraw(self.slave)
+        self.port = os.ttyname(self.slave)
+        if link:
+            with contextlib.suppress(FileNotFoundError):
+                os.unlink(link)
+            os.symlink(self.port, link)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._serve, daemon=True)
+        self._thread.start()
+
+    def close(self):
+        if self.master >= 0:
+            self._stop.set()
+            self._thread.join()
+            os.close(self.master)
+            os.close(self.slave)
+            self.master = self.slave = -1
+
+    def _serve(self):
+        parser = Parser(HOST_REQUESTS)
+        while not self._stop.is_set():
+            if not select.select([self.master], [], [], 0.01)[0]:
+                continue
+            for frame in parser.feed(os.read(self.master, 4096)):
+                reply = self._reply(frame)
+                while reply and not self._stop.is_set():  # The kernel's buffer holds 4 KiB.
+                    if select.select([], [self.master], [], 0.01)[1]:
+                        reply = reply[os.write(self.master, reply[:1024]) :]
+
+    def _reply(self, frame: Frame) -> bytes:
+        if frame.command == Command.VERSION:
+            return b"" if self.version is None else Frame(0x80, 0xFE, Command.VERSION, self.version).encode()
+        if frame.command != Command.EXCHANGE:
+            return b""
+        command = frames.decode_command(frame.data)
+        self.commands.append(command)
+        custom = self.answer(len(self.commands) - 1, command, self.state) if self.answer else None
+        return self.whole() if custom is None else custom
+
+    def whole(self) -> bytes:
+        """The sound answer with the state as it is."""
+        return Frame(0x80, 0xFE, Command.EXCHANGE, self.state.tobytes()).encode()

@@ -1,0 +1,30 @@
+"""The training command with the tiny task among its tasks; arguments as on the command line."""
+
+import types
+
+from tiny_env import TinyConfig, TinyEnv
+
+import dexsim
+import dexsim.tasks
+
+ENTRY = types.SimpleNamespace(config_class=TinyConfig, config=TinyConfig, env_class=TinyEnv)
+
+
+def make(task, config=None, *, backend="auto", num_envs=1):
+    assert task == "tiny"
+    return TinyEnv(config, backend=backend, num_envs=num_envs)
+
+
+def install(patch):
+    """Put the task among the tasks for as long as a `pytest.MonkeyPatch` lasts."""
+    patch.setitem(dexsim.tasks.TASKS, "tiny", ENTRY)
+    patch.setattr(dexsim, "make", make, raising=False)
+
+
+if __name__ == "__main__":
+    from dexsim.core import cli
+    from dexsim_ppo import train
+
+    dexsim.tasks.TASKS["tiny"] = ENTRY
+    dexsim.make = make
+    cli.run(train.main)

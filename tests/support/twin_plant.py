@@ -1,0 +1,79 @@
+"""Physics simple enough to see through, for the emulated hand's wire: every joint follows its command with a lag."""
+
+import math
+
+import numpy as np
+
+from dexsim_real.twin.plant.shapes import Part, Shape
+from dexsim_real.twin.types import Measurement, Motors
+from dexsim_real.wire.frames import Mode
+
+REST = np.array([0.3] * 3 + [0.0] + [0.3] * 8)
+
+
+class ScriptedPlant:
+    """First-order joints, fingertips that press as they bend, an object that turns about the palm's normal.
+
+    Args:
+      trial_seconds: length of a trial.
+      turn: rad/s of the object.
+    """
+
+    up = np.array([math.cos(0.2), 0.0, math.sin(0.2)])
+
+    def __init__(self, trial_seconds: float = math.inf, turn: float = 0.5):
+        self.trial_seconds, self.turn = trial_seconds, turn
+        self.shape = Shape("box", (Part("box", (0.025, 0.025, 0.025)),))
+        self.time, self.angle = 0.0, REST.copy()
+        self.velocity, self.heat = np.zeros(12), np.full(12, 35.0)
+        self.motors: Motors | None = None
+        self.orders: list[tuple[float, Motors]] = []
+
+    @property
+    def trial(self) -> int:
+        return int(self.time / self.trial_seconds) if math.isfinite(self.trial_seconds) else 0
+
+    def drive(self, motors: Motors) -> None:
+        self.motors = motors
+        self.orders.append((self.time, motors))
+
+    def advance(self, seconds: float) -> None:
+        self.time += seconds
+        on = np.zeros(12, bool) if self.motors is None else self.motors.mode == Mode.POSITION
+        goal = np.where(on, self.motors.position, self.angle) if self.motors else self.angle
+        before = self.angle
+        self.angle = goal + (self.angle - goal) * math.exp(-seconds / 0.02)
+        self.velocity = (self.angle - before) / seconds
+
+    def measure(self) -> Measurement:
+        position, quat, acceleration = self.measure_object()
+        force = np.zeros((5, 120, 3))
+        # Quarter of a newton on ten taxels for each radian; what pulls along the tip is half of it.
+        force[:, 40:50, 2] = 0.25 * np.maximum(self.angle[[2, 5, 7, 9, 11]], 0)[:, None]
+        force[:, 40:50, 0] = -0.5 * force[:, 40:50, 2]
+        return Measurement(
+            time=self.time,
+            joint_position=self.angle.copy(),
+            joint_velocity=self.velocity.copy(),
+            current=-100.0 * self.velocity,
+            temperature=self.heat.copy(),
+            taxel_force=force,
+            object_quat=quat,
+            object_position=position,
+            object_acceleration=acceleration,
+        )
+
+    def measure_object(self):
+        half = 0.5 * self.turn * self.time
+        return np.array([0.047, 0.0, 0.071]), np.array([math.cos(half), math.sin(half), 0.0, 0.0]), 9.81 * self.up
+
+    def warm(self, joint: int, degrees: float) -> None:
+        self.heat[joint] += degrees
+
+    def results(self):
+        return [{"trial": k} for k in range(self.trial + 1)]
+
+
+def make(arguments) -> ScriptedPlant:
+    """For `python -m dexsim_real.twin --plant twin_plant:make`."""
+    return ScriptedPlant(arguments.seconds or math.inf)
