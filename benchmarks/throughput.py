@@ -42,7 +42,7 @@ from dexsim_ppo.learner.rollout import scan_restarting
 class WithoutObservation(Env):
     """`observe` left out: what follows sees zeros."""
 
-    def _observe(self, readings, moment, goal):
+    def _observe(self, readings, truth, goal):
         return {
             group: jnp.zeros(sum(field.size for field in fields)) for group, fields in self.observation_layout.items()
         }

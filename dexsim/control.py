@@ -49,7 +49,7 @@ def move_target(control: Control, hand: Hand, target: jax.Array, action: jax.Arr
     return jnp.clip(target, hand.joint_lower, hand.joint_upper)
 
 
-def recalled(control: Control, hand: Hand, action: jax.Array, target: jax.Array) -> jax.Array:
+def observed_action(control: Control, hand: Hand, action: jax.Array, target: jax.Array) -> jax.Array:
     """The last action [J] in [-1, 1] as an observation shows it; `target` [J] rad is its outcome."""
     if control.recall == "action":
         return action

@@ -224,16 +224,16 @@ def layout(hand: Hand, names: tuple[str, ...], config: ObservationConfig) -> tup
         "last_action": 1.0,
         "tangential_force": 2.0,
     }
-    return tuple(Field(name, size[name], scale.get(name)) for name in chosen(names, config))
+    return tuple(Field(name, size[name], scale.get(name)) for name in select_fields(names, config))
 
 
-def chosen(names: tuple[str, ...], config: ObservationConfig) -> tuple[str, ...]:
+def select_fields(names: tuple[str, ...], config: ObservationConfig) -> tuple[str, ...]:
     """The task's fields `names` as configured: those left out gone, those added behind them."""
     names = tuple(name for name in names if name not in config.leave_out)
     return (*names, *(name for name in dict.fromkeys(config.add) if name not in names))
 
 
-def views(config: ObservationConfig) -> tuple[ObservationConfig, ObservationConfig]:
+def group_configs(config: ObservationConfig) -> tuple[ObservationConfig, ObservationConfig]:
     """The configuration as it holds for the actor and for the critic, who may always look.
 
     Raises:
@@ -273,7 +273,7 @@ def observe(
         lambda: _tip_twist(hand, readings.joint_position, motion.joint_velocity),
     )
     parts = []
-    for name in chosen(names, config):
+    for name in select_fields(names, config):
         if name in _ORIENTATIONS:
             parts.append(_ORIENTATIONS[name](features, config.orientation))
         else:

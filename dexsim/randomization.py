@@ -15,7 +15,7 @@ from dexsim.actuator.drive import Actuator
 from dexsim.core.config import check_ranges, setting, validate
 from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import pytree_dataclass
-from dexsim.core.ranges import draw_corner, uniform
+from dexsim.core.ranges import sample_extreme, uniform
 from dexsim.hand.kinematics import Hand
 
 _FACTORS = (
@@ -94,20 +94,20 @@ class Randomization:
     """Factor on a finger's taxel readings."""
     gravity_tilt: float = setting(0.1, unit="rad", low=0.0, high=1.6)
     """Largest tilt of the hand against gravity: pitch and roll (`tilted_down`)."""
-    corners: float = setting(0.0, unit="1", low=0.0, high=1.0)
+    extremes: float = setting(0.0, unit="1", low=0.0, high=1.0)
     """Share of hands (and of their IMUs) with every value at an end of its range, but for the ripples' number
     and phase; see `dexsim.core.ranges`."""
     beyond: float = setting(0.0, unit="1", low=0.0, high=3.0)
-    """How far outside its range a hand in a corner has its values: up to this share of the end's distance from
-    nominal. For evaluation on hands that training never had: `corners` 1 and `beyond` above 0."""
+    """How far outside its range a hand at an extreme has its values: up to this share of the end's distance from
+    nominal. For evaluation on hands that training never had: `extremes` 1 and `beyond` above 0."""
 
     def __post_init__(self):
         validate(self)
         check_ranges(self, *_SPANS)
-        if self.beyond and not self.corners:
+        if self.beyond and not self.extremes:
             raise ConfigError(
-                f"Randomization.beyond = {self.beyond:g} with corners = 0: only hands in a corner have "
-                "values beyond their ranges; set corners, too"
+                f"Randomization.beyond = {self.beyond:g} with extremes = 0: only hands at an extreme have "
+                "values beyond their ranges; set extremes, too"
             )
         width = self.scale * (1 + self.beyond)
         for name in _FACTORS:
@@ -153,12 +153,12 @@ def sample(
     """
     width = config.scale * scale
     off = isinstance(width, (int, float)) and width == 0  # known beforehand: nothing is drawn
-    corner = draw_corner(key, config.corners)
+    extreme = sample_extreme(key, config.extremes)
 
     def draw(key: jax.Array, span: tuple[float, float], nominal: float, shape: tuple[int, ...]) -> jax.Array:
         if off:
             return jnp.full(shape, nominal, float)
-        value = uniform(key, span, corner, shape, nominal=nominal, beyond=config.beyond)
+        value = uniform(key, span, extreme, shape, nominal=nominal, beyond=config.beyond)
         return nominal + width * (value - nominal)
 
     return _assemble(key, draw, config, hand, timestep, control_period)

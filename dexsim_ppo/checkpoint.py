@@ -28,6 +28,7 @@ import numpy as np
 
 from dexsim.core.errors import CheckpointError
 from dexsim.core.files import write_whole
+from dexsim_ppo.retired import migrate_leaves
 
 Tree = TypeVar("Tree")
 
@@ -134,7 +135,7 @@ def load(path: str | Path, *, kind: str, task: str | None = None) -> Checkpoint:
         header["task"],
         header["library"],
         header["content"],
-        _read_leaves(path, header["leaves"], payload),
+        migrate_leaves(_read_leaves(path, header["leaves"], payload)),
     )
 
 

@@ -184,7 +184,7 @@ class EvaluateArguments:
     blind: tuple[str, ...] = ()
     """Readings that the policy does without ("contact_force contact_centre"): it gets their mean in training."""
     set: tuple[str, ...] = ()
-    """Fields of the task's configuration to change ("randomization.corners=1 edge=[0.05,0.05]")."""
+    """Fields of the task's configuration to change ("randomization.extremes=1 edge=[0.05,0.05]")."""
     output: Path | None = None
     """File for the report as JSON."""
     video: Path | None = None

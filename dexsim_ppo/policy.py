@@ -22,6 +22,7 @@ from dexsim_ppo import checkpoint
 from dexsim_ppo.learner.networks import MLP, Layer, apply_mlp
 from dexsim_ppo.learner.running_stats import Normalizer, make_normalizer, normalize
 from dexsim_ppo.learner.types import Environment, Field, Fields, layout_size
+from dexsim_ppo.retired import migrate_config
 
 
 @pytree_dataclass
@@ -155,7 +156,7 @@ class Policy:
         params = PolicyParams(layers, normalizer, content["squash"])
         return cls(
             task=file.task,
-            env_config=content["env_config"],
+            env_config=migrate_config(content["env_config"], file.path),
             observation_layout=layout,
             params=jax.tree.map(jnp.asarray, params),
             control_rate=content["control_rate"],

@@ -28,6 +28,7 @@ from dexsim_ppo import checkpoint
 from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.curriculum import Curriculum
 from dexsim_ppo.policy import Policy, load_policy
+from dexsim_ppo.retired import migrate_arguments
 from dexsim_ppo.training.presets import Preset, find_preset
 from dexsim_ppo.training.runlog import RunFolder
 from dexsim_ppo.training.trainer import Run, TrainArguments, printable, training_config
@@ -92,7 +93,7 @@ def parse_arguments(argv: list[str]) -> tuple[TrainArguments, checkpoint.Checkpo
     entry = cli.find_task(task)
     config_class = entry.config_class
     if resumed:
-        default = arguments_from_dict(config_class, resumed.content["arguments"])
+        default = arguments_from_dict(config_class, migrate_arguments(resumed.content["arguments"], resumed.path))
     else:
         default = preset_arguments(task, entry.config(), known.preset or "auto")
         if policy:

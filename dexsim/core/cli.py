@@ -9,12 +9,13 @@ import os
 import platform
 import re
 import sys
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 from dexsim.core.assets import cache_path
-from dexsim.core.errors import DexsimError
+from dexsim.core.errors import DexsimError, OldFileWarning
 from dexsim.core.files import write_whole
 
 T = TypeVar("T")
@@ -26,6 +27,7 @@ class UsageError(DexsimError):
 
 def run(main: Callable[[Sequence[str] | None], int]) -> None:
     """Run a command and exit: 2 and one line on standard error for whatever the user can mend."""
+    warnings.showwarning = _show_warning
     try:
         code = main(None)
     except DexsimError as error:
@@ -39,6 +41,14 @@ def run(main: Callable[[Sequence[str] | None], int]) -> None:
         print("interrupted", file=sys.stderr)
         code = 130
     sys.exit(code)
+
+
+def _show_warning(message: Warning | str, category: type[Warning], *place: Any, **options: Any) -> None:
+    """Our own warnings as one line; others as Python has them."""
+    if issubclass(category, OldFileWarning):
+        print(f"warning: {message}", file=sys.stderr)
+    else:
+        sys.stderr.write(warnings.formatwarning(message, category, *place[:2]))
 
 
 def parse(cls: type[T], argv: Sequence[str], *, prog: str, description: str, default: T | None = None) -> T:

@@ -113,7 +113,7 @@ def from_dict(cls: type[T], data: dict[str, Any]) -> T:
 
 
 def override(data: dict[str, Any], settings: Iterable[str]) -> dict[str, Any]:
-    """`to_dict`'s output with some fields replaced, each as "object.corners=1" or "edge=[0.05, 0.06]".
+    """`to_dict`'s output with some fields replaced, each as "object.extremes=1" or "edge=[0.05, 0.06]".
 
     Values are JSON, and words without quotes. `from_dict` tells whether the fields exist and the values fit.
 

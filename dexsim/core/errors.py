@@ -9,6 +9,10 @@ class ConfigError(DexsimError):
     """A configuration value is unknown, of the wrong type or out of range."""
 
 
+class OldFileWarning(UserWarning):
+    """A file of an older version was read; says which of its fields were renamed or dropped."""
+
+
 class AssetError(DexsimError):
     """A model, layout or mesh file is missing, broken or asks for what the library cannot do."""
 

@@ -18,29 +18,29 @@ import numpy as np
 
 from dexsim import observation
 from dexsim.actuator.gear_play import GearState
-from dexsim.control import Control, move_target, recalled
+from dexsim.control import Control, move_target, observed_action
 from dexsim.core.pytree import choose
-from dexsim.core.ranges import draw_corner
+from dexsim.core.ranges import sample_extreme
 from dexsim.env.config import EnvConfig
 from dexsim.env.fingerprint import fingerprint
 from dexsim.env.motors import Drive, rotor_share
-from dexsim.env.senses import Senses, Sensors
+from dexsim.env.senses import EpisodeSensors, SensorSuite
 from dexsim.env.state import Sample, Start, State
-from dexsim.env.task import Moment, Task
+from dexsim.env.task import GroundTruth, Task
 from dexsim.geometry import rotations
 from dexsim.hand.kinematics import Hand, forward_kinematics, taxel_normals
 from dexsim.objects.config import load_mesh_object
-from dexsim.objects.params import ObjectParams, narrow
+from dexsim.objects.params import ObjectParams, toward_nominal
 from dexsim.observation import Motion, Readings, ThreeAxisReadings
 from dexsim.physics.seam import Physics, PhysicsState
 from dexsim.randomization import Draw, sample, tilted_down
 from dexsim.render.snapshot import Snapshot
 from dexsim.sensing.config import Sensing
 from dexsim.sensing.imu import SensorDraw
-from dexsim.touch.feel import Touch, feel_links, press_only, split_force, taxel_share
+from dexsim.touch.feel import Touch, feel_links, keep_normal_part, split_force, taxel_share
 from dexsim.touch.surface import taxels_only, whole_surface
 
-__all__ = ["Control", "Env", "EnvConfig", "Moment", "Sample", "Sensing", "Start", "State", "Task"]
+__all__ = ["Control", "Env", "EnvConfig", "GroundTruth", "Sample", "Sensing", "Start", "State", "Task"]
 
 
 class Env:
@@ -75,14 +75,14 @@ class Env:
         )
         self.backend = self.physics.backend
         self.action_size = self.hand.num_joints
-        actor_view, critic_view = observation.views(config.observation)
+        actor_view, critic_view = observation.group_configs(config.observation)
         self._seen = {group: actor_view if group == "actor" else critic_view for group in task.fields}
         self.observation_layout = {
             group: observation.layout(self.hand, names, self._seen[group]) for group, names in task.fields.items()
         }
-        self.senses = Senses(config, hand, task, (actor_view, critic_view))
+        self.senses = SensorSuite(config, hand, task, (actor_view, critic_view))
         self.drive = Drive(config, hand, self.physics)
-        self._surface = whole_surface(hand, config.skin.thickness) if config.skin.bare else taxels_only(hand)
+        self._surface = whole_surface(hand, config.skin.thickness) if config.skin.untaxelled else taxels_only(hand)
         self.primitive_kinds = task.slots
         objects = config.objects
         self._mesh = load_mesh_object(objects) if objects.mesh and objects.mesh_touch == "grid" else None
@@ -120,7 +120,7 @@ class Env:
         config, hand, senses = self.config, self.hand, self.senses
         if scale is not None:
             start = dataclasses.replace(
-                start, target=narrow(start.target, config.objects, self.task.plain_inertia(start.target), scale)
+                start, target=toward_nominal(start.target, config.objects, self.task.unit_inertia(start.target), scale)
             )
         draw, orientation = self._draw(draw_key, sensor_key, 1.0 if scale is None else scale)
         array_params, array = senses.draw_array(jax.random.fold_in(sensor_key, 1), 1.0 if scale is None else scale)
@@ -136,14 +136,14 @@ class Env:
             noise_key,
             sample,
             sample,
-            Sensors(draw, orientation, array_params, array),
+            EpisodeSensors(draw, orientation, array_params, array),
             goal,
-            recalled(config.control, hand, zero, joint_target),
+            observed_action(config.control, hand, zero, joint_target),
         )
         physics = PhysicsState(start.qpos, start.qvel, jnp.zeros(self.physics.mj_model.nv))
-        moment = self._moment(physics, start.target, zero, zero, zero, nothing)
+        truth = self._ground_truth(physics, start.target, zero, zero, zero, nothing)
         false = jnp.zeros((), bool)
-        _, metrics = self.task.reward(goal, moment, false)
+        _, metrics = self.task.reward(goal, truth, false)
         state = State(
             key=key,
             physics=physics,
@@ -160,7 +160,7 @@ class Env:
             tick=jnp.zeros((), jnp.int32),
             length=jnp.zeros((), jnp.int32),
             episode_return=jnp.zeros(()),
-            obs=self._observe(readings, moment, goal),
+            obs=self._observe(readings, truth, goal),
             reward=jnp.zeros(()),
             terminated=false,
             truncated=false,
@@ -168,7 +168,7 @@ class Env:
             array_params=array_params,
             array=array,
             gear=self.drive.begin(joints),
-            tangential_force=moment.tangential_force,
+            tangential_force=truth.tangential_force,
             scale=scale,
         )
         return dataclasses.replace(state, metrics=self._metrics(state, metrics))
@@ -196,27 +196,27 @@ class Env:
         force = jnp.where(finite, force, 0.0)
 
         torque = self._torque(state, joint_target, after, gear)
-        moment = self._moment(after, state.target, torque, action, state.action, force)
-        goal = self.task.update(goal_key, state.goal, moment)
+        truth = self._ground_truth(after, state.target, torque, action, state.action, force)
+        goal = self.task.update(goal_key, state.goal, truth)
         sample = Sample(
-            self.drive.encoder(moment.joint_position, gear),
+            self.drive.encoder(truth.joint_position, gear),
             torque / hand.torque_limit,
-            moment.touch.force,
-            moment.object_position,
-            moment.object_quat,
-            moment.tangential_force,
+            truth.touch.force,
+            truth.object_position,
+            truth.object_quat,
+            truth.tangential_force,
         )
         readings, array = self.senses.read(
             noise_key,
             sample,
             state.sample,
-            Sensors.of(state),
+            EpisodeSensors.of(state),
             goal,
-            recalled(self.config.control, hand, action, joint_target),
+            observed_action(self.config.control, hand, action, joint_target),
             state,
         )
-        dropped = self.task.dropped(goal, moment) | ~finite
-        reward, metrics = self.task.reward(state.goal, moment, dropped)
+        dropped = self.task.dropped(goal, truth) | ~finite
+        reward, metrics = self.task.reward(state.goal, truth, dropped)
         tick = state.tick + 1
         state = State(
             key=key,
@@ -234,7 +234,7 @@ class Env:
             tick=tick,
             length=state.length + 1,
             episode_return=state.episode_return + reward,
-            obs=self._observe(readings, moment, goal),
+            obs=self._observe(readings, truth, goal),
             reward=reward,
             terminated=dropped,
             truncated=(tick >= self.task.episode_ticks) & ~dropped,
@@ -242,7 +242,7 @@ class Env:
             array_params=state.array_params,
             array=array,
             gear=gear,
-            tangential_force=moment.tangential_force,
+            tangential_force=truth.tangential_force,
             scale=state.scale,
         )
         return dataclasses.replace(state, metrics=self._metrics(state, metrics, finite))
@@ -281,8 +281,8 @@ class Env:
             control_period=self.control_period,
             scale=scale,
         )
-        corner = draw_corner(hand_key, ranges.corners)  # the one that `sample` draws
-        sensor = self.senses.draw_orientation(sensor_key, ranges.scale * scale, corner)
+        extreme = sample_extreme(hand_key, ranges.extremes)  # the one that `sample` draws
+        sensor = self.senses.draw_orientation(sensor_key, ranges.scale * scale, extreme)
         # An IMU's upright is the true one; the host takes it for that of a hand without tilt.
         down, tilted = self._tilted(draw)
         return draw, dataclasses.replace(sensor, bias=sensor.bias + jnp.cross(tilted, down))
@@ -314,7 +314,7 @@ class Env:
         """What the taxels feel of the object, as `dexsim.geometry.distance` takes it."""
         return target.shape() if self._mesh is None else self._mesh.grid(target.size)
 
-    def _moment(
+    def _ground_truth(
         self,
         physics: PhysicsState,
         target: ObjectParams,
@@ -322,7 +322,7 @@ class Env:
         action: jax.Array,
         last_action: jax.Array,
         force: jax.Array,
-    ) -> Moment:
+    ) -> GroundTruth:
         seam, hand, config = self.physics, self.hand, self.config
         joints = physics.qpos[seam.joint_qpos]
         place, motion = physics.qpos[seam.object_qpos], physics.qvel[seam.object_dof]
@@ -344,13 +344,13 @@ class Env:
             if config.skin.total == "pressing":
                 # In the links' frames, where the normals are constants.
                 local = rotations.rotate_inverse(pose.tip_rotation, force)
-                touch = press_only(touch, jnp.asarray(surface.normal), local)
-            share = taxel_share(touch.skin_force, hand.num_taxels) if config.skin.bare else 1.0
+                touch = keep_normal_part(touch, jnp.asarray(surface.normal), local)
+            share = taxel_share(touch.skin_force, hand.num_taxels) if config.skin.untaxelled else 1.0
             touch = jax.tree.map(lambda x: x[:, : hand.num_taxels], touch)
         else:
             nothing, share = jnp.zeros(hand.taxel_area.shape), 1.0
             touch = Touch(nothing, nothing, nothing)
-        return Moment(
+        return GroundTruth(
             target=target,
             joint_position=joints,
             joint_velocity=physics.qvel[seam.joint_dof],
@@ -371,27 +371,27 @@ class Env:
             ),
         )
 
-    def _observe(self, readings: Readings, moment: Moment, goal: Any) -> dict[str, jax.Array]:
+    def _observe(self, readings: Readings, truth: GroundTruth, goal: Any) -> dict[str, jax.Array]:
         """The actor sees the readings; the critic the truth, in the same fields."""
         command, goal_quat = self.task.goal_readings(goal)
         known = (
-            moment.joint_position,
-            moment.joint_torque / self.hand.torque_limit,
-            moment.touch.force,
-            moment.object_position,
-            moment.object_velocity,
-            moment.object_quat,
+            truth.joint_position,
+            truth.joint_torque / self.hand.torque_limit,
+            truth.touch.force,
+            truth.object_position,
+            truth.object_velocity,
+            truth.object_quat,
             goal_quat,
             command,
             readings.last_action,
         )
-        truth = (
-            ThreeAxisReadings(*known, moment.tangential_force)
+        true_readings = (
+            ThreeAxisReadings(*known, truth.tangential_force)
             if isinstance(readings, ThreeAxisReadings)
             else Readings(*known)
         )
-        seen = {"actor": readings, "critic": truth}
-        motion = Motion(moment.joint_velocity, moment.object_spin)
+        seen = {"actor": readings, "critic": true_readings}
+        motion = Motion(truth.joint_velocity, truth.object_spin)
         return {
             group: observation.observe(self.hand, seen[group], names, self._seen[group], motion)
             for group, names in self.task.fields.items()

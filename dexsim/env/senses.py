@@ -1,6 +1,6 @@
 """Between the truth and the host: latency, noise, counts, and what a sensor remembers.
 
-`Senses` belongs to one environment and has no state of its own; what an episode draws and what the
+`SensorSuite` belongs to one environment and has no state of its own; what an episode draws and what the
 taxels remember is passed in and out.
 """
 
@@ -23,7 +23,7 @@ from dexsim.sensing.taxels import SensorModel, SensorParams, SensorState
 
 
 @pytree_dataclass
-class Sensors:
+class EpisodeSensors:
     """One episode's sensors, and what they remember."""
 
     draw: Draw
@@ -32,26 +32,26 @@ class Sensors:
     array: SensorState | None
 
     @classmethod
-    def of(cls, state: State) -> "Sensors":
+    def of(cls, state: State) -> "EpisodeSensors":
         return cls(state.draw, state.orientation_sensor, state.array_params, state.array)
 
 
-class Senses:
+class SensorSuite:
     """From `Sample` to `Readings`. Pure methods, for one environment."""
 
-    def __init__(self, config: EnvConfig, hand: Hand, task: Task, views: tuple[ObservationConfig, ...]):
-        """`views`: what the groups observe, which may ask for three axes of touch."""
+    def __init__(self, config: EnvConfig, hand: Hand, task: Task, configs: tuple[ObservationConfig, ...]):
+        """`configs`: what the groups observe, which may ask for three axes of touch."""
         self.config, self.hand, self.task = config, hand, task
         self.period = config.physics.control_period
         self.three_axis = config.touch and (
-            config.sensing.three_axis or any("tangential_force" in view.add for view in views)
+            config.sensing.three_axis or any("tangential_force" in view.add for view in configs)
         )
         self.array = _array(config, hand)
         self._up = -jnp.asarray(task.gravity) / np.linalg.norm(task.gravity)
 
-    def draw_orientation(self, key: jax.Array, scale: jax.Array | float, corner: jax.Array | None) -> SensorDraw:
+    def draw_orientation(self, key: jax.Array, scale: jax.Array | float, extreme: jax.Array | None) -> SensorDraw:
         """One episode's IMU; see `draw_sensor`."""
-        return draw_sensor(key, self.config.sensing.orientation, scale, self.period, corner)
+        return draw_sensor(key, self.config.sensing.orientation, scale, self.period, extreme)
 
     def draw_array(self, key: jax.Array, scale: jax.Array | float) -> tuple[SensorParams | None, SensorState | None]:
         """One episode's taxels, and their memory before the first tick."""
@@ -64,7 +64,7 @@ class Senses:
         key: jax.Array,
         sample: Sample,
         before: Sample,
-        sensors: Sensors,
+        sensors: EpisodeSensors,
         goal: Any,
         last_action: jax.Array,
         state: State | None = None,
@@ -123,7 +123,9 @@ class Senses:
             return Readings(*known), array
         return ThreeAxisReadings(*known, self._read_tangential(keys[2], late, sensors)), array
 
-    def _read_taxels(self, key: jax.Array, late: Sample, sensors: Sensors) -> tuple[jax.Array, SensorState | None]:
+    def _read_taxels(
+        self, key: jax.Array, late: Sample, sensors: EpisodeSensors
+    ) -> tuple[jax.Array, SensorState | None]:
         force, gain = late.taxel_force, sensors.draw.taxel_gain
         if self.array is not None:
             array, taxels = self.array.apply(sensors.array_params, sensors.array, key, force * gain)
@@ -132,7 +134,7 @@ class Senses:
             return measure_taxels(force, gain, self.config.sensing.taxel, key), None
         return force, None
 
-    def _read_tangential(self, key: jax.Array, late: Sample, sensors: Sensors) -> jax.Array:
+    def _read_tangential(self, key: jax.Array, late: Sample, sensors: EpisodeSensors) -> jax.Array:
         """[F, 3] N: by the same taxels, with the gains and the dead ones of their normal forces."""
         gain, params = sensors.draw.taxel_gain, sensors.array_params
         if params is not None and params.gain is not None:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dexsim.core.errors import CalibrationError
-from dexsim.identification.joint import JointLog, complete, segments, simulate
+from dexsim.identification.joint import JointLog, segments, simulate, with_defaults
 from dexsim.identification.report import TYPICAL, Identification, advice, groups, uncertainty
 from dexsim.identification.search import BOUNDS, CHI2, Problem
 
@@ -73,7 +73,7 @@ def evaluate(log: JointLog, values: Mapping[str, float], *, latency: int, subste
     Where the joint rests, the simulation begins anew from the angle in the log (`segments`).
     """
     segment, angle = segments(log)
-    full = complete(dict(values), log)
+    full = with_defaults(dict(values), log)
     full["start"] = jnp.asarray(angle[segment], jnp.float32) - full["encoder_bias"]
     readings = simulate(
         full,

@@ -172,7 +172,7 @@ def _still(log: JointLog, first: int, most: int) -> int:
     return int(np.argmin(np.append(same, False)))
 
 
-def complete(values: dict[str, float], log: JointLog) -> dict[str, jax.Array]:
+def with_defaults(values: dict[str, float], log: JointLog) -> dict[str, jax.Array]:
     """All parameters, with nominal values for those left out.
 
     Raises:
@@ -213,7 +213,7 @@ def synthetic_log(
     values = {"start": float(target[0])} | values
     blank = JointLog(period, target, target, name=name)
     position, torque = simulate(
-        complete(values, blank),
+        with_defaults(values, blank),
         jnp.asarray(target, jnp.float32),
         jnp.int32(latency),
         jnp.float32(period / substeps),

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dexsim.core.errors import CalibrationError
-from dexsim.identification.joint import PARAMETERS, JointLog, complete, segments, simulate
+from dexsim.identification.joint import PARAMETERS, JointLog, segments, simulate, with_defaults
 from dexsim.identification.report import TYPICAL
 
 BOUNDS = {
@@ -123,7 +123,7 @@ class Problem:
                 "searched by their own arguments"
             )
         self.log, self.substeps, self.noise = log, substeps, noise
-        self.fixed = complete(dict(start), log)
+        self.fixed = with_defaults(dict(start), log)
         self.segment, angle = segments(log)
         self.names = (*dict.fromkeys(fit), "dead_band")
         self._index = np.array([_NAMES.index(name) for name in self.names])

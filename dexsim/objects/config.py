@@ -12,15 +12,15 @@ SLOTS = ("box", "capsule", "cylinder")
 SHAPES = ("sphere", "box", "cylinder", "capsule", "composition")
 KINDS = (*SHAPES, "mesh")
 """What `ObjectParams.shape_index` counts."""
-OFF = 1e-4  # m, size of a slot that is switched off: a speck at the object's centre
+INACTIVE_SIZE = 1e-4  # m, size of a slot that is switched off: a speck at the object's centre
 SIZE_RANGES = ("sphere_radius", "box_half", "cylinder_radius", "cylinder_half", "neck_radius", "neck_half")
-BULK_RANGES = ("mass", "inertia_scale", "com_offset", "friction", "bare_friction", "stiffness", "restitution")
+BULK_RANGES = ("mass", "inertia_scale", "com_offset", "friction", "link_friction", "stiffness", "restitution")
 RANGES = (*SIZE_RANGES, *BULK_RANGES)
 """Fields of `ObjectConfig` that are drawn for every object."""
 MESH_RANGES = ("mesh_size", *BULK_RANGES)
 """Those of a mesh."""
 _SPANS = tuple(name for name in (*RANGES, "mesh_size") if name != "com_offset")  # pairs (low, high)
-SHORT = 1e-4  # m, half-length of a capsule that plays a sphere
+SPHERE_HALF_LENGTH = 1e-4  # m, half-length of a capsule that plays a sphere
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -64,7 +64,7 @@ class ObjectConfig:
     """Largest offset of the centre of mass, per axis."""
     friction: tuple[float, float] = setting((0.6, 1.2), unit="1", low=0.01, high=5.0)
     """Sliding friction between the fingertips' rubber and the object."""
-    bare_friction: tuple[float, float] = setting((0.6, 1.2), unit="1", low=0.01, high=5.0)
+    link_friction: tuple[float, float] = setting((0.6, 1.2), unit="1", low=0.01, high=5.0)
     """Sliding friction between all else of the hand (palm, links) and the object."""
     stiffness: tuple[float, float] = setting((1600.0, 1800.0), unit="N/m", low=10.0, high=1e6)
     """Force over depth at rest of a fingertip's contact (`contact.BARE_SHARE` times that elsewhere). Where
@@ -73,7 +73,7 @@ class ObjectConfig:
     restitution: tuple[float, float] = setting((0.03, 0.08), unit="1", low=0.0, high=0.9)
     """Coefficient of restitution: the damping of the contact, which also slows creep. What lies
     below 0.024 bounces as 0.024."""
-    corners: float = setting(0.0, unit="1", low=0.0, high=1.0)
+    extremes: float = setting(0.0, unit="1", low=0.0, high=1.0)
     """Share of objects with every value at an end of its range; see `dexsim.core.ranges`."""
 
     def __post_init__(self):

@@ -15,9 +15,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from dexsim.core.pytree import pytree_dataclass, static
-from dexsim.core.ranges import draw_corner, uniform
+from dexsim.core.ranges import sample_extreme, uniform
 from dexsim.geometry import rotations, sdf
-from dexsim.objects.config import KINDS, OFF, SHAPES, SHORT, SLOTS, ObjectConfig, load_mesh_object, middle
+from dexsim.objects.config import (
+    INACTIVE_SIZE,
+    KINDS,
+    SHAPES,
+    SLOTS,
+    SPHERE_HALF_LENGTH,
+    ObjectConfig,
+    load_mesh_object,
+    middle,
+)
 from dexsim.objects.mesh import scaled_boxes
 
 
@@ -74,12 +83,12 @@ class ObjectParams:
     friction: jax.Array  # [] sliding on the fingertips
     contact: jax.Array  # [2] stiffness N/m and damping ratio of a contact
     quat: jax.Array | None = None  # [K, 4] slot orientations in the object's frame; None: aligned
-    bare_friction: jax.Array | None = None  # [] sliding on the rest of the hand; None: as `friction`
+    link_friction: jax.Array | None = None  # [] sliding on the rest of the hand; None: as `friction`
     kinds: tuple[str, ...] = static(default=SLOTS)
 
     def pair_friction(self, rubber: np.ndarray) -> jax.Array:
         """Sliding friction [P] of pairs of the object with a fingertip (`rubber` [P]) or the bare hand."""
-        bare = self.friction if self.bare_friction is None else self.bare_friction
+        bare = self.friction if self.link_friction is None else self.link_friction
         return jnp.where(rubber, self.friction, bare)
 
     def shape(self) -> sdf.Shape:
@@ -97,18 +106,18 @@ def sample_object(key: jax.Array, config: ObjectConfig, shape_index: jax.Array |
     Raises:
       AssetError: the mesh is refused, see `object_mesh.load`.
     """
-    config, keys, corner = config.narrowed(), jax.random.split(key, 8), draw_corner(key, config.corners)
+    config, keys, extreme = config.narrowed(), jax.random.split(key, 8), sample_extreme(key, config.extremes)
     if config.mesh:
-        return _sample_mesh(keys, config, corner)
+        return _sample_mesh(keys, config, extreme)
     if shape_index is None:
         allowed = jnp.array([SHAPES.index(name) for name in config.shapes])
         shape_index = jax.random.choice(keys[0], allowed)
-    size, position, active = _sample_slots(keys[1], shape_index, config, corner)
+    size, position, active = _sample_slots(keys[1], shape_index, config, extreme)
     density_mass, com, inertia = _mass_properties(size, position, active)
     position = position - com  # the origin is the centre of a uniform solid
-    mass = uniform(keys[2], config.mass, corner)
-    scale = uniform(keys[3], config.inertia_scale, corner) * mass / density_mass
-    com = config.com_offset * uniform(keys[4], (-1.0, 1.0), corner, (3,))
+    mass = uniform(keys[2], config.mass, extreme)
+    scale = uniform(keys[3], config.inertia_scale, extreme) * mass / density_mass
+    com = config.com_offset * uniform(keys[4], (-1.0, 1.0), extreme, (3,))
     return ObjectParams(
         shape_index.astype(jnp.int32),
         size,
@@ -117,18 +126,18 @@ def sample_object(key: jax.Array, config: ObjectConfig, shape_index: jax.Array |
         mass,
         inertia * scale,
         com,
-        uniform(keys[5], config.friction, corner),
-        _sample_contact(keys, config, corner),
-        bare_friction=_sample_bare_friction(keys, config, corner),
+        uniform(keys[5], config.friction, extreme),
+        _sample_contact(keys, config, extreme),
+        link_friction=_sample_link_friction(keys, config, extreme),
     )
 
 
-def _sample_mesh(keys: jax.Array, config: ObjectConfig, corner: jax.Array | None) -> ObjectParams:
+def _sample_mesh(keys: jax.Array, config: ObjectConfig, extreme: jax.Array | None) -> ObjectParams:
     thing = load_mesh_object(config)
-    factor, mass = uniform(keys[1], config.mesh_size, corner), uniform(keys[2], config.mass, corner)
+    factor, mass = uniform(keys[1], config.mesh_size, extreme), uniform(keys[2], config.mass, extreme)
     size, position, quat = scaled_boxes(thing, factor)
-    inertia = mass * factor**2 * uniform(keys[3], config.inertia_scale, corner) * jnp.asarray(thing.inertia)
-    com = config.com_offset * uniform(keys[4], (-1.0, 1.0), corner, (3,))
+    inertia = mass * factor**2 * uniform(keys[3], config.inertia_scale, extreme) * jnp.asarray(thing.inertia)
+    com = config.com_offset * uniform(keys[4], (-1.0, 1.0), extreme, (3,))
     return ObjectParams(
         jnp.int32(KINDS.index("mesh")),
         size,
@@ -137,25 +146,25 @@ def _sample_mesh(keys: jax.Array, config: ObjectConfig, corner: jax.Array | None
         mass,
         inertia,
         com,
-        uniform(keys[5], config.friction, corner),
-        _sample_contact(keys, config, corner),
+        uniform(keys[5], config.friction, extreme),
+        _sample_contact(keys, config, extreme),
         quat,
-        _sample_bare_friction(keys, config, corner),
+        _sample_link_friction(keys, config, extreme),
         thing.kinds,
     )
 
 
-def _sample_bare_friction(keys: jax.Array, config: ObjectConfig, corner: jax.Array | None) -> jax.Array:
-    return uniform(jax.random.fold_in(keys[5], 1), config.bare_friction, corner)
+def _sample_link_friction(keys: jax.Array, config: ObjectConfig, extreme: jax.Array | None) -> jax.Array:
+    return uniform(jax.random.fold_in(keys[5], 1), config.link_friction, extreme)
 
 
-def _sample_contact(keys: jax.Array, config: ObjectConfig, corner: jax.Array | None) -> jax.Array:
+def _sample_contact(keys: jax.Array, config: ObjectConfig, extreme: jax.Array | None) -> jax.Array:
     return jnp.stack(
-        [uniform(keys[6], config.stiffness, corner), damping_ratio(uniform(keys[7], config.restitution, corner))]
+        [uniform(keys[6], config.stiffness, extreme), damping_ratio(uniform(keys[7], config.restitution, extreme))]
     )
 
 
-def plain_inertia(target: ObjectParams, config: ObjectConfig | None = None) -> jax.Array:
+def unit_inertia(target: ObjectParams, config: ObjectConfig | None = None) -> jax.Array:
     """Inertia [3] m^2 of an object of `config` as a uniform solid of 1 kg, about its centre."""
     if config is not None and config.mesh:
         thing = load_mesh_object(config)
@@ -164,7 +173,7 @@ def plain_inertia(target: ObjectParams, config: ObjectConfig | None = None) -> j
     return inertia / mass
 
 
-def narrow(target: ObjectParams, config: ObjectConfig, plain: jax.Array, scale: jax.Array) -> ObjectParams:
+def toward_nominal(target: ObjectParams, config: ObjectConfig, plain: jax.Array, scale: jax.Array) -> ObjectParams:
     """A drawn object with its bulk nearer to nominal: mass, inertia, centre of mass, friction, contact.
 
     Its size stays: start states were chosen for it.
@@ -190,7 +199,7 @@ def narrow(target: ObjectParams, config: ObjectConfig, plain: jax.Array, scale: 
         com=scale * target.com,
         friction=toward("friction", target.friction),
         contact=contact,
-        bare_friction=(None if target.bare_friction is None else toward("bare_friction", target.bare_friction)),
+        link_friction=(None if target.link_friction is None else toward("link_friction", target.link_friction)),
     )
 
 
@@ -225,23 +234,23 @@ def damping_ratio(restitution: jax.Array) -> jax.Array:
 
 
 def _sample_slots(
-    key: jax.Array, shape_index: jax.Array, config: ObjectConfig, corner: jax.Array | None
+    key: jax.Array, shape_index: jax.Array, config: ObjectConfig, extreme: jax.Array | None
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     keys = jax.random.split(key, 7)
     is_sphere, is_box, is_cylinder, is_capsule, is_union = (shape_index == i for i in range(5))
     part = jnp.where(is_union, config.composition_scale, 1.0)
-    half = part * uniform(keys[0], config.box_half, corner, (3,))
-    radius = part * uniform(keys[1], config.cylinder_radius, corner)
-    length = part * uniform(keys[2], config.cylinder_half, corner)
-    ball = uniform(keys[3], config.sphere_radius, corner)
-    neck, neck_half = uniform(keys[4], config.neck_radius, corner), uniform(keys[5], config.neck_half, corner)
+    half = part * uniform(keys[0], config.box_half, extreme, (3,))
+    radius = part * uniform(keys[1], config.cylinder_radius, extreme)
+    length = part * uniform(keys[2], config.cylinder_half, extreme)
+    ball = uniform(keys[3], config.sphere_radius, extreme)
+    neck, neck_half = uniform(keys[4], config.neck_radius, extreme), uniform(keys[5], config.neck_half, extreme)
     box_body = jax.random.bernoulli(keys[6])
 
     # A composition is a box or a cylinder with a capsule jutting out along its axis.
     body_half = jnp.where(box_body, half[2], length)
     capsule = jnp.where(
         is_sphere,
-        jnp.stack([ball, SHORT]),
+        jnp.stack([ball, SPHERE_HALF_LENGTH]),
         jnp.where(is_union, jnp.stack([neck, neck_half]), jnp.stack([radius, length])),
     )
     zero = jnp.zeros(())
@@ -251,7 +260,7 @@ def _sample_slots(
     )
     jut = jnp.where(is_union, body_half + neck_half, 0.0)
     position = jnp.zeros((3, 3)).at[1, 2].set(jut)
-    return jnp.where(active[:, None], size, OFF), position, active
+    return jnp.where(active[:, None], size, INACTIVE_SIZE), position, active
 
 
 def _mass_properties(size: jax.Array, position: jax.Array, active: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:

@@ -30,7 +30,7 @@ NOMINAL = 1700.0
 # which press next to no skin, from sinking in.
 SOFTEST, STIFFEST = 0.25, 4.0
 # m, depth below which springs are the nominal ones: there the skin's law is the lattice's coarseness.
-FIRST = 0.0005
+BLEND_DEPTH = 0.0005
 
 
 def spring(
@@ -159,7 +159,7 @@ def follow_skin(
 
     The springs of a finger press with stiffness times the sum D of their depths, its skin with S: the
     ratio is S / (NOMINAL ROW_SHARE D), and 1 where nothing touches yet, between `SOFTEST` and `STIFFEST`.
-    The first millimetre blends (`FIRST`).
+    The first millimetre blends (`BLEND_DEPTH`).
 
     Args:
       pose: of the hand; `position` [3] and `rotation` [3, 3] are the object's, in the palm frame.
@@ -175,6 +175,6 @@ def follow_skin(
         gap = sdf.primitive_distance(kind, here, shape.size[k])
         depth += jnp.where(shape.active[k], jnp.maximum(jnp.asarray(pads.radius) - gap, 0.0), 0.0)
     nominal = NOMINAL * ROW_SHARE
-    ratio = (jnp.sum(touch.skin_force, -1) + nominal * FIRST) / (nominal * (jnp.sum(depth, -1) + FIRST))
+    ratio = (jnp.sum(touch.skin_force, -1) + nominal * BLEND_DEPTH) / (nominal * (jnp.sum(depth, -1) + BLEND_DEPTH))
     has = jnp.asarray(pads.radius.any(-1))  # a fingertip that is no row of spheres keeps its stiffness
     return jnp.where(has, jnp.clip(ratio, SOFTEST, STIFFEST), 1.0)

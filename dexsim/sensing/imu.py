@@ -46,17 +46,17 @@ class SensorDraw:
 
 
 def draw_sensor(
-    key: jax.Array, config: OrientationSensor, scale: float, control_period: float, corner: jax.Array | None = None
+    key: jax.Array, config: OrientationSensor, scale: float, control_period: float, extreme: jax.Array | None = None
 ) -> SensorDraw:
     """Draw one episode's sensor; `scale` 0 gives one without bias, drift and delay.
 
-    Where `corner` [] is true, all three are at an end of their ranges (`dexsim.core.ranges`).
+    Where `extreme` [] is true, all three are at an end of their ranges (`dexsim.core.ranges`).
     """
     keys, sides = jax.random.split(key, 4), (-1.0, 1.0)
-    delay = uniform(keys[2], config.delay, corner, nominal=0.0)
+    delay = uniform(keys[2], config.delay, extreme, nominal=0.0)
     return SensorDraw(
-        bias=scale * config.bias * uniform(keys[0], sides, corner, (3,)),
-        drift=scale * config.drift * uniform(keys[1], sides, corner),
+        bias=scale * config.bias * uniform(keys[0], sides, extreme, (3,)),
+        drift=scale * config.drift * uniform(keys[1], sides, extreme),
         delay=jnp.clip(scale * delay / control_period, 0.0, 1.0),
         phase=jax.random.uniform(keys[3]),
     )

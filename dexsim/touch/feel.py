@@ -120,7 +120,7 @@ def split_force(force: jax.Array, normals: jax.Array, finger_force: jax.Array) -
     return pressed, jnp.where(touching, finger_force - pressed[:, None] * inward, 0.0)
 
 
-def press_only(touch: Touch, normals: jax.Array, finger_force: jax.Array) -> Touch:
+def keep_normal_part(touch: Touch, normals: jax.Array, finger_force: jax.Array) -> Touch:
     """The same touch with only the pressing part of the fingers' forces shared among the taxels.
 
     Args:

@@ -39,7 +39,7 @@ class Skin:
     its magnitude, friction included; pressing: the part that presses into the skin, which is all that
     a taxel of one axis feels), or the skin itself, whose stress times area is then the force on each
     taxel."""
-    bare: bool = False
+    untaxelled: bool = False
     """Whether the fingertips' skin beyond the taxels bears its share of a finger's total, which nothing reads
     (`dexsim.touch.surface`), or all of it lies on taxels that are near, as in the paper."""
 

@@ -35,13 +35,13 @@ def whole_surface(hand: Hand, reach: float) -> Surface:
     Args:
       reach: m from the nearest taxel within which pressed skin loads that taxel, so that it has no point of its own.
     """
-    bare = [_beyond(hand, finger, reach) for finger in range(hand.num_fingers)]
-    most = max(len(rows) for rows in bare)
-    bare = np.stack([np.concatenate([rows, np.zeros((most - len(rows), 7), np.float32)]) for rows in bare])
+    untaxelled = [_beyond(hand, finger, reach) for finger in range(hand.num_fingers)]
+    most = max(len(rows) for rows in untaxelled)
+    untaxelled = np.stack([np.concatenate([rows, np.zeros((most - len(rows), 7), np.float32)]) for rows in untaxelled])
     return Surface(
-        np.concatenate([hand.taxel_position, bare[..., :3]], 1),
-        np.concatenate([hand.taxel_normal, bare[..., 3:6]], 1),
-        np.concatenate([hand.taxel_area, bare[..., 6]], 1),
+        np.concatenate([hand.taxel_position, untaxelled[..., :3]], 1),
+        np.concatenate([hand.taxel_normal, untaxelled[..., 3:6]], 1),
+        np.concatenate([hand.taxel_area, untaxelled[..., 6]], 1),
     )
 
 

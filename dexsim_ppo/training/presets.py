@@ -22,7 +22,7 @@ class Preset:
     """Episodes of the final evaluation."""
     log_every: int
     """Iterations between lines of metrics."""
-    corners: float = 0.0
+    extremes: float = 0.0
     """Share of training's hands and objects with every value at an end of its range."""
 
 
@@ -58,7 +58,7 @@ PRESETS = {
         evaluation_chunk=1024,
         evaluation_episodes=1024,
         log_every=10,
-        corners=0.6,
+        extremes=0.6,
     ),
 }
 

@@ -46,7 +46,7 @@ class TrainArguments(Generic[EnvConfig]):
     """The learner's settings; their defaults depend on the preset."""
     curriculum: Curriculum = setting(Curriculum())
     """Ranges of the randomisation that widen with success."""
-    corners: float = setting(0.0, unit="1", low=0.0, high=1.0)
+    extremes: float = setting(0.0, unit="1", low=0.0, high=1.0)
     """Share of training's hands, and of its objects, with every value at an end of its range (`dexsim.core.ranges`).
     Evaluations, and the policy's file, keep to what `env` says."""
     task: str = "grasp"
@@ -88,16 +88,16 @@ class TrainArguments(Generic[EnvConfig]):
 
 
 def training_config(arguments: TrainArguments) -> Any:
-    """The task's settings with the corners that training asks for."""
-    env, share = arguments.env, arguments.corners
+    """The task's settings with the extremes that training asks for."""
+    env, share = arguments.env, arguments.extremes
     if not share:
         return env
     if not (hasattr(env, "randomization") and hasattr(env, "objects")):
-        raise ConfigError(f"--corners {share:g}: task {arguments.task!r} has no ranges to stand in corners of")
+        raise ConfigError(f"--extremes {share:g}: task {arguments.task!r} has no ranges to take extremes of")
     return dataclasses.replace(
         env,
-        randomization=dataclasses.replace(env.randomization, corners=share),
-        objects=dataclasses.replace(env.objects, corners=share),
+        randomization=dataclasses.replace(env.randomization, extremes=share),
+        objects=dataclasses.replace(env.objects, extremes=share),
     )
 
 
@@ -119,8 +119,8 @@ class Run:
         self.clock = {"setup_s": time.perf_counter() - started}
 
     def _evaluation_env(self) -> Environment:
-        """Warp sizes its buffers by the batch, and corners are for training only: then evaluation has its own."""
-        if self.env.backend != "warp" and not self.arguments.corners:
+        """Warp sizes its buffers by the batch, and extremes are for training only: then evaluation has its own."""
+        if self.env.backend != "warp" and not self.arguments.extremes:
             return self.env
         import dexsim
 

@@ -67,7 +67,7 @@ def record(arguments: CalibrateArguments, hand: Hand, operator: Operator, **benc
     return work.log.path
 
 
-def conclude(arguments: CalibrateArguments, hand: Hand, logs: Sequence[Path], operator: Operator) -> None:
+def fit_and_report(arguments: CalibrateArguments, hand: Hand, logs: Sequence[Path], operator: Operator) -> None:
     """Fit, show, and write what was asked for; the calibration last.
 
     Raises:
@@ -108,7 +108,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             identify_hand(arguments, hand, operator)
         else:
             logs = arguments.from_log or (record(arguments, hand, operator),)
-            conclude(arguments, hand, logs, operator)
+            fit_and_report(arguments, hand, logs, operator)
     return 0
 
 

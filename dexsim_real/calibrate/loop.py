@@ -33,7 +33,7 @@ class Moment:
 
     sample: Sample
     state: np.ndarray  # `frames.STATE_BLOCK`
-    heeded: bool  # whether the hand was told what was asked for
+    command_applied: bool  # whether the hand was told what was asked for
 
 
 class HandLoop:

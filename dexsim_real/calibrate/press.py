@@ -225,7 +225,7 @@ class PressProcedure:
         before, self._advance = self._advance, advance
         self.loop.recording = bool(phase)
         moment = self.loop.step(self._target())
-        if moment is None or not moment.heeded:
+        if moment is None or not moment.command_applied:
             self._advance = before
             return None
         if phase:

@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from dexsim.control import move_target, recalled
+from dexsim.control import move_target, observed_action
 from dexsim.core.config import from_dict
 from dexsim.hand.kinematics import Hand
 from dexsim.observation import Field, ObservationConfig, Readings, layout, observe
@@ -86,7 +86,7 @@ class Controller:
         self.period = 1.0 / policy.control_rate
         self._observe = make_observe(hand, names, config.observation)
         self._move = jax.jit(lambda *arrays: move_target(config.control, hand, *arrays))
-        self._recall = jax.jit(lambda *arrays: recalled(config.control, hand, *arrays))
+        self._recall = jax.jit(lambda *arrays: observed_action(config.control, hand, *arrays))
         self.start(np.zeros(hand.num_joints, np.float32))
 
     def warm(self) -> None:

@@ -8,7 +8,7 @@ import threading
 import time
 
 from dexsim_real.control.safety import Safety, Sample
-from dexsim_real.core.process import come_first
+from dexsim_real.core.process import raise_priority
 from dexsim_real.core.timing import Pace, Timing
 from dexsim_real.sensors.hand import HandSensing, VelocityFilter
 from dexsim_real.wire.frames import Mode
@@ -69,7 +69,7 @@ class Servo:
             self._rest()
 
     def _run(self) -> None:
-        come_first()
+        raise_priority()
         try:
             self.pace.next = time.monotonic() + self.pace.period
             while not self._stop.is_set():

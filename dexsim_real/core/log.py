@@ -24,7 +24,7 @@ import msgpack
 import numpy as np
 
 from dexsim.core.errors import DexsimError
-from dexsim_real.core.process import stand_back
+from dexsim_real.core.process import lower_priority
 
 MAGIC = b"DXSLOG1\n"
 SYNC = b"\xd5\x0c\xa7\x1e"
@@ -101,7 +101,7 @@ class LogWriter:
             os.close(self._file)
 
     def _run(self) -> None:
-        stand_back()
+        lower_priority()
         synced = time.monotonic()
         while True:
             last = self._stop.wait(_WAIT)

@@ -23,12 +23,12 @@ def use_realtime() -> bool:
     return True
 
 
-def come_first() -> None:
+def raise_priority() -> None:
     """Put this thread before the bridge's others; no effect without real-time priority."""
     _shift(_STEP)
 
 
-def stand_back() -> None:
+def lower_priority() -> None:
     """Put this thread behind the bridge's others, still before ordinary programs; without real-time
     priority it has no effect.
 

@@ -17,6 +17,7 @@ from dexsim import load_hand
 from dexsim.calibration.maps import load_calibration
 from dexsim.core.config import from_dict
 from dexsim.observation import Field, Readings, layout
+from dexsim_ppo.retired import migrate_config
 from dexsim_real.control.controller import load_task, make_observe
 from dexsim_real.core.log import Kind, LogError, LogReader
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig, Measured
@@ -111,7 +112,7 @@ def _rebuild(meta: dict[str, Any]) -> tuple[HandSensing, Any, tuple[Field, ...]]
             calibration = load_calibration(path, hand)
     sensing = HandSensing(hand, from_dict(HardwareConfig, meta["hardware"]), calibration)
     sensing.tare = np.array(meta["tare"], np.float32)
-    task = load_task(meta["task"], meta["env_config"], hand)
+    task = load_task(meta["task"], migrate_config(meta["env_config"], "the log"), hand)
     names, config = task.fields["actor"], task.config.observation
     return sensing, make_observe(hand, names, config), layout(hand, names, config)
 

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from dexsim_real.core.process import stand_back
+from dexsim_real.core.process import lower_priority
 
 _LIVE, _LINES = 0.25, 5.0  # s between two pictures on a terminal, and between two lines elsewhere
 
@@ -56,7 +56,7 @@ class View:
             self.console.print(self._notes.popleft(), highlight=False, markup=False, soft_wrap=True)
 
     def _run(self) -> None:
-        stand_back()
+        lower_priority()
         shown = 0.0
         while not self._stop.wait(_LIVE):
             self._print_notes()

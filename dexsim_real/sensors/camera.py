@@ -18,7 +18,7 @@ import numpy as np
 
 from dexsim.core.config import setting, validate
 from dexsim_real.core.errors import HandError
-from dexsim_real.core.process import stand_back
+from dexsim_real.core.process import lower_priority
 
 Masks = Callable[[], tuple[float, np.ndarray] | None]
 """Blocks until the next picture; gives its time (s, monotonic) and a bool mask [H, W], or None at the end."""
@@ -138,7 +138,7 @@ class HeightSensor:
         self._thread.join(1.0)
 
     def _run(self) -> None:
-        stand_back()
+        lower_priority()
         while not self._stop.is_set():
             picture = self._masks()
             if picture is None:

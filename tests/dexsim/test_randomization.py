@@ -172,7 +172,7 @@ def test_a_scale_that_would_turn_a_motor_round_is_refused(name):
 
 
 def test_beyond_the_ranges_without_corners_is_refused():
-    with pytest.raises(ConfigError, match=r"beyond = 0\.2 with corners = 0"):
+    with pytest.raises(ConfigError, match=r"beyond = 0\.2 with extremes = 0"):
         Randomization(beyond=0.2)
 
 
@@ -225,7 +225,7 @@ def test_the_scale_follows_success():
 
 
 def test_held_out_hands_lie_outside_every_range(hand):
-    config = dataclasses.replace(EVEN, corners=1.0, beyond=0.4)
+    config = dataclasses.replace(EVEN, extremes=1.0, beyond=0.4)
     found = quantities(hand, draws(hand, config))
     for name in found.keys() - {"ripple_count"}:
         values = np.asarray(found[name], float)
@@ -242,11 +242,11 @@ def test_held_out_hands_lie_outside_every_range(hand):
         assert np.all(np.abs(values - nominal) > 1e-4), name
 
 
-# --- corners -----------------------------------------------------------------------------------------
+# --- extremes -----------------------------------------------------------------------------------------
 
 
 def test_a_share_of_hands_stands_in_corners_and_the_others_do_not(hand):
-    config = dataclasses.replace(EVEN, corners=0.3)
+    config = dataclasses.replace(EVEN, extremes=0.3)
     drawn = draws(hand, config)
     plain = draws(hand, EVEN)
     at_end = {}
@@ -264,7 +264,7 @@ def test_a_share_of_hands_stands_in_corners_and_the_others_do_not(hand):
             assert near[at_end[name]].all()
             sides = [np.mean(np.abs(values[at_end[name]] - end) < 1e-5) for end in ends]
             assert min(sides) > (0.4 if len(ends) == 2 else 0.99), name
-        # Elsewhere the draw is what it is without corners.
+        # Elsewhere the draw is what it is without extremes.
         others = ~at_end["stiffness_factor"]
         np.testing.assert_array_equal(values[others], np.asarray(quantities(hand, plain)[name], float)[others])
     assert 0.25 < np.mean(at_end["stiffness_factor"]) < 0.35
@@ -273,30 +273,30 @@ def test_a_share_of_hands_stands_in_corners_and_the_others_do_not(hand):
 
 
 def test_corners_narrow_with_the_scale(hand):
-    one = jax.tree.map(lambda x: np.asarray(x[0]), draws(hand, dataclasses.replace(EVEN, corners=1.0, scale=0.5)))
+    one = jax.tree.map(lambda x: np.asarray(x[0]), draws(hand, dataclasses.replace(EVEN, extremes=1.0, scale=0.5)))
     assert np.all(np.isin(one.torque_gain.round(5), np.float32([0.95, 1.05])))
     np.testing.assert_allclose(one.actuator.efficiency, 0.925, rtol=1e-5)
 
 
 def test_the_imu_of_a_hand_in_a_corner_is_in_one_too():
-    config = RotateConfig(pool_size=16, randomization=dataclasses.replace(EVEN, corners=0.5, gravity_tilt=0.0))
+    config = RotateConfig(pool_size=16, randomization=dataclasses.replace(EVEN, extremes=0.5, gravity_tilt=0.0))
     env = dexsim.make("rotate", config, backend="jax")
     keys = jax.random.split(jax.random.key(0), (64, 2))
     drawn, imu = jax.vmap(lambda two: env._draw(*two))(keys)
-    corner = np.all(np.isin(np.asarray(drawn.torque_gain).round(5), np.float32([0.9, 1.1])), axis=1)
+    extreme = np.all(np.isin(np.asarray(drawn.torque_gain).round(5), np.float32([0.9, 1.1])), axis=1)
     ranges = config.sensing.orientation
     for values, end in (
         (imu.bias, ranges.bias),
         (imu.drift[:, None], ranges.drift),
         (imu.delay[:, None], ranges.delay[1] / env.control_period),
     ):
-        np.testing.assert_array_equal(np.all(np.abs(np.abs(values) - end) < 1e-6 + 1e-4 * end, axis=1), corner)
-    assert 0.3 < np.mean(corner) < 0.7 and len(np.unique(np.sign(imu.bias[corner]), axis=0)) == 8
+        np.testing.assert_array_equal(np.all(np.abs(np.abs(values) - end) < 1e-6 + 1e-4 * end, axis=1), extreme)
+    assert 0.3 < np.mean(extreme) < 0.7 and len(np.unique(np.sign(imu.bias[extreme]), axis=0)) == 8
 
 
 @pytest.mark.parametrize(
     "config",
-    [ObjectConfig(corners=1.0), RotateConfig(objects=ObjectConfig(shapes=("box",), corners=1.0))],
+    [ObjectConfig(extremes=1.0), RotateConfig(objects=ObjectConfig(shapes=("box",), extremes=1.0))],
     ids=["grasp", "rotate"],
 )
 def test_objects_in_corners(config):
@@ -304,7 +304,7 @@ def test_objects_in_corners(config):
     if isinstance(config, RotateConfig):
         draw, ranges = sample_target, config.objects
     drawn = jax.vmap(lambda key: draw(key, config))(jax.random.split(jax.random.key(0), 200))
-    at = {name: np.asarray(getattr(drawn, name)) for name in ("mass", "friction", "bare_friction")}
+    at = {name: np.asarray(getattr(drawn, name)) for name in ("mass", "friction", "link_friction")}
     at["stiffness"], at["com_offset"] = np.asarray(drawn.contact[:, 0]), np.asarray(drawn.com)
     for name, values in at.items():
         span = getattr(ranges, name)
@@ -342,7 +342,7 @@ REACHES = {
     "inertia_scale": {"body_inertia"},
     "com_offset": {"body_ipos"},
     "friction": {"pair_friction"},
-    "bare_friction": {"pair_friction"},
+    "link_friction": {"pair_friction"},
     "sphere_radius": {"geom_size"},
     "box_half": {"geom_size"},
 }

@@ -16,9 +16,9 @@ from dexsim import observation
 from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import pytree_dataclass
 from dexsim.env.state import Start
-from dexsim.env.task import Moment
+from dexsim.env.task import GroundTruth
 from dexsim.hand.kinematics import Hand, flexion_joints
-from dexsim.objects.params import ObjectParams, plain_inertia, sample_object
+from dexsim.objects.params import ObjectParams, sample_object, unit_inertia
 from dexsim.tasks.grasp.config import GraspConfig, GraspReward
 from dexsim.tasks.grasp.report import summarize
 from dexsim.tasks.grasp.start import make_pool
@@ -114,16 +114,16 @@ class Grasp:
         """One object of `config`, of a random or the given kind (index into SHAPES)."""
         return sample_object(key, config.objects, shape_index)
 
-    def plain_inertia(self, target: ObjectParams) -> jax.Array:
+    def unit_inertia(self, target: ObjectParams) -> jax.Array:
         """Inertia [3] m^2 of the object as a uniform solid of 1 kg."""
-        return plain_inertia(target, self.config.objects)
+        return unit_inertia(target, self.config.objects)
 
     def begin(self, key: jax.Array, start: Start) -> Goal:
         del start
         return Goal(jax.random.uniform(key), jnp.zeros((), bool))
 
-    def update(self, key: jax.Array, goal: Goal, moment: Moment) -> Goal:
-        del moment
+    def update(self, key: jax.Array, goal: Goal, truth: GroundTruth) -> Goal:
+        del truth
         when, what = jax.random.split(key)
         change = jax.random.bernoulli(when, self.config.command_change) & ~goal.fixed
         return dataclasses.replace(goal, command=jnp.where(change, jax.random.uniform(what), goal.command))
@@ -145,18 +145,18 @@ class Grasp:
             period=self.config.physics.control_period,
         )
 
-    def dropped(self, goal: Goal, moment: Moment) -> jax.Array:
+    def dropped(self, goal: Goal, truth: GroundTruth) -> jax.Array:
         del goal
-        away = jnp.linalg.norm(moment.object_position - jnp.asarray(self.reference))
+        away = jnp.linalg.norm(truth.object_position - jnp.asarray(self.reference))
         return away > self.config.drop_distance
 
-    def reward(self, goal: Goal, moment: Moment, dropped: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
+    def reward(self, goal: Goal, truth: GroundTruth, dropped: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
         """The reward of a tick and its terms; zero for all but the penalties once dropped."""
         config, weights = self.config, self.config.reward
-        force = jnp.linalg.norm(moment.finger_force, axis=-1)
+        force = jnp.linalg.norm(truth.finger_force, axis=-1)
         contact = force > 0.01
         wanted = self.target_force(goal)
-        torque = moment.joint_torque[self._roots]
+        torque = truth.joint_torque[self._roots]
         held = 1.0 - dropped
         fingers = self._finger_joints
         terms = {
@@ -175,16 +175,16 @@ class Grasp:
             ),
             "alive": held * weights.alive,
             "overload": held * weights.overload * overload(force[1:], wanted + weights.margin) / config.max_force,
-            "spread": weights.spread * joint_spread(moment.joint_position[self._roots[1:]]),
-            "outer": weights.outer * posture_distance(moment.joint_position[fingers], self._centre[fingers]),
-            "action": weights.action * action_rate(moment.action, moment.last_action),
-            "velocity": weights.velocity * joint_speed(moment.joint_velocity),
+            "spread": weights.spread * joint_spread(truth.joint_position[self._roots[1:]]),
+            "outer": weights.outer * posture_distance(truth.joint_position[fingers], self._centre[fingers]),
+            "action": weights.action * action_rate(truth.action, truth.last_action),
+            "velocity": weights.velocity * joint_speed(truth.joint_velocity),
             "drop": weights.drop * dropped,
         }
         reward = sum(terms.values())
         # The command speaks to the four fingers; the thumb balances them.
         mean_force = mean_where(contact[1:], force[1:])
-        pressing = jnp.sum(moment.touch.force, -1)
+        pressing = jnp.sum(truth.touch.force, -1)
         return reward, {
             **{f"reward/{name}": value for name, value in terms.items()},
             "success": held,
@@ -194,11 +194,11 @@ class Grasp:
             "finger_pressing": mean_where(contact[1:], pressing[1:]),
             "total_force": jnp.sum(force),
             "taxel_force": jnp.sum(pressing),
-            "skin_force": jnp.sum(moment.touch.skin_force),
+            "skin_force": jnp.sum(truth.touch.skin_force),
             "thumb_force": force[0],
             "touching": jnp.sum(contact).astype(jnp.float32),
-            "joint_speed": jnp.mean(jnp.abs(moment.joint_velocity)),
-            "action_rate": jnp.mean(jnp.abs(moment.action - moment.last_action)),
+            "joint_speed": jnp.mean(jnp.abs(truth.joint_velocity)),
+            "action_rate": jnp.mean(jnp.abs(truth.action - truth.last_action)),
             **{f"force/{i}": force[i] for i in range(force.shape[0])},
         }
 

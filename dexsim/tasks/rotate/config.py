@@ -69,7 +69,7 @@ class RotateConfig(EnvConfig):
 
     objects: ObjectConfig = setting(
         ObjectConfig(
-            shapes=("box",), mass=(0.06, 0.15), friction=(0.6, 1.2), bare_friction=(0.3, 0.7), com_offset=0.003
+            shapes=("box",), mass=(0.06, 0.15), friction=(0.6, 1.2), link_friction=(0.3, 0.7), com_offset=0.003
         )
     )
     """Mass, inertia, centre of mass, friction and contact of the object; its sizes are `edge`. The bare hand
@@ -112,7 +112,7 @@ class RotateConfig(EnvConfig):
     patience: float = setting(4.0, unit="s", low=0.1, high=1e6)
     """A training episode without a new goal for this long is given up, as a drop is: else policies
     learn to turn once and then hold still. Evaluations wait for ever."""
-    leash: float = setting(0.055, unit="m", low=0.01, high=1.0)
+    drop_radius: float = setting(0.055, unit="m", low=0.01, high=1.0)
     """A training episode whose object is farther than this from the reference is given up likewise: else some policies
     learn gaits that roam over the palm, and lose it over the edge. Evaluations end with `drop_distance`."""
     clearance: float = setting(0.001, unit="m", low=0.0, high=0.05)
@@ -173,7 +173,7 @@ def paper() -> RotateConfig:
         drop_distance=0.09,
         drop_tilt=math.pi,
         patience=1e6,
-        leash=1.0,
+        drop_radius=1.0,
         control=Control(step=0.3, recall="target"),
         episode_seconds=60.0,
         reward=RotateReward(
@@ -195,7 +195,7 @@ def clear_of_palm() -> RotateConfig:
         support="fingers",
         tilt=-1.1,
         roll=0.0,
-        leash=1.0,
+        drop_radius=1.0,
         axis=(0.6, 0.0, -0.8),
         reference=(0.072, 0.005, 0.098),
         squeeze=(0.0, 0.2),

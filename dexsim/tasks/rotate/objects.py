@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dexsim.core.ranges import draw_corner, uniform
+from dexsim.core.ranges import sample_extreme, uniform
 from dexsim.geometry import rotations
 from dexsim.objects.config import SHAPES
 from dexsim.objects.params import ObjectParams, extent, sample_object
@@ -43,9 +43,9 @@ def sample_target(key: jax.Array, config: Any) -> ObjectParams:
     if config.objects.scale != 1:
         middle, reach = (shortest + longest) / 2, config.objects.scale * (longest - shortest) / 2
         shortest, longest = middle - reach, middle + reach
-    corner = draw_corner(base_key, config.objects.corners)  # the one that `sample_object` draws
-    half = uniform(edge_key, (shortest, longest), corner) / 2
-    scale = base.mass * uniform(scale_key, config.objects.narrowed().inertia_scale, corner)
+    extreme = sample_extreme(base_key, config.objects.extremes)  # the one that `sample_object` draws
+    half = uniform(edge_key, (shortest, longest), extreme) / 2
+    scale = base.mass * uniform(scale_key, config.objects.narrowed().inertia_scale, extreme)
     stand = upright(config.unit_axis)
     turns = {
         "cube": None if stand is None else [stand],
@@ -53,7 +53,7 @@ def sample_target(key: jax.Array, config: Any) -> ObjectParams:
         "octagon": [(1.0, 0.0, 0.0, 0.0), _EIGHTH],
     }[config.object]
     quat = None if turns is None else jnp.array(turns, jnp.float32)
-    inertia = plain_inertia(config.object, half)
+    inertia = unit_inertia(config.object, half)
     size = jnp.full((len(kinds), 3), half)
     return dataclasses.replace(
         base,
@@ -77,7 +77,7 @@ def upright(axis: np.ndarray) -> np.ndarray | None:
     return (half / np.linalg.norm(half)).astype(np.float32)
 
 
-def plain_inertia(name: str, half: jax.Array) -> jax.Array:
+def unit_inertia(name: str, half: jax.Array) -> jax.Array:
     """Inertia [3] m^2 of a uniform solid of 1 kg, `half` m from its middle to its sides."""
     if name == "cube":
         return jnp.full(3, 2 / 3) * half**2

@@ -212,7 +212,7 @@ def _settle(
             model.geom_quat[geoms] = target.quat[row]
         model.body_mass[body], model.body_inertia[body] = target.mass[row], target.inertia[row]
         model.body_ipos[body] = target.com[row]
-        slide = np.where(rubber, target.friction[row], target.bare_friction[row])
+        slide = np.where(rubber, target.friction[row], target.link_friction[row])
         model.pair_friction[pairs, :2] = slide[:, None]
         mujoco.mj_resetData(model, data)
         data.qpos[:] = candidates["qpos"][row]

@@ -17,7 +17,7 @@ from dexsim import observation
 from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import pytree_dataclass
 from dexsim.env.state import Start
-from dexsim.env.task import Moment
+from dexsim.env.task import GroundTruth
 from dexsim.geometry import rotations
 from dexsim.hand.kinematics import Hand
 from dexsim.objects import params
@@ -25,7 +25,7 @@ from dexsim.objects.config import BULK_RANGES, MESH_RANGES
 from dexsim.objects.params import ObjectParams
 from dexsim.tasks.placement import palm_height
 from dexsim.tasks.rotate.config import RotateConfig, RotateReward
-from dexsim.tasks.rotate.objects import largest_size, lowest_point, plain_inertia, sample_target, slots
+from dexsim.tasks.rotate.objects import largest_size, lowest_point, sample_target, slots, unit_inertia
 from dexsim.tasks.rotate.report import summarize
 from dexsim.tasks.rotate.start import load_pool
 from dexsim.tasks.terms import action_rate, joint_speed, random_push
@@ -45,7 +45,7 @@ class Goal:
     dwell: jax.Array  # [] s inside the window
     clock: jax.Array  # [] s
     last_success: jax.Array  # [] s, clock at the last goal
-    gives_up: jax.Array  # [] bool, whether `patience` and `leash` end the episode
+    gives_up: jax.Array  # [] bool, whether `patience` and `drop_radius` end the episode
     duty: jax.Array  # [F] share of time touching, lately
     pace: jax.Array  # [] rad/s, mean joint speed, lately
     since_touch: jax.Array  # [] s since any fingertip touched
@@ -121,11 +121,11 @@ class Rotate:
         del shape_index
         return sample_target(key, config)
 
-    def plain_inertia(self, target: ObjectParams) -> jax.Array:
+    def unit_inertia(self, target: ObjectParams) -> jax.Array:
         """Inertia [3] m^2 of the object as a uniform solid of 1 kg."""
         if self.config.object == "mesh":
-            return params.plain_inertia(target, self.config.objects)
-        return plain_inertia(self.config.object, target.size[0, 0])
+            return params.unit_inertia(target, self.config.objects)
+        return unit_inertia(self.config.object, target.size[0, 0])
 
     def begin(self, key: jax.Array, start: Start) -> Goal:
         del key, start
@@ -145,12 +145,12 @@ class Rotate:
             totals={"spin": zero, "joint_speed": zero, "action_rate": zero, "tilt": zero, "touch": fingers},
         )
 
-    def progress(self, goal: Goal, moment: Moment) -> Progress:
+    def progress(self, goal: Goal, truth: GroundTruth) -> Progress:
         """Where the object is with respect to the goal."""
         config = self.config
-        angle = rotations.quat_angle(self._quat(goal), moment.object_quat)
-        distance = jnp.linalg.norm(moment.object_position - jnp.asarray(self.reference))
-        spin = config.direction * jnp.sum(moment.object_spin * self._axis)
+        angle = rotations.quat_angle(self._quat(goal), truth.object_quat)
+        distance = jnp.linalg.norm(truth.object_position - jnp.asarray(self.reference))
+        spin = config.direction * jnp.sum(truth.object_spin * self._axis)
         inside = (angle < config.goal_angle) & (distance < config.goal_distance)
         calm = jnp.abs(spin) <= config.goal_spin if config.goal_spin > 0 else True
         dwell = jnp.where(inside, goal.dwell + self._period, 0.0)
@@ -158,19 +158,19 @@ class Rotate:
         success = inside & calm & (dwell > config.goal_dwell - self._period / 2)
         return Progress(angle, distance, spin, goal.entered | inside, dwell, success)
 
-    def update(self, key: jax.Array, goal: Goal, moment: Moment) -> Goal:
+    def update(self, key: jax.Array, goal: Goal, truth: GroundTruth) -> Goal:
         del key
-        return self._advance(goal, moment)
+        return self._advance(goal, truth)
 
-    def _advance(self, goal: Goal, moment: Moment) -> Goal:
-        now, period = self.progress(goal, moment), self._period
-        touching = self._touching(moment)
+    def _advance(self, goal: Goal, truth: GroundTruth) -> Goal:
+        now, period = self.progress(goal, truth), self._period
+        touching = self._touching(truth)
         clock = goal.clock + period
         change = {
             "spin": now.spin,
-            "joint_speed": jnp.mean(jnp.abs(moment.joint_velocity)),
-            "action_rate": jnp.mean(jnp.abs(moment.action - moment.last_action)),
-            "tilt": self._tilt(moment),
+            "joint_speed": jnp.mean(jnp.abs(truth.joint_velocity)),
+            "action_rate": jnp.mean(jnp.abs(truth.action - truth.last_action)),
+            "tilt": self._tilt(truth),
             "touch": touching,
         }
         return Goal(
@@ -206,19 +206,19 @@ class Rotate:
             period=self._period,
         )
 
-    def dropped(self, goal: Goal, moment: Moment) -> jax.Array:
-        away = jnp.linalg.norm(moment.object_position - jnp.asarray(self.reference))
-        lost = (away > self.config.drop_distance) | (self._tilt(moment) > self.config.drop_tilt)
+    def dropped(self, goal: Goal, truth: GroundTruth) -> jax.Array:
+        away = jnp.linalg.norm(truth.object_position - jnp.asarray(self.reference))
+        lost = (away > self.config.drop_distance) | (self._tilt(truth) > self.config.drop_tilt)
         if self.config.support == "fingers":
-            low = lowest_point(moment.target, moment.object_quat, moment.object_position)
+            low = lowest_point(truth.target, truth.object_quat, truth.object_position)
             lost |= low < self._palm + self.config.clearance
-        hopeless = (away > self.config.leash) | (goal.clock - goal.last_success > self.config.patience)
+        hopeless = (away > self.config.drop_radius) | (goal.clock - goal.last_success > self.config.patience)
         return lost | (goal.gives_up & hopeless)
 
-    def reward(self, goal: Goal, moment: Moment, dropped: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
+    def reward(self, goal: Goal, truth: GroundTruth, dropped: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
         """The reward of a tick and its terms; nothing but penalties once dropped."""
-        weights, now, held = self.config.reward, self.progress(goal, moment), 1.0 - dropped
-        after = self._advance(goal, moment)
+        weights, now, held = self.config.reward, self.progress(goal, truth), 1.0 - dropped
+        after = self._advance(goal, truth)
         work = tips_at_work(after.duty, weights.working_tips, weights.working_duty, weights.tips_by)
         calm = jnp.minimum(weights.bonus_speed / jnp.maximum(after.pace, 1e-6), 1.0) ** 2
         asked = weights.bonus_tips * (goal.turns >= weights.tips_after)
@@ -228,9 +228,9 @@ class Rotate:
             "bonus": held * weights.bonus * now.success * share,
             "spin": held * weights.spin * jnp.clip(now.spin, -1.0, 1.0),
             "fingertips": held * weights.fingertips * work,
-            "action": weights.action * action_rate(moment.action, moment.last_action),
-            "velocity": weights.velocity * joint_speed(moment.joint_velocity),
-            "torque": weights.torque * jnp.sum(moment.joint_torque**2),
+            "action": weights.action * action_rate(truth.action, truth.last_action),
+            "velocity": weights.velocity * joint_speed(truth.joint_velocity),
+            "torque": weights.torque * jnp.sum(truth.joint_torque**2),
             "drop": weights.drop * dropped,
         }
         ticks = jnp.maximum(after.clock / self._period, 1.0)
@@ -250,21 +250,21 @@ class Rotate:
             "joint_speed": mean["joint_speed"],
             "action_rate": mean["action_rate"],
             "tilt": mean["tilt"],
-            "taxel_force": jnp.sum(moment.touch.force),
+            "taxel_force": jnp.sum(truth.touch.force),
             **{f"duty/{i}": mean["touch"][i] for i in range(self.hand.num_fingers)},
         }
 
     def _quat(self, goal: Goal) -> jax.Array:
         return goal_quat(goal.turns, self._axis, self._step)
 
-    def _tilt(self, moment: Moment) -> jax.Array:
+    def _tilt(self, truth: GroundTruth) -> jax.Array:
         """Angle [] rad between the object's own axis and the axis of rotation."""
-        own = rotations.rotate(rotations.quat_to_matrix(moment.object_quat), self._axis)
+        own = rotations.rotate(rotations.quat_to_matrix(truth.object_quat), self._axis)
         across = jnp.linalg.norm(jnp.cross(own, self._axis) + 1e-12)
         return jnp.arctan2(across, jnp.sum(own * self._axis))
 
-    def _touching(self, moment: Moment) -> jax.Array:
-        return (jnp.linalg.norm(moment.finger_force, axis=-1) > TOUCH).astype(jnp.float32)
+    def _touching(self, truth: GroundTruth) -> jax.Array:
+        return (jnp.linalg.norm(truth.finger_force, axis=-1) > TOUCH).astype(jnp.float32)
 
     # --- evaluation ------------------------------------------------------------------------
 

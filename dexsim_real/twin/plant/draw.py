@@ -86,7 +86,7 @@ BANDS: dict[str, Band] = {
     "inertia_scale": Band(0.8, 1.25, "1", "objects.inertia_scale", 1.0),
     "com_offset": _symmetric(0.003, "m", "objects.com_offset", "axis"),
     "friction": Band(0.6, 1.2, "1", "objects.friction", 0.9),
-    "bare_friction": Band(0.6, 1.2, "1", "objects.bare_friction", 0.9),
+    "link_friction": Band(0.6, 1.2, "1", "objects.link_friction", 0.9),
     "stiffness_contact": Band(1600.0, 1800.0, "N/m", "objects.stiffness", 1700.0),
     "restitution": Band(0.03, 0.08, "1", "objects.restitution", 0.05),
     "rubber": Band(0.003, 0.003, "m", "physics.cover", 0.003, width=0.003),
@@ -107,7 +107,7 @@ TASK_BANDS: dict[str, dict[str, Band]] = {
     },
     "rotate": {
         "mass": Band(0.06, 0.15, "kg", "objects.mass", 0.10),
-        "bare_friction": Band(0.3, 0.7, "1", "objects.bare_friction", 0.5),
+        "link_friction": Band(0.3, 0.7, "1", "objects.link_friction", 0.5),
         "edge": Band(0.050, 0.060, "m", "edge", 0.055),
         "imu_bias": _symmetric(0.04, "rad", "sensing.orientation.bias", "axis"),
         "imu_drift": _symmetric(0.0005, "rad/s", "sensing.orientation.drift", "trial"),

@@ -166,7 +166,7 @@ def mass_properties(shape: Shape, mass: float) -> tuple[float, np.ndarray, np.nd
 def _add_pairs(spec: mujoco.MjSpec, shape: Shape | None, draw: Draw, skins: dict[str, bool]) -> None:
     for k in range(len(shape.parts) if shape else 0):
         for name, rubber in skins.items():
-            slide = float(draw.friction if rubber else draw.bare_friction)
+            slide = float(draw.friction if rubber else draw.link_friction)
             twist = float(draw.torsion) * slide if rubber else 1e-4
             roll = float(draw.rolling) * slide if rubber else 1e-5
             spec.add_pair(

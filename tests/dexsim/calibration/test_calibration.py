@@ -263,8 +263,8 @@ def test_what_the_data_cannot_separate_is_said(fitted):
     assert one_way.unloading is None and math.isnan(one_way.friction)
     assert any("friction and offset are not apart" in note for note in one_way.notes)
     force = np.linspace(8.0, 8.8, 400)
-    narrow = fit_joint(Press(force, 0.05 * force + 1e-4 * np.random.default_rng(0).standard_normal(400)), "A")
-    assert any("gain and offset trade off" in note for note in narrow.notes)
+    toward_nominal = fit_joint(Press(force, 0.05 * force + 1e-4 * np.random.default_rng(0).standard_normal(400)), "A")
+    assert any("gain and offset trade off" in note for note in toward_nominal.notes)
 
 
 # --- loading and unloading ----------------------------------------------------------------------

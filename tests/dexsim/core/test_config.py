@@ -216,7 +216,7 @@ def test_override_replaces_fields_by_their_path():
     changed = override(
         plain,
         [
-            "objects.corners=0.5",
+            "objects.extremes=0.5",
             'objects.shapes=["box"]',
             "randomization.backlash=gear_play",
             "randomization.latency=[0, 0.01]",
@@ -228,21 +228,21 @@ def test_override_replaces_fields_by_their_path():
     wanted = dataclasses.replace(
         GraspConfig(),
         episode_seconds=3.0,
-        objects=dataclasses.replace(ObjectConfig(), corners=0.5, shapes=("box",)),
+        objects=dataclasses.replace(ObjectConfig(), extremes=0.5, shapes=("box",)),
         randomization=dataclasses.replace(Randomization(), backlash="gear_play", latency=(0.0, 0.01)),
     )
     assert config == wanted
     # A field that the file does not have yet.
-    assert from_dict(GraspConfig, override({}, ["objects.corners=1"])).objects.corners == 1.0
+    assert from_dict(GraspConfig, override({}, ["objects.extremes=1"])).objects.extremes == 1.0
     for entry, said in (
-        ("objects.corner=1", "ObjectConfig has no field 'corner'"),
-        ("objects.corners=7", "between 0 and 1"),
-        ("objects.corners=much", "expected float"),
+        ("objects.extreme=1", "ObjectConfig has no field 'extreme'"),
+        ("objects.extremes=7", "between 0 and 1"),
+        ("objects.extremes=much", "expected float"),
         ("objects=1", "expected a table"),
         ("episode_seconds.x=1", "expected float"),
-        ("corners", "expected NAME=VALUE"),
+        ("extremes", "expected NAME=VALUE"),
         ("=1", "expected NAME=VALUE"),
-        ("corners=", "expected NAME=VALUE"),
+        ("extremes=", "expected NAME=VALUE"),
     ):
         with pytest.raises(ConfigError, match=said):
             from_dict(GraspConfig, override(plain, [entry]))

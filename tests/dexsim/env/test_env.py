@@ -15,7 +15,7 @@ from dexsim import observation
 from dexsim.control import Control
 from dexsim.core.errors import ConfigError
 from dexsim.env.config import EnvConfig
-from dexsim.env.senses import Sensors
+from dexsim.env.senses import EpisodeSensors
 from dexsim.geometry import rotations
 from dexsim.hand.kinematics import forward_kinematics, taxel_positions
 from dexsim.objects.config import SHAPES, SLOTS, ObjectConfig
@@ -507,7 +507,7 @@ class TestReadings:
         force = jnp.zeros((5, 120)).at[2, 40:44].set(jnp.array([0.013, 0.4, 1.26, 0.02]))
         sample = dataclasses.replace(state.sample, taxel_force=force, joint_torque=jnp.linspace(-1, 1, 12))
         readings, _ = env.senses.read(
-            jax.random.key(1), sample, state.sample, Sensors.of(state), state.goal, jnp.zeros(12)
+            jax.random.key(1), sample, state.sample, EpisodeSensors.of(state), state.goal, jnp.zeros(12)
         )
         np.testing.assert_array_equal(readings.taxel_force, force)
         np.testing.assert_array_equal(readings.joint_torque, sample.joint_torque)

@@ -12,7 +12,7 @@ from simple_physics import SimplePhysics
 import dexsim
 from dexsim import observation
 from dexsim.core.errors import ConfigError
-from dexsim.env.senses import Sensors
+from dexsim.env.senses import EpisodeSensors
 from dexsim.geometry import rotations
 from dexsim.hand.kinematics import forward_kinematics, taxel_normals
 from dexsim.objects.config import ObjectConfig
@@ -27,7 +27,7 @@ from dexsim.tasks.grasp.config import GraspConfig
 from dexsim_ppo.train import parse_arguments
 
 WORLDS = 4
-OFF = SensorNoise(
+INACTIVE_SIZE = SensorNoise(
     hysteresis=None,
     crosstalk=None,
     gain=None,
@@ -87,7 +87,9 @@ def make():
 @pytest.fixture(scope="module")
 def busy(make):
     """All of it at once, compiled once: the environment, states from a reset and 40 ticks on, and a restart."""
-    env = make(dataclasses.replace(QUIET, three_axis=True, array=dataclasses.replace(OFF, gain=(0.5, 1.5))), GEARED)
+    env = make(
+        dataclasses.replace(QUIET, three_axis=True, array=dataclasses.replace(INACTIVE_SIZE, gain=(0.5, 1.5))), GEARED
+    )
     history = [jax.jit(lambda key: jax.vmap(env.reset)(jax.random.split(key, WORLDS)))(jax.random.key(0))]
     step, rng = jax.jit(jax.vmap(env.step)), np.random.default_rng(0)
     for _ in range(40):
@@ -107,7 +109,9 @@ def reads(env, state, forces, key=None):
     for tick, force in enumerate(forces):
         sample = dataclasses.replace(state.sample, taxel_force=force)
         tick_key = jax.random.fold_in(jax.random.key(9) if key is None else key, tick)
-        readings, array = env.senses.read(tick_key, sample, sample, Sensors.of(state), state.goal, jnp.zeros(12), state)
+        readings, array = env.senses.read(
+            tick_key, sample, sample, EpisodeSensors.of(state), state.goal, jnp.zeros(12), state
+        )
         state = dataclasses.replace(state, array=array, readings=readings)
         seen.append(np.asarray(readings.taxel_force))
     return seen, state
@@ -141,11 +145,11 @@ def test_taxels_feel_no_friction(make):
     pose = forward_kinematics(env.hand, qpos[:12])
     # The object where the first finger's pad is.
     at = pose.body_position[env.hand.tip_body[1]]
-    moment = env._moment(
+    truth = env._ground_truth(
         dataclasses.replace(state.physics, qpos=qpos.at[12:15].set(at)), state.target, zero, zero, zero, force
     )
-    felt, normals = np.asarray(moment.touch.force[1]), np.asarray(taxel_normals(env.hand, pose))[1]
-    skin = np.asarray(moment.touch.skin_force[1])
+    felt, normals = np.asarray(truth.touch.force[1]), np.asarray(taxel_normals(env.hand, pose))[1]
+    skin = np.asarray(truth.touch.skin_force[1])
     inward = -(skin[:, None] * normals).sum(0)
     inward /= np.linalg.norm(inward)
     assert felt.sum() == pytest.approx(max(float(force[1] @ inward), 0.0), abs=1e-4)
@@ -154,7 +158,7 @@ def test_taxels_feel_no_friction(make):
 
 class TestTaxels:
     def array(self, **effects):
-        return dataclasses.replace(QUIET, array=dataclasses.replace(OFF, **effects))
+        return dataclasses.replace(QUIET, array=dataclasses.replace(INACTIVE_SIZE, **effects))
 
     def test_off_by_default_and_then_not_there(self, make):
         env = make()
@@ -239,11 +243,11 @@ class TestThreeAxes:
         env = make(dataclasses.replace(QUIET, three_axis=True))
         state, physics, force = touching(env, seed)
         zero = jnp.zeros(12)
-        moment = env._moment(physics, state.target, zero, zero, zero, force)
-        felt = np.asarray(moment.touch.force.sum(-1)) > 0
+        truth = env._ground_truth(physics, state.target, zero, zero, zero, force)
+        felt = np.asarray(truth.touch.force.sum(-1)) > 0
         assert felt[1] and not felt.all()
-        weights = np.asarray(moment.touch.force)[..., None] * np.asarray(taxel_normals(env.hand, moment.pose))
-        tangential = np.asarray(moment.tangential_force)
+        weights = np.asarray(truth.touch.force)[..., None] * np.asarray(taxel_normals(env.hand, truth.pose))
+        tangential = np.asarray(truth.tangential_force)
         for finger in range(5):
             if not felt[finger]:
                 assert np.all(tangential[finger] == 0)
@@ -270,19 +274,21 @@ class TestThreeAxes:
             assert ("joint_velocity" in fields) == ("joint_velocity" in config.add_critic and group == "critic")
         state, physics, force = touching(env)
         zero = jnp.zeros(12)
-        moment = env._moment(physics, state.target, zero, zero, zero, force)
+        truth = env._ground_truth(physics, state.target, zero, zero, zero, force)
         sample = dataclasses.replace(
-            state.sample, taxel_force=moment.touch.force, tangential_force=moment.tangential_force
+            state.sample, taxel_force=truth.touch.force, tangential_force=truth.tangential_force
         )
-        readings, _ = env.senses.read(jax.random.key(0), sample, sample, Sensors.of(state), state.goal, zero, state)
-        np.testing.assert_allclose(readings.tangential_force, moment.tangential_force, atol=1e-5)
-        obs = env._observe(readings, moment, state.goal)
+        readings, _ = env.senses.read(
+            jax.random.key(0), sample, sample, EpisodeSensors.of(state), state.goal, zero, state
+        )
+        np.testing.assert_allclose(readings.tangential_force, truth.tangential_force, atol=1e-5)
+        obs = env._observe(readings, truth, state.goal)
         for group in groups:
             at = 0
             for field in env.observation_layout[group]:
                 if field.name == "tangential_force":
                     assert field.size == 15 and field.scale
-                    np.testing.assert_allclose(obs[group][at : at + 15], moment.tangential_force.ravel(), atol=1e-5)
+                    np.testing.assert_allclose(obs[group][at : at + 15], truth.tangential_force.ravel(), atol=1e-5)
                 at += field.size
             assert at == len(obs[group])
 
@@ -295,7 +301,7 @@ class TestThreeAxes:
             force = jnp.zeros((5, 120)).at[:, :taxels].set(1.0)
             sample = dataclasses.replace(state.sample, taxel_force=force, tangential_force=tangential)
             readings, _ = env.senses.read(
-                jax.random.key(0), sample, sample, Sensors.of(state), state.goal, jnp.zeros(12), state
+                jax.random.key(0), sample, sample, EpisodeSensors.of(state), state.goal, jnp.zeros(12), state
             )
             np.testing.assert_allclose(readings.tangential_force[:, 2], read, atol=1e-5)
 

@@ -15,7 +15,7 @@ from dexsim.geometry import distance, mesh, rotations, sdf
 from dexsim.objects.boxes import fit_boxes
 from dexsim.objects.config import KINDS, ObjectConfig
 from dexsim.objects.mesh import from_mesh, load
-from dexsim.objects.params import narrow, plain_inertia, sample_object
+from dexsim.objects.params import sample_object, toward_nominal, unit_inertia
 from dexsim.randomization_check.effects import check
 from dexsim.tasks.grasp.config import GraspConfig
 from dexsim.tasks.rotate.config import RotateConfig
@@ -147,7 +147,7 @@ class TestDraw:
     def test_it_narrows(self, folder):
         config = self.config(folder)
         one = sample_object(jax.random.key(1), config)
-        bare = narrow(one, config, plain_inertia(one, config), jnp.float32(0.0))
+        bare = toward_nominal(one, config, unit_inertia(one, config), jnp.float32(0.0))
         sides = 2 * np.asarray(one.size[0])
         np.testing.assert_allclose(bare.inertia, np.mean(config.mass) / 12 * (np.sum(sides**2) - sides**2), rtol=1e-4)
         np.testing.assert_allclose(
@@ -199,7 +199,7 @@ def test_a_mesh_is_turned_like_the_cube_that_it_is(simple, folder):
     height = [np.asarray(e.pool.qpos)[:, 12] for e in (cubes, env)]
     assert abs(np.mean(height[0]) - np.mean(height[1])) < 0.001
     target = jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], env.pool.target)
-    np.testing.assert_allclose(env.task.plain_inertia(target), 0.055**2 / 6, rtol=1e-4)
+    np.testing.assert_allclose(env.task.unit_inertia(target), 0.055**2 / 6, rtol=1e-4)
 
 
 @pytest.mark.long

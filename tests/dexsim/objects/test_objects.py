@@ -9,8 +9,8 @@ import pytest
 
 from dexsim.core.errors import ConfigError
 from dexsim.geometry import sdf
-from dexsim.objects.config import OFF, SHAPES, SLOTS, ObjectConfig
-from dexsim.objects.params import bounding_radius, damping_ratio, extent, plain_inertia, sample_object
+from dexsim.objects.config import INACTIVE_SIZE, SHAPES, SLOTS, ObjectConfig
+from dexsim.objects.params import bounding_radius, damping_ratio, extent, sample_object, unit_inertia
 
 BOX, CAPSULE, CYLINDER = range(3)
 ACTIVE = {
@@ -233,7 +233,7 @@ def test_slots_that_are_off_are_specks_inside_the_object():
     for at in range(100):
         one = row(drawn, at)
         off = ~one.active
-        assert np.all(one.size[off] == OFF)
+        assert np.all(one.size[off] == INACTIVE_SIZE)
         assert np.all(is_inside(one, one.position[off]))
 
 
@@ -367,6 +367,6 @@ class TestScale:
     def test_inertia_of_a_uniform_solid(self):
         for shape in SHAPES:
             one = jax.tree.map(lambda x: x[0], self.draw(1.0, shape))
-            ratio = np.asarray(one.inertia / (one.mass * plain_inertia(one)))
+            ratio = np.asarray(one.inertia / (one.mass * unit_inertia(one)))
             np.testing.assert_allclose(ratio, ratio[0], rtol=1e-4)
             assert 0.8 <= ratio[0] <= 1.25

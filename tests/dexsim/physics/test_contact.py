@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from dexsim.objects.config import OFF, SHAPES, SLOTS, ObjectConfig
+from dexsim.objects.config import INACTIVE_SIZE, SHAPES, SLOTS, ObjectConfig
 from dexsim.objects.params import damping_ratio
 from dexsim.physics import contact
 from dexsim.physics.config import PhysicsConfig
@@ -113,7 +113,7 @@ def test_a_ball_bounces_as_configured(restitution, mass):
 
 def test_only_fingertips_wear_rubber(hand):
     bare, clad = (
-        build_model(hand, SLOTS, np.full((3, 3), OFF), PhysicsConfig(cover=cover), (9.81, 0, 0), "jax")
+        build_model(hand, SLOTS, np.full((3, 3), INACTIVE_SIZE), PhysicsConfig(cover=cover), (9.81, 0, 0), "jax")
         for cover in (0.0, 0.003)
     )
     tips = {bare.body(hand.body_names[b]).id for b in hand.tip_body}

@@ -110,7 +110,7 @@ def test_the_palm_ends_where_the_hand_does():
     past = np.array([-0.006, -0.004, -0.002, -0.001, 0.001, 0.002, 0.004, 0.006])  # m, of the line's foot
     target = jax.tree.map(lambda x: jnp.repeat(jnp.asarray(x)[:1], 8, 0), env.pool.target)
     target = dataclasses.replace(
-        target, size=jnp.full_like(target.size, half), com=jnp.zeros((8, 3)), bare_friction=jnp.full(8, 0.7)
+        target, size=jnp.full_like(target.size, half), com=jnp.zeros((8, 3)), link_friction=jnp.full(8, 0.7)
     )
     qpos = np.zeros((8, 19), np.float32)
     qpos[:, :12] = np.clip(0, env.hand.joint_lower, env.hand.joint_upper)  # thumb and fingers out of the way

@@ -14,7 +14,7 @@ from dexsim.sensing.taxels import SensorNoise, neighbour_difference
 GRID, FINGERS, PERIOD = (10, 12), 5, 0.02
 SHAPE = (FINGERS, GRID[0] * GRID[1])
 KEY = jax.random.key(0)
-OFF = SensorNoise(
+INACTIVE_SIZE = SensorNoise(
     hysteresis=None,
     crosstalk=None,
     gain=None,
@@ -29,7 +29,7 @@ OFF = SensorNoise(
 
 
 def model(**effects):
-    return dataclasses.replace(OFF, **effects).model(GRID, fingers=FINGERS, control_period=PERIOD)
+    return dataclasses.replace(INACTIVE_SIZE, **effects).model(GRID, fingers=FINGERS, control_period=PERIOD)
 
 
 def forces(seed=0):

@@ -13,7 +13,7 @@ import pytest
 
 import dexsim
 from dexsim.core.errors import ConfigError
-from dexsim.env.task import Moment
+from dexsim.env.task import GroundTruth
 from dexsim.hand.kinematics import forward_kinematics
 from dexsim.objects.config import SHAPES, ObjectConfig
 from dexsim.physics.config import PhysicsConfig
@@ -89,7 +89,7 @@ def make_moment(hand, **fields):
         "action": zero,
         "last_action": zero,
     }
-    return Moment(
+    return GroundTruth(
         **{
             name: jnp.asarray(value) if name not in ("target", "pose", "touch") else value
             for name, value in (values | fields).items()
@@ -168,7 +168,7 @@ class TestReward:
         velocity[2], action[5], before[5] = 2.0, 0.5, -0.5
         felt = np.zeros((5, 120))
         felt[1, :4], felt[0, :2] = 1.0, 0.5
-        moment = make_moment(
+        truth = make_moment(
             hand,
             finger_force=force,
             joint_torque=torque,
@@ -178,7 +178,7 @@ class TestReward:
             last_action=before,
             touch=Touch(jnp.asarray(felt), jnp.asarray(0.5 * felt), jnp.asarray(felt)),
         )
-        reward, metrics = task.reward(goal_of(0.5), moment, jnp.zeros((), bool))
+        reward, metrics = task.reward(goal_of(0.5), truth, jnp.zeros((), bool))
 
         # Target 4 N; thumb 2 N (loose), index 5 N (tracks), ring 5 mN (no contact).
         track = 0.6 * math.exp(-0.5) + 0.4 * gauss(0.1, 0.4)
@@ -225,9 +225,9 @@ class TestReward:
     def test_a_drop_is_paid_once_and_ends_what_is_earned(self, hand, task):
         force = jnp.full((5, 3), 1.0)
         away = np.array(Grasp.reference) + [0.2, 0.0, 0.0]
-        moment = make_moment(hand, finger_force=force, object_position=away)
-        _, held = task.reward(goal_of(0.2), moment, jnp.zeros((), bool))
-        reward, lost = task.reward(goal_of(0.2), moment, jnp.ones((), bool))
+        truth = make_moment(hand, finger_force=force, object_position=away)
+        _, held = task.reward(goal_of(0.2), truth, jnp.zeros((), bool))
+        reward, lost = task.reward(goal_of(0.2), truth, jnp.ones((), bool))
         assert float(held["reward/force"]) > 0 and float(held["reward/drop"]) == 0
         assert [float(lost[f"reward/{n}"]) for n in ("force", "torque", "alive", "drop")] == [0.0, 0.0, 0.0, -20.0]
         assert float(lost["success"]) == 0.0
@@ -250,8 +250,8 @@ class TestReward:
             torque[hand.root_joint] = (1 + 6 * command) / 19
             force = np.zeros((5, 3))
             force[:, 0] = 1 + 6 * command
-            moment = make_moment(hand, finger_force=force, joint_torque=torque)
-            _, metrics = task.reward(goal_of(command), moment, jnp.zeros((), bool))
+            truth = make_moment(hand, finger_force=force, joint_torque=torque)
+            _, metrics = task.reward(goal_of(command), truth, jnp.zeros((), bool))
             assert float(metrics["reward/force"]) == pytest.approx(2.0, rel=1e-4)
             assert float(metrics["reward/torque"]) == pytest.approx(0.2, rel=1e-3)
             assert float(metrics["force_error"]) == pytest.approx(0.0, abs=1e-4)
@@ -268,8 +268,8 @@ class TestReward:
         ],
     )
     def test_dropped(self, hand, task, offset, dropped):
-        moment = make_moment(hand, object_position=np.array(Grasp.reference) + offset)
-        assert bool(task.dropped(goal_of(0.0), moment)) is dropped
+        truth = make_moment(hand, object_position=np.array(Grasp.reference) + offset)
+        assert bool(task.dropped(goal_of(0.0), truth)) is dropped
 
 
 class TestChance:

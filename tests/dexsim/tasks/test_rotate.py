@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 import dexsim
 from dexsim import observation
 from dexsim.core.errors import ConfigError
-from dexsim.env.task import Moment
+from dexsim.env.task import GroundTruth
 from dexsim.geometry.sdf import signed_distance
 from dexsim.hand.kinematics import forward_kinematics
 from dexsim.sensing.imu import OrientationSensor, draw_sensor, measure_orientation
@@ -34,7 +34,7 @@ def quat_of(rotation: Rotation) -> np.ndarray:
     return np.roll(rotation.as_quat(), 1).astype(np.float32)
 
 
-def moment(task: Rotate, **changes) -> Moment:
+def truth(task: Rotate, **changes) -> GroundTruth:
     """The cube at the reference, aligned and at rest, in an open hand that touches nothing."""
     joints = jnp.zeros(12)
     none = jnp.zeros((5, 120))
@@ -53,7 +53,7 @@ def moment(task: Rotate, **changes) -> Moment:
         "action": joints,
         "last_action": joints,
     }
-    return Moment(**{**values, **{name: jnp.asarray(v) for name, v in changes.items()}})
+    return GroundTruth(**{**values, **{name: jnp.asarray(v) for name, v in changes.items()}})
 
 
 def turned(degrees: float, axis=(1, 0, 0)) -> np.ndarray:
@@ -94,24 +94,22 @@ class TestGoal:
         back = Rotate(RotateConfig(direction=-1), hand)
         for degrees in (-90, -60, 0, 75, 90):
             goal = ahead.begin(jax.random.key(0), None)
-            one = ahead.progress(goal, moment(ahead, object_quat=turned(degrees), object_spin=[0.5, 0, 0]))
-            two = back.progress(goal, moment(back, object_quat=turned(-degrees), object_spin=[-0.5, 0, 0]))
+            one = ahead.progress(goal, truth(ahead, object_quat=turned(degrees), object_spin=[0.5, 0, 0]))
+            two = back.progress(goal, truth(back, object_quat=turned(-degrees), object_spin=[-0.5, 0, 0]))
             assert bool(one.success) == bool(two.success) == (abs(degrees - 90) < 17.2)
             np.testing.assert_allclose(one.angle, two.angle, atol=1e-5)
             np.testing.assert_allclose(one.spin, two.spin, atol=1e-6)
 
     @pytest.mark.parametrize("degrees", [72.5, 73.5, 90, 106.5, 107.5])
     def test_within_0_3_rad_is_reached(self, task, begun, degrees):
-        now = task.progress(begun, moment(task, object_quat=turned(degrees)))
+        now = task.progress(begun, truth(task, object_quat=turned(degrees)))
         np.testing.assert_allclose(now.angle, abs(math.radians(degrees) - math.pi / 2), atol=1e-4)
         assert bool(now.success) == (abs(math.radians(degrees) - math.pi / 2) < 0.3)
 
     def test_too_far_off_too_fast_or_tilted_is_not(self, task, begun):
         def reached(**changes):
             return bool(
-                task.progress(
-                    begun, moment(task, object_quat=changes.pop("object_quat", turned(90)), **changes)
-                ).success
+                task.progress(begun, truth(task, object_quat=changes.pop("object_quat", turned(90)), **changes)).success
             )
 
         place = np.asarray(task.reference)
@@ -128,7 +126,7 @@ class TestGoal:
         task = Rotate(RotateConfig(goal_dwell=3 * PERIOD), hand)
         goal, reached = task.begin(jax.random.key(0), None), []
         for degrees in (90, 90, 0, 90, 90, 90, 90):
-            now = moment(task, object_quat=turned(degrees))
+            now = truth(task, object_quat=turned(degrees))
             reached.append(bool(task.progress(goal, now).success))
             goal = task.update(jax.random.key(0), goal, now)
         assert reached == [False, False, False, False, False, True, False]
@@ -139,7 +137,7 @@ class TestGoal:
         goal, turns, entries = begun, [], []
         for degrees, spin in ((45, 1), (90, 4), (150, 4), (90, 0.5), (100, 0.5), (180, 1), (270, 1), (0, 1)):
             goal = task.update(
-                jax.random.key(0), goal, moment(task, object_quat=turned(degrees), object_spin=[spin, 0, 0])
+                jax.random.key(0), goal, truth(task, object_quat=turned(degrees), object_spin=[spin, 0, 0])
             )
             turns.append(int(goal.turns))
             entries.append(int(goal.entries))
@@ -178,9 +176,9 @@ class TestReward:
             object_spin=[9.0, 0, 0],
         )
         cost = -0.0002 * float(np.sum(action**2))
-        reward, _ = task.reward(goal, moment(task, object_quat=turned(45), **busy), jnp.bool_(False))
+        reward, _ = task.reward(goal, truth(task, object_quat=turned(45), **busy), jnp.bool_(False))
         np.testing.assert_allclose(reward, 1 / (math.pi / 4 + 0.1) + cost, rtol=1e-4)
-        reward, _ = task.reward(goal, moment(task, object_quat=turned(90), **busy), jnp.bool_(False))
+        reward, _ = task.reward(goal, truth(task, object_quat=turned(90), **busy), jnp.bool_(False))
         np.testing.assert_allclose(reward, 250 + 1 / 0.1 + cost, rtol=1e-4)
 
     @pytest.mark.parametrize("by", ["mean", "last"])
@@ -194,7 +192,7 @@ class TestReward:
         }
         for duty, share in cases[by]:
             goal = dataclasses.replace(begun, duty=jnp.asarray(duty, jnp.float32), turns=jnp.int32(2))
-            here = moment(task, object_quat=turned(270))
+            here = truth(task, object_quat=turned(270))
             _, metrics = task.reward(goal, here, jnp.bool_(False))
             np.testing.assert_allclose(metrics["reward/bonus"], 250 * share, rtol=1e-5)
             assert metrics["reward/bonus"] > last
@@ -203,11 +201,11 @@ class TestReward:
     def test_the_first_goals_do_not_ask_for_fingertips(self, task, begun):
         for turns, angle in ((0, 90), (1, 180)):
             goal = dataclasses.replace(begun, turns=jnp.int32(turns))
-            _, metrics = task.reward(goal, moment(task, object_quat=turned(angle)), jnp.bool_(False))
+            _, metrics = task.reward(goal, truth(task, object_quat=turned(angle)), jnp.bool_(False))
             np.testing.assert_allclose(metrics["reward/bonus"], 250, rtol=1e-5)
 
     def test_a_gait_too_fast_earns_less(self, task, begun):
-        limit, here = RotateReward().bonus_speed, moment(task, object_quat=turned(90))
+        limit, here = RotateReward().bonus_speed, truth(task, object_quat=turned(90))
         busy = dataclasses.replace(begun, duty=jnp.ones(5))
         for pace, share in ((0.5 * limit, 1.0), (limit, 1.0), (2 * limit, 0.25), (3 * limit, 1 / 9)):
             # Of this tick's own speed: none.
@@ -218,9 +216,7 @@ class TestReward:
     def test_standing_still_earns_less_than_turning(self, task, begun):
         """Else policies hold the object where their first stroke ended."""
         still, turning = (
-            float(
-                task.reward(begun, moment(task, object_quat=turned(0), object_spin=[spin, 0, 0]), jnp.bool_(False))[0]
-            )
+            float(task.reward(begun, truth(task, object_quat=turned(0), object_spin=[spin, 0, 0]), jnp.bool_(False))[0])
             for spin in (0.0, 0.3)
         )
         assert 0 < still < turning - still
@@ -228,11 +224,11 @@ class TestReward:
     def test_pace_is_a_leaky_mean(self, task, begun):
         goal = begun
         for _ in range(40):
-            goal = task.update(jax.random.key(0), goal, moment(task, joint_velocity=np.full(12, -3.0)))
+            goal = task.update(jax.random.key(0), goal, truth(task, joint_velocity=np.full(12, -3.0)))
         np.testing.assert_allclose(goal.pace, 3 * (1 - (1 - PERIOD / 2.0) ** 40), rtol=1e-4)
 
     def test_a_lost_object_earns_nothing(self, task, begun):
-        here = moment(task, object_quat=turned(90), object_spin=[1.0, 0, 0])
+        here = truth(task, object_quat=turned(90), object_spin=[1.0, 0, 0])
         reward, metrics = task.reward(begun, here, jnp.bool_(True))
         assert float(reward) == RotateReward().drop
         assert float(metrics["slipped"]) == 1 and float(metrics["pushed_out"]) == 0
@@ -240,11 +236,11 @@ class TestReward:
     def test_a_finger_that_just_touched_pushed_it_out(self, task, begun):
         force = np.zeros((5, 3))
         force[3, 1] = 1.0
-        goal = task.update(jax.random.key(0), begun, moment(task, finger_force=force))
+        goal = task.update(jax.random.key(0), begun, truth(task, finger_force=force))
         for ticks, pushed in ((3, True), (10, False)):
             for _ in range(ticks):
-                goal = task.update(jax.random.key(0), goal, moment(task))
-            _, metrics = task.reward(goal, moment(task), jnp.bool_(True))
+                goal = task.update(jax.random.key(0), goal, truth(task))
+            _, metrics = task.reward(goal, truth(task), jnp.bool_(True))
             assert bool(metrics["pushed_out"]) == pushed != bool(metrics["slipped"])
 
     def test_tips_at_work(self):
@@ -259,7 +255,7 @@ class TestReward:
         force[2] = 1.0
         goal = begun
         for _ in range(40):
-            goal = task.update(jax.random.key(0), goal, moment(task, finger_force=force))
+            goal = task.update(jax.random.key(0), goal, truth(task, finger_force=force))
         np.testing.assert_allclose(goal.duty, [0, 0, 1 - (1 - PERIOD / 2.0) ** 40, 0, 0], rtol=1e-4)
 
 
@@ -267,10 +263,10 @@ class TestDrop:
     def test_tipped_over(self, task, begun):
         for degrees, lost in ((55, False), (59, True), (180, True)):
             tipped = Rotation.from_euler("y", degrees, degrees=True) * Rotation.from_euler("x", 1.0)
-            here = moment(task, object_quat=quat_of(tipped))
+            here = truth(task, object_quat=quat_of(tipped))
             np.testing.assert_allclose(task._tilt(here), math.radians(degrees), atol=1e-3)
             assert bool(task.dropped(begun, here)) == lost
-        assert not bool(task.dropped(begun, moment(task, object_quat=turned(170))))
+        assert not bool(task.dropped(begun, truth(task, object_quat=turned(170))))
 
     def test_patience_ends_training_episodes_only(self, hand):
         task = Rotate(RotateConfig(patience=5 * PERIOD), hand)
@@ -281,7 +277,7 @@ class TestDrop:
         ):
             lost = []
             for tick in range(9):
-                here = moment(task, object_quat=turned(90 if tick == 2 else 30))
+                here = truth(task, object_quat=turned(90 if tick == 2 else 30))
                 goal = task.update(jax.random.key(0), goal, here)
                 lost.append(bool(task.dropped(goal, here)))
             # The goal of tick 2 starts the clock anew; the sixth tick after it is one too many.
@@ -289,7 +285,7 @@ class TestDrop:
 
     def test_too_far_away_training_on_a_leash(self, task, begun, hand):
         _, waiting = task.evaluation_plan(1, np.zeros(4, int))
-        free = Rotate(RotateConfig(leash=1.0), hand)
+        free = Rotate(RotateConfig(drop_radius=1.0), hand)
         for rules, goal, limit in (
             (task, begun, 0.055),
             (task, jax.tree.map(lambda x: x[0], waiting), 0.07),
@@ -297,7 +293,7 @@ class TestDrop:
         ):
             for distance, lost in ((limit - 0.001, False), (limit + 0.001, True)):
                 place = np.asarray(task.reference) + [0, 0, distance]
-                assert bool(rules.dropped(goal, moment(task, object_position=place))) == lost
+                assert bool(rules.dropped(goal, truth(task, object_position=place))) == lost
 
     def test_lowest_corner_of_a_tilted_cube(self, task):
         target = sample_target(jax.random.key(3), task.config)
@@ -320,12 +316,12 @@ class TestDrop:
     def test_on_the_palm_is_dropped_when_held_by_fingers(self, hand):
         task = Rotate(RotateConfig(support="fingers"), hand)
         goal = task.begin(jax.random.key(0), None)
-        here = moment(task)
+        here = truth(task)
         half = float(here.target.size[0, 0])
         palm = palm_height(hand)
         for gap, lost in ((0.0005, True), (0.0015, False)):
             place = np.asarray(task.reference) * [0, 1, 1] + [palm + half + gap, 0, 0]
-            assert bool(task.dropped(goal, moment(task, object_position=place))) == lost
+            assert bool(task.dropped(goal, truth(task, object_position=place))) == lost
 
 
 class TestObjects:

@@ -126,7 +126,7 @@ def environments():
         sensing=Sensing(three_axis=True),
         skin=Skin(total="solver"),
     )
-    bare = dataclasses.replace(plain, skin=dataclasses.replace(plain.skin, bare=True))
+    bare = dataclasses.replace(plain, skin=dataclasses.replace(plain.skin, untaxelled=True))
     first, second = (dexsim.make("grasp", config, backend="jax") for config in (plain, bare))
     assert first.fingerprint() != second.fingerprint()
     return first, second, first.reset(jax.random.key(0))
@@ -148,7 +148,7 @@ def touched(environments, hand, angle):
     along = pose.tip_rotation[1] @ jnp.asarray(axis, jnp.float32)
     force = jnp.zeros((hand.num_fingers, 3)).at[1].set(-3.0 * direction + 1.5 * along)
     zero = jnp.zeros(hand.num_joints)
-    return [env._moment(physics, state.target, zero, zero, zero, force) for env in both]
+    return [env._ground_truth(physics, state.target, zero, zero, zero, force) for env in both]
 
 
 def test_an_environment_reads_no_more_than_without(environments, hand):
@@ -156,7 +156,7 @@ def test_an_environment_reads_no_more_than_without(environments, hand):
     plain, bare = touched(environments, hand, 0.0)
     assert plain.touch.force.shape == bare.touch.force.shape == (hand.num_fingers, hand.num_taxels)
     np.testing.assert_array_equal(plain.touch.depth, bare.touch.depth)
-    sums = [np.asarray(moment.touch.force.sum(-1)) for moment in (plain, bare)]
+    sums = [np.asarray(truth.touch.force.sum(-1)) for truth in (plain, bare)]
     assert sums[0][1] > 1.0 and np.all(sums[1] <= sums[0] + 1e-4)
 
 
@@ -171,7 +171,7 @@ def test_what_rests_on_taxels_drags_along_them(environments, hand, angle, least,
 
 
 def test_it_can_be_asked_for_by_name():
-    assert override(to_dict(GraspConfig()), ("skin.bare=true",))["skin"]["bare"] is True
+    assert override(to_dict(GraspConfig()), ("skin.untaxelled=true",))["skin"]["untaxelled"] is True
 
 
 def test_fingertips_of_other_shapes(hand):

@@ -19,7 +19,7 @@ from dexsim.sensing.taxel_reading import TaxelSensor
 from dexsim.touch import feel as touch_feel
 from dexsim.touch import reduce as touch_reduce
 from dexsim.touch import skin as touch_skin
-from dexsim.touch.feel import press_only
+from dexsim.touch.feel import keep_normal_part
 from dexsim.touch.skin import Skin
 
 EYE = np.eye(3, dtype=np.float32)
@@ -302,14 +302,14 @@ def test_reduction_by_loops(weighting):
     taxels = rng.uniform(-0.1, 0.1, (5, 120, 3))
     ours, centre = reduce_touch(np.float32(force), np.float32(taxels), weighting)
     for finger in range(5):
-        total, moment, active = 0.0, np.zeros(3), 0.0
+        total, truth, active = 0.0, np.zeros(3), 0.0
         for taxel in range(120):
             total += force[finger, taxel]
             weight = float(force[finger, taxel] > 0) if weighting == "none" else force[finger, taxel]
-            moment += weight * taxels[finger, taxel]
+            truth += weight * taxels[finger, taxel]
             active += weight
         assert float(ours[finger]) == pytest.approx(total, rel=1e-5)
-        np.testing.assert_allclose(centre[finger], moment / active if active else np.zeros(3), atol=1e-6)
+        np.testing.assert_allclose(centre[finger], truth / active if active else np.zeros(3), atol=1e-6)
 
 
 def test_the_unweighted_centre_ignores_how_hard():
@@ -471,7 +471,7 @@ def test_taxels_of_one_axis_feel_only_what_presses(direction, pressed):
         Skin(margin=0.0),
     )
     normals = np.broadcast_to(np.float32([0, 0, 1]), taxels.shape)
-    only = press_only(touch, normals, 5 * np.float32([direction]))
+    only = keep_normal_part(touch, normals, 5 * np.float32([direction]))
     assert float(only.force.sum()) == pytest.approx(pressed, abs=1e-5)
     np.testing.assert_allclose(only.force, touch.force * pressed / 5, atol=1e-6)
     np.testing.assert_array_equal(only.skin_force, touch.skin_force)

@@ -172,7 +172,7 @@ BAD = {
     "wrong type": (["--ppo.discount", "much"], "could not convert"),
     "out of range": (["--ppo.discount", "1.5"], "PPOConfig.discount = 1.5: must be between 0 and 1"),
     "environment value out of range": (["--env.gain", "7"], "TinyConfig.gain = 7 m: must be between"),
-    "corners of no ranges": (["--corners", "0.3"], "--corners 0.3: task 'tiny' has no ranges"),
+    "extremes of no ranges": (["--extremes", "0.3"], "--extremes 0.3: task 'tiny' has no ranges"),
     "unknown preset": (["--preset", "tpu"], "tpu"),
     "nothing to resume": (["--resume", "/nonexistent/run"], "no checkpoint to resume from"),
 }
@@ -193,12 +193,12 @@ def test_corners_are_for_training_alone():
     from dexsim.tasks.rotate.config import RotateConfig
 
     plain, _ = train.parse_arguments(["--task", "rotate", "--preset", "gpu"])
-    assert plain.corners == 0.6 and plain.env == RotateConfig()
+    assert plain.extremes == 0.6 and plain.env == RotateConfig()
     asked = trainer.training_config(plain)
-    assert asked.randomization.corners == asked.objects.corners == 0.6
+    assert asked.randomization.extremes == asked.objects.extremes == 0.6
     without = dataclasses.replace(asked, randomization=plain.env.randomization, objects=plain.env.objects)
     assert without == plain.env
-    off, _ = train.parse_arguments(["--task", "rotate", "--preset", "gpu", "--corners", "0"])
+    off, _ = train.parse_arguments(["--task", "rotate", "--preset", "gpu", "--extremes", "0"])
     assert trainer.training_config(off) == RotateConfig()
 
 

@@ -25,7 +25,7 @@ from dexsim.core import cli
 from dexsim.core.errors import CalibrationError, ConfigError
 from dexsim_real.calibrate import __main__ as calibrate
 from dexsim_real.calibrate import identify as calibrate_identify
-from dexsim_real.calibrate.__main__ import conclude, main
+from dexsim_real.calibrate.__main__ import fit_and_report, main
 from dexsim_real.calibrate.check import check_rest, dead_taxels, taxel_names
 from dexsim_real.calibrate.fit import fit
 from dexsim_real.calibrate.gauge import Gauge, parse_reading
@@ -95,7 +95,7 @@ def session(hand, tmp_path_factory):
     bench = BenchHand(hand, plates(hand, "index pad", "index side"), dead=((1, 52), (1, 110)))
     options, who = arguments(folder, plot=folder / "hand.png", report=folder / "hand.json"), operator()
     log = record(bench, hand, options, who)
-    conclude(options, hand, [log], who)
+    fit_and_report(options, hand, [log], who)
     return bench, options, log, who.console.file.getvalue()
 
 
@@ -151,7 +151,7 @@ def test_the_motors_come_on_late_stay_within_limits_and_go_off(hand, session):
 def test_a_log_gives_the_same_file_without_the_hand(hand, session, tmp_path):
     _, options, log, _ = session
     again = CalibrateArguments(from_log=(log,), output=tmp_path / "again.toml")
-    conclude(again, hand, again.from_log, operator())
+    fit_and_report(again, hand, again.from_log, operator())
     assert again.output.read_bytes() == options.output.read_bytes()
 
 
@@ -210,7 +210,7 @@ def scale(hand, tmp_path_factory):
     typist = Typist(bench)
     who = Operator(Console(file=typist, width=200), stream=typist)
     options = arguments(tmp_path_factory.mktemp("scale"), fingers=("middle",), gauge="ask", yes=False)
-    conclude(options, hand, [record(bench, hand, options, who)], who)
+    fit_and_report(options, hand, [record(bench, hand, options, who)], who)
     return bench, options, typist
 
 
@@ -461,9 +461,9 @@ def test_nothing_is_overwritten(hand, session, tmp_path):
     with pytest.raises(HandError, match="is there already: give another --output, or --force"):
         arguments(tmp_path)
     with pytest.raises(HandError, match=f"is there already: --from-log {re.escape(str(log))} fits these"):
-        conclude(options, hand, [log], operator())  # It came while the hand was pressing.
+        fit_and_report(options, hand, [log], operator())  # It came while the hand was pressing.
     assert path.read_text() == "precious"
-    conclude(arguments(tmp_path, force=True), hand, [log], operator())
+    fit_and_report(arguments(tmp_path, force=True), hand, [log], operator())
     assert load_calibration(path, hand).joint_names == hand.joint_names
 
 
@@ -628,7 +628,7 @@ def test_the_emulated_hand_gives_its_torque_constants_back(hand, tmp_path, seed)
     plant = PressBench(hand, seed)
     bench, press_bench.GAUGE = PlantPort(plant), lambda: plant.tip_force
     options = arguments(tmp_path, fingers=("middle",), press=PressConfig(), gauge="press_bench:read_gauge")
-    conclude(options, hand, [record(bench, hand, options)], operator())
+    fit_and_report(options, hand, [record(bench, hand, options)], operator())
     found, truth = -torque_constants(load_calibration(options.output, hand)), plant.truth()
     error = np.array([found[0] / truth["loading_nm_per_a"], found[1] / truth["unloading_nm_per_a"]])[:, 6:8] - 1
     # Its motors warm up by 15 K and so lose 1.5 %; ripple is 3 %; contact and taxels differ by a millimetre.

@@ -10,7 +10,7 @@ from dexsim import load_hand
 from dexsim_real.control.safety import Safety, SafetyConfig
 from dexsim_real.control.servo import Servo
 from dexsim_real.core.log import LogWriter
-from dexsim_real.core.process import come_first, stand_back, use_realtime
+from dexsim_real.core.process import lower_priority, raise_priority, use_realtime
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
 
 
@@ -66,8 +66,8 @@ def test_exchanges_come_first_and_the_log_last(tmp_path):
 
 def test_ordinary_threads_stay_ordinary():
     def shifted():
-        come_first()
-        stand_back()
+        raise_priority()
+        lower_priority()
         return os.sched_getscheduler(0)
 
     assert in_thread(shifted) == os.SCHED_OTHER

@@ -65,7 +65,7 @@ def drives(hand, heat=None, **overrides):
 
 
 def _lookup(config, path):
-    if path == "objects.bare_friction" and "bare_friction" not in config["objects"]:
+    if path == "objects.link_friction" and "link_friction" not in config["objects"]:
         path = "objects.friction"  # a policy from before the palm had one of its own
     for name in path.split("."):
         config = config[name]

@@ -1,0 +1,75 @@
+"""Fields of older versions, so that their policies, checkpoints and logs still load.
+
+A field that was renamed is moved to its new name; one that is gone is dropped. Either way the user gets one
+warning line per file. A dropped field names its old value, since an environment made from the file may differ.
+"""
+
+import copy
+import warnings
+from typing import Any
+
+from dexsim.core.errors import OldFileWarning
+
+FIELDS: dict[str, str | None] = {
+    "leash": "drop_radius",
+    "objects.bare_friction": "objects.link_friction",
+    "objects.corners": "objects.extremes",
+    "randomization.corners": "randomization.extremes",
+    "skin.bare": "skin.untaxelled",
+}
+"""Fields of a task's configuration: path to new path, or None for one that is gone."""
+
+ARGUMENTS: dict[str, str | None] = {"corners": "extremes"}
+"""Options of a training run, likewise; those under `env` are in `FIELDS`."""
+
+LEAVES: dict[str, str | None] = {}
+"""Prefixes of the paths of a checkpoint's arrays, likewise."""
+
+
+def migrate_config(config: dict[str, Any], where: Any) -> dict[str, Any]:
+    """A task's configuration from the file `where`, under today's names."""
+    return _migrate(config, FIELDS, where)
+
+
+def migrate_arguments(arguments: dict[str, Any], where: Any) -> dict[str, Any]:
+    """The options of a training run, `env` included."""
+    fields = ARGUMENTS | {f"env.{old}": new and f"env.{new}" for old, new in FIELDS.items()}
+    return _migrate(arguments, fields, where)
+
+
+def migrate_leaves(leaves: dict[str, Any]) -> dict[str, Any]:
+    """A checkpoint's arrays by path, under today's paths."""
+    moved = {}
+    for path, leaf in leaves.items():
+        old = next((old for old in LEAVES if path.startswith(old)), None)
+        if old is None:
+            moved[path] = leaf
+        elif (new := LEAVES[old]) is not None:
+            moved[new + path.removeprefix(old)] = leaf
+    return moved
+
+
+def _migrate(config: dict[str, Any], fields: dict[str, str | None], where: Any) -> dict[str, Any]:
+    config, changes = copy.deepcopy(config), []
+    for old, new in fields.items():
+        *groups, name = old.split(".")
+        group = _group(config, groups)
+        if group is None or name not in group:
+            continue
+        value = group.pop(name)
+        if new is None:
+            changes.append(f"{old} = {value!r} dropped")
+        else:
+            *groups, name = new.split(".")
+            target = _group(config, groups)
+            (config if target is None else target).setdefault(name, value)
+            changes.append(f"{old} is now {new}")
+    if changes:
+        warnings.warn(f"{where}: from an older version of dexsim: {', '.join(changes)}", OldFileWarning, stacklevel=4)
+    return config
+
+
+def _group(config: Any, names: list[str]) -> dict[str, Any] | None:
+    for name in names:
+        config = config.get(name) if isinstance(config, dict) else None
+    return config if isinstance(config, dict) else None
