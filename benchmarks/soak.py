@@ -38,7 +38,7 @@ RATES = {
 """Shares of all exchanges, of which there are 83 a second."""
 GATED = """
 import sys
-from dexsim_real import run, session
+from dexsim_real.run import __main__ as run, session
 prepare = session.Session.prepare
 def gated(self):
     print("ready", flush=True)

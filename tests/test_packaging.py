@@ -182,8 +182,8 @@ def test_installed_wheel_works_from_another_directory(wheel, tmp_path):
     found = run_python(
         """
 import dexsim, dexsim_ppo, dexsim_real
-from dexsim.assets import asset_path
-from dexsim.hand import load_hand
+from dexsim.core.assets import asset_path
+from dexsim.hand.load import load_hand
 load_hand()
 print(*(module.__file__ for module in (dexsim, dexsim_ppo, dexsim_real)))
 print(asset_path("hand/xhand_right.xml"))

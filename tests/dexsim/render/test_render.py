@@ -322,7 +322,7 @@ def test_notebook_figure_of_the_taxels(hand):
 def test_rendering_needs_no_opengl_and_no_pyplot():
     code = (
         "import sys, dexsim.render.render as r; assert not {'matplotlib', 'PIL'} & set(sys.modules);"
-        "import numpy as np; from dexsim.panel import force_color; force_color(np.ones(1), 1.0);"
+        "import numpy as np; from dexsim.render.panel import force_color; force_color(np.ones(1), 1.0);"
         "bad = {'OpenGL', 'glfw', 'matplotlib.pyplot', 'pyglet', 'mujoco.egl', 'imageio_ffmpeg'} & set(sys.modules);"
         "assert not bad, bad"
     )

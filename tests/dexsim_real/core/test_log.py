@@ -141,7 +141,7 @@ def test_killed_at_any_moment_all_but_the_last_moment_is_there(tmp_path):
     """SIGKILL, again and again: every log opens, and lacks at most half a second."""
     code = """
 import sys, time
-from dexsim_real.log import Kind, LogWriter
+from dexsim_real.core.log import Kind, LogWriter
 log = LogWriter(sys.argv[1])
 print("ready", flush=True)
 while True:

@@ -227,7 +227,7 @@ def test_an_action_that_is_not_finite_counts_as_none(hand):
 def jax_as_it_is(monkeypatch):
     """Runs within the tests' process leave the flags that other tests compile with alone."""
     monkeypatch.setattr(run, "prepare_jax", lambda: None)
-    monkeypatch.setattr(replay, "prepare_jax", lambda: None)
+    monkeypatch.setattr(replay_command, "prepare_jax", lambda: None)
 
 
 class FollowingHand(PtyHand):
@@ -597,7 +597,7 @@ import sys
 from dexsim import load_hand
 from dexsim_ppo.evaluate import load_policy
 from dexsim_real import run, replay
-from dexsim_real.control import Controller
+from dexsim_real.control.controller import Controller
 Controller(load_policy("grasp"), load_hand()).warm()
 print([name for name in sys.modules if "mjx" in name or name in ("warp", "brax", "cv2", "serial")])
 """

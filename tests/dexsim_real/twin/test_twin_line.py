@@ -560,7 +560,7 @@ def start(*options):
     return subprocess.Popen(
         [sys.executable, "-m", "dexsim_real.twin", "--plant", "twin_plant:make", "--no-realtime", *options],
         cwd=ROOT,
-        env={**os.environ, "PYTHONPATH": f"{ROOT}:{ROOT / 'tests'}"},
+        env={**os.environ, "PYTHONPATH": f"{ROOT}:{ROOT / 'tests' / 'support'}"},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
     )
