@@ -35,7 +35,7 @@ import dexsim
 from dexsim.core.cli import enable_caches
 from dexsim.core.compilation import collector_paused, jit
 from dexsim.env.env import Env
-from dexsim.tasks import TASKS
+from dexsim.registry import TASKS
 from dexsim_ppo.learner.rollout import scan_restarting
 
 
@@ -129,7 +129,7 @@ def make(task: str, left_out: str, backend: str, num_envs: int, kind: type[Env] 
         config = dataclasses.replace(config, randomization=dataclasses.replace(config.randomization, scale=0.0))
     hand = dexsim.load_hand()
     kind = kind or CLASSES.get(left_out, Env)
-    return kind(entry.task_class(config, hand), hand, backend=backend, num_envs=num_envs)
+    return kind(entry.task(config, hand), hand, backend=backend, num_envs=num_envs)
 
 
 def runner(env: Env, num_envs: int, steps: int, step: Callable | None = None) -> Callable:

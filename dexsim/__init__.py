@@ -1,28 +1,75 @@
 """dexsim: force-aware, tactile dexterous hands in JAX, from simulation to the hand.
 
-import dexsim
-env = dexsim.make("grasp")
-state = env.reset(jax.random.key(0))
-state = env.step(state, action)
+    import dexsim
+    env = dexsim.make("grasp")
+    state = env.reset(jax.random.key(0))
+    state = env.step(state, action)
+
+Names are imported at first use, so that a program that only runs a policy loads no physics.
 """
 
-from typing import Any
+from typing import TYPE_CHECKING
 
-from dexsim.core.errors import AssetError, CheckpointError, ConfigError, DexsimError
+from dexsim.core.door import open_door
+from dexsim.core.errors import (
+    AssetError,
+    CalibrationError,
+    CheckpointError,
+    ConfigError,
+    DexsimError,
+    DexsimWarning,
+    OldFileWarning,
+    OtherEnvWarning,
+)
+
+if TYPE_CHECKING:
+    from dexsim.env.config import EnvConfig
+    from dexsim.env.env import Env
+    from dexsim.env.state import State
+    from dexsim.env.task import Task
+    from dexsim.hand.kinematics import Hand
+    from dexsim.hand.load import load_hand
+    from dexsim.observation import Readings, observe
+    from dexsim.registry import make, register
+    from dexsim.task_spec import TaskSpec
 
 __version__ = "0.1.0"
-__all__ = ["AssetError", "CheckpointError", "ConfigError", "DexsimError", "load_hand", "make"]
+__all__ = [
+    "AssetError",
+    "CalibrationError",
+    "CheckpointError",
+    "ConfigError",
+    "DexsimError",
+    "DexsimWarning",
+    "Env",
+    "EnvConfig",
+    "Hand",
+    "OldFileWarning",
+    "OtherEnvWarning",
+    "Readings",
+    "State",
+    "Task",
+    "TaskSpec",
+    "load_hand",
+    "make",
+    "observe",
+    "register",
+]
 
-
-def make(task: str, config: Any = None, **options: Any) -> Any:
-    """An environment by name; see `dexsim.tasks.make`. MJX is imported only here."""
-    from dexsim.tasks import make as make_task
-
-    return make_task(task, config, **options)
-
-
-def load_hand(path: Any = None) -> Any:
-    """A hand from its TOML; see `dexsim.hand.load.load_hand`."""
-    from dexsim.hand.load import load_hand as load
-
-    return load(path)
+__getattr__, __dir__ = open_door(
+    __name__,
+    __all__,
+    {
+        "Env": "dexsim.env.env",
+        "EnvConfig": "dexsim.env.config",
+        "Hand": "dexsim.hand.kinematics",
+        "Readings": "dexsim.observation",
+        "State": "dexsim.env.state",
+        "Task": "dexsim.env.task",
+        "TaskSpec": "dexsim.task_spec",
+        "load_hand": "dexsim.hand.load",
+        "make": "dexsim.registry",
+        "observe": "dexsim.observation",
+        "register": "dexsim.registry",
+    },
+)

@@ -1,7 +1,47 @@
-"""PPO in pure JAX: train an environment, save a policy, run it anywhere."""
+"""PPO in pure JAX: train an environment, save a policy, run it anywhere.
 
-from dexsim_ppo.learner.config import PPOConfig
-from dexsim_ppo.learner.ppo import TrainState, make_train
-from dexsim_ppo.policy import Policy, act, load_policy
+    from dexsim_ppo import evaluate_policy, load_policy, train_policy
+    trained = train_policy("grasp", minutes=5)
+    report = evaluate_policy(trained.policy, episodes=256)
 
-__all__ = ["PPOConfig", "Policy", "TrainState", "act", "load_policy", "make_train"]
+Names are imported at first use: loading a policy loads neither MuJoCo nor MJX.
+"""
+
+from typing import TYPE_CHECKING
+
+from dexsim.core.door import open_door
+
+if TYPE_CHECKING:
+    from dexsim_ppo.evaluate import evaluate_policy
+    from dexsim_ppo.learner.config import PPOConfig
+    from dexsim_ppo.learner.ppo import TrainState, make_train
+    from dexsim_ppo.policy import Policy, act, load_policy
+    from dexsim_ppo.train import Trained, train_policy
+
+__all__ = [
+    "PPOConfig",
+    "Policy",
+    "TrainState",
+    "Trained",
+    "act",
+    "evaluate_policy",
+    "load_policy",
+    "make_train",
+    "train_policy",
+]
+
+__getattr__, __dir__ = open_door(
+    __name__,
+    __all__,
+    {
+        "PPOConfig": "dexsim_ppo.learner.config",
+        "Policy": "dexsim_ppo.policy",
+        "TrainState": "dexsim_ppo.learner.ppo",
+        "Trained": "dexsim_ppo.train",
+        "act": "dexsim_ppo.policy",
+        "evaluate_policy": "dexsim_ppo.evaluate",
+        "load_policy": "dexsim_ppo.policy",
+        "make_train": "dexsim_ppo.learner.ppo",
+        "train_policy": "dexsim_ppo.train",
+    },
+)

@@ -1,28 +1,36 @@
 """A trained policy: loads from one file, needs no simulator, runs anywhere JAX does.
 
+    policy = load_policy("grasp")        # a shipped one by name, or a file
+    action = policy(observation)
+
 `act(params, obs)` is the pure function, for use under `jit`, `vmap` and `scan`. `Policy` is what a file
 holds: those parameters together with the task, the observation's layout and the control rate.
 """
 
 import dataclasses
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dexsim.core import cli
 from dexsim.core.assets import asset_path
 from dexsim.core.config import from_dict, to_dict
-from dexsim.core.errors import AssetError, CheckpointError, ConfigError
+from dexsim.core.errors import AssetError, CheckpointError, ConfigError, OtherEnvWarning
 from dexsim.core.pytree import pytree_dataclass, static
+from dexsim.task_spec import TaskSpec
 from dexsim_ppo import checkpoint
 from dexsim_ppo.learner.networks import MLP, Layer, apply_mlp
 from dexsim_ppo.learner.running_stats import Normalizer, make_normalizer, normalize
 from dexsim_ppo.learner.types import Environment, Field, Fields, layout_size
-from dexsim_ppo.retired import migrate_config
+from dexsim_ppo.retired import migrate_config, old_spec
+
+if TYPE_CHECKING:
+    from dexsim.env.env import Env
+    from dexsim.hand.kinematics import Hand
 
 
 @pytree_dataclass
@@ -50,7 +58,7 @@ class Policy:
 
     task: str
     env_config: dict[str, Any]
-    """The task's configuration, as `dexsim.core.config.to_dict` gives it."""
+    """Configuration of the environment that it was trained in, as `dexsim.core.config.to_dict` gives it."""
     observation_layout: tuple[Field, ...]
     """Fields of the actor's observation."""
     params: PolicyParams
@@ -58,18 +66,20 @@ class Policy:
     """Actions per second, Hz."""
     training: dict[str, Any] = dataclasses.field(default_factory=dict)
     """Where it comes from: seed, steps, learner settings."""
+    spec: TaskSpec | None = None
+    """What a host must know of the task; None for an environment that is not of this library."""
 
     def __call__(self, obs: jax.Array) -> jax.Array:
         """Action `[..., A]` for an actor observation `[..., n]`."""
         return _act(self.params, obs)
 
-    def blind(self, *names: str) -> "Policy":
-        """This policy without some of its readings, which it takes for their mean in training from then on.
+    def ablate(self, *names: str) -> "Policy":
+        """This policy with some observation fields replaced by their mean in training.
 
-        Tells what a policy relies on. It is not what a policy trained without them would do.
+        Shows what the policy relies on. A policy that was trained without those fields may do better.
 
         Raises:
-          ConfigError: it has no such reading.
+          ConfigError: it observes no such field.
         """
         fields = sorted(field.name for field in self.observation_layout)
         if unknown := sorted(set(names) - set(fields)):
@@ -89,24 +99,71 @@ class Policy:
             "clip": self.params.normalizer.clip,
             "layers": len(self.params.layers),
             "training": self.training,
+            "spec": self.spec and to_dict(self.spec),
         }
         checkpoint.save(path, kind="policy", task=self.task, content=content, tree=self.params)
 
     @classmethod
-    def load(cls, path: str | Path, *, task: str | None = None) -> "Policy":
-        """Read a file.
+    def load(cls, name: str | Path, *, task: str | None = None) -> "Policy":
+        """Read a file, or a shipped policy by its name (`Policy.load("grasp")`).
 
         Args:
+          name: path of a file, or the name of a shipped policy.
           task: refuse a policy of another task; None takes any.
 
         Raises:
-          CheckpointError: see `dexsim_ppo.checkpoint.load`; or the parts do not fit together.
+          CheckpointError: there is no such policy; see `dexsim_ppo.checkpoint.load`; or the parts do not fit together.
         """
+        path = _find(name)
         file = checkpoint.load(path, kind="policy", task=task)
         try:
             return cls._from_file(file)
-        except (KeyError, TypeError, ValueError, IndexError) as error:
+        except (KeyError, TypeError, ValueError, IndexError, ConfigError) as error:
             raise CheckpointError(f"{path}: is not a sound policy ({error!r})") from None
+
+    def make_env(self, *, num_envs: int = 1, backend: str = "auto", hand: "Hand | None" = None, seed: int = 0) -> "Env":
+        """The environment that the policy was trained in.
+
+        Args:
+          num_envs, backend, hand, seed: see `dexsim.make`.
+
+        Raises:
+          ConfigError: its task is not registered.
+          CheckpointError: today's task gives another observation.
+        """
+        from dexsim.registry import find_task, make
+
+        config = from_dict(find_task(self.task).config_class, self.env_config)
+        env = make(self.task, config, backend=backend, num_envs=num_envs, hand=hand, seed=seed)
+        self.check_env(env)
+        return env
+
+    def check_env(self, env: Environment) -> None:
+        """Whether an environment is the one that the policy was trained in.
+
+        Warns (`OtherEnvWarning`) of settings that differ.
+
+        Raises:
+          CheckpointError: the environment's observation has other fields than the policy's.
+        """
+        given = layout_to_list(env.observation_layout["actor"])
+        if given != layout_to_list(self.observation_layout):
+            raise CheckpointError(
+                f"the policy observes {layout_to_list(self.observation_layout)}, and {env.name} gives {given}"
+            )
+        trained = from_dict(type(env.config), self.env_config)  # with today's defaults for fields that are newer
+        trained, now = _flat(to_dict(trained)), _flat(to_dict(env.config))
+        changed = [
+            f"{path} = {now.get(path)!r} (trained: {trained.get(path)!r})"
+            for path in sorted(trained.keys() | now.keys())
+            if trained.get(path) != now.get(path)
+        ]
+        if changed:
+            warnings.warn(
+                f"not the environment that the policy was trained in: {', '.join(changed)}",
+                OtherEnvWarning,
+                stacklevel=2,
+            )
 
     @classmethod
     def from_training(
@@ -134,6 +191,7 @@ class Policy:
             params=jax.tree.map(jnp.copy, params),
             control_rate=1.0 / env.control_period,
             training=training or {},
+            spec=getattr(env, "spec", None),
         )
 
     @classmethod
@@ -154,13 +212,15 @@ class Policy:
         ):
             raise ValueError(f"layer shapes {shapes} for {sizes[0]} observations")
         params = PolicyParams(layers, normalizer, content["squash"])
+        env_config = migrate_config(content["env_config"], file.path)
         return cls(
             task=file.task,
-            env_config=migrate_config(content["env_config"], file.path),
+            env_config=env_config,
             observation_layout=layout,
             params=jax.tree.map(jnp.asarray, params),
             control_rate=content["control_rate"],
             training=content["training"],
+            spec=_read_spec(file, env_config),
         )
 
 
@@ -169,25 +229,30 @@ def layout_to_list(fields: Fields) -> list[list[Any]]:
     return [[field.name, field.size, field.scale] for field in fields]
 
 
-def load_policy(name: str, *, task: str | None = None) -> Policy:
-    """A policy from a file, or a shipped one by its name; of that task, if one is given."""
-    if Path(name).exists() or "/" in name or name.endswith(".msgpack"):
-        return Policy.load(name, task=task)
+def load_policy(name: str | Path, *, task: str | None = None) -> Policy:
+    """A policy from a file, or a shipped one by its name: the same as `Policy.load`."""
+    return Policy.load(name, task=task)
+
+
+def _find(name: str | Path) -> Path:
+    """The file of a policy that is named by a path, or by the name of a shipped one."""
+    text = str(name)
+    if Path(text).exists() or "/" in text or text.endswith(".msgpack"):
+        return Path(text)
     try:
-        return Policy.load(asset_path(f"policies/{name}.msgpack"), task=task)
+        return Path(asset_path(f"policies/{text}.msgpack"))
     except AssetError:
-        raise CheckpointError(f"{name}: no such file, and no shipped policy has that name") from None
+        raise CheckpointError(f"{text}: no such file, and no shipped policy has that name") from None
 
 
-def make_env(policy: Policy, *, backend: str, num_envs: int) -> Environment:
-    """The environment that a policy was trained in."""
-    import dexsim
+def _read_spec(file: checkpoint.Checkpoint, env_config: dict[str, Any]) -> TaskSpec | None:
+    if file.content.get("spec"):
+        return from_dict(TaskSpec, file.content["spec"])
+    return old_spec(file.task, env_config) if file.task in ("grasp", "rotate") else None
 
-    entry = cli.find_task(policy.task)
-    env = dexsim.make(policy.task, from_dict(entry.config_class, policy.env_config), backend=backend, num_envs=num_envs)
-    if layout_to_list(env.observation_layout["actor"]) != layout_to_list(policy.observation_layout):
-        raise CheckpointError(
-            f"the policy observes {layout_to_list(policy.observation_layout)}, and "
-            f"{env.name} gives {layout_to_list(env.observation_layout['actor'])}"
-        )
-    return env
+
+def _flat(config: Any, path: str = "") -> dict[str, Any]:
+    """Nested plain data as one mapping from path to value."""
+    if not isinstance(config, dict):
+        return {path: config}
+    return {k: v for name, value in config.items() for k, v in _flat(value, f"{path}.{name}" if path else name).items()}

@@ -5,10 +5,16 @@ warning line per file. A dropped field names its old value, since an environment
 """
 
 import copy
+import dataclasses
+import math
 import warnings
 from typing import Any
 
-from dexsim.core.errors import OldFileWarning
+from dexsim import observation
+from dexsim.control import Control
+from dexsim.core.config import from_dict
+from dexsim.core.errors import CheckpointError, OldFileWarning
+from dexsim.task_spec import TaskSpec, TurnSpec
 
 FIELDS: dict[str, str | None] = {
     "leash": "drop_radius",
@@ -47,6 +53,47 @@ def migrate_leaves(leaves: dict[str, Any]) -> dict[str, Any]:
         elif (new := LEAVES[old]) is not None:
             moved[new + path.removeprefix(old)] = leaf
     return moved
+
+
+def old_spec(task: str, config: dict[str, Any]) -> TaskSpec:
+    """The task's specification for a file from before files carried one.
+
+    Raises:
+      CheckpointError: of a task that did not exist then.
+    """
+    if task not in ("grasp", "rotate"):
+        raise CheckpointError(f"a policy of the task {task!r} without a task specification: train it with this version")
+    sensing = config.get("sensing", {})
+    common = {
+        "name": task,
+        "posture": tuple(config["posture"]),
+        "control": from_dict(Control, {k: v for k, v in config["control"].items() if k in _fields(Control)}),
+        "observation": from_dict(observation.ObservationConfig, config["observation"]),
+        "object_axes": tuple(sensing.get("object_axes", (True, False, False))),
+        "velocity_filter": sensing.get("velocity_filter", 0.5),
+    }
+    if task == "grasp":
+        return TaskSpec(fields=observation.GRASP, gravity=(9.81, 0.0, 0.0), reference=(0.055, -0.005, 0.090), **common)
+    tilt, roll = config["tilt"], config["roll"]
+    level = 9.81 * math.cos(roll)
+    turn = TurnSpec(
+        axis=tuple(config["axis"]),
+        step=config["direction"] * config["goal_step"],
+        angle=config["goal_angle"],
+        distance=config["goal_distance"],
+        spin=config["goal_spin"],
+    )
+    return TaskSpec(
+        fields=observation.ROTATE,
+        gravity=(-level * math.cos(tilt), 9.81 * math.sin(roll), -level * math.sin(tilt)),
+        reference=tuple(config["reference"]),
+        turn=turn,
+        **common,
+    )
+
+
+def _fields(cls: type) -> set[str]:
+    return {field.name for field in dataclasses.fields(cls)}
 
 
 def _migrate(config: dict[str, Any], fields: dict[str, str | None], where: Any) -> dict[str, Any]:

@@ -11,19 +11,21 @@ import argparse
 import contextlib
 import dataclasses
 import datetime
+import json
 import shlex
 import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 
 from dexsim.core import cli
 from dexsim.core.config import from_dict
-from dexsim.core.errors import ConfigError
+from dexsim.core.errors import ConfigError, DexsimError
+from dexsim.registry import find_task
 from dexsim_ppo import checkpoint
 from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.curriculum import Curriculum
@@ -35,16 +37,85 @@ from dexsim_ppo.training.trainer import Run, TrainArguments, printable, training
 from dexsim_ppo.training.warm_start import check_fit, learner_settings
 
 
+class Trained(NamedTuple):
+    """What a finished training leaves."""
+
+    policy: Policy
+    """The best policy by its evaluations during training, else the last one."""
+    report: dict[str, Any]
+    """`report.json`: the trained against the untrained policy on the same episodes."""
+    folder: Path
+    """The run's folder."""
+
+
+def train_policy(
+    task: str | None = None,
+    config: Any = None,
+    *,
+    ppo: PPOConfig | None = None,
+    preset: str = "auto",
+    policy: str = "",
+    resume: str | Path | None = None,
+    **options: Any,
+) -> Trained:
+    """Train a task from Python: what `python -m dexsim_ppo.train` does.
+
+    Args:
+      task: a registered name; None for grasp, or the task of `policy` or `resume`.
+      config: the task's settings; None for the defaults.
+      ppo: the learner's settings; None for the preset's.
+      preset: sizes and durations, "auto", "cpu" or "gpu".
+      policy: a policy to fine-tune, a file or the name of a shipped one.
+      resume: folder of a run, or one of its checkpoints, to resume.
+      options: other fields of `TrainArguments`, such as `minutes=5`, `seed=1`, `run_dir=Path("runs/mine")`.
+
+    Raises:
+      ConfigError: an unknown task or option, or a value out of range.
+      CheckpointError: the file to begin from is unsound, or does not fit.
+      DexsimError: training diverged, or was stopped by a signal.
+    """
+    started = time.perf_counter()
+    cli.enable_caches()
+    begun = find_beginning(task, policy, resume)
+    arguments = default_arguments(task, preset, begun)
+    given = {"env": config, "ppo": ppo, "policy": policy or None, "resume": resume and Path(resume)} | options
+    if "steps" in options and "minutes" not in options:
+        given["minutes"] = 0.0
+    unknown = sorted(set(options) - {field.name for field in dataclasses.fields(TrainArguments)})
+    if unknown:
+        raise ConfigError(f"train_policy has no option {unknown[0]!r}")
+    arguments = dataclasses.replace(arguments, **{name: value for name, value in given.items() if value is not None})
+    run, stopped = run_training(arguments, begun, started, command="train_policy(...)")
+    if stopped:
+        raise DexsimError(f"training was stopped; resume it with train_policy(resume={str(run.folder.path)!r})")
+    return Trained(Policy.load(run.chosen), json.loads(run.folder.report.read_text()), run.folder.path)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """The command. Returns its exit code."""
     started = time.perf_counter()
     argv = list(sys.argv[1:] if argv is None else argv)
     cli.enable_caches()
     arguments, begun = parse_arguments(argv)
-    resumed = begun if isinstance(begun, checkpoint.Checkpoint) else None
-    path = resumed.path.parent.parent if resumed else new_run_path(arguments)
+    command = shlex.join(["python", "-m", "dexsim_ppo.train", *argv])
+    run, stopped = run_training(arguments, begun, started, command)
+    if stopped:
+        print(
+            f"stopped by {signal.Signals(stopped).name}; resume with: "
+            f"python -m dexsim_ppo.train --resume {shlex.quote(str(run.folder.path))}"
+        )
+        return 128 + stopped
+    return 0
+
+
+def run_training(
+    arguments: TrainArguments, begun: checkpoint.Checkpoint | Policy | None, started: float, command: str
+) -> tuple[Run, int]:
+    """Train, then evaluate and report; the run, and the number of the signal that stopped it or 0."""
     import dexsim
 
+    resumed = begun if isinstance(begun, checkpoint.Checkpoint) else None
+    path = resumed.path.parent.parent if resumed else new_run_path(arguments)
     env = dexsim.make(
         arguments.task, training_config(arguments), backend=arguments.backend, num_envs=arguments.ppo.num_envs
     )
@@ -53,64 +124,68 @@ def main(argv: Sequence[str] | None = None) -> int:
         if begun:
             check_fit(begun, env, arguments.ppo)
         folder.checkpoints.mkdir(parents=True)
-        command = shlex.join(["python", "-m", "dexsim_ppo.train", *argv])
         cli.write_json(
             folder.config, {"command": command, "arguments": printable(arguments)} | cli.environment_report()
         )
     run = Run(env, arguments, folder, started)
     with stop_on_signals() as stopped:
         run.train(begun, stopped)
-    if stopped():
-        print(
-            f"stopped by {signal.Signals(stopped()).name}; go on with: "
-            f"python -m dexsim_ppo.train --resume {shlex.quote(str(folder.path))}"
-        )
-        return 128 + stopped()
-    run.finish()
-    return 0
+    if not stopped():
+        run.finish(command)
+    return run, stopped()
 
 
 # --- options ------------------------------------------------------------------------------------------
 
 
+def find_beginning(
+    task: str | None, policy: str | None, resume: str | Path | None
+) -> checkpoint.Checkpoint | Policy | None:
+    """What a run begins from: the checkpoint to resume, the policy to fine-tune, or nothing."""
+    name = task and task.rpartition(":")[2]
+    if task:
+        find_task(task)
+    if resume and policy:
+        raise ConfigError("--policy begins a run and --resume resumes one: give one of them")
+    if resume:
+        path = Path(resume)
+        file = path if path.is_file() else RunFolder(path).latest_checkpoint()
+        return checkpoint.load(file, kind="train", task=name)
+    return load_policy(policy, task=name) if policy else None
+
+
+def default_arguments(task: str | None, preset: str, begun: checkpoint.Checkpoint | Policy | None) -> TrainArguments:
+    """The options' defaults: the preset's, or those of what the run begins from."""
+    name = begun.task if begun else (task or "grasp").rpartition(":")[2]
+    entry = find_task(name)
+    if isinstance(begun, checkpoint.Checkpoint):
+        return arguments_from_dict(entry.config_class, migrate_arguments(begun.content["arguments"], begun.path))
+    default = preset_arguments(name, entry.config(), preset)
+    if begun:
+        env = from_dict(entry.config_class, begun.env_config)
+        default = dataclasses.replace(default, env=env, ppo=learner_settings(begun, default.ppo))
+    return default
+
+
 def parse_arguments(argv: list[str]) -> tuple[TrainArguments, checkpoint.Checkpoint | Policy | None]:
-    """Options, on top of the preset's or of the resumed run's; and what there is to go on with: that run's
-    checkpoint or a finished policy."""
+    """The command's options, and what the run begins from."""
     early = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     for name in ("--task", "--preset", "--resume", "--policy"):
         early.add_argument(name, nargs="?")
     known, _ = early.parse_known_args(argv)
-    resumed = None
-    if known.resume:
-        path = Path(known.resume)
-        file = path if path.is_file() else RunFolder(path).latest_checkpoint()
-        resumed = checkpoint.load(file, kind="train", task=known.task)
-    if resumed and known.policy:
-        raise ConfigError("--policy begins a run and --resume goes on with one: give one of them")
-    policy = load_policy(known.policy, task=known.task) if known.policy else None
-    begun = resumed or policy
-    task = begun.task if begun else known.task or "grasp"
-    entry = cli.find_task(task)
-    config_class = entry.config_class
-    if resumed:
-        default = arguments_from_dict(config_class, migrate_arguments(resumed.content["arguments"], resumed.path))
-    else:
-        default = preset_arguments(task, entry.config(), known.preset or "auto")
-        if policy:
-            default = dataclasses.replace(
-                default, env=from_dict(config_class, policy.env_config), ppo=learner_settings(policy, default.ppo)
-            )
+    begun = find_beginning(known.task, known.policy, known.resume)
+    default = default_arguments(known.task, known.preset or "auto", begun)
     given = {argument.split("=")[0] for argument in argv}
     if "--steps" in given and "--minutes" not in given:
         default = dataclasses.replace(default, minutes=0.0)
     arguments = cli.parse(
-        TrainArguments[config_class],
+        TrainArguments[type(default.env)],
         argv,
         default=default,
         prog="python -m dexsim_ppo.train",
         description="Train a task.",
     )
-    return arguments, begun
+    return dataclasses.replace(arguments, task=default.task), begun
 
 
 def preset_arguments(task: str, env_config: Any, name: str) -> TrainArguments:
@@ -136,7 +211,7 @@ def new_run_path(arguments: TrainArguments) -> Path:
     if arguments.run_dir:
         if arguments.run_dir.exists():
             raise ConfigError(
-                f"--run-dir {arguments.run_dir}: exists already; choose another, or go on with it through --resume"
+                f"--run-dir {arguments.run_dir}: exists already; choose another, or resume it with --resume"
             )
         return arguments.run_dir
     stem = Path("runs") / f"{arguments.task}-{datetime.datetime.now():%Y%m%d-%H%M%S}"

@@ -1,5 +1,59 @@
-"""The bridge to a real hand: frames, driver, readings, safety, log and replay, control loop.
+"""The bridge to a real hand: frames, driver, readings, safety limits, log and replay, control loop.
 
-`python -m dexsim_real.run` runs a policy on a hand; docs/hardware.md explains the parts. Needs
-neither a GPU nor MJX, and pyserial only where a port is opened.
+`python -m dexsim_real.run` runs a policy on a hand; docs/hardware.md is the manual. The bridge needs neither a GPU
+nor MJX, and pyserial only where a port is opened. Names are imported at first use.
 """
+
+from typing import TYPE_CHECKING
+
+from dexsim.core.door import open_door
+
+if TYPE_CHECKING:
+    from dexsim_real.control.controller import Controller
+    from dexsim_real.control.safety import Safety, SafetyConfig
+    from dexsim_real.core.errors import HandError
+    from dexsim_real.core.log import LogReader, LogWriter
+    from dexsim_real.sensors.hand import HandSensing, HardwareConfig, Measured
+    from dexsim_real.sensors.readings import ObjectEstimate, make_readings
+    from dexsim_real.wire.link import HandPort, LinkConfig
+    from dexsim_real.wire.serial_hand import SerialHand, open_port
+
+__all__ = [
+    "Controller",
+    "HandError",
+    "HandPort",
+    "HandSensing",
+    "HardwareConfig",
+    "LinkConfig",
+    "LogReader",
+    "LogWriter",
+    "Measured",
+    "ObjectEstimate",
+    "Safety",
+    "SafetyConfig",
+    "SerialHand",
+    "make_readings",
+    "open_port",
+]
+
+__getattr__, __dir__ = open_door(
+    __name__,
+    __all__,
+    {
+        "Controller": "dexsim_real.control.controller",
+        "HandError": "dexsim_real.core.errors",
+        "HandPort": "dexsim_real.wire.link",
+        "HandSensing": "dexsim_real.sensors.hand",
+        "HardwareConfig": "dexsim_real.sensors.hand",
+        "LinkConfig": "dexsim_real.wire.link",
+        "LogReader": "dexsim_real.core.log",
+        "LogWriter": "dexsim_real.core.log",
+        "Measured": "dexsim_real.sensors.hand",
+        "ObjectEstimate": "dexsim_real.sensors.readings",
+        "Safety": "dexsim_real.control.safety",
+        "SafetyConfig": "dexsim_real.control.safety",
+        "SerialHand": "dexsim_real.wire.serial_hand",
+        "make_readings": "dexsim_real.sensors.readings",
+        "open_port": "dexsim_real.wire.serial_hand",
+    },
+)

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from dexsim.core.assets import cache_path
-from dexsim.core.errors import DexsimError, OldFileWarning
+from dexsim.core.errors import DexsimError, DexsimWarning
 from dexsim.core.files import write_whole
 
 T = TypeVar("T")
@@ -45,7 +45,7 @@ def run(main: Callable[[Sequence[str] | None], int]) -> None:
 
 def _show_warning(message: Warning | str, category: type[Warning], *place: Any, **options: Any) -> None:
     """Our own warnings as one line; others as Python has them."""
-    if issubclass(category, OldFileWarning):
+    if issubclass(category, DexsimWarning):
         print(f"warning: {message}", file=sys.stderr)
     else:
         sys.stderr.write(warnings.formatwarning(message, category, *place[:2]))
@@ -131,17 +131,3 @@ def plain(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
-
-
-def find_task(name: str) -> Any:
-    """The task's entry, with `config_class`.
-
-    Raises:
-      ConfigError: there is no such task; names those that exist.
-    """
-    import dexsim.tasks
-    from dexsim.core.errors import ConfigError
-
-    if name not in dexsim.tasks.TASKS:
-        raise ConfigError(f"unknown task {name!r}: choose from {', '.join(dexsim.tasks.TASKS)}")
-    return dexsim.tasks.TASKS[name]

@@ -9,7 +9,15 @@ class ConfigError(DexsimError):
     """A configuration value is unknown, of the wrong type or out of range."""
 
 
-class OldFileWarning(UserWarning):
+class DexsimWarning(UserWarning):
+    """Base of every warning. Command-line tools print it as one line."""
+
+
+class OtherEnvWarning(DexsimWarning):
+    """A policy is used in an environment that it was not trained in."""
+
+
+class OldFileWarning(DexsimWarning):
     """A file of an older version was read; says which of its fields were renamed or dropped."""
 
 

@@ -37,6 +37,7 @@ from dexsim.randomization import Draw, sample, tilted_down
 from dexsim.render.snapshot import Snapshot
 from dexsim.sensing.config import Sensing
 from dexsim.sensing.imu import SensorDraw
+from dexsim.task_spec import TaskSpec
 from dexsim.touch.feel import Touch, feel_links, keep_normal_part, split_force, taxel_share
 from dexsim.touch.surface import taxels_only, whole_surface
 
@@ -97,6 +98,11 @@ class Env:
     def control_rate(self) -> float:
         """Control ticks per second, Hz."""
         return 1.0 / self.control_period
+
+    @property
+    def spec(self) -> TaskSpec:
+        """What a host must know to run this task's policies."""
+        return TaskSpec.of(self.task)
 
     def fingerprint(self) -> str | None:
         """A hash of what the compiled `reset` and `step` depend on; None if it cannot tell."""

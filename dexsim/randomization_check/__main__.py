@@ -67,7 +67,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     import tyro
 
     import dexsim
-    from dexsim.tasks import TASKS
+    from dexsim.registry import find_task
 
     arguments = tyro.cli(
         CheckArguments,
@@ -76,9 +76,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         description="Show that every range of the randomisation has an effect.",
     )
     try:
-        if arguments.task not in TASKS:
-            raise DexsimError(f"no task {arguments.task!r}: choose from {', '.join(TASKS)}")
-        config = dataclasses.replace(TASKS[arguments.task].config(), pool_size=80)
+        config = dataclasses.replace(find_task(arguments.task).config(), pool_size=80)
         env = dexsim.make(arguments.task, config, backend=arguments.backend, num_envs=arguments.num_envs)
         keys = jax.random.split(jax.random.key(arguments.seed), arguments.num_envs)
         with collector_paused():

@@ -1,8 +1,6 @@
 """One training run: compile, loop, measure, save, report."""
 
 import dataclasses
-import shlex
-import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -303,10 +301,17 @@ class Run:
         self.folder.prune(self.arguments.keep_checkpoints)
         self._policy(state).save(self.folder.last)
 
-    def finish(self) -> None:
-        """Evaluate trained and untrained policy on the same episodes; curve, report and video."""
-        arguments, folder = self.arguments, self.folder
-        chosen = folder.best if folder.best.exists() else folder.last
+    @property
+    def chosen(self) -> Path:
+        """The file of the policy that the run is judged by: the best, or else the last one."""
+        return self.folder.best if self.folder.best.exists() else self.folder.last
+
+    def finish(self, command: str) -> None:
+        """Evaluate trained and untrained policy on the same episodes; curve, report and video.
+
+        `command` is what started the run, for the report.
+        """
+        arguments, folder, chosen = self.arguments, self.folder, self.chosen
         print(f"evaluating {chosen.name} and the untrained policy", flush=True)
         begin = time.perf_counter()
         trained, untrained = Policy.load(chosen), Policy.load(folder.untrained)
@@ -328,7 +333,7 @@ class Run:
                 name: reports["trained"][name]["low"] > reports["untrained"][name]["high"]
                 for name in ("held", "return", "steps_held")
             },
-            "command": shlex.join(["python", "-m", "dexsim_ppo.train", *sys.argv[1:]]),
+            "command": command,
             "arguments": printable(arguments),
             "timing": self.clock,
         } | cli.environment_report()

@@ -13,18 +13,14 @@ import jax
 import numpy as np
 
 from dexsim.control import move_target, observed_action
-from dexsim.core.config import from_dict
 from dexsim.hand.kinematics import Hand
 from dexsim.observation import Field, ObservationConfig, Readings, layout, observe
-from dexsim.tasks import TASKS
 from dexsim_ppo.policy import Policy
 from dexsim_real.core.errors import HandError
 from dexsim_real.sensors.hand import Measured
 from dexsim_real.sensors.readings import ObjectEstimate, make_readings, sources_of
 
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
-SIMULATION = ("physics", "objects", "randomization", "skin", "reward")
-"""Parts of a task's configuration that a hand has no use for: a policy outlives changes in them."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,19 +50,6 @@ def make_observe(hand: Hand, names: tuple[str, ...], config: ObservationConfig) 
     return jax.jit(lambda readings: observe(hand, readings, names, config))
 
 
-def load_task(name: str, config: dict[str, Any], hand: Hand) -> Any:
-    """The rules of a policy's task, configured as in training where a hand can tell; no MJX.
-
-    Raises:
-      HandError: there is no such task.
-    """
-    if name not in TASKS:
-        raise HandError(f"the policy is of the task {name!r}; known are {', '.join(TASKS)}")
-    entry = TASKS[name]
-    needed = {key: value for key, value in config.items() if key not in SIMULATION}
-    return entry.task_class(from_dict(entry.config_class, needed), hand)
-
-
 class Controller:
     """The policy between readings and joint targets.
 
@@ -76,17 +59,19 @@ class Controller:
 
     def __init__(self, policy: Policy, hand: Hand):
         self.policy, self.hand = policy, hand
-        self.task = load_task(policy.task, policy.env_config, hand)
-        config = self.task.config
-        names = self.task.fields["actor"]
+        if policy.spec is None:
+            raise HandError(f"the policy of the task {policy.task!r} carries no task specification")
+        self.spec = policy.spec
+        self.spec.check_hand(hand)
+        names, config = self.spec.fields, self.spec.observation
         wanted = tuple(Field(f.name, f.size, f.scale) for f in policy.observation_layout)
-        if layout(hand, names, config.observation) != wanted:
+        if layout(hand, names, config) != wanted:
             raise HandError(f"the policy's observation does not fit this version's task {policy.task!r}")
         self.sources = sources_of([field.name for field in wanted])
         self.period = 1.0 / policy.control_rate
-        self._observe = make_observe(hand, names, config.observation)
-        self._move = jax.jit(lambda *arrays: move_target(config.control, hand, *arrays))
-        self._recall = jax.jit(lambda *arrays: observed_action(config.control, hand, *arrays))
+        self._observe = make_observe(hand, names, config)
+        self._move = jax.jit(lambda *arrays: move_target(self.spec.control, hand, *arrays))
+        self._recall = jax.jit(lambda *arrays: observed_action(self.spec.control, hand, *arrays))
         self.start(np.zeros(hand.num_joints, np.float32))
 
     def warm(self) -> None:

@@ -17,8 +17,9 @@ from dexsim import load_hand
 from dexsim.calibration.maps import load_calibration
 from dexsim.core.config import from_dict
 from dexsim.observation import Field, Readings, layout
-from dexsim_ppo.retired import migrate_config
-from dexsim_real.control.controller import load_task, make_observe
+from dexsim.task_spec import TaskSpec
+from dexsim_ppo.retired import old_spec
+from dexsim_real.control.controller import make_observe
 from dexsim_real.core.log import Kind, LogError, LogReader
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig, Measured
 from dexsim_real.wire import frames
@@ -112,8 +113,8 @@ def _rebuild(meta: dict[str, Any]) -> tuple[HandSensing, Any, tuple[Field, ...]]
             calibration = load_calibration(path, hand)
     sensing = HandSensing(hand, from_dict(HardwareConfig, meta["hardware"]), calibration)
     sensing.tare = np.array(meta["tare"], np.float32)
-    task = load_task(meta["task"], migrate_config(meta["env_config"], "the log"), hand)
-    names, config = task.fields["actor"], task.config.observation
+    spec = from_dict(TaskSpec, meta["spec"]) if "spec" in meta else old_spec(meta["task"], meta["env_config"])
+    names, config = spec.fields, spec.observation
     return sensing, make_observe(hand, names, config), layout(hand, names, config)
 
 

@@ -87,9 +87,9 @@ class Session:
         if self.servo.wait_fresh(1.0) is None:
             raise HandError(f"{self.arguments.port}: the hand answered once and then no more")
         self.objects = ObjectSensors(self.arguments, self.controller)
-        task = self.controller.task
-        if self.arguments.imu and hasattr(task.config, "goal_step"):
-            self.goals = TurnGoals(task.config, task.reference)
+        spec = self.controller.spec
+        if self.arguments.imu and spec.turn:
+            self.goals = TurnGoals(spec.turn, np.asarray(spec.reference))
 
     def run(self) -> None:
         """Motors on, approach, and the policy until the time is over or `Safety` ends it."""
@@ -156,7 +156,7 @@ class Session:
     def _approach(self) -> None:
         """To the start posture, and hold it until the object is there."""
         arguments, start = self.arguments, self._pose()
-        goal = np.asarray(getattr(self.controller.task.config, "posture", start), np.float32)
+        goal = np.asarray(self.controller.spec.posture or start, np.float32)
         goal = goal if arguments.approach > 0 else start
         begin, pace = time.monotonic(), Pace(arguments.rate)
         ready = begin + arguments.approach + arguments.place
@@ -246,7 +246,7 @@ class Session:
             Kind.META,
             {
                 "task": policy.task,
-                "env_config": policy.env_config,
+                "spec": to_dict(policy.spec),
                 "policy": arguments.policy,
                 "policy_sha256": digest.hexdigest(),
                 "calibration": text,

@@ -18,26 +18,25 @@ class ObjectSensors:
     """
 
     def __init__(self, arguments: RunArguments, controller: Controller):
-        task, needed = controller.task, controller.sources
-        self._reference = np.asarray(task.reference, float)
+        spec, needed = controller.spec, controller.sources
+        self._reference = np.asarray(spec.reference, float)
         self._camera: HeightSensor | None = None
         self._imu: Imu | None = None
         if "imu" in needed and not arguments.imu:
             raise HandError("the policy observes the object's orientation: give the IMU's port with --imu")
         if "camera" in needed and not (arguments.camera or arguments.fixed_object):
             raise HandError("the policy observes the object's height: give --camera, or --fixed-object")
-        sensing = task.config.sensing
         try:
             if arguments.camera:
                 self._camera = HeightSensor(
                     open_masks(arguments.camera, arguments.optics),
                     arguments.optics,
                     self._reference,
-                    sensing.object_axes,
-                    sensing.velocity_filter,
+                    spec.object_axes,
+                    spec.velocity_filter,
                 )
             if arguments.imu:
-                self._imu = Imu(arguments.imu, -np.asarray(task.gravity), arguments.imu_mount)
+                self._imu = Imu(arguments.imu, -np.asarray(spec.gravity), arguments.imu_mount)
                 self._imu.wait()
         except BaseException:
             self.close()

@@ -118,15 +118,15 @@ class VirtualCamera:
     """Masks of the object and the bridge's height sensor, without a socket."""
 
     def __init__(self, plant: EmulatedHand, controller: Controller):
-        sensing = controller.task.config.sensing
+        spec = controller.spec
         self._plant, self._config = plant, ObjectConfig()
         self._parts = [outline(part) for part in plant.shape.parts]
         self.sensor = HeightSensor(
             lambda: None,
             self._config.optics,
-            np.asarray(controller.task.reference, float),
-            sensing.object_axes,
-            sensing.velocity_filter,
+            np.asarray(spec.reference, float),
+            spec.object_axes,
+            spec.velocity_filter,
         )
 
     def sample(self, time: float) -> None:
@@ -169,7 +169,7 @@ class VirtualRun:
         self._schedule, self._now = Schedule(), 0.0
         self._state: np.ndarray | None = None
         self._mode, self._wish = Mode.PASSIVE, hand.joint_lower
-        self.imu = VirtualImu(plant, -np.asarray(controller.task.gravity))
+        self.imu = VirtualImu(plant, -np.asarray(controller.spec.gravity))
         self.camera = VirtualCamera(plant, controller) if "camera" in controller.sources else None
         self.goals: TurnGoals | None = None
         self.ticks, self.sums = 0, np.zeros(5)
@@ -194,9 +194,9 @@ class VirtualRun:
             self._until(self._now + 1 / RATE)
         if "imu" in self.controller.sources:
             self.imu.calibrate()
-        task = self.controller.task
-        if hasattr(task.config, "goal_step"):
-            self.goals = TurnGoals(task.config, task.reference)
+        spec = self.controller.spec
+        if spec.turn:
+            self.goals = TurnGoals(spec.turn, np.asarray(spec.reference))
         self.controller.start(self._pose())
         anchor, began, tick = self.safety.anchor, self._now, 0
         while self.plant.trial == trial and self._now < began + limit:
@@ -212,7 +212,7 @@ class VirtualRun:
 
     def _tick(self) -> None:
         measured = self.safety.sample.measured
-        position, velocity = np.asarray(self.controller.task.reference, float), np.zeros(3)
+        position, velocity = np.asarray(self.controller.spec.reference, float), np.zeros(3)
         if self.camera:
             _, position, velocity = self.camera.sensor.read()
         seen = ObjectEstimate(position, velocity, self.imu.read())

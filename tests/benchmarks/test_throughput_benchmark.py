@@ -12,7 +12,7 @@ from paths import ROOT
 from simple_physics import SimplePhysics
 
 from dexsim.objects.config import ObjectConfig
-from dexsim.tasks import TASKS, TaskEntry
+from dexsim.registry import TASKS, TaskEntry
 from dexsim.tasks.grasp.config import GraspConfig
 from dexsim.tasks.grasp.task import Grasp
 

@@ -10,7 +10,7 @@ from dexsim.core.assets import asset_path
 from dexsim.core.config import from_dict
 from dexsim.core.errors import ConfigError
 from dexsim.observation import GRASP, ROTATE, layout
-from dexsim.tasks import TASKS
+from dexsim.registry import TASKS
 from dexsim_ppo.policy import Policy, layout_to_list
 from dexsim_real.sensors.readings import sources_of
 
@@ -77,16 +77,16 @@ def test_its_report_is_of_this_file_and_says_how_it_came_about(name):
     assert not report["arguments"]["env"]["randomization"].get("beyond") and "beyond" not in report["command"]
 
 
-def test_a_blinded_policy_takes_the_mean_of_what_it_does_not_see():
+def test_an_ablated_policy_takes_the_mean_of_what_it_does_not_see():
     policy = load("rotate")
     names = ("contact_force", "relative_orientation")
     hidden = np.concatenate([np.full(f.size, f.name in names) for f in policy.observation_layout])
     obs = np.random.default_rng(0).normal(size=(20, 65)).astype(np.float32)
     mean = np.asarray(policy.params.normalizer.mean)
-    blind = policy.blind(*names)
-    np.testing.assert_allclose(blind(obs), policy(np.where(hidden, mean, obs)), atol=2e-5)
-    np.testing.assert_array_equal(blind(obs), blind(np.where(hidden, 9.0, obs)))
-    assert np.max(np.abs(np.asarray(blind(obs)) - np.asarray(policy(obs)))) > 0.1
-    np.testing.assert_array_equal(policy.blind()(obs), policy(obs))
+    ablated = policy.ablate(*names)
+    np.testing.assert_allclose(ablated(obs), policy(np.where(hidden, mean, obs)), atol=2e-5)
+    np.testing.assert_array_equal(ablated(obs), ablated(np.where(hidden, 9.0, obs)))
+    assert np.max(np.abs(np.asarray(ablated(obs)) - np.asarray(policy(obs)))) > 0.1
+    np.testing.assert_array_equal(policy.ablate()(obs), policy(obs))
     with pytest.raises(ConfigError, match="does not observe colour; it observes .*joint_position"):
-        policy.blind("colour")
+        policy.ablate("colour")

@@ -5,19 +5,20 @@ import types
 from tiny_env import TinyConfig, TinyEnv
 
 import dexsim
-import dexsim.tasks
+from dexsim import registry
 
-ENTRY = types.SimpleNamespace(config_class=TinyConfig, config=TinyConfig, env_class=TinyEnv)
+ENTRY = types.SimpleNamespace(config_class=TinyConfig, config=TinyConfig)
 
 
-def make(task, config=None, *, backend="auto", num_envs=1):
+def make(task, config=None, *, backend="auto", num_envs=1, **_):
     assert task == "tiny"
     return TinyEnv(config, backend=backend, num_envs=num_envs)
 
 
 def install(patch):
     """Put the task among the tasks for as long as a `pytest.MonkeyPatch` lasts."""
-    patch.setitem(dexsim.tasks.TASKS, "tiny", ENTRY)
+    patch.setitem(registry.TASKS, "tiny", ENTRY)
+    patch.setattr(registry, "make", make)
     patch.setattr(dexsim, "make", make, raising=False)
 
 
@@ -25,6 +26,6 @@ if __name__ == "__main__":
     from dexsim.core import cli
     from dexsim_ppo import train
 
-    dexsim.tasks.TASKS["tiny"] = ENTRY
-    dexsim.make = make
+    registry.TASKS["tiny"] = ENTRY
+    registry.make = dexsim.make = make
     cli.run(train.main)

@@ -11,6 +11,7 @@ from dexsim.core.errors import ConfigError
 from dexsim.env.config import EnvConfig
 from dexsim.objects.config import ObjectConfig
 from dexsim.observation import ObservationConfig
+from dexsim.task_spec import TurnSpec
 from dexsim.tasks.rotate.objects import KINDS
 
 
@@ -163,7 +164,18 @@ class RotateConfig(EnvConfig):
     @property
     def unit_axis(self) -> np.ndarray:
         """The axis of rotation [3], of length one."""
-        return np.asarray(self.axis, float) / np.linalg.norm(self.axis)
+        return self.turn.unit_axis
+
+    @property
+    def turn(self) -> TurnSpec:
+        """The goals, as a host follows them."""
+        return TurnSpec(
+            axis=self.axis,
+            step=self.direction * self.goal_step,
+            angle=self.goal_angle,
+            distance=self.goal_distance,
+            spin=self.goal_spin,
+        )
 
 
 def paper() -> RotateConfig:

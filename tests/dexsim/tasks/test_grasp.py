@@ -17,7 +17,7 @@ from dexsim.env.task import GroundTruth
 from dexsim.hand.kinematics import forward_kinematics
 from dexsim.objects.config import SHAPES, ObjectConfig
 from dexsim.physics.config import PhysicsConfig
-from dexsim.tasks import TASKS
+from dexsim.registry import TASKS
 from dexsim.tasks.grasp.config import GraspConfig, GraspReward
 from dexsim.tasks.grasp.task import (
     COMMANDS,

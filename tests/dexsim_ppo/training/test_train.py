@@ -218,7 +218,7 @@ def test_files_are_never_overwritten_or_mistaken(finished, tmp_path, monkeypatch
         (evaluate.main, [str(finished.best), "--episodes", "0"], "at least 1"),
         (evaluate.main, [str(finished.best), "--set", "colour=red"], "has no field 'colour'"),
         (evaluate.main, [str(finished.best), "--set", "colour"], "'colour': expected NAME=VALUE"),
-        (evaluate.main, [str(finished.best), "--blind", "colour"], "does not observe colour"),
+        (evaluate.main, [str(finished.best), "--ablate", "colour"], "does not observe colour"),
         (evaluate.main, [], "policy"),
     ):
         assert exit_code(main, arguments) == 2

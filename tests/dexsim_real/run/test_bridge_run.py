@@ -37,6 +37,7 @@ from dexsim.randomization import Randomization
 from dexsim.sensing.config import Sensing
 from dexsim.sensing.imu import OrientationSensor
 from dexsim.sensing.taxel_reading import TaxelSensor
+from dexsim.task_spec import TaskSpec
 from dexsim.tasks.grasp.config import GraspConfig
 from dexsim.tasks.grasp.task import Grasp
 from dexsim.tasks.rotate.config import RotateConfig
@@ -104,7 +105,7 @@ class Acts:
 
     def __init__(self, task, hand, act):
         config = task.config
-        self.act, self.task, self.env_config = act, task.name, to_dict(config)
+        self.act, self.task, self.spec = act, task.name, TaskSpec.of(task)
         self.control_rate = 1 / config.physics.control_period
         self.observation_layout = layout(hand, task.fields["actor"], config.observation)
 
@@ -452,7 +453,7 @@ def test_a_policy_that_dies_leaves_the_hand_safe(tmp_path, monkeypatch, failure,
     died = []
 
     def tick(self, *inputs):
-        if next(count) > 15 and self.task is not None:
+        if next(count) > 15 and self.spec is not None:
             died.append(time.monotonic())
             if failure == "raises":
                 raise RuntimeError("the policy broke")
@@ -633,6 +634,7 @@ def rotate_policy(hand, path):
         observation_layout=fields,
         params=params,
         control_rate=1 / config.physics.control_period,
+        spec=TaskSpec.of(Rotate(config, hand)),
     ).save(path)
 
 

@@ -281,7 +281,7 @@ def seen(angle, axis=(1.0, 0, 0), place=(0.048, 0.0, 0.085)):
 @pytest.mark.parametrize("direction", [1, -1])
 def test_goals_move_on_as_in_the_task(direction):
     config = RotateConfig(direction=direction)
-    goals = TurnGoals(config, config.reference)
+    goals = TurnGoals(config.turn, config.reference)
     rate, period, turns = 0.8 * direction, 0.03, 0
     for k in range(600):
         wanted = np.asarray(goal_quat(turns, np.asarray(config.axis), direction * config.goal_step))
@@ -296,7 +296,7 @@ def test_goals_move_on_as_in_the_task(direction):
 
 def test_a_goal_passed_at_speed_or_far_away_does_not_count():
     config = RotateConfig(goal_spin=2.0)
-    fast, far = TurnGoals(config, config.reference), TurnGoals(config, config.reference)
+    fast, far = TurnGoals(config.turn, config.reference), TurnGoals(config.turn, config.reference)
     for k in range(40):
         fast.update(0.03 * k, seen(6.0 * 0.03 * k))
         far.update(0.03 * k, seen(1.0 * 0.03 * k, place=(0.2, 0, 0.085)))

@@ -17,7 +17,7 @@ from dexsim import load_hand
 from dexsim.core.assets import asset_path
 from dexsim.core.config import to_dict
 from dexsim.randomization import tilted_down
-from dexsim.tasks import TASKS as TRAINED
+from dexsim.registry import TASKS as TRAINED
 from dexsim_real.core.errors import HandError
 from dexsim_real.twin.plant import assistant, referee, scene, shapes
 from dexsim_real.twin.plant.assistant import PLACES, POSTURES, REFERENCES, Assistant, Stage, find_place, put
@@ -98,7 +98,7 @@ def test_bands_repeat_the_ranges_of_the_tasks_and_of_the_shipped_policies(task):
 
 def test_rules_and_places_are_those_of_the_tasks(hand):
     for task in TASKS:
-        rules = TRAINED[task].task_class(TRAINED[task].config_class(), hand)
+        rules = TRAINED[task].task(TRAINED[task].config_class(), hand)
         assert REFERENCES[task] == pytest.approx(rules.reference)
         assert nominal_gravity(task) == pytest.approx(rules.gravity)
     config = rules.config
@@ -114,7 +114,7 @@ def test_rules_and_places_are_those_of_the_tasks(hand):
 def test_a_cube_is_put_in_the_middle_of_trainings_starts(hand, monkeypatch, tmp_path):
     monkeypatch.setenv("DEXSIM_CACHE", str(tmp_path))
     entry = TRAINED["rotate"]
-    rules = entry.task_class(dataclasses.replace(entry.config_class(), pool_size=64), hand)
+    rules = entry.task(dataclasses.replace(entry.config_class(), pool_size=64), hand)
     starts = rules.make_pool(jax.random.key(0)).qpos[:, 13:15]
     assert np.all(np.abs(starts.mean(0) - PLACES["rotate"]) < 0.6 * starts.std(0))
 

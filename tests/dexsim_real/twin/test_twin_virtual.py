@@ -10,7 +10,8 @@ from paths import ROOT
 
 from dexsim import load_hand
 from dexsim.calibration.maps import current_from_counts, normalised_torque
-from dexsim.tasks import TASKS
+from dexsim.registry import make_task
+from dexsim.task_spec import TaskSpec
 from dexsim_real.control.controller import Tick
 from dexsim_real.sensors.hand import HardwareConfig
 from dexsim_real.twin.plant.plant import EmulatedHand, nominal_gravity
@@ -39,7 +40,7 @@ class Scripted:
     period = 0.03
 
     def __init__(self, hand, task, script, sources=()):
-        self.hand, self.task = hand, TASKS[task].task_class(TASKS[task].config_class(), hand)
+        self.hand, self.spec = hand, TaskSpec.of(make_task(task, hand))
         self.sources, self._script, self.seen = set(sources), script, []
 
     def start(self, target):
@@ -126,7 +127,7 @@ def test_the_camera_measures_the_height(hand):
         plant = EmulatedHand(hand, "grasp", 3, kind="nominal", overrides=CALM, shape=shape)
         controller = Scripted(hand, "grasp", lambda k, target: target, {"camera"})
         camera = VirtualCamera(plant, controller)
-        reference = np.array(controller.task.reference)
+        reference = np.array(controller.spec.reference)
         place = plant._data.qpos[plant._scene.object_qpos :][:3]
         place[:] = reference + (0.01, 0.0, 0.0)
         plant.advance(0.0)

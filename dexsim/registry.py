@@ -1,0 +1,153 @@
+"""Tasks by name: those of the library, those that installed packages bring, and the user's own.
+
+dexsim.register("poke", Poke)        # Poke(config: PokeConfig, hand: Hand)
+env = dexsim.make("poke")
+"""
+
+import dataclasses
+import importlib
+import importlib.metadata
+import inspect
+import typing
+from collections.abc import Callable
+from typing import Any
+
+from dexsim.core.errors import ConfigError
+from dexsim.env.config import EnvConfig
+from dexsim.env.env import Env
+from dexsim.env.task import Task
+from dexsim.hand.kinematics import Hand
+from dexsim.hand.load import load_hand
+from dexsim.tasks.grasp.config import GraspConfig
+from dexsim.tasks.grasp.task import Grasp
+from dexsim.tasks.rotate import config as rotate
+from dexsim.tasks.rotate.task import Rotate
+
+PLUGINS = "dexsim.tasks"
+"""Entry-point group in which an installed package names the modules that register its tasks."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TaskEntry:
+    """How a task is made."""
+
+    config_class: type[EnvConfig]
+    task: Callable[[Any, Hand], Task]
+    """`task(config, hand)`: the rules; see `dexsim.env.task.Task`."""
+    config: Callable[[], EnvConfig]
+    """Makes the configuration that the name stands for."""
+
+
+TASKS: dict[str, TaskEntry] = {
+    "grasp": TaskEntry(GraspConfig, Grasp, GraspConfig),
+    "rotate": TaskEntry(rotate.RotateConfig, Rotate, rotate.RotateConfig),
+    "rotate_paper": TaskEntry(rotate.RotateConfig, Rotate, rotate.paper),
+    "rotate_without_orientation": TaskEntry(rotate.RotateConfig, Rotate, rotate.without_orientation),
+    "rotate_clear": TaskEntry(rotate.RotateConfig, Rotate, rotate.clear_of_palm),
+}
+
+
+def register(
+    name: str, factory: Callable[[Any, Hand], Task], config: type[EnvConfig] | Callable[[], EnvConfig] | None = None
+) -> None:
+    """Add a task, so that `make`, training, evaluation and resuming find it by name.
+
+    Commands find it too where `--task` names the module that registers it (`--task my_module:poke`), or where an
+    installed package lists that module under the entry-point group `dexsim.tasks`.
+
+    Args:
+      name: a word; must be new, unless the same factory is registered again (a notebook cell that is run twice).
+      factory: `factory(config, hand) -> Task`, usually the task's class.
+      config: its configuration class, an `EnvConfig`, or a function without arguments that makes the default
+        configuration. By default the type annotation of the factory's first parameter.
+
+    Raises:
+      ConfigError: the name is taken or no word, or no configuration class can be found.
+    """
+    if not isinstance(name, str) or not name.isidentifier():
+        raise ConfigError(f"register({name!r}, ...): the name must be a word, such as 'poke'")
+    make_config = _annotated_config(name, factory) if config is None else config
+    default = make_config()
+    if not isinstance(default, EnvConfig):
+        raise ConfigError(f"register({name!r}, ...): the configuration is a {type(default).__name__}, not an EnvConfig")
+    taken = TASKS.get(name)
+    if taken is not None and getattr(taken.task, "__qualname__", None) != getattr(factory, "__qualname__", ""):
+        raise ConfigError(f"register({name!r}, ...): there is a task of that name already")
+    TASKS[name] = TaskEntry(type(default), factory, make_config)
+
+
+def find_task(name: str) -> TaskEntry:
+    """The entry of a task by its name, or by `module:name` of the module that registers it.
+
+    Raises:
+      ConfigError: there is no such task or module.
+    """
+    module, _, word = name.rpartition(":")
+    if module:
+        _import(module)
+    if word not in TASKS:
+        for plugin in importlib.metadata.entry_points(group=PLUGINS):
+            plugin.load()
+    if word not in TASKS:
+        hint = "" if module else f"; a task of your own needs its module: --task my_module:{word}"
+        raise ConfigError(f"unknown task {word!r}: choose from {', '.join(sorted(TASKS))}{hint}")
+    return TASKS[word]
+
+
+def make(
+    task: str,
+    config: EnvConfig | None = None,
+    *,
+    backend: str = "auto",
+    num_envs: int = 1,
+    hand: Hand | None = None,
+    seed: int = 0,
+) -> Env:
+    """An environment.
+
+    Args:
+      task: a name in `TASKS`, registered ones included.
+      config: the task's config dataclass; None for what the name stands for.
+      backend: physics, "auto", "jax" or "warp".
+      num_envs: batch size that Warp's contact buffers are sized for.
+      hand: a `Hand` from `load_hand`; None for the shipped one.
+      seed: of the pool of start states.
+
+    Raises:
+      ConfigError: unknown task, a config of another task, or `num_envs` below 1.
+    """
+    if num_envs < 1:
+        raise ConfigError(f"make({task!r}, num_envs={num_envs}): must be at least 1")
+    hand = load_hand() if hand is None else hand
+    return Env(make_task(task, hand, config), hand, backend=backend, num_envs=num_envs, seed=seed)
+
+
+def make_task(name: str, hand: Hand, config: EnvConfig | None = None) -> Task:
+    """The rules of a task, without an environment round them; see `make`."""
+    entry = find_task(name)
+    config = entry.config() if config is None else config
+    if not isinstance(config, entry.config_class):
+        raise ConfigError(f"task {name!r} takes a {entry.config_class.__name__}, not a {type(config).__name__}")
+    return entry.task(config, hand)
+
+
+def _annotated_config(name: str, factory: Callable) -> type[EnvConfig]:
+    signature = factory.__init__ if inspect.isclass(factory) else factory
+    try:
+        hints = typing.get_type_hints(signature)
+        first = next(p for p in inspect.signature(factory).parameters)
+    except (NameError, StopIteration, TypeError, ValueError):
+        hints, first = {}, ""
+    found = hints.get(first)
+    if not (inspect.isclass(found) and issubclass(found, EnvConfig)):
+        raise ConfigError(
+            f"register({name!r}, ...): annotate the factory's first parameter with its EnvConfig, or give config="
+        )
+    return found
+
+
+def _import(module: str) -> None:
+    try:
+        importlib.import_module(module)
+    except ImportError as error:
+        raise ConfigError(f"task module {module!r}: cannot be imported ({error})") from None
