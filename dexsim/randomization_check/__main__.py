@@ -66,8 +66,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """The command. Returns its exit code: 0, or 2 where a range has no effect."""
     import tyro
 
-    import dexsim
-    from dexsim.registry import find_task
+    from dexsim.registry import find_task, make
 
     arguments = tyro.cli(
         CheckArguments,
@@ -77,7 +76,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     try:
         config = dataclasses.replace(find_task(arguments.task).config(), pool_size=80)
-        env = dexsim.make(arguments.task, config, backend=arguments.backend, num_envs=arguments.num_envs)
+        env = make(arguments.task, config, backend=arguments.backend, num_envs=arguments.num_envs)
         keys = jax.random.split(jax.random.key(arguments.seed), arguments.num_envs)
         with collector_paused():
             states = jax.block_until_ready(jax.jit(jax.vmap(env.reset))(keys))

@@ -1,0 +1,91 @@
+"""Tasks by name: what `register` takes and refuses, and how a name is found."""
+
+import dataclasses
+import sys
+
+import pytest
+
+import dexsim
+from dexsim import ConfigError, registry
+from dexsim.env.config import EnvConfig
+from dexsim.tasks.grasp.config import GraspConfig
+from dexsim.tasks.grasp.task import Grasp
+
+
+@pytest.fixture(autouse=True)
+def same_tasks_afterwards(monkeypatch):
+    monkeypatch.setattr(registry, "TASKS", dict(registry.TASKS))
+    monkeypatch.delitem(sys.modules, "poke_task", raising=False)
+
+
+class Mine(Grasp):
+    """Grasp under another name."""
+
+    name = "mine"
+
+    def __init__(self, config: GraspConfig, hand: dexsim.Hand):
+        super().__init__(config, hand)
+
+
+def test_a_registered_task_is_made_by_name_with_its_annotated_configuration(hand):
+    dexsim.register("mine", Mine)
+    task = registry.make_task("mine", hand)
+    assert isinstance(task, Mine) and task.config == GraspConfig()
+    assert registry.find_task("mine").config_class is GraspConfig
+
+
+def test_a_factory_without_annotations_names_its_configuration(hand):
+    default = dataclasses.replace(GraspConfig(), push_speed=0.1)
+    with pytest.raises(ConfigError, match="annotate the factory's first parameter"):
+        dexsim.register("mine", lambda config, hand: Mine(config, hand))
+    dexsim.register("mine", lambda config, hand: Mine(config, hand), config=lambda: default)
+    assert registry.make_task("mine", hand).config == default
+
+
+def test_the_same_task_may_be_registered_again_and_no_other(hand):
+    dexsim.register("mine", Mine)
+    dexsim.register("mine", Mine)
+    with pytest.raises(ConfigError, match="'grasp'.*there is a task of that name"):
+        dexsim.register("grasp", Mine)
+
+
+@pytest.mark.parametrize("name", ["", "two words", "a:b", "a/b", None, 3])
+def test_a_name_is_a_word(name):
+    with pytest.raises(ConfigError, match="must be a word"):
+        dexsim.register(name, Mine)
+
+
+def test_a_configuration_is_an_env_config():
+    with pytest.raises(ConfigError, match="is a dict, not an EnvConfig"):
+        dexsim.register("mine", Mine, config=dict)
+    assert issubclass(GraspConfig, EnvConfig)
+
+
+def test_a_module_is_named_with_the_task(hand):
+    assert registry.find_task("poke_task:poke").config().gain == 3.0
+    assert registry.make_task("poke", hand).name == "poke"
+    with pytest.raises(ConfigError, match="task module 'no_such_module': cannot be imported"):
+        registry.find_task("no_such_module:poke")
+    with pytest.raises(ConfigError, match="unknown task 'prod': choose from grasp, poke, rotate"):
+        registry.find_task("poke_task:prod")
+
+
+def test_an_installed_package_brings_tasks_by_its_entry_point(monkeypatch, hand):
+    class Point:
+        def load(self):
+            dexsim.register("mine", Mine)
+
+    asked = []
+    monkeypatch.setattr(registry.importlib.metadata, "entry_points", lambda *, group: asked.append(group) or [Point()])
+    assert registry.find_task("mine").task is Mine and asked == ["dexsim.tasks"]
+
+
+def test_what_make_refuses():
+    for name, options, message in (
+        ("juggle", {}, "unknown task 'juggle': choose from grasp, rotate.*--task my_module:juggle"),
+        ("rotate", {"config": GraspConfig()}, "takes a RotateConfig, not a GraspConfig"),
+        ("grasp", {"num_envs": 0}, r"num_envs=0\): must be at least 1"),
+        ("grasp", {"num_envs": -3}, "must be at least 1"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            dexsim.make(name, options.pop("config", None), **options)

@@ -1,0 +1,94 @@
+"""A task of one's own from registering to resuming, over simple physics: train, evaluate, fine-tune, resume by name."""
+
+import json
+import sys
+import warnings
+
+import jax
+import numpy as np
+import pytest
+from simple_physics import SimplePhysics
+
+from dexsim import ConfigError, OtherEnvWarning, registry
+from dexsim.core.config import override
+from dexsim_ppo import Policy, evaluate_policy, train_policy
+from dexsim_ppo import evaluate as evaluate_command
+from dexsim_ppo import train as train_command
+from dexsim_ppo.learner.config import PPOConfig
+
+SMALL = PPOConfig(num_envs=8, rollout_length=4, epochs=1, minibatches=1, actor_layers=(8,), critic_layers=(8,))
+SIZES = {"evaluation_chunk": 4, "evaluation_episodes": 4, "video": False}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A finished run of two iterations, in a process that has registered the task by naming its module."""
+    patch = pytest.MonkeyPatch()
+    patch.setattr("dexsim.env.env.Physics", SimplePhysics)
+    patch.setattr(registry, "TASKS", dict(registry.TASKS))
+    patch.delitem(sys.modules, "poke_task", raising=False)
+    folder = tmp_path_factory.mktemp("own") / "run"
+    yield train_policy("poke_task:poke", ppo=SMALL, backend="jax", steps=64, run_dir=folder, seed=3, **SIZES)
+    patch.undo()
+
+
+def test_training_by_name_leaves_a_policy_of_that_task(run):
+    assert run.policy.task == run.report["task"] == "poke" and run.policy.env_config["gain"] == 3.0
+    assert run.policy.spec is not None and run.policy.spec.name == "poke"
+    assert run.report["arguments"]["ppo"]["num_envs"] == 8
+    assert {"trained", "untrained"} <= run.report.keys() and (run.folder / "last.msgpack").exists()
+    assert json.loads((run.folder / "config.json").read_text())["arguments"]["task"] == "poke"
+
+
+def test_the_policy_makes_the_environment_that_it_was_trained_in(run):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        env = run.policy.make_env(backend="jax")
+        run.policy.check_env(env)
+    assert env.config.gain == 3.0 and env.config.pool_size == 4
+    action = run.policy(env.reset(jax.random.key(0)).obs["actor"])
+    assert action.shape == (12,) and np.all(np.abs(action) <= 1)
+
+
+def test_evaluation_by_name_and_from_python_agree(run, tmp_path, capsys):
+    report = evaluate_policy(run.folder / "last.msgpack", episodes=4, chunk=4, backend="jax", seed=5)
+    code = evaluate_command.main(
+        [str(run.folder / "last.msgpack"), "--task", "poke_task:poke", "--episodes", "4", "--chunk", "4"]
+        + ["--backend", "jax", "--seed", "5", "--output", str(tmp_path / "report.json")]
+    )
+    written = json.loads((tmp_path / "report.json").read_text())
+    assert code == 0 and "poke" in capsys.readouterr().out
+    assert written["return"] == pytest.approx(report["return"]) and report["episodes"] == 4
+
+
+def test_another_environment_is_warned_of_and_another_observation_refused(run):
+    other = Policy.load(run.folder / "last.msgpack")
+    changed = override(other.env_config, ["gain=1.5"])
+    env = registry.make("poke", registry.find_task("poke").config_class(gain=1.5), backend="jax", num_envs=4)
+    with pytest.warns(OtherEnvWarning, match=r"gain = 1\.5 \(trained: 3\.0\)"):
+        evaluate_policy(other, env=env, episodes=4, chunk=4)
+    assert changed["gain"] == 1.5
+
+
+def test_resuming_by_name_goes_on_where_it_stopped(run):
+    again = train_policy(resume=run.folder, steps=96, **SIZES)
+    assert again.folder == run.folder and again.report["origin"]["iteration"] == 3
+    assert again.policy.task == "poke"
+
+
+def test_fine_tuning_begins_with_the_policy(run, tmp_path):
+    tuned = train_policy(
+        policy=str(run.folder / "last.msgpack"), ppo=SMALL, backend="jax", steps=32, run_dir=tmp_path / "tuned", **SIZES
+    )
+    assert tuned.policy.task == "poke" and tuned.policy.training["policy"].endswith("last.msgpack")
+
+
+def test_what_is_refused(run):
+    with pytest.raises(ConfigError, match="no option 'epochs'"):
+        train_policy("poke", epochs=3)
+    with pytest.raises(ConfigError, match="give one of them"):
+        train_policy(policy="grasp", resume=run.folder)
+    with pytest.raises(ConfigError, match="unknown task 'juggle'"):
+        train_policy("juggle")
+    with pytest.raises(ConfigError, match="unknown task 'juggle'"):
+        train_command.main(["--task", "juggle"])

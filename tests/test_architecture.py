@@ -1,0 +1,235 @@
+"""The map of the house, read from the sources: floors, circles, sizes, and what each package may import.
+
+A room is a folder of a package; a module at a package's root is a room of its own.
+"""
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import pytest
+from paths import ROOT
+
+PACKAGES = ("dexsim", "dexsim_ppo", "dexsim_real")
+
+FLOORS = {
+    "dexsim": (
+        ("core",),
+        ("geometry", "actuator"),
+        ("hand",),
+        ("objects", "control", "randomization", "touch"),
+        ("sensing", "render", "calibration", "identification", "observation"),
+        ("task_spec", "physics.jax_backend"),
+        ("physics",),
+        ("env",),
+        ("tasks",),
+        ("registry",),
+        ("randomization_check", "wrappers"),
+        ("",),
+    ),
+    "dexsim_ppo": (
+        ("learner",),
+        ("retired",),
+        ("checkpoint",),
+        ("policy",),
+        ("evaluate",),
+        ("training",),
+        ("train",),
+        ("",),
+    ),
+    "dexsim_real": (
+        ("core",),
+        ("wire",),
+        ("sensors",),
+        ("control",),
+        ("run", "replay", "calibrate"),
+        ("twin.plant",),
+        ("twin.wire",),
+        ("twin",),
+        ("",),
+    ),
+}
+"""Rooms of each package from the ground up. A room imports only from rooms below it; "" is the package's door."""
+
+FOREIGN = {
+    "dexsim": (),
+    "dexsim_ppo.learner": ("dexsim.core",),
+    "dexsim_ppo": ("dexsim",),
+    "dexsim_real": ("dexsim", "dexsim_ppo"),
+}
+"""What a package, or a room of it, may take from other packages."""
+
+
+@cache
+def modules() -> dict[str, Path]:
+    """All modules of the three packages, by dotted name."""
+    found = {}
+    for package in PACKAGES:
+        for path in sorted((ROOT / package).rglob("*.py")):
+            name = ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+            found[name] = path
+    return found
+
+
+@cache
+def imports(module: str) -> frozenset[str]:
+    """Our modules that this one imports anywhere in it, except for types alone."""
+    tree = ast.parse(modules()[module].read_text())
+    ignored = {id(node) for block in _type_checking_blocks(tree) for node in ast.walk(block)}
+    found = set()
+    for node in ast.walk(tree):
+        if id(node) in ignored:
+            continue
+        if isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{module}: relative import"
+            names = [f"{node.module}.{alias.name}" for alias in node.names]
+            found |= {name if name in modules() else str(node.module) for name in names}
+        elif isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+    return frozenset(name for name in found if name.partition(".")[0] in PACKAGES)
+
+
+def _type_checking_blocks(tree: ast.AST) -> Iterator[ast.If]:
+    for node in ast.walk(tree):
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+            yield node
+
+
+def split(module: str) -> tuple[str, str]:
+    """Package and room of a module."""
+    package, _, rest = module.partition(".")
+    rooms = [room for floor in FLOORS[package] for room in floor if room]
+    inside = [room for room in rooms if rest == room or rest.startswith(f"{room}.")]
+    return package, max(inside, key=len, default="")
+
+
+def arrows() -> Iterator[tuple[str, str]]:
+    """(importing module, imported module), between different modules."""
+    for module in modules():
+        for other in imports(module):
+            assert other in modules(), f"{module} imports {other}, which does not exist"
+            if other != module:
+                yield module, other
+
+
+def test_every_room_is_on_the_map():
+    for package in PACKAGES:
+        rooms = {split(name)[1] for name in modules() if name.startswith(f"{package}.")}
+        listed = {room for floor in FLOORS[package] for room in floor}
+        assert rooms | {""} == listed
+        strays = [name for name in modules() if name.startswith(f"{package}.") and split(name)[1] == ""]
+        assert strays == [], "a module at a package's root has no floor"
+
+
+def test_a_room_imports_only_from_floors_below():
+    wrong = []
+    for module, other in arrows():
+        (package, room), (other_package, other_room) = split(module), split(other)
+        if package != other_package or room == other_room:
+            continue
+        level = {name: i for i, floor in enumerate(FLOORS[package]) for name in floor}
+        if other_room != "" and level[other_room] >= level[room] or other_room == "" and other != package:
+            wrong.append(f"{module} -> {other}")
+    assert wrong == []
+
+
+def test_nothing_inside_a_package_uses_its_door():
+    assert [f"{m} -> {o}" for m, o in arrows() if o in PACKAGES and m.startswith(f"{o}.")] == []
+
+
+def test_packages_take_from_others_only_what_they_may():
+    wrong = []
+    for module, other in arrows():
+        if module.partition(".")[0] == other.partition(".")[0]:
+            continue
+        place = max((p for p in FOREIGN if module == p or module.startswith(f"{p}.")), key=len)
+        if not any(other == allowed or other.startswith(f"{allowed}.") for allowed in FOREIGN[place]):
+            wrong.append(f"{module} -> {other}")
+    assert wrong == []
+
+
+def test_no_module_is_in_a_circle():
+    state: dict[str, int] = {}
+
+    def visit(module: str, path: tuple[str, ...]) -> None:
+        state[module] = 1
+        for other in sorted(imports(module)):
+            assert state.get(other) != 1 or other == module, f"circle: {' -> '.join((*path, module, other))}"
+            if other not in state:
+                visit(other, (*path, module))
+        state[module] = 2
+
+    for module in modules():
+        if module not in state:
+            visit(module, ())
+
+
+def test_folders_and_files_are_small():
+    folders = {path.parent for path in modules().values()}
+    crowded = {
+        str(folder.relative_to(ROOT)): count
+        for folder in folders
+        if (count := sum(path.name != "__init__.py" for path in folder.glob("*.py"))) > 15
+    }
+    long = {name: lines for name, path in modules().items() if (lines := len(path.read_text().splitlines())) > 350}
+    assert (crowded, long) == ({}, {})
+
+
+def test_rooms_have_a_docstring_and_nothing_else():
+    for name, path in modules().items():
+        if path.name == "__init__.py" and name not in PACKAGES:
+            (only,) = ast.parse(path.read_text()).body
+            assert isinstance(only, ast.Expr) and ast.get_docstring(ast.parse(path.read_text())), name
+
+
+# --- what importing costs -------------------------------------------------------------------------------
+
+
+def loaded_by(code: str) -> set[str]:
+    """Modules that a fresh interpreter has loaded after this code."""
+    done = subprocess.run(
+        [sys.executable, "-c", f"{code}\nimport sys\nprint(*sys.modules)"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    return set(done.stdout.splitlines()[-1].split())
+
+
+def inside(loaded: set[str], *packages: str) -> set[str]:
+    return {name for name in loaded if any(name == p or name.startswith(f"{p}.") for p in packages)}
+
+
+@pytest.mark.parametrize("module", ["dexsim_ppo.policy", "dexsim_ppo.learner"])
+def test_policies_and_learner_load_no_simulator(module):
+    names = [name for name in modules() if name == module or name.startswith(f"{module}.")]
+    loaded = loaded_by("\n".join(f"import {name}" for name in names))
+    assert set(names) <= loaded
+    assert (
+        inside(loaded, "mujoco", "mujoco.mjx", "warp", "brax", "dexsim.physics", "dexsim.env", "dexsim.tasks") == set()
+    )
+
+
+def test_running_a_policy_on_a_hand_loads_no_simulation():
+    """MuJoCo reads the hand's MJCF, and nothing else of it is used."""
+    code = """
+from dexsim import load_hand
+from dexsim_ppo import load_policy
+from dexsim_real import Controller
+import dexsim_real.run.__main__
+Controller(load_policy("grasp"), load_hand()).warm()
+"""
+    loaded = loaded_by(code)
+    assert "mujoco" in loaded and "dexsim_real.run.session" in loaded
+    forbidden = ("mujoco.mjx", "warp", "brax", "cv2", "serial", "dexsim.physics", "dexsim.env", "dexsim.tasks")
+    assert inside(loaded, *forbidden, "dexsim.render", "dexsim_ppo.training") == set()
+
+
+def test_a_child_that_fails_is_noticed():
+    with pytest.raises(AssertionError, match="ModuleNotFoundError"):
+        loaded_by("import dexsim.no_such_room")

@@ -1,0 +1,59 @@
+"""The public names of each package: a change of this list is a change of the API."""
+
+import importlib
+import subprocess
+import sys
+
+import pytest
+from paths import ROOT
+
+NAMES = {
+    "dexsim": """
+        AssetError CalibrationError CheckpointError ConfigError DexsimError DexsimWarning Env EnvConfig Hand
+        OldFileWarning OtherEnvWarning Readings State Task TaskSpec load_hand make observe register
+    """,
+    "dexsim_ppo": """
+        PPOConfig Policy TrainState Trained act evaluate_policy load_policy make_train train_policy
+    """,
+    "dexsim_real": """
+        Controller HandError HandPort HandSensing HardwareConfig LinkConfig LogReader LogWriter Measured ObjectEstimate
+        Safety SafetyConfig SerialHand make_readings open_port
+    """,
+}
+
+
+@pytest.mark.parametrize("package", NAMES)
+def test_the_public_names(package):
+    door = importlib.import_module(package)
+    assert sorted(door.__all__) == sorted(NAMES[package].split())
+    assert sorted(name for name in dir(door) if not name.startswith("_")) == sorted(door.__all__)
+    for name in door.__all__:
+        assert getattr(door, name).__doc__, name
+    with pytest.raises(AttributeError, match="no attribute 'no_such_name'"):
+        door.no_such_name  # noqa: B018
+
+
+@pytest.mark.parametrize("package", NAMES)
+def test_a_name_that_is_imported_late_is_known_to_type_checkers(package):
+    """Every late name stands in the block for type checkers, with the module that it comes from."""
+    source = (ROOT / package / "__init__.py").read_text()
+    block = source.partition("if TYPE_CHECKING:")[2].partition("\n__")[0]
+    homes = dict(
+        (name.strip(), line.split()[1])
+        for line in block.splitlines()
+        if line.strip().startswith("from")
+        for name in line.partition(" import ")[2].split(",")
+    )
+    for name, module in homes.items():
+        assert getattr(importlib.import_module(module), name) is getattr(importlib.import_module(package), name)
+    eager = source.partition("if TYPE_CHECKING:")[0]
+    assert all(name in homes or name in eager for name in NAMES[package].split())
+
+
+@pytest.mark.parametrize("package", NAMES)
+def test_a_door_is_light(package):
+    """Importing a package loads none of its rooms but `core`."""
+    code = f"import {package}, sys; print(*(name for name in sys.modules if name.startswith('dexsim')))"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert {name for name in done.stdout.split() if not name.startswith("dexsim.core")} <= {"dexsim", package}
