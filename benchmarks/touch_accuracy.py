@@ -51,7 +51,7 @@ PITCH_BOUND = {
     (1.0, 2.0): 0.019,
     (1.0, 3.0): 0.042,
 }
-WINKLER = Skin(margin=0.0, thickness=0.02, law="linear", total="skin", c10=0.1e6)
+WINKLER = Skin(margin=0.0, thickness=0.02, law="linear", c10=0.1e6)
 
 
 def turned_solid(kind: str, seed: int = 0) -> sdf.Shape:
@@ -177,8 +177,8 @@ def forces(quick: bool) -> list[dict]:
             bound = PITCH_BOUND[round(1e3 * depth, 1), round(1e3 * pitch, 1)]
             ball = press(taxels, area, upright("sphere", radius), (0, 0, radius - depth), WINKLER)
             wanted = modulus * np.pi * depth**2 * (radius - 2 * depth / 3)
-            error = np.asarray(ball.force.sum(1)) / wanted - 1
-            _, centre = reduce_touch(ball.force, taxels)
+            error = np.asarray(ball.skin_force.sum(1)) / wanted - 1
+            _, centre = reduce_touch(ball.skin_force, taxels)
             off = 1e3 * np.linalg.norm(np.asarray(centre)[:, :2], axis=1)
             # 1.25 and 0.1 % allow for the 200 phases drawn here.
             rms = float(np.sqrt(np.mean(error**2)))
@@ -195,7 +195,7 @@ def forces(quick: bool) -> list[dict]:
             )
             bar = press(taxels, area, upright("cylinder", radius, 0.1), (0, 0, radius - depth), WINKLER, upended)
             length = round(0.024 / pitch) * pitch
-            error = np.asarray(bar.force.sum(1)) / (modulus * segment * length) - 1
+            error = np.asarray(bar.skin_force.sum(1)) / (modulus * segment * length) - 1
             rms = float(np.sqrt(np.mean(error**2)))
             bound = _ridge_sampling(half, pitch)
             rows.append(
@@ -239,12 +239,12 @@ def _things() -> dict:
 def _punch() -> dict:
     taxels, area = pad(0.002, np.zeros((1, 2)))
     half, depth = 0.0079, 0.0004  # no taxel is nearer to a side of the box than to its face
-    skin = Skin(margin=0.0, total="skin")
+    skin = Skin(margin=0.0)
     touch = press(taxels, area, upright("box", half, half, 0.01), (0, 0, 0.01 - depth), skin)
     covered = np.all(np.abs(taxels[0, :, :2]) < half, axis=1)
     stretch = 1 - depth / skin.thickness
     wanted = np.where(covered, 2 * (stretch**-2 - stretch) * (skin.c10 + skin.c01 / stretch) * 4e-6, 0)
-    error = float(np.abs(np.asarray(touch.force[0]) - wanted).max() / wanted.max())
+    error = float(np.abs(np.asarray(touch.skin_force[0]) - wanted).max() / wanted.max())
     return {
         "check": "flat punch: equal force where covered, 0 elsewhere",
         "value": error,
@@ -264,7 +264,7 @@ def _loads() -> list[dict]:
     for pitch in (0.001, 0.0022):
         shift = np.random.default_rng(3).uniform(-pitch / 2, pitch / 2, (200, 2))
         touch = press(*pad(pitch, shift), upright("sphere", radius), (0, 0, radius - depth), skin)
-        error = float(np.sqrt(np.mean((np.asarray(touch.force.sum(1)) / weight - 1) ** 2)))
+        error = float(np.sqrt(np.mean((np.asarray(touch.skin_force.sum(1)) / weight - 1) ** 2)))
         rows.append(
             {
                 "check": f"load of 0.1 kg on a ball, {1e3 * depth:.2f} mm deep, pitch {1e3 * pitch:g} mm",
@@ -278,13 +278,13 @@ def _loads() -> list[dict]:
 
 def _monotone(name: str, thing) -> dict:
     taxels, area = pad(0.002, np.zeros((1, 2)))
-    skin = Skin(margin=0.0, total="skin", thickness=0.004)
+    skin = Skin(margin=0.0, thickness=0.004)
 
     def total(depth):
         touch = tactile.feel(
             taxels, area, thing, jnp.stack([0.0007, -0.0004, 0.02 - depth]), jnp.eye(3), jnp.ones(1), skin
         )
-        return touch.force.sum()
+        return touch.skin_force.sum()
 
     force = np.asarray(jax.jit(jax.vmap(total))(jnp.linspace(0, 0.002, 201)))
     fall = float(-np.diff(force).min() / force.max())
@@ -300,11 +300,11 @@ def _gradient(name: str, thing) -> dict:
     """Of the summed force in the object's position, against central differences, in double precision."""
     with jax.enable_x64(True):
         taxels, area = (np.asarray(x, np.float64) for x in pad(0.002, np.zeros((1, 2))))
-        skin, step = Skin(margin=0.0, total="skin"), 1e-8
+        skin, step = Skin(margin=0.0), 1e-8
 
         @jax.jit
         def total(position):
-            return tactile.feel(taxels, area, thing, position, jnp.eye(3), jnp.ones(1), skin).force.sum()
+            return tactile.feel(taxels, area, thing, position, jnp.eye(3), jnp.ones(1), skin).skin_force.sum()
 
         start = jnp.array([0.00071, -0.00043, 0.0193])
         exact = np.asarray(jax.jit(jax.grad(total))(start))
@@ -344,7 +344,7 @@ def _frame(axis: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 def grasps(quick: bool) -> list[dict]:
     """Contacts, force and centre of random grasps by the grid and by the paper's method, against closed forms."""
-    rows, skin, hand = [], Skin(margin=0.0, total="skin"), shipped_skin()
+    rows, skin, hand = [], Skin(margin=0.0), shipped_skin()
     count = 100 if quick else 1000
     config = PointsConfig(count=1024)
     for kind in ("sphere", "box", "cylinder"):
@@ -354,7 +354,7 @@ def grasps(quick: bool) -> list[dict]:
         def feel(thing, pose=pose):
             def one(pose):
                 touch = feel_links(hand, pose, thing, jnp.zeros(3), jnp.eye(3), jnp.ones(5), skin)
-                return touch.depth, *reduce_touch_links(touch.force, hand, pose)
+                return touch.depth, *reduce_touch_links(touch.skin_force, hand, pose)
 
             run = jax.jit(jax.vmap(one))
             found = [np.asarray(x) for x in run(pose)]

@@ -126,7 +126,7 @@ def physics_advance(hand: Any) -> Callable[..., Any]:
 
     from dexsim.objects.config import SLOTS, ObjectConfig
     from dexsim.physics.config import PhysicsConfig
-    from dexsim.physics.seam import Physics
+    from dexsim.physics.physics import Physics
 
     seam = Physics(
         hand,

@@ -26,8 +26,8 @@ class EnvConfig:
     """From action to joint target."""
     sensing: Sensing = setting(Sensing())
     """From truth to readings."""
-    skin: Skin = setting(Skin(total="pressing"))
-    """The rubber over the taxels, which feel what presses into it and no friction."""
+    skin: Skin = setting(Skin())
+    """The rubber over the taxels."""
     observation: ObservationConfig = setting(ObservationConfig())
     """What the policy sees."""
     pool_size: int = setting(2048, unit="1", low=1, high=1_000_000)

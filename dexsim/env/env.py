@@ -32,7 +32,8 @@ from dexsim.hand.kinematics import Hand, forward_kinematics, taxel_normals
 from dexsim.objects.config import load_mesh_object
 from dexsim.objects.params import ObjectParams, toward_nominal
 from dexsim.observation import Motion, Readings, ThreeAxisReadings
-from dexsim.physics.seam import Physics, PhysicsState
+from dexsim.physics.physics import Physics
+from dexsim.physics.seam import PhysicsState
 from dexsim.randomization import Draw, sample, tilted_down
 from dexsim.render.snapshot import Snapshot
 from dexsim.sensing.config import Sensing

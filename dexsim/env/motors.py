@@ -18,7 +18,8 @@ from dexsim.core.errors import ConfigError
 from dexsim.env.config import EnvConfig
 from dexsim.env.state import State
 from dexsim.hand.kinematics import Hand
-from dexsim.physics.seam import Physics, PhysicsState
+from dexsim.physics.physics import Physics
+from dexsim.physics.seam import PhysicsState
 from dexsim.randomization import Draw, Randomization
 
 Motors = Callable[..., tuple[jax.Array, GearState | None]]

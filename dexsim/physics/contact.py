@@ -34,30 +34,25 @@ BLEND_DEPTH = 0.0005
 
 
 def spring(
-    compliance: jax.Array, stiffness: jax.Array, ratio: jax.Array, friction: jax.Array, *, period: float, edges: int = 0
+    compliance: jax.Array, stiffness: jax.Array, ratio: jax.Array, *, period: float
 ) -> tuple[jax.Array, jax.Array]:
     """MuJoCo's parameters for contacts that press with `stiffness` times depth at rest.
 
-    MuJoCo's own parameters fix accelerations instead. The force at rest is N = k d^2 r / (A (1 - d))
-    for a depth r, an impedance d, a reference stiffness k and the inverse weights A of the two bodies;
-    with a pyramid of E edges instead of the elliptic cone it is N = E k d^2 r / (2 mu^2 (1 + mu^2) A
-    (1 - d)) (documentation, chapter Computation, section Constraint model; mj_diagApprox and
-    mj_makeImpedance): at one solref it changes sevenfold between a friction of 0.6 and 1.2. Here
+    MuJoCo's own parameters fix accelerations instead. With an elliptic cone the force at rest is
+    N = k d^2 r / (A (1 - d)) for a depth r, an impedance d, a reference stiffness k and the inverse weights A
+    of the two bodies (documentation, chapter Computation, section Constraint model). Here
     k = 1 / (period^2 d), and d follows from N = stiffness r.
 
     Args:
       compliance: [P] 1/kg, inverse weights A of the two bodies of each pair.
       stiffness: [P] N/m.
       ratio: [] damping ratio.
-      friction: [P] (or [] for all) sliding.
       period: s, time scale on which a contact pushes out what lies in it.
-      edges: of the friction pyramid; 0 for an elliptic cone, and without friction.
 
     Returns:
       solref [P, 2] (direct format) and solimp [P, 5].
     """
-    cone = 2 * friction**2 * (1 + friction**2) / edges if edges else 1.0
-    load = stiffness * cone * compliance * period**2
+    load = stiffness * compliance * period**2
     impedance = jnp.clip(load / (1 + load), 1e-3, 0.9999)
     solref = jnp.stack([-impedance / period**2, -2 * ratio / period * impedance], -1)
     flat = jnp.broadcast_to(jnp.array([0.001, 0.5, 2.0]), (*impedance.shape, 3))

@@ -22,7 +22,7 @@ _UNSUPPORTED_COLLISIONS = {
 
 def check_model(model: mujoco.MjModel, backend: str, where: str | Path = "model") -> None:
     """Raise AssetError naming every feature of `model` that `backend` ignores or lacks."""
-    problems = _ignored(model) + (_lacking_jax(model) if backend == "jax" else _lacking_warp(model))
+    problems = _ignored(model) + _LACKING[backend](model)
     if problems:
         raise AssetError(f"{where}: backend {backend} cannot simulate: {'; '.join(problems)}")
 
@@ -99,6 +99,9 @@ def _lacking_warp(model: mujoco.MjModel) -> list[str]:
     if model.opt.solver == mujoco.mjtSolver.mjSOL_PGS:
         found.append("solver PGS")
     return found
+
+
+_LACKING = {"jax": _lacking_jax, "warp": _lacking_warp}
 
 
 def _any_row(values: np.ndarray) -> np.ndarray:

@@ -8,6 +8,7 @@ from dexsim.hand.kinematics import Hand
 from dexsim.physics import contact
 from dexsim.physics.config import PhysicsConfig
 from dexsim.physics.guard import check_model
+from dexsim.physics.seam import Scene
 
 GEOM_TYPES = {
     "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
@@ -42,7 +43,7 @@ def build_model(
         joint.armature *= 1 - rotor_share
     palm = spec.body(hand.palm)
     palm.pos, palm.quat = [0, 0, 0], [1, 0, 0, 0]
-    touching = _touching_geoms(hand, slots, config)
+    touching = _touching_geoms(hand, slots)
     contact.cover_tips(spec, hand, config.cover)
     touching = contact.split_pads(spec, hand, touching, config.pad_points)
     for geom in spec.geoms:
@@ -65,10 +66,8 @@ def build_model(
             rgba=[0.85, 0.55, 0.25, 1],
         )
         for name in touching:
-            spec.add_pair(
-                geomname1=name, geomname2=f"object_{k}", condim=config.condim, friction=[0.9, 0.9, 0.005, 1e-4, 1e-4]
-            )
-    if backend == "warp":
+            spec.add_pair(geomname1=name, geomname2=f"object_{k}", condim=3, friction=[0.9, 0.9, 0.005, 1e-4, 1e-4])
+    if backend != "jax":  # MJX in JAX has no sensor that matches bodies
         for b in hand.tip_body:
             # data: bit 1 is the force; reduce: 3 is the net force, in the world frame.
             spec.add_sensor(
@@ -82,7 +81,7 @@ def build_model(
             )
     _set_options(spec, config, gravity, backend)
     for pair in spec.pairs:
-        if pair.condim == 1 and spec.option.cone == mujoco.mjtCone.mjCONE_ELLIPTIC:
+        if pair.condim == 1:
             # MJX-JAX knows no frictionless contacts beside elliptic cones; this one slides as freely.
             pair.condim, pair.friction = 3, [1e-3, 1e-3, 0.005, 1e-4, 1e-4]
     model = spec.compile()
@@ -90,9 +89,39 @@ def build_model(
     pairs = contact.pairs_with(model, geoms)
     compliance, share, _ = contact.pair_constants(model, pairs, tip_bodies(model, hand))
     model.pair_solref[pairs], model.pair_solimp[pairs] = contact.spring(
-        compliance, share * contact.NOMINAL, 2.0, 0.9, period=config.contact_period, edges=config.pyramid_edges
+        compliance, share * contact.NOMINAL, 2.0, period=config.contact_period
     )
     return model
+
+
+def build_scene(
+    hand: Hand,
+    slots: tuple[str, ...],
+    largest: np.ndarray,
+    config: PhysicsConfig,
+    gravity: tuple[float, float, float],
+    backend: str,
+    *,
+    rotor_share: float = 0.0,
+) -> Scene:
+    """`build_model`, with the addresses of what changes in it."""
+    model = build_model(hand, slots, largest, config, gravity, backend, rotor_share=rotor_share)
+    joints, free = [model.joint(name) for name in hand.joint_names], model.joint("object")
+    geoms = np.array([model.geom(f"object_{k}").id for k in range(len(slots))])
+    return Scene(
+        hand=hand,
+        config=config,
+        slots=slots,
+        model=model,
+        joint_qpos=np.array([joint.qposadr[0] for joint in joints]),
+        joint_dof=np.array([joint.dofadr[0] for joint in joints]),
+        object_qpos=np.arange(free.qposadr[0], free.qposadr[0] + 7),
+        object_dof=np.arange(free.dofadr[0], free.dofadr[0] + 6),
+        object_body=model.body("object").id,
+        object_geoms=geoms,
+        object_pairs=contact.pairs_with(model, geoms),
+        tip_bodies=tip_bodies(model, hand),
+    )
 
 
 def tip_bodies(model: mujoco.MjModel, hand: Hand) -> np.ndarray:
@@ -100,12 +129,14 @@ def tip_bodies(model: mujoco.MjModel, hand: Hand) -> np.ndarray:
     return np.array([model.body(hand.body_names[b]).id for b in hand.tip_body])
 
 
-def _touching_geoms(hand: Hand, slots: tuple[str, ...], config: PhysicsConfig) -> list[str]:
+def _touching_geoms(hand: Hand, slots: tuple[str, ...]) -> list[str]:
     geoms = [g for g in hand.geoms if g.touches]
     palm = hand.body_names.index(hand.palm)
     kinds = {g.kind for g in geoms if g.body == palm}
     if "plane" in kinds:
-        use_box = config.palm == "box" or (config.palm == "auto" and "box" in kinds and set(slots) <= _MEETS_BOXES)
+        # The half-space at the palm's face also carries an object beside the palm, but meets every primitive in
+        # closed form; its box does not meet cylinders and ellipsoids.
+        use_box = "box" in kinds and set(slots) <= _MEETS_BOXES
         geoms = [g for g in geoms if g.body != palm or (g.kind != "plane") == use_box]
     if not geoms or any(not g.name for g in geoms):
         raise AssetError(
@@ -119,12 +150,10 @@ def _set_options(spec: mujoco.MjSpec, config: PhysicsConfig, gravity: tuple[floa
     option = spec.option
     option.timestep, option.gravity = config.timestep, gravity
     option.integrator = mujoco.mjtIntegrator.mjINT_EULER
-    # Without friction the cone is a line, and the JAX backend knows it as a pyramid only.
-    elliptic = config.cone == "elliptic" and config.condim > 1
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
-    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC if elliptic else mujoco.mjtCone.mjCONE_PYRAMIDAL
-    option.impratio = config.friction_ratio if elliptic else 1.0
-    if elliptic and backend == "warp":
+    # A pyramid approximates the cone, and objects creep through the fingers at 12 to 25 mm/s with it.
+    option.cone, option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, config.friction_ratio
+    if backend == "warp":
         # Warp builds the Hessian of elliptic cones in one go only where the Jacobian is sparse: a
         # third faster here, though a dense one would fit as well.
         option.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE

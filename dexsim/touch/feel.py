@@ -27,7 +27,7 @@ class Touch:
 
     depth: jax.Array  # [F, N] m, compression of the skin (>= 0)
     skin_force: jax.Array  # [F, N] N, by the skin's law alone
-    force: jax.Array  # [F, N] N, by default a spread of the physics' total (see `Skin.total`)
+    force: jax.Array  # [F, N] N, the finger's total from the physics, shared by `skin_force`
 
 
 def feel(
@@ -84,8 +84,7 @@ def _press(points: jax.Array, area: jax.Array, thing: Any, finger_force: jax.Arr
     """`feel` for points [F, N, 3] in the object's frame."""
     depth = jnp.maximum(skin.margin - signed_distance(points, thing), 0.0)
     skin_force = skin_stress(depth / skin.thickness, skin) * area
-    force = skin_force if skin.total == "skin" else spread(skin_force, finger_force)
-    return Touch(depth, skin_force, force)
+    return Touch(depth, skin_force, spread(skin_force, finger_force))
 
 
 def spread(skin_force: jax.Array, finger_force: jax.Array) -> jax.Array:

@@ -12,7 +12,7 @@ from dexsim.core.config import setting, validate
 from dexsim.touch import materials
 
 LAWS = ("mooney_rivlin", "linear")
-TOTALS = ("solver", "pressing", "skin")
+TOTALS = ("pressing", "solver")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -34,11 +34,9 @@ class Skin:
     """Compression beyond which the stress no longer grows."""
     law: str = setting("mooney_rivlin", choices=LAWS)
     """linear: the slope at small strain throughout (Winkler's elastic foundation)."""
-    total: str = setting("solver", choices=TOTALS)
-    """Where a finger's total comes from: the physics' contact force, spread by the skin's law (solver:
-    its magnitude, friction included; pressing: the part that presses into the skin, which is all that
-    a taxel of one axis feels), or the skin itself, whose stress times area is then the force on each
-    taxel."""
+    total: str = setting("pressing", choices=TOTALS)
+    """Which part of the physics' contact force a finger's taxels share: what presses into the skin, which is all
+    that a one-axis taxel feels (pressing), or the magnitude with friction (solver), as in the paper."""
     untaxelled: bool = False
     """Whether the fingertips' skin beyond the taxels bears its share of a finger's total, which nothing reads
     (`dexsim.touch.surface`), or all of it lies on taxels that are near, as in the paper."""

@@ -27,9 +27,9 @@ _JOINTS = (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJo
 class Stepper:
     """Constants of a scene; `step` is pure and written for one environment."""
 
-    mjx: Any  # the module, which only `physics` imports
+    mjx: Any  # the module, imported when a scene is compiled
     collider: collide.Collider
-    most: int  # contacts kept: the deepest
+    max_contacts: int  # contacts kept: the deepest
     iterations: int
     line_search: int
     timestep: float
@@ -82,7 +82,7 @@ class Stepper:
     ) -> tuple[newton.Rows, jax.Array, jax.Array]:
         """The constraints, frames [C, 3, 3] of the contacts, and whose finger they press [C, F]."""
         gap, point, normal = self.collider.touch(data.geom_xpos, data.geom_xmat, model.geom_size)
-        count, dofs, fingers = min(self.most, len(self.collider.pair)), turn.shape[0], self.finger.shape[1]
+        count, dofs, fingers = min(self.max_contacts, len(self.collider.pair)), turn.shape[0], self.finger.shape[1]
         pair = jnp.asarray(self.collider.pair)
         gap = gap - model.pair_margin[pair]
         _, best = jax.lax.top_k(-gap, count)
@@ -149,12 +149,12 @@ class Stepper:
         return qpos, qvel
 
 
-def find_stepper(mjx: Any, model: mujoco.MjModel, tips: np.ndarray, *, most: int) -> Stepper | None:
+def find_stepper(mjx: Any, model: mujoco.MjModel, tips: np.ndarray, *, max_contacts: int) -> Stepper | None:
     """The stepper of a scene, or None where only `mjx.step` knows it.
 
     Args:
       tips: [F] bodies of the fingertips.
-      most: contacts kept in each environment.
+      max_contacts: contacts kept in each environment.
     """
     option = model.opt
     plain = (
@@ -180,7 +180,7 @@ def find_stepper(mjx: Any, model: mujoco.MjModel, tips: np.ndarray, *, most: int
     return Stepper(
         mjx=mjx,
         collider=collider,
-        most=most,
+        max_contacts=max_contacts,
         iterations=int(option.iterations) + _MORE_STEPS,
         line_search=2 * int(option.ls_iterations),
         timestep=float(option.timestep),

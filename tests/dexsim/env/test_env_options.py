@@ -359,7 +359,7 @@ class TestGearPlay:
     def test_the_rotor_takes_its_inertia_from_the_joint(self, hand):
         from dexsim.env.motors import Drive, rotor_share
         from dexsim.physics.model import build_model
-        from dexsim.physics.seam import Physics
+        from dexsim.physics.physics import Physics
 
         config = GraspConfig(randomization=GEARED)
         whole = build_model(hand, ("box",), np.full((1, 3), 0.02), config.physics, (0, 0, -9.81), "jax")

@@ -20,7 +20,9 @@ from dexsim.objects.config import SHAPES, SLOTS, ObjectConfig
 from dexsim.physics.config import PhysicsConfig
 from dexsim.physics.guard import check_model
 from dexsim.physics.model import build_model
-from dexsim.physics.seam import Physics, PhysicsState, choose_backend
+from dexsim.physics.physics import Physics, choose_backend
+from dexsim.physics.seam import PhysicsState
+from dexsim.physics.warp_backend import constraint_rows
 
 WORLDS = 8
 
@@ -179,19 +181,18 @@ class TestAgainstC:
             cosine /= np.maximum(np.linalg.norm(ours, axis=-1), 1e-9)
             assert np.mean(cosine > 0.75) > 0.8, (shape, cosine)
 
-    @pytest.mark.parametrize("condim", [1, 3, 4, 6])
-    def test_the_decoding_of_contact_forces(self, hand, condim):
-        """Edges of the friction pyramid to forces on fingers, on contacts that C MuJoCo solved."""
-        config = PhysicsConfig(condim=condim, **CONVERGED)
+    def test_the_decoding_of_contact_forces(self, hand):
+        """Rows of the solver to forces on fingers, on contacts that C MuJoCo solved."""
+        config = PhysicsConfig(**CONVERGED)
         seam = Physics(hand, SLOTS, ObjectConfig().largest, config, gravity=GRAVITY, backend="jax")
         model, data = pressed_template(hand, seam.mj_model)
-        contacts = [c for c in data.contact if c.dim == condim and c.geom[1] in seam.object_geoms]
+        contacts = [c for c in data.contact if c.geom[1] in seam.scene.object_geoms]
         assert len(contacts) >= 4
         wanted = np.zeros((5, 3))
         tips = {model.body(hand.body_names[b]).id: f for f, b in enumerate(hand.tip_body)}
         for index, contact in enumerate(data.contact):
             finger = tips.get(int(model.geom_bodyid[contact.geom[0]]))
-            if finger is None or contact.geom[1] not in seam.object_geoms:
+            if finger is None or contact.geom[1] not in seam.scene.object_geoms:
                 continue
             wrench = np.zeros(6)
             mujoco.mj_contactForce(model, data, index, wrench)
@@ -210,7 +211,7 @@ class TestAgainstC:
             }
             contact = SimpleNamespace(**column, geom=geom, frame=jnp.asarray(frame))
             impl = SimpleNamespace(contact=contact, efc_force=jnp.asarray(data.efc_force))
-            return np.asarray(seam._force_from_contacts(SimpleNamespace(_impl=impl)))
+            return np.asarray(seam.engine.finger_force(SimpleNamespace(_impl=impl)))
 
         np.testing.assert_allclose(decode(flip=False), wanted, atol=1e-4)
         np.testing.assert_allclose(decode(flip=True), wanted, atol=1e-4)
@@ -240,7 +241,7 @@ def pressed_template(hand, model):
 class TestConstruction:
     def test_backends(self, monkeypatch):
         assert choose_backend("jax") == "jax"
-        with pytest.raises(ConfigError, match="'cuda'.*auto, jax or warp"):
+        with pytest.raises(ConfigError, match="'cuda'.*auto, jax, warp"):
             choose_backend("cuda")
         monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
         assert choose_backend("auto") == "jax"
@@ -255,10 +256,9 @@ class TestConstruction:
     @pytest.mark.parametrize(
         "field, value, message",
         [
-            ("condim", 2, "1, 3, 4 or 6"),
             ("timestep", 0.5, "0.5 s: must be between 0.0001 and 0.02 s"),
             ("substeps", 0, "substeps = 0"),
-            ("palm", "flat", "choose from auto, face, box"),
+            ("contacts", "warp", "choose from closed, mjx"),
         ],
     )
     def test_configuration(self, field, value, message):
@@ -297,15 +297,9 @@ class TestConstruction:
         with pytest.raises(AssetError, match="backend jax: no such joint"):
             Physics(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(), gravity=GRAVITY, backend="jax")
 
-    def test_the_box_palm_needs_warp_for_cylinders(self, hand):
-        with pytest.raises(AssetError, match="BOX"):
-            Physics(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(palm="box"), gravity=GRAVITY, backend="jax")
-
     def test_warps_buffers_hold_the_worst_grip(self, hand, grasp_env):
         """Hands that squeeze as hard as they can need less than the rows that are allocated."""
-        seam = Physics(
-            hand, SLOTS, ObjectConfig().largest, PhysicsConfig(), gravity=GRAVITY, backend="jax", num_envs=WORLDS
-        )
+        allocated = constraint_rows(PhysicsConfig(), hand)
         rng, rows, contacts = np.random.default_rng(3), [], []
         for shape in SHAPES:
             for index in rows_of(grasp_env.pool, shape)[:6]:
@@ -315,7 +309,7 @@ class TestConstruction:
                 rows.append(data.nefc)
                 contacts.append(data.ncon)
         assert max(rows) > 30
-        assert max(rows) <= 0.8 * seam.constraint_rows, (max(rows), seam.constraint_rows)
+        assert max(rows) <= 0.8 * allocated, (max(rows), allocated)
         assert np.mean(contacts) <= 0.8 * PhysicsConfig().max_contacts, np.mean(contacts)
 
 

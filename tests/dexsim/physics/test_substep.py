@@ -10,12 +10,16 @@ import mujoco
 import numpy as np
 import pytest
 from c_scene import GRAVITY
+from mujoco import mjx
 from scipy.spatial.transform import Rotation
 
 from dexsim.objects.config import SLOTS, ObjectConfig
 from dexsim.physics.config import PhysicsConfig
 from dexsim.physics.jax_backend import collide, newton
-from dexsim.physics.seam import Physics, PhysicsState
+from dexsim.physics.jax_backend.substep import find_stepper
+from dexsim.physics.model import build_model, tip_bodies
+from dexsim.physics.physics import Physics
+from dexsim.physics.seam import PhysicsState
 
 SIZES = {"sphere": "0.02", "capsule": "0.012 0.02", "box": "0.02 0.015 0.03", "cylinder": "0.02 0.025"}
 
@@ -240,13 +244,14 @@ def test_gradients_go_through_the_solver():
     assert slope[0] == pytest.approx(float(quotient), rel=0.05, abs=5e-3)
 
 
-@pytest.mark.parametrize("change", [{"cone": "pyramidal"}, {"condim": 4}, {"condim": 1}, {"contacts": "mjx"}])
-def test_other_cones_and_whoever_asks_are_left_to_mjx(hand, change):
-    plain, other = (
-        Physics(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(**extra), gravity=GRAVITY, backend="jax")
-        for extra in ({}, change)
-    )
-    assert plain._stepper is not None and other._stepper is None
+def test_other_cones_are_left_to_mjx(hand):
+    model = build_model(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(), GRAVITY, "jax")
+    tips = tip_bodies(model, hand)
+    assert find_stepper(mjx, model, tips, max_contacts=20) is not None
+    model.pair_dim[0] = 4
+    assert find_stepper(mjx, model, tips, max_contacts=20) is None
+    model.pair_dim[0], model.opt.cone = 3, mujoco.mjtCone.mjCONE_PYRAMIDAL
+    assert find_stepper(mjx, model, tips, max_contacts=20) is None
 
 
 @pytest.mark.slow

@@ -16,7 +16,8 @@ from c_scene import CONVERGED, GRAVITY, row, rows_of, squeeze, stack
 import dexsim
 from dexsim.objects.config import SHAPES, SLOTS, ObjectConfig
 from dexsim.physics.config import PhysicsConfig
-from dexsim.physics.seam import Physics, PhysicsState
+from dexsim.physics.physics import Physics
+from dexsim.physics.seam import PhysicsState
 from dexsim.tasks.rotate.config import RotateConfig
 
 pytest.importorskip("warp")
@@ -89,7 +90,7 @@ def test_a_sub_step_equals_jax(worlds, results, physics_advance, shape):
 
 def test_a_full_buffer_is_loud(hand, worlds, monkeypatch):
     """Fewer constraint rows than a grip needs: Warp would drop contacts without a word."""
-    monkeypatch.setattr(Physics, "constraint_rows", property(lambda self: 16))
+    monkeypatch.setattr("dexsim.physics.warp_backend.constraint_rows", lambda config, hand: 16)
     advance = compile_advance(hand, PhysicsConfig(substeps=2))
     (inputs, *_) = worlds["box"]
     _, force = advance(*inputs)

@@ -76,11 +76,11 @@ def test_600_forces_differentiate_through_a_mesh(hand, links):
     trimesh = pytest.importorskip("trimesh")
     _, pose, *_ = links
     ball = distance.prepare(trimesh.creation.icosphere(subdivisions=3, radius=0.03), CONFIG)
-    skin = Skin(margin=0.001, total="skin")
+    skin = Skin(margin=0.001)
 
     @jax.jit
     def total(place):
-        return feel_links(hand, pose, ball, place, jnp.eye(3), jnp.zeros(5), skin).force.sum()
+        return feel_links(hand, pose, ball, place, jnp.eye(3), jnp.zeros(5), skin).skin_force.sum()
 
     exact, step = np.asarray(jax.jit(jax.grad(total))(PLACE)), 2e-5
     numeric = np.array(
@@ -90,17 +90,14 @@ def test_600_forces_differentiate_through_a_mesh(hand, links):
     np.testing.assert_allclose(exact, numeric, rtol=0.03, atol=0.03 * np.abs(numeric).max())
 
 
-def test_the_skins_own_total(links):
-    """An elastic foundation: stress times area, whatever the solver says."""
+def test_the_skins_own_force_and_the_solvers_total(hand, links):
+    """Stress times area by the skin's law alone; the reading shares the solver's total in the same proportions."""
     feel, *_ = links
-    skin = Skin(margin=0.001, total="skin")
-    touch, force, _ = feel(BALL, skin)
-    np.testing.assert_array_equal(touch.force, touch.skin_force)
-    np.testing.assert_allclose(force, touch.skin_force.sum(1), rtol=1e-6)
-    spread, _, _ = feel(BALL, dataclasses.replace(skin, total="solver"))
-    np.testing.assert_array_equal(spread.skin_force, touch.skin_force)
-    felt = np.asarray(force) > 0
-    np.testing.assert_allclose(spread.force.sum(1), np.where(felt, TOTAL, 0), rtol=1e-5)
+    touch, _, _ = feel(BALL, Skin(margin=0.001))
+    stress = skin_stress(touch.depth / 0.003, Skin(margin=0.001))
+    np.testing.assert_allclose(touch.skin_force, stress * hand.taxel_area, rtol=1e-6)
+    felt = np.asarray(touch.skin_force).sum(1) > 0
+    np.testing.assert_allclose(touch.force.sum(1), np.where(felt, TOTAL, 0), rtol=1e-5)
 
 
 def test_the_linear_law_is_the_slope_at_small_strain():

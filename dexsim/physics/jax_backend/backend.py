@@ -1,0 +1,81 @@
+"""MJX's JAX implementation, any device and differentiable: our contacts and solver where the scene allows them."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dexsim.objects.params import ObjectParams
+from dexsim.physics.jax_backend.substep import find_stepper
+from dexsim.physics.mjx_backend import MjxBackend
+from dexsim.physics.seam import ContactParams, PhysicsState, Scene, TorqueLaw
+
+
+class JaxBackend(MjxBackend):
+    """`dexsim.physics.seam.Backend` in JAX."""
+
+    def __init__(self, scene: Scene, num_envs: int = 1):
+        """Raises AssetError: MJX lacks what the scene uses. JAX reserves no memory for `num_envs`."""
+        del num_envs
+        super().__init__(scene, "jax")
+        model, tips = scene.model, scene.tip_bodies
+        fingers = {int(body): finger for finger, body in enumerate(tips)}
+        # Whose tip link a geom belongs to, -1 for none.
+        self._finger_of_geom = np.array([fingers.get(int(body), -1) for body in model.geom_bodyid])
+        self._is_object_geom = np.isin(np.arange(model.ngeom), scene.object_geoms)
+        self._stepper = None
+        if scene.config.contacts == "closed":
+            self._stepper = find_stepper(self.mjx, model, tips, max_contacts=scene.config.max_contacts)
+
+    def make_data(self) -> Any:
+        """Empty data for one environment."""
+        return self.mjx.make_data(self.model)
+
+    def advance(
+        self,
+        target: ObjectParams,
+        contacts: ContactParams,
+        state: PhysicsState,
+        torque: TorqueLaw,
+        memory: Any,
+        push: jax.Array,
+    ) -> tuple[PhysicsState, jax.Array, Any]:
+        """One control tick, with our contacts and solver (`substep`) or by `mjx.step`."""
+        if self._stepper is None:
+            return super().advance(target, contacts, state, torque, memory, push)
+        scene, model = self.scene, self.configure(target, contacts)
+        data = self.make_data()
+
+        def run(carry: tuple[Any, ...], index: jax.Array) -> tuple[tuple[Any, ...], jax.Array]:
+            (qpos, qvel, warmstart), memory = carry
+            tau, memory = torque(index, qpos[scene.joint_qpos], qvel[scene.joint_dof], memory)
+            applied = jnp.zeros(scene.model.nv).at[scene.joint_dof].set(tau)
+            after, force = self._stepper.step(
+                model, data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart), applied, push
+            )
+            return (after, memory), force
+
+        # The force is not part of the carry: it would begin as zeros, which are the same for all environments, and
+        # vmap would trace all of this twice.
+        begin = ((state.qpos, state.qvel, state.warmstart), memory)
+        (after, memory), forces = jax.lax.scan(run, begin, jnp.arange(scene.config.substeps))
+        return PhysicsState(*after), forces[-1], memory
+
+    def finger_force(self, data: Any) -> jax.Array:
+        """Sum the solver's forces [F, 3] N per finger; this implementation has no sensor that matches bodies."""
+        fingers = self.scene.hand.num_fingers
+        touch = data._impl.contact
+        dim, address = np.asarray(touch.dim), np.asarray(touch.efc_address)
+        use = np.flatnonzero((dim == 3) & (address >= 0))
+        local = data._impl.efc_force[address[use][:, None] + np.arange(3)]
+        frame = touch.frame[use]  # rows are the axes; the normal points from geom1 to geom2
+        force = jnp.sum(frame * local[..., None], 1)
+        touching = (touch.dist[use] < touch.includemargin[use])[:, None]
+        force = jnp.where(touching, force, 0.0)
+        finger = jnp.asarray(self._finger_of_geom)[touch.geom[use]]
+        is_object = jnp.asarray(self._is_object_geom)[touch.geom[use]]
+        # MuJoCo's contact force acts on geom2; geom1 feels the opposite.
+        on_second = is_object[:, 0] * jax.nn.one_hot(finger[:, 1], fingers).T
+        on_first = is_object[:, 1] * jax.nn.one_hot(finger[:, 0], fingers).T
+        return jnp.sum((on_second - on_first)[..., None] * force, 1)

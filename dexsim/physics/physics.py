@@ -1,0 +1,141 @@
+"""`Physics`: the hand, an object and their contacts in one compiled scene, on the engine of choice.
+
+`advance` runs the scene for one control tick. Backends are `jax` (differentiable, any device) and `warp` (about six
+times faster on NVIDIA GPUs); `mujoco.mjx` is not imported before a scene is compiled.
+"""
+
+import importlib.util
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dexsim.core.errors import ConfigError
+from dexsim.geometry import rotations
+from dexsim.hand.kinematics import Hand, forward_kinematics
+from dexsim.objects.params import ObjectParams
+from dexsim.physics import contact
+from dexsim.physics.config import PhysicsConfig
+from dexsim.physics.jax_backend.backend import JaxBackend
+from dexsim.physics.model import build_scene
+from dexsim.physics.seam import Backend, ContactParams, PhysicsState, TorqueLaw
+from dexsim.physics.warp_backend import WarpBackend
+from dexsim.touch.skin import Skin
+
+BACKENDS: dict[str, Callable[..., Backend]] = {"jax": JaxBackend, "warp": WarpBackend}
+
+
+def choose_backend(backend: str) -> str:
+    """The name of a backend; `auto` is Warp where it can be imported and JAX runs on an NVIDIA GPU, else JAX.
+
+    Raises:
+      ConfigError: no such backend, or its library is not installed.
+    """
+    if backend not in ("auto", *BACKENDS):
+        raise ConfigError(f"backend {backend!r}: choose from auto, {', '.join(BACKENDS)}")
+    if backend not in ("auto", "warp"):
+        return backend
+    found = importlib.util.find_spec("warp") is not None
+    if backend == "warp" and not found:
+        raise ConfigError("backend 'warp' needs the extra: pip install 'dexsim[warp]'")
+    on_gpu = jax.default_backend() in ("gpu", "cuda")
+    return "warp" if backend == "warp" or (found and on_gpu) else "jax"
+
+
+class Physics:
+    """The compiled scene. Immutable; its methods are pure and written for one environment."""
+
+    def __init__(
+        self,
+        hand: Hand,
+        slots: tuple[str, ...],
+        largest: np.ndarray,
+        config: PhysicsConfig,
+        *,
+        gravity: tuple[float, float, float],
+        backend: str = "auto",
+        num_envs: int = 1,
+        skin: Skin | None = None,
+        rotor_share: float = 0.0,
+    ):
+        """Compile.
+
+        Args:
+          hand: the hand; its MJCF is read again here.
+          slots: kinds of the object's primitives.
+          largest: [K, 3] m, the largest size of each slot (broad phase bounds).
+          config: solver and contact model.
+          gravity: m/s^2 in the palm frame, which is the world's.
+          backend: "auto", "jax" or "warp".
+          num_envs: batch size that a backend reserves memory for.
+          skin: of the fingertips, whose stiffness it sets; without one it is constant.
+          rotor_share: share of the joints' armature that is left out of the scene.
+
+        Raises:
+          AssetError: the model uses what the backend ignores or lacks.
+          ConfigError: see `choose_backend`.
+        """
+        self.backend = choose_backend(backend)
+        scene = build_scene(hand, slots, largest, config, gravity, self.backend, rotor_share=rotor_share)
+        self.hand, self.config, self.skin, self.scene = hand, config, skin, scene
+        self.mj_model = scene.model
+        self.joint_qpos, self.joint_dof = scene.joint_qpos, scene.joint_dof
+        self.object_qpos, self.object_dof = scene.object_qpos, scene.object_dof
+        self._compliance, self._share, self._finger_of_pair = contact.pair_constants(
+            scene.model, scene.object_pairs, scene.tip_bodies
+        )
+        self._pads = contact.find_pads(scene.model, scene.object_pairs, scene.tip_bodies)
+        self.engine = BACKENDS[self.backend](scene, num_envs)
+
+    def tip_stiffness(self, target: ObjectParams, qpos: jax.Array) -> jax.Array:
+        """How much stiffer [F] than nominal the fingertips are where they press now."""
+        place = qpos[self.object_qpos]
+        turn = rotations.quat_to_matrix(place[3:] / jnp.linalg.norm(place[3:]))
+        pose = forward_kinematics(self.hand, qpos[self.joint_qpos])
+        return contact.follow_skin(self.hand, self._pads, self.skin, pose, target, place[:3], turn)
+
+    def contact_params(self, target: ObjectParams, tips: jax.Array | None = None) -> ContactParams:
+        """Contact parameters of an object; `tips` [F] is the fingertips' stiffness over the nominal one."""
+        friction = target.pair_friction(self._finger_of_pair >= 0)
+        share = jnp.asarray(self._share)
+        if tips is not None:
+            share *= jnp.append(tips, 1.0)[self._finger_of_pair]  # -1, no finger's: the last
+        solref, solimp = contact.spring(
+            self._compliance, share * target.contact[0], target.contact[1], period=self.config.contact_period
+        )
+        return ContactParams(friction, solref, solimp)
+
+    def configure(self, target: ObjectParams, tips: jax.Array | None = None) -> Any:
+        """The engine's model of one environment (`Backend.configure`); `tips` as in `contact_params`."""
+        return self.engine.configure(target, self.contact_params(target, tips))
+
+    def advance(
+        self,
+        target: ObjectParams,
+        state: PhysicsState,
+        torque: Callable[[jax.Array, jax.Array, jax.Array], jax.Array],
+        push: jax.Array,
+    ) -> tuple[PhysicsState, jax.Array]:
+        """Run one control tick with motors that remember nothing: `advance_motors` for all others.
+
+        Args:
+          torque: (sub-step, joint position [J], joint velocity [J]) to joint torque [J] Nm,
+            called before every sub-step.
+        """
+        after, force, _ = self.advance_motors(
+            target,
+            state,
+            lambda index, position, velocity, memory: (torque(index, position, velocity), memory),
+            None,
+            push,
+        )
+        return after, force
+
+    def advance_motors(
+        self, target: ObjectParams, state: PhysicsState, motors: TorqueLaw, memory: Any, push: jax.Array
+    ) -> tuple[PhysicsState, jax.Array, Any]:
+        """Run one control tick; arguments and results are those of `Backend.advance`."""
+        tips = None if self.skin is None else self.tip_stiffness(target, state.qpos)
+        return self.engine.advance(target, self.contact_params(target, tips), state, motors, memory, push)
