@@ -20,7 +20,7 @@ from dexsim.core.compilation import jit
 from dexsim.env.env import Env
 from dexsim.geometry import rotations
 from dexsim.hand.kinematics import forward_kinematics, taxel_positions
-from dexsim.sensing.taxel_reading import measure_taxels
+from dexsim.sensing.taxels import TaxelArray
 from dexsim.touch import feel as tactile
 from dexsim.touch.reduce import reduce_touch
 from dexsim_ppo.learner import ppo
@@ -138,6 +138,9 @@ def touch(env: Env, ticks: Any, key: jax.Array) -> jax.Array:
     """From poses and forces to taxels, readings, and force and centre of each finger, true and read."""
     hand, config, seam = env.hand, env.config, env.physics
 
+    array = TaxelArray(config.sensing.taxel, hand.taxel_grid, hand.num_fingers, config.physics.control_period)
+    params, memory = array.sample(jax.random.key(0)), array.init()
+
     def feel(target, qpos, strength, key):
         pose = forward_kinematics(hand, qpos[seam.joint_qpos])
         taxels, place = taxel_positions(hand, pose), qpos[seam.object_qpos]
@@ -150,7 +153,7 @@ def touch(env: Env, ticks: Any, key: jax.Array) -> jax.Array:
             strength,
             config.skin,
         )
-        read = measure_taxels(felt.force, jnp.ones((hand.num_fingers, 1)), config.sensing.taxel, key)
+        read = array.apply(params, memory, key, felt.force, jnp.ones((hand.num_fingers, 1)))[1]
         weighting = config.observation.weighting
         return [reduce_touch(force, taxels, weighting) for force in (felt.force, read)]
 

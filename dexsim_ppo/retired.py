@@ -20,10 +20,47 @@ FIELDS: dict[str, str | None] = {
     "leash": "drop_radius",
     "objects.bare_friction": "objects.link_friction",
     "objects.corners": "objects.extremes",
+    "objects.mesh_touch": "touch_method",
+    "physics.condim": None,
+    "physics.cone": None,
+    "physics.palm": None,
+    "physics.tips": None,
     "randomization.corners": "randomization.extremes",
+    "sensing.array.bias": "sensing.taxel.bias",
+    "sensing.array.counts": None,
+    "sensing.array.crosstalk": "sensing.taxel.crosstalk",
+    "sensing.array.dead": "sensing.taxel.dead",
+    "sensing.array.drift": "sensing.taxel.drift",
+    "sensing.array.gain": "sensing.taxel.gain",
+    "sensing.array.hysteresis": "sensing.taxel.hysteresis",
+    "sensing.array.hysteresis_time": "sensing.taxel.hysteresis_time",
+    "sensing.array.noise": None,
+    "sensing.array.rate": "sensing.taxel.rate",
+    "sensing.array.resolution": None,
+    "sensing.array.scale": None,
+    "sensing.array.threshold": None,
+    "sensing.array": None,
     "skin.bare": "skin.untaxelled",
 }
 """Fields of a task's configuration: path to new path, or None for one that is gone."""
+
+VALUES: dict[str, dict[Any, Any]] = {
+    "skin.total": {"skin": "pressing"},
+    "touch_method": {"boxes": "closed_form"},
+}
+"""Values of today's fields that were renamed or are gone: path to new values by old ones."""
+
+UNCHANGED: dict[str, Any] = {
+    "physics.condim": 3,
+    "physics.cone": "elliptic",
+    "physics.palm": "auto",
+    "physics.tips": "skin",
+    "sensing.array": {},
+}
+"""Dropped fields at the value that every environment has today: they are not reported."""
+
+INACTIVE: dict[str, tuple[str, Any]] = {"sensing.array": ("scale", 0.0)}
+"""Groups of fields that had no effect while this one of them had this value: dropped, and not reported."""
 
 ARGUMENTS: dict[str, str | None] = {"corners": "extremes"}
 """Options of a training run, likewise; those under `env` are in `FIELDS`."""
@@ -40,7 +77,7 @@ def migrate_config(config: dict[str, Any], where: Any) -> dict[str, Any]:
 def migrate_arguments(arguments: dict[str, Any], where: Any) -> dict[str, Any]:
     """The options of a training run, `env` included."""
     fields = ARGUMENTS | {f"env.{old}": new and f"env.{new}" for old, new in FIELDS.items()}
-    return _migrate(arguments, fields, where)
+    return _migrate(arguments, fields, where, "env.")
 
 
 def migrate_leaves(leaves: dict[str, Any]) -> dict[str, Any]:
@@ -96,8 +133,15 @@ def _fields(cls: type) -> set[str]:
     return {field.name for field in dataclasses.fields(cls)}
 
 
-def _migrate(config: dict[str, Any], fields: dict[str, str | None], where: Any) -> dict[str, Any]:
+def _migrate(config: dict[str, Any], fields: dict[str, str | None], where: Any, prefix: str = "") -> dict[str, Any]:
+    """`prefix` leads to the task's configuration."""
     config, changes = copy.deepcopy(config), []
+    for path, (switch, off) in INACTIVE.items():
+        *groups, name = (prefix + path).split(".")
+        parent = _group(config, groups)
+        group = _group(parent, [name])
+        if group is not None and group.get(switch) == off:
+            del parent[name]
     for old, new in fields.items():
         *groups, name = old.split(".")
         group = _group(config, groups)
@@ -105,12 +149,19 @@ def _migrate(config: dict[str, Any], fields: dict[str, str | None], where: Any) 
             continue
         value = group.pop(name)
         if new is None:
-            changes.append(f"{old} = {value!r} dropped")
+            if old.removeprefix(prefix) not in UNCHANGED or value != UNCHANGED[old.removeprefix(prefix)]:
+                changes.append(f"{old} = {value!r} dropped")
         else:
             *groups, name = new.split(".")
             target = _group(config, groups)
             (config if target is None else target).setdefault(name, value)
             changes.append(f"{old} is now {new}")
+    for path, values in VALUES.items():
+        *groups, name = (prefix + path).split(".")
+        group = _group(config, groups)
+        if group is not None and (old := group.get(name)) in values:
+            group[name] = values[old]
+            changes.append(f"{path} = {old!r} is now {values[old]!r}")
     if changes:
         warnings.warn(f"{where}: from an older version of dexsim: {', '.join(changes)}", OldFileWarning, stacklevel=4)
     return config

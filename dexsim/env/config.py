@@ -5,6 +5,7 @@ import dataclasses
 from dexsim.control import Control
 from dexsim.core.config import setting
 from dexsim.objects.config import ObjectConfig
+from dexsim.objects.touch_geometry import TOUCH_METHODS
 from dexsim.observation import ObservationConfig
 from dexsim.physics.config import PhysicsConfig
 from dexsim.randomization import Randomization
@@ -32,5 +33,8 @@ class EnvConfig:
     """What the policy sees."""
     pool_size: int = setting(2048, unit="1", low=1, high=1_000_000)
     """Start states generated once; every episode starts from one of them."""
+    touch_method: str = setting("closed_form", choices=TOUCH_METHODS)
+    """How far a taxel is from the object: closed forms of the solver's primitives (for a mesh: of the boxes that
+    follow it), a grid baked from the mesh, or the nearest of points on the surface, as in the paper."""
     touch: bool = setting(True)
     """Feel with the taxels; off only to measure their cost."""

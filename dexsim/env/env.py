@@ -29,8 +29,8 @@ from dexsim.env.state import Sample, Start, State
 from dexsim.env.task import GroundTruth, Task
 from dexsim.geometry import rotations
 from dexsim.hand.kinematics import Hand, forward_kinematics, taxel_normals
-from dexsim.objects.config import load_mesh_object
 from dexsim.objects.params import ObjectParams, toward_nominal
+from dexsim.objects.touch_geometry import touch_geometry
 from dexsim.observation import Motion, Readings, ThreeAxisReadings
 from dexsim.physics.physics import Physics
 from dexsim.physics.seam import PhysicsState
@@ -86,8 +86,7 @@ class Env:
         self.drive = Drive(config, hand, self.physics)
         self._surface = whole_surface(hand, config.skin.thickness) if config.skin.untaxelled else taxels_only(hand)
         self.primitive_kinds = task.slots
-        objects = config.objects
-        self._mesh = load_mesh_object(objects) if objects.mesh and objects.mesh_touch == "grid" else None
+        self._touch_geometry = touch_geometry(config.objects, config.touch_method)
         self.pool = task.make_pool(jax.random.key(seed))
 
     @property
@@ -317,10 +316,6 @@ class Env:
         down = np.asarray(self.task.gravity, float) / np.linalg.norm(self.task.gravity)
         return jnp.asarray(down), tilted_down(down, draw.tilt)
 
-    def _felt(self, target: ObjectParams) -> Any:
-        """What the taxels feel of the object, as `dexsim.geometry.distance` takes it."""
-        return target.shape() if self._mesh is None else self._mesh.grid(target.size)
-
     def _ground_truth(
         self,
         physics: PhysicsState,
@@ -341,7 +336,7 @@ class Env:
             touch = feel_links(
                 hand,
                 pose,
-                self._felt(target),
+                self._touch_geometry(target),
                 place[:3],
                 rotations.quat_to_matrix(quat),
                 strength,

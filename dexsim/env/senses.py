@@ -18,8 +18,7 @@ from dexsim.hand.kinematics import Hand
 from dexsim.observation import ObservationConfig, Readings, ThreeAxisReadings
 from dexsim.randomization import Draw
 from dexsim.sensing.imu import SensorDraw, draw_sensor, measure_orientation
-from dexsim.sensing.taxel_reading import measure_tangential, measure_taxels
-from dexsim.sensing.taxels import SensorModel, SensorParams, SensorState
+from dexsim.sensing.taxels import TaxelArray, TaxelMemory, TaxelParams
 
 
 @pytree_dataclass
@@ -28,8 +27,8 @@ class EpisodeSensors:
 
     draw: Draw
     orientation: SensorDraw
-    array_params: SensorParams | None
-    array: SensorState | None
+    array_params: TaxelParams
+    array: TaxelMemory
 
     @classmethod
     def of(cls, state: State) -> "EpisodeSensors":
@@ -46,18 +45,16 @@ class SensorSuite:
         self.three_axis = config.touch and (
             config.sensing.three_axis or any("tangential_force" in view.add for view in configs)
         )
-        self.array = _array(config, hand)
+        self.taxels = TaxelArray(config.sensing.taxel, tuple(hand.taxel_grid), hand.num_fingers, self.period)
         self._up = -jnp.asarray(task.gravity) / np.linalg.norm(task.gravity)
 
     def draw_orientation(self, key: jax.Array, scale: jax.Array | float, extreme: jax.Array | None) -> SensorDraw:
         """One episode's IMU; see `draw_sensor`."""
         return draw_sensor(key, self.config.sensing.orientation, scale, self.period, extreme)
 
-    def draw_array(self, key: jax.Array, scale: jax.Array | float) -> tuple[SensorParams | None, SensorState | None]:
+    def draw_array(self, key: jax.Array, scale: jax.Array | float) -> tuple[TaxelParams, TaxelMemory]:
         """One episode's taxels, and their memory before the first tick."""
-        if self.array is None:
-            return None, None
-        return self.array.sample(key, scale), self.array.init()
+        return self.taxels.sample(key, scale), self.taxels.init()
 
     def read(
         self,
@@ -68,7 +65,7 @@ class SensorSuite:
         goal: Any,
         last_action: jax.Array,
         state: State | None = None,
-    ) -> tuple[Readings, SensorState | None]:
+    ) -> tuple[Readings, TaxelMemory]:
         """What the host gets to know of `sample`.
 
         Args:
@@ -92,7 +89,7 @@ class SensorSuite:
             joints = jnp.round(joints / sensing.joint_resolution) * sensing.joint_resolution
         torque = late.joint_torque * draw.torque_gain
         torque = torque + sensing.torque_noise * jax.random.normal(keys[1], torque.shape)
-        taxels, array = self._read_taxels(keys[2], late, sensors)
+        array, taxels = self._read_taxels(keys[2], late, sensors)
         noise = sensing.object_noise * jax.random.normal(keys[3], (3,))
         position = jnp.where(
             jnp.array(sensing.object_axes), late.object_position + noise, jnp.asarray(self.task.reference)
@@ -123,32 +120,12 @@ class SensorSuite:
             return Readings(*known), array
         return ThreeAxisReadings(*known, self._read_tangential(keys[2], late, sensors)), array
 
-    def _read_taxels(
-        self, key: jax.Array, late: Sample, sensors: EpisodeSensors
-    ) -> tuple[jax.Array, SensorState | None]:
-        force, gain = late.taxel_force, sensors.draw.taxel_gain
-        if self.array is not None:
-            array, taxels = self.array.apply(sensors.array_params, sensors.array, key, force * gain)
-            return taxels, array
-        if self.config.touch:
-            return measure_taxels(force, gain, self.config.sensing.taxel, key), None
-        return force, None
+    def _read_taxels(self, key: jax.Array, late: Sample, sensors: EpisodeSensors) -> tuple[TaxelMemory, jax.Array]:
+        if not self.config.touch:
+            return sensors.array, late.taxel_force
+        return self.taxels.apply(sensors.array_params, sensors.array, key, late.taxel_force, sensors.draw.taxel_gain)
 
     def _read_tangential(self, key: jax.Array, late: Sample, sensors: EpisodeSensors) -> jax.Array:
         """[F, 3] N: by the same taxels, with the gains and the dead ones of their normal forces."""
-        gain, params = sensors.draw.taxel_gain, sensors.array_params
-        if params is not None and params.gain is not None:
-            gain = gain * params.gain
-        if params is not None and params.alive is not None:
-            gain = gain * params.alive
-        return measure_tangential(
-            late.tangential_force, late.taxel_force, gain, self.config.sensing.taxel, jax.random.fold_in(key, 1)
-        )
-
-
-def _array(config: EnvConfig, hand: Hand) -> SensorModel | None:
-    """The imperfect taxels of `Sensing.array`; None where they are off."""
-    noise = config.sensing.array
-    if noise.scale == 0 or not config.touch:
-        return None
-    return noise.model(hand.taxel_grid, fingers=hand.num_fingers, control_period=config.physics.control_period)
+        key, gain = jax.random.fold_in(key, 1), sensors.draw.taxel_gain
+        return self.taxels.apply_tangential(sensors.array_params, key, late.tangential_force, late.taxel_force, gain)

@@ -11,7 +11,7 @@ from dexsim.observation import Readings
 from dexsim.physics.seam import PhysicsState
 from dexsim.randomization import Draw
 from dexsim.sensing.imu import SensorDraw
-from dexsim.sensing.taxels import SensorParams, SensorState
+from dexsim.sensing.taxels import TaxelMemory, TaxelParams
 
 
 @pytree_dataclass
@@ -60,8 +60,8 @@ class State:
     terminated: jax.Array  # [] bool
     truncated: jax.Array  # [] bool
     metrics: dict[str, jax.Array]
-    array_params: SensorParams | None = None  # of the taxels, where `Sensing.array` is on
-    array: SensorState | None = None
+    array_params: TaxelParams | None = None  # of the taxels
+    array: TaxelMemory | None = None
     gear: GearState | None = None  # of the joints, with gear play
     tangential_force: jax.Array | None = None  # [F, 3] N, true, with `Sensing.three_axis`
     scale: jax.Array | None = None  # [] of the ranges that the next episode is drawn from

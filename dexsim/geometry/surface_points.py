@@ -91,6 +91,16 @@ def from_shape(shape: sdf.Shape, config: PointsConfig | None = None) -> SurfaceP
     return _build(jnp.concatenate(position), jnp.concatenate(normal), config)
 
 
+def scaled(surface: SurfacePoints, factor: jax.Array | float) -> SurfacePoints:
+    """The points of an object that is `factor` [] times as large; their table stays valid."""
+    return dataclasses.replace(
+        surface,
+        position=factor * surface.position,
+        origin=factor * surface.origin,
+        spacing=factor * surface.spacing,
+    )
+
+
 def signed_distance(points: jax.Array, surface: SurfacePoints) -> jax.Array:
     """Plane offset (p - p_o) . n_o [...] m at points [..., 3]."""
     return distance_and_normal(points, surface)[0]

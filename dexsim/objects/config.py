@@ -40,8 +40,6 @@ class ObjectConfig:
     """Factor on the mesh's size."""
     mesh_parts: int = setting(6, unit="1", low=1, high=24)
     """Boxes at most that follow the mesh in the solver, whose cost grows with them."""
-    mesh_touch: str = setting("boxes", choices=("boxes", "grid"))
-    """What the taxels feel of a mesh: the solver's boxes, or the mesh itself through a baked grid."""
     sphere_radius: tuple[float, float] = setting((0.022, 0.035), unit="m", low=0.005, high=0.08)
     """Radius of a sphere."""
     box_half: tuple[float, float] = setting((0.020, 0.030), unit="m", low=0.005, high=0.08)

@@ -1,4 +1,4 @@
-"""A mesh as the object of a task: boxes for the solver, mass properties, and a grid for the taxels.
+"""A mesh as the object of a task: boxes for the solver and mass properties.
 
 The object's frame lies in the mesh's centre of mass, along the axes of the file where those are its
 principal axes, else along the principal axes, turned as little as possible.
@@ -6,14 +6,13 @@ principal axes, else along the principal axes, turned as little as possible.
 
 import dataclasses
 import itertools
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dexsim.geometry import grid
 from dexsim.geometry import mesh as meshes
 from dexsim.objects.boxes import Boxes, fit_boxes
 
@@ -34,19 +33,6 @@ class MeshObject:
     def kinds(self) -> tuple[str, ...]:
         """The primitives that it consists of."""
         return ("box",) * len(self.boxes.size)
-
-    @cached_property
-    def _baked(self) -> grid.Grid:
-        with jax.ensure_compile_time_eval():  # whoever asks first may be compiling
-            return grid.bake(self.mesh)
-
-    def grid(self, size: jax.Array) -> grid.Grid:
-        """Its signed distance, where the boxes have these sizes [K, 3] m.
-
-        Raises:
-          AssetError: the mesh cannot be signed.
-        """
-        return grid.select(self._baked, 0, size[0, 0] / self.boxes.size[0, 0])
 
 
 def load(path: str, *, unit: float, parts: int) -> MeshObject:

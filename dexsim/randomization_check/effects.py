@@ -17,6 +17,7 @@ from dexsim.core.compilation import collector_paused
 from dexsim.objects.config import SHAPES
 from dexsim.randomization import Randomization, sample
 from dexsim.sensing.imu import OrientationSensor, draw_sensor
+from dexsim.sensing.taxels import TaxelSensor
 
 NOMINAL = {
     "stiffness_factor": 1.0,
@@ -75,8 +76,8 @@ def check(
         tests[f"Randomization.{name}"] = lambda n=name: bench.hand_range(n)
     for name in _ranges(env.config.sensing.orientation):
         tests[f"OrientationSensor.{name}"] = lambda n=name: bench.orientation_range(n)
-    for name in _ranges(env.config.sensing.array) if env.senses.array is not None else ():
-        tests[f"SensorNoise.{name}"] = lambda n=name: bench.array_range(n)
+    for name in _taxel_ranges(env.config.sensing.taxel):
+        tests[f"TaxelSensor.{name}"] = lambda n=name: bench.taxel_range(n)
     for path in env.task.object_ranges:
         owner, name = _owner(env.config, path)
         tests[f"{type(owner).__name__}.{name}"] = lambda p=path: bench.object_range(p)
@@ -103,6 +104,11 @@ def _ranges(config: Any) -> list[str]:
     return [field.name for field in dataclasses.fields(config) if is_range(field.name)]
 
 
+def _taxel_ranges(config: TaxelSensor) -> list[str]:
+    """Names of the ranges of the taxels that are on."""
+    return [name for name in _ranges(config) if name != "hysteresis_time" or config.hysteresis is not None]
+
+
 class _Bench:
     """The same starts and actions for all ranges."""
 
@@ -118,7 +124,7 @@ class _Bench:
             states,
             draw=self._draw(self._only()),
             orientation_sensor=self._imu(_still_imu(env)),
-            array_params=self._array(),
+            array_params=self._taxels(),
         )
         self.base = self._run(self.states)
         # On the Warp backend two runs of the same differ: what is not well above that is no effect.
@@ -152,17 +158,12 @@ class _Bench:
             jax.random.split(self.key, self.count)
         )
 
-    def _array(self, *names: str, **aids: Any) -> Any:
+    def _taxels(self, *names: str, **aids: Any) -> Any:
         """Taxels that are perfect but for these ranges, with the structure of the environment's."""
-        env = self.env
-        if env.senses.array is None:
-            return None
-        config = env.config.sensing.array
-        nominal = {"rate": 1 / env.control_period, "gain": 1.0, "hysteresis_time": config.hysteresis_time[0]}
-        fixed = {name: (nominal.get(name, 0.0),) * 2 for name in _ranges(config) if name not in names}
-        perfect = dataclasses.replace(config, scale=1.0, **fixed | aids).model(
-            env.hand.taxel_grid, fingers=env.hand.num_fingers, control_period=env.control_period
-        )
+        array, config = self.env.senses.taxels, self.env.config.sensing.taxel
+        nominal = {"rate": 1 / self.env.control_period, "gain": 1.0, "hysteresis_time": config.hysteresis_time[0]}
+        fixed = {name: (nominal.get(name, 0.0),) * 2 for name in _taxel_ranges(config) if name not in names}
+        perfect = dataclasses.replace(array, sensor=dataclasses.replace(config, **fixed | aids))
         return jax.vmap(perfect.sample)(jax.random.split(self.key, self.count))
 
     def _run(self, states: Any) -> dict[str, np.ndarray]:
@@ -226,16 +227,16 @@ class _Bench:
             label, self.states.orientation_sensor, drawn, dataclasses.replace(self.states, orientation_sensor=drawn)
         )
 
-    def array_range(self, name: str) -> Effect:
-        """One field of `SensorNoise`."""
-        label, span = f"SensorNoise.{name}", getattr(self.env.config.sensing.array, name)
+    def taxel_range(self, name: str) -> Effect:
+        """One field of `TaxelSensor`."""
+        label, span = f"TaxelSensor.{name}", getattr(self.env.config.sensing.taxel, name)
         if _width(span) == 0:
             return Effect(label, off=True)
         base, before, aids = None, self.states.array_params, _AIDS.get(name, {})
         if aids:
-            before = self._array(**aids)
+            before = self._taxels(**aids)
             base = self._run(dataclasses.replace(self.states, array_params=before))
-        drawn = self._array(name, **aids)
+        drawn = self._taxels(name, **aids)
         return self._effect(label, before, drawn, dataclasses.replace(self.states, array_params=drawn), base)
 
     def object_range(self, path: str) -> Effect:

@@ -4,8 +4,7 @@ import dataclasses
 
 from dexsim.core.config import setting, validate
 from dexsim.sensing.imu import OrientationSensor
-from dexsim.sensing.taxel_reading import TaxelSensor
-from dexsim.sensing.taxels import SensorNoise
+from dexsim.sensing.taxels import TaxelSensor
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -29,9 +28,6 @@ class Sensing:
     """The IMU inside the object."""
     taxel: TaxelSensor = setting(TaxelSensor())
     """The taxels."""
-    array: SensorNoise = setting(SensorNoise(scale=0.0))
-    """Imperfections of the taxels that are drawn at every episode start and have a memory; with a
-    scale above 0 they take the place of `taxel`."""
     three_axis: bool = setting(False)
     """Taxels that also feel along the skin: the solver's tangential force on each fingertip."""
 

@@ -14,7 +14,7 @@ from dexsim.core.errors import ConfigError, DexsimError
 from dexsim.objects.config import ObjectConfig
 from dexsim.physics.config import PhysicsConfig
 from dexsim.randomization import Randomization
-from dexsim.sensing.taxel_reading import TaxelSensor
+from dexsim.sensing.taxels import TaxelSensor
 from dexsim.tasks.grasp.config import GraspConfig, GraspReward
 from dexsim.touch.skin import Skin
 

@@ -22,7 +22,7 @@ from dexsim.objects.config import SHAPES, SLOTS, ObjectConfig
 from dexsim.physics.seam import PhysicsState
 from dexsim.randomization import Randomization
 from dexsim.sensing.config import Sensing
-from dexsim.sensing.taxel_reading import TaxelSensor
+from dexsim.sensing.taxels import TaxelSensor
 from dexsim.tasks.grasp.config import GraspConfig
 from dexsim.tasks.grasp.task import COMMANDS
 from dexsim.touch.feel import feel

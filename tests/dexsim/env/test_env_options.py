@@ -21,23 +21,19 @@ from dexsim.randomization import Randomization
 from dexsim.randomization_check.effects import check
 from dexsim.sensing.config import Sensing
 from dexsim.sensing.imu import OrientationSensor
-from dexsim.sensing.taxel_reading import TaxelSensor
-from dexsim.sensing.taxels import SensorNoise
+from dexsim.sensing.taxels import TaxelSensor
 from dexsim.tasks.grasp.config import GraspConfig
 from dexsim_ppo.train import parse_arguments
 
 WORLDS = 4
-INACTIVE_SIZE = SensorNoise(
-    hysteresis=None,
-    crosstalk=None,
-    gain=None,
-    bias=None,
-    drift=None,
-    noise=None,
-    dead=None,
-    threshold=None,
-    counts="none",
-    rate=None,
+QUIET_TAXELS = TaxelSensor(noise=0.0, threshold=0.0, resolution=0.0, saturation=1000.0)
+POOR_TAXELS = TaxelSensor(
+    hysteresis=(0.0, 0.3),
+    crosstalk=(0.0, 0.1),
+    gain=(0.85, 1.15),
+    bias=(-0.03, 0.03),
+    drift=(0.0, 0.005),
+    dead=(0.0, 0.05),
 )
 QUIET = Sensing(
     joint_noise=0.0,
@@ -45,7 +41,7 @@ QUIET = Sensing(
     torque_noise=0.0,
     object_noise=0.0,
     orientation=OrientationSensor(noise=0.0, bias=0.0, drift=0.0, delay=(0.0, 0.0)),
-    taxel=TaxelSensor(noise=0.0, threshold=0.0, resolution=0.0),
+    taxel=QUIET_TAXELS,
 )
 
 
@@ -88,7 +84,7 @@ def make():
 def busy(make):
     """All of it at once, compiled once: the environment, states from a reset and 40 ticks on, and a restart."""
     env = make(
-        dataclasses.replace(QUIET, three_axis=True, array=dataclasses.replace(INACTIVE_SIZE, gain=(0.5, 1.5))), GEARED
+        dataclasses.replace(QUIET, three_axis=True, taxel=dataclasses.replace(QUIET_TAXELS, gain=(0.5, 1.5))), GEARED
     )
     history = [jax.jit(lambda key: jax.vmap(env.reset)(jax.random.split(key, WORLDS)))(jax.random.key(0))]
     step, rng = jax.jit(jax.vmap(env.step)), np.random.default_rng(0)
@@ -157,14 +153,12 @@ def test_taxels_feel_no_friction(make):
 
 
 class TestTaxels:
-    def array(self, **effects):
-        return dataclasses.replace(QUIET, array=dataclasses.replace(INACTIVE_SIZE, **effects))
+    def sensing(self, **effects):
+        return dataclasses.replace(QUIET, taxel=dataclasses.replace(QUIET_TAXELS, **effects))
 
     def test_off_by_default_and_then_not_there(self, make):
-        env = make()
-        state = jax.eval_shape(env.reset, jax.random.key(0))
-        assert env.senses.array is None and state.array is None and state.array_params is None
-        assert GraspConfig().sensing.array.scale == 0
+        state = jax.eval_shape(make(Sensing()).reset, jax.random.key(0))
+        assert not jax.tree.leaves((state.array, state.array_params))
 
     def test_gains_are_drawn_anew_for_an_episode_and_stay_in_it(self, busy):
         env, (state, *_, last), begun = busy
@@ -179,7 +173,7 @@ class TestTaxels:
 
     def test_creep_is_remembered_from_tick_to_tick(self, make):
         """A step of force comes in by 1 - a exp(-t / tau); the memory is in the state."""
-        env = make(self.array(hysteresis=(0.4, 0.4), hysteresis_time=(0.1, 0.1)))
+        env = make(self.sensing(hysteresis=(0.4, 0.4), hysteresis_time=(0.1, 0.1)))
         state = env.reset(jax.random.key(0))
         assert float(jnp.abs(state.array.late).max()) == 0
         force = press(1)
@@ -191,7 +185,7 @@ class TestTaxels:
 
     def test_a_slow_array_repeats_itself(self, make):
         """At 8 Hz under 33 Hz control four or five ticks see each sample."""
-        env = make(self.array(rate=(8.0, 8.0)))
+        env = make(self.sensing(rate=(8.0, 8.0)))
         forces = [press(2, 1.0 + tick) for tick in range(34)]
         seen, _ = reads(env, env.reset(jax.random.key(0)), forces)
         values = [float(s.max()) for s in seen]
@@ -200,18 +194,19 @@ class TestTaxels:
 
     def test_crosstalk_drift_and_counts(self, make):
         still = [jnp.zeros((5, 120)).at[:, 65].set(2.0)] * 40
-        env = make(self.array(crosstalk=(0.2, 0.2)))
+        env = make(self.sensing(crosstalk=(0.2, 0.2)))
         spread = reads(env, env.reset(jax.random.key(0)), still[:1])[0][0]
         np.testing.assert_allclose(spread.sum(-1), 2.0, rtol=1e-5)
         np.testing.assert_allclose(spread[:, 65], 1.6, rtol=1e-5)
         assert np.all((spread > 0).sum(-1) == 5)
-        env = make(self.array(drift=(0.5, 0.5)))
+        env = make(self.sensing(drift=(0.5, 0.5)))
+        still = [jnp.full((5, 120), 5.0)] * 40
         drifting = np.stack(reads(env, env.reset(jax.random.key(0)), still)[0])
         # A walk: the deviation grows with the square root of time.
         for ticks in (4, 36):
             expected = 0.5 * np.sqrt(ticks * env.control_period)
             assert np.std(drifting[ticks - 1] - still[0]) == pytest.approx(expected, rel=0.15)
-        env = make(self.array(counts="uint8"))
+        env = make(self.sensing(resolution=0.1, saturation=25.5))
         counted = reads(env, env.reset(jax.random.key(0)), [20 * press(3)])[0][0]
         np.testing.assert_allclose(counted, np.clip(np.round(20 * press(3) / 0.1), 0, 255) * 0.1, atol=1e-5)
         assert counted.max() == pytest.approx(25.5)
@@ -391,7 +386,7 @@ class TestGearPlay:
 @pytest.fixture(scope="module")
 def drawn(make):
     """An environment and 64 resets at three scales."""
-    env = make(dataclasses.replace(QUIET, array=SensorNoise(), orientation=OrientationSensor()), Randomization())
+    env = make(dataclasses.replace(QUIET, taxel=POOR_TAXELS, orientation=OrientationSensor()), Randomization())
     draw = jax.jit(lambda key, scale: jax.vmap(lambda k: env.reset(k, scale))(jax.random.split(key, 64)))
     return env, {scale: draw(jax.random.key(0), jnp.float32(scale)) for scale in (0.0, 0.5, 1.0)}
 
@@ -464,17 +459,16 @@ def test_all_of_it_is_reached_from_the_command_line():
         [
             "--task",
             "grasp",
-            "--env.sensing.array.scale",
-            "1",
-            "--env.sensing.array.hysteresis",
+            "--env.sensing.taxel.hysteresis",
             "0.1",
             "0.2",
-            "--env.sensing.array.drift",
+            "--env.sensing.taxel.drift",
             "0",
             "0.01",
-            "--env.sensing.array.crosstalk",
-            "None",
-            "--env.sensing.array.rate",
+            "--env.sensing.taxel.crosstalk",
+            "0",
+            "0.1",
+            "--env.sensing.taxel.rate",
             "8",
             "20",
             "--env.sensing.three-axis",
@@ -489,9 +483,9 @@ def test_all_of_it_is_reached_from_the_command_line():
             "0.03",
         ]
     )
-    array = arguments.env.sensing.array
-    assert (array.scale, array.hysteresis, array.drift) == (1.0, (0.1, 0.2), (0.0, 0.01))
-    assert array.crosstalk is None and array.rate == (8.0, 20.0) and arguments.env.sensing.three_axis
+    taxel = arguments.env.sensing.taxel
+    assert (taxel.hysteresis, taxel.drift, taxel.gain) == ((0.1, 0.2), (0.0, 0.01), None)
+    assert taxel.crosstalk == (0.0, 0.1) and taxel.rate == (8.0, 20.0) and arguments.env.sensing.three_axis
     assert arguments.env.observation.add == ("tangential_force",)
     assert arguments.env.randomization.backlash == "gear_play"
     assert arguments.env.randomization.gear_gap == (0.0, 0.03)
@@ -499,7 +493,7 @@ def test_all_of_it_is_reached_from_the_command_line():
 
 @pytest.mark.long
 def test_the_self_test_finds_every_range_of_gears_and_taxels(make):
-    env = make(Sensing(array=SensorNoise(rate=(8.0, 20.0), counts="none")), GEARED)
+    env = make(Sensing(taxel=dataclasses.replace(POOR_TAXELS, rate=(8.0, 20.0), resolution=0.0)), GEARED)
     states = jax.jit(lambda key: jax.vmap(env.reset)(jax.random.split(key, WORLDS)))(jax.random.key(0))
     names = (
         "hysteresis",
@@ -508,9 +502,7 @@ def test_the_self_test_finds_every_range_of_gears_and_taxels(make):
         "gain",
         "bias",
         "drift",
-        "noise",
         "dead",
-        "threshold",
         "rate",
     )
     effects = check(
@@ -519,7 +511,7 @@ def test_the_self_test_finds_every_range_of_gears_and_taxels(make):
         states,
         key=jax.random.key(1),
         ticks=10,
-        names=["Randomization.gear_gap", "Randomization.dead_band", *(f"SensorNoise.{name}" for name in names)],
+        names=["Randomization.gear_gap", "Randomization.dead_band", *(f"TaxelSensor.{name}" for name in names)],
     )
     gap, band, *taxels = effects
     assert gap.changed == ("gear_gap",) and gap.joint > 1e-4 and band.off
@@ -533,7 +525,7 @@ def test_everything_at_once_on_the_real_physics():
     """A hand that grips and shakes, then holds still, with play in its gears and poor taxels: sober numbers."""
     config = GraspConfig(
         pool_size=80,
-        sensing=Sensing(array=SensorNoise(rate=(10.0, 30.0)), three_axis=True),
+        sensing=Sensing(taxel=dataclasses.replace(POOR_TAXELS, rate=(10.0, 30.0)), three_axis=True),
         observation=ObservationConfig(add=("tangential_force",)),
         randomization=Randomization(backlash="gear_play"),
     )

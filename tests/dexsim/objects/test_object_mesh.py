@@ -162,22 +162,30 @@ def simple(monkeypatch):
     monkeypatch.setattr("dexsim.env.env.Physics", SimplePhysics)
 
 
-@pytest.mark.parametrize("touch", ["boxes", "grid"])
-def test_taxels_feel_the_mesh_at_the_size_of_the_episode(simple, folder, touch):
-    objects = ObjectConfig(mesh=str(folder / "cuboid.ply"), mesh_unit=0.001, mesh_size=(0.9, 1.1), mesh_touch=touch)
-    env = dexsim.make("grasp", GraspConfig(objects=objects, pool_size=16), backend="jax")
+@pytest.mark.parametrize("method", ["closed_form", "grid", "surface_points"])
+def test_taxels_feel_the_mesh_at_the_size_of_the_episode(simple, folder, method):
+    objects = ObjectConfig(mesh=str(folder / "cuboid.ply"), mesh_unit=0.001, mesh_size=(0.9, 1.1))
+    env = dexsim.make("grasp", GraspConfig(objects=objects, pool_size=16, touch_method=method), backend="jax")
     targets = jax.tree.map(lambda leaf: jnp.asarray(leaf)[:WORLDS], env.pool.target)
     assert len(np.unique(env.pool.target.size[:, 0, 0])) == 16
     points = jnp.asarray(np.random.default_rng(0).uniform(-0.035, 0.035, (500, 3)), jnp.float32)
-    felt = jax.jit(jax.vmap(lambda target: distance.signed_distance(points, env._felt(target))))(targets)
+    felt = jax.jit(jax.vmap(lambda target: distance.signed_distance(points, env._touch_geometry(target))))(targets)
     exact = jax.vmap(lambda target: sdf.box(points, target.size[0]))(targets)
     near = np.abs(exact) < 0.003
-    np.testing.assert_allclose(felt[near], exact[near], atol=3e-4 if touch == "grid" else 1e-6)
+    error, (mean, worst) = (
+        np.abs(felt - exact)[near],
+        {
+            "closed_form": (1e-6, 1e-6),
+            "grid": (3e-5, 3e-4),
+            "surface_points": (2e-4, 3e-3),  # beyond an edge the offset from a face's plane falls short of the distance
+        }[method],
+    )
+    assert error.mean() < mean and error.max() < worst
 
 
 def test_an_environment_steps_with_a_mesh(simple, folder):
-    objects = ObjectConfig(mesh=str(folder / "ell.obj"), mesh_touch="grid")
-    env = dexsim.make("grasp", GraspConfig(objects=objects, pool_size=16), backend="jax")
+    objects = ObjectConfig(mesh=str(folder / "ell.obj"))
+    env = dexsim.make("grasp", GraspConfig(objects=objects, pool_size=16, touch_method="grid"), backend="jax")
     assert set(env.primitive_kinds) == {"box"} and "objects.mesh_size" in env.task.object_ranges
     state = jax.jit(lambda key: jax.vmap(env.reset)(jax.random.split(key, WORLDS)))(jax.random.key(0))
     step, felt = jax.jit(jax.vmap(env.step)), 0

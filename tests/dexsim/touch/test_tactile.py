@@ -1,6 +1,4 @@
-"""Touch against closed forms: Mooney-Rivlin, flat punch, Winkler's sphere; reduction; the sensor; gradients."""
-
-import dataclasses
+"""Touch against closed forms: Mooney-Rivlin, flat punch, Winkler's sphere; reduction; gradients."""
 
 import c_scene
 import jax
@@ -14,8 +12,6 @@ from dexsim.core.errors import ConfigError
 from dexsim.geometry import sdf
 from dexsim.geometry.rotations import axis_angle_to_matrix, compose
 from dexsim.hand.kinematics import forward_kinematics, taxel_positions
-from dexsim.sensing import taxel_reading
-from dexsim.sensing.taxel_reading import TaxelSensor
 from dexsim.touch import feel as touch_feel
 from dexsim.touch import reduce as touch_reduce
 from dexsim.touch import skin as touch_skin
@@ -24,11 +20,9 @@ from dexsim.touch.skin import Skin
 
 EYE = np.eye(3, dtype=np.float32)
 feel = jax.jit(touch_feel.feel, static_argnames="skin")
-measure_taxels = jax.jit(taxel_reading.measure_taxels, static_argnames="sensor")
 reduce_touch = jax.jit(touch_reduce.reduce_touch, static_argnames="weighting")
 skin_stress = jax.jit(touch_skin.skin_stress, static_argnames="skin")
 spread = jax.jit(touch_feel.spread)
-IDEAL = TaxelSensor(noise=0.0, threshold=0.0, resolution=0.0, saturation=1000.0)
 
 
 def solid(kind, *size):
@@ -327,49 +321,6 @@ def test_the_centre_lies_among_the_taxels_that_feel(hand, taxels):
     for finger in np.flatnonzero(np.asarray(force) > 0):
         felt = np.asarray(taxels[finger])[np.asarray(touch.force[finger]) > 0]
         assert np.all(centre[finger] >= felt.min(0) - 1e-6) and np.all(centre[finger] <= felt.max(0) + 1e-6)
-
-
-# --- the sensor ----------------------------------------------------------------------------------
-
-KEY = jax.random.key(0)
-UNIT = np.ones((1, 1), np.float32)
-
-
-def test_an_ideal_sensor_reads_the_truth():
-    force = np.random.default_rng(3).uniform(0, 30, (5, 120)).astype(np.float32)
-    np.testing.assert_array_equal(measure_taxels(force, np.ones((5, 1), np.float32), IDEAL, KEY), force)
-
-
-def test_threshold_counts_and_saturation():
-    sensor = TaxelSensor(noise=0.0, threshold=0.25, resolution=0.1, saturation=25.5)
-    force = np.float32([[0.0, 0.1, 0.24, 0.26, 0.31, 0.36, 1.04, 25.46, 25.7, 300.0]])
-    wanted = [[0.0, 0.0, 0.0, 0.3, 0.3, 0.4, 1.0, 25.5, 25.5, 25.5]]
-    np.testing.assert_allclose(measure_taxels(force, UNIT, sensor, KEY), wanted, atol=1e-5)
-
-
-def test_readings_are_whole_counts():
-    force = np.random.default_rng(4).uniform(0, 30, (5, 120)).astype(np.float32)
-    counts = np.asarray(measure_taxels(force, np.ones((5, 1), np.float32), TaxelSensor(), KEY)) / 0.1
-    np.testing.assert_allclose(counts, np.round(counts), atol=1e-4)
-    assert counts.max() == pytest.approx(255) and counts.min() >= 0
-
-
-def test_noise_never_makes_a_reading_negative():
-    sensor = TaxelSensor(noise=0.5, threshold=0.0, resolution=0.0)
-    reading = np.asarray(measure_taxels(np.zeros((5, 2000), np.float32), np.ones((5, 1), np.float32), sensor, KEY))
-    assert reading.min() == 0 and 0.4 < np.mean(reading > 0) < 0.6
-    # Half of a normal distribution: its mean is sigma / sqrt(2 pi).
-    assert reading.mean() == pytest.approx(0.5 / np.sqrt(2 * np.pi), rel=0.05)
-
-
-def test_noise_has_its_width_and_gain_is_the_fingers_own():
-    sensor = dataclasses.replace(IDEAL, noise=0.2)
-    gain = np.float32([[0.9], [1.1]])
-    reading = np.asarray(measure_taxels(np.full((2, 5000), 10, np.float32), gain, sensor, KEY))
-    np.testing.assert_allclose(reading.mean(1), [9, 11], atol=0.02)
-    np.testing.assert_allclose(reading.std(1), 0.2, rtol=0.05)
-    other = np.asarray(measure_taxels(np.full((2, 5000), 10, np.float32), gain, sensor, jax.random.key(1)))
-    assert np.all(reading != other) or np.mean(reading == other) < 0.01
 
 
 # --- gradients -----------------------------------------------------------------------------------

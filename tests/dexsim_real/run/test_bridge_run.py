@@ -36,7 +36,7 @@ from dexsim.physics.seam import PhysicsState
 from dexsim.randomization import Randomization
 from dexsim.sensing.config import Sensing
 from dexsim.sensing.imu import OrientationSensor
-from dexsim.sensing.taxel_reading import TaxelSensor
+from dexsim.sensing.taxels import TaxelSensor
 from dexsim.task_spec import TaskSpec
 from dexsim.tasks.grasp.config import GraspConfig
 from dexsim.tasks.grasp.task import Grasp

@@ -1,6 +1,7 @@
-"""The sensor's imperfections, one at a time, against closed forms and their statistics."""
+"""What a taxel array does to the force, one effect at a time, against closed forms and their statistics."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -9,27 +10,26 @@ import pytest
 
 from dexsim.core.config import from_dict, to_dict
 from dexsim.core.errors import ConfigError
-from dexsim.sensing.taxels import SensorNoise, neighbour_difference
+from dexsim.sensing.taxels import TaxelArray, TaxelSensor, neighbour_difference
 
 GRID, FINGERS, PERIOD = (10, 12), 5, 0.02
 SHAPE = (FINGERS, GRID[0] * GRID[1])
 KEY = jax.random.key(0)
-INACTIVE_SIZE = SensorNoise(
-    hysteresis=None,
-    crosstalk=None,
-    gain=None,
-    bias=None,
-    drift=None,
-    noise=None,
-    dead=None,
-    threshold=None,
-    counts="none",
-    rate=None,
-)
+IDEAL = TaxelSensor(noise=0.0, threshold=0.0, resolution=0.0, saturation=1000.0)
+UNIT = np.ones((1, 1), np.float32)
+ALL = {
+    "hysteresis": (0.0, 0.3),
+    "crosstalk": (0.0, 0.1),
+    "gain": (0.85, 1.15),
+    "bias": (-0.03, 0.03),
+    "drift": (0.0, 0.005),
+    "dead": (0.0, 0.05),
+}
+BASE = 5.0  # N on every taxel, so that errors of both signs are read
 
 
 def model(**effects):
-    return dataclasses.replace(INACTIVE_SIZE, **effects).model(GRID, fingers=FINGERS, control_period=PERIOD)
+    return TaxelArray(dataclasses.replace(IDEAL, **effects), GRID, FINGERS, PERIOD)
 
 
 def forces(seed=0):
@@ -48,23 +48,58 @@ def run(sensor, force, key=KEY):
     return np.asarray(jax.jit(lambda: jax.lax.scan(step, sensor.init(), (keys, jnp.asarray(force))))()[1]), params
 
 
-def test_scale_zero_is_the_identity_exactly():
-    sensor = SensorNoise(scale=0.0, rate=(5.0, 10.0)).model(GRID, fingers=FINGERS, control_period=PERIOD)
-    force = np.stack([forces(seed) for seed in range(5)])
-    np.testing.assert_array_equal(run(sensor, force)[0], force)
+@functools.partial(jax.jit, static_argnames="sensor")
+def measure(force, gain, sensor, key):
+    """One reading [F, N] of an array without memory."""
+    array = TaxelArray(sensor, (1, force.shape[1]), force.shape[0], PERIOD)
+    return array.apply(array.sample(key), array.init(), key, force, gain)[1]
 
 
-def test_everything_off_is_the_identity_exactly():
+def test_an_ideal_sensor_reads_the_truth_and_has_no_arrays():
     force = np.stack([forces(seed) for seed in range(5)])
-    np.testing.assert_array_equal(run(model(), force)[0], force)
+    readings, params = run(model(), force)
+    np.testing.assert_array_equal(readings, force)
+    assert not jax.tree.leaves((params, model().init()))
+
+
+def test_threshold_counts_and_saturation():
+    sensor = TaxelSensor(noise=0.0, threshold=0.25, resolution=0.1, saturation=25.5)
+    force = np.float32([[0.0, 0.1, 0.24, 0.26, 0.31, 0.36, 1.04, 25.46, 25.7, 300.0]])
+    wanted = [[0.0, 0.0, 0.0, 0.3, 0.3, 0.4, 1.0, 25.5, 25.5, 25.5]]
+    np.testing.assert_allclose(measure(force, UNIT, sensor, KEY), wanted, atol=1e-5)
+
+
+def test_readings_are_whole_counts():
+    force = np.random.default_rng(4).uniform(0, 30, (5, 120)).astype(np.float32)
+    counts = np.asarray(measure(force, np.ones((5, 1), np.float32), TaxelSensor(), KEY)) / 0.1
+    np.testing.assert_allclose(counts, np.round(counts), atol=1e-4)
+    assert counts.max() == pytest.approx(255) and counts.min() >= 0
+
+
+def test_noise_never_makes_a_reading_negative():
+    sensor = TaxelSensor(noise=0.5, threshold=0.0, resolution=0.0)
+    reading = np.asarray(measure(np.zeros((5, 2000), np.float32), np.ones((5, 1), np.float32), sensor, KEY))
+    assert reading.min() == 0 and 0.4 < np.mean(reading > 0) < 0.6
+    # Half of a normal distribution: its mean is sigma / sqrt(2 pi).
+    assert reading.mean() == pytest.approx(0.5 / np.sqrt(2 * np.pi), rel=0.05)
+
+
+def test_noise_has_its_width_and_gain_is_the_fingers_own():
+    sensor = dataclasses.replace(IDEAL, noise=0.2)
+    gain = np.float32([[0.9], [1.1]])
+    reading = np.asarray(measure(np.full((2, 5000), 10, np.float32), gain, sensor, KEY))
+    np.testing.assert_allclose(reading.mean(1), [9, 11], atol=0.02)
+    np.testing.assert_allclose(reading.std(1), 0.2, rtol=0.05)
+    other = np.asarray(measure(np.full((2, 5000), 10, np.float32), gain, sensor, jax.random.key(1)))
+    assert np.all(reading != other) or np.mean(reading == other) < 0.01
 
 
 def test_a_small_scale_is_a_small_error():
-    sensor = dataclasses.replace(SensorNoise(), scale=1e-4, counts="none")
-    force = np.stack([forces(seed) for seed in range(4)])
-    readings, params = run(sensor.model(GRID, fingers=FINGERS, control_period=PERIOD), force)
+    array, force = model(**ALL), jnp.asarray(forces() + BASE)
+    params = array.sample(KEY, 1e-4)
+    reading = array.apply(params, array.init(), KEY, force)[1]
     assert bool(params.alive.all())
-    assert 0 < np.abs(readings - force).max() < 2e-3
+    assert 0 < np.abs(reading - force).max() < 2e-3
 
 
 def test_hysteresis_is_an_exponential_creep():
@@ -107,11 +142,12 @@ def test_crosstalk_by_loops_and_keeps_the_total():
 
 def test_gain_and_bias_are_each_taxels_own_and_last_an_episode():
     sensor = model(gain=(0.8, 1.2), bias=(-0.05, 0.05))
-    zero, one = np.zeros((3, *SHAPE), np.float32), np.ones((3, *SHAPE), np.float32)
-    bias, params = run(sensor, zero)
+    one = np.ones((3, *SHAPE), np.float32)
     total, _ = run(sensor, one)
-    np.testing.assert_array_equal(bias[0], bias[2])
-    gain = total[0] - bias[0]
+    double, _ = run(sensor, 2 * one)
+    np.testing.assert_array_equal(total[0], total[2])
+    gain = double[0] - total[0]
+    bias = total[0] - gain
     assert 0.8 <= gain.min() < 0.82 and 1.18 < gain.max() <= 1.2 and np.abs(bias).max() <= 0.05
     assert gain.std() == pytest.approx(0.4 / np.sqrt(12), rel=0.1)
     other, _ = run(sensor, one, jax.random.key(1))
@@ -120,15 +156,14 @@ def test_gain_and_bias_are_each_taxels_own_and_last_an_episode():
 
 def test_drift_grows_with_the_root_of_time():
     sensor = model(drift=(0.02, 0.02))
-    readings, _ = run(sensor, np.zeros((200, *SHAPE), np.float32))
+    readings = run(sensor, np.full((200, *SHAPE), BASE, np.float32))[0] - BASE
     for step in (50, 200):
         assert readings[step - 1].std() == pytest.approx(0.02 * np.sqrt(step * PERIOD), rel=0.1)
     assert abs(readings[-1].mean()) < 0.01
 
 
 def test_noise_is_white():
-    sensor = model(noise=(0.1, 0.1))
-    readings, _ = run(sensor, np.zeros((60, *SHAPE), np.float32))
+    readings = run(model(noise=0.1), np.full((60, *SHAPE), BASE, np.float32))[0] - BASE
     assert readings.std() == pytest.approx(0.1, rel=0.02)
     assert abs(np.mean(readings[1:] * readings[:-1])) < 0.1 * 0.1**2
 
@@ -141,25 +176,6 @@ def test_dead_taxels_stay_dead_and_their_share_is_drawn():
     np.testing.assert_array_equal(dead[0], ~np.asarray(params.alive))
     shares = jax.vmap(lambda key: 1 - jnp.mean(sensor.sample(key).alive))(jax.random.split(KEY, 100))
     assert float(shares.mean()) == pytest.approx(0.1, abs=0.01)
-
-
-def test_threshold():
-    sensor = model(threshold=(0.1, 0.3))
-    ramp = np.linspace(0, 0.5, 51, dtype=np.float32)
-    readings, params = run(sensor, np.broadcast_to(ramp[:, None, None], (51, *SHAPE)))
-    onset = np.where(readings > 0, readings, np.inf).min(0)
-    threshold = np.asarray(params.threshold)
-    assert threshold.min() >= 0.1 and threshold.max() <= 0.3
-    assert np.all(onset >= threshold - 1e-6) and np.all(onset <= threshold + 0.0101)
-
-
-@pytest.mark.parametrize(("counts", "low", "high"), [("uint8", 0.0, 25.5), ("int8", -12.8, 12.7)])
-def test_counts_and_saturation_are_the_hands(counts, low, high):
-    force = np.zeros((1, *SHAPE), np.float32)
-    force[0, 0, :7] = [0.04, 0.06, 1.234, 25.4, 300.0, -0.3, -300.0]
-    reading = run(model(counts=counts), force)[0][0, 0, :7]
-    wanted = np.clip(np.round(force[0, 0, :7], 1), low, high)
-    np.testing.assert_allclose(reading, wanted, atol=1e-5)
 
 
 def test_sampling_below_the_control_rate_holds_the_last_reading():
@@ -183,7 +199,7 @@ def test_a_rate_above_the_control_rate_changes_nothing():
 
 
 def test_all_at_once_under_vmap():
-    sensor = SensorNoise(rate=(20.0, 40.0)).model(GRID, fingers=FINGERS, control_period=PERIOD)
+    sensor = TaxelArray(TaxelSensor(rate=(20.0, 40.0), **ALL), GRID, FINGERS, PERIOD)
     keys = jax.random.split(KEY, 3)
     params = jax.vmap(sensor.sample)(keys)
     state = jax.tree.map(lambda x: jnp.stack([x] * 3), sensor.init())
@@ -197,14 +213,12 @@ def test_all_at_once_under_vmap():
 
 
 def test_settings_survive_the_round_trip_and_bad_ones_are_refused():
-    config = dataclasses.replace(SensorNoise(), rate=(20.0, 30.0), dead=None)
-    assert from_dict(SensorNoise, to_dict(config)) == config
+    config = TaxelSensor(rate=(20.0, 30.0), **ALL)
+    assert from_dict(TaxelSensor, to_dict(config)) == config
     for fields, words in (
-        ({"gain": (1.2, 0.8)}, r"SensorNoise\.gain"),
-        ({"dead": (0.0, 1.5)}, r"SensorNoise\.dead"),
-        ({"counts": "int4"}, r"SensorNoise\.counts"),
-        ({"gain": (0.05, 1.0), "scale": 2.0}, "reaches below 0"),
-        ({"hysteresis": (0.0, 0.9), "scale": 2.0}, "exceeds 1"),
+        ({"gain": (1.2, 0.8)}, r"TaxelSensor\.gain"),
+        ({"dead": (0.0, 1.5)}, r"TaxelSensor\.dead"),
+        ({"hysteresis_time": (0.2, 0.1)}, r"TaxelSensor\.hysteresis_time"),
     ):
         with pytest.raises(ConfigError, match=words):
-            SensorNoise(**fields)
+            TaxelSensor(**fields)
