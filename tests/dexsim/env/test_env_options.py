@@ -353,23 +353,13 @@ class TestGearPlay:
 
     def test_the_rotor_takes_its_inertia_from_the_joint(self, hand):
         from dexsim.env.motors import Drive, rotor_share
-        from dexsim.physics.model import build_model
-        from dexsim.physics.physics import Physics
+        from dexsim.physics.model import build_model, build_scene
 
         config = GraspConfig(randomization=GEARED)
-        whole = build_model(hand, ("box",), np.full((1, 3), 0.02), config.physics, (0, 0, -9.81), "jax")
-        seam = object.__new__(Physics)
-        seam.hand, seam.slots, seam.config = hand, ("box",), config.physics
-        seam.mj_model = build_model(
-            hand,
-            ("box",),
-            np.full((1, 3), 0.02),
-            config.physics,
-            (0, 0, -9.81),
-            "jax",
-            rotor_share=rotor_share(config.randomization),
-        )
-        seam._find_addresses()
+        scene = ("box",), np.full((1, 3), 0.02), config.physics, (0, 0, -9.81), "jax"
+        whole = build_model(hand, *scene)
+        built = build_scene(hand, *scene, rotor_share=rotor_share(config.randomization))
+        seam = SimpleNamespace(mj_model=built.model, joint_dof=built.joint_dof)
         drive, dofs = Drive(config, hand, seam), seam.joint_dof
         np.testing.assert_allclose(
             drive._rotor_inertia + seam.mj_model.dof_armature[dofs], whole.dof_armature[dofs], rtol=1e-5
