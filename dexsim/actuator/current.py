@@ -55,14 +55,3 @@ def read_current(key: jax.Array, motor: Motor, current: jax.Array) -> jax.Array:
     step = jnp.asarray(motor.resolution)
     rounded = jnp.round(reading / jnp.where(step > 0, step, 1.0)) * step
     return jnp.clip(jnp.where(step > 0, rounded, reading), -motor.limit, motor.limit)
-
-
-def torque_from_current(
-    motor: Motor, current: jax.Array, velocity: jax.Array, position: jax.Array | float = 0.0
-) -> jax.Array:
-    """Torque on the joint, Nm, from the true current: the inverse of `motor_current`."""
-    way = jnp.sign(velocity)
-    ideal = current - motor.no_load_current * way
-    loss = jnp.where(ideal * way > 0, motor.efficiency, jnp.where(ideal * way < 0, 1.0 / motor.back_efficiency, 1.0))
-    ripple = 1.0 + motor.ripple * jnp.sin(motor.ripple_count * position + motor.ripple_phase)
-    return ideal * motor.torque_constant * ripple * loss

@@ -81,20 +81,6 @@ def quat_angle(left: jax.Array, right: jax.Array) -> jax.Array:
     return 2 * jnp.arctan2(vector, jnp.abs(relative[..., 0]))
 
 
-def random_quat(key: jax.Array) -> jax.Array:
-    """A uniformly random orientation [4]."""
-    sample = jax.random.normal(key, (4,))
-    return sample / jnp.linalg.norm(sample)
-
-
 def matrix_to_6d(matrix: jax.Array) -> jax.Array:
     """The first two columns of a rotation [..., 3, 3] as [..., 6] (Zhou et al. 2019)."""
     return jnp.concatenate([matrix[..., :, 0], matrix[..., :, 1]], -1)
-
-
-def matrix_from_6d(sixd: jax.Array) -> jax.Array:
-    """The inverse of `matrix_to_6d`, by Gram-Schmidt; accepts any two independent vectors."""
-    first = sixd[..., :3] / jnp.linalg.norm(sixd[..., :3], axis=-1, keepdims=True)
-    second = sixd[..., 3:] - jnp.sum(first * sixd[..., 3:], -1, keepdims=True) * first
-    second = second / jnp.linalg.norm(second, axis=-1, keepdims=True)
-    return jnp.stack([first, second, jnp.cross(first, second)], -1)

@@ -16,51 +16,9 @@ from dexsim.core.errors import AssetError
 from dexsim.hand.kinematics import (
     Geom,
     Hand,
-    HandPose,
-    flexion_joints,
-    forward_kinematics,
-    taxel_normals,
-    taxel_positions,
 )
 
-__all__ = [
-    "TAXEL_COLUMNS",
-    "Geom",
-    "Hand",
-    "HandPose",
-    "flexion_joints",
-    "forward_kinematics",
-    "lattice_frame",
-    "load_hand",
-    "read_taxels",
-    "taxel_normals",
-    "taxel_positions",
-]
-
 TAXEL_COLUMNS = ("finger", "column", "row", "x", "y", "z", "nx", "ny", "nz", "area")
-
-
-def lattice_frame(position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Outward normals [C, R, 3] and areas [C, R] of a lattice of points [C, R, 3] on a surface.
-
-    The normal is the cross product of the two lattice tangents (central differences), turned
-    away from the lattice's centroid. Each cell's area goes in equal parts to its four corners.
-    """
-    along = np.gradient(position, axis=1)
-    around = np.gradient(position, axis=0)
-    normal = np.cross(around, along)
-    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-    outward = position - position.mean((0, 1))
-    if np.sum(normal * outward) < 0:
-        normal = -normal
-    a, b = position[:-1, :-1], position[1:, :-1]
-    c, d = position[1:, 1:], position[:-1, 1:]
-    cell = 0.5 * np.linalg.norm(np.cross(c - a, d - b), axis=-1)
-    area = np.zeros(position.shape[:2])
-    for rows in (slice(None, -1), slice(1, None)):
-        for columns in (slice(None, -1), slice(1, None)):
-            area[rows, columns] += cell / 4
-    return normal, area
 
 
 def load_hand(path: str | Path | None = None) -> Hand:

@@ -45,14 +45,6 @@ def make_layout(width: int, height: int, grid: tuple[int, int], fingers: int) ->
     return Layout(width, height, cell, grid, slots[:fingers] + (slots[fingers],), font)
 
 
-def cell_box(layout: Layout, finger: int, column: int, row: int) -> tuple[int, int, int, int]:
-    """Pixels (left, top, right, bottom; the last two exclusive) of one taxel's cell in the panel."""
-    x, y = layout.slots[finger]
-    left = x + column * layout.cell
-    top = y + int(1.3 * layout.font) + (layout.grid[1] - 1 - row) * layout.cell
-    return left, top, left + layout.cell - _GAP, top + layout.cell - _GAP
-
-
 def taxel_image(values: np.ndarray, grid: tuple[int, int]) -> np.ndarray:
     """One finger's taxels [N, ...] as an image [rows, columns, ...]: tip at the top, column 0 at the left."""
     columns, rows = grid

@@ -9,8 +9,6 @@ import jax.numpy as jnp
 from dexsim.geometry import rotations
 from dexsim.hand.kinematics import Hand, HandPose
 
-WEIGHTINGS = ("force", "depth", "none")
-
 
 def reduce_touch(force: jax.Array, taxels: jax.Array, weighting: str = "force") -> tuple[jax.Array, jax.Array]:
     """Per-finger total force and contact centre, the same for simulated and measured taxels.

@@ -46,16 +46,6 @@ class Heat:
     air: float = 26.0  # degC
     reference: float = 25.0  # degC at which resistance and torque constant are given
 
-    def steady(self, current: float) -> tuple[float, float]:
-        """Winding and case degC after a current A has flowed for ever; infinite where it runs away."""
-        power, path = current**2 * self.resistance, self.to_case + self.to_air
-        gain = power * self.rise * path
-        if gain >= 1:
-            return np.inf, np.inf
-        cold = power * (1 + self.rise * (self.air - self.reference))
-        heat = cold / (1 - gain)
-        return self.air + heat * path, self.air + heat * self.to_air
-
 
 class Drives:
     """State of the twelve drives; arrays [12] in the hand's order.

@@ -66,11 +66,6 @@ class PressBench(EmulatedHand):
         self._plan, self._foam = placements(hand), foam
         super().__init__(hand, "grasp", seed, kind=kind, overrides={**_SOLID, **(overrides or {})})
 
-    @property
-    def tip_force(self) -> float:
-        """N that the foam is pressed with now, as a gauge behind it shows."""
-        return float(max(-self._spring @ self._normal, 0.0))
-
     def results(self) -> list[dict[str, Any]]:
         """The truth: see `truth`."""
         return [{"trial": 0, "seed": self.seed, "draw": self.kind, **self.truth()}]

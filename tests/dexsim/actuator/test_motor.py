@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dexsim.actuator.current import Motor, motor_current, read_current, torque_from_current
+from dexsim.actuator.current import Motor, motor_current, read_current
 from dexsim.calibration.virtual_press import press
 
 MOTOR = Motor(torque_constant=0.5, efficiency=0.8, back_efficiency=0.6, no_load_current=0.03)
@@ -44,14 +44,6 @@ def test_ripple_goes_round_with_the_joint():
     position = jnp.linspace(0, 2 * jnp.pi, 1001)
     constant = 0.2 / np.asarray(motor_current(motor, 0.2, 0.0, position), float)
     np.testing.assert_allclose(constant, 0.5 * (1 + 0.1 * np.sin(20 * np.asarray(position) + 0.3)), rtol=1e-4)
-
-
-def test_torque_comes_back_from_the_current():
-    rng = np.random.default_rng(0)
-    torque, velocity, position = rng.uniform(-1, 1, 500), rng.uniform(-2, 2, 500), rng.uniform(0, 1, 500)
-    motor = Motor(torque_constant=0.5, efficiency=0.8, back_efficiency=0.6, no_load_current=0.0, ripple=0.05)
-    current = motor_current(motor, torque, velocity, position)
-    np.testing.assert_allclose(torque_from_current(motor, current, velocity, position), torque, atol=1e-5)
 
 
 def test_the_reading_has_bias_noise_steps_and_an_end():

@@ -98,23 +98,8 @@ def test_angle_has_a_finite_gradient_at_zero():
     assert np.all(np.isfinite(jax.grad(rotations.quat_angle)(quat, quat)))
 
 
-def test_six_d_is_two_columns_and_comes_back():
+def test_six_d_is_two_columns():
     matrix = np.array([mujoco_matrix(q) for q in QUATS])
     sixd = rotations.matrix_to_6d(f32(matrix))
     np.testing.assert_allclose(sixd[:, :3], matrix[:, :, 0], atol=1e-6)
     np.testing.assert_allclose(sixd[:, 3:], matrix[:, :, 1], atol=1e-6)
-    np.testing.assert_allclose(rotations.matrix_from_6d(sixd), matrix, atol=1e-6)
-
-
-def test_six_d_of_any_two_vectors_is_a_rotation():
-    matrix = np.asarray(rotations.matrix_from_6d(f32(RNG.normal(size=(64, 6)) * 3)), float)
-    np.testing.assert_allclose(matrix @ matrix.transpose(0, 2, 1), np.tile(np.eye(3), (64, 1, 1)), atol=1e-5)
-    np.testing.assert_allclose(np.linalg.det(matrix), 1.0, atol=1e-5)
-
-
-def test_random_orientations_are_uniform():
-    quat = np.asarray(jax.vmap(rotations.random_quat)(jax.random.split(jax.random.key(0), 4000)))
-    np.testing.assert_allclose(np.linalg.norm(quat, axis=1), 1.0, atol=1e-6)
-    # Uniform on the 3-sphere: E[q] = 0 and E[q q'] = I / 4.
-    np.testing.assert_allclose(quat.mean(0), 0, atol=0.03)
-    np.testing.assert_allclose(quat.T @ quat / len(quat), np.eye(4) / 4, atol=0.02)

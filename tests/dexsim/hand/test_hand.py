@@ -11,7 +11,7 @@ import pytest
 
 from dexsim.core.errors import AssetError
 from dexsim.hand.kinematics import flexion_joints, forward_kinematics, taxel_normals, taxel_positions
-from dexsim.hand.load import lattice_frame, load_hand
+from dexsim.hand.load import load_hand
 
 # --- the shipped hand against published figures ------------------------------------------------
 
@@ -230,19 +230,6 @@ def test_areas_add_up_to_the_lattice(hand):
         assert triangles.sum() == pytest.approx(wanted, rel=0.005)
         assert hand.taxel_area[finger].sum() == pytest.approx(wanted, rel=0.005)
         assert np.all(hand.taxel_area[finger] > 0)
-
-
-def test_lattice_frame_of_a_cylinder():
-    """Normals point radially and areas add up, for a lattice wrapped half round a tube."""
-    angle, height = np.meshgrid(np.linspace(-1.5, 1.5, 31), np.linspace(0, 0.02, 12), indexing="ij")
-    for order in (1, -1):  # either way round
-        points = np.stack([0.01 * np.cos(angle), 0.01 * np.sin(angle) * order, height], -1)
-        normal, area = lattice_frame(points)
-        radial = np.stack([np.cos(angle), np.sin(angle) * order, 0 * angle], -1)
-        np.testing.assert_allclose(normal[1:-1], radial[1:-1], atol=1e-6)
-        np.testing.assert_allclose(normal, radial, atol=0.06)  # one-sided differences at the rim
-        assert area.sum() == pytest.approx(0.01 * 3.0 * 0.02, rel=1e-3)
-        assert area[0, 0] == pytest.approx(area[5, 5] / 4, rel=1e-6)
 
 
 def test_taxels_lie_on_the_collision_pads(hand):

@@ -12,7 +12,7 @@ from dexsim.actuator.drive import Actuator, apply_friction, delayed_target, join
 from dexsim.core.errors import CalibrationError, ConfigError
 from dexsim.identification.excitation import Excitation, chirp, excitation, joint_excitation, steps, triangles
 from dexsim.identification.identify import check_log, evaluate, identify
-from dexsim.identification.joint import JointLog, segments, simulate, synthetic_log, with_defaults
+from dexsim.identification.joint import JointLog, segments, simulate, with_defaults
 from dexsim.identification.report import uncertainty
 
 PERIOD, SUBSTEPS = 0.015, 3
@@ -40,11 +40,40 @@ HOLDOUT = joint_excitation(
 )
 
 
+def synthetic_log(
+    key,
+    values,
+    target,
+    *,
+    period=PERIOD,
+    substeps=SUBSTEPS,
+    latency=0,
+    position_noise=0.0,
+    position_resolution=0.0,
+    torque_noise=0.0,
+    with_torque=True,
+):
+    """A log of the model itself, which starts at the first target: known truth with the noise of a real one."""
+    target = np.asarray(target, float)
+    values = {"start": float(target[0])} | values
+    position, torque = simulate(
+        with_defaults(values, JointLog(period, target, target, name="joint")),
+        jnp.asarray(target, jnp.float32),
+        jnp.int32(latency),
+        jnp.float32(period / substeps),
+        substeps,
+    )
+    keys = jax.random.split(key)
+    position = np.asarray(position + position_noise * jax.random.normal(keys[0], position.shape))
+    if position_resolution > 0:
+        position = np.round(position / position_resolution) * position_resolution
+    torque = np.asarray(torque + torque_noise * jax.random.normal(keys[1], torque.shape))
+    return JointLog(period, target, position.astype(float), torque.astype(float) if with_torque else None, "joint")
+
+
 def log_of(truth, seed=0, target=TARGET, latency=2, **options):
     options = dict(position_noise=0.001, position_resolution=0.0005, torque_noise=0.01) | options
-    return synthetic_log(
-        jax.random.key(seed), truth, target, period=PERIOD, substeps=SUBSTEPS, latency=latency, **options
-    )
+    return synthetic_log(jax.random.key(seed), truth, target, latency=latency, **options)
 
 
 # --- excitation ----------------------------------------------------------------------------------

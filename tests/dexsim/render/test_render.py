@@ -10,7 +10,7 @@ import pytest
 
 from dexsim.hand.load import load_hand
 from dexsim.render import render
-from dexsim.render.panel import cell_box, draw_panel, force_color, make_layout, taxel_image
+from dexsim.render.panel import draw_panel, force_color, make_layout, taxel_image
 from dexsim.render.raycast import FAR, Camera, Primitives, cast, look, normals, project, samples
 from dexsim.render.snapshot import Snapshot
 
@@ -166,6 +166,13 @@ def test_more_force_is_hotter():
     assert np.all(np.diff(brightness) >= 0) and brightness[-1] > 3 * brightness[0]
     np.testing.assert_array_equal(force_color(np.array([2.0, 9.0]), 2.0)[0], force_color(np.array([9.0]), 2.0)[0])
     assert force_color(np.array(np.nan), 1.0).shape == (3,)
+
+
+def cell_box(layout, finger, column, row):
+    """Pixels (left, top, right, bottom; the last two exclusive) of one taxel's cell: the tip's row is at the top."""
+    x, y = layout.slots[finger]
+    left, top = x + column * layout.cell, y + int(1.3 * layout.font) + (layout.grid[1] - 1 - row) * layout.cell
+    return left, top, left + layout.cell - 1, top + layout.cell - 1
 
 
 def test_heat_map_cell_lies_where_documented():
