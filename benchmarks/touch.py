@@ -56,8 +56,8 @@ class Case:
     """One line of the cost table: how an environment's object comes from its index, and how it is felt."""
 
     name: str
-    thing: object
-    per_env: object = None  # function (thing, index) -> object of that environment
+    geometry: object
+    per_env: object = None  # function (geometry, index) -> object of that environment
     path: str = "links"  # or "taxels": positions in the palm frame first; or "brute"
 
 
@@ -70,8 +70,8 @@ def cases(names: list[str] | None) -> list[Case]:
     def classes(dtype: str) -> grid.Grid:
         return grid.stack([grid.bake(shape, GridConfig(dtype=dtype)) for shape in shapes[:CLASSES]])
 
-    def own_class(thing, index):
-        return grid.select(thing, index % CLASSES)
+    def own_class(geometry, index):
+        return grid.select(geometry, index % CLASSES)
 
     makers = {
         "closed box": lambda n: Case(n, box),
@@ -98,20 +98,20 @@ def box_grasps(num_envs: int):
 
 
 def reader(case: Case, hand, kinematics: bool):
-    """`read(thing, pose or joints, shift [3], index)` of one environment: taxel forces, finger forces, centres."""
+    """`read(geometry, pose or joints, shift [3], index)` of one environment: taxel forces, finger forces, centres."""
     total = jnp.ones(5)
 
-    def read(thing, pose, shift, index):
-        thing = case.per_env(thing, index) if case.per_env else thing
+    def read(geometry, pose, shift, index):
+        geometry = case.per_env(geometry, index) if case.per_env else geometry
         pose = forward_kinematics(hand, pose) if kinematics else pose
         if case.path == "links":
-            touch = feel_links(hand, pose, thing, shift, jnp.eye(3), total, SKIN)
+            touch = feel_links(hand, pose, geometry, shift, jnp.eye(3), total, SKIN)
             return touch.force, *reduce_touch_links(touch.force, hand, pose)
         taxels = taxel_positions(hand, pose)
         if case.path == "taxels":
-            touch = feel(taxels, jnp.asarray(hand.taxel_area), thing, shift, jnp.eye(3), total, SKIN)
+            touch = feel(taxels, jnp.asarray(hand.taxel_area), geometry, shift, jnp.eye(3), total, SKIN)
             return touch.force, *reduce_touch(touch.force, taxels)
-        depth = jnp.maximum(SKIN.margin - brute_distance(taxels - shift, thing), 0.0)
+        depth = jnp.maximum(SKIN.margin - brute_distance(taxels - shift, geometry), 0.0)
         skin_force = skin_stress(depth / SKIN.thickness, SKIN) * hand.taxel_area
         force = spread(skin_force, total)
         return force, *reduce_touch(force, taxels)
@@ -129,26 +129,26 @@ def measure(case: Case, num_envs: int, loops: int, repeats: int, hand, machine: 
     index = jnp.arange(num_envs, dtype=jnp.int32)
     read = jax.vmap(reader(case, hand, kinematics), (None, 0, 0, 0))
 
-    def turn(carry, _, thing, pose):
+    def turn(carry, _, geometry, pose):
         shift, _ = carry
-        force, finger, centre = read(thing, pose, shift, index)
+        force, finger, centre = read(geometry, pose, shift, index)
         # The next turn depends on this one; the taxel forces are kept, as a step of an environment keeps them.
         shift = base + 1e-4 * jnp.tanh(centre.sum(1)) + 1e-6 * finger[:, :3]
         return (shift, force), None
 
-    def loop(thing, pose, shift):
+    def loop(geometry, pose, shift):
         force = jnp.zeros((num_envs, *hand.taxel_area.shape))
-        return jax.lax.scan(lambda c, x: turn(c, x, thing, pose), (shift, force), None, length=loops)[0]
+        return jax.lax.scan(lambda c, x: turn(c, x, geometry, pose), (shift, force), None, length=loops)[0]
 
     shift = jnp.tile(base, (num_envs, 1))
     run = jax.jit(loop)
-    jax.block_until_ready(run(case.thing, pose, shift))
+    jax.block_until_ready(run(case.geometry, pose, shift))
     seconds = []
     for _ in range(repeats):
         start = time.perf_counter()
-        jax.block_until_ready(run(case.thing, pose, shift))
+        jax.block_until_ready(run(case.geometry, pose, shift))
         seconds.append((time.perf_counter() - start) / loops)
-    once = jax.jit(read).lower(case.thing, pose, shift, index).compile()
+    once = jax.jit(read).lower(case.geometry, pose, shift, index).compile()
     counted = once.cost_analysis()
     counted = counted[0] if isinstance(counted, list) else counted
     flops, moved = float(counted.get("flops", 0)), float(counted.get("bytes accessed", 0))

@@ -102,13 +102,13 @@ def distance_errors(quick: bool) -> list[dict]:
 
     rows, run = [], jax.jit(signed_distance)
 
-    def compare(kind, box, exact_at, things):
+    def compare(kind, box, exact_at, geometries):
         points = np.random.default_rng(1).uniform(box[0] - 1e-3, box[1] + 1e-3, (100_000, 3)).astype(np.float32)
         exact = np.asarray(exact_at(points))
         near = (exact > -0.003) & (exact < 0.001)
         points, exact = points[near], exact[near]
-        for name, thing in things:
-            ours = np.asarray(run(points, thing))
+        for name, geometry in geometries:
+            ours = np.asarray(run(points, geometry))
             error = 1e6 * np.abs(ours - exact)
             rows.append(
                 {
@@ -149,11 +149,13 @@ def pad(pitch: float, shift: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return taxels, np.broadcast_to(patch.area.astype(np.float32), taxels.shape[:2])
 
 
-def press(taxels, area, thing, position, skin, turn=None) -> Touch:
+def press(taxels, area, geometry, position, skin, turn=None) -> Touch:
     """What lattices feel of an object above them."""
     force = np.ones(len(taxels), np.float32)
     turn = np.eye(3, dtype=np.float32) if turn is None else turn
-    return jax.jit(tactile.feel, static_argnames="skin")(taxels, area, thing, np.float32(position), turn, force, skin)
+    return jax.jit(tactile.feel, static_argnames="skin")(
+        taxels, area, geometry, np.float32(position), turn, force, skin
+    )
 
 
 def forces(quick: bool) -> list[dict]:
@@ -221,12 +223,12 @@ def _ridge_sampling(half: float, pitch: float) -> float:
 def checks() -> list[dict]:
     """Flat punch, known load, monotony and gradients, each against its closed form."""
     rows = [_punch(), *_loads()]
-    for name, thing in _things().items():
-        rows += [_monotone(name, thing), _gradient(name, thing)]
+    for name, geometry in _geometries().items():
+        rows += [_monotone(name, geometry), _gradient(name, geometry)]
     return rows
 
 
-def _things() -> dict:
+def _geometries() -> dict:
     ball = upright("sphere", 0.02)
     return {
         "closed form": ball,
@@ -276,13 +278,13 @@ def _loads() -> list[dict]:
     return rows
 
 
-def _monotone(name: str, thing) -> dict:
+def _monotone(name: str, geometry) -> dict:
     taxels, area = pad(0.002, np.zeros((1, 2)))
     skin = Skin(margin=0.0, thickness=0.004)
 
     def total(depth):
         touch = tactile.feel(
-            taxels, area, thing, jnp.stack([0.0007, -0.0004, 0.02 - depth]), jnp.eye(3), jnp.ones(1), skin
+            taxels, area, geometry, jnp.stack([0.0007, -0.0004, 0.02 - depth]), jnp.eye(3), jnp.ones(1), skin
         )
         return touch.skin_force.sum()
 
@@ -296,7 +298,7 @@ def _monotone(name: str, thing) -> dict:
     }
 
 
-def _gradient(name: str, thing) -> dict:
+def _gradient(name: str, geometry) -> dict:
     """Of the summed force in the object's position, against central differences, in double precision."""
     with jax.enable_x64(True):
         taxels, area = (np.asarray(x, np.float64) for x in pad(0.002, np.zeros((1, 2))))
@@ -304,7 +306,7 @@ def _gradient(name: str, thing) -> dict:
 
         @jax.jit
         def total(position):
-            return tactile.feel(taxels, area, thing, position, jnp.eye(3), jnp.ones(1), skin).skin_force.sum()
+            return tactile.feel(taxels, area, geometry, position, jnp.eye(3), jnp.ones(1), skin).skin_force.sum()
 
         start = jnp.array([0.00071, -0.00043, 0.0193])
         exact = np.asarray(jax.jit(jax.grad(total))(start))
@@ -351,9 +353,9 @@ def grasps(quick: bool) -> list[dict]:
         shape = turned_solid(kind)
         pose = random_grasps(shape, count)
 
-        def feel(thing, pose=pose):
+        def feel(geometry, pose=pose):
             def one(pose):
-                touch = feel_links(hand, pose, thing, jnp.zeros(3), jnp.eye(3), jnp.ones(5), skin)
+                touch = feel_links(hand, pose, geometry, jnp.zeros(3), jnp.eye(3), jnp.ones(5), skin)
                 return touch.depth, *reduce_touch_links(touch.skin_force, hand, pose)
 
             run = jax.jit(jax.vmap(one))

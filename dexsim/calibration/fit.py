@@ -23,7 +23,7 @@ _LARGEST = {"A": 20.0, "Nm": 50.0, "N": 500.0}  # beyond these the unit must be 
 
 
 @dataclasses.dataclass(frozen=True)
-class Press:
+class JointPress:
     """One joint's recording while its fingertip was pressed, in the order of time."""
 
     force: np.ndarray  # [T] N
@@ -45,8 +45,8 @@ class JointLines:
 
 def calibrate(
     hand: Hand,
-    real: Mapping[str, Press],
-    sim: Mapping[str, Press],
+    real: Mapping[str, JointPress],
+    sim: Mapping[str, JointPress],
     *,
     force_per_count: float | np.ndarray = 0.1,
     current_per_count: float = 0.001,
@@ -125,7 +125,7 @@ _GENERAL = (
 )
 
 
-def fit_joint(press: Press, unit: str, where: str = "recording") -> JointLines:
+def fit_joint(press: JointPress, unit: str, where: str = "recording") -> JointLines:
     """Fit loading and unloading of one joint.
 
     Args:
@@ -205,7 +205,7 @@ def _turns(smooth: np.ndarray, step: float) -> tuple[list[int], int]:
     return [*turns, len(smooth) - 1], first_way
 
 
-def _checked(press: Press, unit: str, where: str) -> tuple[np.ndarray, np.ndarray]:
+def _checked(press: JointPress, unit: str, where: str) -> tuple[np.ndarray, np.ndarray]:
     force, value = np.asarray(press.force, float), np.asarray(press.value, float)
     if (
         force.ndim != 1

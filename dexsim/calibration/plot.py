@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dexsim.calibration.fit import Press, find_direction
+from dexsim.calibration.fit import JointPress, find_direction
 from dexsim.calibration.maps import Calibration, Side, normalise
 from dexsim.core.errors import CalibrationError
 
@@ -16,8 +16,8 @@ _WAYS = ("loading", "unloading")
 def plot_calibration(
     path: str | Path,
     calibration: Calibration,
-    real: Mapping[str, Press],
-    sim: Mapping[str, Press],
+    real: Mapping[str, JointPress],
+    sim: Mapping[str, JointPress],
     joints: tuple[str, ...] | None = None,
 ) -> None:
     """Write a figure with one row a joint: the hand, the simulation, both normalised.
@@ -51,7 +51,7 @@ def plot_calibration(
     figure.savefig(path, dpi=110)
 
 
-def _draw_side(axes, side: Side, joint: int, press: Press, label: str) -> None:
+def _draw_side(axes, side: Side, joint: int, press: JointPress, label: str) -> None:
     force, value = np.asarray(press.force, float), np.asarray(press.value, float)
     direction = find_direction(force) if press.direction is None else np.asarray(press.direction)
     ends = np.array([0.0, float(side.force_max[joint])])
@@ -67,7 +67,7 @@ def _draw_side(axes, side: Side, joint: int, press: Press, label: str) -> None:
     axes.legend(fontsize=6)
 
 
-def _draw_normalised(axes, calibration: Calibration, joint: int, real: Press, sim: Press) -> None:
+def _draw_normalised(axes, calibration: Calibration, joint: int, real: JointPress, sim: JointPress) -> None:
     for side, press, colour, label in (
         (calibration.real, real, "tab:green", "current (hand)"),
         (calibration.sim, sim, "tab:red", "torque (simulation)"),

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dexsim.calibration.fit import Press
+from dexsim.calibration.fit import JointPress
 from dexsim.core.errors import CalibrationError
 from dexsim.hand.kinematics import Hand, forward_kinematics, taxel_normals, taxel_positions
 
@@ -41,7 +41,7 @@ def _lever_arms(hand: Hand, at: jax.Array, finger: jax.Array, taxel: jax.Array) 
 
 def simulated_press(
     hand: Hand, joint_position: np.ndarray, finger: str, force: np.ndarray, taxel: int | None = None
-) -> dict[str, Press]:
+) -> dict[str, JointPress]:
     """Recordings, by joint name, of the joints that feel a press of one fingertip.
 
     Args:
@@ -59,7 +59,7 @@ def simulated_press(
     taxel = columns // 2 * rows + rows // 2 if taxel is None else taxel
     arms = lever_arms(hand, joint_position, hand.finger_names.index(finger), taxel)
     return {
-        name: Press(np.asarray(force, float), np.asarray(force, float) * arm)
+        name: JointPress(np.asarray(force, float), np.asarray(force, float) * arm)
         for name, arm in zip(hand.joint_names, arms, strict=True)
         if abs(arm) >= MIN_LEVER
     }

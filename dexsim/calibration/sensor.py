@@ -4,7 +4,7 @@ Recorded frames in, numbers with intervals out. A press is what was recorded whi
 a gauge (or by the solver, to check the fit on simulated data), the taxels' readings, and for the material how deep each
 taxel was pressed, which a flat plate moved by a known way gives.
 
-    fit = fit_finger(Press(force=gauge, reading=taxels, depth=depth, area=area), thickness=0.002)
+    fit = fit_finger(TaxelPress(force=gauge, reading=taxels, depth=depth, area=area), thickness=0.002)
     force = fit.correct(reading.sum(-1))
     save_fit("sensor.json", {"thumb": fit, ...})
 
@@ -43,7 +43,7 @@ class Estimate:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Press:
+class TaxelPress:
     """One finger pressed with varying force."""
 
     force: np.ndarray  # [T] N, reference
@@ -72,7 +72,7 @@ class FingerFit:
 
 
 def fit_finger(
-    press: Press,
+    press: TaxelPress,
     *,
     thickness: float | None = None,
     two_terms: bool = False,
@@ -141,7 +141,7 @@ def load_fit(path: str | Path) -> dict[str, FingerFit]:
         raise AssetError(f"{path}: not a sensor fit ({error})") from None
 
 
-def _checked(press: Press) -> tuple[np.ndarray, np.ndarray]:
+def _checked(press: TaxelPress) -> tuple[np.ndarray, np.ndarray]:
     force, reading = np.asarray(press.force, float), np.asarray(press.reading, float)
     if force.ndim != 1 or reading.ndim != 2 or len(force) != len(reading):
         raise DexsimError(f"sensor fit: force {force.shape} and reading {reading.shape}, expected [T] and [T, N]")
@@ -203,7 +203,7 @@ def _huber(design: np.ndarray, target: np.ndarray, rounds: int = 20) -> np.ndarr
 
 
 def _material(
-    press: Press, keep: np.ndarray, thickness: float | None, two_terms: bool, rng: np.random.Generator
+    press: TaxelPress, keep: np.ndarray, thickness: float | None, two_terms: bool, rng: np.random.Generator
 ) -> tuple[Estimate, Estimate, list[str]]:
     """Mooney-Rivlin coefficients from depth and gauge force: the force is linear in both."""
     depth = np.asarray(press.depth, float)

@@ -4,7 +4,7 @@ import jax
 import numpy as np
 
 from dexsim.actuator.current import Motor, motor_current, read_current
-from dexsim.calibration.fit import Press
+from dexsim.calibration.fit import JointPress
 
 
 def press(
@@ -19,7 +19,7 @@ def press(
     force_noise: float = 0.0,
     force_resolution: float = 0.0,
     force_limit: float = np.inf,
-) -> Press:
+) -> JointPress:
     """Press one joint's fingertip slowly, up and down: what a recording of the hand looks like.
 
     Args:
@@ -41,4 +41,4 @@ def press(
     reading = force + force_noise * np.asarray(jax.random.normal(force_key, force.shape))
     if force_resolution > 0:
         reading = np.round(reading / force_resolution) * force_resolution
-    return Press(np.clip(reading, 0.0, force_limit), np.asarray(current, float))
+    return JointPress(np.clip(reading, 0.0, force_limit), np.asarray(current, float))

@@ -1,9 +1,9 @@
 """Distance by name: one signature, `(points, object) -> distance, normal`, whatever the object is made of.
 
-    thing = prepare("mug.stl", scale=0.001)            # a mesh: baked to a grid
-    thing = prepare(shape)                             # a union of primitives: closed forms
-    thing = prepare(shape, DistanceConfig(method="surface_points"))
-    distance, normal = distance_and_normal(points, thing)
+    geometry = prepare("mug.stl", scale=0.001)            # a mesh: baked to a grid
+    geometry = prepare(shape)                             # a union of primitives: closed forms
+    geometry = prepare(shape, DistanceConfig(method="surface_points"))
+    distance, normal = distance_and_normal(points, geometry)
 
 | method | object | cost a query | error |
 |---|---|---|---|
@@ -91,23 +91,23 @@ def prepare(source: Any, config: DistanceConfig | None = None, *, scale: float =
     return grid.bake(surface, config.grid)
 
 
-def method_of(thing: Any) -> str:
+def method_of(geometry: Any) -> str:
     """The name of the method that a prepared object goes with.
 
     Raises:
       ConfigError: it is none.
     """
     for name, method in METHODS.items():
-        if isinstance(thing, method.kind):
+        if isinstance(geometry, method.kind):
             return name
-    raise ConfigError(f"{type(thing).__name__} has no distance: prepare it first (dexsim.geometry.distance.prepare)")
+    raise ConfigError(f"{type(geometry).__name__} has no distance: prepare it first (dexsim.geometry.distance.prepare)")
 
 
-def signed_distance(points: jax.Array, thing: Any) -> jax.Array:
+def signed_distance(points: jax.Array, geometry: Any) -> jax.Array:
     """Distance [...] m, negative inside, at points [..., 3] in the object's frame."""
-    return METHODS[method_of(thing)].signed_distance(points, thing)
+    return METHODS[method_of(geometry)].signed_distance(points, geometry)
 
 
-def distance_and_normal(points: jax.Array, thing: Any) -> tuple[jax.Array, jax.Array]:
+def distance_and_normal(points: jax.Array, geometry: Any) -> tuple[jax.Array, jax.Array]:
     """Distance [...] m and outward unit normal [..., 3] at points [..., 3] in the object's frame."""
-    return METHODS[method_of(thing)].distance_and_normal(points, thing)
+    return METHODS[method_of(geometry)].distance_and_normal(points, geometry)

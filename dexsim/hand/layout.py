@@ -2,7 +2,7 @@
 
     patch = on_surface("cylinder", lattice(10, 12, pitch=0.0022), radius=0.008)
     patch = placed(patch, position=(0, 0, 0.02), rotation=turn)       # in the link's frame
-    check_outside(patch, thing)                                       # no taxel inside the link
+    check_outside(patch, geometry)                                       # no taxel inside the link
     write_layout("taxels.csv", {"index": patch, "thumb": other})
 
 The file is the one that a hand's TOML names as `taxels` (`hand.load_hand`); `finger` in it stands for the link that
@@ -147,18 +147,18 @@ def placed(patch: Patch, *, position: Any = (0, 0, 0), rotation: Any = None) -> 
     )
 
 
-def check_outside(patch: Patch, thing: Any, *, tolerance: float = 1e-4, name: str = "patch") -> None:
+def check_outside(patch: Patch, geometry: Any, *, tolerance: float = 1e-4, name: str = "patch") -> None:
     """Require that no taxel lies deeper than `tolerance` inside the link it sits on.
 
     Args:
-      thing: the link's surface in its frame, as `distance.prepare` gives it.
+      geometry: the link's surface in its frame, as `distance.prepare` gives it.
 
     Raises:
       AssetError: one does; names it and its depth.
     """
     from dexsim.geometry.distance import signed_distance
 
-    distance = np.asarray(signed_distance(np.asarray(patch.position, np.float32), thing))
+    distance = np.asarray(signed_distance(np.asarray(patch.position, np.float32), geometry))
     worst = int(distance.argmin())
     if distance[worst] < -tolerance:
         column, row = divmod(worst, patch.grid[1])
@@ -179,11 +179,11 @@ def check_hand(hand: Any, *, tolerance: float = 1.5e-3) -> None:
     from dexsim.geometry import sdf
 
     for finger, name in enumerate(hand.finger_names):
-        thing = sdf.of_geoms(g for g in hand.geoms if g.body == hand.tip_body[finger])
-        if thing is None:
+        geometry = sdf.of_geoms(g for g in hand.geoms if g.body == hand.tip_body[finger])
+        if geometry is None:
             continue
         patch = Patch(hand.taxel_grid, hand.taxel_position[finger], hand.taxel_normal[finger], hand.taxel_area[finger])
-        check_outside(patch, thing, tolerance=tolerance, name=f"finger {name!r}")
+        check_outside(patch, geometry, tolerance=tolerance, name=f"finger {name!r}")
 
 
 def write_layout(path: str | Path, patches: dict[str, Patch]) -> Path:

@@ -166,9 +166,9 @@ def segments(log: JointLog, before: int = 8, least: int = 15) -> tuple[np.ndarra
     return np.cumsum(segment, dtype=np.int32), np.array(angles)
 
 
-def _still(log: JointLog, first: int, most: int) -> int:
-    """Samples from `first` on, `most` at most, whose target is the same."""
-    same = log.target[first : first + most] == log.target[first]
+def _still(log: JointLog, first: int, limit: int) -> int:
+    """Samples from `first` on, at most `limit`, whose target is the same."""
+    same = log.target[first : first + limit] == log.target[first]
     return int(np.argmin(np.append(same, False)))
 
 

@@ -82,10 +82,10 @@ def fit_boxes(mesh: meshes.Mesh, parts: int, *, frames: Sequence[np.ndarray] = (
                 write_whole(path, [buffer.getbuffer()])
     extent = float(np.ptp(mesh.vertices, axis=0).max())
     if any(off > share * extent for off, share in zip(boxes.deviation, _WORST, strict=True)):
-        mean, most = (1e3 * off for off in boxes.deviation)
+        mean, worst = (1e3 * off for off in boxes.deviation)
         raise AssetError(
             f"{mesh.name}: {len(boxes.size)} boxes do not follow its surface, {mean:.2g} mm off on "
-            f"average, {most:.2g} mm at worst, of {1e3 * extent:.3g} mm; allow more "
+            f"average, {worst:.2g} mm at worst, of {1e3 * extent:.3g} mm; allow more "
             "(ObjectConfig.mesh_parts)"
         )
     return boxes

@@ -89,7 +89,7 @@ def principal_axes(tensor: np.ndarray) -> np.ndarray:
     return max(map(turned, itertools.permutations(range(3))), key=np.trace)
 
 
-def scaled_boxes(thing: MeshObject, factor: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+def scaled_boxes(mesh_object: MeshObject, factor: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Sizes [K, 3] m, places [K, 3] m and orientations [K, 4] of its boxes at `factor` times its size."""
-    boxes = thing.boxes
+    boxes = mesh_object.boxes
     return factor * jnp.asarray(boxes.size), factor * jnp.asarray(boxes.position), jnp.asarray(boxes.quat)

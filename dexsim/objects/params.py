@@ -133,10 +133,10 @@ def sample_object(key: jax.Array, config: ObjectConfig, shape_index: jax.Array |
 
 
 def _sample_mesh(keys: jax.Array, config: ObjectConfig, extreme: jax.Array | None) -> ObjectParams:
-    thing = load_mesh_object(config)
+    mesh_object = load_mesh_object(config)
     factor, mass = uniform(keys[1], config.mesh_size, extreme), uniform(keys[2], config.mass, extreme)
-    size, position, quat = scaled_boxes(thing, factor)
-    inertia = mass * factor**2 * uniform(keys[3], config.inertia_scale, extreme) * jnp.asarray(thing.inertia)
+    size, position, quat = scaled_boxes(mesh_object, factor)
+    inertia = mass * factor**2 * uniform(keys[3], config.inertia_scale, extreme) * jnp.asarray(mesh_object.inertia)
     com = config.com_offset * uniform(keys[4], (-1.0, 1.0), extreme, (3,))
     return ObjectParams(
         jnp.int32(KINDS.index("mesh")),
@@ -150,7 +150,7 @@ def _sample_mesh(keys: jax.Array, config: ObjectConfig, extreme: jax.Array | Non
         _sample_contact(keys, config, extreme),
         quat,
         _sample_link_friction(keys, config, extreme),
-        thing.kinds,
+        mesh_object.kinds,
     )
 
 
@@ -167,8 +167,8 @@ def _sample_contact(keys: jax.Array, config: ObjectConfig, extreme: jax.Array | 
 def unit_inertia(target: ObjectParams, config: ObjectConfig | None = None) -> jax.Array:
     """Inertia [3] m^2 of an object of `config` as a uniform solid of 1 kg, about its centre."""
     if config is not None and config.mesh:
-        thing = load_mesh_object(config)
-        return (target.size[0, 0] / thing.boxes.size[0, 0]) ** 2 * jnp.asarray(thing.inertia)
+        mesh_object = load_mesh_object(config)
+        return (target.size[0, 0] / mesh_object.boxes.size[0, 0]) ** 2 * jnp.asarray(mesh_object.inertia)
     mass, _, inertia = _mass_properties(target.size, target.position, target.active)
     return inertia / mass
 

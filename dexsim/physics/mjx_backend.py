@@ -8,13 +8,13 @@ import jax.numpy as jnp
 
 from dexsim.core.errors import AssetError
 from dexsim.objects.params import ObjectParams, bounding_radius
-from dexsim.physics.seam import ContactParams, PhysicsState, Scene, TorqueLaw
+from dexsim.physics.seam import ContactParams, PhysicsScene, PhysicsState, TorqueLaw
 
 
 class MjxBackend:
     """A scene in MJX; see `dexsim.physics.seam.Backend`. Each implementation adds its data and its force reader."""
 
-    def __init__(self, scene: Scene, impl: str):
+    def __init__(self, scene: PhysicsScene, impl: str):
         """Raises AssetError: MJX lacks what the scene uses."""
         from mujoco import mjx
 

@@ -8,7 +8,7 @@ from dexsim.hand.kinematics import Hand
 from dexsim.physics import contact
 from dexsim.physics.config import PhysicsConfig
 from dexsim.physics.guard import check_model
-from dexsim.physics.seam import Scene
+from dexsim.physics.seam import PhysicsScene
 
 GEOM_TYPES = {
     "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
@@ -103,12 +103,12 @@ def build_scene(
     backend: str,
     *,
     rotor_share: float = 0.0,
-) -> Scene:
+) -> PhysicsScene:
     """`build_model`, with the addresses of what changes in it."""
     model = build_model(hand, slots, largest, config, gravity, backend, rotor_share=rotor_share)
     joints, free = [model.joint(name) for name in hand.joint_names], model.joint("object")
     geoms = np.array([model.geom(f"object_{k}").id for k in range(len(slots))])
-    return Scene(
+    return PhysicsScene(
         hand=hand,
         config=config,
         slots=slots,

@@ -37,7 +37,7 @@ class PhysicsState:
 
 @pytree_dataclass
 class ContactParams:
-    """Contact parameters of the pairs of hand and object (`Scene.object_pairs`), in MuJoCo's terms."""
+    """Contact parameters of the pairs of hand and object (`PhysicsScene.object_pairs`), in MuJoCo's terms."""
 
     friction: jax.Array  # [P] sliding
     solref: jax.Array  # [P, 2] direct format: minus stiffness, minus damping
@@ -45,7 +45,7 @@ class ContactParams:
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
-class Scene:
+class PhysicsScene:
     """The compiled template that an engine runs, with the addresses of what changes in it."""
 
     hand: Hand

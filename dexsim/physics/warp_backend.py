@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from dexsim.hand.kinematics import Hand
 from dexsim.physics.config import PhysicsConfig
 from dexsim.physics.mjx_backend import MjxBackend
-from dexsim.physics.seam import Scene
+from dexsim.physics.seam import PhysicsScene
 
 # Warp's flags for full buffers: constraint rows, their non-zeros, broad phase, narrow phase,
 # convex collision, contact sensors. Its other flags report iteration limits, which are intended.
@@ -18,7 +18,7 @@ _OVERFLOW = 1 | 2 | 4 | 8 | 16 | 64
 class WarpBackend(MjxBackend):
     """`dexsim.physics.seam.Backend` on Warp."""
 
-    def __init__(self, scene: Scene, num_envs: int):
+    def __init__(self, scene: PhysicsScene, num_envs: int):
         """Raises AssetError: Warp lacks what the scene uses."""
         super().__init__(scene, "warp")
         # Warp prints from the device whenever a solver stops at its iteration limit, which is intended here. Full

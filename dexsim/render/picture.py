@@ -9,7 +9,19 @@ import numpy as np
 
 from dexsim.hand.kinematics import Hand
 from dexsim.render.panel import force_color
-from dexsim.render.raycast import Camera, Primitives, Surface, View, cast, crop, length, look, normals, project, samples
+from dexsim.render.raycast import (
+    Camera,
+    CameraView,
+    Primitives,
+    VisibleSurface,
+    cast,
+    crop,
+    length,
+    look,
+    normals,
+    project,
+    samples,
+)
 
 _SUPERSAMPLE = 2
 _TAXEL_BIAS = 0.0025  # m; the pads follow the taxel lattice to within 1 mm, and no taxel may drown in its pad
@@ -38,7 +50,7 @@ class Light(NamedTuple):
 
     direction: np.ndarray  # [3], toward the light
     up: np.ndarray  # [3]
-    view: View  # orthographic, from the light
+    view: CameraView  # orthographic, from the light
     depth: np.ndarray  # [S, S] m
 
 
@@ -53,10 +65,10 @@ def draw_scene(
 ) -> np.ndarray:
     """uint8 [H, W, 3] of one `Snapshot`; taxels are coloured from 0 to `force_range` [N]."""
     full = look(camera, size, _SUPERSAMPLE)
-    body, thing = hand_primitives(hand, pose), object_primitives(kinds, frame)
+    body, held = hand_primitives(hand, pose), object_primitives(kinds, frame)
     plain = hand_primitives(hand, pose, rounded=False)
     everything = Primitives(
-        plain.kind + thing.kind, *(np.concatenate(pair) for pair in zip(plain[1:], thing[1:], strict=True))
+        plain.kind + held.kind, *(np.concatenate(pair) for pair in zip(plain[1:], held[1:], strict=True))
     )
     view, window = crop(full, everything, _SUPERSAMPLE)
     rows, columns = (slice(part.start // _SUPERSAMPLE, part.stop // _SUPERSAMPLE) for part in window)
@@ -67,9 +79,9 @@ def draw_scene(
     _paint(color, body, surface, view, light, bevel=1e-4)
     pixel, rays, loaded = _taxel_rays(surface, view, pose, frame.taxel_force, force_range)
     _blend(color, pixel, rays, 1.0)
-    front = cast(thing, view)
+    front = cast(held, view)
     front.index[front.depth > surface.depth] = -1
-    _paint(color, thing, front, view, light, bevel=0.003, opacity=_OBJECT_OPACITY)
+    _paint(color, held, front, view, light, bevel=0.003, opacity=_OBJECT_OPACITY)
     # The taxels that matter lie between finger and object: let the loaded ones shine through.
     _blend(color, pixel[loaded], rays[loaded], _TAXEL_GLOW)
 
@@ -130,8 +142,8 @@ def _rounded_box(half: np.ndarray, radius: float) -> list[tuple]:
 def _paint(
     color: np.ndarray,
     primitives: Primitives,
-    surface: Surface,
-    view: View,
+    surface: VisibleSurface,
+    view: CameraView,
     light: Light,
     bevel: float,
     opacity: float = 1.0,
@@ -168,7 +180,7 @@ def _shade(tones, index, points, normal, toward, away, light: Light) -> np.ndarr
     return color
 
 
-def _taxel_rays(surface: Surface, view: View, pose: Pose, force: np.ndarray, force_range: float):
+def _taxel_rays(surface: VisibleSurface, view: CameraView, pose: Pose, force: np.ndarray, force_range: float):
     """Every taxel that faces the camera as a disc on the skin, in the colour of its force.
 
     Returns:
@@ -220,7 +232,7 @@ def _blend(color: np.ndarray, pixel: np.ndarray, rays: np.ndarray, opacity: floa
         plane[:] = plane * keep + share * np.bincount(pixel, values, len(plane))
 
 
-def _key_light(primitives: Primitives, hand: int, view: View, up: tuple[float, float, float]) -> Light:
+def _key_light(primitives: Primitives, hand: int, view: CameraView, up: tuple[float, float, float]) -> Light:
     """A light over the camera's right shoulder, with a shadow map that fits the first `hand` primitives.
 
     Fitted to the hand alone, since a lost object may be anywhere.
@@ -234,7 +246,7 @@ def _key_light(primitives: Primitives, hand: int, view: View, up: tuple[float, f
     reach = np.linalg.norm(primitives.size[:hand], axis=-1)[:, None] * 1.4143
     low, high = (lateral - reach).min(0), (lateral + reach).max(0)
     middle, radius = (low + high) / 2 @ axes, float((high - low)[:2].max() / 2)
-    above = View(middle + light, axes, half / radius, (half, half), (_SHADOW_PIXELS, _SHADOW_PIXELS), True)
+    above = CameraView(middle + light, axes, half / radius, (half, half), (_SHADOW_PIXELS, _SHADOW_PIXELS), True)
     return Light(light.astype(np.float32), up.astype(np.float32), above, cast(primitives, above).depth)
 
 
@@ -283,7 +295,7 @@ def _tone_table() -> np.ndarray:
     return (255 * np.linspace(0, 1, 4096) ** (1 / 2.2)).round().astype(np.uint8)
 
 
-def _toward(view: View, points: np.ndarray) -> np.ndarray:
+def _toward(view: CameraView, points: np.ndarray) -> np.ndarray:
     """Unit vectors [3, M] from points to the camera."""
     away = view.origin.astype(np.float32)[:, None] - points
     return away / length(away)

@@ -34,7 +34,7 @@ class Camera:
     """Vertical opening angle [deg]."""
 
 
-class View(NamedTuple):
+class CameraView(NamedTuple):
     """A camera ready for a picture of one size: axes as rows (right, up, back), focal length in pixels."""
 
     origin: np.ndarray  # [3], m
@@ -55,14 +55,14 @@ class Primitives(NamedTuple):
     color: np.ndarray  # [G, 3], linear RGB
 
 
-class Surface(NamedTuple):
+class VisibleSurface(NamedTuple):
     """What each pixel of a view sees first. Depth runs along the optical axis."""
 
     depth: np.ndarray  # [H, W], m, FAR where empty
     index: np.ndarray  # [H, W] int, primitive, -1 where empty
 
 
-class Samples(NamedTuple):
+class ShadingSamples(NamedTuple):
     """Surface points to shade, those of one primitive together.
 
     Components come first: NumPy is several times faster on three long rows than on many short triples.
@@ -74,7 +74,7 @@ class Samples(NamedTuple):
     points: np.ndarray  # [3, M], m
 
 
-def look(camera: Camera, size: tuple[int, int], supersample: int = 1) -> View:
+def look(camera: Camera, size: tuple[int, int], supersample: int = 1) -> CameraView:
     """The view of `camera` for a picture of `size` (width, height), with `supersample`² rays a pixel."""
     up = _unit(np.asarray(camera.up, np.float64))
     reference = np.array([0.0, 0.0, 1.0]) if abs(up[2]) < 0.9 else np.array([1.0, 0.0, 0.0])
@@ -88,10 +88,10 @@ def look(camera: Camera, size: tuple[int, int], supersample: int = 1) -> View:
     width, height = size[0] * supersample, size[1] * supersample
     scale = height / 2 / np.tan(np.deg2rad(camera.field_of_view) / 2)
     origin = np.asarray(camera.target, np.float64) + camera.distance * back
-    return View(origin, axes, float(scale), (width / 2, height / 2), (width, height))
+    return CameraView(origin, axes, float(scale), (width / 2, height / 2), (width, height))
 
 
-def project(view: View, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def project(view: CameraView, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Pixels [..., 2] and depths [...] of points [..., 3]; pixel (i, j) covers [i, i+1) x [j, j+1), y down."""
     local = (np.asarray(points) - view.origin) @ view.axes.T
     depth = -local[..., 2]
@@ -99,7 +99,7 @@ def project(view: View, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.stack([view.centre[0] + local[..., 0] * scale, view.centre[1] - local[..., 1] * scale], -1), depth
 
 
-def cast(primitives: Primitives, view: View) -> Surface:
+def cast(primitives: Primitives, view: CameraView) -> VisibleSurface:
     """The nearest primitive along every ray of the view."""
     width, height = view.size
     depth = np.full((height, width), FAR, np.float32)
@@ -115,10 +115,10 @@ def cast(primitives: Primitives, view: View) -> Surface:
         nearer = (hit < window) & (hit > 1e-3)
         np.copyto(window, hit, where=nearer)
         np.copyto(index[y0:y1, x0:x1], np.int16(g), where=nearer)
-    return Surface(depth, index)
+    return VisibleSurface(depth, index)
 
 
-def samples(view: View, surface: Surface, n: int) -> Samples:
+def samples(view: CameraView, surface: VisibleSurface, n: int) -> ShadingSamples:
     """Where to shade a surface cast with n x n rays a pixel: once a pixel inside a primitive, once a ray at an edge."""
     indices = [surface.index[i::n, j::n] for i in range(n) for j in range(n)]
     depths = [surface.depth[i::n, j::n] for i in range(n) for j in range(n)]
@@ -145,11 +145,11 @@ def samples(view: View, surface: Surface, n: int) -> Samples:
     x = (column * np.float32(n) + dx - np.float32(view.centre[0])) * slope
     y = (np.float32(view.centre[1]) - row * np.float32(n) - dy) * slope
     points = view.axes.T.astype(np.float32) @ np.stack([x, y, -depth]) + view.origin.astype(np.float32)[:, None]
-    return Samples(pixel, weight, index[order], points)
+    return ShadingSamples(pixel, weight, index[order], points)
 
 
 def normals(primitives: Primitives, index: np.ndarray, points: np.ndarray, bevel: float = 0.003) -> np.ndarray:
-    """Outward unit normals [3, M] at points [3, M] of primitives [M], sorted as in `Samples`.
+    """Outward unit normals [3, M] at points [3, M] of primitives [M], sorted as in `ShadingSamples`.
 
     Edges of boxes and cylinders are shaded as if rounded by `bevel` [m].
     """
@@ -185,7 +185,7 @@ def _local_normal(kind: str, p: np.ndarray, size: np.ndarray, bevel: np.float32)
     return np.stack([p[0] * outward, p[1] * outward, p[2] - np.clip(p[2], -core_z, core_z)])
 
 
-def screen_boxes(view: View, primitives: Primitives) -> np.ndarray:
+def screen_boxes(view: CameraView, primitives: Primitives) -> np.ndarray:
     """Pixel windows [G, 4] (x0, x1, y0, y1) that certainly hold the primitives; empty outside the picture."""
     points = np.empty((len(primitives.kind), 16, 3))
     for g, (kind, (a, b, c), turn) in enumerate(
@@ -208,7 +208,7 @@ def screen_boxes(view: View, primitives: Primitives) -> np.ndarray:
     return np.stack([low[:, 0], high[:, 0], low[:, 1], high[:, 1]], -1)
 
 
-def crop(view: View, primitives: Primitives, multiple: int) -> tuple[View, tuple[slice, slice]]:
+def crop(view: CameraView, primitives: Primitives, multiple: int) -> tuple[CameraView, tuple[slice, slice]]:
     """The part of the view that holds the primitives, on multiples of `multiple` pixels, and its (rows, columns)."""
     boxes = screen_boxes(view, primitives)
     boxes = boxes[(boxes[:, 0] < boxes[:, 1]) & (boxes[:, 2] < boxes[:, 3])]
@@ -220,7 +220,9 @@ def crop(view: View, primitives: Primitives, multiple: int) -> tuple[View, tuple
     return view._replace(centre=centre, size=(int(x1 - x0), int(y1 - y0))), (slice(y0, y1), slice(x0, x1))
 
 
-def _local_rays(view: View, primitives: Primitives, g: int, box: tuple[int, int, int, int]) -> tuple[tuple, tuple]:
+def _local_rays(
+    view: CameraView, primitives: Primitives, g: int, box: tuple[int, int, int, int]
+) -> tuple[tuple, tuple]:
     """Origin and direction of each ray in the frame of primitive g, three components each (scalar or [h, w])."""
     x0, x1, y0, y1 = box
     x = (np.arange(x0, x1, dtype=np.float32) + np.float32(0.5 - view.centre[0])) / np.float32(view.scale)

@@ -33,7 +33,7 @@ class Touch:
 def feel(
     taxels: jax.Array,
     area: jax.Array,
-    thing: Any,
+    geometry: Any,
     position: jax.Array,
     rotation: jax.Array,
     finger_force: jax.Array,
@@ -44,7 +44,7 @@ def feel(
     Args:
       taxels: [F, N, 3] m, taxel positions in the palm frame.
       area: [F, N] m^2.
-      thing, position [3], rotation [3, 3]: the object, prepared for any method of
+      geometry, position [3], rotation [3, 3]: the object, prepared for any method of
         `dexsim.geometry.distance` (a `sdf.Shape` is as it is), and its pose in the palm frame.
       finger_force: [F] N, resultant fingertip-object force of the physics.
       skin: the skin's law.
@@ -52,13 +52,13 @@ def feel(
     A finger whose taxels all lie clear of the object reads zero, whatever its total: it touches
     with a part of the link that carries no taxels.
     """
-    return _press(sdf.to_local(taxels, position, rotation), area, thing, finger_force, skin)
+    return _press(sdf.to_local(taxels, position, rotation), area, geometry, finger_force, skin)
 
 
 def feel_links(
     hand: Hand,
     pose: HandPose,
-    thing: Any,
+    geometry: Any,
     position: jax.Array,
     rotation: jax.Array,
     finger_force: jax.Array,
@@ -77,12 +77,12 @@ def feel_links(
     turn, shift = jax.lax.optimization_barrier((turn, shift))
     taxel = [jnp.asarray(surface.position[..., axis]) for axis in range(3)]
     local = [sum(turn[:, row, axis, None] * taxel[axis] for axis in range(3)) + shift[:, row, None] for row in range(3)]
-    return _press(jnp.stack(local, -1), jnp.asarray(surface.area), thing, finger_force, skin)
+    return _press(jnp.stack(local, -1), jnp.asarray(surface.area), geometry, finger_force, skin)
 
 
-def _press(points: jax.Array, area: jax.Array, thing: Any, finger_force: jax.Array, skin: Skin) -> Touch:
+def _press(points: jax.Array, area: jax.Array, geometry: Any, finger_force: jax.Array, skin: Skin) -> Touch:
     """`feel` for points [F, N, 3] in the object's frame."""
-    depth = jnp.maximum(skin.margin - signed_distance(points, thing), 0.0)
+    depth = jnp.maximum(skin.margin - signed_distance(points, geometry), 0.0)
     skin_force = skin_stress(depth / skin.thickness, skin) * area
     return Touch(depth, skin_force, spread(skin_force, finger_force))
 

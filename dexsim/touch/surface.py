@@ -17,7 +17,7 @@ _STEP, _CELL = 0.001, 0.006  # m: of the points that find the surface, of the ce
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Surface:
-    """Points of the fingertips' skin in their links' frames: N taxels first, then the bare ones; F fingers."""
+    """Points of the fingertips' skin in their links' frames: N taxels first, then those without; F fingers."""
 
     position: np.ndarray  # [F, P, 3] m
     normal: np.ndarray  # [F, P, 3] outward
@@ -36,8 +36,10 @@ def whole_surface(hand: Hand, reach: float) -> Surface:
       reach: m from the nearest taxel within which pressed skin loads that taxel, so that it has no point of its own.
     """
     untaxelled = [_beyond(hand, finger, reach) for finger in range(hand.num_fingers)]
-    most = max(len(rows) for rows in untaxelled)
-    untaxelled = np.stack([np.concatenate([rows, np.zeros((most - len(rows), 7), np.float32)]) for rows in untaxelled])
+    longest = max(len(rows) for rows in untaxelled)
+    untaxelled = np.stack(
+        [np.concatenate([rows, np.zeros((longest - len(rows), 7), np.float32)]) for rows in untaxelled]
+    )
     return Surface(
         np.concatenate([hand.taxel_position, untaxelled[..., :3]], 1),
         np.concatenate([hand.taxel_normal, untaxelled[..., 3:6]], 1),

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.ndimage import binary_dilation
 
 from dexsim.calibration import sensor
-from dexsim.calibration.fit import MIN_SAMPLES, Press, calibrate
+from dexsim.calibration.fit import MIN_SAMPLES, JointPress, calibrate
 from dexsim.calibration.maps import Calibration
 from dexsim.calibration.press import MIN_LEVER
 from dexsim.calibration.sensor import FingerFit, fit_finger
@@ -55,8 +55,8 @@ class Fit:
     """A calibration, what it was fitted to, and how the taxels compare with the gauge."""
 
     calibration: Calibration
-    real: dict[str, Press]
-    sim: dict[str, Press]
+    real: dict[str, JointPress]
+    sim: dict[str, JointPress]
     source: dict[str, str]  # joint to press
     sensors: dict[str, FingerFit]  # by finger: counts as a run sees them against newtons
 
@@ -96,8 +96,8 @@ def fit(session: Session, hand: Hand, created: str | None = None) -> Fit:
                 )
                 continue
             reach[label], source[label] = abs(lever[joint]), recording.name
-            real[label] = Press(force, blocks.current[:, joint], way)
-            sim[label] = Press(force, torque[:, joint], way)
+            real[label] = JointPress(force, blocks.current[:, joint], way)
+            sim[label] = JointPress(force, torque[:, joint], way)
         notes += _press_notes(session, hand, recording, blocks, dead)
     try:
         result = calibrate(
@@ -244,7 +244,7 @@ def _gauges(
 
 def _against(gauge: np.ndarray, counts: np.ndarray, name: str) -> FingerFit:
     try:
-        return fit_finger(sensor.Press(gauge, np.maximum(counts, 0.0)[:, None]))
+        return fit_finger(sensor.TaxelPress(gauge, np.maximum(counts, 0.0)[:, None]))
     except DexsimError as error:
         raise CalibrationError(f"{name}, gauge: {error}") from None
 

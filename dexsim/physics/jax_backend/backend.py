@@ -9,13 +9,13 @@ import numpy as np
 from dexsim.objects.params import ObjectParams
 from dexsim.physics.jax_backend.substep import find_stepper
 from dexsim.physics.mjx_backend import MjxBackend
-from dexsim.physics.seam import ContactParams, PhysicsState, Scene, TorqueLaw
+from dexsim.physics.seam import ContactParams, PhysicsScene, PhysicsState, TorqueLaw
 
 
 class JaxBackend(MjxBackend):
     """`dexsim.physics.seam.Backend` in JAX."""
 
-    def __init__(self, scene: Scene, num_envs: int = 1):
+    def __init__(self, scene: PhysicsScene, num_envs: int = 1):
         """Raises AssetError: MJX lacks what the scene uses. JAX reserves no memory for `num_envs`."""
         del num_envs
         super().__init__(scene, "jax")

@@ -11,7 +11,7 @@ import pytest
 import scipy.stats
 
 from dexsim.actuator.current import Motor
-from dexsim.calibration.fit import MIN_FORCE_RANGE, MIN_SAMPLES, Press, calibrate, find_direction, fit_joint
+from dexsim.calibration.fit import MIN_FORCE_RANGE, MIN_SAMPLES, JointPress, calibrate, find_direction, fit_joint
 from dexsim.calibration.maps import (
     alignment,
     current_from_counts,
@@ -187,7 +187,7 @@ def test_run_time_torque_is_the_motors(hand, fitted):
 def test_a_hand_that_counts_backwards(hand):
     """Currents negative while closing, as the XHand's: torques positive all the same."""
     calibration, real, sim = calibrated(hand)
-    turned = {name: Press(p.force, -p.value) for name, p in real.items()}
+    turned = {name: JointPress(p.force, -p.value) for name, p in real.items()}
     other = calibrate(hand, turned, sim, created="2026-01-01")
     current = jnp.linspace(0.05, 0.6, 12)
     np.testing.assert_allclose(joint_torque(other, -current), joint_torque(calibration, current), rtol=1e-4)
@@ -258,13 +258,13 @@ def test_what_the_data_cannot_separate_is_said(fitted):
     for words in ("force sensor", "product", "offset"):
         assert words in notes
     data = recording()
-    only = Press(data.force, data.value, np.where(find_direction(data.force) > 0, 1, 0))
+    only = JointPress(data.force, data.value, np.where(find_direction(data.force) > 0, 1, 0))
     one_way = fit_joint(only, "A")
     assert one_way.unloading is None and math.isnan(one_way.friction)
     assert any("friction and offset are not apart" in note for note in one_way.notes)
     force = np.linspace(8.0, 8.8, 400)
-    toward_nominal = fit_joint(Press(force, 0.05 * force + 1e-4 * np.random.default_rng(0).standard_normal(400)), "A")
-    assert any("gain and offset trade off" in note for note in toward_nominal.notes)
+    narrow = fit_joint(JointPress(force, 0.05 * force + 1e-4 * np.random.default_rng(0).standard_normal(400)), "A")
+    assert any("gain and offset trade off" in note for note in narrow.notes)
 
 
 # --- loading and unloading ----------------------------------------------------------------------
@@ -299,7 +299,7 @@ def broken(**changes):
             "value": lambda f, v, c=change: (f, c(v)),
             "both": lambda f, v, c=change: (c(f), c(v)),
         }[name](force, value)
-    return Press(force, value)
+    return JointPress(force, value)
 
 
 def put(index, number):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dexsim.calibration.sensor import Press, fit_finger, load_fit, save_fit
+from dexsim.calibration.sensor import TaxelPress, fit_finger, load_fit, save_fit
 from dexsim.core.errors import AssetError, DexsimError
 
 TAXELS, AREA = 40, np.full(40, 4e-6)
@@ -18,7 +18,7 @@ def recording(seed, *, gain=9.0, offset=1.5, threshold=0.3, noise=0.4, count=150
     total[rng.choice(count, outliers, replace=False)] += 60
     share = np.zeros((count, TAXELS))
     share[:, :10] = 0.1
-    return Press(force=force, reading=total[:, None] * share)
+    return TaxelPress(force=force, reading=total[:, None] * share)
 
 
 def test_gain_offset_and_threshold_are_found():
@@ -50,7 +50,7 @@ def test_outliers_do_not_bend_the_line():
 
 def test_saturated_samples_are_left_out():
     press = recording(2)
-    clipped = Press(force=press.force, reading=np.minimum(press.reading, 5.0))
+    clipped = TaxelPress(force=press.force, reading=np.minimum(press.reading, 5.0))
     assert fit_finger(clipped).gain.value < 8.0
     fit = fit_finger(clipped, saturation=5.0)
     assert fit.gain.value == pytest.approx(9.0, rel=0.02) and "saturated" in fit.notes[0]
@@ -65,7 +65,7 @@ def plate(seed, c10, c01, deepest, noise=0.02):
     force = np.sum(2 * (stretch**-2 - stretch) * (c10 + c01 / stretch) * AREA, 1)
     reading = force[:, None] * depth / np.maximum(depth.sum(1, keepdims=True), 1e-12)
     force = force * (1 + noise * rng.normal(size=80))
-    return Press(force=force, reading=reading, depth=depth, area=AREA)
+    return TaxelPress(force=force, reading=reading, depth=depth, area=AREA)
 
 
 def test_the_material_is_found():
@@ -96,13 +96,13 @@ def test_fits_are_kept_in_a_file(tmp_path):
 def test_useless_recordings_are_refused():
     good = recording(7)
     for press, words in (
-        (Press(force=good.force[:5], reading=good.reading[:5]), "5 samples"),
-        (Press(force=np.full(150, 2.0), reading=good.reading), "different forces"),
-        (Press(force=good.force, reading=good.reading[:20]), r"expected \[T\]"),
-        (Press(force=good.force, reading=0 * good.reading), "above the activation threshold"),
-        (Press(force=good.force, reading=100 - good.reading), "do not rise"),
-        (Press(force=np.where(good.force > 7, np.nan, good.force), reading=good.reading), "not finite"),
-        (Press(force=good.force, reading=good.reading, depth=good.reading), "areas"),
+        (TaxelPress(force=good.force[:5], reading=good.reading[:5]), "5 samples"),
+        (TaxelPress(force=np.full(150, 2.0), reading=good.reading), "different forces"),
+        (TaxelPress(force=good.force, reading=good.reading[:20]), r"expected \[T\]"),
+        (TaxelPress(force=good.force, reading=0 * good.reading), "above the activation threshold"),
+        (TaxelPress(force=good.force, reading=100 - good.reading), "do not rise"),
+        (TaxelPress(force=np.where(good.force > 7, np.nan, good.force), reading=good.reading), "not finite"),
+        (TaxelPress(force=good.force, reading=good.reading, depth=good.reading), "areas"),
     ):
         with pytest.raises(DexsimError, match=words) as caught:
             fit_finger(press)

@@ -159,14 +159,14 @@ def test_one_signature_for_all():
     near = np.abs(truth) < 0.003
     for name, bound in (("closed_form", 1e-7), ("grid", 1.5e-5), ("surface_points", 2e-4)):
         points_config = PointsConfig(block=16, table=False)
-        thing = distance.prepare(shape, DistanceConfig(method=name, points=points_config))
-        assert distance.method_of(thing) == name and isinstance(thing, distance.METHODS[name].kind)
-        value, normal = jax.jit(distance.distance_and_normal)(points, thing)
-        np.testing.assert_array_equal(jax.jit(distance.signed_distance)(points, thing), value)
+        geometry = distance.prepare(shape, DistanceConfig(method=name, points=points_config))
+        assert distance.method_of(geometry) == name and isinstance(geometry, distance.METHODS[name].kind)
+        value, normal = jax.jit(distance.distance_and_normal)(points, geometry)
+        np.testing.assert_array_equal(jax.jit(distance.signed_distance)(points, geometry), value)
         assert np.abs(value - truth)[near].max() < bound
         outward = points / np.linalg.norm(points, axis=1, keepdims=True)
         assert np.sum(normal * outward, -1)[near].min() > 0.99
-        assert distance.prepare(thing) is thing
+        assert distance.prepare(geometry) is geometry
 
 
 def test_the_method_is_chosen_by_the_object():

@@ -28,7 +28,7 @@ TRUTH = dict(
 )
 GUESS = dict(stiffness=3.5, damping=0.13, stall_torque=0.45, no_load_speed=12.0, inertia=0.0012)
 TARGET = joint_excitation(Excitation(period=PERIOD), 0.9, 0.8)
-SPHERE_HALF_LENGTH = joint_excitation(
+SHORT = joint_excitation(
     Excitation(
         period=PERIOD, chirp_seconds=2.0, chirp_parts=3, step_count=4, slow_speed=1.0, reversal_cycles=2, rest=0.3
     ),
@@ -241,7 +241,7 @@ def test_holdout_and_report():
 
 
 def test_latency_scan_shows_its_valley():
-    log = log_of(TRUTH | {"dead_band": 0.0}, 3, target=SPHERE_HALF_LENGTH, latency=3)
+    log = log_of(TRUTH | {"dead_band": 0.0}, 3, target=SHORT, latency=3)
     found = identify(log, GUESS, dead_band=None)
     assert found.latency == 3 and found.latency_cost[3] == 0.0
     costs = [found.latency_cost[lag] for lag in range(9)]
@@ -287,7 +287,7 @@ def test_c_mujocos_joint_is_identified():
     truth = dict(
         stiffness=3.0, damping=0.12, stall_torque=0.4, inertia=0.012, coulomb_friction=0.03, viscous_friction=0.01
     )
-    log = c_log(truth, SPHERE_HALF_LENGTH, latency=0.009)
+    log = c_log(truth, SHORT, latency=0.009)
     guess = dict(stiffness=2.0, damping=0.2, stall_torque=0.5, no_load_speed=1e2, inertia=0.012)
     found = identify(log, guess, dead_band=None, substeps=5, latencies=(2, 3, 4))
     assert found.latency == 3 and found.timestep == pytest.approx(3e-3)
@@ -312,7 +312,7 @@ def quick(log, fit, **options):
 
 @pytest.fixture(scope="module")
 def smooth_log():
-    return log_of(TRUTH | {"dead_band": 0.0}, 5, target=SPHERE_HALF_LENGTH)
+    return log_of(TRUTH | {"dead_band": 0.0}, 5, target=SHORT)
 
 
 def group_with(found, *names):
@@ -351,7 +351,7 @@ def test_a_limit_that_was_never_reached():
     gentle = joint_excitation(
         Excitation(period=PERIOD, amplitude=0.04, chirp_frequency=(0.3, 2.0), chirp_seconds=2.0), 0.9, 0.8
     )
-    gentle = np.concatenate([gentle, np.full(len(SPHERE_HALF_LENGTH), 0.9)])[: len(SPHERE_HALF_LENGTH)]
+    gentle = np.concatenate([gentle, np.full(len(SHORT), 0.9)])[: len(SHORT)]
     found = quick(
         log_of(TRUTH | {"dead_band": 0.0}, target=gentle),
         ("stiffness", "damping", "coulomb_friction", "stall_torque", "no_load_speed"),

@@ -58,23 +58,23 @@ def close_to(shape, rng, count=4000):
 
 class TestBoxes:
     def test_a_cube_gives_back_a_cube(self, folder):
-        thing = load(str(folder / "cube.stl"), unit=1.0, parts=6)
-        assert thing.kinds == ("box",) and max(thing.boxes.deviation) < 1e-6
-        np.testing.assert_allclose(thing.boxes.size, [[0.0275] * 3], rtol=1e-4)
-        np.testing.assert_allclose(thing.boxes.position, 0, atol=1e-6)
-        np.testing.assert_allclose(np.abs(thing.boxes.quat), [[1, 0, 0, 0]], atol=1e-4)
-        np.testing.assert_allclose(thing.inertia, 0.055**2 / 6, rtol=1e-6)
-        np.testing.assert_array_equal(thing.axes, np.eye(3))
+        mesh_object = load(str(folder / "cube.stl"), unit=1.0, parts=6)
+        assert mesh_object.kinds == ("box",) and max(mesh_object.boxes.deviation) < 1e-6
+        np.testing.assert_allclose(mesh_object.boxes.size, [[0.0275] * 3], rtol=1e-4)
+        np.testing.assert_allclose(mesh_object.boxes.position, 0, atol=1e-6)
+        np.testing.assert_allclose(np.abs(mesh_object.boxes.quat), [[1, 0, 0, 0]], atol=1e-4)
+        np.testing.assert_allclose(mesh_object.inertia, 0.055**2 / 6, rtol=1e-6)
+        np.testing.assert_array_equal(mesh_object.axes, np.eye(3))
 
     def test_an_l_is_two_bars(self):
         """In the object's frame, which lies askew to them."""
-        thing = from_mesh(mesh.load_mesh(ell()), 6)
+        mesh_object = from_mesh(mesh.load_mesh(ell()), 6)
         points = close_to(BARS, np.random.default_rng(0))
         outside = sdf.signed_distance(points, BARS) > 0
-        found = sdf.signed_distance((points - thing.origin) @ thing.axes, thing.boxes.shape())
+        found = sdf.signed_distance((points - mesh_object.origin) @ mesh_object.axes, mesh_object.boxes.shape())
         error = np.abs(found - sdf.signed_distance(points, BARS))[outside]
-        assert len(thing.kinds) == 2 and error.mean() < 1e-5 and error.max() < 3e-4
-        assert 0.3 < np.arccos(thing.axes[0, 0]) < 0.8
+        assert len(mesh_object.kinds) == 2 and error.mean() < 1e-5 and error.max() < 3e-4
+        assert 0.3 < np.arccos(mesh_object.axes[0, 0]) < 0.8
 
     def test_what_is_round_is_followed_within_the_deviation_that_is_reported(self):
         radius, half = 0.02, 0.02
@@ -92,11 +92,11 @@ class TestBoxes:
         sides, place = np.array([0.04, 0.06, 0.09]), np.array([0.5, -0.2, 0.1])
         solid = trimesh.creation.box(sides)
         moved = mesh.load_mesh((solid.vertices @ np.asarray(turn).T + place, solid.faces))
-        thing = from_mesh(moved, 4)
-        np.testing.assert_allclose(thing.origin, place, atol=1e-7)
-        np.testing.assert_allclose(thing.axes, turn, atol=1e-5)  # no axis turned over or swapped
-        np.testing.assert_allclose(thing.inertia, (np.sum(sides**2) - sides**2) / 12, rtol=1e-5)
-        np.testing.assert_allclose(thing.boxes.size, [sides / 2], rtol=1e-3)
+        mesh_object = from_mesh(moved, 4)
+        np.testing.assert_allclose(mesh_object.origin, place, atol=1e-7)
+        np.testing.assert_allclose(mesh_object.axes, turn, atol=1e-5)  # no axis turned over or swapped
+        np.testing.assert_allclose(mesh_object.inertia, (np.sum(sides**2) - sides**2) / 12, rtol=1e-5)
+        np.testing.assert_allclose(mesh_object.boxes.size, [sides / 2], rtol=1e-3)
 
 
 class TestErrors:

@@ -32,11 +32,11 @@ CONFIG = DistanceConfig(grid=GridConfig(nodes=48), points=PointsConfig(count=204
 
 @pytest.fixture(scope="module")
 def links(hand):
-    """`(thing, skin) -> Touch, finger force, centre` of the half closed hand, and its taxels and normals."""
+    """`(geometry, skin) -> Touch, finger force, centre` of the half closed hand, and its taxels and normals."""
     pose = jax.jit(lambda q: forward_kinematics(hand, q))(JOINTS)
 
-    def feel(thing, skin):
-        touch = feel_links(hand, pose, thing, PLACE, TURN, TOTAL, skin)
+    def feel(geometry, skin):
+        touch = feel_links(hand, pose, geometry, PLACE, TURN, TOTAL, skin)
         return touch, *reduce_touch_links(touch.force, hand, pose)
 
     return jax.jit(feel, static_argnames="skin"), pose, taxel_positions(hand, pose), taxel_normals(hand, pose)
