@@ -65,7 +65,10 @@ INACTIVE: dict[str, tuple[str, Any]] = {"sensing.array": ("scale", 0.0)}
 ARGUMENTS: dict[str, str | None] = {"corners": "extremes"}
 """Options of a training run, likewise; those under `env` are in `FIELDS`."""
 
-LEAVES: dict[str, str | None] = {}
+LEAVES: dict[str, str | None] = {
+    ".env_state.array_params.noise": None,
+    ".env_state.array_params.threshold": None,
+}
 """Prefixes of the paths of a checkpoint's arrays, likewise."""
 
 

@@ -1,0 +1,89 @@
+"""Files of older versions: their fields under today's names and values, and what is said about it."""
+
+import warnings
+
+import pytest
+
+from dexsim.core.config import from_dict, to_dict
+from dexsim.core.errors import OldFileWarning
+from dexsim.tasks.grasp.config import GraspConfig
+from dexsim_ppo.retired import migrate_arguments, migrate_config, migrate_leaves
+
+ARRAY = {
+    "scale": 0.0,
+    "hysteresis": [0.0, 0.3],
+    "hysteresis_time": [0.03, 0.2],
+    "crosstalk": [0.0, 0.1],
+    "gain": [0.85, 1.15],
+    "bias": [-0.03, 0.03],
+    "drift": [0.0, 0.005],
+    "noise": [0.005, 0.02],
+    "dead": [0.0, 0.05],
+    "threshold": [0.03, 0.1],
+    "counts": "uint8",
+    "resolution": 0.1,
+    "rate": None,
+}
+
+
+def old_config(**array):
+    """The defaults in the form of a file from before touch methods and one model of the taxels."""
+    config = to_dict(GraspConfig())
+    del config["touch_method"]
+    config["objects"]["mesh_touch"] = "boxes"
+    config["physics"] |= {"condim": 3, "cone": "elliptic", "tips": "skin", "palm": "auto"}
+    config["sensing"]["taxel"] = {
+        name: config["sensing"]["taxel"][name] for name in ("noise", "threshold", "resolution", "saturation")
+    }
+    config["sensing"]["array"] = ARRAY | array
+    return config
+
+
+def test_what_was_the_default_is_the_default():
+    """The array of taxels was off, so its ranges are dropped; nothing is said of fields that changed nothing."""
+    with pytest.warns(OldFileWarning) as caught:
+        config = migrate_config(old_config(), "a file")
+    assert from_dict(GraspConfig, config) == GraspConfig()
+    assert str(caught[0].message).endswith(
+        "objects.mesh_touch is now touch_method, touch_method = 'boxes' is now 'closed_form'"
+    )
+
+
+def test_effects_of_the_taxels_that_were_on_stay_on():
+    with pytest.warns(OldFileWarning, match=r"sensing\.array\.noise = \[0\.005, 0\.02\] dropped"):
+        config = from_dict(GraspConfig, migrate_config(old_config(scale=1.0, rate=[20, 30], bias=None), "a file"))
+    taxel = config.sensing.taxel
+    assert (taxel.gain, taxel.bias, taxel.rate, taxel.noise) == ((0.85, 1.15), None, (20.0, 30.0), 0.02)
+
+
+def test_a_physics_that_is_gone_is_named():
+    old = old_config()
+    old["physics"] |= {"cone": "pyramidal", "tips": "constant"}
+    old["skin"]["total"] = "skin"
+    with pytest.warns(OldFileWarning) as caught:
+        config = from_dict(GraspConfig, migrate_config(old, "a file"))
+    message = str(caught[0].message)
+    for words in (
+        "physics.cone = 'pyramidal' dropped",
+        "physics.tips = 'constant'",
+        "skin.total = 'skin' is now 'press",
+    ):
+        assert words in message
+    assert "condim" not in message and config.skin.total == "pressing"
+
+
+def test_arguments_of_a_run_hold_the_same_fields():
+    with pytest.warns(OldFileWarning, match="env.objects.mesh_touch"):
+        arguments = migrate_arguments({"env": old_config(), "corners": 0.3}, "a file")
+    assert from_dict(GraspConfig, arguments["env"]) == GraspConfig() and arguments["extremes"] == 0.3
+
+
+def test_todays_files_are_left_alone():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert migrate_config(to_dict(GraspConfig()), "a file") == to_dict(GraspConfig())
+
+
+def test_arrays_of_effects_that_are_gone_are_dropped():
+    leaves = {".env_state.array_params.noise": 1, ".env_state.array_params.gain": 2, ".params": 3}
+    assert migrate_leaves(leaves) == {".env_state.array_params.gain": 2, ".params": 3}
