@@ -22,7 +22,7 @@ FLOORS = {
         ("hand",),
         ("objects", "control", "randomization", "touch"),
         ("sensing", "render", "calibration", "identification", "observation"),
-        ("task_spec", "physics.jax_backend"),
+        ("task_spec", "physics.solver"),
         ("physics",),
         ("env",),
         ("tasks",),

@@ -28,7 +28,7 @@ class PhysicsConfig:
     """Time scale on which a contact pushes out what lies in it (at least four time steps)."""
     contacts: str = setting("closed", choices=("closed", "mjx"))
     """JAX backend only. closed: MJX's rigid bodies with our closed-form contacts and solver, where the
-    scene allows (`dexsim.physics.jax_backend.substep`); mjx: `mjx.step` throughout, some six times slower on a CPU."""
+    scene allows (`dexsim.physics.solver.substep`); mjx: `mjx.step` throughout, some six times slower on a CPU."""
     max_contacts: int = setting(20, unit="1", low=4, high=400)
     """Contacts kept per environment (JAX backend: the deepest; Warp: mean over the batch)."""
 

@@ -18,7 +18,7 @@ from dexsim.hand.kinematics import Hand, forward_kinematics
 from dexsim.objects.params import ObjectParams
 from dexsim.physics import contact
 from dexsim.physics.config import PhysicsConfig
-from dexsim.physics.jax_backend.backend import JaxBackend
+from dexsim.physics.jax_backend import JaxBackend
 from dexsim.physics.model import build_scene
 from dexsim.physics.seam import Backend, ContactParams, PhysicsState, TorqueLaw
 from dexsim.physics.warp_backend import WarpBackend

@@ -15,11 +15,11 @@ from scipy.spatial.transform import Rotation
 
 from dexsim.objects.config import SLOTS, ObjectConfig
 from dexsim.physics.config import PhysicsConfig
-from dexsim.physics.jax_backend import collide, newton
-from dexsim.physics.jax_backend.substep import find_stepper
 from dexsim.physics.model import build_model, tip_bodies
 from dexsim.physics.physics import Physics
 from dexsim.physics.seam import PhysicsState
+from dexsim.physics.solver import collide, newton
+from dexsim.physics.solver.substep import find_stepper
 
 SIZES = {"sphere": "0.02", "capsule": "0.012 0.02", "box": "0.02 0.015 0.03", "cylinder": "0.02 0.025"}
 

@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 
 from dexsim.geometry import sdf
-from dexsim.physics.jax_backend.boxes import POINTS, box_box
+from dexsim.physics.solver.boxes import POINTS, box_box
 
 _BOXES = ("box", "box")
 KINDS = {

@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 
 from dexsim.geometry import rotations
-from dexsim.physics.jax_backend import collide, newton
+from dexsim.physics.solver import collide, newton
 
 # Newton steps beyond the configured ones: they are cheap here, and with few of them some grips stay unsettled
 # between sticking and sliding, where rounding decides (docs/decisions.md).

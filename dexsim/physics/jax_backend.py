@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from dexsim.objects.params import ObjectParams
-from dexsim.physics.jax_backend.substep import find_stepper
 from dexsim.physics.mjx_backend import MjxBackend
 from dexsim.physics.seam import ContactParams, PhysicsScene, PhysicsState, TorqueLaw
+from dexsim.physics.solver.substep import find_stepper
 
 
 class JaxBackend(MjxBackend):

@@ -1,1 +1,0 @@
-"""The JAX backend: rigid bodies by MJX, contacts in closed form, our solver."""
