@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dexsim.calibration.fit import JointPress, find_direction
+from dexsim.calibration.joint import JointPress, find_direction
 from dexsim.calibration.maps import Calibration, Side, normalise
 from dexsim.core.errors import CalibrationError
 

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dexsim.calibration.fit import JointPress
+from dexsim.calibration.joint import JointPress
 from dexsim.core.errors import CalibrationError
 from dexsim.hand.kinematics import Hand, forward_kinematics, taxel_normals, taxel_positions
 

@@ -4,7 +4,7 @@ import jax
 import numpy as np
 
 from dexsim.actuator.current import Motor, motor_current, read_current
-from dexsim.calibration.fit import JointPress
+from dexsim.calibration.joint import JointPress
 
 
 def press(

@@ -1,8 +1,7 @@
 """The search of an identification: one log's least squares, inner and outer loops.
 
-Inner loop: `scipy.optimize.least_squares` with the gradient through the jitted simulation. Outer
-loops without gradient: a scan over latencies, a scan and Brent's method over the dead-band, and a
-cross-entropy search about the result, because a dead-band makes the sum of squares rugged.
+Inner loop: `scipy.optimize.least_squares` with the gradient through the jitted simulation. Outer loops without
+gradient: scans over latency and dead-band, and a cross-entropy search, as a dead-band makes the cost rugged.
 """
 
 import functools

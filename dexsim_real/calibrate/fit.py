@@ -19,7 +19,8 @@ import numpy as np
 from scipy.ndimage import binary_dilation
 
 from dexsim.calibration import sensor
-from dexsim.calibration.fit import MIN_SAMPLES, JointPress, calibrate
+from dexsim.calibration.fit import calibrate
+from dexsim.calibration.joint import MIN_SAMPLES, JointPress
 from dexsim.calibration.maps import Calibration
 from dexsim.calibration.press import MIN_LEVER
 from dexsim.calibration.sensor import FingerFit, fit_finger

@@ -11,7 +11,8 @@ import pytest
 import scipy.stats
 
 from dexsim.actuator.current import Motor
-from dexsim.calibration.fit import MIN_FORCE_RANGE, MIN_SAMPLES, JointPress, calibrate, find_direction, fit_joint
+from dexsim.calibration.fit import calibrate
+from dexsim.calibration.joint import MIN_FORCE_RANGE, MIN_SAMPLES, JointPress, find_direction, fit_joint
 from dexsim.calibration.maps import (
     alignment,
     current_from_counts,

@@ -1,0 +1,232 @@
+"""Lines of one joint from the recording of its pressed fingertip, while loading and while unloading.
+
+The two directions are fitted apart, because friction in the gear obeys two lines: the motor holds more than the force
+asks for on the way up, less on the way down.
+"""
+
+import dataclasses
+
+import numpy as np
+
+from dexsim.core.errors import CalibrationError
+from dexsim.core.robust_line import Line, fit_line
+
+MIN_SAMPLES = 20
+"""Samples that each direction needs."""
+MIN_FORCE_RANGE = 0.5
+"""N between the 5th and the 95th percentile of the force."""
+_LARGEST = {"A": 20.0, "Nm": 50.0, "N": 500.0}  # beyond these the unit must be another
+
+
+@dataclasses.dataclass(frozen=True)
+class JointPress:
+    """One joint's recording while its fingertip was pressed, in the order of time."""
+
+    force: np.ndarray  # [T] N
+    value: np.ndarray  # [T] A (hand) or Nm (simulation), with its own sign
+    direction: np.ndarray | None = None  # [T] 1 loading, -1 unloading, 0 leave out; None: found
+
+
+@dataclasses.dataclass(frozen=True)
+class JointLines:
+    """Both lines of one joint on one side."""
+
+    loading: Line | None
+    unloading: Line | None
+    friction: float  # value, half the gap at the middle of the forces; NaN with one line
+    value_max: float
+    force_max: float
+    notes: tuple[str, ...]
+
+
+def fit_joint(press: JointPress, unit: str, where: str = "recording") -> JointLines:
+    """Fit loading and unloading of one joint.
+
+    Args:
+      press: the recording.
+      unit: "A" or "Nm", of `press.value`.
+      where: named in errors.
+
+    Raises:
+      CalibrationError: too few samples, not a number, no excitation, saturated, mixed units, or
+        the value does not follow the force.
+    """
+    force, value = _checked(press, unit, where)
+    direction = find_direction(force) if press.direction is None else np.sign(np.asarray(press.direction)).astype(int)
+    free, clipped = _not_saturated(force, value, where)
+    notes = [f"{clipped} saturated samples left out ({unit})"] if clipped else []
+    lines = []
+    for sign, name in ((1, "loading"), (-1, "unloading")):
+        keep = free & (direction == sign)
+        lines.append(
+            _fit_direction(force[keep], value[keep], f"{where}, {name}") if np.sum(keep) >= MIN_SAMPLES else None
+        )
+    if lines == [None, None]:
+        counts = [int(np.sum(free & (direction == sign))) for sign in (1, -1)]
+        raise CalibrationError(
+            f"{where}: {counts[0]} samples loading and {counts[1]} unloading: "
+            f"at least {MIN_SAMPLES} in a direction are needed"
+        )
+    if lines[0] is not None and lines[1] is not None and lines[0].gain * lines[1].gain < 0:
+        raise CalibrationError(
+            f"{where}: rises with force while loading and falls while unloading: are two joints or fingers mixed up?"
+        )
+    notes += _line_notes(lines, unit)
+    sound = free & np.any([np.abs(value - line(force)) <= 4.685 * line.noise for line in lines if line is not None], 0)
+    return JointLines(
+        *lines,
+        _friction(lines, force[sound]),
+        float(np.max(np.abs(value[sound]))),
+        float(np.max(force[sound])),
+        tuple(notes),
+    )
+
+
+def find_direction(force: np.ndarray, trim: float = 0.1) -> np.ndarray:
+    """1 while the force [T] rises, -1 while it falls, 0 just after a turn; in the order of time.
+
+    Turns are the extremes that stand out of the noise. The first `trim` of each swing is marked 0:
+    there the gear's friction is on its way from one side to the other.
+    """
+    from scipy.ndimage import median_filter
+
+    smooth = median_filter(np.asarray(force, float), 9 if len(force) >= 90 else 3, mode="nearest")
+    noise = 1.4826 * np.median(np.abs(np.diff(force) - np.median(np.diff(force)))) / np.sqrt(2)
+    step = max(0.05 * np.ptp(smooth), 4.0 * noise)
+    turns, sign = _turns(smooth, step)
+    direction = np.zeros(len(smooth), int)
+    for first, last in zip(turns[:-1], turns[1:], strict=True):
+        swing = np.abs(smooth[first:last] - smooth[first])
+        reach = np.abs(smooth[last] - smooth[first])
+        direction[first:last] = np.where(swing >= trim * reach, sign, 0)
+        sign = -sign
+    return direction
+
+
+def _turns(smooth: np.ndarray, step: float) -> tuple[list[int], int]:
+    """Indices of the extremes that are at least `step` apart, ends included, and the first way."""
+    turns, best, way, first_way = [0], 0, 0, 0
+    for index, value in enumerate(smooth):
+        if way == 0:
+            if abs(value - smooth[0]) >= step:
+                way = first_way = 1 if value > smooth[0] else -1
+                best = index
+        elif way * (value - smooth[best]) > 0:
+            best = index
+        elif way * (smooth[best] - value) >= step:
+            turns.append(best)
+            way, best = -way, index
+    return [*turns, len(smooth) - 1], first_way
+
+
+def _checked(press: JointPress, unit: str, where: str) -> tuple[np.ndarray, np.ndarray]:
+    force, value = np.asarray(press.force, float), np.asarray(press.value, float)
+    if (
+        force.ndim != 1
+        or force.shape != value.shape
+        or (press.direction is not None and np.shape(press.direction) != force.shape)
+    ):
+        raise CalibrationError(f"{where}: force {force.shape}, value {value.shape}: give arrays of one length")
+    if len(force) < MIN_SAMPLES:
+        raise CalibrationError(f"{where}: {len(force)} samples: at least {MIN_SAMPLES} in a direction are needed")
+    bad = np.flatnonzero(~(np.isfinite(force) & np.isfinite(value)))
+    if len(bad):
+        raise CalibrationError(
+            f"{where}: sample {bad[0]} is not a number ({len(bad)} of {len(force)}): leave out the reads that failed"
+        )
+    for name, array, limit in (("force", force, "N"), ("value", value, unit)):
+        typical = float(np.quantile(np.abs(array), 0.75))
+        if typical > _LARGEST[limit]:
+            raise CalibrationError(
+                f"{where}: {name} of {typical:g} {limit}: give it in {limit}, not in counts or thousandths"
+            )
+    _refuse_mixed_units(force, value, where)
+    low, high = np.quantile(force, [0.05, 0.95])
+    if high - low < MIN_FORCE_RANGE:
+        raise CalibrationError(
+            f"{where}: force stays between {low:.3g} and {high:.3g} N: press "
+            f"from contact up over at least {MIN_FORCE_RANGE} N"
+        )
+    if low < -MIN_FORCE_RANGE:
+        raise CalibrationError(f"{where}: force of {low:.3g} N: forces are magnitudes, tare the taxels first")
+    return force, value
+
+
+def _refuse_mixed_units(force: np.ndarray, value: np.ndarray, where: str) -> None:
+    """Two crowds of value / force, well over a decade apart, are two units and not outliers."""
+    use = (force > 0) & (value != 0)
+    ratio = np.sort(np.log10(np.abs(value[use]) / force[use]))
+    margin = len(ratio) // 10
+    if margin < 2:
+        return
+    inner = np.diff(ratio)[margin:-margin]
+    if np.max(inner, initial=0.0) > 1.5:
+        raise CalibrationError(
+            f"{where}: two groups of samples {10 ** np.max(inner):.0f} times "
+            "apart: units are mixed, give all in A, Nm and N"
+        )
+
+
+def _not_saturated(force: np.ndarray, value: np.ndarray, where: str) -> tuple[np.ndarray, int]:
+    """Which samples are off both ends of their ranges, and how many are not."""
+    free = np.ones(len(force), bool)
+    for name, array in (("force", force), ("value", np.abs(value))):
+        top = array >= np.max(array) * (1 - 1e-9)
+        # A count or two at the maximum is its resolution; a crowd there is a stop.
+        crowd = np.sum(top) > max(0.02 * len(array), 3)
+        neighbours = np.sum(array >= np.max(array) - 0.02 * np.ptp(array)) - np.sum(top)
+        if crowd and np.sum(top) > 3 * neighbours:
+            free &= ~top
+            if np.sum(top) > 0.5 * len(array):
+                raise CalibrationError(
+                    f"{where}: {name} sits at its maximum {np.max(array):.3g} in "
+                    f"{np.sum(top)} of {len(array)} samples: saturated, press "
+                    "more gently or raise the limit"
+                )
+    return free, int(np.sum(~free))
+
+
+def _fit_direction(force: np.ndarray, value: np.ndarray, where: str) -> Line:
+    low, high = np.quantile(force, [0.05, 0.95])
+    if high - low < MIN_FORCE_RANGE:
+        raise CalibrationError(
+            f"{where}: force only between {low:.3g} and {high:.3g} N: press over at least {MIN_FORCE_RANGE} N"
+        )
+    line = fit_line(force, value)
+    if line.gain_interval[0] <= 0.0 <= line.gain_interval[1]:
+        raise CalibrationError(
+            f"{where}: does not follow the force (gain {line.gain:.3g}, 95 % "
+            f"{line.gain_interval[0]:.3g} to {line.gain_interval[1]:.3g}): "
+            "check joint and finger, press harder or longer"
+        )
+    return line
+
+
+def _friction(lines: list[Line | None], force: np.ndarray) -> float:
+    if lines[0] is None or lines[1] is None:
+        return float("nan")
+    middle = (np.min(force) + np.max(force)) / 2
+    return float(abs(lines[0](middle) - lines[1](middle)) / 2)
+
+
+def _line_notes(lines: list[Line | None], unit: str) -> list[str]:
+    notes = []
+    for line, name, other in zip(lines, ("loading", "unloading"), ("unloading", "loading"), strict=True):
+        if line is None:
+            notes.append(
+                f"no {name} recorded ({unit}): friction and offset are not apart, the {other} line stands for both"
+            )
+            continue
+        width = (line.gain_interval[1] - line.gain_interval[0]) / 2
+        if width > 0.1 * abs(line.gain):
+            notes.append(f"{name} gain known to {100 * width / abs(line.gain):.0f} % only ({unit})")
+        if line.condition > 20:
+            notes.append(
+                f"{name}: forces lie close together (condition {line.condition:.0f}): "
+                f"gain and offset trade off ({unit})"
+            )
+        if line.outliers > 0.1 * line.samples:
+            notes.append(f"{name}: {line.outliers} of {line.samples} samples are outliers ({unit})")
+        if line.r_squared < 0.9:
+            notes.append(f"{name}: R2 {line.r_squared:.2f}: hardly a line ({unit})")
+    return notes
