@@ -57,7 +57,7 @@ def joint_torque(
     """Torque of one joint's motor, Nm: eta clip(tau_b, -tau_sat, tau_sat) (1 + r sin(n q + phase)).
 
     The PD law and the dead-band see the measured angle, position + encoder bias. This is the
-    torque that the motor's current tells of; `apply_friction` takes off what the gear keeps.
+    torque that corresponds to the motor's current; `apply_friction` subtracts the gear's friction.
 
     Args: scalars, or arrays that broadcast; `drive` is this, vmapped over the joints.
     """

@@ -40,7 +40,7 @@ class Rotor:
 
 @pytree_dataclass
 class GearState:
-    """A gear beside a physics engine: the rotor, and what the engine was given last."""
+    """State of a gear that is simulated outside of the physics engine: the rotor, and the last torque on the joint."""
 
     rotor: Rotor
     velocity: jax.Array  # rad/s, of the link before the last sub-step

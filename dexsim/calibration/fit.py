@@ -95,7 +95,7 @@ _GENERAL = (
 
 
 def _gather(hand: Hand, fits: list, side: int) -> tuple[Side, list[str]]:
-    """Arrays of one side, and the joints that were taken over from their class."""
+    """Arrays of one side, and the joints that got the mean of their class."""
     rows = [_row(fit[side]) if fit else None for fit in fits]
     taken = []
     for joint, row in enumerate(rows):

@@ -44,7 +44,7 @@ class Side:
     noise: jax.Array  # [2, J] value, robust standard deviation about the line
     r_squared: jax.Array  # [2, J]
     condition: jax.Array  # [2, J]
-    samples: jax.Array  # [2, J]; 0 where the line was not measured but taken over
+    samples: jax.Array  # [2, J]; 0 for a line taken from the joint's class
     outliers: jax.Array  # [2, J]
     friction: jax.Array  # [J] value, half the gap between the two lines; NaN where one is missing
     value_max: jax.Array  # [J] largest |value| recorded

@@ -63,7 +63,7 @@ class FingerFit:
     c01: Estimate | None  # Pa
     residual: float  # reading, rms about the line
     samples: int  # that the line was fitted to
-    notes: tuple[str, ...]  # what could not be told apart, what was left out
+    notes: tuple[str, ...]  # parameters that the data cannot separate, samples left out
 
     def correct(self, reading: np.ndarray) -> np.ndarray:
         """Force [...] N from the sum of a finger's readings [...]; zero where nothing reads."""

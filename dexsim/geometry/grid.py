@@ -268,7 +268,7 @@ def _overshoot(distance: np.ndarray, axes: list[np.ndarray]) -> np.ndarray:
 
 
 def _measured(mesh: meshes.Mesh, points: np.ndarray, config: GridConfig, cache: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Exact distance and gradient at the nodes, from the cache where it is there."""
+    """Exact distance and gradient at the nodes, from the cache if possible."""
     key = hashlib.sha256(f"{mesh.fingerprint} {config.nodes} {config.pad!r} {_VERSION}".encode()).hexdigest()[:32]
     path = cache_folder() / f"{key}.npz"
     if cache and (found := _load(path, len(points))) is not None:

@@ -54,7 +54,7 @@ class Hand:
     finger_names: tuple[str, ...]
     tip_body: np.ndarray  # [F]
     tip_offset: np.ndarray  # [F, 3] m, in the tip body's frame
-    root_joint: np.ndarray  # [F] the joint whose torque stands for the finger's
+    root_joint: np.ndarray  # [F] the joint whose torque represents the finger
     taxel_grid: tuple[int, int]  # columns, rows; index = column * rows + row
     taxel_position: np.ndarray  # [F, N, 3] m, in the tip body's frame
     taxel_normal: np.ndarray  # [F, N, 3] outward
@@ -129,7 +129,7 @@ def taxel_normals(hand: Hand, pose: HandPose) -> jax.Array:
 
 
 def _levels(parent: np.ndarray) -> list[np.ndarray]:
-    """Body indices grouped by depth; every body comes after its parent."""
+    """Body indices grouped by depth; every body follows its parent."""
     depth = np.zeros(len(parent), int)
     for body, above in enumerate(parent):
         depth[body] = 0 if above < 0 else depth[above] + 1

@@ -111,7 +111,7 @@ def on_surface(kind: str, points: Lattice, *, radius: float = 0.0, half_length: 
 def on_mesh(mesh: Any, points: Lattice, *, origin: Any, facing: Any, along: Any) -> Patch:
     """Drop a lattice onto a mesh: from a plane at `origin`, against the direction `facing`, rows running `along`.
 
-    Each taxel is where its ray first meets the mesh, with that triangle's normal, and stands for the surface that lies
+    Each taxel is where its ray first meets the mesh, with that triangle's normal, and represents the surface that is
     under its cell.
 
     Raises:
@@ -148,7 +148,7 @@ def placed(patch: Patch, *, position: Any = (0, 0, 0), rotation: Any = None) -> 
 
 
 def check_outside(patch: Patch, geometry: Any, *, tolerance: float = 1e-4, name: str = "patch") -> None:
-    """Require that no taxel lies deeper than `tolerance` inside the link it sits on.
+    """Require that no taxel is deeper than `tolerance` inside the link it sits on.
 
     Args:
       geometry: the link's surface in its frame, as `distance.prepare` gives it.
@@ -174,7 +174,7 @@ def check_hand(hand: Any, *, tolerance: float = 1.5e-3) -> None:
     The default tolerance allows for pads that are capsules fitted to the real skin.
 
     Raises:
-      AssetError: a taxel lies inside its link.
+      AssetError: a taxel is inside its link.
     """
     from dexsim.geometry import sdf
 

@@ -16,7 +16,7 @@ from dexsim.hand.kinematics import Hand
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Excitation:
-    """A recording's signals, in the order in which they come."""
+    """A recording's signals, in order."""
 
     period: float = setting(0.015, unit="s", low=0.001, high=0.1)
     """From one command to the next."""

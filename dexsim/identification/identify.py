@@ -42,7 +42,7 @@ def identify(
     Args:
       log: the recording; the joint rests at its beginning.
       start: first guesses and fixed values, by name in `joint_model.PARAMETERS`.
-      fit: smooth parameters to fit; the angles from which each segment sets off come on top.
+      fit: smooth parameters to fit; the start angles of the segments are always fitted.
       substeps: sub-steps of the simulation in a sample; period / substeps should be the time
         step that the parameters will be used with.
       latencies: candidates, sub-steps; one of them alone fixes it.

@@ -33,7 +33,7 @@ PARAMETERS = {
     "gravity_sin": "Nm",
     "start": "rad",
 }
-"""What the model knows, and the units; `start` is the true angle at the first sample."""
+"""Parameters of the model with their units; `start` is the true angle at the first sample."""
 
 NOMINAL = {
     "dead_band": 0.0,
@@ -176,7 +176,7 @@ def with_defaults(values: dict[str, float], log: JointLog) -> dict[str, jax.Arra
     """All parameters, with nominal values for those left out.
 
     Raises:
-      CalibrationError: a name that the model does not know, or one that has no nominal value.
+      CalibrationError: a name that is no parameter, or a missing parameter without a nominal value.
     """
     unknown = sorted(set(values) - set(PARAMETERS))
     if unknown:

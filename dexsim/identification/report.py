@@ -1,4 +1,4 @@
-"""What an identification knows and what it does not: intervals, correlations, bounds, advice."""
+"""Quality of an identification: intervals, correlations, parameters at their bounds, advice."""
 
 import dataclasses
 

@@ -60,11 +60,12 @@ def fit_boxes(mesh: meshes.Mesh, parts: int, *, frames: Sequence[np.ndarray] = (
     """At most `parts` boxes for a mesh; what was fitted once is kept on disk.
 
     Args:
-      frames: rotations [3, 3] whose columns boxes may start along, beside the mesh's own axes. The best start wins.
+      frames: rotations [3, 3] whose columns boxes may start along, in addition to the mesh's own axes;
+        the best start is used.
 
     Raises:
       AssetError: so many boxes do not follow it (2.5 % of its size off on average, or 10 % at the 99th
-        percentile), or it cannot be told where its inside is.
+        percentile), or its inside cannot be determined.
     """
     frames = (np.eye(3), *frames)
     named = f"{mesh.fingerprint} {parts} {np.round(frames, 5).tolist()} {_VERSION}"

@@ -12,7 +12,7 @@ SLOTS = ("box", "capsule", "cylinder")
 SHAPES = ("sphere", "box", "cylinder", "capsule", "composition")
 KINDS = (*SHAPES, "mesh")
 """What `ObjectParams.shape_index` counts."""
-INACTIVE_SIZE = 1e-4  # m, size of a slot that is switched off: a speck at the object's centre
+INACTIVE_SIZE = 1e-4  # m, size of a slot that is switched off: at the object's centre
 SIZE_RANGES = ("sphere_radius", "box_half", "cylinder_radius", "cylinder_half", "neck_radius", "neck_half")
 BULK_RANGES = ("mass", "inertia_scale", "com_offset", "friction", "link_friction", "stiffness", "restitution")
 RANGES = (*SIZE_RANGES, *BULK_RANGES)
@@ -32,14 +32,14 @@ class ObjectConfig:
     scale: float = setting(1.0, unit="1", low=0.0, high=1.0)
     """Width of all ranges about their middles; 0 leaves one object of each kind."""
     mesh: str = setting("")
-    """File of a closed mesh (STL, OBJ, PLY, ...) that takes the place of `shapes`. Its z axis lies across
-    the fingers for a grasp, its x axis stands on the palm for a rotation."""
+    """File of a closed mesh (STL, OBJ, PLY, ...) that replaces `shapes`. Its z axis is across the
+    fingers in a grasp, its x axis is normal to the palm in a rotation."""
     mesh_unit: float = setting(1.0, unit="m", low=1e-6, high=100.0)
     """Length of that file's unit: 0.001 for millimetres."""
     mesh_size: tuple[float, float] = setting((1.0, 1.0), unit="1", low=0.1, high=10.0)
     """Factor on the mesh's size."""
     mesh_parts: int = setting(6, unit="1", low=1, high=24)
-    """Boxes at most that follow the mesh in the solver, whose cost grows with them."""
+    """Largest number of boxes that approximate the mesh in the solver; its cost grows with them."""
     sphere_radius: tuple[float, float] = setting((0.022, 0.035), unit="m", low=0.005, high=0.08)
     """Radius of a sphere."""
     box_half: tuple[float, float] = setting((0.020, 0.030), unit="m", low=0.005, high=0.08)
@@ -53,7 +53,7 @@ class ObjectConfig:
     neck_half: tuple[float, float] = setting((0.008, 0.018), unit="m", low=0.002, high=0.10)
     """Half-length of that capsule's straight part."""
     composition_scale: float = setting(0.8, unit="1", low=0.1, high=2.0)
-    """Size of a composition's box or cylinder, relative to one that stands alone."""
+    """Size of a composition's box or cylinder, relative to a single one."""
     mass: tuple[float, float] = setting((0.05, 0.20), unit="kg", low=0.001, high=5.0)
     """Mass of the object."""
     inertia_scale: tuple[float, float] = setting((0.8, 1.25), unit="1", low=0.05, high=20.0)
@@ -69,8 +69,8 @@ class ObjectConfig:
     fingertips follow their skin (`PhysicsConfig.tips`), the middle of the default is the skin as it is, and other
     values make it that much stiffer: wide ranges part the solver's forces from what the taxels feel."""
     restitution: tuple[float, float] = setting((0.03, 0.08), unit="1", low=0.0, high=0.9)
-    """Coefficient of restitution: the damping of the contact, which also slows creep. What lies
-    below 0.024 bounces as 0.024."""
+    """Coefficient of restitution: the damping of the contact, which also slows creep. Values
+    below 0.024 act as 0.024."""
     extremes: float = setting(0.0, unit="1", low=0.0, high=1.0)
     """Share of objects with every value at an end of its range; see `dexsim.core.ranges`."""
 

@@ -1,7 +1,7 @@
 """A mesh as the object of a task: boxes for the solver and mass properties.
 
-The object's frame lies in the mesh's centre of mass, along the axes of the file where those are its
-principal axes, else along the principal axes, turned as little as possible.
+The object's frame is at the mesh's centre of mass. Its axes are those of the file where these are principal axes, else
+the principal axes that are nearest to them.
 """
 
 import dataclasses
@@ -54,7 +54,7 @@ def load(path: str, *, unit: float, parts: int) -> MeshObject:
 @lru_cache(maxsize=8)
 def _load(path: str, changed: int, unit: float, parts: int) -> MeshObject:
     del changed
-    with jax.ensure_compile_time_eval():  # whoever asks first may be compiling
+    with jax.ensure_compile_time_eval():  # the first call may be inside of a trace
         return from_mesh(meshes.load_mesh(path, scale=unit), parts)
 
 

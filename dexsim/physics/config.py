@@ -20,15 +20,15 @@ class PhysicsConfig:
     friction_ratio: float = setting(20.0, unit="1", low=0.1, high=1000.0)
     """How much harder a contact resists sliding than penetration (MuJoCo's impratio)."""
     cover: float = setting(0.003, unit="m", low=0.0, high=0.01)
-    """Rubber over the fingertips: their geoms, which follow the taxels, touch this far out. Keep it
-    equal to `Skin.margin`, so that solver and taxels begin to feel at the same distance."""
+    """Thickness of the rubber over the fingertips, by which their geoms are enlarged. Keep it equal to `Skin.margin`,
+    so that contact begins at the same distance for solver and taxels."""
     pad_points: int = setting(3, unit="1", low=1, high=8)
-    """Spheres in a row that stand for each capsule of a fingertip against the object."""
+    """Spheres in a row that replace each capsule of a fingertip in contacts with the object."""
     settling: float = setting(0.03, unit="s", low=0.005, high=0.2)
-    """Time scale on which a contact pushes out what lies in it (at least four time steps)."""
+    """Time scale on which a contact resolves penetration (at least four time steps)."""
     contacts: str = setting("closed", choices=("closed", "mjx"))
-    """JAX backend only. closed: MJX's rigid bodies with our closed-form contacts and solver, where the
-    scene allows (`dexsim.physics.solver.substep`); mjx: `mjx.step` throughout, some six times slower on a CPU."""
+    """JAX backend only. closed: MJX's rigid bodies with closed-form contacts and our own solver where the scene allows
+    it (`dexsim.physics.solver.substep`); mjx: `mjx.step`, about six times slower on a CPU."""
     max_contacts: int = setting(20, unit="1", low=4, high=400)
     """Contacts kept per environment (JAX backend: the deepest; Warp: mean over the batch)."""
 

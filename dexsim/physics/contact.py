@@ -1,10 +1,10 @@
 """Contacts of hand and object: their stiffness in MuJoCo's terms, and the rubber on the fingertips.
 
-A spring of constant stiffness presses alike on a face, an edge and a corner; skin does not: at one depth
-an edge presses half of what a face does. So a fingertip's springs take their stiffness, tick by tick, from
-the skin's law over the taxels (`follow_skin`), and the solver's force is the skin's. For this a fingertip is
-a row of spheres (`split_pads`): a sphere meets a primitive in exactly one point, with every engine, at a
-depth that is known in closed form, where capsules have one or two points on a box and other ones by engine.
+A spring of constant stiffness gives the same force on a face, an edge and a corner. Skin does not: at equal depth an
+edge presses half as hard as a face. So the stiffness of a fingertip's springs is computed at every tick from the
+skin's law over the taxels (`follow_skin`), and the solver's force is that of the skin. For this a fingertip is a row of
+spheres (`split_pads`). A sphere has exactly one contact point with a primitive, on every engine, at a depth in closed
+form; a capsule has one or two points on a box, which differ between engines.
 """
 
 import dataclasses
@@ -20,11 +20,11 @@ from dexsim.objects.params import ObjectParams
 from dexsim.touch.feel import feel_links
 from dexsim.touch.skin import Skin
 
-# One sphere's share of a fingertip's stiffness: two of a row lie in a dent, or three.
+# One sphere's share of a fingertip's stiffness: two or three of a row touch at once.
 ROW_SHARE = 0.5
-# What wears no rubber is stiffer: the palm carries the sum of the fingers.
+# Links without rubber are stiffer: the palm bears the sum of the fingers' forces.
 BARE_SHARE = 2.5
-# N/m, the stiffness of a fingertip that `ObjectParams.contact` scales: that of the template, too.
+# N/m, nominal stiffness of a fingertip, which `ObjectParams.contact` scales; also that of the template.
 NOMINAL = 1700.0
 # How far the skin may make a fingertip's springs softer and stiffer than that. The floor keeps corners,
 # which press next to no skin, from sinking in.
@@ -47,7 +47,7 @@ def spring(
       compliance: [P] 1/kg, inverse weights A of the two bodies of each pair.
       stiffness: [P] N/m.
       ratio: [] damping ratio.
-      period: s, time scale on which a contact pushes out what lies in it.
+      period: s, time scale on which a contact resolves penetration.
 
     Returns:
       solref [P, 2] (direct format) and solimp [P, 5].
@@ -82,7 +82,7 @@ def pair_constants(
 
 
 def cover_tips(spec: mujoco.MjSpec, hand: Hand, cover: float) -> None:
-    """Let the geoms of the fingertips that touch stand out by `cover` m."""
+    """Enlarge the geoms of the fingertips that touch by `cover` m."""
     tips = {hand.body_names[b] for b in hand.tip_body}
     for geom in spec.geoms:
         if geom.parent.name in tips and (geom.contype or geom.conaffinity):
@@ -93,9 +93,9 @@ def cover_tips(spec: mujoco.MjSpec, hand: Hand, cover: float) -> None:
 
 
 def split_pads(spec: mujoco.MjSpec, hand: Hand, touching: list[str], points: int) -> list[str]:
-    """Lay a row of `points` spheres into every capsule of a fingertip that touches.
+    """Place a row of `points` spheres in every capsule of a fingertip that touches.
 
-    The capsules stay for what they touch beside the object.
+    The capsules remain for contacts with anything but the object.
 
     Returns:
       The names of what meets the object: `touching` with the spheres in place of their capsules.

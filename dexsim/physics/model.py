@@ -82,7 +82,7 @@ def build_model(
     _set_options(spec, config, gravity, backend)
     for pair in spec.pairs:
         if pair.condim == 1:
-            # MJX-JAX knows no frictionless contacts beside elliptic cones; this one slides as freely.
+            # MJX in JAX has no frictionless contacts with elliptic cones; this friction is negligible.
             pair.condim, pair.friction = 3, [1e-3, 1e-3, 0.005, 1e-4, 1e-4]
     model = spec.compile()
     geoms = np.flatnonzero(model.geom_bodyid == model.body("object").id)
@@ -134,8 +134,8 @@ def _touching_geoms(hand: Hand, slots: tuple[str, ...]) -> list[str]:
     palm = hand.body_names.index(hand.palm)
     kinds = {g.kind for g in geoms if g.body == palm}
     if "plane" in kinds:
-        # The half-space at the palm's face also carries an object beside the palm, but meets every primitive in
-        # closed form; its box does not meet cylinders and ellipsoids.
+        # The half-space at the palm's face collides with every primitive in closed form, but also supports objects
+        # next to the palm. The palm's box is exact, and collides with boxes, capsules and spheres only.
         use_box = "box" in kinds and set(slots) <= _MEETS_BOXES
         geoms = [g for g in geoms if g.body != palm or (g.kind != "plane") == use_box]
     if not geoms or any(not g.name for g in geoms):
@@ -154,8 +154,7 @@ def _set_options(spec: mujoco.MjSpec, config: PhysicsConfig, gravity: tuple[floa
     # A pyramid approximates the cone, and objects creep through the fingers at 12 to 25 mm/s with it.
     option.cone, option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, config.friction_ratio
     if backend == "warp":
-        # Warp builds the Hessian of elliptic cones in one go only where the Jacobian is sparse: a
-        # third faster here, though a dense one would fit as well.
+        # Warp fuses the Hessian of elliptic cones only with a sparse Jacobian: a third faster here.
         option.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
     option.iterations, option.ls_iterations = config.iterations, config.line_search
     # Box-box has its own kernel only with nativeccd off; eulerdamp costs a factorisation more.

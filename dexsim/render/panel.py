@@ -1,4 +1,4 @@
-"""The read-out beside the picture: one unrolled taxel map per finger, forces in newton, command and colour scale.
+"""The read-out next to the picture: one unrolled taxel map per finger, forces in newton, command and colour scale.
 
 Drawn with Pillow and NumPy instead of matplotlib, which would cost more than the rest of a frame.
 
@@ -19,7 +19,7 @@ _GAP = 1  # pixels between two cells
 
 @dataclass(frozen=True)
 class Layout:
-    """Where everything lies in a panel of `width` x `height` pixels."""
+    """Positions in a panel of `width` x `height` pixels."""
 
     width: int
     height: int

@@ -82,7 +82,7 @@ def draw_scene(
     front = cast(held, view)
     front.index[front.depth > surface.depth] = -1
     _paint(color, held, front, view, light, bevel=0.003, opacity=_OBJECT_OPACITY)
-    # The taxels that matter lie between finger and object: let the loaded ones shine through.
+    # The taxels in contact are between finger and object: draw the loaded ones through the object.
     _blend(color, pixel[loaded], rays[loaded], _TAXEL_GLOW)
 
     picture = _developed_backdrop(size).copy()

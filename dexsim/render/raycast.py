@@ -65,7 +65,7 @@ class VisibleSurface(NamedTuple):
 class ShadingSamples(NamedTuple):
     """Surface points to shade, those of one primitive together.
 
-    Components come first: NumPy is several times faster on three long rows than on many short triples.
+    Components are the first axis: NumPy is several times faster on three long rows than on many short triples.
     """
 
     pixel: np.ndarray  # [M] int, flat number in the picture

@@ -7,7 +7,7 @@ from dexsim.core.pytree import pytree_dataclass
 
 @pytree_dataclass
 class Snapshot:
-    """What a picture needs to know. K primitives (object frame), F fingers of N taxels; stack along T for a video."""
+    """What a picture shows. K primitives (object frame), F fingers of N taxels; stack along T for a video."""
 
     joint_position: Any  # [J] rad
     object_position: Any  # [3] m, palm frame

@@ -49,8 +49,8 @@ def feel(
       finger_force: [F] N, resultant fingertip-object force of the physics.
       skin: the skin's law.
 
-    A finger whose taxels all lie clear of the object reads zero, whatever its total: it touches
-    with a part of the link that carries no taxels.
+    A finger with all taxels clear of the object reads zero, whatever its total: it touches with a part of the link
+    that has no taxels.
     """
     return _press(sdf.to_local(taxels, position, rotation), area, geometry, finger_force, skin)
 
@@ -65,10 +65,10 @@ def feel_links(
     skin: Skin,
     surface: Surface | None = None,
 ) -> Touch:
-    """`feel` for all taxels of a posed hand, or other points of its fingertips' skin.
+    """`feel` for all taxels of a posed hand, or for other points of its fingertips' skin.
 
-    Straight from the links' frames to the object's: one transform a finger instead of two a taxel, and no taxel
-    position in memory.
+    It transforms points directly from the links' frames to the object's: one transform a finger instead of two a
+    taxel, and no taxel positions in memory.
     """
     surface = surface or taxels_only(hand)
     turn = rotations.compose(jnp.swapaxes(rotation, -1, -2), pose.tip_rotation)
@@ -94,7 +94,7 @@ def spread(skin_force: jax.Array, finger_force: jax.Array) -> jax.Array:
 
 
 def taxel_share(skin_force: jax.Array, taxels: int) -> jax.Array:
-    """What part [F, 1] of each finger's load rests on the first `taxels` of its points [F, P]; 0 without touch."""
+    """Share [F, 1] of each finger's load on the first `taxels` of its points [F, P]; 0 without touch."""
     borne = jnp.sum(skin_force, -1, keepdims=True)
     return jnp.sum(skin_force[:, :taxels], -1, keepdims=True) / jnp.where(borne > 0, borne, 1.0)
 

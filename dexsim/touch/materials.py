@@ -64,7 +64,7 @@ def stiffness(compression: np.ndarray, c10: float, c01: float) -> np.ndarray:
 def stable_compression(c10: float, c01: float) -> float:
     """The compression up to which the stiffness is positive; 1 where it always is, 0 where it never is.
 
-    Times l^4 / 2 the stiffness is C10 l^4 + 2 C10 l + 3 C01, which rises with l: there is one crossing at most.
+    Times l^4 / 2 the stiffness is C10 l^4 + 2 C10 l + 3 C01, which increases with l: at most one crossing.
     """
     if c10 <= 0 and c01 <= 0 or 3 * (c10 + c01) <= 0:
         return 0.0

@@ -20,16 +20,16 @@ class Skin:
     """The rubber over the taxels (two-term Mooney-Rivlin) and what the taxels notice of it."""
 
     c10: float = setting(0.003e6, unit="Pa", low=0.0, high=1e8)
-    """First Mooney-Rivlin coefficient; the skin's own value is not published. It is the fingertips'
-    stiffness in the physics, too (`contact.follow_skin`): some 2 N/mm on a face, 1 on an edge."""
+    """First Mooney-Rivlin coefficient; that of the XHand's skin is not published. The fingertips' stiffness in the
+    physics follows from it (`contact.follow_skin`): about 2 N/mm on a face, 1 N/mm on an edge."""
     c01: float = setting(0.0, unit="Pa", low=-1e8, high=1e8)
     """Second Mooney-Rivlin coefficient. Negative values (fits to tension alone) are refused where
     they would make the skin soften before `max_compression`."""
     thickness: float = setting(0.003, unit="m", low=1e-4, high=0.02)
     """Thickness of the compressed layer."""
     margin: float = setting(0.003, unit="m", low=0.0, high=0.01)
-    """How far above the object's surface a taxel already feels it: the rubber over the lattice, and
-    what the solver's geoms stand out by (`PhysicsConfig.cover`)."""
+    """Distance above the object's surface at which a taxel begins to feel it: the thickness of the rubber over the
+    lattice. `PhysicsConfig.cover` is the same distance for the solver."""
     max_compression: float = setting(0.7, unit="1", low=0.05, high=0.95)
     """Compression beyond which the stress no longer grows."""
     law: str = setting("mooney_rivlin", choices=LAWS)
@@ -38,8 +38,8 @@ class Skin:
     """Which part of the physics' contact force a finger's taxels share: what presses into the skin, which is all
     that a one-axis taxel feels (pressing), or the magnitude with friction (solver), as in the paper."""
     untaxelled: bool = False
-    """Whether the fingertips' skin beyond the taxels bears its share of a finger's total, which nothing reads
-    (`dexsim.touch.surface`), or all of it lies on taxels that are near, as in the paper."""
+    """True: the fingertips' skin beyond the taxels bears its share of a finger's total, which no taxel reads
+    (`dexsim.touch.surface`). False: the taxels share all of it, as in the paper."""
 
     def __post_init__(self):
         validate(self)

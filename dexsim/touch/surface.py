@@ -1,8 +1,8 @@
-"""A fingertip's skin beyond its taxels: it bears load that no taxel reads.
+"""A fingertip's skin beyond its taxels, which bears load that no taxel reads.
 
-A fingertip that presses with its edge, its side or the end next to the joint rests partly on rubber under which there
-are no taxels. Sharing the whole force among the taxels that are near, as the paper does, reads too much there. So the
-rest of the fingertip's surface gets points, too, which take their share by the same law.
+A fingertip that presses with its edge, its side or its end next to the joint is partly supported by rubber without
+taxels. If the taxels nearby share the whole force, as in the paper, they read too much. Here the rest of the
+fingertip's surface has points that bear their share by the same law.
 """
 
 import dataclasses

@@ -102,7 +102,7 @@ def _clip(
     local = jnp.sum(along * (centre - position), 1) - half * jnp.array([0.0, 0.0, 1.0])
     axes = jnp.sum(along[:, :, None] * turn[None], 1)  # columns: the other box's axes there
 
-    # The face of the other box that looks most against the normal, as a ring of corners.
+    # The face of the other box that is most opposed to the normal, as a ring of corners.
     down = jnp.argmax(jnp.abs(axes[2]))
     against = jnp.where(axes[2, down] > 0, -1.0, 1.0)
     pick = (down + jnp.array([1, 2, 0])) % 3  # two edges' directions, then the normal's

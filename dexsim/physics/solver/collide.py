@@ -203,7 +203,7 @@ def _plane_ellipsoid(position, rotation, _, centre, turn, size):
 
 
 def _plane_cylinder(position, rotation, _, centre, turn, size):
-    """The lowest point of each disk, and two beside that of the lower one, 120 degrees on."""
+    """The lowest point of each disk, and two more of the lower disk, 120 degrees apart."""
     normal, axis = rotation[:, 2], turn[:, 2]
     share = jnp.sum(normal * axis)
     axis = jnp.where(share > 0, -axis, axis)  # downwards

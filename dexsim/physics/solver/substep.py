@@ -1,8 +1,7 @@
 """One physics sub-step on the JAX backend: MJX's rigid bodies, our contacts and solver.
 
 The same equations as `mjx.step` in this library's scenes, several times faster on a CPU and quicker to
-compile (`collide`, `newton`). Scenes with more than spheres, capsules and planes on primitives, or with other
-cones, are `mjx.step`'s; see `find_stepper`.
+compile (`collide`, `newton`). Other scenes need `mjx.step`; see `find_stepper`.
 """
 
 import dataclasses
@@ -61,7 +60,7 @@ class Stepper:
     ) -> tuple[tuple[jax.Array, jax.Array, jax.Array], jax.Array]:
         for part in ("kinematics", "com_pos", "crb", "com_vel", "passive", "rne"):
             data = getattr(self.mjx, part)(model, data)
-        # Motion of each degree of freedom at the world's origin; MJX has it at its tree's centre of mass.
+        # Motion of each degree of freedom at the world's origin; MJX gives it at its tree's centre of mass.
         turn = data.cdof[:, :3]
         shift = data.cdof[:, 3:] - jnp.cross(turn, data.subtree_com[self.root])
         arm = data.xipos[self.object_body]
@@ -150,7 +149,7 @@ class Stepper:
 
 
 def find_stepper(mjx: Any, model: mujoco.MjModel, tips: np.ndarray, *, max_contacts: int) -> Stepper | None:
-    """The stepper of a scene, or None where only `mjx.step` knows it.
+    """The stepper of a scene, or None where it needs `mjx.step`.
 
     Args:
       tips: [F] bodies of the fingertips.
