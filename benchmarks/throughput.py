@@ -35,101 +35,130 @@ import dexsim
 from dexsim.core.cli import enable_caches
 from dexsim.core.compilation import collector_paused, jit
 from dexsim.env.env import Env
+from dexsim.env.motors import PhysicsTick, stay_finite
+from dexsim.env.observer import Observer
 from dexsim.registry import TASKS
 from dexsim_ppo.learner.rollout import scan_restarting
 
 
-class WithoutObservation(Env):
-    """`observe` left out: what follows sees zeros."""
+class ZeroObserver:
+    """In place of `Env.observer`: what follows sees zeros."""
 
-    def _observe(self, readings, truth, goal):
-        return {
-            group: jnp.zeros(sum(field.size for field in fields)) for group, fields in self.observation_layout.items()
-        }
+    def __init__(self, observer: Observer):
+        self.layout = observer.layout
+
+    def observe(self, *_):
+        return {group: jnp.zeros(sum(field.size for field in fields)) for group, fields in self.layout.items()}
 
 
-class WithoutRedrawing(Env):
-    """A restarted episode goes on with the hand of the one before."""
+class Around:
+    """Stands in for another object, and passes on all that it does not do itself."""
 
-    _kept = None
+    def __init__(self, inner: Any):
+        self.inner = inner
 
-    def _draw(self, *arguments):
-        return self._kept or super()._draw(*arguments)
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.inner, name)
+
+
+class KeptHands(Around):
+    """An environment in which a restarted episode keeps the hand and the IMU of the one before."""
+
+    def __init__(self, env: Env):
+        super().__init__(env)
+        env.sampler = self.sampler = KeptSampler(env.sampler)
 
     def restart(self, state, done):
-        self._kept = state.draw, state.orientation_sensor
+        self.sampler.kept = state.episode
         try:
-            return super().restart(state, done)
+            return self.inner.restart(state, done)
         finally:
-            self._kept = None
+            self.sampler.kept = None
 
 
-class Recorder(Env):
-    """Keeps what a tick of physics was given, for the caller who is tracing `step` at the moment."""
+class KeptSampler(Around):
+    """In place of `Env.sampler`."""
 
-    tick = None  # object, physics state, push, joint torques [S + 1, J] Nm (the last: as read)
+    kept = None  # the episode before, while a restart is traced
 
-    def _drive(self, state, joint_target, push):
-        motors, last = self.drive.motors(state.draw, state.joint_target, joint_target), self.config.physics.substeps
+    def sample(self, *arguments):
+        drawn, kept = self.inner.sample(*arguments), self.kept
+        return drawn if kept is None else dataclasses.replace(drawn, hand=kept.hand, imu=kept.imu)
 
-        def taped(substep, position, velocity, memory):
-            tape, gear = memory
-            torque, gear = motors(substep, position, velocity, gear)
-            return torque, (tape.at[substep].set(torque), gear)
 
-        memory = jnp.zeros((last + 1, self.hand.num_joints)), state.gear
-        after, force, (tape, gear) = self.physics.advance_motors(state.target, state.physics, taped, memory, push)
-        self.tick = state.target, state.physics, push, tape
-        return after, force, gear
+class Recorder(Around):
+    """An environment that also tells what a tick of physics was given."""
 
-    def _torque(self, *arguments):
-        torque, (*given, tape) = super()._torque(*arguments), self.tick
-        self.tick = *given, tape.at[-1].set(torque)
-        return torque
+    def __init__(self, env: Env):
+        super().__init__(env)
+        env.motors.physics = self.tape = RecordingPhysics(env.physics)
 
     def recorded_step(self, state, action) -> tuple[Any, Any]:
-        """`step`, and the tick that went into physics."""
-        after = self.step(state, action)
-        tick, self.tick = self.tick, None
-        return after, tick
+        """`step`, and its tick: object, physics state, push, joint torques [S + 1, J] Nm (the last: as read)."""
+        after = self.inner.step(state, action)
+        *given, tape = self.tape.given
+        torque, self.tape.given = after.sensor_input.joint_torque * self.hand.torque_limit, None
+        return after, (*given, tape.at[-1].set(torque))
 
 
-class Replay(Env):
-    """The actuator left out: joint torques from a tape."""
+class RecordingPhysics(Around):
+    """In place of `Motors.physics`; keeps the last tick for the caller who is tracing `step`."""
 
-    tape = None  # [S + 1, J] Nm, of the tick that is being traced
+    given = None
 
-    def _drive(self, state, joint_target, push):
-        tape = self.tape
-        after, force = self.physics.advance(
-            state.target, state.physics, lambda substep, position, velocity: tape[substep], push
-        )
-        return after, force, state.gear
+    def advance_motors(self, object, state, motors, memory, push):
+        def taped(substep, position, velocity, carried):
+            tape, memory = carried
+            torque, memory = motors(substep, position, velocity, memory)
+            return torque, (tape.at[substep].set(torque), memory)
 
-    def _torque(self, *arguments):
-        return self.tape[-1]
+        tape = jnp.zeros((self.config.substeps + 1, len(self.joint_qpos)))
+        after, force, (tape, memory) = self.inner.advance_motors(object, state, taped, (tape, memory), push)
+        self.given = object, state, push, tape
+        return after, force, memory
+
+
+class Replay(Around):
+    """An environment without an actuator: joint torques from a tape."""
+
+    def __init__(self, env: Env):
+        super().__init__(env)
+        env.motors = self.motors = TapedMotors(env.motors)
 
     def replayed_step(self, state, action, tape):
-        self.tape = tape
-        after, self.tape = self.step(state, action), None
+        self.motors.tape = tape
+        after, self.motors.tape = self.inner.step(state, action), None
         return after
 
 
-CLASSES = {"observation": WithoutObservation, "actuator": Replay, "redrawing": WithoutRedrawing}
+class TapedMotors(Around):
+    """In place of `Env.motors`."""
+
+    tape = None  # [S + 1, J] Nm, of the tick that is being traced
+
+    def tick(self, episode, command, physics, gear, push):
+        tape = self.tape
+        after, force = self.physics.advance(
+            episode.object, physics, lambda substep, position, velocity: tape[substep], push
+        )
+        after, gear, force, finite = stay_finite(command.valid, (physics, gear), (after, gear), force)
+        return PhysicsTick(physics=after, finger_force=force, joint_torque=tape[-1], gear=gear, finite=finite)
+
+
 PARTS = ("touch", "observation", "actuator", "redrawing", "randomization")
 
 
-def make(task: str, left_out: str, backend: str, num_envs: int, kind: type[Env] | None = None) -> Env:
+def make(task: str, left_out: str, backend: str, num_envs: int) -> Any:
     """The environment, whole ("full") or with one part left out."""
-    entry = TASKS[task]
-    config = entry.config()
+    config = TASKS[task].config()
     if left_out == "touch":
         config = dataclasses.replace(config, touch=False)
     if left_out == "randomization":
         config = dataclasses.replace(config, randomization=dataclasses.replace(config.randomization, scale=0.0))
-    hand = dexsim.load_hand()
-    kind = kind or CLASSES.get(left_out, Env)
-    return kind(entry.task(config, hand), hand, backend=backend, num_envs=num_envs)
+    env = dexsim.make(task, config, backend=backend, num_envs=num_envs)
+    if left_out == "observation":
+        env.observer = ZeroObserver(env.observer)
+    return {"actuator": Replay, "redrawing": KeptHands}.get(left_out, lambda env: env)(env)
 
 
 def runner(env: Env, num_envs: int, steps: int, step: Callable | None = None) -> Callable:
@@ -172,7 +201,7 @@ def compare(task: str, backend: str, num_envs: int, parts: tuple[str, ...], step
     for part in parts:
         env, tape, step = make(task, part, backend, num_envs), None, None
         if part == "actuator":
-            recorder = make(task, "full", backend, num_envs, Recorder)
+            recorder = Recorder(make(task, "full", backend, num_envs))
             record = runner(
                 recorder,
                 num_envs,

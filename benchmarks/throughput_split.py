@@ -34,7 +34,7 @@ from dexsim_ppo.training.presets import find_preset
 
 def split(task: str, backend: str, num_envs: int, repeats: int) -> list[dict]:
     """A row for a whole training iteration and one for each part."""
-    env, recorder = make(task, "full", backend, num_envs), make(task, "full", backend, num_envs, Recorder)
+    env, recorder = make(task, "full", backend, num_envs), Recorder(make(task, "full", backend, num_envs))
     preset = find_preset("gpu" if jax.default_backend() == "gpu" else "cpu", task)
     config = dataclasses.replace(preset.ppo, num_envs=num_envs, iterations_per_call=1)
     training = make_train(env, config)
@@ -123,12 +123,12 @@ def physics(env: Env, ticks: Any) -> jax.Array:
     """The recorded ticks, each from its own start."""
 
     def tick(_, given):
-        target, state, push, tape, *_ = given
+        object, state, push, tape, *_ = given
         after, force = jax.vmap(
-            lambda target, state, push, tape: env.physics.advance(
-                target, state, lambda substep, position, velocity: tape[substep], push
+            lambda object, state, push, tape: env.physics.advance(
+                object, state, lambda substep, position, velocity: tape[substep], push
             )
-        )(target, state, push, tape)
+        )(object, state, push, tape)
         return None, _used((after, force))
 
     return jax.lax.scan(tick, None, ticks)[1]
@@ -141,13 +141,13 @@ def touch(env: Env, ticks: Any, key: jax.Array) -> jax.Array:
     array = TaxelArray(config.sensing.taxel, hand.taxel_grid, hand.num_fingers, config.physics.control_period)
     params, memory = array.sample(jax.random.key(0)), array.init()
 
-    def feel(target, qpos, strength, key):
+    def feel(object, qpos, strength, key):
         pose = forward_kinematics(hand, qpos[seam.joint_qpos])
         taxels, place = taxel_positions(hand, pose), qpos[seam.object_qpos]
         felt = tactile.feel(
             taxels,
             jnp.asarray(hand.taxel_area),
-            target.shape(),
+            object.shape(),
             place[:3],
             rotations.quat_to_matrix(place[3:]),
             strength,
@@ -158,9 +158,9 @@ def touch(env: Env, ticks: Any, key: jax.Array) -> jax.Array:
         return [reduce_touch(force, taxels, weighting) for force in (felt.force, read)]
 
     def tick(key, given):
-        target, _, _, _, qpos, strength = given
+        object, _, _, _, qpos, strength = given
         key, use = jax.random.split(key)
-        return key, _used(jax.vmap(feel)(target, qpos, strength, jax.random.split(use, len(qpos))))
+        return key, _used(jax.vmap(feel)(object, qpos, strength, jax.random.split(use, len(qpos))))
 
     return jax.lax.scan(tick, key, ticks)[1]
 

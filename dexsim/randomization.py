@@ -1,6 +1,6 @@
 """What is drawn anew at every episode start, apart from the object itself.
 
-One dataclass of ranges and one `sample`. With `scale` 0 it gives the nominal hand exactly. The
+One dataclass of ranges and one `sample_hand`. With `scale` 0 it gives the nominal hand exactly. The
 scale may be traced, so that a curriculum widens the ranges while training (`Curriculum`).
 """
 
@@ -18,27 +18,28 @@ from dexsim.core.pytree import pytree_dataclass
 from dexsim.core.ranges import sample_extreme, uniform
 from dexsim.hand.kinematics import Hand
 
-_FACTORS = (
-    "stiffness_factor",
-    "damping_factor",
-    "torque_factor",
-    "speed_factor",
-    "efficiency",
-    "torque_gain",
-    "taxel_gain",
-)
-_SPANS = (
-    *_FACTORS,
-    "dead_band",
-    "gear_gap",
-    "latency",
-    "latency_spread",
-    "ripple",
-    "ripple_count",
-    "coulomb_friction",
-    "viscous_friction",
-    "sensing_latency",
-)
+NOMINAL = {
+    "stiffness_factor": 1.0,
+    "damping_factor": 1.0,
+    "dead_band": 0.0,
+    "gear_gap": 0.0,
+    "torque_factor": 1.0,
+    "speed_factor": 1.0,
+    "efficiency": 1.0,
+    "latency": 0.0,
+    "latency_spread": 0.0,
+    "ripple": 0.0,
+    "coulomb_friction": 0.0,
+    "viscous_friction": 0.0,
+    "sensing_latency": 0.0,
+    "encoder_bias": 0.0,
+    "torque_gain": 1.0,
+    "taxel_gain": 1.0,
+    "gravity_tilt": 0.0,
+}
+"""The nominal hand: a value for every range of `Randomization` but the ripples' number, which has none."""
+_DEVIATIONS = ("encoder_bias", "gravity_tilt")  # given by one number, the largest deviation to either side
+_SPANS = (*(name for name in NOMINAL if name not in _DEVIATIONS), "ripple_count")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -110,7 +111,7 @@ class Randomization:
                 "values beyond their ranges; set extremes, too"
             )
         width = self.scale * (1 + self.beyond)
-        for name in _FACTORS:
+        for name in (name for name, nominal in NOMINAL.items() if nominal):  # factors
             low, high = getattr(self, name)
             if min(1 + width * (low - 1), 1 + width * (high - 1)) < 0:
                 raise ConfigError(
@@ -120,8 +121,8 @@ class Randomization:
 
 
 @pytree_dataclass
-class Draw:
-    """One episode's hand."""
+class HandParams:
+    """One episode's hand; J joints, F fingers."""
 
     actuator: Actuator  # [J] leaves
     latency: jax.Array  # [J] int32, sub-steps
@@ -133,7 +134,7 @@ class Draw:
     gear_gap: jax.Array | None = None  # [J] rad, with gear play
 
 
-def sample(
+def sample_hand(
     key: jax.Array,
     config: Randomization,
     hand: Hand,
@@ -141,7 +142,7 @@ def sample(
     timestep: float,
     control_period: float,
     scale: jax.Array | float = 1.0,
-) -> Draw:
+) -> HandParams:
     """Draw one episode's hand.
 
     Args:
@@ -155,42 +156,43 @@ def sample(
     off = isinstance(width, (int, float)) and width == 0  # known beforehand: nothing is drawn
     extreme = sample_extreme(key, config.extremes)
 
-    def draw(key: jax.Array, span: tuple[float, float], nominal: float, shape: tuple[int, ...]) -> jax.Array:
+    def value(key: jax.Array, name: str, shape: tuple[int, ...]) -> jax.Array:
+        nominal, span = NOMINAL[name], getattr(config, name)
         if off:
             return jnp.full(shape, nominal, float)
-        value = uniform(key, span, extreme, shape, nominal=nominal, beyond=config.beyond)
-        return nominal + width * (value - nominal)
+        span = (-span, span) if name in _DEVIATIONS else span
+        drawn = uniform(key, span, extreme, shape, nominal=nominal, beyond=config.beyond)
+        return nominal + width * (drawn - nominal)
 
-    return _assemble(key, draw, config, hand, timestep, control_period)
+    return _assemble(key, value, config, hand, timestep, control_period)
 
 
 def _assemble(
     key: jax.Array,
-    draw: Callable[..., jax.Array],
+    value: Callable[[jax.Array, str, tuple[int, ...]], jax.Array],
     config: Randomization,
     hand: Hand,
     timestep: float,
     control_period: float,
-) -> Draw:
+) -> HandParams:
     keys = iter(jax.random.split(key, 20))
     joints, fingers = (hand.num_joints,), (hand.num_fingers, 1)
-    bias, tilt = ((-reach, reach) for reach in (config.encoder_bias, config.gravity_tilt))
-    stiffness = config.stiffness * draw(next(keys), config.stiffness_factor, 1.0, joints)
-    damping = config.damping * draw(next(keys), config.damping_factor, 1.0, joints)
-    dead_band = draw(next(keys), config.dead_band, 0.0, joints)
+    stiffness = config.stiffness * value(next(keys), "stiffness_factor", joints)
+    damping = config.damping * value(next(keys), "damping_factor", joints)
+    dead_band = value(next(keys), "dead_band", joints)
     geared = config.backlash == "gear_play"
     if geared:
         dead_band = jnp.zeros(joints)
-    stall_torque = hand.torque_limit * draw(next(keys), config.torque_factor, 1.0, joints)
-    no_load_speed = hand.speed_limit * draw(next(keys), config.speed_factor, 1.0, joints)
-    efficiency = draw(next(keys), config.efficiency, 1.0, joints)
-    latency = draw(next(keys), config.latency, 0.0, ())
-    age = draw(next(keys), config.sensing_latency, 0.0, ()) / control_period
-    encoder_bias = draw(next(keys), bias, 0.0, joints)
-    torque_gain = draw(next(keys), config.torque_gain, 1.0, joints)
-    taxel_gain = draw(next(keys), config.taxel_gain, 1.0, fingers)
-    tilt = draw(next(keys), tilt, 0.0, (2,))
-    latency = latency + draw(next(keys), config.latency_spread, 0.0, joints)
+    stall_torque = hand.torque_limit * value(next(keys), "torque_factor", joints)
+    no_load_speed = hand.speed_limit * value(next(keys), "speed_factor", joints)
+    efficiency = value(next(keys), "efficiency", joints)
+    latency = value(next(keys), "latency", ())
+    age = value(next(keys), "sensing_latency", ()) / control_period
+    encoder_bias = value(next(keys), "encoder_bias", joints)
+    torque_gain = value(next(keys), "torque_gain", joints)
+    taxel_gain = value(next(keys), "taxel_gain", fingers)
+    tilt = value(next(keys), "gravity_tilt", (2,))
+    latency = latency + value(next(keys), "latency_spread", joints)
     low, high = config.ripple_count
     actuator = Actuator(
         stiffness=stiffness,
@@ -199,16 +201,16 @@ def _assemble(
         stall_torque=stall_torque,
         no_load_speed=no_load_speed,
         efficiency=efficiency,
-        ripple=draw(next(keys), config.ripple, 0.0, joints),
+        ripple=value(next(keys), "ripple", joints),
         ripple_count=jax.random.uniform(next(keys), joints, minval=low, maxval=high),
         ripple_phase=jax.random.uniform(next(keys), joints, maxval=2 * jnp.pi),
         encoder_bias=encoder_bias,
-        coulomb_friction=hand.torque_limit * draw(next(keys), config.coulomb_friction, 0.0, joints),
-        viscous_friction=draw(next(keys), config.viscous_friction, 0.0, joints),
+        coulomb_friction=hand.torque_limit * value(next(keys), "coulomb_friction", joints),
+        viscous_friction=value(next(keys), "viscous_friction", joints),
     )
-    gap = draw(next(keys), config.gear_gap, 0.0, joints) if geared else None
+    gap = value(next(keys), "gear_gap", joints) if geared else None
     substeps = jnp.round(jnp.minimum(latency, control_period) / timestep).astype(jnp.int32)
-    return Draw(
+    return HandParams(
         actuator=actuator,
         latency=substeps,
         sensing_latency=jnp.clip(age, 0.0, 1.0),

@@ -1,6 +1,6 @@
-"""The environment: rooms composed into pure `reset` and `step` functions.
+"""The environment: parts composed into pure `reset` and `step` functions.
 
-    action -> actuator -> physics -> touch -> Readings -> observe -> observation
+    action -> control -> motors and physics -> touch -> senses -> observer -> task (reward, end)
 
 All functions are written for one environment and vmapped by the caller. The state is a frozen
 pytree of arrays; there is no hidden state and no automatic reset: `step` returns the true final
@@ -16,33 +16,47 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dexsim import observation
-from dexsim.actuator.gear_play import GearState
-from dexsim.control import Control, move_target, observed_action
-from dexsim.core.pytree import choose
-from dexsim.core.ranges import sample_extreme
-from dexsim.env.config import EnvConfig
+from dexsim.control import move_target, observed_action
+from dexsim.core.pytree import choose, pytree_dataclass
+from dexsim.env.episode import EpisodeSampler
 from dexsim.env.fingerprint import fingerprint
-from dexsim.env.motors import Drive, rotor_share
-from dexsim.env.senses import EpisodeSensors, SensorSuite
-from dexsim.env.state import Sample, Start, State
+from dexsim.env.motors import JointCommand, Motors, PhysicsTick, rotor_share
+from dexsim.env.observer import Observer
+from dexsim.env.senses import SensorSuite
+from dexsim.env.state import Episode, SensorInput, State
 from dexsim.env.task import GroundTruth, Task
+from dexsim.env.touch import TouchModel
 from dexsim.geometry import rotations
-from dexsim.hand.kinematics import Hand, forward_kinematics, taxel_normals
-from dexsim.objects.params import ObjectParams, toward_nominal
-from dexsim.objects.touch_geometry import touch_geometry
-from dexsim.observation import Motion, Readings, ThreeAxisReadings
+from dexsim.hand.kinematics import Hand, forward_kinematics
+from dexsim.objects.params import ObjectParams
+from dexsim.observation import Readings
 from dexsim.physics.physics import Physics
-from dexsim.physics.seam import PhysicsState
-from dexsim.randomization import Draw, sample, tilted_down
 from dexsim.render.snapshot import Snapshot
-from dexsim.sensing.config import Sensing
-from dexsim.sensing.imu import SensorDraw
+from dexsim.sensing.taxels import TaxelMemory
 from dexsim.task_spec import TaskSpec
-from dexsim.touch.feel import Touch, feel_links, keep_normal_part, split_force, taxel_share
-from dexsim.touch.surface import taxels_only, whole_surface
 
-__all__ = ["Control", "Env", "EnvConfig", "GroundTruth", "Sample", "Sensing", "Start", "State", "Task"]
+
+@pytree_dataclass
+class Perception:
+    """What is known of a tick."""
+
+    sensor_input: SensorInput
+    readings: Readings
+    taxel_memory: TaxelMemory
+    obs: dict[str, jax.Array]
+
+
+@pytree_dataclass
+class Outcome:
+    """What a tick was worth, and whether it ended the episode; see `State`."""
+
+    reward: jax.Array  # []
+    terminated: jax.Array  # [] bool
+    truncated: jax.Array  # [] bool
+    tick: jax.Array  # [] int32
+    length: jax.Array  # [] int32
+    episode_return: jax.Array  # []
+    metrics: dict[str, jax.Array]  # the task's
 
 
 class Env:
@@ -61,11 +75,10 @@ class Env:
         Raises:
           AssetError, ConfigError: see `Physics`, `load_hand`.
         """
-        self.task, self.name, self.config = task, task.name, task.config
-        self.hand = hand
+        self.task, self.name, self.config, self.hand = task, task.name, task.config, hand
         config = self.config
         self.physics = Physics(
-            self.hand,
+            hand,
             task.slots,
             task.largest,
             config.physics,
@@ -75,18 +88,13 @@ class Env:
             skin=config.skin,
             rotor_share=rotor_share(config.randomization),
         )
-        self.backend = self.physics.backend
-        self.action_size = self.hand.num_joints
-        actor_view, critic_view = observation.group_configs(config.observation)
-        self._seen = {group: actor_view if group == "actor" else critic_view for group in task.fields}
-        self.observation_layout = {
-            group: observation.layout(self.hand, names, self._seen[group]) for group, names in task.fields.items()
-        }
-        self.senses = SensorSuite(config, hand, task, (actor_view, critic_view))
-        self.drive = Drive(config, hand, self.physics)
-        self._surface = whole_surface(hand, config.skin.thickness) if config.skin.untaxelled else taxels_only(hand)
-        self.primitive_kinds = task.slots
-        self._touch_geometry = touch_geometry(config.objects, config.touch_method)
+        self.backend, self.action_size, self.primitive_kinds = self.physics.backend, hand.num_joints, task.slots
+        self.motors = Motors(config, hand, self.physics)
+        self.touch = TouchModel(config, hand)
+        self.senses = SensorSuite(config, hand, task)
+        self.observer = Observer(config, hand, task)
+        self.sampler = EpisodeSampler(config, hand, task, self.senses)
+        self.observation_layout = self.observer.layout
         self.pool = task.make_pool(jax.random.key(seed))
 
     @property
@@ -121,137 +129,30 @@ class Env:
 
     def reset_to(self, key: jax.Array, index: jax.Array, goal: Any = None, scale: jax.Array | None = None) -> State:
         """A new episode from row `index` of the pool, with the task's goal or the given one."""
-        key, draw_key, goal_key, noise_key, sensor_key = jax.random.split(key, 5)
+        key, hand_key, goal_key, noise_key, sensor_key = jax.random.split(key, 5)
         start = jax.tree.map(lambda rows: jnp.asarray(rows)[index], self.pool)
-        config, hand, senses = self.config, self.hand, self.senses
-        if scale is not None:
-            start = dataclasses.replace(
-                start, target=toward_nominal(start.target, config.objects, self.task.unit_inertia(start.target), scale)
-            )
-        draw, orientation = self._draw(draw_key, sensor_key, 1.0 if scale is None else scale)
-        array_params, array = senses.draw_array(jax.random.fold_in(sensor_key, 1), 1.0 if scale is None else scale)
-        if goal is None:
-            goal = self.task.begin(goal_key, start)
-        joints, place = start.qpos[self.physics.joint_qpos], start.qpos[self.physics.object_qpos]
-        joint_target = joints if start.joint_target is None else start.joint_target
-        zero, nothing = jnp.zeros(hand.num_joints), jnp.zeros((hand.num_fingers, 3))
-        sample = Sample(
-            joints, zero, jnp.zeros(hand.taxel_area.shape), place[:3], place[3:], nothing if senses.three_axis else None
-        )
-        readings, array = senses.read(
-            noise_key,
-            sample,
-            sample,
-            EpisodeSensors(draw, orientation, array_params, array),
-            goal,
-            observed_action(config.control, hand, zero, joint_target),
-        )
-        physics = PhysicsState(start.qpos, start.qvel, jnp.zeros(self.physics.mj_model.nv))
-        truth = self._ground_truth(physics, start.target, zero, zero, zero, nothing)
-        false = jnp.zeros((), bool)
-        _, metrics = self.task.reward(goal, truth, false)
-        state = State(
-            key=key,
-            physics=physics,
-            target=start.target,
-            draw=draw,
-            orientation_sensor=orientation,
-            goal=goal,
-            joint_target=joint_target,
-            action=zero,
-            sample=sample,
-            object_velocity=jnp.zeros(3),
-            readings=readings,
-            finger_force=jnp.zeros(hand.num_fingers),
-            tick=jnp.zeros((), jnp.int32),
-            length=jnp.zeros((), jnp.int32),
-            episode_return=jnp.zeros(()),
-            obs=self._observe(readings, truth, goal),
-            reward=jnp.zeros(()),
-            terminated=false,
-            truncated=false,
-            metrics={},
-            array_params=array_params,
-            array=array,
-            gear=self.drive.begin(joints),
-            tangential_force=truth.tangential_force,
-            scale=scale,
-        )
-        return dataclasses.replace(state, metrics=self._metrics(state, metrics))
+        episode = self.sampler.sample(hand_key, sensor_key, start.object, scale)
+        start = dataclasses.replace(start, object=episode.object)
+        goal = self.task.begin(goal_key, start) if goal is None else goal
+        command, tick = self.motors.rest(start.qpos, start.qvel, start.joint_target)
+        truth = self._ground_truth(episode.object, tick, command.action, command.action)
+        sensor_input = self.senses.at_rest(start.qpos[self.physics.joint_qpos], start.qpos[self.physics.object_qpos])
+        seen = self._sense(noise_key, episode, command, truth, goal, sensor_input)
+        outcome = self._judge(truth, goal, tick.finite)
+        return self._state(key, episode, command, tick, goal, seen, outcome, scale)
 
     def step(self, state: State, action: jax.Array) -> State:
         """One control tick. `action` [J] is clipped to [-1, 1]. No automatic reset."""
         key, push_key, goal_key, noise_key = jax.random.split(state.key, 4)
-        sound = jnp.all(jnp.isfinite(action))
-        action = jnp.where(sound, jnp.clip(action, -1.0, 1.0), 0.0)
-        physics, hand = self.physics, self.hand
-        measured = self.drive.encoder(state.physics.qpos[physics.joint_qpos], state.gear)
-        joint_target = self._joint_target(state.joint_target, action, measured)
-
-        push = self.task.push(push_key, state.target) + self._tilt_force(state.draw, state.target)
-        after, force, gear = self._drive(state, joint_target, push)
-        # A diverging solver passes through speeds that are finite and square to 1e27 in the reward.
-        finite = (
-            sound
-            & jnp.all(jnp.isfinite(after.qpos))
-            & jnp.all(jnp.abs(after.qvel) < 1e3)
-            & jnp.all(jnp.isfinite(force))
-        )
-        # A world that has blown up ends its episode here; its numbers must not spread.
-        after, gear = choose(finite, (after, gear), (state.physics, state.gear))
-        force = jnp.where(finite, force, 0.0)
-
-        torque = self._torque(state, joint_target, after, gear)
-        truth = self._ground_truth(after, state.target, torque, action, state.action, force)
+        episode = state.episode
+        command = self._control(state, action)
+        push = self.task.push(push_key, episode.object) + self.sampler.tilt_force(episode)
+        tick = self.motors.tick(episode, command, state.physics, state.gear, push)
+        truth = self._ground_truth(episode.object, tick, command.action, state.action)
         goal = self.task.update(goal_key, state.goal, truth)
-        sample = Sample(
-            self.drive.encoder(truth.joint_position, gear),
-            torque / hand.torque_limit,
-            truth.touch.force,
-            truth.object_position,
-            truth.object_quat,
-            truth.tangential_force,
-        )
-        readings, array = self.senses.read(
-            noise_key,
-            sample,
-            state.sample,
-            EpisodeSensors.of(state),
-            goal,
-            observed_action(self.config.control, hand, action, joint_target),
-            state,
-        )
-        dropped = self.task.dropped(goal, truth) | ~finite
-        reward, metrics = self.task.reward(state.goal, truth, dropped)
-        tick = state.tick + 1
-        state = State(
-            key=key,
-            physics=after,
-            target=state.target,
-            draw=state.draw,
-            orientation_sensor=state.orientation_sensor,
-            goal=goal,
-            joint_target=joint_target,
-            action=action,
-            sample=sample,
-            object_velocity=readings.object_velocity,
-            readings=readings,
-            finger_force=jnp.linalg.norm(force, axis=-1),
-            tick=tick,
-            length=state.length + 1,
-            episode_return=state.episode_return + reward,
-            obs=self._observe(readings, truth, goal),
-            reward=reward,
-            terminated=dropped,
-            truncated=(tick >= self.task.episode_ticks) & ~dropped,
-            metrics={},
-            array_params=state.array_params,
-            array=array,
-            gear=gear,
-            tangential_force=truth.tangential_force,
-            scale=state.scale,
-        )
-        return dataclasses.replace(state, metrics=self._metrics(state, metrics, finite))
+        seen = self._sense(noise_key, episode, command, truth, goal, self._sensor_input(truth, tick), state)
+        outcome = self._judge(truth, goal, tick.finite, state)
+        return self._state(key, episode, command, tick, goal, seen, outcome, state.scale)
 
     def restart(self, state: State, done: jax.Array) -> State:
         """`state`, or where `done` the first state of a new episode from the pool."""
@@ -268,154 +169,125 @@ class Env:
     def widen(self, state: State, scale: jax.Array) -> State:
         """`state`, whose next episodes are drawn from ranges of this width [] in [0, 1].
 
-        It must come from a reset with a scale. The episode under way goes on as it was drawn.
+        It must come from a reset with a scale. The episode under way keeps what it drew.
         """
         return dataclasses.replace(state, scale=scale)
 
-    # --- pieces of a step -----------------------------------------------------------------
+    # --- parts of a step, in their order --------------------------------------------------
 
-    def _draw(
-        self, hand_key: jax.Array, sensor_key: jax.Array, scale: jax.Array | float = 1.0
-    ) -> tuple[Draw, SensorDraw]:
-        """The hand and the object's IMU of one episode."""
-        ranges = self.config.randomization
-        draw = sample(
-            hand_key,
-            ranges,
-            self.hand,
-            timestep=self.config.physics.timestep,
-            control_period=self.control_period,
-            scale=scale,
-        )
-        extreme = sample_extreme(hand_key, ranges.extremes)  # the one that `sample` draws
-        sensor = self.senses.draw_orientation(sensor_key, ranges.scale * scale, extreme)
-        # An IMU's upright is the true one; the host takes it for that of a hand without tilt.
-        down, tilted = self._tilted(draw)
-        return draw, dataclasses.replace(sensor, bias=sensor.bias + jnp.cross(tilted, down))
-
-    def _drive(
-        self, state: State, joint_target: jax.Array, push: jax.Array
-    ) -> tuple[PhysicsState, jax.Array, GearState | None]:
-        """A tick of physics under the motors: the state after it, forces [F, 3] N, gears."""
-        return self.drive.tick(state, joint_target, push)
-
-    def _torque(self, state: State, joint_target: jax.Array, after: PhysicsState, gear: GearState | None) -> jax.Array:
-        """The torque [J] Nm that the motors give at the end of the tick."""
-        return self.drive.reading(state.draw, state.joint_target, joint_target, after, gear)
-
-    def _joint_target(self, target: jax.Array, action: jax.Array, measured: jax.Array) -> jax.Array:
-        return move_target(self.config.control, self.hand, target, action, measured)
-
-    def _tilt_force(self, draw: Draw, target: ObjectParams) -> jax.Array:
-        """The object's share of a tilted gravity, N; the links' share is small and left out."""
-        down, tilted = self._tilted(draw)
-        return target.mass * np.linalg.norm(self.task.gravity) * (tilted - down)
-
-    def _tilted(self, draw: Draw) -> tuple[jax.Array, jax.Array]:
-        """Directions [3] of gravity in the palm frame: as the host takes it, and as it is."""
-        down = np.asarray(self.task.gravity, float) / np.linalg.norm(self.task.gravity)
-        return jnp.asarray(down), tilted_down(down, draw.tilt)
+    def _control(self, state: State, action: jax.Array) -> JointCommand:
+        """The joint targets of this tick; an action that is not finite counts as none."""
+        valid = jnp.all(jnp.isfinite(action))
+        action = jnp.where(valid, jnp.clip(action, -1.0, 1.0), 0.0)
+        measured = self.motors.encoder(state.physics.qpos[self.physics.joint_qpos], state.gear)
+        target = move_target(self.config.control, self.hand, state.joint_target, action, measured)
+        return JointCommand(action=action, target=target, previous=state.joint_target, valid=valid)
 
     def _ground_truth(
-        self,
-        physics: PhysicsState,
-        target: ObjectParams,
-        torque: jax.Array,
-        action: jax.Array,
-        last_action: jax.Array,
-        force: jax.Array,
+        self, object: ObjectParams, tick: PhysicsTick, action: jax.Array, last_action: jax.Array
     ) -> GroundTruth:
-        seam, hand, config = self.physics, self.hand, self.config
+        """Where all is after the tick, and what the fingertips feel of it."""
+        seam, physics, force = self.physics, tick.physics, tick.finger_force
         joints = physics.qpos[seam.joint_qpos]
         place, motion = physics.qpos[seam.object_qpos], physics.qvel[seam.object_dof]
-        pose = forward_kinematics(hand, joints)
+        pose = forward_kinematics(self.hand, joints)
         quat = place[3:] / jnp.linalg.norm(place[3:])
-        strength = jnp.linalg.norm(force, axis=-1)
-        if config.touch:
-            surface = self._surface
-            touch = feel_links(
-                hand,
-                pose,
-                self._touch_geometry(target),
-                place[:3],
-                rotations.quat_to_matrix(quat),
-                strength,
-                config.skin,
-                surface,
-            )
-            if config.skin.total == "pressing":
-                # In the links' frames, where the normals are constants.
-                local = rotations.rotate_inverse(pose.tip_rotation, force)
-                touch = keep_normal_part(touch, jnp.asarray(surface.normal), local)
-            share = taxel_share(touch.skin_force, hand.num_taxels) if config.skin.untaxelled else 1.0
-            touch = jax.tree.map(lambda x: x[:, : hand.num_taxels], touch)
-        else:
-            nothing, share = jnp.zeros(hand.taxel_area.shape), 1.0
-            touch = Touch(nothing, nothing, nothing)
+        felt = self.touch.feel(pose, object, place[:3], quat, force)
         return GroundTruth(
-            target=target,
+            object=object,
             joint_position=joints,
             joint_velocity=physics.qvel[seam.joint_dof],
-            joint_torque=torque,
+            joint_torque=tick.joint_torque,
             pose=pose,
             finger_force=force,
-            touch=touch,
+            touch=felt.touch,
             object_position=place[:3],
             object_quat=quat,
             object_velocity=motion[:3],
             object_spin=rotations.rotate(rotations.quat_to_matrix(quat), motion[3:]),
             action=action,
             last_action=last_action,
-            tangential_force=(
-                split_force(touch.force, taxel_normals(hand, pose), share * force)[1]
-                if self.senses.three_axis
-                else None
-            ),
+            tangential_force=felt.tangential_force,
         )
 
-    def _observe(self, readings: Readings, truth: GroundTruth, goal: Any) -> dict[str, jax.Array]:
-        """The actor sees the readings; the critic the truth, in the same fields."""
-        command, goal_quat = self.task.goal_readings(goal)
-        known = (
-            truth.joint_position,
-            truth.joint_torque / self.hand.torque_limit,
-            truth.touch.force,
-            truth.object_position,
-            truth.object_velocity,
-            truth.object_quat,
-            goal_quat,
-            command,
-            readings.last_action,
+    def _sensor_input(self, truth: GroundTruth, tick: PhysicsTick) -> SensorInput:
+        return SensorInput(
+            joint_position=self.motors.encoder(truth.joint_position, tick.gear),
+            joint_torque=truth.joint_torque / self.hand.torque_limit,
+            taxel_force=truth.touch.force,
+            object_position=truth.object_position,
+            object_quat=truth.object_quat,
+            tangential_force=truth.tangential_force,
         )
-        true_readings = (
-            ThreeAxisReadings(*known, truth.tangential_force)
-            if isinstance(readings, ThreeAxisReadings)
-            else Readings(*known)
-        )
-        seen = {"actor": readings, "critic": true_readings}
-        motion = Motion(truth.joint_velocity, truth.object_spin)
-        return {
-            group: observation.observe(self.hand, seen[group], names, self._seen[group], motion)
-            for group, names in self.task.fields.items()
-        }
 
-    def _metrics(
-        self, state: State, terms: dict[str, jax.Array], finite: jax.Array | bool = True
-    ) -> dict[str, jax.Array]:
-        if state.tangential_force is not None:
-            along = jnp.linalg.norm(state.tangential_force, axis=-1)
-            terms = {
-                **terms,
-                "tangential_force": jnp.sum(along),
-                **{f"tangential/{i}": along[i] for i in range(along.shape[0])},
-            }
-        return {
-            **terms,
-            "return": state.episode_return,
-            "length": state.length.astype(jnp.float32),
-            "shape": state.target.shape_index.astype(jnp.float32),
-            "non_finite": 1.0 - jnp.asarray(finite, jnp.float32),
-        }
+    def _sense(
+        self,
+        key: jax.Array,
+        episode: Episode,
+        command: JointCommand,
+        truth: GroundTruth,
+        goal: Any,
+        sensor_input: SensorInput,
+        last: State | None = None,
+    ) -> Perception:
+        """Readings and observations of a tick after the state `last`, or of an episode's start."""
+        shown = self.task.goal_readings(goal)
+        action = observed_action(self.config.control, self.hand, command.action, command.target)
+        readings, memory = self.senses.read(key, episode, sensor_input, shown, action, last)
+        return Perception(sensor_input, readings, memory, self.observer.observe(readings, truth, *shown))
+
+    def _judge(self, truth: GroundTruth, goal: Any, finite: jax.Array, last: State | None = None) -> Outcome:
+        """The task's verdict on a tick after the state `last`; an episode's start earns nothing."""
+        zero, false, ticks = jnp.zeros(()), jnp.zeros((), bool), jnp.zeros((), jnp.int32)
+        if last is None:
+            _, terms = self.task.reward(goal, truth, false)
+            return Outcome(zero, false, false, ticks, ticks, zero, terms)
+        dropped = self.task.dropped(goal, truth) | ~finite
+        reward, terms = self.task.reward(last.goal, truth, dropped)
+        tick = last.tick + 1
+        truncated = (tick >= self.task.episode_ticks) & ~dropped
+        return Outcome(reward, dropped, truncated, tick, last.length + 1, last.episode_return + reward, terms)
+
+    def _state(
+        self,
+        key: jax.Array,
+        episode: Episode,
+        command: JointCommand,
+        tick: PhysicsTick,
+        goal: Any,
+        seen: Perception,
+        outcome: Outcome,
+        scale: jax.Array | None,
+    ) -> State:
+        return State(
+            key=key,
+            episode=episode,
+            physics=tick.physics,
+            joint_target=command.target,
+            action=command.action,
+            goal=goal,
+            sensor_input=seen.sensor_input,
+            readings=seen.readings,
+            finger_force=jnp.linalg.norm(tick.finger_force, axis=-1),
+            tick=outcome.tick,
+            length=outcome.length,
+            episode_return=outcome.episode_return,
+            obs=seen.obs,
+            reward=outcome.reward,
+            terminated=outcome.terminated,
+            truncated=outcome.truncated,
+            metrics={
+                **outcome.metrics,
+                **_tangential_metrics(seen.sensor_input.tangential_force),
+                "return": outcome.episode_return,
+                "length": outcome.length.astype(jnp.float32),
+                "shape": episode.object.shape_index.astype(jnp.float32),
+                "non_finite": 1.0 - jnp.asarray(tick.finite, jnp.float32),
+            },
+            taxel_memory=seen.taxel_memory,
+            gear=tick.gear,
+            scale=scale,
+        )
 
     # --- evaluation and pictures ----------------------------------------------------------
 
@@ -431,7 +303,7 @@ class Env:
 
     def evaluation_starts(self, key: jax.Array, count: int) -> State:
         """[count] start states by the task's fixed protocol."""
-        index, goal = self.task.evaluation_plan(count, np.asarray(self.pool.target.shape_index))
+        index, goal = self.task.evaluation_plan(count, np.asarray(self.pool.object.shape_index))
         keys = jax.random.split(key, count)
         return jax.vmap(self.reset_to)(keys, jnp.asarray(index), goal)
 
@@ -446,7 +318,7 @@ class Env:
     def snapshot(self, state: State) -> Snapshot:
         """What a frame of video shows."""
         place = state.physics.qpos[self.physics.object_qpos]
-        shape = state.target.shape()
+        shape = state.episode.object.shape()
         return Snapshot(
             joint_position=state.physics.qpos[self.physics.joint_qpos],
             object_position=place[:3],
@@ -460,3 +332,11 @@ class Env:
             target_force=self.task.target_force(state.goal),
             finger_force=state.finger_force,
         )
+
+
+def _tangential_metrics(force: jax.Array | None) -> dict[str, jax.Array]:
+    """Size of each finger's true tangential force [F, 3] and their sum, N; nothing without three-axis taxels."""
+    if force is None:
+        return {}
+    along = jnp.linalg.norm(force, axis=-1)
+    return {"tangential_force": jnp.sum(along), **{f"tangential/{i}": along[i] for i in range(along.shape[0])}}

@@ -15,19 +15,41 @@ import numpy as np
 from dexsim.actuator.drive import apply_friction, delayed_target, drive
 from dexsim.actuator.gear_play import GearPlay, GearState, drive_beside, gear_at
 from dexsim.core.errors import ConfigError
+from dexsim.core.pytree import choose, pytree_dataclass
 from dexsim.env.config import EnvConfig
-from dexsim.env.state import State
+from dexsim.env.state import Episode
 from dexsim.hand.kinematics import Hand
 from dexsim.physics.physics import Physics
 from dexsim.physics.seam import PhysicsState
-from dexsim.randomization import Draw, Randomization
+from dexsim.randomization import HandParams, Randomization
 
-Motors = Callable[..., tuple[jax.Array, GearState | None]]
+MotorLaw = Callable[..., tuple[jax.Array, GearState | None]]
 """(sub-step, joint position [J], joint velocity [J], gear) to torque on the links [J] Nm and gear."""
 
 
-class Drive:
-    """The motors of one environment. Pure methods."""
+@pytree_dataclass
+class JointCommand:
+    """What the motors are told for a control tick."""
+
+    action: jax.Array  # [J] in [-1, 1]; zero where the one given was not finite
+    target: jax.Array  # [J] rad
+    previous: jax.Array  # [J] rad, acts until the latency is over
+    valid: jax.Array  # [] bool, whether the action was finite
+
+
+@pytree_dataclass
+class PhysicsTick:
+    """The world after a control tick."""
+
+    physics: PhysicsState
+    finger_force: jax.Array  # [F, 3] N, of the object on the finger tips
+    joint_torque: jax.Array  # [J] Nm, by the motors' currents at the end of the tick
+    gear: GearState | None  # with gear play
+    finite: jax.Array  # [] bool; where false the world stays as it was, without forces
+
+
+class Motors:
+    """The motors of one environment, and the physics under them. Pure methods."""
 
     def __init__(self, config: EnvConfig, hand: Hand, physics: Physics):
         """Raises ConfigError: gear play for joints without an armature."""
@@ -42,47 +64,67 @@ class Drive:
             self._rotor_inertia, self._steps = _rotors(ranges, model, dofs)
             self._link_inertia = np.asarray(1 / model.dof_invweight0[dofs], np.float32)
 
-    def begin(self, joints: jax.Array) -> GearState | None:
-        """Gears at the start of an episode: rotors at rest in the middle of their gaps."""
-        return gear_at(joints, jnp.zeros_like(joints)) if self.gear_play else None
+    def rest(
+        self, qpos: jax.Array, qvel: jax.Array, target: jax.Array | None = None
+    ) -> tuple[JointCommand, PhysicsTick]:
+        """The start of an episode: no torque, no touch, rotors at rest in the middle of their gaps.
+
+        Args:
+          qpos, qvel: of the start state; see `PhysicsState`.
+          target: [J] rad; None for the joints' own angles.
+        """
+        joints, zero = qpos[self.physics.joint_qpos], jnp.zeros(self.hand.num_joints)
+        target, valid = joints if target is None else target, jnp.ones((), bool)
+        return JointCommand(action=zero, target=target, previous=target, valid=valid), PhysicsTick(
+            physics=PhysicsState(qpos, qvel, jnp.zeros(self.physics.mj_model.nv)),
+            finger_force=jnp.zeros((self.hand.num_fingers, 3)),
+            joint_torque=zero,
+            gear=gear_at(joints, jnp.zeros_like(joints)) if self.gear_play else None,
+            finite=valid,
+        )
 
     def encoder(self, joints: jax.Array, gear: GearState | None) -> jax.Array:
         """What the encoders [J] rad turn with: the joint, or the rotor before the gap."""
         return joints if gear is None else gear.rotor.position
 
     def tick(
-        self, state: State, joint_target: jax.Array, push: jax.Array
-    ) -> tuple[PhysicsState, jax.Array, GearState | None]:
-        """A tick of physics under the motors: the state after it, forces [F, 3] N, gears."""
-        motors = self.motors(state.draw, state.joint_target, joint_target)
-        if not self.gear_play:
-            after, force = self.physics.advance(
-                state.target, state.physics, lambda *inputs: motors(*inputs, None)[0], push
-            )
-            return after, force, None
-        return self.physics.advance_motors(state.target, state.physics, motors, state.gear, push)
+        self, episode: Episode, command: JointCommand, physics: PhysicsState, gear: GearState | None, push: jax.Array
+    ) -> PhysicsTick:
+        """A control tick of physics under the motors.
 
-    def motors(self, draw: Draw, before: jax.Array, target: jax.Array) -> Motors:
-        """The motors as `Physics.advance_motors` wants them; `before` [J] rad acts until the latency is over."""
+        Args:
+          episode: the hand and the object.
+          command: the joint targets.
+          physics, gear: where the tick begins.
+          push: [3] N on the object.
+        """
+        law = self.law(episode.hand, command)
+        after, force, turned = self.physics.advance_motors(episode.object, physics, law, gear, push)
+        after, turned, force, finite = stay_finite(command.valid, (physics, gear), (after, turned), force)
+        torque = self.current_torque(episode.hand, command, after, turned)
+        return PhysicsTick(physics=after, finger_force=force, joint_torque=torque, gear=turned, finite=finite)
+
+    def law(self, hand: HandParams, command: JointCommand) -> MotorLaw:
+        """The motors as `Physics.advance_motors` wants them."""
         if self.gear_play:
-            return self._geared(draw, before, target)
+            return self._geared(hand, command)
 
         def motors(substep: jax.Array, position: jax.Array, velocity: jax.Array, gear: None) -> tuple[jax.Array, None]:
-            wanted = delayed_target(substep, draw.latency, before, target)
-            torque = drive(draw.actuator, wanted, jnp.zeros_like(wanted), position, velocity)
-            return apply_friction(draw.actuator, torque, velocity, self._inertia_rate), None
+            wanted = delayed_target(substep, hand.latency, command.previous, command.target)
+            torque = drive(hand.actuator, wanted, jnp.zeros_like(wanted), position, velocity)
+            return apply_friction(hand.actuator, torque, velocity, self._inertia_rate), None
 
         return motors
 
-    def _geared(self, draw: Draw, before: jax.Array, target: jax.Array) -> Motors:
-        play = GearPlay(draw.gear_gap, self._rotor_inertia, self._tooth_stiffness)
+    def _geared(self, hand: HandParams, command: JointCommand) -> MotorLaw:
+        play = GearPlay(hand.gear_gap, self._rotor_inertia, self._tooth_stiffness)
 
         def motors(
             substep: jax.Array, position: jax.Array, velocity: jax.Array, gear: GearState
         ) -> tuple[jax.Array, GearState]:
-            wanted = delayed_target(substep, draw.latency, before, target)
+            wanted = delayed_target(substep, hand.latency, command.previous, command.target)
             return drive_beside(
-                draw.actuator,
+                hand.actuator,
                 play,
                 gear,
                 wanted,
@@ -95,15 +137,33 @@ class Drive:
 
         return motors
 
-    def reading(
-        self, draw: Draw, before: jax.Array, target: jax.Array, physics: PhysicsState, gear: GearState | None
+    def current_torque(
+        self, hand: HandParams, command: JointCommand, physics: PhysicsState, gear: GearState | None
     ) -> jax.Array:
         """The torque [J] Nm that the motors' currents tell of at the end of a tick, before friction."""
         position, velocity = (physics.qpos[self.physics.joint_qpos], physics.qvel[self.physics.joint_dof])
         if gear is not None:
             position, velocity = gear.rotor.position, gear.rotor.velocity
-        wanted = delayed_target(jnp.asarray(self._substeps), draw.latency, before, target)
-        return drive(draw.actuator, wanted, jnp.zeros_like(wanted), position, velocity)
+        wanted = delayed_target(jnp.asarray(self._substeps), hand.latency, command.previous, command.target)
+        return drive(hand.actuator, wanted, jnp.zeros_like(wanted), position, velocity)
+
+
+def stay_finite(valid: jax.Array, before: Any, after: Any, force: jax.Array) -> tuple[Any, Any, jax.Array, jax.Array]:
+    """A tick's physics and gears, forces [F, 3] N and whether they are sound [] bool.
+
+    A world that has diverged ends its episode: it stays as it was `before`, and its forces are zero, since NaNs
+    must not propagate. `valid` [] bool is false where the action was not finite.
+    """
+    physics = after[0]
+    # A diverging solver passes through speeds that are finite and square to 1e27 in the reward.
+    finite = (
+        valid
+        & jnp.all(jnp.isfinite(physics.qpos))
+        & jnp.all(jnp.abs(physics.qvel) < 1e3)
+        & jnp.all(jnp.isfinite(force))
+    )
+    physics, gear = choose(finite, after, before)
+    return physics, gear, jnp.where(finite, force, 0.0), finite
 
 
 def rotor_share(ranges: Randomization) -> float:
@@ -123,5 +183,5 @@ def _rotors(ranges: Randomization, model: Any, dofs: np.ndarray) -> tuple[np.nda
             "Randomization.backlash = 'gear_play': every joint of the hand's MJCF needs an "
             "armature, of which rotor_share is the rotor"
         )
-    most = ranges.damping * max(1.0, 1 + ranges.scale * (ranges.damping_factor[1] - 1))
-    return np.asarray(rotor, np.float32), max(int(np.ceil(most * model.opt.timestep / rotor.min())), 1)
+    largest = ranges.damping * max(1.0, 1 + ranges.scale * (ranges.damping_factor[1] - 1))
+    return np.asarray(rotor, np.float32), max(int(np.ceil(largest * model.opt.timestep / rotor.min())), 1)

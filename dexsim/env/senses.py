@@ -4,128 +4,147 @@
 taxels remember is passed in and out.
 """
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dexsim.core.pytree import pytree_dataclass
 from dexsim.env.config import EnvConfig
-from dexsim.env.state import Sample, State
+from dexsim.env.state import Episode, SensorInput, State
 from dexsim.env.task import Task
 from dexsim.hand.kinematics import Hand
-from dexsim.observation import ObservationConfig, Readings, ThreeAxisReadings
-from dexsim.randomization import Draw
-from dexsim.sensing.imu import SensorDraw, draw_sensor, measure_orientation
+from dexsim.observation import Readings, ThreeAxisReadings
+from dexsim.sensing.imu import ImuParams, measure_orientation, sample_imu
 from dexsim.sensing.taxels import TaxelArray, TaxelMemory, TaxelParams
 
 
-@pytree_dataclass
-class EpisodeSensors:
-    """One episode's sensors, and what they remember."""
-
-    draw: Draw
-    orientation: SensorDraw
-    array_params: TaxelParams
-    array: TaxelMemory
-
-    @classmethod
-    def of(cls, state: State) -> "EpisodeSensors":
-        return cls(state.draw, state.orientation_sensor, state.array_params, state.array)
-
-
 class SensorSuite:
-    """From `Sample` to `Readings`. Pure methods, for one environment."""
+    """From `SensorInput` to `Readings`. Pure methods, for one environment."""
 
-    def __init__(self, config: EnvConfig, hand: Hand, task: Task, configs: tuple[ObservationConfig, ...]):
-        """`configs`: what the groups observe, which may ask for three axes of touch."""
+    def __init__(self, config: EnvConfig, hand: Hand, task: Task):
         self.config, self.hand, self.task = config, hand, task
         self.period = config.physics.control_period
-        self.three_axis = config.touch and (
-            config.sensing.three_axis or any("tangential_force" in view.add for view in configs)
-        )
         self.taxels = TaxelArray(config.sensing.taxel, tuple(hand.taxel_grid), hand.num_fingers, self.period)
         self._up = -jnp.asarray(task.gravity) / np.linalg.norm(task.gravity)
 
-    def draw_orientation(self, key: jax.Array, scale: jax.Array | float, extreme: jax.Array | None) -> SensorDraw:
-        """One episode's IMU; see `draw_sensor`."""
-        return draw_sensor(key, self.config.sensing.orientation, scale, self.period, extreme)
+    def sample_imu(self, key: jax.Array, scale: jax.Array | float, extreme: jax.Array | None) -> ImuParams:
+        """One episode's IMU; see `dexsim.sensing.imu.sample_imu`."""
+        return sample_imu(key, self.config.sensing.orientation, scale, self.period, extreme)
 
-    def draw_array(self, key: jax.Array, scale: jax.Array | float) -> tuple[TaxelParams, TaxelMemory]:
-        """One episode's taxels, and their memory before the first tick."""
-        return self.taxels.sample(key, scale), self.taxels.init()
+    def sample_taxels(self, key: jax.Array, scale: jax.Array | float) -> TaxelParams:
+        """One episode's taxels."""
+        return self.taxels.sample(key, scale)
+
+    def at_rest(self, joints: jax.Array, place: jax.Array) -> SensorInput:
+        """What the sensors see at an episode's start, where nothing touches.
+
+        Args:
+          joints: [J] rad.
+          place: [7] m and unit quaternion of the object.
+        """
+        nothing = jnp.zeros((self.hand.num_fingers, 3)) if self.config.three_axis else None
+        return SensorInput(
+            joint_position=joints,
+            joint_torque=jnp.zeros(self.hand.num_joints),
+            taxel_force=jnp.zeros(self.hand.taxel_area.shape),
+            object_position=place[:3],
+            object_quat=place[3:],
+            tangential_force=nothing,
+        )
 
     def read(
         self,
         key: jax.Array,
-        sample: Sample,
-        before: Sample,
-        sensors: EpisodeSensors,
-        goal: Any,
+        episode: Episode,
+        now: SensorInput,
+        goal: tuple[jax.Array, jax.Array],
         last_action: jax.Array,
-        state: State | None = None,
+        last: State | None = None,
     ) -> tuple[Readings, TaxelMemory]:
-        """What the host gets to know of `sample`.
+        """What the host gets to know.
 
         Args:
           key: of the noise.
-          sample, before: the truth at this tick and at the one before.
-          sensors: of this episode.
-          goal: the task's own.
-          last_action: [J], as the observation shows it.
-          state: before this tick; None at a reset.
+          episode: the hand, the IMU and the taxels.
+          now: what the sensors see.
+          goal: command [] and goal orientation [4], as `Task.goal_readings` gives them.
+          last_action: [J], the action that led here, as observations show it.
+          last: the state one tick ago; None at the start of an episode.
 
         Returns:
-          The readings, and the taxels' memory after them.
+          The readings, and what the taxels remember.
         """
-        sensing, draw = self.config.sensing, sensors.draw
-        age = draw.sensing_latency
-        late = jax.tree.map(lambda new, old: (1 - age) * new + age * old, sample, before)
+        sensing, hand = self.config.sensing, episode.hand
+        before = now if last is None else last.sensor_input
+        age = hand.sensing_latency
+        late = jax.tree.map(lambda new, old: (1 - age) * new + age * old, now, before)
         keys = jax.random.split(key, 5)
-        joints = late.joint_position + draw.encoder_bias
+        joints = late.joint_position + hand.encoder_bias
         joints = joints + sensing.joint_noise * jax.random.normal(keys[0], joints.shape)
         if sensing.joint_resolution > 0:
             joints = jnp.round(joints / sensing.joint_resolution) * sensing.joint_resolution
-        torque = late.joint_torque * draw.torque_gain
+        torque = late.joint_torque * hand.torque_gain
         torque = torque + sensing.torque_noise * jax.random.normal(keys[1], torque.shape)
-        array, taxels = self._read_taxels(keys[2], late, sensors)
-        noise = sensing.object_noise * jax.random.normal(keys[3], (3,))
+        taxels, memory = self._read_taxels(keys[2], late, episode, last)
+        position, velocity = self._read_place(keys[3], late, last)
+        command, goal_quat = goal
+        readings = {
+            "joint_position": joints,
+            "joint_torque": torque,
+            "taxel_force": taxels,
+            "object_position": position,
+            "object_velocity": velocity,
+            "object_quat": self._read_orientation(keys[4], now, before, episode, last),
+            "goal_quat": goal_quat,
+            "command": command,
+            "last_action": last_action,
+        }
+        if not self.config.three_axis:
+            return Readings(**readings), memory
+        tangential = self._read_tangential(keys[2], late, episode)
+        return ThreeAxisReadings(**readings, tangential_force=tangential), memory
+
+    def _read_place(self, key: jax.Array, late: SensorInput, last: State | None) -> tuple[jax.Array, jax.Array]:
+        """The object's position [3] m and the filtered estimate of its velocity [3] m/s."""
+        sensing = self.config.sensing
+        noise = sensing.object_noise * jax.random.normal(key, (3,))
         position = jnp.where(
             jnp.array(sensing.object_axes), late.object_position + noise, jnp.asarray(self.task.reference)
         )
-        velocity = jnp.zeros(3)
-        if state is not None:
-            step = (position - state.readings.object_position) / self.period
-            velocity = state.object_velocity
-            velocity = velocity + sensing.velocity_filter * (step - velocity)
-        command, goal_quat = self.task.goal_readings(goal)
-        # At a reset the sensor has just read for the first time.
+        if last is None:
+            return position, jnp.zeros(3)
+        step = (position - last.readings.object_position) / self.period
+        velocity = last.readings.object_velocity
+        return position, velocity + sensing.velocity_filter * (step - velocity)
+
+    def _read_orientation(
+        self, key: jax.Array, now: SensorInput, before: SensorInput, episode: Episode, last: State | None
+    ) -> jax.Array:
+        """The object's orientation [4] by its IMU, which has just read for the first time at an episode's start."""
         length, held = (
-            (jnp.zeros(()), sample.object_quat) if state is None else (state.length + 1.0, state.readings.object_quat)
+            (jnp.zeros(()), now.object_quat) if last is None else (last.length + 1.0, last.readings.object_quat)
         )
-        quat = measure_orientation(
-            keys[4],
-            sensing.orientation,
-            sensors.orientation,
+        return measure_orientation(
+            key,
+            self.config.sensing.orientation,
+            episode.imu,
             length,
-            sample.object_quat,
+            now.object_quat,
             before.object_quat,
             held,
             self._up,
             self.period,
         )
-        known = (joints, torque, taxels, position, velocity, quat, goal_quat, command, last_action)
-        if not self.three_axis:
-            return Readings(*known), array
-        return ThreeAxisReadings(*known, self._read_tangential(keys[2], late, sensors)), array
 
-    def _read_taxels(self, key: jax.Array, late: Sample, sensors: EpisodeSensors) -> tuple[TaxelMemory, jax.Array]:
+    def _read_taxels(
+        self, key: jax.Array, late: SensorInput, episode: Episode, last: State | None
+    ) -> tuple[jax.Array, TaxelMemory]:
+        memory = self.taxels.init() if last is None else last.taxel_memory
         if not self.config.touch:
-            return sensors.array, late.taxel_force
-        return self.taxels.apply(sensors.array_params, sensors.array, key, late.taxel_force, sensors.draw.taxel_gain)
+            return late.taxel_force, memory
+        memory, taxels = self.taxels.apply(episode.taxels, memory, key, late.taxel_force, episode.hand.taxel_gain)
+        return taxels, memory
 
-    def _read_tangential(self, key: jax.Array, late: Sample, sensors: EpisodeSensors) -> jax.Array:
+    def _read_tangential(self, key: jax.Array, late: SensorInput, episode: Episode) -> jax.Array:
         """[F, 3] N: by the same taxels, with the gains and the dead ones of their normal forces."""
-        key, gain = jax.random.fold_in(key, 1), sensors.draw.taxel_gain
-        return self.taxels.apply_tangential(sensors.array_params, key, late.tangential_force, late.taxel_force, gain)
+        key, gain = jax.random.fold_in(key, 1), episode.hand.taxel_gain
+        return self.taxels.apply_tangential(episode.taxels, key, late.tangential_force, late.taxel_force, gain)

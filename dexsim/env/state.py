@@ -1,4 +1,4 @@
-"""What an environment carries from tick to tick."""
+"""What an environment carries from tick to tick, and what holds for a whole episode."""
 
 from typing import Any
 
@@ -9,49 +9,56 @@ from dexsim.core.pytree import pytree_dataclass
 from dexsim.objects.params import ObjectParams
 from dexsim.observation import Readings
 from dexsim.physics.seam import PhysicsState
-from dexsim.randomization import Draw
-from dexsim.sensing.imu import SensorDraw
+from dexsim.randomization import HandParams
+from dexsim.sensing.imu import ImuParams
 from dexsim.sensing.taxels import TaxelMemory, TaxelParams
 
 
 @pytree_dataclass
 class Start:
-    """A start state of the pool."""
+    """A start state of the pool; J joints."""
 
-    qpos: jax.Array
-    qvel: jax.Array
-    target: ObjectParams
+    qpos: jax.Array  # [J + 7] rad; m and unit quaternion of the object
+    qvel: jax.Array  # [J + 6] rad/s; m/s (palm frame) and rad/s (object frame)
+    object: ObjectParams
     joint_target: jax.Array | None = None  # [J] rad; None: where the joints are
 
 
 @pytree_dataclass
-class Sample:
+class Episode:
+    """What is drawn once, when an episode begins."""
+
+    hand: HandParams
+    object: ObjectParams
+    imu: ImuParams
+    taxels: TaxelParams
+
+
+@pytree_dataclass
+class SensorInput:
     """What the sensors see at one instant, before latency, noise and counts."""
 
     joint_position: jax.Array  # [J] rad
-    joint_torque: jax.Array  # [J] 1
+    joint_torque: jax.Array  # [J] 1, torque over its limit
     taxel_force: jax.Array  # [F, N] N
     object_position: jax.Array  # [3] m
     object_quat: jax.Array  # [4]
-    tangential_force: jax.Array | None = None  # [F, 3] N, with `Sensing.three_axis`
+    tangential_force: jax.Array | None = None  # [F, 3] N, with three-axis taxels
 
 
 @pytree_dataclass
 class State:
-    """Everything that an environment carries from tick to tick."""
+    """One environment after a tick. J joints, F fingers, N taxels a finger."""
 
     key: jax.Array
+    episode: Episode
     physics: PhysicsState
-    target: ObjectParams
-    draw: Draw
-    orientation_sensor: SensorDraw
-    goal: Any  # the task's own pytree
     joint_target: jax.Array  # [J] rad
     action: jax.Array  # [J], the last one applied
-    sample: Sample
-    object_velocity: jax.Array  # [3] m/s, filtered estimate of the readings
+    goal: Any  # the task's own pytree
+    sensor_input: SensorInput
     readings: Readings
-    finger_force: jax.Array  # [F] N, true resultant forces
+    finger_force: jax.Array  # [F] N, true resultant forces of the object on the finger tips
     tick: jax.Array  # [] int32 since the episode began (may begin staggered)
     length: jax.Array  # [] int32 ticks lived
     episode_return: jax.Array  # []
@@ -60,8 +67,6 @@ class State:
     terminated: jax.Array  # [] bool
     truncated: jax.Array  # [] bool
     metrics: dict[str, jax.Array]
-    array_params: TaxelParams | None = None  # of the taxels
-    array: TaxelMemory | None = None
+    taxel_memory: TaxelMemory
     gear: GearState | None = None  # of the joints, with gear play
-    tangential_force: jax.Array | None = None  # [F, 3] N, true, with `Sensing.three_axis`
     scale: jax.Array | None = None  # [] of the ranges that the next episode is drawn from

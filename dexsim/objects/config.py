@@ -88,7 +88,7 @@ class ObjectConfig:
         def narrow(span: tuple[float, float], middle: float) -> tuple[float, float]:
             return tuple(middle + self.scale * (value - middle) for value in span)
 
-        values = {name: narrow(getattr(self, name), middle(self, name)) for name in _SPANS}
+        values = {name: narrow(getattr(self, name), nominal(self, name)) for name in _SPANS}
         return dataclasses.replace(self, scale=1.0, com_offset=self.scale * self.com_offset, **values)
 
     @property
@@ -132,6 +132,6 @@ def load_mesh_object(config: ObjectConfig) -> MeshObject:
     return load(config.mesh, unit=config.mesh_unit, parts=config.mesh_parts)
 
 
-def middle(config: ObjectConfig, name: str) -> float:
+def nominal(config: ObjectConfig, name: str) -> float:
     """The nominal value of a range of `ObjectConfig`."""
     return 1.0 if name == "inertia_scale" else sum(getattr(config, name)) / 2

@@ -25,7 +25,7 @@ from dexsim.objects.config import (
     SPHERE_HALF_LENGTH,
     ObjectConfig,
     load_mesh_object,
-    middle,
+    nominal,
 )
 from dexsim.objects.mesh import scaled_boxes
 
@@ -164,16 +164,16 @@ def _sample_contact(keys: jax.Array, config: ObjectConfig, extreme: jax.Array | 
     )
 
 
-def unit_inertia(target: ObjectParams, config: ObjectConfig | None = None) -> jax.Array:
+def unit_inertia(object: ObjectParams, config: ObjectConfig | None = None) -> jax.Array:
     """Inertia [3] m^2 of an object of `config` as a uniform solid of 1 kg, about its centre."""
     if config is not None and config.mesh:
         mesh_object = load_mesh_object(config)
-        return (target.size[0, 0] / mesh_object.boxes.size[0, 0]) ** 2 * jnp.asarray(mesh_object.inertia)
-    mass, _, inertia = _mass_properties(target.size, target.position, target.active)
+        return (object.size[0, 0] / mesh_object.boxes.size[0, 0]) ** 2 * jnp.asarray(mesh_object.inertia)
+    mass, _, inertia = _mass_properties(object.size, object.position, object.active)
     return inertia / mass
 
 
-def toward_nominal(target: ObjectParams, config: ObjectConfig, plain: jax.Array, scale: jax.Array) -> ObjectParams:
+def toward_nominal(object: ObjectParams, config: ObjectConfig, plain: jax.Array, scale: jax.Array) -> ObjectParams:
     """A drawn object with its bulk nearer to nominal: mass, inertia, centre of mass, friction, contact.
 
     Its size stays: start states were chosen for it.
@@ -186,20 +186,20 @@ def toward_nominal(target: ObjectParams, config: ObjectConfig, plain: jax.Array,
     config = config.narrowed()
 
     def toward(name: str, value: jax.Array) -> jax.Array:
-        nominal = middle(config, name)
-        return nominal + scale * (value - nominal)
+        centre = nominal(config, name)
+        return centre + scale * (value - centre)
 
-    mass, drawn = toward("mass", target.mass), target.inertia / (target.mass * plain)
-    bounce = damping_ratio(jnp.asarray(middle(config, "restitution")))
-    contact = jnp.stack([toward("stiffness", target.contact[0]), bounce + scale * (target.contact[1] - bounce)])
+    mass, drawn = toward("mass", object.mass), object.inertia / (object.mass * plain)
+    bounce = damping_ratio(jnp.asarray(nominal(config, "restitution")))
+    contact = jnp.stack([toward("stiffness", object.contact[0]), bounce + scale * (object.contact[1] - bounce)])
     return dataclasses.replace(
-        target,
+        object,
         mass=mass,
         inertia=mass * plain * toward("inertia_scale", drawn),
-        com=scale * target.com,
-        friction=toward("friction", target.friction),
+        com=scale * object.com,
+        friction=toward("friction", object.friction),
         contact=contact,
-        link_friction=(None if target.link_friction is None else toward("link_friction", target.link_friction)),
+        link_friction=(None if object.link_friction is None else toward("link_friction", object.link_friction)),
     )
 
 

@@ -14,21 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from dexsim.core.compilation import collector_paused
-from dexsim.objects.config import SHAPES
-from dexsim.randomization import Randomization, sample
-from dexsim.sensing.imu import OrientationSensor, draw_sensor
+from dexsim.objects.config import SHAPES, nominal
+from dexsim.randomization import NOMINAL, Randomization, sample_hand
+from dexsim.sensing.imu import ImuConfig, sample_imu
 from dexsim.sensing.taxels import TaxelSensor
-
-NOMINAL = {
-    "stiffness_factor": 1.0,
-    "damping_factor": 1.0,
-    "torque_factor": 1.0,
-    "speed_factor": 1.0,
-    "efficiency": 1.0,
-    "torque_gain": 1.0,
-    "taxel_gain": 1.0,
-}
-"""Nominal values that are not 0."""
 
 READINGS = ("joint_position", "joint_torque", "taxel_force", "object_position", "object_quat")
 # What must be there for a range to show.
@@ -75,7 +64,7 @@ def check(
     for name in _ranges(env.config.randomization):
         tests[f"Randomization.{name}"] = lambda n=name: bench.hand_range(n)
     for name in _ranges(env.config.sensing.orientation):
-        tests[f"OrientationSensor.{name}"] = lambda n=name: bench.orientation_range(n)
+        tests[f"ImuConfig.{name}"] = lambda n=name: bench.orientation_range(n)
     for name in _taxel_ranges(env.config.sensing.taxel):
         tests[f"TaxelSensor.{name}"] = lambda n=name: bench.taxel_range(n)
     for path in env.task.object_ranges:
@@ -122,14 +111,21 @@ class _Bench:
         self.actions = jnp.clip(throw + close, -1.0, 1.0)
         self.states = dataclasses.replace(
             states,
-            draw=self._draw(self._only()),
-            orientation_sensor=self._imu(_still_imu(env)),
-            array_params=self._taxels(),
+            episode=dataclasses.replace(
+                states.episode,
+                hand=self._hands(self._only()),
+                imu=self._imus(_still_imu(env)),
+                taxels=self._taxels(),
+            ),
         )
         self.base = self._run(self.states)
         # On the Warp backend two runs of the same differ: what is not well above that is no effect.
         again = [self._distance(self._run(self.states)) for _ in range(1 if env.backend == "jax" else 3)]
         self.floor = {name: 3.0 * np.max([run[name] for run in again], 0) for name in self.base}
+
+    def _starts(self, **changes: Any) -> Any:
+        """The starts with other parts of their episodes (`Episode`)."""
+        return dataclasses.replace(self.states, episode=dataclasses.replace(self.states.episode, **changes))
 
     def _only(self, *names: str) -> Randomization:
         """The ranges with all but these at their nominal values."""
@@ -142,9 +138,9 @@ class _Bench:
             fixed |= _AIDS.get(name, {})
         return dataclasses.replace(config, scale=1.0, **fixed)
 
-    def _draw(self, config: Randomization) -> Any:
+    def _hands(self, config: Randomization) -> Any:
         return jax.vmap(
-            lambda key: sample(
+            lambda key: sample_hand(
                 key,
                 config,
                 self.env.hand,
@@ -153,18 +149,18 @@ class _Bench:
             )
         )(jax.random.split(self.key, self.count))
 
-    def _imu(self, config: OrientationSensor) -> Any:
-        return jax.vmap(lambda key: draw_sensor(key, config, 1.0, self.env.control_period))(
+    def _imus(self, config: ImuConfig) -> Any:
+        return jax.vmap(lambda key: sample_imu(key, config, 1.0, self.env.control_period))(
             jax.random.split(self.key, self.count)
         )
 
     def _taxels(self, *names: str, **aids: Any) -> Any:
         """Taxels that are perfect but for these ranges, with the structure of the environment's."""
         array, config = self.env.senses.taxels, self.env.config.sensing.taxel
-        nominal = {"rate": 1 / self.env.control_period, "gain": 1.0, "hysteresis_time": config.hysteresis_time[0]}
-        fixed = {name: (nominal.get(name, 0.0),) * 2 for name in _taxel_ranges(config) if name not in names}
-        perfect = dataclasses.replace(array, sensor=dataclasses.replace(config, **fixed | aids))
-        return jax.vmap(perfect.sample)(jax.random.split(self.key, self.count))
+        perfect = {"rate": 1 / self.env.control_period, "gain": 1.0, "hysteresis_time": config.hysteresis_time[0]}
+        fixed = {name: (perfect.get(name, 0.0),) * 2 for name in _taxel_ranges(config) if name not in names}
+        array = dataclasses.replace(array, sensor=dataclasses.replace(config, **fixed | aids))
+        return jax.vmap(array.sample)(jax.random.split(self.key, self.count))
 
     def _run(self, states: Any) -> dict[str, np.ndarray]:
         """Tracks [T, ...] of what is compared."""
@@ -210,34 +206,32 @@ class _Bench:
         label, ranges = f"Randomization.{name}", self.env.config.randomization
         if name == _unused(ranges) or _width(getattr(ranges, name)) == 0:
             return Effect(label, off=True)
-        base, before = None, self.states.draw
+        base, before = None, self.states.episode.hand
         if name in _AIDS:
-            before = self._draw(dataclasses.replace(self._only(), **_AIDS[name]))
-            base = self._run(dataclasses.replace(self.states, draw=before))
-        draw = self._draw(self._only(name))
-        return self._effect(label, before, draw, dataclasses.replace(self.states, draw=draw), base)
+            before = self._hands(dataclasses.replace(self._only(), **_AIDS[name]))
+            base = self._run(self._starts(hand=before))
+        drawn = self._hands(self._only(name))
+        return self._effect(label, before, drawn, self._starts(hand=drawn), base)
 
     def orientation_range(self, name: str) -> Effect:
-        """One field of `OrientationSensor`."""
-        label, config = f"OrientationSensor.{name}", self.env.config.sensing.orientation
+        """One field of `ImuConfig`."""
+        label, config = f"ImuConfig.{name}", self.env.config.sensing.orientation
         if _width(getattr(config, name)) == 0:
             return Effect(label, off=True)
-        drawn = self._imu(dataclasses.replace(_still_imu(self.env), **{name: getattr(config, name)}))
-        return self._effect(
-            label, self.states.orientation_sensor, drawn, dataclasses.replace(self.states, orientation_sensor=drawn)
-        )
+        drawn = self._imus(dataclasses.replace(_still_imu(self.env), **{name: getattr(config, name)}))
+        return self._effect(label, self.states.episode.imu, drawn, self._starts(imu=drawn))
 
     def taxel_range(self, name: str) -> Effect:
         """One field of `TaxelSensor`."""
         label, span = f"TaxelSensor.{name}", getattr(self.env.config.sensing.taxel, name)
         if _width(span) == 0:
             return Effect(label, off=True)
-        base, before, aids = None, self.states.array_params, _AIDS.get(name, {})
+        base, before, aids = None, self.states.episode.taxels, _AIDS.get(name, {})
         if aids:
             before = self._taxels(**aids)
-            base = self._run(dataclasses.replace(self.states, array_params=before))
+            base = self._run(self._starts(taxels=before))
         drawn = self._taxels(name, **aids)
-        return self._effect(label, before, drawn, dataclasses.replace(self.states, array_params=drawn), base)
+        return self._effect(label, before, drawn, self._starts(taxels=drawn), base)
 
     def object_range(self, path: str) -> Effect:
         """One range of the object, on objects of a shape that has it."""
@@ -245,21 +239,21 @@ class _Bench:
         label = f"{type(owner).__name__}.{name}"
         if _width(getattr(owner, name)) == 0:
             return Effect(label, off=True)
-        nominal = env.config
+        config = env.config
         for other in env.task.object_ranges:
-            holder, field = _owner(nominal, other)
-            centre = 0.0 if field in _WIDTHS else (float(np.mean(getattr(holder, field))),) * 2
-            nominal = _with(nominal, other, centre)
+            holder, field = _owner(config, other)
+            centre = 0.0 if field in _WIDTHS else (nominal(holder, field),) * 2
+            config = _with(config, other, centre)
         shape = jnp.int32(SHAPES.index(_SHAPE_OF.get(name.split("_")[0], "box")))
         keys = jax.random.split(self.key, self.count)
         before, after = (
-            jax.vmap(lambda key, c=c: env.task.draw_object(key, c, shape))(keys)
-            for c in (nominal, _with(nominal, path, getattr(owner, name)))
+            jax.vmap(lambda key, c=c: env.task.sample_object(key, c, shape))(keys)
+            for c in (config, _with(config, path, getattr(owner, name)))
         )
-        base = self._run(dataclasses.replace(self.states, target=before))
-        effect = self._effect(label, before, after, dataclasses.replace(self.states, target=after), base)
+        base = self._run(self._starts(object=before))
+        effect = self._effect(label, before, after, self._starts(object=after), base)
         # What the physics is given must differ too, not only what was drawn.
-        models = [env.physics.configure(jax.tree.map(lambda leaf: leaf[0], target)) for target in (before, after)]
+        models = [env.physics.configure(jax.tree.map(lambda leaf: leaf[0], object)) for object in (before, after)]
         return dataclasses.replace(effect, changed=changes(*models)[0])
 
     def push(self) -> Effect:
@@ -268,7 +262,7 @@ class _Bench:
         forces = np.asarray(
             jax.vmap(
                 lambda key: self.env.task.push(
-                    jax.random.split(key, 4)[1], jax.tree.map(lambda leaf: leaf[0], self.states.target)
+                    jax.random.split(key, 4)[1], jax.tree.map(lambda leaf: leaf[0], self.states.episode.object)
                 )
             )(keys)
         )
@@ -311,7 +305,7 @@ def _width(span: float | tuple[float, float]) -> float:
     return span[1] - span[0] if isinstance(span, tuple) else span
 
 
-def _still_imu(env: Any) -> OrientationSensor:
+def _still_imu(env: Any) -> ImuConfig:
     return dataclasses.replace(env.config.sensing.orientation, bias=0.0, drift=0.0, delay=(0.0, 0.0))
 
 

@@ -3,7 +3,7 @@
 import dataclasses
 
 from dexsim.core.config import setting, validate
-from dexsim.sensing.imu import OrientationSensor
+from dexsim.sensing.imu import ImuConfig
 from dexsim.sensing.taxels import TaxelSensor
 
 
@@ -24,7 +24,7 @@ class Sensing:
     in the paper, where the camera gives only the height."""
     velocity_filter: float = setting(0.5, unit="1", low=0.01, high=1.0)
     """Weight of the newest difference in the object's velocity estimate."""
-    orientation: OrientationSensor = setting(OrientationSensor())
+    orientation: ImuConfig = setting(ImuConfig())
     """The IMU inside the object."""
     taxel: TaxelSensor = setting(TaxelSensor())
     """The taxels."""

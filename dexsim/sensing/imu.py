@@ -16,7 +16,7 @@ from dexsim.geometry import rotations
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class OrientationSensor:
+class ImuConfig:
     """Errors of the object's orientation reading; ranges are drawn at every episode start."""
 
     noise: float = setting(0.02, unit="rad", low=0.0, high=1.0)
@@ -36,7 +36,7 @@ class OrientationSensor:
 
 
 @pytree_dataclass
-class SensorDraw:
+class ImuParams:
     """One episode's sensor."""
 
     bias: jax.Array  # [3] rad; misalignment, and a tilt of the hand that the host does not know
@@ -45,16 +45,16 @@ class SensorDraw:
     phase: jax.Array  # [] fraction of a sampling period
 
 
-def draw_sensor(
-    key: jax.Array, config: OrientationSensor, scale: float, control_period: float, extreme: jax.Array | None = None
-) -> SensorDraw:
+def sample_imu(
+    key: jax.Array, config: ImuConfig, scale: float, control_period: float, extreme: jax.Array | None = None
+) -> ImuParams:
     """Draw one episode's sensor; `scale` 0 gives one without bias, drift and delay.
 
     Where `extreme` [] is true, all three are at an end of their ranges (`dexsim.core.ranges`).
     """
     keys, sides = jax.random.split(key, 4), (-1.0, 1.0)
     delay = uniform(keys[2], config.delay, extreme, nominal=0.0)
-    return SensorDraw(
+    return ImuParams(
         bias=scale * config.bias * uniform(keys[0], sides, extreme, (3,)),
         drift=scale * config.drift * uniform(keys[1], sides, extreme),
         delay=jnp.clip(scale * delay / control_period, 0.0, 1.0),
@@ -64,8 +64,8 @@ def draw_sensor(
 
 def measure_orientation(
     key: jax.Array,
-    config: OrientationSensor,
-    draw: SensorDraw,
+    config: ImuConfig,
+    imu: ImuParams,
     tick: jax.Array,
     now: jax.Array,
     before: jax.Array,
@@ -84,12 +84,12 @@ def measure_orientation(
     """
     # Neighbours on the sphere of quaternions may have opposite signs.
     before = jnp.where(jnp.sum(now * before) < 0, -before, before)
-    late = (1 - draw.delay) * now + draw.delay * before
+    late = (1 - imu.delay) * now + imu.delay * before
     late = late / jnp.linalg.norm(late)
-    error = draw.bias + config.noise * jax.random.normal(key, (3,))
-    error = error + draw.drift * tick * control_period * up
+    error = imu.bias + config.noise * jax.random.normal(key, (3,))
+    error = error + imu.drift * tick * control_period * up
     angle = jnp.sqrt(jnp.sum(error**2) + 1e-20)
     fresh = rotations.quat_multiply(rotations.axis_angle_to_quat(error / angle, angle), late)
     per_tick = config.rate * control_period
-    sampled = jnp.floor(tick * per_tick + draw.phase) > jnp.floor((tick - 1) * per_tick + draw.phase)
+    sampled = jnp.floor(tick * per_tick + imu.phase) > jnp.floor((tick - 1) * per_tick + imu.phase)
     return jnp.where(sampled, fresh, held)

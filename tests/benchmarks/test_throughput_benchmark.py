@@ -54,11 +54,8 @@ def equal(first, second):
 def test_replayed_torques_give_the_same_motion_and_contacts(benchmarks, simple):
     """With friction, latency, ripple, restarts: the tape holds all that the drive did, and readings of its torque."""
     throughput, _ = benchmarks
-    envs = [
-        throughput.make("grasp", "full", "jax", WORLDS, kind)
-        for kind in (throughput.Env, throughput.Recorder, throughput.Replay)
-    ]
-    full, recorder, replay = envs
+    full, replay = (throughput.make("grasp", name, "jax", WORLDS) for name in ("full", "actuator"))
+    recorder = throughput.Recorder(throughput.make("grasp", "full", "jax", WORLDS))
     state = throughput.started(full, WORLDS, 20)
     after, touched, _ = run(throughput, full, state)
 
@@ -77,7 +74,7 @@ def test_replayed_torques_give_the_same_motion_and_contacts(benchmarks, simple):
         lambda state, action, tape: (replay.replayed_step(state, action, tape), tape[:0]),
         tape,
     )
-    for name in ("physics", "sample", "reward", "obs", "metrics"):
+    for name in ("physics", "sensor_input", "reward", "obs", "metrics"):
         pairs = zip(*(jax.tree.leaves(getattr(state, name)) for state in (again, after)), strict=True)
         for ours, theirs in pairs:
             np.testing.assert_allclose(ours, theirs, atol=1e-5, rtol=1e-5, err_msg=name)
@@ -88,15 +85,15 @@ def test_hands_are_kept_or_nominal(benchmarks, simple, hand):
     kept = throughput.make("grasp", "redrawing", "jax", WORLDS)
     state = jax.jit(jax.vmap(kept.reset))(jax.random.split(jax.random.key(0), WORLDS))
     after = jax.jit(jax.vmap(kept.restart))(state, jnp.ones(WORLDS, bool))
-    equal(after.draw, state.draw)
-    equal(after.orientation_sensor, state.orientation_sensor)
+    equal(after.episode.hand, state.episode.hand)
+    equal(after.episode.imu, state.episode.imu)
     assert np.all(np.asarray(after.length) == 0) and np.any(after.physics.qpos != state.physics.qpos)
     nominal = throughput.make("grasp", "randomization", "jax", WORLDS)
-    drawn, _ = nominal._draw(jax.random.key(0), jax.random.key(0))
+    drawn, _ = nominal.sampler.sample_hand(jax.random.key(0), jax.random.key(0))
     np.testing.assert_array_equal(drawn.actuator.stall_torque, hand.torque_limit)
     # Known beforehand, so nothing is drawn: the program has no random bits but for what it needs elsewhere.
     text = [
-        jax.jit(lambda k, e=env: e._draw(k, k)[0]).lower(jax.random.key(0)).as_text()
+        jax.jit(lambda k, e=env: e.sampler.sample_hand(k, k)[0]).lower(jax.random.key(0)).as_text()
         for env in (nominal, throughput.make("grasp", "full", "jax", WORLDS))
     ]
     assert text[0].count("threefry") < text[1].count("threefry")

@@ -8,16 +8,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from episodes import with_episode
 
 import dexsim
 from dexsim.core.errors import ConfigError
 from dexsim.objects.config import ObjectConfig
 from dexsim.objects.params import sample_object
-from dexsim.randomization import Randomization, sample
+from dexsim.randomization import Randomization, sample_hand
 from dexsim.randomization_check.__main__ import conclude, table
 from dexsim.randomization_check.effects import check
 from dexsim.tasks.rotate.config import RotateConfig
-from dexsim.tasks.rotate.objects import sample_target
+from dexsim.tasks.rotate.objects import sample_turned_object
 from dexsim_ppo.learner.curriculum import Curriculum, next_scale
 
 TIMES = dict(timestep=0.005, control_period=0.03)
@@ -27,7 +28,7 @@ TIMES = dict(timestep=0.005, control_period=0.03)
 def draws(hand, config, seed=0):
     """1,000 draws. Not jitted as a whole: a config is a constant, so each would be another compilation."""
     keys = jax.random.split(jax.random.key(seed), 1000)
-    return jax.vmap(lambda key: sample(key, config, hand, **TIMES))(keys)
+    return jax.vmap(lambda key: sample_hand(key, config, hand, **TIMES))(keys)
 
 
 def test_scale_zero_is_the_nominal_hand(hand):
@@ -191,10 +192,10 @@ def test_the_widest_scale_keeps_the_motors_the_right_way_round(hand):
 
 def test_a_traced_scale_is_the_configured_one(hand):
     """The scale may come from the training state: 0 is exactly nominal, and none of it recompiles."""
-    draw = jax.jit(lambda key, scale: sample(key, Randomization(), hand, **TIMES, scale=scale))
+    draw = jax.jit(lambda key, scale: sample_hand(key, Randomization(), hand, **TIMES, scale=scale))
     key = jax.random.key(5)
     for scale in (0.0, 0.5, 1.0):
-        other = sample(key, Randomization(scale=scale), hand, **TIMES)
+        other = sample_hand(key, Randomization(scale=scale), hand, **TIMES)
         for ours, theirs in zip(jax.tree.leaves(draw(key, scale)), jax.tree.leaves(other), strict=True):
             np.testing.assert_allclose(ours, theirs, rtol=1e-6, atol=1e-8)
     nominal = draw(key, 0.0)
@@ -282,7 +283,7 @@ def test_the_imu_of_a_hand_in_a_corner_is_in_one_too():
     config = RotateConfig(pool_size=16, randomization=dataclasses.replace(EVEN, extremes=0.5, gravity_tilt=0.0))
     env = dexsim.make("rotate", config, backend="jax")
     keys = jax.random.split(jax.random.key(0), (64, 2))
-    drawn, imu = jax.vmap(lambda two: env._draw(*two))(keys)
+    drawn, imu = jax.vmap(lambda two: env.sampler.sample_hand(*two))(keys)
     extreme = np.all(np.isin(np.asarray(drawn.torque_gain).round(5), np.float32([0.9, 1.1])), axis=1)
     ranges = config.sensing.orientation
     for values, end in (
@@ -302,7 +303,7 @@ def test_the_imu_of_a_hand_in_a_corner_is_in_one_too():
 def test_objects_in_corners(config):
     draw, ranges = sample_object, config
     if isinstance(config, RotateConfig):
-        draw, ranges = sample_target, config.objects
+        draw, ranges = sample_turned_object, config.objects
     drawn = jax.vmap(lambda key: draw(key, config))(jax.random.split(jax.random.key(0), 200))
     at = {name: np.asarray(getattr(drawn, name)) for name in ("mass", "friction", "link_friction")}
     at["stiffness"], at["com_offset"] = np.asarray(drawn.contact[:, 0]), np.asarray(drawn.com)
@@ -312,7 +313,7 @@ def test_objects_in_corners(config):
         for end in (low, high):
             assert 0.35 < np.mean(np.abs(values - end) < 1e-5 * max(1, abs(end))) < 0.65, name
         assert np.all((np.abs(values - low) < 1e-5 * max(1, low)) | (np.abs(values - high) < 1e-5 * high)), name
-    if draw is sample_target:
+    if draw is sample_turned_object:
         edges = 2 * np.asarray(drawn.size[:, 0, 0])
         assert np.all(np.isin(edges.round(5), np.float32(config.edge).round(5))) and 0.4 < np.mean(edges > 0.055) < 0.6
 
@@ -381,17 +382,16 @@ def test_a_range_that_is_lost_is_found_out(grasp_env, grasp_rollout, fresh, monk
     """Lost between configuration and draw, and lost between draw and physics."""
 
     def forgets_torque(*arguments, **options):
-        drawn = sample(*arguments, **options)
+        drawn = sample_hand(*arguments, **options)
         limit = jnp.asarray(arguments[2].torque_limit)
         return dataclasses.replace(drawn, actuator=dataclasses.replace(drawn.actuator, stall_torque=limit))
 
     def ignores_friction(states, action):
-        calm = dataclasses.replace(states.draw.actuator, viscous_friction=0 * states.draw.actuator.viscous_friction)
-        return grasp_rollout.step(
-            dataclasses.replace(states, draw=dataclasses.replace(states.draw, actuator=calm)), action
-        )
+        drawn = states.episode.hand
+        calm = dataclasses.replace(drawn.actuator, viscous_friction=0 * drawn.actuator.viscous_friction)
+        return grasp_rollout.step(with_episode(states, hand=dataclasses.replace(drawn, actuator=calm)), action)
 
-    monkeypatch.setattr("dexsim.randomization_check.effects.sample", forgets_torque)
+    monkeypatch.setattr("dexsim.randomization_check.effects.sample_hand", forgets_torque)
     names = ("Randomization.torque_factor", "Randomization.viscous_friction", "Randomization.speed_factor")
     effects = check(grasp_env, ignores_friction, fresh, key=jax.random.key(0), ticks=6, names=names)
     assert [effect.found for effect in effects] == [False, False, True]
@@ -408,14 +408,14 @@ def test_runs_that_differ_hide_no_range_and_invent_none(grasp_env, grasp_rollout
     rng = np.random.default_rng(0)
 
     def unsteady(states, action, forgetful=False):
-        drawn = states.draw
+        drawn = states.episode.hand
         if forgetful:
             calm = dataclasses.replace(drawn.actuator, viscous_friction=0 * drawn.actuator.viscous_friction)
-            states = dataclasses.replace(states, draw=dataclasses.replace(drawn, actuator=calm))
+            states = with_episode(states, hand=dataclasses.replace(drawn, actuator=calm))
         after = grasp_rollout.step(states, action)
         noise = jnp.asarray(1e-6 * rng.standard_normal(after.physics.qvel.shape), jnp.float32)
         physics = dataclasses.replace(after.physics, qvel=after.physics.qvel + noise * jnp.abs(after.physics.qvel))
-        return dataclasses.replace(after, physics=physics, draw=drawn)
+        return with_episode(dataclasses.replace(after, physics=physics), hand=drawn)
 
     noisy = copy.copy(grasp_env)
     noisy.backend = "warp"

@@ -200,7 +200,7 @@ def row(tree, index):
 
 def rows_of(pool, shape: str) -> np.ndarray:
     """Rows of a pool of start states with this shape."""
-    return np.flatnonzero(np.asarray(pool.target.shape_index) == SHAPES.index(shape))
+    return np.flatnonzero(np.asarray(pool.object.shape_index) == SHAPES.index(shape))
 
 
 def stack(trees):
@@ -213,7 +213,7 @@ def squeeze(hand, begun, rng: np.random.Generator, steps=100):
 
     Returns (model, qpos, qvel, warm start, joint torque), the numbers in single precision.
     """
-    model = compile_scene(hand, begun.target, exact=bool(begun.target.active[2]), **CONVERGED)
+    model = compile_scene(hand, begun.object, exact=bool(begun.object.active[2]), **CONVERGED)
     data = start(model, begun.qpos, 0 * begun.qvel)
     wanted = begun.qpos[:12] + rng.uniform(0.3, 0.8, 12) * (np.arange(12) > 3)
     wanted[1:3] += rng.uniform(0.0, 0.5, 2)

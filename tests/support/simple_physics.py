@@ -28,16 +28,16 @@ class SimplePhysics:
             opt=SimpleNamespace(timestep=config.timestep),
         )
 
-    def advance(self, target, state, torque, push):
+    def advance(self, object, state, torque, push):
         motors = lambda index, position, velocity, memory: (torque(index, position, velocity), memory)  # noqa: E731
-        return self.advance_motors(target, state, motors, None, push)[:2]
+        return self.advance_motors(object, state, motors, None, push)[:2]
 
-    def advance_motors(self, target, state, motors, memory, push):
+    def advance_motors(self, object, state, motors, memory, push):
         def substep(carry, index):
             qpos, qvel, memory = carry
             tau, memory = motors(index, qpos[:12], qvel[:12], memory)
             speed = qvel[:12] + self.config.timestep / self.inertia * (tau - 0.02 * qvel[:12])
-            fall = qvel[12:15] + self.config.timestep * (jnp.array([9.81, 0, 0]) + push / target.mass)
+            fall = qvel[12:15] + self.config.timestep * (jnp.array([9.81, 0, 0]) + push / object.mass)
             qvel = jnp.concatenate([speed, fall, qvel[15:]])
             moved = jnp.concatenate(
                 [qpos[:12] + self.config.timestep * speed, qpos[12:15] + self.config.timestep * fall, qpos[15:]]

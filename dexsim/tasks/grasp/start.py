@@ -32,7 +32,7 @@ def make_pool(key: jax.Array, hand: Hand, config: Any, reference: tuple[float, f
     chunk = max(min(2 * share, 4096), 64)
 
     @functools.partial(compilation.jit, once=True)
-    def draw(key: jax.Array, shape_index: jax.Array):
+    def sample(key: jax.Array, shape_index: jax.Array):
         keys = jax.random.split(key, chunk)
         return jax.vmap(lambda k: _candidate(k, shape_index, hand, config, reference))(keys)
 
@@ -41,7 +41,7 @@ def make_pool(key: jax.Array, hand: Hand, config: Any, reference: tuple[float, f
         kept, found = [], 0
         for trial in range(40):
             shape_key = jax.random.fold_in(jax.random.fold_in(key, KINDS.index(name)), trial)
-            starts, clear = draw(shape_key, jnp.int32(KINDS.index(name)))
+            starts, clear = sample(shape_key, jnp.int32(KINDS.index(name)))
             rows = np.flatnonzero(np.asarray(clear))[: share - found]
             kept.append(jax.tree.map(lambda x, rows=rows: np.asarray(x)[rows], starts))
             found += rows.size
@@ -62,7 +62,7 @@ def _candidate(
     from dexsim.env.state import Start
 
     keys = jax.random.split(key, 7)
-    target = sample_object(keys[0], config.objects, shape_index)
+    object = sample_object(keys[0], config.objects, shape_index)
     noise = config.posture_noise * jax.random.uniform(keys[1], (hand.num_joints,), minval=-1.0)
     curl = jax.random.uniform(keys[6], minval=config.curl[0], maxval=config.curl[1])
     flexion = np.zeros(hand.num_joints, np.float32)
@@ -85,12 +85,12 @@ def _candidate(
     up = rotations.rotate_inverse(matrix, jnp.array([-1.0, 0.0, 0.0]))
     gap = jax.random.uniform(keys[3], minval=config.release_gap[0], maxval=config.release_gap[1])
     shift = config.place_noise * jax.random.uniform(keys[4], (2,), minval=-1.0)
-    top = extent(target.size, target.position, target.active, up, target.kinds, target.quat)
+    top = extent(object.size, object.position, object.active, up, object.kinds, object.quat)
     position = jnp.stack([palm_height(hand) + gap + top, reference[1] + shift[0], reference[2] + shift[1]])
     speed = jax.random.uniform(keys[5], minval=config.release_speed[0], maxval=config.release_speed[1])
     qpos = jnp.concatenate([joints, position, quat])
     drift = config.release_drift * jax.random.uniform(jax.random.fold_in(keys[5], 1), (2,), minval=-1.0)
     spin = config.release_spin * jax.random.uniform(jax.random.fold_in(keys[5], 2), (3,), minval=-1.0)
     qvel = jnp.concatenate([jnp.zeros(hand.num_joints), speed[None], drift, spin])
-    start = Start(qpos, qvel, target)
-    return start, clearance(hand, joints, target.shape(), position, matrix) > -_OVERLAP
+    start = Start(qpos=qpos, qvel=qvel, object=object)
+    return start, clearance(hand, joints, object.shape(), position, matrix) > -_OVERLAP

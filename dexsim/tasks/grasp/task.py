@@ -18,7 +18,8 @@ from dexsim.core.pytree import pytree_dataclass
 from dexsim.env.state import Start
 from dexsim.env.task import GroundTruth
 from dexsim.hand.kinematics import Hand, flexion_joints
-from dexsim.objects.params import ObjectParams, sample_object, unit_inertia
+from dexsim.objects import params
+from dexsim.objects.params import ObjectParams
 from dexsim.tasks.grasp.config import GraspConfig, GraspReward
 from dexsim.tasks.grasp.report import summarize
 from dexsim.tasks.grasp.start import make_pool
@@ -110,13 +111,13 @@ class Grasp:
         """Objects released below the palm, between the half-closed fingers."""
         return make_pool(key, self.hand, self.config, self.reference)
 
-    def draw_object(self, key: jax.Array, config: GraspConfig, shape_index: jax.Array | None = None) -> ObjectParams:
+    def sample_object(self, key: jax.Array, config: GraspConfig, shape_index: jax.Array | None = None) -> ObjectParams:
         """One object of `config`, of a random or the given kind (index into SHAPES)."""
-        return sample_object(key, config.objects, shape_index)
+        return params.sample_object(key, config.objects, shape_index)
 
-    def unit_inertia(self, target: ObjectParams) -> jax.Array:
+    def unit_inertia(self, object: ObjectParams) -> jax.Array:
         """Inertia [3] m^2 of the object as a uniform solid of 1 kg."""
-        return unit_inertia(target, self.config.objects)
+        return params.unit_inertia(object, self.config.objects)
 
     def begin(self, key: jax.Array, start: Start) -> Goal:
         del start
@@ -129,17 +130,17 @@ class Grasp:
         return dataclasses.replace(goal, command=jnp.where(change, jax.random.uniform(what), goal.command))
 
     def goal_readings(self, goal: Goal) -> tuple[jax.Array, jax.Array]:
-        """Command and target orientation, as `Readings` carry them."""
+        """Command and goal orientation, as `Readings` carry them."""
         return goal.command, jnp.array([1.0, 0.0, 0.0, 0.0])
 
     def target_force(self, goal: Goal) -> jax.Array:
         return target_force(goal.command, self.config.finger_force)
 
-    def push(self, key: jax.Array, target: ObjectParams) -> jax.Array:
+    def push(self, key: jax.Array, object: ObjectParams) -> jax.Array:
         """Force [3] N that changes the object's velocity by up to `push_speed` in one tick."""
         return random_push(
             key,
-            target.mass,
+            object.mass,
             probability=self.config.push_probability,
             speed=self.config.push_speed,
             period=self.config.physics.control_period,

@@ -32,7 +32,7 @@ def largest_size(config: Any) -> np.ndarray:
     return np.full((len(KINDS[config.object]), 3), half)
 
 
-def sample_target(key: jax.Array, config: Any) -> ObjectParams:
+def sample_turned_object(key: jax.Array, config: Any) -> ObjectParams:
     """Draw one object."""
     if config.object == "mesh":
         return sample_object(key, config.objects)
@@ -87,8 +87,8 @@ def unit_inertia(name: str, half: jax.Array) -> jax.Array:
     return jnp.stack([radius**2 / 2, across, across])
 
 
-def lowest_point(target: ObjectParams, quat: jax.Array, position: jax.Array) -> jax.Array:
+def lowest_point(object: ObjectParams, quat: jax.Array, position: jax.Array) -> jax.Array:
     """Smallest coordinate [] m of the object along the palm's normal (x)."""
     down = rotations.rotate_inverse(rotations.quat_to_matrix(quat), jnp.array([-1.0, 0.0, 0.0]))
-    reach = extent(target.size, target.position, target.active, down, target.kinds, target.quat)
+    reach = extent(object.size, object.position, object.active, down, object.kinds, object.quat)
     return position[0] - reach

@@ -31,7 +31,7 @@ from dexsim.objects.params import ObjectParams
 from dexsim.physics import contact
 from dexsim.physics.model import build_model, tip_bodies
 from dexsim.tasks.placement import clearance, palm_height
-from dexsim.tasks.rotate.objects import largest_size, lowest_point, sample_target, slots
+from dexsim.tasks.rotate.objects import largest_size, lowest_point, sample_turned_object, slots
 
 _TRIALS = 300  # rounds of candidates in which every object should find a posture
 _VERSION = 4  # of the procedure: raise it when older pools no longer hold
@@ -48,14 +48,15 @@ def load_pool(key: jax.Array, hand: Hand, config: Any, gravity: tuple[float, flo
     from dexsim.env.state import Start
 
     path = cache_path("pools") / f"rotate-{_fingerprint(key, hand, config)}.npz"
-    template = jax.eval_shape(lambda: sample_target(key, config))
+    template = jax.eval_shape(lambda: sample_turned_object(key, config))
     leaves, structure = jax.tree.flatten(template)
     stored = _read(path, len(leaves))
     if stored is None:
         stored = _make(key, hand, config, gravity)
         _write(path, stored)
     qpos, qvel, joint_target, *rows = stored
-    return Start(qpos, qvel, jax.tree.unflatten(structure, rows), joint_target)
+    object = jax.tree.unflatten(structure, rows)
+    return Start(qpos=qpos, qvel=qvel, object=object, joint_target=joint_target)
 
 
 def _fingerprint(key: jax.Array, hand: Hand, config: Any) -> str:
@@ -108,24 +109,26 @@ def _write(path: Path, arrays: list[np.ndarray]) -> None:
 
 
 def _make(key: jax.Array, hand: Hand, config: Any, gravity: tuple[float, float, float]) -> list[np.ndarray]:
-    """A start state for each of `pool_size` objects: qpos, qvel, joint targets, object leaves.
+    """A start state for each of `pool_size` objects: qpos, qvel, joint objects, object leaves.
 
     Objects are drawn first, and each is tried in posture after posture until it stays: large ones fit into few, and
     where whatever stays is kept they are all but left out.
     """
     size, chunk, threads = config.pool_size, 1024, min(os.cpu_count() or 1, 16)
     object_key, key = jax.random.split(key)
-    targets = jax.device_get(jax.jit(jax.vmap(lambda k: sample_target(k, config)))(jax.random.split(object_key, size)))
-    draw = jax.jit(jax.vmap(lambda k, target: _candidate(k, target, hand, config)))
+    objects = jax.device_get(
+        jax.jit(jax.vmap(lambda k: sample_turned_object(k, config)))(jax.random.split(object_key, size))
+    )
+    sample = jax.jit(jax.vmap(lambda k, object: _candidate(k, object, hand, config)))
     starts, waiting, tried = {}, np.arange(size), 0
     with ThreadPoolExecutor(threads) as pool:
         models = [_model(hand, config, gravity) for _ in range(threads)]
         for trial in range(_TRIALS):
             which = np.resize(waiting, chunk)
             candidates = jax.device_get(
-                draw(
+                sample(
                     jax.random.split(jax.random.fold_in(key, trial), chunk),
-                    jax.tree.map(lambda leaf, which=which: leaf[which], targets),
+                    jax.tree.map(lambda leaf, which=which: leaf[which], objects),
                 )
             )
             rows = np.flatnonzero(candidates["clear"])
@@ -133,7 +136,7 @@ def _make(key: jax.Array, hand: Hand, config: Any, gravity: tuple[float, float, 
             settle = functools.partial(_settle, hand=hand, config=config, candidates=candidates)
             settled = list(pool.map(settle, models, [rows[i::threads] for i in range(threads)]))
             good, qpos = (np.concatenate(x) for x in zip(*settled, strict=True))
-            for k in _clear_of_palm(hand, config, candidates["target"], good, qpos):
+            for k in _clear_of_palm(hand, config, candidates["object"], good, qpos):
                 starts[which[good[k]]] = qpos[k], candidates["joint_target"][good[k]]
             waiting, tried = np.setdiff1d(waiting, list(starts)), tried + len(rows)
             if not len(waiting) or tried > 1000 and len(starts) < tried / 200:
@@ -150,11 +153,11 @@ def _make(key: jax.Array, hand: Hand, config: Any, gravity: tuple[float, float, 
         np.stack([starts[k][0] for k in chosen]),
         np.zeros((size, hand.num_joints + 6), np.float32),
         np.stack([starts[k][1] for k in chosen]),
-        *(leaf[chosen] for leaf in jax.tree.leaves(targets)),
+        *(leaf[chosen] for leaf in jax.tree.leaves(objects)),
     ]
 
 
-def _candidate(key: jax.Array, target: ObjectParams, hand: Hand, config: Any) -> dict[str, Any]:
+def _candidate(key: jax.Array, object: ObjectParams, hand: Hand, config: Any) -> dict[str, Any]:
     """This object just above where it will rest, in a random posture."""
     keys = jax.random.split(key, 5)
     noise = config.posture_noise * jax.random.uniform(keys[0], (hand.num_joints,), minval=-1.0)
@@ -167,9 +170,9 @@ def _candidate(key: jax.Array, target: ObjectParams, hand: Hand, config: Any) ->
     shift = config.place_noise * jax.random.uniform(keys[2], (2,), minval=-1.0)
     place = jnp.asarray(config.reference).at[1:].add(jnp.asarray(config.start_offset) + shift)
     if config.support == "palm":
-        floor = palm_height(hand) + 0.001 - lowest_point(target, quat, jnp.zeros(3))
+        floor = palm_height(hand) + 0.001 - lowest_point(object, quat, jnp.zeros(3))
         place = place.at[0].set(floor)
-    overlap = clearance(hand, joints, target.shape(), place, rotations.quat_to_matrix(quat))
+    overlap = clearance(hand, joints, object.shape(), place, rotations.quat_to_matrix(quat))
     squeeze = jax.random.uniform(keys[4], minval=config.squeeze[0], maxval=config.squeeze[1])
     closed = np.array(flexion)
     closed[flexion_joints(hand, range(1))] = 1.0
@@ -177,7 +180,7 @@ def _candidate(key: jax.Array, target: ObjectParams, hand: Hand, config: Any) ->
     return {
         "qpos": jnp.concatenate([joints, place, quat]),
         "joint_target": joint_target,
-        "target": target,
+        "object": object,
         "clear": overlap > -0.001,
     }
 
@@ -197,8 +200,8 @@ def _settle(
     model: mujoco.MjModel, rows: np.ndarray, *, hand: Hand, config: Any, candidates: dict[str, Any]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Rows that came to rest where they belong, and their qpos."""
-    data, target = mujoco.MjData(model), candidates["target"]
-    geoms = [model.geom(f"object_{k}").id for k in range(len(target.kinds))]
+    data, object = mujoco.MjData(model), candidates["object"]
+    geoms = [model.geom(f"object_{k}").id for k in range(len(object.kinds))]
     body = model.body("object").id
     springs = [model.joint(name).qposadr[0] for name in hand.joint_names]
     pairs = contact.pairs_with(model, np.array(geoms))
@@ -206,13 +209,13 @@ def _settle(
     ticks = max(round(config.settle_seconds / model.opt.timestep), 1)
     good, kept = [], []
     for row in rows:
-        model.geom_size[geoms] = target.size[row]
-        model.geom_pos[geoms] = target.position[row]
-        if target.quat is not None:
-            model.geom_quat[geoms] = target.quat[row]
-        model.body_mass[body], model.body_inertia[body] = target.mass[row], target.inertia[row]
-        model.body_ipos[body] = target.com[row]
-        slide = np.where(rubber, target.friction[row], target.link_friction[row])
+        model.geom_size[geoms] = object.size[row]
+        model.geom_pos[geoms] = object.position[row]
+        if object.quat is not None:
+            model.geom_quat[geoms] = object.quat[row]
+        model.body_mass[body], model.body_inertia[body] = object.mass[row], object.inertia[row]
+        model.body_ipos[body] = object.com[row]
+        slide = np.where(rubber, object.friction[row], object.link_friction[row])
         model.pair_friction[pairs, :2] = slide[:, None]
         mujoco.mj_resetData(model, data)
         data.qpos[:] = candidates["qpos"][row]
@@ -224,11 +227,11 @@ def _settle(
     return np.array(good, int), np.reshape(np.array(kept, np.float32), (len(kept), model.nq))
 
 
-def _clear_of_palm(hand: Hand, config: Any, target: ObjectParams, rows: np.ndarray, qpos: np.ndarray) -> np.ndarray:
+def _clear_of_palm(hand: Hand, config: Any, object: ObjectParams, rows: np.ndarray, qpos: np.ndarray) -> np.ndarray:
     """Which of these rows, by their place in `rows`, are no drop from the beginning, where touching the palm is one."""
     if config.support == "palm" or not len(rows):
         return np.arange(len(rows))
-    low = jax.vmap(lowest_point)(jax.tree.map(lambda leaf: leaf[rows], target), qpos[:, -4:], qpos[:, -7:-4])
+    low = jax.vmap(lowest_point)(jax.tree.map(lambda leaf: leaf[rows], object), qpos[:, -4:], qpos[:, -7:-4])
     return np.flatnonzero(np.asarray(low) > palm_height(hand) + config.clearance)
 
 

@@ -25,7 +25,7 @@ from dexsim.objects.config import BULK_RANGES, MESH_RANGES
 from dexsim.objects.params import ObjectParams
 from dexsim.tasks.placement import palm_height
 from dexsim.tasks.rotate.config import RotateConfig, RotateReward
-from dexsim.tasks.rotate.objects import largest_size, lowest_point, sample_target, slots, unit_inertia
+from dexsim.tasks.rotate.objects import largest_size, lowest_point, sample_turned_object, slots, unit_inertia
 from dexsim.tasks.rotate.report import summarize
 from dexsim.tasks.rotate.start import load_pool
 from dexsim.tasks.terms import action_rate, joint_speed, random_push
@@ -37,7 +37,7 @@ _RECENT = 0.2  # s, a fingertip that touched within this time before a drop push
 
 @pytree_dataclass
 class Goal:
-    """The target, and what has happened since the episode began."""
+    """The goal, and what has happened since the episode began."""
 
     turns: jax.Array  # [] int32 goals reached
     entered: jax.Array  # [] bool, inside the paper's window since this goal was set
@@ -56,7 +56,7 @@ class Goal:
 class Progress:
     """What a tick did for the goal."""
 
-    angle: jax.Array  # [] rad, from the target orientation
+    angle: jax.Array  # [] rad, from the goal orientation
     distance: jax.Array  # [] m, from the reference
     spin: jax.Array  # [] rad/s about the axis, positive in the wanted direction
     entered: jax.Array  # [] bool
@@ -116,16 +116,16 @@ class Rotate:
         """Objects that came to rest in random postures of the hand; see `rotate_start`."""
         return load_pool(key, self.hand, self.config, self.gravity)
 
-    def draw_object(self, key: jax.Array, config: RotateConfig, shape_index: jax.Array | None = None) -> ObjectParams:
+    def sample_object(self, key: jax.Array, config: RotateConfig, shape_index: jax.Array | None = None) -> ObjectParams:
         """One object of `config`; there is only one kind."""
         del shape_index
-        return sample_target(key, config)
+        return sample_turned_object(key, config)
 
-    def unit_inertia(self, target: ObjectParams) -> jax.Array:
+    def unit_inertia(self, object: ObjectParams) -> jax.Array:
         """Inertia [3] m^2 of the object as a uniform solid of 1 kg."""
         if self.config.object == "mesh":
-            return params.unit_inertia(target, self.config.objects)
-        return unit_inertia(self.config.object, target.size[0, 0])
+            return params.unit_inertia(object, self.config.objects)
+        return unit_inertia(self.config.object, object.size[0, 0])
 
     def begin(self, key: jax.Array, start: Start) -> Goal:
         del key, start
@@ -188,7 +188,7 @@ class Rotate:
         )
 
     def goal_readings(self, goal: Goal) -> tuple[jax.Array, jax.Array]:
-        """Command (unused) and target orientation, as `Readings` carry them."""
+        """Command (unused) and goal orientation, as `Readings` carry them."""
         return jnp.zeros(()), self._quat(goal)
 
     def target_force(self, goal: Goal) -> jax.Array:
@@ -196,11 +196,11 @@ class Rotate:
         del goal
         return jnp.zeros(())
 
-    def push(self, key: jax.Array, target: ObjectParams) -> jax.Array:
+    def push(self, key: jax.Array, object: ObjectParams) -> jax.Array:
         """Force [3] N that changes the object's velocity by up to `push_speed` in one tick."""
         return random_push(
             key,
-            target.mass,
+            object.mass,
             probability=self.config.push_probability,
             speed=self.config.push_speed,
             period=self._period,
@@ -210,7 +210,7 @@ class Rotate:
         away = jnp.linalg.norm(truth.object_position - jnp.asarray(self.reference))
         lost = (away > self.config.drop_distance) | (self._tilt(truth) > self.config.drop_tilt)
         if self.config.support == "fingers":
-            low = lowest_point(truth.target, truth.object_quat, truth.object_position)
+            low = lowest_point(truth.object, truth.object_quat, truth.object_position)
             lost |= low < self._palm + self.config.clearance
         hopeless = (away > self.config.drop_radius) | (goal.clock - goal.last_success > self.config.patience)
         return lost | (goal.gives_up & hopeless)

@@ -9,13 +9,13 @@ import mujoco
 import numpy as np
 import pytest
 from c_scene import skin_law
+from episodes import with_episode
 
 import dexsim
 from dexsim import observation
 from dexsim.control import Control
 from dexsim.core.errors import ConfigError
 from dexsim.env.config import EnvConfig
-from dexsim.env.senses import EpisodeSensors
 from dexsim.geometry import rotations
 from dexsim.hand.kinematics import forward_kinematics, taxel_positions
 from dexsim.objects.config import SHAPES, SLOTS, ObjectConfig
@@ -52,18 +52,20 @@ def assert_same(first, second, rows=slice(None)):
         np.testing.assert_array_equal(ours[path][rows], theirs[path][rows], err_msg=path)
 
 
-def placed(rollout, seed, qpos, qvel, target, joint_target=None):
+def placed(rollout, seed, qpos, qvel, object, joint_target=None):
     """A reset batch with its hands and objects put elsewhere."""
     state = rollout.reset(jax.random.key(seed))
     qpos, qvel = jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32)
-    sample = dataclasses.replace(
-        state.sample, joint_position=qpos[:, :12], object_position=qpos[:, 12:15], object_quat=qpos[:, 15:]
+    sensor_input = dataclasses.replace(
+        state.sensor_input, joint_position=qpos[:, :12], object_position=qpos[:, 12:15], object_quat=qpos[:, 15:]
+    )
+    state = with_episode(
+        state, object=jax.tree.map(lambda new, old: jnp.asarray(new, old.dtype), object, state.episode.object)
     )
     return dataclasses.replace(
         state,
         physics=PhysicsState(qpos, qvel, jnp.zeros((WORLDS, 18))),
-        sample=sample,
-        target=jax.tree.map(lambda new, old: jnp.asarray(new, old.dtype), target, state.target),
+        sensor_input=sensor_input,
         joint_target=qpos[:, :12] if joint_target is None else jnp.asarray(joint_target, jnp.float32),
     )
 
@@ -99,8 +101,8 @@ class TestPure:
         first, again, other = (grasp_rollout.reset(jax.random.key(seed)) for seed in (1, 1, 2))
         assert_same(first, again)
         assert not np.array_equal(first.physics.qpos, other.physics.qpos)
-        assert not np.array_equal(first.draw.encoder_bias, other.draw.encoder_bias)
-        assert len(np.unique(first.draw.encoder_bias[:, 0])) == WORLDS
+        assert not np.array_equal(first.episode.hand.encoder_bias, other.episode.hand.encoder_bias)
+        assert len(np.unique(first.episode.hand.encoder_bias[:, 0])) == WORLDS
 
     def test_keys_advance(self, history):
         data = [np.asarray(jax.random.key_data(state.key)) for state, _, _ in history]
@@ -154,19 +156,19 @@ class TestTick:
         pool, config = grasp_env.pool, grasp_env.config
         rows = np.concatenate([c_scene.rows_of(pool, shape)[:4] for shape in ("sphere", "capsule")])
         starts = c_scene.row(pool, rows)
-        state = placed(grasp_rollout, 11, starts.qpos, starts.qvel, starts.target)
+        state = placed(grasp_rollout, 11, starts.qpos, starts.qvel, starts.object)
         for _ in range(8):
             state = grasp_rollout.step(state, jnp.ones((WORLDS, 12)) * (np.arange(12) > 3))
         action = actions(3)
         after = grasp_rollout.step(state, action)
         push = jax.vmap(lambda key, target: grasp_env.task.push(jax.random.split(key, 4)[1], target))(
-            state.key, state.target
+            state.key, state.episode.object
         )
 
         strong, close = 0, []
-        skin = np.asarray(skin_law(hand, config.skin)(state.physics.qpos, state.target))
+        skin = np.asarray(skin_law(hand, config.skin)(state.physics.qpos, state.episode.object))
         for world in range(WORLDS):
-            target = c_scene.row(state.target, world)
+            target = c_scene.row(state.episode.object, world)
             model = c_scene.compile_scene(hand, target, **c_scene.CONVERGED)
             data = c_scene.start(
                 model,
@@ -178,9 +180,9 @@ class TestTick:
             new = old + config.control.step * np.clip(np.asarray(action[world]), -1, 1)
             new = np.clip(new, q - config.control.reach, q + config.control.reach)
             new = np.clip(new, hand.joint_lower, hand.joint_upper)
-            drive, latency = c_scene.row(state.draw.actuator, world), np.asarray(state.draw.latency[world])
+            drawn = c_scene.row(state.episode.hand, world)
+            drive, latency, tilt = drawn.actuator, drawn.latency, drawn.tilt
             inertia_rate = model.dof_M0[:12] / model.opt.timestep
-            tilt = np.asarray(state.draw.tilt[world])
             down = np.array([1.0, -np.tan(tilt[1]), np.tan(tilt[0])])
             force = target.mass * 9.81 * (down / np.linalg.norm(down) - [1.0, 0, 0])
             data.xfrc_applied[model.body("object").id, :3] = force + np.asarray(push[world])
@@ -203,12 +205,12 @@ class TestTick:
         _, _, after = history[5]
         for world in range(WORLDS):
             torque = plain_drive(
-                c_scene.row(after.draw.actuator, world),
+                c_scene.row(after.episode.hand.actuator, world),
                 np.asarray(after.joint_target[world]),
                 np.asarray(after.physics.qpos[world, :12]),
                 np.asarray(after.physics.qvel[world, :12]),
             )
-            np.testing.assert_allclose(after.sample.joint_torque[world] * hand.torque_limit, torque, atol=2e-5)
+            np.testing.assert_allclose(after.sensor_input.joint_torque[world] * hand.torque_limit, torque, atol=2e-5)
 
     @pytest.mark.parametrize("factor", [1.0, 3.0])
     def test_actions_are_clipped(self, grasp_rollout, history, factor):
@@ -301,17 +303,18 @@ class TestEpisodes:
         assert all(tuple(q) in pool for q in ours[".physics.qpos"][done])
         for name in ("tick", "length", "episode_return", "reward"):
             assert not np.any(ours["." + name][done]), name
-        assert np.any(ours[".draw.encoder_bias"][done] != before[".draw.encoder_bias"][done])
+        assert np.any(ours[".episode.hand.encoder_bias"][done] != before[".episode.hand.encoder_bias"][done])
         np.testing.assert_array_equal(begun.joint_target[done], begun.physics.qpos[done, :12])
         # The object goes with its start.
         at = np.flatnonzero((np.asarray(grasp_env.pool.qpos) == ours[".physics.qpos"][0]).all(1))[0]
-        np.testing.assert_array_equal(begun.target.size[0], grasp_env.pool.target.size[at])
+        np.testing.assert_array_equal(begun.episode.object.size[0], grasp_env.pool.object.size[at])
 
     def test_restarts_differ(self, grasp_rollout, history):
         state, everyone = history[-1][2], jnp.ones(WORLDS, bool)
         first = grasp_rollout.restart(state, everyone)
         second = grasp_rollout.restart(first, everyone)
-        assert np.all(np.any(np.asarray(first.draw.encoder_bias) != np.asarray(second.draw.encoder_bias), axis=-1))
+        biases = [np.asarray(begun.episode.hand.encoder_bias) for begun in (first, second)]
+        assert np.all(np.any(biases[0] != biases[1], axis=-1))
 
     def test_stagger(self, grasp_env, history):
         state = history[0][0]
@@ -331,7 +334,7 @@ class TestEpisodes:
         starts = jax.jit(lambda key: grasp_env.evaluation_starts(key, 50))(jax.random.key(0))
         assert np.all(np.asarray(starts.goal.fixed))
         np.testing.assert_allclose(starts.goal.command, np.tile(np.float32(COMMANDS), 10))
-        assert np.bincount(starts.target.shape_index).tolist() == [10] * 5
+        assert np.bincount(starts.episode.object.shape_index).tolist() == [10] * 5
         rows = {tuple(q) for q in np.asarray(grasp_env.pool.qpos)}
         assert all(tuple(q) in rows for q in np.asarray(starts.physics.qpos))
 
@@ -344,16 +347,16 @@ class TestTrouble:
         speeds that are finite, but not of this world.
         """
         state, action, following = history[3]
-        target = dataclasses.replace(state.target, mass=state.target.mass.at[2].set(jnp.nan))
+        object = dataclasses.replace(state.episode.object, mass=state.episode.object.mass.at[2].set(jnp.nan))
         motors = dataclasses.replace(
-            state.draw.actuator,
+            state.episode.hand.actuator,
             **{
-                name: getattr(state.draw.actuator, name).at[5].set(value)
+                name: getattr(state.episode.hand.actuator, name).at[5].set(value)
                 for name, value in (("stiffness", 1e3), ("stall_torque", 1e3), ("no_load_speed", 1e30))
             },
         )
         after = grasp_rollout.step(
-            dataclasses.replace(state, target=target, draw=dataclasses.replace(state.draw, actuator=motors)), action
+            with_episode(state, object=object, hand=dataclasses.replace(state.episode.hand, actuator=motors)), action
         )
         bad, good = np.array([2, 5]), np.array([0, 1, 3, 4, 6, 7])
         assert np.all(after.terminated[bad]) and not np.any(after.truncated[bad])
@@ -416,8 +419,10 @@ class TestReadings:
         np.testing.assert_allclose(fields["joint_position"], after.physics.qpos[:, :12], atol=1e-6)
         np.testing.assert_allclose(fields["object_position"], after.physics.qpos[:, 12:15], atol=1e-6)
         np.testing.assert_allclose(fields["object_velocity"], after.physics.qvel[:, 12:15], atol=1e-6)
-        np.testing.assert_allclose(fields["joint_torque"], after.sample.joint_torque, atol=1e-6)
-        np.testing.assert_allclose(fields["contact_force"], after.sample.taxel_force.sum(-1), rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(fields["joint_torque"], after.sensor_input.joint_torque, atol=1e-6)
+        np.testing.assert_allclose(
+            fields["contact_force"], after.sensor_input.taxel_force.sum(-1), rtol=1e-5, atol=1e-5
+        )
         tips = jax.vmap(lambda q: forward_kinematics(hand, q).tip_position)(after.physics.qpos[:, :12])
         np.testing.assert_allclose(fields["fingertip_position"], tips.reshape(WORLDS, 15), atol=1e-6)
         np.testing.assert_allclose(fields["command"][:, 0], after.goal.command)
@@ -436,9 +441,9 @@ class TestReadings:
             for x in zip(
                 *(
                     (
-                        before.sample.joint_position,
-                        after.sample.joint_position,
-                        after.readings.joint_position - after.draw.encoder_bias,
+                        before.sensor_input.joint_position,
+                        after.sensor_input.joint_position,
+                        after.readings.joint_position - after.episode.hand.encoder_bias,
                     )
                     for before, after in ((s, f) for s, _, f in history)
                 ),
@@ -447,20 +452,20 @@ class TestReadings:
         )
         change = old - new
         age = np.sum((read - new) * change, axis=(0, 2)) / np.sum(change**2, axis=(0, 2))
-        wanted = np.asarray(history[0][0].draw.sensing_latency)
+        wanted = np.asarray(history[0][0].episode.hand.sensing_latency)
         assert np.ptp(wanted) > 0.2
         np.testing.assert_allclose(age, wanted, atol=0.03)
 
     def test_noise_has_the_size_that_is_configured(self, grasp_env, history):
         sensing, errors, places = grasp_env.config.sensing, [], []
         for before, _, after in history:
-            age = np.asarray(after.draw.sensing_latency)[:, None]
+            age = np.asarray(after.episode.hand.sensing_latency)[:, None]
             for name, into in (("joint_position", errors), ("object_position", places)):
-                mixed = (1 - age) * np.asarray(getattr(after.sample, name)) + age * np.asarray(
-                    getattr(before.sample, name)
+                mixed = (1 - age) * np.asarray(getattr(after.sensor_input, name)) + age * np.asarray(
+                    getattr(before.sensor_input, name)
                 )
                 into.append(np.asarray(getattr(after.readings, name)) - mixed)
-        bias = np.asarray(history[0][0].draw.encoder_bias)
+        bias = np.asarray(history[0][0].episode.hand.encoder_bias)
         errors = np.stack(errors) - bias
         assert np.std(errors) == pytest.approx(sensing.joint_noise, rel=0.1)
         assert abs(np.mean(errors)) < sensing.joint_noise / 5
@@ -505,12 +510,12 @@ class TestReadings:
         np.testing.assert_array_equal(state.readings.taxel_force, np.zeros((5, 120)))
         # A pressed moment goes through the same door.
         force = jnp.zeros((5, 120)).at[2, 40:44].set(jnp.array([0.013, 0.4, 1.26, 0.02]))
-        sample = dataclasses.replace(state.sample, taxel_force=force, joint_torque=jnp.linspace(-1, 1, 12))
+        pressed = dataclasses.replace(state.sensor_input, taxel_force=force, joint_torque=jnp.linspace(-1, 1, 12))
         readings, _ = env.senses.read(
-            jax.random.key(1), sample, state.sample, EpisodeSensors.of(state), state.goal, jnp.zeros(12)
+            jax.random.key(1), state.episode, pressed, env.task.goal_readings(state.goal), jnp.zeros(12)
         )
         np.testing.assert_array_equal(readings.taxel_force, force)
-        np.testing.assert_array_equal(readings.joint_torque, sample.joint_torque)
+        np.testing.assert_array_equal(readings.joint_torque, pressed.joint_torque)
 
 
 @pytest.fixture(scope="module")
@@ -525,8 +530,8 @@ def grips(hand, grasp_env, grasp_rollout):
         held = []
         for pool_row in c_scene.rows_of(grasp_env.pool, shape):
             start = c_scene.row(grasp_env.pool, pool_row)
-            exact = bool(start.target.active[SLOTS.index("cylinder")])
-            model = c_scene.compile_scene(hand, start.target, exact=exact)
+            exact = bool(start.object.active[SLOTS.index("cylinder")])
+            model = c_scene.compile_scene(hand, start.object, exact=exact)
             data = c_scene.start(model, start.qpos, 0 * start.qvel)
             close = rng.uniform(0.5, 1.0, 12) * (np.arange(12) > 3)
             close[1:3] = rng.uniform(0.3, 1.0, 2)
@@ -549,7 +554,7 @@ def grips(hand, grasp_env, grasp_rollout):
             part = held[begin : begin + WORLDS]
             rows, *values = zip(*(part * WORLDS)[:WORLDS], strict=True)
             qpos, qvel, wanted = (np.stack(value) for value in values)
-            target = c_scene.row(grasp_env.pool.target, list(rows))
+            target = c_scene.row(grasp_env.pool.object, list(rows))
             state = placed(grasp_rollout, begin, qpos, qvel, target, wanted)
             for _ in range(8):
                 state = grasp_rollout.step(state, jnp.zeros((WORLDS, 12)))
@@ -563,7 +568,7 @@ def skin_pairs(hand, env, states):
     pairs = []
     for state, count in states:
         usable = ~np.asarray(state.terminated) & (np.arange(WORLDS) < count)
-        felt = law(state.physics.qpos, state.target)
+        felt = law(state.physics.qpos, state.episode.object)
         pairs.append(np.stack([np.asarray(state.finger_force), np.asarray(felt)])[:, usable])
     return np.concatenate(pairs, 1)
 
@@ -591,11 +596,11 @@ class TestTouch:
         """
         pressed, total, friction = [], [], []
         for after, count in [batch for shape in SHAPES for batch in grips[shape]]:
-            felt = np.asarray(after.sample.taxel_force.sum(-1))[:count]
+            felt = np.asarray(after.sensor_input.taxel_force.sum(-1))[:count]
             force = np.asarray(after.finger_force)[:count]
             use = felt > 0.1
             pressed, total = [*pressed, *felt[use]], [*total, *force[use]]
-            friction += [*np.broadcast_to(np.asarray(after.target.friction)[:count, None], force.shape)[use]]
+            friction += [*np.broadcast_to(np.asarray(after.episode.object.friction)[:count, None], force.shape)[use]]
         pressed, total, friction = np.array(pressed), np.array(total), np.array(friction)
         assert len(pressed) > 150
         assert np.all(pressed <= total * (1 + 1e-4))
@@ -613,7 +618,7 @@ class TestTouch:
         speck = np.full(3, 1e-4)
         inertia = mass[:, None] / 3 * (np.sum(half**2) - half**2)
         target = dataclasses.replace(
-            grasp_rollout.reset(jax.random.key(0)).target,
+            grasp_rollout.reset(jax.random.key(0)).episode.object,
             shape_index=np.full(WORLDS, SHAPES.index("box")),
             size=np.tile(np.stack([half, speck, speck]), (WORLDS, 1, 1)),
             position=np.zeros((WORLDS, 3, 3)),
@@ -627,8 +632,8 @@ class TestTouch:
         fist = np.array([0, 0, 0, 0, *[1.57] * 8])
         qpos = np.tile([*fist, 0.039, -0.005, 0.0795, 1, 0, 0, 0], (WORLDS, 1))
         state = placed(grasp_rollout, 0, qpos, np.zeros((WORLDS, 18)), target)
-        level = dataclasses.replace(state.draw, tilt=jnp.zeros((WORLDS, 2)))
-        state, still = dataclasses.replace(state, draw=level), state.key
+        level = dataclasses.replace(state.episode.hand, tilt=jnp.zeros((WORLDS, 2)))
+        state, still = with_episode(state, hand=level), state.key
         for _ in range(40):  # the same chance in every tick: one without a push
             state = grasp_rollout.step(dataclasses.replace(state, key=still), jnp.zeros((WORLDS, 12)))
         assert np.all(np.linalg.norm(state.physics.qvel[:, 12:15], axis=1) < 0.015), "still moving"
@@ -643,7 +648,7 @@ class TestTouch:
 
         weight = mass * 9.81
         np.testing.assert_allclose(np.sum(state.finger_force, -1), weight, rtol=0.05)
-        np.testing.assert_allclose(np.sum(state.sample.taxel_force, (-1, -2)), weight, rtol=0.05)
+        np.testing.assert_allclose(np.sum(state.sensor_input.taxel_force, (-1, -2)), weight, rtol=0.05)
         assert np.all(np.asarray(state.finger_force)[:, 0] == 0)
         assert np.all(np.asarray(state.finger_force)[:, 1:] > 0.05 * weight[:, None])
 
@@ -651,7 +656,7 @@ class TestTouch:
     def test_the_gradient_of_touch(self, hand, grasp_env, grips, shape):
         """d(skin force)/d(object pose) against central differences, in float64."""
         after = grips[shape][0][0]
-        total = np.asarray(after.sample.taxel_force.sum((-1, -2)))
+        total = np.asarray(after.sensor_input.taxel_force.sum((-1, -2)))
         worlds = np.argsort(total)[-2:]
         assert np.all(total[worlds] > 0.5)
         area, skin = jnp.asarray(hand.taxel_area), grasp_env.config.skin
@@ -672,7 +677,7 @@ class TestTouch:
                 taxels = taxel_positions(hand, forward_kinematics(hand, joints))
                 target = jax.tree.map(
                     lambda x: jnp.asarray(x, jnp.float64) if x.dtype == np.float32 else jnp.asarray(x),
-                    c_scene.row(after.target, world),
+                    c_scene.row(after.episode.object, world),
                 )
                 shape = target.shape()
                 place = np.asarray(after.physics.qpos[world, 12:], np.float64)
@@ -699,7 +704,7 @@ class TestTouch:
             touch = feel(
                 taxels,
                 jnp.asarray(hand.taxel_area),
-                world.target.shape(),
+                world.episode.object.shape(),
                 position,
                 rotations.quat_to_matrix(world.physics.qpos[15:]),
                 world.finger_force,

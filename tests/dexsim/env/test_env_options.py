@@ -7,12 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from episodes import ground_truth
 from simple_physics import SimplePhysics
 
 import dexsim
 from dexsim import observation
 from dexsim.core.errors import ConfigError
-from dexsim.env.senses import EpisodeSensors
 from dexsim.geometry import rotations
 from dexsim.hand.kinematics import forward_kinematics, taxel_normals
 from dexsim.objects.config import ObjectConfig
@@ -20,7 +20,7 @@ from dexsim.observation import ObservationConfig
 from dexsim.randomization import Randomization
 from dexsim.randomization_check.effects import check
 from dexsim.sensing.config import Sensing
-from dexsim.sensing.imu import OrientationSensor
+from dexsim.sensing.imu import ImuConfig
 from dexsim.sensing.taxels import TaxelSensor
 from dexsim.tasks.grasp.config import GraspConfig
 from dexsim_ppo.train import parse_arguments
@@ -40,7 +40,7 @@ QUIET = Sensing(
     joint_resolution=0.0,
     torque_noise=0.0,
     object_noise=0.0,
-    orientation=OrientationSensor(noise=0.0, bias=0.0, drift=0.0, delay=(0.0, 0.0)),
+    orientation=ImuConfig(noise=0.0, bias=0.0, drift=0.0, delay=(0.0, 0.0)),
     taxel=QUIET_TAXELS,
 )
 
@@ -103,12 +103,12 @@ def reads(env, state, forces, key=None):
     """Readings of taxel forces tick by tick, and the state with the memory after them."""
     seen = []
     for tick, force in enumerate(forces):
-        sample = dataclasses.replace(state.sample, taxel_force=force)
+        pressed = dataclasses.replace(state.sensor_input, taxel_force=force)
+        before = dataclasses.replace(state, sensor_input=pressed)
         tick_key = jax.random.fold_in(jax.random.key(9) if key is None else key, tick)
-        readings, array = env.senses.read(
-            tick_key, sample, sample, EpisodeSensors.of(state), state.goal, jnp.zeros(12), state
-        )
-        state = dataclasses.replace(state, array=array, readings=readings)
+        goal = env.task.goal_readings(state.goal)
+        readings, memory = env.senses.read(tick_key, state.episode, pressed, goal, jnp.zeros(12), before)
+        state = dataclasses.replace(state, taxel_memory=memory, readings=readings)
         seen.append(np.asarray(readings.taxel_force))
     return seen, state
 
@@ -118,11 +118,11 @@ def test_a_tilt_that_the_host_does_not_know_turns_what_its_imu_says(make):
     env = make(randomization=Randomization(gravity_tilt=0.1))
     for key in jax.random.split(jax.random.key(0), 4):
         state = env.reset(key)
-        push = np.asarray(env._tilt_force(state.draw, state.target)) / float(state.target.mass)
+        push = np.asarray(env.sampler.tilt_force(state.episode)) / float(state.episode.object.mass)
         true_up = -(np.array([9.81, 0.0, 0.0]) + push)
         true_up /= np.linalg.norm(true_up)
         assert 0.005 < np.arccos(-true_up[0]) < 0.15
-        error = np.asarray(state.orientation_sensor.bias)
+        error = np.asarray(state.episode.imu.bias)
         angle = np.linalg.norm(error)
         seen = rotations.rotate(
             rotations.quat_to_matrix(rotations.axis_angle_to_quat(jnp.asarray(error / angle), jnp.asarray(angle))),
@@ -136,14 +136,12 @@ def test_taxels_feel_no_friction(make):
     env = make()
     state = env.reset(jax.random.key(1))
     force = jnp.asarray(np.random.default_rng(0).normal(size=(5, 3)), jnp.float32)
-    zero = jnp.zeros(12)
     qpos = state.physics.qpos
     pose = forward_kinematics(env.hand, qpos[:12])
     # The object where the first finger's pad is.
     at = pose.body_position[env.hand.tip_body[1]]
-    truth = env._ground_truth(
-        dataclasses.replace(state.physics, qpos=qpos.at[12:15].set(at)), state.target, zero, zero, zero, force
-    )
+    physics = dataclasses.replace(state.physics, qpos=qpos.at[12:15].set(at))
+    truth = ground_truth(env, state.episode.object, physics, force)
     felt, normals = np.asarray(truth.touch.force[1]), np.asarray(taxel_normals(env.hand, pose))[1]
     skin = np.asarray(truth.touch.skin_force[1])
     inward = -(skin[:, None] * normals).sum(0)
@@ -158,15 +156,15 @@ class TestTaxels:
 
     def test_off_by_default_and_then_not_there(self, make):
         state = jax.eval_shape(make(Sensing()).reset, jax.random.key(0))
-        assert not jax.tree.leaves((state.array, state.array_params))
+        assert not jax.tree.leaves((state.taxel_memory, state.episode.taxels))
 
     def test_gains_are_drawn_anew_for_an_episode_and_stay_in_it(self, busy):
         env, (state, *_, last), begun = busy
-        gain = np.asarray(state.array_params.gain)
+        gain = np.asarray(state.episode.taxels.gain)
         assert gain.shape == (WORLDS, 5, 120) and 0.5 <= gain.min() < 0.55 and 1.45 < gain.max() <= 1.5
         assert np.abs(np.corrcoef(gain.reshape(WORLDS, -1)) - np.eye(WORLDS)).max() < 0.2
-        np.testing.assert_array_equal(last.array_params.gain, gain)
-        same = np.all(np.asarray(begun.array_params.gain) == gain, (1, 2))
+        np.testing.assert_array_equal(last.episode.taxels.gain, gain)
+        same = np.all(np.asarray(begun.episode.taxels.gain) == gain, (1, 2))
         assert same.tolist() == [False, True, False, True]
         force, one = press(0), jax.tree.map(lambda x: x[1], last)
         np.testing.assert_allclose(reads(env, one, [force])[0][0], force * gain[1], rtol=1e-6)
@@ -175,13 +173,13 @@ class TestTaxels:
         """A step of force comes in by 1 - a exp(-t / tau); the memory is in the state."""
         env = make(self.sensing(hysteresis=(0.4, 0.4), hysteresis_time=(0.1, 0.1)))
         state = env.reset(jax.random.key(0))
-        assert float(jnp.abs(state.array.late).max()) == 0
+        assert float(jnp.abs(state.taxel_memory.late).max()) == 0
         force = press(1)
         seen, state = reads(env, state, [force] * 6)
         memory = np.exp(-env.control_period / 0.1)
         for tick, reading in enumerate(seen, start=1):
             np.testing.assert_allclose(reading, force * (1 - 0.4 * memory**tick), rtol=1e-4, atol=1e-6)
-        assert np.asarray(state.array.late).max() > 0.5
+        assert np.asarray(state.taxel_memory.late).max() > 0.5
 
     def test_a_slow_array_repeats_itself(self, make):
         """At 8 Hz under 33 Hz control four or five ticks see each sample."""
@@ -221,7 +219,7 @@ def touching(env, seed=0):
     taxel = pose.body_position[env.hand.tip_body[1]] + rotations.rotate(
         pose.tip_rotation[1], jnp.asarray(env.hand.taxel_position[1, 66])
     )
-    place = taxel + normal * (state.target.size[1, 0] + 0.001)  # inside the rubber over the taxels
+    place = taxel + normal * (state.episode.object.size[1, 0] + 0.001)  # inside the rubber over the taxels
     physics = dataclasses.replace(state.physics, qpos=jnp.concatenate([joints, place, jnp.array([1.0, 0, 0, 0])]))
     force = jnp.asarray(np.random.default_rng(seed).normal(0, 2, (5, 3)), jnp.float32) - 3 * normal
     return state, physics, force
@@ -230,15 +228,14 @@ def touching(env, seed=0):
 class TestThreeAxes:
     def test_off_by_default_and_then_not_there(self, make):
         state = jax.eval_shape(make().reset, jax.random.key(0))
-        assert state.tangential_force is None and state.sample.tangential_force is None
+        assert state.sensor_input.tangential_force is None
         assert not any(name.startswith("tangential") for name in state.metrics)
 
     @pytest.mark.parametrize("seed", range(3))
     def test_what_presses_and_what_shears_make_up_the_solvers_force(self, make, seed):
         env = make(dataclasses.replace(QUIET, three_axis=True))
         state, physics, force = touching(env, seed)
-        zero = jnp.zeros(12)
-        truth = env._ground_truth(physics, state.target, zero, zero, zero, force)
+        truth = ground_truth(env, state.episode.object, physics, force)
         felt = np.asarray(truth.touch.force.sum(-1)) > 0
         assert felt[1] and not felt.all()
         weights = np.asarray(truth.touch.force)[..., None] * np.asarray(taxel_normals(env.hand, truth.pose))
@@ -262,22 +259,21 @@ class TestThreeAxes:
     )
     def test_it_is_observed_by_whom_the_configuration_says(self, make, hand, config, groups):
         env = make(observation=config)
-        assert env.senses.three_axis
+        assert env.config.three_axis
         for group in ("actor", "critic"):
             fields = {field.name: field for field in env.observation_layout[group]}
             assert ("tangential_force" in fields) == (group in groups)
             assert ("joint_velocity" in fields) == ("joint_velocity" in config.add_critic and group == "critic")
         state, physics, force = touching(env)
         zero = jnp.zeros(12)
-        truth = env._ground_truth(physics, state.target, zero, zero, zero, force)
-        sample = dataclasses.replace(
-            state.sample, taxel_force=truth.touch.force, tangential_force=truth.tangential_force
+        truth = ground_truth(env, state.episode.object, physics, force)
+        pressed = dataclasses.replace(
+            state.sensor_input, taxel_force=truth.touch.force, tangential_force=truth.tangential_force
         )
-        readings, _ = env.senses.read(
-            jax.random.key(0), sample, sample, EpisodeSensors.of(state), state.goal, zero, state
-        )
+        before, goal = dataclasses.replace(state, sensor_input=pressed), env.task.goal_readings(state.goal)
+        readings, _ = env.senses.read(jax.random.key(0), state.episode, pressed, goal, zero, before)
         np.testing.assert_allclose(readings.tangential_force, truth.tangential_force, atol=1e-5)
-        obs = env._observe(readings, truth, state.goal)
+        obs = env.observer.observe(readings, truth, *goal)
         for group in groups:
             at = 0
             for field in env.observation_layout[group]:
@@ -294,16 +290,15 @@ class TestThreeAxes:
         tangential = jnp.zeros((5, 3)).at[:, 2].set(2.04)
         for taxels, read in ((1, 2.0), (100, 0.0)):
             force = jnp.zeros((5, 120)).at[:, :taxels].set(1.0)
-            sample = dataclasses.replace(state.sample, taxel_force=force, tangential_force=tangential)
-            readings, _ = env.senses.read(
-                jax.random.key(0), sample, sample, EpisodeSensors.of(state), state.goal, jnp.zeros(12), state
-            )
+            pressed = dataclasses.replace(state.sensor_input, taxel_force=force, tangential_force=tangential)
+            before, goal = dataclasses.replace(state, sensor_input=pressed), env.task.goal_readings(state.goal)
+            readings, _ = env.senses.read(jax.random.key(0), state.episode, pressed, goal, jnp.zeros(12), before)
             np.testing.assert_allclose(readings.tangential_force[:, 2], read, atol=1e-5)
 
     def test_in_state_and_metrics(self, busy):
         _, (_, *_, after), _ = busy
-        assert after.tangential_force.shape == (WORLDS, 5, 3)
-        along = np.linalg.norm(after.tangential_force, axis=-1)
+        assert after.sensor_input.tangential_force.shape == (WORLDS, 5, 3)
+        along = np.linalg.norm(after.sensor_input.tangential_force, axis=-1)
         np.testing.assert_allclose(after.metrics["tangential_force"], along.sum(-1), rtol=1e-6)
         np.testing.assert_allclose(np.stack([after.metrics[f"tangential/{i}"] for i in range(5)], 1), along, rtol=1e-6)
 
@@ -321,13 +316,13 @@ class TestGearPlay:
     def test_off_by_default_and_then_not_there(self, make):
         env = make()
         state = jax.eval_shape(env.reset, jax.random.key(0))
-        assert state.gear is None and state.draw.gear_gap is None and not env.drive.gear_play
+        assert state.gear is None and state.episode.hand.gear_gap is None and not env.motors.gear_play
 
     def test_the_encoder_sits_on_the_rotor_and_the_link_lags_within_the_gap(self, busy):
         _, (state, *history), begun = busy
-        gap = np.asarray(state.draw.gear_gap)
+        gap = np.asarray(state.episode.hand.gear_gap)
         assert np.all((gap >= 0.01) & (gap <= 0.02)) and np.ptp(gap) > 0.005
-        np.testing.assert_array_equal(state.draw.actuator.dead_band, 0)
+        np.testing.assert_array_equal(state.episode.hand.actuator.dead_band, 0)
         np.testing.assert_array_equal(state.gear.rotor.position, state.physics.qpos[:, :12])
         apart = []
         for state in history:
@@ -338,7 +333,8 @@ class TestGearPlay:
         assert np.mean(apart > 0.8 * gap / 2) > 0.3, "the gaps are hardly ever crossed"
         np.testing.assert_array_equal(begun.gear.rotor.position[::2], begun.physics.qpos[::2, :12])
         np.testing.assert_array_equal(begun.gear.rotor.position[1::2], state.gear.rotor.position[1::2])
-        assert np.any(begun.draw.gear_gap[::2] != gap[::2]) and np.all(begun.draw.gear_gap[1::2] == gap[1::2])
+        drawn = np.asarray(begun.episode.hand.gear_gap)
+        assert np.any(drawn[::2] != gap[::2]) and np.all(drawn[1::2] == gap[1::2])
 
     def test_motors_are_told_the_angle_of_the_encoder(self, busy):
         """Targets stay within reach of what the encoder reads."""
@@ -349,10 +345,10 @@ class TestGearPlay:
 
     def test_scale_zero_has_no_gap(self, make):
         env = make(randomization=dataclasses.replace(GEARED, scale=0.0))
-        np.testing.assert_array_equal(env.reset(jax.random.key(0)).draw.gear_gap, 0)
+        np.testing.assert_array_equal(env.reset(jax.random.key(0)).episode.hand.gear_gap, 0)
 
     def test_the_rotor_takes_its_inertia_from_the_joint(self, hand):
-        from dexsim.env.motors import Drive, rotor_share
+        from dexsim.env.motors import Motors, rotor_share
         from dexsim.physics.model import build_model, build_scene
 
         config = GraspConfig(randomization=GEARED)
@@ -360,23 +356,23 @@ class TestGearPlay:
         whole = build_model(hand, *scene)
         built = build_scene(hand, *scene, rotor_share=rotor_share(config.randomization))
         seam = SimpleNamespace(mj_model=built.model, joint_dof=built.joint_dof)
-        drive, dofs = Drive(config, hand, seam), seam.joint_dof
+        motors, dofs = Motors(config, hand, seam), seam.joint_dof
         np.testing.assert_allclose(
-            drive._rotor_inertia + seam.mj_model.dof_armature[dofs], whole.dof_armature[dofs], rtol=1e-5
+            motors._rotor_inertia + seam.mj_model.dof_armature[dofs], whole.dof_armature[dofs], rtol=1e-5
         )
-        assert drive._steps >= 4
+        assert motors._steps >= 4
         bare = SimpleNamespace(
             dof_armature=0 * whole.dof_armature,
             **{name: getattr(whole, name) for name in ("opt", "dof_M0", "dof_invweight0")},
         )
         with pytest.raises(ConfigError, match="needs an armature"):
-            Drive(config, hand, SimpleNamespace(mj_model=bare, joint_dof=dofs))
+            Motors(config, hand, SimpleNamespace(mj_model=bare, joint_dof=dofs))
 
 
 @pytest.fixture(scope="module")
 def drawn(make):
     """An environment and 64 resets at three scales."""
-    env = make(dataclasses.replace(QUIET, taxel=POOR_TAXELS, orientation=OrientationSensor()), Randomization())
+    env = make(dataclasses.replace(QUIET, taxel=POOR_TAXELS, orientation=ImuConfig()), Randomization())
     draw = jax.jit(lambda key, scale: jax.vmap(lambda k: env.reset(k, scale))(jax.random.split(key, 64)))
     return env, {scale: draw(jax.random.key(0), jnp.float32(scale)) for scale in (0.0, 0.5, 1.0)}
 
@@ -388,26 +384,26 @@ class TestScale:
         env, states = drawn
         state, objects = states[0.0], env.config.objects
         for value, nominal in (
-            (state.draw.actuator.stall_torque, hand.torque_limit),
-            (state.draw.encoder_bias, 0),
-            (state.draw.tilt, 0),
-            (state.orientation_sensor.bias, 0),
-            (state.array_params.gain, 1),
-            (state.array_params.bias, 0),
-            (state.array_params.crosstalk, 0),
-            (state.array_params.alive, True),
-            (state.target.mass, np.mean(objects.mass)),
-            (state.target.friction, np.mean(objects.friction)),
-            (state.target.com, 0),
-            (state.target.contact[:, 0], np.mean(objects.stiffness)),
+            (state.episode.hand.actuator.stall_torque, hand.torque_limit),
+            (state.episode.hand.encoder_bias, 0),
+            (state.episode.hand.tilt, 0),
+            (state.episode.imu.bias, 0),
+            (state.episode.taxels.gain, 1),
+            (state.episode.taxels.bias, 0),
+            (state.episode.taxels.crosstalk, 0),
+            (state.episode.taxels.alive, True),
+            (state.episode.object.mass, np.mean(objects.mass)),
+            (state.episode.object.friction, np.mean(objects.friction)),
+            (state.episode.object.com, 0),
+            (state.episode.object.contact[:, 0], np.mean(objects.stiffness)),
         ):
             np.testing.assert_array_equal(value, np.broadcast_to(np.float32(nominal), value.shape))
-        assert len(np.unique(state.target.contact[:, 1])) == 1
-        radius = np.asarray(state.target.size[:, 1, 0])
+        assert len(np.unique(state.episode.object.contact[:, 1])) == 1
+        radius = np.asarray(state.episode.object.size[:, 1, 0])
         assert len(np.unique(radius)) > 1  # sizes stay as the pool has them
         ball = np.mean(objects.mass) * 0.4 * radius**2
         # A sphere is a capsule with a straight part of 0.2 mm.
-        np.testing.assert_allclose(state.target.inertia, np.repeat(ball[:, None], 3, 1), rtol=0.01)
+        np.testing.assert_allclose(state.episode.object.inertia, np.repeat(ball[:, None], 3, 1), rtol=0.01)
 
     def test_one_is_what_the_pool_holds(self, drawn):
         env, states = drawn
@@ -416,8 +412,8 @@ class TestScale:
         at = [rows[tuple(q)] for q in np.asarray(state.physics.qpos)]
         for name in ("mass", "inertia", "com", "friction", "contact"):
             np.testing.assert_allclose(
-                getattr(state.target, name),
-                np.asarray(getattr(env.pool.target, name))[at],
+                getattr(state.episode.object, name),
+                np.asarray(getattr(env.pool.object, name))[at],
                 rtol=1e-4,
                 atol=1e-7,
                 err_msg=name,
@@ -426,19 +422,19 @@ class TestScale:
     def test_half_is_half_way(self, drawn):
         _, states = drawn
         for name in ("mass", "com", "friction", "contact"):
-            low, half, high = (np.asarray(getattr(states[scale].target, name)) for scale in (0.0, 0.5, 1.0))
+            low, half, high = (np.asarray(getattr(states[scale].episode.object, name)) for scale in (0.0, 0.5, 1.0))
             np.testing.assert_allclose(half, (low + high) / 2, rtol=1e-4, atol=1e-6, err_msg=name)
-        low, half, high = (np.asarray(states[scale].draw.encoder_bias) for scale in (0.0, 0.5, 1.0))
+        low, half, high = (np.asarray(states[scale].episode.hand.encoder_bias) for scale in (0.0, 0.5, 1.0))
         np.testing.assert_allclose(half, (low + high) / 2, atol=1e-7)
 
     def test_restarts_draw_at_the_states_scale(self, drawn):
         env, states = drawn
         state = jax.vmap(env.widen, (0, None))(states[1.0], jnp.float32(0.0))
-        np.testing.assert_array_equal(state.draw.encoder_bias, states[1.0].draw.encoder_bias)
+        np.testing.assert_array_equal(state.episode.hand.encoder_bias, states[1.0].episode.hand.encoder_bias)
         begun = jax.jit(jax.vmap(env.restart))(state, jnp.arange(64) < 32)
-        assert np.all(np.asarray(begun.draw.encoder_bias)[:32] == 0) and np.all(np.asarray(begun.scale) == 0)
-        np.testing.assert_array_equal(begun.draw.encoder_bias[32:], state.draw.encoder_bias[32:])
-        np.testing.assert_array_equal(begun.target.mass[:32], np.float32(np.mean(env.config.objects.mass)))
+        assert np.all(np.asarray(begun.episode.hand.encoder_bias)[:32] == 0) and np.all(np.asarray(begun.scale) == 0)
+        np.testing.assert_array_equal(begun.episode.hand.encoder_bias[32:], state.episode.hand.encoder_bias[32:])
+        np.testing.assert_array_equal(begun.episode.object.mass[:32], np.float32(np.mean(env.config.objects.mass)))
 
     def test_without_one_there_is_none(self, make):
         assert jax.eval_shape(make().reset, jax.random.key(0)).scale is None
@@ -528,9 +524,9 @@ def test_everything_at_once_on_the_real_physics():
         state = step(state, jnp.asarray(action, jnp.float32))
         assert not np.any(state.metrics["non_finite"])
         apart = np.abs(np.asarray(state.gear.rotor.position - state.physics.qpos[:, :12]))
-        beyond.append(np.maximum(apart - np.asarray(state.draw.gear_gap) / 2, 0))
+        beyond.append(np.maximum(apart - np.asarray(state.episode.hand.gear_gap) / 2, 0))
         gripped += np.sum(np.asarray(state.finger_force) > 1)
-        sheared += np.sum(np.linalg.norm(state.tangential_force, axis=-1) > 0.3)
+        sheared += np.sum(np.linalg.norm(state.sensor_input.tangential_force, axis=-1) > 0.3)
         assert np.all(np.isfinite(state.obs["actor"])) and state.obs["actor"].shape == (8, 66 + 15)
         state = restart(state, state.terminated | state.truncated)
     assert gripped > 100 and sheared > 100

@@ -166,10 +166,10 @@ def simple(monkeypatch):
 def test_taxels_feel_the_mesh_at_the_size_of_the_episode(simple, folder, method):
     objects = ObjectConfig(mesh=str(folder / "cuboid.ply"), mesh_unit=0.001, mesh_size=(0.9, 1.1))
     env = dexsim.make("grasp", GraspConfig(objects=objects, pool_size=16, touch_method=method), backend="jax")
-    targets = jax.tree.map(lambda leaf: jnp.asarray(leaf)[:WORLDS], env.pool.target)
-    assert len(np.unique(env.pool.target.size[:, 0, 0])) == 16
+    targets = jax.tree.map(lambda leaf: jnp.asarray(leaf)[:WORLDS], env.pool.object)
+    assert len(np.unique(env.pool.object.size[:, 0, 0])) == 16
     points = jnp.asarray(np.random.default_rng(0).uniform(-0.035, 0.035, (500, 3)), jnp.float32)
-    felt = jax.jit(jax.vmap(lambda target: distance.signed_distance(points, env._touch_geometry(target))))(targets)
+    felt = jax.jit(jax.vmap(lambda target: distance.signed_distance(points, env.touch.geometry(target))))(targets)
     exact = jax.vmap(lambda target: sdf.box(points, target.size[0]))(targets)
     near = np.abs(exact) < 0.003
     # Surface points: beyond an edge the offset from a face's plane falls short of the distance.
@@ -201,7 +201,7 @@ def test_a_mesh_is_turned_like_the_cube_that_it_is(simple, folder):
     )
     height = [np.asarray(e.pool.qpos)[:, 12] for e in (cubes, env)]
     assert abs(np.mean(height[0]) - np.mean(height[1])) < 0.001
-    target = jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], env.pool.target)
+    target = jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], env.pool.object)
     np.testing.assert_allclose(env.task.unit_inertia(target), 0.055**2 / 6, rtol=1e-4)
 
 
@@ -216,5 +216,5 @@ def test_an_l_is_dropped_on_the_real_physics(folder):
     for _ in range(40):
         state = step(state, jnp.ones((8, 12)))
         assert not np.any(state.metrics["non_finite"])
-        force, taxels = force + np.sum(state.finger_force > 0.5), taxels + np.sum(state.sample.taxel_force > 0)
+        force, taxels = force + np.sum(state.finger_force > 0.5), taxels + np.sum(state.sensor_input.taxel_force > 0)
     assert force > 100 and taxels > 1000

@@ -328,11 +328,11 @@ def test_damping_falls_as_the_bounce_grows_and_is_bounded():
 
 def test_a_pool_holds_all_shapes_alike(hand, grasp_env):
     pool, count = grasp_env.pool, grasp_env.config.pool_size
-    assert np.ptp(np.bincount(pool.target.shape_index, minlength=5)) <= 1
+    assert np.ptp(np.bincount(pool.object.shape_index, minlength=5)) <= 1
     assert pool.qpos.shape == (count, 19) and np.all(np.isfinite(pool.qpos))
     np.testing.assert_allclose(np.linalg.norm(pool.qpos[:, 15:], axis=1), 1, atol=1e-5)
     assert np.all(pool.qpos[:, :12] >= hand.joint_lower) and np.all(pool.qpos[:, :12] <= hand.joint_upper)
-    assert len(np.unique(pool.target.mass)) == count  # each start has an object of its own
+    assert len(np.unique(pool.object.mass)) == count  # each start has an object of its own
 
 
 class TestScale:

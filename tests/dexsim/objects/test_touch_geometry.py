@@ -63,7 +63,7 @@ def closed_forms(env, state):
         turn = rotations.quat_to_matrix(place[3:] / jnp.linalg.norm(place[3:]))
         return feel_links(env.hand, pose, target.shape(), place[:3], turn, finger_force, SKIN).force, pose
 
-    return jax.jit(jax.vmap(one))(state.physics, state.target, state.finger_force)
+    return jax.jit(jax.vmap(one))(state.physics, state.episode.object, state.finger_force)
 
 
 def compare(env, states, kinds):
@@ -72,11 +72,11 @@ def compare(env, states, kinds):
     found = {kind: [] for kind in kinds}
     for state in states:
         wanted, pose = closed_forms(env, state)
-        read = state.sample.taxel_force
+        read = state.sensor_input.taxel_force
         (total, at), (_, place) = centre(wanted, pose), centre(read, pose)
         moved = np.abs(np.asarray(read) - wanted).sum(-1) / 2
         apart = np.linalg.norm(np.asarray(at) - place, axis=-1)
-        for world, kind in enumerate(np.asarray(state.target.shape_index)):
+        for world, kind in enumerate(np.asarray(state.episode.object.shape_index)):
             on = (np.asarray(total)[world] > 0.2) & (np.asarray(read)[world].sum(-1) > 0)
             name = SHAPES[kind] if kind < len(SHAPES) else "mesh"
             found[name] += list(np.stack([moved[world] / np.maximum(total[world], 1e-9), apart[world]], -1)[on])

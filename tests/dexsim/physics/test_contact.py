@@ -164,17 +164,17 @@ def test_springs_follow_the_skin(hand):
         start = c_scene.row(pool, index)
         model, qpos, qvel, *_ = c_scene.squeeze(hand, start, rng)
         nominal = model.pair_solref.copy()
-        felt = law(qpos[None], jax.tree.map(lambda leaf: leaf[None], start.target))
-        c_scene.follow_skin(model, c_scene.start(model, qpos, qvel), hand, start.target, np.asarray(felt)[0])
-        changed[SHAPES[start.target.shape_index]] += np.sum(model.pair_solref[:, 0] != nominal[:, 0])
-        solref, solimp = configure(start.target, jnp.asarray(qpos))
+        felt = law(qpos[None], jax.tree.map(lambda leaf: leaf[None], start.object))
+        c_scene.follow_skin(model, c_scene.start(model, qpos, qvel), hand, start.object, np.asarray(felt)[0])
+        changed[SHAPES[start.object.shape_index]] += np.sum(model.pair_solref[:, 0] != nominal[:, 0])
+        solref, solimp = configure(start.object, jnp.asarray(qpos))
         there = {
             (model.geom(a).name, model.geom(b).name): pair
             for pair, (a, b) in enumerate(zip(model.pair_geom1, model.pair_geom2, strict=True))
         }
         for pair, link, other in zip(seam.scene.object_pairs, first, second, strict=True):
             slot = int(other.removeprefix("object_"))
-            if start.target.active[slot]:
+            if start.object.active[slot]:
                 at = there[link, c_scene.KINDS[slot]]
                 np.testing.assert_allclose(solref[pair], model.pair_solref[at], rtol=2e-3)
                 np.testing.assert_allclose(solimp[pair], model.pair_solimp[at], rtol=2e-3)

@@ -47,7 +47,7 @@ def contact_steps(hand, grasp_env, physics_advance):
         begun = [squeeze(hand, start, rng) for start in starts]
         qpos, qvel, warmstart, torque = (jnp.stack(x) for x in list(zip(*begun, strict=True))[1:])
         after, force = physics_advance(
-            stack([s.target for s in starts]), PhysicsState(qpos, qvel, warmstart), torque, jnp.zeros((WORLDS, 3))
+            stack([s.object for s in starts]), PhysicsState(qpos, qvel, warmstart), torque, jnp.zeros((WORLDS, 3))
         )
         c_rows = []
         for _, (model, *state, applied) in zip(starts, begun, strict=True):
@@ -96,7 +96,7 @@ class TestAgainstC:
         starts = [row(grasp_env.pool, rows_of(grasp_env.pool, shape)[i]) for shape in SHAPES for i in (0, 1)]
         begun, references = [], []
         for start in starts:
-            model = c_scene.compile_scene(hand, start.target, gravity=(-9.81, 0, 0), **CONVERGED)
+            model = c_scene.compile_scene(hand, start.object, gravity=(-9.81, 0, 0), **CONVERGED)
             data = c_scene.start(model, start.qpos, 0 * start.qvel)
             data.qpos[:12], data.qpos[12] = 0, data.qpos[12] + 0.001
             for _ in range(60):
@@ -104,7 +104,7 @@ class TestAgainstC:
                 mujoco.mj_step(model, data)
             assert {model.geom(c.geom[0]).name for c in data.contact} == {"palm_face"}
             model.opt.gravity[:] = GRAVITY
-            push = np.float32(start.target.mass * np.array([-19.62, 1.0, -2.0]))
+            push = np.float32(start.object.mass * np.array([-19.62, 1.0, -2.0]))
             state = [np.float32(x) for x in (data.qpos, data.qvel, data.qacc_warmstart)]
             data = c_scene.start(model, *state)
             data.xfrc_applied[model.body("object").id, :3] = push
@@ -114,7 +114,7 @@ class TestAgainstC:
         for part in (slice(0, WORLDS), slice(len(starts) - WORLDS, None)):
             qpos, qvel, warmstart, push = (jnp.stack(x) for x in zip(*begun[part], strict=True))
             after, force = physics_advance(
-                stack([s.target for s in starts[part]]),
+                stack([s.object for s in starts[part]]),
                 PhysicsState(qpos, qvel, warmstart),
                 jnp.zeros((WORLDS, 12)),
                 push,
@@ -140,9 +140,9 @@ class TestAgainstC:
         qpos[:, :12] = middle
         qpos[:, 12:15] = 3.0, -0.2, 0.5
         qvel = rng.normal(size=(WORLDS, 18)).astype(np.float32)
-        models = [c_scene.compile_scene(hand, s.target, **CONVERGED) for s in starts]
+        models = [c_scene.compile_scene(hand, s.object, **CONVERGED) for s in starts]
         datas = [c_scene.start(m, q, v) for m, q, v in zip(models, qpos, qvel, strict=True)]
-        target = stack([s.target for s in starts])
+        target = stack([s.object for s in starts])
         state = PhysicsState(jnp.asarray(qpos), jnp.asarray(qvel), jnp.zeros((WORLDS, 18)))
         for step in range(300):
             swing = 0.2 * np.sin(0.03 * step + np.arange(12) + np.arange(WORLDS)[:, None])
@@ -164,7 +164,7 @@ class TestAgainstC:
         qpos = np.stack([s.qpos for s in starts])
         qpos[:, 12] = 1.0
         state = PhysicsState(jnp.asarray(qpos), jnp.zeros((WORLDS, 18)), jnp.zeros((WORLDS, 18)))
-        target = stack([s.target for s in starts])
+        target = stack([s.object for s in starts])
         target = dataclasses.replace(target, com=jnp.zeros((WORLDS, 3)))
         push = np.float32(np.random.default_rng(2).normal(size=(WORLDS, 3)))
         after, _ = physics_advance(target, state, jnp.zeros((WORLDS, 12)), jnp.asarray(push))

@@ -262,7 +262,7 @@ def test_mjx_step_agrees(hand, grasp_env):
     starts = [c_scene.row(grasp_env.pool, i) for i in c_scene.rows_of(grasp_env.pool, "capsule")[:worlds]]
     begun = [c_scene.squeeze(hand, start, rng) for start in starts]
     qpos, qvel, warmstart, torque = (jnp.stack(x) for x in list(zip(*begun, strict=True))[1:])
-    target = c_scene.stack([start.target for start in starts])
+    target = c_scene.stack([start.object for start in starts])
     alone = dataclasses.replace(
         target,
         kinds=("capsule",),

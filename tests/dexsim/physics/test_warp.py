@@ -47,14 +47,14 @@ def worlds(hand, grasp_env):
             start = row(grasp_env.pool, index)
             _, *state, torque = squeeze(hand, start, rng)
             # Warp's convex collisions are C MuJoCo's native ones.
-            exact = bool(start.target.active[SLOTS.index("cylinder")])
-            model = c_scene.compile_scene(hand, start.target, exact=exact, **CONVERGED)
+            exact = bool(start.object.active[SLOTS.index("cylinder")])
+            model = c_scene.compile_scene(hand, start.object, exact=exact, **CONVERGED)
             data = c_scene.start(model, *state)
             data.qfrc_applied[:12] = torque
             mujoco.mj_step(model, data)
             force = c_scene.finger_force(model, data, hand)
             if np.linalg.norm(force, axis=-1).max() > 0.5 and len(inputs) < WORLDS:
-                inputs.append((start.target, *state, torque))
+                inputs.append((start.object, *state, torque))
                 wanted.append((data.qvel.copy(), force))
         assert len(inputs) == WORLDS, shape
         targets, qpos, qvel, warmstart, torque = zip(*inputs, strict=True)
@@ -109,7 +109,7 @@ def test_the_palm_ends_where_the_hand_does():
     palm = next(g for g in env.hand.geoms if g.name == "palm")
     edge = palm.position[1] + palm.size[1]
     past = np.array([-0.006, -0.004, -0.002, -0.001, 0.001, 0.002, 0.004, 0.006])  # m, of the line's foot
-    target = jax.tree.map(lambda x: jnp.repeat(jnp.asarray(x)[:1], 8, 0), env.pool.target)
+    target = jax.tree.map(lambda x: jnp.repeat(jnp.asarray(x)[:1], 8, 0), env.pool.object)
     target = dataclasses.replace(
         target, size=jnp.full_like(target.size, half), com=jnp.zeros((8, 3)), link_friction=jnp.full(8, 0.7)
     )

@@ -75,7 +75,7 @@ def make_moment(hand, **fields):
     joints = jnp.asarray((hand.joint_lower + hand.joint_upper) / 2)
     nothing = jnp.zeros((5, 120))
     values = {
-        "target": None,
+        "object": None,
         "joint_position": joints,
         "joint_velocity": zero,
         "joint_torque": zero,
@@ -91,7 +91,7 @@ def make_moment(hand, **fields):
     }
     return GroundTruth(
         **{
-            name: jnp.asarray(value) if name not in ("target", "pose", "touch") else value
+            name: jnp.asarray(value) if name not in ("object", "pose", "touch") else value
             for name, value in (values | fields).items()
         }
     )
@@ -361,7 +361,7 @@ class TestEvaluationPlan:
 
 class TestPool:
     def test_every_shape_has_its_share(self, grasp_env):
-        count = np.bincount(grasp_env.pool.target.shape_index, minlength=len(SHAPES))
+        count = np.bincount(grasp_env.pool.object.shape_index, minlength=len(SHAPES))
         assert count.tolist() == [16] * 5
 
     def test_objects_start_clear_of_the_hand(self, hand, grasp_env):
@@ -369,7 +369,7 @@ class TestPool:
         each capsule, so that an edge between two of them may lie up to 1 mm deeper."""
         pool, links, palm = grasp_env.pool, [], []
         for i in range(pool.qpos.shape[0]):
-            target = jax.tree.map(lambda leaf, i=i: np.asarray(leaf)[i], pool.target)
+            target = jax.tree.map(lambda leaf, i=i: np.asarray(leaf)[i], pool.object)
             model = c_scene.compile_scene(hand, target, margin=0.03, exact=True)
             data = c_scene.start(model, pool.qpos[i], pool.qvel[i])
             mujoco.mj_forward(model, data)

@@ -16,10 +16,10 @@ from dexsim.core.errors import ConfigError
 from dexsim.env.task import GroundTruth
 from dexsim.geometry.sdf import signed_distance
 from dexsim.hand.kinematics import forward_kinematics
-from dexsim.sensing.imu import OrientationSensor, draw_sensor, measure_orientation
+from dexsim.sensing.imu import ImuConfig, measure_orientation, sample_imu
 from dexsim.tasks.placement import palm_height
 from dexsim.tasks.rotate.config import RotateConfig, RotateReward, clear_of_palm, paper
-from dexsim.tasks.rotate.objects import KINDS, lowest_point, sample_target, upright
+from dexsim.tasks.rotate.objects import KINDS, lowest_point, sample_turned_object, upright
 from dexsim.tasks.rotate.report import summarize
 from dexsim.tasks.rotate.start import _fingerprint
 from dexsim.tasks.rotate.task import Rotate, goal_quat, goal_reward, tips_at_work
@@ -39,7 +39,7 @@ def truth(task: Rotate, **changes) -> GroundTruth:
     joints = jnp.zeros(12)
     none = jnp.zeros((5, 120))
     values = {
-        "target": sample_target(jax.random.key(0), task.config),
+        "object": sample_turned_object(jax.random.key(0), task.config),
         "joint_position": joints,
         "joint_velocity": joints,
         "joint_torque": joints,
@@ -296,7 +296,7 @@ class TestDrop:
                 assert bool(rules.dropped(goal, truth(task, object_position=place))) == lost
 
     def test_lowest_corner_of_a_tilted_cube(self, task):
-        target = sample_target(jax.random.key(3), task.config)
+        target = sample_turned_object(jax.random.key(3), task.config)
         half, place = float(target.size[0, 0]), np.array([0.06, 0.0, 0.08])
         corners = half * CORNERS
         for seed in range(5):
@@ -305,7 +305,7 @@ class TestDrop:
             np.testing.assert_allclose(lowest_point(target, quat_of(rotation), jnp.asarray(place)), low, atol=1e-6)
 
     def test_lowest_point_of_an_upright_cylinder(self, hand):
-        target = sample_target(jax.random.key(3), RotateConfig(object="cylinder"))
+        target = sample_turned_object(jax.random.key(3), RotateConfig(object="cylinder"))
         half = float(target.size[0, 0])
         for tilt in (0.0, 0.3, 1.2):  # about y: the rim's lowest point
             quat = quat_of(Rotation.from_euler("y", tilt))
@@ -317,7 +317,7 @@ class TestDrop:
         task = Rotate(RotateConfig(support="fingers"), hand)
         goal = task.begin(jax.random.key(0), None)
         here = truth(task)
-        half = float(here.target.size[0, 0])
+        half = float(here.object.size[0, 0])
         palm = palm_height(hand)
         for gap, lost in ((0.0005, True), (0.0015, False)):
             place = np.asarray(task.reference) * [0, 1, 1] + [palm + half + gap, 0, 0]
@@ -329,7 +329,7 @@ class TestObjects:
     def test_touch_sees_the_object_that_is_meant(self, kind):
         """Distances along the axis and across it: the sides of a cube, the rim of a cylinder."""
         config = RotateConfig(object=kind, edge=(0.05, 0.05))
-        shape = sample_target(jax.random.key(0), config).shape()
+        shape = sample_turned_object(jax.random.key(0), config).shape()
         angles = np.radians(np.arange(0, 360, 45))
         ring = 0.1 * np.stack([0 * angles, np.cos(angles), np.sin(angles)], -1)
         reach = {
@@ -343,7 +343,7 @@ class TestObjects:
     def test_inertia_of_a_cube(self):
         config = RotateConfig()
         config = dataclasses.replace(config, objects=dataclasses.replace(config.objects, inertia_scale=(1.0, 1.0)))
-        target = sample_target(jax.random.key(1), config)
+        target = sample_turned_object(jax.random.key(1), config)
         edge = 2 * float(target.size[0, 0])
         np.testing.assert_allclose(target.inertia, np.full(3, float(target.mass) * edge**2 / 6), rtol=1e-5)
 
@@ -355,13 +355,13 @@ class TestPool:
         task = Rotate(config, hand)
         pool = task.make_pool(jax.random.key(0))
         assert pool.qpos.shape == (48, 19) and np.all(pool.qvel == 0)
-        half = pool.target.size[:, 0, 0]
+        half = pool.object.size[:, 0, 0]
         turns = Rotation.from_quat(np.roll(pool.qpos[:, 15:19], -1, axis=1)).as_matrix()
         lowest = np.min((CORNERS @ turns.transpose(0, 2, 1))[..., 0], axis=1) * half
         gap = pool.qpos[:, 12] + lowest - palm_height(hand)
         # On the palm, which gives way where a finger presses from above.
         assert np.all(gap < 0.003) and np.all(gap > -0.006) and np.mean(np.abs(gap) < 0.001) > 0.7
-        assert np.ptp(pool.target.friction) > 0.3
+        assert np.ptp(pool.object.friction) > 0.3
         # Each size has its share, though large cubes fit between the fingers in far fewer postures.
         assert np.all(np.histogram(2 * half, 3, config.edge)[0] > 9)
         again = task.make_pool(jax.random.key(0))
@@ -378,7 +378,7 @@ class TestPool:
         stand = Rotation.align_vectors([axis], [[1.0, 0, 0]])[0]  # Its face on the axis, up to a turn about it.
         for k in range(12):
             # The eight corners of the cube as the pool has it, in the palm frame.
-            half, slot = pool.target.size[k, 0], Rotation.from_quat(np.roll(pool.target.quat[k, 0], -1))
+            half, slot = pool.object.size[k, 0], Rotation.from_quat(np.roll(pool.object.quat[k, 0], -1))
             np.testing.assert_allclose(slot.apply([1.0, 0, 0]), stand.apply([1.0, 0, 0]), atol=1e-6)
             corners = half * CORNERS
             turn = Rotation.from_quat(np.roll(pool.qpos[k, 15:19], -1))
@@ -456,7 +456,7 @@ class TestObservation:
         np.testing.assert_allclose(twist[:, 3:], angular, atol=1e-4)
 
 
-class TestOrientationSensor:
+class TestImuConfig:
     UP = jnp.array([1.0, 0.0, 0.0])
 
     def read(self, sensor, draw, tick, now, before, held, key=0):
@@ -465,14 +465,14 @@ class TestOrientationSensor:
         )
 
     def test_a_perfect_one_reads_the_truth(self):
-        sensor = OrientationSensor(noise=0.0)
-        draw = draw_sensor(jax.random.key(0), sensor, 0.0, PERIOD)
+        sensor = ImuConfig(noise=0.0)
+        draw = sample_imu(jax.random.key(0), sensor, 0.0, PERIOD)
         now = turned(40, (0, 0, 1))
         np.testing.assert_allclose(self.read(sensor, draw, 5, now, turned(10), turned(0)), now, atol=1e-6)
 
     def test_delay_drift_and_bias(self):
-        sensor = OrientationSensor(noise=0.0, rate=1000.0)
-        draw = draw_sensor(jax.random.key(0), sensor, 0.0, PERIOD)
+        sensor = ImuConfig(noise=0.0, rate=1000.0)
+        draw = sample_imu(jax.random.key(0), sensor, 0.0, PERIOD)
         late = dataclasses.replace(draw, delay=jnp.float32(0.5))
         read = self.read(sensor, late, 5, turned(10), turned(8), turned(0))
         assert Rotation.from_quat(np.roll(read, -1)).magnitude() == pytest.approx(math.radians(9), abs=1e-4)
@@ -488,8 +488,8 @@ class TestOrientationSensor:
         np.testing.assert_allclose(Rotation.from_quat(np.roll(read, -1)).as_rotvec(), [0, 0.03, 0], atol=1e-5)
 
     def test_noise_has_the_stated_deviation(self):
-        sensor = OrientationSensor(noise=0.05)
-        draw = draw_sensor(jax.random.key(0), sensor, 0.0, PERIOD)
+        sensor = ImuConfig(noise=0.05)
+        draw = sample_imu(jax.random.key(0), sensor, 0.0, PERIOD)
         reads = jax.vmap(
             lambda k: measure_orientation(
                 k, sensor, draw, jnp.float32(1), turned(0), turned(0), turned(0), self.UP, PERIOD
@@ -500,8 +500,8 @@ class TestOrientationSensor:
 
     def test_a_slow_sensor_is_read_again(self):
         """At 10 Hz under 33 Hz control, three or four ticks see each sample."""
-        sensor = OrientationSensor(noise=0.0, rate=10.0)
-        draw = draw_sensor(jax.random.key(0), sensor, 0.0, PERIOD)
+        sensor = ImuConfig(noise=0.0, rate=10.0)
+        draw = sample_imu(jax.random.key(0), sensor, 0.0, PERIOD)
         held, seen = turned(0), []
         for tick in range(1, 34):
             now = turned(float(tick))

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from episodes import ground_truth
 
 import dexsim
 from dexsim.core.config import override, to_dict
@@ -140,15 +141,14 @@ def touched(environments, hand, angle):
     front, side = facing(hand, 1)
     direction = np.cos(angle) * front + np.sin(angle) * side
     direction = pose.tip_rotation[1] @ jnp.asarray(direction, jnp.float32)
-    size = float(state.target.size[np.flatnonzero(np.asarray(state.target.active))[0], 0])
+    size = float(state.episode.object.size[np.flatnonzero(np.asarray(state.episode.object.active))[0], 0])
     place = (
         pose.body_position[hand.tip_body[1]] + pose.tip_rotation[1] @ jnp.asarray(centre) + direction * (radius + size)
     )
     physics = dataclasses.replace(state.physics, qpos=state.physics.qpos.at[both[0].physics.object_qpos[:3]].set(place))
     along = pose.tip_rotation[1] @ jnp.asarray(axis, jnp.float32)
     force = jnp.zeros((hand.num_fingers, 3)).at[1].set(-3.0 * direction + 1.5 * along)
-    zero = jnp.zeros(hand.num_joints)
-    return [env._ground_truth(physics, state.target, zero, zero, zero, force) for env in both]
+    return [ground_truth(env, state.episode.object, physics, force) for env in both]
 
 
 def test_an_environment_reads_no_more_than_without(environments, hand):

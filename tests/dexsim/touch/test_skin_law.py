@@ -27,10 +27,10 @@ OBJECTS, LEVELS = 30, 4
 
 def hold(hand, start, rng, law):
     """[(qpos, force on the fingers [5] N, deepest contact of a fingertip m)] of the levels at which it held."""
-    exact = bool(start.target.active[SLOTS.index("cylinder")])
-    model = c_scene.compile_scene(hand, start.target, exact=exact, iterations=20, line_search=30)
+    exact = bool(start.object.active[SLOTS.index("cylinder")])
+    model = c_scene.compile_scene(hand, start.object, exact=exact, iterations=20, line_search=30)
     data = c_scene.start(model, start.qpos, 0 * start.qvel)
-    known = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], start.target)
+    known = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], start.object)
     close = rng.uniform(0.5, 1.0, 12) * (np.arange(12) > 3)
     close[1:3] = rng.uniform(0.3, 1.0, 2)
     found = []
@@ -43,7 +43,7 @@ def hold(hand, start, rng, law):
                 here = data.qpos[:12].copy()
                 wanted = np.clip(start.qpos[:12] + share * close, here - grip, here + grip)
             felt = law(data.qpos[None].astype(np.float32), known)
-            c_scene.follow_skin(model, data, hand, start.target, np.asarray(felt)[0])
+            c_scene.follow_skin(model, data, hand, start.object, np.asarray(felt)[0])
             for _ in range(5):
                 torque = 3 * (wanted - data.qpos[:12]) - 0.1 * data.qvel[:12]
                 data.qfrc_applied[:12] = np.clip(torque, -hand.torque_limit, hand.torque_limit)
@@ -72,7 +72,7 @@ def grips(hand):
             held += levels
             rows += [row] * len(levels)
         qpos, force, depth = (np.stack(x) for x in zip(*held, strict=True))
-        felt = law(jnp.asarray(qpos, jnp.float32), c_scene.row(pool.target, np.array(rows)))
+        felt = law(jnp.asarray(qpos, jnp.float32), c_scene.row(pool.object, np.array(rows)))
         found[shape] = np.stack([force, np.asarray(felt)]), depth
     return found
 

@@ -29,19 +29,20 @@ from dexsim.control import Control
 from dexsim.core import cli
 from dexsim.core.config import to_dict
 from dexsim.env.env import Env
+from dexsim.env.observer import Observer
 from dexsim.env.state import Start
 from dexsim.geometry import rotations
 from dexsim.observation import layout
 from dexsim.physics.seam import PhysicsState
 from dexsim.randomization import Randomization
 from dexsim.sensing.config import Sensing
-from dexsim.sensing.imu import OrientationSensor
+from dexsim.sensing.imu import ImuConfig
 from dexsim.sensing.taxels import TaxelSensor
 from dexsim.task_spec import TaskSpec
 from dexsim.tasks.grasp.config import GraspConfig
 from dexsim.tasks.grasp.task import Grasp
 from dexsim.tasks.rotate.config import RotateConfig
-from dexsim.tasks.rotate.objects import sample_target
+from dexsim.tasks.rotate.objects import sample_turned_object
 from dexsim.tasks.rotate.task import Rotate
 from dexsim_ppo.learner.networks import Layer
 from dexsim_ppo.learner.running_stats import Normalizer
@@ -65,7 +66,7 @@ QUIET = Sensing(
     joint_resolution=0.0,
     torque_noise=0.0,
     object_noise=0.0,
-    orientation=OrientationSensor(noise=0.0, bias=0.0, drift=0.0, delay=(0.0, 0.0), rate=10000.0),
+    orientation=ImuConfig(noise=0.0, bias=0.0, drift=0.0, delay=(0.0, 0.0), rate=10000.0),
     taxel=TaxelSensor(noise=0.0),
 )
 
@@ -79,15 +80,16 @@ class FakePhysics:
         self.object_qpos, self.object_dof = np.arange(12, 19), np.arange(12, 18)
         self.mj_model = SimpleNamespace(nv=18, dof_M0=np.ones(18), opt=SimpleNamespace(timestep=config.timestep))
 
-    def advance(self, target, state, torque, push):
+    def advance_motors(self, object, state, motors, memory, push):
         joints, velocity = state.qpos[:12], state.qvel[:12]
-        velocity = torque(jnp.asarray(5), joints, velocity) * 2.0
+        torque, memory = motors(jnp.asarray(5), joints, velocity, memory)
+        velocity = torque * 2.0
         joints = joints + self.config.control_period * velocity
         turned = rotations.quat_multiply(jnp.array([jnp.cos(0.02), jnp.sin(0.02), 0.0, 0.0]), state.qpos[15:])
         qpos = jnp.concatenate([joints, state.qpos[12:15], turned])
         qvel = jnp.concatenate([velocity, jnp.zeros(6)])
         force = jnp.zeros((5, 3)).at[:, 0].set(jnp.abs(jnp.sin(5 * joints[:5])) * 3)
-        return PhysicsState(qpos, qvel, state.warmstart), force
+        return PhysicsState(qpos, qvel, state.warmstart), force, memory
 
 
 class StillRotate(Rotate):
@@ -96,8 +98,8 @@ class StillRotate(Rotate):
     def make_pool(self, key):
         place = jnp.concatenate([jnp.asarray(self.reference), jnp.array([1.0, 0, 0, 0])])
         qpos = jnp.concatenate([jnp.asarray(self.config.posture), place])
-        target = sample_target(key, self.config)
-        return jax.tree.map(lambda x: x[None], Start(qpos, jnp.zeros(18), target))
+        object = sample_turned_object(key, self.config)
+        return jax.tree.map(lambda x: x[None], Start(qpos=qpos, qvel=jnp.zeros(18), object=object))
 
 
 class Acts:
@@ -128,10 +130,8 @@ def test_one_frame_gives_the_same_observation_through_both_doors_bit_for_bit(han
     task = task_class(config, hand)
     controller = Controller(Acts(task, hand, lambda observation: rng.uniform(-1, 1, 12).astype(np.float32)), hand)
     sensing = HandSensing(hand, HardwareConfig())
-    # The simulation's door: `Env._observe`, compiled by itself, on readings and some truth for the critic.
-    env = object.__new__(Env)
-    env.task, env.hand, env.config = task, hand, config
-    env._seen = dict.fromkeys(task.fields, config.observation)
+    # The simulation's door: `Observer`, compiled by itself, on readings and some truth for the critic.
+    observer = Observer(config, hand, task)
 
     def door(readings, goal):
         moment = SimpleNamespace(
@@ -143,7 +143,8 @@ def test_one_frame_gives_the_same_observation_through_both_doors_bit_for_bit(han
             object_quat=readings.object_quat,
             object_spin=jnp.zeros(3),
         )
-        return env._observe(readings, moment, goal)["actor"]
+        command, goal_quat = task.goal_readings(goal)
+        return observer.observe(readings, moment, command, goal_quat)["actor"]
 
     door = jax.jit(door)
     goal = task.begin(jax.random.key(0), None)

@@ -1,0 +1,70 @@
+"""What an episode draws at its start: the hand, the object's bulk, the IMU and the taxels."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dexsim.core.ranges import sample_extreme
+from dexsim.env.config import EnvConfig
+from dexsim.env.senses import SensorSuite
+from dexsim.env.state import Episode
+from dexsim.env.task import Task
+from dexsim.hand.kinematics import Hand
+from dexsim.objects.params import ObjectParams, toward_nominal
+from dexsim.randomization import HandParams, sample_hand, tilted_down
+from dexsim.sensing.imu import ImuParams
+
+
+class EpisodeSampler:
+    """Draws an `Episode`. Pure methods, for one environment."""
+
+    def __init__(self, config: EnvConfig, hand: Hand, task: Task, senses: SensorSuite):
+        self.config, self.hand, self.task, self.senses = config, hand, task, senses
+
+    def sample(
+        self, hand_key: jax.Array, sensor_key: jax.Array, object: ObjectParams, scale: jax.Array | None = None
+    ) -> Episode:
+        """One episode.
+
+        Args:
+          hand_key, sensor_key: of hand and IMU, and of the sensors.
+          object: of the start state, for which it was chosen.
+          scale: [] in [0, 1], narrows every range about nominal; None for 1.
+        """
+        if scale is not None:
+            object = toward_nominal(object, self.config.objects, self.task.unit_inertia(object), scale)
+        width = 1.0 if scale is None else scale
+        hand, imu = self.sample_hand(hand_key, sensor_key, width)
+        taxels = self.senses.sample_taxels(jax.random.fold_in(sensor_key, 1), width)
+        return Episode(hand=hand, object=object, imu=imu, taxels=taxels)
+
+    def sample_hand(
+        self, hand_key: jax.Array, sensor_key: jax.Array, scale: jax.Array | float = 1.0
+    ) -> tuple[HandParams, ImuParams]:
+        """The hand, and the object's IMU as that hand's host takes it."""
+        ranges = self.config.randomization
+        hand = sample_hand(
+            hand_key,
+            ranges,
+            self.hand,
+            timestep=self.config.physics.timestep,
+            control_period=self.config.physics.control_period,
+            scale=scale,
+        )
+        extreme = sample_extreme(hand_key, ranges.extremes)  # the one that `sample_hand` draws
+        imu = self.senses.sample_imu(sensor_key, ranges.scale * scale, extreme)
+        # An IMU's upright is the true one; the host takes it for that of a hand without tilt.
+        down, tilted = self._gravity(hand)
+        return hand, dataclasses.replace(imu, bias=imu.bias + jnp.cross(tilted, down))
+
+    def tilt_force(self, episode: Episode) -> jax.Array:
+        """The object's share [3] N of a tilted gravity; the links' share is small and left out."""
+        down, tilted = self._gravity(episode.hand)
+        return episode.object.mass * np.linalg.norm(self.task.gravity) * (tilted - down)
+
+    def _gravity(self, hand: HandParams) -> tuple[jax.Array, jax.Array]:
+        """Directions [3] of gravity in the palm frame: as the host takes it, and as it is."""
+        down = np.asarray(self.task.gravity, float) / np.linalg.norm(self.task.gravity)
+        return jnp.asarray(down), tilted_down(down, hand.tilt)
