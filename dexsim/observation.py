@@ -6,6 +6,7 @@ know which world it is in. Shapes: J joints, F fingers, N taxels a finger.
 
 import dataclasses
 from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -53,70 +54,41 @@ class Motion:
 
 
 @dataclasses.dataclass(frozen=True)
-class Field:
-    """A named piece of an observation.
-
-    `scale`: None for the running normaliser; a number divides the values instead. Touch has a
-    fixed scale, since running statistics of a signal that is mostly zero explode at the first
-    contact.
-    """
-
-    name: str
-    size: int
-    scale: float | None = None
-
-
-MEASURED_FIELDS = (
-    "joint_position",
-    "joint_torque",
-    "object_position",
-    "object_velocity",
-    "contact_force",
-    "contact_centre",
-    "tangential_force",
-    "fingertip_position",
-    "fingertip_rotation",
-    "command",
-    "last_action",
-    "relative_orientation",
-    "object_orientation",
-)
-"""What follows from readings."""
-TRUE_FIELDS = ("fingertip_velocity", "joint_velocity", "object_spin")
-"""What only a simulator knows."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class ObservationConfig:
-    """What of the touch and orientation signals the policy sees (the paper's ablations)."""
-
-    weighting: str = setting("force", choices=("force", "none"))
-    """Contact centre weighted by taxel force, or the plain mean of the active taxels."""
-    orientation: str = setting("6d", choices=("6d", "quaternion"))
-    """Encoding of the relative target orientation."""
-    leave_out: tuple[str, ...] = setting((), choices=("contact_force", "contact_centre", "relative_orientation"))
-    """Observation fields that the actor goes without."""
-    add: tuple[str, ...] = setting((), choices=(*MEASURED_FIELDS, *TRUE_FIELDS))
-    """Measured fields beyond the task's own, for actor and critic; `tangential_force` turns on
-    `Sensing.three_axis`."""
-    add_critic: tuple[str, ...] = setting((), choices=(*MEASURED_FIELDS, *TRUE_FIELDS))
-    """Fields that only the critic gets on top; those that only a simulator knows, too."""
-
-    def __post_init__(self):
-        validate(self)
-
-
-@dataclasses.dataclass(frozen=True)
 class Features:
     """What the fields are made of, computed once from the readings."""
 
     readings: Readings
-    tip_position: jax.Array  # [F, 3] m
+    encoding: str  # of orientations, see `ObservationConfig.orientation`
     contact_force: jax.Array  # [F] N
     contact_centre: jax.Array  # [F, 3] m
     pose: HandPose
     motion: Motion | None
     twist: Callable[[], jax.Array]  # [F, 6] m/s, rad/s, of the finger tips
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ObservationField:
+    """A named piece of an observation: all there is to know about it."""
+
+    name: str
+    size: Callable[[Hand, str], int]
+    """How many values, for a hand and an encoding of orientations."""
+    source: str
+    """Who measures it on a hand: "hand", "camera", "imu", or "three-axis taxels", which our hand has not; "user" and
+    "policy" know it themselves; "simulator" alone knows the rest, which is for critics."""
+    compute: Callable[[Features], jax.Array]
+    """Its values [size]."""
+    scale: float | None = None
+    """None for the running normaliser; a number divides the values instead. Touch has a fixed scale, since running
+    statistics of a signal that is mostly zero explode at the first contact."""
+
+
+class LayoutEntry(NamedTuple):
+    """Where a field is in an observation vector; see `ObservationField`."""
+
+    name: str
+    size: int
+    scale: float | None = None
 
 
 def _tip_twist(hand: Hand, joint_position: jax.Array, joint_velocity: jax.Array) -> jax.Array:
@@ -138,32 +110,157 @@ def _encode(quat: jax.Array, encoding: str) -> jax.Array:
     return rotations.matrix_to_6d(rotations.quat_to_matrix(quat))
 
 
-def _relative_orientation(f: Features, encoding: str) -> jax.Array:
+def _relative_orientation(f: Features) -> jax.Array:
     """Rotation that takes the object to its goal, in the palm frame."""
     relative = rotations.quat_multiply(f.readings.goal_quat, rotations.quat_conjugate(f.readings.object_quat))
-    return _encode(relative, encoding)
+    return _encode(relative, f.encoding)
 
 
-_TERMS: dict[str, Callable[[Features], jax.Array]] = {
-    "joint_position": lambda f: f.readings.joint_position,
-    "joint_torque": lambda f: f.readings.joint_torque,
-    "object_position": lambda f: f.readings.object_position,
-    "object_velocity": lambda f: f.readings.object_velocity,
-    "contact_force": lambda f: f.contact_force,
-    "contact_centre": lambda f: f.contact_centre.ravel(),
-    "fingertip_position": lambda f: f.tip_position.ravel(),
-    "tangential_force": lambda f: f.readings.tangential_force.ravel(),
-    "command": lambda f: f.readings.command[None],
-    "last_action": lambda f: f.readings.last_action,
-    "fingertip_rotation": lambda f: rotations.matrix_to_6d(f.pose.tip_rotation).ravel(),
-    "fingertip_velocity": lambda f: f.twist().ravel(),
-    "joint_velocity": lambda f: f.motion.joint_velocity,
-    "object_spin": lambda f: f.motion.object_spin,
+def _per_joint(hand: Hand, encoding: str) -> int:
+    return hand.num_joints
+
+
+def _per_finger(count: int) -> Callable[[Hand, str], int]:
+    return lambda hand, encoding: count * hand.num_fingers
+
+
+def _fixed(count: int) -> Callable[[Hand, str], int]:
+    return lambda hand, encoding: count
+
+
+def _angles(hand: Hand, encoding: str) -> int:
+    return 4 if encoding == "quaternion" else 6
+
+
+FIELDS: dict[str, ObservationField] = {
+    field.name: field
+    for field in (
+        ObservationField(
+            name="joint_position",
+            size=_per_joint,
+            source="hand",
+            compute=lambda f: f.readings.joint_position,
+        ),
+        ObservationField(
+            name="joint_torque",
+            size=_per_joint,
+            scale=0.3,
+            source="hand",
+            compute=lambda f: f.readings.joint_torque,
+        ),
+        ObservationField(
+            name="object_position",
+            size=_fixed(3),
+            source="camera",
+            compute=lambda f: f.readings.object_position,
+        ),
+        ObservationField(
+            name="object_velocity",
+            size=_fixed(3),
+            source="camera",
+            compute=lambda f: f.readings.object_velocity,
+        ),
+        ObservationField(
+            name="contact_force",
+            size=_per_finger(1),
+            scale=5.0,
+            source="hand",
+            compute=lambda f: f.contact_force,
+        ),
+        ObservationField(
+            name="contact_centre",
+            size=_per_finger(3),
+            scale=0.1,
+            source="hand",
+            compute=lambda f: f.contact_centre.ravel(),
+        ),
+        ObservationField(
+            name="tangential_force",
+            size=_per_finger(3),
+            scale=2.0,
+            source="three-axis taxels",
+            compute=lambda f: f.readings.tangential_force.ravel(),
+        ),
+        ObservationField(
+            name="fingertip_position",
+            size=_per_finger(3),
+            source="hand",
+            compute=lambda f: f.pose.tip_position.ravel(),
+        ),
+        ObservationField(
+            name="fingertip_rotation",
+            size=_per_finger(6),
+            source="hand",
+            compute=lambda f: rotations.matrix_to_6d(f.pose.tip_rotation).ravel(),
+        ),
+        ObservationField(
+            name="command",
+            size=_fixed(1),
+            scale=0.5,
+            source="user",
+            compute=lambda f: f.readings.command[None],
+        ),
+        ObservationField(
+            name="last_action",
+            size=_per_joint,
+            scale=1.0,
+            source="policy",
+            compute=lambda f: f.readings.last_action,
+        ),
+        ObservationField(
+            name="relative_orientation",
+            size=_angles,
+            source="imu",
+            compute=_relative_orientation,
+        ),
+        ObservationField(
+            name="object_orientation",
+            size=_angles,
+            source="imu",
+            compute=lambda f: _encode(f.readings.object_quat, f.encoding),
+        ),
+        ObservationField(
+            name="fingertip_velocity",
+            size=_per_finger(6),
+            source="simulator",
+            compute=lambda f: f.twist().ravel(),
+        ),
+        ObservationField(
+            name="joint_velocity",
+            size=_per_joint,
+            source="simulator",
+            compute=lambda f: f.motion.joint_velocity,
+        ),
+        ObservationField(
+            name="object_spin",
+            size=_fixed(3),
+            source="simulator",
+            compute=lambda f: f.motion.object_spin,
+        ),
+    )
 }
-_ORIENTATIONS = {
-    "relative_orientation": _relative_orientation,
-    "object_orientation": lambda f, encoding: _encode(f.readings.object_quat, encoding),
-}
+"""Every field by name. A field of one's own is one more entry."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ObservationConfig:
+    """What of the touch and orientation signals the policy sees (the paper's ablations)."""
+
+    weighting: str = setting("force", choices=("force", "none"))
+    """Contact centre weighted by taxel force, or the plain mean of the active taxels."""
+    orientation: str = setting("6d", choices=("6d", "quaternion"))
+    """Encoding of the relative target orientation."""
+    leave_out: tuple[str, ...] = setting((), choices=("contact_force", "contact_centre", "relative_orientation"))
+    """Observation fields that the actor goes without."""
+    add: tuple[str, ...] = setting((), choices=FIELDS)
+    """Measured fields beyond the task's own, for actor and critic; `tangential_force` turns on
+    `Sensing.three_axis`."""
+    add_critic: tuple[str, ...] = setting((), choices=FIELDS)
+    """Fields that only the critic gets on top; those that only a simulator knows, too."""
+
+    def __post_init__(self):
+        validate(self)
+
 
 GRASP = (
     "joint_position",
@@ -194,37 +291,10 @@ ROTATE_CRITIC = (
 )
 
 
-def layout(hand: Hand, names: tuple[str, ...], config: ObservationConfig) -> tuple[Field, ...]:
+def layout(hand: Hand, names: tuple[str, ...], config: ObservationConfig) -> tuple[LayoutEntry, ...]:
     """Names, sizes and scales of an observation's fields, in order."""
-    joints, fingers = hand.num_joints, hand.num_fingers
-    angles = 4 if config.orientation == "quaternion" else 6
-    size = {
-        "joint_position": joints,
-        "joint_torque": joints,
-        "object_position": 3,
-        "object_velocity": 3,
-        "contact_force": fingers,
-        "contact_centre": 3 * fingers,
-        "fingertip_position": 3 * fingers,
-        "command": 1,
-        "last_action": joints,
-        "relative_orientation": angles,
-        "object_orientation": angles,
-        "fingertip_rotation": 6 * fingers,
-        "fingertip_velocity": 6 * fingers,
-        "joint_velocity": joints,
-        "object_spin": 3,
-        "tangential_force": 3 * fingers,
-    }
-    scale = {
-        "contact_force": 5.0,
-        "contact_centre": 0.1,
-        "command": 0.5,
-        "joint_torque": 0.3,
-        "last_action": 1.0,
-        "tangential_force": 2.0,
-    }
-    return tuple(Field(name, size[name], scale.get(name)) for name in select_fields(names, config))
+    chosen = [FIELDS[name] for name in select_fields(names, config)]
+    return tuple(LayoutEntry(field.name, field.size(hand, config.orientation), field.scale) for field in chosen)
 
 
 def select_fields(names: tuple[str, ...], config: ObservationConfig) -> tuple[str, ...]:
@@ -239,7 +309,7 @@ def group_configs(config: ObservationConfig) -> tuple[ObservationConfig, Observa
     Raises:
       ConfigError: the actor is to see what nothing measures.
     """
-    true = [name for name in config.add if name in TRUE_FIELDS]
+    true = [name for name in config.add if FIELDS[name].source == "simulator"]
     if true:
         raise ConfigError(f"ObservationConfig.add = {true[0]!r}: no sensor measures it; name it in add_critic")
     return config, dataclasses.replace(config, leave_out=(), add=(*config.add, *config.add_critic), add_critic=())
@@ -264,18 +334,13 @@ def observe(
     pose = forward_kinematics(hand, readings.joint_position)
     force, centre = reduce_touch_links(readings.taxel_force, hand, pose, config.weighting)
     features = Features(
-        readings,
-        pose.tip_position,
-        force,
-        centre,
-        pose,
-        motion,
-        lambda: _tip_twist(hand, readings.joint_position, motion.joint_velocity),
+        readings=readings,
+        encoding=config.orientation,
+        contact_force=force,
+        contact_centre=centre,
+        pose=pose,
+        motion=motion,
+        twist=lambda: _tip_twist(hand, readings.joint_position, motion.joint_velocity),
     )
-    parts = []
-    for name in select_fields(names, config):
-        if name in _ORIENTATIONS:
-            parts.append(_ORIENTATIONS[name](features, config.orientation))
-        else:
-            parts.append(_TERMS[name](features))
+    parts = [FIELDS[name].compute(features) for name in select_fields(names, config)]
     return jnp.concatenate(parts).astype(jnp.float32)

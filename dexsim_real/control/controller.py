@@ -14,7 +14,7 @@ import numpy as np
 
 from dexsim.control import move_target, observed_action
 from dexsim.hand.kinematics import Hand
-from dexsim.observation import Field, ObservationConfig, Readings, layout, observe
+from dexsim.observation import LayoutEntry, ObservationConfig, Readings, layout, observe
 from dexsim_ppo.policy import Policy
 from dexsim_real.core.errors import HandError
 from dexsim_real.sensors.hand import Measured
@@ -64,7 +64,7 @@ class Controller:
         self.spec = policy.spec
         self.spec.check_hand(hand)
         names, config = self.spec.fields, self.spec.observation
-        wanted = tuple(Field(f.name, f.size, f.scale) for f in policy.observation_layout)
+        wanted = tuple(LayoutEntry(f.name, f.size, f.scale) for f in policy.observation_layout)
         if layout(hand, names, config) != wanted:
             raise HandError(f"the policy's observation does not fit this version's task {policy.task!r}")
         self.sources = sources_of([field.name for field in wanted])

@@ -16,7 +16,7 @@ import numpy as np
 from dexsim import load_hand
 from dexsim.calibration.maps import load_calibration
 from dexsim.core.config import from_dict
-from dexsim.observation import Field, Readings, layout
+from dexsim.observation import LayoutEntry, Readings, layout
 from dexsim.task_spec import TaskSpec
 from dexsim_ppo.retired import old_spec
 from dexsim_real.control.controller import make_observe
@@ -36,7 +36,7 @@ class Replay:
     measured: list[Measured]  # by tick
     ticks: list[dict[str, Any]]  # as logged
     observation: np.ndarray  # [T, n] recomputed
-    fields: tuple[Field, ...]  # of the observation
+    fields: tuple[LayoutEntry, ...]  # of the observation
 
 
 def replay(path: Path) -> Replay:
@@ -48,7 +48,7 @@ def replay(path: Path) -> Replay:
     reader = LogReader(path)
     states: dict[int, bytes] = {}
     times, measured, ticks, observations, notes = [], [], [], [], []
-    fields: tuple[Field, ...] = ()
+    fields: tuple[LayoutEntry, ...] = ()
     counts = dict.fromkeys(("frames", "readings_same", "observations_same", "without_frame"), 0)
     first, meta, end = "", None, None
     for record in reader:
@@ -103,7 +103,7 @@ def replay(path: Path) -> Replay:
     return Replay(report, since, measured, ticks, np.array(observations), fields)
 
 
-def _rebuild(meta: dict[str, Any]) -> tuple[HandSensing, Any, tuple[Field, ...]]:
+def _rebuild(meta: dict[str, Any]) -> tuple[HandSensing, Any, tuple[LayoutEntry, ...]]:
     """The sensing of a logged run, its observation, and the fields of that."""
     hand, calibration = load_hand(), None
     if meta["calibration"]:

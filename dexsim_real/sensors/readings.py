@@ -5,25 +5,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from dexsim.observation import Readings
+from dexsim.observation import FIELDS, Readings
 from dexsim_real.core.errors import HandError
 from dexsim_real.sensors.hand import Measured
 
-SOURCES = {
-    "joint_position": "hand",
-    "joint_torque": "hand",
-    "contact_force": "hand",
-    "contact_centre": "hand",
-    "fingertip_position": "hand",
-    "fingertip_rotation": "hand",
-    "last_action": "policy",
-    "command": "user",
-    "object_position": "camera",
-    "object_velocity": "camera",
-    "relative_orientation": "imu",
-    "object_orientation": "imu",
-}
-"""Who measures each field of an observation on hardware."""
+SOURCES = ("hand", "camera", "imu", "user", "policy")
+"""Who gives the bridge what a policy observes; see `ObservationField.source`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,9 +29,9 @@ def sources_of(names: Sequence[str]) -> set[str]:
       HandError: a field that no sensor of the bridge measures.
     """
     for name in names:
-        if name not in SOURCES:
+        if name not in FIELDS or FIELDS[name].source not in SOURCES:
             raise HandError(f"the policy observes {name!r}, which the hand cannot measure")
-    return {SOURCES[name] for name in names}
+    return {FIELDS[name].source for name in names}
 
 
 def make_readings(
@@ -65,4 +52,4 @@ def make_readings(
         "command": command,
         "last_action": last_action,
     }
-    return Readings(**{field.name: np.asarray(known[field.name], np.float32) for field in dataclasses.fields(Readings)})
+    return Readings(**{name: np.asarray(value, np.float32) for name, value in known.items()})

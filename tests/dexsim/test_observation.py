@@ -9,7 +9,19 @@ import pytest
 
 from dexsim import observation
 from dexsim.core.errors import ConfigError
-from dexsim.observation import GRASP, ROTATE, Field, ObservationConfig, Readings, layout
+from dexsim.observation import (
+    FIELDS,
+    GRASP,
+    ROTATE,
+    LayoutEntry,
+    Motion,
+    ObservationConfig,
+    ObservationField,
+    Readings,
+    ThreeAxisReadings,
+    layout,
+)
+from dexsim_real.sensors.readings import sources_of
 
 TIPS = ("thumb_tip", "index_tip", "mid_tip", "ring_tip", "pinky_tip")
 observe = jax.jit(observation.observe, static_argnums=(0, 2, 3))
@@ -210,5 +222,28 @@ def test_unknown_options_are_refused():
         ObservationConfig(leave_out=("smell",))
 
 
-def test_fields_are_hashable():
-    assert hash(Field("command", 1, 0.5)) == hash(Field("command", 1, 0.5))
+@pytest.mark.parametrize("orientation", ["6d", "quaternion"])
+def test_every_field_has_the_size_that_it_says(hand, readings, orientation):
+    config = ObservationConfig(orientation=orientation)
+    three_axis = ThreeAxisReadings(**vars(readings), tangential_force=np.ones((5, 3), np.float32))
+    motion = Motion(np.ones(12, np.float32), np.ones(3, np.float32))
+    for name in FIELDS:
+        values = observation.observe(hand, three_axis, (name,), config, motion)
+        assert [entry.size for entry in layout(hand, (name,), config)] == [len(values)], name
+
+
+def test_a_field_of_ones_own_is_one_entry(hand, readings, monkeypatch):
+    """Named in the configuration, it stands at the observation's end, and the bridge knows who measures it."""
+    own = ObservationField(
+        name="bending",
+        size=lambda hand, encoding: 1,
+        source="hand",
+        compute=lambda f: f.readings.joint_position.sum()[None],
+        scale=12.0,
+    )
+    monkeypatch.setitem(FIELDS, own.name, own)
+    config = ObservationConfig(add=("bending",))
+    assert layout(hand, GRASP, config)[-1] == LayoutEntry("bending", 1, 12.0)
+    vector = observation.observe(hand, readings, GRASP, config)
+    assert vector.shape == (67,) and float(vector[-1]) == pytest.approx(readings.joint_position.sum(), rel=1e-5)
+    assert sources_of(("bending",)) == {"hand"}
