@@ -11,15 +11,10 @@ from dexsim.hand.kinematics import Hand
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Control:
-    """How an action in [-1, 1] becomes a joint target."""
+    """How an action in [-1, 1] moves the joint targets."""
 
-    mode: str = setting("delta", choices=("delta", "absolute"))
-    """"delta": the target moves by action * step; "absolute": it follows the action's place in
-    the joint's range, smoothed."""
     step: float = setting(0.2, unit="rad", low=0.001, high=1.0)
-    """Largest change of a target in one tick (delta)."""
-    smoothing: float = setting(0.4, unit="1", low=0.01, high=1.0)
-    """Weight of the newest target in the moving average (absolute)."""
+    """Largest change of a target in one tick: the target moves by action * step."""
     reach: float = setting(0.5, unit="rad", low=0.01, high=4.0)
     """Largest distance of a target from the measured angle: bounds windup and grip torque."""
     recall: str = setting("action", choices=("action", "target"))
@@ -39,12 +34,7 @@ def move_target(control: Control, hand: Hand, target: jax.Array, action: jax.Arr
       action: [J] in [-1, 1].
       measured: [J] rad, joint angles now.
     """
-    if control.mode == "delta":
-        target = target + control.step * action
-    else:
-        middle = (hand.joint_upper + hand.joint_lower) / 2
-        wanted = middle + action * (hand.joint_upper - hand.joint_lower) / 2
-        target = target + control.smoothing * (wanted - target)
+    target = target + control.step * action
     target = jnp.clip(target, measured - control.reach, measured + control.reach)
     return jnp.clip(target, hand.joint_lower, hand.joint_upper)
 

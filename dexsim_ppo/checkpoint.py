@@ -135,32 +135,35 @@ def load(path: str | Path, *, kind: str, task: str | None = None) -> Checkpoint:
         header["task"],
         header["library"],
         header["content"],
-        migrate_leaves(_read_leaves(path, header["leaves"], payload)),
+        _read_leaves(path, header["leaves"], payload),
     )
 
 
 def restore(checkpoint: Checkpoint, like: Tree) -> Tree:
     """The loaded leaves in the shape of `like`, a pytree of arrays or of `jax.ShapeDtypeStruct`s.
 
+    Leaves of older versions go where today's are (`dexsim_ppo.retired`).
+
     Raises:
       CheckpointError: a leaf is missing, left over, or of another shape or type; names it.
     """
     wanted, structure = jax.tree_util.tree_flatten_with_path(like)
     paths = [jax.tree_util.keystr(tree_path) for tree_path, _ in wanted]
-    for name in (*paths, *checkpoint.leaves):
-        if (name in checkpoint.leaves) != (name in set(paths)):
+    leaves = migrate_leaves(checkpoint.leaves, set(paths))
+    for name in (*paths, *leaves):
+        if (name in leaves) != (name in set(paths)):
             raise CheckpointError(
                 f"{checkpoint.path}: does not fit this configuration: {name} is "
-                f"{'not expected' if name in checkpoint.leaves else 'missing'}"
+                f"{'not expected' if name in leaves else 'missing'}"
             )
     for name, (_, leaf) in zip(paths, wanted, strict=True):
-        found = checkpoint.leaves[name]
+        found = leaves[name]
         if found.shape != leaf.shape or found.dtype != leaf.dtype:
             raise CheckpointError(
                 f"{checkpoint.path}: does not fit this configuration: {name} is "
                 f"{found.dtype}{list(found.shape)}, expected {leaf.dtype}{list(leaf.shape)}"
             )
-    return jax.tree_util.tree_unflatten(structure, [checkpoint.leaves[name] for name in paths])
+    return jax.tree_util.tree_unflatten(structure, [leaves[name] for name in paths])
 
 
 def _bytes(array: np.ndarray) -> memoryview:

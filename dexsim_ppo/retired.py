@@ -8,6 +8,7 @@ import copy
 import dataclasses
 import math
 import warnings
+from collections.abc import Collection
 from typing import Any
 
 from dexsim import observation
@@ -17,6 +18,9 @@ from dexsim.core.errors import CheckpointError, OldFileWarning
 from dexsim.task_spec import TaskSpec, TurnSpec
 
 FIELDS: dict[str, str | None] = {
+    "control.mode": None,
+    "control.smoothing": None,
+    "goal_dwell": None,
     "leash": "drop_radius",
     "objects.bare_friction": "objects.link_friction",
     "objects.corners": "objects.extremes",
@@ -26,6 +30,8 @@ FIELDS: dict[str, str | None] = {
     "physics.palm": None,
     "physics.tips": None,
     "randomization.corners": "randomization.extremes",
+    "reward.fingertips": None,
+    "reward.tips_by": None,
     "sensing.array.bias": "sensing.taxel.bias",
     "sensing.array.counts": None,
     "sensing.array.crosstalk": "sensing.taxel.crosstalk",
@@ -51,10 +57,15 @@ VALUES: dict[str, dict[Any, Any]] = {
 """Values of today's fields that were renamed or are gone: path to new values by old ones."""
 
 UNCHANGED: dict[str, Any] = {
+    "control.mode": "delta",
+    "control.smoothing": 0.4,
+    "goal_dwell": 0.0,
     "physics.condim": 3,
     "physics.cone": "elliptic",
     "physics.palm": "auto",
     "physics.tips": "skin",
+    "reward.fingertips": 0.0,
+    "reward.tips_by": "last",
     "sensing.array": {},
 }
 """Dropped fields at the value that every environment has today: they are not reported."""
@@ -68,8 +79,17 @@ ARGUMENTS: dict[str, str | None] = {"corners": "extremes"}
 LEAVES: dict[str, str | None] = {
     ".env_state.array_params.noise": None,
     ".env_state.array_params.threshold": None,
+    ".env_state.array": ".env_state.taxel_memory",
+    ".env_state.array_params": ".env_state.episode.taxels",
+    ".env_state.draw": ".env_state.episode.hand",
+    ".env_state.goal.dwell": None,
+    ".env_state.object_velocity": None,
+    ".env_state.orientation_sensor": ".env_state.episode.imu",
+    ".env_state.sample": ".env_state.sensor_input",
+    ".env_state.tangential_force": None,
+    ".env_state.target": ".env_state.episode.object",
 }
-"""Prefixes of the paths of a checkpoint's arrays, likewise."""
+"""Paths of a checkpoint's arrays and of groups of them, likewise; the first that fits holds."""
 
 
 def migrate_config(config: dict[str, Any], where: Any) -> dict[str, Any]:
@@ -83,16 +103,17 @@ def migrate_arguments(arguments: dict[str, Any], where: Any) -> dict[str, Any]:
     return _migrate(arguments, fields, where, "env.")
 
 
-def migrate_leaves(leaves: dict[str, Any]) -> dict[str, Any]:
-    """A checkpoint's arrays by path, under today's paths."""
-    moved = {}
-    for path, leaf in leaves.items():
-        old = next((old for old in LEAVES if path.startswith(old)), None)
-        if old is None:
-            moved[path] = leaf
-        elif (new := LEAVES[old]) is not None:
-            moved[new + path.removeprefix(old)] = leaf
-    return moved
+def migrate_leaves(leaves: dict[str, Any], wanted: Collection[str]) -> dict[str, Any]:
+    """A checkpoint's arrays by path, under today's paths; those that are `wanted` under the path they have stay."""
+    moved = {path if path in wanted else _leaf_path(path): leaf for path, leaf in leaves.items()}
+    return {path: leaf for path, leaf in moved.items() if path is not None}
+
+
+def _leaf_path(path: str) -> str | None:
+    for old, new in LEAVES.items():
+        if path == old or path.startswith((f"{old}.", f"{old}[")):
+            return None if new is None else new + path.removeprefix(old)
+    return path
 
 
 def old_spec(task: str, config: dict[str, Any]) -> TaskSpec:

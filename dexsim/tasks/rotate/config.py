@@ -48,15 +48,11 @@ class RotateReward:
     spin: float = setting(2.0, unit="s/rad", low=0.0, high=1000.0)
     """Spin about the axis in the wanted direction, up to +-1 rad/s: a gradient before the first
     goal is ever reached."""
-    fingertips: float = setting(0.0, unit="1", low=0.0, high=1000.0)
-    """Share of `working_tips` fingertips that have done their share of touching lately."""
     working_tips: int = setting(3, unit="1", low=1, high=20)
-    """Fingertips that are asked to take part."""
+    """Fingertips that are asked to take part. The least busy of them counts: by their mean two busy ones would earn
+    most of it, and some seeds keep to two."""
     working_duty: float = setting(0.12, unit="1", low=0.001, high=1.0)
     """Share of the time for which one has to touch to earn all of that."""
-    tips_by: str = setting("last", choices=("mean", "last"))
-    """What counts as taking part: the mean of those fingertips, or the least busy of them. By the mean,
-    two that are busy earn most of it, and some seeds keep to two."""
     drop: float = setting(-50.0, unit="1", low=-10000.0, high=0.0)
     """Once, when the object is lost."""
 
@@ -92,9 +88,7 @@ class RotateConfig(EnvConfig):
     goal_distance: float = setting(0.05, unit="m", low=0.001, high=0.5)
     """... this far from the reference ..."""
     goal_spin: float = setting(2.0, unit="rad/s", low=0.0, high=1000.0)
-    """... at no more than this spin about the axis (0: any) ..."""
-    goal_dwell: float = setting(0.0, unit="s", low=0.0, high=10.0)
-    """... held for this long."""
+    """... at no more than this spin about the axis; 0 for any."""
     support: str = setting("palm", choices=("palm", "fingers"))
     """Carried by the palm, or held clear of it by the fingers: then touching the palm is a drop."""
     tilt: float = setting(-0.2, unit="rad", low=-1.2, high=1.2)

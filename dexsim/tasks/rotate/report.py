@@ -18,7 +18,7 @@ def summarize(metrics: dict[str, np.ndarray], lived: np.ndarray, control_period:
 
     Returns:
       A JSON-able dict. "successes" are consecutive by nature: a drop ends the episode. They count goals
-      reached under the configured test (spin and dwell), "paper_successes" those under the paper's.
+      reached under the configured test (with spin), "paper_successes" those under the paper's.
       "seconds_per_success" is the time at the last goal over their number, of episodes with one or
       more. "seconds_to_fall" is cut at the episode's length where the object stayed. Intervals are 95 %:
       Wilson's for proportions, else bootstrap over episodes.

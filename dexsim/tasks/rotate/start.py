@@ -74,7 +74,6 @@ def _fingerprint(key: jax.Array, hand: Hand, config: Any) -> str:
         "goal_angle",
         "goal_distance",
         "goal_spin",
-        "goal_dwell",
         "episode_seconds",
         "evaluation_seconds",
         "push_probability",

@@ -42,7 +42,6 @@ class Goal:
     turns: jax.Array  # [] int32 goals reached
     entered: jax.Array  # [] bool, inside the paper's window since this goal was set
     entries: jax.Array  # [] int32 goals reached as the paper counts
-    dwell: jax.Array  # [] s inside the window
     clock: jax.Array  # [] s
     last_success: jax.Array  # [] s, clock at the last goal
     gives_up: jax.Array  # [] bool, whether `patience` and `drop_radius` end the episode
@@ -60,7 +59,6 @@ class Progress:
     distance: jax.Array  # [] m, from the reference
     spin: jax.Array  # [] rad/s about the axis, positive in the wanted direction
     entered: jax.Array  # [] bool
-    dwell: jax.Array  # [] s
     success: jax.Array  # [] bool
 
 
@@ -80,10 +78,9 @@ def goal_reward(angle: jax.Array, distance: jax.Array, weights: RotateReward) ->
     return gate / (jnp.abs(angle) + weights.epsilon)
 
 
-def tips_at_work(duty: jax.Array, count: int, enough: float, by: str = "mean") -> jax.Array:
-    """min(duty / enough, 1) of the `count` busiest fingertips: their mean, or the least of them."""
-    busiest = jnp.minimum(jnp.sort(duty)[::-1][:count] / enough, 1.0)
-    return jnp.sum(busiest) / count if by == "mean" else busiest[-1]
+def tips_at_work(duty: jax.Array, count: int, enough: float) -> jax.Array:
+    """min(duty / enough, 1) [] of the least busy of the `count` busiest fingertips; `duty` [F]."""
+    return jnp.minimum(jnp.sort(duty)[::-1][:count] / enough, 1.0)[-1]
 
 
 class Rotate:
@@ -135,7 +132,6 @@ class Rotate:
             turns=none,
             entered=jnp.zeros((), bool),
             entries=none,
-            dwell=zero,
             clock=zero,
             last_success=zero,
             gives_up=jnp.ones((), bool),
@@ -153,10 +149,7 @@ class Rotate:
         spin = config.direction * jnp.sum(truth.object_spin * self._axis)
         inside = (angle < config.goal_angle) & (distance < config.goal_distance)
         calm = jnp.abs(spin) <= config.goal_spin if config.goal_spin > 0 else True
-        dwell = jnp.where(inside, goal.dwell + self._period, 0.0)
-        # Half a tick of slack: sums of ticks are not exact.
-        success = inside & calm & (dwell > config.goal_dwell - self._period / 2)
-        return Progress(angle, distance, spin, goal.entered | inside, dwell, success)
+        return Progress(angle, distance, spin, goal.entered | inside, inside & calm)
 
     def update(self, key: jax.Array, goal: Goal, truth: GroundTruth) -> Goal:
         del key
@@ -177,7 +170,6 @@ class Rotate:
             turns=goal.turns + now.success,
             entered=now.entered & ~now.success,
             entries=goal.entries + (now.entered & ~goal.entered),
-            dwell=jnp.where(now.success, 0.0, now.dwell),
             clock=clock,
             last_success=jnp.where(now.success, clock, goal.last_success),
             gives_up=goal.gives_up,
@@ -219,7 +211,7 @@ class Rotate:
         """The reward of a tick and its terms; nothing but penalties once dropped."""
         weights, now, held = self.config.reward, self.progress(goal, truth), 1.0 - dropped
         after = self._advance(goal, truth)
-        work = tips_at_work(after.duty, weights.working_tips, weights.working_duty, weights.tips_by)
+        work = tips_at_work(after.duty, weights.working_tips, weights.working_duty)
         calm = jnp.minimum(weights.bonus_speed / jnp.maximum(after.pace, 1e-6), 1.0) ** 2
         asked = weights.bonus_tips * (goal.turns >= weights.tips_after)
         share = calm * (1.0 - asked * (1.0 - work))
@@ -227,7 +219,6 @@ class Rotate:
             "goal": held * weights.goal * goal_reward(now.angle, now.distance, weights),
             "bonus": held * weights.bonus * now.success * share,
             "spin": held * weights.spin * jnp.clip(now.spin, -1.0, 1.0),
-            "fingertips": held * weights.fingertips * work,
             "action": weights.action * action_rate(truth.action, truth.last_action),
             "velocity": weights.velocity * joint_speed(truth.joint_velocity),
             "torque": weights.torque * jnp.sum(truth.joint_torque**2),

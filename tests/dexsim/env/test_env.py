@@ -224,18 +224,6 @@ class TestTick:
         assert np.all(np.abs(np.asarray(after.joint_target) - measured) <= 0.5 + 1e-6)
         assert np.abs(moved).max() > 0.1
 
-    def test_absolute_targets(self, hand, grasp_env):
-        """The other way to read an action: a place in the joint's range, smoothed."""
-        control = Control(mode="absolute", smoothing=0.25, reach=4.0)
-        other = dexsim.make(
-            "grasp", GraspConfig(control=control, pool_size=1, objects=ObjectConfig(shapes=("sphere",))), backend="jax"
-        )
-        start = jnp.asarray(hand.joint_lower)
-        for value, share in ((1.0, 1.0), (-1.0, 0.0), (0.0, 0.5)):
-            target = other._joint_target(start, jnp.full(12, value), start)
-            reach = hand.joint_upper - hand.joint_lower
-            np.testing.assert_allclose(target, hand.joint_lower + 0.25 * share * reach, atol=1e-6)
-
 
 def plain_drive(drive, wanted, position, velocity):
     """The paper's four equations and the ripple, joint by joint; the loop sees the encoder."""
@@ -384,7 +372,7 @@ class TestTrouble:
     @pytest.mark.parametrize(
         "make, message",
         [
-            (lambda: Control(mode="torque"), "Control.mode = 'torque': choose from delta, absolute"),
+            (lambda: Control(recall="torque"), "Control.recall = 'torque': choose from action, target"),
             (lambda: Control(step=5.0), "Control.step = 5 rad: must be between 0.001 and 1 rad"),
             (lambda: Sensing(joint_noise=-1.0), "Sensing.joint_noise = -1 rad"),
             (lambda: EnvConfig(pool_size=0), "EnvConfig.pool_size|pool_size = 0"),
