@@ -1,4 +1,18 @@
-"""What a task is: the truth that it sees, and the rules that it adds."""
+"""What a task is: the truth that it sees, and the rules that it adds.
+
+A task of one's own is a class with what `Task` names, made from a configuration and a hand, and registered:
+
+    class Lift:                                    # no base class needed
+        name = "lift"
+        ...
+        def __init__(self, config: LiftConfig, hand: Hand): ...
+
+    dexsim.register("lift", Lift)
+    env = dexsim.make("lift")
+
+SI units; positions, velocities and forces are in the palm frame, quaternions (w, x, y, z). Shapes: J joints, F
+fingers, N taxels a finger, K primitives of an object, P start states.
+"""
 
 from typing import Any, Protocol
 
@@ -6,6 +20,7 @@ import jax
 import numpy as np
 
 from dexsim.core.pytree import pytree_dataclass
+from dexsim.env.config import EnvConfig
 from dexsim.env.state import Start
 from dexsim.hand.kinematics import HandPose
 from dexsim.objects.params import ObjectParams
@@ -33,29 +48,113 @@ class GroundTruth:
 
 
 class Task(Protocol):
-    """What a task adds. All methods are pure and written for one environment."""
+    """What a task adds to a hand and an object.
+
+    Methods are pure and written for one environment: JAX traces and vmaps them, but for `make_pool`,
+    `evaluation_plan` and `summarize`, which run once, on the host. `Goal` stands for the task's own pytree of arrays,
+    which an episode carries from tick to tick.
+    """
 
     name: str
-    config: Any
-    fields: dict[str, tuple[str, ...]]  # observation fields of "actor" and "critic"
-    gravity: tuple[float, float, float]  # m/s^2, palm frame
-    reference: tuple[float, float, float]  # m, where the object belongs
+    config: EnvConfig
+    """An `EnvConfig` or a subclass with settings of the task's own."""
+    fields: dict[str, tuple[str, ...]]
+    """Names of the observation's fields (`dexsim.observation.FIELDS`), for "actor" and for "critic"."""
+    gravity: tuple[float, float, float]
+    """m/s^2; it says how the hand is mounted."""
+    reference: tuple[float, float, float]
+    """m, where the object belongs; readings show it for coordinates that are not measured."""
     episode_ticks: int
+    """Time limit of a training episode, control ticks."""
     slots: tuple[str, ...]
-    largest: np.ndarray  # [K, 3] m, upper bound of each slot's size
+    """Kinds of the primitives [K] that objects consist of: "box", "capsule", "cylinder", "ellipsoid"."""
+    largest: np.ndarray
+    """[K, 3] m, upper bound of each primitive's size."""
     evaluation_ticks: int
-    evaluation: str  # "series" or "totals": what `summarize` is given, see `Env.summarize`
-    object_ranges: tuple[str, ...]  # paths in `config` of what is drawn for every object
+    """Length of an evaluation episode, control ticks."""
+    evaluation: str
+    """What `summarize` is given: "series" or "totals"."""
+    object_ranges: tuple[str, ...]
+    """Paths in `config` of the ranges that `sample_object` draws from, for the self-test of the randomisation."""
 
-    def sample_object(self, key: jax.Array, config: Any, shape_index: jax.Array | None = None) -> ObjectParams: ...
-    def make_pool(self, key: jax.Array) -> Start: ...
-    def unit_inertia(self, object: ObjectParams) -> jax.Array: ...
-    def begin(self, key: jax.Array, start: Start) -> Any: ...
-    def update(self, key: jax.Array, goal: Any, truth: GroundTruth) -> Any: ...
-    def goal_readings(self, goal: Any) -> tuple[jax.Array, jax.Array]: ...
-    def push(self, key: jax.Array, object: ObjectParams) -> jax.Array: ...
-    def reward(self, goal: Any, truth: GroundTruth, dropped: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]: ...
-    def dropped(self, goal: Any, truth: GroundTruth) -> jax.Array: ...
-    def target_force(self, goal: Any) -> jax.Array: ...
-    def evaluation_plan(self, count: int, shape_index: np.ndarray) -> tuple[np.ndarray, Any]: ...
-    def summarize(self, metrics: dict[str, np.ndarray], alive: np.ndarray, control_period: float) -> dict: ...
+    def make_pool(self, key: jax.Array) -> Start:
+        """Start states [P, ...] of which every episode begins with one; made once.
+
+        Raises:
+          ConfigError: the configuration leaves too few of them.
+        """
+        ...
+
+    def sample_object(self, key: jax.Array, config: Any, shape_index: jax.Array | None = None) -> ObjectParams:
+        """One object.
+
+        Args:
+          key: of this object.
+          config: a configuration of this task, whose ranges may be others than `self.config`'s.
+          shape_index: [] int32 into `dexsim.objects.config.SHAPES`; None for any that the task has.
+        """
+        ...
+
+    def unit_inertia(self, object: ObjectParams) -> jax.Array:
+        """Inertia [3] m^2 of the object as a uniform solid of 1 kg, which a narrowed range of inertia is about."""
+        ...
+
+    def begin(self, key: jax.Array, start: Start) -> Any:
+        """The Goal of a new episode that begins with `start`."""
+        ...
+
+    def update(self, key: jax.Array, goal: Any, truth: GroundTruth) -> Any:
+        """The Goal after a tick; of the same structure, shapes and types."""
+        ...
+
+    def goal_readings(self, goal: Any) -> tuple[jax.Array, jax.Array]:
+        """What readings carry of the goal: grip command [] in [0, 1], and the object's goal orientation [4]."""
+        ...
+
+    def push(self, key: jax.Array, object: ObjectParams) -> jax.Array:
+        """Force [3] N on the object's centre of mass during the next tick; zeros for none."""
+        ...
+
+    def dropped(self, goal: Any, truth: GroundTruth) -> jax.Array:
+        """Whether [] bool the episode has failed and ends here. `goal` is the one after the tick."""
+        ...
+
+    def reward(self, goal: Any, truth: GroundTruth, dropped: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """The reward [] of a tick, and metrics [] by name.
+
+        Names must be the same in every tick; "return", "length", "shape", "non_finite" and names that begin with
+        "tangential" are the environment's.
+
+        Args:
+          goal: the one that held during the tick.
+          truth: after the tick.
+          dropped: [] bool, whether the episode ends by failure: `dropped`, or physics that diverged.
+        """
+        ...
+
+    def target_force(self, goal: Any) -> jax.Array:
+        """Force [] N that each finger is asked for; it is shown in pictures only. Zero for none."""
+        ...
+
+    def evaluation_plan(self, count: int, shape_index: np.ndarray) -> tuple[np.ndarray, Any]:
+        """The episodes of an evaluation.
+
+        Args:
+          count: how many.
+          shape_index: [P] of the pool's objects.
+
+        Returns:
+          Rows [count] of the pool, and Goals [count, ...].
+        """
+        ...
+
+    def summarize(self, metrics: dict[str, np.ndarray], alive: np.ndarray, control_period: float) -> dict[str, Any]:
+        """An evaluation's report: plain data that JSON can hold. "headline" maps names to the numbers to print.
+
+        Args:
+          metrics: the environment's, by name. For "series" [T, N], zero once an episode has ended; for "totals" [N],
+            of each episode's last tick.
+          alive: for "series" [T, N] bool, whether an episode had not ended; for "totals" [N], the ticks it lived.
+          control_period: s.
+        """
+        ...

@@ -1,0 +1,128 @@
+"""A task written from `dexsim.env.task.Task` alone: balance a ball on the upturned palm."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from simple_physics import SimplePhysics
+
+import dexsim
+from dexsim import registry
+from dexsim.core.config import setting
+from dexsim.core.pytree import pytree_dataclass
+from dexsim.env.config import EnvConfig
+from dexsim.env.state import Start
+from dexsim.objects.params import sample_object, unit_inertia
+
+WORLDS = 4
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class BalanceConfig(EnvConfig):
+    """The balance task."""
+
+    pool_size: int = setting(6, unit="1", low=1)
+    """Start states."""
+    height: float = setting(0.1, unit="m", low=0.0, high=1.0)
+    """Where the ball starts above the palm's centre."""
+    reach: float = setting(0.15, unit="m", low=0.0, high=1.0)
+    """The ball is lost when it is farther than this from there."""
+
+
+@pytree_dataclass
+class Goal:
+    """What an episode carries."""
+
+    ticks: jax.Array  # [] so far
+
+
+class Balance:
+    """The rules: no base class, nothing of another task."""
+
+    name, evaluation, object_ranges = "balance", "series", ("objects.mass",)
+    fields = {"actor": ("joint_position", "contact_force"), "critic": ("joint_position", "joint_velocity")}
+    gravity, episode_ticks, evaluation_ticks = (-9.81, 0.0, 0.0), 30, 20
+
+    def __init__(self, config: BalanceConfig, hand: dexsim.Hand):
+        self.config, self.hand = config, hand
+        self.slots, self.largest = config.objects.slots, config.objects.largest
+        self.reference = (config.height, 0.0, 0.1)
+
+    def make_pool(self, key):
+        keys = jax.random.split(key, self.config.pool_size)
+        object = jax.vmap(lambda key: self.sample_object(key, self.config, jnp.int32(0)))(keys)
+        rest = jnp.concatenate([jnp.zeros(self.hand.num_joints), jnp.array([*self.reference, 1.0, 0.0, 0.0, 0.0])])
+        qpos = jnp.tile(rest, (len(keys), 1))
+        return Start(qpos=qpos, qvel=jnp.zeros((len(keys), self.hand.num_joints + 6)), object=object)
+
+    def sample_object(self, key, config, shape_index=None):
+        return sample_object(key, config.objects, shape_index)
+
+    def unit_inertia(self, object):
+        return unit_inertia(object, self.config.objects)
+
+    def begin(self, key, start):
+        return Goal(jnp.zeros(()))
+
+    def update(self, key, goal, truth):
+        return Goal(goal.ticks + 1)
+
+    def goal_readings(self, goal):
+        return jnp.zeros(()), jnp.array([1.0, 0.0, 0.0, 0.0])
+
+    def push(self, key, object):
+        return jnp.zeros(3)
+
+    def dropped(self, goal, truth):
+        return self._distance(truth) > self.config.reach
+
+    def reward(self, goal, truth, dropped):
+        distance = self._distance(truth)
+        return jnp.where(dropped, -1.0, 1.0 - distance), {"distance": distance, "ticks": goal.ticks}
+
+    def target_force(self, goal):
+        return jnp.zeros(())
+
+    def evaluation_plan(self, count, shape_index):
+        return np.arange(count) % len(shape_index), Goal(jnp.zeros(count))
+
+    def summarize(self, metrics, alive, control_period):
+        held = float(alive[-1].mean())
+        return {"held": held, "headline": {"held": held}}
+
+    def _distance(self, truth):
+        return jnp.linalg.norm(truth.object_position - jnp.asarray(self.reference) + 1e-12)
+
+
+@pytest.fixture
+def env(monkeypatch):
+    monkeypatch.setattr("dexsim.env.env.Physics", SimplePhysics)
+    monkeypatch.setattr(registry, "TASKS", dict(registry.TASKS))
+    dexsim.register("balance", Balance)
+    return dexsim.make("balance", backend="jax", num_envs=WORLDS)
+
+
+def test_it_runs_from_reset_to_restart(env):
+    """In `SimplePhysics` an object falls freely: it is lost after sqrt(2 reach / g), and the episode begins again."""
+    state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), WORLDS))
+    assert state.obs["actor"].shape == (WORLDS, 12 + 5) and state.obs["critic"].shape == (WORLDS, 24)
+    step, restart = jax.jit(jax.vmap(env.step)), jax.jit(jax.vmap(env.restart))
+    lost = int(np.ceil(np.sqrt(2 * env.config.reach / 9.81) / env.control_period))
+    for tick in range(1, lost + 1):
+        state = step(state, jnp.zeros((WORLDS, env.action_size)))
+        np.testing.assert_array_equal(state.metrics["ticks"], tick - 1)  # of the goal that held during the tick
+        np.testing.assert_array_equal(state.terminated, tick >= lost)
+        np.testing.assert_allclose(state.reward, np.where(tick >= lost, -1.0, 1.0 - state.metrics["distance"]))
+    again = restart(state, state.terminated)
+    assert not np.any(again.length) and not np.any(again.goal.ticks)
+    np.testing.assert_allclose(again.physics.qpos[:, 12], env.config.height)
+
+
+def test_it_is_evaluated_by_its_own_plan_and_report(env):
+    starts = env.evaluation_starts(jax.random.key(0), 8)
+    assert starts.reward.shape == (8,)
+    report = env.summarize({}, np.array([[True, True], [True, False]]))
+    assert report["headline"] == {"held": 0.5}
+    assert env.spec.name == "balance" and env.spec.fields == Balance.fields["actor"]
