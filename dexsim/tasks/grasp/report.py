@@ -6,6 +6,7 @@ from dexsim.core.statistics import bootstrap, mean, proportion, statistic
 from dexsim.objects.config import KINDS
 
 _SETTLE = 3.0  # s after release from which forces count
+_FORCES = ("finger_force", "finger_pressing", "total_force", "taxel_force", "thumb_force", "touching")
 
 
 def summarize(
@@ -31,54 +32,15 @@ def summarize(
     held = alive[-1]
     late = slice(min(round(_SETTLE / control_period), ticks // 2), None)
     command, shape = metrics["command"][0], metrics["shape"][0].astype(int)
-    force = metrics["finger_force"][late].mean(0)
-    pressing = metrics["finger_pressing"][late].mean(0)
-    total = metrics["total_force"][late].mean(0)
-    sensed = metrics["taxel_force"][late].mean(0)
-    thumb = metrics["thumb_force"][late].mean(0)
-    touching = metrics["touching"][late].mean(0)
+    # Of each episode [N], the mean over its late ticks.
+    mean_of = {name: metrics[name][late].mean(0) for name in _FORCES}
     wanted = span[0] + command * (span[1] - span[0])
+    force, total = mean_of["finger_force"], mean_of["total_force"]
     returns = np.where(alive, metrics["reward"], 0.0).sum(0) if "reward" in metrics else metrics["return"].max(0)
-
-    by_command = []
-    for level in np.unique(command):
-        mine = command == level
-        good = mine & held
-        by_command.append(
-            {
-                "command": float(level),
-                "episodes": int(mine.sum()),
-                "held": proportion(held[mine]),
-                "target_force_n": float(wanted[mine].mean()),
-                "finger_force_n": mean(force[good]),
-                "total_force_n": mean(total[good]),
-                "taxel_force_n": mean(sensed[good]),
-                "thumb_force_n": mean(thumb[good]),
-                "touching_fingers": mean(touching[good]),
-            }
-        )
-    by_shape = []
-    for index in np.unique(shape):
-        mine = shape == index
-        good = mine & held
-        by_shape.append(
-            {
-                "shape": KINDS[index],
-                "episodes": int(mine.sum()),
-                "held": proportion(held[mine]),
-                "pearson_r": pearson(command[good], force[good]),
-                "pearson_r_pressing": pearson(command[good], pressing[good]),
-                "pearson_r_total": pearson(command[good], total[good]),
-                "pearson_r_taxels": pearson(command[good], sensed[good]),
-                "rmse_n": rmse(force[good], wanted[good]),
-            }
-        )
-
+    by_command = [_command_row(level, command, held, wanted, mean_of) for level in np.unique(command)]
+    by_shape = [_shape_row(index, shape, command, held, wanted, mean_of) for index in np.unique(shape)]
     means = [row["total_force_n"]["mean"] for row in by_command]
-    finger_means = [row["finger_force_n"]["mean"] for row in by_command]
     complete = all(m is not None for m in means)
-    monotone = bool(complete and np.all(np.diff(means) > 0))
-    ratio = float(means[-1] / means[0]) if complete and len(means) > 1 and means[0] > 0 else None
     report = {
         "episodes": episodes,
         "seconds": ticks * control_period,
@@ -86,12 +48,12 @@ def summarize(
         "hold_time_s": mean(alive.sum(0) * control_period),
         "return": mean(returns),
         "pearson_r": pearson(command[held], force[held]),
-        "pearson_r_pressing": pearson(command[held], pressing[held]),
+        "pearson_r_pressing": pearson(command[held], mean_of["finger_pressing"][held]),
         "pearson_r_total": pearson(command[held], total[held]),
         "rmse_n": rmse(force[held], wanted[held]),
-        "force_range": ratio,
-        "total_force_monotone": monotone,
-        "finger_force_by_command_n": finger_means,
+        "force_range": float(means[-1] / means[0]) if complete and len(means) > 1 and means[0] > 0 else None,
+        "total_force_monotone": bool(complete and np.all(np.diff(means) > 0)),
+        "finger_force_by_command_n": [row["finger_force_n"]["mean"] for row in by_command],
         "total_force_by_command_n": means,
         "skin_correlation": _optional_pearson(metrics, alive),
         "joint_speed_rad_s": mean(metrics["joint_speed"].mean(0)),
@@ -99,17 +61,63 @@ def summarize(
         "by_command": by_command,
         "by_shape": by_shape,
     }
-    r = [row["pearson_r"]["r"] for row in by_shape]
-    report["headline"] = {
+    return report | {"headline": _headline(report)}
+
+
+def _command_row(
+    level: float, command: np.ndarray, held: np.ndarray, wanted: np.ndarray, mean_of: dict[str, np.ndarray]
+) -> dict:
+    """The episodes at one command; arrays [N] are of all episodes."""
+    mine = command == level
+    good = mine & held
+    return {
+        "command": float(level),
+        "episodes": int(mine.sum()),
+        "held": proportion(held[mine]),
+        "target_force_n": float(wanted[mine].mean()),
+        "finger_force_n": mean(mean_of["finger_force"][good]),
+        "total_force_n": mean(mean_of["total_force"][good]),
+        "taxel_force_n": mean(mean_of["taxel_force"][good]),
+        "thumb_force_n": mean(mean_of["thumb_force"][good]),
+        "touching_fingers": mean(mean_of["touching"][good]),
+    }
+
+
+def _shape_row(
+    index: int,
+    shape: np.ndarray,
+    command: np.ndarray,
+    held: np.ndarray,
+    wanted: np.ndarray,
+    mean_of: dict[str, np.ndarray],
+) -> dict:
+    """The episodes with one shape; arrays [N] are of all episodes."""
+    mine = shape == index
+    good = mine & held
+    force = mean_of["finger_force"][good]
+    return {
+        "shape": KINDS[index],
+        "episodes": int(mine.sum()),
+        "held": proportion(held[mine]),
+        "pearson_r": pearson(command[good], force),
+        "pearson_r_pressing": pearson(command[good], mean_of["finger_pressing"][good]),
+        "pearson_r_total": pearson(command[good], mean_of["total_force"][good]),
+        "pearson_r_taxels": pearson(command[good], mean_of["taxel_force"][good]),
+        "rmse_n": rmse(force, wanted[good]),
+    }
+
+
+def _headline(report: dict) -> dict:
+    by_shape = [row["pearson_r"]["r"] for row in report["by_shape"]]
+    return {
         "held": report["held"]["mean"],
-        "held at worst command": min(row["held"]["mean"] for row in by_command),
+        "held at worst command": min(row["held"]["mean"] for row in report["by_command"]),
         "Pearson r (all)": report["pearson_r"]["r"],
-        "Pearson r (worst shape)": min((x for x in r if x is not None), default=None),
-        "force range": ratio,
+        "Pearson r (worst shape)": min((r for r in by_shape if r is not None), default=None),
+        "force range": report["force_range"],
         "RMSE (N)": report["rmse_n"]["mean"],
         "return": report["return"]["mean"],
     }
-    return report
 
 
 def _optional_pearson(metrics: dict[str, np.ndarray], alive: np.ndarray) -> dict | None:

@@ -27,6 +27,7 @@ from dexsim.tasks.terms import action_rate, joint_speed, mean_where, random_push
 
 COMMANDS = (0.0, 0.25, 0.5, 0.75, 1.0)
 """The commands of an evaluation."""
+_CONTACT = 0.01  # N, force from which a finger counts as touching
 
 
 @pytree_dataclass
@@ -155,7 +156,7 @@ class Grasp:
         """The reward of a tick and its terms; zero for all but the penalties once dropped."""
         config, weights = self.config, self.config.reward
         force = jnp.linalg.norm(truth.finger_force, axis=-1)
-        contact = force > 0.01
+        contact = force > _CONTACT
         wanted = self.target_force(goal)
         torque = truth.joint_torque[self._roots]
         held = 1.0 - dropped
@@ -182,15 +183,19 @@ class Grasp:
             "velocity": weights.velocity * joint_speed(truth.joint_velocity),
             "drop": weights.drop * dropped,
         }
-        reward = sum(terms.values())
+        metrics = {f"reward/{name}": value for name, value in terms.items()}
+        return sum(terms.values()), metrics | self._metrics(goal, truth, held)
+
+    def _metrics(self, goal: Goal, truth: GroundTruth, held: jax.Array) -> dict[str, jax.Array]:
+        force = jnp.linalg.norm(truth.finger_force, axis=-1)
+        contact = force > _CONTACT
         # The command speaks to the four fingers; the thumb balances them.
         mean_force = mean_where(contact[1:], force[1:])
         pressing = jnp.sum(truth.touch.force, -1)
-        return reward, {
-            **{f"reward/{name}": value for name, value in terms.items()},
+        return {
             "success": held,
             "command": goal.command,
-            "force_error": jnp.abs(mean_force - wanted),
+            "force_error": jnp.abs(mean_force - self.target_force(goal)),
             "finger_force": mean_force,
             "finger_pressing": mean_where(contact[1:], pressing[1:]),
             "total_force": jnp.sum(force),
