@@ -16,7 +16,6 @@ from dexsim.core.errors import CheckpointError
 from dexsim_ppo import checkpoint
 from dexsim_ppo.learner.ppo import make_train
 from dexsim_ppo.policy import Policy, act
-from dexsim_ppo.retired import migrate_leaves
 
 TREE = {
     "x": jnp.arange(6, dtype=jnp.float32).reshape(2, 3),
@@ -155,32 +154,6 @@ def test_restore_names_what_does_not_fit(file):
             checkpoint.restore(loaded, TREE | change)
     with pytest.raises(CheckpointError, match=r"\['x'\] is not expected"):
         checkpoint.restore(loaded, {k: v for k, v in TREE.items() if k != "x"})
-
-
-def test_arrays_of_an_older_environment_go_where_todays_are(tmp_path):
-    """Groups that were renamed move, what repeated others is dropped, and like-named arrays of others stay."""
-    old = {
-        ".env_state.draw.tilt": [1.0],
-        ".env_state.array.late": [2.0],
-        ".env_state.array_params.gain": [3.0],
-        ".env_state.sample.joint_position": [4.0],
-        ".env_state.object_velocity": [5.0],
-        ".env_state.targets": [6.0],
-        ".env_state.goal.dwell": [7.0],
-        ".env_state.metrics['target']": [8.0],
-    }
-    wanted = {
-        ".env_state.episode.hand.tilt": [1.0],
-        ".env_state.taxel_memory.late": [2.0],
-        ".env_state.episode.taxels.gain": [3.0],
-        ".env_state.sensor_input.joint_position": [4.0],
-        ".env_state.targets": [6.0],
-        ".env_state.metrics['target']": [8.0],
-    }
-    assert migrate_leaves(old, wanted) == wanted
-    # A task of one's own may use a name that is gone elsewhere.
-    own = wanted | {".env_state.goal.dwell": [7.0]}
-    assert migrate_leaves(old, own) == own
 
 
 def test_a_failed_write_leaves_the_old_file(file, monkeypatch):

@@ -84,6 +84,28 @@ def test_todays_files_are_left_alone():
         assert migrate_config(to_dict(GraspConfig()), "a file") == to_dict(GraspConfig())
 
 
-def test_arrays_of_effects_that_are_gone_are_dropped():
-    leaves = {".env_state.array_params.noise": 1, ".env_state.array_params.gain": 2, ".params": 3}
-    assert migrate_leaves(leaves) == {".env_state.array_params.gain": 2, ".params": 3}
+def test_arrays_of_an_older_environment_go_where_todays_are():
+    """Groups that were renamed move, what repeated others is dropped, and like-named arrays of others stay."""
+    old = {
+        ".env_state.draw.tilt": [1.0],
+        ".env_state.array.late": [2.0],
+        ".env_state.array_params.gain": [3.0],
+        ".env_state.array_params.noise": [0.0],
+        ".env_state.sample.joint_position": [4.0],
+        ".env_state.object_velocity": [5.0],
+        ".env_state.targets": [6.0],
+        ".env_state.goal.dwell": [7.0],
+        ".env_state.metrics['target']": [8.0],
+    }
+    wanted = {
+        ".env_state.episode.hand.tilt": [1.0],
+        ".env_state.taxel_memory.late": [2.0],
+        ".env_state.episode.taxels.gain": [3.0],
+        ".env_state.sensor_input.joint_position": [4.0],
+        ".env_state.targets": [6.0],
+        ".env_state.metrics['target']": [8.0],
+    }
+    assert migrate_leaves(old, wanted) == wanted
+    # A task of one's own may use a name that is gone elsewhere.
+    own = wanted | {".env_state.goal.dwell": [7.0]}
+    assert migrate_leaves(old, own) == own
