@@ -119,7 +119,7 @@ def grasp_rollout(grasp_env: Any) -> Rollout:
 def physics_advance(hand: Any) -> Callable[..., Any]:
     """One sub-step of 8 worlds on the `jax` backend, under given joint torques and pushes.
 
-    `physics_advance(target, state, torque [8, J], push [8, 3])` returns the state and the fingers'
+    `physics_advance(object, state, torque [8, J], push [8, 3])` returns the state and the fingers'
     forces [8, F, 3]; the solver converges.
     """
     from c_scene import CONVERGED, GRAVITY
@@ -139,8 +139,8 @@ def physics_advance(hand: Any) -> Callable[..., Any]:
     )
     return jax.jit(
         jax.vmap(
-            lambda target, state, torque, push: seam.advance(
-                target, state, lambda index, position, velocity: torque, push
+            lambda object, state, torque, push: seam.advance(
+                object, state, lambda index, position, velocity: torque, push
             )
         )
     )

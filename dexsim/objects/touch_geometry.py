@@ -37,12 +37,12 @@ def touch_geometry(config: ObjectConfig, method: str) -> Callable[[ObjectParams]
             raise ConfigError(
                 "touch_method = 'grid': needs a mesh (ObjectConfig.mesh); choose closed_form or surface_points"
             )
-        return lambda target: surface_points.from_shape(target.shape(), _POINTS)
+        return lambda object: surface_points.from_shape(object.shape(), _POINTS)
     mesh_object = load_mesh_object(config)
     edge = mesh_object.boxes.size[0, 0]
     with jax.ensure_compile_time_eval():
         if method == "grid":
             baked = grid.bake(mesh_object.mesh)
-            return lambda target: grid.select(baked, 0, target.size[0, 0] / edge)
+            return lambda object: grid.select(baked, 0, object.size[0, 0] / edge)
         points = surface_points.from_mesh(mesh_object.mesh)
-    return lambda target: surface_points.scaled(points, target.size[0, 0] / edge)
+    return lambda object: surface_points.scaled(points, object.size[0, 0] / edge)

@@ -146,7 +146,7 @@ def follow_skin(
     pads: Pads,
     skin: Skin,
     pose: HandPose,
-    target: ObjectParams,
+    object: ObjectParams,
     position: jax.Array,
     rotation: jax.Array,
 ) -> jax.Array:
@@ -159,7 +159,7 @@ def follow_skin(
     Args:
       pose: of the hand; `position` [3] and `rotation` [3, 3] are the object's, in the palm frame.
     """
-    shape = target.shape()
+    shape = object.shape()
     touch = feel_links(hand, pose, shape, position, rotation, jnp.ones(hand.num_fingers), skin)
     centre = pose.body_position[hand.tip_body][:, None] + rotations.rotate(
         pose.tip_rotation[:, None], jnp.asarray(pads.centre)

@@ -34,7 +34,7 @@ class JaxBackend(MjxBackend):
 
     def advance(
         self,
-        target: ObjectParams,
+        object: ObjectParams,
         contacts: ContactParams,
         state: PhysicsState,
         torque: TorqueLaw,
@@ -43,8 +43,8 @@ class JaxBackend(MjxBackend):
     ) -> tuple[PhysicsState, jax.Array, Any]:
         """One control tick, with our contacts and solver (`substep`) or by `mjx.step`."""
         if self._stepper is None:
-            return super().advance(target, contacts, state, torque, memory, push)
-        scene, model = self.scene, self.configure(target, contacts)
+            return super().advance(object, contacts, state, torque, memory, push)
+        scene, model = self.scene, self.configure(object, contacts)
         data = self.make_data()
 
         def run(carry: tuple[Any, ...], index: jax.Array) -> tuple[tuple[Any, ...], jax.Array]:

@@ -33,20 +33,20 @@ class MjxBackend:
         """Force [F, 3] N of the object on each finger, from data after a step."""
         raise NotImplementedError
 
-    def configure(self, target: ObjectParams, contacts: ContactParams) -> Any:
+    def configure(self, object: ObjectParams, contacts: ContactParams) -> Any:
         """The MJX model with one environment's object and contact parameters put in."""
         model, scene = self.model, self.scene
         geoms, body, pair = scene.object_geoms, scene.object_body, scene.object_pairs
         # body_invweight0 keeps its template value on purpose: the contact's parameters are worked
         # out from it, and stiffness must not change with the mass of what is touched.
         return model.replace(
-            geom_size=model.geom_size.at[geoms].set(target.size),
-            geom_rbound=model.geom_rbound.at[geoms].set(bounding_radius(target.size, scene.slots)),
-            geom_pos=model.geom_pos.at[geoms].set(target.position),
-            geom_quat=(model.geom_quat if target.quat is None else model.geom_quat.at[geoms].set(target.quat)),
-            body_mass=model.body_mass.at[body].set(target.mass),
-            body_inertia=model.body_inertia.at[body].set(target.inertia),
-            body_ipos=model.body_ipos.at[body].set(target.com),
+            geom_size=model.geom_size.at[geoms].set(object.size),
+            geom_rbound=model.geom_rbound.at[geoms].set(bounding_radius(object.size, scene.slots)),
+            geom_pos=model.geom_pos.at[geoms].set(object.position),
+            geom_quat=(model.geom_quat if object.quat is None else model.geom_quat.at[geoms].set(object.quat)),
+            body_mass=model.body_mass.at[body].set(object.mass),
+            body_inertia=model.body_inertia.at[body].set(object.inertia),
+            body_ipos=model.body_ipos.at[body].set(object.com),
             pair_friction=model.pair_friction.at[pair, :2].set(contacts.friction[:, None]),
             pair_solref=model.pair_solref.at[pair].set(contacts.solref),
             pair_solimp=model.pair_solimp.at[pair].set(contacts.solimp),
@@ -54,7 +54,7 @@ class MjxBackend:
 
     def advance(
         self,
-        target: ObjectParams,
+        object: ObjectParams,
         contacts: ContactParams,
         state: PhysicsState,
         torque: TorqueLaw,
@@ -62,7 +62,7 @@ class MjxBackend:
         push: jax.Array,
     ) -> tuple[PhysicsState, jax.Array, Any]:
         """One control tick by `mjx.step`."""
-        scene, model = self.scene, self.configure(target, contacts)
+        scene, model = self.scene, self.configure(object, contacts)
         data = self.make_data().replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.warmstart)
         wrench = jnp.zeros((scene.model.nbody, 6)).at[scene.object_body, :3].set(push)
         data = data.replace(xfrc_applied=wrench)

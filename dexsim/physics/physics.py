@@ -89,31 +89,31 @@ class Physics:
         self._pads = contact.find_pads(scene.model, scene.object_pairs, scene.tip_bodies)
         self.engine = BACKENDS[self.backend](scene, num_envs)
 
-    def tip_stiffness(self, target: ObjectParams, qpos: jax.Array) -> jax.Array:
+    def tip_stiffness(self, object: ObjectParams, qpos: jax.Array) -> jax.Array:
         """How much stiffer [F] than nominal the fingertips are where they press now."""
         place = qpos[self.object_qpos]
         turn = rotations.quat_to_matrix(place[3:] / jnp.linalg.norm(place[3:]))
         pose = forward_kinematics(self.hand, qpos[self.joint_qpos])
-        return contact.follow_skin(self.hand, self._pads, self.skin, pose, target, place[:3], turn)
+        return contact.follow_skin(self.hand, self._pads, self.skin, pose, object, place[:3], turn)
 
-    def contact_params(self, target: ObjectParams, tips: jax.Array | None = None) -> ContactParams:
+    def contact_params(self, object: ObjectParams, tips: jax.Array | None = None) -> ContactParams:
         """Contact parameters of an object; `tips` [F] is the fingertips' stiffness over the nominal one."""
-        friction = target.pair_friction(self._finger_of_pair >= 0)
+        friction = object.pair_friction(self._finger_of_pair >= 0)
         share = jnp.asarray(self._share)
         if tips is not None:
             share *= jnp.append(tips, 1.0)[self._finger_of_pair]  # -1, no finger's: the last
         solref, solimp = contact.spring(
-            self._compliance, share * target.contact[0], target.contact[1], period=self.config.contact_period
+            self._compliance, share * object.contact[0], object.contact[1], period=self.config.contact_period
         )
         return ContactParams(friction, solref, solimp)
 
-    def configure(self, target: ObjectParams, tips: jax.Array | None = None) -> Any:
+    def configure(self, object: ObjectParams, tips: jax.Array | None = None) -> Any:
         """The engine's model of one environment (`Backend.configure`); `tips` as in `contact_params`."""
-        return self.engine.configure(target, self.contact_params(target, tips))
+        return self.engine.configure(object, self.contact_params(object, tips))
 
     def advance(
         self,
-        target: ObjectParams,
+        object: ObjectParams,
         state: PhysicsState,
         torque: Callable[[jax.Array, jax.Array, jax.Array], jax.Array],
         push: jax.Array,
@@ -125,7 +125,7 @@ class Physics:
             called before every sub-step.
         """
         after, force, _ = self.advance_motors(
-            target,
+            object,
             state,
             lambda index, position, velocity, memory: (torque(index, position, velocity), memory),
             None,
@@ -134,8 +134,8 @@ class Physics:
         return after, force
 
     def advance_motors(
-        self, target: ObjectParams, state: PhysicsState, motors: TorqueLaw, memory: Any, push: jax.Array
+        self, object: ObjectParams, state: PhysicsState, motors: TorqueLaw, memory: Any, push: jax.Array
     ) -> tuple[PhysicsState, jax.Array, Any]:
         """Run one control tick; arguments and results are those of `Backend.advance`."""
-        tips = None if self.skin is None else self.tip_stiffness(target, state.qpos)
-        return self.engine.advance(target, self.contact_params(target, tips), state, motors, memory, push)
+        tips = None if self.skin is None else self.tip_stiffness(object, state.qpos)
+        return self.engine.advance(object, self.contact_params(object, tips), state, motors, memory, push)

@@ -69,13 +69,13 @@ class Backend(Protocol):
     AssetError for a scene that the engine cannot run.
     """
 
-    def configure(self, target: ObjectParams, contacts: ContactParams) -> Any:
+    def configure(self, object: ObjectParams, contacts: ContactParams) -> Any:
         """The engine's model of one environment: a pytree whose leaves have the names of `mujoco.MjModel`."""
         ...
 
     def advance(
         self,
-        target: ObjectParams,
+        object: ObjectParams,
         contacts: ContactParams,
         state: PhysicsState,
         torque: TorqueLaw,
@@ -85,7 +85,7 @@ class Backend(Protocol):
         """Run one control tick of `PhysicsConfig.substeps` sub-steps.
 
         Args:
-          target: the object.
+          object: the object.
           contacts: of the object's pairs during the whole tick.
           state: where to start from.
           torque: of the joints, from sub-step to sub-step.
