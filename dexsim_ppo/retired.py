@@ -83,10 +83,12 @@ LEAVES: dict[str, str | None] = {
     ".env_state.array_params": ".env_state.episode.taxels",
     ".env_state.draw": ".env_state.episode.hand",
     ".env_state.goal.dwell": None,
+    ".env_state.metrics['reward/fingertips']": None,
     ".env_state.object_velocity": None,
     ".env_state.orientation_sensor": ".env_state.episode.imu",
     ".env_state.sample": ".env_state.sensor_input",
     ".env_state.tangential_force": None,
+    ".env_state.target.bare_friction": ".env_state.episode.object.link_friction",
     ".env_state.target": ".env_state.episode.object",
 }
 """Paths of a checkpoint's arrays and of groups of them, likewise; the first that fits holds."""

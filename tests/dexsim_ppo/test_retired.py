@@ -93,6 +93,8 @@ def test_arrays_of_an_older_environment_go_where_todays_are():
         ".env_state.array_params.noise": [0.0],
         ".env_state.sample.joint_position": [4.0],
         ".env_state.object_velocity": [5.0],
+        ".env_state.target.bare_friction": [9.0],
+        ".env_state.target.mass": [10.0],
         ".env_state.targets": [6.0],
         ".env_state.goal.dwell": [7.0],
         ".env_state.metrics['target']": [8.0],
@@ -102,6 +104,8 @@ def test_arrays_of_an_older_environment_go_where_todays_are():
         ".env_state.taxel_memory.late": [2.0],
         ".env_state.episode.taxels.gain": [3.0],
         ".env_state.sensor_input.joint_position": [4.0],
+        ".env_state.episode.object.link_friction": [9.0],
+        ".env_state.episode.object.mass": [10.0],
         ".env_state.targets": [6.0],
         ".env_state.metrics['target']": [8.0],
     }
