@@ -149,7 +149,7 @@ def _collect(folder: Path, code: int, wall: float) -> dict[str, Any]:
             "policy_jitter": bridge["policy_jitter"],
             "round_trip": bridge["round_trip"],
             "outside_limits": twin["commands"]["outside_limits"],
-            "let_go_s": twin["physics"]["let_go_s"],
+            "slipped_s": twin["physics"]["slipped_s"],
         },
     }
 
@@ -165,7 +165,7 @@ def line(report: dict[str, Any]) -> str:
     return (
         f"{report['trial']:4d}  {told}  {report['seconds']:7.2f} s  {report['end']}  ({report['wall']:.0f} s; "
         f"{bridge['unanswered']} of {bridge['exchanges']} exchanges unanswered, policy late p99 "
-        f"{bridge['policy_jitter']['p99_ms']:.1f} ms, physics let go {bridge['let_go_s']:.2f} s)"
+        f"{bridge['policy_jitter']['p99_ms']:.1f} ms, physics let go {bridge['slipped_s']:.2f} s)"
     )
 
 

@@ -44,7 +44,7 @@ def load(policy: str) -> tuple[Any, Any, Any]:
 
 def run_trial(options: dict[str, Any], seed: int, number: int) -> dict[str, Any]:
     """The referee's report of one trial."""
-    from dexsim_real.twin.plant.plant import EmulatedHand
+    from dexsim_real.twin.plant.emulated_hand import EmulatedHand
     from dexsim_real.twin.plant.shapes import SHAPES
     from dexsim_real.twin.virtual import RunOptions, VirtualRun
 
@@ -221,7 +221,7 @@ def arguments() -> argparse.Namespace:
         action="append",
         default=[],
         metavar="NAME=VALUE",
-        help="fix a parameter of the emulated hand (dexsim_real/twin/draw.py): a number, or outside, inside, nominal",
+        help="fix a parameter of the emulated hand (dexsim_real/twin/plant/parameters.py): a number, or outside, inside, nominal",
     )
     parser.add_argument("--no-safety", dest="safety", action="store_false", help="leave the bridge's limits out")
     parser.add_argument("--processes", type=int, default=1)

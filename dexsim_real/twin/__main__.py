@@ -23,9 +23,9 @@ from dexsim.hand.load import load_hand
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.process import use_realtime
 from dexsim_real.sensors.camera import CameraConfig
-from dexsim_real.twin.loop import Twin
 from dexsim_real.twin.options import TwinArguments
-from dexsim_real.twin.types import Plant
+from dexsim_real.twin.plant.protocol import Plant
+from dexsim_real.twin.server import Twin
 
 
 def make_plant(arguments: TwinArguments, hand: Hand) -> Plant:
@@ -40,7 +40,7 @@ def make_plant(arguments: TwinArguments, hand: Hand) -> Plant:
             return getattr(importlib.import_module(module), function or "make_plant")(arguments)
         except (ImportError, AttributeError) as error:
             raise HandError(f"{arguments.plant}: {error}") from None
-    from dexsim_real.twin.plant.plant import EmulatedHand
+    from dexsim_real.twin.plant.emulated_hand import EmulatedHand
 
     return EmulatedHand(
         hand,
@@ -62,7 +62,7 @@ def check_policy(name: str, task: str, hand: Hand) -> None:
       HandError: it is not.
     """
     from dexsim_ppo.policy import load_policy
-    from dexsim_real.twin.plant.plant import nominal_gravity
+    from dexsim_real.twin.plant.emulated_hand import nominal_gravity
 
     policy = load_policy(name)
     if policy.task != task:

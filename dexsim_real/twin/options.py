@@ -4,13 +4,13 @@ import dataclasses
 from pathlib import Path
 
 from dexsim.core.config import setting, validate
-from dexsim_real.twin.plant.draw import KINDS, TASKS
+from dexsim_real.twin.plant.parameters import KINDS, TASKS
 from dexsim_real.twin.plant.shapes import SHAPES
-from dexsim_real.twin.wire.check import LimitsConfig
+from dexsim_real.twin.wire.command_check import LimitsConfig
+from dexsim_real.twin.wire.emulated_sensors import ObjectSensorConfig
 from dexsim_real.twin.wire.faults import FaultConfig
 from dexsim_real.twin.wire.firmware import FirmwareConfig
 from dexsim_real.twin.wire.line import LineConfig
-from dexsim_real.twin.wire.object_side import ObjectConfig
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -50,7 +50,7 @@ class TwinArguments:
     realtime: bool = True
     """Ask for real-time priority: it stands for hardware, which waits for no scheduler."""
     plant: str | None = None
-    """MODULE:FUNCTION of your own that makes the physics (`dexsim_real.twin.types.Plant`) from these options."""
+    """MODULE:FUNCTION of your own that makes the physics (`dexsim_real.twin.plant.protocol.Plant`) from these options."""
     line: LineConfig = setting(LineConfig())
     """Timing of the wire."""
     firmware: FirmwareConfig = setting(FirmwareConfig())
@@ -59,7 +59,7 @@ class TwinArguments:
     """What every command is held against."""
     faults: FaultConfig = setting(FaultConfig())
     """What goes wrong."""
-    object: ObjectConfig = setting(ObjectConfig())
+    object: ObjectSensorConfig = setting(ObjectSensorConfig())
     """IMU and camera."""
 
     def __post_init__(self):

@@ -16,17 +16,17 @@ from dexsim.calibration.maps import Calibration, Side
 from dexsim.hand.kinematics import Hand
 from dexsim_real.control.controller import IDENTITY, Controller
 from dexsim_real.control.goals import TurnGoals
-from dexsim_real.control.safety import Safety, SafetyConfig, Sample
+from dexsim_real.control.safety import HandSample, Safety, SafetyConfig
 from dexsim_real.sensors.camera import HeightSensor
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig, VelocityFilter
 from dexsim_real.sensors.imu import BAUD, UPRIGHT_X, RvcParser, align, conjugate, encode, multiply
 from dexsim_real.sensors.readings import ObjectEstimate
 from dexsim_real.twin.plant.assistant import POSTURES
-from dexsim_real.twin.plant.motors import STALL_CURRENT
-from dexsim_real.twin.plant.plant import EmulatedHand
+from dexsim_real.twin.plant.drives import STALL_CURRENT
+from dexsim_real.twin.plant.emulated_hand import EmulatedHand
 from dexsim_real.twin.plant.shapes import matrix, turn
+from dexsim_real.twin.wire.emulated_sensors import ObjectSensorConfig, outline, silhouette
 from dexsim_real.twin.wire.firmware import Firmware, FirmwareConfig
-from dexsim_real.twin.wire.object_side import ObjectConfig, outline, silhouette
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Command, Frame, Mode, Parser
 
@@ -119,7 +119,7 @@ class VirtualCamera:
 
     def __init__(self, plant: EmulatedHand, controller: Controller):
         spec = controller.spec
-        self._plant, self._config = plant, ObjectConfig()
+        self._plant, self._config = plant, ObjectSensorConfig()
         self._parts = [outline(part) for part in plant.shape.parts]
         self.sensor = HeightSensor(
             lambda: None,
@@ -225,7 +225,7 @@ class VirtualRun:
             self.trace.append({"time": self._now, "tick": tick, "measured": measured})
 
     def _tell(self, target: np.ndarray) -> None:
-        self.safety.wish(target, self._now)
+        self.safety.set_target(target, self._now)
         if np.isfinite(target).all():
             self._wish = target
 
@@ -250,7 +250,7 @@ class VirtualRun:
             self._state = frames.decode_state(frame.data)
             measured = self.sensing.measure(self._state)
             velocity = self._filter.update(self._now, measured.joint_position)
-            self.safety.see(Sample(self._now, 0, 0, measured, velocity))
+            self.safety.see(HandSample(self._now, 0, 0, measured, velocity))
 
     def _sense_orientation(self) -> None:
         data = self.imu.sample()
@@ -270,7 +270,7 @@ class VirtualRun:
             self._state = None
             self._until(self._now + 1 / RATE)
             states += [self._state] if self._state is not None else []
-        self.sensing.zero(states)
+        self.sensing.set_tare(states)
 
     def _pose(self) -> np.ndarray:
         return self.safety.sample.measured.joint_position

@@ -14,9 +14,9 @@ import mujoco
 import numpy as np
 
 from dexsim_real.twin.plant import shapes
-from dexsim_real.twin.plant.draw import Draw
+from dexsim_real.twin.plant.parameters import TrialParameters
 from dexsim_real.twin.plant.scene import Scene
-from dexsim_real.twin.plant.shapes import Shape, product, turn
+from dexsim_real.twin.plant.shapes import ObjectShape, product, turn
 
 POSTURES = {
     "grasp": (1.45, 0.15, 0.25, 0.0, 1.1, 0.8, 1.1, 0.8, 1.1, 0.8, 1.1, 0.8),
@@ -53,11 +53,11 @@ class Place:
     velocity: np.ndarray  # [3] m/s
 
 
-def draw_place(draw: Draw, shape: Shape, rng: np.random.Generator) -> Place:
+def sample_place(parameters: TrialParameters, shape: ObjectShape, rng: np.random.Generator) -> Place:
     """A place to let go of the object, whether the fingers leave it free or not."""
-    if draw.task == "rotate":
-        quat = turn((1.0, 0.0, 0.0), float(draw.heading_error) * rng.uniform(-1, 1))
-        shift = float(draw.place_error) * rng.uniform(-1, 1, 2)
+    if parameters.task == "rotate":
+        quat = turn((1.0, 0.0, 0.0), float(parameters.heading_error) * rng.uniform(-1, 1))
+        shift = float(parameters.place_error) * rng.uniform(-1, 1, 2)
         gap, speed = 0.0005, 0.0
     else:
         # Long objects lie across the fingers, a little askew; their roll is free.
@@ -66,18 +66,18 @@ def draw_place(draw: Draw, shape: Shape, rng: np.random.Generator) -> Place:
         for axis, angle in (((1, 0, 0), -np.pi / 2), ((0, 0, 1), 0.2 * askew), ((1, 0, 0), 0.5 * about)):
             quat = product(turn(axis, angle), quat)
         shift = 0.01 * rng.uniform(-1, 1, 2)
-        gap, speed = float(draw.gap), float(draw.release_speed)
+        gap, speed = float(parameters.gap), float(parameters.release_speed)
     up = shapes.matrix(quat).T @ np.array([-1.0, 0.0, 0.0])
-    position = np.array([PALM_FACE + gap + shape.reach(up), *(PLACES[draw.task] + shift)])
+    position = np.array([PALM_FACE + gap + shape.reach(up), *(PLACES[parameters.task] + shift)])
     return Place(position, quat, np.array([speed, 0.0, 0.0]))
 
 
-def find_place(scene: Scene, draw: Draw, shape: Shape, rng: np.random.Generator) -> Place | None:
+def find_place(scene: Scene, parameters: TrialParameters, shape: ObjectShape, rng: np.random.Generator) -> Place | None:
     """A place where the hand in its start posture leaves the object free; None when there seems to be none."""
     data = mujoco.MjData(scene.model)
-    data.qpos[scene.drive_qpos] = POSTURES[draw.task]
+    data.qpos[scene.drive_qpos] = POSTURES[parameters.task]
     for _ in range(60):
-        place = draw_place(draw, shape, rng)
+        place = sample_place(parameters, shape, rng)
         if clear(scene, data, place):
             return place
     return None

@@ -12,8 +12,8 @@ import mujoco
 import numpy as np
 
 from dexsim.hand.kinematics import Hand
-from dexsim_real.twin.plant.draw import Draw
-from dexsim_real.twin.plant.shapes import Shape
+from dexsim_real.twin.plant.parameters import TrialParameters
+from dexsim_real.twin.plant.shapes import ObjectShape
 
 TIMESTEP = 0.0005  # s
 ROTORS = (8e-4, 4e-4)  # kg m^2, inertia of the strong and the weak motors as seen at the joint
@@ -46,7 +46,7 @@ class Scene:
     is_object: np.ndarray  # [geoms] bool
 
 
-def build_scene(hand: Hand, draw: Draw, shape: Shape | None, gravity: np.ndarray) -> Scene:
+def build_scene(hand: Hand, parameters: TrialParameters, shape: ObjectShape | None, gravity: np.ndarray) -> Scene:
     """Compile a trial's world.
 
     Args:
@@ -60,35 +60,35 @@ def build_scene(hand: Hand, draw: Draw, shape: Shape | None, gravity: np.ndarray
         spec.delete(element)
     palm = spec.body(hand.palm)
     palm.pos, palm.quat = [0, 0, 0], [1, 0, 0, 0]
-    _add_play(spec, hand, draw)
-    skins = _cover(spec, hand, draw)
-    _add_object(spec, draw, shape)
-    _add_pairs(spec, shape, draw, skins)
+    _add_play(spec, hand, parameters)
+    skins = _cover(spec, hand, parameters)
+    _add_object(spec, parameters, shape)
+    _add_pairs(spec, shape, parameters, skins)
     option = spec.option
     option.timestep, option.gravity = TIMESTEP, gravity
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    option.cone, option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, float(draw.cone_ratio)
+    option.cone, option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, float(parameters.cone_ratio)
     option.solver, option.iterations, option.tolerance = mujoco.mjtSolver.mjSOL_NEWTON, 30, 1e-9
     model = spec.compile()
-    _set_springs(model, draw, skins)
+    _set_springs(model, parameters, skins)
     return _index(model, hand)
 
 
-def _add_play(spec: mujoco.MjSpec, hand: Hand, draw: Draw) -> None:
+def _add_play(spec: mujoco.MjSpec, hand: Hand, parameters: TrialParameters) -> None:
     for j, name in enumerate(hand.joint_names):
         drive, strong = spec.joint(name), hand.torque_limit[j] > STRONG
-        drive.armature = float(draw.rotor_inertia) * ROTORS[0 if strong else 1]
-        drive.damping = _fill(drive.damping, _GREASE + float(draw.viscous_friction[j]))
+        drive.armature = float(parameters.rotor_inertia) * ROTORS[0 if strong else 1]
+        drive.damping = _fill(drive.damping, _GREASE + float(parameters.viscous_friction[j]))
         drive.frictionloss = 1e-4  # So that it has a row in the solver; the drive sets it at each step.
         drive.solref_friction, drive.solimp_friction[:2] = _STIFF_FRICTION, (0.99, 0.99)
-        half = max(float(draw.gear_play[j]), 1e-6) / 2
+        half = max(float(parameters.gear_play[j]), 1e-6) / 2
         play = drive.parent.add_joint(
             name=f"{name}_play",
             type=mujoco.mjtJoint.mjJNT_HINGE,
             axis=drive.axis,
             pos=drive.pos,
             range=[-half, half],
-            armature=float(draw.gear_inertia),
+            armature=float(parameters.gear_inertia),
         )
         play.damping = _fill(play.damping, 2e-4)
 
@@ -102,7 +102,7 @@ def _fill(value, number: float):
     return filled
 
 
-def _cover(spec: mujoco.MjSpec, hand: Hand, draw: Draw) -> dict[str, bool]:
+def _cover(spec: mujoco.MjSpec, hand: Hand, parameters: TrialParameters) -> dict[str, bool]:
     """Put rubber on the fingertips; names of the geoms that touch, and whether they wear rubber."""
     tips = {hand.body_names[b] for b in hand.tip_body}
     names = {}
@@ -112,20 +112,20 @@ def _cover(spec: mujoco.MjSpec, hand: Hand, draw: Draw) -> dict[str, bool]:
         if touches:
             names[geom.name] = geom.parent.name in tips
             if names[geom.name]:
-                geom.size = [geom.size[0] + float(draw.rubber), *geom.size[1:]]
+                geom.size = [geom.size[0] + float(parameters.rubber), *geom.size[1:]]
     return names
 
 
-def _add_object(spec: mujoco.MjSpec, draw: Draw, shape: Shape | None) -> None:
+def _add_object(spec: mujoco.MjSpec, parameters: TrialParameters, shape: ObjectShape | None) -> None:
     body = spec.worldbody.add_body(name="object", pos=[0.5, 0, 0])
     body.add_freejoint(name="object")
     if shape is None:
         body.explicitinertial, body.mass, body.inertia = True, 0.1, [1e-5] * 3
         return
-    mass, centre, inertia = mass_properties(shape, float(draw.mass))
-    body.explicitinertial, body.mass, body.ipos = True, mass, centre + draw.com_offset
+    mass, centre, inertia = mass_properties(shape, float(parameters.mass))
+    body.explicitinertial, body.mass, body.ipos = True, mass, centre + parameters.com_offset
     # Diagonal by the shapes' symmetry.
-    body.inertia = np.diag(inertia) * float(draw.inertia_scale)
+    body.inertia = np.diag(inertia) * float(parameters.inertia_scale)
     for k, part in enumerate(shape.parts):
         body.add_geom(
             name=f"object_{k}",
@@ -143,7 +143,7 @@ def _three(size: tuple[float, ...]) -> list[float]:
 
 
 @functools.lru_cache(maxsize=64)
-def _solid(shape: Shape) -> tuple[float, np.ndarray, np.ndarray]:
+def _solid(shape: ObjectShape) -> tuple[float, np.ndarray, np.ndarray]:
     """Mass, centre and inertia about it of the uniform solid of density 1, as MuJoCo's compiler has them."""
     spec = mujoco.MjSpec()
     body = spec.worldbody.add_body(name="solid")
@@ -157,18 +157,20 @@ def _solid(shape: Shape) -> tuple[float, np.ndarray, np.ndarray]:
     return float(model.body_mass[1]), model.body_ipos[1].copy(), turn @ np.diag(model.body_inertia[1]) @ turn.T
 
 
-def mass_properties(shape: Shape, mass: float) -> tuple[float, np.ndarray, np.ndarray]:
+def mass_properties(shape: ObjectShape, mass: float) -> tuple[float, np.ndarray, np.ndarray]:
     """Mass kg, centre [3] m and inertia [3, 3] kg m^2 of a uniform solid of this shape (overlaps count twice)."""
     volume, centre, inertia = _solid(shape)
     return mass, centre, inertia * mass / volume
 
 
-def _add_pairs(spec: mujoco.MjSpec, shape: Shape | None, draw: Draw, skins: dict[str, bool]) -> None:
+def _add_pairs(
+    spec: mujoco.MjSpec, shape: ObjectShape | None, parameters: TrialParameters, skins: dict[str, bool]
+) -> None:
     for k in range(len(shape.parts) if shape else 0):
         for name, rubber in skins.items():
-            slide = float(draw.friction if rubber else draw.link_friction)
-            twist = float(draw.torsion) * slide if rubber else 1e-4
-            roll = float(draw.rolling) * slide if rubber else 1e-5
+            slide = float(parameters.friction if rubber else parameters.link_friction)
+            twist = float(parameters.torsion) * slide if rubber else 1e-4
+            roll = float(parameters.rolling) * slide if rubber else 1e-5
             spec.add_pair(
                 geomname1=name,
                 geomname2=f"object_{k}",
@@ -234,22 +236,22 @@ def damping_of(restitution: float, stiffness: float, mass: float) -> float:
     return float(2 * ratio * np.sqrt(stiffness * mass))
 
 
-def _set_springs(model: mujoco.MjModel, draw: Draw, skins: dict[str, bool]) -> None:
-    mass, restitution = float(draw.mass), float(draw.restitution)
+def _set_springs(model: mujoco.MjModel, parameters: TrialParameters, skins: dict[str, bool]) -> None:
+    mass, restitution = float(parameters.mass), float(parameters.restitution)
     for p in range(model.npair):
         ids = (model.pair_geom1[p], model.pair_geom2[p])
         names = [model.geom(g).name for g in ids]
         ours = [name for name in names if name in skins]
         if not any(name.startswith("object_") for name in names):
             continue
-        stiffness = float(draw.stiffness_contact if skins[ours[0]] else draw.palm_stiffness)
+        stiffness = float(parameters.stiffness_contact if skins[ours[0]] else parameters.palm_stiffness)
         inverse_mass = float(model.body_invweight0[model.geom_bodyid[list(ids)], 0].sum())
         damping = damping_of(restitution, stiffness, mass)
         model.pair_solref[p], model.pair_solimp[p] = spring(inverse_mass, stiffness, damping)
     for j in range(model.njnt):
         if model.joint(j).name.endswith("_play"):
             inverse_mass = float(model.dof_invweight0[model.jnt_dofadr[j]])
-            stiffness = float(draw.gear_stiffness)
+            stiffness = float(parameters.gear_stiffness)
             model.jnt_solref[j], model.jnt_solimp[j] = spring(
                 inverse_mass, stiffness, 2 * np.sqrt(stiffness / inverse_mass)
             )

@@ -8,14 +8,14 @@ import dataclasses
 
 import numpy as np
 
-from dexsim_real.twin.plant.draw import Draw
+from dexsim_real.twin.plant.parameters import TrialParameters
 
 SHAPES = ("sphere", "box", "cylinder", "capsule", "composition")
 BODY_SHARE = 0.8  # size of a composition's body against one that stands alone
 
 
 @dataclasses.dataclass(frozen=True)
-class Part:
+class Primitive:
     """One primitive, aligned with the object's axes."""
 
     kind: str  # "sphere", "box", "cylinder", "capsule"
@@ -24,11 +24,11 @@ class Part:
 
 
 @dataclasses.dataclass(frozen=True)
-class Shape:
+class ObjectShape:
     """A union of parts."""
 
     name: str
-    parts: tuple[Part, ...]
+    parts: tuple[Primitive, ...]
 
     def distance(self, points: np.ndarray) -> np.ndarray:
         """Signed distance [...] m of points [..., 3] in the object's frame, negative inside.
@@ -65,7 +65,7 @@ def _capsule(points: np.ndarray, size: tuple[float, ...]) -> np.ndarray:
 _DISTANCE = {"sphere": _sphere, "box": _box, "cylinder": _cylinder, "capsule": _capsule}
 
 
-def _reach(part: Part, direction: np.ndarray) -> float:
+def _reach(part: Primitive, direction: np.ndarray) -> float:
     x, y, z = np.abs(direction)
     size, across = part.size, float(np.hypot(x, y))
     return float(
@@ -78,28 +78,30 @@ def _reach(part: Part, direction: np.ndarray) -> float:
     )
 
 
-def draw_shape(draw: Draw, rng: np.random.Generator, name: str | None = None) -> Shape:
+def sample_shape(parameters: TrialParameters, rng: np.random.Generator, name: str | None = None) -> ObjectShape:
     """The object of a trial: a cube to rotate, any of `SHAPES` to grasp (or the one of that name)."""
     which, body = rng.choice(SHAPES), rng.random() < 0.5
-    if draw.task == "rotate":
-        half = float(draw.edge) / 2
-        return Shape("box", (Part("box", (half, half, half)),))
+    if parameters.task == "rotate":
+        half = float(parameters.edge) / 2
+        return ObjectShape("box", (Primitive("box", (half, half, half)),))
     name = name or str(which)
-    half = tuple(float(h) for h in draw.box_half)
-    tube = float(draw.cylinder_radius), float(draw.cylinder_half)
+    half = tuple(float(h) for h in parameters.box_half)
+    tube = float(parameters.cylinder_radius), float(parameters.cylinder_half)
     if name == "composition":
-        return _composition(draw, "box" if body else "cylinder", half if body else tube)
-    size = {"sphere": (float(draw.sphere_radius),), "box": half, "cylinder": tube, "capsule": tube}[name]
-    return Shape(name, (Part(name, size),))
+        return _composition(parameters, "box" if body else "cylinder", half if body else tube)
+    size = {"sphere": (float(parameters.sphere_radius),), "box": half, "cylinder": tube, "capsule": tube}[name]
+    return ObjectShape(name, (Primitive(name, size),))
 
 
-def _composition(draw: Draw, kind: str, size: tuple[float, ...]) -> Shape:
+def _composition(parameters: TrialParameters, kind: str, size: tuple[float, ...]) -> ObjectShape:
     """A smaller box or cylinder with a capsule jutting out along z; the origin in its middle."""
     body = tuple(BODY_SHARE * s for s in size)
-    neck = float(draw.neck_radius), float(draw.neck_half)
+    neck = float(parameters.neck_radius), float(parameters.neck_half)
     out = body[-1] + neck[1]
     shift = (out + neck[1] + neck[0] - body[-1]) / 2
-    return Shape("composition", (Part(kind, body, (0.0, 0.0, -shift)), Part("capsule", neck, (0.0, 0.0, out - shift))))
+    return ObjectShape(
+        "composition", (Primitive(kind, body, (0.0, 0.0, -shift)), Primitive("capsule", neck, (0.0, 0.0, out - shift)))
+    )
 
 
 # --- rotations -----------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 
 from dexsim.core.config import setting, validate
-from dexsim_real.twin.types import Measurement, Motors, Plant
+from dexsim_real.twin.plant.protocol import MotorCommands, Plant, PlantMeasurement
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Command, Frame, Mode
 
@@ -49,10 +49,10 @@ class FirmwareConfig:
         validate(self)
 
 
-def idle_motors() -> Motors:
+def idle_motors() -> MotorCommands:
     """What the board has been told before anybody spoke: everything off."""
     nothing = np.zeros(frames.JOINTS)
-    return Motors(*(nothing.copy() for _ in range(5)), mode=np.full(frames.JOINTS, int(Mode.PASSIVE)))
+    return MotorCommands(*(nothing.copy() for _ in range(5)), mode=np.full(frames.JOINTS, int(Mode.PASSIVE)))
 
 
 class Firmware:
@@ -115,7 +115,7 @@ class Firmware:
         self.counts[Command(frame.command).name.lower() if command != Command.ERROR else "refused"] += 1
         return Frame(frames.palm_address(self.config.hand_id), frame.source, command, data)
 
-    def state(self, measured: Measurement) -> np.ndarray:
+    def state(self, measured: PlantMeasurement) -> np.ndarray:
         """A `frames.STATE_BLOCK` of what is measured, in the wire's few bits."""
         config, block = self.config, frames.empty_state()
         joint, tip = block["joint"], block["tip"]
@@ -156,7 +156,7 @@ class Firmware:
         self._protect(measured)
         was_on, self._alive, self._abandoned = self.on, now, False
         self._drive(
-            Motors(
+            MotorCommands(
                 *(block[name].astype(float) for name in ("position", "kp", "ki", "kd", "torque_max")),
                 mode=np.where(self._hot, int(Mode.PASSIVE), block["mode"].astype(int)),
             )
@@ -209,14 +209,14 @@ class Firmware:
 
     # --- pieces ---------------------------------------------------------------------------------
 
-    def _drive(self, motors: Motors) -> None:
+    def _drive(self, motors: MotorCommands) -> None:
         self.motors = motors
         self.plant.drive(motors)
 
-    def _counts(self, measured: Measurement) -> np.ndarray:
+    def _counts(self, measured: PlantMeasurement) -> np.ndarray:
         return np.round(measured.taxel_force / self.config.force_per_count).astype(np.int32)
 
-    def _protect(self, measured: Measurement) -> None:
+    def _protect(self, measured: PlantMeasurement) -> None:
         """Which motors are too hot or loaded for too long."""
         hot, limit = measured.temperature, self.config.shutdown
         self._hot = (hot > limit) | (self._hot & (hot > limit - 10.0))

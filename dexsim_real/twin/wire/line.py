@@ -12,8 +12,8 @@ import numpy as np
 
 from dexsim.core.config import setting, validate
 from dexsim_real.core.timing import Timing
-from dexsim_real.twin.types import Plant
-from dexsim_real.twin.wire.check import CommandCheck
+from dexsim_real.twin.plant.protocol import Plant
+from dexsim_real.twin.wire.command_check import CommandCheck
 from dexsim_real.twin.wire.faults import Fault, Injector
 from dexsim_real.twin.wire.firmware import Firmware
 from dexsim_real.twin.wire.terminal import Terminal

@@ -26,14 +26,14 @@ from dexsim.core.errors import CalibrationError, ConfigError
 from dexsim_real.calibrate import __main__ as calibrate
 from dexsim_real.calibrate import identify as calibrate_identify
 from dexsim_real.calibrate.__main__ import fit_and_report, main
-from dexsim_real.calibrate.check import check_rest, dead_taxels, taxel_names
-from dexsim_real.calibrate.fit import fit
 from dexsim_real.calibrate.gauge import Gauge, parse_reading
-from dexsim_real.calibrate.loop import Operator
+from dexsim_real.calibrate.hand_loop import Operator
 from dexsim_real.calibrate.options import CalibrateArguments, CheckConfig, PressConfig
 from dexsim_real.calibrate.plan import placements
+from dexsim_real.calibrate.press_fit import fit
 from dexsim_real.calibrate.read import read_logs
 from dexsim_real.calibrate.report import torque_constant_intervals, torque_constants
+from dexsim_real.calibrate.taxel_check import check_rest, dead_taxels, taxel_names
 from dexsim_real.control.safety import SafetyConfig
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogError, LogReader, LogWriter
@@ -623,7 +623,7 @@ def test_a_line_that_loses_too_much_identifies_nothing(hand, tmp_path):
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_emulated_hand_gives_its_torque_constants_back(hand, tmp_path, seed):
     """Gears with play, ripple, heat, taxels with faults, parameters outside the ranges of training; a gauge."""
-    from dexsim_real.twin.plant.press import PressBench
+    from dexsim_real.twin.press import PressBench
 
     plant = PressBench(hand, seed)
     bench, press_bench.GAUGE = PlantPort(plant), lambda: plant.tip_force
@@ -647,7 +647,7 @@ def test_the_command_on_the_emulated_hand_through_the_bytes(hand, tmp_path):
             "-m",
             "dexsim_real.twin",
             "--plant",
-            "dexsim_real.twin.plant.press",
+            "dexsim_real.twin.press",
             "--link",
             str(tmp_path / "port"),
             "--imu-link",

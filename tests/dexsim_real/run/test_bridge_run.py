@@ -51,7 +51,7 @@ from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogError, LogReader
 from dexsim_real.replay import __main__ as replay_command
 from dexsim_real.replay import replay
-from dexsim_real.replay.view import show_rerun
+from dexsim_real.replay.plots import show_rerun
 from dexsim_real.run import __main__ as run
 from dexsim_real.run import view
 from dexsim_real.sensors import imu
@@ -440,14 +440,14 @@ def test_the_live_table(monkeypatch):
     console = Console(file=shown, force_terminal=True, width=80)
     monkeypatch.setattr(view, "Console", lambda **options: console)
     monkeypatch.setattr(view, "_LIVE", 0.02)
-    with view.View("a title", lambda: {"age": "3.1 ms", "force": "1.0 N"}) as live:
+    with view.StatusView("a title", lambda: {"age": "3.1 ms", "force": "1.0 N"}) as live:
         live.note("something happened")
         time.sleep(0.2)
     for text in ("a title", "age", "3.1 ms", "something happened"):
         assert text in shown.getvalue()
 
 
-@pytest.mark.parametrize(("failure", "reaction"), [("raises", None), ("hangs", "no wish"), ("nan", "not finite")])
+@pytest.mark.parametrize(("failure", "reaction"), [("raises", None), ("hangs", "no target"), ("nan", "not finite")])
 def test_a_policy_that_dies_leaves_the_hand_safe(tmp_path, monkeypatch, failure, reaction):
     real, count = Controller.tick, iter(range(10**6))
     died = []

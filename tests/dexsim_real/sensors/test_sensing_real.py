@@ -70,7 +70,7 @@ def test_taxels_are_tared_and_scaled(hand):
     rest["tip"]["taxel"]["z"] = np.arange(120) % 7
     other = rest.copy()
     other["tip"]["taxel"]["z"] += 2
-    sensing.zero([rest, other])  # Mean: 1 above rest.
+    sensing.set_tare([rest, other])  # Mean: 1 above rest.
     pressed = rest.copy()
     pressed["tip"]["taxel"]["z"][2, 17] += 31
     pressed["tip"]["taxel"]["x"][2, 17] = -100  # Does not count with "z".
@@ -90,7 +90,7 @@ def test_zeroing_is_refused_under_load(hand):
     loaded = state()
     loaded["tip"]["taxel"]["z"][1, 5] = 90
     with pytest.raises(HandError, match="index read up to 90 counts"):
-        sensing.zero([loaded] * 5)
+        sensing.set_tare([loaded] * 5)
     assert not sensing.tare.any()
 
 

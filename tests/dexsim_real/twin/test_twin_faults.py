@@ -17,7 +17,7 @@ pytest.importorskip("serial")
 from twin_plant import REST, ScriptedPlant
 
 from dexsim_real.core.errors import HandError
-from dexsim_real.twin.wire.check import CommandCheck, LimitsConfig
+from dexsim_real.twin.wire.command_check import CommandCheck, LimitsConfig
 from dexsim_real.twin.wire.faults import BYTES, KINDS, Fault, FaultConfig, Injector, parse_fault
 from dexsim_real.twin.wire.firmware import Firmware, FirmwareConfig
 from dexsim_real.twin.wire.line import HandLine, LineConfig

@@ -28,12 +28,12 @@ from dexsim_real.core.errors import HandError
 from dexsim_real.sensors import imu
 from dexsim_real.sensors.camera import CameraConfig, HeightSensor, height_of, open_masks
 from dexsim_real.twin import __main__ as twin_command
-from dexsim_real.twin.loop import Twin, World
 from dexsim_real.twin.options import TwinArguments
-from dexsim_real.twin.plant.shapes import Part, Shape
-from dexsim_real.twin.types import Measurement
+from dexsim_real.twin.plant.protocol import PlantMeasurement
+from dexsim_real.twin.plant.shapes import ObjectShape, Primitive
+from dexsim_real.twin.server import PlantClock, Twin
 from dexsim_real.twin.wire import object_side
-from dexsim_real.twin.wire.check import CommandCheck, LimitsConfig
+from dexsim_real.twin.wire.command_check import CommandCheck, LimitsConfig
 from dexsim_real.twin.wire.faults import FaultConfig, Injector
 from dexsim_real.twin.wire.firmware import ABANDONED, OVERHEATED, Firmware, FirmwareConfig
 from dexsim_real.twin.wire.line import HandLine, LineConfig
@@ -117,7 +117,7 @@ def test_the_state_in_the_wires_few_bits():
     force[0, 0] = [0.149, -0.151, 25.449]
     force[0, 1] = [-13.0, 13.0, 25.6]
     quat, none = np.array([1.0, 0, 0, 0]), np.zeros(3)
-    state = board.state(Measurement(0.0, angle, speed, current, np.full(12, 41.6), force, quat, none, none))
+    state = board.state(PlantMeasurement(0.0, angle, speed, current, np.full(12, 41.6), force, quat, none, none))
     data = state.tobytes()
     for joint in range(12):
         row = struct.unpack_from("<BBfhHHHHHhHH", data, 24 * joint)
@@ -299,7 +299,7 @@ def test_an_exchange_takes_what_it_takes_on_the_hand(bench):
 
 
 def test_answers_come_in_pieces_at_the_pace_of_the_wire(bench):
-    one = bench(line=LineConfig(jitter=0.0, pauses=0.0))
+    one = bench(line=LineConfig(jitter=0.0, extra_delay_probability=0.0))
     start = one.now
     one.send(Frame(0xFE, 0x80, Command.EXCHANGE, command().tobytes()).encode())
     pieces = one.run(0.02)
@@ -310,7 +310,7 @@ def test_answers_come_in_pieces_at_the_pace_of_the_wire(bench):
 
 
 def test_requests_queue_while_an_answer_is_on_its_way(bench):
-    one = bench(line=LineConfig(jitter=0.0, pauses=0.0))
+    one = bench(line=LineConfig(jitter=0.0, extra_delay_probability=0.0))
     request = Frame(0xFE, 0x80, Command.EXCHANGE, command().tobytes()).encode()
     one.send(request + request)
     got = one.run(0.03)
@@ -410,19 +410,19 @@ def test_physics_follows_the_wall_clock_and_lets_go_what_it_cannot(hand):
             time.sleep(pace * seconds)
 
     notes, pace = [], 0.0
-    world = World(Slow(), 10.0, notes.append)
+    world = PlantClock(Slow(), 10.0, notes.append)
     for now in np.arange(10.0, 10.5, 0.0007):
-        world.catch_up(now, World.SLICE)
-    assert world.plant.time == pytest.approx(0.5, abs=0.003) and world.let_go == 0
+        world.catch_up(now, PlantClock.SLICE)
+    assert world.plant.time == pytest.approx(0.5, abs=0.003) and world.slipped == 0
     # Behind by less than the bound all of it is caught up, in slices; behind by more, the rest is let go.
     for _ in range(100):
-        world.catch_up(10.58, World.SLICE)
+        world.catch_up(10.58, PlantClock.SLICE)
     assert world.plant.time == pytest.approx(0.58, abs=1e-6)
     world.catch_up(13.0)
-    assert world.plant.time == pytest.approx(0.59, abs=1e-6) and world.let_go == pytest.approx(2.41, abs=1e-6)
+    assert world.plant.time == pytest.approx(0.59, abs=1e-6) and world.slipped == pytest.approx(2.41, abs=1e-6)
     assert len(notes) == 1 and "too slow" in notes[0]
     report = world.report()
-    assert report["simulated_s"] + report["let_go_s"] == pytest.approx(3.0, abs=1e-3)
+    assert report["simulated_s"] + report["slipped_s"] == pytest.approx(3.0, abs=1e-3)
 
 
 def test_a_terminal_keeps_its_name(tmp_path):
@@ -500,12 +500,12 @@ OPTICS = CameraConfig()
 def test_the_silhouette_of_a_sphere_and_of_a_box():
     place = np.array([0.05, 0.0, 0.09])
     depth = OPTICS.position[1] - place[1]
-    ball = object_side.outline(Part("sphere", (0.03,))) + place
+    ball = object_side.outline(Primitive("sphere", (0.03,))) + place
     mask = object_side.silhouette([ball], OPTICS, (640, 480))
     # Outline of a sphere seen by a pinhole: a cone of half angle asin(r / d), nearly a circle.
     radius = 600 * math.tan(math.asin(0.03 / math.dist(OPTICS.position, place)))
     assert mask.sum() == pytest.approx(math.pi * radius**2, rel=0.03)
-    cube = object_side.outline(Part("box", (0.025, 0.025, 0.025))) + place
+    cube = object_side.outline(Primitive("box", (0.025, 0.025, 0.025))) + place
     mask = object_side.silhouette([cube], OPTICS, (640, 480))
     side = 600 * 0.05 / (depth - 0.025)  # The near face hides the rest, seen nearly head on.
     assert mask.sum() == pytest.approx(side**2, rel=0.06)
@@ -520,14 +520,14 @@ def test_the_silhouette_of_a_sphere_and_of_a_box():
 @pytest.mark.parametrize(
     "part",
     [
-        Part("cylinder", (0.02, 0.03)),
-        Part("capsule", (0.02, 0.03)),
-        Part("sphere", (0.03,)),
-        Part("box", (0.01, 0.02, 0.03), (0.01, 0.0, -0.02)),
+        Primitive("cylinder", (0.02, 0.03)),
+        Primitive("capsule", (0.02, 0.03)),
+        Primitive("sphere", (0.03,)),
+        Primitive("box", (0.01, 0.02, 0.03), (0.01, 0.0, -0.02)),
     ],
 )
 def test_outlines_reach_as_far_as_the_exact_shape(part):
-    shape, points = Shape("one", (part,)), object_side.outline(part)
+    shape, points = ObjectShape("one", (part,)), object_side.outline(part)
     rng = np.random.default_rng(0)
     for _ in range(200):
         way = rng.standard_normal(3)

@@ -21,12 +21,12 @@ from dexsim.registry import TASKS as TRAINED
 from dexsim_real.core.errors import HandError
 from dexsim_real.twin.plant import assistant, referee, scene, shapes
 from dexsim_real.twin.plant.assistant import PLACES, POSTURES, REFERENCES, Assistant, Stage, find_place, put
-from dexsim_real.twin.plant.draw import BANDS, FAR, NEAR, PUSHES, TASKS, bands, draw_trial
-from dexsim_real.twin.plant.motors import BACK_EMF, PERIOD, STALL_CURRENT, STIFFNESS, Drives, Heat
-from dexsim_real.twin.plant.plant import GRAVITY, EmulatedHand, nominal_gravity, tilted_gravity
+from dexsim_real.twin.plant.drives import BACK_EMF, PERIOD, STALL_CURRENT, STIFFNESS, Drives, Heat
+from dexsim_real.twin.plant.emulated_hand import GRAVITY, EmulatedHand, nominal_gravity, tilted_gravity
+from dexsim_real.twin.plant.parameters import BANDS, FAR, NEAR, PUSHES, TASKS, bands, sample_trial
+from dexsim_real.twin.plant.protocol import MotorCommands
 from dexsim_real.twin.plant.referee import GoalCount, Referee
-from dexsim_real.twin.plant.shapes import Part, Shape, draw_shape, matrix, product, turn
-from dexsim_real.twin.types import Motors
+from dexsim_real.twin.plant.shapes import ObjectShape, Primitive, matrix, product, sample_shape, turn
 from dexsim_real.wire.frames import Mode
 
 QUIET = {"taxel_noise": 0.0, "taxel_bias": 0.0, "taxel_spread": 0.0, "taxel_threshold": 0.0}
@@ -52,12 +52,12 @@ def motors(position, *, kp=100.0, ki=0.0, kd=0.0, torque_max=300.0, mode=Mode.PO
     def full(value):
         return np.broadcast_to(np.asarray(value, float), 12).copy()
 
-    return Motors(full(position), full(kp), full(ki), full(kd), full(torque_max), full(int(mode)))
+    return MotorCommands(full(position), full(kp), full(ki), full(kd), full(torque_max), full(int(mode)))
 
 
 def drives(hand, heat=None, **overrides):
     made = Drives(hand.torque_limit, hand.speed_limit, heat or Heat())
-    made.configure(draw_trial("grasp", np.random.default_rng(0), "nominal", IDEAL | overrides))
+    made.configure(sample_trial("grasp", np.random.default_rng(0), "nominal", IDEAL | overrides))
     return made
 
 
@@ -123,19 +123,19 @@ def test_the_fingers_leave_room_where_a_cube_is_put(hand):
     """Hands around which no cube fits are drawn anew, which must not choose among them."""
     for trial in range(30):
         rng = np.random.default_rng([7, trial])
-        draw = draw_trial("rotate", rng, "outside", {})
-        shape = draw_shape(draw, rng, None)
-        built = scene.build_scene(hand, draw, shape, tilted_gravity("rotate", draw.gravity_tilt))
-        assert find_place(built, draw, shape, rng) is not None
+        parameters = sample_trial("rotate", rng, "outside", {})
+        shape = sample_shape(parameters, rng, None)
+        built = scene.build_scene(hand, parameters, shape, tilted_gravity("rotate", parameters.gravity_tilt))
+        assert find_place(built, parameters, shape, rng) is not None
 
 
 @pytest.mark.parametrize("task", TASKS)
 def test_every_value_lies_outside_its_range_and_near_it(task):
     sides = {name: set() for name in bands(task)}
     for seed in range(60):
-        draw = draw_trial(task, np.random.default_rng(seed))
+        parameters = sample_trial(task, np.random.default_rng(seed))
         for name, band in bands(task).items():
-            value, width = draw.value[name], band.width or band.high - band.low
+            value, width = parameters.value[name], band.width or band.high - band.low
             assert np.all((value < band.low) | (value > band.high)), name
             assert np.all(value >= band.low - (FAR + 1e-9) * width), name
             assert np.all(value <= band.high + (FAR + 1e-9) * width), name
@@ -148,22 +148,22 @@ def test_every_value_lies_outside_its_range_and_near_it(task):
 
 def test_inside_nominal_and_overrides():
     for task in TASKS:
-        inside, nominal = (draw_trial(task, np.random.default_rng(3), kind) for kind in ("inside", "nominal"))
+        inside, nominal = (sample_trial(task, np.random.default_rng(3), kind) for kind in ("inside", "nominal"))
         for name, band in bands(task).items():
             assert np.all((inside.value[name] >= band.low) & (inside.value[name] <= band.high)), name
             assert np.all(nominal.value[name] == band.nominal), name
-    fixed = draw_trial("grasp", np.random.default_rng(3), "outside", {"gear_play": 0.002, "rolling": 0.0})
+    fixed = sample_trial("grasp", np.random.default_rng(3), "outside", {"gear_play": 0.002, "rolling": 0.0})
     assert np.all(fixed.gear_play == 0.002) and fixed.rolling == 0.0
-    assert np.array_equal(fixed.stiffness, draw_trial("grasp", np.random.default_rng(3)).stiffness)
+    assert np.array_equal(fixed.stiffness, sample_trial("grasp", np.random.default_rng(3)).stiffness)
     # One parameter outside, all others nominal: the very value that it has with all others outside.
-    one = draw_trial("grasp", np.random.default_rng(3), "nominal", {"friction": "outside"})
+    one = sample_trial("grasp", np.random.default_rng(3), "nominal", {"friction": "outside"})
     assert one.friction == fixed.friction and np.all(one.stiffness == 1.0)
     with pytest.raises(HandError, match="friction = 'outsid'"):
-        draw_trial("grasp", np.random.default_rng(0), overrides={"friction": "outsid"})
+        sample_trial("grasp", np.random.default_rng(0), overrides={"friction": "outsid"})
     with pytest.raises(HandError, match="no parameter 'gaer_play'"):
-        draw_trial("grasp", np.random.default_rng(0), overrides={"gaer_play": 1.0})
+        sample_trial("grasp", np.random.default_rng(0), overrides={"gaer_play": 1.0})
     with pytest.raises(HandError, match="tasks are"):
-        draw_trial("juggle", np.random.default_rng(0))
+        sample_trial("juggle", np.random.default_rng(0))
 
 
 def test_the_physics_shares_no_code_with_training():
@@ -362,7 +362,7 @@ def test_an_object_on_the_fingertips_weighs_what_it_weighs(hand):
     speed = np.linalg.norm(plant._data.qvel[plant._scene.object_dof :][:3])
     assert speed < 1e-3
     shown = plant.measure().taxel_force
-    weight = float(plant.draw.mass) * GRAVITY
+    weight = float(plant.parameters.mass) * GRAVITY
     assert shown[..., 2].sum() == pytest.approx(weight, rel=0.05)
     plant._contacts()
     assert plant._pressing == pytest.approx(shown[..., 2].sum(-1), rel=0.02, abs=0.01 * weight)
@@ -513,7 +513,7 @@ def test_places_are_clear_of_the_hand(hand):
         assert assistant.clear(plant._scene, data, plant._place)
         up = matrix(plant._place.quat).T @ [-1.0, 0.0, 0.0]
         top = plant._place.position[0] - plant.shape.reach(up)
-        assert top == pytest.approx(assistant.PALM_FACE + float(plant.draw.gap))
+        assert top == pytest.approx(assistant.PALM_FACE + float(plant.parameters.gap))
 
 
 # --- shapes --------------------------------------------------------------------------------------
@@ -522,10 +522,10 @@ def test_places_are_clear_of_the_hand(hand):
 @pytest.mark.parametrize(
     "part",
     [
-        Part("sphere", (0.03,)),
-        Part("box", (0.02, 0.03, 0.025)),
-        Part("cylinder", (0.02, 0.03), (0.01, 0.0, 0.0)),
-        Part("capsule", (0.015, 0.02)),
+        Primitive("sphere", (0.03,)),
+        Primitive("box", (0.02, 0.03, 0.025)),
+        Primitive("cylinder", (0.02, 0.03), (0.01, 0.0, 0.0)),
+        Primitive("capsule", (0.015, 0.02)),
     ],
 )
 def test_distances_agree_with_mujoco(part):
@@ -542,19 +542,19 @@ def test_distances_agree_with_mujoco(part):
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     points = data.geom_xpos[1:]
-    ours = Shape("x", (part,)).distance(points)
+    ours = ObjectShape("x", (part,)).distance(points)
     theirs = np.array([mujoco.mj_geomDistance(model, data, 0, k + 1, 1.0, np.zeros(6)) + 1e-5 for k in range(200)])
     outside = theirs > 1e-3
     assert ours[outside] == pytest.approx(theirs[outside], abs=1e-5)
     assert np.all((ours < 0) == (theirs < 0))
     along = np.array([0.6, 0.0, 0.8])
     fine = np.random.default_rng(0).uniform(-0.06, 0.06, (200_000, 3))
-    inside = fine[Shape("x", (part,)).distance(fine) < 0]
-    assert Shape("x", (part,)).reach(along) == pytest.approx((inside @ along).max(), abs=2e-3)
+    inside = fine[ObjectShape("x", (part,)).distance(fine) < 0]
+    assert ObjectShape("x", (part,)).reach(along) == pytest.approx((inside @ along).max(), abs=2e-3)
 
 
 def test_mass_properties_of_a_box():
-    mass, centre, inertia = scene.mass_properties(Shape("box", (Part("box", (0.02, 0.03, 0.04)),)), 0.3)
+    mass, centre, inertia = scene.mass_properties(ObjectShape("box", (Primitive("box", (0.02, 0.03, 0.04)),)), 0.3)
     assert mass == 0.3 and centre == pytest.approx(np.zeros(3))
     assert np.diag(inertia) == pytest.approx(
         [0.1 * (0.03**2 + 0.04**2), 0.1 * (0.02**2 + 0.04**2), 0.1 * (0.02**2 + 0.03**2)]
@@ -638,7 +638,7 @@ def test_forces_of_a_grasp_are_means_from_three_seconds_on():
 
 
 def test_all_shapes_are_drawn():
-    draw = draw_trial("grasp", np.random.default_rng(0))
-    drawn = {shapes.draw_shape(draw, np.random.default_rng(k)).name for k in range(60)}
+    parameters = sample_trial("grasp", np.random.default_rng(0))
+    drawn = {shapes.sample_shape(parameters, np.random.default_rng(k)).name for k in range(60)}
     assert drawn == set(shapes.SHAPES)
     assert len(BANDS) > 20

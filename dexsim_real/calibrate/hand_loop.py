@@ -1,7 +1,7 @@
-"""One thread, one hand: exchanges at a steady rate through `Safety`, for procedures that wait and measure.
+"""A single-threaded exchange loop through `Safety`, for procedures that move and measure.
 
-A run's servo thread keeps a policy's delays away from the hand. A procedure has no such delays, so here the
-exchange and what comes of it are one call, which also lets clock and hand be simulated.
+In a run a separate thread keeps the delays of a policy away from the hand. A procedure has no such delays, so one call
+makes an exchange and returns its result. Clock and hand can be simulated.
 """
 
 import dataclasses
@@ -15,7 +15,7 @@ from typing import Any, TextIO
 import numpy as np
 from rich.console import Console
 
-from dexsim_real.control.safety import Reaction, Safety, Sample
+from dexsim_real.control.safety import HandSample, Reaction, Safety
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogWriter
 from dexsim_real.core.timing import Pace
@@ -24,25 +24,28 @@ from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Command, Frame, Mode
 from dexsim_real.wire.link import HandPort, Reply
 
-_PATIENCE = 2.0  # s that `Safety` may hold, or the hand may be silent
+_PATIENCE = 2.0  # s, longest hold by `Safety` or silence of the hand
 
 
 @dataclasses.dataclass(frozen=True)
-class Moment:
-    """One exchange that was answered."""
+class Exchange:
+    """An answered exchange."""
 
-    sample: Sample
+    sample: HandSample
     state: np.ndarray  # `frames.STATE_BLOCK`
-    command_applied: bool  # whether the hand was told what was asked for
+    command_applied: bool  # whether the requested target was sent, possibly clipped
 
 
 class HandLoop:
-    """The hand, one `step` a cycle.
+    """Exchanges with a hand, one `step` per cycle.
 
     Args:
-      port: not yet connected; belongs to this loop from then on.
-      safety: whose limits hold; its notes should go to the log.
-      log: gets every frame while `marks` is set, and what `mark` is given.
+      port: not yet connected; used by this loop only.
+      sensing: conversion to SI units.
+      safety: decides the commands; its notes should go to the log.
+      log: gets the frames while `recording` is set, and the marks.
+      rate: exchanges per second.
+      clock, sleep: replace those of `time`, for simulated time.
     """
 
     def __init__(
@@ -60,46 +63,45 @@ class HandLoop:
         self.clock, self.pace = clock, Pace(rate, clock, sleep)
         self.recording = False
         self._filter = VelocityFilter(sensing.config.velocity_time)
-        self._trouble_since: float | None = None
+        self._failing_since: float | None = None
         self._generation: int | None = None
         self._number = 0
 
-    def step(self, target: np.ndarray | None = None) -> Moment | None:
-        """One exchange; None when it was not answered.
+    def step(self, target: np.ndarray | None = None) -> Exchange | None:
+        """Make an exchange; None when it was not answered.
 
         Args:
-          target: where the joints [J] shall be, rad; None leaves them where `Safety` has them.
+          target: [J] rad, requested joint targets; None keeps the last ones.
 
         Raises:
-          HandError: `Safety` has turned the motors off, the hand was away, or does what it was told for too long
-            a time no more.
+          HandError: `Safety` turned the motors off, the hand was disconnected, or hold or silence lasted too long.
         """
         now = self.clock()
         if target is not None:
-            self.safety.wish(target, now)
+            self.safety.set_target(target, now)
         decision = self.safety.decide(now)
         command = self.sensing.command(decision.position, decision.mode)
         self._number += 1
         self._keep(Kind.SENT, frames.HOST, command, now)
         reply = self.port.exchange(command)
-        moment = None if reply is None else self._take(reply, decision.reaction)
+        exchange = None if reply is None else self._take(reply, decision.reaction)
         self._check(now, decision, reply)
         self.pace.wait()
-        return moment
+        return exchange
 
     def mark(self, content: dict[str, Any]) -> None:
-        """What the newest frame in the log means."""
+        """Annotate the newest exchange in the log."""
         self.log.add(Kind.TICK, {"sequence": self._number, **content}, self.clock())
 
-    def collect(self, seconds: float, target: np.ndarray | None = None) -> list[Moment]:
-        """The answers of this much time."""
+    def collect(self, seconds: float, target: np.ndarray | None = None) -> list[Exchange]:
+        """The answered exchanges of this duration in s."""
         until, found = self.clock() + seconds, []
         while self.clock() < until:
             found.append(self.step(target))
-        return [moment for moment in found if moment is not None]
+        return [exchange for exchange in found if exchange is not None]
 
     def move(self, goal: np.ndarray, speed: float = 0.6) -> None:
-        """To a posture [J] rad, the joint with the longest way at `speed` rad/s on average."""
+        """Move to a posture [J] rad; the joint with the longest path has a mean speed of `speed` rad/s."""
         start = self.pose()
         seconds = max(float(np.abs(goal - start).max()) / speed, 0.3)
         begin = self.clock()
@@ -108,11 +110,11 @@ class HandLoop:
         self.step(goal)
 
     def pose(self) -> np.ndarray:
-        """Joint angles [J] rad, measured last."""
+        """The last measured joint angles [J] rad."""
         return self.safety.sample.measured.joint_position.astype(float)
 
     def close(self) -> None:
-        """Motors off: until the hand has confirmed it, or ten times; then the port is closed."""
+        """Turn the motors off (repeat until the hand confirms it, at most ten times) and close the port."""
         off = self.sensing.command(self.sensing.hand.joint_lower, Mode.PASSIVE)
         try:
             for _ in range(10):
@@ -123,16 +125,16 @@ class HandLoop:
 
     # --- pieces ---------------------------------------------------------------------------------
 
-    def _take(self, reply: Reply, reaction: Reaction) -> Moment:
+    def _take(self, reply: Reply, reaction: Reaction) -> Exchange:
         self._keep(Kind.RECEIVED, frames.palm_address(0), reply.state, reply.received)
         measured = self.sensing.measure(reply.state)
         velocity = self._filter.update(reply.received, measured.joint_position)
-        sample = Sample(reply.received, reply.sequence, reply.generation, measured, velocity)
+        sample = HandSample(reply.received, reply.sequence, reply.generation, measured, velocity)
         self.safety.see(sample)
-        return Moment(sample, reply.state, reaction <= Reaction.CLIP)
+        return Exchange(sample, reply.state, reaction <= Reaction.CLIP)
 
     def _keep(self, kind: Kind, source: int, block: np.ndarray, when: float) -> None:
-        """A frame for the log, as it goes over the wire of hand 0."""
+        """Log a frame as it is on the wire of a hand with id 0."""
         if self.recording:
             target = frames.HOST if kind == Kind.RECEIVED else frames.palm_address(0)
             frame = Frame(source, target, Command.EXCHANGE, block.tobytes())
@@ -142,38 +144,40 @@ class HandLoop:
         if self.safety.latched:
             raise HandError(f"stopped: {self.safety.latched}")
         if reply is not None and self._generation not in (None, reply.generation):
-            raise HandError("stopped: the hand was away and came back, its pose may be another; begin again")
+            raise HandError("stopped: the hand was disconnected and its pose may have changed; start again")
         self._generation = reply.generation if reply is not None else self._generation
-        fine = reply is not None and (decision.reaction <= Reaction.CLIP or not self.safety.engaged)
-        self._trouble_since = None if fine else self._trouble_since or now
-        if self._trouble_since is not None and now - self._trouble_since > _PATIENCE:
+        working = reply is not None and (decision.reaction <= Reaction.CLIP or not self.safety.engaged)
+        self._failing_since = None if working else self._failing_since or now
+        if self._failing_since is not None and now - self._failing_since > _PATIENCE:
             raise HandError(f"stopped: {decision.reason or 'the hand does not answer'} for {_PATIENCE:g} s")
 
 
 class Operator:
-    """Who stands beside the hand: is told what to do, and asked while the hand goes on.
+    """The person beside the hand: reads instructions, and answers questions while the hand keeps moving.
 
     Args:
-      silent: ask nothing and take every answer to be yes.
+      console: for output.
+      assume_yes: ask nothing and assume that every answer is yes.
+      stream: of the answers; None is the standard input.
     """
 
-    def __init__(self, console: Console, *, silent: bool = False, stream: TextIO | None = None):
-        self.console, self.silent = console, silent
+    def __init__(self, console: Console, *, assume_yes: bool = False, stream: TextIO | None = None):
+        self.console, self.assume_yes = console, assume_yes
         self._stream = stream or sys.stdin
         self._lines: queue.SimpleQueue[str] = queue.SimpleQueue()
         self._reader: threading.Thread | None = None
 
     def tell(self, text: str) -> None:
-        """One line."""
+        """Print one line."""
         self.console.print(text, highlight=False, markup=False, soft_wrap=True)
 
     def ask(self, text: str, meanwhile: Callable[[], object]) -> str:
-        """The answer, stripped; `meanwhile` is called until it comes.
+        """Ask a question; returns the stripped answer. `meanwhile` is called until it arrives.
 
         Raises:
-          HandError: there is nobody to answer.
+          HandError: the input is closed.
         """
-        while self._stream.isatty() and not self._lines.empty():  # Keys pressed before the question do not answer it.
+        while self._stream.isatty() and not self._lines.empty():  # Discard keys pressed before the question.
             self._lines.get()
         self.tell(text)
         if self._reader is None:
@@ -183,7 +187,7 @@ class Operator:
             meanwhile()
         line = self._lines.get()
         if not line:
-            raise HandError("nobody answers: standard input is closed (--yes asks nothing)")
+            raise HandError("nobody can answer: standard input is closed (--yes asks nothing)")
         return line.strip()
 
     def _read(self) -> None:

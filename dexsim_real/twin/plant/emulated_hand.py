@@ -13,13 +13,13 @@ import numpy as np
 
 from dexsim.hand.kinematics import Hand
 from dexsim_real.twin.plant.assistant import Assistant, Place, Stage, clear, find_place, put
-from dexsim_real.twin.plant.draw import EXCHANGE_SENSE, PUSHES, Draw, draw_trial
-from dexsim_real.twin.plant.motors import PERIOD, Drives
+from dexsim_real.twin.plant.drives import PERIOD, Drives
+from dexsim_real.twin.plant.parameters import EXCHANGE_SENSE, PUSHES, TrialParameters, sample_trial
+from dexsim_real.twin.plant.protocol import MotorCommands, PlantMeasurement
 from dexsim_real.twin.plant.referee import Referee
 from dexsim_real.twin.plant.scene import TIMESTEP, build_scene
-from dexsim_real.twin.plant.shapes import Shape, draw_shape, matrix, product, turn
-from dexsim_real.twin.plant.skin import Skin
-from dexsim_real.twin.types import Measurement, Motors
+from dexsim_real.twin.plant.shapes import ObjectShape, matrix, product, sample_shape, turn
+from dexsim_real.twin.plant.taxel_array import TaxelArray
 from dexsim_real.wire.frames import Mode
 
 MOUNT = {"grasp": None, "rotate": (-0.2, -0.2)}
@@ -69,7 +69,7 @@ class EmulatedHand:
       seed: of everything random.
       trials: how many there shall be, after which the hand is left empty; None: no end.
       kind: "outside", "inside" or "nominal" (`draw`).
-      overrides: parameters that are given, not drawn (`draw_trial`).
+      overrides: parameters that are given, not drawn (`sample_trial`).
       seconds: time limit of a trial; None for the task's.
       command: what the runner was asked for; only written into the results.
       shape: name of the objects (grasp); None for random ones.
@@ -94,10 +94,10 @@ class EmulatedHand:
         self.command, self._end = command, None if trials is None else first + trials
         self._overrides, self._seconds, self._shape = overrides, seconds, shape
         self._drives = Drives(hand.torque_limit, hand.speed_limit)
-        self._skin, self._assistant = Skin(hand), Assistant(task)
+        self._skin, self._assistant = TaxelArray(hand), Assistant(task)
         self._done: list[dict[str, Any]] = []
         self.time, self._ticks, self._due = 0.0, 0, 0.0
-        self._told: Motors | None = None
+        self._told: MotorCommands | None = None
         # A hand that nobody drives lies with its fingers slightly bent.
         self._rest = np.clip(0.3, hand.joint_lower, hand.joint_upper).astype(float)
         self._data: mujoco.MjData | None = None
@@ -106,7 +106,7 @@ class EmulatedHand:
 
     # --- the interface --------------------------------------------------------------------------
 
-    def drive(self, motors: Motors) -> None:
+    def drive(self, motors: MotorCommands) -> None:
         """New commands, effective from now."""
         self._told = motors
         self._drives.order(self.time, motors)
@@ -118,16 +118,16 @@ class EmulatedHand:
             self._due -= PERIOD
             self._tick()
 
-    def measure(self) -> Measurement:
+    def measure(self) -> PlantMeasurement:
         """What the hand's sensors show; each shows the past."""
-        late = max(float(self.draw.sensing_latency) - EXCHANGE_SENSE, 0.0)
+        late = max(float(self.parameters.sensing_latency) - EXCHANGE_SENSE, 0.0)
         past, rng = self._before(late), self._noise
         position, quat, acceleration = self.measure_object()
         shown = past.qpos[self._scene.drive_qpos] + self._drives.bias
-        return Measurement(
+        return PlantMeasurement(
             time=self.time,
             joint_velocity=past.qvel[self._scene.drive_dof],
-            joint_position=shown + self.draw.encoder_noise * rng.standard_normal(shown.shape),
+            joint_position=shown + self.parameters.encoder_noise * rng.standard_normal(shown.shape),
             current=self._shown_current(past),
             temperature=self._drives.case.copy(),
             taxel_force=self._skin.report(self._felt(late), rng),
@@ -139,17 +139,17 @@ class EmulatedHand:
     def measure_object(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Place [3] m as a camera's masks give it, orientation [4] and acceleration [3] m/s^2 as an IMU in the object
         does: late, noisy and biased as those are."""
-        draw, rng = self.draw, self._object_noise
+        parameters, rng = self.parameters, self._object_noise
         at = self._scene.object_qpos
-        position = self._before(float(draw.camera_delay)).qpos[at : at + 3]
-        position = position + draw.camera_noise * rng.standard_normal(3)
-        past = self._before(max(float(getattr(draw, "imu_delay", 0.0)) - IMU_TRANSPORT, 0.0))
+        position = self._before(float(parameters.camera_delay)).qpos[at : at + 3]
+        position = position + parameters.camera_noise * rng.standard_normal(3)
+        past = self._before(max(float(getattr(parameters, "imu_delay", 0.0)) - IMU_TRANSPORT, 0.0))
         quat = past.qpos[at + 3 : at + 7].copy()
         felt = matrix(quat).T @ (past.acceleration - self._gravity)
         if self.task != "rotate":
             return position, quat, felt
-        heading = turn(self.up, float(draw.imu_drift) * (self.time - self._began))
-        error = draw.imu_bias + draw.imu_noise * rng.standard_normal(3)
+        heading = turn(self.up, float(parameters.imu_drift) * (self.time - self._began))
+        error = parameters.imu_bias + parameters.imu_noise * rng.standard_normal(3)
         angle = float(np.linalg.norm(error))
         skew = turn(error / max(angle, 1e-12), angle)
         return position, product(product(heading, quat), skew), felt
@@ -188,17 +188,17 @@ class EmulatedHand:
         rng = np.random.default_rng([self.seed, self.trial])
         joints = self._rest if self._data is None else self._joints()
         while True:  # Some objects fit nowhere between the fingers; nobody would put those there.
-            self.draw: Draw = draw_trial(self.task, rng, self.kind, self._overrides)
-            self.shape: Shape = draw_shape(self.draw, rng, self._shape)
-            self._gravity = tilted_gravity(self.task, self.draw.gravity_tilt)
-            scene = build_scene(self.hand, self.draw, self.shape, self._gravity)
-            place = find_place(scene, self.draw, self.shape, rng)
+            self.parameters: TrialParameters = sample_trial(self.task, rng, self.kind, self._overrides)
+            self.shape: ObjectShape = sample_shape(self.parameters, rng, self._shape)
+            self._gravity = tilted_gravity(self.task, self.parameters.gravity_tilt)
+            scene = build_scene(self.hand, self.parameters, self.shape, self._gravity)
+            place = find_place(scene, self.parameters, self.shape, rng)
             if place is not None:
                 break
         self._scene, self._place = scene, place
         self._noise, self._object_noise, self._pushing = rng.spawn(3)
-        self._drives.configure(self.draw)
-        self._skin.configure(self.draw, rng)
+        self._drives.configure(self.parameters)
+        self._skin.configure(self.parameters, rng)
         self._data = mujoco.MjData(scene.model)
         self._data.qpos[scene.drive_qpos] = joints
         self._assistant.begin(self.time)
@@ -209,7 +209,9 @@ class EmulatedHand:
         mujoco.mj_forward(scene.model, self._data)
         self._tips, self._pressing, self._touches = np.zeros((5, 3)), np.zeros(5), []
         self._past: collections.deque[_Past] = collections.deque(maxlen=round(_MEMORY / PERIOD))
-        self._samples: collections.deque = collections.deque(maxlen=round(_MEMORY / float(self.draw.taxel_period)) + 2)
+        self._samples: collections.deque = collections.deque(
+            maxlen=round(_MEMORY / float(self.parameters.taxel_period)) + 2
+        )
         self._next_sample = self.time
         self._remember()
 
@@ -234,7 +236,7 @@ class EmulatedHand:
             "stage": self.stage.value,
             "hottest": round(self._hottest, 2),
             **self._referee.report(),
-            "parameters": self.draw.summary(),
+            "parameters": self.parameters.summary(),
         }
 
     # --- one firmware period --------------------------------------------------------------------
@@ -257,7 +259,7 @@ class EmulatedHand:
         self.time = self._ticks * PERIOD
         self._remember()
         if self.time >= self._next_sample - 1e-9:
-            self._next_sample += float(self.draw.taxel_period)
+            self._next_sample += float(self.parameters.taxel_period)
             self._sample_skin()
         if self._ticks % _LOOK == 0:
             self._look()
@@ -306,15 +308,15 @@ class EmulatedHand:
             force[:3], self._push_until = 0.0, None
         if self.time < self._push_at:
             return
-        rng, lasts = self._pushing, float(self.draw.push_seconds)
+        rng, lasts = self._pushing, float(self.parameters.push_seconds)
         way = rng.standard_normal(3)
         change = PUSHES[self.task][1] * rng.random() * way / np.linalg.norm(way)
-        force[:3] = float(self.draw.mass) * change / lasts
+        force[:3] = float(self.parameters.mass) * change / lasts
         self._push_until = self.time + lasts
         self._plan_push()
 
     def _plan_push(self) -> None:
-        rate = PUSHES[self.task][0] * float(self.draw.push_rate)
+        rate = PUSHES[self.task][0] * float(self.parameters.push_rate)
         self._push_at = self.time + self._pushing.exponential(1 / rate) if rate > 0 else np.inf
 
     # --- sensors --------------------------------------------------------------------------------
@@ -371,5 +373,5 @@ class EmulatedHand:
 
     def _shown_current(self, past: _Past) -> np.ndarray:
         """mA, positive when opening."""
-        noise = float(self.draw.current_noise) * self._noise.standard_normal(past.current.shape)
-        return -1000.0 * (past.current * self.draw.current_gain + noise)
+        noise = float(self.parameters.current_noise) * self._noise.standard_normal(past.current.shape)
+        return -1000.0 * (past.current * self.parameters.current_gain + noise)

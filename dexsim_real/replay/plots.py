@@ -1,4 +1,4 @@
-"""A replayed log as a figure, or in the rerun viewer."""
+"""Plots of a replayed log: a figure, or the rerun viewer."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def signals(run: Replay) -> dict[str, np.ndarray]:
-    """What both show, [T, n] each: angles and their targets (rad), forces (N), command (1), age of the reading (s)."""
+    """Plotted signals, [T, n] each: joint angles and targets (rad), forces (N), command (1), age of the measurement (s)."""
     return {
         "angle": np.array([now.joint_position for now in run.measured]),
         "target": np.array([tick["target"] for tick in run.ticks]),
@@ -27,7 +27,7 @@ def signals(run: Replay) -> dict[str, np.ndarray]:
 
 
 def plot(run: Replay, path: Path) -> None:
-    """A figure: joint angles against targets, finger forces and command, ages, and what the policy saw."""
+    """Write a figure of joint angles and targets, finger forces and command, measurement ages, and the observation."""
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(4, 1, figsize=(10, 13), sharex=True, constrained_layout=True)
@@ -46,7 +46,7 @@ def plot(run: Replay, path: Path) -> None:
     command.set_ylabel("command / 1")
     axes[2].plot(run.time, 1e3 * seen["age"], lw=0.8)
     axes[2].set_ylabel("age of the measurement / ms")
-    # Entries differ in unit and size, so each is shown by how far it is from its own mean.
+    # Entries differ in unit and scale, so each is normalised.
     spread = np.maximum(run.observation.std(0), 1e-6)
     edges = np.cumsum([0] + [field.size for field in run.fields])
     axes[3].pcolormesh(
@@ -70,8 +70,11 @@ def plot(run: Replay, path: Path) -> None:
 
 
 def show_rerun(run: Replay, path: Path | None = None) -> None:
-    """Opens the rerun viewer, or writes a file for it: angles, targets, forces, command, the observation by its
-    fields, and the taxels of each fingertip as pictures.
+    """Show a replay in the rerun viewer: the signals, the observation by fields, and taxels as pictures.
+
+    Args:
+      run: the replay.
+      path: recording to write; None opens the viewer.
 
     Raises:
       LogError: rerun is not installed.
@@ -80,7 +83,7 @@ def show_rerun(run: Replay, path: Path | None = None) -> None:
     try:
         import rerun
     except ImportError:
-        raise LogError("the rerun viewer is missing: pip install 'dexsim[rerun]' (or use --plot)") from None
+        raise LogError("the rerun viewer is not installed: pip install 'dexsim[rerun]', or use --plot") from None
     hand = load_hand()
     edges = np.cumsum([field.size for field in run.fields])[:-1]
     names = {"angle": hand.joint_names, "target": hand.joint_names, "force": hand.finger_names}
@@ -96,7 +99,7 @@ def show_rerun(run: Replay, path: Path | None = None) -> None:
         recording.spawn()
     else:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.touch()  # Where that fails it says which file; rerun would not.
+        path.touch()  # Its error names the file; rerun's does not.
         recording.save(path)
     for entity, (labels, values) in series.items():
         recording.log(entity, rerun.SeriesLines(names=list(labels)), static=True)

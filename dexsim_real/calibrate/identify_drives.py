@@ -1,9 +1,8 @@
-"""`python -m dexsim_real.calibrate --identify`: moves the free joints, and fits the drives' parameters to the log.
+"""`python -m dexsim_real.calibrate --identify`: moves the free joints, and fits the parameters of the drives to the log.
 
-One joint after the other follows `dexsim.identification.excitation`; what was commanded and what the hand answered,
-exchange by
-exchange, goes to `dexsim.identification.identify`. Without a calibration there are angles only, which fix torques over
-inertia: the inertia is then the model's.
+Each joint in turn follows `dexsim.identification.excitation`. Commands and answers of every exchange are passed to
+`dexsim.identification.identify`. Without a calibration there are only angles, which determine the ratio of torque to
+inertia; the inertia is then that of the model.
 """
 
 import dataclasses
@@ -22,7 +21,7 @@ from dexsim.identification.identify import FIT, identify
 from dexsim.identification.joint import JointLog
 from dexsim.identification.report import Identification
 from dexsim_real.calibrate.bench import Workbench
-from dexsim_real.calibrate.loop import Operator
+from dexsim_real.calibrate.hand_loop import Operator
 from dexsim_real.calibrate.options import CalibrateArguments
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogError, LogReader
@@ -30,24 +29,24 @@ from dexsim_real.sensors.hand import HardwareConfig
 from dexsim_real.wire import frames
 
 TASK = "identify"
-STIFFNESS, DAMPING = 3.0, 0.1  # Nm/rad, Nm s/rad: first guesses
+STIFFNESS, DAMPING = 3.0, 0.1  # Nm/rad, Nm s/rad: initial values of the fit
 _SIGNALS = {
     "fit": {},
     "hold-out": {"amplitude": 0.2, "chirp_frequency": (0.5, 2.5), "chirp_seconds": 3.0, "step_count": 3},
 }
-_TIMESTEP = 0.006  # s, near that of the simulation
+_TIMESTEP = 0.006  # s, about that of the simulation
 _LOST = 0.02  # share of the exchanges that may be missing
 
 
 def identify_hand(arguments: CalibrateArguments, hand: Hand, operator: Operator, **bench: Any) -> list[Identification]:
-    """Record, or read logs, fit each joint, and write what was found.
+    """Record or read logs, fit each joint, and write the results.
 
     Raises:
-      DexsimError: the hand, the log or the data cannot tell.
+      DexsimError: the hand fails, a log cannot be used, or the data are insufficient.
     """
     for name in arguments.joints:
         if name not in hand.joint_names:
-            raise HandError(f"no joint {name!r}: choose from {', '.join(hand.joint_names)}")
+            raise HandError(f"no joint {name!r}; choose from {', '.join(hand.joint_names)}")
     calibration = load_calibration(arguments.calibration, hand) if arguments.calibration else None
     logs = arguments.from_log or (record(arguments, hand, operator, **bench),)
     found = []
@@ -74,27 +73,27 @@ def identify_hand(arguments: CalibrateArguments, hand: Hand, operator: Operator,
         )
         operator.tell(found[-1].report())
     if not found:
-        raise HandError("none of these joints is in the log")
+        raise HandError("the logs contain none of the chosen joints; check --joints and --from-log")
     cli.write_json(arguments.destination, {"joints": {result.joint: _plain(result) for result in found}})
     operator.tell(f"identified: {arguments.destination}")
     return found
 
 
 def record(arguments: CalibrateArguments, hand: Hand, operator: Operator, **bench: Any) -> Path:
-    """Move the joints; returns the log."""
+    """Move the joints and record their answers; returns the log."""
     period = 1.0 / arguments.rate
     signals = {
-        label: excitation(hand, Excitation(period=period, **options), _open(hand), arguments.joints or None)
+        label: excitation(hand, Excitation(period=period, **options), _open_posture(hand), arguments.joints or None)
         for label, options in _SIGNALS.items()
     }
     seconds = sum(len(part) * period + 1.5 for signal in signals.values() for part in signal.values())
-    operator.tell(f"the fingers move one after the other for {seconds / 60:.0f} minutes: keep everything clear of them")
+    operator.tell(f"the fingers move one after the other for {seconds / 60:.0f} minutes: keep clear of them")
     with Workbench(arguments, hand, operator, {"task": TASK}, **bench) as work:
         loop = work.loop
-        # Else `Safety` would take what the taxels show at rest for a touch.
-        loop.sensing.zero([moment.state for moment in loop.collect(0.5)])
+        # Otherwise `Safety` would mistake the taxels' zero error for a touch.
+        loop.sensing.set_tare([exchange.state for exchange in loop.collect(0.5)])
         loop.step()
-        if not operator.silent and operator.ask("  Enter begins, s stops:", loop.step).lower() in ("s", "stop"):
+        if not operator.assume_yes and operator.ask("  Enter starts, s stops:", loop.step).lower() in ("s", "stop"):
             raise HandError("stopped before anything moved")
         work.safety.engage()
         for name in next(iter(signals.values())):
@@ -112,10 +111,10 @@ def record(arguments: CalibrateArguments, hand: Hand, operator: Operator, **benc
 def read_logs(
     paths: Iterable[Path], hand: Hand, calibration: Calibration | None
 ) -> dict[str, tuple[JointLog, JointLog | None]]:
-    """By joint, the log to fit and the one to test on.
+    """By joint, the log to fit and the held-out log to test on, None if there is none.
 
     Raises:
-      LogError: not the log of an identification, or too much of it is missing.
+      LogError: not a log of an identification, or too many exchanges are missing.
     """
     parts: dict[tuple[str, str], list] = {}
     hardware, period = HardwareConfig(), 0.0
@@ -135,7 +134,8 @@ def read_logs(
                     (content["sequence"], sent, received)
                 )
         if task != TASK:
-            raise LogError(f"{path}: is no log of an identification: {task or 'it ends before the hand was ready'}")
+            found = f"it is a log of {task!r}" if task else "it ends before the hand was ready"
+            raise LogError(f"{path}: this is not a log of --identify: {found}")
     logs = {key: _joint_log(key[0], rows, hand, hardware, calibration, period) for key, rows in parts.items()}
     return {name: (logs[name, "fit"], logs.get((name, "hold-out"))) for name, label in logs if label == "fit"}
 
@@ -147,11 +147,11 @@ def _joint_log(
     sign, offset = hardware.joint_sign[joint], hardware.joint_offset[joint]
     lost = np.array([number != received[0] for number, _, received in rows])
     if np.mean(lost) > _LOST:
-        raise LogError(f"{name}: {np.sum(lost)} of {len(lost)} exchanges are missing: mend the line and record again")
+        raise LogError(f"{name}: {np.sum(lost)} of {len(lost)} exchanges are missing; check the cable and record again")
     state = np.array([frames.decode_state(received[1][frames.HEADER.size : -2])["joint"] for _, _, received in rows])
     command = np.array([frames.decode_command(sent[1][frames.HEADER.size : -2])["position"] for _, sent, _ in rows])
     target, position = (part[:, joint].astype(float) * sign + offset for part in (command, state["position"]))
-    # What was not answered is filled in: a line through few of many samples.
+    # Few samples are missing: interpolate them.
     time = np.arange(len(rows))
     position = np.interp(time, time[~lost], position[~lost])
     torque = None
@@ -162,8 +162,8 @@ def _joint_log(
     return JointLog(period, target, position, torque, name)
 
 
-def _open(hand: Hand) -> np.ndarray:
-    """A posture [J] rad about which every joint can move without meeting another."""
+def _open_posture(hand: Hand) -> np.ndarray:
+    """A posture [J] rad about which every joint can move without a collision."""
     posture = np.full(hand.num_joints, 0.5)
     posture[:3] = 0.5, 0.4, 0.5
     posture[3] = 0.0
@@ -171,7 +171,7 @@ def _open(hand: Hand) -> np.ndarray:
 
 
 def _inertia(hand: Hand) -> np.ndarray:
-    """[J] kg m^2 about the joints, as the model has them."""
+    """Inertia [J] kg m^2 about the joints in the model."""
     import mujoco
 
     model = mujoco.MjModel.from_xml_path(str(hand.model_path))

@@ -15,8 +15,8 @@ import dataclasses
 
 import numpy as np
 
-from dexsim_real.twin.plant.draw import EXCHANGE_COMMAND, Draw
-from dexsim_real.twin.types import Motors
+from dexsim_real.twin.plant.parameters import EXCHANGE_COMMAND, TrialParameters
+from dexsim_real.twin.plant.protocol import MotorCommands
 from dexsim_real.wire.frames import Mode
 
 STIFFNESS = 3.0 / 100  # Nm/rad per unit of kp
@@ -78,20 +78,20 @@ class Drives:
         self._last: np.ndarray | None = None
         self._on, self._limit, self._most = np.zeros(joints, bool), zero.copy(), zero.copy()
 
-    def configure(self, draw: Draw) -> None:
+    def configure(self, parameters: TrialParameters) -> None:
         """Take a trial's parameters; heat and commands stay."""
-        self.stiffness, self.emf = STIFFNESS * draw.stiffness, BACK_EMF * draw.damping
-        self.constant = self._stall / STALL_CURRENT * draw.torque  # Nm/A, cold
-        self.no_load_speed = self._fast * draw.speed
-        self.efficiency, self.coulomb = draw.efficiency, draw.coulomb_friction * self._stall
-        self.ripple, self.ripple_count = draw.ripple, draw.ripple_count
-        self.bias, self.no_load_current = draw.encoder_bias, float(draw.no_load_current)
+        self.stiffness, self.emf = STIFFNESS * parameters.stiffness, BACK_EMF * parameters.damping
+        self.constant = self._stall / STALL_CURRENT * parameters.torque  # Nm/A, cold
+        self.no_load_speed = self._fast * parameters.speed
+        self.efficiency, self.coulomb = parameters.efficiency, parameters.coulomb_friction * self._stall
+        self.ripple, self.ripple_count = parameters.ripple, parameters.ripple_count
+        self.bias, self.no_load_current = parameters.encoder_bias, float(parameters.no_load_current)
         self._loss = 1.0 - self.efficiency
-        self.thermal = float(draw.thermal)
+        self.thermal = float(parameters.thermal)
         self._feel_heat()
-        self.delay = np.maximum(float(draw.latency) - EXCHANGE_COMMAND, 0.0) + draw.latency_spread
+        self.delay = np.maximum(float(parameters.latency) - EXCHANGE_COMMAND, 0.0) + parameters.latency_spread
 
-    def order(self, time: float, motors: Motors) -> None:
+    def order(self, time: float, motors: MotorCommands) -> None:
         """A command that the palm board has received at `time`; the joints' boards get it later."""
         there = time + self.delay - 1e-9
         self._queue.append((there, np.array([getattr(motors, name) for name in _FIELDS], float)))

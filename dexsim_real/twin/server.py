@@ -14,18 +14,18 @@ from typing import Any
 from dexsim.core.config import to_dict
 from dexsim.hand.kinematics import Hand
 from dexsim_real.twin.options import TwinArguments
-from dexsim_real.twin.types import Plant
-from dexsim_real.twin.wire.check import CommandCheck
+from dexsim_real.twin.plant.protocol import Plant
+from dexsim_real.twin.wire.command_check import CommandCheck
+from dexsim_real.twin.wire.emulated_sensors import EmulatedCamera, EmulatedImu
 from dexsim_real.twin.wire.faults import Injector
 from dexsim_real.twin.wire.firmware import Firmware
 from dexsim_real.twin.wire.line import HandLine
-from dexsim_real.twin.wire.object_side import ImuSide, MaskSide
 from dexsim_real.twin.wire.terminal import Terminal
 
 _EVENTS = 20_000  # kept for the report
 
 
-class World:
+class PlantClock:
     """The plant beside the wall clock.
 
     Args:
@@ -78,7 +78,7 @@ class World:
         """How well it kept up."""
         return {
             "simulated_s": round(self.simulated, 3),
-            "let_go_s": round(self.let_go, 3),
+            "slipped_s": round(self.let_go, 3),
             "cpu_per_simulated_s": round(self.spent / self.simulated, 4) if self.simulated else 0.0,
         }
 
@@ -107,7 +107,7 @@ class Twin:
         self.arguments, self.plant, self._show = arguments, plant, show
         self.events: deque[tuple[float, str]] = deque(maxlen=_EVENTS)
         self.start, seed = time.monotonic(), arguments.seed
-        self.world = World(plant, self.start, self.note)
+        self.world = PlantClock(plant, self.start, self.note)
         self.firmware = Firmware(plant, arguments.firmware, self.note)
         self.injector = Injector(arguments.faults, seed)
         self.check = CommandCheck(hand.joint_lower, hand.joint_upper, arguments.limits)
@@ -122,15 +122,15 @@ class Twin:
             catch_up=self.world.catch_up,
             note=self.note,
         )
-        self.imu: ImuSide | None = None
-        self.masks: MaskSide | None = None
+        self.imu: EmulatedImu | None = None
+        self.masks: EmulatedCamera | None = None
         try:
             if arguments.task == "rotate":
-                self.imu = ImuSide(
+                self.imu = EmulatedImu(
                     arguments.imu_link or folder / "imu", plant, arguments.object, seed=seed, start=self.start
                 )
             if arguments.task == "grasp" or arguments.mask_socket:
-                self.masks = MaskSide(
+                self.masks = EmulatedCamera(
                     arguments.mask_socket or folder / "masks", plant, arguments.object, seed=seed, start=self.start
                 )
         except BaseException:
@@ -159,7 +159,7 @@ class Twin:
                     side.serve(now)
             if free > self.world.cost or now > self.world.due + 0.01:
                 if now >= self.world.due:
-                    self.world.catch_up(now, World.SLICE)
+                    self.world.catch_up(now, PlantClock.SLICE)
                 until = min(self.world.due, *(side.due for side in sides))
             else:
                 until = now + free

@@ -1,4 +1,4 @@
-"""What the terminal shows of a run: a table that renews itself, or a line now and then."""
+"""The status of a run on the terminal: a live table, or a line every few seconds when the output is no terminal."""
 
 import threading
 from collections import deque
@@ -11,14 +11,16 @@ from rich.table import Table
 
 from dexsim_real.core.process import lower_priority
 
-_LIVE, _LINES = 0.25, 5.0  # s between two pictures on a terminal, and between two lines elsewhere
+_LIVE, _LINES = 0.25, 5.0  # s between two updates of the table, and between two lines
 
 
-class View:
-    """Shows `status()` from a thread of its own; a context manager.
+class StatusView:
+    """Shows `status()` from a background thread. A context manager.
 
     Args:
-      status: gives name to text, in order; called from the view's thread.
+      title: of the table.
+      status: returns the rows of the table, name to text; called from the background thread.
+      quiet: show nothing.
     """
 
     def __init__(self, title: str, status: Callable[[], dict[str, str]], quiet: bool = False):
@@ -33,7 +35,7 @@ class View:
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="view", daemon=True)
 
-    def __enter__(self) -> "View":
+    def __enter__(self) -> "StatusView":
         if self._live:
             self._live.start()
         self._thread.start()
@@ -46,7 +48,7 @@ class View:
             self._live.stop()
 
     def note(self, text: str) -> None:
-        """A line that stays. While the view runs its thread prints it: the caller never waits for a terminal."""
+        """Print a line. While the view runs, its thread does, so the caller never waits for a terminal."""
         self._notes.append(text)
         if not self._thread.is_alive():
             self._print_notes()
@@ -76,7 +78,7 @@ class View:
 
 
 def summary_table(title: str, summary: dict[str, Any]) -> Table:
-    """Nested results as a table."""
+    """A table of nested results."""
     table = Table("measure", "value", title=title, title_justify="left")
     for name, value in summary.items():
         if isinstance(value, dict):

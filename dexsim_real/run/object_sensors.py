@@ -1,4 +1,4 @@
-"""What knows of the object on hardware: a camera for its height, an IMU for its orientation."""
+"""Sensors of the object on hardware: a camera for its height, an IMU for its orientation."""
 
 import numpy as np
 
@@ -11,10 +11,10 @@ from dexsim_real.sensors.readings import ObjectEstimate
 
 
 class ObjectSensors:
-    """Camera and IMU as far as the policy needs them; the rest is taken as fixed.
+    """Camera and IMU of a run; a coordinate that neither measures is taken as fixed.
 
     Raises:
-      HandError: the policy needs one that is not given.
+      HandError: the policy needs a sensor that is not given, or a sensor cannot be opened.
     """
 
     def __init__(self, arguments: RunArguments, controller: Controller):
@@ -23,9 +23,9 @@ class ObjectSensors:
         self._camera: HeightSensor | None = None
         self._imu: Imu | None = None
         if "imu" in needed and not arguments.imu:
-            raise HandError("the policy observes the object's orientation: give the IMU's port with --imu")
+            raise HandError("the policy observes the object's orientation; give the IMU's port with --imu")
         if "camera" in needed and not (arguments.camera or arguments.fixed_object):
-            raise HandError("the policy observes the object's height: give --camera, or --fixed-object")
+            raise HandError("the policy observes the object's height; give --camera, or --fixed-object to assume it")
         try:
             if arguments.camera:
                 self._camera = HeightSensor(
@@ -43,7 +43,7 @@ class ObjectSensors:
             raise
 
     def ready(self) -> bool:
-        """Whether the object is in sight; then it is taken to lie squarely, its heading zero."""
+        """Whether the camera sees the object; if so, its current orientation becomes the identity."""
         if self._camera and not self._camera.seen:
             return False
         if self._imu:
@@ -51,7 +51,7 @@ class ObjectSensors:
         return True
 
     def read(self, now: float) -> tuple[ObjectEstimate, float, float]:
-        """The estimate, the age s of its oldest part, and the time of the newest orientation."""
+        """The estimate, the age in s of its oldest measurement, and the time in s of the newest orientation."""
         position, velocity, quat, when, oldest = self._reference, np.zeros(3), IDENTITY, now, now
         if self._camera:
             seen, position, velocity = self._camera.read()

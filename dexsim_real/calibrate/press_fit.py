@@ -1,12 +1,12 @@
-"""From recorded presses to a calibration: forces and lever arms by taxel, robust lines by joint.
+"""Fits a calibration to recorded presses: forces and lever arms of the taxels, one robust line per joint and direction.
 
-The torque that the simulation would show is computed from the same recording: every taxel's force times its lever
-arm at the measured angles, J^T f with the kinematics that both worlds share. So it does not matter where exactly on
-the fingertip was pressed.
+The torque that the simulation would report is computed from the same recording: the force of every taxel times its
+lever arm at the measured joint angles (J^T f, with the kinematics of the simulation). The exact place of the contact on
+the fingertip does not matter.
 
-Friction makes two lines of a joint's current, and which of them holds is for the joint's own motion to say: while a
-finger presses harder, one of its joints may well give way. Samples of joints at rest, where friction could have any
-size, are left out.
+Because of friction a joint has two lines of current against torque. The motion of the joint decides which one applies:
+while a finger presses harder, one of its joints may move back. Samples of resting joints are excluded, since their
+friction can have any size.
 """
 
 import dataclasses
@@ -25,51 +25,56 @@ from dexsim.calibration.press import MIN_LEVER
 from dexsim.calibration.sensor import FingerFit, fit_finger
 from dexsim.core.errors import CalibrationError, DexsimError
 from dexsim.hand.kinematics import Hand, forward_kinematics, taxel_normals, taxel_positions
-from dexsim_real.calibrate.check import dead_taxels, fill_dead, taxel_names
-from dexsim_real.calibrate.press import LOADING, RELEASED, UNLOADING
-from dexsim_real.calibrate.read import Recording, Session
+from dexsim_real.calibrate.press_procedure import LOADING, RELEASED, UNLOADING
+from dexsim_real.calibrate.read import PressSession, Recording
+from dexsim_real.calibrate.taxel_check import dead_taxels, fill_dead, taxel_names
 
-_BLOCK = 0.25  # s that make one sample: counts are coarse, and a mean of many is not
-_ACTIVE = 2.0  # counts from which on a taxel takes part
-_STILL = 0.25  # of the usual speed, below which a joint is at rest
-_NOISE = 4.0  # standard deviations of a block's angle, the same
-_TOP, _TOP_BLOCKS = 0.97, 4  # share of the largest current, and for how long, that make it the motor's limit
-_READINGS = 8  # of the gauge that a fingertip needs
-_SHEAR = 0.1  # of the force, from which on a note is due
+_BLOCK = 0.25  # s averaged into one block, since counts are coarse
+_ACTIVE = 2.0  # counts above which a taxel takes part
+_STILL = 0.25  # share of the usual speed below which a joint is at rest
+_NOISE = 4.0  # standard deviations of the speed noise below which a joint is at rest
+_TOP, _TOP_BLOCKS = 0.97, 4  # a current in this share of its maximum for this many blocks is at the motor's limit
+_READINGS = 8  # gauge readings that a fingertip needs
+_SHEAR = 0.1  # share of the force above which shear is noted
 
 
 @dataclasses.dataclass(frozen=True)
 class Blocks:
-    """A press in means over a quarter of a second, B of them."""
+    """A press averaged over B blocks of a quarter of a second."""
 
-    counts: np.ndarray  # [B, N] of the taxels that take part, others 0
+    counts: np.ndarray  # [B, N] of the taxels that take part, 0 of the others
     current: np.ndarray  # [B, J] A
     position: np.ndarray  # [B, J] rad
     speed: np.ndarray  # [B, J] rad/s
-    shear: np.ndarray  # [B, 2] counts, by the taxels' own axes
-    run: np.ndarray  # [B] number of the way up or down that it belongs to
+    shear: np.ndarray  # [B, 2] counts, along the taxels' x and y
+    run: np.ndarray  # [B] number of the loading or unloading phase
 
 
 @dataclasses.dataclass(frozen=True)
 class Fit:
-    """A calibration, what it was fitted to, and how the taxels compare with the gauge."""
+    """A calibration, the data that it was fitted to, and the comparison of the taxels with the gauge."""
 
     calibration: Calibration
     real: dict[str, Press]
     sim: dict[str, Press]
-    source: dict[str, str]  # joint to press
-    sensors: dict[str, FingerFit]  # by finger: counts as a run sees them against newtons
+    source: dict[str, str]  # press that each joint was fitted to
+    sensors: dict[str, FingerFit]  # by finger: counts as in a run against newtons
 
 
-def fit(session: Session, hand: Hand, created: str | None = None) -> Fit:
-    """Fit everything that was recorded.
+def fit(session: PressSession, hand: Hand, created: str | None = None) -> Fit:
+    """Fit a calibration to all recorded presses.
+
+    Args:
+      session: the presses.
+      hand: model of the hand.
+      created: date for the calibration; None is now.
 
     Raises:
-      CalibrationError: what is missing, or cannot be a press.
+      CalibrationError: recordings are missing or unusable.
     """
     pressed = [r for r in session.recordings.values() if len(r.samples(LOADING, UNLOADING))]
     if not pressed:
-        raise CalibrationError("no press was recorded: begin again")
+        raise CalibrationError("no press was recorded; record again")
     per_count, newtons, sensors, notes = _gauges(session, hand, pressed)
     real, sim, source, reach = {}, {}, {}, {}
     for recording in pressed:
@@ -81,7 +86,7 @@ def fit(session: Session, hand: Hand, created: str | None = None) -> Fit:
         torque = taxel_torque(hand, blocks.position, recording.finger, blocks.counts * gain)
         high = force > 0.5 * force.max()
         lever = torque[high].sum(0) / force[high].sum()
-        # What the gauge adds to the taxels' sum lies where they do.
+        # The force that the gauge adds to the taxels' sum acts at the same place.
         torque += offset * lever
         for joint in recording.joints:
             label = hand.joint_names[joint]
@@ -91,7 +96,7 @@ def fit(session: Session, hand: Hand, created: str | None = None) -> Fit:
             way[_at_limit(blocks.current[:, joint], blocks.run)] = 0
             if max(np.sum(way > 0), np.sum(way < 0)) < MIN_SAMPLES:
                 notes.append(
-                    f"{label}: hardly moved while the {recording.name} was pressed, friction held it: press "
+                    f"{label}: hardly moved while the {recording.name} was pressed, held by friction; press "
                     "on something softer, or more often"
                 )
                 continue
@@ -113,13 +118,21 @@ def fit(session: Session, hand: Hand, created: str | None = None) -> Fit:
     except CalibrationError as error:
         raise CalibrationError("; ".join([str(error), *(note for note in notes if "hardly moved" in note)])) from None
     notes += _zero_note(session, hand)
-    # What a gauge has measured is no longer unknown.
+    # With a gauge the absolute scale is known.
     kept = tuple(note for note in result.notes if not (sensors and note.startswith("only the ratio")))
     return Fit(dataclasses.replace(result, notes=(*kept, *notes)), real, sim, source, sensors)
 
 
 def make_blocks(recording: Recording, grid: tuple[int, int]) -> Blocks:
-    """Means over blocks of time within a phase; what is left over at a phase's end is not used."""
+    """Average a recording over blocks of time. An incomplete block at the end of a phase is dropped.
+
+    Args:
+      recording: of a press.
+      grid: columns and rows of the taxels.
+
+    Raises:
+      CalibrationError: no phase is long enough.
+    """
     size = max(round(_BLOCK * recording.rate), 1)
     phase = np.array(recording.phase)
     runs = [
@@ -127,11 +140,13 @@ def make_blocks(recording: Recording, grid: tuple[int, int]) -> Blocks:
         for first, last in _runs(phase)
         if phase[first] in (LOADING, UNLOADING)
     ]
-    runs = [np.array(run) for run in runs if len(run) > 1]  # One block has no speed.
+    runs = [np.array(run) for run in runs if len(run) > 1]  # A single block has no speed.
     if not runs:
-        raise CalibrationError(f"{recording.name}: no press lasted for {2 * _BLOCK:g} s: press more slowly")
+        raise CalibrationError(
+            f"{recording.name}: no press lasted {2 * _BLOCK:g} s; press more slowly (--press.seconds)"
+        )
     time, angle = np.array(recording.time), np.array(recording.position)
-    # Not across a turn: there friction is on its way from one side to the other.
+    # Not across a reversal, where friction changes its sign.
     speed = np.concatenate([np.gradient(angle[run].mean(1), time[run].mean(1), axis=0) for run in runs])
     rows = np.concatenate(runs)
     position = angle[rows].mean(1)
@@ -149,10 +164,10 @@ def make_blocks(recording: Recording, grid: tuple[int, int]) -> Blocks:
 
 
 def taxel_torque(hand: Hand, position: np.ndarray, finger: int, force: np.ndarray) -> np.ndarray:
-    """Joint torques [T, J] Nm that hold taxel forces [T, N] N at angles [T, J] rad: J^T f.
+    """Joint torques [T, J] Nm that balance taxel forces [T, N] N at joint angles [T, J] rad: J^T f.
 
-    All forces of a fingertip point the same way, along their mean normal: the skin lies flat on what it is pressed
-    against, and a fingertip's force is the sum over its taxels, as in simulation.
+    All forces of a fingertip act along their mean normal: the skin is flat where it is pressed, and the force of a
+    fingertip is the sum over its taxels, as in simulation.
     """
     rows = [
         _torque(hand, np.int32(finger), np.float32(at), np.float32(push))
@@ -169,7 +184,7 @@ def _torque(hand: Hand, finger: jax.Array, at: jax.Array, force: jax.Array) -> j
 
 
 def _direction(speed: np.ndarray, recording: Recording, joint: int) -> np.ndarray:
-    """Way [B] in which a joint moves: 1, -1, or 0 where it rests."""
+    """Direction [B] of motion of a joint: 1, -1, or 0 at rest."""
     position = np.array(recording.position)[:, joint]
     jitter = np.median(np.abs(np.diff(position))) / 0.6745 / np.sqrt(2)
     noise = jitter / np.sqrt(max(_BLOCK * recording.rate, 1)) / (np.sqrt(2) * _BLOCK)
@@ -178,7 +193,7 @@ def _direction(speed: np.ndarray, recording: Recording, joint: int) -> np.ndarra
 
 
 def _at_limit(current: np.ndarray, run: np.ndarray) -> np.ndarray:
-    """Whether [B] the motor gives all that it may: its current stays at the top of a press."""
+    """Mask [B] of blocks in which the motor is at its current limit: its current stays at the maximum of the press."""
     found = np.zeros(len(current), bool)
     for number in np.unique(run):
         here = np.flatnonzero(run == number)
@@ -189,7 +204,7 @@ def _at_limit(current: np.ndarray, run: np.ndarray) -> np.ndarray:
 
 
 def _runs(phase: np.ndarray) -> list[tuple[int, int]]:
-    """First and last + 1 of each stretch of one phase."""
+    """First index and last + 1 of each run of equal phases."""
     cuts = np.flatnonzero(phase[1:] != phase[:-1]) + 1
     return list(zip([0, *cuts], [*cuts, len(phase)], strict=True))
 
@@ -198,11 +213,13 @@ def _runs(phase: np.ndarray) -> list[tuple[int, int]]:
 
 
 def _gauges(
-    session: Session, hand: Hand, pressed: list[Recording]
+    session: PressSession, hand: Hand, pressed: list[Recording]
 ) -> tuple[np.ndarray, dict[str, Any], dict, list[str]]:
-    """Newtons per count [F] for a run; newtons = gain counts + offset by press, for the joints; fits; notes.
+    """Compare the taxels with the gauge.
 
-    For the joints a press goes by its own comparison, or by that of the finger's other press.
+    Returns:
+      Newtons per count [F] for a run; gain and offset (newtons = gain * counts + offset) by press, for the joints; fits
+      by finger; notes. A press without readings uses those of the finger's other press.
     """
     per_count = np.full(hand.num_fingers, session.hardware.force_per_count)
     newtons, fits, notes = {}, {}, []
@@ -210,9 +227,7 @@ def _gauges(
         levels = [level for level in recording.gauge if len(recording.samples(level))]
         if len(levels) < _READINGS:
             if levels:
-                notes.append(
-                    f"{recording.name}: {len(levels)} readings of the gauge do not count, {_READINGS} are needed"
-                )
+                notes.append(f"{recording.name}: {len(levels)} gauge readings are ignored, {_READINGS} are needed")
             continue
         name, gauge = hand.finger_names[recording.finger], np.array([recording.gauge[k] for k in levels])
         every = np.array(recording.counts)
@@ -223,7 +238,7 @@ def _gauges(
         newtons[recording.name] = 1.0 / whole.gain.value, -whole.offset.value / whole.gain.value
         notes.append(
             f"{recording.name}: {found.gain} counts per newton by the gauge ({found.samples} readings), "
-            f"{found.offset} counts at none"
+            f"{found.offset} counts at zero force"
         )
         if name not in fits:
             fits[name], per_count[recording.finger] = found, 1.0 / found.gain.value
@@ -234,7 +249,7 @@ def _gauges(
             np.mean([1.0 / found.gain.value for found in fits.values()]),
         )
         notes += [
-            f"{name}: not compared with the gauge, mean of the other fingers"
+            f"{name}: not compared with the gauge; has the mean of the other fingers"
             for name in hand.finger_names
             if name not in fits
         ]
@@ -249,34 +264,36 @@ def _against(gauge: np.ndarray, counts: np.ndarray, name: str) -> FingerFit:
         raise CalibrationError(f"{name}, gauge: {error}") from None
 
 
-def _press_notes(session: Session, hand: Hand, recording: Recording, blocks: Blocks, dead: np.ndarray) -> list[str]:
-    """Dead taxels, shear and drift of one press."""
+def _press_notes(
+    session: PressSession, hand: Hand, recording: Recording, blocks: Blocks, dead: np.ndarray
+) -> list[str]:
+    """Notes on dead taxels, shear and drift of one press."""
     notes, finger = [], hand.finger_names[recording.finger]
     if dead.any():
         notes.append(
-            f"{finger}: dead: {taxel_names(hand, dead)}: nothing where those around were pressed; here "
-            "their mean stands in for it, a run does without"
+            f"{finger}: dead: {taxel_names(hand, dead)} read nothing while their neighbours were pressed; the fit "
+            "uses the mean of the neighbours, a run reads zero"
         )
     sums = blocks.counts.sum(-1)
     high = sums > 0.5 * sums.max()
     share = float(np.median(np.linalg.norm(blocks.shear[high], axis=-1) / sums[high]))
     if share > _SHEAR:
         notes.append(
-            f"{recording.name}: shear of {100 * share:.0f} % of the force by the taxels' x and y: it loads "
-            "the joints and is not in their lines; press on something that slides, rolls or is soft"
+            f"{recording.name}: shear of {100 * share:.0f} % of the force by the taxels' x and y, which the fit "
+            "ignores; press on something that slides, rolls or is soft"
         )
     left = np.array(recording.counts)[recording.samples(RELEASED)].sum(-1)
     if len(left) and np.median(left) > session.check.release:
-        notes.append(f"{recording.name}: {np.median(left):.0f} counts are left after the press: the zero drifts")
+        notes.append(f"{recording.name}: {np.median(left):.0f} counts remain after the press: the zero drifts")
     return notes
 
 
-def _zero_note(session: Session, hand: Hand) -> list[str]:
+def _zero_note(session: PressSession, hand: Hand) -> list[str]:
     if not len(session.rest_current):
         return []
     zero = session.rest_current.mean(0)
     worst = int(np.abs(zero).argmax())
     return [
-        f"motors off, the currents read up to {1e3 * abs(zero[worst]):.0f} mA ({hand.joint_names[worst]}): that "
-        "much of the offsets is the reading's zero error"
+        f"with the motors off the currents read up to {1e3 * abs(zero[worst]):.0f} mA ({hand.joint_names[worst]}): "
+        "this zero error of the sensor is part of the offsets"
     ]

@@ -18,15 +18,15 @@ import numpy as np
 from dexsim.core.config import setting, validate
 from dexsim_real.core.errors import HandError
 from dexsim_real.sensors.camera import CameraConfig, encode_mask
-from dexsim_real.twin.plant.shapes import Part
-from dexsim_real.twin.types import Plant
+from dexsim_real.twin.plant.protocol import Plant
+from dexsim_real.twin.plant.shapes import Primitive
 from dexsim_real.twin.wire.terminal import Terminal
 
 _STANDARD_GRAVITY = 9.80665  # m/s^2, what a part means by 1 g
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class ObjectConfig:
+class ObjectSensorConfig:
     """IMU and camera, as far as they are the same in every trial."""
 
     imu_rate: float = setting(100.0, unit="Hz", low=1.0, high=1000.0)
@@ -79,7 +79,7 @@ def rvc_frame(index: int, rotation: np.ndarray, acceleration: np.ndarray) -> byt
     return b"\xaa\xaa" + body + bytes([sum(body) % 256])
 
 
-class ImuSide(Clocked):
+class EmulatedImu(Clocked):
     """The part's wire.
 
     Args:
@@ -87,7 +87,7 @@ class ImuSide(Clocked):
       start: s, time of its first sample.
     """
 
-    def __init__(self, link: Path, plant: Plant, config: ObjectConfig, *, seed: int, start: float):
+    def __init__(self, link: Path, plant: Plant, config: ObjectSensorConfig, *, seed: int, start: float):
         super().__init__(config.imu_rate, start)
         self.terminal, self.sent = Terminal(link), 0
         self._plant, self._mount = plant, _matrix(np.asarray(config.imu_mount))
@@ -129,7 +129,7 @@ def _level(up: np.ndarray) -> np.ndarray:
 # --- camera --------------------------------------------------------------------------------------
 
 
-def outline(part: Part) -> np.ndarray:
+def outline(part: Primitive) -> np.ndarray:
     """Points [N, 3] m of a primitive, in the object's frame, whose hull looks like it."""
     round_ = np.linspace(0, 2 * np.pi, 24, endpoint=False)
     ring = np.stack([np.cos(round_), np.sin(round_), 0 * round_], 1)
@@ -181,7 +181,7 @@ def _fill(mask: np.ndarray, pixels: np.ndarray, sides: np.ndarray) -> None:
     mask[low[1] : high[1], low[0] : high[0]] |= inside
 
 
-class MaskSide(Clocked):
+class EmulatedCamera(Clocked):
     """The program that sends masks.
 
     Args:
@@ -191,12 +191,14 @@ class MaskSide(Clocked):
 
     _ROOM = 4  # records that may wait for a slow reader
 
-    def __init__(self, path: Path, plant: Plant, config: ObjectConfig, *, seed: int, start: float):
+    def __init__(self, path: Path, plant: Plant, config: ObjectSensorConfig, *, seed: int, start: float):
         super().__init__(config.camera_rate, start)
         self.path, self.counts = path, Counter()
         self._plant, self._config = plant, config
         self._rng = np.random.default_rng(seed)
-        silhouette([outline(Part("sphere", (0.03,)))], config.optics, config.picture)  # Imports what it needs: now.
+        silhouette(
+            [outline(Primitive("sphere", (0.03,)))], config.optics, config.picture
+        )  # Imports what it needs: now.
         self._clients: dict[socket.socket, bytearray] = {}
         self._server = socket.socket(socket.AF_UNIX)
         try:

@@ -9,11 +9,11 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from dexsim_real.twin.plant.shapes import Shape
+from dexsim_real.twin.plant.shapes import ObjectShape
 
 
 @dataclasses.dataclass(frozen=True)
-class Motors:
+class MotorCommands:
     """What the palm board has been told; one entry a joint, in the wire's order and units."""
 
     position: np.ndarray  # [12] rad
@@ -25,7 +25,7 @@ class Motors:
 
 
 @dataclasses.dataclass(frozen=True)
-class Measurement:
+class PlantMeasurement:
     """What the hand's own sensors show at an instant, before the wire's quantisation."""
 
     time: float  # s since the plant began
@@ -44,12 +44,12 @@ class Plant(Protocol):
 
     trial: int
     """Number of the trial under way."""
-    shape: Shape
+    shape: ObjectShape
     """The object of this trial."""
     up: np.ndarray
     """[3] the vertical in the palm's frame."""
 
-    def drive(self, motors: Motors) -> None:
+    def drive(self, motors: MotorCommands) -> None:
         """New commands, effective from now."""
         ...
 
@@ -57,7 +57,7 @@ class Plant(Protocol):
         """Let this much time pass."""
         ...
 
-    def measure(self) -> Measurement: ...
+    def measure(self) -> PlantMeasurement: ...
 
     def measure_object(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Place [3] m as a camera has it, orientation [4] and acceleration [3] m/s^2 as an IMU in the object does:

@@ -10,14 +10,14 @@ taxel's own axes. Then come the array's faults: crosstalk, gains, zero errors, n
 import numpy as np
 
 from dexsim.hand.kinematics import Hand
-from dexsim_real.twin.plant.draw import Draw
-from dexsim_real.twin.plant.shapes import Shape
+from dexsim_real.twin.plant.parameters import TrialParameters
+from dexsim_real.twin.plant.shapes import ObjectShape
 
 _FULLY, _NOT_AT_ALL = 0.004, 0.008  # m along the skin from a contact to the nearest taxel: felt within, not beyond
 _LEFT = 0.15  # share of the rubber that no load squeezes away
 
 
-class Skin:
+class TaxelArray:
     """The taxels of five fingertips; F fingers, N taxels."""
 
     def __init__(self, hand: Hand):
@@ -25,18 +25,20 @@ class Skin:
         self._normal, self._grid = hand.taxel_normal.astype(float), hand.taxel_grid
         self._axes = _axes(self._place, hand.taxel_normal.astype(float), hand.taxel_grid)
 
-    def configure(self, draw: Draw, rng: np.random.Generator) -> None:
+    def configure(self, parameters: TrialParameters, rng: np.random.Generator) -> None:
         """Take a trial's parameters and array."""
         shape = self._area.shape
-        self.thickness = float(draw.rubber)
-        self._gain = draw.taxel_gain[:, None] * np.maximum(1 + draw.taxel_spread * rng.standard_normal(shape), 0.1)
-        self._bias = draw.taxel_bias * rng.standard_normal(shape)
-        self._noise, self._threshold = float(draw.taxel_noise), float(draw.taxel_threshold)
-        self._crosstalk = float(draw.taxel_crosstalk)
+        self.thickness = float(parameters.rubber)
+        self._gain = parameters.taxel_gain[:, None] * np.maximum(
+            1 + parameters.taxel_spread * rng.standard_normal(shape), 0.1
+        )
+        self._bias = parameters.taxel_bias * rng.standard_normal(shape)
+        self._noise, self._threshold = float(parameters.taxel_noise), float(parameters.taxel_threshold)
+        self._crosstalk = float(parameters.taxel_crosstalk)
 
     def load(
         self,
-        shape: Shape,
+        shape: ObjectShape,
         place: np.ndarray,
         turn: np.ndarray,
         tips: tuple[np.ndarray, np.ndarray],
@@ -82,7 +84,7 @@ class Skin:
         along = ((away - height[:, None] * outward) ** 2).sum(-1)
         return float(np.sqrt((along + np.maximum(np.abs(height) - self.thickness, 0.0) ** 2).min()))
 
-    def _share(self, shape: Shape, points: np.ndarray, area: np.ndarray) -> np.ndarray:
+    def _share(self, shape: ObjectShape, points: np.ndarray, area: np.ndarray) -> np.ndarray:
         """Share [N] of the load on each taxel; zero where the object is out of all taxels' reach."""
         squeeze = np.clip((self.thickness - shape.distance(points)) / self.thickness, 0.0, 1 - _LEFT)
         push = squeeze / (1.0 - squeeze) * area

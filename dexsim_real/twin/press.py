@@ -1,6 +1,6 @@
 """The emulated hand on a bench, with somebody who holds a pen before whichever fingertip comes forward.
 
-    python -m dexsim_real.twin --plant dexsim_real.twin.plant.press --draw outside --seed 3
+    python -m dexsim_real.twin --plant dexsim_real.twin.press --draw outside --seed 3
 
 For `python -m dexsim_real.calibrate`, with the same motors, gears and skin as in the trials; what the calibration
 should find is in the results. The pen lies across the finger on a block of foam, which gives way along its normal
@@ -18,14 +18,14 @@ from dexsim.hand.load import load_hand
 from dexsim_real.calibrate.plan import Placement, placements
 from dexsim_real.twin.options import TwinArguments
 from dexsim_real.twin.plant.assistant import Place, Stage, put
-from dexsim_real.twin.plant.motors import STALL_CURRENT
-from dexsim_real.twin.plant.plant import EmulatedHand
+from dexsim_real.twin.plant.drives import STALL_CURRENT
+from dexsim_real.twin.plant.emulated_hand import EmulatedHand
 from dexsim_real.twin.plant.scene import build_scene
-from dexsim_real.twin.plant.shapes import Part, Shape, matrix
+from dexsim_real.twin.plant.shapes import ObjectShape, Primitive, matrix
 from dexsim_real.wire.frames import Mode
 
 _RADIUS = 0.006  # m
-PEN = Shape("capsule", (Part("capsule", (_RADIUS, 0.020)),))
+PEN = ObjectShape("capsule", (Primitive("capsule", (_RADIUS, 0.020)),))
 _AWAY = np.array([0.4, 0.0, 0.0])
 _MEANT = 0.015  # rad by which targets may lie off a placement's line
 _TURN = 0.5  # Nm/rad by which it keeps the pen as it lies
@@ -77,8 +77,8 @@ class PressBench(EmulatedHand):
 
     def truth(self) -> dict[str, Any]:
         """What a calibration should find: Nm per reported A pressing on and giving way, by joint; gains by finger."""
-        draw, drives = self.draw, self._drives
-        constant = drives.constant / draw.current_gain
+        parameters, drives = self.parameters, self._drives
+        constant = drives.constant / parameters.current_gain
         loss = 1.0 - drives.efficiency
         return {
             "joints": list(self.hand.joint_names),
@@ -86,7 +86,7 @@ class PressBench(EmulatedHand):
             "unloading_nm_per_a": (constant * (1 + loss)).tolist(),
             "friction_nm": np.asarray(drives.coulomb).tolist(),
             "stall_a": STALL_CURRENT,
-            "taxel_gain": draw.taxel_gain.tolist(),
+            "taxel_gain": parameters.taxel_gain.tolist(),
         }
 
     # --- the pen --------------------------------------------------------------------------------
@@ -94,7 +94,7 @@ class PressBench(EmulatedHand):
     def _next_trial(self) -> None:
         super()._next_trial()
         self.shape, self._assistant = PEN, _Holder()
-        self._scene = scene = build_scene(self.hand, self.draw, PEN, self._gravity)
+        self._scene = scene = build_scene(self.hand, self.parameters, PEN, self._gravity)
         joints = self._data.qpos[scene.drive_qpos].copy()
         self._data = mujoco.MjData(scene.model)
         self._data.qpos[scene.drive_qpos] = joints
@@ -109,7 +109,7 @@ class PressBench(EmulatedHand):
     def _tick(self) -> None:
         """The foam holds the pen by springs."""
         scene, data, foam = self._scene, self._data, self._foam
-        at, dof, mass = scene.object_qpos, scene.object_dof, float(self.draw.mass)
+        at, dof, mass = scene.object_qpos, scene.object_dof, float(self.parameters.mass)
         shift, speed = data.qpos[at : at + 3] - self._place.position, data.qvel[dof : dof + 3]
         along = np.outer(self._normal, self._normal)
         across = np.eye(3) - along
@@ -189,5 +189,5 @@ def _facing(normal: np.ndarray, along: np.ndarray) -> np.ndarray:
 
 
 def make_plant(arguments: TwinArguments) -> PressBench:
-    """For `python -m dexsim_real.twin --plant dexsim_real.twin.plant.press`."""
+    """For `python -m dexsim_real.twin --plant dexsim_real.twin.press`."""
     return PressBench(load_hand(), arguments.seed, kind=arguments.draw)

@@ -149,7 +149,7 @@ PUSHES = {"grasp": (0.5, 0.3), "rotate": (1 / 6, 0.1)}
 
 
 @dataclasses.dataclass(frozen=True)
-class Draw:
+class TrialParameters:
     """One trial's hand and object: values by the names in `BANDS`, `TASK_BANDS` and `STRUCTURE`."""
 
     task: str
@@ -172,9 +172,9 @@ def bands(task: str) -> dict[str, Band]:
     return BANDS | TASK_BANDS[task]
 
 
-def draw_trial(
+def sample_trial(
     task: str, rng: np.random.Generator, kind: str = "outside", overrides: dict[str, float | str] | None = None
-) -> Draw:
+) -> TrialParameters:
     """One trial's parameters.
 
     Args:
@@ -200,4 +200,4 @@ def draw_trial(
     value = {name: table[name].draw(rng, kinds.get(name, kind)) for name in sorted(table)}
     value |= {name: np.asarray(number, float) for name, number in STRUCTURE.items()}
     value |= {name: np.full_like(value[name], number) for name, number in given.items() if name not in kinds}
-    return Draw(task, kind, value)
+    return TrialParameters(task, kind, value)
