@@ -1,4 +1,4 @@
-"""`python -m dexsim_real.calibrate --identify`: moves the free joints, and fits the parameters of the drives to the log.
+"""`python -m dexsim_real.calibrate --identify`: moves the free joints and fits the drives' parameters to the log.
 
 Each joint in turn follows `dexsim.identification.excitation`. Commands and answers of every exchange are passed to
 `dexsim.identification.identify`. Without a calibration there are only angles, which determine the ratio of torque to

@@ -78,7 +78,7 @@ class CalibrateArguments:
     levels: int = setting(6, unit="1", low=5, high=30)
     """Number of forces at which the gauge is read, both rising and falling."""
     fingers: tuple[str, ...] = ()
-    """Fingers to press; all by default. Joints that are not pressed get the mean of those with the same torque limit."""
+    """Fingers to press; all by default. The other joints get the mean of those with the same torque limit."""
     sides: bool = True
     """Also press with the sides of thumb and index finger, to load the joints that spread them."""
     yes: bool = False

@@ -64,9 +64,7 @@ def read_logs(paths: Iterable[Path], hand: Hand) -> PressSession:
         if session is None:
             session = found
         elif (found.hardware, found.rate) != (session.hardware, session.rate):
-            raise LogError(
-                f"{path}: recorded with other --hardware options or another --rate than the logs before; fit it alone"
-            )
+            raise LogError(f"{path}: recorded with other --hardware options or another --rate than the logs before")
         else:
             session.recordings.update(found.recordings)
     return session

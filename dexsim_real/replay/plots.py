@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def signals(run: Replay) -> dict[str, np.ndarray]:
-    """Plotted signals, [T, n] each: joint angles and targets (rad), forces (N), command (1), age of the measurement (s)."""
+    """Plotted signals, [T, n] each: joint angles and targets (rad), forces (N), command (1), measurement ages (s)."""
     return {
         "angle": np.array([now.joint_position for now in run.measured]),
         "target": np.array([tick["target"] for tick in run.ticks]),

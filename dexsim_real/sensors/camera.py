@@ -114,7 +114,7 @@ class HeightSensor:
     ):
         if sum(axes) != 1:
             raise HandError(
-                f"the policy observes the object's coordinates {axes}; one camera measures one of them, so use another policy"
+                f"the policy observes the object's coordinates {axes}; one camera measures one: use another policy"
             )
         self._masks, self._config, self._weight = masks, config, weight
         self._reference, self._axis = np.asarray(reference, float), axes.index(True)

@@ -1,10 +1,10 @@
-"""The emulated hand on a bench, with somebody who holds a pen before whichever fingertip comes forward.
+"""The emulated hand on a press bench: an emulated person holds a pen in front of the fingertip that is to press.
 
-    python -m dexsim_real.twin --plant dexsim_real.twin.press --draw outside --seed 3
+    python -m dexsim_real.twin --plant dexsim_real.twin.press --parameters outside --seed 3
 
-For `python -m dexsim_real.calibrate`, with the same motors, gears and skin as in the trials; what the calibration
-should find is in the results. The pen lies across the finger on a block of foam, which gives way along its normal
-and, softer, across it.
+For `python -m dexsim_real.calibrate`, with the drives, gears and taxels of the trials. The results contain the true
+values that the calibration should find. The pen is across the finger on a block of foam, which yields along its normal
+and, more softly, across it.
 """
 
 import dataclasses
@@ -27,32 +27,40 @@ from dexsim_real.wire.frames import Mode
 _RADIUS = 0.006  # m
 PEN = ObjectShape("capsule", (Primitive("capsule", (_RADIUS, 0.020)),))
 _AWAY = np.array([0.4, 0.0, 0.0])
-_MEANT = 0.015  # rad by which targets may lie off a placement's line
-_TURN = 0.5  # Nm/rad by which it keeps the pen as it lies
+_TOLERANCE = 0.015  # rad, largest distance of targets from the path of a placement
+_TURN = 0.5  # Nm/rad, rotational stiffness of the foam
 _RATIO = 0.7  # damping ratio of both springs
 _SOLID = {"mass": 0.1, "inertia_scale": 10.0, "com_offset": 0.0}
 
 
 @dataclasses.dataclass(frozen=True)
 class Foam:
-    """What the fingertips press on."""
+    """The foam that the fingertips press on."""
 
     stiffness: float = 1000.0  # N/m along the normal
     shear: float = 400.0  # N/m across it
-    gap: float = 0.002  # m between fingertip and pen where contact is expected
+    gap: float = 0.002  # m between fingertip and pen at the posture of contact
 
 
 class _Holder:
-    """Stands in for the assistant: the pen is there all the time, held by springs."""
+    """Replaces the assistant: the pen is always there, held by springs."""
 
     stage = Stage.FREE
 
     def begin(self, time: float) -> None:
-        """Nothing to wait for."""
+        """There is nothing to wait for."""
 
 
 class PressBench(EmulatedHand):
-    """An emulated hand with a pen on foam in place of an object; one trial without end."""
+    """An emulated hand with a pen on foam as its object, and one trial without end.
+
+    Args:
+      hand: model of the hand.
+      seed: of all random numbers.
+      kind: "outside", "inside" or "nominal" (`parameters.KINDS`).
+      overrides: fixed parameters (`sample_trial`).
+      foam: its stiffness and place.
+    """
 
     def __init__(
         self,
@@ -66,17 +74,12 @@ class PressBench(EmulatedHand):
         self._plan, self._foam = placements(hand), foam
         super().__init__(hand, "grasp", seed, kind=kind, overrides={**_SOLID, **(overrides or {})})
 
-    @property
-    def tip_force(self) -> float:
-        """N that the foam is pressed with now, as a gauge behind it shows."""
-        return float(max(-self._spring @ self._normal, 0.0))
-
     def results(self) -> list[dict[str, Any]]:
-        """The truth: see `truth`."""
-        return [{"trial": 0, "seed": self.seed, "draw": self.kind, **self.truth()}]
+        """True values of the hand (`truth`)."""
+        return [{"trial": 0, "seed": self.seed, "parameter_kind": self.kind, **self.truth()}]
 
     def truth(self) -> dict[str, Any]:
-        """What a calibration should find: Nm per reported A pressing on and giving way, by joint; gains by finger."""
+        """Values that a calibration should find: Nm per reported A (loading, unloading), taxel gains by finger."""
         parameters, drives = self.parameters, self._drives
         constant = drives.constant / parameters.current_gain
         loss = 1.0 - drives.efficiency
@@ -99,7 +102,7 @@ class PressBench(EmulatedHand):
         self._data = mujoco.MjData(scene.model)
         self._data.qpos[scene.drive_qpos] = joints
         self._probe = mujoco.MjData(scene.model)
-        self._meant: Placement | None = None
+        self._pressing_placement: Placement | None = None
         self._remove()
         mujoco.mj_forward(scene.model, self._data)
         self._past.clear()
@@ -107,7 +110,7 @@ class PressBench(EmulatedHand):
         self._remember()
 
     def _tick(self) -> None:
-        """The foam holds the pen by springs."""
+        """Apply the springs that hold the pen."""
         scene, data, foam = self._scene, self._data, self._foam
         at, dof, mass = scene.object_qpos, scene.object_dof, float(self.parameters.mass)
         shift, speed = data.qpos[at : at + 3] - self._place.position, data.qvel[dof : dof + 3]
@@ -125,32 +128,32 @@ class PressBench(EmulatedHand):
         super()._tick()
 
     def _look(self) -> None:
-        """Whoever holds the pen sees which finger waits for it."""
-        told = self._told
+        """Hold the pen in front of the fingertip that is about to press."""
+        commands = self._commands
         if self._touches:
             return
-        if told is None or not np.all(told.mode == Mode.POSITION):
+        if commands is None or not np.all(commands.mode == Mode.POSITION):
             self._remove()
             return
-        meant = next((p for p in self._plan if self._waits(p, told.position)), self._meant)
-        if meant is not None and meant is not self._meant:
-            self._hold_before(meant)
-        elif self._meant is not None and self._left(told.position):
+        placement = next((p for p in self._plan if self._waits(p, commands.position)), self._pressing_placement)
+        if placement is not None and placement is not self._pressing_placement:
+            self._hold_before(placement)
+        elif self._pressing_placement is not None and self._left(commands.position):
             self._remove()
 
     def _waits(self, placement: Placement, target: np.ndarray) -> bool:
-        """Whether these targets [12] lie on the way to a placement's contact."""
+        """Whether these targets [12] rad are on the path to the contact of a placement."""
         advance = (target - placement.posture) @ placement.direction / (placement.direction @ placement.direction)
         off = np.abs(target - placement.posture - advance * placement.direction).max()
-        return bool(off < _MEANT and -0.7 < advance < -0.03)
+        return bool(off < _TOLERANCE and -0.7 < advance < -0.03)
 
     def _left(self, target: np.ndarray) -> bool:
-        others = np.setdiff1d(np.arange(len(target)), self._meant.joints)
-        return bool(np.abs(target - self._meant.posture)[others].max() > 3 * _MEANT)
+        others = np.setdiff1d(np.arange(len(target)), self._pressing_placement.joints)
+        return bool(np.abs(target - self._pressing_placement.posture)[others].max() > 3 * _TOLERANCE)
 
     def _hold_before(self, placement: Placement) -> None:
-        """Across the finger, at the placement's posture and taxels, less the gap."""
-        self._meant, probe, model = placement, self._probe, self._scene.model
+        """Place the pen across the finger at the taxels of a placement, with the gap."""
+        self._pressing_placement, probe, model = placement, self._probe, self._scene.model
         probe.qpos[self._scene.drive_qpos] = placement.posture
         mujoco.mj_kinematics(model, probe)
         body = self._scene.tip_body[placement.finger]
@@ -171,7 +174,7 @@ class PressBench(EmulatedHand):
         self._put(point + (_RADIUS + far - gap + self._foam.gap) * self._normal, quat)
 
     def _remove(self) -> None:
-        self._meant, self._normal = None, np.array([0.0, 0.0, 1.0])
+        self._pressing_placement, self._normal = None, np.array([0.0, 0.0, 1.0])
         self._put(_AWAY, np.array([1.0, 0.0, 0.0, 0.0]))
 
     def _put(self, position: np.ndarray, quat: np.ndarray) -> None:
@@ -180,7 +183,7 @@ class PressBench(EmulatedHand):
 
 
 def _facing(normal: np.ndarray, along: np.ndarray) -> np.ndarray:
-    """Orientation [4] whose x looks along the normal and whose z lies across the finger."""
+    """Orientation [4] with x along the normal and z across the finger."""
     y = along - along @ normal * normal
     y /= np.linalg.norm(y)
     quat = np.empty(4)
@@ -189,5 +192,5 @@ def _facing(normal: np.ndarray, along: np.ndarray) -> np.ndarray:
 
 
 def make_plant(arguments: TwinArguments) -> PressBench:
-    """For `python -m dexsim_real.twin --plant dexsim_real.twin.press`."""
-    return PressBench(load_hand(), arguments.seed, kind=arguments.draw)
+    """The plant of `python -m dexsim_real.twin --plant dexsim_real.twin.press`."""
+    return PressBench(load_hand(), arguments.seed, kind=arguments.parameters)

@@ -1,7 +1,7 @@
-"""The emulated hand at work: one thread that serves wire, IMU and camera, and brings the physics along.
+"""Runs an emulated hand in real time: one thread serves the hand's port, IMU and camera, and advances the physics.
 
-Whatever is due on the wire comes first. Physics goes in slices of a millisecond between, and follows the wall
-clock; a machine too slow for that lets time go, and says so.
+The port has priority. In between, the physics advances in slices of a millisecond and follows the wall clock. On a slow
+machine simulated time slips; the slip is reported.
 """
 
 import select
@@ -26,33 +26,34 @@ _EVENTS = 20_000  # kept for the report
 
 
 class PlantClock:
-    """The plant beside the wall clock.
+    """Keeps the time of a plant at the wall clock.
 
     Args:
-      start: s, the wall clock's time at which the plant's begins; `now` is where it has come to.
-      note: called with one line when time is let go.
+      plant: the physics.
+      start: s, wall clock at the start of the plant; `now` is its current time.
+      note: called with one line when simulated time slips.
     """
 
-    SLICE = 0.001  # s, simulated in one go
-    BEHIND = 0.1  # s, beyond which time is let go
+    SLICE = 0.001  # s, simulated at once
+    MAX_LAG = 0.1  # s behind the wall clock above which simulated time slips
 
     def __init__(self, plant: Plant, start: float, note: Callable[[str], None] = lambda text: None):
         self.plant, self.now, self._note = plant, start, note
-        self.let_go, self.simulated, self.spent = 0.0, 0.0, 0.0  # s
-        self.cost = 0.0  # s, what a slice takes
-        self._told = -1e9
+        self.slipped, self.simulated, self.spent = 0.0, 0.0, 0.0  # s
+        self.cost = 0.0  # s, computing time of a slice
+        self._noted_at = -1e9
 
     @property
     def due(self) -> float:
-        """When the next slice may be computed."""
+        """Time s from which the next slice may be computed."""
         return self.now + self.SLICE
 
-    def catch_up(self, now: float, most: float = 0.01) -> None:
-        """Bring the plant to this time, or nearer by `most` s."""
-        behind = now - self.now
-        if behind > self.BEHIND:
-            self._let_go(now, behind - most)
-        step = min(now - self.now, most)
+    def catch_up(self, now: float, limit: float = 0.01) -> None:
+        """Advance the plant to a time in s, by at most `limit` s."""
+        lag = now - self.now
+        if lag > self.MAX_LAG:
+            self._slip(now, lag - limit)
+        step = min(now - self.now, limit)
         if step <= 0:
             return
         begun = time.monotonic()
@@ -63,38 +64,41 @@ class PlantClock:
         self.spent += took
         self.cost += 0.05 * (took * self.SLICE / max(step, 1e-4) - self.cost)
 
-    def _let_go(self, now: float, seconds: float) -> None:
+    def _slip(self, now: float, seconds: float) -> None:
         self.now += seconds
-        self.let_go += seconds
-        if now > self._told + 5.0:
-            self._told = now
+        self.slipped += seconds
+        if now > self._noted_at + 5.0:
+            self._noted_at = now
             share = self.spent / self.simulated if self.simulated else 0.0
             self._note(
-                f"this machine is too slow: {self.let_go:.2f} s of the physics let go so far "
-                f"(a second of it takes {share:.2f} s)"
+                f"this machine is too slow: simulated time slipped by {self.slipped:.2f} s so far "
+                f"(a simulated second takes {share:.2f} s); close other programs"
             )
 
     def report(self) -> dict[str, float]:
-        """How well it kept up."""
+        """Simulated time, slip and computing time; JSON-able."""
         return {
             "simulated_s": round(self.simulated, 3),
-            "slipped_s": round(self.let_go, 3),
+            "slipped_s": round(self.slipped, 3),
             "cpu_per_simulated_s": round(self.spent / self.simulated, 4) if self.simulated else 0.0,
         }
 
 
 class Twin:
-    """Everything of one emulated hand.
+    """An emulated hand with its ports.
 
     Args:
-      folder: for the ports that have no name of their own.
-      show: called with each event's line.
+      arguments: options of the command.
+      hand: model of the hand.
+      plant: the physics.
+      folder: for ports that the options do not name.
+      show: called with one line for every event.
 
     Raises:
-      HandError: a port or socket cannot be made.
+      HandError: a port or socket cannot be created.
     """
 
-    HICCUP = 0.02  # s, the bridge's usual patience beyond the wire's own time
+    HICCUP = 0.02  # s, a longer interruption by the machine exceeds the bridge's default `--link.margin`
 
     def __init__(
         self,
@@ -107,7 +111,7 @@ class Twin:
         self.arguments, self.plant, self._show = arguments, plant, show
         self.events: deque[tuple[float, str]] = deque(maxlen=_EVENTS)
         self.start, seed = time.monotonic(), arguments.seed
-        self.world = PlantClock(plant, self.start, self.note)
+        self.clock = PlantClock(plant, self.start, self.note)
         self.firmware = Firmware(plant, arguments.firmware, self.note)
         self.injector = Injector(arguments.faults, seed)
         self.check = CommandCheck(hand.joint_lower, hand.joint_upper, arguments.limits)
@@ -119,7 +123,7 @@ class Twin:
             self.injector,
             arguments.line,
             seed=seed,
-            catch_up=self.world.catch_up,
+            catch_up=self.clock.catch_up,
             note=self.note,
         )
         self.imu: EmulatedImu | None = None
@@ -137,61 +141,61 @@ class Twin:
             self.close()
             raise
         self._first = self._trial = plant.trial
-        self.hiccups = 0  # times that this machine let nothing happen for `HICCUP`
+        self.hiccups = 0  # number of interruptions by the machine longer than `HICCUP`
         self._stop = False
 
     def stop(self) -> None:
-        """End soon; safe to call from a signal."""
+        """End soon; may be called from a signal handler."""
         self._stop = True
 
     def run(self) -> None:
-        """Until all trials are over, or `stop`."""
+        """Run until all trials have ended, or `stop` was called."""
         sides = [side for side in (self.imu, self.masks) if side]
-        now = self.world.now = time.monotonic()
+        now = self.clock.now = time.monotonic()
         while not self._stop:
             before, now = now, time.monotonic()
             self.hiccups += now - before > self.HICCUP
             self.line.serve(now)
             free = self.line.due() - now
             for side in sides:
-                # A picture takes a millisecond or so: it waits while the wire wants something soon.
+                # A picture takes about 1 ms to compute: postpone it when the port is due soon.
                 if free > 0.002 or now > side.due + 0.01:
                     side.serve(now)
-            if free > self.world.cost or now > self.world.due + 0.01:
-                if now >= self.world.due:
-                    self.world.catch_up(now, PlantClock.SLICE)
-                until = min(self.world.due, *(side.due for side in sides))
+            if free > self.clock.cost or now > self.clock.due + 0.01:
+                if now >= self.clock.due:
+                    self.clock.catch_up(now, PlantClock.SLICE)
+                until = min(self.clock.due, *(side.due for side in sides))
             else:
                 until = now + free
             if self.plant.trial != self._trial:
                 self._trial = self.plant.trial
                 done = self._trial - self._first
                 end = self.plant.results()[done - 1].get("end", "")
-                self.note(f"trial {done} of {self.arguments.trials} is over: {end}")
+                self.note(f"end of trial {done} of {self.arguments.trials}: {end}")
                 self._stop |= done >= self.arguments.trials
             pause = min(until, self.line.due()) - time.monotonic()
-            ports = [self.line.terminal] if self.line.terminal.plugged else []
+            ports = [self.line.terminal] if self.line.terminal.connected else []
             select.select(ports, [], [], max(pause, 0.0))
 
     def close(self) -> None:
-        """Take the ports away."""
+        """Close all ports."""
         for part in (self.line, self.imu, self.masks):
             if part:
                 part.close()
 
     def note(self, text: str) -> None:
-        """An event, for the report and whoever looks on."""
+        """Record and show an event."""
         now = time.monotonic()
         self.events.append((now, text))
         self._show(f"{now - self.start:9.3f} s  {text}")
 
     def report(self) -> dict[str, Any]:
-        """Results of the trials, and everything that was counted."""
+        """Results of the trials, and all statistics; JSON-able."""
         arguments, firmware, line = self.arguments, self.firmware, self.line
         return {
             "task": arguments.task,
             "seed": arguments.seed,
-            "draw": arguments.draw,
+            "parameter_kind": arguments.parameters,
             "start": self.start,
             "seconds": round(time.monotonic() - self.start, 3),
             "trials": self.plant.results()[: arguments.trials],
@@ -210,7 +214,7 @@ class Twin:
                 "trips": firmware.trips,
             },
             "hiccups": self.hiccups,
-            "physics": self.world.report(),
+            "physics": self.clock.report(),
             "slowest_exchange_ms": round(1e3 * line.slowest, 3),
             "late": line.lateness.summary(),
             "imu_frames": self.imu.sent if self.imu else 0,

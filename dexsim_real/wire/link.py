@@ -92,7 +92,7 @@ class HandPort(Protocol):
         ...
 
     def exchange(self, command: np.ndarray) -> Reply | None:
-        """Send joint commands (`frames.COMMAND_BLOCK`) and return the answer; None when no valid answer arrived in time.
+        """Send joint commands (`frames.COMMAND_BLOCK`); None when no valid answer arrived in time.
 
         Line errors never raise. After a reconnection the given command is not sent: the first reply of a new
         generation comes from a passive hand.

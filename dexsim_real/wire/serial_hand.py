@@ -213,7 +213,7 @@ class SerialHand:
             )
         if not self._parser.counts.frames and not self._parser.counts.crc_errors:
             return (
-                f"{self.port}: none of {self._received} bytes belong to a frame; set --link.baud to the hand's baud rate "
+                f"{self.port}: none of {self._received} bytes belong to a frame; set --link.baud to that of the hand "
                 f"(now {self.config.baud} baud)"
             )
         return (

@@ -27,7 +27,7 @@ def test_one_short_trial_through_the_bytes(tmp_path):
             "1",
             "--seconds",
             "1.5",
-            "--draw",
+            "--parameters",
             "nominal",
             "--no-realtime",
             "--json",

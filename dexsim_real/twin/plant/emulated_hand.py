@@ -1,8 +1,8 @@
-"""The emulated hand's physics: `Plant` of `types`, one trial after another.
+"""The physics of the emulated hand: a `Plant` that runs one trial after another.
 
-The world is C MuJoCo at half a millisecond (`scene`); each millisecond the firmware runs (`motors`); every
-hundredth of a second the fingertips sample (`skin`) and the referee looks. An assistant hands over the objects.
-The palm frame is the world's. Everything follows from the seed and the commands, bit for bit.
+C MuJoCo runs at 0.5 ms (`scene`), the firmware at 1 ms (`drives`), the fingertips (`taxel_array`) and the referee at
+10 ms. An assistant places the objects. The palm frame is the world frame. Everything follows deterministically from the
+seed and the commands.
 """
 
 import collections
@@ -13,7 +13,9 @@ import numpy as np
 
 from dexsim.hand.kinematics import Hand
 from dexsim_real.twin.plant.assistant import Assistant, Place, Stage, clear, find_place, put
+from dexsim_real.twin.plant.contacts import tip_contacts
 from dexsim_real.twin.plant.drives import PERIOD, Drives
+from dexsim_real.twin.plant.mount import GRAVITY, tilted_gravity
 from dexsim_real.twin.plant.parameters import EXCHANGE_SENSE, PUSHES, TrialParameters, sample_trial
 from dexsim_real.twin.plant.protocol import MotorCommands, PlantMeasurement
 from dexsim_real.twin.plant.referee import Referee
@@ -22,37 +24,14 @@ from dexsim_real.twin.plant.shapes import ObjectShape, matrix, product, sample_s
 from dexsim_real.twin.plant.taxel_array import TaxelArray
 from dexsim_real.wire.frames import Mode
 
-MOUNT = {"grasp": None, "rotate": (-0.2, -0.2)}
-"""Nominal pitch and roll of the hand, rad: None for upside down, else palm up with the wrist lowered (or raised, below
-zero), and the thumb's side."""
-GRAVITY = 9.81
-IMU_TRANSPORT = 0.0017  # s of an orientation's bytes
+IMU_TRANSPORT = 0.0017  # s for the bytes of an orientation
 _SUBSTEPS = round(PERIOD / TIMESTEP)
-_LOOK = 10  # firmware periods between two looks of the referee
-_MEMORY = 0.2  # s of the past that sensors may show
-
-
-def nominal_gravity(task: str) -> np.ndarray:
-    """Gravity [3] m/s^2 in the palm frame of a hand that is mounted as it should be."""
-    if MOUNT[task] is None:
-        return GRAVITY * np.array([1.0, 0.0, 0.0])
-    pitch, roll = MOUNT[task]
-    return GRAVITY * np.array([-np.cos(pitch) * np.cos(roll), np.sin(roll), -np.sin(pitch) * np.cos(roll)])
-
-
-def tilted_gravity(task: str, tilt: np.ndarray) -> np.ndarray:
-    """Gravity [3] of a hand whose mount is off by angles [2] rad about two axes across the vertical."""
-    down = nominal_gravity(task)
-    way = down / GRAVITY
-    side = np.array([0.0, 1.0, 0.0]) - way[1] * way  # the palm's y, made level
-    side = side / np.linalg.norm(side)
-    for axis, angle in ((side, tilt[0]), (np.cross(way, side), tilt[1])):
-        down = matrix(turn(axis, float(angle))) @ down
-    return down
+_LOOK = 10  # firmware periods between two updates of the referee
+_MEMORY = 0.2  # s, longest delay of a sensor
 
 
 class _Past(NamedTuple):
-    """What the sensors saw at one time; copies of MuJoCo's own vectors, to be picked from."""
+    """The state at one time, from which delayed sensors read."""
 
     qpos: np.ndarray
     qvel: np.ndarray
@@ -64,16 +43,16 @@ class EmulatedHand:
     """A hand with an object, trial after trial.
 
     Args:
-      hand: geometry.
+      hand: model of the hand.
       task: "grasp" or "rotate".
-      seed: of everything random.
-      trials: how many there shall be, after which the hand is left empty; None: no end.
-      kind: "outside", "inside" or "nominal" (`draw`).
-      overrides: parameters that are given, not drawn (`sample_trial`).
-      seconds: time limit of a trial; None for the task's.
-      command: what the runner was asked for; only written into the results.
-      shape: name of the objects (grasp); None for random ones.
-      first: number of the first trial: a trial is the same whether others went before it or not.
+      seed: of all random numbers.
+      trials: number of trials, after which the hand stays empty; None is no limit.
+      kind: "outside", "inside" or "nominal" (`parameters.KINDS`).
+      overrides: fixed parameters (`sample_trial`).
+      seconds: time limit of a trial; None is that of the task.
+      command: grip command of the runner; only noted in the results.
+      shape: name of the objects (grasp); None samples one per trial.
+      first: number of the first trial. A trial does not depend on the trials before it.
     """
 
     def __init__(
@@ -97,8 +76,8 @@ class EmulatedHand:
         self._skin, self._assistant = TaxelArray(hand), Assistant(task)
         self._done: list[dict[str, Any]] = []
         self.time, self._ticks, self._due = 0.0, 0, 0.0
-        self._told: MotorCommands | None = None
-        # A hand that nobody drives lies with its fingers slightly bent.
+        self._commands: MotorCommands | None = None
+        # The fingers of a hand without commands are slightly bent.
         self._rest = np.clip(0.3, hand.joint_lower, hand.joint_upper).astype(float)
         self._data: mujoco.MjData | None = None
         self.trial = first - 1
@@ -107,19 +86,19 @@ class EmulatedHand:
     # --- the interface --------------------------------------------------------------------------
 
     def drive(self, motors: MotorCommands) -> None:
-        """New commands, effective from now."""
-        self._told = motors
-        self._drives.order(self.time, motors)
+        """Set new motor commands, effective from now."""
+        self._commands = motors
+        self._drives.send(self.time, motors)
 
     def advance(self, seconds: float) -> None:
-        """Let this much time pass; what is less than a millisecond is kept for the next time."""
+        """Simulate this duration in s; a remainder below 1 ms is kept for the next call."""
         self._due += seconds
         while self._due >= PERIOD - 1e-12:
             self._due -= PERIOD
             self._tick()
 
     def measure(self) -> PlantMeasurement:
-        """What the hand's sensors show; each shows the past."""
+        """Readings of the hand's sensors, each with its delay."""
         late = max(float(self.parameters.sensing_latency) - EXCHANGE_SENSE, 0.0)
         past, rng = self._before(late), self._noise
         position, quat, acceleration = self.measure_object()
@@ -128,17 +107,19 @@ class EmulatedHand:
             time=self.time,
             joint_velocity=past.qvel[self._scene.drive_dof],
             joint_position=shown + self.parameters.encoder_noise * rng.standard_normal(shown.shape),
-            current=self._shown_current(past),
+            current=self._reported_current(past),
             temperature=self._drives.case.copy(),
-            taxel_force=self._skin.report(self._felt(late), rng),
+            taxel_force=self._skin.report(self._delayed_taxel_force(late), rng),
             object_quat=quat,
             object_position=position,
             object_acceleration=acceleration,
         )
 
     def measure_object(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Place [3] m as a camera's masks give it, orientation [4] and acceleration [3] m/s^2 as an IMU in the object
-        does: late, noisy and biased as those are."""
+        """Position [3] m from a camera's masks; orientation [4] and acceleration [3] m/s^2 from an IMU in the object.
+
+        All with delay, noise and bias.
+        """
         parameters, rng = self.parameters, self._object_noise
         at = self._scene.object_qpos
         position = self._before(float(parameters.camera_delay)).qpos[at : at + 3]
@@ -155,12 +136,12 @@ class EmulatedHand:
         return position, product(product(heading, quat), skew), felt
 
     def warm(self, joint: int, degrees: float) -> None:
-        """Heat one motor (a fault)."""
+        """Heat a motor by this many K (a fault); cool it if negative."""
         self._drives.winding[joint] += degrees
         self._drives.case[joint] += degrees
 
     def results(self) -> list[dict[str, Any]]:
-        """The truth about every trial so far, the current one included."""
+        """True results of all trials so far, including the current one."""
         return [*self._done] if self._finished else [*self._done, self._report()]
 
     @property
@@ -170,12 +151,12 @@ class EmulatedHand:
 
     @property
     def limit(self) -> float:
-        """Seconds of a trial that nothing ends."""
+        """Time limit of a trial in s."""
         return self._referee.limit
 
     @property
     def stage(self) -> Stage:
-        """Where the object is."""
+        """State of the object."""
         return self._assistant.stage
 
     # --- trials ---------------------------------------------------------------------------------
@@ -187,7 +168,7 @@ class EmulatedHand:
             return
         rng = np.random.default_rng([self.seed, self.trial])
         joints = self._rest if self._data is None else self._joints()
-        while True:  # Some objects fit nowhere between the fingers; nobody would put those there.
+        while True:  # Some objects fit nowhere between the fingers: sample another.
             self.parameters: TrialParameters = sample_trial(self.task, rng, self.kind, self._overrides)
             self.shape: ObjectShape = sample_shape(self.parameters, rng, self._shape)
             self._gravity = tilted_gravity(self.task, self.parameters.gravity_tilt)
@@ -209,9 +190,8 @@ class EmulatedHand:
         mujoco.mj_forward(scene.model, self._data)
         self._tips, self._pressing, self._touches = np.zeros((5, 3)), np.zeros(5), []
         self._past: collections.deque[_Past] = collections.deque(maxlen=round(_MEMORY / PERIOD))
-        self._samples: collections.deque = collections.deque(
-            maxlen=round(_MEMORY / float(self.parameters.taxel_period)) + 2
-        )
+        samples = round(_MEMORY / float(self.parameters.taxel_period)) + 2
+        self._samples: collections.deque = collections.deque(maxlen=samples)
         self._next_sample = self.time
         self._remember()
 
@@ -230,7 +210,7 @@ class EmulatedHand:
             "trial": self.trial,
             "task": self.task,
             "seed": self.seed,
-            "draw": self.kind,
+            "parameter_kind": self.kind,
             "command": self.command,
             "shape": self.shape.name,
             "stage": self.stage.value,
@@ -248,7 +228,7 @@ class EmulatedHand:
         data.qfrc_applied[scene.drive_dof] = torque
         scene.model.dof_frictionloss[scene.drive_dof] = friction
         if self.stage is Stage.FREE:
-            self._shove()
+            self._push()
             mujoco.mj_step(scene.model, data, _SUBSTEPS)
         else:
             held = self._place.position if self.stage is Stage.HOLD else self._assistant.shelf(self._place)
@@ -287,32 +267,32 @@ class EmulatedHand:
                 self._done.append(self._report())
                 self._next_trial()
             return
-        before, told = self.stage, self._told
-        targets = told.position if told is not None and np.all(told.mode == Mode.POSITION) else None
+        before, commands = self.stage, self._commands
+        targets = commands.position if commands is not None and np.all(commands.mode == Mode.POSITION) else None
         if self._finished:
             return
-        free = self._room() if self._assistant.curious(self.time) else None
+        free = self._place_is_clear() if self._assistant.wants_clearance(self.time) else None
         if self._assistant.watch(self.time, targets, self._joints(), free) is Stage.FREE and before is Stage.HOLD:
             put(scene, data, self._place.position, self._place.quat, self._place.velocity)
             self._plan_push()
 
-    def _room(self) -> bool:
+    def _place_is_clear(self) -> bool:
         probe = mujoco.MjData(self._scene.model)
         probe.qpos[:] = self._data.qpos
         return clear(self._scene, probe, self._place)
 
-    def _shove(self) -> None:
-        """Pushes at random times: a force on the object for a moment."""
+    def _push(self) -> None:
+        """Push the object at random times, with a constant force for a short time."""
         force = self._data.xfrc_applied[self._scene.object_body]
         if self._push_until is not None and self.time >= self._push_until:
             force[:3], self._push_until = 0.0, None
         if self.time < self._push_at:
             return
-        rng, lasts = self._pushing, float(self.parameters.push_seconds)
-        way = rng.standard_normal(3)
-        change = PUSHES[self.task][1] * rng.random() * way / np.linalg.norm(way)
-        force[:3] = float(self.parameters.mass) * change / lasts
-        self._push_until = self.time + lasts
+        rng, duration = self._pushing, float(self.parameters.push_seconds)
+        direction = rng.standard_normal(3)
+        change = PUSHES[self.task][1] * rng.random() * direction / np.linalg.norm(direction)
+        force[:3] = float(self.parameters.mass) * change / duration
+        self._push_until = self.time + duration
         self._plan_push()
 
     def _plan_push(self) -> None:
@@ -322,23 +302,8 @@ class EmulatedHand:
     # --- sensors --------------------------------------------------------------------------------
 
     def _contacts(self) -> None:
-        """Forces of the object on the fingertips as they are now."""
-        scene, data = self._scene, self._data
-        self._tips, self._pressing, self._touches = np.zeros((5, 3)), np.zeros(5), []
-        wrench = np.zeros(6)
-        for i in range(data.ncon):
-            first, second = data.contact.geom[i]
-            finger = max(scene.finger_of_geom[first], scene.finger_of_geom[second])
-            if finger < 0 or not (scene.is_object[first] or scene.is_object[second]):
-                continue
-            mujoco.mj_contactForce(scene.model, data, i, wrench)
-            # The frame's first row points from the first geom to the second, which feels the force.
-            frame = data.contact.frame[i].reshape(3, 3)
-            sign = 1.0 if scene.is_object[first] else -1.0
-            normal, tangent = sign * wrench[0] * frame[0], sign * wrench[1:3] @ frame[1:]
-            self._tips[finger] += normal + tangent
-            self._pressing[finger] += abs(wrench[0])
-            self._touches.append((int(finger), data.contact.pos[i].copy(), normal, tangent))
+        """Update the forces of the object on the fingertips."""
+        self._tips, self._pressing, self._touches = tip_contacts(self._scene, self._data)
 
     def _sample_skin(self) -> None:
         self._contacts()
@@ -361,17 +326,17 @@ class EmulatedHand:
         self._past.append(_Past(data.qpos.copy(), data.qvel.copy(), acceleration, self._drives.current))
 
     def _before(self, age: float) -> _Past:
-        """What was a while ago; the oldest that is remembered, if that is less."""
+        """The state `age` s ago, or the oldest one stored."""
         back = min(round(age / PERIOD), len(self._past) - 1)
         return self._past[-1 - back]
 
-    def _felt(self, late: float) -> np.ndarray:
+    def _delayed_taxel_force(self, late: float) -> np.ndarray:
         for time, force in reversed(self._samples):
             if time <= self.time - late + 1e-9:
                 return force
         return np.zeros((5, self.hand.num_taxels, 3))
 
-    def _shown_current(self, past: _Past) -> np.ndarray:
-        """mA, positive when opening."""
+    def _reported_current(self, past: _Past) -> np.ndarray:
+        """Reported current [12] mA, positive when opening."""
         noise = float(self.parameters.current_noise) * self._noise.standard_normal(past.current.shape)
         return -1000.0 * (past.current * self.parameters.current_gain + noise)

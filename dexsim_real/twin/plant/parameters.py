@@ -1,12 +1,12 @@
-"""Which hand and which object a trial of the emulated hand has: bands just outside what training draws from.
+"""Parameters of the hand and the object in a trial on the emulated hand, sampled just outside training's ranges.
 
-Each `Band` is a range of training, with the place where it is written; a value lies beyond one of its ends, by 5 to
-15 % of its width. Every joint, finger and trial picks its side anew. Where one side means nothing (a gear play below
-zero, an efficiency above one) the other is taken. `kind` "inside" draws from the ranges themselves and "nominal" takes
-their middle or neutral value: for finding out what breaks a policy. What training does not have at all (gears with
-play, rubber that twists, a warm motor) is in every draw, as `STRUCTURE`.
+Each `Band` is a range of training, with its place in the configuration. A value is beyond one end of its range, by 5 to
+15 % of the width. Every joint, finger and trial samples its own end; where one end is impossible (a negative gear play,
+an efficiency above one) the other is used. To find out what breaks a policy, the kind "inside" samples within the
+ranges, and "nominal" takes their middle or neutral value. `STRUCTURE` holds what training does not model (torsional
+friction, thermal effects, ...) and is in every trial.
 
-The ranges are repeated here, and a test holds them against the configuration of the shipped policies.
+The ranges are repeated here; a test compares them with the configurations of the shipped policies.
 """
 
 import dataclasses
@@ -18,35 +18,35 @@ from dexsim_real.core.errors import HandError
 KINDS = ("outside", "inside", "nominal")
 TASKS = ("grasp", "rotate")
 NEAR, FAR = 0.05, 0.15  # beyond an edge, as shares of the range's width
-EXCHANGE_COMMAND = 0.007  # s from a policy's tick to the board: half an exchange's period at 83 Hz, 1 ms of wire
-EXCHANGE_SENSE = 0.0146  # s from the board to a policy's tick: 8.6 ms of reply and half a period
+EXCHANGE_COMMAND = 0.007  # s from a policy tick to the board: half a period at 83 Hz and 1 ms on the wire
+EXCHANGE_SENSE = 0.0146  # s from the board to a policy tick: 8.6 ms of reply and half a period
 _COUNT = {"trial": (), "joint": (12,), "finger": (5,), "axis": (3,), "plane": (2,)}
 
 
 @dataclasses.dataclass(frozen=True)
 class Band:
-    """A range of training and where values outside it lie."""
+    """A range of training, from which values inside, outside or at the nominal point are taken."""
 
     low: float
     high: float
     unit: str
-    origin: str  # where training has it: path in a task's configuration
+    origin: str  # path in a task's configuration
     nominal: float
-    per: str = "trial"
-    sides: str = "both"  # "both", "high", "low"
-    width: float = 0.0  # what the shares are of; 0: the range's own
+    per: str = "trial"  # one value per "trial", "joint", "finger", "axis" or "plane"
+    sides: str = "both"  # possible ends: "both", "high", "low"
+    width: float = 0.0  # width that the shares refer to; 0 is that of the range
 
     def outside(self) -> tuple[tuple[float, float], ...]:
-        """The spans beyond its ends, lowest first."""
+        """The intervals beyond its ends, lowest first."""
         width = self.width or self.high - self.low
         below = (self.low - FAR * width, self.low - NEAR * width)
         above = (self.high + NEAR * width, self.high + FAR * width)
         return {"both": (below, above), "low": (below,), "high": (above,)}[self.sides]
 
-    def draw(self, rng: np.random.Generator, kind: str) -> np.ndarray:
-        """Values of the shape that `per` asks for."""
+    def sample(self, rng: np.random.Generator, kind: str) -> np.ndarray:
+        """Sample values of a kind in `KINDS`; the shape follows from `per`."""
         shape = _COUNT[self.per]
-        # The same numbers are used up for every kind, so that two kinds differ in nothing else.
+        # Every kind consumes the same random numbers, so that kinds differ in nothing else.
         side, place = rng.random(shape), rng.random(shape)
         if kind == "nominal":
             return np.full(shape, self.nominal)
@@ -57,8 +57,8 @@ class Band:
         return (low + place.T * (high - low)).T
 
 
-def _symmetric(reach: float, unit: str, origin: str, per: str) -> Band:
-    return Band(-reach, reach, unit, origin, 0.0, per)
+def _symmetric(limit: float, unit: str, origin: str, per: str) -> Band:
+    return Band(-limit, limit, unit, origin, 0.0, per)
 
 
 BANDS: dict[str, Band] = {
@@ -75,14 +75,14 @@ BANDS: dict[str, Band] = {
     "viscous_friction": Band(0.0, 0.01, "Nm s/rad", "randomization.viscous_friction", 0.0, "joint", "high"),
     "latency": Band(0.0, 0.02, "s", "randomization.latency", 0.0, "trial", "high"),
     "latency_spread": Band(0.0, 0.005, "s", "randomization.latency_spread", 0.0, "joint", "high"),
-    # --- what it reports
+    # --- the sensors of the hand
     "sensing_latency": Band(0.0, 0.02, "s", "randomization.sensing_latency", 0.0, "trial", "high"),
     "encoder_bias": _symmetric(0.01, "rad", "randomization.encoder_bias", "joint"),
     "current_gain": Band(0.9, 1.1, "1", "randomization.torque_gain", 1.0, "joint"),
     "taxel_gain": Band(0.9, 1.1, "1", "randomization.taxel_gain", 1.0, "finger"),
-    # --- where it stands
+    # --- the mount
     "gravity_tilt": _symmetric(0.1, "rad", "randomization.gravity_tilt", "plane"),
-    # --- the object and how it is touched
+    # --- the object and its contacts
     "inertia_scale": Band(0.8, 1.25, "1", "objects.inertia_scale", 1.0),
     "com_offset": _symmetric(0.003, "m", "objects.com_offset", "axis"),
     "friction": Band(0.6, 1.2, "1", "objects.friction", 0.9),
@@ -91,7 +91,7 @@ BANDS: dict[str, Band] = {
     "restitution": Band(0.03, 0.08, "1", "objects.restitution", 0.05),
     "rubber": Band(0.003, 0.003, "m", "physics.cover", 0.003, width=0.003),
 }
-"""What both tasks share; `TASK_BANDS` adds to it or replaces."""
+"""Bands of both tasks; `TASK_BANDS` adds to them or replaces them."""
 
 TASK_BANDS: dict[str, dict[str, Band]] = {
     "grasp": {
@@ -116,41 +116,41 @@ TASK_BANDS: dict[str, dict[str, Band]] = {
 }
 
 STRUCTURE: dict[str, float | tuple[float, ...]] = {
-    "torsion": 0.002,  # m, torsional friction of a rubber patch over its sliding friction
+    "torsion": 0.002,  # m, ratio of torsional to sliding friction of the rubber
     "rolling": 0.0001,  # m, rolling friction
-    "palm_stiffness": 8000.0,  # N/m, bare plastic
-    "cone_ratio": 100.0,  # impratio: how much harder friction is than pressing
+    "palm_stiffness": 8000.0,  # N/m, plastic without rubber
+    "cone_ratio": 100.0,  # impratio: stiffness of friction relative to the normal direction
     "gear_stiffness": 150.0,  # Nm/rad of the closed gear
     "gear_inertia": 1e-5,  # kg m^2 of the gear's last stage, at the joint
-    "rotor_inertia": 1.0,  # factor on the rotors' reflected inertia, see `motors`
+    "rotor_inertia": 1.0,  # factor on the rotors' reflected inertia (`scene.ROTORS`)
     "no_load_current": 0.01,  # A
-    "thermal": 1.0,  # 0: motors stay cold
+    "thermal": 1.0,  # factor on thermal effects; 0: motors stay cold
     "current_noise": 0.012,  # A
     "encoder_noise": 0.001,  # rad
     "taxel_noise": 0.015,  # N
-    "taxel_bias": 0.02,  # N, standard deviation over the taxels
-    "taxel_spread": 0.08,  # standard deviation of the taxels' gains
+    "taxel_bias": 0.02,  # N, standard deviation
+    "taxel_spread": 0.08,  # standard deviation of the gains
     "taxel_threshold": 0.06,  # N
-    "taxel_crosstalk": 0.06,  # share of a taxel's force that its neighbours feel
+    "taxel_crosstalk": 0.06,  # share of a taxel's force that spreads to its neighbours
     "taxel_period": 0.01,  # s between two samples of a fingertip
-    "camera_noise": 0.0025,  # m, white, of what segmentation makes of the object's place
+    "camera_noise": 0.0025,  # m, white noise of the object's position after segmentation
     "camera_delay": 0.03,  # s from a picture to its mask
-    "imu_noise": 0.01,  # rad, white
-    "heading_error": 0.05,  # rad, largest error of whoever puts the object down squarely
-    "place_error": 0.004,  # m, the same of its place
-    "push_rate": 1.0,  # factor on how often the object is pushed, see `PUSHES`
-    "push_seconds": 0.03,  # s that a push lasts
+    "imu_noise": 0.01,  # rad, white noise
+    "heading_error": 0.05,  # rad, largest heading error when the object is placed
+    "place_error": 0.004,  # m, largest position error when the object is placed
+    "push_rate": 1.0,  # factor on the rate of pushes (`PUSHES`)
+    "push_seconds": 0.03,  # s, duration of a push
 }
-"""What training does not draw, or does not have: one value for all trials."""
+"""Parameters that training does not randomise or does not model: one value for all trials."""
 
 
 PUSHES = {"grasp": (0.5, 0.3), "rotate": (1 / 6, 0.1)}
-"""Pushes a second, and the largest change of speed m/s by one: those of the tasks' evaluations."""
+"""Pushes per second, and largest change of velocity m/s by a push, as in the evaluation of each task."""
 
 
 @dataclasses.dataclass(frozen=True)
 class TrialParameters:
-    """One trial's hand and object: values by the names in `BANDS`, `TASK_BANDS` and `STRUCTURE`."""
+    """Parameters of one trial, by the names in `BANDS`, `TASK_BANDS` and `STRUCTURE`. Each is also an attribute."""
 
     task: str
     kind: str
@@ -163,41 +163,41 @@ class TrialParameters:
             raise AttributeError(name) from None
 
     def summary(self) -> dict[str, float | list[float]]:
-        """For a report: JSON-able, four digits."""
+        """The sampled parameters, JSON-able."""
         return {name: np.round(value, 6).tolist() for name, value in self.value.items() if name not in STRUCTURE}
 
 
 def bands(task: str) -> dict[str, Band]:
-    """All bands of a task."""
+    """All bands of a task, by name."""
     return BANDS | TASK_BANDS[task]
 
 
 def sample_trial(
     task: str, rng: np.random.Generator, kind: str = "outside", overrides: dict[str, float | str] | None = None
 ) -> TrialParameters:
-    """One trial's parameters.
+    """Sample the parameters of a trial.
 
     Args:
       task: "grasp" or "rotate".
-      rng: of this trial.
+      rng: random numbers of this trial.
       kind: one of `KINDS`.
-      overrides: values that replace what is drawn, for all joints or axes alike; or a name in `KINDS`, of which this
-        one parameter shall be.
+      overrides: values by name, the same for all joints, fingers or axes; or a name in `KINDS` that applies to this
+        parameter.
 
     Raises:
       HandError: there is no such task, kind or parameter.
     """
     if task not in TASKS or kind not in KINDS:
-        raise HandError(f"draw {task!r} {kind!r}: tasks are {', '.join(TASKS)}, kinds {', '.join(KINDS)}")
+        raise HandError(f"no parameters of {task!r} {kind!r}: tasks are {', '.join(TASKS)}, kinds {', '.join(KINDS)}")
     table, given = bands(task), overrides or {}
     for name, number in given.items():
         if name not in table and name not in STRUCTURE:
             known = ", ".join(sorted([*table, *STRUCTURE]))
-            raise HandError(f"the emulated hand has no parameter {name!r}; there are {known}")
+            raise HandError(f"the emulated hand has no parameter {name!r}; choose from {known}")
         if isinstance(number, str) and (number not in KINDS or name not in table):
-            raise HandError(f"{name} = {number!r}: a number, or for what is drawn {', '.join(KINDS)}")
+            raise HandError(f"{name} = {number!r}: give a number, or for a sampled parameter one of {', '.join(KINDS)}")
     kinds = {name: number for name, number in given.items() if isinstance(number, str)}
-    value = {name: table[name].draw(rng, kinds.get(name, kind)) for name in sorted(table)}
+    value = {name: table[name].sample(rng, kinds.get(name, kind)) for name in sorted(table)}
     value |= {name: np.asarray(number, float) for name, number in STRUCTURE.items()}
     value |= {name: np.full_like(value[name], number) for name, number in given.items() if name not in kinds}
     return TrialParameters(task, kind, value)

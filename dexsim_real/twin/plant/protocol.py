@@ -1,7 +1,7 @@
-"""What the emulated hand's physics and its wire agree on.
+"""The interface between the physics of an emulated hand and its wire.
 
-`Plant` is the world: joints, motors, skin and object, in C MuJoCo. The wire (`dexsim_real.twin.wire.line`) turns
-bytes into calls of it, at the pace of the wall clock, and knows nothing of physics.
+A `Plant` simulates joints, motors, skin and object. `dexsim_real.twin.wire` translates bytes into calls of a plant, in
+real time, and knows nothing of physics.
 """
 
 import dataclasses
@@ -14,7 +14,7 @@ from dexsim_real.twin.plant.shapes import ObjectShape
 
 @dataclasses.dataclass(frozen=True)
 class MotorCommands:
-    """What the palm board has been told; one entry a joint, in the wire's order and units."""
+    """Commands that the palm board received; one entry per joint, in the order and units of the wire."""
 
     position: np.ndarray  # [12] rad
     kp: np.ndarray  # [12]
@@ -26,48 +26,50 @@ class MotorCommands:
 
 @dataclasses.dataclass(frozen=True)
 class PlantMeasurement:
-    """What the hand's own sensors show at an instant, before the wire's quantisation."""
+    """Readings of the emulated hand's sensors at one time, before the quantisation of the wire."""
 
-    time: float  # s since the plant began
-    joint_position: np.ndarray  # [12] rad, of the encoders
+    time: float  # s since the start of the plant
+    joint_position: np.ndarray  # [12] rad, from the encoders
     joint_velocity: np.ndarray  # [12] rad/s
     current: np.ndarray  # [12] mA
     temperature: np.ndarray  # [12] degC, of the motors
-    taxel_force: np.ndarray  # [5, 120, 3] N along the wire's x, y, z; z presses into the tip
-    object_quat: np.ndarray  # [4], of the object in the palm's frame
-    object_position: np.ndarray  # [3] m, palm's frame
-    object_acceleration: np.ndarray  # [3] m/s^2 as an IMU in it feels, its own frame
+    taxel_force: np.ndarray  # [5, 120, 3] N along x, y, z of the wire; z points into the tip
+    object_quat: np.ndarray  # [4] (w, x, y, z) of the object in the palm frame
+    object_position: np.ndarray  # [3] m, palm frame
+    object_acceleration: np.ndarray  # [3] m/s^2, measured by an IMU in the object, object frame
 
 
 class Plant(Protocol):
-    """A hand with an object, advanced in time by whoever owns it."""
+    """A simulated hand with an object. The owner advances its time."""
 
     trial: int
-    """Number of the trial under way."""
+    """Number of the current trial."""
     shape: ObjectShape
-    """The object of this trial."""
+    """Object of the current trial."""
     up: np.ndarray
-    """[3] the vertical in the palm's frame."""
+    """[3] the vertical in the palm frame."""
 
     def drive(self, motors: MotorCommands) -> None:
-        """New commands, effective from now."""
+        """Set new motor commands, effective from now."""
         ...
 
     def advance(self, seconds: float) -> None:
-        """Let this much time pass."""
+        """Simulate this duration in s."""
         ...
 
     def measure(self) -> PlantMeasurement: ...
 
     def measure_object(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Place [3] m as a camera has it, orientation [4] and acceleration [3] m/s^2 as an IMU in the object does:
-        late, noisy and biased as those are."""
+        """Position [3] m from a camera; orientation [4] and acceleration [3] m/s^2 from an IMU in the object.
+
+        All with delay, noise and bias.
+        """
         ...
 
     def warm(self, joint: int, degrees: float) -> None:
-        """Heat one motor (a fault); negative: let it cool."""
+        """Heat a motor by this many K (a fault); cool it if negative."""
         ...
 
     def results(self) -> list[dict[str, Any]]:
-        """The truth about every trial so far, the current one included."""
+        """True results of all trials so far, including the current one."""
         ...

@@ -1,8 +1,8 @@
-"""The emulated hand's world in C MuJoCo: the hand with gears that have play, an object, their contacts.
+"""The MuJoCo model of a trial: the hand with gear play, an object, their contacts.
 
-Each joint is two hinges about one axis. The first is the drive: it carries the rotor's inertia, friction and
-the encoder. The second is the gear's play: free within its gap, then stiff. Contacts have elliptic cones and are
-springs with the stiffness asked for; rubber tips also resist twisting.
+Each joint is two hinges about one axis. The first is the drive, with the rotor's inertia, friction and the encoder. The
+second is the gear play: free within its gap, then stiff. Contacts are springs of given stiffness with elliptic friction
+cones; rubber fingertips also have torsional friction.
 """
 
 import dataclasses
@@ -17,10 +17,10 @@ from dexsim_real.twin.plant.shapes import ObjectShape
 
 TIMESTEP = 0.0005  # s
 ROTORS = (8e-4, 4e-4)  # kg m^2, inertia of the strong and the weak motors as seen at the joint
-STRONG = 0.8  # Nm, joints with more than this have strong motors
+STRONG = 0.8  # Nm, torque limit above which a joint has a strong motor
 END_STOP = 300.0  # Nm/rad
-_GREASE = 0.02  # Nm s/rad of a gear that nothing is known of
-_STIFF_FRICTION = (0.002, 1.0)  # solref of dry friction: what sticks creeps by less than 1e-3 rad/s
+_GREASE = 0.02  # Nm s/rad, assumed viscous friction of a gear
+_STIFF_FRICTION = (0.002, 1.0)  # solref of dry friction: a sticking joint creeps by less than 1e-3 rad/s
 _KINDS = {
     "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
     "box": mujoco.mjtGeom.mjGEOM_BOX,
@@ -31,15 +31,15 @@ _KINDS = {
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """A compiled world and where things are in it; J joints in the hand's own order, F fingers."""
+    """A compiled model and its indices; J joints in the order of the hand, F fingers."""
 
     model: mujoco.MjModel
     drive_qpos: np.ndarray  # [J]
     drive_dof: np.ndarray  # [J]
     play_qpos: np.ndarray  # [J]
     play_dof: np.ndarray  # [J]
-    object_qpos: int  # of seven
-    object_dof: int  # of six
+    object_qpos: int  # first of seven
+    object_dof: int  # first of six
     object_body: int
     tip_body: np.ndarray  # [F]
     finger_of_geom: np.ndarray  # [geoms] index of the fingertip, -1 for none
@@ -47,12 +47,12 @@ class Scene:
 
 
 def build_scene(hand: Hand, parameters: TrialParameters, shape: ObjectShape | None, gravity: np.ndarray) -> Scene:
-    """Compile a trial's world.
+    """Compile the model of a trial.
 
     Args:
-      hand: geometry, joint ranges and torque classes; nothing else of it is used.
-      draw: the trial's parameters.
-      shape: the object; None for the hand alone (a speck stands in for it).
+      hand: only its geometry, joint ranges and torque limits are used.
+      parameters: of the trial.
+      shape: of the object; None for the hand alone, with a body without geometry in its place.
       gravity: [3] m/s^2, palm frame.
     """
     spec = mujoco.MjSpec.from_file(str(hand.model_path))
@@ -79,7 +79,7 @@ def _add_play(spec: mujoco.MjSpec, hand: Hand, parameters: TrialParameters) -> N
         drive, strong = spec.joint(name), hand.torque_limit[j] > STRONG
         drive.armature = float(parameters.rotor_inertia) * ROTORS[0 if strong else 1]
         drive.damping = _fill(drive.damping, _GREASE + float(parameters.viscous_friction[j]))
-        drive.frictionloss = 1e-4  # So that it has a row in the solver; the drive sets it at each step.
+        drive.frictionloss = 1e-4  # Not 0, so that it has a row in the solver; set at each step.
         drive.solref_friction, drive.solimp_friction[:2] = _STIFF_FRICTION, (0.99, 0.99)
         half = max(float(parameters.gear_play[j]), 1e-6) / 2
         play = drive.parent.add_joint(
@@ -94,7 +94,7 @@ def _add_play(spec: mujoco.MjSpec, hand: Hand, parameters: TrialParameters) -> N
 
 
 def _fill(value, number: float):
-    """A joint's damping, which is one number or a polynomial's coefficients."""
+    """Damping of a joint, which is a number or the coefficients of a polynomial."""
     if np.ndim(value) == 0:
         return number
     filled = np.zeros_like(value)
@@ -103,7 +103,7 @@ def _fill(value, number: float):
 
 
 def _cover(spec: mujoco.MjSpec, hand: Hand, parameters: TrialParameters) -> dict[str, bool]:
-    """Put rubber on the fingertips; names of the geoms that touch, and whether they wear rubber."""
+    """Put rubber on the fingertips; returns the names of the colliding geoms, and whether they have rubber."""
     tips = {hand.body_names[b] for b in hand.tip_body}
     names = {}
     for geom in spec.geoms:
@@ -124,7 +124,7 @@ def _add_object(spec: mujoco.MjSpec, parameters: TrialParameters, shape: ObjectS
         return
     mass, centre, inertia = mass_properties(shape, float(parameters.mass))
     body.explicitinertial, body.mass, body.ipos = True, mass, centre + parameters.com_offset
-    # Diagonal by the shapes' symmetry.
+    # Diagonal because of the symmetry of the shapes.
     body.inertia = np.diag(inertia) * float(parameters.inertia_scale)
     for k, part in enumerate(shape.parts):
         body.add_geom(
@@ -144,7 +144,7 @@ def _three(size: tuple[float, ...]) -> list[float]:
 
 @functools.lru_cache(maxsize=64)
 def _solid(shape: ObjectShape) -> tuple[float, np.ndarray, np.ndarray]:
-    """Mass, centre and inertia about it of the uniform solid of density 1, as MuJoCo's compiler has them."""
+    """Mass, centre and inertia about the centre of a uniform solid of density 1, from MuJoCo's compiler."""
     spec = mujoco.MjSpec()
     body = spec.worldbody.add_body(name="solid")
     for part in shape.parts:
@@ -183,7 +183,7 @@ def _add_pairs(
 
 
 def spring(inverse_mass: float, stiffness: float, damping: float) -> tuple[np.ndarray, np.ndarray]:
-    """solref and solimp of a constraint that pushes back with `stiffness` r at rest.
+    """solref and solimp of a constraint whose force at rest is `stiffness` r, for a penetration r.
 
     A constraint of impedance d and regularisation R = A (1 - d) / d gives a force (d k r + b v + a_0) / (A + R), a_0
     being the acceleration without it: d k r / R at rest, and a motion x'' = -d (d k x + b x') by itself
@@ -194,7 +194,7 @@ def spring(inverse_mass: float, stiffness: float, damping: float) -> tuple[np.nd
     Args:
       inverse_mass: A in 1/kg (or 1/(kg m^2)), MuJoCo's estimate for the two bodies.
       stiffness: N/m (Nm/rad).
-      damping: N s/m (Nm s/rad) that goes with this stiffness.
+      damping: N s/m (Nm s/rad) for this stiffness.
     """
     loss = min(0.5, (0.7 / (damping * inverse_mass * TIMESTEP)) ** 2)
     loss = max(loss, 0.02)
@@ -210,9 +210,9 @@ def spring(inverse_mass: float, stiffness: float, damping: float) -> tuple[np.nd
 
 @functools.lru_cache(maxsize=1)
 def _bounces() -> tuple[np.ndarray, np.ndarray]:
-    """Damping ratios and the restitutions that they give, by integrating a bounce.
+    """Damping ratios z and their coefficients of restitution, by integrating a bounce.
 
-    x'' + 2 z x' + x = 0 from x' = 1 until the force 2 z x' + x is no longer a push.
+    x'' + 2 z x' + x = 0 from x' = 1 until the force 2 z x' + x is no longer repulsive.
     """
     ratios = np.linspace(0.02, 6.0, 300)
     position, speed = np.zeros_like(ratios), np.ones_like(ratios)
@@ -230,7 +230,7 @@ def _bounces() -> tuple[np.ndarray, np.ndarray]:
 
 
 def damping_of(restitution: float, stiffness: float, mass: float) -> float:
-    """Damping N s/m of a spring N/m that throws a mass kg back with this restitution."""
+    """Damping N s/m of a contact spring N/m with this coefficient of restitution for a mass in kg."""
     ratios, outcome = _bounces()
     ratio = np.interp(restitution, outcome[::-1], ratios[::-1])
     return float(2 * ratio * np.sqrt(stiffness * mass))

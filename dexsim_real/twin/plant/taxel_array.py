@@ -1,10 +1,10 @@
-"""The emulated fingertips: what 5 x 120 taxels report of the solver's contacts.
+"""The taxels of the emulated fingertips: 5 x 120 forces from the solver's contacts.
 
-A taxel lies under rubber. Where the object's surface comes nearer than the rubber is thick, the rubber is squeezed,
-and pushes back the harder the less of it is left. That law shares out the load among the taxels; how large the load
-is, the solver's contacts say: a fingertip's skin carries their normal force, as a scale under it would. Contacts that
-lie off the lattice (the nail's side) load no taxel. Shear is shared in the same proportion and shown along the
-taxel's own axes. Then come the array's faults: crosstalk, gains, zero errors, noise, a threshold.
+The taxels are covered by rubber, which is squeezed where the object's surface is nearer than the rubber is thick. The
+rubber's pressure grows as its remaining thickness shrinks and distributes the load over the taxels. The total load is
+the normal force of the solver's contacts, as a scale under the fingertip would measure. Contacts beside the lattice (at
+the nail) load no taxel. Shear is distributed in the same proportion, along the taxels' own axes. Imperfections follow:
+crosstalk, gains, zero errors, noise, a threshold.
 """
 
 import numpy as np
@@ -13,12 +13,12 @@ from dexsim.hand.kinematics import Hand
 from dexsim_real.twin.plant.parameters import TrialParameters
 from dexsim_real.twin.plant.shapes import ObjectShape
 
-_FULLY, _NOT_AT_ALL = 0.004, 0.008  # m along the skin from a contact to the nearest taxel: felt within, not beyond
-_LEFT = 0.15  # share of the rubber that no load squeezes away
+_FULLY, _NOT_AT_ALL = 0.004, 0.008  # m along the skin from a contact to the nearest taxel: fully felt, not felt
+_LEFT = 0.15  # smallest remaining share of the rubber's thickness
 
 
 class TaxelArray:
-    """The taxels of five fingertips; F fingers, N taxels."""
+    """The taxels of all fingertips; F fingers, N taxels each."""
 
     def __init__(self, hand: Hand):
         self._place, self._area = hand.taxel_position.astype(float), hand.taxel_area.astype(float)
@@ -26,7 +26,7 @@ class TaxelArray:
         self._axes = _axes(self._place, hand.taxel_normal.astype(float), hand.taxel_grid)
 
     def configure(self, parameters: TrialParameters, rng: np.random.Generator) -> None:
-        """Take a trial's parameters and array."""
+        """Set the parameters of a trial, and sample the imperfections of the taxels."""
         shape = self._area.shape
         self.thickness = float(parameters.rubber)
         self._gain = parameters.taxel_gain[:, None] * np.maximum(
@@ -44,13 +44,15 @@ class TaxelArray:
         tips: tuple[np.ndarray, np.ndarray],
         contacts: list[tuple[int, np.ndarray, np.ndarray, np.ndarray]],
     ) -> np.ndarray:
-        """Forces [F, N, 3] N on the taxels along their own axes, before the array's faults.
+        """Forces [F, N, 3] N on the taxels along their own axes, without imperfections.
 
         Args:
-          shape, place [3], turn [3, 3]: the object.
+          shape: of the object.
+          place: [3] m, position of the object.
+          turn: [3, 3] rotation of the object.
           tips: positions [F, 3] and rotations [F, 3, 3] of the fingertips' frames.
-          contacts: for each contact of object and fingertip (finger, point [3], normal force [3],
-            tangential force [3]), forces on the finger.
+          contacts: for each contact of object and fingertip: finger, point [3] m, normal force [3] N, tangential
+            force [3] N on the finger.
         """
         force = np.zeros((*self._area.shape, 3))
         for finger in {contact[0] for contact in contacts}:
@@ -59,9 +61,9 @@ class TaxelArray:
             pressed, dragged = 0.0, np.zeros(3)
             for _, point, normal, tangent in (c for c in contacts if c[0] == finger):
                 gap = self._gap(point - taxels, outward)
-                felt = np.clip((_NOT_AT_ALL - gap) / (_NOT_AT_ALL - _FULLY), 0.0, 1.0)
-                pressed += felt * float(np.linalg.norm(normal))
-                dragged += felt * tangent
+                weight = np.clip((_NOT_AT_ALL - gap) / (_NOT_AT_ALL - _FULLY), 0.0, 1.0)
+                pressed += weight * float(np.linalg.norm(normal))
+                dragged += weight * tangent
             share = self._share(shape, (taxels - place) @ turn, self._area[finger])
             axes = np.einsum("ij,nkj->nki", frame, self._axes[finger])
             force[finger] = share[:, None] * (axes @ dragged)
@@ -69,23 +71,23 @@ class TaxelArray:
         return force
 
     def report(self, force: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """What the array makes of forces [F, N, 3] N."""
+        """Add the imperfections to forces [F, N, 3] N."""
         mixed = force + self._crosstalk / 4 * _spill(force, self._grid)
         shown = mixed * self._gain[..., None] + self._noise * rng.standard_normal(force.shape)
         shown[..., 2] += self._bias
         return np.where(np.abs(shown) < self._threshold, 0.0, shown)
 
     def _gap(self, away: np.ndarray, outward: np.ndarray) -> float:
-        """How far m along the skin a contact lies from the nearest taxel, given its vectors [N, 3] from all of them.
+        """Distance m along the skin from a contact to the nearest taxel, given the vectors [N, 3] from all taxels.
 
-        Up to the rubber's thickness, height above a taxel is no distance.
+        Height above a taxel counts only beyond the rubber's thickness.
         """
         height = (away * outward).sum(-1)
         along = ((away - height[:, None] * outward) ** 2).sum(-1)
         return float(np.sqrt((along + np.maximum(np.abs(height) - self.thickness, 0.0) ** 2).min()))
 
     def _share(self, shape: ObjectShape, points: np.ndarray, area: np.ndarray) -> np.ndarray:
-        """Share [N] of the load on each taxel; zero where the object is out of all taxels' reach."""
+        """Share [N] of the load on each taxel; zero when the object touches no taxel's rubber."""
         squeeze = np.clip((self.thickness - shape.distance(points)) / self.thickness, 0.0, 1 - _LEFT)
         push = squeeze / (1.0 - squeeze) * area
         total = push.sum()
@@ -93,7 +95,7 @@ class TaxelArray:
 
 
 def _axes(place: np.ndarray, normal: np.ndarray, grid: tuple[int, int]) -> np.ndarray:
-    """Rows [F, N, 3, 3]: x across the finger, y along it to the tip, z into it; unit vectors of the tip's frame."""
+    """Unit vectors [F, N, 3, 3] in the tip's frame: x across the finger, y along it to the tip, z into it."""
     lattice = place.reshape(len(place), *grid, 3)
     along = np.gradient(lattice, axis=2).reshape(place.shape)
     along -= (along * normal).sum(-1, keepdims=True) * normal
@@ -102,7 +104,7 @@ def _axes(place: np.ndarray, normal: np.ndarray, grid: tuple[int, int]) -> np.nd
 
 
 def _spill(force: np.ndarray, grid: tuple[int, int]) -> np.ndarray:
-    """What the four neighbours on the lattice lend a taxel less what it lends them [F, N, 3]."""
+    """Sum over the four neighbours on the lattice of their force minus the taxel's force [F, N, 3]."""
     field = force.reshape(len(force), *grid, 3)
     out = np.zeros_like(field)
     for axis in (1, 2):

@@ -1,4 +1,4 @@
-"""What the emulated hand thinks of its orders: every one is held against limits, whatever the motors do with it."""
+"""Checks every command that the emulated hand receives against limits, whatever the motors do with it."""
 
 import dataclasses
 from collections import Counter, deque
@@ -11,57 +11,59 @@ from dexsim_real.wire.frames import Mode
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class LimitsConfig:
-    """What no command may exceed. The joints' own ranges come with the hand."""
+    """Limits of commands. The joint ranges come with the hand."""
 
     speed: float = setting(20.0, unit="rad/s", low=0.01, high=1000.0)
-    """Fastest change of a commanded angle: the bridge's own `--safety.speed`. A joint may always be told to stop
-    where it is or has been in the last `recent` seconds."""
+    """Largest rate of change of a commanded angle, the bridge's `--safety.speed`. A joint may always be commanded to an
+    angle of the last `recent` seconds, to stop it."""
     recent: float = setting(0.15, unit="s", low=0.0, high=10.0)
-    """How old the news of a joint may be by which the bridge stops it."""
+    """Largest age of a joint angle to which the bridge stops a joint."""
     slack: float = setting(0.004, unit="s", low=0.0, high=1.0)
-    """Time by which two commands may have come closer together than they were decided."""
+    """Time by which the interval between two commands may be shorter at the hand than at the bridge."""
     reach: float = setting(0.75, unit="rad", low=0.01, high=10.0)
-    """Largest distance of a command from the angle that the hand reported last; the bridge's own
-    `--safety.reach`, and what a joint moves in an exchange."""
+    """Largest distance of a command from the last reported angle: the bridge's `--safety.reach` and the motion of a
+    joint during an exchange."""
     start: float = setting(0.05, unit="rad", low=0.0, high=1.0)
-    """Distance from the reported angle of the command that turns the motors on."""
+    """Largest distance from the reported angle of a command that turns the motors on."""
     torque_max: int = setting(400, unit="mA", low=0, high=32767)
-    """Largest current limit."""
+    """Largest current limit in a command."""
 
     def __post_init__(self):
         validate(self)
 
 
 class CommandCheck:
-    """Counts commands outside limits, by what is wrong with them.
+    """Counts commands outside the limits, by limit.
 
     Args:
-      lower: [12] rad, ends of the joints' ranges.
-      upper: [12] rad.
+      lower, upper: [12] rad, joint ranges.
+      config: the other limits.
     """
 
-    WORDS = 20  # commands that are described in words
+    MAX_LISTED = 20  # commands outside the limits that are described in the report
     _ROUNDING = 1e-5  # rad, float32
 
     def __init__(self, lower: np.ndarray, upper: np.ndarray, config: LimitsConfig):
         self._lower, self._upper, self.config = np.asarray(lower), np.asarray(upper), config
-        self.checked, self.fastest = 0, 0.0  # rad/s, after allowing for the slack
+        self.checked, self.fastest = 0, 0.0  # number; rad/s, with the slack
         self.wrong: Counter[str] = Counter()
-        self.first: list[str] = []  # the first few, in words
+        self.first: list[str] = []  # descriptions of the first ones
         self._last: tuple[float, np.ndarray, np.ndarray] | None = None
-        self._shown: deque[tuple[float, np.ndarray]] = deque()  # what was reported lately
+        self._shown: deque[tuple[float, np.ndarray]] = deque()  # reported angles, recent ones
 
     def take(self, now: float, command: np.ndarray, reported: np.ndarray, since: float | None = None) -> list[str]:
-        """What is wrong with joint commands [12] (`frames.JOINT_COMMAND`) received at `now` s.
+        """Check joint commands; returns the names of the limits that they exceed.
 
         Args:
+          now: s, time of reception.
+          command: [12] `frames.JOINT_COMMAND`.
           reported: [12] rad, angles of the last state that was sent.
-          since: s, the earliest time at which it may have come, where that is not `now`.
+          since: s, earliest possible time of arrival; None is `now`.
         """
         found = self._find(now, now if since is None else since, command, reported)
         self.checked += 1
         self.wrong.update(found)
-        if found and len(self.first) < self.WORDS:
+        if found and len(self.first) < self.MAX_LISTED:
             self.first.append(
                 f"{now:.4f} {', '.join(found)}: {np.round(command['position'], 4).tolist()}, "
                 f"reported {np.round(reported, 4).tolist()}"
@@ -88,7 +90,7 @@ class CommandCheck:
             found.append("current limit")
         if np.any(on & (np.abs(position - reported) > config.reach)):
             found.append("reach")
-        # A hand that was off is taken over where it is; one that is on is moved on from the last command.
+        # A hand that was off starts from the reported angle; one that is on continues from the last command.
         fresh = on if before is None else on & ~before[2]
         if np.any(fresh & (np.abs(position - reported) > config.start)):
             found.append("start")
@@ -101,13 +103,13 @@ class CommandCheck:
         return found
 
     def _stops(self, position: np.ndarray) -> np.ndarray:
-        """Which joints [12] are told to be where they lately were."""
+        """Mask [12] of the joints that are commanded to a recently reported angle."""
         shown = np.stack([angles for _, angles in self._shown])
         near = self.config.start
         return (position >= shown.min(0) - near) & (position <= shown.max(0) + near)
 
     def report(self) -> dict[str, object]:
-        """Counts for the summary."""
+        """Results; JSON-able."""
         return {
             "checked": self.checked,
             "outside_limits": sum(self.wrong.values()),

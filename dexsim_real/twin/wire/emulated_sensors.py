@@ -1,9 +1,8 @@
-"""What knows of the object beside an emulated hand: an IMU within it, and a camera's masks of it.
+"""The emulated sensors of the object: an IMU inside it, and a camera that sends masks of it.
 
-The IMU sends what a BNO08x sends in its UART-RVC mode, 19 bytes a hundred times a second, on a terminal of its own.
-The masks go to whoever connects to a Unix socket, as records of `dexsim_real.sensors.camera.encode_mask`. What is
-wrong with
-both (noise, bias, drift, delay) is in what the plant measures; here are their formats, rates and blind spots.
+The IMU sends RVC frames like a BNO08x, 19 bytes a hundred times a second, on a terminal of its own. The masks are sent
+to clients of a Unix socket, as records of `dexsim_real.sensors.camera.encode_mask`. Noise, bias, drift and delay come
+from the plant; this module adds formats, rates and lost pictures.
 """
 
 import contextlib
@@ -22,40 +21,45 @@ from dexsim_real.twin.plant.protocol import Plant
 from dexsim_real.twin.plant.shapes import Primitive
 from dexsim_real.twin.wire.terminal import Terminal
 
-_STANDARD_GRAVITY = 9.80665  # m/s^2, what a part means by 1 g
+_STANDARD_GRAVITY = 9.80665  # m/s^2, 1 g of the IMU
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ObjectSensorConfig:
-    """IMU and camera, as far as they are the same in every trial."""
+    """Properties of IMU and camera that are the same in every trial."""
 
     imu_rate: float = setting(100.0, unit="Hz", low=1.0, high=1000.0)
-    """Samples per second."""
+    """Samples of the IMU per second."""
     imu_mount: tuple[float, float, float, float] = setting(
         (0.70710678, 0.0, 0.70710678, 0.0), unit="1", low=-1.0, high=1.0
     )
-    """Orientation (w, x, y, z) of the part in the object: its z along the object's x."""
+    """Orientation (w, x, y, z) of the IMU in the object; by default its z is along the object's x."""
     camera_rate: float = setting(30.0, unit="Hz", low=1.0, high=200.0)
     """Pictures per second."""
     picture: tuple[int, int] = setting((640, 480), unit="px", low=8, high=8192)
     """Columns and rows of a picture."""
     lost: float = setting(0.01, unit="1", low=0.0, high=1.0)
-    """Share of pictures in which the object is not found."""
+    """Probability that the object is not found in a picture."""
     optics: CameraConfig = setting(CameraConfig())
-    """Where the camera is; tell the runner the same."""
+    """Pose of the camera; give the same `--optics` options to `dexsim_real.run`."""
 
     def __post_init__(self):
         validate(self)
 
 
 class Clocked:
-    """What samples at a rate of its own: served when `due`; samples that were missed are left out."""
+    """A sensor with a rate of its own: call `serve` when `due`; missed samples are skipped.
+
+    Args:
+      rate: Hz.
+      start: s, time of the first sample.
+    """
 
     def __init__(self, rate: float, start: float):
         self.due, self._period = start, 1.0 / rate
 
     def serve(self, now: float) -> None:
-        """One sample, if it is time."""
+        """Take a sample if one is due at this time in s."""
         if now >= self.due:
             self.due = max(self.due + self._period, now)
             self._sample(now)
@@ -68,8 +72,8 @@ class Clocked:
 
 
 def rvc_frame(index: int, rotation: np.ndarray, acceleration: np.ndarray) -> bytes:
-    """The 19 bytes about a part that is turned by `rotation` [3, 3] in its level world and feels `acceleration` [3]
-    m/s^2 in its own frame."""
+    """The RVC frame of an IMU with a rotation [3, 3] in its world frame, z up, and an acceleration [3] m/s^2 in its own
+    frame."""
     yaw = math.atan2(rotation[1, 0], rotation[0, 0])
     pitch = math.asin(float(np.clip(-rotation[2, 0], -1.0, 1.0)))
     roll = math.atan2(rotation[2, 1], rotation[2, 2])
@@ -80,18 +84,20 @@ def rvc_frame(index: int, rotation: np.ndarray, acceleration: np.ndarray) -> byt
 
 
 class EmulatedImu(Clocked):
-    """The part's wire.
+    """The emulated IMU.
 
     Args:
       link: name of its terminal.
-      start: s, time of its first sample.
+      plant: the physics.
+      config: rate and mount.
+      seed: of its heading, which has no absolute reference.
+      start: s, time of the first sample.
     """
 
     def __init__(self, link: Path, plant: Plant, config: ObjectSensorConfig, *, seed: int, start: float):
         super().__init__(config.imu_rate, start)
         self.terminal, self.sent = Terminal(link), 0
         self._plant, self._mount = plant, _matrix(np.asarray(config.imu_mount))
-        # It knows no north.
         self._north = _about_z(float(np.random.default_rng(seed).uniform(-math.pi, math.pi)))
 
     def close(self) -> None:
@@ -99,9 +105,9 @@ class EmulatedImu(Clocked):
 
     def _sample(self, now: float) -> None:
         _, quat, felt = self._plant.measure_object()
-        # Its world stands upright by what gravity really is, which the runner knows only nearly.
+        # The vertical of its world frame follows the true gravity, which the runner knows only approximately.
         world = self._north @ _level(np.asarray(self._plant.up))
-        self.terminal.read()  # It has no ears.
+        self.terminal.read()  # It ignores what it receives.
         self.terminal.write(rvc_frame(self.sent, world @ _matrix(quat) @ self._mount, self._mount.T @ felt))
         self.sent += 1
 
@@ -119,7 +125,7 @@ def _about_z(angle: float) -> np.ndarray:
 
 
 def _level(up: np.ndarray) -> np.ndarray:
-    """Rows [3, 3]: a level frame's axes in the frame in which `up` [3] is the vertical."""
+    """Rows [3, 3]: the axes of a level frame, in the frame in which `up` [3] is the vertical."""
     z = up / np.linalg.norm(up)
     x = np.cross(np.eye(3)[np.argmin(np.abs(z))], z)
     x /= np.linalg.norm(x)
@@ -130,7 +136,7 @@ def _level(up: np.ndarray) -> np.ndarray:
 
 
 def outline(part: Primitive) -> np.ndarray:
-    """Points [N, 3] m of a primitive, in the object's frame, whose hull looks like it."""
+    """Points [N, 3] m in the object's frame whose convex hull approximates a primitive."""
     round_ = np.linspace(0, 2 * np.pi, 24, endpoint=False)
     ring = np.stack([np.cos(round_), np.sin(round_), 0 * round_], 1)
     if part.kind == "box":
@@ -138,7 +144,7 @@ def outline(part: Primitive) -> np.ndarray:
     elif part.kind == "cylinder":
         radius, half = part.size
         points = np.concatenate([radius * ring + [0, 0, half], radius * ring - [0, 0, half]])
-    else:  # A sphere, or two halves of one.
+    else:  # A sphere, or the two hemispheres of a capsule.
         heights = np.linspace(-np.pi / 2, np.pi / 2, 13)
         ball = part.size[0] * np.concatenate([np.cos(h) * ring + [0, 0, np.sin(h)] for h in heights])
         half = part.size[1] if part.kind == "capsule" else 0.0
@@ -147,9 +153,12 @@ def outline(part: Primitive) -> np.ndarray:
 
 
 def silhouette(parts: list[np.ndarray], optics: CameraConfig, size: tuple[int, int]) -> np.ndarray:
-    """The picture [rows, columns], bool, of convex bodies given by points [N, 3] m in the palm frame.
+    """The mask [rows, columns], bool, of convex bodies.
 
-    Bodies that reach behind the camera are not seen.
+    Args:
+      parts: points [N, 3] m of each body, palm frame. Bodies that extend behind the camera are not seen.
+      optics: the camera.
+      size: columns and rows.
     """
     from scipy.spatial import ConvexHull, QhullError
 
@@ -165,13 +174,13 @@ def silhouette(parts: list[np.ndarray], optics: CameraConfig, size: tuple[int, i
         pixels = np.stack(
             [optics.focal[0] * x / depth + optics.centre[0], optics.focal[1] * y / depth + optics.centre[1]], 1
         )
-        with contextlib.suppress(QhullError):  # A body that is seen as a line covers no pixel.
+        with contextlib.suppress(QhullError):  # A body that projects to a line covers no pixel.
             _fill(mask, pixels, ConvexHull(pixels).equations)
     return mask
 
 
 def _fill(mask: np.ndarray, pixels: np.ndarray, sides: np.ndarray) -> None:
-    """Set the pixels whose centres lie within all sides (a x + b y + c <= 0) of a polygon."""
+    """Set the pixels whose centres are inside a convex polygon with sides a x + b y + c <= 0."""
     low = np.clip(np.floor(pixels.min(0)).astype(int), 0, mask.shape[::-1])
     high = np.clip(np.ceil(pixels.max(0)).astype(int) + 1, 0, mask.shape[::-1])
     columns, rows = np.arange(low[0], high[0]), np.arange(low[1], high[1])
@@ -182,32 +191,39 @@ def _fill(mask: np.ndarray, pixels: np.ndarray, sides: np.ndarray) -> None:
 
 
 class EmulatedCamera(Clocked):
-    """The program that sends masks.
+    """The emulated camera, and the program that sends its masks.
 
     Args:
       path: of its socket.
-      start: s, time of its first picture.
+      plant: the physics.
+      config: rate, pose and pictures.
+      seed: of the lost pictures.
+      start: s, time of the first picture.
+
+    Raises:
+      HandError: the socket cannot be created.
     """
 
-    _ROOM = 4  # records that may wait for a slow reader
+    _MAX_QUEUED = 4  # records waiting for a slow reader
 
     def __init__(self, path: Path, plant: Plant, config: ObjectSensorConfig, *, seed: int, start: float):
         super().__init__(config.camera_rate, start)
         self.path, self.counts = path, Counter()
         self._plant, self._config = plant, config
         self._rng = np.random.default_rng(seed)
-        silhouette(
-            [outline(Primitive("sphere", (0.03,)))], config.optics, config.picture
-        )  # Imports what it needs: now.
+        # Imports SciPy now, not during the first exchange.
+        silhouette([outline(Primitive("sphere", (0.03,)))], config.optics, config.picture)
         self._clients: dict[socket.socket, bytearray] = {}
         self._server = socket.socket(socket.AF_UNIX)
         try:
             if path.is_socket():
-                path.unlink()  # Of a program that is no more.
+                path.unlink()  # Left by a program that has ended.
             self._server.bind(str(path))
         except OSError as error:
             self._server.close()
-            raise HandError(f"{path}: no socket for masks here ({error.strerror})") from None
+            raise HandError(
+                f"{path}: the socket for masks cannot be created ({error.strerror}); choose another --mask-socket"
+            ) from None
         self._server.listen()
         self._server.setblocking(False)
 
@@ -231,14 +247,14 @@ class EmulatedCamera(Clocked):
 
     def _send(self, data: bytes) -> None:
         for client, waiting in list(self._clients.items()):
-            if len(waiting) < self._ROOM * len(data):
+            if len(waiting) < self._MAX_QUEUED * len(data):
                 waiting += data
             else:
-                self.counts["left out"] += 1
+                self.counts["skipped"] += 1
             try:
                 del waiting[: client.send(waiting)]
             except BlockingIOError:
                 pass
-            except OSError:  # It has gone.
+            except OSError:  # The client has disconnected.
                 client.close()
                 del self._clients[client]

@@ -652,7 +652,7 @@ def test_the_command_on_the_emulated_hand_through_the_bytes(hand, tmp_path):
             str(tmp_path / "port"),
             "--imu-link",
             str(tmp_path / "imu"),
-            "--draw",
+            "--parameters",
             "nominal",
             "--output",
             str(tmp_path / "truth.json"),
