@@ -2,9 +2,9 @@
 
     python benchmarks/soak.py --minutes 30 --kills 50
 
-Soak: repeated runs of `python -m dexsim_real.run` on `python -m dexsim_real.twin` with all faults injected. It passes if
-nothing crashes, no command exceeds its limits, both ends are in a safe state within 0.1 s of losing each other, and the
-host's counters match the injected faults (up to the number of `hiccups` of the machine). Kills: runners end by SIGKILL
+Soak: `python -m dexsim_real.run` repeatedly on `python -m dexsim_real.twin` with all faults injected. It passes if
+nothing crashes, no command exceeds its limits, both ends are safe within 0.1 s of losing each other, and the host's
+counters match the injected faults (up to the number of `hiccups` of the machine). Kills: runners end by SIGKILL
 at random times. It passes if every log opens and replays, and the motors are off within 0.1 s. The exit code is 1 if
 anything fails.
 """

@@ -44,7 +44,7 @@ def inspect(path: Path, safe: float) -> dict:
 
 
 def reactions(states: list[float], sent: list[float], notes: list[tuple[float, bool]], safe: float) -> Iterator[float]:
-    """For each silence longer than allowed, the age in s of the last state when the last command before the hold was sent.
+    """For each silence longer than allowed, the age in s of the last state at the last command before the hold.
 
     `notes` are the changes of the bridge's reaction: their time, and whether it then held or relaxed for lack of
     measurements. A bridge that the machine has suspended sends nothing, which is safe.

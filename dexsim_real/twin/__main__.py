@@ -67,7 +67,7 @@ def check_policy(name: str, task: str, hand: Hand) -> None:
     policy = load_policy(name)
     if policy.task != task:
         raise HandError(f"{name} is a policy of the task {policy.task!r}; give --task {policy.task}")
-    trained, mounted = load_task(task, policy.env_config, hand).gravity, nominal_gravity(task)
+    trained, mounted = policy.spec.gravity, nominal_gravity(task)
     if np.abs(np.asarray(trained) - mounted).max() > 0.01:
         raise HandError(
             f"{name} was trained with gravity {np.round(trained, 2).tolist()} m/s^2 in the palm frame, the emulated "

@@ -8,7 +8,7 @@ import numpy as np
 from dexsim_real.twin.plant.scene import Scene
 
 
-class Touch(NamedTuple):
+class TipContact(NamedTuple):
     """One contact of object and fingertip; palm frame, forces act on the finger."""
 
     finger: int
@@ -22,7 +22,7 @@ class TipContacts(NamedTuple):
 
     force: np.ndarray  # [5, 3] N on each fingertip
     pressing: np.ndarray  # [5] N, sum of the normal forces of each fingertip
-    touches: list[Touch]
+    touches: list[TipContact]
 
 
 def tip_contacts(scene: Scene, data: mujoco.MjData) -> TipContacts:
@@ -41,5 +41,5 @@ def tip_contacts(scene: Scene, data: mujoco.MjData) -> TipContacts:
         normal, tangent = sign * wrench[0] * frame[0], sign * wrench[1:3] @ frame[1:]
         found.force[finger] += normal + tangent
         found.pressing[finger] += abs(wrench[0])
-        found.touches.append(Touch(int(finger), data.contact.pos[i].copy(), normal, tangent))
+        found.touches.append(TipContact(int(finger), data.contact.pos[i].copy(), normal, tangent))
     return found

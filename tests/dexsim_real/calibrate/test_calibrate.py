@@ -24,7 +24,7 @@ from dexsim.calibration.maps import joint_torque, load_calibration
 from dexsim.core import cli
 from dexsim.core.errors import CalibrationError, ConfigError
 from dexsim_real.calibrate import __main__ as calibrate
-from dexsim_real.calibrate import identify as calibrate_identify
+from dexsim_real.calibrate import identify_drives
 from dexsim_real.calibrate.__main__ import fit_and_report, main
 from dexsim_real.calibrate.gauge import Gauge, parse_reading
 from dexsim_real.calibrate.hand_loop import Operator
@@ -70,7 +70,7 @@ def arguments(folder, **options):
 
 
 def operator():
-    return Operator(Console(file=io.StringIO(), width=200), silent=True)
+    return Operator(Console(file=io.StringIO(), width=200), assume_yes=True)
 
 
 def record(bench, hand, options, who=None):
@@ -309,12 +309,12 @@ def test_a_touch_is_told_from_a_taxel_that_is_stuck(hand):
     counts, current = resting()
     stuck = counts.copy()
     stuck[:, 4, 17] = 255
-    with pytest.raises(HandError, match="pinky: column 1 row 5 read 255 counts alone: stuck") as caught:
+    with pytest.raises(HandError, match="pinky: column 1 row 5 read 255 counts alone and are stuck") as caught:
         check_rest(hand, stuck, current, CheckConfig(), 40.0, ())
     assert "\n" not in str(caught.value)
     touched = counts.copy()
     touched[:, 0, [40, 41, 52, 53]] += 60
-    with pytest.raises(HandError, match="4 taxels side by side on the thumb .* touches it") as caught:
+    with pytest.raises(HandError, match="4 adjacent taxels of the thumb .* touches it") as caught:
         check_rest(hand, touched, current, CheckConfig(), 40.0, ())
     assert "\n" not in str(caught.value)
     # A light touch hides among what is left at rest, unless it changes.
@@ -458,9 +458,9 @@ def test_nothing_is_overwritten(hand, session, tmp_path):
     path = tmp_path / "hand.toml"
     options = arguments(tmp_path)
     path.write_text("precious")
-    with pytest.raises(HandError, match="is there already: give another --output, or --force"):
+    with pytest.raises(HandError, match="already exists: give another --output, or --force"):
         arguments(tmp_path)
-    with pytest.raises(HandError, match=f"is there already: --from-log {re.escape(str(log))} fits these"):
+    with pytest.raises(HandError, match=f"already exists: --from-log {re.escape(str(log))} fits these"):
         fit_and_report(options, hand, [log], operator())  # It came while the hand was pressing.
     assert path.read_text() == "precious"
     fit_and_report(arguments(tmp_path, force=True), hand, [log], operator())
@@ -542,10 +542,10 @@ def test_the_command_refuses_a_touched_hand_in_one_line(tmp_path, monkeypatch, c
         assert all(np.all(block["mode"] == Mode.PASSIVE) for block in peer.commands)
     lines = capsys.readouterr().err.strip().splitlines()
     assert "firmware 1.3.9" in lines[0]
-    assert lines[-1].startswith("error: cannot zero the taxels: 3 taxels side by side on the ring read above 40 counts")
+    assert lines[-1].startswith("error: cannot tare the taxels: 3 adjacent taxels of the ring read above 40 counts")
     assert not (tmp_path / "hand.toml").exists()
     assert command("--port", "x", "--output", str(tmp_path / "hand.log")) == 2
-    assert "is there already" in capsys.readouterr().err
+    assert "already exists" in capsys.readouterr().err
 
 
 # --- identification ----------------------------------------------------------------------------------
@@ -559,10 +559,10 @@ def identifying(bench, hand, folder, monkeypatch, **options):
         kept[log.name] = log, start, rest
         raise CalibrationError("enough")
 
-    monkeypatch.setattr(calibrate_identify, "identify", keep)
+    monkeypatch.setattr(identify_drives, "identify", keep)
     options = arguments(folder, identify=True, output=folder / "hand.json", joints=("mid_joint1",), **options)
     with pytest.raises(CalibrationError, match="enough"):
-        calibrate_identify.identify_hand(options, hand, operator(), port=bench, clock=bench.clock, sleep=bench.sleep)
+        identify_drives.identify_hand(options, hand, operator(), port=bench, clock=bench.clock, sleep=bench.sleep)
     return kept["mid_joint1"]
 
 
@@ -608,12 +608,12 @@ def test_a_line_that_loses_too_much_identifies_nothing(hand, tmp_path):
     bench.exchange = lossy
     options = arguments(tmp_path, identify=True, output=tmp_path / "hand.json", joints=("mid_joint1",))
     with pytest.raises(LogError, match="mid_joint1: .* exchanges are missing"):
-        calibrate_identify.identify_hand(options, hand, operator(), port=bench, clock=bench.clock, sleep=bench.sleep)
+        identify_drives.identify_hand(options, hand, operator(), port=bench, clock=bench.clock, sleep=bench.sleep)
     with pytest.raises(LogError, match="is the log of something else .identify."):
         read_logs([options.log], hand)
     with pytest.raises(HandError, match="no joint 'knee'"):
         wrong = dataclasses.replace(options, joints=("knee",), log=tmp_path / "b.log")
-        calibrate_identify.identify_hand(wrong, hand, operator())
+        identify_drives.identify_hand(wrong, hand, operator())
 
 
 # --- the emulated hand -------------------------------------------------------------------------------
@@ -626,7 +626,7 @@ def test_the_emulated_hand_gives_its_torque_constants_back(hand, tmp_path, seed)
     from dexsim_real.twin.press import PressBench
 
     plant = PressBench(hand, seed)
-    bench, press_bench.GAUGE = PlantPort(plant), lambda: plant.tip_force
+    bench, press_bench.GAUGE = PlantPort(plant), lambda: float(max(-plant._spring @ plant._normal, 0.0))
     options = arguments(tmp_path, fingers=("middle",), press=PressConfig(), gauge="press_bench:read_gauge")
     fit_and_report(options, hand, [record(bench, hand, options)], operator())
     found, truth = -torque_constants(load_calibration(options.output, hand)), plant.truth()

@@ -222,8 +222,8 @@ def test_changes_are_noted_once(bench):
     bench.notes.clear()
     bench.run(0.5, wish=MIDDLE, force=30.0)
     bench.run(2.0, wish=MIDDLE)
-    assert bench.notes == ["hold: a fingertip presses too hard", "in command"]
-    assert bench.safety.counts["a fingertip presses too hard"] == round(0.5 / CYCLE)
+    assert bench.notes == ["hold: the fingertip force is too high", "in command"]
+    assert bench.safety.counts["the fingertip force is too high"] == round(0.5 / CYCLE)
 
 
 EVENT = st.fixed_dictionaries(

@@ -53,7 +53,7 @@ from dexsim_real.replay import __main__ as replay_command
 from dexsim_real.replay import replay
 from dexsim_real.replay.plots import show_rerun
 from dexsim_real.run import __main__ as run
-from dexsim_real.run import view
+from dexsim_real.run import status
 from dexsim_real.sensors import imu
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
 from dexsim_real.sensors.readings import ObjectEstimate
@@ -414,7 +414,7 @@ def forged(folder):
 
 
 def test_motors_off_means_off_and_the_view_says_what_is_read(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(view, "_LINES", 0.25)
+    monkeypatch.setattr(status, "_LINES", 0.25)
     with FollowingHand() as peer:
         options = [o for o in arguments(peer, tmp_path, "--seconds", "0.9", "--motors-off") if o != "--quiet"]
         assert run.main(options) == 0
@@ -423,7 +423,7 @@ def test_motors_off_means_off_and_the_view_says_what_is_read(tmp_path, monkeypat
     shown = capsys.readouterr().err
     for text in (
         "firmware 1.3.9",
-        "the policy begins",
+        "the policy starts",
         "policy 33.3 Hz",
         "exchanges 83.3 Hz",
         "0 corrupt",
@@ -438,9 +438,9 @@ def test_motors_off_means_off_and_the_view_says_what_is_read(tmp_path, monkeypat
 def test_the_live_table(monkeypatch):
     shown = io.StringIO()
     console = Console(file=shown, force_terminal=True, width=80)
-    monkeypatch.setattr(view, "Console", lambda **options: console)
-    monkeypatch.setattr(view, "_LIVE", 0.02)
-    with view.StatusView("a title", lambda: {"age": "3.1 ms", "force": "1.0 N"}) as live:
+    monkeypatch.setattr(status, "Console", lambda **options: console)
+    monkeypatch.setattr(status, "_LIVE", 0.02)
+    with status.StatusView("a title", lambda: {"age": "3.1 ms", "force": "1.0 N"}) as live:
         live.note("something happened")
         time.sleep(0.2)
     for text in ("a title", "age", "3.1 ms", "something happened"):
@@ -585,7 +585,7 @@ def test_signals(tmp_path, number):
         assert code == -9
         ticks = [record.time for record in LogReader(tmp_path / "run.log") if record.kind == Kind.TICK]
         assert sent - ticks[-1] < 1.0
-        assert replay.replay(tmp_path / "run.log").report["ended"] == "cut off"
+        assert replay.replay(tmp_path / "run.log").report["ended"] == "truncated"
     else:
         assert code == (143 if number == signal.SIGTERM else 130)
         assert not on[-1] and not on[np.array(peer.times) > sent + 0.5].any()

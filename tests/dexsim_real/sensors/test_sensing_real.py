@@ -169,7 +169,7 @@ def test_configurations_that_cannot_be():
 def test_who_measures_what():
     assert sources_of(GRASP) == {"hand", "camera", "user"}
     assert sources_of(ROTATE) == {"hand", "imu", "policy"}
-    with pytest.raises(HandError, match="cannot measure"):
+    with pytest.raises(HandError, match="no sensor measures"):
         sources_of(ROTATE_CRITIC)
 
 

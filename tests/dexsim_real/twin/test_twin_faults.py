@@ -59,7 +59,7 @@ def test_scripted_faults_come_at_their_time_in_order():
     injector = Injector(
         FaultConfig(script=("2 stuck 4 7 88", "0.5 drop request", "2 heat 3 40 1.5", "1 disconnect 0.7", "9 late")), 0
     )
-    found = [(k * 0.1, injector.draw(50 + k * 0.1)) for k in range(30)]
+    found = [(k * 0.1, injector.sample(50 + k * 0.1)) for k in range(30)]
     found = [(round(when, 1), fault) for when, fault in found if fault]
     assert [(when, fault.kind) for when, fault in found] == [
         (0.5, "drop"),
@@ -71,7 +71,7 @@ def test_scripted_faults_come_at_their_time_in_order():
     assert (found[2][1].joint, found[2][1].degrees, found[2][1].seconds) == (3, 40, 1.5)
     assert (found[3][1].taxel, found[3][1].count) == ((4, 7), 88)
     assert injector.injected == {"drop request": 1, "disconnect": 1, "heat": 1, "stuck": 1}
-    assert 0.1 <= injector.draw(60).seconds <= 0.15  # Drawn, where the script says nothing.
+    assert 0.1 <= injector.sample(60).seconds <= 0.15  # Drawn, where the script says nothing.
 
 
 def test_random_faults_have_their_rates_and_the_seed_repeats_them():
@@ -89,7 +89,7 @@ def test_random_faults_have_their_rates_and_the_seed_repeats_them():
     runs = []
     for seed in (1, 1, 2):
         injector = Injector(config, seed)
-        runs.append(([injector.draw(0.012 * k) for k in range(20_000)], injector.injected))
+        runs.append(([injector.sample(0.012 * k) for k in range(20_000)], injector.injected))
     assert runs[0] == runs[1] and runs[0] != runs[2]
     made = runs[0][1]
     for kind in KINDS:
@@ -130,7 +130,7 @@ def test_no_damage_leaves_a_frame_that_passes(seed, kind, request):
 class Cable:
     """Both ends of a cable in memory: a `Terminal` for the hand, pyserial's port for the host, and their clock."""
 
-    plugged, baud = True, 3_000_000
+    connected, baud = True, 3_000_000
 
     def __init__(self):
         self.now, self.line = 1000.0, None
@@ -139,10 +139,10 @@ class Cable:
     # What the hand sees.
 
     def open(self):
-        self.plugged = True
+        self.connected = True
 
     def close(self):
-        self.plugged = False
+        self.connected = False
         self.to_hand, self.to_host = bytearray(), bytearray()  # Whoever holds the old ones has lost them.
 
     def read(self):
@@ -167,12 +167,12 @@ class Port:
     """What pyserial gives the host."""
 
     def __init__(self, cable, timeout):
-        if not cable.plugged:
+        if not cable.connected:
             raise OSError(2, "gone")
         self._cable, self._timeout, self._buffer = cable, timeout, cable.to_host
 
     def _check(self):
-        if self._buffer is not self._cable.to_host or not self._cable.plugged:
+        if self._buffer is not self._cable.to_host or not self._cable.connected:
             raise OSError(5, "unplugged")
 
     @property
@@ -187,7 +187,7 @@ class Port:
 
     def read(self, size):
         self._check()
-        self._cable.wait(self._timeout, lambda: len(self._buffer) >= size or not self._cable.plugged)
+        self._cable.wait(self._timeout, lambda: len(self._buffer) >= size or not self._cable.connected)
         self._cable.wait(2e-5)
         self._check()
         data = bytes(self._buffer[:size])

@@ -32,7 +32,7 @@ from dexsim_real.twin.options import TwinArguments
 from dexsim_real.twin.plant.protocol import PlantMeasurement
 from dexsim_real.twin.plant.shapes import ObjectShape, Primitive
 from dexsim_real.twin.server import PlantClock, Twin
-from dexsim_real.twin.wire import object_side
+from dexsim_real.twin.wire import emulated_sensors
 from dexsim_real.twin.wire.command_check import CommandCheck, LimitsConfig
 from dexsim_real.twin.wire.faults import FaultConfig, Injector
 from dexsim_real.twin.wire.firmware import ABANDONED, OVERHEATED, Firmware, FirmwareConfig
@@ -410,18 +410,18 @@ def test_physics_follows_the_wall_clock_and_lets_go_what_it_cannot(hand):
             time.sleep(pace * seconds)
 
     notes, pace = [], 0.0
-    world = PlantClock(Slow(), 10.0, notes.append)
+    clock = PlantClock(Slow(), 10.0, notes.append)
     for now in np.arange(10.0, 10.5, 0.0007):
-        world.catch_up(now, PlantClock.SLICE)
-    assert world.plant.time == pytest.approx(0.5, abs=0.003) and world.slipped == 0
+        clock.catch_up(now, PlantClock.SLICE)
+    assert clock.plant.time == pytest.approx(0.5, abs=0.003) and clock.slipped == 0
     # Behind by less than the bound all of it is caught up, in slices; behind by more, the rest is let go.
     for _ in range(100):
-        world.catch_up(10.58, PlantClock.SLICE)
-    assert world.plant.time == pytest.approx(0.58, abs=1e-6)
-    world.catch_up(13.0)
-    assert world.plant.time == pytest.approx(0.59, abs=1e-6) and world.slipped == pytest.approx(2.41, abs=1e-6)
+        clock.catch_up(10.58, PlantClock.SLICE)
+    assert clock.plant.time == pytest.approx(0.58, abs=1e-6)
+    clock.catch_up(13.0)
+    assert clock.plant.time == pytest.approx(0.59, abs=1e-6) and clock.slipped == pytest.approx(2.41, abs=1e-6)
     assert len(notes) == 1 and "too slow" in notes[0]
-    report = world.report()
+    report = clock.report()
     assert report["simulated_s"] + report["slipped_s"] == pytest.approx(3.0, abs=1e-3)
 
 
@@ -442,7 +442,7 @@ def test_a_terminal_keeps_its_name(tmp_path):
     os.close(file)
     terminal.close()
     (tmp_path / "file").touch()
-    with pytest.raises(HandError, match="no link"):
+    with pytest.raises(HandError, match="not a link"):
         Terminal(tmp_path / "file")
     with pytest.raises(HandError, match="no pseudo-terminal"):
         Terminal(tmp_path / "none" / "port")
@@ -462,7 +462,7 @@ def rotation_by_axis(axis, angle):
 def test_an_rvc_frame_says_yaw_pitch_and_roll(yaw, pitch, roll):
     """Turned about z, then the new y, then the new x; against the bridge's reader as well."""
     rotation = rotation_by_axis([0, 0, 1], yaw) @ rotation_by_axis([0, 1, 0], pitch) @ rotation_by_axis([1, 0, 0], roll)
-    frame = object_side.rvc_frame(7, rotation, np.array([0.0, 0.5 * 9.80665, 9.80665]))
+    frame = emulated_sensors.rvc_frame(7, rotation, np.array([0.0, 0.5 * 9.80665, 9.80665]))
     assert len(frame) == 19 and frame[:3] == b"\xaa\xaa\x07" and sum(frame[2:18]) % 256 == frame[18]
     words = struct.unpack_from("<6h", frame, 3)
     np.testing.assert_allclose(words[:3], np.degrees([yaw, pitch, roll]) * 100, atol=0.51)
@@ -500,21 +500,21 @@ OPTICS = CameraConfig()
 def test_the_silhouette_of_a_sphere_and_of_a_box():
     place = np.array([0.05, 0.0, 0.09])
     depth = OPTICS.position[1] - place[1]
-    ball = object_side.outline(Primitive("sphere", (0.03,))) + place
-    mask = object_side.silhouette([ball], OPTICS, (640, 480))
+    ball = emulated_sensors.outline(Primitive("sphere", (0.03,))) + place
+    mask = emulated_sensors.silhouette([ball], OPTICS, (640, 480))
     # Outline of a sphere seen by a pinhole: a cone of half angle asin(r / d), nearly a circle.
     radius = 600 * math.tan(math.asin(0.03 / math.dist(OPTICS.position, place)))
     assert mask.sum() == pytest.approx(math.pi * radius**2, rel=0.03)
-    cube = object_side.outline(Primitive("box", (0.025, 0.025, 0.025))) + place
-    mask = object_side.silhouette([cube], OPTICS, (640, 480))
+    cube = emulated_sensors.outline(Primitive("box", (0.025, 0.025, 0.025))) + place
+    mask = emulated_sensors.silhouette([cube], OPTICS, (640, 480))
     side = 600 * 0.05 / (depth - 0.025)  # The near face hides the rest, seen nearly head on.
     assert mask.sum() == pytest.approx(side**2, rel=0.06)
     assert height_of(mask, OPTICS, place, 0) == pytest.approx(0.05, abs=0.001)
     # Half outside of the picture, behind the camera, and on edge.
-    assert 0 < object_side.silhouette([cube + [0.2, 0, 0]], OPTICS, (640, 480)).sum() < mask.sum()
-    assert not object_side.silhouette([cube + [0, 0.6, 0]], OPTICS, (640, 480)).any()
+    assert 0 < emulated_sensors.silhouette([cube + [0.2, 0, 0]], OPTICS, (640, 480)).sum() < mask.sum()
+    assert not emulated_sensors.silhouette([cube + [0, 0.6, 0]], OPTICS, (640, 480)).any()
     flat = cube * [1, 1, 0] + [0, 0, OPTICS.position[2]]
-    assert object_side.silhouette([flat], OPTICS, (640, 480)).sum() < 100
+    assert emulated_sensors.silhouette([flat], OPTICS, (640, 480)).sum() < 100
 
 
 @pytest.mark.parametrize(
@@ -527,7 +527,7 @@ def test_the_silhouette_of_a_sphere_and_of_a_box():
     ],
 )
 def test_outlines_reach_as_far_as_the_exact_shape(part):
-    shape, points = ObjectShape("one", (part,)), object_side.outline(part)
+    shape, points = ObjectShape("one", (part,)), emulated_sensors.outline(part)
     rng = np.random.default_rng(0)
     for _ in range(200):
         way = rng.standard_normal(3)

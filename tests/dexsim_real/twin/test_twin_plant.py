@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from paths import ROOT
 
-import dexsim_real.twin
+import dexsim_real.twin.plant
 from dexsim import load_hand
 from dexsim.core.assets import asset_path
 from dexsim.core.config import to_dict
@@ -167,34 +168,28 @@ def test_inside_nominal_and_overrides():
 
 
 def test_the_physics_shares_no_code_with_training():
-    """Geometry of the hand, configuration and errors are all that comes from `dexsim`; nothing of JAX."""
-    rooms = ("plant", "scene", "motors", "skin", "shapes", "draw", "assistant", "referee")
-    ours = ("types", *(f"plant.{room}" for room in rooms))
-    allowed = {"dexsim.hand.kinematics"}
-    for name in ours:
-        path = Path(dexsim_real.twin.__file__).parent / f"{name.replace('.', '/')}.py"
+    """Every module of the folder: of `dexsim` it takes the type of a hand's model alone, of JAX nothing."""
+    folder = Path(dexsim_real.twin.plant.__file__).parent
+    paths = sorted(folder.rglob("*.py"))
+    ours = {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__") for path in paths}
+    assert "dexsim_real.twin.plant.emulated_hand" in ours and len(ours) > 10
+    bridge = {"dexsim_real.wire.frames", "dexsim_real.core.errors", *ours}
+    for path in paths:
         for node in ast.walk(ast.parse(path.read_text())):
-            found = (
-                [alias.name for alias in node.names]
-                if isinstance(node, ast.Import)
-                else [node.module]
-                if isinstance(node, ast.ImportFrom)
-                else []
-            )
-            for module in found:
-                assert module.split(".")[0] not in ("jax", "dexsim_ppo"), f"{name} imports {module}"
-                assert "mjx" not in module
-                assert not module.startswith("dexsim.") and module != "dexsim" or module in allowed, f"{name}: {module}"
-                if module == "dexsim.hand.kinematics":
-                    assert [alias.name for alias in node.names] == ["Hand"]
-            if module_of_bridge := [m for m in found if m.startswith("dexsim_real.")]:
-                assert set(module_of_bridge) <= {
-                    "dexsim_real.wire.frames",
-                    "dexsim_real.core.errors",
-                    *(f"dexsim_real.twin.{n}" for n in ours),
-                    "dexsim_real.twin",
-                    "dexsim_real.twin.plant",
-                }, f"{name} imports {module_of_bridge}"
+            if isinstance(node, ast.Import):
+                found = [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom):
+                assert node.level == 0, f"{path.name}: relative import"
+                found = [f"{node.module}.{alias.name}" for alias in node.names]
+            else:
+                continue
+            for name in found:
+                package = name.split(".")[0]
+                assert package not in ("jax", "dexsim_ppo", "importlib"), f"{path.name} imports {name}"
+                assert "mjx" not in name
+                assert package != "dexsim" or name == "dexsim.hand.kinematics.Hand", f"{path.name}: {name}"
+                if package == "dexsim_real":
+                    assert name in bridge or name.rpartition(".")[0] in bridge, f"{path.name}: {name}"
 
 
 # --- motors --------------------------------------------------------------------------------------
@@ -202,7 +197,7 @@ def test_the_physics_shares_no_code_with_training():
 
 def test_a_step_follows_the_second_order_closed_form(hand):
     made, inertia, step = drives(hand), 2e-3, 0.05
-    made.order(0.0, motors(step))
+    made.send(0.0, motors(step))
     angle, speed, fine = np.zeros(12), np.zeros(12), 20
     stiffness, damping = STIFFNESS * 100, BACK_EMF
     omega, zeta = math.sqrt(stiffness / inertia), damping / 2 / math.sqrt(stiffness * inertia)
@@ -225,7 +220,7 @@ def test_a_step_follows_the_second_order_closed_form(hand):
 def test_a_load_costs_a_steady_error_that_integral_action_removes(hand):
     for ki, rest in ((0.0, 0.2 / 3.0), (100.0, 0.0)):
         made, inertia = drives(hand), 2e-3
-        made.order(0.0, motors(0.5, ki=1.0 * ki))
+        made.send(0.0, motors(0.5, ki=1.0 * ki))
         angle, speed = np.zeros(12), np.zeros(12)
         for k in range(60000 if ki else 2000):
             torque, _ = made.step(k * PERIOD, angle, speed)
@@ -236,7 +231,7 @@ def test_a_load_costs_a_steady_error_that_integral_action_removes(hand):
 
 def test_current_at_a_static_torque_and_its_limits(hand):
     made = drives(hand)
-    made.order(0.0, motors(0.1))
+    made.send(0.0, motors(0.1))
     torque, _ = made.step(0.0, np.zeros(12), np.zeros(12))
     assert torque == pytest.approx(np.full(12, 0.3))
     assert made.current == pytest.approx(0.3 / hand.torque_limit * STALL_CURRENT)
@@ -250,14 +245,14 @@ def test_current_at_a_static_torque_and_its_limits(hand):
         (300, -0.5, 1.0),
     ):
         made = drives(hand)
-        made.order(0.0, motors(1.5 + 2 * (speed > 0), torque_max=torque_max))
+        made.send(0.0, motors(1.5 + 2 * (speed > 0), torque_max=torque_max))
         torque, _ = made.step(0.0, np.zeros(12), speed * hand.speed_limit)
         assert torque == pytest.approx(share * hand.torque_limit, abs=1e-6), (torque_max, speed)
 
 
 def test_losses_depend_on_the_direction_of_power(hand):
     made = drives(hand, efficiency=0.8, coulomb_friction=0.02)
-    made.order(0.0, motors(0.05))
+    made.send(0.0, motors(0.05))
     torque, friction = made.step(0.0, np.zeros(12), np.zeros(12))
     # What moves the load is 0.8 of the torque less the dry friction; what holds when driven back, 1.2 and more.
     assert torque - friction == pytest.approx(0.8 * 0.15 - 0.02 * hand.torque_limit)
@@ -267,8 +262,8 @@ def test_losses_depend_on_the_direction_of_power(hand):
 def test_commands_reach_each_board_after_its_own_delay(hand):
     made = drives(hand)
     made.delay = np.linspace(0.0, 0.011, 12)
-    made.order(0.0, motors(0.0))
-    made.order(0.005, motors(0.1))
+    made.send(0.0, motors(0.0))
+    made.send(0.005, motors(0.1))
     reached = np.full(12, np.nan)
     for k in range(30):
         torque, _ = made.step(k * PERIOD, np.zeros(12), np.zeros(12))
@@ -279,15 +274,22 @@ def test_commands_reach_each_board_after_its_own_delay(hand):
 
 def test_passive_motors_give_nothing(hand):
     made = drives(hand)
-    made.order(0.0, motors(1.0, mode=Mode.PASSIVE))
+    made.send(0.0, motors(1.0, mode=Mode.PASSIVE))
     torque, _ = made.step(0.0, np.zeros(12), np.zeros(12))
     assert not torque.any() and not made.current.any()
+
+
+def steady(heat, current):
+    """Winding and case, degC, after a current A has flowed for ever: the loss grows with the winding's temperature."""
+    power, path = current**2 * heat.resistance, heat.to_case + heat.to_air
+    loss = power * (1 + heat.rise * (heat.air - heat.reference)) / (1 - power * heat.rise * path)
+    return heat.air + loss * path, heat.air + loss * heat.to_air
 
 
 def test_heat_settles_where_loss_and_flow_balance(hand):
     heat = Heat(winding=0.01, case=0.02)
     made = drives(hand, heat, thermal=1.0)
-    made.order(0.0, motors(0.1 * hand.torque_limit))
+    made.send(0.0, motors(0.1 * hand.torque_limit))
     for k in range(4000):
         made.step(k * PERIOD, np.zeros(12), np.zeros(12))
     current = 0.3  # of 1 A: 0.1 rad per Nm of limit times 3 Nm/rad
@@ -295,7 +297,7 @@ def test_heat_settles_where_loss_and_flow_balance(hand):
     loss = current**2 * heat.resistance * (1 + heat.rise * (made.winding - heat.reference))
     assert made.winding - made.case == pytest.approx(loss * heat.to_case, rel=1e-3)
     assert made.case - heat.air == pytest.approx(loss * heat.to_air, rel=1e-3)
-    assert (made.winding[0], made.case[0]) == pytest.approx(heat.steady(current), abs=0.02)
+    assert (made.winding[0], made.case[0]) == pytest.approx(steady(heat, current), abs=0.02)
     torque, _ = made.step(9.0, np.zeros(12), np.zeros(12))
     weaker = 1 - heat.weakening * (made.winding - heat.reference)
     assert torque == pytest.approx(0.3 * hand.torque_limit * weaker, rel=1e-3)
@@ -498,7 +500,7 @@ def test_motors_that_go_off_take_the_object_back(hand):
 def test_a_runner_that_goes_on_is_served_after_a_while():
     helper, posture = Assistant("rotate", patience=5.0), np.array(POSTURES["rotate"]) + 0.2
     assert helper.watch(0.0, posture, posture, None) is Stage.AWAY
-    assert not helper.curious(4.9) and helper.curious(5.1)
+    assert not helper.wants_clearance(4.9) and helper.wants_clearance(5.1)
     assert helper.watch(5.1, posture, posture, False) is Stage.AWAY
     assert helper.watch(5.2, posture, posture, True) is Stage.HOLD
     assert helper.watch(5.5, posture, posture, None) is Stage.HOLD
