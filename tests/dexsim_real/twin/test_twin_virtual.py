@@ -14,7 +14,8 @@ from dexsim.registry import make_task
 from dexsim.task_spec import TaskSpec
 from dexsim_real.control.controller import Tick
 from dexsim_real.sensors.hand import HardwareConfig
-from dexsim_real.twin.plant.emulated_hand import EmulatedHand, nominal_gravity
+from dexsim_real.twin.plant.emulated_hand import EmulatedHand
+from dexsim_real.twin.plant.mount import nominal_gravity
 from dexsim_real.twin.plant.shapes import SHAPES, product
 from dexsim_real.twin.virtual import (
     RATE,
