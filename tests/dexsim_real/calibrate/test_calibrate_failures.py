@@ -137,7 +137,7 @@ def test_nothing_is_overwritten(hand, session, tmp_path):
 def test_logs_that_are_none_of_presses(hand, tmp_path):
     with LogWriter(tmp_path / "run.log") as log:
         log.add(Kind.META, {"task": "grasp"})
-    with pytest.raises(LogError, match="is the log of something else .grasp."):
+    with pytest.raises(LogError, match="this is a log of .grasp."):
         read_logs([tmp_path / "run.log"], hand)
     with LogWriter(tmp_path / "early.log") as log:
         log.add(Kind.NOTE, "end: no answer")

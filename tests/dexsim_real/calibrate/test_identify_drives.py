@@ -72,7 +72,7 @@ def test_a_line_that_loses_too_much_identifies_nothing(hand, tmp_path):
     options = arguments(tmp_path, identify=True, output=tmp_path / "hand.json", joints=("mid_joint1",))
     with pytest.raises(LogError, match="mid_joint1: .* exchanges are missing"):
         identify_drives.identify_hand(options, hand, operator(), port=bench, clock=bench.clock, sleep=bench.sleep)
-    with pytest.raises(LogError, match="is the log of something else .identify."):
+    with pytest.raises(LogError, match="this is a log of .identify."):
         read_logs([options.log], hand)
     with pytest.raises(HandError, match="no joint 'knee'"):
         wrong = dataclasses.replace(options, joints=("knee",), log=tmp_path / "b.log")

@@ -22,17 +22,6 @@ from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogError, LogReader, LogWriter
 
 
-@pytest.fixture(scope="module")
-def session(hand, tmp_path_factory):
-    """The index pressed with pad and side: bench, arguments, log, what the terminal showed."""
-    folder = tmp_path_factory.mktemp("press")
-    bench = BenchHand(hand, plates(hand, "index pad", "index side"), dead=((1, 52), (1, 110)))
-    options, who = arguments(folder, plot=folder / "hand.png", report=folder / "hand.json"), operator()
-    log = record(bench, hand, options, who)
-    fit_and_report(options, hand, [log], who)
-    return bench, options, log, who.console.file.getvalue()
-
-
 def test_torque_constants_come_back(hand, session):
     bench, options, _, _ = session
     calibration = load_calibration(options.output, hand)
@@ -60,8 +49,8 @@ def test_the_file_says_what_is_not_known_and_the_report_has_it_all(hand, session
     notes = "\n".join(load_calibration(options.output, hand).notes)
     assert "ring_joint1: not recorded" in notes and "error of the force sensor" in notes
     # Of the two that read nothing the one in the middle of the press is dead; the other lies beside it.
-    assert "index: dead: column 4 row 4:" in notes and "column 9 row 2" not in notes
-    assert "motors off, the currents read up to" in notes
+    assert "index: dead: column 4 row 4 read" in notes and "column 9 row 2" not in notes
+    assert "with the motors off the currents read up to" in notes
     report = json.loads(options.report.read_text())
     joint = report["joints"]["index_joint1"]
     assert joint["press"] == "index pad" and joint["loading"]["r_squared"] > 0.99
@@ -120,7 +109,7 @@ class Typist(io.StringIO):
     def write(self, text):
         if "Enter presses" in text:
             self.lines.put("\n")
-        elif "the gauge shows" in text:
+        elif "reading of the gauge" in text:
             self.read += 1
             grams = 1e3 * self.bench.force[2] / 9.80665
             # A slip of the finger first: it is asked for again.
@@ -151,7 +140,7 @@ def scale(hand, tmp_path_factory):
 def test_a_kitchen_scale_gives_the_newtons(hand, scale):
     """Without the scale all torques would be 15 % too small."""
     bench, options, typist = scale
-    assert typist.read == 12 and "'five' is no reading" in typist.getvalue()
+    assert typist.read == 12 and "'five' is not a reading" in typist.getvalue()
     calibration = load_calibration(options.output, hand)
     truth = np.stack([bench.constant * bench.efficiency, bench.constant / bench.back])
     np.testing.assert_allclose(-torque_constants(calibration)[:, 6:8], truth[:, 6:8], rtol=0.03)
@@ -181,5 +170,5 @@ def test_readings_of_a_gauge(text, newtons):
 
 @pytest.mark.parametrize("text", ["", "five", "5 lb", "-3", "1e3", "nan", "530", "5.2.1"])
 def test_what_is_no_reading(text):
-    with pytest.raises(HandError, match="no reading|grams need a g"):
+    with pytest.raises(HandError, match="not a reading|grams need a g"):
         parse_reading(text)

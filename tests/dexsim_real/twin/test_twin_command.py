@@ -105,12 +105,15 @@ def test_what_is_wrong_is_said_in_one_line(tmp_path):
     for options, message in (
         (["--faults.script", "5 melt"], "no kind 'melt'"),
         (["--task", "juggle"], "choose from grasp, rotate"),
-        (["--policy", "grasp"], "of the task 'grasp', the hand is mounted for 'rotate'"),
+        (["--policy", "grasp"], "of the task 'grasp'; give --task grasp"),
         (["--policy", "nobody"], "nobody: no such file"),
         (["--plant", "nowhere:make"], "No module named 'nowhere'"),
         (["--faults.flip", "2"], "between 0 and 1"),
         (["--plant", "twin_plant:make", "--link", str(tmp_path / "no" / "port")], "no pseudo-terminal"),
-        (["--plant", "twin_plant:make", "--mask-socket", str(tmp_path / "no" / "m")], "no socket for masks"),
+        (
+            ["--plant", "twin_plant:make", "--mask-socket", str(tmp_path / "no" / "m")],
+            "socket for masks cannot be created",
+        ),
     ):
         with pytest.raises(DexsimError, match=message) as found:
             twin_command.main([*options, "--no-realtime"])
