@@ -59,7 +59,7 @@ def test_dead_taxels_are_those_among_pressed_ones(hand):
 def test_a_touched_hand_is_refused_before_the_motors_come_on(hand, tmp_path):
     bench = BenchHand(hand, plates(hand, "index pad"))
     bench.touched[2, [40, 41, 52, 53]] = 6.0
-    with pytest.raises(HandError, match="on the middle .* free the fingertips"):
+    with pytest.raises(HandError, match="of the middle .* free the fingertips"):
         record(bench, hand, arguments(tmp_path, press=QUICK))
     assert not on(bench).any() and bench.closed and not (tmp_path / "hand.toml").exists()
 
@@ -76,6 +76,6 @@ def test_a_finger_zeroed_under_load_is_found_out(hand, tmp_path):
         return exchange(command)
 
     bench.exchange = let_go
-    with pytest.raises(HandError, match="index pad: reads -.* it was touched while it was zeroed"):
+    with pytest.raises(HandError, match="index pad: reads -.* it was touched while it was tared"):
         record(bench, hand, arguments(tmp_path, press=QUICK))
     assert off(bench) and bench.closed
