@@ -1,6 +1,7 @@
 """The documentation: its snippets run, its commands have the options that they name, its log is sound and rendered."""
 
 import json
+import pkgutil
 import re
 import shlex
 import sys
@@ -110,6 +111,27 @@ def test_extras_and_targets_exist():
             assert next(word for word in shlex.split(line)[1:] if "=" not in word) in targets, (
                 f"{name_of(page)}: {line}"
             )
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_names_in_the_text_exist(page):
+    """Paths of the checkout, and dotted names of the packages, that a page mentions in backquotes."""
+    if page.name == "CHANGELOG.md":
+        return  # It names what is gone.
+    for name in re.findall(
+        r"`((?:dexsim|dexsim_ppo|dexsim_real|tests|benchmarks|docs|assets)/[\w./-]+)`", page.read_text()
+    ):
+        assert (ROOT / name).exists(), f"{name_of(page)}: {name}"
+    for name in re.findall(r"`((?:dexsim|dexsim_ppo|dexsim_real)(?:\.\w+)+)[`(]", page.read_text()):
+        assert resolves(name), f"{name_of(page)}: {name}"
+
+
+def resolves(name: str) -> bool:
+    try:
+        pkgutil.resolve_name(name)
+    except (ImportError, AttributeError):
+        return False
+    return True
 
 
 @pytest.mark.parametrize("page", WORDS)
