@@ -121,6 +121,8 @@ def check(record: dict[str, Any]) -> str | None:
     for key in ("commit", "title", "command", "hardware", "verdict", "notes"):
         if not isinstance(record[key], str):
             return f"{key} is not text"
+    if not (record["title"] and record["command"] and record["verdict"]):
+        return "title, command or verdict is empty"
     if not all(isinstance(seed, int) for seed in record["seeds"]):
         return "seeds are not integers"
     for name, value in record["metrics"].items():
