@@ -98,7 +98,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     cli.enable_caches()
     arguments, begun = parse_arguments(argv)
     command = shlex.join(["python", "-m", "dexsim_ppo.train", *argv])
-    run, stopped = run_training(arguments, begun, started, command)
+    with cli.naming_options(TrainArguments, arguments):
+        run, stopped = run_training(arguments, begun, started, command)
     if stopped:
         print(
             f"stopped by {signal.Signals(stopped).name}; resume with: "
@@ -173,8 +174,11 @@ def parse_arguments(argv: list[str]) -> tuple[TrainArguments, checkpoint.Checkpo
     for name in ("--task", "--preset", "--resume", "--policy"):
         early.add_argument(name, nargs="?")
     known, _ = early.parse_known_args(argv)
+    preset, description = known.preset or "auto", "Train a task."
+    if preset == "auto" and cli.wants_help(argv):  # To ask which device there is takes seconds.
+        preset, description = "cpu", f"{description} Defaults that depend on the device are those of --preset cpu."
     begun = find_beginning(known.task, known.policy, known.resume)
-    default = default_arguments(known.task, known.preset or "auto", begun)
+    default = default_arguments(known.task, preset, begun)
     given = {argument.split("=")[0] for argument in argv}
     if "--steps" in given and "--minutes" not in given:
         default = dataclasses.replace(default, minutes=0.0)
@@ -183,7 +187,7 @@ def parse_arguments(argv: list[str]) -> tuple[TrainArguments, checkpoint.Checkpo
         argv,
         default=default,
         prog="python -m dexsim_ppo.train",
-        description="Train a task.",
+        description=description,
     )
     return dataclasses.replace(arguments, task=default.task), begun
 
