@@ -7,6 +7,7 @@ The policy is a file, or the name of a shipped one. The episodes are the task's 
 """
 
 import dataclasses
+import functools
 import math
 import sys
 import time
@@ -23,6 +24,7 @@ import tyro
 from dexsim.core import cli, statistics
 from dexsim.core.compilation import collector_paused, jit
 from dexsim.core.config import override, setting, validate
+from dexsim.core.options import Option
 from dexsim.registry import find_task
 from dexsim_ppo.learner.types import Environment
 from dexsim_ppo.policy import Policy, PolicyParams, act, load_policy
@@ -251,7 +253,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     chunk = min(arguments.chunk or default_chunk(), arguments.episodes)
     seconds = [f"evaluation_seconds={arguments.seconds}"] if arguments.seconds else []
     policy = dataclasses.replace(policy, env_config=override(policy.env_config, (*seconds, *arguments.set)))
-    env = policy.make_env(backend=arguments.backend, num_envs=chunk)
+    entry = find_task(policy.task)
+    with cli.naming_options(entry.config_class, entry.config(), functools.partial(_typed, arguments)):
+        env = policy.make_env(backend=arguments.backend, num_envs=chunk)
     report, snapshots = Evaluator(env, chunk)(policy.params, episodes=arguments.episodes, seed=arguments.seed)
     report |= {"policy": arguments.policy, "ablate": list(arguments.ablate), "set": list(arguments.set)}
     report |= {"backend": env.backend} | cli.environment_report()
@@ -261,6 +265,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments.video:
         print(f"video: {write_video(env, snapshots, arguments.video)}")
     return 0
+
+
+def _typed(arguments: EvaluateArguments, field: Option) -> str | None:
+    """What was typed before the value of a field of the task's configuration; None if it is the file's."""
+    path = ".".join(field.path)
+    if any(entry.partition("=")[0] == path for entry in arguments.set):
+        return f"--set {path}="
+    return "--seconds " if path == "evaluation_seconds" and arguments.seconds else None
 
 
 def print_report(report: dict[str, Any], *, title: str) -> None:

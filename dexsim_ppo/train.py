@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import jax
 
 from dexsim.core import cli
-from dexsim.core.config import from_dict
+from dexsim.core.config import from_dict, naming_file
 from dexsim.core.errors import ConfigError, DexsimError
 from dexsim.registry import find_task
 from dexsim_ppo import checkpoint
@@ -160,7 +160,8 @@ def default_arguments(task: str | None, preset: str, begun: checkpoint.Checkpoin
     name = begun.task if begun else (task or "grasp").rpartition(":")[2]
     entry = find_task(name)
     if isinstance(begun, checkpoint.Checkpoint):
-        return arguments_from_dict(entry.config_class, migrate_arguments(begun.content["arguments"], begun.path))
+        with naming_file(begun.path):
+            return arguments_from_dict(entry.config_class, migrate_arguments(begun.content["arguments"], begun.path))
     default = preset_arguments(name, entry.config(), preset)
     if begun:
         env = from_dict(entry.config_class, begun.env_config)

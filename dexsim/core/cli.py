@@ -17,7 +17,7 @@ from typing import Any, Literal, TypeVar
 from dexsim.core.assets import cache_path
 from dexsim.core.errors import ConfigError, DexsimError, DexsimWarning
 from dexsim.core.files import write_whole
-from dexsim.core.options import explain, group_docs, help_page, in_option_names, options_of
+from dexsim.core.options import Option, explain, group_docs, help_page, in_option_names, options_of
 
 T = TypeVar("T")
 
@@ -85,12 +85,14 @@ def parse(cls: type[T], argv: Sequence[str], *, prog: str, description: str, def
 
 
 @contextlib.contextmanager
-def naming_options(cls: type, default: Any = None) -> Iterator[None]:
-    """Errors from within that name a field of the options name the option as it is typed."""
+def naming_options(
+    cls: type, default: Any = None, typed: Callable[[Option], str | None] = "{.name} ".format
+) -> Iterator[None]:
+    """Errors from within that name a field of these options name the option as it is typed; see `in_option_names`."""
     try:
         yield
     except ConfigError as error:
-        raise UsageError(in_option_names(str(error), options_of(cls, default))) from None
+        raise UsageError(in_option_names(str(error), options_of(cls, default), typed)) from None
 
 
 def wants_help(argv: Sequence[str]) -> bool:

@@ -3,13 +3,15 @@
 The same dataclasses are the command line (tyro), the checkpoint header and the documentation.
 """
 
+import contextlib
 import dataclasses
 import functools
 import json
 import math
 import types
 import typing
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from pathlib import Path
 from typing import Any, TypeVar
 
 from dexsim.core.errors import ConfigError
@@ -136,6 +138,15 @@ def from_dict(cls: type[T], data: dict[str, Any]) -> T:
         if name not in known:
             raise ConfigError(f"{cls.__name__} has no field {name!r}")
     return cls(**{name: _rebuild(hints[name], value, f"{cls.__name__}.{name}") for name, value in data.items()})
+
+
+@contextlib.contextmanager
+def naming_file(path: str | Path) -> Iterator[None]:
+    """Errors from within begin with the name of the file that the configuration is read from."""
+    try:
+        yield
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
 
 
 def override(data: dict[str, Any], settings: Iterable[str]) -> dict[str, Any]:

@@ -13,7 +13,7 @@ import shutil
 import textwrap
 import types
 import typing
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from dexsim.core.config import choices_of, number_text, range_text
 
 METAVARS = {bool: "True|False", int: "INT", float: "FLOAT", str: "TEXT", Path: "PATH"}
 KINDS = {bool: "True or False", int: "a whole number", float: "a number", str: "a word", Path: "a path"}
-MANY = {bool: "times True or False", int: "whole numbers", float: "numbers", str: "words", Path: "paths"}
+MANY = {bool: "values, each True or False", int: "whole numbers", float: "numbers", str: "words", Path: "paths"}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -280,14 +280,24 @@ def given(argv: Sequence[str]) -> dict[str, list[str]]:
     return found
 
 
-def in_option_names(message: str, options: Iterable[Option]) -> str:
-    """An error message that names fields by class, with the options' names as they are typed instead."""
+def in_option_names(message: str, options: Iterable[Option], typed: Callable[[Option], str | None]) -> str:
+    """An error message that names fields by class, with what is typed instead.
+
+    Args:
+      message: such as "GraspConfig.push_probability = 1.5: must be between 0 and 1".
+      options: those that may be meant.
+      typed: what is typed before an option's value, such as "--env.push-probability "; None for an option that
+        was not typed.
+    """
     for option in options:
+        before = typed(option)
+        if before is None:
+            continue
         field = rf"\b{re.escape(option.owner.__name__)}\.{option.path[-1]}"
-        message = re.sub(rf"{field} = '([^']*)'", lambda m, n=option.name: f"{n} {m[1]}", message)
-        message = re.sub(rf"{field} = \(([^()]*)\)", lambda m, n=option.name: f"{n} {m[1].replace(',', '')}", message)
-        message = re.sub(rf"{field} = ", f"{option.name} ", message)
-        message = re.sub(rf"{field}\b", option.name, message)
+        message = re.sub(rf"{field} = '([^']*)'", lambda m, b=before: b + m[1], message)
+        message = re.sub(rf"{field} = \(([^()]*)\)", lambda m, b=before: b + m[1].replace(",", ""), message)
+        message = re.sub(rf"{field} = ", before, message)
+        message = re.sub(rf"{field}\b", before.rstrip(" ="), message)
     return message
 
 

@@ -69,14 +69,14 @@ class PPOConfig:
     observation_clip: float = setting(5.0, unit="1", low=0.1)
     """Bound on the magnitude of normalised observations."""
     matmul_precision: Literal["default", "high", "highest"] = setting("highest")
-    """Of the networks' matrix products; on NVIDIA GPUs `default` is TF32."""
+    """Precision of the networks' matrix products; on NVIDIA GPUs `default` is TF32."""
 
     def __post_init__(self) -> None:
         validate(self)
         if self.num_envs * self.rollout_length % self.minibatches:
             raise ConfigError(
-                f"PPOConfig.minibatches = {self.minibatches}: must divide num_envs * "
-                f"rollout_length = {self.num_envs * self.rollout_length}"
+                f"PPOConfig.minibatches = {self.minibatches}: must divide PPOConfig.num_envs * "
+                f"PPOConfig.rollout_length, which is {self.num_envs * self.rollout_length}"
             )
         for low, mid, high in (
             ("learning_rate_min", "learning_rate", "learning_rate_max"),
@@ -84,8 +84,8 @@ class PPOConfig:
         ):
             if not getattr(self, low) <= getattr(self, mid) <= getattr(self, high):
                 raise ConfigError(
-                    f"PPOConfig.{mid} = {getattr(self, mid):g}: must be between {low} "
-                    f"= {getattr(self, low):g} and {high} = {getattr(self, high):g}"
+                    f"PPOConfig.{mid} = {getattr(self, mid):g}: must be between PPOConfig.{low} "
+                    f"= {getattr(self, low):g} and PPOConfig.{high} = {getattr(self, high):g}"
                 )
 
     @property

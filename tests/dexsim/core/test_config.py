@@ -91,7 +91,7 @@ def test_config_errors_are_the_librarys():
         (Randomization, dict(latency=(0.0, 1.0)), ("Randomization.latency", "1 s", "0 and 0.2 s")),
         (GraspReward, dict(drop=3.0), ("GraspReward.drop", "3", "-10000 and 0")),
         (GraspConfig, dict(finger_force=(5.0, 2.0)), ("GraspConfig.finger_force", "5, 2")),
-        (GraspConfig, dict(pool_size=0), ("GraspConfig.pool_size", "0", "1 and 1e+06")),
+        (GraspConfig, dict(pool_size=0), ("GraspConfig.pool_size", "0", "1 and 1000000")),
     ],
 )
 def test_the_librarys_own_configs_refuse_alike(build, fields, words):
@@ -119,9 +119,9 @@ def test_every_number_of_the_grasp_config_has_a_range_that_is_enforced():
             for bad in (-1e9, 1e9):
                 bad = type(first)(bad)
                 text = message(cls, **{field.name: (bad,) * len(value) if isinstance(value, tuple) else bad})
-                assert f"{cls.__name__}.{field.name} = {bad:g}" in text
+                assert f"{cls.__name__}.{field.name} = {bad:.0f}" in text
                 unit = field.metadata["unit"]
-                assert unit == "" or unit in text
+                assert unit in ("", "1") or unit in text
             checked += 1
     assert checked > 60
 
