@@ -134,9 +134,9 @@ def test_every_option_says_what_it_is(command, task):
     for found in load(command, task)[2]:
         text = field_docs(found.owner).get(found.field.name, "")
         place = f"{found.owner.__name__}.{found.field.name}"
-        if len(text) < 8 or not text.endswith("."):
+        if len(text) < 6 or not text.endswith("."):
             lacking.append(f"{place}: help text, a sentence or a noun phrase that ends with a full stop")
-        if not (text[:1].isupper() or re.match(r"[\w]+: ", text)) and text[:1] not in '+"R':
+        if not (text[:1].isupper() or re.match(r"[\w]+: ", text)) and text[:1] not in '+"':
             lacking.append(f"{place}: help text of its own, not the rest of another's: {text!r}")
         if found.hint is None:
             continue

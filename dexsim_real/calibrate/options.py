@@ -63,9 +63,10 @@ class CalibrateArguments:
     """Options of `python -m dexsim_real.calibrate`."""
 
     port: str | None = None
-    """Serial port of the hand (a name under /dev/serial/by-id stays the same), or sdk:MODULE:FUNCTION."""
+    """Serial port of the hand (names under /dev/serial/by-id are stable), or sdk:MODULE:FUNCTION. None only with
+    --from-log."""
     output: Path | None = None
-    """The file to write: hand.toml by default, and hand.json with --identify."""
+    """Output file; None for hand.toml, or hand.json with --identify."""
     force: bool = False
     """Overwrite the output if it is there."""
     from_log: tuple[Path, ...] = ()
@@ -73,8 +74,8 @@ class CalibrateArguments:
     identify: bool = False
     """Move the free joints one after the other, and fit stiffness, damping, friction and latency instead."""
     gauge: str | None = None
-    """Compare the taxels with an instrument: `ask` to type in what a kitchen scale or a force gauge shows, or
-    MODULE:FUNCTION for a function that gives newtons. Without it the taxels are the reference, as in the paper."""
+    """Compare the taxels with a gauge: `ask` to type the readings of a kitchen scale or force gauge, or MODULE:FUNCTION
+    for a function that returns newtons. None: the taxels are the reference, as in the paper."""
     levels: int = setting(6, unit="1", low=5, high=30)
     """Forces at which the gauge is read, on the way up and on the way down."""
     fingers: tuple[str, ...] = ()
@@ -86,17 +87,17 @@ class CalibrateArguments:
     serial: str = ""
     """Serial number or name of the hand, for the file."""
     calibration: Path | None = None
-    """With --identify: this hand's calibration file, without which torques are unknown."""
+    """With --identify: calibration file of this hand; None leaves torques unknown."""
     joints: tuple[str, ...] = ()
     """With --identify: which joints; all by default."""
     dead_band: bool = False
     """With --identify: search for the drives' dead-band as well, which takes minutes a joint."""
     plot: Path | None = None
-    """File for the figure (.png, .pdf or .svg)."""
+    """Image file for the figure (.png, .pdf or .svg); None draws no figure."""
     report: Path | None = None
-    """File for all results as JSON."""
+    """JSON file for all results; None writes no file."""
     log: Path | None = None
-    """Log file; by default a new one under runs/real."""
+    """Log file; None for a new file in runs/real."""
     rate: float = setting(83.0, unit="Hz", low=20.0, high=1000.0)
     """Exchanges with the hand per second."""
     realtime: bool = True

@@ -24,13 +24,14 @@ class ReplayArguments:
     log: Annotated[Path, tyro.conf.Positional]
     """A log of `dexsim_real.run`."""
     plot: Path | None = None
-    """File for a figure of angles, forces, timing and the observation (matplotlib)."""
+    """Image file for a figure of joint angles, forces, timing and observation (.png, .pdf or .svg); None draws no
+    figure."""
     rerun: bool = False
     """Show it in the rerun viewer, taxels as pictures (extra: pip install 'dexsim[rerun]')."""
     rrd: Path | None = None
-    """File for the rerun viewer, to be opened on another machine."""
+    """Recording for the rerun viewer, to open on another machine; None writes no file."""
     output: Path | None = None
-    """File for the report as JSON."""
+    """JSON file for the report; None writes no file."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:

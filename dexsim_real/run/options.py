@@ -30,15 +30,16 @@ class RunArguments:
     motors_off: bool = False
     """Read, compute and show everything, but leave the motors off."""
     calibration: Path | None = None
-    """This hand's calibration file."""
+    """Calibration file of this hand; None only with --uncalibrated."""
     uncalibrated: bool = False
     """Run without a calibration, on guessed scales (`--hardware.current-scale`, `--hardware.force-per-count`)."""
     imu: str | None = None
-    """Serial port of the IMU in the object."""
+    """Serial port of the IMU in the object; None if the policy needs no IMU."""
     imu_mount: tuple[float, float, float, float] = setting(UPRIGHT_X, unit="1", low=-1.0, high=1.0)
     """Orientation (w, x, y, z) of the IMU in the object; by default its z lies along the object's x."""
     camera: str | None = None
-    """Mask source: camera number, video file, unix:PATH or MODULE:FUNCTION."""
+    """Source of the object's masks: camera number, video file, unix:PATH or MODULE:FUNCTION. None if the policy needs
+    no camera."""
     fixed_object: bool = False
     """Run without a camera: the object is taken to stay where it belongs."""
     zero: bool = True
@@ -51,9 +52,9 @@ class RunArguments:
     place: float = setting(0.0, unit="s", low=0.0, high=600.0)
     """Pause in the start posture, to put the object into the hand: squarely, if the IMU is used."""
     log: Path | None = None
-    """Log file; by default a new one under runs/real."""
+    """Log file; None for a new file in runs/real."""
     output: Path | None = None
-    """File for the summary as JSON."""
+    """JSON file for the summary; None writes no file."""
     realtime: bool = True
     """Ask for real-time priority; without the right to it the run goes on without."""
     quiet: bool = False

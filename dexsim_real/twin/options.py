@@ -20,14 +20,14 @@ class TwinArguments:
     task: str = setting("rotate", choices=TASKS)
     """What the hand is mounted for: palm up with a cube, or upside down with objects to catch."""
     policy: str | None = None
-    """The policy that will run on it, a file or a shipped name, to see that it fits; by default that of the task's
-    name."""
+    """Policy that will run on the hand, to check that it fits: a file, or the name of a shipped policy. None for the
+    shipped policy of the task."""
     seed: int = setting(0, unit="1", low=0, high=2**31 - 1)
     """Of everything random: parameters, objects, noise, faults."""
     trials: int = setting(10, unit="1", low=1, high=100_000)
     """Objects that are handed over before the program ends."""
     seconds: float | None = setting(None, unit="s", low=0.1, high=86400.0)
-    """Time limit of a trial; the task's own by default (grasp 8, rotate 120)."""
+    """Time limit of a trial; None for that of the task (grasp 8 s, rotate 120 s)."""
     draw: str = setting("outside", choices=KINDS)
     """Parameters just outside the ranges of training, inside them, or nominal."""
     first: int = setting(0, unit="1", low=0, high=100_000)
@@ -35,22 +35,23 @@ class TwinArguments:
     shape: str = setting("any", choices=("any", *SHAPES))
     """Objects of grasp trials."""
     command: float | None = setting(None, unit="1", low=0.0, high=1.0)
-    """Grip command that the runner will be given; only noted in the results and in the command shown."""
+    """Grip command for the command line that is shown, and for the results; None leaves it out."""
     calibration: Path | None = None
-    """Calibration file for the command shown; by default that of a hand whose motors are all nominal, which is written
-    to a temporary folder. `python -m dexsim_real.calibrate` makes one as for a real hand."""
+    """Calibration file for the command line that is shown; None for a temporary file for nominal motors. `python -m
+    dexsim_real.calibrate` creates one, as for a real hand."""
     link: Path | None = None
-    """Name of the hand's port; by default in a new folder under the system's temporary one."""
+    """Path of the hand's port; None for one in a new temporary folder."""
     imu_link: Path | None = None
-    """Name of the IMU's port (rotate)."""
+    """Path of the IMU's port (rotate); None for one in a new temporary folder."""
     mask_socket: Path | None = None
-    """Unix socket of the camera's masks (grasp)."""
+    """Path of the Unix socket for the camera's masks (grasp); None for one in a new temporary folder."""
     output: Path | None = None
-    """File for results, counters and events as JSON, written at the end."""
+    """JSON file for results, statistics and events, written at the end; None writes no file."""
     realtime: bool = True
     """Ask for real-time priority: it stands for hardware, which waits for no scheduler."""
     plant: str | None = None
-    """MODULE:FUNCTION of your own that makes the physics (`dexsim_real.twin.types.Plant`) from these options."""
+    """MODULE:FUNCTION that creates the physics (a `dexsim_real.twin.types.Plant`) from these options; None for the
+    library's own."""
     line: LineConfig = setting(LineConfig())
     """Timing of the wire."""
     firmware: FirmwareConfig = setting(FirmwareConfig())

@@ -29,15 +29,15 @@ class RotateReward:
     gate_steepness: float = setting(400.0, unit="1/m", low=1.0, high=1e5)
     """How sharply it closes."""
     bonus: float = setting(250.0, unit="1", low=0.0, high=1e5)
-    """Once for each goal reached ..."""
+    """Reward for each goal reached, before `bonus_tips` and `bonus_speed` reduce it."""
     bonus_tips: float = setting(0.8, unit="1", low=0.0, high=1.0)
-    """... of which this share is for `working_tips` fingertips that take part, which no hand can earn by
-    standing still ..."""
+    """Share of the bonus that depends on `working_tips` fingertips taking part; a hand cannot earn it by standing
+    still."""
     tips_after: int = setting(2, unit="1", low=0, high=1000)
-    """... once this many goals have been reached in the episode: asked for from the first goal on, it teaches
-    policies that have found one stroke to clamp the object with all fingers ..."""
+    """Goals in an episode after which `bonus_tips` counts. From the first goal on it would teach policies that have
+    found one stroke to clamp the object with all fingers."""
     bonus_speed: float = setting(0.9, unit="rad/s", low=0.01, high=1e6)
-    """... and which falls with the square of the joint speed (mean of all joints, lately) beyond this."""
+    """Recent joint speed (mean of all joints) beyond which the bonus falls with the square of the speed."""
     action: float = setting(-0.01, unit="1", low=-1000.0, high=0.0)
     """Squared change of the action."""
     velocity: float = setting(-0.018, unit="s^2/rad^2", low=-1000.0, high=0.0)
@@ -88,13 +88,13 @@ class RotateConfig(EnvConfig):
     goal_step: float = setting(math.pi / 2, unit="rad", low=0.1, high=math.pi)
     """Angle between two goals."""
     goal_angle: float = setting(0.3, unit="rad", low=0.01, high=1.5)
-    """A goal is reached within this angle ..."""
+    """Largest angle to a goal at which it is reached."""
     goal_distance: float = setting(0.05, unit="m", low=0.001, high=0.5)
-    """... this far from the reference ..."""
+    """Largest distance from the reference at which a goal is reached."""
     goal_spin: float = setting(2.0, unit="rad/s", low=0.0, high=1000.0)
-    """... at no more than this spin about the axis (0: any) ..."""
+    """Largest spin about the axis at which a goal is reached; 0 for any."""
     goal_dwell: float = setting(0.0, unit="s", low=0.0, high=10.0)
-    """... held for this long."""
+    """Time for which these conditions must hold before a goal is reached."""
     support: str = setting("palm", choices=("palm", "fingers"))
     """Carried by the palm, or held clear of it by the fingers: then touching the palm is a drop."""
     tilt: float = setting(-0.2, unit="rad", low=-1.2, high=1.2)
@@ -106,10 +106,10 @@ class RotateConfig(EnvConfig):
     reference: tuple[float, float, float] = setting((0.047, 0.024, 0.088), unit="m", low=-0.5, high=0.5)
     """Where the object belongs: where thumb and fingers meet, and where the gaits that keep it carry it."""
     drop_distance: float = setting(0.07, unit="m", low=0.01, high=1.0)
-    """The object is lost when its centre is farther than this from the reference ..."""
+    """The object is lost when its centre is farther than this from the reference."""
     drop_tilt: float = setting(1.0, unit="rad", low=0.1, high=3.2)
-    """... or when it has tipped over: its own axis is farther than this from the axis of rotation,
-    and no goal can be reached any more."""
+    """The object is lost when it has tipped over: its own axis is farther than this from the axis of rotation, and no
+    goal can be reached any more."""
     patience: float = setting(4.0, unit="s", low=0.1, high=1e6)
     """A training episode without a new goal for this long is given up, as a drop is: else policies
     learn to turn once and then hold still. Evaluations wait for ever."""
@@ -139,10 +139,10 @@ class RotateConfig(EnvConfig):
     heading_noise: float = setting(0.7, unit="rad", low=0.0, high=math.pi)
     """Largest turn of the object about the axis at the start."""
     start_offset: tuple[float, float] = setting((-0.018, -0.001), unit="m", low=-0.1, high=0.1)
-    """Where the object is put at the start, across and along the palm (y, z) from the reference: a little away
-    from thumb and fingertips, beside which the first stroke often fails ..."""
+    """Start position of the object, across and along the palm (y, z) from the reference: a little away from thumb and
+    fingertips, beside which the first stroke often fails."""
     place_noise: float = setting(0.010, unit="m", low=0.0, high=0.05)
-    """... and the largest shift from there."""
+    """Largest shift of the object from its start position."""
     settle_seconds: float = setting(0.8, unit="s", low=0.05, high=10.0)
     """Time that start states are given to come to rest; those that do not are left out."""
     reward: RotateReward = setting(RotateReward(gate=0.04))

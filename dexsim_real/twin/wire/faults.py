@@ -34,19 +34,19 @@ class FaultConfig:
     flip: float = setting(0.0, unit="1", low=0.0, high=1.0)
     """Share of exchanges with one to three wrong bits."""
     drop: float = setting(0.0, unit="1", low=0.0, high=1.0)
-    """With some bytes missing."""
+    """Share of exchanges with missing bytes."""
     duplicate: float = setting(0.0, unit="1", low=0.0, high=1.0)
-    """With some bytes twice."""
+    """Share of exchanges with repeated bytes."""
     late: float = setting(0.0, unit="1", low=0.0, high=1.0)
-    """Answered too late."""
+    """Share of exchanges that are answered too late."""
     stall: float = setting(0.0, unit="1", low=0.0, high=1.0)
-    """At which the hand falls silent for a while."""
+    """Share of exchanges at which the hand stops answering for a while."""
     disconnect: float = setting(0.0, unit="1", low=0.0, high=1.0)
-    """At which the port goes away for a while."""
+    """Share of exchanges at which the port disappears for a while."""
     heat: float = setting(0.0, unit="1", low=0.0, high=1.0)
-    """At which a motor gets hot for a while."""
+    """Share of exchanges at which a motor gets hot for a while."""
     stuck: float = setting(0.0, unit="1", low=0.0, high=1.0)
-    """At which one more taxel gets stuck."""
+    """Share of exchanges at which one more taxel gets stuck."""
     on_request: float = setting(0.3, unit="1", low=0.0, high=1.0)
     """Share of damaged bytes that befalls the request, not the answer."""
     late_seconds: tuple[float, float] = setting((0.1, 0.15), unit="s", low=0.0, high=10.0)
@@ -56,9 +56,9 @@ class FaultConfig:
     away_seconds: tuple[float, float] = setting((0.1, 1.0), unit="s", low=0.0, high=60.0)
     """How long the port is gone."""
     heat_degrees: float = setting(60.0, unit="K", low=0.0, high=200.0)
-    """By how much a motor gets hotter ..."""
+    """Temperature rise of a hot motor."""
     heat_seconds: float = setting(2.0, unit="s", low=0.0, high=3600.0)
-    """... and for how long."""
+    """Duration of that rise."""
     stuck_count: tuple[int, int] = setting((5, 30), unit="count", low=0, high=255)
     """What a stuck taxel shows."""
     script: tuple[str, ...] = ()

@@ -35,9 +35,9 @@ class LineConfig:
     jitter: float = setting(0.00002, unit="s", low=0.0, high=0.1)
     """Standard deviation of that."""
     pause: float = setting(0.0011, unit="s", low=0.0, high=0.1)
-    """Longest extra pause, which befalls ..."""
+    """Longest extra delay of an answer."""
     pauses: float = setting(0.01, unit="1", low=0.0, high=1.0)
-    """... this share of the exchanges."""
+    """Share of the exchanges that have an extra delay."""
     piece: int = setting(510, unit="byte", low=1, high=4096)
     """Bytes that the adapter hands on at once."""
 
