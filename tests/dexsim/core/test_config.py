@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dexsim.core.config import check_ranges, from_dict, override, setting, to_dict, validate
+from dexsim.core.config import check_ranges, from_dict, naming_file, override, setting, to_dict, validate
 from dexsim.core.errors import ConfigError, DexsimError
 from dexsim.objects.config import ObjectConfig
 from dexsim.physics.config import PhysicsConfig
@@ -198,6 +198,26 @@ def test_any_config_survives_the_round_trip(stiffness, turns, low, high, wire, m
 )
 def test_a_bad_dictionary_is_refused_by_name(data, wanted):
     assert message(from_dict, Chair, data) == wanted
+
+
+def test_errors_of_a_file_begin_with_its_name():
+    with pytest.raises(ConfigError, match=r"^hand\.toml: Spring\.stiffness = 9 N/m: must be between 0\.5 and 8 N/m$"):
+        with naming_file("hand.toml"):
+            from_dict(Spring, {"stiffness": 9.0})
+
+
+def test_literal_types_are_choices():
+    @dataclasses.dataclass(frozen=True, kw_only=True)
+    class Door:
+        side: typing.Literal["left", "right"] | None = None
+        marks: tuple[typing.Literal[1, 2], ...] = ()
+
+        def __post_init__(self):
+            validate(self)
+
+    assert Door(side="left", marks=(1, 2)) and Door(side=None)
+    assert message(Door, side="top") == "Door.side = 'top': choose from left, right"
+    assert message(Door, marks=(3,)) == "Door.marks = 3: choose from 1, 2"
 
 
 def test_a_whole_number_serves_as_a_real_one():
