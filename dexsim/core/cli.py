@@ -68,7 +68,9 @@ def parse(cls: type[T], argv: Sequence[str], *, prog: str, description: str, def
     page = _help_asked(argv)
     if page is not False:
         groups = [".".join(path).replace("_", "-") for path in group_docs(cls, default)]
-        if page and page not in groups:
+        if page and not groups:
+            page = None
+        elif page and page not in groups:
             raise UsageError(f"--help-all {page}: choose from {', '.join(groups)}")
         print(help_page(cls, default, prog=prog, description=description, group=page), flush=True)
         raise SystemExit(0)

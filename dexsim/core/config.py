@@ -65,10 +65,12 @@ def validate(config: Any) -> None:
 @functools.cache
 def choices_of(cls: type) -> dict[str, tuple[Any, ...]]:
     """What each field may be, where only some values may: by its `setting` or its `Literal` type."""
-    hints = typing.get_type_hints(cls)
-    choices = {
-        field.name: field.metadata.get("choices") or _literals(hints[field.name]) for field in dataclasses.fields(cls)
-    }
+    try:
+        hints = typing.get_type_hints(cls)
+    except NameError:  # A type that only a type checker imports.
+        hints = {}
+    fields = dataclasses.fields(cls)
+    choices = {field.name: field.metadata.get("choices") or _literals(hints.get(field.name)) for field in fields}
     return {name: values for name, values in choices.items() if values}
 
 

@@ -266,3 +266,15 @@ def test_override_replaces_fields_by_their_path():
     ):
         with pytest.raises(ConfigError, match=said):
             from_dict(GraspConfig, override(plain, [entry]))
+
+
+def test_a_type_that_only_a_type_checker_knows_does_not_hinder_the_check():
+    @dataclasses.dataclass(frozen=True, kw_only=True)
+    class Lamp:
+        colour: str = setting("red", choices=("red", "blue"))
+        bulb: "Nowhere" = None  # noqa: F821
+
+        def __post_init__(self):
+            validate(self)
+
+    assert message(Lamp, colour="green") == "Lamp.colour = 'green': choose from red, blue"
