@@ -10,8 +10,7 @@ import json
 import math
 import types
 import typing
-from collections.abc import Iterable, Iterator
-from pathlib import Path
+from collections.abc import Iterable
 from typing import Any, TypeVar
 
 from dexsim.core.errors import ConfigError
@@ -143,7 +142,7 @@ def from_dict(cls: type[T], data: dict[str, Any]) -> T:
 
 
 @contextlib.contextmanager
-def naming_file(path: str | Path) -> Iterator[None]:
+def naming_file(path: object) -> typing.Iterator[None]:
     """Errors from within begin with the name of the file that the configuration is read from."""
     try:
         yield
