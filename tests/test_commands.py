@@ -22,7 +22,7 @@ from dexsim_ppo.train import preset_arguments
 
 # Options class or a maker of default options, and what must be typed beside the option that is looked at.
 COMMANDS = {
-    "dexsim_ppo.train": ("dexsim_ppo.training.trainer:TrainArguments", []),
+    "dexsim_ppo.train": ("dexsim_ppo.train:TrainArguments", []),
     "dexsim_ppo.evaluate": ("dexsim_ppo.evaluate:EvaluateArguments", ["grasp"]),
     "dexsim_real.run": ("dexsim_real.run.options:RunArguments", ["grasp", "--port", "x", "--uncalibrated"]),
     "dexsim_real.calibrate": ("dexsim_real.calibrate.options:CalibrateArguments", ["--port", "x"]),
