@@ -39,29 +39,31 @@ class SensorNoise:
     scale: float = setting(1.0, unit="1", low=0.0, high=3.0)
     """Width of all ranges about a perfect sensor; 0 passes the force through untouched, counts included."""
     hysteresis: Range | None = setting((0.0, 0.3), unit="1", low=0.0, high=0.9)
-    """Share of a change that comes late, per finger."""
+    """Share of a change that comes late, per finger; None: no such effect."""
     hysteresis_time: Range = setting((0.03, 0.2), unit="s", low=1e-3, high=10.0)
     """Time constant of that share."""
     crosstalk: Range | None = setting((0.0, 0.1), unit="1", low=0.0, high=0.8)
-    """Share of a taxel's force that its four neighbours on the lattice feel instead, per finger."""
+    """Share of a taxel's force that its four neighbours on the lattice feel instead, per finger; None: no such
+    effect."""
     gain: Range | None = setting((0.85, 1.15), unit="1", low=0.05, high=5.0)
-    """Factor on each taxel."""
+    """Factor on each taxel; None: no such effect."""
     bias: Range | None = setting((-0.03, 0.03), unit="N", low=-10.0, high=10.0)
-    """Constant error of each taxel, left over by the tare."""
+    """Constant error of each taxel, left over by the tare; None: no such effect."""
     drift: Range | None = setting((0.0, 0.005), unit="N/sqrt(s)", low=0.0, high=1.0)
-    """Random walk of each taxel: its standard deviation after one second, per finger."""
+    """Random walk of each taxel: its standard deviation after one second, per finger; None: no such effect."""
     noise: Range | None = setting((0.005, 0.02), unit="N", low=0.0, high=10.0)
-    """Standard deviation of white noise, per finger."""
+    """Standard deviation of white noise, per finger; None: no such effect."""
     dead: Range | None = setting((0.0, 0.05), unit="1", low=0.0, high=1.0)
-    """Probability that a taxel reads zero for the whole episode."""
+    """Probability that a taxel reads zero for the whole episode; None: no such effect."""
     threshold: Range | None = setting((0.03, 0.10), unit="N", low=0.0, high=10.0)
-    """Magnitude below which a taxel reads zero, per taxel."""
+    """Magnitude below which a taxel reads zero, per taxel; None: no such effect."""
     counts: str = setting("uint8", choices=tuple(COUNTS))
     """Integer type of a reading: uint8 for normal, int8 for tangential force; none: no rounding, no saturation."""
     resolution: float = setting(0.1, unit="N", low=1e-6, high=10.0)
     """Force per count: bytes saturate at 25.5 N."""
     rate: Range | None = setting(None, unit="Hz", low=0.1, high=1e4)
-    """The array's own sampling rate, below the control rate; between samples the last reading stands."""
+    """The array's own sampling rate, below the control rate; between samples the last reading is repeated. None: it
+    samples at the control rate."""
 
     def __post_init__(self):
         validate(self)

@@ -63,9 +63,10 @@ class CalibrateArguments:
     """Options of `python -m dexsim_real.calibrate`."""
 
     port: str | None = None
-    """Serial port of the hand (names under /dev/serial/by-id are stable), or sdk:MODULE:FUNCTION."""
+    """Serial port of the hand (names under /dev/serial/by-id are stable), or sdk:MODULE:FUNCTION. None only with
+    --from-log."""
     output: Path | None = None
-    """Output file; by default hand.toml, or hand.json with --identify."""
+    """Output file; None for hand.toml, or hand.json with --identify."""
     force: bool = False
     """Overwrite an existing output file."""
     from_log: tuple[Path, ...] = ()
@@ -74,7 +75,7 @@ class CalibrateArguments:
     """Identify the drives instead: move each free joint, and fit stiffness, damping, friction and latency."""
     gauge: str | None = None
     """Compare the taxels with a gauge: `ask` to type the readings of a kitchen scale or force gauge, or MODULE:FUNCTION
-    for a function that returns newtons. Without a gauge the taxels are the reference, as in the paper."""
+    for a function that returns newtons. None: the taxels are the reference, as in the paper."""
     levels: int = setting(6, unit="1", low=5, high=30)
     """Number of forces at which the gauge is read, both rising and falling."""
     fingers: tuple[str, ...] = ()
@@ -86,17 +87,17 @@ class CalibrateArguments:
     serial: str = ""
     """Serial number or name of the hand, for the output file."""
     calibration: Path | None = None
-    """With --identify: calibration file of this hand; without it torques are unknown."""
+    """With --identify: calibration file of this hand; None leaves torques unknown."""
     joints: tuple[str, ...] = ()
     """With --identify: joints to move; all by default."""
     dead_band: bool = False
     """With --identify: also fit the dead band of the drives, which takes minutes per joint."""
     plot: Path | None = None
-    """Image file for the figure (.png, .pdf or .svg)."""
+    """Image file for the figure (.png, .pdf or .svg); None draws no figure."""
     report: Path | None = None
-    """JSON file for all results."""
+    """JSON file for all results; None writes no file."""
     log: Path | None = None
-    """Log file; by default a new file in runs/real."""
+    """Log file; None for a new file in runs/real."""
     rate: float = setting(83.0, unit="Hz", low=20.0, high=1000.0)
     """Exchanges with the hand per second."""
     realtime: bool = True

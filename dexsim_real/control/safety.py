@@ -68,9 +68,9 @@ class SafetyConfig:
     patience: float = setting(1.0, unit="s", low=0.0, high=60.0)
     """Duration of a hold for lack of joint targets or measurements, after which the motors go off."""
     slow_speed: float = setting(0.5, unit="rad/s", low=0.01, high=100.0)
-    """Largest speed of commands right after the motors come on or a hold ends."""
+    """Speed of commands right after the motors turn on or a hold ends; it then grows to `speed`."""
     ramp: float = setting(1.0, unit="s", low=0.0, high=60.0)
-    """Time in which `slow_speed` grows to `speed`."""
+    """Time in which the speed of commands grows from `slow_speed` to `speed`."""
 
     def __post_init__(self):
         validate(self)

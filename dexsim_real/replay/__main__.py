@@ -24,13 +24,14 @@ class ReplayArguments:
     log: Annotated[Path, tyro.conf.Positional]
     """Log file of `python -m dexsim_real.run`."""
     plot: Path | None = None
-    """Image file for a figure of joint angles, forces, timing and observation (.png, .pdf or .svg)."""
+    """Image file for a figure of joint angles, forces, timing and observation (.png, .pdf or .svg); None draws no
+    figure."""
     rerun: bool = False
     """Open the rerun viewer, with taxels as pictures (needs pip install 'dexsim[rerun]')."""
     rrd: Path | None = None
-    """Recording for the rerun viewer, to open on another machine."""
+    """Recording for the rerun viewer, to open on another machine; None writes no file."""
     output: Path | None = None
-    """JSON file for the report."""
+    """JSON file for the report; None writes no file."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -30,15 +30,16 @@ class RunArguments:
     motors_off: bool = False
     """Measure, compute and display everything with the motors off."""
     calibration: Path | None = None
-    """Calibration file of this hand."""
+    """Calibration file of this hand; None only with --uncalibrated."""
     uncalibrated: bool = False
     """Run without a calibration, on default scales (`--hardware.current-scale`, `--hardware.force-per-count`)."""
     imu: str | None = None
-    """Serial port of the IMU in the object."""
+    """Serial port of the IMU in the object; None if the policy needs no IMU."""
     imu_mount: tuple[float, float, float, float] = setting(UPRIGHT_X, unit="1", low=-1.0, high=1.0)
     """Orientation (w, x, y, z) of the IMU in the object; by default its z is along the object's x."""
     camera: str | None = None
-    """Source of the object's masks: camera number, video file, unix:PATH or MODULE:FUNCTION."""
+    """Source of the object's masks: camera number, video file, unix:PATH or MODULE:FUNCTION. None if the policy needs
+    no camera."""
     fixed_object: bool = False
     """Run without a camera: assume that the object stays at its nominal position."""
     tare: bool = True
@@ -51,9 +52,9 @@ class RunArguments:
     place: float = setting(0.0, unit="s", low=0.0, high=600.0)
     """Time in the start posture to put the object into the hand; align it with the palm if the IMU is used."""
     log: Path | None = None
-    """Log file; by default a new file in runs/real."""
+    """Log file; None for a new file in runs/real."""
     output: Path | None = None
-    """JSON file for the summary."""
+    """JSON file for the summary; None writes no file."""
     realtime: bool = True
     """Request real-time priority; continue without it if not permitted."""
     quiet: bool = False

@@ -20,14 +20,14 @@ class TwinArguments:
     task: str = setting("rotate", choices=TASKS)
     """Task: `rotate` mounts the hand palm up with a cube, `grasp` upside down with various objects."""
     policy: str | None = None
-    """Policy that will run on the hand, to check that it fits: a file, or the name of a shipped policy. By default the
+    """Policy that will run on the hand, to check that it fits: a file, or the name of a shipped policy. None for the
     shipped policy of the task."""
     seed: int = setting(0, unit="1", low=0, high=2**31 - 1)
     """Seed of all random numbers: parameters, objects, noise, faults."""
     trials: int = setting(10, unit="1", low=1, high=100_000)
     """Number of trials, with one object each."""
     seconds: float | None = setting(None, unit="s", low=0.1, high=86400.0)
-    """Time limit of a trial; by default that of the task (grasp 8 s, rotate 120 s)."""
+    """Time limit of a trial; None for that of the task (grasp 8 s, rotate 120 s)."""
     parameters: str = setting("outside", choices=KINDS)
     """Parameters of hand and object: just outside the ranges of training, inside them, or nominal."""
     first: int = setting(0, unit="1", low=0, high=100_000)
@@ -35,22 +35,23 @@ class TwinArguments:
     shape: str = setting("any", choices=("any", *SHAPES))
     """Shape of the objects (grasp)."""
     command: float | None = setting(None, unit="1", low=0.0, high=1.0)
-    """Grip command for the command line that is shown, and for the results."""
+    """Grip command for the command line that is shown, and for the results; None leaves it out."""
     calibration: Path | None = None
-    """Calibration file for the command line that is shown; by default a temporary file for nominal motors.
-    `python -m dexsim_real.calibrate` creates one, as for a real hand."""
+    """Calibration file for the command line that is shown; None for a temporary file for nominal motors. `python -m
+    dexsim_real.calibrate` creates one, as for a real hand."""
     link: Path | None = None
-    """Path of the hand's port; by default in a new temporary folder."""
+    """Path of the hand's port; None for one in a new temporary folder."""
     imu_link: Path | None = None
-    """Path of the IMU's port (rotate)."""
+    """Path of the IMU's port (rotate); None for one in a new temporary folder."""
     mask_socket: Path | None = None
-    """Path of the Unix socket for the camera's masks (grasp)."""
+    """Path of the Unix socket for the camera's masks (grasp); None for one in a new temporary folder."""
     output: Path | None = None
-    """JSON file for results, statistics and events, written at the end."""
+    """JSON file for results, statistics and events, written at the end; None writes no file."""
     realtime: bool = True
     """Request real-time priority; continue without it if not permitted."""
     plant: str | None = None
-    """MODULE:FUNCTION that creates the physics (a `dexsim_real.twin.plant.protocol.Plant`) from these options."""
+    """MODULE:FUNCTION that creates the physics (a `dexsim_real.twin.plant.protocol.Plant`) from these options; None for
+    the library's own."""
     line: LineConfig = setting(LineConfig())
     """Timing of the serial line."""
     firmware: FirmwareConfig = setting(FirmwareConfig())
