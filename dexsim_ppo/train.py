@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import jax
 
 from dexsim.core import cli
-from dexsim.core.config import from_dict
+from dexsim.core.config import from_dict, naming_file
 from dexsim.core.errors import ConfigError, DexsimError
 from dexsim.registry import find_task
 from dexsim_ppo import checkpoint
@@ -98,7 +98,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     cli.enable_caches()
     arguments, begun = parse_arguments(argv)
     command = shlex.join(["python", "-m", "dexsim_ppo.train", *argv])
-    run, stopped = run_training(arguments, begun, started, command)
+    with cli.naming_options(TrainArguments, arguments):
+        run, stopped = run_training(arguments, begun, started, command)
     if stopped:
         print(
             f"stopped by {signal.Signals(stopped).name}; resume with: "
@@ -159,7 +160,8 @@ def default_arguments(task: str | None, preset: str, begun: checkpoint.Checkpoin
     name = begun.task if begun else (task or "grasp").rpartition(":")[2]
     entry = find_task(name)
     if isinstance(begun, checkpoint.Checkpoint):
-        return arguments_from_dict(entry.config_class, migrate_arguments(begun.content["arguments"], begun.path))
+        with naming_file(begun.path):
+            return arguments_from_dict(entry.config_class, migrate_arguments(begun.content["arguments"], begun.path))
     default = preset_arguments(name, entry.config(), preset)
     if begun:
         env = from_dict(entry.config_class, begun.env_config)
@@ -173,8 +175,11 @@ def parse_arguments(argv: list[str]) -> tuple[TrainArguments, checkpoint.Checkpo
     for name in ("--task", "--preset", "--resume", "--policy"):
         early.add_argument(name, nargs="?")
     known, _ = early.parse_known_args(argv)
+    preset, description = known.preset or "auto", "Train a task."
+    if preset == "auto" and cli.wants_help(argv):  # To ask which device there is takes seconds.
+        preset, description = "cpu", f"{description} Defaults that depend on the device are those of --preset cpu."
     begun = find_beginning(known.task, known.policy, known.resume)
-    default = default_arguments(known.task, known.preset or "auto", begun)
+    default = default_arguments(known.task, preset, begun)
     given = {argument.split("=")[0] for argument in argv}
     if "--steps" in given and "--minutes" not in given:
         default = dataclasses.replace(default, minutes=0.0)
@@ -183,7 +188,7 @@ def parse_arguments(argv: list[str]) -> tuple[TrainArguments, checkpoint.Checkpo
         argv,
         default=default,
         prog="python -m dexsim_ppo.train",
-        description="Train a task.",
+        description=description,
     )
     return dataclasses.replace(arguments, task=default.task), begun
 

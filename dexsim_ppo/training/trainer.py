@@ -43,39 +43,40 @@ class TrainArguments(Generic[EnvConfig]):
     ppo: PPOConfig
     """The learner's settings; their defaults depend on the preset."""
     curriculum: Curriculum = setting(Curriculum())
-    """Ranges of the randomisation that widen with success."""
+    """Widen the randomisation as the policy succeeds."""
     extremes: float = setting(0.0, unit="1", low=0.0, high=1.0)
-    """Share of training's hands, and of its objects, with every value at an end of its range (`dexsim.core.ranges`).
-    Evaluations, and the policy's file, keep to what `env` says."""
+    """Share of training's hands and objects that get the extreme of every range at once. Evaluations and the policy's
+    file keep to the settings of `--env`."""
     task: str = "grasp"
-    """What to train."""
-    seed: int = setting(0, low=0)
+    """Task to train; my_module:poke for a task of your own."""
+    seed: int = setting(0, unit="1", low=0, high=2**32 - 1)
     """Seed of everything random."""
-    backend: Literal["auto", "jax", "warp"] = setting("auto", choices=("auto", "jax", "warp"))
-    """Physics backend."""
-    preset: Literal["auto", "cpu", "gpu"] = setting("auto", choices=("auto", "cpu", "gpu"))
-    """Sizes and durations; `auto` goes by the device found."""
+    backend: Literal["auto", "jax", "warp"] = setting("auto")
+    """Physics backend. auto: warp on a GPU if it is installed, otherwise jax."""
+    preset: Literal["auto", "cpu", "gpu"] = setting("auto")
+    """Default sizes and durations. auto: those of the device found."""
     steps: float = setting(0.0, unit="environment steps", low=0.0)
-    """Stop after so many, those before a resume included; 0 for no limit."""
+    """Stop after this many steps, including those before a resume; 0 for no limit."""
     minutes: float = setting(0.0, unit="min", low=0.0)
-    """Stop training after this time, compilation and the time before a resume included; 0 for no limit."""
+    """Budget of training time, including compilation and the time before a resume; 0 for no limit. With --steps and
+    without --minutes there is no limit."""
     run_dir: Path | None = None
-    """Folder to write to; must not exist yet. Default: runs/<task>-<time>."""
+    """Folder to write to, which must not exist yet; None for a new runs/TASK-TIME."""
     resume: Path | None = None
-    """Folder of a run (or one of its checkpoints) to go on with."""
+    """Folder of a run, or one of its checkpoints, to resume exactly; None starts a new run."""
     policy: str = ""
-    """Policy to go on from, on whatever has changed since: a file, or the name of a shipped one. Its task and
-    configuration are the defaults."""
+    """Policy to fine-tune: a file, or the name of a shipped one. Its task and configuration are the defaults. Empty:
+    train from scratch."""
     video: bool = True
     """Render a video at the end."""
     log_every: int = setting(1, unit="iterations", low=1)
     """Iterations between lines of metrics."""
     checkpoint_every: int = setting(100, unit="iterations", low=1)
     """Iterations between checkpoints."""
-    keep_checkpoints: int = setting(3, low=1)
-    """Newest checkpoints to keep."""
+    keep_checkpoints: int = setting(3, unit="1", low=1)
+    """Number of latest checkpoints to keep."""
     evaluate_every: int = setting(0, unit="iterations", low=0)
-    """Iterations between evaluations, which choose the best policy; 0 for none."""
+    """Iterations between the evaluations that choose the best policy; 0 for none."""
     evaluation_chunk: int = setting(32, unit="episodes", low=1)
     """Episodes evaluated side by side; an evaluation during training is one chunk."""
     evaluation_episodes: int = setting(128, unit="episodes", low=1)
