@@ -48,7 +48,7 @@ class TaxelSensor:
     hysteresis_time: Range = setting((0.03, 0.2), unit="s", low=1e-3, high=10.0)
     """Time constant of that share."""
     crosstalk: Range | None = setting(None, unit="1", low=0.0, high=0.8)
-    """Share of a taxel's force that its four neighbours on the lattice feel instead, per finger; None: no such effect."""
+    """Share of a taxel's force that its four neighbours feel instead, per finger; None: no such effect."""
     gain: Range | None = setting(None, unit="1", low=0.05, high=5.0)
     """Factor on each taxel, on top of the finger's (`Randomization.taxel_gain`); None: no such effect."""
     bias: Range | None = setting(None, unit="N", low=-10.0, high=10.0)
