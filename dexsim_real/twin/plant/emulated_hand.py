@@ -21,7 +21,7 @@ from dexsim_real.twin.plant.protocol import MotorCommands, PlantMeasurement
 from dexsim_real.twin.plant.referee import Referee
 from dexsim_real.twin.plant.scene import TIMESTEP, build_scene
 from dexsim_real.twin.plant.shapes import ObjectShape, matrix, product, sample_shape, turn
-from dexsim_real.twin.plant.taxel_array import TaxelArray
+from dexsim_real.twin.plant.taxel_array import EmulatedTaxels
 from dexsim_real.wire.frames import Mode
 
 IMU_TRANSPORT = 0.0017  # s for the bytes of an orientation
@@ -73,7 +73,7 @@ class EmulatedHand:
         self.command, self._end = command, None if trials is None else first + trials
         self._overrides, self._seconds, self._shape = overrides, seconds, shape
         self._drives = Drives(hand.torque_limit, hand.speed_limit)
-        self._skin, self._assistant = TaxelArray(hand), Assistant(task)
+        self._skin, self._assistant = EmulatedTaxels(hand), Assistant(task)
         self._done: list[dict[str, Any]] = []
         self.time, self._ticks, self._due = 0.0, 0, 0.0
         self._commands: MotorCommands | None = None

@@ -17,7 +17,7 @@ _FULLY, _NOT_AT_ALL = 0.004, 0.008  # m along the skin from a contact to the nea
 _LEFT = 0.15  # smallest remaining share of the rubber's thickness
 
 
-class TaxelArray:
+class EmulatedTaxels:
     """The taxels of all fingertips; F fingers, N taxels each."""
 
     def __init__(self, hand: Hand):
