@@ -31,10 +31,11 @@ from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.curriculum import Curriculum
 from dexsim_ppo.policy import Policy, load_policy
 from dexsim_ppo.retired import migrate_arguments
+from dexsim_ppo.training.arguments import TrainArguments, printable, training_config
+from dexsim_ppo.training.fine_tune import check_fit, fine_tuning_config
 from dexsim_ppo.training.presets import Preset, find_preset
 from dexsim_ppo.training.runlog import RunFolder
-from dexsim_ppo.training.trainer import Run, TrainArguments, printable, training_config
-from dexsim_ppo.training.warm_start import check_fit, learner_settings
+from dexsim_ppo.training.trainer import Run
 
 
 class Trained(NamedTuple):
@@ -88,7 +89,7 @@ def train_policy(
     run, stopped = run_training(arguments, begun, started, command="train_policy(...)")
     if stopped:
         raise DexsimError(f"training was stopped; resume it with train_policy(resume={str(run.folder.path)!r})")
-    return Trained(Policy.load(run.chosen), json.loads(run.folder.report.read_text()), run.folder.path)
+    return Trained(Policy.load(run.selected), json.loads(run.folder.report.read_text()), run.folder.path)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -165,7 +166,7 @@ def default_arguments(task: str | None, preset: str, begun: checkpoint.Checkpoin
     default = preset_arguments(name, entry.config(), preset)
     if begun:
         env = from_dict(entry.config_class, begun.env_config)
-        default = dataclasses.replace(default, env=env, ppo=learner_settings(begun, default.ppo))
+        default = dataclasses.replace(default, env=env, ppo=fine_tuning_config(begun, default.ppo))
     return default
 
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 
 def sample(key: jax.Array, mean: jax.Array, log_std: jax.Array) -> jax.Array:
-    """A draw of the shape of `mean`."""
+    """A random action [..., A], of the shape of `mean`."""
     return mean + jnp.exp(log_std) * jax.random.normal(key, mean.shape)
 
 
@@ -37,7 +37,7 @@ def kl_divergence(mean_p: jax.Array, log_std_p: jax.Array, mean_q: jax.Array, lo
 def bounds_loss(mean: jax.Array, limit: float = 1.1) -> jax.Array:
     """Squared distance of the mean from [-limit, limit], summed over the last axis.
 
-    Zero inside and even in `mean`. It keeps means where clipped actions still change.
+    Zero inside. Beyond the limit a clipped action no longer changes, so nothing else would bring the mean back.
     """
     return jnp.sum(jnp.maximum(jnp.abs(mean) - limit, 0.0) ** 2, axis=-1)
 
