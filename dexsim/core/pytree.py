@@ -5,6 +5,10 @@ from typing import Any, TypeVar, dataclass_transform
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+
+Array = jax.Array | np.ndarray
+"""An array on the device or on the host."""
 
 
 def choose(done: jax.Array, new: Any, old: Any) -> Any:

@@ -23,6 +23,7 @@ import jax
 
 from dexsim.core.config import setting, validate
 from dexsim.core.errors import ConfigError
+from dexsim.core.pytree import Array
 from dexsim.geometry import grid, mesh, sdf, surface_points
 
 
@@ -30,8 +31,8 @@ class Method(NamedTuple):
     """One way to a distance: the class of its objects and its two functions."""
 
     kind: type
-    signed_distance: Callable[[jax.Array, Any], jax.Array]
-    distance_and_normal: Callable[[jax.Array, Any], tuple[jax.Array, jax.Array]]
+    signed_distance: Callable[[Any, Any], jax.Array]
+    distance_and_normal: Callable[[Any, Any], tuple[jax.Array, jax.Array]]
 
 
 METHODS: dict[str, Method] = {
@@ -103,11 +104,11 @@ def method_of(thing: Any) -> str:
     raise ConfigError(f"{type(thing).__name__} has no distance: prepare it first (dexsim.geometry.distance.prepare)")
 
 
-def signed_distance(points: jax.Array, thing: Any) -> jax.Array:
+def signed_distance(points: Array, thing: Any) -> jax.Array:
     """Distance [...] m, negative inside, at points [..., 3] in the object's frame."""
     return METHODS[method_of(thing)].signed_distance(points, thing)
 
 
-def distance_and_normal(points: jax.Array, thing: Any) -> tuple[jax.Array, jax.Array]:
+def distance_and_normal(points: Array, thing: Any) -> tuple[jax.Array, jax.Array]:
     """Distance [...] m and outward unit normal [..., 3] at points [..., 3] in the object's frame."""
     return METHODS[method_of(thing)].distance_and_normal(points, thing)

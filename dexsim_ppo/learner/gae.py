@@ -30,7 +30,7 @@ def compute_gae(
     # `where`, not a product: the value of a diverged final state may be NaN.
     bootstrap = jnp.where(terminated, 0.0, next_value)
     delta = reward + discount * bootstrap - value
-    decay = discount * gae_lambda * (1.0 - (terminated | truncated))
+    decay = discount * gae_lambda * (1.0 - (terminated | truncated).astype(reward.dtype))
 
     def backward(advantage, step):
         delta_t, decay_t = step

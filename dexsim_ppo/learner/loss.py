@@ -56,8 +56,9 @@ def loss(
 
     entropy, bounds_loss = distribution.entropy(params.log_std), jnp.float32(0)
     if config.distribution == "tanh":
-        noise = (batch.decision.action - batch.decision.mean) * jnp.exp(-old_log_std)
-        entropy += jnp.mean(distribution.tanh_log_det(mean + noise * jnp.exp(params.log_std)))
+        old_rate, std = (jnp.broadcast_to(jnp.exp(x), mean.shape) for x in (-old_log_std, params.log_std))
+        noise = (batch.decision.action - batch.decision.mean) * old_rate
+        entropy += jnp.mean(distribution.tanh_log_det(mean + noise * std))
     else:
         bounds_loss = jnp.mean(distribution.bounds_loss(mean))
 

@@ -47,7 +47,8 @@ def init_mlp(key: jax.Array, sizes: tuple[int, ...], output_gain: float) -> MLP:
 def apply_mlp(layers: MLP, x: jax.Array, precision: str = "highest") -> jax.Array:
     """ELU network: `x` [..., in] to [..., out]. `precision` names a `jax.lax.Precision`."""
     for i, layer in enumerate(layers):
-        x = jnp.matmul(x, layer.kernel, precision=precision) + layer.bias
+        x = jnp.matmul(x, layer.kernel, precision=precision)
+        x = x + jnp.broadcast_to(layer.bias, x.shape)
         if i < len(layers) - 1:
             x = jax.nn.elu(x)
     return x

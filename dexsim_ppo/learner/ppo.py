@@ -8,7 +8,7 @@ saving and loading that one pytree resumes training exactly.
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -32,7 +32,7 @@ from dexsim_ppo.learner.running_stats import (
     update_stats,
     value_std,
 )
-from dexsim_ppo.learner.types import Environment, layout_size
+from dexsim_ppo.learner.types import CurriculumEnvironment, Environment, layout_size
 
 
 @pytree_dataclass
@@ -98,8 +98,10 @@ def init_state(env: Environment, config: PPOConfig, key: jax.Array, curriculum: 
         critic_sizes=(sizes["critic"], *config.critic_layers, 1),
         initial_std=config.initial_std,
     )
-    scale = None if curriculum is None else jnp.float32(curriculum.start)
-    reset = env.reset if scale is None else lambda key: env.reset(key, scale)
+    scale, reset = None, env.reset
+    if curriculum is not None:
+        scale = jnp.float32(curriculum.start)
+        reset = functools.partial(cast(CurriculumEnvironment, env).reset, scale=scale)
     env_state = jax.vmap(reset)(jax.random.split(reset_key, config.num_envs))
     env_state = jax.vmap(env.stagger)(env_state, jax.random.split(stagger_key, config.num_envs))
     return TrainState(
@@ -140,9 +142,10 @@ def train_iteration(
     }
     scale = state.scale
     if curriculum is not None:
+        assert scale is not None, "the state of a training with a curriculum"
         scale, success = update_scale(curriculum, scale, metrics)
         metrics |= {"curriculum/scale": scale, "curriculum/success": success}
-        env_state = jax.vmap(env.widen, (0, None))(env_state, scale)
+        env_state = jax.vmap(cast(CurriculumEnvironment, env).widen, (0, None))(env_state, scale)
     stats = {
         group: update_stats(state.observation_stats[group], rollout.obs[group]) for group in state.observation_stats
     }

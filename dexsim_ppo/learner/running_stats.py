@@ -83,7 +83,8 @@ def recover_stats(normalizer: Normalizer, *, std_floor: float) -> RunningStats:
 
 def normalize(normalizer: Normalizer, x: jax.Array) -> jax.Array:
     """Normalised and clipped `x` [..., n]."""
-    z = (x - normalizer.mean) / normalizer.std
+    mean, std = (jnp.broadcast_to(v, x.shape) for v in (normalizer.mean, normalizer.std))
+    z = (x - mean) / std
     return jnp.clip(z, -normalizer.clip, normalizer.clip)
 
 

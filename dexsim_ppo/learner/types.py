@@ -51,7 +51,7 @@ class Environment(Protocol):
     """What `summarize` takes: "series" over all ticks, or "totals" that the task accumulates."""
 
     def reset(self, key: jax.Array) -> Any:
-        """A new episode. One that can follow a curriculum also takes `scale` [] in [0, 1]."""
+        """A new episode."""
         ...
 
     def step(self, state: Any, action: jax.Array) -> Any:
@@ -60,10 +60,6 @@ class Environment(Protocol):
 
     def restart(self, state: Any, done: jax.Array) -> Any:
         """A new episode if `done` [], else the same state; the random keys advance either way."""
-        ...
-
-    def widen(self, state: Any, scale: jax.Array) -> Any:
-        """Let the next episodes be drawn from ranges of this width []; only with a curriculum."""
         ...
 
     def stagger(self, state: Any, key: jax.Array) -> Any:
@@ -81,6 +77,18 @@ class Environment(Protocol):
 
     def snapshot(self, state: Any) -> Any:
         """What one video frame shows."""
+        ...
+
+
+class CurriculumEnvironment(Environment, Protocol):
+    """An environment whose randomisation ranges have a scale [] in [0, 1]."""
+
+    def reset(self, key: jax.Array, scale: jax.Array | None = None) -> Any:
+        """A new episode, from ranges of this scale."""
+        ...
+
+    def widen(self, state: Any, scale: jax.Array) -> Any:
+        """Take the next episodes from ranges of this scale."""
         ...
 
 

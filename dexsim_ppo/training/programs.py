@@ -123,7 +123,8 @@ class _Leaves:
 
 
 def _compile(path: Path, step: Callable, shapes: Any, on_traced: Callable[[], None]) -> Program:
-    leaves, names = _Leaves(shapes), []
+    leaves = _Leaves(shapes)
+    names: list[str] = []
 
     def flat(values: list[jax.Array]) -> tuple[list[jax.Array], list[jax.Array]]:
         state, metrics = step(leaves.back(values))

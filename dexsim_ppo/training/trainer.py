@@ -76,25 +76,24 @@ class Run:
     def _prepare(self, source: checkpoint.Checkpoint | Policy | None) -> tuple[TrainState, Callable]:
         """The state to start from and the compiled training step."""
         training = make_train(self.env, self.config, self.arguments.curriculum)
-        key, resumed = jax.random.key(self.arguments.seed), isinstance(source, checkpoint.Checkpoint)
-        begin = time.perf_counter()
+        key, begin = jax.random.key(self.arguments.seed), time.perf_counter()
         shapes = training.shapes(key)
         # One core compiles and runs `init` while another traces the step.
         with ThreadPoolExecutor(1) as aside:
-            if resumed:
+            if isinstance(source, checkpoint.Checkpoint):
                 state = jax.tree.map(jnp.copy, checkpoint.restore(source, shapes))
                 progress = source.content["progress"]
                 self.best, self.seconds_before = progress["best"], progress["seconds"]
             else:
-                beginning = aside.submit(lambda: jax.block_until_ready(training.init(key)))
+                fresh = aside.submit(lambda: jax.block_until_ready(training.init(key)))
             step = programs.compile_step(
                 training.plain_step,
                 shapes,
                 self._identity(),
                 lambda: self.clock.update(trace_s=time.perf_counter() - begin),
             )
-            if not resumed:
-                state = beginning.result()
+            if not isinstance(source, checkpoint.Checkpoint):
+                state = fresh.result()
                 if source:
                     state = initialize_from(source, self.config, state)
                 self._policy(state).save(self.folder.untrained)
