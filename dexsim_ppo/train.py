@@ -123,7 +123,7 @@ def run_training(
     )
     folder = RunFolder(path)
     if not resumed:
-        if begun:
+        if isinstance(begun, Policy):
             check_fit(begun, env, arguments.ppo)
         folder.checkpoints.mkdir(parents=True)
         cli.write_json(
@@ -184,8 +184,9 @@ def parse_arguments(argv: list[str]) -> tuple[TrainArguments, checkpoint.Checkpo
     given = {argument.split("=")[0] for argument in argv}
     if "--steps" in given and "--minutes" not in given:
         default = dataclasses.replace(default, minutes=0.0)
+    generic: Any = TrainArguments  # a static checker knows no type that is only found at run time
     arguments = cli.parse(
-        TrainArguments[type(default.env)],
+        generic[type(default.env)],
         argv,
         default=default,
         prog="python -m dexsim_ppo.train",
@@ -203,7 +204,7 @@ def preset_arguments(task: str, env_config: Any, name: str) -> TrainArguments:
     return TrainArguments(env=env_config, task=task, **values)
 
 
-def arguments_from_dict(config_class: type, data: dict[str, Any]) -> TrainArguments:
+def arguments_from_dict(config_class: type[Any], data: dict[str, Any]) -> TrainArguments:
     """The options that a checkpoint holds."""
     data = dict(data)
     env, ppo = from_dict(config_class, data.pop("env")), from_dict(PPOConfig, data.pop("ppo"))

@@ -37,18 +37,45 @@ class State(Protocol):
 class Environment(Protocol):
     """Pure functions of one environment's state."""
 
-    name: str
-    backend: str
-    config: Any
-    action_size: int
-    observation_layout: Mapping[str, Fields]
-    control_period: float
-    """Length of one control tick, s."""
-    evaluation_steps: int
-    """Length of an evaluation episode, control ticks."""
+    @property
+    def name(self) -> str:
+        """The task's name."""
+        ...
 
-    evaluation: str
-    """What `summarize` takes: "series" over all ticks, or "totals" that the task accumulates."""
+    @property
+    def backend(self) -> str:
+        """The physics backend."""
+        ...
+
+    @property
+    def config(self) -> Any:
+        """The task's configuration."""
+        ...
+
+    @property
+    def action_size(self) -> int:
+        """Length of the action (A)."""
+        ...
+
+    @property
+    def observation_layout(self) -> Mapping[str, Fields]:
+        """Fields of the `"actor"` and `"critic"` observations."""
+        ...
+
+    @property
+    def control_period(self) -> float:
+        """Length of one control tick, s."""
+        ...
+
+    @property
+    def evaluation_steps(self) -> int:
+        """Length of an evaluation episode, control ticks."""
+        ...
+
+    @property
+    def evaluation(self) -> str:
+        """What `summarize` takes: "series" over all ticks, or "totals" that the task accumulates."""
+        ...
 
     def reset(self, key: jax.Array) -> Any:
         """A new episode."""
@@ -70,7 +97,7 @@ class Environment(Protocol):
         """States [count] at which the task's evaluation episodes start."""
         ...
 
-    def summarize(self, metrics: Mapping[str, np.ndarray], alive: np.ndarray) -> dict[str, Any]:
+    def summarize(self, metrics: dict[str, np.ndarray], alive: np.ndarray) -> dict[str, Any]:
         """The task's report, from metrics [T, N] and the mask [T, N] of live ticks; with "totals", from the
         metrics [N] of each episode's last tick and its length [N] in ticks."""
         ...

@@ -19,7 +19,7 @@ from tiny_env import TinyEnv
 from dexsim.core import cli
 from dexsim_ppo import evaluate, train
 from dexsim_ppo.policy import Policy
-from dexsim_ppo.training import arguments
+from dexsim_ppo.training.arguments import training_config
 from dexsim_ppo.training.runlog import RunFolder, read_metrics
 
 QUICK = [
@@ -194,12 +194,12 @@ def test_corners_are_for_training_alone():
 
     plain, _ = train.parse_arguments(["--task", "rotate", "--preset", "gpu"])
     assert plain.extremes == 0.6 and plain.env == RotateConfig()
-    asked = arguments.training_config(plain)
+    asked = training_config(plain)
     assert asked.randomization.extremes == asked.objects.extremes == 0.6
     without = dataclasses.replace(asked, randomization=plain.env.randomization, objects=plain.env.objects)
     assert without == plain.env
     off, _ = train.parse_arguments(["--task", "rotate", "--preset", "gpu", "--extremes", "0"])
-    assert arguments.training_config(off) == RotateConfig()
+    assert training_config(off) == RotateConfig()
 
 
 def test_files_are_never_overwritten_or_mistaken(finished, tmp_path, monkeypatch, capsys):
