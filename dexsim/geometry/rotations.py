@@ -72,7 +72,7 @@ def quat_multiply(left: Array, right: Array) -> jax.Array:
 
 def quat_conjugate(quat: Array) -> jax.Array:
     """The inverse of a unit quaternion [..., 4]."""
-    return jnp.multiply(quat, jnp.array([1.0, -1.0, -1.0, -1.0]))
+    return jnp.multiply(quat, jnp.broadcast_to(jnp.array([1.0, -1.0, -1.0, -1.0]), quat.shape))
 
 
 def quat_angle(left: Array, right: Array) -> jax.Array:

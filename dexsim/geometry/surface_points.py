@@ -80,7 +80,7 @@ def from_shape(shape: sdf.Shape, config: PointsConfig | None = None) -> SurfaceP
     for k, kind in enumerate(shape.kinds):
         local, out = _TEMPLATES[kind](config.count, shape.size[k])
         turn = shape.rotation[k]
-        place = jnp.einsum("ij,nj->ni", turn, local, precision="highest") + shape.position[k]
+        place = jnp.einsum("ij,nj->ni", turn, local, precision="highest") + shape.position[k][None]
         buried = jnp.zeros(config.count, bool)
         for other, name in enumerate(shape.kinds):
             if other != k:
@@ -231,8 +231,8 @@ def _sphere_points(count: int, size: Array) -> tuple[jax.Array, jax.Array]:
 
 def _ellipsoid_points(count: int, size: Array) -> tuple[jax.Array, jax.Array]:
     unit = jnp.asarray(_fibonacci(count))
-    out = unit / size
-    return unit * size, out / jnp.linalg.norm(out, axis=-1, keepdims=True)
+    out = unit / size[None]
+    return unit * size[None], out / jnp.linalg.norm(out, axis=-1, keepdims=True)
 
 
 def _capsule_points(count: int, size: Array) -> tuple[jax.Array, jax.Array]:
@@ -258,7 +258,7 @@ def _cylinder_points(count: int, size: Array) -> tuple[jax.Array, jax.Array]:
         [np.cos(np.arange(end) * golden), np.sin(np.arange(end) * golden)], -1
     )
     disc = jnp.asarray(np.concatenate([disc, np.zeros((end, 1))], 1), jnp.float32)
-    up = jnp.array([0.0, 0.0, 1.0])
+    up = jnp.array([[0.0, 0.0, 1.0]])
     position = [
         size[0] * round_ + (size[1] * rise)[:, None] * up,
         size[0] * disc + size[1] * up,
@@ -277,7 +277,7 @@ def _box_points(count: int, size: Array) -> tuple[jax.Array, jax.Array]:
     rows = np.arange(count)
     unit[rows, axis] = out[rows, axis] = side
     unit[rows, (axis + 1) % 3], unit[rows, (axis + 2) % 3] = flat[:, 0], flat[:, 1]
-    return jnp.asarray(unit, jnp.float32) * size, jnp.asarray(out, jnp.float32)
+    return jnp.asarray(unit, jnp.float32) * size[None], jnp.asarray(out, jnp.float32)
 
 
 _TEMPLATES = {

@@ -4,6 +4,8 @@ Matrix products name their precision: on NVIDIA GPUs JAX's default is TF32, and 
 kept cube reorientation from being learned.
 """
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 
@@ -37,7 +39,7 @@ def init_mlp(key: jax.Array, sizes: tuple[int, ...], output_gain: float) -> MLP:
     """
     layers = []
     keys = jax.random.split(key, len(sizes) - 1)
-    for i, (rows, columns) in enumerate(zip(sizes[:-1], sizes[1:], strict=True)):
+    for i, (rows, columns) in enumerate(itertools.pairwise(sizes)):
         gain = output_gain if i == len(sizes) - 2 else 2.0**0.5
         kernel = jax.nn.initializers.orthogonal(gain)(keys[i], (rows, columns), jnp.float32)
         layers.append(Layer(kernel=kernel, bias=jnp.zeros(columns)))

@@ -172,7 +172,7 @@ BAD = {
     "wrong type": (["--ppo.discount", "much"], "--ppo.discount much: expected a number"),
     "out of range": (["--ppo.discount", "1.5"], "--ppo.discount 1.5: must be between 0 and 1"),
     "environment value out of range": (["--env.gain", "7"], "--env.gain 7 m: must be between"),
-    "extremes of no ranges": (["--extremes", "0.3"], "--extremes 0.3: task 'tiny' has no ranges"),
+    "extremes of no ranges": (["--extremes", "0.3"], "--extremes 0.3: task 'tiny' has no randomisation ranges"),
     "unknown preset": (["--preset", "tpu"], "tpu"),
     "nothing to resume": (["--resume", "/nonexistent/run"], "no checkpoint to resume from"),
 }
