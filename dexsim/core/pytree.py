@@ -11,6 +11,11 @@ Array = jax.Array | np.ndarray
 """An array on the device or on the host."""
 
 
+def align(x: Array, like: Array) -> jax.Array:
+    """`x` with leading axes of length one, as many as it needs to broadcast against `like`."""
+    return jnp.expand_dims(x, tuple(range(like.ndim - x.ndim)))
+
+
 def choose(done: jax.Array, new: Any, old: Any) -> Any:
     """`new` if `done` [], else `old`: two trees of one structure, random keys included."""
 

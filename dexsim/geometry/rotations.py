@@ -7,7 +7,7 @@ which loses a tenth of a millimetre over the length of a finger.
 import jax
 import jax.numpy as jnp
 
-from dexsim.core.pytree import Array
+from dexsim.core.pytree import Array, align
 
 
 def rotate(matrix: Array, vector: Array) -> jax.Array:
@@ -72,7 +72,7 @@ def quat_multiply(left: Array, right: Array) -> jax.Array:
 
 def quat_conjugate(quat: Array) -> jax.Array:
     """The inverse of a unit quaternion [..., 4]."""
-    return jnp.multiply(quat, jnp.broadcast_to(jnp.array([1.0, -1.0, -1.0, -1.0]), quat.shape))
+    return jnp.multiply(quat, align(jnp.array([1.0, -1.0, -1.0, -1.0]), quat))
 
 
 def quat_angle(left: Array, right: Array) -> jax.Array:

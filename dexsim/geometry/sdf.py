@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dexsim.core.errors import ConfigError
-from dexsim.core.pytree import Array, pytree_dataclass, static
+from dexsim.core.pytree import Array, align, pytree_dataclass, static
 
 KINDS = ("sphere", "box", "capsule", "cylinder", "ellipsoid")
 FAR = 1e3  # m, the distance to a primitive that is switched off
@@ -68,7 +68,7 @@ def ellipsoid(point: Array, size: Array) -> jax.Array:
     p = jax.lax.stop_gradient(jnp.abs(point)) + 1e-9
     s = jax.lax.stop_gradient(size)
     least = jnp.min(s)
-    gap, s, size = (jnp.broadcast_to(x, point.shape) for x in ((s - least) * (s + least), s, size))
+    gap, s, size = (align(x, point) for x in ((s - least) * (s + least), s, size))
     # Each term alone must not exceed one at the root, so this start lies left of it.
     u = jnp.max(s * p - gap, axis=-1)
     for _ in range(12):

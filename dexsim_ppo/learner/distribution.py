@@ -10,16 +10,19 @@ import math
 import jax
 import jax.numpy as jnp
 
+from dexsim.core.pytree import align
+
 
 def sample(key: jax.Array, mean: jax.Array, log_std: jax.Array) -> jax.Array:
     """A random action [..., A], of the shape of `mean`."""
-    return mean + jnp.broadcast_to(jnp.exp(log_std), mean.shape) * jax.random.normal(key, mean.shape)
+    std, noise = jnp.exp(log_std), jax.random.normal(key, mean.shape)
+    return mean + align(std, mean) * noise
 
 
 def log_prob(x: jax.Array, mean: jax.Array, log_std: jax.Array) -> jax.Array:
     """Log density of `x`, summed over the last axis."""
-    z = (x - mean) * jnp.broadcast_to(jnp.exp(-log_std), mean.shape)
-    return -jnp.sum(0.5 * z**2 + jnp.broadcast_to(log_std, mean.shape) + 0.5 * math.log(2 * math.pi), axis=-1)
+    z = (x - mean) * align(jnp.exp(-log_std), mean)
+    return -jnp.sum(0.5 * z**2 + align(log_std, mean) + 0.5 * math.log(2 * math.pi), axis=-1)
 
 
 def entropy(log_std: jax.Array) -> jax.Array:
@@ -30,9 +33,9 @@ def entropy(log_std: jax.Array) -> jax.Array:
 def kl_divergence(mean_p: jax.Array, log_std_p: jax.Array, mean_q: jax.Array, log_std_q: jax.Array) -> jax.Array:
     """KL(p || q) in nats, summed over the last axis."""
     variance_ratio = jnp.exp(2 * (log_std_p - log_std_q))
-    distance = ((mean_p - mean_q) * jnp.broadcast_to(jnp.exp(-log_std_q), mean_q.shape)) ** 2
-    ratio, log_ratio = (jnp.broadcast_to(x, mean_q.shape) for x in (variance_ratio, jnp.log(variance_ratio)))
-    return 0.5 * jnp.sum(ratio + distance - 1 - log_ratio, axis=-1)
+    distance = ((mean_p - mean_q) * align(jnp.exp(-log_std_q), mean_q)) ** 2
+    terms = align(variance_ratio, distance) + distance - 1 - align(jnp.log(variance_ratio), distance)
+    return 0.5 * jnp.sum(terms, axis=-1)
 
 
 def bounds_loss(mean: jax.Array, limit: float = 1.1) -> jax.Array:

@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 
-from dexsim.core.pytree import pytree_dataclass
+from dexsim.core.pytree import align, pytree_dataclass
 from dexsim_ppo.learner import distribution
 from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.networks import Params, apply_mlp
@@ -56,9 +56,8 @@ def loss(
 
     entropy, bounds_loss = distribution.entropy(params.log_std), jnp.float32(0)
     if config.distribution == "tanh":
-        old_rate, std = (jnp.broadcast_to(jnp.exp(x), mean.shape) for x in (-old_log_std, params.log_std))
-        noise = (batch.decision.action - batch.decision.mean) * old_rate
-        entropy += jnp.mean(distribution.tanh_log_det(mean + noise * std))
+        noise = (batch.decision.action - batch.decision.mean) * align(jnp.exp(-old_log_std), mean)
+        entropy += jnp.mean(distribution.tanh_log_det(mean + noise * align(jnp.exp(params.log_std), mean)))
     else:
         bounds_loss = jnp.mean(distribution.bounds_loss(mean))
 

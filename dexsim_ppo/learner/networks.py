@@ -9,7 +9,7 @@ import itertools
 import jax
 import jax.numpy as jnp
 
-from dexsim.core.pytree import pytree_dataclass
+from dexsim.core.pytree import align, pytree_dataclass
 
 
 @pytree_dataclass
@@ -50,7 +50,7 @@ def apply_mlp(layers: MLP, x: jax.Array, precision: str = "highest") -> jax.Arra
     """ELU network: `x` [..., in] to [..., out]. `precision` names a `jax.lax.Precision`."""
     for i, layer in enumerate(layers):
         x = jnp.matmul(x, layer.kernel, precision=precision)
-        x = x + jnp.broadcast_to(layer.bias, x.shape)
+        x = x + align(layer.bias, x)
         if i < len(layers) - 1:
             x = jax.nn.elu(x)
     return x

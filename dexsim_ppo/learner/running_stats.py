@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dexsim.core.pytree import pytree_dataclass, static
+from dexsim.core.pytree import align, pytree_dataclass, static
 from dexsim_ppo.learner.types import Fields, layout_size
 
 # The count is capped here; from then on the mean is exponential over about this many samples. Without the
@@ -83,8 +83,7 @@ def recover_stats(normalizer: Normalizer, *, std_floor: float) -> RunningStats:
 
 def normalize(normalizer: Normalizer, x: jax.Array) -> jax.Array:
     """Normalised and clipped `x` [..., n]."""
-    mean, std = (jnp.broadcast_to(v, x.shape) for v in (normalizer.mean, normalizer.std))
-    z = (x - mean) / std
+    z = (x - align(normalizer.mean, x)) / align(normalizer.std, x)
     return jnp.clip(z, -normalizer.clip, normalizer.clip)
 
 
