@@ -45,10 +45,11 @@ def validate(config: Any) -> None:
     Raises:
       ConfigError: names the class, the field, the value, the unit and the range.
     """
-    for field in dataclasses.fields(config):
+    cls: type = type(config)
+    for field in dataclasses.fields(cls):
         value = getattr(config, field.name)
-        where = f"{type(config).__name__}.{field.name}"
-        choices = choices_of(type(config)).get(field.name)
+        where = f"{cls.__name__}.{field.name}"
+        choices = choices_of(cls).get(field.name)
         if choices is not None and value is not None:
             for item in value if isinstance(value, tuple) else (value,):
                 if item not in choices:
