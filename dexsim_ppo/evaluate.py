@@ -88,10 +88,10 @@ class Evaluator:
             return (state, _follow(last, *series)), (None, film)
 
         state = self.env.evaluation_starts(key, self.chunk)
-        last = (dict(state.metrics), jnp.zeros(self.chunk, jnp.int32), jnp.zeros(self.chunk, bool))
-        (_, last), (series, film) = jax.lax.scan(
-            step, (state, last if self.totals else None), None, length=self.env.evaluation_steps
-        )
+        last: Any = None
+        if self.totals:
+            last = (dict(state.metrics), jnp.zeros(self.chunk, jnp.int32), jnp.zeros(self.chunk, bool))
+        (_, last), (series, film) = jax.lax.scan(step, (state, last), None, length=self.env.evaluation_steps)
         return (last[:2] if self.totals else series), film
 
     def _film(self, frames: Any, terminated: np.ndarray) -> Any:

@@ -31,10 +31,11 @@ from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.curriculum import Curriculum
 from dexsim_ppo.policy import Policy, load_policy
 from dexsim_ppo.retired import migrate_arguments
+from dexsim_ppo.training.arguments import TrainArguments, printable, training_config
+from dexsim_ppo.training.fine_tune import check_fit, fine_tuning_config
 from dexsim_ppo.training.presets import Preset, find_preset
 from dexsim_ppo.training.runlog import RunFolder
-from dexsim_ppo.training.trainer import Run, TrainArguments, printable, training_config
-from dexsim_ppo.training.warm_start import check_fit, learner_settings
+from dexsim_ppo.training.trainer import Run
 
 
 class Trained(NamedTuple):
@@ -88,7 +89,7 @@ def train_policy(
     run, stopped = run_training(arguments, begun, started, command="train_policy(...)")
     if stopped:
         raise DexsimError(f"training was stopped; resume it with train_policy(resume={str(run.folder.path)!r})")
-    return Trained(Policy.load(run.chosen), json.loads(run.folder.report.read_text()), run.folder.path)
+    return Trained(Policy.load(run.selected), json.loads(run.folder.report.read_text()), run.folder.path)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -122,7 +123,7 @@ def run_training(
     )
     folder = RunFolder(path)
     if not resumed:
-        if begun:
+        if isinstance(begun, Policy):
             check_fit(begun, env, arguments.ppo)
         folder.checkpoints.mkdir(parents=True)
         cli.write_json(
@@ -165,7 +166,7 @@ def default_arguments(task: str | None, preset: str, begun: checkpoint.Checkpoin
     default = preset_arguments(name, entry.config(), preset)
     if begun:
         env = from_dict(entry.config_class, begun.env_config)
-        default = dataclasses.replace(default, env=env, ppo=learner_settings(begun, default.ppo))
+        default = dataclasses.replace(default, env=env, ppo=fine_tuning_config(begun, default.ppo))
     return default
 
 
@@ -183,8 +184,9 @@ def parse_arguments(argv: list[str]) -> tuple[TrainArguments, checkpoint.Checkpo
     given = {argument.split("=")[0] for argument in argv}
     if "--steps" in given and "--minutes" not in given:
         default = dataclasses.replace(default, minutes=0.0)
+    generic: Any = TrainArguments  # a static checker knows no type that is only found at run time
     arguments = cli.parse(
-        TrainArguments[type(default.env)],
+        generic[type(default.env)],
         argv,
         default=default,
         prog="python -m dexsim_ppo.train",
@@ -202,7 +204,7 @@ def preset_arguments(task: str, env_config: Any, name: str) -> TrainArguments:
     return TrainArguments(env=env_config, task=task, **values)
 
 
-def arguments_from_dict(config_class: type, data: dict[str, Any]) -> TrainArguments:
+def arguments_from_dict(config_class: type[Any], data: dict[str, Any]) -> TrainArguments:
     """The options that a checkpoint holds."""
     data = dict(data)
     env, ppo = from_dict(config_class, data.pop("env")), from_dict(PPOConfig, data.pop("ppo"))

@@ -11,11 +11,14 @@ import math
 import types
 import typing
 from collections.abc import Iterable
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from dexsim.core.errors import ConfigError
 
-T = TypeVar("T")
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+T = TypeVar("T", bound="DataclassInstance")
 
 
 def setting(
@@ -42,10 +45,11 @@ def validate(config: Any) -> None:
     Raises:
       ConfigError: names the class, the field, the value, the unit and the range.
     """
-    for field in dataclasses.fields(config):
+    cls: type = type(config)
+    for field in dataclasses.fields(cls):
         value = getattr(config, field.name)
-        where = f"{type(config).__name__}.{field.name}"
-        choices = choices_of(type(config)).get(field.name)
+        where = f"{cls.__name__}.{field.name}"
+        choices = choices_of(cls).get(field.name)
         if choices is not None and value is not None:
             for item in value if isinstance(value, tuple) else (value,):
                 if item not in choices:
@@ -181,7 +185,7 @@ def _merge(data: Any, change: dict[str, Any]) -> dict[str, Any]:
 
 def _rebuild(hint: Any, value: Any, where: str) -> Any:
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
-    if dataclasses.is_dataclass(hint):
+    if isinstance(hint, type) and dataclasses.is_dataclass(hint):
         return from_dict(hint, value)
     if origin in (typing.Union, types.UnionType):
         if value is None and type(None) in arguments:

@@ -8,6 +8,7 @@ import dataclasses
 import difflib
 import functools
 import inspect
+import itertools
 import re
 import shutil
 import textwrap
@@ -149,10 +150,11 @@ def field_docs(cls: type) -> dict[str, str]:
     """The docstring under each field of a dataclass, each on one line."""
     docs: dict[str, str] = {}
     for base in reversed([c for c in cls.__mro__ if dataclasses.is_dataclass(c)]):
-        body = ast.parse(textwrap.dedent(inspect.getsource(base))).body[0].body  # type: ignore[attr-defined]
-        for field, after in zip(body, body[1:], strict=False):
+        definition = ast.parse(textwrap.dedent(inspect.getsource(base))).body[0]
+        assert isinstance(definition, ast.ClassDef)
+        for field, after in itertools.pairwise(definition.body):
             if isinstance(field, ast.AnnAssign) and isinstance(after, ast.Expr):
-                docs[field.target.id] = " ".join(ast.literal_eval(after.value).split())  # type: ignore[attr-defined]
+                docs[ast.unparse(field.target)] = " ".join(ast.literal_eval(after.value).split())
     return docs
 
 
@@ -169,7 +171,8 @@ def options_of(cls: type, default: Any = None, path: tuple[str, ...] = ()) -> li
     hints = typing.get_type_hints(cls, include_extras=True)
     options, nested = [], []
     for field in dataclasses.fields(cls):
-        value, hint, marks = _default(field, default), hints[field.name], ()
+        value, hint = _default(field, default), hints[field.name]
+        marks: list[Any] = []
         here = (*path, field.name)
         if dataclasses.is_dataclass(value):
             nested += options_of(type(value), value, here)
@@ -294,8 +297,8 @@ def in_option_names(message: str, options: Iterable[Option], typed: Callable[[Op
         if before is None:
             continue
         field = rf"\b{re.escape(option.owner.__name__)}\.{option.path[-1]}"
-        message = re.sub(rf"{field} = '([^']*)'", lambda m, b=before: b + m[1], message)
-        message = re.sub(rf"{field} = \(([^()]*)\)", lambda m, b=before: b + m[1].replace(",", ""), message)
+        message = re.sub(rf"{field} = '([^']*)'", functools.partial(_unwrapped, before), message)
+        message = re.sub(rf"{field} = \(([^()]*)\)", functools.partial(_unwrapped, before, drop=","), message)
         message = re.sub(rf"{field} = ", before, message)
         message = re.sub(rf"{field}\b", before.rstrip(" ="), message)
     return message
@@ -336,3 +339,8 @@ def _meant(name: str, names: Iterable[str]) -> str:
     same = [n for n in names if n.rpartition(".")[2] == name.removeprefix("--")]
     near = same or difflib.get_close_matches(name, names, n=1)
     return f" (perhaps {near[0]})" if near else ""
+
+
+def _unwrapped(before: str, match: re.Match[str], drop: str = "") -> str:
+    """`before` and the value inside quotes or parentheses, without `drop`."""
+    return before + (match[1].replace(drop, "") if drop else match[1])

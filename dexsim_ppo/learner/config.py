@@ -18,7 +18,7 @@ class PPOConfig:
     epochs: int = setting(5, unit="1", low=1)
     """Passes over the experience of one iteration."""
     minibatches: int = setting(4, unit="1", low=1)
-    """Parts that one pass is split into; must divide T * B. Few large ones are best."""
+    """Minibatches per epoch; must divide T * B. A few large ones work best."""
     iterations_per_call: int = setting(1, unit="1", low=1)
     """Iterations inside one compiled call."""
     discount: float = setting(0.99, unit="1", low=0.0, high=1.0)
@@ -28,9 +28,9 @@ class PPOConfig:
     reward_scale: float = setting(1.0, unit="1", low=1e-9)
     """Factor on rewards, seen by the learner only."""
     clip_ratio: float = setting(0.2, unit="1", low=1e-3, high=1.0)
-    """Change of an action's probability beyond which its gradient is cut."""
+    """Relative change of an action's probability beyond which its gradient is zero."""
     value_clip: float = setting(0.2, unit="value deviations", low=0.0)
-    """Change of a value beyond which its gradient is cut; 0 turns this off."""
+    """Change of a value beyond which its gradient is zero; 0 turns value clipping off."""
     value_coefficient: float = setting(1.0, unit="1", low=0.0)
     """Weight of the value loss."""
     entropy_coefficient: float = setting(0.0, unit="1", low=0.0)
@@ -38,7 +38,7 @@ class PPOConfig:
     bounds_coefficient: float = setting(1e-3, unit="1", low=0.0)
     """Weight of the penalty on Gaussian means beyond +-1.1."""
     max_grad_norm: float = setting(1.0, unit="1", low=1e-6)
-    """Length that the gradients of actor and critic are each clipped to."""
+    """Norm that the gradients of actor and critic are each clipped to."""
     learning_rate: float = setting(5e-4, unit="1", low=0.0, high=1.0)
     """Adam's step size, at the start if it adapts."""
     learning_rate_min: float = setting(1e-5, unit="1", low=0.0, high=1.0)
@@ -46,14 +46,13 @@ class PPOConfig:
     learning_rate_max: float = setting(2e-3, unit="1", low=0.0, high=1.0)
     """Upper end of the adaptive learning rate."""
     kl_target: float = setting(0.012, unit="nats", low=0.0)
-    """Policy change in one iteration that the learning rate adapts to; 0 keeps the rate fixed."""
+    """KL divergence per iteration that the learning rate adapts to; 0 keeps the rate fixed."""
     distribution: Literal["gaussian", "tanh"] = setting("gaussian")
     """Gaussian clipped by the environment, or squashed by tanh."""
     critic_first: int = setting(0, unit="iterations", low=0)
-    """First iterations, in which only the critic learns, at the cap of the learning rate: for an actor that knows
-    more than its critic."""
+    """Initial iterations that train only the critic, at `learning_rate_max`: in fine-tuning the critic is new."""
     initial_std: float = setting(0.6, unit="1", low=1e-3, high=10.0)
-    """Standard deviation of the first policy's actions, of a range [-1, 1]."""
+    """Initial standard deviation of actions, whose range is [-1, 1]."""
     std_min: float = setting(0.05, unit="1", low=1e-4, high=10.0)
     """Floor of the standard deviation."""
     std_max: float = setting(1.0, unit="1", low=1e-4, high=10.0)

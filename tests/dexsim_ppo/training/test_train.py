@@ -19,7 +19,7 @@ from tiny_env import TinyEnv
 from dexsim.core import cli
 from dexsim_ppo import evaluate, train
 from dexsim_ppo.policy import Policy
-from dexsim_ppo.training import trainer
+from dexsim_ppo.training.arguments import training_config
 from dexsim_ppo.training.runlog import RunFolder, read_metrics
 
 QUICK = [
@@ -172,7 +172,7 @@ BAD = {
     "wrong type": (["--ppo.discount", "much"], "--ppo.discount much: expected a number"),
     "out of range": (["--ppo.discount", "1.5"], "--ppo.discount 1.5: must be between 0 and 1"),
     "environment value out of range": (["--env.gain", "7"], "--env.gain 7 m: must be between"),
-    "extremes of no ranges": (["--extremes", "0.3"], "--extremes 0.3: task 'tiny' has no ranges"),
+    "extremes of no ranges": (["--extremes", "0.3"], "--extremes 0.3: task 'tiny' has no randomisation ranges"),
     "unknown preset": (["--preset", "tpu"], "tpu"),
     "nothing to resume": (["--resume", "/nonexistent/run"], "no checkpoint to resume from"),
 }
@@ -194,12 +194,12 @@ def test_corners_are_for_training_alone():
 
     plain, _ = train.parse_arguments(["--task", "rotate", "--preset", "gpu"])
     assert plain.extremes == 0.6 and plain.env == RotateConfig()
-    asked = trainer.training_config(plain)
+    asked = training_config(plain)
     assert asked.randomization.extremes == asked.objects.extremes == 0.6
     without = dataclasses.replace(asked, randomization=plain.env.randomization, objects=plain.env.objects)
     assert without == plain.env
     off, _ = train.parse_arguments(["--task", "rotate", "--preset", "gpu", "--extremes", "0"])
-    assert trainer.training_config(off) == RotateConfig()
+    assert training_config(off) == RotateConfig()
 
 
 def test_files_are_never_overwritten_or_mistaken(finished, tmp_path, monkeypatch, capsys):

@@ -1,4 +1,4 @@
-"""Training that goes on from a policy: what it takes over, what it leaves alone at first, what it refuses."""
+"""Fine-tuning a policy: what is kept, what trains first, and what is refused."""
 
 import dataclasses
 
@@ -13,8 +13,8 @@ from tiny_env import CONFIG, SMALL, TinyConfig, TinyEnv
 from dexsim_ppo import evaluate, train
 from dexsim_ppo.learner.ppo import make_train
 from dexsim_ppo.policy import Policy
+from dexsim_ppo.training.fine_tune import fine_tuning_config, initialize_from
 from dexsim_ppo.training.runlog import RunFolder, read_metrics
-from dexsim_ppo.training.warm_start import learner_settings, start_from
 
 
 @pytest.fixture(scope="module")
@@ -35,11 +35,11 @@ def tiny_task(monkeypatch):
 def started(policy, config, env=None):
     env = env or TinyEnv()
     training = make_train(env, config)
-    return env, training, start_from(policy, config, training.init(jax.random.key(1)))
+    return env, training, initialize_from(policy, config, training.init(jax.random.key(1)))
 
 
 def test_it_acts_like_the_policy(policy):
-    config = learner_settings(policy, SMALL)
+    config = fine_tuning_config(policy, SMALL)
     env, _, state = started(policy, config)
     obs = jax.random.normal(jax.random.key(2), (256, 3))
     again = Policy.from_training(env, config, state)
@@ -48,7 +48,7 @@ def test_it_acts_like_the_policy(policy):
 
 
 def test_the_critic_learns_first_and_then_both(policy):
-    config = dataclasses.replace(learner_settings(policy, SMALL), critic_first=3)
+    config = dataclasses.replace(fine_tuning_config(policy, SMALL), critic_first=3)
     _, training, state = started(policy, config)
     params = []
     for _ in range(4):
@@ -68,7 +68,7 @@ def test_the_critic_learns_first_and_then_both(policy):
 def test_what_it_knows_survives_and_grows(policy):
     """On a weaker motor: better from the first iteration on than one from nothing, never worse, better at the end."""
     env = TinyEnv(TinyConfig(gain=0.15))
-    config = dataclasses.replace(learner_settings(policy, CONFIG), critic_first=200)
+    config = dataclasses.replace(fine_tuning_config(policy, CONFIG), critic_first=200)
     _, training, state = started(policy, config, env)
     measure = evaluate.Evaluator(env, 256)
     score = lambda state: measure(  # noqa: E731
@@ -114,8 +114,8 @@ def test_what_does_not_fit_is_refused(policy, tiny_task, tmp_path, monkeypatch, 
     for arguments, said in (
         (["--task", "grasp", "--policy", "policy.msgpack"], "of the task 'tiny', not 'grasp'"),
         (["--policy", "nothing.msgpack"], "cannot be read"),
-        (["--policy", "other.msgpack"], "does not observe"),
-        (["--policy", "policy.msgpack", "--ppo.actor-layers", "7"], "leave ppo.actor_layers"),
+        (["--policy", "other.msgpack"], "observations of policy and environment differ"),
+        (["--policy", "policy.msgpack", "--ppo.actor-layers", "7"], "do not set --ppo.actor-layers"),
     ):
         assert exit_code(train.main, [*arguments, "--steps", "128"]) == 2
         error = capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""Training that goes on from a finished policy, on objects, motors or sensors that have changed."""
+"""Fine-tuning: training that starts from a policy, on changed objects, motors or sensors."""
 
 import dataclasses
 
@@ -13,12 +13,11 @@ from dexsim_ppo.learner.types import Environment
 from dexsim_ppo.policy import Policy, layout_to_list
 
 
-def learner_settings(policy: Policy, config: PPOConfig) -> PPOConfig:
-    """`config` with the policy's network, little noise, small steps, and some iterations for the critic alone.
+def fine_tuning_config(policy: Policy, config: PPOConfig) -> PPOConfig:
+    """`config` with the policy's network, little noise, small steps, and initial iterations for the critic alone.
 
-    A policy's file holds neither its critic nor its noise. The first policy's noise would undo what it knows, a
-    critic that has not settled would lead it astray, for its errors all point the same way, and the steps of a first
-    training are too large for what little is left to gain.
+    A policy file holds neither critic nor noise. The noise and step size of training from scratch would make the
+    policy forget. So would a fresh critic, whose errors are correlated: it trains alone first.
     """
     return dataclasses.replace(
         config,
@@ -34,26 +33,26 @@ def learner_settings(policy: Policy, config: PPOConfig) -> PPOConfig:
 
 
 def check_fit(policy: Policy, env: Environment, config: PPOConfig) -> None:
-    """Whether a learner with this configuration can go on from the policy.
+    """Check that a learner with this configuration can start from the policy.
 
     Raises:
-      ConfigError: the policy observes something else than the environment offers, or has another network.
+      ConfigError: the policy's observation is not the environment's, or its network is not the configuration's.
     """
     theirs, mine = (layout_to_list(fields) for fields in (policy.observation_layout, env.observation_layout["actor"]))
     if theirs != mine:
         odd = [name for name, *_ in (*(f for f in theirs if f not in mine), *(f for f in mine if f not in theirs))]
-        raise ConfigError(f"the policy does not observe what this configuration offers: {', '.join(odd) or 'order'}")
+        raise ConfigError(f"observations of policy and environment differ: {', '.join(odd) or 'their order'}")
     layers = tuple(layer.kernel.shape[1] for layer in policy.params.layers)
     if layers != (*config.actor_layers, env.action_size) or policy.params.squash != config.distribution:
         raise ConfigError(
-            f"the policy's network has layers {layers} and is {policy.params.squash!r}; leave "
-            "ppo.actor_layers and ppo.distribution as they are"
+            f"the policy's network has layers {layers} and is {policy.params.squash!r}: do not set "
+            "--ppo.actor-layers or --ppo.distribution"
         )
 
 
-def start_from(policy: Policy, config: PPOConfig, state: TrainState) -> TrainState:
-    """A fresh learner's state with the policy's actor and observation statistics, so that the network goes on seeing
-    what it was trained with."""
+def initialize_from(policy: Policy, config: PPOConfig, state: TrainState) -> TrainState:
+    """A fresh learner's state with the policy's actor and observation statistics: the actor's inputs keep the
+    normalisation that it was trained with."""
     stats = recover_stats(policy.params.normalizer, std_floor=config.observation_std_floor)
     return dataclasses.replace(
         state,
