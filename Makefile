@@ -37,6 +37,7 @@ test: $(TESTABLE)
 lint: $(LINTABLE)
 	$(PY) -m ruff check $(ARGS)
 	$(PY) -m ruff format --check
+	$(PY) -m mypy
 
 clean:
 	rm -rf $(VENV) dist .pytest_cache .ruff_cache
@@ -58,6 +59,7 @@ $(TESTABLE): pyproject.toml | $(VENV)/.created
 	$(PIP) install --quiet --editable ".[brax,warp,video,tb]" --group test
 	@touch $@
 
+# With the packages, since mypy reads the types of JAX and NumPy.
 $(LINTABLE): pyproject.toml | $(VENV)/.created
-	$(PIP) install --quiet --group lint
+	$(PIP) install --quiet --editable . --group lint
 	@touch $@

@@ -1,12 +1,11 @@
-"""The bridge's timing against a scripted hand on a pseudo-terminal: one JSON line per measurement.
+"""Timing of the bridge with a scripted hand on a pseudo-terminal: one JSON line per measurement.
 
     python benchmarks/bridge.py --seconds 600
 
-The hand is a process of its own that answers 9.6 ms after each request, as the real one does over
-RS485. Measured are the whole command as a user runs it (exchanges at 83 Hz, the policy at its own rate,
-log and safety on) and, apart, observation and policy alone. `--twin` takes the emulated hand with its physics and the
-object's sensors in place of the scripted one, `--port` a hand that is there already. `own` is the same timing without
-the cycles during which the machine took a core from everybody (`machine`): what is left is the bridge's.
+The hand is a separate process that answers 9.6 ms after each request, like the real one over RS485. Two measurements:
+the whole command as a user runs it (exchanges at 83 Hz, the policy at its own rate, log and safety on), and observation
+and policy alone. `--twin` uses the emulated hand with its physics and object sensors, `--port` an existing hand. `own`
+is the timing without the cycles in which the machine took a core from all programs (`machine`).
 """
 
 import argparse
@@ -27,16 +26,16 @@ from pathlib import Path
 import numpy as np
 
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parent.parent)}
-EXCHANGE = 0.0096  # s, measured on the hand: mean and median of the round trip
+EXCHANGE = 0.0096  # s, mean and median of the round trip, measured on a hand
 
 
 def peer() -> None:
-    """A hand that follows its targets; prints its port, and serves until its input closes."""
+    """A scripted hand that follows its targets; prints its port, and serves until its input closes."""
     from dexsim_real.core.process import use_realtime
     from dexsim_real.wire import frames
     from dexsim_real.wire.frames import Command, Frame, Mode, Parser
 
-    use_realtime()  # It stands for hardware, which waits for no scheduler.
+    use_realtime()  # Hardware waits for no scheduler.
     master, slave = os.openpty()
     tty.setraw(slave)
     print(os.ttyname(slave), flush=True)
@@ -49,7 +48,7 @@ def peer() -> None:
         due = time.monotonic() + EXCHANGE
         for frame in parser.feed(os.read(master, 4096)):
             if frame.command == Command.VERSION:
-                time.sleep(0.0002)  # An answer sooner than its bytes take is not believed.
+                time.sleep(0.0002)  # The bridge rejects an answer that arrives sooner than its bytes take.
                 os.write(master, Frame(0x80, frames.HOST, Command.VERSION, b"bench").encode())
             elif frame.command == Command.EXCHANGE:
                 command, joint = frames.decode_command(frame.data), state["joint"]
@@ -64,7 +63,7 @@ def peer() -> None:
 
 @contextlib.contextmanager
 def scripted_hand():
-    """A runner's options for a scripted hand in its own process."""
+    """Run a scripted hand in its own process; options of the runner for it."""
     process = subprocess.Popen(
         [sys.executable, __file__, "--peer"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=ENVIRONMENT
     )
@@ -77,7 +76,7 @@ def scripted_hand():
 
 @contextlib.contextmanager
 def emulated_hand(task: str, folder: Path):
-    """A runner's options for `python -m dexsim_real.twin`."""
+    """Run `python -m dexsim_real.twin`; options of the runner for it."""
     port, imu, masks = (folder / name for name in ("hand", "imu", "masks"))
     process = subprocess.Popen(
         [
@@ -108,25 +107,25 @@ def emulated_hand(task: str, folder: Path):
 
 
 def resident() -> float:
-    """Memory of this process, MiB."""
+    """Memory of this process in MiB."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
 def own_loops(ticks: dict, waited: dict, intervals: np.ndarray) -> dict[str, dict]:
-    """The two loops' timing while the machine let them run.
+    """Timing of the two loops in the cycles in which the machine let them run.
 
     Args:
-      ticks: by loop, deadlines and when they were met, alternating, s.
-      waited: by loop, deadlines missed for the hand before each cycle; the policy's has none.
-      intervals: [N, 2] s, when the machine was away.
+      ticks: by loop, deadlines in s and when they were met, alternating.
+      waited: by loop, deadlines missed because of the hand before each cycle; none for the policy loop.
+      intervals: [N, 2] s in which the machine ran no program.
     """
     from machine import own_timing
 
     own = {}
-    # Without their first second; shorter loops belong to starting up.
+    # Without the first second; shorter loops belong to the start.
     for pace, times in sorted(ticks.items(), key=lambda x: len(x[1]))[-2:]:
         first, (due, met) = round(1 / pace.period), np.reshape(times, (-1, 2)).T
-        # Starting up ends with a fresh count.
+        # The count is reset after the start.
         known = np.array([*waited[pace], 0][: len(due) + 1] if pace in waited else np.zeros(len(due) + 1), int)
         own["exchange_loop" if pace in waited else "policy_loop"] = own_timing(
             due[first:], met[first:], pace.period, intervals, np.maximum(np.diff(known), 0)[first:]
@@ -135,7 +134,7 @@ def own_loops(ticks: dict, waited: dict, intervals: np.ndarray) -> dict[str, dic
 
 
 def measure_run(options: argparse.Namespace, hand: list[str], folder: Path) -> dict:
-    """A whole run by the command, its own summary, and the memory over time."""
+    """A whole run of the command: its summary, timing and memory."""
     from machine import Away
 
     from dexsim_real.control import servo
@@ -208,7 +207,7 @@ def measure_compute(policy: str, ticks: int) -> dict:
     from dexsim import load_hand
     from dexsim_ppo.policy import load_policy
     from dexsim_real.control.controller import IDENTITY, Controller
-    from dexsim_real.core.process import use_realtime
+    from dexsim_real.core.process import leave_realtime, use_realtime
     from dexsim_real.sensors.hand import HandSensing, HardwareConfig
     from dexsim_real.sensors.readings import ObjectEstimate
     from dexsim_real.wire import frames
@@ -219,7 +218,7 @@ def measure_compute(policy: str, ticks: int) -> dict:
     rng = np.random.default_rng(0)
     seen = ObjectEstimate(np.zeros(3), np.zeros(3), IDENTITY)
     both, whole = [], []
-    realtime = use_realtime()  # As the command does.
+    realtime = use_realtime()  # Like the command.
     for _ in range(ticks):
         state = frames.empty_state()
         state["joint"]["position"] = rng.uniform(hand.joint_lower, hand.joint_upper)
@@ -230,7 +229,7 @@ def measure_compute(policy: str, ticks: int) -> dict:
         np.asarray(controller.policy(np.asarray(controller._observe(tick.readings))))
         both.append(time.perf_counter() - middle)
         whole.append(middle - start)
-    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    leave_realtime()
     return {
         name: {f"p{q}_ms": round(1e3 * float(np.percentile(times, q)), 4) for q in (50, 99)}
         for name, times in (("observe_and_policy", both), ("whole_tick", whole))
@@ -239,11 +238,11 @@ def measure_compute(policy: str, ticks: int) -> dict:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--policy", default="grasp")
-    parser.add_argument("--port", help="a hand that is there already")
-    parser.add_argument("--twin", choices=("grasp", "rotate"), help="the emulated hand, for a policy of this task")
-    parser.add_argument("--seconds", type=float, default=60.0)
-    parser.add_argument("--ticks", type=int, default=5000)
+    parser.add_argument("--policy", default="grasp", help="policy file, or name of a shipped policy")
+    parser.add_argument("--port", help="port of an existing hand")
+    parser.add_argument("--twin", choices=("grasp", "rotate"), help="use the emulated hand, for a policy of this task")
+    parser.add_argument("--seconds", type=float, default=60.0, help="duration of the run")
+    parser.add_argument("--ticks", type=int, default=5000, help="ticks of observation and policy alone")
     parser.add_argument("--peer", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.peer:

@@ -1,7 +1,7 @@
-"""When the machine let nothing run: times that a benchmark of timing cannot be blamed for.
+"""Finds the times in which the machine ran no program, to exclude them from timing benchmarks.
 
-A sentinel on each core, of higher priority than all that is measured, wakes twice a millisecond. What holds it up
-holds up everything on that core: a hypervisor that lent the processor to others, the kernel, firmware.
+On each core a sentinel with a higher priority than the measured programs wakes twice a millisecond. What delays it (a
+hypervisor, the kernel, firmware) delays everything on that core.
 """
 
 import gc
@@ -14,15 +14,15 @@ import time
 
 import numpy as np
 
-STEP = 0.0005  # s between two looks
-GAP = 0.0003  # s, lateness of a look from which the core counts as away; several together must not fill a cycle's slack
+STEP = 0.0005  # s between two wake-ups
+GAP = 0.0003  # s, delay of a wake-up above which the core counts as away; several must not fill a cycle's slack
 PRIORITY = 90
 
 
 class Away:
     """Watches every core of this process while the block runs; then `intervals` [N, 2] s (monotonic clock), merged.
 
-    Where real-time priority is not `allowed` (docs/hardware.md) it watches nothing, and every fault is the program's.
+    Without the permission for real-time priority (`allowed`, docs/hardware.md) it watches nothing.
     """
 
     def __enter__(self) -> "Away":
@@ -41,8 +41,8 @@ class Away:
         finally:
             os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
         for process in self._sentinels:
-            process.stdout.readline()  # It looks from now on.
-        self._begin = time.monotonic()  # Before, a sentinel that started took its core from another.
+            process.stdout.readline()  # It watches from now on.
+        self._begin = time.monotonic()  # Before, starting sentinels took the cores from others.
         return self
 
     def __exit__(self, *_) -> None:
@@ -53,7 +53,7 @@ class Away:
         self.intervals = merged([span for span in found if span[0] > self._begin])
 
     def summary(self) -> dict[str, float]:
-        """How often and how long."""
+        """Number and duration of the intervals."""
         lengths = self.intervals[:, 1] - self.intervals[:, 0]
         return {
             "watched": self.allowed,
@@ -64,7 +64,7 @@ class Away:
 
 
 def merged(intervals: list) -> np.ndarray:
-    """The union of intervals, as disjoint ones [N, 2] in order."""
+    """The union of intervals as disjoint, ordered intervals [N, 2]."""
     union: list[list[float]] = []
     for begin, end in sorted(intervals):
         if union and begin <= union[-1][1]:
@@ -85,14 +85,14 @@ def overlaps(begin: np.ndarray, end: np.ndarray, intervals: np.ndarray) -> np.nd
 def own_timing(
     due: np.ndarray, met: np.ndarray, period: float, intervals: np.ndarray, others: np.ndarray | None = None
 ) -> dict[str, float]:
-    """A loop's lateness and missed deadlines while the machine let it run.
+    """Lateness and missed deadlines of a loop in the cycles in which the machine let it run.
 
     Args:
       due: [K] s, deadlines that the loop kept, in order.
-      met: [K] s, when it went on after each.
-      intervals: [N, 2] s, when a core was away; a cycle that meets one, or should have begun in one, is left out, and
-        counted in `left_out`.
-      others: [K] how many of the deadlines missed before each are another's fault.
+      met: [K] s, when it continued after each.
+      intervals: [N, 2] s, when a core was away; a cycle that overlaps one, or should have begun in one, is excluded;
+        `left_out` is the share of such cycles.
+      others: [K] number of deadlines missed before each for other reasons.
     """
     held_up = overlaps(due[:-1], met[1:], intervals)
     late, missed = (met - due)[1:], np.rint(np.diff(due) / period).astype(int) - 1
@@ -109,7 +109,7 @@ def own_timing(
 
 
 def watch(core: int) -> None:
-    """Until SIGTERM; then prints the times at which this core was away."""
+    """Watch a core until SIGTERM, then print the intervals in which it was away."""
     found, done = [], []
     os.sched_setaffinity(0, {core})
     signal.signal(signal.SIGTERM, lambda *_: done.append(True))

@@ -1,12 +1,12 @@
-"""Trials on the emulated hand as a user has them: two processes, a terminal between them, the paper's metrics.
+"""Trials of a policy on the emulated hand in real time, as a user runs them: the paper's metrics.
 
     python benchmarks/trials.py --task rotate --trials 10
     python benchmarks/trials.py --task grasp --trials 25
 
-For each trial a fresh `python -m dexsim_real.twin` hands one object over, and the very command that it shows,
-`python -m dexsim_real.run ...`, plays against it on the wall clock, through RS485 frames, an IMU's bytes and a
-camera's masks. What is counted is the emulated hand's own truth. Trial k of a seed is trial k of
-`benchmarks/zero_shot.py`, which computes the same without a clock.
+For each trial a new `python -m dexsim_real.twin` provides one object, and the command that it prints,
+`python -m dexsim_real.run ...`, controls it through RS485 frames, an IMU's bytes and a camera's masks. The metrics use
+the true state of the emulated hand. Trial k of a seed is trial k of `benchmarks/zero_shot.py`, which computes it in
+virtual time.
 """
 
 import argparse
@@ -26,11 +26,11 @@ from zero_shot import COMMANDS, TARGETS, grasp_metrics, rotate_metrics, simulate
 
 ROOT = Path(__file__).resolve().parent.parent
 LIMITS = {"grasp": 8.0, "rotate": 120.0}  # s, the tasks' own
-_START, _AFTER = 90.0, 60.0  # s until a process is up; beyond a trial's limit
+_START, _AFTER = 90.0, 60.0  # s to start a process; s after a trial's time limit
 
 
 def start(words: list[str], **options: Any) -> subprocess.Popen:
-    """Python with these words, in the repository."""
+    """Start Python with these arguments in the repository."""
     path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH", "")]))
     return subprocess.Popen(
         [sys.executable, *words], cwd=ROOT, env={**os.environ, "PYTHONPATH": path}, text=True, **options
@@ -38,7 +38,7 @@ def start(words: list[str], **options: Any) -> subprocess.Popen:
 
 
 def twin_words(options: argparse.Namespace, number: int, folder: Path) -> list[str]:
-    """The emulated hand with trial `number`; commands and shapes as in `zero_shot.py`."""
+    """Arguments of the emulated hand for a trial; commands and shapes as in `zero_shot.py`."""
     from dexsim_real.twin.plant.shapes import SHAPES
 
     words = [
@@ -48,8 +48,8 @@ def twin_words(options: argparse.Namespace, number: int, folder: Path) -> list[s
         options.task,
         "--seed",
         str(options.seed),
-        "--draw",
-        options.draw,
+        "--parameters",
+        options.parameters,
         "--first",
         str(number),
         "--trials",
@@ -77,7 +77,7 @@ def twin_words(options: argparse.Namespace, number: int, folder: Path) -> list[s
 
 
 def shown_command(twin: subprocess.Popen) -> list[str]:
-    """The words of the runner's command, from what the emulated hand prints."""
+    """Arguments of the runner, from the output of the emulated hand."""
     until = time.monotonic() + _START
     for line in twin.stdout:
         words = shlex.split(line) if "dexsim_real.run" in line else []
@@ -89,7 +89,7 @@ def shown_command(twin: subprocess.Popen) -> list[str]:
 
 
 def run_trial(options: argparse.Namespace, number: int, folder: Path) -> dict[str, Any]:
-    """One trial: the referee's report, with what the bridge says of itself as `bridge`."""
+    """Run one trial: the referee's report, with statistics of the bridge as `bridge`."""
     began = time.monotonic()
     limit = options.seconds or LIMITS[options.task]
     with (folder / "twin.txt").open("w") as errors, (folder / "run.txt").open("w") as shown:
@@ -112,7 +112,7 @@ def run_trial(options: argparse.Namespace, number: int, folder: Path) -> dict[st
             ]
             runner = start(words, stdout=shown, stderr=subprocess.STDOUT)
             until = time.monotonic() + _START + limit + _AFTER
-            # The emulated hand ends with its trial; a runner that ends before it has failed.
+            # The emulated hand ends with its trial; a runner that ends earlier has failed.
             while twin.poll() is None and runner.poll() is None and time.monotonic() < until:
                 time.sleep(0.05)
         finally:
@@ -142,58 +142,60 @@ def _collect(folder: Path, code: int, wall: float) -> dict[str, Any]:
         "bridge": {
             "exit": code,
             "end": bridge["end"],
-            "believed_successes": bridge.get("successes"),
+            "measured_successes": bridge.get("successes"),
             "exchanges": link["sent"],
             "unanswered": link["sent"] - link["answered"],
             "safety": bridge["safety"],
             "policy_jitter": bridge["policy_jitter"],
             "round_trip": bridge["round_trip"],
             "outside_limits": twin["commands"]["outside_limits"],
-            "let_go_s": twin["physics"]["let_go_s"],
+            "slipped_s": twin["physics"]["slipped_s"],
         },
     }
 
 
 def line(report: dict[str, Any]) -> str:
-    """One trial for people."""
-    told = (
+    """One trial as a line of text."""
+    result = (
         f"command {report['command']:.2f} {report['shape']:<11} fingers {report['finger_force']:6.2f} N"
         if report["task"] == "grasp"
         else f"{report['successes']:3d} successes ({report['paper_successes']} as the paper counts)"
     )
     bridge = report["bridge"]
     return (
-        f"{report['trial']:4d}  {told}  {report['seconds']:7.2f} s  {report['end']}  ({report['wall']:.0f} s; "
+        f"{report['trial']:4d}  {result}  {report['seconds']:7.2f} s  {report['end']}  ({report['wall']:.0f} s; "
         f"{bridge['unanswered']} of {bridge['exchanges']} exchanges unanswered, policy late p99 "
-        f"{bridge['policy_jitter']['p99_ms']:.1f} ms, physics let go {bridge['let_go_s']:.2f} s)"
+        f"{bridge['policy_jitter']['p99_ms']:.1f} ms, simulated time slipped {bridge['slipped_s']:.2f} s)"
     )
 
 
 def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--task", choices=("grasp", "rotate"), required=True)
-    parser.add_argument("--policy", help="policy file; by default the shipped one of the task")
+    parser.add_argument("--policy", help="policy file; by default the shipped policy of the task")
     parser.add_argument("--trials", type=int, default=10)
     parser.add_argument("--first", type=int, default=0, help="number of the first trial")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--seconds", type=float, help="time limit of a trial; by default the task's (8 or 120)")
     parser.add_argument(
-        "--draw",
+        "--seconds", type=float, help="time limit of a trial in s; by default that of the task (8 or 120)"
+    )
+    parser.add_argument(
+        "--parameters",
         choices=("outside", "inside", "nominal"),
         default="outside",
-        help="parameters outside training's ranges, inside them, or at their middle",
+        help="parameters of hand and object: outside training's ranges, inside them, or nominal",
     )
-    parser.add_argument("--twin", default="", help="more options of `dexsim_real.twin`, in one word")
-    parser.add_argument("--runner", default="", help="more options of `dexsim_real.run`, in one word")
+    parser.add_argument("--twin", default="", help="more options of `dexsim_real.twin`, as one argument")
+    parser.add_argument("--runner", default="", help="more options of `dexsim_real.run`, as one argument")
     parser.add_argument("--no-realtime", dest="realtime", action="store_false")
-    parser.add_argument("--json", type=Path, help="file for everything")
+    parser.add_argument("--json", type=Path, help="JSON file for all results")
     return parser.parse_args()
 
 
 def main() -> None:
     options = arguments()
     reports = []
-    with contextlib.suppress(KeyboardInterrupt):  # What is done by then is shown.
+    with contextlib.suppress(KeyboardInterrupt):  # Show the trials done so far.
         for number in range(options.first, options.first + options.trials):
             with tempfile.TemporaryDirectory(prefix="dexsim-trial-") as folder:
                 reports.append(run_trial(options, number, Path(folder)))
@@ -203,7 +205,7 @@ def main() -> None:
     here = (grasp_metrics if options.task == "grasp" else rotate_metrics)(reports)
     there = simulated(options.task, options.policy or options.task)
     print(
-        f"{options.task}: {len(reports)} trials through the bytes, parameters {options.draw}, seed {options.seed}; "
+        f"{options.task}: {len(reports)} trials in real time, parameters {options.parameters}, seed {options.seed}; "
         f"targets {TARGETS[options.task]}"
     )
     print(table(here, there))

@@ -1,12 +1,12 @@
-"""Shipped policies on the emulated hand, with no fine-tuning: the paper's metrics beside those in simulation.
+"""Shipped policies on the emulated hand without fine-tuning: the paper's metrics, beside those in simulation.
 
     python benchmarks/zero_shot.py --task rotate --trials 10
-    python benchmarks/zero_shot.py --task grasp --trials 50 --draw inside --set gear_play=0
+    python benchmarks/zero_shot.py --task grasp --trials 50 --parameters inside --set gear_play=0
     python benchmarks/zero_shot.py --task grasp --trials 50 --seed 0 1 2 3 --processes 2
 
-Virtual time: every exchange goes through the bytes of both frames and the emulated palm board, then the bridge's own
-sensing, safety and controller, but in one process and as fast as it computes (`dexsim_real.twin.virtual`). What is
-counted is the referee's truth, not what the bridge believes. Trial k of a seed is the same whatever runs beside it.
+In virtual time (`dexsim_real.twin.virtual`): frames, emulated palm board, and the bridge's sensing, safety and
+controller run in one process, as fast as they compute. The metrics use the true state, not the measurements of the
+bridge. Trial k of a seed does not depend on the other trials.
 """
 
 import argparse
@@ -28,7 +28,7 @@ COMMANDS = (0.0, 0.25, 0.5, 0.75, 1.0)
 
 @functools.lru_cache(maxsize=2)
 def load(policy: str) -> tuple[Any, Any, Any]:
-    """Hand, controller and calibration; once a process."""
+    """Hand, controller and calibration; loaded once per process."""
     from dexsim_real.control.controller import Controller, prepare_jax
 
     prepare_jax()
@@ -44,7 +44,7 @@ def load(policy: str) -> tuple[Any, Any, Any]:
 
 def run_trial(options: dict[str, Any], seed: int, number: int) -> dict[str, Any]:
     """The referee's report of one trial."""
-    from dexsim_real.twin.plant.plant import EmulatedHand
+    from dexsim_real.twin.plant.emulated_hand import EmulatedHand
     from dexsim_real.twin.plant.shapes import SHAPES
     from dexsim_real.twin.virtual import RunOptions, VirtualRun
 
@@ -55,7 +55,7 @@ def run_trial(options: dict[str, Any], seed: int, number: int) -> dict[str, Any]
         hand,
         options["task"],
         seed,
-        kind=options["draw"],
+        kind=options["parameters"],
         overrides=options["set"],
         seconds=options["seconds"],
         trials=1,
@@ -73,20 +73,20 @@ def run_all(options: dict[str, Any], trials: int, processes: int, show: bool) ->
     seeds, numbers = zip(*itertools.product(options["seed"], range(trials)), strict=True)
     if processes <= 1:
         return [_shown(report, show) for report in map(trial, seeds, numbers)]
-    # JAX does not survive a fork.
+    # JAX does not support fork.
     with concurrent.futures.ProcessPoolExecutor(processes, multiprocessing.get_context("spawn")) as pool:
         return [_shown(report, show) for report in pool.map(trial, seeds, numbers)]
 
 
 def _shown(report: dict[str, Any], show: bool) -> dict[str, Any]:
     if show:
-        told = (
+        result = (
             f"command {report['command']:.2f} {report['shape']:<11} fingers {report['finger_force']:6.2f} N"
             if report["task"] == "grasp"
             else f"{report['successes']:3d} successes ({report['paper_successes']} as the paper counts)"
         )
         print(
-            f"{report['trial']:4d}  {told}  {report['seconds']:7.2f} s  {report['end']}  ({report['wall']:.0f} s)",
+            f"{report['trial']:4d}  {result}  {report['seconds']:7.2f} s  {report['end']}  ({report['wall']:.0f} s)",
             file=sys.stderr,
             flush=True,
         )
@@ -97,8 +97,8 @@ def _shown(report: dict[str, Any], show: bool) -> dict[str, Any]:
 
 
 def grasp_metrics(reports: list[dict[str, Any]]) -> dict[str, Any]:
-    """Held, and how the forces of held objects follow the command: with friction, and pressing alone, as the paper's
-    hand and this one measure it."""
+    """Success rate, and correlation of the forces of held objects with the command: total force, and its normal part
+    alone, which taxels measure."""
     from dexsim.core.statistics import mean, proportion
     from dexsim.tasks.grasp.report import pearson
 
@@ -132,7 +132,7 @@ def grasp_metrics(reports: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def rotate_metrics(reports: list[dict[str, Any]]) -> dict[str, Any]:
-    """The paper's three, with the count of the task's rule (spin) and of the paper's."""
+    """The paper's three metrics, with goals counted by the task's rule (spin limit) and by the paper's."""
     from dexsim.core.statistics import mean, proportion
 
     count, paper, lived = (
@@ -150,7 +150,7 @@ def rotate_metrics(reports: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def simulated(task: str, policy: str) -> dict[str, Any]:
-    """The same metrics of the policy's report in simulation; empty where there is none."""
+    """The same metrics from the policy's report in simulation; empty if there is none."""
     from dexsim.core.assets import asset_path
     from dexsim.core.errors import DexsimError
 
@@ -171,7 +171,7 @@ def simulated(task: str, policy: str) -> dict[str, Any]:
 
 
 def table(here: dict[str, Any], there: dict[str, Any]) -> str:
-    """Rows of metric, emulated hand, simulation."""
+    """Table with the columns metric, emulated hand, simulation."""
 
     def cell(entry: Any) -> str:
         if not isinstance(entry, dict):
@@ -206,26 +206,32 @@ def table(here: dict[str, Any], there: dict[str, Any]) -> str:
 def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--task", choices=("grasp", "rotate"), required=True)
-    parser.add_argument("--policy", help="policy file; by default the shipped one of the task")
-    parser.add_argument("--trials", type=int, default=10, help="of each seed")
-    parser.add_argument("--seed", type=int, nargs="+", default=[0], help="the metrics are over the trials of all seeds")
-    parser.add_argument("--seconds", type=float, help="time limit of a trial; by default the task's (8 or 120)")
+    parser.add_argument("--policy", help="policy file; by default the shipped policy of the task")
+    parser.add_argument("--trials", type=int, default=10, help="trials of each seed")
     parser.add_argument(
-        "--draw",
+        "--seed", type=int, nargs="+", default=[0], help="seeds; the metrics are over the trials of all seeds"
+    )
+    parser.add_argument(
+        "--seconds", type=float, help="time limit of a trial in s; by default that of the task (8 or 120)"
+    )
+    parser.add_argument(
+        "--parameters",
         choices=("outside", "inside", "nominal"),
         default="outside",
-        help="parameters outside training's ranges, inside them, or at their middle",
+        help="parameters of hand and object: outside training's ranges, inside them, or nominal",
     )
     parser.add_argument(
         "--set",
         action="append",
         default=[],
         metavar="NAME=VALUE",
-        help="fix a parameter of the emulated hand (dexsim_real/twin/draw.py): a number, or outside, inside, nominal",
+        help="fix a parameter (dexsim_real/twin/plant/parameters.py): a number, or outside, inside, nominal",
     )
-    parser.add_argument("--no-safety", dest="safety", action="store_false", help="leave the bridge's limits out")
+    parser.add_argument(
+        "--no-safety", dest="safety", action="store_false", help="run without the bridge's safety limits"
+    )
     parser.add_argument("--processes", type=int, default=1)
-    parser.add_argument("--json", type=Path, help="file for everything")
+    parser.add_argument("--json", type=Path, help="JSON file for all results")
     return parser.parse_args()
 
 
@@ -235,7 +241,7 @@ def main() -> None:
         "task": given.task,
         "policy": given.policy or given.task,
         "seed": given.seed,
-        "draw": given.draw,
+        "parameters": given.parameters,
         "seconds": given.seconds,
         "safety": given.safety,
         "set": {
@@ -247,7 +253,7 @@ def main() -> None:
     here = (grasp_metrics if given.task == "grasp" else rotate_metrics)(reports)
     there = simulated(given.task, options["policy"])
     print(
-        f"{given.task}: {len(reports)} trials, parameters {given.draw}, seed {' '.join(map(str, given.seed))}; "
+        f"{given.task}: {len(reports)} trials, parameters {given.parameters}, seed {' '.join(map(str, given.seed))}; "
         f"targets {TARGETS[given.task]}"
     )
     print(table(here, there))

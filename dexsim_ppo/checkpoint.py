@@ -167,7 +167,7 @@ def restore(checkpoint: Checkpoint, like: Tree) -> Tree:
 
 
 def _bytes(array: np.ndarray) -> memoryview:
-    return memoryview(array.reshape(-1).view(np.uint8))
+    return array.reshape(-1).view(np.uint8).data
 
 
 def _open_envelope(path: Path, data: memoryview) -> tuple[dict[str, Any], memoryview]:
@@ -221,7 +221,9 @@ def _read_leaves(path: Path, specs: list[dict[str, Any]], payload: memoryview) -
         array = np.frombuffer(payload, dtype, math.prod(spec["shape"]), offset).reshape(spec["shape"])
         offset += array.nbytes
         try:
-            leaves[spec["path"]] = jax.random.wrap_key_data(array, impl=spec["prng"]) if spec["prng"] else array
+            leaves[spec["path"]] = (
+                jax.random.wrap_key_data(jnp.asarray(array), impl=spec["prng"]) if spec["prng"] else array
+            )
         except Exception as error:
             raise CheckpointError(f"{path}: {spec['path']} is no PRNG key ({error})") from None
     return leaves

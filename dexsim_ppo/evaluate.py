@@ -7,6 +7,7 @@ The policy is a file, or the name of a shipped one. The episodes are the task's 
 """
 
 import dataclasses
+import functools
 import math
 import sys
 import time
@@ -22,8 +23,8 @@ import tyro
 
 from dexsim.core import cli, statistics
 from dexsim.core.compilation import collector_paused, jit
-from dexsim.core.config import override
-from dexsim.core.errors import ConfigError
+from dexsim.core.config import override, setting, validate
+from dexsim.core.options import Option
 from dexsim.registry import find_task
 from dexsim_ppo.learner.types import Environment
 from dexsim_ppo.policy import Policy, PolicyParams, act, load_policy
@@ -87,10 +88,10 @@ class Evaluator:
             return (state, _follow(last, *series)), (None, film)
 
         state = self.env.evaluation_starts(key, self.chunk)
-        last = (dict(state.metrics), jnp.zeros(self.chunk, jnp.int32), jnp.zeros(self.chunk, bool))
-        (_, last), (series, film) = jax.lax.scan(
-            step, (state, last if self.totals else None), None, length=self.env.evaluation_steps
-        )
+        last: Any = None
+        if self.totals:
+            last = (dict(state.metrics), jnp.zeros(self.chunk, jnp.int32), jnp.zeros(self.chunk, bool))
+        (_, last), (series, film) = jax.lax.scan(step, (state, last), None, length=self.env.evaluation_steps)
         return (last[:2] if self.totals else series), film
 
     def _film(self, frames: Any, terminated: np.ndarray) -> Any:
@@ -211,33 +212,30 @@ class EvaluateArguments:
     """Options of `python -m dexsim_ppo.evaluate`."""
 
     policy: Annotated[str, tyro.conf.Positional]
-    """A policy file, or the name of a shipped one ("grasp")."""
-    episodes: int = 1024
-    """Evaluation episodes."""
-    seed: int = 0
+    """A policy file, or the name of a shipped policy, such as grasp."""
+    episodes: int = setting(1024, unit="1", low=1)
+    """Evaluation episodes, rounded up to whole chunks."""
+    seed: int = setting(0, unit="1", low=0, high=2**32 - 1)
     """Seed of the episodes."""
-    backend: Literal["auto", "jax", "warp"] = "auto"
-    """Physics backend."""
-    chunk: int = 0
-    """Episodes run side by side; 0 chooses by the device."""
-    seconds: float = 0.0
+    backend: Literal["auto", "jax", "warp"] = setting("auto")
+    """Physics backend. auto: warp on a GPU if it is installed, otherwise jax."""
+    chunk: int = setting(0, unit="1", low=0)
+    """Episodes simulated side by side; 0 chooses by the device."""
+    seconds: float = setting(0.0, unit="s", low=0.0)
     """Length of an evaluation episode; 0 for the task's own."""
     task: str = ""
-    """Module and name of a task of your own ("my_module:poke"); the policy's file names all others."""
+    """Module and name of a task of your own, such as my_module:poke; the policy's file names all others."""
     ablate: tuple[str, ...] = ()
-    """Observation fields to replace by their training mean ("contact_force contact_centre")."""
+    """Observation fields to replace by their training mean, such as contact_force contact_centre."""
     set: tuple[str, ...] = ()
-    """Fields of the task's configuration to change ("randomization.extremes=1 edge=[0.05,0.05]")."""
+    """Change fields of the task's configuration, such as randomization.extremes=1 edge=[0.05,0.05]."""
     output: Path | None = None
-    """File for the report as JSON."""
+    """File for the report, as JSON; None writes no report."""
     video: Path | None = None
-    """File for a video of the first and the last command (MP4 or GIF)."""
+    """File for a video of the first and the last command (MP4 or GIF); None renders no video."""
 
     def __post_init__(self) -> None:
-        if self.episodes < 1 or self.chunk < 0:
-            raise ConfigError("--episodes must be at least 1 and --chunk at least 0")
-        if not (math.isfinite(self.seconds) and self.seconds >= 0):
-            raise ConfigError("--seconds must be a finite number of at least 0")
+        validate(self)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -255,7 +253,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     chunk = min(arguments.chunk or default_chunk(), arguments.episodes)
     seconds = [f"evaluation_seconds={arguments.seconds}"] if arguments.seconds else []
     policy = dataclasses.replace(policy, env_config=override(policy.env_config, (*seconds, *arguments.set)))
-    env = policy.make_env(backend=arguments.backend, num_envs=chunk)
+    entry = find_task(policy.task)
+    with cli.naming_options(entry.config_class, entry.config(), functools.partial(_typed, arguments)):
+        env = policy.make_env(backend=arguments.backend, num_envs=chunk)
     report, snapshots = Evaluator(env, chunk)(policy.params, episodes=arguments.episodes, seed=arguments.seed)
     report |= {"policy": arguments.policy, "ablate": list(arguments.ablate), "set": list(arguments.set)}
     report |= {"backend": env.backend} | cli.environment_report()
@@ -265,6 +265,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments.video:
         print(f"video: {write_video(env, snapshots, arguments.video)}")
     return 0
+
+
+def _typed(arguments: EvaluateArguments, field: Option) -> str | None:
+    """What was typed before the value of a field of the task's configuration; None if it is the file's."""
+    path = ".".join(field.path)
+    if any(entry.partition("=")[0] == path for entry in arguments.set):
+        return f"--set {path}="
+    return "--seconds " if path == "evaluation_seconds" and arguments.seconds else None
 
 
 def print_report(report: dict[str, Any], *, title: str) -> None:

@@ -11,7 +11,7 @@ import dataclasses
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -39,7 +39,7 @@ class PolicyParams:
 
     layers: MLP
     normalizer: Normalizer
-    squash: str = static(default="gaussian")
+    squash: Literal["gaussian", "tanh"] = static(default="gaussian")
     """`"gaussian"`: actions are clipped to [-1, 1]; `"tanh"`: squashed."""
 
 

@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import jax
 
 from dexsim.core import cli
-from dexsim.core.config import from_dict
+from dexsim.core.config import from_dict, naming_file
 from dexsim.core.errors import ConfigError, DexsimError
 from dexsim.registry import find_task
 from dexsim_ppo import checkpoint
@@ -31,10 +31,11 @@ from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.curriculum import Curriculum
 from dexsim_ppo.policy import Policy, load_policy
 from dexsim_ppo.retired import migrate_arguments
+from dexsim_ppo.training.arguments import TrainArguments, printable, training_config
+from dexsim_ppo.training.fine_tune import check_fit, fine_tuning_config
 from dexsim_ppo.training.presets import Preset, find_preset
 from dexsim_ppo.training.runlog import RunFolder
-from dexsim_ppo.training.trainer import Run, TrainArguments, printable, training_config
-from dexsim_ppo.training.warm_start import check_fit, learner_settings
+from dexsim_ppo.training.trainer import Run
 
 
 class Trained(NamedTuple):
@@ -88,7 +89,7 @@ def train_policy(
     run, stopped = run_training(arguments, begun, started, command="train_policy(...)")
     if stopped:
         raise DexsimError(f"training was stopped; resume it with train_policy(resume={str(run.folder.path)!r})")
-    return Trained(Policy.load(run.chosen), json.loads(run.folder.report.read_text()), run.folder.path)
+    return Trained(Policy.load(run.selected), json.loads(run.folder.report.read_text()), run.folder.path)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -98,7 +99,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     cli.enable_caches()
     arguments, begun = parse_arguments(argv)
     command = shlex.join(["python", "-m", "dexsim_ppo.train", *argv])
-    run, stopped = run_training(arguments, begun, started, command)
+    with cli.naming_options(TrainArguments, arguments):
+        run, stopped = run_training(arguments, begun, started, command)
     if stopped:
         print(
             f"stopped by {signal.Signals(stopped).name}; resume with: "
@@ -121,7 +123,7 @@ def run_training(
     )
     folder = RunFolder(path)
     if not resumed:
-        if begun:
+        if isinstance(begun, Policy):
             check_fit(begun, env, arguments.ppo)
         folder.checkpoints.mkdir(parents=True)
         cli.write_json(
@@ -159,11 +161,12 @@ def default_arguments(task: str | None, preset: str, begun: checkpoint.Checkpoin
     name = begun.task if begun else (task or "grasp").rpartition(":")[2]
     entry = find_task(name)
     if isinstance(begun, checkpoint.Checkpoint):
-        return arguments_from_dict(entry.config_class, migrate_arguments(begun.content["arguments"], begun.path))
+        with naming_file(begun.path):
+            return arguments_from_dict(entry.config_class, migrate_arguments(begun.content["arguments"], begun.path))
     default = preset_arguments(name, entry.config(), preset)
     if begun:
         env = from_dict(entry.config_class, begun.env_config)
-        default = dataclasses.replace(default, env=env, ppo=learner_settings(begun, default.ppo))
+        default = dataclasses.replace(default, env=env, ppo=fine_tuning_config(begun, default.ppo))
     return default
 
 
@@ -173,17 +176,21 @@ def parse_arguments(argv: list[str]) -> tuple[TrainArguments, checkpoint.Checkpo
     for name in ("--task", "--preset", "--resume", "--policy"):
         early.add_argument(name, nargs="?")
     known, _ = early.parse_known_args(argv)
+    preset, description = known.preset or "auto", "Train a task."
+    if preset == "auto" and cli.wants_help(argv):  # To ask which device there is takes seconds.
+        preset, description = "cpu", f"{description} Defaults that depend on the device are those of --preset cpu."
     begun = find_beginning(known.task, known.policy, known.resume)
-    default = default_arguments(known.task, known.preset or "auto", begun)
+    default = default_arguments(known.task, preset, begun)
     given = {argument.split("=")[0] for argument in argv}
     if "--steps" in given and "--minutes" not in given:
         default = dataclasses.replace(default, minutes=0.0)
+    generic: Any = TrainArguments  # a static checker knows no type that is only found at run time
     arguments = cli.parse(
-        TrainArguments[type(default.env)],
+        generic[type(default.env)],
         argv,
         default=default,
         prog="python -m dexsim_ppo.train",
-        description="Train a task.",
+        description=description,
     )
     return dataclasses.replace(arguments, task=default.task), begun
 
@@ -197,7 +204,7 @@ def preset_arguments(task: str, env_config: Any, name: str) -> TrainArguments:
     return TrainArguments(env=env_config, task=task, **values)
 
 
-def arguments_from_dict(config_class: type, data: dict[str, Any]) -> TrainArguments:
+def arguments_from_dict(config_class: type[Any], data: dict[str, Any]) -> TrainArguments:
     """The options that a checkpoint holds."""
     data = dict(data)
     env, ppo = from_dict(config_class, data.pop("env")), from_dict(PPOConfig, data.pop("ppo"))

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from dexsim_real.control.safety import Safety, SafetyConfig
     from dexsim_real.core.errors import HandError
     from dexsim_real.core.log import LogReader, LogWriter
-    from dexsim_real.sensors.hand import HandSensing, HardwareConfig, Measured
+    from dexsim_real.sensors.hand import HandMeasurement, HandSensing, HardwareConfig
     from dexsim_real.sensors.readings import ObjectEstimate, make_readings
     from dexsim_real.wire.link import HandPort, LinkConfig
     from dexsim_real.wire.serial_hand import SerialHand, open_port
@@ -21,13 +21,13 @@ if TYPE_CHECKING:
 __all__ = [
     "Controller",
     "HandError",
+    "HandMeasurement",
     "HandPort",
     "HandSensing",
     "HardwareConfig",
     "LinkConfig",
     "LogReader",
     "LogWriter",
-    "Measured",
     "ObjectEstimate",
     "Safety",
     "SafetyConfig",
@@ -42,13 +42,13 @@ __getattr__, __dir__ = open_door(
     {
         "Controller": "dexsim_real.control.controller",
         "HandError": "dexsim_real.core.errors",
+        "HandMeasurement": "dexsim_real.sensors.hand",
         "HandPort": "dexsim_real.wire.link",
         "HandSensing": "dexsim_real.sensors.hand",
         "HardwareConfig": "dexsim_real.sensors.hand",
         "LinkConfig": "dexsim_real.wire.link",
         "LogReader": "dexsim_real.core.log",
         "LogWriter": "dexsim_real.core.log",
-        "Measured": "dexsim_real.sensors.hand",
         "ObjectEstimate": "dexsim_real.sensors.readings",
         "Safety": "dexsim_real.control.safety",
         "SafetyConfig": "dexsim_real.control.safety",

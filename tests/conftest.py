@@ -4,10 +4,11 @@ Set `DEXSIM_TEST_GPU=1` to run on the GPU (`pytest -m gpu` then runs the tests t
 `DEXSIM_CACHE` to keep compiled programs elsewhere than in `~/.cache/dexsim`.
 """
 
+import contextlib
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -71,6 +72,20 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         for item in items:
             if "gpu" in item.keywords:
                 item.add_marker(skip)
+
+
+# Folders whose tests trace our own code only: there a silent broadcast or cast between arrays is an error.
+STRICT = ("dexsim/actuator", "dexsim/core", "dexsim/geometry", "dexsim/hand", "dexsim_ppo/learner")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def strict_promotion(request: pytest.FixtureRequest) -> Iterator[None]:
+    """JAX's strict mode, in the folders of `STRICT`."""
+    with contextlib.ExitStack() as modes:
+        if request.path.relative_to(Path(__file__).parent).as_posix().startswith(STRICT):
+            modes.enter_context(jax.numpy_rank_promotion("raise"))
+            modes.enter_context(jax.numpy_dtype_promotion("strict"))
+        yield
 
 
 class Rollout(NamedTuple):

@@ -16,8 +16,8 @@ NAMES = {
         PPOConfig Policy TrainState Trained act evaluate_policy load_policy make_train train_policy
     """,
     "dexsim_real": """
-        Controller HandError HandPort HandSensing HardwareConfig LinkConfig LogReader LogWriter Measured ObjectEstimate
-        Safety SafetyConfig SerialHand make_readings open_port
+        Controller HandError HandMeasurement HandPort HandSensing HardwareConfig LinkConfig LogReader LogWriter
+        ObjectEstimate Safety SafetyConfig SerialHand make_readings open_port
     """,
 }
 

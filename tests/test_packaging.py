@@ -115,7 +115,7 @@ def test_the_commands_of_the_readme_are_make_targets():
 
 @in_checkout
 @pytest.mark.parametrize(
-    "page", [path.relative_to(ROOT).as_posix() for path in (*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"))]
+    "page", [path.relative_to(ROOT).as_posix() for path in (*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"))]
 )
 def test_links_lead_somewhere(page):
     text = (ROOT / page).read_text()

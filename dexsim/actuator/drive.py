@@ -68,6 +68,7 @@ def joint_torque(
     torque = actuator.efficiency * jnp.clip(torque, -limit, limit)
     if actuator.ripple is None:
         return torque
+    assert actuator.ripple_count is not None and actuator.ripple_phase is not None
     angle = actuator.ripple_count * position + actuator.ripple_phase
     return torque * (1.0 + actuator.ripple * jnp.sin(angle))
 
@@ -76,7 +77,9 @@ drive = jax.vmap(joint_torque)
 """`joint_torque` over joints: an `Actuator` of [J] leaves and arrays [J] to torques [J] Nm."""
 
 
-def apply_friction(actuator: Actuator, torque: jax.Array, velocity: jax.Array, inertia_rate: jax.Array) -> jax.Array:
+def apply_friction(
+    actuator: Actuator, torque: jax.Array, velocity: jax.Array, inertia_rate: jax.Array | float
+) -> jax.Array:
     """What Coulomb and viscous friction leave of a torque, Nm: one backward Euler step.
 
     The joint alone, without contacts, would end the sub-step at the momentum rate

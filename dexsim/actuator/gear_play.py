@@ -147,7 +147,7 @@ def drive_beside(
       The mean torque [J] Nm on the link over the sub-step, and the gear after it.
     """
     load = inertia * (velocity - gear.velocity) / timestep - gear.torque
-    step, total, rotor, moved, speed = timestep / steps, 0.0, gear.rotor, position, velocity
+    step, total, rotor, moved, speed = timestep / steps, jnp.zeros_like(position), gear.rotor, position, velocity
     for _ in range(steps):
         torque, rotor = drive_with_play(
             actuator, play, rotor, target, moved, speed, inertia=inertia, timestep=step, link_torque=load

@@ -1,5 +1,4 @@
-"""Finds the files of `assets/`, beside the packages in a checkout, in `dexsim` when installed; and
-the folder for what is kept between runs."""
+"""Paths: the files of `assets/` (beside the packages in a checkout, inside `dexsim` when installed), and the cache."""
 
 import os
 from pathlib import Path
@@ -40,9 +39,9 @@ def asset_path(name: str) -> Path:
 
 
 def cache_path(name: str) -> Path:
-    """Where `name` (a kind of file) is kept between runs: in `$DEXSIM_CACHE`, else `~/.cache/dexsim`.
+    """The cache folder `name`, in `$DEXSIM_CACHE` or else `~/.cache/dexsim`. It may not exist yet.
 
-    Everything there can be deleted at any time; it is made again. The folder may not exist yet.
+    Everything in it can be deleted at any time and is then made again.
     """
     root = os.environ.get("DEXSIM_CACHE")
     return (Path(root) if root else Path.home() / ".cache" / "dexsim") / name

@@ -1,4 +1,4 @@
-"""What the two commands share: options from dataclasses, one-line errors, compilation caches."""
+"""What the commands share: options from dataclasses, one-line errors, compilation caches."""
 
 import contextlib
 import importlib.metadata
@@ -10,19 +10,20 @@ import platform
 import re
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 from dexsim.core.assets import cache_path
-from dexsim.core.errors import DexsimError, DexsimWarning
+from dexsim.core.errors import ConfigError, DexsimError, DexsimWarning
 from dexsim.core.files import write_whole
+from dexsim.core.options import Option, explain, group_docs, help_page, in_option_names, options_of
 
 T = TypeVar("T")
 
 
-class UsageError(DexsimError):
-    """An option is unknown or has a value of the wrong type."""
+class UsageError(ConfigError):
+    """An option is unknown, or its value is of the wrong type or out of range."""
 
 
 def run(main: Callable[[Sequence[str] | None], int]) -> None:
@@ -33,6 +34,9 @@ def run(main: Callable[[Sequence[str] | None], int]) -> None:
     except DexsimError as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         code = 2
+    except BrokenPipeError:  # The reader of a pipe, such as `head`, has seen enough.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        code = 141
     except OSError as error:  # A file, a folder or a disk.
         where = f"{error.filename}: " if error.filename else ""
         print(f"error: {where}{error.strerror or error}", file=sys.stderr)
@@ -52,26 +56,62 @@ def _show_warning(message: Warning | str, category: type[Warning], *place: Any, 
 
 
 def parse(cls: type[T], argv: Sequence[str], *, prog: str, description: str, default: T | None = None) -> T:
-    """Options of a dataclass, through tyro; its boxed messages become one line.
+    """Options of a dataclass, through tyro; what it refuses becomes one line that names the option.
+
+    `--help` and `--help-all` print the options and exit.
 
     Raises:
-      UsageError: an unknown option or a value that does not parse.
+      UsageError: an option is unknown, or its value is of the wrong type or out of range.
     """
     import tyro
 
+    page = _help_asked(argv)
+    if page is not False:
+        groups = [".".join(path).replace("_", "-") for path in group_docs(cls, default)]
+        if page and not groups:
+            page = None
+        elif page and page not in groups:
+            raise UsageError(f"--help-all {page}: choose from {', '.join(groups)}")
+        print(help_page(cls, default, prog=prog, description=description, group=page), flush=True)
+        raise SystemExit(0)
     stderr = io.StringIO()
     kwargs: dict[str, Any] = {} if default is None else {"default": default}
     try:
-        with contextlib.redirect_stderr(stderr):
+        with contextlib.redirect_stderr(stderr), naming_options(cls, default):
             return tyro.cli(cls, args=list(argv), prog=prog, description=description, **kwargs)
     except SystemExit as stop:
         if not stop.code:
             raise
-        raise UsageError(_one_line(stderr.getvalue())) from None
+        message = explain(argv, options_of(cls, default), _one_line(stderr.getvalue()))
+        raise UsageError(f"{message}; see --help") from None
+
+
+@contextlib.contextmanager
+def naming_options(
+    cls: type, default: Any = None, typed: Callable[[Option], str | None] = "{.name} ".format
+) -> Iterator[None]:
+    """Errors from within that name a field of these options name the option as it is typed; see `in_option_names`."""
+    try:
+        yield
+    except ConfigError as error:
+        raise UsageError(in_option_names(str(error), options_of(cls, default), typed)) from None
+
+
+def wants_help(argv: Sequence[str]) -> bool:
+    """Whether a command line asks for help, which needs no device."""
+    return _help_asked(argv) is not False
+
+
+def _help_asked(argv: Sequence[str]) -> str | None | Literal[False]:
+    """The page of `help_page` that is asked for: "", a group or None for all of it; False without the wish."""
+    if "--help-all" in argv:
+        group = list(argv)[argv.index("--help-all") + 1 :][:1]
+        return group[0].replace("_", "-") if group and not group[0].startswith("-") else None
+    return "" if "-h" in argv or "--help" in argv else False
 
 
 def _one_line(box: str) -> str:
-    """The message of tyro's box, and the option it thinks was meant.
+    """The message of tyro's box.
 
     The box has a title, then the message and hints between rules; drawn in plain ASCII where the output
     is not UTF-8, with the title as a part of its own.
@@ -79,8 +119,7 @@ def _one_line(box: str) -> str:
     lines = [re.sub(r"[│|╭╮╰╯]", " ", line).strip() for line in box.splitlines() if "╭" not in line]
     parts = re.split(r"\n[-─]{4,}\n", "\n".join(lines).strip())
     message = parts[0] if "╭" in box else parts[min(1, len(parts) - 1)]
-    meant = re.search(r"Perhaps you meant:?\s+(--[\w.-]+)", "\n".join(lines))
-    return " ".join(message.split()).rstrip(".") + (f" (perhaps {meant[1]})" if meant else "") + "; see --help"
+    return " ".join(message.split()).rstrip(".")
 
 
 def enable_caches() -> None:

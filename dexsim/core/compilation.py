@@ -1,4 +1,4 @@
-"""How this library compiles its large programs."""
+"""Compilation options for large programs."""
 
 import contextlib
 import functools
@@ -8,18 +8,18 @@ from typing import Any
 
 import jax
 
-# LLVM optimises less, and XLA's older emitters make less code of a fusion: programs compile faster and run as fast.
+# LLVM optimises less, and XLA's older emitters produce less code per fusion: faster to compile, as fast to run.
 LIGHT = (("xla_backend_optimization_level", 1), ("xla_cpu_use_fusion_emitters", False))
 
 
 def jit(function: Callable, *, once: bool = False, **options: Any) -> Any:
-    """`jax.jit`, but on a CPU the compiler does less.
+    """`jax.jit` with less optimisation on a CPU.
 
-    A physics step is one very large program. On two cores its compilation takes half as long this
-    way, for a few per cent of speed; a short training run is mostly compilation otherwise.
+    A physics step is one very large program. On two cores this halves its compilation time for a few
+    per cent of speed; otherwise a short training run would be mostly compilation.
 
     Args:
-      once: the program runs a single time, so that optimising it never pays.
+      once: the program runs only once, so that optimising it does not pay off.
     """
     if jax.default_backend() == "cpu":
         options["compiler_options"] = _light() | ({"xla_backend_optimization_level": 0} if once else {})
@@ -28,7 +28,7 @@ def jit(function: Callable, *, once: bool = False, **options: Any) -> Any:
 
 @functools.cache
 def _light() -> dict[str, Any]:
-    """Those of the options that this version of XLA knows."""
+    """The options that this version of XLA knows."""
     known = {}
     for name, value in LIGHT:
         try:
@@ -43,8 +43,8 @@ def _light() -> dict[str, Any]:
 def collector_paused() -> Iterator[None]:
     """No garbage collection inside.
 
-    Warp registers JAX's stream for each graph that it captures. A collection in the midst of that may
-    delete an earlier registration of the same stream, and the run ends with "unknown stream".
+    Warp registers JAX's stream for each graph that it captures. A collection during a capture may delete an
+    earlier registration of the same stream, and the run fails with "unknown stream".
     """
     enabled = gc.isenabled()
     gc.disable()

@@ -3,17 +3,22 @@
 The same dataclasses are the command line (tyro), the checkpoint header and the documentation.
 """
 
+import contextlib
 import dataclasses
+import functools
 import json
 import math
 import types
 import typing
 from collections.abc import Collection, Iterable
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from dexsim.core.errors import ConfigError
 
-T = TypeVar("T")
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+T = TypeVar("T", bound="DataclassInstance")
 
 
 def setting(
@@ -40,29 +45,56 @@ def validate(config: Any) -> None:
     Raises:
       ConfigError: names the class, the field, the value, the unit and the range.
     """
-    for field in dataclasses.fields(config):
+    cls: type = type(config)
+    for field in dataclasses.fields(cls):
         value = getattr(config, field.name)
-        where = f"{type(config).__name__}.{field.name}"
-        choices = field.metadata.get("choices")
-        if choices is not None:
+        where = f"{cls.__name__}.{field.name}"
+        choices = choices_of(cls).get(field.name)
+        if choices is not None and value is not None:
             for item in value if isinstance(value, tuple) else (value,):
                 if item not in choices:
-                    raise ConfigError(f"{where} = {item!r}: choose from {', '.join(choices)}")
+                    raise ConfigError(f"{where} = {item!r}: choose from {', '.join(map(str, choices))}")
         low, high = field.metadata.get("low"), field.metadata.get("high")
         for number in _numbers(value):
             if not math.isfinite(number):
                 raise ConfigError(f"{where} = {number}: must be a finite number")
             if (low is not None and number < low) or (high is not None and number > high):
                 unit = field.metadata.get("unit")
-                unit = f" {unit}" if unit else ""
-                span = (
-                    f"between {low:g} and {high:g}"
-                    if low is not None and high is not None
-                    else f"at least {low:g}"
-                    if low is not None
-                    else f"at most {high:g}"
-                )
-                raise ConfigError(f"{where} = {number:g}{unit}: must be {span}{unit}")
+                unit = f" {unit}" if unit and unit != "1" else ""
+                span = range_text(low, high, "between {} and {}")
+                raise ConfigError(f"{where} = {number_text(number)}{unit}: must be {span}{unit}")
+
+
+@functools.cache
+def choices_of(cls: type) -> dict[str, tuple[Any, ...]]:
+    """What each field may be, where only some values may: by its `setting` or its `Literal` type."""
+    try:
+        hints = typing.get_type_hints(cls)
+    except NameError:  # A type that only a type checker imports.
+        hints = {}
+    fields = dataclasses.fields(cls)
+    choices = {field.name: field.metadata.get("choices") or _literals(hints.get(field.name)) for field in fields}
+    return {name: values for name, values in choices.items() if values}
+
+
+def range_text(low: float | None, high: float | None, both: str) -> str:
+    """A range in words; `both` is the pattern where it has two ends. Empty without a limit."""
+    if low is not None and high is not None:
+        return both.format(number_text(low), number_text(high))
+    if low is not None:
+        return f"at least {number_text(low)}"
+    return f"at most {number_text(high)}" if high is not None else ""
+
+
+def number_text(number: float) -> str:
+    """A number as a person writes it: 100000 rather than 1e+05."""
+    return f"{number:.0f}" if abs(number) < 1e10 and number == int(number) else f"{number:.7g}"
+
+
+def _literals(hint: Any) -> tuple[Any, ...]:
+    if typing.get_origin(hint) is typing.Literal:
+        return typing.get_args(hint)
+    return tuple(value for argument in typing.get_args(hint) for value in _literals(argument))
 
 
 def check_ranges(config: Any, *names: str) -> None:
@@ -71,7 +103,8 @@ def check_ranges(config: Any, *names: str) -> None:
         low, high = getattr(config, name)
         if low > high:
             raise ConfigError(
-                f"{type(config).__name__}.{name} = ({low:g}, {high:g}): the first must not exceed the second"
+                f"{type(config).__name__}.{name} = ({number_text(low)}, {number_text(high)}): "
+                "the first must not exceed the second"
             )
 
 
@@ -112,6 +145,15 @@ def from_dict(cls: type[T], data: dict[str, Any]) -> T:
     return cls(**{name: _rebuild(hints[name], value, f"{cls.__name__}.{name}") for name, value in data.items()})
 
 
+@contextlib.contextmanager
+def naming_file(path: object) -> typing.Iterator[None]:
+    """Errors from within begin with the name of the file that the configuration is read from."""
+    try:
+        yield
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
+
+
 def override(data: dict[str, Any], settings: Iterable[str]) -> dict[str, Any]:
     """`to_dict`'s output with some fields replaced, each as "object.extremes=1" or "edge=[0.05, 0.06]".
 
@@ -143,7 +185,7 @@ def _merge(data: Any, change: dict[str, Any]) -> dict[str, Any]:
 
 def _rebuild(hint: Any, value: Any, where: str) -> Any:
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
-    if dataclasses.is_dataclass(hint):
+    if isinstance(hint, type) and dataclasses.is_dataclass(hint):
         return from_dict(hint, value)
     if origin in (typing.Union, types.UnionType):
         if value is None and type(None) in arguments:

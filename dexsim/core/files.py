@@ -1,4 +1,4 @@
-"""What an environment's compiled program depends on, as one hash."""
+"""Source files of a package, and writing a file whole or not at all."""
 
 import os
 import tempfile
@@ -7,18 +7,18 @@ from pathlib import Path
 
 
 def python_sources(package: Path) -> Iterable[Path]:
-    """The modules below a folder, in order."""
+    """The Python files below a folder, sorted."""
     return sorted(package.rglob("*.py"))
 
 
 def write_whole(path: Path, chunks: Iterable[bytes | memoryview]) -> None:
-    """Write `chunks` one after another to `path`; its folder is made if need be.
+    """Write `chunks` one after another to `path`, and create its folder if needed.
 
-    They go to a file beside it, which takes the name only once everything is on the disk. So neither a
-    crash nor another program ever sees half a file, and a file that was there stays until then.
+    They go to a temporary file, which is renamed once everything is on the disk. So neither a crash nor
+    another program leaves or sees half a file, and an existing file stays until then.
 
     Raises:
-      OSError: the file cannot be written; what was there before is untouched.
+      OSError: the file cannot be written; an existing file is untouched.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")

@@ -1,14 +1,23 @@
-"""What an environment carries and what it hands to a task: start states, moments, the state, the task's rules."""
+"""Dataclasses as pytrees, and a choice between two of them."""
 
 import dataclasses
 from typing import Any, TypeVar, dataclass_transform
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+
+Array = jax.Array | np.ndarray
+"""An array on the device or on the host."""
+
+
+def align(x: Array, like: Array) -> jax.Array:
+    """`x` with leading axes of length one, as many as it needs to broadcast against `like`."""
+    return jnp.expand_dims(x, tuple(range(like.ndim - x.ndim)))
 
 
 def choose(done: jax.Array, new: Any, old: Any) -> Any:
-    """`new` where `done` [], else `old`: two states, their random keys included."""
+    """`new` if `done` [], else `old`: two trees of one structure, random keys included."""
 
     def leaf(new: jax.Array, old: jax.Array) -> jax.Array:
         if jnp.issubdtype(old.dtype, jax.dtypes.prng_key):
@@ -22,11 +31,11 @@ T = TypeVar("T")
 
 
 def static(**kwargs: Any) -> Any:
-    """A field that is part of the tree's structure (hashable, never traced)."""
+    """A field that is part of the tree's structure: hashable and never traced."""
     return dataclasses.field(metadata={"static": True}, **kwargs)
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(static, dataclasses.field))
 def pytree_dataclass(cls: type[T]) -> type[T]:
-    """A frozen dataclass whose fields are pytree children, but for those marked `static()`."""
+    """A frozen dataclass whose fields are pytree children, except those marked `static()`."""
     return jax.tree_util.register_dataclass(dataclasses.dataclass(frozen=True)(cls))

@@ -1,17 +1,17 @@
-"""Extremes: episodes whose every value lies at an end of its range.
+"""Random values of ranges, and extremes: episodes in which every value takes an end of its range.
 
-Drawn independently, values are never all far off at once: the hands and objects that a policy meets in training fill
-the middle of the box that the ranges span. A real hand may sit at an extreme of it, and one beyond its ranges does.
+Independent values are hardly ever all far from nominal at once, so training would only cover the middle of the box
+that the ranges span. A real hand may lie at a corner of that box, or outside it.
 """
 
 import jax
 import jax.numpy as jnp
 
-_EXTREME = 0x0C0E  # stream of the keys that choose extremes
+_EXTREME = 0x0C0E  # stream of the keys that select extreme episodes
 
 
 def sample_extreme(key: jax.Array, share: float) -> jax.Array | None:
-    """Whether this episode [] is one of that share; None, which costs nothing, if none is."""
+    """Whether this episode is one of that share of extremes, bool []; None for a share of 0, which costs nothing."""
     return None if share == 0 else jax.random.bernoulli(jax.random.fold_in(key, _EXTREME), share)
 
 
@@ -24,14 +24,14 @@ def uniform(
     nominal: float | None = None,
     beyond: float = 0.0,
 ) -> jax.Array:
-    """A value [*shape] of a range (low, high), or at an extreme the end of it on that value's side of nominal.
+    """A random value [*shape] of a range; in an extreme episode, the end of the range on that value's side of nominal.
 
     Args:
       key: of this value.
-      span: the range. One that begins at its nominal value has its far end only.
-      extreme: [] bool, or None for no extremes; see `sample_extreme`.
+      span: the range (low, high). A range that begins at its nominal value has only its far end as an extreme.
+      extreme: from `sample_extreme`: bool [], or None for no extremes.
       nominal: by default the middle of the range.
-      beyond: an extreme lies up to this share of the end's distance from nominal outside the range.
+      beyond: extremes lie outside the range, by up to this share of the end's distance from nominal.
     """
     value = jax.random.uniform(key, shape, minval=span[0], maxval=span[1])
     if extreme is None:

@@ -1,4 +1,4 @@
-"""A straight line through data with outliers, with honest intervals.
+"""A straight line through data with outliers, with confidence intervals.
 
 Theil-Sen start, Huber and then Tukey's bisquare by iteratively reweighted least squares (an
 MM-estimate), and a sandwich covariance that allows for unequal and autocorrelated residuals
@@ -17,7 +17,7 @@ _PAIRS = 20_000
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Line:
-    """y = gain x + offset, and how well the data know it. Intervals are of 95 %."""
+    """The line y = gain x + offset, with 95 % intervals."""
 
     gain: float
     offset: float
@@ -26,12 +26,12 @@ class Line:
     noise: float
     """Robust standard deviation of the residuals, in units of y."""
     r_squared: float
-    """Share of the variance of the samples kept that the line explains."""
+    """Share of the variance that the line explains, without outliers."""
     condition: float
-    """Condition number of the columns (1, x / max |x|): large where x hardly changes."""
+    """Condition number of the columns (1, x / max |x|): large if x hardly changes."""
     samples: int
     outliers: int
-    """Samples that the fit gave no weight."""
+    """Number of samples with zero weight."""
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
         """The line at x."""
@@ -42,8 +42,8 @@ def fit_line(x: np.ndarray, y: np.ndarray, *, seed: int = 0) -> Line:
     """Fit y = gain x + offset.
 
     Args:
-      x, y: [T] finite, in the order of time, T > 2 and x not constant.
-      seed: of the pairs that Theil-Sen looks at where there are more than 20,000.
+      x, y: [T], finite and in order of time; T > 2 and x not constant.
+      seed: of the random pairs for Theil-Sen, if there are more than 20,000 pairs.
     """
     x, y = np.asarray(x, float), np.asarray(y, float)
     reach = np.max(np.abs(x))
@@ -51,8 +51,8 @@ def fit_line(x: np.ndarray, y: np.ndarray, *, seed: int = 0) -> Line:
     start = np.array(theil_sen(x, y, seed)) * [1.0, reach]
     guess, scale, weight = _reweight(design, y, start)
     residual = y - design @ guess
-    # Along x, what returns at the same place (ripple of the motor) lies side by side in repeated
-    # presses, and so does what drifts within one press: both must widen the intervals.
+    # Sorted along x, errors that recur at the same x (motor ripple) or drift within one press are neighbours:
+    # their autocorrelation must widen the intervals.
     order = np.argsort(x, kind="stable")
     half = _half_widths(design[order], residual[order], weight[order], scale)
     offset, gain = guess / [1.0, reach]
@@ -74,14 +74,14 @@ def fit_line(x: np.ndarray, y: np.ndarray, *, seed: int = 0) -> Line:
 
 
 def theil_sen(x: np.ndarray, y: np.ndarray, seed: int = 0) -> tuple[float, float]:
-    """Offset and gain: the median slope over pairs of samples, and the median of what it leaves."""
+    """Offset and gain: the median slope over pairs of samples, and the median residual."""
     count = len(x)
     if count * (count - 1) // 2 <= _PAIRS:
         first, second = np.triu_indices(count, 1)
     else:
         first, second = np.random.default_rng(seed).integers(0, count, (2, _PAIRS))
     run = x[second] - x[first]
-    far = np.abs(run) > 0.1 * np.ptp(x)  # near pairs hold noise alone
+    far = np.abs(run) > 0.1 * np.ptp(x)  # close pairs hold only noise
     gain = float(np.median((y[second] - y[first])[far] / run[far]))
     return float(np.median(y - gain * x)), gain
 
@@ -94,7 +94,7 @@ def _reweight(design: np.ndarray, y: np.ndarray, start: np.ndarray) -> tuple[np.
     for bound, weigh in ((_HUBER, _huber_weight), (_BISQUARE, _bisquare_weight)):
         for _ in range(50):
             residual = y - design @ guess
-            if weigh is _huber_weight:  # the bisquare keeps the scale, or it might shrink on
+            if weigh is _huber_weight:  # the bisquare keeps the scale, which might shrink without end
                 scale = max(_MAD * float(np.median(np.abs(residual))), floor)
             weight = weigh(residual / (bound * scale))
             root = np.sqrt(weight)
@@ -127,10 +127,10 @@ def _half_widths(design: np.ndarray, residual: np.ndarray, weight: np.ndarray, s
 
 
 def _periodic(design: np.ndarray, residual: np.ndarray, inverse: np.ndarray) -> np.ndarray:
-    """Variance [P] of the parameters over where along x a wave in the residuals happens to start.
+    """Variance [P] of the parameters over the phase along x of a periodic residual.
 
-    A ripple of a few periods does not average out, and no autocovariance that dies away describes
-    it: the residuals are turned round along x by every offset and fitted each time.
+    A ripple of a few periods neither averages out nor has a decaying autocovariance. So the residuals are
+    shifted cyclically along x by every offset, and fitted each time.
     """
     spectrum = np.fft.rfft(design, axis=0).conj() * np.fft.rfft(residual)[:, None]
     turned = np.fft.irfft(spectrum, n=len(residual), axis=0)  # design.T @ roll(residual, offset)
@@ -138,9 +138,9 @@ def _periodic(design: np.ndarray, residual: np.ndarray, inverse: np.ndarray) -> 
 
 
 def long_run(score: np.ndarray) -> np.ndarray:
-    """Sum [P, P] of the autocovariances of a series `score` [T, P] of zero mean, times T.
+    """Sum [P, P] of the autocovariances of a zero-mean series `score` [T, P], times T.
 
-    Newey-West on the series with its first-order autoregression taken out (Andrews and Monahan
+    Newey-West on the series without its first-order autoregression (Andrews and Monahan
     1992), bandwidth after Andrews 1991.
     """
     count = len(score)

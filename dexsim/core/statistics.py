@@ -1,4 +1,4 @@
-"""Intervals for reports: proportions, means and other statistics over episodes (host, NumPy)."""
+"""Proportions, means and other statistics over episodes, with 95 % intervals (host, NumPy)."""
 
 from collections.abc import Callable
 
@@ -16,7 +16,7 @@ def proportion(hits: np.ndarray) -> dict:
     scale = 1 + _Z * _Z / n
     middle = (p + _Z * _Z / (2 * n)) / scale
     half = _Z * np.sqrt(p * (1 - p) / n + _Z * _Z / (4 * n * n)) / scale
-    # None and all: the ends are exact, but for rounding.
+    # At 0 and 1 the interval's end is exact; rounding would miss it.
     low, high = 0.0 if p == 0 else middle - half, 1.0 if p == 1 else middle + half
     return {"mean": p, "low": float(low), "high": float(high), "count": n}
 

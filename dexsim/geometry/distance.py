@@ -23,6 +23,7 @@ import jax
 
 from dexsim.core.config import setting, validate
 from dexsim.core.errors import ConfigError
+from dexsim.core.pytree import Array
 from dexsim.geometry import grid, mesh, sdf, surface_points
 
 
@@ -30,8 +31,8 @@ class Method(NamedTuple):
     """One way to a distance: the class of its objects and its two functions."""
 
     kind: type
-    signed_distance: Callable[[jax.Array, Any], jax.Array]
-    distance_and_normal: Callable[[jax.Array, Any], tuple[jax.Array, jax.Array]]
+    signed_distance: Callable[[Any, Any], jax.Array]
+    distance_and_normal: Callable[[Any, Any], tuple[jax.Array, jax.Array]]
 
 
 METHODS: dict[str, Method] = {
@@ -103,11 +104,11 @@ def method_of(geometry: Any) -> str:
     raise ConfigError(f"{type(geometry).__name__} has no distance: prepare it first (dexsim.geometry.distance.prepare)")
 
 
-def signed_distance(points: jax.Array, geometry: Any) -> jax.Array:
+def signed_distance(points: Array, geometry: Any) -> jax.Array:
     """Distance [...] m, negative inside, at points [..., 3] in the object's frame."""
     return METHODS[method_of(geometry)].signed_distance(points, geometry)
 
 
-def distance_and_normal(points: jax.Array, geometry: Any) -> tuple[jax.Array, jax.Array]:
+def distance_and_normal(points: Array, geometry: Any) -> tuple[jax.Array, jax.Array]:
     """Distance [...] m and outward unit normal [..., 3] at points [..., 3] in the object's frame."""
     return METHODS[method_of(geometry)].distance_and_normal(points, geometry)

@@ -121,8 +121,12 @@ def stack(grids: list[Grid]) -> Grid:
     kinds = {(g.nodes, g.interpolation, g.values.dtype) for g in grids}
     if len(kinds) != 1:
         raise ConfigError(f"stack: grids of one configuration expected, found {len(kinds)}")
-    joined = {name: jnp.concatenate([getattr(g, name) for g in grids]) for name in ("values", "origin", "spacing")}
-    return dataclasses.replace(grids[0], **joined)
+    return dataclasses.replace(
+        grids[0],
+        values=jnp.concatenate([g.values for g in grids]),
+        origin=jnp.concatenate([g.origin for g in grids]),
+        spacing=jnp.concatenate([g.spacing for g in grids]),
+    )
 
 
 def select(grid: Grid, index: jax.Array, scale: jax.Array | float = 1.0) -> Grid:
@@ -161,7 +165,7 @@ def _look_up(points: jax.Array, grid: Grid) -> tuple[jax.Array, list[jax.Array]]
         cell = jnp.minimum(jax.lax.stop_gradient(held).astype(jnp.int32), n - 2)
         gaps.append((at - held) * step[axis])
         cells.append(cell)
-        parts.append(held - cell)
+        parts.append(held - cell.astype(held.dtype))
         free.append(at == held)
     first = base + (cells[0] * n + cells[1]) * n + cells[2]
     if grid.interpolation == "linear":
@@ -224,7 +228,7 @@ def _read_linear(grid: Grid, first: jax.Array, cells: list[jax.Array]) -> list[j
         return [half for k in _corner_offsets(n)[::2] for half in _read(values, first + k)]
     # One aligned sector of 32 bytes, whose slices stay in the kernel that uses them. Read by one index, XLA (JAX 0.10)
     # writes every point's index to memory in a kernel of its own, by two it does not; with several classes vice versa.
-    at = (first,)
+    at: tuple[jax.Array, ...] = (first,)
     if grid.classes == 1:
         values, at = values.reshape(-1, n * n, 8), (grid.index * n + cells[0], cells[1] * n + cells[2])
     (row,) = _read(values, *at)

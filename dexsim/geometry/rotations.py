@@ -7,23 +7,25 @@ which loses a tenth of a millimetre over the length of a finger.
 import jax
 import jax.numpy as jnp
 
+from dexsim.core.pytree import Array, align
 
-def rotate(matrix: jax.Array, vector: jax.Array) -> jax.Array:
+
+def rotate(matrix: Array, vector: Array) -> jax.Array:
     """`matrix` [..., 3, 3] times `vector` [..., 3]."""
     return jnp.sum(matrix * vector[..., None, :], axis=-1)
 
 
-def rotate_inverse(matrix: jax.Array, vector: jax.Array) -> jax.Array:
+def rotate_inverse(matrix: Array, vector: Array) -> jax.Array:
     """The transpose of `matrix` [..., 3, 3] times `vector` [..., 3]."""
     return jnp.sum(matrix * vector[..., :, None], axis=-2)
 
 
-def compose(left: jax.Array, right: jax.Array) -> jax.Array:
+def compose(left: Array, right: Array) -> jax.Array:
     """The matrix product of two rotations [..., 3, 3]."""
     return jnp.sum(left[..., :, :, None] * right[..., None, :, :], axis=-2)
 
 
-def quat_to_matrix(quat: jax.Array) -> jax.Array:
+def quat_to_matrix(quat: Array) -> jax.Array:
     """A unit quaternion [..., 4] as a rotation matrix [..., 3, 3]."""
     w, x, y, z = (quat[..., i] for i in range(4))
     rows = (
@@ -34,7 +36,7 @@ def quat_to_matrix(quat: jax.Array) -> jax.Array:
     return jnp.stack([jnp.stack(row, -1) for row in rows], -2)
 
 
-def axis_angle_to_matrix(axis: jax.Array, angle: jax.Array) -> jax.Array:
+def axis_angle_to_matrix(axis: Array, angle: Array) -> jax.Array:
     """Rodrigues' formula: unit `axis` [..., 3], `angle` [...] rad, to [..., 3, 3]."""
     c, s = jnp.cos(angle), jnp.sin(angle)
     x, y, z = (axis[..., i] for i in range(3))
@@ -47,13 +49,13 @@ def axis_angle_to_matrix(axis: jax.Array, angle: jax.Array) -> jax.Array:
     return jnp.stack([jnp.stack(row, -1) for row in rows], -2)
 
 
-def axis_angle_to_quat(axis: jax.Array, angle: jax.Array) -> jax.Array:
+def axis_angle_to_quat(axis: Array, angle: Array) -> jax.Array:
     """Unit `axis` [..., 3], `angle` [...] rad, to a quaternion [..., 4]."""
     half = jnp.asarray(angle)[..., None] / 2
     return jnp.concatenate([jnp.cos(half), jnp.sin(half) * axis], -1)
 
 
-def quat_multiply(left: jax.Array, right: jax.Array) -> jax.Array:
+def quat_multiply(left: Array, right: Array) -> jax.Array:
     """The Hamilton product of quaternions [..., 4]."""
     a, b, c, d = (left[..., i] for i in range(4))
     e, f, g, h = (right[..., i] for i in range(4))
@@ -68,12 +70,12 @@ def quat_multiply(left: jax.Array, right: jax.Array) -> jax.Array:
     )
 
 
-def quat_conjugate(quat: jax.Array) -> jax.Array:
+def quat_conjugate(quat: Array) -> jax.Array:
     """The inverse of a unit quaternion [..., 4]."""
-    return quat * jnp.array([1.0, -1.0, -1.0, -1.0])
+    return jnp.multiply(quat, align(jnp.array([1.0, -1.0, -1.0, -1.0]), quat))
 
 
-def quat_angle(left: jax.Array, right: jax.Array) -> jax.Array:
+def quat_angle(left: Array, right: Array) -> jax.Array:
     """The angle between two orientations [..., 4], in [0, pi] rad."""
     relative = quat_multiply(quat_conjugate(left), right)
     # atan2 keeps full precision near zero, where arccos of the scalar part has none.
@@ -81,6 +83,6 @@ def quat_angle(left: jax.Array, right: jax.Array) -> jax.Array:
     return 2 * jnp.arctan2(vector, jnp.abs(relative[..., 0]))
 
 
-def matrix_to_6d(matrix: jax.Array) -> jax.Array:
+def matrix_to_6d(matrix: Array) -> jax.Array:
     """The first two columns of a rotation [..., 3, 3] as [..., 6] (Zhou et al. 2019)."""
     return jnp.concatenate([matrix[..., :, 0], matrix[..., :, 1]], -1)

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dexsim.core.errors import ConfigError
-from dexsim.core.pytree import pytree_dataclass, static
+from dexsim.core.pytree import Array, align, pytree_dataclass, static
 
 KINDS = ("sphere", "box", "capsule", "cylinder", "ellipsoid")
 FAR = 1e3  # m, the distance to a primitive that is switched off
@@ -26,29 +26,29 @@ class Shape:
     """A union of K primitives in the object's frame; `kinds` is fixed, all else may be traced."""
 
     kinds: tuple[str, ...] = static()
-    size: jax.Array  # [K, 3] m
-    position: jax.Array  # [K, 3] m
-    rotation: jax.Array  # [K, 3, 3]
-    active: jax.Array  # [K] bool
+    size: Array  # [K, 3] m
+    position: Array  # [K, 3] m
+    rotation: Array  # [K, 3, 3]
+    active: Array  # [K] bool
 
 
-def sphere(point: jax.Array, size: jax.Array) -> jax.Array:
+def sphere(point: Array, size: Array) -> jax.Array:
     x, y, z = _split(point)
     return _length(x, y, z) - size[0]
 
 
-def box(point: jax.Array, size: jax.Array) -> jax.Array:
+def box(point: Array, size: Array) -> jax.Array:
     x, y, z = (jnp.abs(p) - size[axis] for axis, p in enumerate(_split(point)))
     outside = _length(jnp.maximum(x, 0.0), jnp.maximum(y, 0.0), jnp.maximum(z, 0.0))
     return outside + jnp.minimum(jnp.maximum(jnp.maximum(x, y), z), 0.0)
 
 
-def capsule(point: jax.Array, size: jax.Array) -> jax.Array:
+def capsule(point: Array, size: Array) -> jax.Array:
     x, y, z = _split(point)
     return _length(x, y, z - jnp.clip(z, -size[1], size[1])) - size[0]
 
 
-def cylinder(point: jax.Array, size: jax.Array) -> jax.Array:
+def cylinder(point: Array, size: Array) -> jax.Array:
     x, y, z = _split(point)
     radial = _length(x, y) - size[0]
     axial = jnp.abs(z) - size[1]
@@ -56,7 +56,7 @@ def cylinder(point: jax.Array, size: jax.Array) -> jax.Array:
     return outside + jnp.minimum(jnp.maximum(radial, axial), 0.0)
 
 
-def ellipsoid(point: jax.Array, size: jax.Array) -> jax.Array:
+def ellipsoid(point: Array, size: Array) -> jax.Array:
     """Exact distance by Newton's method for the nearest surface point.
 
     The nearest point is q = s^2 p / (t + s^2) with t the largest root of
@@ -68,7 +68,7 @@ def ellipsoid(point: jax.Array, size: jax.Array) -> jax.Array:
     p = jax.lax.stop_gradient(jnp.abs(point)) + 1e-9
     s = jax.lax.stop_gradient(size)
     least = jnp.min(s)
-    gap = (s - least) * (s + least)
+    gap, s, size = (align(x, point) for x in ((s - least) * (s + least), s, size))
     # Each term alone must not exceed one at the root, so this start lies left of it.
     u = jnp.max(s * p - gap, axis=-1)
     for _ in range(12):
@@ -83,7 +83,7 @@ def ellipsoid(point: jax.Array, size: jax.Array) -> jax.Array:
     return jnp.sum(normal * (sign * point - size * unit), -1)
 
 
-_DISTANCE: dict[str, Callable[[jax.Array, jax.Array], jax.Array]] = {
+_DISTANCE: dict[str, Callable[[Array, Array], jax.Array]] = {
     "sphere": sphere,
     "box": box,
     "capsule": capsule,
@@ -92,22 +92,25 @@ _DISTANCE: dict[str, Callable[[jax.Array, jax.Array], jax.Array]] = {
 }
 
 
-def primitive_distance(kind: str, points: jax.Array, size: jax.Array) -> jax.Array:
+def primitive_distance(kind: str, points: Array, size: Array) -> jax.Array:
     """Distance [...] m from `points` [..., 3] to one primitive in its own frame."""
     return _DISTANCE[kind](points, size)
 
 
-def signed_distance(points: jax.Array, shape: Shape) -> jax.Array:
+def signed_distance(points: Array, shape: Shape) -> jax.Array:
     """Distance [...] m from `points` [..., 3] (object frame) to the union."""
-    distance = None
-    for k, kind in enumerate(shape.kinds):
+
+    def one(k: int) -> jax.Array:
         local = to_local(points, shape.position[k], shape.rotation[k])
-        d = jnp.where(shape.active[k], primitive_distance(kind, local, shape.size[k]), FAR)
-        distance = d if distance is None else jnp.minimum(distance, d)
+        return jnp.where(shape.active[k], primitive_distance(shape.kinds[k], local, shape.size[k]), FAR)
+
+    distance = one(0)
+    for k in range(1, len(shape.kinds)):
+        distance = jnp.minimum(distance, one(k))
     return distance
 
 
-def to_local(points: jax.Array, position: jax.Array, rotation: jax.Array) -> jax.Array:
+def to_local(points: Array, position: Array, rotation: Array) -> jax.Array:
     """Points [..., 3] in the frame at `position` [3], `rotation` [3, 3].
 
     Component by component: XLA then makes one kernel of transform and distance, where sums over an
@@ -123,9 +126,11 @@ def of_geoms(geoms: Iterable[Any]) -> Shape | None:
     if not parts:
         return None
     return Shape(
-        tuple(g.kind for g in parts),
-        *(np.stack([getattr(g, name) for g in parts]) for name in ("size", "position", "rotation")),
-        np.ones(len(parts), bool),
+        kinds=tuple(g.kind for g in parts),
+        size=np.stack([g.size for g in parts]),
+        position=np.stack([g.position for g in parts]),
+        rotation=np.stack([g.rotation for g in parts]),
+        active=np.ones(len(parts), bool),
     )
 
 
@@ -157,20 +162,20 @@ def _reach(kind: str, size: np.ndarray, turn: np.ndarray) -> np.ndarray:
     return size[0] + (size[1] * along if kind == "capsule" else np.zeros(3))
 
 
-def distance_and_normal(points: jax.Array, shape: Shape) -> tuple[jax.Array, jax.Array]:
+def distance_and_normal(points: Array, shape: Shape) -> tuple[jax.Array, jax.Array]:
     """Distance [...] m and outward unit normal [..., 3] of the nearest surface, object frame."""
     distance, pullback = jax.vjp(lambda p: signed_distance(p, shape), points)
     (normal,) = pullback(jnp.ones_like(distance))
     return distance, normal
 
 
-def _split(point: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _split(point: Array) -> tuple[Array, Array, Array]:
     return point[..., 0], point[..., 1], point[..., 2]
 
 
-def _length(*parts: jax.Array) -> jax.Array:
+def _length(*parts: Array) -> jax.Array:
     return jnp.sqrt(sum(part * part for part in parts) + _TINY)
 
 
-def _norm(vector: jax.Array) -> jax.Array:
+def _norm(vector: Array) -> jax.Array:
     return jnp.sqrt(jnp.sum(vector * vector, -1) + _TINY)

@@ -21,7 +21,7 @@ import numpy as np
 
 from dexsim.core.config import setting, validate
 from dexsim.core.errors import ConfigError
-from dexsim.core.pytree import pytree_dataclass, static
+from dexsim.core.pytree import Array, pytree_dataclass, static
 from dexsim.geometry import mesh as meshes
 from dexsim.geometry import sdf
 
@@ -80,7 +80,7 @@ def from_shape(shape: sdf.Shape, config: PointsConfig | None = None) -> SurfaceP
     for k, kind in enumerate(shape.kinds):
         local, out = _TEMPLATES[kind](config.count, shape.size[k])
         turn = shape.rotation[k]
-        place = jnp.einsum("ij,nj->ni", turn, local, precision="highest") + shape.position[k]
+        place = jnp.einsum("ij,nj->ni", turn, local, precision="highest") + shape.position[k][None]
         buried = jnp.zeros(config.count, bool)
         for other, name in enumerate(shape.kinds):
             if other != k:
@@ -146,10 +146,11 @@ def _scan(points: jax.Array, surface: SurfacePoints) -> jax.Array:
 
 
 def _from_table(points: jax.Array, surface: SurfacePoints) -> jax.Array:
-    n, row = surface.cells, 0
+    n, cell = surface.cells, []
     for axis in range(3):
         at = (points[..., axis] - surface.origin[axis]) / surface.spacing[axis]
-        row = row * n + jnp.clip(at, 0, n - 1).astype(jnp.int32)
+        cell.append(jnp.clip(at, 0, n - 1).astype(jnp.int32))
+    row = (cell[0] * n + cell[1]) * n + cell[2]
 
     def step(start, carry):
         best, index = carry
@@ -167,7 +168,7 @@ def _from_table(points: jax.Array, surface: SurfacePoints) -> jax.Array:
 
 def _build(position: jax.Array, normal: jax.Array, config: PointsConfig) -> SurfacePoints:
     known = config.table and not isinstance(position, jax.core.Tracer)
-    cells, table, origin, spacing = 0, jnp.zeros((1, 1), jnp.int16), jnp.zeros(3), jnp.ones(3)
+    cells, table, origin, spacing = 0, np.zeros((1, 1)), np.zeros(3), np.ones(3)
     if known:
         cells = config.cells
         table, origin, spacing = _candidates(np.asarray(position, np.float64), config)
@@ -195,8 +196,8 @@ def _candidates(position: np.ndarray, config: PointsConfig) -> tuple[np.ndarray,
         raise ConfigError("surface points: no active primitive")
     low, high = position[real].min(0) - config.reach, position[real].max(0) + config.reach
     spacing = (high - low) / config.cells
-    middle = [a + h * (np.arange(config.cells) + 0.5) for a, h in zip(low, spacing, strict=True)]
-    middle = np.stack(np.meshgrid(*middle, indexing="ij"), -1).reshape(-1, 3)
+    axes = [a + h * (np.arange(config.cells) + 0.5) for a, h in zip(low, spacing, strict=True)]
+    middle = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     tree = cKDTree(position[real])
     diagonal = float(np.linalg.norm(spacing)) * 1.001
     width = 8
@@ -233,18 +234,18 @@ def _fibonacci(count: int) -> np.ndarray:
     return np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z], -1).astype(np.float32)
 
 
-def _sphere_points(count: int, size: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _sphere_points(count: int, size: Array) -> tuple[jax.Array, jax.Array]:
     out = jnp.asarray(_fibonacci(count))
     return size[0] * out, out
 
 
-def _ellipsoid_points(count: int, size: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _ellipsoid_points(count: int, size: Array) -> tuple[jax.Array, jax.Array]:
     unit = jnp.asarray(_fibonacci(count))
-    out = unit / size
-    return unit * size, out / jnp.linalg.norm(out, axis=-1, keepdims=True)
+    out = unit / size[None]
+    return unit * size[None], out / jnp.linalg.norm(out, axis=-1, keepdims=True)
 
 
-def _capsule_points(count: int, size: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _capsule_points(count: int, size: Array) -> tuple[jax.Array, jax.Array]:
     """Even along the axis with the share of area on tube and caps (both have 2 pi r per unit of height)."""
     radius, half = size[0], size[1]
     height = (half + radius) * jnp.asarray(_fibonacci(count)[:, 2])
@@ -256,7 +257,7 @@ def _capsule_points(count: int, size: jax.Array) -> tuple[jax.Array, jax.Array]:
     return radius * out + jnp.stack([0 * turn, 0 * turn, height - over], -1), out
 
 
-def _cylinder_points(count: int, size: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _cylinder_points(count: int, size: Array) -> tuple[jax.Array, jax.Array]:
     """Half of them on the side, a quarter on each end (sunflower pattern)."""
     side, end = count - 2 * (count // 4), count // 4
     golden = np.pi * (3 - np.sqrt(5))
@@ -267,7 +268,7 @@ def _cylinder_points(count: int, size: jax.Array) -> tuple[jax.Array, jax.Array]
         [np.cos(np.arange(end) * golden), np.sin(np.arange(end) * golden)], -1
     )
     disc = jnp.asarray(np.concatenate([disc, np.zeros((end, 1))], 1), jnp.float32)
-    up = jnp.array([0.0, 0.0, 1.0])
+    up = jnp.array([[0.0, 0.0, 1.0]])
     position = [
         size[0] * round_ + (size[1] * rise)[:, None] * up,
         size[0] * disc + size[1] * up,
@@ -276,7 +277,7 @@ def _cylinder_points(count: int, size: jax.Array) -> tuple[jax.Array, jax.Array]
     return jnp.concatenate(position), jnp.concatenate([round_, jnp.tile(up, (end, 1)), jnp.tile(-up, (end, 1))])
 
 
-def _box_points(count: int, size: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _box_points(count: int, size: Array) -> tuple[jax.Array, jax.Array]:
     """A sixth on each face, in a low-discrepancy pattern (Roberts 2018) in units of the half-extents."""
     face = np.arange(count) % 6
     order = np.arange(count) // 6
@@ -286,7 +287,7 @@ def _box_points(count: int, size: jax.Array) -> tuple[jax.Array, jax.Array]:
     rows = np.arange(count)
     unit[rows, axis] = out[rows, axis] = side
     unit[rows, (axis + 1) % 3], unit[rows, (axis + 2) % 3] = flat[:, 0], flat[:, 1]
-    return jnp.asarray(unit, jnp.float32) * size, jnp.asarray(out, jnp.float32)
+    return jnp.asarray(unit, jnp.float32) * size[None], jnp.asarray(out, jnp.float32)
 
 
 _TEMPLATES = {

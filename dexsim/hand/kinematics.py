@@ -96,19 +96,17 @@ def forward_kinematics(hand: Hand, joint_position: jax.Array) -> HandPose:
     angle = angle - hand.joint_reference
     turn = rotations.axis_angle_to_matrix(jnp.asarray(hand.joint_axis), angle)
     local_rotation = rotations.compose(jnp.asarray(hand.body_rotation), turn)
-    lever = hand.joint_anchor - rotations.rotate(turn, jnp.asarray(hand.joint_anchor))
+    lever = jnp.asarray(hand.joint_anchor) - rotations.rotate(turn, jnp.asarray(hand.joint_anchor))
     local_position = hand.body_position + rotations.rotate(jnp.asarray(hand.body_rotation), lever)
 
-    order, position, rotation = [], None, None
-    for level in _levels(hand.body_parent):
-        if position is None:
-            position, rotation = local_position[level], local_rotation[level]
-        else:
-            rows = np.array([order.index(p) for p in hand.body_parent[level]], np.int32)
-            new_position = position[rows] + rotations.rotate(rotation[rows], local_position[level])
-            new_rotation = rotations.compose(rotation[rows], local_rotation[level])
-            position = jnp.concatenate([position, new_position])
-            rotation = jnp.concatenate([rotation, new_rotation])
+    roots, *deeper = _levels(hand.body_parent)
+    order, position, rotation = list(roots), local_position[roots], local_rotation[roots]
+    for level in deeper:
+        rows = np.array([order.index(p) for p in hand.body_parent[level]], np.int32)
+        new_position = position[rows] + rotations.rotate(rotation[rows], local_position[level])
+        new_rotation = rotations.compose(rotation[rows], local_rotation[level])
+        position = jnp.concatenate([position, new_position])
+        rotation = jnp.concatenate([rotation, new_rotation])
         order += list(level)
     back = np.argsort(order).astype(np.int32)
     position, rotation = position[back], rotation[back]

@@ -55,7 +55,7 @@ def lattice(columns: int, rows: int, *, pitch: float | tuple[float, float], kind
     Raises:
       ConfigError: no taxels, no pitch or an unknown kind.
     """
-    across, along = (pitch, pitch) if np.isscalar(pitch) else pitch
+    across, along = (pitch, pitch) if isinstance(pitch, (int, float)) else pitch
     if kind not in ("rect", "hex"):
         raise ConfigError(f"lattice kind {kind!r}: choose rect or hex")
     if columns < 1 or rows < 1 or not (across > 0 and along > 0):
@@ -229,15 +229,15 @@ def read_layout(path: str | Path) -> dict[str, Patch]:
         with open(path, newline="") as file:
             entries = list(csv.DictReader(file))
         fingers = tuple(dict.fromkeys(entry["finger"] for entry in entries))
-        grid = [1 + max(int(entry[name]) for entry in entries) for name in ("column", "row")]
+        columns, rows = (1 + max(int(entry[name]) for entry in entries) for name in ("column", "row"))
     except FileNotFoundError:
         raise AssetError(f"{path}: no such file") from None
     except (OSError, KeyError, TypeError, ValueError) as error:
         raise AssetError(f"{path}: not a taxel layout ({error})") from None
-    table = read_taxels(path, fingers, grid).astype(np.float64)
+    table = read_taxels(path, fingers, (columns, rows)).astype(np.float64)
     return {
-        name: Patch(tuple(grid), rows[:, 0:3], rows[:, 3:6], rows[:, 6])
-        for name, rows in zip(fingers, table, strict=True)
+        name: Patch((columns, rows), taxels[:, 0:3], taxels[:, 3:6], taxels[:, 6])
+        for name, taxels in zip(fingers, table, strict=True)
     }
 
 

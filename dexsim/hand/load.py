@@ -246,7 +246,7 @@ def _read_toml(path: Path) -> dict:
         raise AssetError(f"{path}: {error}") from None
 
 
-def read_taxels(path: Path, fingers: tuple[str, ...], grid: list[int]) -> np.ndarray:
+def read_taxels(path: Path, fingers: tuple[str, ...], grid: tuple[int, int]) -> np.ndarray:
     """[F, N, 7]: position, normal, area. Every finger must have columns * rows taxels."""
     try:
         with open(path, newline="") as file:

@@ -11,12 +11,13 @@ error (exit code 2): somewhere between the configuration and the physics it was 
 import dataclasses
 import sys
 from collections.abc import Sequence
+from typing import Literal
 
 import jax
 
+from dexsim.core import cli
 from dexsim.core.compilation import collector_paused
 from dexsim.core.config import setting, validate
-from dexsim.core.errors import DexsimError
 from dexsim.randomization_check.effects import Effect, check
 
 
@@ -47,16 +48,16 @@ def conclude(effects: Sequence[Effect]) -> int:
 class CheckArguments:
     """Show that every range of the randomisation has an effect."""
 
-    task: str = setting("grasp")
-    """Name of the task, with its default configuration."""
-    backend: str = setting("auto", choices=("auto", "jax", "warp"))
-    """Physics backend."""
+    task: str = "grasp"
+    """Name of the task, which gets its default configuration; my_module:poke for a task of your own."""
+    backend: Literal["auto", "jax", "warp"] = setting("auto")
+    """Physics backend. auto: warp on a GPU if it is installed, otherwise jax."""
     num_envs: int = setting(16, unit="1", low=2, high=65536)
-    """Hands drawn for each range."""
+    """Hands sampled for each range."""
     ticks: int = setting(12, unit="1", low=1, high=1000)
-    """Control ticks that are compared."""
-    seed: int = setting(0, low=0)
-    """Of starts, draws and actions."""
+    """Control ticks to compare."""
+    seed: int = setting(0, unit="1", low=0, high=2**32 - 2)
+    """Seed of starts, samples and actions."""
 
     def __post_init__(self):
         validate(self)
@@ -64,31 +65,25 @@ class CheckArguments:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """The command. Returns its exit code: 0, or 2 where a range has no effect."""
-    import tyro
-
     from dexsim.registry import find_task, make
 
-    arguments = tyro.cli(
+    arguments = cli.parse(
         CheckArguments,
-        args=argv,
+        sys.argv[1:] if argv is None else argv,
         prog="python -m dexsim.randomization_check",
         description="Show that every range of the randomisation has an effect.",
     )
-    try:
-        config = dataclasses.replace(find_task(arguments.task).config(), pool_size=80)
-        env = make(arguments.task, config, backend=arguments.backend, num_envs=arguments.num_envs)
-        keys = jax.random.split(jax.random.key(arguments.seed), arguments.num_envs)
-        with collector_paused():
-            states = jax.block_until_ready(jax.jit(jax.vmap(env.reset))(keys))
-        effects = check(
-            env, jax.jit(jax.vmap(env.step)), states, key=jax.random.key(arguments.seed + 1), ticks=arguments.ticks
-        )
-    except DexsimError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    config = dataclasses.replace(find_task(arguments.task).config(), pool_size=80)
+    env = make(arguments.task, config, backend=arguments.backend, num_envs=arguments.num_envs)
+    keys = jax.random.split(jax.random.key(arguments.seed), arguments.num_envs)
+    with collector_paused():
+        states = jax.block_until_ready(jax.jit(jax.vmap(env.reset))(keys))
+    effects = check(
+        env, jax.jit(jax.vmap(env.step)), states, key=jax.random.key(arguments.seed + 1), ticks=arguments.ticks
+    )
     print(f"{arguments.task} on {env.backend}, {arguments.num_envs} hands, {arguments.ticks} ticks")
     return conclude(effects)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    cli.run(main)

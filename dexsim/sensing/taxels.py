@@ -30,7 +30,7 @@ DRAWN = ("hysteresis", "crosstalk", "gain", "bias", "drift", "dead", "rate")
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class TaxelSensor:
-    """From the force on a taxel to its reading. Ranges (low, high) are drawn at every episode start; None: no effect.
+    """From the force on a taxel to its reading. Ranges (low, high) are drawn at every episode start.
 
     Published ranges (Tactile Genesis 2026): gain 0.85 to 1.15, 5 % dead taxels, hysteresis 0.5 at 0.05 s.
     """
@@ -44,21 +44,22 @@ class TaxelSensor:
     saturation: float = setting(25.5, unit="N", low=0.1, high=1000.0)
     """Largest force a taxel can report."""
     hysteresis: Range | None = setting(None, unit="1", low=0.0, high=0.9)
-    """Share of a change that arrives late, per finger."""
+    """Share of a change that arrives late, per finger; None: no such effect."""
     hysteresis_time: Range = setting((0.03, 0.2), unit="s", low=1e-3, high=10.0)
     """Time constant of that share."""
     crosstalk: Range | None = setting(None, unit="1", low=0.0, high=0.8)
-    """Share of a taxel's force that its four neighbours on the lattice feel instead, per finger."""
+    """Share of a taxel's force that its four neighbours feel instead, per finger; None: no such effect."""
     gain: Range | None = setting(None, unit="1", low=0.05, high=5.0)
-    """Factor on each taxel, on top of the finger's (`Randomization.taxel_gain`)."""
+    """Factor on each taxel, on top of the finger's (`Randomization.taxel_gain`); None: no such effect."""
     bias: Range | None = setting(None, unit="N", low=-10.0, high=10.0)
-    """Constant error of each taxel, left over by the tare."""
+    """Constant error of each taxel, left over by the tare; None: no such effect."""
     drift: Range | None = setting(None, unit="N/sqrt(s)", low=0.0, high=1.0)
-    """Random walk of each taxel: its standard deviation after one second, per finger."""
+    """Random walk of each taxel: its standard deviation after one second, per finger; None: no such effect."""
     dead: Range | None = setting(None, unit="1", low=0.0, high=1.0)
-    """Probability that a taxel reads zero for the whole episode."""
+    """Probability that a taxel reads zero for the whole episode; None: no such effect."""
     rate: Range | None = setting(None, unit="Hz", low=0.1, high=1e4)
-    """The array's own sampling rate, below the control rate; between samples the last reading is repeated."""
+    """The array's own sampling rate, below the control rate; between samples the last reading is repeated. None: it
+    samples at the control rate."""
 
     def __post_init__(self):
         validate(self)

@@ -1,1 +1,1 @@
-"""PPO in pure JAX. Knows an environment only by its `reset`, `step`, `restart` and `stagger`."""
+"""PPO in pure JAX, for any environment with `reset`, `step`, `restart` and `stagger`."""

@@ -37,7 +37,7 @@ def update(
     decay: tuple[float, float] = (0.9, 0.999),
     epsilon: float = 1e-5,
 ) -> tuple[Tree, AdamState]:
-    """One step down the gradient; returns the new parameters and moments."""
+    """One step down the gradient: new parameters and moments. `learning_rate` is []."""
     b1, b2 = decay
     count = state.count + 1
     mean = jax.tree.map(lambda m, g: b1 * m + (1 - b1) * g, state.mean, grads)
@@ -52,12 +52,12 @@ def update(
 
 
 def global_norm(tree: Tree) -> jax.Array:
-    """Euclidean norm over all leaves."""
+    """Euclidean norm [] over all leaves."""
     return jnp.sqrt(sum(jnp.sum(leaf**2) for leaf in jax.tree.leaves(tree)))
 
 
 def clip_by_global_norm(grads: Tree, max_norm: float) -> tuple[Tree, jax.Array]:
-    """Scale the gradient down to `max_norm` where it is longer; also returns the norm before that."""
+    """Scale gradients longer than `max_norm` down to it; also return the norm [] before clipping."""
     norm = global_norm(grads)
     scale = jnp.minimum(1.0, max_norm / jnp.maximum(norm, 1e-12))
     return jax.tree.map(lambda g: g * scale, grads), norm

@@ -11,72 +11,71 @@ from dexsim.core.errors import ConfigError
 class PPOConfig:
     """Settings of the learner."""
 
-    num_envs: int = setting(4096, low=1)
+    num_envs: int = setting(4096, unit="1", low=1)
     """Environments simulated side by side (B)."""
     rollout_length: int = setting(16, unit="steps", low=1)
     """Steps of each environment per iteration (T)."""
-    epochs: int = setting(5, low=1)
+    epochs: int = setting(5, unit="1", low=1)
     """Passes over the experience of one iteration."""
-    minibatches: int = setting(4, low=1)
-    """Parts that one pass is split into; must divide T * B. Few large ones are best."""
-    iterations_per_call: int = setting(1, low=1)
+    minibatches: int = setting(4, unit="1", low=1)
+    """Minibatches per epoch; must divide T * B. A few large ones work best."""
+    iterations_per_call: int = setting(1, unit="1", low=1)
     """Iterations inside one compiled call."""
-    discount: float = setting(0.99, low=0.0, high=1.0)
+    discount: float = setting(0.99, unit="1", low=0.0, high=1.0)
     """Weight of the next step's return."""
-    gae_lambda: float = setting(0.95, low=0.0, high=1.0)
+    gae_lambda: float = setting(0.95, unit="1", low=0.0, high=1.0)
     """Weight of longer returns in the advantage."""
-    reward_scale: float = setting(1.0, low=1e-9)
+    reward_scale: float = setting(1.0, unit="1", low=1e-9)
     """Factor on rewards, seen by the learner only."""
-    clip_ratio: float = setting(0.2, low=1e-3, high=1.0)
-    """Change of an action's probability beyond which its gradient is cut."""
+    clip_ratio: float = setting(0.2, unit="1", low=1e-3, high=1.0)
+    """Relative change of an action's probability beyond which its gradient is zero."""
     value_clip: float = setting(0.2, unit="value deviations", low=0.0)
-    """Change of a value beyond which its gradient is cut; 0 turns this off."""
-    value_coefficient: float = setting(1.0, low=0.0)
+    """Change of a value beyond which its gradient is zero; 0 turns value clipping off."""
+    value_coefficient: float = setting(1.0, unit="1", low=0.0)
     """Weight of the value loss."""
-    entropy_coefficient: float = setting(0.0, low=0.0)
+    entropy_coefficient: float = setting(0.0, unit="1", low=0.0)
     """Weight of the entropy bonus."""
-    bounds_coefficient: float = setting(1e-3, low=0.0)
+    bounds_coefficient: float = setting(1e-3, unit="1", low=0.0)
     """Weight of the penalty on Gaussian means beyond +-1.1."""
-    max_grad_norm: float = setting(1.0, low=1e-6)
-    """Length that the gradients of actor and critic are each clipped to."""
-    learning_rate: float = setting(5e-4, low=0.0, high=1.0)
+    max_grad_norm: float = setting(1.0, unit="1", low=1e-6)
+    """Norm that the gradients of actor and critic are each clipped to."""
+    learning_rate: float = setting(5e-4, unit="1", low=0.0, high=1.0)
     """Adam's step size, at the start if it adapts."""
-    learning_rate_min: float = setting(1e-5, low=0.0, high=1.0)
+    learning_rate_min: float = setting(1e-5, unit="1", low=0.0, high=1.0)
     """Lower end of the adaptive learning rate."""
-    learning_rate_max: float = setting(2e-3, low=0.0, high=1.0)
+    learning_rate_max: float = setting(2e-3, unit="1", low=0.0, high=1.0)
     """Upper end of the adaptive learning rate."""
     kl_target: float = setting(0.012, unit="nats", low=0.0)
-    """Policy change in one iteration that the learning rate adapts to; 0 keeps the rate fixed."""
-    distribution: Literal["gaussian", "tanh"] = setting("gaussian", choices=("gaussian", "tanh"))
+    """KL divergence per iteration that the learning rate adapts to; 0 keeps the rate fixed."""
+    distribution: Literal["gaussian", "tanh"] = setting("gaussian")
     """Gaussian clipped by the environment, or squashed by tanh."""
     critic_first: int = setting(0, unit="iterations", low=0)
-    """First iterations, in which only the critic learns, at the cap of the learning rate: for an actor that knows
-    more than its critic."""
-    initial_std: float = setting(0.6, low=1e-3, high=10.0)
-    """Standard deviation of the first policy's actions, of a range [-1, 1]."""
-    std_min: float = setting(0.05, low=1e-4, high=10.0)
+    """Initial iterations that train only the critic, at `learning_rate_max`: in fine-tuning the critic is new."""
+    initial_std: float = setting(0.6, unit="1", low=1e-3, high=10.0)
+    """Initial standard deviation of actions, whose range is [-1, 1]."""
+    std_min: float = setting(0.05, unit="1", low=1e-4, high=10.0)
     """Floor of the standard deviation."""
-    std_max: float = setting(1.0, low=1e-4, high=10.0)
+    std_max: float = setting(1.0, unit="1", low=1e-4, high=10.0)
     """Cap of the standard deviation."""
-    actor_layers: tuple[int, ...] = setting((512, 256, 128), low=1)
+    actor_layers: tuple[int, ...] = setting((512, 256, 128), unit="1", low=1)
     """Hidden layer sizes of the actor."""
-    critic_layers: tuple[int, ...] = setting((512, 256, 128), low=1)
+    critic_layers: tuple[int, ...] = setting((512, 256, 128), unit="1", low=1)
     """Hidden layer sizes of the critic."""
     normalize_value: bool = True
     """Learn values in units of the running deviation of returns."""
     observation_std_floor: float = setting(1e-2, unit="observation units", low=0.0)
     """Smallest deviation that a running observation normaliser divides by."""
-    observation_clip: float = setting(5.0, low=0.1)
+    observation_clip: float = setting(5.0, unit="1", low=0.1)
     """Bound on the magnitude of normalised observations."""
-    matmul_precision: Literal["default", "high", "highest"] = setting("highest", choices=("default", "high", "highest"))
-    """Of the networks' matrix products; on NVIDIA GPUs `default` is TF32."""
+    matmul_precision: Literal["default", "high", "highest"] = setting("highest")
+    """Precision of the networks' matrix products; on NVIDIA GPUs `default` is TF32."""
 
     def __post_init__(self) -> None:
         validate(self)
         if self.num_envs * self.rollout_length % self.minibatches:
             raise ConfigError(
-                f"PPOConfig.minibatches = {self.minibatches}: must divide num_envs * "
-                f"rollout_length = {self.num_envs * self.rollout_length}"
+                f"PPOConfig.minibatches = {self.minibatches}: must divide PPOConfig.num_envs * "
+                f"PPOConfig.rollout_length, which is {self.num_envs * self.rollout_length}"
             )
         for low, mid, high in (
             ("learning_rate_min", "learning_rate", "learning_rate_max"),
@@ -84,8 +83,8 @@ class PPOConfig:
         ):
             if not getattr(self, low) <= getattr(self, mid) <= getattr(self, high):
                 raise ConfigError(
-                    f"PPOConfig.{mid} = {getattr(self, mid):g}: must be between {low} "
-                    f"= {getattr(self, low):g} and {high} = {getattr(self, high):g}"
+                    f"PPOConfig.{mid} = {getattr(self, mid):g}: must be between PPOConfig.{low} "
+                    f"= {getattr(self, low):g} and PPOConfig.{high} = {getattr(self, high):g}"
                 )
 
     @property

@@ -1,4 +1,4 @@
-"""A curriculum: the width of the environments' ranges follows success."""
+"""A curriculum: randomisation ranges widen as the success rate grows."""
 
 import dataclasses
 
@@ -11,23 +11,23 @@ from dexsim.core.errors import ConfigError
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Curriculum:
-    """How the scale of the ranges follows success; the scale is part of the training state."""
+    """How the scale of the randomisation ranges follows the success rate. The scale is part of the training state."""
 
     on: bool = setting(False)
-    """Widen the ranges while training; off, they have their full width from the beginning."""
+    """Widen the ranges during training; otherwise they have their full width from the start."""
     metric: str = setting("")
-    """What counts as success: by default the share of ended episodes that lived to their time limit,
-    else a metric of training by name, such as episode/goals_per_minute."""
+    """Training metric that measures success, such as episode/goals_per_minute. Empty: the share of ended episodes that
+    reached their time limit."""
     start: float = setting(0.1, unit="1", low=0.0, high=1.0)
-    """Scale at the beginning."""
+    """Initial scale."""
     widen_above: float = setting(0.8, unit="1", low=0.0, high=1e6)
-    """Success from which the ranges grow."""
+    """Success at or above which the ranges widen."""
     narrow_below: float = setting(0.4, unit="1", low=0.0, high=1e6)
-    """Success below which they shrink."""
+    """Success below which the ranges narrow."""
     step: float = setting(0.02, unit="1", low=0.0001, high=1.0)
-    """Change of the scale at each update."""
+    """Change of the scale per iteration."""
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         validate(self)
         if self.narrow_below > self.widen_above:
             raise ConfigError(
@@ -36,9 +36,9 @@ class Curriculum:
 
 
 def next_scale(scale: jax.Array, success: jax.Array, curriculum: Curriculum) -> jax.Array:
-    """The scale [] in [0, 1] after an update with this rate of success [] in [0, 1].
+    """The next scale [] in [0, 1], from the current scale [] and the success [].
 
-    A rate that is not a number (no episode has ended) leaves the scale as it is.
+    A NaN success (no episode has ended) leaves the scale unchanged.
     """
     step = jnp.where(
         success >= curriculum.widen_above,

@@ -1,13 +1,15 @@
 """Multilayer perceptrons of actor and critic, as plain functions on pytrees.
 
 Matrix products name their precision: on NVIDIA GPUs JAX's default is TF32, and its 10-bit mantissa
-has stopped cube reorientation from being learned.
+kept cube reorientation from being learned.
 """
+
+import itertools
 
 import jax
 import jax.numpy as jnp
 
-from dexsim.core.pytree import pytree_dataclass
+from dexsim.core.pytree import align, pytree_dataclass
 
 
 @pytree_dataclass
@@ -23,7 +25,7 @@ MLP = tuple[Layer, ...]
 
 @pytree_dataclass
 class Params:
-    """Everything that gradients reach."""
+    """All trained parameters."""
 
     actor: MLP
     log_std: jax.Array  # [A], of the Gaussian before any squashing
@@ -37,7 +39,7 @@ def init_mlp(key: jax.Array, sizes: tuple[int, ...], output_gain: float) -> MLP:
     """
     layers = []
     keys = jax.random.split(key, len(sizes) - 1)
-    for i, (rows, columns) in enumerate(zip(sizes[:-1], sizes[1:], strict=True)):
+    for i, (rows, columns) in enumerate(itertools.pairwise(sizes)):
         gain = output_gain if i == len(sizes) - 2 else 2.0**0.5
         kernel = jax.nn.initializers.orthogonal(gain)(keys[i], (rows, columns), jnp.float32)
         layers.append(Layer(kernel=kernel, bias=jnp.zeros(columns)))
@@ -45,9 +47,10 @@ def init_mlp(key: jax.Array, sizes: tuple[int, ...], output_gain: float) -> MLP:
 
 
 def apply_mlp(layers: MLP, x: jax.Array, precision: str = "highest") -> jax.Array:
-    """ELU network: `x` [..., in] to [..., out]. `precision` is a name of `jax.lax.Precision`."""
+    """ELU network: `x` [..., in] to [..., out]. `precision` names a `jax.lax.Precision`."""
     for i, layer in enumerate(layers):
-        x = jnp.matmul(x, layer.kernel, precision=precision) + layer.bias
+        x = jnp.matmul(x, layer.kernel, precision=precision)
+        x = x + align(layer.bias, x)
         if i < len(layers) - 1:
             x = jax.nn.elu(x)
     return x
@@ -56,7 +59,7 @@ def apply_mlp(layers: MLP, x: jax.Array, precision: str = "highest") -> jax.Arra
 def init_params(
     key: jax.Array, *, actor_sizes: tuple[int, ...], critic_sizes: tuple[int, ...], initial_std: float
 ) -> Params:
-    """Parameters of both networks; the small actor gain makes the first actions nearly the noise's.
+    """Parameters of both networks. The actor's small output gain makes the first actions nearly pure noise.
 
     Args:
       actor_sizes: observation size, hidden sizes, action size.
@@ -71,9 +74,9 @@ def init_params(
 
 
 def rescale_output(layers: MLP, mean: jax.Array, std: jax.Array, new_mean: jax.Array, new_std: jax.Array) -> MLP:
-    """Change the last layer so that `new_std * out + new_mean` is what `std * out + mean` was.
+    """Change the last layer so that `new_std * out + new_mean` equals the old `std * out + mean`.
 
-    Keeps the critic's predictions when the value normaliser moves (PopArt, van Hasselt et al. 2016).
+    Preserves the critic's predictions when the value normaliser changes (PopArt, van Hasselt et al. 2016).
     """
     last = layers[-1]
     kernel = last.kernel * (std / new_std)

@@ -1,14 +1,14 @@
-"""Proximal policy optimisation (Schulman et al. 2017), top to bottom.
+"""Proximal policy optimisation (Schulman et al. 2017).
 
 `make_train(env, config)` returns two compiled functions: `init(key) -> TrainState` and
-`step(state) -> (state, metrics)`. One step collects `[T, B]` experience, estimates advantages, and goes
-over it `epochs` times in `minibatches` parts. Everything that training needs in order to go on is in
-`TrainState`, so saving and loading that one pytree resumes it exactly.
+`step(state) -> (state, metrics)`. One step collects [T, B] experience, estimates advantages, and makes
+`epochs` passes over it in `minibatches` parts. `TrainState` holds everything that training depends on:
+saving and loading that one pytree resumes training exactly.
 """
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -21,20 +21,18 @@ from dexsim_ppo.learner.adam import AdamState
 from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.curriculum import Curriculum, next_scale
 from dexsim_ppo.learner.gae import compute_gae
-from dexsim_ppo.learner.networks import Params, apply_mlp, init_params, rescale_output
+from dexsim_ppo.learner.loss import Metrics, Samples, actor_mean, critic_value, loss
+from dexsim_ppo.learner.networks import Params, init_params, rescale_output
 from dexsim_ppo.learner.rollout import Decision, Rollout, collect
 from dexsim_ppo.learner.running_stats import (
     Normalizer,
     RunningStats,
     init_stats,
     make_normalizer,
-    normalize,
     update_stats,
     value_std,
 )
-from dexsim_ppo.learner.types import Environment, layout_size
-
-Metrics = dict[str, jax.Array]
+from dexsim_ppo.learner.types import CurriculumEnvironment, Environment, layout_size
 
 
 @pytree_dataclass
@@ -49,8 +47,8 @@ class TrainState:
     env_state: Any  # [B, ...]
     key: jax.Array
     iteration: jax.Array  # int32 []
-    skipped_updates: jax.Array  # int32 [], minibatches left out since their gradient was not finite
-    scale: jax.Array | None = None  # [] width of the environments' ranges, with a curriculum
+    skipped_updates: jax.Array  # int32 [], minibatches whose gradient was not finite
+    scale: jax.Array | None = None  # [] width of the randomisation ranges, with a curriculum
 
 
 class Training(NamedTuple):
@@ -58,22 +56,11 @@ class Training(NamedTuple):
 
     init: Callable[[jax.Array], TrainState]
     shapes: Callable[[jax.Array], TrainState]
-    """What `init` would return, as `jax.eval_shape` has it."""
+    """Shapes and types of what `init` returns, without computing it."""
     plain_step: Callable[[TrainState], tuple[TrainState, Metrics]]
-    """`step` before it is jitted."""
+    """`step` before compilation."""
     step: Callable[[TrainState], tuple[TrainState, Metrics]]
-    """Takes over its argument's memory: do not use that state again. Metrics are [iterations_per_call]."""
-
-
-@pytree_dataclass
-class Samples:
-    """Experience as the update sees it; arrays [N, ...] with N rows of a rollout."""
-
-    obs: dict[str, jax.Array]
-    decision: Decision
-    advantage: jax.Array
-    value: jax.Array  # normalised
-    target: jax.Array  # normalised
+    """Donates its argument: do not use that state again. Metrics are [iterations_per_call]."""
 
 
 def make_train(env: Environment, config: PPOConfig, curriculum: Curriculum | None = None) -> Training:
@@ -91,8 +78,8 @@ def make_train(env: Environment, config: PPOConfig, curriculum: Curriculum | Non
         return strong_types(state), metrics
 
     compiled_init = jit(init, once=True)
-    # Copies part leaves that share a buffer (actor and critic may see the same array): no buffer can be
-    # donated twice.
+    # Leaves may share a buffer (actor and critic may observe the same array), and no buffer can be donated
+    # twice: copies separate them.
     return Training(
         init=lambda key: jax.tree.map(jnp.copy, compiled_init(key)),
         shapes=lambda key: jax.eval_shape(init, key),
@@ -102,7 +89,7 @@ def make_train(env: Environment, config: PPOConfig, curriculum: Curriculum | Non
 
 
 def init_state(env: Environment, config: PPOConfig, key: jax.Array, curriculum: Curriculum | None = None) -> TrainState:
-    """A fresh learner and freshly reset environments with staggered clocks."""
+    """A fresh learner, and freshly reset environments with staggered clocks."""
     params_key, reset_key, stagger_key, key = jax.random.split(key, 4)
     sizes = {group: layout_size(fields) for group, fields in env.observation_layout.items()}
     params = init_params(
@@ -111,8 +98,10 @@ def init_state(env: Environment, config: PPOConfig, key: jax.Array, curriculum: 
         critic_sizes=(sizes["critic"], *config.critic_layers, 1),
         initial_std=config.initial_std,
     )
-    scale = None if curriculum is None else jnp.float32(curriculum.start)
-    reset = env.reset if scale is None else lambda key: env.reset(key, scale)
+    scale, reset = None, env.reset
+    if curriculum is not None:
+        scale = jnp.float32(curriculum.start)
+        reset = functools.partial(cast(CurriculumEnvironment, env).reset, scale=scale)
     env_state = jax.vmap(reset)(jax.random.split(reset_key, config.num_envs))
     env_state = jax.vmap(env.stagger)(env_state, jax.random.split(stagger_key, config.num_envs))
     return TrainState(
@@ -134,7 +123,7 @@ def train_iteration(
 ) -> tuple[TrainState, Metrics]:
     """Collect, estimate advantages, update; with a curriculum, widen or narrow the ranges."""
     key, collect_key, update_key = jax.random.split(state.key, 3)
-    # Collection and update share these, so the first minibatch's probability ratio is exactly one.
+    # Shared by collection and update, so that the first minibatch's probability ratio is exactly one.
     normalizers = make_normalizers(env, config, state.observation_stats)
     env_state, rollout, metrics = collect_rollout(env, config, state, normalizers, collect_key)
     value_stats, params, samples = prepare(config, state.value_stats, state.params, rollout)
@@ -153,9 +142,10 @@ def train_iteration(
     }
     scale = state.scale
     if curriculum is not None:
-        scale, success = follow(curriculum, scale, metrics)
+        assert scale is not None, "the state of a training with a curriculum"
+        scale, success = update_scale(curriculum, scale, metrics)
         metrics |= {"curriculum/scale": scale, "curriculum/success": success}
-        env_state = jax.vmap(env.widen, (0, None))(env_state, scale)
+        env_state = jax.vmap(cast(CurriculumEnvironment, env).widen, (0, None))(env_state, scale)
     stats = {
         group: update_stats(state.observation_stats[group], rollout.obs[group]) for group in state.observation_stats
     }
@@ -173,11 +163,11 @@ def train_iteration(
     ), metrics
 
 
-def follow(curriculum: Curriculum, scale: jax.Array, metrics: Metrics) -> tuple[jax.Array, jax.Array]:
-    """The scale [] after an iteration with these metrics, and the success [] that it followed.
+def update_scale(curriculum: Curriculum, scale: jax.Array, metrics: Metrics) -> tuple[jax.Array, jax.Array]:
+    """The next scale [] of the curriculum, and the success [] of this iteration.
 
     Raises:
-      ConfigError: there is no metric of that name.
+      ConfigError: the curriculum names a metric that does not exist.
     """
     if not curriculum.metric:
         success = 1 - metrics["terminated_share"]
@@ -204,7 +194,7 @@ def make_normalizers(env: Environment, config: PPOConfig, stats: dict[str, Runni
 def collect_rollout(
     env: Environment, config: PPOConfig, state: TrainState, normalizers: dict[str, Normalizer], key: jax.Array
 ) -> tuple[Any, Rollout, Metrics]:
-    """Experience under the current policy; values are in reward units."""
+    """Experience [T, B, ...] under the current policy; values are in reward units."""
     params, std = state.params, value_std(state.value_stats)
 
     def act(key, obs):
@@ -219,27 +209,13 @@ def collect_rollout(
     return collect(env, state.env_state, key, act, value, config.rollout_length)
 
 
-def actor_mean(
-    config: PPOConfig, params: Params, normalizers: dict[str, Normalizer], obs: dict[str, jax.Array]
-) -> jax.Array:
-    """Mean of the Gaussian, `[..., A]`."""
-    return apply_mlp(params.actor, normalize(normalizers["actor"], obs["actor"]), config.matmul_precision)
-
-
-def critic_value(
-    config: PPOConfig, params: Params, normalizers: dict[str, Normalizer], obs: dict[str, jax.Array]
-) -> jax.Array:
-    """Normalised value, `[...]`."""
-    return apply_mlp(params.critic, normalize(normalizers["critic"], obs["critic"]), config.matmul_precision)[..., 0]
-
-
 # --- advantages ---------------------------------------------------------------------------------------
 
 
 def prepare(
     config: PPOConfig, value_stats: RunningStats, params: Params, rollout: Rollout
 ) -> tuple[RunningStats, Params, Samples]:
-    """Advantages and normalised value targets as flat rows; moves the value normaliser on."""
+    """Advantages and normalised value targets as flat rows [T * B]; updates the value normaliser."""
     advantage, target = compute_gae(
         config.reward_scale * rollout.reward,
         rollout.value,
@@ -281,7 +257,7 @@ def update(
 ) -> tuple[Learner, Metrics]:
     """All epochs over shuffled minibatches, then the learning rate of the next iteration.
 
-    Metrics are means over the minibatches, but for the KL divergence: that of the last epoch.
+    Metrics are means over all minibatches, except the KL divergence: its mean over the last epoch.
     """
     rows = config.steps_per_iteration
     keys = jax.random.split(key, config.epochs)
@@ -299,63 +275,23 @@ def update(
     last_epoch = metrics["kl"][-config.minibatches :]
     metrics = jax.tree.map(jnp.nanmean, metrics) | {"kl": jnp.nanmean(last_epoch)}
     rate = adapt_learning_rate(config, learner.learning_rate, metrics["kl"])
-    if config.critic_first:  # A policy that stands still says nothing about the rate.
+    if config.critic_first:  # A policy that does not move says nothing about the rate.
         rate = jnp.where(moves, rate, learner.learning_rate)
     return learner._replace(learning_rate=rate), metrics
 
 
-def loss(
-    params: Params, config: PPOConfig, normalizers: dict[str, Normalizer], batch: Samples, old_log_std: jax.Array
-) -> tuple[jax.Array, Metrics]:
-    """The clipped surrogate, the value loss and the regularisers over one minibatch."""
-    mean = actor_mean(config, params, normalizers, batch.obs)
-    ratio = jnp.exp(distribution.log_prob(batch.decision.action, mean, params.log_std) - batch.decision.log_prob)
-    clipped = jnp.clip(ratio, 1 - config.clip_ratio, 1 + config.clip_ratio)
-    policy_loss = -jnp.mean(jnp.minimum(ratio * batch.advantage, clipped * batch.advantage))
-
-    value = critic_value(config, params, normalizers, batch.obs)
-    errors = (value - batch.target) ** 2
-    if config.value_clip > 0:
-        near = batch.value + jnp.clip(value - batch.value, -config.value_clip, config.value_clip)
-        errors = jnp.maximum(errors, (near - batch.target) ** 2)
-    value_loss = 0.5 * jnp.mean(errors)
-
-    entropy, bounds_loss = distribution.entropy(params.log_std), jnp.float32(0)
-    if config.distribution == "tanh":
-        noise = (batch.decision.action - batch.decision.mean) * jnp.exp(-old_log_std)
-        entropy += jnp.mean(distribution.tanh_log_det(mean + noise * jnp.exp(params.log_std)))
-    else:
-        bounds_loss = jnp.mean(distribution.bounds_loss(mean))
-
-    total = (
-        policy_loss
-        + config.value_coefficient * value_loss
-        + config.bounds_coefficient * bounds_loss
-        - config.entropy_coefficient * entropy
-    )
-    kl = distribution.kl_divergence(batch.decision.mean, old_log_std, mean, params.log_std)
-    return total, {
-        "policy_loss": policy_loss,
-        "value_loss": value_loss,
-        "bounds_loss": bounds_loss,
-        "entropy": entropy,
-        "kl": jnp.mean(kl),
-        "clip_fraction": jnp.mean((jnp.abs(ratio - 1) > config.clip_ratio).astype(jnp.float32)),
-    }
-
-
 def apply_gradients(config: PPOConfig, learner: Learner, grads: Params) -> tuple[Learner, Metrics]:
-    """Clip and step; a gradient that is not finite is skipped and counted."""
+    """Clip the gradients and step. A minibatch whose gradient is not finite is skipped and counted."""
     actor_grads, actor_norm = adam.clip_by_global_norm((grads.actor, grads.log_std), config.max_grad_norm)
     critic_grads, critic_norm = adam.clip_by_global_norm(grads.critic, config.max_grad_norm)
     rate, moves = learner.learning_rate, actor_learns(config, learner)
     if config.critic_first:
         rate = jnp.where(moves, rate, config.learning_rate_max)
     params, moments = adam.update(Params(*actor_grads, critic_grads), learner.adam, learner.params, rate)
-    # Projected rather than clipped where it is used: a clip has no gradient to come back with.
+    # Projected after the step, not clipped in the loss: beyond a clip the gradient is zero, and it could not return.
     log_std = jnp.clip(params.log_std, jnp.log(config.std_min), jnp.log(config.std_max))
     params = Params(params.actor, log_std, params.critic)
-    if config.critic_first:  # The moments follow the gradient all the same, so the actor's first step is no leap.
+    if config.critic_first:  # Adam's moments already follow the gradient, so that the actor's first step is small.
         held = jax.tree.map(functools.partial(jnp.where, moves), params, learner.params)
         params = Params(held.actor, held.log_std, params.critic)
     ok = jnp.isfinite(actor_norm) & jnp.isfinite(critic_norm)
@@ -366,15 +302,15 @@ def apply_gradients(config: PPOConfig, learner: Learner, grads: Params) -> tuple
 
 
 def actor_learns(config: PPOConfig, learner: Learner) -> jax.Array:
-    """Whether the critic has had its iterations alone, []."""
+    """Whether the initial iterations for the critic alone are over: bool []."""
     return learner.adam.count >= config.critic_first * config.epochs * config.minibatches
 
 
 def adapt_learning_rate(config: PPOConfig, rate: jax.Array, kl: jax.Array) -> jax.Array:
-    """Slow down beyond twice the target KL and speed up below half of it, within the band.
+    """The next learning rate []: lower above twice the target KL, higher below half of it, within its bounds.
 
-    `kl` is the change that a whole iteration made to the policy. Adapting within the iteration would
-    cut the rate at every minibatch after the first one beyond the target, and overshoot.
+    `kl` [] measures the whole iteration. Adapting after every minibatch would overshoot: once beyond the
+    target, each further minibatch of the iteration would lower the rate again.
     """
     if config.kl_target == 0:
         return rate
@@ -385,7 +321,7 @@ def adapt_learning_rate(config: PPOConfig, rate: jax.Array, kl: jax.Array) -> ja
 
 
 def strong_types(tree: Any) -> Any:
-    """Drop weak types: JAX would compile a second time when the next state does not carry them."""
+    """Remove weak types, which the next state would not have: JAX would compile the step twice."""
 
     def strong(x):
         return x if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else jax.lax.convert_element_type(x, x.dtype)

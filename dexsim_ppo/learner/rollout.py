@@ -1,4 +1,4 @@
-"""Collects experience: `T` steps of `B` environments under one `lax.scan`, policy inside."""
+"""Collects experience: T steps of B environments and the policy inside one `lax.scan`."""
 
 import dataclasses
 from collections.abc import Callable, Mapping
@@ -10,14 +10,14 @@ import jax.numpy as jnp
 from dexsim.core.pytree import choose, pytree_dataclass
 from dexsim_ppo.learner.types import Environment
 
-_RESERVE_STEPS = 16  # short beside an episode, long beside the cost of computing a batch of new ones
+_RESERVE_STEPS = 16  # short compared with an episode; makes a batch of new episodes cheap per step
 
 
 @pytree_dataclass
 class Decision:
-    """What the policy did in one state; arrays [B, ...]."""
+    """The policy's action and its distribution; arrays [B, ...]."""
 
-    action: jax.Array  # [B, A] the Gaussian sample, before any squashing
+    action: jax.Array  # [B, A] Gaussian sample before any squashing
     mean: jax.Array  # [B, A]
     log_prob: jax.Array  # [B]
 
@@ -46,16 +46,16 @@ def collect(
 ) -> tuple[Any, Rollout, dict[str, jax.Array]]:
     """Run the policy for `length` steps.
 
-    The order is: act, step, record, restart. So the recorded flags, metrics and `next_value` belong to
-    the true final state of an episode, and the next step starts from a fresh one.
+    The order is act, step, record, restart: the recorded flags, metrics and `next_value` belong to the true
+    final state of an episode, and the next step starts from a fresh one.
 
     Args:
       state: batch [B] of environment states.
 
     Returns:
-      The states to go on from, the experience, and scalar metrics: `step/<name>` is a mean over all
-      steps, `episode/<name>` the mean of the last step's value over the episodes that ended (NaN if
-      none did), `episodes` their number.
+      The last states, the experience, and scalar metrics: `step/<name>` is a mean over all steps,
+      `episode/<name>` the mean final value over the episodes that ended (NaN if none did), `episodes`
+      their number.
     """
     step_env = jax.vmap(env.step)
 
@@ -74,8 +74,8 @@ def collect(
         )
         return after, (record, dict(after.metrics))
 
-    state, (rollout, told) = scan_restarting(env, step, state, jax.random.split(key, length))
-    # All sums are taken here: within the scan each would be a reduction of few numbers, which GPUs are slow at.
+    state, (rollout, step_metrics) = scan_restarting(env, step, state, jax.random.split(key, length))
+    # Sums are taken outside the scan: inside it each would reduce few numbers, which is slow on GPUs.
     finite, done = jnp.isfinite(rollout.reward), rollout.terminated | rollout.truncated
     rollout = dataclasses.replace(rollout, reward=jnp.where(finite, rollout.reward, 0.0))
     episodes, steps = jnp.sum(done, dtype=jnp.float32), done.size
@@ -85,23 +85,23 @@ def collect(
         "terminated_share": jnp.sum(rollout.terminated, dtype=jnp.float32) / episodes,
         "nonfinite_rewards": jnp.sum(~finite, dtype=jnp.float32),
     }
-    metrics |= {f"step/{k}": _sum(v, jnp.ones_like(done)) / steps for k, v in told.items()}
-    metrics |= {f"episode/{k}": _sum(v, done) / episodes for k, v in told.items()}
+    metrics |= {f"step/{k}": _sum(v, jnp.ones_like(done)) / steps for k, v in step_metrics.items()}
+    metrics |= {f"episode/{k}": _sum(v, done) / episodes for k, v in step_metrics.items()}
     return state, rollout, metrics
 
 
 def scan_restarting(
     env: Environment, step: Callable[[Any, Any], tuple[Any, Any]], state: Any, inputs: Any
 ) -> tuple[Any, Any]:
-    """`jax.lax.scan`, with a new episode after each step wherever one ended.
+    """`jax.lax.scan` that starts a new episode after each step wherever one ended.
 
-    `jax.vmap(env.restart)` after each step would compute a new episode for every environment and throw nearly
-    all of them away. So one for each is kept in reserve and renewed after at most 16 steps: an environment
-    whose episode ends twice in between begins both times alike. Restarting just the rows that ended, in a
-    loop, would have a GPU wait for the host at every step.
+    `jax.vmap(env.restart)` after every step would compute a new episode for every environment and discard
+    nearly all of them. Instead one new episode per environment is kept in reserve and renewed after at most
+    16 steps; an environment whose episode ends twice within that time starts the same episode twice.
+    Restarting only the rows that ended would make a GPU wait for the host at every step.
 
     Args:
-      step: `(states [B], input) -> (states after it, output)`; it does not restart.
+      step: `(states [B], input) -> (next states, output)`, without restarting.
       inputs: pytree [T, ...].
 
     Returns:
@@ -113,11 +113,11 @@ def scan_restarting(
 
     def run_block(state, inputs):
         everyone = jnp.ones(state.reward.shape[0], bool)
-        # The second call moves the random keys on that the first has used.
+        # The second call advances the random keys that the first one used.
         fresh, state = restart(state, everyone), restart(state, ~everyone)
 
-        def run_step(state, given):
-            after, output = step(state, given)
+        def run_step(state, step_input):
+            after, output = step(state, step_input)
             return jax.vmap(choose)(after.terminated | after.truncated, fresh, after), output
 
         return jax.lax.scan(run_step, state, inputs)

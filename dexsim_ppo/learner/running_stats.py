@@ -1,14 +1,14 @@
-"""Running mean and variance, and the normalisers made from them."""
+"""Running mean and variance, and normalisers made from them."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dexsim.core.pytree import pytree_dataclass, static
+from dexsim.core.pytree import align, pytree_dataclass, static
 from dexsim_ppo.learner.types import Fields, layout_size
 
-# The count stops here, and what was a mean over all samples becomes an exponential one over about this
-# many. A float32 count would freeze at 2**24 and an int32 one overflow after an hour on a GPU.
+# The count is capped here; from then on the mean is exponential over about this many samples. Without the
+# cap a float32 count would freeze at 2**24, and an int32 count overflow after an hour on a GPU.
 MEMORY = 2**27
 
 
@@ -36,7 +36,7 @@ def init_stats(shape: tuple[int, ...]) -> RunningStats:
 
 
 def update_stats(stats: RunningStats, batch: jax.Array) -> RunningStats:
-    """Merge a batch [..., n] (Chan et al. 1979); elements whose batch is not finite stay as they are."""
+    """Merge a batch [..., n] (Chan et al. 1979). Elements whose batch is not finite stay unchanged."""
     axes = tuple(range(batch.ndim - stats.mean.ndim))
     size = int(np.prod([batch.shape[axis] for axis in axes]))
     batch_mean, batch_variance = jnp.mean(batch, axes), jnp.var(batch, axes)
@@ -54,12 +54,12 @@ def update_stats(stats: RunningStats, batch: jax.Array) -> RunningStats:
 def make_normalizer(stats: RunningStats, fields: Fields, *, std_floor: float, clip: float) -> Normalizer:
     """Normaliser of one observation group.
 
-    Fields with a fixed scale are only divided by it: running statistics of a channel that is silent
-    until first contact would turn that contact into an outlier. The floor guards the other fields.
+    Fields with a fixed scale are only divided by it: with running statistics, a channel that is silent
+    until first contact would see that contact as an outlier.
 
     Args:
-      stats: over vectors [n], n being the sum of the fields' sizes.
-      std_floor: smallest standard deviation, in the observation's own units.
+      stats: of vectors [n], where n is the sum of the fields' sizes.
+      std_floor: smallest standard deviation of the other fields, in the observation's units.
     """
     scale = np.concatenate([np.full(f.size, f.scale or 0.0, np.float32) for f in fields])
     if scale.size != layout_size(fields) or scale.shape != stats.mean.shape:
@@ -70,9 +70,9 @@ def make_normalizer(stats: RunningStats, fields: Fields, *, std_floor: float, cl
 
 
 def recover_stats(normalizer: Normalizer, *, std_floor: float) -> RunningStats:
-    """Statistics that `make_normalizer` makes this normaliser of, for fields that have no fixed scale.
+    """Statistics [n] from which `make_normalizer` makes this normaliser, for fields without a fixed scale.
 
-    They count as ones of many samples: they scarcely move.
+    Their count is the largest, so that further samples hardly change them.
     """
     return RunningStats(
         count=jnp.int32(MEMORY),
@@ -83,7 +83,7 @@ def recover_stats(normalizer: Normalizer, *, std_floor: float) -> RunningStats:
 
 def normalize(normalizer: Normalizer, x: jax.Array) -> jax.Array:
     """Normalised and clipped `x` [..., n]."""
-    z = (x - normalizer.mean) / normalizer.std
+    z = (x - align(normalizer.mean, x)) / align(normalizer.std, x)
     return jnp.clip(z, -normalizer.clip, normalizer.clip)
 
 

@@ -1,4 +1,4 @@
-"""What the trainer knows of an environment, and nothing more."""
+"""What the learner and its tools require of an environment."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
@@ -24,34 +24,61 @@ class State(Protocol):
     """State of one environment: a pytree. Callers add batch axes with `jax.vmap`."""
 
     obs: Mapping[str, jax.Array]
-    """`"actor"` [n] and `"critic"` [m]; after `step`, before `restart`: the true final observation."""
+    """`"actor"` [n] and `"critic"` [m]. After `step` and before `restart` it is the true final observation."""
     reward: jax.Array
     terminated: jax.Array
-    """bool []: the episode ended for good; nothing follows. Wins over `truncated`."""
+    """bool []: the episode reached a terminal state. Takes precedence over `truncated`."""
     truncated: jax.Array
-    """bool []: the time limit cut the episode; the return goes on beyond it."""
+    """bool []: the time limit cut the episode; its value is bootstrapped."""
     metrics: Mapping[str, jax.Array]
-    """Scalars of this step; `"return"` and `"length"` are running sums over the episode."""
+    """Scalars of this step; `"return"` and `"length"` are sums over the episode so far."""
 
 
 class Environment(Protocol):
     """Pure functions of one environment's state."""
 
-    name: str
-    backend: str
-    config: Any
-    action_size: int
-    observation_layout: Mapping[str, Fields]
-    control_period: float
-    """Length of one control tick, s."""
-    evaluation_steps: int
-    """Length of an evaluation episode in ticks."""
+    @property
+    def name(self) -> str:
+        """The task's name."""
+        ...
 
-    evaluation: str
-    """What `summarize` is given: "series" of every tick, or "totals" that the task keeps by itself."""
+    @property
+    def backend(self) -> str:
+        """The physics backend."""
+        ...
+
+    @property
+    def config(self) -> Any:
+        """The task's configuration."""
+        ...
+
+    @property
+    def action_size(self) -> int:
+        """Length of the action (A)."""
+        ...
+
+    @property
+    def observation_layout(self) -> Mapping[str, Fields]:
+        """Fields of the `"actor"` and `"critic"` observations."""
+        ...
+
+    @property
+    def control_period(self) -> float:
+        """Length of one control tick, s."""
+        ...
+
+    @property
+    def evaluation_steps(self) -> int:
+        """Length of an evaluation episode, control ticks."""
+        ...
+
+    @property
+    def evaluation(self) -> str:
+        """What `summarize` takes: "series" over all ticks, or "totals" that the task accumulates."""
+        ...
 
     def reset(self, key: jax.Array) -> Any:
-        """A new episode. One that can follow a curriculum also takes `scale` [] in [0, 1]."""
+        """A new episode."""
         ...
 
     def step(self, state: Any, action: jax.Array) -> Any:
@@ -59,28 +86,36 @@ class Environment(Protocol):
         ...
 
     def restart(self, state: Any, done: jax.Array) -> Any:
-        """Begin a new episode where `done`, else return the state as it is, but for random keys."""
-        ...
-
-    def widen(self, state: Any, scale: jax.Array) -> Any:
-        """Let the next episodes be drawn from ranges of this width []; only with a curriculum."""
+        """A new episode if `done` [], else the same state; the random keys advance either way."""
         ...
 
     def stagger(self, state: Any, key: jax.Array) -> Any:
-        """Move the episode clock to a random time, so that a batch does not truncate in step."""
+        """Set the episode clock to a random time, so that a batch does not truncate all at once."""
         ...
 
     def evaluation_starts(self, key: jax.Array, count: int) -> Any:
         """States [count] at which the task's evaluation episodes start."""
         ...
 
-    def summarize(self, metrics: Mapping[str, np.ndarray], alive: np.ndarray) -> dict[str, Any]:
-        """The task's report from evaluation metrics [T, N] and the mask [T, N] of live steps; with "totals"
-        from the metrics of each episode's last tick [N] and the ticks it lived [N]."""
+    def summarize(self, metrics: dict[str, np.ndarray], alive: np.ndarray) -> dict[str, Any]:
+        """The task's report, from metrics [T, N] and the mask [T, N] of live ticks; with "totals", from the
+        metrics [N] of each episode's last tick and its length [N] in ticks."""
         ...
 
     def snapshot(self, state: Any) -> Any:
-        """What one frame of video shows."""
+        """What one video frame shows."""
+        ...
+
+
+class CurriculumEnvironment(Environment, Protocol):
+    """An environment whose randomisation ranges have a scale [] in [0, 1]."""
+
+    def reset(self, key: jax.Array, scale: jax.Array | None = None) -> Any:
+        """A new episode, from ranges of this scale."""
+        ...
+
+    def widen(self, state: Any, scale: jax.Array) -> Any:
+        """Take the next episodes from ranges of this scale."""
         ...
 
 

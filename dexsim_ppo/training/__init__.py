@@ -1,1 +1,1 @@
-"""A training run: loop, presets, display, files."""
+"""A training run: loop, presets, display and files."""

@@ -1,4 +1,4 @@
-"""Live view of training: a panel on a terminal, plain lines elsewhere."""
+"""Live view of training: a table on a terminal, plain lines elsewhere."""
 
 import math
 from typing import Any
@@ -7,7 +7,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-# (heading, metric, format); a metric that the task does not have is left out.
+# (heading, metric, format). Metrics that the task does not have are left out.
 COLUMNS = (
     ("return", "episode/return", ".2f"),
     ("success", "episode/success", ".1%"),
@@ -24,7 +24,7 @@ class Display:
     """Shows rows of metrics; use as a context manager.
 
     Args:
-      title: what is being trained, and where.
+      title: the task and the device.
     """
 
     def __init__(self, title: str):
@@ -43,11 +43,11 @@ class Display:
             self._live.stop()
 
     def note(self, text: str) -> None:
-        """A line that stays."""
+        """Print a line above the table."""
         self.console.print(text, highlight=False, markup=False, soft_wrap=True)
 
     def show(self, row: dict[str, Any]) -> None:
-        """The newest metrics. One that is NaN (no episode has ended) keeps its last value."""
+        """Show the newest metrics. A NaN (no episode has ended) keeps the last value."""
         self._known |= {k: v for k, v in row.items() if not (isinstance(v, float) and math.isnan(v))}
         cells = self._cells(self._known)
         if self._live:
@@ -82,7 +82,7 @@ def count(x: float) -> str:
 
 
 def duration(seconds: float) -> str:
-    """75 as 1:15; unknown as a dash."""
+    """75 as 1:15; a number that is not finite as a dash."""
     if not math.isfinite(seconds):
         return "-"
     minutes, seconds = divmod(max(0, round(seconds)), 60)

@@ -1,4 +1,4 @@
-"""How much to train, and how large, by the device found."""
+"""Training defaults per device: sizes and durations."""
 
 from dataclasses import dataclass, replace
 
@@ -7,27 +7,27 @@ from dexsim_ppo.learner.config import PPOConfig
 
 @dataclass(frozen=True, kw_only=True)
 class Preset:
-    """Defaults of the training command; each can be set by its own option."""
+    """Defaults of the training command's options."""
 
     ppo: PPOConfig
     steps: int
-    """Environment steps; 0 for no limit."""
+    """Budget of environment steps; 0 for no limit."""
     minutes: float
-    """Wall-clock of the training loop, compilation included; 0 for no limit."""
+    """Budget of wall-clock time, compilation included, min; 0 for no limit."""
     evaluate_every: int
     """Iterations between evaluations."""
     evaluation_chunk: int
-    """Episodes evaluated side by side; an evaluation during training is one chunk."""
+    """Episodes evaluated in parallel; an evaluation during training is one chunk."""
     evaluation_episodes: int
     """Episodes of the final evaluation."""
     log_every: int
-    """Iterations between lines of metrics."""
+    """Iterations between logged metrics."""
     extremes: float = 0.0
-    """Share of training's hands and objects with every value at an end of its range."""
+    """Share of training episodes whose hand or object takes the extreme of every range."""
 
 
 PRESETS = {
-    # Two cores: simulation is nearly all of the time, so small networks and many passes over little data.
+    # Two cores: simulation takes nearly all of the time, so small networks and many passes over little data.
     "cpu": Preset(
         ppo=PPOConfig(
             num_envs=256, rollout_length=16, epochs=5, minibatches=4, actor_layers=(128, 128), critic_layers=(128, 128)
@@ -39,7 +39,7 @@ PRESETS = {
         evaluation_episodes=150,
         log_every=5,
     ),
-    # One large GPU: enough environments to fill it, few large minibatches.
+    # One large GPU: enough environments to fill it, and few large minibatches.
     "gpu": Preset(
         ppo=PPOConfig(
             num_envs=32768,
@@ -68,10 +68,10 @@ def find_preset(name: str, task: str) -> Preset:
     preset = PRESETS.get(name, PRESETS["cpu"])
     if not task.startswith("rotate"):
         return preset
-    # Episodes of two minutes are long to evaluate, so that is done once, at the end; and a gait wants
-    # less noise than a grip that has to try out forces.
+    # Two-minute episodes are slow to evaluate, so they are evaluated once, at the end. A gait needs less
+    # noise than a grasp, which has to explore forces.
     if preset is PRESETS["cpu"]:
         return replace(preset, evaluation_chunk=16, evaluation_episodes=16)
-    # Half the environments: twice the updates for the same experience, which a gait is found with.
+    # Half the environments: twice the updates from the same experience, which finding a gait needs.
     ppo = replace(preset.ppo, num_envs=16384, minibatches=8, entropy_coefficient=0.001)
     return replace(preset, ppo=ppo, minutes=7.5, evaluate_every=0)

@@ -1,7 +1,7 @@
-"""Compiled training steps kept between runs, so that a second start need not even trace.
+"""A cache of compiled training steps, so that a second run skips tracing as well.
 
-JAX's own cache is asked for a program that was traced and lowered already, which in a training step takes
-longer than loading the program. Here the question is a hash of all that tracing depends on (`key`).
+JAX's own cache needs a traced and lowered program to look up, and for a training step that takes longer than
+loading the compiled one. This cache looks up a hash of everything that tracing depends on (`key`).
 """
 
 import contextlib
@@ -27,7 +27,7 @@ from dexsim.core.cli import environment_report
 from dexsim.core.compilation import jit
 from dexsim.core.files import python_sources
 
-KEPT = 8  # of some 10 MB each, the newest
+KEPT = 8  # newest programs, about 10 MB each
 _OPTIONS = (
     "jax_enable_x64",
     "jax_default_matmul_precision",
@@ -41,48 +41,50 @@ _OPTIONS = (
 
 
 class Program:
-    """A compiled `step(state) -> (state, metrics)`, whose state may hold typed keys."""
+    """A compiled `step(state) -> (state, metrics)`. The state may hold typed random keys."""
 
-    def __init__(self, compiled: Callable, like: Any, names: list[str], instead: Callable[[], "Program"] | None = None):
-        """`instead` makes the program anew, should one that was kept not run."""
-        self._compiled, self._names, self._instead = compiled, names, instead
+    def __init__(
+        self, compiled: Callable, like: Any, names: list[str], fallback: Callable[[], "Program"] | None = None
+    ):
+        """`fallback` compiles the program again if a cached one does not run."""
+        self._compiled, self._names, self._fallback = compiled, names, fallback
         self._leaves = _Leaves(like)
 
     def __call__(self, state: Any) -> tuple[Any, dict[str, jax.Array]]:
         leaves = self._leaves.of(state)
-        if self._instead:
-            try:  # on a copy, since the program takes over its arguments' memory
+        if self._fallback:
+            try:  # on a copy, since the program donates its arguments
                 done = jax.block_until_ready(self._compiled([jnp.copy(leaf) for leaf in leaves]))
             except jax.errors.JaxRuntimeError:
-                program = self._instead()
+                program = self._fallback()
                 self._compiled, self._names = program._compiled, program._names
                 done = self._compiled(leaves)
-            self._instead = None
+            self._fallback = None
         else:
             done = self._compiled(leaves)
         return self._leaves.back(done[0]), dict(zip(self._names, done[1], strict=True))
 
 
 def compile_step(step: Callable, shapes: Any, identity: Any, on_traced: Callable[[], None]) -> Callable:
-    """Compile a training step, or load it where it was compiled before.
+    """Compile a training step, or load it from the cache.
 
     Args:
-      step: state to (state, metrics), not jitted; it takes over the state's memory.
+      step: state to (state, metrics), not yet compiled; the compiled step donates the state.
       shapes: the state's shapes.
-      identity: what says which program this is, as JSON; None to keep nothing.
-      on_traced: called when tracing is over, where it was needed.
+      identity: JSON data that identifies the program; None to cache nothing.
+      on_traced: called after tracing, if the program had to be traced.
     """
-    if identity is None or jax.default_backend() != "cpu":  # Warp's kernels are not in the program itself.
+    if identity is None or jax.default_backend() != "cpu":  # Warp's kernels are not part of the program.
         lowered = jit(step, donate_argnums=0).lower(shapes)
         on_traced()
         return lowered.compile()
     path = cache_path("programs") / f"{key(identity, shapes)}.pkl"
-    anew = functools.partial(_compile, path, step, shapes, on_traced)
-    return _load(path, shapes, anew) or anew()
+    compile_again = functools.partial(_compile, path, step, shapes, on_traced)
+    return _load(path, shapes, compile_again) or compile_again()
 
 
 def key(identity: Any, shapes: Any) -> str:
-    """The hash of a program: its identity, this package, versions, machine, and options of JAX."""
+    """A program's hash: its identity, this package's sources, versions, machine and JAX options."""
     parts = [
         identity,
         environment_report(),
@@ -98,7 +100,7 @@ def key(identity: Any, shapes: Any) -> str:
 
 
 class _Leaves:
-    """A tree as a list of plain arrays, which can be pickled where trees of our own classes cannot."""
+    """Converts a tree to a list of plain arrays and back. Compiled programs over such lists can be pickled."""
 
     def __init__(self, like: Any):
         leaves, self._tree = jax.tree.flatten(like)
@@ -121,7 +123,8 @@ class _Leaves:
 
 
 def _compile(path: Path, step: Callable, shapes: Any, on_traced: Callable[[], None]) -> Program:
-    leaves, names = _Leaves(shapes), []
+    leaves = _Leaves(shapes)
+    names: list[str] = []
 
     def flat(values: list[jax.Array]) -> tuple[list[jax.Array], list[jax.Array]]:
         state, metrics = step(leaves.back(values))
@@ -132,13 +135,13 @@ def _compile(path: Path, step: Callable, shapes: Any, on_traced: Callable[[], No
     on_traced()
     found = _HITS.count()
     compiled = lowered.compile()
-    if _HITS.count() == found:  # What comes from JAX's cache cannot be serialised again: it lacks its functions.
+    if _HITS.count() == found:  # A program from JAX's cache lacks its functions and cannot be serialised.
         _save(path, compiled, names)
     return Program(compiled, shapes, names)
 
 
 def _save(path: Path, compiled: Any, names: list[str]) -> None:
-    """Keep a program; without room or leave to write, do without."""
+    """Cache a program, if the disk has room and may be written to."""
     part = path.with_suffix(f".{os.getpid()}")
     try:
         content = pickle.dumps((serialize_executable.serialize(compiled), names))
@@ -153,22 +156,22 @@ def _save(path: Path, compiled: Any, names: list[str]) -> None:
             part.unlink(missing_ok=True)
 
 
-def _load(path: Path, shapes: Any, anew: Callable[[], Program]) -> Program | None:
+def _load(path: Path, shapes: Any, compile_again: Callable[[], Program]) -> Program | None:
     try:
         content = path.read_bytes()
     except OSError:
         return None
     try:
-        serialized, names = pickle.loads(content)  # our own file, as JAX's cache is
-        program = Program(serialize_executable.deserialize_and_load(*serialized), shapes, names, anew)
+        serialized, names = pickle.loads(content)  # our own file, like JAX's cache
+        program = Program(serialize_executable.deserialize_and_load(*serialized), shapes, names, compile_again)
         path.touch()
-    except Exception:  # cut short, or of a runtime that we cannot name: compile again
+    except Exception:  # truncated, or of another runtime: compile again
         return None
     return program
 
 
 class _CacheHits:
-    """Counts, by thread, what JAX's own cache has answered."""
+    """Counts the hits of JAX's own cache per thread."""
 
     def __init__(self):
         self._found = threading.local()
@@ -186,7 +189,7 @@ _HITS = _CacheHits()
 
 
 def _cpu_features() -> str:
-    """What compiled code may use of this processor."""
+    """The processor's instruction sets."""
     try:
         flags = re.search(r"^(flags|Features)\s*:(.*)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
     except OSError:

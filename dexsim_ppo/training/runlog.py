@@ -49,11 +49,11 @@ class RunFolder:
 
 
 class MetricsLog:
-    """Appends a line of JSON per logged iteration, and TensorBoard events if a writer is installed."""
+    """Appends one line of JSON per logged iteration, and TensorBoard events if a writer is installed."""
 
     def __init__(self, folder: RunFolder, first_iteration: int):
         rows = [row for row in read_metrics(folder.metrics) if row["iteration"] <= first_iteration]
-        # A resumed run goes on from its checkpoint: what came after that is run again.
+        # A resumed run repeats what came after its checkpoint.
         folder.metrics.write_text("".join(json.dumps(row) + "\n" for row in rows))
         self._file = folder.metrics.open("a", buffering=1)
         self._writer = _tensorboard_writer(folder.path)
@@ -74,7 +74,7 @@ class MetricsLog:
 
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:
-    """Rows of a metrics file; a last line that was cut short is left out."""
+    """Rows of a metrics file; a truncated last line is left out."""
     rows = []
     for line in path.read_text().splitlines() if path.exists() else []:
         try:

@@ -1,12 +1,10 @@
 """One training run: compile, loop, measure, save, report."""
 
-import dataclasses
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Generic, Literal, TypeVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,99 +12,27 @@ import numpy as np
 
 from dexsim.core import cli
 from dexsim.core.compilation import collector_paused
-from dexsim.core.config import setting, to_dict, validate
-from dexsim.core.errors import ConfigError, DexsimError
+from dexsim.core.config import to_dict
+from dexsim.core.errors import DexsimError
 from dexsim_ppo import checkpoint
 from dexsim_ppo.evaluate import Evaluator, print_report, write_video
 from dexsim_ppo.learner.config import PPOConfig
-from dexsim_ppo.learner.curriculum import Curriculum
 from dexsim_ppo.learner.ppo import TrainState, make_train
 from dexsim_ppo.learner.types import Environment
 from dexsim_ppo.policy import Policy
 from dexsim_ppo.training import programs
+from dexsim_ppo.training.arguments import TrainArguments, printable
 from dexsim_ppo.training.display import Display
+from dexsim_ppo.training.fine_tune import initialize_from
 from dexsim_ppo.training.runlog import MetricsLog, RunFolder, draw_curve, read_metrics
-from dexsim_ppo.training.warm_start import start_from
 
-EnvConfig = TypeVar("EnvConfig")
-# Evaluations that choose the best policy and the final one see different episodes.
+# Selecting the best policy and the final evaluation use different episodes.
 SELECTION_SEED, REPORT_SEED = 1, 0
 DIVERGED_AFTER = 5
 
 
-@dataclass(frozen=True, kw_only=True)
-class TrainArguments(Generic[EnvConfig]):
-    """Options of `python -m dexsim_ppo.train`."""
-
-    env: EnvConfig
-    """The task's settings."""
-    ppo: PPOConfig
-    """The learner's settings; their defaults depend on the preset."""
-    curriculum: Curriculum = setting(Curriculum())
-    """Ranges of the randomisation that widen with success."""
-    extremes: float = setting(0.0, unit="1", low=0.0, high=1.0)
-    """Share of training's hands, and of its objects, with every value at an end of its range (`dexsim.core.ranges`).
-    Evaluations, and the policy's file, keep to what `env` says."""
-    task: str = "grasp"
-    """What to train."""
-    seed: int = setting(0, low=0)
-    """Seed of everything random."""
-    backend: Literal["auto", "jax", "warp"] = setting("auto", choices=("auto", "jax", "warp"))
-    """Physics backend."""
-    preset: Literal["auto", "cpu", "gpu"] = setting("auto", choices=("auto", "cpu", "gpu"))
-    """Sizes and durations; `auto` goes by the device found."""
-    steps: float = setting(0.0, unit="environment steps", low=0.0)
-    """Stop after so many, those before a resume included; 0 for no limit."""
-    minutes: float = setting(0.0, unit="min", low=0.0)
-    """Stop training after this time, compilation and the time before a resume included; 0 for no limit."""
-    run_dir: Path | None = None
-    """Folder to write to; must not exist yet. Default: runs/<task>-<time>."""
-    resume: Path | None = None
-    """Folder of a run (or one of its checkpoints) to go on with."""
-    policy: str = ""
-    """Policy to go on from, on whatever has changed since: a file, or the name of a shipped one. Its task and
-    configuration are the defaults."""
-    video: bool = True
-    """Render a video at the end."""
-    log_every: int = setting(1, unit="iterations", low=1)
-    """Iterations between lines of metrics."""
-    checkpoint_every: int = setting(100, unit="iterations", low=1)
-    """Iterations between checkpoints."""
-    keep_checkpoints: int = setting(3, low=1)
-    """Newest checkpoints to keep."""
-    evaluate_every: int = setting(0, unit="iterations", low=0)
-    """Iterations between evaluations, which choose the best policy; 0 for none."""
-    evaluation_chunk: int = setting(32, unit="episodes", low=1)
-    """Episodes evaluated side by side; an evaluation during training is one chunk."""
-    evaluation_episodes: int = setting(128, unit="episodes", low=1)
-    """Episodes of the final evaluation."""
-
-    def __post_init__(self) -> None:
-        validate(self)
-
-
-def training_config(arguments: TrainArguments) -> Any:
-    """The task's settings with the extremes that training asks for."""
-    env, share = arguments.env, arguments.extremes
-    if not share:
-        return env
-    if not (hasattr(env, "randomization") and hasattr(env, "objects")):
-        raise ConfigError(f"--extremes {share:g}: task {arguments.task!r} has no ranges to take extremes of")
-    return dataclasses.replace(
-        env,
-        randomization=dataclasses.replace(env.randomization, extremes=share),
-        objects=dataclasses.replace(env.objects, extremes=share),
-    )
-
-
-def printable(arguments: TrainArguments) -> dict[str, Any]:
-    """The options as plain data, without those that only say where this process reads and writes."""
-    data = to_dict(dataclasses.replace(arguments, run_dir=None, resume=None))
-    return {k: v for k, v in data.items() if k not in ("run_dir", "resume")}
-
-
 class Run:
-    """One training run: compiles, loops, measures, saves."""
+    """One training run. `train` and then `finish` leave everything in its folder."""
 
     def __init__(self, env: Environment, arguments: TrainArguments, folder: RunFolder, started: float):
         self.env, self.arguments, self.folder, self.started = env, arguments, folder, started
@@ -117,7 +43,7 @@ class Run:
         self.clock = {"setup_s": time.perf_counter() - started}
 
     def _evaluation_env(self) -> Environment:
-        """Warp sizes its buffers by the batch, and extremes are for training only: then evaluation has its own."""
+        """The training environment, or one of its own: Warp sizes buffers by the batch; extremes are for training."""
         if self.env.backend != "warp" and not self.arguments.extremes:
             return self.env
         import dexsim
@@ -126,15 +52,20 @@ class Run:
             self.arguments.task, self.arguments.env, backend=self.env.backend, num_envs=self.arguments.evaluation_chunk
         )
 
-    def train(self, begun: checkpoint.Checkpoint | Policy | None, stopped: Callable[[], int]) -> None:
-        """The training loop, from what was begun before; leaves a checkpoint and the last policy behind."""
+    def train(self, source: checkpoint.Checkpoint | Policy | None, stopped: Callable[[], int]) -> None:
+        """The training loop; ends with a checkpoint and the last policy.
+
+        Args:
+          source: a checkpoint to resume, a policy to fine-tune, or None to start from scratch.
+          stopped: nonzero once the run is to end early.
+        """
         arguments, device = self.arguments, jax.devices()[0]
         with Display(f"{arguments.task} on {device.device_kind}, {self.env.backend}") as display:
             display.note(
                 f"{self.folder.path}: {arguments.task}, {self.config.num_envs} environments, "
                 f"{self.env.backend} physics on {device.device_kind}; compiling"
             )
-            state, step = self._prepare(begun)
+            state, step = self._prepare(source)
             display.note(f"compiled in {self.clock['compile_s']:.1f} s")
             log = MetricsLog(self.folder, int(state.iteration))
             try:
@@ -142,36 +73,35 @@ class Run:
             finally:
                 log.close()
 
-    def _prepare(self, begun: checkpoint.Checkpoint | Policy | None) -> tuple[TrainState, Callable]:
+    def _prepare(self, source: checkpoint.Checkpoint | Policy | None) -> tuple[TrainState, Callable]:
         """The state to start from and the compiled training step."""
         training = make_train(self.env, self.config, self.arguments.curriculum)
-        key, resumed = jax.random.key(self.arguments.seed), isinstance(begun, checkpoint.Checkpoint)
-        begin = time.perf_counter()
+        key, begin = jax.random.key(self.arguments.seed), time.perf_counter()
         shapes = training.shapes(key)
-        # The first states are compiled and made on one core while the step is traced on another.
+        # One core compiles and runs `init` while another traces the step.
         with ThreadPoolExecutor(1) as aside:
-            if resumed:
-                state = jax.tree.map(jnp.copy, checkpoint.restore(begun, shapes))
-                progress = begun.content["progress"]
+            if isinstance(source, checkpoint.Checkpoint):
+                state = jax.tree.map(jnp.copy, checkpoint.restore(source, shapes))
+                progress = source.content["progress"]
                 self.best, self.seconds_before = progress["best"], progress["seconds"]
             else:
-                beginning = aside.submit(lambda: jax.block_until_ready(training.init(key)))
+                fresh = aside.submit(lambda: jax.block_until_ready(training.init(key)))
             step = programs.compile_step(
                 training.plain_step,
                 shapes,
                 self._identity(),
                 lambda: self.clock.update(trace_s=time.perf_counter() - begin),
             )
-            if not resumed:
-                state = beginning.result()
-                if begun:
-                    state = start_from(begun, self.config, state)
+            if not isinstance(source, checkpoint.Checkpoint):
+                state = fresh.result()
+                if source:
+                    state = initialize_from(source, self.config, state)
                 self._policy(state).save(self.folder.untrained)
         self.clock["compile_s"] = time.perf_counter() - begin
         return state, step
 
     def _identity(self) -> Any:
-        """Which program the training step is; None for an environment that cannot say which it is."""
+        """What identifies the training step's program; None for an environment without a fingerprint."""
         fingerprint = getattr(self.env, "fingerprint", lambda: None)()
         return fingerprint and [fingerprint, to_dict(self.config), to_dict(self.arguments.curriculum)]
 
@@ -209,7 +139,7 @@ class Run:
         self.clock["training_s"] = time.perf_counter() - begin
         self.clock["step_s"] = self.clock["training_s"] - spent_elsewhere
         self.clock["env_steps"] = iteration * self.config.steps_per_iteration
-        # Warp compiles its kernels in the first call, which says nothing about the rate.
+        # The first call is left out of the rate: Warp compiles its kernels in it.
         steps = max(iteration - first - per_call, 0) * self.config.steps_per_iteration
         self.clock["env_steps_per_s"] = steps / max(self.clock["step_s"] - self.clock.get("first_call_s", 0.0), 1e-9)
         if arguments.evaluate_every and not stopped() and not evaluated:
@@ -217,15 +147,15 @@ class Run:
         self._save(state, iteration)
 
     def _due(self, iteration: int, every: int) -> bool:
-        """Whether a multiple of `every` lies in the call that ended at `iteration`; 0 is never."""
+        """Whether the call that ended at `iteration` passed a multiple of `every`; 0 is never."""
         return every > 0 and iteration // every > (iteration - self.config.iterations_per_call) // every
 
     def _seconds(self) -> float:
-        """Wall-clock of the whole run, that before a resume included."""
+        """Wall-clock time of the whole run, including that before a resume, s."""
         return self.seconds_before + time.perf_counter() - self.started
 
     def _seconds_left(self, iteration: int, env_steps_per_s: float) -> float:
-        """Until the first of the budgets is used up; infinite without one."""
+        """Time until the first budget is used up, s; infinite without a budget."""
         steps, minutes = self.arguments.steps, self.arguments.minutes
         left = [float("inf")]
         if steps:
@@ -245,14 +175,18 @@ class Run:
         }
 
     def _check(self, metrics: dict[str, np.ndarray], skipped_before: int) -> int:
-        """Stop a run in which no gradient has been finite for several calls."""
+        """Total of skipped updates so far.
+
+        Raises:
+          DexsimError: no gradient was finite in several calls.
+        """
         skipped = int(metrics["skipped_updates"][-1])
         updates = self.config.iterations_per_call * self.config.epochs * self.config.minibatches
         self.bad_calls = self.bad_calls + 1 if skipped - skipped_before == updates else 0
         if self.bad_calls >= DIVERGED_AFTER:
             raise DexsimError(
                 f"training diverged: no finite gradient in the last {self.bad_calls} "
-                f"calls; the checkpoints in {self.folder.checkpoints} are from before"
+                f"calls; earlier checkpoints are in {self.folder.checkpoints}"
             )
         return skipped
 
@@ -272,7 +206,7 @@ class Run:
         )
 
     def _evaluate(self, state: TrainState, iteration: int, display: Display) -> dict[str, float]:
-        """Measure the policy, and keep the very one measured if its return is the best so far."""
+        """Evaluate the policy, and save it if its return is the best so far."""
         policy = self._policy(state)
         report, _ = self.evaluator(policy.params, episodes=self.arguments.evaluation_chunk, seed=SELECTION_SEED)
         score, held = report["return"]["value"], report["held"]["value"]
@@ -287,7 +221,7 @@ class Run:
         return {"evaluation/return": score, "evaluation/held": held}
 
     def _save(self, state: TrainState, iteration: int) -> None:
-        """A checkpoint from which training goes on exactly, and the policy as it stands."""
+        """Save a checkpoint, from which training resumes exactly, and the current policy."""
         checkpoint.save(
             self.folder.checkpoint(iteration),
             kind="train",
@@ -302,19 +236,19 @@ class Run:
         self._policy(state).save(self.folder.last)
 
     @property
-    def chosen(self) -> Path:
-        """The file of the policy that the run is judged by: the best, or else the last one."""
+    def selected(self) -> Path:
+        """The file of the policy that the run is judged by: the best one, or else the last."""
         return self.folder.best if self.folder.best.exists() else self.folder.last
 
     def finish(self, command: str) -> None:
-        """Evaluate trained and untrained policy on the same episodes; curve, report and video.
+        """Evaluate trained and untrained policy on the same episodes; write curve, report and video.
 
         `command` is what started the run, for the report.
         """
-        arguments, folder, chosen = self.arguments, self.folder, self.chosen
-        print(f"evaluating {chosen.name} and the untrained policy", flush=True)
+        arguments, folder, selected = self.arguments, self.folder, self.selected
+        print(f"evaluating {selected.name} and the untrained policy", flush=True)
         begin = time.perf_counter()
-        trained, untrained = Policy.load(chosen), Policy.load(folder.untrained)
+        trained, untrained = Policy.load(selected), Policy.load(folder.untrained)
         reports, films = {}, {}
         for name, policy in (("trained", trained), ("untrained", untrained)):
             reports[name], films[name] = self.evaluator(
@@ -324,7 +258,7 @@ class Run:
         draw_curve(read_metrics(folder.metrics), folder.path / "curve.png", arguments.task)
         report = {
             "task": arguments.task,
-            "policy": chosen.name,
+            "policy": selected.name,
             "origin": trained.training,
             "backend": self.env.backend,
             "seed": arguments.seed,
@@ -339,7 +273,7 @@ class Run:
         } | cli.environment_report()
         cli.write_json(folder.report, report)
         print_report(reports["untrained"], title=f"{arguments.task}: untrained")
-        print_report(reports["trained"], title=f"{arguments.task}: {chosen}")
+        print_report(reports["trained"], title=f"{arguments.task}: {selected}")
         if arguments.video:
             begin = time.perf_counter()
             video = write_video(self.evaluator.env, films["trained"], folder.path / "policy.mp4")
@@ -351,6 +285,6 @@ class Run:
 
 
 def _mean(values: np.ndarray) -> float:
-    """Mean over the iterations of a call, without those that have no value."""
+    """Mean [] over the iterations of a call that have a finite value."""
     values = np.asarray(values, np.float64)
     return float(np.nanmean(values)) if np.isfinite(values).any() else float("nan")

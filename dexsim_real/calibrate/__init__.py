@@ -1,1 +1,1 @@
-"""`python -m dexsim_real.calibrate`: press, fit, identify."""
+"""`python -m dexsim_real.calibrate`: calibrate a hand by pressing its fingertips, or identify its drives."""

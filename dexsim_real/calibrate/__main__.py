@@ -1,10 +1,10 @@
-"""Calibrates a hand: currents to torques, counts to newtons, by pressing its fingertips on something firm.
+"""Calibrates a hand by pressing its fingertips on something firm: currents to torques, taxel counts to newtons.
 
     python -m dexsim_real.calibrate --port /dev/serial/by-id/usb-FTDI_... --output hand.toml
 
-First the taxels are checked and zeroed with the motors off; then one fingertip after the other is pressed, slowly, up
-and down. With `--gauge ask` a kitchen scale or force gauge is the reference; without, the taxels are, as in the
-paper. The output is written at the end, whole or not at all. `--from-log FILE` fits a recorded session again.
+The taxels are checked and tared with the motors off. Then each fingertip presses slowly, with rising and falling force.
+With `--gauge ask` a kitchen scale or force gauge is the reference; otherwise the taxels are, as in the paper. The
+output is written at the end, complete or not at all. `--from-log FILE` fits recorded presses again.
 """
 
 import dataclasses
@@ -21,13 +21,13 @@ from dexsim.calibration.plot import plot_calibration
 from dexsim.core import cli
 from dexsim.hand.kinematics import Hand
 from dexsim_real.calibrate.bench import Workbench
-from dexsim_real.calibrate.fit import fit
 from dexsim_real.calibrate.gauge import Gauge
-from dexsim_real.calibrate.identify import identify_hand
-from dexsim_real.calibrate.loop import Operator
+from dexsim_real.calibrate.hand_loop import Operator
+from dexsim_real.calibrate.identify_drives import identify_hand
 from dexsim_real.calibrate.options import CalibrateArguments
 from dexsim_real.calibrate.plan import placements
-from dexsim_real.calibrate.press import PressProcedure, placement_record
+from dexsim_real.calibrate.press_fit import fit
+from dexsim_real.calibrate.press_procedure import PressProcedure, placement_record
 from dexsim_real.calibrate.read import read_logs
 from dexsim_real.calibrate.report import grouped, report, table
 from dexsim_real.control.controller import prepare_jax
@@ -35,18 +35,18 @@ from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind
 from dexsim_real.core.process import stopping
 
-_SPEED = 2.0  # rad/s of the commands at most
+_SPEED = 2.0  # rad/s, largest rate of change of the commands
 
 
 def record(arguments: CalibrateArguments, hand: Hand, operator: Operator, **bench: Any) -> Path:
-    """The press procedure; returns its log.
+    """Run the press procedure; returns its log.
 
     Raises:
-      HandError: what went wrong; the motors are off.
+      HandError: the procedure failed; the motors are off.
     """
     plan = placements(hand, arguments.fingers, arguments.sides)
     gauge = Gauge(arguments.gauge, operator) if arguments.gauge else None
-    # Nothing here needs to be fast.
+    # No motion here needs to be fast.
     slow = dataclasses.replace(arguments.safety, speed=min(arguments.safety.speed, _SPEED))
     arguments = dataclasses.replace(arguments, safety=slow)
     with Workbench(arguments, hand, operator, {"task": "calibrate"}, **bench) as work:
@@ -62,16 +62,16 @@ def record(arguments: CalibrateArguments, hand: Hand, operator: Operator, **benc
             if not pressed:
                 raise
             raise HandError(
-                f"{error} (the {pressed} presses before are in {work.log.path}: --from-log fits them)"
+                f"{error} (the {pressed} presses before are in {work.log.path}; fit them with --from-log)"
             ) from None
     return work.log.path
 
 
 def fit_and_report(arguments: CalibrateArguments, hand: Hand, logs: Sequence[Path], operator: Operator) -> None:
-    """Fit, show, and write what was asked for; the calibration last.
+    """Fit the presses, print the result, and write the files asked for, the calibration last.
 
     Raises:
-      DexsimError: the recordings cannot tell, or a file cannot be written.
+      DexsimError: the recordings are insufficient, or a file cannot be written.
     """
     found = fit(read_logs(logs, hand), hand)
     operator.console.print(table(found))
@@ -82,10 +82,10 @@ def fit_and_report(arguments: CalibrateArguments, hand: Hand, logs: Sequence[Pat
     if arguments.plot:
         plot_calibration(arguments.plot, found.calibration, found.real, found.sim)
         operator.tell(f"figure: {arguments.plot}")
-    if arguments.destination.exists() and not arguments.force:  # It may have come meanwhile.
+    if arguments.destination.exists() and not arguments.force:  # It may have been created meanwhile.
         raise HandError(
-            f"{arguments.destination} is there already: --from-log {' '.join(map(str, logs))} fits these "
-            "presses again, into another --output"
+            f"{arguments.destination} already exists: --from-log {' '.join(map(str, logs))} fits these "
+            "presses into another --output"
         )
     save_calibration(arguments.destination, found.calibration)
     operator.tell(f"calibration: {arguments.destination}")
@@ -102,7 +102,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     prepare_jax()
     cli.enable_caches()
     hand = load_hand()
-    operator = Operator(Console(stderr=True), silent=arguments.yes)
+    operator = Operator(Console(stderr=True), assume_yes=arguments.yes)
     with stopping():
         if arguments.identify:
             identify_hand(arguments, hand, operator)

@@ -1,7 +1,5 @@
-"""A hand on the bench: port, log and limits of one procedure, opened together and closed with the motors off."""
+"""A hand on the bench: port, log and safety limits of a procedure, opened and closed together."""
 
-import contextlib
-import os
 import sys
 import time
 from collections.abc import Callable
@@ -11,22 +9,26 @@ from typing import Any
 from dexsim.core import cli
 from dexsim.core.config import to_dict
 from dexsim.hand.kinematics import Hand
-from dexsim_real.calibrate.loop import HandLoop, Operator
+from dexsim_real.calibrate.hand_loop import HandLoop, Operator
 from dexsim_real.calibrate.options import CalibrateArguments
 from dexsim_real.control.safety import Safety
 from dexsim_real.core.log import Kind, LogWriter
-from dexsim_real.core.process import use_realtime
+from dexsim_real.core.process import leave_realtime, use_realtime
 from dexsim_real.sensors.hand import HandSensing
 from dexsim_real.wire.link import HandPort
 from dexsim_real.wire.serial_hand import open_port
 
 
 class Workbench:
-    """A hand with its log and limits for one procedure; a context manager that ends with the motors off.
+    """A hand with log and safety limits for one procedure. A context manager that ends with the motors off.
 
     Args:
-      port: in place of the one that the arguments name.
-      clock, sleep: in place of the machine's.
+      arguments: options of the command.
+      hand: model of the hand.
+      operator: is told what happens.
+      meta: written to the log, with the configuration.
+      port: replaces the port that the arguments name.
+      clock, sleep: replace those of `time`, for simulated time.
     """
 
     def __init__(
@@ -51,7 +53,7 @@ class Workbench:
 
     def __enter__(self) -> "Workbench":
         try:
-            # Only from here to the end: what computes for long with it would starve the machine.
+            # Only during the procedure: long computations in a real-time thread would starve the machine.
             if self._arguments.realtime:
                 use_realtime()
             self._say(self.loop.port.connect())
@@ -88,8 +90,7 @@ class Workbench:
             self.log.add(Kind.END, {"end": end})
             self.log.close()
             if self._arguments.realtime:
-                with contextlib.suppress(OSError, AttributeError):
-                    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+                leave_realtime()
 
     def _react(self, text: str) -> None:
         self.log.add(Kind.NOTE, text)

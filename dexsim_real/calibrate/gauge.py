@@ -1,4 +1,4 @@
-"""What an instrument shows while a fingertip presses on it: typed in, or read by the user's function."""
+"""Reference force of a press: a reading typed by the user, or a function of the user."""
 
 import importlib
 import re
@@ -6,55 +6,56 @@ from collections.abc import Callable
 
 import numpy as np
 
-from dexsim_real.calibrate.loop import Operator
+from dexsim_real.calibrate.hand_loop import Operator
 from dexsim_real.core.errors import HandError
 
 _UNITS = {"": 1.0, "n": 1.0, "g": 9.80665e-3, "kg": 9.80665}
-_LARGEST = 100.0  # N
+_LARGEST = 100.0  # N, largest plausible reading
 
 
 def parse_reading(text: str) -> float:
     """Newtons from "5.2", "5.2 N", "530 g" or "0.53 kg".
 
     Raises:
-      HandError: not a reading, or none that a fingertip can make.
+      HandError: not a number with a known unit, or more than a fingertip can press.
     """
     match = re.fullmatch(r"\s*([0-9]+(?:[.,][0-9]*)?|[.,][0-9]+)\s*([a-zA-Z]*)\s*", text)
     if not match or match[2].lower() not in _UNITS:
-        raise HandError(f"{text.strip()!r} is no reading: type newtons, or a number with g or kg")
+        raise HandError(f"{text.strip()!r} is not a reading: type newtons, or a number with g or kg")
     force = float(match[1].replace(",", ".")) * _UNITS[match[2].lower()]
     if force > _LARGEST:
-        raise HandError(f"{text.strip()!r} is {force:.0f} N: more than a fingertip can press; grams need a g")
+        raise HandError(f"{text.strip()!r} is {force:.0f} N, more than a fingertip can press; grams need a g")
     return force
 
 
 class Gauge:
-    """An instrument.
+    """A force gauge.
 
     Args:
-      source: "ask", or MODULE:FUNCTION; the function takes nothing and gives newtons.
+      source: "ask", or MODULE:FUNCTION of a function without arguments that returns newtons.
+      operator: is asked for readings.
 
     Raises:
-      HandError: the function cannot be found.
+      HandError: the function cannot be found, or there is nobody to ask.
     """
 
     def __init__(self, source: str, operator: Operator):
         self._operator, self._function = operator, None
-        self.tireless = source != "ask"
+        self.automatic = source != "ask"
         if source != "ask":
             self._function = _find(source)
-        elif operator.silent:
-            raise HandError("--gauge ask needs answers, --yes asks nothing: leave one of them out")
+        elif operator.assume_yes:
+            raise HandError("--gauge ask needs answers, but --yes asks nothing; remove one of them")
 
     def read(self, meanwhile: Callable[[], object]) -> float | None:
-        """Newtons; None where the user skips. `meanwhile` is called while the user reads."""
+        """Force N; None when the user skips the reading. `meanwhile` is called until the user answers."""
         if self._function is not None:
             force = float(self._function())
             if not np.isfinite(force):
-                raise HandError(f"the gauge's function gave {force}")
+                raise HandError(f"the function of --gauge returned {force}; it must return newtons")
             return force
         while True:
-            text = self._operator.ask("  the gauge shows (newtons, or a number with g or kg; s skips):", meanwhile)
+            text = self._operator.ask("  reading of the gauge (newtons, or a number with g or kg; s skips):", meanwhile)
             if text.lower() in ("s", "skip"):
                 return None
             try:

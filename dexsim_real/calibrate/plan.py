@@ -1,11 +1,11 @@
-"""Which fingertip presses how: postures, and the way in which targets advance.
+"""Plan of the presses: posture of each fingertip, and direction in which the joint targets advance.
 
-A press loads the joints that have a lever arm at the pressed place. Targets advance in proportion to these
-arms: joints with equal gains then push along the skin's normal, and what is pressed upon feels little shear.
-The pads load the flexing joints of a finger; the joints that spread thumb and index need their sides.
+A press loads the joints with a lever arm at the contact. Targets advance in proportion to these lever arms: joints with
+equal gains then push along the skin's normal, with little shear. The pads load the flexing joints of a finger; the
+joints that spread thumb and index finger are loaded by the sides.
 
-A finger is almost straight when it presses, because there the pad lies close to the line through its joints,
-and a shear force, which taxels of unknown axes do not tell, has a short arm.
+A finger presses almost straight: its pad is then close to the line through its joints, so a shear force, which the
+taxels may not show, has a short lever arm.
 """
 
 import dataclasses
@@ -17,41 +17,42 @@ from dexsim.hand.kinematics import Hand
 from dexsim_real.core.errors import HandError
 
 _OPEN, _OPEN_THUMB = 0.1, (0.1, 0.1, 0.1)  # rad, of the joints that do not press
-_SHARE = 0.3  # of the longest lever arm, from which on a joint takes part
+_SHARE = 0.3  # of the longest lever arm, above which a joint takes part
 
 
 @dataclasses.dataclass(frozen=True)
 class Placement:
-    """One fingertip, one place on it."""
+    """One press: a fingertip, and the place on it."""
 
     name: str  # "index pad"
     finger: int
-    taxels: tuple[int, ...]  # in the middle of the pressed place
-    joints: tuple[int, ...]  # that press
-    posture: np.ndarray  # [J] rad, where contact is expected
+    taxels: tuple[int, ...]  # at the middle of the contact
+    joints: tuple[int, ...]  # joints that press
+    posture: np.ndarray  # [J] rad, at the expected contact
     direction: np.ndarray  # [J] rad of targets for each rad of advance; the largest is 1
-    task: str  # for the user
+    task: str  # instruction for the user
 
 
 def placements(hand: Hand, fingers: tuple[str, ...] = (), sides: bool = True) -> list[Placement]:
     """All presses, pads first.
 
     Args:
+      hand: model of the hand.
       fingers: names; all by default.
-      sides: thumb and index with their sides as well.
+      sides: also the sides of thumb and index finger.
 
     Raises:
       HandError: no such finger.
     """
     for name in fingers:
         if name not in hand.finger_names:
-            raise HandError(f"no finger {name!r}: choose from {', '.join(hand.finger_names)}")
-    chosen = [i for i, name in enumerate(hand.finger_names) if name in (fingers or hand.finger_names)]
+            raise HandError(f"no finger {name!r}; choose from {', '.join(hand.finger_names)}")
+    selected = [i for i, name in enumerate(hand.finger_names) if name in (fingers or hand.finger_names)]
     columns, rows = hand.taxel_grid
     middle = [c * rows + r for c in (columns // 2 - 1, columns // 2) for r in (rows // 2 - 2, rows // 2 - 1)]
     side = [(columns - 2) * rows + r for r in (rows // 2 - 2, rows // 2 - 1)]
     found = []
-    for finger in [*[i for i in chosen if i], *[i for i in chosen if not i]]:
+    for finger in [*[i for i in selected if i], *[i for i in selected if not i]]:
         name = hand.finger_names[finger]
         found.append(
             _placement(
@@ -60,10 +61,10 @@ def placements(hand: Hand, fingers: tuple[str, ...] = (), sides: bool = True) ->
                 finger,
                 middle,
                 _bent(hand, finger),
-                f"hold a round pen, backed by foam, across the {name}'s pad, 1 cm before it",
+                f"hold a round pen, backed by foam, across the pad of the {name}, 1 cm in front of it",
             )
         )
-    for finger in [i for i in chosen if sides and i in (0, 1)]:
+    for finger in [i for i in selected if sides and i in (0, 1)]:
         name, toward = hand.finger_names[finger], ("palm's normal", "thumb")[finger]
         found.append(
             _placement(
@@ -72,7 +73,7 @@ def placements(hand: Hand, fingers: tuple[str, ...] = (), sides: bool = True) ->
                 finger,
                 side,
                 _spread(hand, finger),
-                f"the same across the side of the {name} that faces the {toward}, 3 mm before it",
+                f"hold the pen across the side of the {name} that faces the {toward}, 3 mm in front of it",
             )
         )
     return found
@@ -95,7 +96,7 @@ def _opened(hand: Hand) -> np.ndarray:
 
 
 def _bent(hand: Hand, finger: int) -> np.ndarray:
-    """The pressing finger a little further than the others."""
+    """A posture in which the pressing finger is bent a little more than the others."""
     posture = _opened(hand)
     if finger == 0:
         posture[:3] = 0.3, 0.3, 0.2

@@ -1,4 +1,4 @@
-"""The log of a press session, as arrays: one `Recording` a press."""
+"""Reads the logs of a press session: one `Recording` per press."""
 
 import dataclasses
 from collections.abc import Iterable
@@ -9,9 +9,9 @@ import numpy as np
 
 from dexsim.core.config import from_dict
 from dexsim.hand.kinematics import Hand
-from dexsim_real.calibrate.check import raw_sensing
 from dexsim_real.calibrate.options import CheckConfig
-from dexsim_real.calibrate.press import REST
+from dexsim_real.calibrate.press_procedure import REST
+from dexsim_real.calibrate.taxel_check import raw_sensing
 from dexsim_real.core.log import Kind, LogError, LogReader
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
 from dexsim_real.wire import frames
@@ -19,30 +19,30 @@ from dexsim_real.wire import frames
 
 @dataclasses.dataclass
 class Recording:
-    """One press; lists of [T] samples in the order of time."""
+    """One press; the lists have T samples in the order of time."""
 
     name: str
     finger: int
-    joints: tuple[int, ...]  # that pressed
+    joints: tuple[int, ...]  # joints that pressed
     rate: float  # samples per second
     tare: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(frames.TAXELS))  # [N] counts
     phase: list[str] = dataclasses.field(default_factory=list)
     time: list[float] = dataclasses.field(default_factory=list)  # s
-    counts: list[np.ndarray] = dataclasses.field(default_factory=list)  # [N] zeroed, below zero as well
-    shown: list[float] = dataclasses.field(default_factory=list)  # counts of the fingertip as a run sees it
+    counts: list[np.ndarray] = dataclasses.field(default_factory=list)  # [N] tared, negative ones included
+    shown: list[float] = dataclasses.field(default_factory=list)  # counts of the fingertip as in a run
     shear: list[np.ndarray] = dataclasses.field(default_factory=list)  # [2] counts, sums of the taxels' x and y
-    current: list[np.ndarray] = dataclasses.field(default_factory=list)  # [J] A, with the hand's sign
+    current: list[np.ndarray] = dataclasses.field(default_factory=list)  # [J] A, with the sign of the hand
     position: list[np.ndarray] = dataclasses.field(default_factory=list)  # [J] rad
     gauge: dict[str, float] = dataclasses.field(default_factory=dict)  # N by phase
 
     def samples(self, *phases: str) -> np.ndarray:
-        """Which samples are of these phases."""
+        """Indices of the samples of these phases."""
         return np.flatnonzero(np.isin(self.phase, phases))
 
 
 @dataclasses.dataclass
-class Session:
-    """All that a log, or several, say."""
+class PressSession:
+    """The content of one or several logs of presses."""
 
     hardware: HardwareConfig
     check: CheckConfig
@@ -52,11 +52,11 @@ class Session:
     rest_current: np.ndarray  # [T, J] A, motors off
 
 
-def read_logs(paths: Iterable[Path], hand: Hand) -> Session:
-    """The presses in logs of `dexsim_real.calibrate`; of a press in several the last counts.
+def read_logs(paths: Iterable[Path], hand: Hand) -> PressSession:
+    """The presses in logs of `dexsim_real.calibrate`. A press in several logs is taken from the last.
 
     Raises:
-      LogError: not such a log, or of a hand with other settings than the one before.
+      LogError: not a log of presses, or recorded with other settings than the logs before.
     """
     session = None
     for path in paths:
@@ -64,7 +64,7 @@ def read_logs(paths: Iterable[Path], hand: Hand) -> Session:
         if session is None:
             session = found
         elif (found.hardware, found.rate) != (session.hardware, session.rate):
-            raise LogError(f"{path}: was recorded with other --hardware options or another --rate than the logs before")
+            raise LogError(f"{path}: recorded with other --hardware options or another --rate than the logs before")
         else:
             session.recordings.update(found.recordings)
     return session
@@ -72,7 +72,7 @@ def read_logs(paths: Iterable[Path], hand: Hand) -> Session:
 
 class _Reader:
     def __init__(self, path: Path, hand: Hand):
-        self.session: Session | None = None
+        self.session: PressSession | None = None
         self._hand, self._number, self._frame = hand, -1, b""
         rest: list[np.ndarray] = []
         for record in LogReader(path):
@@ -88,14 +88,14 @@ class _Reader:
             elif record.kind == Kind.TICK:
                 self._sample(record.time, content, rest)
         if self.session is None:
-            raise LogError(f"{path}: ends before the hand was ready")
+            raise LogError(f"{path}: the log ends before the hand was ready; record again")
         self.session.rest_current = np.array(rest)
 
     def _begin(self, path: Path, meta: dict[str, Any]) -> None:
         if meta["task"] != "calibrate":
-            raise LogError(f"{path}: is the log of something else ({meta['task']}), not of presses")
+            raise LogError(f"{path}: this is a log of {meta['task']!r}; give a log of `dexsim_real.calibrate`")
         hardware = from_dict(HardwareConfig, meta["hardware"])
-        self.session = Session(
+        self.session = PressSession(
             hardware, from_dict(CheckConfig, meta["check"]), meta["serial"], meta["rate"], {}, np.empty(0)
         )
         self._sensing, self._raw = HandSensing(self._hand, hardware), raw_sensing(self._hand, hardware)

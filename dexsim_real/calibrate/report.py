@@ -1,4 +1,4 @@
-"""What a calibration found, for people and as plain data."""
+"""Report of a calibration: plain data, and a table for the terminal."""
 
 from typing import Any
 
@@ -7,18 +7,18 @@ from rich.table import Table
 
 from dexsim.calibration.maps import Calibration, Side
 from dexsim.core.config import to_dict
-from dexsim_real.calibrate.fit import Fit
+from dexsim_real.calibrate.press_fit import Fit
 
 _WAYS = ("loading", "unloading")
 
 
 def torque_constants(calibration: Calibration) -> np.ndarray:
-    """[2, J] Nm at the joint for each ampere more, pressing on and giving way: the ratio of the gains."""
+    """Torque constants [2, J] Nm/A at the joint, loading and unloading: the ratio of the gains."""
     return np.asarray(calibration.sim.gain) / np.asarray(calibration.real.gain)
 
 
 def torque_constant_intervals(calibration: Calibration) -> np.ndarray:
-    """[2, J, 2] 95 % intervals of `torque_constants`; the widths of both sides are added in quadrature."""
+    """95 % intervals [2, J, 2] Nm/A of `torque_constants`; the widths of both sides are added in quadrature."""
     real, sim = calibration.real, calibration.sim
     share = np.hypot(_half(real) / np.abs(real.gain), _half(sim) / np.abs(sim.gain))
     value = torque_constants(calibration)[..., None]
@@ -26,7 +26,7 @@ def torque_constant_intervals(calibration: Calibration) -> np.ndarray:
 
 
 def report(fit: Fit) -> dict[str, Any]:
-    """Everything as plain data."""
+    """All results as plain data."""
     calibration, real = fit.calibration, fit.calibration.real
     constants, intervals = torque_constants(calibration), torque_constant_intervals(calibration)
     joints = {}
@@ -63,14 +63,12 @@ def report(fit: Fit) -> dict[str, Any]:
 
 
 def table(fit: Fit) -> Table:
-    """A table for the terminal, one row a joint: pressing on / giving way; the worse of the two where there is one."""
+    """A table with one row per joint. A cell has loading / unloading, or the worse of the two."""
     calibration, real = fit.calibration, fit.calibration.real
     constants, intervals = torque_constants(calibration), torque_constant_intervals(calibration)
     width = np.max(np.ptp(intervals, axis=-1) / 2 / np.abs(constants), 0)
-    shown = Table(
-        box=None, padding=(0, 1, 0, 0), title="current to torque, pressing on / giving way", title_justify="left"
-    )
-    for head in ("joint", "pressed with", "Nm / A", "95 %", "R2", "cond.", "friction", "up to"):
+    shown = Table(box=None, padding=(0, 1, 0, 0), title="current to torque, loading / unloading", title_justify="left")
+    for head in ("joint", "pressed with", "Nm / A", "95 %", "R2", "cond.", "friction", "max force"):
         shown.add_column(head, no_wrap=True)
     for joint, name in enumerate(calibration.joint_names):
         shown.add_row(
@@ -87,7 +85,7 @@ def table(fit: Fit) -> Table:
 
 
 def grouped(notes: tuple[str, ...]) -> list[str]:
-    """Notes with those that say the same of several joints in one."""
+    """Notes, with equal notes on several joints joined."""
     joined: dict[str, list[str]] = {}
     for note in notes:
         name, colon, text = note.partition(": ")
@@ -97,6 +95,3 @@ def grouped(notes: tuple[str, ...]) -> list[str]:
 
 def _half(side: Side) -> np.ndarray:
     return (np.asarray(side.gain_high) - np.asarray(side.gain_low)) / 2
-
-
-__all__ = ["grouped", "report", "table", "torque_constant_intervals", "torque_constants"]

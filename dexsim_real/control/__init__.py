@@ -1,1 +1,1 @@
-"""The policy, its goals, and the safety limits."""
+"""Control of the hand: policy, goals, safety limits, and the exchange thread."""

@@ -1,8 +1,7 @@
-"""A policy on hardware: measurements in, action and joint targets out, in the simulation's order.
+"""A policy on hardware: from measurements to an action and joint targets, in the order of the simulation.
 
-One tick here is one `Env.step` of the simulation seen from outside: the readings carry the action
-that led to them, `observe` and the policy follow, and the action moves the joint targets by the same
-`move_target`.
+A tick corresponds to one `Env.step`: the readings contain the action that led to them, the same `observe` computes the
+observation, and the same `move_target` applies the policy's action to the joint targets.
 """
 
 import dataclasses
@@ -17,7 +16,7 @@ from dexsim.hand.kinematics import Hand
 from dexsim.observation import LayoutEntry, ObservationConfig, Readings, layout, observe
 from dexsim_ppo.policy import Policy
 from dexsim_real.core.errors import HandError
-from dexsim_real.sensors.hand import Measured
+from dexsim_real.sensors.hand import HandMeasurement
 from dexsim_real.sensors.readings import ObjectEstimate, make_readings, sources_of
 
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
@@ -25,18 +24,18 @@ IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 
 @dataclasses.dataclass(frozen=True)
 class Tick:
-    """What one tick saw and did; NumPy float32."""
+    """One control tick; NumPy float32."""
 
     readings: Readings
     observation: np.ndarray
-    action: np.ndarray  # [J], zero where the policy's was not finite
-    target: np.ndarray  # [J] rad; not finite where the policy's action was not
+    action: np.ndarray  # [J], zero if the policy's was not finite
+    target: np.ndarray  # [J] rad, NaN if the policy's action was not finite
 
 
 def prepare_jax() -> None:
-    """JAX on the CPU, in the thread that calls it: waking others costs milliseconds on a busy machine.
+    """Run JAX on the CPU and in the calling thread: waking other threads costs milliseconds on a busy machine.
 
-    To be called before anything is computed; a replay needs the same to give the same bits.
+    Call it before anything is computed. A replay needs the same setting to reproduce a run to the last bit.
     """
     flags = os.environ.get("XLA_FLAGS", "")
     if "--xla_cpu_multi_thread_eigen" not in flags:
@@ -46,7 +45,7 @@ def prepare_jax() -> None:
 
 
 def make_observe(hand: Hand, names: tuple[str, ...], config: ObservationConfig) -> Any:
-    """The one jitted `observe` of a task: readings to observation."""
+    """The jit-compiled `observe` of a task, from `Readings` to the observation."""
     return jax.jit(lambda readings: observe(hand, readings, names, config))
 
 
@@ -75,27 +74,34 @@ class Controller:
         self.start(np.zeros(hand.num_joints, np.float32))
 
     def warm(self) -> None:
-        """Compile everything, so that the first tick is as fast as the others."""
+        """Compile everything, so that the first tick is as fast as the next ones."""
         hand = self.hand
         joints = np.zeros(hand.num_joints, np.float32)
-        nothing = Measured(
+        idle = HandMeasurement(
             joints, joints, np.zeros((hand.num_fingers, hand.num_taxels), np.float32), joints, np.zeros(1), np.zeros(1)
         )
         for _ in range(3):
-            self.tick(nothing, ObjectEstimate(np.zeros(3), np.zeros(3), IDENTITY), IDENTITY, 0.0)
+            self.tick(idle, ObjectEstimate(np.zeros(3), np.zeros(3), IDENTITY), IDENTITY, 0.0)
         self.start(joints)
 
     def start(self, target: np.ndarray) -> None:
-        """Begin an episode with these joint targets [J] rad; no action has been."""
+        """Begin an episode with these joint targets [J] rad and no previous action."""
         self.target = np.asarray(target, np.float32)
         self.last_action = np.zeros(self.hand.num_joints, np.float32)
 
     def anchor(self, position: np.ndarray) -> None:
-        """Go on from this pose [J] rad: the hand did not follow its targets for a while."""
+        """Continue from this pose [J] rad, after a time in which the hand did not follow its targets."""
         self.target = np.asarray(position, np.float32)
 
-    def tick(self, measured: Measured, seen: ObjectEstimate, goal_quat: np.ndarray, command: float) -> Tick:
-        """Readings, observation, action, and the joint targets that follow."""
+    def tick(self, measured: HandMeasurement, seen: ObjectEstimate, goal_quat: np.ndarray, command: float) -> Tick:
+        """Compute readings, observation, action and joint targets.
+
+        Args:
+          measured: of the hand.
+          seen: of the object.
+          goal_quat: [4] goal orientation of the object.
+          command: grip command in [0, 1].
+        """
         last_action = np.asarray(self._recall(self.last_action, self.target))
         readings = make_readings(measured, seen, goal_quat, command, last_action)
         observation = np.asarray(self._observe(readings))
@@ -103,7 +109,7 @@ class Controller:
         if np.isfinite(action).all():
             target = np.asarray(self._move(self.target, action, measured.joint_position))
             self.target = target
-        else:  # As in simulation it counts as no action; `Safety` sees the target and holds.
+        else:  # As in simulation this counts as no action; `Safety` holds when a target is not finite.
             action, target = np.zeros_like(self.last_action), np.full_like(self.target, np.nan)
         self.last_action = action
         return Tick(readings, observation, action, target)

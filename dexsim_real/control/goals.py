@@ -1,4 +1,4 @@
-"""Goals of the rotation task on hardware."""
+"""Goals of the rotation task on hardware, tracked with the IMU."""
 
 import math
 
@@ -10,10 +10,14 @@ from dexsim_real.sensors.readings import ObjectEstimate
 
 
 class TurnGoals:
-    """Goals of the rotation task, followed with what the IMU says, by the task's own rules.
+    """Tracks the goals of the rotation task by the rules of the task.
 
-    The simulation judges by the true spin and place of the object; here the spin is estimated from the
-    orientation (filtered over 0.1 s), and of the place only the measured coordinate counts.
+    The simulation uses the object's true angular velocity and position. Here the angular velocity is estimated from
+    the orientation (filtered over 0.1 s), and only the measured coordinate of the position counts.
+
+    Args:
+      turn: goals of the task.
+      reference: [3] m, nominal position of the object.
     """
 
     _SMOOTH = 0.1  # s
@@ -27,7 +31,12 @@ class TurnGoals:
         self.quat = self._goal()
 
     def update(self, time: float, seen: ObjectEstimate) -> np.ndarray:
-        """The goal [4] that the readings of this tick carry; it has moved on if it was reached."""
+        """Goal orientation [4] for this tick; the next one as soon as the last was reached.
+
+        Args:
+          time: s of the orientation.
+          seen: of the object.
+        """
         goal, quat = self._turn, seen.quat
         if self._last is not None and time > self._last[0]:
             step = time - self._last[0]

@@ -1,13 +1,13 @@
-"""The thread that owns the hand: one exchange a cycle, at absolute deadlines, through `Safety`.
+"""The exchange thread: one exchange with the hand per cycle, at absolute deadlines, through `Safety`.
 
-The policy runs elsewhere and slower. If it dies, this thread goes on and `Safety` acts; when this
-thread ends, for whatever reason, its last act is to turn the motors off.
+The policy runs in another thread at a lower rate. If it dies, this thread continues and `Safety` reacts. Whatever ends
+this thread, it turns the motors off.
 """
 
 import threading
 import time
 
-from dexsim_real.control.safety import Safety, Sample
+from dexsim_real.control.safety import HandSample, Safety
 from dexsim_real.core.process import raise_priority
 from dexsim_real.core.timing import Pace, Timing
 from dexsim_real.sensors.hand import HandSensing, VelocityFilter
@@ -16,10 +16,12 @@ from dexsim_real.wire.link import HandPort, Reply
 
 
 class Servo:
-    """Runs exchanges until stopped.
+    """Exchanges commands and states with the hand until stopped.
 
     Args:
-      port: connected; from now on only this thread touches it.
+      port: connected; used by this thread only from now on.
+      sensing: conversion to SI units.
+      safety: decides the commands.
       rate: exchanges per second.
     """
 
@@ -27,7 +29,7 @@ class Servo:
         self.port, self.sensing, self.safety = port, sensing, safety
         self.pace = Pace(rate)
         self.round_trip = Timing()
-        self.waited = 0  # deadlines missed because the hand was slow to answer
+        self.waited = 0  # deadlines missed because of late answers
         self.error: BaseException | None = None
         self._filter = VelocityFilter(sensing.config.velocity_time)
         self._stop = threading.Event()
@@ -43,25 +45,25 @@ class Servo:
         self._engage = True
 
     def alive(self) -> bool:
-        """Whether exchanges go on."""
+        """Whether the thread runs."""
         return self._thread.is_alive()
 
     def forget(self) -> None:
-        """Measure times anew, without those of starting up."""
+        """Reset the timing statistics, to exclude the start."""
         self.pace.jitter, self.round_trip, self.waited = Timing(), Timing(), 0
 
     def free(self, now: float) -> float:
-        """The next time at which an exchange has just gone out: the interpreter has nothing to do until its answer."""
+        """The next time s at which a request has just been sent and the interpreter is idle until its answer."""
         lead, period = 0.001, self.pace.period
         return now + (self.pace.next + lead - now) % period
 
-    def wait_fresh(self, seconds: float) -> Sample | None:
-        """The next sample that arrives, or None when none does in time."""
+    def wait_fresh(self, seconds: float) -> HandSample | None:
+        """Wait for the next sample; None when none arrives in time."""
         self._fresh.clear()
         return self.safety.sample if self._fresh.wait(seconds) else None
 
     def stop(self) -> None:
-        """Motors off, port closed; returns when both are done."""
+        """Turn the motors off and close the port."""
         self._stop.set()
         if self._thread.ident is not None:
             self._thread.join()
@@ -78,16 +80,16 @@ class Servo:
                 own, missed = time.monotonic() - due - took, self.pace.jitter.missed
                 self.pace.wait()
                 missed = self.pace.jitter.missed - missed
-                # Not ours if a usual answer would have left enough time.
+                # A usual answer would have left enough time: the hand was late, not the bridge.
                 if missed and own + self.round_trip.percentile(50) < self.pace.period:
                     self.waited += missed
-        except BaseException as error:  # Whatever it is, the motors go off; the main thread reports it.
+        except BaseException as error:  # The main thread reports it.
             self.error = error
         finally:
             self._rest()
 
     def _cycle(self) -> float:
-        """One exchange; the seconds that it took."""
+        """One exchange; returns its duration in s."""
         if self._engage:
             self.safety.engage()
             self._engage = False
@@ -102,7 +104,7 @@ class Servo:
         self._fresh.set()
         return took
 
-    def _sample(self, reply: Reply) -> Sample:
+    def _sample(self, reply: Reply) -> HandSample:
         measured = self.sensing.measure(reply.state)
         before = self.safety.sample
         if before is not None and before.generation != reply.generation:
@@ -110,10 +112,10 @@ class Servo:
         velocity = self.sensing.velocity(reply.state)
         if velocity is None:
             velocity = self._filter.update(reply.received, measured.joint_position)
-        return Sample(reply.received, reply.sequence, reply.generation, measured, velocity)
+        return HandSample(reply.received, reply.sequence, reply.generation, measured, velocity)
 
     def _rest(self) -> None:
-        """Motors off: until the hand has confirmed it, or ten times."""
+        """Turn the motors off: repeat until the hand confirms it, at most ten times."""
         off = self.sensing.command(self.sensing.hand.joint_lower, Mode.PASSIVE)
         try:
             for _ in range(10):

@@ -1,1 +1,1 @@
-"""Foundations of the bridge: errors, the log, timing, the process."""
+"""Foundations of the bridge: errors, run logs, deadlines, thread priorities and signals."""

@@ -1,4 +1,4 @@
-"""What to tell the user when the hand cannot be reached: one line, with what helps."""
+"""Errors of the bridge: one line that names the problem and the remedy."""
 
 import errno
 import grp
@@ -9,11 +9,11 @@ from dexsim.core.errors import DexsimError
 
 
 class HandError(DexsimError):
-    """The hand cannot be reached, or not used as asked."""
+    """The hand or one of its sensors cannot be reached, or cannot do what was asked."""
 
 
 def explain(port: str, error: Exception) -> str:
-    """One line about a port that does not open: the reason, and what helps."""
+    """One line about a port that does not open: the reason and the remedy."""
     number = getattr(error, "errno", None)
     if number == errno.EACCES:
         return (
@@ -21,15 +21,16 @@ def explain(port: str, error: Exception) -> str:
             f"`sudo usermod -aG {_group(port)} $USER`, then log out and in again"
         )
     if number in (errno.EBUSY, errno.EAGAIN) or "exclusively lock" in str(error):
-        return f"{port}: another program has it open (`fuser -v {port}` names it): close that first"
+        return f"{port}: another program has it open (`fuser -v {port}` names it). Close that program first"
     if number in (errno.ENOENT, errno.ENXIO, errno.ENODEV):
         found = sorted(str(link) for link in Path("/dev/serial/by-id").glob("*"))
-        return f"{port}: there is no such port; found {', '.join(found) if found else 'no serial port at all'}"
-    return f"{port}: cannot be opened ({error})"
+        known = f"choose from {', '.join(found)}" if found else "no serial port was found; check cable and power"
+        return f"{port}: there is no such port; {known}"
+    return f"{port}: cannot be opened ({error}); check the name and the cable"
 
 
 def latency_warnings(port: str, sysfs: Path = Path("/sys/bus/usb-serial/devices")) -> list[str]:
-    """An FTDI adapter's latency timer above 1 ms: at its usual 16 ms the loop runs at half its rate."""
+    """Warn of an FTDI adapter whose latency timer exceeds 1 ms: at the usual 16 ms the loop runs at half its rate."""
     name = os.path.basename(os.path.realpath(port))
     timer = sysfs / name / "latency_timer"
     try:
@@ -39,8 +40,8 @@ def latency_warnings(port: str, sysfs: Path = Path("/sys/bus/usb-serial/devices"
     if value <= 1:
         return []
     return [
-        f"{port}: the adapter waits {value} ms before it passes on short packets. Now: "
-        f"`echo 1 | sudo tee {timer}`. For good, as /etc/udev/rules.d/99-dexsim.rules: "
+        f"{port}: the adapter waits {value} ms before it forwards short packets. Set 1 ms now: "
+        f"`echo 1 | sudo tee {timer}`. Set it permanently in /etc/udev/rules.d/99-dexsim.rules: "
         'ACTION=="add", SUBSYSTEM=="usb-serial", DRIVER=="ftdi_sio", ATTR{latency_timer}="1"'
     ]
 

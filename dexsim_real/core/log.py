@@ -1,10 +1,9 @@
-"""The log of a run: append-only records, written by a thread of its own, readable after any crash.
+"""Run logs: append-only records, written by a background thread, readable after any crash.
 
     DXSLOG1\\n, then records: sync (4 bytes) | kind | time | length | CRC-32 | payload
 
-What has been handed over reaches the kernel within a tenth of a second, where it survives the end of
-the program; once a second it is forced to the disk. A record torn off at the end, or damaged within,
-costs only itself.
+A record reaches the kernel within 0.1 s and then survives the end of the program. Once a second the file
+is synced to the disk. A truncated or damaged record costs only itself.
 """
 
 import contextlib
@@ -32,37 +31,40 @@ _HEAD = struct.Struct("<4sBdII")
 _SEQUENCE = struct.Struct("<Q")
 _WAIT = 0.05  # s between two writes
 _FORCE = 1.0  # s between two syncs to the disk
-_ROOM = 50_000  # records that may wait for a slow disk
+_MAX_QUEUED = 50_000  # records waiting for a slow disk
 
 
 class LogError(DexsimError):
-    """A log cannot be written, or a file is not one."""
+    """A log cannot be written, or a file is not a log."""
 
 
 class Kind(enum.IntEnum):
-    """What a record holds."""
+    """Kind of a record."""
 
     META = 1  # configuration of the run
-    SENT = 2  # number of the exchange, then the frame
-    RECEIVED = 3
-    TICK = 4  # readings, observation, action, target of one control tick
+    SENT = 2  # (number of the exchange, frame) from the host
+    RECEIVED = 3  # the same from the hand
+    TICK = 4  # readings, observation, action and joint target of one control tick
     NOTE = 5  # one line of text
     END = 6  # summary
 
 
 @dataclasses.dataclass(frozen=True)
 class Record:
-    """One entry. `content` is a dict with NumPy arrays, a text, or (number, frame)."""
+    """One entry of a log."""
 
     kind: Kind
     time: float  # s, monotonic clock of the machine that wrote it
-    content: Any
+    content: Any  # dict with NumPy arrays, text, or (number, frame), by `kind`
 
 
 class LogWriter:
-    """Takes records from any thread without waiting; a context manager.
+    """Accepts records from any thread without blocking. A context manager.
 
-    A full disk ends the log, not the run: `failure` says so, and `dropped` counts what was lost.
+    A full disk ends the log, not the run: `failure` has the reason and `dropped` counts the lost records.
+
+    Raises:
+      LogError: the file cannot be created, or exists.
     """
 
     def __init__(self, path: str | Path):
@@ -72,7 +74,7 @@ class LogWriter:
             self._file = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o644)
             os.write(self._file, MAGIC)
         except OSError as error:
-            raise LogError(f"{self.path}: the log cannot be written ({error.strerror})") from None
+            raise LogError(f"{self.path}: the log cannot be written ({error.strerror}); choose another --log") from None
         self.failure = ""
         self.dropped = 0
         self._queue: queue.SimpleQueue = queue.SimpleQueue()
@@ -87,14 +89,14 @@ class LogWriter:
         self.close()
 
     def add(self, kind: Kind, content: Any, when: float | None = None) -> None:
-        """Hand over a record; its arrays must not change afterwards."""
-        if self.failure or self._queue.qsize() > _ROOM:
+        """Queue a record. Its arrays must not change afterwards."""
+        if self.failure or self._queue.qsize() > _MAX_QUEUED:
             self.dropped += 1
             return
         self._queue.put((kind, time.monotonic() if when is None else when, content))
 
     def close(self) -> None:
-        """Write what waits, and close the file."""
+        """Write all queued records and close the file."""
         if not self._stop.is_set():
             self._stop.set()
             self._thread.join()
@@ -109,7 +111,7 @@ class LogWriter:
             with contextlib.suppress(queue.Empty):
                 while True:
                     batch.append(encode(*self._queue.get_nowait()))
-                    time.sleep(0)  # Gives up the interpreter at once to a thread that waits for it.
+                    time.sleep(0)  # Releases the interpreter lock to a waiting thread.
             try:
                 _write_all(self._file, b"".join(batch))
                 if last or time.monotonic() - synced > _FORCE:
@@ -123,7 +125,7 @@ class LogWriter:
 
 
 def encode(kind: Kind, when: float, content: Any) -> bytes:
-    """A record's bytes."""
+    """The bytes of a record."""
     if isinstance(content, tuple):
         payload = _SEQUENCE.pack(content[0]) + content[1]
     elif isinstance(content, str):
@@ -135,10 +137,10 @@ def encode(kind: Kind, when: float, content: Any) -> bytes:
 
 
 class LogReader:
-    """Iterates over a log's sound records; `damaged` counts the bytes left out so far.
+    """Iterates over the intact records of a log; `damaged` counts the bytes skipped so far.
 
     Raises:
-      LogError: missing, or not a log.
+      LogError: the file is missing, or is not a log.
     """
 
     def __init__(self, path: str | Path):
@@ -146,9 +148,9 @@ class LogReader:
         try:
             self._data = self.path.read_bytes()
         except OSError as error:
-            raise LogError(f"{self.path}: cannot be read ({error.strerror})") from None
+            raise LogError(f"{self.path}: the log cannot be read ({error.strerror})") from None
         if not self._data.startswith(MAGIC):
-            raise LogError(f"{self.path}: is not a log of a run")
+            raise LogError(f"{self.path}: this is not a log of `dexsim_real`; give a .log file of a run")
 
     def __iter__(self) -> Iterator[Record]:
         at, data, self.damaged = len(MAGIC), self._data, 0

@@ -1,4 +1,8 @@
-"""Real-time priority, and which of the bridge's threads comes first."""
+"""The bridge as a process: real-time priority of its threads, and signals that end it.
+
+Threads of equal real-time priority do not preempt each other, so the exchange thread runs above the others and
+disk and terminal output below them.
+"""
 
 import contextlib
 import os
@@ -11,10 +15,12 @@ _STEP = 5
 
 
 def use_realtime() -> bool:
-    """Give this thread, and those that it starts, precedence over ordinary programs.
+    """Request real-time priority for this thread and those that it starts.
 
-    All threads of the bridge should have it, since they share one interpreter lock. False where the
-    user may not (docs/hardware.md says how to allow it).
+    All threads of the bridge need it, since they share one interpreter lock.
+
+    Returns:
+      Whether it was granted (docs/hardware.md says how to allow it).
     """
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_PRIORITY))
@@ -23,33 +29,37 @@ def use_realtime() -> bool:
     return True
 
 
+def leave_realtime() -> None:
+    """Return this thread to ordinary scheduling."""
+    with contextlib.suppress(OSError, AttributeError):
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+
+
 def raise_priority() -> None:
-    """Put this thread before the bridge's others; no effect without real-time priority."""
-    _shift(_STEP)
+    """Run this thread before the bridge's others. No effect without real-time priority."""
+    _change_priority(_STEP)
 
 
 def lower_priority() -> None:
-    """Put this thread behind the bridge's others, still before ordinary programs; without real-time
-    priority it has no effect.
+    """Run this thread after the bridge's others, still before ordinary programs.
 
-    Threads of one priority do not interrupt each other: an exchange would wait for the kernel to end a
-    write to the disk.
+    No effect without real-time priority.
     """
-    _shift(-_STEP)
+    _change_priority(-_STEP)
 
 
-def _shift(by: int) -> None:
-    with contextlib.suppress(OSError, AttributeError):  # More than `use_realtime` had may not be allowed.
+def _change_priority(by: int) -> None:
+    with contextlib.suppress(OSError, AttributeError):  # A priority above that of `use_realtime` may be refused.
         if os.sched_getscheduler(0) == os.SCHED_FIFO:
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_PRIORITY + by))
 
 
 @contextlib.contextmanager
 def stopping() -> Iterator[None]:
-    """SIGTERM and SIGHUP raise SystemExit(128 + number), SIGINT raises KeyboardInterrupt.
+    """Within this context SIGTERM and SIGHUP raise SystemExit(128 + number), and SIGINT raises KeyboardInterrupt.
 
-    Also SIGINT where a shell has us ignore it, as it does with what runs in the background: whoever
-    interrupts a moving hand means it.
+    A shell starts background programs with SIGINT ignored. It is handled here nevertheless, so that a moving hand
+    can always be interrupted.
     """
     handlers = {signal.SIGTERM: _terminate, signal.SIGHUP: _terminate, signal.SIGINT: signal.default_int_handler}
     before = {number: signal.signal(number, handler) for number, handler in handlers.items()}

@@ -1,4 +1,4 @@
-"""Absolute deadlines, and how late things are."""
+"""Absolute deadlines, and statistics of lateness."""
 
 import math
 import time
@@ -8,7 +8,7 @@ import numpy as np
 
 
 class Timing:
-    """How late something was, in constant memory: a histogram of 10 us bins up to 50 ms."""
+    """Statistics of durations in constant memory: a histogram of 10 us bins up to 50 ms."""
 
     _BIN, _BINS = 1e-5, 5000
 
@@ -17,20 +17,20 @@ class Timing:
         self.count, self.missed, self.worst = 0, 0, 0.0
 
     def add(self, seconds: float) -> None:
-        """One more sample."""
+        """Add a sample in s."""
         self._bins[min(int(max(seconds, 0.0) / self._BIN), self._BINS)] += 1
         self.count += 1
         self.worst = max(self.worst, seconds)
 
     def percentile(self, percent: float) -> float:
-        """Seconds below which this share of the samples lies."""
+        """Percentile of the samples in s; NaN when there are none."""
         if not self.count:
             return float("nan")
         at = np.searchsorted(np.cumsum(self._bins), percent / 100 * self.count)
         return min((int(at) + 1) * self._BIN, self.worst)
 
     def summary(self) -> dict[str, float]:
-        """Percentiles in ms, and counts."""
+        """Percentiles in ms, number of samples, number of missed deadlines."""
         return {
             "count": self.count,
             "missed": self.missed,
@@ -40,11 +40,16 @@ class Timing:
         }
 
 
-GRACE = 0.001  # s, how late a cycle may begin rather than be left out
+GRACE = 0.001  # s by which a cycle may begin late instead of being skipped
 
 
 class Pace:
-    """Absolute deadlines `start + k / rate`: what one cycle takes does not shift the next."""
+    """Absolute deadlines `start + k / rate`, so a slow cycle does not shift the next one.
+
+    Args:
+      rate: Hz.
+      clock, sleep: replace those of `time`, for simulated time.
+    """
 
     def __init__(
         self, rate: float, clock: Callable[[], float] = time.monotonic, sleep: Callable[[float], None] = time.sleep
@@ -54,9 +59,9 @@ class Pace:
         self.next = clock() + self.period
 
     def wait(self) -> None:
-        """Sleep until the next deadline. One that has just passed is kept, late; earlier ones are missed."""
+        """Sleep until the next deadline. One that passed by at most `GRACE` is kept; older ones are missed."""
         now = self._clock()
-        # An exchange fills most of its period: left out for a hair's breadth, the next would cost a whole one.
+        # An exchange fills most of its period: skipping a deadline over a fraction of a millisecond costs a whole one.
         behind = max(math.ceil((now - self.next - GRACE) / self.period), 0)
         self.jitter.missed += behind
         self.next += behind * self.period
@@ -66,9 +71,9 @@ class Pace:
 
 
 def keep_phase(rate: float, other: float, share: float = 0.01) -> float:
-    """`rate`, or the nearest multiple of half of `other` if that is no farther than this share of it.
+    """`rate` rounded to a multiple of half of `other`, if that changes it by at most `share`.
 
-    Two loops whose rates are in that ratio meet at the same one or two phases for ever.
+    Two loops with such rates keep one or two fixed phases to each other.
     """
     near = max(round(2 * rate / other), 1) * other / 2
     return near if abs(near - rate) <= share * rate else rate

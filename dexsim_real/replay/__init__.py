@@ -1,1 +1,1 @@
-"""`python -m dexsim_real.replay`: a run's log, recomputed and shown."""
+"""`python -m dexsim_real.replay`: recompute and plot the log of a run."""

@@ -1,4 +1,4 @@
-"""Shows a run's log, and proves that the policy saw what its frames say.
+"""Recomputes and plots the log of a run, and checks every observation against the recorded frames.
 
 python -m dexsim_real.replay runs/real/....log --plot run.png
 """
@@ -13,8 +13,8 @@ import tyro
 
 from dexsim.core import cli
 from dexsim_real.control.controller import prepare_jax
+from dexsim_real.replay.plots import plot, show_rerun
 from dexsim_real.replay.replay import replay
-from dexsim_real.replay.view import plot, show_rerun
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -22,24 +22,25 @@ class ReplayArguments:
     """Options of `python -m dexsim_real.replay`."""
 
     log: Annotated[Path, tyro.conf.Positional]
-    """A log of `dexsim_real.run`."""
+    """Log file of `python -m dexsim_real.run`."""
     plot: Path | None = None
-    """File for a figure of angles, forces, timing and the observation (matplotlib)."""
+    """Image file for a figure of joint angles, forces, timing and observation (.png, .pdf or .svg); None draws no
+    figure."""
     rerun: bool = False
-    """Show it in the rerun viewer, taxels as pictures (extra: pip install 'dexsim[rerun]')."""
+    """Open the rerun viewer, with taxels as pictures (needs pip install 'dexsim[rerun]')."""
     rrd: Path | None = None
-    """File for the rerun viewer, to be opened on another machine."""
+    """Recording for the rerun viewer, to open on another machine; None writes no file."""
     output: Path | None = None
-    """File for the report as JSON."""
+    """JSON file for the report; None writes no file."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The command. Returns its exit code: 0, or 1 when something was not the same."""
+    """The command. Returns its exit code: 0, or 1 when a recomputed observation differs."""
     arguments = cli.parse(
         ReplayArguments,
         sys.argv[1:] if argv is None else argv,
         prog="python -m dexsim_real.replay",
-        description="Recompute and show the log of a run on the hand.",
+        description="Recompute and plot the log of a run on the hand.",
     )
     prepare_jax()
     cli.enable_caches()
@@ -50,12 +51,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     same = report["readings_same"] == report["observations_same"] == report["ticks"]
     print(
         f"{report['ticks']} ticks in {report['seconds']:.2f} s, {report['frames']} frames, "
-        f"{report['damaged_bytes']} bytes damaged, ended: {report['ended']}"
+        f"{report['damaged_bytes']} damaged bytes, end: {report['ended']}"
     )
     print(
-        "every observation is the same, bit for bit"
+        "all observations agree to the last bit"
         if same
-        else f"{report['observations_same']} observations of {report['ticks']} are the same; the first that is not: "
+        else f"{report['observations_same']} of {report['ticks']} observations agree; first difference: "
         f"{report['first_difference']}"
     )
     if arguments.output:
@@ -67,7 +68,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         show_rerun(run)
     if arguments.rrd and run.ticks:
         show_rerun(run, arguments.rrd)
-        print(f"for the rerun viewer: {arguments.rrd}")
+        print(f"rerun recording: {arguments.rrd}")
     return 0 if same else 1
 
 

@@ -1,9 +1,7 @@
-"""Reads a run's log, recomputes every observation from the raw frames, and shows it.
+"""Recomputes every observation of a logged run from the raw frames.
 
-    python -m dexsim_real.replay runs/real/20260101-120000.log --plot run.png
-
-Joint angles, torques and taxel forces are computed again from the frame that each tick saw, and the
-observation from the readings, by the code that ran on the hand: bit for bit the same, or it says so.
+Joint angles, torques and taxel forces are recomputed from the frame that each tick used, and the observation from the
+readings, by the code that ran on the hand. The report counts the ticks that agree to the last bit.
 """
 
 import dataclasses
@@ -21,7 +19,7 @@ from dexsim.task_spec import TaskSpec
 from dexsim_ppo.retired import old_spec
 from dexsim_real.control.controller import make_observe
 from dexsim_real.core.log import Kind, LogError, LogReader
-from dexsim_real.sensors.hand import HandSensing, HardwareConfig, Measured
+from dexsim_real.sensors.hand import HandMeasurement, HandSensing, HardwareConfig
 from dexsim_real.wire import frames
 
 MEASURED = ("joint_position", "joint_torque", "taxel_force")
@@ -29,12 +27,12 @@ MEASURED = ("joint_position", "joint_torque", "taxel_force")
 
 @dataclasses.dataclass
 class Replay:
-    """A log, recomputed."""
+    """A recomputed log."""
 
     report: dict[str, Any]
     time: np.ndarray  # [T] s since the first tick
-    measured: list[Measured]  # by tick
-    ticks: list[dict[str, Any]]  # as logged
+    measured: list[HandMeasurement]  # one per tick, recomputed
+    ticks: list[dict[str, Any]]  # one per tick, as logged
     observation: np.ndarray  # [T, n] recomputed
     fields: tuple[LayoutEntry, ...]  # of the observation
 
@@ -43,7 +41,7 @@ def replay(path: Path) -> Replay:
     """Recompute a log.
 
     Raises:
-      LogError: not a log, or one that ends before its configuration.
+      LogError: not a log, or the log ends before the hand was ready.
     """
     reader = LogReader(path)
     states: dict[int, bytes] = {}
@@ -68,7 +66,7 @@ def replay(path: Path) -> Replay:
                 continue
             now = sensing.measure(frames.decode_state(frame[frames.HEADER.size : -2]))
             same = all(_same(getattr(now, name), tick["readings"][name]) for name in MEASURED)
-            # What the hand measures is taken as recomputed; camera, goal and command as logged.
+            # The hand's measurements are recomputed; camera, goal and command are taken from the log.
             again = {**tick["readings"], **{name: getattr(now, name) for name in MEASURED}}
             observation = np.asarray(observe(Readings(**again)))
             identical = _same(observation, tick["observation"])
@@ -85,7 +83,7 @@ def replay(path: Path) -> Replay:
         elif record.kind == Kind.END:
             end = record.content
     if meta is None:
-        raise LogError(f"{path}: ends before the hand was ready; its notes: {'; '.join(notes) or 'none'}")
+        raise LogError(f"{path}: the log ends before the hand was ready; its notes: {'; '.join(notes) or 'none'}")
     report = {
         "log": str(path),
         "task": meta["task"],
@@ -95,7 +93,7 @@ def replay(path: Path) -> Replay:
         "seconds": times[-1] - times[0] if times else 0.0,
         "first_difference": first or None,
         "damaged_bytes": reader.damaged,
-        "ended": end["end"] if end else "cut off",
+        "ended": end["end"] if end else "truncated",
         "notes": notes,
         "recorded_on": meta["environment"],
     }
@@ -104,7 +102,7 @@ def replay(path: Path) -> Replay:
 
 
 def _rebuild(meta: dict[str, Any]) -> tuple[HandSensing, Any, tuple[LayoutEntry, ...]]:
-    """The sensing of a logged run, its observation, and the fields of that."""
+    """Sensing, observation function and observation fields of a logged run."""
     hand, calibration = load_hand(), None
     if meta["calibration"]:
         with tempfile.TemporaryDirectory() as folder:
@@ -119,5 +117,5 @@ def _rebuild(meta: dict[str, Any]) -> tuple[HandSensing, Any, tuple[LayoutEntry,
 
 
 def _same(a: np.ndarray, b: np.ndarray) -> bool:
-    """Equal bit for bit."""
+    """Whether two arrays agree to the last bit."""
     return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()

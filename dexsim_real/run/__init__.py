@@ -1,1 +1,1 @@
-"""`python -m dexsim_real.run`: a policy on the hand."""
+"""`python -m dexsim_real.run`: run a policy on the hand."""

@@ -2,8 +2,8 @@
 
     python -m dexsim_real.run grasp --port /dev/serial/by-id/usb-FTDI_... --command 0.6
 
-The policy is a file, or the name of a shipped one. Everything is compiled before the port is opened;
-the motors come on at the measured pose and go off at the end, however the end comes.
+The policy is a file or the name of a shipped policy. Everything is compiled before the port is opened. The motors come
+on at the measured pose, and go off at the end of the program, even after a failure.
 """
 
 import sys
@@ -15,7 +15,7 @@ from dexsim_real.core.errors import HandError
 from dexsim_real.core.process import stopping
 from dexsim_real.run.options import RunArguments
 from dexsim_real.run.session import Session
-from dexsim_real.run.view import summary_table
+from dexsim_real.run.status import summary_table
 
 
 def main(argv: Sequence[str] | None = None) -> int:

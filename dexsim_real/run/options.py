@@ -1,4 +1,4 @@
-"""Options of `python -m dexsim_real.run`, one dataclass with those of every part within."""
+"""Options of `python -m dexsim_real.run`: one dataclass that contains the options of every part."""
 
 import dataclasses
 from pathlib import Path
@@ -20,56 +20,57 @@ class RunArguments:
     """Options of `python -m dexsim_real.run`."""
 
     policy: Annotated[str, tyro.conf.Positional]
-    """A policy file, or the name of a shipped one ("grasp")."""
+    """Policy file, or name of a shipped policy ("grasp")."""
     port: str
-    """Serial port of the hand (a name under /dev/serial/by-id stays the same), or sdk:MODULE:FUNCTION."""
+    """Serial port of the hand (names under /dev/serial/by-id are stable), or sdk:MODULE:FUNCTION."""
     command: float = setting(0.5, unit="1", low=0.0, high=1.0)
     """Grip command in [0, 1]."""
     seconds: float = setting(30.0, unit="s", low=0.1, high=86400.0)
-    """Length of the run, after the approach."""
+    """Duration of the run, after the approach."""
     motors_off: bool = False
-    """Read, compute and show everything, but leave the motors off."""
+    """Measure, compute and display everything with the motors off."""
     calibration: Path | None = None
-    """This hand's calibration file."""
+    """Calibration file of this hand; None only with --uncalibrated."""
     uncalibrated: bool = False
-    """Run without a calibration, on guessed scales (`--hardware.current-scale`, `--hardware.force-per-count`)."""
+    """Run without a calibration, on default scales (`--hardware.current-scale`, `--hardware.force-per-count`)."""
     imu: str | None = None
-    """Serial port of the IMU in the object."""
+    """Serial port of the IMU in the object; None if the policy needs no IMU."""
     imu_mount: tuple[float, float, float, float] = setting(UPRIGHT_X, unit="1", low=-1.0, high=1.0)
-    """Orientation (w, x, y, z) of the IMU in the object; by default its z lies along the object's x."""
+    """Orientation (w, x, y, z) of the IMU in the object; by default its z is along the object's x."""
     camera: str | None = None
-    """Mask source: camera number, video file, unix:PATH or MODULE:FUNCTION."""
+    """Source of the object's masks: camera number, video file, unix:PATH or MODULE:FUNCTION. None if the policy needs
+    no camera."""
     fixed_object: bool = False
-    """Run without a camera: the object is taken to stay where it belongs."""
-    zero: bool = True
-    """Zero the taxels first; refused while a fingertip touches something."""
+    """Run without a camera: assume that the object stays at its nominal position."""
+    tare: bool = True
+    """Tare the taxels first; refused while a fingertip touches something."""
     rate: float = setting(83.0, unit="Hz", low=1.0, high=1000.0)
-    """Exchanges with the hand per second, moved by up to 1 % so that the policy, which keeps its own rate,
-    computes while an answer is under way."""
+    """Exchanges with the hand per second, adjusted by up to 1 % so that the policy computes during the wait for an
+    answer."""
     approach: float = setting(2.0, unit="s", low=0.0, high=60.0)
-    """Time to move from the measured pose to the task's start posture; 0 stays there."""
+    """Time to move from the measured pose to the task's start posture; 0 stays at the measured pose."""
     place: float = setting(0.0, unit="s", low=0.0, high=600.0)
-    """Pause in the start posture, to put the object into the hand: squarely, if the IMU is used."""
+    """Time in the start posture to put the object into the hand; align it with the palm if the IMU is used."""
     log: Path | None = None
-    """Log file; by default a new one under runs/real."""
+    """Log file; None for a new file in runs/real."""
     output: Path | None = None
-    """File for the summary as JSON."""
+    """JSON file for the summary; None writes no file."""
     realtime: bool = True
-    """Ask for real-time priority; without the right to it the run goes on without."""
+    """Request real-time priority; continue without it if not permitted."""
     quiet: bool = False
-    """No live view."""
+    """Hide the live status."""
     link: LinkConfig = setting(LinkConfig())
     """The serial line."""
     hardware: HardwareConfig = setting(HardwareConfig())
-    """Signs, scales and gains."""
+    """Signs, scales and gains of the hand."""
     safety: SafetyConfig = setting(SafetyConfig())
-    """Limits."""
+    """Safety limits."""
     optics: CameraConfig = setting(CameraConfig())
-    """The camera: where it is, and the object's colour."""
+    """Pose of the camera, and colour of the object."""
 
     def __post_init__(self):
         validate(self)
         if self.calibration is None and not self.uncalibrated:
-            raise HandError("give --calibration FILE, or --uncalibrated to run on guessed scales")
+            raise HandError("give --calibration FILE, or --uncalibrated to run on default scales")
         if self.calibration is not None and self.uncalibrated:
             raise HandError("give --calibration or --uncalibrated, not both")

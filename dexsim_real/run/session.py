@@ -1,10 +1,8 @@
-"""One run on the hand: connect, zero, sense, approach, follow the policy, and end with the motors off."""
+"""A run on the hand: connect, tare, approach, run the policy, and end with the motors off."""
 
-import contextlib
 import dataclasses
 import gc
 import hashlib
-import os
 import sys
 import time
 from pathlib import Path
@@ -24,22 +22,26 @@ from dexsim_real.control.safety import Safety
 from dexsim_real.control.servo import Servo
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogWriter
-from dexsim_real.core.process import use_realtime
+from dexsim_real.core.process import leave_realtime, use_realtime
 from dexsim_real.core.timing import Pace, Timing, keep_phase
+from dexsim_real.run.object_sensors import ObjectSensors
 from dexsim_real.run.options import RunArguments
-from dexsim_real.run.view import View
+from dexsim_real.run.status import StatusView
 from dexsim_real.sensors.hand import HandSensing
-from dexsim_real.sensors.objects import ObjectSensors
 from dexsim_real.wire.frames import Mode, empty_state
 from dexsim_real.wire.serial_hand import open_port
 
-_ZERO_SAMPLES = 30
+_TARE_SAMPLES = 30
 _SWITCH = sys.getswitchinterval()
-_PATIENCE = 60.0  # s that the object may take to come into sight
+_PATIENCE = 60.0  # s to wait until the camera sees the object
 
 
 class Session:
-    """One run: made with nothing open but files, `prepare`d with the motors off, then run."""
+    """A run: the constructor opens only files, `prepare` connects with the motors off, `run` turns them on.
+
+    Raises:
+      DexsimError: the policy, calibration or log cannot be used.
+    """
 
     def __init__(self, arguments: RunArguments):
         self.arguments = arguments
@@ -52,14 +54,14 @@ class Session:
         config = arguments.safety
         config = dataclasses.replace(config, watchdog=max(config.watchdog, 2.5 * self.controller.period))
         self.safety = Safety(hand, config, self._react)
-        # From here on, since compiling in a real-time thread would starve the machine.
+        # Not earlier: compiling in a real-time thread would starve the machine.
         realtime = arguments.realtime and use_realtime()
         path = arguments.log or Path("runs/real") / time.strftime("%Y%m%d-%H%M%S.log")
         self.log = LogWriter(path)
         self.port = open_port(arguments.port, arguments.link, self._tap)
         rate = keep_phase(arguments.rate, policy.control_rate)
         self.servo = Servo(self.port, self.sensing, self.safety, rate)
-        self.view = View(f"{policy.task} on {arguments.port}", self._status, arguments.quiet)
+        self.view = StatusView(f"{policy.task} on {arguments.port}", self._status, arguments.quiet)
         self.objects: ObjectSensors | None = None
         self.goals: TurnGoals | None = None
         self.compute, self.pace = Timing(), Pace(policy.control_rate)
@@ -72,27 +74,31 @@ class Session:
     # --- stages ---------------------------------------------------------------------------------
 
     def prepare(self) -> None:
-        """Connect with the motors off, zero the taxels, start camera and IMU.
+        """Connect with the motors off, tare the taxels, start camera and IMU.
 
         Raises:
-          HandError: whatever is missing or does not answer.
+          HandError: something is missing or does not answer.
         """
         self._note(self.port.connect())
         for warning in getattr(self.port, "warnings", list)():
             self._note(f"warning: {warning}")
-        if self.arguments.zero:
-            self._zero()
+        if self.arguments.tare:
+            self._tare()
         self._write_meta()
         self.servo.start()
         if self.servo.wait_fresh(1.0) is None:
-            raise HandError(f"{self.arguments.port}: the hand answered once and then no more")
+            raise HandError(f"{self.arguments.port}: the hand stopped answering; check the cable and the power")
         self.objects = ObjectSensors(self.arguments, self.controller)
         spec = self.controller.spec
         if self.arguments.imu and spec.turn:
             self.goals = TurnGoals(spec.turn, np.asarray(spec.reference))
 
     def run(self) -> None:
-        """Motors on, approach, and the policy until the time is over or `Safety` ends it."""
+        """Turn the motors on, approach the start posture, and run the policy until time or `Safety` ends it.
+
+        Raises:
+          HandError: `Safety` or a failure ended the run.
+        """
         sys.setswitchinterval(2e-4)
         gc.collect()
         gc.freeze()
@@ -101,11 +107,11 @@ class Session:
                 self.servo.engage()
             self._approach()
             self.controller.start(self._pose())
-            self._note("the policy begins")
+            self._note("the policy starts")
             self.end = self._loop()
 
     def close(self, reason: str = "") -> None:
-        """Motors off and everything closed; safe to call at any stage."""
+        """Turn the motors off and close everything; may be called at any stage."""
         self.end = reason or self.end
         self.servo.stop()
         if self.objects:
@@ -115,11 +121,10 @@ class Session:
         self.log.close()
         gc.unfreeze()
         sys.setswitchinterval(_SWITCH)
-        with contextlib.suppress(OSError, AttributeError):
-            os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+        leave_realtime()
 
     def summary(self) -> dict[str, Any]:
-        """What the run was like."""
+        """Results and statistics of the run; JSON-able."""
         servo, safety = self.servo, self.safety
         summary = {
             "end": self.end,
@@ -143,18 +148,20 @@ class Session:
 
     # --- pieces ---------------------------------------------------------------------------------
 
-    def _zero(self) -> None:
+    def _tare(self) -> None:
         states, until = [], time.monotonic() + 5.0
-        while len(states) < _ZERO_SAMPLES and time.monotonic() < until:
+        while len(states) < _TARE_SAMPLES and time.monotonic() < until:
             reply = self.port.exchange(self.sensing.command(self.sensing.hand.joint_lower, Mode.PASSIVE))
             if reply is not None:
                 states.append(reply.state)
-        if len(states) < _ZERO_SAMPLES:
-            raise HandError(f"{self.arguments.port}: only {len(states)} answers in 5 s; cannot zero the taxels")
-        self.sensing.zero(states)
+        if len(states) < _TARE_SAMPLES:
+            raise HandError(
+                f"{self.arguments.port}: only {len(states)} answers in 5 s, cannot tare the taxels; check the cable"
+            )
+        self.sensing.set_tare(states)
 
     def _approach(self) -> None:
-        """To the start posture, and hold it until the object is there."""
+        """Move to the start posture, and hold it until the object is seen."""
         arguments, start = self.arguments, self._pose()
         goal = np.asarray(self.controller.spec.posture or start, np.float32)
         goal = goal if arguments.approach > 0 else start
@@ -163,11 +170,11 @@ class Session:
         while (now := time.monotonic()) < ready or not self.objects.ready():
             if now > ready + _PATIENCE:
                 raise HandError(
-                    "the camera does not see the object: check its light, the colour threshold "
+                    "the camera does not see the object; check the light, the colour thresholds "
                     "(--optics.hsv-low, --optics.hsv-high) and --optics.min-area"
                 )
             share = min((now - begin) / arguments.approach, 1.0) if arguments.approach > 0 else 1.0
-            self.safety.wish(start + np.float32(share * share * (3 - 2 * share)) * (goal - start), now)
+            self.safety.set_target(start + np.float32(share * share * (3 - 2 * share)) * (goal - start), now)
             self._check()
             pace.wait()
 
@@ -184,7 +191,7 @@ class Session:
         anchor, self.started = self.safety.anchor, time.monotonic()
         self.servo.forget()
         self.pace = Pace(self.controller.policy.control_rate)
-        # The policy begins when a request has just gone out, and at rates that keep their phase always does.
+        # A tick starts when a request has just been sent; rates from `keep_phase` keep it so.
         self.pace.next = self.servo.free(self.pace.next)
         while time.monotonic() < self.started + self.arguments.seconds:
             self._check()
@@ -205,8 +212,8 @@ class Session:
         if self.arguments.motors_off:
             self.controller.anchor(sample.measured.joint_position)
         tick = self.controller.tick(sample.measured, seen, goal, self.arguments.command)
-        trouble = "the object is out of sight" if age > self.safety.config.stale_object else ""
-        self.safety.wish(tick.target, now, trouble)
+        hold_reason = "the object is out of sight" if age > self.safety.config.stale_object else ""
+        self.safety.set_target(tick.target, now, hold_reason)
         self.tick = tick
         self.force += float(sample.measured.finger_force.sum())
         self.forces += 1
@@ -233,7 +240,7 @@ class Session:
         self.view.note(text)
 
     def _react(self, text: str) -> None:
-        """A change of `Safety`'s reaction; clips are too frequent for the terminal."""
+        """Log a change of the safety reaction; clips are too frequent for the terminal."""
         self.log.add(Kind.NOTE, text)
         if text.startswith(("hold", "relax")) and self.safety.engaged:
             self.view.note(text)

@@ -1,1 +1,1 @@
-"""From bytes and pictures to `Readings`."""
+"""Sensors of the real hand and the object: from bytes and pictures to `Readings`."""

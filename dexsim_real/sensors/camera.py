@@ -1,8 +1,8 @@
-"""The object's height from a camera: mask, centroid, ray, and the nearest point of a line.
+"""The object's height from a camera: segmentation mask, centroid, ray, height.
 
-As in the paper the object's other coordinates are taken as fixed, so the centroid's ray and the
-line along the measured axis meet in one height. Where masks come from is open: `Masks` is any
-callable; built in are a colour threshold (OpenCV) and a stream from another program.
+As in the paper, the object's other coordinates are taken as fixed. The height is that of the point on the measured
+axis that is nearest to the centroid's ray. `Masks` is any callable; built in are a colour threshold (OpenCV) and a
+stream from another program.
 """
 
 import dataclasses
@@ -21,7 +21,7 @@ from dexsim_real.core.errors import HandError
 from dexsim_real.core.process import lower_priority
 
 Masks = Callable[[], tuple[float, np.ndarray] | None]
-"""Blocks until the next picture; gives its time (s, monotonic) and a bool mask [H, W], or None at the end."""
+"""Blocks until the next picture; returns its time (s, monotonic clock) and a bool mask [H, W], or None at the end."""
 
 _STREAM = struct.Struct("<4sHHd")
 _MAGIC = b"MASK"
@@ -29,34 +29,34 @@ _MAGIC = b"MASK"
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class CameraConfig:
-    """A pinhole camera in the palm frame, and the colour of the object."""
+    """Pinhole camera in the palm frame, and colour of the object."""
 
     focal: tuple[float, float] = setting((600.0, 600.0), unit="px", low=1.0, high=1e5)
     """Focal lengths along columns and rows."""
     centre: tuple[float, float] = setting((320.0, 240.0), unit="px", low=-1e4, high=1e5)
     """Principal point: column and row."""
     position: tuple[float, float, float] = setting((0.06, 0.5, 0.09), unit="m", low=-10.0, high=10.0)
-    """Place of the camera in the palm frame."""
+    """Position of the camera in the palm frame."""
     forward: tuple[float, float, float] = setting((0.0, -1.0, 0.0), unit="1", low=-1.0, high=1.0)
-    """Where it looks, palm frame."""
+    """Viewing direction in the palm frame."""
     down: tuple[float, float, float] = setting((1.0, 0.0, 0.0), unit="1", low=-1.0, high=1.0)
-    """Where the rows of its picture grow, palm frame."""
+    """Direction in the palm frame in which the rows of the picture increase."""
     hsv_low: tuple[int, int, int] = setting((40, 80, 60), unit="1", low=0, high=255)
-    """Colour threshold, OpenCV's hue (0 to 179), saturation and value."""
+    """Lower colour threshold: OpenCV's hue (0 to 179), saturation and value."""
     hsv_high: tuple[int, int, int] = setting((85, 255, 255), unit="1", low=0, high=255)
-    """Its upper end."""
+    """Upper colour threshold."""
     min_area: int = setting(60, unit="px", low=1, high=10_000_000)
-    """Smaller masks are taken for none."""
+    """Smallest area of a mask; smaller ones count as no object."""
 
     def __post_init__(self):
         validate(self)
         forward, down = (np.asarray(v, float) for v in (self.forward, self.down))
         if np.linalg.norm(np.cross(forward, down)) < 1e-3:
-            raise HandError("CameraConfig: forward and down must not be parallel")
+            raise HandError("CameraConfig.forward and CameraConfig.down must not be parallel")
 
 
 def camera_axes(config: CameraConfig) -> np.ndarray:
-    """Rows [3, 3]: the picture's right, down and forward in the palm frame, orthonormal."""
+    """Rows [3, 3]: the picture's right, down and forward axes in the palm frame, orthonormal."""
     forward = np.asarray(config.forward, float) / np.linalg.norm(config.forward)
     down = np.asarray(config.down, float) - forward * (np.asarray(config.down) @ forward)
     down /= np.linalg.norm(down)
@@ -64,10 +64,17 @@ def camera_axes(config: CameraConfig) -> np.ndarray:
 
 
 def height_of(mask: np.ndarray, config: CameraConfig, reference: np.ndarray, axis: int) -> float | None:
-    """Coordinate m of the object along the palm frame's `axis`, the others being `reference`'s.
+    """Coordinate m of the object along an axis of the palm frame.
 
-    The point of the line nearest to the ray through the mask's centroid. None where the mask is too
-    small or the ray runs along the line.
+    Args:
+      mask: [H, W] bool.
+      config: of the camera.
+      reference: [3] m, the object's other coordinates.
+      axis: 0, 1 or 2.
+
+    Returns:
+      The coordinate of the point on the axis nearest to the ray through the mask's centroid. None when the mask is
+      too small, or the ray is parallel to the axis.
     """
     rows, columns = np.nonzero(mask)
     if rows.size < config.min_area:
@@ -89,19 +96,26 @@ def height_of(mask: np.ndarray, config: CameraConfig, reference: np.ndarray, axi
 
 
 class HeightSensor:
-    """Follows the object from its own thread; `read` gives the newest position and velocity.
+    """Tracks the object from its own thread; `read` returns the newest position and velocity.
 
     Args:
-      masks: where masks come from.
+      masks: source of masks.
+      config: of the camera.
+      reference: [3] m, the object's coordinates that are not measured.
       axes: which coordinates are measured (`Sensing.object_axes`): exactly one.
       weight: of the newest difference in the velocity (`Sensing.velocity_filter`).
+
+    Raises:
+      HandError: `axes` are not exactly one.
     """
 
     def __init__(
         self, masks: Masks, config: CameraConfig, reference: np.ndarray, axes: tuple[bool, bool, bool], weight: float
     ):
         if sum(axes) != 1:
-            raise HandError(f"the policy wants the object's coordinates {axes}; one camera measures one of them")
+            raise HandError(
+                f"the policy observes the object's coordinates {axes}; one camera measures one: use another policy"
+            )
         self._masks, self._config, self._weight = masks, config, weight
         self._reference, self._axis = np.asarray(reference, float), axes.index(True)
         self._newest: tuple[float, np.ndarray, np.ndarray] | None = None
@@ -111,17 +125,17 @@ class HeightSensor:
 
     @property
     def seen(self) -> bool:
-        """Whether the object has come into sight."""
+        """Whether the object has been seen."""
         return self._newest is not None
 
     def read(self) -> tuple[float, np.ndarray, np.ndarray]:
-        """Time of the newest sight (s, monotonic), position [3] m and filtered velocity [3] m/s."""
+        """Time of the newest measurement (s, monotonic clock), position [3] m and filtered velocity [3] m/s."""
         if self._newest is None:
-            raise HandError("the camera has not seen the object")
+            raise HandError("the camera has not seen the object yet; wait until `seen` is true")
         return self._newest
 
     def see(self, when: float, mask: np.ndarray) -> None:
-        """Take in one mask."""
+        """Update with the mask of a picture taken at a time in s."""
         height = height_of(mask, self._config, self._reference, self._axis)
         if height is None:
             return
@@ -150,10 +164,12 @@ class HeightSensor:
 
 
 def open_masks(spec: str, config: CameraConfig) -> Masks:
-    """A mask source by name: a camera number or video file, `unix:PATH`, or `MODULE:FUNCTION`.
+    """A source of masks.
 
-    A function takes a BGR picture [H, W, 3] uint8 and gives a bool mask [H, W]; it gets its pictures from
-    camera 0. `unix:PATH` connects to a program that sends `encode_mask`'s records.
+    Args:
+      spec: a camera number or video file; `unix:PATH` for a program that sends records of `encode_mask`; or
+        `MODULE:FUNCTION` for a function from a BGR picture [H, W, 3] uint8 of camera 0 to a bool mask [H, W].
+      config: of the camera; its colours segment the pictures of a camera or file.
 
     Raises:
       HandError: it cannot be opened.
@@ -165,12 +181,12 @@ def open_masks(spec: str, config: CameraConfig) -> Masks:
         try:
             return _camera("0", getattr(importlib.import_module(module), function))
         except (ImportError, AttributeError) as error:
-            raise HandError(f"{spec}: {error}") from None
+            raise HandError(f"{spec}: {error}; give MODULE:FUNCTION of an importable module") from None
     return _camera(spec, lambda picture: colour_mask(picture, config))
 
 
 def colour_mask(picture: np.ndarray, config: CameraConfig) -> np.ndarray:
-    """Pixels [H, W] of a BGR picture whose colour is within the threshold, specks removed."""
+    """Mask [H, W] of the pixels of a BGR picture within the colour thresholds, single pixels removed."""
     cv2 = _opencv()
     hsv = cv2.cvtColor(picture, cv2.COLOR_BGR2HSV)
     mask = cv2.inRange(hsv, np.array(config.hsv_low, np.uint8), np.array(config.hsv_high, np.uint8))
@@ -178,7 +194,7 @@ def colour_mask(picture: np.ndarray, config: CameraConfig) -> np.ndarray:
 
 
 def encode_mask(when: float, mask: np.ndarray) -> bytes:
-    """A mask [H, W] as one record of a stream: magic, width, height, time, packed bits."""
+    """A record of a mask stream: magic, width, height, time s, packed bits of a mask [H, W]."""
     height, width = mask.shape
     return _STREAM.pack(_MAGIC, width, height, when) + np.packbits(mask).tobytes()
 
@@ -188,7 +204,7 @@ def _stream(path: str) -> Masks:
     try:
         link.connect(path)
     except OSError as error:
-        raise HandError(f"{path}: no program sends masks here ({error.strerror})") from None
+        raise HandError(f"{path}: no program sends masks here ({error.strerror}); start that program first") from None
     file = link.makefile("rb")
 
     def read() -> tuple[float, np.ndarray] | None:
@@ -211,7 +227,7 @@ def _camera(spec: str, segment: Callable[[np.ndarray], np.ndarray]) -> Masks:
     cv2 = _opencv()
     capture = cv2.VideoCapture(int(spec) if spec.isdigit() else spec)
     if not capture.isOpened():
-        raise HandError(f"{spec}: the camera cannot be opened")
+        raise HandError(f"{spec}: the camera cannot be opened; check its number or the file")
 
     def read() -> tuple[float, np.ndarray] | None:
         sound, picture = capture.read()

@@ -1,4 +1,4 @@
-"""From what the hand reports to SI units: calibration, zeroing, dead taxels, filtered speeds."""
+"""From reported values to SI units: calibration, tare, dead taxels, filtered velocities."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -18,42 +18,41 @@ _JOINTS = frames.JOINTS
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class HardwareConfig:
-    """What no public source proves about the hand, and what its firmware is told.
+    """Signs, scales and gains of a hand, most of them unconfirmed by public sources.
 
-    Check these on your own unit before the motors are on; docs/hardware.md says how.
+    Check them on your own hand before you turn the motors on (docs/hardware.md).
     """
 
     joint_sign: tuple[float, ...] = setting((1.0,) * _JOINTS, unit="1", low=-1.0, high=1.0)
-    """Sense of each joint against the model. Public descriptions disagree about joint 3 (splay of
-    the index); here positive is toward the thumb."""
+    """Direction of each joint relative to the model: 1 or -1. Public descriptions disagree about joint 3 (splay of the
+    index finger); in the model positive is toward the thumb."""
     joint_offset: tuple[float, ...] = setting((0.0,) * _JOINTS, unit="rad", low=-1.0, high=1.0)
     """Added to the reported angle after the sign."""
     kp: tuple[int, ...] = setting((100,) * _JOINTS, unit="1", low=0, high=5000)
-    """Position gain, in a unit that the maker does not publish; 80 to 225 are in use."""
+    """Position gain in an unpublished unit; 80 to 225 are in use."""
     ki: tuple[int, ...] = setting((0,) * _JOINTS, unit="1", low=-3000, high=3000)
-    """Integral gain, unit unknown."""
+    """Integral gain in an unpublished unit."""
     kd: tuple[int, ...] = setting((0,) * _JOINTS, unit="1", low=0, high=12000)
-    """Damping gain, unit unknown: sources say 0 to 5000 and use 12000."""
+    """Damping gain in an unpublished unit; sources give a range of 0 to 5000 and use 12000."""
     torque_max: int = setting(300, unit="mA", low=0, high=1200)
-    """Current limit sent with every command. Reported currents far above it have been seen, so it
-    is not the only guard: see `SafetyConfig.current`."""
+    """Current limit sent with every command. Hands have reported currents far above it, so `--safety.current` limits
+    the current as well."""
     force_per_count: float = setting(0.1, unit="N", low=1e-4, high=10.0)
-    """Force of one taxel count without a calibration; the vendor says 0.1 N, no measurement does."""
+    """Force of one taxel count without a calibration. The vendor's 0.1 N has not been confirmed by a measurement."""
     taxel_axes: str = setting("z", choices=("z", "norm"))
-    """What stands for a taxel's force: the pressing component, or the length of all three."""
+    """Force of a taxel: its normal component (z), or the norm of all three components (norm)."""
     taxel_floor: float = setting(1.0, unit="count", low=0.0, high=255.0)
-    """Tared counts below this read as zero; in use elsewhere are 2, and 5 to 30 are left after a
-    reset."""
+    """Tared counts below this read as zero."""
     tare_limit: float = setting(40.0, unit="count", low=0.0, high=255.0)
-    """A taxel above this when taring means that the hand is touching something."""
+    """Largest count of a taxel when it is tared; a higher one means that the fingertip touches something."""
     current_sign: float = setting(-1.0, unit="1", low=-1.0, high=1.0)
-    """Sense of the current without a calibration: reported positive when opening."""
+    """Sign of the current without a calibration: -1 when a positive current opens the hand."""
     current_scale: float = setting(1000.0, unit="mA", low=1.0, high=20000.0)
-    """Current that reads as torque 1 without a calibration: a guess."""
+    """Current that reads as torque 1 without a calibration (not measured)."""
     reported_velocity: bool = setting(False)
-    """Use the velocity that newer firmware reports instead of differences of the angle."""
+    """Use the velocity reported by newer firmware instead of differences of the joint angle."""
     velocity_time: float = setting(0.02, unit="s", low=0.0, high=1.0)
-    """Time constant of the filter on differences of the angle."""
+    """Time constant of the filter on differences of the joint angle."""
 
     def __post_init__(self):
         validate(self)
@@ -65,15 +64,15 @@ class HardwareConfig:
 
 
 @dataclasses.dataclass(frozen=True)
-class Measured:
-    """What one state block says, in SI units; float32 throughout."""
+class HandMeasurement:
+    """One state block in SI units; float32 throughout."""
 
     joint_position: np.ndarray  # [J] rad
-    joint_torque: np.ndarray  # [J] 1
+    joint_torque: np.ndarray  # [J] 1, relative to the stall torque
     taxel_force: np.ndarray  # [F, N] N
     current: np.ndarray  # [J] A, magnitude
     temperature: np.ndarray  # [J + F] degC, joint boards and tips
-    errors: np.ndarray  # [J, 3] the hand's error bits: palm, joint and tip board
+    errors: np.ndarray  # [J, 3] error bits of palm, joint and tip board
 
     @property
     def finger_force(self) -> np.ndarray:
@@ -81,7 +80,7 @@ class Measured:
         return self.taxel_force.sum(-1)
 
     def finite(self) -> bool:
-        """Whether every number is."""
+        """Whether angles, torques and forces are finite."""
         return bool(
             np.isfinite(self.joint_position).all()
             and np.isfinite(self.joint_torque).all()
@@ -90,21 +89,24 @@ class Measured:
 
 
 class HandSensing:
-    """Both directions between the hand's blocks and SI units.
+    """Converts the hand's state blocks to SI units, and joint angles to command blocks.
+
+    `tare` [F, N] holds the taxel counts that read as no force.
 
     Args:
-      hand: the model whose joints and fingers these are.
-      calibration: of this very hand; without one, `HardwareConfig` guesses.
+      hand: model of the hand.
+      config: signs, scales and gains.
+      calibration: of this hand; None uses the scales of `config`.
 
     Raises:
-      HandError: the model is not of a hand that these frames can carry.
+      HandError: the model has other joints or taxels than the frames.
     """
 
     def __init__(self, hand: Hand, config: HardwareConfig, calibration: Calibration | None = None):
         if (hand.num_joints, hand.num_fingers, hand.num_taxels) != (_JOINTS, frames.TIPS, frames.TAXELS):
             raise HandError(
-                f"{hand.name}: {hand.num_joints} joints and {hand.num_fingers} x {hand.num_taxels} "
-                f"taxels do not fit the frames' {_JOINTS} and {frames.TIPS} x {frames.TAXELS}"
+                f"{hand.name}: {hand.num_joints} joints and {hand.num_fingers} x {hand.num_taxels} taxels; the frames "
+                f"carry {_JOINTS} and {frames.TIPS} x {frames.TAXELS}. Use the model of that hand"
             )
         self.hand, self.config, self.calibration = hand, config, calibration
         self._sign = np.array(config.joint_sign, np.float32)
@@ -120,13 +122,13 @@ class HandSensing:
                 lambda counts: normalised_torque(calibration, current_from_counts(calibration, counts))
             )
 
-    def measure(self, state: np.ndarray) -> Measured:
-        """SI units of a `frames.STATE_BLOCK`."""
+    def measure(self, state: np.ndarray) -> HandMeasurement:
+        """A `frames.STATE_BLOCK` in SI units."""
         joint, tip = state["joint"], state["tip"]
         counts = np.maximum(self._counts(state) - self.tare, 0.0)
         counts = np.where(counts < self.config.taxel_floor, np.float32(0), counts)
         board = joint["temperature"] & 0xFF
-        return Measured(
+        return HandMeasurement(
             joint_position=joint["position"] * self._sign + self._offset,
             joint_torque=np.asarray(self._torque(joint["current"].astype(np.float32)), np.float32),
             taxel_force=counts * self._per_count,
@@ -135,8 +137,11 @@ class HandSensing:
             errors=np.stack([joint["palm_error"], joint["joint_error"], joint["tip_error"]], -1),
         )
 
-    def zero(self, states: Sequence[np.ndarray]) -> None:
-        """Take the taxels' mean over these states as zero.
+    def set_tare(self, states: Sequence[np.ndarray]) -> None:
+        """Tare the taxels: their mean counts over these states read as no force from now on.
+
+        Args:
+          states: `frames.STATE_BLOCK` of an untouched hand.
 
         Raises:
           HandError: a fingertip touches something.
@@ -146,13 +151,13 @@ class HandSensing:
         if np.any(worst > self.config.tare_limit):
             names = [self.hand.finger_names[i] for i in np.flatnonzero(worst > self.config.tare_limit)]
             raise HandError(
-                f"cannot zero the taxels: {', '.join(names)} read up to {worst.max():.0f} counts "
+                f"cannot tare the taxels: {', '.join(names)} read up to {worst.max():.0f} counts "
                 f"(limit {self.config.tare_limit:.0f}); free the fingertips, or power-cycle the hand"
             )
         self.tare = counts
 
     def command(self, position: np.ndarray, mode: Mode) -> np.ndarray:
-        """A `frames.COMMAND_BLOCK` for joint angles [J] rad of the model; all off unless in `POSITION`."""
+        """A `frames.COMMAND_BLOCK` for joint angles [J] rad of the model. Gains are 0 in all modes but `POSITION`."""
         config, on = self.config, mode == Mode.POSITION
         return frames.command_block(
             (np.asarray(position) - self._offset) * self._sign,
@@ -164,7 +169,7 @@ class HandSensing:
         )
 
     def velocity(self, state: np.ndarray) -> np.ndarray | None:
-        """Joint velocities [J] rad/s as reported; None when they are to be estimated."""
+        """Reported joint velocities [J] rad/s; None when they must be estimated."""
         if not self.config.reported_velocity:
             return None
         return state["joint"]["velocity"].astype(np.float32) * np.float32(1e-3) * self._sign
@@ -177,19 +182,23 @@ class HandSensing:
 
 
 class VelocityFilter:
-    """Differences of the joint angles through a first-order filter."""
+    """Joint velocities: differences of the joint angles through a first-order filter.
+
+    Args:
+      time_constant: s.
+    """
 
     def __init__(self, time_constant: float):
         self._constant = time_constant
         self.reset()
 
     def reset(self) -> None:
-        """Forget what was before."""
+        """Forget all measurements."""
         self._last: tuple[float, np.ndarray] | None = None
         self.velocity = np.zeros(_JOINTS, np.float32)
 
     def update(self, time: float, position: np.ndarray) -> np.ndarray:
-        """Velocities [J] rad/s after one more measurement [J] rad at a time in s."""
+        """Velocities [J] rad/s after a measurement [J] rad at a time in s."""
         if self._last is not None and time > self._last[0]:
             step = time - self._last[0]
             weight = step / (step + self._constant)

@@ -1,10 +1,10 @@
-"""The IMU inside the object: BNO08x parts in their UART-RVC mode, and their frame in the palm's.
+"""The IMU inside the object: a BNO08x in UART-RVC mode, and its orientation in the palm frame.
 
-RVC frames come unasked, 100 a second at 115200 baud: AA AA, index, yaw, pitch and roll in 0.01
-degree, three accelerations in mg, three more bytes, and the sum of all after the head (BNO080
-datasheet, 1.3.5.2). Yaw has no north: it is fixed once, against a known pose of the object. Yaw,
-pitch and roll are blind where the part's x points up or down, so the part's z belongs on the axis
-that stays upright: `UPRIGHT_X` is its mount in an object that turns about its x.
+The IMU sends 100 RVC frames a second at 115200 baud: AA AA, index, yaw, pitch and roll in 0.01 degree, three
+accelerations in mg, three more bytes, and the sum of all bytes after the head (BNO080 datasheet, 1.3.5.2). Yaw has no
+absolute reference: it is aligned once to a known pose of the object. Yaw, pitch and roll are singular where the IMU's x
+points up or down, so mount it with its z along the axis that stays upright: `UPRIGHT_X` is the mount in an object that
+turns about its x.
 """
 
 import math
@@ -22,11 +22,11 @@ SIZE = 19
 BAUD = 115200
 _BODY = struct.Struct("<B6h3B")
 UPRIGHT_X = (0.5**0.5, 0.0, 0.5**0.5, 0.0)
-"""Orientation of the part in the object: the part's z along the object's x."""
+"""Orientation (w, x, y, z) of the IMU in the object: the IMU's z along the object's x."""
 
 
 def encode(index: int, quat: np.ndarray, acceleration: tuple[float, float, float] = (0.0, 0.0, 9.81)) -> bytes:
-    """The frame of an orientation (w, x, y, z) of the part in its world, z up; acceleration in m/s^2."""
+    """The RVC frame of an orientation (w, x, y, z) in the IMU's world frame, z up; acceleration in m/s^2."""
     w, x, y, z = (float(v) for v in quat)
     yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     pitch = math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x))))
@@ -37,7 +37,7 @@ def encode(index: int, quat: np.ndarray, acceleration: tuple[float, float, float
 
 
 def decode(frame: bytes) -> np.ndarray | None:
-    """Orientation (w, x, y, z) of a frame, or None where it is damaged."""
+    """Orientation (w, x, y, z) of an RVC frame; None when the frame is damaged."""
     body = frame[len(HEAD) : -1]
     if len(frame) != SIZE or frame[:2] != HEAD or sum(body) & 0xFF != frame[-1]:
         return None
@@ -57,14 +57,14 @@ def decode(frame: bytes) -> np.ndarray | None:
 
 
 class RvcParser:
-    """Orientations out of a stream of bytes; damaged frames are counted and left out."""
+    """Extracts orientations from a stream of bytes; damaged frames are counted and skipped."""
 
     def __init__(self) -> None:
         self._buffer = bytearray()
         self.damaged = 0
 
     def feed(self, data: bytes) -> list[np.ndarray]:
-        """Orientations that these bytes complete."""
+        """Add received bytes; returns the orientations that they complete."""
         self._buffer += data
         found, at = [], 0
         while (at := self._buffer.find(HEAD, at)) >= 0 and at + SIZE <= len(self._buffer):
@@ -79,7 +79,7 @@ class RvcParser:
 
 
 def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Product of two quaternions."""
+    """Product of two quaternions (w, x, y, z)."""
     w, v = a[0] * b[0] - a[1:] @ b[1:], a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:])
     return np.concatenate([[w], v])
 
@@ -90,13 +90,17 @@ def conjugate(a: np.ndarray) -> np.ndarray:
 
 
 def align(sensed: np.ndarray, known: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """The rotation that takes the part's world to the palm frame.
+    """The rotation [4] from the IMU's world frame to the palm frame.
 
-    Gravity fixes two of its angles (`up` [3] is the vertical in the palm frame); only the heading is
-    taken from the `known` orientation that the part had in the palm frame when `sensed` was read.
+    Gravity fixes two of its angles; only the heading is taken from the known orientation.
+
+    Args:
+      sensed: [4] orientation of the IMU in its world frame.
+      known: [4] orientation of the IMU in the palm frame at the same time.
+      up: [3] the vertical in the palm frame.
     """
     up = np.asarray(up, float) / np.linalg.norm(up)
-    # The shortest rotation from the part's z to the palm frame's vertical; half a turn about x if opposite.
+    # The shortest rotation from the IMU's z to the palm frame's vertical; half a turn about x if opposite.
     level = np.array([1.0 + up[2], -up[1], up[0], 0.0]) if up[2] > -1 + 1e-9 else np.array([0.0, 1.0, 0.0, 0.0])
     level /= np.linalg.norm(level)
     error = multiply(known, conjugate(multiply(level, sensed)))
@@ -106,12 +110,15 @@ def align(sensed: np.ndarray, known: np.ndarray, up: np.ndarray) -> np.ndarray:
 
 
 class Imu:
-    """Reads the part from its own thread; `read` gives the newest orientation in the palm frame.
+    """Reads an IMU from its own thread; `read` returns the newest orientation in the palm frame.
 
     Args:
-      port: serial port of the part.
+      port: serial port of the IMU.
       up: [3] the vertical in the palm frame.
-      mount: [4] orientation of the part in the object.
+      mount: [4] orientation of the IMU in the object.
+
+    Raises:
+      HandError: the port cannot be opened.
     """
 
     def __init__(self, port: str, up: np.ndarray, mount: tuple[float, ...] = UPRIGHT_X):
@@ -126,27 +133,27 @@ class Imu:
         self._thread.start()
 
     def wait(self, seconds: float = 2.0) -> None:
-        """Until the part sends.
+        """Wait for the first orientation.
 
         Raises:
-          HandError: nothing came in this time.
+          HandError: none arrived in this time.
         """
         until = time.monotonic() + seconds
         while self._newest is None:
             if time.monotonic() > until:
                 raise HandError(
-                    f"{self.port}: no orientation from the IMU; is it in UART-RVC mode (PS0 high, PS1 low)?"
+                    f"{self.port}: the IMU sends no orientation; set it to UART-RVC mode (PS0 high, PS1 low)"
                 )
             time.sleep(0.005)
 
     def calibrate(self, known: np.ndarray) -> None:
-        """Fix the heading: the object lies now as `known` [4]."""
+        """Align the heading: the object now has the orientation `known` [4] in the palm frame."""
         self._world = align(self._newest[1], multiply(known, self._mount), self._up)
 
     def read(self) -> tuple[float, np.ndarray]:
-        """When the newest sample came (s, monotonic) and the object's orientation [4]."""
+        """Time of the newest sample (s, monotonic clock) and orientation [4] of the object in the palm frame."""
         if self._newest is None or self._world is None:
-            raise HandError(f"{self.port}: the IMU has not been calibrated")
+            raise HandError(f"{self.port}: the heading of the IMU has not been aligned; call `calibrate` first")
         when, quat = self._newest
         return when, multiply(multiply(self._world, quat), conjugate(self._mount))
 
@@ -160,10 +167,10 @@ class Imu:
             try:
                 quats = self.parser.feed(self._serial.read(SIZE))
             except OSError:
-                return  # The sample grows old, and `Safety` acts on that.
+                return  # `Safety` reacts to the age of the last sample.
             if quats:
                 before = self._newest[1] if self._newest else quats[-1]
-                # Of the two quaternions of an orientation the one nearer to the last, as in simulation.
+                # q and -q are one orientation: take the one nearer to the last, as in simulation.
                 self._newest = time.monotonic(), quats[-1] if quats[-1] @ before >= 0 else -quats[-1]
 
 

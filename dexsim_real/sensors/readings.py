@@ -1,4 +1,4 @@
-"""From measurements to `Readings`: the hardware's half of the one road to the policy."""
+"""From measurements on hardware to the `Readings` from which the observation is computed."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -7,39 +7,59 @@ import numpy as np
 
 from dexsim.observation import FIELDS, Readings
 from dexsim_real.core.errors import HandError
-from dexsim_real.sensors.hand import Measured
+from dexsim_real.sensors.hand import HandMeasurement
 
-SOURCES = ("hand", "camera", "imu", "user", "policy")
-"""Who gives the bridge what a policy observes; see `ObservationField.source`."""
+SOURCES = {
+    "joint_position": "hand",
+    "joint_torque": "hand",
+    "contact_force": "hand",
+    "contact_centre": "hand",
+    "fingertip_position": "hand",
+    "fingertip_rotation": "hand",
+    "last_action": "policy",
+    "command": "user",
+    "object_position": "camera",
+    "object_velocity": "camera",
+    "relative_orientation": "imu",
+    "object_orientation": "imu",
+}
+"""The sensor that measures each field of an observation on hardware."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ObjectEstimate:
-    """What camera and IMU say about the object, palm frame."""
+    """Pose and velocity of the object from camera and IMU, palm frame."""
 
     position: np.ndarray  # [3] m
     velocity: np.ndarray  # [3] m/s
-    quat: np.ndarray  # [4]
+    quat: np.ndarray  # [4] (w, x, y, z)
 
 
 def sources_of(names: Sequence[str]) -> set[str]:
-    """Which of "hand", "camera", "imu", ... an observation with these fields needs.
+    """The sensors ("hand", "camera", "imu", ...) that an observation with these fields needs.
 
     Raises:
-      HandError: a field that no sensor of the bridge measures.
+      HandError: no sensor of the bridge measures a field.
     """
     for name in names:
         if name not in FIELDS or FIELDS[name].source not in SOURCES:
-            raise HandError(f"the policy observes {name!r}, which the hand cannot measure")
+            raise HandError(
+                f"the policy observes {name!r}, which no sensor measures on hardware; use a policy without it"
+            )
     return {FIELDS[name].source for name in names}
 
 
 def make_readings(
-    measured: Measured, seen: ObjectEstimate, goal_quat: np.ndarray, command: float, last_action: np.ndarray
+    measured: HandMeasurement, seen: ObjectEstimate, goal_quat: np.ndarray, command: float, last_action: np.ndarray
 ) -> Readings:
-    """One tick of measurements, filled by name; float32, as in simulation.
+    """The `Readings` of one tick, float32 as in simulation.
 
-    `last_action` is the action that led to these measurements.
+    Args:
+      measured: of the hand.
+      seen: of the object.
+      goal_quat: [4] goal orientation of the object.
+      command: grip command in [0, 1].
+      last_action: [J] the action that led to these measurements.
     """
     known = {
         "joint_position": measured.joint_position,

@@ -1,1 +1,1 @@
-"""The emulated hand: physics that no policy has trained on, behind the real hand's bytes."""
+"""`python -m dexsim_real.twin`: an emulated hand with the wire format of the real one and physics of its own."""

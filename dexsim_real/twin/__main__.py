@@ -1,8 +1,8 @@
-"""An emulated hand: the real hand's bytes on a pseudo-terminal, physics that no policy has trained on behind them.
+"""Emulates a hand on a pseudo-terminal: the wire format of the real hand, and physics that no policy was trained on.
 
     python -m dexsim_real.twin --task rotate
 
-It prints the command that runs a policy on it, and goes on until its trials are over or Ctrl-C.
+It prints the command that runs a policy on it, and ends after its trials or with Ctrl-C.
 """
 
 import importlib
@@ -23,31 +23,31 @@ from dexsim.hand.load import load_hand
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.process import use_realtime
 from dexsim_real.sensors.camera import CameraConfig
-from dexsim_real.twin.loop import Twin
 from dexsim_real.twin.options import TwinArguments
-from dexsim_real.twin.types import Plant
+from dexsim_real.twin.plant.protocol import Plant
+from dexsim_real.twin.server import Twin
 
 
 def make_plant(arguments: TwinArguments, hand: Hand) -> Plant:
-    """The physics that the options ask for.
+    """The physics for the options.
 
     Raises:
-      HandError: a function of the user's own that cannot be found.
+      HandError: the function of `--plant` cannot be found.
     """
     if arguments.plant:
         module, _, function = arguments.plant.partition(":")
         try:
             return getattr(importlib.import_module(module), function or "make_plant")(arguments)
         except (ImportError, AttributeError) as error:
-            raise HandError(f"{arguments.plant}: {error}") from None
-    from dexsim_real.twin.plant.plant import EmulatedHand
+            raise HandError(f"--plant {arguments.plant}: {error}; give MODULE:FUNCTION") from None
+    from dexsim_real.twin.plant.emulated_hand import EmulatedHand
 
     return EmulatedHand(
         hand,
         arguments.task,
         arguments.seed,
         trials=arguments.trials,
-        kind=arguments.draw,
+        kind=arguments.parameters,
         seconds=arguments.seconds,
         command=arguments.command,
         first=arguments.first,
@@ -56,27 +56,27 @@ def make_plant(arguments: TwinArguments, hand: Hand) -> Plant:
 
 
 def check_policy(name: str, task: str, hand: Hand) -> None:
-    """A policy is for this task, and for a hand that is mounted as this one.
+    """Check that a policy fits the task and the mount of the emulated hand.
 
     Raises:
-      HandError: it is not.
+      HandError: it does not.
     """
     from dexsim_ppo.policy import load_policy
-    from dexsim_real.twin.plant.plant import nominal_gravity
+    from dexsim_real.twin.plant.mount import nominal_gravity
 
     policy = load_policy(name)
     if policy.task != task:
-        raise HandError(f"{name} is a policy of the task {policy.task!r}, the hand is mounted for {task!r}")
+        raise HandError(f"{name} is a policy of the task {policy.task!r}; give --task {policy.task}")
     trained, mounted = policy.spec.gravity, nominal_gravity(task)
     if np.abs(np.asarray(trained) - mounted).max() > 0.01:
         raise HandError(
-            f"{name} was trained with gravity {np.round(trained, 2).tolist()} m/s^2 in the palm's frame, "
-            f"the emulated hand is mounted for {np.round(mounted, 2).tolist()}"
+            f"{name} was trained with gravity {np.round(trained, 2).tolist()} m/s^2 in the palm frame, the emulated "
+            f"hand has {np.round(mounted, 2).tolist()}; use a policy that was trained with this mount"
         )
 
 
 def write_calibration(path: Path, hand: Hand) -> Path:
-    """The calibration of an emulated hand whose motors are all nominal; each trial's own deviate from it."""
+    """Write the calibration of an emulated hand with nominal motors, from which the motors of each trial deviate."""
     from dexsim.calibration.maps import save_calibration
     from dexsim_real.twin.virtual import ideal_calibration
 
@@ -85,7 +85,7 @@ def write_calibration(path: Path, hand: Hand) -> Path:
 
 
 def runner_command(twin: Twin, calibration: Path | None) -> list[str]:
-    """The command that runs a policy on this hand."""
+    """The command that runs a policy on an emulated hand."""
     arguments, line, board = twin.arguments, twin.arguments.line, twin.arguments.firmware
     words = [
         "python",
@@ -153,7 +153,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _print(lines: queue.SimpleQueue) -> None:
-    """From a thread of its own: the wire never waits for a terminal."""
+    """Print lines in a background thread, so that the terminal never blocks the hand's port."""
     for text in iter(lines.get, None):
         print(text, flush=True)
 

@@ -1,16 +1,16 @@
-"""Options of `python -m dexsim_real.twin`, one dataclass with those of every part within."""
+"""Options of `python -m dexsim_real.twin`: one dataclass that contains the options of every part."""
 
 import dataclasses
 from pathlib import Path
 
 from dexsim.core.config import setting, validate
-from dexsim_real.twin.plant.draw import KINDS, TASKS
+from dexsim_real.twin.plant.parameters import KINDS, TASKS
 from dexsim_real.twin.plant.shapes import SHAPES
-from dexsim_real.twin.wire.check import LimitsConfig
+from dexsim_real.twin.wire.command_check import LimitsConfig
+from dexsim_real.twin.wire.emulated_sensors import ObjectSensorConfig
 from dexsim_real.twin.wire.faults import FaultConfig
 from dexsim_real.twin.wire.firmware import FirmwareConfig
 from dexsim_real.twin.wire.line import LineConfig
-from dexsim_real.twin.wire.object_side import ObjectConfig
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -18,49 +18,50 @@ class TwinArguments:
     """Options of `python -m dexsim_real.twin`."""
 
     task: str = setting("rotate", choices=TASKS)
-    """What the hand is mounted for: palm up with a cube, or upside down with objects to catch."""
+    """Task: `rotate` mounts the hand palm up with a cube, `grasp` upside down with various objects."""
     policy: str | None = None
-    """The policy that will run on it, a file or a shipped name, to see that it fits; by default that of the task's
-    name."""
+    """Policy that will run on the hand, to check that it fits: a file, or the name of a shipped policy. None for the
+    shipped policy of the task."""
     seed: int = setting(0, unit="1", low=0, high=2**31 - 1)
-    """Of everything random: parameters, objects, noise, faults."""
+    """Seed of all random numbers: parameters, objects, noise, faults."""
     trials: int = setting(10, unit="1", low=1, high=100_000)
-    """Objects that are handed over before the program ends."""
+    """Number of trials, with one object each."""
     seconds: float | None = setting(None, unit="s", low=0.1, high=86400.0)
-    """Time limit of a trial; the task's own by default (grasp 8, rotate 120)."""
-    draw: str = setting("outside", choices=KINDS)
-    """Parameters just outside the ranges of training, inside them, or nominal."""
+    """Time limit of a trial; None for that of the task (grasp 8 s, rotate 120 s)."""
+    parameters: str = setting("outside", choices=KINDS)
+    """Parameters of hand and object: just outside the ranges of training, inside them, or nominal."""
     first: int = setting(0, unit="1", low=0, high=100_000)
-    """Number of the first trial: a trial is the same whether others went before it or not."""
+    """Number of the first trial. A trial does not depend on the trials before it."""
     shape: str = setting("any", choices=("any", *SHAPES))
-    """Objects of grasp trials."""
+    """Shape of the objects (grasp)."""
     command: float | None = setting(None, unit="1", low=0.0, high=1.0)
-    """Grip command that the runner will be given; only noted in the results and in the command shown."""
+    """Grip command for the command line that is shown, and for the results; None leaves it out."""
     calibration: Path | None = None
-    """Calibration file for the command shown; by default that of a hand whose motors are all nominal, which is written
-    to a temporary folder. `python -m dexsim_real.calibrate` makes one as for a real hand."""
+    """Calibration file for the command line that is shown; None for a temporary file for nominal motors. `python -m
+    dexsim_real.calibrate` creates one, as for a real hand."""
     link: Path | None = None
-    """Name of the hand's port; by default in a new folder under the system's temporary one."""
+    """Path of the hand's port; None for one in a new temporary folder."""
     imu_link: Path | None = None
-    """Name of the IMU's port (rotate)."""
+    """Path of the IMU's port (rotate); None for one in a new temporary folder."""
     mask_socket: Path | None = None
-    """Unix socket of the camera's masks (grasp)."""
+    """Path of the Unix socket for the camera's masks (grasp); None for one in a new temporary folder."""
     output: Path | None = None
-    """File for results, counters and events as JSON, written at the end."""
+    """JSON file for results, statistics and events, written at the end; None writes no file."""
     realtime: bool = True
-    """Ask for real-time priority: it stands for hardware, which waits for no scheduler."""
+    """Request real-time priority; continue without it if not permitted."""
     plant: str | None = None
-    """MODULE:FUNCTION of your own that makes the physics (`dexsim_real.twin.types.Plant`) from these options."""
+    """MODULE:FUNCTION that creates the physics (a `dexsim_real.twin.plant.protocol.Plant`) from these options; None for
+    the library's own."""
     line: LineConfig = setting(LineConfig())
-    """Timing of the wire."""
+    """Timing of the serial line."""
     firmware: FirmwareConfig = setting(FirmwareConfig())
     """The palm board."""
     limits: LimitsConfig = setting(LimitsConfig())
-    """What every command is held against."""
+    """Limits against which every command is checked."""
     faults: FaultConfig = setting(FaultConfig())
-    """What goes wrong."""
-    object: ObjectConfig = setting(ObjectConfig())
-    """IMU and camera."""
+    """Injected faults."""
+    object: ObjectSensorConfig = setting(ObjectSensorConfig())
+    """IMU and camera of the object."""
 
     def __post_init__(self):
         validate(self)

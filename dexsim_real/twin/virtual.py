@@ -1,8 +1,8 @@
-"""A run on the emulated hand in virtual time: the bridge's own parts, in one process and without a clock.
+"""A run on the emulated hand in virtual time: the parts of the bridge in one process, without a clock.
 
-What `dexsim_real.run.session` does with threads and a serial port happens here event by event: exchanges at 83 Hz that
-take 9.6 ms, the policy at its own rate on the newest state, an IMU and a camera at theirs. Every exchange goes through
-the bytes of both frames and the emulated palm board, so counts, rounding and delays are the wire's.
+What `dexsim_real.run.session` does with threads and a serial port is simulated as events: exchanges at 83 Hz that take
+9.6 ms, the policy, the IMU and the camera at their own rates. Every exchange is encoded to frames and executed by the
+emulated palm board, so quantisation and delays are those of the wire.
 """
 
 import dataclasses
@@ -16,31 +16,31 @@ from dexsim.calibration.maps import Calibration, Side
 from dexsim.hand.kinematics import Hand
 from dexsim_real.control.controller import IDENTITY, Controller
 from dexsim_real.control.goals import TurnGoals
-from dexsim_real.control.safety import Safety, SafetyConfig, Sample
+from dexsim_real.control.safety import HandSample, Safety, SafetyConfig
 from dexsim_real.sensors.camera import HeightSensor
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig, VelocityFilter
 from dexsim_real.sensors.imu import BAUD, UPRIGHT_X, RvcParser, align, conjugate, encode, multiply
 from dexsim_real.sensors.readings import ObjectEstimate
 from dexsim_real.twin.plant.assistant import POSTURES
-from dexsim_real.twin.plant.motors import STALL_CURRENT
-from dexsim_real.twin.plant.plant import EmulatedHand
+from dexsim_real.twin.plant.drives import STALL_CURRENT
+from dexsim_real.twin.plant.emulated_hand import EmulatedHand
 from dexsim_real.twin.plant.shapes import matrix, turn
+from dexsim_real.twin.wire.emulated_sensors import ObjectSensorConfig, outline, silhouette
 from dexsim_real.twin.wire.firmware import Firmware, FirmwareConfig
-from dexsim_real.twin.wire.object_side import ObjectConfig, outline, silhouette
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Command, Frame, Mode, Parser
 
 RATE = 83.0  # exchanges a second
-REQUEST, ROUND_TRIP = 0.001, 0.0096  # s from the host to the board; until the answer is there
+REQUEST, ROUND_TRIP = 0.001, 0.0096  # s until a request reaches the board; until its answer has arrived
 IMU_RATE, CAMERA_RATE = 100.0, 30.0  # Hz
-_ZERO_SAMPLES = 30
-_SLACK = 5.0  # s beyond a trial's limit after which something is wrong
+_TARE_SAMPLES = 30
+_SLACK = 5.0  # s after the time limit of a trial at which a run ends anyway
 
 
 def ideal_calibration(hand: Hand) -> Calibration:
-    """The calibration of an emulated hand whose motors are all nominal: what a press procedure finds on average.
+    """The calibration of an emulated hand with nominal motors, the mean result of the press procedure.
 
-    Each trial's drawn errors of current and taxels are then errors of this calibration.
+    The sampled errors of current and taxels in a trial are errors of this calibration.
     """
 
     def side(gain: np.ndarray) -> Side:
@@ -60,31 +60,31 @@ def ideal_calibration(hand: Hand) -> Calibration:
 
 
 class Schedule:
-    """Events in virtual time."""
+    """A queue of events in virtual time."""
 
     def __init__(self) -> None:
         self._queue: list[tuple[float, int, Callable[[], None]]] = []
         self._count = 0
 
     def at(self, time: float, what: Callable[[], None]) -> None:
-        """Call `what` at a time in s."""
+        """Schedule a call at a time in s."""
         heapq.heappush(self._queue, (time, self._count, what))
         self._count += 1
 
     def pop(self) -> tuple[float, Callable[[], None]]:
-        """The next event."""
+        """Remove and return the next event: its time in s and its call."""
         time, _, what = heapq.heappop(self._queue)
         return time, what
 
 
 class VirtualImu:
-    """The part in the object and the bridge's way with it, without a port."""
+    """The IMU in the object and the bridge's processing of it, without a port."""
 
     def __init__(self, plant: EmulatedHand, nominal_up: np.ndarray):
         self._plant, self._nominal_up = plant, nominal_up
         self._mount = np.asarray(UPRIGHT_X)
         self._parser, self._index = RvcParser(), 0
-        # The part's world has the true vertical as z and some heading.
+        # The IMU's world frame has the true vertical as z and an arbitrary heading.
         up = plant.up
         level = np.array([1.0 + up[2], up[1], -up[0], 0.0]) if up[2] > -1 + 1e-9 else np.array([0.0, 1, 0, 0])
         self._level = multiply(turn((0, 0, 1), 1.0 + plant.seed), level / np.linalg.norm(level))
@@ -92,34 +92,34 @@ class VirtualImu:
         self._sensed, self.time = IDENTITY, 0.0
 
     def sample(self) -> bytes:
-        """The bytes about the orientation that the part shows now."""
+        """The bytes of the current orientation."""
         _, quat, _ = self._plant.measure_object()
         self._index += 1
         return encode(self._index, multiply(self._level, multiply(quat, self._mount)))
 
     def receive(self, time: float, data: bytes) -> None:
-        """The bridge reads them."""
+        """Process received bytes at a time in s."""
         for quat in self._parser.feed(data):
             self._sensed = quat if quat @ self._sensed >= 0 else -quat
             self.time = time
 
     def calibrate(self) -> None:
-        """The object lies squarely now."""
+        """Align the heading: the object now has the identity orientation."""
         self._world = align(self._sensed, multiply(IDENTITY, self._mount), self._nominal_up)
 
     def read(self) -> np.ndarray:
-        """Orientation in the palm frame, as the bridge has it."""
+        """Orientation [4] of the object in the palm frame, as measured by the bridge."""
         if self._world is None:
             return IDENTITY
         return multiply(multiply(self._world, self._sensed), conjugate(self._mount))
 
 
 class VirtualCamera:
-    """Masks of the object and the bridge's height sensor, without a socket."""
+    """The camera and the bridge's height sensor, without a socket."""
 
     def __init__(self, plant: EmulatedHand, controller: Controller):
         spec = controller.spec
-        self._plant, self._config = plant, ObjectConfig()
+        self._plant, self._config = plant, ObjectSensorConfig()
         self._parts = [outline(part) for part in plant.shape.parts]
         self.sensor = HeightSensor(
             lambda: None,
@@ -130,7 +130,7 @@ class VirtualCamera:
         )
 
     def sample(self, time: float) -> None:
-        """One picture, which shows what is a while ago."""
+        """Take a picture at a time in s; it shows the object with the delay of the camera."""
         place, quat, _ = self._plant.measure_object()
         parts = [points @ matrix(quat).T + place for points in self._parts]
         self.sensor.see(time, silhouette(parts, self._config.optics, self._config.picture))
@@ -138,12 +138,12 @@ class VirtualCamera:
 
 @dataclasses.dataclass(frozen=True)
 class RunOptions:
-    """One run."""
+    """Options of a virtual run."""
 
     command: float = 0.5  # in [0, 1]
-    safety: bool = True
+    safety: bool = True  # whether the safety limits apply
     approach: float = 2.0  # s to the start posture
-    place: float = 0.5  # s in it, before the policy begins
+    place: float = 0.5  # s in the start posture
     hardware: HardwareConfig = HardwareConfig()
     limits: SafetyConfig = SafetyConfig()
 
@@ -152,9 +152,10 @@ class VirtualRun:
     """One trial of a policy on an emulated hand.
 
     Args:
-      plant: fresh, with one trial to come.
-      controller: warmed; it is started anew.
+      plant: a new one, before its first trial.
+      controller: warmed; it is restarted.
       calibration: of this hand.
+      options: of the run.
     """
 
     def __init__(self, plant: EmulatedHand, controller: Controller, calibration: Calibration, options: RunOptions):
@@ -168,7 +169,7 @@ class VirtualRun:
         self._requests, self._replies = Parser(frames.HOST_REQUESTS), Parser(frames.HAND_REPLIES)
         self._schedule, self._now = Schedule(), 0.0
         self._state: np.ndarray | None = None
-        self._mode, self._wish = Mode.PASSIVE, hand.joint_lower
+        self._mode, self._target = Mode.PASSIVE, hand.joint_lower
         self.imu = VirtualImu(plant, -np.asarray(controller.spec.gravity))
         self.camera = VirtualCamera(plant, controller) if "camera" in controller.sources else None
         self.goals: TurnGoals | None = None
@@ -176,21 +177,21 @@ class VirtualRun:
         self.trace: list[dict[str, Any]] | None = None
 
     def run(self) -> dict[str, Any]:
-        """The referee's report, with what the bridge believed."""
+        """Run the trial; returns the referee's report, with the measurements of the bridge as `bridge`."""
         trial, limit = self.plant.trial, self.plant.limit + _SLACK
         self._schedule.at(0.0, self._exchange)
         if "imu" in self.controller.sources:
             self._schedule.at(0.001, self._sense_orientation)
         if self.camera:
             self._schedule.at(0.002, self._take_picture)
-        self._zero()
+        self._tare()
         self._mode = Mode.POSITION
         self.safety.engage()
         start, began = self._pose(), self._now
         goal = np.asarray(POSTURES[self.plant.task], np.float32)
         while self._now < began + self.options.approach + self.options.place:
             share = np.float32(min((self._now - began) / self.options.approach, 1.0))
-            self._tell(start + share * share * (3 - 2 * share) * (goal - start))
+            self._set_target(start + share * share * (3 - 2 * share) * (goal - start))
             self._until(self._now + 1 / RATE)
         if "imu" in self.controller.sources:
             self.imu.calibrate()
@@ -218,20 +219,20 @@ class VirtualRun:
         seen = ObjectEstimate(position, velocity, self.imu.read())
         goal = self.goals.update(self.imu.time, seen) if self.goals else IDENTITY
         tick = self.controller.tick(measured, seen, goal, self.options.command)
-        self._tell(tick.target)
+        self._set_target(tick.target)
         self.sums += measured.finger_force
         self.ticks += 1
         if self.trace is not None:
             self.trace.append({"time": self._now, "tick": tick, "measured": measured})
 
-    def _tell(self, target: np.ndarray) -> None:
-        self.safety.wish(target, self._now)
+    def _set_target(self, target: np.ndarray) -> None:
+        self.safety.set_target(target, self._now)
         if np.isfinite(target).all():
-            self._wish = target
+            self._target = target
 
     def _exchange(self) -> None:
-        """The servo thread's cycle: ask, and hear 9.6 ms later."""
-        position, mode = self._wish, self._mode
+        """The exchange thread's cycle: send a request; its answer arrives 9.6 ms later."""
+        position, mode = self._target, self._mode
         if self.safety.engaged and self.options.safety:
             decision = self.safety.decide(self._now)
             position, mode = decision.position, decision.mode
@@ -243,14 +244,14 @@ class VirtualRun:
     def _answer(self, data: bytes, now: float) -> None:
         for frame in self._requests.feed(data):
             reply = self.firmware.answer(frame, now).encode()
-            self._schedule.at(self._now + ROUND_TRIP - REQUEST, lambda reply=reply: self._hear(reply))
+            self._schedule.at(self._now + ROUND_TRIP - REQUEST, lambda reply=reply: self._receive(reply))
 
-    def _hear(self, data: bytes) -> None:
+    def _receive(self, data: bytes) -> None:
         for frame in self._replies.feed(data):
             self._state = frames.decode_state(frame.data)
             measured = self.sensing.measure(self._state)
             velocity = self._filter.update(self._now, measured.joint_position)
-            self.safety.see(Sample(self._now, 0, 0, measured, velocity))
+            self.safety.see(HandSample(self._now, 0, 0, measured, velocity))
 
     def _sense_orientation(self) -> None:
         data = self.imu.sample()
@@ -264,19 +265,19 @@ class VirtualRun:
 
     # --- pieces ---------------------------------------------------------------------------------
 
-    def _zero(self) -> None:
+    def _tare(self) -> None:
         states: list[np.ndarray] = []
-        while len(states) < _ZERO_SAMPLES:
+        while len(states) < _TARE_SAMPLES:
             self._state = None
             self._until(self._now + 1 / RATE)
             states += [self._state] if self._state is not None else []
-        self.sensing.zero(states)
+        self.sensing.set_tare(states)
 
     def _pose(self) -> np.ndarray:
         return self.safety.sample.measured.joint_position
 
     def _until(self, time: float) -> None:
-        """Let the world and the bridge's threads run to a time."""
+        """Run the plant and the events up to a time in s."""
         while True:
             when, what = self._schedule.pop()
             if when > time:
@@ -293,11 +294,11 @@ class VirtualRun:
     def _summary(self, trial: int) -> dict[str, Any]:
         report = next(r for r in self.plant.results() if r["trial"] == trial)
         mean = self.sums / max(self.ticks, 1)
-        believed = {
+        measured = {
             "ticks": self.ticks,
             "sensed_force": np.round(mean, 4).tolist(),
             "safety": dict(self.safety.counts),
             "latched": self.safety.latched,
             "successes": self.goals.successes if self.goals else None,
         }
-        return report | {"command": self.options.command, "bridge": believed}
+        return report | {"command": self.options.command, "bridge": measured}

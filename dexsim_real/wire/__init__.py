@@ -1,1 +1,1 @@
-"""The hand's wire format and its serial port."""
+"""The hand's wire format and its serial port: frames, link, driver."""

@@ -1,10 +1,10 @@
-"""The hand's wire format on RS485: frames, their checksum, the two big blocks, a parser.
+"""The hand's wire format on RS485: frames, checksum, command and state blocks, parser.
 
     55 AA | source | target | command | length, low byte first | data | CRC, low byte first
 
-The CRC is CRC-16/XMODEM over everything before it. Both ends of the line are here: a host sends
-`EXCHANGE` with twelve joint commands and gets back the whole state, and an emulated hand does the
-reverse. Layouts are from public drivers and headers; docs/hardware.md says how sure each is.
+The CRC is CRC-16/XMODEM over everything before it. The module serves both ends of the line: a host sends
+`EXCHANGE` with twelve joint commands and receives the whole state; an emulated hand does the reverse. Layouts come
+from public drivers and headers; docs/hardware.md says how certain each one is.
 """
 
 import binascii
@@ -30,14 +30,14 @@ TIP_IDS = (0x11, 0x12, 0x13, 0x14, 0x15)
 
 
 class FrameError(DexsimError):
-    """A block has the wrong size or cannot be what it claims to be."""
+    """A block has the wrong size or invalid joint ids."""
 
 
 class Command(enum.IntEnum):
-    """What a frame asks for, or answers."""
+    """Command byte of a frame, in requests and answers."""
 
     ERROR = 0x00
-    EXCHANGE = 0x02  # joint commands out, whole state back
+    EXCHANGE = 0x02  # request: joint commands; answer: whole state
     SET_MODE = 0x08
     READ_MODE = 0x09
     CLEAR_PRESSURE = 0x12  # zero the taxels of one tip
@@ -48,11 +48,11 @@ class Command(enum.IntEnum):
 
 
 class Mode(enum.IntEnum):
-    """What a joint does with its command."""
+    """Control mode of a joint."""
 
-    PASSIVE = 0  # relaxed; on some firmware not fully limp
+    PASSIVE = 0  # motor off; on some firmware not fully limp
     POSITION = 3
-    FORCE = 5  # refused by some units
+    FORCE = 5  # rejected by some units
 
 
 JOINT_COMMAND = np.dtype(
@@ -101,8 +101,7 @@ HAND_REPLIES: dict[int, range] = {
     Command.READ_MODE: range(2, 65),
     Command.READ_REGISTER: range(5, 65),
 }
-"""Data lengths that a host believes. None fits the host's own request, so an adapter that echoes
-what it sends cannot be taken for the hand."""
+"""Valid data lengths of answers. None fits a request, so the echo of an adapter is never mistaken for the hand."""
 HOST_REQUESTS: dict[int, range] = {
     Command.EXCHANGE: range(COMMAND_BLOCK.itemsize, COMMAND_BLOCK.itemsize + 1),
     Command.VERSION: range(0, 1),
@@ -112,7 +111,7 @@ HOST_REQUESTS: dict[int, range] = {
     Command.RESET: range(0, 2),
     Command.READ_REGISTER: range(1, 5),
 }
-"""Data lengths that a hand believes."""
+"""Valid data lengths of requests."""
 
 
 def crc16(data: bytes | bytearray | memoryview) -> int:
@@ -121,13 +120,13 @@ def crc16(data: bytes | bytearray | memoryview) -> int:
 
 
 def palm_address(hand_id: int) -> int:
-    """Address of a hand's palm board."""
+    """Bus address of a hand's palm board."""
     return hand_id | 0x80
 
 
 @dataclasses.dataclass(frozen=True)
 class Frame:
-    """One frame without head and checksum."""
+    """A frame without head and checksum."""
 
     source: int
     target: int
@@ -141,32 +140,32 @@ class Frame:
           FrameError: more data than a frame can carry.
         """
         if len(self.data) > MAX_DATA:
-            raise FrameError(f"{len(self.data)} bytes of data, a frame carries at most {MAX_DATA}")
+            raise FrameError(f"{len(self.data)} bytes of data; a frame carries at most {MAX_DATA}")
         body = HEADER.pack(HEAD, self.source, self.target, self.command, len(self.data)) + self.data
         return body + crc16(body).to_bytes(2, "little")
 
 
 @dataclasses.dataclass
 class ParserCounts:
-    """What a parser has seen."""
+    """Statistics of a parser."""
 
     received: int = 0  # bytes
     frames: int = 0  # accepted
-    crc_errors: int = 0  # believable headers with a wrong checksum
-    resyncs: int = 0  # times that bytes had to be skipped to find a frame
-    skipped: int = 0  # bytes that belong to no accepted frame
-    checked: int = 0  # bytes that went through the checksum
+    crc_errors: int = 0  # valid headers with a wrong checksum
+    resyncs: int = 0  # number of times that bytes were skipped to find a frame
+    skipped: int = 0  # bytes outside of accepted frames
+    checked: int = 0  # bytes on which the checksum was computed
 
 
 class Parser:
-    """Frames out of a stream of bytes, whatever happens to the stream.
+    """Extracts frames from a damaged or truncated stream of bytes.
 
-    A header is believed only with a known command and a length that this command can have; the
-    checksum decides. When it fails, the search goes on one byte after that header, so no frame
-    that lies intact in the stream is lost. A false header delays what follows by at most one frame.
+    A header is valid only with a known command and a length that this command can have; then the checksum decides.
+    When it fails, the search continues one byte after that header, so every intact frame of the stream is found.
+    A false header delays the next frame by at most one frame.
 
-    Memory is bounded by one frame and one chunk. Each byte is searched once for the head, and goes
-    through the checksum at most once for each believable header in the longest frame before it.
+    Memory is bounded by one frame and one chunk. Each byte is searched once for the head, and enters the checksum at
+    most once for each valid header in the longest frame before it.
 
     Args:
       lengths: possible data lengths of each command, `HAND_REPLIES` or `HOST_REQUESTS`.
@@ -179,18 +178,18 @@ class Parser:
         self.counts = ParserCounts()
 
     def feed(self, data: bytes) -> list[Frame]:
-        """Take bytes as they arrive; returns the frames that they complete."""
+        """Add received bytes; returns the frames that they complete."""
         self.counts.received += len(data)
         self._buffer += data
         return self._scan(final=False)
 
     def expire(self) -> list[Frame]:
-        """The line has gone silent: what waits is no frame, but a frame may lie within it."""
+        """End of transmission: drop an incomplete frame, and return the frames inside its bytes."""
         return self._scan(final=True)
 
     @property
     def pending(self) -> int:
-        """Bytes that wait for the rest of their frame."""
+        """Number of bytes of an incomplete frame."""
         return len(self._buffer)
 
     def _scan(self, final: bool) -> list[Frame]:
@@ -225,10 +224,7 @@ class Parser:
         return frames
 
     def _frame_end(self, at: int) -> int | None:
-        """Where the frame whose head is here ends, as far as its header has arrived.
-
-        None: no such frame exists.
-        """
+        """End of the frame that begins here, as far as its header has arrived; None when there is no such frame."""
         buffer = self._buffer
         if len(buffer) < at + HEADER.size:
             return at + OVERHEAD
@@ -257,8 +253,10 @@ def command_block(
     torque_max: np.ndarray | int,
     mode: np.ndarray | int = Mode.POSITION,
 ) -> np.ndarray:
-    """Joint commands, `COMMAND_BLOCK`: angles [12] rad, gains in the firmware's units, current
-    limit in mA; scalars hold for all joints."""
+    """A `COMMAND_BLOCK`: angles [12] rad, gains in the firmware's units, current limit in mA.
+
+    A scalar applies to all joints.
+    """
     block = np.zeros((), COMMAND_BLOCK)
     block["id"] = np.arange(JOINTS)
     for name, value in (
@@ -274,7 +272,7 @@ def command_block(
 
 
 def empty_state() -> np.ndarray:
-    """A `STATE_BLOCK` of zeros with its ids filled in."""
+    """A `STATE_BLOCK` of zeros with its ids set."""
     block = np.zeros((), STATE_BLOCK)
     block["joint"]["id"] = np.arange(JOINTS)
     block["joint"]["sensor_id"][list(TIP_JOINTS)] = TIP_IDS
@@ -285,7 +283,7 @@ def decode_command(data: bytes) -> np.ndarray:
     """Joint commands [12] from the data of a host's `EXCHANGE`.
 
     Raises:
-      FrameError: wrong size, or ids that are not 0 to 11.
+      FrameError: wrong size, or the ids are not 0 to 11.
     """
     return _decode(data, COMMAND_BLOCK, "command", lambda block: block["id"])
 
@@ -294,7 +292,7 @@ def decode_state(data: bytes) -> np.ndarray:
     """The state from the data of a hand's `EXCHANGE`.
 
     Raises:
-      FrameError: wrong size, or joint ids that are not 0 to 11.
+      FrameError: wrong size, or the joint ids are not 0 to 11.
     """
     return _decode(data, STATE_BLOCK, "state", lambda block: block["joint"]["id"])
 

@@ -1,8 +1,7 @@
-"""The hand behind a serial port: one request, one answer, a deadline, and a count of everything.
+"""The hand on a serial port: requests and answers with deadlines, statistics, reconnection.
 
-`SerialHand` speaks `dexsim_real.wire.frames` over pyserial, to a USB adapter or to a pseudo-terminal.
-Whatever else can move a hand (a vendor's SDK that the user has installed) needs only `HandPort`'s few
-methods; see `open_port`.
+`SerialHand` sends the frames of `dexsim_real.wire.frames` over pyserial, to a USB adapter or a pseudo-terminal.
+`open_port` also accepts a `HandPort` of the user's own, for example around a vendor's SDK.
 """
 
 import contextlib
@@ -19,14 +18,14 @@ from dexsim_real.wire.frames import Command, Frame, Mode
 from dexsim_real.wire.link import HandPort, LinkConfig, LinkCounts, Reply
 
 _POLL = 0.002  # s, longest wait of one read
-_WRITE = 0.5  # s, longest write; also what this program may be held up in one before the port counts as failed
-_QUIET = 0.006  # s without a byte, after which nothing more of a frame will come
+_WRITE = 0.5  # s, longest write; a longer one counts as a failure of the port
+_QUIET = 0.006  # s without a byte after which a frame has ended
 
 _LONGEST = frames.OVERHEAD + frames.STATE_BLOCK.itemsize  # bytes of the longest answer
 
 
 def passive_command() -> np.ndarray:
-    """Joint commands that leave all motors off."""
+    """Joint commands with all motors off."""
     return frames.command_block(np.zeros(frames.JOINTS), kp=0, ki=0, kd=0, torque_max=0, mode=Mode.PASSIVE)
 
 
@@ -35,7 +34,7 @@ class SerialHand:
 
     Args:
       port: device, by-id link, pseudo-terminal or pyserial URL.
-      tap: called with ("tx" or "rx", bytes) for every frame, from the thread that exchanges.
+      tap: called with ("tx" or "rx", bytes) for every frame, from the thread that calls `exchange`.
     """
 
     def __init__(self, port: str, config: LinkConfig | None = None, *, tap: Callable[[str, bytes], None] | None = None):
@@ -59,7 +58,9 @@ class SerialHand:
             raise
         except OSError as error:
             self.close()
-            raise HandError(f"{self.port}: failed while greeting the hand ({error})") from None
+            raise HandError(
+                f"{self.port}: the connection failed during the handshake ({error}); check the cable"
+            ) from None
         return f"{self.port}: hand {self.config.hand_id}, firmware {version}"
 
     def exchange(self, command: np.ndarray) -> Reply | None:
@@ -67,7 +68,7 @@ class SerialHand:
             return self._reconnect()
         try:
             return self._exchange(command)
-        except OSError:  # pyserial's errors are.
+        except OSError:  # Base class of pyserial's errors.
             self.close()
             self._pause = self.config.backoff[0]
             self._retry_at = time.monotonic() + self._pause
@@ -80,7 +81,7 @@ class SerialHand:
             self._serial = None
 
     def warnings(self) -> list[str]:
-        """What slows this port down, with the remedy."""
+        """Settings that slow this port down, with the remedy."""
         return latency_warnings(self.port)
 
     # --- one exchange ---------------------------------------------------------------------
@@ -99,7 +100,7 @@ class SerialHand:
         return Reply(state, sent, time.monotonic(), self.counts.sent, self._generation)
 
     def _request(self, command: Command, data: bytes, reply: int) -> tuple[Frame | None, float]:
-        """Send and wait for the answer to this command; and when it was sent."""
+        """Send a command; its answer and the time s of sending."""
         request = Frame(frames.HOST, frames.palm_address(self.config.hand_id), command, data).encode()
         self.counts.sent += 1
         try:
@@ -125,8 +126,8 @@ class SerialHand:
         return answer, sent
 
     def _wait(self, command: Command, sent: float, request: int, reply: int) -> Frame | None:
-        """The answer. At the deadline a frame that is on its way may still arrive: on a line of two
-        wires nobody else could speak meanwhile."""
+        """Wait for the answer. A frame that is arriving at the deadline is still received: on a two-wire line no other
+        frame could be sent meanwhile."""
         deadline = sent + self.config.deadline(request, reply)
         answer, final, heard = None, False, sent
         while answer is None and not final:
@@ -138,10 +139,10 @@ class SerialHand:
                 size = frames.OVERHEAD + len(frame.data)
                 possible = not self.config.paced or now - sent >= self.config.on_wire(request + size)
                 if possible and frame.command in (command, Command.ERROR):
-                    self.counts.late += answer is not None  # Of two the newer is the answer.
+                    self.counts.late += answer is not None  # The newer of two answers counts.
                     answer = frame
                 else:
-                    self.counts.late += 1  # It answers something that was given up.
+                    self.counts.late += 1  # It answers an earlier request.
                     self._received -= size
         return answer
 
@@ -153,7 +154,7 @@ class SerialHand:
         return data
 
     def _discard(self) -> None:
-        """Throw away what came too late, to its end: it must not pass for the next answer."""
+        """Discard late answers to their last byte, so that none is mistaken for the next answer."""
         found, until = [], time.monotonic() + self.config.on_wire(_LONGEST) + _QUIET
         while (self._serial.in_waiting or self._parser.pending) and time.monotonic() < until:
             found += self._parser.feed(self._read())
@@ -177,7 +178,7 @@ class SerialHand:
         except (OSError, ValueError) as error:
             raise HandError(explain(self.port, error)) from None
         if local:
-            # Only real adapters have it. The FTDI driver then sets its latency timer to 1 ms.
+            # Only real adapters support it. The FTDI driver then sets its latency timer to 1 ms.
             with contextlib.suppress(OSError, ValueError, AttributeError, NotImplementedError):
                 self._serial.set_low_latency_mode(True)
         self._parser = frames.Parser(frames.HAND_REPLIES)
@@ -186,7 +187,7 @@ class SerialHand:
         self._received = 0
 
     def _greet(self, patience: float) -> str:
-        """Ask for the version and for one passive state; the version may stay unknown."""
+        """Handshake: ask for the version and one state with the motors off. The version may stay unknown."""
         until, version = time.monotonic() + patience, "unknown"
         self._generation += 1
         while True:
@@ -202,22 +203,22 @@ class SerialHand:
     def _silence(self) -> str:
         if not self._received:
             return (
-                f"{self.port}: no answer. Is the hand powered, are A and B of RS485 swapped, is its "
-                f"id {self.config.hand_id}?"
+                f"{self.port}: no answer; check the power, the A and B wires of RS485, and that the hand has the id "
+                f"{self.config.hand_id} (--link.hand-id)"
             )
         if self.counts.late:
             return (
-                f"{self.port}: answers come sooner than {self.config.baud} baud allow; if this line is emulated "
-                "and has no pace, say --link.no-paced"
+                f"{self.port}: answers arrive sooner than {self.config.baud} baud allow; use --link.no-paced for an "
+                "emulated line without timing"
             )
         if not self._parser.counts.frames and not self._parser.counts.crc_errors:
             return (
-                f"{self.port}: {self._received} bytes came and none make a frame: is the hand set to "
-                f"{self.config.baud} baud?"
+                f"{self.port}: none of {self._received} bytes belong to a frame; set --link.baud to that of the hand "
+                f"(now {self.config.baud} baud)"
             )
         return (
-            f"{self.port}: the hand answers, but not with a sound state ({self.counts.crc_errors} "
-            f"wrong checksums, {self.counts.refused} refusals): check cable and termination"
+            f"{self.port}: the hand answers without a valid state ({self.counts.crc_errors} "
+            f"wrong checksums, {self.counts.refused} refusals); check cable and termination"
         )
 
     def _reconnect(self) -> Reply | None:
@@ -237,10 +238,12 @@ class SerialHand:
 
 
 def open_port(spec: str, config: LinkConfig, tap: Callable[[str, bytes], None] | None = None) -> HandPort:
-    """A hand by its name: a serial port, or `sdk:MODULE:FUNCTION`.
+    """The hand at a port.
 
-    The function is the user's own, and gives a `HandPort` that drives a vendor's SDK; it is called
-    with the `LinkConfig`.
+    Args:
+      spec: a serial port, or `sdk:MODULE:FUNCTION` for a function that takes a `LinkConfig` and returns a `HandPort`.
+      config: of the serial line.
+      tap: see `SerialHand`.
 
     Raises:
       HandError: the module or function cannot be found.
@@ -251,7 +254,7 @@ def open_port(spec: str, config: LinkConfig, tap: Callable[[str, bytes], None] |
     try:
         return getattr(importlib.import_module(module), function or "open_hand")(config)
     except (ImportError, AttributeError) as error:
-        raise HandError(f"{spec}: {error}") from None
+        raise HandError(f"{spec}: {error}; give sdk:MODULE:FUNCTION of an importable module") from None
 
 
 def _printable(data: bytes) -> str:

@@ -27,7 +27,7 @@ def test_one_short_trial_through_the_bytes(tmp_path):
             "1",
             "--seconds",
             "1.5",
-            "--draw",
+            "--parameters",
             "nominal",
             "--no-realtime",
             "--json",
@@ -51,5 +51,5 @@ def test_one_short_trial_through_the_bytes(tmp_path):
     assert trial["bridge"]["exchanges"] > 100
     assert result["metrics"]["held"]["mean"] == float(trial["held"])
     lines = done.stdout.splitlines()
-    assert "1 trials through the bytes" in lines[0] and "emulated hand" in lines[1] and "simulation" in lines[1]
+    assert "1 trials in real time" in lines[0] and "emulated hand" in lines[1] and "simulation" in lines[1]
     assert any(line.startswith("held") for line in lines) and "command 1.00 sphere" in done.stderr

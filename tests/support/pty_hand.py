@@ -11,6 +11,10 @@ import numpy as np
 
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import HOST_REQUESTS, Command, Frame, Parser
+from dexsim_real.wire.link import LinkConfig
+
+QUICK = LinkConfig(settle=0.0, margin=0.12, handshake=0.1, backoff=(0.02, 0.05), paced=False)
+"""For a hand that answers at once."""
 
 
 class PtyHand:

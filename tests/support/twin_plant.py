@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 
-from dexsim_real.twin.plant.shapes import Part, Shape
-from dexsim_real.twin.types import Measurement, Motors
+from dexsim_real.twin.plant.protocol import MotorCommands, PlantMeasurement
+from dexsim_real.twin.plant.shapes import ObjectShape, Primitive
 from dexsim_real.wire.frames import Mode
 
 REST = np.array([0.3] * 3 + [0.0] + [0.3] * 8)
@@ -23,17 +23,17 @@ class ScriptedPlant:
 
     def __init__(self, trial_seconds: float = math.inf, turn: float = 0.5):
         self.trial_seconds, self.turn = trial_seconds, turn
-        self.shape = Shape("box", (Part("box", (0.025, 0.025, 0.025)),))
+        self.shape = ObjectShape("box", (Primitive("box", (0.025, 0.025, 0.025)),))
         self.time, self.angle = 0.0, REST.copy()
         self.velocity, self.heat = np.zeros(12), np.full(12, 35.0)
-        self.motors: Motors | None = None
-        self.orders: list[tuple[float, Motors]] = []
+        self.motors: MotorCommands | None = None
+        self.orders: list[tuple[float, MotorCommands]] = []
 
     @property
     def trial(self) -> int:
         return int(self.time / self.trial_seconds) if math.isfinite(self.trial_seconds) else 0
 
-    def drive(self, motors: Motors) -> None:
+    def drive(self, motors: MotorCommands) -> None:
         self.motors = motors
         self.orders.append((self.time, motors))
 
@@ -45,13 +45,13 @@ class ScriptedPlant:
         self.angle = goal + (self.angle - goal) * math.exp(-seconds / 0.02)
         self.velocity = (self.angle - before) / seconds
 
-    def measure(self) -> Measurement:
+    def measure(self) -> PlantMeasurement:
         position, quat, acceleration = self.measure_object()
         force = np.zeros((5, 120, 3))
         # Quarter of a newton on ten taxels for each radian; what pulls along the tip is half of it.
         force[:, 40:50, 2] = 0.25 * np.maximum(self.angle[[2, 5, 7, 9, 11]], 0)[:, None]
         force[:, 40:50, 0] = -0.5 * force[:, 40:50, 2]
-        return Measurement(
+        return PlantMeasurement(
             time=self.time,
             joint_position=self.angle.copy(),
             joint_velocity=self.velocity.copy(),

@@ -11,36 +11,35 @@ class GraspReward:
     """Weights and widths of the reward terms, per control tick."""
 
     force: float = setting(2.0, unit="1", low=0.0, high=1000.0)
-    """R_force: each touching finger's force against its target."""
+    """Weight of R_force: force of each touching finger against its target."""
     torque: float = setting(0.2, unit="1", low=0.0, high=1000.0)
-    """R_torque: each touching finger's root-joint torque against its target."""
+    """Weight of R_torque: root-joint torque of each touching finger against its target."""
     alive: float = setting(0.5, unit="1", low=0.0, high=1000.0)
-    """Each tick that the object is held."""
+    """Reward for each tick in which the object is held."""
     spread: float = setting(-0.5, unit="1/rad^2", low=-1000.0, high=0.0)
-    """R_diff: variance of the four inner fingers' first joint angles."""
+    """Weight of R_diff: variance of the first joint angles of the four inner fingers."""
     outer: float = setting(-0.05, unit="1/rad", low=-1000.0, high=0.0)
-    """R_outer: distance of the four fingers' joints from their centre posture."""
+    """Weight of R_outer: distance of the four fingers' joints from their centre posture."""
     action: float = setting(-0.02, unit="1", low=-1000.0, high=0.0)
-    """R_action: squared change of the action."""
+    """Weight of R_action: squared change of the action."""
     velocity: float = setting(-0.002, unit="s^2/rad^2", low=-1000.0, high=0.0)
-    """R_vel: squared joint velocity."""
+    """Weight of R_vel: squared joint velocity."""
     drop: float = setting(-20.0, unit="1", low=-10000.0, high=0.0)
-    """Once, when the object is lost."""
+    """Reward when the object is lost, paid once."""
     sigma: float = setting(0.10, unit="1", low=0.001, high=10.0)
-    """Width of the Gaussians, on quantities over their maxima (the paper's value)."""
+    """Width of the narrow Gaussian, in units of the maximum force or torque (the paper's value)."""
     tail_sigma: float = setting(0.40, unit="1", low=0.001, high=10.0)
-    """Width of the wide Gaussian that carries a gradient far from the target."""
+    """Width of the wide Gaussian, which gives a gradient far from the target."""
     tail: float = setting(0.4, unit="1", low=0.0, high=1.0)
-    """Share of the wide Gaussian."""
+    """Share of the wide Gaussian in the reward."""
     overload: float = setting(0.0, unit="1", low=-1000.0, high=0.0)
-    """What the four fingers press beyond `margin` above their target, over `max_force`. The Gaussians are flat there:
-    a finger that bears an object nearly alone gains nothing by letting go a little."""
+    """Weight of the four fingers' force beyond `margin` above their target, divided by `max_force`. The Gaussians are
+    flat there: a finger that carries an object nearly alone gains nothing by relaxing a little."""
     margin: float = setting(1.5, unit="N", low=0.0, high=100.0)
-    """Force above the target that `overload` leaves alone."""
+    """Force above the target that `overload` does not count."""
     thumb: str = setting("loose", choices=("loose", "track", "binary"))
-    """Thumb: it opposes all other fingers, so a balanced grasp needs more of it than of each of
-    them. "loose": only the wide Gaussian; "track": like the fingers; "binary": the paper's, any
-    force within the bounds."""
+    """Force term of the thumb, which opposes all other fingers and needs more force than each of them. loose: the wide
+    Gaussian only; track: as for the fingers; binary: the paper's, any force within the bounds."""
 
     def __post_init__(self):
         validate(self)
@@ -51,22 +50,21 @@ class GraspConfig(EnvConfig):
     """The grasp task."""
 
     episode_seconds: float = setting(6.0, unit="s", low=0.2, high=3600.0)
-    """Time limit of a training episode. Short, for objects are lost while they are caught, and longer than 3 s, from
-    where forces count: at 4 s the force follows the command less well."""
+    """Training episode length. Force is scored from 3 s on, so it must be longer than that."""
     evaluation_seconds: float = setting(8.0, unit="s", low=0.2, high=3600.0)
-    """Length of an evaluation episode: an object must be held this long."""
+    """Evaluation episode length; the object must be held this long."""
     finger_force: tuple[float, float] = setting((2.0, 7.0), unit="N", low=0.05, high=40.0)
     """Target force of a touching finger at command 0 and 1."""
     max_force: float = setting(10.0, unit="N", low=0.5, high=200.0)
-    """Calibrated maximum that forces are normalised by."""
+    """Force that forces are normalised by."""
     force_per_torque: float = setting(19.0, unit="N/Nm", low=1.0, high=200.0)
     """Finger force per root-joint torque; ties the torque target to the force target."""
     command_change: float = setting(0.005, unit="1", low=0.0, high=1.0)
-    """Probability per tick that the command is drawn anew within an episode."""
+    """Probability per tick that a new command is sampled within an episode."""
     push_probability: float = setting(0.015, unit="1", low=0.0, high=1.0)
     """Probability per tick of a push on the object."""
     push_speed: float = setting(0.3, unit="m/s", low=0.0, high=5.0)
-    """Largest change of the object's speed by a push."""
+    """Largest change of the object's speed in a push."""
     drop_distance: float = setting(0.12, unit="m", low=0.02, high=1.0)
     """The object is lost when its centre is farther than this from the grasp centre."""
     posture: tuple[float, ...] = setting(
@@ -74,13 +72,13 @@ class GraspConfig(EnvConfig):
     )
     """Joint angles that episodes start near."""
     posture_noise: float = setting(0.12, unit="rad", low=0.0, high=1.0)
-    """Largest deviation from them."""
+    """Largest deviation of the start posture from `posture`, per joint."""
     curl: tuple[float, float] = setting((-0.3, 0.1), unit="rad", low=-3.0, high=3.0)
-    """Added to all joints of the four fingers alike: how far closed they start."""
+    """Range added to all joints of the four fingers alike: how far closed they start."""
     release_gap: tuple[float, float] = setting((0.001, 0.009), unit="m", low=0.0, high=0.1)
-    """Gap between palm and object at release."""
+    """Range of the gap between palm and object at release."""
     release_speed: tuple[float, float] = setting((0.0, 0.1), unit="m/s", low=0.0, high=3.0)
-    """Speed of the object away from the palm at release."""
+    """Range of the object's speed away from the palm at release."""
     release_drift: float = setting(0.05, unit="m/s", low=0.0, high=3.0)
     """Largest speed along the palm, in each direction, at release."""
     release_spin: float = setting(1.0, unit="rad/s", low=0.0, high=30.0)
@@ -88,7 +86,7 @@ class GraspConfig(EnvConfig):
     place_noise: float = setting(0.012, unit="m", low=0.0, high=0.1)
     """Largest shift of the object along the palm, in each direction."""
     turn_noise: tuple[float, float] = setting((0.6, 0.3), unit="rad", low=0.0, high=3.2)
-    """Largest turn of an object about the palm's normal, and how far askew it lies; its roll is free."""
+    """Largest turn of the object about the palm's normal, and its largest tilt; its roll is free."""
     reward: GraspReward = setting(GraspReward())
     """Reward weights."""
 

@@ -20,41 +20,40 @@ class RotateReward:
     """Weights of the reward terms, per control tick."""
 
     goal: float = setting(0.2, unit="rad", low=0.0, high=1000.0)
-    """Close to goal: 1 / (d_rot + epsilon), gated by the distance from the reference. The paper's weight, 1, pays for
-    holding still where a stroke ended."""
+    """Weight of 1 / (d_rot + `epsilon`), the closeness to the goal, gated by the distance from the reference. The
+    paper's weight, 1, rewards holding still at the end of a stroke."""
     epsilon: float = setting(0.1, unit="rad", low=1e-3, high=10.0)
-    """Floor under the angle in it."""
+    """Constant added to the angle d_rot."""
     gate: float = setting(0.05, unit="m", low=0.001, high=1.0)
     """Distance from the reference at which the gate is half closed."""
     gate_steepness: float = setting(400.0, unit="1/m", low=1.0, high=1e5)
-    """How sharply it closes."""
+    """Slope of the gate."""
     bonus: float = setting(250.0, unit="1", low=0.0, high=1e5)
-    """Once for each goal reached ..."""
+    """Reward for each goal reached, before `bonus_tips` and `bonus_speed` reduce it."""
     bonus_tips: float = setting(0.8, unit="1", low=0.0, high=1.0)
-    """... of which this share is for `working_tips` fingertips that take part, which no hand can earn by
-    standing still ..."""
+    """Share of the bonus that depends on `working_tips` fingertips taking part; a hand cannot earn it by standing
+    still."""
     tips_after: int = setting(2, unit="1", low=0, high=1000)
-    """... once this many goals have been reached in the episode: asked for from the first goal on, it teaches
-    policies that have found one stroke to clamp the object with all fingers ..."""
+    """Goals in an episode after which `bonus_tips` counts. From the first goal on it would teach policies that have
+    found one stroke to clamp the object with all fingers."""
     bonus_speed: float = setting(0.9, unit="rad/s", low=0.01, high=1e6)
-    """... and which falls with the square of the joint speed (mean of all joints, lately) beyond this."""
+    """Recent joint speed (mean of all joints) beyond which the bonus falls with the square of the speed."""
     action: float = setting(-0.01, unit="1", low=-1000.0, high=0.0)
-    """Squared change of the action."""
+    """Weight of the squared change of the action."""
     velocity: float = setting(-0.018, unit="s^2/rad^2", low=-1000.0, high=0.0)
-    """Squared joint velocity."""
+    """Weight of the squared joint velocity."""
     torque: float = setting(-0.5, unit="1/Nm^2", low=-1000.0, high=0.0)
-    """Squared joint torque: a price on clamping the object where a stroke has ended, which is where
-    policies got stuck."""
+    """Weight of the squared joint torque: it discourages clamping the object at the end of a stroke."""
     spin: float = setting(2.0, unit="s/rad", low=0.0, high=1000.0)
-    """Spin about the axis in the wanted direction, up to +-1 rad/s: a gradient before the first
+    """Weight of the spin about the axis in the wanted direction, up to +-1 rad/s. It gives a gradient before the first
     goal is ever reached."""
     working_tips: int = setting(3, unit="1", low=1, high=20)
-    """Fingertips that are asked to take part. The least busy of them counts: by their mean two busy ones would earn
-    most of it, and some seeds keep to two."""
+    """Fingertips that should take part. The least busy of them counts: with their mean, two busy fingertips would earn
+    most of the bonus, and some seeds use only two."""
     working_duty: float = setting(0.12, unit="1", low=0.001, high=1.0)
-    """Share of the time for which one has to touch to earn all of that."""
+    """Share of the time for which a fingertip must touch to count fully."""
     drop: float = setting(-50.0, unit="1", low=-10000.0, high=0.0)
-    """Once, when the object is lost."""
+    """Reward when the object is lost, paid once."""
 
     def __post_init__(self):
         validate(self)
@@ -69,78 +68,80 @@ class RotateConfig(EnvConfig):
             shapes=("box",), mass=(0.06, 0.15), friction=(0.6, 1.2), link_friction=(0.3, 0.7), com_offset=0.003
         )
     )
-    """Mass, inertia, centre of mass, friction and contact of the object; its sizes are `edge`. The bare hand
-    is plastic: where it grips as rubber does, random strokes carry the object onto the thumb and over."""
+    """Mass, inertia, centre of mass, friction and contact of the object; its sizes are `edge`. Links have less friction
+    than fingertips: with more, random strokes carry the object over the thumb."""
     control: Control = setting(Control(step=0.08, recall="target"))
     """From action to joint target."""
     object: str = setting("cube", choices=(*KINDS, "mesh"))
-    """What is turned: a cube, an upright cylinder, an eight-cornered union of two boxes, or `objects.mesh`."""
+    """Object to rotate: a cube, an upright cylinder, an eight-cornered union of two boxes (octagon), or the mesh of
+    `objects.mesh`."""
     edge: tuple[float, float] = setting((0.050, 0.060), unit="m", low=0.02, high=0.12)
-    """Edge of the cube; width and height of the others."""
+    """Range of the edge of the cube; of width and height for the other objects."""
     axis: tuple[float, float, float] = setting((1.0, 0.0, 0.0), unit="1", low=-1.0, high=1.0)
     """Axis of rotation in the palm frame; (1, 0, 0) is the palm's normal."""
     direction: int = setting(1, unit="1", low=-1, high=1)
-    """+1 or -1: sense of rotation about the axis."""
+    """Direction of rotation about the axis, +1 or -1."""
     goal_step: float = setting(math.pi / 2, unit="rad", low=0.1, high=math.pi)
     """Angle between two goals."""
     goal_angle: float = setting(0.3, unit="rad", low=0.01, high=1.5)
-    """A goal is reached within this angle ..."""
+    """Largest angle to a goal at which it is reached."""
     goal_distance: float = setting(0.05, unit="m", low=0.001, high=0.5)
-    """... this far from the reference ..."""
+    """Largest distance from the reference at which a goal is reached."""
     goal_spin: float = setting(2.0, unit="rad/s", low=0.0, high=1000.0)
-    """... at no more than this spin about the axis; 0 for any."""
+    """Largest spin about the axis at which a goal is reached; 0 for any."""
     support: str = setting("palm", choices=("palm", "fingers"))
-    """Carried by the palm, or held clear of it by the fingers: then touching the palm is a drop."""
+    """palm: the palm carries the object; fingers: they hold it clear of the palm, and touching the palm is a drop."""
     tilt: float = setting(-0.2, unit="rad", low=-1.2, high=1.2)
-    """The hand's nominal pitch: positive lets the object slide toward the wrist, where no finger reaches it.
-    Leaning toward the fingers brings it back to them."""
+    """Nominal pitch of the hand. Positive lets the object slide toward the wrist, which no finger reaches; negative
+    returns it to the fingers."""
     roll: float = setting(-0.2, unit="rad", low=-1.2, high=1.2)
-    """The hand's nominal roll: positive lets the object slide toward the thumb, beside which it falls over the palm's
-    edge most easily."""
+    """Nominal roll of the hand. Positive lets the object slide toward the thumb, where it falls over the palm's edge
+    most easily."""
     reference: tuple[float, float, float] = setting((0.047, 0.024, 0.088), unit="m", low=-0.5, high=0.5)
-    """Where the object belongs: where thumb and fingers meet, and where the gaits that keep it carry it."""
+    """Reference position of the object, where thumb and fingers meet."""
     drop_distance: float = setting(0.07, unit="m", low=0.01, high=1.0)
-    """The object is lost when its centre is farther than this from the reference ..."""
+    """The object is lost when its centre is farther than this from the reference."""
     drop_tilt: float = setting(1.0, unit="rad", low=0.1, high=3.2)
-    """... or when it has tipped over: its own axis is farther than this from the axis of rotation,
-    and no goal can be reached any more."""
+    """The object is lost when it has tipped over: its own axis is farther than this from the axis of rotation, and no
+    goal can be reached any more."""
     patience: float = setting(4.0, unit="s", low=0.1, high=1e6)
-    """A training episode without a new goal for this long is given up, as a drop is: else policies
-    learn to turn once and then hold still. Evaluations wait for ever."""
+    """A training episode ends as a drop after this long without a new goal. Without this limit policies learn to turn
+    once and then hold still. Evaluations have no such limit."""
     drop_radius: float = setting(0.055, unit="m", low=0.01, high=1.0)
-    """A training episode whose object is farther than this from the reference is given up likewise: else some policies
-    learn gaits that roam over the palm, and lose it over the edge. Evaluations end with `drop_distance`."""
+    """A training episode ends as a drop when the object is farther than this from the reference. Without this limit
+    some policies learn gaits that lose the object over the palm's edge. Evaluations use `drop_distance`."""
     clearance: float = setting(0.001, unit="m", low=0.0, high=0.05)
     """Smallest gap between palm and object with support "fingers"."""
     episode_seconds: float = setting(20.0, unit="s", low=0.2, high=3600.0)
-    """Time limit of a training episode: short, as most that is lost is lost with the first strokes."""
+    """Training episode length. It is short, as most objects are lost in the first strokes."""
     evaluation_seconds: float = setting(120.0, unit="s", low=0.2, high=3600.0)
-    """Length of an evaluation episode."""
+    """Evaluation episode length."""
     push_probability: float = setting(0.005, unit="1", low=0.0, high=1.0)
     """Probability per tick of a push on the object."""
     push_speed: float = setting(0.1, unit="m/s", low=0.0, high=5.0)
-    """Largest change of the object's speed by a push."""
+    """Largest change of the object's speed in a push."""
     posture: tuple[float, ...] = setting(
         (1.0, 0.2, 0.3, 0.0, 0.8, 0.5, 0.8, 0.5, 0.8, 0.5, 0.8, 0.5), unit="rad", low=-3.2, high=3.2
     )
     """Joint angles that episodes start near."""
     posture_noise: float = setting(0.3, unit="rad", low=0.0, high=1.0)
-    """Largest deviation from them: wide, so that where one stroke ends is where another can begin."""
+    """Largest deviation of the start posture from `posture`, per joint. It is wide, so that a stroke can begin where
+    another ended."""
     curl: tuple[float, float] = setting((0.0, 0.0), unit="rad", low=-2.0, high=2.0)
-    """Added to all joints of the four fingers alike."""
+    """Range added to all joints of the four fingers alike."""
     squeeze: tuple[float, float] = setting((0.0, 0.0), unit="rad", low=-1.0, high=1.0)
-    """How far the joint targets of thumb and fingers lie beyond that posture: the grip."""
+    """Range of the distance between joint targets and start posture of thumb and fingers: the grip."""
     heading_noise: float = setting(0.7, unit="rad", low=0.0, high=math.pi)
     """Largest turn of the object about the axis at the start."""
     start_offset: tuple[float, float] = setting((-0.018, -0.001), unit="m", low=-0.1, high=0.1)
-    """Where the object is put at the start, across and along the palm (y, z) from the reference: a little away
-    from thumb and fingertips, beside which the first stroke often fails ..."""
+    """Start position of the object, across and along the palm (y, z) from the reference: a little away from thumb and
+    fingertips, beside which the first stroke often fails."""
     place_noise: float = setting(0.010, unit="m", low=0.0, high=0.05)
-    """... and the largest shift from there."""
+    """Largest shift of the object from its start position."""
     settle_seconds: float = setting(0.8, unit="s", low=0.05, high=10.0)
-    """Time that start states are given to come to rest; those that do not are left out."""
+    """Time for start states to come to rest; states that do not are discarded."""
     reward: RotateReward = setting(RotateReward(gate=0.04))
-    """Reward weights. The gate closes short of `goal_distance`, about which nothing reaches the object any more."""
+    """Reward weights. The gate closes before `goal_distance`."""
 
     def __post_init__(self):
         validate(self)

@@ -1,1 +1,1 @@
-"""The emulated hand's physics, which shares no code with the simulation."""
+"""Physics of the emulated hand, which shares no code with the simulation that policies train in."""

@@ -1,10 +1,10 @@
-"""Whoever puts the object into the hand: waits for the start posture, holds it in place, lets go, takes it away.
+"""The assistant: an emulated person who places the object, releases it, and takes it away.
 
-    AWAY -> (targets stand at the start posture, joints near it) -> HOLD -> (targets move on) -> FREE -> AWAY
+    AWAY -> (joint targets at the start posture, joints near it) -> HOLD -> (joint targets move) -> FREE -> AWAY
 
-While away the object has the orientation that it will be put down with, so that an IMU in it can be aligned. A
-runner that goes on after a drop never returns to the start posture: when `patience` is over and the object's place
-is clear, the assistant gives it the next object as its fingers are.
+While away the object has its release orientation, so that an IMU in it can be aligned. A runner that continues after a
+drop never returns to the start posture: after `patience` seconds the assistant places the next object as soon as the
+fingers leave its place clear.
 """
 
 import dataclasses
@@ -14,30 +14,30 @@ import mujoco
 import numpy as np
 
 from dexsim_real.twin.plant import shapes
-from dexsim_real.twin.plant.draw import Draw
+from dexsim_real.twin.plant.parameters import TrialParameters
 from dexsim_real.twin.plant.scene import Scene
-from dexsim_real.twin.plant.shapes import Shape, product, turn
+from dexsim_real.twin.plant.shapes import ObjectShape, product, turn
 
 POSTURES = {
     "grasp": (1.45, 0.15, 0.25, 0.0, 1.1, 0.8, 1.1, 0.8, 1.1, 0.8, 1.1, 0.8),
     "rotate": (1.0, 0.2, 0.3, 0.0, 0.8, 0.5, 0.8, 0.5, 0.8, 0.5, 0.8, 0.5),
 }
-"""Joint angles rad at which a run begins."""
+"""Start posture [12] rad by task."""
 REFERENCES = {"grasp": (0.055, -0.005, 0.090), "rotate": (0.047, 0.024, 0.088)}
-"""Where the object belongs, m."""
+"""Nominal position [3] m of the object by task, palm frame."""
 PLACES = {"grasp": REFERENCES["grasp"][1:], "rotate": (0.007, 0.079)}
-"""Where along the palm (y, z) it is put, m: in the middle of training's start states. 5 mm nearer to the wrist is where
-hardly any of them lies, and a policy's first strokes may miss it there (`docs/hardware.md` tells users so)."""
+"""Position along the palm (y, z) m where the object is placed: the centre of the start states in training. Few of them
+are 5 mm nearer to the wrist, and a policy may miss an object there (docs/hardware.md)."""
 PALM_FACE = 0.020  # m, x of the palm's surface
-_ARRIVED, _LEFT = 0.002, 0.005  # rad, targets off the start posture: arrived within, gone beyond
-_NEAR = 0.3  # rad, joints off it: the hand stands there as well as its gears let it
-_OVERLAP = 0.0015  # m that object and hand may share where it is put
-_SHELF = np.array([0.35, 0.0, 0.0])  # m from its place, where an object waits
-_HAND_OVER = 0.5  # s of holding before letting go, for a runner that goes on
+_ARRIVED, _LEFT = 0.002, 0.005  # rad, distance of targets from the start posture: arrived below, left above
+_NEAR = 0.3  # rad, largest distance of a joint from the start posture
+_OVERLAP = 0.0015  # m, largest overlap of object and hand where it is placed
+_SHELF = np.array([0.35, 0.0, 0.0])  # m, waiting position relative to the release position
+_HAND_OVER = 0.5  # s of holding before release, for a runner that continues after a drop
 
 
 class Stage(enum.Enum):
-    """Where the object is."""
+    """State of the object in a trial."""
 
     AWAY = "away"
     HOLD = "hold"
@@ -46,45 +46,45 @@ class Stage(enum.Enum):
 
 @dataclasses.dataclass(frozen=True)
 class Place:
-    """Where and how fast an object is let go, palm frame."""
+    """Release pose and velocity of an object, palm frame."""
 
     position: np.ndarray  # [3] m
     quat: np.ndarray  # [4]
     velocity: np.ndarray  # [3] m/s
 
 
-def draw_place(draw: Draw, shape: Shape, rng: np.random.Generator) -> Place:
-    """A place to let go of the object, whether the fingers leave it free or not."""
-    if draw.task == "rotate":
-        quat = turn((1.0, 0.0, 0.0), float(draw.heading_error) * rng.uniform(-1, 1))
-        shift = float(draw.place_error) * rng.uniform(-1, 1, 2)
+def sample_place(parameters: TrialParameters, shape: ObjectShape, rng: np.random.Generator) -> Place:
+    """Sample a release pose of the object; the fingers may overlap it."""
+    if parameters.task == "rotate":
+        quat = turn((1.0, 0.0, 0.0), float(parameters.heading_error) * rng.uniform(-1, 1))
+        shift = float(parameters.place_error) * rng.uniform(-1, 1, 2)
         gap, speed = 0.0005, 0.0
     else:
-        # Long objects lie across the fingers, a little askew; their roll is free.
+        # The long axis is across the fingers with a small error; the roll about it is uniform.
         roll, about, askew = rng.uniform(-1, 1, 3)
         quat = turn((0.0, 0.0, 1.0), roll * np.pi)
         for axis, angle in (((1, 0, 0), -np.pi / 2), ((0, 0, 1), 0.2 * askew), ((1, 0, 0), 0.5 * about)):
             quat = product(turn(axis, angle), quat)
         shift = 0.01 * rng.uniform(-1, 1, 2)
-        gap, speed = float(draw.gap), float(draw.release_speed)
+        gap, speed = float(parameters.gap), float(parameters.release_speed)
     up = shapes.matrix(quat).T @ np.array([-1.0, 0.0, 0.0])
-    position = np.array([PALM_FACE + gap + shape.reach(up), *(PLACES[draw.task] + shift)])
+    position = np.array([PALM_FACE + gap + shape.reach(up), *(PLACES[parameters.task] + shift)])
     return Place(position, quat, np.array([speed, 0.0, 0.0]))
 
 
-def find_place(scene: Scene, draw: Draw, shape: Shape, rng: np.random.Generator) -> Place | None:
-    """A place where the hand in its start posture leaves the object free; None when there seems to be none."""
+def find_place(scene: Scene, parameters: TrialParameters, shape: ObjectShape, rng: np.random.Generator) -> Place | None:
+    """Sample a release pose that the hand in its start posture leaves clear; None when 60 attempts find none."""
     data = mujoco.MjData(scene.model)
-    data.qpos[scene.drive_qpos] = POSTURES[draw.task]
+    data.qpos[scene.drive_qpos] = POSTURES[parameters.task]
     for _ in range(60):
-        place = draw_place(draw, shape, rng)
+        place = sample_place(parameters, shape, rng)
         if clear(scene, data, place):
             return place
     return None
 
 
 def clear(scene: Scene, data: mujoco.MjData, place: Place) -> bool:
-    """Whether the hand, as `data` has it, leaves the object's place free. Moves the object there."""
+    """Whether the hand in the state `data` leaves the release pose clear. Moves the object there."""
     put(scene, data, place.position, place.quat)
     mujoco.mj_kinematics(scene.model, data)
     mujoco.mj_collision(scene.model, data)
@@ -95,7 +95,7 @@ def clear(scene: Scene, data: mujoco.MjData, place: Place) -> bool:
 def put(
     scene: Scene, data: mujoco.MjData, position: np.ndarray, quat: np.ndarray, velocity: np.ndarray | None = None
 ) -> None:
-    """Place the object, at rest or with a velocity [3] m/s."""
+    """Set the object's pose, and its velocity [3] m/s or zero."""
     at, dof = scene.object_qpos, scene.object_dof
     data.qpos[at : at + 3], data.qpos[at + 3 : at + 7] = position, quat
     data.qvel[dof : dof + 6] = 0.0
@@ -104,10 +104,11 @@ def put(
 
 
 class Assistant:
-    """The stage of a trial.
+    """Decides the stage of a trial.
 
     Args:
-      patience: s after which a runner that does not return to the start posture is served as it is.
+      task: "grasp" or "rotate".
+      patience: s after which a runner that does not return to the start posture gets its object where it is.
     """
 
     def __init__(self, task: str, patience: float = 15.0):
@@ -115,38 +116,39 @@ class Assistant:
         self.begin(0.0)
 
     def begin(self, time: float) -> None:
-        """Take the object away and wait for the hand."""
+        """Take the object away at a time in s, and wait for the hand."""
         self.stage, self._since, self._held, self._on = Stage.AWAY, time, None, False
 
     def watch(self, time: float, targets: np.ndarray | None, joints: np.ndarray, free: bool | None) -> Stage:
-        """The stage after one more look.
+        """Update the stage.
 
         Args:
-          targets: [12] rad that the motors follow; None when they are off.
-          joints: [12] rad.
-          free: whether the object's place is clear of the hand; None when nobody looked (see `curious`).
+          time: s.
+          targets: [12] rad, joint targets; None when the motors are off.
+          joints: [12] rad, joint angles.
+          free: whether the hand leaves the release pose clear; None when unknown (see `wants_clearance`).
         """
         if self.stage is Stage.FREE:
             return self.stage
         if targets is None:
             self.begin(time)
             return self.stage
-        if not self._on:  # Patience is with a runner at work, not with a hand that is switched off.
+        if not self._on:  # Patience counts while the motors are on.
             self._on, self._since = True, time
         off = np.max(np.abs(targets - self._posture))
         if self.stage is Stage.AWAY:
             if off < _ARRIVED and np.max(np.abs(joints - self._posture)) < _NEAR:
                 self.stage, self._held = Stage.HOLD, None
-            elif free and self.curious(time):
+            elif free and self.wants_clearance(time):
                 self.stage, self._held = Stage.HOLD, time
         elif self._held is None and off > _LEFT or self._held is not None and time - self._held > _HAND_OVER:
             self.stage = Stage.FREE
         return self.stage
 
-    def curious(self, time: float) -> bool:
-        """Whether it would serve a hand that is not in its start posture."""
+    def wants_clearance(self, time: float) -> bool:
+        """Whether `watch` needs to know if the release pose is clear: the patience is over."""
         return self.stage is Stage.AWAY and self._on and time - self._since > self._patience
 
     def shelf(self, place: Place) -> np.ndarray:
-        """Where the object waits, [3] m."""
+        """Waiting position [3] m of the object."""
         return place.position + _SHELF

@@ -1,8 +1,8 @@
-"""The truth about a trial on the emulated hand: what the paper counts, from the world's own state.
+"""The referee: metrics of a trial on the emulated hand, from the true state.
 
-No sensor, calibration or goal of the runner enters here. Rules are those of the tasks: an object that is grasped is
-lost farther than 0.12 m from its place; a cube that is turned has reached a goal within 0.3 rad and 0.05 m of it
-(the paper's count) at no more than 2 rad/s (the task's count), is lost 0.07 m away, or tipped by 1 rad.
+No sensor, calibration or goal of the runner is used. The rules are those of the tasks. A grasped object is lost beyond
+0.12 m from its nominal position. A cube has reached a goal within 0.3 rad and 0.05 m (the paper's count) and at no more
+than 2 rad/s (the task's count); it is lost beyond 0.07 m, or when tipped by 1 rad.
 """
 
 import math
@@ -14,23 +14,23 @@ from dexsim_real.twin.plant.assistant import REFERENCES
 from dexsim_real.twin.plant.shapes import matrix, product, turn
 
 LIMITS = {"grasp": 8.0, "rotate": 120.0}
-"""Seconds of a trial that nothing ends."""
-LOST = {"grasp": 0.12, "rotate": 0.07}  # m
+"""Time limit in s of a trial, by task."""
+LOST = {"grasp": 0.12, "rotate": 0.07}  # m, drop radius
 GOAL_STEP, GOAL_ANGLE, GOAL_DISTANCE, GOAL_SPIN = math.pi / 2, 0.3, 0.05, 2.0  # rad, rad, m, rad/s
 TIPPED = 1.0  # rad
-TOUCH = 0.1  # N from which a fingertip counts as touching (grasp: `_GRIP`)
+TOUCH = 0.1  # N above which a fingertip counts as touching (for forces of a grasp: `_GRIP`)
 _GRIP = 0.01  # N
-_SETTLE = 3.0  # s after release from which forces count
-_RECENT = 0.2  # s, a fingertip that touched within it before a drop pushed the object out
+_SETTLE = 3.0  # s after release before forces count
+_RECENT = 0.2  # s; a fingertip that touched this shortly before a drop pushed the object out
 _AXIS = np.array([1.0, 0.0, 0.0])
 
 
 class Referee:
-    """Watches one trial from release to end.
+    """Follows one trial from release to end.
 
     Args:
       task: "grasp" or "rotate".
-      seconds: time limit; None for the task's.
+      seconds: time limit; None is that of the task.
     """
 
     def __init__(self, task: str, seconds: float | None = None):
@@ -58,13 +58,15 @@ class Referee:
         pressing: np.ndarray,
         joint_speed: np.ndarray,
     ) -> None:
-        """One more look.
+        """Update with the current state.
 
         Args:
-          step: s since the last one.
-          position, quat, spin: of the object in the palm frame; m, -, rad/s.
+          step: s since the last update.
+          position: [3] m of the object, palm frame.
+          quat: [4] orientation of the object, palm frame.
+          spin: [3] rad/s, angular velocity of the object, palm frame.
           tips: [5, 3] N, the solver's force on each fingertip.
-          pressing: [5] N, the sum of its contacts' normal forces, which is what taxels can feel of it.
+          pressing: [5] N, sum of the normal forces of each fingertip, the part that taxels can measure.
           joint_speed: [12] rad/s.
         """
         if self.over:
@@ -91,7 +93,7 @@ class Referee:
             self.end = "time limit"
 
     def _grip(self, strength: np.ndarray, pressing: np.ndarray) -> None:
-        """The command speaks to the four fingers; the thumb balances them."""
+        """Accumulate forces. The command applies to the four fingers; the thumb balances them."""
         touching = strength[1:] > _GRIP
         if touching.any():
             self._finger += float(strength[1:][touching].mean())
@@ -101,7 +103,7 @@ class Referee:
         self._counted += 1
 
     def report(self) -> dict[str, Any]:
-        """What has been seen so far; JSON-able."""
+        """Metrics so far; JSON-able."""
         lived, count = max(self.time, 1e-9), max(self._counted, 1)
         report: dict[str, Any] = {
             "seconds": round(self.time, 4),
@@ -130,10 +132,10 @@ class Referee:
 
 
 class GoalCount:
-    """Consecutive goals 90 degrees apart about the palm's normal, from the heading of the first look.
+    """Counts consecutive goals 90 degrees apart about the palm's normal, from the first heading.
 
     Args:
-      fastest: rad/s about the axis at which a goal still counts.
+      fastest: largest rad/s about the axis at which a goal counts.
     """
 
     def __init__(self, fastest: float):
@@ -143,8 +145,8 @@ class GoalCount:
         self._heading = 0.0
 
     def watch(self, time: float, quat: np.ndarray, away: float, spin: float) -> None:
-        """One more look: orientation [4], distance m from the object's place, spin rad/s."""
-        heading = 2 * math.atan2(quat[1], quat[0])  # the turn about x that is nearest to the orientation
+        """Update with time s, orientation [4], distance m from the nominal position, spin rad/s about the axis."""
+        heading = 2 * math.atan2(quat[1], quat[0])  # angle of the rotation about x nearest to the orientation
         if self._start is None:
             self._start = self._heading = heading
         self.angle += (heading - self._heading + math.pi) % (2 * math.pi) - math.pi

@@ -1,8 +1,8 @@
-"""The emulated hand's world in C MuJoCo: the hand with gears that have play, an object, their contacts.
+"""The MuJoCo model of a trial: the hand with gear play, an object, their contacts.
 
-Each joint is two hinges about one axis. The first is the drive: it carries the rotor's inertia, friction and
-the encoder. The second is the gear's play: free within its gap, then stiff. Contacts have elliptic cones and are
-springs with the stiffness asked for; rubber tips also resist twisting.
+Each joint is two hinges about one axis. The first is the drive, with the rotor's inertia, friction and the encoder. The
+second is the gear play: free within its gap, then stiff. Contacts are springs of given stiffness with elliptic friction
+cones; rubber fingertips also have torsional friction.
 """
 
 import dataclasses
@@ -12,15 +12,15 @@ import mujoco
 import numpy as np
 
 from dexsim.hand.kinematics import Hand
-from dexsim_real.twin.plant.draw import Draw
-from dexsim_real.twin.plant.shapes import Shape
+from dexsim_real.twin.plant.parameters import TrialParameters
+from dexsim_real.twin.plant.shapes import ObjectShape
 
 TIMESTEP = 0.0005  # s
 ROTORS = (8e-4, 4e-4)  # kg m^2, inertia of the strong and the weak motors as seen at the joint
-STRONG = 0.8  # Nm, joints with more than this have strong motors
+STRONG = 0.8  # Nm, torque limit above which a joint has a strong motor
 END_STOP = 300.0  # Nm/rad
-_GREASE = 0.02  # Nm s/rad of a gear that nothing is known of
-_STIFF_FRICTION = (0.002, 1.0)  # solref of dry friction: what sticks creeps by less than 1e-3 rad/s
+_GREASE = 0.02  # Nm s/rad, assumed viscous friction of a gear
+_STIFF_FRICTION = (0.002, 1.0)  # solref of dry friction: a sticking joint creeps by less than 1e-3 rad/s
 _KINDS = {
     "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
     "box": mujoco.mjtGeom.mjGEOM_BOX,
@@ -31,28 +31,28 @@ _KINDS = {
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """A compiled world and where things are in it; J joints in the hand's own order, F fingers."""
+    """A compiled model and its indices; J joints in the order of the hand, F fingers."""
 
     model: mujoco.MjModel
     drive_qpos: np.ndarray  # [J]
     drive_dof: np.ndarray  # [J]
     play_qpos: np.ndarray  # [J]
     play_dof: np.ndarray  # [J]
-    object_qpos: int  # of seven
-    object_dof: int  # of six
+    object_qpos: int  # first of seven
+    object_dof: int  # first of six
     object_body: int
     tip_body: np.ndarray  # [F]
     finger_of_geom: np.ndarray  # [geoms] index of the fingertip, -1 for none
     is_object: np.ndarray  # [geoms] bool
 
 
-def build_scene(hand: Hand, draw: Draw, shape: Shape | None, gravity: np.ndarray) -> Scene:
-    """Compile a trial's world.
+def build_scene(hand: Hand, parameters: TrialParameters, shape: ObjectShape | None, gravity: np.ndarray) -> Scene:
+    """Compile the model of a trial.
 
     Args:
-      hand: geometry, joint ranges and torque classes; nothing else of it is used.
-      draw: the trial's parameters.
-      shape: the object; None for the hand alone (a speck stands in for it).
+      hand: only its geometry, joint ranges and torque limits are used.
+      parameters: of the trial.
+      shape: of the object; None for the hand alone, with a body without geometry in its place.
       gravity: [3] m/s^2, palm frame.
     """
     spec = mujoco.MjSpec.from_file(str(hand.model_path))
@@ -60,41 +60,41 @@ def build_scene(hand: Hand, draw: Draw, shape: Shape | None, gravity: np.ndarray
         spec.delete(element)
     palm = spec.body(hand.palm)
     palm.pos, palm.quat = [0, 0, 0], [1, 0, 0, 0]
-    _add_play(spec, hand, draw)
-    skins = _cover(spec, hand, draw)
-    _add_object(spec, draw, shape)
-    _add_pairs(spec, shape, draw, skins)
+    _add_play(spec, hand, parameters)
+    skins = _cover(spec, hand, parameters)
+    _add_object(spec, parameters, shape)
+    _add_pairs(spec, shape, parameters, skins)
     option = spec.option
     option.timestep, option.gravity = TIMESTEP, gravity
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    option.cone, option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, float(draw.cone_ratio)
+    option.cone, option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, float(parameters.cone_ratio)
     option.solver, option.iterations, option.tolerance = mujoco.mjtSolver.mjSOL_NEWTON, 30, 1e-9
     model = spec.compile()
-    _set_springs(model, draw, skins)
+    _set_springs(model, parameters, skins)
     return _index(model, hand)
 
 
-def _add_play(spec: mujoco.MjSpec, hand: Hand, draw: Draw) -> None:
+def _add_play(spec: mujoco.MjSpec, hand: Hand, parameters: TrialParameters) -> None:
     for j, name in enumerate(hand.joint_names):
         drive, strong = spec.joint(name), hand.torque_limit[j] > STRONG
-        drive.armature = float(draw.rotor_inertia) * ROTORS[0 if strong else 1]
-        drive.damping = _fill(drive.damping, _GREASE + float(draw.viscous_friction[j]))
-        drive.frictionloss = 1e-4  # So that it has a row in the solver; the drive sets it at each step.
+        drive.armature = float(parameters.rotor_inertia) * ROTORS[0 if strong else 1]
+        drive.damping = _fill(drive.damping, _GREASE + float(parameters.viscous_friction[j]))
+        drive.frictionloss = 1e-4  # Not 0, so that it has a row in the solver; set at each step.
         drive.solref_friction, drive.solimp_friction[:2] = _STIFF_FRICTION, (0.99, 0.99)
-        half = max(float(draw.gear_play[j]), 1e-6) / 2
+        half = max(float(parameters.gear_play[j]), 1e-6) / 2
         play = drive.parent.add_joint(
             name=f"{name}_play",
             type=mujoco.mjtJoint.mjJNT_HINGE,
             axis=drive.axis,
             pos=drive.pos,
             range=[-half, half],
-            armature=float(draw.gear_inertia),
+            armature=float(parameters.gear_inertia),
         )
         play.damping = _fill(play.damping, 2e-4)
 
 
 def _fill(value, number: float):
-    """A joint's damping, which is one number or a polynomial's coefficients."""
+    """Damping of a joint, which is a number or the coefficients of a polynomial."""
     if np.ndim(value) == 0:
         return number
     filled = np.zeros_like(value)
@@ -102,8 +102,8 @@ def _fill(value, number: float):
     return filled
 
 
-def _cover(spec: mujoco.MjSpec, hand: Hand, draw: Draw) -> dict[str, bool]:
-    """Put rubber on the fingertips; names of the geoms that touch, and whether they wear rubber."""
+def _cover(spec: mujoco.MjSpec, hand: Hand, parameters: TrialParameters) -> dict[str, bool]:
+    """Put rubber on the fingertips; returns the names of the colliding geoms, and whether they have rubber."""
     tips = {hand.body_names[b] for b in hand.tip_body}
     names = {}
     for geom in spec.geoms:
@@ -112,20 +112,20 @@ def _cover(spec: mujoco.MjSpec, hand: Hand, draw: Draw) -> dict[str, bool]:
         if touches:
             names[geom.name] = geom.parent.name in tips
             if names[geom.name]:
-                geom.size = [geom.size[0] + float(draw.rubber), *geom.size[1:]]
+                geom.size = [geom.size[0] + float(parameters.rubber), *geom.size[1:]]
     return names
 
 
-def _add_object(spec: mujoco.MjSpec, draw: Draw, shape: Shape | None) -> None:
+def _add_object(spec: mujoco.MjSpec, parameters: TrialParameters, shape: ObjectShape | None) -> None:
     body = spec.worldbody.add_body(name="object", pos=[0.5, 0, 0])
     body.add_freejoint(name="object")
     if shape is None:
         body.explicitinertial, body.mass, body.inertia = True, 0.1, [1e-5] * 3
         return
-    mass, centre, inertia = mass_properties(shape, float(draw.mass))
-    body.explicitinertial, body.mass, body.ipos = True, mass, centre + draw.com_offset
-    # Diagonal by the shapes' symmetry.
-    body.inertia = np.diag(inertia) * float(draw.inertia_scale)
+    mass, centre, inertia = mass_properties(shape, float(parameters.mass))
+    body.explicitinertial, body.mass, body.ipos = True, mass, centre + parameters.com_offset
+    # Diagonal because of the symmetry of the shapes.
+    body.inertia = np.diag(inertia) * float(parameters.inertia_scale)
     for k, part in enumerate(shape.parts):
         body.add_geom(
             name=f"object_{k}",
@@ -143,8 +143,8 @@ def _three(size: tuple[float, ...]) -> list[float]:
 
 
 @functools.lru_cache(maxsize=64)
-def _solid(shape: Shape) -> tuple[float, np.ndarray, np.ndarray]:
-    """Mass, centre and inertia about it of the uniform solid of density 1, as MuJoCo's compiler has them."""
+def _solid(shape: ObjectShape) -> tuple[float, np.ndarray, np.ndarray]:
+    """Mass, centre and inertia about the centre of a uniform solid of density 1, from MuJoCo's compiler."""
     spec = mujoco.MjSpec()
     body = spec.worldbody.add_body(name="solid")
     for part in shape.parts:
@@ -157,18 +157,20 @@ def _solid(shape: Shape) -> tuple[float, np.ndarray, np.ndarray]:
     return float(model.body_mass[1]), model.body_ipos[1].copy(), turn @ np.diag(model.body_inertia[1]) @ turn.T
 
 
-def mass_properties(shape: Shape, mass: float) -> tuple[float, np.ndarray, np.ndarray]:
+def mass_properties(shape: ObjectShape, mass: float) -> tuple[float, np.ndarray, np.ndarray]:
     """Mass kg, centre [3] m and inertia [3, 3] kg m^2 of a uniform solid of this shape (overlaps count twice)."""
     volume, centre, inertia = _solid(shape)
     return mass, centre, inertia * mass / volume
 
 
-def _add_pairs(spec: mujoco.MjSpec, shape: Shape | None, draw: Draw, skins: dict[str, bool]) -> None:
+def _add_pairs(
+    spec: mujoco.MjSpec, shape: ObjectShape | None, parameters: TrialParameters, skins: dict[str, bool]
+) -> None:
     for k in range(len(shape.parts) if shape else 0):
         for name, rubber in skins.items():
-            slide = float(draw.friction if rubber else draw.link_friction)
-            twist = float(draw.torsion) * slide if rubber else 1e-4
-            roll = float(draw.rolling) * slide if rubber else 1e-5
+            slide = float(parameters.friction if rubber else parameters.link_friction)
+            twist = float(parameters.torsion) * slide if rubber else 1e-4
+            roll = float(parameters.rolling) * slide if rubber else 1e-5
             spec.add_pair(
                 geomname1=name,
                 geomname2=f"object_{k}",
@@ -181,7 +183,7 @@ def _add_pairs(spec: mujoco.MjSpec, shape: Shape | None, draw: Draw, skins: dict
 
 
 def spring(inverse_mass: float, stiffness: float, damping: float) -> tuple[np.ndarray, np.ndarray]:
-    """solref and solimp of a constraint that pushes back with `stiffness` r at rest.
+    """solref and solimp of a constraint whose force at rest is `stiffness` r, for a penetration r.
 
     A constraint of impedance d and regularisation R = A (1 - d) / d gives a force (d k r + b v + a_0) / (A + R), a_0
     being the acceleration without it: d k r / R at rest, and a motion x'' = -d (d k x + b x') by itself
@@ -192,7 +194,7 @@ def spring(inverse_mass: float, stiffness: float, damping: float) -> tuple[np.nd
     Args:
       inverse_mass: A in 1/kg (or 1/(kg m^2)), MuJoCo's estimate for the two bodies.
       stiffness: N/m (Nm/rad).
-      damping: N s/m (Nm s/rad) that goes with this stiffness.
+      damping: N s/m (Nm s/rad) for this stiffness.
     """
     loss = min(0.5, (0.7 / (damping * inverse_mass * TIMESTEP)) ** 2)
     loss = max(loss, 0.02)
@@ -208,9 +210,9 @@ def spring(inverse_mass: float, stiffness: float, damping: float) -> tuple[np.nd
 
 @functools.lru_cache(maxsize=1)
 def _bounces() -> tuple[np.ndarray, np.ndarray]:
-    """Damping ratios and the restitutions that they give, by integrating a bounce.
+    """Damping ratios z and their coefficients of restitution, by integrating a bounce.
 
-    x'' + 2 z x' + x = 0 from x' = 1 until the force 2 z x' + x is no longer a push.
+    x'' + 2 z x' + x = 0 from x' = 1 until the force 2 z x' + x is no longer repulsive.
     """
     ratios = np.linspace(0.02, 6.0, 300)
     position, speed = np.zeros_like(ratios), np.ones_like(ratios)
@@ -228,28 +230,28 @@ def _bounces() -> tuple[np.ndarray, np.ndarray]:
 
 
 def damping_of(restitution: float, stiffness: float, mass: float) -> float:
-    """Damping N s/m of a spring N/m that throws a mass kg back with this restitution."""
+    """Damping N s/m of a contact spring N/m with this coefficient of restitution for a mass in kg."""
     ratios, outcome = _bounces()
     ratio = np.interp(restitution, outcome[::-1], ratios[::-1])
     return float(2 * ratio * np.sqrt(stiffness * mass))
 
 
-def _set_springs(model: mujoco.MjModel, draw: Draw, skins: dict[str, bool]) -> None:
-    mass, restitution = float(draw.mass), float(draw.restitution)
+def _set_springs(model: mujoco.MjModel, parameters: TrialParameters, skins: dict[str, bool]) -> None:
+    mass, restitution = float(parameters.mass), float(parameters.restitution)
     for p in range(model.npair):
         ids = (model.pair_geom1[p], model.pair_geom2[p])
         names = [model.geom(g).name for g in ids]
         ours = [name for name in names if name in skins]
         if not any(name.startswith("object_") for name in names):
             continue
-        stiffness = float(draw.stiffness_contact if skins[ours[0]] else draw.palm_stiffness)
+        stiffness = float(parameters.stiffness_contact if skins[ours[0]] else parameters.palm_stiffness)
         inverse_mass = float(model.body_invweight0[model.geom_bodyid[list(ids)], 0].sum())
         damping = damping_of(restitution, stiffness, mass)
         model.pair_solref[p], model.pair_solimp[p] = spring(inverse_mass, stiffness, damping)
     for j in range(model.njnt):
         if model.joint(j).name.endswith("_play"):
             inverse_mass = float(model.dof_invweight0[model.jnt_dofadr[j]])
-            stiffness = float(draw.gear_stiffness)
+            stiffness = float(parameters.gear_stiffness)
             model.jnt_solref[j], model.jnt_solimp[j] = spring(
                 inverse_mass, stiffness, 2 * np.sqrt(stiffness / inverse_mass)
             )

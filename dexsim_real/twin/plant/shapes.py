@@ -1,44 +1,43 @@
-"""Objects of the emulated hand: unions of primitives, their exact distance, and how they are drawn.
+"""Objects of the emulated hand: unions of primitives, signed distances, sampling.
 
-Written for this hand alone, in NumPy; what training collides and feels with is other code.
-Axes of capsules and cylinders are their own z.
+Written in NumPy and independent of the code that training uses. The axis of capsules and cylinders is z.
 """
 
 import dataclasses
 
 import numpy as np
 
-from dexsim_real.twin.plant.draw import Draw
+from dexsim_real.twin.plant.parameters import TrialParameters
 
 SHAPES = ("sphere", "box", "cylinder", "capsule", "composition")
-BODY_SHARE = 0.8  # size of a composition's body against one that stands alone
+BODY_SHARE = 0.8  # size of a composition's body relative to a single body
 
 
 @dataclasses.dataclass(frozen=True)
-class Part:
-    """One primitive, aligned with the object's axes."""
+class Primitive:
+    """A primitive, aligned with the object's axes."""
 
     kind: str  # "sphere", "box", "cylinder", "capsule"
-    size: tuple[float, ...]  # radius; half extents; radius, half length
-    place: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    size: tuple[float, ...]  # m: radius; half extents; radius, half length
+    place: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m, centre in the object's frame
 
 
 @dataclasses.dataclass(frozen=True)
-class Shape:
-    """A union of parts."""
+class ObjectShape:
+    """A union of primitives."""
 
     name: str
-    parts: tuple[Part, ...]
+    parts: tuple[Primitive, ...]
 
     def distance(self, points: np.ndarray) -> np.ndarray:
         """Signed distance [...] m of points [..., 3] in the object's frame, negative inside.
 
-        Inside a union it is a bound: the depth below the nearer part's surface.
+        Inside a union it is a lower bound: the depth below the nearest surface of a primitive.
         """
         return np.min([_DISTANCE[part.kind](points - part.place, part.size) for part in self.parts], axis=0)
 
     def reach(self, direction: np.ndarray) -> float:
-        """How far m the object extends along a unit direction [3] of its frame, from its origin."""
+        """Extent in m of the object from its origin along a unit direction [3] of its frame."""
         return max(_reach(part, direction) + float(np.dot(part.place, direction)) for part in self.parts)
 
 
@@ -65,7 +64,7 @@ def _capsule(points: np.ndarray, size: tuple[float, ...]) -> np.ndarray:
 _DISTANCE = {"sphere": _sphere, "box": _box, "cylinder": _cylinder, "capsule": _capsule}
 
 
-def _reach(part: Part, direction: np.ndarray) -> float:
+def _reach(part: Primitive, direction: np.ndarray) -> float:
     x, y, z = np.abs(direction)
     size, across = part.size, float(np.hypot(x, y))
     return float(
@@ -78,28 +77,30 @@ def _reach(part: Part, direction: np.ndarray) -> float:
     )
 
 
-def draw_shape(draw: Draw, rng: np.random.Generator, name: str | None = None) -> Shape:
-    """The object of a trial: a cube to rotate, any of `SHAPES` to grasp (or the one of that name)."""
+def sample_shape(parameters: TrialParameters, rng: np.random.Generator, name: str | None = None) -> ObjectShape:
+    """Sample the object of a trial: a cube to rotate; to grasp, one of `SHAPES`, or the named one."""
     which, body = rng.choice(SHAPES), rng.random() < 0.5
-    if draw.task == "rotate":
-        half = float(draw.edge) / 2
-        return Shape("box", (Part("box", (half, half, half)),))
+    if parameters.task == "rotate":
+        half = float(parameters.edge) / 2
+        return ObjectShape("box", (Primitive("box", (half, half, half)),))
     name = name or str(which)
-    half = tuple(float(h) for h in draw.box_half)
-    tube = float(draw.cylinder_radius), float(draw.cylinder_half)
+    half = tuple(float(h) for h in parameters.box_half)
+    tube = float(parameters.cylinder_radius), float(parameters.cylinder_half)
     if name == "composition":
-        return _composition(draw, "box" if body else "cylinder", half if body else tube)
-    size = {"sphere": (float(draw.sphere_radius),), "box": half, "cylinder": tube, "capsule": tube}[name]
-    return Shape(name, (Part(name, size),))
+        return _composition(parameters, "box" if body else "cylinder", half if body else tube)
+    size = {"sphere": (float(parameters.sphere_radius),), "box": half, "cylinder": tube, "capsule": tube}[name]
+    return ObjectShape(name, (Primitive(name, size),))
 
 
-def _composition(draw: Draw, kind: str, size: tuple[float, ...]) -> Shape:
-    """A smaller box or cylinder with a capsule jutting out along z; the origin in its middle."""
+def _composition(parameters: TrialParameters, kind: str, size: tuple[float, ...]) -> ObjectShape:
+    """A smaller box or cylinder with a capsule along z; the origin is in the middle."""
     body = tuple(BODY_SHARE * s for s in size)
-    neck = float(draw.neck_radius), float(draw.neck_half)
+    neck = float(parameters.neck_radius), float(parameters.neck_half)
     out = body[-1] + neck[1]
     shift = (out + neck[1] + neck[0] - body[-1]) / 2
-    return Shape("composition", (Part(kind, body, (0.0, 0.0, -shift)), Part("capsule", neck, (0.0, 0.0, out - shift))))
+    return ObjectShape(
+        "composition", (Primitive(kind, body, (0.0, 0.0, -shift)), Primitive("capsule", neck, (0.0, 0.0, out - shift)))
+    )
 
 
 # --- rotations -----------------------------------------------------------------------------------
@@ -111,7 +112,7 @@ def turn(axis: tuple[float, float, float], angle: float) -> np.ndarray:
 
 
 def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """a after b."""
+    """Product of two quaternions: the rotation a after b."""
     w, x, y, z = a
     return np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]) @ b
 

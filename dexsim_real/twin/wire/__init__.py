@@ -1,1 +1,1 @@
-"""The emulated hand's end of the wire."""
+"""The emulated hand's end of the wire: firmware, timing, faults, sensors of the object."""

@@ -1,16 +1,16 @@
-"""Faults of an emulated hand: drawn at random or scripted, and counted where they are made.
+"""Faults of an emulated hand: random or scripted, and counted when they are injected.
 
-At most one befalls an exchange, so that what the host must count follows from what was injected:
+An exchange has at most one fault, so the injected faults determine what the host must count:
 
 | fault | what happens | what the host's `LinkCounts` show |
 |---|---|---|
-| flip, drop, duplicate of an answer | one to three bits, or some bytes | one `corrupt` |
-| the same of a request | the hand does not understand it | one `silent` |
-| late | the answer comes long after its deadline; meanwhile the hand is deaf | `silent`, and one `late` |
-| stall | the hand is deaf for a while, and never answers this request | `silent` |
-| disconnect | the terminal goes and comes back under its name | one `lost`, then one `reconnects` |
+| flip, drop, duplicate in an answer | wrong bits, missing or repeated bytes | one `corrupt` |
+| flip, drop, duplicate in a request | the hand ignores the request | one `silent` |
+| late | the answer arrives long after its deadline; meanwhile the hand ignores requests | `silent`, and one `late` |
+| stall | the hand ignores this request, and all others for a while | `silent` |
+| disconnect | the terminal disappears and returns with the same name | one `lost`, then one `reconnects` |
 | heat | a motor gets hotter | none: `Safety` ends the run |
-| stuck | a taxel shows one number from now on | none: the number is in every state |
+| stuck | a taxel reports a constant count from now on | none: the count is in every state |
 """
 
 import dataclasses
@@ -24,72 +24,72 @@ from dexsim_real.wire import frames
 
 BYTES = ("flip", "drop", "duplicate")
 KINDS = (*BYTES, "late", "stall", "disconnect", "heat", "stuck")
-_RUN = 40  # bytes, most that are dropped or doubled at once
+_RUN = 40  # bytes, longest run that is dropped or duplicated
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class FaultConfig:
-    """How often what goes wrong; all at zero by default."""
+    """Probabilities and sizes of faults; no faults by default."""
 
     flip: float = setting(0.0, unit="1", low=0.0, high=1.0)
-    """Share of exchanges with one to three wrong bits."""
+    """Probability of one to three wrong bits, per exchange."""
     drop: float = setting(0.0, unit="1", low=0.0, high=1.0)
-    """With some bytes missing."""
+    """Probability of missing bytes, per exchange."""
     duplicate: float = setting(0.0, unit="1", low=0.0, high=1.0)
-    """With some bytes twice."""
+    """Probability of repeated bytes, per exchange."""
     late: float = setting(0.0, unit="1", low=0.0, high=1.0)
-    """Answered too late."""
+    """Probability of a late answer, per exchange."""
     stall: float = setting(0.0, unit="1", low=0.0, high=1.0)
-    """At which the hand falls silent for a while."""
+    """Probability that the hand stops answering for a while, per exchange."""
     disconnect: float = setting(0.0, unit="1", low=0.0, high=1.0)
-    """At which the port goes away for a while."""
+    """Probability that the port disappears for a while, per exchange."""
     heat: float = setting(0.0, unit="1", low=0.0, high=1.0)
-    """At which a motor gets hot for a while."""
+    """Probability that a motor gets hot for a while, per exchange."""
     stuck: float = setting(0.0, unit="1", low=0.0, high=1.0)
-    """At which one more taxel gets stuck."""
+    """Probability that another taxel gets stuck, per exchange."""
     on_request: float = setting(0.3, unit="1", low=0.0, high=1.0)
-    """Share of damaged bytes that befalls the request, not the answer."""
+    """Probability that damaged bytes are in the request instead of the answer."""
     late_seconds: tuple[float, float] = setting((0.1, 0.15), unit="s", low=0.0, high=10.0)
-    """Delay of a late answer; beyond the host's `--link.margin`, or it is not late."""
+    """Range of the delay of a late answer; it must exceed `--link.margin` of the host."""
     stall_seconds: tuple[float, float] = setting((0.05, 0.4), unit="s", low=0.0, high=60.0)
-    """How long the hand is deaf."""
+    """Range of the duration of a stall."""
     away_seconds: tuple[float, float] = setting((0.1, 1.0), unit="s", low=0.0, high=60.0)
-    """How long the port is gone."""
+    """Range of the duration of a disconnection."""
     heat_degrees: float = setting(60.0, unit="K", low=0.0, high=200.0)
-    """By how much a motor gets hotter ..."""
+    """Temperature rise of a hot motor."""
     heat_seconds: float = setting(2.0, unit="s", low=0.0, high=3600.0)
-    """... and for how long."""
+    """Duration for which a motor stays hot."""
     stuck_count: tuple[int, int] = setting((5, 30), unit="count", low=0, high=255)
-    """What a stuck taxel shows."""
+    """Range of the count of a stuck taxel."""
     script: tuple[str, ...] = ()
-    """Faults at a time, such as "12.5 stall 0.2": seconds after the first exchange, a kind, its values
+    """Scripted faults, such as "12.5 stall 0.2": seconds after the first exchange, kind, values
     (`flip|drop|duplicate [request|answer]`, `late|stall|disconnect SECONDS`, `heat JOINT KELVIN SECONDS`,
-    `stuck TIP TAXEL COUNT`); without values they are drawn."""
+    `stuck TIP TAXEL COUNT`). Missing values are sampled."""
 
     def __post_init__(self):
         validate(self)
         check_ranges(self, "late_seconds", "stall_seconds", "away_seconds", "stuck_count")
         if sum(getattr(self, kind) for kind in KINDS) > 1:
-            raise HandError("FaultConfig: the shares of all faults must not exceed 1 together")
+            raise HandError("FaultConfig: the probabilities of all faults must not exceed 1 in sum")
         for line in self.script:
             parse_fault(line)
 
 
 @dataclasses.dataclass(frozen=True)
 class Fault:
-    """One fault of one exchange; what its kind does not need stays as it is."""
+    """The fault of an exchange. Fields that its kind does not need keep their defaults."""
 
-    kind: str
-    on_request: bool = False
-    seconds: float = 0.0
+    kind: str  # one of `KINDS`
+    on_request: bool = False  # whether the request is damaged instead of the answer
+    seconds: float = 0.0  # s, delay or duration
     joint: int = 0
-    degrees: float = 0.0
+    degrees: float = 0.0  # K
     taxel: tuple[int, int] = (0, 0)  # tip, number
     count: int = 0
 
     @property
     def name(self) -> str:
-        """What it is counted as."""
+        """Name under which the fault is counted."""
         return f"{self.kind} {'request' if self.on_request else 'answer'}" if self.kind in BYTES else self.kind
 
 
@@ -97,18 +97,16 @@ def parse_fault(line: str) -> tuple[float, str, tuple[str, ...]]:
     """Time s, kind and values of a scripted fault.
 
     Raises:
-      HandError: what is wrong with the line.
+      HandError: the line is not a fault.
     """
     words = line.split()
     try:
         when, kind, values = float(words[0]), words[1], tuple(words[2:])
         if kind not in KINDS:
-            raise HandError(f"fault {line!r}: no kind {kind!r}; there are {', '.join(KINDS)}")
+            raise HandError(f"fault {line!r}: no kind {kind!r}; choose from {', '.join(KINDS)}")
         _with_values(Fault(kind), values)
     except (IndexError, ValueError):
-        raise HandError(
-            f"fault {line!r}: expected a time in s, a kind and its values, such as '12.5 stall 0.2'"
-        ) from None
+        raise HandError(f"fault {line!r}: give a time in s, a kind and its values, such as '12.5 stall 0.2'") from None
     if not 0 <= when < 1e9:
         raise HandError(f"fault {line!r}: its time must be at least 0 s")
     return when, kind, values
@@ -118,7 +116,8 @@ class Injector:
     """Decides the fault of each exchange.
 
     Args:
-      seed: of what is drawn; the same seed and exchanges give the same faults.
+      config: probabilities and sizes.
+      seed: of the random numbers; the same seed and exchanges give the same faults.
     """
 
     def __init__(self, config: FaultConfig, seed: int):
@@ -129,32 +128,32 @@ class Injector:
         self._first: float | None = None  # s, time of the first exchange
         self._rates = np.cumsum([getattr(config, kind) for kind in KINDS])
 
-    def draw(self, now: float) -> Fault | None:
-        """The fault of the exchange that was asked for at `now` s, counted already."""
+    def sample(self, now: float) -> Fault | None:
+        """The fault of the exchange requested at `now` s; None for none. It is counted as injected."""
         self._first = now if self._first is None else self._first
         fault = None
         if self._script and now - self._first >= self._script[0][0]:
             _, kind, values = self._script.pop(0)
-            fault = _with_values(self._drawn(kind), values)
+            fault = _with_values(self._random_fault(kind), values)
         elif self._rates[-1] > 0:
             at = int(np.searchsorted(self._rates, self._rng.random(), side="right"))
-            fault = self._drawn(KINDS[at]) if at < len(KINDS) else None
+            fault = self._random_fault(KINDS[at]) if at < len(KINDS) else None
         if fault:
             self.injected[fault.name] += 1
         return fault
 
     def damage(self, fault: Fault, frame: bytes) -> bytes:
-        """A frame's bytes after the fault; the frame itself is nowhere among them."""
+        """The damaged bytes of a frame; they never contain the intact frame."""
         while frame in (bad := self._damage(fault.kind, bytearray(frame))):
             pass
         return bad
 
     def expected(self) -> dict[str, int]:
-        """What the host's counters must show of the faults that have one to themselves."""
+        """Counters of the host that the injected faults determine exactly."""
         made = self.injected
         return {"corrupt": sum(made[f"{kind} answer"] for kind in BYTES), "lost": made["disconnect"]}
 
-    def _drawn(self, kind: str) -> Fault:
+    def _random_fault(self, kind: str) -> Fault:
         rng, config = self._rng, self.config
         spans = {
             "late": config.late_seconds,
@@ -185,7 +184,7 @@ class Injector:
 
 
 def _with_values(fault: Fault, values: tuple[str, ...]) -> Fault:
-    """A fault with scripted values in place of drawn ones; ValueError where they do not fit."""
+    """A fault with scripted values instead of random ones; ValueError if they do not fit its kind."""
     if not values:
         return fault
     if fault.kind in BYTES:

@@ -1,7 +1,7 @@
-"""The emulated palm board: what each frame does, what it answers, and what it does when nobody asks any more.
+"""The emulated palm board: action and answer for each command, and the watchdog.
 
-Answers have the layouts of `dexsim_real.wire.frames`. What no public source tells (the payload of the rare commands,
-the meaning of the error bits) is this board's own, and said where it is made up.
+Answers have the layouts of `dexsim_real.wire.frames`. No public source describes the payload of rare commands or the
+meaning of the error bits: these are defined here, and marked as such.
 """
 
 import dataclasses
@@ -11,12 +11,12 @@ from collections.abc import Callable
 import numpy as np
 
 from dexsim.core.config import setting, validate
-from dexsim_real.twin.types import Measurement, Motors, Plant
+from dexsim_real.twin.plant.protocol import MotorCommands, Plant, PlantMeasurement
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Command, Frame, Mode
 
 OVERHEATED, OVERLOADED, ABANDONED = 1, 2, 4
-"""Error bits of a joint, this board's own: too hot and off, too much current for long, no host."""
+"""Error bits of a joint, defined by this board: too hot and off, overcurrent, no host."""
 _COMMUNICATION, _ID, _PARAMETER, _MODE, _FORCE_MODE = 2, 1, 30, 67, 81
 _ERROR_BASE = 1501000
 _SERIAL, _HAND_ID, _NAME = 21, 53, 54  # registers
@@ -29,48 +29,50 @@ class FirmwareConfig:
     hand_id: int = setting(0, unit="1", low=0, high=125)
     """Id of the hand."""
     version: str = "1.3.9 emulated"
-    """What it calls itself."""
+    """Firmware version that it reports."""
     watchdog: float = setting(0.08, unit="s", low=0.01, high=10.0)
-    """Without a valid exchange for this long the motors go off."""
+    """Time without a valid exchange after which the motors go off."""
     encoder_bits: int = setting(12, unit="1", low=4, high=16)
-    """Resolution of a full turn."""
+    """Resolution of the encoders, bits per revolution."""
     force_per_count: float = setting(0.1, unit="N", low=1e-3, high=10.0)
     """Force of one taxel count."""
     palm_temperature: int = setting(38, unit="degC", low=0, high=120)
-    """Of the palm board, with which a joint's own travels in one number."""
+    """Temperature of the palm board."""
     tip_temperature: int = setting(31, unit="degC", low=0, high=120)
-    """Of the fingertips."""
+    """Temperature of the fingertips."""
     shutdown: float = setting(95.0, unit="degC", low=30.0, high=200.0)
-    """A motor above this goes off by itself until it is 10 K cooler."""
+    """Temperature at which a motor goes off until it is 10 K cooler."""
     overload: float = setting(1800.0, unit="mA", low=10.0, high=30000.0)
-    """Current that sets an error bit when it lasts for half a second."""
+    """Current that sets an error bit after half a second."""
 
     def __post_init__(self):
         validate(self)
 
 
-def idle_motors() -> Motors:
-    """What the board has been told before anybody spoke: everything off."""
-    nothing = np.zeros(frames.JOINTS)
-    return Motors(*(nothing.copy() for _ in range(5)), mode=np.full(frames.JOINTS, int(Mode.PASSIVE)))
+def idle_motors() -> MotorCommands:
+    """Commands before the first exchange: all motors off."""
+    zero = np.zeros(frames.JOINTS)
+    return MotorCommands(*(zero.copy() for _ in range(5)), mode=np.full(frames.JOINTS, int(Mode.PASSIVE)))
 
 
 class Firmware:
     """Executes frames on a plant.
 
     Args:
-      note: called with one line when the motors change hands.
+      plant: the physics.
+      config: of the board.
+      note: called with one line when the motors turn on or off.
     """
 
     def __init__(self, plant: Plant, config: FirmwareConfig, note: Callable[[str], None] = lambda text: None):
         self.plant, self.config, self._note = plant, config, note
-        self.counts: Counter[str] = Counter()  # by what was done
+        self.counts: Counter[str] = Counter()  # executed commands by name
         self.motors = idle_motors()
-        self.stuck: dict[tuple[int, int], int] = {}  # counts of a taxel (tip, number) that shows nothing else
+        self.stuck: dict[tuple[int, int], int] = {}  # constant counts of stuck taxels (tip, number)
         self.reported = np.zeros(frames.JOINTS)  # rad, angles of the last state sent
-        self.trips: list[float] = []  # times s of the watchdog
-        self.longest = 0.0  # s, from the last exchange until it acted
-        self._zero = np.zeros((frames.TIPS, frames.TAXELS, 3), np.int32)
+        self.trips: list[float] = []  # s, times at which the watchdog acted
+        self.longest = 0.0  # s, longest time from the last exchange until it acted
+        self._tare = np.zeros((frames.TIPS, frames.TAXELS, 3), np.int32)
         self._alive = -np.inf  # s, time of the last valid exchange
         self._hot = np.zeros(frames.JOINTS, bool)
         self._overload_since: np.ndarray = np.full(frames.JOINTS, np.inf)
@@ -78,16 +80,16 @@ class Firmware:
 
     @property
     def on(self) -> bool:
-        """Whether any motor is."""
+        """Whether any motor is on."""
         return bool(np.any(self.motors.mode != Mode.PASSIVE))
 
     @property
     def deadline(self) -> float:
-        """When the watchdog acts unless somebody asks; never while the motors are off."""
+        """Time s at which the watchdog acts without another exchange; infinite while the motors are off."""
         return self._alive + self.config.watchdog if self.on else np.inf
 
     def watch(self, now: float) -> bool:
-        """Motors off if nobody has asked for too long; whether that was now."""
+        """Turn the motors off if the last exchange is too long ago; returns whether it did."""
         if now < self.deadline:
             return False
         self.trips.append(now)
@@ -98,7 +100,7 @@ class Firmware:
         return True
 
     def answer(self, frame: Frame, now: float) -> Frame | None:
-        """Do what a frame asks, and the answer to it; None for one that is for somebody else."""
+        """Execute a frame and return the answer; None for a frame addressed to another hand."""
         if frame.target not in (frames.palm_address(self.config.hand_id), frames.BROADCAST):
             self.counts["for another"] += 1
             return None
@@ -115,8 +117,8 @@ class Firmware:
         self.counts[Command(frame.command).name.lower() if command != Command.ERROR else "refused"] += 1
         return Frame(frames.palm_address(self.config.hand_id), frame.source, command, data)
 
-    def state(self, measured: Measurement) -> np.ndarray:
-        """A `frames.STATE_BLOCK` of what is measured, in the wire's few bits."""
+    def state(self, measured: PlantMeasurement) -> np.ndarray:
+        """A `frames.STATE_BLOCK` of a measurement, with the quantisation of the wire."""
         config, block = self.config, frames.empty_state()
         joint, tip = block["joint"], block["tip"]
         step = 2 * np.pi / 2**config.encoder_bits
@@ -132,7 +134,7 @@ class Firmware:
             + OVERLOADED * (measured.time > self._overload_since + 0.5)
             + ABANDONED * self._abandoned
         )
-        counts = self._counts(measured) - self._zero
+        counts = self._counts(measured) - self._tare
         for (finger, taxel), value in self.stuck.items():
             counts[finger, taxel] = 0, 0, value
         for axis, name in enumerate("xyz"):
@@ -156,7 +158,7 @@ class Firmware:
         self._protect(measured)
         was_on, self._alive, self._abandoned = self.on, now, False
         self._drive(
-            Motors(
+            MotorCommands(
                 *(block[name].astype(float) for name in ("position", "kp", "ki", "kd", "torque_max")),
                 mode=np.where(self._hot, int(Mode.PASSIVE), block["mode"].astype(int)),
             )
@@ -185,17 +187,17 @@ class Firmware:
         return Command.READ_MODE, self.motors.mode.astype(np.uint8).tobytes()
 
     def _clear(self, data: bytes, now: float) -> tuple[Command, bytes]:
-        """What the taxels of one tip, or of all, show now is their zero."""
+        """Tare the taxels of one tip, or of all."""
         tips = list(frames.TIP_IDS) if not data else list(data)
         if not set(tips) <= set(frames.TIP_IDS):
             return self._error(_ID)
         counts = self._counts(self.plant.measure())
         for tip in tips:
-            self._zero[tip - frames.TIP_IDS[0]] = counts[tip - frames.TIP_IDS[0]]
+            self._tare[tip - frames.TIP_IDS[0]] = counts[tip - frames.TIP_IDS[0]]
         return Command.CLEAR_PRESSURE, bytes([tips[0] if data else 0, 0])
 
     def _reset(self, data: bytes, now: float) -> tuple[Command, bytes]:
-        self._zero[:] = 0
+        self._tare[:] = 0
         self._drive(idle_motors())
         return Command.ACKNOWLEDGE, bytes([Command.RESET, 0])
 
@@ -209,15 +211,15 @@ class Firmware:
 
     # --- pieces ---------------------------------------------------------------------------------
 
-    def _drive(self, motors: Motors) -> None:
+    def _drive(self, motors: MotorCommands) -> None:
         self.motors = motors
         self.plant.drive(motors)
 
-    def _counts(self, measured: Measurement) -> np.ndarray:
+    def _counts(self, measured: PlantMeasurement) -> np.ndarray:
         return np.round(measured.taxel_force / self.config.force_per_count).astype(np.int32)
 
-    def _protect(self, measured: Measurement) -> None:
-        """Which motors are too hot or loaded for too long."""
+    def _protect(self, measured: PlantMeasurement) -> None:
+        """Update which motors are too hot or overloaded."""
         hot, limit = measured.temperature, self.config.shutdown
         self._hot = (hot > limit) | (self._hot & (hot > limit - 10.0))
         self._overload_since = np.where(
@@ -226,7 +228,7 @@ class Firmware:
 
     @staticmethod
     def _refusal(mode: np.ndarray) -> int:
-        """Error of a mode that the board does not know or does not have; 0 for none."""
+        """Error code of an unknown or unsupported mode; 0 for none."""
         if not np.isin(mode, list(Mode)).all():
             return _MODE
         return _FORCE_MODE if np.any(mode == Mode.FORCE) else 0
@@ -237,6 +239,6 @@ class Firmware:
 
 
 def _whole(values: np.ndarray, kind: type) -> np.ndarray:
-    """Rounded and held within the range of an integer type."""
+    """Rounded and clipped to the range of an integer type."""
     span = np.iinfo(kind)
     return np.clip(np.round(values), span.min, span.max).astype(kind)

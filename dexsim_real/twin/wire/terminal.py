@@ -1,4 +1,4 @@
-"""A pseudo-terminal under a name that outlives it: the emulated hand's end of a cable."""
+"""A pseudo-terminal with a stable name: the emulated device's end of a cable."""
 
 import contextlib
 import os
@@ -12,38 +12,40 @@ _RATES = {getattr(termios, name): int(name[1:]) for name in dir(termios) if name
 
 
 class Terminal:
-    """Opens and closes like a plug; `name` is a link to whatever terminal is there at the moment.
+    """A pseudo-terminal that can be disconnected and reconnected. `name` is a link to the current terminal.
 
     Args:
-      link: path of that link.
+      link: path of the link.
 
     Raises:
-      HandError: something else lies at that path, or no terminal can be had.
+      HandError: the path exists and is not a link, or no terminal can be created.
     """
 
     def __init__(self, link: Path):
         self.name = Path(link)
         self._master = self._slave = -1
         if self.name.exists() and not self.name.is_symlink():
-            raise HandError(f"{link}: is there already, and is no link")
+            raise HandError(f"{link}: already exists and is not a link; choose another path")
         self.open()
 
     def open(self) -> None:
-        """Make a terminal, then the link to it."""
+        """Connect: create a terminal and the link to it."""
         try:
             self._master, self._slave = os.openpty()
             tty.setraw(self._slave)
             os.set_blocking(self._master, False)
-            # Renamed into place, so that the name is never half there.
+            # Renamed into place, so that the link changes atomically.
             fresh = self.name.with_name(f".{self.name.name}.{os.getpid()}")
             fresh.symlink_to(os.ttyname(self._slave))
             fresh.replace(self.name)
         except OSError as error:
             self.close()
-            raise HandError(f"{self.name}: no pseudo-terminal under this name ({error.strerror})") from None
+            raise HandError(
+                f"{self.name}: no pseudo-terminal can be created here ({error.strerror}); choose another path"
+            ) from None
 
     def close(self) -> None:
-        """Pull the plug: whoever has it open gets an error."""
+        """Disconnect: programs that have the terminal open get an error."""
         if self._master < 0:
             return
         with contextlib.suppress(OSError):
@@ -54,27 +56,27 @@ class Terminal:
         self._master = self._slave = -1
 
     @property
-    def plugged(self) -> bool:
-        """Whether there is a terminal."""
+    def connected(self) -> bool:
+        """Whether the terminal is connected."""
         return self._master >= 0
 
     @property
     def baud(self) -> int | None:
-        """Rate that the other side has set; None where it cannot be told."""
+        """Baud rate set by the other side; None if unknown."""
         return _RATES.get(termios.tcgetattr(self._slave)[5])
 
     def fileno(self) -> int:
         return self._master
 
     def read(self) -> bytes:
-        """What has come; empty when nothing has."""
+        """Received bytes; empty if there are none."""
         try:
             return os.read(self._master, 65536)
         except BlockingIOError:
             return b""
 
     def write(self, data: bytes) -> int:
-        """Send; returns how many bytes found room in the other side's buffer."""
+        """Send bytes; returns how many fit into the buffer of the other side."""
         try:
             return os.write(self._master, data)
         except BlockingIOError:

@@ -12,9 +12,9 @@ from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import pytree_dataclass
 from dexsim_ppo import checkpoint
 from dexsim_ppo.learner.curriculum import Curriculum
-from dexsim_ppo.learner.ppo import follow, make_train
+from dexsim_ppo.learner.ppo import make_train, update_scale
 from dexsim_ppo.train import arguments_from_dict, parse_arguments
-from dexsim_ppo.training.trainer import printable
+from dexsim_ppo.training.arguments import printable
 
 RULES = Curriculum(on=True, start=0.5, widen_above=0.9, narrow_below=0.3, step=0.1)
 
@@ -75,7 +75,7 @@ def run(env, rules, iterations):
     return state, rows
 
 
-def test_ranges_widen_with_success_and_episodes_follow():
+def test_ranges_widen_with_success_and_episodes_update_scale():
     state, rows = run(WideEnv(), RULES, 7)
     np.testing.assert_allclose([row["curriculum/scale"] for row in rows], [0.6, 0.7, 0.8, 0.9, 1, 1, 1], rtol=1e-5)
     assert all(row["curriculum/success"] == 1 for row in rows)
@@ -99,10 +99,10 @@ def test_no_ended_episode_says_nothing():
 def test_success_may_be_a_metric_by_name():
     metrics = {"terminated_share": jnp.float32(1.0), "episode/goals": jnp.float32(7.0)}
     rules = dataclasses.replace(RULES, metric="episode/goals", widen_above=6.0, narrow_below=2.0)
-    scale, success = follow(rules, jnp.float32(0.5), metrics)
+    scale, success = update_scale(rules, jnp.float32(0.5), metrics)
     assert float(scale) == pytest.approx(0.6) and float(success) == 7
     with pytest.raises(ConfigError, match="Curriculum.metric = 'step/luck': choose from episode/goals"):
-        follow(dataclasses.replace(rules, metric="step/luck"), scale, metrics)
+        update_scale(dataclasses.replace(rules, metric="step/luck"), scale, metrics)
 
 
 def test_off_it_is_not_there():

@@ -180,7 +180,10 @@ def test_restarts_what_ended_and_nothing_else(length, block, share):
     def step(state, given):
         number, ended = given
         after = dataclasses.replace(
-            state, x=state.x + number, terminated=ended & (number % 2 == 0), truncated=ended & (number % 2 == 1)
+            state,
+            x=state.x + number.astype(state.x.dtype),
+            terminated=ended & (number % 2 == 0),
+            truncated=ended & (number % 2 == 1),
         )
         return after, (state.x, after.x)
 
@@ -219,7 +222,9 @@ def test_metrics_are_those_of_a_plain_loop():
     """Means over all steps, and over the last steps of episodes; what is not finite is left out and counted."""
     env, count, length = BadRewards(), 6, 16
     states = jax.vmap(env.reset)(jax.random.split(jax.random.key(3), count))
-    states = dataclasses.replace(states, metrics=states.metrics | {"length": jnp.arange(count) * 2.0})
+    states = dataclasses.replace(
+        states, metrics=states.metrics | {"length": jnp.arange(count, dtype=jnp.float32) * 2.0}
+    )
     decide = lambda key, obs: (  # noqa: E731
         Decision(*[jnp.zeros((count, 1))] * 2, jnp.zeros(count)),
         jax.random.normal(key, (count, 1)),

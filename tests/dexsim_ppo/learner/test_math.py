@@ -31,7 +31,7 @@ def gae(reward, value, next_value, terminated, truncated, discount=0.5, gae_lamb
         discount=discount,
         gae_lambda=gae_lambda,
     )
-    np.testing.assert_allclose(target[:, 0], advantage[:, 0] + np.asarray(value), rtol=1e-6)
+    np.testing.assert_allclose(target[:, 0], np.asarray(advantage[:, 0]) + np.asarray(value), rtol=1e-6)
     return np.asarray(advantage[:, 0])
 
 

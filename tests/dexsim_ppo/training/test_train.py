@@ -19,7 +19,7 @@ from tiny_env import TinyEnv
 from dexsim.core import cli
 from dexsim_ppo import evaluate, train
 from dexsim_ppo.policy import Policy
-from dexsim_ppo.training import trainer
+from dexsim_ppo.training.arguments import training_config
 from dexsim_ppo.training.runlog import RunFolder, read_metrics
 
 QUICK = [
@@ -169,10 +169,10 @@ def test_intervals():
 BAD = {
     "unknown option": (["--ppo.number-envs", "3"], "--ppo.number-envs"),
     "unknown task": (["--task", "juggle"], "unknown task 'juggle'"),
-    "wrong type": (["--ppo.discount", "much"], "could not convert"),
-    "out of range": (["--ppo.discount", "1.5"], "PPOConfig.discount = 1.5: must be between 0 and 1"),
-    "environment value out of range": (["--env.gain", "7"], "TinyConfig.gain = 7 m: must be between"),
-    "extremes of no ranges": (["--extremes", "0.3"], "--extremes 0.3: task 'tiny' has no ranges"),
+    "wrong type": (["--ppo.discount", "much"], "--ppo.discount much: expected a number"),
+    "out of range": (["--ppo.discount", "1.5"], "--ppo.discount 1.5: must be between 0 and 1"),
+    "environment value out of range": (["--env.gain", "7"], "--env.gain 7 m: must be between"),
+    "extremes of no ranges": (["--extremes", "0.3"], "--extremes 0.3: task 'tiny' has no randomisation ranges"),
     "unknown preset": (["--preset", "tpu"], "tpu"),
     "nothing to resume": (["--resume", "/nonexistent/run"], "no checkpoint to resume from"),
 }
@@ -194,12 +194,12 @@ def test_corners_are_for_training_alone():
 
     plain, _ = train.parse_arguments(["--task", "rotate", "--preset", "gpu"])
     assert plain.extremes == 0.6 and plain.env == RotateConfig()
-    asked = trainer.training_config(plain)
+    asked = training_config(plain)
     assert asked.randomization.extremes == asked.objects.extremes == 0.6
     without = dataclasses.replace(asked, randomization=plain.env.randomization, objects=plain.env.objects)
     assert without == plain.env
     off, _ = train.parse_arguments(["--task", "rotate", "--preset", "gpu", "--extremes", "0"])
-    assert trainer.training_config(off) == RotateConfig()
+    assert training_config(off) == RotateConfig()
 
 
 def test_files_are_never_overwritten_or_mistaken(finished, tmp_path, monkeypatch, capsys):
@@ -217,6 +217,7 @@ def test_files_are_never_overwritten_or_mistaken(finished, tmp_path, monkeypatch
         (evaluate.main, ["no-such-policy"], "no shipped policy has that name"),
         (evaluate.main, [str(finished.best), "--episodes", "0"], "at least 1"),
         (evaluate.main, [str(finished.best), "--set", "colour=red"], "has no field 'colour'"),
+        (evaluate.main, [str(finished.best), "--set", "gain=7"], "error: --set gain=7 m: must be between"),
         (evaluate.main, [str(finished.best), "--set", "colour"], "'colour': expected NAME=VALUE"),
         (evaluate.main, [str(finished.best), "--ablate", "colour"], "does not observe colour"),
         (evaluate.main, [], "policy"),

@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dexsim.core.errors import ConfigError
-from dexsim_real.control.safety import Reaction, Safety, SafetyConfig, Sample
+from dexsim_real.control.safety import HandSample, Reaction, Safety, SafetyConfig
 from dexsim_real.control.servo import Servo
 from dexsim_real.core.timing import GRACE, Pace, keep_phase
-from dexsim_real.sensors.hand import HandSensing, HardwareConfig, Measured
+from dexsim_real.sensors.hand import HandMeasurement, HandSensing, HardwareConfig
 from dexsim_real.wire.frames import Mode
 
 CYCLE = 0.012
@@ -22,7 +22,7 @@ MIDDLE = np.array([0.9, 0.4, 0.8, 0.0] + [0.9] * 8, np.float32)
 def sample(time, position=MIDDLE, *, velocity=0.0, force=0.0, current=0.1, temperature=35.0, generation=1):
     taxels = np.zeros((5, 120), np.float32)
     taxels[:, 0] = force
-    measured = Measured(
+    measured = HandMeasurement(
         joint_position=np.array(position, np.float32),
         joint_torque=np.zeros(12, np.float32),
         taxel_force=taxels,
@@ -30,7 +30,7 @@ def sample(time, position=MIDDLE, *, velocity=0.0, force=0.0, current=0.1, tempe
         temperature=np.full(17, temperature, np.float32),
         errors=np.zeros((12, 3), np.uint16),
     )
-    return Sample(time, 0, generation, measured, np.full(12, velocity, np.float32))
+    return HandSample(time, 0, generation, measured, np.full(12, velocity, np.float32))
 
 
 class Bench:
@@ -45,7 +45,7 @@ class Bench:
         if fresh:
             self.safety.see(sample(self.now, self.position, **measurement))
         if wish is not None:
-            self.safety.wish(wish, self.now)
+            self.safety.set_target(wish, self.now)
         decision = self.safety.decide(self.now)
         self.now += CYCLE
         if follow and decision.mode == Mode.POSITION:
@@ -162,7 +162,7 @@ def test_a_dead_policy_is_held_within_100_ms_then_relaxed(bench):
     first = reactions.index(Reaction.HOLD)
     assert (first * CYCLE) <= 0.1
     assert Reaction.RELAX in reactions and 1.0 <= reactions.index(Reaction.RELAX) * CYCLE <= 1.2
-    assert bench.safety.latched.startswith("no wish") and bench.now > start
+    assert bench.safety.latched.startswith("no target") and bench.now > start
     assert bench.cycle(wish=MIDDLE).mode == Mode.PASSIVE
 
 
@@ -188,7 +188,7 @@ def test_a_policy_that_waits_for_a_silent_hand_is_not_dead(bench):
 
 
 def test_a_wish_with_a_reason_not_to_heed_it_holds(bench):
-    bench.safety.wish(MIDDLE + np.float32(0.1), bench.now, "the object is out of sight")
+    bench.safety.set_target(MIDDLE + np.float32(0.1), bench.now, "the object is out of sight")
     decision = bench.cycle()
     assert (decision.reaction, decision.reason) == (Reaction.HOLD, "the object is out of sight")
 
@@ -206,7 +206,7 @@ def test_a_hand_that_was_away_during_a_hold_is_held_where_it_then_is(bench, back
     """Its motors were off meanwhile, by its own watchdog if not by a new connection: the pose of before is history."""
 
     def unseen(**event):
-        bench.safety.wish(MIDDLE, bench.now, "the object is out of sight")
+        bench.safety.set_target(MIDDLE, bench.now, "the object is out of sight")
         return bench.cycle(**event)
 
     assert all(unseen().reason == "the object is out of sight" for _ in range(5))
@@ -222,8 +222,8 @@ def test_changes_are_noted_once(bench):
     bench.notes.clear()
     bench.run(0.5, wish=MIDDLE, force=30.0)
     bench.run(2.0, wish=MIDDLE)
-    assert bench.notes == ["hold: a fingertip presses too hard", "in command"]
-    assert bench.safety.counts["a fingertip presses too hard"] == round(0.5 / CYCLE)
+    assert bench.notes == ["hold: the fingertip force is too high", "in command"]
+    assert bench.safety.counts["the fingertip force is too high"] == round(0.5 / CYCLE)
 
 
 EVENT = st.fixed_dictionaries(

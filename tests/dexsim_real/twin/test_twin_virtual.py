@@ -14,7 +14,8 @@ from dexsim.registry import make_task
 from dexsim.task_spec import TaskSpec
 from dexsim_real.control.controller import Tick
 from dexsim_real.sensors.hand import HardwareConfig
-from dexsim_real.twin.plant.plant import EmulatedHand, nominal_gravity
+from dexsim_real.twin.plant.emulated_hand import EmulatedHand
+from dexsim_real.twin.plant.mount import nominal_gravity
 from dexsim_real.twin.plant.shapes import SHAPES, product
 from dexsim_real.twin.virtual import (
     RATE,
@@ -103,7 +104,7 @@ def test_an_unsafe_wish_is_clipped_unless_the_limits_are_left_out(hand):
     for safety in (True, False):
         run, _, _ = virtual(hand, "rotate", jump, seconds=0.15, safety=safety)
         run.run()
-        clipped = [name for name in run.safety.counts if name.startswith("wish beyond a limit")]
+        clipped = [name for name in run.safety.counts if name.startswith("target beyond a limit")]
         assert bool(clipped) == safety
 
 

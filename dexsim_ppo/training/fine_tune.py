@@ -1,0 +1,61 @@
+"""Fine-tuning: training that starts from a policy, on changed objects, motors or sensors."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+
+from dexsim.core.errors import ConfigError
+from dexsim_ppo.learner.config import PPOConfig
+from dexsim_ppo.learner.ppo import TrainState
+from dexsim_ppo.learner.running_stats import recover_stats
+from dexsim_ppo.learner.types import Environment
+from dexsim_ppo.policy import Policy, layout_to_list
+
+
+def fine_tuning_config(policy: Policy, config: PPOConfig) -> PPOConfig:
+    """`config` with the policy's network, little noise, small steps, and initial iterations for the critic alone.
+
+    A policy file holds neither critic nor noise. The noise and step size of training from scratch would make the
+    policy forget. So would a fresh critic, whose errors are correlated: it trains alone first.
+    """
+    return dataclasses.replace(
+        config,
+        actor_layers=tuple(layer.kernel.shape[1] for layer in policy.params.layers[:-1]),
+        distribution=policy.params.squash,
+        learning_rate=1e-5,
+        learning_rate_min=1e-6,
+        learning_rate_max=5e-4,
+        kl_target=2e-4,
+        initial_std=0.2,
+        critic_first=100,
+    )
+
+
+def check_fit(policy: Policy, env: Environment, config: PPOConfig) -> None:
+    """Check that a learner with this configuration can start from the policy.
+
+    Raises:
+      ConfigError: the policy's observation is not the environment's, or its network is not the configuration's.
+    """
+    theirs, mine = (layout_to_list(fields) for fields in (policy.observation_layout, env.observation_layout["actor"]))
+    if theirs != mine:
+        odd = [name for name, *_ in (*(f for f in theirs if f not in mine), *(f for f in mine if f not in theirs))]
+        raise ConfigError(f"observations of policy and environment differ: {', '.join(odd) or 'their order'}")
+    layers = tuple(layer.kernel.shape[1] for layer in policy.params.layers)
+    if layers != (*config.actor_layers, env.action_size) or policy.params.squash != config.distribution:
+        raise ConfigError(
+            f"the policy's network has layers {layers} and is {policy.params.squash!r}: do not set "
+            "--ppo.actor-layers or --ppo.distribution"
+        )
+
+
+def initialize_from(policy: Policy, config: PPOConfig, state: TrainState) -> TrainState:
+    """A fresh learner's state with the policy's actor and observation statistics: the actor's inputs keep the
+    normalisation that it was trained with."""
+    stats = recover_stats(policy.params.normalizer, std_floor=config.observation_std_floor)
+    return dataclasses.replace(
+        state,
+        params=dataclasses.replace(state.params, actor=jax.tree.map(jnp.copy, policy.params.layers)),
+        observation_stats=state.observation_stats | {"actor": stats},
+    )

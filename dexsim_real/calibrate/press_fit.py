@@ -1,0 +1,300 @@
+"""Fits a calibration to recorded presses: forces and lever arms of the taxels, one robust line per joint and direction.
+
+The torque that the simulation would report is computed from the same recording: the force of every taxel times its
+lever arm at the measured joint angles (J^T f, with the kinematics of the simulation). The exact place of the contact on
+the fingertip does not matter.
+
+Because of friction a joint has two lines of current against torque. The motion of the joint decides which one applies:
+while a finger presses harder, one of its joints may move back. Samples of resting joints are excluded, since their
+friction can have any size.
+"""
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.ndimage import binary_dilation
+
+from dexsim.calibration import sensor
+from dexsim.calibration.fit import calibrate
+from dexsim.calibration.joint import MIN_SAMPLES, JointPress
+from dexsim.calibration.maps import Calibration
+from dexsim.calibration.press import MIN_LEVER
+from dexsim.calibration.sensor import FingerFit, fit_finger
+from dexsim.core.errors import CalibrationError, DexsimError
+from dexsim.hand.kinematics import Hand, forward_kinematics, taxel_normals, taxel_positions
+from dexsim_real.calibrate.press_procedure import LOADING, RELEASED, UNLOADING
+from dexsim_real.calibrate.read import PressSession, Recording
+from dexsim_real.calibrate.taxel_check import dead_taxels, fill_dead, taxel_names
+
+_BLOCK = 0.25  # s averaged into one block, since counts are coarse
+_ACTIVE = 2.0  # counts above which a taxel takes part
+_STILL = 0.25  # share of the usual speed below which a joint is at rest
+_NOISE = 4.0  # standard deviations of the speed noise below which a joint is at rest
+_TOP, _TOP_BLOCKS = 0.97, 4  # a current in this share of its maximum for this many blocks is at the motor's limit
+_READINGS = 8  # gauge readings that a fingertip needs
+_SHEAR = 0.1  # share of the force above which shear is noted
+
+
+@dataclasses.dataclass(frozen=True)
+class Blocks:
+    """A press averaged over B blocks of a quarter of a second."""
+
+    counts: np.ndarray  # [B, N] of the taxels that take part, 0 of the others
+    current: np.ndarray  # [B, J] A
+    position: np.ndarray  # [B, J] rad
+    speed: np.ndarray  # [B, J] rad/s
+    shear: np.ndarray  # [B, 2] counts, along the taxels' x and y
+    run: np.ndarray  # [B] number of the loading or unloading phase
+
+
+@dataclasses.dataclass(frozen=True)
+class Fit:
+    """A calibration, the data that it was fitted to, and the comparison of the taxels with the gauge."""
+
+    calibration: Calibration
+    real: dict[str, JointPress]
+    sim: dict[str, JointPress]
+    source: dict[str, str]  # press that each joint was fitted to
+    sensors: dict[str, FingerFit]  # by finger: counts as in a run against newtons
+
+
+def fit(session: PressSession, hand: Hand, created: str | None = None) -> Fit:
+    """Fit a calibration to all recorded presses.
+
+    Args:
+      session: the presses.
+      hand: model of the hand.
+      created: date for the calibration; None is now.
+
+    Raises:
+      CalibrationError: recordings are missing or unusable.
+    """
+    pressed = [r for r in session.recordings.values() if len(r.samples(LOADING, UNLOADING))]
+    if not pressed:
+        raise CalibrationError("no press was recorded; record again")
+    per_count, newtons, sensors, notes = _gauges(session, hand, pressed)
+    real, sim, source, reach = {}, {}, {}, {}
+    for recording in pressed:
+        blocks = make_blocks(recording, hand.taxel_grid)
+        dead = dead_taxels(hand, blocks.counts, session.check.neighbours)
+        blocks = dataclasses.replace(blocks, counts=fill_dead(hand, blocks.counts, dead))
+        gain, offset = newtons[recording.name]
+        force = blocks.counts.sum(-1) * gain + offset
+        torque = taxel_torque(hand, blocks.position, recording.finger, blocks.counts * gain)
+        high = force > 0.5 * force.max()
+        lever = torque[high].sum(0) / force[high].sum()
+        # The force that the gauge adds to the taxels' sum acts at the same place.
+        torque += offset * lever
+        for joint in recording.joints:
+            label = hand.joint_names[joint]
+            if abs(lever[joint]) < max(MIN_LEVER, reach.get(label, 0.0)):
+                continue
+            way = _direction(blocks.speed[:, joint], recording, joint) * int(np.sign(lever[joint]))
+            way[_at_limit(blocks.current[:, joint], blocks.run)] = 0
+            if max(np.sum(way > 0), np.sum(way < 0)) < MIN_SAMPLES:
+                notes.append(
+                    f"{label}: hardly moved while the {recording.name} was pressed, held by friction; press "
+                    "on something softer, or more often"
+                )
+                continue
+            reach[label], source[label] = abs(lever[joint]), recording.name
+            real[label] = JointPress(force, blocks.current[:, joint], way)
+            sim[label] = JointPress(force, torque[:, joint], way)
+        notes += _press_notes(session, hand, recording, blocks, dead)
+    try:
+        result = calibrate(
+            hand,
+            real,
+            sim,
+            force_per_count=per_count,
+            current_per_count=1e-3,
+            missing="class",
+            serial=session.serial,
+            created=created,
+        )
+    except CalibrationError as error:
+        raise CalibrationError("; ".join([str(error), *(note for note in notes if "hardly moved" in note)])) from None
+    notes += _zero_note(session, hand)
+    # With a gauge the absolute scale is known.
+    kept = tuple(note for note in result.notes if not (sensors and note.startswith("only the ratio")))
+    return Fit(dataclasses.replace(result, notes=(*kept, *notes)), real, sim, source, sensors)
+
+
+def make_blocks(recording: Recording, grid: tuple[int, int]) -> Blocks:
+    """Average a recording over blocks of time. An incomplete block at the end of a phase is dropped.
+
+    Args:
+      recording: of a press.
+      grid: columns and rows of the taxels.
+
+    Raises:
+      CalibrationError: no phase is long enough.
+    """
+    size = max(round(_BLOCK * recording.rate), 1)
+    phase = np.array(recording.phase)
+    runs = [
+        [np.arange(size) + at for at in range(first, last - size + 1, size)]
+        for first, last in _runs(phase)
+        if phase[first] in (LOADING, UNLOADING)
+    ]
+    runs = [np.array(run) for run in runs if len(run) > 1]  # A single block has no speed.
+    if not runs:
+        raise CalibrationError(
+            f"{recording.name}: no press lasted {2 * _BLOCK:g} s; press more slowly (--press.seconds)"
+        )
+    time, angle = np.array(recording.time), np.array(recording.position)
+    # Not across a reversal, where friction changes its sign.
+    speed = np.concatenate([np.gradient(angle[run].mean(1), time[run].mean(1), axis=0) for run in runs])
+    rows = np.concatenate(runs)
+    position = angle[rows].mean(1)
+    counts = np.array(recording.counts)[rows].mean(1)
+    active = (counts.max(0) >= _ACTIVE).reshape(grid)
+    counts = counts * binary_dilation(active, np.ones((3, 3))).ravel()
+    return Blocks(
+        counts,
+        np.array(recording.current)[rows].mean(1),
+        position,
+        speed,
+        np.array(recording.shear)[rows].mean(1),
+        np.repeat(np.arange(len(runs)), [len(run) for run in runs]),
+    )
+
+
+def taxel_torque(hand: Hand, position: np.ndarray, finger: int, force: np.ndarray) -> np.ndarray:
+    """Joint torques [T, J] Nm that balance taxel forces [T, N] N at joint angles [T, J] rad: J^T f.
+
+    All forces of a fingertip act along their mean normal: the skin is flat where it is pressed, and the force of a
+    fingertip is the sum over its taxels, as in simulation.
+    """
+    rows = [
+        _torque(hand, np.int32(finger), np.float32(at), np.float32(push))
+        for at, push in zip(position, force, strict=True)
+    ]
+    return np.array(rows, float)
+
+
+@functools.partial(jax.jit, static_argnames="hand")
+def _torque(hand: Hand, finger: jax.Array, at: jax.Array, force: jax.Array) -> jax.Array:
+    mean = force @ taxel_normals(hand, forward_kinematics(hand, at))[finger]
+    normal = mean / jnp.maximum(jnp.linalg.norm(mean), 1e-6)
+    return jax.grad(lambda q: force @ taxel_positions(hand, forward_kinematics(hand, q))[finger] @ normal)(at)
+
+
+def _direction(speed: np.ndarray, recording: Recording, joint: int) -> np.ndarray:
+    """Direction [B] of motion of a joint: 1, -1, or 0 at rest."""
+    position = np.array(recording.position)[:, joint]
+    jitter = np.median(np.abs(np.diff(position))) / 0.6745 / np.sqrt(2)
+    noise = jitter / np.sqrt(max(_BLOCK * recording.rate, 1)) / (np.sqrt(2) * _BLOCK)
+    usual = np.quantile(np.abs(speed), 0.75)
+    return np.where(np.abs(speed) > max(_STILL * usual, _NOISE * noise), np.sign(speed), 0).astype(int)
+
+
+def _at_limit(current: np.ndarray, run: np.ndarray) -> np.ndarray:
+    """Mask [B] of blocks in which the motor is at its current limit: its current stays at the maximum of the press."""
+    found = np.zeros(len(current), bool)
+    for number in np.unique(run):
+        here = np.flatnonzero(run == number)
+        size = np.abs(current[here])
+        top = size > _TOP * size.max()
+        found[here] = top & (top.sum() >= _TOP_BLOCKS)
+    return found
+
+
+def _runs(phase: np.ndarray) -> list[tuple[int, int]]:
+    """First index and last + 1 of each run of equal phases."""
+    cuts = np.flatnonzero(phase[1:] != phase[:-1]) + 1
+    return list(zip([0, *cuts], [*cuts, len(phase)], strict=True))
+
+
+# --- the gauge, the notes ------------------------------------------------------------------------------
+
+
+def _gauges(
+    session: PressSession, hand: Hand, pressed: list[Recording]
+) -> tuple[np.ndarray, dict[str, Any], dict, list[str]]:
+    """Compare the taxels with the gauge.
+
+    Returns:
+      Newtons per count [F] for a run; gain and offset (newtons = gain * counts + offset) by press, for the joints; fits
+      by finger; notes. A press without readings uses those of the finger's other press.
+    """
+    per_count = np.full(hand.num_fingers, session.hardware.force_per_count)
+    newtons, fits, notes = {}, {}, []
+    for recording in sorted(pressed, key=lambda r: not r.name.endswith("pad")):
+        levels = [level for level in recording.gauge if len(recording.samples(level))]
+        if len(levels) < _READINGS:
+            if levels:
+                notes.append(f"{recording.name}: {len(levels)} gauge readings are ignored, {_READINGS} are needed")
+            continue
+        name, gauge = hand.finger_names[recording.finger], np.array([recording.gauge[k] for k in levels])
+        every = np.array(recording.counts)
+        counts = np.array([every[recording.samples(k)].mean(0) for k in levels])
+        active = binary_dilation((counts.max(0) >= _ACTIVE).reshape(hand.taxel_grid), np.ones((3, 3))).ravel()
+        shown = np.array([np.mean(np.array(recording.shown)[recording.samples(k)]) for k in levels])
+        whole, found = (_against(gauge, part, recording.name) for part in ((counts * active).sum(-1), shown))
+        newtons[recording.name] = 1.0 / whole.gain.value, -whole.offset.value / whole.gain.value
+        notes.append(
+            f"{recording.name}: {found.gain} counts per newton by the gauge ({found.samples} readings), "
+            f"{found.offset} counts at zero force"
+        )
+        if name not in fits:
+            fits[name], per_count[recording.finger] = found, 1.0 / found.gain.value
+    if fits:
+        per_count = np.where(
+            np.isin(hand.finger_names, list(fits)),
+            per_count,
+            np.mean([1.0 / found.gain.value for found in fits.values()]),
+        )
+        notes += [
+            f"{name}: not compared with the gauge; has the mean of the other fingers"
+            for name in hand.finger_names
+            if name not in fits
+        ]
+    rest = {r.name: (float(per_count[r.finger]), 0.0) for r in pressed}
+    return per_count, rest | newtons, fits, notes
+
+
+def _against(gauge: np.ndarray, counts: np.ndarray, name: str) -> FingerFit:
+    try:
+        return fit_finger(sensor.TaxelPress(gauge, np.maximum(counts, 0.0)[:, None]))
+    except DexsimError as error:
+        raise CalibrationError(f"{name}, gauge: {error}") from None
+
+
+def _press_notes(
+    session: PressSession, hand: Hand, recording: Recording, blocks: Blocks, dead: np.ndarray
+) -> list[str]:
+    """Notes on dead taxels, shear and drift of one press."""
+    notes, finger = [], hand.finger_names[recording.finger]
+    if dead.any():
+        notes.append(
+            f"{finger}: dead: {taxel_names(hand, dead)} read nothing while their neighbours were pressed; the fit "
+            "uses the mean of the neighbours, a run reads zero"
+        )
+    sums = blocks.counts.sum(-1)
+    high = sums > 0.5 * sums.max()
+    share = float(np.median(np.linalg.norm(blocks.shear[high], axis=-1) / sums[high]))
+    if share > _SHEAR:
+        notes.append(
+            f"{recording.name}: shear of {100 * share:.0f} % of the force by the taxels' x and y, which the fit "
+            "ignores; press on something that slides, rolls or is soft"
+        )
+    left = np.array(recording.counts)[recording.samples(RELEASED)].sum(-1)
+    if len(left) and np.median(left) > session.check.release:
+        notes.append(f"{recording.name}: {np.median(left):.0f} counts remain after the press: the zero drifts")
+    return notes
+
+
+def _zero_note(session: PressSession, hand: Hand) -> list[str]:
+    if not len(session.rest_current):
+        return []
+    zero = session.rest_current.mean(0)
+    worst = int(np.abs(zero).argmax())
+    return [
+        f"with the motors off the currents read up to {1e3 * abs(zero[worst]):.0f} mA ({hand.joint_names[worst]}): "
+        "this zero error of the sensor is part of the offsets"
+    ]

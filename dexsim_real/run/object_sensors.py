@@ -1,0 +1,67 @@
+"""Sensors of the object on hardware: a camera for its height, an IMU for its orientation."""
+
+import numpy as np
+
+from dexsim_real.control.controller import IDENTITY, Controller
+from dexsim_real.core.errors import HandError
+from dexsim_real.run.options import RunArguments
+from dexsim_real.sensors.camera import HeightSensor, open_masks
+from dexsim_real.sensors.imu import Imu
+from dexsim_real.sensors.readings import ObjectEstimate
+
+
+class ObjectSensors:
+    """Camera and IMU of a run; a coordinate that neither measures is taken as fixed.
+
+    Raises:
+      HandError: the policy needs a sensor that is not given, or a sensor cannot be opened.
+    """
+
+    def __init__(self, arguments: RunArguments, controller: Controller):
+        spec, needed = controller.spec, controller.sources
+        self._reference = np.asarray(spec.reference, float)
+        self._camera: HeightSensor | None = None
+        self._imu: Imu | None = None
+        if "imu" in needed and not arguments.imu:
+            raise HandError("the policy observes the object's orientation; give the IMU's port with --imu")
+        if "camera" in needed and not (arguments.camera or arguments.fixed_object):
+            raise HandError("the policy observes the object's height; give --camera, or --fixed-object to assume it")
+        try:
+            if arguments.camera:
+                self._camera = HeightSensor(
+                    open_masks(arguments.camera, arguments.optics),
+                    arguments.optics,
+                    self._reference,
+                    spec.object_axes,
+                    spec.velocity_filter,
+                )
+            if arguments.imu:
+                self._imu = Imu(arguments.imu, -np.asarray(spec.gravity), arguments.imu_mount)
+                self._imu.wait()
+        except BaseException:
+            self.close()
+            raise
+
+    def ready(self) -> bool:
+        """Whether the camera sees the object; if so, its current orientation becomes the identity."""
+        if self._camera and not self._camera.seen:
+            return False
+        if self._imu:
+            self._imu.calibrate(IDENTITY)
+        return True
+
+    def read(self, now: float) -> tuple[ObjectEstimate, float, float]:
+        """The estimate, the age in s of its oldest measurement, and the time in s of the newest orientation."""
+        position, velocity, quat, when, oldest = self._reference, np.zeros(3), IDENTITY, now, now
+        if self._camera:
+            seen, position, velocity = self._camera.read()
+            oldest = min(oldest, seen)
+        if self._imu:
+            when, quat = self._imu.read()
+            oldest = min(oldest, when)
+        return ObjectEstimate(position, velocity, quat), now - oldest, when
+
+    def close(self) -> None:
+        for sensor in (self._camera, self._imu):
+            if sensor:
+                sensor.close()

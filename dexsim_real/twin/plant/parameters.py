@@ -1,0 +1,203 @@
+"""Parameters of the hand and the object in a trial on the emulated hand, sampled just outside training's ranges.
+
+Each `Band` is a range of training, with its place in the configuration. A value is beyond one end of its range, by 5 to
+15 % of the width. Every joint, finger and trial samples its own end; where one end is impossible (a negative gear play,
+an efficiency above one) the other is used. To find out what breaks a policy, the kind "inside" samples within the
+ranges, and "nominal" takes their middle or neutral value. `STRUCTURE` holds what training does not model (torsional
+friction, thermal effects, ...) and is in every trial.
+
+The ranges are repeated here; a test compares them with the configurations of the shipped policies.
+"""
+
+import dataclasses
+
+import numpy as np
+
+from dexsim_real.core.errors import HandError
+
+KINDS = ("outside", "inside", "nominal")
+TASKS = ("grasp", "rotate")
+NEAR, FAR = 0.05, 0.15  # beyond an edge, as shares of the range's width
+EXCHANGE_COMMAND = 0.007  # s from a policy tick to the board: half a period at 83 Hz and 1 ms on the wire
+EXCHANGE_SENSE = 0.0146  # s from the board to a policy tick: 8.6 ms of reply and half a period
+_COUNT = {"trial": (), "joint": (12,), "finger": (5,), "axis": (3,), "plane": (2,)}
+
+
+@dataclasses.dataclass(frozen=True)
+class Band:
+    """A range of training, from which values inside, outside or at the nominal point are taken."""
+
+    low: float
+    high: float
+    unit: str
+    origin: str  # path in a task's configuration
+    nominal: float
+    per: str = "trial"  # one value per "trial", "joint", "finger", "axis" or "plane"
+    sides: str = "both"  # possible ends: "both", "high", "low"
+    width: float = 0.0  # width that the shares refer to; 0 is that of the range
+
+    def outside(self) -> tuple[tuple[float, float], ...]:
+        """The intervals beyond its ends, lowest first."""
+        width = self.width or self.high - self.low
+        below = (self.low - FAR * width, self.low - NEAR * width)
+        above = (self.high + NEAR * width, self.high + FAR * width)
+        return {"both": (below, above), "low": (below,), "high": (above,)}[self.sides]
+
+    def sample(self, rng: np.random.Generator, kind: str) -> np.ndarray:
+        """Sample values of a kind in `KINDS`; the shape follows from `per`."""
+        shape = _COUNT[self.per]
+        # Every kind consumes the same random numbers, so that kinds differ in nothing else.
+        side, place = rng.random(shape), rng.random(shape)
+        if kind == "nominal":
+            return np.full(shape, self.nominal)
+        if kind == "inside":
+            return self.low + place * (self.high - self.low)
+        spans = np.array(self.outside())
+        low, high = spans[(side * len(spans)).astype(int)].T
+        return (low + place.T * (high - low)).T
+
+
+def _symmetric(limit: float, unit: str, origin: str, per: str) -> Band:
+    return Band(-limit, limit, unit, origin, 0.0, per)
+
+
+BANDS: dict[str, Band] = {
+    # --- the drive, per joint
+    "stiffness": Band(0.8, 1.2, "1", "randomization.stiffness_factor", 1.0, "joint"),
+    "damping": Band(0.7, 1.3, "1", "randomization.damping_factor", 1.0, "joint"),
+    "gear_play": Band(0.0, 0.01, "rad", "randomization.dead_band", 0.0, "joint", "high"),
+    "torque": Band(0.9, 1.1, "1", "randomization.torque_factor", 1.0, "joint"),
+    "speed": Band(0.9, 1.1, "1", "randomization.speed_factor", 1.0, "joint"),
+    "efficiency": Band(0.85, 1.0, "1", "randomization.efficiency", 1.0, "joint", "low"),
+    "ripple": Band(0.0, 0.03, "1", "randomization.ripple", 0.0, "joint", "high"),
+    "ripple_count": Band(20.0, 200.0, "1/rad", "randomization.ripple_count", 100.0, "joint", "high"),
+    "coulomb_friction": Band(0.0, 0.03, "1", "randomization.coulomb_friction", 0.0, "joint", "high"),
+    "viscous_friction": Band(0.0, 0.01, "Nm s/rad", "randomization.viscous_friction", 0.0, "joint", "high"),
+    "latency": Band(0.0, 0.02, "s", "randomization.latency", 0.0, "trial", "high"),
+    "latency_spread": Band(0.0, 0.005, "s", "randomization.latency_spread", 0.0, "joint", "high"),
+    # --- the sensors of the hand
+    "sensing_latency": Band(0.0, 0.02, "s", "randomization.sensing_latency", 0.0, "trial", "high"),
+    "encoder_bias": _symmetric(0.01, "rad", "randomization.encoder_bias", "joint"),
+    "current_gain": Band(0.9, 1.1, "1", "randomization.torque_gain", 1.0, "joint"),
+    "taxel_gain": Band(0.9, 1.1, "1", "randomization.taxel_gain", 1.0, "finger"),
+    # --- the mount
+    "gravity_tilt": _symmetric(0.1, "rad", "randomization.gravity_tilt", "plane"),
+    # --- the object and its contacts
+    "inertia_scale": Band(0.8, 1.25, "1", "objects.inertia_scale", 1.0),
+    "com_offset": _symmetric(0.003, "m", "objects.com_offset", "axis"),
+    "friction": Band(0.6, 1.2, "1", "objects.friction", 0.9),
+    "link_friction": Band(0.6, 1.2, "1", "objects.link_friction", 0.9),
+    "stiffness_contact": Band(1600.0, 1800.0, "N/m", "objects.stiffness", 1700.0),
+    "restitution": Band(0.03, 0.08, "1", "objects.restitution", 0.05),
+    "rubber": Band(0.003, 0.003, "m", "physics.cover", 0.003, width=0.003),
+}
+"""Bands of both tasks; `TASK_BANDS` adds to them or replaces them."""
+
+TASK_BANDS: dict[str, dict[str, Band]] = {
+    "grasp": {
+        "mass": Band(0.05, 0.20, "kg", "objects.mass", 0.12),
+        "sphere_radius": Band(0.022, 0.035, "m", "objects.sphere_radius", 0.028),
+        "box_half": Band(0.020, 0.030, "m", "objects.box_half", 0.025, "axis"),
+        "cylinder_radius": Band(0.020, 0.030, "m", "objects.cylinder_radius", 0.025),
+        "cylinder_half": Band(0.020, 0.035, "m", "objects.cylinder_half", 0.027),
+        "neck_radius": Band(0.010, 0.016, "m", "objects.neck_radius", 0.013),
+        "neck_half": Band(0.008, 0.018, "m", "objects.neck_half", 0.013),
+        "gap": Band(0.001, 0.009, "m", "release_gap", 0.005, "trial", "high"),
+        "release_speed": Band(0.0, 0.1, "m/s", "release_speed", 0.0, "trial", "high"),
+    },
+    "rotate": {
+        "mass": Band(0.06, 0.15, "kg", "objects.mass", 0.10),
+        "link_friction": Band(0.3, 0.7, "1", "objects.link_friction", 0.5),
+        "edge": Band(0.050, 0.060, "m", "edge", 0.055),
+        "imu_bias": _symmetric(0.04, "rad", "sensing.orientation.bias", "axis"),
+        "imu_drift": _symmetric(0.0005, "rad/s", "sensing.orientation.drift", "trial"),
+        "imu_delay": Band(0.0, 0.02, "s", "sensing.orientation.delay", 0.0, "trial", "high"),
+    },
+}
+
+STRUCTURE: dict[str, float | tuple[float, ...]] = {
+    "torsion": 0.002,  # m, ratio of torsional to sliding friction of the rubber
+    "rolling": 0.0001,  # m, rolling friction
+    "palm_stiffness": 8000.0,  # N/m, plastic without rubber
+    "cone_ratio": 100.0,  # impratio: stiffness of friction relative to the normal direction
+    "gear_stiffness": 150.0,  # Nm/rad of the closed gear
+    "gear_inertia": 1e-5,  # kg m^2 of the gear's last stage, at the joint
+    "rotor_inertia": 1.0,  # factor on the rotors' reflected inertia (`scene.ROTORS`)
+    "no_load_current": 0.01,  # A
+    "thermal": 1.0,  # factor on thermal effects; 0: motors stay cold
+    "current_noise": 0.012,  # A
+    "encoder_noise": 0.001,  # rad
+    "taxel_noise": 0.015,  # N
+    "taxel_bias": 0.02,  # N, standard deviation
+    "taxel_spread": 0.08,  # standard deviation of the gains
+    "taxel_threshold": 0.06,  # N
+    "taxel_crosstalk": 0.06,  # share of a taxel's force that spreads to its neighbours
+    "taxel_period": 0.01,  # s between two samples of a fingertip
+    "camera_noise": 0.0025,  # m, white noise of the object's position after segmentation
+    "camera_delay": 0.03,  # s from a picture to its mask
+    "imu_noise": 0.01,  # rad, white noise
+    "heading_error": 0.05,  # rad, largest heading error when the object is placed
+    "place_error": 0.004,  # m, largest position error when the object is placed
+    "push_rate": 1.0,  # factor on the rate of pushes (`PUSHES`)
+    "push_seconds": 0.03,  # s, duration of a push
+}
+"""Parameters that training does not randomise or does not model: one value for all trials."""
+
+
+PUSHES = {"grasp": (0.5, 0.3), "rotate": (1 / 6, 0.1)}
+"""Pushes per second, and largest change of velocity m/s by a push, as in the evaluation of each task."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TrialParameters:
+    """Parameters of one trial, by the names in `BANDS`, `TASK_BANDS` and `STRUCTURE`. Each is also an attribute."""
+
+    task: str
+    kind: str
+    value: dict[str, np.ndarray]
+
+    def __getattr__(self, name: str) -> np.ndarray:
+        try:
+            return self.__dict__["value"][name]
+        except KeyError:
+            raise AttributeError(name) from None
+
+    def summary(self) -> dict[str, float | list[float]]:
+        """The sampled parameters, JSON-able."""
+        return {name: np.round(value, 6).tolist() for name, value in self.value.items() if name not in STRUCTURE}
+
+
+def bands(task: str) -> dict[str, Band]:
+    """All bands of a task, by name."""
+    return BANDS | TASK_BANDS[task]
+
+
+def sample_trial(
+    task: str, rng: np.random.Generator, kind: str = "outside", overrides: dict[str, float | str] | None = None
+) -> TrialParameters:
+    """Sample the parameters of a trial.
+
+    Args:
+      task: "grasp" or "rotate".
+      rng: random numbers of this trial.
+      kind: one of `KINDS`.
+      overrides: values by name, the same for all joints, fingers or axes; or a name in `KINDS` that applies to this
+        parameter.
+
+    Raises:
+      HandError: there is no such task, kind or parameter.
+    """
+    if task not in TASKS or kind not in KINDS:
+        raise HandError(f"no parameters of {task!r} {kind!r}: tasks are {', '.join(TASKS)}, kinds {', '.join(KINDS)}")
+    table, given = bands(task), overrides or {}
+    for name, number in given.items():
+        if name not in table and name not in STRUCTURE:
+            known = ", ".join(sorted([*table, *STRUCTURE]))
+            raise HandError(f"the emulated hand has no parameter {name!r}; choose from {known}")
+        if isinstance(number, str) and (number not in KINDS or name not in table):
+            raise HandError(f"{name} = {number!r}: give a number, or for a sampled parameter one of {', '.join(KINDS)}")
+    kinds = {name: number for name, number in given.items() if isinstance(number, str)}
+    value = {name: table[name].sample(rng, kinds.get(name, kind)) for name in sorted(table)}
+    value |= {name: np.asarray(number, float) for name, number in STRUCTURE.items()}
+    value |= {name: np.full_like(value[name], number) for name, number in given.items() if name not in kinds}
+    return TrialParameters(task, kind, value)

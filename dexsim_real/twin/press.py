@@ -1,0 +1,196 @@
+"""The emulated hand on a press bench: an emulated person holds a pen in front of the fingertip that is to press.
+
+    python -m dexsim_real.twin --plant dexsim_real.twin.press --parameters outside --seed 3
+
+For `python -m dexsim_real.calibrate`, with the drives, gears and taxels of the trials. The results contain the true
+values that the calibration should find. The pen is across the finger on a block of foam, which yields along its normal
+and, more softly, across it.
+"""
+
+import dataclasses
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from dexsim.hand.kinematics import Hand
+from dexsim.hand.load import load_hand
+from dexsim_real.calibrate.plan import Placement, placements
+from dexsim_real.twin.options import TwinArguments
+from dexsim_real.twin.plant.assistant import Place, Stage, put
+from dexsim_real.twin.plant.drives import STALL_CURRENT
+from dexsim_real.twin.plant.emulated_hand import EmulatedHand
+from dexsim_real.twin.plant.scene import build_scene
+from dexsim_real.twin.plant.shapes import ObjectShape, Primitive, matrix
+from dexsim_real.wire.frames import Mode
+
+_RADIUS = 0.006  # m
+PEN = ObjectShape("capsule", (Primitive("capsule", (_RADIUS, 0.020)),))
+_AWAY = np.array([0.4, 0.0, 0.0])
+_TOLERANCE = 0.015  # rad, largest distance of targets from the path of a placement
+_TURN = 0.5  # Nm/rad, rotational stiffness of the foam
+_RATIO = 0.7  # damping ratio of both springs
+_SOLID = {"mass": 0.1, "inertia_scale": 10.0, "com_offset": 0.0}
+
+
+@dataclasses.dataclass(frozen=True)
+class Foam:
+    """The foam that the fingertips press on."""
+
+    stiffness: float = 1000.0  # N/m along the normal
+    shear: float = 400.0  # N/m across it
+    gap: float = 0.002  # m between fingertip and pen at the posture of contact
+
+
+class _Holder:
+    """Replaces the assistant: the pen is always there, held by springs."""
+
+    stage = Stage.FREE
+
+    def begin(self, time: float) -> None:
+        """There is nothing to wait for."""
+
+
+class PressBench(EmulatedHand):
+    """An emulated hand with a pen on foam as its object, and one trial without end.
+
+    Args:
+      hand: model of the hand.
+      seed: of all random numbers.
+      kind: "outside", "inside" or "nominal" (`parameters.KINDS`).
+      overrides: fixed parameters (`sample_trial`).
+      foam: its stiffness and place.
+    """
+
+    def __init__(
+        self,
+        hand: Hand,
+        seed: int = 0,
+        *,
+        kind: str = "outside",
+        overrides: dict[str, float] | None = None,
+        foam: Foam = Foam(),
+    ):
+        self._plan, self._foam = placements(hand), foam
+        super().__init__(hand, "grasp", seed, kind=kind, overrides={**_SOLID, **(overrides or {})})
+
+    def results(self) -> list[dict[str, Any]]:
+        """True values of the hand (`truth`)."""
+        return [{"trial": 0, "seed": self.seed, "parameter_kind": self.kind, **self.truth()}]
+
+    def truth(self) -> dict[str, Any]:
+        """Values that a calibration should find: Nm per reported A (loading, unloading), taxel gains by finger."""
+        parameters, drives = self.parameters, self._drives
+        constant = drives.constant / parameters.current_gain
+        loss = 1.0 - drives.efficiency
+        return {
+            "joints": list(self.hand.joint_names),
+            "loading_nm_per_a": (constant * (1 - loss)).tolist(),
+            "unloading_nm_per_a": (constant * (1 + loss)).tolist(),
+            "friction_nm": np.asarray(drives.coulomb).tolist(),
+            "stall_a": STALL_CURRENT,
+            "taxel_gain": parameters.taxel_gain.tolist(),
+        }
+
+    # --- the pen --------------------------------------------------------------------------------
+
+    def _next_trial(self) -> None:
+        super()._next_trial()
+        self.shape, self._assistant = PEN, _Holder()
+        self._scene = scene = build_scene(self.hand, self.parameters, PEN, self._gravity)
+        joints = self._data.qpos[scene.drive_qpos].copy()
+        self._data = mujoco.MjData(scene.model)
+        self._data.qpos[scene.drive_qpos] = joints
+        self._probe = mujoco.MjData(scene.model)
+        self._pressing_placement: Placement | None = None
+        self._remove()
+        mujoco.mj_forward(scene.model, self._data)
+        self._past.clear()
+        self._samples.clear()
+        self._remember()
+
+    def _tick(self) -> None:
+        """Apply the springs that hold the pen."""
+        scene, data, foam = self._scene, self._data, self._foam
+        at, dof, mass = scene.object_qpos, scene.object_dof, float(self.parameters.mass)
+        shift, speed = data.qpos[at : at + 3] - self._place.position, data.qvel[dof : dof + 3]
+        along = np.outer(self._normal, self._normal)
+        across = np.eye(3) - along
+        force = -(foam.stiffness * along + foam.shear * across) @ shift
+        force -= 2 * _RATIO * (np.sqrt(foam.stiffness * mass) * along + np.sqrt(foam.shear * mass) * across) @ speed
+        skew = np.empty(3)
+        mujoco.mju_subQuat(skew, data.qpos[at + 3 : at + 7], self._place.quat)
+        inertia = float(scene.model.body_inertia[scene.object_body].max())
+        torque = -_TURN * skew - 2 * _RATIO * np.sqrt(_TURN * inertia) * data.qvel[dof + 3 : dof + 6]
+        wrench = data.xfrc_applied[scene.object_body]
+        wrench[:3], wrench[3:] = force - mass * self._gravity, matrix(data.qpos[at + 3 : at + 7]) @ torque
+        self._spring = force
+        super()._tick()
+
+    def _look(self) -> None:
+        """Hold the pen in front of the fingertip that is about to press."""
+        commands = self._commands
+        if self._touches:
+            return
+        if commands is None or not np.all(commands.mode == Mode.POSITION):
+            self._remove()
+            return
+        placement = next((p for p in self._plan if self._waits(p, commands.position)), self._pressing_placement)
+        if placement is not None and placement is not self._pressing_placement:
+            self._hold_before(placement)
+        elif self._pressing_placement is not None and self._left(commands.position):
+            self._remove()
+
+    def _waits(self, placement: Placement, target: np.ndarray) -> bool:
+        """Whether these targets [12] rad are on the path to the contact of a placement."""
+        advance = (target - placement.posture) @ placement.direction / (placement.direction @ placement.direction)
+        off = np.abs(target - placement.posture - advance * placement.direction).max()
+        return bool(off < _TOLERANCE and -0.7 < advance < -0.03)
+
+    def _left(self, target: np.ndarray) -> bool:
+        others = np.setdiff1d(np.arange(len(target)), self._pressing_placement.joints)
+        return bool(np.abs(target - self._pressing_placement.posture)[others].max() > 3 * _TOLERANCE)
+
+    def _hold_before(self, placement: Placement) -> None:
+        """Place the pen across the finger at the taxels of a placement, with the gap."""
+        self._pressing_placement, probe, model = placement, self._probe, self._scene.model
+        probe.qpos[self._scene.drive_qpos] = placement.posture
+        mujoco.mj_kinematics(model, probe)
+        body = self._scene.tip_body[placement.finger]
+        frame, finger = probe.xmat[body].reshape(3, 3), placement.finger
+        taxels = list(placement.taxels)
+        point = probe.xpos[body] + frame @ self.hand.taxel_position[finger, taxels].mean(0)
+        normal = frame @ self.hand.taxel_normal[finger, taxels].mean(0)
+        self._normal = normal / np.linalg.norm(normal)
+        along = frame @ (self.hand.taxel_position[finger, 11] - self.hand.taxel_position[finger, 0])
+        quat = _facing(self._normal, along)
+        far = 0.03
+        put(self._scene, probe, point + (_RADIUS + far) * self._normal, quat)
+        mujoco.mj_kinematics(model, probe)
+        pen = model.geom("object_0").id
+        touching = np.union1d(model.pair_geom1, model.pair_geom2)
+        tips = touching[self._scene.finger_of_geom[touching] == finger]
+        gap = min(mujoco.mj_geomDistance(model, probe, int(tip), pen, 0.1, None) for tip in tips)
+        self._put(point + (_RADIUS + far - gap + self._foam.gap) * self._normal, quat)
+
+    def _remove(self) -> None:
+        self._pressing_placement, self._normal = None, np.array([0.0, 0.0, 1.0])
+        self._put(_AWAY, np.array([1.0, 0.0, 0.0, 0.0]))
+
+    def _put(self, position: np.ndarray, quat: np.ndarray) -> None:
+        self._place, self._spring = Place(position, quat, np.zeros(3)), np.zeros(3)
+        put(self._scene, self._data, position, quat)
+
+
+def _facing(normal: np.ndarray, along: np.ndarray) -> np.ndarray:
+    """Orientation [4] with x along the normal and z across the finger."""
+    y = along - along @ normal * normal
+    y /= np.linalg.norm(y)
+    quat = np.empty(4)
+    mujoco.mju_mat2Quat(quat, np.stack([normal, y, np.cross(normal, y)], 1).ravel())
+    return quat
+
+
+def make_plant(arguments: TwinArguments) -> PressBench:
+    """The plant of `python -m dexsim_real.twin --plant dexsim_real.twin.press`."""
+    return PressBench(load_hand(), arguments.seed, kind=arguments.parameters)

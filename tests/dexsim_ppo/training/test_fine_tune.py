@@ -1,0 +1,123 @@
+"""Fine-tuning a policy: what is kept, what trains first, and what is refused."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import tiny_train
+from test_train import QUICK, exit_code
+from tiny_env import CONFIG, SMALL, TinyConfig, TinyEnv
+
+from dexsim_ppo import evaluate, train
+from dexsim_ppo.learner.ppo import make_train
+from dexsim_ppo.policy import Policy
+from dexsim_ppo.training.fine_tune import fine_tuning_config, initialize_from
+from dexsim_ppo.training.runlog import RunFolder, read_metrics
+
+
+@pytest.fixture(scope="module")
+def policy():
+    """The integrator solved."""
+    training = make_train(TinyEnv(), CONFIG)
+    state = training.init(jax.random.key(0))
+    for _ in range(12):
+        state, _ = training.step(state)
+    return Policy.from_training(TinyEnv(), CONFIG, state)
+
+
+@pytest.fixture
+def tiny_task(monkeypatch):
+    tiny_train.install(monkeypatch)
+
+
+def started(policy, config, env=None):
+    env = env or TinyEnv()
+    training = make_train(env, config)
+    return env, training, initialize_from(policy, config, training.init(jax.random.key(1)))
+
+
+def test_it_acts_like_the_policy(policy):
+    config = fine_tuning_config(policy, SMALL)
+    env, _, state = started(policy, config)
+    obs = jax.random.normal(jax.random.key(2), (256, 3))
+    again = Policy.from_training(env, config, state)
+    np.testing.assert_allclose(again(obs), policy(obs), atol=1e-5)
+    assert float(jnp.std(policy(obs))) > 0.1, "a policy that does something"
+
+
+def test_the_critic_learns_first_and_then_both(policy):
+    config = dataclasses.replace(fine_tuning_config(policy, SMALL), critic_first=3)
+    _, training, state = started(policy, config)
+    params = []
+    for _ in range(4):
+        state, metrics = training.step(jax.tree.map(jnp.copy, state))
+        params.append(jax.tree.map(np.asarray, state.params))
+        rate = float(metrics["learning_rate"][-1])
+        assert len(params) > 3 or rate == pytest.approx(config.learning_rate)
+    for before, after, moved in zip(params[:-1], params[1:], (False, False, True), strict=True):
+        for part in ("actor", "log_std"):
+            same = jax.tree.leaves(jax.tree.map(np.array_equal, getattr(before, part), getattr(after, part)))
+            assert not any(same) if moved else all(same), part
+        assert not np.array_equal(before.critic[0].kernel, after.critic[0].kernel)
+    for mine, theirs in zip(params[2].actor, policy.params.layers, strict=True):
+        np.testing.assert_array_equal(mine.kernel, theirs.kernel)
+
+
+def test_what_it_knows_survives_and_grows(policy):
+    """On a weaker motor: better from the first iteration on than one from nothing, never worse, better at the end."""
+    env = TinyEnv(TinyConfig(gain=0.15))
+    config = dataclasses.replace(fine_tuning_config(policy, CONFIG), critic_first=200)
+    _, training, state = started(policy, config, env)
+    measure = evaluate.Evaluator(env, 256)
+    score = lambda state: measure(  # noqa: E731
+        Policy.from_training(env, config, state).params,
+        episodes=256,
+        seed=1,
+    )[0]["return"]["value"]
+    first = score(state)
+    assert first > score(training.init(jax.random.key(1))) + 3
+    scores = []
+    for iteration in range(30):
+        state, _ = training.step(state)
+        if iteration % 5 == 4:
+            scores.append(score(state))
+    assert min(scores) > first - 0.02 and scores[-1] > first + 0.05, scores
+
+
+def test_from_the_command_line(policy, tiny_task, tmp_path):
+    file = tmp_path / "policy.msgpack"
+    dataclasses.replace(policy, env_config={**policy.env_config, "gain": 0.2}).save(file)
+    left_out = [i + k for i, o in enumerate(QUICK) if o in ("--task", "--ppo.actor-layers") for k in (0, 1)]
+    options = [o for i, o in enumerate(QUICK) if i not in left_out]
+    assert train.main([*options, "--policy", str(file), "--steps", str(2 * 128), "--run-dir", str(tmp_path / "a")]) == 0
+    folder = RunFolder(tmp_path / "a")
+    began, ended = Policy.load(folder.untrained), Policy.load(folder.last)
+    assert ended.env_config["gain"] == 0.2, "the policy's configuration is the default"
+    assert ended.training["policy"] == str(file)
+    obs = jax.random.normal(jax.random.key(2), (64, 3))
+    np.testing.assert_allclose(began(obs), policy(obs), atol=1e-5)
+    assert len(read_metrics(folder.metrics)) == 2
+    assert train.main(["--resume", str(tmp_path / "a"), "--steps", str(3 * 128)]) == 0, "resumes like any other"
+    assert exit_code(train.main, ["--resume", str(tmp_path / "a"), "--policy", str(file)]) == 2
+
+
+def test_what_does_not_fit_is_refused(policy, tiny_task, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    policy.save("policy.msgpack")
+    other = dataclasses.replace(
+        policy, observation_layout=tuple(field._replace(name=field.name + "_2") for field in policy.observation_layout)
+    )
+    other.save("other.msgpack")
+    before = sorted(tmp_path.iterdir())
+    for arguments, said in (
+        (["--task", "grasp", "--policy", "policy.msgpack"], "of the task 'tiny', not 'grasp'"),
+        (["--policy", "nothing.msgpack"], "cannot be read"),
+        (["--policy", "other.msgpack"], "observations of policy and environment differ"),
+        (["--policy", "policy.msgpack", "--ppo.actor-layers", "7"], "do not set --ppo.actor-layers"),
+    ):
+        assert exit_code(train.main, [*arguments, "--steps", "128"]) == 2
+        error = capsys.readouterr().err
+        assert said in error and error.count("\n") == 1, error
+        assert sorted(tmp_path.iterdir()) == before, "nothing is written"

@@ -1,0 +1,212 @@
+"""Whatever goes wrong in a calibration leaves the motors off and files as they were."""
+
+import dataclasses
+import io
+import re
+
+import numpy as np
+import pytest
+from calibrating import QUICK, arguments, off, on, operator, plates, record
+from press_bench import BenchHand
+from pty_hand import PtyHand
+from rich.console import Console
+
+from dexsim.calibration.maps import load_calibration
+from dexsim.core import cli
+from dexsim.core.errors import CalibrationError, ConfigError
+from dexsim_real.calibrate import __main__ as calibrate
+from dexsim_real.calibrate.__main__ import fit_and_report, main
+from dexsim_real.calibrate.gauge import Gauge
+from dexsim_real.calibrate.hand_loop import Operator
+from dexsim_real.calibrate.options import PressConfig
+from dexsim_real.calibrate.press_fit import fit
+from dexsim_real.calibrate.read import read_logs
+from dexsim_real.calibrate.report import torque_constants
+from dexsim_real.control.safety import SafetyConfig
+from dexsim_real.core.errors import HandError
+from dexsim_real.core.log import Kind, LogError, LogReader, LogWriter
+from dexsim_real.wire.frames import Mode
+
+
+class Interrupted(BenchHand):
+    """Something happens in the middle of the third second of pressing."""
+
+    def __init__(self, hand, event, **options):
+        super().__init__(hand, plates(hand, "index pad"), **options)
+        self.event, self.pressing = event, 0
+
+    def exchange(self, command):
+        self.pressing += self.force[1] > 0.5
+        if self.pressing == 60:
+            self.pressing += 1
+            answer = self.event(self)
+            if answer is not None:
+                return None
+        return super().exchange(command)
+
+
+def raises(error):
+    def event(bench):
+        raise error
+
+    return event
+
+
+def heat(bench):
+    bench.temperature = 95
+
+
+@pytest.mark.parametrize(
+    ("event", "error", "says"),
+    [
+        (raises(KeyboardInterrupt()), KeyboardInterrupt, None),
+        (raises(SystemExit(143)), SystemExit, "143"),
+        (raises(RuntimeError("broken")), RuntimeError, "broken"),
+        (heat, HandError, "too hot: 95 degC"),
+    ],
+)
+def test_however_it_ends_the_motors_are_off_and_the_old_file_is_there(hand, tmp_path, event, error, says):
+    (tmp_path / "hand.toml").write_text("precious")
+    bench = Interrupted(hand, event)
+    with pytest.raises(error, match=says):
+        record(bench, hand, arguments(tmp_path, force=True, press=QUICK))
+    assert on(bench).any() and off(bench) and bench.closed
+    assert (tmp_path / "hand.toml").read_text() == "precious"
+    ends = [entry.content for entry in LogReader(tmp_path / "hand.log") if entry.kind == Kind.END]
+    assert len(ends) == 1 and ends[0]["end"]
+
+
+def test_a_silent_hand_ends_it(hand, tmp_path):
+    bench = Interrupted(hand, lambda bench: None)
+    deaf = [False]
+    exchange = bench.exchange
+
+    def answer(command):
+        if bench.pressing >= 60:
+            deaf[0] = True
+        reply = exchange(command)
+        return None if deaf[0] else reply
+
+    bench.exchange = answer
+    with pytest.raises(HandError, match="stopped: no measurement for 2 s"):
+        record(bench, hand, arguments(tmp_path, press=QUICK))
+    assert off(bench) and bench.closed
+
+
+def test_what_it_presses_on_is_missing_or_unfelt(hand, tmp_path):
+    with pytest.raises(HandError, match="index pad: met nothing within"):
+        record(BenchHand(hand, []), hand, arguments(tmp_path, press=QUICK, log=tmp_path / "a.log"))
+    numb = BenchHand(hand, plates(hand, "index pad"), taxel_gain=[1, 0, 1, 1, 1])
+    with pytest.raises(HandError, match="index pad: 0.8.* A and no taxel feels it"):
+        options = arguments(tmp_path, press=PressConfig(current=0.8, approach_speed=0.5), log=tmp_path / "b.log")
+        record(numb, hand, options)
+    assert off(numb)
+
+
+def test_motors_that_give_no_more_turn_round(hand, tmp_path):
+    """A current limit far below what 8 N need: the press ends where the force ends."""
+    hardware = dataclasses.replace(arguments(tmp_path).hardware, torque_max=90)  # 0.45 A on the bench
+    bench = BenchHand(hand, plates(hand, "index pad"))
+    options = arguments(tmp_path, hardware=hardware, sides=False)
+    log = record(bench, hand, options)
+    found = fit(read_logs([log], hand), hand)
+    # As much as the joint gives by itself, or, pushed by the other one, as much as it holds.
+    gives, holds = (
+        (0.45 - 0.02) * bench.constant[4] * part / bench.plates[0].arms[4]
+        for part in (bench.efficiency[4], 1.15 / bench.back[4])
+    )
+    assert gives < found.calibration.real.force_max[4] < holds < 7
+    truth = bench.constant[4] * bench.efficiency[4]
+    assert -torque_constants(found.calibration)[0, 4] == pytest.approx(truth, rel=0.05)
+
+
+def test_nothing_is_overwritten(hand, session, tmp_path):
+    _, _, log, _ = session
+    path = tmp_path / "hand.toml"
+    options = arguments(tmp_path)
+    path.write_text("precious")
+    with pytest.raises(HandError, match="already exists: give another --output, or --force"):
+        arguments(tmp_path)
+    with pytest.raises(HandError, match=f"already exists: --from-log {re.escape(str(log))} fits these"):
+        fit_and_report(options, hand, [log], operator())  # It came while the hand was pressing.
+    assert path.read_text() == "precious"
+    fit_and_report(arguments(tmp_path, force=True), hand, [log], operator())
+    assert load_calibration(path, hand).joint_names == hand.joint_names
+
+
+def test_logs_that_are_none_of_presses(hand, tmp_path):
+    with LogWriter(tmp_path / "run.log") as log:
+        log.add(Kind.META, {"task": "grasp"})
+    with pytest.raises(LogError, match="this is a log of .grasp."):
+        read_logs([tmp_path / "run.log"], hand)
+    with LogWriter(tmp_path / "early.log") as log:
+        log.add(Kind.NOTE, "end: no answer")
+    with pytest.raises(LogError, match="ends before the hand was ready"):
+        read_logs([tmp_path / "early.log"], hand)
+    with pytest.raises(CalibrationError, match="no press was recorded"):
+        bench = BenchHand(hand, [])
+        with pytest.raises(HandError, match="met nothing"):
+            record(bench, hand, arguments(tmp_path, press=QUICK))
+        fit(read_logs([tmp_path / "hand.log"], hand), hand)
+
+
+def test_options_that_do_not_go_together(tmp_path):
+    for options, says in (
+        ({"port": None}, "--port for a hand, or --from-log"),
+        ({"from_log": (tmp_path / "a.log",)}, "--port for a hand, or --from-log"),
+        ({"press": PressConfig(current=1.9)}, "must be below --safety.current"),
+        ({"press": PressConfig(peak=20.0), "safety": SafetyConfig(finger_force=20.0)}, "well below"),
+    ):
+        with pytest.raises(HandError, match=says):
+            arguments(tmp_path, **options)
+    with pytest.raises(ConfigError, match="PressConfig.peak"):
+        PressConfig(peak=60.0)
+    with pytest.raises(HandError, match="no_such_module"):
+        Gauge("no_such_module:f", operator())
+    with pytest.raises(HandError, match="--gauge ask needs answers"):
+        Gauge("ask", operator())
+
+
+def test_nobody_at_the_terminal(hand, tmp_path):
+    bench = BenchHand(hand, plates(hand, "index pad"))
+    who = Operator(Console(file=io.StringIO()), stream=io.StringIO(""))
+    with pytest.raises(HandError, match="standard input is closed .--yes asks nothing."):
+        record(bench, hand, arguments(tmp_path, yes=False, press=QUICK), who)
+    assert off(bench) and bench.closed
+
+
+def command(*options):
+    """The command in this process, with its exit code and the last line on standard error."""
+    with pytest.raises(SystemExit) as stop:
+        cli.run(lambda _: main(list(options)))
+    return stop.value.code
+
+
+def test_the_command_refuses_a_touched_hand_in_one_line(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("serial")
+    monkeypatch.setattr(calibrate, "prepare_jax", lambda: None)
+    with PtyHand() as peer:
+        peer.state["tip"]["taxel"]["z"][3, 40:43] = 90
+        options = [
+            "--port",
+            peer.port,
+            "--yes",
+            "--output",
+            str(tmp_path / "hand.toml"),
+            "--log",
+            str(tmp_path / "hand.log"),
+            "--link.settle",
+            "0",
+            "--link.no-paced",
+            "--check.seconds",
+            "0.5",
+            "--no-realtime",
+        ]
+        assert command(*options) == 2
+        assert all(np.all(block["mode"] == Mode.PASSIVE) for block in peer.commands)
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert "firmware 1.3.9" in lines[0]
+    assert lines[-1].startswith("error: cannot tare the taxels: 3 adjacent taxels of the ring read above 40 counts")
+    assert not (tmp_path / "hand.toml").exists()
+    assert command("--port", "x", "--output", str(tmp_path / "hand.log")) == 2
+    assert "already exists" in capsys.readouterr().err

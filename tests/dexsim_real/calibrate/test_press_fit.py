@@ -1,0 +1,174 @@
+"""Presses of a hand with known torque constants, fitted from its log; readings of a gauge."""
+
+import io
+import json
+import queue
+
+import numpy as np
+import pytest
+from calibrating import arguments, off, on, operator, plates, record
+from press_bench import BenchHand
+from rich.console import Console
+
+from dexsim.calibration.maps import joint_torque, load_calibration
+from dexsim_real.calibrate.__main__ import fit_and_report
+from dexsim_real.calibrate.gauge import parse_reading
+from dexsim_real.calibrate.hand_loop import Operator
+from dexsim_real.calibrate.options import CalibrateArguments
+from dexsim_real.calibrate.press_fit import fit
+from dexsim_real.calibrate.read import read_logs
+from dexsim_real.calibrate.report import torque_constant_intervals, torque_constants
+from dexsim_real.core.errors import HandError
+from dexsim_real.core.log import Kind, LogError, LogReader, LogWriter
+
+
+def test_torque_constants_come_back(hand, session):
+    bench, options, _, _ = session
+    calibration = load_calibration(options.output, hand)
+    # Positive currents open, positive torques close: the hand's sense is in the sign.
+    found, intervals = -torque_constants(calibration), -torque_constant_intervals(calibration)
+    truth = np.stack([bench.constant * bench.efficiency, bench.constant / bench.back])
+    joints = [hand.joint_names.index(name) for name in ("index_bend", "index_joint1", "index_joint2")]
+    np.testing.assert_allclose(found[:, joints], truth[:, joints], rtol=0.03)
+    assert np.mean(np.abs(found / truth - 1)[:, joints]) < 0.015
+    inside = (intervals.min(-1) <= truth) & (truth <= intervals.max(-1))
+    assert inside[:, joints].mean() >= 5 / 6
+    # Where a run knows the direction, currents become torques; the zero error of the reading is in the offset.
+    current = np.zeros(12)
+    current[4] = -(0.5 / truth[0, 4] + bench.idle[4] + bench.bias[4])
+    assert float(joint_torque(calibration, current, np.ones(12))[4]) == pytest.approx(0.5, rel=0.04)
+    # Half the gap between the lines in the middle of the forces, which reach from about 1 N to 8 N.
+    assert calibration.real.force_max[4] == pytest.approx(8.0, abs=0.5)
+    torque = 4.5 * bench.plates[0].arms[4]
+    gap = torque * (1 / truth[0, 4] - 1 / truth[1, 4]) / 2 + bench.idle[4]
+    assert calibration.real.friction[4] == pytest.approx(gap, rel=0.15)
+
+
+def test_the_file_says_what_is_not_known_and_the_report_has_it_all(hand, session):
+    _, options, _, shown = session
+    notes = "\n".join(load_calibration(options.output, hand).notes)
+    assert "ring_joint1: not recorded" in notes and "error of the force sensor" in notes
+    # Of the two that read nothing the one in the middle of the press is dead; the other lies beside it.
+    assert "index: dead: column 4 row 4 read" in notes and "column 9 row 2" not in notes
+    assert "with the motors off the currents read up to" in notes
+    report = json.loads(options.report.read_text())
+    joint = report["joints"]["index_joint1"]
+    assert joint["press"] == "index pad" and joint["loading"]["r_squared"] > 0.99
+    assert joint["loading"]["condition"] < 10 and joint["loading"]["samples"] > 20
+    assert report["joints"]["mid_joint1"]["press"] is None
+    assert report["newtons_per_count"] == dict.fromkeys(hand.finger_names, 0.1)
+    assert "Nm / A" in shown and "index side" in shown and f"calibration: {options.output}" in shown
+    assert options.plot.stat().st_size > 20_000
+
+
+def test_the_motors_come_on_late_stay_within_limits_and_go_off(hand, session):
+    bench, options, _, _ = session
+    motors = on(bench)
+    resting = round(options.check.seconds * options.rate)
+    assert not motors[:resting].any() and off(bench) and bench.closed
+    sent = np.array([command["position"] for command in bench.commands])[motors]
+    assert np.all(sent >= hand.joint_lower - 1e-6) and np.all(sent <= hand.joint_upper + 1e-6)
+    assert np.abs(np.diff(sent, axis=0)).max() <= 2.0 / options.rate * 1.2
+
+
+def test_a_log_gives_the_same_file_without_the_hand(hand, session, tmp_path):
+    _, options, log, _ = session
+    again = CalibrateArguments(from_log=(log,), output=tmp_path / "again.toml")
+    fit_and_report(again, hand, again.from_log, operator())
+    assert again.output.read_bytes() == options.output.read_bytes()
+
+
+def test_logs_add_up(hand, session, scale, tmp_path):
+    """What one session left out another has pressed."""
+    other = scale[1].log
+    both = fit(read_logs([session[2], other], hand), hand)
+    assert {both.source[name] for name in ("index_joint1", "mid_joint1", "index_bend")} == {
+        "index pad",
+        "middle pad",
+        "index side",
+    }
+    assert both.sensors.keys() == {"middle"}
+    with pytest.raises(LogError, match="other --hardware options"):
+        path = tmp_path / "other.log"
+        with LogWriter(path) as log:
+            for entry in LogReader(other):
+                content = entry.content
+                if entry.kind == Kind.META and "hardware" in content:
+                    content = {**content, "hardware": {**content["hardware"], "taxel_floor": 2.0}}
+                log.add(entry.kind, content, entry.time)
+        read_logs([other, path], hand)
+
+
+class Typist(io.StringIO):
+    """A terminal and who sits at it: presses Enter when told to, types in what the scale shows."""
+
+    def __init__(self, bench):
+        super().__init__()
+        self.bench, self.lines, self.read = bench, queue.SimpleQueue(), 0
+
+    def write(self, text):
+        if "Enter presses" in text:
+            self.lines.put("\n")
+        elif "reading of the gauge" in text:
+            self.read += 1
+            grams = 1e3 * self.bench.force[2] / 9.80665
+            # A slip of the finger first: it is asked for again.
+            self.lines.put("five\n" if self.read == 2 else f"{grams:.0f} g\n")
+        return super().write(text)
+
+    def __iter__(self):
+        return self
+
+    def __next__(self):
+        return self.lines.get()
+
+    def isatty(self):
+        return False
+
+
+@pytest.fixture(scope="module")
+def scale(hand, tmp_path_factory):
+    """The middle pressed on a kitchen scale; its taxels read 15 % too little."""
+    bench = BenchHand(hand, plates(hand, "middle pad"), taxel_gain=[1, 1, 0.85, 1, 1])
+    typist = Typist(bench)
+    who = Operator(Console(file=typist, width=200), stream=typist)
+    options = arguments(tmp_path_factory.mktemp("scale"), fingers=("middle",), gauge="ask", yes=False)
+    fit_and_report(options, hand, [record(bench, hand, options, who)], who)
+    return bench, options, typist
+
+
+def test_a_kitchen_scale_gives_the_newtons(hand, scale):
+    """Without the scale all torques would be 15 % too small."""
+    bench, options, typist = scale
+    assert typist.read == 12 and "'five' is not a reading" in typist.getvalue()
+    calibration = load_calibration(options.output, hand)
+    truth = np.stack([bench.constant * bench.efficiency, bench.constant / bench.back])
+    np.testing.assert_allclose(-torque_constants(calibration)[:, 6:8], truth[:, 6:8], rtol=0.03)
+    # As a run sees them, counts below the floor are cut off, so that the slope is a little steeper than the taxels'.
+    assert calibration.force_per_count[2] == pytest.approx(0.1 / 0.85, rel=0.1)
+    notes = "\n".join(calibration.notes)
+    assert "middle pad:" in notes and "counts per newton by the gauge (11 readings)" in notes
+    assert "thumb: not compared with the gauge" in notes and "error of the force sensor" not in notes
+
+
+def test_too_few_readings_do_not_count(hand, scale):
+    session = read_logs([scale[1].log], hand)
+    recording = session.recordings["middle pad"]
+    recording.gauge = dict(list(recording.gauge.items())[:7])
+    found = fit(session, hand)
+    assert not found.sensors and np.all(np.asarray(found.calibration.force_per_count) == 0.1)
+    assert any("middle pad: 7 gauge readings are ignored" in note for note in found.calibration.notes)
+
+
+@pytest.mark.parametrize(
+    ("text", "newtons"),
+    [("5.2", 5.2), ("5,2 N", 5.2), ("530 g", 5.197525), ("0.53kg", 5.197525), (" .5n ", 0.5), ("0", 0.0)],
+)
+def test_readings_of_a_gauge(text, newtons):
+    assert parse_reading(text) == pytest.approx(newtons)
+
+
+@pytest.mark.parametrize("text", ["", "five", "5 lb", "-3", "1e3", "nan", "530", "5.2.1"])
+def test_what_is_no_reading(text):
+    with pytest.raises(HandError, match="not a reading|grams need a g"):
+        parse_reading(text)

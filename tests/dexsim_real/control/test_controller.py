@@ -1,0 +1,222 @@
+"""The simulation and the bridge give the same observation, in the same order of action and sensing."""
+
+import os
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from paths import ROOT
+
+pytest.importorskip("serial")
+from dexsim.control import Control
+from dexsim.env.env import Env
+from dexsim.env.observer import Observer
+from dexsim.env.state import Start
+from dexsim.geometry import rotations
+from dexsim.observation import layout
+from dexsim.physics.seam import PhysicsState
+from dexsim.randomization import Randomization
+from dexsim.sensing.config import Sensing
+from dexsim.sensing.imu import ImuConfig
+from dexsim.sensing.taxels import TaxelSensor
+from dexsim.task_spec import TaskSpec
+from dexsim.tasks.grasp.config import GraspConfig
+from dexsim.tasks.grasp.task import Grasp
+from dexsim.tasks.rotate.config import RotateConfig
+from dexsim.tasks.rotate.objects import sample_turned_object
+from dexsim.tasks.rotate.task import Rotate
+from dexsim_ppo.policy import load_policy
+from dexsim_real.control.controller import IDENTITY, Controller
+from dexsim_real.sensors.hand import HandSensing, HardwareConfig
+from dexsim_real.sensors.readings import ObjectEstimate
+from dexsim_real.wire import frames
+
+QUIET = Sensing(
+    joint_noise=0.0,
+    joint_resolution=0.0,
+    torque_noise=0.0,
+    object_noise=0.0,
+    orientation=ImuConfig(noise=0.0, bias=0.0, drift=0.0, delay=(0.0, 0.0), rate=10000.0),
+    taxel=TaxelSensor(noise=0.0),
+)
+
+
+class FakePhysics:
+    """Joints that follow torque like a first-order lag and an object that turns: `Env` around it is the real one."""
+
+    def __init__(self, hand, slots, largest, config, **options):
+        self.backend, self.config = "jax", config
+        self.joint_qpos, self.joint_dof = np.arange(12), np.arange(12)
+        self.object_qpos, self.object_dof = np.arange(12, 19), np.arange(12, 18)
+        self.mj_model = SimpleNamespace(nv=18, dof_M0=np.ones(18), opt=SimpleNamespace(timestep=config.timestep))
+
+    def advance_motors(self, object, state, motors, memory, push):
+        joints, velocity = state.qpos[:12], state.qvel[:12]
+        torque, memory = motors(jnp.asarray(5), joints, velocity, memory)
+        velocity = torque * 2.0
+        joints = joints + self.config.control_period * velocity
+        turned = rotations.quat_multiply(jnp.array([jnp.cos(0.02), jnp.sin(0.02), 0.0, 0.0]), state.qpos[15:])
+        qpos = jnp.concatenate([joints, state.qpos[12:15], turned])
+        qvel = jnp.concatenate([velocity, jnp.zeros(6)])
+        force = jnp.zeros((5, 3)).at[:, 0].set(jnp.abs(jnp.sin(5 * joints[:5])) * 3)
+        return PhysicsState(qpos, qvel, state.warmstart), force, memory
+
+
+class StillRotate(Rotate):
+    """The task, but with one start state made on the spot."""
+
+    def make_pool(self, key):
+        place = jnp.concatenate([jnp.asarray(self.reference), jnp.array([1.0, 0, 0, 0])])
+        qpos = jnp.concatenate([jnp.asarray(self.config.posture), place])
+        object = sample_turned_object(key, self.config)
+        return jax.tree.map(lambda x: x[None], Start(qpos=qpos, qvel=jnp.zeros(18), object=object))
+
+
+class Acts:
+    """What the controller needs of a policy, with a function in place of the network."""
+
+    def __init__(self, task, hand, act):
+        config = task.config
+        self.act, self.task, self.spec = act, task.name, TaskSpec.of(task)
+        self.control_rate = 1 / config.physics.control_period
+        self.observation_layout = layout(hand, task.fields["actor"], config.observation)
+
+    def __call__(self, observation):
+        return self.act(observation)
+
+
+def random_state(rng, hand):
+    """A state block with every number different and few taxels pressed."""
+    block = frames.empty_state()
+    block["joint"]["position"] = rng.uniform(hand.joint_lower, hand.joint_upper)
+    block["joint"]["current"] = rng.integers(-900, 900, 12)
+    block["tip"]["taxel"]["z"] = rng.integers(0, 60, (5, 120)) * (rng.random((5, 120)) < 0.1)
+    return block
+
+
+@pytest.mark.parametrize(("task_class", "config"), [(Grasp, GraspConfig()), (Rotate, RotateConfig())])
+def test_one_frame_gives_the_same_observation_through_both_doors_bit_for_bit(hand, task_class, config):
+    rng = np.random.default_rng(4)
+    task = task_class(config, hand)
+    controller = Controller(Acts(task, hand, lambda observation: rng.uniform(-1, 1, 12).astype(np.float32)), hand)
+    sensing = HandSensing(hand, HardwareConfig())
+    # The simulation's door: `Observer`, compiled by itself, on readings and some truth for the critic.
+    observer = Observer(config, hand, task)
+
+    def door(readings, goal):
+        moment = SimpleNamespace(
+            **dict.fromkeys(("joint_torque", "joint_velocity", "action"), jnp.zeros(12)),
+            joint_position=readings.joint_position,
+            touch=SimpleNamespace(force=readings.taxel_force),
+            object_position=readings.object_position,
+            object_velocity=readings.object_velocity,
+            object_quat=readings.object_quat,
+            object_spin=jnp.zeros(3),
+        )
+        command, goal_quat = task.goal_readings(goal)
+        return observer.observe(readings, moment, command, goal_quat)["actor"]
+
+    door = jax.jit(door)
+    goal = task.begin(jax.random.key(0), None)
+    for _ in range(20):
+        quats = rng.normal(size=(2, 4))
+        quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+        seen = ObjectEstimate(rng.normal(size=3), rng.normal(size=3), quats[0])
+        data = random_state(rng, hand).tobytes()
+        tick = controller.tick(sensing.measure(frames.decode_state(data)), seen, quats[1], 0.37)
+        simulated = np.asarray(door(tick.readings, goal))
+        assert simulated.dtype == tick.observation.dtype == np.float32
+        assert simulated.tobytes() == tick.observation.tobytes()
+        assert len(simulated) == (66 if task.name == "grasp" else 65)
+
+
+def test_a_golden_trace_pins_the_order_of_action_and_sensing(hand, monkeypatch):
+    """The real `Env.step` over simple physics, and the bridge fed with frames of what that hand measured."""
+    monkeypatch.setattr("dexsim.env.env.Physics", FakePhysics)
+    config = RotateConfig(
+        sensing=QUIET,
+        randomization=Randomization(scale=0.0),
+        pool_size=1,
+        edge=(0.11, 0.11),
+        control=Control(step=0.08),
+    )
+    task = StillRotate(config, hand)
+    weights = np.random.default_rng(0).normal(size=(65, 12)).astype(np.float32) * 0.3
+
+    def act(observation):
+        return jnp.tanh(jnp.asarray(observation) @ weights)
+
+    env = Env(task, hand)
+    state, step = jax.jit(env.reset)(jax.random.key(3)), jax.jit(env.step)
+    controller = Controller(Acts(task, hand, act), hand)
+    controller.start(np.asarray(state.joint_target))
+    sensing = HandSensing(hand, HardwareConfig(taxel_floor=0.0))
+    at = [f.name for f in controller.policy.observation_layout].index("last_action")
+    begin = sum(f.size for f in controller.policy.observation_layout[:at])
+    actions, touched = [np.zeros(12, np.float32)], 0
+    for _ in range(10):
+        readings = state.readings
+        block = frames.empty_state()
+        block["joint"]["position"] = readings.joint_position
+        block["tip"]["taxel"]["z"] = np.round(np.asarray(readings.taxel_force) / 0.1)
+        seen = ObjectEstimate(readings.object_position, readings.object_velocity, readings.object_quat)
+        tick = controller.tick(sensing.measure(block), seen, readings.goal_quat, 0.0)
+        # The action in the observation is the one that led to this measurement, not the one it leads to.
+        np.testing.assert_array_equal(tick.observation[begin : begin + 12], actions[-1])
+        np.testing.assert_array_equal(tick.readings.last_action, actions[-1])
+        np.testing.assert_allclose(tick.readings.last_action, readings.last_action, atol=1e-5)
+        np.testing.assert_allclose(tick.observation, state.obs["actor"], atol=2e-5)
+        actions.append(tick.action)
+        touched += bool(np.any(readings.taxel_force))
+        state = step(state, act(state.obs["actor"]))
+        np.testing.assert_allclose(tick.target, state.joint_target, atol=1e-5)
+        np.testing.assert_allclose(tick.action, state.action, atol=1e-5)
+    assert np.abs(np.diff(actions, axis=0)).max() > 0.05 and touched > 4
+
+
+def test_an_action_that_is_not_finite_counts_as_none(hand):
+    task = Grasp(GraspConfig(), hand)
+    answers = iter([np.full(12, 0.5, np.float32), np.full(12, np.nan, np.float32), np.full(12, 3.0, np.float32)])
+    controller = Controller(Acts(task, hand, lambda observation: next(answers)), hand)
+    middle = ((hand.joint_lower + hand.joint_upper) / 2).astype(np.float32)
+    controller.start(middle)
+    block = frames.empty_state()
+    block["joint"]["position"] = middle
+    measured = HandSensing(hand, HardwareConfig()).measure(block)
+    seen = ObjectEstimate(np.zeros(3), np.zeros(3), IDENTITY)
+    first, second, third = (controller.tick(measured, seen, IDENTITY, 0.5) for _ in range(3))
+    assert np.isnan(second.target).all() and not second.action.any()
+    np.testing.assert_array_equal(third.readings.last_action, np.zeros(12))
+    np.testing.assert_array_equal(third.action, np.ones(12))  # Clipped, as `Env.step` does.
+    inside = np.abs(middle - hand.joint_upper) > 0.4
+    np.testing.assert_allclose((third.target - first.target)[inside], 0.2, atol=1e-5)
+
+
+def test_running_a_policy_needs_no_mjx(tmp_path):
+    code = """
+import sys
+from dexsim import load_hand
+from dexsim_ppo.evaluate import load_policy
+from dexsim_real import run, replay
+from dexsim_real.control.controller import Controller
+Controller(load_policy("grasp"), load_hand()).warm()
+print([name for name in sys.modules if name.startswith("mujoco.mjx") or name in ("warp", "brax", "cv2", "serial")])
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        env={**os.environ, "JAX_PLATFORMS": "cpu"},
+    )
+    assert done.stdout.strip() == "[]", done.stderr
+
+
+def test_the_shipped_policy_fits_the_bridge(hand):
+    controller = Controller(load_policy("grasp"), hand)
+    assert controller.sources == {"hand", "camera", "user"} and controller.period == pytest.approx(0.03)

@@ -1,0 +1,41 @@
+"""Goals of the rotation task on hardware."""
+
+import math
+
+import numpy as np
+import pytest
+
+from dexsim.tasks.rotate.config import RotateConfig
+from dexsim.tasks.rotate.task import goal_quat
+from dexsim_real.control.goals import TurnGoals
+from dexsim_real.sensors.readings import ObjectEstimate
+
+
+def seen(angle, axis=(1.0, 0, 0), place=(0.048, 0.0, 0.085)):
+    quat = np.array([math.cos(angle / 2), *(math.sin(angle / 2) * np.array(axis))])
+    return ObjectEstimate(np.array(place), np.zeros(3), quat)
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+def test_goals_move_on_as_in_the_task(direction):
+    config = RotateConfig(direction=direction)
+    goals = TurnGoals(config.turn, config.reference)
+    rate, period, turns = 0.8 * direction, 0.03, 0
+    for k in range(600):
+        wanted = np.asarray(goal_quat(turns, np.asarray(config.axis), direction * config.goal_step))
+        np.testing.assert_allclose(goals.quat, wanted, atol=1e-5)
+        angle = rate * period * k
+        goals.update(period * k, seen(angle))
+        # A goal is reached 0.3 rad before it.
+        turns = max(turns, math.floor((abs(angle) + config.goal_angle - 1e-9) / config.goal_step))
+        assert goals.successes == turns
+    assert turns >= 8 and len(goals.times) == turns
+
+
+def test_a_goal_passed_at_speed_or_far_away_does_not_count():
+    config = RotateConfig(goal_spin=2.0)
+    fast, far = TurnGoals(config.turn, config.reference), TurnGoals(config.turn, config.reference)
+    for k in range(40):
+        fast.update(0.03 * k, seen(6.0 * 0.03 * k))
+        far.update(0.03 * k, seen(1.0 * 0.03 * k, place=(0.2, 0, 0.085)))
+    assert fast.successes == far.successes == 0

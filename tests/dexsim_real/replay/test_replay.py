@@ -1,0 +1,140 @@
+"""A run and its replay: to the last bit, and what the viewer gets."""
+
+import sys
+
+import numpy as np
+import pytest
+
+pytest.importorskip("serial")
+from following_hand import FollowingHand, arguments, records, summary
+
+from dexsim_real.core.log import Kind, LogError, LogReader
+from dexsim_real.replay import __main__ as replay_command
+from dexsim_real.replay import replay
+from dexsim_real.replay.plots import show_rerun
+from dexsim_real.run import __main__ as run
+
+pytestmark = pytest.mark.usefixtures("jax_as_it_is")
+
+
+def test_a_run_from_the_measured_pose_to_motors_off_and_its_replay(hand, tmp_path):
+    with FollowingHand() as peer:
+        assert run.main(arguments(peer, tmp_path, "--seconds", "1.2", "--command", "0.6")) == 0
+        on, commands = peer.on(), peer.commands
+    first = int(np.argmax(on))
+    # Off while zeroing and warming, on at the measured pose, without a break until the end, then off.
+    assert first > 30 and on[first:-1].all() and not on[-1]
+    np.testing.assert_allclose(commands[first]["position"], peer.poses[first], atol=1e-6)
+    sent = np.array([block["position"] for block, motor in zip(commands, on, strict=True) if motor])
+    assert np.all(sent >= hand.joint_lower - 1e-6) and np.all(sent <= hand.joint_upper + 1e-6)
+    speeds = np.abs(np.diff(sent, axis=0)).max(1) / np.diff(np.array(peer.times)[on])
+    assert np.median(speeds) < 25
+    report = summary(tmp_path)
+    assert report["end"] == "time is over" and report["command"] == 0.6
+    assert report["policy_jitter"]["count"] == pytest.approx(1.2 * 100 / 3, abs=15)
+    assert report["link"]["sent"] == report["link"]["answered"] == len(commands) + 1  # And the version.
+    # Everything is in the log: each frame, and each tick with the frame that it saw.
+    assert len(records(tmp_path, Kind.RECEIVED)) == len(records(tmp_path, Kind.SENT)) == len(commands) + 1
+    ticks = records(tmp_path, Kind.TICK)
+    assert [tick["readings"]["command"] for tick in ticks] == [np.float32(0.6)] * len(ticks)
+    for before, after in zip(ticks[:-1], ticks[1:], strict=True):
+        assert after["readings"]["last_action"].tobytes() == before["action"].tobytes()
+    again = replay.replay(tmp_path / "run.log").report
+    assert again["ticks"] == again["readings_same"] == again["observations_same"] == len(ticks) > 20
+    assert again["first_difference"] is None and again["damaged_bytes"] == 0
+    assert replay_command.main([str(tmp_path / "run.log"), "--plot", str(tmp_path / "run.png")]) == 0
+    assert (tmp_path / "run.png").stat().st_size > 10_000
+    forged(tmp_path)
+    seen_in_rerun(tmp_path)
+
+
+class Rerun:
+    """Stands in for the rerun package, which is an extra of 170 MB: keeps what is sent to the viewer."""
+
+    class RecordingStream:
+        def __init__(self, name):
+            self.columns, self.pictures, self.names, self.saved = {}, [], {}, None
+            Rerun.last = self
+
+        def save(self, path):
+            self.saved = path
+
+        def set_time(self, timeline, duration):
+            self.now = duration
+
+        def log(self, entity, what, static=False):
+            self.names.update({entity: what}) if static else self.pictures.append((self.now, entity, what))
+
+        def send_columns(self, entity, indexes, columns):
+            self.columns[entity] = indexes[0], columns
+
+        def disconnect(self):
+            pass
+
+    class Scalars:
+        @staticmethod
+        def columns(scalars):
+            return scalars
+
+    @staticmethod
+    def SeriesLines(names):
+        return names
+
+    @staticmethod
+    def TimeColumn(timeline, duration):
+        return duration
+
+    @staticmethod
+    def DepthImage(picture, **_):
+        return picture
+
+
+def seen_in_rerun(folder):
+    """What goes to the viewer is what the log says, under the names of joints, fingers and fields."""
+    path = folder / "run.log"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(sys.modules, "rerun", None)
+        with pytest.raises(LogError, match=r"pip install 'dexsim\[rerun\]'"):
+            show_rerun(replay.replay(path), folder / "run.rrd")
+        patch.setitem(sys.modules, "rerun", Rerun)
+        assert replay_command.main([str(path), "--rrd", str(folder / "new" / "run.rrd")]) == 0
+    sent, ticks = Rerun.last, records(folder, Kind.TICK)
+    assert sent.saved == folder / "new" / "run.rrd"
+    for entity, key in (("angle", "joint_position"), ("observation/joint_position", "joint_position")):
+        np.testing.assert_array_equal(sent.columns[entity][1], [tick["readings"][key] for tick in ticks])
+    whole = np.concatenate([values for entity, (_, values) in sent.columns.items() if "observation/" in entity], 1)
+    np.testing.assert_array_equal(whole, [tick["observation"] for tick in ticks])
+    for entity, (times, values) in sent.columns.items():
+        assert values.shape == (len(times), len(sent.names[entity])) and len(times) == len(ticks), entity
+        assert times[0] == 0 and np.all(np.diff(times) > 0)
+    assert len(sent.pictures) == 5 * len(ticks) and {picture.shape for *_, picture in sent.pictures} == {(12, 10)}
+
+
+def test_the_real_viewer_takes_a_replay(tmp_path):
+    """Not in the suite's environment: `pip install rerun-sdk` first."""
+    pytest.importorskip("rerun")
+    with FollowingHand() as peer:
+        assert run.main(arguments(peer, tmp_path, "--seconds", "0.5")) == 0
+    assert replay_command.main([str(tmp_path / "run.log"), "--rrd", str(tmp_path / "run.rrd")]) == 0
+    assert (tmp_path / "run.rrd").read_bytes()[:3] == b"RRF"
+
+
+def forged(folder):
+    """One bit of one logged observation changed: replay must tell."""
+    from dexsim_real.core.log import LogWriter
+
+    path = folder / "forged.log"
+    with LogWriter(path) as log:
+        seen = 0
+        for record in LogReader(folder / "run.log"):
+            content = record.content
+            if record.kind == Kind.TICK:
+                seen += 1
+                if seen == 10:
+                    bits = content["observation"].copy().view(np.uint32)
+                    bits[7] ^= 1
+                    content = {**content, "observation": bits.view(np.float32)}
+            log.add(record.kind, content, record.time)
+    report = replay.replay(path).report
+    assert report["observations_same"] == report["ticks"] - 1 and report["first_difference"].startswith("tick 9 ")
+    assert replay_command.main([str(path)]) == 1

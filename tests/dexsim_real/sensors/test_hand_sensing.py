@@ -1,0 +1,147 @@
+"""From the hand's counts to SI units: signs, scales, tare, and what measures each field."""
+
+import numpy as np
+import pytest
+
+from dexsim.observation import GRASP, ROTATE, ROTATE_CRITIC
+from dexsim_real.core.errors import HandError
+from dexsim_real.sensors.hand import HandSensing, HardwareConfig, VelocityFilter
+from dexsim_real.sensors.readings import sources_of
+from dexsim_real.wire import frames
+from dexsim_real.wire.frames import Mode
+
+
+def state(**joint):
+    block = frames.empty_state()
+    for name, value in joint.items():
+        block["joint"][name] = value
+    return block
+
+
+def test_angles_have_sign_and_offset_both_ways(hand):
+    sign = np.where(np.arange(12) == 3, -1.0, 1.0)
+    offset = np.linspace(-0.1, 0.1, 12)
+    sensing = HandSensing(hand, HardwareConfig(joint_sign=tuple(sign), joint_offset=tuple(offset)))
+    raw = np.linspace(-0.5, 1.5, 12).astype(np.float32)
+    measured = sensing.measure(state(position=raw))
+    np.testing.assert_allclose(measured.joint_position, raw * sign + offset, atol=1e-6)
+    sent = sensing.command(measured.joint_position, Mode.POSITION)
+    np.testing.assert_allclose(sent["position"], raw, atol=1e-6)
+    assert measured.joint_position.dtype == np.float32
+
+
+def test_a_relaxed_command_carries_no_gain(hand):
+    block = HandSensing(hand, HardwareConfig()).command(np.zeros(12), Mode.PASSIVE)
+    for name in ("kp", "ki", "kd", "torque_max", "mode"):
+        assert not block[name].any()
+    on = HandSensing(hand, HardwareConfig(torque_max=250)).command(np.zeros(12), Mode.POSITION)
+    assert set(on["torque_max"].tolist()) == {250} and set(on["kp"].tolist()) == {100}
+
+
+def test_taxels_are_tared_and_scaled(hand):
+    sensing = HandSensing(hand, HardwareConfig(force_per_count=0.1, taxel_floor=1.0))
+    rest = state()
+    rest["tip"]["taxel"]["z"] = np.arange(120) % 7
+    other = rest.copy()
+    other["tip"]["taxel"]["z"] += 2
+    sensing.set_tare([rest, other])  # Mean: 1 above rest.
+    pressed = rest.copy()
+    pressed["tip"]["taxel"]["z"][2, 17] += 31
+    pressed["tip"]["taxel"]["x"][2, 17] = -100  # Does not count with "z".
+    force = sensing.measure(pressed).taxel_force
+    wanted = np.zeros((5, 120))
+    wanted[2, 17] = 3.0
+    np.testing.assert_allclose(force, wanted, atol=1e-6)
+    np.testing.assert_allclose(sensing.measure(pressed).finger_force, wanted.sum(1), atol=1e-6)
+    norm = HandSensing(hand, HardwareConfig(taxel_axes="norm"))
+    block = state()
+    block["tip"]["taxel"][4, 119] = (-3, 4, 12)
+    assert norm.measure(block).taxel_force[4, 119] == pytest.approx(1.3)
+
+
+def test_zeroing_is_refused_under_load(hand):
+    sensing = HandSensing(hand, HardwareConfig())
+    loaded = state()
+    loaded["tip"]["taxel"]["z"][1, 5] = 90
+    with pytest.raises(HandError, match="index read up to 90 counts"):
+        sensing.set_tare([loaded] * 5)
+    assert not sensing.tare.any()
+
+
+def test_current_without_and_with_a_calibration(hand, tmp_path):
+    counts = np.linspace(-900, 900, 12).astype(np.int16)
+    plain = HandSensing(hand, HardwareConfig(current_sign=-1.0, current_scale=1500.0))
+    np.testing.assert_allclose(plain.measure(state(current=counts)).joint_torque, counts / -1500.0, atol=1e-6)
+    np.testing.assert_allclose(plain.measure(state(current=counts)).current, np.abs(counts) / 1000.0, atol=1e-6)
+
+    from dexsim.calibration.maps import Calibration, Side, load_calibration, save_calibration
+
+    def side(gain, offset):
+        pair = np.ones((2, 12))
+        return Side(
+            pair * gain,
+            pair,
+            pair,
+            pair * offset,
+            pair,
+            pair,
+            pair,
+            pair,
+            pair,
+            pair,
+            pair,
+            np.ones(12),
+            np.ones(12),
+            np.ones(12),
+        )
+
+    # current = -0.05 F - 0.02 A and torque = 0.04 F Nm, so torque = -0.8 (current + 0.02).
+    calibration = Calibration(
+        side(-0.05, -0.02),
+        side(0.04, 0.0),
+        hand.torque_limit,
+        np.full(5, 0.2),
+        hand=hand.name,
+        joint_names=hand.joint_names,
+        finger_names=hand.finger_names,
+    )
+    save_calibration(tmp_path / "hand.toml", calibration)
+    sensing = HandSensing(hand, HardwareConfig(), load_calibration(tmp_path / "hand.toml", hand))
+    block = state(current=counts)
+    block["tip"]["taxel"]["z"][0, 0] = 10
+    measured = sensing.measure(block)
+    np.testing.assert_allclose(measured.joint_torque, -0.8 * (counts / 1000 + 0.02) / hand.torque_limit, atol=2e-6)
+    assert measured.taxel_force[0, 0] == pytest.approx(2.0)
+
+
+def test_temperatures_are_of_the_joint_boards_and_tips(hand):
+    block = state(temperature=(41 << 8) | 56)
+    block["tip"]["temperature"] = 33
+    heat = HandSensing(hand, HardwareConfig()).measure(block).temperature
+    np.testing.assert_array_equal(heat, [56] * 12 + [33] * 5)
+
+
+def test_velocity_reported_or_from_differences(hand):
+    reported = HandSensing(hand, HardwareConfig(reported_velocity=True, joint_sign=(-1.0,) + (1.0,) * 11))
+    np.testing.assert_allclose(reported.velocity(state(velocity=1500)), [-1.5] + [1.5] * 11)
+    assert HandSensing(hand, HardwareConfig()).velocity(state()) is None
+    # A first-order filter: after n steps of h at a constant rate, 1 - (T / (T + h))^n of it is seen.
+    follow = VelocityFilter(0.02)
+    for n in range(6):
+        velocity = follow.update(0.01 * n, np.full(12, 0.03 * n, np.float32))
+    np.testing.assert_allclose(velocity, 3.0 * (1 - (2 / 3) ** 5), rtol=1e-4)
+    np.testing.assert_array_equal(follow.update(0.05, np.zeros(12, np.float32)), velocity)  # No time has passed.
+
+
+def test_configurations_that_cannot_be():
+    with pytest.raises(HandError, match="11 values for 12 joints"):
+        HardwareConfig(joint_sign=(1.0,) * 11)
+    with pytest.raises(HandError, match="must be 1 or -1"):
+        HardwareConfig(joint_sign=(0.5,) * 12)
+
+
+def test_who_measures_what():
+    assert sources_of(GRASP) == {"hand", "camera", "user"}
+    assert sources_of(ROTATE) == {"hand", "imu", "policy"}
+    with pytest.raises(HandError, match="no sensor measures"):
+        sources_of(ROTATE_CRITIC)

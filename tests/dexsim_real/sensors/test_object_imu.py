@@ -1,0 +1,116 @@
+"""The object's IMU: frames, parser, alignment, port."""
+
+import math
+import time
+
+import jax
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dexsim.geometry import rotations
+from dexsim_real.control.controller import IDENTITY
+from dexsim_real.core.errors import HandError
+from dexsim_real.sensors import imu
+
+DATASHEET = bytes.fromhex("AA AA DE 01 00 92 FF 25 08 8D FE EC FF D1 03 00 00 00 E7")
+
+
+def quat_of(yaw, pitch, roll):
+    """Yaw, then pitch, then roll, each about the part's own axis; degrees."""
+    quat = IDENTITY
+    for axis, angle in (((0, 0, 1), yaw), ((0, 1, 0), pitch), ((1, 0, 0), roll)):
+        half = math.radians(angle) / 2
+        turn = np.array([math.cos(half), *(math.sin(half) * np.array(axis))])
+        quat = np.asarray(rotations.quat_multiply(quat, turn))
+    return quat
+
+
+def apart(a, b):
+    """Angle between two orientations, rad, by their matrices."""
+    a, b = (np.asarray(rotations.quat_to_matrix(np.asarray(q, np.float32))) for q in (a, b))
+    return math.acos(np.clip((np.trace(a.T @ b) - 1) / 2, -1, 1))
+
+
+def test_the_datasheets_example_message():
+    # Yaw 0.01, pitch -1.10, roll 20.85 degrees.
+    assert apart(imu.decode(DATASHEET), quat_of(0.01, -1.10, 20.85)) < 1e-3
+    bad = bytearray(DATASHEET)
+    bad[7] ^= 1
+    assert imu.decode(bytes(bad)) is None and imu.decode(DATASHEET[:-1]) is None
+
+
+@given(st.floats(-180, 180), st.floats(-89, 89), st.floats(-180, 180), st.integers(0, 300))
+def test_orientations_survive_the_wire(yaw, pitch, roll, index):
+    quat = quat_of(yaw, pitch, roll)
+    assert apart(imu.decode(imu.encode(index, quat)), quat) < 2e-3
+
+
+@settings(max_examples=50)
+@given(
+    st.lists(st.one_of(st.binary(max_size=30), st.just(b"\xaa"), st.just(DATASHEET[:9])), max_size=20),
+    st.integers(1, 40),
+)
+def test_the_imu_parser_recovers_from_noise(parts, size):
+    stream = b"".join(parts) + 4 * DATASHEET
+    parser, found = imu.RvcParser(), []
+    for at in range(0, len(stream), size):
+        found += parser.feed(stream[at : at + size])
+        assert len(parser._buffer) <= imu.SIZE + size
+    # One in 256 false heads passes the checksum, and then takes the next frame's beginning with it.
+    assert len(found) >= 3 and all(apart(quat, imu.decode(DATASHEET)) < 1e-6 for quat in found[-3:])
+    if not parts:
+        assert len(found) == 4 and parser.damaged == 0
+
+
+@given(st.floats(-3, 3), st.floats(-0.4, 0.4), st.floats(-3, 3))
+def test_alignment_takes_heading_from_the_known_pose_and_tilt_from_gravity(heading, tilt, later):
+    """The part's world is the palm's, turned so that z is up and by an unknown heading."""
+    up = np.array([math.cos(tilt), 0.0, math.sin(tilt)])
+    # palm_from_world: takes z to up, after a turn about z by the heading.
+    axis = np.cross([0, 0, 1.0], up)
+    axis /= np.linalg.norm(axis)
+    half = math.acos(up[2]) / 2
+    world = imu.multiply(
+        np.array([math.cos(half), *(math.sin(half) * axis)]),
+        np.array([math.cos(heading / 2), 0, 0, math.sin(heading / 2)]),
+    )
+    truth = np.array([1.0, 0, 0, 0])
+    found = imu.align(imu.multiply(imu.conjugate(world), truth), truth, up)
+    turned = np.array([math.cos(later / 2), *(math.sin(later / 2) * up)])
+    sensed = imu.multiply(imu.conjugate(world), turned)
+    assert apart(imu.multiply(found, sensed), turned) < 1e-3
+
+
+def test_the_imu_thread_reads_a_port():
+    pytest.importorskip("serial")
+    import os
+    import tty
+
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    part = imu.Imu(os.ttyname(slave), np.array([1.0, 0, 0]))  # The part's z points up, along the palm's x.
+    with pytest.raises(HandError, match="UART-RVC"):
+        part.wait(0.05)
+    os.write(master, imu.encode(0, quat_of(40, 0, 0)))
+    part.wait()
+    part.calibrate(IDENTITY)
+    assert apart(part.read()[1], IDENTITY) < 2e-3
+    os.write(master, b"\x00\xaa" + imu.encode(1, quat_of(70, 0, 0)))
+    until = time.monotonic() + 2
+    while apart(part.read()[1], IDENTITY) < 0.1 and time.monotonic() < until:
+        time.sleep(0.01)
+    # 30 degrees about the part's vertical are 30 degrees about the palm's.
+    half = math.radians(15)
+    assert apart(part.read()[1], [math.cos(half), math.sin(half), 0, 0]) < 2e-3
+    part.close()
+    os.close(master)
+    os.close(slave)
+
+
+def test_quaternions_agree_with_the_library():
+    rng = np.random.default_rng(0)
+    a, b = rng.normal(size=(2, 4))
+    a, b = a / np.linalg.norm(a), b / np.linalg.norm(b)
+    np.testing.assert_allclose(imu.multiply(a, b), jax.jit(rotations.quat_multiply)(a, b), atol=1e-6)

@@ -1,0 +1,216 @@
+"""The emulated hand's physics against closed forms, and its trials."""
+
+import dataclasses
+import json
+import math
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from emulated_plant import free, motors, world
+
+from dexsim.randomization import tilted_down
+from dexsim_real.twin.plant import assistant, scene
+from dexsim_real.twin.plant.assistant import POSTURES, Assistant, Stage
+from dexsim_real.twin.plant.drives import PERIOD
+from dexsim_real.twin.plant.emulated_hand import EmulatedHand
+from dexsim_real.twin.plant.mount import GRAVITY, nominal_gravity, tilted_gravity
+from dexsim_real.twin.plant.parameters import TASKS
+from dexsim_real.twin.plant.shapes import matrix
+
+
+def test_free_fall(hand):
+    plant = world(hand, "grasp")
+    free(plant, (0.5, 0.0, 0.0))
+    plant.advance(0.2)
+    at = plant._scene.object_qpos
+    fallen = plant._data.qpos[at : at + 3] - (0.5, 0.0, 0.0)
+    assert fallen == pytest.approx([0.5 * GRAVITY * 0.2**2, 0.0, 0.0], abs=1e-3)
+    # An accelerometer in free fall feels nothing; held, it feels the ground push back.
+    assert plant.measure_object()[2] == pytest.approx(np.zeros(3), abs=1e-6)
+    held = world(hand, "rotate", imu_noise=0.0)
+    held.advance(0.05)
+    _, quat, felt = held.measure_object()
+    assert matrix(quat) @ felt == pytest.approx(-nominal_gravity("rotate"), abs=1e-6)
+
+
+def test_tilt_turns_gravity_and_keeps_its_size():
+    for task in TASKS:
+        nominal, tilted = nominal_gravity(task), tilted_gravity(task, np.array([0.12, 0.0]))
+        assert np.linalg.norm(tilted) == pytest.approx(GRAVITY)
+        assert math.acos(nominal @ tilted / GRAVITY**2) == pytest.approx(0.12)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_the_ends_of_trainings_tilts_are_those_of_a_mount(task):
+    """Pitch and roll on both sides, each in its own way; which sign is which says nothing."""
+    down = nominal_gravity(task) / GRAVITY
+    for pitch, roll in ((0.1, 0.1), (0.1, 0.0), (0.0, 0.1)):
+        angles = np.array([(a * pitch, b * roll) for a in (-1, 1) for b in (-1, 1)])
+        trained = np.stack([tilted_down(down, jnp.asarray(both)) for both in angles])
+        mounted = np.stack([tilted_gravity(task, both) for both in angles]) / GRAVITY
+        apart = np.linalg.norm(trained[:, None] - mounted, axis=-1)
+        assert np.all(apart.min(0) < 1e-3) and np.all(apart.min(1) < 1e-3)
+
+
+def test_an_object_on_the_fingertips_weighs_what_it_weighs(hand):
+    plant = world(hand, taxel_crosstalk=0.05)
+    plant._scene.model.opt.gravity[:] = (-GRAVITY, 0.0, 0.0)
+    plant.drive(motors(0.0, kp=400))
+    plant._data.qpos[plant._scene.drive_qpos] = 0.0
+    plant.advance(0.1)
+    free(plant, (0.0215 + 0.0275, -0.006, 0.183))
+    plant.advance(1.5)
+    speed = np.linalg.norm(plant._data.qvel[plant._scene.object_dof :][:3])
+    assert speed < 1e-3
+    shown = plant.measure().taxel_force
+    weight = float(plant.parameters.mass) * GRAVITY
+    assert shown[..., 2].sum() == pytest.approx(weight, rel=0.05)
+    plant._contacts()
+    assert plant._pressing == pytest.approx(shown[..., 2].sum(-1), rel=0.02, abs=0.01 * weight)
+    assert np.count_nonzero(shown[..., 2].sum(-1) > 0.05 * weight) >= 2
+    assert shown[0].sum() == 0 and shown[..., 2].min() >= 0
+
+
+@pytest.mark.parametrize("stiffness", [1700.0, 8000.0])
+def test_contacts_are_springs_of_the_stiffness_and_bounce_asked_for(stiffness):
+    def drop(speed, gravity):
+        spec = mujoco.MjSpec()
+        spec.option.timestep, spec.option.gravity = scene.TIMESTEP, [0, 0, -gravity]
+        spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+        spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+        spec.worldbody.add_geom(
+            name="floor", type=mujoco.mjtGeom.mjGEOM_BOX, size=[1, 1, 0.1], pos=[0, 0, -0.1], contype=0, conaffinity=0
+        )
+        body = spec.worldbody.add_body(pos=[0, 0, 0.03])
+        body.add_freejoint()
+        body.add_geom(
+            name="ball", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.03, 0, 0], mass=0.1, contype=0, conaffinity=0
+        )
+        spec.add_pair(geomname1="floor", geomname2="ball", condim=4)
+        model = spec.compile()
+        model.pair_solref[0], model.pair_solimp[0] = scene.spring(
+            model.body_invweight0[:, 0].sum(), stiffness, scene.damping_of(0.08, stiffness, 0.1)
+        )
+        data = mujoco.MjData(model)
+        data.qvel[2] = -speed
+        mujoco.mj_step(model, data, 4000)
+        return data
+
+    assert drop(0.3, 0.0).qvel[2] / 0.3 == pytest.approx(0.08, rel=0.15)
+    assert 0.03 - drop(0.0, GRAVITY).qpos[2] == pytest.approx(0.1 * GRAVITY / stiffness, rel=0.01)
+
+
+def test_a_gear_with_play_loses_that_much_motion(hand, monkeypatch):
+    play, load = 0.02, 0.05
+    plant = world(hand, gear_play=play, gear_stiffness=150.0)
+    plant._scene.model.opt.gravity[:] = 0.0
+    free(plant, (0.5, 0.0, 0.0))  # out of the fingers' way
+    posture = np.array(POSTURES["rotate"])
+    plant._data.qpos[plant._scene.drive_qpos] = posture
+    plant.drive(motors(posture))
+    gap, rotor = [], []
+    for way in (1.0, -1.0):
+        # A torque on the link acts on both of its hinges.
+        plant._data.qfrc_applied[plant._scene.play_dof] = way * load
+        step = plant._drives.step
+        with monkeypatch.context() as patch:
+            patch.setattr(plant._drives, "step", lambda *a, way=way, step=step: (step(*a)[0] + way * load, 0.0))
+            plant.advance(0.6)
+        gap.append(plant._data.qpos[plant._scene.play_qpos].copy())
+        rotor.append(plant._data.qpos[plant._scene.drive_qpos].copy())
+    assert gap[0] - gap[1] == pytest.approx(np.full(12, play + 2 * load / 150.0), rel=0.05)
+    assert rotor[0] - rotor[1] == pytest.approx(np.full(12, 2 * load / 3.0), rel=0.05)
+
+
+def test_currents_are_reported_in_milliamperes_positive_when_opening(hand):
+    plant = world(hand, current_noise=0.0, current_gain=1.1)
+    plant._scene.model.opt.gravity[:] = 0.0
+    plant._data.qpos[plant._scene.drive_qpos] = hand.joint_lower
+    plant.drive(motors(hand.joint_lower - 0.1))
+    plant.advance(0.8)
+    assert plant.measure().current == pytest.approx(1000 * 1.1 * 0.3 / hand.torque_limit, rel=0.05)
+
+
+def test_readings_are_as_old_as_drawn(hand):
+    plant = world(hand, sensing_latency=0.0146 + 0.01, encoder_noise=0.0)
+    plant.drive(motors(POSTURES["rotate"]))
+    shown, true = [], []
+    for _ in range(60):
+        plant.advance(PERIOD)
+        shown.append(plant.measure().joint_position[4])
+        true.append(plant._data.qpos[plant._scene.drive_qpos[4]])
+    assert shown[20:] == pytest.approx(true[10:50], abs=1e-12)
+    assert true[-1] > true[10] + 0.01
+
+
+def test_a_run_is_repeated_by_its_seed_and_by_no_other(hand):
+    def run(seed, first=0):
+        plant = EmulatedHand(hand, "grasp", seed, first=first)
+        plant.drive(motors(POSTURES["grasp"]))
+        plant.advance(1.2)
+        plant.drive(motors(np.array(POSTURES["grasp"]) + 0.1))
+        plant.advance(0.3)
+        shown = plant.measure()
+        return np.concatenate([np.ravel(getattr(shown, f.name)) for f in dataclasses.fields(shown)]), plant.results()
+
+    (first, result), (again, same), (other, _), (later, _) = run(0), run(0), run(1), run(0, 3)
+    assert result[0]["stage"] == "free"
+    assert np.array_equal(first, again) and result == same
+    assert not np.array_equal(first, other) and not np.array_equal(first, later)
+    assert json.loads(json.dumps(result)) == result
+
+
+def test_the_object_is_held_until_the_targets_move_on(hand):
+    plant = EmulatedHand(hand, "rotate", 2, trials=1)
+    posture = np.array(POSTURES["rotate"])
+    at = plant._scene.object_qpos
+    plant.drive(motors(posture + 0.1))
+    plant.advance(0.3)
+    assert plant.stage is Stage.AWAY
+    plant.drive(motors(posture))
+    plant.advance(0.5)
+    assert plant.stage is Stage.HOLD
+    held = plant._data.qpos[at : at + 7].copy()
+    plant.advance(1.0)
+    assert plant._data.qpos[at : at + 7] == pytest.approx(held, abs=1e-4)
+    plant.drive(motors(posture + 0.01))
+    plant.advance(0.05)
+    assert plant.stage is Stage.FREE
+    # Thrown out of the hand: the trial is over, and there is no other.
+    free(plant, (0.5, 0.0, 0.0), judged=True)
+    plant.advance(0.05)
+    (report,) = plant.results()
+    assert report["end"].startswith("dropped") and report["fell"] and plant.trial == 1
+    plant.advance(0.05)
+    assert len(plant.results()) == 1
+
+
+def test_motors_that_go_off_take_the_object_back(hand):
+    helper, posture = Assistant("rotate"), np.array(POSTURES["rotate"])
+    assert helper.watch(0.0, posture, posture, None) is Stage.HOLD
+    assert helper.watch(0.1, None, posture, None) is Stage.AWAY
+    assert helper.watch(0.2, posture, posture, None) is Stage.HOLD
+    assert helper.watch(0.3, posture + 0.01, posture, None) is Stage.FREE
+
+
+def test_a_runner_that_goes_on_is_served_after_a_while():
+    helper, posture = Assistant("rotate", patience=5.0), np.array(POSTURES["rotate"]) + 0.2
+    assert helper.watch(0.0, posture, posture, None) is Stage.AWAY
+    assert not helper.wants_clearance(4.9) and helper.wants_clearance(5.1)
+    assert helper.watch(5.1, posture, posture, False) is Stage.AWAY
+    assert helper.watch(5.2, posture, posture, True) is Stage.HOLD
+    assert helper.watch(5.5, posture, posture, None) is Stage.HOLD
+    assert helper.watch(5.8, posture, posture, None) is Stage.FREE
+
+
+def test_places_are_clear_of_the_hand(hand):
+    for seed in range(12):
+        plant = EmulatedHand(hand, "grasp", seed)
+        data = mujoco.MjData(plant._scene.model)
+        data.qpos[plant._scene.drive_qpos] = POSTURES["grasp"]
+        assert assistant.clear(plant._scene, data, plant._place)
+        up = matrix(plant._place.quat).T @ [-1.0, 0.0, 0.0]
+        top = plant._place.position[0] - plant.shape.reach(up)
+        assert top == pytest.approx(assistant.PALM_FACE + float(plant.parameters.gap))

@@ -1,0 +1,149 @@
+"""Parameters of the emulated hand against training's ranges, and its sources against training's code."""
+
+import ast
+import dataclasses
+import json
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from paths import ROOT
+
+import dexsim_real.twin.plant
+from dexsim.core.assets import asset_path
+from dexsim.core.config import to_dict
+from dexsim.registry import TASKS as TRAINED
+from dexsim_real.core.errors import HandError
+from dexsim_real.twin.plant import referee, scene
+from dexsim_real.twin.plant.assistant import PLACES, POSTURES, REFERENCES, find_place
+from dexsim_real.twin.plant.mount import nominal_gravity, tilted_gravity
+from dexsim_real.twin.plant.parameters import FAR, NEAR, PUSHES, TASKS, bands, sample_trial
+from dexsim_real.twin.plant.shapes import sample_shape
+
+
+def _lookup(config, path):
+    if path == "objects.link_friction" and "link_friction" not in config["objects"]:
+        path = "objects.friction"  # a policy from before the palm had one of its own
+    for name in path.split("."):
+        config = config[name]
+    return config
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_bands_repeat_the_ranges_of_the_tasks_and_of_the_shipped_policies(task):
+    header = json.loads(Path(asset_path(f"policies/{task}.json")).read_text())
+    assert header["task"] == task
+    from dexsim_ppo.policy import load_policy
+
+    for config in (to_dict(TRAINED[task].config_class()), load_policy(task).env_config):
+        for name, band in bands(task).items():
+            trained = _lookup(config, band.origin)
+            low, high = (
+                trained
+                if isinstance(trained, (tuple, list))
+                else ((-trained, trained) if band.low < 0 else (trained, trained))
+            )
+            assert (band.low, band.high) == pytest.approx((low, high)), name
+        assert PUSHES[task][1] == config["push_speed"]
+        assert PUSHES[task][0] == pytest.approx(
+            config["push_probability"] / config["physics"]["timestep"] / config["physics"]["substeps"]
+        )
+        assert POSTURES[task] == pytest.approx(config["posture"])
+        assert referee.LOST[task] == config["drop_distance"]
+        assert referee.LIMITS[task] == config["evaluation_seconds"]
+
+
+def test_rules_and_places_are_those_of_the_tasks(hand):
+    for task in TASKS:
+        rules = TRAINED[task].task(TRAINED[task].config_class(), hand)
+        assert REFERENCES[task] == pytest.approx(rules.reference)
+        assert nominal_gravity(task) == pytest.approx(rules.gravity)
+    config = rules.config
+    assert (
+        referee.GOAL_STEP,
+        referee.GOAL_ANGLE,
+        referee.GOAL_DISTANCE,
+        referee.GOAL_SPIN,
+        referee.TIPPED,
+    ) == pytest.approx((config.goal_step, config.goal_angle, config.goal_distance, config.goal_spin, config.drop_tilt))
+
+
+def test_a_cube_is_put_in_the_middle_of_trainings_starts(hand, monkeypatch, tmp_path):
+    monkeypatch.setenv("DEXSIM_CACHE", str(tmp_path))
+    entry = TRAINED["rotate"]
+    rules = entry.task(dataclasses.replace(entry.config_class(), pool_size=64), hand)
+    starts = rules.make_pool(jax.random.key(0)).qpos[:, 13:15]
+    assert np.all(np.abs(starts.mean(0) - PLACES["rotate"]) < 0.6 * starts.std(0))
+
+
+def test_the_fingers_leave_room_where_a_cube_is_put(hand):
+    """Hands around which no cube fits are drawn anew, which must not choose among them."""
+    for trial in range(30):
+        rng = np.random.default_rng([7, trial])
+        parameters = sample_trial("rotate", rng, "outside", {})
+        shape = sample_shape(parameters, rng, None)
+        built = scene.build_scene(hand, parameters, shape, tilted_gravity("rotate", parameters.gravity_tilt))
+        assert find_place(built, parameters, shape, rng) is not None
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_every_value_lies_outside_its_range_and_near_it(task):
+    sides = {name: set() for name in bands(task)}
+    for seed in range(60):
+        parameters = sample_trial(task, np.random.default_rng(seed))
+        for name, band in bands(task).items():
+            value, width = parameters.value[name], band.width or band.high - band.low
+            assert np.all((value < band.low) | (value > band.high)), name
+            assert np.all(value >= band.low - (FAR + 1e-9) * width), name
+            assert np.all(value <= band.high + (FAR + 1e-9) * width), name
+            beyond = np.maximum(band.low - value, value - band.high)
+            assert np.all(beyond >= (NEAR - 1e-9) * width), name
+            sides[name] |= set(np.atleast_1d(value > band.high).ravel().tolist())
+    for name, band in bands(task).items():
+        assert sides[name] == {"both": {True, False}, "high": {True}, "low": {False}}[band.sides], name
+
+
+def test_inside_nominal_and_overrides():
+    for task in TASKS:
+        inside, nominal = (sample_trial(task, np.random.default_rng(3), kind) for kind in ("inside", "nominal"))
+        for name, band in bands(task).items():
+            assert np.all((inside.value[name] >= band.low) & (inside.value[name] <= band.high)), name
+            assert np.all(nominal.value[name] == band.nominal), name
+    fixed = sample_trial("grasp", np.random.default_rng(3), "outside", {"gear_play": 0.002, "rolling": 0.0})
+    assert np.all(fixed.gear_play == 0.002) and fixed.rolling == 0.0
+    assert np.array_equal(fixed.stiffness, sample_trial("grasp", np.random.default_rng(3)).stiffness)
+    # One parameter outside, all others nominal: the very value that it has with all others outside.
+    one = sample_trial("grasp", np.random.default_rng(3), "nominal", {"friction": "outside"})
+    assert one.friction == fixed.friction and np.all(one.stiffness == 1.0)
+    with pytest.raises(HandError, match="friction = 'outsid'"):
+        sample_trial("grasp", np.random.default_rng(0), overrides={"friction": "outsid"})
+    with pytest.raises(HandError, match="no parameter 'gaer_play'"):
+        sample_trial("grasp", np.random.default_rng(0), overrides={"gaer_play": 1.0})
+    with pytest.raises(HandError, match="tasks are"):
+        sample_trial("juggle", np.random.default_rng(0))
+
+
+def test_the_physics_shares_no_code_with_training():
+    """Every module of the folder: of `dexsim` it takes the type of a hand's model alone, of JAX nothing."""
+    folder = Path(dexsim_real.twin.plant.__file__).parent
+    paths = sorted(folder.rglob("*.py"))
+    ours = {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__") for path in paths}
+    assert "dexsim_real.twin.plant.emulated_hand" in ours and len(ours) > 10
+    bridge = {"dexsim_real.wire.frames", "dexsim_real.core.errors", *ours}
+    for path in paths:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                found = [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom):
+                assert node.level == 0, f"{path.name}: relative import"
+                found = [f"{node.module}.{alias.name}" for alias in node.names]
+            else:
+                continue
+            for name in found:
+                package = name.split(".")[0]
+                assert package not in ("jax", "dexsim_ppo", "importlib"), f"{path.name} imports {name}"
+                assert "mjx" not in name
+                assert package != "dexsim" or name == "dexsim.hand.kinematics.Hand", f"{path.name}: {name}"
+                if package == "dexsim_real":
+                    assert name in bridge or name.rpartition(".")[0] in bridge, f"{path.name}: {name}"

@@ -1,0 +1,58 @@
+"""Objects of the emulated hand against MuJoCo's geometry."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from dexsim_real.twin.plant import scene, shapes
+from dexsim_real.twin.plant.parameters import BANDS, sample_trial
+from dexsim_real.twin.plant.shapes import ObjectShape, Primitive
+
+
+@pytest.mark.parametrize(
+    "part",
+    [
+        Primitive("sphere", (0.03,)),
+        Primitive("box", (0.02, 0.03, 0.025)),
+        Primitive("cylinder", (0.02, 0.03), (0.01, 0.0, 0.0)),
+        Primitive("capsule", (0.015, 0.02)),
+    ],
+)
+def test_distances_agree_with_mujoco(part):
+    spec = mujoco.MjSpec()
+    spec.worldbody.add_geom(name="part", type=scene._KINDS[part.kind], size=scene._three(part.size), pos=part.place)
+    for k in range(200):
+        spec.worldbody.add_geom(
+            name=f"p{k}",
+            type=mujoco.mjtGeom.mjGEOM_SPHERE,
+            size=[1e-5, 0, 0],
+            pos=np.random.default_rng(k).uniform(-0.06, 0.06, 3),
+        )
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    points = data.geom_xpos[1:]
+    ours = ObjectShape("x", (part,)).distance(points)
+    theirs = np.array([mujoco.mj_geomDistance(model, data, 0, k + 1, 1.0, np.zeros(6)) + 1e-5 for k in range(200)])
+    outside = theirs > 1e-3
+    assert ours[outside] == pytest.approx(theirs[outside], abs=1e-5)
+    assert np.all((ours < 0) == (theirs < 0))
+    along = np.array([0.6, 0.0, 0.8])
+    fine = np.random.default_rng(0).uniform(-0.06, 0.06, (200_000, 3))
+    inside = fine[ObjectShape("x", (part,)).distance(fine) < 0]
+    assert ObjectShape("x", (part,)).reach(along) == pytest.approx((inside @ along).max(), abs=2e-3)
+
+
+def test_mass_properties_of_a_box():
+    mass, centre, inertia = scene.mass_properties(ObjectShape("box", (Primitive("box", (0.02, 0.03, 0.04)),)), 0.3)
+    assert mass == 0.3 and centre == pytest.approx(np.zeros(3))
+    assert np.diag(inertia) == pytest.approx(
+        [0.1 * (0.03**2 + 0.04**2), 0.1 * (0.02**2 + 0.04**2), 0.1 * (0.02**2 + 0.03**2)]
+    )
+
+
+def test_all_shapes_are_drawn():
+    parameters = sample_trial("grasp", np.random.default_rng(0))
+    drawn = {shapes.sample_shape(parameters, np.random.default_rng(k)).name for k in range(60)}
+    assert drawn == set(shapes.SHAPES)
+    assert len(BANDS) > 20

@@ -1,0 +1,120 @@
+"""The command `python -m dexsim_real.twin`, and the time of its physics."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from paths import ROOT
+
+pytest.importorskip("serial")
+from twin_plant import ScriptedPlant
+
+from dexsim.calibration.maps import current_from_counts, load_calibration, normalised_torque
+from dexsim.core.errors import DexsimError
+from dexsim_real.twin import __main__ as twin_command
+from dexsim_real.twin.server import PlantClock
+from dexsim_real.twin.wire.firmware import FirmwareConfig
+
+
+def test_physics_follows_the_wall_clock_and_lets_go_what_it_cannot(hand):
+    class Slow(ScriptedPlant):
+        def advance(self, seconds):
+            super().advance(seconds)
+            time.sleep(pace * seconds)
+
+    notes, pace = [], 0.0
+    clock = PlantClock(Slow(), 10.0, notes.append)
+    for now in np.arange(10.0, 10.5, 0.0007):
+        clock.catch_up(now, PlantClock.SLICE)
+    assert clock.plant.time == pytest.approx(0.5, abs=0.003) and clock.slipped == 0
+    # Behind by less than the bound all of it is caught up, in slices; behind by more, the rest is let go.
+    for _ in range(100):
+        clock.catch_up(10.58, PlantClock.SLICE)
+    assert clock.plant.time == pytest.approx(0.58, abs=1e-6)
+    clock.catch_up(13.0)
+    assert clock.plant.time == pytest.approx(0.59, abs=1e-6) and clock.slipped == pytest.approx(2.41, abs=1e-6)
+    assert len(notes) == 1 and "too slow" in notes[0]
+    report = clock.report()
+    assert report["simulated_s"] + report["slipped_s"] == pytest.approx(3.0, abs=1e-3)
+
+
+def start(*options):
+    return subprocess.Popen(
+        [sys.executable, "-m", "dexsim_real.twin", "--plant", "twin_plant:make", "--no-realtime", *options],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": f"{ROOT}:{ROOT / 'tests' / 'support'}"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+
+
+def test_the_command_shows_how_to_use_it_and_writes_its_results(tmp_path):
+    process = start(
+        "--task",
+        "grasp",
+        "--trials",
+        "2",
+        "--seconds",
+        "0.4",
+        "--command",
+        "0.6",
+        "--output",
+        str(tmp_path / "out.json"),
+        "--object.optics.position",
+        "0.06",
+        "0.6",
+        "0.09",
+    )
+    out, error = process.communicate(timeout=60)
+    assert process.returncode == 0, error
+    shown = out.decode()
+    assert "python -m dexsim_real.run grasp --port /tmp/dexsim-twin-" in shown and "--command 0.6" in shown
+    assert "--uncalibrated" in shown and "--camera unix:/tmp/dexsim-twin-" in shown
+    assert "--optics.position 0.06 0.6 0.09" in shown
+    report = json.loads((tmp_path / "out.json").read_text())
+    assert [row["trial"] for row in report["trials"]] == [0, 1] and report["commands"]["checked"] == 0
+    assert not list(Path("/tmp").glob("dexsim-twin-*/hand*")) or shown.split("--port ")[1].split()[0] not in map(
+        str, Path("/tmp").glob("dexsim-twin-*/hand")
+    )
+
+
+def test_the_calibration_beside_the_port_is_one_of_this_hand(hand, tmp_path):
+    path = twin_command.write_calibration(tmp_path / "calibration.toml", hand)
+    calibration = load_calibration(path, hand)
+    np.testing.assert_allclose(calibration.force_per_count, FirmwareConfig().force_per_count)
+    counts = np.linspace(-800, 800, 12).astype(np.float32)
+    torque = np.asarray(normalised_torque(calibration, current_from_counts(calibration, counts)))
+    assert np.all(torque * counts < 0)  # The wire's current is positive when opening.
+
+
+def test_it_ends_in_good_order_when_it_is_told_to(tmp_path):
+    waiting = start("--link", str(tmp_path / "port"), "--output", str(tmp_path / "out.json"))
+    assert waiting.stdout.readline().startswith(b"rotate: the emulated hand is at")
+    waiting.send_signal(signal.SIGTERM)
+    assert waiting.wait(10) == 0 and (tmp_path / "out.json").exists() and not (tmp_path / "port").is_symlink()
+    waiting.communicate()
+
+
+def test_what_is_wrong_is_said_in_one_line(tmp_path):
+    for options, message in (
+        (["--faults.script", "5 melt"], "no kind 'melt'"),
+        (["--task", "juggle"], "choose from grasp, rotate"),
+        (["--policy", "grasp"], "of the task 'grasp'; give --task grasp"),
+        (["--policy", "nobody"], "nobody: no such file"),
+        (["--plant", "nowhere:make"], "No module named 'nowhere'"),
+        (["--faults.flip", "2"], "between 0 and 1"),
+        (["--plant", "twin_plant:make", "--link", str(tmp_path / "no" / "port")], "no pseudo-terminal"),
+        (
+            ["--plant", "twin_plant:make", "--mask-socket", str(tmp_path / "no" / "m")],
+            "socket for masks cannot be created",
+        ),
+    ):
+        with pytest.raises(DexsimError, match=message) as found:
+            twin_command.main([*options, "--no-realtime"])
+        assert "\n" not in str(found.value)

@@ -1,0 +1,350 @@
+"""Faults of the emulated hand: scripts, rates, damage, and what the bridge counts."""
+
+import dataclasses
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+pytest.importorskip("serial")
+from twin_plant import REST, ScriptedPlant
+
+from dexsim_real.core.errors import HandError
+from dexsim_real.twin.wire.command_check import CommandCheck, LimitsConfig
+from dexsim_real.twin.wire.faults import BYTES, KINDS, Fault, FaultConfig, Injector, parse_fault
+from dexsim_real.twin.wire.firmware import Firmware, FirmwareConfig
+from dexsim_real.twin.wire.line import HandLine, LineConfig
+from dexsim_real.wire import frames
+from dexsim_real.wire.frames import HAND_REPLIES, Command, Frame, Mode, Parser
+from dexsim_real.wire.link import LinkConfig
+from dexsim_real.wire.serial_hand import SerialHand
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("5 melt", "no kind 'melt'; choose from flip"),
+        ("soon stall", "give a time in s"),
+        ("", "give a time"),
+        ("5 stall 1 2", "give a time"),
+        ("5 flip both", "give a time"),
+        ("5 heat 12 60 1", "give a time"),
+        ("5 stuck 0 120 9", "give a time"),
+        ("5 stuck 0 119 256", "give a time"),
+        ("-1 stall", "at least 0"),
+        ("5 stall -1", "give a time"),
+        ("nan drop", "at least 0"),
+    ],
+)
+def test_a_script_that_cannot_be_meant_is_refused_in_one_line(line, message):
+    with pytest.raises(HandError, match=message) as found:
+        FaultConfig(script=(line,))
+    assert repr(line) in str(found.value) and "\n" not in str(found.value)
+
+
+def test_rates_must_fit_into_one():
+    FaultConfig(flip=0.5, drop=0.5)
+    with pytest.raises(HandError, match="must not exceed 1"):
+        FaultConfig(flip=0.5, drop=0.4, late=0.2)
+
+
+def test_scripted_faults_come_at_their_time_in_order():
+    injector = Injector(
+        FaultConfig(script=("2 stuck 4 7 88", "0.5 drop request", "2 heat 3 40 1.5", "1 disconnect 0.7", "9 late")), 0
+    )
+    found = [(k * 0.1, injector.sample(50 + k * 0.1)) for k in range(30)]
+    found = [(round(when, 1), fault) for when, fault in found if fault]
+    assert [(when, fault.kind) for when, fault in found] == [
+        (0.5, "drop"),
+        (1.0, "disconnect"),
+        (2.0, "heat"),
+        (2.1, "stuck"),
+    ]
+    assert found[0][1].on_request and found[1][1].seconds == 0.7
+    assert (found[2][1].joint, found[2][1].degrees, found[2][1].seconds) == (3, 40, 1.5)
+    assert (found[3][1].taxel, found[3][1].count) == ((4, 7), 88)
+    assert injector.injected == {"drop request": 1, "disconnect": 1, "heat": 1, "stuck": 1}
+    assert 0.1 <= injector.sample(60).seconds <= 0.15  # Drawn, where the script says nothing.
+
+
+def test_random_faults_have_their_rates_and_the_seed_repeats_them():
+    config = FaultConfig(
+        flip=0.05,
+        drop=0.04,
+        duplicate=0.03,
+        late=0.02,
+        stall=0.015,
+        disconnect=0.01,
+        heat=0.008,
+        stuck=0.006,
+        on_request=0.25,
+    )
+    runs = []
+    for seed in (1, 1, 2):
+        injector = Injector(config, seed)
+        runs.append(([injector.sample(0.012 * k) for k in range(20_000)], injector.injected))
+    assert runs[0] == runs[1] and runs[0] != runs[2]
+    made = runs[0][1]
+    for kind in KINDS:
+        share = sum(made[name] for name in made if name.startswith(kind)) / 20_000
+        rate = getattr(config, kind)
+        assert share == pytest.approx(rate, abs=5 * np.sqrt(rate / 20_000)), kind
+    requests = sum(made[f"{kind} request"] for kind in BYTES) / sum(
+        made[f"{k} {s}"] for k in BYTES for s in ("request", "answer")
+    )
+    assert requests == pytest.approx(0.25, abs=0.05)
+    assert sum(made.values()) == sum(fault is not None for fault in runs[0][0])
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from(BYTES), st.booleans())
+def test_no_damage_leaves_a_frame_that_passes(seed, kind, request):
+    rng = np.random.default_rng(seed)
+    state = np.frombuffer(rng.bytes(2208), frames.STATE_BLOCK).copy()
+    state["joint"]["id"] = np.arange(12)
+    frame = Frame(0x80, 0xFE, Command.EXCHANGE, state.tobytes()).encode()
+    lengths = HAND_REPLIES
+    if request:
+        block = frames.command_block(rng.normal(size=12), kp=100, ki=0, kd=0, torque_max=300)
+        frame, lengths = Frame(0xFE, 0x80, Command.EXCHANGE, block.tobytes()).encode(), frames.HOST_REQUESTS
+    bad = Injector(FaultConfig(), seed).damage(Fault(kind, request), frame)
+    parser = Parser(lengths)
+    assert bad != frame and frame not in bad and bad
+    assert parser.feed(bad) + parser.expire() == []
+    changed = abs(len(bad) - len(frame))
+    assert (changed == 0) == (kind == "flip") and changed <= 40
+    if kind == "flip":
+        bits = sum((a ^ b).bit_count() for a, b in zip(bad, frame, strict=True))
+        assert 1 <= bits <= 3
+
+
+class Cable:
+    """Both ends of a cable in memory: a `Terminal` for the hand, pyserial's port for the host, and their clock."""
+
+    connected, baud = True, 3_000_000
+
+    def __init__(self):
+        self.now, self.line = 1000.0, None
+        self.to_hand, self.to_host = bytearray(), bytearray()
+
+    # What the hand sees.
+
+    def open(self):
+        self.connected = True
+
+    def close(self):
+        self.connected = False
+        self.to_hand, self.to_host = bytearray(), bytearray()  # Whoever holds the old ones has lost them.
+
+    def read(self):
+        data = bytes(self.to_hand)
+        self.to_hand.clear()
+        return data
+
+    def write(self, data):
+        self.to_host += data
+        return len(data)
+
+    # Time: it passes only where the host waits.
+
+    def wait(self, seconds, enough=lambda: False):
+        until = self.now + seconds
+        while self.now < until and not enough():
+            self.now = min(max(self.line.due(), self.now + 1e-6), until)
+            self.line.serve(self.now)
+
+
+class Port:
+    """What pyserial gives the host."""
+
+    def __init__(self, cable, timeout):
+        if not cable.connected:
+            raise OSError(2, "gone")
+        self._cable, self._timeout, self._buffer = cable, timeout, cable.to_host
+
+    def _check(self):
+        if self._buffer is not self._cable.to_host or not self._cable.connected:
+            raise OSError(5, "unplugged")
+
+    @property
+    def in_waiting(self):
+        self._check()
+        return len(self._buffer)
+
+    def write(self, data):
+        self._check()
+        self._cable.to_hand += data
+        self._cable.wait(1e-5)
+
+    def read(self, size):
+        self._check()
+        self._cable.wait(self._timeout, lambda: len(self._buffer) >= size or not self._cable.connected)
+        self._cable.wait(2e-5)
+        self._check()
+        data = bytes(self._buffer[:size])
+        del self._buffer[:size]
+        return data
+
+    def close(self):
+        pass
+
+
+class Pair:
+    """The bridge's driver and an emulated hand on one cable."""
+
+    def __init__(self, hand, monkeypatch, faults, seed=0, **link):
+        import serial
+
+        self.cable, self.plant, self.notes = Cable(), ScriptedPlant(), []
+        cable = self.cable
+        monkeypatch.setattr(
+            "dexsim_real.wire.serial_hand.time", SimpleNamespace(monotonic=lambda: cable.now, sleep=cable.wait)
+        )
+        monkeypatch.setattr(serial, "serial_for_url", lambda url, timeout, **_: Port(cable, timeout))
+        self.board = Firmware(self.plant, FirmwareConfig(), self.notes.append)
+        self.check = CommandCheck(hand.joint_lower, hand.joint_upper, LimitsConfig())
+        self.injector = Injector(faults, seed)
+        self.line = cable.line = HandLine(
+            cable, self.plant, self.board, self.check, self.injector, LineConfig(), seed=seed, note=self.notes.append
+        )
+        self.port = SerialHand("loop://", LinkConfig(settle=0.0, backoff=(0.02, 0.1), **link))
+        self.port.connect()
+
+    def exchange(self, mode=Mode.POSITION, period=0.012):
+        """One exchange a cycle, as the bridge does."""
+        start = self.cable.now
+        reply = self.port.exchange(frames.command_block(REST, kp=100, ki=0, kd=0, torque_max=300, mode=mode))
+        took = self.cable.now - start
+        self.cable.wait(-took % period)
+        return reply
+
+    def run(self, seconds):
+        """Times at which answers came."""
+        until, replies = self.cable.now + seconds, []
+        while self.cable.now < until:
+            replies.append(self.exchange())
+        return [reply.received for reply in replies if reply is not None]
+
+    def settle(self):
+        """Until nothing is under way any more."""
+        self.cable.wait(1.0)
+        for _ in range(3):
+            self.exchange(Mode.PASSIVE)
+        while self.exchange(Mode.PASSIVE) is None:
+            pass
+
+    def agreement(self):
+        """What the host counted, beside what was injected."""
+        counts, line, made = self.port.counts, self.line.counts, self.injector.injected
+        expected = self.injector.expected()
+        damaged_requests = sum(made[f"{kind} request"] for kind in BYTES)
+        return {
+            "corrupt": (counts.corrupt, expected["corrupt"]),
+            "lost": (counts.lost, expected["lost"]),
+            # What the hand never answered, and what came too late.
+            "silent": (counts.silent, damaged_requests + line["ignored"] + counts.late),
+            "answered": (counts.answered + counts.refused + counts.late, line["answers"]),
+            "sent": (counts.sent, line["requests"]),
+            "ends": (counts.sent, counts.answered + counts.corrupt + counts.silent + counts.refused + counts.lost),
+            "damaged": (line["damaged answers"] + line["damaged requests"], expected["corrupt"] + damaged_requests),
+        }
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_every_injected_fault_is_found_in_the_hosts_counters(hand, monkeypatch, seed):
+    """Half of all exchanges go wrong in one way or another."""
+    faults = FaultConfig(
+        flip=0.1,
+        drop=0.1,
+        duplicate=0.1,
+        late=0.04,
+        stall=0.04,
+        disconnect=0.04,
+        stuck=0.05,
+        heat=0.03,
+        stall_seconds=(0.005, 0.2),
+        away_seconds=(0.01, 0.2),
+    )
+    pair = Pair(hand, monkeypatch, faults, seed)
+    answers = pair.run(40)
+    pair.settle()
+    made = pair.injector.injected
+    assert set(made) == {*(f"{kind} {side}" for kind in BYTES for side in ("answer", "request")), *KINDS[3:]}
+    assert len(answers) > 400 and min(made.values()) > 5
+    for name, (found, injected) in pair.agreement().items():
+        assert found == injected, (name, pair.agreement(), made)
+    # One that befalls the greeting itself makes two connections one.
+    assert 0.8 * made["disconnect"] < pair.port.counts.reconnects <= made["disconnect"]
+    assert pair.check.report()["outside_limits"] == 0 and pair.check.checked == pair.board.counts["exchange"]
+    cable, heat = pair.cable, pair.plant.heat
+    cable.wait(3.0)
+    np.testing.assert_allclose(heat, 35.0)  # Every motor that was heated has cooled.
+
+
+@pytest.mark.parametrize(
+    ("name", "counter"),
+    [
+        ("flip answer", "corrupt"),
+        ("drop answer", "corrupt"),
+        ("duplicate answer", "corrupt"),
+        ("flip request", "silent"),
+        ("drop request", "silent"),
+        ("duplicate request", "silent"),
+        ("late 0.1", "silent"),
+        ("stall 0.2", "silent"),
+        ("disconnect 0.1", "lost"),
+    ],
+)
+def test_each_fault_alone_has_its_effect_and_passes(hand, monkeypatch, name, counter):
+    pair = Pair(hand, monkeypatch, FaultConfig(script=(f"1 {name}",)))
+    pair.run(0.99)
+    good = dataclasses.replace(pair.port.counts)
+    assert good.sent == good.answered
+    while pair.exchange() is not None:
+        pass
+    changed = {
+        key: value - getattr(good, key)
+        for key, value in dataclasses.asdict(pair.port.counts).items()
+        if key not in ("sent", "answered", "crc_errors", "resyncs") and value != getattr(good, key)
+    }
+    assert changed == {counter: 1}
+    start = pair.cable.now
+    while pair.exchange() is None:
+        pass
+    assert pair.cable.now - start < 0.4
+    pair.run(0.5)
+    assert pair.port.counts.reconnects == (counter == "lost")
+    assert pair.port.counts.late == name.startswith("late")
+    assert all(found == made for found, made in pair.agreement().values())
+
+
+def test_heat_and_stuck_taxels_reach_the_state(hand, monkeypatch):
+    pair = Pair(hand, monkeypatch, FaultConfig(script=("0.1 heat 7 45 0.3", "0.2 stuck 2 60 99")))
+    states = [pair.exchange().state for _ in range(60)]
+    heat = np.array([state["joint"]["temperature"] & 0xFF for state in states])
+    hot = np.flatnonzero(heat[:, 7] == 80)
+    assert np.all(np.delete(heat, 7, 1) == 35) and set(heat[:, 7]) == {35, 80}
+    assert 23 <= len(hot) <= 27 and np.all(np.diff(hot) == 1)
+    stuck = [int(state["tip"]["taxel"]["z"][2, 60]) for state in states]
+    assert set(stuck) == {0, 99} and stuck == sorted(stuck)
+
+
+def test_the_hand_is_safe_within_a_tenth_of_a_second_of_losing_its_host(hand, monkeypatch):
+    faults = FaultConfig(script=("0.3 disconnect 0.4", "1.2 stall 0.4", "2 late 0.2"))
+    pair = Pair(hand, monkeypatch, faults)
+    answered = pair.run(3.0)
+    lost = [a for a, b in zip(answered, answered[1:], strict=False) if b - a > 0.15]
+    trips = pair.board.trips
+    assert len(trips) == len(lost) == 3
+    for trip, last in zip(trips, lost, strict=True):
+        assert 0 < trip - last < 0.1
+    # In between and at the end the motors were on again, since somebody asked.
+    assert [text for text in pair.notes if text == "motors on"] == ["motors on"] * 4
+    # A host that is gone for good.
+    pair.cable.wait(1.0)
+    assert len(trips) == 4 and trips[-1] - answered[-1] < 0.1 and not pair.board.on
+
+
+def test_parse_gives_time_kind_and_values():
+    assert parse_fault("12.5 stall 0.2") == (12.5, "stall", ("0.2",)) and parse_fault("3 drop") == (3.0, "drop", ())

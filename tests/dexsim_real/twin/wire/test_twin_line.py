@@ -1,0 +1,152 @@
+"""The emulated line: timing in virtual time, the bridge's driver on it, and the name of its terminal."""
+
+import os
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+pytest.importorskip("serial")
+from twin_line import Bench, Running, command
+from twin_plant import REST
+
+from dexsim_real.core.errors import HandError
+from dexsim_real.twin.wire.line import LineConfig
+from dexsim_real.twin.wire.terminal import Terminal
+from dexsim_real.wire import frames
+from dexsim_real.wire.frames import HAND_REPLIES, Command, Frame, Mode, Parser
+from dexsim_real.wire.link import LinkConfig
+from dexsim_real.wire.serial_hand import SerialHand
+
+
+@pytest.fixture
+def bench(tmp_path, hand):
+    made = []
+
+    def make(**options):
+        made.append(Bench(tmp_path, hand, **options))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.close()
+
+
+def test_an_exchange_takes_what_it_takes_on_the_hand(bench):
+    """On a hand: mean 9.59 to 9.60 ms, 95 % below 9.62 to 9.63 ms, at most 10.7 ms, of 1773 exchanges."""
+    one = bench()
+    times = []
+    for _ in range(700):
+        took, data = one.exchange()
+        (frame,) = Parser(HAND_REPLIES).feed(data)
+        assert frame.command == Command.EXCHANGE
+        times.append(1e3 * took)
+    assert np.mean(times) == pytest.approx(9.59, abs=0.02) and np.percentile(times, 95) < 9.64
+    assert 10.2 < max(times) < 10.8 and min(times) > 9.4
+    assert one.line.counts == {"requests": 700, "answers": 700, "damaged requests": 0, "bytes without room": 0}
+
+
+def test_answers_come_in_pieces_at_the_pace_of_the_wire(bench):
+    one = bench(line=LineConfig(jitter=0.0, extra_delay_probability=0.0))
+    start = one.now
+    one.send(Frame(0xFE, 0x80, Command.EXCHANGE, command().tobytes()).encode())
+    pieces = one.run(0.02)
+    begin = start + 297 * 10 / 3e6 + 0.0012
+    ends = np.cumsum([len(data) for _, data in pieces])
+    assert ends.tolist() == [510, 1020, 1530, 2040, 2217]
+    np.testing.assert_allclose([when for when, _ in pieces], begin + ends * 10 / 3e6, atol=1e-9)
+
+
+def test_requests_queue_while_an_answer_is_on_its_way(bench):
+    one = bench(line=LineConfig(jitter=0.0, extra_delay_probability=0.0))
+    request = Frame(0xFE, 0x80, Command.EXCHANGE, command().tobytes()).encode()
+    one.send(request + request)
+    got = one.run(0.03)
+    assert len(Parser(HAND_REPLIES).feed(b"".join(data for _, data in got))) == 2
+    # The second begins when the first has ended, after a pause of its own.
+    assert got[5][0] - got[4][0] == pytest.approx(0.0012 + 510 * 10 / 3e6, abs=1e-9)
+
+
+def test_the_watchdog_in_the_line(bench):
+    one = bench()
+    one.exchange()
+    assert one.board.on
+    asked = one.now - 0.012
+    one.run(0.5)
+    assert not one.board.on
+    assert 0.08 < one.board.trips[0] - asked < 0.083  # From when the command was understood.
+    # A request that has come counts, even when this machine looks at it too late.
+    one.exchange()
+    one.port.write(Frame(0xFE, 0x80, Command.EXCHANGE, command().tobytes()).encode())
+    one.now += 0.3
+    one.line.serve(one.now)
+    one.run(0.012)
+    assert len(one.board.trips) == 1 and one.board.on
+
+
+def test_a_host_at_another_baud_rate_is_not_understood(bench):
+    one = bench()
+    one.port.baudrate = 115200
+    assert one.exchange() is None and one.line.counts["bytes at another baud"] == 297
+    assert "115200 baud, the hand at 3000000" in one.notes[-1]
+    one.port.baudrate = 3_000_000
+    assert one.exchange() is not None
+
+
+@given(st.binary(max_size=600))
+def test_noise_on_the_line_is_answered_with_silence(hand, noise):
+    import tempfile
+
+    with tempfile.TemporaryDirectory() as folder:
+        one = Bench(Path(folder), hand)
+        one.send(noise)
+        sound = len(Parser(frames.HOST_REQUESTS).feed(noise))
+        assert (one.run(0.05) != []) <= (sound > 0)
+        assert one.exchange(period=0.05) is not None
+        one.close()
+
+
+def test_the_driver_talks_to_it(hand, tmp_path):
+    with Running(hand, tmp_path, task="rotate") as running:
+        port = SerialHand(running.port, LinkConfig(settle=0.0, margin=0.2))
+        assert "firmware 1.3.9" in port.connect()
+        goal, replies = REST + 0.05, []
+        for k in range(30):
+            replies.append(port.exchange(command(REST if k < 2 else goal)))
+        port.close()
+        time.sleep(0.15)
+    first, last = replies[0].state["joint"], replies[-1].state["joint"]
+    np.testing.assert_allclose(first["position"], REST, atol=1e-3)
+    np.testing.assert_allclose(last["position"], goal, atol=3e-3)
+    assert port.counts.sent == port.counts.answered == running.twin.line.counts["answers"] == 32
+    assert np.median([reply.received - reply.sent for reply in replies]) > 0.0095
+    assert np.all(last["raw_position"] & 0xF == Mode.POSITION)
+    report = running.twin.report()
+    assert report["commands"]["outside_limits"] == 0 and len(report["watchdog"]["trips"]) == 1
+    assert [text for _, text in running.twin.events if "motors" in text][-1].startswith("watchdog")
+
+
+def test_a_terminal_keeps_its_name(tmp_path):
+    terminal = Terminal(tmp_path / "port")
+    file = os.open(tmp_path / "port", os.O_RDWR | os.O_NOCTTY)
+    terminal.write(b"a")
+    assert os.read(file, 10) == b"a"
+    terminal.close()
+    assert not (tmp_path / "port").is_symlink()
+    with pytest.raises(OSError):
+        os.write(file, b"x")
+    os.close(file)
+    terminal.open()
+    file = os.open(tmp_path / "port", os.O_RDWR | os.O_NOCTTY)
+    os.write(file, b"b")
+    assert terminal.read() == b"b" and terminal.read() == b""
+    os.close(file)
+    terminal.close()
+    (tmp_path / "file").touch()
+    with pytest.raises(HandError, match="not a link"):
+        Terminal(tmp_path / "file")
+    with pytest.raises(HandError, match="no pseudo-terminal"):
+        Terminal(tmp_path / "none" / "port")

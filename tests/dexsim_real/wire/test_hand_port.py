@@ -1,0 +1,85 @@
+"""Opening a port: messages for the usual problems, latency timer, deadlines."""
+
+import dataclasses
+import errno
+import os
+
+import pytest
+from pty_hand import QUICK, PtyHand
+
+from dexsim_real.core.errors import (
+    HandError,
+    explain,
+    latency_warnings,
+)
+from dexsim_real.wire.frames import (
+    Command,
+    Frame,
+)
+from dexsim_real.wire.link import (
+    LinkConfig,
+)
+from dexsim_real.wire.serial_hand import SerialHand, open_port
+
+
+def test_a_silent_hand_and_a_wrong_baud_rate_are_told_apart():
+    with PtyHand(lambda *_: b"", version=None) as peer, pytest.raises(HandError, match="no answer.*power"):
+        SerialHand(peer.port, QUICK).connect()
+    with PtyHand(lambda *_: b"\x13\x37" * 40, version=None) as peer, pytest.raises(HandError, match="3000000 baud"):
+        SerialHand(peer.port, QUICK).connect()
+    broken = Frame(0x80, 0xFE, Command.ERROR, b"\x02").encode()
+    with PtyHand(lambda *_: broken) as peer, pytest.raises(HandError, match="refusals"):
+        SerialHand(peer.port, QUICK).connect()
+
+
+def test_an_emulated_line_without_pace_is_told_so():
+    with PtyHand() as peer, pytest.raises(HandError, match="sooner than 3000000 baud.*--link.no-paced"):
+        SerialHand(peer.port, dataclasses.replace(QUICK, paced=True)).connect()
+
+
+def test_a_hand_that_does_not_tell_its_version_is_still_a_hand():
+    with PtyHand(version=None) as peer:
+        port = SerialHand(peer.port, QUICK)
+        assert "firmware unknown" in port.connect()
+        port.close()
+
+
+def test_two_programs_do_not_share_a_port():
+    with PtyHand() as peer:
+        first = SerialHand(peer.port, QUICK)
+        first.connect()
+        with pytest.raises(HandError, match="another program has it open"):
+            SerialHand(peer.port, QUICK).connect()
+        first.close()
+
+
+def test_messages_for_the_usual_troubles(tmp_path):
+    with pytest.raises(HandError, match="there is no such port"):
+        SerialHand(str(tmp_path / "none"), QUICK).connect()
+    file = tmp_path / "port"
+    file.touch()
+    group = __import__("grp").getgrgid(os.stat(file).st_gid).gr_name
+    text = explain(str(file), PermissionError(errno.EACCES, "Permission denied"))
+    assert f"usermod -aG {group}" in text and "\n" not in text
+    assert "another program" in explain("/dev/x", OSError(errno.EBUSY, "busy"))
+    with pytest.raises(HandError, match="no_such_module"):
+        open_port("sdk:no_such_module:f", QUICK)
+
+
+def test_the_latency_timer(tmp_path):
+    timer = tmp_path / "ttyUSB7" / "latency_timer"
+    timer.parent.mkdir()
+    device = tmp_path / "by-id"
+    device.symlink_to("/dev/ttyUSB7")
+    timer.write_text("16\n")
+    (text,) = latency_warnings(str(device), tmp_path)
+    assert f"echo 1 | sudo tee {timer}" in text and "16 ms" in text
+    timer.write_text("1\n")
+    assert latency_warnings(str(device), tmp_path) == []
+    assert latency_warnings("/dev/ttyACM0", tmp_path) == []
+
+
+def test_the_deadline_follows_size_and_baud():
+    # 297 + 2217 bytes of ten bits at 3 Mbaud are 8.38 ms.
+    assert LinkConfig(margin=0.001).deadline(297, 2217) == pytest.approx(0.00838 + 0.001, abs=1e-5)
+    assert LinkConfig(baud=115200, margin=0.001).deadline(297, 2217) == pytest.approx(0.2192, abs=1e-4)

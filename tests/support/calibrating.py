@@ -1,0 +1,59 @@
+"""The press procedure on a simulated bench, for tests."""
+
+import io
+
+import numpy as np
+from press_bench import Plate
+from rich.console import Console
+
+from dexsim_real.calibrate import __main__ as calibrate
+from dexsim_real.calibrate.hand_loop import Operator
+from dexsim_real.calibrate.options import CalibrateArguments, PressConfig
+from dexsim_real.calibrate.plan import placements
+from dexsim_real.wire.frames import Mode
+
+SHORT = PressConfig(cycles=3, seconds=5.0, approach_speed=0.3, first_speed=0.08)
+
+QUICK = PressConfig(cycles=1, seconds=1.0, approach_speed=0.5, first_speed=0.2, pause=0.2)
+
+
+def plates(hand, *names):
+    """A spring before each named placement, which presses on twenty taxels or a dozen."""
+    found = []
+    for placement in placements(hand):
+        if names and placement.name not in names:
+            continue
+        columns = (3, 4, 5, 6) if placement.name.endswith("pad") else (7, 8, 9)
+        taxels = np.array([column * 12 + row for column in columns for row in range(3, 8)])
+        share = np.exp(-0.5 * ((taxels % 12 - 5) / 1.2) ** 2)
+        found.append(Plate(placement.finger, taxels, share / share.sum(), placement.posture, placement.joints))
+    return found
+
+
+def arguments(folder, **options):
+    options = {
+        "port": "bench",
+        "output": folder / "hand.toml",
+        "log": folder / "hand.log",
+        "yes": True,
+        "press": SHORT,
+        "fingers": ("index",),
+        "realtime": False,
+    } | options
+    return CalibrateArguments(**options)
+
+
+def operator():
+    return Operator(Console(file=io.StringIO(), width=200), assume_yes=True)
+
+
+def record(bench, hand, options, who=None):
+    return calibrate.record(options, hand, who or operator(), port=bench, clock=bench.clock, sleep=bench.sleep)
+
+
+def off(bench):
+    return np.all(bench.commands[-1]["mode"] == Mode.PASSIVE)
+
+
+def on(bench):
+    return np.array([np.all(command["mode"] == Mode.POSITION) for command in bench.commands])

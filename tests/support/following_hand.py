@@ -1,0 +1,69 @@
+"""A scripted hand for runs of the bridge's commands, and what a run leaves behind."""
+
+import json
+import time
+
+import numpy as np
+from pty_hand import PtyHand
+
+from dexsim_real.core.log import LogReader
+from dexsim_real.wire.frames import Mode
+
+
+class FollowingHand(PtyHand):
+    """Joints that go a third of the way to their target at each exchange; it keeps what was asked of it."""
+
+    def __init__(self, trouble=None, pause=0.0):
+        super().__init__(self._follow)
+        self.trouble, self.pause = trouble or (lambda index, state: None), pause
+        self.times, self.poses = [], []
+        self.state["joint"]["position"] = 0.1
+        self.state["joint"]["position"][3] = 0.0
+
+    def _follow(self, index, block, state):
+        time.sleep(self.pause)
+        joint = state["joint"]
+        self.times.append(time.monotonic())
+        self.poses.append(joint["position"].copy())
+        on = block["mode"] == Mode.POSITION
+        joint["position"] += np.where(on, (block["position"] - joint["position"]) / 3, 0)
+        return self.trouble(index, state)
+
+    def on(self):
+        """Whether the motors were on, by exchange."""
+        return np.array([bool(np.all(block["mode"] == Mode.POSITION)) for block in self.commands])
+
+
+def arguments(peer, folder, *more):
+    """Patient with the peer, which shares this process and perhaps a busy machine."""
+    return [
+        "grasp",
+        "--port",
+        peer.port,
+        "--uncalibrated",
+        "--fixed-object",
+        "--link.settle",
+        "0",
+        "--link.no-paced",
+        "--link.margin",
+        "0.2",
+        "--safety.stale",
+        "1",
+        "--approach",
+        "0.4",
+        "--log",
+        str(folder / "run.log"),
+        "--output",
+        str(folder / "run.json"),
+        "--quiet",
+        "--no-realtime",
+        *more,
+    ]
+
+
+def summary(folder):
+    return json.loads((folder / "run.json").read_text())
+
+
+def records(folder, kind):
+    return [record.content for record in LogReader(folder / "run.log") if record.kind == kind]
