@@ -9,21 +9,8 @@ from dexsim.observation import FIELDS, Readings
 from dexsim_real.core.errors import HandError
 from dexsim_real.sensors.hand import HandMeasurement
 
-SOURCES = {
-    "joint_position": "hand",
-    "joint_torque": "hand",
-    "contact_force": "hand",
-    "contact_centre": "hand",
-    "fingertip_position": "hand",
-    "fingertip_rotation": "hand",
-    "last_action": "policy",
-    "command": "user",
-    "object_position": "camera",
-    "object_velocity": "camera",
-    "relative_orientation": "imu",
-    "object_orientation": "imu",
-}
-"""The sensor that measures each field of an observation on hardware."""
+SOURCES = ("hand", "camera", "imu", "user", "policy")
+"""Who gives the bridge what a policy observes; see `ObservationField.source`."""
 
 
 @dataclasses.dataclass(frozen=True)
