@@ -31,7 +31,7 @@ _CONTACT = 0.01  # N, force from which a finger counts as touching
 
 
 @pytree_dataclass
-class Goal:
+class GraspGoal:
     """What the policy is asked for."""
 
     command: jax.Array  # [] in [0, 1]
@@ -120,21 +120,21 @@ class Grasp:
         """Inertia [3] m^2 of the object as a uniform solid of 1 kg."""
         return params.unit_inertia(object, self.config.objects)
 
-    def begin(self, key: jax.Array, start: Start) -> Goal:
+    def begin(self, key: jax.Array, start: Start) -> GraspGoal:
         del start
-        return Goal(jax.random.uniform(key), jnp.zeros((), bool))
+        return GraspGoal(jax.random.uniform(key), jnp.zeros((), bool))
 
-    def update(self, key: jax.Array, goal: Goal, truth: GroundTruth) -> Goal:
+    def update(self, key: jax.Array, goal: GraspGoal, truth: GroundTruth) -> GraspGoal:
         del truth
         when, what = jax.random.split(key)
         change = jax.random.bernoulli(when, self.config.command_change) & ~goal.fixed
         return dataclasses.replace(goal, command=jnp.where(change, jax.random.uniform(what), goal.command))
 
-    def goal_readings(self, goal: Goal) -> tuple[jax.Array, jax.Array]:
+    def goal_readings(self, goal: GraspGoal) -> tuple[jax.Array, jax.Array]:
         """Command and goal orientation, as `Readings` carry them."""
         return goal.command, jnp.array([1.0, 0.0, 0.0, 0.0])
 
-    def target_force(self, goal: Goal) -> jax.Array:
+    def target_force(self, goal: GraspGoal) -> jax.Array:
         return target_force(goal.command, self.config.finger_force)
 
     def push(self, key: jax.Array, object: ObjectParams) -> jax.Array:
@@ -147,12 +147,12 @@ class Grasp:
             period=self.config.physics.control_period,
         )
 
-    def dropped(self, goal: Goal, truth: GroundTruth) -> jax.Array:
+    def dropped(self, goal: GraspGoal, truth: GroundTruth) -> jax.Array:
         del goal
         away = jnp.linalg.norm(truth.object_position - jnp.asarray(self.reference))
         return away > self.config.drop_distance
 
-    def reward(self, goal: Goal, truth: GroundTruth, dropped: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
+    def reward(self, goal: GraspGoal, truth: GroundTruth, dropped: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
         """The reward of a tick and its terms; zero for all but the penalties once dropped."""
         config, weights = self.config, self.config.reward
         force = jnp.linalg.norm(truth.finger_force, axis=-1)
@@ -186,7 +186,7 @@ class Grasp:
         metrics = {f"reward/{name}": value for name, value in terms.items()}
         return sum(terms.values()), metrics | self._metrics(goal, truth, held)
 
-    def _metrics(self, goal: Goal, truth: GroundTruth, held: jax.Array) -> dict[str, jax.Array]:
+    def _metrics(self, goal: GraspGoal, truth: GroundTruth, held: jax.Array) -> dict[str, jax.Array]:
         force = jnp.linalg.norm(truth.finger_force, axis=-1)
         contact = force > _CONTACT
         # The command speaks to the four fingers; the thumb balances them.
@@ -210,7 +210,7 @@ class Grasp:
 
     # --- evaluation ------------------------------------------------------------------------
 
-    def evaluation_plan(self, count: int, shape_index: np.ndarray) -> tuple[np.ndarray, Goal]:
+    def evaluation_plan(self, count: int, shape_index: np.ndarray) -> tuple[np.ndarray, GraspGoal]:
         """Pool rows [count] and goals: five commands for each shape, evenly, never changing."""
         rows = np.arange(count)
         command = (rows % len(COMMANDS))[:, None] == np.arange(len(COMMANDS))
@@ -222,7 +222,7 @@ class Grasp:
             of_shape = np.flatnonzero(shape_index == shape)
             mine = wanted == shape
             index[mine] = of_shape[(turn[mine] * len(COMMANDS) + rows[mine] % len(COMMANDS)) % len(of_shape)]
-        goal = Goal(jnp.asarray(command @ np.asarray(COMMANDS), jnp.float32), jnp.ones(count, bool))
+        goal = GraspGoal(jnp.asarray(command @ np.asarray(COMMANDS), jnp.float32), jnp.ones(count, bool))
         return index, goal
 
     def summarize(self, metrics: dict[str, np.ndarray], alive: np.ndarray, control_period: float) -> dict:

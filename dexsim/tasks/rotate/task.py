@@ -36,7 +36,7 @@ _RECENT = 0.2  # s, a fingertip that touched within this time before a drop push
 
 
 @pytree_dataclass
-class Goal:
+class RotateGoal:
     """The goal, and what has happened since the episode began."""
 
     turns: jax.Array  # [] int32 goals reached
@@ -124,11 +124,11 @@ class Rotate:
             return params.unit_inertia(object, self.config.objects)
         return unit_inertia(self.config.object, object.size[0, 0])
 
-    def begin(self, key: jax.Array, start: Start) -> Goal:
+    def begin(self, key: jax.Array, start: Start) -> RotateGoal:
         del key, start
         zero, none = jnp.zeros(()), jnp.zeros((), jnp.int32)
         fingers = jnp.zeros(self.hand.num_fingers)
-        return Goal(
+        return RotateGoal(
             turns=none,
             entered=jnp.zeros((), bool),
             entries=none,
@@ -141,7 +141,7 @@ class Rotate:
             totals={"spin": zero, "joint_speed": zero, "action_rate": zero, "tilt": zero, "touch": fingers},
         )
 
-    def progress(self, goal: Goal, truth: GroundTruth) -> Progress:
+    def progress(self, goal: RotateGoal, truth: GroundTruth) -> Progress:
         """Where the object is with respect to the goal."""
         config = self.config
         angle = rotations.quat_angle(self._quat(goal), truth.object_quat)
@@ -151,11 +151,11 @@ class Rotate:
         calm = jnp.abs(spin) <= config.goal_spin if config.goal_spin > 0 else True
         return Progress(angle, distance, spin, goal.entered | inside, inside & calm)
 
-    def update(self, key: jax.Array, goal: Goal, truth: GroundTruth) -> Goal:
+    def update(self, key: jax.Array, goal: RotateGoal, truth: GroundTruth) -> RotateGoal:
         del key
         return self._advance(goal, truth)
 
-    def _advance(self, goal: Goal, truth: GroundTruth) -> Goal:
+    def _advance(self, goal: RotateGoal, truth: GroundTruth) -> RotateGoal:
         now, period = self.progress(goal, truth), self._period
         touching = self._touching(truth)
         clock = goal.clock + period
@@ -166,7 +166,7 @@ class Rotate:
             "tilt": self._tilt(truth),
             "touch": touching,
         }
-        return Goal(
+        return RotateGoal(
             turns=goal.turns + now.success,
             entered=now.entered & ~now.success,
             entries=goal.entries + (now.entered & ~goal.entered),
@@ -179,11 +179,11 @@ class Rotate:
             totals={name: goal.totals[name] + change[name] for name in goal.totals},
         )
 
-    def goal_readings(self, goal: Goal) -> tuple[jax.Array, jax.Array]:
+    def goal_readings(self, goal: RotateGoal) -> tuple[jax.Array, jax.Array]:
         """Command (unused) and goal orientation, as `Readings` carry them."""
         return jnp.zeros(()), self._quat(goal)
 
-    def target_force(self, goal: Goal) -> jax.Array:
+    def target_force(self, goal: RotateGoal) -> jax.Array:
         """No force is asked for."""
         del goal
         return jnp.zeros(())
@@ -198,7 +198,7 @@ class Rotate:
             period=self._period,
         )
 
-    def dropped(self, goal: Goal, truth: GroundTruth) -> jax.Array:
+    def dropped(self, goal: RotateGoal, truth: GroundTruth) -> jax.Array:
         away = jnp.linalg.norm(truth.object_position - jnp.asarray(self.reference))
         lost = (away > self.config.drop_distance) | (self._tilt(truth) > self.config.drop_tilt)
         if self.config.support == "fingers":
@@ -207,7 +207,9 @@ class Rotate:
         hopeless = (away > self.config.drop_radius) | (goal.clock - goal.last_success > self.config.patience)
         return lost | (goal.gives_up & hopeless)
 
-    def reward(self, goal: Goal, truth: GroundTruth, dropped: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
+    def reward(
+        self, goal: RotateGoal, truth: GroundTruth, dropped: jax.Array
+    ) -> tuple[jax.Array, dict[str, jax.Array]]:
         """The reward of a tick and its terms; nothing but penalties once dropped."""
         weights, now, held = self.config.reward, self.progress(goal, truth), 1.0 - dropped
         after = self._advance(goal, truth)
@@ -245,7 +247,7 @@ class Rotate:
             **{f"duty/{i}": mean["touch"][i] for i in range(self.hand.num_fingers)},
         }
 
-    def _quat(self, goal: Goal) -> jax.Array:
+    def _quat(self, goal: RotateGoal) -> jax.Array:
         return goal_quat(goal.turns, self._axis, self._step)
 
     def _tilt(self, truth: GroundTruth) -> jax.Array:
@@ -259,7 +261,7 @@ class Rotate:
 
     # --- evaluation ------------------------------------------------------------------------
 
-    def evaluation_plan(self, count: int, shape_index: np.ndarray) -> tuple[np.ndarray, Goal]:
+    def evaluation_plan(self, count: int, shape_index: np.ndarray) -> tuple[np.ndarray, RotateGoal]:
         """Rows [count] of the pool, evenly spread over it; goals that end with a drop only."""
         goal = dataclasses.replace(self.begin(jax.random.key(0), None), gives_up=jnp.zeros((), bool))
         goals = jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), goal)

@@ -21,8 +21,8 @@ from dexsim.registry import TASKS
 from dexsim.tasks.grasp.config import GraspConfig, GraspReward
 from dexsim.tasks.grasp.task import (
     COMMANDS,
-    Goal,
     Grasp,
+    GraspGoal,
     command_reward,
     joint_spread,
     posture_distance,
@@ -98,7 +98,7 @@ def make_moment(hand, **fields):
 
 
 def goal_of(command):
-    return Goal(jnp.float32(command), jnp.zeros((), bool))
+    return GraspGoal(jnp.float32(command), jnp.zeros((), bool))
 
 
 class TestTerms:
@@ -311,7 +311,7 @@ class TestChance:
 
     def test_a_fixed_command_never_changes(self, hand):
         task = Grasp(GraspConfig(command_change=1.0), hand)
-        fixed = Goal(jnp.float32(0.25), jnp.ones((), bool))
+        fixed = GraspGoal(jnp.float32(0.25), jnp.ones((), bool))
         keys = jax.random.split(jax.random.key(2), 50)
         assert np.all(np.asarray(jax.vmap(lambda k: task.update(k, fixed, None).command)(keys)) == 0.25)
 
