@@ -51,9 +51,12 @@ def snippets():
 
 
 def commands(start: str):
-    """Shell commands of all pages that begin with `start`, in blocks or inline, up to a comment."""
+    """Shell commands of all pages that begin with `start`, in blocks or inline, up to a comment; not those of a block
+    after `<!-- not run: why -->`."""
     for page in PAGES:
-        text = page.read_text().replace("\\\n", " ")
+        text = re.sub(r"<!-- not run: [^>]+ -->\n```\n.*?```", "", page.read_text(), flags=re.DOTALL).replace(
+            "\\\n", " "
+        )
         for found in re.finditer(rf"{re.escape(start)}[^`\n#]*", text):
             yield pytest.param(found[0].strip(), id=f"{name_of(page)}: {found[0].strip()}")
 
