@@ -127,7 +127,7 @@ def load_mesh_object(config: ObjectConfig) -> MeshObject:
     """The mesh of `config`, fitted.
 
     Raises:
-      AssetError: see `object_mesh.load`.
+      AssetError: see `dexsim.objects.mesh.load`.
     """
     return load(config.mesh, unit=config.mesh_unit, parts=config.mesh_parts)
 

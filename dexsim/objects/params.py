@@ -104,7 +104,7 @@ def sample_object(key: jax.Array, config: ObjectConfig, shape_index: jax.Array |
     """Draw one object, of a kind in `config.shapes` or of the given one (index into SHAPES), or the mesh.
 
     Raises:
-      AssetError: the mesh is refused, see `object_mesh.load`.
+      AssetError: the mesh is refused, see `dexsim.objects.mesh.load`.
     """
     config, keys, extreme = config.narrowed(), jax.random.split(key, 8), sample_extreme(key, config.extremes)
     if config.mesh:
