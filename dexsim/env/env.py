@@ -27,6 +27,7 @@ from dexsim.env.state import Episode, SensorInput, State
 from dexsim.env.task import GroundTruth, Task
 from dexsim.env.touch import TouchModel
 from dexsim.geometry import rotations
+from dexsim.geometry.vectors import length
 from dexsim.hand.kinematics import Hand, forward_kinematics
 from dexsim.objects.params import ObjectParams
 from dexsim.observation import Readings
@@ -268,7 +269,7 @@ class Env:
             goal=goal,
             sensor_input=seen.sensor_input,
             readings=seen.readings,
-            finger_force=jnp.linalg.norm(tick.finger_force, axis=-1),
+            finger_force=length(tick.finger_force),
             tick=outcome.tick,
             length=outcome.length,
             episode_return=outcome.episode_return,
@@ -338,5 +339,5 @@ def _tangential_metrics(force: jax.Array | None) -> dict[str, jax.Array]:
     """Size of each finger's true tangential force [F, 3] and their sum, N; nothing without three-axis taxels."""
     if force is None:
         return {}
-    along = jnp.linalg.norm(force, axis=-1)
+    along = length(force)
     return {"tangential_force": jnp.sum(along), **{f"tangential/{i}": along[i] for i in range(along.shape[0])}}

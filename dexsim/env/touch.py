@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from dexsim.core.pytree import pytree_dataclass
 from dexsim.env.config import EnvConfig
 from dexsim.geometry import rotations
+from dexsim.geometry.vectors import length
 from dexsim.hand.kinematics import Hand, HandPose, taxel_normals
 from dexsim.objects.params import ObjectParams
 from dexsim.objects.touch_geometry import touch_geometry
@@ -60,7 +61,7 @@ class TouchModel:
             self.geometry(object),
             position,
             rotations.quat_to_matrix(quat),
-            jnp.linalg.norm(force, axis=-1),
+            length(force),
             skin,
             surface,
         )

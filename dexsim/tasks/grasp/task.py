@@ -17,6 +17,7 @@ from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import pytree_dataclass
 from dexsim.env.state import Start
 from dexsim.env.task import GroundTruth
+from dexsim.geometry.vectors import length
 from dexsim.hand.kinematics import Hand, flexion_joints
 from dexsim.objects import params
 from dexsim.objects.params import ObjectParams
@@ -149,13 +150,13 @@ class Grasp:
 
     def dropped(self, goal: GraspGoal, truth: GroundTruth) -> jax.Array:
         del goal
-        away = jnp.linalg.norm(truth.object_position - jnp.asarray(self.reference))
+        away = length(truth.object_position - jnp.asarray(self.reference))
         return away > self.config.drop_distance
 
     def reward(self, goal: GraspGoal, truth: GroundTruth, dropped: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
         """The reward of a tick and its terms; zero for all but the penalties once dropped."""
         config, weights = self.config, self.config.reward
-        force = jnp.linalg.norm(truth.finger_force, axis=-1)
+        force = length(truth.finger_force)
         contact = force > _CONTACT
         wanted = self.target_force(goal)
         torque = truth.joint_torque[self._roots]
@@ -187,7 +188,7 @@ class Grasp:
         return sum(terms.values()), metrics | self._metrics(goal, truth, held)
 
     def _metrics(self, goal: GraspGoal, truth: GroundTruth, held: jax.Array) -> dict[str, jax.Array]:
-        force = jnp.linalg.norm(truth.finger_force, axis=-1)
+        force = length(truth.finger_force)
         contact = force > _CONTACT
         # The command speaks to the four fingers; the thumb balances them.
         mean_force = mean_where(contact[1:], force[1:])
@@ -226,5 +227,5 @@ class Grasp:
         return index, goal
 
     def summarize(self, metrics: dict[str, np.ndarray], alive: np.ndarray, control_period: float) -> dict:
-        """The report of an evaluation; see `grasp_report`."""
+        """The report of an evaluation; see `dexsim.tasks.grasp.report`."""
         return summarize(metrics, alive, control_period, self.config.finger_force)

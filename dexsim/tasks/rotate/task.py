@@ -19,6 +19,7 @@ from dexsim.core.pytree import pytree_dataclass
 from dexsim.env.state import Start
 from dexsim.env.task import GroundTruth
 from dexsim.geometry import rotations
+from dexsim.geometry.vectors import length
 from dexsim.hand.kinematics import Hand
 from dexsim.objects import params
 from dexsim.objects.config import BULK_RANGES, MESH_RANGES
@@ -110,7 +111,7 @@ class Rotate:
         self.evaluation_ticks = max(round(config.evaluation_seconds / self._period), 1)
 
     def make_pool(self, key: jax.Array) -> Start:
-        """Objects that came to rest in random postures of the hand; see `rotate_start`."""
+        """Objects that came to rest in random postures of the hand; see `dexsim.tasks.rotate.start`."""
         return load_pool(key, self.hand, self.config, self.gravity)
 
     def sample_object(self, key: jax.Array, config: RotateConfig, shape_index: jax.Array | None = None) -> ObjectParams:
@@ -145,7 +146,7 @@ class Rotate:
         """Where the object is with respect to the goal."""
         config = self.config
         angle = rotations.quat_angle(self._quat(goal), truth.object_quat)
-        distance = jnp.linalg.norm(truth.object_position - jnp.asarray(self.reference))
+        distance = length(truth.object_position - jnp.asarray(self.reference))
         spin = config.direction * jnp.sum(truth.object_spin * self._axis)
         inside = (angle < config.goal_angle) & (distance < config.goal_distance)
         calm = jnp.abs(spin) <= config.goal_spin if config.goal_spin > 0 else True
@@ -199,7 +200,7 @@ class Rotate:
         )
 
     def dropped(self, goal: RotateGoal, truth: GroundTruth) -> jax.Array:
-        away = jnp.linalg.norm(truth.object_position - jnp.asarray(self.reference))
+        away = length(truth.object_position - jnp.asarray(self.reference))
         lost = (away > self.config.drop_distance) | (self._tilt(truth) > self.config.drop_tilt)
         if self.config.support == "fingers":
             low = lowest_point(truth.object, truth.object_quat, truth.object_position)
@@ -257,7 +258,7 @@ class Rotate:
         return jnp.arctan2(across, jnp.sum(own * self._axis))
 
     def _touching(self, truth: GroundTruth) -> jax.Array:
-        return (jnp.linalg.norm(truth.finger_force, axis=-1) > TOUCH).astype(jnp.float32)
+        return (length(truth.finger_force) > TOUCH).astype(jnp.float32)
 
     # --- evaluation ------------------------------------------------------------------------
 
@@ -268,5 +269,5 @@ class Rotate:
         return np.linspace(0, len(shape_index) - 1, count).round().astype(int), goals
 
     def summarize(self, metrics: dict[str, np.ndarray], lived: np.ndarray, control_period: float) -> dict:
-        """The report of an evaluation; see `rotate_report`."""
+        """The report of an evaluation; see `dexsim.tasks.rotate.report`."""
         return summarize(metrics, lived, control_period, self.evaluation_ticks)
