@@ -17,6 +17,7 @@ from typing import Any, Literal, TypeVar
 from dexsim.core.assets import cache_path
 from dexsim.core.errors import ConfigError, DexsimError, DexsimWarning
 from dexsim.core.files import write_whole
+from dexsim.core.install import DISTRIBUTION
 from dexsim.core.options import Option, explain, group_docs, help_page, in_option_names, options_of
 
 T = TypeVar("T")
@@ -138,7 +139,7 @@ def environment_report() -> dict[str, Any]:
     import jax
 
     versions = {"python": platform.python_version()}
-    for name in ("dexsim", "jax", "jaxlib", "mujoco", "mujoco-mjx", "warp-lang", "numpy"):
+    for name in (DISTRIBUTION, "jax", "jaxlib", "mujoco", "mujoco-mjx", "warp-lang", "numpy"):
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
             versions[name] = importlib.metadata.version(name)
     devices = jax.devices()
