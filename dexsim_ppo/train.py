@@ -86,6 +86,8 @@ def train_policy(
     unknown = sorted(set(options) - {field.name for field in dataclasses.fields(TrainArguments)})
     if unknown:
         raise ConfigError(f"train_policy has no option {unknown[0]!r}")
+    if isinstance(begun, Policy) and config is None:
+        begun.check_mesh()
     default = arguments
     arguments = dataclasses.replace(arguments, **{name: value for name, value in given.items() if value is not None})
     if isinstance(begun, checkpoint.Checkpoint):
@@ -187,6 +189,8 @@ def parse_arguments(argv: list[str]) -> tuple[TrainArguments, checkpoint.Checkpo
     begun = find_beginning(known.task, known.policy, known.resume)
     default = default_arguments(known.task, preset, begun)
     given = {argument.split("=")[0] for argument in argv}
+    if isinstance(begun, Policy) and not cli.wants_help(argv) and "--env.objects.mesh" not in given:
+        begun.check_mesh()
     if "--steps" in given and "--minutes" not in given:
         default = dataclasses.replace(default, minutes=0.0)
     generic: Any = TrainArguments  # a static checker knows no type that is only found at run time
