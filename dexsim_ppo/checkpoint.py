@@ -35,6 +35,7 @@ Tree = TypeVar("Tree")
 MAGIC = b"DEXSIM"
 FORMAT_VERSION = 1
 LIBRARY_VERSION = "0.1.0"
+_DIMENSIONS = 16  # of an array; ours have four at most, and NumPy's limit is 64
 _PREFIX = struct.Struct("<6sHQ32s")
 _HASHED_PREFIX = struct.Struct("<6sHQ")
 _DTYPES = (
@@ -208,9 +209,11 @@ def _open_envelope(path: Path, data: memoryview) -> tuple[dict[str, Any], memory
 def _leaf_size(leaf: dict[str, Any]) -> int:
     shape, dtype = leaf["shape"], leaf["dtype"]
     if dtype not in _DTYPES or not isinstance(leaf["path"], str) or not isinstance(leaf["prng"], str):
-        raise ValueError(f"leaf {leaf!r}")
+        raise ValueError(f"leaf {str(leaf):.100}")
+    if not isinstance(shape, list) or len(shape) > _DIMENSIONS:
+        raise ValueError(f"shape {str(shape):.100}")
     if not all(type(n) is int and 0 <= n < 2**40 for n in shape):
-        raise ValueError(f"shape {shape!r}")
+        raise ValueError(f"shape {str(shape):.100}")
     return math.prod(shape) * jnp.dtype(dtype).itemsize
 
 
@@ -218,7 +221,12 @@ def _read_leaves(path: Path, specs: list[dict[str, Any]], payload: memoryview) -
     leaves, offset = {}, 0
     for spec in specs:
         dtype = jnp.dtype(spec["dtype"])
-        array = np.frombuffer(payload, dtype, math.prod(spec["shape"]), offset).reshape(spec["shape"])
+        count = math.prod(spec["shape"])
+        try:  # Without elements there is nothing to read, and NumPy bounds the product of the other dimensions.
+            flat = np.frombuffer(payload, dtype, count, offset) if count else np.zeros(0, dtype)
+            array = flat.reshape(spec["shape"])
+        except ValueError as error:
+            raise CheckpointError(f"{path}: {spec['path']} has an impossible shape ({error})") from None
         offset += array.nbytes
         try:
             leaves[spec["path"]] = (

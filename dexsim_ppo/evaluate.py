@@ -251,11 +251,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments.task:
         find_task(arguments.task)
     chunk = min(arguments.chunk or default_chunk(), arguments.episodes)
+    if not any(entry.startswith("objects.mesh=") for entry in arguments.set):
+        policy.check_mesh()
     seconds = [f"evaluation_seconds={arguments.seconds}"] if arguments.seconds else []
     policy = dataclasses.replace(policy, env_config=override(policy.env_config, (*seconds, *arguments.set)))
     entry = find_task(policy.task)
     with cli.naming_options(entry.config_class, entry.config(), functools.partial(_typed, arguments)):
-        env = policy.make_env(backend=arguments.backend, num_envs=chunk)
+        env = policy.build_env(backend=arguments.backend, num_envs=chunk)
     report, snapshots = Evaluator(env, chunk)(policy.params, episodes=arguments.episodes, seed=arguments.seed)
     report |= {"policy": arguments.policy, "ablate": list(arguments.ablate), "set": list(arguments.set)}
     report |= {"backend": env.backend} | cli.environment_report()

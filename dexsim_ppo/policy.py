@@ -118,7 +118,7 @@ class Policy:
         file = checkpoint.load(path, kind="policy", task=task)
         try:
             return cls._from_file(file)
-        except (KeyError, TypeError, ValueError, IndexError, ConfigError) as error:
+        except (KeyError, TypeError, ValueError, IndexError, AttributeError, RecursionError, ConfigError) as error:
             raise CheckpointError(f"{path}: is not a sound policy ({error!r})") from None
 
     def make_env(self, *, num_envs: int = 1, backend: str = "auto", hand: "Hand | None" = None, seed: int = 0) -> "Env":
@@ -129,8 +129,29 @@ class Policy:
 
         Raises:
           ConfigError: its task is not registered.
-          CheckpointError: today's task gives another observation.
+          CheckpointError: today's task gives another observation, or the policy's mesh is outside of this folder.
         """
+        self.check_mesh()
+        return self.build_env(num_envs=num_envs, backend=backend, hand=hand, seed=seed)
+
+    def check_mesh(self) -> None:
+        """Refuse an object mesh that the policy's file names outside of the current folder.
+
+        A policy may come from anywhere; which files of this computer are opened is for its user to say.
+
+        Raises:
+          CheckpointError: the mesh is elsewhere.
+        """
+        objects = self.env_config.get("objects")
+        mesh = str(objects.get("mesh") or "") if isinstance(objects, dict) else ""
+        if mesh and not Path(mesh).expanduser().resolve().is_relative_to(Path.cwd().resolve()):
+            raise CheckpointError(
+                f"the policy's object mesh {mesh[:200]!r} is outside of the current folder: name the file yourself, "
+                "with --set objects.mesh=FILE (evaluate) or --env.objects.mesh FILE (train), or go to its folder"
+            )
+
+    def build_env(self, *, num_envs: int, backend: str, hand: "Hand | None" = None, seed: int = 0) -> "Env":
+        """`make_env` with whatever mesh `env_config` names."""
         from dexsim.registry import find_task, make
 
         config = from_dict(find_task(self.task).config_class, self.env_config)
@@ -198,6 +219,7 @@ class Policy:
     def _from_file(cls, file: checkpoint.Checkpoint) -> "Policy":
         content, leaves = file.content, file.leaves
         layout = tuple(Field(*field) for field in content["observation_layout"])
+        _check_content(content, layout)
         layers = tuple(
             Layer(leaves[f".layers[{i}].kernel"], leaves[f".layers[{i}].bias"]) for i in range(content["layers"])
         )
@@ -211,6 +233,7 @@ class Policy:
             or not normalizer.mean.shape == normalizer.std.shape == (sizes[0],)
         ):
             raise ValueError(f"layer shapes {shapes} for {sizes[0]} observations")
+        _check_numbers(layers, normalizer)
         params = PolicyParams(layers, normalizer, content["squash"])
         env_config = migrate_config(content["env_config"], file.path)
         return cls(
@@ -222,6 +245,47 @@ class Policy:
             training=content["training"],
             spec=_read_spec(file, env_config),
         )
+
+
+def _check_content(content: dict[str, Any], layout: tuple[Field, ...]) -> None:
+    """Raises ValueError: a value of another type, or beyond what a policy of a hand can have."""
+    for name, kind in (("env_config", dict), ("training", dict), ("layers", int)):
+        if type(content[name]) is not kind:
+            raise ValueError(f"{name} is not a {kind.__name__}")
+    # No hand is run at less than one command a second, and none answers a thousand.
+    for name, low, high in (("control_rate", 1.0, 1000.0), ("clip", 0.1, 1e4), ("layers", 1, 64)):
+        _check_number(name, content[name], low, high)
+    if content["squash"] not in ("gaussian", "tanh"):
+        raise ValueError(f"squash = {str(content['squash']):.50}")
+    for field in layout:
+        if not isinstance(field.name, str) or type(field.size) is not int:
+            raise ValueError(f"observation field {str(tuple(field)):.100}")
+        _check_number(f"size of {field.name:.50}", field.size, 1, 100_000)
+        if field.scale is not None:
+            _check_number(f"scale of {field.name:.50}", field.scale, 1e-9, 1e9)
+
+
+def _check_number(name: str, value: Any, low: float, high: float) -> None:
+    if type(value) not in (int, float) or not low <= value <= high:
+        raise ValueError(f"{name} = {str(value):.50}: must be a number between {low:g} and {high:g}")
+
+
+def _check_numbers(layers: MLP, normalizer: Normalizer) -> None:
+    """Raises ValueError: some number is not finite, or some observation would give an action that is not."""
+    arrays = {"normalizer.mean": normalizer.mean, "normalizer.std": normalizer.std}
+    for i, layer in enumerate(layers):
+        arrays |= {f"layers[{i}].kernel": layer.kernel, f"layers[{i}].bias": layer.bias}
+    for name, array in arrays.items():
+        if array.dtype != np.float32 or not np.all(np.isfinite(array)):
+            raise ValueError(f"{name} holds what is not a finite float32")
+    if not np.all(np.asarray(normalizer.std) >= 1e-12):
+        raise ValueError("normalizer.std is not positive")
+    largest = np.full(normalizer.mean.shape, float(normalizer.clip))
+    for layer in layers:  # The activation does not go beyond its input or 1.
+        kernel, bias = np.asarray(layer.kernel, float), np.asarray(layer.bias, float)
+        largest = np.maximum(largest @ np.abs(kernel) + np.abs(bias), 1.0)
+        if largest.max(initial=0.0) > 1e30:
+            raise ValueError("its weights are so large that actions overflow")
 
 
 def layout_to_list(fields: Fields) -> list[list[Any]]:

@@ -11,6 +11,7 @@ import argparse
 import contextlib
 import dataclasses
 import datetime
+import itertools
 import json
 import shlex
 import signal
@@ -31,7 +32,7 @@ from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.curriculum import Curriculum
 from dexsim_ppo.policy import Policy, load_policy
 from dexsim_ppo.retired import migrate_arguments
-from dexsim_ppo.training.arguments import TrainArguments, printable, training_config
+from dexsim_ppo.training.arguments import TrainArguments, check_resumed, printable, training_config
 from dexsim_ppo.training.fine_tune import check_fit, fine_tuning_config
 from dexsim_ppo.training.presets import Preset, find_preset
 from dexsim_ppo.training.runlog import RunFolder
@@ -85,7 +86,12 @@ def train_policy(
     unknown = sorted(set(options) - {field.name for field in dataclasses.fields(TrainArguments)})
     if unknown:
         raise ConfigError(f"train_policy has no option {unknown[0]!r}")
+    if isinstance(begun, Policy) and config is None:
+        begun.check_mesh()
+    default = arguments
     arguments = dataclasses.replace(arguments, **{name: value for name, value in given.items() if value is not None})
+    if isinstance(begun, checkpoint.Checkpoint):
+        check_resumed(arguments, default)
     run, stopped = run_training(arguments, begun, started, command="train_policy(...)")
     if stopped:
         raise DexsimError(f"training was stopped; resume it with train_policy(resume={str(run.folder.path)!r})")
@@ -117,15 +123,16 @@ def run_training(
     import dexsim
 
     resumed = begun if isinstance(begun, checkpoint.Checkpoint) else None
-    path = resumed.path.parent.parent if resumed else new_run_path(arguments)
+    if not resumed and arguments.run_dir and arguments.run_dir.exists():
+        raise _taken(arguments.run_dir)
     env = dexsim.make(
         arguments.task, training_config(arguments), backend=arguments.backend, num_envs=arguments.ppo.num_envs
     )
-    folder = RunFolder(path)
+    if isinstance(begun, Policy):
+        check_fit(begun, env, arguments.ppo)
+    folder = RunFolder(resumed.path.parent.parent if resumed else make_run_folder(arguments))
     if not resumed:
-        if isinstance(begun, Policy):
-            check_fit(begun, env, arguments.ppo)
-        folder.checkpoints.mkdir(parents=True)
+        folder.checkpoints.mkdir()
         cli.write_json(
             folder.config, {"command": command, "arguments": printable(arguments)} | cli.environment_report()
         )
@@ -182,6 +189,8 @@ def parse_arguments(argv: list[str]) -> tuple[TrainArguments, checkpoint.Checkpo
     begun = find_beginning(known.task, known.policy, known.resume)
     default = default_arguments(known.task, preset, begun)
     given = {argument.split("=")[0] for argument in argv}
+    if isinstance(begun, Policy) and not cli.wants_help(argv) and "--env.objects.mesh" not in given:
+        begun.check_mesh()
     if "--steps" in given and "--minutes" not in given:
         default = dataclasses.replace(default, minutes=0.0)
     generic: Any = TrainArguments  # a static checker knows no type that is only found at run time
@@ -192,7 +201,11 @@ def parse_arguments(argv: list[str]) -> tuple[TrainArguments, checkpoint.Checkpo
         prog="python -m dexsim_ppo.train",
         description=description,
     )
-    return dataclasses.replace(arguments, task=default.task), begun
+    arguments = dataclasses.replace(arguments, task=default.task)
+    if isinstance(begun, checkpoint.Checkpoint):
+        with cli.naming_options(generic[type(default.env)], default):
+            check_resumed(arguments, default)
+    return arguments, begun
 
 
 def preset_arguments(task: str, env_config: Any, name: str) -> TrainArguments:
@@ -213,16 +226,25 @@ def arguments_from_dict(config_class: type[Any], data: dict[str, Any]) -> TrainA
     return TrainArguments(env=env, ppo=ppo, curriculum=curriculum, **{k: v for k, v in data.items() if k in known})
 
 
-def new_run_path(arguments: TrainArguments) -> Path:
-    """A folder that does not exist yet."""
+def make_run_folder(arguments: TrainArguments) -> Path:
+    """A new folder. Making it is what takes the name, so that runs that begin in one second get different ones."""
     if arguments.run_dir:
-        if arguments.run_dir.exists():
-            raise ConfigError(
-                f"--run-dir {arguments.run_dir}: exists already; choose another, or resume it with --resume"
-            )
+        try:
+            arguments.run_dir.mkdir(parents=True)
+        except FileExistsError:
+            raise _taken(arguments.run_dir) from None
         return arguments.run_dir
     stem = Path("runs") / f"{arguments.task}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
-    return next(p for i in range(1000) if not (p := Path(f"{stem}-{i}" if i else stem)).exists())
+    for number in itertools.count():
+        path = Path(f"{stem}-{number}" if number else stem)
+        with contextlib.suppress(FileExistsError):
+            path.mkdir(parents=True)
+            return path
+    raise AssertionError("unreachable")
+
+
+def _taken(path: Path) -> ConfigError:
+    return ConfigError(f"--run-dir {path}: exists already; choose another, or resume it with --resume")
 
 
 @contextlib.contextmanager

@@ -38,6 +38,7 @@ FLOORS = {
         ("evaluate",),
         ("training",),
         ("train",),
+        ("reproduce",),
         ("",),
     ),
     "dexsim_real": (

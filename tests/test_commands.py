@@ -24,6 +24,7 @@ from dexsim_ppo.train import preset_arguments
 COMMANDS = {
     "dexsim_ppo.train": ("dexsim_ppo.train:TrainArguments", []),
     "dexsim_ppo.evaluate": ("dexsim_ppo.evaluate:EvaluateArguments", ["grasp"]),
+    "dexsim_ppo.reproduce": ("dexsim_ppo.reproduce:ReproduceArguments", ["x.msgpack"]),
     "dexsim_real.run": ("dexsim_real.run.options:RunArguments", ["grasp", "--port", "x", "--uncalibrated"]),
     "dexsim_real.calibrate": ("dexsim_real.calibrate.options:CalibrateArguments", ["--port", "x"]),
     "dexsim_real.twin": ("dexsim_real.twin.options:TwinArguments", []),
@@ -100,7 +101,7 @@ def options(command, task):
 
 def shown(capsys, command, *argv):
     """What a command prints for its help."""
-    package = command if command in ("dexsim_ppo.train", "dexsim_ppo.evaluate") else f"{command}.__main__"
+    package = command if command.startswith("dexsim_ppo.") else f"{command}.__main__"
     with pytest.raises(SystemExit) as stop:
         importlib.import_module(package).main(list(argv))
     assert stop.value.code == 0
@@ -254,7 +255,7 @@ def test_a_bad_value_is_refused_by_the_options_name(command, task, data):
 @settings(max_examples=8, deadline=None)
 @given(data=st.data())
 def test_a_misspelt_option_is_refused_and_the_right_one_named(command, task, data):
-    long = [found for found in options(command, task) if found.name.startswith("--") and len(found.name) > 6]
+    long = [found for found in options(command, task) if found.name.startswith("--") and len(found.name) > 5]
     found = data.draw(st.sampled_from(long))
     at = data.draw(st.integers(4, len(found.name) - 1))
     wrong = found.name[:at] + "qq" + found.name[at:]

@@ -192,3 +192,25 @@ print(asset_path("hand/xhand_right.xml"))
         site,
     )
     assert all(Path(name).is_relative_to(site) for name in found.split()), found
+
+
+def test_no_text_sends_people_to_the_name_of_another_project():
+    """`dexsim` on PyPI is not this library. Sources, pages and notebooks install a checkout or a wheel file."""
+    folders = ("dexsim", "dexsim_ppo", "dexsim_real", "docs", "notebooks", "benchmarks", "tests")
+    files = [path for folder in folders for path in (ROOT / folder).rglob("*") if path.is_file()]
+    files += [*ROOT.glob("*.md"), *ROOT.glob("*.toml"), ROOT / "Makefile"]
+    text = {path: path.read_text() for path in files if path.suffix in ("", ".py", ".md", ".toml", ".ipynb")}
+    assert len(text) > 100
+    found = r"""pip3? install[^`\n]*[\s'"]dexsim(-xhand)?(?=[\s'"`\[=<>)]|$)|['"`]dexsim(-xhand)?\["""
+    wrong = [path.name for path, content in text.items() if re.search(found, content, re.MULTILINE)]
+    assert wrong == ["pyproject.toml"], "there the extra `viz` names another extra"
+
+
+@in_checkout
+def test_the_distribution_has_the_name_that_messages_give():
+    from dexsim.core.install import DISTRIBUTION, install_line
+
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert project["name"] == DISTRIBUTION != "dexsim"
+    for extra in project["optional-dependencies"]:
+        assert re.fullmatch(rf"pip install -e '\.\[{extra}\]' .*\.whl\[{extra}\]'", install_line(extra))

@@ -16,7 +16,8 @@ from typing import Any, Literal, TypeVar
 
 from dexsim.core.assets import cache_path
 from dexsim.core.errors import ConfigError, DexsimError, DexsimWarning
-from dexsim.core.files import write_whole
+from dexsim.core.files import make_private, write_whole
+from dexsim.core.install import DISTRIBUTION
 from dexsim.core.options import Option, explain, group_docs, help_page, in_option_names, options_of
 
 T = TypeVar("T")
@@ -126,11 +127,25 @@ def enable_caches() -> None:
     """Keep compiled programs between runs, in `$DEXSIM_CACHE` or else `~/.cache/dexsim`."""
     import jax
 
-    path = os.environ.get("JAX_COMPILATION_CACHE_DIR") or cache_path("xla")
-    jax.config.update("jax_compilation_cache_dir", str(path))
+    path = os.environ.get("JAX_COMPILATION_CACHE_DIR") or _cache("xla")
+    jax.config.update("jax_compilation_cache_dir", path)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-    os.environ.setdefault("WARP_CACHE_PATH", str(cache_path("warp")))
+    if "WARP_CACHE_PATH" not in os.environ and (warp := _cache("warp")):
+        os.environ["WARP_CACHE_PATH"] = warp
+
+
+def _cache(name: str) -> str | None:
+    """A cache folder for compiled code, which runs when it is loaded; None if others may write to it."""
+    path = cache_path(name)
+    try:
+        make_private(path)
+    except PermissionError as error:
+        warnings.warn(f"no cache of compiled code: {error}", DexsimWarning, stacklevel=3)
+        return None
+    except OSError:  # Nothing can be written: the library that owns the cache says so, or goes without.
+        pass
+    return str(path)
 
 
 def environment_report() -> dict[str, Any]:
@@ -138,7 +153,7 @@ def environment_report() -> dict[str, Any]:
     import jax
 
     versions = {"python": platform.python_version()}
-    for name in ("dexsim", "jax", "jaxlib", "mujoco", "mujoco-mjx", "warp-lang", "numpy"):
+    for name in (DISTRIBUTION, "jax", "jaxlib", "mujoco", "mujoco-mjx", "warp-lang", "numpy"):
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
             versions[name] = importlib.metadata.version(name)
     devices = jax.devices()

@@ -1,9 +1,14 @@
-"""Source files of a package, and writing a file whole or not at all."""
+"""Source files of a package, writing a file whole or not at all, and folders that nobody else may write to."""
 
+import contextlib
+import fcntl
 import os
+import stat
 import tempfile
 from collections.abc import Iterable
 from pathlib import Path
+
+_TEMPORARY = ".part"
 
 
 def python_sources(package: Path) -> Iterable[Path]:
@@ -15,21 +20,23 @@ def write_whole(path: Path, chunks: Iterable[bytes | memoryview]) -> None:
     """Write `chunks` one after another to `path`, and create its folder if needed.
 
     They go to a temporary file, which is renamed once everything is on the disk. So neither a crash nor
-    another program leaves or sees half a file, and an existing file stays until then.
+    another program leaves or sees half a file, and an existing file stays until then. Temporary files that a
+    killed program left in the folder are removed.
 
     Raises:
       OSError: the file cannot be written; an existing file is untouched.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    remove_stale(path.parent)
+    handle, temporary = _locked_temporary(path)
     try:
         with os.fdopen(handle, "wb") as file:
             for chunk in chunks:
                 file.write(chunk)
             file.flush()
             os.fsync(file.fileno())
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
+            os.chmod(temporary, 0o644)
+            os.replace(temporary, path)
     except BaseException:
         Path(temporary).unlink(missing_ok=True)
         raise
@@ -38,3 +45,64 @@ def write_whole(path: Path, chunks: Iterable[bytes | memoryview]) -> None:
         os.fsync(folder)
     finally:
         os.close(folder)
+
+
+def remove_stale(folder: Path) -> None:
+    """Remove the temporary files of `write_whole` whose writer is gone: a writer holds a lock on its file."""
+    for path in folder.glob(f".*{_TEMPORARY}"):
+        with contextlib.suppress(OSError), path.open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # BlockingIOError: somebody is writing
+            path.unlink()
+
+
+def _locked_temporary(path: Path) -> tuple[int, str]:
+    """An open, locked temporary file beside `path`."""
+    while True:
+        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=_TEMPORARY)
+        with contextlib.suppress(OSError):  # A file system without locks.
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        with contextlib.suppress(FileNotFoundError):  # Another program took it for stale before it was locked.
+            if os.stat(temporary).st_ino == os.fstat(handle).st_ino:
+                return handle, temporary
+        os.close(handle)
+
+
+def make_private(folder: Path) -> None:
+    """Make a folder (0700) that only this user may write to, or check that an existing one is such a folder.
+
+    Raises:
+      PermissionError: it is somebody else's, or others may write to it.
+      OSError: it cannot be made.
+    """
+    folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+    check_private(folder, os.stat(folder))
+
+
+def check_private(path: Path, status: os.stat_result) -> None:
+    """Check owner and mode of a file or folder.
+
+    Raises:
+      PermissionError: it is somebody else's, or others may write to it.
+    """
+    if status.st_uid != os.geteuid():
+        raise PermissionError(f"{path} belongs to another user")
+    if status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        raise PermissionError(f"{path} can be written by others (chmod go-w)")
+
+
+def read_private(path: Path) -> bytes:
+    """Read a file that only this user may have written.
+
+    Raises:
+      PermissionError: it is somebody else's, a link, or others may write to it.
+      OSError: it cannot be read.
+    """
+    try:
+        handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
+    except OSError as error:
+        if path.is_symlink():
+            raise PermissionError(f"{path} is a link") from error
+        raise
+    with os.fdopen(handle, "rb") as file:
+        check_private(path, os.fstat(file.fileno()))  # of what was opened, not of what may be there by now
+        return file.read()

@@ -1,5 +1,6 @@
 """What an environment's compiled program depends on, as one hash."""
 
+import dataclasses
 import hashlib
 import json
 from pathlib import Path
@@ -25,6 +26,24 @@ def fingerprint(env: Any) -> str | None:
     digest = hashlib.sha256(json.dumps([env.name, env.backend, to_dict(env.config)]).encode())
     for path in (*python_sources(_PACKAGE), env.hand.model_path):
         digest.update(path.read_bytes())
-    for leaf in jax.tree.leaves((env.pool, env.hand.taxel_position, env.hand.taxel_normal, env.hand.taxel_area)):
+    for leaf in jax.tree.leaves(env.pool):
         digest.update(np.ascontiguousarray(leaf).data)
+    _add(digest, env.hand)
     return digest.hexdigest()
+
+
+def _add(digest: Any, value: Any) -> None:
+    """Hash a description such as `Hand`, all that was read from its TOML: every field with its name and type."""
+    if dataclasses.is_dataclass(value):
+        for field in dataclasses.fields(value):
+            digest.update(field.name.encode())
+            _add(digest, getattr(value, field.name))
+    elif isinstance(value, tuple):
+        digest.update(f"{len(value)} values".encode())
+        for item in value:
+            _add(digest, item)
+    elif isinstance(value, np.ndarray):
+        digest.update(f"{value.dtype} {value.shape}".encode())
+        digest.update(np.ascontiguousarray(value).data)
+    else:
+        digest.update(repr(value).encode())

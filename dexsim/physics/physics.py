@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dexsim.core.errors import ConfigError
+from dexsim.core.install import install_line
 from dexsim.geometry import rotations
 from dexsim.hand.kinematics import Hand, forward_kinematics
 from dexsim.objects.params import ObjectParams
@@ -39,7 +40,7 @@ def choose_backend(backend: str) -> str:
         return backend
     found = importlib.util.find_spec("warp") is not None
     if backend == "warp" and not found:
-        raise ConfigError("backend 'warp' needs the extra: pip install 'dexsim[warp]'")
+        raise ConfigError(f"backend 'warp' needs the extra: {install_line('warp')}")
     on_gpu = jax.default_backend() in ("gpu", "cuda")
     return "warp" if backend == "warp" or (found and on_gpu) else "jax"
 

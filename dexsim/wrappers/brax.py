@@ -23,12 +23,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from dexsim.core.errors import ConfigError
+from dexsim.core.install import install_line
 
 try:
     from brax.envs.base import Env, State, Wrapper
     from brax.envs.wrappers.training import EpisodeWrapper, VmapWrapper
 except ImportError as error:
-    raise ImportError("dexsim.wrappers.brax needs brax: pip install 'dexsim[brax]'") from error
+    raise ImportError(f"dexsim.wrappers.brax needs brax: {install_line('brax')}") from error
 
 
 def _put_replicated(x: Any, devices: Sequence[jax.Device]) -> Any:

@@ -23,7 +23,7 @@ from dexsim_ppo.learner.curriculum import Curriculum, next_scale
 from dexsim_ppo.learner.gae import compute_gae
 from dexsim_ppo.learner.loss import Metrics, Samples, actor_mean, critic_value, loss
 from dexsim_ppo.learner.networks import Params, init_params, rescale_output
-from dexsim_ppo.learner.rollout import Decision, Rollout, collect
+from dexsim_ppo.learner.rollout import Decision, Rollout, bound_rewards, collect
 from dexsim_ppo.learner.running_stats import (
     Normalizer,
     RunningStats,
@@ -126,6 +126,9 @@ def train_iteration(
     # Shared by collection and update, so that the first minibatch's probability ratio is exactly one.
     normalizers = make_normalizers(env, config, state.observation_stats)
     env_state, rollout, metrics = collect_rollout(env, config, state, normalizers, collect_key)
+    if config.normalize_value:
+        rollout, bounded = bound_rewards(rollout, state.value_stats, config.reward_scale)
+        metrics |= {"bounded_rewards": bounded}
     value_stats, params, samples = prepare(config, state.value_stats, state.params, rollout)
     learner, update_metrics = update(
         config,
@@ -201,7 +204,7 @@ def collect_rollout(
         mean = actor_mean(config, params, normalizers, obs)
         action = distribution.sample(key, mean, params.log_std)
         decision = Decision(action, mean, distribution.log_prob(action, mean, params.log_std))
-        return decision, jnp.tanh(action) if config.distribution == "tanh" else action
+        return decision, jnp.tanh(action) if config.distribution == "tanh" else jnp.clip(action, -1.0, 1.0)
 
     def value(obs):
         return state.value_stats.mean + std * critic_value(config, params, normalizers, obs)

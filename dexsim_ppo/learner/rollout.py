@@ -8,7 +8,13 @@ import jax
 import jax.numpy as jnp
 
 from dexsim.core.pytree import choose, pytree_dataclass
+from dexsim_ppo.learner.running_stats import RunningStats, value_std
 from dexsim_ppo.learner.types import Environment
+
+# A reward beyond this many deviations of the returns is a fault of the simulation, not something to learn from. It is
+# bounded, not dropped: where rewards do grow, each iteration raises the bound.
+_FAR = 100.0
+_FAR_AT_FIRST = 1000.0  # of the root mean square of the other rewards, while there are no returns
 
 _RESERVE_STEPS = 16  # short compared with an episode; makes a batch of new episodes cheap per step
 
@@ -55,7 +61,7 @@ def collect(
     Returns:
       The last states, the experience, and scalar metrics: `step/<name>` is a mean over all steps,
       `episode/<name>` the mean final value over the episodes that ended (NaN if none did), `episodes`
-      their number.
+      their number, `repeated_starts` how many starts were used before (see `scan_restarting`).
     """
     step_env = jax.vmap(env.step)
 
@@ -84,6 +90,7 @@ def collect(
         "episodes": episodes,
         "terminated_share": jnp.sum(rollout.terminated, dtype=jnp.float32) / episodes,
         "nonfinite_rewards": jnp.sum(~finite, dtype=jnp.float32),
+        "repeated_starts": _repeated(done),
     }
     metrics |= {f"step/{k}": _sum(v, jnp.ones_like(done)) / steps for k, v in step_metrics.items()}
     metrics |= {f"episode/{k}": _sum(v, done) / episodes for k, v in step_metrics.items()}
@@ -97,7 +104,8 @@ def scan_restarting(
 
     `jax.vmap(env.restart)` after every step would compute a new episode for every environment and discard
     nearly all of them. Instead one new episode per environment is kept in reserve and renewed after at most
-    16 steps; an environment whose episode ends twice within that time starts the same episode twice.
+    16 steps; an environment whose episode ends twice within that time starts the same episode twice
+    (`repeated_starts` counts them: none where episodes last longer).
     Restarting only the rows that ended would make a GPU wait for the host at every step.
 
     Args:
@@ -108,7 +116,7 @@ def scan_restarting(
       The last states and the outputs [T, ...].
     """
     length = jax.tree.leaves(inputs)[0].shape[0]
-    block = max(n for n in range(1, _RESERVE_STEPS + 1) if length % n == 0)
+    block = _block(length)
     restart = jax.jit(jax.vmap(env.restart))
 
     def run_block(state, inputs):
@@ -125,6 +133,36 @@ def scan_restarting(
     blocks = jax.tree.map(lambda x: x.reshape(length // block, block, *x.shape[1:]), inputs)
     state, outputs = jax.lax.scan(run_block, state, blocks)
     return state, jax.tree.map(lambda x: x.reshape(length, *x.shape[2:]), outputs)
+
+
+def bound_rewards(rollout: Rollout, returns: RunningStats, scale: float) -> tuple[Rollout, jax.Array]:
+    """Bound rewards so far from all others that they would ruin the value normaliser for hundreds of iterations.
+
+    Args:
+      returns: statistics of the returns so far [], in units of scaled rewards.
+      scale: factor on rewards.
+
+    Returns:
+      The experience, and the number [] of rewards that were bounded.
+    """
+    size = jnp.abs(rollout.reward).reshape(-1)
+    others = jnp.where(jnp.arange(size.size) == jnp.argmax(size), 0.0, size)  # one fault must not excuse itself
+    at_first = _FAR_AT_FIRST * jnp.sqrt(jnp.mean(others**2))
+    limit = jnp.where(returns.count > 0, _FAR * value_std(returns) / scale, at_first)
+    bounded = jnp.sum(size > limit, dtype=jnp.float32)
+    return dataclasses.replace(rollout, reward=jnp.clip(rollout.reward, -limit, limit)), bounded
+
+
+def _block(length: int) -> int:
+    """Steps that share one reserve of new episodes."""
+    return max(n for n in range(1, _RESERVE_STEPS + 1) if length % n == 0)
+
+
+def _repeated(done: jax.Array) -> jax.Array:
+    """Number [] of episodes in `done` [T, B] that began with a start already used."""
+    block = _block(done.shape[0])
+    ends = jnp.sum(done.reshape(-1, block, done.shape[1]), axis=1, dtype=jnp.float32)
+    return jnp.sum(jnp.maximum(ends - 1, 0.0))
 
 
 def _sum(x: jax.Array, mask: jax.Array) -> jax.Array:

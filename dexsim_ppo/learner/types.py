@@ -82,11 +82,17 @@ class Environment(Protocol):
         ...
 
     def step(self, state: Any, action: jax.Array) -> Any:
-        """Advance by one control tick with an action [A], clipped to [-1, 1]; no automatic restart."""
+        """Advance by one control tick; no automatic restart.
+
+        An action [A] is in [-1, 1]: learner and `Policy` clip or squash what they give, whatever the environment does.
+        """
         ...
 
     def restart(self, state: Any, done: jax.Array) -> Any:
-        """A new episode if `done` [], else the same state; the random keys advance either way."""
+        """A new episode if `done` [], else the same state; the random keys advance either way.
+
+        The learner calls it every 16 steps at least: episodes that end sooner begin several times from one start.
+        """
         ...
 
     def stagger(self, state: Any, key: jax.Array) -> Any:

@@ -1,6 +1,7 @@
 """Options of the training command."""
 
 import dataclasses
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, Literal, TypeVar
@@ -81,6 +82,45 @@ def training_config(arguments: TrainArguments) -> Any:
         randomization=dataclasses.replace(env.randomization, extremes=share),
         objects=dataclasses.replace(env.objects, extremes=share),
     )
+
+
+# What a resumed run may be given anew: its budget, and what looks on. Everything else is part of the saved state.
+_RESUMABLE = {
+    "checkpoint_every",
+    "evaluate_every",
+    "evaluation_chunk",
+    "evaluation_episodes",
+    "keep_checkpoints",
+    "log_every",
+    "minutes",
+    "resume",
+    "steps",
+    "video",
+}
+
+
+def check_resumed(arguments: TrainArguments, saved: TrainArguments) -> None:
+    """Check that a resumed run is still the same training.
+
+    Raises:
+      ConfigError: an option would change it; names the first.
+    """
+    for owner, name, new, old in _differences(arguments, saved):
+        if owner is not TrainArguments or name not in _RESUMABLE:
+            raise ConfigError(
+                f"{owner.__name__}.{name} = {new!r}: a resumed run keeps its {old!r}; to train on with other settings, "
+                "fine-tune its policy (--policy)"
+            )
+
+
+def _differences(new: Any, old: Any) -> Iterator[tuple[type, str, Any, Any]]:
+    """Class and name of each field that differs, with both values; nested configurations field by field."""
+    for field in dataclasses.fields(new):
+        a, b = getattr(new, field.name), getattr(old, field.name)
+        if dataclasses.is_dataclass(a) and type(a) is type(b):
+            yield from _differences(a, b)
+        elif a != b:
+            yield type(new), field.name, a, b
 
 
 def printable(arguments: TrainArguments) -> dict[str, Any]:

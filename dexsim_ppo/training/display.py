@@ -70,6 +70,12 @@ class Display:
         for heading, name, style in (*COLUMNS[:4], *extra, *COLUMNS[4:]):
             if name in row:
                 cells[heading] = format(row[name], style)
+        # Only what went wrong is shown.
+        if row.get("skipped_updates"):
+            cells["skipped updates"] = f"{row['skipped_updates']:.0f} of {row['updates']:.0f}"
+        for kind in ("nonfinite", "bounded"):
+            if row.get(f"total/{kind}_rewards"):
+                cells[f"{kind} rewards"] = f"{row[f'total/{kind}_rewards']:.0f}"
         return cells
 
 

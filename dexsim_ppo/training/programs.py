@@ -2,9 +2,11 @@
 
 JAX's own cache needs a traced and lowered program to look up, and for a training step that takes longer than
 loading the compiled one. This cache looks up a hash of everything that tracing depends on (`key`).
+
+Its files are pickles of compiled code: whoever can write one can run code here. So only files and a folder that belong
+to this user, and that nobody else may write to, are used.
 """
 
-import contextlib
 import functools
 import hashlib
 import json
@@ -13,6 +15,7 @@ import pickle
 import platform
 import re
 import threading
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -25,7 +28,8 @@ from jax.experimental import serialize_executable
 from dexsim.core.assets import cache_path
 from dexsim.core.cli import environment_report
 from dexsim.core.compilation import jit
-from dexsim.core.files import python_sources
+from dexsim.core.errors import DexsimWarning
+from dexsim.core.files import make_private, python_sources, read_private, write_whole
 
 KEPT = 8  # newest programs, about 10 MB each
 _OPTIONS = (
@@ -142,27 +146,27 @@ def _compile(path: Path, step: Callable, shapes: Any, on_traced: Callable[[], No
 
 def _save(path: Path, compiled: Any, names: list[str]) -> None:
     """Cache a program, if the disk has room and may be written to."""
-    part = path.with_suffix(f".{os.getpid()}")
     try:
-        content = pickle.dumps((serialize_executable.serialize(compiled), names))
-        path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-        part.write_bytes(content)
-        part.replace(path)
+        make_private(path.parent)
+        write_whole(path, [pickle.dumps((serialize_executable.serialize(compiled), names))])
         newest = sorted(path.parent.glob("*.pkl"), key=lambda p: p.stat().st_mtime, reverse=True)
         for old in newest[KEPT:]:
             old.unlink(missing_ok=True)
-    except (OSError, ValueError, TypeError, jax.errors.JaxRuntimeError):
-        with contextlib.suppress(OSError):
-            part.unlink(missing_ok=True)
+    except (OSError, ValueError, TypeError, jax.errors.JaxRuntimeError):  # `_load` has said who else may write there
+        return
 
 
 def _load(path: Path, shapes: Any, compile_again: Callable[[], Program]) -> Program | None:
     try:
-        content = path.read_bytes()
+        make_private(path.parent)
+        content = read_private(path)
+    except PermissionError as error:
+        warnings.warn(f"compiled programs are not cached: {error}", DexsimWarning, stacklevel=2)
+        return None
     except OSError:
         return None
     try:
-        serialized, names = pickle.loads(content)  # our own file, like JAX's cache
+        serialized, names = pickle.loads(content)  # our own file: see above
         program = Program(serialize_executable.deserialize_and_load(*serialized), shapes, names, compile_again)
         path.touch()
     except Exception:  # truncated, or of another runtime: compile again

@@ -1,6 +1,7 @@
 """A run's folder: configuration, metrics, checkpoints, policies and the learning curve."""
 
 import importlib.util
+import itertools
 import json
 import re
 from pathlib import Path
@@ -41,6 +42,12 @@ class RunFolder:
         if not found:
             raise CheckpointError(f"{self.path}: holds no checkpoint to resume from")
         return found[-1]
+
+    def keep_report(self) -> None:
+        """Number the report of a run that had ended before and was resumed: another must not replace it."""
+        if self.report.exists():
+            number = next(i for i in itertools.count(1) if not (self.path / f"report-{i}.json").exists())
+            self.report.rename(self.path / f"report-{number}.json")
 
     def prune(self, keep: int) -> None:
         """Delete all but the newest `keep` checkpoints."""

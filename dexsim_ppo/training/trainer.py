@@ -13,7 +13,6 @@ import numpy as np
 from dexsim.core import cli
 from dexsim.core.compilation import collector_paused
 from dexsim.core.config import to_dict
-from dexsim.core.errors import DexsimError
 from dexsim_ppo import checkpoint
 from dexsim_ppo.evaluate import Evaluator, print_report, write_video
 from dexsim_ppo.learner.config import PPOConfig
@@ -23,12 +22,12 @@ from dexsim_ppo.policy import Policy
 from dexsim_ppo.training import programs
 from dexsim_ppo.training.arguments import TrainArguments, printable
 from dexsim_ppo.training.display import Display
+from dexsim_ppo.training.faults import Faults, keep
 from dexsim_ppo.training.fine_tune import initialize_from
 from dexsim_ppo.training.runlog import MetricsLog, RunFolder, draw_curve, read_metrics
 
 # Selecting the best policy and the final evaluation use different episodes.
 SELECTION_SEED, REPORT_SEED = 1, 0
-DIVERGED_AFTER = 5
 
 
 class Run:
@@ -39,7 +38,7 @@ class Run:
         self.config: PPOConfig = arguments.ppo
         self.evaluator = Evaluator(self._evaluation_env(), arguments.evaluation_chunk)
         self.best: dict[str, Any] = {"return": None, "iteration": 0}
-        self.seconds_before, self.bad_calls = 0.0, 0
+        self.seconds_before = 0.0
         self.clock = {"setup_s": time.perf_counter() - started}
 
     def _evaluation_env(self) -> Environment:
@@ -111,10 +110,11 @@ class Run:
         arguments, per_call = self.arguments, self.config.iterations_per_call
         iteration = first = int(state.iteration)
         begin, spent_elsewhere = time.perf_counter(), 0.0
-        skipped, evaluated = int(state.skipped_updates), iteration == 0
+        faults, evaluated = Faults(self.config, self.folder, self._content(), state), iteration == 0
         while not stopped() and self._seconds_left(iteration, 1.0) > 0:
             call = time.perf_counter()
             with collector_paused():
+                before = keep(state)
                 state, metrics = step(state)
                 metrics = jax.device_get(metrics)
             now, iteration = time.perf_counter(), iteration + per_call
@@ -124,8 +124,9 @@ class Run:
                     f"first update {self.clock['first_update_s']:.1f} s after the start, "
                     f"{now - call:.1f} s of it for itself"
                 )
-            skipped = self._check(metrics, skipped)
             row = {name: _mean(values) for name, values in metrics.items()}
+            row |= faults.check(before, metrics, iteration, display.note)
+            del before
             row |= self._progress(iteration, now - call)
             evaluated = self._due(iteration, arguments.evaluate_every)
             if evaluated:
@@ -174,21 +175,14 @@ class Run:
             "seconds_left": self._seconds_left(iteration, rate),
         }
 
-    def _check(self, metrics: dict[str, np.ndarray], skipped_before: int) -> int:
-        """Total of skipped updates so far.
-
-        Raises:
-          DexsimError: no gradient was finite in several calls.
-        """
-        skipped = int(metrics["skipped_updates"][-1])
-        updates = self.config.iterations_per_call * self.config.epochs * self.config.minibatches
-        self.bad_calls = self.bad_calls + 1 if skipped - skipped_before == updates else 0
-        if self.bad_calls >= DIVERGED_AFTER:
-            raise DexsimError(
-                f"training diverged: no finite gradient in the last {self.bad_calls} "
-                f"calls; earlier checkpoints are in {self.folder.checkpoints}"
-            )
-        return skipped
+    def _content(self) -> dict[str, Any]:
+        """What a reproducer has to know of the run."""
+        return {
+            "task": self.arguments.task,
+            "backend": self.env.backend,
+            "arguments": printable(self.arguments),
+            "calls": self.config.iterations_per_call,
+        }
 
     def _policy(self, state: TrainState) -> Policy:
         return Policy.from_training(
@@ -271,6 +265,7 @@ class Run:
             "arguments": printable(arguments),
             "timing": self.clock,
         } | cli.environment_report()
+        folder.keep_report()
         cli.write_json(folder.report, report)
         print_report(reports["untrained"], title=f"{arguments.task}: untrained")
         print_report(reports["trained"], title=f"{arguments.task}: {selected}")

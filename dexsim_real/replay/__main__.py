@@ -27,7 +27,7 @@ class ReplayArguments:
     """Image file for a figure of joint angles, forces, timing and observation (.png, .pdf or .svg); None draws no
     figure."""
     rerun: bool = False
-    """Open the rerun viewer, with taxels as pictures (needs pip install 'dexsim[rerun]')."""
+    """Open the rerun viewer, with taxels as pictures (needs the extra `rerun`)."""
     rrd: Path | None = None
     """Recording for the rerun viewer, to open on another machine; None writes no file."""
     output: Path | None = None

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dexsim import load_hand
+from dexsim.core.install import install_line
 from dexsim.render.panel import taxel_image
 from dexsim_real.core.log import LogError
 
@@ -83,7 +84,7 @@ def show_rerun(run: Replay, path: Path | None = None) -> None:
     try:
         import rerun
     except ImportError:
-        raise LogError("the rerun viewer is not installed: pip install 'dexsim[rerun]', or use --plot") from None
+        raise LogError(f"the rerun viewer is not installed: {install_line('rerun')}; or use --plot") from None
     hand = load_hand()
     edges = np.cumsum([field.size for field in run.fields])[:-1]
     names = {"angle": hand.joint_names, "target": hand.joint_names, "force": hand.finger_names}

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from dexsim.core.config import setting, validate
+from dexsim.core.install import install_line
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.process import lower_priority
 
@@ -240,5 +241,5 @@ def _opencv() -> Any:
     try:
         import cv2
     except ImportError:
-        raise HandError("OpenCV is missing: pip install 'dexsim[vision]'") from None
+        raise HandError(f"OpenCV is missing: {install_line('vision')}") from None
     return cv2

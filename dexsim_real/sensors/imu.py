@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from dexsim.core.install import install_line
 from dexsim_real.core.errors import HandError, explain
 
 HEAD = b"\xaa\xaa"
@@ -179,7 +180,7 @@ def _open(port: str) -> Any:
     try:
         import serial
     except ImportError:
-        raise HandError("pyserial is missing: pip install 'dexsim[real]'") from None
+        raise HandError(f"pyserial is missing: {install_line('real')}") from None
     try:
         return serial.Serial(port, BAUD, timeout=0.05, exclusive=True)
     except (OSError, ValueError) as error:

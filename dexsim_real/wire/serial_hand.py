@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from dexsim.core.install import install_line
 from dexsim_real.core.errors import HandError, explain, latency_warnings
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Command, Frame, Mode
@@ -167,7 +168,7 @@ class SerialHand:
         try:
             import serial
         except ImportError:
-            raise HandError("pyserial is missing: pip install 'dexsim[real]'") from None
+            raise HandError(f"pyserial is missing: {install_line('real')}") from None
         self.close()
         local = "://" not in self.port
         try:

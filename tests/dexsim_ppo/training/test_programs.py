@@ -1,12 +1,25 @@
 """Compiled training steps kept between runs."""
 
+import copy
+import dataclasses
+import os
+import pickle
+import re
+import shutil
+import tempfile
+import warnings
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.experimental.compilation_cache.compilation_cache import reset_cache
 
+from dexsim.core.assets import asset_path
+from dexsim.core.errors import DexsimWarning
 from dexsim.env.fingerprint import fingerprint
+from dexsim.hand.load import load_hand
 from dexsim_ppo.training import programs
 from dexsim_ppo.training.programs import compile_step, key
 
@@ -135,9 +148,6 @@ def test_the_oldest_go(folder, monkeypatch):
 
 
 def test_fingerprints(grasp_env, monkeypatch):
-    import copy
-    import dataclasses
-
     base = fingerprint(grasp_env)
     assert base == fingerprint(grasp_env) == grasp_env.fingerprint()
     other = copy.copy(grasp_env)
@@ -146,5 +156,92 @@ def test_fingerprints(grasp_env, monkeypatch):
     other = copy.copy(grasp_env)
     other.pool = jax.tree.map(lambda x: x + 1 if np.issubdtype(np.asarray(x).dtype, np.floating) else x, grasp_env.pool)
     assert fingerprint(other) not in (base, None)
+    other = copy.copy(grasp_env)
+    for field in dataclasses.fields(grasp_env.hand):
+        other.hand = dataclasses.replace(grasp_env.hand, **{field.name: changed(getattr(grasp_env.hand, field.name))})
+        assert fingerprint(other) not in (base, None), field.name
     other.task = type("Mine", (), {})()  # its sources are not this package's
     assert fingerprint(other) is None
+
+
+def changed(value):
+    """A hand's field with one small change."""
+    if isinstance(value, np.ndarray):
+        other = value.copy()
+        other.flat[0] += 1
+        return other
+    if isinstance(value, tuple) and dataclasses.is_dataclass(value[0]):
+        return (dataclasses.replace(value[0], size=changed(value[0].size)), *value[1:])
+    if isinstance(value, tuple):
+        return (value[0] * 2, *value[1:])
+    return Path(shutil.copy(value, tempfile.mkdtemp())) if isinstance(value, Path) else value + "x"
+
+
+def test_a_hand_with_other_speed_limits_in_its_toml_is_another_program(tmp_path, grasp_env):
+    """The drive closes over them, so a kept program would go on with the old hand."""
+    folder = tmp_path / "hand"
+    shutil.copytree(asset_path("hand"), folder)
+    toml = folder / "xhand_right.toml"
+    text = toml.read_text()
+    slower = re.sub(
+        r"speed_limits = \[([^\]]*)\]",
+        lambda found: f"speed_limits = [{', '.join(str(float(x) / 20) for x in found[1].split(',') if x.strip())}]",
+        text,
+    )
+    assert slower != text
+    hashes = []
+    for content in (text, slower):
+        toml.write_text(content)
+        env = copy.copy(grasp_env)
+        env.hand = load_hand(toml)
+        hashes.append(fingerprint(env))
+    assert None not in hashes and hashes[0] != hashes[1]
+
+
+class Planted:
+    """What unpickling runs."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return (Path.touch, (self.path,))
+
+
+OTHERS = {
+    "folder for all": lambda folder, file: folder.chmod(0o777),
+    "folder for the group": lambda folder, file: folder.chmod(0o770),
+    "file for all": lambda folder, file: file.chmod(0o666),
+    "file for the group": lambda folder, file: file.chmod(0o664),
+    "a link": lambda folder, file: file.symlink_to(shutil.move(file, folder.parent / "elsewhere")),
+    "folder of another user": lambda folder, file: os.chown(folder, 12345, -1),
+    "file of another user": lambda folder, file: os.chown(file, 12345, -1),
+}
+
+
+@pytest.mark.parametrize("how", OTHERS)
+def test_what_others_may_have_written_is_not_loaded(folder, tmp_path, how):
+    """One warning, nothing unpickled, and the program runs all the same."""
+    if "another" in how and os.geteuid():
+        pytest.skip("only root can give files away")
+    good, _ = run("one")
+    (file,) = folder.glob("*.pkl")
+    assert folder.stat().st_mode & 0o777 == 0o700
+    file.write_bytes(pickle.dumps(Planted(tmp_path / "planted")))
+    OTHERS[how](folder, file)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        again, traced = run("one")
+    assert traced and not (tmp_path / "planted").exists()
+    np.testing.assert_array_equal(again[0], good[0])
+    (line,) = [str(w.message) for w in said if issubclass(w.category, DexsimWarning)]
+    assert line.startswith("compiled programs are not cached: ") and "\n" not in line and str(folder.parent) in line
+
+
+def test_the_planted_file_would_run(folder, tmp_path):
+    """Otherwise the test above would test nothing."""
+    run("one")
+    (file,) = folder.glob("*.pkl")
+    file.write_bytes(pickle.dumps(Planted(tmp_path / "planted")))
+    run("one")
+    assert (tmp_path / "planted").exists()

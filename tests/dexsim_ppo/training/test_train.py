@@ -211,7 +211,7 @@ def test_files_are_never_overwritten_or_mistaken(finished, tmp_path, monkeypatch
     for main, arguments, said in (
         (train.main, [*QUICK, "--run-dir", run], "exists already"),
         (train.main, ["--task", "grasp", "--resume", run], "of the task 'tiny', not 'grasp'"),
-        (train.main, ["--resume", run, "--ppo.num-envs", "32"], "does not fit this configuration"),
+        (train.main, ["--resume", run, "--ppo.num-envs", "32"], "--ppo.num-envs 32: a resumed run keeps its 16"),
         (train.main, ["--resume", str(finished.best)], "'policy' file, not a 'train' file"),
         (evaluate.main, [str(broken)], "cut short"),
         (evaluate.main, ["no-such-policy"], "no shipped policy has that name"),

@@ -94,7 +94,7 @@ def seen_in_rerun(folder):
     path = folder / "run.log"
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(sys.modules, "rerun", None)
-        with pytest.raises(LogError, match=r"pip install 'dexsim\[rerun\]'"):
+        with pytest.raises(LogError, match=r"pip install -e '\.\[rerun\]'"):
             show_rerun(replay.replay(path), folder / "run.rrd")
         patch.setitem(sys.modules, "rerun", Rerun)
         assert replay_command.main([str(path), "--rrd", str(folder / "new" / "run.rrd")]) == 0

@@ -1,0 +1,100 @@
+"""Faults of a training run: counted, shown, and kept in a file from which they can be replayed."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dexsim.core.errors import DexsimError
+from dexsim_ppo import checkpoint
+from dexsim_ppo.learner.config import PPOConfig
+from dexsim_ppo.learner.ppo import TrainState
+from dexsim_ppo.training.runlog import RunFolder
+
+DIVERGED_AFTER = 5  # calls in a row that skip more than half of their updates
+KEPT = 3  # reproducers of one run
+COUNTED = ("nonfinite_rewards", "bounded_rewards")
+
+# The step donates its state, so what a reproducer needs is copied before: one launch for all arrays.
+keep: Callable[[TrainState], TrainState] = jax.jit(lambda state: jax.tree.map(jnp.copy, state))
+
+
+class Faults:
+    """What went wrong so far.
+
+    Args:
+      config: the learner's settings.
+      folder: where reproducers go.
+      content: what a reproducer has to know of the run beside its state.
+      state: the state that training begins from.
+    """
+
+    def __init__(self, config: PPOConfig, folder: RunFolder, content: dict[str, Any], state: TrainState):
+        self._per_call = config.iterations_per_call * config.epochs * config.minibatches
+        self._per_iteration = config.epochs * config.minibatches
+        self._folder, self._content = folder, content
+        self._skipped, self._totals = int(state.skipped_updates), dict.fromkeys(COUNTED, 0.0)
+        self._clean_until, self._bad_calls = int(state.iteration), 0
+        self._clean, self._files = True, list[Path]()
+
+    def check(
+        self, before: TrainState, metrics: dict[str, np.ndarray], iteration: int, note: Callable[[str], None]
+    ) -> dict[str, float]:
+        """Totals for the log and the display, after a call that ended at `iteration`.
+
+        Args:
+          before: a copy of the state before the call.
+          metrics: of the call.
+          note: shows a line to the user.
+
+        Raises:
+          DexsimError: most gradients of several calls in a row were not finite.
+        """
+        skipped = int(metrics["skipped_updates"][-1])
+        lost, self._skipped = skipped - self._skipped, skipped
+        if not lost:
+            self._clean, self._clean_until = True, iteration
+        elif self._clean:
+            self._clean = False
+            note(
+                f"iteration {iteration}: {lost} of {self._per_call} updates skipped, their gradient is not finite"
+                f"{self._write(before, lost)}"
+            )
+        self._bad_calls = self._bad_calls + 1 if 2 * lost > self._per_call else 0
+        if self._bad_calls >= DIVERGED_AFTER:
+            raise DexsimError(
+                f"training diverged: in each of the last {self._bad_calls} calls most gradients were not finite, the "
+                f"first one after iteration {self._clean_until}; {self._from_before()}{self._how_to_replay()}"
+            )
+        for name in COUNTED:
+            self._totals[name] += float(np.sum(metrics.get(name, 0.0)))
+        return {
+            "skipped_updates": float(skipped),
+            "updates": float(iteration * self._per_iteration),
+            **{f"total/{name}": value for name, value in self._totals.items()},
+        }
+
+    def _write(self, before: TrainState, lost: int) -> str:
+        """Write a reproducer; how to replay it."""
+        if len(self._files) >= KEPT:
+            return ""
+        path = self._folder.path / f"reproduce-{int(before.iteration):08d}.msgpack"
+        try:
+            checkpoint.save(
+                path, kind="reproducer", task=self._content["task"], tree=before, content=self._content | {"lost": lost}
+            )
+        except OSError as error:  # A full disk is no reason to stop.
+            return f"; {path} could not be written ({error.strerror})"
+        self._files.append(path)
+        return self._how_to_replay()
+
+    def _how_to_replay(self) -> str:
+        return f"; replay: python -m dexsim_ppo.reproduce {self._files[-1]}" if self._files else ""
+
+    def _from_before(self) -> str:
+        """Which checkpoints are from before the fault: later ones hold its state."""
+        sound = [path for path in self._folder.existing_checkpoints() if int(path.stem) <= self._clean_until]
+        return f"the newest checkpoint from before is {sound[-1]}" if sound else "no checkpoint is from before"

@@ -1,0 +1,97 @@
+"""Files: what a killed program leaves is removed, and folders that others may write to are turned away."""
+
+import os
+import signal
+import subprocess
+import sys
+
+import jax
+import pytest
+from paths import ROOT
+
+from dexsim.core import cli
+from dexsim.core.errors import DexsimWarning
+from dexsim.core.files import make_private, write_whole
+
+# Writes half of a file, says so, and waits to be killed.
+HALF = """
+import sys, time
+from pathlib import Path
+from dexsim.core.files import write_whole
+
+def chunks():
+    yield b"x" * 2**20
+    print("half", flush=True)
+    time.sleep(60)
+    yield b"never"
+
+write_whole(Path(sys.argv[1]), chunks())
+"""
+
+
+def begin(path):
+    """A process in the middle of a write."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", HALF, str(path)],
+        stdout=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+    )
+    assert process.stdout.readline() == "half\n"
+    return process
+
+
+def test_what_a_kill_during_a_write_leaves_is_removed_by_the_next_write(tmp_path):
+    killed, writing = begin(tmp_path / "00000100.msgpack"), begin(tmp_path / "00000200.msgpack")
+    try:
+        killed.send_signal(signal.SIGKILL)
+        killed.wait()
+        assert len(list(tmp_path.iterdir())) == 2
+        write_whole(tmp_path / "00000300.msgpack", [b"whole"])
+        left = {path.name for path in tmp_path.iterdir()}
+        assert "00000300.msgpack" in left and len(left) == 2
+        assert any(name.startswith(".00000200.msgpack") for name in left), "that one is still being written"
+    finally:
+        writing.kill()
+        writing.wait()
+
+
+def test_only_temporaries_are_removed(tmp_path):
+    for name in (".hidden", "a.part", ".b.txt"):
+        (tmp_path / name).write_text("mine")
+    write_whole(tmp_path / "file", [b"1"])
+    write_whole(tmp_path / "file", [b"2"])
+    assert {path.name for path in tmp_path.iterdir()} == {".hidden", "a.part", ".b.txt", "file"}
+    assert (tmp_path / "file").read_bytes() == b"2"
+
+
+def test_a_private_folder(tmp_path):
+    make_private(tmp_path / "new" / "one")
+    assert (tmp_path / "new" / "one").stat().st_mode & 0o777 == 0o700
+    (tmp_path / "new" / "one").chmod(0o755)
+    make_private(tmp_path / "new" / "one")
+    for mode in (0o775, 0o757):
+        (tmp_path / "new" / "one").chmod(mode)
+        with pytest.raises(PermissionError, match=r"one can be written by others \(chmod go-w\)$"):
+            make_private(tmp_path / "new" / "one")
+
+
+def test_compiled_code_is_not_loaded_from_a_folder_that_others_may_write_to(tmp_path, monkeypatch):
+    """JAX's and Warp's caches hold code as well."""
+    for name in ("DEXSIM_CACHE", "JAX_COMPILATION_CACHE_DIR", "WARP_CACHE_PATH"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("DEXSIM_CACHE", str(tmp_path))
+    (tmp_path / "xla").mkdir()
+    (tmp_path / "xla").chmod(0o777)
+    before = jax.config.jax_compilation_cache_dir
+    try:
+        with pytest.warns(DexsimWarning, match=r"^no cache of compiled code: [^\n]*xla can be written by others"):
+            cli.enable_caches()
+        assert jax.config.jax_compilation_cache_dir is None
+        assert os.environ.pop("WARP_CACHE_PATH") == str(tmp_path / "warp")
+        (tmp_path / "xla").chmod(0o700)
+        cli.enable_caches()
+        assert jax.config.jax_compilation_cache_dir == str(tmp_path / "xla")
+    finally:
+        os.environ.pop("WARP_CACHE_PATH", None)
+        jax.config.update("jax_compilation_cache_dir", before)

@@ -1,0 +1,136 @@
+"""What one faulty environment may do to the learner, and what the learner promises to environments."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tiny_env import SMALL, TinyEnv
+
+from dexsim_ppo.learner import ppo
+from dexsim_ppo.learner.ppo import make_train
+from dexsim_ppo.learner.rollout import Rollout, bound_rewards
+from dexsim_ppo.learner.running_stats import RunningStats, value_std
+from dexsim_ppo.policy import PolicyParams, act
+
+NEVER = 1e9
+ROWS = dataclasses.replace(SMALL, num_envs=64, rollout_length=16)  # 1,024 rows an iteration
+
+
+class OneFault(TinyEnv):
+    """Gives one finite reward of 1e6 when the countdown in its metrics ends."""
+
+    def _start(self, key):
+        state = super()._start(key)
+        return dataclasses.replace(state, metrics=state.metrics | {"countdown": jnp.float32(NEVER)})
+
+    def step(self, state, action):
+        countdown = state.metrics["countdown"] - 1
+        state = super().step(state, action)
+        reward = jnp.where(countdown == 0, 1e6, state.reward)
+        return dataclasses.replace(state, reward=reward, metrics=state.metrics | {"countdown": countdown})
+
+
+def with_fault(state, steps):
+    """One of the environments gives its faulty reward after so many steps."""
+    metrics = dict(state.env_state.metrics)
+    metrics["countdown"] = metrics["countdown"].at[5].set(steps)
+    metrics["length"] = metrics["length"].at[5].set(0.0)
+    return dataclasses.replace(state, env_state=dataclasses.replace(state.env_state, metrics=metrics))
+
+
+@pytest.mark.parametrize("before", [0, 10])
+def test_one_reward_of_a_million_does_not_ruin_the_value_normaliser(before):
+    """At the start of training and later: the deviation of returns stays of their order, and the fault is counted."""
+    training, deviations = make_train(OneFault(), ROWS), []
+    for fault in (False, True):
+        state, counted = training.init(jax.random.key(0)), 0.0
+        for iteration in range(before + 2):
+            if fault and iteration == before:
+                state = with_fault(state, 3.0)
+            state, metrics = training.step(state)
+            counted += float(metrics["bounded_rewards"][0])
+        assert counted == float(fault)
+        deviations.append(float(value_std(state.value_stats)))
+    assert deviations[1] < 100 * deviations[0]
+    if before:
+        assert deviations[1] < 5 * deviations[0]
+    assert int(state.skipped_updates) == 0
+
+
+def experience(reward):
+    zero, flag = jnp.zeros_like(reward), jnp.zeros(reward.shape, bool)
+    return Rollout(obs={}, decision=None, value=zero, next_value=zero, reward=reward, terminated=flag, truncated=flag)
+
+
+@pytest.mark.parametrize("count", [0, 5])
+def test_healthy_rewards_stay_to_the_last_bit(count):
+    """Also constant ones, none at all, and a bonus of fifty deviations."""
+    stats = RunningStats(jnp.int32(count), jnp.float32(0.0), jnp.float32(25.0))
+    for reward in (
+        jax.random.normal(jax.random.key(0), (16, 64)),
+        jnp.full((16, 64), 0.3),
+        jnp.zeros((16, 64)),
+        jax.random.normal(jax.random.key(1), (16, 64)).at[3, 4].set(250.0),
+    ):
+        same, counted = bound_rewards(experience(reward), stats, 1.0)
+        np.testing.assert_array_equal(same.reward, reward)
+        assert float(counted) == 0
+
+
+def test_rewards_that_grow_are_followed():
+    """A sparse reward after long silence: bounded at first, whole after some iterations."""
+    stats = RunningStats(jnp.int32(10_000), jnp.float32(0.0), jnp.float32(0.0))
+    reward = jnp.zeros((16, 64)).at[3, 4].set(250.0)
+    config = dataclasses.replace(ROWS, normalize_value=True)
+    params = make_train(TinyEnv(), config).init(jax.random.key(0)).params
+
+    @jax.jit
+    def iterate(stats):
+        rollout, counted = bound_rewards(experience(reward), stats, 1.0)
+        return ppo.prepare(config, stats, params, rollout)[0], rollout, counted
+
+    for _ in range(40):
+        stats, rollout, counted = iterate(stats)
+    assert float(counted) == 0 and float(rollout.reward.max()) == 250
+
+
+class Unclipped(TinyEnv):
+    """Trusts that actions are in [-1, 1], and remembers the largest."""
+
+    def step(self, state, action):
+        after = super().step(state, action)
+        return dataclasses.replace(after, metrics=after.metrics | {"error": jnp.max(jnp.abs(action))})
+
+
+@pytest.mark.parametrize("distribution", ["gaussian", "tanh"])
+def test_actions_are_in_range_in_training_as_from_a_policy(distribution):
+    """A task's reward or its `last_action` sees the same range from the learner and from `act`."""
+    config = dataclasses.replace(SMALL, distribution=distribution, initial_std=5.0, std_max=10.0)
+    training = make_train(Unclipped(), config)
+    state, metrics = training.step(training.init(jax.random.key(0)))
+    assert 0.7 < float(metrics["step/error"][0]) <= 1.0
+    normalizers = ppo.make_normalizers(Unclipped(), config, state.observation_stats)
+    layers = jax.tree.map(lambda x: 1e3 * x, state.params.actor)
+    obs = 10 * jax.random.normal(jax.random.key(1), (50, 3))
+    assert float(jnp.abs(act(PolicyParams(layers, normalizers["actor"], distribution), obs)).max()) == 1.0
+
+
+class Short(TinyEnv):
+    """Ends every episode after four steps."""
+
+    def step(self, state, action):
+        state = super().step(state, action)
+        return dataclasses.replace(state, truncated=state.metrics["length"] >= 4)
+
+    def stagger(self, state, key):
+        return state
+
+
+def test_starts_that_are_used_again_are_counted():
+    """Sixteen steps from one reserve: four episodes end, and all but the first begin from a used start."""
+    for env, repeated in ((Short(), 3), (TinyEnv(), 0)):
+        training = make_train(env, ROWS)
+        _, metrics = training.step(training.init(jax.random.key(0)))
+        assert float(metrics["repeated_starts"][0]) == repeated * ROWS.num_envs

@@ -1,0 +1,148 @@
+"""A policy file from anywhere: forged values with true checksums get one line, and open no file."""
+
+import dataclasses
+import hashlib
+import struct
+
+import jax
+import msgpack
+import numpy as np
+import pytest
+from tiny_env import SMALL, TinyEnv
+
+from dexsim.core.assets import asset_path
+from dexsim.core.errors import CheckpointError
+from dexsim_ppo import checkpoint, evaluate, train
+from dexsim_ppo.learner.ppo import make_train
+from dexsim_ppo.policy import Policy, load_policy
+
+
+@pytest.fixture(scope="module")
+def sound():
+    env = TinyEnv()
+    return Policy.from_training(env, SMALL, make_train(env, SMALL).init(jax.random.key(0)))
+
+
+def forge(sound, path, *, content=None, arrays=None):
+    """The policy's file with other values of the header's content, or another last number of an array."""
+    sound.save(path)
+    file = checkpoint.load(path, kind="policy")
+
+    def put(place, leaf):
+        leaf = np.array(leaf)
+        leaf.flat[-1] = (arrays or {}).get(jax.tree_util.keystr(place), leaf.flat[-1])
+        return leaf
+
+    tree = jax.tree_util.tree_map_with_path(put, sound.params)
+    checkpoint.save(path, kind="policy", task=file.task, content=file.content | (content or {}), tree=tree)
+    return path
+
+
+CONTENT = {
+    "a rate of zero": {"control_rate": 0},
+    "a rate that is no number": {"control_rate": float("nan")},
+    "a negative rate": {"control_rate": -33},
+    "a rate of a gigahertz": {"control_rate": 1e9},
+    "an infinite rate": {"control_rate": float("inf")},
+    "a rate in words": {"control_rate": "33"},
+    "no rate": {"control_rate": None},
+    "a clip in words": {"clip": "5"},
+    "a list for a clip": {"clip": [5.0]},
+    "a clip that is no number": {"clip": float("nan")},
+    "a negative clip": {"clip": -5.0},
+    "true for a clip": {"clip": True},
+    "another squashing": {"squash": "softsign"},
+    "a list for a squashing": {"squash": [1]},
+    "a fraction of a layer": {"layers": 2.0},
+    "no layers": {"layers": 0},
+    "many layers": {"layers": 2**40},
+    "a scale that is no number": {"observation_layout": [["a", 3, float("nan")]]},
+    "a negative scale": {"observation_layout": [["a", 3, -1.0]]},
+    "a negative size": {"observation_layout": [["a", 4, None], ["b", -1, None]]},
+    "a fraction of a size": {"observation_layout": [["a", 3.0, None]]},
+    "a number for a name": {"observation_layout": [[7, 3, None]]},
+    "a layout in words": {"observation_layout": "abc"},
+    "no configuration": {"env_config": None},
+    "a list for the origin": {"training": []},
+    "a specification in words": {"spec": "grasp"},
+}
+
+
+@pytest.mark.parametrize("what", CONTENT)
+def test_a_value_that_no_policy_has_is_one_line(sound, tmp_path, what):
+    with pytest.raises(CheckpointError, match=r"^[^\n]{1,400}$"):
+        Policy.load(forge(sound, tmp_path / "p.msgpack", content=CONTENT[what]))
+
+
+ARRAYS = {
+    "NaN weight": {".layers[0].kernel": np.nan},
+    "infinite bias": {".layers[1].bias": np.inf},
+    "NaN mean": {".normalizer.mean": np.nan},
+    "deviation of zero": {".normalizer.std": 0.0},
+    "negative deviation": {".normalizer.std": -1.0},
+    "weights that overflow": {".layers[0].kernel": 3e38, ".layers[1].kernel": 3e38},
+}
+
+
+@pytest.mark.parametrize("what", ARRAYS)
+def test_an_array_that_would_give_no_action_is_one_line(sound, tmp_path, what):
+    with pytest.raises(CheckpointError, match=r"^[^\n]{1,400}$"):
+        Policy.load(forge(sound, tmp_path / "p.msgpack", arrays=ARRAYS[what]))
+
+
+def test_large_weights_that_do_not_overflow_are_a_policy(sound, tmp_path):
+    path = forge(sound, tmp_path / "p.msgpack", arrays={".layers[0].kernel": 1e6})
+    action = Policy.load(path)(np.full(3, 1e30, np.float32))
+    assert np.all(np.abs(action) <= 1)
+
+
+@pytest.mark.parametrize("shape", [[1] * 65, [1] * 100_000, [0] + [2**39] * 3, [0] * 65], ids=len)
+def test_a_shape_that_no_array_can_have_is_one_line(tmp_path, shape):
+    path = tmp_path / "a"
+    checkpoint.save(path, kind="policy", task="tiny", content={}, tree={"x": np.zeros(1 if all(shape) else 0)})
+    data = path.read_bytes()
+    size = struct.unpack("<Q", data[8:16])[0]
+    header = msgpack.unpackb(data[48 : 48 + size])
+    header["leaves"][0]["shape"] = shape
+    packed = msgpack.packb(header)
+    prefix = data[:8] + struct.pack("<Q", len(packed))
+    path.write_bytes(prefix + hashlib.sha256(prefix + packed).digest() + packed + data[48 + size :])
+    with pytest.raises(CheckpointError, match=r"^[^\n]{1,400}$"):
+        checkpoint.load(path, kind="policy")
+
+
+@pytest.mark.parametrize("mesh", ["/etc/passwd", "../secret.stl", "~/secret.stl", "link.stl"])
+def test_a_policy_does_not_choose_which_files_are_opened(tmp_path, monkeypatch, mesh):
+    """Measuring it, training from it and making its environment name the file in one line; the user may give it."""
+    here = tmp_path / "here"
+    here.mkdir()
+    (tmp_path / "secret.stl").write_text("secret")
+    (here / "link.stl").symlink_to(tmp_path / "secret.stl")
+    monkeypatch.chdir(here)
+    shipped = load_policy("grasp")
+    content = checkpoint.load(asset_path("policies/grasp.msgpack"), kind="policy").content
+    config = shipped.env_config | {"objects": shipped.env_config["objects"] | {"mesh": mesh}}
+    path = here / "p.msgpack"
+    checkpoint.save(path, kind="policy", task="grasp", tree=shipped.params, content=content | {"env_config": config})
+    opened = []
+    monkeypatch.setattr("dexsim.objects.config.load", lambda path, **_: opened.append(path))
+    for open_it in (
+        lambda: Policy.load(path).make_env(backend="jax"),
+        lambda: evaluate.main([str(path), "--episodes", "1"]),
+        lambda: evaluate.evaluate_policy(path, episodes=1),
+        lambda: train.parse_arguments(["--policy", str(path), "--preset", "cpu"]),
+        lambda: train.train_policy(policy=str(path), preset="cpu"),
+    ):
+        with pytest.raises(
+            CheckpointError, match=r"^the policy's object mesh '[^\n]*' is outside of the current folder"
+        ):
+            open_it()
+    assert opened == []
+    own, _ = train.parse_arguments(["--policy", str(path), "--preset", "cpu", "--env.objects.mesh", "../mine.stl"])
+    assert own.env.objects.mesh == "../mine.stl"
+
+
+def test_a_mesh_of_the_current_folder_is_the_policys(sound, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for mesh in ("", "mug.stl", "parts/mug.stl", str(tmp_path / "mug.stl")):
+        dataclasses.replace(sound, env_config={"objects": {"mesh": mesh}}).check_mesh()

@@ -1,0 +1,108 @@
+"""A resumed run is the same training, and what it finds in its folder stays."""
+
+import contextlib
+import dataclasses
+import datetime
+import json
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+import tiny_train
+from tiny_env import TinyConfig
+
+from dexsim.core.errors import ConfigError
+from dexsim_ppo import checkpoint, train
+from dexsim_ppo.learner.curriculum import Curriculum
+from dexsim_ppo.policy import Policy
+from dexsim_ppo.train import make_run_folder
+from dexsim_ppo.training.arguments import check_resumed
+from dexsim_ppo.training.runlog import RunFolder
+
+QUICK = "--task tiny --preset cpu --no-video --ppo.num-envs 16 --ppo.rollout-length 8 --ppo.actor-layers 8".split()
+QUICK += "--ppo.critic-layers 8 --evaluation-chunk 16 --evaluation-episodes 16 --seed 3".split()
+PER_ITERATION = 16 * 8
+
+
+@pytest.fixture(autouse=True)
+def tiny_task(monkeypatch):
+    tiny_train.install(monkeypatch)
+
+
+@pytest.fixture
+def finished(tmp_path):
+    assert train.main([*QUICK, "--steps", str(2 * PER_ITERATION), "--run-dir", str(tmp_path / "a")]) == 0
+    return RunFolder(tmp_path / "a")
+
+
+CHANGES = {
+    "seed": (["--seed", "9"], "--seed 9: a resumed run keeps its 3"),
+    "learner": (["--ppo.learning-rate", "1e-3"], "--ppo.learning-rate 0.001: a resumed run keeps its 0.0005"),
+    "task": (["--env.gain", "0.5"], "--env.gain 0.5: a resumed run keeps its 0.25"),
+    "curriculum": (["--curriculum.on"], "--curriculum.on True: a resumed run keeps its False"),
+    "extremes": (["--extremes", "0.5"], "--extremes 0.5: a resumed run keeps its 0"),
+    "folder": (["--run-dir", "elsewhere"], "--run-dir"),
+}
+
+
+def test_what_would_change_the_training_is_refused_and_the_rest_applies(finished):
+    """Nothing of the saved state follows from such an option, and the report would name it all the same."""
+    for given, said in CHANGES.values():
+        with pytest.raises(ConfigError) as refused:
+            train.main(["--resume", str(finished.path), *given])
+        assert str(refused.value).startswith(said) and "\n" not in str(refused.value)
+    with pytest.raises(ConfigError, match=r"TrainArguments\.seed = 9: a resumed run keeps its 3"):
+        train.train_policy(resume=finished.path, seed=9)
+    same = ["--seed", "3", "--ppo.learning-rate", "5e-4"]
+    looks_on = ["--steps", str(3 * PER_ITERATION), "--evaluation-episodes", "32", "--log-every", "2"]
+    assert train.main(["--resume", str(finished.path), *same, *looks_on]) == 0
+    report = json.loads(finished.report.read_text())
+    assert report["seed"] == 3 and report["trained"]["episodes"] == 32
+    assert Policy.load(finished.last).training["iteration"] == 3
+    saved = checkpoint.load(finished.latest_checkpoint(), kind="train").content["arguments"]
+    assert (saved["seed"], saved["log_every"], saved["evaluation_episodes"]) == (3, 2, 32)
+
+
+def test_only_budget_and_what_looks_on_may_change(finished):
+    """Field by field: an option that is added later is part of the training, unless this list grows with it."""
+    _, begun = train.parse_arguments(["--resume", str(finished.path)])
+    saved = train.default_arguments(None, "auto", begun)
+    other = {"seed": 9, "extremes": 0.5, "backend": "warp", "preset": "gpu", "task": "other", "policy": "grasp"}
+    other |= {"run_dir": Path("x"), "resume": Path("x"), "video": True, "env": TinyConfig(gain=0.5)}
+    other |= {"ppo": dataclasses.replace(saved.ppo, discount=0.5), "curriculum": Curriculum(on=True)}
+    allowed = set()
+    for field in dataclasses.fields(saved):
+        value = other.get(field.name, 77)
+        assert value != getattr(saved, field.name)
+        with contextlib.suppress(ConfigError):
+            check_resumed(dataclasses.replace(saved, **{field.name: value}), saved)
+            allowed.add(field.name)
+    assert allowed == {
+        *("checkpoint_every", "evaluate_every", "evaluation_chunk", "evaluation_episodes", "keep_checkpoints"),
+        *("log_every", "minutes", "resume", "steps", "video"),
+    }
+
+
+def test_the_report_of_a_finished_run_is_kept(finished):
+    first = json.loads(finished.report.read_text())
+    for steps in (3, 4):
+        assert train.main(["--resume", str(finished.path), "--steps", str(steps * PER_ITERATION)]) == 0
+    assert json.loads((finished.path / "report-1.json").read_text()) == first
+    second = json.loads((finished.path / "report-2.json").read_text())
+    assert second["origin"]["iteration"] == 3
+    assert json.loads(finished.report.read_text())["origin"]["iteration"] == 4
+
+
+def test_runs_that_begin_in_one_second_get_folders_of_their_own(tmp_path, monkeypatch):
+    class Now(datetime.datetime):
+        @classmethod
+        def now(cls, tz=None):
+            return cls(2026, 1, 1, 12)
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(train.datetime, "datetime", Now)
+    arguments, _ = train.parse_arguments(QUICK)
+    with ThreadPoolExecutor(8) as many:
+        made = list(many.map(lambda _: make_run_folder(arguments), range(24)))
+    assert len(set(made)) == 24 and all(path.is_dir() for path in made)
+    assert str(min(made, key=lambda path: len(str(path)))) == "runs/tiny-20260101-120000"
