@@ -68,7 +68,7 @@ class HandLoop:
         self._number = 0
 
     def step(self, target: np.ndarray | None = None) -> Exchange | None:
-        """Make an exchange; None when it was not answered.
+        """Make an exchange; None when it was not answered, or the measurement was implausible.
 
         Args:
           target: [J] rad, requested joint targets; None keeps the last ones.
@@ -125,12 +125,14 @@ class HandLoop:
 
     # --- pieces ---------------------------------------------------------------------------------
 
-    def _take(self, reply: Reply, reaction: Reaction) -> Exchange:
+    def _take(self, reply: Reply, reaction: Reaction) -> Exchange | None:
         self._keep(Kind.RECEIVED, frames.palm_address(0), reply.state, reply.received)
         measured = self.sensing.measure(reply.state)
-        velocity = self._filter.update(reply.received, measured.joint_position)
+        velocity = self._filter.estimate(reply.received, measured.joint_position)
         sample = HandSample(reply.received, reply.sequence, reply.generation, measured, velocity)
-        self.safety.see(sample)
+        if not self.safety.see(sample):
+            return None
+        self._filter.update(reply.received, measured.joint_position)
         return Exchange(sample, reply.state, reaction <= Reaction.CLIP)
 
     def _keep(self, kind: Kind, source: int, block: np.ndarray, when: float) -> None:

@@ -32,6 +32,7 @@ class Servo:
         self.waited = 0  # deadlines missed because of late answers
         self.error: BaseException | None = None
         self._filter = VelocityFilter(sensing.config.velocity_time)
+        self._generation = 0
         self._stop = threading.Event()
         self._engage = False
         self._fresh = threading.Event()
@@ -58,7 +59,7 @@ class Servo:
         return now + (self.pace.next + lead - now) % period
 
     def wait_fresh(self, seconds: float) -> HandSample | None:
-        """Wait for the next sample; None when none arrives in time."""
+        """Wait for the next plausible sample; None when none arrives in time."""
         self._fresh.clear()
         return self.safety.sample if self._fresh.wait(seconds) else None
 
@@ -100,18 +101,20 @@ class Servo:
         if reply is None:
             return took
         self.round_trip.add(reply.received - reply.sent)
-        self.safety.see(self._sample(reply))
-        self._fresh.set()
+        sample = self._sample(reply)
+        if self.safety.see(sample):
+            self._filter.update(sample.time, sample.measured.joint_position)
+            self._fresh.set()
         return took
 
     def _sample(self, reply: Reply) -> HandSample:
         measured = self.sensing.measure(reply.state)
-        before = self.safety.sample
-        if before is not None and before.generation != reply.generation:
+        if reply.generation != self._generation:
             self._filter.reset()
+        self._generation = reply.generation
         velocity = self.sensing.velocity(reply.state)
         if velocity is None:
-            velocity = self._filter.update(reply.received, measured.joint_position)
+            velocity = self._filter.estimate(reply.received, measured.joint_position)
         return HandSample(reply.received, reply.sequence, reply.generation, measured, velocity)
 
     def _rest(self) -> None:

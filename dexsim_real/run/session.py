@@ -87,6 +87,8 @@ class Session:
         self._write_meta()
         self.servo.start()
         if self.servo.wait_fresh(1.0) is None:
+            if self.safety.problem:
+                raise HandError(f"{self.arguments.port}: {self.safety.problem}; check `--hardware.joint-offset`")
             raise HandError(f"{self.arguments.port}: the hand stopped answering; check the cable and the power")
         self.objects = ObjectSensors(self.arguments, self.controller)
         spec = self.controller.spec
@@ -199,7 +201,7 @@ class Session:
             if now - sample.time <= self.safety.config.stale:
                 if anchor != self.safety.anchor:
                     anchor = self.safety.anchor
-                    self.controller.anchor(sample.measured.joint_position)
+                    self.controller.anchor(self.safety.commanded)
                 self._tick(now, sample)
                 self.compute.add(time.monotonic() - now)
             self.pace.wait()
