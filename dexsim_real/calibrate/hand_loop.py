@@ -15,9 +15,11 @@ from typing import Any, TextIO
 import numpy as np
 from rich.console import Console
 
+from dexsim_real.control.motors_off import UNCONFIRMED, patience, turn_off
 from dexsim_real.control.safety import HandSample, Reaction, Safety
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogWriter
+from dexsim_real.core.process import ignore_signals
 from dexsim_real.core.timing import Pace
 from dexsim_real.sensors.hand import HandSensing, VelocityFilter
 from dexsim_real.wire import frames
@@ -66,6 +68,7 @@ class HandLoop:
         self._failing_since: float | None = None
         self._generation: int | None = None
         self._number = 0
+        self._driven = self._closed = False
 
     def step(self, target: np.ndarray | None = None) -> Exchange | None:
         """Make an exchange; None when it was not answered, or the measurement was implausible.
@@ -83,6 +86,7 @@ class HandLoop:
         command = self.sensing.command(decision.position, decision.mode)
         self._number += 1
         self._keep(Kind.SENT, frames.HOST, command, now)
+        self._driven |= decision.mode == Mode.POSITION
         reply = self.port.exchange(command)
         exchange = None if reply is None else self._take(reply, decision.reaction)
         self._check(now, decision, reply)
@@ -114,13 +118,20 @@ class HandLoop:
         return self.safety.sample.measured.joint_position.astype(float)
 
     def close(self) -> None:
-        """Turn the motors off (repeat until the hand confirms it, at most ten times) and close the port."""
+        """Turn the motors off and close the port.
+
+        Raises:
+          HandError: the hand has not confirmed it.
+        """
+        ignore_signals()
+        if self._closed:
+            return
         off = self.sensing.command(self.sensing.hand.joint_lower, Mode.PASSIVE)
         try:
-            for _ in range(10):
-                if self.port.exchange(off) is not None:
-                    break
+            if not turn_off(self.port, off, patience(self._driven)) and self._driven:
+                raise HandError(f"{UNCONFIRMED}; press the emergency stop")
         finally:
+            self._closed = True
             self.port.close()
 
     # --- pieces ---------------------------------------------------------------------------------

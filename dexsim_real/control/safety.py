@@ -191,14 +191,15 @@ class Safety:
         """The command for this cycle."""
         if not self.engaged or self.latched or self.sample is None:
             return self._finish(now, Reaction.RELAX, self.latched or "not engaged", self._rest())
-        sample, config = self.sample, self.config
+        sample = self.sample
         fatal = self._fatal(now, sample)
         if fatal:
             self.relax(fatal)
             return self._finish(now, Reaction.RELAX, fatal, self._rest())
         if self._commanded is None:
             if self.problem or not self._pose.known:
-                return self._finish(now, Reaction.RELAX, self.problem or UNKNOWN, self._rest())
+                silent = now - sample.time > self.config.stale and not self.problem
+                return self._finish(now, Reaction.RELAX, _SILENT if silent else self.problem or UNKNOWN, self._rest())
             self._start(now, sample)
         wish = self._target  # Read once: another thread may replace it meanwhile.
         reason = self._reason_to_hold(now, sample, wish)

@@ -33,6 +33,8 @@ from dexsim_real.wire.serial_hand import SerialHand
         ("5 heat 12 60 1", "give a time"),
         ("5 stuck 0 120 9", "give a time"),
         ("5 stuck 0 119 256", "give a time"),
+        ("5 angle 4 twisted 1 1", "give a time"),
+        ("5 angle 4 offset 1.3", "give a time"),
         ("-1 stall", "at least 0"),
         ("5 stall -1", "give a time"),
         ("nan drop", "at least 0"),
@@ -79,6 +81,7 @@ def test_random_faults_have_their_rates_and_the_seed_repeats_them():
         disconnect=0.01,
         heat=0.008,
         stuck=0.006,
+        angle=0.004,
         on_request=0.25,
     )
     runs = []
@@ -193,7 +196,7 @@ class Port:
 class Pair:
     """The bridge's driver and an emulated hand on one cable."""
 
-    def __init__(self, hand, monkeypatch, faults, seed=0, **link):
+    def __init__(self, hand, monkeypatch, faults, seed=0, watchdog=0.08, **link):
         import serial
 
         self.cable, self.plant, self.notes = Cable(), ScriptedPlant(), []
@@ -202,7 +205,7 @@ class Pair:
             "dexsim_real.wire.serial_hand.time", SimpleNamespace(monotonic=lambda: cable.now, sleep=cable.wait)
         )
         monkeypatch.setattr(serial, "serial_for_url", lambda url, timeout, **_: Port(cable, timeout))
-        self.board = Firmware(self.plant, FirmwareConfig(), self.notes.append)
+        self.board = Firmware(self.plant, FirmwareConfig(watchdog=watchdog), self.notes.append)
         self.check = CommandCheck(hand.joint_lower, hand.joint_upper, LimitsConfig())
         self.injector = Injector(faults, seed)
         self.line = cable.line = HandLine(
@@ -263,6 +266,7 @@ def test_every_injected_fault_is_found_in_the_hosts_counters(hand, monkeypatch, 
         disconnect=0.04,
         stuck=0.05,
         heat=0.03,
+        angle=0.03,
         stall_seconds=(0.005, 0.2),
         away_seconds=(0.01, 0.2),
     )
@@ -279,6 +283,8 @@ def test_every_injected_fault_is_found_in_the_hosts_counters(hand, monkeypatch, 
     assert pair.check.report()["outside_limits"] == 0 and pair.check.checked == pair.board.counts["exchange"]
     cable, heat = pair.cable, pair.plant.heat
     cable.wait(3.0)
+    pair.exchange(Mode.PASSIVE)
+    assert not pair.board.wrong  # All wrong angles have ended.
     np.testing.assert_allclose(heat, 35.0)  # Every motor that was heated has cooled.
 
 
@@ -330,6 +336,20 @@ def test_heat_and_stuck_taxels_reach_the_state(hand, monkeypatch):
     assert set(stuck) == {0, 99} and stuck == sorted(stuck)
 
 
+def test_wrong_angles_reach_the_state_for_their_time(hand, monkeypatch):
+    script = ("0.1 angle 4 offset 1.3 0", "0.2 angle 5 stuck 1.9 0.2", "0.5 angle 6 stuck 1e30 0.01")
+    pair = Pair(hand, monkeypatch, FaultConfig(script=script))
+    replies = [pair.exchange().state["joint"]["position"] for _ in range(60)]
+    off = np.abs(np.array(replies) - REST) > 0.1
+    assert off[:, 4].sum() == off[:, 6].sum() == 1 and 16 <= off[:, 5].sum() <= 18
+    assert not np.delete(off, [4, 5, 6], 1).any() and np.all(np.diff(np.flatnonzero(off[:, 5])) == 1)
+    assert np.array(replies)[:, 4].max() == pytest.approx(REST[4] + 1.3, abs=1e-3)
+    np.testing.assert_allclose(pair.board.angles, REST, atol=1e-3)
+    injector = Injector(FaultConfig(), 3)
+    kinds = {(fault.form, abs(fault.radians) > 1e29) for fault in (injector._random_fault("angle") for _ in range(50))}
+    assert kinds == {("offset", False), ("stuck", False), ("stuck", True)}
+
+
 def test_the_hand_is_safe_within_a_tenth_of_a_second_of_losing_its_host(hand, monkeypatch):
     faults = FaultConfig(script=("0.3 disconnect 0.4", "1.2 stall 0.4", "2 late 0.2"))
     pair = Pair(hand, monkeypatch, faults)
@@ -344,6 +364,13 @@ def test_the_hand_is_safe_within_a_tenth_of_a_second_of_losing_its_host(hand, mo
     # A host that is gone for good.
     pair.cable.wait(1.0)
     assert len(trips) == 4 and trips[-1] - answered[-1] < 0.1 and not pair.board.on
+
+
+def test_a_hand_without_a_watchdog_stays_on_when_it_loses_its_host(hand, monkeypatch):
+    pair = Pair(hand, monkeypatch, FaultConfig(), watchdog=0.0)
+    pair.run(0.3)
+    pair.cable.wait(5.0)
+    assert pair.board.on and not pair.board.trips
 
 
 def test_parse_gives_time_kind_and_values():
