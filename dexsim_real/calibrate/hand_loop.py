@@ -15,7 +15,7 @@ from typing import Any, TextIO
 import numpy as np
 from rich.console import Console
 
-from dexsim_real.control.motors_off import UNCONFIRMED, patience, turn_off
+from dexsim_real.control.motors_off import patience, turn_off
 from dexsim_real.control.safety import HandSample, Reaction, Safety
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogWriter
@@ -68,7 +68,7 @@ class HandLoop:
         self._failing_since: float | None = None
         self._generation: int | None = None
         self._number = 0
-        self._driven = self._closed = False
+        self.driven = self._closed = False  # whether the motors may be on; whether the port is closed
 
     def step(self, target: np.ndarray | None = None) -> Exchange | None:
         """Make an exchange; None when it was not answered, or the measurement was implausible.
@@ -86,7 +86,7 @@ class HandLoop:
         command = self.sensing.command(decision.position, decision.mode)
         self._number += 1
         self._keep(Kind.SENT, frames.HOST, command, now)
-        self._driven |= decision.mode == Mode.POSITION
+        self.driven |= decision.mode == Mode.POSITION
         reply = self.port.exchange(command)
         exchange = None if reply is None else self._take(reply, decision.reaction)
         self._check(now, decision, reply)
@@ -118,18 +118,14 @@ class HandLoop:
         return self.safety.sample.measured.joint_position.astype(float)
 
     def close(self) -> None:
-        """Turn the motors off and close the port.
-
-        Raises:
-          HandError: the hand has not confirmed it.
-        """
+        """Turn the motors off and close the port; `driven` remains True if the hand has not confirmed it."""
         ignore_signals()
         if self._closed:
             return
         off = self.sensing.command(self.sensing.hand.joint_lower, Mode.PASSIVE)
         try:
-            if not turn_off(self.port, off, patience(self._driven)) and self._driven:
-                raise HandError(f"{UNCONFIRMED}; press the emergency stop")
+            if turn_off(self.port, off, patience(self.driven)):
+                self.driven = False
         finally:
             self._closed = True
             self.port.close()
