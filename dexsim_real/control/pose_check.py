@@ -63,17 +63,16 @@ class PoseCheck:
             self._agreeing = 0
             return f"{self._say(position, outside)}, outside its limits"
         room = _JUMP + self._speed * min(gap, _GAP)
-        if self._low is None:
-            agrees = self._last is not None and bool(np.all(np.abs(position - self._last) <= room))
+        last, low, high = self._last, self._low, self._high
+        if last is None or low is None or high is None:
+            agrees = last is not None and bool(np.all(np.abs(position - last) <= room))
             self._agreeing = self._agreeing + 1 if agrees else 1
             self._last, self._known_time = position, time
             return "" if self.known else UNKNOWN
-        jumped = (position < np.minimum(self._last, self._low) - room) | (
-            position > np.maximum(self._last, self._high) + room
-        )
-        jumped |= np.abs(position - self._last) > _JUMP + self._speed * (time - self._known_time)
+        jumped = (position < np.minimum(last, low) - room) | (position > np.maximum(last, high) + room)
+        jumped |= np.abs(position - last) > _JUMP + self._speed * (time - self._known_time)
         if jumped.any():
-            return f"{self._say(position, jumped)}, too far from {self._last[jumped.argmax()]:.2f} rad before"
+            return f"{self._say(position, jumped)}, too far from {last[jumped.argmax()]:.2f} rad before"
         self._last, self._known_time = position, time
         self._low = self._high = command
         return ""

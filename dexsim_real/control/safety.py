@@ -207,7 +207,7 @@ class Safety:
             return self._hold(now, sample, reason)
         if self._holding:
             self._restart(now)
-        return self._follow(now, sample, self._commanded if wish is None else wish[1])
+        return self._follow(now, sample, self.commanded if wish is None else wish[1])
 
     # --- pieces -----------------------------------------------------------------------------
 
@@ -263,7 +263,7 @@ class Safety:
         if reason == _FORCE:  # Staying there would keep the force.
             position = self._toward(now, sample.measured.joint_position, config.slow_speed)
         else:
-            position = self._toward(now, self._confirmed, config.speed)
+            position = self._toward(now, self.commanded if self._confirmed is None else self._confirmed, config.speed)
         return self._finish(now, Reaction.HOLD, reason, position)
 
     def _follow(self, now: float, sample: HandSample, target: np.ndarray) -> SafetyDecision:
@@ -271,8 +271,8 @@ class Safety:
         grown = min((now - self._ramp_start) / config.ramp, 1.0) if config.ramp > 0 else 1.0
         # Reach ends a motion away from the measured pose and starts none: that pose may be wrong.
         near = (
-            np.minimum(measured - config.reach, self._commanded),
-            np.maximum(measured + config.reach, self._commanded),
+            np.minimum(measured - config.reach, self.commanded),
+            np.maximum(measured + config.reach, self.commanded),
         )
         position = self._toward(
             now, np.clip(target, *near), config.slow_speed + grown * (config.speed - config.slow_speed)
@@ -285,7 +285,7 @@ class Safety:
     def _toward(self, now: float, goal: np.ndarray, speed: float) -> np.ndarray:
         """The next command on the way to a goal [J] rad: the last limits, after every other rule."""
         step = np.float32(speed * min(max(now - self._time, 0.0), _GAP))
-        return np.clip(self._inside(goal), self._commanded - step, self._commanded + step)
+        return np.clip(self._inside(goal), self.commanded - step, self.commanded + step)
 
     def _inside(self, position: np.ndarray) -> np.ndarray:
         return np.clip(position, self._lower, self._upper).astype(np.float32)

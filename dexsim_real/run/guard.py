@@ -49,6 +49,8 @@ class Guard:
             start_new_session=True,
             env={**os.environ, "PYTHONPATH": path},
         )
+        assert self._process.stdin and self._process.stdout
+        self._input, self._output = self._process.stdin, self._process.stdout
 
     def arm(self) -> None:
         """Wait until the process is ready; from now on it acts when this process ends.
@@ -56,8 +58,7 @@ class Guard:
         Raises:
           HandError: it did not start.
         """
-        output = self._process.stdout
-        if not select.select([output], [], [], _STARTUP)[0] or output.readline() != b"ready\n":
+        if not select.select([self._output], [], [], _STARTUP)[0] or self._output.readline() != b"ready\n":
             raise HandError("the guard process did not start; --no-guard runs without it")
         self._tell(_ON)
 
@@ -72,22 +73,22 @@ class Guard:
 
     def dismiss(self, off: bool) -> None:
         """End of the run. Unless the motors are confirmed to be `off`, the process turns them off."""
-        if self._process.stdin.closed:
+        if self._input.closed:
             return
         try:
             if off:
                 self._tell(_OFF)
-            self._process.stdin.close()
+            self._input.close()
         except OSError:
             pass  # It has ended before.
-        self._process.stdout.close()
+        self._output.close()
         if off:
             self._process.wait(_STARTUP)
 
     def _tell(self, word: bytes) -> None:
         try:
-            self._process.stdin.write(word)
-            self._process.stdin.flush()
+            self._input.write(word)
+            self._input.flush()
         except OSError:
             raise HandError("the guard process has ended") from None
 

@@ -219,8 +219,8 @@ def _with_values(fault: Fault, values: tuple[str, ...]) -> Fault:
         changes = {"joint": _within(joint, frames.JOINTS), "degrees": float(degrees), "seconds": float(seconds)}
     elif fault.kind == "angle":
         joint, form, radians, seconds = values
-        changes = {"joint": _within(joint, frames.JOINTS), "form": _FORMS[_FORMS.index(form)]}
-        changes |= {"radians": float(radians), "seconds": float(seconds)}
+        fault = dataclasses.replace(fault, form=_FORMS[_FORMS.index(form)])
+        changes = {"joint": _within(joint, frames.JOINTS), "radians": float(radians), "seconds": float(seconds)}
     elif fault.kind == "stuck":
         tip, taxel, count = values
         changes = {"taxel": (_within(tip, frames.TIPS), _within(taxel, frames.TAXELS)), "count": _within(count, 256)}
