@@ -38,8 +38,8 @@ def test_wrong_angles_move_nothing_as_judged_by_the_true_ones(hand, tmp_path):
         "4 angle 7 offset -0.9 0.2",
     )
     with Running(hand, tmp_path, task="grasp", faults=FaultConfig(script=script)) as running:
-        process = start(running, tmp_path, "--seconds", "5")
-        assert process.wait(60) == 0, process.stderr.read()
+        process = start(running, tmp_path, "--seconds", "5", "--safety.patience", "5", "--safety.watchdog", "1")
+        assert process.wait(60) == 0, summary(tmp_path)["end"]
         report = running.twin.report()
     assert report["faults"]["injected"] == {"angle": 4} and report["commands"]["outside_limits"] == 0
     assert summary(tmp_path)["safety"]["implausible: measurement"] > 20
