@@ -17,6 +17,7 @@ def inspect(path: Path, safe: float) -> dict:
       safe: s within which a loss must be noticed.
     """
     reader, link, end, state = LogReader(path), {}, "no end", None
+    implausible = 0
     states, sent, notes = [], [], []
     for record in reader:
         if record.kind == Kind.RECEIVED and record.content[1][4] == frames.Command.EXCHANGE:
@@ -29,6 +30,7 @@ def inspect(path: Path, safe: float) -> dict:
             notes.append((record.time, record.content.startswith(("hold: no measurement", "relax"))))
         elif record.kind == Kind.END:
             link, end = record.content["link"], record.content["end"]
+            implausible = record.content["safety"].get("implausible: measurement", 0)
 
     def stuck(taxels: list) -> bool:
         seen = frames.decode_state(state[7:-2])["tip"]["taxel"]["z"]
@@ -38,6 +40,7 @@ def inspect(path: Path, safe: float) -> dict:
         "link": link,
         "end": end.split(":")[0] + (": " + end.split(":")[1].strip() if "stopped" in end else ""),
         "damaged": reader.damaged,
+        "implausible": implausible,
         "holds": list(reactions(states, sent, notes, safe)),
         "stuck": stuck,
     }
@@ -109,6 +112,12 @@ def autopsy(path: Path, death: float) -> dict:
         again = replay(path).report
         row |= {"ticks": again["ticks"], "same": again["observations_same"] == again["readings_same"] == again["ticks"]}
     return row
+
+
+def on_at_end(report: dict) -> bool:
+    """Whether the last event that concerns the motors turned them on."""
+    changes = [text for _, text in report["events"] if text.startswith(("motors", "watchdog"))]
+    return changes[-1:] == ["motors on"]
 
 
 def motors_off(report: dict, death: float, until: float) -> float | None:

@@ -49,7 +49,7 @@ def record(arguments: CalibrateArguments, hand: Hand, operator: Operator, **benc
     # No motion here needs to be fast.
     slow = dataclasses.replace(arguments.safety, speed=min(arguments.safety.speed, _SPEED))
     arguments = dataclasses.replace(arguments, safety=slow)
-    with Workbench(arguments, hand, operator, {"task": "calibrate"}, **bench) as work:
+    with stopping(), Workbench(arguments, hand, operator, {"task": "calibrate"}, **bench) as work:
         procedure = PressProcedure(work.loop, arguments, operator, gauge)
         pressed = 0
         try:
@@ -64,6 +64,8 @@ def record(arguments: CalibrateArguments, hand: Hand, operator: Operator, **benc
             raise HandError(
                 f"{error} (the {pressed} presses before are in {work.log.path}; fit them with --from-log)"
             ) from None
+        finally:  # A signal that comes just before this line is followed by the close of the workbench.
+            work.loop.close()
     return work.log.path
 
 
@@ -103,12 +105,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     cli.enable_caches()
     hand = load_hand()
     operator = Operator(Console(stderr=True), assume_yes=arguments.yes)
-    with stopping():
-        if arguments.identify:
-            identify_hand(arguments, hand, operator)
-        else:
-            logs = arguments.from_log or (record(arguments, hand, operator),)
-            fit_and_report(arguments, hand, logs, operator)
+    if arguments.identify:
+        identify_hand(arguments, hand, operator)
+    else:
+        logs = arguments.from_log or (record(arguments, hand, operator),)
+        fit_and_report(arguments, hand, logs, operator)
     return 0
 
 

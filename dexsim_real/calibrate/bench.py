@@ -11,7 +11,9 @@ from dexsim.core.config import to_dict
 from dexsim.hand.kinematics import Hand
 from dexsim_real.calibrate.hand_loop import HandLoop, Operator
 from dexsim_real.calibrate.options import CalibrateArguments
+from dexsim_real.control.motors_off import UNCONFIRMED
 from dexsim_real.control.safety import Safety
+from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogWriter
 from dexsim_real.core.process import leave_realtime, use_realtime
 from dexsim_real.sensors.hand import HandSensing
@@ -88,11 +90,15 @@ class Workbench:
             self.loop.close()
         finally:
             end = "" if error is None else str(error) or kind.__name__
+            if self.loop.driven:
+                self._say(f"{UNCONFIRMED}: press the emergency stop")
             self.log.add(Kind.NOTE, f"end: {end or 'done'}")
             self.log.add(Kind.END, {"end": end})
             self.log.close()
             if self._arguments.realtime:
                 leave_realtime()
+        if self.loop.driven and error is None:
+            raise HandError(f"{UNCONFIRMED}: press the emergency stop")
 
     def _react(self, text: str) -> None:
         self.log.add(Kind.NOTE, text)

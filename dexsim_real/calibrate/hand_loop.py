@@ -15,9 +15,11 @@ from typing import Any, TextIO
 import numpy as np
 from rich.console import Console
 
+from dexsim_real.control.motors_off import patience, turn_off
 from dexsim_real.control.safety import HandSample, Reaction, Safety
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogWriter
+from dexsim_real.core.process import ignore_signals
 from dexsim_real.core.timing import Pace
 from dexsim_real.sensors.hand import HandSensing, VelocityFilter
 from dexsim_real.wire import frames
@@ -66,9 +68,10 @@ class HandLoop:
         self._failing_since: float | None = None
         self._generation: int | None = None
         self._number = 0
+        self.driven = self._closed = False  # whether the motors may be on; whether the port is closed
 
     def step(self, target: np.ndarray | None = None) -> Exchange | None:
-        """Make an exchange; None when it was not answered.
+        """Make an exchange; None when it was not answered, or the measurement was implausible.
 
         Args:
           target: [J] rad, requested joint targets; None keeps the last ones.
@@ -83,6 +86,7 @@ class HandLoop:
         command = self.sensing.command(decision.position, decision.mode)
         self._number += 1
         self._keep(Kind.SENT, frames.HOST, command, now)
+        self.driven |= decision.mode == Mode.POSITION
         reply = self.port.exchange(command)
         exchange = None if reply is None else self._take(reply, decision.reaction)
         self._check(now, decision, reply)
@@ -116,23 +120,28 @@ class HandLoop:
         return sample.measured.joint_position.astype(float)
 
     def close(self) -> None:
-        """Turn the motors off (repeat until the hand confirms it, at most ten times) and close the port."""
+        """Turn the motors off and close the port; `driven` remains True if the hand has not confirmed it."""
+        ignore_signals()
+        if self._closed:
+            return
         off = self.sensing.command(self.sensing.hand.joint_lower, Mode.PASSIVE)
         try:
-            for _ in range(10):
-                if self.port.exchange(off) is not None:
-                    break
+            if turn_off(self.port, off, patience(self.driven)):
+                self.driven = False
         finally:
+            self._closed = True
             self.port.close()
 
     # --- pieces ---------------------------------------------------------------------------------
 
-    def _take(self, reply: Reply, reaction: Reaction) -> Exchange:
+    def _take(self, reply: Reply, reaction: Reaction) -> Exchange | None:
         self._keep(Kind.RECEIVED, frames.palm_address(0), reply.state, reply.received)
         measured = self.sensing.measure(reply.state)
-        velocity = self._filter.update(reply.received, measured.joint_position)
+        velocity = self._filter.estimate(reply.received, measured.joint_position)
         sample = HandSample(reply.received, reply.sequence, reply.generation, measured, velocity)
-        self.safety.see(sample)
+        if not self.safety.see(sample):
+            return None
+        self._filter.update(reply.received, measured.joint_position)
         return Exchange(sample, reply.state, reaction <= Reaction.CLIP)
 
     def _keep(self, kind: Kind, source: int, block: np.ndarray, when: float) -> None:

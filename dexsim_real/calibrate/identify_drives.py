@@ -25,6 +25,7 @@ from dexsim_real.calibrate.hand_loop import Operator
 from dexsim_real.calibrate.options import CalibrateArguments
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogError, LogReader
+from dexsim_real.core.process import stopping
 from dexsim_real.sensors.hand import HardwareConfig
 from dexsim_real.wire import frames
 
@@ -88,23 +89,26 @@ def record(arguments: CalibrateArguments, hand: Hand, operator: Operator, **benc
     }
     seconds = sum(len(part) * period + 1.5 for signal in signals.values() for part in signal.values())
     operator.tell(f"the fingers move one after the other for {seconds / 60:.0f} minutes: keep clear of them")
-    with Workbench(arguments, hand, operator, {"task": TASK}, **bench) as work:
-        loop = work.loop
-        # Otherwise `Safety` would mistake the taxels' zero error for a touch.
-        loop.sensing.set_tare([exchange.state for exchange in loop.collect(0.5)])
-        loop.step()
-        if not operator.assume_yes and operator.ask("  Enter starts, s stops:", loop.step).lower() in ("s", "stop"):
-            raise HandError("stopped before anything moved")
-        work.safety.engage()
-        for name in next(iter(signals.values())):
-            operator.tell(name)
-            for label, targets in signals.items():
-                loop.move(targets[name][0])
-                loop.recording = True
-                for target in targets[name]:
-                    loop.step(target)
-                    loop.mark({"joint": name, "signal": label})
-                loop.recording = False
+    with stopping(), Workbench(arguments, hand, operator, {"task": TASK}, **bench) as work:
+        try:
+            loop = work.loop
+            # Otherwise `Safety` would mistake the taxels' zero error for a touch.
+            loop.sensing.set_tare([exchange.state for exchange in loop.collect(0.5)])
+            loop.step()
+            if not operator.assume_yes and operator.ask("  Enter starts, s stops:", loop.step).lower() in ("s", "stop"):
+                raise HandError("stopped before anything moved")
+            work.safety.engage()
+            for name in next(iter(signals.values())):
+                operator.tell(name)
+                for label, targets in signals.items():
+                    loop.move(targets[name][0])
+                    loop.recording = True
+                    for target in targets[name]:
+                        loop.step(target)
+                        loop.mark({"joint": name, "signal": label})
+                    loop.recording = False
+        finally:  # A signal that comes just before this line is followed by the close of the workbench.
+            work.loop.close()
     return work.log.path
 
 

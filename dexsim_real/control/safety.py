@@ -8,9 +8,12 @@ their times, so any course of events can be tested.
 | joint target outside position, speed or reach limits | clip |
 | joint target not finite; joint too fast; fingertip force too high; target or measurement too old | hold |
 | current too high for too long; too hot; targets or measurements missing for long | relax |
+| measured angles that cannot be true (`PoseCheck`) | no measurement; relax permanently when they last |
 
-Hold: the pose measured when the hold began, at the usual gains. Relax: motors off. After a hold or a reconnection the
-commands start at the measured pose, slowly at first.
+Hold: the last command that the hand confirmed, at the usual gains; when the force is too high, slowly toward the
+measured pose. Relax: motors off. The motors come on at the measured pose. Then each command differs from the one before
+by at most the speed limit times the time between them, whatever was measured or requested: this limit applies last.
+After a hold or a reconnection commands are slow at first.
 """
 
 import dataclasses
@@ -22,10 +25,13 @@ import numpy as np
 
 from dexsim.core.config import setting, validate
 from dexsim.hand.kinematics import Hand
+from dexsim_real.control.pose_check import UNKNOWN, PoseCheck
 from dexsim_real.sensors.hand import HandMeasurement
 from dexsim_real.wire.frames import Mode
 
 _SILENT, _DEAD = "no measurement", "no target"  # reasons that turn the motors off when they last
+_FORCE = "the fingertip force is too high"
+_GAP = 0.03  # s, longest interval between two commands that counts for the speed limit
 
 
 class Reaction(enum.IntEnum):
@@ -43,10 +49,12 @@ class SafetyConfig:
 
     margin: float = setting(0.0, unit="rad", low=0.0, high=0.5)
     """Distance of commands from the joints' end stops."""
+    beyond: float = setting(0.1, unit="rad", low=0.0, high=1.0)
+    """Distance beyond a joint's limits at which a measured angle counts as wrong."""
     speed: float = setting(20.0, unit="rad/s", low=0.01, high=200.0)
     """Largest rate of change of a command. A policy that changes targets by 0.2 rad needs 0.2 rad within a cycle."""
     reach: float = setting(0.6, unit="rad", low=0.01, high=4.0)
-    """Largest distance of a command from the measured angle."""
+    """Distance of a command from the measured angle beyond which it does not move farther away."""
     joint_speed: float = setting(20.0, unit="rad/s", low=0.1, high=1000.0)
     """Measured joint speed above which the hand holds."""
     current: float = setting(1.8, unit="A", low=0.01, high=20.0)
@@ -113,31 +121,53 @@ class Safety:
         self.config, self._note = config, note
         self._lower = hand.joint_lower.astype(np.float32) + config.margin
         self._upper = hand.joint_upper.astype(np.float32) - config.margin
-        self.sample: HandSample | None = None
+        self.sample: HandSample | None = None  # the newest plausible one
+        self.problem = ""  # why the newest measurement does not count
         self.engaged = False
         self.latched = ""  # why the motors are off permanently
-        self.anchor = 0  # number of times that commands restarted from the measured pose
+        self.anchor = 0  # number of times that commands restarted, after a hold or with the motors off before
         self.counts: Counter[str] = Counter()  # cycles by reason
         self._target: tuple[float, np.ndarray, str] | None = None  # time s, joint target, reason to hold
-        self._held: np.ndarray | None = None
+        self._pose = PoseCheck(hand, config.beyond)
+        self._generation: int | None = None
+        self._wrong: tuple[float, float] | None = None  # s, first and last of the newest wrong measurements
+        self._holding = False
         self._since = 0.0  # s, when the current reason to hold began
-        self._commanded: np.ndarray | None = None
+        self._commanded: np.ndarray | None = None  # last command with the motors on
+        self._confirmed: np.ndarray | None = None  # last one that the hand answered
         self._time = self._ramp_start = 0.0
         self._overcurrent_since: float | None = None  # s
         self.last = (Reaction.NONE, "")  # reaction and reason of the newest decision
 
-    def see(self, sample: HandSample) -> None:
-        """Update with a measurement; one that is not finite is ignored."""
-        if not sample.measured.finite():
-            self.counts["not finite: measurement"] += 1
-            return
-        if self.sample is not None and sample.generation != self.sample.generation:
-            # The hand was disconnected with its motors off: its pose may have changed.
-            self._commanded = None
-        self.sample = sample
-        high = bool(np.any(sample.measured.current > self.config.current))
+    @property
+    def commanded(self) -> np.ndarray:
+        """Where commands continue [J] rad: the last one, or the measured pose with the motors off."""
+        return self._rest() if self._commanded is None else self._commanded
+
+    def see(self, sample: HandSample) -> bool:
+        """Update with a measurement; returns whether it is plausible. Otherwise it does not count as one."""
+        if self._generation not in (None, sample.generation):
+            # The hand was disconnected with its motors off: its pose may have changed. A wrong reading remains wrong.
+            self._commanded = self._confirmed = None
+            if not self.problem:
+                self._pose.release()
+        self._generation, self._confirmed = sample.generation, self._commanded
+        measured = sample.measured
+        self.problem = (
+            self._pose.judge(sample.time, measured.joint_position, self._commanded)
+            if measured.finite()
+            else "not finite"
+        )
+        if self.problem:
+            if self.problem != UNKNOWN:
+                self.counts["implausible: measurement"] += 1
+                self._wrong = (sample.time if self._wrong is None else self._wrong[0]), sample.time
+            return False
+        self.sample, self._wrong = sample, None
+        high = bool(np.any(measured.current > self.config.current))
         since = self._overcurrent_since
         self._overcurrent_since = (sample.time if since is None else since) if high else None
+        return True
 
     def set_target(self, position: np.ndarray, time: float, hold_reason: str = "") -> None:
         """Set the requested joint targets.
@@ -151,7 +181,7 @@ class Safety:
 
     def engage(self) -> None:
         """Turn the motors on at the measured pose. No effect once latched."""
-        self.engaged, self._commanded, self._held, self._target = True, None, None, None
+        self.engaged, self._commanded, self._confirmed, self._target = True, None, None, None
 
     def relax(self, reason: str) -> None:
         """Turn the motors off permanently."""
@@ -161,32 +191,23 @@ class Safety:
         """The command for this cycle."""
         if not self.engaged or self.latched or self.sample is None:
             return self._finish(now, Reaction.RELAX, self.latched or "not engaged", self._rest())
-        sample, config = self.sample, self.config
+        sample = self.sample
         fatal = self._fatal(now, sample)
         if fatal:
             self.relax(fatal)
             return self._finish(now, Reaction.RELAX, fatal, self._rest())
-        reason = self._reason_to_hold(now, sample)
-        # A hand that was silent may have turned its motors off: its pose may have changed.
-        back = self.last[1] == _SILENT and reason != _SILENT
-        if self._commanded is None or back:
+        if self._commanded is None:
+            if self.problem or not self._pose.known:
+                silent = now - sample.time > self.config.stale and not self.problem
+                return self._finish(now, Reaction.RELAX, _SILENT if silent else self.problem or UNKNOWN, self._rest())
             self._start(now, sample)
+        wish = self._target  # Read once: another thread may replace it meanwhile.
+        reason = self._reason_to_hold(now, sample, wish)
         if reason:
-            if self._held is None:
-                self._held = self._inside(sample.measured.joint_position)
-            if reason != self.last[1]:
-                self._since = now
-            if reason in (_SILENT, _DEAD) and now - self._since > config.patience:
-                if reason == _DEAD:
-                    self.relax(f"{reason} for {config.patience:g} s")
-                # Without measurements the pose is unknown: restart from the next measured one.
-                self._commanded = None
-                return self._finish(now, Reaction.RELAX, reason, self._held)
-            self._commanded = self._held
-            return self._finish(now, Reaction.HOLD, reason, self._held)
-        if self._held is not None:
-            self._start(now, sample)
-        return self._follow(now, sample)
+            return self._hold(now, sample, reason)
+        if self._holding:
+            self._restart(now)
+        return self._follow(now, sample, self.commanded if wish is None else wish[1])
 
     # --- pieces -----------------------------------------------------------------------------
 
@@ -197,47 +218,74 @@ class Safety:
         if self._overcurrent_since is not None and sample.time - self._overcurrent_since > config.current_seconds:
             current = sample.measured.current
             return f"current too high: {current.max():.2f} A in joint {current.argmax()}"
+        if self._wrong is not None and self._wrong[1] - self._wrong[0] > config.patience:
+            return f"implausible measurements for {config.patience:g} s: {self.problem}"
         return ""
 
-    def _reason_to_hold(self, now: float, sample: HandSample) -> str:
+    def _reason_to_hold(self, now: float, sample: HandSample, wish: tuple[float, np.ndarray, str] | None) -> str:
         config, force = self.config, sample.measured.finger_force
         if now - sample.time > config.stale:
             return _SILENT
         if np.any(np.abs(sample.velocity) > config.joint_speed):
             return "a joint is too fast"
         if force.max() > config.finger_force or force.sum() > config.total_force:
-            return "the fingertip force is too high"
-        if self._target is not None and not np.isfinite(self._target[1]).all():
+            return _FORCE
+        if wish is None:  # Before the first target the start pose is the target.
+            return ""
+        if not np.isfinite(wish[1]).all():
             return "target is not finite"
-        # Before the first target the start pose is the target.
-        if self._target is not None and now - self._target[0] > config.watchdog:
-            return _DEAD
-        return self._target[2] if self._target is not None else ""
+        return _DEAD if now - wish[0] > config.watchdog else wish[2]
 
     def _start(self, now: float, sample: HandSample) -> None:
-        self._commanded, self._held = self._inside(sample.measured.joint_position), None
-        self._ramp_start = self._time = now
+        """Turn the motors on at the measured pose."""
+        self._commanded = self._confirmed = self._inside(sample.measured.joint_position)
+        self._time = now
+        self._restart(now)
+
+    def _restart(self, now: float) -> None:
+        """Continue from the last command, slowly at first."""
+        self._holding, self._ramp_start = False, now
         self.anchor += 1
 
-    def _follow(self, now: float, sample: HandSample) -> SafetyDecision:
+    def _hold(self, now: float, sample: HandSample, reason: str) -> SafetyDecision:
         config = self.config
-        assert self._commanded is not None, "`_start` comes first"
-        if self._target is None:
-            return self._finish(now, Reaction.NONE, "", self._commanded)
-        target = self._target[1]
+        if reason != self.last[1]:
+            self._since = now
+        if reason in (_SILENT, _DEAD) and now - self._since > config.patience:
+            if reason == _DEAD:
+                self.relax(f"{reason} for {config.patience:g} s")
+            elif not self.problem:
+                self._pose.release()
+            # With the motors off the pose may change: restart from the next one that is known.
+            self._commanded = self._confirmed = None
+            return self._finish(now, Reaction.RELAX, reason, self._rest())
+        self._holding = True
+        if reason == _FORCE:  # Staying there would keep the force.
+            position = self._toward(now, sample.measured.joint_position, config.slow_speed)
+        else:
+            position = self._toward(now, self.commanded if self._confirmed is None else self._confirmed, config.speed)
+        return self._finish(now, Reaction.HOLD, reason, position)
+
+    def _follow(self, now: float, sample: HandSample, target: np.ndarray) -> SafetyDecision:
+        config, measured = self.config, sample.measured.joint_position
         grown = min((now - self._ramp_start) / config.ramp, 1.0) if config.ramp > 0 else 1.0
-        speed = config.slow_speed + grown * (config.speed - config.slow_speed)
-        step = np.float32(speed * max(now - self._time, 0.0))
-        measured = sample.measured.joint_position
-        position = np.clip(target, self._commanded - step, self._commanded + step)
-        position = np.clip(position, measured - config.reach, measured + config.reach)
-        position = self._inside(position)
-        clipped = np.abs(position - target) > 1e-5
-        self._commanded = position
-        if not clipped.any():
+        # Reach ends a motion away from the measured pose and starts none: that pose may be wrong.
+        near = (
+            np.minimum(measured - config.reach, self.commanded),
+            np.maximum(measured + config.reach, self.commanded),
+        )
+        position = self._toward(
+            now, np.clip(target, *near), config.slow_speed + grown * (config.speed - config.slow_speed)
+        )
+        if not np.any(np.abs(position - target) > 1e-5):
             return self._finish(now, Reaction.NONE, "", position)
         ramping = " (ramp)" if grown < 1 else ""
         return self._finish(now, Reaction.CLIP, f"target beyond a limit{ramping}", position)
+
+    def _toward(self, now: float, goal: np.ndarray, speed: float) -> np.ndarray:
+        """The next command on the way to a goal [J] rad: the last limits, after every other rule."""
+        step = np.float32(speed * min(max(now - self._time, 0.0), _GAP))
+        return np.clip(self._inside(goal), self.commanded - step, self.commanded + step)
 
     def _inside(self, position: np.ndarray) -> np.ndarray:
         return np.clip(position, self._lower, self._upper).astype(np.float32)
@@ -249,6 +297,9 @@ class Safety:
 
     def _finish(self, now: float, reaction: Reaction, reason: str, position: np.ndarray) -> SafetyDecision:
         self._time = now
+        if reaction != Reaction.RELAX:
+            self._commanded = position
+            self._pose.follow(position)
         self.counts[reason] += bool(reason)
         if (reaction, reason) != self.last:
             self._note(f"{reaction.name.lower()}: {reason}" if reason else "in command")

@@ -7,8 +7,9 @@ this thread, it turns the motors off.
 import threading
 import time
 
+from dexsim_real.control.motors_off import patience, turn_off
 from dexsim_real.control.safety import HandSample, Safety
-from dexsim_real.core.process import raise_priority
+from dexsim_real.core.process import ignore_signals, raise_priority
 from dexsim_real.core.timing import Pace, Timing
 from dexsim_real.sensors.hand import HandSensing, VelocityFilter
 from dexsim_real.wire.frames import Mode
@@ -31,7 +32,10 @@ class Servo:
         self.round_trip = Timing()
         self.waited = 0  # deadlines missed because of late answers
         self.error: BaseException | None = None
+        self.driven = False  # whether the motors may be on
         self._filter = VelocityFilter(sensing.config.velocity_time)
+        self._generation = 0
+        self._rested = False
         self._stop = threading.Event()
         self._engage = False
         self._fresh = threading.Event()
@@ -58,16 +62,17 @@ class Servo:
         return now + (self.pace.next + lead - now) % period
 
     def wait_fresh(self, seconds: float) -> HandSample | None:
-        """Wait for the next sample; None when none arrives in time."""
+        """Wait for the next plausible sample; None when none arrives in time."""
         self._fresh.clear()
         return self.safety.sample if self._fresh.wait(seconds) else None
 
     def stop(self) -> None:
-        """Turn the motors off and close the port."""
+        """Turn the motors off and close the port; `driven` remains True if the hand has not confirmed it."""
+        ignore_signals()
         self._stop.set()
         if self._thread.ident is not None:
             self._thread.join()
-        else:
+        elif not self._rested:
             self._rest()
 
     def _run(self) -> None:
@@ -94,32 +99,36 @@ class Servo:
             self.safety.engage()
             self._engage = False
         decision = self.safety.decide(time.monotonic())
+        self.driven |= decision.mode == Mode.POSITION
         started = time.monotonic()
         reply = self.port.exchange(self.sensing.command(decision.position, decision.mode))
         took = time.monotonic() - started
         if reply is None:
             return took
+        self.driven = decision.mode == Mode.POSITION
         self.round_trip.add(reply.received - reply.sent)
-        self.safety.see(self._sample(reply))
-        self._fresh.set()
+        sample = self._sample(reply)
+        if self.safety.see(sample):
+            self._filter.update(sample.time, sample.measured.joint_position)
+            self._fresh.set()
         return took
 
     def _sample(self, reply: Reply) -> HandSample:
         measured = self.sensing.measure(reply.state)
-        before = self.safety.sample
-        if before is not None and before.generation != reply.generation:
+        if reply.generation != self._generation:
             self._filter.reset()
+        self._generation = reply.generation
         velocity = self.sensing.velocity(reply.state)
         if velocity is None:
-            velocity = self._filter.update(reply.received, measured.joint_position)
+            velocity = self._filter.estimate(reply.received, measured.joint_position)
         return HandSample(reply.received, reply.sequence, reply.generation, measured, velocity)
 
     def _rest(self) -> None:
-        """Turn the motors off: repeat until the hand confirms it, at most ten times."""
+        """Turn the motors off, and close the port."""
         off = self.sensing.command(self.sensing.hand.joint_lower, Mode.PASSIVE)
+        self._rested = True
         try:
-            for _ in range(10):
-                if self.port.exchange(off) is not None:
-                    break
+            if turn_off(self.port, off, patience(self.driven)):
+                self.driven = False
         finally:
             self.port.close()

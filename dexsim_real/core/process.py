@@ -54,21 +54,41 @@ def _change_priority(by: int) -> None:
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_PRIORITY + by))
 
 
+_ENDING = ("SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP")
+_armed = False  # whether a signal may still interrupt the program
+
+
 @contextlib.contextmanager
 def stopping() -> Iterator[None]:
-    """Within this context SIGTERM and SIGHUP raise SystemExit(128 + number), and SIGINT raises KeyboardInterrupt.
+    """Within this context the first signal that would end or suspend the program interrupts it; later ones do nothing.
 
-    A shell starts background programs with SIGINT ignored. It is handled here nevertheless, so that a moving hand
-    can always be interrupted.
+    SIGTERM, SIGHUP, SIGQUIT and SIGTSTP (Ctrl-Z) raise SystemExit(128 + number), and SIGINT raises KeyboardInterrupt.
+    A second one could otherwise interrupt what turns the motors off. A shell starts background programs with SIGINT
+    ignored. It is handled here nevertheless, so that a moving hand can always be interrupted.
     """
-    handlers = {signal.SIGTERM: _terminate, signal.SIGHUP: _terminate, signal.SIGINT: signal.default_int_handler}
-    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
+    global _armed
+    numbers = [signal.SIGINT, *(getattr(signal, name) for name in _ENDING if hasattr(signal, name))]
+    before = {number: signal.signal(number, _interrupt) for number in numbers}
+    _armed = True
     try:
         yield
     finally:
+        _armed = False
         for number, handler in before.items():
             signal.signal(number, handler)
 
 
-def _terminate(number: int, frame: Any) -> None:
+def ignore_signals() -> None:
+    """From now on no signal interrupts the program, up to the end of `stopping`: call it before the motors go off."""
+    global _armed
+    _armed = False
+
+
+def _interrupt(number: int, frame: Any) -> None:
+    global _armed
+    if not _armed:
+        return
+    _armed = False
+    if number == signal.SIGINT:
+        raise KeyboardInterrupt
     raise SystemExit(128 + number)

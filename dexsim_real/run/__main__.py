@@ -32,27 +32,32 @@ def main(argv: Sequence[str] | None = None) -> int:
     reason, code = "", 0
     with stopping():
         try:
-            session.prepare()
-            session.run()
-        except HandError as error:
-            reason, code = str(error), 1
-            if not session.started:
+            try:
+                session.prepare()
+                session.run()
+            except HandError as error:
+                reason, code = str(error), 1
+                if not session.started:
+                    raise
+            except KeyboardInterrupt:
+                reason, code = "Ctrl-C", 130
+            except SystemExit as stop:
+                code = stop.code if isinstance(stop.code, int) else 1
+                reason = f"signal {code - 128}"
+            except BaseException as error:
+                reason = f"failure: {error!r}"
                 raise
-        except KeyboardInterrupt:
-            reason, code = "Ctrl-C", 130
-        except SystemExit as stop:
-            code = stop.code if isinstance(stop.code, int) else 1
-            reason = f"signal {code - 128}"
-        except BaseException as error:
-            reason = f"failure: {error!r}"
-            raise
-        finally:
+            finally:
+                session.close(reason)
+        finally:  # Again: the one signal that interrupts may have come just before the line above.
             session.close(reason)
-    summary = session.summary()
-    if not arguments.quiet:
-        session.view.console.print(summary_table(f"{session.controller.policy.task}: {session.end}", summary))
-    if arguments.output:
-        cli.write_json(arguments.output, summary)
+        if session.servo.driven:
+            code = 1
+        summary = session.summary()
+        if not arguments.quiet:
+            session.view.console.print(summary_table(f"{session.controller.policy.task}: {session.end}", summary))
+        if arguments.output:
+            cli.write_json(arguments.output, summary)
     return code
 
 

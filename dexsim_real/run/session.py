@@ -18,12 +18,14 @@ from dexsim.core.config import to_dict
 from dexsim_ppo.policy import load_policy
 from dexsim_real.control.controller import IDENTITY, Controller, Tick
 from dexsim_real.control.goals import TurnGoals
+from dexsim_real.control.motors_off import UNCONFIRMED
 from dexsim_real.control.safety import Safety
 from dexsim_real.control.servo import Servo
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogWriter
-from dexsim_real.core.process import leave_realtime, use_realtime
+from dexsim_real.core.process import ignore_signals, leave_realtime, use_realtime
 from dexsim_real.core.timing import Pace, Timing, keep_phase
+from dexsim_real.run.guard import Guard
 from dexsim_real.run.object_sensors import ObjectSensors
 from dexsim_real.run.options import RunArguments
 from dexsim_real.run.status import StatusView
@@ -45,6 +47,9 @@ class Session:
 
     def __init__(self, arguments: RunArguments):
         self.arguments = arguments
+        serial = not arguments.port.startswith("sdk:") and "://" not in arguments.port
+        wanted = arguments.guard and serial and not arguments.motors_off
+        self.guard = Guard(arguments.port, arguments.link) if wanted else None
         policy, hand = load_policy(arguments.policy), load_hand()
         self.controller = Controller(policy, hand)
         calibration = load_calibration(arguments.calibration, hand) if arguments.calibration else None
@@ -67,7 +72,7 @@ class Session:
         self.compute, self.pace = Timing(), Pace(policy.control_rate)
         self.started = self.force = self.forces = 0.0
         self.tick: Tick | None = None
-        self.end = "not started"
+        self.end, self._closed = "not started", False
         if arguments.realtime and not realtime:
             self._note("without real-time priority: expect jitter on a busy machine (docs/hardware.md)")
 
@@ -87,6 +92,8 @@ class Session:
         self._write_meta()
         self.servo.start()
         if self.servo.wait_fresh(1.0) is None:
+            if self.safety.problem:
+                raise HandError(f"{self.arguments.port}: {self.safety.problem}; check `--hardware.joint-offset`")
             raise HandError(f"{self.arguments.port}: the hand stopped answering; check the cable and the power")
         self.objects = ObjectSensors(self.arguments, self.controller)
         spec = self.controller.spec
@@ -103,6 +110,8 @@ class Session:
         gc.collect()
         gc.freeze()
         with self.view:
+            if self.guard:
+                self.guard.arm()
             if not self.arguments.motors_off:
                 self.servo.engage()
             self._approach()
@@ -111,9 +120,16 @@ class Session:
             self.end = self._loop()
 
     def close(self, reason: str = "") -> None:
-        """Turn the motors off and close everything; may be called at any stage."""
+        """Turn the motors off and close everything; may be called at any stage, and again."""
+        ignore_signals()
+        if self._closed:
+            return
         self.end = reason or self.end
         self.servo.stop()
+        if self.guard:
+            self.guard.dismiss(off=not self.servo.driven)
+        if self.servo.driven:
+            self.end += f"; {UNCONFIRMED}: press the emergency stop"
         if self.objects:
             self.objects.close()
         self._note(f"end: {self.end}")
@@ -122,12 +138,14 @@ class Session:
         gc.unfreeze()
         sys.setswitchinterval(_SWITCH)
         leave_realtime()
+        self._closed = True
 
     def summary(self) -> dict[str, Any]:
         """Results and statistics of the run; JSON-able."""
         servo, safety = self.servo, self.safety
         summary = {
             "end": self.end,
+            "motors_off": not self.servo.driven,
             "seconds": round(time.monotonic() - self.started, 3) if self.started else 0.0,
             "command": self.arguments.command,
             "policy_jitter": self.pace.jitter.summary(),
@@ -188,6 +206,8 @@ class Session:
         return self.safety.sample.measured.joint_position
 
     def _check(self) -> None:
+        if self.guard:
+            self.guard.check()
         if self.servo.error is not None:
             raise HandError(f"the exchange thread failed: {self.servo.error!r}")
         if self.safety.latched:
@@ -206,7 +226,7 @@ class Session:
             if now - sample.time <= self.safety.config.stale:
                 if anchor != self.safety.anchor:
                     anchor = self.safety.anchor
-                    self.controller.anchor(sample.measured.joint_position)
+                    self.controller.anchor(self.safety.commanded)
                 self._tick(now, sample)
                 self.compute.add(time.monotonic() - now)
             self.pace.wait()

@@ -157,9 +157,13 @@ class HandSensing:
         self.tare = counts
 
     def command(self, position: np.ndarray, mode: Mode) -> np.ndarray:
-        """A `frames.COMMAND_BLOCK` for joint angles [J] rad of the model. Gains are 0 in all modes but `POSITION`."""
+        """A `frames.COMMAND_BLOCK` for joint angles [J] rad of the model. Gains are 0 in all modes but `POSITION`.
+
+        Raises:
+          HandError: an angle is not finite.
+        """
         config, on = self.config, mode == Mode.POSITION
-        return frames.command_block(
+        block = frames.command_block(
             (np.asarray(position) - self._offset) * self._sign,
             kp=np.array(config.kp) * on,
             ki=np.array(config.ki) * on,
@@ -167,6 +171,9 @@ class HandSensing:
             torque_max=config.torque_max * on,
             mode=mode,
         )
+        if not np.isfinite(block["position"]).all():
+            raise HandError("a command is not finite; it was not sent")
+        return block
 
     def velocity(self, state: np.ndarray) -> np.ndarray | None:
         """Reported joint velocities [J] rad/s; None when they must be estimated."""
@@ -197,12 +204,17 @@ class VelocityFilter:
         self._last: tuple[float, np.ndarray] | None = None
         self.velocity = np.zeros(_JOINTS, np.float32)
 
+    def estimate(self, time: float, position: np.ndarray) -> np.ndarray:
+        """Velocities [J] rad/s if this measurement [J] rad at a time in s were kept."""
+        if self._last is None or time <= self._last[0]:
+            return self.velocity
+        step = time - self._last[0]
+        weight = step / (step + self._constant)
+        rate = (position - self._last[1]) / step
+        return (self.velocity + weight * (rate - self.velocity)).astype(np.float32)
+
     def update(self, time: float, position: np.ndarray) -> np.ndarray:
-        """Velocities [J] rad/s after a measurement [J] rad at a time in s."""
-        if self._last is not None and time > self._last[0]:
-            step = time - self._last[0]
-            weight = step / (step + self._constant)
-            rate = (position - self._last[1]) / step
-            self.velocity = (self.velocity + weight * (rate - self.velocity)).astype(np.float32)
+        """Keep a measurement [J] rad at a time in s; returns the velocities [J] rad/s after it."""
+        self.velocity = self.estimate(time, position)
         self._last = time, position
         return self.velocity

@@ -204,7 +204,7 @@ class VirtualRun:
         while self.plant.trial == trial and self._now < began + limit:
             if anchor != self.safety.anchor:
                 anchor = self.safety.anchor
-                self.controller.anchor(self._pose())
+                self.controller.anchor(self.safety.commanded)
             self._tick()
             tick += 1
             self._until(began + tick * self.controller.period)
@@ -252,8 +252,9 @@ class VirtualRun:
         for frame in self._replies.feed(data):
             self._state = frames.decode_state(frame.data)
             measured = self.sensing.measure(self._state)
-            velocity = self._filter.update(self._now, measured.joint_position)
-            self.safety.see(HandSample(self._now, 0, 0, measured, velocity))
+            velocity = self._filter.estimate(self._now, measured.joint_position)
+            if self.safety.see(HandSample(self._now, 0, 0, measured, velocity)):
+                self._filter.update(self._now, measured.joint_position)
 
     def _sense_orientation(self) -> None:
         data = self.imu.sample()

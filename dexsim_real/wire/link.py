@@ -32,7 +32,7 @@ class LinkConfig:
     paced: bool = setting(True)
     """Reject answers that arrive sooner than the baud rate allows: they belong to an earlier request. Turn this off for
     an emulated line without timing."""
-    backoff: tuple[float, float] = setting((0.1, 3.0), unit="s", low=0.001, high=600.0)
+    backoff: tuple[float, float] = setting((0.1, 0.5), unit="s", low=0.001, high=600.0)
     """First and longest wait between attempts to reconnect; it doubles at each attempt."""
 
     def __post_init__(self):

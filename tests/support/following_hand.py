@@ -57,6 +57,7 @@ def arguments(peer, folder, *more):
         str(folder / "run.json"),
         "--quiet",
         "--no-realtime",
+        "--no-guard",
         *more,
     ]
 

@@ -29,9 +29,9 @@ def ask(board, kind, data=b"", now=0.0, target=0x80):
 class Bench:
     """A line, and a host that writes and reads in virtual time."""
 
-    def __init__(self, folder, hand, *, line=None, seed=0):
+    def __init__(self, folder, hand, *, line=None, board=None, seed=0):
         self.plant, self.notes = ScriptedPlant(), []
-        self.board = Firmware(self.plant, FirmwareConfig(), self.notes.append)
+        self.board = Firmware(self.plant, board or FirmwareConfig(), self.notes.append)
         self.line = HandLine(
             Terminal(folder / "hand"),
             self.plant,

@@ -1,7 +1,10 @@
-"""Checks every command that the emulated hand receives against limits, whatever the motors do with it."""
+"""Checks every command that the emulated hand receives against limits, whatever the motors do with it.
+
+Commands are compared with the true joint angles, not with the reported ones, which may be wrong (a fault).
+"""
 
 import dataclasses
-from collections import Counter, deque
+from collections import Counter
 
 import numpy as np
 
@@ -14,17 +17,14 @@ class LimitsConfig:
     """Limits of commands. The joint ranges come with the hand."""
 
     speed: float = setting(20.0, unit="rad/s", low=0.01, high=1000.0)
-    """Largest rate of change of a commanded angle, the bridge's `--safety.speed`. A joint may always be commanded to an
-    angle of the last `recent` seconds, to stop it."""
-    recent: float = setting(0.15, unit="s", low=0.0, high=10.0)
-    """Largest age of a joint angle to which the bridge stops a joint."""
+    """Largest rate of change of a commanded angle, the bridge's `--safety.speed`."""
     slack: float = setting(0.004, unit="s", low=0.0, high=1.0)
     """Time by which the interval between two commands may be shorter at the hand than at the bridge."""
     reach: float = setting(0.75, unit="rad", low=0.01, high=10.0)
-    """Largest distance of a command from the last reported angle: the bridge's `--safety.reach` and the motion of a
-    joint during an exchange."""
+    """Largest distance of a command from the true angle: the bridge's `--safety.reach` and the motion of a joint during
+    an exchange."""
     start: float = setting(0.05, unit="rad", low=0.0, high=1.0)
-    """Largest distance from the reported angle of a command that turns the motors on."""
+    """Largest distance from the true angle of a command that turns the motors on."""
     torque_max: int = setting(400, unit="mA", low=0, high=32767)
     """Largest current limit in a command."""
 
@@ -49,32 +49,28 @@ class CommandCheck:
         self.wrong: Counter[str] = Counter()
         self.first: list[str] = []  # descriptions of the first ones
         self._last: tuple[float, np.ndarray, np.ndarray] | None = None
-        self._shown: deque[tuple[float, np.ndarray]] = deque()  # reported angles, recent ones
 
-    def take(self, now: float, command: np.ndarray, reported: np.ndarray, since: float | None = None) -> list[str]:
+    def take(self, now: float, command: np.ndarray, angles: np.ndarray, since: float | None = None) -> list[str]:
         """Check joint commands; returns the names of the limits that they exceed.
 
         Args:
           now: s, time of reception.
           command: [12] `frames.JOINT_COMMAND`.
-          reported: [12] rad, angles of the last state that was sent.
+          angles: [12] rad, true angles at the last state that was sent.
           since: s, earliest possible time of arrival; None is `now`.
         """
-        found = self._find(now, now if since is None else since, command, reported)
+        found = self._find(now, now if since is None else since, command, angles)
         self.checked += 1
         self.wrong.update(found)
         if found and len(self.first) < self.MAX_LISTED:
             self.first.append(
                 f"{now:.4f} {', '.join(found)}: {np.round(command['position'], 4).tolist()}, "
-                f"reported {np.round(reported, 4).tolist()}"
+                f"joints at {np.round(angles, 4).tolist()}"
             )
         return found
 
-    def _find(self, now: float, since: float, command: np.ndarray, reported: np.ndarray) -> list[str]:
+    def _find(self, now: float, since: float, command: np.ndarray, angles: np.ndarray) -> list[str]:
         config, position = self.config, command["position"].astype(float)
-        self._shown.append((now, reported))
-        while self._shown[0][0] < now - config.recent:
-            self._shown.popleft()
         on = command["mode"] != Mode.PASSIVE
         before, self._last = self._last, None
         if not np.isin(command["mode"], list(Mode)).all():
@@ -88,25 +84,19 @@ class CommandCheck:
             found.append("range")
         if np.any(on & ((command["torque_max"] < 0) | (command["torque_max"] > config.torque_max))):
             found.append("current limit")
-        if np.any(on & (np.abs(position - reported) > config.reach)):
+        if np.any(on & (np.abs(position - angles) > config.reach)):
             found.append("reach")
-        # A hand that was off starts from the reported angle; one that is on continues from the last command.
+        # A hand that was off starts from the true angle; one that is on continues from the last command.
         fresh = on if before is None else on & ~before[2]
-        if np.any(fresh & (np.abs(position - reported) > config.start)):
+        if np.any(fresh & (np.abs(position - angles) > config.start)):
             found.append("start")
         if before is not None:
-            step = np.where(on & before[2] & ~self._stops(position), np.abs(position - before[1]), 0.0)
+            step = np.where(on & before[2], np.abs(position - before[1]), 0.0)
             speed = float(np.nanmax(step)) / (now - before[0] + config.slack)
             self.fastest = max(self.fastest, speed)
             if speed > config.speed:
                 found.append("speed")
         return found
-
-    def _stops(self, position: np.ndarray) -> np.ndarray:
-        """Mask [12] of the joints that are commanded to a recently reported angle."""
-        shown = np.stack([angles for _, angles in self._shown])
-        near = self.config.start
-        return (position >= shown.min(0) - near) & (position <= shown.max(0) + near)
 
     def report(self) -> dict[str, object]:
         """Results; JSON-able."""

@@ -10,6 +10,7 @@ An exchange has at most one fault, so the injected faults determine what the hos
 | stall | the hand ignores this request, and all others for a while | `silent` |
 | disconnect | the terminal disappears and returns with the same name | one `lost`, then one `reconnects` |
 | heat | a motor gets hotter | none: `Safety` ends the run |
+| angle | a joint reports a wrong angle: its own with an offset, or a constant one | none: the frame is intact |
 | stuck | a taxel reports a constant count from now on | none: the count is in every state |
 """
 
@@ -24,7 +25,8 @@ from dexsim_real.core.errors import HandError
 from dexsim_real.wire import frames
 
 BYTES = ("flip", "drop", "duplicate")
-KINDS = (*BYTES, "late", "stall", "disconnect", "heat", "stuck")
+KINDS = (*BYTES, "late", "stall", "disconnect", "heat", "stuck", "angle")
+_FORMS = ("offset", "stuck")  # of a wrong angle
 _RUN = 40  # bytes, longest run that is dropped or duplicated
 
 
@@ -48,6 +50,8 @@ class FaultConfig:
     """Probability that a motor gets hot for a while, per exchange."""
     stuck: float = setting(0.0, unit="1", low=0.0, high=1.0)
     """Probability that another taxel gets stuck, per exchange."""
+    angle: float = setting(0.0, unit="1", low=0.0, high=1.0)
+    """Probability that a joint reports a wrong angle for a while, per exchange: with an offset, stuck, or huge."""
     on_request: float = setting(0.3, unit="1", low=0.0, high=1.0)
     """Probability that damaged bytes are in the request instead of the answer."""
     late_seconds: tuple[float, float] = setting((0.1, 0.15), unit="s", low=0.0, high=10.0)
@@ -60,16 +64,22 @@ class FaultConfig:
     """Temperature rise of a hot motor."""
     heat_seconds: float = setting(2.0, unit="s", low=0.0, high=3600.0)
     """Duration for which a motor stays hot."""
+    angle_offset: tuple[float, float] = setting((0.7, 1.5), unit="rad", low=0.0, high=10.0)
+    """Range of the magnitude of a wrong angle's offset."""
+    angle_seconds: tuple[float, float] = setting((0.0, 0.8), unit="s", low=0.0, high=60.0)
+    """Range of the duration of a wrong angle; 0 is a single frame."""
     stuck_count: tuple[int, int] = setting((5, 30), unit="count", low=0, high=255)
     """Range of the count of a stuck taxel."""
     script: tuple[str, ...] = ()
     """Scripted faults, such as "12.5 stall 0.2": seconds after the first exchange, kind, values
     (`flip|drop|duplicate [request|answer]`, `late|stall|disconnect SECONDS`, `heat JOINT KELVIN SECONDS`,
-    `stuck TIP TAXEL COUNT`). Missing values are sampled."""
+    `stuck TIP TAXEL COUNT`, `angle JOINT offset|stuck RADIANS SECONDS`). Missing values are sampled."""
 
     def __post_init__(self):
         validate(self)
-        check_ranges(self, "late_seconds", "stall_seconds", "away_seconds", "stuck_count")
+        check_ranges(
+            self, "late_seconds", "stall_seconds", "away_seconds", "stuck_count", "angle_offset", "angle_seconds"
+        )
         if sum(getattr(self, kind) for kind in KINDS) > 1:
             raise HandError("FaultConfig: the probabilities of all faults must not exceed 1 in sum")
         for line in self.script:
@@ -84,6 +94,8 @@ class Fault:
     on_request: bool = False  # whether the request is damaged instead of the answer
     seconds: float = 0.0  # s, delay or duration
     joint: int = 0
+    form: str = "offset"  # of a wrong angle
+    radians: float = 0.0
     degrees: float = 0.0  # K
     taxel: tuple[int, int] = (0, 0)  # tip, number
     count: int = 0
@@ -161,16 +173,28 @@ class Injector:
             "stall": config.stall_seconds,
             "disconnect": config.away_seconds,
             "heat": (config.heat_seconds, config.heat_seconds),
+            "angle": config.angle_seconds,
         }
+        form, radians = self._wrong_angle() if kind == "angle" else ("offset", 0.0)
         return Fault(
             kind,
             bool(kind in BYTES and rng.random() < config.on_request),
             float(rng.uniform(*spans[kind])) if kind in spans else 0.0,
             int(rng.integers(frames.JOINTS)),
+            form,
+            radians,
             config.heat_degrees,
             (int(rng.integers(frames.TIPS)), int(rng.integers(frames.TAXELS))),
             int(rng.integers(config.stuck_count[0], config.stuck_count[1] + 1)),
         )
+
+    def _wrong_angle(self) -> tuple[str, float]:
+        """Form and rad of a wrong angle: an offset, an angle within or near the limits, or a huge number."""
+        rng = self._rng
+        sort = int(rng.integers(3))
+        if sort == 0:
+            return "offset", float(rng.choice([-1.0, 1.0]) * rng.uniform(*self.config.angle_offset))
+        return "stuck", float(rng.uniform(-0.5, 2.5)) if sort == 1 else float(rng.choice([-1e30, 1e30]))
 
     def _damage(self, kind: str, data: bytearray) -> bytes:
         rng, at = self._rng, int(self._rng.integers(len(data)))
@@ -198,6 +222,10 @@ def _with_values(fault: Fault, values: tuple[str, ...]) -> Fault:
             "degrees": float(degrees),
             "seconds": float(seconds),
         }
+    elif fault.kind == "angle":
+        joint, form, radians, seconds = values
+        fault = dataclasses.replace(fault, form=_FORMS[_FORMS.index(form)])
+        changes = {"joint": _within(joint, frames.JOINTS), "radians": float(radians), "seconds": float(seconds)}
     elif fault.kind == "stuck":
         tip, taxel, count = values
         changes = {"taxel": (_within(tip, frames.TIPS), _within(taxel, frames.TAXELS)), "count": _within(count, 256)}

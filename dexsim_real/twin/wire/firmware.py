@@ -30,8 +30,8 @@ class FirmwareConfig:
     """Id of the hand."""
     version: str = "1.3.9 emulated"
     """Firmware version that it reports."""
-    watchdog: float = setting(0.08, unit="s", low=0.01, high=10.0)
-    """Time without a valid exchange after which the motors go off."""
+    watchdog: float = setting(0.0, unit="s", low=0.0, high=10.0)
+    """Time without a valid exchange after which the motors go off; 0: never. What the real hand does is not known."""
     encoder_bits: int = setting(12, unit="1", low=4, high=16)
     """Resolution of the encoders, bits per revolution."""
     force_per_count: float = setting(0.1, unit="N", low=1e-3, high=10.0)
@@ -70,7 +70,8 @@ class Firmware:
         self.counts: Counter[str] = Counter()  # executed commands by name
         self.motors = idle_motors()
         self.stuck: dict[tuple[int, int], int] = {}  # constant counts of stuck taxels (tip, number)
-        self.reported = np.zeros(frames.JOINTS)  # rad, angles of the last state sent
+        self.wrong: dict[int, tuple[str, float]] = {}  # false angles by joint: "offset" or "stuck", rad
+        self.angles = np.zeros(frames.JOINTS)  # rad, true angles of the last state sent
         self.trips: list[float] = []  # s, times at which the watchdog acted
         self.longest = 0.0  # s, longest time from the last exchange until it acted
         self._tare = np.zeros((frames.TIPS, frames.TAXELS, 3), np.int32)
@@ -86,8 +87,8 @@ class Firmware:
 
     @property
     def deadline(self) -> float:
-        """Time s at which the watchdog acts without another exchange; infinite while the motors are off."""
-        return self._alive + self.config.watchdog if self.on else np.inf
+        """Time s at which the watchdog acts without another exchange; infinite if it does not."""
+        return self._alive + self.config.watchdog if self.on and self.config.watchdog else np.inf
 
     def watch(self, now: float) -> bool:
         """Turn the motors off if the last exchange is too long ago; returns whether it did."""
@@ -167,7 +168,9 @@ class Firmware:
         if was_on != self.on:
             self._note("motors on" if self.on else "motors off")
         state = self.state(measured)
-        self.reported = state["joint"]["position"].astype(float)
+        self.angles = state["joint"]["position"].astype(float)
+        for joint, (form, angle) in self.wrong.items():
+            state["joint"]["position"][joint] = angle + (self.angles[joint] if form == "offset" else 0.0)
         return Command.EXCHANGE, state.tobytes()
 
     def _version(self, data: bytes, now: float) -> tuple[Command, bytes]:

@@ -98,6 +98,7 @@ class HandLine:
         self._heard_all = self._said_all = -np.inf  # s, end on the wire of the last request and answer
         self._heard = self._acted = self._looked = -np.inf
         self._cooling: list[tuple[float, Fault]] = []
+        self._wrong_until: dict[int, float] = {}  # s, by joint that reports a wrong angle
         self._host_baud: int | None = None
 
     def due(self) -> float:
@@ -173,6 +174,7 @@ class HandLine:
             self.counts["ignored"] += 1
             self._deaf = now + fault.seconds
             return
+        self._end_wrong_angles(now)
         self._apply_hand_fault(now, fault)
         damaged = fault is not None and fault.on_request
         self._catch_up(now)
@@ -195,7 +197,7 @@ class HandLine:
         except frames.FrameError:
             return
         known = len(self.check.first)
-        found = self.check.take(request.read, command, self.firmware.reported, request.since)
+        found = self.check.take(request.read, command, self.firmware.angles, request.since)
         if found and known < CommandCheck.MAX_LISTED:
             self._note(f"command outside limits ({', '.join(found)})")
 
@@ -216,13 +218,21 @@ class HandLine:
         self._said_all = start + self._on_wire(len(data))
 
     def _apply_hand_fault(self, now: float, fault: Fault | None) -> None:
-        """Apply a fault of the hand itself: heat, stuck taxel."""
+        """Apply a fault of the hand itself: heat, stuck taxel, wrong angle."""
         if fault and fault.kind == "heat":
             self._plant.warm(fault.joint, fault.degrees)
             self._cooling.append((now + fault.seconds, fault))
             self._note(f"joint {fault.joint} is {fault.degrees:.0f} K hotter")
         elif fault and fault.kind == "stuck":
             self.firmware.stuck[fault.taxel] = fault.count
+        elif fault and fault.kind == "angle":
+            self.firmware.wrong[fault.joint] = fault.form, fault.radians
+            self._wrong_until[fault.joint] = now + fault.seconds
+            self._note(f"joint {fault.joint} reports {fault.form} {fault.radians:.3g} rad for {fault.seconds:.2f} s")
+
+    def _end_wrong_angles(self, now: float) -> None:
+        for joint in [joint for joint, until in self._wrong_until.items() if until <= now]:
+            del self._wrong_until[joint], self.firmware.wrong[joint]
 
     def _disconnect(self, now: float, fault: Fault) -> None:
         self._requests.clear()

@@ -190,7 +190,9 @@ def test_what_is_missing_is_said_in_one_line(tmp_path, capsys):
         assert not peer.on().any()
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGKILL])
+@pytest.mark.parametrize(
+    "number", [signal.SIGTERM, signal.SIGINT, signal.SIGQUIT, signal.SIGHUP, signal.SIGTSTP, signal.SIGKILL]
+)
 def test_signals(tmp_path, number):
     with FollowingHand() as peer:
         command = [sys.executable, "-m", "dexsim_real.run", *arguments(peer, tmp_path, "--seconds", "60")]
@@ -210,15 +212,17 @@ def test_signals(tmp_path, number):
         time.sleep(0.1)
         on = peer.on()
     if number == signal.SIGKILL:
-        # Nobody is left to relax it: that is for the hand's own watchdog. The log is whole.
+        # Without a guard nobody is left to relax it. The log is whole.
         assert code == -9
         ticks = [record.time for record in LogReader(tmp_path / "run.log") if record.kind == Kind.TICK]
         assert sent - ticks[-1] < 1.0
         assert replay.replay(tmp_path / "run.log").report["ended"] == "truncated"
     else:
-        assert code == (143 if number == signal.SIGTERM else 130)
+        assert code == (130 if number == signal.SIGINT else 128 + number)
         assert not on[-1] and not on[np.array(peer.times) > sent + 0.5].any()
-        assert ("signal 15" if number == signal.SIGTERM else "Ctrl-C") in records(tmp_path, Kind.END)[0]["end"]
+        assert ("Ctrl-C" if number == signal.SIGINT else f"signal {int(number)}") in records(tmp_path, Kind.END)[0][
+            "end"
+        ]
 
 
 def rotate_policy(hand, path):

@@ -150,21 +150,39 @@ def test_without_an_exchange_the_motors_go_off():
     assert (board.state(plant.measure())["joint"]["joint_error"] == ABANDONED).all()
 
 
+def test_a_board_without_a_watchdog_keeps_the_last_command():
+    """The default: what the real hand does is not known."""
+    plant = ScriptedPlant()
+    board = Firmware(plant, FirmwareConfig())
+    ask(board, Command.EXCHANGE, command().tobytes(), now=5.0)
+    assert board.deadline == math.inf and not board.watch(1e6) and board.on and board.trips == []
+
+
+def test_a_wrong_angle_is_in_the_state_and_the_true_one_is_kept():
+    plant = ScriptedPlant()
+    board = Firmware(plant, FirmwareConfig())
+    board.wrong = {4: ("offset", 1.3), 5: ("stuck", 1.9), 6: ("stuck", 1e30)}
+    answer = ask(board, Command.EXCHANGE, command().tobytes(), now=5.0)
+    shown = frames.decode_state(answer.data)["joint"]["position"]
+    np.testing.assert_allclose(board.angles, REST, atol=1e-3)
+    np.testing.assert_allclose(shown, [*REST[:4], REST[4] + 1.3, 1.9, 1e30, *REST[7:]], atol=1e-3)
+
+
 def test_commands_outside_limits_are_told_apart(hand):
-    def found(*commands, reported=REST, step=0.012, **options):
+    def found(*commands, angles=REST, step=0.012, **options):
         check = CommandCheck(hand.joint_lower, hand.joint_upper, LimitsConfig(slack=0.0, speed=8.0, **options))
-        return [check.take(1.0 + step * k, block, reported) for k, block in enumerate(commands)][-1]
+        return [check.take(1.0 + step * k, block, angles) for k, block in enumerate(commands)][-1]
 
     moved = np.where(np.arange(12) == 5, 0.09, 0.0)
     off = command(position=np.full(12, 9.0), mode=Mode.PASSIVE)
     assert found(command()) == found(command(), command(REST + moved)) == found(off) == []
     assert found(command(), command(REST + 1.1 * moved)) == ["speed"]
     assert found(command(), command(REST + 1.1 * moved), step=0.014) == []
-    assert found(command(REST + 3 * moved), command()) == []  # It may always stop.
+    assert found(command(REST + 3 * moved), command()) == ["speed"]  # Not even to where the joint is.
     assert found(off, command(REST + 0.04)) == [] and found(off, command(REST + 0.06)) == ["start"]
     assert found(command(REST - 0.01), command(np.where(np.arange(12) == 0, -0.01, REST)), step=1.0) == ["range"]
     beyond = hand.joint_upper + 2e-5
-    assert found(command(hand.joint_upper), command(beyond), reported=hand.joint_upper) == ["range"]
+    assert found(command(hand.joint_upper), command(beyond), angles=hand.joint_upper) == ["range"]
     assert found(command(), command(REST + 0.8 * (np.arange(12) != 3)), step=1.0) == ["reach"]
     assert found(command(torque_max=500)) == ["current limit"]
     assert found(command(mode=4)) == ["mode"] and found(command(position=np.nan)) == ["not finite"]

@@ -1,7 +1,6 @@
 """Faults of the emulated hand: scripts, rates, damage, and what the bridge counts."""
 
 import dataclasses
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,17 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 pytest.importorskip("serial")
-from twin_plant import REST, ScriptedPlant
+from twin_pair import Pair
+from twin_plant import REST
 
 from dexsim_real.core.errors import HandError
-from dexsim_real.twin.wire.command_check import CommandCheck, LimitsConfig
 from dexsim_real.twin.wire.faults import BYTES, KINDS, Fault, FaultConfig, Injector, parse_fault
-from dexsim_real.twin.wire.firmware import Firmware, FirmwareConfig
-from dexsim_real.twin.wire.line import HandLine, LineConfig
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import HAND_REPLIES, Command, Frame, Mode, Parser
-from dexsim_real.wire.link import LinkConfig
-from dexsim_real.wire.serial_hand import SerialHand
 
 
 @pytest.mark.parametrize(
@@ -33,6 +28,8 @@ from dexsim_real.wire.serial_hand import SerialHand
         ("5 heat 12 60 1", "give a time"),
         ("5 stuck 0 120 9", "give a time"),
         ("5 stuck 0 119 256", "give a time"),
+        ("5 angle 4 twisted 1 1", "give a time"),
+        ("5 angle 4 offset 1.3", "give a time"),
         ("-1 stall", "at least 0"),
         ("5 stall -1", "give a time"),
         ("nan drop", "at least 0"),
@@ -79,6 +76,7 @@ def test_random_faults_have_their_rates_and_the_seed_repeats_them():
         disconnect=0.01,
         heat=0.008,
         stuck=0.006,
+        angle=0.004,
         on_request=0.25,
     )
     runs = []
@@ -119,138 +117,6 @@ def test_no_damage_leaves_a_frame_that_passes(seed, kind, request):
         assert 1 <= bits <= 3
 
 
-class Cable:
-    """Both ends of a cable in memory: a `Terminal` for the hand, pyserial's port for the host, and their clock."""
-
-    connected, baud = True, 3_000_000
-
-    def __init__(self):
-        self.now, self.line = 1000.0, None
-        self.to_hand, self.to_host = bytearray(), bytearray()
-
-    # What the hand sees.
-
-    def open(self):
-        self.connected = True
-
-    def close(self):
-        self.connected = False
-        self.to_hand, self.to_host = bytearray(), bytearray()  # Whoever holds the old ones has lost them.
-
-    def read(self):
-        data = bytes(self.to_hand)
-        self.to_hand.clear()
-        return data
-
-    def write(self, data):
-        self.to_host += data
-        return len(data)
-
-    # Time: it passes only where the host waits.
-
-    def wait(self, seconds, enough=lambda: False):
-        until = self.now + seconds
-        while self.now < until and not enough():
-            self.now = min(max(self.line.due(), self.now + 1e-6), until)
-            self.line.serve(self.now)
-
-
-class Port:
-    """What pyserial gives the host."""
-
-    def __init__(self, cable, timeout):
-        if not cable.connected:
-            raise OSError(2, "gone")
-        self._cable, self._timeout, self._buffer = cable, timeout, cable.to_host
-
-    def _check(self):
-        if self._buffer is not self._cable.to_host or not self._cable.connected:
-            raise OSError(5, "unplugged")
-
-    @property
-    def in_waiting(self):
-        self._check()
-        return len(self._buffer)
-
-    def write(self, data):
-        self._check()
-        self._cable.to_hand += data
-        self._cable.wait(1e-5)
-
-    def read(self, size):
-        self._check()
-        self._cable.wait(self._timeout, lambda: len(self._buffer) >= size or not self._cable.connected)
-        self._cable.wait(2e-5)
-        self._check()
-        data = bytes(self._buffer[:size])
-        del self._buffer[:size]
-        return data
-
-    def close(self):
-        pass
-
-
-class Pair:
-    """The bridge's driver and an emulated hand on one cable."""
-
-    def __init__(self, hand, monkeypatch, faults, seed=0, **link):
-        import serial
-
-        self.cable, self.plant, self.notes = Cable(), ScriptedPlant(), []
-        cable = self.cable
-        monkeypatch.setattr(
-            "dexsim_real.wire.serial_hand.time", SimpleNamespace(monotonic=lambda: cable.now, sleep=cable.wait)
-        )
-        monkeypatch.setattr(serial, "serial_for_url", lambda url, timeout, **_: Port(cable, timeout))
-        self.board = Firmware(self.plant, FirmwareConfig(), self.notes.append)
-        self.check = CommandCheck(hand.joint_lower, hand.joint_upper, LimitsConfig())
-        self.injector = Injector(faults, seed)
-        self.line = cable.line = HandLine(
-            cable, self.plant, self.board, self.check, self.injector, LineConfig(), seed=seed, note=self.notes.append
-        )
-        self.port = SerialHand("loop://", LinkConfig(settle=0.0, backoff=(0.02, 0.1), **link))
-        self.port.connect()
-
-    def exchange(self, mode=Mode.POSITION, period=0.012):
-        """One exchange a cycle, as the bridge does."""
-        start = self.cable.now
-        reply = self.port.exchange(frames.command_block(REST, kp=100, ki=0, kd=0, torque_max=300, mode=mode))
-        took = self.cable.now - start
-        self.cable.wait(-took % period)
-        return reply
-
-    def run(self, seconds):
-        """Times at which answers came."""
-        until, replies = self.cable.now + seconds, []
-        while self.cable.now < until:
-            replies.append(self.exchange())
-        return [reply.received for reply in replies if reply is not None]
-
-    def settle(self):
-        """Until nothing is under way any more."""
-        self.cable.wait(1.0)
-        for _ in range(3):
-            self.exchange(Mode.PASSIVE)
-        while self.exchange(Mode.PASSIVE) is None:
-            pass
-
-    def agreement(self):
-        """What the host counted, beside what was injected."""
-        counts, line, made = self.port.counts, self.line.counts, self.injector.injected
-        expected = self.injector.expected()
-        damaged_requests = sum(made[f"{kind} request"] for kind in BYTES)
-        return {
-            "corrupt": (counts.corrupt, expected["corrupt"]),
-            "lost": (counts.lost, expected["lost"]),
-            # What the hand never answered, and what came too late.
-            "silent": (counts.silent, damaged_requests + line["ignored"] + counts.late),
-            "answered": (counts.answered + counts.refused + counts.late, line["answers"]),
-            "sent": (counts.sent, line["requests"]),
-            "ends": (counts.sent, counts.answered + counts.corrupt + counts.silent + counts.refused + counts.lost),
-            "damaged": (line["damaged answers"] + line["damaged requests"], expected["corrupt"] + damaged_requests),
-        }
-
-
 @pytest.mark.parametrize("seed", range(2))
 def test_every_injected_fault_is_found_in_the_hosts_counters(hand, monkeypatch, seed):
     """Half of all exchanges go wrong in one way or another."""
@@ -263,6 +129,7 @@ def test_every_injected_fault_is_found_in_the_hosts_counters(hand, monkeypatch, 
         disconnect=0.04,
         stuck=0.05,
         heat=0.03,
+        angle=0.03,
         stall_seconds=(0.005, 0.2),
         away_seconds=(0.01, 0.2),
     )
@@ -279,6 +146,8 @@ def test_every_injected_fault_is_found_in_the_hosts_counters(hand, monkeypatch, 
     assert pair.check.report()["outside_limits"] == 0 and pair.check.checked == pair.board.counts["exchange"]
     cable, heat = pair.cable, pair.plant.heat
     cable.wait(3.0)
+    pair.exchange(Mode.PASSIVE)
+    assert not pair.board.wrong  # All wrong angles have ended.
     np.testing.assert_allclose(heat, 35.0)  # Every motor that was heated has cooled.
 
 
@@ -330,6 +199,20 @@ def test_heat_and_stuck_taxels_reach_the_state(hand, monkeypatch):
     assert set(stuck) == {0, 99} and stuck == sorted(stuck)
 
 
+def test_wrong_angles_reach_the_state_for_their_time(hand, monkeypatch):
+    script = ("0.1 angle 4 offset 1.3 0", "0.2 angle 5 stuck 1.9 0.2", "0.5 angle 6 stuck 1e30 0.01")
+    pair = Pair(hand, monkeypatch, FaultConfig(script=script))
+    replies = [pair.exchange().state["joint"]["position"] for _ in range(60)]
+    off = np.abs(np.array(replies) - REST) > 0.1
+    assert off[:, 4].sum() == off[:, 6].sum() == 1 and 16 <= off[:, 5].sum() <= 18
+    assert not np.delete(off, [4, 5, 6], 1).any() and np.all(np.diff(np.flatnonzero(off[:, 5])) == 1)
+    assert np.array(replies)[:, 4].max() == pytest.approx(REST[4] + 1.3, abs=1e-3)
+    np.testing.assert_allclose(pair.board.angles, REST, atol=1e-3)
+    injector = Injector(FaultConfig(), 3)
+    kinds = {(fault.form, abs(fault.radians) > 1e29) for fault in (injector._random_fault("angle") for _ in range(50))}
+    assert kinds == {("offset", False), ("stuck", False), ("stuck", True)}
+
+
 def test_the_hand_is_safe_within_a_tenth_of_a_second_of_losing_its_host(hand, monkeypatch):
     faults = FaultConfig(script=("0.3 disconnect 0.4", "1.2 stall 0.4", "2 late 0.2"))
     pair = Pair(hand, monkeypatch, faults)
@@ -344,6 +227,13 @@ def test_the_hand_is_safe_within_a_tenth_of_a_second_of_losing_its_host(hand, mo
     # A host that is gone for good.
     pair.cable.wait(1.0)
     assert len(trips) == 4 and trips[-1] - answered[-1] < 0.1 and not pair.board.on
+
+
+def test_a_hand_without_a_watchdog_stays_on_when_it_loses_its_host(hand, monkeypatch):
+    pair = Pair(hand, monkeypatch, FaultConfig(), watchdog=0.0)
+    pair.run(0.3)
+    pair.cable.wait(5.0)
+    assert pair.board.on and not pair.board.trips
 
 
 def test_parse_gives_time_kind_and_values():

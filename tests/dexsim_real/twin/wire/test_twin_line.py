@@ -14,6 +14,7 @@ from twin_line import Bench, Running, command
 from twin_plant import REST
 
 from dexsim_real.core.errors import HandError
+from dexsim_real.twin.wire.firmware import FirmwareConfig
 from dexsim_real.twin.wire.line import LineConfig
 from dexsim_real.twin.wire.terminal import Terminal
 from dexsim_real.wire import frames
@@ -73,6 +74,10 @@ def test_requests_queue_while_an_answer_is_on_its_way(bench):
 def test_the_watchdog_in_the_line(bench):
     one = bench()
     one.exchange()
+    one.run(5.0)
+    assert one.board.on and not one.board.trips  # There is none unless asked for.
+    one = bench(board=FirmwareConfig(watchdog=0.08))
+    one.exchange()
     assert one.board.on
     asked = one.now - 0.012
     one.run(0.5)
@@ -110,7 +115,7 @@ def test_noise_on_the_line_is_answered_with_silence(hand, noise):
 
 
 def test_the_driver_talks_to_it(hand, tmp_path):
-    with Running(hand, tmp_path, task="rotate") as running:
+    with Running(hand, tmp_path, task="rotate", firmware=FirmwareConfig(watchdog=0.08)) as running:
         port = SerialHand(running.port, LinkConfig(settle=0.0, margin=0.2))
         assert "firmware 1.3.9" in port.connect()
         goal, replies = REST + 0.05, []

@@ -1,0 +1,192 @@
+"""Whatever ends a run, the motors go off: signals in a row, a lost cable, SIGKILL. The hand has no watchdog."""
+
+import contextlib
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from paths import ROOT
+
+pytest.importorskip("serial")
+from following_hand import FollowingHand, arguments, summary
+from pty_hand import QUICK
+
+from dexsim_real.control.motors_off import turn_off
+from dexsim_real.core.process import ignore_signals, stopping
+from dexsim_real.run.guard import Guard
+from dexsim_real.wire.serial_hand import SerialHand, passive_command
+
+
+def runner(peer, folder, *more):
+    options = [word for word in arguments(peer, folder, "--seconds", "60") if word not in more]
+    return subprocess.Popen([sys.executable, "-m", "dexsim_real.run", *options], cwd=ROOT, stderr=subprocess.PIPE)
+
+
+def wait(condition, seconds=60.0):
+    until = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < until
+        time.sleep(0.01)
+
+
+@contextlib.contextmanager
+def moving(folder, *without):
+    """A runner whose motors are on, and its hand."""
+    with FollowingHand() as peer:
+        process = runner(peer, folder, *without)
+        try:
+            wait(lambda: peer.on().sum() > 60 or process.poll() is not None)
+            assert process.poll() is None, process.stderr.read()
+            yield peer, process
+        finally:
+            process.kill()
+            process.communicate()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signals_in_a_row_turn_the_motors_off(tmp_path, number):
+    """The second and later ones come while the first is handled."""
+    with moving(tmp_path) as (peer, process):
+        for _ in range(3):
+            process.send_signal(number)
+            time.sleep(random.uniform(0.001, 0.006))
+        assert process.wait(20) == (130 if number == signal.SIGINT else 143)
+        assert not peer.on()[-1]
+    assert summary(tmp_path)["motors_off"]
+
+
+def test_only_the_first_signal_interrupts():
+    interrupted = []
+    with stopping():
+        try:
+            os.kill(os.getpid(), signal.SIGQUIT)
+            time.sleep(1)
+        except SystemExit as stop:
+            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGTSTP, signal.SIGHUP):
+                os.kill(os.getpid(), number)
+                time.sleep(0.01)
+            interrupted.append(stop.code)
+    with stopping():
+        ignore_signals()
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(0.01)
+        interrupted.append("not")
+    assert interrupted == [128 + signal.SIGQUIT, "not"]
+
+
+def test_the_stop_is_repeated_until_the_cable_is_back(tmp_path):
+    """Interrupted while the cable is out: the motors go off when it returns, 2 s later."""
+    link = str(tmp_path / "hand")
+    with FollowingHand() as peer:
+        peer.close()
+        peer.open(link)
+        peer.port = link
+        process = runner(peer, tmp_path)
+        try:
+            wait(lambda: peer.on().sum() > 60)
+            peer.close()
+            time.sleep(0.2)
+            process.send_signal(signal.SIGINT)
+            time.sleep(2.0)
+            assert process.poll() is None
+            peer.open(link)
+            asked = len(peer.commands)
+            assert process.wait(20) == 130
+            assert len(peer.commands) > asked and not peer.on()[asked:].any()
+        finally:
+            process.kill()
+            process.communicate()
+    assert summary(tmp_path)["motors_off"]
+
+
+def test_a_hand_that_never_confirms_is_named(tmp_path):
+    with FollowingHand() as peer:
+        process = runner(peer, tmp_path)
+        wait(lambda: peer.on().sum() > 60)
+        peer.close()
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30) == 1
+        process.communicate()
+    report = summary(tmp_path)
+    assert not report["motors_off"] and "press the emergency stop" in report["end"]
+
+
+def test_turning_off_is_bounded():
+    class Deaf:
+        def exchange(self, command):
+            time.sleep(0.01)
+
+    begin = time.monotonic()
+    assert not turn_off(Deaf(), passive_command(), 0.2) and time.monotonic() - begin < 1.0
+
+
+@pytest.mark.parametrize("way", [signal.SIGKILL, signal.SIGSEGV])
+def test_the_guard_stops_the_hand_of_a_runner_that_was_killed(tmp_path, way):
+    with moving(tmp_path, "--no-guard") as (peer, process):
+        process.send_signal(way)
+        process.wait(20)
+        died = time.monotonic()
+        wait(lambda: not peer.on()[-1], 3.0)
+        took = time.monotonic() - died
+    assert took < 1.0, took
+
+
+def test_without_a_guard_the_motors_of_a_killed_runner_stay_on(tmp_path):
+    """What the guard is for: this hand has no watchdog."""
+    with moving(tmp_path) as (peer, process):
+        process.kill()
+        process.wait(20)
+        time.sleep(1.0)
+        assert peer.on()[-1]
+
+
+def test_the_guard_says_nothing_to_a_hand_that_is_off(tmp_path):
+    with moving(tmp_path, "--no-guard") as (peer, process):
+        process.send_signal(signal.SIGINT)
+        assert process.wait(20) == 130
+        asked = len(peer.commands)
+        time.sleep(0.5)
+        assert len(peer.commands) == asked and not peer.on()[-1]
+
+
+def test_the_guard_waits_for_a_cable(tmp_path):
+    link = str(tmp_path / "hand")
+    with FollowingHand() as peer:
+        peer.close()
+        guard = Guard(link, QUICK)
+        guard.arm()
+        guard.check()
+        guard.dismiss(off=False)
+        time.sleep(1.0)
+        peer.open(link)
+        wait(lambda: len(peer.commands) > 0, 5.0)
+        assert not peer.on().any()
+        assert guard._process.wait(10) == 0
+
+
+def test_a_guard_that_was_not_armed_does_nothing(tmp_path):
+    with FollowingHand() as peer:
+        guard = Guard(peer.port, QUICK)
+        guard.dismiss(off=False)
+        assert guard._process.wait(20) == 0 and not peer.commands
+
+
+def test_a_serial_hand_turns_off_over_a_reconnection(tmp_path):
+    link = str(tmp_path / "hand")
+    with FollowingHand() as peer:
+        peer.close()
+        peer.open(link)
+        hand = SerialHand(link, QUICK)
+        hand.connect()
+        peer.close()
+        assert hand.exchange(passive_command()) is None
+        peer.open(link)
+        asked = len(peer.commands)
+        assert turn_off(hand, passive_command(), 5.0)
+        assert len(peer.commands) > asked and np.all(~peer.on())
+        hand.close()
