@@ -44,7 +44,7 @@ def main() -> None:
         )
 
     def tick(state):
-        return jax.vmap(lambda s: env.drive.tick(s.episode, hold(s), s.physics, s.gear, jnp.zeros(3)))(state)
+        return jax.vmap(lambda s: env.motors.tick(s.episode, hold(s), s.physics, s.gear, jnp.zeros(3)))(state)
 
     whole, known = jit(tick), c_backend.record
 

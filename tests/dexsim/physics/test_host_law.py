@@ -32,7 +32,7 @@ def motors(request):
     """An environment, some of its states, and its motors for one of them."""
     env = make(request.param)
     states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), WORLDS))
-    return env, states, lambda state: env.drive.law(state.episode.hand, command(state))
+    return env, states, lambda state: env.motors.law(state.episode.hand, command(state))
 
 
 def test_they_agree_with_xla_to_rounding(motors):
@@ -64,9 +64,11 @@ def test_they_agree_with_xla_to_rounding(motors):
 def test_a_tick_is_that_of_a_call_for_each_sub_step(motors, monkeypatch):
     """Laws that the host cannot evaluate stay in XLA, at a call for each sub-step. Here both ways, with one law."""
     env, states, _ = motors
-    tick = lambda: jax.jit(jax.vmap(lambda s: env.drive.tick(s.episode, command(s), s.physics, s.gear, jnp.zeros(3))))(
-        states
-    )  # noqa: E731
+
+    def tick():
+        run = jax.vmap(lambda s: env.motors.tick(s.episode, command(s), s.physics, s.gear, jnp.zeros(3)))
+        return jax.jit(run)(states)
+
     whole, calls = tick(), []
 
     def unknown(law, joints, memory):
