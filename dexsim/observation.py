@@ -65,6 +65,10 @@ class Features:
     motion: Motion | None
     twist: Callable[[], jax.Array]  # [F, 6] m/s, rad/s, of the finger tips
 
+    def known_motion(self) -> Motion:
+        assert self.motion is not None, "the critic's fields need the motion"
+        return self.motion
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ObservationField:
@@ -102,6 +106,11 @@ def _tip_twist(hand: Hand, joint_position: jax.Array, joint_velocity: jax.Array)
     skew = rotations.compose(change, jnp.swapaxes(rotation, -1, -2))
     angular = jnp.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], -1)
     return jnp.concatenate([linear, angular], -1)
+
+
+def _tangential_force(features: Features) -> jax.Array:
+    assert isinstance(features.readings, ThreeAxisReadings), "three-axis taxels are off"
+    return features.readings.tangential_force.ravel()
 
 
 def _encode(quat: jax.Array, encoding: str) -> jax.Array:
@@ -179,7 +188,7 @@ FIELDS: dict[str, ObservationField] = {
             size=_per_finger(3),
             scale=2.0,
             source="three-axis taxels",
-            compute=lambda f: f.readings.tangential_force.ravel(),
+            compute=_tangential_force,
         ),
         ObservationField(
             name="fingertip_position",
@@ -207,12 +216,7 @@ FIELDS: dict[str, ObservationField] = {
             source="policy",
             compute=lambda f: f.readings.last_action,
         ),
-        ObservationField(
-            name="relative_orientation",
-            size=_angles,
-            source="imu",
-            compute=_relative_orientation,
-        ),
+        ObservationField(name="relative_orientation", size=_angles, source="imu", compute=_relative_orientation),
         ObservationField(
             name="object_orientation",
             size=_angles,
@@ -229,13 +233,13 @@ FIELDS: dict[str, ObservationField] = {
             name="joint_velocity",
             size=_per_joint,
             source="simulator",
-            compute=lambda f: f.motion.joint_velocity,
+            compute=lambda f: f.known_motion().joint_velocity,
         ),
         ObservationField(
             name="object_spin",
             size=_fixed(3),
             source="simulator",
-            compute=lambda f: f.motion.object_spin,
+            compute=lambda f: f.known_motion().object_spin,
         ),
     )
 }
@@ -340,7 +344,7 @@ def observe(
         contact_centre=centre,
         pose=pose,
         motion=motion,
-        twist=lambda: _tip_twist(hand, readings.joint_position, motion.joint_velocity),
+        twist=lambda: _tip_twist(hand, readings.joint_position, features.known_motion().joint_velocity),
     )
     parts = [FIELDS[name].compute(features) for name in select_fields(names, config)]
     return jnp.concatenate(parts).astype(jnp.float32)

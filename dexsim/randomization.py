@@ -183,8 +183,8 @@ def _assemble(
     geared = config.backlash == "gear_play"
     if geared:
         dead_band = jnp.zeros(joints)
-    stall_torque = hand.torque_limit * value(next(keys), "torque_factor", joints)
-    no_load_speed = hand.speed_limit * value(next(keys), "speed_factor", joints)
+    stall_torque = jnp.asarray(hand.torque_limit) * value(next(keys), "torque_factor", joints)
+    no_load_speed = jnp.asarray(hand.speed_limit) * value(next(keys), "speed_factor", joints)
     efficiency = value(next(keys), "efficiency", joints)
     latency = value(next(keys), "latency", ())
     age = value(next(keys), "sensing_latency", ()) / control_period
@@ -205,7 +205,7 @@ def _assemble(
         ripple_count=jax.random.uniform(next(keys), joints, minval=low, maxval=high),
         ripple_phase=jax.random.uniform(next(keys), joints, maxval=2 * jnp.pi),
         encoder_bias=encoder_bias,
-        coulomb_friction=hand.torque_limit * value(next(keys), "coulomb_friction", joints),
+        coulomb_friction=jnp.asarray(hand.torque_limit) * value(next(keys), "coulomb_friction", joints),
         viscous_friction=value(next(keys), "viscous_friction", joints),
     )
     gap = value(next(keys), "gear_gap", joints) if geared else None

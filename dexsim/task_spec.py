@@ -5,6 +5,7 @@ of any task runs on a computer that has neither MJX nor the task's code.
 """
 
 import dataclasses
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -77,8 +78,8 @@ class TaskSpec:
         return cls(
             name=task.name,
             fields=tuple(task.fields["actor"]),
-            gravity=tuple(map(float, task.gravity)),
-            reference=tuple(map(float, task.reference)),
+            gravity=_triple(task.gravity),
+            reference=_triple(task.reference),
             posture=tuple(map(float, getattr(config, "posture", ()))),
             control=config.control,
             observation=config.observation,
@@ -91,3 +92,8 @@ class TaskSpec:
         """Raises ConfigError: the start posture is of another hand."""
         if self.posture and len(self.posture) != hand.num_joints:
             raise ConfigError(f"task {self.name!r}: {len(self.posture)} posture angles, the hand has {hand.num_joints}")
+
+
+def _triple(values: Iterable[float]) -> tuple[float, float, float]:
+    x, y, z = map(float, values)
+    return x, y, z

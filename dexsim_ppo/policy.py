@@ -20,7 +20,7 @@ import numpy as np
 from dexsim.core.assets import asset_path
 from dexsim.core.config import from_dict, to_dict
 from dexsim.core.errors import AssetError, CheckpointError, ConfigError, OtherEnvWarning
-from dexsim.core.pytree import pytree_dataclass, static
+from dexsim.core.pytree import Array, pytree_dataclass, static
 from dexsim.task_spec import TaskSpec
 from dexsim_ppo import checkpoint
 from dexsim_ppo.learner.networks import MLP, Layer, apply_mlp
@@ -69,7 +69,7 @@ class Policy:
     spec: TaskSpec | None = None
     """What a host must know of the task; None for an environment that is not of this library."""
 
-    def __call__(self, obs: jax.Array) -> jax.Array:
+    def __call__(self, obs: Array) -> jax.Array:
         """Action `[..., A]` for an actor observation `[..., n]`."""
         return _act(self.params, obs)
 

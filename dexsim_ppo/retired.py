@@ -166,7 +166,7 @@ def _migrate(config: dict[str, Any], fields: dict[str, str | None], where: Any, 
         *groups, name = (prefix + path).split(".")
         parent = _group(config, groups)
         group = _group(parent, [name])
-        if group is not None and group.get(switch) == off:
+        if parent is not None and group is not None and group.get(switch) == off:
             del parent[name]
     for old, new in fields.items():
         *groups, name = old.split(".")
@@ -185,9 +185,9 @@ def _migrate(config: dict[str, Any], fields: dict[str, str | None], where: Any, 
     for path, values in VALUES.items():
         *groups, name = (prefix + path).split(".")
         group = _group(config, groups)
-        if group is not None and (old := group.get(name)) in values:
-            group[name] = values[old]
-            changes.append(f"{path} = {old!r} is now {values[old]!r}")
+        if group is not None and (value := group.get(name)) in values:
+            group[name] = values[value]
+            changes.append(f"{path} = {value!r} is now {values[value]!r}")
     if changes:
         warnings.warn(f"{where}: from an older version of dexsim: {', '.join(changes)}", OldFileWarning, stacklevel=4)
     return config

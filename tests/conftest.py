@@ -74,13 +74,26 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
                 item.add_marker(skip)
 
 
-# Folders whose tests trace our own code only: there a silent broadcast or cast between arrays is an error.
-STRICT = ("dexsim/actuator", "dexsim/core", "dexsim/geometry", "dexsim/hand", "dexsim_ppo/learner")
+# Tests in which a silent broadcast or cast between arrays is an error: those that trace our own code only.
+STRICT = (
+    "dexsim/actuator",
+    "dexsim/calibration",
+    "dexsim/core",
+    "dexsim/geometry",
+    "dexsim/hand",
+    "dexsim/identification",
+    "dexsim/render",
+    "dexsim/sensing",
+    "dexsim/tasks",
+    "dexsim/test_observation",
+    "dexsim/touch",
+    "dexsim_ppo/learner",
+)
 
 
 @pytest.fixture(autouse=True, scope="module")
 def strict_promotion(request: pytest.FixtureRequest) -> Iterator[None]:
-    """JAX's strict mode, in the folders of `STRICT`."""
+    """JAX's strict mode, in the tests of `STRICT`."""
     with contextlib.ExitStack() as modes:
         if request.path.relative_to(Path(__file__).parent).as_posix().startswith(STRICT):
             modes.enter_context(jax.numpy_rank_promotion("raise"))

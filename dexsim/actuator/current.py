@@ -12,7 +12,7 @@ the direction of motion. Commutation makes the torque constant ripple with the a
 import jax
 import jax.numpy as jnp
 
-from dexsim.core.pytree import pytree_dataclass
+from dexsim.core.pytree import Array, pytree_dataclass
 
 
 @pytree_dataclass
@@ -32,7 +32,7 @@ class Motor:
     limit: jax.Array | float = jnp.inf  # A, largest current that the driver gives or reports
 
 
-def motor_current(motor: Motor, torque: jax.Array, velocity: jax.Array, position: jax.Array | float = 0.0) -> jax.Array:
+def motor_current(motor: Motor, torque: Array, velocity: Array, position: Array | float = 0.0) -> jax.Array:
     """Current, A, of a motor that holds `torque` Nm at the joint.
 
     Args:
@@ -45,7 +45,7 @@ def motor_current(motor: Motor, torque: jax.Array, velocity: jax.Array, position
     power = torque * way
     loss = jnp.where(power > 0, 1.0 / motor.efficiency, jnp.where(power < 0, motor.back_efficiency, 1.0))
     ripple = 1.0 + motor.ripple * jnp.sin(motor.ripple_count * position + motor.ripple_phase)
-    return torque / (motor.torque_constant * ripple) * loss + motor.no_load_current * way
+    return jnp.asarray(torque / (motor.torque_constant * ripple) * loss + motor.no_load_current * way)
 
 
 def read_current(key: jax.Array, motor: Motor, current: jax.Array) -> jax.Array:

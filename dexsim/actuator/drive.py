@@ -10,7 +10,7 @@ gear play, with its own state.
 import jax
 import jax.numpy as jnp
 
-from dexsim.core.pytree import pytree_dataclass
+from dexsim.core.pytree import Array, pytree_dataclass
 
 
 @pytree_dataclass
@@ -35,7 +35,11 @@ class Actuator:
 
 
 def pd_torque(
-    actuator: Actuator, target: jax.Array, target_velocity: jax.Array, position: jax.Array, velocity: jax.Array
+    actuator: Actuator,
+    target: jax.Array,
+    target_velocity: jax.Array | float,
+    position: jax.Array | float,
+    velocity: jax.Array,
 ) -> jax.Array:
     """tau_c = k_p (q_ref - q) + k_d (qd_ref - qd), Nm."""
     return actuator.stiffness * (target - position) + actuator.damping * (target_velocity - velocity)
@@ -52,7 +56,7 @@ def torque_limit(actuator: Actuator, velocity: jax.Array) -> jax.Array:
 
 
 def joint_torque(
-    actuator: Actuator, target: jax.Array, target_velocity: jax.Array, position: jax.Array, velocity: jax.Array
+    actuator: Actuator, target: jax.Array, target_velocity: jax.Array | float, position: jax.Array, velocity: jax.Array
 ) -> jax.Array:
     """Torque of one joint's motor, Nm: eta clip(tau_b, -tau_sat, tau_sat) (1 + r sin(n q + phase)).
 
@@ -78,7 +82,7 @@ drive = jax.vmap(joint_torque)
 
 
 def apply_friction(
-    actuator: Actuator, torque: jax.Array, velocity: jax.Array, inertia_rate: jax.Array | float
+    actuator: Actuator, torque: jax.Array, velocity: jax.Array, inertia_rate: Array | float
 ) -> jax.Array:
     """What Coulomb and viscous friction leave of a torque, Nm: one backward Euler step.
 

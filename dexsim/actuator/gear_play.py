@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 
 from dexsim.actuator.drive import Actuator, apply_friction, joint_torque
-from dexsim.core.pytree import pytree_dataclass
+from dexsim.core.pytree import Array, pytree_dataclass
 
 
 @pytree_dataclass
@@ -25,7 +25,7 @@ class GearPlay:
     """Parameters of one joint's gear (scalars) or of all of them ([J])."""
 
     gap: jax.Array | float  # rad, lost motion of the link at a held rotor, end to end
-    rotor_inertia: jax.Array | float  # J, kg m^2 at the joint (times the gear ratio squared)
+    rotor_inertia: Array | float  # J, kg m^2 at the joint (times the gear ratio squared)
     tooth_stiffness: jax.Array | float = 500.0  # k, Nm/rad
     tooth_damping: jax.Array | float | None = None  # d, Nm s/rad; None: critical, no bounce
 
@@ -59,9 +59,9 @@ def tooth_torque(
     position: jax.Array,
     velocity: jax.Array,
     *,
-    inertia: jax.Array,
+    inertia: Array,
     timestep: float,
-    link_torque: jax.Array | float = 0.0,
+    link_torque: Array | float = 0.0,
 ) -> jax.Array:
     """Torque through the gear on the link, Nm, at the end of a sub-step.
 
@@ -93,9 +93,9 @@ def drive_with_play(
     position: jax.Array,
     velocity: jax.Array,
     *,
-    inertia: jax.Array,
+    inertia: Array,
     timestep: float,
-    link_torque: jax.Array | float = 0.0,
+    link_torque: Array | float = 0.0,
 ) -> tuple[jax.Array, Rotor]:
     """`dexsim.actuator.drive.joint_torque` through a gear with play.
 
@@ -127,7 +127,7 @@ def drive_beside(
     position: jax.Array,
     velocity: jax.Array,
     *,
-    inertia: jax.Array,
+    inertia: Array,
     timestep: float,
     steps: int,
 ) -> tuple[jax.Array, GearState]:

@@ -3,6 +3,7 @@
 import dataclasses
 import datetime
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -67,11 +68,12 @@ def calibrate(
         for lines in fit
         for note in lines.notes
     )
-    sides, taken = zip(*(_gather(hand, fits, k) for k in (0, 1)), strict=True)
-    notes += tuple(f"{name}: not recorded, mean of the joints of its torque limit" for name in taken[0])
+    (real_side, taken), (sim_side, _) = (_gather(hand, fits, k) for k in (0, 1))
+    notes += tuple(f"{name}: not recorded, mean of the joints of its torque limit" for name in taken)
     scale = np.broadcast_to(np.asarray(force_per_count, float), (hand.num_fingers,)).copy()
     calibration = Calibration(
-        *sides,
+        real_side,
+        sim_side,
         np.round(np.asarray(hand.torque_limit, float), 6),
         scale,
         hand=hand.name,
@@ -96,23 +98,23 @@ _GENERAL = (
 
 def _gather(hand: Hand, fits: list, side: int) -> tuple[Side, list[str]]:
     """Arrays of one side, and the joints that got the mean of their class."""
-    rows = [_row(fit[side]) if fit else None for fit in fits]
-    taken = []
-    for joint, row in enumerate(rows):
-        if row is not None:
+    measured = {joint: _row(fit[side]) for joint, fit in enumerate(fits) if fit}
+    rows, taken = [], []
+    for joint in range(len(fits)):
+        if joint in measured:
+            rows.append(measured[joint])
             continue
-        same = [
-            r for j, r in enumerate(rows) if fits[j] is not None and hand.torque_limit[j] == hand.torque_limit[joint]
-        ]
+        same = [row for other, row in measured.items() if hand.torque_limit[other] == hand.torque_limit[joint]]
         if not same:
             raise CalibrationError(
                 f"{hand.joint_names[joint]}: no recording of any joint with "
                 f"{hand.torque_limit[joint]:g} Nm to take over"
             )
         taken.append(hand.joint_names[joint])
-        rows[joint] = {key: np.mean([r[key] for r in same], 0) for key in same[0]}
-        rows[joint]["samples"] = rows[joint]["outliers"] = np.zeros(2)
-    return Side(**{key: np.stack([row[key] for row in rows], -1) for key in rows[0]}), taken
+        mean = {key: np.mean([row[key] for row in same], 0) for key in same[0]}
+        rows.append(mean | {"samples": np.zeros(2), "outliers": np.zeros(2)})
+    fields: dict[str, Any] = {key: np.stack([row[key] for row in rows], -1) for key in rows[0]}
+    return Side(**fields), taken
 
 
 def _row(lines: JointLines) -> dict[str, np.ndarray]:

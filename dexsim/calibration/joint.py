@@ -55,7 +55,7 @@ def fit_joint(press: JointPress, unit: str, where: str = "recording") -> JointLi
     direction = find_direction(force) if press.direction is None else np.sign(np.asarray(press.direction)).astype(int)
     free, clipped = _not_saturated(force, value, where)
     notes = [f"{clipped} saturated samples left out ({unit})"] if clipped else []
-    lines = []
+    lines: list[Line | None] = []
     for sign, name in ((1, "loading"), (-1, "unloading")):
         keep = free & (direction == sign)
         lines.append(
@@ -74,7 +74,8 @@ def fit_joint(press: JointPress, unit: str, where: str = "recording") -> JointLi
     notes += _line_notes(lines, unit)
     sound = free & np.any([np.abs(value - line(force)) <= 4.685 * line.noise for line in lines if line is not None], 0)
     return JointLines(
-        *lines,
+        lines[0],
+        lines[1],
         _friction(lines, force[sound]),
         float(np.max(np.abs(value[sound]))),
         float(np.max(force[sound])),

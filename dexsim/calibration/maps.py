@@ -23,7 +23,7 @@ import numpy as np
 
 from dexsim.core.errors import CalibrationError
 from dexsim.core.files import write_whole
-from dexsim.core.pytree import pytree_dataclass, static
+from dexsim.core.pytree import Array, align, pytree_dataclass, static
 from dexsim.hand.kinematics import Hand
 
 FORMAT = "dexsim calibration"
@@ -35,20 +35,20 @@ class Side:
     """Lines value = gain force + offset of all joints: of the hand (value A) or of the
     simulation (value Nm). Intervals are of 95 %."""
 
-    gain: jax.Array  # [2, J] value/N
-    gain_low: jax.Array  # [2, J]
-    gain_high: jax.Array  # [2, J]
-    offset: jax.Array  # [2, J] value
-    offset_low: jax.Array  # [2, J]
-    offset_high: jax.Array  # [2, J]
-    noise: jax.Array  # [2, J] value, robust standard deviation about the line
-    r_squared: jax.Array  # [2, J]
-    condition: jax.Array  # [2, J]
-    samples: jax.Array  # [2, J]; 0 for a line taken from the joint's class
-    outliers: jax.Array  # [2, J]
-    friction: jax.Array  # [J] value, half the gap between the two lines; NaN where one is missing
-    value_max: jax.Array  # [J] largest |value| recorded
-    force_max: jax.Array  # [J] N, largest force recorded
+    gain: Array  # [2, J] value/N
+    gain_low: Array  # [2, J]
+    gain_high: Array  # [2, J]
+    offset: Array  # [2, J] value
+    offset_low: Array  # [2, J]
+    offset_high: Array  # [2, J]
+    noise: Array  # [2, J] value, robust standard deviation about the line
+    r_squared: Array  # [2, J]
+    condition: Array  # [2, J]
+    samples: Array  # [2, J]; 0 for a line taken from the joint's class
+    outliers: Array  # [2, J]
+    friction: Array  # [J] value, half the gap between the two lines; NaN where one is missing
+    value_max: Array  # [J] largest |value| recorded
+    force_max: Array  # [J] N, largest force recorded
 
     def middle(self) -> tuple[jax.Array, jax.Array]:
         """Gain [J] and offset [J] of the line half way between loading and unloading."""
@@ -61,8 +61,8 @@ class Calibration:
 
     real: Side  # A against N
     sim: Side  # Nm against N
-    torque_scale: jax.Array  # [J] Nm that read as 1: the hand's torque limits, as in `Env`
-    force_per_count: jax.Array  # [F] N
+    torque_scale: Array  # [J] Nm that read as 1: the hand's torque limits, as in `Env`
+    force_per_count: Array  # [F] N
     hand: str = static()
     joint_names: tuple[str, ...] = static()
     finger_names: tuple[str, ...] = static()
@@ -77,10 +77,10 @@ class Calibration:
 
 def current_from_counts(calibration: Calibration, counts: jax.Array) -> jax.Array:
     """Currents [J] A from what the hand reports [J] counts."""
-    return jnp.asarray(counts) * calibration.current_per_count
+    return jnp.asarray(counts, jnp.float32) * calibration.current_per_count
 
 
-def joint_torque(calibration: Calibration, current: jax.Array, direction: jax.Array | float = 0.0) -> jax.Array:
+def joint_torque(calibration: Calibration, current: Array, direction: jax.Array | float = 0.0) -> jax.Array:
     """Joint torques [..., J] Nm, in the simulation's sense, from motor currents [..., J] A.
 
     Args:
@@ -93,24 +93,26 @@ def joint_torque(calibration: Calibration, current: jax.Array, direction: jax.Ar
     real = calibration.real
     middle_gain, middle_offset = real.middle()
 
-    def pick(lines: jax.Array, middle: jax.Array) -> jax.Array:
-        loading, unloading = jnp.asarray(lines)[0], jnp.asarray(lines)[1]
-        return jnp.where(direction > 0, loading, jnp.where(direction < 0, unloading, middle))
+    def pick(lines: Array, middle: jax.Array) -> jax.Array:
+        loading, unloading, between = (align(line, current) for line in (*jnp.asarray(lines), middle))
+        return jnp.where(direction > 0, loading, jnp.where(direction < 0, unloading, between))
 
     force = (current - pick(real.offset, middle_offset)) / pick(real.gain, middle_gain)
     gain, offset = calibration.sim.middle()
-    return gain * force + offset
+    return align(gain, force) * force + align(offset, force)
 
 
 def normalised_torque(calibration: Calibration, current: jax.Array, direction: jax.Array | float = 0.0) -> jax.Array:
     """`joint_torque` over the joints' torque limits: `Readings.joint_torque`. Not clipped."""
-    return joint_torque(calibration, current, direction) / jnp.asarray(calibration.torque_scale)
+    torque = joint_torque(calibration, current, direction)
+    return torque / align(jnp.asarray(calibration.torque_scale), torque)
 
 
 def taxel_force(calibration: Calibration, counts: jax.Array) -> jax.Array:
     """Taxel forces [..., F, N] N from counts [..., F, N] after taring; negative ones read 0."""
     scale = jnp.asarray(calibration.force_per_count)[..., None]
-    return jnp.maximum(jnp.asarray(counts) * scale, 0.0)
+    counts = jnp.asarray(counts, scale.dtype)
+    return jnp.maximum(counts * align(scale, counts), 0.0)
 
 
 def normalise(side: Side, joint: int, force: np.ndarray, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -206,14 +208,15 @@ def load_calibration(path: str | Path, hand: Hand | None = None) -> Calibration:
         raise CalibrationError(
             f"{path}: is of hand {table['hand']!r} with {len(names)} joints, not of {hand.name!r}: calibrate this hand"
         )
-    sides = [_side(path, table["joint"], key) for key in ("real", "sim")]
+    real, sim = (_side(path, table["joint"], key) for key in ("real", "sim"))
     fingers = tuple(_field(path, table, "finger_names", list))
     per_count = np.array(_numbers(path, table, "force_per_count", len(fingers)))
     scale = np.array([_numbers(path, entry, "torque_scale")[0] for entry in table["joint"]])
     if not (np.all(scale > 0) and np.all(per_count > 0)):
         raise CalibrationError(f"{path}: torque_scale and force_per_count must be above 0")
     return Calibration(
-        *sides,
+        real,
+        sim,
         scale,
         per_count,
         hand=table["hand"],
@@ -251,9 +254,9 @@ def _side(path: Path, joints: list[dict], key: str) -> Side:
         columns.append(
             [_numbers(path, lines, name, 2) for name in _PAIRS] + [_numbers(path, lines, name) for name in _SINGLES]
         )
-    pairs = {name: np.array([column[i] for column in columns]).T for i, name in enumerate(_PAIRS)}
-    singles = {name: np.array([column[len(_PAIRS) + i][0] for column in columns]) for i, name in enumerate(_SINGLES)}
-    side = Side(**pairs, **singles)
+    fields: dict[str, Any] = {name: np.array([column[i] for column in columns]).T for i, name in enumerate(_PAIRS)}
+    fields |= {name: np.array([column[len(_PAIRS) + i][0] for column in columns]) for i, name in enumerate(_SINGLES)}
+    side = Side(**fields)
     for name in ("gain", "offset", "value_max", "force_max"):
         if not np.all(np.isfinite(getattr(side, name))):
             raise CalibrationError(f"{path}: {key}.{name} must be finite numbers")
@@ -271,7 +274,7 @@ def _field(path: Path, table: dict, name: str, kind: type) -> Any:
 
 def _numbers(path: Path, table: dict, name: str, count: int = 1) -> list[float]:
     value = table.get(name)
-    values = value if isinstance(value, list) else [value]
+    values: list[Any] = value if isinstance(value, list) else [value]
     if len(values) != count or not all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in values):
         raise CalibrationError(f"{path}: field {name!r} must hold {count} number(s)")
     return [float(v) for v in values]
@@ -282,9 +285,9 @@ def _text(value: str) -> str:
     return f'"{escaped}"'
 
 
-def _number(value: float) -> str:
-    value = float(value)
-    return "nan" if math.isnan(value) else repr(value)
+def _number(value: float | Array) -> str:
+    number = float(value)
+    return "nan" if math.isnan(number) else repr(number)
 
 
 def _list(values: Any) -> str:

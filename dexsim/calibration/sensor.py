@@ -225,7 +225,7 @@ def _material(
     stretch = 1 - np.maximum(depth[touching], 0) / thickness
     rise = 2 * (stretch**-2 - stretch) * press.area
     basis = np.stack([rise.sum(1), (rise / stretch).sum(1)], 1)
-    zero, notes = Estimate(0.0, 0.0, 0.0), []
+    zero, notes = Estimate(0.0, 0.0, 0.0), list[str]()
     if not two_terms:
         return _bootstrap(basis[:, :1], force[touching], rng)[0], zero, notes
     c10, c01 = _bootstrap(basis, force[touching], rng)

@@ -26,5 +26,5 @@ def fingerprint(env: Any) -> str | None:
     for path in (*python_sources(_PACKAGE), env.hand.model_path):
         digest.update(path.read_bytes())
     for leaf in jax.tree.leaves((env.pool, env.hand.taxel_position, env.hand.taxel_normal, env.hand.taxel_area)):
-        digest.update(np.ascontiguousarray(leaf))
+        digest.update(np.ascontiguousarray(leaf).data)
     return digest.hexdigest()

@@ -117,6 +117,7 @@ class Motors:
         return motors
 
     def _geared(self, hand: HandParams, command: JointCommand) -> MotorLaw:
+        assert hand.gear_gap is not None, "hands with gear play have a gap"
         play = GearPlay(hand.gear_gap, self._rotor_inertia, self._tooth_stiffness)
 
         def motors(

@@ -53,5 +53,6 @@ class Observer:
             "last_action": readings.last_action,
         }
         if isinstance(readings, ThreeAxisReadings):
+            assert truth.tangential_force is not None, "three-axis taxels are off"
             return ThreeAxisReadings(**known, tangential_force=truth.tangential_force)
         return Readings(**known)

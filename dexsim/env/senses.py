@@ -23,7 +23,7 @@ class SensorSuite:
     def __init__(self, config: EnvConfig, hand: Hand, task: Task):
         self.config, self.hand, self.task = config, hand, task
         self.period = config.physics.control_period
-        self.taxels = TaxelArray(config.sensing.taxel, tuple(hand.taxel_grid), hand.num_fingers, self.period)
+        self.taxels = TaxelArray(config.sensing.taxel, hand.taxel_grid, hand.num_fingers, self.period)
         self._up = -jnp.asarray(task.gravity) / np.linalg.norm(task.gravity)
 
     def sample_imu(self, key: jax.Array, scale: jax.Array | float, extreme: jax.Array | None) -> ImuParams:
@@ -121,7 +121,9 @@ class SensorSuite:
     ) -> jax.Array:
         """The object's orientation [4] by its IMU, which has just read for the first time at an episode's start."""
         length, held = (
-            (jnp.zeros(()), now.object_quat) if last is None else (last.length + 1.0, last.readings.object_quat)
+            (jnp.zeros(()), now.object_quat)
+            if last is None
+            else (last.length.astype(jnp.float32) + 1.0, last.readings.object_quat)
         )
         return measure_orientation(
             key,
@@ -146,5 +148,6 @@ class SensorSuite:
 
     def _read_tangential(self, key: jax.Array, late: SensorInput, episode: Episode) -> jax.Array:
         """[F, 3] N: by the same taxels, with the gains and the dead ones of their normal forces."""
+        assert late.tangential_force is not None, "three-axis taxels are off"
         key, gain = jax.random.fold_in(key, 1), episode.hand.taxel_gain
         return self.taxels.apply_tangential(episode.taxels, key, late.tangential_force, late.taxel_force, gain)

@@ -56,8 +56,6 @@ class Task(Protocol):
     """
 
     name: str
-    config: EnvConfig
-    """An `EnvConfig` or a subclass with settings of the task's own."""
     fields: dict[str, tuple[str, ...]]
     """Names of the observation's fields (`dexsim.observation.FIELDS`), for "actor" and for "critic"."""
     gravity: tuple[float, float, float]
@@ -76,6 +74,11 @@ class Task(Protocol):
     """What `summarize` is given: "series" or "totals"."""
     object_ranges: tuple[str, ...]
     """Paths in `config` of the ranges that `sample_object` draws from, for the self-test of the randomisation."""
+
+    @property
+    def config(self) -> EnvConfig:
+        """An `EnvConfig` or a subclass with settings of the task's own; an attribute will do."""
+        ...
 
     def make_pool(self, key: jax.Array) -> Start:
         """Start states [P, ...] of which every episode begins with one; made once.

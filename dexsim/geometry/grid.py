@@ -129,7 +129,7 @@ def stack(grids: list[Grid]) -> Grid:
     )
 
 
-def select(grid: Grid, index: jax.Array, scale: jax.Array | float = 1.0) -> Grid:
+def select(grid: Grid, index: jax.Array | int, scale: jax.Array | float = 1.0) -> Grid:
     """The object of class `index` [], `scale` times as large; the values stay shared under `vmap`."""
     return dataclasses.replace(grid, index=jnp.asarray(index, jnp.int32), scale=jnp.asarray(scale, jnp.float32))
 

@@ -10,19 +10,23 @@ import jax.numpy as jnp
 from dexsim.core.pytree import Array, align
 
 
+def _sum_of_products(left: Array, right: Array, axis: int) -> jax.Array:
+    return jnp.sum(align(left, right) * align(right, left), axis=axis)
+
+
 def rotate(matrix: Array, vector: Array) -> jax.Array:
     """`matrix` [..., 3, 3] times `vector` [..., 3]."""
-    return jnp.sum(matrix * vector[..., None, :], axis=-1)
+    return _sum_of_products(matrix, vector[..., None, :], axis=-1)
 
 
 def rotate_inverse(matrix: Array, vector: Array) -> jax.Array:
     """The transpose of `matrix` [..., 3, 3] times `vector` [..., 3]."""
-    return jnp.sum(matrix * vector[..., :, None], axis=-2)
+    return _sum_of_products(matrix, vector[..., :, None], axis=-2)
 
 
 def compose(left: Array, right: Array) -> jax.Array:
     """The matrix product of two rotations [..., 3, 3]."""
-    return jnp.sum(left[..., :, :, None] * right[..., None, :, :], axis=-2)
+    return _sum_of_products(left[..., :, :, None], right[..., None, :, :], axis=-2)
 
 
 def quat_to_matrix(quat: Array) -> jax.Array:

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dexsim.core.pytree import pytree_dataclass
+from dexsim.core.pytree import Array, pytree_dataclass
 from dexsim.geometry import rotations
 
 
@@ -85,7 +85,7 @@ class HandPose:
     tip_rotation: jax.Array  # [F, 3, 3]
 
 
-def forward_kinematics(hand: Hand, joint_position: jax.Array) -> HandPose:
+def forward_kinematics(hand: Hand, joint_position: Array) -> HandPose:
     """Poses of every link from joint angles [J] rad.
 
     Bodies of equal depth in the tree move together, so the unrolled program has a few wide

@@ -84,10 +84,11 @@ def evaluate(log: JointLog, values: Mapping[str, float], *, latency: int, subste
         segment,
     )
     measured = (log.position, np.nan if log.torque is None else log.torque)
-    return tuple(
+    angle_off, torque_off = (
         float(np.sqrt(np.mean((np.asarray(ours, float) - theirs) ** 2)))
         for ours, theirs in zip(readings, measured, strict=True)
     )
+    return angle_off, torque_off
 
 
 def check_log(log: JointLog) -> None:

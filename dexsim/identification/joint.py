@@ -132,6 +132,7 @@ def _blurred_torque(
     blur: float, drive: Actuator, target: jax.Array, position: jax.Array, velocity: jax.Array
 ) -> jax.Array:
     """`joint_torque` with a dead-band that fades in over `blur` rad."""
+    assert drive.encoder_bias is not None  # one of `PARAMETERS`
     error = target - (position + drive.encoder_bias)
     share = jax.nn.sigmoid((jnp.abs(error) - drive.dead_band) * (4.0 / blur))
     torque = share * pd_torque(drive, error, 0.0, 0.0, velocity)
@@ -159,7 +160,7 @@ def segments(log: JointLog, before: int = 8, least: int = 15) -> tuple[np.ndarra
         half = before // 2
         drift = np.mean(position[first : first + half]) - np.mean(position[change - half : change])
         if abs(drift) < 4.0 * noise / np.sqrt(half / 2):
-            firsts.append(first)
+            firsts.append(int(first))
     segment = np.zeros(len(position), np.int32)
     segment[firsts[1:]] = 1
     angles = [np.mean(position[first : first + max(_still(log, first, before), 1)]) for first in firsts]

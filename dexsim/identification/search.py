@@ -145,7 +145,7 @@ class Problem:
         self.measured = np.stack(channels)
         self.target = jnp.asarray(log.target, jnp.float32)
         self.timestep = log.period / substeps
-        self.best, self.latency_cost = np.inf, {}
+        self.best, self.latency_cost = np.inf, dict[int, float]()
 
     def _all(self, theta: np.ndarray) -> jax.Array:
         """All parameters [..., len(_NAMES)] from the fitted ones [..., P]."""

@@ -42,7 +42,7 @@ class Boxes:
     size: np.ndarray  # [K, 3] m, half-extents
     position: np.ndarray  # [K, 3] m
     quat: np.ndarray  # [K, 4]
-    deviation: tuple[float, float]  # m, between the two surfaces: mean and 99th percentile
+    deviation: tuple[float, ...]  # m, between the two surfaces: mean and 99th percentile
 
     def shape(self) -> sdf.Shape:
         """The union, for distances."""
@@ -105,10 +105,11 @@ def _fit(mesh: meshes.Mesh, parts: int, frames: Sequence[np.ndarray]) -> Boxes:
     rng = np.random.default_rng(0)
     extent = float(np.ptp(mesh.vertices, axis=0).max())
     skin, normal, _ = meshes.sample_surface(mesh, 3000, rng)
+    low, high = mesh.bounds + [[-0.03 * extent], [0.03 * extent]]
     points = np.concatenate(
         [
             skin + rng.normal(0, 0.03 * extent, (3000, 1)) * normal,
-            rng.uniform(*(mesh.bounds + [[-0.03 * extent], [0.03 * extent]]), (1500, 3)),
+            rng.uniform(low, high, (1500, 3)),
         ]
     )
     distance, _ = meshes.signed_distance(mesh, points)
@@ -155,7 +156,7 @@ def _grow(mesh: meshes.Mesh, parts: int, rng: np.random.Generator) -> tuple[np.n
         seeds, depth = np.argwhere(left), -distance[left]
         chosen = rng.choice(len(seeds), min(_SEEDS, len(seeds)), replace=False, p=depth / depth.sum())
         grown = [_grow_one(inside, seeds[index], rng) for index in chosen]
-        gain = [np.sum(left[_cut(box)]) - np.sum(~inside[_cut(box)]) for box in grown]
+        gain = [int(np.sum(left[_cut(box)])) - int(np.sum(~inside[_cut(box)])) for box in grown]
         best = grown[int(np.argmax(gain))]
         left[_cut(best)] = False
         kept.append(best)

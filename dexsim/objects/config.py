@@ -1,6 +1,7 @@
 """Which objects are drawn, and from which ranges."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 
@@ -86,9 +87,10 @@ class ObjectConfig:
             return self
 
         def narrow(span: tuple[float, float], middle: float) -> tuple[float, float]:
-            return tuple(middle + self.scale * (value - middle) for value in span)
+            low, high = span
+            return middle + self.scale * (low - middle), middle + self.scale * (high - middle)
 
-        values = {name: narrow(getattr(self, name), nominal(self, name)) for name in _SPANS}
+        values: dict[str, Any] = {name: narrow(getattr(self, name), nominal(self, name)) for name in _SPANS}
         return dataclasses.replace(self, scale=1.0, com_offset=self.scale * self.com_offset, **values)
 
     @property

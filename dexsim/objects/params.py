@@ -54,18 +54,18 @@ def extent(
 
     The other arguments are those of `ObjectParams`.
     """
-    reach = []
+    reaches = []
     for k, kind in enumerate(kinds):
         local = direction if quat is None else rotations.rotate_inverse(rotations.quat_to_matrix(quat[k]), direction)
         along, (a, b, c) = jnp.abs(local), size[k]
-        reach.append(
+        reaches.append(
             {
                 "box": along[0] * a + along[1] * b + along[2] * c,
                 "capsule": a + b * along[2],
                 "cylinder": a * jnp.hypot(along[0], along[1]) + b * along[2],
             }[kind]
         )
-    reach = jnp.stack(reach) + jnp.sum(position * direction, -1)
+    reach = jnp.stack(reaches) + jnp.sum(position * direction[None], -1)
     return jnp.max(jnp.where(active, reach, -jnp.inf))
 
 
@@ -114,7 +114,7 @@ def sample_object(key: jax.Array, config: ObjectConfig, shape_index: jax.Array |
         shape_index = jax.random.choice(keys[0], allowed)
     size, position, active = _sample_slots(keys[1], shape_index, config, extreme)
     density_mass, com, inertia = _mass_properties(size, position, active)
-    position = position - com  # the origin is the centre of a uniform solid
+    position = position - com[None]  # the origin is the centre of a uniform solid
     mass = uniform(keys[2], config.mass, extreme)
     scale = uniform(keys[3], config.inertia_scale, extreme) * mass / density_mass
     com = config.com_offset * uniform(keys[4], (-1.0, 1.0), extreme, (3,))

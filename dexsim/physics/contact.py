@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from dexsim.core.pytree import Array
 from dexsim.geometry import rotations, sdf
 from dexsim.hand.kinematics import Hand, HandPose
 from dexsim.objects.params import ObjectParams
@@ -34,7 +35,7 @@ BLEND_DEPTH = 0.0005
 
 
 def spring(
-    compliance: jax.Array, stiffness: jax.Array, ratio: jax.Array, *, period: float
+    compliance: Array, stiffness: Array, ratio: jax.Array | float, *, period: float
 ) -> tuple[jax.Array, jax.Array]:
     """MuJoCo's parameters for contacts that press with `stiffness` times depth at rest.
 
@@ -164,7 +165,8 @@ def follow_skin(
     centre = pose.body_position[hand.tip_body][:, None] + rotations.rotate(
         pose.tip_rotation[:, None], jnp.asarray(pads.centre)
     )
-    local, depth = sdf.to_local(centre, position, rotation), 0.0
+    local = sdf.to_local(centre, position, rotation)
+    depth: jax.Array | float = 0.0
     for k, kind in enumerate(shape.kinds):  # one spring for every primitive that a sphere is in
         here = sdf.to_local(local, shape.position[k], shape.rotation[k])
         gap = sdf.primitive_distance(kind, here, shape.size[k])

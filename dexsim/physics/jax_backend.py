@@ -42,7 +42,8 @@ class JaxBackend(MjxBackend):
         push: jax.Array,
     ) -> tuple[PhysicsState, jax.Array, Any]:
         """One control tick, with our contacts and solver (`substep`) or by `mjx.step`."""
-        if self._stepper is None:
+        stepper = self._stepper
+        if stepper is None:
             return super().advance(object, contacts, state, torque, memory, push)
         scene, model = self.scene, self.configure(object, contacts)
         data = self.make_data()
@@ -51,7 +52,7 @@ class JaxBackend(MjxBackend):
             (qpos, qvel, warmstart), memory = carry
             tau, memory = torque(index, qpos[scene.joint_qpos], qvel[scene.joint_dof], memory)
             applied = jnp.zeros(scene.model.nv).at[scene.joint_dof].set(tau)
-            after, force = self._stepper.step(
+            after, force = stepper.step(
                 model, data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart), applied, push
             )
             return (after, memory), force
@@ -76,6 +77,6 @@ class JaxBackend(MjxBackend):
         finger = jnp.asarray(self._finger_of_geom)[touch.geom[use]]
         is_object = jnp.asarray(self._is_object_geom)[touch.geom[use]]
         # MuJoCo's contact force acts on geom2; geom1 feels the opposite.
-        on_second = is_object[:, 0] * jax.nn.one_hot(finger[:, 1], fingers).T
-        on_first = is_object[:, 1] * jax.nn.one_hot(finger[:, 0], fingers).T
+        on_second = is_object[:, 0].astype(jnp.float32) * jax.nn.one_hot(finger[:, 1], fingers).T
+        on_first = is_object[:, 1].astype(jnp.float32) * jax.nn.one_hot(finger[:, 0], fingers).T
         return jnp.sum((on_second - on_first)[..., None] * force, 1)

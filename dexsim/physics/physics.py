@@ -93,6 +93,7 @@ class Physics:
 
     def tip_stiffness(self, object: ObjectParams, qpos: jax.Array) -> jax.Array:
         """How much stiffer [F] than nominal the fingertips are where they press now."""
+        assert self.skin is not None, "without a skin, springs are constant"
         place = qpos[self.object_qpos]
         turn = rotations.quat_to_matrix(place[3:] / jnp.linalg.norm(place[3:]))
         pose = forward_kinematics(self.hand, qpos[self.joint_qpos])

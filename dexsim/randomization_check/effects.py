@@ -6,6 +6,7 @@ so a difference counts only in ticks in which it is larger than that.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -14,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dexsim.core.compilation import collector_paused
+from dexsim.core.pytree import align
 from dexsim.objects.config import SHAPES, nominal
 from dexsim.randomization import NOMINAL, Randomization, sample_hand
 from dexsim.sensing.imu import ImuConfig, sample_imu
@@ -21,7 +23,10 @@ from dexsim.sensing.taxels import TaxelSensor
 
 READINGS = ("joint_position", "joint_torque", "taxel_force", "object_position", "object_quat")
 # What must be there for a range to show.
-_AIDS = {"ripple_count": {"ripple": (0.03, 0.03)}, "hysteresis_time": {"hysteresis": (0.3, 0.3)}}
+_AIDS: dict[str, dict[str, Any]] = {
+    "ripple_count": {"ripple": (0.03, 0.03)},
+    "hysteresis_time": {"hysteresis": (0.3, 0.3)},
+}
 _SHAPE_OF = {"sphere": "sphere", "cylinder": "cylinder", "neck": "composition"}
 _WIDTHS = ("encoder_bias", "gravity_tilt", "com_offset", "bias", "drift")  # ranges given by one number
 
@@ -62,14 +67,14 @@ def check(
     bench = _Bench(env, step, states, key, ticks)
     tests: dict[str, Callable[[], Effect]] = {}
     for name in _ranges(env.config.randomization):
-        tests[f"Randomization.{name}"] = lambda n=name: bench.hand_range(n)
+        tests[f"Randomization.{name}"] = functools.partial(bench.hand_range, name)
     for name in _ranges(env.config.sensing.orientation):
-        tests[f"ImuConfig.{name}"] = lambda n=name: bench.orientation_range(n)
+        tests[f"ImuConfig.{name}"] = functools.partial(bench.orientation_range, name)
     for name in _taxel_ranges(env.config.sensing.taxel):
-        tests[f"TaxelSensor.{name}"] = lambda n=name: bench.taxel_range(n)
+        tests[f"TaxelSensor.{name}"] = functools.partial(bench.taxel_range, name)
     for path in env.task.object_ranges:
         owner, name = _owner(env.config, path)
-        tests[f"{type(owner).__name__}.{name}"] = lambda p=path: bench.object_range(p)
+        tests[f"{type(owner).__name__}.{name}"] = functools.partial(bench.object_range, path)
     tests["push"] = bench.push
     unused = f"Randomization.{_unused(env.config.randomization)}"
     return [tests[name]() for name in names or (name for name in tests if name != unused)]
@@ -108,7 +113,7 @@ class _Bench:
         # Fingers close, and all joints are thrown about: contact, full torque and speed occur.
         throw = jax.random.uniform(action_key, (ticks, self.count, env.action_size), minval=-1.0)
         close = jnp.asarray([0.0 if low < 0 else 0.5 for low in env.hand.joint_lower])
-        self.actions = jnp.clip(throw + close, -1.0, 1.0)
+        self.actions = jnp.clip(throw + align(close, throw), -1.0, 1.0)
         self.states = dataclasses.replace(
             states,
             episode=dataclasses.replace(

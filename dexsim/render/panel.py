@@ -116,7 +116,7 @@ def draw_panel(
     draw = ImageDraw.Draw(image)
     font, pad = _font(layout.font), int(1.3 * layout.font)
     width, height = layout.cell * layout.grid[0] - _GAP, layout.cell * layout.grid[1]
-    colors = np.where(taxel_force[..., None] > 0, force_color(taxel_force, force_range), np.uint8(EMPTY))
+    colors = np.where(taxel_force[..., None] > 0, force_color(taxel_force, force_range), np.array(EMPTY, np.uint8))
     grid = np.arange(layout.cell) >= layout.cell - _GAP
     for f, (x, y) in enumerate(layout.slots[:-1]):
         text = f"{finger_force[f]:.1f} N"

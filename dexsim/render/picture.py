@@ -103,7 +103,7 @@ def object_primitives(kinds: tuple[str, ...], frame: Any) -> Primitives:
     active = np.flatnonzero(frame.primitive_active)
     position = frame.object_position + frame.primitive_position[active] @ frame.object_rotation.T
     rotation = frame.object_rotation @ frame.primitive_rotation[active]
-    color = np.tile(np.float32(_OBJECT), (len(active), 1))
+    color = np.tile(np.array(_OBJECT, np.float32), (len(active), 1))
     return Primitives(tuple(kinds[k] for k in active), frame.primitive_size[active], position, rotation, color)
 
 
@@ -149,7 +149,8 @@ def _paint(
     opacity: float = 1.0,
 ) -> None:
     """Shade a surface and lay it over the picture, linear RGB [3, h * w]."""
-    pixel, weight, index, points = samples(view, surface, _SUPERSAMPLE)
+    found = samples(view, surface, _SUPERSAMPLE)
+    pixel, weight, index, points = found.pixel, found.weight, found.index, found.points
     normal, toward = normals(primitives, index, points, bevel), _toward(view, points)
     away = 1 - np.clip(_dot(normal, toward), 0, 1)
     # Glass-like: more opaque where the surface turns away, so that the silhouette stays crisp.
@@ -219,7 +220,7 @@ def _taxel_rays(surface: VisibleSurface, view: CameraView, pose: Pose, force: np
 
     hot = (force_color(level, force_range) / np.float32(255)) ** np.float32(2.2)
     facing = -np.sum(normal * centre, -1) / np.linalg.norm(centre, axis=-1)
-    tone = np.where(level[:, None] > 0, hot, np.float32(_IDLE_TAXEL) * (0.35 + 0.65 * facing[:, None]))
+    tone = np.where(level[:, None] > 0, hot, np.array(_IDLE_TAXEL, np.float32) * (0.35 + 0.65 * facing[:, None]))
     pixel = (row // _SUPERSAMPLE) * (view.size[0] // _SUPERSAMPLE) + column // _SUPERSAMPLE
     return pixel, tone[taxel].astype(np.float32), level[taxel] > 0
 
@@ -237,8 +238,8 @@ def _key_light(primitives: Primitives, hand: int, view: CameraView, up: tuple[fl
 
     Fitted to the hand alone, since a lost object may be anywhere.
     """
-    up = np.asarray(up, np.float64)
-    light = _unit(0.55 * view.axes[0] + 0.75 * up + 0.75 * view.axes[2])
+    upward = np.asarray(up, np.float64)
+    light = _unit(0.55 * view.axes[0] + 0.75 * upward + 0.75 * view.axes[2])
     side = _unit(np.cross(light, view.axes[1]))
     axes, half = np.stack([side, np.cross(light, side), light]), _SHADOW_PIXELS / 2
     # No primitive reaches farther from its centre than the length of its size times the root of 2 (a stubby capsule).
@@ -247,7 +248,7 @@ def _key_light(primitives: Primitives, hand: int, view: CameraView, up: tuple[fl
     low, high = (lateral - reach).min(0), (lateral + reach).max(0)
     middle, radius = (low + high) / 2 @ axes, float((high - low)[:2].max() / 2)
     above = CameraView(middle + light, axes, half / radius, (half, half), (_SHADOW_PIXELS, _SHADOW_PIXELS), True)
-    return Light(light.astype(np.float32), up.astype(np.float32), above, cast(primitives, above).depth)
+    return Light(light.astype(np.float32), upward.astype(np.float32), above, cast(primitives, above).depth)
 
 
 def _visible(light: Light, points: np.ndarray, normal: np.ndarray) -> np.ndarray:

@@ -55,14 +55,16 @@ class Primitives(NamedTuple):
     color: np.ndarray  # [G, 3], linear RGB
 
 
-class VisibleSurface(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class VisibleSurface:
     """What each pixel of a view sees first. Depth runs along the optical axis."""
 
     depth: np.ndarray  # [H, W], m, FAR where empty
     index: np.ndarray  # [H, W] int, primitive, -1 where empty
 
 
-class ShadingSamples(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class ShadingSamples:
     """Surface points to shade, those of one primitive together.
 
     Components are the first axis: NumPy is several times faster on three long rows than on many short triples.
@@ -125,21 +127,21 @@ def samples(view: CameraView, surface: VisibleSurface, n: int) -> ShadingSamples
     inside = indices[0] >= 0
     for other in indices[1:]:
         inside &= other == indices[0]
-    pixel = [np.flatnonzero(inside)]
-    index = [indices[0].reshape(-1)[pixel[0]]]
-    depth = [sum(x.reshape(-1)[pixel[0]] for x in depths) * np.float32(1 / n**2)]
+    pixels = [np.flatnonzero(inside)]
+    parts = [indices[0].reshape(-1)[pixels[0]]]
+    ways = [np.asarray(sum(x.reshape(-1)[pixels[0]] for x in depths)) * np.float32(1 / n**2)]
     shift = [(0.5 * n, 0.5 * n)]
     for k, (some, far) in enumerate(zip(indices, depths, strict=True)):
-        pixel.append(np.flatnonzero((some >= 0) & ~inside))
-        index.append(some.reshape(-1)[pixel[-1]])
-        depth.append(far.reshape(-1)[pixel[-1]])
+        pixels.append(np.flatnonzero((some >= 0) & ~inside))
+        parts.append(some.reshape(-1)[pixels[-1]])
+        ways.append(far.reshape(-1)[pixels[-1]])
         shift.append((k % n + 0.5, k // n + 0.5))
-    counts = [len(part) for part in pixel]
-    index = np.concatenate(index)
+    counts = [len(part) for part in pixels]
+    index = np.concatenate(parts)
     order = np.argsort(index, kind="stable")
-    pixel, depth = np.concatenate(pixel)[order].astype(np.int32), np.concatenate(depth)[order]
-    dx, dy = (np.repeat(np.float32(values), counts)[order] for values in zip(*shift, strict=True))
-    weight = np.repeat(np.float32([1] + [1 / n**2] * n**2), counts)[order]
+    pixel, depth = np.concatenate(pixels)[order].astype(np.int32), np.concatenate(ways)[order]
+    dx, dy = (np.repeat(np.array(values, np.float32), counts)[order] for values in zip(*shift, strict=True))
+    weight = np.repeat(np.array([1] + [1 / n**2] * n**2, np.float32), counts)[order]
     row, column = np.divmod(pixel, np.int32(view.size[0] // n))
     slope = np.float32(1 / view.scale) if view.orthographic else depth * np.float32(1 / view.scale)
     x = (column * np.float32(n) + dx - np.float32(view.centre[0])) * slope

@@ -15,6 +15,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from dexsim.core.pytree import Array
 from dexsim.hand.kinematics import Hand, forward_kinematics, taxel_normals, taxel_positions
 from dexsim.hand.load import load_hand
 from dexsim.render.panel import draw_panel, force_color, make_layout, taxel_image
@@ -147,7 +148,7 @@ def _painter(hand, kinds, snapshot, camera, size, force_range, finger_range) -> 
 
 
 @lru_cache(maxsize=4)
-def _kinematics(hand: Hand) -> Callable[[jax.Array], tuple]:
+def _kinematics(hand: Hand) -> Callable[[Array], tuple]:
     def pose(joint_position):
         links = forward_kinematics(hand, joint_position)
         return (links.body_position, links.body_rotation, taxel_positions(hand, links), taxel_normals(hand, links))
@@ -206,7 +207,8 @@ def _write_gif(frame: Callable[[int], np.ndarray], count: int, path: Path, fps: 
     # One palette for all frames: quantising to a given palette is fast and nothing flickers. A quarter of it is kept
     # for the colours of force, which cover few pixels; the rest is drawn from frames throughout the video.
     some = np.concatenate([frame(t) for t in np.linspace(0, count - 1, min(count, 5)).astype(int)])
-    scene = Image.fromarray(some).quantize(192, Image.Quantize.MEDIANCUT).getpalette()[: 3 * 192]
+    quantized = Image.fromarray(some).quantize(192, Image.Quantize.MEDIANCUT)
+    scene = (quantized.getpalette() or [])[: 3 * 192]
     palette = Image.new("P", (1, 1))
     palette.putpalette(scene + force_color(np.linspace(0, 1, 64), 1.0).reshape(-1).tolist())
     images = [Image.fromarray(frame(t)).quantize(palette=palette, dither=Image.Dither.NONE) for t in range(count)]

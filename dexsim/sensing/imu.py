@@ -46,7 +46,7 @@ class ImuParams:
 
 
 def sample_imu(
-    key: jax.Array, config: ImuConfig, scale: float, control_period: float, extreme: jax.Array | None = None
+    key: jax.Array, config: ImuConfig, scale: jax.Array | float, control_period: float, extreme: jax.Array | None = None
 ) -> ImuParams:
     """Draw one episode's sensor; `scale` 0 gives one without bias, drift and delay.
 

@@ -115,7 +115,6 @@ class TaxelArray:
             return None if span is None else nominal + scale * (_uniform(keys[name], span, shape) - nominal)
 
         drift, dead = draw("drift", 0.0, finger), draw("dead", 0.0, ())
-        slow = sensor.rate is not None
         time = _uniform(keys["time"], sensor.hysteresis_time, finger)
         return TaxelParams(
             hysteresis=draw("hysteresis", 0.0, finger),
@@ -125,8 +124,8 @@ class TaxelArray:
             bias=draw("bias", 0.0, each),
             drift=None if drift is None else drift * self.control_period**0.5,
             alive=None if dead is None else jax.random.uniform(keys["alive"], each) >= dead,
-            rate=self.control_period * _uniform(keys["rate"], sensor.rate, ()) if slow else None,
-            phase=jax.random.uniform(keys["phase"], ()) if slow else None,
+            rate=None if sensor.rate is None else self.control_period * _uniform(keys["rate"], sensor.rate, ()),
+            phase=None if sensor.rate is None else jax.random.uniform(keys["phase"], ()),
         )
 
     def init(self) -> TaxelMemory:
@@ -159,7 +158,9 @@ class TaxelArray:
         """
         sensor, late, walk = self.sensor, memory.late, memory.walk
         value = felt = force * finger_gain
+        # What is off is None in `params` and `memory` alike.
         if late is not None:
+            assert params.memory is not None and params.hysteresis is not None
             late = felt + params.memory * (late - felt)
             value = value + params.hysteresis * (late - felt)
         if params.crosstalk is not None:
@@ -169,6 +170,7 @@ class TaxelArray:
         if params.bias is not None:
             value = value + params.bias
         if walk is not None:
+            assert params.drift is not None
             walk = walk + params.drift * jax.random.normal(jax.random.fold_in(key, 2), self.shape)
             value = value + walk
         value = value + sensor.noise * jax.random.normal(key, force.shape)
@@ -180,6 +182,7 @@ class TaxelArray:
         value = jnp.clip(value, 0.0, sensor.saturation)
         held, clock = memory.held, memory.clock
         if clock is not None:
+            assert held is not None and params.phase is not None and params.rate is not None
             first = clock < 0
             clock = jnp.where(first, params.phase, clock + params.rate)
             value = jnp.where(first | (clock >= 1), value, held)

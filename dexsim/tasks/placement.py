@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dexsim.core.pytree import align
 from dexsim.geometry import rotations, sdf
 from dexsim.hand.kinematics import Hand, forward_kinematics
 
@@ -25,5 +26,5 @@ def clearance(hand: Hand, joints: jax.Array, shape: sdf.Shape, position: jax.Arr
     body = np.array([g.body for g in capsules])
     radius = np.array([g.size[0] for g in capsules])[:, None]
     points = pose.body_position[body][:, None] + rotations.rotate(pose.body_rotation[body][:, None], jnp.asarray(local))
-    points = rotations.rotate_inverse(rotation, points - position)
+    points = rotations.rotate_inverse(rotation, points - align(position, points))
     return jnp.min(sdf.signed_distance(points, shape) - radius)

@@ -16,7 +16,7 @@ def joint_speed(velocity: jax.Array) -> jax.Array:
 
 def mean_where(chosen: jax.Array, values: jax.Array) -> jax.Array:
     """Mean [] of the `chosen` [N] values [N]; 0 when none is chosen."""
-    return jnp.sum(jnp.where(chosen, values, 0.0)) / jnp.maximum(jnp.sum(chosen), 1)
+    return jnp.sum(jnp.where(chosen, values, 0.0)) / jnp.maximum(jnp.sum(chosen), 1).astype(jnp.float32)
 
 
 def random_push(key: jax.Array, mass: jax.Array, *, probability: float, speed: float, period: float) -> jax.Array:

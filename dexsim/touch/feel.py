@@ -72,7 +72,7 @@ def feel_links(
     """
     surface = surface or taxels_only(hand)
     turn = rotations.compose(jnp.swapaxes(rotation, -1, -2), pose.tip_rotation)
-    shift = rotations.rotate_inverse(rotation, pose.body_position[hand.tip_body] - position)
+    shift = rotations.rotate_inverse(rotation, pose.body_position[hand.tip_body] - position[None])
     # Without the barrier XLA would compose the rotations anew for every taxel.
     turn, shift = jax.lax.optimization_barrier((turn, shift))
     taxel = [jnp.asarray(surface.position[..., axis]) for axis in range(3)]

@@ -35,11 +35,9 @@ def whole_surface(hand: Hand, reach: float) -> Surface:
     Args:
       reach: m from the nearest taxel within which pressed skin loads that taxel, so that it has no point of its own.
     """
-    untaxelled = [_beyond(hand, finger, reach) for finger in range(hand.num_fingers)]
-    longest = max(len(rows) for rows in untaxelled)
-    untaxelled = np.stack(
-        [np.concatenate([rows, np.zeros((longest - len(rows), 7), np.float32)]) for rows in untaxelled]
-    )
+    beyond = [_beyond(hand, finger, reach) for finger in range(hand.num_fingers)]
+    longest = max(len(rows) for rows in beyond)
+    untaxelled = np.stack([np.concatenate([rows, np.zeros((longest - len(rows), 7), np.float32)]) for rows in beyond])
     return Surface(
         np.concatenate([hand.taxel_position, untaxelled[..., :3]], 1),
         np.concatenate([hand.taxel_normal, untaxelled[..., 3:6]], 1),
@@ -64,7 +62,9 @@ def _beyond(hand: Hand, finger: int, reach: float) -> np.ndarray:
     points, normal = points[gap > reach], normal[gap > reach]
     _, cell = np.unique(np.floor(points / _CELL), axis=0, return_inverse=True)
     count = np.bincount(cell.ravel())
-    rows = np.stack([np.bincount(cell.ravel(), weights=x) for x in np.concatenate([points, normal], 1).T], 1)
+    rows: np.ndarray = np.stack(
+        [np.bincount(cell.ravel(), weights=x) for x in np.concatenate([points, normal], 1).T], 1
+    )
     rows[:, :3] /= count[:, None]
     # The two sides of a thin part may share a cell.
     rows[:, 3:] /= np.maximum(np.linalg.norm(rows[:, 3:], axis=1, keepdims=True), 1e-9)

@@ -31,11 +31,11 @@ except ImportError as error:
     raise ImportError("dexsim.wrappers.brax needs brax: pip install 'dexsim[brax]'") from error
 
 
-def _put_replicated(tree: Any, devices: list[jax.Device]) -> Any:
-    """`tree` with a leading axis over `devices`: JAX 0.10 took it out, brax 0.14 still calls it."""
+def _put_replicated(x: Any, devices: Sequence[jax.Device]) -> Any:
+    """`x` with a leading axis over `devices`: JAX 0.10 took it out, brax 0.14 still calls it."""
     mesh = jax.sharding.Mesh(np.array(devices), ("device",))
     sharding = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("device"))
-    return jax.tree.map(lambda leaf: jax.device_put(jnp.stack([jnp.asarray(leaf)] * len(devices)), sharding), tree)
+    return jax.tree.map(lambda leaf: jax.device_put(jnp.stack([jnp.asarray(leaf)] * len(devices)), sharding), x)
 
 
 if not hasattr(jax, "device_put_replicated"):

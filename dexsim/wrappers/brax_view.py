@@ -55,8 +55,8 @@ def brax_scene(env: BraxEnv, trajectory: Sequence[Any]) -> tuple[Any, list[Any]]
         for k, kind in enumerate(env.env.primitive_kinds)
         if first.primitive_active[k]
     ]
-    kinds, sizes, links, positions, rotations, colours = zip(*rows, strict=True)
-    sizes = [np.max(size).repeat(3) if kind == "ellipsoid" else size for kind, size in zip(kinds, sizes, strict=True)]
+    kinds, extents, links, positions, rotations, colours = zip(*rows, strict=True)
+    sizes = [np.max(size).repeat(3) if kind == "ellipsoid" else size for kind, size in zip(kinds, extents, strict=True)]
     system = SimpleNamespace(
         opt=SimpleNamespace(timestep=env.dt),
         link_names=[*hand.body_names, "object"],

@@ -46,7 +46,9 @@ class Workbench:
         self._arguments = arguments
         sensing = HandSensing(hand, arguments.hardware)
         path = arguments.log or Path("runs/real") / time.strftime("calibrate-%Y%m%d-%H%M%S.log")
-        port = port or open_port(arguments.port, arguments.link)
+        if port is None:
+            assert arguments.port is not None, "`CalibrateArguments` asks for it"
+            port = open_port(arguments.port, arguments.link)
         self.log = LogWriter(path)
         self.safety = Safety(hand, arguments.safety, self._react)
         self.loop = HandLoop(port, sensing, self.safety, self.log, arguments.rate, clock=clock, sleep=sleep)

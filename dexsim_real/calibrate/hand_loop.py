@@ -111,7 +111,9 @@ class HandLoop:
 
     def pose(self) -> np.ndarray:
         """The last measured joint angles [J] rad."""
-        return self.safety.sample.measured.joint_position.astype(float)
+        sample = self.safety.sample
+        assert sample is not None, "no state yet"
+        return sample.measured.joint_position.astype(float)
 
     def close(self) -> None:
         """Turn the motors off (repeat until the hand confirms it, at most ten times) and close the port."""

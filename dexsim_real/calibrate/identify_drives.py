@@ -30,7 +30,7 @@ from dexsim_real.wire import frames
 
 TASK = "identify"
 STIFFNESS, DAMPING = 3.0, 0.1  # Nm/rad, Nm s/rad: initial values of the fit
-_SIGNALS = {
+_SIGNALS: dict[str, dict[str, Any]] = {
     "fit": {},
     "hold-out": {"amplitude": 0.2, "chirp_frequency": (0.5, 2.5), "chirp_seconds": 3.0, "step_count": 3},
 }

@@ -77,7 +77,8 @@ def fit(session: PressSession, hand: Hand, created: str | None = None) -> Fit:
     if not pressed:
         raise CalibrationError("no press was recorded; record again")
     per_count, newtons, sensors, notes = _gauges(session, hand, pressed)
-    real, sim, source, reach = {}, {}, {}, {}
+    real, sim, source = {}, {}, {}
+    reach: dict[str, float] = {}
     for recording in pressed:
         blocks = make_blocks(recording, hand.taxel_grid)
         dead = dead_taxels(hand, blocks.counts, session.check.neighbours)
@@ -136,12 +137,12 @@ def make_blocks(recording: Recording, grid: tuple[int, int]) -> Blocks:
     """
     size = max(round(_BLOCK * recording.rate), 1)
     phase = np.array(recording.phase)
-    runs = [
+    blocks = [
         [np.arange(size) + at for at in range(first, last - size + 1, size)]
         for first, last in _runs(phase)
         if phase[first] in (LOADING, UNLOADING)
     ]
-    runs = [np.array(run) for run in runs if len(run) > 1]  # A single block has no speed.
+    runs = [np.array(run) for run in blocks if len(run) > 1]  # A single block has no speed.
     if not runs:
         raise CalibrationError(
             f"{recording.name}: no press lasted {2 * _BLOCK:g} s; press more slowly (--press.seconds)"

@@ -137,7 +137,9 @@ class PressProcedure:
 
     def _load(self, speed: float) -> None:
         """Press until peak force, current or travel is reached, or the motors stall."""
-        begin, forces, positions = self.loop.pose(), [], []
+        begin = self.loop.pose()
+        forces: list[float] = []
+        positions: list[np.ndarray] = []
         first = self._target()
         while True:
             exchange = self._step(min(self._advance + speed * self.loop.pace.period, self.config.travel), LOADING)
@@ -186,6 +188,7 @@ class PressProcedure:
 
     def _climb(self, speed: float) -> None:
         """Hold rising and falling forces, and read the gauge at each."""
+        assert self.gauge is not None, "levels are for the gauge"
         shares = np.linspace(1 / self.arguments.levels, 1.0, self.arguments.levels)
         for number, share in enumerate([*shares, *shares[-2::-1]]):
             rising = number < len(shares)

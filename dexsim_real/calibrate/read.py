@@ -58,59 +58,62 @@ def read_logs(paths: Iterable[Path], hand: Hand) -> PressSession:
     Raises:
       LogError: not a log of presses, or recorded with other settings than the logs before.
     """
-    session = None
+    session: PressSession | None = None
     for path in paths:
-        found = _Reader(Path(path), hand).session
+        found = _Reader(Path(path), hand).read()
         if session is None:
             session = found
         elif (found.hardware, found.rate) != (session.hardware, session.rate):
             raise LogError(f"{path}: recorded with other --hardware options or another --rate than the logs before")
         else:
             session.recordings.update(found.recordings)
+    assert session is not None, "no log given"
     return session
 
 
 class _Reader:
     def __init__(self, path: Path, hand: Hand):
-        self.session: PressSession | None = None
-        self._hand, self._number, self._frame = hand, -1, b""
-        rest: list[np.ndarray] = []
-        for record in LogReader(path):
+        self._path, self._hand, self._number, self._frame = path, hand, -1, b""
+
+    def read(self) -> PressSession:
+        session, rest = None, list[np.ndarray]()
+        for record in LogReader(self._path):
             content = record.content
             if record.kind == Kind.META and "task" in content:
-                self._begin(path, content)
-            elif self.session is None:
+                session = self._begin(content)
+            elif session is None:
                 continue
             elif record.kind == Kind.META:
-                self._configure(content)
+                self._configure(session, content)
             elif record.kind == Kind.RECEIVED:
                 self._number, self._frame = content
             elif record.kind == Kind.TICK:
-                self._sample(record.time, content, rest)
-        if self.session is None:
-            raise LogError(f"{path}: the log ends before the hand was ready; record again")
-        self.session.rest_current = np.array(rest)
+                self._sample(session, record.time, content, rest)
+        if session is None:
+            raise LogError(f"{self._path}: the log ends before the hand was ready; record again")
+        session.rest_current = np.array(rest)
+        return session
 
-    def _begin(self, path: Path, meta: dict[str, Any]) -> None:
+    def _begin(self, meta: dict[str, Any]) -> PressSession:
         if meta["task"] != "calibrate":
-            raise LogError(f"{path}: this is a log of {meta['task']!r}; give a log of `dexsim_real.calibrate`")
+            raise LogError(f"{self._path}: this is a log of {meta['task']!r}; give a log of `dexsim_real.calibrate`")
         hardware = from_dict(HardwareConfig, meta["hardware"])
-        self.session = PressSession(
+        self._sensing, self._raw = HandSensing(self._hand, hardware), raw_sensing(self._hand, hardware)
+        return PressSession(
             hardware, from_dict(CheckConfig, meta["check"]), meta["serial"], meta["rate"], {}, np.empty(0)
         )
-        self._sensing, self._raw = HandSensing(self._hand, hardware), raw_sensing(self._hand, hardware)
 
-    def _configure(self, content: dict[str, Any]) -> None:
+    def _configure(self, session: PressSession, content: dict[str, Any]) -> None:
         if "tare" in content:
             self._sensing.tare = np.array(content["tare"], np.float32)
         if "placement" in content:
             placement = content["placement"]
-            self.session.recordings[placement["name"]] = Recording(
-                placement["name"], placement["finger"], tuple(placement["joints"]), self.session.rate
+            session.recordings[placement["name"]] = Recording(
+                placement["name"], placement["finger"], tuple(placement["joints"]), session.rate
             )
 
-    def _sample(self, time: float, tick: dict[str, Any], rest: list[np.ndarray]) -> None:
-        recording = self.session.recordings.get(tick["press"])
+    def _sample(self, session: PressSession, time: float, tick: dict[str, Any], rest: list[np.ndarray]) -> None:
+        recording = session.recordings.get(tick["press"])
         if recording is not None and "gauge" in tick:
             recording.gauge[tick["phase"]] = tick["gauge"]
             return
@@ -128,7 +131,7 @@ class _Reader:
         recording.phase.append(tick["phase"])
         recording.time.append(time)
         recording.counts.append(self._raw.measure(state).taxel_force[finger].astype(float) - recording.tare)
-        recording.shown.append(float(measured.taxel_force[finger].sum()) / self.session.hardware.force_per_count)
+        recording.shown.append(float(measured.taxel_force[finger].sum()) / session.hardware.force_per_count)
         recording.shear.append(np.array([taxel[axis].sum(dtype=float) for axis in "xy"]))
         recording.current.append(current)
         recording.position.append(measured.joint_position.astype(float))

@@ -25,7 +25,7 @@ class TurnGoals:
     def __init__(self, turn: TurnSpec, reference: np.ndarray):
         self._turn, self._reference = turn, np.asarray(reference)
         self._axis = turn.unit_axis
-        self.successes, self.times = 0, []
+        self.successes, self.times = 0, list[float]()
         self._last: tuple[float, np.ndarray] | None = None
         self._spin = 0.0
         self.quat = self._goal()

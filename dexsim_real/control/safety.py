@@ -221,6 +221,7 @@ class Safety:
 
     def _follow(self, now: float, sample: HandSample) -> SafetyDecision:
         config = self.config
+        assert self._commanded is not None, "`_start` comes first"
         if self._target is None:
             return self._finish(now, Reaction.NONE, "", self._commanded)
         target = self._target[1]

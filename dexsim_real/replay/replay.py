@@ -45,7 +45,8 @@ def replay(path: Path) -> Replay:
     """
     reader = LogReader(path)
     states: dict[int, bytes] = {}
-    times, measured, ticks, observations, notes = [], [], [], [], []
+    times, measured, observations, notes = [], [], [], []
+    ticks: list[Any] = []
     fields: tuple[LayoutEntry, ...] = ()
     counts = dict.fromkeys(("frames", "readings_same", "observations_same", "without_frame"), 0)
     first, meta, end = "", None, None

@@ -41,7 +41,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         except KeyboardInterrupt:
             reason, code = "Ctrl-C", 130
         except SystemExit as stop:
-            reason, code = f"signal {stop.code - 128}", stop.code
+            code = stop.code if isinstance(stop.code, int) else 1
+            reason = f"signal {code - 128}"
         except BaseException as error:
             reason = f"failure: {error!r}"
             raise

@@ -149,7 +149,7 @@ class Session:
     # --- pieces ---------------------------------------------------------------------------------
 
     def _tare(self) -> None:
-        states, until = [], time.monotonic() + 5.0
+        states, until = list[np.ndarray](), time.monotonic() + 5.0
         while len(states) < _TARE_SAMPLES and time.monotonic() < until:
             reply = self.port.exchange(self.sensing.command(self.sensing.hand.joint_lower, Mode.PASSIVE))
             if reply is not None:
@@ -167,7 +167,8 @@ class Session:
         goal = goal if arguments.approach > 0 else start
         begin, pace = time.monotonic(), Pace(arguments.rate)
         ready = begin + arguments.approach + arguments.place
-        while (now := time.monotonic()) < ready or not self.objects.ready():
+        objects = self._objects()
+        while (now := time.monotonic()) < ready or not objects.ready():
             if now > ready + _PATIENCE:
                 raise HandError(
                     "the camera does not see the object; check the light, the colour thresholds "
@@ -178,7 +179,12 @@ class Session:
             self._check()
             pace.wait()
 
+    def _objects(self) -> ObjectSensors:
+        assert self.objects is not None, "`prepare` opens the sensors"
+        return self.objects
+
     def _pose(self) -> np.ndarray:
+        assert self.safety.sample is not None, "no state yet"
         return self.safety.sample.measured.joint_position
 
     def _check(self) -> None:
@@ -196,6 +202,7 @@ class Session:
         while time.monotonic() < self.started + self.arguments.seconds:
             self._check()
             now, sample = time.monotonic(), self.safety.sample
+            assert sample is not None, "no state yet"
             if now - sample.time <= self.safety.config.stale:
                 if anchor != self.safety.anchor:
                     anchor = self.safety.anchor
@@ -207,7 +214,7 @@ class Session:
         return "time is over"
 
     def _tick(self, now: float, sample: Any) -> None:
-        seen, age, when = self.objects.read(now)
+        seen, age, when = self._objects().read(now)
         goal = self.goals.update(when, seen) if self.goals else IDENTITY
         if self.arguments.motors_off:
             self.controller.anchor(sample.measured.joint_position)

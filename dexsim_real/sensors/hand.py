@@ -146,7 +146,7 @@ class HandSensing:
         Raises:
           HandError: a fingertip touches something.
         """
-        counts = np.mean([self._counts(state) for state in states], axis=0, dtype=np.float32)
+        counts = np.asarray(np.mean([self._counts(state) for state in states], axis=0, dtype=np.float32))
         worst = counts.max(1)
         if np.any(worst > self.config.tare_limit):
             names = [self.hand.finger_names[i] for i in np.flatnonzero(worst > self.config.tare_limit)]

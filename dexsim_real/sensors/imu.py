@@ -148,6 +148,7 @@ class Imu:
 
     def calibrate(self, known: np.ndarray) -> None:
         """Align the heading: the object now has the orientation `known` [4] in the palm frame."""
+        assert self._newest is not None, "`wait` for the first orientation"
         self._world = align(self._newest[1], multiply(known, self._mount), self._up)
 
     def read(self) -> tuple[float, np.ndarray]:

@@ -67,6 +67,8 @@ def check_policy(name: str, task: str, hand: Hand) -> None:
     policy = load_policy(name)
     if policy.task != task:
         raise HandError(f"{name} is a policy of the task {policy.task!r}; give --task {policy.task}")
+    if policy.spec is None:
+        raise HandError(f"{name} is of an environment that is not of this library")
     trained, mounted = policy.spec.gravity, nominal_gravity(task)
     if np.abs(np.asarray(trained) - mounted).max() > 0.01:
         raise HandError(

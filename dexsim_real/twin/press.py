@@ -17,7 +17,7 @@ from dexsim.hand.kinematics import Hand
 from dexsim.hand.load import load_hand
 from dexsim_real.calibrate.plan import Placement, placements
 from dexsim_real.twin.options import TwinArguments
-from dexsim_real.twin.plant.assistant import Place, Stage, put
+from dexsim_real.twin.plant.assistant import Assistant, Place, Stage, put
 from dexsim_real.twin.plant.drives import STALL_CURRENT
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand
 from dexsim_real.twin.plant.scene import build_scene
@@ -42,10 +42,11 @@ class Foam:
     gap: float = 0.002  # m between fingertip and pen at the posture of contact
 
 
-class _Holder:
+class _Holder(Assistant):
     """Replaces the assistant: the pen is always there, held by springs."""
 
-    stage = Stage.FREE
+    def __init__(self) -> None:
+        self.stage = Stage.FREE
 
     def begin(self, time: float) -> None:
         """There is nothing to wait for."""
@@ -148,8 +149,10 @@ class PressBench(EmulatedHand):
         return bool(off < _TOLERANCE and -0.7 < advance < -0.03)
 
     def _left(self, target: np.ndarray) -> bool:
-        others = np.setdiff1d(np.arange(len(target)), self._pressing_placement.joints)
-        return bool(np.abs(target - self._pressing_placement.posture)[others].max() > 3 * _TOLERANCE)
+        placement = self._pressing_placement
+        assert placement is not None, "the pen is away"
+        others = np.setdiff1d(np.arange(len(target)), placement.joints)
+        return bool(np.abs(target - placement.posture)[others].max() > 3 * _TOLERANCE)
 
     def _hold_before(self, placement: Placement) -> None:
         """Place the pen across the finger at the taxels of a placement, with the gap."""

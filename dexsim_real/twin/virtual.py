@@ -6,6 +6,7 @@ emulated palm board, so quantisation and delays are those of the wire.
 """
 
 import dataclasses
+import functools
 import heapq
 from collections.abc import Callable
 from typing import Any
@@ -18,7 +19,7 @@ from dexsim_real.control.controller import IDENTITY, Controller
 from dexsim_real.control.goals import TurnGoals
 from dexsim_real.control.safety import HandSample, Safety, SafetyConfig
 from dexsim_real.sensors.camera import HeightSensor
-from dexsim_real.sensors.hand import HandSensing, HardwareConfig, VelocityFilter
+from dexsim_real.sensors.hand import HandMeasurement, HandSensing, HardwareConfig, VelocityFilter
 from dexsim_real.sensors.imu import BAUD, UPRIGHT_X, RvcParser, align, conjugate, encode, multiply
 from dexsim_real.sensors.readings import ObjectEstimate
 from dexsim_real.twin.plant.assistant import POSTURES
@@ -183,7 +184,7 @@ class VirtualRun:
         if "imu" in self.controller.sources:
             self._schedule.at(0.001, self._sense_orientation)
         if self.camera:
-            self._schedule.at(0.002, self._take_picture)
+            self._schedule.at(0.002, functools.partial(self._take_picture, self.camera))
         self._tare()
         self._mode = Mode.POSITION
         self.safety.engage()
@@ -212,7 +213,7 @@ class VirtualRun:
     # --- the bridge's threads ---------------------------------------------------------------------
 
     def _tick(self) -> None:
-        measured = self.safety.sample.measured
+        measured = self._measured()
         position, velocity = np.asarray(self.controller.spec.reference, float), np.zeros(3)
         if self.camera:
             _, position, velocity = self.camera.sensor.read()
@@ -243,8 +244,9 @@ class VirtualRun:
 
     def _answer(self, data: bytes, now: float) -> None:
         for frame in self._requests.feed(data):
-            reply = self.firmware.answer(frame, now).encode()
-            self._schedule.at(self._now + ROUND_TRIP - REQUEST, lambda reply=reply: self._receive(reply))
+            reply = self.firmware.answer(frame, now)
+            assert reply is not None, "a request of our own is answered"
+            self._schedule.at(self._now + ROUND_TRIP - REQUEST, functools.partial(self._receive, reply.encode()))
 
     def _receive(self, data: bytes) -> None:
         for frame in self._replies.feed(data):
@@ -259,9 +261,9 @@ class VirtualRun:
         self._schedule.at(there, lambda: self.imu.receive(there, data))
         self._schedule.at(self._now + 1 / IMU_RATE, self._sense_orientation)
 
-    def _take_picture(self) -> None:
-        self.camera.sample(self._now)
-        self._schedule.at(self._now + 1 / CAMERA_RATE, self._take_picture)
+    def _take_picture(self, camera: VirtualCamera) -> None:
+        camera.sample(self._now)
+        self._schedule.at(self._now + 1 / CAMERA_RATE, functools.partial(self._take_picture, camera))
 
     # --- pieces ---------------------------------------------------------------------------------
 
@@ -273,8 +275,12 @@ class VirtualRun:
             states += [self._state] if self._state is not None else []
         self.sensing.set_tare(states)
 
+    def _measured(self) -> HandMeasurement:
+        assert self.safety.sample is not None, "no state yet"
+        return self.safety.sample.measured
+
     def _pose(self) -> np.ndarray:
-        return self.safety.sample.measured.joint_position
+        return self._measured().joint_position
 
     def _until(self, time: float) -> None:
         """Run the plant and the events up to a time in s."""

@@ -231,8 +231,11 @@ def squeeze(hand, begun, rng: np.random.Generator, steps=100):
 
 @contextlib.contextmanager
 def double_precision() -> Iterator[None]:
-    """64-bit JAX. Traces that JAX keeps from 32-bit code clash with it, and the other way round."""
+    """64-bit JAX, where the library's 32-bit constants may be promoted.
+
+    Traces that JAX keeps from 32-bit code clash with it, and the other way round.
+    """
     jax.clear_caches()
-    with jax.enable_x64(True):
+    with jax.enable_x64(True), jax.numpy_dtype_promotion("standard"):
         yield
     jax.clear_caches()

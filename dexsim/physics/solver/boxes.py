@@ -33,14 +33,14 @@ def box_box(
     theirs = _apart(centre, turn, other, position, rotation, size)
     first = mine.max() >= theirs.max() - 1e-6
     pick = lambda a, b: jax.tree.map(functools.partial(jnp.where, first), a, b)  # noqa: E731
-    (position, rotation, size), incident = (
+    (position, rotation, size), (centre, turn, other) = (
         pick(a, b)
         for a, b in (
             ((position, rotation, size), (centre, turn, other)),
             ((centre, turn, other), (position, rotation, size)),
         )
     )
-    gap, point, normal = _clip(position, rotation, size, *incident, pick(mine, theirs).argmax())
+    gap, point, normal = _clip(position, rotation, size, centre, turn, other, pick(mine, theirs).argmax())
     normal = jnp.broadcast_to(jnp.where(first, normal, -normal), point.shape)
     overlap = jnp.maximum(mine.max(), theirs.max())
     alone = (overlap < 0) & ((gap.min() >= 0) | (edges[0] > _BETTER * overlap + _LESS))
@@ -64,8 +64,8 @@ def _cross(
     best = gaps.argmax()
     way = normal[best]
     # The middles of the edges that reach farthest toward the other box, and where they pass each other.
-    mine = jnp.sign(way @ rotation) * size * (np.arange(3) != jnp.asarray(_EDGES)[best, 0])
-    theirs = -jnp.sign(way @ turn) * other * (np.arange(3) != jnp.asarray(_EDGES)[best, 1])
+    mine = jnp.sign(way @ rotation) * size * (np.arange(3) != jnp.asarray(_EDGES)[best, 0]).astype(jnp.float32)
+    theirs = -jnp.sign(way @ turn) * other * (np.arange(3) != jnp.asarray(_EDGES)[best, 1]).astype(jnp.float32)
     start, end = position + rotation @ mine, centre + turn @ theirs
     share = one[best] @ two[best]
     along = ((end - start) @ (one[best] - share * two[best])) / jnp.maximum(1 - share**2, 1e-6)
@@ -77,7 +77,7 @@ def _apart(
 ) -> jax.Array:
     """Gap [6] along each of a box's face normals (+x, +y, +z, -x, -y, -z) to another box."""
     place = jnp.sum(rotation * (centre - position)[:, None], 0)
-    reach = size + jnp.sum(jnp.abs(jnp.sum(rotation[:, :, None] * turn[:, None, :], 0)) * other, -1)
+    reach = size + jnp.sum(jnp.abs(jnp.sum(rotation[:, :, None] * turn[:, None, :], 0)) * other[None], -1)
     return jnp.concatenate([place - reach, -place - reach])
 
 
@@ -99,7 +99,7 @@ def _clip(
     order = (face + jnp.array([1, 2, 0])) % 3
     along = rotation[:, order].T * jnp.stack([1.0, 1.0, jnp.where(face < 3, 1.0, -1.0)])[:, None]
     half = size[order]
-    local = jnp.sum(along * (centre - position), 1) - half * jnp.array([0.0, 0.0, 1.0])
+    local = jnp.sum(along * (centre - position)[None], 1) - half * jnp.array([0.0, 0.0, 1.0])
     axes = jnp.sum(along[:, :, None] * turn[None], 1)  # columns: the other box's axes there
 
     # The face of the other box that is most opposed to the normal, as a ring of corners.
@@ -108,28 +108,29 @@ def _clip(
     pick = (down + jnp.array([1, 2, 0])) % 3  # two edges' directions, then the normal's
     edges, wide = axes[:, pick], other[pick]
     middle = local + against * wide[2] * edges[:, 2]
-    corner = middle + (_RING[:, :1] * wide[0]) * edges[:, 0] + (_RING[:, 1:] * wide[1]) * edges[:, 1]
+    corner = middle[None] + (_RING[:, :1] * wide[0]) * edges[:, 0][None] + (_RING[:, 1:] * wide[1]) * edges[:, 1][None]
     way = jnp.roll(corner, -1, 0) - corner
 
     # Which stretch of each edge lies over the reference face.
     flat = jnp.where(jnp.abs(way[:, :2]) < 1e-9, 1e-9, way[:, :2])
-    one, two = (-half[:2] - corner[:, :2]) / flat, (half[:2] - corner[:, :2]) / flat
+    flank = half[:2][None]
+    one, two = (-flank - corner[:, :2]) / flat, (flank - corner[:, :2]) / flat
     begin = jnp.clip(jnp.minimum(one, two).max(1), 0.0, None)
     end = jnp.clip(jnp.maximum(one, two).min(1), None, 1.0)
     over = begin <= end
     started, ended = (corner + t[:, None] * way for t in (begin, end))
     # The reference face's own corners, where they lie under the incident face.
-    rim = _RING * half[:2]
+    rim = _RING * flank
     normal = edges[:, 2]
     steep = jnp.where(jnp.abs(normal[2]) < 1e-6, 1e-6, normal[2])
-    height = middle[2] - jnp.sum((rim - middle[:2]) * normal[:2], -1) / steep
+    height = middle[2] - jnp.sum((rim - middle[:2][None]) * normal[:2][None], -1) / steep
     inner = jnp.concatenate([rim, height[:, None]], -1)
-    place = (inner - middle) @ edges[:, :2]
-    under = jnp.all(jnp.abs(place) < wide[:2] - 1e-7, -1)
+    place = (inner - middle[None]) @ edges[:, :2]
+    under = jnp.all(jnp.abs(place) < wide[:2][None] - 1e-7, -1)
 
     points = jnp.concatenate([started, ended, inner])
     # An edge that ends over the face ends where the next begins.
     gap = jnp.where(jnp.concatenate([over, over & (end < 1.0), under]), points[:, 2], sdf.FAR)
-    found = points - 0.5 * points[:, 2:] * jnp.array([0.0, 0.0, 1.0])
-    world = position + sum(found[:, k, None] * along[k] for k in range(3)) + half[2] * along[2]
+    found = points - 0.5 * points[:, 2:] * jnp.array([[0.0, 0.0, 1.0]])
+    world = position[None] + sum(found[:, k, None] * along[k][None] for k in range(3)) + (half[2] * along[2])[None]
     return gap, world, along[2]

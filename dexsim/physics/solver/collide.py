@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from dexsim.core.pytree import Array
 from dexsim.geometry import sdf
 from dexsim.physics.solver.boxes import POINTS, box_box
 
@@ -48,7 +49,8 @@ class Balls:
     def find(self, position: jax.Array, rotation: jax.Array, size: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Gaps [S + 2 P], points and normals [S + 2 P, 3]; see `Collider.touch`."""
         mine, other = self.sphere.T
-        centre, radius, same = position[mine], size[mine, 0], np.zeros(len(mine), bool)
+        centre, radius = position[mine], size[mine, 0]
+        same: Array = np.zeros(len(mine), bool)
         if len(self.capsule):
             mine, theirs = self.capsule.T
             ends, one = jax.vmap(functools.partial(_nearest_stretch, self.kind))(
@@ -75,7 +77,8 @@ class Patches:
     def find(self, position: jax.Array, rotation: jax.Array, size: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         """As `Balls.find`."""
         planes, others = ((position[g], rotation[g], size[g]) for g in self.pairs.T)
-        return tuple(part.reshape(-1, *part.shape[2:]) for part in jax.vmap(self.meet)(*planes, *others))
+        gap, point, normal = (part.reshape(-1, *part.shape[2:]) for part in jax.vmap(self.meet)(*planes, *others))
+        return gap, point, normal
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -98,7 +101,8 @@ class Collider:
           normals [C, 3] from the pair's first geom to its second.
         """
         found = [group.find(position, rotation, size) for group in self.groups]
-        return tuple(jnp.concatenate(parts) for parts in zip(*found, strict=True))
+        gap, point, normal = (jnp.concatenate(parts) for parts in zip(*found, strict=True))
+        return gap, point, normal
 
 
 def find_collider(model: mujoco.MjModel) -> Collider | None:
@@ -112,7 +116,8 @@ def find_collider(model: mujoco.MjModel) -> Collider | None:
             return None
         rows.setdefault((first, second), []).append(pair)
     geoms = np.stack([model.pair_geom1, model.pair_geom2], -1)
-    groups, order = [], []
+    groups: list[Balls | Patches] = []
+    order: list[np.ndarray] = []
     for second in dict.fromkeys(second for _, second in rows):
         plane, sphere, capsule, box = (
             np.array(rows.get((first, second), []), int) for first in ("plane", "sphere", "capsule", "box")
@@ -160,7 +165,7 @@ def _nearest_stretch(
     def halve(_, bracket):
         low, high = bracket
         middle = 0.5 * (low + high)
-        points = start + middle[:, None] * along
+        points = start[None] + middle[:, None] * along[None]
         _, slope = jax.jvp(
             lambda p: sdf.primitive_distance(kind, p, size), (points,), (jnp.broadcast_to(along, points.shape),)
         )
@@ -171,14 +176,14 @@ def _nearest_stretch(
     # An end of the segment itself, exactly, where the bracket has closed on it.
     step = 2 * half / 2**_HALVINGS
     place = jnp.where(low <= -half + 0.5 * step, -half, jnp.where(high >= half - 0.5 * step, half, 0.5 * (low + high)))
-    return centre + place[:, None] * axis, jnp.abs(place[1] - place[0]) < _SAME
+    return centre[None] + place[:, None] * axis[None], jnp.abs(place[1] - place[0]) < _SAME
 
 
 def _on_plane(position: jax.Array, rotation: jax.Array, points: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Lowest points [N, 3] of a body against a plane."""
     normal = rotation[:, 2]
-    gap = sum((points[:, k] - position[k]) * normal[k] for k in range(3))
-    return gap, points - 0.5 * gap[:, None] * normal, jnp.broadcast_to(normal, points.shape)
+    gap = jnp.asarray(sum((points[:, k] - position[k]) * normal[k] for k in range(3)))
+    return gap, points - 0.5 * gap[:, None] * normal[None], jnp.broadcast_to(normal, points.shape)
 
 
 def _plane_sphere(position, rotation, _, centre, turn, size):
@@ -186,20 +191,20 @@ def _plane_sphere(position, rotation, _, centre, turn, size):
 
 
 def _plane_capsule(position, rotation, _, centre, turn, size):
-    ends = jnp.array([[size[1]], [-size[1]]]) * turn[:, 2]
-    return _on_plane(position, rotation, centre + ends - rotation[:, 2] * size[0])
+    ends = jnp.array([[size[1]], [-size[1]]]) * turn[:, 2][None]
+    return _on_plane(position, rotation, centre[None] + ends - (rotation[:, 2] * size[0])[None])
 
 
 def _plane_box(position, rotation, _, centre, turn, size):
     signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float32)
-    corners = sum((signs[:, k] * size[k])[:, None] * turn[:, k] for k in range(3))
-    return _on_plane(position, rotation, centre + corners)
+    corners = sum((signs[:, k] * size[k])[:, None] * turn[:, k][None] for k in range(3))
+    return _on_plane(position, rotation, centre[None] + corners)
 
 
 def _plane_ellipsoid(position, rotation, _, centre, turn, size):
     local = jnp.sum(turn * rotation[:, 2, None], 0) * size
     local = local / jnp.sqrt(jnp.sum(local**2) + 1e-20)
-    return _on_plane(position, rotation, (centre - jnp.sum(turn * (local * size), 1))[None])
+    return _on_plane(position, rotation, (centre - jnp.sum(turn * (local * size)[None], 1))[None])
 
 
 def _plane_cylinder(position, rotation, _, centre, turn, size):
@@ -213,7 +218,7 @@ def _plane_cylinder(position, rotation, _, centre, turn, size):
     side = jnp.cross(down, axis) * np.sqrt(0.75).astype(np.float32)
     axis = axis * size[1]
     points = jnp.stack([axis + down, down - axis, axis - 0.5 * down + side, axis - 0.5 * down - side])
-    return _on_plane(position, rotation, centre + points)
+    return _on_plane(position, rotation, centre[None] + points)
 
 
 # How a plane meets a primitive, in how many points.

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from dexsim.core.pytree import Array, align
 from dexsim.geometry import rotations
 from dexsim.physics.solver import collide, newton
 
@@ -58,8 +59,10 @@ class Stepper:
     def _step(
         self, model: Any, data: Any, applied: jax.Array, push: jax.Array
     ) -> tuple[tuple[jax.Array, jax.Array, jax.Array], jax.Array]:
-        for part in ("kinematics", "com_pos", "crb", "com_vel", "passive", "rne"):
-            data = getattr(self.mjx, part)(model, data)
+        # MJX relies on implicit promotion, which the caller may have made an error.
+        with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
+            for part in ("kinematics", "com_pos", "crb", "com_vel", "passive", "rne"):
+                data = getattr(self.mjx, part)(model, data)
         # Motion of each degree of freedom at the world's origin; MJX gives it at its tree's centre of mass.
         turn = data.cdof[:, :3]
         shift = data.cdof[:, 3:] - jnp.cross(turn, data.subtree_com[self.root])
@@ -105,7 +108,7 @@ class Stepper:
         motion = jnp.concatenate([frame, lever], -1) @ jnp.concatenate([shift, turn], -1).T
         jacobian = motion * moves[:, None, :]
         stiffness, damping, impedance = _spring(solref, solimp, gap, self.timestep)
-        speed = jnp.sum(jacobian * data.qvel, -1)
+        speed = jnp.sum(jacobian * align(data.qvel, jacobian), -1)
         wanted = -damping[:, None] * speed
         wanted = wanted.at[:, 0].add(-stiffness * impedance * gap)
         friction = jnp.maximum(friction, 1e-15)
@@ -184,11 +187,11 @@ def find_stepper(mjx: Any, model: mujoco.MjModel, tips: np.ndarray, *, max_conta
         line_search=2 * int(option.ls_iterations),
         timestep=float(option.timestep),
         impratio=float(option.impratio),
-        moves=np.float32(moves[bodies[1]]) - np.float32(moves[bodies[0]]),
-        compliance=np.float32(model.body_invweight0[bodies, 0].sum(0)),
+        moves=moves[bodies[1]].astype(np.float32) - moves[bodies[0]].astype(np.float32),
+        compliance=model.body_invweight0[bodies, 0].sum(0).astype(np.float32),
         finger=finger,
         root=model.body_rootid[model.dof_bodyid],
-        push=np.float32(moves[held]),
+        push=moves[held].astype(np.float32),
         object_body=held,
         limit=_limit_constants(model),
         scalar=address[scalar],
@@ -232,9 +235,7 @@ def _frame(normal: jax.Array) -> jax.Array:
     return jnp.stack([normal, side, jnp.cross(normal, side)], 1)
 
 
-def _spring(
-    solref: jax.Array, solimp: jax.Array, gap: jax.Array, timestep: float
-) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _spring(solref: Array, solimp: Array, gap: jax.Array, timestep: float) -> tuple[jax.Array, jax.Array, jax.Array]:
     """MuJoCo's stiffness 1/s^2, damping 1/s and impedance from solref [N, 2], solimp [N, 5] and gaps [N] m."""
     low, high = (jnp.clip(solimp[:, k], 1e-4, 0.9999) for k in (0, 1))
     width, middle = jnp.maximum(solimp[:, 2], 1e-15), jnp.clip(solimp[:, 3], 1e-4, 0.9999)

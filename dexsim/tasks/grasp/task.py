@@ -89,7 +89,7 @@ class Grasp:
 
     name = "grasp"
     evaluation = "series"
-    fields = {"actor": observation.GRASP, "critic": observation.GRASP}
+    fields: dict[str, tuple[str, ...]] = {"actor": observation.GRASP, "critic": observation.GRASP}
     gravity = (9.81, 0.0, 0.0)  # upside down: the palm's normal points to the ground
     reference = (0.055, -0.005, 0.090)  # m, between palm and half-closed fingers
 
@@ -160,7 +160,8 @@ class Grasp:
         contact = force > _CONTACT
         wanted = self.target_force(goal)
         torque = truth.joint_torque[self._roots]
-        held = 1.0 - dropped
+        fallen = dropped.astype(jnp.float32)
+        held = 1.0 - fallen
         fingers = self._finger_joints
         terms = {
             "force": held
@@ -182,10 +183,10 @@ class Grasp:
             "outer": weights.outer * posture_distance(truth.joint_position[fingers], self._centre[fingers]),
             "action": weights.action * action_rate(truth.action, truth.last_action),
             "velocity": weights.velocity * joint_speed(truth.joint_velocity),
-            "drop": weights.drop * dropped,
+            "drop": weights.drop * fallen,
         }
         metrics = {f"reward/{name}": value for name, value in terms.items()}
-        return sum(terms.values()), metrics | self._metrics(goal, truth, held)
+        return jnp.asarray(sum(terms.values())), metrics | self._metrics(goal, truth, held)
 
     def _metrics(self, goal: GraspGoal, truth: GroundTruth, held: jax.Array) -> dict[str, jax.Array]:
         force = length(truth.finger_force)

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dexsim.core.pytree import Array
 from dexsim.core.ranges import sample_extreme, uniform
 from dexsim.geometry import rotations
 from dexsim.objects.config import SHAPES
@@ -87,7 +88,7 @@ def unit_inertia(name: str, half: jax.Array) -> jax.Array:
     return jnp.stack([radius**2 / 2, across, across])
 
 
-def lowest_point(object: ObjectParams, quat: jax.Array, position: jax.Array) -> jax.Array:
+def lowest_point(object: ObjectParams, quat: Array, position: Array) -> jax.Array:
     """Smallest coordinate [] m of the object along the palm's normal (x)."""
     down = rotations.rotate_inverse(rotations.quat_to_matrix(quat), jnp.array([-1.0, 0.0, 0.0]))
     reach = extent(object.size, object.position, object.active, down, object.kinds, object.quat)

@@ -90,7 +90,7 @@ def _fingerprint(key: jax.Array, hand: Hand, config: Any) -> str:
     return digest.hexdigest()[:16]
 
 
-def _read(path: Path, count: int) -> list[np.ndarray] | None:
+def _read(path: Path, count: int) -> list[Any] | None:
     """The arrays of a pool file; None if it is missing, damaged or of another layout."""
     try:
         with np.load(path) as file:
@@ -102,12 +102,13 @@ def _read(path: Path, count: int) -> list[np.ndarray] | None:
 def _write(path: Path, arrays: list[np.ndarray]) -> None:
     """Keep the arrays; a cache that cannot be written is no error."""
     buffer = io.BytesIO()
-    np.savez(buffer, **{f"a{i}": a for i, a in enumerate(arrays)})
+    named: dict[str, Any] = {f"a{i}": a for i, a in enumerate(arrays)}
+    np.savez(buffer, **named)
     with contextlib.suppress(OSError):
         write_whole(path, [buffer.getbuffer()])
 
 
-def _make(key: jax.Array, hand: Hand, config: Any, gravity: tuple[float, float, float]) -> list[np.ndarray]:
+def _make(key: jax.Array, hand: Hand, config: Any, gravity: tuple[float, float, float]) -> list[Any]:
     """A start state for each of `pool_size` objects: qpos, qvel, joint objects, object leaves.
 
     Objects are drawn first, and each is tried in posture after posture until it stays: large ones fit into few, and

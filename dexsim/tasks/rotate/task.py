@@ -66,10 +66,10 @@ class Progress:
 # --- small pure functions ----------------------------------------------------------------------
 
 
-def goal_quat(turns: jax.Array, axis: jax.Array, angle: jax.Array) -> jax.Array:
+def goal_quat(turns: jax.Array | int, axis: jax.Array, angle: jax.Array | float) -> jax.Array:
     """Orientation [4] of the goal after `turns` goals: (turns + 1) steps of `angle` about `axis`."""
     # Angles are taken modulo a full turn, so that single precision lasts for any number of goals.
-    total = jnp.remainder((turns + 1) * angle, 2 * jnp.pi)
+    total = jnp.remainder(jnp.asarray(turns + 1, jnp.float32) * angle, 2 * jnp.pi)
     return rotations.axis_angle_to_quat(axis, total)
 
 
@@ -125,7 +125,7 @@ class Rotate:
             return params.unit_inertia(object, self.config.objects)
         return unit_inertia(self.config.object, object.size[0, 0])
 
-    def begin(self, key: jax.Array, start: Start) -> RotateGoal:
+    def begin(self, key: jax.Array, start: Start | None) -> RotateGoal:
         del key, start
         zero, none = jnp.zeros(()), jnp.zeros((), jnp.int32)
         fingers = jnp.zeros(self.hand.num_fingers)
@@ -168,9 +168,9 @@ class Rotate:
             "touch": touching,
         }
         return RotateGoal(
-            turns=goal.turns + now.success,
+            turns=goal.turns + now.success.astype(jnp.int32),
             entered=now.entered & ~now.success,
-            entries=goal.entries + (now.entered & ~goal.entered),
+            entries=goal.entries + (now.entered & ~goal.entered).astype(jnp.int32),
             clock=clock,
             last_success=jnp.where(now.success, clock, goal.last_success),
             gives_up=goal.gives_up,
@@ -212,25 +212,27 @@ class Rotate:
         self, goal: RotateGoal, truth: GroundTruth, dropped: jax.Array
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
         """The reward of a tick and its terms; nothing but penalties once dropped."""
-        weights, now, held = self.config.reward, self.progress(goal, truth), 1.0 - dropped
+        weights, now = self.config.reward, self.progress(goal, truth)
+        fallen = dropped.astype(jnp.float32)
+        held = 1.0 - fallen
         after = self._advance(goal, truth)
         work = tips_at_work(after.duty, weights.working_tips, weights.working_duty)
         calm = jnp.minimum(weights.bonus_speed / jnp.maximum(after.pace, 1e-6), 1.0) ** 2
-        asked = weights.bonus_tips * (goal.turns >= weights.tips_after)
+        asked = weights.bonus_tips * (goal.turns >= weights.tips_after).astype(jnp.float32)
         share = calm * (1.0 - asked * (1.0 - work))
         terms = {
             "goal": held * weights.goal * goal_reward(now.angle, now.distance, weights),
-            "bonus": held * weights.bonus * now.success * share,
+            "bonus": held * weights.bonus * now.success.astype(jnp.float32) * share,
             "spin": held * weights.spin * jnp.clip(now.spin, -1.0, 1.0),
             "action": weights.action * action_rate(truth.action, truth.last_action),
             "velocity": weights.velocity * joint_speed(truth.joint_velocity),
             "torque": weights.torque * jnp.sum(truth.joint_torque**2),
-            "drop": weights.drop * dropped,
+            "drop": weights.drop * fallen,
         }
         ticks = jnp.maximum(after.clock / self._period, 1.0)
         mean = {name: total / ticks for name, total in after.totals.items()}
         turns, recent = after.turns.astype(jnp.float32), after.since_touch <= _RECENT
-        return sum(terms.values()), {
+        return jnp.asarray(sum(terms.values())), {
             **{f"reward/{name}": value for name, value in terms.items()},
             "goals_per_minute": turns / jnp.maximum(after.clock, self._period) * 60.0,
             "successes": turns,

@@ -117,7 +117,8 @@ class Assistant:
 
     def begin(self, time: float) -> None:
         """Take the object away at a time in s, and wait for the hand."""
-        self.stage, self._since, self._held, self._on = Stage.AWAY, time, None, False
+        self.stage, self._since, self._on = Stage.AWAY, time, False
+        self._held: float | None = None
 
     def watch(self, time: float, targets: np.ndarray | None, joints: np.ndarray, free: bool | None) -> Stage:
         """Update the stage.

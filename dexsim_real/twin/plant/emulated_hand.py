@@ -79,7 +79,7 @@ class EmulatedHand:
         self._commands: MotorCommands | None = None
         # The fingers of a hand without commands are slightly bent.
         self._rest = np.clip(0.3, hand.joint_lower, hand.joint_upper).astype(float)
-        self._data: mujoco.MjData | None = None
+        self._data: Any = None  # `mujoco.MjData` from the first trial on
         self.trial = first - 1
         self._next_trial()
 
@@ -185,10 +185,12 @@ class EmulatedHand:
         self._assistant.begin(self.time)
         self._referee = Referee(self.task, self._seconds)
         self._began, self._hottest = self.time, 0.0
-        self._push_until, self._push_at = None, np.inf
+        self._push_until: float | None = None
+        self._push_at = np.inf
         self._pin(self._assistant.shelf(place), place)
         mujoco.mj_forward(scene.model, self._data)
-        self._tips, self._pressing, self._touches = np.zeros((5, 3)), np.zeros(5), []
+        self._tips, self._pressing = np.zeros((5, 3)), np.zeros(5)
+        self._touches: list[Any] = []
         self._past: collections.deque[_Past] = collections.deque(maxlen=round(_MEMORY / PERIOD))
         samples = round(_MEMORY / float(self.parameters.taxel_period)) + 2
         self._samples: collections.deque = collections.deque(maxlen=samples)

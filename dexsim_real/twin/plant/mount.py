@@ -4,7 +4,7 @@ import numpy as np
 
 from dexsim_real.twin.plant.shapes import matrix, turn
 
-MOUNT = {"grasp": None, "rotate": (-0.2, -0.2)}
+MOUNT: dict[str, tuple[float, float] | None] = {"grasp": None, "rotate": (-0.2, -0.2)}
 """Nominal pitch and roll rad of a hand mounted palm up: wrist and thumb side lowered (raised if negative). None is
 upside down."""
 GRAVITY = 9.81  # m/s^2
@@ -12,9 +12,10 @@ GRAVITY = 9.81  # m/s^2
 
 def nominal_gravity(task: str) -> np.ndarray:
     """Gravity [3] m/s^2 in the palm frame of a hand with the nominal mount."""
-    if MOUNT[task] is None:
+    mount = MOUNT[task]
+    if mount is None:
         return GRAVITY * np.array([1.0, 0.0, 0.0])
-    pitch, roll = MOUNT[task]
+    pitch, roll = mount
     return GRAVITY * np.array([-np.cos(pitch) * np.cos(roll), np.sin(roll), -np.sin(pitch) * np.cos(roll)])
 
 

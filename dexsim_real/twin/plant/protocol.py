@@ -46,8 +46,11 @@ class Plant(Protocol):
     """Number of the current trial."""
     shape: ObjectShape
     """Object of the current trial."""
-    up: np.ndarray
-    """[3] the vertical in the palm frame."""
+
+    @property
+    def up(self) -> np.ndarray:
+        """[3] the vertical in the palm frame."""
+        ...
 
     def drive(self, motors: MotorCommands) -> None:
         """Set new motor commands, effective from now."""

@@ -140,7 +140,8 @@ class GoalCount:
 
     def __init__(self, fastest: float):
         self._fastest = fastest
-        self.count, self.times, self.angle = 0, [], 0.0
+        self.count, self.angle = 0, 0.0
+        self.times: list[float] = []
         self._start: float | None = None
         self._heading = 0.0
 

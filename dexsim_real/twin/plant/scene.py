@@ -151,9 +151,9 @@ def _solid(shape: ObjectShape) -> tuple[float, np.ndarray, np.ndarray]:
         body.add_geom(type=_KINDS[part.kind], size=_three(part.size), pos=part.place, density=1.0)
     spec.compiler.boundmass = 0
     model = spec.compile()
-    turn = np.empty(9)
-    mujoco.mju_quat2Mat(turn, model.body_iquat[1])
-    turn = turn.reshape(3, 3)
+    flat = np.empty(9)
+    mujoco.mju_quat2Mat(flat, model.body_iquat[1])
+    turn = flat.reshape(3, 3)
     return float(model.body_mass[1]), model.body_ipos[1].copy(), turn @ np.diag(model.body_inertia[1]) @ turn.T
 
 

@@ -4,6 +4,7 @@ Written in NumPy and independent of the code that training uses. The axis of cap
 """
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -81,14 +82,15 @@ def sample_shape(parameters: TrialParameters, rng: np.random.Generator, name: st
     """Sample the object of a trial: a cube to rotate; to grasp, one of `SHAPES`, or the named one."""
     which, body = rng.choice(SHAPES), rng.random() < 0.5
     if parameters.task == "rotate":
-        half = float(parameters.edge) / 2
-        return ObjectShape("box", (Primitive("box", (half, half, half)),))
+        edge = float(parameters.edge) / 2
+        return ObjectShape("box", (Primitive("box", (edge, edge, edge)),))
     name = name or str(which)
     half = tuple(float(h) for h in parameters.box_half)
-    tube = float(parameters.cylinder_radius), float(parameters.cylinder_half)
+    tube: tuple[float, ...] = float(parameters.cylinder_radius), float(parameters.cylinder_half)
     if name == "composition":
         return _composition(parameters, "box" if body else "cylinder", half if body else tube)
-    size = {"sphere": (float(parameters.sphere_radius),), "box": half, "cylinder": tube, "capsule": tube}[name]
+    ball: tuple[float, ...] = (float(parameters.sphere_radius),)
+    size = {"sphere": ball, "box": half, "cylinder": tube, "capsule": tube}[name]
     return ObjectShape(name, (Primitive(name, size),))
 
 
@@ -106,7 +108,7 @@ def _composition(parameters: TrialParameters, kind: str, size: tuple[float, ...]
 # --- rotations -----------------------------------------------------------------------------------
 
 
-def turn(axis: tuple[float, float, float], angle: float) -> np.ndarray:
+def turn(axis: Sequence[float] | np.ndarray, angle: float) -> np.ndarray:
     """Quaternion (w, x, y, z) of a rotation about a unit axis."""
     return np.array([np.cos(angle / 2), *(np.sin(angle / 2) * np.asarray(axis, float))])
 

@@ -208,7 +208,8 @@ class EmulatedCamera(Clocked):
 
     def __init__(self, path: Path, plant: Plant, config: ObjectSensorConfig, *, seed: int, start: float):
         super().__init__(config.camera_rate, start)
-        self.path, self.counts = path, Counter()
+        self.path = path
+        self.counts: Counter[str] = Counter()
         self._plant, self._config = plant, config
         self._rng = np.random.default_rng(seed)
         # Imports SciPy now, not during the first exchange.

@@ -15,6 +15,7 @@ An exchange has at most one fault, so the injected faults determine what the hos
 
 import dataclasses
 from collections import Counter
+from typing import Any
 
 import numpy as np
 
@@ -192,7 +193,11 @@ def _with_values(fault: Fault, values: tuple[str, ...]) -> Fault:
         return dataclasses.replace(fault, on_request=("answer", "request").index(side) == 1)
     if fault.kind == "heat":
         joint, degrees, seconds = values
-        changes = {"joint": _within(joint, frames.JOINTS), "degrees": float(degrees), "seconds": float(seconds)}
+        changes: dict[str, Any] = {
+            "joint": _within(joint, frames.JOINTS),
+            "degrees": float(degrees),
+            "seconds": float(seconds),
+        }
     elif fault.kind == "stuck":
         tip, taxel, count = values
         changes = {"taxel": (_within(tip, frames.TIPS), _within(taxel, frames.TAXELS)), "count": _within(count, 256)}

@@ -52,7 +52,8 @@ class FirmwareConfig:
 def idle_motors() -> MotorCommands:
     """Commands before the first exchange: all motors off."""
     zero = np.zeros(frames.JOINTS)
-    return MotorCommands(*(zero.copy() for _ in range(5)), mode=np.full(frames.JOINTS, int(Mode.PASSIVE)))
+    off = np.full(frames.JOINTS, int(Mode.PASSIVE))
+    return MotorCommands(zero.copy(), zero.copy(), zero.copy(), zero.copy(), zero.copy(), off)
 
 
 class Firmware:
@@ -159,7 +160,7 @@ class Firmware:
         was_on, self._alive, self._abandoned = self.on, now, False
         self._drive(
             MotorCommands(
-                *(block[name].astype(float) for name in ("position", "kp", "ki", "kd", "torque_max")),
+                **{name: block[name].astype(float) for name in ("position", "kp", "ki", "kd", "torque_max")},
                 mode=np.where(self._hot, int(Mode.PASSIVE), block["mode"].astype(int)),
             )
         )

@@ -180,7 +180,8 @@ class HandLine:
             self._parser.expire()  # An incomplete request from before the silence.
         self._acted = now
         answers = []
-        for frame in self._parser.feed(self.injector.damage(fault, request.frame) if damaged else request.frame):
+        data = self.injector.damage(fault, request.frame) if fault and damaged else request.frame
+        for frame in self._parser.feed(data):
             if frame.command == Command.EXCHANGE:
                 self._inspect(request, frame)
             answers.append(self.firmware.answer(frame, now))
@@ -207,7 +208,7 @@ class HandLine:
         elif not fault:
             self.slowest = max(self.slowest, start + self._on_wire(len(answer)) - request.read)
         damaged = fault is not None and fault.kind in ("flip", "drop", "duplicate") and not fault.on_request
-        data = self.injector.damage(fault, answer) if damaged else answer
+        data = self.injector.damage(fault, answer) if fault and damaged else answer
         self.counts["damaged answers" if damaged else "answers"] += 1
         for at in range(0, len(data), self.config.chunk):
             chunk = data[at : at + self.config.chunk]

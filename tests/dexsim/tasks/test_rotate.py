@@ -127,7 +127,7 @@ class TestGoal:
         goal, turns, entries = begun, [], []
         for degrees, spin in ((45, 1), (90, 4), (150, 4), (90, 0.5), (100, 0.5), (180, 1), (270, 1), (0, 1)):
             goal = task.update(
-                jax.random.key(0), goal, truth(task, object_quat=turned(degrees), object_spin=[spin, 0, 0])
+                jax.random.key(0), goal, truth(task, object_quat=turned(degrees), object_spin=[float(spin), 0.0, 0.0])
             )
             turns.append(int(goal.turns))
             entries.append(int(goal.entries))
