@@ -17,7 +17,8 @@ the median over the rounds of 1 - (time without) / (time of the full step), with
 | redrawing | hands drawn once and kept: the same spread of hands, so the same contacts |
 | randomization | scale 0: one nominal hand, nothing is drawn; contacts may differ a little |
 
-`--train` measures PPO on top, `--split` the parts of a training step (see `throughput_split`).
+`--train` measures training with the device's preset, all backends in turn, `--split` the parts of a training step
+(see `throughput_split`).
 """
 
 import argparse
@@ -256,29 +257,40 @@ def measure(env: Env, num_envs: int, steps: int, repeats: int) -> dict:
     return timing([seconds(run, state, jax.random.key(2), None)[0] for _ in range(repeats)], num_envs * steps, steps)
 
 
-def measure_training(task: str, backend: str, num_envs: int, iterations: int) -> dict:
-    """Env-steps per second of PPO's train step, compile excluded."""
-    from dexsim_ppo.learner.config import PPOConfig
+def measure_training(task: str, backends: list[str], num_envs: int, iterations: int, repeats: int) -> list[dict]:
+    """Env-steps per second of the device's training preset, learner included and compilation excluded; in turn."""
     from dexsim_ppo.learner.ppo import make_train
+    from dexsim_ppo.training.presets import find_preset
 
-    env = dexsim.make(task, backend=backend, num_envs=num_envs)
-    config = dataclasses.replace(PPOConfig(), num_envs=num_envs)
-    init, train_step = make_train(env, config)
-    state, metrics = train_step(init(jax.random.key(0)))
-    jax.block_until_ready(metrics)
-    start = time.perf_counter()
-    with collector_paused():
-        for _ in range(iterations):
-            state, metrics = train_step(state)
-        jax.block_until_ready(metrics)
-    steps = iterations * config.steps_per_iteration
-    return {"env_steps_per_s": round(steps / (time.perf_counter() - start)), "backend": env.backend}
+    preset = find_preset("gpu" if jax.default_backend() == "gpu" else "cpu", task)
+    config = dataclasses.replace(preset.ppo, num_envs=num_envs, iterations_per_call=1)
+    runs = {}
+    for backend in backends:
+        env = dexsim.make(task, backend=backend, num_envs=num_envs)
+        training = make_train(env, config)
+        state, first = training.init(jax.random.key(0)), time.perf_counter()
+        for _ in range(8):  # objects settle, hands close
+            state, metrics = jax.block_until_ready(training.step(state))
+        runs[env.backend] = [training.step, state, [], round(time.perf_counter() - first, 1)]
+    for _ in range(repeats):
+        for run in runs.values():
+            with collector_paused():
+                start = time.perf_counter()
+                for _ in range(iterations):
+                    run[1], metrics = run[0](run[1])
+                jax.block_until_ready(metrics)
+                run[2].append(time.perf_counter() - start)
+    steps = iterations * config.rollout_length
+    return [
+        {"backend": name, "num_envs": num_envs} | timing(times, num_envs * steps, steps) | {"first_calls_s": first}
+        for name, (_, _, times, first) in runs.items()
+    ]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--task", default="grasp", choices=sorted(TASKS))
-    parser.add_argument("--backends", nargs="+", default=["auto"], choices=["auto", "jax", "warp"])
+    parser.add_argument("--backends", nargs="+", default=["auto"], choices=["auto", "jax", "warp", "c"])
     parser.add_argument("--num-envs", nargs="+", type=int, default=[256])
     parser.add_argument("--leave-out", nargs="*", default=list(PARTS), choices=PARTS)
     parser.add_argument("--steps", type=int, default=16)
@@ -305,11 +317,9 @@ def main() -> None:
                 options.task, backend, num_envs, tuple(options.leave_out), options.steps, options.repeats
             ):
                 show({"measure": "env"} | row)
-            if options.train:
-                show(
-                    {"measure": "training", "num_envs": num_envs}
-                    | measure_training(options.task, backend, num_envs, options.train)
-                )
+    for num_envs in options.num_envs if options.train else ():
+        for row in measure_training(options.task, options.backends, num_envs, options.train, options.repeats):
+            show({"measure": "training"} | row)
 
 
 if __name__ == "__main__":

@@ -217,7 +217,7 @@ class EvaluateArguments:
     """Evaluation episodes, rounded up to whole chunks."""
     seed: int = setting(0, unit="1", low=0, high=2**32 - 1)
     """Seed of the episodes."""
-    backend: Literal["auto", "jax", "warp"] = setting("auto")
+    backend: Literal["auto", "jax", "warp", "c"] = setting("auto")
     """Physics backend. auto: warp on a GPU if it is installed, otherwise jax."""
     chunk: int = setting(0, unit="1", low=0)
     """Episodes simulated side by side; 0 chooses by the device."""

@@ -69,7 +69,7 @@ class Env:
         Args:
           task: the task with its configuration.
           hand: the hand.
-          backend: "auto", "jax" or "warp".
+          backend: "auto", "jax", "warp" or "c".
           num_envs: batch size that the Warp buffers are sized for.
           seed: of the pool.
 

@@ -101,7 +101,7 @@ def _lacking_warp(model: mujoco.MjModel) -> list[str]:
     return found
 
 
-_LACKING = {"jax": _lacking_jax, "warp": _lacking_warp}
+_LACKING = {"jax": _lacking_jax, "warp": _lacking_warp, "c": lambda model: []}
 
 
 def _any_row(values: np.ndarray) -> np.ndarray:

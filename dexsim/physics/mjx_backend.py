@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 
 from dexsim.core.errors import AssetError
-from dexsim.objects.params import ObjectParams, bounding_radius
+from dexsim.objects.params import ObjectParams
+from dexsim.physics.parameters import places, values
 from dexsim.physics.seam import ContactParams, PhysicsScene, PhysicsState, TorqueLaw
 
 
@@ -35,21 +36,12 @@ class MjxBackend:
 
     def configure(self, object: ObjectParams, contacts: ContactParams) -> Any:
         """The MJX model with one environment's object and contact parameters put in."""
-        model, scene = self.model, self.scene
-        geoms, body, pair = scene.object_geoms, scene.object_body, scene.object_pairs
-        # body_invweight0 keeps its template value on purpose: the contact's parameters are worked
-        # out from it, and stiffness must not change with the mass of what is touched.
-        return model.replace(
-            geom_size=model.geom_size.at[geoms].set(object.size),
-            geom_rbound=model.geom_rbound.at[geoms].set(bounding_radius(object.size, scene.slots)),
-            geom_pos=model.geom_pos.at[geoms].set(object.position),
-            geom_quat=(model.geom_quat if object.quat is None else model.geom_quat.at[geoms].set(object.quat)),
-            body_mass=model.body_mass.at[body].set(object.mass),
-            body_inertia=model.body_inertia.at[body].set(object.inertia),
-            body_ipos=model.body_ipos.at[body].set(object.com),
-            pair_friction=model.pair_friction.at[pair, :2].set(contacts.friction[:, None]),
-            pair_solref=model.pair_solref.at[pair].set(contacts.solref),
-            pair_solimp=model.pair_solimp.at[pair].set(contacts.solimp),
+        where = places(self.scene)
+        return self.model.replace(
+            **{
+                name: getattr(self.model, name).at[where[name]].set(value)
+                for name, value in values(self.scene, object, contacts).items()
+            }
         )
 
     def advance(

@@ -157,8 +157,15 @@ def _set_options(spec: mujoco.MjSpec, config: PhysicsConfig, gravity: tuple[floa
         # Warp fuses the Hessian of elliptic cones only with a sparse Jacobian: a third faster here.
         option.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
     option.iterations, option.ls_iterations = config.iterations, config.line_search
-    # Box-box has its own kernel only with nativeccd off; eulerdamp costs a factorisation more.
-    option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP | mujoco.mjtDisableBit.mjDSBL_NATIVECCD
+    if backend == "c":
+        # With the few iterations that are enough for Warp's line search, C MuJoCo's stops short: forces were off by up
+        # to 28 N. It stops by itself once it has converged, so more iterations cost nothing.
+        option.iterations, option.ls_iterations = max(config.iterations, 10), max(config.line_search, 13)
+    option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP  # it costs a factorisation more
+    if backend != "c":
+        # In MJX box-box has its own kernel only with nativeccd off. C MuJoCo has it anyway, and its older convex
+        # collisions find contacts of a capsule on a cylinder that are millimetres too deep.
+        option.disableflags |= mujoco.mjtDisableBit.mjDSBL_NATIVECCD
     # MJX also offers max_geom_pairs, a cull by bounding spheres. It drops touching pairs of long
     # capsules, one tick this finger, the next tick that one, so it stays off.
     spec.add_numeric(name="max_contact_points", data=[float(config.max_contacts)], size=1)

@@ -1,7 +1,7 @@
 """`Physics`: the hand, an object and their contacts in one compiled scene, on the engine of choice.
 
-`advance` runs the scene for one control tick. Backends are `jax` (differentiable, any device) and `warp` (about six
-times faster on NVIDIA GPUs); `mujoco.mjx` is not imported before a scene is compiled.
+`advance` runs the scene for one control tick. Backends are `jax` (differentiable, any device), `warp` (about six times
+faster on NVIDIA GPUs) and `c` (C MuJoCo on the CPU's cores); `mujoco.mjx` is not imported before a scene is compiled.
 """
 
 import importlib.util
@@ -18,6 +18,7 @@ from dexsim.geometry import rotations
 from dexsim.hand.kinematics import Hand, forward_kinematics
 from dexsim.objects.params import ObjectParams
 from dexsim.physics import contact
+from dexsim.physics.c_backend import CBackend
 from dexsim.physics.config import PhysicsConfig
 from dexsim.physics.jax_backend import JaxBackend
 from dexsim.physics.model import build_scene
@@ -25,24 +26,25 @@ from dexsim.physics.seam import Backend, ContactParams, PhysicsState, TorqueLaw
 from dexsim.physics.warp_backend import WarpBackend
 from dexsim.touch.skin import Skin
 
-BACKENDS: dict[str, Callable[..., Backend]] = {"jax": JaxBackend, "warp": WarpBackend}
+BACKENDS: dict[str, Callable[..., Backend]] = {"jax": JaxBackend, "warp": WarpBackend, "c": CBackend}
 
 
 def choose_backend(backend: str) -> str:
     """The name of a backend; `auto` is Warp where it can be imported and JAX runs on an NVIDIA GPU, else JAX.
 
     Raises:
-      ConfigError: no such backend, or its library is not installed.
+      ConfigError: no such backend, or its library or device is missing.
     """
     if backend not in ("auto", *BACKENDS):
         raise ConfigError(f"backend {backend!r}: choose from auto, {', '.join(BACKENDS)}")
-    if backend not in ("auto", "warp"):
-        return backend
-    found = importlib.util.find_spec("warp") is not None
+    device, found = jax.default_backend(), importlib.util.find_spec("warp") is not None
+    if backend == "auto":
+        return "warp" if found and device in ("gpu", "cuda") else "jax"
     if backend == "warp" and not found:
         raise ConfigError(f"backend 'warp' needs the extra: {install_line('warp')}")
-    on_gpu = jax.default_backend() in ("gpu", "cuda")
-    return "warp" if backend == "warp" or (found and on_gpu) else "jax"
+    if backend == "c" and device != "cpu":
+        raise ConfigError("backend 'c' runs on the CPU's cores: set JAX_PLATFORMS=cpu")
+    return backend
 
 
 class Physics:
@@ -69,7 +71,7 @@ class Physics:
           largest: [K, 3] m, the largest size of each slot (broad phase bounds).
           config: solver and contact model.
           gravity: m/s^2 in the palm frame, which is the world's.
-          backend: "auto", "jax" or "warp".
+          backend: "auto", "jax", "warp" or "c".
           num_envs: batch size that a backend reserves memory for.
           skin: of the fingertips, whose stiffness it sets; without one it is constant.
           rotor_share: share of the joints' armature that is left out of the scene.

@@ -125,7 +125,7 @@ class _Bench:
         )
         self.base = self._run(self.states)
         # On the Warp backend two runs of the same differ: what is not well above that is no effect.
-        again = [self._distance(self._run(self.states)) for _ in range(1 if env.backend == "jax" else 3)]
+        again = [self._distance(self._run(self.states)) for _ in range(3 if env.backend == "warp" else 1)]
         self.floor = {name: 3.0 * np.max([run[name] for run in again], 0) for name in self.base}
 
     def _starts(self, **changes: Any) -> Any:

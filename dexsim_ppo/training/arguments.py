@@ -31,7 +31,7 @@ class TrainArguments(Generic[EnvConfig]):
     """Task to train; my_module:poke for a task of your own."""
     seed: int = setting(0, unit="1", low=0, high=2**32 - 1)
     """Seed of everything random."""
-    backend: Literal["auto", "jax", "warp"] = setting("auto")
+    backend: Literal["auto", "jax", "warp", "c"] = setting("auto")
     """Physics backend. auto: warp on a GPU if it is installed, otherwise jax."""
     preset: Literal["auto", "cpu", "gpu"] = setting("auto")
     """Default sizes and durations. auto: those of the device found."""

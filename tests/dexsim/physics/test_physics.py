@@ -252,6 +252,8 @@ class TestConstruction:
             choose_backend("warp")
         monkeypatch.setattr("importlib.util.find_spec", lambda name: object())
         assert choose_backend("auto") == choose_backend("warp") == "warp"
+        with pytest.raises(ConfigError, match="JAX_PLATFORMS=cpu"):
+            choose_backend("c")
 
     @pytest.mark.parametrize(
         "field, value, message",

@@ -1,0 +1,87 @@
+"""The `c` backend's physics alone: physics steps per second, one JSON line for each way of calling it.
+
+    python benchmarks/host_physics.py --num-envs 256
+
+The same hands in the same states, in turn: bare `mujoco.rollout` with the same models and threads and torques that do
+not change; a control tick in one call, as the backend does it; a call for each sub-step, as it does it for motor laws
+that the host cannot evaluate. Bind the process to fewer cores (`taskset -c 0`) for fewer threads.
+"""
+
+import argparse
+import json
+import statistics
+
+import jax
+import jax.numpy as jnp
+from throughput import seconds
+
+import dexsim
+from dexsim.core.cli import enable_caches
+from dexsim.core.compilation import jit
+from dexsim.env.motors import JointCommand
+from dexsim.physics import c_backend
+from dexsim.physics.host.engine import _APPLIED, pool
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--task", default="grasp")
+    parser.add_argument("--num-envs", type=int, default=256)
+    parser.add_argument("--ticks", type=int, default=40, help="before the measurement, with closing hands")
+    parser.add_argument("--repeats", type=int, default=15)
+    options = parser.parse_args()
+    enable_caches()
+    env, count = dexsim.make(options.task, backend="c", num_envs=options.num_envs), options.num_envs
+    close = jnp.broadcast_to(0.3 * (jnp.arange(env.action_size) > 3), (count, env.action_size))
+    state = jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), count))
+    advance = jit(jax.vmap(env.step))
+    for _ in range(options.ticks):
+        state = advance(state, close)
+
+    def hold(s):
+        return JointCommand(
+            action=0 * s.joint_target, target=s.joint_target, previous=s.joint_target, valid=jnp.array(True)
+        )
+
+    def tick(state):
+        return jax.vmap(lambda s: env.motors.tick(s.episode, hold(s), s.physics, s.gear, jnp.zeros(3)))(state)
+
+    whole, known = jit(tick), c_backend.record
+
+    def unknown(law, joints, memory):
+        return known(law, joints, memory) if law.__module__ == c_backend.__name__ else None
+
+    parts = jit(lambda state: tick(state))
+    seconds(whole, state)
+    c_backend.record = unknown
+    seconds(parts, state)
+    c_backend.record = known
+
+    engine, substeps = env.physics.engine._engine, env.config.physics.substeps
+    rows, workers = engine._batch(count), pool()
+    applied = rows.applied[:, None].repeat(substeps, 1)
+    after, sensors = (x[:, None].repeat(substeps, 1) for x in (rows.states[0], rows.sensors))
+    begin, warmstart, chunk = rows.states[0].copy(), rows.warmstart.copy(), max(1, count // (10 * workers.threads))
+
+    def bare():
+        workers.rollout.rollout(
+            rows.models, engine._datas, substeps, _APPLIED, begin, warmstart, applied, after, sensors, chunk
+        )
+
+    cases = {"rollout": (bare,), "tick in one call": (whole, state), "call for each sub-step": (parts, state)}
+    times: dict[str, list[float]] = {name: [] for name in cases}
+    for _ in range(options.repeats):
+        for name, case in cases.items():
+            times[name].append(seconds(*case)[0])
+    for name, taken in times.items():
+        rate = round(count * substeps / statistics.median(taken))
+        common = {
+            "threads": workers.threads,
+            "num_envs": count,
+            "touching": round(float(jnp.mean(state.finger_force > 0)), 3),
+        }
+        print(json.dumps({"way": name, "physics_steps_per_s": rate} | common), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,46 @@
+"""Which numbers of a compiled model one environment replaces: its object, and the parameters of its contacts."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from dexsim.objects.params import ObjectParams, bounding_radius
+from dexsim.physics.seam import ContactParams, PhysicsScene
+
+
+def places(scene: PhysicsScene) -> dict[str, Any]:
+    """Fields of `mujoco.MjModel` that change, and where in them.
+
+    `body_invweight0` is not among them: the contact's parameters are worked out from it, and stiffness must not change
+    with the mass of what is touched.
+    """
+    geoms, body, pairs = scene.object_geoms, scene.object_body, scene.object_pairs
+    return {
+        "geom_size": geoms,
+        "geom_rbound": geoms,
+        "geom_pos": geoms,
+        "geom_quat": geoms,
+        "body_mass": body,
+        "body_inertia": body,
+        "body_ipos": body,
+        "pair_friction": (pairs, slice(0, 2)),
+        "pair_solref": pairs,
+        "pair_solimp": pairs,
+    }
+
+
+def values(scene: PhysicsScene, object: ObjectParams, contacts: ContactParams) -> dict[str, jax.Array]:
+    """What goes to those places; without `geom_quat` where the object's primitives are aligned with it."""
+    found = {
+        "geom_size": object.size,
+        "geom_rbound": bounding_radius(object.size, scene.slots),
+        "geom_pos": object.position,
+        "body_mass": object.mass,
+        "body_inertia": object.inertia,
+        "body_ipos": object.com,
+        "pair_friction": jnp.stack([contacts.friction] * 2, -1),
+        "pair_solref": contacts.solref,
+        "pair_solimp": contacts.solimp,
+    }
+    return found if object.quat is None else found | {"geom_quat": object.quat}

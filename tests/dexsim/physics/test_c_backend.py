@@ -1,0 +1,326 @@
+"""The C backend against closed forms, a scene in C MuJoCo that is compiled a second time, and the JAX backend."""
+
+import dataclasses
+import os
+
+import c_scene
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from c_scene import CONVERGED, GRAVITY, row, rows_of, squeeze, stack
+
+from dexsim.core.compilation import jit
+from dexsim.core.errors import ConfigError
+from dexsim.geometry import rotations
+from dexsim.objects.config import SHAPES, SLOTS, ObjectConfig
+from dexsim.physics import c_backend
+from dexsim.physics import model as scene_model
+from dexsim.physics.config import PhysicsConfig
+from dexsim.physics.host import engine as host_engine
+from dexsim.physics.physics import Physics
+from dexsim.physics.seam import PhysicsState
+from dexsim_ppo import load_policy
+
+WORLDS = 8
+AWAY = np.array([1.0, 0.0, 0.0])  # m, where nothing is near: the palm's face is a half-space
+
+
+def make(hand, gravity=GRAVITY, **changes):
+    return Physics(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(**changes), gravity=gravity, backend="c")
+
+
+def hold(index, position, velocity):
+    """Keeps the hand flat."""
+    return -3.0 * position - 0.1 * velocity
+
+
+@pytest.fixture(scope="module")
+def seam(hand):
+    return make(hand)
+
+
+@pytest.fixture(scope="module")
+def one_step(hand):
+    """One sub-step of a batch under given torques, the solver converged."""
+    physics = make(hand, substeps=1, **CONVERGED)
+    return jax.jit(
+        jax.vmap(lambda target, state, torque, push: physics.advance(target, state, lambda *_: torque, push))
+    )
+
+
+@pytest.fixture(scope="module")
+def tick(seam):
+    return jax.jit(jax.vmap(lambda target, state, push: seam.advance(target, state, hold, push)))
+
+
+@pytest.fixture(scope="module")
+def grips(hand, grasp_env):
+    """(start, model, qpos, qvel, warm start, torque) of 8 squeezed hands of each shape."""
+    rng = np.random.default_rng(0)
+    starts = [row(grasp_env.pool, i) for shape in SHAPES for i in rows_of(grasp_env.pool, shape)[:WORLDS]]
+    return [(start, *squeeze(hand, start, rng)) for start in starts]
+
+
+def batch_of(grips):
+    """Object, state and torque of some grips."""
+    starts, _, qpos, qvel, warmstart, torque = zip(*grips, strict=True)
+    state = PhysicsState(*(jnp.stack(x) for x in (qpos, qvel, warmstart)))
+    return stack([start.object for start in starts]), state, jnp.stack(torque)
+
+
+def at(grips, place, velocity=(0,) * 6):
+    """Objects of some grips elsewhere, the hand flat and at rest."""
+    target, _, _ = batch_of(grips)
+    count = len(grips)
+    qpos = np.concatenate([np.zeros(12), place, [1, 0, 0, 0]])
+    qvel = np.concatenate([np.zeros(12), velocity])
+    rows = (np.tile(np.float32(x), (count, 1)) for x in (qpos, qvel, np.zeros(18)))
+    return target, PhysicsState(*map(jnp.asarray, rows))
+
+
+def assert_same(first, second):
+    for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(second), strict=True):
+        np.testing.assert_array_equal(np.asarray(a), np.asarray(b))
+
+
+class TestClosedForms:
+    def test_free_fall_under_a_push(self, tick, grips):
+        """Semi-implicit Euler: after n steps v = n a dt and x = n (n + 1) / 2 a dt^2."""
+        target, state = at(grips[:WORLDS], AWAY)
+        push = np.float32(np.random.default_rng(1).normal(size=(WORLDS, 3)))
+        after, force = tick(target, state, push)
+        acceleration = np.array(GRAVITY) + push / np.asarray(target.mass)[:, None]
+        np.testing.assert_allclose(after.qvel[:, 12:15], 5 * 0.006 * acceleration, rtol=1e-5)
+        np.testing.assert_allclose(after.qpos[:, 12:15] - AWAY, 15 * 0.006**2 * acceleration, atol=2e-7)
+        assert not np.any(np.asarray(force))
+        np.testing.assert_allclose(after.warmstart[:, 12:15], acceleration, rtol=1e-5)
+
+    def test_a_spinning_object_turns_about_its_centre_of_mass(self, hand, grips):
+        """Without forces the centre of mass keeps its velocity; the object's origin circles round it."""
+        physics = make(hand, gravity=(0, 0, 0), timestep=0.0005)
+        target, state = at(grips[:1], AWAY, velocity=[0.1, 0, 0, 0, 0, 20.0])
+        com = np.float32([0.02, 0.0, 0.0])
+        target = dataclasses.replace(target, com=jnp.asarray(com)[None], inertia=jnp.full((1, 3), 1e-4))
+        step = jax.jit(jax.vmap(lambda state: physics.advance(row0(target), state, hold, jnp.zeros(3))[0]))
+
+        def centre(state):
+            turn = rotations.quat_to_matrix(state.qpos[0, 15:])
+            return np.asarray(state.qpos[0, 12:15] + turn @ com)
+
+        begun, count = centre(state), 40
+        for _ in range(count):
+            state = step(state)
+        moved = (centre(state) - begun) / (count * 5 * 0.0005)
+        # v + w x r at the start: the origin moves at 0.1 m/s along x, the centre at 0.4 m/s along y as well.
+        np.testing.assert_allclose(moved, [0.1, 0.4, 0.0], atol=0.02)
+
+    def test_sliding_on_the_palm(self, hand, grips):
+        """A box that F pushes over the palm's plane gains (F - mu N) / m, and N is what its weight and lift ask for."""
+        physics, friction, share = make(hand, gravity=(-9.81, 0.0, 0.0)), 0.4, 0.7
+        start = next(g for g in grips if g[0].object.active[0] and not g[0].object.active[1])
+        half = np.asarray(start[0].object.size[0, 0])
+        target, state = map(row0, at([start], [half + palm_height(physics), 0.0, -0.5]))
+        target = dataclasses.replace(
+            target,
+            com=jnp.zeros(3),
+            link_friction=jnp.float32(friction),
+            inertia=jnp.full(3, 0.1),  # so that it does not rock
+        )
+        advance = jax.jit(lambda state, push: physics.advance(target, state, hold, push)[0])
+        for _ in range(40):
+            state = advance(state, jnp.zeros(3))
+        assert np.abs(state.qvel[12:]).max() < 2e-3, "not at rest"
+        speeds, push = [], float(target.mass) * 9.81 * share
+        for _ in range(6):
+            state = advance(state, jnp.array([0.0, push, 0.0]))
+            speeds.append(np.array(state.qvel[12:14]))
+        (lifted, gained), weight = speeds[-1] - speeds[1], 9.81 * 4 * 0.03
+        assert gained > 0.3
+        assert gained == pytest.approx(share * weight - friction * (weight + lifted), rel=2e-3)
+
+
+def row0(tree):
+    return jax.tree.map(lambda leaf: leaf[0], tree)
+
+
+def palm_height(physics):
+    model = physics.mj_model
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    return data.geom("palm_face").xpos[0]
+
+
+class TestForces:
+    def test_a_sub_step_equals_one_of_a_scene_that_is_compiled_anew(self, hand, one_step, grips):
+        """All shapes. The other scene has the object's true offsets, masses and primitives from the start."""
+        target, state, torque = batch_of(grips)
+        after, force = one_step(target, state, torque, jnp.zeros((len(grips), 3)))
+        touched = 0
+        for index, (start, _, *begun, applied) in enumerate(grips):
+            model = c_scene.compile_scene(hand, start.object, exact=True, **CONVERGED)
+            data = c_scene.start(model, *begun)
+            data.qfrc_applied[:12] = applied
+            mujoco.mj_step(model, data)
+            wanted = c_scene.finger_force(model, data, hand)
+            touched += np.linalg.norm(wanted, axis=-1).max() > 0.5
+            np.testing.assert_allclose(force[index], wanted, atol=2e-3 + 1e-4 * np.abs(wanted).max())
+            np.testing.assert_allclose(after.qvel[index], data.qvel, atol=1e-3)
+            np.testing.assert_allclose(after.qpos[index], data.qpos, atol=1e-5)
+        assert touched > len(grips) / 2, "hardly a world is in contact: the test tests nothing"
+
+    @pytest.mark.parametrize("shape", ["sphere", "capsule"])
+    def test_the_jax_backend_has_the_same_forces(self, one_step, physics_advance, grips, shape):
+        """Within single precision's share: contact depths of 1e-7 m under springs of 1e4 N/m."""
+        mine = grips[SHAPES.index(shape) * WORLDS :][:WORLDS]
+        inputs = (*batch_of(mine), jnp.zeros((WORLDS, 3)))
+        (after, force), (theirs, wanted) = one_step(*inputs), physics_advance(*inputs)
+        strength = np.linalg.norm(wanted, axis=-1).max(-1)
+        assert np.sum(strength > 0.5) >= 5
+        assert np.all(np.abs(force - wanted).max((1, 2)) < 0.01 + 2e-3 * strength)
+        np.testing.assert_allclose(after.qvel, theirs.qvel, atol=5e-3)
+
+    def test_the_default_iterations_are_enough(self, hand, one_step, grips):
+        """Three and six, which the configuration asks for and Warp takes, are not: C MuJoCo takes more."""
+        physics = make(hand, substeps=1)
+        step = jax.jit(jax.vmap(lambda t, s, torque: physics.advance(t, s, lambda *_: torque, jnp.zeros(3))))
+        target, state, torque = batch_of(grips)
+        state = dataclasses.replace(state, warmstart=0 * state.warmstart)
+        _, force = step(target, state, torque)
+        _, wanted = one_step(target, state, torque, jnp.zeros((len(grips), 3)))
+        np.testing.assert_allclose(force, wanted, atol=0.1)
+
+
+class TestStateless:
+    def test_batches_of_any_size_and_order_give_the_same_bits(self, tick, grips):
+        target, state, _ = batch_of(grips[:WORLDS])
+        push = jnp.zeros((WORLDS, 3))
+        whole = tick(target, state, push)
+        assert_same(whole, tick(target, state, push))
+        for rows in (np.arange(3), np.array([5]), np.array([7, 2, 4]), np.arange(WORLDS)[::-1]):
+            part = jax.tree.map(lambda x, rows=rows: x[rows], (target, state, push))
+            assert_same(tick(*part), jax.tree.map(lambda x, rows=rows: x[rows], whole))
+        assert_same(whole, tick(target, state, push))
+
+    def test_a_loop_a_scan_and_a_nested_batch(self, seam, tick, grips):
+        target, state, _ = batch_of(grips[:4])
+        push = jnp.zeros((4, 3))
+        whole = tick(target, state, push)
+        alone = jax.jit(lambda t, s: seam.advance(t, s, hold, jnp.zeros(3)))
+        for index in range(4):
+            one = jax.tree.map(lambda x, i=index: x[i], (target, state))
+            assert_same(alone(*one), jax.tree.map(lambda x, i=index: x[i], whole))
+        assert_same(seam.advance(*one, hold, jnp.zeros(3)), jax.tree.map(lambda x: x[3], whole))
+        square = jax.tree.map(lambda x: x.reshape(2, 2, *x.shape[1:]), (target, state, push))
+        nested = jax.jit(jax.vmap(jax.vmap(lambda t, s, p: seam.advance(t, s, hold, p))))(*square)
+        assert_same(jax.tree.map(lambda x: x.reshape(4, *x.shape[2:]), nested), whole)
+        scanned, _ = jax.jit(lambda s: jax.lax.scan(lambda s, _: (tick(target, s, push)[0], None), s, length=3))(state)
+        for _ in range(3):
+            state = tick(target, state, push)[0]
+        assert_same(scanned, state)
+
+    def test_two_scenes_in_turn(self, hand, tick, grips):
+        """Alternating engines and objects leaves nothing behind in either."""
+        other = make(hand, gravity=(0.0, 0.0, 0.0))
+        float_ = jax.jit(jax.vmap(lambda t, s, p: other.advance(t, s, hold, p)))
+        first, second = ((*batch_of(part)[:2], jnp.zeros((4, 3))) for part in (grips[:4], grips[8:12]))
+        wanted = [tick(*first), float_(*first), tick(*second), float_(*second)]
+        assert np.any(np.asarray(wanted[0][0].qvel) != np.asarray(wanted[1][0].qvel))
+        for _ in range(2):
+            for result, (step, given) in zip(
+                wanted, [(tick, first), (float_, first), (tick, second), (float_, second)], strict=True
+            ):
+                assert_same(step(*given), result)
+
+    def test_a_saved_state_continues_to_the_bit(self, hand, seam, tick, grips):
+        """In a new engine, as after a restart, whose cache is empty."""
+        target, state, _ = batch_of(grips[:4])
+        push = jnp.zeros((4, 3))
+        for _ in range(5):
+            state = tick(target, state, push)[0]
+        saved = jax.tree.map(np.array, state)
+        for _ in range(5):
+            state = tick(target, state, push)[0]
+        jax.block_until_ready(state)
+        c_backend._engines.pop(seam.engine._key)
+        fresh = make(hand)
+        again = jax.jit(jax.vmap(lambda t, s, p: fresh.advance(t, s, hold, p)))
+        resumed = jax.tree.map(jnp.asarray, saved)
+        for _ in range(5):
+            resumed = again(target, resumed, push)[0]
+        assert_same(resumed, state)
+        assert fresh.engine._engine._rows, "the new engine was not used"
+        c_backend._engines[seam.engine._key] = seam.engine._engine
+
+
+def test_a_gradient_is_refused_by_name(seam, grips):
+    target, state, _ = batch_of(grips[:1])
+
+    def height(push):
+        return seam.advance(row0(target), row0(state), hold, push)[0].qpos[12]
+
+    with pytest.raises(ConfigError, match="backend='jax'"):
+        jax.grad(height)(jnp.zeros(3))
+    assert np.isfinite(jax.jit(height)(jnp.zeros(3)))
+
+
+class TestTrouble:
+    def test_a_world_that_diverges_is_marked_and_alone(self, seam, tick, grips):
+        target, state, _ = batch_of(grips[:4])
+        push = jnp.zeros((4, 3))
+        wanted, counted = tick(target, state, push), seam.engine._engine.diverged
+        broken = dataclasses.replace(state, qpos=state.qpos.at[1, 3].set(jnp.nan), qvel=state.qvel.at[2, 14].set(1e12))
+        after = tick(target, broken, push)
+        assert np.isnan(np.asarray(after[1])[1:3]).all()
+        assert seam.engine._engine.diverged > counted
+        sound = jax.tree.map(lambda x: x[np.array([0, 3])], (after, wanted))
+        assert_same(*sound)
+        assert_same(tick(target, state, push), wanted)
+
+    def test_full_memory_is_an_error(self, hand, grips, monkeypatch):
+        """MuJoCo drops contacts that do not fit, with a warning that no one sees."""
+        options, memory = scene_model._set_options, [1_000_000]
+
+        def cramped(spec, *given):
+            options(spec, *given)
+            spec.memory = memory[0]
+
+        monkeypatch.setattr(scene_model, "_set_options", cramped)
+        target, state, _ = batch_of(grips[:4])
+
+        def run():
+            physics = make(hand)
+            tick = jax.vmap(lambda t, s: physics.advance(t, s, hold, jnp.zeros(3)))
+            jax.block_until_ready(tick(target, state))
+            return max(data.maxuse_arena for data in physics.engine._engine._datas)
+
+        memory[0] = int(run() * 1.03)
+        with pytest.raises(jax.errors.JaxRuntimeError, match="no room for all contacts"):
+            run()
+
+    def test_a_forked_process_says_so(self, tick, grips, monkeypatch):
+        target, state, _ = batch_of(grips[:4])
+        monkeypatch.setattr(host_engine.pool(), "process", os.getpid() + 1)
+        with pytest.raises(jax.errors.JaxRuntimeError, match="spawn"):
+            jax.block_until_ready(tick(target, state, jnp.zeros((4, 3))))
+
+
+@pytest.mark.slow
+def test_the_shipped_policy_holds_as_much_as_on_the_jax_backend():
+    """64 hands a backend, the same starts: shares that differ by less than chance lets them (four standard errors)."""
+    policy, held, force = load_policy("grasp"), {}, {}
+    for backend in ("jax", "c"):
+        env = policy.make_env(num_envs=64, backend=backend)
+
+        def body(state, _, env=env):
+            after = jax.vmap(env.step)(state, policy(state.obs["actor"]))
+            return after, (after.terminated, after.finger_force)
+
+        begun = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(5), 64))
+        _, (lost, pressed) = jit(lambda state, body=body: jax.lax.scan(body, state, length=200))(begun)
+        kept = ~np.asarray(lost).any(0)
+        held[backend], force[backend] = kept.mean(), np.asarray(pressed)[100:].sum(-1)[:, kept].mean()
+    assert held["jax"] > 0.8
+    assert abs(held["c"] - held["jax"]) < 4 * np.sqrt(2 * 0.1 * 0.9 / 64)
+    assert force["c"] == pytest.approx(force["jax"], rel=0.1)
