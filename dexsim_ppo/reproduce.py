@@ -101,8 +101,8 @@ def findings(env: Environment, config: PPOConfig, state: TrainState) -> Iterator
                     f"{group} observation {field.name!r}: {len(set(rows.tolist()))} of {bad.shape[1]} environments "
                     f"({some}), first at step {steps.min()}"
                 )
-    if count := float(metrics["nonfinite_rewards"]):
-        yield f"rewards: {count:.0f} of {config.steps_per_iteration} (taken as 0)"
+    if count := int(metrics["nonfinite_rewards"]):
+        yield f"rewards: {count} of {config.steps_per_iteration} (taken as 0)"
     for name in ("value", "next_value"):
         if count := int(jnp.sum(~jnp.isfinite(getattr(rollout, name)))):
             yield f"{name}: {count} of {config.steps_per_iteration}"

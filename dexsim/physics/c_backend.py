@@ -102,10 +102,10 @@ class CBackend:
         return PhysicsState(qpos, qvel, warmstart), force, jax.tree.unflatten(law.tree, after)
 
     def _call(self, fields: tuple[str, ...], law: str, substeps: int, *arguments: jax.Array) -> list[jax.Array]:
-        qpos, qvel, warmstart = arguments[len(fields) : len(fields) + 3]
-        force = jax.ShapeDtypeStruct((self.scene.hand.num_fingers, 3), qpos.dtype)
-        memory = arguments[len(arguments) - read_law(law.encode()).outputs + 1 :]
-        results = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in (qpos, qvel, warmstart, force, *memory)]
+        force = jax.ShapeDtypeStruct((self.scene.hand.num_fingers, 3), arguments[len(fields)].dtype)
+        memory: tuple[jax.Array, ...] = arguments[len(arguments) - read_law(law.encode()).outputs + 1 :]
+        before, after = ([jax.ShapeDtypeStruct(x.shape, x.dtype) for x in part] for part in (arguments, memory))
+        results = [*before[len(fields) : len(fields) + 3], force, *after]
         head = json.dumps({"engine": self._key, "fields": fields, "substeps": substeps})
         return call.call(results, *arguments, head=head, law=law)
 

@@ -53,7 +53,8 @@ class _Rows:
     def __init__(self, template: mujoco.MjModel, size: int):
         self.size = size
         self.models = [copy.copy(template) for _ in range(size)]
-        self._template, self._given = template, {}
+        self._template = template
+        self._given: dict[str, np.ndarray] = {}
         self._whole: dict[str, np.ndarray] = {}
         self._views: dict[str, list[np.ndarray]] = {}
         nstate = mujoco.mj_stateSize(template, mujoco.mjtState.mjSTATE_FULLPHYSICS.value)
@@ -68,7 +69,7 @@ class _Rows:
             self._given[name] = np.array(values)
             self._whole[name] = np.repeat(np.asarray(getattr(self._template, name), float)[None], self.size, 0)
             self._views[name] = [getattr(model, name) for model in self.models]
-            rows = range(self.size)
+            rows = list(range(self.size))
         else:
             rows = np.flatnonzero((values != last).reshape(self.size, -1).any(1)).tolist()
             if not rows:
