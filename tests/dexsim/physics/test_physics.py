@@ -248,7 +248,7 @@ class TestConstruction:
         monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
         monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
         assert choose_backend("auto") == "jax"
-        with pytest.raises(ConfigError, match=r"dexsim\[warp\]"):
+        with pytest.raises(ConfigError, match=r"needs the extra: pip install .*\[warp\]"):
             choose_backend("warp")
         monkeypatch.setattr("importlib.util.find_spec", lambda name: object())
         assert choose_backend("auto") == choose_backend("warp") == "warp"
