@@ -74,28 +74,27 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
                 item.add_marker(skip)
 
 
-# Tests in which a silent broadcast or cast between arrays is an error: those that trace our own code only.
-STRICT = (
-    "dexsim/actuator",
-    "dexsim/calibration",
-    "dexsim/core",
-    "dexsim/geometry",
-    "dexsim/hand",
-    "dexsim/identification",
-    "dexsim/render",
-    "dexsim/sensing",
-    "dexsim/tasks",
-    "dexsim/test_observation",
-    "dexsim/touch",
-    "dexsim_ppo/learner",
+# Silent broadcasts and casts between arrays are errors in all tests but these, whose own arithmetic (rows against
+# batches) or whose subject, MJX and brax, relies on them.
+LENIENT = (
+    "benchmarks",
+    "dexsim/env/test_env.py",
+    "dexsim/env/test_env_options.py",
+    "dexsim/objects/test_object_mesh.py",
+    "dexsim/objects/test_touch_geometry.py",
+    "dexsim/physics/test_c_backend.py",
+    "dexsim/physics/test_physics.py",
+    "dexsim/physics/test_substep.py",
+    "dexsim/test_randomization.py",
+    "dexsim/wrappers",
 )
 
 
 @pytest.fixture(autouse=True, scope="module")
 def strict_promotion(request: pytest.FixtureRequest) -> Iterator[None]:
-    """JAX's strict mode, in the tests of `STRICT`."""
+    """JAX's strict modes, in all tests but those of `LENIENT`."""
     with contextlib.ExitStack() as modes:
-        if request.path.relative_to(Path(__file__).parent).as_posix().startswith(STRICT):
+        if not request.path.relative_to(Path(__file__).parent).as_posix().startswith(LENIENT):
             modes.enter_context(jax.numpy_rank_promotion("raise"))
             modes.enter_context(jax.numpy_dtype_promotion("strict"))
         yield

@@ -10,9 +10,14 @@ refused by XLA when the target is registered.
 """
 
 import _thread
+import atexit
+import collections
+import contextlib
 import ctypes
 import functools
 import math
+import threading
+import time
 import traceback
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -122,6 +127,9 @@ def _answer(handler: Handler, address: int) -> int | None:
                 version.major, version.minor = _MAJOR, runtime.minor if runtime.major == _MAJOR else 0
                 return None
         if frame.stage == _EXECUTE:
+            _calls.append(time.monotonic())
+            if _ending.is_set():
+                return _error(frame, "the interpreter is ending")
             handler(_arrays(frame.arguments), _arrays(frame.results), _attributes(frame.attributes))
     except KeyboardInterrupt:
         # With synchronous dispatch this is the main thread. The program ends here, and Ctrl-C is raised again when
@@ -134,6 +142,23 @@ def _answer(handler: Handler, address: int) -> int | None:
 
 
 _kept: list[Any] = []  # what C holds addresses of
+_ending = threading.Event()
+_calls: collections.deque[float] = collections.deque(maxlen=1)  # s, when the last call came
+_QUIET, _PATIENCE = 0.3, 5.0  # s, without a call before the interpreter may end, and the longest wait for that
+
+
+def _end() -> None:
+    """Before the interpreter ends: a program that is still running must not call into it any more.
+
+    Its next call fails, which ends the program; its results are waited for, and programs without results by silence.
+    """
+    _ending.set()
+    until = time.monotonic() + _PATIENCE
+    for array in jax.live_arrays():
+        with contextlib.suppress(Exception):
+            array.block_until_ready()
+    while _calls and time.monotonic() < min(until, _calls[0] + _QUIET):
+        time.sleep(0.01)
 
 
 @functools.cache
@@ -141,6 +166,7 @@ def register(handler: Handler) -> None:
     """Make `handler` what `call` calls; once in a process."""
     function = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)(functools.partial(_answer, handler))
     _kept.append(function)
+    atexit.register(_end)
     jax.ffi.register_ffi_target(TARGET, jax.ffi.pycapsule(function), platform="cpu")
 
 

@@ -58,8 +58,8 @@ LONG = (
     + """
 state = ticks(state)[0]
 jax.block_until_ready(state)
-print("running", flush=True)
 try:
+    print("running", flush=True)  # From here on a signal must be caught.
     while True:
         state = ticks(state)[0]
         jax.block_until_ready(state)
