@@ -1,8 +1,8 @@
 """A scripted hand at the other end of a pseudo-terminal: what each answer is, the test decides."""
 
-import contextlib
 import os
 import select
+import tempfile
 import threading
 import tty
 from collections.abc import Callable
@@ -33,6 +33,7 @@ class PtyHand:
         self.commands: list[np.ndarray] = []
         self.master = self.slave = -1
         self.port = ""
+        self._folder = tempfile.TemporaryDirectory()
 
     def __enter__(self):
         self.open()
@@ -40,16 +41,18 @@ class PtyHand:
 
     def __exit__(self, *_):
         self.close()
+        self._folder.cleanup()
 
-    def open(self, link: str | None = None):
-        """Make the terminal, and a link to it under a name that outlives it."""
+    def open(self):
+        """Make the terminal, and a link to it that `close` removes.
+
+        The terminal's own name is no good: the system gives it to the next program that opens one, and a bridge that
+        looks for its lost hand would find a stranger's.
+        """
         self.master, self.slave = os.openpty()
         tty.setraw(self.slave)
-        self.port = os.ttyname(self.slave)
-        if link:
-            with contextlib.suppress(FileNotFoundError):
-                os.unlink(link)
-            os.symlink(self.port, link)
+        self.port = os.path.join(self._folder.name, "hand")
+        os.symlink(os.ttyname(self.slave), self.port)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._serve, daemon=True)
         self._thread.start()
@@ -58,6 +61,7 @@ class PtyHand:
         if self.master >= 0:
             self._stop.set()
             self._thread.join()
+            os.unlink(self.port)
             os.close(self.master)
             os.close(self.slave)
             self.master = self.slave = -1

@@ -81,11 +81,7 @@ def test_only_the_first_signal_interrupts():
 
 def test_the_stop_is_repeated_until_the_cable_is_back(tmp_path):
     """Interrupted while the cable is out: the motors go off when it returns, 2 s later."""
-    link = str(tmp_path / "hand")
     with FollowingHand() as peer:
-        peer.close()
-        peer.open(link)
-        peer.port = link
         process = runner(peer, tmp_path)
         try:
             wait(lambda: peer.on().sum() > 60)
@@ -94,7 +90,7 @@ def test_the_stop_is_repeated_until_the_cable_is_back(tmp_path):
             process.send_signal(signal.SIGINT)
             time.sleep(2.0)
             assert process.poll() is None
-            peer.open(link)
+            peer.open()
             asked = len(peer.commands)
             assert process.wait(20) == 130
             assert len(peer.commands) > asked and not peer.on()[asked:].any()
@@ -154,16 +150,15 @@ def test_the_guard_says_nothing_to_a_hand_that_is_off(tmp_path):
         assert len(peer.commands) == asked and not peer.on()[-1]
 
 
-def test_the_guard_waits_for_a_cable(tmp_path):
-    link = str(tmp_path / "hand")
+def test_the_guard_waits_for_a_cable():
     with FollowingHand() as peer:
         peer.close()
-        guard = Guard(link, QUICK)
+        guard = Guard(peer.port, QUICK)
         guard.arm()
         guard.check()
         guard.dismiss(off=False)
         time.sleep(1.0)
-        peer.open(link)
+        peer.open()
         wait(lambda: len(peer.commands) > 0, 5.0)
         assert not peer.on().any()
         assert guard._process.wait(10) == 0
@@ -176,16 +171,13 @@ def test_a_guard_that_was_not_armed_does_nothing(tmp_path):
         assert guard._process.wait(20) == 0 and not peer.commands
 
 
-def test_a_serial_hand_turns_off_over_a_reconnection(tmp_path):
-    link = str(tmp_path / "hand")
+def test_a_serial_hand_turns_off_over_a_reconnection():
     with FollowingHand() as peer:
-        peer.close()
-        peer.open(link)
-        hand = SerialHand(link, QUICK)
+        hand = SerialHand(peer.port, QUICK)
         hand.connect()
         peer.close()
         assert hand.exchange(passive_command()) is None
-        peer.open(link)
+        peer.open()
         asked = len(peer.commands)
         assert turn_off(hand, passive_command(), 5.0)
         assert len(peer.commands) > asked and np.all(~peer.on())

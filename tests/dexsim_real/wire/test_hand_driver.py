@@ -272,11 +272,10 @@ def test_an_answer_behind_a_false_head():
         port.close()
 
 
-def test_the_hand_goes_and_comes_back(tmp_path):
-    link = str(tmp_path / "hand")
+def test_the_hand_goes_and_comes_back():
     peer = PtyHand()
-    peer.open(link)
-    port = SerialHand(link, QUICK)
+    peer.open()
+    port = SerialHand(peer.port, QUICK)
     port.connect()
     assert port.exchange(command()).generation == 1
     peer.close()
@@ -285,7 +284,7 @@ def test_the_hand_goes_and_comes_back(tmp_path):
         assert port.exchange(command()) is None
     assert port.counts.lost == 1 and time.monotonic() - start < 1
     peer.commands.clear()
-    peer.open(link)
+    peer.open()
     reply = None
     while reply is None and time.monotonic() - start < 3:
         reply = port.exchange(command())
