@@ -110,8 +110,8 @@ class CalibrateArguments:
     """The serial line."""
     hardware: HardwareConfig = setting(HardwareConfig())
     """Signs, scales and gains of the hand."""
-    safety: SafetyConfig = setting(SafetyConfig(watchdog=0.3, stale=0.15))
-    """Safety limits."""
+    safety: SafetyConfig = setting(SafetyConfig(watchdog=0.3, stale=0.15, stall_current=1.8))
+    """Safety limits. Presses hold still at currents that a run need not hold."""
 
     def __post_init__(self):
         validate(self)

@@ -94,7 +94,8 @@ class Session:
         if self.servo.wait_fresh(1.0) is None:
             if self.safety.problem:
                 raise HandError(f"{self.arguments.port}: {self.safety.problem}; check `--hardware.joint-offset`")
-            raise HandError(f"{self.arguments.port}: the hand stopped answering; check the cable and the power")
+            why = self.safety.refused or "the hand stopped answering; check the cable and the power"
+            raise HandError(f"{self.arguments.port}: {why}")
         self.objects = ObjectSensors(self.arguments, self.controller)
         spec = self.controller.spec
         if self.arguments.imu and spec.turn:
@@ -173,8 +174,10 @@ class Session:
             if reply is not None:
                 states.append(reply.state)
         if len(states) < _TARE_SAMPLES:
+            refusal = getattr(self.port, "refusal", None)
             raise HandError(
-                f"{self.arguments.port}: only {len(states)} answers in 5 s, cannot tare the taxels; check the cable"
+                f"{self.arguments.port}: only {len(states)} answers in 5 s, cannot tare the taxels; "
+                f"{refusal.text if refusal else 'check the cable'}"
             )
         self.sensing.set_tare(states)
 
@@ -312,7 +315,7 @@ class Session:
             f"{counts.late} late, {counts.reconnects} reconnects",
             "force": f"{' '.join(f'{f:.1f}' for f in force)} N, sum {force.sum():.1f} N",
             "command": f"{self.arguments.command:.2f}",
-            "heat": f"joints {heat[:12].max():.0f}, tips {heat[12:].max():.0f} degC",
+            "heat": f"joints {heat[:12].max():.0f}, tips {heat[12:17].max():.0f}, palm {heat[17]:.0f} degC",
         }
         if self.goals:
             rows["successes"] = str(self.goals.successes)

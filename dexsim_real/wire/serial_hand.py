@@ -17,6 +17,7 @@ from dexsim_real.core.errors import HandError, explain, latency_warnings
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Command, Frame, Mode
 from dexsim_real.wire.link import HandPort, LinkConfig, LinkCounts, Reply
+from dexsim_real.wire.refusals import Refusal, read_refusal
 
 _POLL = 0.002  # s, longest wait of one read
 _WRITE = 0.5  # s, longest write; a longer one counts as a failure of the port
@@ -33,6 +34,8 @@ def passive_command() -> np.ndarray:
 class SerialHand:
     """`HandPort` over a serial port.
 
+    `refusal` is the ERROR frame that answered the newest request, None if another answer or none came.
+
     Args:
       port: device, by-id link, pseudo-terminal or pyserial URL.
       tap: called with ("tx" or "rx", bytes) for every frame, from the thread that calls `exchange`.
@@ -41,6 +44,7 @@ class SerialHand:
     def __init__(self, port: str, config: LinkConfig | None = None, *, tap: Callable[[str, bytes], None] | None = None):
         self.port, self.config = port, config or LinkConfig()
         self.counts = LinkCounts()
+        self.refusal: Refusal | None = None
         self._tap = tap or (lambda direction, data: None)
         self._serial: Any = None
         self._parser = frames.Parser(frames.HAND_REPLIES)
@@ -65,6 +69,7 @@ class SerialHand:
         return f"{self.port}: hand {self.config.hand_id}, firmware {version}"
 
     def exchange(self, command: np.ndarray) -> Reply | None:
+        self.refusal = None
         if self._serial is None:
             return self._reconnect()
         try:
@@ -104,6 +109,7 @@ class SerialHand:
         """Send a command; its answer and the time s of sending."""
         request = Frame(frames.HOST, frames.palm_address(self.config.hand_id), command, data).encode()
         self.counts.sent += 1
+        self.refusal = None
         try:
             self._discard()
             self._tap("tx", request)
@@ -121,7 +127,7 @@ class SerialHand:
             self.counts.silent += self._received == before
         elif answer.command == Command.ERROR:
             self.counts.refused += 1
-            answer = None
+            self.refusal, answer = read_refusal(answer.data), None
         else:
             self.counts.answered += 1
         return answer, sent
@@ -212,6 +218,8 @@ class SerialHand:
                 f"{self.port}: answers arrive sooner than {self.config.baud} baud allow; use --link.no-paced for an "
                 "emulated line without timing"
             )
+        if self.refusal is not None:
+            return f"{self.port}: {self.refusal.text}; power-cycle the hand, and check that it is cool and moves freely"
         if not self._parser.counts.frames and not self._parser.counts.crc_errors:
             return (
                 f"{self.port}: none of {self._received} bytes belong to a frame; set --link.baud to that of the hand "
