@@ -84,8 +84,6 @@ class CalibrateArguments:
     """Also press with the sides of thumb and index finger, to load the joints that spread them."""
     yes: bool = False
     """Ask nothing: assume that the fingers always have something to press on."""
-    serial: str = ""
-    """Serial number or name of the hand, for the output file."""
     calibration: Path | None = None
     """With --identify: calibration file of this hand; None leaves torques unknown."""
     joints: tuple[str, ...] = ()

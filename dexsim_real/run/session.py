@@ -31,6 +31,7 @@ from dexsim_real.run.options import RunArguments
 from dexsim_real.run.status import StatusView
 from dexsim_real.sensors.hand import HandSensing
 from dexsim_real.wire.frames import Mode, empty_state
+from dexsim_real.wire.identity import check_identity
 from dexsim_real.wire.serial_hand import open_port
 
 _TARE_SAMPLES = 30
@@ -87,6 +88,8 @@ class Session:
         self._note(self.port.connect())
         for warning in getattr(self.port, "warnings", list)():
             self._note(f"warning: {warning}")
+        for note in check_identity(getattr(self.port, "identity", None), self.sensing.hand, self.sensing.calibration):
+            self._note(note)
         if self.arguments.tare:
             self._tare()
         self._write_meta()
@@ -173,11 +176,11 @@ class Session:
             reply = self.port.exchange(self.sensing.command(self.sensing.hand.joint_lower, Mode.PASSIVE))
             if reply is not None:
                 states.append(reply.state)
+            elif (refusal := getattr(self.port, "refusal", None)) and refusal.serious:
+                raise HandError(f"{self.arguments.port}: {refusal.text}")
         if len(states) < _TARE_SAMPLES:
-            refusal = getattr(self.port, "refusal", None)
             raise HandError(
-                f"{self.arguments.port}: only {len(states)} answers in 5 s, cannot tare the taxels; "
-                f"{refusal.text if refusal else 'check the cable'}"
+                f"{self.arguments.port}: only {len(states)} answers in 5 s, cannot tare the taxels; check the cable"
             )
         self.sensing.set_tare(states)
 

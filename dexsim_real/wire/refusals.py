@@ -40,15 +40,10 @@ _PASSING = frozenset({2, 3, 4, 6, 18, 19, 20, 36, 39, 40, 41, 50, 70})
 
 @dataclasses.dataclass(frozen=True)
 class Refusal:
-    """An ERROR frame."""
+    """Why an exchange was refused, by the hand in an ERROR frame or by the driver."""
 
-    number: int | None  # last digits of the error code; None if the frame holds no known number
-    text: str  # what the hand reports, for messages
-
-    @property
-    def serious(self) -> bool:
-        """Whether the hand itself is in trouble, or will never take this command; not a disturbed exchange."""
-        return self.number is not None and self.number not in _PASSING
+    text: str  # for messages
+    serious: bool  # the hand itself is in trouble or is another one, or will never take this command
 
 
 def read_refusal(data: bytes) -> Refusal:
@@ -57,5 +52,5 @@ def read_refusal(data: bytes) -> Refusal:
         code = int.from_bytes(data[:size], "little")
         for number in (code - _BASE, code):
             if len(data) >= size and number in _NAMES:
-                return Refusal(number, f"the hand reports {_NAMES[number]} ({_BASE + number})")
-    return Refusal(None, f"the hand reports an unknown error ({data[:8].hex(' ')})")
+                return Refusal(f"the hand reports {_NAMES[number]} ({_BASE + number})", number not in _PASSING)
+    return Refusal(f"the hand reports an unknown error ({data[:8].hex(' ')})", serious=False)

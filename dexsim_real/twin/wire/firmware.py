@@ -14,12 +14,13 @@ from dexsim.core.config import setting, validate
 from dexsim_real.twin.plant.protocol import MotorCommands, Plant, PlantMeasurement
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Command, Frame, Mode
+from dexsim_real.wire.identity import SERIAL_NUMBER, SIDE
 
 OVERHEATED, OVERLOADED, ABANDONED = 1, 2, 4
 """Error bits of a joint, defined by this board: too hot and off, overcurrent, no host."""
 _COMMUNICATION, _ID, _PARAMETER, _MODE, _FORCE_MODE = 2, 1, 30, 67, 81
 _ERROR_BASE = 1501000
-_SERIAL, _HAND_ID, _NAME = 21, 53, 54  # registers
+_HAND_ID, _NAME = 53, 54  # registers
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -30,6 +31,10 @@ class FirmwareConfig:
     """Id of the hand."""
     version: str = "1.3.9 emulated"
     """Firmware version that it reports."""
+    serial_number: str = "2R32EMULATED"
+    """Serial number that it reports; empty for a firmware that reports neither it nor the side."""
+    handedness: str = setting("right", choices=("right", "left"))
+    """Side that it reports."""
     watchdog: float = setting(0.0, unit="s", low=0.0, high=10.0)
     """Time without a valid exchange after which the motors go off; 0: never. What the real hand does is not known."""
     encoder_bits: int = setting(12, unit="1", low=4, high=16)
@@ -207,11 +212,13 @@ class Firmware:
 
     def _register(self, data: bytes, now: float) -> tuple[Command, bytes]:
         """Two bytes of number and 32 of content."""
-        number = int.from_bytes(data[:2], "little")
-        known = {_SERIAL: b"2R32EMULATED", _HAND_ID: bytes([self.config.hand_id]), _NAME: b"emulated"}
+        number, config = int.from_bytes(data[:2], "little"), self.config
+        known = {_HAND_ID: bytes([config.hand_id]), _NAME: b"emulated"}
+        if config.serial_number:
+            known |= {SERIAL_NUMBER: config.serial_number.encode("ascii", "replace"), SIDE: config.handedness.encode()}
         if number not in known:
             return self._error(_PARAMETER)
-        return Command.READ_REGISTER, number.to_bytes(2, "little") + known[number].ljust(32, b"\0")
+        return Command.READ_REGISTER, number.to_bytes(2, "little") + known[number][:32].ljust(32, b"\0")
 
     # --- pieces ---------------------------------------------------------------------------------
 

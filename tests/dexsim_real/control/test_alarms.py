@@ -180,18 +180,18 @@ def test_error_fields_are_not_swapped(hand, boards, joint):
 
 
 @pytest.mark.parametrize(
-    ("data", "number", "text"),
+    ("data", "serious", "text"),
     [
-        ((1501028).to_bytes(4, "little"), 28, "over-temperature (1501028)"),
-        ((1501035).to_bytes(4, "little") + b"\x04\x00", 35, "over-current (1501035)"),
-        (b"\x1c\x00", 28, "over-temperature (1501028)"),
-        (b"\x06", 6, "busy (1501006)"),
-        (b"\xee\xee\xee\xee", None, "unknown error (ee ee ee ee)"),
+        ((1501028).to_bytes(4, "little"), True, "over-temperature (1501028)"),
+        ((1501035).to_bytes(4, "little") + b"\x04\x00", True, "over-current (1501035)"),
+        (b"\x1c\x00", True, "over-temperature (1501028)"),
+        (b"\x06", False, "busy (1501006)"),
+        (b"\xee\xee\xee\xee", False, "unknown error (ee ee ee ee)"),
     ],
 )
-def test_an_error_frame_keeps_its_number(data, number, text):
+def test_an_error_frame_keeps_its_number(data, serious, text):
     refusal = read_refusal(data)
-    assert refusal.number == number and text in refusal.text
+    assert refusal.serious == serious and text in refusal.text
 
 
 class Refusing:
