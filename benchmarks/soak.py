@@ -5,9 +5,10 @@
 Soak: `python -m dexsim_real.run` repeatedly on `python -m dexsim_real.twin` with all faults injected. It passes if
 nothing crashes, no command exceeds its limits as judged by the true joint angles, the bridge is safe within 0.1 s of
 losing the hand or of the time that an alarm of the hand may last, every run ends with the motors off, and the host's
-counters match the injected faults (up to the number of `hiccups` of the machine). Kills: runners end by SIGKILL at random times. It passes if every log opens and replays,
-and the guard process has turned the motors off within 0.5 s: the emulated hand has no watchdog unless `--twin
-"--firmware.watchdog 0.08"` asks for it. The exit code is 1 if anything fails.
+counters match the injected faults (up to the number of `hiccups` of the machine). Kills: runners end by SIGKILL at
+random times. It passes if every log opens and replays, and the guard process has turned the motors off within 0.5 s:
+the emulated hand has no watchdog unless `--twin "--firmware.watchdog 0.08"` asks for it. The exit code is 1 if anything
+fails.
 """
 
 import argparse
