@@ -1,11 +1,10 @@
 """Contacts of hand and object: their stiffness in MuJoCo's terms, and the rubber on the fingertips.
 
-A spring of constant stiffness gives the same force on a face, an edge and a corner. Skin does not: at equal depth an
-edge presses half as hard as a face. So the stiffness of a fingertip's springs is computed at every tick from the
-skin's law over the taxels, and the skin beyond them where that bears load (`follow_skin`), and the solver's force is
-that of the skin. For this a fingertip is a row of spheres (`split_pads`). A sphere has exactly one contact point with
-a primitive, on every engine, at a depth in closed form; a capsule has one or two points on a box, which differ between
-engines.
+A spring of constant stiffness gives the same force on a face, over its rim and at its corner. Skin does not: at equal
+depth the rim presses half as hard, the corner a quarter. So the stiffness of a fingertip's springs is computed at every
+tick from the skin's law over the taxels, and the skin beyond them where that bears load (`follow_skin`), and the
+solver's force is that of the skin. For this a fingertip is a row of spheres (`split_pads`). A sphere has exactly one
+contact point with a primitive, on every engine, at a depth in closed form; a capsule has one or two points on a box.
 """
 
 import dataclasses

@@ -1,6 +1,6 @@
 """`Physics`: the hand, an object and their contacts in one compiled scene, on the engine of choice.
 
-`advance` runs the scene for one control tick. Backends are `jax` (differentiable, any device), `warp` (about six times
+`advance` runs the scene for one control tick. Backends are `jax` (differentiable, any device), `warp` (about four times
 faster on NVIDIA GPUs) and `c` (C MuJoCo on the CPU's cores); `mujoco.mjx` is not imported before a scene is compiled.
 """
 

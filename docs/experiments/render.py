@@ -66,10 +66,14 @@ TABLES: dict[str, tuple[str, dict[str, str]]] = {
             "ms": "ms, 4,096 envs",
             "ms_8192": "ms, 8,192 envs",
             "ms_32768": "ms, 32,768 envs",
-            "step_share_pct_32768": "% of a step, 32,768 envs",
+            "step_share_pct_32768": "query alone, % of a step, 32,768 envs",
         },
     ),
-    "physics": ("Physics", {f"pearson_r_per_finger_{s}": s for s in ("sphere", "box", "cylinder", "capsule")}),
+    "physics": (
+        "Physics",
+        {f"pearson_r_per_finger_{s}": f"skin law r, {s}" for s in ("sphere", "box", "cylinder", "capsule")}
+        | {f"force_difference_p95_n_{s}": f"force difference p95, {s} [N]" for s in ("box", "cylinder", "capsule")},
+    ),
     "cpu": (
         "Two CPU cores",
         {

@@ -1,8 +1,8 @@
 """Closed-form contacts of the hand's spheres, capsules and planes with primitives, and of boxes with boxes, for the
 JAX backend.
 
-MJX finds contacts with cylinders by a gradient descent and those with boxes by clipping polygons: half of what
-compiling a step took, and for cylinders up to a millimetre too shallow. Here a sphere meets a primitive where
+MJX finds contacts with cylinders by a gradient descent, up to a millimetre too shallow, and those with boxes by
+clipping polygons, at other points than C MuJoCo: both take long to compile. Here a sphere meets a primitive where
 its distance function says, and a capsule where the balls at one or two places of its axis do (`Balls`).
 """
 
