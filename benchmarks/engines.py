@@ -34,8 +34,8 @@ TOUCHING = 0.01  # N
 
 def grips(env: Env, act, count: int, ticks: list[int]) -> State:
     """States [count times len(ticks)] of grips that are as old as `ticks`."""
-    state = jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), count))
-    step, found = jit(jax.vmap(env.step)), []
+    state = jit(jax.vmap(env.reset), backend="c")(jax.random.split(jax.random.key(0), count))
+    step, found = jit(jax.vmap(env.step), backend="c"), []
     for tick in range(max(ticks)):
         state = step(state, act(state.obs["actor"]))
         if tick + 1 in ticks:
@@ -58,7 +58,7 @@ def physics_tick(env: Env, way: str, **changes):
         )
         return physics.advance_motors(s.episode.object, s.physics, law, s.gear, jnp.zeros(3))[:2]
 
-    return jit(jax.vmap(one))
+    return jit(jax.vmap(one), backend=backend)
 
 
 def forces(env: Env, state: State, way: str) -> np.ndarray:

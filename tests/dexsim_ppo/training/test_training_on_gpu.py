@@ -25,8 +25,8 @@ def test_some_iterations_of_grasp():
     )
     training = make_train(env, config)
     with collector_paused():
-        state = begun = training.init(jax.random.key(0))
-        ended, force = 0.0, []
+        state = training.init(jax.random.key(0))
+        begun, ended, force = jax.tree.map(np.array, state.params), 0.0, []
         for _ in range(ITERATIONS):
             state, metrics = training.step(state)
             ended += np.nansum(np.asarray(metrics["episodes"]))
@@ -36,10 +36,5 @@ def test_some_iterations_of_grasp():
     assert int(state.skipped_updates) == 0 and int(state.iteration) == ITERATIONS
     assert ended >= ENVS, "episodes of 20 ticks end within 32 ticks"
     assert np.max(force) > 0.5, "no hand has touched anything"
-    for before, after in zip(jax.tree.leaves(begun.params), jax.tree.leaves(state.params), strict=True):
-        assert before.shape == after.shape and np.isfinite(np.asarray(after)).all()
-    changed = [
-        np.abs(np.asarray(a) - np.asarray(b)).max()
-        for a, b in zip(jax.tree.leaves(begun.params), jax.tree.leaves(state.params), strict=True)
-    ]
-    assert max(changed) > 1e-4, "nothing was learnt"
+    moved = jax.tree.map(lambda before, after: np.abs(np.asarray(after) - before).max(), begun, state.params)
+    assert np.isfinite(jax.tree.leaves(moved)).all() and max(jax.tree.leaves(moved)) > 1e-4, moved
