@@ -66,10 +66,14 @@ TABLES: dict[str, tuple[str, dict[str, str]]] = {
             "ms": "ms, 4,096 envs",
             "ms_8192": "ms, 8,192 envs",
             "ms_32768": "ms, 32,768 envs",
-            "step_share_pct_32768": "% of a step, 32,768 envs",
+            "step_share_pct_32768": "query alone, % of a step, 32,768 envs",
         },
     ),
-    "physics": ("Physics", {f"pearson_r_per_finger_{s}": s for s in ("sphere", "box", "cylinder", "capsule")}),
+    "physics": (
+        "Physics",
+        {f"pearson_r_per_finger_{s}": f"skin law r, {s}" for s in ("sphere", "box", "cylinder", "capsule")}
+        | {f"force_difference_p95_n_{s}": f"force difference p95, {s} [N]" for s in ("box", "cylinder", "capsule")},
+    ),
     "cpu": (
         "Two CPU cores",
         {
@@ -121,6 +125,8 @@ def check(record: dict[str, Any]) -> str | None:
     for key in ("commit", "title", "command", "hardware", "verdict", "notes"):
         if not isinstance(record[key], str):
             return f"{key} is not text"
+    if record["commit"] and not re.fullmatch(r"[0-9a-f]{7}( \(.+\))?", record["commit"]):
+        return f"commit {record['commit']!r} is not seven digits, with a remark in brackets"
     if not (record["title"] and record["command"] and record["verdict"]):
         return "title, command or verdict is empty"
     if not all(isinstance(seed, int) for seed in record["seeds"]):
@@ -149,7 +155,7 @@ def render(name: str) -> str:
     for record in records:
         cells = [_value(record["metrics"], metric) for metric in columns]
         named = f'<a id="{record["id"]}"></a>{record["title"]} (`{record["id"]}`)'
-        commit = record["commit"].split()[0].rstrip(";,") if record["commit"] else ""
+        commit = record["commit"].split(" ")[0]
         lines.append(_row([named, record["date"], commit, *cells, record["verdict"]]))
     return "\n".join(lines) + "\n"
 

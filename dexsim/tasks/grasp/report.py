@@ -124,7 +124,8 @@ def _optional_pearson(metrics: dict[str, np.ndarray], alive: np.ndarray) -> dict
     if "skin_force" not in metrics:
         return None
     keep = alive & (metrics["total_force"] > 0.01)
-    return pearson(metrics["skin_force"][keep], metrics["total_force"][keep], samples=0)
+    # Both are of the taxels: skin beyond them may bear load as well.
+    return pearson(metrics["skin_force"][keep], metrics["taxel_force"][keep], samples=0)
 
 
 def rmse(values: np.ndarray, wanted: np.ndarray) -> dict:

@@ -201,7 +201,8 @@ class TestSummary:
 
     def test_skin_correlation_counts_only_what_lives_and_touches(self):
         metrics, alive = evaluation(noise=0.5, lost=range(0, 200, 4), settle_force=2.0)
-        metrics["skin_force"] = 0.7 * metrics["total_force"] + 0.1
+        metrics["skin_force"] = 0.7 * metrics["taxel_force"] + 0.1
+        metrics["total_force"] += np.random.default_rng(1).uniform(0, 2, alive.shape)  # borne by skin without taxels
         metrics["skin_force"][20:, ::4] = -1e3
         metrics["total_force"][:5], metrics["skin_force"][:5] = 0.0, 50.0
         found = report.summarize(metrics, alive, PERIOD, SPAN)
