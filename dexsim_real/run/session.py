@@ -28,6 +28,7 @@ from dexsim_real.core.timing import Pace, Timing, keep_phase
 from dexsim_real.run.guard import Guard
 from dexsim_real.run.object_sensors import ObjectSensors
 from dexsim_real.run.options import RunArguments
+from dexsim_real.run.outcome import Outcome
 from dexsim_real.run.status import StatusView
 from dexsim_real.sensors.hand import HandSensing
 from dexsim_real.wire.frames import Mode, empty_state
@@ -71,6 +72,7 @@ class Session:
         self.goals: TurnGoals | None = None
         self.compute, self.pace = Timing(), Pace(policy.control_rate)
         self.started = self.force = self.forces = 0.0
+        self.outcome = Outcome()
         self.tick: Tick | None = None
         self.end, self._closed = "not started", False
         if arguments.realtime and not realtime:
@@ -158,6 +160,7 @@ class Session:
             "mean_finger_force": self.force / self.forces if self.forces else 0.0,
             "log": str(self.log.path),
             "log_dropped": self.log.dropped,
+            "missing": self.outcome.missing(self.log),
         }
         if self.goals:
             times = [t - self.started for t in self.goals.times]
@@ -215,6 +218,7 @@ class Session:
 
     def _loop(self) -> str:
         anchor, self.started = self.safety.anchor, time.monotonic()
+        self.outcome = Outcome(self.started)
         self.servo.forget()
         self.pace = Pace(self.controller.policy.control_rate)
         # A tick starts when a request has just been sent; rates from `keep_phase` keep it so.
@@ -223,7 +227,9 @@ class Session:
             self._check()
             now, sample = time.monotonic(), self.safety.sample
             assert sample is not None, "no state yet"
-            if now - sample.time <= self.safety.config.stale:
+            measured = now - sample.time <= self.safety.config.stale
+            self.outcome.add(now, measured, self.safety)
+            if measured:
                 if anchor != self.safety.anchor:
                     anchor = self.safety.anchor
                     self.controller.anchor(self.safety.commanded)
@@ -242,6 +248,7 @@ class Session:
         hold_reason = "the object is out of sight" if age > self.safety.config.stale_object else ""
         self.safety.set_target(tick.target, now, hold_reason)
         self.tick = tick
+        self.outcome.act(tick.target)
         self.force += float(sample.measured.finger_force.sum())
         self.forces += 1
         readings = {field.name: getattr(tick.readings, field.name) for field in dataclasses.fields(tick.readings)}
