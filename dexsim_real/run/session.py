@@ -240,13 +240,13 @@ class Session:
         return "time is over"
 
     def _tick(self, now: float, sample: Any) -> None:
-        seen, age, when = self._objects().read(now)
+        objects = self._objects()
+        seen, when = objects.read(now)
         goal = self.goals.update(when, seen) if self.goals else IDENTITY
         if self.arguments.motors_off:
             self.controller.anchor(sample.measured.joint_position)
         tick = self.controller.tick(sample.measured, seen, goal, self.arguments.command)
-        hold_reason = "the object is out of sight" if age > self.safety.config.stale_object else ""
-        self.safety.set_target(tick.target, now, hold_reason)
+        self.safety.set_target(tick.target, now, objects.lost(now, self.safety.config.stale_object))
         self.tick = tick
         self.outcome.act(tick.target)
         self.force += float(sample.measured.finger_force.sum())

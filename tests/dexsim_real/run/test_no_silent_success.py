@@ -3,6 +3,8 @@
 import dataclasses
 import errno
 import os
+import socket
+import threading
 import time
 
 import numpy as np
@@ -22,6 +24,7 @@ from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import LogWriter
 from dexsim_real.run import __main__ as run
 from dexsim_real.run.outcome import Outcome
+from dexsim_real.sensors.camera import encode_mask
 
 pytestmark = pytest.mark.usefixtures("jax_as_it_is")
 
@@ -62,6 +65,33 @@ def test_a_policy_whose_actions_are_not_finite(tmp_path, capsys, monkeypatch):
     number = summary(tmp_path)["missing"][0].split()[0]
     assert f"error: {number} of {number} actions of the policy were not finite; the hand was held for" in line
     assert "last because: target is not finite" in line
+
+
+def test_a_camera_that_is_lost(tmp_path):
+    """Its pictures end while the hand holds the object: hold, then motors off, as the manual says."""
+    server = socket.socket(socket.AF_UNIX)
+    server.bind(str(tmp_path / "masks"))
+    server.listen()
+    mask = np.zeros((480, 640), bool)
+    mask[230:250, 310:330] = True
+
+    def show():
+        link = server.accept()[0]
+        for _ in range(40):
+            link.sendall(encode_mask(time.monotonic(), mask))
+            time.sleep(0.03)
+        link.close()
+
+    thread = threading.Thread(target=show)
+    thread.start()
+    with FollowingHand() as peer:
+        options = arguments(peer, tmp_path, "--seconds", "9", "--safety.patience", "0.3")
+        options[options.index("--fixed-object")] = f"--camera=unix:{tmp_path / 'masks'}"
+        assert run.main(options) == 1
+        on, seconds = peer.on(), np.ptp(peer.times)
+    thread.join()
+    assert on.any() and not on[-1] and seconds < 5
+    assert summary(tmp_path)["end"] == "stopped: the camera sends no more pictures for 0.3 s"
 
 
 def full_after(monkeypatch, size):
