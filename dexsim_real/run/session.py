@@ -67,6 +67,7 @@ class Session:
         self.port = open_port(arguments.port, arguments.link, self._tap)
         rate = keep_phase(arguments.rate, policy.control_rate)
         self.servo = Servo(self.port, self.sensing, self.safety, rate)
+        self.servo.masked = self._mask
         self.view = StatusView(f"{policy.task} on {arguments.port}", self._status, arguments.quiet)
         self.objects: ObjectSensors | None = None
         self.goals: TurnGoals | None = None
@@ -179,7 +180,8 @@ class Session:
             raise HandError(
                 f"{self.arguments.port}: only {len(states)} answers in 5 s, cannot tare the taxels; check the cable"
             )
-        self.sensing.set_tare(states)
+        for line in self.sensing.set_tare(states):
+            self._note(f"warning: {line}")
 
     def _approach(self) -> None:
         """Move to the start posture, and hold it until the object is seen."""
@@ -268,6 +270,12 @@ class Session:
     def _tap(self, direction: str, data: bytes) -> None:
         kind = Kind.SENT if direction == "tx" else Kind.RECEIVED
         self.log.add(kind, (self.port.counts.sent, data))
+
+    def _mask(self, sequence: int, lines: list[str]) -> None:
+        """Taxels have got stuck: a replay needs to know from which exchange on."""
+        self.log.add(Kind.META, {"tare": self.sensing.tare, "from": sequence})
+        for line in lines:
+            self._note(f"warning: {line}")
 
     def _note(self, text: str) -> None:
         self.log.add(Kind.NOTE, text)
