@@ -104,8 +104,10 @@ class Workbench:
             self.log.close()
             if self._arguments.realtime:
                 leave_realtime()
-        if self.loop.driven and error is None:
+        if error is None and self.loop.driven:
             raise HandError(f"{UNCONFIRMED}: press the emergency stop")
+        if error is None and (self.log.dropped or self.log.failure):
+            raise HandError(f"{self.log.dropped} log records are lost ({self.log.failure or 'the disk is too slow'})")
 
     def _react(self, text: str) -> None:
         self.log.add(Kind.NOTE, text)

@@ -156,6 +156,8 @@ class HandLoop:
     def _check(self, now: float, decision: Any, reply: Reply | None) -> None:
         if self.safety.latched:
             raise HandError(f"stopped: {self.safety.latched}")
+        if self.log.failure:
+            raise HandError(f"stopped: the log is lost ({self.log.failure})")
         if reply is not None and self._generation not in (None, reply.generation):
             raise HandError("stopped: the hand was disconnected and its pose may have changed; start again")
         self._generation = reply.generation if reply is not None else self._generation

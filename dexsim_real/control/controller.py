@@ -13,7 +13,7 @@ import numpy as np
 
 from dexsim.control import move_target, observed_action
 from dexsim.hand.kinematics import Hand
-from dexsim.observation import LayoutEntry, ObservationConfig, Readings, layout, observe
+from dexsim.observation import LayoutEntry, ObservationConfig, Readings, layout, observe, select_fields
 from dexsim_ppo.policy import Policy
 from dexsim_real.core.errors import HandError
 from dexsim_real.sensors.hand import HandMeasurement
@@ -63,10 +63,10 @@ class Controller:
         self.spec = policy.spec
         self.spec.check_hand(hand)
         names, config = self.spec.fields, self.spec.observation
+        self.sources = sources_of(select_fields(names, config))
         wanted = tuple(LayoutEntry(f.name, f.size, f.scale) for f in policy.observation_layout)
         if layout(hand, names, config) != wanted:
             raise HandError(f"the policy's observation does not fit this version's task {policy.task!r}")
-        self.sources = sources_of([field.name for field in wanted])
         self.period = 1.0 / policy.control_rate
         self._observe = make_observe(hand, names, config)
         self._move = jax.jit(lambda *arrays: move_target(self.spec.control, hand, *arrays))

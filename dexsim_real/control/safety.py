@@ -7,7 +7,7 @@ their times, so any course of events can be tested.
 |---|---|
 | joint target outside position, speed or reach limits | clip |
 | joint target not finite; joint too fast; fingertip force too high; target or measurement too old | hold |
-| targets or measurements missing for long | relax |
+| targets or measurements (also of the object) missing for long | relax |
 | measured angles that cannot be true (`PoseCheck`) | no measurement; relax permanently when they last |
 | alarms of the hand itself (`Alarms`): heat, current, error bits, motors off, refusals | hold, relax permanently |
 
@@ -86,7 +86,8 @@ class SafetyConfig:
     watchdog: float = setting(0.08, unit="s", low=0.001, high=10.0)
     """Age of the newest joint target above which the hand holds, at least two control ticks."""
     patience: float = setting(1.0, unit="s", low=0.0, high=60.0)
-    """Duration of a hold for lack of joint targets or measurements, after which the motors go off."""
+    """Duration of a hold for lack of joint targets or measurements, also of the object, after which the motors go
+    off."""
     slow_speed: float = setting(0.5, unit="rad/s", low=0.01, high=100.0)
     """Speed of commands right after the motors turn on or a hold ends; it then grows to `speed`."""
     ramp: float = setting(1.0, unit="s", low=0.0, high=60.0)
@@ -196,7 +197,8 @@ class Safety:
         Args:
           position: [J] rad.
           time: s of the request.
-          hold_reason: why the hand should hold instead of moving there; empty to move.
+          hold_reason: why the hand should hold instead of moving there, and the motors go off when it lasts; empty to
+            move.
         """
         self._target = time, np.array(position, np.float32), hold_reason
 
@@ -226,7 +228,7 @@ class Safety:
         wish = self._target  # Read once: another thread may replace it meanwhile.
         reason = self._reason_to_hold(now, sample, wish)
         if reason:
-            return self._hold(now, sample, reason)
+            return self._hold(now, sample, reason, wish)
         if self._holding:
             self._restart(now)
         return self._follow(now, sample, self.commanded if wish is None else wish[1])
@@ -269,12 +271,14 @@ class Safety:
         self._holding, self._ramp_start = False, now
         self.anchor += 1
 
-    def _hold(self, now: float, sample: HandSample, reason: str) -> SafetyDecision:
-        config, silent = self.config, reason.startswith(_SILENT)
+    def _hold(
+        self, now: float, sample: HandSample, reason: str, wish: tuple[float, np.ndarray, str] | None
+    ) -> SafetyDecision:
+        config, asked, silent = self.config, wish is not None and reason == wish[2], reason.startswith(_SILENT)
         if reason != self.last[1] and not (silent and self.last[1].startswith(_SILENT)):
             self._since = now
-        if (silent or reason == _DEAD) and now - self._since > config.patience:
-            if reason == _DEAD:
+        if (asked or silent or reason == _DEAD) and now - self._since > config.patience:
+            if asked or reason == _DEAD:
                 self.relax(f"{reason} for {config.patience:g} s")
             elif not self.problem:
                 self._pose.release()

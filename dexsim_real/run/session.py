@@ -28,6 +28,7 @@ from dexsim_real.core.timing import Pace, Timing, keep_phase
 from dexsim_real.run.guard import Guard
 from dexsim_real.run.object_sensors import ObjectSensors
 from dexsim_real.run.options import RunArguments
+from dexsim_real.run.outcome import Outcome
 from dexsim_real.run.status import StatusView
 from dexsim_real.sensors.hand import HandSensing
 from dexsim_real.wire.frames import Mode, empty_state
@@ -67,11 +68,13 @@ class Session:
         self.port = open_port(arguments.port, arguments.link, self._tap)
         rate = keep_phase(arguments.rate, policy.control_rate)
         self.servo = Servo(self.port, self.sensing, self.safety, rate)
+        self.servo.masked = self._mask
         self.view = StatusView(f"{policy.task} on {arguments.port}", self._status, arguments.quiet)
         self.objects: ObjectSensors | None = None
         self.goals: TurnGoals | None = None
         self.compute, self.pace = Timing(), Pace(policy.control_rate)
         self.started = self.force = self.forces = 0.0
+        self.outcome = Outcome()
         self.tick: Tick | None = None
         self.end, self._closed = "not started", False
         if arguments.realtime and not realtime:
@@ -162,6 +165,7 @@ class Session:
             "mean_finger_force": self.force / self.forces if self.forces else 0.0,
             "log": str(self.log.path),
             "log_dropped": self.log.dropped,
+            "missing": self.outcome.missing(self.log),
         }
         if self.goals:
             times = [t - self.started for t in self.goals.times]
@@ -182,7 +186,8 @@ class Session:
             raise HandError(
                 f"{self.arguments.port}: only {len(states)} answers in 5 s, cannot tare the taxels; check the cable"
             )
-        self.sensing.set_tare(states)
+        for line in self.sensing.set_tare(states):
+            self._note(f"warning: {line}")
 
     def _approach(self) -> None:
         """Move to the start posture, and hold it until the object is seen."""
@@ -221,6 +226,7 @@ class Session:
 
     def _loop(self) -> str:
         anchor, self.started = self.safety.anchor, time.monotonic()
+        self.outcome = Outcome(self.started)
         self.servo.forget()
         self.pace = Pace(self.controller.policy.control_rate)
         # A tick starts when a request has just been sent; rates from `keep_phase` keep it so.
@@ -229,7 +235,9 @@ class Session:
             self._check()
             now, sample = time.monotonic(), self.safety.sample
             assert sample is not None, "no state yet"
-            if now - sample.time <= self.safety.config.stale:
+            measured = now - sample.time <= self.safety.config.stale
+            self.outcome.add(now, measured, self.safety)
+            if measured:
                 if anchor != self.safety.anchor:
                     anchor = self.safety.anchor
                     self.controller.anchor(self.safety.commanded)
@@ -240,14 +248,15 @@ class Session:
         return "time is over"
 
     def _tick(self, now: float, sample: Any) -> None:
-        seen, age, when = self._objects().read(now)
+        objects = self._objects()
+        seen, when = objects.read(now)
         goal = self.goals.update(when, seen) if self.goals else IDENTITY
         if self.arguments.motors_off:
             self.controller.anchor(sample.measured.joint_position)
         tick = self.controller.tick(sample.measured, seen, goal, self.arguments.command)
-        hold_reason = "the object is out of sight" if age > self.safety.config.stale_object else ""
-        self.safety.set_target(tick.target, now, hold_reason)
+        self.safety.set_target(tick.target, now, objects.lost(now, self.safety.config.stale_object))
         self.tick = tick
+        self.outcome.act(tick.target)
         self.force += float(sample.measured.finger_force.sum())
         self.forces += 1
         readings = {field.name: getattr(tick.readings, field.name) for field in dataclasses.fields(tick.readings)}
@@ -267,6 +276,12 @@ class Session:
     def _tap(self, direction: str, data: bytes) -> None:
         kind = Kind.SENT if direction == "tx" else Kind.RECEIVED
         self.log.add(kind, (self.port.counts.sent, data))
+
+    def _mask(self, sequence: int, lines: list[str]) -> None:
+        """Taxels have got stuck: a replay needs to know from which exchange on."""
+        self.log.add(Kind.META, {"tare": self.sensing.tare, "from": sequence})
+        for line in lines:
+            self._note(f"warning: {line}")
 
     def _note(self, text: str) -> None:
         self.log.add(Kind.NOTE, text)

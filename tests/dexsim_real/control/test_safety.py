@@ -201,6 +201,20 @@ def test_a_wish_with_a_reason_not_to_heed_it_holds(bench):
     assert (decision.reaction, decision.reason) == (Reaction.HOLD, "the object is out of sight")
 
 
+def test_an_object_that_stays_out_of_sight_ends_it(bench):
+    def unseen(seconds):
+        for _ in range(round(seconds / CYCLE)):
+            bench.safety.set_target(MIDDLE, bench.now, "the object is out of sight")
+            decision = bench.cycle()
+        return decision
+
+    assert unseen(0.9).reaction == Reaction.HOLD
+    assert bench.cycle(wish=MIDDLE).reaction < Reaction.HOLD  # Seen again in time.
+    assert unseen(0.9).reaction == Reaction.HOLD and unseen(0.2).mode == Mode.PASSIVE
+    assert bench.safety.latched == "the object is out of sight for 1 s"
+    assert bench.cycle(wish=MIDDLE).mode == Mode.PASSIVE
+
+
 def test_a_reconnected_hand_starts_from_its_pose(bench):
     anchor = bench.safety.anchor
     bench.position = MIDDLE - np.float32(0.5) * FREE

@@ -39,7 +39,7 @@ def test_a_relaxed_command_carries_no_gain(hand):
 
 
 def test_taxels_are_tared_and_scaled(hand):
-    sensing = HandSensing(hand, HardwareConfig(force_per_count=0.1, taxel_floor=1.0))
+    sensing = HandSensing(hand, HardwareConfig(force_per_count=0.1, taxel_floor=1.0, tare_sum=1000.0))
     rest = state()
     rest["tip"]["taxel"]["z"] = np.arange(120) % 7
     other = rest.copy()
@@ -62,8 +62,8 @@ def test_taxels_are_tared_and_scaled(hand):
 def test_zeroing_is_refused_under_load(hand):
     sensing = HandSensing(hand, HardwareConfig())
     loaded = state()
-    loaded["tip"]["taxel"]["z"][1, 5] = 90
-    with pytest.raises(HandError, match="index read up to 90 counts"):
+    loaded["tip"]["taxel"]["z"][1, [5, 6, 17]] = 90
+    with pytest.raises(HandError, match="3 adjacent taxels of the index read above 40 counts"):
         sensing.set_tare([loaded] * 5)
     assert not sensing.tare.any()
 
