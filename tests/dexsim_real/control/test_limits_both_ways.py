@@ -52,6 +52,17 @@ def test_commands_stop_at_reach_from_a_stuck_hand_in_either_direction(hand, way)
 
 
 @pytest.mark.parametrize("way", [UP, DOWN])
+def test_reach_pulls_a_command_in_neither_direction(hand, way):
+    """A hand that is pushed farther away than reach, slowly enough to be believed, takes no command along."""
+    bench = ready(hand, reach=0.2)
+    for k in range(60):
+        bench.position = MIDDLE + np.float32(way * min(0.008 * k, 0.4)) * FREE
+        decision = bench.cycle(wish=MIDDLE, follow=False)
+        np.testing.assert_array_equal(decision.position, MIDDLE)
+    assert decision.reaction == Reaction.NONE and bench.safety.counts["implausible: measurement"] == 0
+
+
+@pytest.mark.parametrize("way", [UP, DOWN])
 def test_a_joint_too_fast_in_either_direction_holds(hand, way):
     bench = ready(hand)
     for joint in range(12):
@@ -60,3 +71,14 @@ def test_a_joint_too_fast_in_either_direction_holds(hand, way):
         decision = bench.safety.decide(bench.now)
         assert (decision.reaction, decision.reason) == (Reaction.HOLD, "a joint is too fast")
         bench.run(0.1, wish=MIDDLE)
+
+
+@pytest.mark.parametrize("way", [UP, DOWN])
+@pytest.mark.parametrize("pause", [0.02, 0.03, 0.06, 0.4])
+def test_time_that_a_late_cycle_has_missed_is_not_made_up_for(hand, way, pause):
+    """After a pause the next command moves by the speed limit times 30 ms at most."""
+    bench = ready(hand, speed=2.0)
+    bench.now += pause - CYCLE
+    decision = bench.cycle(wish=MIDDLE + np.float32(way * 0.5) * FREE)
+    assert decision.reaction == Reaction.CLIP
+    np.testing.assert_allclose((decision.position - MIDDLE)[FREE > 0], way * 2.0 * min(pause, 0.03), rtol=1e-3)
