@@ -121,6 +121,16 @@ def test_temperatures_are_of_the_joint_boards_the_tips_and_the_palm(hand):
     np.testing.assert_array_equal(heat, [56] * 12 + [33] * 5 + [41])
 
 
+def test_error_bits_are_of_the_palm_the_joint_and_the_tip(hand):
+    """From bytes: in a joint's 24 they are at 12, 14 and 16."""
+    data = bytearray(state().tobytes())
+    for joint in range(12):
+        for board in range(3):
+            data[24 * joint + 12 + 2 * board] = 16 * board + joint + 1
+    errors = HandSensing(hand, HardwareConfig()).measure(frames.decode_state(bytes(data))).errors
+    np.testing.assert_array_equal(errors, np.arange(1, 13)[:, None] + 16 * np.arange(3))
+
+
 def test_velocity_reported_or_from_differences(hand):
     reported = HandSensing(hand, HardwareConfig(reported_velocity=True, joint_sign=(-1.0,) + (1.0,) * 11))
     np.testing.assert_allclose(reported.velocity(state(velocity=1500)), [-1.5] + [1.5] * 11)
