@@ -3,7 +3,9 @@
     python -m dexsim_ppo.evaluate grasp --episodes 1024 --seed 0
 
 The policy is a file, or the name of a shipped one. The episodes are the task's own protocol
-(`env.evaluation_starts`), never restarted: what counts is whether the hand still holds at the end.
+(`env.evaluation_plan`), never restarted: what counts is whether the hand still holds at the end. Their start states
+are drawn for this evaluation by its seed; training had others. Beside the policy a hand that does nothing gets the
+same episodes: what it achieves, too, is no achievement.
 """
 
 import dataclasses
@@ -45,31 +47,46 @@ class Evaluator:
     def __init__(self, env: Environment, chunk: int):
         self.env, self.chunk = env, chunk
         self.totals = env.evaluation == "totals"
-        self._run = jit(self._episodes, backend=env.backend)
+        self._run, self._plans = jit(self._episodes, backend=env.backend), dict[tuple[int, int], Any]()
 
-    def __call__(self, params: PolicyParams, *, episodes: int, seed: int) -> tuple[dict[str, Any], Any]:
+    def __call__(
+        self, params: PolicyParams, *, episodes: int, seed: int, idle: bool = False
+    ) -> tuple[dict[str, Any], Any]:
         """Measure over at least `episodes` episodes, rounded up to whole chunks.
+
+        Args:
+          params: the policy.
+          episodes: how many.
+          seed: of the episodes.
+          idle: send zero actions, whatever the policy says.
 
         Returns:
           The report: `"held"` (share of episodes never terminated), `"return"` and `"steps_held"`, each
-          with a 95 % interval over episodes, and `"task"`: what the task's `summarize` makes of its
+          with a 95 % interval by start, and `"task"`: what the task's `summarize` makes of its
           metrics. And the snapshots of the shown episodes, for `write_video`.
         """
-        started = time.perf_counter()
+        started, chunks = time.perf_counter(), math.ceil(episodes / self.chunk)
+        plan = self._plan(chunks * self.chunk, seed)
         with collector_paused():
-            chunks = [
-                jax.device_get(self._run(params, jax.random.fold_in(jax.random.key(seed), i)))
-                for i in range(math.ceil(episodes / self.chunk))
+            parts = [
+                jax.device_get(self._run(params, jax.tree.map(lambda x, i=i: x[i : i + self.chunk], plan), idle))
+                for i in range(0, chunks * self.chunk, self.chunk)
             ]
         # Episodes are the last axis of all that is measured.
-        measured = jax.tree.map(lambda *xs: np.concatenate(xs, axis=-1), *(measured for measured, _ in chunks))
-        report = (summarize_totals if self.totals else summarize)(self.env, *measured) | {
+        measured = jax.tree.map(lambda *xs: np.concatenate(xs, axis=-1), *(measured for measured, _ in parts))
+        report = (summarize_totals if self.totals else summarize)(self.env, *measured, np.asarray(plan.row)) | {
             "seed": seed,
             "seconds": time.perf_counter() - started,
         }
-        return report, self._film(*chunks[0][1])
+        return report, self._film(*parts[0][1])
 
-    def _episodes(self, params: PolicyParams, key: jax.Array):
+    def _plan(self, count: int, seed: int) -> Any:
+        """The episodes; kept, since a run selects its best policy on the same ones again and again."""
+        if (count, seed) not in self._plans:
+            self._plans[count, seed] = self.env.evaluation_plan(count, seed)
+        return self._plans[count, seed]
+
+    def _episodes(self, params: PolicyParams, plan: Any, idle: bool):
         """One chunk: what the report needs, and snapshots and termination flags [T, shown].
 
         The report needs metrics and termination flags [T, chunk]; of long episodes, whose task keeps its
@@ -79,7 +96,8 @@ class Evaluator:
 
         def step(carry, _):
             state, last = carry
-            state = jax.vmap(self.env.step)(state, act(params, state.obs["actor"]))
+            action = act(params, state.obs["actor"])
+            state = jax.vmap(self.env.step)(state, jnp.where(idle, jnp.zeros_like(action), action))
             frame = jax.tree.map(lambda x: x[shown], jax.vmap(self.env.snapshot)(state))
             series = (dict(state.metrics), state.terminated)
             film = (frame, state.terminated[shown])
@@ -87,7 +105,7 @@ class Evaluator:
                 return (state, None), (series, film)
             return (state, _follow(last, *series)), (None, film)
 
-        state = self.env.evaluation_starts(key, self.chunk)
+        state = self.env.evaluation_starts(plan)
         last: Any = None
         if self.totals:
             last = (dict(state.metrics), jnp.zeros(self.chunk, jnp.int32), jnp.zeros(self.chunk, bool))
@@ -102,8 +120,10 @@ class Evaluator:
         return jax.tree.map(lambda x: np.concatenate([x[:end, i] for i, end in enumerate(ends)]), frames)
 
 
-def summarize(env: Environment, metrics: dict[str, np.ndarray], terminated: np.ndarray) -> dict[str, Any]:
-    """Report of episodes from their metrics `[T, N]` and termination flags `[T, N]`.
+def summarize(
+    env: Environment, metrics: dict[str, np.ndarray], terminated: np.ndarray, start: np.ndarray
+) -> dict[str, Any]:
+    """Report of episodes from their metrics `[T, N]`, termination flags `[T, N]` and starts `[N]`.
 
     An episode lives up to, and not including, its first terminated step. That step's reward belongs to
     the return, and nothing after it counts.
@@ -117,23 +137,34 @@ def summarize(env: Environment, metrics: dict[str, np.ndarray], terminated: np.n
     return {
         "episodes": episodes,
         "steps": steps,
-        "held": proportion(alive[-1]),
-        "return": mean_interval(returns),
-        "steps_held": mean_interval(steps_held),
+        **_intervals(alive[-1], returns, steps_held, start),
         "task": env.summarize(masked, alive),
     }
 
 
-def summarize_totals(env: Environment, metrics: dict[str, np.ndarray], lived: np.ndarray) -> dict[str, Any]:
-    """Report of episodes from the metrics of their last tick [N] and the ticks they lived [N]."""
+def summarize_totals(
+    env: Environment, metrics: dict[str, np.ndarray], lived: np.ndarray, start: np.ndarray
+) -> dict[str, Any]:
+    """Report of episodes from the metrics of their last tick [N], the ticks they lived [N] and their starts [N]."""
     held = lived == env.evaluation_steps
     return {
         "episodes": int(lived.size),
         "steps": env.evaluation_steps,
-        "held": proportion(held),
-        "return": mean_interval(metrics["return"]),
-        "steps_held": mean_interval(lived),
+        **_intervals(held, metrics["return"], lived, start),
         "task": env.summarize(metrics, lived),
+    }
+
+
+def _intervals(held: np.ndarray, returns: np.ndarray, lived: np.ndarray, start: np.ndarray) -> dict[str, Any]:
+    """What every report has, of episodes [N]: how many starts they had, and the figures with intervals by start."""
+    starts = len(np.unique(start))
+    share = proportion(held) if starts == held.size else mean_interval(held.astype(float), start)
+    share |= {"low": max(share["low"], 0.0), "high": min(share["high"], 1.0)}
+    return {
+        "starts": starts,
+        "held": share,
+        "return": mean_interval(returns, start),
+        "steps_held": mean_interval(lived, start),
     }
 
 
@@ -145,9 +176,12 @@ def _follow(last: tuple, metrics: dict[str, jax.Array], terminated: jax.Array) -
     return kept, lived + ~ended, ended
 
 
-def mean_interval(x: np.ndarray) -> dict[str, float]:
-    """Mean of independent samples with its normal 95 % interval."""
-    mean, half = float(np.mean(x)), 1.96 * float(np.std(x, ddof=min(1, x.size - 1))) / x.size**0.5
+def mean_interval(x: np.ndarray, start: np.ndarray) -> dict[str, float]:
+    """Mean of samples [N] with its normal 95 % interval, by start [N]: samples of one start are not independent."""
+    _, which = np.unique(start, return_inverse=True)
+    mean, starts = float(np.mean(x)), int(which.max()) + 1
+    off = np.bincount(which, np.asarray(x, float) - mean)
+    half = 1.96 * float(np.sqrt(np.sum(off**2) * starts / max(starts - 1, 1))) / x.size
     return {"value": mean, "low": mean - half, "high": mean + half}
 
 
@@ -215,8 +249,8 @@ class EvaluateArguments:
     """A policy file, or the name of a shipped policy, such as grasp."""
     episodes: int = setting(1024, unit="1", low=1)
     """Evaluation episodes, rounded up to whole chunks."""
-    seed: int = setting(0, unit="1", low=0, high=2**32 - 1)
-    """Seed of the episodes."""
+    seed: int = setting(0, unit="1", low=0, high=2**32 - 2)
+    """Seed of the episodes and their start states. Training selects its best policy by episodes of another."""
     backend: Literal["auto", "jax", "warp", "c"] = setting("auto")
     """Physics backend. auto: c on a CPU, warp on an NVIDIA GPU if it is installed, otherwise jax."""
     chunk: int = setting(0, unit="1", low=0)

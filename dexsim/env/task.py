@@ -73,7 +73,8 @@ class Task(Protocol):
     evaluation: str
     """What `summarize` is given: "series" or "totals"."""
     object_ranges: tuple[str, ...]
-    """Paths in `config` of the ranges that `sample_object` draws from, for the self-test of the randomisation."""
+    """Paths in `config` of the ranges that `sample_object` draws from. Those of the object's bulk among them, such as
+    "objects.mass", are drawn anew at every episode start; the others stay as the pool has them."""
 
     @property
     def config(self) -> EnvConfig:
@@ -81,7 +82,8 @@ class Task(Protocol):
         ...
 
     def make_pool(self, key: jax.Array) -> Start:
-        """Start states [P, ...] of which every episode begins with one; made once.
+        """Start states [P, ...] of which every episode begins with one; made once for training, and once for each
+        evaluation, with keys of their own.
 
         Raises:
           ConfigError: the configuration leaves too few of them.
@@ -144,10 +146,11 @@ class Task(Protocol):
 
         Args:
           count: how many.
-          shape_index: [P] of the pool's objects.
+          shape_index: [P] of the objects in the evaluation's pool.
 
         Returns:
-          Rows [count] of the pool, and Goals [count, ...].
+          Rows [count] of that pool, and Goals [count, ...]. Rows repeat only where there are too few
+          of them, or where episodes are meant to share a start.
         """
         ...
 
