@@ -52,13 +52,7 @@ class Evaluator:
     def __call__(
         self, params: PolicyParams, *, episodes: int, seed: int, idle: bool = False
     ) -> tuple[dict[str, Any], Any]:
-        """Measure over at least `episodes` episodes, rounded up to whole chunks.
-
-        Args:
-          params: the policy.
-          episodes: how many.
-          seed: of the episodes.
-          idle: send zero actions, whatever the policy says.
+        """Measure over at least `episodes` episodes, rounded up to whole chunks; with zero actions if `idle`.
 
         Returns:
           The report: `"held"` (share of episodes never terminated), `"return"` and `"steps_held"`, each
@@ -214,6 +208,7 @@ def evaluate_policy(
     env: Environment | None = None,
     backend: str = "auto",
     chunk: int = 0,
+    baseline: bool = True,
 ) -> dict[str, Any]:
     """Measure a policy over fixed, seeded episodes.
 
@@ -224,9 +219,11 @@ def evaluate_policy(
       env: where to measure it; None for the environment that it was trained in. Another one is warned of.
       backend: physics, where `env` is None.
       chunk: episodes run side by side; 0 chooses by the device.
+      baseline: measure a hand that does nothing on the same episodes, too, which doubles the time.
 
     Returns:
-      The report: `"held"`, `"return"`, `"steps_held"` with 95 % intervals, and `"task"`: the task's own figures.
+      The report: `"held"`, `"return"`, `"steps_held"` with 95 % intervals, `"task"`: the task's own figures, and
+      `"do_nothing"`: the same of the baseline.
 
     Raises:
       CheckpointError, ConfigError: see `Policy.load` and `Policy.make_env`.
@@ -237,7 +234,10 @@ def evaluate_policy(
         env = policy.make_env(backend=backend, num_envs=chunk)
     else:
         policy.check_env(env)
-    report, _ = Evaluator(env, chunk)(policy.params, episodes=episodes, seed=seed)
+    evaluator = Evaluator(env, chunk)
+    report, _ = evaluator(policy.params, episodes=episodes, seed=seed)
+    if baseline:
+        report["do_nothing"], _ = evaluator(policy.params, episodes=episodes, seed=seed, idle=True)
     return report | {"backend": env.backend}
 
 
@@ -259,6 +259,8 @@ class EvaluateArguments:
     """Length of an evaluation episode; 0 for the task's own."""
     task: str = ""
     """Module and name of a task of your own, such as my_module:poke; the policy's file names all others."""
+    baseline: bool = True
+    """Measure a hand that does nothing on the same episodes, too, which doubles the time."""
     ablate: tuple[str, ...] = ()
     """Observation fields to replace by their training mean, such as contact_force contact_centre."""
     set: tuple[str, ...] = ()
@@ -292,12 +294,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     entry = find_task(policy.task)
     with cli.naming_options(entry.config_class, entry.config(), functools.partial(_typed, arguments)):
         env = policy.build_env(backend=arguments.backend, num_envs=chunk)
-    report, snapshots = Evaluator(env, chunk)(policy.params, episodes=arguments.episodes, seed=arguments.seed)
+    evaluator = Evaluator(env, chunk)
+    measure = functools.partial(evaluator, policy.params, episodes=arguments.episodes, seed=arguments.seed)
+    report, snapshots = measure()
+    if arguments.baseline:
+        report["do_nothing"], _ = measure(idle=True)
     report |= {"policy": arguments.policy, "ablate": list(arguments.ablate), "set": list(arguments.set)}
     report |= {"backend": env.backend} | cli.environment_report()
     if arguments.output:
         cli.write_json(arguments.output, report)
-    print_report(report, title=f"{policy.task}: {arguments.policy}")
+    print_report(report, report.get("do_nothing"), title=f"{policy.task}: {arguments.policy}")
     if arguments.video:
         print(f"video: {write_video(env, snapshots, arguments.video)}")
     return 0
@@ -311,20 +317,31 @@ def _typed(arguments: EvaluateArguments, field: Option) -> str | None:
     return "--seconds " if path == "evaluation_seconds" and arguments.seconds else None
 
 
-def print_report(report: dict[str, Any], *, title: str) -> None:
-    """A table of the report's headline."""
+def print_report(report: dict[str, Any], do_nothing: dict[str, Any] | None, *, title: str) -> None:
+    """A table of the report's headline, and beside it that of a hand that does nothing, if it was measured."""
     from rich.console import Console
     from rich.table import Table
 
-    table = Table("measure", "value", "95 % interval", title=title)
-    for name in ("held", "return", "steps_held"):
-        entry = report[name]
-        table.add_row(name, f"{entry['value']:.4g}", f"{entry['low']:.4g} .. {entry['high']:.4g}")
-    for name, value in report["task"].get("headline", {}).items():
-        if name not in report:  # With its interval it is in the table already.
-            table.add_row(name, "-" if value is None else f"{value:.4g}", "")
+    idle = do_nothing and _headline(do_nothing)
+    table = Table("measure", "value", "95 % interval", *(["doing nothing"] if idle else []), title=title)
+    for name, entry in _headline(report).items():
+        low, high = entry.get("low"), entry.get("high")
+        span = "" if low is None or high is None else f"{low:.4g} .. {high:.4g}"
+        beside = [_number(idle.get(name, {}).get("value"))] if idle else []
+        table.add_row(name, _number(entry["value"]), span, *beside)
     Console().print(table)
     print(f"{report['episodes']} episodes of {report['steps']} steps, seed {report['seed']}, {report['seconds']:.1f} s")
+
+
+def _headline(report: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """Names of the task's headline, or else the share held, and the return: value, low and high."""
+    headline = report["task"].get("headline") or {"held": report["held"]}
+    rows = {name: entry if isinstance(entry, dict) else {"value": entry} for name, entry in headline.items()}
+    return rows | {"return": report["return"]}
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.4g}"
 
 
 if __name__ == "__main__":

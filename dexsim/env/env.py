@@ -205,6 +205,7 @@ class Env:
             joint_torque=tick.joint_torque,
             pose=pose,
             finger_force=force,
+            normal_force=felt.normal_force,
             touch=felt.touch,
             object_position=place[:3],
             object_quat=quat,
@@ -288,6 +289,7 @@ class Env:
                 "length": outcome.length.astype(jnp.float32),
                 "shape": episode.object.shape_index.astype(jnp.float32),
                 "non_finite": 1.0 - jnp.asarray(tick.finite, jnp.float32),
+                "torque_limited": jnp.any(tick.limited).astype(jnp.float32),
             },
             taxel_memory=seen.taxel_memory,
             gear=tick.gear,
@@ -311,14 +313,14 @@ class Env:
         return make_plan(self.task, count, seed)
 
     def evaluation_starts(self, plan: EvaluationPlan) -> State:
-        """[N] start states of a plan or of a slice of one."""
+        """[N] start states of a plan, or of a slice of one."""
         return jax.vmap(self.reset_from)(plan.key, plan.start, plan.goal)
 
     def summarize(self, metrics: dict[str, np.ndarray], alive: np.ndarray) -> dict:
         """The task's report of an evaluation (host).
 
-        A task of kind "series" gets metrics [T, N] and alive [T, N]; one of kind "totals" those
-        of each episode's last tick [N] and the ticks lived [N].
+        A task of kind "series" gets metrics [T, N] and alive [T, N]; one of kind "totals" those of each episode's last
+        tick [N] and the ticks lived [N].
         """
         return self.task.summarize(metrics, alive, self.control_period)
 

@@ -86,7 +86,7 @@ def test_a_run_leaves_its_files(finished):
 
 def test_the_report_compares_with_the_untrained_policy(finished):
     report = json.loads(finished.report.read_text())
-    for name in ("trained", "untrained"):
+    for name in ("trained", "untrained", "do_nothing"):
         held = report[name]["held"]
         assert held["low"] <= held["value"] <= held["high"]
         assert report[name]["episodes"] == 32 and report[name]["seed"] == 0
@@ -127,7 +127,8 @@ def test_evaluate_command(finished, tmp_path, capsys):
     assert first["return"] == second["return"] and first["episodes"] == 32
     report = json.loads(finished.report.read_text())
     assert first["return"]["value"] == pytest.approx(report["trained"]["return"]["value"], rel=1e-5)
-    assert "held" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert "doing nothing" in shown and "error" in shown and "return" in shown and first["do_nothing"]["episodes"] == 32
 
 
 class Drops(TinyEnv):
@@ -177,6 +178,21 @@ def test_intervals_are_by_start():
     report = evaluate.summarize(TinyEnv(), {"return": values[None], "error": values[None]}, terminated, start)
     assert report["starts"] == 4 and report["held"]["value"] == 0.75
     assert report["held"]["low"] < 0.3 and report["held"]["high"] == 1.0
+
+
+def test_a_hand_that_does_nothing_gets_the_same_episodes(finished, capsys):
+    """It stays where it starts: with rewards of 1 - |x - target| over 32 steps the return follows from the starts."""
+    env = TinyEnv()
+    evaluator, params = evaluate.Evaluator(env, 16), Policy.load(finished.best).params
+    idle, _ = evaluator(params, episodes=16, seed=4, idle=True)
+    starts = env.evaluation_starts(env.evaluation_plan(16, 4))
+    assert idle["return"]["value"] == pytest.approx(float(32 * np.mean(1 - np.abs(starts.x - starts.target))), rel=1e-4)
+    report = evaluate.evaluate_policy(finished.best, env=env, episodes=16, chunk=16, seed=4)
+    assert report["do_nothing"]["return"] == pytest.approx(idle["return"])
+    evaluate.print_report(report, report["do_nothing"], title="tiny")
+    shown = capsys.readouterr().out
+    assert "doing nothing" in shown and f"{idle['task']['error']:.4g}" in shown
+    assert "do_nothing" not in evaluate.evaluate_policy(finished.best, env=env, episodes=16, chunk=16, baseline=False)
 
 
 def test_the_size_of_a_chunk_does_not_change_the_episodes(finished):
