@@ -112,7 +112,7 @@ def grasp_metrics(reports: list[dict[str, Any]], span: tuple[float, float]) -> d
       span: N, target force per touching finger at command 0 and 1.
     """
     from dexsim.core.statistics import mean, proportion
-    from dexsim.tasks.grasp.report import FORCES, correlations, force_error
+    from dexsim.tasks.grasp.report import FORCES, correlations, force_error, saturates
 
     held, names = np.array([r["held"] for r in reports]), (*FORCES.values(), "total_force", "torque_limited")
     command, *columns = (np.array([r[name] for r in reports], float) for name in ("command", *names))
@@ -124,6 +124,7 @@ def grasp_metrics(reports: list[dict[str, Any]], span: tuple[float, float]) -> d
     by_command = [
         {"command": float(c), "held": proportion(held[command == c])}
         | {name: mean(mean_of[name][held & (command == c)]) for name in names}
+        | {"saturates": saturates(mean_of["torque_limited"][held & (command == c)])}
         for c in np.unique(command)
     ]
     by_shape = [
@@ -219,7 +220,8 @@ def table(here: dict[str, Any], there: dict[str, Any], idle: dict[str, Any]) -> 
             ("torque_limited", "ticks with a joint at its torque limit", "torque_limited"),
         ):
             cells = cell(entry[name]), cell(other.get(name_there)), cell(still.get(name))
-            rows.append((f"command {entry['command']:g}: {shown}", *cells))
+            mark = " (saturates)" if name == "finger_force" and entry["saturates"] else ""
+            rows.append((f"command {entry['command']:g}: {shown}{mark}", *cells))
     rows += [(f"{entry['shape']}: held", cell(entry["held"]), "", "") for entry in here.get("by_shape", [])]
     rows = [("", "emulated hand", "simulation", "doing nothing"), *rows]
     widths = [max(len(row[k]) for row in rows) for k in range(4)]

@@ -126,8 +126,7 @@ class Env:
         `scale` [] in [0, 1] narrows what is drawn about nominal, now and at restarts; see `widen`.
         """
         key, pick = jax.random.split(key)
-        count = self.pool.qpos.shape[0]
-        return self.reset_to(key, jax.random.randint(pick, (), 0, count), scale=scale)
+        return self.reset_to(key, jax.random.randint(pick, (), 0, self.pool.qpos.shape[0]), scale=scale)
 
     def reset_to(self, key: jax.Array, index: jax.Array, goal: Any = None, scale: jax.Array | None = None) -> State:
         """A new episode from row `index` of the pool, with the task's goal or the given one."""

@@ -91,6 +91,7 @@ def _command_row(
         "thumb_force_n": mean(mean_of["thumb_force"][good]),
         "touching_fingers": mean(mean_of["touching"][good]),
         "torque_limited": mean(mean_of["torque_limited"][good]),
+        "saturates": saturates(mean_of["torque_limited"][good]),
     }
 
 
@@ -134,6 +135,11 @@ def _optional_pearson(metrics: dict[str, np.ndarray], alive: np.ndarray) -> dict
         return None
     keep = alive & (metrics["total_force"] > 0.01)
     return pearson(metrics["skin_force"][keep], metrics["total_force"][keep], samples=0)
+
+
+def saturates(torque_limited: np.ndarray) -> bool:
+    """Whether a command is beyond the motors: held objects [N] see a joint at its torque limit most of the time."""
+    return bool(torque_limited.size and torque_limited.mean() > 0.5)
 
 
 def correlations(command: np.ndarray, held: np.ndarray, mean_of: dict[str, np.ndarray]) -> dict:

@@ -184,6 +184,7 @@ class TestSummary:
     def test_commands_that_saturate_are_marked(self):
         found = report.summarize(*evaluation(), PERIOD, SPAN)
         assert [row["torque_limited"]["mean"] for row in found["by_command"]] == [0, 0, 0, 0, 1]
+        assert [row["saturates"] for row in found["by_command"]] == [False] * 4 + [True]
         assert found["torque_limited"]["mean"] == found["headline"]["ticks with a joint at its torque limit"]["value"]
         assert found["torque_limited"]["mean"] == pytest.approx(0.2)
 
