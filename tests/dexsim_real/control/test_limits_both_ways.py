@@ -69,7 +69,8 @@ def test_a_joint_too_fast_in_either_direction_holds(hand, way):
         bench.safety.see(sample(bench.now, MIDDLE, velocity=way * 21.0 * (np.arange(12) == joint)))
         bench.safety.set_target(MIDDLE, bench.now)
         decision = bench.safety.decide(bench.now)
-        assert (decision.reaction, decision.reason) == (Reaction.HOLD, "a joint is too fast")
+        assert decision.reaction == Reaction.HOLD
+        assert decision.reason.startswith(f"too fast: joint {hand.joint_names[joint]} (")
         bench.run(0.1, wish=MIDDLE)
 
 
