@@ -119,6 +119,8 @@ def runner_words(twin: TwinProcess, options: argparse.Namespace, log: Path, seco
         str(twin.port),
         "--camera",
         f"unix:{twin.masks}",
+        "--safety.stale-object",  # A dropped object is out of sight until the next trial, which would end the run.
+        "10",
         "--uncalibrated",
         "--quiet",
         "--link.settle",

@@ -106,6 +106,8 @@ def runner_command(twin: Twin, calibration: Path | None) -> list[str]:
             words += ["--imu-mount", *(f"{v:g}" for v in arguments.object.imu_mount)]
     if twin.masks and arguments.task == "grasp":
         words += ["--camera", f"unix:{twin.masks.path}"]
+        # A dropped object is out of sight until the next trial, which would end the run.
+        words += ["--safety.stale-object", "10"] if arguments.trials > 1 else []
         for name in ("focal", "centre", "position", "forward", "down"):
             value = getattr(arguments.object.optics, name)
             if value != getattr(CameraConfig(), name):
