@@ -67,7 +67,8 @@ class Calibration:
     joint_names: tuple[str, ...] = static()
     finger_names: tuple[str, ...] = static()
     current_per_count: float = static(default=0.001)  # A; the XHand reports mA
-    serial: str = static(default="")
+    serial: str = static(default="")  # of the hand, as it told it; empty if it did not
+    handedness: str = static(default="")  # likewise
     created: str = static(default="")
     notes: tuple[str, ...] = static(default=())
 
@@ -160,6 +161,7 @@ def save_calibration(path: str | Path, calibration: Calibration) -> None:
         f"version = {VERSION}",
         f"hand = {_text(calibration.hand)}",
         f"serial = {_text(calibration.serial)}",
+        f"handedness = {_text(calibration.handedness)}",
         f"created = {_text(calibration.created)}",
         f"current_per_count = {_number(calibration.current_per_count)}  # A",
         f"finger_names = [{', '.join(map(_text, calibration.finger_names))}]",
@@ -222,6 +224,7 @@ def load_calibration(path: str | Path, hand: Hand | None = None) -> Calibration:
         finger_names=fingers,
         current_per_count=_numbers(path, table, "current_per_count")[0],
         serial=_field(path, table, "serial", str),
+        handedness=_field(path, {"handedness": "", **table}, "handedness", str),
         created=_field(path, table, "created", str),
         notes=tuple(_list_of(path, table, "notes", str)),
     )

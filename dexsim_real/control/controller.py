@@ -77,9 +77,8 @@ class Controller:
         """Compile everything, so that the first tick is as fast as the next ones."""
         hand = self.hand
         joints = np.zeros(hand.num_joints, np.float32)
-        idle = HandMeasurement(
-            joints, joints, np.zeros((hand.num_fingers, hand.num_taxels), np.float32), joints, np.zeros(1), np.zeros(1)
-        )
+        touch, rest = np.zeros((hand.num_fingers, hand.num_taxels), np.float32), np.zeros(1)
+        idle = HandMeasurement(joints, joints, touch, joints, rest, rest, rest)
         for _ in range(3):
             self.tick(idle, ObjectEstimate(np.zeros(3), np.zeros(3), IDENTITY), IDENTITY, 0.0)
         self.start(joints)

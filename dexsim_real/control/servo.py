@@ -108,6 +108,7 @@ class Servo:
         reply = self.port.exchange(self.sensing.command(decision.position, decision.mode))
         took = time.monotonic() - started
         if reply is None:
+            self.safety.refuse(getattr(self.port, "refusal", None))
             return took
         self.driven = decision.mode == Mode.POSITION
         self.round_trip.add(reply.received - reply.sent)

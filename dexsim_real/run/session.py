@@ -32,6 +32,7 @@ from dexsim_real.run.outcome import Outcome
 from dexsim_real.run.status import StatusView
 from dexsim_real.sensors.hand import HandSensing
 from dexsim_real.wire.frames import Mode, empty_state
+from dexsim_real.wire.identity import check_identity
 from dexsim_real.wire.serial_hand import open_port
 
 _TARE_SAMPLES = 30
@@ -90,6 +91,8 @@ class Session:
         self._note(self.port.connect())
         for warning in getattr(self.port, "warnings", list)():
             self._note(f"warning: {warning}")
+        for note in check_identity(getattr(self.port, "identity", None), self.sensing.hand, self.sensing.calibration):
+            self._note(note)
         if self.arguments.tare:
             self._tare()
         self._write_meta()
@@ -97,7 +100,8 @@ class Session:
         if self.servo.wait_fresh(1.0) is None:
             if self.safety.problem:
                 raise HandError(f"{self.arguments.port}: {self.safety.problem}; check `--hardware.joint-offset`")
-            raise HandError(f"{self.arguments.port}: the hand stopped answering; check the cable and the power")
+            why = self.safety.refused or "the hand stopped answering; check the cable and the power"
+            raise HandError(f"{self.arguments.port}: {why}")
         self.objects = ObjectSensors(self.arguments, self.controller)
         spec = self.controller.spec
         if self.arguments.imu and spec.turn:
@@ -176,6 +180,8 @@ class Session:
             reply = self.port.exchange(self.sensing.command(self.sensing.hand.joint_lower, Mode.PASSIVE))
             if reply is not None:
                 states.append(reply.state)
+            elif (refusal := getattr(self.port, "refusal", None)) and refusal.serious:
+                raise HandError(f"{self.arguments.port}: {refusal.text}")
         if len(states) < _TARE_SAMPLES:
             raise HandError(
                 f"{self.arguments.port}: only {len(states)} answers in 5 s, cannot tare the taxels; check the cable"
@@ -327,7 +333,7 @@ class Session:
             f"{counts.late} late, {counts.reconnects} reconnects",
             "force": f"{' '.join(f'{f:.1f}' for f in force)} N, sum {force.sum():.1f} N",
             "command": f"{self.arguments.command:.2f}",
-            "heat": f"joints {heat[:12].max():.0f}, tips {heat[12:].max():.0f} degC",
+            "heat": f"joints {heat[:12].max():.0f}, tips {heat[12:17].max():.0f}, palm {heat[17]:.0f} degC",
         }
         if self.goals:
             rows["successes"] = str(self.goals.successes)

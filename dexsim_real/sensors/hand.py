@@ -75,8 +75,9 @@ class HandMeasurement:
     joint_torque: np.ndarray  # [J] 1, relative to the stall torque
     taxel_force: np.ndarray  # [F, N] N
     current: np.ndarray  # [J] A, magnitude
-    temperature: np.ndarray  # [J + F] degC, joint boards and tips
+    temperature: np.ndarray  # [J + F + 1] degC, joint boards, tips and palm board
     errors: np.ndarray  # [J, 3] error bits of palm, joint and tip board
+    mode: np.ndarray  # [J] control mode that the hand reports, `frames.Mode`
 
     @property
     def finger_force(self) -> np.ndarray:
@@ -132,14 +133,15 @@ class HandSensing:
         joint, tip = state["joint"], state["tip"]
         counts = np.maximum(self._counts(state) - self.tare, 0.0)
         counts = np.where(counts < self.config.taxel_floor, np.float32(0), counts)
-        board = joint["temperature"] & 0xFF
+        board, palm = joint["temperature"] & 0xFF, joint["temperature"] >> 8
         return HandMeasurement(
             joint_position=joint["position"] * self._sign + self._offset,
             joint_torque=np.asarray(self._torque(joint["current"].astype(np.float32)), np.float32),
             taxel_force=counts * self._per_count,
             current=np.abs(joint["current"].astype(np.float32)) * np.float32(1e-3),
-            temperature=np.concatenate([board, tip["temperature"]]).astype(np.float32),
+            temperature=np.concatenate([board, tip["temperature"], [palm.max()]]).astype(np.float32),
             errors=np.stack([joint["palm_error"], joint["joint_error"], joint["tip_error"]], -1),
+            mode=(joint["raw_position"] & 0xF).astype(np.uint8),
         )
 
     def set_tare(self, states: Sequence[np.ndarray]) -> list[str]:

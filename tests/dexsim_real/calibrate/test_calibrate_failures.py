@@ -62,7 +62,7 @@ def heat(bench):
         (raises(KeyboardInterrupt()), KeyboardInterrupt, None),
         (raises(SystemExit(143)), SystemExit, "143"),
         (raises(RuntimeError("broken")), RuntimeError, "broken"),
-        (heat, HandError, "too hot: 95 degC"),
+        (heat, HandError, r"too hot: joint thumb_bend \(thumb\), 95 degC"),
     ],
 )
 def test_however_it_ends_the_motors_are_off_and_the_old_file_is_there(hand, tmp_path, event, error, says):
