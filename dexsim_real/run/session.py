@@ -28,9 +28,11 @@ from dexsim_real.core.timing import Pace, Timing, keep_phase
 from dexsim_real.run.guard import Guard
 from dexsim_real.run.object_sensors import ObjectSensors
 from dexsim_real.run.options import RunArguments
+from dexsim_real.run.outcome import Outcome
 from dexsim_real.run.status import StatusView
 from dexsim_real.sensors.hand import HandSensing
 from dexsim_real.wire.frames import Mode, empty_state
+from dexsim_real.wire.identity import check_identity
 from dexsim_real.wire.serial_hand import open_port
 
 _TARE_SAMPLES = 30
@@ -66,11 +68,13 @@ class Session:
         self.port = open_port(arguments.port, arguments.link, self._tap)
         rate = keep_phase(arguments.rate, policy.control_rate)
         self.servo = Servo(self.port, self.sensing, self.safety, rate)
+        self.servo.masked = self._mask
         self.view = StatusView(f"{policy.task} on {arguments.port}", self._status, arguments.quiet)
         self.objects: ObjectSensors | None = None
         self.goals: TurnGoals | None = None
         self.compute, self.pace = Timing(), Pace(policy.control_rate)
         self.started = self.force = self.forces = 0.0
+        self.outcome = Outcome()
         self.tick: Tick | None = None
         self.end, self._closed = "not started", False
         if arguments.realtime and not realtime:
@@ -87,6 +91,8 @@ class Session:
         self._note(self.port.connect())
         for warning in getattr(self.port, "warnings", list)():
             self._note(f"warning: {warning}")
+        for note in check_identity(getattr(self.port, "identity", None), self.sensing.hand, self.sensing.calibration):
+            self._note(note)
         if self.arguments.tare:
             self._tare()
         self._write_meta()
@@ -94,7 +100,8 @@ class Session:
         if self.servo.wait_fresh(1.0) is None:
             if self.safety.problem:
                 raise HandError(f"{self.arguments.port}: {self.safety.problem}; check `--hardware.joint-offset`")
-            raise HandError(f"{self.arguments.port}: the hand stopped answering; check the cable and the power")
+            why = self.safety.refused or "the hand stopped answering; check the cable and the power"
+            raise HandError(f"{self.arguments.port}: {why}")
         self.objects = ObjectSensors(self.arguments, self.controller)
         spec = self.controller.spec
         if self.arguments.imu and spec.turn:
@@ -158,6 +165,7 @@ class Session:
             "mean_finger_force": self.force / self.forces if self.forces else 0.0,
             "log": str(self.log.path),
             "log_dropped": self.log.dropped,
+            "missing": self.outcome.missing(self.log),
         }
         if self.goals:
             times = [t - self.started for t in self.goals.times]
@@ -172,11 +180,14 @@ class Session:
             reply = self.port.exchange(self.sensing.command(self.sensing.hand.joint_lower, Mode.PASSIVE))
             if reply is not None:
                 states.append(reply.state)
+            elif (refusal := getattr(self.port, "refusal", None)) and refusal.serious:
+                raise HandError(f"{self.arguments.port}: {refusal.text}")
         if len(states) < _TARE_SAMPLES:
             raise HandError(
                 f"{self.arguments.port}: only {len(states)} answers in 5 s, cannot tare the taxels; check the cable"
             )
-        self.sensing.set_tare(states)
+        for line in self.sensing.set_tare(states):
+            self._note(f"warning: {line}")
 
     def _approach(self) -> None:
         """Move to the start posture, and hold it until the object is seen."""
@@ -215,6 +226,7 @@ class Session:
 
     def _loop(self) -> str:
         anchor, self.started = self.safety.anchor, time.monotonic()
+        self.outcome = Outcome(self.started)
         self.servo.forget()
         self.pace = Pace(self.controller.policy.control_rate)
         # A tick starts when a request has just been sent; rates from `keep_phase` keep it so.
@@ -223,7 +235,9 @@ class Session:
             self._check()
             now, sample = time.monotonic(), self.safety.sample
             assert sample is not None, "no state yet"
-            if now - sample.time <= self.safety.config.stale:
+            measured = now - sample.time <= self.safety.config.stale
+            self.outcome.add(now, measured, self.safety)
+            if measured:
                 if anchor != self.safety.anchor:
                     anchor = self.safety.anchor
                     self.controller.anchor(self.safety.commanded)
@@ -234,14 +248,15 @@ class Session:
         return "time is over"
 
     def _tick(self, now: float, sample: Any) -> None:
-        seen, age, when = self._objects().read(now)
+        objects = self._objects()
+        seen, when = objects.read(now)
         goal = self.goals.update(when, seen) if self.goals else IDENTITY
         if self.arguments.motors_off:
             self.controller.anchor(sample.measured.joint_position)
         tick = self.controller.tick(sample.measured, seen, goal, self.arguments.command)
-        hold_reason = "the object is out of sight" if age > self.safety.config.stale_object else ""
-        self.safety.set_target(tick.target, now, hold_reason)
+        self.safety.set_target(tick.target, now, objects.lost(now, self.safety.config.stale_object))
         self.tick = tick
+        self.outcome.act(tick.target)
         self.force += float(sample.measured.finger_force.sum())
         self.forces += 1
         readings = {field.name: getattr(tick.readings, field.name) for field in dataclasses.fields(tick.readings)}
@@ -261,6 +276,12 @@ class Session:
     def _tap(self, direction: str, data: bytes) -> None:
         kind = Kind.SENT if direction == "tx" else Kind.RECEIVED
         self.log.add(kind, (self.port.counts.sent, data))
+
+    def _mask(self, sequence: int, lines: list[str]) -> None:
+        """Taxels have got stuck: a replay needs to know from which exchange on."""
+        self.log.add(Kind.META, {"tare": self.sensing.tare, "from": sequence})
+        for line in lines:
+            self._note(f"warning: {line}")
 
     def _note(self, text: str) -> None:
         self.log.add(Kind.NOTE, text)
@@ -312,7 +333,7 @@ class Session:
             f"{counts.late} late, {counts.reconnects} reconnects",
             "force": f"{' '.join(f'{f:.1f}' for f in force)} N, sum {force.sum():.1f} N",
             "command": f"{self.arguments.command:.2f}",
-            "heat": f"joints {heat[:12].max():.0f}, tips {heat[12:].max():.0f} degC",
+            "heat": f"joints {heat[:12].max():.0f}, tips {heat[12:17].max():.0f}, palm {heat[17]:.0f} degC",
         }
         if self.goals:
             rows["successes"] = str(self.goals.successes)

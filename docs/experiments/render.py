@@ -17,6 +17,10 @@ KEYS = ("id", "date", "commit", "title", "command", "hardware", "seeds", "metric
 GRASP = {
     "held_pct": "held [%]",
     "held_worst_command_pct": "worst command [%]",
+    "r_resultant": "r, resultant",
+    "r_normal": "r, normal",
+    "r_taxels": "r, taxels",
+    "force_error_n": "force error [N]",
     "pearson_r": "force r",
     "force_rmse_n": "force RMSE [N]",
     "force_range": "force range [×]",
@@ -25,6 +29,8 @@ ROTATE = {
     "successes_median": "successes, median",
     "successes_mean": "mean",
     "successes_p10": "10th percentile",
+    "successes_per_minute": "per minute",
+    "do_nothing_successes_mean": "doing nothing, mean",
     "without_success_pct": "no success [%]",
     "seconds_per_success": "s per success",
     "never_dropped_pct": "never dropped [%]",
@@ -32,7 +38,20 @@ ROTATE = {
 TABLES: dict[str, tuple[str, dict[str, str]]] = {
     "rotate_training": ("Training: rotate", ROTATE | {"fingertips_working": "fingertips"}),
     "grasp_training": ("Training: grasp", GRASP),
-    "evaluation": ("Evaluations in simulation", ROTATE | {"held_pct": "held [%]", "pearson_r": "force r"}),
+    "evaluation": (
+        "Evaluations in simulation",
+        ROTATE
+        | {
+            "held_pct": "held [%]",
+            "do_nothing_held_pct": "doing nothing, held [%]",
+            "force_error_n": "force error [N]",
+            "r_resultant": "r, resultant",
+            "r_normal": "r, normal",
+            "r_taxels": "r, taxels",
+            "torque_limited_pct": "at a torque limit [%]",
+            "pearson_r": "force r",
+        },
+    ),
     "ablation": (
         "Tactile ablation",
         {"successes_mean": "successes, mean", "successes_median": "median", "never_dropped_pct": "never dropped [%]"},
@@ -42,8 +61,14 @@ TABLES: dict[str, tuple[str, dict[str, str]]] = {
         {
             "trials": "trials",
             "held_pct": "held [%]",
-            "pearson_r_normal": "r, normal force",
-            "pearson_r": "r, whole force",
+            "do_nothing_held_pct": "doing nothing, held [%]",
+            "force_error_n": "force error [N]",
+            "r_resultant": "r, resultant",
+            "r_normal": "r, normal",
+            "r_taxels": "r, taxels",
+            "torque_limited_pct": "at a torque limit [%]",
+            "pearson_r_normal": "pearson_r_normal",
+            "pearson_r": "pearson_r",
         },
     ),
     "zero_shot_rotate": (
@@ -51,6 +76,8 @@ TABLES: dict[str, tuple[str, dict[str, str]]] = {
         {
             "trials": "trials",
             "successes_mean": "successes, mean",
+            "successes_per_minute": "per minute",
+            "do_nothing_successes_mean": "doing nothing, mean",
             "seconds_per_success": "s per success",
             "seconds_to_drop": "s to the drop",
             "never_dropped_pct": "never dropped [%]",
