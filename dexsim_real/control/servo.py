@@ -6,6 +6,7 @@ this thread, it turns the motors off.
 
 import threading
 import time
+from collections.abc import Callable
 
 from dexsim_real.control.motors_off import patience, turn_off
 from dexsim_real.control.safety import HandSample, Safety
@@ -24,11 +25,19 @@ class Servo:
       sensing: conversion to SI units.
       safety: decides the commands.
       rate: exchanges per second.
+      beat: called before every exchange as a sign of life, with the time s by which the next call may be late.
     """
 
-    def __init__(self, port: HandPort, sensing: HandSensing, safety: Safety, rate: float):
+    def __init__(
+        self,
+        port: HandPort,
+        sensing: HandSensing,
+        safety: Safety,
+        rate: float,
+        beat: Callable[[float], None] = lambda more: None,
+    ):
         self.port, self.sensing, self.safety = port, sensing, safety
-        self.pace = Pace(rate)
+        self.pace, self._beat = Pace(rate), beat
         self.round_trip = Timing()
         self.waited = 0  # deadlines missed because of late answers
         self.error: BaseException | None = None
@@ -95,6 +104,7 @@ class Servo:
 
     def _cycle(self) -> float:
         """One exchange; returns its duration in s."""
+        self._beat(0.0)
         if self._engage:
             self.safety.engage()
             self._engage = False
@@ -127,6 +137,7 @@ class Servo:
         """Turn the motors off, and close the port."""
         off = self.sensing.command(self.sensing.hand.joint_lower, Mode.PASSIVE)
         self._rested = True
+        self._beat(patience(self.driven))
         try:
             if turn_off(self.port, off, patience(self.driven)):
                 self.driven = False

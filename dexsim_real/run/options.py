@@ -43,7 +43,7 @@ class RunArguments:
     fixed_object: bool = False
     """Run without a camera: assume that the object stays at its nominal position."""
     guard: bool = True
-    """Start a second process that turns the motors off when this one dies (not with `sdk:` ports)."""
+    """Start a second process that turns the motors off when this one dies or freezes."""
     tare: bool = True
     """Tare the taxels first; refused while a fingertip touches something."""
     rate: float = setting(83.0, unit="Hz", low=1.0, high=1000.0)

@@ -47,8 +47,7 @@ class Session:
 
     def __init__(self, arguments: RunArguments):
         self.arguments = arguments
-        serial = not arguments.port.startswith("sdk:") and "://" not in arguments.port
-        wanted = arguments.guard and serial and not arguments.motors_off
+        wanted = arguments.guard and not arguments.motors_off
         self.guard = Guard(arguments.port, arguments.link) if wanted else None
         policy, hand = load_policy(arguments.policy), load_hand()
         self.controller = Controller(policy, hand)
@@ -65,7 +64,8 @@ class Session:
         self.log = LogWriter(path)
         self.port = open_port(arguments.port, arguments.link, self._tap)
         rate = keep_phase(arguments.rate, policy.control_rate)
-        self.servo = Servo(self.port, self.sensing, self.safety, rate)
+        beat = self.guard.beat if self.guard else lambda more: None
+        self.servo = Servo(self.port, self.sensing, self.safety, rate, beat)
         self.view = StatusView(f"{policy.task} on {arguments.port}", self._status, arguments.quiet)
         self.objects: ObjectSensors | None = None
         self.goals: TurnGoals | None = None
