@@ -120,6 +120,7 @@ def runner_words(twin: TwinProcess, options: argparse.Namespace, log: Path, seco
         "--camera",
         f"unix:{twin.masks}",
         "--uncalibrated",
+        "--yes",
         "--quiet",
         "--link.settle",
         "0.1",

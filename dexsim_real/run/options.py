@@ -29,6 +29,8 @@ class RunArguments:
     """Duration of the run, after the approach."""
     motors_off: bool = False
     """Measure, compute and display everything with the motors off."""
+    yes: bool = False
+    """Do not ask before the motors come on (for scripts and the emulated hand)."""
     calibration: Path | None = None
     """Calibration file of this hand; None only with --uncalibrated."""
     uncalibrated: bool = False

@@ -19,16 +19,18 @@ from dexsim_ppo.policy import load_policy
 from dexsim_real.control.controller import IDENTITY, Controller, Tick
 from dexsim_real.control.goals import TurnGoals
 from dexsim_real.control.motors_off import UNCONFIRMED
-from dexsim_real.control.safety import Safety
+from dexsim_real.control.safety import Reaction, Safety
 from dexsim_real.control.servo import Servo
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogWriter
 from dexsim_real.core.process import ignore_signals, leave_realtime, use_realtime
 from dexsim_real.core.timing import Pace, Timing, keep_phase
+from dexsim_real.run import consent
 from dexsim_real.run.guard import Guard
+from dexsim_real.run.hand_view import HandState
 from dexsim_real.run.object_sensors import ObjectSensors
 from dexsim_real.run.options import RunArguments
-from dexsim_real.run.status import StatusView
+from dexsim_real.run.status import Status, StatusView
 from dexsim_real.sensors.hand import HandSensing
 from dexsim_real.wire.frames import Mode, empty_state
 from dexsim_real.wire.serial_hand import open_port
@@ -91,21 +93,22 @@ class Session:
             self._tare()
         self._write_meta()
         self.servo.start()
-        if self.servo.wait_fresh(1.0) is None:
-            if self.safety.problem:
-                raise HandError(f"{self.arguments.port}: {self.safety.problem}; check `--hardware.joint-offset`")
-            raise HandError(f"{self.arguments.port}: the hand stopped answering; check the cable and the power")
+        self._await_pose()
         self.objects = ObjectSensors(self.arguments, self.controller)
         spec = self.controller.spec
         if self.arguments.imu and spec.turn:
             self.goals = TurnGoals(spec.turn, np.asarray(spec.reference))
 
     def run(self) -> None:
-        """Turn the motors on, approach the start posture, and run the policy until time or `Safety` ends it.
+        """Ask, turn the motors on, approach the start posture, and run the policy until time or `Safety` ends it.
 
         Raises:
-          HandError: `Safety` or a failure ended the run.
+          HandError: the answer was not yes, or `Safety` or a failure ended the run.
         """
+        if not (self.arguments.yes or self.arguments.motors_off):
+            self.view.show()
+            consent.ask()
+            self._await_pose()  # The hand may have been moved or lost meanwhile.
         sys.setswitchinterval(2e-4)
         gc.collect()
         gc.freeze()
@@ -177,6 +180,12 @@ class Session:
                 f"{self.arguments.port}: only {len(states)} answers in 5 s, cannot tare the taxels; check the cable"
             )
         self.sensing.set_tare(states)
+
+    def _await_pose(self) -> None:
+        if self.servo.wait_fresh(1.0) is None:
+            if self.safety.problem:
+                raise HandError(f"{self.arguments.port}: {self.safety.problem}; check `--hardware.joint-offset`")
+            raise HandError(f"{self.arguments.port}: the hand stopped answering; check the cable and the power")
 
     def _approach(self) -> None:
         """Move to the start posture, and hold it until the object is seen."""
@@ -294,29 +303,28 @@ class Session:
             },
         )
 
-    def _status(self) -> dict[str, str]:
-        sample, counts = self.safety.sample, self.port.counts
+    def _status(self) -> Status:
+        sample, counts, tick = self.safety.sample, self.port.counts, self.tick
         if sample is None:
-            return {"hand": "no measurement"}
-        force, heat = sample.measured.finger_force, sample.measured.temperature
+            return Status({"hand": self.safety.problem or "no measurement"})
         reaction, reason = self.safety.last
         rows = {
             "time": f"{time.monotonic() - self.started if self.started else 0:.1f} s",
             "safety": f"{reaction.name.lower()} {reason}".strip(),
-            "age": f"{1e3 * (time.monotonic() - sample.time):.1f} ms",
+            "age": f"{1e3 * (time.monotonic() - sample.time):.1f} ms {self.safety.problem}".strip(),
             "policy": self._timing(self.pace.jitter, 1 / self.pace.period),
             "exchanges": self._timing(self.servo.pace.jitter, 1 / self.servo.pace.period),
             "round trip": f"p50 {1e3 * self.servo.round_trip.percentile(50):.2f} ms, "
             f"p99 {1e3 * self.servo.round_trip.percentile(99):.2f} ms",
             "link": f"{counts.answered} answered, {counts.corrupt} corrupt, {counts.silent} silent, "
             f"{counts.late} late, {counts.reconnects} reconnects",
-            "force": f"{' '.join(f'{f:.1f}' for f in force)} N, sum {force.sum():.1f} N",
             "command": f"{self.arguments.command:.2f}",
-            "heat": f"joints {heat[:12].max():.0f}, tips {heat[12:].max():.0f} degC",
         }
         if self.goals:
             rows["successes"] = str(self.goals.successes)
-        return rows
+        sent = reaction != Reaction.RELAX
+        command = self.safety.commanded if sent else tick.target if tick else None
+        return Status(rows, HandState(self.sensing.hand, sample.measured, command, sent))
 
     @staticmethod
     def _timing(timing: Timing, rate: float) -> str:
