@@ -45,7 +45,7 @@ class Evaluator:
     def __init__(self, env: Environment, chunk: int):
         self.env, self.chunk = env, chunk
         self.totals = env.evaluation == "totals"
-        self._run = jit(self._episodes)
+        self._run = jit(self._episodes, backend=env.backend)
 
     def __call__(self, params: PolicyParams, *, episodes: int, seed: int) -> tuple[dict[str, Any], Any]:
         """Measure over at least `episodes` episodes, rounded up to whole chunks.
@@ -218,7 +218,7 @@ class EvaluateArguments:
     seed: int = setting(0, unit="1", low=0, high=2**32 - 1)
     """Seed of the episodes."""
     backend: Literal["auto", "jax", "warp", "c"] = setting("auto")
-    """Physics backend. auto: warp on a GPU if it is installed, otherwise jax."""
+    """Physics backend. auto: c on a CPU, warp on an NVIDIA GPU if it is installed, otherwise jax."""
     chunk: int = setting(0, unit="1", low=0)
     """Episodes simulated side by side; 0 chooses by the device."""
     seconds: float = setting(0.0, unit="s", low=0.0)

@@ -1,7 +1,5 @@
 """What an episode draws at its start: the hand, the object's bulk, the IMU and the taxels."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -43,7 +41,7 @@ class EpisodeSampler:
     def sample_hand(
         self, hand_key: jax.Array, sensor_key: jax.Array, scale: jax.Array | float = 1.0
     ) -> tuple[HandParams, ImuParams]:
-        """The hand, and the object's IMU as that hand's host takes it."""
+        """The hand, and the object's IMU."""
         ranges = self.config.randomization
         hand = sample_hand(
             hand_key,
@@ -54,10 +52,7 @@ class EpisodeSampler:
             scale=scale,
         )
         extreme = sample_extreme(hand_key, ranges.extremes)  # the one that `sample_hand` draws
-        imu = self.senses.sample_imu(sensor_key, ranges.scale * scale, extreme)
-        # An IMU's upright is the true one; the host takes it for that of a hand without tilt.
-        down, tilted = self._gravity(hand)
-        return hand, dataclasses.replace(imu, bias=imu.bias + jnp.cross(tilted, down))
+        return hand, self.senses.sample_imu(sensor_key, ranges.scale * scale, extreme)
 
     def tilt_force(self, episode: Episode) -> jax.Array:
         """The object's share [3] N of a tilted gravity; the links' share is small and left out."""

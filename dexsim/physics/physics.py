@@ -30,7 +30,7 @@ BACKENDS: dict[str, Callable[..., Backend]] = {"jax": JaxBackend, "warp": WarpBa
 
 
 def choose_backend(backend: str) -> str:
-    """The name of a backend; `auto` is Warp where it can be imported and JAX runs on an NVIDIA GPU, else JAX.
+    """The name of a backend. `auto`: c on a CPU, warp on an NVIDIA GPU where it can be imported, else jax.
 
     Raises:
       ConfigError: no such backend, or its library or device is missing.
@@ -39,7 +39,7 @@ def choose_backend(backend: str) -> str:
         raise ConfigError(f"backend {backend!r}: choose from auto, {', '.join(BACKENDS)}")
     device, found = jax.default_backend(), importlib.util.find_spec("warp") is not None
     if backend == "auto":
-        return "warp" if found and device in ("gpu", "cuda") else "jax"
+        return "c" if device == "cpu" else "warp" if found and device in ("gpu", "cuda") else "jax"
     if backend == "warp" and not found:
         raise ConfigError(f"backend 'warp' needs the extra: {install_line('warp')}")
     if backend == "c" and device != "cpu":

@@ -90,6 +90,7 @@ class Run:
                 shapes,
                 self._identity(),
                 lambda: self.clock.update(trace_s=time.perf_counter() - begin),
+                self.env.backend,
             )
             if not isinstance(source, checkpoint.Checkpoint):
                 state = fresh.result()

@@ -36,7 +36,7 @@ class ObjectSensors:
                     spec.velocity_filter,
                 )
             if arguments.imu:
-                self._imu = Imu(arguments.imu, -np.asarray(spec.gravity), arguments.imu_mount)
+                self._imu = Imu(arguments.imu, arguments.imu_mount)
                 self._imu.wait()
         except BaseException:
             self.close()

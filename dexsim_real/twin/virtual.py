@@ -81,8 +81,8 @@ class Schedule:
 class VirtualImu:
     """The IMU in the object and the bridge's processing of it, without a port."""
 
-    def __init__(self, plant: EmulatedHand, nominal_up: np.ndarray):
-        self._plant, self._nominal_up = plant, nominal_up
+    def __init__(self, plant: EmulatedHand):
+        self._plant = plant
         self._mount = np.asarray(UPRIGHT_X)
         self._parser, self._index = RvcParser(), 0
         # The IMU's world frame has the true vertical as z and an arbitrary heading.
@@ -105,8 +105,8 @@ class VirtualImu:
             self.time = time
 
     def calibrate(self) -> None:
-        """Align the heading: the object now has the identity orientation."""
-        self._world = align(self._sensed, multiply(IDENTITY, self._mount), self._nominal_up)
+        """Align: the object now has the identity orientation."""
+        self._world = align(self._sensed, multiply(IDENTITY, self._mount))
 
     def read(self) -> np.ndarray:
         """Orientation [4] of the object in the palm frame, as measured by the bridge."""
@@ -171,7 +171,7 @@ class VirtualRun:
         self._schedule, self._now = Schedule(), 0.0
         self._state: np.ndarray | None = None
         self._mode, self._target = Mode.PASSIVE, hand.joint_lower
-        self.imu = VirtualImu(plant, -np.asarray(controller.spec.gravity))
+        self.imu = VirtualImu(plant)
         self.camera = VirtualCamera(plant, controller) if "camera" in controller.sources else None
         self.goals: TurnGoals | None = None
         self.ticks, self.sums = 0, np.zeros(5)

@@ -244,6 +244,8 @@ class TestConstruction:
         with pytest.raises(ConfigError, match="'cuda'.*auto, jax, warp"):
             choose_backend("cuda")
         monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
+        assert choose_backend("auto") == choose_backend("c") == "c"
+        monkeypatch.setattr(jax, "default_backend", lambda: "tpu")
         assert choose_backend("auto") == "jax"
         monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
         monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
