@@ -12,13 +12,14 @@ from dexsim_real.twin.wire.command_check import LimitsConfig
 from dexsim_real.wire.frames import Mode
 
 DEFAULTS = SafetyConfig()
+MARGIN = 0.03  # rad
 FINGER = 15.0  # N, fingertip force in the hand's specification
 
 
 def test_defaults_are_below_what_the_hand_can_do(hand):
     assert DEFAULTS.speed < hand.speed_limit.min() and DEFAULTS.joint_speed < hand.speed_limit.max()
     assert DEFAULTS.finger_force <= FINGER and DEFAULTS.total_force <= 80.0
-    assert 0.01 <= DEFAULTS.margin <= 0.2 * (hand.joint_upper - hand.joint_lower).min()
+    assert DEFAULTS.margin >= MARGIN and DEFAULTS.margin <= 0.2 * (hand.joint_upper - hand.joint_lower).min()
     assert LimitsConfig().speed == DEFAULTS.speed  # The emulated hand checks what the bridge promises.
 
 
@@ -30,7 +31,7 @@ def test_the_speed_limit_lets_the_shipped_policies_move_as_in_training(name):
 
 @pytest.mark.parametrize("end", ["lower", "upper"])
 def test_a_hand_at_its_end_stops_is_not_moved_by_the_motors_coming_on(hand, end):
-    bench = Bench(hand, **vars(DEFAULTS))
+    bench = Bench(hand, margin=MARGIN)
     stop = bench.position = (hand.joint_lower if end == "lower" else hand.joint_upper).astype(np.float32)
     bench.engage()
     first = bench.cycle()
@@ -42,7 +43,7 @@ def test_a_hand_at_its_end_stops_is_not_moved_by_the_motors_coming_on(hand, end)
     path = np.array([bench.cycle(wish=stop).position for _ in range(200)])
     away = np.abs(path - stop)
     assert away[0].max() <= 0.55 * CYCLE and np.all(np.diff(away, axis=0) >= 0)
-    np.testing.assert_allclose(away[-1], DEFAULTS.margin, atol=1e-6)
+    np.testing.assert_allclose(away[-1], MARGIN, atol=1e-6)
 
 
 @given(st.lists(st.floats(-3, 3), min_size=12, max_size=12), st.booleans())
@@ -51,13 +52,13 @@ def test_commands_stay_away_from_the_end_stops(hand, wish, hard):
     bench.engage()
     for _ in range(100):
         decision = bench.cycle(wish=np.array(wish), force=16.0 if hard else 0.0)
-        assert np.all(decision.position >= hand.joint_lower + DEFAULTS.margin - 1e-6)
-        assert np.all(decision.position <= hand.joint_upper - DEFAULTS.margin + 1e-6)
+        assert np.all(decision.position >= hand.joint_lower + MARGIN - 1e-6)
+        assert np.all(decision.position <= hand.joint_upper - MARGIN + 1e-6)
 
 
 def test_the_margin_alone_is_no_event(hand):
     """Policies rest joints at their stops, which would otherwise hide every other clip."""
-    bench = Bench(hand, **vars(DEFAULTS) | {"ramp": 0.0})
+    bench = Bench(hand, margin=MARGIN, ramp=0.0)
     bench.engage()
     bench.run(1.0, wish=hand.joint_lower)
     assert bench.cycle(wish=hand.joint_lower).reaction == Reaction.NONE
