@@ -18,8 +18,8 @@ class HandState:
 
     hand: Hand
     measured: HandMeasurement
-    command: np.ndarray | None  # [J] rad, the newest one; None before the first
-    sent: bool  # whether the motors follow the command
+    target: np.ndarray | None  # [J] rad, the newest joint targets; None before the first
+    sent: bool  # whether the motors follow them
 
 
 def error_text(registers: np.ndarray) -> str:
@@ -57,19 +57,11 @@ def hand_line(state: HandState) -> dict[str, str]:
 
 def _joints(state: HandState) -> Table:
     hand, measured = state.hand, state.measured
-    columns = [
-        "joint (rad)",
-        "measured",
-        "command" if state.sent else "(not sent)",
-        "A",
-        "degC",
-        "errors: palm",
-        *_BOARDS[1:],
-    ]
-    table = _table(columns)
+    boards = ("errors: palm", *_BOARDS[1:])
+    table = _table(["joint (rad)", "measured", "target" if state.sent else "(not sent)", "A", "degC", *boards])
     heat, _ = _heat(state)
     for joint, name in enumerate(hand.joint_names):
-        asked = "-" if state.command is None else f"{state.command[joint]:.3f}"
+        asked = "-" if state.target is None else f"{state.target[joint]:.3f}"
         table.add_row(
             f"{joint:2d} {name}",
             f"{measured.joint_position[joint]:.3f}",

@@ -323,11 +323,13 @@ class Session:
         if self.goals:
             rows["successes"] = str(self.goals.successes)
         sent = reaction != Reaction.RELAX
-        command = self.safety.commanded if sent else tick.target if tick else None
-        return Status(rows, HandState(self.sensing.hand, sample.measured, command, sent))
+        target = self.safety.commanded if sent else tick.target if tick else None
+        return Status(rows, HandState(self.sensing.hand, sample.measured, target, sent))
 
     @staticmethod
     def _timing(timing: Timing, rate: float) -> str:
+        if not timing.count:
+            return f"{rate:.1f} Hz"
         return (
             f"{rate:.1f} Hz, late p50 {1e3 * timing.percentile(50):.2f} ms, "
             f"p99 {1e3 * timing.percentile(99):.2f} ms, missed {timing.missed}"

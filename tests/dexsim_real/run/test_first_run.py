@@ -53,9 +53,9 @@ def test_the_view_shows_every_joint_and_finger_by_name_on_100_by_30(hand, state)
     assert len(lines) <= 29 and "…" not in shown
     for joint, name in enumerate(hand.joint_names):
         (line,) = (line for line in lines if re.match(rf"\s*{joint} {name} ", line))
-        angle, command, current, heat, *errors = line.split()[2:9]
+        angle, target, current, heat, *errors = line.split()[2:9]
         assert abs(float(angle) - state.measured.joint_position[joint]) < 6e-4
-        assert abs(float(command) - state.command[joint]) < 6e-4
+        assert abs(float(target) - state.target[joint]) < 6e-4
         assert (float(current), int(heat)) == (pytest.approx(1.101 + 0.001 * joint, abs=0.006), 101 + joint)
         assert errors == {3: ["0101", "ffff", "-"], 11: ["-", "-", "8000"]}.get(joint, ["-"] * 3)
     for finger, name in enumerate(FINGERS):
@@ -63,10 +63,10 @@ def test_the_view_shows_every_joint_and_finger_by_name_on_100_by_30(hand, state)
     assert re.search(r"sum +303.0 *$", shown, re.MULTILINE)
 
 
-def test_a_command_that_is_not_sent_is_called_so(hand, state):
+def test_targets_that_are_not_sent_are_called_so(hand, state):
     quiet = HandState(hand, state.measured, None, sent=False)
-    assert "(not sent)" in picture(quiet) and "command" not in picture(quiet)
-    assert "not sent" not in picture(state)
+    assert "(not sent)" in picture(quiet) and "target" not in picture(quiet)
+    assert "not sent" not in picture(state) and "  target  " in picture(state)
 
 
 def test_without_a_terminal_the_same_is_one_line(state):
