@@ -10,7 +10,8 @@ from dexsim.env.senses import SensorSuite
 from dexsim.env.state import Episode
 from dexsim.env.task import Task
 from dexsim.hand.kinematics import Hand
-from dexsim.objects.params import ObjectParams, toward_nominal
+from dexsim.objects.config import BULK_RANGES
+from dexsim.objects.params import ObjectParams, redraw_bulk, toward_nominal
 from dexsim.randomization import HandParams, sample_hand, tilted_down
 from dexsim.sensing.imu import ImuParams
 
@@ -20,17 +21,27 @@ class EpisodeSampler:
 
     def __init__(self, config: EnvConfig, hand: Hand, task: Task, senses: SensorSuite):
         self.config, self.hand, self.task, self.senses = config, hand, task, senses
+        self._bulk = tuple(name for name in BULK_RANGES if f"objects.{name}" in task.object_ranges)
 
     def sample(
-        self, hand_key: jax.Array, sensor_key: jax.Array, object: ObjectParams, scale: jax.Array | None = None
+        self,
+        hand_key: jax.Array,
+        sensor_key: jax.Array,
+        object_key: jax.Array,
+        object: ObjectParams,
+        scale: jax.Array | None = None,
     ) -> Episode:
         """One episode.
 
         Args:
-          hand_key, sensor_key: of hand and IMU, and of the sensors.
-          object: of the start state, for which it was chosen.
+          hand_key, sensor_key, object_key: of hand and IMU, of the sensors, and of the object's bulk.
+          object: of the start state. Its shape stays, for the state was chosen for it; what of its bulk the task
+            draws (`Task.object_ranges`) is drawn anew.
           scale: [] in [0, 1], narrows every range about nominal; None for 1.
         """
+        if self._bulk:
+            plain = self.task.unit_inertia(object)
+            object = redraw_bulk(object_key, object, self.config.objects, plain, self._bulk)
         if scale is not None:
             object = toward_nominal(object, self.config.objects, self.task.unit_inertia(object), scale)
         width = 1.0 if scale is None else scale

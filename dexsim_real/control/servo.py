@@ -26,6 +26,8 @@ class Servo:
       safety: decides the commands.
       rate: exchanges per second.
       beat: called before every exchange as a sign of life, with the time s by which the next call may be late.
+
+    `masked` is called with the number of the exchange from which on taxels are masked, and with lines that name them.
     """
 
     def __init__(
@@ -42,6 +44,7 @@ class Servo:
         self.waited = 0  # deadlines missed because of late answers
         self.error: BaseException | None = None
         self.driven = False  # whether the motors may be on
+        self.masked: Callable[[int, list[str]], None] = lambda sequence, lines: None
         self._filter = VelocityFilter(sensing.config.velocity_time)
         self._generation = 0
         self._rested = False
@@ -114,6 +117,7 @@ class Servo:
         reply = self.port.exchange(self.sensing.command(decision.position, decision.mode))
         took = time.monotonic() - started
         if reply is None:
+            self.safety.refuse(getattr(self.port, "refusal", None))
             return took
         self.driven = decision.mode == Mode.POSITION
         self.round_trip.add(reply.received - reply.sent)
@@ -124,6 +128,8 @@ class Servo:
         return took
 
     def _sample(self, reply: Reply) -> HandSample:
+        if lines := self.sensing.mask_stuck(reply.state, self.safety.config.finger_force):
+            self.masked(reply.sequence, lines)
         measured = self.sensing.measure(reply.state)
         if reply.generation != self._generation:
             self._filter.reset()

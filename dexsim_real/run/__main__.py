@@ -21,7 +21,7 @@ from dexsim_real.run.status import summary_table
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The command. Returns its exit code: 0, or 1 when `Safety` or a failure ended the run."""
+    """The command. Returns its exit code: 0, or 1 when `Safety` or a failure ended the run or something is missing."""
     arguments = cli.parse(
         RunArguments,
         sys.argv[1:] if argv is None else argv,
@@ -58,6 +58,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         if session.servo.driven:
             code = 1
         summary = session.summary()
+        if code == 0 and summary["missing"]:
+            code = 1
+            print(f"error: {'; '.join(summary['missing'])}", file=sys.stderr)
         if not arguments.quiet:
             session.view.console.print(summary_table(f"{session.controller.policy.task}: {session.end}", summary))
         if arguments.output:

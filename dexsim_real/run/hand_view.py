@@ -38,7 +38,7 @@ def hand_tables(state: HandState) -> Table:
 def hand_line(state: HandState) -> dict[str, str]:
     """The same in a few words, name to text, for an output without a terminal."""
     hand, measured = state.hand, state.measured
-    joints, tips = _heat(state)
+    joints, tips, palm = _heat(state)
     force, hottest, tip = measured.finger_force, int(joints.argmax()), int(tips.argmax())
     pairs = ", ".join(f"{name} {value:.1f}" for name, value in zip(hand.finger_names, force, strict=True))
     errors = [
@@ -50,7 +50,7 @@ def hand_line(state: HandState) -> dict[str, str]:
         "angles": " ".join(f"{angle:.2f}" for angle in measured.joint_position) + " rad",
         "force": f"{pairs} N, sum {force.sum():.1f} N",
         "heat": f"{hand.joint_names[hottest]} {joints[hottest]:.0f}, tip of the {hand.finger_names[tip]} "
-        f"{tips[tip]:.0f} degC",
+        f"{tips[tip]:.0f}, palm {palm:.0f} degC",
         "errors": "; ".join(errors) or "none",
     }
 
@@ -59,7 +59,7 @@ def _joints(state: HandState) -> Table:
     hand, measured = state.hand, state.measured
     boards = ("errors: palm", *_BOARDS[1:])
     table = _table(["joint (rad)", "measured", "target" if state.sent else "(not sent)", "A", "degC", *boards])
-    heat, _ = _heat(state)
+    heat = _heat(state)[0]
     for joint, name in enumerate(hand.joint_names):
         asked = "-" if state.target is None else f"{state.target[joint]:.3f}"
         table.add_row(
@@ -75,17 +75,18 @@ def _joints(state: HandState) -> Table:
 
 def _fingers(state: HandState) -> Table:
     table = _table(["finger", "N", "degC"])
-    force, (_, heat) = state.measured.finger_force, _heat(state)
+    force, (_, heat, palm) = state.measured.finger_force, _heat(state)
     for finger, name in enumerate(state.hand.finger_names):
         table.add_row(name, f"{force[finger]:.1f}", f"{heat[finger]:.0f}")
     table.add_row("sum", f"{force.sum():.1f}", "")
+    table.add_row("palm board", "", f"{palm:.0f}")
     return table
 
 
-def _heat(state: HandState) -> tuple[np.ndarray, np.ndarray]:
-    """Temperatures degC of the joint boards and of the fingertips."""
-    heat, joints, fingers = state.measured.temperature, state.hand.num_joints, state.hand.num_fingers
-    return heat[:joints], heat[joints : joints + fingers]
+def _heat(state: HandState) -> tuple[np.ndarray, np.ndarray, float]:
+    """Temperatures degC of the joint boards, of the fingertips and of the palm board."""
+    heat, joints = state.measured.temperature, state.hand.num_joints
+    return heat[:joints], heat[joints:-1], float(heat[-1])
 
 
 def _table(columns: list[str]) -> Table:

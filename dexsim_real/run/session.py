@@ -19,7 +19,7 @@ from dexsim_ppo.policy import load_policy
 from dexsim_real.control.controller import IDENTITY, Controller, Tick
 from dexsim_real.control.goals import TurnGoals
 from dexsim_real.control.motors_off import UNCONFIRMED
-from dexsim_real.control.safety import Reaction, Safety
+from dexsim_real.control.safety import Safety
 from dexsim_real.control.servo import Servo
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogWriter
@@ -27,12 +27,14 @@ from dexsim_real.core.process import ignore_signals, leave_realtime, use_realtim
 from dexsim_real.core.timing import Pace, Timing, keep_phase
 from dexsim_real.run import consent
 from dexsim_real.run.guard import Guard
-from dexsim_real.run.hand_view import HandState
 from dexsim_real.run.object_sensors import ObjectSensors
 from dexsim_real.run.options import RunArguments
-from dexsim_real.run.status import Status, StatusView
+from dexsim_real.run.outcome import Outcome
+from dexsim_real.run.overview import overview
+from dexsim_real.run.status import StatusView
 from dexsim_real.sensors.hand import HandSensing
 from dexsim_real.wire.frames import Mode, empty_state
+from dexsim_real.wire.identity import check_identity
 from dexsim_real.wire.serial_hand import open_port
 
 _TARE_SAMPLES = 30
@@ -68,11 +70,13 @@ class Session:
         rate = keep_phase(arguments.rate, policy.control_rate)
         beat = self.guard.beat if self.guard else lambda more: None
         self.servo = Servo(self.port, self.sensing, self.safety, rate, beat)
-        self.view = StatusView(f"{policy.task} on {arguments.port}", self._status, arguments.quiet)
+        self.servo.masked = self._mask
+        self.view = StatusView(f"{policy.task} on {arguments.port}", lambda: overview(self), arguments.quiet)
         self.objects: ObjectSensors | None = None
         self.goals: TurnGoals | None = None
         self.compute, self.pace = Timing(), Pace(policy.control_rate)
         self.started = self.force = self.forces = 0.0
+        self.outcome = Outcome()
         self.tick: Tick | None = None
         self.end, self._closed = "not started", False
         if arguments.realtime and not realtime:
@@ -89,6 +93,8 @@ class Session:
         self._note(self.port.connect())
         for warning in getattr(self.port, "warnings", list)():
             self._note(f"warning: {warning}")
+        for note in check_identity(getattr(self.port, "identity", None), self.sensing.hand, self.sensing.calibration):
+            self._note(note)
         if self.arguments.tare:
             self._tare()
         self._write_meta()
@@ -161,6 +167,7 @@ class Session:
             "mean_finger_force": self.force / self.forces if self.forces else 0.0,
             "log": str(self.log.path),
             "log_dropped": self.log.dropped,
+            "missing": self.outcome.missing(self.log),
         }
         if self.goals:
             times = [t - self.started for t in self.goals.times]
@@ -175,17 +182,21 @@ class Session:
             reply = self.port.exchange(self.sensing.command(self.sensing.hand.joint_lower, Mode.PASSIVE))
             if reply is not None:
                 states.append(reply.state)
+            elif (refusal := getattr(self.port, "refusal", None)) and refusal.serious:
+                raise HandError(f"{self.arguments.port}: {refusal.text}")
         if len(states) < _TARE_SAMPLES:
             raise HandError(
                 f"{self.arguments.port}: only {len(states)} answers in 5 s, cannot tare the taxels; check the cable"
             )
-        self.sensing.set_tare(states)
+        for line in self.sensing.set_tare(states):
+            self._note(f"warning: {line}")
 
     def _await_pose(self) -> None:
         if self.servo.wait_fresh(1.0) is None:
             if self.safety.problem:
                 raise HandError(f"{self.arguments.port}: {self.safety.problem}; check `--hardware.joint-offset`")
-            raise HandError(f"{self.arguments.port}: the hand stopped answering; check the cable and the power")
+            why = self.safety.refused or "the hand stopped answering; check the cable and the power"
+            raise HandError(f"{self.arguments.port}: {why}")
 
     def _approach(self) -> None:
         """Move to the start posture, and hold it until the object is seen."""
@@ -224,6 +235,7 @@ class Session:
 
     def _loop(self) -> str:
         anchor, self.started = self.safety.anchor, time.monotonic()
+        self.outcome = Outcome(self.started)
         self.servo.forget()
         self.pace = Pace(self.controller.policy.control_rate)
         # A tick starts when a request has just been sent; rates from `keep_phase` keep it so.
@@ -232,7 +244,9 @@ class Session:
             self._check()
             now, sample = time.monotonic(), self.safety.sample
             assert sample is not None, "no state yet"
-            if now - sample.time <= self.safety.config.stale:
+            measured = now - sample.time <= self.safety.config.stale
+            self.outcome.add(now, measured, self.safety)
+            if measured:
                 if anchor != self.safety.anchor:
                     anchor = self.safety.anchor
                     self.controller.anchor(self.safety.commanded)
@@ -243,14 +257,15 @@ class Session:
         return "time is over"
 
     def _tick(self, now: float, sample: Any) -> None:
-        seen, age, when = self._objects().read(now)
+        objects = self._objects()
+        seen, when = objects.read(now)
         goal = self.goals.update(when, seen) if self.goals else IDENTITY
         if self.arguments.motors_off:
             self.controller.anchor(sample.measured.joint_position)
         tick = self.controller.tick(sample.measured, seen, goal, self.arguments.command)
-        hold_reason = "the object is out of sight" if age > self.safety.config.stale_object else ""
-        self.safety.set_target(tick.target, now, hold_reason)
+        self.safety.set_target(tick.target, now, objects.lost(now, self.safety.config.stale_object))
         self.tick = tick
+        self.outcome.act(tick.target)
         self.force += float(sample.measured.finger_force.sum())
         self.forces += 1
         readings = {field.name: getattr(tick.readings, field.name) for field in dataclasses.fields(tick.readings)}
@@ -270,6 +285,12 @@ class Session:
     def _tap(self, direction: str, data: bytes) -> None:
         kind = Kind.SENT if direction == "tx" else Kind.RECEIVED
         self.log.add(kind, (self.port.counts.sent, data))
+
+    def _mask(self, sequence: int, lines: list[str]) -> None:
+        """Taxels have got stuck: a replay needs to know from which exchange on."""
+        self.log.add(Kind.META, {"tare": self.sensing.tare, "from": sequence})
+        for line in lines:
+            self._note(f"warning: {line}")
 
     def _note(self, text: str) -> None:
         self.log.add(Kind.NOTE, text)
@@ -301,36 +322,4 @@ class Session:
                 "clock": time.time(),
                 "environment": cli.environment_report(),
             },
-        )
-
-    def _status(self) -> Status:
-        sample, counts, tick = self.safety.sample, self.port.counts, self.tick
-        if sample is None:
-            return Status({"hand": self.safety.problem or "no measurement"})
-        reaction, reason = self.safety.last
-        rows = {
-            "time": f"{time.monotonic() - self.started if self.started else 0:.1f} s",
-            "safety": f"{reaction.name.lower()} {reason}".strip(),
-            "age": f"{1e3 * (time.monotonic() - sample.time):.1f} ms {self.safety.problem}".strip(),
-            "policy": self._timing(self.pace.jitter, 1 / self.pace.period),
-            "exchanges": self._timing(self.servo.pace.jitter, 1 / self.servo.pace.period),
-            "round trip": f"p50 {1e3 * self.servo.round_trip.percentile(50):.2f} ms, "
-            f"p99 {1e3 * self.servo.round_trip.percentile(99):.2f} ms",
-            "link": f"{counts.answered} answered, {counts.corrupt} corrupt, {counts.silent} silent, "
-            f"{counts.late} late, {counts.reconnects} reconnects",
-            "command": f"{self.arguments.command:.2f}",
-        }
-        if self.goals:
-            rows["successes"] = str(self.goals.successes)
-        sent = reaction != Reaction.RELAX
-        target = self.safety.commanded if sent else tick.target if tick else None
-        return Status(rows, HandState(self.sensing.hand, sample.measured, target, sent))
-
-    @staticmethod
-    def _timing(timing: Timing, rate: float) -> str:
-        if not timing.count:
-            return f"{rate:.1f} Hz"
-        return (
-            f"{rate:.1f} Hz, late p50 {1e3 * timing.percentile(50):.2f} ms, "
-            f"p99 {1e3 * timing.percentile(99):.2f} ms, missed {timing.missed}"
         )

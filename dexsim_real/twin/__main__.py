@@ -5,6 +5,7 @@
 It prints the command that runs a policy on it, and ends after its trials or with Ctrl-C.
 """
 
+import dataclasses
 import importlib
 import queue
 import shlex
@@ -26,6 +27,7 @@ from dexsim_real.sensors.camera import CameraConfig
 from dexsim_real.twin.options import TwinArguments
 from dexsim_real.twin.plant.protocol import Plant
 from dexsim_real.twin.server import Twin
+from dexsim_real.twin.wire.firmware import FirmwareConfig
 
 
 def make_plant(arguments: TwinArguments, hand: Hand) -> Plant:
@@ -77,12 +79,13 @@ def check_policy(name: str, task: str, hand: Hand) -> None:
         )
 
 
-def write_calibration(path: Path, hand: Hand) -> Path:
+def write_calibration(path: Path, hand: Hand, board: FirmwareConfig) -> Path:
     """Write the calibration of an emulated hand with nominal motors, from which the motors of each trial deviate."""
     from dexsim.calibration.maps import save_calibration
     from dexsim_real.twin.virtual import ideal_calibration
 
-    save_calibration(path, ideal_calibration(hand))
+    side = board.handedness if board.serial_number else ""
+    save_calibration(path, dataclasses.replace(ideal_calibration(hand), serial=board.serial_number, handedness=side))
     return path
 
 
@@ -132,7 +135,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         twin = Twin(arguments, hand, make_plant(arguments, hand), Path(folder), lines.put)
         before = {number: signal.signal(number, lambda *_: twin.stop()) for number in (signal.SIGTERM, signal.SIGINT)}
         calibration = arguments.calibration or (
-            None if arguments.plant else write_calibration(Path(folder) / "calibration.toml", hand)
+            None if arguments.plant else write_calibration(Path(folder) / "calibration.toml", hand, arguments.firmware)
         )
         printer = threading.Thread(target=_print, args=(lines,), name="print", daemon=True)
         printer.start()

@@ -35,6 +35,7 @@ RATE = 83.0  # exchanges a second
 REQUEST, ROUND_TRIP = 0.001, 0.0096  # s until a request reaches the board; until its answer has arrived
 IMU_RATE, CAMERA_RATE = 100.0, 30.0  # Hz
 _TARE_SAMPLES = 30
+_LEVER = 2.0**-4  # m, of a fingertip about any joint; cancels out in the ideal calibration
 _SLACK = 5.0  # s after the time limit of a trial at which a run ends anyway
 
 
@@ -50,8 +51,8 @@ def ideal_calibration(hand: Hand) -> Calibration:
         return Side(both, both, both, zero, zero, zero, zero, zero + 1, zero + 1, zero, zero, 0 * one, one, one)
 
     return Calibration(
-        real=side(-STALL_CURRENT / hand.torque_limit),
-        sim=side(np.ones(hand.num_joints)),
+        real=side(-STALL_CURRENT / hand.torque_limit * _LEVER),
+        sim=side(np.full(hand.num_joints, _LEVER)),
         torque_scale=hand.torque_limit,
         force_per_count=np.full(hand.num_fingers, FirmwareConfig().force_per_count),
         hand=hand.name,

@@ -76,7 +76,11 @@ class Reply:
 
 
 class HandPort(Protocol):
-    """The interface of a hand. `exchange` is called from one thread only."""
+    """The interface of a hand. `exchange` is called from one thread only.
+
+    A port may also have `warnings()`, lines for the user; `identity`, a `dexsim_real.wire.identity.Identity` or None;
+    and `refusal`, a `dexsim_real.wire.refusals.Refusal` when the newest exchange was refused, else None.
+    """
 
     counts: LinkCounts
 

@@ -12,6 +12,7 @@ import numpy as np
 from dexsim_real.twin.wire.firmware import Firmware, FirmwareConfig
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Command, Frame, Mode
+from dexsim_real.wire.identity import Identity
 from dexsim_real.wire.link import LinkCounts, Reply
 
 EXCHANGE = 0.0096  # s
@@ -64,6 +65,8 @@ class BenchHand:
         self._load()
 
     # --- the port -------------------------------------------------------------------------------
+
+    identity = Identity("2R32BENCH", "right")
 
     def connect(self):
         return "bench: hand 0, firmware none"

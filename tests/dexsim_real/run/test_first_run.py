@@ -30,7 +30,7 @@ def state(hand):
     joint, tip = block["joint"], block["tip"]
     joint["position"] = np.linspace(-0.101, 1.9, 12)
     joint["current"] = -np.arange(1101, 1113)
-    joint["temperature"] = np.arange(101, 113)
+    joint["temperature"] = np.arange(101, 113) + 256 * 42  # the palm's in the high byte
     joint["palm_error"][3], joint["joint_error"][3], joint["tip_error"][11] = 0x0101, 0xFFFF, 0x8000
     tip["taxel"]["z"][:, :3] = np.arange(200, 205)[:, None]
     tip["temperature"] = np.arange(121, 126)
@@ -60,7 +60,7 @@ def test_the_view_shows_every_joint_and_finger_by_name_on_100_by_30(hand, state)
         assert errors == {3: ["0101", "ffff", "-"], 11: ["-", "-", "8000"]}.get(joint, ["-"] * 3)
     for finger, name in enumerate(FINGERS):
         assert re.search(rf"{name} +{60 + 0.3 * finger:.1f} +{121 + finger}$", shown, re.MULTILINE)
-    assert re.search(r"sum +303.0 *$", shown, re.MULTILINE)
+    assert re.search(r"sum +303.0 *$", shown, re.MULTILINE) and re.search(r"palm board +42$", shown, re.MULTILINE)
 
 
 def test_targets_that_are_not_sent_are_called_so(hand, state):
@@ -72,7 +72,7 @@ def test_targets_that_are_not_sent_are_called_so(hand, state):
 def test_without_a_terminal_the_same_is_one_line(state):
     words = hand_line(state)
     assert words["errors"] == "index_bend palm 0x0101, joint 0xffff; pinky_joint2 tip 0x8000"
-    assert words["heat"] == "pinky_joint2 112, tip of the pinky 125 degC"
+    assert words["heat"] == "pinky_joint2 112, tip of the pinky 125, palm 42 degC"
     assert words["force"].startswith("thumb 60.0, index 60.3") and words["force"].endswith("sum 303.0 N")
 
 
