@@ -128,6 +128,7 @@ def runner_words(twin: TwinProcess, options: argparse.Namespace, log: Path, seco
         "--safety.stale-object",  # Between two trials the object is out of sight, which would end the run.
         "60",
         "--uncalibrated",
+        "--yes",
         "--quiet",
         "--link.settle",
         "0.1",

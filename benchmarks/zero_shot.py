@@ -3,6 +3,7 @@
     python benchmarks/zero_shot.py --task rotate --trials 10
     python benchmarks/zero_shot.py --task grasp --trials 50 --parameters inside --set gear_play=0
     python benchmarks/zero_shot.py --task grasp --trials 50 --seed 0 1 2 3 --processes 2
+    python benchmarks/zero_shot.py --task grasp --trials 25 --limit speed=20 --limit margin=0
 
 In virtual time (`dexsim_real.twin.virtual`): frames, emulated palm board, and the bridge's sensing, safety and
 controller run in one process, as fast as they compute. The metrics use the true state, not the measurements of the
@@ -50,6 +51,7 @@ def load(name: str, idle: bool) -> tuple[Any, Any, Any]:
 
 def run_trial(options: dict[str, Any], seed: int, number: int) -> dict[str, Any]:
     """The referee's report of one trial."""
+    from dexsim_real.control.safety import SafetyConfig
     from dexsim_real.twin.plant.emulated_hand import EmulatedHand
     from dexsim_real.twin.plant.shapes import SHAPES
     from dexsim_real.twin.virtual import RunOptions, VirtualRun
@@ -69,7 +71,9 @@ def run_trial(options: dict[str, Any], seed: int, number: int) -> dict[str, Any]
         shape=shape,
     )
     began = time.perf_counter()
-    report = VirtualRun(plant, controller, calibration, RunOptions(command=command, safety=options["safety"])).run()
+    limits = SafetyConfig(**options["limit"])
+    run = VirtualRun(plant, controller, calibration, RunOptions(command, safety=options["safety"], limits=limits))
+    report = run.run()
     return report | {"wall": round(time.perf_counter() - began, 2)}
 
 
@@ -256,6 +260,13 @@ def arguments() -> argparse.Namespace:
         help="fix a parameter (dexsim_real/twin/plant/parameters.py): a number, or outside, inside, nominal",
     )
     parser.add_argument(
+        "--limit",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="another value for a safety limit of the bridge (dexsim_real/control/safety.py)",
+    )
+    parser.add_argument(
         "--no-safety", dest="safety", action="store_false", help="run without the bridge's safety limits"
     )
     parser.add_argument(
@@ -279,6 +290,7 @@ def main() -> None:
             name: value if value in ("outside", "inside", "nominal") else float(value)
             for name, value in (pair.split("=") for pair in given.set)
         },
+        "limit": {name: float(value) for name, value in (pair.split("=") for pair in given.limit)},
     }
     reports = run_all(options, given.trials, given.processes, show=True)
     still = run_all(options | {"idle": True}, given.trials, given.processes, show=False) if given.baseline else []

@@ -50,16 +50,18 @@ class Reaction(enum.IntEnum):
 class SafetyConfig:
     """Limits of the hand. Ages count from the time of the measurement or joint target."""
 
-    margin: float = setting(0.0, unit="rad", low=0.0, high=0.5)
-    """Distance of commands from the joints' end stops."""
+    margin: float = setting(0.03, unit="rad", low=0.0, high=0.5)
+    """Distance of commands from the joints' end stops; motors that come on nearer to one begin there. What it cuts
+    off a target does not count as a clip."""
     beyond: float = setting(0.1, unit="rad", low=0.0, high=1.0)
     """Distance beyond a joint's limits at which a measured angle counts as wrong."""
-    speed: float = setting(20.0, unit="rad/s", low=0.01, high=200.0)
-    """Largest rate of change of a command. A policy that changes targets by 0.2 rad needs 0.2 rad within a cycle."""
+    speed: float = setting(7.0, unit="rad/s", low=0.01, high=200.0)
+    """Largest rate of change of a command, below the no-load speed of the slower joints (8.6 rad/s). A policy that
+    changes targets by 0.2 rad every 0.03 s needs 6.7 rad/s."""
     reach: float = setting(0.6, unit="rad", low=0.01, high=4.0)
     """Distance of a command from the measured angle beyond which it does not move farther away."""
-    joint_speed: float = setting(20.0, unit="rad/s", low=0.1, high=1000.0)
-    """Measured joint speed above which the hand holds."""
+    joint_speed: float = setting(10.0, unit="rad/s", low=0.1, high=1000.0)
+    """Measured joint speed above which the hand holds; above `speed`, since a joint catches up with its command."""
     current: float = setting(1.8, unit="A", low=0.01, high=20.0)
     """Current of a joint above which the motors go off; the XHand reports 1.5 A when stalled at its usual limit."""
     current_seconds: float = setting(1.0, unit="s", low=0.0, high=60.0)
@@ -75,8 +77,8 @@ class SafetyConfig:
     """Time for which the hand holds while it reports an error or motors that are off, before they go off for good."""
     ignored_errors: tuple[int, int, int] = setting((0, 0, 0), unit="1", low=0, high=65535)
     """Error bits of palm, joint and tip board that are harmless on this hand, as sums of bits."""
-    finger_force: float = setting(25.0, unit="N", low=0.1, high=1000.0)
-    """Force of a fingertip (sum of its taxels) above which the hand holds."""
+    finger_force: float = setting(15.0, unit="N", low=0.1, high=1000.0)
+    """Force of a fingertip (sum of its taxels) above which the hand holds; the XHand is specified for 15 N."""
     total_force: float = setting(70.0, unit="N", low=0.1, high=1000.0)
     """Force of all fingertips above which the hand holds; it is rated for 80 N."""
     stale: float = setting(0.05, unit="s", low=0.001, high=10.0)
@@ -132,6 +134,7 @@ class Safety:
 
     def __init__(self, hand: Hand, config: SafetyConfig, note: Callable[[str], None] = lambda text: None):
         self.config, self._note = config, note
+        self._stops = hand.joint_lower.astype(np.float32), hand.joint_upper.astype(np.float32)
         self._lower = hand.joint_lower.astype(np.float32) + config.margin
         self._upper = hand.joint_upper.astype(np.float32) - config.margin
         self.sample: HandSample | None = None  # the newest plausible one
@@ -262,7 +265,9 @@ class Safety:
 
     def _start(self, now: float, sample: HandSample) -> None:
         """Turn the motors on at the measured pose."""
-        self._commanded = self._confirmed = self._inside(sample.measured.joint_position)
+        # Between the end stops, not within the margin: enabling must not move the hand.
+        pose = np.clip(sample.measured.joint_position, self._stops[0], self._stops[1])
+        self._commanded = self._confirmed = pose.astype(np.float32)
         self._time = now
         self._restart(now)
 
@@ -287,7 +292,7 @@ class Safety:
             return self._finish(now, Reaction.RELAX, reason, self._rest())
         self._holding = True
         if reason == _FORCE:  # Staying there would keep the force.
-            position = self._toward(now, sample.measured.joint_position, config.slow_speed)
+            position = self._toward(now, self._inside(sample.measured.joint_position), config.slow_speed)
         else:
             position = self._toward(now, self.commanded if self._confirmed is None else self._confirmed, config.speed)
         return self._finish(now, Reaction.HOLD, reason, position)
@@ -301,17 +306,19 @@ class Safety:
             np.maximum(measured + config.reach, self.commanded),
         )
         position = self._toward(
-            now, np.clip(target, *near), config.slow_speed + grown * (config.speed - config.slow_speed)
+            now, self._inside(np.clip(target, *near)), config.slow_speed + grown * (config.speed - config.slow_speed)
         )
-        if not np.any(np.abs(position - target) > 1e-5):
+        # Policies rest joints at their stops: the margin alone is no event.
+        clipped = np.abs(position - self._inside(target)), np.abs(target - np.clip(target, *self._stops))
+        if np.maximum(*clipped).max() <= 1e-5:
             return self._finish(now, Reaction.NONE, "", position)
         ramping = " (ramp)" if grown < 1 else ""
         return self._finish(now, Reaction.CLIP, f"target beyond a limit{ramping}", position)
 
     def _toward(self, now: float, goal: np.ndarray, speed: float) -> np.ndarray:
-        """The next command on the way to a goal [J] rad: the last limits, after every other rule."""
+        """The next command on the way to a goal [J] rad between the end stops: the last limit, after every rule."""
         step = np.float32(speed * min(max(now - self._time, 0.0), _GAP))
-        return np.clip(self._inside(goal), self.commanded - step, self.commanded + step)
+        return np.clip(goal, self.commanded - step, self.commanded + step).astype(np.float32)
 
     def _inside(self, position: np.ndarray) -> np.ndarray:
         return np.clip(position, self._lower, self._upper).astype(np.float32)

@@ -25,13 +25,21 @@ class Servo:
       sensing: conversion to SI units.
       safety: decides the commands.
       rate: exchanges per second.
+      beat: called before every exchange as a sign of life, with the time s by which the next call may be late.
 
     `masked` is called with the number of the exchange from which on taxels are masked, and with lines that name them.
     """
 
-    def __init__(self, port: HandPort, sensing: HandSensing, safety: Safety, rate: float):
+    def __init__(
+        self,
+        port: HandPort,
+        sensing: HandSensing,
+        safety: Safety,
+        rate: float,
+        beat: Callable[[float], None] = lambda more: None,
+    ):
         self.port, self.sensing, self.safety = port, sensing, safety
-        self.pace = Pace(rate)
+        self.pace, self._beat = Pace(rate), beat
         self.round_trip = Timing()
         self.waited = 0  # deadlines missed because of late answers
         self.error: BaseException | None = None
@@ -99,6 +107,7 @@ class Servo:
 
     def _cycle(self) -> float:
         """One exchange; returns its duration in s."""
+        self._beat(0.0)
         if self._engage:
             self.safety.engage()
             self._engage = False
@@ -134,6 +143,7 @@ class Servo:
         """Turn the motors off, and close the port."""
         off = self.sensing.command(self.sensing.hand.joint_lower, Mode.PASSIVE)
         self._rested = True
+        self._beat(patience(self.driven))
         try:
             if turn_off(self.port, off, patience(self.driven)):
                 self.driven = False

@@ -2,8 +2,9 @@
 
     python -m dexsim_real.run grasp --port /dev/serial/by-id/usb-FTDI_... --command 0.6
 
-The policy is a file or the name of a shipped policy. Everything is compiled before the port is opened. The motors come
-on at the measured pose, and go off at the end of the program, even after a failure.
+The policy is a file or the name of a shipped policy. Everything is compiled before the port is opened. The program
+asks before the motors come on (`--yes` does not). They come on at the measured pose, and go off at the end of the
+program, even after a failure.
 """
 
 import sys
@@ -13,6 +14,7 @@ from dexsim.core import cli
 from dexsim_real.control.controller import prepare_jax
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.process import stopping
+from dexsim_real.run import consent
 from dexsim_real.run.options import RunArguments
 from dexsim_real.run.session import Session
 from dexsim_real.run.status import summary_table
@@ -26,6 +28,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         prog="python -m dexsim_real.run",
         description="Run a policy on the hand.",
     )
+    if not (arguments.yes or arguments.motors_off):
+        consent.check_terminal()
     prepare_jax()
     cli.enable_caches()
     session = Session(arguments)

@@ -25,10 +25,12 @@ from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogWriter
 from dexsim_real.core.process import ignore_signals, leave_realtime, use_realtime
 from dexsim_real.core.timing import Pace, Timing, keep_phase
+from dexsim_real.run import consent
 from dexsim_real.run.guard import Guard
 from dexsim_real.run.object_sensors import ObjectSensors
 from dexsim_real.run.options import RunArguments
 from dexsim_real.run.outcome import Outcome
+from dexsim_real.run.overview import overview
 from dexsim_real.run.status import StatusView
 from dexsim_real.sensors.hand import HandSensing
 from dexsim_real.wire.frames import Mode, empty_state
@@ -49,8 +51,7 @@ class Session:
 
     def __init__(self, arguments: RunArguments):
         self.arguments = arguments
-        serial = not arguments.port.startswith("sdk:") and "://" not in arguments.port
-        wanted = arguments.guard and serial and not arguments.motors_off
+        wanted = arguments.guard and not arguments.motors_off
         self.guard = Guard(arguments.port, arguments.link) if wanted else None
         policy, hand = load_policy(arguments.policy), load_hand()
         self.controller = Controller(policy, hand)
@@ -67,9 +68,10 @@ class Session:
         self.log = LogWriter(path)
         self.port = open_port(arguments.port, arguments.link, self._tap)
         rate = keep_phase(arguments.rate, policy.control_rate)
-        self.servo = Servo(self.port, self.sensing, self.safety, rate)
+        beat = self.guard.beat if self.guard else lambda more: None
+        self.servo = Servo(self.port, self.sensing, self.safety, rate, beat)
         self.servo.masked = self._mask
-        self.view = StatusView(f"{policy.task} on {arguments.port}", self._status, arguments.quiet)
+        self.view = StatusView(f"{policy.task} on {arguments.port}", lambda: overview(self), arguments.quiet)
         self.objects: ObjectSensors | None = None
         self.goals: TurnGoals | None = None
         self.compute, self.pace = Timing(), Pace(policy.control_rate)
@@ -97,22 +99,22 @@ class Session:
             self._tare()
         self._write_meta()
         self.servo.start()
-        if self.servo.wait_fresh(1.0) is None:
-            if self.safety.problem:
-                raise HandError(f"{self.arguments.port}: {self.safety.problem}; check `--hardware.joint-offset`")
-            why = self.safety.refused or "the hand stopped answering; check the cable and the power"
-            raise HandError(f"{self.arguments.port}: {why}")
+        self._await_pose()
         self.objects = ObjectSensors(self.arguments, self.controller)
         spec = self.controller.spec
         if self.arguments.imu and spec.turn:
             self.goals = TurnGoals(spec.turn, np.asarray(spec.reference))
 
     def run(self) -> None:
-        """Turn the motors on, approach the start posture, and run the policy until time or `Safety` ends it.
+        """Ask, turn the motors on, approach the start posture, and run the policy until time or `Safety` ends it.
 
         Raises:
-          HandError: `Safety` or a failure ended the run.
+          HandError: the answer was not yes, or `Safety` or a failure ended the run.
         """
+        if not (self.arguments.yes or self.arguments.motors_off):
+            self.view.show()
+            consent.ask()
+            self._await_pose()  # The hand may have been moved or lost meanwhile.
         sys.setswitchinterval(2e-4)
         gc.collect()
         gc.freeze()
@@ -188,6 +190,13 @@ class Session:
             )
         for line in self.sensing.set_tare(states):
             self._note(f"warning: {line}")
+
+    def _await_pose(self) -> None:
+        if self.servo.wait_fresh(1.0) is None:
+            if self.safety.problem:
+                raise HandError(f"{self.arguments.port}: {self.safety.problem}; check `--hardware.joint-offset`")
+            why = self.safety.refused or "the hand stopped answering; check the cable and the power"
+            raise HandError(f"{self.arguments.port}: {why}")
 
     def _approach(self) -> None:
         """Move to the start posture, and hold it until the object is seen."""
@@ -313,35 +322,4 @@ class Session:
                 "clock": time.time(),
                 "environment": cli.environment_report(),
             },
-        )
-
-    def _status(self) -> dict[str, str]:
-        sample, counts = self.safety.sample, self.port.counts
-        if sample is None:
-            return {"hand": "no measurement"}
-        force, heat = sample.measured.finger_force, sample.measured.temperature
-        reaction, reason = self.safety.last
-        rows = {
-            "time": f"{time.monotonic() - self.started if self.started else 0:.1f} s",
-            "safety": f"{reaction.name.lower()} {reason}".strip(),
-            "age": f"{1e3 * (time.monotonic() - sample.time):.1f} ms",
-            "policy": self._timing(self.pace.jitter, 1 / self.pace.period),
-            "exchanges": self._timing(self.servo.pace.jitter, 1 / self.servo.pace.period),
-            "round trip": f"p50 {1e3 * self.servo.round_trip.percentile(50):.2f} ms, "
-            f"p99 {1e3 * self.servo.round_trip.percentile(99):.2f} ms",
-            "link": f"{counts.answered} answered, {counts.corrupt} corrupt, {counts.silent} silent, "
-            f"{counts.late} late, {counts.reconnects} reconnects",
-            "force": f"{' '.join(f'{f:.1f}' for f in force)} N, sum {force.sum():.1f} N",
-            "command": f"{self.arguments.command:.2f}",
-            "heat": f"joints {heat[:12].max():.0f}, tips {heat[12:17].max():.0f}, palm {heat[17]:.0f} degC",
-        }
-        if self.goals:
-            rows["successes"] = str(self.goals.successes)
-        return rows
-
-    @staticmethod
-    def _timing(timing: Timing, rate: float) -> str:
-        return (
-            f"{rate:.1f} Hz, late p50 {1e3 * timing.percentile(50):.2f} ms, "
-            f"p99 {1e3 * timing.percentile(99):.2f} ms, missed {timing.missed}"
         )

@@ -100,6 +100,7 @@ def runner_command(twin: Twin, calibration: Path | None) -> list[str]:
         "--port",
         str(twin.line.terminal.name),
         *(["--calibration", str(calibration)] if calibration else ["--uncalibrated"]),
+        "--yes",
     ]
     if arguments.command is not None:
         words += ["--command", f"{arguments.command:g}"]

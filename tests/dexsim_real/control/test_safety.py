@@ -39,7 +39,7 @@ class Bench:
 
     def __init__(self, hand, **options):
         self.notes = []
-        self.safety = Safety(hand, SafetyConfig(**{"speed": 8.0, **options}), self.notes.append)
+        self.safety = Safety(hand, SafetyConfig(**{"speed": 8.0, "margin": 0.0, **options}), self.notes.append)
         self.now, self.position = 10.0, MIDDLE
 
     def cycle(self, wish=None, fresh=True, follow=True, **measurement):
