@@ -44,14 +44,16 @@ def gripped(objects):
     """An environment that feels by surface points, and batches of its states [WORLDS] while hands close."""
     config = GraspConfig(objects=objects, pool_size=16, skin=SKIN, touch_method="surface_points")
     env = dexsim.make("grasp", config, backend="jax", num_envs=WORLDS)
-    # Pools hold one shape after the other: two of each.
-    rows = jnp.arange(WORLDS) * 2
-    state = jax.jit(jax.vmap(env.reset_to))(jax.random.split(jax.random.key(0), WORLDS), rows)
-    step, states = jax.jit(jax.vmap(env.step)), []
-    for _ in range(20):
-        state = step(state, 0.6 * jnp.ones((WORLDS, 12)))
-        states.append(state)
-    return env, states[8:]
+    reset, step, states = jax.jit(jax.vmap(env.reset_to)), jax.jit(jax.vmap(env.step)), []
+    # Pools hold one shape after the other: two of each at a time. One batch's means scatter by a half of themselves.
+    for batch in range(4):
+        rows = jnp.arange(WORLDS) * 2 + batch % 2
+        state = reset(jax.random.split(jax.random.key(batch // 2), WORLDS), rows)
+        for tick in range(20):
+            state = step(state, 0.6 * jnp.ones((WORLDS, 12)))
+            if tick >= 8:
+                states.append(state)
+    return env, states
 
 
 def closed_forms(env, state):
