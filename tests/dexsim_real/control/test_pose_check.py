@@ -87,3 +87,11 @@ def test_where_commands_were_before_explains_nothing(hand, check, way):
         assert check.judge(k * CYCLE, pose(angle), pose(angle)) == ""
     for k in range(41, 200):
         assert check.judge(k * CYCLE, pose(START + way * 0.5), pose())
+
+
+@pytest.mark.parametrize("way", [UP, DOWN])
+def test_all_commands_since_the_last_reading_count(hand, check, way):
+    """The joint may have followed the one before the newest."""
+    check.follow(pose(START + way * 0.5))
+    check.follow(pose())
+    assert check.judge(0.1, pose(START + way * 0.5), pose()) == ""
