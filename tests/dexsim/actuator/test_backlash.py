@@ -244,3 +244,14 @@ def test_beside_an_engine_it_is_the_same_gear(stop, inertia):
         for end in (74, 149, 224, 298):
             np.testing.assert_allclose(error[:, end], 0.0, atol=2e-3)
         assert np.abs(coarse[0] - coarse[1]).max() < gap / 2 + 0.04
+
+
+@pytest.mark.parametrize("way", [1.0, -1.0])
+def test_teeth_push_and_never_pull(way):
+    """A rotor that leaves a tooth fast: its damping alone would hold the link back."""
+    play = GearPlay(gap=0.02, rotor_inertia=1e-4, tooth_stiffness=500.0, tooth_damping=10.0)
+    for slip, pushes in ((-10.0, False), (0.0, True)):
+        rotor = Rotor(jnp.float32(0.1 * way), jnp.float32(slip * way))
+        zero = jnp.float32(0.0)
+        torque = float(tooth_torque(play, rotor, zero, zero, zero, inertia=1e-4, timestep=1e-4))
+        assert torque * way > 0 if pushes else torque == 0

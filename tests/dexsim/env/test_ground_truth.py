@@ -9,6 +9,7 @@ from episodes import ground_truth
 from simple_physics import SimplePhysics
 
 import dexsim
+from dexsim.env.motors import stay_finite
 from dexsim.objects.config import ObjectConfig
 from dexsim.observation import ObservationConfig, Readings
 from dexsim.physics.seam import PhysicsState
@@ -89,3 +90,16 @@ def test_velocity_and_spin_are_the_objects_change_in_the_palm_frame(env, seen, s
     np.testing.assert_allclose(field(env, "critic", "object_spin", critic), spin, atol=1e-4)
     orientation = turned(place[3:])[:, :2].T.ravel()
     np.testing.assert_allclose(field(env, "critic", "object_orientation", critic), orientation, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("speed", "sound"), [(999.0, True), (1001.0, False), (-999.0, True), (-1001.0, False), (np.nan, False)]
+)
+def test_a_world_too_fast_in_either_direction_stays_as_it_was(speed, sound):
+    before, after = (PhysicsState(jnp.full(19, x), jnp.zeros(18), jnp.zeros(18)) for x in (1.0, 2.0))
+    after = PhysicsState(after.qpos, after.qvel.at[7].set(speed), after.warmstart)
+    valid = jnp.ones((), bool)
+    physics, _, force, finite = stay_finite(valid, (before, None), (after, None), jnp.ones((5, 3)))
+    assert bool(finite) == sound
+    np.testing.assert_array_equal(physics.qpos, 2.0 if sound else 1.0)
+    np.testing.assert_array_equal(force, 1.0 if sound else 0.0)

@@ -11,6 +11,7 @@ from tiny_env import SMALL, TinyEnv
 from dexsim_ppo.learner import ppo
 from dexsim_ppo.learner.curriculum import Curriculum, next_scale
 from dexsim_ppo.learner.loss import Samples
+from dexsim_ppo.learner.networks import apply_mlp, init_params
 from dexsim_ppo.learner.ppo import Learner, make_train
 from dexsim_ppo.learner.rollout import Decision, Rollout, bound_rewards
 from dexsim_ppo.learner.running_stats import RunningStats
@@ -148,3 +149,16 @@ def test_far_rewards_are_bounded_in_units_of_scaled_returns(scale):
 def test_the_curriculum_widens_at_its_upper_mark_and_narrows_below_its_lower(success, change):
     rules = Curriculum(on=True, widen_above=0.875, narrow_below=0.75, step=0.1)
     assert float(next_scale(jnp.float32(0.5), jnp.float32(success), rules)) == pytest.approx(0.5 + change)
+
+
+def test_a_new_actor_is_nearly_pure_noise_and_a_new_critic_is_not_flat():
+    sizes = {"actor_sizes": (20, 64, 32, 4), "critic_sizes": (20, 64, 32, 1)}
+    params = init_params(jax.random.key(0), initial_std=0.7, **sizes)
+    x = jax.random.normal(jax.random.key(1), (200, 20))
+    mean, value = (np.asarray(apply_mlp(layers, x)) for layers in (params.actor, params.critic))
+    assert np.abs(mean).max() < 0.1 and value.std() > 0.3
+    np.testing.assert_allclose(np.exp(params.log_std), 0.7, rtol=1e-6)
+    first, second, last = (np.asarray(layer.kernel, float) for layer in params.actor)
+    np.testing.assert_allclose(first @ first.T, 2 * np.eye(20), atol=1e-4)
+    np.testing.assert_allclose(second.T @ second, 2 * np.eye(32), atol=1e-4)
+    np.testing.assert_allclose(last.T @ last, 1e-4 * np.eye(4), atol=1e-8)

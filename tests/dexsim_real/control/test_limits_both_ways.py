@@ -103,3 +103,20 @@ def test_wrong_readings_far_apart_do_not_add_up(hand):
         bench.position = MIDDLE
         assert all(d.mode == Mode.POSITION for d in bench.run(2.0, wish=MIDDLE))
     assert bench.safety.counts["implausible: measurement"] == 15 and not bench.safety.latched
+
+
+def test_a_target_of_before_the_motors_came_on_moves_nothing(hand):
+    bench = Bench(hand)
+    bench.run(0.1, wish=MIDDLE + np.float32(0.1) * FREE)
+    bench.safety.set_target(MIDDLE + np.float32(0.1) * FREE, bench.now)
+    bench.safety.engage()
+    for decision in bench.run(0.05):
+        assert decision.mode == Mode.POSITION
+        np.testing.assert_array_equal(decision.position, MIDDLE)
+
+
+def test_the_first_reason_for_motors_off_is_the_one_that_is_told(hand):
+    bench = ready(hand)
+    bench.safety.relax("the cable")
+    bench.safety.relax("a later one")
+    assert bench.cycle(wish=MIDDLE).reason == bench.safety.latched == "the cable"

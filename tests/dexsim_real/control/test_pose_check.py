@@ -76,3 +76,22 @@ def test_a_reading_outside_the_limits_ends_the_agreement(hand, angle):
         check.judge(k * CYCLE, pose(), None)
     assert "outside its limits" in check.judge(2 * CYCLE, pose(angle), None)
     assert [bool(check.judge(k * CYCLE, pose(), None)) for k in range(3, 6)] == [True, True, False]
+
+
+@pytest.mark.parametrize("way", [UP, DOWN])
+def test_where_commands_were_before_explains_nothing(hand, check, way):
+    """A joint that went there and back does not go there again by itself."""
+    path = START + way * 0.6 * np.concatenate([np.linspace(0, 1, 20), np.linspace(1, 0, 20)])
+    for k, angle in enumerate(path, start=1):
+        check.follow(pose(angle))
+        assert check.judge(k * CYCLE, pose(angle), pose(angle)) == ""
+    for k in range(41, 200):
+        assert check.judge(k * CYCLE, pose(START + way * 0.5), pose())
+
+
+@pytest.mark.parametrize("way", [UP, DOWN])
+def test_all_commands_since_the_last_reading_count(hand, check, way):
+    """The joint may have followed the one before the newest."""
+    check.follow(pose(START + way * 0.5))
+    check.follow(pose())
+    assert check.judge(0.1, pose(START + way * 0.5), pose()) == ""
