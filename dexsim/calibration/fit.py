@@ -142,7 +142,9 @@ def _allow_for_scatter(hand: Hand, real: Side, sim: Side) -> Side:
 
 def _row(lines: JointLines) -> dict[str, np.ndarray]:
     """The fields of `Side` for one joint; a missing line is the other one with 0 samples, off by the gear's losses."""
-    stand_in = (lines.loading or lines.unloading).widened(_LOSSES)
+    only = lines.loading or lines.unloading
+    assert only is not None, "`fit_joint` refuses a recording without a line"
+    stand_in = only.widened(_LOSSES)
     both = [lines.loading or stand_in, lines.unloading or stand_in]
     measured = np.array([lines.loading is not None, lines.unloading is not None])
     row = {

@@ -162,8 +162,8 @@ def _half_widths(design: np.ndarray, residual: np.ndarray, weight: np.ndarray, s
     variance = np.maximum(random, _periodic(design, weight * residual, inverse))
     # Autocorrelated samples count for fewer, also in how well the variance itself is known.
     rho = float(np.max(_autocorrelation(score), initial=0.0))
-    freedom = max(len(residual) * (1 - rho) / (1 + rho) - 2, 3.0)
-    return stdtrit(freedom, 0.975) * np.sqrt(np.maximum(variance, 0.0))
+    worth = max(len(residual) * (1 - rho) / (1 + rho) - 2, 3.0)
+    return stdtrit(worth, 0.975) * np.sqrt(np.maximum(variance, 0.0))
 
 
 def _between_groups(design: np.ndarray, y: np.ndarray, guess: np.ndarray, group: np.ndarray) -> np.ndarray:

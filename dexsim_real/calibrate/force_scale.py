@@ -54,7 +54,7 @@ def force_scale(session: PressSession, hand: Hand, pressed: list[Recording]) -> 
             [np.array(recording.position)[recording.samples(level)].mean(0) for level in levels],
         )
         gauge = np.array([recording.gauge[level] for level in levels])
-        gauge = gauge / _upright(hand, recording.finger, counts, np.array(posture))
+        gauge = gauge / upright(hand, recording.finger, counts, np.array(posture))
         run = np.array([shown[recording.samples(level)].mean() for level in levels])
         whole, found = (_against(gauge, part, recording.name) for part in (counts.sum(-1), run))
         newtons[recording.name] = 1.0 / whole.gain.value, -whole.offset.value / whole.gain.value
@@ -83,7 +83,7 @@ def force_scale(session: PressSession, hand: Hand, pressed: list[Recording]) -> 
     return ForceScale(per_count, newtons, error, fits, tuple(notes))
 
 
-def _upright(hand: Hand, finger: int, counts: np.ndarray, position: np.ndarray) -> np.ndarray:
+def upright(hand: Hand, finger: int, counts: np.ndarray, position: np.ndarray) -> np.ndarray:
     """Share [K] of each force [K, N] that the gauge shows: it stands still while the fingertip turns.
 
     It faces the fingertip at the smallest of the forces, at joint angles [K, J].

@@ -39,12 +39,13 @@ _STILL = 0.25  # share of the usual speed below which a joint is at rest
 _NOISE = 4.0  # standard deviations of the speed noise below which a joint is at rest
 _TOP, _TOP_BLOCKS = 0.97, 4  # a current in this share of its maximum for this many blocks is at the motor's limit
 _SHEAR = 0.1  # share of the force above which shear is noted
+_TRUST = 0.3  # share of the torque above which shear, which the fit ignores, makes a press useless for a joint
 
 
 METHOD = (
     f"the intervals contain the method's own error: {1e3 * _LEVER:g} mm of lever arm and {100 * _HEAT:g} % for warm "
     "motors; on emulated hands of known truth the torque constants came out about 2 % low, since presses warm "
-    "the motors and the taxels put the contact too near the joint"
+    "the motors and the taxels put the contact too near the joint (thumb_bend 6 %)"
 )
 """Note of every calibration."""
 
@@ -100,11 +101,15 @@ def fit(session: PressSession, hand: Hand, created: str | None = None) -> Fit:
         torque = taxel_torque(hand, blocks.position, recording.finger, blocks.counts * gain)
         high = force > 0.5 * force.max()
         lever = torque[high].sum(0) / force[high].sum()
+        slip = _shear_share(blocks) * _shear_lever(hand, blocks.position[high].mean(0), recording.finger, blocks.counts)
         # The force that the gauge adds to the taxels' sum acts at the same place.
         torque += offset * lever
         for joint in recording.joints:
             label = hand.joint_names[joint]
             if abs(lever[joint]) < max(MIN_LEVER, reach.get(label, 0.0)):
+                continue
+            if slip[joint] > _TRUST * abs(lever[joint]):
+                notes.append(f"{label}: loaded by shear while the {recording.name} was pressed; press with the side")
                 continue
             way = _direction(blocks.speed[:, joint], recording, joint) * int(np.sign(lever[joint]))
             way[_at_limit(blocks.current[:, joint], blocks.run)] = 0
@@ -116,7 +121,8 @@ def fit(session: PressSession, hand: Hand, created: str | None = None) -> Fit:
                 continue
             reach[label], source[label] = abs(lever[joint]), recording.name
             # A force read too large makes the gain of the current too small, and leaves the lever arm.
-            known = float(np.hypot(scale.error[recording.name], _HEAT)), _LEVER / abs(float(lever[joint]))
+            arm = float(np.hypot(_LEVER, slip[joint]) / abs(lever[joint]))
+            known = float(np.hypot(scale.error[recording.name], _HEAT)), arm
             real[label], sim[label] = (
                 JointPress(force, value[:, joint], way, blocks.press, error)
                 for value, error in zip((blocks.current, torque), known, strict=True)
@@ -134,7 +140,9 @@ def fit(session: PressSession, hand: Hand, created: str | None = None) -> Fit:
             created=created,
         )
     except CalibrationError as error:
-        raise CalibrationError("; ".join([str(error), *(note for note in notes if "hardly moved" in note)])) from None
+        raise CalibrationError(
+            "; ".join([str(error), *(note for note in notes if "hardly moved" in note or "by shear" in note)])
+        ) from None
     notes += _zero_note(session, hand)
     # With a gauge the absolute scale is known.
     kept = tuple(note for note in result.notes if not (scale.sensors and note.startswith("only the ratio")))
@@ -205,6 +213,23 @@ def _torque(hand: Hand, finger: jax.Array, at: jax.Array, force: jax.Array) -> j
     return jax.grad(lambda q: force @ taxel_positions(hand, forward_kinematics(hand, q))[finger] @ normal)(at)
 
 
+def _shear_share(blocks: Blocks) -> float:
+    """Shear over normal force by the taxels, at high force."""
+    sums = blocks.counts.sum(-1)
+    high = sums > 0.5 * sums.max()
+    return float(np.median(np.linalg.norm(blocks.shear[high], axis=-1) / sums[high]))
+
+
+def _shear_lever(hand: Hand, position: np.ndarray, finger: int, counts: np.ndarray) -> np.ndarray:
+    """Largest lever arms [J] m of a force along the skin at the centre of the counts [B, N], at joint angles [J]."""
+    weight = jnp.asarray(counts.sum(0) / counts.sum(), jnp.float32)
+    at = jnp.asarray(position, jnp.float32)
+    normal = weight @ taxel_normals(hand, forward_kinematics(hand, at))[finger]
+    way = jax.jacfwd(lambda q: weight @ taxel_positions(hand, forward_kinematics(hand, q))[finger])(at)
+    along = (normal / jnp.linalg.norm(normal)) @ way
+    return np.sqrt(np.maximum(np.sum(np.square(way), 0) - np.square(along), 0.0))
+
+
 def _direction(speed: np.ndarray, recording: Recording, joint: int) -> np.ndarray:
     """Direction [B] of motion of a joint: 1, -1, or 0 at rest."""
     position = np.array(recording.position)[:, joint]
@@ -244,9 +269,7 @@ def _press_notes(
             f"{finger}: dead: {taxel_names(hand, dead)} read nothing while their neighbours were pressed; the fit "
             "uses the mean of the neighbours, a run reads zero"
         )
-    sums = blocks.counts.sum(-1)
-    high = sums > 0.5 * sums.max()
-    share = float(np.median(np.linalg.norm(blocks.shear[high], axis=-1) / sums[high]))
+    share = _shear_share(blocks)
     if share > _SHEAR:
         notes.append(
             f"{recording.name}: shear of {100 * share:.0f} % of the force by the taxels' x and y, which the fit "

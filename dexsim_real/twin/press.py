@@ -210,6 +210,7 @@ class VirtualPort:
         self.sleep(_REQUEST)
         request = Frame(frames.HOST, frames.palm_address(0), Command.EXCHANGE, command.tobytes())
         answer = self.firmware.answer(request, self.time)
+        assert answer is not None, "the request is addressed to this hand"
         self.sleep(_EXCHANGE - _REQUEST)
         self.sequence += 1
         self.counts.sent += 1
