@@ -160,6 +160,7 @@ def measure_run(options: argparse.Namespace, hand: list[str], folder: Path) -> d
         options.policy,
         *hand,
         "--uncalibrated",
+        "--yes",
         "--link.settle",
         "0.1",
         "--quiet",

@@ -8,6 +8,12 @@ from dexsim_real.core.log import Kind, LogError, LogReader
 from dexsim_real.replay.replay import replay
 from dexsim_real.wire import frames
 
+EXPECTED = ("time is over",) + tuple(
+    f"stopped: {why}"
+    for why in ("too hot", "implausible", "error bits", "the hand switched itself off", "stalled", "the hand reports")
+)
+"""Ends of runs with faults."""
+
 
 def inspect(path: Path, safe: float) -> dict:
     """Evaluate a log: counters at the end, and how soon each loss of the hand was noticed.
@@ -61,17 +67,29 @@ def reactions(states: list[float], sent: list[float], notes: list[tuple[float, b
         yield max((when - before for when in sent if before < when < alarm), default=0.0)
 
 
-def heat_reactions(report: dict) -> list[float]:
-    """Seconds from a heat fault until the motors were off, for motors that were on."""
-    on, hot, found = False, None, []
+ALLOWED = {"heat": 0.0, "warm": 0.0, "error": 0.2, "off": 0.2, "jam": 3.0, "refuse": 0.0, "refuse: number 6": 1.05}
+"""Seconds for which the bridge may tolerate an alarm, by its kind; a hand that is busy is only silent."""
+_DISTURBED = tuple(f"fault {kind}:" for kind in ("stall", "late", "disconnect", "angle"))
+
+
+def alarm_reactions(report: dict) -> list[tuple[str, float]]:
+    """For alarms of a hand whose motors are on: kind, and s from the allowed time until the motors were off.
+
+    An alarm is left out if another fault kept the bridge from seeing it, up to a second before or until the motors were
+    off.
+    """
+    on, pending, disturbed, found = False, [], -1e9, []
     for when, text in report["events"]:
-        if text.startswith("joint") and text.endswith("hotter") and on and hot is None:
-            hot = when
+        if text.startswith(_DISTURBED):
+            disturbed, pending = when, []
         elif text == "motors on":
             on = True
         elif text.startswith(("motors off", "watchdog")):
-            found += [when - hot] if hot is not None else []
-            on, hot = False, None
+            found += [(kind, when - begun - ALLOWED[kind]) for kind, begun in pending]
+            on, pending = False, []
+        elif text.startswith("fault ") and on and when > disturbed + 1.0:
+            kind = max((kind for kind in ALLOWED if text.startswith(f"fault {kind}")), key=len)
+            pending.append((kind, when))
     return found
 
 

@@ -177,7 +177,7 @@ def runner(env: Env, num_envs: int, steps: int, step: Callable | None = None) ->
         state, (touched, tape) = scan_restarting(env, body, state, (jax.random.split(key, steps), tape))
         return state, jnp.mean(touched), tape
 
-    return jit(run)
+    return jit(run, backend=env.backend)
 
 
 def seconds(run: Callable, *arguments: Any) -> tuple[float, Any]:

@@ -8,6 +8,7 @@ the sum of parts compiled apart).
 """
 
 import dataclasses
+import functools
 import statistics
 from collections.abc import Callable
 from typing import Any
@@ -42,18 +43,19 @@ def split(task: str, backend: str, num_envs: int, repeats: int) -> list[dict]:
     state = training.init(jax.random.key(0))
     for _ in range(3):
         state, _ = training.step(state)
-    whole = jit(lambda state: ppo.train_iteration(env, config, state))
-    ticks, actions = jit(lambda state: record(recorder, config, state))(state)
-    rollout = jit(lambda state: experience(env, config, state))(state)[1]
+    compiled = functools.partial(jit, backend=env.backend)
+    whole = compiled(lambda state: ppo.train_iteration(env, config, state))
+    ticks, actions = compiled(lambda state: record(recorder, config, state))(state)
+    rollout = compiled(lambda state: experience(env, config, state))(state)[1]
     # What a part works on is an argument: as constants, XLA would fold it or hold it twice.
     cases: dict[str, tuple[Callable, tuple[Any, ...]]] = {
         "training step": (whole, (state,)),
-        "rollout": (jit(lambda state: experience(env, config, state)), (state,)),
-        "environment": (jit(lambda begin, actions: environment(env, begin, actions)), (state.env_state, actions)),
-        "physics": (jit(lambda ticks: physics(env, ticks)), (ticks,)),
-        "touch": (jit(lambda ticks, key: touch(env, ticks, key)), (ticks, jax.random.key(1))),
-        "policy": (jit(lambda state, rollout: policy(env, config, state, rollout)), (state, rollout)),
-        "learner": (jit(lambda state, rollout: learn(env, config, state, rollout)), (state, rollout)),
+        "rollout": (compiled(lambda state: experience(env, config, state)), (state,)),
+        "environment": (compiled(lambda begin, actions: environment(env, begin, actions)), (state.env_state, actions)),
+        "physics": (compiled(lambda ticks: physics(env, ticks)), (ticks,)),
+        "touch": (compiled(lambda ticks, key: touch(env, ticks, key)), (ticks, jax.random.key(1))),
+        "policy": (compiled(lambda state, rollout: policy(env, config, state, rollout)), (state, rollout)),
+        "learner": (compiled(lambda state, rollout: learn(env, config, state, rollout)), (state, rollout)),
     }
     times = {name: [] for name in cases}
     for run, arguments in cases.values():

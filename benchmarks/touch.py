@@ -4,8 +4,9 @@
     python benchmarks/touch.py --quick                             # a minute on a laptop
     python benchmarks/touch.py --tables cost --num-envs 32768 --step
 
-Needs neither a physics engine nor a mesh file; only `--step` (the share of a full step of the grasp task) and
-`--kinematics` load the hand's model. Costs are medians over repeats of a compiled loop whose every turn moves the
+Needs neither a physics engine nor a mesh file; only `--step` (the query's time over that of a full step of the grasp
+task) and `--kinematics` load the hand's model. A step without touch is faster by more than that share: `throughput.py
+--leave-out touch` measures it. Costs are medians over repeats of a compiled loop whose every turn moves the
 objects; FLOPs and bytes are XLA's own count of one turn (of a loop's body, as in the points' scan and table, it counts
 one round only); the floor is the longer of bytes at the memory bandwidth and FLOPs at the arithmetic rate that this
 program measures on the same device.

@@ -22,7 +22,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from zero_shot import COMMANDS, TARGETS, grasp_metrics, rotate_metrics, simulated, table
+from zero_shot import COMMANDS, TARGETS, metrics, run_all, simulated, table
 
 ROOT = Path(__file__).resolve().parent.parent
 LIMITS = {"grasp": 8.0, "rotate": 120.0}  # s, the tasks' own
@@ -169,6 +169,13 @@ def line(report: dict[str, Any]) -> str:
     )
 
 
+def idle_trials(options: argparse.Namespace, policy: str, count: int) -> list[dict[str, Any]]:
+    """The trials of a hand that does nothing, in virtual time."""
+    idle = {name: getattr(options, name) for name in ("task", "parameters", "seconds")}
+    idle |= {"policy": policy, "seed": [options.seed], "safety": True, "set": {}, "idle": True}
+    return run_all(idle, options.first + count, 1, show=False)[options.first :]
+
+
 def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--task", choices=("grasp", "rotate"), required=True)
@@ -188,6 +195,12 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--twin", default="", help="more options of `dexsim_real.twin`, as one argument")
     parser.add_argument("--runner", default="", help="more options of `dexsim_real.run`, as one argument")
     parser.add_argument("--no-realtime", dest="realtime", action="store_false")
+    parser.add_argument(
+        "--no-baseline",
+        dest="baseline",
+        action="store_false",
+        help="do not run the trials with an idle hand, too (in virtual time)",
+    )
     parser.add_argument("--json", type=Path, help="JSON file for all results")
     return parser.parse_args()
 
@@ -202,13 +215,14 @@ def main() -> None:
             print(line(reports[-1]), file=sys.stderr, flush=True)
     if not reports:
         sys.exit(130)
-    here = (grasp_metrics if options.task == "grasp" else rotate_metrics)(reports)
-    there = simulated(options.task, options.policy or options.task)
+    policy = options.policy or options.task
+    here, there = metrics(options.task, policy, reports), simulated(options.task, policy)
+    idle = metrics(options.task, policy, idle_trials(options, policy, len(reports))) if options.baseline else {}
     print(
         f"{options.task}: {len(reports)} trials in real time, parameters {options.parameters}, seed {options.seed}; "
         f"targets {TARGETS[options.task]}"
     )
-    print(table(here, there))
+    print(table(here, there, idle))
     if options.json:
         options.json.write_text(
             json.dumps(
@@ -216,6 +230,7 @@ def main() -> None:
                     "options": {k: str(v) for k, v in vars(options).items()},
                     "metrics": here,
                     "simulation": there,
+                    "do_nothing": idle,
                     "trials": reports,
                 },
                 indent=1,

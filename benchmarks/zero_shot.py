@@ -3,14 +3,16 @@
     python benchmarks/zero_shot.py --task rotate --trials 10
     python benchmarks/zero_shot.py --task grasp --trials 50 --parameters inside --set gear_play=0
     python benchmarks/zero_shot.py --task grasp --trials 50 --seed 0 1 2 3 --processes 2
+    python benchmarks/zero_shot.py --task grasp --trials 25 --limit speed=20 --limit margin=0
 
 In virtual time (`dexsim_real.twin.virtual`): frames, emulated palm board, and the bridge's sensing, safety and
 controller run in one process, as fast as they compute. The metrics use the true state, not the measurements of the
-bridge. Trial k of a seed does not depend on the other trials.
+bridge. Trial k of a seed does not depend on the other trials. A hand that does nothing gets the same trials.
 """
 
 import argparse
 import concurrent.futures
+import dataclasses
 import functools
 import itertools
 import json
@@ -22,33 +24,39 @@ from typing import Any
 
 import numpy as np
 
-TARGETS = {"grasp": "held 90 %, r 0.8", "rotate": "25.1 successes, 3.36 s each, 84.3 s to fall"}
+TARGETS = {"grasp": "held 90 %, r 0.8", "rotate": "25.1 successes, 17.9 a minute, 84.3 s to fall"}
 COMMANDS = (0.0, 0.25, 0.5, 0.75, 1.0)
 
 
 @functools.lru_cache(maxsize=2)
-def load(policy: str) -> tuple[Any, Any, Any]:
-    """Hand, controller and calibration; loaded once per process."""
+def load(name: str, idle: bool) -> tuple[Any, Any, Any]:
+    """Hand, controller and calibration; loaded once per process. An idle policy's actions are zero."""
     from dexsim_real.control.controller import Controller, prepare_jax
 
     prepare_jax()
+    import jax
+
     from dexsim import load_hand
     from dexsim_ppo.policy import load_policy
     from dexsim_real.twin.virtual import ideal_calibration
 
-    hand = load_hand()
-    controller = Controller(load_policy(policy), hand)
+    hand, policy = load_hand(), load_policy(name)
+    if idle:
+        layers = jax.tree.map(np.zeros_like, policy.params.layers)
+        policy = dataclasses.replace(policy, params=dataclasses.replace(policy.params, layers=layers))
+    controller = Controller(policy, hand)
     controller.warm()
     return hand, controller, ideal_calibration(hand)
 
 
 def run_trial(options: dict[str, Any], seed: int, number: int) -> dict[str, Any]:
     """The referee's report of one trial."""
+    from dexsim_real.control.safety import SafetyConfig
     from dexsim_real.twin.plant.emulated_hand import EmulatedHand
     from dexsim_real.twin.plant.shapes import SHAPES
     from dexsim_real.twin.virtual import RunOptions, VirtualRun
 
-    hand, controller, calibration = load(options["policy"])
+    hand, controller, calibration = load(options["policy"], options.get("idle", False))
     # As in the task's evaluation: five commands for each shape.
     command, shape = COMMANDS[number % len(COMMANDS)], SHAPES[number // len(COMMANDS) % len(SHAPES)]
     plant = EmulatedHand(
@@ -63,7 +71,9 @@ def run_trial(options: dict[str, Any], seed: int, number: int) -> dict[str, Any]
         shape=shape,
     )
     began = time.perf_counter()
-    report = VirtualRun(plant, controller, calibration, RunOptions(command=command, safety=options["safety"])).run()
+    limits = SafetyConfig(**options["limit"])
+    run = VirtualRun(plant, controller, calibration, RunOptions(command, safety=options["safety"], limits=limits))
+    report = run.run()
     return report | {"wall": round(time.perf_counter() - began, 2)}
 
 
@@ -96,26 +106,30 @@ def _shown(report: dict[str, Any], show: bool) -> dict[str, Any]:
 # --- metrics -------------------------------------------------------------------------------------
 
 
-def grasp_metrics(reports: list[dict[str, Any]]) -> dict[str, Any]:
-    """Success rate, and correlation of the forces of held objects with the command: total force, and its normal part
-    alone, which taxels measure."""
-    from dexsim.core.statistics import mean, proportion
-    from dexsim.tasks.grasp.report import pearson
+def grasp_metrics(reports: list[dict[str, Any]], span: tuple[float, float]) -> dict[str, Any]:
+    """Success rate, force error over all trials, and correlation of the forces of held objects with the command.
 
-    held = np.array([r["held"] for r in reports])
-    command, force, pressing, total = (
-        np.array([r[name] for r in reports], float)[held]
-        for name in ("command", "finger_force", "finger_pressing", "total_force")
-    )
+    Names, window and forces are those of the evaluation in simulation (`dexsim.tasks.grasp.report`).
+
+    Args:
+      reports: the referee's, of trials.
+      span: N, target force per touching finger at command 0 and 1.
+    """
+    from dexsim.core.statistics import mean, proportion
+    from dexsim.tasks.grasp.report import FORCES, correlations, force_error, saturates
+
+    held, names = np.array([r["held"] for r in reports]), (*FORCES.values(), "total_force", "torque_limited")
+    command, *columns = (np.array([r[name] for r in reports], float) for name in ("command", *names))
+    mean_of = dict(zip(names, columns, strict=True))
+    # A referee's means end with the trial; a lost object is not pressed for the rest of the window.
+    start, end = np.array([r["window_s"] for r in reports], float).T
+    lived = np.clip((np.array([r["seconds"] for r in reports], float) - start) / (end - start), 0.0, 1.0)
+    wanted = span[0] + command * (span[1] - span[0])
     by_command = [
-        {
-            "command": c,
-            "held": proportion(held[[r["command"] == c for r in reports]]),
-            "finger_force": mean(force[command == c]),
-            "finger_pressing": mean(pressing[command == c]),
-            "total_force": mean(total[command == c]),
-        }
-        for c in sorted({r["command"] for r in reports})
+        {"command": float(c), "held": proportion(held[command == c])}
+        | {name: mean(mean_of[name][held & (command == c)]) for name in names}
+        | {"saturates": saturates(mean_of["torque_limited"][held & (command == c)])}
+        for c in np.unique(command)
     ]
     by_shape = [
         {"shape": s, "held": proportion(held[[r["shape"] == s for r in reports]])}
@@ -123,55 +137,69 @@ def grasp_metrics(reports: list[dict[str, Any]]) -> dict[str, Any]:
     ]
     return {
         "held": proportion(held),
-        "pearson_r": pearson(command, force),
-        "pearson_r_pressing": pearson(command, pressing),
-        "pearson_r_total": pearson(command, total),
+        "force_error_n": force_error(np.where(held, 1.0, lived) * mean_of["finger_force"], wanted),
+        **correlations(command, held, mean_of),
+        "torque_limited": mean(mean_of["torque_limited"][held]),
+        "window_s": [float(start.min()), float(end.max())],
         "by_command": by_command,
         "by_shape": by_shape,
     }
 
 
 def rotate_metrics(reports: list[dict[str, Any]]) -> dict[str, Any]:
-    """The paper's three metrics, with goals counted by the task's rule (spin limit) and by the paper's."""
-    from dexsim.core.statistics import mean, proportion
+    """The paper's three metrics, with goals counted by the task's rule (spin limit) and by the paper's.
+
+    The pace is over all the time that trials lasted, time in which the hand was stuck included.
+    """
+    from dexsim.core.statistics import mean, proportion, ratio
 
     count, paper, lived = (
         np.array([r[name] for r in reports], float) for name in ("successes", "paper_successes", "seconds_to_fall")
     )
-    pace = np.array([r["seconds_per_success"] for r in reports if r["successes"]], float)
     return {
         "successes": mean(count) | {"median": float(np.median(count)), "sorted": sorted(count.tolist())},
         "paper_successes": mean(paper) | {"median": float(np.median(paper)), "sorted": sorted(paper.tolist())},
-        "seconds_per_success": mean(pace),
+        "successes_per_minute": ratio(count, lived / 60),
         "seconds_to_fall": mean(lived),
         "kept_to_the_end": proportion(np.array([not r["fell"] for r in reports])),
         "joint_speed": mean(np.array([r["joint_speed"] for r in reports])),
     }
 
 
+def metrics(task: str, policy: str, reports: list[dict[str, Any]]) -> dict[str, Any]:
+    """The metrics of a policy's trials."""
+    if task == "rotate":
+        return rotate_metrics(reports)
+    from dexsim_ppo.policy import load_policy
+
+    return grasp_metrics(reports, tuple(load_policy(policy).env_config["finger_force"]))
+
+
 def simulated(task: str, policy: str) -> dict[str, Any]:
-    """The same metrics from the policy's report in simulation; empty if there is none."""
+    """The same metrics from the policy's report in simulation; those that it has."""
     from dexsim.core.assets import asset_path
     from dexsim.core.errors import DexsimError
 
     path = Path(policy).with_suffix(".json")
     try:
         path = path if path.is_file() else asset_path(f"policies/{Path(policy).stem}.json")
-        report = json.loads(path.read_text())["trained"]["task"]
+        report = json.loads(path.read_text())
+        report = report.get("evaluation", report["trained"])["task"]
     except (OSError, KeyError, ValueError, DexsimError):
         return {}
     if task == "grasp":
-        names = "held", "pearson_r", "pearson_r_pressing", "pearson_r_total", "by_command"
+        names = "held", "force_error_n", "r_resultant", "r_normal", "r_taxels", "torque_limited", "by_command"
         return {name: report[name] for name in names if name in report}
     counts = {
         name: report[name]["mean"] | {"median": report[name]["median"]["median"]}
         for name in ("successes", "paper_successes")
     }
-    return counts | {name: report[name] for name in ("seconds_per_success", "seconds_to_fall", "kept_to_the_end")}
+    names = "successes_per_minute", "seconds_to_fall", "kept_to_the_end"
+    return counts | {name: report[name] for name in names if name in report}
 
 
-def table(here: dict[str, Any], there: dict[str, Any]) -> str:
-    """Table with the columns metric, emulated hand, simulation."""
+def table(here: dict[str, Any], there: dict[str, Any], idle: dict[str, Any]) -> str:
+    """Table with the columns metric, emulated hand, simulation, and a hand that does nothing in the same trials."""
 
     def cell(entry: Any) -> str:
         if not isinstance(entry, dict):
@@ -183,24 +211,28 @@ def table(here: dict[str, Any], there: dict[str, Any]) -> str:
         middle = f", median {entry['median']:.3g}" if "median" in entry else ""
         return f"{entry[key]:.3g}{span}{middle}"
 
+    def at(metrics: dict[str, Any], command: float) -> dict[str, Any]:
+        return next((row for row in metrics.get("by_command", []) if row["command"] == command), {})
+
     names = [name for name in here if isinstance(here[name], dict)]
-    rows = [(name.replace("_", " "), cell(here[name]), cell(there.get(name))) for name in names]
+    rows = [(name.replace("_", " "), cell(here[name]), cell(there.get(name)), cell(idle.get(name))) for name in names]
     for entry in here.get("by_command", []):
-        other = next((row for row in there.get("by_command", []) if row["command"] == entry["command"]), {})
-        rows.append((f"command {entry['command']:g}: held", cell(entry["held"]), cell(other.get("held"))))
-        rows.append(
-            (
-                f"command {entry['command']:g}: finger force (N)",
-                cell(entry["finger_force"]),
-                cell(other.get("finger_force_n")),
-            )
-        )
-    rows += [(f"{entry['shape']}: held", cell(entry["held"]), "") for entry in here.get("by_shape", [])]
-    rows = [("", "emulated hand", "simulation"), *rows]
-    widths = [max(len(row[k]) for row in rows) for k in range(3)]
-    return "\n".join(
-        "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows
-    )
+        other, still = (at(metrics, entry["command"]) for metrics in (there, idle))
+        for name, shown, name_there in (
+            ("held", "held", "held"),
+            ("finger_force", "finger force (N)", "finger_force_n"),
+            ("torque_limited", "ticks with a joint at its torque limit", "torque_limited"),
+        ):
+            cells = cell(entry[name]), cell(other.get(name_there)), cell(still.get(name))
+            mark = " (saturates)" if name == "finger_force" and entry["saturates"] else ""
+            rows.append((f"command {entry['command']:g}: {shown}{mark}", *cells))
+    rows += [(f"{entry['shape']}: held", cell(entry["held"]), "", "") for entry in here.get("by_shape", [])]
+    rows = [("", "emulated hand", "simulation", "doing nothing"), *rows]
+    widths = [max(len(row[k]) for row in rows) for k in range(4)]
+    lines = ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    if "window_s" in here:
+        lines.append("forces and r: of held objects, from {:g} to {:g} s after release".format(*here["window_s"]))
+    return "\n".join(lines)
 
 
 def arguments() -> argparse.Namespace:
@@ -228,7 +260,17 @@ def arguments() -> argparse.Namespace:
         help="fix a parameter (dexsim_real/twin/plant/parameters.py): a number, or outside, inside, nominal",
     )
     parser.add_argument(
+        "--limit",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="another value for a safety limit of the bridge (dexsim_real/control/safety.py)",
+    )
+    parser.add_argument(
         "--no-safety", dest="safety", action="store_false", help="run without the bridge's safety limits"
+    )
+    parser.add_argument(
+        "--no-baseline", dest="baseline", action="store_false", help="do not run the trials with an idle hand, too"
     )
     parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--json", type=Path, help="JSON file for all results")
@@ -248,19 +290,21 @@ def main() -> None:
             name: value if value in ("outside", "inside", "nominal") else float(value)
             for name, value in (pair.split("=") for pair in given.set)
         },
+        "limit": {name: float(value) for name, value in (pair.split("=") for pair in given.limit)},
     }
     reports = run_all(options, given.trials, given.processes, show=True)
-    here = (grasp_metrics if given.task == "grasp" else rotate_metrics)(reports)
+    still = run_all(options | {"idle": True}, given.trials, given.processes, show=False) if given.baseline else []
+    here = metrics(given.task, options["policy"], reports)
+    idle = metrics(given.task, options["policy"], still) if still else {}
     there = simulated(given.task, options["policy"])
     print(
         f"{given.task}: {len(reports)} trials, parameters {given.parameters}, seed {' '.join(map(str, given.seed))}; "
         f"targets {TARGETS[given.task]}"
     )
-    print(table(here, there))
+    print(table(here, there, idle))
     if given.json:
-        given.json.write_text(
-            json.dumps({"options": options, "metrics": here, "simulation": there, "trials": reports}, indent=1)
-        )
+        found = {"options": options, "metrics": here, "simulation": there, "do_nothing": idle, "trials": reports}
+        given.json.write_text(json.dumps(found, indent=1))
 
 
 if __name__ == "__main__":

@@ -122,7 +122,7 @@ def load(path: str | Path, *, kind: str, task: str | None = None) -> Checkpoint:
     """
     path = Path(path)
     try:
-        data = memoryview(path.read_bytes())
+        data = memoryview(_read(path))
     except OSError as error:
         raise CheckpointError(f"{path}: cannot be read ({error.strerror or error})") from None
     header, payload = _open_envelope(path, data)
@@ -169,6 +169,13 @@ def restore(checkpoint: Checkpoint, like: Tree) -> Tree:
 
 def _bytes(array: np.ndarray) -> memoryview:
     return array.reshape(-1).view(np.uint8).data
+
+
+def _read(path: Path) -> bytes:
+    """The whole file if it begins as ours do; else its beginning, since what is not ours may have no end."""
+    with path.open("rb") as file:
+        head = file.read(len(MAGIC))
+        return head + file.read() if head == MAGIC else head
 
 
 def _open_envelope(path: Path, data: memoryview) -> tuple[dict[str, Any], memoryview]:

@@ -3,7 +3,9 @@
     python -m dexsim_ppo.evaluate grasp --episodes 1024 --seed 0
 
 The policy is a file, or the name of a shipped one. The episodes are the task's own protocol
-(`env.evaluation_starts`), never restarted: what counts is whether the hand still holds at the end.
+(`env.evaluation_plan`), never restarted: what counts is whether the hand still holds at the end. Their start states
+are drawn for this evaluation by its seed; training had others. Beside the policy a hand that does nothing gets the
+same episodes: what it achieves, too, is no achievement.
 """
 
 import dataclasses
@@ -45,31 +47,40 @@ class Evaluator:
     def __init__(self, env: Environment, chunk: int):
         self.env, self.chunk = env, chunk
         self.totals = env.evaluation == "totals"
-        self._run = jit(self._episodes)
+        self._run, self._plans = jit(self._episodes, backend=env.backend), dict[tuple[int, int], Any]()
 
-    def __call__(self, params: PolicyParams, *, episodes: int, seed: int) -> tuple[dict[str, Any], Any]:
-        """Measure over at least `episodes` episodes, rounded up to whole chunks.
+    def __call__(
+        self, params: PolicyParams, *, episodes: int, seed: int, idle: bool = False
+    ) -> tuple[dict[str, Any], Any]:
+        """Measure over at least `episodes` episodes, rounded up to whole chunks; with zero actions if `idle`.
 
         Returns:
           The report: `"held"` (share of episodes never terminated), `"return"` and `"steps_held"`, each
-          with a 95 % interval over episodes, and `"task"`: what the task's `summarize` makes of its
+          with a 95 % interval by start, and `"task"`: what the task's `summarize` makes of its
           metrics. And the snapshots of the shown episodes, for `write_video`.
         """
-        started = time.perf_counter()
+        started, chunks = time.perf_counter(), math.ceil(episodes / self.chunk)
+        plan = self._plan(chunks * self.chunk, seed)
         with collector_paused():
-            chunks = [
-                jax.device_get(self._run(params, jax.random.fold_in(jax.random.key(seed), i)))
-                for i in range(math.ceil(episodes / self.chunk))
+            parts = [
+                jax.device_get(self._run(params, jax.tree.map(lambda x, i=i: x[i : i + self.chunk], plan), idle))
+                for i in range(0, chunks * self.chunk, self.chunk)
             ]
         # Episodes are the last axis of all that is measured.
-        measured = jax.tree.map(lambda *xs: np.concatenate(xs, axis=-1), *(measured for measured, _ in chunks))
-        report = (summarize_totals if self.totals else summarize)(self.env, *measured) | {
+        measured = jax.tree.map(lambda *xs: np.concatenate(xs, axis=-1), *(measured for measured, _ in parts))
+        report = (summarize_totals if self.totals else summarize)(self.env, *measured, np.asarray(plan.row)) | {
             "seed": seed,
             "seconds": time.perf_counter() - started,
         }
-        return report, self._film(*chunks[0][1])
+        return report, self._film(*parts[0][1])
 
-    def _episodes(self, params: PolicyParams, key: jax.Array):
+    def _plan(self, count: int, seed: int) -> Any:
+        """The episodes; kept, since a run selects its best policy on the same ones again and again."""
+        if (count, seed) not in self._plans:
+            self._plans[count, seed] = self.env.evaluation_plan(count, seed)
+        return self._plans[count, seed]
+
+    def _episodes(self, params: PolicyParams, plan: Any, idle: bool):
         """One chunk: what the report needs, and snapshots and termination flags [T, shown].
 
         The report needs metrics and termination flags [T, chunk]; of long episodes, whose task keeps its
@@ -79,7 +90,8 @@ class Evaluator:
 
         def step(carry, _):
             state, last = carry
-            state = jax.vmap(self.env.step)(state, act(params, state.obs["actor"]))
+            action = act(params, state.obs["actor"])
+            state = jax.vmap(self.env.step)(state, jnp.where(idle, jnp.zeros_like(action), action))
             frame = jax.tree.map(lambda x: x[shown], jax.vmap(self.env.snapshot)(state))
             series = (dict(state.metrics), state.terminated)
             film = (frame, state.terminated[shown])
@@ -87,7 +99,7 @@ class Evaluator:
                 return (state, None), (series, film)
             return (state, _follow(last, *series)), (None, film)
 
-        state = self.env.evaluation_starts(key, self.chunk)
+        state = self.env.evaluation_starts(plan)
         last: Any = None
         if self.totals:
             last = (dict(state.metrics), jnp.zeros(self.chunk, jnp.int32), jnp.zeros(self.chunk, bool))
@@ -102,8 +114,10 @@ class Evaluator:
         return jax.tree.map(lambda x: np.concatenate([x[:end, i] for i, end in enumerate(ends)]), frames)
 
 
-def summarize(env: Environment, metrics: dict[str, np.ndarray], terminated: np.ndarray) -> dict[str, Any]:
-    """Report of episodes from their metrics `[T, N]` and termination flags `[T, N]`.
+def summarize(
+    env: Environment, metrics: dict[str, np.ndarray], terminated: np.ndarray, start: np.ndarray
+) -> dict[str, Any]:
+    """Report of episodes from their metrics `[T, N]`, termination flags `[T, N]` and starts `[N]`.
 
     An episode lives up to, and not including, its first terminated step. That step's reward belongs to
     the return, and nothing after it counts.
@@ -117,23 +131,34 @@ def summarize(env: Environment, metrics: dict[str, np.ndarray], terminated: np.n
     return {
         "episodes": episodes,
         "steps": steps,
-        "held": proportion(alive[-1]),
-        "return": mean_interval(returns),
-        "steps_held": mean_interval(steps_held),
+        **_intervals(alive[-1], returns, steps_held, start),
         "task": env.summarize(masked, alive),
     }
 
 
-def summarize_totals(env: Environment, metrics: dict[str, np.ndarray], lived: np.ndarray) -> dict[str, Any]:
-    """Report of episodes from the metrics of their last tick [N] and the ticks they lived [N]."""
+def summarize_totals(
+    env: Environment, metrics: dict[str, np.ndarray], lived: np.ndarray, start: np.ndarray
+) -> dict[str, Any]:
+    """Report of episodes from the metrics of their last tick [N], the ticks they lived [N] and their starts [N]."""
     held = lived == env.evaluation_steps
     return {
         "episodes": int(lived.size),
         "steps": env.evaluation_steps,
-        "held": proportion(held),
-        "return": mean_interval(metrics["return"]),
-        "steps_held": mean_interval(lived),
+        **_intervals(held, metrics["return"], lived, start),
         "task": env.summarize(metrics, lived),
+    }
+
+
+def _intervals(held: np.ndarray, returns: np.ndarray, lived: np.ndarray, start: np.ndarray) -> dict[str, Any]:
+    """What every report has, of episodes [N]: how many starts they had, and the figures with intervals by start."""
+    starts = len(np.unique(start))
+    share = proportion(held) if starts == held.size else mean_interval(held.astype(float), start)
+    share |= {"low": max(share["low"], 0.0), "high": min(share["high"], 1.0)}
+    return {
+        "starts": starts,
+        "held": share,
+        "return": mean_interval(returns, start),
+        "steps_held": mean_interval(lived, start),
     }
 
 
@@ -145,9 +170,12 @@ def _follow(last: tuple, metrics: dict[str, jax.Array], terminated: jax.Array) -
     return kept, lived + ~ended, ended
 
 
-def mean_interval(x: np.ndarray) -> dict[str, float]:
-    """Mean of independent samples with its normal 95 % interval."""
-    mean, half = float(np.mean(x)), 1.96 * float(np.std(x, ddof=min(1, x.size - 1))) / x.size**0.5
+def mean_interval(x: np.ndarray, start: np.ndarray) -> dict[str, float]:
+    """Mean of samples [N] with its normal 95 % interval, by start [N]: samples of one start are not independent."""
+    _, which = np.unique(start, return_inverse=True)
+    mean, starts = float(np.mean(x)), int(which.max()) + 1
+    off = np.bincount(which, np.asarray(x, float) - mean)
+    half = 1.96 * float(np.sqrt(np.sum(off**2) * starts / max(starts - 1, 1))) / x.size
     return {"value": mean, "low": mean - half, "high": mean + half}
 
 
@@ -180,6 +208,7 @@ def evaluate_policy(
     env: Environment | None = None,
     backend: str = "auto",
     chunk: int = 0,
+    baseline: bool = True,
 ) -> dict[str, Any]:
     """Measure a policy over fixed, seeded episodes.
 
@@ -190,9 +219,11 @@ def evaluate_policy(
       env: where to measure it; None for the environment that it was trained in. Another one is warned of.
       backend: physics, where `env` is None.
       chunk: episodes run side by side; 0 chooses by the device.
+      baseline: measure a hand that does nothing on the same episodes, too, which doubles the time.
 
     Returns:
-      The report: `"held"`, `"return"`, `"steps_held"` with 95 % intervals, and `"task"`: the task's own figures.
+      The report: `"held"`, `"return"`, `"steps_held"` with 95 % intervals, `"task"`: the task's own figures, and
+      `"do_nothing"`: the same of the baseline.
 
     Raises:
       CheckpointError, ConfigError: see `Policy.load` and `Policy.make_env`.
@@ -203,7 +234,10 @@ def evaluate_policy(
         env = policy.make_env(backend=backend, num_envs=chunk)
     else:
         policy.check_env(env)
-    report, _ = Evaluator(env, chunk)(policy.params, episodes=episodes, seed=seed)
+    evaluator = Evaluator(env, chunk)
+    report, _ = evaluator(policy.params, episodes=episodes, seed=seed)
+    if baseline:
+        report["do_nothing"], _ = evaluator(policy.params, episodes=episodes, seed=seed, idle=True)
     return report | {"backend": env.backend}
 
 
@@ -215,16 +249,18 @@ class EvaluateArguments:
     """A policy file, or the name of a shipped policy, such as grasp."""
     episodes: int = setting(1024, unit="1", low=1)
     """Evaluation episodes, rounded up to whole chunks."""
-    seed: int = setting(0, unit="1", low=0, high=2**32 - 1)
-    """Seed of the episodes."""
+    seed: int = setting(0, unit="1", low=0, high=2**32 - 2)
+    """Seed of the episodes and their start states. Training selects its best policy by episodes of another."""
     backend: Literal["auto", "jax", "warp", "c"] = setting("auto")
-    """Physics backend. auto: warp on a GPU if it is installed, otherwise jax."""
+    """Physics backend. auto: c on a CPU, warp on an NVIDIA GPU if it is installed, otherwise jax."""
     chunk: int = setting(0, unit="1", low=0)
     """Episodes simulated side by side; 0 chooses by the device."""
     seconds: float = setting(0.0, unit="s", low=0.0)
     """Length of an evaluation episode; 0 for the task's own."""
     task: str = ""
     """Module and name of a task of your own, such as my_module:poke; the policy's file names all others."""
+    baseline: bool = True
+    """Measure a hand that does nothing on the same episodes, too, which doubles the time."""
     ablate: tuple[str, ...] = ()
     """Observation fields to replace by their training mean, such as contact_force contact_centre."""
     set: tuple[str, ...] = ()
@@ -258,12 +294,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     entry = find_task(policy.task)
     with cli.naming_options(entry.config_class, entry.config(), functools.partial(_typed, arguments)):
         env = policy.build_env(backend=arguments.backend, num_envs=chunk)
-    report, snapshots = Evaluator(env, chunk)(policy.params, episodes=arguments.episodes, seed=arguments.seed)
+    evaluator = Evaluator(env, chunk)
+    measure = functools.partial(evaluator, policy.params, episodes=arguments.episodes, seed=arguments.seed)
+    report, snapshots = measure()
+    if arguments.baseline:
+        report["do_nothing"], _ = measure(idle=True)
     report |= {"policy": arguments.policy, "ablate": list(arguments.ablate), "set": list(arguments.set)}
     report |= {"backend": env.backend} | cli.environment_report()
     if arguments.output:
         cli.write_json(arguments.output, report)
-    print_report(report, title=f"{policy.task}: {arguments.policy}")
+    print_report(report, report.get("do_nothing"), title=f"{policy.task}: {arguments.policy}")
     if arguments.video:
         print(f"video: {write_video(env, snapshots, arguments.video)}")
     return 0
@@ -277,20 +317,31 @@ def _typed(arguments: EvaluateArguments, field: Option) -> str | None:
     return "--seconds " if path == "evaluation_seconds" and arguments.seconds else None
 
 
-def print_report(report: dict[str, Any], *, title: str) -> None:
-    """A table of the report's headline."""
+def print_report(report: dict[str, Any], do_nothing: dict[str, Any] | None, *, title: str) -> None:
+    """A table of the report's headline, and beside it that of a hand that does nothing, if it was measured."""
     from rich.console import Console
     from rich.table import Table
 
-    table = Table("measure", "value", "95 % interval", title=title)
-    for name in ("held", "return", "steps_held"):
-        entry = report[name]
-        table.add_row(name, f"{entry['value']:.4g}", f"{entry['low']:.4g} .. {entry['high']:.4g}")
-    for name, value in report["task"].get("headline", {}).items():
-        if name not in report:  # With its interval it is in the table already.
-            table.add_row(name, "-" if value is None else f"{value:.4g}", "")
+    idle = do_nothing and _headline(do_nothing)
+    table = Table("measure", "value", "95 % interval", *(["doing nothing"] if idle else []), title=title)
+    for name, entry in _headline(report).items():
+        low, high = entry.get("low"), entry.get("high")
+        span = "" if low is None or high is None else f"{low:.4g} .. {high:.4g}"
+        beside = [_number(idle.get(name, {}).get("value"))] if idle else []
+        table.add_row(name, _number(entry["value"]), span, *beside)
     Console().print(table)
     print(f"{report['episodes']} episodes of {report['steps']} steps, seed {report['seed']}, {report['seconds']:.1f} s")
+
+
+def _headline(report: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """Names of the task's headline, or else the share held, and the return: value, low and high."""
+    headline = report["task"].get("headline") or {"held": report["held"]}
+    rows = {name: entry if isinstance(entry, dict) else {"value": entry} for name, entry in headline.items()}
+    return rows | {"return": report["return"]}
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.4g}"
 
 
 if __name__ == "__main__":

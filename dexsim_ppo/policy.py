@@ -119,7 +119,8 @@ class Policy:
         try:
             return cls._from_file(file)
         except (KeyError, TypeError, ValueError, IndexError, AttributeError, RecursionError, ConfigError) as error:
-            raise CheckpointError(f"{path}: is not a sound policy ({error!r})") from None
+            text = " ".join(repr(error).split())
+            raise CheckpointError(f"{path}: is not a sound policy ({text:.300})") from None
 
     def make_env(self, *, num_envs: int = 1, backend: str = "auto", hand: "Hand | None" = None, seed: int = 0) -> "Env":
         """The environment that the policy was trained in.

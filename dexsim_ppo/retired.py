@@ -11,6 +11,8 @@ import warnings
 from collections.abc import Collection
 from typing import Any
 
+import jax
+
 from dexsim import observation
 from dexsim.control import Control
 from dexsim.core.config import from_dict
@@ -102,7 +104,10 @@ def migrate_config(config: dict[str, Any], where: Any) -> dict[str, Any]:
 def migrate_arguments(arguments: dict[str, Any], where: Any) -> dict[str, Any]:
     """The options of a training run, `env` included."""
     fields = ARGUMENTS | {f"env.{old}": new and f"env.{new}" for old, new in FIELDS.items()}
-    return _migrate(arguments, fields, where, "env.")
+    arguments = _migrate(arguments, fields, where, "env.")
+    if arguments.get("backend") == "auto" and jax.default_backend() == "cpu":
+        arguments["backend"] = "jax"  # what it meant on a CPU when files still held it
+    return arguments
 
 
 def migrate_leaves(leaves: dict[str, Any], wanted: Collection[str]) -> dict[str, Any]:

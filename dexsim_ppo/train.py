@@ -128,6 +128,7 @@ def run_training(
     env = dexsim.make(
         arguments.task, training_config(arguments), backend=arguments.backend, num_envs=arguments.ppo.num_envs
     )
+    arguments = dataclasses.replace(arguments, backend=env.backend)  # so that a resumed run has the same engine
     if isinstance(begun, Policy):
         check_fit(begun, env, arguments.ppo)
     folder = RunFolder(resumed.path.parent.parent if resumed else make_run_folder(arguments))

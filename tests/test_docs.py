@@ -4,6 +4,7 @@ import json
 import pkgutil
 import re
 import shlex
+import subprocess
 import sys
 import tomllib
 from pathlib import Path
@@ -165,6 +166,24 @@ def test_every_record_is_valid_and_named_once():
     assert len(ids) == len(set(ids)) > 300
 
 
+def test_cited_commits_exist():
+    git = ["git", "-C", str(ROOT)]
+    whole = subprocess.run([*git, "rev-parse", "--is-shallow-repository"], capture_output=True, text=True)
+    if whole.returncode or whole.stdout.strip() != "false":
+        pytest.skip("needs a clone with its history")
+    cited = sorted(
+        {
+            commit
+            for name in render.TABLES
+            for record in render.load(name)
+            for commit in re.findall(r"\b[0-9a-f]{7}\b", record["commit"])
+        }
+    )
+    found = subprocess.run([*git, "cat-file", "--batch-check"], input="\n".join(cited), capture_output=True, text=True)
+    kinds = {line.split()[0][:7]: line.split()[1] for line in found.stdout.splitlines()}
+    assert len(cited) > 60 and not [commit for commit in cited if kinds.get(commit) != "commit"]
+
+
 @pytest.mark.parametrize("name", render.TABLES)
 def test_table_is_up_to_date(name):
     assert (render.HERE / f"{name}.md").read_text() == render.render(name), "run python docs/experiments/render.py"
@@ -175,6 +194,7 @@ def test_table_is_up_to_date(name):
     [
         {"id": "Two words"},
         {"date": "23 November 2026"},
+        {"commit": "af96a1c with other contacts"},
         {"seeds": ["one"]},
         {"metrics": {"held_pct": None}},
         {"metrics": {"held_pct_ci95": [98.9]}},

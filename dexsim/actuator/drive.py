@@ -55,19 +55,25 @@ def torque_limit(actuator: Actuator, velocity: jax.Array) -> jax.Array:
     return actuator.stall_torque * jnp.maximum(1.0 - jnp.abs(velocity) / actuator.no_load_speed, 0.0)
 
 
+def wanted_torque(
+    actuator: Actuator, target: jax.Array, target_velocity: jax.Array | float, position: jax.Array, velocity: jax.Array
+) -> jax.Array:
+    """tau_b at the measured angle, position + encoder bias: what the loop asks for, Nm, whatever the limit."""
+    measured = position if actuator.encoder_bias is None else position + actuator.encoder_bias
+    torque = pd_torque(actuator, target, target_velocity, measured, velocity)
+    return dead_band(actuator, torque, target, measured)
+
+
 def joint_torque(
     actuator: Actuator, target: jax.Array, target_velocity: jax.Array | float, position: jax.Array, velocity: jax.Array
 ) -> jax.Array:
     """Torque of one joint's motor, Nm: eta clip(tau_b, -tau_sat, tau_sat) (1 + r sin(n q + phase)).
 
-    The PD law and the dead-band see the measured angle, position + encoder bias. This is the
-    torque that corresponds to the motor's current; `apply_friction` subtracts the gear's friction.
+    This is the torque that corresponds to the motor's current; `apply_friction` subtracts the gear's friction.
 
     Args: scalars, or arrays that broadcast; `drive` is this, vmapped over the joints.
     """
-    measured = position if actuator.encoder_bias is None else position + actuator.encoder_bias
-    torque = pd_torque(actuator, target, target_velocity, measured, velocity)
-    torque = dead_band(actuator, torque, target, measured)
+    torque = wanted_torque(actuator, target, target_velocity, position, velocity)
     limit = torque_limit(actuator, velocity)
     torque = actuator.efficiency * jnp.clip(torque, -limit, limit)
     if actuator.ripple is None:
@@ -79,6 +85,15 @@ def joint_torque(
 
 drive = jax.vmap(joint_torque)
 """`joint_torque` over joints: an `Actuator` of [J] leaves and arrays [J] to torques [J] Nm."""
+
+
+@jax.vmap
+def at_limit(
+    actuator: Actuator, target: jax.Array, target_velocity: jax.Array | float, position: jax.Array, velocity: jax.Array
+) -> jax.Array:
+    """Whether joints [J] bool are at their torque limit: |tau_b| >= tau_sat. The arguments are those of `drive`."""
+    torque = wanted_torque(actuator, target, target_velocity, position, velocity)
+    return jnp.abs(torque) >= torque_limit(actuator, velocity)
 
 
 def apply_friction(

@@ -23,6 +23,7 @@ def calibrate(
     current_per_count: float = 0.001,
     missing: str = "refuse",
     serial: str = "",
+    handedness: str = "",
     created: str | None = None,
 ) -> Calibration:
     """Fit all joints of a hand.
@@ -35,7 +36,7 @@ def calibrate(
       current_per_count: A per reported count; kept in the file.
       missing: what to do with joints that were not recorded (a fingertip's pad does not load
         every joint): "refuse", or "class" to take the mean of joints with the same torque limit.
-      serial, created: kept in the file; `created` is today by default.
+      serial, handedness, created: kept in the file; `created` is today by default.
 
     Raises:
       CalibrationError: names the joint and what data is needed.
@@ -83,6 +84,7 @@ def calibrate(
         finger_names=hand.finger_names,
         current_per_count=current_per_count,
         serial=serial,
+        handedness=handedness,
         created=created if created is not None else datetime.date.today().isoformat(),
         notes=notes,
     )

@@ -13,7 +13,6 @@ Shapes: J joints, F fingers, N taxels a finger; a leading 2 is (loading, unloadi
 """
 
 import math
-import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +20,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dexsim.calibration import bounds
 from dexsim.core.errors import CalibrationError
-from dexsim.core.files import write_whole
+from dexsim.core.files import read_toml, write_whole
 from dexsim.core.pytree import Array, align, pytree_dataclass, static
 from dexsim.hand.kinematics import Hand
 
@@ -67,7 +67,8 @@ class Calibration:
     joint_names: tuple[str, ...] = static()
     finger_names: tuple[str, ...] = static()
     current_per_count: float = static(default=0.001)  # A; the XHand reports mA
-    serial: str = static(default="")
+    serial: str = static(default="")  # of the hand, as it told it; empty if it did not
+    handedness: str = static(default="")  # likewise
     created: str = static(default="")
     notes: tuple[str, ...] = static(default=())
 
@@ -160,6 +161,7 @@ def save_calibration(path: str | Path, calibration: Calibration) -> None:
         f"version = {VERSION}",
         f"hand = {_text(calibration.hand)}",
         f"serial = {_text(calibration.serial)}",
+        f"handedness = {_text(calibration.handedness)}",
         f"created = {_text(calibration.created)}",
         f"current_per_count = {_number(calibration.current_per_count)}  # A",
         f"finger_names = [{', '.join(map(_text, calibration.finger_names))}]",
@@ -199,48 +201,51 @@ def load_calibration(path: str | Path, hand: Hand | None = None) -> Calibration:
       hand: if given, the hand that it must belong to.
 
     Raises:
-      CalibrationError: missing, cut, not a calibration, of a newer version or of another hand.
+      CalibrationError: missing, cut, not a calibration, of a newer version, of another hand, or with a number
+        that no hand gives.
     """
     path = Path(path)
     table = _read(path)
-    names = tuple(_field(path, entry, "name", str) for entry in table["joint"])
-    if hand is not None and (table["hand"], names) != (hand.name, hand.joint_names):
+    entries = _list_of(path, table, "joint", dict)
+    names = tuple(_field(path, entry, "name", str) for entry in entries)
+    fingers = tuple(_list_of(path, table, "finger_names", str))
+    if hand is not None and (table["hand"], names, fingers) != (hand.name, hand.joint_names, hand.finger_names):
         raise CalibrationError(
-            f"{path}: is of hand {table['hand']!r} with {len(names)} joints, not of {hand.name!r}: calibrate this hand"
+            f"{path}: is of hand {table['hand']!r:.60} with {len(names)} joints and {len(fingers)} fingers, not of "
+            f"{hand.name!r} or its joints or fingers: calibrate this hand"
         )
-    real, sim = (_side(path, table["joint"], key) for key in ("real", "sim"))
-    fingers = tuple(_field(path, table, "finger_names", list))
-    per_count = np.array(_numbers(path, table, "force_per_count", len(fingers)))
-    scale = np.array([_numbers(path, entry, "torque_scale")[0] for entry in table["joint"]])
-    if not (np.all(scale > 0) and np.all(per_count > 0)):
-        raise CalibrationError(f"{path}: torque_scale and force_per_count must be above 0")
-    return Calibration(
-        real,
-        sim,
-        scale,
-        per_count,
+    calibration = Calibration(
+        _side(path, entries, "real"),
+        _side(path, entries, "sim"),
+        np.array([_numbers(path, entry, "torque_scale")[0] for entry in entries]),
+        np.array(_numbers(path, table, "force_per_count", len(fingers))),
         hand=table["hand"],
         joint_names=names,
         finger_names=fingers,
         current_per_count=_numbers(path, table, "current_per_count")[0],
         serial=_field(path, table, "serial", str),
+        handedness=_field(path, {"handedness": "", **table}, "handedness", str),
         created=_field(path, table, "created", str),
-        notes=tuple(_field(path, table, "notes", list)),
+        notes=tuple(_list_of(path, table, "notes", str)),
     )
+    bounds.check(path, calibration, hand)
+    return calibration
 
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
+        table = read_toml(path)
     except OSError as error:
         raise CalibrationError(f"{path}: cannot be read ({error.strerror})") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise CalibrationError(f"{path}: damaged or cut off ({error})") from None
+    except ValueError as error:
+        raise CalibrationError(f"{path}: damaged or cut off ({_line(error)})") from None
     if table.get("format") != FORMAT:
         raise CalibrationError(f"{path}: not a calibration file")
     version = _field(path, table, "version", int)
     if version > VERSION:
-        raise CalibrationError(f"{path}: is of version {version}, this library reads up to {VERSION}: upgrade dexsim")
+        raise CalibrationError(
+            f"{path}: is of version {version!s:.20}, this library reads up to {VERSION}: upgrade dexsim"
+        )
     if table.get("end") != {"complete": True} or not table.get("joint"):
         raise CalibrationError(f"{path}: cut off: its end is missing")
     _field(path, table, "hand", str)
@@ -256,28 +261,36 @@ def _side(path: Path, joints: list[dict], key: str) -> Side:
         )
     fields: dict[str, Any] = {name: np.array([column[i] for column in columns]).T for i, name in enumerate(_PAIRS)}
     fields |= {name: np.array([column[len(_PAIRS) + i][0] for column in columns]) for i, name in enumerate(_SINGLES)}
-    side = Side(**fields)
-    for name in ("gain", "offset", "value_max", "force_max"):
-        if not np.all(np.isfinite(getattr(side, name))):
-            raise CalibrationError(f"{path}: {key}.{name} must be finite numbers")
-    if np.any(side.gain == 0):
-        raise CalibrationError(f"{path}: {key}.gain is 0: torque would not follow")
-    return side
+    return Side(**fields)
 
 
 def _field(path: Path, table: dict, name: str, kind: type) -> Any:
     value = table.get(name)
-    if not isinstance(value, kind):
+    if type(value) is not kind:
         raise CalibrationError(f"{path}: field {name!r} is missing or not a {kind.__name__}")
     return value
+
+
+def _list_of(path: Path, table: dict, name: str, kind: type) -> list[Any]:
+    values = _field(path, table, name, list)
+    if any(type(value) is not kind for value in values):
+        raise CalibrationError(f"{path}: field {name!r} holds what is not a {kind.__name__}")
+    return values
 
 
 def _numbers(path: Path, table: dict, name: str, count: int = 1) -> list[float]:
     value = table.get(name)
     values: list[Any] = value if isinstance(value, list) else [value]
-    if len(values) != count or not all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in values):
+    if len(values) != count or any(type(v) not in (int, float) for v in values):
         raise CalibrationError(f"{path}: field {name!r} must hold {count} number(s)")
-    return [float(v) for v in values]
+    try:
+        return [float(v) for v in values]
+    except OverflowError:
+        raise CalibrationError(f"{path}: field {name!r} holds a number without bounds") from None
+
+
+def _line(error: object) -> str:
+    return " ".join(str(error).split())[:100]
 
 
 def _text(value: str) -> str:

@@ -27,6 +27,7 @@ from scipy.special import stdtrit
 from dexsim.calibration.joint import find_presses
 from dexsim.core.config import from_dict, to_dict
 from dexsim.core.errors import AssetError, DexsimError
+from dexsim.core.files import read_bounded
 from dexsim.core.robust_line import LEAST_GROUPS, Regression, fit_line, regress
 
 _RESAMPLES = 400
@@ -147,15 +148,23 @@ def load_fit(path: str | Path) -> dict[str, FingerFit]:
     """Read what `save_fit` wrote.
 
     Raises:
-      AssetError: missing or broken.
+      AssetError: missing, broken, or a gain that no sensor has.
     """
     try:
-        table = json.loads(Path(path).read_text())
-        return {name: from_dict(FingerFit, entry) for name, entry in table.items()}
+        table = json.loads(read_bounded(Path(path)))
+        fits = {name: from_dict(FingerFit, entry) for name, entry in table.items()}
     except FileNotFoundError:
         raise AssetError(f"{path}: no such file") from None
-    except (OSError, ValueError, AttributeError, TypeError, DexsimError) as error:
-        raise AssetError(f"{path}: not a sensor fit ({error})") from None
+    except (OSError, ValueError, AttributeError, TypeError, RecursionError, DexsimError) as error:
+        raise AssetError(f"{path}: not a sensor fit ({str(error):.100})") from None
+    for name, fit in fits.items():
+        # Readings are newtons or counts, of 1 mN to 1 N each.
+        if not 0.01 <= fit.gain.value <= 1e3 or not np.isfinite(fit.offset.value):
+            gain, offset = fit.gain.value, fit.offset.value
+            raise AssetError(
+                f"{path}: {name:.40}: gain {gain:g} and offset {offset:g}: must be 0.01 to 1000, and finite"
+            )
+    return fits
 
 
 def _checked(press: TaxelPress) -> tuple[np.ndarray, np.ndarray]:

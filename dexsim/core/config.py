@@ -53,7 +53,7 @@ def validate(config: Any) -> None:
         if choices is not None and value is not None:
             for item in value if isinstance(value, tuple) else (value,):
                 if item not in choices:
-                    raise ConfigError(f"{where} = {item!r}: choose from {', '.join(map(str, choices))}")
+                    raise ConfigError(f"{where} = {item!r:.80}: choose from {', '.join(map(str, choices))}")
         low, high = field.metadata.get("low"), field.metadata.get("high")
         for number in _numbers(value):
             if not math.isfinite(number):
@@ -112,7 +112,10 @@ def _numbers(value: Any) -> list[float]:
     if isinstance(value, bool) or value is None or isinstance(value, str):
         return []
     if isinstance(value, (int, float)):
-        return [float(value)]
+        try:
+            return [float(value)]
+        except OverflowError:  # A whole number of hundreds of digits.
+            return [math.inf]
     if isinstance(value, tuple):
         return [number for item in value for number in _numbers(item)]
     return []
@@ -141,7 +144,7 @@ def from_dict(cls: type[T], data: dict[str, Any]) -> T:
     known = {field.name for field in dataclasses.fields(cls)}
     for name in data:
         if name not in known:
-            raise ConfigError(f"{cls.__name__} has no field {name!r}")
+            raise ConfigError(f"{cls.__name__} has no field {name!r:.80}")
     return cls(**{name: _rebuild(hints[name], value, f"{cls.__name__}.{name}") for name, value in data.items()})
 
 
@@ -193,14 +196,14 @@ def _rebuild(hint: Any, value: Any, where: str) -> Any:
         return _rebuild(next(a for a in arguments if a is not type(None)), value, where)
     if origin is tuple:
         if not isinstance(value, (list, tuple)):
-            raise ConfigError(f"{where} = {value!r}: expected a list")
+            raise ConfigError(f"{where} = {value!r:.80}: expected a list")
         if len(arguments) == 2 and arguments[1] is Ellipsis:
             return tuple(_rebuild(arguments[0], item, where) for item in value)
         if len(value) != len(arguments):
             raise ConfigError(f"{where}: expected {len(arguments)} values, found {len(value)}")
         return tuple(_rebuild(a, item, where) for a, item in zip(arguments, value, strict=True))
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
+        return _numbers(value)[0]
     if isinstance(hint, type) and (not isinstance(value, hint) or (hint is int and isinstance(value, bool))):
-        raise ConfigError(f"{where} = {value!r}: expected {hint.__name__}")
+        raise ConfigError(f"{where} = {value!r:.80}: expected {hint.__name__}")
     return value

@@ -1,14 +1,21 @@
-"""Source files of a package, writing a file whole or not at all, and folders that nobody else may write to."""
+"""Source files of a package, writing a file whole or not at all, reading TOML within bounds, private folders."""
 
 import contextlib
 import fcntl
 import os
+import re
 import stat
 import tempfile
+import tomllib
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 _TEMPORARY = ".part"
+_SMALL = 128 * 1024  # bytes; a hand's calibration has 20,000
+_TOML_PARTS = 16  # of a dotted key; the reader's time and memory grow with their square
+_PART = r"""(?:[\w-]++|"(?:[^"\\\n]|\\.){0,200}+"|'[^'\n]{0,200}+')"""  # Of longer parts few fit into the file.
+_LONG_KEY = re.compile(rf"(?<![\w-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{{_TOML_PARTS},}}")
 
 
 def python_sources(package: Path) -> Iterable[Path]:
@@ -53,6 +60,37 @@ def remove_stale(folder: Path) -> None:
         with contextlib.suppress(OSError), path.open("rb") as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # BlockingIOError: somebody is writing
             path.unlink()
+
+
+def read_bounded(path: Path) -> bytes:
+    """Read a small file that anybody may have written, such as a calibration.
+
+    Raises:
+      ValueError: larger than 128 KiB.
+      OSError: it cannot be read.
+    """
+    with path.open("rb") as file:
+        data = file.read(_SMALL + 1)
+    if len(data) > _SMALL:
+        raise ValueError(f"larger than {_SMALL // 1024} KiB")
+    return data
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Read a TOML file that anybody may have written, in bounded time and memory.
+
+    Raises:
+      ValueError: too large, keys with too many parts, nested too deep, or no TOML.
+      OSError: it cannot be read.
+    """
+    text = read_bounded(path).decode("utf-8").replace("\r\n", "\n")
+    if found := _LONG_KEY.search(text):
+        line = text.count("\n", 0, found.start()) + 1
+        raise ValueError(f"a key with more than {_TOML_PARTS} parts (at line {line})")
+    try:
+        return tomllib.loads(text)
+    except RecursionError:
+        raise ValueError("nested too deep") from None
 
 
 def _locked_temporary(path: Path) -> tuple[int, str]:

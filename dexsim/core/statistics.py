@@ -31,12 +31,30 @@ def median(values: np.ndarray, samples: int = 500) -> dict:
     return statistic(values, np.median, "median", samples)
 
 
+def ratio(parts: np.ndarray, wholes: np.ndarray, samples: int = 500) -> dict:
+    """Sum of `parts` [N] over sum of `wholes` [N] with a bootstrap 95 % interval: a rate over all of a time."""
+
+    def divide(rows: np.ndarray | slice) -> float:
+        return float(parts[rows].sum() / wholes[rows].sum())
+
+    if not parts.size or not wholes.sum() > 0:
+        return {"mean": None, "low": None, "high": None}
+    low, high = bootstrap(divide, parts.size, samples)
+    return {"mean": divide(slice(None)), "low": low, "high": high}
+
+
 def statistic(values: np.ndarray, function: Callable, name: str, samples: int = 500) -> dict:
     """`function` of `values` [N] under `name`, with a bootstrap 95 % interval."""
     if values.size == 0:
         return {name: None, "low": None, "high": None}
     low, high = bootstrap(lambda rows: function(values[rows]), values.size, samples)
     return {name: float(function(values)), "low": low, "high": high}
+
+
+def entry(found: dict) -> dict:
+    """A statistic as a headline has it: its number as "value", with its interval."""
+    value = next(found[name] for name in ("mean", "median", "r") if name in found)
+    return {"value": value, "low": found["low"], "high": found["high"]}
 
 
 def bootstrap(function: Callable[[np.ndarray], float], count: int, samples: int) -> tuple[float, float]:

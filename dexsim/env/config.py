@@ -32,7 +32,7 @@ class EnvConfig:
     observation: ObservationConfig = setting(ObservationConfig())
     """What the policy sees."""
     pool_size: int = setting(2048, unit="1", low=1, high=1_000_000)
-    """Start states generated once; every episode starts from one of them."""
+    """Start states generated once; every episode starts from one of them. An evaluation generates its own."""
     touch_method: str = setting("closed_form", choices=TOUCH_METHODS)
     """How far a taxel is from the object: closed forms of the solver's primitives (for a mesh: of the boxes that
     follow it), a grid baked from the mesh, or the nearest of points on the surface, as in the paper."""

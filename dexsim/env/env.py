@@ -19,11 +19,12 @@ import numpy as np
 from dexsim.control import move_target, observed_action
 from dexsim.core.pytree import choose, pytree_dataclass
 from dexsim.env.episode import EpisodeSampler
+from dexsim.env.evaluation import EvaluationPlan, make_plan
 from dexsim.env.fingerprint import fingerprint
 from dexsim.env.motors import JointCommand, Motors, PhysicsTick, rotor_share
 from dexsim.env.observer import Observer
 from dexsim.env.senses import SensorSuite
-from dexsim.env.state import Episode, SensorInput, State
+from dexsim.env.state import Episode, SensorInput, Start, State
 from dexsim.env.task import GroundTruth, Task
 from dexsim.env.touch import TouchModel
 from dexsim.geometry import rotations
@@ -71,7 +72,7 @@ class Env:
           hand: the hand.
           backend: "auto", "jax", "warp" or "c".
           num_envs: batch size that the Warp buffers are sized for.
-          seed: of the pool.
+          seed: of the pool. Evaluations have pools of their own.
 
         Raises:
           AssetError, ConfigError: see `Physics`, `load_hand`.
@@ -125,14 +126,16 @@ class Env:
         `scale` [] in [0, 1] narrows what is drawn about nominal, now and at restarts; see `widen`.
         """
         key, pick = jax.random.split(key)
-        count = self.pool.qpos.shape[0]
-        return self.reset_to(key, jax.random.randint(pick, (), 0, count), scale=scale)
+        return self.reset_to(key, jax.random.randint(pick, (), 0, self.pool.qpos.shape[0]), scale=scale)
 
     def reset_to(self, key: jax.Array, index: jax.Array, goal: Any = None, scale: jax.Array | None = None) -> State:
         """A new episode from row `index` of the pool, with the task's goal or the given one."""
-        key, hand_key, goal_key, noise_key, sensor_key = jax.random.split(key, 5)
-        start = jax.tree.map(lambda rows: jnp.asarray(rows)[index], self.pool)
-        episode = self.sampler.sample(hand_key, sensor_key, start.object, scale)
+        return self.reset_from(key, jax.tree.map(lambda rows: jnp.asarray(rows)[index], self.pool), goal, scale)
+
+    def reset_from(self, key: jax.Array, start: Start, goal: Any = None, scale: jax.Array | None = None) -> State:
+        """A new episode from this start state: its poses and shape, with bulk, hand and sensors drawn by `key`."""
+        key, hand_key, goal_key, noise_key, sensor_key, object_key = jax.random.split(key, 6)
+        episode = self.sampler.sample(hand_key, sensor_key, object_key, start.object, scale)
         start = dataclasses.replace(start, object=episode.object)
         goal = self.task.begin(goal_key, start) if goal is None else goal
         command, tick = self.motors.rest(start.qpos, start.qvel, start.joint_target)
@@ -201,6 +204,7 @@ class Env:
             joint_torque=tick.joint_torque,
             pose=pose,
             finger_force=force,
+            normal_force=felt.normal_force,
             touch=felt.touch,
             object_position=place[:3],
             object_quat=quat,
@@ -284,6 +288,7 @@ class Env:
                 "length": outcome.length.astype(jnp.float32),
                 "shape": episode.object.shape_index.astype(jnp.float32),
                 "non_finite": 1.0 - jnp.asarray(tick.finite, jnp.float32),
+                "torque_limited": jnp.any(tick.limited).astype(jnp.float32),
             },
             taxel_memory=seen.taxel_memory,
             gear=tick.gear,
@@ -302,17 +307,19 @@ class Env:
         """Length of an evaluation episode, ticks."""
         return self.task.evaluation_ticks
 
-    def evaluation_starts(self, key: jax.Array, count: int) -> State:
-        """[count] start states by the task's fixed protocol."""
-        index, goal = self.task.evaluation_plan(count, np.asarray(self.pool.object.shape_index))
-        keys = jax.random.split(key, count)
-        return jax.vmap(self.reset_to)(keys, jnp.asarray(index), goal)
+    def evaluation_plan(self, count: int, seed: int) -> EvaluationPlan:
+        """The task's fixed protocol for `count` episodes, from a pool of start states of this evaluation's own."""
+        return make_plan(self.task, count, seed)
+
+    def evaluation_starts(self, plan: EvaluationPlan) -> State:
+        """[N] start states of a plan, or of a slice of one."""
+        return jax.vmap(self.reset_from)(plan.key, plan.start, plan.goal)
 
     def summarize(self, metrics: dict[str, np.ndarray], alive: np.ndarray) -> dict:
         """The task's report of an evaluation (host).
 
-        A task of kind "series" gets metrics [T, N] and alive [T, N]; one of kind "totals" those
-        of each episode's last tick [N] and the ticks lived [N].
+        A task of kind "series" gets metrics [T, N] and alive [T, N]; one of kind "totals" those of each episode's last
+        tick [N] and the ticks lived [N].
         """
         return self.task.summarize(metrics, alive, self.control_period)
 

@@ -1,7 +1,5 @@
 """What an episode draws at its start: the hand, the object's bulk, the IMU and the taxels."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,7 +10,8 @@ from dexsim.env.senses import SensorSuite
 from dexsim.env.state import Episode
 from dexsim.env.task import Task
 from dexsim.hand.kinematics import Hand
-from dexsim.objects.params import ObjectParams, toward_nominal
+from dexsim.objects.config import BULK_RANGES
+from dexsim.objects.params import ObjectParams, redraw_bulk, toward_nominal
 from dexsim.randomization import HandParams, sample_hand, tilted_down
 from dexsim.sensing.imu import ImuParams
 
@@ -22,17 +21,27 @@ class EpisodeSampler:
 
     def __init__(self, config: EnvConfig, hand: Hand, task: Task, senses: SensorSuite):
         self.config, self.hand, self.task, self.senses = config, hand, task, senses
+        self._bulk = tuple(name for name in BULK_RANGES if f"objects.{name}" in task.object_ranges)
 
     def sample(
-        self, hand_key: jax.Array, sensor_key: jax.Array, object: ObjectParams, scale: jax.Array | None = None
+        self,
+        hand_key: jax.Array,
+        sensor_key: jax.Array,
+        object_key: jax.Array,
+        object: ObjectParams,
+        scale: jax.Array | None = None,
     ) -> Episode:
         """One episode.
 
         Args:
-          hand_key, sensor_key: of hand and IMU, and of the sensors.
-          object: of the start state, for which it was chosen.
+          hand_key, sensor_key, object_key: of hand and IMU, of the sensors, and of the object's bulk.
+          object: of the start state. Its shape stays, for the state was chosen for it; what of its bulk the task
+            draws (`Task.object_ranges`) is drawn anew.
           scale: [] in [0, 1], narrows every range about nominal; None for 1.
         """
+        if self._bulk:
+            plain = self.task.unit_inertia(object)
+            object = redraw_bulk(object_key, object, self.config.objects, plain, self._bulk)
         if scale is not None:
             object = toward_nominal(object, self.config.objects, self.task.unit_inertia(object), scale)
         width = 1.0 if scale is None else scale
@@ -43,7 +52,7 @@ class EpisodeSampler:
     def sample_hand(
         self, hand_key: jax.Array, sensor_key: jax.Array, scale: jax.Array | float = 1.0
     ) -> tuple[HandParams, ImuParams]:
-        """The hand, and the object's IMU as that hand's host takes it."""
+        """The hand, and the object's IMU."""
         ranges = self.config.randomization
         hand = sample_hand(
             hand_key,
@@ -54,10 +63,7 @@ class EpisodeSampler:
             scale=scale,
         )
         extreme = sample_extreme(hand_key, ranges.extremes)  # the one that `sample_hand` draws
-        imu = self.senses.sample_imu(sensor_key, ranges.scale * scale, extreme)
-        # An IMU's upright is the true one; the host takes it for that of a hand without tilt.
-        down, tilted = self._gravity(hand)
-        return hand, dataclasses.replace(imu, bias=imu.bias + jnp.cross(tilted, down))
+        return hand, self.senses.sample_imu(sensor_key, ranges.scale * scale, extreme)
 
     def tilt_force(self, episode: Episode) -> jax.Array:
         """The object's share [3] N of a tilted gravity; the links' share is small and left out."""

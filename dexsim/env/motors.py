@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dexsim.actuator.drive import apply_friction, delayed_target, drive
+from dexsim.actuator.drive import apply_friction, at_limit, delayed_target, drive
 from dexsim.actuator.gear_play import GearPlay, GearState, drive_beside, gear_at
 from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import choose, pytree_dataclass
@@ -45,6 +45,7 @@ class PhysicsTick:
     finger_force: jax.Array  # [F, 3] N, of the object on the finger tips
     joint_torque: jax.Array  # [J] Nm, by the motors' currents at the end of the tick
     gear: GearState | None  # with gear play
+    limited: jax.Array  # [J] bool, whether the motor is at its torque limit at the end of the tick
     finite: jax.Array  # [] bool; where false the world stays as it was, without forces
 
 
@@ -80,6 +81,7 @@ class Motors:
             finger_force=jnp.zeros((self.hand.num_fingers, 3)),
             joint_torque=zero,
             gear=gear_at(joints, jnp.zeros_like(joints)) if self.gear_play else None,
+            limited=jnp.zeros(self.hand.num_joints, bool),
             finite=valid,
         )
 
@@ -101,8 +103,10 @@ class Motors:
         law = self.law(episode.hand, command)
         after, force, turned = self.physics.advance_motors(episode.object, physics, law, gear, push)
         after, turned, force, finite = stay_finite(command.valid, (physics, gear), (after, turned), force)
-        torque = self.current_torque(episode.hand, command, after, turned)
-        return PhysicsTick(physics=after, finger_force=force, joint_torque=torque, gear=turned, finite=finite)
+        torque, limited = self.current_torque(episode.hand, command, after, turned)
+        return PhysicsTick(
+            physics=after, finger_force=force, joint_torque=torque, gear=turned, limited=limited, finite=finite
+        )
 
     def law(self, hand: HandParams, command: JointCommand) -> MotorLaw:
         """The motors as `Physics.advance_motors` wants them."""
@@ -140,13 +144,15 @@ class Motors:
 
     def current_torque(
         self, hand: HandParams, command: JointCommand, physics: PhysicsState, gear: GearState | None
-    ) -> jax.Array:
-        """The torque [J] Nm that the motors' currents tell of at the end of a tick, before friction."""
+    ) -> tuple[jax.Array, jax.Array]:
+        """The torque [J] Nm that the motors' currents tell of at the end of a tick, before friction, and whether it
+        [J] is at its limit."""
         position, velocity = (physics.qpos[self.physics.joint_qpos], physics.qvel[self.physics.joint_dof])
         if gear is not None:
             position, velocity = gear.rotor.position, gear.rotor.velocity
         wanted = delayed_target(jnp.asarray(self._substeps), hand.latency, command.previous, command.target)
-        return drive(hand.actuator, wanted, jnp.zeros_like(wanted), position, velocity)
+        state = hand.actuator, wanted, jnp.zeros_like(wanted), position, velocity
+        return drive(*state), at_limit(*state)
 
 
 def stay_finite(valid: jax.Array, before: Any, after: Any, force: jax.Array) -> tuple[Any, Any, jax.Array, jax.Array]:

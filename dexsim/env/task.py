@@ -37,6 +37,7 @@ class GroundTruth:
     joint_torque: jax.Array  # [J] Nm
     pose: HandPose
     finger_force: jax.Array  # [F, 3] N, of the object on the finger tips
+    normal_force: jax.Array  # [F] N of it, into the skin; 0 where the finger touches with no skin
     touch: Touch
     object_position: jax.Array  # [3] m
     object_quat: jax.Array  # [4]
@@ -73,7 +74,8 @@ class Task(Protocol):
     evaluation: str
     """What `summarize` is given: "series" or "totals"."""
     object_ranges: tuple[str, ...]
-    """Paths in `config` of the ranges that `sample_object` draws from, for the self-test of the randomisation."""
+    """Paths in `config` of the ranges that `sample_object` draws from. Those of the object's bulk among them, such as
+    "objects.mass", are drawn anew at every episode start; the others stay as the pool has them."""
 
     @property
     def config(self) -> EnvConfig:
@@ -81,7 +83,8 @@ class Task(Protocol):
         ...
 
     def make_pool(self, key: jax.Array) -> Start:
-        """Start states [P, ...] of which every episode begins with one; made once.
+        """Start states [P, ...] of which every episode begins with one; made once for training, and once for each
+        evaluation, with keys of their own.
 
         Raises:
           ConfigError: the configuration leaves too few of them.
@@ -125,8 +128,8 @@ class Task(Protocol):
     def reward(self, goal: Any, truth: GroundTruth, dropped: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
         """The reward [] of a tick, and metrics [] by name.
 
-        Names must be the same in every tick; "return", "length", "shape", "non_finite" and names that begin with
-        "tangential" are the environment's.
+        Names must be the same in every tick; "return", "length", "shape", "non_finite", "torque_limited" (whether a
+        joint is at its torque limit) and names that begin with "tangential" are the environment's.
 
         Args:
           goal: the one that held during the tick.
@@ -144,15 +147,17 @@ class Task(Protocol):
 
         Args:
           count: how many.
-          shape_index: [P] of the pool's objects.
+          shape_index: [P] of the objects in the evaluation's pool.
 
         Returns:
-          Rows [count] of the pool, and Goals [count, ...].
+          Rows [count] of that pool, and Goals [count, ...]. Rows repeat only where there are too few
+          of them, or where episodes are meant to share a start.
         """
         ...
 
     def summarize(self, metrics: dict[str, np.ndarray], alive: np.ndarray, control_period: float) -> dict[str, Any]:
-        """An evaluation's report: plain data that JSON can hold. "headline" maps names to the numbers to print.
+        """An evaluation's report: plain data that JSON can hold. "headline" maps names to what is
+        printed, figures that a hand that does nothing fails: numbers, or dictionaries with "value", "low" and "high".
 
         Args:
           metrics: the environment's, by name. For "series" [T, N], zero once an episode has ended; for "totals" [N],

@@ -19,6 +19,7 @@ class FingertipTouch:
     """What the fingertips feel in a tick; F fingers, N taxels."""
 
     touch: Touch  # [F, N]
+    normal_force: jax.Array  # [F] N, what of the finger's force presses into its skin, with or without taxels
     tangential_force: jax.Array | None  # [F, 3] N along the taxels, with three-axis taxels
 
 
@@ -42,18 +43,18 @@ class TouchModel:
         """
         hand, config = self.hand, self.config
         if config.touch:
-            touch, share = self._press(pose, object, position, quat, force)
+            touch, normal, share = self._press(pose, object, position, quat, force)
         else:
-            nothing, share = jnp.zeros(hand.taxel_area.shape), 1.0
+            nothing, normal, share = jnp.zeros(hand.taxel_area.shape), jnp.zeros(hand.num_fingers), 1.0
             touch = Touch(nothing, nothing, nothing)
         if not config.three_axis:
-            return FingertipTouch(touch, None)
-        return FingertipTouch(touch, split_force(touch.force, taxel_normals(hand, pose), share * force)[1])
+            return FingertipTouch(touch, normal, None)
+        return FingertipTouch(touch, normal, split_force(touch.force, taxel_normals(hand, pose), share * force)[1])
 
     def _press(
         self, pose: HandPose, object: ObjectParams, position: jax.Array, quat: jax.Array, force: jax.Array
-    ) -> tuple[Touch, jax.Array | float]:
-        """The touch, and the share [F, 1] of each finger's load that the taxels bear."""
+    ) -> tuple[Touch, jax.Array, jax.Array | float]:
+        """The touch, the normal forces [F] N, and the share [F, 1] of each finger's load that the taxels bear."""
         hand, skin, surface = self.hand, self.config.skin, self._surface
         touch = feel_links(
             hand,
@@ -65,9 +66,10 @@ class TouchModel:
             skin,
             surface,
         )
+        # In the links' frames, where the normals are constants.
+        local = rotations.rotate_inverse(pose.tip_rotation, force)
+        pressed = keep_normal_part(touch, jnp.asarray(surface.normal), local)
         if skin.total == "pressing":
-            # In the links' frames, where the normals are constants.
-            local = rotations.rotate_inverse(pose.tip_rotation, force)
-            touch = keep_normal_part(touch, jnp.asarray(surface.normal), local)
+            touch = pressed
         share = taxel_share(touch.skin_force, hand.num_taxels) if skin.untaxelled else 1.0
-        return jax.tree.map(lambda x: x[:, : hand.num_taxels], touch), share
+        return jax.tree.map(lambda x: x[:, : hand.num_taxels], touch), jnp.sum(pressed.force, -1), share

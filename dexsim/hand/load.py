@@ -5,7 +5,6 @@ files under `assets/hand/` knows which hand it is.
 """
 
 import csv
-import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ import numpy as np
 
 from dexsim.core.assets import asset_path
 from dexsim.core.errors import AssetError
+from dexsim.core.files import read_toml
 from dexsim.hand.kinematics import (
     Geom,
     Hand,
@@ -164,12 +164,14 @@ def _check_table(path: Path, table: dict) -> None:
         if key not in table:
             raise AssetError(f"{path}: no entry {key!r}")
         if not isinstance(table[key], kind):
-            raise AssetError(f"{path}: {key} = {table[key]!r}: expected a {'string' if kind is str else 'list'}")
+            raise AssetError(f"{path}: {key} = {table[key]!r:.60}: expected a {'string' if kind is str else 'list'}")
+    if not isinstance(table.get("name", ""), str):
+        raise AssetError(f"{path}: name = {table['name']!r:.60}: expected a string")
     grid, speeds = table["taxel_grid"], table["speed_limits"]
-    if len(grid) != 2 or any(type(n) is not int or n < 1 for n in grid):
-        raise AssetError(f"{path}: taxel_grid = {grid}: expected two whole numbers above 0")
-    if any(type(v) not in (int, float) or not 0 < v < np.inf for v in speeds):
-        raise AssetError(f"{path}: speed_limits = {speeds}: expected numbers above 0, rad/s")
+    if len(grid) != 2 or any(type(n) is not int or not 1 <= n <= 1000 for n in grid):
+        raise AssetError(f"{path}: taxel_grid = {grid!s:.60}: expected two whole numbers above 0, at most 1000")
+    if any(type(v) not in (int, float) or not 0 < v <= 1000 for v in speeds):
+        raise AssetError(f"{path}: speed_limits = {speeds!s:.60}: expected numbers above 0, at most 1000 rad/s")
     if any(type(name) is not str for name in table["joints"]) or not table["fingers"]:
         raise AssetError(f"{path}: joints must list names, and there must be a finger")
     for number, finger in enumerate(table["fingers"], start=1):
@@ -238,11 +240,10 @@ def _read_geoms(model, row: dict[int, int]) -> tuple[Geom, ...]:
 
 def _read_toml(path: Path) -> dict:
     try:
-        with open(path, "rb") as file:
-            return tomllib.load(file)
+        return read_toml(path)
     except FileNotFoundError:
         raise AssetError(f"{path}: no such file") from None
-    except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (OSError, ValueError) as error:
         raise AssetError(f"{path}: {error}") from None
 
 

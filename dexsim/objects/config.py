@@ -26,7 +26,8 @@ SPHERE_HALF_LENGTH = 1e-4  # m, half-length of a capsule that plays a sphere
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ObjectConfig:
-    """Which objects are drawn, and their ranges (low, high). Resampled at every episode start."""
+    """Which objects are drawn, and their ranges (low, high). Bulk (mass to restitution) is drawn at every episode
+    start, shape and sizes once for each start state of the pool, whose poses were chosen for them."""
 
     shapes: tuple[str, ...] = setting(SHAPES, choices=SHAPES)
     """Kinds of object, drawn with equal probability."""

@@ -85,6 +85,7 @@ class ObjectParams:
     quat: jax.Array | None = None  # [K, 4] slot orientations in the object's frame; None: aligned
     link_friction: jax.Array | None = None  # [] sliding on the rest of the hand; None: as `friction`
     kinds: tuple[str, ...] = static(default=SLOTS)
+    extreme: jax.Array | None = None  # [] bool, whether every value is at an end of its range; None: no object's is
 
     def pair_friction(self, rubber: np.ndarray) -> jax.Array:
         """Sliding friction [P] of pairs of the object with a fingertip (`rubber` [P]) or the bare hand."""
@@ -115,52 +116,89 @@ def sample_object(key: jax.Array, config: ObjectConfig, shape_index: jax.Array |
     size, position, active = _sample_slots(keys[1], shape_index, config, extreme)
     density_mass, com, inertia = _mass_properties(size, position, active)
     position = position - com[None]  # the origin is the centre of a uniform solid
-    mass = uniform(keys[2], config.mass, extreme)
-    scale = uniform(keys[3], config.inertia_scale, extreme) * mass / density_mass
-    com = config.com_offset * uniform(keys[4], (-1.0, 1.0), extreme, (3,))
-    return ObjectParams(
-        shape_index.astype(jnp.int32),
-        size,
-        position,
-        active,
-        mass,
-        inertia * scale,
-        com,
-        uniform(keys[5], config.friction, extreme),
-        _sample_contact(keys, config, extreme),
-        link_friction=_sample_link_friction(keys, config, extreme),
+    return _with_bulk(
+        _bare(shape_index.astype(jnp.int32), size, position, active, extreme),
+        inertia / density_mass,
+        _sample_bulk(keys, config, extreme),
     )
 
 
 def _sample_mesh(keys: jax.Array, config: ObjectConfig, extreme: jax.Array | None) -> ObjectParams:
     mesh_object = load_mesh_object(config)
-    factor, mass = uniform(keys[1], config.mesh_size, extreme), uniform(keys[2], config.mass, extreme)
+    factor = uniform(keys[1], config.mesh_size, extreme)
     size, position, quat = scaled_boxes(mesh_object, factor)
-    inertia = mass * factor**2 * uniform(keys[3], config.inertia_scale, extreme) * jnp.asarray(mesh_object.inertia)
-    com = config.com_offset * uniform(keys[4], (-1.0, 1.0), extreme, (3,))
+    object = _bare(jnp.int32(KINDS.index("mesh")), size, position, jnp.ones(len(size), bool), extreme)
+    object = dataclasses.replace(object, quat=quat, kinds=mesh_object.kinds)
+    return _with_bulk(object, factor**2 * jnp.asarray(mesh_object.inertia), _sample_bulk(keys, config, extreme))
+
+
+def _bare(
+    shape_index: jax.Array, size: jax.Array, position: jax.Array, active: jax.Array, extreme: jax.Array | None
+) -> ObjectParams:
+    """An object that is a shape so far."""
+    zero, three = jnp.zeros(()), jnp.zeros(3)
     return ObjectParams(
-        jnp.int32(KINDS.index("mesh")),
-        size,
-        position,
-        jnp.ones(len(size), bool),
-        mass,
-        inertia,
-        com,
-        uniform(keys[5], config.friction, extreme),
-        _sample_contact(keys, config, extreme),
-        quat,
-        _sample_link_friction(keys, config, extreme),
-        mesh_object.kinds,
+        shape_index, size, position, active, zero, three, three, zero, jnp.zeros(2), link_friction=zero, extreme=extreme
     )
 
 
-def _sample_link_friction(keys: jax.Array, config: ObjectConfig, extreme: jax.Array | None) -> jax.Array:
-    return uniform(jax.random.fold_in(keys[5], 1), config.link_friction, extreme)
+# --- bulk: what an object is beside its shape, by the names of `BULK_RANGES` ---------------------
 
 
-def _sample_contact(keys: jax.Array, config: ObjectConfig, extreme: jax.Array | None) -> jax.Array:
-    return jnp.stack(
-        [uniform(keys[6], config.stiffness, extreme), damping_ratio(uniform(keys[7], config.restitution, extreme))]
+def redraw_bulk(
+    key: jax.Array, object: ObjectParams, config: ObjectConfig, plain: jax.Array, names: tuple[str, ...]
+) -> ObjectParams:
+    """The same object with another bulk. Its shape stays: start states were chosen for it.
+
+    Args:
+      key: of the bulk.
+      object: one of `config`; an extreme object stays one, at ends of its own for every value.
+      config: the ranges.
+      plain: [3] m^2, inertia of its shape as a uniform solid of 1 kg.
+      names: the ranges, of `BULK_RANGES`, that are drawn.
+    """
+    drawn = _sample_bulk(jax.random.split(key, 8), config.narrowed(), object.extreme)
+    kept = _bulk_of(object, plain)
+    return _with_bulk(object, plain, {name: (drawn if name in names else kept)[name] for name in kept})
+
+
+def _sample_bulk(keys: jax.Array, config: ObjectConfig, extreme: jax.Array | None) -> dict[str, jax.Array]:
+    """One value of each bulk range; "com_offset" is the centre of mass [3], "restitution" a damping ratio."""
+    return {
+        "mass": uniform(keys[2], config.mass, extreme),
+        "inertia_scale": uniform(keys[3], config.inertia_scale, extreme),
+        "com_offset": config.com_offset * uniform(keys[4], (-1.0, 1.0), extreme, (3,)),
+        "friction": uniform(keys[5], config.friction, extreme),
+        "link_friction": uniform(jax.random.fold_in(keys[5], 1), config.link_friction, extreme),
+        "stiffness": uniform(keys[6], config.stiffness, extreme),
+        "restitution": damping_ratio(uniform(keys[7], config.restitution, extreme)),
+    }
+
+
+def _bulk_of(object: ObjectParams, plain: jax.Array) -> dict[str, jax.Array]:
+    """The bulk of an object whose shape has the unit inertia `plain` [3]."""
+    link_friction = object.friction if object.link_friction is None else object.link_friction
+    return {
+        "mass": object.mass,
+        "inertia_scale": object.inertia / (object.mass * plain),
+        "com_offset": object.com,
+        "friction": object.friction,
+        "link_friction": link_friction,
+        "stiffness": object.contact[0],
+        "restitution": object.contact[1],
+    }
+
+
+def _with_bulk(object: ObjectParams, plain: jax.Array, bulk: dict[str, jax.Array]) -> ObjectParams:
+    """The object with this bulk; see `_bulk_of`."""
+    return dataclasses.replace(
+        object,
+        mass=bulk["mass"],
+        inertia=bulk["mass"] * plain * bulk["inertia_scale"],
+        com=bulk["com_offset"],
+        friction=bulk["friction"],
+        contact=jnp.stack([bulk["stiffness"], bulk["restitution"]]),
+        link_friction=None if object.link_friction is None else bulk["link_friction"],
     )
 
 
@@ -183,24 +221,11 @@ def toward_nominal(object: ObjectParams, config: ObjectConfig, plain: jax.Array,
       plain: [3] m^2, inertia of its shape as a uniform solid of 1 kg.
       scale: [] in [0, 1]; 0 is nominal exactly, 1 leaves the object as it is.
     """
-    config = config.narrowed()
-
-    def toward(name: str, value: jax.Array) -> jax.Array:
-        centre = nominal(config, name)
-        return centre + scale * (value - centre)
-
-    mass, drawn = toward("mass", object.mass), object.inertia / (object.mass * plain)
-    bounce = damping_ratio(jnp.asarray(nominal(config, "restitution")))
-    contact = jnp.stack([toward("stiffness", object.contact[0]), bounce + scale * (object.contact[1] - bounce)])
-    return dataclasses.replace(
-        object,
-        mass=mass,
-        inertia=mass * plain * toward("inertia_scale", drawn),
-        com=scale * object.com,
-        friction=toward("friction", object.friction),
-        contact=contact,
-        link_friction=(None if object.link_friction is None else toward("link_friction", object.link_friction)),
-    )
+    config, bulk = config.narrowed(), _bulk_of(object, plain)
+    middle = {name: nominal(config, name) for name in bulk if name != "com_offset"} | {"com_offset": 0.0}
+    middle["restitution"] = damping_ratio(jnp.asarray(middle["restitution"]))
+    near = {name: middle[name] + scale * (value - middle[name]) for name, value in bulk.items()}
+    return _with_bulk(object, plain, near)
 
 
 def restitution(ratio: np.ndarray) -> np.ndarray:

@@ -28,7 +28,7 @@ class PhysicsConfig:
     """Time scale on which a contact resolves penetration (at least four time steps)."""
     contacts: str = setting("closed", choices=("closed", "mjx"))
     """JAX backend only. closed: MJX's rigid bodies with closed-form contacts and our own solver where the scene allows
-    it (`dexsim.physics.solver.substep`); mjx: `mjx.step`, about six times slower on a CPU."""
+    it (`dexsim.physics.solver.substep`); mjx: `mjx.step`, about twice as slow on a CPU, other points on boxes."""
     max_contacts: int = setting(20, unit="1", low=4, high=400)
     """Contacts kept per environment (JAX backend: the deepest; Warp: mean over the batch)."""
 

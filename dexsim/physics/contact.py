@@ -1,10 +1,10 @@
 """Contacts of hand and object: their stiffness in MuJoCo's terms, and the rubber on the fingertips.
 
-A spring of constant stiffness gives the same force on a face, an edge and a corner. Skin does not: at equal depth an
-edge presses half as hard as a face. So the stiffness of a fingertip's springs is computed at every tick from the
-skin's law over the taxels (`follow_skin`), and the solver's force is that of the skin. For this a fingertip is a row of
-spheres (`split_pads`). A sphere has exactly one contact point with a primitive, on every engine, at a depth in closed
-form; a capsule has one or two points on a box, which differ between engines.
+A spring of constant stiffness gives the same force on a face, over its rim and at its corner. Skin does not: at equal
+depth the rim presses half as hard, the corner a quarter. So the stiffness of a fingertip's springs is computed at every
+tick from the skin's law over the taxels, and the skin beyond them where that bears load (`follow_skin`), and the
+solver's force is that of the skin. For this a fingertip is a row of spheres (`split_pads`). A sphere has exactly one
+contact point with a primitive, on every engine, at a depth in closed form; a capsule has one or two points on a box.
 """
 
 import dataclasses
@@ -20,6 +20,7 @@ from dexsim.hand.kinematics import Hand, HandPose
 from dexsim.objects.params import ObjectParams
 from dexsim.touch.feel import feel_links
 from dexsim.touch.skin import Skin
+from dexsim.touch.surface import Surface
 
 # One sphere's share of a fingertip's stiffness: two or three of a row touch at once.
 ROW_SHARE = 0.5
@@ -146,6 +147,7 @@ def follow_skin(
     hand: Hand,
     pads: Pads,
     skin: Skin,
+    surface: Surface,
     pose: HandPose,
     object: ObjectParams,
     position: jax.Array,
@@ -158,10 +160,11 @@ def follow_skin(
     The first millimetre blends (`BLEND_DEPTH`).
 
     Args:
+      surface: the skin that bears load (`dexsim.touch.surface.skin_surface`).
       pose: of the hand; `position` [3] and `rotation` [3, 3] are the object's, in the palm frame.
     """
     shape = object.shape()
-    touch = feel_links(hand, pose, shape, position, rotation, jnp.ones(hand.num_fingers), skin)
+    touch = feel_links(hand, pose, shape, position, rotation, jnp.ones(hand.num_fingers), skin, surface)
     centre = pose.body_position[hand.tip_body][:, None] + rotations.rotate(
         pose.tip_rotation[:, None], jnp.asarray(pads.centre)
     )

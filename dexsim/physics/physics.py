@@ -1,6 +1,6 @@
 """`Physics`: the hand, an object and their contacts in one compiled scene, on the engine of choice.
 
-`advance` runs the scene for one control tick. Backends are `jax` (differentiable, any device), `warp` (about six times
+`advance` runs the scene for one control tick. Backends are `jax` (differentiable, any device), `warp` (about four times
 faster on NVIDIA GPUs) and `c` (C MuJoCo on the CPU's cores); `mujoco.mjx` is not imported before a scene is compiled.
 """
 
@@ -25,12 +25,13 @@ from dexsim.physics.model import build_scene
 from dexsim.physics.seam import Backend, ContactParams, PhysicsState, TorqueLaw
 from dexsim.physics.warp_backend import WarpBackend
 from dexsim.touch.skin import Skin
+from dexsim.touch.surface import skin_surface
 
 BACKENDS: dict[str, Callable[..., Backend]] = {"jax": JaxBackend, "warp": WarpBackend, "c": CBackend}
 
 
 def choose_backend(backend: str) -> str:
-    """The name of a backend; `auto` is Warp where it can be imported and JAX runs on an NVIDIA GPU, else JAX.
+    """The name of a backend. `auto`: c on a CPU, warp on an NVIDIA GPU where it can be imported, else jax.
 
     Raises:
       ConfigError: no such backend, or its library or device is missing.
@@ -39,7 +40,7 @@ def choose_backend(backend: str) -> str:
         raise ConfigError(f"backend {backend!r}: choose from auto, {', '.join(BACKENDS)}")
     device, found = jax.default_backend(), importlib.util.find_spec("warp") is not None
     if backend == "auto":
-        return "warp" if found and device in ("gpu", "cuda") else "jax"
+        return "c" if device == "cpu" else "warp" if found and device in ("gpu", "cuda") else "jax"
     if backend == "warp" and not found:
         raise ConfigError(f"backend 'warp' needs the extra: {install_line('warp')}")
     if backend == "c" and device != "cpu":
@@ -90,15 +91,16 @@ class Physics:
             scene.model, scene.object_pairs, scene.tip_bodies
         )
         self._pads = contact.find_pads(scene.model, scene.object_pairs, scene.tip_bodies)
+        self._surface = None if skin is None else skin_surface(hand, skin)
         self.engine = BACKENDS[self.backend](scene, num_envs)
 
     def tip_stiffness(self, object: ObjectParams, qpos: jax.Array) -> jax.Array:
         """How much stiffer [F] than nominal the fingertips are where they press now."""
-        assert self.skin is not None, "without a skin, springs are constant"
+        assert self.skin is not None and self._surface is not None, "without a skin, springs are constant"
         place = qpos[self.object_qpos]
         turn = rotations.quat_to_matrix(place[3:] / jnp.linalg.norm(place[3:]))
         pose = forward_kinematics(self.hand, qpos[self.joint_qpos])
-        return contact.follow_skin(self.hand, self._pads, self.skin, pose, object, place[:3], turn)
+        return contact.follow_skin(self.hand, self._pads, self.skin, self._surface, pose, object, place[:3], turn)
 
     def contact_params(self, object: ObjectParams, tips: jax.Array | None = None) -> ContactParams:
         """Contact parameters of an object; `tips` [F] is the fingertips' stiffness over the nominal one."""

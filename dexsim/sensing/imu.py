@@ -22,7 +22,7 @@ class ImuConfig:
     noise: float = setting(0.02, unit="rad", low=0.0, high=1.0)
     """Standard deviation of white noise, per axis."""
     bias: float = setting(0.04, unit="rad", low=0.0, high=1.0)
-    """Largest constant misalignment, per axis."""
+    """Largest constant misalignment, per axis: how far off the pose is that it is aligned to."""
     drift: float = setting(0.0005, unit="rad/s", low=0.0, high=0.1)
     """Largest drift of the heading about the vertical."""
     rate: float = setting(100.0, unit="Hz", low=1.0, high=10000.0)
@@ -39,7 +39,7 @@ class ImuConfig:
 class ImuParams:
     """One episode's sensor."""
 
-    bias: jax.Array  # [3] rad; misalignment, and a tilt of the hand that the host does not know
+    bias: jax.Array  # [3] rad
     drift: jax.Array  # [] rad/s
     delay: jax.Array  # [] fraction of a control tick
     phase: jax.Array  # [] fraction of a sampling period

@@ -21,7 +21,8 @@ class Skin:
 
     c10: float = setting(0.003e6, unit="Pa", low=0.0, high=1e8)
     """First Mooney-Rivlin coefficient; that of the XHand's skin is not published. The fingertips' stiffness in the
-    physics follows from it (`contact.follow_skin`): about 2 N/mm on a face, 1 N/mm on an edge."""
+    physics follows from it (`contact.follow_skin`): a face presses an outer finger with 1 N at 1 mm and 6 N at 2 mm,
+    its rim with half of that."""
     c01: float = setting(0.0, unit="Pa", low=-1e8, high=1e8)
     """Second Mooney-Rivlin coefficient. Negative values (fits to tension alone) are refused where
     they would make the skin soften before `max_compression`."""
@@ -38,8 +39,9 @@ class Skin:
     """Which part of the physics' contact force a finger's taxels share: what presses into the skin, which is all
     that a one-axis taxel feels (pressing), or the magnitude with friction (solver), as in the paper."""
     untaxelled: bool = False
-    """True: the fingertips' skin beyond the taxels bears its share of a finger's total, which no taxel reads
-    (`dexsim.touch.surface`). False: the taxels share all of it, as in the paper."""
+    """True: the fingertips' skin beyond the taxels bears its share of a finger's total, which no taxel reads, and of
+    the contact's stiffness (`dexsim.touch.surface`). False: the skin ends with the taxels, which share all of it, as
+    in the paper; beyond them fingertips are as soft as `contact.SOFTEST` lets them be."""
 
     def __post_init__(self):
         validate(self)

@@ -84,7 +84,7 @@ def make_train(env: Environment, config: PPOConfig, curriculum: Curriculum | Non
         init=lambda key: jax.tree.map(jnp.copy, compiled_init(key)),
         shapes=lambda key: jax.eval_shape(init, key),
         plain_step=step,
-        step=jit(step, donate_argnums=0),
+        step=jit(step, backend=env.backend, donate_argnums=0),
     )
 
 

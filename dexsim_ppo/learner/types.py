@@ -99,8 +99,15 @@ class Environment(Protocol):
         """Set the episode clock to a random time, so that a batch does not truncate all at once."""
         ...
 
-    def evaluation_starts(self, key: jax.Array, count: int) -> Any:
-        """States [count] at which the task's evaluation episodes start."""
+    def evaluation_plan(self, count: int, seed: int) -> Any:
+        """The task's evaluation episodes: a pytree of [count, ...] arrays (host).
+
+        Its attribute `row` [count] is the same for episodes that begin from the same start, and so are not independent.
+        """
+        ...
+
+    def evaluation_starts(self, plan: Any) -> Any:
+        """States [N] at which the episodes of a plan, or of a slice of one, start."""
         ...
 
     def summarize(self, metrics: dict[str, np.ndarray], alive: np.ndarray) -> dict[str, Any]:

@@ -32,7 +32,7 @@ class TrainArguments(Generic[EnvConfig]):
     seed: int = setting(0, unit="1", low=0, high=2**32 - 1)
     """Seed of everything random."""
     backend: Literal["auto", "jax", "warp", "c"] = setting("auto")
-    """Physics backend. auto: warp on a GPU if it is installed, otherwise jax."""
+    """Physics backend. auto: c on a CPU, warp on an NVIDIA GPU if it is installed, otherwise jax."""
     preset: Literal["auto", "cpu", "gpu"] = setting("auto")
     """Default sizes and durations. auto: those of the device found."""
     steps: float = setting(0.0, unit="environment steps", low=0.0)

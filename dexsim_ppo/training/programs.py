@@ -69,7 +69,9 @@ class Program:
         return self._leaves.back(done[0]), dict(zip(self._names, done[1], strict=True))
 
 
-def compile_step(step: Callable, shapes: Any, identity: Any, on_traced: Callable[[], None]) -> Callable:
+def compile_step(
+    step: Callable, shapes: Any, identity: Any, on_traced: Callable[[], None], backend: str = "jax"
+) -> Callable:
     """Compile a training step, or load it from the cache.
 
     Args:
@@ -77,13 +79,14 @@ def compile_step(step: Callable, shapes: Any, identity: Any, on_traced: Callable
       shapes: the state's shapes.
       identity: JSON data that identifies the program; None to cache nothing.
       on_traced: called after tracing, if the program had to be traced.
+      backend: of the physics in it.
     """
     if identity is None or jax.default_backend() != "cpu":  # Warp's kernels are not part of the program.
-        lowered = jit(step, donate_argnums=0).lower(shapes)
+        lowered = jit(step, backend=backend, donate_argnums=0).lower(shapes)
         on_traced()
         return lowered.compile()
     path = cache_path("programs") / f"{key(identity, shapes)}.pkl"
-    compile_again = functools.partial(_compile, path, step, shapes, on_traced)
+    compile_again = functools.partial(_compile, path, step, shapes, on_traced, backend)
     return _load(path, shapes, compile_again) or compile_again()
 
 
@@ -126,7 +129,7 @@ class _Leaves:
         )
 
 
-def _compile(path: Path, step: Callable, shapes: Any, on_traced: Callable[[], None]) -> Program:
+def _compile(path: Path, step: Callable, shapes: Any, on_traced: Callable[[], None], backend: str) -> Program:
     leaves = _Leaves(shapes)
     names: list[str] = []
 
@@ -135,7 +138,7 @@ def _compile(path: Path, step: Callable, shapes: Any, on_traced: Callable[[], No
         names[:] = sorted(metrics)
         return leaves.of(state), [metrics[name] for name in names]
 
-    lowered = jit(flat, donate_argnums=0).lower(jax.eval_shape(leaves.of, shapes))
+    lowered = jit(flat, backend=backend, donate_argnums=0).lower(jax.eval_shape(leaves.of, shapes))
     on_traced()
     found = _HITS.count()
     compiled = lowered.compile()

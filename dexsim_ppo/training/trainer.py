@@ -1,5 +1,6 @@
 """One training run: compile, loop, measure, save, report."""
 
+import functools
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -26,8 +27,8 @@ from dexsim_ppo.training.faults import Faults, keep
 from dexsim_ppo.training.fine_tune import initialize_from
 from dexsim_ppo.training.runlog import MetricsLog, RunFolder, draw_curve, read_metrics
 
-# Selecting the best policy and the final evaluation use different episodes.
-SELECTION_SEED, REPORT_SEED = 1, 0
+# Selecting the best policy uses starts and episodes that no report has: `evaluate --seed` ends below.
+SELECTION_SEED, REPORT_SEED = 2**32 - 1, 0
 
 
 class Run:
@@ -90,6 +91,7 @@ class Run:
                 shapes,
                 self._identity(),
                 lambda: self.clock.update(trace_s=time.perf_counter() - begin),
+                self.env.backend,
             )
             if not isinstance(source, checkpoint.Checkpoint):
                 state = fresh.result()
@@ -235,7 +237,8 @@ class Run:
         return self.folder.best if self.folder.best.exists() else self.folder.last
 
     def finish(self, command: str) -> None:
-        """Evaluate trained and untrained policy on the same episodes; write curve, report and video.
+        """Evaluate trained and untrained policy and a hand that does nothing on the same episodes; write curve, report
+        and video.
 
         `command` is what started the run, for the report.
         """
@@ -243,11 +246,11 @@ class Run:
         print(f"evaluating {selected.name} and the untrained policy", flush=True)
         begin = time.perf_counter()
         trained, untrained = Policy.load(selected), Policy.load(folder.untrained)
-        reports, films = {}, {}
-        for name, policy in (("trained", trained), ("untrained", untrained)):
-            reports[name], films[name] = self.evaluator(
-                policy.params, episodes=arguments.evaluation_episodes, seed=REPORT_SEED
-            )
+        measure = functools.partial(self.evaluator, episodes=arguments.evaluation_episodes, seed=REPORT_SEED)
+        reports = {}
+        reports["trained"], film = measure(trained.params)
+        reports["untrained"], _ = measure(untrained.params)
+        reports["do_nothing"], _ = measure(untrained.params, idle=True)
         self.clock["evaluation_s"] = time.perf_counter() - begin
         draw_curve(read_metrics(folder.metrics), folder.path / "curve.png", arguments.task)
         report = {
@@ -267,11 +270,11 @@ class Run:
         } | cli.environment_report()
         folder.keep_report()
         cli.write_json(folder.report, report)
-        print_report(reports["untrained"], title=f"{arguments.task}: untrained")
-        print_report(reports["trained"], title=f"{arguments.task}: {selected}")
+        for name, policy in (("untrained", "untrained"), ("trained", selected)):
+            print_report(reports[name], reports["do_nothing"], title=f"{arguments.task}: {policy}")
         if arguments.video:
             begin = time.perf_counter()
-            video = write_video(self.evaluator.env, films["trained"], folder.path / "policy.mp4")
+            video = write_video(self.evaluator.env, film, folder.path / "policy.mp4")
             self.clock["video_s"] = time.perf_counter() - begin
             print(f"video: {video}")
         self.clock["total_s"] = time.perf_counter() - self.started

@@ -27,12 +27,11 @@ from dexsim_real.calibrate.identify_drives import identify_hand
 from dexsim_real.calibrate.options import CalibrateArguments
 from dexsim_real.calibrate.plan import placements
 from dexsim_real.calibrate.press_fit import fit
-from dexsim_real.calibrate.press_procedure import PressProcedure, placement_record
+from dexsim_real.calibrate.press_procedure import PressProcedure
 from dexsim_real.calibrate.read import read_logs
 from dexsim_real.calibrate.report import grouped, report, table
 from dexsim_real.control.controller import prepare_jax
 from dexsim_real.core.errors import HandError
-from dexsim_real.core.log import Kind
 from dexsim_real.core.process import stopping
 
 _SPEED = 2.0  # rad/s, largest rate of change of the commands
@@ -56,7 +55,6 @@ def record(arguments: CalibrateArguments, hand: Hand, operator: Operator, **benc
             procedure.check(tuple(placement.finger for placement in plan))
             work.safety.engage()
             for placement in plan:
-                work.log.add(Kind.META, {"placement": placement_record(placement)})
                 pressed += procedure.press(placement)
         except HandError as error:
             if not pressed:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from dexsim.calibration.maps import load_calibration
 from dexsim.core import cli
 from dexsim.core.config import to_dict
 from dexsim.hand.kinematics import Hand
@@ -17,6 +18,7 @@ from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogWriter
 from dexsim_real.core.process import leave_realtime, use_realtime
 from dexsim_real.sensors.hand import HandSensing
+from dexsim_real.wire.identity import check_identity
 from dexsim_real.wire.link import HandPort
 from dexsim_real.wire.serial_hand import open_port
 
@@ -63,13 +65,18 @@ class Workbench:
             self._say(self.loop.port.connect())
             for warning in getattr(self.loop.port, "warnings", list)():
                 self._say(f"warning: {warning}")
+            identity, calibration = getattr(self.loop.port, "identity", None), self._arguments.calibration
+            known = load_calibration(calibration, self.loop.sensing.hand) if calibration else None
+            for note in check_identity(identity, self.loop.sensing.hand, known):
+                self._say(note)
             self.log.add(
                 Kind.META,
                 {
                     "env_config": {},
                     "policy": "",
                     "calibration": "",
-                    "serial": self._arguments.serial,
+                    "serial": identity.serial_number if identity else "",
+                    "handedness": identity.handedness if identity else "",
                     "hardware": to_dict(self._arguments.hardware),
                     "safety": to_dict(self._arguments.safety),
                     "check": to_dict(self._arguments.check),
@@ -97,8 +104,10 @@ class Workbench:
             self.log.close()
             if self._arguments.realtime:
                 leave_realtime()
-        if self.loop.driven and error is None:
+        if error is None and self.loop.driven:
             raise HandError(f"{UNCONFIRMED}: press the emergency stop")
+        if error is None and (self.log.dropped or self.log.failure):
+            raise HandError(f"{self.log.dropped} log records are lost ({self.log.failure or 'the disk is too slow'})")
 
     def _react(self, text: str) -> None:
         self.log.add(Kind.NOTE, text)

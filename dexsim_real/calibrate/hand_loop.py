@@ -88,6 +88,8 @@ class HandLoop:
         self._keep(Kind.SENT, frames.HOST, command, now)
         self.driven |= decision.mode == Mode.POSITION
         reply = self.port.exchange(command)
+        if reply is None:
+            self.safety.refuse(getattr(self.port, "refusal", None))
         exchange = None if reply is None else self._take(reply, decision.reaction)
         self._check(now, decision, reply)
         self.pace.wait()
@@ -154,13 +156,16 @@ class HandLoop:
     def _check(self, now: float, decision: Any, reply: Reply | None) -> None:
         if self.safety.latched:
             raise HandError(f"stopped: {self.safety.latched}")
+        if self.log.failure:
+            raise HandError(f"stopped: the log is lost ({self.log.failure})")
         if reply is not None and self._generation not in (None, reply.generation):
             raise HandError("stopped: the hand was disconnected and its pose may have changed; start again")
         self._generation = reply.generation if reply is not None else self._generation
         working = reply is not None and (decision.reaction <= Reaction.CLIP or not self.safety.engaged)
         self._failing_since = None if working else self._failing_since or now
         if self._failing_since is not None and now - self._failing_since > _PATIENCE:
-            raise HandError(f"stopped: {decision.reason or 'the hand does not answer'} for {_PATIENCE:g} s")
+            why = self.safety.refused or decision.reason or "the hand does not answer"
+            raise HandError(f"stopped: {why} for {_PATIENCE:g} s")
 
 
 class Operator:

@@ -84,8 +84,6 @@ class CalibrateArguments:
     """Also press with the sides of thumb and index finger, to load the joints that spread them."""
     yes: bool = False
     """Ask nothing: assume that the fingers always have something to press on."""
-    serial: str = ""
-    """Serial number or name of the hand, for the output file."""
     calibration: Path | None = None
     """With --identify: calibration file of this hand; None leaves torques unknown."""
     joints: tuple[str, ...] = ()
@@ -110,8 +108,8 @@ class CalibrateArguments:
     """The serial line."""
     hardware: HardwareConfig = setting(HardwareConfig())
     """Signs, scales and gains of the hand."""
-    safety: SafetyConfig = setting(SafetyConfig(watchdog=0.3, stale=0.15))
-    """Safety limits."""
+    safety: SafetyConfig = setting(SafetyConfig(watchdog=0.3, stale=0.15, stall_current=1.8))
+    """Safety limits. Presses hold still at currents that a run need not hold."""
 
     def __post_init__(self):
         validate(self)

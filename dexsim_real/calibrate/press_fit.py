@@ -137,6 +137,7 @@ def fit(session: PressSession, hand: Hand, created: str | None = None) -> Fit:
             current_per_count=1e-3,
             missing="class",
             serial=session.serial,
+            handedness=session.handedness,
             created=created,
         )
     except CalibrationError as error:

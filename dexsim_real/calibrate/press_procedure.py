@@ -5,6 +5,7 @@ and a later one give the same result.
 """
 
 import dataclasses
+import itertools
 import math
 from typing import Any
 
@@ -24,8 +25,13 @@ LOADING, UNLOADING, RELEASED, REST = "loading", "unloading", "released", "rest"
 _ANSWERED = 0.5  # share of the exchanges at rest that must be answered
 _LAST = 12  # samples at the end of a press that are averaged
 _STALL = 0.02  # share of the peak force by which the force must grow in a second, or the motors stall
+_ATTEMPTS = 3  # at a press, with nobody to ask
 _LEAST_MOTION = 0.004  # rad that each joint should move in a press
 _LEAN = (0.5, -0.5, 0.0)  # more motion of the first joints or the last: presses with different shear
+
+
+class MissedPress(HandError):
+    """A press that brought nothing and can be made again, such as one beside the pen."""
 
 
 class PressProcedure:
@@ -66,9 +72,7 @@ class PressProcedure:
             raise HandError(f"only {len(exchanges)} answers in {seconds:g} s; check the cable, or close other programs")
         counts = np.array([self._raw(exchange) for exchange in exchanges])
         current = np.array([exchange.state["joint"]["current"] for exchange in exchanges], float)
-        report = check_rest(
-            self.hand, counts, current, self.arguments.check, self.loop.sensing.config.tare_limit, fingers
-        )
+        report = check_rest(self.hand, counts, current, self.arguments.check, self.loop.sensing.config, fingers)
         for note in report.notes:
             self.operator.tell(f"  {note}")
         self._set_tare(report.tare)
@@ -76,11 +80,28 @@ class PressProcedure:
         return report
 
     def press(self, placement: Placement) -> bool:
-        """All presses of one placement; False when the user skips it.
+        """All presses of one placement, again when they are missed; False when the user skips it.
 
         Raises:
-          HandError: nothing was met or felt, or `Safety` ended the press.
+          HandError: they were missed three times with nobody to ask, or `Safety` ended the press.
         """
+        for attempt in itertools.count(1):
+            self._begin_recording(placement)
+            try:
+                return self._press(placement)
+            except MissedPress as missed:
+                self._begin_recording(placement)  # Drops what was recorded of it.
+                if self.operator.assume_yes and attempt >= _ATTEMPTS:
+                    raise
+                self.operator.tell(f"  {missed}; again")
+        raise AssertionError("the attempts have no end")
+
+    # --- pieces ---------------------------------------------------------------------------------
+
+    def _begin_recording(self, placement: Placement) -> None:
+        self.loop.log.add(Kind.META, {"placement": placement_record(placement)})
+
+    def _press(self, placement: Placement) -> bool:
         self._start_from(placement)
         self.loop.move(self._target())
         self.operator.tell(f"{placement.name}: {placement.task}")
@@ -102,13 +123,12 @@ class PressProcedure:
         self._back_off()
         return True
 
-    # --- pieces ---------------------------------------------------------------------------------
-
     def _tare_in_air(self) -> None:
         """Tare in the air where the press begins: gravity and the last press have moved the zero."""
         self.loop.collect(self.config.pause, self._target())
         exchanges = self.loop.collect(self.config.pause, self._target())
-        self.loop.sensing.set_tare([exchange.state for exchange in exchanges])
+        if stuck := self.loop.sensing.set_tare([exchange.state for exchange in exchanges]):
+            raise HandError(f"{'; '.join(stuck)}; power-cycle the hand")
         self._set_tare(self.loop.sensing.tare)
         free = [self._force(exchange) for exchange in self.loop.collect(self.config.pause, self._target())]
         self._touch = max(self.config.touch, float(np.mean(free) + 6 * np.std(free)))
@@ -127,12 +147,12 @@ class PressProcedure:
             if self._force(exchange) >= self._touch:
                 break
             if self._current(exchange) >= self.config.current:
-                raise HandError(
+                raise MissedPress(
                     f"{name}: {self._current(exchange):.2f} A and no taxel feels it; press on "
                     "the taxels, and check that their sensor is connected"
                 )
             if self._advance >= self.config.travel:
-                raise HandError(f"{name}: met nothing within {self.config.travel:g} rad; hold the object closer")
+                raise MissedPress(f"{name}: met nothing within {self.config.travel:g} rad; hold the object closer")
         self._base, self._advance = self._target(), 0.0
 
     def _load(self, speed: float) -> None:
@@ -157,7 +177,7 @@ class PressProcedure:
                 break
             if self._advance >= self.config.travel or stalled:
                 if forces[-1] < 4 * self._touch:
-                    raise HandError(
+                    raise MissedPress(
                         f"{self._placement.name}: the force stays at {forces[-1]:.1f} N; press on something "
                         "firmer, or raise --hardware.torque-max"
                     )
@@ -222,7 +242,10 @@ class PressProcedure:
         exchanges = self._record(self._placement.name, RELEASED, self.config.pause)
         finger = self._placement.finger
         sums = np.array([(self._raw(m) - self.loop.sensing.tare)[finger].sum() for m in exchanges])
-        check_release(self._placement.name, sums, self.arguments.check)
+        try:
+            check_release(self._placement.name, sums, self.arguments.check)
+        except HandError as error:
+            raise MissedPress(str(error)) from None
 
     def _step(self, advance: float, phase: str) -> Exchange | None:
         """One exchange at this advance in rad, logged as a sample of the phase unless that is empty.

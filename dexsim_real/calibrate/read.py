@@ -46,7 +46,8 @@ class PressSession:
 
     hardware: HardwareConfig
     check: CheckConfig
-    serial: str
+    serial: str  # of the hand, as it told it
+    handedness: str
     rate: float
     recordings: dict[str, Recording]
     rest_current: np.ndarray  # [T, J] A, motors off
@@ -65,6 +66,8 @@ def read_logs(paths: Iterable[Path], hand: Hand) -> PressSession:
             session = found
         elif (found.hardware, found.rate) != (session.hardware, session.rate):
             raise LogError(f"{path}: recorded with other --hardware options or another --rate than the logs before")
+        elif found.serial != session.serial:
+            raise LogError(f"{path}: is of hand {found.serial!r}, the logs before of hand {session.serial!r}")
         else:
             session.recordings.update(found.recordings)
     assert session is not None, "no log given"
@@ -99,9 +102,8 @@ class _Reader:
             raise LogError(f"{self._path}: this is a log of {meta['task']!r}; give a log of `dexsim_real.calibrate`")
         hardware = from_dict(HardwareConfig, meta["hardware"])
         self._sensing, self._raw = HandSensing(self._hand, hardware), raw_sensing(self._hand, hardware)
-        return PressSession(
-            hardware, from_dict(CheckConfig, meta["check"]), meta["serial"], meta["rate"], {}, np.empty(0)
-        )
+        check, side = from_dict(CheckConfig, meta["check"]), meta.get("handedness", "")  # Older logs name no side.
+        return PressSession(hardware, check, meta["serial"], side, meta["rate"], {}, np.empty(0))
 
     def _configure(self, session: PressSession, content: dict[str, Any]) -> None:
         if "tare" in content:

@@ -54,6 +54,7 @@ def report(fit: Fit) -> dict[str, Any]:
     return {
         "hand": calibration.hand,
         "serial": calibration.serial,
+        "handedness": calibration.handedness,
         "created": calibration.created,
         "newtons_per_count": dict(zip(calibration.finger_names, calibration.force_per_count, strict=True)),
         "gauge": {name: to_dict(found) for name, found in fit.sensors.items()},

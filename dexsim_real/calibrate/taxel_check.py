@@ -12,8 +12,8 @@ from dexsim.hand.kinematics import Hand
 from dexsim_real.calibrate.options import CheckConfig
 from dexsim_real.core.errors import HandError
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
+from dexsim_real.sensors.taxels import judge_rest, taxel_names
 
-_TOUCH = 3  # adjacent high taxels that mean a touch
 _SMOOTH = 10  # samples of the moving mean for the drift
 
 
@@ -34,7 +34,12 @@ def raw_sensing(hand: Hand, hardware: HardwareConfig) -> HandSensing:
 
 
 def check_rest(
-    hand: Hand, counts: np.ndarray, current: np.ndarray, config: CheckConfig, limit: float, fingers: tuple[int, ...]
+    hand: Hand,
+    counts: np.ndarray,
+    current: np.ndarray,
+    config: CheckConfig,
+    hardware: HardwareConfig,
+    fingers: tuple[int, ...],
 ) -> RestReport:
     """Check a recording with the motors off and nothing touching the hand.
 
@@ -42,25 +47,19 @@ def check_rest(
       counts: [T, F, N] raw taxel counts.
       current: [T, J] raw.
       config: thresholds.
-      limit: counts above which a taxel cannot be tared (`HardwareConfig.tare_limit`).
+      hardware: limits of what can be tared.
       fingers: indices of the fingers that will be pressed.
 
     Raises:
-      HandError: something touches a fingertip, or a taxel is stuck above `limit`.
+      HandError: something touches a fingertip, or a taxel is stuck.
     """
     mean, noise = counts.mean(0), counts.std(0)
+    stuck, limit = judge_rest(hand, mean, hardware.tare_limit, hardware.tare_sum), hardware.tare_limit
     notes = []
     for finger, name in enumerate(hand.finger_names):
-        high = mean[finger] > limit
-        patch = _largest_patch(high.reshape(hand.taxel_grid))
-        if patch >= _TOUCH:
+        if stuck[finger].any():
             raise HandError(
-                f"cannot tare the taxels: {patch} adjacent taxels of the {name} read above "
-                f"{limit:.0f} counts: something touches it; free the fingertips"
-            )
-        if high.any():
-            raise HandError(
-                f"{name}: {taxel_names(hand, high)} read {mean[finger].max():.0f} counts alone and are stuck; "
+                f"{name}: {taxel_names(hand, stuck[finger])} read {mean[finger].max():.0f} counts alone and are stuck; "
                 "power-cycle the hand, or raise --hardware.tare-limit here and in every run"
             )
         drift, usual = _drift(counts[:, finger].sum(-1))
@@ -91,8 +90,7 @@ def check_release(name: str, sums: np.ndarray, config: CheckConfig) -> None:
     left = float(np.median(sums))
     if left < -config.release:
         raise HandError(
-            f"{name}: reads {left:.0f} counts after the press: it was touched while it was tared; "
-            "free the fingertip and start again"
+            f"{name}: reads {left:.0f} counts after the press: it was touched while it was tared; free the fingertip"
         )
 
 
@@ -134,21 +132,7 @@ def fill_dead(hand: Hand, counts: np.ndarray, dead: np.ndarray) -> np.ndarray:
     return filled
 
 
-def taxel_names(hand: Hand, which: np.ndarray) -> str:
-    """ "column 3 row 7, ..." of a mask [N], counted from 0 as in the layout file."""
-    rows = hand.taxel_grid[1]
-    named = [f"column {i // rows} row {i % rows}" for i in np.flatnonzero(which)]
-    return ", ".join(named[:6]) + (f" and {len(named) - 6} more" if len(named) > 6 else "")
-
-
 def _drift(sums: np.ndarray) -> tuple[float, float]:
     """Range of the moving mean, and the part of it that noise alone explains."""
     smooth = np.convolve(sums, np.full(_SMOOTH, 1 / _SMOOTH), "valid")
     return float(np.ptp(smooth)), float(6 * np.std(np.diff(sums)) / np.sqrt(2 * _SMOOTH))
-
-
-def _largest_patch(mask: np.ndarray) -> int:
-    from scipy.ndimage import label
-
-    labels, count = label(mask, np.ones((3, 3)))
-    return int(np.bincount(labels.ravel())[1:].max()) if count else 0

@@ -13,7 +13,7 @@ import numpy as np
 
 from dexsim.control import move_target, observed_action
 from dexsim.hand.kinematics import Hand
-from dexsim.observation import LayoutEntry, ObservationConfig, Readings, layout, observe
+from dexsim.observation import LayoutEntry, ObservationConfig, Readings, layout, observe, select_fields
 from dexsim_ppo.policy import Policy
 from dexsim_real.core.errors import HandError
 from dexsim_real.sensors.hand import HandMeasurement
@@ -63,10 +63,10 @@ class Controller:
         self.spec = policy.spec
         self.spec.check_hand(hand)
         names, config = self.spec.fields, self.spec.observation
+        self.sources = sources_of(select_fields(names, config))
         wanted = tuple(LayoutEntry(f.name, f.size, f.scale) for f in policy.observation_layout)
         if layout(hand, names, config) != wanted:
             raise HandError(f"the policy's observation does not fit this version's task {policy.task!r}")
-        self.sources = sources_of([field.name for field in wanted])
         self.period = 1.0 / policy.control_rate
         self._observe = make_observe(hand, names, config)
         self._move = jax.jit(lambda *arrays: move_target(self.spec.control, hand, *arrays))
@@ -77,9 +77,8 @@ class Controller:
         """Compile everything, so that the first tick is as fast as the next ones."""
         hand = self.hand
         joints = np.zeros(hand.num_joints, np.float32)
-        idle = HandMeasurement(
-            joints, joints, np.zeros((hand.num_fingers, hand.num_taxels), np.float32), joints, np.zeros(1), np.zeros(1)
-        )
+        touch, rest = np.zeros((hand.num_fingers, hand.num_taxels), np.float32), np.zeros(1)
+        idle = HandMeasurement(joints, joints, touch, joints, rest, rest, rest)
         for _ in range(3):
             self.tick(idle, ObjectEstimate(np.zeros(3), np.zeros(3), IDENTITY), IDENTITY, 0.0)
         self.start(joints)

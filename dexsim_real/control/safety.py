@@ -7,8 +7,9 @@ their times, so any course of events can be tested.
 |---|---|
 | joint target outside position, speed or reach limits | clip |
 | joint target not finite; joint too fast; fingertip force too high; target or measurement too old | hold |
-| current too high for too long; too hot; targets or measurements missing for long | relax |
+| targets or measurements (also of the object) missing for long | relax |
 | measured angles that cannot be true (`PoseCheck`) | no measurement; relax permanently when they last |
+| alarms of the hand itself (`Alarms`): heat, current, error bits, motors off, refusals | hold, relax permanently |
 
 Hold: the last command that the hand confirmed, at the usual gains; when the force is too high, slowly toward the
 measured pose. Relax: motors off. The motors come on at the measured pose. Then each command differs from the one before
@@ -25,9 +26,11 @@ import numpy as np
 
 from dexsim.core.config import setting, validate
 from dexsim.hand.kinematics import Hand
+from dexsim_real.control.alarms import Alarms, joint_labels
 from dexsim_real.control.pose_check import UNKNOWN, PoseCheck
 from dexsim_real.sensors.hand import HandMeasurement
 from dexsim_real.wire.frames import Mode
+from dexsim_real.wire.refusals import Refusal
 
 _SILENT, _DEAD = "no measurement", "no target"  # reasons that turn the motors off when they last
 _FORCE = "the fingertip force is too high"
@@ -47,34 +50,46 @@ class Reaction(enum.IntEnum):
 class SafetyConfig:
     """Limits of the hand. Ages count from the time of the measurement or joint target."""
 
-    margin: float = setting(0.0, unit="rad", low=0.0, high=0.5)
-    """Distance of commands from the joints' end stops."""
+    margin: float = setting(0.03, unit="rad", low=0.0, high=0.5)
+    """Distance of commands from the joints' end stops; motors that come on nearer to one begin there. What it cuts
+    off a target does not count as a clip."""
     beyond: float = setting(0.1, unit="rad", low=0.0, high=1.0)
     """Distance beyond a joint's limits at which a measured angle counts as wrong."""
-    speed: float = setting(20.0, unit="rad/s", low=0.01, high=200.0)
-    """Largest rate of change of a command. A policy that changes targets by 0.2 rad needs 0.2 rad within a cycle."""
+    speed: float = setting(7.0, unit="rad/s", low=0.01, high=200.0)
+    """Largest rate of change of a command, below the no-load speed of the slower joints (8.6 rad/s). A policy that
+    changes targets by 0.2 rad every 0.03 s needs 6.7 rad/s."""
     reach: float = setting(0.6, unit="rad", low=0.01, high=4.0)
     """Distance of a command from the measured angle beyond which it does not move farther away."""
-    joint_speed: float = setting(20.0, unit="rad/s", low=0.1, high=1000.0)
-    """Measured joint speed above which the hand holds."""
+    joint_speed: float = setting(10.0, unit="rad/s", low=0.1, high=1000.0)
+    """Measured joint speed above which the hand holds; above `speed`, since a joint catches up with its command."""
     current: float = setting(1.8, unit="A", low=0.01, high=20.0)
     """Current of a joint above which the motors go off; the XHand reports 1.5 A when stalled at its usual limit."""
     current_seconds: float = setting(1.0, unit="s", low=0.0, high=60.0)
     """Time for which a joint may exceed `current`."""
+    stall_current: float = setting(1.3, unit="A", low=0.01, high=20.0)
+    """Current above which a joint that does not move is stalled. A stalled thumb reported 1.5 A, other joints 0.8 to
+    1.1 A, which a firm grasp also needs."""
+    stall_seconds: float = setting(3.0, unit="s", low=0.1, high=600.0)
+    """Time after which the motors go off when a joint is stalled."""
     temperature: float = setting(70.0, unit="degC", low=20.0, high=150.0)
-    """Temperature of a joint board or a fingertip above which the motors go off."""
-    finger_force: float = setting(25.0, unit="N", low=0.1, high=1000.0)
-    """Force of a fingertip (sum of its taxels) above which the hand holds."""
+    """Temperature of a joint board, a fingertip or the palm board above which the motors go off."""
+    alarm_seconds: float = setting(0.2, unit="s", low=0.0, high=60.0)
+    """Time for which the hand holds while it reports an error or motors that are off, before they go off for good."""
+    ignored_errors: tuple[int, int, int] = setting((0, 0, 0), unit="1", low=0, high=65535)
+    """Error bits of palm, joint and tip board that are harmless on this hand, as sums of bits."""
+    finger_force: float = setting(15.0, unit="N", low=0.1, high=1000.0)
+    """Force of a fingertip (sum of its taxels) above which the hand holds; the XHand is specified for 15 N."""
     total_force: float = setting(70.0, unit="N", low=0.1, high=1000.0)
     """Force of all fingertips above which the hand holds; it is rated for 80 N."""
     stale: float = setting(0.05, unit="s", low=0.001, high=10.0)
     """Age of the newest measurement above which the hand holds."""
-    stale_object: float = setting(0.3, unit="s", low=0.01, high=10.0)
+    stale_object: float = setting(0.3, unit="s", low=0.01, high=60.0)
     """Age of the newest camera or IMU measurement above which the hand holds."""
     watchdog: float = setting(0.08, unit="s", low=0.001, high=10.0)
     """Age of the newest joint target above which the hand holds, at least two control ticks."""
     patience: float = setting(1.0, unit="s", low=0.0, high=60.0)
-    """Duration of a hold for lack of joint targets or measurements, after which the motors go off."""
+    """Duration of a hold for lack of joint targets or measurements, also of the object, after which the motors go
+    off."""
     slow_speed: float = setting(0.5, unit="rad/s", low=0.01, high=100.0)
     """Speed of commands right after the motors turn on or a hold ends; it then grows to `speed`."""
     ramp: float = setting(1.0, unit="s", low=0.0, high=60.0)
@@ -119,6 +134,7 @@ class Safety:
 
     def __init__(self, hand: Hand, config: SafetyConfig, note: Callable[[str], None] = lambda text: None):
         self.config, self._note = config, note
+        self._stops = hand.joint_lower.astype(np.float32), hand.joint_upper.astype(np.float32)
         self._lower = hand.joint_lower.astype(np.float32) + config.margin
         self._upper = hand.joint_upper.astype(np.float32) - config.margin
         self.sample: HandSample | None = None  # the newest plausible one
@@ -129,6 +145,8 @@ class Safety:
         self.counts: Counter[str] = Counter()  # cycles by reason
         self._target: tuple[float, np.ndarray, str] | None = None  # time s, joint target, reason to hold
         self._pose = PoseCheck(hand, config.beyond)
+        self._alarms = Alarms(hand, config)
+        self._joints = joint_labels(hand)
         self._generation: int | None = None
         self._wrong: tuple[float, float] | None = None  # s, first and last of the newest wrong measurements
         self._holding = False
@@ -136,13 +154,17 @@ class Safety:
         self._commanded: np.ndarray | None = None  # last command with the motors on
         self._confirmed: np.ndarray | None = None  # last one that the hand answered
         self._time = self._ramp_start = 0.0
-        self._overcurrent_since: float | None = None  # s
         self.last = (Reaction.NONE, "")  # reaction and reason of the newest decision
 
     @property
     def commanded(self) -> np.ndarray:
         """Where commands continue [J] rad: the last one, or the measured pose with the motors off."""
         return self._rest() if self._commanded is None else self._commanded
+
+    @property
+    def refused(self) -> str:
+        """What the hand said when it refused a command, until it answers one again."""
+        return self._alarms.refused
 
     def see(self, sample: HandSample) -> bool:
         """Update with a measurement; returns whether it is plausible. Otherwise it does not count as one."""
@@ -164,10 +186,13 @@ class Safety:
                 self._wrong = (sample.time if self._wrong is None else self._wrong[0]), sample.time
             return False
         self.sample, self._wrong = sample, None
-        high = bool(np.any(measured.current > self.config.current))
-        since = self._overcurrent_since
-        self._overcurrent_since = (sample.time if since is None else since) if high else None
+        self._alarms.see(sample.time, measured, self._commanded is not None)
         return True
+
+    def refuse(self, refusal: Refusal | None) -> None:
+        """Update with an exchange that brought no state; None if the hand has not refused it."""
+        if refusal is not None:
+            self._alarms.refuse(refusal)
 
     def set_target(self, position: np.ndarray, time: float, hold_reason: str = "") -> None:
         """Set the requested joint targets.
@@ -175,7 +200,8 @@ class Safety:
         Args:
           position: [J] rad.
           time: s of the request.
-          hold_reason: why the hand should hold instead of moving there; empty to move.
+          hold_reason: why the hand should hold instead of moving there, and the motors go off when it lasts; empty to
+            move.
         """
         self._target = time, np.array(position, np.float32), hold_reason
 
@@ -192,42 +218,43 @@ class Safety:
         if not self.engaged or self.latched or self.sample is None:
             return self._finish(now, Reaction.RELAX, self.latched or "not engaged", self._rest())
         sample = self.sample
-        fatal = self._fatal(now, sample)
+        fatal = self._fatal()
         if fatal:
             self.relax(fatal)
             return self._finish(now, Reaction.RELAX, fatal, self._rest())
         if self._commanded is None:
-            if self.problem or not self._pose.known:
+            if self.problem or self._alarms.hold or not self._pose.known:
                 silent = now - sample.time > self.config.stale and not self.problem
-                return self._finish(now, Reaction.RELAX, _SILENT if silent else self.problem or UNKNOWN, self._rest())
+                why = self._silence() if silent else self.problem or self._alarms.hold or UNKNOWN
+                return self._finish(now, Reaction.RELAX, why, self._rest())
             self._start(now, sample)
         wish = self._target  # Read once: another thread may replace it meanwhile.
         reason = self._reason_to_hold(now, sample, wish)
         if reason:
-            return self._hold(now, sample, reason)
+            return self._hold(now, sample, reason, wish)
         if self._holding:
             self._restart(now)
         return self._follow(now, sample, self.commanded if wish is None else wish[1])
 
     # --- pieces -----------------------------------------------------------------------------
 
-    def _fatal(self, now: float, sample: HandSample) -> str:
-        config = self.config
-        if np.any(sample.measured.temperature > config.temperature):
-            return f"too hot: {sample.measured.temperature.max():.0f} degC"
-        if self._overcurrent_since is not None and sample.time - self._overcurrent_since > config.current_seconds:
-            current = sample.measured.current
-            return f"current too high: {current.max():.2f} A in joint {current.argmax()}"
-        if self._wrong is not None and self._wrong[1] - self._wrong[0] > config.patience:
-            return f"implausible measurements for {config.patience:g} s: {self.problem}"
-        return ""
+    def _fatal(self) -> str:
+        if self._wrong is not None and self._wrong[1] - self._wrong[0] > self.config.patience:
+            return f"implausible measurements for {self.config.patience:g} s: {self.problem}"
+        return self._alarms.fatal
+
+    def _silence(self) -> str:
+        return f"{_SILENT}: {self.refused}" if self.refused else _SILENT
 
     def _reason_to_hold(self, now: float, sample: HandSample, wish: tuple[float, np.ndarray, str] | None) -> str:
         config, force = self.config, sample.measured.finger_force
         if now - sample.time > config.stale:
-            return _SILENT
-        if np.any(np.abs(sample.velocity) > config.joint_speed):
-            return "a joint is too fast"
+            return self._silence()
+        if self._alarms.hold:
+            return self._alarms.hold
+        speed = np.abs(sample.velocity)
+        if np.any(speed > config.joint_speed):
+            return f"too fast: {self._joints[int(speed.argmax())]}"
         if force.max() > config.finger_force or force.sum() > config.total_force:
             return _FORCE
         if wish is None:  # Before the first target the start pose is the target.
@@ -238,7 +265,9 @@ class Safety:
 
     def _start(self, now: float, sample: HandSample) -> None:
         """Turn the motors on at the measured pose."""
-        self._commanded = self._confirmed = self._inside(sample.measured.joint_position)
+        # Between the end stops, not within the margin: enabling must not move the hand.
+        pose = np.clip(sample.measured.joint_position, self._stops[0], self._stops[1])
+        self._commanded = self._confirmed = pose.astype(np.float32)
         self._time = now
         self._restart(now)
 
@@ -247,12 +276,14 @@ class Safety:
         self._holding, self._ramp_start = False, now
         self.anchor += 1
 
-    def _hold(self, now: float, sample: HandSample, reason: str) -> SafetyDecision:
-        config = self.config
-        if reason != self.last[1]:
+    def _hold(
+        self, now: float, sample: HandSample, reason: str, wish: tuple[float, np.ndarray, str] | None
+    ) -> SafetyDecision:
+        config, asked, silent = self.config, wish is not None and reason == wish[2], reason.startswith(_SILENT)
+        if reason != self.last[1] and not (silent and self.last[1].startswith(_SILENT)):
             self._since = now
-        if reason in (_SILENT, _DEAD) and now - self._since > config.patience:
-            if reason == _DEAD:
+        if (asked or silent or reason == _DEAD) and now - self._since > config.patience:
+            if asked or reason == _DEAD:
                 self.relax(f"{reason} for {config.patience:g} s")
             elif not self.problem:
                 self._pose.release()
@@ -261,7 +292,7 @@ class Safety:
             return self._finish(now, Reaction.RELAX, reason, self._rest())
         self._holding = True
         if reason == _FORCE:  # Staying there would keep the force.
-            position = self._toward(now, sample.measured.joint_position, config.slow_speed)
+            position = self._toward(now, self._inside(sample.measured.joint_position), config.slow_speed)
         else:
             position = self._toward(now, self.commanded if self._confirmed is None else self._confirmed, config.speed)
         return self._finish(now, Reaction.HOLD, reason, position)
@@ -275,17 +306,19 @@ class Safety:
             np.maximum(measured + config.reach, self.commanded),
         )
         position = self._toward(
-            now, np.clip(target, *near), config.slow_speed + grown * (config.speed - config.slow_speed)
+            now, self._inside(np.clip(target, *near)), config.slow_speed + grown * (config.speed - config.slow_speed)
         )
-        if not np.any(np.abs(position - target) > 1e-5):
+        # Policies rest joints at their stops: the margin alone is no event.
+        clipped = np.abs(position - self._inside(target)), np.abs(target - np.clip(target, *self._stops))
+        if np.maximum(*clipped).max() <= 1e-5:
             return self._finish(now, Reaction.NONE, "", position)
         ramping = " (ramp)" if grown < 1 else ""
         return self._finish(now, Reaction.CLIP, f"target beyond a limit{ramping}", position)
 
     def _toward(self, now: float, goal: np.ndarray, speed: float) -> np.ndarray:
-        """The next command on the way to a goal [J] rad: the last limits, after every other rule."""
+        """The next command on the way to a goal [J] rad between the end stops: the last limit, after every rule."""
         step = np.float32(speed * min(max(now - self._time, 0.0), _GAP))
-        return np.clip(self._inside(goal), self.commanded - step, self.commanded + step)
+        return np.clip(goal, self.commanded - step, self.commanded + step).astype(np.float32)
 
     def _inside(self, position: np.ndarray) -> np.ndarray:
         return np.clip(position, self._lower, self._upper).astype(np.float32)

@@ -6,6 +6,7 @@ this thread, it turns the motors off.
 
 import threading
 import time
+from collections.abc import Callable
 
 from dexsim_real.control.motors_off import patience, turn_off
 from dexsim_real.control.safety import HandSample, Safety
@@ -24,15 +25,26 @@ class Servo:
       sensing: conversion to SI units.
       safety: decides the commands.
       rate: exchanges per second.
+      beat: called before every exchange as a sign of life, with the time s by which the next call may be late.
+
+    `masked` is called with the number of the exchange from which on taxels are masked, and with lines that name them.
     """
 
-    def __init__(self, port: HandPort, sensing: HandSensing, safety: Safety, rate: float):
+    def __init__(
+        self,
+        port: HandPort,
+        sensing: HandSensing,
+        safety: Safety,
+        rate: float,
+        beat: Callable[[float], None] = lambda more: None,
+    ):
         self.port, self.sensing, self.safety = port, sensing, safety
-        self.pace = Pace(rate)
+        self.pace, self._beat = Pace(rate), beat
         self.round_trip = Timing()
         self.waited = 0  # deadlines missed because of late answers
         self.error: BaseException | None = None
         self.driven = False  # whether the motors may be on
+        self.masked: Callable[[int, list[str]], None] = lambda sequence, lines: None
         self._filter = VelocityFilter(sensing.config.velocity_time)
         self._generation = 0
         self._rested = False
@@ -95,6 +107,7 @@ class Servo:
 
     def _cycle(self) -> float:
         """One exchange; returns its duration in s."""
+        self._beat(0.0)
         if self._engage:
             self.safety.engage()
             self._engage = False
@@ -104,6 +117,7 @@ class Servo:
         reply = self.port.exchange(self.sensing.command(decision.position, decision.mode))
         took = time.monotonic() - started
         if reply is None:
+            self.safety.refuse(getattr(self.port, "refusal", None))
             return took
         self.driven = decision.mode == Mode.POSITION
         self.round_trip.add(reply.received - reply.sent)
@@ -114,6 +128,8 @@ class Servo:
         return took
 
     def _sample(self, reply: Reply) -> HandSample:
+        if lines := self.sensing.mask_stuck(reply.state, self.safety.config.finger_force):
+            self.masked(reply.sequence, lines)
         measured = self.sensing.measure(reply.state)
         if reply.generation != self._generation:
             self._filter.reset()
@@ -127,6 +143,7 @@ class Servo:
         """Turn the motors off, and close the port."""
         off = self.sensing.command(self.sensing.hand.joint_lower, Mode.PASSIVE)
         self._rested = True
+        self._beat(patience(self.driven))
         try:
             if turn_off(self.port, off, patience(self.driven)):
                 self.driven = False

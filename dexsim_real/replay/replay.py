@@ -48,12 +48,16 @@ def replay(path: Path) -> Replay:
     times, measured, observations, notes = [], [], [], []
     ticks: list[Any] = []
     fields: tuple[LayoutEntry, ...] = ()
+    tares: list[tuple[int, np.ndarray]] = []  # number of the exchange from which on one holds
     counts = dict.fromkeys(("frames", "readings_same", "observations_same", "without_frame"), 0)
     first, meta, end = "", None, None
     for record in reader:
-        if record.kind == Kind.META:
+        if record.kind == Kind.META and "from" in record.content:
+            tares.append((record.content["from"], record.content["tare"]))
+        elif record.kind == Kind.META:
             meta = record.content
             sensing, observe, fields = _rebuild(meta)
+            tares = [(0, sensing.tare)]
         elif record.kind == Kind.RECEIVED:
             number, frame = record.content
             counts["frames"] += 1
@@ -65,6 +69,8 @@ def replay(path: Path) -> Replay:
             if frame is None:
                 counts["without_frame"] += 1
                 continue
+            # The exchange thread may have masked a taxel before the tick's record was written.
+            sensing.tare = next(tare for begin, tare in reversed(tares) if begin <= tick["sequence"])
             now = sensing.measure(frames.decode_state(frame[frames.HEADER.size : -2]))
             same = all(_same(getattr(now, name), tick["readings"][name]) for name in MEASURED)
             # The hand's measurements are recomputed; camera, goal and command are taken from the log.

@@ -2,8 +2,9 @@
 
     python -m dexsim_real.run grasp --port /dev/serial/by-id/usb-FTDI_... --command 0.6
 
-The policy is a file or the name of a shipped policy. Everything is compiled before the port is opened. The motors come
-on at the measured pose, and go off at the end of the program, even after a failure.
+The policy is a file or the name of a shipped policy. Everything is compiled before the port is opened. The program
+asks before the motors come on (`--yes` does not). They come on at the measured pose, and go off at the end of the
+program, even after a failure.
 """
 
 import sys
@@ -13,19 +14,22 @@ from dexsim.core import cli
 from dexsim_real.control.controller import prepare_jax
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.process import stopping
+from dexsim_real.run import consent
 from dexsim_real.run.options import RunArguments
 from dexsim_real.run.session import Session
 from dexsim_real.run.status import summary_table
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The command. Returns its exit code: 0, or 1 when `Safety` or a failure ended the run."""
+    """The command. Returns its exit code: 0, or 1 when `Safety` or a failure ended the run or something is missing."""
     arguments = cli.parse(
         RunArguments,
         sys.argv[1:] if argv is None else argv,
         prog="python -m dexsim_real.run",
         description="Run a policy on the hand.",
     )
+    if not (arguments.yes or arguments.motors_off):
+        consent.check_terminal()
     prepare_jax()
     cli.enable_caches()
     session = Session(arguments)
@@ -54,6 +58,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         if session.servo.driven:
             code = 1
         summary = session.summary()
+        if code == 0 and summary["missing"]:
+            code = 1
+            print(f"error: {'; '.join(summary['missing'])}", file=sys.stderr)
         if not arguments.quiet:
             session.view.console.print(summary_table(f"{session.controller.policy.task}: {session.end}", summary))
         if arguments.output:

@@ -1,66 +1,96 @@
-"""A second process that turns the motors off when the runner dies, whatever killed it.
+"""A second process that turns the motors off when the runner dies or freezes, whatever killed or stopped it.
 
     python -m dexsim_real.run.guard PORT LINK
 
-`python -m dexsim_real.run` starts it. A pipe connects the two: while the motors may be on, its content ends with "on".
-The kernel closes the pipe at the runner's death, even by SIGKILL. Only then the guard opens the port, so that never two
-processes talk on the line. It ignores signals and has a session of its own, so Ctrl-C and a closed terminal do not end
-it. A runner that is suspended (SIGSTOP) has not died: the hand keeps its last command.
+`python -m dexsim_real.run` starts it. A pipe connects the two. While the motors may be on, the exchange thread writes
+signs of life to it, each with the seconds until the next one; the kernel closes it at the runner's death, even by
+SIGKILL. A runner whose sign is overdue, such as one suspended by SIGSTOP, is killed. Only then the guard opens the
+port, so that never two processes talk on the line. It ignores signals and has a session of its own, so Ctrl-C and a
+closed terminal do not end it.
 """
 
 import contextlib
 import dataclasses
+import importlib
 import json
+import math
 import os
 import select
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
 from dexsim_real.control.motors_off import UNCONFIRMED, turn_off
 from dexsim_real.core.errors import HandError
+from dexsim_real.wire import frames
 from dexsim_real.wire.link import LinkConfig
-from dexsim_real.wire.serial_hand import SerialHand, passive_command
+from dexsim_real.wire.serial_hand import open_port, passive_command
 
-_ON, _OFF = b"on ", b"off "
+_OFF = b"off"
 _STARTUP = 20.0  # s, longest start of the guard
 _PATIENCE = 60.0  # s for which it tries
+_ATTEMPT = 5.0  # s after which it opens the port again
 _BACKOFF = (0.005, 0.1)  # s between attempts to open the port
 _SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP", "SIGPIPE")
+_EVERY = 0.1  # s between two signs of life
+_FREEZE = 1.5  # s without a sign of life that count as frozen, besides the exchanges below
+_EXCHANGES = 10  # exchanges with a silent hand that may pass between two signs, when the port is opened again
+_MOMENT = 0.3  # s for a runner whose sign is overdue: when the whole machine paused, it has to wake too
+_DEATH = 5.0  # s in which a killed process has ended
+_ENDED = "the runner has ended without turning the motors off"
+_FROZEN = "the runner stood still, and was killed"
 
 
 class Guard:
     """The runner's end: starts the process.
 
     Args:
-      port: serial port of the hand.
+      port: of the hand, as for `open_port`.
       link: of the serial line.
     """
 
     def __init__(self, port: str, link: LinkConfig):
         root = str(Path(__file__).resolve().parents[2])
-        path = os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH", "")]))
         self._process = subprocess.Popen(
             [sys.executable, "-m", "dexsim_real.run.guard", port, json.dumps(dataclasses.asdict(link))],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             start_new_session=True,
-            env={**os.environ, "PYTHONPATH": path},
+            # The path of this process: it has the module of an `sdk:` port.
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, [root, *sys.path]))},
         )
         assert self._process.stdin and self._process.stdout
         self._input, self._output = self._process.stdin, self._process.stdout
+        os.set_blocking(self._input.fileno(), False)  # The exchange thread must not wait for the guard.
+        longest = frames.OVERHEAD + frames.STATE_BLOCK.itemsize
+        self._allowed = _FREEZE + _EXCHANGES * link.deadline(longest, longest)
+        self._armed, self._due = False, 0.0
 
     def arm(self) -> None:
-        """Wait until the process is ready; from now on it acts when this process ends.
+        """Wait until the process is ready; from now on it acts when this one ends, or `beat` is not called.
 
         Raises:
           HandError: it did not start.
         """
         if not select.select([self._output], [], [], _STARTUP)[0] or self._output.readline() != b"ready\n":
             raise HandError("the guard process did not start; --no-guard runs without it")
-        self._tell(_ON)
+        self._tell(b"%.3f" % self._allowed)
+        self._armed = True
+
+    def beat(self, more: float = 0.0) -> None:
+        """A sign of life of the thread that exchanges commands with the hand; it never blocks.
+
+        Args:
+          more: s, by which the next one may be later than usual.
+        """
+        now = time.monotonic()
+        if self._armed and (now >= self._due or more):
+            self._due = now + _EVERY
+            with contextlib.suppress(HandError):  # `check` finds a guard that has ended.
+                self._tell(b"%.3f" % (self._allowed + more))
 
     def check(self) -> None:
         """Check that the process runs.
@@ -75,20 +105,21 @@ class Guard:
         """End of the run. Unless the motors are confirmed to be `off`, the process turns them off."""
         if self._input.closed:
             return
-        try:
+        self._armed = False
+        with contextlib.suppress(HandError):  # It has ended before.
             if off:
                 self._tell(_OFF)
-            self._input.close()
-        except OSError:
-            pass  # It has ended before.
+        self._input.close()
         self._output.close()
         if off:
-            self._process.wait(_STARTUP)
+            try:
+                self._process.wait(_STARTUP)
+            except subprocess.TimeoutExpired:  # It is suspended, and there is nothing left to do for it.
+                self._process.kill()
 
     def _tell(self, word: bytes) -> None:
         try:
-            self._input.write(word)
-            self._input.flush()
+            os.write(self._input.fileno(), word + b"\n")
         except OSError:
             raise HandError("the guard process has ended") from None
 
@@ -97,20 +128,63 @@ def main(argv: Sequence[str]) -> int:
     """The process. Returns its exit code: 1 if the motors were on and the hand did not confirm that they are off."""
     for name in _SIGNALS:
         signal.signal(getattr(signal, name), signal.SIG_IGN)
-    port, options = argv[0], json.loads(argv[1])
+    runner, port, options = os.getppid(), argv[0], json.loads(argv[1])
     link = LinkConfig(**options | {"settle": 0.0, "backoff": _BACKOFF})
-    hand, off = SerialHand(port, link), passive_command()
-    import serial  # noqa: F401  # Now, so that nothing must be loaded when it counts.
-
+    # Now, so that nothing must be loaded when it counts.
+    module = port.removeprefix("sdk:").partition(":")[0] if port.startswith("sdk:") else "serial"
+    with contextlib.suppress(ImportError):  # The runner says so.
+        importlib.import_module(module)
     with contextlib.suppress(OSError):  # The runner may have ended already.
         os.write(1, b"ready\n")
-    if not sys.stdin.buffer.read().endswith(_ON):
+    why = _watch(sys.stdin.fileno())
+    if not why:
         return 0
-    done = turn_off(hand, off, _PATIENCE)
-    hand.close()
+    if why == _FROZEN:
+        _kill(runner, sys.stdin.fileno())
+    done = _stop(port, link)
     text = "motors off" if done else f"{UNCONFIRMED}; press the emergency stop"
-    print(f"guard: the runner has ended without turning the motors off: {text}", file=sys.stderr, flush=True)
+    print(f"guard: {why}: {text}", file=sys.stderr, flush=True)
     return 0 if done else 1
+
+
+def _watch(pipe: int) -> str:
+    """Wait until the motors must be turned off; returns why, or nothing after an orderly end."""
+    rest, on, until = b"", False, math.inf
+    while True:
+        pause = None if until == math.inf else max(until - time.monotonic(), 0.0)
+        ready = select.select([pipe], [], [], pause)[0] or select.select([pipe], [], [], _MOMENT)[0]
+        if not ready:
+            return _FROZEN
+        data = os.read(pipe, 4096)
+        if not data:
+            return _ENDED if on else ""
+        *words, rest = (rest + data).split(b"\n")
+        if words:
+            on = words[-1] != _OFF
+            until = time.monotonic() + float(words[-1]) if on else math.inf
+
+
+def _kill(runner: int, pipe: int) -> None:
+    """Kill the runner, and wait until the kernel has closed its files."""
+    if os.getppid() == runner:  # Otherwise it has just ended, and the number may be another's.
+        os.kill(runner, signal.SIGKILL)
+    until = time.monotonic() + _DEATH
+    while select.select([pipe], [], [], max(until - time.monotonic(), 0.0))[0] and os.read(pipe, 4096):
+        pass
+
+
+def _stop(port: str, link: LinkConfig) -> bool:
+    """Turn the motors off; returns whether the hand has confirmed it."""
+    until, pause = time.monotonic() + _PATIENCE, _BACKOFF[0]
+    while time.monotonic() < until:
+        # Whatever somebody's own port does here, the next attempt may succeed.
+        with contextlib.suppress(Exception), contextlib.closing(open_port(port, link)) as hand:
+            hand.connect()
+            if turn_off(hand, passive_command(), _ATTEMPT):
+                return True
+        time.sleep(pause)
+        pause = min(2 * pause, _BACKOFF[1])
+    return False
 
 
 if __name__ == "__main__":

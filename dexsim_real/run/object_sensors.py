@@ -36,30 +36,40 @@ class ObjectSensors:
                     spec.velocity_filter,
                 )
             if arguments.imu:
-                self._imu = Imu(arguments.imu, -np.asarray(spec.gravity), arguments.imu_mount)
+                self._imu = Imu(arguments.imu, arguments.imu_mount)
                 self._imu.wait()
         except BaseException:
             self.close()
             raise
 
     def ready(self) -> bool:
-        """Whether the camera sees the object; if so, its current orientation becomes the identity."""
+        """Whether the camera sees the object; if so, its current orientation becomes the identity.
+
+        Raises:
+          HandError: no picture will come any more.
+        """
         if self._camera and not self._camera.seen:
+            if self._camera.failure:
+                raise HandError(self._camera.failure)
             return False
         if self._imu:
             self._imu.calibrate(IDENTITY)
         return True
 
-    def read(self, now: float) -> tuple[ObjectEstimate, float, float]:
-        """The estimate, the age in s of its oldest measurement, and the time in s of the newest orientation."""
-        position, velocity, quat, when, oldest = self._reference, np.zeros(3), IDENTITY, now, now
+    def read(self, now: float) -> tuple[ObjectEstimate, float]:
+        """The estimate, and the time in s of the newest orientation."""
+        position, velocity, quat, when = self._reference, np.zeros(3), IDENTITY, now
         if self._camera:
-            seen, position, velocity = self._camera.read()
-            oldest = min(oldest, seen)
+            _, position, velocity = self._camera.read()
         if self._imu:
             when, quat = self._imu.read()
-            oldest = min(oldest, when)
-        return ObjectEstimate(position, velocity, quat), now - oldest, when
+        return ObjectEstimate(position, velocity, quat), when
+
+    def lost(self, now: float, limit: float) -> str:
+        """Why a measurement is older than `limit` s, with the sensor; empty if none is."""
+        if self._camera and now - self._camera.read()[0] > limit:
+            return self._camera.failure or "the object is out of sight"
+        return "the IMU is silent" if self._imu and now - self._imu.read()[0] > limit else ""
 
     def close(self) -> None:
         for sensor in (self._camera, self._imu):

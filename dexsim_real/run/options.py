@@ -29,6 +29,8 @@ class RunArguments:
     """Duration of the run, after the approach."""
     motors_off: bool = False
     """Measure, compute and display everything with the motors off."""
+    yes: bool = False
+    """Do not ask before the motors come on (for scripts and the emulated hand)."""
     calibration: Path | None = None
     """Calibration file of this hand; None only with --uncalibrated."""
     uncalibrated: bool = False
@@ -43,7 +45,7 @@ class RunArguments:
     fixed_object: bool = False
     """Run without a camera: assume that the object stays at its nominal position."""
     guard: bool = True
-    """Start a second process that turns the motors off when this one dies (not with `sdk:` ports)."""
+    """Start a second process that turns the motors off when this one dies or freezes."""
     tare: bool = True
     """Tare the taxels first; refused while a fingertip touches something."""
     rate: float = setting(83.0, unit="Hz", low=1.0, high=1000.0)

@@ -25,12 +25,16 @@ from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogWriter
 from dexsim_real.core.process import ignore_signals, leave_realtime, use_realtime
 from dexsim_real.core.timing import Pace, Timing, keep_phase
+from dexsim_real.run import consent
 from dexsim_real.run.guard import Guard
 from dexsim_real.run.object_sensors import ObjectSensors
 from dexsim_real.run.options import RunArguments
+from dexsim_real.run.outcome import Outcome
+from dexsim_real.run.overview import overview
 from dexsim_real.run.status import StatusView
 from dexsim_real.sensors.hand import HandSensing
 from dexsim_real.wire.frames import Mode, empty_state
+from dexsim_real.wire.identity import check_identity
 from dexsim_real.wire.serial_hand import open_port
 
 _TARE_SAMPLES = 30
@@ -47,8 +51,7 @@ class Session:
 
     def __init__(self, arguments: RunArguments):
         self.arguments = arguments
-        serial = not arguments.port.startswith("sdk:") and "://" not in arguments.port
-        wanted = arguments.guard and serial and not arguments.motors_off
+        wanted = arguments.guard and not arguments.motors_off
         self.guard = Guard(arguments.port, arguments.link) if wanted else None
         policy, hand = load_policy(arguments.policy), load_hand()
         self.controller = Controller(policy, hand)
@@ -65,12 +68,15 @@ class Session:
         self.log = LogWriter(path)
         self.port = open_port(arguments.port, arguments.link, self._tap)
         rate = keep_phase(arguments.rate, policy.control_rate)
-        self.servo = Servo(self.port, self.sensing, self.safety, rate)
-        self.view = StatusView(f"{policy.task} on {arguments.port}", self._status, arguments.quiet)
+        beat = self.guard.beat if self.guard else lambda more: None
+        self.servo = Servo(self.port, self.sensing, self.safety, rate, beat)
+        self.servo.masked = self._mask
+        self.view = StatusView(f"{policy.task} on {arguments.port}", lambda: overview(self), arguments.quiet)
         self.objects: ObjectSensors | None = None
         self.goals: TurnGoals | None = None
         self.compute, self.pace = Timing(), Pace(policy.control_rate)
         self.started = self.force = self.forces = 0.0
+        self.outcome = Outcome()
         self.tick: Tick | None = None
         self.end, self._closed = "not started", False
         if arguments.realtime and not realtime:
@@ -87,25 +93,28 @@ class Session:
         self._note(self.port.connect())
         for warning in getattr(self.port, "warnings", list)():
             self._note(f"warning: {warning}")
+        for note in check_identity(getattr(self.port, "identity", None), self.sensing.hand, self.sensing.calibration):
+            self._note(note)
         if self.arguments.tare:
             self._tare()
         self._write_meta()
         self.servo.start()
-        if self.servo.wait_fresh(1.0) is None:
-            if self.safety.problem:
-                raise HandError(f"{self.arguments.port}: {self.safety.problem}; check `--hardware.joint-offset`")
-            raise HandError(f"{self.arguments.port}: the hand stopped answering; check the cable and the power")
+        self._await_pose()
         self.objects = ObjectSensors(self.arguments, self.controller)
         spec = self.controller.spec
         if self.arguments.imu and spec.turn:
             self.goals = TurnGoals(spec.turn, np.asarray(spec.reference))
 
     def run(self) -> None:
-        """Turn the motors on, approach the start posture, and run the policy until time or `Safety` ends it.
+        """Ask, turn the motors on, approach the start posture, and run the policy until time or `Safety` ends it.
 
         Raises:
-          HandError: `Safety` or a failure ended the run.
+          HandError: the answer was not yes, or `Safety` or a failure ended the run.
         """
+        if not (self.arguments.yes or self.arguments.motors_off):
+            self.view.show()
+            consent.ask()
+            self._await_pose()  # The hand may have been moved or lost meanwhile.
         sys.setswitchinterval(2e-4)
         gc.collect()
         gc.freeze()
@@ -158,6 +167,7 @@ class Session:
             "mean_finger_force": self.force / self.forces if self.forces else 0.0,
             "log": str(self.log.path),
             "log_dropped": self.log.dropped,
+            "missing": self.outcome.missing(self.log),
         }
         if self.goals:
             times = [t - self.started for t in self.goals.times]
@@ -172,11 +182,21 @@ class Session:
             reply = self.port.exchange(self.sensing.command(self.sensing.hand.joint_lower, Mode.PASSIVE))
             if reply is not None:
                 states.append(reply.state)
+            elif (refusal := getattr(self.port, "refusal", None)) and refusal.serious:
+                raise HandError(f"{self.arguments.port}: {refusal.text}")
         if len(states) < _TARE_SAMPLES:
             raise HandError(
                 f"{self.arguments.port}: only {len(states)} answers in 5 s, cannot tare the taxels; check the cable"
             )
-        self.sensing.set_tare(states)
+        for line in self.sensing.set_tare(states):
+            self._note(f"warning: {line}")
+
+    def _await_pose(self) -> None:
+        if self.servo.wait_fresh(1.0) is None:
+            if self.safety.problem:
+                raise HandError(f"{self.arguments.port}: {self.safety.problem}; check `--hardware.joint-offset`")
+            why = self.safety.refused or "the hand stopped answering; check the cable and the power"
+            raise HandError(f"{self.arguments.port}: {why}")
 
     def _approach(self) -> None:
         """Move to the start posture, and hold it until the object is seen."""
@@ -215,6 +235,7 @@ class Session:
 
     def _loop(self) -> str:
         anchor, self.started = self.safety.anchor, time.monotonic()
+        self.outcome = Outcome(self.started)
         self.servo.forget()
         self.pace = Pace(self.controller.policy.control_rate)
         # A tick starts when a request has just been sent; rates from `keep_phase` keep it so.
@@ -223,7 +244,9 @@ class Session:
             self._check()
             now, sample = time.monotonic(), self.safety.sample
             assert sample is not None, "no state yet"
-            if now - sample.time <= self.safety.config.stale:
+            measured = now - sample.time <= self.safety.config.stale
+            self.outcome.add(now, measured, self.safety)
+            if measured:
                 if anchor != self.safety.anchor:
                     anchor = self.safety.anchor
                     self.controller.anchor(self.safety.commanded)
@@ -234,14 +257,15 @@ class Session:
         return "time is over"
 
     def _tick(self, now: float, sample: Any) -> None:
-        seen, age, when = self._objects().read(now)
+        objects = self._objects()
+        seen, when = objects.read(now)
         goal = self.goals.update(when, seen) if self.goals else IDENTITY
         if self.arguments.motors_off:
             self.controller.anchor(sample.measured.joint_position)
         tick = self.controller.tick(sample.measured, seen, goal, self.arguments.command)
-        hold_reason = "the object is out of sight" if age > self.safety.config.stale_object else ""
-        self.safety.set_target(tick.target, now, hold_reason)
+        self.safety.set_target(tick.target, now, objects.lost(now, self.safety.config.stale_object))
         self.tick = tick
+        self.outcome.act(tick.target)
         self.force += float(sample.measured.finger_force.sum())
         self.forces += 1
         readings = {field.name: getattr(tick.readings, field.name) for field in dataclasses.fields(tick.readings)}
@@ -261,6 +285,12 @@ class Session:
     def _tap(self, direction: str, data: bytes) -> None:
         kind = Kind.SENT if direction == "tx" else Kind.RECEIVED
         self.log.add(kind, (self.port.counts.sent, data))
+
+    def _mask(self, sequence: int, lines: list[str]) -> None:
+        """Taxels have got stuck: a replay needs to know from which exchange on."""
+        self.log.add(Kind.META, {"tare": self.sensing.tare, "from": sequence})
+        for line in lines:
+            self._note(f"warning: {line}")
 
     def _note(self, text: str) -> None:
         self.log.add(Kind.NOTE, text)
@@ -292,35 +322,4 @@ class Session:
                 "clock": time.time(),
                 "environment": cli.environment_report(),
             },
-        )
-
-    def _status(self) -> dict[str, str]:
-        sample, counts = self.safety.sample, self.port.counts
-        if sample is None:
-            return {"hand": "no measurement"}
-        force, heat = sample.measured.finger_force, sample.measured.temperature
-        reaction, reason = self.safety.last
-        rows = {
-            "time": f"{time.monotonic() - self.started if self.started else 0:.1f} s",
-            "safety": f"{reaction.name.lower()} {reason}".strip(),
-            "age": f"{1e3 * (time.monotonic() - sample.time):.1f} ms",
-            "policy": self._timing(self.pace.jitter, 1 / self.pace.period),
-            "exchanges": self._timing(self.servo.pace.jitter, 1 / self.servo.pace.period),
-            "round trip": f"p50 {1e3 * self.servo.round_trip.percentile(50):.2f} ms, "
-            f"p99 {1e3 * self.servo.round_trip.percentile(99):.2f} ms",
-            "link": f"{counts.answered} answered, {counts.corrupt} corrupt, {counts.silent} silent, "
-            f"{counts.late} late, {counts.reconnects} reconnects",
-            "force": f"{' '.join(f'{f:.1f}' for f in force)} N, sum {force.sum():.1f} N",
-            "command": f"{self.arguments.command:.2f}",
-            "heat": f"joints {heat[:12].max():.0f}, tips {heat[12:].max():.0f} degC",
-        }
-        if self.goals:
-            rows["successes"] = str(self.goals.successes)
-        return rows
-
-    @staticmethod
-    def _timing(timing: Timing, rate: float) -> str:
-        return (
-            f"{rate:.1f} Hz, late p50 {1e3 * timing.percentile(50):.2f} ms, "
-            f"p99 {1e3 * timing.percentile(99):.2f} ms, missed {timing.missed}"
         )

@@ -1,29 +1,39 @@
-"""The status of a run on the terminal: a live table, or a line every few seconds when the output is no terminal."""
+"""The status of a run on the terminal: live tables, or a line every few seconds when the output is no terminal."""
 
+import dataclasses
 import threading
 from collections import deque
 from collections.abc import Callable
 from typing import Any
 
-from rich.console import Console
+from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.table import Table
 
 from dexsim_real.core.process import lower_priority
+from dexsim_real.run.hand_view import HandState, hand_line, hand_tables
 
-_LIVE, _LINES = 0.25, 5.0  # s between two updates of the table, and between two lines
+_LIVE, _LINES = 0.25, 5.0  # s between two updates of the tables, and between two lines
+
+
+@dataclasses.dataclass(frozen=True)
+class Status:
+    """The state of a run."""
+
+    rows: dict[str, str]  # name to text
+    hand: HandState | None = None  # None without a measurement
 
 
 class StatusView:
     """Shows `status()` from a background thread. A context manager.
 
     Args:
-      title: of the table.
-      status: returns the rows of the table, name to text; called from the background thread.
+      title: of the tables.
+      status: the current state; called from the background thread, and by `show`.
       quiet: show nothing.
     """
 
-    def __init__(self, title: str, status: Callable[[], dict[str, str]], quiet: bool = False):
+    def __init__(self, title: str, status: Callable[[], Status], quiet: bool = False):
         self.console = Console(stderr=True, quiet=quiet)
         self._title, self._status = title, status
         self._live = (
@@ -53,6 +63,10 @@ class StatusView:
         if not self._thread.is_alive():
             self._print_notes()
 
+    def show(self) -> None:
+        """Print the tables once."""
+        self.console.print(self._tables(self._status()))
+
     def _print_notes(self) -> None:
         while self._notes:
             self.console.print(self._notes.popleft(), highlight=False, markup=False, soft_wrap=True)
@@ -64,17 +78,18 @@ class StatusView:
             self._print_notes()
             shown += _LIVE
             if self._live:
-                self._live.update(self._table(self._status()), refresh=True)
+                self._live.update(self._tables(self._status()), refresh=True)
             elif shown >= _LINES:
-                shown = 0.0
-                self._notes.append(" | ".join(f"{name} {value}" for name, value in self._status().items()))
+                shown, status = 0.0, self._status()
+                words = status.rows | (hand_line(status.hand) if status.hand else {})
+                self._notes.append(" | ".join(f"{name} {value}" for name, value in words.items()))
         self._print_notes()
 
-    def _table(self, status: dict[str, str]) -> Table:
-        table = Table(show_header=False, title=self._title, title_justify="left")
-        for row in status.items():
-            table.add_row(*row)
-        return table
+    def _tables(self, status: Status) -> RenderableType:
+        rows = Table.grid(padding=(0, 2))
+        for row in status.rows.items():
+            rows.add_row(*row)
+        return Group(self._title, *([hand_tables(status.hand)] if status.hand else []), "", rows)
 
 
 def summary_table(title: str, summary: dict[str, Any]) -> Table:

@@ -22,10 +22,13 @@ from dexsim_real.core.errors import HandError
 from dexsim_real.core.process import lower_priority
 
 Masks = Callable[[], tuple[float, np.ndarray] | None]
-"""Blocks until the next picture; returns its time (s, monotonic clock) and a bool mask [H, W], or None at the end."""
+"""Blocks until the next picture; returns its time (s, monotonic clock) and a bool mask [H, W], or None at the end.
+
+A time in the future, as of another clock, counts as now."""
 
 _STREAM = struct.Struct("<4sHHd")
 _MAGIC = b"MASK"
+_PIXELS = 2**26  # largest picture of a stream
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -120,6 +123,7 @@ class HeightSensor:
         self._masks, self._config, self._weight = masks, config, weight
         self._reference, self._axis = np.asarray(reference, float), axes.index(True)
         self._newest: tuple[float, np.ndarray, np.ndarray] | None = None
+        self.failure = ""  # why no picture comes any more
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="vision", daemon=True)
         self._thread.start()
@@ -155,10 +159,17 @@ class HeightSensor:
     def _run(self) -> None:
         lower_priority()
         while not self._stop.is_set():
-            picture = self._masks()
-            if picture is None:
+            try:
+                picture = self._masks()
+                if picture is None:
+                    self.failure = "the camera sends no more pictures"
+                    return
+                when, mask = picture
+                now = time.monotonic()
+                self.see(when if when < now else now, mask)
+            except Exception as error:  # Also of the user's function.
+                self.failure = f"the camera failed: {' '.join(str(error).split()) or type(error).__name__:.200}"
                 return
-            self.see(*picture)
 
 
 # --- sources of masks ----------------------------------------------------------------------------
@@ -213,8 +224,8 @@ def _stream(path: str) -> Masks:
         if len(head) < _STREAM.size:
             return None
         magic, width, height, when = _STREAM.unpack(head)
-        if magic != _MAGIC:
-            return None
+        if magic != _MAGIC or width * height > _PIXELS:
+            raise HandError(f"{path}: what this program sends are no masks")
         bits = file.read((width * height + 7) // 8)
         if len(bits) < (width * height + 7) // 8:
             return None

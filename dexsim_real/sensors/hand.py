@@ -10,6 +10,7 @@ from dexsim.calibration.maps import Calibration, current_from_counts, normalised
 from dexsim.core.config import setting, validate
 from dexsim.hand.kinematics import Hand
 from dexsim_real.core.errors import HandError
+from dexsim_real.sensors.taxels import StuckTaxels, judge_rest, taxel_names
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Mode
 
@@ -44,7 +45,10 @@ class HardwareConfig:
     taxel_floor: float = setting(1.0, unit="count", low=0.0, high=255.0)
     """Tared counts below this read as zero."""
     tare_limit: float = setting(40.0, unit="count", low=0.0, high=255.0)
-    """Largest count of a taxel when it is tared; a higher one means that the fingertip touches something."""
+    """Count above which a taxel cannot be tared: alone it is stuck, and several adjacent ones touch something."""
+    tare_sum: float = setting(50.0, unit="count", low=0.0, high=30600.0)
+    """Largest sum of a fingertip's counts when it is tared, single taxels left out: the largest load that taring can
+    hide, 5 N by the vendor's 0.1 N."""
     current_sign: float = setting(-1.0, unit="1", low=-1.0, high=1.0)
     """Sign of the current without a calibration: -1 when a positive current opens the hand."""
     current_scale: float = setting(1000.0, unit="mA", low=1.0, high=20000.0)
@@ -71,8 +75,9 @@ class HandMeasurement:
     joint_torque: np.ndarray  # [J] 1, relative to the stall torque
     taxel_force: np.ndarray  # [F, N] N
     current: np.ndarray  # [J] A, magnitude
-    temperature: np.ndarray  # [J + F] degC, joint boards and tips
+    temperature: np.ndarray  # [J + F + 1] degC, joint boards, tips and palm board
     errors: np.ndarray  # [J, 3] error bits of palm, joint and tip board
+    mode: np.ndarray  # [J] control mode that the hand reports, `frames.Mode`
 
     @property
     def finger_force(self) -> np.ndarray:
@@ -91,7 +96,7 @@ class HandMeasurement:
 class HandSensing:
     """Converts the hand's state blocks to SI units, and joint angles to command blocks.
 
-    `tare` [F, N] holds the taxel counts that read as no force.
+    `tare` [F, N] holds the taxel counts that read as no force; infinite for stuck taxels, which never read one.
 
     Args:
       hand: model of the hand.
@@ -112,6 +117,7 @@ class HandSensing:
         self._sign = np.array(config.joint_sign, np.float32)
         self._offset = np.array(config.joint_offset, np.float32)
         self.tare = np.zeros((frames.TIPS, frames.TAXELS), np.float32)
+        self._stuck = StuckTaxels(hand)
         if calibration is None:
             self._per_count = np.full((frames.TIPS, 1), config.force_per_count, np.float32)
             scale = np.float32(config.current_sign / config.current_scale)
@@ -127,34 +133,57 @@ class HandSensing:
         joint, tip = state["joint"], state["tip"]
         counts = np.maximum(self._counts(state) - self.tare, 0.0)
         counts = np.where(counts < self.config.taxel_floor, np.float32(0), counts)
-        board = joint["temperature"] & 0xFF
+        board, palm = joint["temperature"] & 0xFF, joint["temperature"] >> 8
         return HandMeasurement(
             joint_position=joint["position"] * self._sign + self._offset,
             joint_torque=np.asarray(self._torque(joint["current"].astype(np.float32)), np.float32),
             taxel_force=counts * self._per_count,
             current=np.abs(joint["current"].astype(np.float32)) * np.float32(1e-3),
-            temperature=np.concatenate([board, tip["temperature"]]).astype(np.float32),
+            temperature=np.concatenate([board, tip["temperature"], [palm.max()]]).astype(np.float32),
             errors=np.stack([joint["palm_error"], joint["joint_error"], joint["tip_error"]], -1),
+            mode=(joint["raw_position"] & 0xF).astype(np.uint8),
         )
 
-    def set_tare(self, states: Sequence[np.ndarray]) -> None:
-        """Tare the taxels: their mean counts over these states read as no force from now on.
+    def set_tare(self, states: Sequence[np.ndarray]) -> list[str]:
+        """Tare the taxels: their mean counts over these states read as no force from now on. Mask stuck ones.
 
         Args:
           states: `frames.STATE_BLOCK` of an untouched hand.
 
+        Returns:
+          One line for each fingertip with stuck taxels.
+
         Raises:
-          HandError: a fingertip touches something.
+          HandError: a fingertip touches something, or has many stuck taxels.
         """
         counts = np.asarray(np.mean([self._counts(state) for state in states], axis=0, dtype=np.float32))
-        worst = counts.max(1)
-        if np.any(worst > self.config.tare_limit):
-            names = [self.hand.finger_names[i] for i in np.flatnonzero(worst > self.config.tare_limit)]
-            raise HandError(
-                f"cannot tare the taxels: {', '.join(names)} read up to {worst.max():.0f} counts "
-                f"(limit {self.config.tare_limit:.0f}); free the fingertips, or power-cycle the hand"
-            )
-        self.tare = counts
+        stuck = judge_rest(self.hand, counts, self.config.tare_limit, self.config.tare_sum)
+        self.tare = np.where(stuck, np.float32(np.inf), counts)
+        return self._say_masked(stuck)
+
+    def mask_stuck(self, state: np.ndarray, limit: float) -> list[str]:
+        """Mask taxels that have got stuck, given every answer of a run.
+
+        Args:
+          state: a `frames.STATE_BLOCK`.
+          limit: N, the largest force of a finger.
+
+        Returns:
+          One line for each fingertip with taxels masked by this answer.
+        """
+        counts = np.maximum(self._counts(state) - self.tare, 0.0)
+        stuck = self._stuck.find(counts, limit / self._per_count)
+        if stuck is None:
+            return []
+        self.tare = np.where(stuck, np.float32(np.inf), self.tare)
+        return self._say_masked(stuck)
+
+    def _say_masked(self, stuck: np.ndarray) -> list[str]:
+        return [
+            f"{name}: stuck and read as 0 from now on: taxel {taxel_names(self.hand, which)}"
+            for name, which in zip(self.hand.finger_names, stuck, strict=True)
+            if which.any()
+        ]
 
     def command(self, position: np.ndarray, mode: Mode) -> np.ndarray:
         """A `frames.COMMAND_BLOCK` for joint angles [J] rad of the model. Gains are 0 in all modes but `POSITION`.

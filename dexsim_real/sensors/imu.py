@@ -2,9 +2,9 @@
 
 The IMU sends 100 RVC frames a second at 115200 baud: AA AA, index, yaw, pitch and roll in 0.01 degree, three
 accelerations in mg, three more bytes, and the sum of all bytes after the head (BNO080 datasheet, 1.3.5.2). Yaw has no
-absolute reference: it is aligned once to a known pose of the object. Yaw, pitch and roll are singular where the IMU's x
-points up or down, so mount it with its z along the axis that stays upright: `UPRIGHT_X` is the mount in an object that
-turns about its x.
+absolute reference and the palm may lean, so a known pose of the object aligns both (`align`). Yaw, pitch and roll are
+singular where the IMU's x points up or down: mount it with its z along the axis that stays upright. `UPRIGHT_X` is the
+mount in an object that turns about its x.
 """
 
 import math
@@ -90,24 +90,17 @@ def conjugate(a: np.ndarray) -> np.ndarray:
     return a * np.array([1.0, -1.0, -1.0, -1.0])
 
 
-def align(sensed: np.ndarray, known: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """The rotation [4] from the IMU's world frame to the palm frame.
+def align(sensed: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """The rotation [4] from the IMU's world frame to the palm frame, from one known pose.
 
-    Gravity fixes two of its angles; only the heading is taken from the known orientation.
+    All three angles come from the pose. Gravity would give two of them only if the palm's own lean were known: a mount
+    that leans would then look like a turned object. What the pose is off by stays as a constant error.
 
     Args:
       sensed: [4] orientation of the IMU in its world frame.
       known: [4] orientation of the IMU in the palm frame at the same time.
-      up: [3] the vertical in the palm frame.
     """
-    up = np.asarray(up, float) / np.linalg.norm(up)
-    # The shortest rotation from the IMU's z to the palm frame's vertical; half a turn about x if opposite.
-    level = np.array([1.0 + up[2], -up[1], up[0], 0.0]) if up[2] > -1 + 1e-9 else np.array([0.0, 1.0, 0.0, 0.0])
-    level /= np.linalg.norm(level)
-    error = multiply(known, conjugate(multiply(level, sensed)))
-    heading = np.array([error[0], *(up * (error[1:] @ up))])
-    size = np.linalg.norm(heading)
-    return multiply(heading / size if size > 1e-9 else np.array([1.0, 0, 0, 0]), level)
+    return multiply(known, conjugate(sensed))
 
 
 class Imu:
@@ -115,15 +108,14 @@ class Imu:
 
     Args:
       port: serial port of the IMU.
-      up: [3] the vertical in the palm frame.
       mount: [4] orientation of the IMU in the object.
 
     Raises:
       HandError: the port cannot be opened.
     """
 
-    def __init__(self, port: str, up: np.ndarray, mount: tuple[float, ...] = UPRIGHT_X):
-        self.port, self._up = port, up
+    def __init__(self, port: str, mount: tuple[float, ...] = UPRIGHT_X):
+        self.port = port
         self._mount = np.asarray(mount) / np.linalg.norm(mount)
         self._world: np.ndarray | None = None
         self._newest: tuple[float, np.ndarray] | None = None
@@ -148,14 +140,14 @@ class Imu:
             time.sleep(0.005)
 
     def calibrate(self, known: np.ndarray) -> None:
-        """Align the heading: the object now has the orientation `known` [4] in the palm frame."""
+        """Align: the object now has the orientation `known` [4] in the palm frame."""
         assert self._newest is not None, "`wait` for the first orientation"
-        self._world = align(self._newest[1], multiply(known, self._mount), self._up)
+        self._world = align(self._newest[1], multiply(known, self._mount))
 
     def read(self) -> tuple[float, np.ndarray]:
         """Time of the newest sample (s, monotonic clock) and orientation [4] of the object in the palm frame."""
         if self._newest is None or self._world is None:
-            raise HandError(f"{self.port}: the heading of the IMU has not been aligned; call `calibrate` first")
+            raise HandError(f"{self.port}: the IMU has not been aligned; call `calibrate` first")
         when, quat = self._newest
         return when, multiply(multiply(self._world, quat), conjugate(self._mount))
 

@@ -32,7 +32,7 @@ def sources_of(names: Sequence[str]) -> set[str]:
     for name in names:
         if name not in FIELDS or FIELDS[name].source not in SOURCES:
             raise HandError(
-                f"the policy observes {name!r}, which no sensor measures on hardware; use a policy without it"
+                f"the policy observes {name!r:.80}, which no sensor measures on hardware; use a policy without it"
             )
     return {FIELDS[name].source for name in names}
 

@@ -5,6 +5,7 @@
 It prints the command that runs a policy on it, and ends after its trials or with Ctrl-C.
 """
 
+import dataclasses
 import importlib
 import queue
 import shlex
@@ -26,6 +27,7 @@ from dexsim_real.sensors.camera import CameraConfig
 from dexsim_real.twin.options import TwinArguments
 from dexsim_real.twin.plant.protocol import Plant
 from dexsim_real.twin.server import Twin
+from dexsim_real.twin.wire.firmware import FirmwareConfig
 
 
 def make_plant(arguments: TwinArguments, hand: Hand) -> Plant:
@@ -77,12 +79,13 @@ def check_policy(name: str, task: str, hand: Hand) -> None:
         )
 
 
-def write_calibration(path: Path, hand: Hand) -> Path:
+def write_calibration(path: Path, hand: Hand, board: FirmwareConfig) -> Path:
     """Write the calibration of an emulated hand with nominal motors, from which the motors of each trial deviate."""
     from dexsim.calibration.maps import save_calibration
     from dexsim_real.twin.virtual import ideal_calibration
 
-    save_calibration(path, ideal_calibration(hand))
+    side = board.handedness if board.serial_number else ""
+    save_calibration(path, dataclasses.replace(ideal_calibration(hand), serial=board.serial_number, handedness=side))
     return path
 
 
@@ -97,6 +100,7 @@ def runner_command(twin: Twin, calibration: Path | None) -> list[str]:
         "--port",
         str(twin.line.terminal.name),
         *(["--calibration", str(calibration)] if calibration else ["--uncalibrated"]),
+        "--yes",
     ]
     if arguments.command is not None:
         words += ["--command", f"{arguments.command:g}"]
@@ -106,6 +110,8 @@ def runner_command(twin: Twin, calibration: Path | None) -> list[str]:
             words += ["--imu-mount", *(f"{v:g}" for v in arguments.object.imu_mount)]
     if twin.masks and arguments.task == "grasp":
         words += ["--camera", f"unix:{twin.masks.path}"]
+        # Between two trials the object is out of sight for up to 20 s, which would end the run.
+        words += ["--safety.stale-object", "60"] if arguments.trials > 1 else []
         for name in ("focal", "centre", "position", "forward", "down"):
             value = getattr(arguments.object.optics, name)
             if value != getattr(CameraConfig(), name):
@@ -131,7 +137,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         twin = Twin(arguments, hand, make_plant(arguments, hand), Path(folder), lines.put)
         before = {number: signal.signal(number, lambda *_: twin.stop()) for number in (signal.SIGTERM, signal.SIGINT)}
         calibration = arguments.calibration or (
-            None if arguments.plant else write_calibration(Path(folder) / "calibration.toml", hand)
+            None if arguments.plant else write_calibration(Path(folder) / "calibration.toml", hand, arguments.firmware)
         )
         printer = threading.Thread(target=_print, args=(lines,), name="print", daemon=True)
         printer.start()

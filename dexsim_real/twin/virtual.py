@@ -35,6 +35,7 @@ RATE = 83.0  # exchanges a second
 REQUEST, ROUND_TRIP = 0.001, 0.0096  # s until a request reaches the board; until its answer has arrived
 IMU_RATE, CAMERA_RATE = 100.0, 30.0  # Hz
 _TARE_SAMPLES = 30
+_LEVER = 2.0**-4  # m, of a fingertip about any joint; cancels out in the ideal calibration
 _SLACK = 5.0  # s after the time limit of a trial at which a run ends anyway
 
 
@@ -50,8 +51,8 @@ def ideal_calibration(hand: Hand) -> Calibration:
         return Side(both, both, both, zero, zero, zero, zero, zero + 1, zero + 1, zero, zero, 0 * one, one, one)
 
     return Calibration(
-        real=side(-STALL_CURRENT / hand.torque_limit),
-        sim=side(np.ones(hand.num_joints)),
+        real=side(-STALL_CURRENT / hand.torque_limit * _LEVER),
+        sim=side(np.full(hand.num_joints, _LEVER)),
         torque_scale=hand.torque_limit,
         force_per_count=np.full(hand.num_fingers, FirmwareConfig().force_per_count),
         hand=hand.name,
@@ -81,8 +82,8 @@ class Schedule:
 class VirtualImu:
     """The IMU in the object and the bridge's processing of it, without a port."""
 
-    def __init__(self, plant: EmulatedHand, nominal_up: np.ndarray):
-        self._plant, self._nominal_up = plant, nominal_up
+    def __init__(self, plant: EmulatedHand):
+        self._plant = plant
         self._mount = np.asarray(UPRIGHT_X)
         self._parser, self._index = RvcParser(), 0
         # The IMU's world frame has the true vertical as z and an arbitrary heading.
@@ -105,8 +106,8 @@ class VirtualImu:
             self.time = time
 
     def calibrate(self) -> None:
-        """Align the heading: the object now has the identity orientation."""
-        self._world = align(self._sensed, multiply(IDENTITY, self._mount), self._nominal_up)
+        """Align: the object now has the identity orientation."""
+        self._world = align(self._sensed, multiply(IDENTITY, self._mount))
 
     def read(self) -> np.ndarray:
         """Orientation [4] of the object in the palm frame, as measured by the bridge."""
@@ -171,7 +172,7 @@ class VirtualRun:
         self._schedule, self._now = Schedule(), 0.0
         self._state: np.ndarray | None = None
         self._mode, self._target = Mode.PASSIVE, hand.joint_lower
-        self.imu = VirtualImu(plant, -np.asarray(controller.spec.gravity))
+        self.imu = VirtualImu(plant)
         self.camera = VirtualCamera(plant, controller) if "camera" in controller.sources else None
         self.goals: TurnGoals | None = None
         self.ticks, self.sums = 0, np.zeros(5)

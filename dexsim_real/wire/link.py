@@ -76,7 +76,11 @@ class Reply:
 
 
 class HandPort(Protocol):
-    """The interface of a hand. `exchange` is called from one thread only."""
+    """The interface of a hand. `exchange` is called from one thread only.
+
+    A port may also have `warnings()`, lines for the user; `identity`, a `dexsim_real.wire.identity.Identity` or None;
+    and `refusal`, a `dexsim_real.wire.refusals.Refusal` when the newest exchange was refused, else None.
+    """
 
     counts: LinkCounts
 
@@ -94,7 +98,8 @@ class HandPort(Protocol):
     def exchange(self, command: np.ndarray) -> Reply | None:
         """Send joint commands (`frames.COMMAND_BLOCK`); None when no valid answer arrived in time.
 
-        Line errors never raise. After a reconnection the given command is not sent: the first reply of a new
+        Line errors never raise. It returns within a second, also while the hand is gone: the guard process takes a
+        runner that does not move for dead. After a reconnection the given command is not sent: the first reply of a new
         generation comes from a passive hand.
         """
         ...

@@ -16,12 +16,16 @@ from dexsim.core.install import install_line
 from dexsim_real.core.errors import HandError, explain, latency_warnings
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Command, Frame, Mode
+from dexsim_real.wire.identity import SERIAL_NUMBER, SIDE, Identity, read_identity
 from dexsim_real.wire.link import HandPort, LinkConfig, LinkCounts, Reply
+from dexsim_real.wire.refusals import Refusal, read_refusal
 
 _POLL = 0.002  # s, longest wait of one read
 _WRITE = 0.5  # s, longest write; a longer one counts as a failure of the port
 _QUIET = 0.006  # s without a byte after which a frame has ended
 
+_ATTEMPTS = 2  # to read a register
+_REGISTER = 34  # bytes of the answer: number and content
 _LONGEST = frames.OVERHEAD + frames.STATE_BLOCK.itemsize  # bytes of the longest answer
 
 
@@ -33,6 +37,9 @@ def passive_command() -> np.ndarray:
 class SerialHand:
     """`HandPort` over a serial port.
 
+    `refusal` says why the newest request was refused, None if it was not. `identity` is what the hand told about itself
+    when it was connected. Another hand on the port is refused: it is told to turn its motors off, and nothing else.
+
     Args:
       port: device, by-id link, pseudo-terminal or pyserial URL.
       tap: called with ("tx" or "rx", bytes) for every frame, from the thread that calls `exchange`.
@@ -41,6 +48,8 @@ class SerialHand:
     def __init__(self, port: str, config: LinkConfig | None = None, *, tap: Callable[[str, bytes], None] | None = None):
         self.port, self.config = port, config or LinkConfig()
         self.counts = LinkCounts()
+        self.refusal: Refusal | None = None
+        self.identity = Identity()
         self._tap = tap or (lambda direction, data: None)
         self._serial: Any = None
         self._parser = frames.Parser(frames.HAND_REPLIES)
@@ -54,6 +63,7 @@ class SerialHand:
         try:
             time.sleep(self.config.settle)
             version = self._greet(self.config.handshake)
+            self.identity = self._identify()
         except HandError:
             self.close()
             raise
@@ -62,9 +72,10 @@ class SerialHand:
             raise HandError(
                 f"{self.port}: the connection failed during the handshake ({error}); check the cable"
             ) from None
-        return f"{self.port}: hand {self.config.hand_id}, firmware {version}"
+        return f"{self.port}: hand {self.config.hand_id}, {self.identity.describe()}, firmware {version}"
 
     def exchange(self, command: np.ndarray) -> Reply | None:
+        self.refusal = None
         if self._serial is None:
             return self._reconnect()
         try:
@@ -104,6 +115,7 @@ class SerialHand:
         """Send a command; its answer and the time s of sending."""
         request = Frame(frames.HOST, frames.palm_address(self.config.hand_id), command, data).encode()
         self.counts.sent += 1
+        self.refusal = None
         try:
             self._discard()
             self._tap("tx", request)
@@ -121,7 +133,7 @@ class SerialHand:
             self.counts.silent += self._received == before
         elif answer.command == Command.ERROR:
             self.counts.refused += 1
-            answer = None
+            self.refusal, answer = read_refusal(answer.data), None
         else:
             self.counts.answered += 1
         return answer, sent
@@ -201,6 +213,36 @@ class SerialHand:
             if time.monotonic() > until:
                 raise HandError(self._silence())
 
+    def _identify(self) -> Identity:
+        return read_identity(self._register(SERIAL_NUMBER), self._register(SIDE))
+
+    def _register(self, number: int) -> bytes | None:
+        """Content of a register; None when the hand does not tell."""
+        name = number.to_bytes(2, "little")
+        for _ in range(_ATTEMPTS):
+            frame, _ = self._request(Command.READ_REGISTER, name, _REGISTER)
+            if frame is not None and frame.data.startswith(name):
+                return frame.data[len(name) :]
+            if self.refusal is not None:
+                break
+        return None
+
+    def _recognise(self) -> None:
+        """Check that the hand is the one from before.
+
+        Raises:
+          HandError: it is another one, or does not tell.
+        """
+        if self.identity == Identity():
+            return
+        found = self._identify()
+        if found == self.identity:
+            return
+        text = f"another hand is on {self.port}: {found.describe()}, not {self.identity.describe()}"
+        told = all(new or not old for new, old in zip(vars(found).values(), vars(self.identity).values(), strict=True))
+        self.refusal = Refusal(text, serious=True) if told else None
+        raise HandError(text)
+
     def _silence(self) -> str:
         if not self._received:
             return (
@@ -212,6 +254,8 @@ class SerialHand:
                 f"{self.port}: answers arrive sooner than {self.config.baud} baud allow; use --link.no-paced for an "
                 "emulated line without timing"
             )
+        if self.refusal is not None:
+            return f"{self.port}: {self.refusal.text}; power-cycle the hand, and check that it is cool and moves freely"
         if not self._parser.counts.frames and not self._parser.counts.crc_errors:
             return (
                 f"{self.port}: none of {self._received} bytes belong to a frame; set --link.baud to that of the hand "
@@ -229,6 +273,7 @@ class SerialHand:
         try:
             self._open()
             self._greet(0.0)
+            self._recognise()
         except (HandError, OSError):
             self.close()
             self._pause = min(2 * self._pause, self.config.backoff[1])

@@ -17,6 +17,10 @@ KEYS = ("id", "date", "commit", "title", "command", "hardware", "seeds", "metric
 GRASP = {
     "held_pct": "held [%]",
     "held_worst_command_pct": "worst command [%]",
+    "r_resultant": "r, resultant",
+    "r_normal": "r, normal",
+    "r_taxels": "r, taxels",
+    "force_error_n": "force error [N]",
     "pearson_r": "force r",
     "force_rmse_n": "force RMSE [N]",
     "force_range": "force range [×]",
@@ -25,6 +29,8 @@ ROTATE = {
     "successes_median": "successes, median",
     "successes_mean": "mean",
     "successes_p10": "10th percentile",
+    "successes_per_minute": "per minute",
+    "do_nothing_successes_mean": "doing nothing, mean",
     "without_success_pct": "no success [%]",
     "seconds_per_success": "s per success",
     "never_dropped_pct": "never dropped [%]",
@@ -32,7 +38,20 @@ ROTATE = {
 TABLES: dict[str, tuple[str, dict[str, str]]] = {
     "rotate_training": ("Training: rotate", ROTATE | {"fingertips_working": "fingertips"}),
     "grasp_training": ("Training: grasp", GRASP),
-    "evaluation": ("Evaluations in simulation", ROTATE | {"held_pct": "held [%]", "pearson_r": "force r"}),
+    "evaluation": (
+        "Evaluations in simulation",
+        ROTATE
+        | {
+            "held_pct": "held [%]",
+            "do_nothing_held_pct": "doing nothing, held [%]",
+            "force_error_n": "force error [N]",
+            "r_resultant": "r, resultant",
+            "r_normal": "r, normal",
+            "r_taxels": "r, taxels",
+            "torque_limited_pct": "at a torque limit [%]",
+            "pearson_r": "force r",
+        },
+    ),
     "ablation": (
         "Tactile ablation",
         {"successes_mean": "successes, mean", "successes_median": "median", "never_dropped_pct": "never dropped [%]"},
@@ -42,8 +61,14 @@ TABLES: dict[str, tuple[str, dict[str, str]]] = {
         {
             "trials": "trials",
             "held_pct": "held [%]",
-            "pearson_r_normal": "r, normal force",
-            "pearson_r": "r, whole force",
+            "do_nothing_held_pct": "doing nothing, held [%]",
+            "force_error_n": "force error [N]",
+            "r_resultant": "r, resultant",
+            "r_normal": "r, normal",
+            "r_taxels": "r, taxels",
+            "torque_limited_pct": "at a torque limit [%]",
+            "pearson_r_normal": "pearson_r_normal",
+            "pearson_r": "pearson_r",
         },
     ),
     "zero_shot_rotate": (
@@ -51,6 +76,8 @@ TABLES: dict[str, tuple[str, dict[str, str]]] = {
         {
             "trials": "trials",
             "successes_mean": "successes, mean",
+            "successes_per_minute": "per minute",
+            "do_nothing_successes_mean": "doing nothing, mean",
             "seconds_per_success": "s per success",
             "seconds_to_drop": "s to the drop",
             "never_dropped_pct": "never dropped [%]",
@@ -66,10 +93,14 @@ TABLES: dict[str, tuple[str, dict[str, str]]] = {
             "ms": "ms, 4,096 envs",
             "ms_8192": "ms, 8,192 envs",
             "ms_32768": "ms, 32,768 envs",
-            "step_share_pct_32768": "% of a step, 32,768 envs",
+            "step_share_pct_32768": "query alone, % of a step, 32,768 envs",
         },
     ),
-    "physics": ("Physics", {f"pearson_r_per_finger_{s}": s for s in ("sphere", "box", "cylinder", "capsule")}),
+    "physics": (
+        "Physics",
+        {f"pearson_r_per_finger_{s}": f"skin law r, {s}" for s in ("sphere", "box", "cylinder", "capsule")}
+        | {f"force_difference_p95_n_{s}": f"force difference p95, {s} [N]" for s in ("box", "cylinder", "capsule")},
+    ),
     "cpu": (
         "Two CPU cores",
         {
@@ -131,6 +162,8 @@ def check(record: dict[str, Any]) -> str | None:
     for key in ("commit", "title", "command", "hardware", "verdict", "notes"):
         if not isinstance(record[key], str):
             return f"{key} is not text"
+    if record["commit"] and not re.fullmatch(r"[0-9a-f]{7}( \(.+\))?", record["commit"]):
+        return f"commit {record['commit']!r} is not seven digits, with a remark in brackets"
     if not (record["title"] and record["command"] and record["verdict"]):
         return "title, command or verdict is empty"
     if not all(isinstance(seed, int) for seed in record["seeds"]):
@@ -159,7 +192,7 @@ def render(name: str) -> str:
     for record in records:
         cells = [_value(record["metrics"], metric) for metric in columns]
         named = f'<a id="{record["id"]}"></a>{record["title"]} (`{record["id"]}`)'
-        commit = record["commit"].split()[0].rstrip(";,") if record["commit"] else ""
+        commit = record["commit"].split(" ")[0]
         lines.append(_row([named, record["date"], commit, *cells, record["verdict"]]))
     return "\n".join(lines) + "\n"
 

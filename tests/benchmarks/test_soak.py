@@ -50,6 +50,24 @@ def test_two_runners_die(soak, capsys):
 @pytest.mark.parametrize(
     "events, wanted",
     [
+        ([(1, "motors on"), (5, "fault heat: joint 4, 60 K"), (5.03, "motors off")], [("heat", 0.03)]),
+        ([(1, "motors on"), (5, "fault jam: joint 4"), (8.04, "motors off")], [("jam", 0.04)]),
+        ([(1, "motors on"), (5, "fault refuse: number 6,"), (6.1, "motors off")], [("refuse: number 6", 0.05)]),
+        ([(1, "motors on"), (5, "fault refuse: number 28,"), (6, "motors off")], [("refuse", 1.0)]),
+        ([(1, "motors on"), (4.5, "fault stall: 0.4 s"), (5, "fault off: all joints"), (6, "motors off")], []),
+        ([(1, "motors on"), (5, "fault error: tip"), (5.1, "fault disconnect: 1 s"), (7, "motors off")], []),
+        ([(1, "motors on"), (2, "motors off"), (5, "fault warm: palm"), (7, "motors on"), (8, "motors off")], []),
+    ],
+)
+def test_how_late_the_motors_went_off_after_an_alarm(soak, events, wanted):
+    found = importlib.import_module("soak_checks").alarm_reactions({"events": events})
+    assert [kind for kind, _ in found] == [kind for kind, _ in wanted]
+    np.testing.assert_allclose([late for _, late in found], [late for _, late in wanted], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "events, wanted",
+    [
         ([(1.0, "motors on"), (5.07, "watchdog: no exchange for 80 ms, motors off")], 0.07),
         ([(1.0, "motors on"), (5.01, "this machine is too slow"), (5.07, "watchdog: late, motors off")], 0.07),
         ([(5.02, "motors on"), (5.09, "watchdog: late, motors off"), (6.0, "motors on")], 0.09),

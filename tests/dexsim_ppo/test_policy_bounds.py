@@ -1,20 +1,26 @@
 """A policy file from anywhere: forged values with true checksums get one line, and open no file."""
 
+import copy
 import dataclasses
 import hashlib
+import re
 import struct
 
 import jax
 import msgpack
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from tiny_env import SMALL, TinyEnv
 
 from dexsim.core.assets import asset_path
-from dexsim.core.errors import CheckpointError
+from dexsim.core.config import to_dict
+from dexsim.core.errors import CheckpointError, DexsimError
 from dexsim_ppo import checkpoint, evaluate, train
 from dexsim_ppo.learner.ppo import make_train
 from dexsim_ppo.policy import Policy, load_policy
+from dexsim_real.control.controller import Controller
 
 
 @pytest.fixture(scope="module")
@@ -65,6 +71,10 @@ CONTENT = {
     "no configuration": {"env_config": None},
     "a list for the origin": {"training": []},
     "a specification in words": {"spec": "grasp"},
+    "a long word for a number": {"spec": {"name": "a", "fields": [], "velocity_filter": "a" * 10_000}},
+    "a long list for a name": {"spec": {"name": [0] * 5000, "fields": []}},
+    "gravity of no number": {"spec": {"name": "a", "fields": [], "gravity": [float("nan"), 0, 0]}},
+    "a posture beyond any joint": {"spec": {"name": "a", "fields": [], "posture": [1e9]}},
 }
 
 
@@ -88,6 +98,63 @@ ARRAYS = {
 def test_an_array_that_would_give_no_action_is_one_line(sound, tmp_path, what):
     with pytest.raises(CheckpointError, match=r"^[^\n]{1,400}$"):
         Policy.load(forge(sound, tmp_path / "p.msgpack", arrays=ARRAYS[what]))
+
+
+def test_an_observation_that_nothing_gives_is_one_line(hand):
+    shipped = load_policy("grasp")
+    spec = dataclasses.replace(shipped.spec, fields=("../../etc/passwd",) * 9)
+    with pytest.raises(DexsimError, match=r"^the policy observes '../../etc/passwd', which[^\n]*$"):
+        Controller(dataclasses.replace(shipped, spec=spec), hand)
+
+
+def test_a_file_without_end_is_no_policy(tmp_path):
+    with pytest.raises(CheckpointError, match="^/dev/zero: is not a dexsim checkpoint or policy$"):
+        Policy.load("/dev/zero")
+
+
+WRONG = st.one_of(
+    st.sampled_from(["x" * 9999, [0] * 999]),
+    st.none(),
+    st.booleans(),
+    st.integers(-(2**62), 2**62),
+    st.floats(),
+    st.text(max_size=3),
+    st.lists(st.floats(), max_size=4),
+    st.just({}),
+    st.just({"a": 1}),
+    st.binary(max_size=2),
+)
+
+
+def places(content, above=()):
+    """Every place in nested content."""
+    inner = content.items() if isinstance(content, dict) else enumerate(content) if isinstance(content, list) else ()
+    for name, value in inner:
+        yield (*above, name)
+        yield from places(value, (*above, name))
+
+
+@settings(max_examples=20)
+@given(st.data())
+def test_any_other_value_anywhere_is_one_line_or_a_policy(tmp_path_factory, hand, data):
+    path = tmp_path_factory.getbasetemp() / "forged.msgpack"
+    shipped = load_policy("grasp")
+    content = checkpoint.load(asset_path("policies/grasp.msgpack"), kind="policy").content
+    content = copy.deepcopy(content | {"spec": to_dict(shipped.spec)})
+    *above, name = data.draw(st.sampled_from(list(places(content | {"env_config": {}}))))
+    node = content
+    for step in above:
+        node = node[step]
+    node[name] = data.draw(WRONG)
+    checkpoint.save(path, kind="policy", task="grasp", content=content, tree=shipped.params)
+    try:
+        policy = Policy.load(path)
+        Controller(policy, hand)
+    except DexsimError as error:
+        assert re.match(r"^[^\n]{1,500}$", str(error))
+        return
+    assert 1 <= policy.control_rate <= 1000
+    assert np.all(np.abs(policy(np.full(66, 1e30, np.float32))) <= 1)
 
 
 def test_large_weights_that_do_not_overflow_are_a_policy(sound, tmp_path):

@@ -74,8 +74,9 @@ def test_a_physics_that_is_gone_is_named():
 
 def test_arguments_of_a_run_hold_the_same_fields():
     with pytest.warns(OldFileWarning, match="env.objects.mesh_touch"):
-        arguments = migrate_arguments({"env": old_config(), "corners": 0.3}, "a file")
+        arguments = migrate_arguments({"env": old_config(), "corners": 0.3, "backend": "auto"}, "a file")
     assert from_dict(GraspConfig, arguments["env"]) == GraspConfig() and arguments["extremes"] == 0.3
+    assert arguments["backend"] == "jax"
 
 
 def test_todays_files_are_left_alone():

@@ -1,16 +1,21 @@
-"""The policies in assets/policies: load without a simulator, fit today's tasks, and act."""
+"""The policies in assets/policies: load without a simulator, fit today's tasks, act, hold and turn."""
 
 import json
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import dexsim
 from dexsim.core.assets import asset_path
 from dexsim.core.config import from_dict
 from dexsim.core.errors import ConfigError
 from dexsim.observation import GRASP, ROTATE, layout
 from dexsim.registry import TASKS
+from dexsim.tasks.grasp.config import GraspConfig
+from dexsim.tasks.grasp.task import GraspGoal
+from dexsim.tasks.rotate.config import RotateConfig
 from dexsim_ppo.policy import Policy, layout_to_list
 from dexsim_real.sensors.readings import sources_of
 
@@ -90,3 +95,55 @@ def test_an_ablated_policy_takes_the_mean_of_what_it_does_not_see():
     np.testing.assert_array_equal(policy.ablate()(obs), policy(obs))
     with pytest.raises(ConfigError, match="does not observe colour; it observes .*joint_position"):
         policy.ablate("colour")
+
+
+WORLDS = 8
+
+
+def player(env):
+    """`play(states, seconds, policy)`: whether episodes failed [T, B], fingertip forces [T, B, F] N, and metrics.
+
+    Without a policy the hand gets no action. A failure does not stop a world here.
+    """
+    step = jax.jit(jax.vmap(env.step))
+
+    def play(states, seconds, policy=None):
+        history = []
+        for _ in range(round(seconds / env.control_period)):
+            states = step(states, jnp.zeros((WORLDS, 12)) if policy is None else policy(states.obs["actor"]))
+            history.append(jax.device_get((states.terminated, states.finger_force, states.metrics)))
+        return jax.tree.map(lambda *ticks: np.stack(ticks), *history)
+
+    return play
+
+
+def test_the_grasp_holds_and_presses_as_asked():
+    """Four seconds from four starts, each once with the lowest and once with the highest command.
+
+    A hand that does nothing drops every object, so that holding says something.
+    """
+    env = dexsim.make("grasp", GraspConfig(pool_size=20), backend="c", num_envs=WORLDS)
+    goals = GraspGoal(jnp.tile(jnp.array([0.0, 1.0]), WORLDS // 2), jnp.ones(WORLDS, bool))
+    pairs = jnp.repeat(jnp.arange(WORLDS // 2), 2)
+    rows = jnp.array([1, 6, 11, 16])[pairs]  # of different shapes
+    starts = jax.jit(jax.vmap(env.reset_to))(jax.random.split(jax.random.key(0), WORLDS // 2)[pairs], rows, goals)
+    assert len(np.unique(starts.episode.object.shape_index)) == WORLDS // 2
+    play = player(env)
+    dropped, force, _ = play(starts, 4.0, load("grasp"))
+    assert np.sum(~dropped.any(0)) >= 6
+    late = force[len(force) // 2 :, :, 1:].sum(-1).mean(0)  # N, of the four fingers
+    assert np.all(late[1::2] - late[::2] > 4.0), late
+    dropped, _, _ = play(starts, 4.0)
+    assert np.all(dropped.any(0))
+
+
+def test_the_rotate_turns():
+    """At least two quarter turns in four seconds and no drop; a hand that does nothing turns none."""
+    env = dexsim.make("rotate", RotateConfig(pool_size=WORLDS), backend="c", num_envs=WORLDS)
+    starts = jax.jit(jax.vmap(env.reset_to))(jax.random.split(jax.random.key(0), WORLDS), jnp.arange(WORLDS))
+    play = player(env)
+    dropped, _, metrics = play(starts, 4.0, load("rotate"))
+    turns = metrics["successes"][-1]
+    assert np.sum(~dropped.any(0) & (turns >= 2)) >= 6, turns
+    _, _, metrics = play(starts, 4.0)
+    assert not metrics["successes"].any()

@@ -10,6 +10,7 @@ from dexsim_real.calibrate import __main__ as calibrate
 from dexsim_real.calibrate.hand_loop import Operator
 from dexsim_real.calibrate.options import CalibrateArguments, PressConfig
 from dexsim_real.calibrate.plan import placements
+from dexsim_real.sensors.hand import HardwareConfig
 from dexsim_real.wire.frames import Mode
 
 SHORT = PressConfig(cycles=3, seconds=5.0, approach_speed=0.3, first_speed=0.08)
@@ -39,6 +40,7 @@ def arguments(folder, **options):
         "press": SHORT,
         "fingers": ("index",),
         "realtime": False,
+        "hardware": HardwareConfig(tare_sum=1000.0),  # The bench's taxels read 0 to 6 counts at rest.
     } | options
     return CalibrateArguments(**options)
 

@@ -15,5 +15,7 @@ def with_episode(state, **parts):
 def ground_truth(env, object, physics, force):
     """What a task would see of this object and physics state, under forces [F, 3] N on the finger tips."""
     zero = jnp.zeros(env.hand.num_joints)
-    tick = PhysicsTick(physics=physics, finger_force=force, joint_torque=zero, gear=None, finite=jnp.ones((), bool))
+    tick = PhysicsTick(
+        physics=physics, finger_force=force, joint_torque=zero, gear=None, limited=zero > 0, finite=jnp.ones((), bool)
+    )
     return env._ground_truth(object, tick, zero, zero)

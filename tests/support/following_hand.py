@@ -41,6 +41,7 @@ def arguments(peer, folder, *more):
         "--port",
         peer.port,
         "--uncalibrated",
+        "--yes",
         "--fixed-object",
         "--link.settle",
         "0",

@@ -11,6 +11,7 @@ import numpy as np
 
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Mode
+from dexsim_real.wire.identity import Identity
 from dexsim_real.wire.link import LinkCounts, Reply
 
 EXCHANGE = 0.0096  # s
@@ -63,6 +64,8 @@ class BenchHand:
         self._load()
 
     # --- the port -------------------------------------------------------------------------------
+
+    identity = Identity("2R32BENCH", "right")
 
     def connect(self):
         return "bench: hand 0, firmware none"

@@ -24,10 +24,12 @@ class PtyHand:
       answer: (number of the exchange, command block [12], state block) to the bytes to send; None for the
         whole, sound answer. It may change the state in place.
       version: what a version request is answered with; None for silence.
+      registers: contents by number; other registers are answered with silence.
     """
 
-    def __init__(self, answer: Callable | None = None, version: bytes | None = b"1.3.9"):
+    def __init__(self, answer: Callable | None = None, version: bytes | None = b"1.3.9", registers: dict | None = None):
         self.answer, self.version = answer, version
+        self.registers = {20: b"right", 21: b"2R32SCRIPTED"} if registers is None else registers
         self.state = frames.empty_state()
         self.state["joint"]["temperature"] = 30
         self.commands: list[np.ndarray] = []
@@ -80,6 +82,10 @@ class PtyHand:
     def _reply(self, frame: Frame) -> bytes:
         if frame.command == Command.VERSION:
             return b"" if self.version is None else Frame(0x80, 0xFE, Command.VERSION, self.version).encode()
+        if frame.command == Command.READ_REGISTER:
+            content = self.registers.get(int.from_bytes(frame.data, "little"))
+            whole = b"" if content is None else frame.data + content.ljust(32, b"\0")
+            return whole and Frame(0x80, 0xFE, Command.READ_REGISTER, whole).encode()
         if frame.command != Command.EXCHANGE:
             return b""
         command = frames.decode_command(frame.data)

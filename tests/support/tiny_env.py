@@ -67,6 +67,12 @@ class TinyState:
     key: jax.Array
 
 
+@pytree_dataclass
+class TinyPlan:
+    key: jax.Array
+    row: np.ndarray
+
+
 class TinyEnv:
     """The environment interface in forty lines."""
 
@@ -128,8 +134,11 @@ class TinyEnv:
     def restart(self, state: TinyState, done: jax.Array) -> TinyState:
         return jax.tree.map(lambda new, old: jnp.where(done, new, old), self._start(state.key), state)
 
-    def evaluation_starts(self, key: jax.Array, count: int) -> TinyState:
-        return jax.vmap(self._start)(jax.random.split(key, count))
+    def evaluation_plan(self, count: int, seed: int) -> "TinyPlan":
+        return TinyPlan(jax.random.split(jax.random.key(seed), count), np.arange(count))
+
+    def evaluation_starts(self, plan: "TinyPlan") -> TinyState:
+        return jax.vmap(self._start)(plan.key)
 
     def summarize(self, metrics: dict[str, np.ndarray], alive: np.ndarray) -> dict[str, Any]:
         error = float(metrics["error"][alive].mean())

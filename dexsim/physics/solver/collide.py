@@ -1,9 +1,9 @@
 """Closed-form contacts of the hand's spheres, capsules and planes with primitives, and of boxes with boxes, for the
 JAX backend.
 
-MJX finds contacts with cylinders by a gradient descent and those with boxes by clipping polygons: half of what
-compiling a step took, and for cylinders up to a millimetre too shallow. Here a sphere meets a primitive where
-its distance function says, and a capsule at the one or two ends of that stretch of its axis which is nearest.
+MJX finds contacts with cylinders by a gradient descent, up to a millimetre too shallow, and those with boxes by
+clipping polygons, at other points than C MuJoCo: both take long to compile. Here a sphere meets a primitive where
+its distance function says, and a capsule where the balls at one or two places of its axis do (`Balls`).
 """
 
 import dataclasses
@@ -17,7 +17,7 @@ import numpy as np
 
 from dexsim.core.pytree import Array
 from dexsim.geometry import sdf
-from dexsim.physics.solver.boxes import POINTS, box_box
+from dexsim.physics.solver.boxes import POINTS, box_box, capsule_box
 
 _BOXES = ("box", "box")
 KINDS = {
@@ -39,7 +39,8 @@ _SLOPE, _SAME = 1e-3, 1e-3
 class Balls:
     """Pairs of the hand's spheres and capsules with one kind of primitive.
 
-    A capsule is met as the balls at the ends of its nearest stretch, so all are balls in the end.
+    A capsule is met as balls at two places of its axis, so all are balls in the end: on a box where C MuJoCo has them
+    (`boxes.capsule_box`), on other kinds at the ends of the stretch that is nearest.
     """
 
     kind: str
@@ -53,12 +54,11 @@ class Balls:
         same: Array = np.zeros(len(mine), bool)
         if len(self.capsule):
             mine, theirs = self.capsule.T
-            ends, one = jax.vmap(functools.partial(_nearest_stretch, self.kind))(
+            ends, one = jax.vmap(_over_box if self.kind == "box" else functools.partial(_nearest_stretch, self.kind))(
                 position[mine], rotation[mine][:, :, 2], size[mine, 1], position[theirs], rotation[theirs], size[theirs]
             )
             centre = jnp.concatenate([centre, ends.reshape(-1, 3)])
             radius = jnp.concatenate([radius, jnp.repeat(size[mine, 0], 2)])
-            # A stretch that is a point has one end.
             same = jnp.concatenate([same, jnp.stack([jnp.zeros_like(one), one], -1).reshape(-1)])
             other = np.concatenate([other, np.repeat(theirs, 2)])
         gap, point, normal = jax.vmap(functools.partial(_ball, self.kind))(
@@ -143,6 +143,21 @@ def _ball(
     normal = -jnp.stack([sum(rotation[row, k] * outward[k] for k in range(3)) for row in range(3)])
     gap = gap[0] - radius
     return gap, centre + normal * (radius + 0.5 * gap), normal
+
+
+def _over_box(
+    centre: jax.Array,
+    axis: jax.Array,
+    half: jax.Array,
+    position: jax.Array,
+    rotation: jax.Array,
+    size: jax.Array,
+) -> tuple[jax.Array, jax.Array]:
+    """The places [2, 3] of a segment that meet a box, and whether there is one only."""
+    start = sdf.to_local(centre[None], position, rotation)[0]
+    along = sdf.to_local((centre + axis)[None], position, rotation)[0] - start
+    place, second = capsule_box(start, half * along, size)
+    return centre[None] + (half * place)[:, None] * axis[None], ~second
 
 
 def _nearest_stretch(

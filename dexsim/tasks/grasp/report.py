@@ -2,11 +2,19 @@
 
 import numpy as np
 
-from dexsim.core.statistics import bootstrap, mean, proportion, statistic
+from dexsim.core.statistics import bootstrap, entry, mean, proportion, statistic
 from dexsim.objects.config import KINDS
 
-_SETTLE = 3.0  # s after release from which forces count
-_FORCES = ("finger_force", "finger_pressing", "total_force", "taxel_force", "thumb_force", "touching")
+SETTLE = 3.0  # s after release from which forces count
+FORCES = {"r_resultant": "finger_force", "r_normal": "finger_normal", "r_taxels": "finger_taxels"}
+"""Correlations with the command, and the metric of each: a touching finger's whole contact force with friction, what of
+it presses into the skin, and what of that the taxels bear."""
+_MEANS = (*FORCES.values(), "total_force", "taxel_force", "thumb_force", "touching", "torque_limited")
+
+
+def window(seconds: float) -> tuple[float, float]:
+    """From when to when [s] after release the forces of a trial of this length count."""
+    return min(SETTLE, seconds / 2), seconds
 
 
 def summarize(
@@ -21,21 +29,21 @@ def summarize(
       span: N, target force per touching finger at command 0 and 1.
 
     Returns:
-      A JSON-able dict. Forces are averaged over the ticks from 3 s after release (from the
-      middle of shorter episodes), for episodes held to the end. "finger_force" is the solver's
-      force per touching finger among those commanded (all but the thumb), friction included, "total_force" the
-      sum over all fingers, "taxel_force" that sum as the taxels feel it. "pearson_r" goes by "finger_force",
-      "pearson_r_pressing" by what the taxels feel of it: the normal forces, which the paper's hand measures.
+      A JSON-able dict. Forces are averaged over the ticks of "window_s": from 3 s after release (from the middle of
+      shorter episodes) to the end, for episodes held to the end. They are means over the touching fingers among those
+      commanded (all but the thumb); "total_force" is the solver's force summed over all fingers, "taxel_force" that
+      sum as the taxels feel it. "r_resultant", "r_normal" and "r_taxels" correlate command and force, see `FORCES`.
+      "torque_limited" is the share of these ticks with a joint at its torque limit: there force cannot follow.
+      "force_error_n" is the root mean square error of the resultant over all episodes; a lost object is not pressed.
       Intervals are 95 %: Wilson's for proportions, else bootstrap over episodes.
     """
     ticks, episodes = alive.shape
     held = alive[-1]
-    late = slice(min(round(_SETTLE / control_period), ticks // 2), None)
+    late = slice(min(round(SETTLE / control_period), ticks // 2), None)
     command, shape = metrics["command"][0], metrics["shape"][0].astype(int)
     # Of each episode [N], the mean over its late ticks.
-    mean_of = {name: metrics[name][late].mean(0) for name in _FORCES}
+    mean_of = {name: np.where(alive, metrics[name], 0.0)[late].mean(0) for name in _MEANS}
     wanted = span[0] + command * (span[1] - span[0])
-    force, total = mean_of["finger_force"], mean_of["total_force"]
     returns = np.where(alive, metrics["reward"], 0.0).sum(0) if "reward" in metrics else metrics["return"].max(0)
     by_command = [_command_row(level, command, held, wanted, mean_of) for level in np.unique(command)]
     by_shape = [_shape_row(index, shape, command, held, wanted, mean_of) for index in np.unique(shape)]
@@ -44,13 +52,13 @@ def summarize(
     report = {
         "episodes": episodes,
         "seconds": ticks * control_period,
+        "window_s": list(window(ticks * control_period)),
         "held": proportion(held),
         "hold_time_s": mean(alive.sum(0) * control_period),
         "return": mean(returns),
-        "pearson_r": pearson(command[held], force[held]),
-        "pearson_r_pressing": pearson(command[held], mean_of["finger_pressing"][held]),
-        "pearson_r_total": pearson(command[held], total[held]),
-        "rmse_n": rmse(force[held], wanted[held]),
+        **correlations(command, held, mean_of),
+        "force_error_n": force_error(mean_of["finger_force"], wanted),
+        "torque_limited": mean(mean_of["torque_limited"][held]),
         "force_range": float(means[-1] / means[0]) if complete and len(means) > 1 and means[0] > 0 else None,
         "total_force_monotone": bool(complete and np.all(np.diff(means) > 0)),
         "finger_force_by_command_n": [row["finger_force_n"]["mean"] for row in by_command],
@@ -76,10 +84,14 @@ def _command_row(
         "held": proportion(held[mine]),
         "target_force_n": float(wanted[mine].mean()),
         "finger_force_n": mean(mean_of["finger_force"][good]),
+        "finger_normal_n": mean(mean_of["finger_normal"][good]),
+        "finger_taxels_n": mean(mean_of["finger_taxels"][good]),
         "total_force_n": mean(mean_of["total_force"][good]),
         "taxel_force_n": mean(mean_of["taxel_force"][good]),
         "thumb_force_n": mean(mean_of["thumb_force"][good]),
         "touching_fingers": mean(mean_of["touching"][good]),
+        "torque_limited": mean(mean_of["torque_limited"][good]),
+        "saturates": saturates(mean_of["torque_limited"][good]),
     }
 
 
@@ -93,30 +105,28 @@ def _shape_row(
 ) -> dict:
     """The episodes with one shape; arrays [N] are of all episodes."""
     mine = shape == index
-    good = mine & held
-    force = mean_of["finger_force"][good]
     return {
         "shape": KINDS[index],
         "episodes": int(mine.sum()),
         "held": proportion(held[mine]),
-        "pearson_r": pearson(command[good], force),
-        "pearson_r_pressing": pearson(command[good], mean_of["finger_pressing"][good]),
-        "pearson_r_total": pearson(command[good], mean_of["total_force"][good]),
-        "pearson_r_taxels": pearson(command[good], mean_of["taxel_force"][good]),
-        "rmse_n": rmse(force, wanted[good]),
+        **correlations(command, mine & held, mean_of),
+        "force_error_n": force_error(mean_of["finger_force"][mine], wanted[mine]),
     }
 
 
 def _headline(report: dict) -> dict:
-    by_shape = [row["pearson_r"]["r"] for row in report["by_shape"]]
+    start, end = report["window_s"]
+    by_shape = [row["r_taxels"]["r"] for row in report["by_shape"]]
     return {
-        "held": report["held"]["mean"],
+        "held": entry(report["held"]),
         "held at worst command": min(row["held"]["mean"] for row in report["by_command"]),
-        "Pearson r (all)": report["pearson_r"]["r"],
-        "Pearson r (worst shape)": min((r for r in by_shape if r is not None), default=None),
+        "force error, 0 N where lost (N)": entry(report["force_error_n"]),
+        f"r, resultant force ({start:.3g} to {end:.3g} s)": entry(report["r_resultant"]),
+        "r, normal force": entry(report["r_normal"]),
+        "r, force on the taxels": entry(report["r_taxels"]),
+        "r, force on the taxels, worst shape": min((r for r in by_shape if r is not None), default=None),
+        "ticks with a joint at its torque limit": entry(report["torque_limited"]),
         "force range": report["force_range"],
-        "RMSE (N)": report["rmse_n"]["mean"],
-        "return": report["return"]["mean"],
     }
 
 
@@ -124,10 +134,21 @@ def _optional_pearson(metrics: dict[str, np.ndarray], alive: np.ndarray) -> dict
     if "skin_force" not in metrics:
         return None
     keep = alive & (metrics["total_force"] > 0.01)
-    return pearson(metrics["skin_force"][keep], metrics["total_force"][keep], samples=0)
+    # Both are of the taxels: skin beyond them may bear load as well.
+    return pearson(metrics["skin_force"][keep], metrics["taxel_force"][keep], samples=0)
 
 
-def rmse(values: np.ndarray, wanted: np.ndarray) -> dict:
+def saturates(torque_limited: np.ndarray) -> bool:
+    """Whether a command is beyond the motors: held objects [N] see a joint at its torque limit most of the time."""
+    return bool(torque_limited.size and torque_limited.mean() > 0.5)
+
+
+def correlations(command: np.ndarray, held: np.ndarray, mean_of: dict[str, np.ndarray]) -> dict:
+    """Pearson's r of command [N] and each of `FORCES` [N], of what was held [N]."""
+    return {name: pearson(command[held], mean_of[metric][held]) for name, metric in FORCES.items()}
+
+
+def force_error(values: np.ndarray, wanted: np.ndarray) -> dict:
     """Root mean square error with a bootstrap 95 % interval."""
     return statistic((values - wanted) ** 2, lambda square: np.sqrt(square.mean()), "mean")
 

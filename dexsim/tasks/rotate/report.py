@@ -19,16 +19,18 @@ def summarize(metrics: dict[str, np.ndarray], lived: np.ndarray, control_period:
     Returns:
       A JSON-able dict. "successes" are consecutive by nature: a drop ends the episode. They count goals
       reached under the configured test (with spin), "paper_successes" those under the paper's.
-      "seconds_per_success" is the time at the last goal over their number, of episodes with one or
-      more. "seconds_to_fall" is cut at the episode's length where the object stayed. Intervals are 95 %:
-      Wilson's for proportions, else bootstrap over episodes.
+      "successes_per_minute" is their number in all episodes over all the time that episodes lasted, the time in
+      which a hand is stuck included: 60 over it is the paper's seconds per success. "seconds_per_success" is the
+      time at the last goal over their number, of episodes with one or more, so that time stuck after it is left
+      out. "seconds_to_fall" is cut at the episode's length where the object stayed. Intervals are 95 %: Wilson's
+      for proportions, else bootstrap over episodes.
     """
     seconds, successes = lived * control_period, metrics["successes"]
     some = successes > 0
     pace = metrics["time_at_last_success"][some] / successes[some]
     kept = lived >= ticks
     duty = np.stack([metrics[name] for name in sorted(metrics) if name.startswith("duty/")], -1)
-    minutes = np.maximum(seconds, control_period) / 60
+    minutes = np.maximum(seconds, control_period) / 60  # A drop in the first tick leaves none.
     report = {
         "episodes": int(lived.size),
         "seconds": ticks * control_period,
@@ -40,7 +42,7 @@ def summarize(metrics: dict[str, np.ndarray], lived: np.ndarray, control_period:
         | {"median": float(np.median(seconds)), "longest": float(seconds.max())},
         "kept_to_the_end": statistics.proportion(kept),
         "rotations_per_minute": statistics.mean(metrics["spin"] * 60 / (2 * np.pi)),
-        "goals_per_minute": statistics.mean(successes / minutes),
+        "successes_per_minute": statistics.ratio(successes, minutes),
         "end": {
             "pushed_out": int(np.sum(metrics["pushed_out"] > 0)),
             "slipped": int(np.sum(metrics["slipped"] > 0)),
@@ -59,16 +61,15 @@ def summarize(metrics: dict[str, np.ndarray], lived: np.ndarray, control_period:
 
 
 def _headline(report: dict) -> dict:
+    """What a hand that only keeps the object fails, and how the hand moved."""
     duty = np.array(report["gait"]["fingertip_duty"])
     return {
-        "successes (median)": report["successes"]["median"]["median"],
-        "successes (mean)": report["successes"]["mean"]["mean"],
+        "successes (median)": statistics.entry(report["successes"]["median"]),
+        "successes (mean)": statistics.entry(report["successes"]["mean"]),
         "successes (10th percentile)": report["successes"]["percentiles"]["10"],
-        "paper's successes (mean)": report["paper_successes"]["mean"]["mean"],
-        "episodes without": report["without_success"]["mean"],
-        "s per success": report["seconds_per_success"]["mean"],
-        "s to fall (mean)": report["seconds_to_fall"]["mean"],
-        "joint speed (rad/s)": report["gait"]["joint_speed_rad_s"]["mean"],
+        "paper's successes (mean)": statistics.entry(report["paper_successes"]["mean"]),
+        "successes per minute, time stuck included": statistics.entry(report["successes_per_minute"]),
+        "joint speed (rad/s)": statistics.entry(report["gait"]["joint_speed_rad_s"]),
         "fingertips at work (duty over 10 %)": int(np.sum(duty > 0.1)),
     }
 

@@ -21,14 +21,14 @@ class TipContacts(NamedTuple):
     """All contacts of the object with the fingertips."""
 
     force: np.ndarray  # [5, 3] N on each fingertip
-    pressing: np.ndarray  # [5] N, sum of the normal forces of each fingertip
+    normal: np.ndarray  # [5] N of it, along the sum of the fingertip's contact normals
     touches: list[TipContact]
 
 
 def tip_contacts(scene: Scene, data: mujoco.MjData) -> TipContacts:
     """Contacts of the object with the fingertips in the state `data`."""
     found = TipContacts(np.zeros((5, 3)), np.zeros(5), [])
-    wrench = np.zeros(6)
+    inward, wrench = np.zeros((5, 3)), np.zeros(6)
     for i in range(data.ncon):
         first, second = data.contact.geom[i]
         finger = max(scene.finger_of_geom[first], scene.finger_of_geom[second])
@@ -40,6 +40,9 @@ def tip_contacts(scene: Scene, data: mujoco.MjData) -> TipContacts:
         sign = 1.0 if scene.is_object[first] else -1.0
         normal, tangent = sign * wrench[0] * frame[0], sign * wrench[1:3] @ frame[1:]
         found.force[finger] += normal + tangent
-        found.pressing[finger] += abs(wrench[0])
+        inward[finger] += normal
         found.touches.append(TipContact(int(finger), data.contact.pos[i].copy(), normal, tangent))
+    # As in simulation (`dexsim.touch.feel.keep_normal_part`), where one direction stands for the whole fingertip.
+    length = np.maximum(np.linalg.norm(inward, axis=-1), 1e-12)
+    found.normal[:] = np.maximum((found.force * inward).sum(-1) / length, 0.0)
     return found

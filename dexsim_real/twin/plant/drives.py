@@ -67,6 +67,7 @@ class Drives:
         self._integral, self._speed = zero.copy(), zero.copy()
         self._last: np.ndarray | None = None
         self._on, self._limit, self._max_torque = np.zeros(joints, bool), zero.copy(), zero.copy()
+        self._highest = self._lowest = zero  # A, of the last period
 
     def configure(self, parameters: TrialParameters) -> None:
         """Set the parameters of a trial; temperatures and commands are kept."""
@@ -108,6 +109,10 @@ class Drives:
             self._warm_up()
         return torque, self.coulomb + self._loss * np.abs(torque)
 
+    def at_limit(self) -> np.ndarray:
+        """Which drives [12] bool are at the largest torque that supply or `torque_max` allows."""
+        return self._on & ((self.current >= self._highest) | (self.current <= -self._lowest))
+
     def _receive(self, time: float) -> None:
         """Each board takes the newest command that has reached it."""
         for there, motors in self._queue:
@@ -142,6 +147,7 @@ class Drives:
         share = speed / self.no_load_speed
         highest = np.minimum(np.maximum(self._stalled * (1.0 - share), 0.0), self._limit)
         lowest = np.minimum(np.maximum(self._stalled * (1.0 + share), 0.0), self._limit)
+        self._highest, self._lowest = highest, lowest
         return np.where(self._on, np.minimum(np.maximum(torque / self.constant, -lowest), highest), 0.0)
 
     def _warm_up(self) -> None:

@@ -189,7 +189,7 @@ class EmulatedHand:
         self._push_at = np.inf
         self._pin(self._assistant.shelf(place), place)
         mujoco.mj_forward(scene.model, self._data)
-        self._tips, self._pressing = np.zeros((5, 3)), np.zeros(5)
+        self._tips, self._normal = np.zeros((5, 3)), np.zeros(5)
         self._touches: list[Any] = []
         self._past: collections.deque[_Past] = collections.deque(maxlen=round(_MEMORY / PERIOD))
         samples = round(_MEMORY / float(self.parameters.taxel_period)) + 2
@@ -259,8 +259,10 @@ class EmulatedHand:
                 quat.copy(),
                 spin,
                 self._tips,
-                self._pressing,
+                self._normal,
+                self._samples[-1][1][..., 2].sum(-1) if self._samples else np.zeros(5),
                 data.qvel[scene.drive_dof],
+                self._drives.at_limit(),
             )
             self._hottest = max(self._hottest, float(self._drives.case.max()))
             if not np.isfinite(data.qpos).all() or data.warning.number.any():
@@ -305,7 +307,7 @@ class EmulatedHand:
 
     def _contacts(self) -> None:
         """Update the forces of the object on the fingertips."""
-        self._tips, self._pressing, self._touches = tip_contacts(self._scene, self._data)
+        self._tips, self._normal, self._touches = tip_contacts(self._scene, self._data)
 
     def _sample_skin(self) -> None:
         self._contacts()

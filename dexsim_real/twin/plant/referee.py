@@ -39,7 +39,8 @@ class Referee:
         self._reference = np.array(REFERENCES[task])
         self._touched = -math.inf
         self._counted, self._weight = 0, 0.0
-        self._force, self._finger, self._pressing, self._total = np.zeros(5), 0.0, 0.0, 0.0
+        self._force, self._total, self._limited = np.zeros(5), 0.0, 0.0
+        self._finger = dict.fromkeys(("force", "normal", "taxels"), 0.0)
         self._duty, self._speed = np.zeros(5), 0.0
         self.goals = None if task == "grasp" else {"task": GoalCount(GOAL_SPIN), "paper": GoalCount(math.inf)}
 
@@ -55,8 +56,10 @@ class Referee:
         quat: np.ndarray,
         spin: np.ndarray,
         tips: np.ndarray,
-        pressing: np.ndarray,
+        normal: np.ndarray,
+        taxels: np.ndarray,
         joint_speed: np.ndarray,
+        at_limit: np.ndarray,
     ) -> None:
         """Update with the current state.
 
@@ -66,8 +69,10 @@ class Referee:
           quat: [4] orientation of the object, palm frame.
           spin: [3] rad/s, angular velocity of the object, palm frame.
           tips: [5, 3] N, the solver's force on each fingertip.
-          pressing: [5] N, sum of the normal forces of each fingertip, the part that taxels can measure.
+          normal: [5] N of that, along the contact's normal.
+          taxels: [5] N of that, on the taxels.
           joint_speed: [12] rad/s.
+          at_limit: [12] bool, joints at their torque limit.
         """
         if self.over:
             return
@@ -87,23 +92,36 @@ class Referee:
         if self.goals:
             for count in self.goals.values():
                 count.watch(self.time, quat, away, float(spin @ _AXIS))
-        elif self.time > min(_SETTLE, self.limit / 2):
-            self._grip(strength, pressing)
+        elif self.time > self.window[0]:
+            self._grip({"force": strength, "normal": normal, "taxels": taxels})
+            self._limited += bool(np.any(at_limit))
         if self.time >= self.limit - 1e-9:
             self.end = "time limit"
 
-    def _grip(self, strength: np.ndarray, pressing: np.ndarray) -> None:
-        """Accumulate forces. The command applies to the four fingers; the thumb balances them."""
+    @property
+    def window(self) -> tuple[float, float]:
+        """From when to when [s] after release forces count."""
+        return min(_SETTLE, self.limit / 2), self.limit
+
+    def _grip(self, forces: dict[str, np.ndarray]) -> None:
+        """Accumulate forces [5]. The command applies to the four fingers; the thumb balances them."""
+        strength = forces["force"]
         touching = strength[1:] > _GRIP
         if touching.any():
-            self._finger += float(strength[1:][touching].mean())
-            self._pressing += float(pressing[1:][touching].mean())
+            for name, force in forces.items():
+                self._finger[name] += float(force[1:][touching].mean())
         self._force += strength
         self._total += float(strength.sum())
         self._counted += 1
 
     def report(self) -> dict[str, Any]:
-        """Metrics so far; JSON-able."""
+        """Metrics so far; JSON-able.
+
+        The forces of a grasp are those of `dexsim.tasks.grasp.report`, by the same names and over the same window:
+        "finger_force" is the whole contact force of a touching finger, "finger_normal" what of it presses into the
+        skin, "finger_taxels" what of that the taxels bear; "torque_limited" is the share of the window with a joint
+        at its torque limit.
+        """
         lived, count = max(self.time, 1e-9), max(self._counted, 1)
         report: dict[str, Any] = {
             "seconds": round(self.time, 4),
@@ -115,9 +133,10 @@ class Referee:
             return report | {
                 "held": self.end == "time limit",
                 "force": np.round(self._force / count, 4).tolist(),
-                "finger_force": round(self._finger / count, 4),
-                "finger_pressing": round(self._pressing / count, 4),
+                "window_s": list(self.window),
+                **{f"finger_{name}": round(total / count, 4) for name, total in self._finger.items()},
                 "total_force": round(self._total / count, 4),
+                "torque_limited": round(self._limited / count, 4),
             }
         task, paper = self.goals["task"], self.goals["paper"]
         return report | {

@@ -16,7 +16,7 @@ from dexsim_real.wire.frames import Mode
 class LimitsConfig:
     """Limits of commands. The joint ranges come with the hand."""
 
-    speed: float = setting(20.0, unit="rad/s", low=0.01, high=1000.0)
+    speed: float = setting(7.0, unit="rad/s", low=0.01, high=1000.0)
     """Largest rate of change of a commanded angle, the bridge's `--safety.speed`."""
     slack: float = setting(0.004, unit="s", low=0.0, high=1.0)
     """Time by which the interval between two commands may be shorter at the hand than at the bridge."""

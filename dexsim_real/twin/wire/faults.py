@@ -10,6 +10,11 @@ An exchange has at most one fault, so the injected faults determine what the hos
 | stall | the hand ignores this request, and all others for a while | `silent` |
 | disconnect | the terminal disappears and returns with the same name | one `lost`, then one `reconnects` |
 | heat | a motor gets hotter | none: `Safety` ends the run |
+| warm | a fingertip or the palm board gets hotter | none: `Safety` ends the run |
+| error | a board reports error bits for a joint | none: `Safety` ends the run |
+| off | the motor of a joint, or all, switch themselves off | none: `Safety` ends the run |
+| jam | a joint cannot move, and reports a high current | none: `Safety` ends the run |
+| refuse | the hand refuses to be driven: it answers with an error number | one `refused` for each exchange |
 | angle | a joint reports a wrong angle: its own with an offset, or a constant one | none: the frame is intact |
 | stuck | a taxel reports a constant count from now on | none: the count is in every state |
 """
@@ -25,8 +30,12 @@ from dexsim_real.core.errors import HandError
 from dexsim_real.wire import frames
 
 BYTES = ("flip", "drop", "duplicate")
-KINDS = (*BYTES, "late", "stall", "disconnect", "heat", "stuck", "angle")
+KINDS = (*BYTES, "late", "stall", "disconnect", "heat", "stuck", "angle", "warm", "error", "off", "jam", "refuse")
+ALARMS = ("warm", "error", "off", "jam", "refuse")
+ALL = -1  # all joints
 _FORMS = ("offset", "stuck")  # of a wrong angle
+BOARDS = ("palm", "joint", "tip")
+_NUMBERS = (28, 35, 6)  # of random refusals: over-temperature, over-current, busy
 _RUN = 40  # bytes, longest run that is dropped or duplicated
 
 
@@ -52,6 +61,16 @@ class FaultConfig:
     """Probability that another taxel gets stuck, per exchange."""
     angle: float = setting(0.0, unit="1", low=0.0, high=1.0)
     """Probability that a joint reports a wrong angle for a while, per exchange: with an offset, stuck, or huge."""
+    warm: float = setting(0.0, unit="1", low=0.0, high=1.0)
+    """Probability that a fingertip or the palm board gets hot for a while, per exchange."""
+    error: float = setting(0.0, unit="1", low=0.0, high=1.0)
+    """Probability that a board reports an error bit for a while, per exchange."""
+    off: float = setting(0.0, unit="1", low=0.0, high=1.0)
+    """Probability that a motor, or all, switch themselves off for a while, per exchange."""
+    jam: float = setting(0.0, unit="1", low=0.0, high=1.0)
+    """Probability that a joint is blocked for a while, per exchange."""
+    refuse: float = setting(0.0, unit="1", low=0.0, high=1.0)
+    """Probability that the hand refuses to be driven for a while, per exchange."""
     on_request: float = setting(0.3, unit="1", low=0.0, high=1.0)
     """Probability that damaged bytes are in the request instead of the answer."""
     late_seconds: tuple[float, float] = setting((0.1, 0.15), unit="s", low=0.0, high=10.0)
@@ -61,9 +80,15 @@ class FaultConfig:
     away_seconds: tuple[float, float] = setting((0.1, 1.0), unit="s", low=0.0, high=60.0)
     """Range of the duration of a disconnection."""
     heat_degrees: float = setting(60.0, unit="K", low=0.0, high=200.0)
-    """Temperature rise of a hot motor."""
+    """Temperature rise of a hot motor or board."""
     heat_seconds: float = setting(2.0, unit="s", low=0.0, high=3600.0)
     """Duration for which a motor stays hot."""
+    alarm_seconds: float = setting(2.0, unit="s", low=0.0, high=3600.0)
+    """Duration of hot boards, error bits, motors that are off and refusals."""
+    jam_seconds: float = setting(6.0, unit="s", low=0.0, high=3600.0)
+    """Duration for which a joint is blocked."""
+    jam_current: float = setting(1500.0, unit="mA", low=0.0, high=30000.0)
+    """Current of a blocked joint."""
     angle_offset: tuple[float, float] = setting((0.7, 1.5), unit="rad", low=0.0, high=10.0)
     """Range of the magnitude of a wrong angle's offset."""
     angle_seconds: tuple[float, float] = setting((0.0, 0.8), unit="s", low=0.0, high=60.0)
@@ -73,7 +98,9 @@ class FaultConfig:
     script: tuple[str, ...] = ()
     """Scripted faults, such as "12.5 stall 0.2": seconds after the first exchange, kind, values
     (`flip|drop|duplicate [request|answer]`, `late|stall|disconnect SECONDS`, `heat JOINT KELVIN SECONDS`,
-    `stuck TIP TAXEL COUNT`, `angle JOINT offset|stuck RADIANS SECONDS`). Missing values are sampled."""
+    `stuck TIP TAXEL COUNT`, `angle JOINT offset|stuck RADIANS SECONDS`, `warm TIP|palm KELVIN SECONDS`,
+    `error palm|joint|tip JOINT BITS SECONDS`, `off JOINT|all SECONDS`, `jam JOINT MILLIAMPERES SECONDS`,
+    `refuse NUMBER SECONDS`). Missing values are sampled."""
 
     def __post_init__(self):
         validate(self)
@@ -93,7 +120,11 @@ class Fault:
     kind: str  # one of `KINDS`
     on_request: bool = False  # whether the request is damaged instead of the answer
     seconds: float = 0.0  # s, delay or duration
-    joint: int = 0
+    joint: int = 0  # or `ALL`
+    board: str = ""  # of error bits
+    number: int = 0  # error bits, or number of a refusal
+    part: int = 0  # a tip, or `frames.TIPS` for the palm board
+    current: float = 0.0  # mA, of a blocked joint
     form: str = "offset"  # of a wrong angle
     radians: float = 0.0
     degrees: float = 0.0  # K
@@ -104,6 +135,20 @@ class Fault:
     def name(self) -> str:
         """Name under which the fault is counted."""
         return f"{self.kind} {'request' if self.on_request else 'answer'}" if self.kind in BYTES else self.kind
+
+    def describe(self) -> str:
+        """A fault of the hand in a few words."""
+        joint = "all joints" if self.joint == ALL else f"joint {self.joint}"
+        what = {
+            "heat": f"{joint}, {self.degrees:.0f} K",
+            "warm": f"{'palm board' if self.part == frames.TIPS else f'tip {self.part}'}, {self.degrees:.0f} K",
+            "angle": f"{joint} reports {self.form} {self.radians:.3g} rad",
+            "error": f"{self.board} board of {joint}, bits 0x{self.number:04x}",
+            "off": joint,
+            "jam": f"{joint}, {self.current:.0f} mA",
+            "refuse": f"number {self.number}",
+        }
+        return f"{self.kind}: {what[self.kind]}, for {self.seconds:.2f} s"
 
 
 def parse_fault(line: str) -> tuple[float, str, tuple[str, ...]]:
@@ -174,18 +219,34 @@ class Injector:
             "disconnect": config.away_seconds,
             "heat": (config.heat_seconds, config.heat_seconds),
             "angle": config.angle_seconds,
+            "jam": (config.jam_seconds, config.jam_seconds),
+            **dict.fromkeys(("warm", "error", "off", "refuse"), (config.alarm_seconds, config.alarm_seconds)),
         }
         form, radians = self._wrong_angle() if kind == "angle" else ("offset", 0.0)
-        return Fault(
+        fault = Fault(
             kind,
             bool(kind in BYTES and rng.random() < config.on_request),
             float(rng.uniform(*spans[kind])) if kind in spans else 0.0,
             int(rng.integers(frames.JOINTS)),
-            form,
-            radians,
-            config.heat_degrees,
-            (int(rng.integers(frames.TIPS)), int(rng.integers(frames.TAXELS))),
-            int(rng.integers(config.stuck_count[0], config.stuck_count[1] + 1)),
+            form=form,
+            radians=radians,
+            degrees=config.heat_degrees,
+            taxel=(int(rng.integers(frames.TIPS)), int(rng.integers(frames.TAXELS))),
+            count=int(rng.integers(config.stuck_count[0], config.stuck_count[1] + 1)),
+        )
+        return self._random_alarm(fault) if kind in ALARMS else fault
+
+    def _random_alarm(self, fault: Fault) -> Fault:
+        """Values of an alarm that are needed by no other fault."""
+        rng = self._rng
+        number = int(rng.choice(_NUMBERS)) if fault.kind == "refuse" else 1 << int(rng.integers(16))
+        return dataclasses.replace(
+            fault,
+            joint=ALL if fault.kind == "off" and rng.random() < 0.5 else fault.joint,
+            board=BOARDS[int(rng.integers(3))],
+            number=number,
+            part=int(rng.integers(frames.TIPS + 1)),
+            current=self.config.jam_current,
         )
 
     def _wrong_angle(self) -> tuple[str, float]:
@@ -229,12 +290,35 @@ def _with_values(fault: Fault, values: tuple[str, ...]) -> Fault:
     elif fault.kind == "stuck":
         tip, taxel, count = values
         changes = {"taxel": (_within(tip, frames.TIPS), _within(taxel, frames.TAXELS)), "count": _within(count, 256)}
+    elif fault.kind in ALARMS:
+        changes = {**_alarm_values(fault.kind, values[:-1]), "seconds": float(values[-1])}
     else:
         (seconds,) = values
         changes = {"seconds": float(seconds)}
     if not 0 <= changes.get("seconds", 0) < 1e6:
         raise ValueError
     return dataclasses.replace(fault, **changes)
+
+
+def _alarm_values(kind: str, values: tuple[str, ...]) -> dict[str, Any]:
+    """Fields of an alarm by its scripted values without the duration."""
+    if kind == "error":
+        board, joint, bits = values
+        return {
+            "board": BOARDS[BOARDS.index(board)],
+            "joint": _within(joint, frames.JOINTS),
+            "number": _within(bits, 1 << 16),
+        }
+    if kind == "warm":
+        part, degrees = values
+        return {"part": frames.TIPS if part == "palm" else _within(part, frames.TIPS), "degrees": float(degrees)}
+    if kind == "jam":
+        joint, current = values
+        return {"joint": _within(joint, frames.JOINTS), "current": float(current)}
+    (value,) = values
+    if kind == "off":
+        return {"joint": ALL if value == "all" else _within(value, frames.JOINTS)}
+    return {"number": _within(value, 1000)}
 
 
 def _within(text: str, end: int) -> int:

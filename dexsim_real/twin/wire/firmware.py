@@ -12,14 +12,16 @@ import numpy as np
 
 from dexsim.core.config import setting, validate
 from dexsim_real.twin.plant.protocol import MotorCommands, Plant, PlantMeasurement
+from dexsim_real.twin.wire.faults import ALL, Fault
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Command, Frame, Mode
+from dexsim_real.wire.identity import SERIAL_NUMBER, SIDE
 
 OVERHEATED, OVERLOADED, ABANDONED = 1, 2, 4
 """Error bits of a joint, defined by this board: too hot and off, overcurrent, no host."""
 _COMMUNICATION, _ID, _PARAMETER, _MODE, _FORCE_MODE = 2, 1, 30, 67, 81
 _ERROR_BASE = 1501000
-_SERIAL, _HAND_ID, _NAME = 21, 53, 54  # registers
+_HAND_ID, _NAME = 53, 54  # registers
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -30,6 +32,10 @@ class FirmwareConfig:
     """Id of the hand."""
     version: str = "1.3.9 emulated"
     """Firmware version that it reports."""
+    serial_number: str = "2R32EMULATED"
+    """Serial number that it reports; empty for a firmware that reports neither it nor the side."""
+    handedness: str = setting("right", choices=("right", "left"))
+    """Side that it reports."""
     watchdog: float = setting(0.0, unit="s", low=0.0, high=10.0)
     """Time without a valid exchange after which the motors go off; 0: never. What the real hand does is not known."""
     encoder_bits: int = setting(12, unit="1", low=4, high=16)
@@ -70,7 +76,7 @@ class Firmware:
         self.counts: Counter[str] = Counter()  # executed commands by name
         self.motors = idle_motors()
         self.stuck: dict[tuple[int, int], int] = {}  # constant counts of stuck taxels (tip, number)
-        self.wrong: dict[int, tuple[str, float]] = {}  # false angles by joint: "offset" or "stuck", rad
+        self.faults: list[Fault] = []  # that last now
         self.angles = np.zeros(frames.JOINTS)  # rad, true angles of the last state sent
         self.trips: list[float] = []  # s, times at which the watchdog acted
         self.longest = 0.0  # s, longest time from the last exchange until it acted
@@ -123,9 +129,8 @@ class Firmware:
         """A `frames.STATE_BLOCK` of a measurement, with the quantisation of the wire."""
         config, block = self.config, frames.empty_state()
         joint, tip = block["joint"], block["tip"]
-        step = 2 * np.pi / 2**config.encoder_bits
-        ticks = np.round(measured.joint_position / step)
-        joint["position"] = ticks * step
+        joint["position"] = self._angles(measured)
+        ticks = np.round(joint["position"] / self._tick)
         joint["current"] = _whole(measured.current, np.int16)
         joint["velocity"] = _whole(1e3 * measured.joint_velocity, np.int16)
         raw = (np.round(ticks * 2.0 ** (12 - config.encoder_bits)).astype(int) + 2048) & 0xFFF
@@ -144,6 +149,8 @@ class Firmware:
             tip["taxel"][name] = _whole(counts[..., axis], kind)
             tip["total"][name] = _whole(counts[..., axis].sum(-1), kind)
         tip["taxel_temperature"] = tip["temperature"] = config.tip_temperature
+        for fault in self.faults:
+            self._report(fault, block)
         return block
 
     # --- commands: data and time to the answer's command and data -----------------------------------
@@ -156,21 +163,17 @@ class Firmware:
         refusal = self._refusal(block["mode"])
         if refusal or not np.isfinite(block["position"]).all():
             return self._error(refusal or _PARAMETER)
+        for fault in self.faults:
+            if fault.kind == "refuse":  # It can still be turned off.
+                if not block["mode"].any():
+                    self._command(block)
+                return self._error(fault.number)
         measured = self.plant.measure()
         self._protect(measured)
-        was_on, self._alive, self._abandoned = self.on, now, False
-        self._drive(
-            MotorCommands(
-                **{name: block[name].astype(float) for name in ("position", "kp", "ki", "kd", "torque_max")},
-                mode=np.where(self._hot, int(Mode.PASSIVE), block["mode"].astype(int)),
-            )
-        )
-        if was_on != self.on:
-            self._note("motors on" if self.on else "motors off")
+        self._alive, self._abandoned = now, False
+        self._command(block)
         state = self.state(measured)
-        self.angles = state["joint"]["position"].astype(float)
-        for joint, (form, angle) in self.wrong.items():
-            state["joint"]["position"][joint] = angle + (self.angles[joint] if form == "offset" else 0.0)
+        self.angles = self._angles(measured)
         return Command.EXCHANGE, state.tobytes()
 
     def _version(self, data: bytes, now: float) -> tuple[Command, bytes]:
@@ -207,13 +210,56 @@ class Firmware:
 
     def _register(self, data: bytes, now: float) -> tuple[Command, bytes]:
         """Two bytes of number and 32 of content."""
-        number = int.from_bytes(data[:2], "little")
-        known = {_SERIAL: b"2R32EMULATED", _HAND_ID: bytes([self.config.hand_id]), _NAME: b"emulated"}
+        number, config = int.from_bytes(data[:2], "little"), self.config
+        known = {_HAND_ID: bytes([config.hand_id]), _NAME: b"emulated"}
+        if config.serial_number:
+            known |= {SERIAL_NUMBER: config.serial_number.encode("ascii", "replace"), SIDE: config.handedness.encode()}
         if number not in known:
             return self._error(_PARAMETER)
-        return Command.READ_REGISTER, number.to_bytes(2, "little") + known[number].ljust(32, b"\0")
+        return Command.READ_REGISTER, number.to_bytes(2, "little") + known[number][:32].ljust(32, b"\0")
 
     # --- pieces ---------------------------------------------------------------------------------
+
+    @property
+    def _tick(self) -> float:
+        """Resolution of the encoders, rad."""
+        return 2 * np.pi / 2**self.config.encoder_bits
+
+    def _angles(self, measured: PlantMeasurement) -> np.ndarray:
+        """True joint angles [12] rad, with the resolution of the encoders."""
+        return np.round(measured.joint_position / self._tick) * self._tick
+
+    def _command(self, block: np.ndarray) -> None:
+        """Set the motors; some may be too hot, off or blocked."""
+        was_on, mode, position = self.on, block["mode"].astype(int), block["position"].astype(float)
+        mode[self._hot] = Mode.PASSIVE
+        for fault in self.faults:
+            if fault.kind == "off":
+                mode[slice(None) if fault.joint == ALL else fault.joint] = Mode.PASSIVE
+            elif fault.kind == "jam":
+                position[fault.joint] = fault.radians
+        others = {name: block[name].astype(float) for name in ("kp", "ki", "kd", "torque_max")}
+        self._drive(MotorCommands(position=position, mode=mode, **others))
+        if was_on != self.on:
+            self._note("motors on" if self.on else "motors off")
+
+    def _report(self, fault: Fault, block: np.ndarray) -> None:
+        """Change a state [] as a fault does."""
+        joint, tip = block["joint"], block["tip"]
+        if fault.kind == "angle":
+            joint["position"][fault.joint] = fault.radians + (
+                joint["position"][fault.joint] if fault.form == "offset" else 0.0
+            )
+        elif fault.kind == "error":
+            joint[f"{fault.board}_error"][fault.joint] |= fault.number
+        elif fault.kind == "jam" and self.motors.mode[fault.joint] != Mode.PASSIVE:
+            joint["current"][fault.joint] = -fault.current
+        elif fault.kind == "warm" and fault.part == frames.TIPS:
+            joint["temperature"] = min(self.config.palm_temperature + int(fault.degrees), 255) << 8 | (
+                joint["temperature"] & 0xFF
+            )
+        elif fault.kind == "warm":
+            tip["temperature"][fault.part] = min(self.config.tip_temperature + int(fault.degrees), 255)
 
     def _drive(self, motors: MotorCommands) -> None:
         self.motors = motors

@@ -14,7 +14,7 @@ from dexsim.core.config import setting, validate
 from dexsim_real.core.timing import Timing
 from dexsim_real.twin.plant.protocol import Plant
 from dexsim_real.twin.wire.command_check import CommandCheck
-from dexsim_real.twin.wire.faults import Fault, Injector
+from dexsim_real.twin.wire.faults import BYTES, Fault, Injector
 from dexsim_real.twin.wire.firmware import Firmware
 from dexsim_real.twin.wire.terminal import Terminal
 from dexsim_real.wire import frames
@@ -98,7 +98,7 @@ class HandLine:
         self._heard_all = self._said_all = -np.inf  # s, end on the wire of the last request and answer
         self._heard = self._acted = self._looked = -np.inf
         self._cooling: list[tuple[float, Fault]] = []
-        self._wrong_until: dict[int, float] = {}  # s, by joint that reports a wrong angle
+        self._lasting: list[tuple[float, Fault]] = []  # until when (s), fault of the board
         self._host_baud: int | None = None
 
     def due(self) -> float:
@@ -173,8 +173,9 @@ class HandLine:
         if fault and fault.kind == "stall":
             self.counts["ignored"] += 1
             self._deaf = now + fault.seconds
+            self._note(f"fault stall: {fault.seconds:.2f} s")
             return
-        self._end_wrong_angles(now)
+        self._end_hand_faults(now)
         self._apply_hand_fault(now, fault)
         damaged = fault is not None and fault.on_request
         self._catch_up(now)
@@ -206,10 +207,11 @@ class HandLine:
         start = max(self._turn(request), now - self._on_wire(len(answer)) / 2)
         if fault and fault.kind == "late":
             start += fault.seconds
+            self._note(f"fault late: {fault.seconds:.2f} s")
             self._deaf = start + self._on_wire(len(answer))
         elif not fault:
             self.slowest = max(self.slowest, start + self._on_wire(len(answer)) - request.read)
-        damaged = fault is not None and fault.kind in ("flip", "drop", "duplicate") and not fault.on_request
+        damaged = fault is not None and fault.kind in BYTES and not fault.on_request
         data = self.injector.damage(fault, answer) if fault and damaged else answer
         self.counts["damaged answers" if damaged else "answers"] += 1
         for at in range(0, len(data), self.config.chunk):
@@ -218,21 +220,26 @@ class HandLine:
         self._said_all = start + self._on_wire(len(data))
 
     def _apply_hand_fault(self, now: float, fault: Fault | None) -> None:
-        """Apply a fault of the hand itself: heat, stuck taxel, wrong angle."""
-        if fault and fault.kind == "heat":
+        """Begin a fault of the hand itself."""
+        if fault is None or fault.kind in (*BYTES, "late"):
+            return
+        if fault.kind == "stuck":
+            self.firmware.stuck[fault.taxel] = fault.count
+            return
+        self._note(f"fault {fault.describe()}")
+        if fault.kind == "heat":
             self._plant.warm(fault.joint, fault.degrees)
             self._cooling.append((now + fault.seconds, fault))
-            self._note(f"joint {fault.joint} is {fault.degrees:.0f} K hotter")
-        elif fault and fault.kind == "stuck":
-            self.firmware.stuck[fault.taxel] = fault.count
-        elif fault and fault.kind == "angle":
-            self.firmware.wrong[fault.joint] = fault.form, fault.radians
-            self._wrong_until[fault.joint] = now + fault.seconds
-            self._note(f"joint {fault.joint} reports {fault.form} {fault.radians:.3g} rad for {fault.seconds:.2f} s")
+            return
+        if fault.kind == "jam":  # Where it is now.
+            fault = dataclasses.replace(fault, radians=float(self.firmware.angles[fault.joint]))
+        self.firmware.faults.append(fault)
+        self._lasting.append((now + fault.seconds, fault))
 
-    def _end_wrong_angles(self, now: float) -> None:
-        for joint in [joint for joint, until in self._wrong_until.items() if until <= now]:
-            del self._wrong_until[joint], self.firmware.wrong[joint]
+    def _end_hand_faults(self, now: float) -> None:
+        for entry in [entry for entry in self._lasting if entry[0] <= now]:
+            self._lasting.remove(entry)
+            self.firmware.faults.remove(entry[1])
 
     def _disconnect(self, now: float, fault: Fault) -> None:
         self._requests.clear()
@@ -242,7 +249,7 @@ class HandLine:
         self._deaf = self._heard_all = self._said_all = -np.inf
         self._back = now + fault.seconds
         self.terminal.close()
-        self._note(f"disconnected for {fault.seconds:.2f} s")
+        self._note(f"fault disconnect: {fault.seconds:.2f} s")
 
     def _on_wire(self, size: int) -> float:
         return size * BITS_PER_BYTE / self.config.baud

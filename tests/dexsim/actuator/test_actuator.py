@@ -309,3 +309,18 @@ def test_gradients_are_finite_in_the_band_and_beyond_the_no_load_speed():
         (motor(), (1.0, 0.0, 0.0, 8.63)),
     ):
         assert all(np.isfinite(leaf) for leaf in jax.tree.leaves(gradient(drives, *state)))
+
+
+def test_a_drive_is_at_its_limit_where_it_gives_less_than_its_loop_asks_for():
+    """Against the reference: with ten thousand times the stall torque the same drive gives more, or just as much."""
+    drives, state = random_drives(2000, seed=4)
+    names = ("stiffness", "damping", "dead_band", "stall_torque", "no_load_speed", "efficiency")
+    limited = np.asarray(jax.jit(actuator.at_limit)(drives, *state))
+    for k in range(2000):
+        kp, kd, band, stall, speed, efficiency = (float(getattr(drives, name)[k]) for name in names)
+        target, target_velocity, position, velocity = (float(x[k]) for x in state)
+        given = reference(kp, kd, band, stall, speed, efficiency, target, target_velocity, position, velocity)
+        asked = reference(kp, kd, band, 1e4 * stall, 1e9, efficiency, target, target_velocity, position, velocity)
+        if abs(abs(asked) - abs(given)) > 1e-5 or abs(velocity) < speed and abs(given) < 0.99 * efficiency * stall:
+            assert limited[k] == (abs(asked) > abs(given) + 1e-5), k
+    assert 0.1 < limited.mean() < 0.9

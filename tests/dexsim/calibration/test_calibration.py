@@ -393,7 +393,7 @@ def test_cut_anywhere_it_is_refused(hand, fitted, tmp_path):
         ('hand = "xhand_right"', 'hand = "xhand_left"', "is of hand 'xhand_left'.*not of 'xhand_right'"),
         ('format = "dexsim calibration"', 'format = "other"', "not a calibration file"),
         ('name = "thumb_bend"', 'name = "thumb_bent"', "calibrate this hand"),
-        ("torque_scale = 1.1", "torque_scale = 0.0", "above 0"),
+        ("torque_scale = 1.1", "torque_scale = 0.0", "thumb_bend: torque_scale = 0: must be between"),
         ("torque_scale = 1.1", "torque_scale = true", "must hold 1 number"),
         ("friction = ", "fiction = ", "'friction' must hold 1 number"),
         ("complete = true", "complete = false", "cut off"),

@@ -1,5 +1,7 @@
 """Known sensors are found again, within intervals that keep their promise; useless recordings are refused."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -91,6 +93,17 @@ def test_fits_are_kept_in_a_file(tmp_path):
     (tmp_path / "other.json").write_text('{"thumb": {"gain": 3}}')
     with pytest.raises(AssetError, match="not a sensor fit"):
         load_fit(tmp_path / "other.json")
+
+
+@pytest.mark.parametrize(
+    "forged", ['"gain": {"value": 0', '"gain": {"value": NaN', '"gain": {"value": -2', "deep", "long"]
+)
+def test_fits_that_no_sensor_gives_are_refused_in_one_line(tmp_path, forged):
+    path = save_fit(tmp_path / "sensor.json", {"thumb": fit_finger(recording(6))})
+    text = re.sub(r'"gain": \{\s*"value": [^,]*', forged, path.read_text())
+    path.write_text({"deep": "[" * 100_000, "long": text + " " * 200_000}.get(forged, text))
+    with pytest.raises(AssetError, match=rf"^{re.escape(str(path))}: [^\n]{{1,200}}$"):
+        load_fit(path)
 
 
 def test_useless_recordings_are_refused():

@@ -1,6 +1,7 @@
 """The JAX backend's own contacts and solver, against C MuJoCo's geometry and the conditions of a minimum."""
 
 import dataclasses
+import functools
 import itertools
 
 import c_scene
@@ -35,8 +36,13 @@ def scene(first, second):
     return model, mujoco.MjData(model)
 
 
+@functools.lru_cache(maxsize=1)
+def compiled_touch(model):
+    return jax.jit(collide.find_collider(model).touch)
+
+
 def candidates(model, data):
-    gap, point, normal = collide.find_collider(model).touch(
+    gap, point, normal = compiled_touch(model)(
         *(jnp.asarray(x, jnp.float32) for x in (data.geom_xpos, data.geom_xmat.reshape(-1, 3, 3), model.geom_size))
     )
     return np.asarray(gap), np.asarray(point), np.asarray(normal)
@@ -100,7 +106,48 @@ def test_a_capsule_that_lies_on_a_face(second):
     np.testing.assert_allclose(normal, [[0, 0, -1]] * 2, atol=1e-5)
     data.qpos[3:7] = np.cos(0.6), 0, np.sin(0.6), 0
     mujoco.mj_kinematics(model, data)
-    assert np.sum(candidates(model, data)[0] < 1.0) == 1
+    assert np.sum(candidates(model, data)[0] < 0.0) == 1
+
+
+def test_a_capsule_on_a_box():
+    """Every contact of C MuJoCo's, at its depth and place: leaning, across edges, at corners and flat on a face."""
+    model, data = scene("capsule", "box")
+    rng, counts = np.random.default_rng(0), [0, 0, 0]
+    for trial in range(700):
+        data.qpos[:] = rng.normal(size=model.nq)
+        data.qpos[:3] = 0
+        data.qpos[7:10] *= rng.uniform(0.015, 0.045) / np.linalg.norm(data.qpos[7:10])
+        if trial % 3 == 0:  # hardly leaning: where a second contact matters most
+            data.qpos[3:7] = np.sqrt(0.5), *np.eye(3)[trial % 2] * np.sqrt(0.5)
+            data.qpos[10:] = 1, *rng.normal(size=3) * 0.015
+        mujoco.mj_normalizeQuat(model, data.qpos)
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_collision(model, data)
+        gap, point, normal = candidates(model, data)
+        wanted = [c for c in data.contact if c.dist < 0]
+        if wanted and min(c.dist for c in wanted) < -0.008:
+            continue  # nothing sinks in as deep
+        mine = gap < 0
+        assert mine.sum() == len(wanted), (trial, gap, [c.dist for c in wanted])
+        counts[len(wanted)] += 1
+        for c in wanted:
+            away = np.linalg.norm(point[mine] - c.pos, axis=-1) + np.abs(gap[mine] - c.dist)
+            assert away.min() < 2e-5, (trial, c.dist, gap)
+            np.testing.assert_allclose(normal[mine][away.argmin()], c.frame[:3], atol=2e-3)
+    assert min(counts) > 40, counts
+
+
+def test_gradients_go_through_a_capsule_on_a_box():
+    """The depth's slope along a shift is minus its normal, also where the capsule is parallel to edges."""
+    model, data = scene("capsule", "box")
+    data.qpos[:7] = 0, 0, 0.041, np.sqrt(0.5), 0, np.sqrt(0.5), 0
+    data.qpos[7:] = 0, 0, 0, 1, 0, 0, 0
+    mujoco.mj_kinematics(model, data)
+    position, rotation = jnp.asarray(data.geom_xpos, jnp.float32), jnp.asarray(data.geom_xmat.reshape(-1, 3, 3))
+    touch = collide.find_collider(model).touch
+    gap = lambda shift: touch(position.at[0].add(shift), rotation, jnp.asarray(model.geom_size))[0]  # noqa: E731
+    slope = jax.jit(jax.jacrev(gap))(jnp.zeros(3))
+    np.testing.assert_allclose(slope, [[0, 0, 1]] * 2, atol=1e-5)
 
 
 PALM, CUBE = np.array([0.02, 0.0455, 0.0535]), np.array([0.0275, 0.0275, 0.0275])

@@ -81,6 +81,7 @@ def make_moment(hand, **fields):
         "joint_torque": zero,
         "pose": forward_kinematics(hand, joints),
         "finger_force": jnp.zeros((5, 3)),
+        "normal_force": jnp.zeros(5),
         "touch": Touch(nothing, nothing, nothing),
         "object_position": jnp.asarray(Grasp.reference),
         "object_quat": jnp.array([1.0, 0, 0, 0]),
@@ -176,6 +177,7 @@ class TestReward:
             joint_velocity=velocity,
             action=action,
             last_action=before,
+            normal_force=[1.5, 4.5, 0, 0, 0],
             touch=Touch(jnp.asarray(felt), jnp.asarray(0.5 * felt), jnp.asarray(felt)),
         )
         reward, metrics = task.reward(goal_of(0.5), truth, jnp.zeros((), bool))
@@ -204,7 +206,8 @@ class TestReward:
             "success": 1.0,
             "command": 0.5,
             "finger_force": 5.0,
-            "finger_pressing": 4.0,
+            "finger_normal": 4.5,
+            "finger_taxels": 4.0,
             "force_error": 1.0,
             "total_force": 7.005,
             "taxel_force": 5.0,

@@ -32,7 +32,9 @@ def evaluation(ticks=60, repeats=8, noise=0.0, slope=4.0, lost=(), settle_force=
         "command": flat * command,
         "shape": flat * shape,
         "finger_force": force,
-        "finger_pressing": force**2,
+        "finger_normal": force**2,
+        "finger_taxels": np.sqrt(np.abs(force)),
+        "torque_limited": flat * (command == 1.0),
         "total_force": 3 * force,
         "taxel_force": 2 * force,
         "thumb_force": flat * 0.5,
@@ -86,8 +88,8 @@ class TestStatistics:
         assert found["mean"] == pytest.approx(values.mean())
         assert (found["low"], found["high"]) == pytest.approx(tuple(known), abs=0.02)
 
-    def test_rmse(self):
-        found = report.rmse(np.array([1.0, 2.0, 5.0]), np.array([1.0, 4.0, 4.0]))
+    def test_force_error(self):
+        found = report.force_error(np.array([1.0, 2.0, 5.0]), np.array([1.0, 4.0, 4.0]))
         assert found["mean"] == pytest.approx(np.sqrt(5 / 3))
         assert 0 <= found["low"] <= found["mean"] <= found["high"] <= 2
 
@@ -97,7 +99,7 @@ class TestStatistics:
 
     def test_of_nothing(self):
         empty = np.zeros(0)
-        assert report.mean(empty)["mean"] is None and report.rmse(empty, empty)["mean"] is None
+        assert report.mean(empty)["mean"] is None and report.force_error(empty, empty)["mean"] is None
 
 
 class TestSummary:
@@ -113,7 +115,7 @@ class TestSummary:
         found = report.summarize(*evaluation(noise=1e-3), PERIOD, SPAN)
         assert found["episodes"] == 200 and found["seconds"] == pytest.approx(6.0)
         assert found["held"]["mean"] == 1.0 and found["hold_time_s"]["mean"] == pytest.approx(6.0)
-        assert found["pearson_r"]["r"] > 0.9999 and found["rmse_n"]["mean"] < 2e-3
+        assert found["r_resultant"]["r"] > 0.9999 and found["force_error_n"]["mean"] < 2e-3
         assert found["total_force_monotone"] is True
         assert found["force_range"] == pytest.approx(5.0, rel=2e-3)
         assert found["return"]["mean"] == pytest.approx(60 * 0.25)
@@ -155,15 +157,45 @@ class TestSummary:
         rng = np.random.default_rng(5)
         metrics["finger_force"][:, worst] = rng.uniform(1, 5, worst.sum())
         found = report.summarize(metrics, alive, PERIOD, SPAN)
-        by_name = {row["shape"]: row["pearson_r"]["r"] for row in found["by_shape"]}
+        by_name = {row["shape"]: row["r_resultant"]["r"] for row in found["by_shape"]}
         assert list(by_name) == list(SHAPES)
         assert all(r > 0.99 for name, r in by_name.items() if name != SHAPES[3])
         assert abs(by_name[SHAPES[3]]) < 0.5
-        assert found["headline"]["Pearson r (worst shape)"] == by_name[SHAPES[3]]
         wrong = stats.pearsonr(metrics["command"][0], metrics["finger_force"][-1]).statistic
-        assert found["pearson_r"]["r"] == pytest.approx(wrong)
-        pressing = stats.pearsonr(metrics["command"][0], metrics["finger_pressing"][-1]).statistic
-        assert found["pearson_r_pressing"]["r"] == pytest.approx(pressing)
+        assert found["r_resultant"]["r"] == pytest.approx(wrong)
+
+    def test_three_forces_under_three_names(self):
+        """The whole contact force, its normal part and what taxels bear of that, over one window."""
+        metrics, alive = evaluation(noise=0.3)
+        rng = np.random.default_rng(7)
+        worst = metrics["shape"][0] == 2
+        metrics["finger_taxels"][:, worst] = rng.uniform(1, 5, worst.sum())
+        found = report.summarize(metrics, alive, PERIOD, SPAN)
+        assert found["window_s"] == pytest.approx([3.0, 6.0])
+        late = {name: metrics[name][30:].mean(0) for name in ("finger_force", "finger_normal", "finger_taxels")}
+        for name, metric in (("resultant", "force"), ("normal", "normal"), ("taxels", "taxels")):
+            known = stats.pearsonr(metrics["command"][0], late[f"finger_{metric}"]).statistic
+            assert found[f"r_{name}"]["r"] == pytest.approx(known), name
+        assert found["by_command"][2]["finger_normal_n"]["mean"] == pytest.approx(late["finger_normal"][80:120].mean())
+        headline = found["headline"]
+        assert headline["r, force on the taxels"]["value"] == found["r_taxels"]["r"]
+        assert headline["r, force on the taxels, worst shape"] == found["by_shape"][2]["r_taxels"]["r"] < 0.5
+
+    def test_commands_that_saturate_are_marked(self):
+        found = report.summarize(*evaluation(), PERIOD, SPAN)
+        assert [row["torque_limited"]["mean"] for row in found["by_command"]] == [0, 0, 0, 0, 1]
+        assert [row["saturates"] for row in found["by_command"]] == [False] * 4 + [True]
+        assert found["torque_limited"]["mean"] == found["headline"]["ticks with a joint at its torque limit"]["value"]
+        assert found["torque_limited"]["mean"] == pytest.approx(0.2)
+
+    def test_dropping_objects_does_not_lower_the_force_error(self):
+        """Whoever loses everything is off by the whole target: sqrt(mean of 1, 4, 9, 16, 25) N."""
+        metrics, alive = evaluation(lost=range(200))
+        found = report.summarize(metrics, alive, PERIOD, SPAN)
+        assert found["force_error_n"]["mean"] == pytest.approx(np.sqrt(11))
+        good = report.summarize(*evaluation(), PERIOD, SPAN)["force_error_n"]["mean"]
+        some = report.summarize(*evaluation(lost=range(0, 200, 4)), PERIOD, SPAN)["force_error_n"]["mean"]
+        assert good < 1e-9 and some == pytest.approx(np.sqrt(11 / 4))
 
     def test_a_dip_is_not_monotone(self):
         metrics, alive = evaluation()
@@ -176,7 +208,7 @@ class TestSummary:
         found = report.summarize(*evaluation(slope=0.0), PERIOD, SPAN)
         assert found["total_force_monotone"] is False
         assert found["force_range"] == pytest.approx(1.0)
-        assert found["pearson_r"]["r"] is None
+        assert found["r_resultant"]["r"] is None
 
     def test_a_command_without_held_episodes(self):
         metrics, alive = evaluation(lost=range(40, 80))  # all of command 0.25
@@ -190,8 +222,8 @@ class TestSummary:
         found = report.summarize(*evaluation(lost=range(200)), PERIOD, SPAN)
         assert found["held"]["mean"] == 0.0 and 0 < found["held"]["high"] < 0.03
         assert found["hold_time_s"]["mean"] == pytest.approx(2.0)
-        assert found["pearson_r"]["r"] is None and found["rmse_n"]["mean"] is None
-        assert found["headline"]["Pearson r (worst shape)"] is None
+        assert found["r_resultant"]["r"] is None
+        assert found["headline"]["r, force on the taxels, worst shape"] is None
         assert found["force_range"] is None
 
     def test_diverged_worlds_are_counted(self):
@@ -201,7 +233,8 @@ class TestSummary:
 
     def test_skin_correlation_counts_only_what_lives_and_touches(self):
         metrics, alive = evaluation(noise=0.5, lost=range(0, 200, 4), settle_force=2.0)
-        metrics["skin_force"] = 0.7 * metrics["total_force"] + 0.1
+        metrics["skin_force"] = 0.7 * metrics["taxel_force"] + 0.1
+        metrics["total_force"] += np.random.default_rng(1).uniform(0, 2, alive.shape)  # borne by skin without taxels
         metrics["skin_force"][20:, ::4] = -1e3
         metrics["total_force"][:5], metrics["skin_force"][:5] = 0.0, 50.0
         found = report.summarize(metrics, alive, PERIOD, SPAN)

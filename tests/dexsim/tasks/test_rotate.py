@@ -45,6 +45,7 @@ def truth(task: Rotate, **changes) -> GroundTruth:
         "joint_torque": joints,
         "pose": forward_kinematics(task.hand, joints),
         "finger_force": jnp.zeros((5, 3)),
+        "normal_force": jnp.zeros(5),
         "touch": Touch(none, none, none),
         "object_position": jnp.asarray(task.reference),
         "object_quat": jnp.array([1.0, 0, 0, 0]),
@@ -521,11 +522,24 @@ class TestReport:
         assert report["successes"]["sorted"] == [0, 10, 20, 30]
         assert report["without_success"]["mean"] == 0.25
         assert report["seconds_per_success"]["mean"] == pytest.approx((2 + 1.5 + 2) / 3)
+        # 60 goals in 3 + 30 + 120 + 120 s, those after the last goal included.
+        assert report["successes_per_minute"]["mean"] == pytest.approx(60 / (273 / 60))
+        assert report["headline"]["successes per minute, time stuck included"]["value"] == pytest.approx(3600 / 273)
         assert report["seconds_to_fall"]["mean"] == pytest.approx((3 + 30 + 120 + 120) / 4)
         assert report["end"] == {"pushed_out": 1, "slipped": 1, "timeout": 2}
         assert report["rotations_per_minute"]["mean"] == pytest.approx(30)
         assert report["gait"]["fingertip_duty"] == pytest.approx([0.2, 0, 0.05])
         assert report["headline"]["fingertips at work (duty over 10 %)"] == 1
+
+    def test_a_hand_that_only_keeps_the_cube_fails_every_headline(self):
+        """It never drops the cube, for two minutes; no figure of success or pace may say that this is something."""
+        zero = np.zeros(8)
+        names = ("successes", "paper_successes", "time_at_last_success", "spin", "joint_speed", "action_rate", "tilt")
+        still = dict.fromkeys((*names, "pushed_out", "slipped", "non_finite", "duty/0"), zero)
+        report = summarize(still, np.full(8, 4000), 0.03, 4000)
+        assert report["kept_to_the_end"]["mean"] == 1.0
+        values = [entry["value"] if isinstance(entry, dict) else entry for entry in report["headline"].values()]
+        assert values == [0.0] * len(values)
 
 
 @pytest.fixture(scope="module")

@@ -17,10 +17,12 @@ from paths import ROOT
 from tiny_env import TinyEnv
 
 from dexsim.core import cli
+from dexsim.core.errors import ConfigError
 from dexsim_ppo import evaluate, train
 from dexsim_ppo.policy import Policy
 from dexsim_ppo.training.arguments import training_config
 from dexsim_ppo.training.runlog import RunFolder, read_metrics
+from dexsim_ppo.training.trainer import SELECTION_SEED
 
 QUICK = [
     "--task",
@@ -84,7 +86,7 @@ def test_a_run_leaves_its_files(finished):
 
 def test_the_report_compares_with_the_untrained_policy(finished):
     report = json.loads(finished.report.read_text())
-    for name in ("trained", "untrained"):
+    for name in ("trained", "untrained", "do_nothing"):
         held = report[name]["held"]
         assert held["low"] <= held["value"] <= held["high"]
         assert report[name]["episodes"] == 32 and report[name]["seed"] == 0
@@ -99,11 +101,11 @@ def test_the_report_compares_with_the_untrained_policy(finished):
 def test_the_best_policy_is_the_one_that_was_measured(finished):
     rows = [r for r in read_metrics(finished.metrics) if r.get("evaluation/return") is not None]
     policy = Policy.load(finished.best, task="tiny")
-    report, _ = evaluate.Evaluator(TinyEnv(), 16)(policy.params, episodes=16, seed=1)
+    report, _ = evaluate.Evaluator(TinyEnv(), 16)(policy.params, episodes=16, seed=SELECTION_SEED)
     if policy.training["iteration"] == rows[0]["iteration"]:
         assert report["return"]["value"] == pytest.approx(rows[0]["evaluation/return"], rel=1e-5)
     last = Policy.load(finished.last).params
-    last, _ = evaluate.Evaluator(TinyEnv(), 16)(last, episodes=16, seed=1)
+    last, _ = evaluate.Evaluator(TinyEnv(), 16)(last, episodes=16, seed=SELECTION_SEED)
     assert report["return"]["value"] >= last["return"]["value"] - 1e-4
 
 
@@ -125,7 +127,8 @@ def test_evaluate_command(finished, tmp_path, capsys):
     assert first["return"] == second["return"] and first["episodes"] == 32
     report = json.loads(finished.report.read_text())
     assert first["return"]["value"] == pytest.approx(report["trained"]["return"]["value"], rel=1e-5)
-    assert "held" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert "doing nothing" in shown and "error" in shown and "return" in shown and first["do_nothing"]["episodes"] == 32
 
 
 class Drops(TinyEnv):
@@ -151,7 +154,7 @@ def test_episodes_end_at_their_first_termination():
         "return": np.array([[1.0, 1], [11, 2], [99, 3]]),
         "error": np.array([[1.0, 1], [np.nan, 1], [np.nan, 4]]),
     }
-    report = evaluate.summarize(TinyEnv(), metrics, terminated)
+    report = evaluate.summarize(TinyEnv(), metrics, terminated, np.arange(2))
     assert report["held"]["value"] == 0.5
     assert report["return"]["value"] == pytest.approx((11 + 3) / 2)
     assert report["steps_held"]["value"] == pytest.approx((1 + 3) / 2)
@@ -161,9 +164,46 @@ def test_episodes_end_at_their_first_termination():
 def test_intervals():
     entry = evaluate.proportion(np.array([True] * 8 + [False] * 2))
     assert (entry["low"], entry["high"]) == pytest.approx((0.4902, 0.9433), abs=2e-4)  # Wilson
-    entry = evaluate.mean_interval(np.array([1.0, 2, 3, 4]))
+    entry = evaluate.mean_interval(np.array([1.0, 2, 3, 4]), np.arange(4))
     assert entry["value"] == 2.5
     assert entry["high"] - 2.5 == pytest.approx(1.96 * np.sqrt(5 / 3) / 2)
+
+
+def test_intervals_are_by_start():
+    """Copies of an episode add nothing: four starts sixteen times each are four samples."""
+    values, start = np.tile([1.0, 2, 3, 4], 16), np.tile(np.arange(4), 16)
+    few, many = evaluate.mean_interval(values[:4], start[:4]), evaluate.mean_interval(values, start)
+    assert many == pytest.approx(few)
+    terminated = np.tile(np.array([True, False, False, False]), 16)[None]
+    report = evaluate.summarize(TinyEnv(), {"return": values[None], "error": values[None]}, terminated, start)
+    assert report["starts"] == 4 and report["held"]["value"] == 0.75
+    assert report["held"]["low"] < 0.3 and report["held"]["high"] == 1.0
+
+
+def test_a_hand_that_does_nothing_gets_the_same_episodes(finished, capsys):
+    """It stays where it starts: with rewards of 1 - |x - target| over 32 steps the return follows from the starts."""
+    env = TinyEnv()
+    evaluator, params = evaluate.Evaluator(env, 16), Policy.load(finished.best).params
+    idle, _ = evaluator(params, episodes=16, seed=4, idle=True)
+    starts = env.evaluation_starts(env.evaluation_plan(16, 4))
+    assert idle["return"]["value"] == pytest.approx(float(32 * np.mean(1 - np.abs(starts.x - starts.target))), rel=1e-4)
+    report = evaluate.evaluate_policy(finished.best, env=env, episodes=16, chunk=16, seed=4)
+    assert report["do_nothing"]["return"] == pytest.approx(idle["return"])
+    evaluate.print_report(report, report["do_nothing"], title="tiny")
+    shown = capsys.readouterr().out
+    assert "doing nothing" in shown and f"{idle['task']['error']:.4g}" in shown
+    assert "do_nothing" not in evaluate.evaluate_policy(finished.best, env=env, episodes=16, chunk=16, baseline=False)
+
+
+def test_the_size_of_a_chunk_does_not_change_the_episodes(finished):
+    params = Policy.load(finished.best).params
+    whole, parts = (evaluate.Evaluator(TinyEnv(), chunk)(params, episodes=16, seed=4)[0] for chunk in (16, 4))
+    assert parts["return"] == pytest.approx(whole["return"], rel=1e-5) and parts["starts"] == 16
+
+
+def test_the_best_policy_is_selected_by_episodes_that_no_report_has():
+    with pytest.raises(ConfigError, match="seed"):
+        evaluate.EvaluateArguments(policy="grasp", seed=SELECTION_SEED)
 
 
 BAD = {

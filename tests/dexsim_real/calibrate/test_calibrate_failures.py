@@ -62,7 +62,7 @@ def heat(bench):
         (raises(KeyboardInterrupt()), KeyboardInterrupt, None),
         (raises(SystemExit(143)), SystemExit, "143"),
         (raises(RuntimeError("broken")), RuntimeError, "broken"),
-        (heat, HandError, "too hot: 95 degC"),
+        (heat, HandError, r"too hot: joint thumb_bend \(thumb\), 95 degC"),
     ],
 )
 def test_however_it_ends_the_motors_are_off_and_the_old_file_is_there(hand, tmp_path, event, error, says):
@@ -101,6 +101,43 @@ def test_what_it_presses_on_is_missing_or_unfelt(hand, tmp_path):
         options = arguments(tmp_path, press=PressConfig(current=0.8, approach_speed=0.5), log=tmp_path / "b.log")
         record(numb, hand, options)
     assert off(numb)
+
+
+class Helper(Operator):
+    """Holds the pen beside the finger until it is told so often that the press was missed."""
+
+    def __init__(self, bench, misses, **options):
+        super().__init__(Console(file=io.StringIO(), width=200), **options)
+        self.bench, self.misses, self.told, self.plates = bench, misses, 0, bench.plates
+        bench.plates = []
+
+    def tell(self, text):
+        super().tell(text)
+        if text.endswith("again"):
+            self.told += 1
+            self.bench.plates = self.plates if self.told == self.misses else []
+
+
+def test_a_missed_pen_is_pressed_again(hand, tmp_path):
+    """Twice beside it, then the press is as good as any; three times with nobody to ask end it."""
+    bench = BenchHand(hand, plates(hand, "index pad"))
+    helper = Helper(bench, 2, assume_yes=True)
+    options = arguments(tmp_path, press=QUICK, sides=False, log=tmp_path / "a.log")
+    (recording,) = read_logs([record(bench, hand, options, helper)], hand).recordings.values()
+    assert helper.told == 2 and np.max(recording.shown) > 60 and off(bench)
+    bench = BenchHand(hand, plates(hand, "index pad"))
+    helper = Helper(bench, 3, assume_yes=True)
+    with pytest.raises(HandError, match="index pad: met nothing within"):
+        record(bench, hand, dataclasses.replace(options, log=tmp_path / "b.log"), helper)
+    assert helper.told == 2 and off(bench)
+
+
+def test_a_missed_pen_can_be_skipped(hand, tmp_path):
+    bench = BenchHand(hand, plates(hand, "index pad"))
+    helper = Helper(bench, 9, stream=io.StringIO("\n\n\n\ns\n"))
+    options = arguments(tmp_path, press=QUICK, sides=False, yes=False)
+    (recording,) = read_logs([record(bench, hand, options, helper)], hand).recordings.values()
+    assert helper.told == 4 and not recording.time and off(bench) and bench.closed
 
 
 def test_motors_that_give_no_more_turn_round(hand, tmp_path):

@@ -46,6 +46,11 @@ def test_torque_constants_come_back(hand, session):
     assert calibration.real.friction[4] == pytest.approx(gap, rel=0.15)
 
 
+def test_the_file_names_the_hand(hand, session):
+    calibration = load_calibration(session[1].output, hand)
+    assert (calibration.serial, calibration.handedness) == ("2R32BENCH", "right")
+
+
 def test_the_file_says_what_is_not_known_and_the_report_has_it_all(hand, session):
     _, options, _, shown = session
     notes = "\n".join(load_calibration(options.output, hand).notes)

@@ -1,30 +1,35 @@
 """Checks of the tactile sensors."""
 
+import re
+
 import numpy as np
 import pytest
-from calibrating import QUICK, arguments, off, on, plates, record
+from calibrating import QUICK, arguments, off, on, operator, plates, record
 from press_bench import BenchHand
 
 from dexsim_real.calibrate.options import CheckConfig
+from dexsim_real.calibrate.read import read_logs
 from dexsim_real.calibrate.taxel_check import check_rest, dead_taxels, taxel_names
 from dexsim_real.core.errors import HandError
+from dexsim_real.sensors.hand import HardwareConfig
 
 
 def resting(seed=0, count=160):
     rng = np.random.default_rng(seed)
-    counts = np.round(rng.uniform(0, 6, (5, 120)) + 0.4 * rng.standard_normal((count, 5, 120)))
+    left = rng.uniform(0, 6, (5, 120)) * (rng.random((5, 120)) < 0.05)
+    counts = np.round(left + 0.2 * rng.standard_normal((count, 5, 120)))
     return np.maximum(counts, 0), rng.normal(5, 2, (count, 12))
 
 
 def test_what_a_hand_at_rest_shows(hand):
     counts, current = resting()
-    report = check_rest(hand, counts, current, CheckConfig(), 40.0, tuple(range(5)))
+    report = check_rest(hand, counts, current, CheckConfig(), HardwareConfig(), tuple(range(5)))
     assert report.notes == ()
     np.testing.assert_allclose(report.tare, counts.mean(0))
     assert np.all(np.abs(report.current - 5) < 1)
     noisy = counts.copy()
     noisy[:, 2, 31] += 8 * (np.random.default_rng(1).random(len(counts)) < 0.5)
-    notes = check_rest(hand, noisy, current, CheckConfig(), 40.0, (2,)).notes
+    notes = check_rest(hand, noisy, current, CheckConfig(), HardwareConfig(), (2,)).notes
     assert len(notes) == 1 and notes[0].startswith("middle: noisy: column 2 row 7 (up to 4")
 
 
@@ -33,18 +38,22 @@ def test_a_touch_is_told_from_a_taxel_that_is_stuck(hand):
     stuck = counts.copy()
     stuck[:, 4, 17] = 255
     with pytest.raises(HandError, match="pinky: column 1 row 5 read 255 counts alone and are stuck") as caught:
-        check_rest(hand, stuck, current, CheckConfig(), 40.0, ())
+        check_rest(hand, stuck, current, CheckConfig(), HardwareConfig(), ())
     assert "\n" not in str(caught.value)
     touched = counts.copy()
     touched[:, 0, [40, 41, 52, 53]] += 60
     with pytest.raises(HandError, match="4 adjacent taxels of the thumb .* touches it") as caught:
-        check_rest(hand, touched, current, CheckConfig(), 40.0, ())
+        check_rest(hand, touched, current, CheckConfig(), HardwareConfig(), ())
     assert "\n" not in str(caught.value)
+    pressed = counts.copy()
+    pressed[:, 2, 30:60] += 8  # 24 N in all, less than a taxel may read at rest each.
+    with pytest.raises(HandError, match="those of the middle read 2.. counts together, limit 50: something touches it"):
+        check_rest(hand, pressed, current, CheckConfig(), HardwareConfig(), ())
     # A light touch hides among what is left at rest, unless it changes.
     swaying = counts.copy()
     swaying[:, 3, 50:60] += np.round(2 + 2 * np.sin(np.arange(len(counts)) / 25))[:, None]
     with pytest.raises(HandError, match="ring's sum moved by .* touches it"):
-        check_rest(hand, swaying, current, CheckConfig(), 40.0, ())
+        check_rest(hand, swaying, current, CheckConfig(), HardwareConfig(), ())
 
 
 def test_dead_taxels_are_those_among_pressed_ones(hand):
@@ -65,17 +74,21 @@ def test_a_touched_hand_is_refused_before_the_motors_come_on(hand, tmp_path):
 
 
 def test_a_finger_zeroed_under_load_is_found_out(hand, tmp_path):
-    """Somebody holds the index when it is zeroed, too lightly to be seen, and lets go during the press."""
-    bench = BenchHand(hand, plates(hand, "index pad"))
+    """Somebody holds the index when it is zeroed, too lightly to be seen, and lets go during the press: again."""
+    bench, who = BenchHand(hand, plates(hand, "index pad")), operator()
     bench.touched[1, 30:60] = 0.3
-    exchange = bench.exchange
+    exchange, let_go_at = bench.exchange, []
 
     def let_go(command):
-        if bench.force[1] > 1.0:
+        if bench.force[1] > 1.0 and bench.touched.any():
             bench.touched[:] = 0
+            let_go_at.append(bench.time)
         return exchange(command)
 
     bench.exchange = let_go
-    with pytest.raises(HandError, match="index pad: reads -.* it was touched while it was tared"):
-        record(bench, hand, arguments(tmp_path, press=QUICK))
+    log = record(bench, hand, arguments(tmp_path, press=QUICK, sides=False), who)
+    said = who.console.file.getvalue()
+    assert re.search(r"index pad: reads -\d+ counts .* it was touched while it was tared; .*; again", said)
+    (recording,) = read_logs([log], hand).recordings.values()
+    assert recording.time[0] > let_go_at[0] + 1.0 and len(recording.time) > 50
     assert off(bench) and bench.closed

@@ -32,10 +32,24 @@ def test_goals_move_on_as_in_the_task(direction):
     assert turns >= 8 and len(goals.times) == turns
 
 
-def test_a_goal_passed_at_speed_or_far_away_does_not_count():
+@pytest.mark.parametrize("way", [1, -1])
+def test_a_goal_passed_at_speed_or_far_away_does_not_count(way):
+    """Whichever way round the object passes it."""
     config = RotateConfig(goal_spin=2.0)
     fast, far = TurnGoals(config.turn, config.reference), TurnGoals(config.turn, config.reference)
     for k in range(40):
-        fast.update(0.03 * k, seen(6.0 * 0.03 * k))
-        far.update(0.03 * k, seen(1.0 * 0.03 * k, place=(0.2, 0, 0.085)))
+        fast.update(0.03 * k, seen(way * 6.0 * 0.03 * k))
+        far.update(0.03 * k, seen(way * 1.0 * 0.03 * k, place=(0.2, 0, 0.085)))
     assert fast.successes == far.successes == 0
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+def test_a_quaternion_of_the_other_sign_is_no_turn(direction):
+    """q and -q are one orientation; an IMU may give either, from one sample to the next."""
+    config = RotateConfig(direction=direction, goal_spin=2.0)
+    goals = TurnGoals(config.turn, config.reference)
+    for k in range(100):
+        estimate = seen(0.8 * direction * 0.03 * k)
+        sign = -1 if k % 2 else 1
+        goals.update(0.03 * k, ObjectEstimate(estimate.position, estimate.velocity, sign * estimate.quat))
+    assert goals.successes == 1

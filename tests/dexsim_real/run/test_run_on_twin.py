@@ -17,7 +17,7 @@ from dexsim_real.twin.wire.faults import FaultConfig
 
 
 def start(running, folder, *more):
-    words = ["grasp", "--port", running.port, "--uncalibrated", "--fixed-object", "--quiet", "--no-realtime"]
+    words = ["grasp", "--port", running.port, "--uncalibrated", "--fixed-object", "--yes", "--quiet", "--no-realtime"]
     words += ["--link.settle", "0", "--link.margin", "0.1", "--safety.stale", "0.5", "--approach", "0.4"]
     words += ["--log", str(folder / "run.log"), "--output", str(folder / "run.json"), *more]
     return subprocess.Popen([sys.executable, "-m", "dexsim_real.run", *words], cwd=ROOT, stderr=subprocess.PIPE)

@@ -106,6 +106,45 @@ def test_a_stream_of_masks_from_another_program(tmp_path):
         open_masks(f"unix:{tmp_path}/none", config)
 
 
+def until(condition):
+    end = time.monotonic() + 2
+    while not condition() and time.monotonic() < end:
+        time.sleep(0.005)
+    return condition()
+
+
+def test_a_camera_that_ends_or_fails_says_so():
+    config, reference = CameraConfig(), np.array([0.055, -0.005, 0.09])
+
+    def broken():
+        raise RuntimeError("the lens\nfell off")
+
+    for masks, says in ((lambda: None, "sends no more pictures"), (broken, "the camera failed: the lens fell off")):
+        sensor = HeightSensor(masks, config, reference, (True, False, False), 0.5)
+        assert until(lambda sensor=sensor: sensor.failure) and says in sensor.failure
+        sensor.close()
+
+
+@pytest.mark.parametrize("when", [1.7e9 * 10, math.nan, math.inf])
+def test_a_picture_of_another_clock_does_not_stay_young(when):
+    config, reference = CameraConfig(), np.array([0.055, -0.005, 0.09])
+    pictures = iter([(when, picture(reference, config)), None])
+    sensor = HeightSensor(lambda: next(pictures), config, reference, (True, False, False), 0.5)
+    assert until(lambda: sensor.seen) and sensor.read()[0] <= time.monotonic()
+    sensor.close()
+
+
+def test_a_stream_of_something_else(tmp_path):
+    for name, head in (("a", b"PICT" + bytes(12)), ("b", b"MASK" + b"\xff" * 12)):
+        server = socket.socket(socket.AF_UNIX)
+        server.bind(str(tmp_path / name))
+        server.listen()
+        read = open_masks(f"unix:{tmp_path / name}", CameraConfig())
+        server.accept()[0].sendall(head)
+        with pytest.raises(HandError, match="are no masks"):
+            read()
+
+
 def test_the_colour_threshold():
     cv2 = pytest.importorskip("cv2")
     config = CameraConfig()

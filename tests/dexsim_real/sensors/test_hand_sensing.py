@@ -39,7 +39,7 @@ def test_a_relaxed_command_carries_no_gain(hand):
 
 
 def test_taxels_are_tared_and_scaled(hand):
-    sensing = HandSensing(hand, HardwareConfig(force_per_count=0.1, taxel_floor=1.0))
+    sensing = HandSensing(hand, HardwareConfig(force_per_count=0.1, taxel_floor=1.0, tare_sum=1000.0))
     rest = state()
     rest["tip"]["taxel"]["z"] = np.arange(120) % 7
     other = rest.copy()
@@ -62,8 +62,8 @@ def test_taxels_are_tared_and_scaled(hand):
 def test_zeroing_is_refused_under_load(hand):
     sensing = HandSensing(hand, HardwareConfig())
     loaded = state()
-    loaded["tip"]["taxel"]["z"][1, 5] = 90
-    with pytest.raises(HandError, match="index read up to 90 counts"):
+    loaded["tip"]["taxel"]["z"][1, [5, 6, 17]] = 90
+    with pytest.raises(HandError, match="3 adjacent taxels of the index read above 40 counts"):
         sensing.set_tare([loaded] * 5)
     assert not sensing.tare.any()
 
@@ -114,11 +114,21 @@ def test_current_without_and_with_a_calibration(hand, tmp_path):
     assert measured.taxel_force[0, 0] == pytest.approx(2.0)
 
 
-def test_temperatures_are_of_the_joint_boards_and_tips(hand):
+def test_temperatures_are_of_the_joint_boards_the_tips_and_the_palm(hand):
     block = state(temperature=(41 << 8) | 56)
     block["tip"]["temperature"] = 33
     heat = HandSensing(hand, HardwareConfig()).measure(block).temperature
-    np.testing.assert_array_equal(heat, [56] * 12 + [33] * 5)
+    np.testing.assert_array_equal(heat, [56] * 12 + [33] * 5 + [41])
+
+
+def test_error_bits_are_of_the_palm_the_joint_and_the_tip(hand):
+    """From bytes: in a joint's 24 they are at 12, 14 and 16."""
+    data = bytearray(state().tobytes())
+    for joint in range(12):
+        for board in range(3):
+            data[24 * joint + 12 + 2 * board] = 16 * board + joint + 1
+    errors = HandSensing(hand, HardwareConfig()).measure(frames.decode_state(bytes(data))).errors
+    np.testing.assert_array_equal(errors, np.arange(1, 13)[:, None] + 16 * np.arange(3))
 
 
 def test_velocity_reported_or_from_differences(hand):

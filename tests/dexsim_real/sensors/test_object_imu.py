@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from dexsim.geometry import rotations
 from dexsim_real.control.controller import IDENTITY
@@ -64,23 +65,20 @@ def test_the_imu_parser_recovers_from_noise(parts, size):
         assert len(found) == 4 and parser.damaged == 0
 
 
-@given(st.floats(-3, 3), st.floats(-0.4, 0.4), st.floats(-3, 3))
-def test_alignment_takes_heading_from_the_known_pose_and_tilt_from_gravity(heading, tilt, later):
-    """The part's world is the palm's, turned so that z is up and by an unknown heading."""
-    up = np.array([math.cos(tilt), 0.0, math.sin(tilt)])
-    # palm_from_world: takes z to up, after a turn about z by the heading.
-    axis = np.cross([0, 0, 1.0], up)
-    axis /= np.linalg.norm(axis)
-    half = math.acos(up[2]) / 2
-    world = imu.multiply(
-        np.array([math.cos(half), *(math.sin(half) * axis)]),
-        np.array([math.cos(heading / 2), 0, 0, math.sin(heading / 2)]),
-    )
-    truth = np.array([1.0, 0, 0, 0])
-    found = imu.align(imu.multiply(imu.conjugate(world), truth), truth, up)
-    turned = np.array([math.cos(later / 2), *(math.sin(later / 2) * up)])
-    sensed = imu.multiply(imu.conjugate(world), turned)
-    assert apart(imu.multiply(found, sensed), turned) < 1e-3
+turns = st.tuples(st.floats(-3, 3), st.floats(-1.2, 1.2), st.floats(-3, 3)).map(
+    lambda angles: Rotation.from_euler("zyx", angles)
+)
+
+
+@given(turns, turns, turns)
+def test_one_known_pose_aligns_all_three_angles(world, first, later):
+    """Whatever the palm's lean and the IMU's heading, `later` is measured as it is in the palm frame."""
+
+    def wxyz(rotation):
+        return np.roll(rotation.as_quat(), 1)
+
+    found = imu.align(wxyz(world.inv() * first), wxyz(first))
+    assert apart(imu.multiply(found, wxyz(world.inv() * later)), wxyz(later)) < 2e-3
 
 
 def test_the_imu_thread_reads_a_port():
@@ -90,7 +88,7 @@ def test_the_imu_thread_reads_a_port():
 
     master, slave = os.openpty()
     tty.setraw(slave)
-    part = imu.Imu(os.ttyname(slave), np.array([1.0, 0, 0]))  # The part's z points up, along the palm's x.
+    part = imu.Imu(os.ttyname(slave))  # Its z along the object's x.
     with pytest.raises(HandError, match="UART-RVC"):
         part.wait(0.05)
     os.write(master, imu.encode(0, quat_of(40, 0, 0)))

@@ -85,7 +85,7 @@ def test_the_command_shows_how_to_use_it_and_writes_its_results(tmp_path):
 
 
 def test_the_calibration_beside_the_port_is_one_of_this_hand(hand, tmp_path):
-    path = twin_command.write_calibration(tmp_path / "calibration.toml", hand)
+    path = twin_command.write_calibration(tmp_path / "calibration.toml", hand, FirmwareConfig())
     calibration = load_calibration(path, hand)
     np.testing.assert_allclose(calibration.force_per_count, FirmwareConfig().force_per_count)
     counts = np.linspace(-800, 800, 12).astype(np.float32)

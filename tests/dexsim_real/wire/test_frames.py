@@ -79,6 +79,9 @@ def test_a_state_block_byte_for_byte():
     np.testing.assert_array_equal(joint["current"], -100 * np.arange(12))
     np.testing.assert_array_equal(joint["raw_position"] >> 4, np.arange(12))
     np.testing.assert_array_equal(joint["temperature"] & 0xFF, np.arange(12))
+    np.testing.assert_array_equal(joint["temperature"] >> 8, 40)
+    for name, bits in (("palm_error", 1), ("joint_error", 2), ("tip_error", 3)):
+        np.testing.assert_array_equal(joint[name], bits, err_msg=name)
     np.testing.assert_array_equal(joint["velocity"], -7 * np.arange(12))
     assert joint["sensor_id"][2] == 17
     np.testing.assert_array_equal(tip["taxel"]["z"], np.tile(2 * np.arange(120), (5, 1)))

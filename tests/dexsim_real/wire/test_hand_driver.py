@@ -48,11 +48,11 @@ def test_one_request_one_answer():
         port.close()
     # The motors are off until the caller says otherwise.
     assert set(peer.commands[0]["mode"].tolist()) == {Mode.PASSIVE} and not peer.commands[0]["torque_max"].any()
-    # Every frame is seen whole, in order: version, passive state, exchange.
-    assert [way for way, _ in seen] == ["tx", "rx"] * 3
+    # Every frame is seen whole, in order: version, passive state, serial number, side, exchange.
+    assert [way for way, _ in seen] == ["tx", "rx"] * 5
     assert seen[-2][1] == Frame(0xFE, 0x80, Command.EXCHANGE, command(0.5).tobytes()).encode()
     assert seen[-1][1] == peer.whole()
-    assert port.counts.sent == 3 == port.counts.answered
+    assert port.counts.sent == 5 == port.counts.answered
 
 
 FAULTS = {

@@ -116,3 +116,19 @@ def test_heat_settles_where_loss_and_flow_balance(hand):
     torque, _ = made.step(9.0, np.zeros(12), np.zeros(12))
     weaker = 1 - heat.weakening * (made.winding - heat.reference)
     assert torque == pytest.approx(0.3 * hand.torque_limit * weaker, rel=1e-3)
+
+
+def test_a_drive_is_at_its_limit_where_it_asks_for_more(hand):
+    made = drives(hand)
+    assert not made.at_limit().any()
+    step = np.where(np.arange(12) % 2, 1.0, 0.01)  # 3 Nm and 0.03 Nm; they stall at 1.1 and 0.4 Nm
+    for sign in (1, -1):
+        made.send(0.0, motors(sign * step))
+        made.step(0.0, np.zeros(12), np.zeros(12))
+        np.testing.assert_array_equal(made.at_limit(), np.arange(12) % 2 == 1)
+    made.send(0.0, motors(0.1, torque_max=15))  # 0.3 Nm asked for, 0.055 and 0.02 Nm allowed
+    made.step(0.0, np.zeros(12), np.zeros(12))
+    assert made.at_limit().all()
+    made.send(0.0, motors(1.0, mode=Mode.PASSIVE))
+    made.step(0.0, np.zeros(12), np.zeros(12))
+    assert not made.at_limit().any()

@@ -68,7 +68,7 @@ def test_an_object_on_the_fingertips_weighs_what_it_weighs(hand):
     weight = float(plant.parameters.mass) * GRAVITY
     assert shown[..., 2].sum() == pytest.approx(weight, rel=0.05)
     plant._contacts()
-    assert plant._pressing == pytest.approx(shown[..., 2].sum(-1), rel=0.02, abs=0.01 * weight)
+    assert plant._normal == pytest.approx(shown[..., 2].sum(-1), rel=0.02, abs=0.01 * weight)
     assert np.count_nonzero(shown[..., 2].sum(-1) > 0.05 * weight) >= 2
     assert shown[0].sum() == 0 and shown[..., 2].min() >= 0
 

@@ -51,7 +51,9 @@ def watched(task, positions, *, seconds=None, tips=0.0, quat=(1.0, 0, 0, 0)):
             np.zeros(3),
             force,
             np.zeros(5),
+            np.zeros(5),
             np.full(12, 0.5),
+            np.zeros(12, bool),
         )
     return judge
 
@@ -75,10 +77,13 @@ def test_forces_of_a_grasp_are_means_from_three_seconds_on():
     for k in range(801):
         force = np.zeros((5, 3))
         force[:, 1] = (9.0, 1.0, 2.0, 0.0, 3.0) if k >= 300 else 50.0
-        judge.watch(0.01, place, np.array([1.0, 0, 0, 0]), np.zeros(3), force, 0.8 * force[:, 1], np.zeros(12))
+        felt = 0.8 * force[:, 1], 0.5 * force[:, 1]
+        limited = np.arange(12) == (3 if k % 4 == 0 else -1)
+        judge.watch(0.01, place, np.array([1.0, 0, 0, 0]), np.zeros(3), force, *felt, np.zeros(12), limited)
     report = judge.report()
     assert report["held"] and report["force"] == pytest.approx([9.0, 1.0, 2.0, 0.0, 3.0])
     assert report["finger_force"] == pytest.approx(2.0) and report["total_force"] == pytest.approx(15.0)
-    assert report["finger_pressing"] == pytest.approx(1.6)
+    assert report["finger_normal"] == pytest.approx(1.6) and report["finger_taxels"] == pytest.approx(1.0)
+    assert report["torque_limited"] == pytest.approx(0.25) and report["window_s"] == [3.0, 8.0]
     lost = watched("grasp", [place + (0.121, 0, 0)]).report()
     assert not lost["held"] and lost["end"].startswith("dropped")

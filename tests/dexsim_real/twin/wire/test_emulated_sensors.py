@@ -47,7 +47,7 @@ def test_an_rvc_frame_says_yaw_pitch_and_roll(yaw, pitch, roll):
 def test_the_bridges_imu_reader_sees_how_the_object_turns(hand, tmp_path):
     plant = ScriptedPlant(turn=2.0)
     with Running(hand, tmp_path, plant, task="rotate") as running:
-        reader = imu.Imu(str(running.twin.imu.terminal.name), plant.up)
+        reader = imu.Imu(str(running.twin.imu.terminal.name))
         reader.wait()
         half = 0.5 * plant.turn * plant.time
         reader.calibrate(np.array([math.cos(half), math.sin(half), 0, 0]))

@@ -12,6 +12,7 @@ from twin_plant import REST, ScriptedPlant
 
 from dexsim_real.twin.plant.protocol import PlantMeasurement
 from dexsim_real.twin.wire.command_check import CommandCheck, LimitsConfig
+from dexsim_real.twin.wire.faults import Fault
 from dexsim_real.twin.wire.firmware import ABANDONED, OVERHEATED, Firmware, FirmwareConfig
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import HAND_REPLIES, Command, Mode, Parser
@@ -161,7 +162,8 @@ def test_a_board_without_a_watchdog_keeps_the_last_command():
 def test_a_wrong_angle_is_in_the_state_and_the_true_one_is_kept():
     plant = ScriptedPlant()
     board = Firmware(plant, FirmwareConfig())
-    board.wrong = {4: ("offset", 1.3), 5: ("stuck", 1.9), 6: ("stuck", 1e30)}
+    wrong = ((4, "offset", 1.3), (5, "stuck", 1.9), (6, "stuck", 1e30))
+    board.faults = [Fault("angle", joint=joint, form=form, radians=angle) for joint, form, angle in wrong]
     answer = ask(board, Command.EXCHANGE, command().tobytes(), now=5.0)
     shown = frames.decode_state(answer.data)["joint"]["position"]
     np.testing.assert_allclose(board.angles, REST, atol=1e-3)

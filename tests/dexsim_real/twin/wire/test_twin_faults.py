@@ -12,7 +12,7 @@ from twin_pair import Pair
 from twin_plant import REST
 
 from dexsim_real.core.errors import HandError
-from dexsim_real.twin.wire.faults import BYTES, KINDS, Fault, FaultConfig, Injector, parse_fault
+from dexsim_real.twin.wire.faults import BOARDS, BYTES, KINDS, Fault, FaultConfig, Injector, parse_fault
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import HAND_REPLIES, Command, Frame, Mode, Parser
 
@@ -30,6 +30,12 @@ from dexsim_real.wire.frames import HAND_REPLIES, Command, Frame, Mode, Parser
         ("5 stuck 0 119 256", "give a time"),
         ("5 angle 4 twisted 1 1", "give a time"),
         ("5 angle 4 offset 1.3", "give a time"),
+        ("5 error hand 4 1 1", "give a time"),
+        ("5 error joint 4 65536 1", "give a time"),
+        ("5 off -1 1", "give a time"),
+        ("5 jam 12 1500 1", "give a time"),
+        ("5 warm 5 60 1", "give a time"),
+        ("5 refuse 28 60 1", "give a time"),
         ("-1 stall", "at least 0"),
         ("5 stall -1", "give a time"),
         ("nan drop", "at least 0"),
@@ -77,6 +83,11 @@ def test_random_faults_have_their_rates_and_the_seed_repeats_them():
         heat=0.008,
         stuck=0.006,
         angle=0.004,
+        warm=0.005,
+        error=0.007,
+        off=0.009,
+        jam=0.011,
+        refuse=0.013,
         on_request=0.25,
     )
     runs = []
@@ -130,6 +141,13 @@ def test_every_injected_fault_is_found_in_the_hosts_counters(hand, monkeypatch, 
         stuck=0.05,
         heat=0.03,
         angle=0.03,
+        warm=0.02,
+        error=0.02,
+        off=0.02,
+        jam=0.02,
+        refuse=0.02,
+        alarm_seconds=0.05,
+        jam_seconds=0.1,
         stall_seconds=(0.005, 0.2),
         away_seconds=(0.01, 0.2),
     )
@@ -143,11 +161,14 @@ def test_every_injected_fault_is_found_in_the_hosts_counters(hand, monkeypatch, 
         assert found == injected, (name, pair.agreement(), made)
     # One that befalls the greeting itself makes two connections one.
     assert 0.8 * made["disconnect"] < pair.port.counts.reconnects <= made["disconnect"]
-    assert pair.check.report()["outside_limits"] == 0 and pair.check.checked == pair.board.counts["exchange"]
+    assert pair.check.report()["outside_limits"] == 0 and pair.check.checked == (
+        pair.board.counts["exchange"] + pair.board.counts["refused"]
+    )
     cable, heat = pair.cable, pair.plant.heat
+    pair.injector._rates[:] = 0  # Nothing new befalls the last exchange.
     cable.wait(3.0)
     pair.exchange(Mode.PASSIVE)
-    assert not pair.board.wrong  # All wrong angles have ended.
+    assert not pair.board.faults  # All faults of the board have ended.
     np.testing.assert_allclose(heat, 35.0)  # Every motor that was heated has cooled.
 
 
@@ -211,6 +232,56 @@ def test_wrong_angles_reach_the_state_for_their_time(hand, monkeypatch):
     injector = Injector(FaultConfig(), 3)
     kinds = {(fault.form, abs(fault.radians) > 1e29) for fault in (injector._random_fault("angle") for _ in range(50))}
     assert kinds == {("offset", False), ("stuck", False), ("stuck", True)}
+
+
+def test_alarms_reach_the_state_for_their_time(hand, monkeypatch):
+    script = (
+        "0.1 warm 3 60 0.1",
+        "0.3 warm palm 50 0.1",
+        "0.5 error joint 7 513 0.1",
+        "0.7 off 4 0.1",
+        "0.9 off all 0.1",
+        "1.1 jam 9 1500 0.1",
+    )
+    pair = Pair(hand, monkeypatch, FaultConfig(script=script))
+    states = [pair.exchange().state for _ in range(110)]
+    tips = np.array([state["tip"]["temperature"] for state in states])
+    palms = np.array([state["joint"]["temperature"] >> 8 for state in states])
+    boards = np.array([state["joint"]["temperature"] & 0xFF for state in states])
+    bits = np.array([np.stack([state["joint"][f"{name}_error"] for name in BOARDS]) for state in states])
+    modes = np.array([state["joint"]["raw_position"] & 0xF for state in states])
+    currents = np.array([state["joint"]["current"] for state in states])
+    assert set(tips[:, 3]) == {31, 91} and set(np.delete(tips, 3, 1).flat) == {31}
+    assert set(palms.flat) == {38, 88} and set(boards.flat) == {35}
+    assert np.all(palms == palms[:, :1])
+    assert set(bits[:, 1, 7]) == {0, 513} and bits.sum() == bits[:, 1, 7].sum()
+    off = modes != Mode.POSITION
+    for what in (tips[:, 3] == 91, palms[:, 0] == 88, bits[:, 1, 7] > 0, off.all(1), off[:, 4] & ~off.all(1)):
+        assert 8 <= what.sum() <= 10
+    assert off.sum() == off[:, 4].sum() + 11 * off.all(1).sum()
+    assert 8 <= (currents[:, 9] == -1500).sum() <= 10 and np.abs(np.delete(currents, 9, 1)).max() < 1500
+
+
+def test_a_jammed_joint_does_not_move_while_the_others_do(hand, monkeypatch):
+    pair = Pair(hand, monkeypatch, FaultConfig(script=("0.05 jam 9 1500 0.3",)))
+    goal = REST + 0.1 * (np.arange(12) != 3)
+    for k in range(25):
+        pair.port.exchange(frames.command_block(REST if k < 6 else goal, kp=100, ki=0, kd=0, torque_max=300))
+        pair.cable.wait(0.003)
+        pair.plant.advance(0.012)
+    moved = np.abs(pair.plant.angle - REST) > 0.05
+    assert not moved[9] and np.delete(moved, [3, 9]).all()
+
+
+def test_a_hand_that_refuses_to_be_driven_can_be_turned_off(hand, monkeypatch):
+    pair = Pair(hand, monkeypatch, FaultConfig(script=("0.1 refuse 28 0.5",)), watchdog=0.0)
+    pair.run(0.2)
+    assert pair.board.on and pair.exchange() is None
+    assert "over-temperature (1501028)" in pair.port.refusal.text
+    assert pair.exchange(Mode.PASSIVE) is None and not pair.board.on
+    pair.cable.wait(0.5)
+    assert pair.exchange() is not None and pair.port.refusal is None and pair.board.on
+    assert all(found == made for found, made in pair.agreement().values())
 
 
 def test_the_hand_is_safe_within_a_tenth_of_a_second_of_losing_its_host(hand, monkeypatch):

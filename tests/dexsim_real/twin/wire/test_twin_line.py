@@ -126,7 +126,7 @@ def test_the_driver_talks_to_it(hand, tmp_path):
     first, last = replies[0].state["joint"], replies[-1].state["joint"]
     np.testing.assert_allclose(first["position"], REST, atol=1e-3)
     np.testing.assert_allclose(last["position"], goal, atol=3e-3)
-    assert port.counts.sent == port.counts.answered == running.twin.line.counts["answers"] == 32
+    assert port.counts.sent == port.counts.answered == running.twin.line.counts["answers"] == 34
     assert np.median([reply.received - reply.sent for reply in replies]) > 0.0095
     assert np.all(last["raw_position"] & 0xF == Mode.POSITION)
     report = running.twin.report()

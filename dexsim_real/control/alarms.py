@@ -1,0 +1,141 @@
+"""What the hand says about its own state: heat, current, error bits, control mode, refused commands.
+
+| finding | reaction |
+|---|---|
+| a joint board, a fingertip or the palm board too hot, in two answers in a row | relax |
+| current too high for too long; high current without motion for longer | relax |
+| an error bit; motors that report another mode than commanded, in two answers in a row | hold; relax when it lasts |
+| the hand refuses commands for a reason of its own, twice in a row | relax |
+
+The meaning of the error bits is not public, so every bit counts unless it is listed as harmless. Each finding is one
+line that names joint and finger.
+"""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dexsim.hand.kinematics import Hand
+from dexsim_real.sensors.hand import HandMeasurement
+from dexsim_real.wire.frames import Mode
+from dexsim_real.wire.refusals import Refusal
+
+if TYPE_CHECKING:
+    from dexsim_real.control.safety import SafetyConfig
+
+_BOARDS = ("palm", "joint", "tip")
+_STILL = 0.05  # rad, motion below which a joint with high current is stalled
+
+
+def joint_labels(hand: Hand) -> tuple[str, ...]:
+    """Names of the joints for messages, with their fingers."""
+    finger_of: dict[int, str] = {}
+    for finger, body in zip(hand.finger_names, hand.tip_body, strict=True):
+        while body >= 0:
+            finger_of.setdefault(int(hand.body_joint[body]), finger)
+            body = hand.body_parent[body]
+    return tuple(f"joint {name} ({finger_of[joint]})" for joint, name in enumerate(hand.joint_names))
+
+
+class _Timer:
+    """How long a finding has lasted without a break."""
+
+    def __init__(self) -> None:
+        self._since: float | None = None
+
+    def lasts(self, time: float, found: bool) -> float:
+        """Seconds from the first answer with this finding to this one; -1 without it."""
+        self._since = (time if self._since is None else self._since) if found else None
+        return -1.0 if self._since is None else time - self._since
+
+
+class Alarms:
+    """Judges the answers of the hand in the order in which they arrive.
+
+    Args:
+      hand: names of joints and fingers.
+      config: limits.
+    """
+
+    def __init__(self, hand: Hand, config: "SafetyConfig"):
+        self.config = config
+        self.fatal = ""  # why the motors must go off
+        self.hold = ""  # why the hand must not be moved now
+        self.refused = ""  # what the hand said when it refused a command, until it answers one again
+        self._joints = joint_labels(hand)
+        self._parts = (*self._joints, *(f"fingertip of the {name}" for name in hand.finger_names), "palm board")
+        self._harmless = np.array(config.ignored_errors, np.uint16)
+        self._hot, self._current, self._error, self._off = _Timer(), _Timer(), _Timer(), _Timer()
+        self._reports_mode = False  # whether the hand has ever reported that its motors are on
+        self._moved_at: np.ndarray | None = None  # [J] s, since when a joint neither moved nor had a low current
+        self._stood: np.ndarray = np.zeros(hand.num_joints)  # [J] rad, its angle then
+        self._serious = 0  # serious refusals in a row
+
+    def see(self, time: float, measured: HandMeasurement, on: bool) -> None:
+        """Judge an answer.
+
+        Args:
+          time: s of the answer.
+          measured: what it contains.
+          on: whether the motors were commanded to be on.
+        """
+        self.refused, self._serious = "", 0
+        found = (self._heat(time, measured), self._overcurrent(time, measured), self._stall(time, measured))
+        waiting = (self._errors(time, measured), self._switched_off(time, measured, on))
+        limit = self.config.alarm_seconds
+        self.fatal = next(filter(None, found), "") or next((text for text, lasts in waiting if lasts > limit), "")
+        self.hold = next((text for text, lasts in waiting if text), "")
+
+    def refuse(self, refusal: Refusal) -> None:
+        """Judge an answer in which the hand refuses the command."""
+        self.refused = refusal.text
+        self._serious = self._serious + 1 if refusal.serious else 0
+        if self._serious > 1:
+            self.fatal = refusal.text
+
+    # --- findings -------------------------------------------------------------------------------
+
+    def _heat(self, time: float, measured: HandMeasurement) -> str:
+        hottest = int(measured.temperature.argmax())
+        degrees = measured.temperature[hottest]
+        if self._hot.lasts(time, bool(degrees > self.config.temperature)) <= 0:
+            return ""
+        return f"too hot: {self._parts[hottest]}, {degrees:.0f} degC"
+
+    def _overcurrent(self, time: float, measured: HandMeasurement) -> str:
+        joint = int(measured.current.argmax())
+        if (
+            self._current.lasts(time, bool(measured.current[joint] > self.config.current))
+            <= self.config.current_seconds
+        ):
+            return ""
+        return f"current too high: {measured.current[joint]:.2f} A in {self._joints[joint]}"
+
+    def _stall(self, time: float, measured: HandMeasurement) -> str:
+        position = measured.joint_position
+        fine = (measured.current <= self.config.stall_current) | (np.abs(position - self._stood) > _STILL)
+        since = np.full(len(position), time) if self._moved_at is None else np.where(fine, time, self._moved_at)
+        self._moved_at, self._stood = since, np.where(since == time, position, self._stood)
+        joint = int(since.argmin())
+        if time - since[joint] <= self.config.stall_seconds:
+            return ""
+        return f"stalled: {self._joints[joint]} draws {measured.current[joint]:.2f} A without moving"
+
+    def _errors(self, time: float, measured: HandMeasurement) -> tuple[str, float]:
+        bits = measured.errors & ~self._harmless
+        lasts = self._error.lasts(time, bool(bits.any()))
+        if lasts < 0:
+            return "", lasts
+        joint, board = np.unravel_index(int((bits != 0).argmax()), bits.shape)
+        return f"error bits 0x{bits[joint, board]:04x} of the {_BOARDS[board]} board, {self._joints[joint]}", lasts
+
+    def _switched_off(self, time: float, measured: HandMeasurement, on: bool) -> tuple[str, float]:
+        """Whether motors are off that were commanded to be on. Old firmware may not report the mode at all."""
+        off = measured.mode != Mode.POSITION
+        self._reports_mode |= on and not off.all()
+        lasts = self._off.lasts(time, bool(on and self._reports_mode and off.any()))
+        if lasts <= 0:
+            return "", lasts
+        joint = int(off.argmax())
+        which = "all joints report" if off.all() else f"{self._joints[joint]} reports"
+        return f"the hand switched itself off: {which} mode {measured.mode[joint]}", lasts

@@ -1,0 +1,34 @@
+"""Nobody's hand moves unasked: the question before the motors come on."""
+
+import sys
+
+from dexsim_real.core.errors import HandError
+
+_QUESTION = (
+    "The motors come on at this pose, then the hand moves to its start posture.\n"
+    "Is the power switch within reach, and the hand's room clear? [y/N] "
+)
+
+
+def check_terminal() -> None:
+    """Check that somebody can be asked.
+
+    Raises:
+      HandError: input or error output is no terminal.
+    """
+    if not all(stream is not None and stream.isatty() for stream in (sys.stdin, sys.stderr)):
+        raise HandError(
+            "nobody can be asked before the motors come on, since this is no terminal; "
+            "give --yes to run without the question, or --motors-off"
+        )
+
+
+def ask() -> None:
+    """Ask on the terminal whether the motors may come on, and wait for the answer.
+
+    Raises:
+      HandError: the answer is not yes.
+    """
+    print(_QUESTION, end="", file=sys.stderr, flush=True)
+    if sys.stdin.readline().strip().lower() not in ("y", "yes"):
+        raise HandError("the answer was not yes: the motors stayed off")

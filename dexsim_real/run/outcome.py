@@ -1,0 +1,60 @@
+"""Whether a run did what it was started for: a hand that was gone or held, or lost records, are no success."""
+
+import numpy as np
+
+from dexsim_real.control.safety import Reaction, Safety
+from dexsim_real.core.log import LogWriter
+
+_BLIND = 0.1  # share of the time without a measurement that a run may have, such as a cable that was out for a moment
+_HELD = 0.5  # share of the time in which `Safety` may have held the hand
+
+
+class Outcome:
+    """Counts what goes wrong while the policy runs.
+
+    Args:
+      began: s, monotonic clock.
+    """
+
+    def __init__(self, began: float = 0.0):
+        self._last = began
+        self._total = self._blind = self._held = 0.0  # s
+        self._actions = self._wrong = 0
+        self._reason = ""  # of the newest hold
+
+    def add(self, now: float, measured: bool, safety: Safety) -> None:
+        """Count the time since the last call.
+
+        Args:
+          now: s.
+          measured: whether the newest measurement was young enough.
+          safety: its newest decision counts, unless the motors are off on purpose.
+        """
+        step, self._last = now - self._last, now
+        self._total += step
+        self._blind += 0.0 if measured else step
+        reaction, reason = safety.last
+        if safety.engaged and reaction >= Reaction.HOLD:
+            self._held += step
+            self._reason = reason
+
+    def act(self, target: np.ndarray) -> None:
+        """Count an action by the joint targets [J] that it gave."""
+        self._actions += 1
+        self._wrong += not np.isfinite(target).all()
+
+    def missing(self, log: LogWriter) -> list[str]:
+        """What the run lacks, one line each; empty for a whole run. `log` should be closed."""
+        found = []
+        if self._blind > _BLIND * self._total:
+            found.append(f"no measurement for {self._share(self._blind)} of the run")
+        if self._wrong:
+            found.append(f"{self._wrong} of {self._actions} actions of the policy were not finite")
+        if self._held > _HELD * self._total:
+            found.append(f"the hand was held for {self._share(self._held)} of the run, last because: {self._reason}")
+        if log.dropped or log.failure:
+            found.append(f"{log.dropped} log records are lost ({log.failure or 'the disk is too slow'})")
+        return found
+
+    def _share(self, seconds: float) -> str:
+        return f"{100 * seconds / self._total:.0f} %"

@@ -1,0 +1,84 @@
+"""Whose hand it is: serial number and side, read at start and after every reconnection.
+
+The vendor's header names register 20 (side of the hand) and 21 (serial number, 32 bytes), and its manual the models
+2L32 (left) and 2R32 (right), with which serial numbers begin. How an answer holds a register is not public. Assumed is
+what the emulated hand sends: the register's number in two bytes, low byte first, then its content.
+"""
+
+import dataclasses
+
+from dexsim.calibration.maps import Calibration
+from dexsim.hand.kinematics import Hand
+from dexsim_real.core.errors import HandError
+
+SIDE, SERIAL_NUMBER = 20, 21
+"""Registers."""
+_WORDS = {"l": "left", "left": "left", "r": "right", "right": "right", "2l32": "left", "2r32": "right"}
+_SIDES = ("left", "right")
+
+
+@dataclasses.dataclass(frozen=True)
+class Identity:
+    """What a hand tells about itself; a field is empty if it does not."""
+
+    serial_number: str = ""
+    handedness: str = ""  # "left", "right", or "code N" when the meaning of the answer is not known
+
+    def describe(self) -> str:
+        """Both in a few words."""
+        return f"{self.handedness or 'unknown side'}, serial number {self.serial_number or 'unknown'}"
+
+
+def read_identity(serial_number: bytes | None, side: bytes | None) -> Identity:
+    """The identity in the contents of the two registers; None for one that the hand did not answer."""
+    text = _text(serial_number or b"")
+    if side is None and not text:
+        return Identity()
+    for word in (_text(side or b""), text[:4]):
+        if word.lower() in _WORDS:
+            return Identity(text, _WORDS[word.lower()])
+    return Identity(text, f"code {side[0]}" if side else "")
+
+
+def check_identity(identity: Identity | None, hand: Hand, calibration: Calibration | None = None) -> list[str]:
+    """Check that a hand fits the model and the calibration; returns notes about what could not be checked.
+
+    Args:
+      identity: None if the port cannot tell it.
+      hand: model of the hand.
+      calibration: the one that will be used.
+
+    Raises:
+      HandError: it is another hand.
+    """
+    found = identity or Identity()
+    model = next((side for side in _SIDES if side in hand.name), "")
+    if model and found.handedness in _SIDES and found.handedness != model:
+        raise HandError(
+            f"this is a {found.handedness} hand (serial number {found.serial_number}), the model a {model} one"
+        )
+    serial = calibration.serial if calibration else ""
+    if serial and not found.serial_number:
+        raise HandError(
+            f"the hand does not tell its serial number, and the calibration is of hand {serial}: calibrate this hand, "
+            "or remove the serial number from the file if it is this hand's"
+        )
+    if serial and serial != found.serial_number:
+        raise HandError(f"this is hand {found.serial_number}, the calibration is of hand {serial}: calibrate this hand")
+    side = calibration.handedness if calibration else ""
+    if side and found.handedness and side != found.handedness:
+        raise HandError(f"this hand is {found.handedness}, the calibration is of a {side} one: calibrate this hand")
+    notes = []
+    if not found.serial_number:
+        notes.append("the hand does not tell its serial number: another hand on this port would not be noticed")
+    elif calibration and not serial:
+        notes.append("the calibration names no serial number: it may be of another hand")
+    if found.handedness.startswith("code"):
+        notes.append(f"the hand gives its side as {found.handedness}, whose meaning is not known")
+    return [f"warning: {note}" for note in notes]
+
+
+def _text(content: bytes) -> str:
+    """The printable text at the beginning of a register."""
+    text = content.split(b"\0")[0].decode("ascii", "replace").strip()
+    return text if text.isprintable() and text.isascii() else ""

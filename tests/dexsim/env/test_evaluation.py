@@ -1,0 +1,175 @@
+"""What episodes draw: the object's bulk anew each time, and evaluations from start states that training never had."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+from simple_physics import SimplePhysics
+
+import dexsim
+from dexsim.core.pytree import pytree_dataclass
+from dexsim.env.evaluation import make_plan
+from dexsim.env.state import Start
+from dexsim.objects.config import BULK_RANGES, ObjectConfig
+from dexsim.objects.params import damping_ratio, redraw_bulk, unit_inertia
+from dexsim.tasks.grasp.config import GraspConfig
+
+MANY = 400
+OBJECTS = ObjectConfig(shapes=("box", "sphere"), extremes=0.5)
+
+
+@pytest.fixture(scope="module")
+def env():
+    """Grasp over simple physics, with a pool of eight objects of which some are extreme."""
+    patch = pytest.MonkeyPatch()
+    patch.setattr("dexsim.env.env.Physics", SimplePhysics)
+    yield dexsim.make("grasp", GraspConfig(pool_size=8, objects=OBJECTS), backend="jax")
+    patch.undo()
+
+
+@pytest.fixture(scope="module")
+def drawn(env):
+    """The objects of `MANY` episodes from each row of the pool: leaves [8, MANY, ...]."""
+    reset = jax.jit(jax.vmap(jax.vmap(lambda key, row: env.reset_to(key, row).episode.object, (0, None))))
+    return reset(jax.random.split(jax.random.key(5), (8, MANY)), jnp.arange(8))
+
+
+def bulk(object):
+    """Values [..., 9] that are uniform in the ranges of `spans`."""
+    return np.stack(
+        [object.mass, object.friction, object.link_friction, *np.moveaxis(object.com, -1, 0), object.contact[..., 0]],
+        -1,
+    )
+
+
+def spans(config):
+    offset = (-config.com_offset, config.com_offset)
+    return np.array([config.mass, config.friction, config.link_friction, offset, offset, offset, config.stiffness])
+
+
+class TestBulk:
+    def test_every_episode_has_its_own_and_the_rows_shape(self, env, drawn):
+        for name in ("size", "position", "active", "shape_index"):
+            of_row = np.asarray(getattr(env.pool.object, name))
+            np.testing.assert_array_equal(getattr(drawn, name), np.repeat(of_row[:, None], MANY, 1), err_msg=name)
+        plain = ~np.asarray(env.pool.object.extreme)
+        for name in ("mass", "friction", "link_friction"):
+            values = np.asarray(getattr(drawn, name))[plain]
+            assert len(np.unique(values)) > 0.99 * values.size, name
+
+    def test_it_is_uniform_in_its_ranges_whatever_the_row(self, env, drawn):
+        low, high = spans(env.config.objects).T
+        place = (bulk(drawn) - low) / (high - low)
+        for row in np.flatnonzero(~np.asarray(env.pool.object.extreme)):
+            for values in place[row].T:
+                assert stats.kstest(values, "uniform").pvalue > 1e-4
+        bounce = np.asarray(damping_ratio(jnp.asarray(env.config.objects.restitution)))
+        assert np.all((drawn.contact[..., 1] <= bounce[0] + 1e-6) & (drawn.contact[..., 1] >= bounce[1] - 1e-6))
+
+    def test_inertia_follows_mass_and_shape(self, env, drawn):
+        """A box's is m/3 (b^2 + c^2); every ratio to it lies in the range, the same for all three axes."""
+        boxes = np.flatnonzero(np.asarray(drawn.shape_index)[:, 0] == 1)
+        square = np.asarray(drawn.size)[boxes, :, 0] ** 2
+        uniform = np.asarray(drawn.mass)[boxes, :, None] / 3 * (square.sum(-1, keepdims=True) - square)
+        ratio = np.asarray(drawn.inertia)[boxes] / uniform
+        np.testing.assert_allclose(ratio, ratio[..., :1].repeat(3, -1), rtol=1e-4)
+        low, high = env.config.objects.inertia_scale
+        assert low - 1e-4 <= ratio.min() < low + 0.02 and high - 0.02 < ratio.max() <= high + 1e-4
+
+    def test_extreme_objects_stay_extreme_at_ends_of_their_own(self, env, drawn):
+        extreme = np.asarray(env.pool.object.extreme)
+        assert 0 < extreme.sum() < 8
+        low, high = spans(env.config.objects).T
+        place = (bulk(drawn) - low) / (high - low)
+        at_end = np.isclose(place, 0, atol=1e-4) | np.isclose(place, 1, atol=1e-4)
+        assert np.all(at_end[extreme]) and np.mean(at_end[~extreme]) < 0.01
+        heavy = np.mean(place[extreme][..., 0] > 0.5)
+        assert 0.4 < heavy < 0.6
+
+    def test_what_a_task_does_not_draw_stays_as_it_is(self, env, drawn):
+        one = jax.tree.map(lambda leaf: jnp.asarray(leaf)[3], env.pool.object)
+        got = redraw(one, OBJECTS, ("mass",))
+        for name in ("friction", "link_friction", "com", "contact"):
+            before = np.asarray(getattr(one, name))
+            np.testing.assert_allclose(getattr(got, name), np.broadcast_to(before, (16, *before.shape)), rtol=1e-6)
+        assert len(np.unique(got.mass)) > 1
+        np.testing.assert_allclose(got.inertia / got.mass[:, None], np.tile(one.inertia / one.mass, (16, 1)), rtol=1e-5)
+
+    def test_narrowed_ranges_hold_for_episodes_too(self, env, drawn):
+        """`ObjectConfig.scale` 0: one bulk for all."""
+        one = jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], env.pool.object)
+        got = redraw(dataclasses.replace(one, extreme=None), dataclasses.replace(OBJECTS, scale=0.0), BULK_RANGES)
+        np.testing.assert_allclose(got.mass, np.full(16, np.mean(OBJECTS.mass)), rtol=1e-6)
+        np.testing.assert_array_equal(got.com, np.zeros((16, 3)))
+
+
+def redraw(object, config, names):
+    """The object with the bulk of 16 episodes."""
+    draw = jax.jit(jax.vmap(lambda key: redraw_bulk(key, object, config, unit_inertia(object), names)))
+    return draw(jax.random.split(jax.random.key(1), 16))
+
+
+class Rows:
+    """As much of a task as a plan needs: eight start states a pool."""
+
+    def make_pool(self, key):
+        return Start(
+            qpos=np.asarray(jax.random.uniform(key, (8, 19))),
+            qvel=np.zeros((8, 18)),
+            object=SimpleObject(np.zeros(8, int)),
+        )
+
+    def evaluation_plan(self, count, shape_index):
+        return np.arange(count) % len(shape_index), np.arange(count)
+
+
+class Pairs(Rows):
+    """Two episodes a start."""
+
+    def evaluation_plan(self, count, shape_index):
+        return np.arange(count) // 2, np.arange(count)
+
+
+@pytree_dataclass
+class SimpleObject:
+    shape_index: np.ndarray
+
+
+class TestPlan:
+    def test_no_start_is_trainings_and_no_seed_has_anothers(self):
+        plans = [make_plan(Rows(), 8, seed).start.qpos for seed in (0, 1, 2**32 - 1)]
+        pools = [rows_of(qpos) for qpos in (Rows().make_pool(jax.random.key(0)).qpos, *plans)]
+        assert [len(pool) for pool in pools] == [8] * 4 and len(set.union(*pools)) == 32
+
+    def test_the_same_seed_gives_the_same_episodes(self):
+        first, again = (make_plan(Rows(), 8, 3) for _ in range(2))
+        np.testing.assert_array_equal(jax.random.key_data(first.key), jax.random.key_data(again.key))
+        np.testing.assert_array_equal(first.start.qpos, again.start.qpos)
+
+    @pytest.mark.parametrize("count", [1, 8, 30])
+    def test_no_start_repeats_however_many_episodes(self, count):
+        plan = make_plan(Rows(), count, 0)
+        assert len(rows_of(plan.start.qpos)) == len(np.unique(plan.row)) == count
+        assert len(np.unique(jax.random.key_data(plan.key), axis=0)) == count
+
+    def test_a_plan_that_means_to_repeat_may(self):
+        plan = make_plan(Pairs(), 6, 0)
+        assert plan.row.tolist() == [0, 0, 1, 1, 2, 2] and len(rows_of(plan.start.qpos)) == 3
+
+    def test_a_slice_of_a_plan_gives_its_episodes(self, env):
+        """Of the real task: more episodes than its pool has rows, all from starts of their own."""
+        plan = env.evaluation_plan(12, 0)
+        assert len(rows_of(plan.start.qpos) - rows_of(env.pool.qpos)) == 12
+        starts = jax.jit(env.evaluation_starts)
+        first, second = (starts(jax.tree.map(lambda leaf, i=i: leaf[i : i + 4], plan)) for i in (2, 4))
+        np.testing.assert_array_equal(first.physics.qpos, plan.start.qpos[2:6])
+        np.testing.assert_array_equal(first.episode.object.size, plan.start.object.size[2:6])
+        np.testing.assert_array_equal(first.goal.command, plan.goal.command[2:6])
+        np.testing.assert_array_equal(first.episode.object.mass[2:], second.episode.object.mass[:2])
+
+
+def rows_of(qpos):
+    return {tuple(row) for row in np.asarray(qpos)}

@@ -1,0 +1,91 @@
+"""The frames of what reward and critic see of the object's motion, against C MuJoCo's own integration."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from episodes import ground_truth
+from simple_physics import SimplePhysics
+
+import dexsim
+from dexsim.objects.config import ObjectConfig
+from dexsim.observation import ObservationConfig, Readings
+from dexsim.physics.seam import PhysicsState
+from dexsim.tasks.grasp.config import GraspConfig
+
+MOMENT = 1e-6  # s
+FREE_BODY = """<mujoco><worldbody><body><freejoint/><geom size="0.02" density="100"/></body></worldbody></mujoco>"""
+
+
+@pytest.fixture(scope="module")
+def env():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("dexsim.env.env.Physics", SimplePhysics)
+        config = GraspConfig(
+            pool_size=4,
+            objects=ObjectConfig(shapes=("sphere",)),
+            observation=ObservationConfig(add_critic=("object_orientation", "object_spin")),
+        )
+        yield dexsim.make("grasp", config, backend="jax")
+
+
+@pytest.fixture(scope="module")
+def seen(env):
+    """The object's velocity and spin as a task sees them, and the critic's observation, from a physics state."""
+    object = jax.tree.map(lambda rows: jnp.asarray(rows)[0], env.pool.object)
+    upright, joints, nothing = jnp.array([1.0, 0, 0, 0]), jnp.zeros(12), jnp.zeros(3)
+    readings = Readings(
+        joints, joints, jnp.zeros((5, 120)), nothing, nothing, upright, upright, jnp.float32(0.5), joints
+    )
+
+    def look(physics):
+        truth = ground_truth(env, object, physics, jnp.zeros((5, 3)))
+        critic = env.observer.observe(readings, truth, jnp.float32(0.5), upright)["critic"]
+        return (truth.object_velocity, truth.object_spin), critic
+
+    return jax.jit(look)
+
+
+def turned(quat):
+    matrix = np.zeros(9)
+    mujoco.mju_quat2Mat(matrix, np.asarray(quat, float))
+    return matrix.reshape(3, 3)
+
+
+def field(env, group, name, values):
+    at = 0
+    for entry in env.observation_layout[group]:
+        if entry.name == name:
+            return values[at : at + entry.size]
+        at += entry.size
+    raise AssertionError(f"{group} does not observe {name}")
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_velocity_and_spin_are_the_objects_change_in_the_palm_frame(env, seen, seed):
+    """The engine has the spin in the object's own frame; reward and critic have both in the palm frame."""
+    rng = np.random.default_rng(seed)
+    quat = rng.normal(size=4)
+    place = np.concatenate([rng.normal(0, 0.05, 3), quat / np.linalg.norm(quat)])
+    motion = rng.normal(size=6)
+    later = place.copy()
+    mujoco.mj_integratePos(mujoco.MjModel.from_xml_string(FREE_BODY), later, motion, MOMENT)
+    velocity = (later[:3] - place[:3]) / MOMENT
+    change = turned(later[3:]) @ turned(place[3:]).T
+    spin = (
+        np.array([change[2, 1] - change[1, 2], change[0, 2] - change[2, 0], change[1, 0] - change[0, 1]]) / 2 / MOMENT
+    )
+    assert np.linalg.norm(spin - motion[3:]) > 0.3, "the frames agree by chance: the test tests nothing"
+
+    qpos = np.concatenate([np.full(12, 0.3), place])
+    physics = PhysicsState(
+        *(jnp.asarray(x, jnp.float32) for x in (qpos, np.append(np.zeros(12), motion), np.zeros(18)))
+    )
+    found, critic = seen(physics)
+    np.testing.assert_allclose(found[0], velocity, atol=1e-5)
+    np.testing.assert_allclose(found[1], spin, atol=1e-4)
+    np.testing.assert_allclose(field(env, "critic", "object_velocity", critic), velocity, atol=1e-5)
+    np.testing.assert_allclose(field(env, "critic", "object_spin", critic), spin, atol=1e-4)
+    orientation = turned(place[3:])[:, :2].T.ravel()
+    np.testing.assert_allclose(field(env, "critic", "object_orientation", critic), orientation, atol=1e-5)

@@ -1,0 +1,106 @@
+"""Each limit of `Safety` on both of its sides: a limit of one side passes every test that pushes the other way."""
+
+import numpy as np
+import pytest
+from test_safety import CYCLE, FREE, MIDDLE, Bench, sample
+
+from dexsim_real.control.safety import Reaction
+from dexsim_real.wire.frames import Mode
+
+UP, DOWN = 1.0, -1.0
+
+
+def ready(hand, **options):
+    """A bench whose motors are on and whose ramp is over."""
+    bench = Bench(hand, **options)
+    bench.engage()
+    bench.run(2.0, wish=MIDDLE)
+    return bench
+
+
+@pytest.mark.parametrize("way", [UP, DOWN])
+def test_commands_keep_the_margin_from_either_end_stop(hand, way):
+    bench = ready(hand, margin=0.05)
+    bench.run(2.0, wish=np.full(12, way * 9.0))
+    end = hand.joint_upper - 0.05 if way == UP else hand.joint_lower + 0.05
+    np.testing.assert_allclose(bench.position, end, atol=1e-5)
+
+
+@pytest.mark.parametrize("way", [UP, DOWN])
+def test_the_motors_come_on_with_the_margin_from_either_end_stop(hand, way):
+    """A pose beyond the margin is no reason to command it."""
+    bench = Bench(hand, margin=0.05)
+    bench.position = np.asarray(hand.joint_upper if way == UP else hand.joint_lower, np.float32)
+    bench.engage()
+    first = bench.cycle(follow=False).position
+    end = hand.joint_upper - 0.05 if way == UP else hand.joint_lower + 0.05
+    np.testing.assert_allclose(first, end, atol=1e-5)
+
+
+@pytest.mark.parametrize("way", [UP, DOWN])
+def test_commands_move_at_most_at_the_speed_limit_in_either_direction(hand, way):
+    bench = ready(hand, speed=2.0)
+    path = np.array([bench.position] + [d.position for d in bench.run(0.1, wish=MIDDLE + np.float32(way * 0.5) * FREE)])
+    np.testing.assert_allclose(np.diff(path, axis=0)[:, FREE > 0], way * 2.0 * CYCLE, rtol=1e-3)
+
+
+@pytest.mark.parametrize("way", [UP, DOWN])
+def test_commands_stop_at_reach_from_a_stuck_hand_in_either_direction(hand, way):
+    bench = ready(hand, reach=0.2)
+    decision = bench.run(1.0, wish=MIDDLE + np.float32(way * 0.7) * FREE, follow=False)[-1]
+    assert decision.reaction == Reaction.CLIP
+    np.testing.assert_allclose(decision.position, MIDDLE + np.float32(way * 0.2) * FREE, atol=1e-5)
+
+
+@pytest.mark.parametrize("way", [UP, DOWN])
+def test_reach_pulls_a_command_in_neither_direction(hand, way):
+    """A hand that is pushed farther away than reach, slowly enough to be believed, takes no command along."""
+    bench = ready(hand, reach=0.2)
+    for k in range(60):
+        bench.position = MIDDLE + np.float32(way * min(0.008 * k, 0.4)) * FREE
+        decision = bench.cycle(wish=MIDDLE, follow=False)
+        np.testing.assert_array_equal(decision.position, MIDDLE)
+    assert decision.reaction == Reaction.NONE and bench.safety.counts["implausible: measurement"] == 0
+
+
+@pytest.mark.parametrize("way", [UP, DOWN])
+def test_a_joint_too_fast_in_either_direction_holds(hand, way):
+    bench = ready(hand)
+    for joint in range(12):
+        bench.safety.see(sample(bench.now, MIDDLE, velocity=way * 21.0 * (np.arange(12) == joint)))
+        bench.safety.set_target(MIDDLE, bench.now)
+        decision = bench.safety.decide(bench.now)
+        assert decision.reaction == Reaction.HOLD
+        assert decision.reason.startswith(f"too fast: joint {hand.joint_names[joint]} (")
+        bench.run(0.1, wish=MIDDLE)
+
+
+@pytest.mark.parametrize("way", [UP, DOWN])
+@pytest.mark.parametrize("pause", [0.02, 0.03, 0.06, 0.4])
+def test_time_that_a_late_cycle_has_missed_is_not_made_up_for(hand, way, pause):
+    """After a pause the next command moves by the speed limit times 30 ms at most."""
+    bench = ready(hand, speed=2.0)
+    bench.now += pause - CYCLE
+    decision = bench.cycle(wish=MIDDLE + np.float32(way * 0.5) * FREE)
+    assert decision.reaction == Reaction.CLIP
+    np.testing.assert_allclose((decision.position - MIDDLE)[FREE > 0], way * 2.0 * min(pause, 0.03), rtol=1e-3)
+
+
+@pytest.mark.parametrize("way", [UP, DOWN])
+def test_too_much_force_eases_slowly_from_the_first_command_on(hand, way):
+    bench = ready(hand)
+    wish = MIDDLE + np.float32(way * 0.1) * FREE
+    path = [bench.run(0.5, wish=wish, follow=False)[-1].position]
+    path += [d.position for d in bench.run(0.1, wish=wish, follow=False, force=30.0)]
+    np.testing.assert_allclose(np.diff(path, axis=0)[:, FREE > 0], -way * 0.5 * CYCLE, rtol=1e-3)
+
+
+def test_wrong_readings_far_apart_do_not_add_up(hand):
+    """One every two seconds for half a minute; each is a fault, but none of them lasts."""
+    bench = ready(hand)
+    for _ in range(15):
+        bench.position = MIDDLE + np.float32(1.9) * (np.arange(12) == 4)
+        bench.cycle(wish=MIDDLE, follow=False)
+        bench.position = MIDDLE
+        assert all(d.mode == Mode.POSITION for d in bench.run(2.0, wish=MIDDLE))
+    assert bench.safety.counts["implausible: measurement"] == 15 and not bench.safety.latched

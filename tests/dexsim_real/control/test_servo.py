@@ -1,0 +1,91 @@
+"""The exchange thread's end: how long a hand is told to turn its motors off, by whether they may be on."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from test_safety import CYCLE, MIDDLE
+
+from dexsim_real.control.motors_off import PATIENCE
+from dexsim_real.control.safety import Safety, SafetyConfig
+from dexsim_real.control.servo import Servo
+from dexsim_real.sensors.hand import HandSensing, HardwareConfig
+from dexsim_real.wire import frames
+from dexsim_real.wire.frames import Mode
+from dexsim_real.wire.link import LinkCounts, Reply
+
+
+class Hand:
+    """Answers at once, or not at all until a time; a clock of its own that every exchange moves on."""
+
+    def __init__(self):
+        self.counts, self.now, self.silent_until, self.modes, self.closed = LinkCounts(), 100.0, 0.0, [], False
+
+    def exchange(self, command):
+        sent, self.now = self.now, self.now + CYCLE
+        if sent < self.silent_until:
+            return None
+        self.modes.append(int(command["mode"][0]))
+        state = frames.empty_state()
+        state["joint"]["position"] = MIDDLE
+        return Reply(state, sent, self.now, len(self.modes), 1)
+
+    def close(self):
+        self.closed = True
+
+
+@pytest.fixture
+def servo(hand, monkeypatch):
+    """Its cycles are called one by one, in the clock of its hand."""
+    port = Hand()
+    clock = SimpleNamespace(monotonic=lambda: port.now)
+    for module in ("servo", "motors_off"):
+        monkeypatch.setattr(f"dexsim_real.control.{module}.time", clock)
+    monkeypatch.setattr("dexsim_real.control.servo.ignore_signals", lambda: None)
+    return Servo(port, HandSensing(hand, HardwareConfig()), Safety(hand, SafetyConfig()), 1 / CYCLE)
+
+
+def run(servo, cycles):
+    for _ in range(cycles):
+        servo.safety.set_target(MIDDLE, servo.port.now)
+        servo._cycle()
+
+
+@pytest.mark.parametrize(("on", "silence", "confirmed"), [(True, 4.0, True), (True, 7.0, False), (False, 4.0, False)])
+def test_a_hand_that_is_on_and_silent_is_told_for_five_seconds(servo, on, silence, confirmed):
+    """One that is off already delays the end by a third of a second only."""
+    assert PATIENCE == 5.0
+    run(servo, 5)
+    if on:
+        servo.engage()
+        run(servo, 5)
+    port = servo.port
+    assert port.modes[-1] == (Mode.POSITION if on else Mode.PASSIVE)
+    port.silent_until = began = port.now
+    port.silent_until += silence
+    servo.stop()
+    assert port.closed and servo.driven == (on and not confirmed)
+    assert (port.modes[-1] == Mode.PASSIVE) == (confirmed or not on)
+    assert port.now - began == pytest.approx(silence if confirmed else 5.0 if on else 0.3, abs=0.1)
+
+
+def test_a_command_without_an_answer_may_have_turned_the_motors_on(servo):
+    run(servo, 5)
+    servo.engage()
+    servo.port.silent_until = servo.port.now + 2 * CYCLE
+    assert not servo.driven
+    run(servo, 1)
+    assert servo.driven and Mode.POSITION not in servo.port.modes
+    servo.stop()
+    assert not servo.driven and servo.port.modes[-1] == Mode.PASSIVE
+
+
+def test_the_velocity_begins_anew_with_a_connection(servo):
+    """A hand that was moved while it was away is not a fast one."""
+    run(servo, 5)
+    state = frames.empty_state()
+    state["joint"]["position"] = MIDDLE + np.float32(0.1)
+    sample = servo._sample(Reply(state, servo.port.now, servo.port.now + CYCLE, 9, 2))
+    np.testing.assert_array_equal(sample.velocity, 0.0)
+    again = servo._sample(Reply(state, servo.port.now, servo.port.now + CYCLE, 10, 2))
+    np.testing.assert_array_equal(again.velocity, 0.0)

@@ -1,0 +1,124 @@
+"""The guard process: a runner that freezes, or that reaches its hand over a port of somebody's own."""
+
+import contextlib
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+from paths import ROOT
+
+pytest.importorskip("serial")
+from following_hand import FollowingHand
+from pty_hand import QUICK
+
+from dexsim_real.control.motors_off import PATIENCE
+from dexsim_real.control.safety import Safety, SafetyConfig
+from dexsim_real.control.servo import Servo
+from dexsim_real.run.guard import Guard
+from dexsim_real.sensors.hand import HandSensing, HardwareConfig
+from dexsim_real.wire.link import LinkCounts
+
+FREEZE = 4.0  # s, in which a frozen runner's hand must be off: 2 s with this line, the rest for a busy machine
+RUNNER = """
+import sys, time
+from dexsim_real.run.guard import Guard
+from dexsim_real.wire.link import LinkConfig
+guard = Guard(sys.argv[1], LinkConfig(settle=0.0, margin=0.02, handshake=0.1, paced=False))
+guard.arm()
+guard.beat(*map(float, sys.argv[2:]))
+print("armed", flush=True)
+while len(sys.argv) < 3:
+    guard.beat()
+    time.sleep(0.01)
+time.sleep(60)
+"""
+
+
+@pytest.fixture
+def peer():
+    with FollowingHand() as peer:
+        yield peer
+
+
+@contextlib.contextmanager
+def guarded(peer, *words):
+    """A runner under guard; with a time s its last sign of life, which says by how much the next one may be late."""
+    process = subprocess.Popen([sys.executable, "-c", RUNNER, peer.port, *words], cwd=ROOT, stdout=subprocess.PIPE)
+    try:
+        assert process.stdout.readline() == b"armed\n"
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def test_a_frozen_runner_is_killed_and_its_hand_turned_off(peer):
+    with guarded(peer) as process:
+        process.send_signal(signal.SIGSTOP)
+        begin = time.monotonic()
+        assert process.wait(FREEZE) == -signal.SIGKILL
+        while not peer.commands and time.monotonic() < begin + FREEZE:
+            time.sleep(0.01)
+        assert peer.commands and not peer.on().any()
+
+
+def test_who_counts_as_frozen(peer):
+    """Not who gives signs of life, pauses briefly, or has asked for the time, as a runner does that stops its hand."""
+    with guarded(peer) as living, guarded(peer) as paused, guarded(peer, "5") as patient:
+        paused.send_signal(signal.SIGSTOP)
+        time.sleep(0.7)
+        paused.send_signal(signal.SIGCONT)
+        time.sleep(2.0)
+        assert [process.poll() for process in (living, paused, patient)] == [None] * 3 and not peer.commands
+        with guarded(peer, "0.1") as silent:
+            assert silent.wait(FREEZE) == -signal.SIGKILL
+
+
+def test_the_exchange_thread_gives_the_signs_of_life(hand):
+    """Before every exchange, and once more with the time that turning the motors off may take."""
+    events = []
+
+    class Port:
+        counts = LinkCounts()
+
+        def exchange(self, command):
+            events.append("exchange")
+            time.sleep(0.001)
+
+        def close(self):
+            pass
+
+    safety = Safety(hand, SafetyConfig())
+    servo = Servo(Port(), HandSensing(hand, HardwareConfig()), safety, 500.0, events.append)
+    servo.driven = True
+    servo.start()
+    while events.count("exchange") < 20:
+        time.sleep(0.001)
+    Port.exchange = lambda self, command: events.append("answered") or True
+    servo.stop()
+    last = events.index(PATIENCE)
+    assert events[:last:2] == [0.0] * (last // 2) and set(events[1:last:2]) <= {"exchange"}
+    assert events[last + 1 :] == ["answered"]
+
+
+@pytest.mark.parametrize("attempts", [1, 3])
+def test_the_guard_stops_a_hand_on_somebodys_own_port(peer, tmp_path, monkeypatch, attempts):
+    """A port that fails at first is opened again."""
+    (tmp_path / "my_sdk.py").write_text(
+        "from dexsim_real.wire.serial_hand import SerialHand\n"
+        "opened = []\n"
+        "def open_hand(config):\n"
+        "    opened.append(config)\n"
+        f"    if len(opened) < {attempts}:\n"
+        "        raise RuntimeError('busy')\n"
+        f"    return SerialHand({peer.port!r}, config)\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    guard = Guard("sdk:my_sdk:open_hand", QUICK)
+    guard.arm()
+    assert not peer.commands
+    guard.dismiss(off=False)
+    assert guard._process.wait(10) == 0
+    assert peer.commands and not peer.on().any()
