@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from scipy.special import stdtrit
 
 from dexsim.calibration.joint import JointLines, JointPress, fit_joint
 from dexsim.calibration.maps import Calibration, Side, alignment
@@ -70,6 +71,7 @@ def calibrate(
         for note in lines.notes
     )
     (real_side, taken), (sim_side, _) = (_gather(hand, fits, k) for k in (0, 1))
+    real_side = _allow_for_scatter(hand, real_side, sim_side)
     notes += tuple(f"{name}: not recorded, mean of the joints of its torque limit" for name in taken)
     scale = np.broadcast_to(np.asarray(force_per_count, float), (hand.num_fingers,)).copy()
     calibration = Calibration(
@@ -98,6 +100,9 @@ _GENERAL = (
 )
 
 
+_LOSSES = 0.3  # share by which a gear's losses may part the gains of the two directions
+
+
 def _gather(hand: Hand, fits: list, side: int) -> tuple[Side, list[str]]:
     """Arrays of one side, and the joints that got the mean of their class."""
     measured = {joint: _row(fit[side]) for joint, fit in enumerate(fits) if fit}
@@ -119,9 +124,30 @@ def _gather(hand: Hand, fits: list, side: int) -> tuple[Side, list[str]]:
     return Side(**fields), taken
 
 
+def _allow_for_scatter(hand: Hand, real: Side, sim: Side) -> Side:
+    """Widen the gains of joints that took the mean of their class: one more joint scatters as those measured do.
+
+    With a single measured joint nothing is known of the scatter: the interval is the gain itself to either side.
+    """
+    half = (np.asarray(real.gain_high) - np.asarray(real.gain_low)) / 2
+    measured, limit = np.any(np.asarray(real.samples) > 0, 0), np.asarray(hand.torque_limit)
+    ratio = np.asarray(sim.gain) / np.asarray(real.gain)
+    for joint in np.flatnonzero(~measured):
+        mates = ratio[:, measured & (limit == limit[joint])]
+        count, share = mates.shape[1], np.ones(2)
+        if count > 1:
+            scatter = stdtrit(count - 1, 0.975) * np.std(mates, 1, ddof=1) * np.sqrt(1 + 1 / count)
+            share = np.minimum(scatter / np.abs(np.mean(mates, 1)), 1.0)
+        half[:, joint] = np.hypot(half[:, joint], share * np.abs(real.gain[:, joint]))
+    return dataclasses.replace(real, gain_low=real.gain - half, gain_high=real.gain + half)
+
+
 def _row(lines: JointLines) -> dict[str, np.ndarray]:
-    """The fields of `Side` for one joint; a missing line is the other one with 0 samples."""
-    both = [lines.loading or lines.unloading, lines.unloading or lines.loading]
+    """The fields of `Side` for one joint; a missing line is the other one with 0 samples, off by the gear's losses."""
+    only = lines.loading or lines.unloading
+    assert only is not None, "`fit_joint` refuses a recording without a line"
+    stand_in = only.widened(_LOSSES)
+    both = [lines.loading or stand_in, lines.unloading or stand_in]
     measured = np.array([lines.loading is not None, lines.unloading is not None])
     row = {
         name: np.array([getattr(line, name) for line in both], float)

@@ -1,7 +1,8 @@
 """Lines of one joint from the recording of its pressed fingertip, while loading and while unloading.
 
 The two directions are fitted apart, because friction in the gear obeys two lines: the motor holds more than the force
-asks for on the way up, less on the way down.
+asks for on the way up, less on the way down. Samples of one press share its place, its ripple and its friction, so
+intervals count whole presses, not samples.
 """
 
 import dataclasses
@@ -9,7 +10,7 @@ import dataclasses
 import numpy as np
 
 from dexsim.core.errors import CalibrationError
-from dexsim.core.robust_line import Line, fit_line
+from dexsim.core.robust_line import LEAST_GROUPS, Line, fit_line
 
 MIN_SAMPLES = 20
 """Samples that each direction needs."""
@@ -25,6 +26,9 @@ class JointPress:
     force: np.ndarray  # [T] N
     value: np.ndarray  # [T] A (hand) or Nm (simulation), with its own sign
     direction: np.ndarray | None = None  # [T] 1 loading, -1 unloading, 0 leave out; None: found
+    press: np.ndarray | None = None  # [T] int, number of the press, up and down; None: found
+    gain_error: float = 0.0
+    """Share of the gain, 95 %, that no sample can show: of the force's scale, or of the lever arm."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,13 +57,16 @@ def fit_joint(press: JointPress, unit: str, where: str = "recording") -> JointLi
     """
     force, value = _checked(press, unit, where)
     direction = find_direction(force) if press.direction is None else np.sign(np.asarray(press.direction)).astype(int)
+    number = find_presses(force) if press.press is None else np.asarray(press.press)
     free, clipped = _not_saturated(force, value, where)
     notes = [f"{clipped} saturated samples left out ({unit})"] if clipped else []
     lines: list[Line | None] = []
     for sign, name in ((1, "loading"), (-1, "unloading")):
         keep = free & (direction == sign)
         lines.append(
-            _fit_direction(force[keep], value[keep], f"{where}, {name}") if np.sum(keep) >= MIN_SAMPLES else None
+            _fit_direction(force[keep], value[keep], number[keep], f"{where}, {name}")
+            if np.sum(keep) >= MIN_SAMPLES
+            else None
         )
     if lines == [None, None]:
         counts = [int(np.sum(free & (direction == sign))) for sign in (1, -1)]
@@ -72,10 +79,13 @@ def fit_joint(press: JointPress, unit: str, where: str = "recording") -> JointLi
             f"{where}: rises with force while loading and falls while unloading: are two joints or fingers mixed up?"
         )
     notes += _line_notes(lines, unit)
+    if len(np.unique(number[free & (direction != 0)])) < LEAST_GROUPS:
+        notes.append(f"fewer than {LEAST_GROUPS} presses: the intervals leave out how presses differ ({unit})")
     sound = free & np.any([np.abs(value - line(force)) <= 4.685 * line.noise for line in lines if line is not None], 0)
+    wide = [line and line.widened(press.gain_error) for line in lines]
     return JointLines(
-        lines[0],
-        lines[1],
+        wide[0],
+        wide[1],
         _friction(lines, force[sound]),
         float(np.max(np.abs(value[sound]))),
         float(np.max(force[sound])),
@@ -89,12 +99,7 @@ def find_direction(force: np.ndarray, trim: float = 0.1) -> np.ndarray:
     Turns are the extremes that stand out of the noise. The first `trim` of each swing is marked 0:
     there the gear's friction is on its way from one side to the other.
     """
-    from scipy.ndimage import median_filter
-
-    smooth = median_filter(np.asarray(force, float), 9 if len(force) >= 90 else 3, mode="nearest")
-    noise = 1.4826 * np.median(np.abs(np.diff(force) - np.median(np.diff(force)))) / np.sqrt(2)
-    step = max(0.05 * np.ptp(smooth), 4.0 * noise)
-    turns, sign = _turns(smooth, step)
+    smooth, turns, sign = _swings(force)
     direction = np.zeros(len(smooth), int)
     for first, last in zip(turns[:-1], turns[1:], strict=True):
         swing = np.abs(smooth[first:last] - smooth[first])
@@ -102,6 +107,25 @@ def find_direction(force: np.ndarray, trim: float = 0.1) -> np.ndarray:
         direction[first:last] = np.where(swing >= trim * reach, sign, 0)
         sign = -sign
     return direction
+
+
+def find_presses(force: np.ndarray) -> np.ndarray:
+    """Number [T] of the press, up and down again, that each sample of a force [T] belongs to."""
+    _, turns, sign = _swings(force)
+    number = np.zeros(len(force), int)
+    for turn in turns[1 + (sign > 0) : -1 : 2]:  # A press begins where the force begins to rise.
+        number[turn:] += 1
+    return number
+
+
+def _swings(force: np.ndarray) -> tuple[np.ndarray, list[int], int]:
+    """The force [T] without noise, its turns, and the way of the first swing."""
+    from scipy.ndimage import median_filter
+
+    smooth = median_filter(np.asarray(force, float), 9 if len(force) >= 90 else 3, mode="nearest")
+    noise = 1.4826 * np.median(np.abs(np.diff(force) - np.median(np.diff(force)))) / np.sqrt(2)
+    step = max(0.05 * np.ptp(smooth), 4.0 * noise)
+    return smooth, *_turns(smooth, step)
 
 
 def _turns(smooth: np.ndarray, step: float) -> tuple[list[int], int]:
@@ -122,11 +146,8 @@ def _turns(smooth: np.ndarray, step: float) -> tuple[list[int], int]:
 
 def _checked(press: JointPress, unit: str, where: str) -> tuple[np.ndarray, np.ndarray]:
     force, value = np.asarray(press.force, float), np.asarray(press.value, float)
-    if (
-        force.ndim != 1
-        or force.shape != value.shape
-        or (press.direction is not None and np.shape(press.direction) != force.shape)
-    ):
+    marks = [mark for mark in (press.direction, press.press) if mark is not None]
+    if force.ndim != 1 or any(np.shape(array) != force.shape for array in (value, *marks)):
         raise CalibrationError(f"{where}: force {force.shape}, value {value.shape}: give arrays of one length")
     if len(force) < MIN_SAMPLES:
         raise CalibrationError(f"{where}: {len(force)} samples: at least {MIN_SAMPLES} in a direction are needed")
@@ -187,13 +208,13 @@ def _not_saturated(force: np.ndarray, value: np.ndarray, where: str) -> tuple[np
     return free, int(np.sum(~free))
 
 
-def _fit_direction(force: np.ndarray, value: np.ndarray, where: str) -> Line:
+def _fit_direction(force: np.ndarray, value: np.ndarray, press: np.ndarray, where: str) -> Line:
     low, high = np.quantile(force, [0.05, 0.95])
     if high - low < MIN_FORCE_RANGE:
         raise CalibrationError(
             f"{where}: force only between {low:.3g} and {high:.3g} N: press over at least {MIN_FORCE_RANGE} N"
         )
-    line = fit_line(force, value)
+    line = fit_line(force, value, group=press)
     if line.gain_interval[0] <= 0.0 <= line.gain_interval[1]:
         raise CalibrationError(
             f"{where}: does not follow the force (gain {line.gain:.3g}, 95 % "

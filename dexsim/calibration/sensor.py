@@ -8,9 +8,9 @@ taxel was pressed, which a flat plate moved by a known way gives.
     force = fit.correct(reading.sum(-1))
     save_fit("sensor.json", {"thumb": fit, ...})
 
-The line is fitted robustly (Huber weights), to samples beyond the largest force that still read zero: below it noise
-decides which samples read at all, which would bend the line. Intervals are percentiles over resampled recordings
-(Efron's bootstrap), so they hold for quantised and heavy-tailed readings as well. NumPy only.
+The line is fitted robustly (`dexsim.core.robust_line`), to samples beyond the largest force that still read zero: below
+it noise decides which samples read at all, which would bend the line. Samples of one press belong together: from three
+presses on, intervals count presses and not samples.
 
 Shapes: T samples, N taxels.
 """
@@ -22,13 +22,17 @@ import json
 from pathlib import Path
 
 import numpy as np
+from scipy.special import stdtrit
 
+from dexsim.calibration.joint import find_presses
 from dexsim.core.config import from_dict, to_dict
 from dexsim.core.errors import AssetError, DexsimError
 from dexsim.core.files import read_bounded
+from dexsim.core.robust_line import LEAST_GROUPS, Regression, fit_line, regress
 
 _RESAMPLES = 400
 _LEAST = 8  # samples
+_JUMP = 0.1  # share of the range of forces from one sample to the next above which no press is followed
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,6 +46,15 @@ class Estimate:
     def __str__(self) -> str:
         return f"{self.value:.4g} [{self.low:.4g}, {self.high:.4g}]"
 
+    def widened(self, share: float) -> Estimate:
+        """With an error of this share (95 %), which the samples cannot show, in the interval."""
+        more = abs(share * self.value)
+        return Estimate(
+            self.value,
+            self.value - float(np.hypot(self.value - self.low, more)),
+            self.value + float(np.hypot(self.high - self.value, more)),
+        )
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class TaxelPress:
@@ -51,6 +64,8 @@ class TaxelPress:
     reading: np.ndarray  # [T, N] N or counts, what the taxels said
     depth: np.ndarray | None = None  # [T, N] m, compression of the skin over each taxel
     area: np.ndarray | None = None  # [N] m^2
+    press: np.ndarray | None = None
+    """[T] int, number of the press, up and down; None: found from the force, samples being in the order of time."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,7 +102,7 @@ def fit_finger(
       thickness: of the skin, m; needed for the material.
       two_terms: fit C01 as well. Presses up to moderate compression tell only the sum of C10 and C01; a note says so.
       saturation: largest reading of a taxel; samples in which one reaches it are left out.
-      seed: of the resampling.
+      seed: of the resampling for the threshold.
 
     Raises:
       DexsimError: shapes that do not fit, too few samples, a force that does not vary, or a response that falls.
@@ -99,23 +114,25 @@ def fit_finger(
         keep = ~np.any(reading >= saturation, axis=1)
         if not np.all(keep):
             notes.append(f"{np.sum(~keep)} of {len(keep)} samples saturated, left out")
-    force, reading = force[keep], reading[keep]
+    number = _presses(press)
+    if len(np.unique(number)) < LEAST_GROUPS:
+        notes.append(f"fewer than {LEAST_GROUPS} presses: the intervals leave out how presses differ")
+    force, reading, group = force[keep], reading[keep], number[keep]
     total = reading.sum(1)
-    rng = np.random.default_rng(seed)
 
-    threshold = _threshold(force, total, rng)
+    threshold = _threshold(force, total, group, np.random.default_rng(seed))
     silent = force[total <= 0]
     above = force > (silent.max() if silent.size else -np.inf)
     if above.sum() < _LEAST:
         raise DexsimError(f"sensor fit: {above.sum()} samples above the activation threshold, at least {_LEAST} needed")
-    line = _bootstrap(np.stack([force[above], np.ones(above.sum())], 1), total[above], rng)
-    gain, offset = line
+    line = fit_line(force[above], total[above], group=group[above])
+    gain, offset = Estimate(line.gain, *line.gain_interval), Estimate(line.offset, *line.offset_interval)
     if gain.low <= 0:
         raise DexsimError(f"sensor fit: readings do not rise with force (gain {gain}); is the recording aligned?")
     residual = float(np.sqrt(np.mean((total[above] - gain.value * force[above] - offset.value) ** 2)))
     c10 = c01 = None
     if press.depth is not None:
-        c10, c01, said = _material(press, keep, thickness, two_terms, rng)
+        c10, c01, said = _material(press, keep, group, thickness, two_terms)
         notes += said
     return FingerFit(gain, offset, threshold, c10, c01, residual, int(above.sum()), tuple(notes))
 
@@ -164,55 +181,54 @@ def _checked(press: TaxelPress) -> tuple[np.ndarray, np.ndarray]:
     return force, reading
 
 
-def _threshold(force: np.ndarray, total: np.ndarray, rng: np.random.Generator) -> Estimate:
+def _presses(press: TaxelPress) -> np.ndarray:
+    """Number [T] of the press of each sample; each is its own where the force jumps, as between held forces."""
+    force = np.asarray(press.force, float)
+    if press.press is not None:
+        return np.asarray(press.press)
+    slow = np.median(np.abs(np.diff(force))) < _JUMP * np.ptp(force)
+    return find_presses(force) if slow else np.arange(len(force))
+
+
+def _threshold(force: np.ndarray, total: np.ndarray, group: np.ndarray, rng: np.random.Generator) -> Estimate:
     """The force that best parts silent from reading samples."""
-    pick = rng.integers(len(force), size=(_RESAMPLES, len(force)))
-    several = np.array([_best_split(force[rows], total[rows] > 0) for rows in pick])
-    value = _best_split(force, total > 0)
-    return Estimate(value, *_interval(several, value))
+    last, first = _best_split(force, total > 0)
+    presses = [group == k for k in np.unique(group)]
+    if len(presses) >= LEAST_GROUPS and min(np.sum(rows) for rows in presses) >= _LEAST:
+        several = np.array([np.mean(_best_split(force[rows], total[rows] > 0)) for rows in presses])
+        half = stdtrit(len(several) - 1, 0.975) * np.std(several, ddof=1) / np.sqrt(len(several))
+        low, high = np.mean(several) - half, np.mean(several) + half
+    else:
+        pick = rng.integers(len(force), size=(_RESAMPLES, len(force)))
+        several = np.array([np.mean(_best_split(force[rows], total[rows] > 0)) for rows in pick])
+        low, high = np.percentile(several, [2.5, 97.5])
+    # Nothing is known between two neighbouring forces.
+    return Estimate((last + first) / 2, float(min(low, last)), float(max(high, first)))
 
 
-def _best_split(force: np.ndarray, active: np.ndarray) -> float:
-    """Midpoint between two sorted forces with the fewest silent samples above and reading ones below."""
+def _best_split(force: np.ndarray, active: np.ndarray) -> tuple[float, float]:
+    """The two neighbouring forces with the fewest silent samples above and reading ones below."""
     order = np.argsort(force, kind="stable")
     force, active = force[order], active[order]
     wrong = np.concatenate([[0], np.cumsum(active)]) + np.sum(~active) - np.concatenate([[0], np.cumsum(~active)])
     best = np.flatnonzero(wrong == wrong.min())
     split = int(best[len(best) // 2])
-    if split in (0, len(force)):
-        return float(force[0] if split == 0 else force[-1])
-    return float((force[split - 1] + force[split]) / 2)
+    return float(force[max(split - 1, 0)]), float(force[min(split, len(force) - 1)])
 
 
-def _bootstrap(design: np.ndarray, target: np.ndarray, rng: np.random.Generator) -> list[Estimate]:
-    """Huber regression [T, K] -> [T] with intervals over resampled rows."""
-    value = _huber(design[None], target[None])[0]
-    pick = rng.integers(len(target), size=(_RESAMPLES, len(target)))
-    several = _huber(design[pick], target[pick])
-    return [Estimate(float(v), *_interval(several[:, k], v)) for k, v in enumerate(value)]
-
-
-def _interval(several: np.ndarray, value: float) -> tuple[float, float]:
-    low, high = np.percentile(several, [2.5, 97.5])
-    return float(min(low, value)), float(max(high, value))
-
-
-def _huber(design: np.ndarray, target: np.ndarray, rounds: int = 20) -> np.ndarray:
-    """Coefficients [R, K] of R regressions at once by reweighting; 1.345 robust deviations keep full weight."""
-    scale = np.sqrt(np.mean(design**2, axis=1, keepdims=True)) + 1e-300
-    x, weight = design / scale, np.ones_like(target)
-    for _ in range(rounds):
-        normal = np.einsum("rtk,rt,rtl->rkl", x, weight, x) + 1e-12 * np.eye(x.shape[-1])
-        right = np.einsum("rtk,rt,rt->rk", x, weight, target)
-        answer = np.linalg.solve(normal, right[..., None])[..., 0]
-        error = np.abs(target - np.einsum("rtk,rk->rt", x, answer))
-        deviation = 1.4826 * np.median(error, axis=1, keepdims=True) + 1e-9 * np.abs(target).max()
-        weight = np.minimum(1.0, 1.345 * deviation / np.maximum(error, 1e-300))
-    return answer / scale[:, 0]
+def _estimates(design: np.ndarray, target: np.ndarray, group: np.ndarray) -> list[Estimate]:
+    """Robust regression of the target [T] on the columns of a design [T, K] through zero, with intervals."""
+    size = np.max(np.abs(design), 0)
+    start = np.linalg.lstsq(design / size, target, rcond=None)[0]
+    found: Regression = regress(design / size, target, start, order=design[:, 0], group=group)
+    return [
+        Estimate(float(v), float(v - half), float(v + half))
+        for v, half in zip(found.value / size, found.half / size, strict=True)
+    ]
 
 
 def _material(
-    press: TaxelPress, keep: np.ndarray, thickness: float | None, two_terms: bool, rng: np.random.Generator
+    press: TaxelPress, keep: np.ndarray, group: np.ndarray, thickness: float | None, two_terms: bool
 ) -> tuple[Estimate, Estimate, list[str]]:
     """Mooney-Rivlin coefficients from depth and gauge force: the force is linear in both."""
     depth = np.asarray(press.depth, float)
@@ -234,13 +250,14 @@ def _material(
     stretch = 1 - np.maximum(depth[touching], 0) / thickness
     rise = 2 * (stretch**-2 - stretch) * press.area
     basis = np.stack([rise.sum(1), (rise / stretch).sum(1)], 1)
+    force, group = force[touching], group[touching]
     zero, notes = Estimate(0.0, 0.0, 0.0), list[str]()
     if not two_terms:
-        return _bootstrap(basis[:, :1], force[touching], rng)[0], zero, notes
-    c10, c01 = _bootstrap(basis, force[touching], rng)
+        return _estimates(basis[:, :1], force, group)[0], zero, notes
+    c10, c01 = _estimates(basis, force, group)
     width = max(c10.high - c10.low, c01.high - c01.low)
     if width > 0.5 * max(abs(c10.value + c01.value), 1e-300):
-        total = _bootstrap(basis.mean(1, keepdims=True), force[touching], rng)[0]
+        total = _estimates(basis.mean(1, keepdims=True), force, group)[0]
         notes.append(
             f"C10 and C01 cannot be told apart up to {deepest:.0%} compression; their sum is about {total.value:.4g} Pa"
         )

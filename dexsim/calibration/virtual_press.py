@@ -2,6 +2,7 @@
 
 import jax
 import numpy as np
+from scipy.signal import lfilter
 
 from dexsim.actuator.current import Motor, motor_current, read_current
 from dexsim.calibration.joint import JointPress
@@ -42,3 +43,40 @@ def press(
     if force_resolution > 0:
         reading = np.round(reading / force_resolution) * force_resolution
     return JointPress(np.clip(reading, 0.0, force_limit), np.asarray(current, float))
+
+
+def varied_presses(
+    rng: np.random.Generator,
+    *,
+    gain: float = 0.05,
+    offset: float = 0.02,
+    friction: float = 0.0,
+    spread: float = 0.02,
+    shift: float = 0.005,
+    noise: float = 0.004,
+    correlation: float = 0.9,
+    presses: int = 4,
+    samples: int = 800,
+    peak: float = 8.0,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Presses that differ, with noise that does not forget: force [T] N, value [T].
+
+    Args:
+      rng: random numbers.
+      gain, offset: of the line, on average over presses.
+      friction: added while loading, subtracted while unloading.
+      spread: standard deviation of the gain from press to press, as a share of it.
+      shift: standard deviation of the offset from press to press.
+      noise: standard deviation of each sample.
+      correlation: of neighbouring samples' noise.
+      presses, samples: number of presses, and samples in all.
+      peak: N, largest force of the triangle wave.
+    """
+    phase = np.arange(samples) / samples * presses
+    number, share = phase.astype(int), 1.0 - np.abs(2.0 * (phase % 1.0) - 1.0)
+    force, way = peak * share, np.where(phase % 1.0 < 0.5, 1.0, -1.0)
+    slope = gain * (1.0 + spread * rng.standard_normal(presses))[number]
+    zero = offset + shift * rng.standard_normal(presses)[number]
+    fresh = noise * np.sqrt(1.0 - correlation**2) * rng.standard_normal(samples)
+    fresh[0] = noise * rng.standard_normal()
+    return force, slope * force + zero + friction * way + lfilter([1.0], [1.0, -correlation], fresh)

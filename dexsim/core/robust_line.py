@@ -1,8 +1,9 @@
 """A straight line through data with outliers, with confidence intervals.
 
 Theil-Sen start, Huber and then Tukey's bisquare by iteratively reweighted least squares (an
-MM-estimate), and a sandwich covariance that allows for unequal and autocorrelated residuals
-(Andrews and Monahan 1992). Plain NumPy in double precision.
+MM-estimate). The interval is the wider of two: of a sandwich covariance that allows for unequal and
+autocorrelated residuals (Andrews and Monahan 1992), and of a jackknife over whole repetitions, which sees what
+differs between them however the residuals within one belong together. Plain NumPy in double precision.
 """
 
 import dataclasses
@@ -13,6 +14,9 @@ from scipy.special import stdtrit
 _HUBER, _BISQUARE = 1.345, 4.685  # 95 % efficiency under normal errors
 _MAD = 1.4826  # median absolute deviation to standard deviation, normal errors
 _PAIRS = 20_000
+LEAST_GROUPS = 3
+"""Repetitions below which their differences are not part of an interval."""
+_MOST_GROUPS = 20  # more are joined in the order of their numbers, since each costs a fit
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -37,26 +41,38 @@ class Line:
         """The line at x."""
         return self.gain * np.asarray(x) + self.offset
 
+    def widened(self, share: float) -> "Line":
+        """The line with an error of this share of the gain (95 %), which the data cannot show, in its interval."""
+        half = np.hypot((self.gain_interval[1] - self.gain_interval[0]) / 2, share * self.gain)
+        return dataclasses.replace(self, gain_interval=(float(self.gain - half), float(self.gain + half)))
 
-def fit_line(x: np.ndarray, y: np.ndarray, *, seed: int = 0) -> Line:
+
+@dataclasses.dataclass(frozen=True)
+class Regression:
+    """Robust coefficients of a linear model, and half their 95 % intervals."""
+
+    value: np.ndarray  # [P]
+    half: np.ndarray  # [P]
+    weight: np.ndarray  # [T] in [0, 1], 0 for outliers
+    scale: float  # robust standard deviation of the residuals
+
+
+def fit_line(x: np.ndarray, y: np.ndarray, *, group: np.ndarray | None = None, seed: int = 0) -> Line:
     """Fit y = gain x + offset.
 
     Args:
       x, y: [T], finite and in order of time; T > 2 and x not constant.
+      group: [T] int, number of the repetition (a press) that a sample belongs to. From `LEAST_GROUPS` on, their
+        differences widen the intervals.
       seed: of the random pairs for Theil-Sen, if there are more than 20,000 pairs.
     """
     x, y = np.asarray(x, float), np.asarray(y, float)
     reach = np.max(np.abs(x))
     design = np.stack([np.ones_like(x), x / reach], -1)
     start = np.array(theil_sen(x, y, seed)) * [1.0, reach]
-    guess, scale, weight = _reweight(design, y, start)
-    residual = y - design @ guess
-    # Sorted along x, errors that recur at the same x (motor ripple) or drift within one press are neighbours:
-    # their autocorrelation must widen the intervals.
-    order = np.argsort(x, kind="stable")
-    half = _half_widths(design[order], residual[order], weight[order], scale)
-    offset, gain = guess / [1.0, reach]
-    half = half / [1.0, reach]
+    found = regress(design, y, start, order=x, group=group)
+    weight, residual = found.weight, y - design @ found.value
+    (offset, gain), half = found.value / [1.0, reach], found.half / [1.0, reach]
     kept = weight > 0
     centred = y[kept] - np.average(y[kept], weights=weight[kept])
     unexplained = np.sum(weight * residual**2) / max(np.sum(weight[kept] * centred**2), 1e-300)
@@ -65,12 +81,33 @@ def fit_line(x: np.ndarray, y: np.ndarray, *, seed: int = 0) -> Line:
         offset=float(offset),
         gain_interval=(float(gain - half[1]), float(gain + half[1])),
         offset_interval=(float(offset - half[0]), float(offset + half[0])),
-        noise=float(scale),
+        noise=float(found.scale),
         r_squared=float(1.0 - unexplained),
         condition=float(np.linalg.cond(design)),
         samples=len(x),
         outliers=int(np.sum(~kept)),
     )
+
+
+def regress(
+    design: np.ndarray, y: np.ndarray, start: np.ndarray, *, order: np.ndarray, group: np.ndarray | None = None
+) -> Regression:
+    """Robust regression of y [T] on the columns of a design [T, P].
+
+    Args:
+      design, y: finite.
+      start: [P], first guess, robust itself.
+      order: [T], sorted by which neighbouring residuals belong together.
+      group: [T] int, repetitions, as for `fit_line`.
+    """
+    guess, scale, weight = _reweight(design, y, start)
+    # Sorted along x, errors that recur at the same x (motor ripple) or drift within one press are neighbours:
+    # their autocorrelation must widen the intervals.
+    row = np.argsort(order, kind="stable")
+    half = _half_widths(design[row], (y - design @ guess)[row], weight[row], scale)
+    if group is not None:
+        half = np.maximum(half, _between_groups(design, y, guess, np.asarray(group)))
+    return Regression(guess, half, weight, scale)
 
 
 def theil_sen(x: np.ndarray, y: np.ndarray, seed: int = 0) -> tuple[float, float]:
@@ -123,7 +160,26 @@ def _half_widths(design: np.ndarray, residual: np.ndarray, weight: np.ndarray, s
     freedom = max(len(residual) - 2, 1)
     random = np.diag(inverse @ long_run(score) @ inverse) * len(residual) / freedom
     variance = np.maximum(random, _periodic(design, weight * residual, inverse))
-    return stdtrit(freedom, 0.975) * np.sqrt(np.maximum(variance, 0.0))
+    # Autocorrelated samples count for fewer, also in how well the variance itself is known.
+    rho = float(np.max(_autocorrelation(score), initial=0.0))
+    worth = max(len(residual) * (1 - rho) / (1 + rho) - 2, 3.0)
+    return stdtrit(worth, 0.975) * np.sqrt(np.maximum(variance, 0.0))
+
+
+def _between_groups(design: np.ndarray, y: np.ndarray, guess: np.ndarray, group: np.ndarray) -> np.ndarray:
+    """Half the 95 % interval [P] by the jackknife over whole groups; 0 with too few of them.
+
+    Few groups make Student's t quantile large, which is what few repetitions are worth.
+    """
+    number = np.unique(group, return_inverse=True)[1]
+    count = int(number.max()) + 1
+    if count < LEAST_GROUPS:
+        return np.zeros(len(guess))
+    if count > _MOST_GROUPS:
+        number, count = number * _MOST_GROUPS // count, _MOST_GROUPS
+    without = np.array([_reweight(design[number != k], y[number != k], guess)[0] for k in range(count)])
+    variance = (count - 1) / count * np.sum((without - guess) ** 2, 0)
+    return stdtrit(count - 1, 0.975) * np.sqrt(variance)
 
 
 def _periodic(design: np.ndarray, residual: np.ndarray, inverse: np.ndarray) -> np.ndarray:
@@ -157,6 +213,9 @@ def long_run(score: np.ndarray) -> np.ndarray:
 
 
 def _autocorrelation(series: np.ndarray) -> np.ndarray:
-    """First-order coefficient [P] of each column, corrected for its bias in short series."""
+    """First-order coefficient [P] of each column, corrected for its bias in short series.
+
+    Correlation over more than a quarter of the series is not to be told from a trend.
+    """
     rho = np.sum(series[:-1] * series[1:], 0) / np.maximum(np.sum(series**2, 0), 1e-300)
-    return np.clip(rho + (1.0 + 3.0 * rho) / len(series), -0.5, 0.97)
+    return np.clip(rho + (1.0 + 3.0 * rho) / len(series), -0.5, min(0.97, 1.0 - 4.0 / len(series)))

@@ -20,6 +20,12 @@ MIN_SAMPLES = 200
 MIN_MOTION = 0.02
 """rad that the joint must have moved."""
 
+MODEL = (
+    "the intervals hold for a joint that obeys this model at this time step; on C MuJoCo's joint at steps of 0.5 ms "
+    "gains came out 2 % low, Coulomb friction 6 % high and viscous friction 12 % low"
+)
+"""Note of every identification."""
+
 FIT = ("stiffness", "damping", "coulomb_friction", "viscous_friction", "stall_torque")
 """What is fitted by default, apart from latency, dead-band and the angles where it rests."""
 
@@ -150,25 +156,25 @@ def _conclude(
     dead_band: tuple[float, float] | None,
     holdout: JointLog | None,
 ) -> Identification:
-    log, theta, samples = problem.log, problem.theta, len(problem.log.target)
+    log, theta = problem.log, problem.theta
     fitted = problem.names if dead_band is not None else problem.names[:-1]
     count = len(fitted)
     residual = problem.residual(theta, problem.starts, latency)
     jacobian = problem.jacobian(theta, problem.starts, latency)
     columns = np.r_[np.arange(count), np.arange(len(theta), jacobian.shape[1])]
     size = np.maximum(np.abs(theta), [TYPICAL[name] for name in problem.names])[:count]
-    deviation, correlation, condition, null = uncertainty(
-        jacobian[:, columns], residual, np.append(size, np.full(len(problem.starts), 0.05)), samples
+    half, correlation, condition, null = uncertainty(
+        jacobian[:, columns], residual, np.append(size, np.full(len(problem.starts), 0.05)), problem.segment
     )
-    deviation, correlation = deviation[:count], correlation[:count, :count]
+    half, correlation = half[:count], correlation[:count, :count]
     null = [members[:count] for members in null if np.any(members[:count])]
     low, high = problem.low[:count], problem.high[:count]
     # Curvature at the best point, widened by what was seen to fit as well farther off.
     least, largest = problem.plausible(latency, dead_band is not None)
     ends = np.stack(
         [
-            np.maximum(np.minimum(theta[:count] - 1.96 * deviation, least[:count]), low),
-            np.minimum(np.maximum(theta[:count] + 1.96 * deviation, largest[:count]), high),
+            np.maximum(np.minimum(theta[:count] - half, least[:count]), low),
+            np.minimum(np.maximum(theta[:count] + half, largest[:count]), high),
         ],
         -1,
     )
@@ -182,7 +188,7 @@ def _conclude(
     values["start"] = float(problem.starts[0])
     touching = (theta[:count] <= low + 1e-3 * size) | (theta[:count] >= high - 1e-3 * size)
     at_bound = tuple(n for n, hit in zip(fitted, touching, strict=True) if hit)
-    found = groups(fitted, null, correlation, deviation, size)
+    found = groups(fitted, null, correlation, half, size)
     errors = residual.reshape(len(problem.measured), -1) * problem.noise[: len(problem.measured), None]
     rmse = np.sqrt(np.mean(errors**2, -1))
     cost, best = problem.latency_cost, problem.latency_cost[latency]
@@ -224,6 +230,7 @@ def _notes(
     after: float,
 ) -> list[str]:
     notes = advice(found)
+    notes.append(MODEL)
     notes += [f"{name} ran into its bound: its interval is one-sided" for name in at_bound]
     if len(latencies) > 1 and latency == max(latencies):
         notes.append("latency is the largest that was tried: try more")

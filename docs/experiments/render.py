@@ -111,6 +111,16 @@ TABLES: dict[str, tuple[str, dict[str, str]]] = {
             "held_pct": "held [%]",
         },
     ),
+    "calibration": (
+        "Calibration: coverage of the 95 % intervals",
+        {
+            "intervals": "intervals",
+            "covered_pct": "hold the truth [%]",
+            "covered_before_pct": "before [%]",
+            "half_width_pct": "half-width, median [%]",
+            "mean_error_pct": "error, mean [%]",
+        },
+    ),
     "bridge": (
         "Bridge: timing, faults, calibration",
         {

@@ -9,9 +9,8 @@ import dataclasses
 import mujoco
 import numpy as np
 
-from dexsim_real.twin.wire.firmware import Firmware, FirmwareConfig
 from dexsim_real.wire import frames
-from dexsim_real.wire.frames import Command, Frame, Mode
+from dexsim_real.wire.frames import Mode
 from dexsim_real.wire.identity import Identity
 from dexsim_real.wire.link import LinkCounts, Reply
 
@@ -169,42 +168,6 @@ class BenchHand:
             counts[finger, index] = 0.0
         taxel["z"] = np.clip(np.round(counts), 0, 255)
         return block
-
-
-class PlantPort:
-    """`HandPort` of an emulated hand, through its palm board and the bytes of both frames, in virtual time."""
-
-    def __init__(self, plant):
-        self.plant, self.firmware = plant, Firmware(plant, FirmwareConfig())
-        self.counts, self.sequence, self.time, self.commands = LinkCounts(), 0, 0.0, []
-
-    def connect(self):
-        return "emulated: hand 0"
-
-    def exchange(self, command):
-        self.commands.append(command)
-        sent = self.time
-        self._advance(0.001)
-        request = Frame(frames.HOST, frames.palm_address(0), Command.EXCHANGE, command.tobytes())
-        answer = self.firmware.answer(request, self.time)
-        self._advance(EXCHANGE - 0.001)
-        self.sequence += 1
-        self.counts.sent += 1
-        self.counts.answered += 1
-        return Reply(frames.decode_state(answer.data), sent, self.time, self.sequence, 1)
-
-    def close(self):
-        pass
-
-    def clock(self):
-        return self.time
-
-    def sleep(self, seconds):
-        self._advance(max(seconds, 0.0))
-
-    def _advance(self, seconds):
-        self.plant.advance(seconds)
-        self.time += seconds
 
 
 GAUGE = None

@@ -7,11 +7,13 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+import scipy.signal
+import scipy.stats
 
 from dexsim.actuator.drive import Actuator, apply_friction, delayed_target, joint_torque
 from dexsim.core.errors import CalibrationError, ConfigError
 from dexsim.identification.excitation import Excitation, chirp, excitation, joint_excitation, steps, triangles
-from dexsim.identification.identify import check_log, evaluate, identify
+from dexsim.identification.identify import FIT, check_log, evaluate, identify
 from dexsim.identification.joint import JointLog, segments, simulate, with_defaults
 from dexsim.identification.report import uncertainty
 
@@ -371,7 +373,9 @@ def test_intervals_of_a_linear_problem_are_the_textbooks():
     rng = np.random.default_rng(0)
     jacobian = rng.standard_normal((400, 3)) @ np.diag([1.0, 2.0, 5.0])
     residual = 0.1 * rng.standard_normal(400)
-    deviation, correlation, condition, null = uncertainty(jacobian, residual, np.ones(3), 400)
+    one = np.zeros(400, int)
+    half, correlation, condition, null = uncertainty(jacobian, residual, np.ones(3), one)
+    deviation = half / 1.96
     covariance = np.linalg.inv(jacobian.T @ jacobian) * np.sum(residual**2) / 397
     assert np.all(deviation >= 0.999 * np.sqrt(np.diag(covariance)))
     np.testing.assert_allclose(deviation, np.sqrt(np.diag(covariance)), rtol=0.2)
@@ -379,10 +383,35 @@ def test_intervals_of_a_linear_problem_are_the_textbooks():
     np.testing.assert_allclose(correlation, covariance / np.outer(spread, spread), atol=1e-9)
     assert condition == pytest.approx(np.linalg.cond(jacobian)) and not null
     twin = np.column_stack([jacobian, jacobian[:, 1]])
-    deviation, correlation, _, null = uncertainty(twin, residual, np.ones(4), 400)
-    np.testing.assert_array_equal(np.isinf(deviation), [False, True, False, True])
+    half, correlation, _, null = uncertainty(twin, residual, np.ones(4), one)
+    np.testing.assert_array_equal(np.isinf(half), [False, True, False, True])
     np.testing.assert_array_equal(null[0], [False, True, False, True])
     assert np.all(np.isnan(correlation[1]))
+
+
+def test_segments_that_disagree_widen_the_intervals():
+    """A constant in six segments of one level each: the interval of the mean of six numbers."""
+    rng = np.random.default_rng(0)
+    level, segment = rng.standard_normal(6), np.repeat(np.arange(6), 50)
+    residual = (level - level.mean())[segment]
+    half = uncertainty(np.ones((300, 1)), residual, np.ones(1), segment)[0]
+    assert half[0] == pytest.approx(scipy.stats.t.ppf(0.975, 5) * np.std(level, ddof=1) / np.sqrt(6), rel=1e-6)
+
+
+def test_a_ripple_that_the_model_does_not_have_stays_within_the_intervals():
+    """Torque that ripples by 3 % and noise that does not forget: what the segments disagree about."""
+    rng = np.random.default_rng(1)
+    log = log_of(TRUTH | {"dead_band": 0.0}, 8, target=SHORT)
+    noise = scipy.signal.lfilter([np.sqrt(1 - 0.9**2)], [1, -0.9], rng.standard_normal((2, len(SHORT))))
+    rippled = dataclasses.replace(
+        log,
+        position=log.position + 0.001 * noise[0],
+        torque=log.torque * (1 + 0.03 * np.sin(150 * log.position)) + 0.01 * noise[1],
+    )
+    found = quick(rippled, FIT)
+    for name in FIT:
+        assert found.intervals[name][0] <= TRUTH[name] <= found.intervals[name][1], name
+    assert any("obeys this model" in note for note in found.notes)
 
 
 # --- refusals ----------------------------------------------------------------------------------------------

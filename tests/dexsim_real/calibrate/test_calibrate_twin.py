@@ -11,7 +11,6 @@ import press_bench
 import pytest
 from calibrating import arguments, operator, record
 from paths import ROOT
-from press_bench import PlantPort
 
 from dexsim.calibration.maps import load_calibration
 from dexsim_real.calibrate.__main__ import fit_and_report
@@ -23,10 +22,10 @@ from dexsim_real.calibrate.report import torque_constants
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_emulated_hand_gives_its_torque_constants_back(hand, tmp_path, seed):
     """Gears with play, ripple, heat, taxels with faults, parameters outside the ranges of training; a gauge."""
-    from dexsim_real.twin.press import PressBench
+    from dexsim_real.twin.press import PressBench, VirtualPort
 
     plant = PressBench(hand, seed)
-    bench, press_bench.GAUGE = PlantPort(plant), lambda: float(max(-plant._spring @ plant._normal, 0.0))
+    bench, press_bench.GAUGE = VirtualPort(plant), lambda: float(max(-plant._spring @ plant._normal, 0.0))
     options = arguments(tmp_path, fingers=("middle",), press=PressConfig(), gauge="press_bench:read_gauge")
     fit_and_report(options, hand, [record(bench, hand, options)], operator())
     found, truth = -torque_constants(load_calibration(options.output, hand)), plant.truth()

@@ -11,7 +11,9 @@ from press_bench import BenchHand
 from rich.console import Console
 
 from dexsim.calibration.maps import joint_torque, load_calibration
+from dexsim.core.errors import CalibrationError
 from dexsim_real.calibrate.__main__ import fit_and_report
+from dexsim_real.calibrate.force_scale import upright
 from dexsim_real.calibrate.gauge import parse_reading
 from dexsim_real.calibrate.hand_loop import Operator
 from dexsim_real.calibrate.options import CalibrateArguments
@@ -163,6 +165,46 @@ def test_too_few_readings_do_not_count(hand, scale):
     found = fit(session, hand)
     assert not found.sensors and np.all(np.asarray(found.calibration.force_per_count) == 0.1)
     assert any("middle pad: 7 gauge readings are ignored" in note for note in found.calibration.notes)
+
+
+def test_without_the_scale_its_error_is_in_the_intervals(hand, scale):
+    """The taxels read 15 % too little, and nothing in the presses shows it."""
+    bench, options, _ = scale
+    session = read_logs([options.log], hand)
+    truth = np.stack([bench.constant * bench.efficiency, bench.constant / bench.back])[:, 6:8]
+    for recording in session.recordings.values():
+        recording.gauge = {}
+    found = fit(session, hand).calibration
+    low, high = np.sort(-torque_constant_intervals(found)[:, 6:8], -1).transpose(2, 0, 1)
+    assert np.all((low < truth) & (truth < high)) and np.all(high - low < 0.8 * truth)
+    assert np.all(np.abs(-torque_constants(found)[:, 6:8] / truth - 1) > 0.1)
+    assert any(note.startswith("no gauge: ") for note in found.notes)
+    # One joint of each strength was pressed, so nothing is known of how others differ.
+    other = torque_constant_intervals(found)[:, 0]
+    assert np.all(other.min(-1) < 0) and np.all(found.real.samples[:, 0] == 0)
+    assert any("% low" in note for note in found.notes)  # the bias of the method
+
+
+def test_a_joint_that_shear_loads_is_left_out(hand, scale):
+    """The fit takes all force along the normal; by the taxels' x and y most of it is not."""
+    session = read_logs([scale[1].log], hand)
+    recording = session.recordings["middle pad"]
+    plain = torque_constant_intervals(fit(session, hand).calibration)[:, 6]
+    sums = np.array(recording.counts).sum(-1)
+    recording.shear = list(np.outer(sums, [0.0, 0.3]))
+    shifted = torque_constant_intervals(fit(session, hand).calibration)[:, 6]
+    assert np.all(np.ptp(shifted, -1) > np.ptp(plain, -1))
+    recording.shear = list(np.outer(sums, [0.0, 20.0]))
+    with pytest.raises(CalibrationError, match="mid_joint1: loaded by shear while the middle pad was pressed"):
+        fit(session, hand)
+
+
+def test_the_gauge_stands_still_while_the_fingertip_turns(hand):
+    position = np.zeros((3, 12))
+    position[:, 6] = 0.3, 0.3, 0.5  # rad, about the knuckle
+    counts = np.zeros((3, hand.num_taxels))
+    counts[:, 65] = 5.0, 20.0, 40.0
+    np.testing.assert_allclose(upright(hand, 2, counts, position), [1.0, 1.0, np.cos(0.2)], atol=5e-4)
 
 
 @pytest.mark.parametrize(
