@@ -121,7 +121,7 @@ def test_a_hot_hand_is_relaxed_and_the_run_ends(tmp_path):
         assert run.main(arguments(peer, tmp_path, "--seconds", "5")) == 1
         hot = peer.times[100]
         assert not peer.on()[np.array(peer.times) > hot + 0.3].any()
-    assert "too hot: 95 degC" in summary(tmp_path)["end"]
+    assert "too hot: joint thumb_bend (thumb), 95 degC" in summary(tmp_path)["end"]
 
 
 def test_a_line_full_of_faults_does_not_end_the_run(hand, tmp_path):
