@@ -125,6 +125,8 @@ def runner_words(twin: TwinProcess, options: argparse.Namespace, log: Path, seco
         str(twin.port),
         "--camera",
         f"unix:{twin.masks}",
+        "--safety.stale-object",  # Between two trials the object is out of sight, which would end the run.
+        "60",
         "--uncalibrated",
         "--yes",
         "--quiet",

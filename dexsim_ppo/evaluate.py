@@ -68,7 +68,8 @@ class Evaluator:
             ]
         # Episodes are the last axis of all that is measured.
         measured = jax.tree.map(lambda *xs: np.concatenate(xs, axis=-1), *(measured for measured, _ in parts))
-        report = (summarize_totals if self.totals else summarize)(self.env, *measured, np.asarray(plan.row)) | {
+        found, over = measured
+        report = (summarize_totals if self.totals else summarize)(self.env, found, over, np.asarray(plan.row)) | {
             "seed": seed,
             "seconds": time.perf_counter() - started,
         }

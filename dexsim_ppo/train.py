@@ -19,7 +19,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 
@@ -128,7 +128,9 @@ def run_training(
     env = dexsim.make(
         arguments.task, training_config(arguments), backend=arguments.backend, num_envs=arguments.ppo.num_envs
     )
-    arguments = dataclasses.replace(arguments, backend=env.backend)  # so that a resumed run has the same engine
+    arguments = dataclasses.replace(
+        arguments, backend=cast(Any, env.backend)
+    )  # so that a resumed run has the same engine
     if isinstance(begun, Policy):
         check_fit(begun, env, arguments.ppo)
     folder = RunFolder(resumed.path.parent.parent if resumed else make_run_folder(arguments))

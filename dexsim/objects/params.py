@@ -9,6 +9,7 @@ all that (`ObjectConfig.mesh`): its slots are the boxes that follow it.
 """
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -222,7 +223,9 @@ def toward_nominal(object: ObjectParams, config: ObjectConfig, plain: jax.Array,
       scale: [] in [0, 1]; 0 is nominal exactly, 1 leaves the object as it is.
     """
     config, bulk = config.narrowed(), _bulk_of(object, plain)
-    middle = {name: nominal(config, name) for name in bulk if name != "com_offset"} | {"com_offset": 0.0}
+    middle: dict[str, Any] = {name: nominal(config, name) for name in bulk if name != "com_offset"} | {
+        "com_offset": 0.0
+    }
     middle["restitution"] = damping_ratio(jnp.asarray(middle["restitution"]))
     near = {name: middle[name] + scale * (value - middle[name]) for name, value in bulk.items()}
     return _with_bulk(object, plain, near)

@@ -83,7 +83,7 @@ class SafetyConfig:
     """Force of all fingertips above which the hand holds; it is rated for 80 N."""
     stale: float = setting(0.05, unit="s", low=0.001, high=10.0)
     """Age of the newest measurement above which the hand holds."""
-    stale_object: float = setting(0.3, unit="s", low=0.01, high=10.0)
+    stale_object: float = setting(0.3, unit="s", low=0.01, high=60.0)
     """Age of the newest camera or IMU measurement above which the hand holds."""
     watchdog: float = setting(0.08, unit="s", low=0.001, high=10.0)
     """Age of the newest joint target above which the hand holds, at least two control ticks."""

@@ -110,6 +110,8 @@ def runner_command(twin: Twin, calibration: Path | None) -> list[str]:
             words += ["--imu-mount", *(f"{v:g}" for v in arguments.object.imu_mount)]
     if twin.masks and arguments.task == "grasp":
         words += ["--camera", f"unix:{twin.masks.path}"]
+        # Between two trials the object is out of sight for up to 20 s, which would end the run.
+        words += ["--safety.stale-object", "60"] if arguments.trials > 1 else []
         for name in ("focal", "centre", "position", "forward", "down"):
             value = getattr(arguments.object.optics, name)
             if value != getattr(CameraConfig(), name):

@@ -5,6 +5,7 @@ import pytest
 from test_safety import CYCLE, FREE, MIDDLE, Bench, sample
 
 from dexsim_real.control.safety import Reaction
+from dexsim_real.wire.frames import Mode
 
 UP, DOWN = 1.0, -1.0
 
@@ -69,7 +70,7 @@ def test_a_joint_too_fast_in_either_direction_holds(hand, way):
         bench.safety.set_target(MIDDLE, bench.now)
         decision = bench.safety.decide(bench.now)
         assert decision.reaction == Reaction.HOLD
-        assert decision.reason.startswith(f"too fast: joint {hand.joint_names[joint]} ")
+        assert decision.reason.startswith(f"too fast: joint {hand.joint_names[joint]} (")
         bench.run(0.1, wish=MIDDLE)
 
 
@@ -82,3 +83,23 @@ def test_time_that_a_late_cycle_has_missed_is_not_made_up_for(hand, way, pause):
     decision = bench.cycle(wish=MIDDLE + np.float32(way * 0.5) * FREE)
     assert decision.reaction == Reaction.CLIP
     np.testing.assert_allclose((decision.position - MIDDLE)[FREE > 0], way * 2.0 * min(pause, 0.03), rtol=1e-3)
+
+
+@pytest.mark.parametrize("way", [UP, DOWN])
+def test_too_much_force_eases_slowly_from_the_first_command_on(hand, way):
+    bench = ready(hand)
+    wish = MIDDLE + np.float32(way * 0.1) * FREE
+    path = [bench.run(0.5, wish=wish, follow=False)[-1].position]
+    path += [d.position for d in bench.run(0.1, wish=wish, follow=False, force=30.0)]
+    np.testing.assert_allclose(np.diff(path, axis=0)[:, FREE > 0], -way * 0.5 * CYCLE, rtol=1e-3)
+
+
+def test_wrong_readings_far_apart_do_not_add_up(hand):
+    """One every two seconds for half a minute; each is a fault, but none of them lasts."""
+    bench = ready(hand)
+    for _ in range(15):
+        bench.position = MIDDLE + np.float32(1.9) * (np.arange(12) == 4)
+        bench.cycle(wish=MIDDLE, follow=False)
+        bench.position = MIDDLE
+        assert all(d.mode == Mode.POSITION for d in bench.run(2.0, wish=MIDDLE))
+    assert bench.safety.counts["implausible: measurement"] == 15 and not bench.safety.latched
