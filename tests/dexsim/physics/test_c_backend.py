@@ -170,7 +170,7 @@ class TestForces:
             np.testing.assert_allclose(after.qpos[index], data.qpos, atol=1e-5)
         assert touched > len(grips) / 2, "hardly a world is in contact: the test tests nothing"
 
-    @pytest.mark.parametrize("shape", ["sphere", "capsule"])
+    @pytest.mark.parametrize("shape", ["sphere", "box", "capsule", "composition"])
     def test_the_jax_backend_has_the_same_forces(self, one_step, physics_advance, grips, shape):
         """Within single precision's share: contact depths of 1e-7 m under springs of 1e4 N/m."""
         mine = grips[SHAPES.index(shape) * WORLDS :][:WORLDS]
