@@ -44,7 +44,7 @@ _TRUST = 0.3  # share of the torque above which shear, which the fit ignores, ma
 
 METHOD = (
     f"the intervals contain the method's own error: {1e3 * _LEVER:g} mm of lever arm and {100 * _HEAT:g} % for warm "
-    "motors; on emulated hands of known truth the torque constants came out about 3 % low, since presses warm "
+    "motors; on emulated hands of known truth the torque constants came out about 2 % low, since presses warm "
     "the motors and the taxels put the contact too near the joint (thumb_bend 6 %)"
 )
 """Note of every calibration."""
