@@ -71,7 +71,7 @@ def run_trial(options: dict[str, Any], seed: int, number: int) -> dict[str, Any]
         shape=shape,
     )
     began = time.perf_counter()
-    limits = SafetyConfig(**options["limit"])
+    limits = SafetyConfig(**options.get("limit", {}))
     run = VirtualRun(plant, controller, calibration, RunOptions(command, safety=options["safety"], limits=limits))
     report = run.run()
     return report | {"wall": round(time.perf_counter() - began, 2)}
