@@ -281,7 +281,7 @@ def test_corners_narrow_with_the_scale(hand):
 
 def test_the_imu_of_a_hand_in_a_corner_is_in_one_too():
     config = RotateConfig(pool_size=16, randomization=dataclasses.replace(EVEN, extremes=0.5, gravity_tilt=0.0))
-    env = dexsim.make("rotate", config, backend="jax")
+    env = dexsim.make("rotate", config, backend="c")
     keys = jax.random.split(jax.random.key(0), (64, 2))
     drawn, imu = jax.vmap(lambda two: env.sampler.sample_hand(*two))(keys)
     extreme = np.all(np.isin(np.asarray(drawn.torque_gain).round(5), np.float32([0.9, 1.1])), axis=1)

@@ -28,7 +28,7 @@ def run(tmp_path_factory):
     patch.setattr(registry, "TASKS", dict(registry.TASKS))
     patch.delitem(sys.modules, "poke_task", raising=False)
     folder = tmp_path_factory.mktemp("own") / "run"
-    yield train_policy("poke_task:poke", ppo=SMALL, backend="jax", steps=64, run_dir=folder, seed=3, **SIZES)
+    yield train_policy("poke_task:poke", ppo=SMALL, backend="c", steps=64, run_dir=folder, seed=3, **SIZES)
     patch.undo()
 
 
@@ -43,7 +43,7 @@ def test_training_by_name_leaves_a_policy_of_that_task(run):
 def test_the_policy_makes_the_environment_that_it_was_trained_in(run):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        env = run.policy.make_env(backend="jax")
+        env = run.policy.make_env(backend="c")
         run.policy.check_env(env)
     assert env.config.gain == 3.0 and env.config.pool_size == 4
     action = run.policy(env.reset(jax.random.key(0)).obs["actor"])
@@ -51,7 +51,7 @@ def test_the_policy_makes_the_environment_that_it_was_trained_in(run):
 
 
 def test_evaluation_by_name_and_from_python_agree(run, tmp_path, capsys):
-    report = evaluate_policy(run.folder / "last.msgpack", episodes=4, chunk=4, backend="jax", seed=5)
+    report = evaluate_policy(run.folder / "last.msgpack", episodes=4, chunk=4, backend="c", seed=5)
     code = evaluate_command.main(
         [str(run.folder / "last.msgpack"), "--task", "poke_task:poke", "--episodes", "4", "--chunk", "4"]
         + ["--backend", "jax", "--seed", "5", "--output", str(tmp_path / "report.json")]
@@ -64,7 +64,7 @@ def test_evaluation_by_name_and_from_python_agree(run, tmp_path, capsys):
 def test_another_environment_is_warned_of_and_another_observation_refused(run):
     other = Policy.load(run.folder / "last.msgpack")
     changed = override(other.env_config, ["gain=1.5"])
-    env = registry.make("poke", registry.find_task("poke").config_class(gain=1.5), backend="jax", num_envs=4)
+    env = registry.make("poke", registry.find_task("poke").config_class(gain=1.5), backend="c", num_envs=4)
     with pytest.warns(OtherEnvWarning, match=r"gain = 1\.5 \(trained: 3\.0\)"):
         evaluate_policy(other, env=env, episodes=4, chunk=4)
     assert changed["gain"] == 1.5
@@ -78,7 +78,7 @@ def test_resuming_by_name_goes_on_where_it_stopped(run):
 
 def test_fine_tuning_begins_with_the_policy(run, tmp_path):
     tuned = train_policy(
-        policy=str(run.folder / "last.msgpack"), ppo=SMALL, backend="jax", steps=32, run_dir=tmp_path / "tuned", **SIZES
+        policy=str(run.folder / "last.msgpack"), ppo=SMALL, backend="c", steps=32, run_dir=tmp_path / "tuned", **SIZES
     )
     assert tuned.policy.task == "poke" and tuned.policy.training["policy"].endswith("last.msgpack")
 

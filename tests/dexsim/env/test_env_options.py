@@ -73,7 +73,7 @@ def make():
                 observation=observation or ObservationConfig(),
                 objects=ObjectConfig(shapes=("sphere",)),
             ),
-            backend="jax",
+            backend="c",
         )
 
     yield build
@@ -506,7 +506,7 @@ def test_everything_at_once_on_the_real_physics():
         observation=ObservationConfig(add=("tangential_force",)),
         randomization=Randomization(backlash="gear_play"),
     )
-    env = dexsim.make("grasp", config, backend="jax", num_envs=8)
+    env = dexsim.make("grasp", config, backend="c", num_envs=8)
     state = jax.jit(lambda key: jax.vmap(env.reset)(jax.random.split(key, 8)))(jax.random.key(0))
     step, restart = jax.jit(jax.vmap(env.step)), jax.jit(jax.vmap(env.restart))
     rng, gripped, sheared, beyond = np.random.default_rng(0), 0, 0, []

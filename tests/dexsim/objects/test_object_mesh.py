@@ -165,7 +165,7 @@ def simple(monkeypatch):
 @pytest.mark.parametrize("method", ["closed_form", "grid", "surface_points"])
 def test_taxels_feel_the_mesh_at_the_size_of_the_episode(simple, folder, method):
     objects = ObjectConfig(mesh=str(folder / "cuboid.ply"), mesh_unit=0.001, mesh_size=(0.9, 1.1))
-    env = dexsim.make("grasp", GraspConfig(objects=objects, pool_size=16, touch_method=method), backend="jax")
+    env = dexsim.make("grasp", GraspConfig(objects=objects, pool_size=16, touch_method=method), backend="c")
     targets = jax.tree.map(lambda leaf: jnp.asarray(leaf)[:WORLDS], env.pool.object)
     assert len(np.unique(env.pool.object.size[:, 0, 0])) == 16
     points = jnp.asarray(np.random.default_rng(0).uniform(-0.035, 0.035, (500, 3)), jnp.float32)
@@ -180,7 +180,7 @@ def test_taxels_feel_the_mesh_at_the_size_of_the_episode(simple, folder, method)
 
 def test_an_environment_steps_with_a_mesh(simple, folder):
     objects = ObjectConfig(mesh=str(folder / "ell.obj"))
-    env = dexsim.make("grasp", GraspConfig(objects=objects, pool_size=16, touch_method="grid"), backend="jax")
+    env = dexsim.make("grasp", GraspConfig(objects=objects, pool_size=16, touch_method="grid"), backend="c")
     assert set(env.primitive_kinds) == {"box"} and "objects.mesh_size" in env.task.object_ranges
     state = jax.jit(lambda key: jax.vmap(env.reset)(jax.random.split(key, WORLDS)))(jax.random.key(0))
     step, felt = jax.jit(jax.vmap(env.step)), 0
@@ -193,11 +193,11 @@ def test_an_environment_steps_with_a_mesh(simple, folder):
 def test_a_mesh_is_turned_like_the_cube_that_it_is(simple, folder):
     """Start states settle in C MuJoCo: a mesh of a cube comes to rest where the cube of that edge does."""
     nominal = ObjectConfig(mass=(0.1, 0.1), friction=(0.9, 0.9), com_offset=0.0)
-    cubes = dexsim.make("rotate", RotateConfig(objects=nominal, edge=(0.055, 0.055), pool_size=64), backend="jax")
+    cubes = dexsim.make("rotate", RotateConfig(objects=nominal, edge=(0.055, 0.055), pool_size=64), backend="c")
     env = dexsim.make(
         "rotate",
         RotateConfig(object="mesh", pool_size=64, objects=dataclasses.replace(nominal, mesh=str(folder / "cube.stl"))),
-        backend="jax",
+        backend="c",
     )
     height = [np.asarray(e.pool.qpos)[:, 12] for e in (cubes, env)]
     assert abs(np.mean(height[0]) - np.mean(height[1])) < 0.001
@@ -208,7 +208,7 @@ def test_a_mesh_is_turned_like_the_cube_that_it_is(simple, folder):
 @pytest.mark.long
 def test_an_l_is_dropped_on_the_real_physics(folder):
     config = GraspConfig(pool_size=80, objects=ObjectConfig(mesh=str(folder / "ell.obj"), mesh_size=(0.9, 1.1)))
-    env = dexsim.make("grasp", config, backend="jax", num_envs=8)
+    env = dexsim.make("grasp", config, backend="c", num_envs=8)
     state = jax.jit(lambda key: jax.vmap(env.reset)(jax.random.split(key, 8)))(jax.random.key(0))
     step, force, taxels = jax.jit(jax.vmap(env.step)), 0, 0
     (size,) = check(env, step, state, key=jax.random.key(1), ticks=9, names=["ObjectConfig.mesh_size"])

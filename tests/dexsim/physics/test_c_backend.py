@@ -306,7 +306,7 @@ class TestTrouble:
             jax.block_until_ready(tick(target, state, jnp.zeros((4, 3))))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_shipped_policy_holds_as_much_as_on_the_jax_backend():
     """64 hands a backend, the same starts: shares that differ by less than chance lets them (four standard errors)."""
     policy, held, force = load_policy("grasp"), {}, {}

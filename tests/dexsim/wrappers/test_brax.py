@@ -208,7 +208,7 @@ def test_ppo_runs_on_grasp(physics, grasp_env, monkeypatch):
     env = grasp_env
     if physics == "simple":
         monkeypatch.setattr("dexsim.env.env.Physics", SimplePhysics)
-        env = dexsim.make("grasp", GraspConfig(pool_size=20), backend="jax")
+        env = dexsim.make("grasp", GraspConfig(pool_size=20), backend="c")
     history, params = train(
         BraxEnv(env),
         num_timesteps=3 * 8 * 4,
