@@ -86,7 +86,9 @@ def compare(env, states, kinds):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kinds", [PRIMITIVES, ("mesh",)], ids=["primitives", "mesh"])
+@pytest.mark.parametrize(
+    "kinds", [pytest.param(PRIMITIVES, id="primitives"), pytest.param(("mesh",), id="mesh", marks=pytest.mark.long)]
+)
 def test_surface_points_feel_what_closed_forms_feel(cuboid, kinds):
     objects = ObjectConfig(mesh=cuboid, mesh_size=(0.9, 1.1)) if kinds == ("mesh",) else ObjectConfig(shapes=kinds)
     for kind, rows in compare(*gripped(objects), kinds).items():
