@@ -67,10 +67,6 @@ class EpisodeSampler:
 
     def tilt_force(self, episode: Episode) -> jax.Array:
         """The object's share [3] N of a tilted gravity; the links' share is small and left out."""
-        down, tilted = self._gravity(episode.hand)
-        return episode.object.mass * np.linalg.norm(self.task.gravity) * (tilted - down)
-
-    def _gravity(self, hand: HandParams) -> tuple[jax.Array, jax.Array]:
-        """Directions [3] of gravity in the palm frame: as the host takes it, and as it is."""
         down = np.asarray(self.task.gravity, float) / np.linalg.norm(self.task.gravity)
-        return jnp.asarray(down), tilted_down(down, hand.tilt)
+        tilted = tilted_down(down, episode.hand.tilt)
+        return episode.object.mass * np.linalg.norm(self.task.gravity) * (tilted - jnp.asarray(down))

@@ -35,22 +35,21 @@ ROTATE = {
     "seconds_per_success": "s per success",
     "never_dropped_pct": "never dropped [%]",
 }
+HELD = {
+    "held_pct": "held [%]",
+    "do_nothing_held_pct": "doing nothing, held [%]",
+    "force_error_n": "force error [N]",
+    "r_resultant": "r, resultant",
+    "r_normal": "r, normal",
+    "r_taxels": "r, taxels",
+    "torque_limited_pct": "at a torque limit [%]",
+}
 TABLES: dict[str, tuple[str, dict[str, str]]] = {
     "rotate_training": ("Training: rotate", ROTATE | {"fingertips_working": "fingertips"}),
     "grasp_training": ("Training: grasp", GRASP),
     "evaluation": (
         "Evaluations in simulation",
-        ROTATE
-        | {
-            "held_pct": "held [%]",
-            "do_nothing_held_pct": "doing nothing, held [%]",
-            "force_error_n": "force error [N]",
-            "r_resultant": "r, resultant",
-            "r_normal": "r, normal",
-            "r_taxels": "r, taxels",
-            "torque_limited_pct": "at a torque limit [%]",
-            "pearson_r": "force r",
-        },
+        ROTATE | HELD | {"pearson_r": "force r"},
     ),
     "ablation": (
         "Tactile ablation",
@@ -58,18 +57,7 @@ TABLES: dict[str, tuple[str, dict[str, str]]] = {
     ),
     "zero_shot_grasp": (
         "Zero-shot on the emulated hand: grasp",
-        {
-            "trials": "trials",
-            "held_pct": "held [%]",
-            "do_nothing_held_pct": "doing nothing, held [%]",
-            "force_error_n": "force error [N]",
-            "r_resultant": "r, resultant",
-            "r_normal": "r, normal",
-            "r_taxels": "r, taxels",
-            "torque_limited_pct": "at a torque limit [%]",
-            "pearson_r_normal": "pearson_r_normal",
-            "pearson_r": "pearson_r",
-        },
+        {"trials": "trials"} | HELD | {"pearson_r_normal": "pearson_r_normal", "pearson_r": "pearson_r"},
     ),
     "zero_shot_rotate": (
         "Zero-shot on the emulated hand: rotate",

@@ -145,6 +145,14 @@ def _ball(
     return gap, centre + normal * (radius + 0.5 * gap), normal
 
 
+def _in_primitive(
+    centre: jax.Array, axis: jax.Array, position: jax.Array, rotation: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Middle [3] and direction [3] of a segment in a primitive's frame."""
+    start = sdf.to_local(centre[None], position, rotation)[0]
+    return start, sdf.to_local((centre + axis)[None], position, rotation)[0] - start
+
+
 def _over_box(
     centre: jax.Array,
     axis: jax.Array,
@@ -154,8 +162,7 @@ def _over_box(
     size: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
     """The places [2, 3] of a segment that meet a box, and whether there is one only."""
-    start = sdf.to_local(centre[None], position, rotation)[0]
-    along = sdf.to_local((centre + axis)[None], position, rotation)[0] - start
+    start, along = _in_primitive(centre, axis, position, rotation)
     place, second = capsule_box(start, half * along, size)
     return centre[None] + (half * place)[:, None] * axis[None], ~second
 
@@ -173,8 +180,7 @@ def _nearest_stretch(
 
     Along a line the distance to what is convex is convex: bisection on its slope.
     """
-    start = sdf.to_local(centre[None], position, rotation)[0]
-    along = sdf.to_local((centre + axis)[None], position, rotation)[0] - start
+    start, along = _in_primitive(centre, axis, position, rotation)
     tilt = jnp.array([_SLOPE, -_SLOPE])
 
     def halve(_, bracket):
