@@ -126,7 +126,7 @@ def bare(env: Env, ticks: Any) -> Callable[[], None]:
 
 
 def measure(task: str, config: PPOConfig, modes: list[str], per_calls: list[int], repeats: int) -> Iterator[dict]:
-    """Rows: mujoco_warp alone, then physics and training in each mode."""
+    """Rows: physics and training in each mode, then mujoco_warp alone."""
     captures, steps = Captures(), config.steps_per_iteration
     ticks: Any = None
     for mode in modes:
@@ -134,7 +134,6 @@ def measure(task: str, config: PPOConfig, modes: list[str], per_calls: list[int]
         env = make(task, "full", "warp", config.num_envs)
         if ticks is None:
             ticks = recorded(env, Recorder(make(task, "full", "warp", config.num_envs)), config)
-            yield {"measure": "bare"} | timed(bare(env, ticks[:4]), captures, repeats, steps)
         run = functools.partial(jit(functools.partial(physics, env)), ticks)
         yield {"measure": "physics", "mode": mode} | timed(run, captures, repeats, steps)
         for per_call in per_calls:
@@ -142,6 +141,7 @@ def measure(task: str, config: PPOConfig, modes: list[str], per_calls: list[int]
             run = functools.partial(iterate, training.step, [training.init(jax.random.key(0))])
             row = timed(run, captures, repeats, steps * per_call)
             yield {"measure": "training", "mode": mode, "iterations_per_call": per_call} | row
+    yield {"measure": "bare"} | timed(bare(env, ticks[:4]), captures, repeats, steps)
 
 
 def recorded(env: Env, recorder: Recorder, config: PPOConfig) -> Any:
