@@ -30,10 +30,16 @@ PRESETS = {
     # Two cores: simulation takes nearly all of the time, so small networks and many passes over little data.
     "cpu": Preset(
         ppo=PPOConfig(
-            num_envs=256, rollout_length=16, epochs=5, minibatches=4, actor_layers=(128, 128), critic_layers=(128, 128)
+            num_envs=256,
+            rollout_length=16,
+            epochs=5,
+            minibatches=4,
+            kl_target=0.02,
+            actor_layers=(128, 128),
+            critic_layers=(128, 128),
         ),
         steps=0,
-        minutes=6.5,
+        minutes=7.0,
         evaluate_every=0,
         evaluation_chunk=50,
         evaluation_episodes=150,
@@ -71,7 +77,8 @@ def find_preset(name: str, task: str) -> Preset:
     # Two-minute episodes are slow to evaluate, so they are evaluated once, at the end. A gait needs less
     # noise than a grasp, which has to explore forces.
     if preset is PRESETS["cpu"]:
-        return replace(preset, evaluation_chunk=16, evaluation_episodes=16)
+        ppo = replace(preset.ppo, num_envs=512, epochs=4, minibatches=16, entropy_coefficient=0.001)
+        return replace(preset, ppo=ppo, minutes=30.0, evaluation_chunk=64, evaluation_episodes=64)
     # Half the environments: twice the updates from the same experience, which finding a gait needs.
     ppo = replace(preset.ppo, num_envs=16384, minibatches=8, entropy_coefficient=0.001)
     return replace(preset, ppo=ppo, minutes=7.5, evaluate_every=0)
