@@ -39,7 +39,7 @@ PRESETS = {
             critic_layers=(128, 128),
         ),
         steps=0,
-        minutes=7.6,
+        minutes=7.0,
         evaluate_every=0,
         evaluation_chunk=50,
         evaluation_episodes=150,
