@@ -2,7 +2,7 @@
 
     python benchmarks/host_physics.py --num-envs 256
 
-The same hands in the same states, in turn: bare `mujoco.rollout` with the same models and threads and torques that do
+The shipped policy's hands in the same states, held grips for the most part, in turn: bare `mujoco.rollout` with the same models and threads and torques that do
 not change; a control tick in one call, as the backend does it; a call for each sub-step, as it does it for motor laws
 that the host cannot evaluate. Bind the process to fewer cores (`taskset -c 0`) for fewer threads.
 """
@@ -15,28 +15,28 @@ import jax
 import jax.numpy as jnp
 from throughput import seconds
 
-import dexsim
 from dexsim.core.cli import enable_caches
 from dexsim.core.compilation import jit
 from dexsim.env.motors import JointCommand
 from dexsim.physics import c_backend
 from dexsim.physics.host.engine import _APPLIED, pool
+from dexsim_ppo import load_policy
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--task", default="grasp")
     parser.add_argument("--num-envs", type=int, default=256)
-    parser.add_argument("--ticks", type=int, default=40, help="before the measurement, with closing hands")
+    parser.add_argument("--ticks", type=int, default=80, help="before the measurement")
     parser.add_argument("--repeats", type=int, default=15)
     options = parser.parse_args()
     enable_caches()
-    env, count = dexsim.make(options.task, backend="c", num_envs=options.num_envs), options.num_envs
-    close = jnp.broadcast_to(0.3 * (jnp.arange(env.action_size) > 3), (count, env.action_size))
-    state = jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), count))
-    advance = jit(jax.vmap(env.step))
+    policy, count = load_policy(options.task), options.num_envs
+    env = policy.make_env(backend="c", num_envs=count)
+    state = jit(jax.vmap(env.reset), backend="c")(jax.random.split(jax.random.key(0), count))
+    advance = jit(lambda state: jax.vmap(env.step)(state, policy(state.obs["actor"])), backend="c")
     for _ in range(options.ticks):
-        state = advance(state, close)
+        state = advance(state)
 
     def hold(s):
         return JointCommand(
