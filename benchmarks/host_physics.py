@@ -2,9 +2,10 @@
 
     python benchmarks/host_physics.py --num-envs 256
 
-The shipped policy's hands in the same states, held grips for the most part, in turn: bare `mujoco.rollout` with the same models and threads and torques that do
-not change; a control tick in one call, as the backend does it; a call for each sub-step, as it does it for motor laws
-that the host cannot evaluate. Bind the process to fewer cores (`taskset -c 0`) for fewer threads.
+The shipped policy's hands in the same states, held grips for the most part, in turn: bare `mujoco.rollout` with the
+same models and threads and torques that do not change; a control tick in one call, as the backend does it; a call for
+each sub-step, as it does it for motor laws that the host cannot evaluate. Bind the process to fewer cores
+(`taskset -c 0`) for fewer threads.
 """
 
 import argparse
