@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from test_safety import CYCLE, FREE, MIDDLE, Bench, sample
 
-from dexsim_real.control.alarms import joint_labels
+from dexsim_real.control.alarms import Alarms, joint_labels
 from dexsim_real.control.safety import Reaction, Safety, SafetyConfig
 from dexsim_real.control.servo import Servo
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
@@ -242,3 +242,16 @@ def test_a_busy_hand_is_held_then_relaxed_and_the_reason_is_shown(hand, monkeypa
     assert not safety.latched and safety.last == (Reaction.RELAX, "no measurement: the hand reports busy (1501006)")
     held = [k for k, (reaction, _) in enumerate(found) if reaction == Reaction.HOLD]
     assert 0.9 < len(held) * CYCLE < 1.1 and (Reaction.HOLD, "no measurement") in found
+
+
+@pytest.mark.parametrize(("between", "fatal"), [("", True), ("busy", False), ("answer", False)])
+def test_only_serious_refusals_in_a_row_turn_the_motors_off(hand, bench, between, fatal):
+    hot, alarms = read_refusal((1501028).to_bytes(4, "little")), Alarms(hand, SafetyConfig())
+    alarms.refuse(hot)
+    assert not alarms.fatal
+    if between == "busy":
+        alarms.refuse(read_refusal(b"\x06\x00"))
+    if between == "answer":
+        alarms.see(bench.now, reported(bench).measured, True)
+    alarms.refuse(hot)
+    assert bool(alarms.fatal) == fatal

@@ -220,3 +220,14 @@ print([name for name in sys.modules if name.startswith("mujoco.mjx") or name in 
 def test_the_shipped_policy_fits_the_bridge(hand):
     controller = Controller(load_policy("grasp"), hand)
     assert controller.sources == {"hand", "camera", "user"} and controller.period == pytest.approx(0.03)
+
+
+def test_an_episode_begins_without_a_last_action(hand):
+    task = Grasp(GraspConfig(), hand)
+    controller = Controller(Acts(task, hand, lambda observation: np.full(12, 0.5, np.float32)), hand)
+    measured = HandSensing(hand, HardwareConfig()).measure(random_state(np.random.default_rng(0), hand))
+    seen = ObjectEstimate(np.zeros(3), np.zeros(3), IDENTITY)
+    last = [controller.tick(measured, seen, IDENTITY, 0.0).readings.last_action for _ in range(2)]
+    controller.start(measured.joint_position)
+    again = controller.tick(measured, seen, IDENTITY, 0.0).readings.last_action
+    np.testing.assert_array_equal([*last, again], np.array([0.0, 0.5, 0.0])[:, None] * np.ones(12))

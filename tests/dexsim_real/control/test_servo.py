@@ -7,7 +7,7 @@ import pytest
 from test_safety import CYCLE, MIDDLE
 
 from dexsim_real.control.motors_off import PATIENCE
-from dexsim_real.control.safety import Safety, SafetyConfig
+from dexsim_real.control.safety import Reaction, Safety, SafetyConfig
 from dexsim_real.control.servo import Servo
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
 from dexsim_real.wire import frames
@@ -89,3 +89,15 @@ def test_the_velocity_begins_anew_with_a_connection(servo):
     np.testing.assert_array_equal(sample.velocity, 0.0)
     again = servo._sample(Reply(state, servo.port.now, servo.port.now + CYCLE, 10, 2))
     np.testing.assert_array_equal(again.velocity, 0.0)
+
+
+def test_a_hand_that_was_silent_when_it_was_told_to_turn_off_may_still_be_on(servo):
+    run(servo, 5)
+    servo.engage()
+    run(servo, 5)
+    servo.port.silent_until = servo.port.now + 3.0
+    run(servo, round(2.0 / CYCLE))
+    assert servo.safety.last[0] == Reaction.RELAX, "long silent: the commands are to turn off"
+    assert servo.driven
+    run(servo, round(1.5 / CYCLE))
+    assert not servo.driven and servo.port.modes[-1] == Mode.PASSIVE
