@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from dexsim.core.config import setting, validate
+from dexsim.force_loop import ForceLoop
 from dexsim.hand.kinematics import Hand
 
 
@@ -21,6 +22,8 @@ class Control:
     """What an observation's last action is: the action itself, or the joint targets that it led to,
     as a place in each joint's range. A policy of steps that does not see its targets cannot know how
     hard it presses."""
+    force: ForceLoop = setting(ForceLoop())
+    """Correction of the force command by the estimated force, for tasks that have one."""
 
     def __post_init__(self):
         validate(self)

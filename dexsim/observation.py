@@ -15,7 +15,8 @@ from dexsim.core.config import setting, validate
 from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import pytree_dataclass
 from dexsim.geometry import rotations
-from dexsim.hand.kinematics import Hand, HandPose, forward_kinematics
+from dexsim.hand.kinematics import Hand, HandPose, forward_kinematics, tip_twist
+from dexsim.touch.estimate import ForceEstimate, estimate_force
 from dexsim.touch.reduce import reduce_touch_links
 
 
@@ -61,6 +62,7 @@ class Features:
     encoding: str  # of orientations, see `ObservationConfig.orientation`
     contact_force: jax.Array  # [F] N
     contact_centre: jax.Array  # [F, 3] m
+    finger_force: Callable[[], jax.Array]  # [F] N, estimated from taxels and torque
     pose: HandPose
     motion: Motion | None
     twist: Callable[[], jax.Array]  # [F, 6] m/s, rad/s, of the finger tips
@@ -93,19 +95,6 @@ class LayoutEntry(NamedTuple):
     name: str
     size: int
     scale: float | None = None
-
-
-def _tip_twist(hand: Hand, joint_position: jax.Array, joint_velocity: jax.Array) -> jax.Array:
-    """Linear and angular velocity [F, 6] of the finger tips, m/s and rad/s in the palm frame."""
-
-    def tips(joints: jax.Array) -> tuple[jax.Array, jax.Array]:
-        pose = forward_kinematics(hand, joints)
-        return pose.tip_position, pose.tip_rotation
-
-    (_, rotation), (linear, change) = jax.jvp(tips, (joint_position,), (joint_velocity,))
-    skew = rotations.compose(change, jnp.swapaxes(rotation, -1, -2))
-    angular = jnp.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], -1)
-    return jnp.concatenate([linear, angular], -1)
 
 
 def _tangential_force(features: Features) -> jax.Array:
@@ -182,6 +171,13 @@ FIELDS: dict[str, ObservationField] = {
             scale=0.1,
             source="hand",
             compute=lambda f: f.contact_centre.ravel(),
+        ),
+        ObservationField(
+            name="finger_force",
+            size=_per_finger(1),
+            scale=5.0,
+            source="hand",
+            compute=lambda f: f.finger_force(),
         ),
         ObservationField(
             name="tangential_force",
@@ -261,6 +257,8 @@ class ObservationConfig:
     `Sensing.three_axis`."""
     add_critic: tuple[str, ...] = setting((), choices=FIELDS)
     """Fields that only the critic gets on top; those that only a simulator knows, too."""
+    force: ForceEstimate = setting(ForceEstimate())
+    """Estimate of the fingers' force, for the field `finger_force` and for `Control.force`."""
 
     def __post_init__(self):
         validate(self)
@@ -342,9 +340,10 @@ def observe(
         encoding=config.orientation,
         contact_force=force,
         contact_centre=centre,
+        finger_force=lambda: estimate_force(config.force, hand, readings.taxel_force, readings.joint_torque),
         pose=pose,
         motion=motion,
-        twist=lambda: _tip_twist(hand, readings.joint_position, features.known_motion().joint_velocity),
+        twist=lambda: tip_twist(hand, readings.joint_position, features.known_motion().joint_velocity),
     )
     parts = [FIELDS[name].compute(features) for name in select_fields(names, config)]
     return jnp.concatenate(parts).astype(jnp.float32)

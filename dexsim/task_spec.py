@@ -8,13 +8,17 @@ import dataclasses
 from collections.abc import Iterable
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from dexsim.control import Control
 from dexsim.core.config import setting, validate
 from dexsim.core.errors import ConfigError
+from dexsim.force_loop import correct_command
 from dexsim.hand.kinematics import Hand
-from dexsim.observation import ObservationConfig
+from dexsim.observation import ObservationConfig, Readings
+from dexsim.touch.estimate import estimate_force
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -67,9 +71,18 @@ class TaskSpec:
     """Weight of the newest difference in the estimate of the object's velocity."""
     turn: TurnSpec | None = None
     """Goals that follow one another; None for a task without."""
+    finger_force: tuple[float, float] | None = None
+    """Force in N of a touching finger at the commands 0 and 1; None for a task without a force command."""
 
     def __post_init__(self) -> None:
         validate(self)
+        if self.control.force.gain and self.finger_force is None:
+            raise ConfigError(f"task {self.name!r}: Control.force needs a force command, which the task has not")
+
+    @property
+    def force_loop(self) -> bool:
+        """Whether the command is corrected by the estimated force."""
+        return self.control.force.gain > 0
 
     @classmethod
     def of(cls, task: Any) -> "TaskSpec":
@@ -86,12 +99,32 @@ class TaskSpec:
             object_axes=config.sensing.object_axes,
             velocity_filter=config.sensing.velocity_filter,
             turn=getattr(config, "turn", None),
+            finger_force=getattr(config, "finger_force", None),
         )
 
     def check_hand(self, hand: Hand) -> None:
         """Raises ConfigError: the start posture is of another hand."""
         if self.posture and len(self.posture) != hand.num_joints:
             raise ConfigError(f"task {self.name!r}: {len(self.posture)} posture angles, the hand has {hand.num_joints}")
+
+
+def correct_readings(
+    spec: TaskSpec, hand: Hand, period: float, readings: Readings, correction: jax.Array | None
+) -> tuple[Readings, jax.Array]:
+    """Readings whose command is what the force loop shows the policy, and the correction in it.
+
+    Args:
+      spec: of a task with a force loop.
+      hand: the hand.
+      period: s, control tick.
+      readings: one tick, with the user's command.
+      correction: [] of the tick before; None at the start of an episode.
+    """
+    assert spec.finger_force is not None, "checked when the specification was made"
+    force = estimate_force(spec.observation.force, hand, readings.taxel_force, readings.joint_torque)
+    before = jnp.zeros(()) if correction is None else correction
+    after = correct_command(spec.control.force, spec.finger_force, period, readings.command, before, force)
+    return dataclasses.replace(readings, command=readings.command + after), after
 
 
 def _triple(values: Iterable[float]) -> tuple[float, float, float]:

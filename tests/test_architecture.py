@@ -18,7 +18,7 @@ PACKAGES = ("dexsim", "dexsim_ppo", "dexsim_real")
 FLOORS = {
     "dexsim": (
         ("core",),
-        ("geometry", "actuator"),
+        ("geometry", "actuator", "force_loop"),
         ("hand",),
         ("objects", "control", "randomization", "touch"),
         ("sensing", "render", "calibration", "identification", "observation"),

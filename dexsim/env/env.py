@@ -17,48 +17,23 @@ import jax.numpy as jnp
 import numpy as np
 
 from dexsim.control import move_target, observed_action
-from dexsim.core.pytree import choose, pytree_dataclass
+from dexsim.core.pytree import choose
 from dexsim.env.episode import EpisodeSampler
 from dexsim.env.evaluation import EvaluationPlan, make_plan
 from dexsim.env.fingerprint import fingerprint
 from dexsim.env.motors import JointCommand, Motors, PhysicsTick, rotor_share
 from dexsim.env.observer import Observer
 from dexsim.env.senses import SensorSuite
-from dexsim.env.state import Episode, SensorInput, Start, State
+from dexsim.env.state import Episode, Outcome, Perception, SensorInput, Start, State
 from dexsim.env.task import GroundTruth, Task
 from dexsim.env.touch import TouchModel
 from dexsim.geometry import rotations
 from dexsim.geometry.vectors import length
 from dexsim.hand.kinematics import Hand, forward_kinematics
 from dexsim.objects.params import ObjectParams
-from dexsim.observation import Readings
 from dexsim.physics.physics import Physics
 from dexsim.render.snapshot import Snapshot
-from dexsim.sensing.taxels import TaxelMemory
-from dexsim.task_spec import TaskSpec
-
-
-@pytree_dataclass
-class Perception:
-    """What is known of a tick."""
-
-    sensor_input: SensorInput
-    readings: Readings
-    taxel_memory: TaxelMemory
-    obs: dict[str, jax.Array]
-
-
-@pytree_dataclass
-class Outcome:
-    """What a tick was worth, and whether it ended the episode; see `State`."""
-
-    reward: jax.Array  # []
-    terminated: jax.Array  # [] bool
-    truncated: jax.Array  # [] bool
-    tick: jax.Array  # [] int32
-    length: jax.Array  # [] int32
-    episode_return: jax.Array  # []
-    metrics: dict[str, jax.Array]  # the task's
+from dexsim.task_spec import TaskSpec, correct_readings
 
 
 class Env:
@@ -78,6 +53,7 @@ class Env:
           AssetError, ConfigError: see `Physics`, `load_hand`.
         """
         self.task, self.name, self.config, self.hand = task, task.name, task.config, hand
+        self.spec = TaskSpec.of(task)  # what a host must know to run this task's policies
         config = self.config
         self.physics = Physics(
             hand,
@@ -108,11 +84,6 @@ class Env:
     def control_rate(self) -> float:
         """Control ticks per second, Hz."""
         return 1.0 / self.control_period
-
-    @property
-    def spec(self) -> TaskSpec:
-        """What a host must know to run this task's policies."""
-        return TaskSpec.of(self.task)
 
     def fingerprint(self) -> str | None:
         """A hash of what the compiled `reset` and `step` depend on; None if it cannot tell."""
@@ -239,7 +210,12 @@ class Env:
         shown = self.task.goal_readings(goal)
         action = observed_action(self.config.control, self.hand, command.action, command.target)
         readings, memory = self.senses.read(key, episode, sensor_input, shown, action, last)
-        return Perception(sensor_input, readings, memory, self.observer.observe(readings, truth, *shown))
+        correction = None
+        if self.spec.force_loop:
+            correction = None if last is None else last.correction
+            readings, correction = correct_readings(self.spec, self.hand, self.control_period, readings, correction)
+        obs = self.observer.observe(readings, truth, *shown)
+        return Perception(sensor_input, readings, memory, obs, correction)
 
     def _judge(self, truth: GroundTruth, goal: Any, finite: jax.Array, last: State | None = None) -> Outcome:
         """The task's verdict on a tick after the state `last`; an episode's start earns nothing."""
@@ -291,6 +267,7 @@ class Env:
                 "torque_limited": jnp.any(tick.limited).astype(jnp.float32),
             },
             taxel_memory=seen.taxel_memory,
+            correction=seen.correction,
             gear=tick.gear,
             scale=scale,
         )

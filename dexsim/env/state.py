@@ -69,4 +69,29 @@ class State:
     metrics: dict[str, jax.Array]
     taxel_memory: TaxelMemory
     gear: GearState | None = None  # of the joints, with gear play
+    correction: jax.Array | None = None  # [] of the command, with a force loop
     scale: jax.Array | None = None  # [] of the ranges that the next episode is drawn from
+
+
+@pytree_dataclass
+class Perception:
+    """What is known of a tick."""
+
+    sensor_input: SensorInput
+    readings: Readings
+    taxel_memory: TaxelMemory
+    obs: dict[str, jax.Array]
+    correction: jax.Array | None
+
+
+@pytree_dataclass
+class Outcome:
+    """What a tick was worth, and whether it ended the episode; see `State`."""
+
+    reward: jax.Array  # []
+    terminated: jax.Array  # [] bool
+    truncated: jax.Array  # [] bool
+    tick: jax.Array  # [] int32
+    length: jax.Array  # [] int32
+    episode_return: jax.Array  # []
+    metrics: dict[str, jax.Array]  # the task's

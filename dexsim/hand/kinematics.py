@@ -144,3 +144,16 @@ def flexion_joints(hand: Hand, fingers: range) -> np.ndarray:
             joints += [joint] if joint >= 0 else []
             body = int(hand.body_parent[body])
     return np.array(sorted(joints))
+
+
+def tip_twist(hand: Hand, joint_position: jax.Array, joint_velocity: jax.Array) -> jax.Array:
+    """Linear and angular velocity [F, 6] of the finger tips, m/s and rad/s in the palm frame."""
+
+    def tips(joints: jax.Array) -> tuple[jax.Array, jax.Array]:
+        pose = forward_kinematics(hand, joints)
+        return pose.tip_position, pose.tip_rotation
+
+    (_, rotation), (linear, change) = jax.jvp(tips, (joint_position,), (joint_velocity,))
+    skew = rotations.compose(change, jnp.swapaxes(rotation, -1, -2))
+    angular = jnp.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], -1)
+    return jnp.concatenate([linear, angular], -1)

@@ -14,6 +14,7 @@ import numpy as np
 from dexsim.control import move_target, observed_action
 from dexsim.hand.kinematics import Hand
 from dexsim.observation import LayoutEntry, ObservationConfig, Readings, layout, observe, select_fields
+from dexsim.task_spec import correct_readings
 from dexsim_ppo.policy import Policy
 from dexsim_real.core.errors import HandError
 from dexsim_real.sensors.hand import HandMeasurement
@@ -70,6 +71,9 @@ class Controller:
         self.period = 1.0 / policy.control_rate
         self._observe = make_observe(hand, names, config)
         self._move = jax.jit(lambda *arrays: move_target(self.spec.control, hand, *arrays))
+        self._correct = jax.jit(
+            lambda readings, correction: correct_readings(self.spec, hand, self.period, readings, correction)
+        )
         self._recall = jax.jit(lambda *arrays: observed_action(self.spec.control, hand, *arrays))
         self.start(np.zeros(hand.num_joints, np.float32))
 
@@ -87,6 +91,7 @@ class Controller:
         """Begin an episode with these joint targets [J] rad and no previous action."""
         self.target = np.asarray(target, np.float32)
         self.last_action = np.zeros(self.hand.num_joints, np.float32)
+        self.correction = np.zeros((), np.float32)  # of the command, by the force loop
 
     def anchor(self, position: np.ndarray) -> None:
         """Continue from this pose [J] rad, after a time in which the hand did not follow its targets."""
@@ -103,6 +108,9 @@ class Controller:
         """
         last_action = np.asarray(self._recall(self.last_action, self.target))
         readings = make_readings(measured, seen, goal_quat, command, last_action)
+        if self.spec.force_loop:
+            readings, correction = jax.device_get(self._correct(readings, self.correction))
+            self.correction = np.asarray(correction)
         observation = np.asarray(self._observe(readings))
         action = np.clip(np.asarray(self.policy(observation)), -1.0, 1.0)
         if np.isfinite(action).all():

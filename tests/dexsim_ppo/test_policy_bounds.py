@@ -100,6 +100,16 @@ def test_an_array_that_would_give_no_action_is_one_line(sound, tmp_path, what):
         Policy.load(forge(sound, tmp_path / "p.msgpack", arrays=ARRAYS[what]))
 
 
+def test_weights_that_cancel_for_some_observations_overflow_for_others(sound, tmp_path):
+    """Rows of large weights with alternating signs: equal inputs give zero, others give infinity."""
+    signs = lambda x: 1e20 * (-1.0) ** np.arange(x.shape[0])[:, None] * np.ones(x.shape)  # noqa: E731
+    change = lambda x: signs(x).astype(np.float32) if np.ndim(x) == 2 else np.asarray(x)  # noqa: E731
+    forged = dataclasses.replace(sound, params=jax.tree.map(change, sound.params))
+    forged.save(tmp_path / "p.msgpack")
+    with pytest.raises(CheckpointError, match=r"^[^\n]*so large that actions overflow[^\n]*$"):
+        Policy.load(tmp_path / "p.msgpack")
+
+
 def test_an_observation_that_nothing_gives_is_one_line(hand):
     shipped = load_policy("grasp")
     spec = dataclasses.replace(shipped.spec, fields=("../../etc/passwd",) * 9)

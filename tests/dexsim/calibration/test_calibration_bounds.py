@@ -70,6 +70,10 @@ WRONG = {
         ("offset = [0.02, 0.02]", "offset = [5.0, 5.0]"),
         "thumb_bend: real.offset = 5: without current",
     ),
+    "the opposite torque at rest": (
+        ("offset = [0.02, 0.02]", "offset = [-5.0, -5.0]"),
+        "thumb_bend: real.offset = -5: without current",
+    ),
     "an endless offset": (("offset = [0.02, 0.02]", "offset = [inf, inf]"), "thumb_bend: real.offset = inf: "),
     "another torque": (
         ("torque_scale = 1.1", "torque_scale = 0.9"),

@@ -15,7 +15,7 @@ from dexsim import observation
 from dexsim.core.errors import ConfigError
 from dexsim.env.task import GroundTruth
 from dexsim.geometry.sdf import signed_distance
-from dexsim.hand.kinematics import forward_kinematics
+from dexsim.hand.kinematics import forward_kinematics, tip_twist
 from dexsim.sensing.imu import ImuConfig, measure_orientation, sample_imu
 from dexsim.tasks.placement import palm_height
 from dexsim.tasks.rotate.config import RotateConfig, RotateReward, clear_of_palm, paper
@@ -429,7 +429,7 @@ class TestObservation:
         rng = np.random.default_rng(0)
         joints, speed = rng.uniform(0, 1, 12), rng.normal(size=12)
         with double_precision():
-            twist = np.asarray(observation._tip_twist(hand, jnp.asarray(joints), jnp.asarray(speed)))
+            twist = np.asarray(tip_twist(hand, jnp.asarray(joints), jnp.asarray(speed)))
             poses = [
                 jax.tree.map(np.asarray, forward_kinematics(hand, jnp.asarray(joints + s * speed * 1e-6)))
                 for s in (-1, 1)

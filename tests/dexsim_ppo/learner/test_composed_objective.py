@@ -109,8 +109,9 @@ def experience(script, config, params, stats, value_stats, key):
         _, rollout, _ = ppo.collect_rollout(script, config, state, normalizers, key)
         _, start, samples = ppo.prepare(config, value_stats, params, rollout)
         moved = jax.tree.map(jnp.add, start, step)
-        value, grads = jax.value_and_grad(lambda p: loss(p, config, normalizers, samples, params.log_std)[0])(moved)
-        return rollout.decision.action, start, value, grads
+        objective = lambda p: loss(p, config, normalizers, samples, params.log_std)  # noqa: E731
+        (value, metrics), grads = jax.value_and_grad(objective, has_aux=True)(moved)
+        return rollout.decision.action, start, value, grads, metrics["kl"]
 
     return run
 
@@ -218,6 +219,16 @@ class Reference:
         total = -surrogate + c.value_coefficient * value_loss + c.bounds_coefficient * bounds
         return total / count - c.entropy_coefficient * entropy
 
+    def divergence(self, params):
+        """KL divergence of the new policy from the old one, which the learning rate adapts to."""
+        total, old_std, std = 0.0, np.exp(self.old.log_std), np.exp(params.log_std)
+        for s in self.samples:
+            mean = self.network(params.actor, self.seen("actor", s["obs"]["actor"]))
+            for k in range(ACTIONS):
+                spread = old_std[k] ** 2 + (s["mean"][k] - mean[k]) ** 2
+                total += math.log(std[k] / old_std[k]) + spread / (2 * std[k] ** 2) - 0.5
+        return total / len(self.samples)
+
 
 @pytest.mark.parametrize(
     "options",
@@ -230,10 +241,11 @@ def test_objective_and_gradient_from_raw_experience(options):
     run = experience(script, config, params, stats, value_stats, jax.random.key(5))
     rng = np.random.default_rng(0)
     for share in (0.0, 1.0):
-        actions, start, value, grads = run(jax.tree.map(lambda x, share=share: share * x, step))
+        actions, start, value, grads, kl = run(jax.tree.map(lambda x, share=share: share * x, step))
         reference = Reference(script, config, params, stats, value_stats, actions)
         here = jax.tree.map(lambda a, b, share=share: a + share * b, double(start), double(step))
         assert float(value) == pytest.approx(reference(here), rel=2e-5, abs=2e-5)
+        assert float(kl) == pytest.approx(reference.divergence(here), rel=1e-4, abs=1e-6)
     # At the moved parameters only: with ratios of exactly one and unmoved values the objective has kinks.
     for _ in range(4):
         way = jax.tree.map(lambda x: rng.normal(size=x.shape), here)
@@ -245,7 +257,7 @@ def test_objective_and_gradient_from_raw_experience(options):
 def test_the_critics_values_survive_the_new_statistics():
     """In reward units, to the last digit that float32 has: the normaliser moves, the values do not."""
     script, config, params, stats, value_stats, step = setting(3)
-    actions, start, _, _ = experience(script, config, params, stats, value_stats, jax.random.key(5))(step)
+    actions, start, *_ = experience(script, config, params, stats, value_stats, jax.random.key(5))(step)
     reference = Reference(script, config, params, stats, value_stats, actions)
     assert abs(reference.new_std / reference.std - 1) > 0.1
     for sample in reference.samples:

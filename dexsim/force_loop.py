@@ -1,0 +1,57 @@
+"""An outer loop around a policy that takes a force command: what the fingers lack is added to the command.
+
+The loop integrates the difference between the commanded force and the mean estimated force of the touching fingers but
+the first, the thumb, which balances them. The policy sees the corrected command. Simulation and bridge run this code.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+
+from dexsim.core.config import setting, validate
+
+_LOW, _HIGH = -0.3, 1.5  # of the command that a policy trained on [0, 1] is shown
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ForceLoop:
+    """Settings of the loop."""
+
+    gain: float = setting(0.0, unit="1/s", low=0.0, high=20.0)
+    """Rate at which the command is corrected, per error; 0 turns the loop off."""
+    limit: float = setting(0.6, unit="1", low=0.0, high=2.0)
+    """Largest correction of the command."""
+    slew: float = setting(1.0, unit="1/s", low=0.001, high=100.0)
+    """Largest rate of the correction."""
+
+    def __post_init__(self) -> None:
+        validate(self)
+
+
+def correct_command(
+    loop: ForceLoop,
+    span: tuple[float, float],
+    period: float,
+    command: jax.Array,
+    correction: jax.Array,
+    force: jax.Array,
+) -> jax.Array:
+    """The next correction [] of the command.
+
+    Args:
+      loop: settings.
+      span: N, force of a touching finger at the commands 0 and 1.
+      period: s, control tick.
+      command: [] in [0, 1].
+      correction: [] so far; it stays while fewer than two fingers beside the first touch.
+      force: [F] N estimated, zero where nothing touches.
+    """
+    others = force[1:]
+    touching = jnp.sum(jnp.where(others > 0, 1.0, 0.0))
+    mean = jnp.sum(others) / jnp.maximum(touching, 1.0)
+    error = command - (mean - span[0]) / (span[1] - span[0])
+    change = jnp.clip(loop.gain * error, -loop.slew, loop.slew) * period
+    moved = jnp.where(touching >= 2, correction + change, correction)
+    # No windup: the sum stays in what a policy is shown.
+    return jnp.clip(moved, jnp.maximum(-loop.limit, _LOW - command), jnp.minimum(loop.limit, _HIGH - command))

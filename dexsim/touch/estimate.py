@@ -1,0 +1,52 @@
+"""The force of a finger, estimated from what a hand measures: its taxels, and the torque of its root joint.
+
+Taxels miss what the skin beside them bears; a root joint's torque misses what its friction holds. Pressing, the torque
+tells more of a finger's force, and the taxels are a lower bound of it.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+
+from dexsim.core.config import setting, validate
+from dexsim.core.errors import ConfigError
+from dexsim.hand.kinematics import Hand
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ForceEstimate:
+    """How taxels and torque make an estimate."""
+
+    per_torque: tuple[float, ...] = setting((), unit="N", low=0.0, high=1000.0)
+    """Force of each finger with its root joint at the torque limit; empty: the taxels alone."""
+    error: tuple[float, ...] = setting((), unit="N", low=0.0, high=100.0)
+    """Standard deviation of the estimate of each finger, where it was found; not used."""
+    touching: float = setting(0.1, unit="N", low=0.001, high=10.0)
+    """Force on a finger's taxels from which it counts as touching."""
+
+    def __post_init__(self) -> None:
+        validate(self)
+
+
+def estimate_force(estimate: ForceEstimate, hand: Hand, taxel_force: jax.Array, joint_torque: jax.Array) -> jax.Array:
+    """Estimated force [F] N of each finger: the larger of its taxels' sum and its torque's force; 0 without touch.
+
+    Args:
+      estimate: its settings.
+      hand: the hand.
+      taxel_force: [F, N] N.
+      joint_torque: [J], over the joints' torque limits.
+
+    Raises:
+      ConfigError: `per_torque` is of a hand with another number of fingers.
+    """
+    felt = jnp.sum(taxel_force, -1)
+    force = felt
+    if estimate.per_torque:
+        if len(estimate.per_torque) != hand.num_fingers:
+            raise ConfigError(
+                f"ForceEstimate.per_torque has {len(estimate.per_torque)} values, the hand {hand.num_fingers} fingers"
+            )
+        force = jnp.maximum(felt, jnp.asarray(estimate.per_torque) * jnp.abs(joint_torque[hand.root_joint]))
+    return jnp.where(felt > estimate.touching, force, 0.0)

@@ -1,0 +1,118 @@
+"""The force loop around a policy, against closed forms; its estimate of force; the same on the bridge."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dexsim.control import Control
+from dexsim.core.errors import ConfigError
+from dexsim.force_loop import ForceLoop, correct_command
+from dexsim.task_spec import TaskSpec
+from dexsim.touch.estimate import ForceEstimate, estimate_force
+
+SPAN, PERIOD = (2.0, 7.0), 0.03
+LOOP = ForceLoop(gain=0.5, limit=0.6, slew=1.0)
+
+
+def fingers(*force):
+    return jnp.asarray(force, jnp.float32)
+
+
+def test_the_correction_of_a_weak_grip_follows_its_differential_equation():
+    """A grip with 0.8 of the shown force: the correction approaches what closes the gap, with rate gain times slope."""
+    command, slope, found, correction = 0.5, 0.8, [], jnp.zeros(())
+    for _ in range(400):
+        force = SPAN[0] + slope * (command + correction) * (SPAN[1] - SPAN[0])
+        correction = correct_command(LOOP, SPAN, PERIOD, jnp.asarray(command), correction, fingers(9.0, *[force] * 4))
+        found.append(float(correction))
+    final, steps = command / slope - command, np.arange(1, 401)
+    np.testing.assert_allclose(found, final * (1 - (1 - LOOP.gain * slope * PERIOD) ** steps), atol=1e-5)
+    assert abs(found[-1] - final) < 0.01
+
+
+@pytest.mark.parametrize(
+    ("force", "moves"), [((0, 4, 0, 0, 0), False), ((9, 0, 0, 0, 0), False), ((0, 4, 0, 0, 2), True)]
+)
+def test_it_waits_for_two_fingers_beside_the_thumb(force, moves):
+    after = correct_command(LOOP, SPAN, PERIOD, jnp.asarray(1.0), jnp.asarray(0.2), fingers(*force))
+    assert float(after) == pytest.approx(0.2 + moves * 0.5 * (1 - (3 - 2) / 5) * PERIOD)
+
+
+@given(
+    st.lists(st.floats(0, 60), min_size=5, max_size=5),
+    st.floats(0, 1),
+    st.floats(-0.3, 0.5),
+    st.floats(0.01, 20),
+    st.floats(0.01, 5),
+)
+def test_its_limits_hold_whatever_is_measured(force, command, correction, gain, slew):
+    loop = ForceLoop(gain=gain, limit=0.6, slew=slew)
+    start = np.clip(correction, -0.3 - command, 1.5 - command)
+    after = float(correct_command(loop, SPAN, PERIOD, jnp.asarray(command), jnp.asarray(start), fingers(*force)))
+    assert abs(after) <= 0.6 + 1e-6 and -0.3 - 1e-6 <= command + after <= 1.5 + 1e-6
+    assert abs(after - start) <= slew * PERIOD + 1e-6
+
+
+def test_an_estimate_is_the_larger_of_taxels_and_torque_and_zero_without_touch(hand):
+    taxels = np.zeros((5, hand.num_taxels), np.float32)
+    taxels[:, 3] = [2.0, 0.5, 0.0, 6.0, 0.05]
+    torque = np.zeros(12, np.float32)
+    torque[hand.root_joint] = [0.1, -0.2, 0.3, 0.1, 0.4]
+    estimate = ForceEstimate(per_torque=(8.0, 15.0, 13.0, 14.0, 15.0))
+    found = estimate_force(estimate, hand, taxels, torque)
+    np.testing.assert_allclose(found, [2.0, 3.0, 0.0, 6.0, 0.0], rtol=1e-6)
+    np.testing.assert_allclose(estimate_force(ForceEstimate(), hand, taxels, torque), [2.0, 0.5, 0.0, 6.0, 0.0])
+    with pytest.raises(ConfigError, match="per_torque has 2 values, the hand 5 fingers"):
+        estimate_force(ForceEstimate(per_torque=(1.0, 2.0)), hand, taxels, torque)
+
+
+def test_a_task_without_a_force_command_refuses_a_loop():
+    with pytest.raises(ConfigError, match="needs a force command"):
+        TaskSpec(name="turn", fields=(), control=Control(force=LOOP))
+    assert not TaskSpec(name="turn", fields=()).force_loop
+    assert TaskSpec(name="hold", fields=(), control=Control(force=LOOP), finger_force=SPAN).force_loop
+
+
+def test_bridge_and_simulation_show_the_policy_the_same_command(hand):
+    """The environment's readings, given to the controller with the user's command, lead to the same corrections."""
+    pytest.importorskip("serial")
+    import dexsim
+    from dexsim.tasks.grasp.config import GraspConfig
+    from dexsim_real.control.controller import Controller
+    from dexsim_real.sensors.hand import HandMeasurement
+    from dexsim_real.sensors.readings import ObjectEstimate
+
+    config = GraspConfig(pool_size=64)
+    observation = dataclasses.replace(config.observation, force=ForceEstimate(per_torque=(8.0, 15.0, 13.0, 14.0, 15.0)))
+    control = dataclasses.replace(config.control, force=dataclasses.replace(LOOP, gain=5.0))
+    env = dexsim.make("grasp", dataclasses.replace(config, observation=observation, control=control), num_envs=8)
+
+    class Close:
+        task, spec, control_rate = env.name, env.spec, env.control_rate
+        observation_layout = env.observation_layout["actor"]
+
+        def __call__(self, observation):
+            return np.full(12, 0.2, np.float32)
+
+    state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(3), 8))
+    step, controllers = jax.jit(jax.vmap(env.step)), [Controller(Close(), hand) for _ in range(8)]
+    shown, wanted, nothing = [], [], np.zeros(1)
+    for _ in range(60):
+        readings = jax.device_get(state.readings)
+        for index, controller in enumerate(controllers):
+            row = jax.tree.map(lambda x, i=index: x[i], readings)
+            measured = HandMeasurement(
+                row.joint_position, row.joint_torque, row.taxel_force, row.joint_torque, nothing, nothing, nothing
+            )
+            seen = ObjectEstimate(row.object_position, row.object_velocity, row.object_quat)
+            command = float(state.goal.command[index])
+            shown.append(float(controller.tick(measured, seen, row.goal_quat, command).readings.command))
+            wanted.append(float(row.command))
+        state = step(state, jnp.full((8, 12), 0.2))
+    np.testing.assert_allclose(shown, wanted, atol=1e-6)
+    assert np.abs(np.asarray(state.correction)).max() > 0.1, "no hand has pressed"
