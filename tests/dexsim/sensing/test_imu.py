@@ -1,0 +1,50 @@
+"""The object's IMU against SciPy's rotations: whose frame its error is in, and from when its heading drifts."""
+
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from dexsim.env.senses import SensorSuite
+from dexsim.sensing.config import Sensing
+from dexsim.sensing.imu import ImuConfig, ImuParams, measure_orientation
+from dexsim.tasks.rotate.config import RotateConfig
+from dexsim.tasks.rotate.task import Rotate
+
+CONFIG = ImuConfig(noise=0.0, bias=0.0, drift=0.0, delay=(0.0, 0.0), rate=10000.0)
+TURNED = Rotation.from_rotvec([0.4, -1.1, 0.7])
+
+
+def quat(rotation):
+    return jnp.asarray(np.roll(rotation.as_quat(), 1), jnp.float32)
+
+
+def rotation(quat):
+    return Rotation.from_quat(np.roll(np.asarray(quat, np.float64), -1))
+
+
+def params(bias=(0.0, 0.0, 0.0), drift=0.0):
+    return ImuParams(bias=jnp.asarray(bias), drift=jnp.asarray(drift), delay=jnp.zeros(()), phase=jnp.zeros(()))
+
+
+@pytest.mark.parametrize("bias", [(0.2, 0.0, 0.0), (0.0, -0.15, 0.1)])
+def test_the_error_is_fixed_to_the_palm(bias):
+    """A mount that is turned shows every orientation turned by the same rotation of the palm's axes."""
+    true, up = quat(TURNED), jnp.array([-1.0, 0.0, 0.0])
+    read = measure_orientation(jax.random.key(0), CONFIG, params(bias), jnp.ones(()), true, true, true, up, 0.03)
+    np.testing.assert_allclose((rotation(read) * TURNED.inv()).as_rotvec(), bias, atol=1e-5)
+
+
+def test_the_heading_drifts_from_the_start_of_the_episode(hand):
+    """Also where the clock of the time limit began at random: two ticks after a start it has drifted for two ticks."""
+    config = RotateConfig(sensing=Sensing(orientation=CONFIG))
+    senses, true = SensorSuite(config, hand, Rotate(config, hand)), quat(TURNED)
+    now = SimpleNamespace(object_quat=true)
+    last = SimpleNamespace(length=jnp.int32(1), tick=jnp.int32(500), readings=SimpleNamespace(object_quat=true))
+    read = senses._read_orientation(jax.random.key(0), now, now, SimpleNamespace(imu=params(drift=0.1)), last)
+    turn = (rotation(read) * TURNED.inv()).as_rotvec()
+    gravity = np.asarray(Rotate(config, hand).gravity)
+    np.testing.assert_allclose(turn, -gravity / np.linalg.norm(gravity) * 0.1 * 2 * senses.period, atol=1e-5)
