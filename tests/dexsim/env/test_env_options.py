@@ -119,6 +119,9 @@ def test_a_tilted_hand_pulls_the_object_aside_and_leaves_the_orientation_alone(m
     for key in jax.random.split(jax.random.key(0), 4):
         episode = env.reset(key).episode
         push = np.asarray(env.sampler.tilt_force(episode)) / float(episode.object.mass)
+        pitch, roll = np.asarray(episode.hand.tilt, np.float64)
+        down = np.array([1.0, -np.tan(roll), np.tan(pitch)])
+        np.testing.assert_allclose(push, 9.81 * (down / np.linalg.norm(down) - [1.0, 0.0, 0.0]), atol=1e-5)
         true_up = -(np.array([9.81, 0.0, 0.0]) + push)
         assert 0.005 < np.arccos(-true_up[0] / np.linalg.norm(true_up)) < 0.15
         assert not np.any(np.asarray(episode.imu.bias))
