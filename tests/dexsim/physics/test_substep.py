@@ -20,7 +20,7 @@ from dexsim.physics.model import build_model, tip_bodies
 from dexsim.physics.physics import Physics
 from dexsim.physics.seam import PhysicsState
 from dexsim.physics.solver import collide, newton
-from dexsim.physics.solver.substep import find_stepper
+from dexsim.physics.solver.substep import _spring, find_stepper
 
 SIZES = {"sphere": "0.02", "capsule": "0.012 0.02", "box": "0.02 0.015 0.03", "cylinder": "0.02 0.025"}
 
@@ -339,3 +339,22 @@ def test_mjx_step_agrees(hand, grasp_env):
     np.testing.assert_allclose(our_force, force, atol=0.02)
     np.testing.assert_allclose(ours.qvel, theirs.qvel, atol=5e-3)
     np.testing.assert_allclose(ours.qpos, theirs.qpos, atol=3e-5)
+
+
+@pytest.mark.parametrize("power", [1.0, 2.0, 4.0])
+@pytest.mark.parametrize("middle", [0.3, 0.5])
+def test_the_impedance_rises_as_in_the_documentation(middle, power):
+    """From low to high over the width, through the mean share `middle` at depth `middle`, without a step."""
+    low, high, width = 0.6, 0.95, 0.01
+    share = jnp.array([0.0, middle - 1e-4, middle, middle + 1e-4, 0.5 + 0.5 * middle, 1.0, 2.0])
+    solimp = jnp.broadcast_to(jnp.array([low, high, width, middle, power]), (len(share), 5))
+    solref = jnp.broadcast_to(jnp.array([-100.0, -10.0]), (len(share), 2))
+    impedance = np.asarray(_spring(solref, solimp, -share * width, 0.002)[2])
+    deep = np.minimum(np.asarray(share), 1.0)
+    wanted = np.where(
+        deep < middle,
+        deep**power / middle ** (power - 1),
+        1 - (1 - deep) ** power / (1 - middle) ** (power - 1),
+    )
+    np.testing.assert_allclose(impedance, low + wanted * (high - low), rtol=1e-5)
+    assert impedance[1] == pytest.approx(impedance[3], abs=1e-3)  # no step at the middle

@@ -3,6 +3,7 @@
 import dataclasses
 import io
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,14 +18,16 @@ from dexsim.core.errors import CalibrationError, ConfigError
 from dexsim_real.calibrate import __main__ as calibrate
 from dexsim_real.calibrate.__main__ import fit_and_report, main
 from dexsim_real.calibrate.gauge import Gauge
-from dexsim_real.calibrate.hand_loop import Operator
+from dexsim_real.calibrate.hand_loop import HandLoop, Operator
 from dexsim_real.calibrate.options import PressConfig
 from dexsim_real.calibrate.press_fit import fit
+from dexsim_real.calibrate.press_procedure import PressProcedure
 from dexsim_real.calibrate.read import read_logs
 from dexsim_real.calibrate.report import torque_constants
-from dexsim_real.control.safety import SafetyConfig
+from dexsim_real.control.safety import Safety, SafetyConfig
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogError, LogReader, LogWriter
+from dexsim_real.sensors.hand import HandSensing, HardwareConfig
 from dexsim_real.wire.frames import Mode
 
 
@@ -247,3 +250,41 @@ def test_the_command_refuses_a_touched_hand_in_one_line(tmp_path, monkeypatch, c
     assert not (tmp_path / "hand.toml").exists()
     assert command("--port", "x", "--output", str(tmp_path / "hand.log")) == 2
     assert "already exists" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("engaged", [False, True])
+def test_a_hand_that_never_answers_ends_a_loop_whether_its_motors_are_on_or_not(hand, tmp_path, engaged):
+    """Also where nothing waits for a number of answers: two seconds of silence are the end of it."""
+    bench = BenchHand(hand, [])
+    bench.exchange, clock = lambda command: None, SimpleNamespace(now=0.0)
+    safety = Safety(hand, SafetyConfig())
+    sleep = lambda seconds: setattr(clock, "now", clock.now + seconds)  # noqa: E731
+    log = LogWriter(tmp_path / "a.log")
+    loop = HandLoop(bench, HandSensing(hand, HardwareConfig()), safety, log, 50.0, clock=lambda: clock.now, sleep=sleep)
+    if engaged:
+        safety.engage()
+    try:
+        with pytest.raises(HandError, match="stopped: .* for 2 s"):
+            for _ in range(round(3.0 * 50)):
+                loop.step()
+    finally:
+        log.close()
+    assert 2.0 < clock.now < 2.2
+
+
+def test_a_level_that_the_current_does_not_allow_is_not_sought_beyond_it():
+    """`_seek` is alone between the gauge's levels: the taxels may read too low, and then only the current ends it."""
+    config = PressConfig(current=0.8)
+    advanced, current = [0.0], lambda: 10.0 * advanced[0]  # A, the motor winds up; the taxels feel nothing
+    procedure = object.__new__(PressProcedure)
+    procedure.config, procedure._advance = config, 0.0
+    procedure.loop = SimpleNamespace(pace=SimpleNamespace(period=0.01))
+    procedure._force, procedure._current = lambda exchange: 0.0, lambda exchange: current()
+
+    def step(advance, phase):
+        procedure._advance = advanced[0] = advance
+        return object()
+
+    procedure._step = step
+    procedure._seek(2.0, 0.1)
+    assert current() == pytest.approx(0.8, abs=0.02) and procedure._advance < config.travel
