@@ -20,8 +20,6 @@ class ForceEstimate:
 
     per_torque: tuple[float, ...] = setting((), unit="N", low=0.0, high=1000.0)
     """Force of each finger with its root joint at the torque limit; empty: the taxels alone."""
-    error: tuple[float, ...] = setting((), unit="N", low=0.0, high=100.0)
-    """Standard deviation of the estimate of each finger, where it was found; not used."""
     touching: float = setting(0.1, unit="N", low=0.001, high=10.0)
     """Force on a finger's taxels from which it counts as touching."""
 
