@@ -31,6 +31,8 @@ from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.ppo import make_train
 from dexsim_ppo.training.presets import find_preset
 
+TICKS = 2  # that are run again: each is an environment's whole model, for every environment
+
 
 class Captures:
     """Counts the graphs that Warp captures from now on."""
@@ -92,6 +94,7 @@ def bare(env: Env, ticks: Any) -> Callable[[], None]:
     size = engine._contact_buffer
     model = mjw.put_model(scene.model)
     model.opt.warn_overflow = False
+    model.opt.graph_conditional = False  # as MJX's
     rows = constraint_rows(scene.config, scene.hand)
     data = mjw.make_data(scene.model, nworld=tapes.shape[1], naconmax=size, naccdmax=size, njmax=rows)
     for name, value in given.items():  # a row for each world
@@ -126,8 +129,9 @@ def bare(env: Env, ticks: Any) -> Callable[[], None]:
 
 
 def measure(task: str, config: PPOConfig, modes: list[str], per_calls: list[int], repeats: int) -> Iterator[dict]:
-    """Rows: physics and training in each mode, then mujoco_warp alone."""
+    """Rows: physics and training in each mode, mujoco_warp alone after the first mode's physics."""
     captures, steps = Captures(), config.steps_per_iteration
+    physics_steps = config.num_envs * min(TICKS, config.rollout_length)
     ticks: Any = None
     for mode in modes:
         use_mode(mode)
@@ -135,22 +139,24 @@ def measure(task: str, config: PPOConfig, modes: list[str], per_calls: list[int]
         if ticks is None:
             ticks = recorded(env, Recorder(make(task, "full", "warp", config.num_envs)), config)
         run = functools.partial(jit(functools.partial(physics, env)), ticks)
-        yield {"measure": "physics", "mode": mode} | timed(run, captures, repeats, steps)
+        yield {"measure": "physics", "mode": mode} | timed(run, captures, repeats, physics_steps)
+        if mode == modes[0]:
+            yield {"measure": "bare"} | timed(bare(env, ticks[:4]), captures, repeats, physics_steps)
         for per_call in per_calls:
             training = make_train(env, dataclasses.replace(config, iterations_per_call=per_call))
             run = functools.partial(iterate, training.step, [training.init(jax.random.key(0))])
             row = timed(run, captures, repeats, steps * per_call)
             yield {"measure": "training", "mode": mode, "iterations_per_call": per_call} | row
-    yield {"measure": "bare"} | timed(bare(env, ticks[:4]), captures, repeats, steps)
 
 
 def recorded(env: Env, recorder: Recorder, config: PPOConfig) -> Any:
-    """Ticks [T, B] of a rollout after six iterations."""
+    """The first `TICKS` ticks [T, B] of a rollout after six iterations."""
     training = make_train(env, config)
     state = training.init(jax.random.key(0))
     for _ in range(6):
         state, _ = training.step(state)
-    return jax.block_until_ready(jit(functools.partial(record, recorder, config))(state)[0])
+    ticks = jit(functools.partial(record, recorder, config))(state)[0]
+    return jax.block_until_ready(jax.tree.map(lambda x: x[:TICKS], ticks))
 
 
 def iterate(step: Callable, holder: list) -> Any:
@@ -165,7 +171,7 @@ def main() -> None:
     parser.add_argument("--num-envs", type=int, default=16384)
     parser.add_argument("--modes", nargs="+", default=["WARP", "WARP_STAGED", "WARP_STAGED_EX"])
     parser.add_argument("--rollout-length", type=int, default=8)
-    parser.add_argument("--iterations-per-call", nargs="+", type=int, default=[1])
+    parser.add_argument("--iterations-per-call", nargs="*", type=int, default=[1], help="none: physics only")
     parser.add_argument("--repeats", type=int, default=7)
     options = parser.parse_args()
     enable_caches()
