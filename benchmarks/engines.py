@@ -56,7 +56,7 @@ def physics_tick(env: Env, way: str, **changes):
         law = env.motors.law(
             s.episode.hand, JointCommand(action=0 * target, target=target, previous=target, valid=valid)
         )
-        return physics.advance_motors(s.episode.object, s.physics, law, s.gear, jnp.zeros(3))[:2]
+        return physics.advance_motors(s.episode.object, s.physics, law, s.gear, jnp.zeros(3), s.episode.hand.cover)[:2]
 
     return jit(jax.vmap(one), backend=backend)
 

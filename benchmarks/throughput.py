@@ -95,7 +95,7 @@ class Recorder(Around):
         env.motors.physics = self.tape = RecordingPhysics(env.physics)
 
     def recorded_step(self, state, action) -> tuple[Any, Any]:
-        """`step`, and its tick: object, physics state, push, joint torques [S + 1, J] Nm (the last: as read)."""
+        """`step`, and its tick: object, physics state, push, cover, joint torques [S + 1, J] Nm (the last: as read)."""
         after = self.inner.step(state, action)
         *given, tape = self.tape.given
         torque, self.tape.given = after.sensor_input.joint_torque * self.hand.torque_limit, None
@@ -107,15 +107,15 @@ class RecordingPhysics(Around):
 
     given = None
 
-    def advance_motors(self, object, state, motors, memory, push):
+    def advance_motors(self, object, state, motors, memory, push, cover):
         def taped(substep, position, velocity, carried):
             tape, memory = carried
             torque, memory = motors(substep, position, velocity, memory)
             return torque, (tape.at[substep].set(torque), memory)
 
         tape = jnp.zeros((self.config.substeps + 1, len(self.joint_qpos)))
-        after, force, (tape, memory) = self.inner.advance_motors(object, state, taped, (tape, memory), push)
-        self.given = object, state, push, tape
+        after, force, (tape, memory) = self.inner.advance_motors(object, state, taped, (tape, memory), push, cover)
+        self.given = object, state, push, cover, tape
         return after, force, memory
 
 
@@ -140,7 +140,7 @@ class TapedMotors(Around):
     def tick(self, episode, command, physics, gear, push):
         tape = self.tape
         after, force = self.physics.advance(
-            episode.object, physics, lambda substep, position, velocity: tape[substep], push
+            episode.object, physics, lambda substep, position, velocity: tape[substep], push, episode.hand.cover
         )
         after, gear, force, finite = stay_finite(command.valid, (physics, gear), (after, gear), force)
         return PhysicsTick(physics=after, finger_force=force, joint_torque=tape[-1], gear=gear, finite=finite)

@@ -125,12 +125,12 @@ def physics(env: Env, ticks: Any) -> jax.Array:
     """The recorded ticks, each from its own start."""
 
     def tick(_, given):
-        object, state, push, tape, *_ = given
+        object, state, push, cover, tape, *_ = given
         after, force = jax.vmap(
-            lambda object, state, push, tape: env.physics.advance(
-                object, state, lambda substep, position, velocity: tape[substep], push
+            lambda object, state, push, cover, tape: env.physics.advance(
+                object, state, lambda substep, position, velocity: tape[substep], push, cover
             )
-        )(object, state, push, tape)
+        )(object, state, push, cover, tape)
         return None, _used((after, force))
 
     return jax.lax.scan(tick, None, ticks)[1]

@@ -79,14 +79,14 @@ def bare(env: Env, ticks: Any) -> Callable[[], None]:
     import warp as wp
 
     scene, engine = env.physics.scene, env.physics.engine
-    objects, states, pushes, tapes = ticks
+    objects, states, pushes, covers, tapes = ticks
 
-    def parameters(object: Any, state: Any) -> dict[str, jax.Array]:
-        contacts = env.physics.contact_params(object, env.physics.tip_stiffness(object, state.qpos))
+    def parameters(object: Any, state: Any, cover: jax.Array) -> dict[str, jax.Array]:
+        contacts = env.physics.contact_params(object, env.physics.tip_stiffness(object, state.qpos, cover), cover)
         where, given = places(scene), values(scene, object, contacts)
         return {name: getattr(engine.model, name).at[where[name]].set(value) for name, value in given.items()}
 
-    given = jax.tree.map(np.asarray, jax.jit(jax.vmap(jax.vmap(parameters)))(objects, states))
+    given = jax.tree.map(np.asarray, jax.jit(jax.vmap(jax.vmap(parameters)))(objects, states, covers))
     wrench = np.zeros((*pushes.shape[:2], scene.model.nbody, 6), np.float32)
     wrench[:, :, scene.object_body, :3] = pushes
     applied = np.zeros((*tapes.shape[:3], scene.model.nv), np.float32)
@@ -141,7 +141,7 @@ def measure(task: str, config: PPOConfig, modes: list[str], per_calls: list[int]
         run = functools.partial(jit(functools.partial(physics, env)), ticks)
         yield {"measure": "physics", "mode": mode} | timed(run, captures, repeats, physics_steps)
         if mode == modes[0]:
-            yield {"measure": "bare"} | timed(bare(env, ticks[:4]), captures, repeats, physics_steps)
+            yield {"measure": "bare"} | timed(bare(env, ticks[:5]), captures, repeats, physics_steps)
         for per_call in per_calls:
             training = make_train(env, dataclasses.replace(config, iterations_per_call=per_call))
             run = functools.partial(iterate, training.step, [training.init(jax.random.key(0))])

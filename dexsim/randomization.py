@@ -36,6 +36,7 @@ NOMINAL = {
     "torque_gain": 1.0,
     "taxel_gain": 1.0,
     "gravity_tilt": 0.0,
+    "cover": 0.0,
 }
 """The nominal hand: a value for every range of `Randomization` but the ripples' number, which has none."""
 _DEVIATIONS = ("encoder_bias", "gravity_tilt")  # given by one number, the largest deviation to either side
@@ -95,6 +96,10 @@ class Randomization:
     """Factor on a finger's taxel readings."""
     gravity_tilt: float = setting(0.1, unit="rad", low=0.0, high=1.6)
     """Largest tilt of the hand against gravity: pitch and roll (`tilted_down`)."""
+    cover: tuple[float, float] = setting((-0.003, 0.0), unit="m", low=-0.01, high=0.01)
+    """Change of the rubber's thickness over all fingertips, for solver and taxels alike (`PhysicsConfig.cover`,
+    `Skin.margin`); nominal 0. The maker's fingertip ends within 0.5 mm of the taxels, soft rubber yields before it
+    bears load: how far out a contact begins is not known. Thicknesses below 0 count as 0."""
     extremes: float = setting(0.0, unit="1", low=0.0, high=1.0)
     """Share of hands (and of their IMUs) with every value at an end of its range, but for the ripples' number
     and phase; see `dexsim.core.ranges`."""
@@ -131,6 +136,7 @@ class HandParams:
     torque_gain: jax.Array  # [J]
     taxel_gain: jax.Array  # [F, 1]
     tilt: jax.Array  # [2] rad
+    cover: jax.Array  # [] m, on top of `PhysicsConfig.cover`
     gear_gap: jax.Array | None = None  # [J] rad, with gear play
 
 
@@ -208,7 +214,8 @@ def _assemble(
         coulomb_friction=jnp.asarray(hand.torque_limit) * value(next(keys), "coulomb_friction", joints),
         viscous_friction=value(next(keys), "viscous_friction", joints),
     )
-    gap = value(next(keys), "gear_gap", joints) if geared else None
+    gap_key = next(keys)
+    gap = value(gap_key, "gear_gap", joints) if geared else None
     substeps = jnp.round(jnp.minimum(latency, control_period) / timestep).astype(jnp.int32)
     return HandParams(
         actuator=actuator,
@@ -218,6 +225,7 @@ def _assemble(
         torque_gain=torque_gain,
         taxel_gain=taxel_gain,
         tilt=tilt,
+        cover=value(next(keys), "cover", ()),
         gear_gap=gap,
     )
 

@@ -30,7 +30,6 @@ from dexsim.env.touch import TouchModel
 from dexsim.geometry import rotations
 from dexsim.geometry.vectors import length
 from dexsim.hand.kinematics import Hand, forward_kinematics
-from dexsim.objects.params import ObjectParams
 from dexsim.physics.physics import Physics
 from dexsim.render.snapshot import Snapshot
 from dexsim.task_spec import TaskSpec, correct_readings
@@ -110,7 +109,7 @@ class Env:
         start = dataclasses.replace(start, object=episode.object)
         goal = self.task.begin(goal_key, start) if goal is None else goal
         command, tick = self.motors.rest(start.qpos, start.qvel, start.joint_target)
-        truth = self._ground_truth(episode.object, tick, command.action, command.action)
+        truth = self._ground_truth(episode, tick, command.action, command.action)
         sensor_input = self.senses.at_rest(start.qpos[self.physics.joint_qpos], start.qpos[self.physics.object_qpos])
         seen = self._sense(noise_key, episode, command, truth, goal, sensor_input)
         outcome = self._judge(truth, goal, tick.finite)
@@ -123,7 +122,7 @@ class Env:
         command = self._control(state, action)
         push = self.task.push(push_key, episode.object) + self.sampler.tilt_force(episode)
         tick = self.motors.tick(episode, command, state.physics, state.gear, push)
-        truth = self._ground_truth(episode.object, tick, command.action, state.action)
+        truth = self._ground_truth(episode, tick, command.action, state.action)
         goal = self.task.update(goal_key, state.goal, truth)
         seen = self._sense(noise_key, episode, command, truth, goal, self._sensor_input(truth, tick), state)
         outcome = self._judge(truth, goal, tick.finite, state)
@@ -159,15 +158,15 @@ class Env:
         return JointCommand(action=action, target=target, previous=state.joint_target, valid=valid)
 
     def _ground_truth(
-        self, object: ObjectParams, tick: PhysicsTick, action: jax.Array, last_action: jax.Array
+        self, episode: Episode, tick: PhysicsTick, action: jax.Array, last_action: jax.Array
     ) -> GroundTruth:
         """Where all is after the tick, and what the fingertips feel of it."""
-        seam, physics, force = self.physics, tick.physics, tick.finger_force
+        seam, physics, force, object = self.physics, tick.physics, tick.finger_force, episode.object
         joints = physics.qpos[seam.joint_qpos]
         place, motion = physics.qpos[seam.object_qpos], physics.qvel[seam.object_dof]
         pose = forward_kinematics(self.hand, joints)
         quat = place[3:] / jnp.linalg.norm(place[3:])
-        felt = self.touch.feel(pose, object, place[:3], quat, force)
+        felt = self.touch.feel(pose, object, place[:3], quat, force, episode.hand.cover)
         return GroundTruth(
             object=object,
             joint_position=joints,

@@ -101,7 +101,7 @@ class Motors:
           push: [3] N on the object.
         """
         law = self.law(episode.hand, command)
-        after, force, turned = self.physics.advance_motors(episode.object, physics, law, gear, push)
+        after, force, turned = self.physics.advance_motors(episode.object, physics, law, gear, push, episode.hand.cover)
         after, turned, force, finite = stay_finite(command.valid, (physics, gear), (after, turned), force)
         torque, limited = self.current_torque(episode.hand, command, after, turned)
         return PhysicsTick(

@@ -32,7 +32,13 @@ class TouchModel:
         self.geometry = touch_geometry(config.objects, config.touch_method)
 
     def feel(
-        self, pose: HandPose, object: ObjectParams, position: jax.Array, quat: jax.Array, force: jax.Array
+        self,
+        pose: HandPose,
+        object: ObjectParams,
+        position: jax.Array,
+        quat: jax.Array,
+        force: jax.Array,
+        cover: jax.Array | float = 0.0,
     ) -> FingertipTouch:
         """The taxels' forces.
 
@@ -40,10 +46,11 @@ class TouchModel:
           pose: of the hand.
           object, position [3] m, quat [4]: the object and where it is, palm frame.
           force: [F, 3] N, of the object on the finger tips, palm frame.
+          cover: [] m, change of the rubber's thickness from `Skin.margin`.
         """
         hand, config = self.hand, self.config
         if config.touch:
-            touch, normal, share = self._press(pose, object, position, quat, force)
+            touch, normal, share = self._press(pose, object, position, quat, force, cover)
         else:
             nothing, normal, share = jnp.zeros(hand.taxel_area.shape), jnp.zeros(hand.num_fingers), 1.0
             touch = Touch(nothing, nothing, nothing)
@@ -52,7 +59,13 @@ class TouchModel:
         return FingertipTouch(touch, normal, split_force(touch.force, taxel_normals(hand, pose), share * force)[1])
 
     def _press(
-        self, pose: HandPose, object: ObjectParams, position: jax.Array, quat: jax.Array, force: jax.Array
+        self,
+        pose: HandPose,
+        object: ObjectParams,
+        position: jax.Array,
+        quat: jax.Array,
+        force: jax.Array,
+        cover: jax.Array | float,
     ) -> tuple[Touch, jax.Array, jax.Array | float]:
         """The touch, the normal forces [F] N, and the share [F, 1] of each finger's load that the taxels bear."""
         hand, skin, surface = self.hand, self.config.skin, self._surface
@@ -65,6 +78,7 @@ class TouchModel:
             length(force),
             skin,
             surface,
+            cover,
         )
         # In the links' frames, where the normals are constants.
         local = rotations.rotate_inverse(pose.tip_rotation, force)

@@ -62,14 +62,14 @@ class ObjectConfig:
     """Factor on the inertia of a uniform solid."""
     com_offset: float = setting(0.003, unit="m", low=0.0, high=0.05)
     """Largest offset of the centre of mass, per axis."""
-    friction: tuple[float, float] = setting((0.6, 1.2), unit="1", low=0.01, high=5.0)
+    friction: tuple[float, float] = setting((0.4, 1.2), unit="1", low=0.01, high=5.0)
     """Sliding friction between the fingertips' rubber and the object."""
-    link_friction: tuple[float, float] = setting((0.6, 1.2), unit="1", low=0.01, high=5.0)
+    link_friction: tuple[float, float] = setting((0.3, 1.2), unit="1", low=0.01, high=5.0)
     """Sliding friction between all else of the hand (palm, links) and the object."""
     stiffness: tuple[float, float] = setting((1600.0, 1800.0), unit="N/m", low=10.0, high=1e6)
-    """Force over depth at rest of a fingertip's contact (`contact.BARE_SHARE` times that elsewhere). Where
-    fingertips follow their skin (`PhysicsConfig.tips`), the middle of the default is the skin as it is, and other
-    values make it that much stiffer: wide ranges part the solver's forces from what the taxels feel."""
+    """Force over depth at rest of a fingertip's contact (`contact.BARE_SHARE` times that elsewhere). Fingertips
+    follow their skin (`contact.follow_skin`): the middle of the default is the skin as it is, and other values make it
+    that much stiffer: wide ranges part the solver's forces from what the taxels feel."""
     restitution: tuple[float, float] = setting((0.03, 0.08), unit="1", low=0.0, high=0.9)
     """Coefficient of restitution: the damping of the contact, which also slows creep. Values
     below 0.024 act as 0.024."""

@@ -88,10 +88,20 @@ def cover_tips(spec: mujoco.MjSpec, hand: Hand, cover: float) -> None:
     tips = {hand.body_names[b] for b in hand.tip_body}
     for geom in spec.geoms:
         if geom.parent.name in tips and (geom.contype or geom.conaffinity):
-            round_ = geom.type in (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE)
-            size = np.array(geom.size)
-            size[: 1 if round_ else 3] += cover
-            geom.size = size
+            geom.size = np.array(geom.size) + cover * _growth(geom.type)
+
+
+def covered(model: mujoco.MjModel, pairs: np.ndarray, tips: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Geoms [S] on bodies `tips` that are part of `pairs`, and the change [S, 3] of their sizes over the rubber's."""
+    used = np.unique([model.pair_geom1[pairs], model.pair_geom2[pairs]])
+    used = used[np.isin(model.geom_bodyid[used], tips)]
+    return used, np.array([_growth(kind) for kind in model.geom_type[used]], float).reshape(-1, 3)
+
+
+def _growth(kind: int) -> np.ndarray:
+    """How much each of a geom's sizes [3] grows with the rubber on it."""
+    round_ = int(kind) in (mujoco.mjtGeom.mjGEOM_SPHERE.value, mujoco.mjtGeom.mjGEOM_CAPSULE.value)
+    return np.array([1.0, 0.0, 0.0]) if round_ else np.ones(3)
 
 
 def split_pads(spec: mujoco.MjSpec, hand: Hand, touching: list[str], points: int) -> list[str]:
@@ -152,6 +162,7 @@ def follow_skin(
     object: ObjectParams,
     position: jax.Array,
     rotation: jax.Array,
+    cover: jax.Array | float = 0.0,
 ) -> jax.Array:
     """How much stiffer [F] than nominal a fingertip's springs are for their sum to be the skin's force.
 
@@ -162,9 +173,11 @@ def follow_skin(
     Args:
       surface: the skin that bears load (`dexsim.touch.surface.skin_surface`).
       pose: of the hand; `position` [3] and `rotation` [3, 3] are the object's, in the palm frame.
+      cover: [] m, change of the rubber's thickness from `pads` and `skin`.
     """
-    shape = object.shape()
-    touch = feel_links(hand, pose, shape, position, rotation, jnp.ones(hand.num_fingers), skin, surface)
+    shape, radius = object.shape(), jnp.asarray(pads.radius)
+    radius = jnp.where(radius > 0, radius + cover, 0.0)
+    touch = feel_links(hand, pose, shape, position, rotation, jnp.ones(hand.num_fingers), skin, surface, cover)
     centre = pose.body_position[hand.tip_body][:, None] + rotations.rotate(
         pose.tip_rotation[:, None], jnp.asarray(pads.centre)
     )
@@ -173,7 +186,7 @@ def follow_skin(
     for k, kind in enumerate(shape.kinds):  # one spring for every primitive that a sphere is in
         here = sdf.to_local(local, shape.position[k], shape.rotation[k])
         gap = sdf.primitive_distance(kind, here, shape.size[k])
-        depth += jnp.where(shape.active[k], jnp.maximum(jnp.asarray(pads.radius) - gap, 0.0), 0.0)
+        depth += jnp.where(shape.active[k], jnp.maximum(radius - gap, 0.0), 0.0)
     nominal = NOMINAL * ROW_SHARE
     ratio = (jnp.sum(touch.skin_force, -1) + nominal * BLEND_DEPTH) / (nominal * (jnp.sum(depth, -1) + BLEND_DEPTH))
     has = jnp.asarray(pads.radius.any(-1))  # a fingertip that is no row of spheres keeps its stiffness

@@ -108,6 +108,8 @@ def build_scene(
     model = build_model(hand, slots, largest, config, gravity, backend, rotor_share=rotor_share)
     joints, free = [model.joint(name) for name in hand.joint_names], model.joint("object")
     geoms = np.array([model.geom(f"object_{k}").id for k in range(len(slots))])
+    pairs, tips = contact.pairs_with(model, geoms), tip_bodies(model, hand)
+    rubber, growth = contact.covered(model, pairs, tips)
     return PhysicsScene(
         hand=hand,
         config=config,
@@ -119,8 +121,10 @@ def build_scene(
         object_dof=np.arange(free.dofadr[0], free.dofadr[0] + 6),
         object_body=model.body("object").id,
         object_geoms=geoms,
-        object_pairs=contact.pairs_with(model, geoms),
-        tip_bodies=tip_bodies(model, hand),
+        object_pairs=pairs,
+        tip_bodies=tips,
+        tip_geoms=rubber,
+        tip_growth=growth,
     )
 
 
@@ -160,7 +164,7 @@ def _set_options(spec: mujoco.MjSpec, config: PhysicsConfig, gravity: tuple[floa
     if backend == "c":
         # With the few iterations that are enough for Warp's line search, C MuJoCo's stops short: forces were off by up
         # to 28 N. It stops by itself once it has converged, so more iterations cost nothing.
-        option.iterations, option.ls_iterations = max(config.iterations, 10), max(config.line_search, 13)
+        option.iterations, option.ls_iterations = max(config.iterations, 20), max(config.line_search, 20)
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP  # it costs a factorisation more
     if backend != "c":
         # In MJX box-box has its own kernel only with nativeccd off. C MuJoCo has it anyway, and its older convex

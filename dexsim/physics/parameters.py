@@ -1,9 +1,10 @@
-"""Which numbers of a compiled model one environment replaces: its object, and the parameters of its contacts."""
+"""Which numbers of a compiled model one environment replaces: its object, its contacts' parameters, its fingertips."""
 
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from dexsim.objects.params import ObjectParams, bounding_radius
 from dexsim.physics.seam import ContactParams, PhysicsScene
@@ -17,7 +18,7 @@ def places(scene: PhysicsScene) -> dict[str, Any]:
     """
     geoms, body, pairs = scene.object_geoms, scene.object_body, scene.object_pairs
     return {
-        "geom_size": geoms,
+        "geom_size": np.concatenate([geoms, scene.tip_geoms]),
         "geom_rbound": geoms,
         "geom_pos": geoms,
         "geom_quat": geoms,
@@ -32,8 +33,9 @@ def places(scene: PhysicsScene) -> dict[str, Any]:
 
 def values(scene: PhysicsScene, object: ObjectParams, contacts: ContactParams) -> dict[str, jax.Array]:
     """What goes to those places; without `geom_quat` where the object's primitives are aligned with it."""
+    tips = scene.model.geom_size[scene.tip_geoms] + contacts.cover * scene.tip_growth
     found = {
-        "geom_size": object.size,
+        "geom_size": jnp.concatenate([object.size, tips]),
         "geom_rbound": bounding_radius(object.size, scene.slots),
         "geom_pos": object.position,
         "body_mass": object.mass,

@@ -94,16 +94,26 @@ class Physics:
         self._surface = None if skin is None else skin_surface(hand, skin)
         self.engine = BACKENDS[self.backend](scene, num_envs)
 
-    def tip_stiffness(self, object: ObjectParams, qpos: jax.Array) -> jax.Array:
-        """How much stiffer [F] than nominal the fingertips are where they press now."""
+    def tip_stiffness(self, object: ObjectParams, qpos: jax.Array, cover: jax.Array | float = 0.0) -> jax.Array:
+        """How much stiffer [F] than nominal the fingertips are where they press now; `cover` as in `contact_params`."""
         assert self.skin is not None and self._surface is not None, "without a skin, springs are constant"
         place = qpos[self.object_qpos]
         turn = rotations.quat_to_matrix(place[3:] / jnp.linalg.norm(place[3:]))
         pose = forward_kinematics(self.hand, qpos[self.joint_qpos])
-        return contact.follow_skin(self.hand, self._pads, self.skin, self._surface, pose, object, place[:3], turn)
+        return contact.follow_skin(
+            self.hand, self._pads, self.skin, self._surface, pose, object, place[:3], turn, self._change(cover)
+        )
 
-    def contact_params(self, object: ObjectParams, tips: jax.Array | None = None) -> ContactParams:
-        """Contact parameters of an object; `tips` [F] is the fingertips' stiffness over the nominal one."""
+    def contact_params(
+        self, object: ObjectParams, tips: jax.Array | None = None, cover: jax.Array | float = 0.0
+    ) -> ContactParams:
+        """Contact parameters of an object.
+
+        Args:
+          object: the object.
+          tips: [F] the fingertips' stiffness over the nominal one.
+          cover: [] m, change of the thickness of their rubber from `PhysicsConfig.cover`.
+        """
         friction = object.pair_friction(self._finger_of_pair >= 0)
         share = jnp.asarray(self._share)
         if tips is not None:
@@ -111,11 +121,14 @@ class Physics:
         solref, solimp = contact.spring(
             self._compliance, share * object.contact[0], object.contact[1], period=self.config.contact_period
         )
-        return ContactParams(friction, solref, solimp)
+        return ContactParams(friction, solref, solimp, self._change(cover))
 
-    def configure(self, object: ObjectParams, tips: jax.Array | None = None) -> Any:
-        """The engine's model of one environment (`Backend.configure`); `tips` as in `contact_params`."""
-        return self.engine.configure(object, self.contact_params(object, tips))
+    def _change(self, cover: jax.Array | float) -> jax.Array:
+        return jnp.maximum(jnp.asarray(cover, jnp.float32), -self.config.cover)  # no rubber is the least
+
+    def configure(self, object: ObjectParams, tips: jax.Array | None = None, cover: jax.Array | float = 0.0) -> Any:
+        """The engine's model of one environment (`Backend.configure`); arguments as in `contact_params`."""
+        return self.engine.configure(object, self.contact_params(object, tips, cover))
 
     def advance(
         self,
@@ -123,6 +136,7 @@ class Physics:
         state: PhysicsState,
         torque: Callable[[jax.Array, jax.Array, jax.Array], jax.Array],
         push: jax.Array,
+        cover: jax.Array | float = 0.0,
     ) -> tuple[PhysicsState, jax.Array]:
         """Run one control tick with motors that remember nothing: `advance_motors` for all others.
 
@@ -136,12 +150,19 @@ class Physics:
             lambda index, position, velocity, memory: (torque(index, position, velocity), memory),
             None,
             push,
+            cover,
         )
         return after, force
 
     def advance_motors(
-        self, object: ObjectParams, state: PhysicsState, motors: TorqueLaw, memory: Any, push: jax.Array
+        self,
+        object: ObjectParams,
+        state: PhysicsState,
+        motors: TorqueLaw,
+        memory: Any,
+        push: jax.Array,
+        cover: jax.Array | float = 0.0,
     ) -> tuple[PhysicsState, jax.Array, Any]:
-        """Run one control tick; arguments and results are those of `Backend.advance`."""
-        tips = None if self.skin is None else self.tip_stiffness(object, state.qpos)
-        return self.engine.advance(object, self.contact_params(object, tips), state, motors, memory, push)
+        """Run one control tick; `cover` as in `contact_params`, the rest as in `Backend.advance`."""
+        tips = None if self.skin is None else self.tip_stiffness(object, state.qpos, cover)
+        return self.engine.advance(object, self.contact_params(object, tips, cover), state, motors, memory, push)

@@ -37,11 +37,13 @@ class PhysicsState:
 
 @pytree_dataclass
 class ContactParams:
-    """Contact parameters of the pairs of hand and object (`PhysicsScene.object_pairs`), in MuJoCo's terms."""
+    """Contacts of hand and object: parameters of their pairs (`PhysicsScene.object_pairs`) in MuJoCo's terms, and how
+    thick the fingertips are."""
 
     friction: jax.Array  # [P] sliding
     solref: jax.Array  # [P, 2] direct format: minus stiffness, minus damping
     solimp: jax.Array  # [P, 5]
+    cover: jax.Array  # [] m, change of the rubber's thickness from `PhysicsConfig.cover`
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
@@ -60,6 +62,8 @@ class PhysicsScene:
     object_geoms: np.ndarray  # [K]
     object_pairs: np.ndarray  # [P]
     tip_bodies: np.ndarray  # [F]
+    tip_geoms: np.ndarray  # [S] of the fingertips that meet the object
+    tip_growth: np.ndarray  # [S, 3] change of `geom_size` over the rubber's
 
 
 class Backend(Protocol):

@@ -38,6 +38,7 @@ def feel(
     rotation: jax.Array,
     finger_force: jax.Array,
     skin: Skin,
+    cover: jax.Array | float = 0.0,
 ) -> Touch:
     """Taxel forces from the geometry of the contact and the finger's total force.
 
@@ -48,11 +49,12 @@ def feel(
         `dexsim.geometry.distance` (a `sdf.Shape` is as it is), and its pose in the palm frame.
       finger_force: [F] N, resultant fingertip-object force of the physics.
       skin: the skin's law.
+      cover: [] m, by which the rubber is thicker than `skin.margin`.
 
     A finger with all taxels clear of the object reads zero, whatever its total: it touches with a part of the link
     that has no taxels.
     """
-    return _press(sdf.to_local(taxels, position, rotation), area, geometry, finger_force, skin)
+    return _press(sdf.to_local(taxels, position, rotation), area, geometry, finger_force, skin, cover)
 
 
 def feel_links(
@@ -64,6 +66,7 @@ def feel_links(
     finger_force: jax.Array,
     skin: Skin,
     surface: Surface | None = None,
+    cover: jax.Array | float = 0.0,
 ) -> Touch:
     """`feel` for all taxels of a posed hand, or for other points of its fingertips' skin.
 
@@ -77,12 +80,20 @@ def feel_links(
     turn, shift = jax.lax.optimization_barrier((turn, shift))
     taxel = [jnp.asarray(surface.position[..., axis]) for axis in range(3)]
     local = [sum(turn[:, row, axis, None] * taxel[axis] for axis in range(3)) + shift[:, row, None] for row in range(3)]
-    return _press(jnp.stack(local, -1), jnp.asarray(surface.area), geometry, finger_force, skin)
+    return _press(jnp.stack(local, -1), jnp.asarray(surface.area), geometry, finger_force, skin, cover)
 
 
-def _press(points: jax.Array, area: jax.Array, geometry: Any, finger_force: jax.Array, skin: Skin) -> Touch:
+def _press(
+    points: jax.Array,
+    area: jax.Array,
+    geometry: Any,
+    finger_force: jax.Array,
+    skin: Skin,
+    cover: jax.Array | float = 0.0,
+) -> Touch:
     """`feel` for points [F, N, 3] in the object's frame."""
-    depth = jnp.maximum(skin.margin - signed_distance(points, geometry), 0.0)
+    margin = jnp.maximum(skin.margin + cover, 0.0)
+    depth = jnp.maximum(margin - signed_distance(points, geometry), 0.0)
     skin_force = skin_stress(depth / skin.thickness, skin) * area
     return Touch(depth, skin_force, spread(skin_force, finger_force))
 

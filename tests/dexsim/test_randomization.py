@@ -78,6 +78,7 @@ def quantities(hand, drawn):
         "torque_gain": drawn.torque_gain,
         "taxel_gain": drawn.taxel_gain[..., 0],
         "gravity_tilt": drawn.tilt,
+        "cover": drawn.cover[:, None],
     }
 
 
@@ -101,6 +102,7 @@ DISTINCT = Randomization(
     torque_gain=(1.3, 1.5),
     taxel_gain=(0.3, 0.4),
     gravity_tilt=0.5,
+    cover=(0.001, 0.002),
 )
 
 
@@ -339,6 +341,7 @@ REACHES = {
     "torque_gain": {"torque_gain"},
     "taxel_gain": {"taxel_gain"},
     "gravity_tilt": {"tilt"},
+    "cover": {"cover"},
     "mass": {"body_mass"},
     "inertia_scale": {"body_inertia"},
     "com_offset": {"body_ipos"},

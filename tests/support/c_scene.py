@@ -6,6 +6,7 @@ body's origin), only its active primitives exist, and forces are summed from `mj
 """
 
 import contextlib
+import dataclasses
 from collections.abc import Iterator
 
 import jax
@@ -38,10 +39,11 @@ def compile_scene(
     margin=0.0,
     exact=False,
     settling=0.03,
+    cover=COVER,
 ) -> mujoco.MjModel:
     """One object (`ObjectParams` of NumPy leaves) under the hand.
 
-    Fingertips wear 3 mm of rubber; each of their three spheres presses with half of
+    Fingertips wear `cover` m of rubber; each of their three spheres presses with half of
     `target.contact[0]` newtons a metre of depth (see `follow_skin`), other links and the palm with
     2.5 of it. `margin` m lists contacts that far apart, for clearances, which are those of the bare
     pads. `exact` takes C MuJoCo's native convex collisions, whose one contact of a capsule on a
@@ -53,7 +55,7 @@ def compile_scene(
         spec.delete(actuator)
     names = [g.name for g in spec.geoms if (g.contype or g.conaffinity) and g.name != "palm"]
     if not margin:
-        names = [name for geom in names for name in _clad(spec, geom)]
+        names = [name for geom in names for name in _clad(spec, geom, cover)]
     for geom in spec.geoms:
         geom.contype = geom.conaffinity = 0
     tips = {hand.body_names[body] for body in hand.tip_body}
@@ -94,12 +96,12 @@ def compile_scene(
     return model
 
 
-def _clad(spec: mujoco.MjSpec, name: str) -> list[str]:
+def _clad(spec: mujoco.MjSpec, name: str, cover: float) -> list[str]:
     """Rubber over a pad, and what of it meets the object: a row of spheres along its axis."""
     if "_pad" not in name:
         return [name]
     pad = spec.geom(name)
-    radius, ends = pad.size[0] + COVER, np.reshape(pad.fromto, (2, 3))
+    radius, ends = pad.size[0] + cover, np.reshape(pad.fromto, (2, 3))
     pad.size = [radius, *pad.size[1:]]
     for k in range(ROW):
         share = k / (ROW - 1)
@@ -170,10 +172,10 @@ def finger_force(model: mujoco.MjModel, data: mujoco.MjData, hand) -> np.ndarray
 
 
 def skin_law(hand, skin):
-    """`law(qpos [n, J + 7], target)`: the fingers' forces [n, F] N by the skin's law alone."""
+    """`law(qpos [n, J + 7], target, cover [n] m)`: the fingers' forces [n, F] N by the skin's law alone."""
     area = jnp.asarray(hand.taxel_area)
 
-    def law(qpos, target):
+    def law(qpos, target, cover):
         taxels = taxel_positions(hand, forward_kinematics(hand, qpos[: hand.num_joints]))
         place = qpos[hand.num_joints :]
         touch = feel(
@@ -183,11 +185,13 @@ def skin_law(hand, skin):
             place[:3],
             rotations.quat_to_matrix(place[3:]),
             jnp.ones(hand.num_fingers),
-            skin,
+            dataclasses.replace(skin, margin=0.0),
+            cover,
         )
         return jnp.sum(touch.skin_force, -1)
 
-    return jax.jit(jax.vmap(law))
+    compiled = jax.jit(jax.vmap(law))
+    return lambda qpos, target, cover=COVER: compiled(qpos, target, jnp.broadcast_to(jnp.float32(cover), len(qpos)))
 
 
 # --- worlds to compare in ---------------------------------------------------------------------

@@ -1,6 +1,7 @@
 """Parts of an environment's state, for tests that put others in."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 
@@ -18,4 +19,5 @@ def ground_truth(env, object, physics, force):
     tick = PhysicsTick(
         physics=physics, finger_force=force, joint_torque=zero, gear=None, limited=zero > 0, finite=jnp.ones((), bool)
     )
-    return env._ground_truth(object, tick, zero, zero)
+    episode = SimpleNamespace(object=object, hand=SimpleNamespace(cover=0.0))
+    return env._ground_truth(episode, tick, zero, zero)

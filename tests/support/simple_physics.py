@@ -28,11 +28,13 @@ class SimplePhysics:
             opt=SimpleNamespace(timestep=config.timestep),
         )
 
-    def advance(self, object, state, torque, push):
+    def advance(self, object, state, torque, push, cover=0.0):
         motors = lambda index, position, velocity, memory: (torque(index, position, velocity), memory)  # noqa: E731
-        return self.advance_motors(object, state, motors, None, push)[:2]
+        return self.advance_motors(object, state, motors, None, push, cover)[:2]
 
-    def advance_motors(self, object, state, motors, memory, push):
+    def advance_motors(self, object, state, motors, memory, push, cover=0.0):
+        del cover  # nothing touches anything
+
         def substep(carry, index):
             qpos, qvel, memory = carry
             tau, memory = motors(index, qpos[:12], qvel[:12], memory)

