@@ -21,8 +21,6 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
-import jax
-
 from dexsim.core import cli
 from dexsim.core.config import from_dict, naming_file
 from dexsim.core.errors import ConfigError, DexsimError
@@ -34,7 +32,7 @@ from dexsim_ppo.policy import Policy, load_policy
 from dexsim_ppo.retired import migrate_arguments
 from dexsim_ppo.training.arguments import TrainArguments, check_resumed, printable, training_config
 from dexsim_ppo.training.fine_tune import check_fit, fine_tuning_config
-from dexsim_ppo.training.presets import Preset, find_preset
+from dexsim_ppo.training.presets import Preset, device_preset, find_preset
 from dexsim_ppo.training.runlog import RunFolder
 from dexsim_ppo.training.trainer import Run
 
@@ -66,7 +64,7 @@ def train_policy(
       task: a registered name; None for grasp, or the task of `policy` or `resume`.
       config: the task's settings; None for the defaults.
       ppo: the learner's settings; None for the preset's.
-      preset: sizes and durations, "auto", "cpu" or "gpu".
+      preset: sizes and durations, "auto", "cpu", "cpu-large" or "gpu".
       policy: a policy to fine-tune, a file or the name of a shipped one.
       resume: folder of a run, or one of its checkpoints, to resume.
       options: other fields of `TrainArguments`, such as `minutes=5`, `seed=1`, `run_dir=Path("runs/mine")`.
@@ -214,7 +212,7 @@ def parse_arguments(argv: list[str]) -> tuple[TrainArguments, checkpoint.Checkpo
 def preset_arguments(task: str, env_config: Any, name: str) -> TrainArguments:
     """The options' defaults under a preset."""
     if name == "auto":
-        name = "gpu" if jax.default_backend() == "gpu" else "cpu"
+        name = device_preset()
     preset = find_preset(name, task)
     values = {f.name: getattr(preset, f.name) for f in dataclasses.fields(Preset)}
     return TrainArguments(env=env_config, task=task, **values)

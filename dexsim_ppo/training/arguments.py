@@ -33,8 +33,8 @@ class TrainArguments(Generic[EnvConfig]):
     """Seed of everything random."""
     backend: Literal["auto", "jax", "warp", "c"] = setting("auto")
     """Physics backend. auto: c on a CPU, warp on an NVIDIA GPU if it is installed, otherwise jax."""
-    preset: Literal["auto", "cpu", "gpu"] = setting("auto")
-    """Default sizes and durations. auto: those of the device found."""
+    preset: Literal["auto", "cpu", "cpu-large", "gpu"] = setting("auto")
+    """Default sizes and durations. auto: those of the device found; cpu-large is for 16 cores and more."""
     steps: float = setting(0.0, unit="environment steps", low=0.0)
     """Stop after this many steps, including those before a resume; 0 for no limit."""
     minutes: float = setting(0.0, unit="min", low=0.0)

@@ -1,6 +1,9 @@
 """Training defaults per device: sizes and durations."""
 
+import os
 from dataclasses import dataclass, replace
+
+import jax
 
 from dexsim_ppo.learner.config import PPOConfig
 
@@ -45,6 +48,24 @@ PRESETS = {
         evaluation_episodes=150,
         log_every=5,
     ),
+    # 16 cores and more: enough environments for all of them. Sized by a cost model, tried on 12 cores.
+    "cpu-large": Preset(
+        ppo=PPOConfig(
+            num_envs=1024,
+            rollout_length=16,
+            epochs=4,
+            minibatches=16,
+            kl_target=0.02,
+            actor_layers=(128, 128),
+            critic_layers=(128, 128),
+        ),
+        steps=0,
+        minutes=5.0,
+        evaluate_every=0,
+        evaluation_chunk=250,
+        evaluation_episodes=500,
+        log_every=5,
+    ),
     # One large GPU: enough environments to fill it, and few large minibatches.
     "gpu": Preset(
         ppo=PPOConfig(
@@ -76,9 +97,19 @@ def find_preset(name: str, task: str) -> Preset:
         return preset
     # Two-minute episodes are slow to evaluate, so they are evaluated once, at the end. A gait needs less
     # noise than a grasp, which has to explore forces.
+    ppo = replace(preset.ppo, epochs=4, minibatches=16, entropy_coefficient=0.001)
     if preset is PRESETS["cpu"]:
-        ppo = replace(preset.ppo, num_envs=512, epochs=4, minibatches=16, entropy_coefficient=0.001)
-        return replace(preset, ppo=ppo, minutes=30.0, evaluation_chunk=64, evaluation_episodes=64)
-    # Half the environments: twice the updates from the same experience, which finding a gait needs.
-    ppo = replace(preset.ppo, num_envs=16384, minibatches=8, entropy_coefficient=0.001)
-    return replace(preset, ppo=ppo, minutes=7.5, evaluate_every=0)
+        ppo = replace(ppo, num_envs=512)
+        return replace(preset, ppo=ppo, minutes=30.0, evaluation_chunk=64, evaluation_episodes=256)
+    if preset is PRESETS["cpu-large"]:
+        return replace(preset, ppo=ppo, minutes=15.0, evaluation_chunk=256, evaluation_episodes=256)
+    # A quarter of the environments: four times the updates from the same experience, which finding a gait needs.
+    return replace(preset, ppo=replace(ppo, num_envs=8192), minutes=5.0, evaluate_every=0)
+
+
+def device_preset() -> str:
+    """The name of the preset for the device found, and on a CPU for the number of cores that this process may use."""
+    if jax.default_backend() == "gpu":
+        return "gpu"
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return "cpu-large" if cores >= 16 else "cpu"

@@ -85,8 +85,9 @@ class TestAgainstC:
         wrong, strength = error(found)
         assert np.sum(strength > 0.5) >= 5, "hardly a world is in contact: the test tests nothing"
         assert np.all(wrong < 0.01 + 2e-3 * strength), (wrong, strength)
-        np.testing.assert_allclose(found.velocity, found.c_velocity, atol=SWING)
-        np.testing.assert_allclose(found.position, found.c_position, atol=0.006 * SWING)
+        apart = np.abs(found.velocity - found.c_velocity).max(0)
+        assert np.all(apart < SWING), apart
+        assert np.all(np.abs(found.position - found.c_position).max(0) < 0.006 * np.append(SWING, 5e-3))
 
     def test_a_sub_step_in_contact_with_a_cylinder(self, contact_steps):
         """A link that lies on a cylinder has one contact in C MuJoCo and one at each end of the stretch here."""
