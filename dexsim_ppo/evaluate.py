@@ -168,7 +168,7 @@ def _follow(last: tuple, metrics: dict[str, jax.Array], terminated: jax.Array) -
     before, lived, ended = last
     kept = jax.tree.map(lambda old, new: jnp.where(ended, old, new), before, metrics)
     ended = ended | terminated
-    return kept, lived + ~ended, ended
+    return kept, lived + (~ended).astype(jnp.int32), ended
 
 
 def mean_interval(x: np.ndarray, start: np.ndarray) -> dict[str, float]:

@@ -92,17 +92,17 @@ def by_library(a, *, tanh: bool):
     def objective(weights, log_std, critic):
         layers = Layer(weights, jnp.zeros(ACTIONS)), Layer(critic, jnp.zeros(1))
         params = Params((layers[0],), log_std, (layers[1],))
-        return loss(params, config, {"actor": same, "critic": same}, batch, f(a["old_log_std"]))[0]
+        return loss(params, config, {"actor": same, "critic": same}, batch, f(a["old_log_std"]))
 
     learnt = tuple(f(a[name]) for name in ("weights", "log_std", "critic"))
-    return jax.value_and_grad(objective, argnums=(0, 1, 2))(*learnt)
+    return jax.value_and_grad(objective, argnums=(0, 1, 2), has_aux=True)(*learnt)
 
 
 @pytest.mark.parametrize("tanh", [False, True])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_objective_and_gradient(tanh, seed):
     a = problem(seed)
-    value, grads = by_library(a, tanh=tanh)
+    (value, _), grads = by_library(a, tanh=tanh)
     assert float(value) == pytest.approx(by_hand(a, tanh=tanh), rel=2e-5)
     for name, grad in zip(("weights", "log_std", "critic"), grads, strict=True):
         found = np.zeros_like(a[name])
@@ -116,15 +116,28 @@ def test_objective_and_gradient(tanh, seed):
         np.testing.assert_allclose(grad, found, rtol=2e-3, atol=2e-5, err_msg=name)
 
 
-def test_the_batch_takes_every_branch():
-    """Otherwise a clip without effect would pass."""
-    a = problem()
-    mean, value = a["obs"] @ a["weights"], a["obs"] @ a["critic"][:, 0]
+def ratios(a) -> np.ndarray:
+    """The new policy's density over the old one's, of each action."""
+    mean = a["obs"] @ a["weights"]
     action = a["old_mean"] + np.exp(a["old_log_std"]) * a["noise"]
     log = lambda mean, log_std: np.sum(  # noqa: E731
         -(((action - mean) / np.exp(log_std)) ** 2) / 2 - log_std, axis=1
     )
-    ratio = np.exp(log(mean, a["log_std"]) - log(a["old_mean"], a["old_log_std"]))
+    return np.exp(log(mean, a["log_std"]) - log(a["old_mean"], a["old_log_std"]))
+
+
+def test_the_share_that_is_clipped_counts_both_sides():
+    a = problem()
+    ratio = ratios(a)
+    (_, metrics), _ = by_library(a, tanh=False)
+    assert np.any(ratio < 1 - CLIP) and np.any(ratio > 1 + CLIP)
+    assert float(metrics["clip_fraction"]) == pytest.approx(np.mean((ratio < 1 - CLIP) | (ratio > 1 + CLIP)))
+
+
+def test_the_batch_takes_every_branch():
+    """Otherwise a clip without effect would pass."""
+    a = problem()
+    ratio, mean, value = ratios(a), a["obs"] @ a["weights"], a["obs"] @ a["critic"][:, 0]
     for good in (a["advantage"] > 0, a["advantage"] < 0):
         for clipped in (ratio > 1 + CLIP, ratio < 1 - CLIP, np.abs(ratio - 1) < CLIP):
             assert np.any(good & clipped)
