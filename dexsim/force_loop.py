@@ -11,7 +11,8 @@ import jax.numpy as jnp
 
 from dexsim.core.config import setting, validate
 
-_LOW, _HIGH = -0.3, 1.5  # of the command that a policy trained on [0, 1] is shown
+# Of the command that a policy trained on [0, 1] is shown. Below 0 it lets go of weak grips.
+_LOW, _HIGH = 0.0, 1.5
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -52,9 +52,9 @@ def test_it_waits_for_two_fingers_beside_the_thumb(force, moves):
 )
 def test_its_limits_hold_whatever_is_measured(force, command, correction, gain, slew):
     loop = ForceLoop(gain=gain, limit=0.6, slew=slew)
-    start = np.clip(correction, -0.3 - command, 1.5 - command)
+    start = np.clip(correction, -command, 1.5 - command)
     after = float(correct_command(loop, SPAN, PERIOD, jnp.asarray(command), jnp.asarray(start), fingers(*force)))
-    assert abs(after) <= 0.6 + 1e-6 and -0.3 - 1e-6 <= command + after <= 1.5 + 1e-6
+    assert abs(after) <= 0.6 + 1e-6 and -1e-6 <= command + after <= 1.5 + 1e-6
     assert abs(after - start) <= slew * PERIOD + 1e-6
 
 
