@@ -55,6 +55,7 @@ class Hand:
     tip_body: np.ndarray  # [F]
     tip_offset: np.ndarray  # [F, 3] m, in the tip body's frame
     root_joint: np.ndarray  # [F] the joint whose torque represents the finger
+    force_per_torque: np.ndarray  # [F] N/Nm, force of the finger over that torque; 0: not known
     taxel_grid: tuple[int, int]  # columns, rows; index = column * rows + row
     taxel_position: np.ndarray  # [F, N, 3] m, in the tip body's frame
     taxel_normal: np.ndarray  # [F, N, 3] outward

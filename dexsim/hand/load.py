@@ -66,6 +66,7 @@ def load_hand(path: str | Path | None = None) -> Hand:
         tip_body=np.array([row[int(model.site_bodyid[s])] for s in tips], np.int32),
         tip_offset=_f32(model.site_pos[tips]),
         root_joint=np.array(root, np.int32),
+        force_per_torque=_f32([finger.get("force_per_torque", 0.0) for finger in table["fingers"]]),
         taxel_grid=tuple(table["taxel_grid"]),
         taxel_position=taxels[..., 0:3],
         taxel_normal=taxels[..., 3:6],
@@ -178,6 +179,9 @@ def _check_table(path: Path, table: dict) -> None:
         for key in ("name", "tip", "root_joint"):
             if not isinstance(finger, dict) or not isinstance(finger.get(key), str):
                 raise AssetError(f"{path}: finger {number} has no entry {key!r}")
+        force = finger.get("force_per_torque", 0.0)
+        if type(force) not in (int, float) or not 0 <= force <= 1000:
+            raise AssetError(f"{path}: finger {number}: force_per_torque = {force!r:.60}: expected 0 to 1000 N/Nm")
 
 
 def _check_finite(model, path: Path) -> None:

@@ -8,6 +8,7 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from dexsim.core.config import setting, validate
 from dexsim.core.errors import ConfigError
@@ -19,7 +20,8 @@ class ForceEstimate:
     """How taxels and torque make an estimate."""
 
     per_torque: tuple[float, ...] = setting((), unit="N", low=0.0, high=1000.0)
-    """Force of each finger with its root joint at the torque limit; empty: the taxels alone."""
+    """Force of each finger with its root joint at the torque limit; empty: by the hand's own `force_per_torque`, and of
+    a hand without it the taxels alone."""
     touching: float = setting(0.1, unit="N", low=0.001, high=10.0)
     """Force on a finger's taxels from which it counts as touching."""
 
@@ -40,11 +42,12 @@ def estimate_force(estimate: ForceEstimate, hand: Hand, taxel_force: jax.Array, 
       ConfigError: `per_torque` is of a hand with another number of fingers.
     """
     felt = jnp.sum(taxel_force, -1)
-    force = felt
+    gain = hand.force_per_torque * hand.torque_limit[hand.root_joint]
     if estimate.per_torque:
         if len(estimate.per_torque) != hand.num_fingers:
             raise ConfigError(
                 f"ForceEstimate.per_torque has {len(estimate.per_torque)} values, the hand {hand.num_fingers} fingers"
             )
-        force = jnp.maximum(felt, jnp.asarray(estimate.per_torque) * jnp.abs(joint_torque[hand.root_joint]))
+        gain = np.asarray(estimate.per_torque, np.float32)
+    force = jnp.maximum(felt, gain * jnp.abs(joint_torque[hand.root_joint]))
     return jnp.where(felt > estimate.touching, force, 0.0)

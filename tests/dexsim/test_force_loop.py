@@ -66,7 +66,11 @@ def test_an_estimate_is_the_larger_of_taxels_and_torque_and_zero_without_touch(h
     estimate = ForceEstimate(per_torque=(8.0, 15.0, 13.0, 14.0, 15.0))
     found = estimate_force(estimate, hand, taxels, torque)
     np.testing.assert_allclose(found, [2.0, 3.0, 0.0, 6.0, 0.0], rtol=1e-6)
-    np.testing.assert_allclose(estimate_force(ForceEstimate(), hand, taxels, torque), [2.0, 0.5, 0.0, 6.0, 0.0])
+    unknown = dataclasses.replace(hand, force_per_torque=np.zeros(5, np.float32))
+    np.testing.assert_allclose(estimate_force(ForceEstimate(), unknown, taxels, torque), [2.0, 0.5, 0.0, 6.0, 0.0])
+    own = hand.force_per_torque * hand.torque_limit[hand.root_joint] * [0.1, 0.2, 0.3, 0.1, 0.4]
+    wanted = np.maximum([2.0, 0.5, 0.0, 6.0, 0.0], own * [1, 1, 0, 1, 0])
+    np.testing.assert_allclose(estimate_force(ForceEstimate(), hand, taxels, torque), wanted, rtol=1e-5)
     with pytest.raises(ConfigError, match="per_torque has 2 values, the hand 5 fingers"):
         estimate_force(ForceEstimate(per_torque=(1.0, 2.0)), hand, taxels, torque)
 

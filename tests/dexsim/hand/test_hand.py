@@ -455,6 +455,15 @@ BAD_TABLES = [
     bad("finger without a tip", "pinch.toml", "tip", table=table('tip = "left_tip"\n', "")),
     bad("finger without a name", "pinch.toml", "name", table=table('name = "left"\n', "")),
     bad("finger without a root joint", "pinch.toml", "root_joint", table=table('root_joint = "left_a"\n', "")),
+    *(
+        bad(
+            f"force per torque {value}",
+            "pinch.toml",
+            "force_per_torque",
+            table=f"{PINCH_TOML}force_per_torque = {value}",
+        )
+        for value in ("-1.0", "nan", '"strong"', "1e9", "true")
+    ),
     bad("too few speeds", "pinch.toml", "speed_limits", table=table("[1, 2, 3, 4]", "[1, 2, 3]")),
     bad("speed of zero", "pinch.toml", "speed_limits", table=table("[1, 2, 3, 4]", "[1, 0, 3, 4]")),
     bad("speed not a number", "pinch.toml", "speed_limits", table=table("[1, 2, 3, 4]", "[1, nan, 3, 4]")),
