@@ -201,6 +201,7 @@ def test_metrics_of_grasps_count_only_what_was_held(benchmark):
             "finger_normal": (1 + c) ** 2,
             "finger_taxels": 1 - c,
             "total_force": 9 + c,
+            "total_torque": 0.5 + c,
             "torque_limited": 0.6 * (c == 1),
             "seconds": 8.0 if held else 5.5,
             "window_s": [3.0, 8.0],
