@@ -37,9 +37,10 @@ def summarize(
       A JSON-able dict. Forces are averaged over the ticks of "window_s": from 3 s after release (from the middle of
       shorter episodes) to the end, for episodes held to the end. They are means over the touching fingers among those
       commanded (all but the thumb); "total_force" is the solver's force summed over all fingers, "taxel_force" that
-      sum as the taxels feel it. "total_torque" is the sum over touching fingers of the root joint's torque as a share of
-      its limit; "r_torque" correlates it with the command, "slope_torque" and "slope_force_n" are the least-squares
-      slopes of it and of the finger force over the command. "r_resultant", "r_normal" and "r_taxels" correlate command and force, see `FORCES`.
+      sum as the taxels feel it. "r_resultant", "r_normal" and "r_taxels" correlate command and force, see `FORCES`.
+      "total_torque" is the sum over touching fingers of the root joint's torque as a share of its limit; "r_torque"
+      correlates it with the command. "slope_torque" and "slope_force_n" are least-squares slopes over the command, of
+      it and of the finger force.
       "torque_limited" is the share of these ticks with a joint at its torque limit: there force cannot follow.
       "force_error_n" is the root mean square error of the resultant over all episodes; a lost object is not pressed.
       Intervals are 95 %: Wilson's for proportions, else bootstrap over episodes.
