@@ -96,6 +96,7 @@ def run(experiment: Experiment, budget: Budget, output: Path, work: Path) -> lis
       DexsimError: a training or a measurement failed; what was done before it is kept.
     """
     cli.enable_caches()
+    commit()  # of the code that is loaded now
     for row in experiment.rows:
         path = report_path(output, experiment, row)
         report = load_report(path)

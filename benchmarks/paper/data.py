@@ -1,6 +1,7 @@
 """What a table or figure is made of: rows, seeds and budgets; and where its reports are."""
 
 import dataclasses
+import functools
 import json
 import subprocess
 from collections.abc import Callable
@@ -171,9 +172,10 @@ def is_done(experiment: Experiment, row: Row, budget: Budget, report: dict[str, 
     return level > budget.level or (level == budget.level and len(report["seeds"]) >= len(experiment.seeds(budget)))
 
 
+@functools.cache
 def commit() -> str:
-    """The commit that runs, in seven digits, and whether the files differ from it."""
-    git = ["git", "-C", str(ROOT)]
+    """The commit that runs, in seven digits, and whether the code differs from it."""
+    git, code = ["git", "-C", str(ROOT)], ("dexsim", "dexsim_ppo", "dexsim_real", "benchmarks", "assets")
     found = subprocess.run([*git, "rev-parse", "--short=7", "HEAD"], capture_output=True, text=True)
-    changed = subprocess.run([*git, "status", "--porcelain", "-uno"], capture_output=True, text=True)
+    changed = subprocess.run([*git, "status", "--porcelain", "-uno", *code], capture_output=True, text=True)
     return found.stdout.strip() + (" (changed)" if changed.stdout.strip() else "")

@@ -107,9 +107,8 @@ def skin(experiment: Experiment, reports: Reports, folder: Path) -> list[Path]:
     left.plot(strain, 1e-3 * np.array(curves["linear"]), "--", color="0.5", label="slope at small strain")
     left.plot(felt[:, 0], 1e-3 * felt[:, 1], "o", ms=3, color=COLORS[1], label="taxel under a flat face")
     for color, name in zip(COLORS, (n for n in curves if n not in ("skin", "linear")), strict=False):
-        right.plot(strain, 1e-3 * np.array(curves[name]), color=color, label=name.replace("_", " "))
+        right.plot(strain[1:], 1e-3 * np.array(curves[name])[1:], color=color, label=name.replace("_", " "))
     right.set_yscale("log")
-    right.set_ylim(1.0, None)
     for axis, title in ((left, "the hand's skin"), (right, "silicones")):
         axis.set(xlabel="compression [%]", ylabel="stress [kPa]", title=title)
         axis.legend(fontsize=7, frameon=False)
@@ -130,7 +129,9 @@ def contacts(experiment: Experiment, reports: Reports, folder: Path) -> list[Pat
             above.plot(centres[:, 0], centres[:, 1], ".", ms=4, alpha=0.4, color=color, label=label)
             below.plot(times, force[:, finger], lw=1.2, color=color)
             above.set(title=_FINGERS[finger], xlim=(-0.7, 9.7), ylim=(-0.7, 11.7), xlabel="column", aspect="equal")
-            below.set(xlabel="time [s]", ylim=(0, None))
+    highest = max(np.percentile(np.array(found[world]["force_n"]), 99.5) for world in ("simulation", "hand"))
+    for axis in axes[1]:
+        axis.set(xlabel="time [s]", ylim=(0, 1.05 * highest))
     axes[0, 0].set_ylabel("row (tip at the top)")
     axes[1, 0].set_ylabel("force on the taxels [N]")
     axes[0, 0].legend(fontsize=7, frameon=False)

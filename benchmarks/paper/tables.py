@@ -50,7 +50,7 @@ def seeds(report: dict[str, Any] | None) -> list[dict[str, Any]]:
 def how(experiment: Experiment, row: Row, report: dict[str, Any] | None) -> str:
     """Where a row's numbers are from."""
     if not report:
-        return "shipped policy, one seed, GPU" if row.policy else UNTRAINED
+        return "shipped policy, one seed, trained on a GPU" if row.policy else UNTRAINED
     count = len(report["seeds"])
     trained = [seed["training"] for seed in seeds(report) if seed.get("training")]
     if not trained:
