@@ -4,9 +4,6 @@ from paper import figure_data, figures, measure, tables
 from paper.data import Experiment, Row
 from paper.measure import points_at_twice
 
-_HAND = (
-    "The paper's numbers are from its real hand; ours are from simulation and from the emulated hand, never a real one."
-)
 _PAPER = {
     "full": ("25.1 / 22.0 / 3.36 / 84.3", "8, 10, 12, 15, 19, 25, 26, 35, 46, 55"),
     "quaternion": ("2.9 / 2.5 / 5.24 / 15.2", "1, 1, 1, 1, 2, 3, 4, 5, 5, 6"),
@@ -92,7 +89,6 @@ _REWARDS = (
         label="R_force and R_torque",
         task="grasp",
         settings=("reward.force=2", "reward.torque=0.2"),
-        policy="grasp",
         paper={"force range [N]": "44.50–93.92", "torque range": "1.09–1.52"},
     ),
     Row(
@@ -126,7 +122,7 @@ _ALL = (
         measure=measure.trained,
         table=tables.rotation,
         draw=figures.successes,
-        differs=f"{_HAND} A success asks for a spin below 2 rad/s as well; a trial ends after 120 s.",
+        differs="A success asks for a spin below 2 rad/s as well; a trial ends after 120 s.",
         trains=True,
         minutes=12.0,
     ),
@@ -137,7 +133,7 @@ _ALL = (
         measure=measure.trained,
         table=tables.rotation,
         draw=figures.successes,
-        differs=f"{_HAND} A trial ends after 120 s.",
+        differs="A trial ends after 120 s.",
         trains=True,
         minutes=12.0,
     ),
@@ -162,7 +158,7 @@ _ALL = (
         measure=measure.trained,
         table=tables.grasp,
         draw=figures.command_curves,
-        differs=f"{_HAND} Our targets are 2 to 7 N a finger; the paper's hand presses harder. The paper does not say "
+        differs="Our targets are 2 to 7 N a finger; the paper's hand presses harder. The paper does not say "
         "what its joint torque is a share of. Ours is the sum over touching fingers of the root joint's torque over "
         "its limit. Alone, R_torque has the weight that R_force has.",
         trains=True,
@@ -175,7 +171,7 @@ _ALL = (
         measure=measure.shipped,
         table=tables.commands,
         draw=figures.command_curves,
-        differs=f"{_HAND} Torque on the emulated hand is what the bridge measures through the current.",
+        differs="Torque on the emulated hand is what the bridge measures through the current.",
         minutes=4.0,
     ),
     Experiment(
@@ -185,7 +181,7 @@ _ALL = (
         measure=figure_data.calibration,
         table=tables.calibration,
         draw=figures.copied,
-        differs=f"{_HAND} The emulated hand's motors have friction and other gains than the model in training.",
+        differs="The emulated hand's motors have friction and other gains than the model in training.",
         minutes=1.0,
     ),
     Experiment(
@@ -206,7 +202,7 @@ _ALL = (
         measure=figure_data.contacts,
         table=tables.contacts,
         draw=figures.contacts,
-        differs=f"{_HAND} The actions of a grasp on the emulated hand are repeated in simulation, open loop.",
+        differs="The actions of a grasp on the emulated hand are repeated in simulation, open loop.",
         minutes=1.0,
     ),
     Experiment(
@@ -222,7 +218,7 @@ _ALL = (
         measure=measure.on_the_hand,
         table=tables.rotation,
         draw=figures.successes,
-        differs=f"{_HAND} Every parameter is outside training's ranges. A success asks for a spin below 2 rad/s as "
+        differs="Every parameter is outside training's ranges. A success asks for a spin below 2 rad/s as "
         "well; a trial ends after 120 s.",
         minutes=6.0,
     ),

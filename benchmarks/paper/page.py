@@ -13,9 +13,9 @@ _HEAD = """# Results beside the paper's
 Made from the reports in `docs/results` by `python benchmarks/paper.py page`. The command under each table measures it
 anew: `--list` shows what is done, `--budget gpu` trains longer and measures more, `--output docs/results` writes here.
 
-Numbers in brackets: of one seed the 95 % interval over episodes or trials, of several the lowest and highest seed. No
-policy has run on a real hand yet. The emulated hand is another simulator behind the bridge's own frames; every
-parameter is outside training's ranges.
+The paper's numbers are from its real hand. No policy of ours has run on one yet: the emulated hand is another simulator
+behind the bridge's own frames, with every parameter outside training's ranges. Numbers in brackets: of one seed the
+95 % interval over episodes or trials, of several the lowest and highest seed.
 """
 
 
@@ -47,11 +47,9 @@ def _section(experiment: Experiment, reports: dict[str, dict[str, Any]], folder:
     lines = [f"## {experiment.title}", ""]
     if experiment.table and (reports or experiment.trains):
         lines += [markdown(experiment.table(experiment, reports)), ""]
-    if experiment.name == "skin" and reports:
-        worst = max(seed["worst_deviation"] for seed in seeds(next(iter(reports.values()))))
-        lines += [f"Largest deviation of the touch model from the law in closed form: {worst:.1g} of it.", ""]
-    if not reports:
-        lines += ["Not measured yet." if not experiment.trains else "Not trained yet.", ""]
+    if not reports and not experiment.trains:
+        lines += ["Not measured yet.", ""]
+    lines += [line for report in reports.values() for seed in seeds(report) for line in _summary(seed)]
     figures = sorted(path for path in (folder / experiment.name).rglob("*") if path.suffix in (".svg", ".jpg"))
     for path in figures:
         where = Path(os.path.relpath(path, PAGE.parent)).as_posix()
@@ -59,6 +57,18 @@ def _section(experiment: Experiment, reports: dict[str, dict[str, Any]], folder:
     lines += [f"What differs: {experiment.differs}", ""]
     lines += [_source(experiment, reports), ""]
     return "\n".join(lines)
+
+
+def _summary(seed: dict[str, Any]) -> list[str]:
+    """What a report says in one sentence, if it does."""
+    if "worst_deviation" in seed:
+        return [f"The touch model deviates from the law in closed form by at most {seed['worst_deviation']:.2%}.", ""]
+    report = seed.get("simulation", {})
+    if len(report.get("by_shape", ())) < 20:  # The task's own shapes are fewer.
+        return []
+    worst = min(report["by_shape"], key=lambda row: row["held"]["mean"])
+    held = f"{100 * report['held']['mean']:.1f} % of {report['episodes']} episodes are held"
+    return [f"{held}. The worst object is the {worst['shape']}: {100 * worst['held']['mean']:.0f} %.", ""]
 
 
 def _source(experiment: Experiment, reports: dict[str, dict[str, Any]]) -> str:

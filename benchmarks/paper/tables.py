@@ -204,7 +204,8 @@ def calibration(experiment: Experiment, reports: Reports) -> list[list[str]]:
     for row in (row for report in reports.values() for s in seeds(report) for row in s["joints"]):
         worst = min(row["loading_r_squared"], row["unloading_r_squared"])
         largest = f"{row['force_max_n']:.3g}", f"{row['current_max_a']:.3g}", f"{row['torque_max_nm']:.3g}"
-        ratio = f"{row['nm_per_a']:.3g}", f"{row['true_nm_per_a']:.3g}"
+        # This hand's currents are negative when it closes.
+        ratio = f"{-row['nm_per_a']:.3g}", f"{-row['true_nm_per_a']:.3g}"
         lines.append([row["joint"], *largest, f"{worst:.3f}", *ratio])
     return lines
 
