@@ -108,6 +108,8 @@ class Row:
     """Observation fields that the policy does without."""
     points: tuple[float, ...] = ()
     """Of a sweep, in order."""
+    training: tuple[float, float] | None = None
+    """The range of training that a sweep goes beyond; None where training has one value."""
     paper: dict[str, str] = dataclasses.field(default_factory=dict)
     """The paper's numbers, by column."""
 
@@ -160,7 +162,7 @@ def settings_of(row: Row) -> dict[str, Any]:
     return {
         name: list(value) if isinstance(value, tuple) else value
         for name, value in dataclasses.asdict(row).items()
-        if name not in ("label", "paper")
+        if name not in ("label", "paper", "training")
     }
 
 

@@ -47,27 +47,35 @@ def _observation_rows(task: str) -> tuple[Row, ...]:
 
 
 def _sweep_rows() -> tuple[Row, ...]:
-    """Parameter, configuration, points: the ends of twice the range of training, and of that range between them."""
-    grasp = (
-        ("friction", "finger friction", "objects.friction=[{},{}]", points_at_twice(0.6, 1.2)),
-        ("link_friction", "link friction", "objects.link_friction=[{},{}]", points_at_twice(0.6, 1.2)),
-        ("mass", "mass [kg]", "objects.mass=[{},{}]", points_at_twice(0.05, 0.20, 0.02)),
-        ("latency", "command latency [s]", "randomization.latency=[{},{}]", (0.0, 0.01, 0.02, 0.03)),
-        ("torque_gain", "torque gain", "randomization.torque_gain=[{},{}]", points_at_twice(0.9, 1.1)),
-        ("taxel_noise", "taxel noise [N]", "sensing.taxel.noise={}", (0.0, 0.01, 0.02, 0.04)),
-        ("dead_taxels", "dead taxels [share]", "sensing.taxel.dead=[{},{}]", (0.0, 0.05, 0.1, 0.2)),
-        ("lean", "mount lean, at most [rad]", "randomization.gravity_tilt={}", (0.0, 0.05, 0.1, 0.2)),
+    """The rows of both skills. With a range of training the points are its ends and those of a range twice as wide."""
+    shared = (
+        ("friction", "finger friction", "objects.friction=[{},{}]", (0.6, 1.2), ()),
+        ("latency", "command latency [s]", "randomization.latency=[{},{}]", (0.0, 0.02), (0.0, 0.01, 0.02, 0.03)),
+        ("torque_gain", "torque gain", "randomization.torque_gain=[{},{}]", (0.9, 1.1), ()),
+        ("taxel_noise", "taxel noise [N]", "sensing.taxel.noise={}", None, (0.0, 0.01, 0.02, 0.04)),
+        ("dead_taxels", "dead taxels [share]", "sensing.taxel.dead=[{},{}]", None, (0.0, 0.05, 0.1, 0.2)),
+        ("lean", "mount lean, at most [rad]", "randomization.gravity_tilt={}", (0.0, 0.1), (0.0, 0.05, 0.1, 0.2)),
     )
-    rotate = (
-        grasp[0],
-        ("link_friction", "link friction", "objects.link_friction=[{},{}]", points_at_twice(0.3, 0.7)),
-        ("mass", "mass [kg]", "objects.mass=[{},{}]", points_at_twice(0.06, 0.15, 0.02)),
-        *grasp[3:],
-        ("orientation", "orientation error, at most [rad]", "sensing.orientation.bias={}", (0.0, 0.02, 0.04, 0.08)),
-        ("edge", "cube edge [m]", "edge=[{},{}]", points_at_twice(0.050, 0.060)),
-    )
+    own = {
+        "grasp": (
+            ("link_friction", "link friction", "objects.link_friction=[{},{}]", (0.6, 1.2), ()),
+            ("mass", "mass [kg]", "objects.mass=[{},{}]", (0.05, 0.20), ()),
+        ),
+        "rotate": (
+            ("link_friction", "link friction", "objects.link_friction=[{},{}]", (0.3, 0.7), ()),
+            ("mass", "mass [kg]", "objects.mass=[{},{}]", (0.06, 0.15), ()),
+            (
+                "orientation",
+                "orientation error, at most [rad]",
+                "sensing.orientation.bias={}",
+                (0.0, 0.04),
+                (0.0, 0.02, 0.04, 0.08),
+            ),
+            ("edge", "cube edge [m]", "edge=[{},{}]", (0.050, 0.060), ()),
+        ),
+    }
     rows = []
-    for skill, sweeps in (("grasp", grasp), ("rotate", rotate)):
+    for skill, sweeps in own.items():
         rows.append(Row(name=f"{skill}_reference", label=f"{skill}: training's ranges", task=skill, policy=skill))
         rows += [
             Row(
@@ -76,9 +84,10 @@ def _sweep_rows() -> tuple[Row, ...]:
                 task=skill,
                 policy=skill,
                 settings=(setting,),
-                points=points,
+                points=points or points_at_twice(*training, floor=0.02),
+                training=training,
             )
-            for name, label, setting, points in sweeps
+            for name, label, setting, training, points in (*shared, *sweeps)
         ]
     return tuple(rows)
 

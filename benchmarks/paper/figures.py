@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from paper.data import Experiment, Row
+from paper.data import Experiment
 from paper.tables import seeds
 
 Reports = dict[str, dict[str, Any]]
@@ -161,7 +161,8 @@ def sweeps(experiment: Experiment, reports: Reports, folder: Path) -> list[Path]
             if reference:
                 axis.axhline(reference[1], ls=":", color="0.5", lw=1)
                 axis.axhspan(reference[2], reference[3], color="0.5", alpha=0.12, lw=0)
-            _shade_training(axis, row)
+            if row.training:
+                axis.axvspan(*row.training, color=COLORS[2], alpha=0.10, lw=0)
             axis.set_xlabel(row.label.partition(": ")[2], fontsize=8)
             axis.tick_params(labelsize=7)
             axis.set_ylim(0, None if skill == "rotate" else 104)
@@ -178,10 +179,3 @@ def _points(report: dict[str, Any] | None, skill: str) -> Iterator[tuple[float, 
         if entry["mean"] is not None:
             where = np.nan if point["point"] is None else point["point"]
             yield where, factor * entry["mean"], factor * entry["low"], factor * entry["high"]
-
-
-def _shade_training(axis: Any, row: Row) -> None:
-    """The range of training, where the points are the ends of twice its width."""
-    a, b, c, d = row.points
-    if a < b < c < d and abs((a + d) / 2 - (b + c) / 2) < 1e-9:
-        axis.axvspan(b, c, color=COLORS[2], alpha=0.10, lw=0)

@@ -222,7 +222,7 @@ def contacts(experiment: Experiment, reports: Reports) -> list[list[str]]:
 
 def sweeps(experiment: Experiment, reports: Reports) -> list[list[str]]:
     """Success at the measured points of each parameter."""
-    lines = [["sweep", "value: grasps held [%], or cubes kept [%] and turns a minute"]]
+    lines = [["sweep", "**value**: grasps held [%] and r of the force, or cubes kept [%] and turns a minute"]]
     for row in experiment.rows:
         points = [point for seed in seeds(reports.get(row.name)) for point in seed["points"]]
         texts = [_point(row.skill)(point) for point in points]
@@ -234,7 +234,7 @@ def _point(skill: str) -> Callable[[dict[str, Any]], str]:
     def text(point: dict[str, Any]) -> str:
         name = "" if point["point"] is None else f"**{point['point']:.3g}**: "
         if skill == "grasp":
-            return f"{name}{percent([point['held']])}"
+            return f"{name}{percent([point['held']])}, {cell([{'r': point['r_resultant']['r']}])}"
         return f"{name}{percent([point['kept_to_the_end']])}, {cell([point['successes_per_minute']])}"
 
     return text

@@ -224,6 +224,17 @@ def test_observations_of_the_rows(paper):
     }
 
 
+def test_ranges_of_training_are_those_of_the_shipped_policies(paper):
+    from dexsim_ppo import load_policy
+
+    for row in paper.experiments.EXPERIMENTS["robustness"].rows:
+        if row.training:
+            value = load_policy(row.policy).env_config
+            for name in row.settings[0].partition("=")[0].split("."):
+                value = value[name]
+            assert row.training == pytest.approx(tuple(value) if isinstance(value, (list, tuple)) else (0.0, value))
+
+
 def test_sweeps_reach_twice_the_range_of_training(paper):
     assert paper.measure.points_at_twice(0.6, 1.2) == pytest.approx((0.3, 0.6, 1.2, 1.5))
     assert paper.measure.points_at_twice(0.05, 0.2, 0.02) == pytest.approx((0.02, 0.05, 0.2, 0.275))
@@ -301,7 +312,11 @@ def test_a_cell_is_of_one_seed_or_of_several(paper):
     cell = paper.tables.cell
     one = {"mean": 0.5, "low": 0.4, "high": 0.6}
     assert cell([one]) == "0.5 (0.4–0.6)" and cell([one, {"mean": 0.7}]) == "0.6 (0.5–0.7)"
-    assert cell([None, {"mean": None}]) == "" and paper.tables.percent([one]) == "50 (40–60)"
+    assert (
+        cell([{"r": 0.25, "low": None, "high": None}]) == "0.25"
+        and cell([None, {"mean": None}]) == ""
+        and paper.tables.percent([one]) == "50 (40–60)"
+    )
 
 
 def test_rows_without_training_say_so(paper):
