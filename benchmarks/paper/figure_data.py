@@ -46,7 +46,7 @@ def calibration(row: Row, seed: int, budget: Budget, work: Path) -> dict[str, An
         realtime=False,
         fingers=(row.name,),
         sides=False,
-        press=PressConfig() if budget.minutes else PressConfig(cycles=3, seconds=1.5),
+        press=PressConfig() if budget.minutes else PressConfig(seconds=2.0),
     )
     operator = Operator(Console(file=io.StringIO()), assume_yes=True)
     record(arguments, hand, operator, port=port, clock=port.clock, sleep=port.sleep)
