@@ -83,7 +83,8 @@ def _sweep_rows() -> tuple[Row, ...]:
                 label=f"{skill}: {label}",
                 task=skill,
                 policy=skill,
-                settings=(setting,),
+                # Few small cubes stay in the hand: a pool that they can fill.
+                settings=(setting, "pool_size=256") if name == "edge" else (setting,),
                 points=points or points_at_twice(*training, floor=0.02),
                 training=training,
             )
