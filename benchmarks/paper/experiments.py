@@ -251,7 +251,7 @@ _ALL = (
         draw=figures.sweeps,
         differs="Not in the paper. One parameter at a time has one value, the others have training's ranges. Latency "
         "ends at one control tick, the most that is modelled; training has no dead taxels and one level of taxel noise "
-        "(0.02 N). Episodes of the rotation last 20 s.",
+        "(0.02 N). The rotation's policy observes no torque. Its episodes last 20 s.",
         minutes=0.9,
     ),
 )

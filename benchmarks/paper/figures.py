@@ -157,7 +157,16 @@ def sweeps(experiment: Experiment, reports: Reports, folder: Path) -> list[Path]
         for axis, row in zip(axes.ravel(), shown, strict=False):
             points = np.array(list(_points(reports[row.name], skill)), float).reshape(-1, 4)
             off = np.maximum(np.abs(points[:, 2:].T - points[:, 1]), 0.0)
-            axis.errorbar(points[:, 0], points[:, 1], off, fmt="o-", ms=3, lw=1.2, capsize=2, color=COLORS[0])
+            axis.errorbar(
+                points[:, 0],
+                points[:, 1],
+                off,
+                fmt="o-" if len(points) > 2 else "o",
+                ms=3,
+                lw=1.2,
+                capsize=2,
+                color=COLORS[0],
+            )
             if reference:
                 axis.axhline(reference[1], ls=":", color="0.5", lw=1)
                 axis.axhspan(reference[2], reference[3], color="0.5", alpha=0.12, lw=0)
