@@ -7,7 +7,8 @@
     python benchmarks/paper.py page                        docs/results.md from the reports in docs/results
 
 Every row writes `report.json` as soon as a seed of it is done, so that an interrupted command goes on there. A row that
-was measured with a larger budget is kept. Trainings are in `runs/paper`, and are resumed as well.
+was measured with a larger budget is kept. Trainings are in `runs/paper`, and are resumed as well. The parts are in the
+folder of the same name, which Python finds before this file.
 """
 
 from paper.command import main

@@ -199,6 +199,7 @@ def simulated(task: str, policy: str) -> dict[str, Any]:
     """The same metrics from the policy's report in simulation; those that it has."""
     from dexsim.core.assets import asset_path
     from dexsim.core.errors import DexsimError
+    from dexsim.tasks.grasp.report import FORCES
 
     path = Path(policy).with_suffix(".json")
     try:
@@ -208,7 +209,16 @@ def simulated(task: str, policy: str) -> dict[str, Any]:
     except (OSError, KeyError, ValueError, DexsimError):
         return {}
     if task == "grasp":
-        names = "held", "force_error_n", "r_resultant", "r_normal", "r_taxels", "torque_limited", "by_command"
+        names = (
+            "held",
+            "force_error_n",
+            *FORCES,
+            "r_torque",
+            "slope_force_n",
+            "slope_torque",
+            "torque_limited",
+            "by_command",
+        )
         return {name: report[name] for name in names if name in report}
     counts = {
         name: report[name]["mean"] | {"median": report[name]["median"]["median"]}

@@ -41,7 +41,6 @@ class Budget:
     """For trials. More than one runs them in processes of their own, as a GPU needs: the bridge's JAX is on the CPU."""
 
 
-_FULL = {"points": 4, "episodes": {"grasp": 256, "rotate": 256}, "seconds": {"grasp": 8.0, "rotate": 20.0}}
 BUDGETS = {
     budget.name: budget
     for budget in (
@@ -70,7 +69,7 @@ BUDGETS = {
             trials={"grasp": 25, "rotate": 10},
             seconds={},
             sweep={"points": 2, "episodes": {"grasp": 25, "rotate": 16}, "seconds": {"grasp": 8.0, "rotate": 20.0}},
-            objects=10,
+            objects=25,
             processes=1,
         ),
         Budget(
@@ -83,7 +82,7 @@ BUDGETS = {
             episodes={"grasp": 1024, "rotate": 1024},
             trials={"grasp": 50, "rotate": 10},
             seconds={},
-            sweep=_FULL,
+            sweep={"points": 4, "episodes": {"grasp": 256, "rotate": 256}, "seconds": {"grasp": 8.0, "rotate": 20.0}},
             objects=50,
             processes=8,
         ),
