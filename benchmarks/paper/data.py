@@ -8,6 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from dexsim.core.errors import ConfigError
+
 ROOT = Path(__file__).resolve().parents[2]
 REPORTS = ROOT / "docs" / "results"
 """Reports in the repository, of which the page of results is made."""
@@ -152,8 +154,20 @@ def report_path(folder: Path, experiment: Experiment, row: Row) -> Path:
 
 
 def load_report(path: Path) -> dict[str, Any]:
-    """A row's report; empty if there is none."""
-    return json.loads(path.read_text()) if path.is_file() else {}
+    """A row's report; empty if there is none.
+
+    Raises:
+      ConfigError: the file is no report.
+    """
+    if not path.is_file():
+        return {}
+    try:
+        report = json.loads(path.read_text())
+        if report["budget"] in BUDGETS and isinstance(report["seeds"], dict) and report["row"]:
+            return report
+    except (ValueError, KeyError, TypeError):
+        pass
+    raise ConfigError(f"{path}: is not a report of a row; delete it, and the row is measured anew")
 
 
 def settings_of(row: Row) -> dict[str, Any]:

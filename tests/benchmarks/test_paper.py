@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from paths import ROOT
 
+from dexsim.core.errors import ConfigError
+
 pytest.importorskip("serial")
 if not (ROOT / "docs" / "results").exists():
     pytest.skip("needs a checkout", allow_module_level=True)
@@ -119,6 +121,17 @@ class TestResuming:
         paper.command.run(only, budget, here, here / "work")
         head, first, second, _ = paper.command.listing(experiment, budget, here)
         assert "about 126 min left" in head and "3 of 3 seeds, cpu budget" in first and "0 of 3 seeds" in second
+
+    @pytest.mark.parametrize(
+        "text", ["", '{"budget": "cpu"', "[]", '{"budget": "large", "row": {"a": 1}, "seeds": {}}']
+    )
+    def test_a_file_that_is_no_report_is_named(self, paper, here, text):
+        experiment, calls = stub(paper)
+        path = here / "stub" / "b" / "report.json"
+        path.parent.mkdir(parents=True)
+        path.write_text(text)
+        with pytest.raises(ConfigError, match="stub/b/report.json: is not a report of a row; delete it"):
+            list(paper.command.listing(experiment, paper.data.BUDGETS["cpu"], here))
 
     def test_an_unknown_name_is_refused(self, paper, capsys):
         with pytest.raises(SystemExit):
