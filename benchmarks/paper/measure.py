@@ -70,7 +70,6 @@ def train(row: Row, seed: int, budget: Budget, folder: Path) -> tuple[Path, dict
         "minutes": budget.minutes[row.skill],
         "seed": seed,
         "hardware": report["hardware"],
-        "command": report["command"],
     }
 
 
