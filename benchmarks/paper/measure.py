@@ -22,10 +22,10 @@ HELD_OUT_POOL = 480
 def trained(row: Row, seed: int, budget: Budget, work: Path) -> dict[str, Any]:
     """Train a seed of a row, or finish its training; then measure the policy in both worlds.
 
-    A budget without training measures the shipped policy of the skill in its place.
+    A budget without training measures the shipped policy of the skill in its place, one for all rows.
     """
     if not budget.minutes:
-        return shipped(row, seed, budget, work) | {"training": None}
+        return _both_worlds(row, row.skill, seed, budget) | {"training": None}
     file, training = train(row, seed, budget, work)
     return _both_worlds(row, str(file), seed, budget) | {"training": training}
 
@@ -33,7 +33,7 @@ def trained(row: Row, seed: int, budget: Budget, work: Path) -> dict[str, Any]:
 def shipped(row: Row, seed: int, budget: Budget, work: Path) -> dict[str, Any]:
     """A shipped policy in both worlds."""
     del work
-    return _both_worlds(row, row.policy or row.skill, seed, budget)
+    return _both_worlds(row, row.policy, seed, budget)
 
 
 def _both_worlds(row: Row, policy: str, seed: int, budget: Budget) -> dict[str, Any]:
