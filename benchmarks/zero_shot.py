@@ -73,8 +73,23 @@ def run_trial(options: dict[str, Any], seed: int, number: int) -> dict[str, Any]
     began = time.perf_counter()
     limits = SafetyConfig(**options.get("limit", {}))
     run = VirtualRun(plant, controller, calibration, RunOptions(command, safety=options["safety"], limits=limits))
+    if options["task"] == "grasp":
+        run.trace = []
     report = run.run()
+    if run.trace:
+        report["total_torque"] = _measured_torque(run.trace, hand, report["window_s"])
     return report | {"wall": round(time.perf_counter() - began, 2)}
+
+
+def _measured_torque(trace: list[dict[str, Any]], hand: Any, window: list[float]) -> float:
+    """Sum over touching fingers of the root joint's torque as a share of its limit, as the bridge measures it: mean
+    over the window [s]. The runner's clock starts with its first tick, when the object is let go."""
+    sums = [
+        float(np.abs(entry["tick"].readings.joint_torque[hand.root_joint])[entry["measured"].finger_force > 0.0].sum())
+        for entry in trace
+        if window[0] <= entry["time"] - trace[0]["time"] < window[1]
+    ]
+    return round(float(np.mean(sums)), 4) if sums else 0.0
 
 
 def run_all(options: dict[str, Any], trials: int, processes: int, show: bool) -> list[dict[str, Any]]:
@@ -109,16 +124,18 @@ def _shown(report: dict[str, Any], show: bool) -> dict[str, Any]:
 def grasp_metrics(reports: list[dict[str, Any]], span: tuple[float, float]) -> dict[str, Any]:
     """Success rate, force error over all trials, and correlation of the forces of held objects with the command.
 
-    Names, window and forces are those of the evaluation in simulation (`dexsim.tasks.grasp.report`).
+    Names, window and forces are those of the evaluation in simulation (`dexsim.tasks.grasp.report`); torques are as the
+    bridge measures them.
 
     Args:
       reports: the referee's, of trials.
       span: N, target force per touching finger at command 0 and 1.
     """
     from dexsim.core.statistics import mean, proportion
-    from dexsim.tasks.grasp.report import FORCES, correlations, force_error, saturates
+    from dexsim.tasks.grasp.report import FORCES, correlations, force_error, pearson, saturates, slope
 
-    held, names = np.array([r["held"] for r in reports]), (*FORCES.values(), "total_force", "torque_limited")
+    held = np.array([r["held"] for r in reports])
+    names = (*FORCES.values(), "total_force", "total_torque", "torque_limited")
     command, *columns = (np.array([r[name] for r in reports], float) for name in ("command", *names))
     mean_of = dict(zip(names, columns, strict=True))
     # A referee's means end with the trial; a lost object is not pressed for the rest of the window.
@@ -139,6 +156,9 @@ def grasp_metrics(reports: list[dict[str, Any]], span: tuple[float, float]) -> d
         "held": proportion(held),
         "force_error_n": force_error(np.where(held, 1.0, lived) * mean_of["finger_force"], wanted),
         **correlations(command, held, mean_of),
+        "r_torque": pearson(command[held], mean_of["total_torque"][held]),
+        "slope_force_n": slope(command[held], mean_of["finger_force"][held]),
+        "slope_torque": slope(command[held], mean_of["total_torque"][held]),
         "torque_limited": mean(mean_of["torque_limited"][held]),
         "window_s": [float(start.min()), float(end.max())],
         "by_command": by_command,
@@ -179,6 +199,7 @@ def simulated(task: str, policy: str) -> dict[str, Any]:
     """The same metrics from the policy's report in simulation; those that it has."""
     from dexsim.core.assets import asset_path
     from dexsim.core.errors import DexsimError
+    from dexsim.tasks.grasp.report import FORCES
 
     path = Path(policy).with_suffix(".json")
     try:
@@ -188,7 +209,16 @@ def simulated(task: str, policy: str) -> dict[str, Any]:
     except (OSError, KeyError, ValueError, DexsimError):
         return {}
     if task == "grasp":
-        names = "held", "force_error_n", "r_resultant", "r_normal", "r_taxels", "torque_limited", "by_command"
+        names = (
+            "held",
+            "force_error_n",
+            *FORCES,
+            "r_torque",
+            "slope_force_n",
+            "slope_torque",
+            "torque_limited",
+            "by_command",
+        )
         return {name: report[name] for name in names if name in report}
     counts = {
         name: report[name]["mean"] | {"median": report[name]["median"]["median"]}

@@ -9,7 +9,7 @@ SETTLE = 3.0  # s after release from which forces count
 FORCES = {"r_resultant": "finger_force", "r_normal": "finger_normal", "r_taxels": "finger_taxels"}
 """Correlations with the command, and the metric of each: a touching finger's whole contact force with friction, what of
 it presses into the skin, and what of that the taxels bear."""
-_MEANS = (*FORCES.values(), "total_force", "taxel_force", "thumb_force", "touching", "torque_limited")
+_MEANS = (*FORCES.values(), "total_force", "total_torque", "taxel_force", "thumb_force", "touching", "torque_limited")
 
 
 def window(seconds: float) -> tuple[float, float]:
@@ -18,7 +18,11 @@ def window(seconds: float) -> tuple[float, float]:
 
 
 def summarize(
-    metrics: dict[str, np.ndarray], alive: np.ndarray, control_period: float, span: tuple[float, float]
+    metrics: dict[str, np.ndarray],
+    alive: np.ndarray,
+    control_period: float,
+    span: tuple[float, float],
+    shapes: tuple[str, ...] = KINDS,
 ) -> dict:
     """Reduce an evaluation to a report.
 
@@ -27,12 +31,16 @@ def summarize(
       alive: [T, N] bool, False after the object was lost.
       control_period: s.
       span: N, target force per touching finger at command 0 and 1.
+      shapes: names of what the metric "shape" counts.
 
     Returns:
       A JSON-able dict. Forces are averaged over the ticks of "window_s": from 3 s after release (from the middle of
       shorter episodes) to the end, for episodes held to the end. They are means over the touching fingers among those
       commanded (all but the thumb); "total_force" is the solver's force summed over all fingers, "taxel_force" that
       sum as the taxels feel it. "r_resultant", "r_normal" and "r_taxels" correlate command and force, see `FORCES`.
+      "total_torque" is the sum over touching fingers of the root joint's torque as a share of its limit; "r_torque"
+      correlates it with the command. "slope_torque" and "slope_force_n" are least-squares slopes over the command, of
+      it and of the finger force.
       "torque_limited" is the share of these ticks with a joint at its torque limit: there force cannot follow.
       "force_error_n" is the root mean square error of the resultant over all episodes; a lost object is not pressed.
       Intervals are 95 %: Wilson's for proportions, else bootstrap over episodes.
@@ -46,7 +54,7 @@ def summarize(
     wanted = span[0] + command * (span[1] - span[0])
     returns = np.where(alive, metrics["reward"], 0.0).sum(0) if "reward" in metrics else metrics["return"].max(0)
     by_command = [_command_row(level, command, held, wanted, mean_of) for level in np.unique(command)]
-    by_shape = [_shape_row(index, shape, command, held, wanted, mean_of) for index in np.unique(shape)]
+    by_shape = [_shape_row(shapes[index], shape == index, command, held, wanted, mean_of) for index in np.unique(shape)]
     means = [row["total_force_n"]["mean"] for row in by_command]
     complete = all(m is not None for m in means)
     report = {
@@ -57,6 +65,9 @@ def summarize(
         "hold_time_s": mean(alive.sum(0) * control_period),
         "return": mean(returns),
         **correlations(command, held, mean_of),
+        "r_torque": pearson(command[held], mean_of["total_torque"][held]),
+        "slope_force_n": slope(command[held], mean_of["finger_force"][held]),
+        "slope_torque": slope(command[held], mean_of["total_torque"][held]),
         "force_error_n": force_error(mean_of["finger_force"], wanted),
         "torque_limited": mean(mean_of["torque_limited"][held]),
         "force_range": float(means[-1] / means[0]) if complete and len(means) > 1 and means[0] > 0 else None,
@@ -87,6 +98,7 @@ def _command_row(
         "finger_normal_n": mean(mean_of["finger_normal"][good]),
         "finger_taxels_n": mean(mean_of["finger_taxels"][good]),
         "total_force_n": mean(mean_of["total_force"][good]),
+        "total_torque": mean(mean_of["total_torque"][good]),
         "taxel_force_n": mean(mean_of["taxel_force"][good]),
         "thumb_force_n": mean(mean_of["thumb_force"][good]),
         "touching_fingers": mean(mean_of["touching"][good]),
@@ -96,17 +108,16 @@ def _command_row(
 
 
 def _shape_row(
-    index: int,
-    shape: np.ndarray,
+    name: str,
+    mine: np.ndarray,
     command: np.ndarray,
     held: np.ndarray,
     wanted: np.ndarray,
     mean_of: dict[str, np.ndarray],
 ) -> dict:
-    """The episodes with one shape; arrays [N] are of all episodes."""
-    mine = shape == index
+    """The episodes `mine` with one shape; arrays [N] are of all episodes."""
     return {
-        "shape": KINDS[index],
+        "shape": name,
         "episodes": int(mine.sum()),
         "held": proportion(held[mine]),
         **correlations(command, mine & held, mean_of),
@@ -164,3 +175,16 @@ def pearson(x: np.ndarray, y: np.ndarray, samples: int = 500) -> dict:
         return {"r": None, "low": None, "high": None}
     low, high = bootstrap(correlate, x.size, samples) if samples else (None, None)
     return {"r": correlate(slice(None)), "low": low, "high": high}
+
+
+def slope(x: np.ndarray, y: np.ndarray, samples: int = 500) -> dict:
+    """Least-squares slope of y over x with a bootstrap 95 % interval; None where it is undefined."""
+
+    def fit(rows: np.ndarray | slice) -> float:
+        off = x[rows] - x[rows].mean()
+        return float(off @ y[rows] / (off @ off)) if off.any() else np.nan
+
+    if x.size < 3 or x.std() == 0:
+        return {"mean": None, "low": None, "high": None}
+    low, high = bootstrap(fit, x.size, samples)
+    return {"mean": fit(slice(None)), "low": low, "high": high}

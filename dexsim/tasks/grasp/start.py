@@ -10,38 +10,41 @@ import numpy as np
 from dexsim.core import compilation
 from dexsim.core.errors import ConfigError
 from dexsim.geometry import rotations
-from dexsim.hand.kinematics import Hand, flexion_joints
-from dexsim.objects.config import KINDS
-from dexsim.objects.params import extent, sample_object
+from dexsim.hand.kinematics import flexion_joints
+from dexsim.objects.params import extent
 from dexsim.tasks.placement import clearance, palm_height
 
 _OVERLAP = 0.001  # m, hand and object may start this deep in each other
 
 
-def make_pool(key: jax.Array, hand: Hand, config: Any, reference: tuple[float, float, float]):
+def make_pool(key: jax.Array, task: Any):
     """Draw candidates and keep those in which the hand is clear of the object.
 
     Every shape gets an equal share of the pool: large boxes overlap far more often than small
     spheres, and a plain rejection would all but leave them out of training.
 
+    Args:
+      key: of the pool.
+      task: a `Grasp`: its hand, configuration, reference and objects.
+
     Raises:
       ConfigError: next to no candidate of a shape is clear, so the ranges do not fit the hand.
     """
-    shapes = config.objects.kinds
+    config, shapes = task.config, task.drawn_shapes
     share = -(-config.pool_size // len(shapes))
     chunk = max(min(2 * share, 4096), 64)
 
     @functools.partial(compilation.jit, once=True)
     def sample(key: jax.Array, shape_index: jax.Array):
         keys = jax.random.split(key, chunk)
-        return jax.vmap(lambda k: _candidate(k, shape_index, hand, config, reference))(keys)
+        return jax.vmap(lambda k: _candidate(k, shape_index, task))(keys)
 
     pools = []
     for name in shapes:
         kept, found = [], 0
         for trial in range(40):
-            shape_key = jax.random.fold_in(jax.random.fold_in(key, KINDS.index(name)), trial)
-            starts, clear = sample(shape_key, jnp.int32(KINDS.index(name)))
+            shape_key = jax.random.fold_in(jax.random.fold_in(key, task.shape_names.index(name)), trial)
+            starts, clear = sample(shape_key, jnp.int32(task.shape_names.index(name)))
             rows = np.flatnonzero(np.asarray(clear))[: share - found]
             kept.append(jax.tree.map(lambda x, rows=rows: np.asarray(x)[rows], starts))
             found += rows.size
@@ -56,13 +59,12 @@ def make_pool(key: jax.Array, hand: Hand, config: Any, reference: tuple[float, f
     return jax.tree.map(lambda *parts: np.concatenate(parts)[: config.pool_size], *pools)
 
 
-def _candidate(
-    key: jax.Array, shape_index: jax.Array, hand: Hand, config: Any, reference: tuple[float, float, float]
-) -> tuple[Any, jax.Array]:
+def _candidate(key: jax.Array, shape_index: jax.Array, task: Any) -> tuple[Any, jax.Array]:
     from dexsim.env.state import Start
 
+    hand, config, reference = task.hand, task.config, task.reference
     keys = jax.random.split(key, 7)
-    object = sample_object(keys[0], config.objects, shape_index)
+    object = task.sample_object(keys[0], config, shape_index)
     noise = config.posture_noise * jax.random.uniform(keys[1], (hand.num_joints,), minval=-1.0)
     curl = jax.random.uniform(keys[6], minval=config.curl[0], maxval=config.curl[1])
     flexion = np.zeros(hand.num_joints, np.float32)

@@ -20,6 +20,7 @@ from dexsim.env.task import GroundTruth
 from dexsim.geometry.vectors import length
 from dexsim.hand.kinematics import Hand, flexion_joints
 from dexsim.objects import params
+from dexsim.objects.config import KINDS
 from dexsim.objects.params import ObjectParams
 from dexsim.tasks.grasp.config import GraspConfig, GraspReward
 from dexsim.tasks.grasp.report import summarize
@@ -92,6 +93,8 @@ class Grasp:
     fields: dict[str, tuple[str, ...]] = {"actor": observation.GRASP, "critic": observation.GRASP}
     gravity = (9.81, 0.0, 0.0)  # upside down: the palm's normal points to the ground
     reference = (0.055, -0.005, 0.090)  # m, between palm and half-closed fingers
+    shape_names = KINDS
+    """What `ObjectParams.shape_index` counts."""
 
     def __init__(self, config: GraspConfig, hand: Hand):
         if len(config.posture) != hand.num_joints:
@@ -111,7 +114,12 @@ class Grasp:
 
     def make_pool(self, key: jax.Array) -> Start:
         """Objects released below the palm, between the half-closed fingers."""
-        return make_pool(key, self.hand, self.config, self.reference)
+        return make_pool(key, self)
+
+    @property
+    def drawn_shapes(self) -> tuple[str, ...]:
+        """Names, of `shape_names`, of what the pool has."""
+        return self.config.objects.kinds
 
     def sample_object(self, key: jax.Array, config: GraspConfig, shape_index: jax.Array | None = None) -> ObjectParams:
         """One object of `config`, of a random or the given kind (index into SHAPES)."""
@@ -202,6 +210,9 @@ class Grasp:
             "finger_normal": mean_where(contact[1:], truth.normal_force[1:]),
             "finger_taxels": mean_where(contact[1:], pressing[1:]),
             "total_force": jnp.sum(force),
+            "total_torque": jnp.sum(
+                jnp.where(contact, jnp.abs(truth.joint_torque[self._roots]), 0.0) / self._max_torque
+            ),
             "taxel_force": jnp.sum(pressing),
             "skin_force": jnp.sum(truth.touch.skin_force),
             "thumb_force": force[0],
@@ -230,4 +241,4 @@ class Grasp:
 
     def summarize(self, metrics: dict[str, np.ndarray], alive: np.ndarray, control_period: float) -> dict:
         """The report of an evaluation; see `dexsim.tasks.grasp.report`."""
-        return summarize(metrics, alive, control_period, self.config.finger_force)
+        return summarize(metrics, alive, control_period, self.config.finger_force, self.shape_names)

@@ -210,6 +210,7 @@ class TestReward:
             "finger_taxels": 4.0,
             "force_error": 1.0,
             "total_force": 7.005,
+            "total_torque": 0.11 / 1.1 + 0.33 / 1.1,
             "taxel_force": 5.0,
             "skin_force": 2.5,
             "thumb_force": 2.0,

@@ -36,6 +36,7 @@ def evaluation(ticks=60, repeats=8, noise=0.0, slope=4.0, lost=(), settle_force=
         "finger_taxels": np.sqrt(np.abs(force)),
         "torque_limited": flat * (command == 1.0),
         "total_force": 3 * force,
+        "total_torque": 0.2 * force,
         "taxel_force": 2 * force,
         "thumb_force": flat * 0.5,
         "touching": flat * 3,
@@ -246,3 +247,29 @@ class TestSummary:
     def test_goes_through_json(self, lost):
         found = report.summarize(*evaluation(lost=lost), PERIOD, SPAN)
         assert json.loads(json.dumps(found, allow_nan=False)) == found
+
+
+class TestTorque:
+    def test_slopes_and_range(self):
+        found = report.summarize(*evaluation(), PERIOD, SPAN)
+        assert found["slope_force_n"]["mean"] == pytest.approx(4.0) and found["slope_torque"]["mean"] == pytest.approx(
+            0.8
+        )
+        assert found["r_torque"]["r"] == pytest.approx(1.0)
+        torque = [row["total_torque"]["mean"] for row in found["by_command"]]
+        assert torque == pytest.approx([0.2, 0.4, 0.6, 0.8, 1.0])
+
+    def test_slope_is_least_squares(self):
+        rng = np.random.default_rng(2)
+        x, noise = rng.uniform(size=300), rng.normal(size=300)
+        found, known = report.slope(x, 3 * x + noise), stats.linregress(x, 3 * x + noise)
+        assert found["mean"] == pytest.approx(known.slope)
+        assert (found["high"] - found["low"]) / 2 == pytest.approx(1.96 * known.stderr, rel=0.2)
+
+    def test_one_command_has_no_slope(self):
+        assert report.slope(np.ones(10), np.arange(10.0)) == {"mean": None, "low": None, "high": None}
+
+    def test_names_of_other_shapes(self):
+        names = tuple(f"object {k}" for k in range(5))
+        found = report.summarize(*evaluation(), PERIOD, SPAN, names)
+        assert [row["shape"] for row in found["by_shape"]] == list(names)

@@ -18,7 +18,6 @@ import pytest
 
 from dexsim.objects.config import SHAPES, SLOTS
 from dexsim.tasks.grasp.config import GraspConfig
-from dexsim.tasks.grasp.start import make_pool
 from dexsim.tasks.grasp.task import Grasp
 from dexsim.touch.skin import Skin
 
@@ -63,7 +62,7 @@ def hold(hand, start, rng, law):
 @pytest.fixture(scope="module")
 def grips(hand):
     """By shape: (force by the solver, by the skin's law) [2, n, 5] N, and the deepest contacts [n] m."""
-    pool = make_pool(jax.random.key(11), hand, GraspConfig(pool_size=OBJECTS * len(SHAPES)), Grasp.reference)
+    pool = Grasp(GraspConfig(pool_size=OBJECTS * len(SHAPES)), hand).make_pool(jax.random.key(11))
     law, rng, found = c_scene.skin_law(hand, Skin()), np.random.default_rng(5), {}
     for shape in SHAPES:
         rows, held = [], []

@@ -3,6 +3,7 @@
 import importlib.util
 import json
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -201,6 +202,7 @@ def test_metrics_of_grasps_count_only_what_was_held(benchmark):
             "finger_normal": (1 + c) ** 2,
             "finger_taxels": 1 - c,
             "total_force": 9 + c,
+            "total_torque": 0.5 + c,
             "torque_limited": 0.6 * (c == 1),
             "seconds": 8.0 if held else 5.5,
             "window_s": [3.0, 8.0],
@@ -221,6 +223,20 @@ def test_metrics_of_grasps_count_only_what_was_held(benchmark):
     text = benchmark.table(metrics, benchmark.simulated("grasp", "grasp"), {})
     assert "command 0.5: finger force (N) " in text and "from 3 to 8 s" in text
     assert "command 1: finger force (N) (saturates)" in text and text.count("(saturates)") == 1
+
+
+def test_measured_torque_is_of_touching_fingers_in_the_window(benchmark, hand):
+    torque = np.zeros(12)
+    torque[hand.root_joint] = (0.5, -0.3, 0.2, 0.1, 0.4)
+    force = np.array([1.0, 2.0, 0.0, 3.0, 0.0])
+
+    def entry(time, factor):
+        tick = SimpleNamespace(readings=SimpleNamespace(joint_torque=factor * torque))
+        return {"time": time, "tick": tick, "measured": SimpleNamespace(finger_force=force)}
+
+    trace = [entry(10.0, 9.0), entry(12.9, 9.0), entry(13.5, 1.0), entry(15.0, 2.0), entry(18.0, 9.0)]
+    assert benchmark._measured_torque(trace, hand, [3.0, 8.0]) == pytest.approx(1.5 * (0.5 + 0.3 + 0.1))
+    assert benchmark._measured_torque(trace[:2], hand, [3.0, 8.0]) == 0.0
 
 
 def test_both_worlds_name_forces_alike(benchmark):

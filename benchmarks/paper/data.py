@@ -1,0 +1,196 @@
+"""What a table or figure is made of: rows, seeds and budgets; and where its reports are."""
+
+import dataclasses
+import functools
+import json
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from dexsim.core.errors import ConfigError
+
+ROOT = Path(__file__).resolve().parents[2]
+REPORTS = ROOT / "docs" / "results"
+"""Reports in the repository, of which the page of results is made."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Budget:
+    """How much a row may cost."""
+
+    name: str
+    level: int
+    """A row keeps the report of the highest level."""
+    preset: str
+    """Of the training command."""
+    backend: str
+    minutes: dict[str, float]
+    """Training of one seed, by skill; empty: shipped policies stand in, nothing is trained."""
+    seeds: int
+    episodes: dict[str, int]
+    """Evaluation in simulation, by skill."""
+    trials: dict[str, int]
+    """On the emulated hand, for each seed."""
+    seconds: dict[str, float]
+    """Length of an evaluation and of a trial; the task's own where missing."""
+    sweep: dict[str, Any]
+    """Of a robustness sweep: "points" of each row (0: training's ranges alone, 2: the ends), and by skill "episodes"
+    and "seconds"."""
+    objects: int
+    """Evaluation episodes of each held-out object."""
+    processes: int
+    """For trials. More than one runs them in processes of their own, as a GPU needs: the bridge's JAX is on the CPU."""
+
+
+BUDGETS = {
+    budget.name: budget
+    for budget in (
+        Budget(
+            name="smoke",
+            level=0,
+            preset="cpu",
+            backend="c",
+            minutes={},
+            seeds=1,
+            episodes={"grasp": 10, "rotate": 10},
+            trials={"grasp": 1, "rotate": 1},
+            seconds={"grasp": 0.3, "rotate": 0.3},
+            sweep={"points": 0, "episodes": {"grasp": 10, "rotate": 10}, "seconds": {"grasp": 0.3, "rotate": 0.3}},
+            objects=5,
+            processes=1,
+        ),
+        Budget(
+            name="cpu",
+            level=1,
+            preset="cpu",
+            backend="c",
+            minutes={"grasp": 20.0, "rotate": 30.0},
+            seeds=3,
+            episodes={"grasp": 150, "rotate": 16},
+            trials={"grasp": 25, "rotate": 10},
+            seconds={},
+            sweep={"points": 2, "episodes": {"grasp": 25, "rotate": 16}, "seconds": {"grasp": 8.0, "rotate": 20.0}},
+            objects=25,
+            processes=1,
+        ),
+        Budget(
+            name="gpu",
+            level=2,
+            preset="gpu",
+            backend="auto",
+            minutes={"grasp": 8.0, "rotate": 7.5},
+            seeds=3,
+            episodes={"grasp": 1024, "rotate": 1024},
+            trials={"grasp": 50, "rotate": 10},
+            seconds={},
+            sweep={"points": 4, "episodes": {"grasp": 256, "rotate": 256}, "seconds": {"grasp": 8.0, "rotate": 20.0}},
+            objects=50,
+            processes=8,
+        ),
+    )
+}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Row:
+    """One configuration of a table, or one curve of a figure."""
+
+    name: str
+    """Folder of its report."""
+    label: str
+    task: str = ""
+    """Registered task that it trains or measures."""
+    settings: tuple[str, ...] = ()
+    """Changes to the task's configuration, as `--set` of the evaluation command takes them."""
+    policy: str = ""
+    """Shipped policy: what is measured, or where rows are trained the one whose own report is shown beside them."""
+    ablate: tuple[str, ...] = ()
+    """Observation fields that the policy does without."""
+    points: tuple[float, ...] = ()
+    """Of a sweep, in order."""
+    training: tuple[float, float] | None = None
+    """The range of training that a sweep goes beyond; None where training has one value."""
+    paper: dict[str, str] = dataclasses.field(default_factory=dict)
+    """The paper's numbers, by column."""
+
+    @property
+    def skill(self) -> str:
+        """grasp or rotate."""
+        return self.task.partition("_")[0]
+
+
+Measure = Callable[[Row, int, Budget, Path], dict[str, Any]]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Experiment:
+    """A table or figure."""
+
+    name: str
+    title: str
+    rows: tuple[Row, ...]
+    measure: Measure
+    """`measure(row, seed, budget, work)`: the report of one seed; `work` is the folder of its training."""
+    table: Callable[["Experiment", dict[str, dict]], list[list[str]]] | None
+    """Header and rows of the table, from the reports by row; None for a figure alone."""
+    draw: Callable[["Experiment", dict[str, dict], Path], list[Path]] | None
+    """Writes the figures into a folder; None for a table alone."""
+    differs: str
+    """What differs from the paper."""
+    trains: bool = False
+    """Whether every seed of a row is a training."""
+    minutes: float = 1.0
+    """Estimate for a row on two cores, training apart."""
+
+    def seeds(self, budget: Budget) -> range:
+        """Seeds of each row; what is not trained has one."""
+        return range(budget.seeds if self.trains else 1)
+
+
+def report_path(folder: Path, experiment: Experiment, row: Row) -> Path:
+    """File of a row's report."""
+    return folder / experiment.name / row.name / "report.json"
+
+
+def load_report(path: Path) -> dict[str, Any]:
+    """A row's report; empty if there is none.
+
+    Raises:
+      ConfigError: the file is no report.
+    """
+    if not path.is_file():
+        return {}
+    try:
+        report = json.loads(path.read_text())
+        if report["budget"] in BUDGETS and isinstance(report["seeds"], dict) and report["row"]:
+            return report
+    except (ValueError, KeyError, TypeError):
+        pass
+    raise ConfigError(f"{path}: is not a report of a row; delete it, and the row is measured anew")
+
+
+def settings_of(row: Row) -> dict[str, Any]:
+    """What a report must have been measured with to be this row's."""
+    return {
+        name: list(value) if isinstance(value, tuple) else value
+        for name, value in dataclasses.asdict(row).items()
+        if name not in ("label", "paper", "training")
+    }
+
+
+def is_done(experiment: Experiment, row: Row, budget: Budget, report: dict[str, Any]) -> bool:
+    """Whether a report holds all that a budget asks of a row."""
+    if not report or report["row"] != settings_of(row):
+        return False
+    level = BUDGETS[report["budget"]].level
+    return level > budget.level or (level == budget.level and len(report["seeds"]) >= len(experiment.seeds(budget)))
+
+
+@functools.cache
+def commit() -> str:
+    """The commit that runs, in seven digits, and whether the code differs from it."""
+    git, code = ["git", "-C", str(ROOT)], ("dexsim", "dexsim_ppo", "dexsim_real", "benchmarks", "assets")
+    found = subprocess.run([*git, "rev-parse", "--short=7", "HEAD"], capture_output=True, text=True)
+    changed = subprocess.run([*git, "status", "--porcelain", "-uno", *code], capture_output=True, text=True)
+    return found.stdout.strip() + (" (changed)" if changed.stdout.strip() else "")

@@ -1,0 +1,243 @@
+"""How a row is measured: training, evaluation in simulation, trials on the emulated hand, sweeps, held-out objects."""
+
+import functools
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dexsim.core.config import from_dict, override, to_dict
+from dexsim.registry import find_task
+from dexsim_ppo import load_policy, train_policy
+from dexsim_ppo.evaluate import Evaluator
+from dexsim_ppo.policy import Policy
+from dexsim_ppo.training.runlog import RunFolder
+from paper.data import BUDGETS, Budget, Row
+
+HELD_OUT_POOL = 480
+
+
+def trained(row: Row, seed: int, budget: Budget, work: Path) -> dict[str, Any]:
+    """Train a seed of a row, or finish its training; then measure the policy in both worlds.
+
+    A budget without training measures the shipped policy of the skill in its place, one for all rows.
+    """
+    if not budget.minutes:
+        return _both_worlds(row, row.skill, seed, budget) | {"training": None}
+    file, training = train(row, seed, budget, work)
+    return _both_worlds(row, str(file), seed, budget) | {"training": training}
+
+
+def shipped(row: Row, seed: int, budget: Budget, work: Path) -> dict[str, Any]:
+    """A shipped policy in both worlds."""
+    del work
+    return _both_worlds(row, row.policy, seed, budget)
+
+
+def _both_worlds(row: Row, policy: str, seed: int, budget: Budget) -> dict[str, Any]:
+    count, seconds = budget.episodes[row.skill], budget.seconds.get(row.skill)
+    return {
+        "simulation": simulate(load_policy(policy), (), count, seconds, budget),
+        "hand": trials(row.skill, policy, seed, budget.name),
+    }
+
+
+def train(row: Row, seed: int, budget: Budget, folder: Path) -> tuple[Path, dict[str, Any]]:
+    """The policy of a seed and what its training took; resumes a run that was interrupted."""
+    run = RunFolder(folder)
+    if not run.report.exists():
+        if run.checkpoints.exists() and run.existing_checkpoints():
+            train_policy(resume=folder)
+        else:
+            # A run without a checkpoint has nothing to resume, and its folder is in the way.
+            shutil.rmtree(folder, ignore_errors=True)
+            train_policy(
+                row.task,
+                task_config(row),
+                preset=budget.preset,
+                backend=budget.backend,
+                minutes=budget.minutes[row.skill],
+                seed=seed,
+                run_dir=folder,
+                video=False,
+            )
+    report = json.loads(run.report.read_text())
+    origin = report["origin"]
+    return folder / report["policy"], {
+        "env_steps": origin["env_steps"],
+        "minutes": budget.minutes[row.skill],
+        "seed": seed,
+        "hardware": report["hardware"],
+    }
+
+
+def task_config(row: Row) -> Any:
+    """Configuration of a row's task.
+
+    Raises:
+      ConfigError: a setting that the task does not have, or a value out of range.
+    """
+    entry = find_task(row.task)
+    return from_dict(entry.config_class, override(to_dict(entry.config()), row.settings))
+
+
+def evaluated(row: Row, seed: int, budget: Budget, work: Path) -> dict[str, Any]:
+    """A shipped policy in simulation, with observation fields ablated."""
+    del work
+    policy = load_policy(row.policy).ablate(*row.ablate)
+    seconds = budget.seconds.get(row.skill)
+    return {"simulation": simulate(policy, row.settings, budget.episodes[row.skill], seconds, budget, seed)}
+
+
+def on_the_hand(row: Row, seed: int, budget: Budget, work: Path) -> dict[str, Any]:
+    """Trials of a shipped policy on the emulated hand."""
+    del work
+    return {"hand": trials(row.skill, row.policy, seed, budget.name)}
+
+
+def swept(row: Row, seed: int, budget: Budget, work: Path) -> dict[str, Any]:
+    """A shipped policy at each point of a sweep; a row without a parameter is the reference."""
+    del work
+    policy, sweep, found = load_policy(row.policy), budget.sweep, []
+    points: tuple[float | None, ...] = row.points if sweep["points"] else ()
+    if len(points) > sweep["points"]:
+        points = (points[0], points[-1])
+    for point in points or (None,):
+        settings = sweep_settings(row, point)
+        count, seconds = sweep["episodes"][row.skill], sweep["seconds"][row.skill]
+        task = simulate(policy, settings, count, seconds, budget, seed)
+        found.append({"point": point} | _success(row.skill, task))
+    return {"points": found}
+
+
+def sweep_settings(row: Row, point: float | None) -> list[str]:
+    """The row's settings at one point; None leaves training's ranges."""
+    return [] if point is None else [setting.format(point, point) for setting in row.settings]
+
+
+def _success(skill: str, report: dict[str, Any]) -> dict[str, Any]:
+    if skill == "grasp":
+        return {name: report[name] for name in ("held", "r_taxels", "r_resultant", "force_error_n")}
+    return {name: report[name] for name in ("kept_to_the_end", "successes_per_minute", "seconds_to_fall")} | {
+        "successes": report["successes"]["mean"]
+    }
+
+
+def simulate(
+    policy: Policy, settings: Any, episodes: int, seconds: float | None, budget: Budget, seed: int = 0
+) -> dict[str, Any]:
+    """The task's report of an evaluation, with the share held of all episodes.
+
+    Args:
+      policy: measured in the environment that it was trained in.
+      settings: changes to that environment's configuration.
+      episodes: at least; rounded up to whole batches of 64 (1,024 on a GPU).
+      seconds: length of an episode; None is the task's own.
+      budget: its backend.
+      seed: of the episodes.
+    """
+    length = [f"evaluation_seconds={seconds}"] if seconds else []
+    config = json.dumps(override(policy.env_config, [*settings, *length]), sort_keys=True)
+    evaluator = _evaluator(policy.task, config, budget.backend, min(episodes, 1024 if budget.backend == "auto" else 64))
+    report, _ = evaluator(policy.params, episodes=episodes, seed=seed)
+    return {name: value for name, value in report["task"].items() if name != "headline"} | {
+        "backend": evaluator.env.backend
+    }
+
+
+@functools.lru_cache(maxsize=4)
+def _evaluator(task: str, config: str, backend: str, chunk: int) -> Evaluator:
+    """Compiled evaluations; rows of one environment share them."""
+    import dexsim
+
+    made = from_dict(find_task(task).config_class, json.loads(config))
+    return Evaluator(dexsim.make(task, made, backend=backend, num_envs=chunk), chunk)
+
+
+@functools.lru_cache(maxsize=4)
+def trials(skill: str, policy: str, seed: int, budget_name: str) -> dict[str, Any]:
+    """The metrics of trials on the emulated hand in virtual time, every parameter outside training's ranges."""
+    import zero_shot
+
+    budget = BUDGETS[budget_name]
+    options = {
+        "task": skill,
+        "policy": policy,
+        "seed": [seed],
+        "parameters": "outside",
+        "seconds": budget.seconds.get(skill),
+        "safety": True,
+        "set": {},
+        "limit": {},
+    }
+    reports = zero_shot.run_all(options, budget.trials[skill], budget.processes, show=False)
+    return zero_shot.metrics(skill, policy, reports) | {"trials": len(reports)}
+
+
+# --- objects that no training has seen -------------------------------------------------------------------
+
+
+class HeldOutEvaluator(Evaluator):
+    """Keeps one picture of every object at the middle command, late in its episode."""
+
+    def __init__(self, env: Any, chunk: int, names: int):
+        super().__init__(env, chunk)
+        self.SHOWN = tuple(5 * k + 2 for k in range(names))
+
+    def _film(self, frames: Any, terminated: np.ndarray) -> Any:
+        import jax
+
+        late = round(0.75 * len(terminated))
+        return jax.tree.map(lambda x: x[late], frames)
+
+
+def held_out(row: Row, seed: int, budget: Budget, work: Path) -> dict[str, Any]:
+    """A shipped policy with held-out objects, each at every command; pictures are in `work`."""
+    import dexsim
+    from dexsim.env.env import Env
+    from dexsim.tasks.grasp.config import GraspConfig
+    from paper.held_out import COMPOSITIONS, NAMES, HeldOutGrasp
+
+    policy, hand = load_policy(row.policy), dexsim.load_hand()
+    names = NAMES
+    settings = [*row.settings, f"pool_size={HELD_OUT_POOL}"]
+    if not budget.minutes:  # A look at the machinery: meshes take seconds each to be followed by boxes.
+        names, settings = tuple(COMPOSITIONS)[:2], [*settings, "pool_size=20"]
+    if seconds := budget.seconds.get("grasp"):
+        settings.append(f"evaluation_seconds={seconds}")
+    config = from_dict(GraspConfig, override(policy.env_config, settings))
+    chunk = 5 * len(names)
+    env = Env(HeldOutGrasp(config, hand, names), hand, backend=budget.backend, num_envs=chunk)
+    evaluator = HeldOutEvaluator(env, chunk, len(names))
+    report, frames = evaluator(policy.params, episodes=budget.objects * len(names), seed=seed)
+    work.mkdir(parents=True, exist_ok=True)
+    sheet = work / "objects.jpg"
+    contact_sheet(hand, env.task.slots, frames, names, sheet)
+    kept = {name: value for name, value in report["task"].items() if name != "headline"}
+    return {"simulation": kept | {"backend": env.backend}, "files": [str(sheet)]}
+
+
+def contact_sheet(hand: Any, kinds: tuple[str, ...], frames: Any, names: tuple[str, ...], path: Path) -> None:
+    """One picture of each object in the hand, six in a row."""
+    import jax
+    from PIL import Image, ImageDraw
+
+    from dexsim.render.render import render_frame
+
+    width, height, columns = 252, 240, 6
+    sheet = Image.new("RGB", (columns * width, -(-len(names) // columns) * height), "white")
+    for k, name in enumerate(names):
+        frame = jax.tree.map(lambda x, k=k: x[k], frames)
+        picture = render_frame(hand, kinds, frame, size=(width + height // 2, height))[:, :width]
+        tile = Image.fromarray(np.ascontiguousarray(picture))
+        ImageDraw.Draw(tile).text((8, 6), name.replace("_", " "), fill="white")
+        sheet.paste(tile, (k % columns * width, k // columns * height))
+    sheet.save(path, quality=82)
+
+
+def points_at_twice(low: float, high: float, floor: float = 0.0) -> tuple[float, float, float, float]:
+    """Ends of a range of training and of one twice as wide about its middle, not below `floor`."""
+    middle, half = (low + high) / 2, (high - low) / 2
+    return max(middle - 2 * half, floor), low, high, middle + 2 * half

@@ -1,0 +1,240 @@
+"""Tables of the experiments: a header and rows of text, made from the reports."""
+
+import json
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from dexsim.core.assets import asset_path
+from paper.data import Experiment, Row
+
+Reports = dict[str, dict[str, Any]]
+UNTRAINED = "not trained yet"
+
+
+def cell(entries: Iterable[dict[str, Any] | None], digits: int = 3) -> str:
+    """A number with its interval: of one seed the 95 % interval over episodes, of several the lowest and highest."""
+    found = [entry for entry in entries if entry and _middle(entry) is not None]
+    if not found:
+        return ""
+    values = [_middle(entry) for entry in found]
+    if len(values) > 1:
+        return f"{sum(values) / len(values):.{digits}g} ({min(values):.{digits}g}–{max(values):.{digits}g})"
+    low, high = found[0].get("low"), found[0].get("high")
+    span = "" if low is None or high is None else f" ({low:.{digits}g}–{high:.{digits}g})"
+    return f"{values[0]:.{digits}g}{span}"
+
+
+def percent(entries: Iterable[dict[str, Any] | None]) -> str:
+    """`cell` of shares, in per cent."""
+    scaled = [
+        {
+            name: None if value is None else 100 * value
+            for name, value in entry.items()
+            if name in ("mean", "low", "high")
+        }
+        for entry in entries
+        if entry
+    ]
+    return cell(scaled)
+
+
+def _middle(entry: dict[str, Any]) -> Any:
+    return next((entry[name] for name in ("mean", "median", "r") if name in entry), None)
+
+
+def seeds(report: dict[str, Any] | None) -> list[dict[str, Any]]:
+    """What was found for each seed."""
+    return list(report["seeds"].values()) if report else []
+
+
+def how(experiment: Experiment, row: Row, report: dict[str, Any] | None) -> str:
+    """Where a row's numbers are from."""
+    if not report:
+        return "shipped policy, one seed, trained on a GPU" if row.policy else UNTRAINED
+    count = len(report["seeds"])
+    trained = [seed["training"] for seed in seeds(report) if seed.get("training")]
+    if not trained:
+        return f"{report['budget']} budget"
+    short = "short " if row.skill == "rotate" and report["budget"] == "cpu" else ""
+    return f"{count} × {short}{trained[0]['minutes']:g} min, {report['budget']} budget"
+
+
+# --- rotation -------------------------------------------------------------------------------------------
+
+
+def rotation(experiment: Experiment, reports: Reports) -> list[list[str]]:
+    """The paper's columns beside ours in simulation and on the emulated hand."""
+    paper = any(row.paper for row in experiment.rows)
+    head = ["observation", *(["paper: mean / median / s each / s to fall"] if paper else [])]
+    head += ["simulation: mean", "median", "s each", "s to fall"]
+    hand = any("hand" in seed for report in reports.values() for seed in seeds(report))
+    head += ["emulated hand: mean", "median", "s to fall", "sorted"] if hand else []
+    lines = [[*head, "measured"]]
+    for row in experiment.rows:
+        report = reports.get(row.name)
+        found, numbers = seeds(report), row.paper
+        there = [seed["simulation"] for seed in found if "simulation" in seed] or _shipped(row)
+        line = [row.label]
+        if paper:
+            line.append(numbers["mean / median / s each / s to fall"])
+        key = "paper_successes" if row.task == "rotate_paper" else "successes"
+        line += [
+            cell(s[key]["mean"] for s in there),
+            cell(s[key]["median"] for s in there),
+            cell(_seconds_each(s[key]["mean"]["mean"], s["seconds_to_fall"]["mean"]) for s in there),
+            cell(s["seconds_to_fall"] for s in there),
+        ]
+        if hand:
+            worlds = [seed["hand"] for seed in found if "hand" in seed]
+            line += [
+                cell(s[key] for s in worlds),
+                cell({"median": s[key]["median"]} for s in worlds),
+                cell(s["seconds_to_fall"] for s in worlds),
+                ", ".join(f"{v:g}" for v in sorted(v for s in worlds for v in s[key]["sorted"])),
+            ]
+        lines.append([*line, how(experiment, row, report)])
+    return lines
+
+
+def _seconds_each(count: float, seconds: float) -> dict[str, Any]:
+    """Seconds a success over all the time that trials lasted."""
+    return {"mean": seconds / count if count else None}
+
+
+def _shipped(row: Row) -> list[dict[str, Any]]:
+    """The shipped policy's own report in simulation, where the row names one."""
+    if not row.policy:
+        return []
+    report = json.loads(asset_path(f"policies/{row.policy}.json").read_text())
+    return [report.get("evaluation", report["trained"])["task"]]
+
+
+# --- grasp ----------------------------------------------------------------------------------------------
+
+
+def grasp(experiment: Experiment, reports: Reports) -> list[list[str]]:
+    """Ranges of force and torque over the command in both worlds, correlations and slopes."""
+    head = ["reward", "paper: force [N]", "paper: torque"]
+    for world in ("simulation", "emulated hand"):
+        head += [f"{world}: held [%]", "total force [N]", "total torque", "r, force", "r, torque", "N / command"]
+    lines = [[*head, "measured"]]
+    for row in experiment.rows:
+        report = reports.get(row.name)
+        line = [row.label, row.paper["force range [N]"], row.paper["torque range"]]
+        for world in ("simulation", "hand"):
+            found = [seed[world] for seed in seeds(report)] or (_shipped(row) if world == "simulation" else [])
+            line += [
+                percent(s["held"] for s in found),
+                _range(found, ("total_force", "total_force_n")),
+                _range(found, ("total_torque",)),
+                cell(s["r_resultant"] for s in found),
+                cell(s.get("r_torque") for s in found),
+                cell(s.get("slope_force_n") for s in found),
+            ]
+        lines.append([*line, how(experiment, row, report)])
+    return lines
+
+
+def _range(found: list[dict[str, Any]], names: tuple[str, ...]) -> str:
+    """Means at the first and the last command, averaged over seeds."""
+    ends = []
+    for report in found:
+        means = [value(row, *names) for row in report["by_command"]]
+        if means[0] is not None and means[-1] is not None:
+            ends.append((means[0], means[-1]))
+    if not ends:
+        return ""
+    low, high = (sum(end[k] for end in ends) / len(ends) for k in (0, 1))
+    return f"{low:.3g}–{high:.3g}"
+
+
+def value(row: dict[str, Any], *names: str) -> float | None:
+    """Mean of the first of these names that a command's row has; both worlds name some forces differently."""
+    entry = next((row[name] for name in names if name in row), None)
+    return entry and entry["mean"]
+
+
+def commands(experiment: Experiment, reports: Reports) -> list[list[str]]:
+    """What is held and pressed at each command."""
+    lines = [["world", "command", "held [%]", "finger force [N]", "total force [N]", "total torque"]]
+    for world, label in (("simulation", "simulation"), ("hand", "emulated hand")):
+        for seed in (s for report in reports.values() for s in seeds(report)):
+            for row in seed[world]["by_command"]:
+                force = row.get("finger_force_n", row.get("finger_force"))
+                total = row.get("total_force_n", row.get("total_force"))
+                cells = percent([row["held"]]), cell([force]), cell([total]), cell([row["total_torque"]])
+                lines.append([label, f"{row['command']:g}", *cells])
+            more = seed[world]
+            r = f"r {cell([more['r_resultant']])}", f"r {cell([more['r_torque']])}"
+            slopes = f"{cell([more['slope_force_n']])} N", cell([more["slope_torque"]])
+            lines.append(
+                [label, "all", percent([more["held"]]), f"{r[0]}, slope {slopes[0]}", "", f"{r[1]}, slope {slopes[1]}"]
+            )
+    return lines
+
+
+def held_out(experiment: Experiment, reports: Reports) -> list[list[str]]:
+    """Every object, the worst first, and then every command."""
+    lines = [["object", "held [%]", "r, resultant force", "r, force on the taxels", "force error [N]"]]
+    for report in (s["simulation"] for found in reports.values() for s in seeds(found)):
+        for row in sorted(report["by_shape"], key=lambda row: (row["held"]["mean"], row["shape"])):
+            lines.append(_object(row["shape"].replace("_", " "), row))
+        for row in report["by_command"]:
+            lines.append([f"command {row['command']:g}, all objects", percent([row["held"]]), "", "", ""])
+        lines.append(_object("all objects, all commands", report))
+    return lines
+
+
+def _object(name: str, row: dict[str, Any]) -> list[str]:
+    return [
+        name,
+        percent([row["held"]]),
+        cell([row["r_resultant"]]),
+        cell([row["r_taxels"]]),
+        cell([row["force_error_n"]]),
+    ]
+
+
+# --- others ---------------------------------------------------------------------------------------------
+
+
+def calibration(experiment: Experiment, reports: Reports) -> list[list[str]]:
+    """Every joint that was pressed with."""
+    lines = [["joint", "force to [N]", "current to [A]", "torque to [Nm]", "worst R²", "Nm per A", "true"]]
+    for row in (row for report in reports.values() for s in seeds(report) for row in s["joints"]):
+        worst = min(row["loading_r_squared"], row["unloading_r_squared"])
+        largest = f"{row['force_max_n']:.3g}", f"{row['current_max_a']:.3g}", f"{row['torque_max_nm']:.3g}"
+        # This hand's currents are negative when it closes.
+        ratio = f"{-row['nm_per_a']:.3g}", f"{-row['true_nm_per_a']:.3g}"
+        lines.append([row["joint"], *largest, f"{worst:.3f}", *ratio])
+    return lines
+
+
+def contacts(experiment: Experiment, reports: Reports) -> list[list[str]]:
+    """How far the two worlds are apart."""
+    lines = [["motion", "centres apart, mean [taxels]", "forces apart, rms [N]", "force, rms [N]"]]
+    for found in (s for report in reports.values() for s in seeds(report)):
+        apart, off, size = (found[k] for k in ("centre_distance_taxels", "force_difference_rms_n", "force_rms_n"))
+        text = "" if apart is None else f"{apart:.2f}"
+        lines.append([f"{found['object']}, command {found['command']:g}", text, f"{off:.2f}", f"{size:.2f}"])
+    return lines
+
+
+def sweeps(experiment: Experiment, reports: Reports) -> list[list[str]]:
+    """Success at the measured points of each parameter."""
+    lines = [["sweep", "**value**: grasps held [%] and r of the force, or cubes kept [%] and turns a minute"]]
+    for row in experiment.rows:
+        points = [point for seed in seeds(reports.get(row.name)) for point in seed["points"]]
+        texts = [_point(row.skill)(point) for point in points]
+        lines.append([row.label, "; ".join(texts) or "not measured yet"])
+    return lines
+
+
+def _point(skill: str) -> Callable[[dict[str, Any]], str]:
+    def text(point: dict[str, Any]) -> str:
+        name = "" if point["point"] is None else f"**{point['point']:.3g}**: "
+        if skill == "grasp":
+            return f"{name}{percent([point['held']])}, {cell([{'r': point['r_resultant']['r']}])}"
+        return f"{name}{percent([point['kept_to_the_end']])}, {cell([point['successes_per_minute']])}"
+
+    return text

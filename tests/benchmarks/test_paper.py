@@ -1,0 +1,366 @@
+"""The paper's tables and figures: all of them with a tiny budget, what is resumed, and what the rows consist of."""
+
+import dataclasses
+import importlib
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from paths import ROOT
+
+from dexsim.core.errors import ConfigError
+
+pytest.importorskip("serial")
+if not (ROOT / "docs" / "results").exists():
+    pytest.skip("needs a checkout", allow_module_level=True)
+
+
+@pytest.fixture(scope="module")
+def paper():
+    """The package's modules by name."""
+    with pytest.MonkeyPatch.context() as patch:
+        # The flags that other tests compile with stay as they are.
+        patch.setattr("dexsim_real.control.controller.prepare_jax", lambda: None)
+        patch.syspath_prepend(str(ROOT / "benchmarks"))
+        names = ("command", "data", "experiments", "held_out", "measure", "meshes", "page", "tables")
+        yield SimpleNamespace(**{name: importlib.import_module(f"paper.{name}") for name in names})
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """A folder of one's own, in which trainings are kept as well."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def stub(paper, **changes):
+    """An experiment of three rows that counts what it measures."""
+    calls = []
+
+    def measure(row, seed, budget, work):
+        calls.append((row.name, seed))
+        return {"value": len(calls)}
+
+    rows = tuple(paper.data.Row(name=name, label=name, task="grasp") for name in ("a", "b", "c"))
+    given = {"name": "stub", "title": "Stub", "differs": "-", "table": None, "draw": None, "trains": True}
+    return paper.data.Experiment(rows=rows, measure=measure, **given | changes), calls
+
+
+# --- everything, tiny -----------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_smoke_of_everything(paper, here, capsys):
+    """Every row has a report, every experiment its table or figures; another run has nothing to do."""
+    output = here / "reports"
+    assert paper.command.main(["all", "--budget", "smoke", "--output", str(output)]) == 0
+    for experiment in paper.experiments.EXPERIMENTS.values():
+        for row in experiment.rows:
+            report = json.loads(paper.data.report_path(output, experiment, row).read_text())
+            assert report["budget"] == "smoke" and set(report["seeds"]) == {"0"}
+        written = [path.suffix for path in (output / experiment.name).rglob("*")]
+        assert (".svg" in written or ".jpg" in written) == (experiment.draw is not None)
+        assert (".md" in written) == (experiment.table is not None)
+    skin = json.loads((output / "skin" / "law" / "report.json").read_text())["seeds"]["0"]
+    assert skin["worst_deviation"] < 0.01 and skin["felt"][-1]["compression"] > 0.6
+    capsys.readouterr()
+    again = {path: path.stat().st_mtime_ns for path in output.rglob("report.json")}
+    paper.command.main(["all", "--budget", "smoke", "--output", str(output)])
+    assert again == {path: path.stat().st_mtime_ns for path in output.rglob("report.json")}
+    paper.command.main(["all", "--budget", "smoke", "--output", str(output), "--list"])
+    assert "about 0 min left" in capsys.readouterr().out
+    assert "smoke budget" in paper.page.render(output)
+
+
+# --- rows and seeds that are done -----------------------------------------------------------------------
+
+
+class TestResuming:
+    def test_rows_and_seeds_go_on_where_they_stopped(self, paper, here):
+        experiment, calls = stub(paper)
+        measure = experiment.measure
+
+        def fails(row, seed, budget, work):
+            if (row.name, seed) == ("b", 1):
+                raise KeyboardInterrupt
+            return measure(row, seed, budget, work)
+
+        budget = paper.data.BUDGETS["cpu"]
+        with pytest.raises(KeyboardInterrupt):
+            paper.command.run(dataclasses.replace(experiment, measure=fails), budget, here, here / "work")
+        assert calls == [("a", 0), ("a", 1), ("a", 2), ("b", 0)]
+        paper.command.run(experiment, budget, here, here / "work")
+        assert calls[4:] == [("b", 1), ("b", 2), ("c", 0), ("c", 1), ("c", 2)]
+        report = json.loads((here / "stub" / "b" / "report.json").read_text())
+        assert [report["seeds"][str(seed)]["value"] for seed in range(3)] == [4, 5, 6]
+
+    def test_a_larger_budget_measures_anew_and_a_smaller_one_keeps(self, paper, here):
+        experiment, calls = stub(paper, trains=False)
+        for name, count in (("smoke", 3), ("cpu", 6), ("smoke", 6), ("cpu", 6), ("gpu", 9)):
+            paper.command.run(experiment, paper.data.BUDGETS[name], here, here / "work")
+            assert len(calls) == count, name
+
+    def test_another_setting_is_another_row(self, paper, here):
+        experiment, calls = stub(paper, trains=False)
+        budget = paper.data.BUDGETS["cpu"]
+        paper.command.run(experiment, budget, here, here / "work")
+        changed = dataclasses.replace(experiment.rows[1], settings=("reward.force=1",))
+        other = dataclasses.replace(experiment, rows=(experiment.rows[0], changed, experiment.rows[2]))
+        assert set(paper.page.reports_of(other, here)) == {"a", "c"}
+        paper.command.run(other, budget, here, here / "work")
+        assert calls[3:] == [("b", 0)]
+        relabelled = dataclasses.replace(changed, label="another label", paper={"x": "1"})
+        assert paper.data.settings_of(relabelled) == paper.data.settings_of(changed)
+
+    def test_list_tells_what_is_left(self, paper, here):
+        experiment, _ = stub(paper)
+        budget = paper.data.BUDGETS["cpu"]
+        assert "about 189 min left" in next(paper.command.listing(experiment, budget, here))  # 3 x 3 x (20 + 1)
+        only = dataclasses.replace(experiment, rows=experiment.rows[:1])
+        paper.command.run(only, budget, here, here / "work")
+        head, first, second, _ = paper.command.listing(experiment, budget, here)
+        assert "about 126 min left" in head and "3 of 3 seeds, cpu budget" in first and "0 of 3 seeds" in second
+
+    @pytest.mark.parametrize(
+        "text", ["", '{"budget": "cpu"', "[]", '{"budget": "large", "row": {"a": 1}, "seeds": {}}']
+    )
+    def test_a_file_that_is_no_report_is_named(self, paper, here, text):
+        experiment, calls = stub(paper)
+        path = here / "stub" / "b" / "report.json"
+        path.parent.mkdir(parents=True)
+        path.write_text(text)
+        with pytest.raises(ConfigError, match="stub/b/report.json: is not a report of a row; delete it"):
+            list(paper.command.listing(experiment, paper.data.BUDGETS["cpu"], here))
+
+    def test_an_unknown_name_is_refused(self, paper, capsys):
+        with pytest.raises(SystemExit):
+            paper.command.main(["reward"])
+        assert "invalid choice: 'reward'" in capsys.readouterr().err
+
+
+class TestTraining:
+    """A row's training goes through `train_policy`."""
+
+    @pytest.fixture
+    def trained(self, paper, monkeypatch):
+        calls = []
+
+        def train_policy(task=None, config=None, **options):
+            calls.append((task, config, options))
+            folder = options.get("run_dir") or options["resume"]
+            folder.mkdir(parents=True, exist_ok=True)
+            report = {"policy": "last.msgpack", "origin": {"env_steps": 7}, "hardware": {}, "command": "train"}
+            (folder / "report.json").write_text(json.dumps(report))
+
+        monkeypatch.setattr(paper.measure, "train_policy", train_policy)
+        return calls
+
+    def row(self, paper):
+        return next(row for row in paper.experiments.EXPERIMENTS["rewards"].rows if row.name == "torque")
+
+    def test_its_settings_reach_the_training(self, paper, trained, here):
+        from dexsim_ppo.train import preset_arguments
+
+        folder, budget = here / "seed2", paper.data.BUDGETS["cpu"]
+        file, found = paper.measure.train(self.row(paper), 2, budget, folder)
+        ((task, config, options),) = trained
+        assert (task, config.reward.force, config.reward.torque) == ("grasp", 0.0, 2.0)
+        assert file == folder / "last.msgpack" and found["env_steps"] == 7
+        # The entry point of users has all of these options.
+        default = preset_arguments(task, config, options.pop("preset"))
+        arguments = dataclasses.replace(default, **options)
+        assert (arguments.seed, arguments.minutes, arguments.backend) == (2, 20.0, "c")
+        paper.measure.train(self.row(paper), 2, budget, folder)
+        assert len(trained) == 1, "a finished training is not repeated"
+
+    def test_it_resumes_from_a_checkpoint(self, paper, trained, here):
+        folder = here / "seed0"
+        (folder / "checkpoints").mkdir(parents=True)
+        (folder / "checkpoints" / "00000010.msgpack").touch()
+        paper.measure.train(self.row(paper), 0, paper.data.BUDGETS["cpu"], folder)
+        assert trained == [(None, None, {"resume": folder})]
+
+    def test_it_begins_anew_without_one(self, paper, trained, here):
+        folder = here / "seed0"
+        (folder / "checkpoints").mkdir(parents=True)
+        (folder / "metrics.jsonl").touch()
+        paper.measure.train(self.row(paper), 0, paper.data.BUDGETS["cpu"], folder)
+        assert trained[0][2]["run_dir"] == folder and not (folder / "metrics.jsonl").exists()
+
+
+# --- what the rows are ----------------------------------------------------------------------------------
+
+
+def test_settings_of_all_rows_are_of_their_tasks(paper):
+    """What would otherwise fail after an hour: a field's name, a value out of range, a field that is not observed."""
+    from dexsim.core.config import from_dict, override, to_dict
+    from dexsim.registry import find_task
+    from dexsim_ppo import load_policy
+
+    for experiment in paper.experiments.EXPERIMENTS.values():
+        assert len({row.name for row in experiment.rows}) == len(experiment.rows)
+        for row in experiment.rows:
+            if row.points:
+                entry, policy = find_task(row.task), load_policy(row.policy)
+                for point in row.points:
+                    settings = paper.measure.sweep_settings(row, point)
+                    changed = override(policy.env_config, settings)
+                    assert to_dict(from_dict(entry.config_class, changed)) != policy.env_config or point in (0.0, 0.02)
+            elif row.task:
+                paper.measure.task_config(row)
+            if row.ablate:
+                load_policy(row.policy).ablate(*row.ablate)
+    assert len(paper.experiments.EXPERIMENTS["observations"].rows) == 7
+
+
+def test_observations_of_the_rows(paper):
+    """What each row's policy sees of touch and orientation."""
+    from dexsim import load_hand
+    from dexsim.observation import ROTATE, layout
+
+    hand = load_hand()
+    sizes = {}
+    for row in paper.experiments.EXPERIMENTS["observations_paper"].rows:
+        config = paper.measure.task_config(row).observation
+        fields = {entry.name: entry.size for entry in layout(hand, ROTATE, config)}
+        kept = (fields.get(name, 0) for name in ("contact_centre", "contact_force", "relative_orientation"))
+        sizes[row.name] = (*kept, config.weighting)
+    assert sizes == {
+        "full": (15, 5, 6, "force"),
+        "quaternion": (15, 5, 4, "force"),
+        "unweighted": (15, 5, 6, "none"),
+        "no_force": (15, 0, 6, "force"),
+        "centre_alone": (15, 0, 6, "none"),
+        "no_touch": (0, 0, 6, "force"),
+        "no_orientation": (15, 5, 0, "force"),
+    }
+
+
+def test_ranges_of_training_are_those_of_the_shipped_policies(paper):
+    from dexsim_ppo import load_policy
+
+    for row in paper.experiments.EXPERIMENTS["robustness"].rows:
+        if row.training:
+            value = load_policy(row.policy).env_config
+            for name in row.settings[0].partition("=")[0].split("."):
+                value = value[name]
+            assert row.training == pytest.approx(tuple(value) if isinstance(value, (list, tuple)) else (0.0, value))
+
+
+def test_sweeps_reach_twice_the_range_of_training(paper):
+    assert paper.measure.points_at_twice(0.6, 1.2) == pytest.approx((0.3, 0.6, 1.2, 1.5))
+    assert paper.measure.points_at_twice(0.05, 0.2, 0.02) == pytest.approx((0.02, 0.05, 0.2, 0.275))
+
+
+# --- objects that no training has seen ------------------------------------------------------------------
+
+
+class TestHeldOut:
+    def test_meshes_are_those_of_the_code(self, paper, tmp_path):
+        paper.meshes.write(tmp_path)
+        for name in paper.meshes.MESHES:
+            assert (tmp_path / f"{name}.stl").read_bytes() == (paper.held_out.FOLDER / f"{name}.stl").read_bytes()
+
+    def test_meshes_are_closed_and_of_many_kinds(self, paper):
+        import trimesh
+
+        convex, thin = 0, 0
+        for name in paper.meshes.MESHES:
+            body = trimesh.load(paper.held_out.FOLDER / f"{name}.stl")
+            assert body.is_watertight and body.is_winding_consistent and body.volume > 0, name
+            assert 0.030 <= body.extents.max() <= 0.090, name
+            convex += body.volume > 0.99 * body.convex_hull.volume
+            thin += body.extents.min() <= 0.012
+        assert len(paper.meshes.MESHES) == 12 and convex <= 3 and thin >= 1 and len(paper.held_out.HEAVY) >= 3
+
+    def test_volumes_are_those_of_closed_forms(self, paper):
+        import trimesh
+
+        volumes = {n: trimesh.load(paper.held_out.FOLDER / f"{n}.stl").volume for n in ("l_bracket", "ring", "plate")}
+        assert volumes["l_bracket"] == pytest.approx(5 * 0.019 * 0.034 * 0.019, rel=1e-5)
+        assert volumes["plate"] == pytest.approx(0.010 * 0.044 * 0.062, rel=1e-5)
+        torus = 2 * np.pi * 0.022 * np.pi * 0.010 * 0.012  # Pappus; the facets cut a little off
+        assert volumes["ring"] == pytest.approx(torus, rel=0.05) and volumes["ring"] < torus
+
+    def test_no_composition_is_one_of_training(self, paper):
+        """Training has a box or a cylinder with one capsule along its z."""
+        for name, parts in paper.held_out.COMPOSITIONS.items():
+            kinds = sorted(part[0] for part in parts)
+            assert kinds not in (["box", "capsule"], ["capsule", "cylinder"]) or name == "mace"
+        # The mace's ball is three times as large as the largest neck of training, and at its end.
+        ball = paper.held_out.COMPOSITIONS["mace"][0]
+        assert ball[2][0] > 16 and len(paper.held_out.COMPOSITIONS) == 12
+
+    def test_mass_properties(self, paper):
+        """A box in closed form, and two balls apart by the parallel axis theorem."""
+        box = paper.held_out._composition((("box", "z", (10, 20, 30), (5, 0, 0)),))
+        a, b, c = 0.010, 0.020, 0.030
+        assert box.inertia == pytest.approx(np.array([b * b + c * c, a * a + c * c, a * a + b * b]) / 3, rel=0.02)
+        assert box.position[0] == pytest.approx(np.zeros(3), abs=1e-5)
+        balls = (("capsule", "z", (15, 0.01), (0, 0, 25)), ("capsule", "z", (15, 0.01), (0, 0, -25)))
+        own = 2 / 5 * 0.015**2
+        found = paper.held_out._composition(balls).inertia
+        assert found == pytest.approx([own + 0.025**2, own + 0.025**2, own], rel=0.02)
+
+    def test_objects_are_drawn_with_their_own_mass(self, paper, hand):
+        import jax
+
+        from dexsim.tasks.grasp.config import GraspConfig
+
+        names = ("cross", "anvil")
+        task = paper.held_out.HeldOutGrasp(GraspConfig(pool_size=8), hand, names)
+        keys = jax.random.split(jax.random.key(0), 40)
+        objects = [jax.vmap(lambda k, i=i: task.sample_object(k, task.config, np.int32(i)))(keys) for i in (0, 1)]
+        light, heavy = (np.asarray(object.mass) for object in objects)
+        assert 0.05 <= light.min() and light.max() <= 0.2 and 0.25 <= heavy.min() and heavy.max() <= 0.35
+        assert "objects.mass" not in task.object_ranges and "objects.friction" in task.object_ranges
+        assert np.asarray(objects[0].active)[0].sum() == 2 and np.asarray(objects[1].active)[0].sum() == 3
+
+
+# --- tables and page ------------------------------------------------------------------------------------
+
+
+def test_a_cell_is_of_one_seed_or_of_several(paper):
+    cell = paper.tables.cell
+    one = {"mean": 0.5, "low": 0.4, "high": 0.6}
+    assert cell([one]) == "0.5 (0.4–0.6)" and cell([one, {"mean": 0.7}]) == "0.6 (0.5–0.7)"
+    assert (
+        cell([{"r": 0.25, "low": None, "high": None}]) == "0.25"
+        and cell([None, {"mean": None}]) == ""
+        and paper.tables.percent([one]) == "50 (40–60)"
+    )
+
+
+def test_rows_without_training_say_so(paper):
+    experiment = paper.experiments.EXPERIMENTS["observations_paper"]
+    lines = paper.tables.rotation(experiment, {})
+    assert len(lines) == 8 and {line[-1] for line in lines[1:]} == {"not trained yet"}
+    assert [line[1].split(" / ")[0] for line in lines[1:]] == ["25.1", "2.9", "12.2", "13.2", "7.5", "1.1", "11.2"]
+    shipped = paper.tables.rotation(paper.experiments.EXPERIMENTS["observations"], {})
+    assert "shipped policy" in shipped[1][-1] and shipped[1][2].startswith("118")
+
+
+def test_the_page_agrees_with_the_reports(paper):
+    assert paper.page.PAGE.read_text() == paper.page.render(), "run python benchmarks/paper.py page"
+
+
+def test_committed_tables_agree_with_the_reports(paper):
+    for experiment in paper.experiments.EXPERIMENTS.values():
+        path = paper.data.REPORTS / experiment.name / "table.md"
+        if path.exists():
+            reports = paper.page.reports_of(experiment, paper.data.REPORTS)
+            assert path.read_text() == paper.page.markdown(experiment.table(experiment, reports)) + "\n"
+
+
+def test_committed_reports_are_of_todays_rows(paper):
+    """No report of a row that has changed since, and none of a smoke run."""
+    known = {
+        paper.data.report_path(paper.data.REPORTS, experiment, row): row
+        for experiment in paper.experiments.EXPERIMENTS.values()
+        for row in experiment.rows
+    }
+    for path in paper.data.REPORTS.rglob("report.json"):
+        report = json.loads(path.read_text())
+        assert report["row"] == paper.data.settings_of(known[path]) and report["budget"] != "smoke", path
+        assert report["commit"] and report["hardware"]["cpu_cores"] and report["command"].endswith(report["budget"])
