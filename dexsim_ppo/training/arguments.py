@@ -67,12 +67,19 @@ class TrainArguments(Generic[EnvConfig]):
 
 
 def training_config(arguments: TrainArguments) -> Any:
-    """The task's configuration with the share of extremes that training uses.
+    """The task's configuration as training uses it: with its share of extremes, and without a force loop.
+
+    A policy that does not follow its command yet learns from a loop to ignore a command that drifts.
 
     Raises:
       ConfigError: extremes for a task without randomisation ranges.
     """
     env, share = arguments.env, arguments.extremes
+    control = getattr(env, "control", None)
+    if control is not None and control.force.gain:
+        env = dataclasses.replace(
+            env, control=dataclasses.replace(control, force=dataclasses.replace(control.force, gain=0.0))
+        )
     if not share:
         return env
     if not (hasattr(env, "randomization") and hasattr(env, "objects")):

@@ -21,7 +21,7 @@ from dexsim_ppo.learner.ppo import TrainState, make_train
 from dexsim_ppo.learner.types import Environment
 from dexsim_ppo.policy import Policy
 from dexsim_ppo.training import programs
-from dexsim_ppo.training.arguments import TrainArguments, printable
+from dexsim_ppo.training.arguments import TrainArguments, printable, training_config
 from dexsim_ppo.training.display import Display
 from dexsim_ppo.training.faults import Faults, keep
 from dexsim_ppo.training.fine_tune import initialize_from
@@ -43,8 +43,9 @@ class Run:
         self.clock = {"setup_s": time.perf_counter() - started}
 
     def _evaluation_env(self) -> Environment:
-        """The training environment, or one of its own: Warp sizes buffers by the batch; extremes are for training."""
-        if self.env.backend != "warp" and not self.arguments.extremes:
+        """The training environment, or one of its own: Warp sizes buffers by the batch, and training has extremes and
+        no force loop."""
+        if self.env.backend != "warp" and training_config(self.arguments) == self.arguments.env:
             return self.env
         import dexsim
 

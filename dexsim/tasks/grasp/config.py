@@ -2,8 +2,10 @@
 
 import dataclasses
 
+from dexsim.control import Control
 from dexsim.core.config import check_ranges, setting, validate
 from dexsim.env.config import EnvConfig
+from dexsim.force_loop import ForceLoop
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -49,6 +51,8 @@ class GraspReward:
 class GraspConfig(EnvConfig):
     """The grasp task."""
 
+    control: Control = setting(Control(force=ForceLoop(gain=0.5, limit=1.5)))
+    """From action to joint target. The force loop is for use: training goes without."""
     episode_seconds: float = setting(6.0, unit="s", low=0.2, high=3600.0)
     """Training episode length. Force is scored from 3 s on, so it must be longer than that."""
     evaluation_seconds: float = setting(8.0, unit="s", low=0.2, high=3600.0)
