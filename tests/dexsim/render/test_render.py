@@ -1,5 +1,6 @@
 """The renderer: geometry against the pinhole formula, colours, where heat-map cells lie, and readable video files."""
 
+import dataclasses
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -9,8 +10,8 @@ import numpy as np
 import pytest
 
 from dexsim.hand.load import load_hand
-from dexsim.render import render
-from dexsim.render.panel import draw_panel, force_color, make_layout, taxel_image
+from dexsim.render import picture, render
+from dexsim.render.panel import draw_panel, force_color, make_layout, read_outs, taxel_image
 from dexsim.render.raycast import FAR, Camera, Primitives, cast, look, normals, project, samples
 from dexsim.render.snapshot import Snapshot
 
@@ -181,7 +182,7 @@ def test_heat_map_cell_lies_where_documented():
     for finger, column, row in ((0, 0, 0), (2, 9, 0), (3, 4, 11), (4, 7, 5)):
         force = np.zeros((5, 120), np.float32)
         force[finger, column * 12 + row] = 1.0
-        panel = draw_panel(layout, names, force, force.sum(1), np.zeros(0), np.nan, 1.0, 1.0)
+        panel = draw_panel(layout, names, force, force.sum(1), {}, np.nan, 1.0, 1.0)
         left, top, right, bottom = cell_box(layout, finger, column, row)
         hot = force_color(np.array(1.0), 1.0)
         assert np.all(panel[top:bottom, left:right] == hot)
@@ -216,7 +217,7 @@ def test_frame_of_every_kind(hand, active):
 def test_a_loaded_taxel_shows_on_the_finger(hand):
     """Of two pictures that differ in one taxel's force, the pixels around that taxel differ and turn hot."""
     cold = snapshot(hand, active=None)
-    pose = render._poses(hand, cold.joint_position[None])[0]
+    pose = render.hand_poses(hand, cold.joint_position[None])[0]
     size = (640, 480)
     view = look(render.CAMERAS["grasp"], (400, 480))
     facing = np.sum(pose.taxel_normal * (view.origin - pose.taxel_position), -1)
@@ -239,6 +240,47 @@ def test_frame_is_deterministic_and_both_cameras_work(hand):
     assert np.any(other != one)
     away = Camera(distance=0.3, target=(0.0, 0.0, 5.0), azimuth=180)  # the scene is behind it
     assert render.render_frame(hand, KINDS, snapshot(hand), size=SMALL, camera=away).shape == (240, 320, 3)
+
+
+def quarter(axis):
+    """A quarter turn about an axis."""
+    turn = np.roll(np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]], np.float32), axis + 1, (0, 1))
+    return turn
+
+
+def test_sides_of_a_box_have_the_colours_that_are_nearest_to_their_normals():
+    box = primitives(("box", [0.02] * 3, [0, 0, 0]))._replace(rotation=quarter(2)[None], sides=np.eye(6)[:, :3])
+    # Turned by a quarter about z, the box's +x looks along y, and its +y along -x.
+    tones = picture._tones(box, np.zeros(3, int), np.float32([[0, 0.9, 0], [-0.8, 0.1, 0], [0.1, 0, 0.9]]).T)
+    np.testing.assert_array_equal(tones.T, np.eye(6)[[0, 2, 4], :3])
+
+
+def test_a_quarter_turn_of_a_cube_can_be_seen(hand):
+    cube = dataclasses.replace(snapshot(hand, active="box"), primitive_size=np.full((5, 3), 0.025, np.float32))
+    turned = dataclasses.replace(cube, object_rotation=quarter(0))
+    plain, other = (render.render_frame(hand, KINDS, s, size=SMALL, camera="rotate") for s in (cube, turned))
+    assert np.any(plain != other, -1).mean() > 0.02
+
+
+def test_the_goal_is_shown_in_its_orientation_and_only_where_there_is_one(hand):
+    without = snapshot(hand, active="box")
+    view = look(render.CAMERAS["rotate"], (200, 240))
+    x, y = project(view, picture.goal_position(render.CAMERAS["rotate"]))[0].astype(int)
+    frames = [
+        render.render_frame(hand, KINDS, s, size=SMALL, camera="rotate")[y - 4 : y + 4, x - 4 : x + 4].mean((0, 1))
+        for s in (without, *(dataclasses.replace(without, goal_rotation=turn) for turn in (np.eye(3), quarter(0))))
+    ]
+    assert np.ptp(frames[0]) < 20, "the backdrop is grey"
+    assert np.abs(frames[1] - frames[0]).max() > 60 and np.abs(frames[2] - frames[1]).max() > 60
+
+
+def test_a_picture_says_time_turns_command_and_forces(hand):
+    force = np.zeros(hand.taxel_position.shape[:2], np.float32)
+    force[1, 0] = 2.5
+    plain = snapshot(hand, force=force)
+    assert read_outs(plain) == {"command": "0.50", "target": "3.0 N", "total": "2.5 N"}
+    turning = dataclasses.replace(plain, turns=np.int32(7), seconds=np.float32(12.34))
+    assert read_outs(turning) == {"time": "12.3 s", "turns": "7", "total": "2.5 N"}
 
 
 def test_broken_numbers_still_make_a_frame(hand):
