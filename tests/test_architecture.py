@@ -28,6 +28,7 @@ FLOORS = {
         ("tasks",),
         ("registry",),
         ("randomization_check", "wrappers"),
+        ("view",),
         ("",),
     ),
     "dexsim_ppo": (
@@ -57,6 +58,7 @@ FLOORS = {
 
 FOREIGN = {
     "dexsim": (),
+    "dexsim.view": ("dexsim_ppo", "dexsim_real"),  # a command over all three, which nothing imports
     "dexsim_ppo.learner": ("dexsim.core",),
     "dexsim_ppo": ("dexsim",),
     "dexsim_real": ("dexsim", "dexsim_ppo"),

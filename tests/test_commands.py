@@ -29,6 +29,7 @@ COMMANDS = {
     "dexsim_real.calibrate": ("dexsim_real.calibrate.options:CalibrateArguments", ["--port", "x"]),
     "dexsim_real.twin": ("dexsim_real.twin.options:TwinArguments", []),
     "dexsim_real.replay": ("dexsim_real.replay.__main__:ReplayArguments", ["x.log"]),
+    "dexsim.view": ("dexsim.view.__main__:ViewArguments", ["grasp"]),
     "dexsim.randomization_check": ("dexsim.randomization_check.__main__:CheckArguments", []),
 }
 CASES = [(command, "") for command in COMMANDS if command != "dexsim_ppo.train"]

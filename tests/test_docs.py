@@ -33,6 +33,7 @@ COMMANDS = {
     "dexsim_real.calibrate": "dexsim_real.calibrate.options:CalibrateArguments",
     "dexsim_real.twin": "dexsim_real.twin.options:TwinArguments",
     "dexsim_real.replay": "dexsim_real.replay.__main__:ReplayArguments",
+    "dexsim.view": "dexsim.view.__main__:ViewArguments",
     "dexsim.randomization_check": "dexsim.randomization_check.__main__:CheckArguments",
 }
 """The commands whose options are one dataclass; those of `dexsim_ppo.train` depend on the task."""
