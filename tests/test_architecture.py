@@ -34,7 +34,7 @@ FLOORS = {
     "dexsim_ppo": (
         ("learner",),
         ("retired",),
-        ("checkpoint",),
+        ("checkpoint", "report"),
         ("policy",),
         ("evaluate",),
         ("training",),

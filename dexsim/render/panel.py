@@ -141,13 +141,18 @@ def draw_panel(
             mark = x + int(target_force / finger_range * (width - 1))
             draw.rectangle((mark, bar - 1, mark + 1, bar + thick + 1), fill=INK)
     x, y = layout.slots[-1]
+    # Above the colour scale; a small panel has little room.
+    room = pad + height - max(4, layout.cell) - int(1.3 * layout.font)
+    pitch = min(round(1.35 * layout.font), room // max(len(captions) + len(lines), 1))
+    small = _font(min(layout.font - 2, pitch))
     for caption in captions:
-        draw.text((x, y), caption, fill=FAINT, font=_font(layout.font - 2))
-        y += round(1.2 * layout.font)
+        draw.text((x, y), caption, fill=FAINT, font=small)
+        y += pitch
     for name, value in lines.items():
-        draw.text((x, y), name, fill=FAINT, font=font)
-        draw.text((x + width - draw.textlength(value, font), y), value, fill=INK, font=font)
-        y += round(1.4 * layout.font)
+        fits = draw.textlength(name + value, font) + layout.font < width
+        draw.text((x, y), name, fill=FAINT, font=font if fits else small)
+        draw.text((x + width, y), value, fill=INK, font=font if fits else small, anchor="ra")
+        y += pitch
     return np.asarray(image)
 
 

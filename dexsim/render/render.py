@@ -65,19 +65,21 @@ def render_episode(
     *,
     camera: Camera | str | None = None,
     size: tuple[int, int] = (640, 480),
-    max_frames: int = 400,
+    rate: float | None = None,
 ) -> Path:
-    """Write snapshots stacked along T as a video that plays `fps` of them a second; return the path written.
+    """Write snapshots stacked along T, `fps` of them a second, as a video as long as they last; return its path.
 
-    MP4 where imageio-ffmpeg (extra `video`) can be imported, else GIF with the suffix changed. Longer episodes than
-    `max_frames` are thinned evenly and keep their duration. The camera is the preset named like the task.
+    MP4 where imageio-ffmpeg (extra `video`) can be imported, else GIF with the suffix changed. `rate` is the video's
+    own number of frames a second, each the nearest snapshot; None shows every snapshot. The camera is the preset named
+    like the task.
     """
     snapshots = _finite(snapshots)
     total = len(snapshots.joint_position)
     if total == 0:
         raise ValueError("render_episode: no snapshots to draw")
-    stride = -(-total // max_frames)
-    snapshots = jax.tree.map(lambda x: x[::stride], snapshots)
+    rate = rate or fps
+    nearest = np.minimum(np.round(np.arange(max(round(total * rate / fps), 1)) * fps / rate).astype(int), total - 1)
+    snapshots = jax.tree.map(lambda x: x[nearest], snapshots)
     hand = getattr(env, "hand", None) or load_hand()
     if camera is None:
         camera = env.name if env.name in CAMERAS else "grasp"
@@ -92,7 +94,7 @@ def render_episode(
     def frame(t: int) -> np.ndarray:
         return draw(jax.tree.map(lambda x: x[t], snapshots), poses[t])
 
-    return _write_video(frame, len(poses), Path(path), fps / stride, size)
+    return _write_video(frame, len(poses), Path(path), rate, size)
 
 
 def draw_taxels(hand: Hand, taxel_force: np.ndarray, ax: Any = None):

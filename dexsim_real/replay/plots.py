@@ -9,6 +9,7 @@ import numpy as np
 
 from dexsim import load_hand
 from dexsim.core.install import install_line
+from dexsim.hand.kinematics import Hand
 from dexsim.render.panel import taxel_image
 from dexsim_real.core.log import LogError
 
@@ -28,29 +29,41 @@ def signals(run: Replay) -> dict[str, np.ndarray]:
 
 
 def plot(run: Replay, path: Path) -> None:
-    """Write a figure of joint angles and targets, finger forces and command, measurement ages, and the observation."""
+    """Write a figure: joint angles and targets by finger, finger forces and command, ages, and the observation."""
     import matplotlib.pyplot as plt
 
-    figure, axes = plt.subplots(4, 1, figsize=(10, 13), sharex=True, constrained_layout=True)
     hand, seen = load_hand(), signals(run)
-    for joint, name in enumerate(hand.joint_names):
-        (line,) = axes[0].plot(run.time, seen["angle"][:, joint], lw=1, label=name.removeprefix("right_hand_"))
-        axes[0].plot(run.time, seen["target"][:, joint], lw=0.6, ls=":", color=line.get_color())
-    axes[0].set_ylabel("joint angle, target (dotted) / rad")
-    axes[0].legend(fontsize=6, ncols=4)
+    fingers = hand.num_fingers
+    figure, axes = plt.subplots(
+        fingers + 3,
+        1,
+        figsize=(10, 19),
+        sharex=True,
+        constrained_layout=True,
+        height_ratios=[1.0] * fingers + [1.5, 0.8, 3.0],
+    )
+    for finger, (axis, name) in enumerate(zip(axes, hand.finger_names, strict=False)):
+        for joint in finger_joints(hand, finger):
+            label = hand.joint_names[joint].removeprefix("right_hand_").removesuffix("_joint").replace("_", " ")
+            (line,) = axis.plot(run.time, seen["angle"][:, joint], lw=1, label=label)
+            axis.plot(run.time, seen["target"][:, joint], lw=0.8, ls=":", color=line.get_color())
+        axis.set_ylabel(f"{name} [rad]")
+        axis.legend(fontsize=7, ncols=4, loc="upper right", frameon=False)
+    axes[0].set_title("joint angles; targets dotted", loc="left", fontsize=9)
+    felt, age, observation = axes[fingers:]
     for finger, name in enumerate(hand.finger_names):
-        axes[1].plot(run.time, seen["force"][:, finger], lw=1, label=name)
-    axes[1].set_ylabel("fingertip force / N")
-    axes[1].legend(fontsize=7, ncols=5)
-    command = axes[1].twinx()
+        felt.plot(run.time, seen["force"][:, finger], lw=1, label=name)
+    felt.set(ylabel="force on the taxels [N]", ylim=(0, max(1.05 * float(seen["force"].max()), 0.1)))
+    felt.legend(fontsize=7, ncols=5, loc="upper right", frameon=False)
+    command = felt.twinx()
     command.plot(run.time, seen["command"], "k--", lw=0.8)
-    command.set_ylabel("command / 1")
-    axes[2].plot(run.time, 1e3 * seen["age"], lw=0.8)
-    axes[2].set_ylabel("age of the measurement / ms")
+    command.set(ylabel="command, dashed [0 to 1]", ylim=(-0.02, 1.02))
+    age.plot(run.time, 1e3 * seen["age"], lw=0.8)
+    age.set_ylabel("age of the\nmeasurement [ms]")
     # Entries differ in unit and scale, so each is normalised.
     spread = np.maximum(run.observation.std(0), 1e-6)
     edges = np.cumsum([0] + [field.size for field in run.fields])
-    axes[3].pcolormesh(
+    observation.pcolormesh(
         run.time,
         np.arange(edges[-1]) + 0.5,
         ((run.observation - run.observation.mean(0)) / spread).T,
@@ -60,14 +73,24 @@ def plot(run: Replay, path: Path) -> None:
         shading="nearest",
         rasterized=True,
     )
-    axes[3].set_yticks((edges[:-1] + edges[1:]) / 2, [field.name for field in run.fields], fontsize=7)
-    axes[3].hlines(edges[1:-1], run.time[0], run.time[-1], color="k", lw=0.5)
-    axes[3].invert_yaxis()
-    axes[3].set_title("observation, each entry in standard deviations from its mean", fontsize=9)
-    axes[3].set_xlabel("time / s")
+    middles = (edges[:-1] + edges[1:]) / 2
+    observation.set_yticks(middles, [field.name.replace("_", " ") for field in run.fields], fontsize=7)
+    observation.hlines(edges[1:-1], run.time[0], run.time[-1], color="k", lw=0.5)
+    observation.invert_yaxis()
+    observation.set_title("observation: each entry in standard deviations from its mean", loc="left", fontsize=9)
+    observation.set_xlabel("time [s]")
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=120)
     plt.close(figure)
+
+
+def finger_joints(hand: Hand, finger: int) -> list[int]:
+    """Joints from the palm to a fingertip."""
+    body, joints = int(hand.tip_body[finger]), list[int]()
+    while body >= 0:
+        joints += [int(hand.body_joint[body])] if hand.body_joint[body] >= 0 else []
+        body = int(hand.body_parent[body])
+    return joints[::-1]
 
 
 def show_rerun(run: Replay, path: Path | None = None) -> None:

@@ -205,6 +205,23 @@ def test_panel_fits(size):
     assert max(box[2] for box in boxes) <= layout.width and max(box[3] for box in boxes) <= layout.height
 
 
+@pytest.mark.parametrize("size", [(416, 312), (640, 480), (1920, 1080)])
+def test_read_outs_stay_clear_of_the_colour_scale(size):
+    layout = make_layout(size[1] // 2, size[1], (10, 12), 5)
+    force = np.zeros((5, 120))
+    lines = {"time": "12.3 s", "command": "0.25", "target": "3.0 N", "total": "12.5 N"}
+    panels = [
+        draw_panel(layout, ("a", "b", "c", "d", "e"), force, force.sum(1), some, np.nan, 1.0, 1.0, ("", ""))
+        for some in ({}, lines)
+    ]
+    x, y = layout.slots[-1]
+    scale = y + int(1.3 * layout.font) + layout.cell * 12 - max(4, layout.cell) - int(1.3 * layout.font)
+    rows, columns = np.nonzero(np.any(panels[0] != panels[1], -1))
+    assert rows.min() >= y and rows.max() <= scale + 1 and columns.max() < x + layout.cell * 10
+    inked = np.any(panels[0] != panels[1], -1)[y:scale].any(1)
+    assert np.sum(np.diff(inked.astype(int)) == 1) + inked[0] >= 3, "lines are apart"
+
+
 @pytest.mark.parametrize("active", [*KINDS, None])
 def test_frame_of_every_kind(hand, active):
     frame = render.render_frame(hand, KINDS, snapshot(hand, active=active), size=SMALL)
@@ -339,14 +356,17 @@ def test_mp4_is_written_and_readable(hand, tmp_path):
     assert np.abs(first[:, :200] - drawn[:, :200]).mean() < 4  # what lossy compression leaves
 
 
-def test_long_episodes_are_thinned(hand, tmp_path, monkeypatch):
+def test_a_film_of_another_rate_keeps_its_duration(hand, tmp_path, monkeypatch):
     from PIL import Image
 
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     env, steps = episode(hand, 9)
-    path = render.render_episode(env, steps, tmp_path / "video.gif", fps=30, size=(160, 120), max_frames=4)
-    with Image.open(path) as image:
-        assert image.n_frames == 3 and image.info["duration"] == 100  # every third, three times as long
+    for rate, frames, duration in ((10, 3, 100), (60, 18, 20)):
+        path = render.render_episode(env, steps, tmp_path / "video.gif", fps=30, size=(160, 120), rate=rate)
+        with Image.open(path) as image:
+            assert image.n_frames <= frames and image.info["duration"] >= duration - 4
+            total = sum(image.seek(k) or image.info["duration"] for k in range(image.n_frames))
+        assert total == pytest.approx(300, abs=30 + 60 * (rate == 60))  # a GIF counts hundredths, and merges twins
     empty = jax.tree.map(lambda x: x[:0], steps)
     with pytest.raises(ValueError, match="no snapshots"):
         render.render_episode(env, empty, tmp_path / "none.gif", fps=30)

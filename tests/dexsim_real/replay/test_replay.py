@@ -43,10 +43,26 @@ def test_a_run_from_the_measured_pose_to_motors_off_and_its_replay(hand, tmp_pat
     again = replay.replay(tmp_path / "run.log").report
     assert again["ticks"] == again["readings_same"] == again["observations_same"] == len(ticks) > 20
     assert again["first_difference"] is None and again["damaged_bytes"] == 0
-    assert replay_command.main([str(tmp_path / "run.log"), "--plot", str(tmp_path / "run.png")]) == 0
-    assert (tmp_path / "run.png").stat().st_size > 10_000
+    drawn_by_finger(hand, tmp_path, ticks)
     forged(tmp_path)
     seen_in_rerun(tmp_path)
+
+
+def drawn_by_finger(hand, folder, ticks):
+    """The figure has one axis a finger, with each of its joints and its target."""
+    drawn = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("matplotlib.pyplot.close", drawn.append)
+        assert replay_command.main([str(folder / "run.log"), "--plot", str(folder / "run.png")]) == 0
+    assert (folder / "run.png").stat().st_size > 10_000
+    axes = drawn[0].axes[:5]
+    assert [axis.get_ylabel() for axis in axes] == [f"{name} [rad]" for name in hand.finger_names]
+    lines = [line for axis in axes for line in axis.lines]
+    assert [len(axis.lines) // 2 for axis in axes] == [3, 3, 2, 2, 2]
+    for joint in range(12):
+        angles, targets = lines[2 * joint : 2 * joint + 2]
+        np.testing.assert_array_equal(angles.get_ydata(), [t["readings"]["joint_position"][joint] for t in ticks])
+        np.testing.assert_array_equal(targets.get_ydata(), [t["target"][joint] for t in ticks])
 
 
 class Rerun:
