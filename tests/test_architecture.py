@@ -32,11 +32,11 @@ FLOORS = {
         ("",),
     ),
     "dexsim_ppo": (
-        ("learner",),
+        ("learner", "portable"),
         ("retired",),
         ("checkpoint", "report"),
         ("policy",),
-        ("evaluate",),
+        ("evaluate", "export"),
         ("training",),
         ("train",),
         ("reproduce",),
