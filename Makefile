@@ -56,7 +56,7 @@ $(INSTALLED): pyproject.toml | $(VENV)/.created
 	@touch $@
 
 $(TESTABLE): pyproject.toml | $(VENV)/.created
-	$(PIP) install --quiet --editable ".[brax,warp,video,tb,view,onnx]" --group test
+	$(PIP) install --quiet --editable ".[brax,warp,video,tb,view,onnx,lerobot,gym]" --group test
 	@touch $@
 
 # With the packages, since mypy reads the types of JAX and NumPy.

@@ -25,6 +25,7 @@ COMMANDS = {
     "dexsim_ppo.train": ("dexsim_ppo.train:TrainArguments", []),
     "dexsim_ppo.evaluate": ("dexsim_ppo.evaluate:EvaluateArguments", ["grasp"]),
     "dexsim_ppo.export": ("dexsim_ppo.export:ExportArguments", ["grasp", "--output", "grasp.npz"]),
+    "dexsim_ppo.record": ("dexsim_ppo.record:RecordArguments", ["grasp", "--rrd", "x.rrd"]),
     "dexsim_ppo.reproduce": ("dexsim_ppo.reproduce:ReproduceArguments", ["x.msgpack"]),
     "dexsim_real.run": ("dexsim_real.run.options:RunArguments", ["grasp", "--port", "x", "--uncalibrated"]),
     "dexsim_real.calibrate": ("dexsim_real.calibrate.options:CalibrateArguments", ["--port", "x"]),

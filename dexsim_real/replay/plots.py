@@ -1,4 +1,4 @@
-"""Plots of a replayed log: a figure, or the rerun viewer."""
+"""What is made of a replayed log: a figure, the rerun viewer, a dataset."""
 
 from __future__ import annotations
 
@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dexsim import load_hand
-from dexsim.core.install import install_line
+from dexsim.datasets.rerun import show_rerun
+from dexsim.datasets.trajectory import Trajectory, from_readings
 from dexsim.hand.kinematics import Hand
-from dexsim.render.panel import taxel_image
-from dexsim_real.core.log import LogError
 
 if TYPE_CHECKING:
     from dexsim_real.replay.replay import Replay
@@ -93,7 +92,7 @@ def finger_joints(hand: Hand, finger: int) -> list[int]:
     return joints[::-1]
 
 
-def show_rerun(run: Replay, path: Path | None = None) -> None:
+def open_rerun(run: Replay, path: Path | None = None) -> None:
     """Show a replay in the rerun viewer: the signals, the observation by fields, and taxels as pictures.
 
     Args:
@@ -101,13 +100,9 @@ def show_rerun(run: Replay, path: Path | None = None) -> None:
       path: recording to write; None opens the viewer.
 
     Raises:
-      LogError: rerun is not installed.
+      DexsimError: rerun is not installed.
       OSError: the file cannot be written.
     """
-    try:
-        import rerun
-    except ImportError:
-        raise LogError(f"the rerun viewer is not installed: {install_line('rerun')}; or use --plot") from None
     hand = load_hand()
     edges = np.cumsum([field.size for field in run.fields])[:-1]
     names = {"angle": hand.joint_names, "target": hand.joint_names, "force": hand.finger_names}
@@ -118,22 +113,11 @@ def show_rerun(run: Replay, path: Path | None = None) -> None:
             for field, values in zip(run.fields, np.split(run.observation, edges, 1), strict=True)
         },
     }
-    recording = rerun.RecordingStream("dexsim")
-    if path is None:
-        recording.spawn()
-    else:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.touch()  # Its error names the file; rerun's does not.
-        recording.save(path)
-    for entity, (labels, values) in series.items():
-        recording.log(entity, rerun.SeriesLines(names=list(labels)), static=True)
-        recording.send_columns(
-            entity, [rerun.TimeColumn("run", duration=run.time)], rerun.Scalars.columns(scalars=values)
-        )
-    top = max(float(np.max([m.taxel_force for m in run.measured])), 1e-3)
-    for at, now in zip(run.time, run.measured, strict=True):
-        recording.set_time("run", duration=float(at))
-        for finger, name in enumerate(hand.finger_names):
-            picture = taxel_image(now.taxel_force[finger], hand.taxel_grid)
-            recording.log(f"taxels/{name}", rerun.DepthImage(picture, colormap="inferno", depth_range=(0.0, top)))
-    recording.disconnect()
+    show_rerun(hand, run.time, series, np.stack([now.taxel_force for now in run.measured]), path)
+
+
+def trajectory(run: Replay) -> Trajectory:
+    """A replay as data; the object as the bridge estimated it."""
+    return from_readings(
+        run.time, [tick["readings"] for tick in run.ticks], np.array([tick["target"] for tick in run.ticks])
+    )

@@ -8,10 +8,11 @@ import pytest
 pytest.importorskip("serial")
 from following_hand import FollowingHand, arguments, records, summary
 
-from dexsim_real.core.log import Kind, LogError, LogReader
+from dexsim.core.errors import DexsimError
+from dexsim_real.core.log import Kind, LogReader
 from dexsim_real.replay import __main__ as replay_command
 from dexsim_real.replay import replay
-from dexsim_real.replay.plots import show_rerun
+from dexsim_real.replay.plots import open_rerun
 from dexsim_real.run import __main__ as run
 
 pytestmark = pytest.mark.usefixtures("jax_as_it_is")
@@ -111,8 +112,8 @@ def seen_in_rerun(folder):
     path = folder / "run.log"
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(sys.modules, "rerun", None)
-        with pytest.raises(LogError, match=r"pip install -e '\.\[rerun\]'"):
-            show_rerun(replay.replay(path), folder / "run.rrd")
+        with pytest.raises(DexsimError, match=r"pip install -e '\.\[rerun\]'"):
+            open_rerun(replay.replay(path), folder / "run.rrd")
         patch.setitem(sys.modules, "rerun", Rerun)
         assert replay_command.main([str(path), "--rrd", str(folder / "new" / "run.rrd")]) == 0
     sent, ticks = Rerun.last, records(folder, Kind.TICK)
