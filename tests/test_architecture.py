@@ -30,6 +30,7 @@ FLOORS = {
         ("registry",),
         ("randomization_check", "wrappers"),
         ("view",),
+        ("__main__",),
         ("",),
     ),
     "dexsim_ppo": (

@@ -91,6 +91,22 @@ def test_command_has_its_options(line):
             override(config, list(options.set))
 
 
+def console_lines():
+    """Lines of code blocks that begin with the console command."""
+    for page in PAGES:
+        for block in re.findall(r"^```\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE):
+            for line in re.findall(r"^dexsim [^#\n]*", block, re.MULTILINE):
+                yield pytest.param(line.strip(), id=f"{name_of(page)}: {line.strip()}")
+
+
+@pytest.mark.parametrize("line", list(console_lines()))
+def test_console_command_exists(line):
+    from dexsim.__main__ import COMMANDS as names
+
+    _, name, *argv = shlex.split(line)
+    test_command_has_its_options(shlex.join(["python", "-m", names[name][0].removesuffix(".__main__"), *argv]))
+
+
 def parse_train(argv: list[str]) -> None:
     from dexsim_ppo import train
 

@@ -34,7 +34,8 @@ def run(main: Callable[[Sequence[str] | None], int]) -> None:
     try:
         code = main(None)
     except DexsimError as error:
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        page = f" ({error.page} helps)" if error.page else ""
+        print(f"error: {' '.join(str(error).split())}{page}", file=sys.stderr)
         code = 2
     except BrokenPipeError:  # The reader of a pipe, such as `head`, has seen enough.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

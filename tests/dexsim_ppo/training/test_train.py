@@ -196,6 +196,29 @@ def test_without_a_number_of_episodes_the_device_decides(finished):
     assert evaluate.default_episodes(long) == 64
 
 
+def test_a_saved_configuration_begins_a_new_run(finished, tmp_path, capsys):
+    """Its options are the defaults; what is typed beside it holds."""
+    for given in (finished.path, finished.config):
+        again, begun = train.parse_arguments(["--config", str(given), "--seed", "9", "--env.gain", "0.5"])
+        saved = train.saved_arguments(Path(given), None)
+        assert begun is None and again.seed == 9 and again.env.gain == 0.5 and again.run_dir is None
+        assert again.ppo == saved.ppo and again.evaluation_chunk == 16 and again.steps == 6 * PER_ITERATION
+    path = tmp_path / "again"
+    assert train.main(["--config", str(finished.path), "--run-dir", str(path)]) == 0
+    first, second = (Policy.load(RunFolder(p).last).params for p in (finished.path, path))
+    jax.tree.map(np.testing.assert_array_equal, first, second)
+    (tmp_path / "other.json").write_text("{}")
+    for arguments, said in (
+        (["--config", str(finished.path), "--task", "grasp"], "of the task 'tiny', not 'grasp'"),
+        (["--config", str(finished.path), "--resume", str(finished.path)], "give one of them"),
+        (["--config", str(tmp_path / "other.json")], "no configuration of a run"),
+        (["--config", str(tmp_path / "none.json")], "no configuration of a run"),
+    ):
+        capsys.readouterr()
+        assert exit_code(train.main, arguments) == 2
+        assert said in (error := capsys.readouterr().err) and error.count("\n") == 1
+
+
 def test_episodes_end_at_their_first_termination():
     # Episode 0 terminates at step 1 (with a reward of 10 counted in), and "lives" again later.
     terminated = np.array([[0, 0], [1, 0], [0, 0]], bool)
