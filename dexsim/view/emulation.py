@@ -11,6 +11,7 @@ from dexsim.view.source import Control, Frame, Slider, Values
 from dexsim_ppo.policy import load_policy
 from dexsim_real.control.controller import Controller, prepare_jax
 from dexsim_real.core.errors import HandError
+from dexsim_real.twin.__main__ import check_policy
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand
 from dexsim_real.twin.plant.parameters import TASKS
 from dexsim_real.twin.plant.shapes import matrix
@@ -25,7 +26,7 @@ class Emulation:
       seed: of the trials.
 
     Raises:
-      HandError: the emulated hand has no such task, or the policy observes what no sensor measures.
+      HandError: the emulated hand has no such task or mount, or the policy observes what no sensor measures.
     """
 
     def __init__(self, name: str, seed: int = 0):
@@ -33,6 +34,7 @@ class Emulation:
         self.hand, policy = load_hand(), load_policy(name)
         if policy.task not in TASKS:
             raise HandError(f"{name}: the emulated hand has the tasks {' and '.join(TASKS)}, not {policy.task!r}")
+        check_policy(name, policy.task, self.hand)
         self._controller = Controller(policy, self.hand)
         self._controller.warm()
         self._calibration = ideal_calibration(self.hand)

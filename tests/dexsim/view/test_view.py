@@ -208,8 +208,7 @@ def page(simulation):
     if chromium is None:
         pytest.skip("no Chromium on this machine (apt-get install chromium)")
     pytest.importorskip("viser")
-    from playwright.sync_api import sync_playwright
-
+    sync_playwright = pytest.importorskip("playwright.sync_api").sync_playwright
     from dexsim.view.viewer import Viewer
 
     viewer, stop = Viewer(simulation, title="test", port=18080), threading.Event()
@@ -254,19 +253,24 @@ def test_the_page_shows_the_hand(page):
 
 def test_a_slider_changes_the_force(page):
     command = page.get_by_role("slider").first
-    forces = []
-    for key in ("Home", "End"):
+
+    def slide(key, wanted):
         command.focus()
         page.keyboard.press(key)
-        wanted = 0.0 if key == "Home" else 1.0
-        assert wait_until(lambda wanted=wanted: page.viewer.values()["command"] == wanted)
-        began = time.monotonic()
-        samples = []
-        while time.monotonic() < began + 5:
+        assert wait_until(lambda: page.viewer.values()["command"] == wanted)
+
+    def mean(seconds):
+        end, samples = time.monotonic() + seconds, []
+        while time.monotonic() < end:
             samples.append(total(page))
-            time.sleep(0.3)
-        forces.append(np.mean(samples[8:]))
-    assert forces[1] > 1.3 * forces[0]
+            time.sleep(0.2)
+        return np.mean(samples)
+
+    slide("Home", 0.0)
+    time.sleep(1.0)
+    gentle = mean(2.0)
+    slide("End", 1.0)
+    assert wait_until(lambda: mean(1.0) > 1.3 * gentle), "the force stays what it was"
 
 
 def test_pause_and_step(page):
