@@ -3,6 +3,7 @@
 import dataclasses
 import io
 import shutil
+import sys
 import threading
 import time
 from types import SimpleNamespace
@@ -196,6 +197,15 @@ def test_a_log_is_a_source(tmp_path, monkeypatch):
 def test_what_is_nothing_is_refused_in_one_line():
     with pytest.raises(ConfigError, match="^no_such_thing: no policy file, no shipped policy, and unknown task"):
         open_source(ViewArguments(what="no_such_thing"))
+
+
+def test_without_viser_the_extra_is_named(simulation, monkeypatch):
+    from dexsim.core.errors import DexsimError
+    from dexsim.view.viewer import Viewer
+
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(DexsimError, match=r"pip install -e '\.\[view\]'"):
+        Viewer(simulation, title="test")
 
 
 # --- the page -------------------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ from dexsim.core.errors import DexsimError
 from dexsim_real.core.log import Kind, LogReader
 from dexsim_real.replay import __main__ as replay_command
 from dexsim_real.replay import replay
-from dexsim_real.replay.plots import open_rerun
+from dexsim_real.replay.plots import open_rerun, trajectory
 from dexsim_real.run import __main__ as run
 
 pytestmark = pytest.mark.usefixtures("jax_as_it_is")
@@ -45,8 +45,18 @@ def test_a_run_from_the_measured_pose_to_motors_off_and_its_replay(hand, tmp_pat
     assert again["ticks"] == again["readings_same"] == again["observations_same"] == len(ticks) > 20
     assert again["first_difference"] is None and again["damaged_bytes"] == 0
     drawn_by_finger(hand, tmp_path, ticks)
+    taken_along(tmp_path, ticks)
     forged(tmp_path)
     seen_in_rerun(tmp_path)
+
+
+def taken_along(folder, ticks):
+    """As data: what each tick read, and the target that followed."""
+    data = trajectory(replay.replay(folder / "run.log"))
+    for name in ("joint_position", "taxel_force", "object_quat", "command"):
+        np.testing.assert_array_equal(getattr(data, name), np.float32([tick["readings"][name] for tick in ticks]))
+    np.testing.assert_array_equal(data.target, np.float32([tick["target"] for tick in ticks]))
+    assert data.time[0] == 0 and np.all(np.diff(data.time) > 0)
 
 
 def drawn_by_finger(hand, folder, ticks):
