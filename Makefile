@@ -2,6 +2,7 @@
 # virtual environment, installs what it needs, and does its job.
 #
 #   make train ARGS="--steps 2e6"     options of `python -m dexsim_ppo.train`
+#   make docs                         the documentation site, in site/
 #   make test ARGS="-k touch"         options of pytest (which runs on two processes)
 #   make PYTHON=python3.12 test       another interpreter (for a new .venv)
 #   make EXTRAS=cuda,warp train       other extras than the ones chosen by the device found
@@ -19,9 +20,10 @@ comma := ,
 # One stamp for each set of requirements: a step runs again only when pyproject.toml has changed.
 INSTALLED := $(VENV)/.installed-$(subst $(comma),-,$(EXTRAS))
 TESTABLE := $(VENV)/.testable
+DOCUMENTABLE := $(VENV)/.documentable
 LINTABLE := $(VENV)/.lintable
 
-.PHONY: train test lint clean help
+.PHONY: train test lint docs clean help
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
 
@@ -39,8 +41,11 @@ lint: $(LINTABLE)
 	$(PY) -m ruff format --check
 	$(PY) -m mypy
 
+docs: $(DOCUMENTABLE)
+	$(PY) -m mkdocs build --strict $(ARGS)
+
 clean:
-	rm -rf $(VENV) dist .pytest_cache .ruff_cache
+	rm -rf $(VENV) dist site .cache .pytest_cache .ruff_cache
 	find . -name __pycache__ -not -path './.git/*' -prune -exec rm -rf {} +
 
 # pip 25.1 is the first that knows dependency groups.
@@ -56,7 +61,12 @@ $(INSTALLED): pyproject.toml | $(VENV)/.created
 	@touch $@
 
 $(TESTABLE): pyproject.toml | $(VENV)/.created
-	$(PIP) install --quiet --editable ".[brax,warp,video,tb]" --group test
+	$(PIP) install --quiet --editable ".[brax,warp,video,tb,view,onnx,lerobot,gym,docs]" --group test
+	@touch $@
+
+# With the extras whose modules the reference imports.
+$(DOCUMENTABLE): pyproject.toml | $(VENV)/.created
+	$(PIP) install --quiet --editable ".[docs,real]"
 	@touch $@
 
 # With the packages, since mypy reads the types of JAX and NumPy.

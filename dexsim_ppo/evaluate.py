@@ -8,6 +8,7 @@ are drawn for this evaluation by its seed; training had others. Beside the polic
 same episodes: what it achieves, too, is no achievement.
 """
 
+import contextlib
 import dataclasses
 import functools
 import math
@@ -23,13 +24,15 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from dexsim.core import cli, statistics
+from dexsim.core import cli
 from dexsim.core.compilation import collector_paused, jit
 from dexsim.core.config import override, setting, validate
 from dexsim.core.options import Option
+from dexsim.core.progress import progress
 from dexsim.registry import find_task
 from dexsim_ppo.learner.types import Environment
 from dexsim_ppo.policy import Policy, PolicyParams, act, load_policy
+from dexsim_ppo.report import print_report, summarize, summarize_totals
 
 
 class Evaluator:
@@ -40,8 +43,7 @@ class Evaluator:
       chunk: episodes run side by side.
     """
 
-    # The task spreads its commands over a chunk, so its first and last episode show the two ends.
-    SHOWN = (0, -1)
+    SHOWN = 2  # episodes that are filmed
     SHOWN_SECONDS = 60.0
 
     def __init__(self, env: Environment, chunk: int):
@@ -50,22 +52,26 @@ class Evaluator:
         self._run, self._plans = jit(self._episodes, backend=env.backend), dict[tuple[int, int], Any]()
 
     def __call__(
-        self, params: PolicyParams, *, episodes: int, seed: int, idle: bool = False
+        self, params: PolicyParams, *, episodes: int, seed: int, idle: bool = False, label: str = ""
     ) -> tuple[dict[str, Any], Any]:
         """Measure over at least `episodes` episodes, rounded up to whole chunks; with zero actions if `idle`.
+
+        A `label` shows a progress bar of that name on standard error.
 
         Returns:
           The report: `"held"` (share of episodes never terminated), `"return"` and `"steps_held"`, each
           with a 95 % interval by start, and `"task"`: what the task's `summarize` makes of its
           metrics. And the snapshots of the shown episodes, for `write_video`.
         """
-        started, chunks = time.perf_counter(), math.ceil(episodes / self.chunk)
-        plan = self._plan(chunks * self.chunk, seed)
-        with collector_paused():
-            parts = [
-                jax.device_get(self._run(params, jax.tree.map(lambda x, i=i: x[i : i + self.chunk], plan), idle))
-                for i in range(0, chunks * self.chunk, self.chunk)
-            ]
+        started, parts = time.perf_counter(), list[Any]()
+        count = math.ceil(episodes / self.chunk) * self.chunk
+        plan = self._plan(count, seed)
+        with collector_paused(), progress(label, count, "episodes") if label else contextlib.nullcontext() as show:
+            for i in range(0, count, self.chunk):
+                part = jax.tree.map(lambda x, i=i: x[i : i + self.chunk], plan)
+                parts.append(jax.device_get(self._run(params, part, idle)))
+                if show:
+                    show(i + self.chunk)
         # Episodes are the last axis of all that is measured.
         measured = jax.tree.map(lambda *xs: np.concatenate(xs, axis=-1), *(measured for measured, _ in parts))
         found, over = measured
@@ -87,7 +93,8 @@ class Evaluator:
         The report needs metrics and termination flags [T, chunk]; of long episodes, whose task keeps its
         own totals, only the metrics of each one's last tick [chunk] and the ticks it lived [chunk].
         """
-        shown = jnp.array(self.SHOWN)
+        state = self.env.evaluation_starts(plan)
+        shown = self._extremes(state)
 
         def step(carry, _):
             state, last = carry
@@ -100,12 +107,22 @@ class Evaluator:
                 return (state, None), (series, film)
             return (state, _follow(last, *series)), (None, film)
 
-        state = self.env.evaluation_starts(plan)
         last: Any = None
         if self.totals:
             last = (dict(state.metrics), jnp.zeros(self.chunk, jnp.int32), jnp.zeros(self.chunk, bool))
         (_, last), (series, film) = jax.lax.scan(step, (state, last), None, length=self.env.evaluation_steps)
         return (last[:2] if self.totals else series), film
+
+    def _extremes(self, state: Any) -> jax.Array:
+        """Two episodes [2] of a chunk: those of the lowest and the highest command, or the first and the last where
+        all are equal or there is none."""
+        first_and_last = jnp.array([0, self.chunk - 1])
+        command = getattr(jax.vmap(self.env.snapshot)(state), "command", None)
+        if command is None:
+            return first_and_last
+        command = command.reshape(self.chunk, -1).sum(-1)
+        ends = jnp.stack([jnp.argmin(command), jnp.argmax(command)])
+        return jnp.where(ends[0] == ends[1], first_and_last, ends)
 
     def _film(self, frames: Any, terminated: np.ndarray) -> Any:
         """The shown episodes one after another, each to half a second after it terminated."""
@@ -113,54 +130,6 @@ class Evaluator:
         ends = [int(np.argmax(t)) + after if t.any() else len(t) for t in terminated.T]
         ends = [min(end, longest) for end in ends]
         return jax.tree.map(lambda x: np.concatenate([x[:end, i] for i, end in enumerate(ends)]), frames)
-
-
-def summarize(
-    env: Environment, metrics: dict[str, np.ndarray], terminated: np.ndarray, start: np.ndarray
-) -> dict[str, Any]:
-    """Report of episodes from their metrics `[T, N]`, termination flags `[T, N]` and starts `[N]`.
-
-    An episode lives up to, and not including, its first terminated step. That step's reward belongs to
-    the return, and nothing after it counts.
-    """
-    steps, episodes = terminated.shape
-    alive = ~np.logical_or.accumulate(terminated, axis=0)
-    steps_held = alive.sum(axis=0)
-    last = np.minimum(steps_held, steps - 1)
-    returns = metrics["return"][last, np.arange(episodes)]
-    masked = {name: np.where(alive, values, 0) for name, values in metrics.items()}
-    return {
-        "episodes": episodes,
-        "steps": steps,
-        **_intervals(alive[-1], returns, steps_held, start),
-        "task": env.summarize(masked, alive),
-    }
-
-
-def summarize_totals(
-    env: Environment, metrics: dict[str, np.ndarray], lived: np.ndarray, start: np.ndarray
-) -> dict[str, Any]:
-    """Report of episodes from the metrics of their last tick [N], the ticks they lived [N] and their starts [N]."""
-    held = lived == env.evaluation_steps
-    return {
-        "episodes": int(lived.size),
-        "steps": env.evaluation_steps,
-        **_intervals(held, metrics["return"], lived, start),
-        "task": env.summarize(metrics, lived),
-    }
-
-
-def _intervals(held: np.ndarray, returns: np.ndarray, lived: np.ndarray, start: np.ndarray) -> dict[str, Any]:
-    """What every report has, of episodes [N]: how many starts they had, and the figures with intervals by start."""
-    starts = len(np.unique(start))
-    share = proportion(held) if starts == held.size else mean_interval(held.astype(float), start)
-    share |= {"low": max(share["low"], 0.0), "high": min(share["high"], 1.0)}
-    return {
-        "starts": starts,
-        "held": share,
-        "return": mean_interval(returns, start),
-        "steps_held": mean_interval(lived, start),
-    }
 
 
 def _follow(last: tuple, metrics: dict[str, jax.Array], terminated: jax.Array) -> tuple:
@@ -171,29 +140,18 @@ def _follow(last: tuple, metrics: dict[str, jax.Array], terminated: jax.Array) -
     return kept, lived + (~ended).astype(jnp.int32), ended
 
 
-def mean_interval(x: np.ndarray, start: np.ndarray) -> dict[str, float]:
-    """Mean of samples [N] with its normal 95 % interval, by start [N]: samples of one start are not independent."""
-    _, which = np.unique(start, return_inverse=True)
-    mean, starts = float(np.mean(x)), int(which.max()) + 1
-    off = np.bincount(which, np.asarray(x, float) - mean)
-    half = 1.96 * float(np.sqrt(np.sum(off**2) * starts / max(starts - 1, 1))) / x.size
-    return {"value": mean, "low": mean - half, "high": mean + half}
+def write_video(env: Environment, snapshots: Any, path: Path, quality: str = "quick") -> Path:
+    """Render an evaluation's snapshots; returns the file written, a GIF's where MP4 cannot be.
 
-
-def proportion(x: np.ndarray) -> dict[str, float]:
-    """Share of true samples with its Wilson 95 % interval."""
-    share = statistics.proportion(x)
-    return {"value": share["mean"], "low": share["low"], "high": share["high"]}
-
-
-def write_video(env: Environment, snapshots: Any, path: Path) -> Path:
-    """Render an evaluation's snapshots; returns the file written, a GIF's where MP4 cannot be."""
+    `quality` "quick" is 640 x 480 with 400 frames, but eight a second at least; "talk" is 1920 x 1080 with 30 a second.
+    """
     from dexsim.render.render import render_episode
 
-    ticks = jax.tree.leaves(snapshots)[0].shape[0]
-    # Eight pictures a second at least, or a gait cannot be followed.
-    frames = max(400, round(8 * ticks * env.control_period))
-    return Path(render_episode(env, snapshots, path, 1.0 / env.control_period, max_frames=frames))
+    fps = 1.0 / env.control_period
+    seconds = jax.tree.leaves(snapshots)[0].shape[0] / fps
+    # At fewer than eight pictures a second a gait cannot be followed.
+    size, rate = ((1920, 1080), 30.0) if quality == "talk" else ((640, 480), min(max(400 / seconds, 8.0), fps))
+    return Path(render_episode(env, snapshots, path, fps, size=size, rate=rate))
 
 
 def default_chunk() -> int:
@@ -201,10 +159,17 @@ def default_chunk() -> int:
     return 1024 if jax.default_backend() == "gpu" else 64
 
 
+def default_episodes(env: Environment) -> int:
+    """Episodes of an evaluation on the device found: 1024 on a GPU, on a CPU what about a minute suffices for."""
+    if jax.default_backend() == "gpu":
+        return 1024
+    return 64 * int(np.clip(2000 / env.evaluation_steps, 1, 16))
+
+
 def evaluate_policy(
     policy: Policy | str | Path,
     *,
-    episodes: int = 1024,
+    episodes: int = 0,
     seed: int = 0,
     env: Environment | None = None,
     backend: str = "auto",
@@ -215,7 +180,7 @@ def evaluate_policy(
 
     Args:
       policy: a policy, its file, or the name of a shipped one.
-      episodes: how many, rounded up to whole chunks.
+      episodes: how many, rounded up to whole chunks; 0 chooses by the device and the length of an episode.
       seed: of the episodes.
       env: where to measure it; None for the environment that it was trained in. Another one is warned of.
       backend: physics, where `env` is None.
@@ -230,12 +195,12 @@ def evaluate_policy(
       CheckpointError, ConfigError: see `Policy.load` and `Policy.make_env`.
     """
     policy = policy if isinstance(policy, Policy) else load_policy(policy)
-    chunk = min(chunk or default_chunk(), episodes)
+    chunk = min(chunk or default_chunk(), episodes or default_chunk())
     if env is None:
         env = policy.make_env(backend=backend, num_envs=chunk)
     else:
         policy.check_env(env)
-    evaluator = Evaluator(env, chunk)
+    evaluator, episodes = Evaluator(env, chunk), episodes or default_episodes(env)
     report, _ = evaluator(policy.params, episodes=episodes, seed=seed)
     if baseline:
         report["do_nothing"], _ = evaluator(policy.params, episodes=episodes, seed=seed, idle=True)
@@ -248,8 +213,8 @@ class EvaluateArguments:
 
     policy: Annotated[str, tyro.conf.Positional]
     """A policy file, or the name of a shipped policy, such as grasp."""
-    episodes: int = setting(1024, unit="1", low=1)
-    """Evaluation episodes, rounded up to whole chunks."""
+    episodes: int = setting(0, unit="1", low=0)
+    """Evaluation episodes, rounded up to whole chunks. 0: 1024 on a GPU; on a CPU 448 of grasp, 64 of rotate."""
     seed: int = setting(0, unit="1", low=0, high=2**32 - 2)
     """Seed of the episodes and their start states. Training selects its best policy by episodes of another."""
     backend: Literal["auto", "jax", "warp", "c"] = setting("auto")
@@ -269,7 +234,9 @@ class EvaluateArguments:
     output: Path | None = None
     """File for the report, as JSON; None writes no report."""
     video: Path | None = None
-    """File for a video of the first and the last command (MP4 or GIF); None renders no video."""
+    """File for a video of the lowest and the highest command, MP4 or GIF; None renders no video."""
+    video_quality: Literal["quick", "talk"] = setting("quick")
+    """quick: 640 x 480 and few frames. talk: 1920 x 1080 at 30 frames a second, which takes minutes."""
 
     def __post_init__(self) -> None:
         validate(self)
@@ -284,10 +251,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         description="Measure a policy over fixed, seeded episodes.",
     )
     cli.enable_caches()
+    for path in (arguments.output, arguments.video):
+        if path:
+            cli.check_writable(path)
     policy = load_policy(arguments.policy).ablate(*arguments.ablate)
     if arguments.task:
         find_task(arguments.task)
-    chunk = min(arguments.chunk or default_chunk(), arguments.episodes)
+    chunk = min(arguments.chunk or default_chunk(), arguments.episodes or default_chunk())
     if not any(entry.startswith("objects.mesh=") for entry in arguments.set):
         policy.check_mesh()
     seconds = [f"evaluation_seconds={arguments.seconds}"] if arguments.seconds else []
@@ -295,18 +265,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     entry = find_task(policy.task)
     with cli.naming_options(entry.config_class, entry.config(), functools.partial(_typed, arguments)):
         env = policy.build_env(backend=arguments.backend, num_envs=chunk)
-    evaluator = Evaluator(env, chunk)
-    measure = functools.partial(evaluator, policy.params, episodes=arguments.episodes, seed=arguments.seed)
-    report, snapshots = measure()
+    evaluator, episodes = Evaluator(env, chunk), arguments.episodes or default_episodes(env)
+    measure = functools.partial(evaluator, policy.params, episodes=episodes, seed=arguments.seed)
+    report, snapshots = measure(label=arguments.policy)
     if arguments.baseline:
-        report["do_nothing"], _ = measure(idle=True)
+        report["do_nothing"], _ = measure(idle=True, label="doing nothing")
     report |= {"policy": arguments.policy, "ablate": list(arguments.ablate), "set": list(arguments.set)}
     report |= {"backend": env.backend} | cli.environment_report()
+    # First the table: a full disk must not cost what was measured.
+    print_report(report, report.get("do_nothing"), title=f"{policy.task}: {arguments.policy}")
     if arguments.output:
         cli.write_json(arguments.output, report)
-    print_report(report, report.get("do_nothing"), title=f"{policy.task}: {arguments.policy}")
     if arguments.video:
-        print(f"video: {write_video(env, snapshots, arguments.video)}")
+        print(f"video: {write_video(env, snapshots, arguments.video, arguments.video_quality)}")
     return 0
 
 
@@ -316,33 +287,6 @@ def _typed(arguments: EvaluateArguments, field: Option) -> str | None:
     if any(entry.partition("=")[0] == path for entry in arguments.set):
         return f"--set {path}="
     return "--seconds " if path == "evaluation_seconds" and arguments.seconds else None
-
-
-def print_report(report: dict[str, Any], do_nothing: dict[str, Any] | None, *, title: str) -> None:
-    """A table of the report's headline, and beside it that of a hand that does nothing, if it was measured."""
-    from rich.console import Console
-    from rich.table import Table
-
-    idle = do_nothing and _headline(do_nothing)
-    table = Table("measure", "value", "95 % interval", *(["doing nothing"] if idle else []), title=title)
-    for name, entry in _headline(report).items():
-        low, high = entry.get("low"), entry.get("high")
-        span = "" if low is None or high is None else f"{low:.4g} .. {high:.4g}"
-        beside = [_number(idle.get(name, {}).get("value"))] if idle else []
-        table.add_row(name, _number(entry["value"]), span, *beside)
-    Console().print(table)
-    print(f"{report['episodes']} episodes of {report['steps']} steps, seed {report['seed']}, {report['seconds']:.1f} s")
-
-
-def _headline(report: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """Names of the task's headline, or else the share held, and the return: value, low and high."""
-    headline = report["task"].get("headline") or {"held": report["held"]}
-    rows = {name: entry if isinstance(entry, dict) else {"value": entry} for name, entry in headline.items()}
-    return rows | {"return": report["return"]}
-
-
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.4g}"
 
 
 if __name__ == "__main__":

@@ -123,10 +123,7 @@ class Policy:
             raise CheckpointError(f"{path}: is not a sound policy ({text:.300})") from None
 
     def make_env(self, *, num_envs: int = 1, backend: str = "auto", hand: "Hand | None" = None, seed: int = 0) -> "Env":
-        """The environment that the policy was trained in.
-
-        Args:
-          num_envs, backend, hand, seed: see `dexsim.make`.
+        """The environment that the policy was trained in; arguments as in `dexsim.make`.
 
         Raises:
           ConfigError: its task is not registered.

@@ -178,17 +178,41 @@ def default_arguments(task: str | None, preset: str, begun: checkpoint.Checkpoin
     return default
 
 
+def saved_arguments(path: Path, task: str | None) -> TrainArguments:
+    """The options in `config.json` of a run, or of the run in this folder.
+
+    Raises:
+      ConfigError: it is no such file, or of another task than the one given.
+    """
+    file = RunFolder(path).config if path.is_dir() else path
+    try:
+        saved = json.loads(file.read_text())["arguments"]
+        name = str(saved["task"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ConfigError(f"--config {path}: no configuration of a run ({' '.join(str(error).split()):.200})") from None
+    if task and task.rpartition(":")[2] != name:
+        raise ConfigError(f"--config {path}: is of the task {name!r}, not {task!r}")
+    with naming_file(file):
+        return arguments_from_dict(find_task(task or name).config_class, migrate_arguments(saved, file))
+
+
 def parse_arguments(argv: list[str]) -> tuple[TrainArguments, checkpoint.Checkpoint | Policy | None]:
     """The command's options, and what the run begins from."""
     early = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
-    for name in ("--task", "--preset", "--resume", "--policy"):
+    for name in ("--task", "--preset", "--resume", "--policy", "--config"):
         early.add_argument(name, nargs="?")
     known, _ = early.parse_known_args(argv)
     preset, description = known.preset or "auto", "Train a task."
     if preset == "auto" and cli.wants_help(argv):  # To ask which device there is takes seconds.
         preset, description = "cpu", f"{description} Defaults that depend on the device are those of --preset cpu."
-    begun = find_beginning(known.task, known.policy, known.resume)
-    default = default_arguments(known.task, preset, begun)
+    if known.config:
+        if known.resume:
+            raise ConfigError("--config begins a run and --resume resumes one: give one of them")
+        default = saved_arguments(Path(known.config), known.task)
+        begun = find_beginning(default.task, known.policy or default.policy, None)
+    else:
+        begun = find_beginning(known.task, known.policy, known.resume)
+        default = default_arguments(known.task, preset, begun)
     given = {argument.split("=")[0] for argument in argv}
     if isinstance(begun, Policy) and not cli.wants_help(argv) and "--env.objects.mesh" not in given:
         begun.check_mesh()

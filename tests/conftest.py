@@ -51,6 +51,7 @@ LONGEST = (
     "test_brax",
     "test_warp",
     "test_rotate",
+    "test_view",
     "test_substep",
     "test_env_options",
     "test_skin_law",

@@ -24,11 +24,14 @@ from dexsim_ppo.train import preset_arguments
 COMMANDS = {
     "dexsim_ppo.train": ("dexsim_ppo.train:TrainArguments", []),
     "dexsim_ppo.evaluate": ("dexsim_ppo.evaluate:EvaluateArguments", ["grasp"]),
+    "dexsim_ppo.export": ("dexsim_ppo.export:ExportArguments", ["grasp", "--output", "grasp.npz"]),
+    "dexsim_ppo.record": ("dexsim_ppo.record:RecordArguments", ["grasp", "--rrd", "x.rrd"]),
     "dexsim_ppo.reproduce": ("dexsim_ppo.reproduce:ReproduceArguments", ["x.msgpack"]),
     "dexsim_real.run": ("dexsim_real.run.options:RunArguments", ["grasp", "--port", "x", "--uncalibrated"]),
     "dexsim_real.calibrate": ("dexsim_real.calibrate.options:CalibrateArguments", ["--port", "x"]),
     "dexsim_real.twin": ("dexsim_real.twin.options:TwinArguments", []),
     "dexsim_real.replay": ("dexsim_real.replay.__main__:ReplayArguments", ["x.log"]),
+    "dexsim.view": ("dexsim.view.__main__:ViewArguments", ["grasp"]),
     "dexsim.randomization_check": ("dexsim.randomization_check.__main__:CheckArguments", []),
 }
 CASES = [(command, "") for command in COMMANDS if command != "dexsim_ppo.train"]

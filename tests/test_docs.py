@@ -28,11 +28,14 @@ WORDS = {"README.md": 700, "docs/findings.md": 800}
 
 COMMANDS = {
     "dexsim_ppo.evaluate": "dexsim_ppo.evaluate:EvaluateArguments",
+    "dexsim_ppo.export": "dexsim_ppo.export:ExportArguments",
+    "dexsim_ppo.record": "dexsim_ppo.record:RecordArguments",
     "dexsim_ppo.reproduce": "dexsim_ppo.reproduce:ReproduceArguments",
     "dexsim_real.run": "dexsim_real.run.options:RunArguments",
     "dexsim_real.calibrate": "dexsim_real.calibrate.options:CalibrateArguments",
     "dexsim_real.twin": "dexsim_real.twin.options:TwinArguments",
     "dexsim_real.replay": "dexsim_real.replay.__main__:ReplayArguments",
+    "dexsim.view": "dexsim.view.__main__:ViewArguments",
     "dexsim.randomization_check": "dexsim.randomization_check.__main__:CheckArguments",
 }
 """The commands whose options are one dataclass; those of `dexsim_ppo.train` depend on the task."""
@@ -86,6 +89,22 @@ def test_command_has_its_options(line):
             policy = load_policy(options.policy)
             config = from_dict(registry.find_task(policy.task).config_class, policy.env_config)
             override(config, list(options.set))
+
+
+def console_lines():
+    """Lines of code blocks that begin with the console command."""
+    for page in PAGES:
+        for block in re.findall(r"^```\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE):
+            for line in re.findall(r"^dexsim [^#\n]*", block, re.MULTILINE):
+                yield pytest.param(line.strip(), id=f"{name_of(page)}: {line.strip()}")
+
+
+@pytest.mark.parametrize("line", list(console_lines()))
+def test_console_command_exists(line):
+    from dexsim.__main__ import COMMANDS as names
+
+    _, name, *argv = shlex.split(line)
+    test_command_has_its_options(shlex.join(["python", "-m", names[name][0].removesuffix(".__main__"), *argv]))
 
 
 def parse_train(argv: list[str]) -> None:

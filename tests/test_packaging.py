@@ -89,6 +89,14 @@ def test_core_dependencies_are_only_the_listed_ones():
 
 
 @in_checkout
+def test_the_console_command_has_its_entry_point():
+    import pkgutil
+
+    scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
+    assert callable(pkgutil.resolve_name(scripts["dexsim"])) and list(scripts) == ["dexsim"]
+
+
+@in_checkout
 def test_checkpoints_name_the_version_of_the_distribution():
     from dexsim_ppo.checkpoint import LIBRARY_VERSION
 

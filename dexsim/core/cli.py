@@ -1,6 +1,7 @@
 """What the commands share: options from dataclasses, one-line errors, compilation caches."""
 
 import contextlib
+import errno
 import importlib.metadata
 import io
 import json
@@ -33,7 +34,8 @@ def run(main: Callable[[Sequence[str] | None], int]) -> None:
     try:
         code = main(None)
     except DexsimError as error:
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        page = f" ({error.page} helps)" if error.page else ""
+        print(f"error: {' '.join(str(error).split())}{page}", file=sys.stderr)
         code = 2
     except BrokenPipeError:  # The reader of a pipe, such as `head`, has seen enough.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -167,6 +169,19 @@ def environment_report() -> dict[str, Any]:
             "machine": platform.machine(),
         },
     }
+
+
+def check_writable(path: Path) -> None:
+    """Make the folder of a file that is to be written after long work, and see that the file can be.
+
+    Raises:
+      OSError: it cannot.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.is_dir():
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    if not os.access(path.parent, os.W_OK):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path.parent))
 
 
 def write_json(path: Path, data: Any) -> None:

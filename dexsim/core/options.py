@@ -337,8 +337,12 @@ def _meant(name: str, names: Iterable[str]) -> str:
     """The option that was perhaps meant: the same name in a group, or one spelled much like it."""
     names = [candidate for candidate in names if candidate.startswith("--")]
     same = [n for n in names if n.rpartition(".")[2] == name.removeprefix("--")]
-    near = same or difflib.get_close_matches(name, names, n=1)
-    return f" (perhaps {near[0]})" if near else ""
+    return f" (perhaps {same[0]})" if same else closest(name, names)
+
+
+def closest(name: str, names: Iterable[str]) -> str:
+    """The name that was perhaps meant, as the end of a message; empty if none is spelled like it."""
+    return "".join(f" (perhaps {near})" for near in difflib.get_close_matches(name, names, n=1))
 
 
 def _unwrapped(before: str, match: re.Match[str], drop: str = "") -> str:

@@ -303,6 +303,7 @@ class Env:
         """What a frame of video shows."""
         place = state.physics.qpos[self.physics.object_qpos]
         shape = state.episode.object.shape()
+        turning = self.spec.turn is not None
         return Snapshot(
             joint_position=state.physics.qpos[self.physics.joint_qpos],
             object_position=place[:3],
@@ -315,6 +316,9 @@ class Env:
             command=state.readings.command,
             target_force=self.task.target_force(state.goal),
             finger_force=state.finger_force,
+            goal_rotation=rotations.quat_to_matrix(state.readings.goal_quat) if turning else None,
+            turns=getattr(state.goal, "turns", None) if turning else None,
+            seconds=state.length.astype(jnp.float32) * self.control_period,
         )
 
 

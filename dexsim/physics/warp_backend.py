@@ -20,6 +20,9 @@ class WarpBackend(MjxBackend):
 
     def __init__(self, scene: PhysicsScene, num_envs: int):
         """Raises AssetError: Warp lacks what the scene uses."""
+        import warp
+
+        warp.config.log_level = warp.LOG_WARNING  # else it lists devices and every kernel that it loads
         super().__init__(scene, "warp")
         # Warp prints from the device whenever a solver stops at its iteration limit, which is intended here. Full
         # buffers show in `finger_force` instead.

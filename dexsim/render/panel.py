@@ -8,13 +8,18 @@ bottom and the last row (its tip) at the top; taxel index = column * rows + row.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 
+from dexsim.render.snapshot import Snapshot
+
 INK, FAINT, PANEL, EMPTY, ACCENT = ((233, 236, 241), (138, 146, 160), (24, 27, 33), (40, 44, 53), (94, 196, 255))
 _GAP = 1  # pixels between two cells
+TRUE, FELT = ("maps: felt force", "bars: true force"), ("maps: felt force", "bars: their sum")
+"""Captions of a panel whose bars show the simulation's contact forces, or what the taxels feel."""
 
 
 @dataclass(frozen=True)
@@ -100,15 +105,16 @@ def draw_panel(
     names: tuple[str, ...],
     taxel_force: np.ndarray,
     finger_force: np.ndarray,
-    command: np.ndarray,
+    lines: Mapping[str, str],
     target_force: float,
     force_range: float,
     finger_range: float,
+    captions: tuple[str, str] = TRUE,
 ) -> np.ndarray:
     """The panel as uint8 [height, width, 3].
 
-    `taxel_force` [F, N] N, `finger_force` [F] N, `command` any shape (none: left out), `target_force` N (not finite:
-    left out). The bar under a map is the finger's force out of `finger_range` N; its mark is the target.
+    `taxel_force` [F, N] N, `finger_force` [F] N, `lines` are read-outs (`read_outs`), `captions` say what maps and bars
+    show. The bar under a map is the finger's force out of `finger_range` N; its mark is the target [N].
     """
     from PIL import Image, ImageDraw
 
@@ -134,21 +140,40 @@ def draw_panel(
         if np.isfinite(target_force) and 0 < target_force <= finger_range:
             mark = x + int(target_force / finger_range * (width - 1))
             draw.rectangle((mark, bar - 1, mark + 1, bar + thick + 1), fill=INK)
-    _read_outs(draw, layout, finger_force, command, target_force)
+    x, y = layout.slots[-1]
+    # Above the colour scale; a small panel has little room.
+    room = pad + height - max(4, layout.cell) - int(1.3 * layout.font)
+    pitch = min(round(1.35 * layout.font), room // max(len(captions) + len(lines), 1))
+    small = _font(min(layout.font - 2, pitch))
+    for caption in captions:
+        draw.text((x, y), caption, fill=FAINT, font=small)
+        y += pitch
+    for name, value in lines.items():
+        fits = draw.textlength(name + value, font) + layout.font < width
+        draw.text((x, y), name, fill=FAINT, font=font if fits else small)
+        draw.text((x + width, y), value, fill=INK, font=font if fits else small, anchor="ra")
+        y += pitch
     return np.asarray(image)
 
 
-def _read_outs(draw, layout: Layout, finger_force, command, target_force) -> None:
-    x, y = layout.slots[-1]
-    width = layout.cell * layout.grid[0] - _GAP
-    lines = [("total", f"{np.sum(finger_force):.1f} N")]
-    if np.isfinite(target_force):
-        lines.insert(0, ("target", f"{float(target_force):.1f} N"))
-    if np.size(command):
-        lines.insert(0, ("command", " ".join(f"{c:.2f}" for c in np.ravel(command)[:3])))
-    font = _font(layout.font)
-    y += int(1.3 * layout.font)
-    for name, value in lines:
-        draw.text((x, y), name, fill=FAINT, font=font)
-        draw.text((x + width - draw.textlength(value, font), y), value, fill=INK, font=font)
-        y += int(1.5 * layout.font)
+def read_outs(snapshot: Snapshot) -> dict[str, str]:
+    """What a picture says in words, by name: time, turns or command and target, and the fingers' force in all."""
+    lines = {}
+    if snapshot.seconds is not None:
+        lines["time"] = f"{float(snapshot.seconds):.1f} s"
+    if snapshot.turns is not None:
+        lines["turns"] = f"{int(snapshot.turns)}"
+    elif np.size(snapshot.command):
+        lines["command"] = " ".join(f"{c:.2f}" for c in np.ravel(snapshot.command)[:3])
+        if np.isfinite(snapshot.target_force):
+            lines["target"] = f"{float(snapshot.target_force):.1f} N"
+    return lines | {"total": f"{np.sum(snapshot.finger_force):.1f} N"}
+
+
+def write_label(picture: np.ndarray, at: np.ndarray, text: str) -> np.ndarray:
+    """A picture uint8 [H, W, 3] with a word centred at a pixel (x, y)."""
+    from PIL import Image, ImageDraw
+
+    image = Image.fromarray(picture)
+    ImageDraw.Draw(image).text(tuple(at), text, fill=INK, font=_font(max(8, len(picture) // 36)), anchor="mm")
+    return np.asarray(image)

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dexsim.hand.kinematics import Hand
+from dexsim.render.colors import FACES, LINK, OBJECT, PALM, TIP, linear
 from dexsim.render.panel import force_color
 from dexsim.render.raycast import (
     Camera,
@@ -26,11 +27,13 @@ from dexsim.render.raycast import (
 _SUPERSAMPLE = 2
 _TAXEL_BIAS = 0.0025  # m; the pads follow the taxel lattice to within 1 mm, and no taxel may drown in its pad
 _OBJECT_OPACITY = 0.62  # so that fingers behind the object stay visible
+_GOAL_OPACITY, _GOAL_SCALE, _GOAL_AT = 0.9, 0.45, np.array([-0.066, 0.088])  # m to the right and up of the middle
 _TAXEL_GLOW = 0.6  # how strongly a loaded taxel shows through the object
 _SHADOW_PIXELS = 256
 
 # Linear RGB.
-_PALM, _LINK, _TIP, _OBJECT = ((0.045, 0.05, 0.06), (0.42, 0.44, 0.47), (0.07, 0.075, 0.085), (0.03, 0.22, 0.42))
+_PALM, _LINK, _TIP, _OBJECT = (linear(color) for color in (PALM, LINK, TIP, OBJECT))
+_SIDES = np.array([linear(color) for color in FACES], np.float32)
 _IDLE_TAXEL = (0.12, 0.13, 0.15)
 _SKY, _GROUND, _KEY = (0.62, 0.68, 0.78), (0.24, 0.22, 0.2), (1.75, 1.68, 1.55)
 _BACKDROP = (0.040, 0.047, 0.060), (0.012, 0.014, 0.019)  # middle, corners
@@ -67,10 +70,9 @@ def draw_scene(
     full = look(camera, size, _SUPERSAMPLE)
     body, held = hand_primitives(hand, pose), object_primitives(kinds, frame)
     plain = hand_primitives(hand, pose, rounded=False)
-    everything = Primitives(
-        plain.kind + held.kind, *(np.concatenate(pair) for pair in zip(plain[1:], held[1:], strict=True))
-    )
-    view, window = crop(full, everything, _SUPERSAMPLE)
+    goal = goal_primitives(held, frame, camera)
+    everything = _together(plain, held)
+    view, window = crop(full, _together(everything, goal), _SUPERSAMPLE)
     rows, columns = (slice(part.start // _SUPERSAMPLE, part.stop // _SUPERSAMPLE) for part in window)
     light = _key_light(everything, len(plain.kind), view, camera.up)
 
@@ -84,6 +86,9 @@ def draw_scene(
     _paint(color, held, front, view, light, bevel=0.003, opacity=_OBJECT_OPACITY)
     # The taxels in contact are between finger and object: draw the loaded ones through the object.
     _blend(color, pixel[loaded], rays[loaded], _TAXEL_GLOW)
+    marker = cast(goal, view)
+    marker.index[marker.depth > np.minimum(surface.depth, front.depth)] = -1
+    _paint(color, goal, marker, view, light, bevel=0.001, opacity=_GOAL_OPACITY)
 
     picture = _developed_backdrop(size).copy()
     picture[rows, columns] = _develop(color.reshape(3, rows.stop - rows.start, columns.stop - columns.start))
@@ -104,7 +109,30 @@ def object_primitives(kinds: tuple[str, ...], frame: Any) -> Primitives:
     position = frame.object_position + frame.primitive_position[active] @ frame.object_rotation.T
     rotation = frame.object_rotation @ frame.primitive_rotation[active]
     color = np.tile(np.array(_OBJECT, np.float32), (len(active), 1))
-    return Primitives(tuple(kinds[k] for k in active), frame.primitive_size[active], position, rotation, color)
+    kind = tuple(kinds[k] for k in active)
+    return Primitives(
+        kind, frame.primitive_size[active], position, rotation, color, _SIDES if kind == ("box",) else None
+    )
+
+
+def goal_position(camera: Camera) -> np.ndarray:
+    """Where [3] m the goal is shown: in the upper left of the picture, beside the hand."""
+    return np.asarray(camera.target) + _GOAL_AT @ look(camera, (2, 2)).axes[:2]
+
+
+def goal_primitives(held: Primitives, frame: Any, camera: Camera) -> Primitives:
+    """The object again, smaller and in its goal orientation; nothing for a task without one."""
+    if frame.goal_rotation is None:
+        return Primitives((), *(part[:0] for part in held[1:5]))
+    turn = frame.goal_rotation @ frame.object_rotation.T
+    position = goal_position(camera) + _GOAL_SCALE * (held.position - frame.object_position) @ turn.T
+    return held._replace(size=_GOAL_SCALE * held.size, position=position, rotation=turn @ held.rotation)
+
+
+def _together(first: Primitives, second: Primitives) -> Primitives:
+    """Both, in one colour each: for shadows and bounds."""
+    parts = (np.concatenate(pair) for pair in zip(first[1:5], second[1:5], strict=True))
+    return Primitives(first.kind + second.kind, *parts)
 
 
 @lru_cache(maxsize=4)
@@ -156,13 +184,22 @@ def _paint(
     # Glass-like: more opaque where the surface turns away, so that the silhouette stays crisp.
     weight = weight * (opacity + (1 - opacity) * away * away)
     keep = 1 - np.bincount(pixel, weight, color.shape[1]).astype(np.float32)
-    shaded = _shade(primitives.color, index, points, normal, toward, away, light)
+    shaded = _shade(_tones(primitives, index, normal), points, normal, toward, away, light)
     for plane, values in zip(color, shaded, strict=True):
         plane *= keep
         plane += np.bincount(pixel, weight * values, len(plane)).astype(np.float32)
 
 
-def _shade(tones, index, points, normal, toward, away, light: Light) -> np.ndarray:
+def _tones(primitives: Primitives, index: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """The colour [3, M] of each sample: its primitive's, or that of the side of a box that its normal is nearest to."""
+    if primitives.sides is None or not len(index):
+        return np.ascontiguousarray(primitives.color.T)[:, index]
+    local = primitives.rotation[0].T.astype(np.float32) @ normal
+    axis = np.abs(local).argmax(0)
+    return primitives.sides.T[:, 2 * axis + (local[axis, np.arange(len(axis))] < 0)]
+
+
+def _shade(tones, points, normal, toward, away, light: Light) -> np.ndarray:
     """Linear RGB [3, M]: sky and ground, one warm key light with shadow, a faint highlight and a rim."""
     lit = light.direction @ normal
     day = np.flatnonzero(lit > 0)
@@ -177,7 +214,7 @@ def _shade(tones, index, points, normal, toward, away, light: Light) -> np.ndarr
     color = np.empty_like(points)
     for c in range(3):
         ambient = np.float32(0.75 * _GROUND[c]) + height * np.float32(0.75 * (_SKY[c] - _GROUND[c]))
-        color[c] = np.ascontiguousarray(tones[:, c])[index] * (ambient + lit * np.float32(_KEY[c])) + shine
+        color[c] = tones[c] * (ambient + lit * np.float32(_KEY[c])) + shine
     return color
 
 

@@ -53,6 +53,7 @@ class Primitives(NamedTuple):
     position: np.ndarray  # [G, 3], m
     rotation: np.ndarray  # [G, 3, 3]
     color: np.ndarray  # [G, 3], linear RGB
+    sides: np.ndarray | None = None  # [6, 3], of boxes' sides +x, -x, +y, -y, +z, -z; None: as `color`
 
 
 @dataclass(frozen=True, eq=False)

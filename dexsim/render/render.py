@@ -18,16 +18,16 @@ import numpy as np
 from dexsim.core.pytree import Array
 from dexsim.hand.kinematics import Hand, forward_kinematics, taxel_normals, taxel_positions
 from dexsim.hand.load import load_hand
-from dexsim.render.panel import draw_panel, force_color, make_layout, taxel_image
-from dexsim.render.picture import Pose, draw_scene
-from dexsim.render.raycast import Camera
+from dexsim.render.panel import draw_panel, force_color, make_layout, read_outs, taxel_image, write_label
+from dexsim.render.picture import Pose, draw_scene, goal_position
+from dexsim.render.raycast import Camera, look, project
 from dexsim.render.snapshot import Snapshot
 
 CAMERAS = {
     "grasp": Camera(azimuth=100.0, elevation=-20.0, distance=0.43, target=(0.048, 0.010, 0.092), up=(-1.0, 0.0, 0.0)),
-    "rotate": Camera(azimuth=-130.0, elevation=35.0, distance=0.50, target=(0.040, 0.010, 0.100), up=(1.0, 0.0, 0.0)),
+    "rotate": Camera(azimuth=95.0, elevation=30.0, distance=0.50, target=(0.045, 0.010, 0.085), up=(1.0, 0.0, 0.0)),
 }
-"""The hand held palm down, and palm up."""
+"""The hand held palm down, and palm up from the side on which fingers and thumb are both in sight."""
 
 
 def render_frame(
@@ -54,7 +54,7 @@ def render_frame(
     """
     frame = _finite(snapshot)
     draw = _painter(hand, tuple(kinds), frame, camera, size, force_range, finger_range)
-    return draw(frame, _poses(hand, frame.joint_position[None])[0])
+    return draw(frame, hand_poses(hand, frame.joint_position[None])[0])
 
 
 def render_episode(
@@ -65,19 +65,21 @@ def render_episode(
     *,
     camera: Camera | str | None = None,
     size: tuple[int, int] = (640, 480),
-    max_frames: int = 400,
+    rate: float | None = None,
 ) -> Path:
-    """Write snapshots stacked along T as a video that plays `fps` of them a second; return the path written.
+    """Write snapshots stacked along T, `fps` of them a second, as a video as long as they last; return its path.
 
-    MP4 where imageio-ffmpeg (extra `video`) can be imported, else GIF with the suffix changed. Longer episodes than
-    `max_frames` are thinned evenly and keep their duration. The camera is the preset named like the task.
+    MP4 where imageio-ffmpeg (extra `video`) can be imported, else GIF with the suffix changed. `rate` is the video's
+    own number of frames a second, each the nearest snapshot; None shows every snapshot. The camera is the preset named
+    like the task.
     """
     snapshots = _finite(snapshots)
     total = len(snapshots.joint_position)
     if total == 0:
         raise ValueError("render_episode: no snapshots to draw")
-    stride = -(-total // max_frames)
-    snapshots = jax.tree.map(lambda x: x[::stride], snapshots)
+    rate = rate or fps
+    nearest = np.minimum(np.round(np.arange(max(round(total * rate / fps), 1)) * fps / rate).astype(int), total - 1)
+    snapshots = jax.tree.map(lambda x: x[nearest], snapshots)
     hand = getattr(env, "hand", None) or load_hand()
     if camera is None:
         camera = env.name if env.name in CAMERAS else "grasp"
@@ -87,12 +89,12 @@ def render_episode(
     targets = snapshots.target_force[np.isfinite(snapshots.target_force)]
     finger_range = max(float(np.quantile(snapshots.finger_force, 0.995)), float(targets.max(initial=0)))
     draw = _painter(hand, tuple(env.primitive_kinds), snapshots, camera, size, force_range, finger_range or None)
-    poses = _poses(hand, snapshots.joint_position)
+    poses = hand_poses(hand, snapshots.joint_position)
 
     def frame(t: int) -> np.ndarray:
         return draw(jax.tree.map(lambda x: x[t], snapshots), poses[t])
 
-    return _write_video(frame, len(poses), Path(path), fps / stride, size)
+    return _write_video(frame, len(poses), Path(path), rate, size)
 
 
 def draw_taxels(hand: Hand, taxel_force: np.ndarray, ax: Any = None):
@@ -133,13 +135,16 @@ def _painter(hand, kinds, snapshot, camera, size, force_range, finger_range) -> 
         raise ValueError(f"kinds: {len(kinds)} given, the snapshot has {np.shape(snapshot.primitive_size)[-2]}")
     camera = CAMERAS[camera] if isinstance(camera, str) else camera
     layout = make_layout(panel_width, height, hand.taxel_grid, len(hand.finger_names))
+    view = look(camera, (width - panel_width, height))
     force_range = force_range or float(np.max(snapshot.taxel_force)) or 1.0
     finger_range = finger_range or float(np.nanmax(np.append(snapshot.finger_force, snapshot.target_force))) or 1.0
 
     def draw(frame: Snapshot, pose: Pose) -> np.ndarray:
         scene = draw_scene(hand, kinds, frame, pose, camera, (width - panel_width, height), force_range)
+        if frame.goal_rotation is not None:
+            scene = write_label(scene, project(view, goal_position(camera))[0] + (0, height // 11), "goal")
         panel = draw_panel(
-            layout, hand.finger_names, frame.taxel_force, frame.finger_force, frame.command,
+            layout, hand.finger_names, frame.taxel_force, frame.finger_force, read_outs(frame),
             float(frame.target_force), force_range, finger_range,
         )  # fmt: skip
         return np.concatenate([scene, panel], 1)
@@ -156,7 +161,7 @@ def _kinematics(hand: Hand) -> Callable[[Array], tuple]:
     return jax.jit(jax.vmap(pose))
 
 
-def _poses(hand: Hand, joint_position: np.ndarray) -> list[Pose]:
+def hand_poses(hand: Hand, joint_position: np.ndarray) -> list[Pose]:
     """Poses of T frames from joint angles [T, J], in one compiled call."""
     arrays = [np.asarray(x) for x in _kinematics(hand)(joint_position)]
     return [Pose(*(x[t] for x in arrays)) for t in range(len(joint_position))]

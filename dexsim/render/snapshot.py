@@ -20,3 +20,6 @@ class Snapshot:
     command: Any  # any shape
     target_force: Any  # [] N
     finger_force: Any  # [F] N
+    goal_rotation: Any = None  # [3, 3] orientation that the object is asked for; None for a task without goals
+    turns: Any = None  # [] int32 goals reached since the episode began; None for a task without goals
+    seconds: Any = None  # [] s since the episode began; None where nobody counts

@@ -44,6 +44,9 @@ class TrainArguments(Generic[EnvConfig]):
     """Folder to write to, which must not exist yet; None for a new runs/TASK-TIME."""
     resume: Path | None = None
     """Folder of a run, or one of its checkpoints, to resume exactly; None starts a new run."""
+    config: Path | None = None
+    """Configuration of a run, its `config.json` or its folder, whose options are the defaults of a new one; None for
+    those of the preset."""
     policy: str = ""
     """Policy to fine-tune: a file, or the name of a shipped one. Its task and configuration are the defaults. Empty:
     train from scratch."""
@@ -132,5 +135,5 @@ def _differences(new: Any, old: Any) -> Iterator[tuple[type, str, Any, Any]]:
 
 def printable(arguments: TrainArguments) -> dict[str, Any]:
     """The options as plain data, without the paths of this process."""
-    data = to_dict(dataclasses.replace(arguments, run_dir=None, resume=None))
-    return {k: v for k, v in data.items() if k not in ("run_dir", "resume")}
+    data = to_dict(dataclasses.replace(arguments, run_dir=None, resume=None, config=None))
+    return {k: v for k, v in data.items() if k not in ("run_dir", "resume", "config")}

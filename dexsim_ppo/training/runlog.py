@@ -10,7 +10,16 @@ from typing import Any
 from dexsim.core.cli import plain
 from dexsim.core.errors import CheckpointError
 
-CURVES = ("episode/return", "episode/success", "episode/goals_per_minute", "reward")
+CURVES = {
+    "episode/return": "return\nof an episode",
+    "episode/success": "success\n[share of episodes]",
+    "episode/goals_per_minute": "goals\n[1/min]",
+    "episode/length": "length of an\nepisode [ticks]",
+    "reward": "reward\nof a tick",
+    "step/force_error": "force error\n[N]",
+    "step/angle_error": "angle error\n[rad]",
+}
+"""What the learning curve shows, and how it says it."""
 
 
 class RunFolder:
@@ -103,29 +112,48 @@ def _tensorboard_writer(path: Path) -> Any:
 
 
 def draw_curve(rows: list[dict[str, Any]], path: Path, title: str) -> None:
-    """Learning curves over environment steps as a PNG."""
+    """Learning curves over environment steps as a PNG, with the elapsed time above."""
     import matplotlib
 
     matplotlib.use("agg")
     import matplotlib.pyplot as plt
+    import numpy as np
 
-    names = [name for name in CURVES if any(row.get(name) is not None for row in rows)]
-    names += sorted({name for row in rows for name in row if name.startswith("step/") and name.endswith("error")})[:1]
+    errors = sorted({name for row in rows for name in row if name.startswith("step/") and name.endswith("error")})[:1]
+    words = CURVES | {
+        name: name.removeprefix("step/").replace("_", " ") + "\nof a tick" for name in errors if name not in CURVES
+    }
+    names = [name for name in words if any(row.get(name) is not None for row in rows)]
     if not names:
         return
     figure, axes = plt.subplots(
-        len(names), 1, figsize=(7, 2.2 * len(names)), sharex=True, squeeze=False, layout="constrained"
+        len(names), 1, figsize=(7, 1.9 * len(names)), sharex=True, squeeze=False, layout="constrained"
     )
+    million = 1e-6
     for ax, name in zip(axes[:, 0], names, strict=True):
-        points = [(row["env_steps"], row[name]) for row in rows if row.get(name) is not None]
-        ax.plot(*zip(*points, strict=True), lw=1.2)
-        ax.set_ylabel(name)
+        points = [(million * row["env_steps"], row[name]) for row in rows if row.get(name) is not None]
+        ax.plot(*zip(*points, strict=True), lw=1.2, label="training")
+        ax.set_ylabel(words[name])
         ax.grid(alpha=0.3)
-    held = [(row["env_steps"], row["evaluation/return"]) for row in rows if row.get("evaluation/return") is not None]
+        ax.spines[["top", "right"]].set_visible(False)
+        if name == "episode/success":
+            ax.set_ylim(-0.03, 1.03)
+    held = [
+        (million * row["env_steps"], row["evaluation/return"])
+        for row in rows
+        if row.get("evaluation/return") is not None
+    ]
     if held and names[0] == "episode/return":
         axes[0, 0].plot(*zip(*held, strict=True), "o", ms=4, label="evaluation")
-        axes[0, 0].legend()
-    axes[0, 0].set_title(title)
-    axes[-1, 0].set_xlabel("environment steps")
+        axes[0, 0].legend(frameon=False)
+    axes[0, 0].set_title(title, loc="left")
+    axes[-1, 0].set_xlabel("environment steps [million]")
+    timed = [(million * row["env_steps"], row["seconds"] / 60) for row in rows if "seconds" in row]
+    if len(timed) > 1:
+        steps, minutes = np.array(timed).T
+        above = axes[0, 0].secondary_xaxis(
+            "top", functions=(lambda x: np.interp(x, steps, minutes), lambda t: np.interp(t, minutes, steps))
+        )
+        above.set_xlabel("elapsed [min]")
     figure.savefig(path, dpi=120)
     plt.close(figure)

@@ -15,11 +15,12 @@ from dexsim.core import cli
 from dexsim.core.compilation import collector_paused
 from dexsim.core.config import to_dict
 from dexsim_ppo import checkpoint
-from dexsim_ppo.evaluate import Evaluator, print_report, write_video
+from dexsim_ppo.evaluate import Evaluator, write_video
 from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.ppo import TrainState, make_train
 from dexsim_ppo.learner.types import Environment
 from dexsim_ppo.policy import Policy
+from dexsim_ppo.report import print_report
 from dexsim_ppo.training import programs
 from dexsim_ppo.training.arguments import TrainArguments, printable, training_config
 from dexsim_ppo.training.display import Display
@@ -64,10 +65,12 @@ class Run:
         with Display(f"{arguments.task} on {device.device_kind}, {self.env.backend}") as display:
             display.note(
                 f"{self.folder.path}: {arguments.task}, {self.config.num_envs} environments, "
-                f"{self.env.backend} physics on {device.device_kind}; compiling"
+                f"{self.env.backend} physics on {device.device_kind}"
             )
+            display.working("compiling the training step; the second time it is read from the cache")
             state, step = self._prepare(source)
             display.note(f"compiled in {self.clock['compile_s']:.1f} s")
+            display.working("first update" + (": compiling Warp's kernels" if self.env.backend == "warp" else ""))
             log = MetricsLog(self.folder, int(state.iteration))
             try:
                 self._loop(state, step, display, log, stopped)

@@ -11,6 +11,8 @@ from dexsim.core.errors import DexsimError
 class HandError(DexsimError):
     """The hand or one of its sensors cannot be reached, or cannot do what was asked."""
 
+    page = "docs/troubleshooting.md#bridge"
+
 
 def explain(port: str, error: Exception) -> str:
     """One line about a port that does not open: the reason and the remedy."""

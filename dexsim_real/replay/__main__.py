@@ -11,9 +11,11 @@ from typing import Annotated
 
 import tyro
 
+from dexsim import load_hand
 from dexsim.core import cli
+from dexsim.datasets.lerobot import write_lerobot
 from dexsim_real.control.controller import prepare_jax
-from dexsim_real.replay.plots import plot, show_rerun
+from dexsim_real.replay.plots import open_rerun, plot, trajectory
 from dexsim_real.replay.replay import replay
 
 
@@ -30,6 +32,9 @@ class ReplayArguments:
     """Open the rerun viewer, with taxels as pictures (needs the extra `rerun`)."""
     rrd: Path | None = None
     """Recording for the rerun viewer, to open on another machine; None writes no file."""
+    lerobot: Path | None = None
+    """Folder for a dataset of one episode in the LeRobot format (extra `lerobot`), which must not exist yet; None
+    writes none."""
     output: Path | None = None
     """JSON file for the report; None writes no file."""
 
@@ -65,10 +70,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         plot(run, arguments.plot)
         print(f"figure: {arguments.plot}")
     if arguments.rerun and run.ticks:
-        show_rerun(run)
+        open_rerun(run)
     if arguments.rrd and run.ticks:
-        show_rerun(run, arguments.rrd)
+        open_rerun(run, arguments.rrd)
         print(f"rerun recording: {arguments.rrd}")
+    if arguments.lerobot and run.ticks:
+        print(f"LeRobot dataset: {write_lerobot(arguments.lerobot, load_hand(), report['task'], [trajectory(run)])}")
     return 0 if same else 1
 
 

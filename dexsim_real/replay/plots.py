@@ -1,4 +1,4 @@
-"""Plots of a replayed log: a figure, or the rerun viewer."""
+"""What is made of a replayed log: a figure, the rerun viewer, a dataset."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dexsim import load_hand
-from dexsim.core.install import install_line
-from dexsim.render.panel import taxel_image
-from dexsim_real.core.log import LogError
+from dexsim.datasets.rerun import show_rerun
+from dexsim.datasets.trajectory import Trajectory, from_readings
+from dexsim.hand.kinematics import Hand
 
 if TYPE_CHECKING:
     from dexsim_real.replay.replay import Replay
@@ -28,29 +28,41 @@ def signals(run: Replay) -> dict[str, np.ndarray]:
 
 
 def plot(run: Replay, path: Path) -> None:
-    """Write a figure of joint angles and targets, finger forces and command, measurement ages, and the observation."""
+    """Write a figure: joint angles and targets by finger, finger forces and command, ages, and the observation."""
     import matplotlib.pyplot as plt
 
-    figure, axes = plt.subplots(4, 1, figsize=(10, 13), sharex=True, constrained_layout=True)
     hand, seen = load_hand(), signals(run)
-    for joint, name in enumerate(hand.joint_names):
-        (line,) = axes[0].plot(run.time, seen["angle"][:, joint], lw=1, label=name.removeprefix("right_hand_"))
-        axes[0].plot(run.time, seen["target"][:, joint], lw=0.6, ls=":", color=line.get_color())
-    axes[0].set_ylabel("joint angle, target (dotted) / rad")
-    axes[0].legend(fontsize=6, ncols=4)
+    fingers = hand.num_fingers
+    figure, axes = plt.subplots(
+        fingers + 3,
+        1,
+        figsize=(10, 19),
+        sharex=True,
+        constrained_layout=True,
+        height_ratios=[1.0] * fingers + [1.5, 0.8, 3.0],
+    )
+    for finger, (axis, name) in enumerate(zip(axes, hand.finger_names, strict=False)):
+        for joint in finger_joints(hand, finger):
+            label = hand.joint_names[joint].removeprefix("right_hand_").removesuffix("_joint").replace("_", " ")
+            (line,) = axis.plot(run.time, seen["angle"][:, joint], lw=1, label=label)
+            axis.plot(run.time, seen["target"][:, joint], lw=0.8, ls=":", color=line.get_color())
+        axis.set_ylabel(f"{name} [rad]")
+        axis.legend(fontsize=7, ncols=4, loc="upper right", frameon=False)
+    axes[0].set_title("joint angles; targets dotted", loc="left", fontsize=9)
+    felt, age, observation = axes[fingers:]
     for finger, name in enumerate(hand.finger_names):
-        axes[1].plot(run.time, seen["force"][:, finger], lw=1, label=name)
-    axes[1].set_ylabel("fingertip force / N")
-    axes[1].legend(fontsize=7, ncols=5)
-    command = axes[1].twinx()
+        felt.plot(run.time, seen["force"][:, finger], lw=1, label=name)
+    felt.set(ylabel="force on the taxels [N]", ylim=(0, max(1.05 * float(seen["force"].max()), 0.1)))
+    felt.legend(fontsize=7, ncols=5, loc="upper right", frameon=False)
+    command = felt.twinx()
     command.plot(run.time, seen["command"], "k--", lw=0.8)
-    command.set_ylabel("command / 1")
-    axes[2].plot(run.time, 1e3 * seen["age"], lw=0.8)
-    axes[2].set_ylabel("age of the measurement / ms")
+    command.set(ylabel="command, dashed [0 to 1]", ylim=(-0.02, 1.02))
+    age.plot(run.time, 1e3 * seen["age"], lw=0.8)
+    age.set_ylabel("age of the\nmeasurement [ms]")
     # Entries differ in unit and scale, so each is normalised.
     spread = np.maximum(run.observation.std(0), 1e-6)
     edges = np.cumsum([0] + [field.size for field in run.fields])
-    axes[3].pcolormesh(
+    observation.pcolormesh(
         run.time,
         np.arange(edges[-1]) + 0.5,
         ((run.observation - run.observation.mean(0)) / spread).T,
@@ -60,17 +72,27 @@ def plot(run: Replay, path: Path) -> None:
         shading="nearest",
         rasterized=True,
     )
-    axes[3].set_yticks((edges[:-1] + edges[1:]) / 2, [field.name for field in run.fields], fontsize=7)
-    axes[3].hlines(edges[1:-1], run.time[0], run.time[-1], color="k", lw=0.5)
-    axes[3].invert_yaxis()
-    axes[3].set_title("observation, each entry in standard deviations from its mean", fontsize=9)
-    axes[3].set_xlabel("time / s")
+    middles = (edges[:-1] + edges[1:]) / 2
+    observation.set_yticks(middles, [field.name.replace("_", " ") for field in run.fields], fontsize=7)
+    observation.hlines(edges[1:-1], run.time[0], run.time[-1], color="k", lw=0.5)
+    observation.invert_yaxis()
+    observation.set_title("observation: each entry in standard deviations from its mean", loc="left", fontsize=9)
+    observation.set_xlabel("time [s]")
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=120)
     plt.close(figure)
 
 
-def show_rerun(run: Replay, path: Path | None = None) -> None:
+def finger_joints(hand: Hand, finger: int) -> list[int]:
+    """Joints from the palm to a fingertip."""
+    body, joints = int(hand.tip_body[finger]), list[int]()
+    while body >= 0:
+        joints += [int(hand.body_joint[body])] if hand.body_joint[body] >= 0 else []
+        body = int(hand.body_parent[body])
+    return joints[::-1]
+
+
+def open_rerun(run: Replay, path: Path | None = None) -> None:
     """Show a replay in the rerun viewer: the signals, the observation by fields, and taxels as pictures.
 
     Args:
@@ -78,13 +100,9 @@ def show_rerun(run: Replay, path: Path | None = None) -> None:
       path: recording to write; None opens the viewer.
 
     Raises:
-      LogError: rerun is not installed.
+      DexsimError: rerun is not installed.
       OSError: the file cannot be written.
     """
-    try:
-        import rerun
-    except ImportError:
-        raise LogError(f"the rerun viewer is not installed: {install_line('rerun')}; or use --plot") from None
     hand = load_hand()
     edges = np.cumsum([field.size for field in run.fields])[:-1]
     names = {"angle": hand.joint_names, "target": hand.joint_names, "force": hand.finger_names}
@@ -95,22 +113,11 @@ def show_rerun(run: Replay, path: Path | None = None) -> None:
             for field, values in zip(run.fields, np.split(run.observation, edges, 1), strict=True)
         },
     }
-    recording = rerun.RecordingStream("dexsim")
-    if path is None:
-        recording.spawn()
-    else:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.touch()  # Its error names the file; rerun's does not.
-        recording.save(path)
-    for entity, (labels, values) in series.items():
-        recording.log(entity, rerun.SeriesLines(names=list(labels)), static=True)
-        recording.send_columns(
-            entity, [rerun.TimeColumn("run", duration=run.time)], rerun.Scalars.columns(scalars=values)
-        )
-    top = max(float(np.max([m.taxel_force for m in run.measured])), 1e-3)
-    for at, now in zip(run.time, run.measured, strict=True):
-        recording.set_time("run", duration=float(at))
-        for finger, name in enumerate(hand.finger_names):
-            picture = taxel_image(now.taxel_force[finger], hand.taxel_grid)
-            recording.log(f"taxels/{name}", rerun.DepthImage(picture, colormap="inferno", depth_range=(0.0, top)))
-    recording.disconnect()
+    show_rerun(hand, run.time, series, np.stack([now.taxel_force for now in run.measured]), path)
+
+
+def trajectory(run: Replay) -> Trajectory:
+    """A replay as data; the object as the bridge estimated it."""
+    return from_readings(
+        run.time, [tick["readings"] for tick in run.ticks], np.array([tick["target"] for tick in run.ticks])
+    )

@@ -20,7 +20,7 @@ class RunArguments:
     """Options of `python -m dexsim_real.run`."""
 
     policy: Annotated[str, tyro.conf.Positional]
-    """Policy file, or name of a shipped policy ("grasp")."""
+    """Policy file, name of a shipped policy ("grasp"), or file of `python -m dexsim_ppo.export` (.npz or .onnx)."""
     port: str
     """Serial port of the hand (names under /dev/serial/by-id are stable), or sdk:MODULE:FUNCTION."""
     command: float = setting(0.5, unit="1", low=0.0, high=1.0)

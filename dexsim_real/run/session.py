@@ -15,6 +15,7 @@ from dexsim import load_hand
 from dexsim.calibration.maps import load_calibration
 from dexsim.core import cli
 from dexsim.core.config import to_dict
+from dexsim_ppo.export import load_exported
 from dexsim_ppo.policy import load_policy
 from dexsim_real.control.controller import IDENTITY, Controller, Tick
 from dexsim_real.control.goals import TurnGoals
@@ -53,7 +54,8 @@ class Session:
         self.arguments = arguments
         wanted = arguments.guard and not arguments.motors_off
         self.guard = Guard(arguments.port, arguments.link) if wanted else None
-        policy, hand = load_policy(arguments.policy), load_hand()
+        exported = arguments.policy.endswith((".npz", ".onnx"))
+        policy, hand = (load_exported if exported else load_policy)(arguments.policy), load_hand()
         self.controller = Controller(policy, hand)
         calibration = load_calibration(arguments.calibration, hand) if arguments.calibration else None
         self.sensing = HandSensing(hand, arguments.hardware, calibration)

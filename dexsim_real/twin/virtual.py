@@ -8,7 +8,7 @@ emulated palm board, so quantisation and delays are those of the wire.
 import dataclasses
 import functools
 import heapq
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -180,6 +180,13 @@ class VirtualRun:
 
     def run(self) -> dict[str, Any]:
         """Run the trial; returns the referee's report, with the measurements of the bridge as `bridge`."""
+        trial = self.plant.trial
+        for _ in self.ticking():
+            pass
+        return self._summary(trial)
+
+    def ticking(self) -> Iterator[None]:
+        """Run the trial in pieces: yields after each tick of the policy, and ends with the trial."""
         trial, limit = self.plant.trial, self.plant.limit + _SLACK
         self._schedule.at(0.0, self._exchange)
         if "imu" in self.controller.sources:
@@ -209,12 +216,17 @@ class VirtualRun:
             self._tick()
             tick += 1
             self._until(began + tick * self.controller.period)
-        return self._summary(trial)
+            yield
+
+    @property
+    def now(self) -> float:
+        """Virtual time since the start, s."""
+        return self._now
 
     # --- the bridge's threads ---------------------------------------------------------------------
 
     def _tick(self) -> None:
-        measured = self._measured()
+        measured = self.measured()
         position, velocity = np.asarray(self.controller.spec.reference, float), np.zeros(3)
         if self.camera:
             _, position, velocity = self.camera.sensor.read()
@@ -277,12 +289,13 @@ class VirtualRun:
             states += [self._state] if self._state is not None else []
         self.sensing.set_tare(states)
 
-    def _measured(self) -> HandMeasurement:
+    def measured(self) -> HandMeasurement:
+        """What the bridge measured last."""
         assert self.safety.sample is not None, "no state yet"
         return self.safety.sample.measured
 
     def _pose(self) -> np.ndarray:
-        return self._measured().joint_position
+        return self.measured().joint_position
 
     def _until(self, time: float) -> None:
         """Run the plant and the events up to a time in s."""

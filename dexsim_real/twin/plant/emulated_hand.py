@@ -1,8 +1,7 @@
 """The physics of the emulated hand: a `Plant` that runs one trial after another.
 
-C MuJoCo runs at 0.5 ms (`scene`), the firmware at 1 ms (`drives`), the fingertips (`taxel_array`) and the referee at
-10 ms. An assistant places the objects. The palm frame is the world frame. Everything follows deterministically from the
-seed and the commands.
+C MuJoCo runs at 0.5 ms (`scene`), the firmware at 1 ms (`drives`), fingertips (`taxel_array`) and referee at 10 ms. An
+assistant places the objects. The palm frame is the world frame. All follows from the seed and the commands.
 """
 
 import collections
@@ -134,6 +133,11 @@ class EmulatedHand:
         angle = float(np.linalg.norm(error))
         skew = turn(error / max(angle, 1e-12), angle)
         return position, product(product(heading, quat), skew), felt
+
+    def true_pose(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """True joint angles [12] rad; position [3] m and orientation [4] of the object."""
+        qpos, scene, at = self._data.qpos.copy(), self._scene, self._scene.object_qpos
+        return qpos[scene.drive_qpos] + qpos[scene.play_qpos], qpos[at : at + 3], qpos[at + 3 : at + 7]
 
     def warm(self, joint: int, degrees: float) -> None:
         """Heat a motor by this many K (a fault); cool it if negative."""

@@ -1,5 +1,6 @@
 """The renderer: geometry against the pinhole formula, colours, where heat-map cells lie, and readable video files."""
 
+import dataclasses
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -9,8 +10,8 @@ import numpy as np
 import pytest
 
 from dexsim.hand.load import load_hand
-from dexsim.render import render
-from dexsim.render.panel import draw_panel, force_color, make_layout, taxel_image
+from dexsim.render import picture, render
+from dexsim.render.panel import draw_panel, force_color, make_layout, read_outs, taxel_image
 from dexsim.render.raycast import FAR, Camera, Primitives, cast, look, normals, project, samples
 from dexsim.render.snapshot import Snapshot
 
@@ -181,7 +182,7 @@ def test_heat_map_cell_lies_where_documented():
     for finger, column, row in ((0, 0, 0), (2, 9, 0), (3, 4, 11), (4, 7, 5)):
         force = np.zeros((5, 120), np.float32)
         force[finger, column * 12 + row] = 1.0
-        panel = draw_panel(layout, names, force, force.sum(1), np.zeros(0), np.nan, 1.0, 1.0)
+        panel = draw_panel(layout, names, force, force.sum(1), {}, np.nan, 1.0, 1.0)
         left, top, right, bottom = cell_box(layout, finger, column, row)
         hot = force_color(np.array(1.0), 1.0)
         assert np.all(panel[top:bottom, left:right] == hot)
@@ -204,6 +205,23 @@ def test_panel_fits(size):
     assert max(box[2] for box in boxes) <= layout.width and max(box[3] for box in boxes) <= layout.height
 
 
+@pytest.mark.parametrize("size", [(416, 312), (640, 480), (1920, 1080)])
+def test_read_outs_stay_clear_of_the_colour_scale(size):
+    layout = make_layout(size[1] // 2, size[1], (10, 12), 5)
+    force = np.zeros((5, 120))
+    lines = {"time": "12.3 s", "command": "0.25", "target": "3.0 N", "total": "12.5 N"}
+    panels = [
+        draw_panel(layout, ("a", "b", "c", "d", "e"), force, force.sum(1), some, np.nan, 1.0, 1.0, ("", ""))
+        for some in ({}, lines)
+    ]
+    x, y = layout.slots[-1]
+    scale = y + int(1.3 * layout.font) + layout.cell * 12 - max(4, layout.cell) - int(1.3 * layout.font)
+    rows, columns = np.nonzero(np.any(panels[0] != panels[1], -1))
+    assert rows.min() >= y and rows.max() <= scale + 1 and columns.max() < x + layout.cell * 10
+    inked = np.any(panels[0] != panels[1], -1)[y:scale].any(1)
+    assert np.sum(np.diff(inked.astype(int)) == 1) + inked[0] >= 3, "lines are apart"
+
+
 @pytest.mark.parametrize("active", [*KINDS, None])
 def test_frame_of_every_kind(hand, active):
     frame = render.render_frame(hand, KINDS, snapshot(hand, active=active), size=SMALL)
@@ -216,7 +234,7 @@ def test_frame_of_every_kind(hand, active):
 def test_a_loaded_taxel_shows_on_the_finger(hand):
     """Of two pictures that differ in one taxel's force, the pixels around that taxel differ and turn hot."""
     cold = snapshot(hand, active=None)
-    pose = render._poses(hand, cold.joint_position[None])[0]
+    pose = render.hand_poses(hand, cold.joint_position[None])[0]
     size = (640, 480)
     view = look(render.CAMERAS["grasp"], (400, 480))
     facing = np.sum(pose.taxel_normal * (view.origin - pose.taxel_position), -1)
@@ -239,6 +257,47 @@ def test_frame_is_deterministic_and_both_cameras_work(hand):
     assert np.any(other != one)
     away = Camera(distance=0.3, target=(0.0, 0.0, 5.0), azimuth=180)  # the scene is behind it
     assert render.render_frame(hand, KINDS, snapshot(hand), size=SMALL, camera=away).shape == (240, 320, 3)
+
+
+def quarter(axis):
+    """A quarter turn about an axis."""
+    turn = np.roll(np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]], np.float32), axis + 1, (0, 1))
+    return turn
+
+
+def test_sides_of_a_box_have_the_colours_that_are_nearest_to_their_normals():
+    box = primitives(("box", [0.02] * 3, [0, 0, 0]))._replace(rotation=quarter(2)[None], sides=np.eye(6)[:, :3])
+    # Turned by a quarter about z, the box's +x looks along y, and its +y along -x.
+    tones = picture._tones(box, np.zeros(3, int), np.float32([[0, 0.9, 0], [-0.8, 0.1, 0], [0.1, 0, 0.9]]).T)
+    np.testing.assert_array_equal(tones.T, np.eye(6)[[0, 2, 4], :3])
+
+
+def test_a_quarter_turn_of_a_cube_can_be_seen(hand):
+    cube = dataclasses.replace(snapshot(hand, active="box"), primitive_size=np.full((5, 3), 0.025, np.float32))
+    turned = dataclasses.replace(cube, object_rotation=quarter(0))
+    plain, other = (render.render_frame(hand, KINDS, s, size=SMALL, camera="rotate") for s in (cube, turned))
+    assert np.any(plain != other, -1).mean() > 0.02
+
+
+def test_the_goal_is_shown_in_its_orientation_and_only_where_there_is_one(hand):
+    without = snapshot(hand, active="box")
+    view = look(render.CAMERAS["rotate"], (200, 240))
+    x, y = project(view, picture.goal_position(render.CAMERAS["rotate"]))[0].astype(int)
+    frames = [
+        render.render_frame(hand, KINDS, s, size=SMALL, camera="rotate")[y - 4 : y + 4, x - 4 : x + 4].mean((0, 1))
+        for s in (without, *(dataclasses.replace(without, goal_rotation=turn) for turn in (np.eye(3), quarter(0))))
+    ]
+    assert np.ptp(frames[0]) < 20, "the backdrop is grey"
+    assert np.abs(frames[1] - frames[0]).max() > 60 and np.abs(frames[2] - frames[1]).max() > 60
+
+
+def test_a_picture_says_time_turns_command_and_forces(hand):
+    force = np.zeros(hand.taxel_position.shape[:2], np.float32)
+    force[1, 0] = 2.5
+    plain = snapshot(hand, force=force)
+    assert read_outs(plain) == {"command": "0.50", "target": "3.0 N", "total": "2.5 N"}
+    turning = dataclasses.replace(plain, turns=np.int32(7), seconds=np.float32(12.34))
+    assert read_outs(turning) == {"time": "12.3 s", "turns": "7", "total": "2.5 N"}
 
 
 def test_broken_numbers_still_make_a_frame(hand):
@@ -297,14 +356,17 @@ def test_mp4_is_written_and_readable(hand, tmp_path):
     assert np.abs(first[:, :200] - drawn[:, :200]).mean() < 4  # what lossy compression leaves
 
 
-def test_long_episodes_are_thinned(hand, tmp_path, monkeypatch):
+def test_a_film_of_another_rate_keeps_its_duration(hand, tmp_path, monkeypatch):
     from PIL import Image
 
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     env, steps = episode(hand, 9)
-    path = render.render_episode(env, steps, tmp_path / "video.gif", fps=30, size=(160, 120), max_frames=4)
-    with Image.open(path) as image:
-        assert image.n_frames == 3 and image.info["duration"] == 100  # every third, three times as long
+    for rate, frames, duration in ((10, 3, 100), (60, 18, 20)):
+        path = render.render_episode(env, steps, tmp_path / "video.gif", fps=30, size=(160, 120), rate=rate)
+        with Image.open(path) as image:
+            assert image.n_frames <= frames and image.info["duration"] >= duration - 4
+            total = sum(image.seek(k) or image.info["duration"] for k in range(image.n_frames))
+        assert total == pytest.approx(300, abs=30 + 60 * (rate == 60))  # a GIF counts hundredths, and merges twins
     empty = jax.tree.map(lambda x: x[:0], steps)
     with pytest.raises(ValueError, match="no snapshots"):
         render.render_episode(env, empty, tmp_path / "none.gif", fps=30)

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -18,8 +19,10 @@ from tiny_env import TinyEnv
 
 from dexsim.core import cli
 from dexsim.core.errors import ConfigError
+from dexsim.core.pytree import pytree_dataclass
 from dexsim_ppo import evaluate, train
 from dexsim_ppo.policy import Policy
+from dexsim_ppo.report import mean_interval, print_report, proportion, summarize
 from dexsim_ppo.training.arguments import training_config
 from dexsim_ppo.training.runlog import RunFolder, read_metrics
 from dexsim_ppo.training.trainer import SELECTION_SEED
@@ -147,6 +150,75 @@ def test_film_shows_the_first_and_last_episode_to_half_a_second_after_its_end(fi
     assert film["x"].shape == (2 * (6 + 5),)
 
 
+@pytree_dataclass
+class Commanded:
+    """What a film of `Commands` holds."""
+
+    command: Any
+
+
+class Commands(TinyEnv):
+    """The target is what is commanded."""
+
+    def snapshot(self, state):
+        return Commanded(state.target)
+
+
+def test_film_shows_the_lowest_and_the_highest_command(finished):
+    env = Commands()
+    _, film = evaluate.Evaluator(env, 8)(Policy.load(finished.best).params, episodes=8, seed=0)
+    starts = np.asarray(env.evaluation_starts(env.evaluation_plan(8, 0)).target).reshape(8)
+    shown = np.asarray(film.command).reshape(2, -1)
+    np.testing.assert_allclose(shown[:, 0], [starts.min(), starts.max()], rtol=1e-6)
+
+
+def test_evaluate_refuses_a_path_that_it_cannot_write_before_it_measures(finished, tmp_path, monkeypatch):
+    monkeypatch.setattr(evaluate.Evaluator, "__call__", lambda *_, **__: pytest.fail("measured first"))
+    for option in ("--output", "--video"):
+        with pytest.raises(IsADirectoryError, match=str(tmp_path)):
+            evaluate.main([str(finished.best), option, str(tmp_path)])
+
+
+def test_a_full_disk_does_not_cost_the_table(finished, tmp_path, monkeypatch, capsys):
+    def full(path, data):
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr(cli, "write_json", full)
+    with pytest.raises(OSError, match="No space left"):
+        evaluate.main([str(finished.best), "--episodes", "16", "--output", str(tmp_path / "report.json")])
+    assert "return" in capsys.readouterr().out
+
+
+def test_without_a_number_of_episodes_the_device_decides(finished):
+    report = evaluate.evaluate_policy(finished.best, env=TinyEnv(), chunk=16, baseline=False)
+    assert report["episodes"] == 64 * 16, "episodes of 32 ticks: as many as ever"
+    long = type("Long", (TinyEnv,), {"evaluation_steps": 4000})()
+    assert evaluate.default_episodes(long) == 64
+
+
+def test_a_saved_configuration_begins_a_new_run(finished, tmp_path, capsys):
+    """Its options are the defaults; what is typed beside it holds."""
+    for given in (finished.path, finished.config):
+        again, begun = train.parse_arguments(["--config", str(given), "--seed", "9", "--env.gain", "0.5"])
+        saved = train.saved_arguments(Path(given), None)
+        assert begun is None and again.seed == 9 and again.env.gain == 0.5 and again.run_dir is None
+        assert again.ppo == saved.ppo and again.evaluation_chunk == 16 and again.steps == 6 * PER_ITERATION
+    path = tmp_path / "again"
+    assert train.main(["--config", str(finished.path), "--run-dir", str(path)]) == 0
+    first, second = (Policy.load(RunFolder(p).last).params for p in (finished.path, path))
+    jax.tree.map(np.testing.assert_array_equal, first, second)
+    (tmp_path / "other.json").write_text("{}")
+    for arguments, said in (
+        (["--config", str(finished.path), "--task", "grasp"], "of the task 'tiny', not 'grasp'"),
+        (["--config", str(finished.path), "--resume", str(finished.path)], "give one of them"),
+        (["--config", str(tmp_path / "other.json")], "no configuration of a run"),
+        (["--config", str(tmp_path / "none.json")], "no configuration of a run"),
+    ):
+        capsys.readouterr()
+        assert exit_code(train.main, arguments) == 2
+        assert said in (error := capsys.readouterr().err) and error.count("\n") == 1
+
+
 def test_episodes_end_at_their_first_termination():
     # Episode 0 terminates at step 1 (with a reward of 10 counted in), and "lives" again later.
     terminated = np.array([[0, 0], [1, 0], [0, 0]], bool)
@@ -154,7 +226,7 @@ def test_episodes_end_at_their_first_termination():
         "return": np.array([[1.0, 1], [11, 2], [99, 3]]),
         "error": np.array([[1.0, 1], [np.nan, 1], [np.nan, 4]]),
     }
-    report = evaluate.summarize(TinyEnv(), metrics, terminated, np.arange(2))
+    report = summarize(TinyEnv(), metrics, terminated, np.arange(2))
     assert report["held"]["value"] == 0.5
     assert report["return"]["value"] == pytest.approx((11 + 3) / 2)
     assert report["steps_held"]["value"] == pytest.approx((1 + 3) / 2)
@@ -162,9 +234,9 @@ def test_episodes_end_at_their_first_termination():
 
 
 def test_intervals():
-    entry = evaluate.proportion(np.array([True] * 8 + [False] * 2))
+    entry = proportion(np.array([True] * 8 + [False] * 2))
     assert (entry["low"], entry["high"]) == pytest.approx((0.4902, 0.9433), abs=2e-4)  # Wilson
-    entry = evaluate.mean_interval(np.array([1.0, 2, 3, 4]), np.arange(4))
+    entry = mean_interval(np.array([1.0, 2, 3, 4]), np.arange(4))
     assert entry["value"] == 2.5
     assert entry["high"] - 2.5 == pytest.approx(1.96 * np.sqrt(5 / 3) / 2)
 
@@ -172,10 +244,10 @@ def test_intervals():
 def test_intervals_are_by_start():
     """Copies of an episode add nothing: four starts sixteen times each are four samples."""
     values, start = np.tile([1.0, 2, 3, 4], 16), np.tile(np.arange(4), 16)
-    few, many = evaluate.mean_interval(values[:4], start[:4]), evaluate.mean_interval(values, start)
+    few, many = mean_interval(values[:4], start[:4]), mean_interval(values, start)
     assert many == pytest.approx(few)
     terminated = np.tile(np.array([True, False, False, False]), 16)[None]
-    report = evaluate.summarize(TinyEnv(), {"return": values[None], "error": values[None]}, terminated, start)
+    report = summarize(TinyEnv(), {"return": values[None], "error": values[None]}, terminated, start)
     assert report["starts"] == 4 and report["held"]["value"] == 0.75
     assert report["held"]["low"] < 0.3 and report["held"]["high"] == 1.0
 
@@ -189,7 +261,7 @@ def test_a_hand_that_does_nothing_gets_the_same_episodes(finished, capsys):
     assert idle["return"]["value"] == pytest.approx(float(32 * np.mean(1 - np.abs(starts.x - starts.target))), rel=1e-4)
     report = evaluate.evaluate_policy(finished.best, env=env, episodes=16, chunk=16, seed=4)
     assert report["do_nothing"]["return"] == pytest.approx(idle["return"])
-    evaluate.print_report(report, report["do_nothing"], title="tiny")
+    print_report(report, report["do_nothing"], title="tiny")
     shown = capsys.readouterr().out
     assert "doing nothing" in shown and f"{idle['task']['error']:.4g}" in shown
     assert "do_nothing" not in evaluate.evaluate_policy(finished.best, env=env, episodes=16, chunk=16, baseline=False)
@@ -255,7 +327,7 @@ def test_files_are_never_overwritten_or_mistaken(finished, tmp_path, monkeypatch
         (train.main, ["--resume", str(finished.best)], "'policy' file, not a 'train' file"),
         (evaluate.main, [str(broken)], "cut short"),
         (evaluate.main, ["no-such-policy"], "no shipped policy has that name"),
-        (evaluate.main, [str(finished.best), "--episodes", "0"], "at least 1"),
+        (evaluate.main, [str(finished.best), "--episodes", "-1"], "at least 0"),
         (evaluate.main, [str(finished.best), "--set", "colour=red"], "has no field 'colour'"),
         (evaluate.main, [str(finished.best), "--set", "gain=7"], "error: --set gain=7 m: must be between"),
         (evaluate.main, [str(finished.best), "--set", "colour"], "'colour': expected NAME=VALUE"),

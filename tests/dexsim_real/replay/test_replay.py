@@ -8,10 +8,11 @@ import pytest
 pytest.importorskip("serial")
 from following_hand import FollowingHand, arguments, records, summary
 
-from dexsim_real.core.log import Kind, LogError, LogReader
+from dexsim.core.errors import DexsimError
+from dexsim_real.core.log import Kind, LogReader
 from dexsim_real.replay import __main__ as replay_command
 from dexsim_real.replay import replay
-from dexsim_real.replay.plots import show_rerun
+from dexsim_real.replay.plots import open_rerun, trajectory
 from dexsim_real.run import __main__ as run
 
 pytestmark = pytest.mark.usefixtures("jax_as_it_is")
@@ -43,10 +44,36 @@ def test_a_run_from_the_measured_pose_to_motors_off_and_its_replay(hand, tmp_pat
     again = replay.replay(tmp_path / "run.log").report
     assert again["ticks"] == again["readings_same"] == again["observations_same"] == len(ticks) > 20
     assert again["first_difference"] is None and again["damaged_bytes"] == 0
-    assert replay_command.main([str(tmp_path / "run.log"), "--plot", str(tmp_path / "run.png")]) == 0
-    assert (tmp_path / "run.png").stat().st_size > 10_000
+    drawn_by_finger(hand, tmp_path, ticks)
+    taken_along(tmp_path, ticks)
     forged(tmp_path)
     seen_in_rerun(tmp_path)
+
+
+def taken_along(folder, ticks):
+    """As data: what each tick read, and the target that followed."""
+    data = trajectory(replay.replay(folder / "run.log"))
+    for name in ("joint_position", "taxel_force", "object_quat", "command"):
+        np.testing.assert_array_equal(getattr(data, name), np.float32([tick["readings"][name] for tick in ticks]))
+    np.testing.assert_array_equal(data.target, np.float32([tick["target"] for tick in ticks]))
+    assert data.time[0] == 0 and np.all(np.diff(data.time) > 0)
+
+
+def drawn_by_finger(hand, folder, ticks):
+    """The figure has one axis a finger, with each of its joints and its target."""
+    drawn = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("matplotlib.pyplot.close", drawn.append)
+        assert replay_command.main([str(folder / "run.log"), "--plot", str(folder / "run.png")]) == 0
+    assert (folder / "run.png").stat().st_size > 10_000
+    axes = drawn[0].axes[:5]
+    assert [axis.get_ylabel() for axis in axes] == [f"{name} [rad]" for name in hand.finger_names]
+    lines = [line for axis in axes for line in axis.lines]
+    assert [len(axis.lines) // 2 for axis in axes] == [3, 3, 2, 2, 2]
+    for joint in range(12):
+        angles, targets = lines[2 * joint : 2 * joint + 2]
+        np.testing.assert_array_equal(angles.get_ydata(), [t["readings"]["joint_position"][joint] for t in ticks])
+        np.testing.assert_array_equal(targets.get_ydata(), [t["target"][joint] for t in ticks])
 
 
 class Rerun:
@@ -95,8 +122,8 @@ def seen_in_rerun(folder):
     path = folder / "run.log"
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(sys.modules, "rerun", None)
-        with pytest.raises(LogError, match=r"pip install -e '\.\[rerun\]'"):
-            show_rerun(replay.replay(path), folder / "run.rrd")
+        with pytest.raises(DexsimError, match=r"pip install -e '\.\[rerun\]'"):
+            open_rerun(replay.replay(path), folder / "run.rrd")
         patch.setitem(sys.modules, "rerun", Rerun)
         assert replay_command.main([str(path), "--rrd", str(folder / "new" / "run.rrd")]) == 0
     sent, ticks = Rerun.last, records(folder, Kind.TICK)

@@ -1,0 +1,60 @@
+"""The console command `dexsim`: one word for each of the library's commands.
+
+dexsim train --task grasp        # the same as python -m dexsim_ppo.train --task grasp
+"""
+
+import importlib
+import sys
+from collections.abc import Sequence
+
+from dexsim.core import cli
+from dexsim.core.errors import ConfigError
+from dexsim.core.options import closest
+
+COMMANDS = {
+    "train": ("dexsim_ppo.train", "train a task"),
+    "evaluate": ("dexsim_ppo.evaluate", "measure a policy over fixed episodes"),
+    "view": ("dexsim.view.__main__", "show a hand live in the browser"),
+    "export": ("dexsim_ppo.export", "write a policy for programs without JAX"),
+    "record": ("dexsim_ppo.record", "record simulated episodes for other programs"),
+    "run": ("dexsim_real.run.__main__", "run a policy on the hand"),
+    "twin": ("dexsim_real.twin.__main__", "emulate a hand on a pseudo-terminal"),
+    "calibrate": ("dexsim_real.calibrate.__main__", "calibrate a hand"),
+    "replay": ("dexsim_real.replay.__main__", "recompute and plot the log of a run"),
+    "randomization-check": ("dexsim.randomization_check.__main__", "test that every range has an effect"),
+    "reproduce": ("dexsim_ppo.reproduce", "replay a faulty training iteration"),
+}
+"""Module and purpose of each command."""
+
+
+def usage() -> str:
+    """The page of `dexsim --help`."""
+    lines = [f"  {name:20} {purpose}" for name, (_, purpose) in COMMANDS.items()]
+    return "\n".join(
+        ["usage: dexsim COMMAND [options]", "", *lines, "", "dexsim COMMAND --help shows the command's options."]
+    )
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command. Returns its exit code.
+
+    Raises:
+      ConfigError: no such command.
+    """
+    argv = list(sys.argv[1:] if argv is None else argv)
+    if not argv or argv[0] in ("-h", "--help"):
+        print(usage())
+        return 0
+    name, *rest = argv
+    if name not in COMMANDS:
+        raise ConfigError(f"{name}: no such command{closest(name, COMMANDS)}; see dexsim --help")
+    return importlib.import_module(COMMANDS[name][0]).main(rest)
+
+
+def console() -> None:
+    """The entry point of the console command."""
+    cli.run(main)
+
+
+if __name__ == "__main__":
+    console()

@@ -1,0 +1,183 @@
+"""Trajectories in the LeRobot dataset format, version 3.0, without torch and without LeRobot.
+
+Touch is laid out as LeRobot's open proposal for tactile sensors has it (huggingface/lerobot, pull request 4469, in its
+state of August 2026): a feature `observation.tactile.NAME` for each sensor, a set of points with a force vector each,
+[N, 3] in N. Vectors are in the fingertip's frame; ours have only the part along the normal. Where the points are, m in
+that frame, is in `meta/tactile.json`, which is our own addition.
+"""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dexsim.core.errors import DexsimError
+from dexsim.core.install import install_line
+from dexsim.datasets.trajectory import Trajectory
+from dexsim.hand.kinematics import Hand
+
+VERSION = "v3.0"
+FPS = 30
+"""Frames a second: the format knows whole numbers only, so the nearest tick of each instant is taken."""
+_FILE = "chunk-000/file-000.parquet"
+_QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
+
+
+def write_lerobot(folder: Path, hand: Hand, task: str, trajectories: Sequence[Trajectory]) -> Path:
+    """Write a dataset, one episode for each trajectory; returns its folder.
+
+    Args:
+      folder: must not exist yet.
+      hand: whose trajectories they are.
+      task: what was done, a phrase.
+      trajectories: at least one.
+
+    Raises:
+      DexsimError: pyarrow is not installed, the folder exists, or there is no trajectory.
+    """
+    try:
+        import pandas
+        import pyarrow
+        import pyarrow.parquet as parquet
+    except ImportError:
+        raise DexsimError(f"the LeRobot format needs pyarrow and pandas: {install_line('lerobot')}") from None
+    if folder.exists():
+        raise DexsimError(f"{folder}: exists already; name another folder")
+    if not trajectories:
+        raise DexsimError(f"{folder}: no trajectory to write")
+    columns: dict[str, list[np.ndarray]] = {}
+    episodes, begin = [], 0
+    for number, trajectory in enumerate(trajectories):
+        frames = features_of(hand, trajectory.at_rate(FPS))
+        length = len(frames["timestamp"])
+        frames |= {
+            "episode_index": np.full(length, number, np.int64),
+            "index": np.arange(begin, begin + length, dtype=np.int64),
+            "task_index": np.zeros(length, np.int64),
+        }
+        for name, values in frames.items():
+            columns.setdefault(name, []).append(values)
+        episodes.append(_episode(number, begin, length, task, frames))
+        begin += length
+    whole = {name: np.concatenate(parts) for name, parts in columns.items()}
+    for part in ("data/chunk-000", "meta/episodes/chunk-000"):
+        (folder / part).mkdir(parents=True)
+    parquet.write_table(
+        pyarrow.table({name: _column(pyarrow, values) for name, values in whole.items()}), folder / "data" / _FILE
+    )
+    parquet.write_table(pyarrow.Table.from_pylist(episodes), folder / "meta" / "episodes" / _FILE)
+    pandas.DataFrame({"task_index": [0]}, index=[task]).to_parquet(folder / "meta" / "tasks.parquet")
+    for name, content in {
+        "info": _info(hand, whole, len(trajectories)),
+        "stats": {name: _statistics(values) for name, values in whole.items()},
+        "tactile": _tactile(hand),
+    }.items():
+        (folder / "meta" / f"{name}.json").write_text(json.dumps(content, indent=1) + "\n")
+    return folder
+
+
+def features_of(hand: Hand, trajectory: Trajectory) -> dict[str, np.ndarray]:
+    """The features of each frame [T, ...] by their names in the format; `action` is the joint targets, rad."""
+    force = trajectory.taxel_force[..., None] * -hand.taxel_normal
+    count = len(trajectory.time)
+    return {
+        "observation.state": trajectory.joint_position,
+        "observation.joint_torque": trajectory.joint_torque,
+        **{f"observation.tactile.{name}": force[:, i].astype(np.float32) for i, name in enumerate(hand.finger_names)},
+        "observation.object_position": trajectory.object_position,
+        "observation.object_quat": trajectory.object_quat,
+        "observation.command": trajectory.command,
+        "action": trajectory.target,
+        "timestamp": (np.arange(count) / FPS).astype(np.float32),
+        "frame_index": np.arange(count, dtype=np.int64),
+    }
+
+
+def _info(hand: Hand, columns: dict[str, np.ndarray], episodes: int) -> dict[str, Any]:
+    joints, force = list(hand.joint_names), ["Fx", "Fy", "Fz"]
+    names = {
+        "observation.state": joints,
+        "observation.joint_torque": joints,
+        "action": joints,
+        "observation.object_position": ["x", "y", "z"],
+        "observation.object_quat": ["w", "x", "y", "z"],
+        **{f"observation.tactile.{name}": force for name in hand.finger_names},
+    }
+    return {
+        "codebase_version": VERSION,
+        "robot_type": hand.name,
+        "total_episodes": episodes,
+        "total_frames": len(columns["index"]),
+        "total_tasks": 1,
+        "chunks_size": 1000,
+        "data_files_size_in_mb": 100,
+        "video_files_size_in_mb": 500,
+        "fps": FPS,
+        "splits": {"train": f"0:{episodes}"},
+        "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+        "video_path": None,
+        "features": {
+            name: {"dtype": values.dtype.name, "shape": list(values.shape[1:]) or [1], "names": names.get(name)}
+            for name, values in columns.items()
+        },
+    }
+
+
+def _tactile(hand: Hand) -> dict[str, Any]:
+    """Where the points of each tactile feature are."""
+    return {
+        "unit": {"position": "m", "force": "N"},
+        "frame": "of the link that carries the fingertip's taxels",
+        "sensors": {
+            f"observation.tactile.{name}": {
+                "link": hand.body_names[hand.tip_body[i]],
+                "position": np.round(hand.taxel_position[i], 6).tolist(),
+                "normal": np.round(hand.taxel_normal[i], 6).tolist(),
+            }
+            for i, name in enumerate(hand.finger_names)
+        },
+    }
+
+
+def _episode(number: int, begin: int, length: int, task: str, frames: dict[str, np.ndarray]) -> dict[str, Any]:
+    """A row of `meta/episodes`."""
+    statistics = {
+        f"stats/{name}/{which}": value
+        for name, values in frames.items()
+        for which, value in _statistics(values).items()
+    }
+    return {
+        "episode_index": number,
+        "tasks": [task],
+        "length": length,
+        "data/chunk_index": 0,
+        "data/file_index": 0,
+        "dataset_from_index": begin,
+        "dataset_to_index": begin + length,
+        "meta/episodes/chunk_index": 0,
+        "meta/episodes/file_index": 0,
+        **statistics,
+    }
+
+
+def _statistics(values: np.ndarray) -> dict[str, Any]:
+    """Minimum, maximum, mean, deviation and quantiles over frames; scalars are lists of one number."""
+    values = np.asarray(values, float)
+    values = values[:, None] if values.ndim == 1 else values
+    found = {"min": values.min(0), "max": values.max(0), "mean": values.mean(0), "std": values.std(0)}
+    found |= {name: np.quantile(values, at, axis=0) for name, at in _QUANTILES.items()}
+    return {name: value.tolist() for name, value in found.items()} | {"count": [len(values)]}
+
+
+def _column(pyarrow: Any, values: np.ndarray) -> Any:
+    return pyarrow.array(values.tolist(), _type(pyarrow, values))
+
+
+def _type(pyarrow: Any, values: np.ndarray) -> Any:
+    """Nested lists of the array's own number type."""
+    kind = pyarrow.from_numpy_dtype(values.dtype)
+    for _ in values.shape[1:]:
+        kind = pyarrow.list_(kind)
+    return kind

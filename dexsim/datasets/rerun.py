@@ -1,0 +1,51 @@
+"""Signals and taxels in the rerun viewer, or as its recording (extra `rerun`)."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from dexsim.core.errors import DexsimError
+from dexsim.core.install import install_line
+from dexsim.hand.kinematics import Hand
+from dexsim.render.panel import taxel_image
+
+Series = Mapping[str, tuple[Sequence[str], np.ndarray]]
+"""Values [T, n] and the names of their columns, by entity."""
+
+
+def show_rerun(hand: Hand, time: np.ndarray, series: Series, taxel_force: np.ndarray, path: Path | None = None) -> None:
+    """Show signals, and taxels as pictures.
+
+    Args:
+      hand: the hand.
+      time: [T] s.
+      series: the signals.
+      taxel_force: [T, F, N] N.
+      path: recording to write; None opens the viewer.
+
+    Raises:
+      DexsimError: rerun is not installed.
+      OSError: the file cannot be written.
+    """
+    try:
+        import rerun
+    except ImportError:
+        raise DexsimError(f"the rerun viewer is not installed: {install_line('rerun')}") from None
+    recording = rerun.RecordingStream("dexsim")
+    if path is None:
+        recording.spawn()
+    else:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()  # Its error names the file; rerun's does not.
+        recording.save(path)
+    for entity, (labels, values) in series.items():
+        recording.log(entity, rerun.SeriesLines(names=list(labels)), static=True)
+        recording.send_columns(entity, [rerun.TimeColumn("run", duration=time)], rerun.Scalars.columns(scalars=values))
+    top = max(float(np.max(taxel_force)), 1e-3)
+    for at, force in zip(time, taxel_force, strict=True):
+        recording.set_time("run", duration=float(at))
+        for finger, name in enumerate(hand.finger_names):
+            picture = taxel_image(force[finger], hand.taxel_grid)
+            recording.log(f"taxels/{name}", rerun.DepthImage(picture, colormap="inferno", depth_range=(0.0, top)))
+    recording.disconnect()

@@ -1,0 +1,96 @@
+"""Shows a hand live in the browser.
+
+    python -m dexsim.view grasp
+
+Shown is a simulation with a policy, the emulated hand (`--emulated`), or the log of a run on a hand.
+"""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from dexsim.core import cli
+from dexsim.core.config import setting, validate
+from dexsim.core.errors import CheckpointError, ConfigError
+from dexsim.registry import find_task, make
+from dexsim.view.policies import NONE, PolicyShelf
+from dexsim.view.source import Source
+from dexsim.view.viewer import Viewer
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewArguments:
+    """Options of `python -m dexsim.view`."""
+
+    what: Annotated[str, tyro.conf.Positional]
+    """Policy file, name of a shipped policy or of a task (my_module:poke for one of your own), or log file (.log) of a
+    run on a hand."""
+    emulated: bool = False
+    """Run the policy on the emulated hand instead of the simulation that it was trained in."""
+    seed: int = setting(0, unit="1", low=0, high=2**31 - 1)
+    """Seed of the episodes."""
+    host: str = "127.0.0.1"
+    """Address to serve the page at; 0.0.0.0 lets other computers see and control it."""
+    port: int = setting(8080, unit="1", low=1, high=65535)
+    """Port to serve the page at; the next free one if it is taken."""
+
+    def __post_init__(self) -> None:
+        validate(self)
+
+
+def open_source(arguments: ViewArguments) -> Source:
+    """What the arguments ask to be shown.
+
+    Raises:
+      ConfigError: it is neither a policy nor a task.
+      DexsimError: see the sources.
+    """
+    name = arguments.what
+    if name.endswith(".log"):
+        from dexsim.view.recording import Recording
+
+        return Recording(Path(name))
+    if arguments.emulated:
+        from dexsim.view.emulation import Emulation
+
+        return Emulation(name, arguments.seed)
+    from dexsim.view.simulation import Simulation
+    from dexsim_ppo.policy import load_policy
+
+    try:
+        policy = load_policy(name)
+    except CheckpointError:
+        if Path(name).exists():
+            raise
+        try:
+            find_task(name)
+        except ConfigError as error:
+            raise ConfigError(f"{name}: no policy file, no shipped policy, and {error}") from None
+        env, name = make(name.rpartition(":")[2]), NONE
+    else:
+        env = policy.make_env()
+    return Simulation(env, PolicyShelf(env, name), arguments.seed)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command. Returns its exit code, 0."""
+    arguments = cli.parse(
+        ViewArguments,
+        sys.argv[1:] if argv is None else argv,
+        prog="python -m dexsim.view",
+        description="Show a hand live in the browser.",
+    )
+    cli.enable_caches()
+    print(f"preparing {arguments.what}", flush=True)
+    viewer = Viewer(open_source(arguments), title=f"dexsim: {arguments.what}", host=arguments.host, port=arguments.port)
+    print(f"open {viewer.url} in a browser; Ctrl-C ends", flush=True)
+    viewer.run()
+    return 0
+
+
+if __name__ == "__main__":
+    cli.run(main)

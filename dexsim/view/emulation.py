@@ -1,0 +1,84 @@
+"""The emulated hand with a policy, in virtual time: true poses, and touch as the bridge measures it."""
+
+import dataclasses
+from collections.abc import Iterator
+
+import numpy as np
+
+from dexsim.hand.load import load_hand
+from dexsim.render.snapshot import Snapshot
+from dexsim.view.source import Control, Frame, Slider, Values
+from dexsim_ppo.policy import load_policy
+from dexsim_real.control.controller import Controller, prepare_jax
+from dexsim_real.core.errors import HandError
+from dexsim_real.twin.__main__ import check_policy
+from dexsim_real.twin.plant.emulated_hand import EmulatedHand
+from dexsim_real.twin.plant.parameters import TASKS
+from dexsim_real.twin.plant.shapes import matrix
+from dexsim_real.twin.virtual import RunOptions, VirtualRun, ideal_calibration
+
+
+class Emulation:
+    """Trials of a policy on the emulated hand; each reset is the next one.
+
+    Args:
+      name: a policy file, or the name of a shipped policy.
+      seed: of the trials.
+
+    Raises:
+      HandError: the emulated hand has no such task or mount, or the policy observes what no sensor measures.
+    """
+
+    def __init__(self, name: str, seed: int = 0):
+        prepare_jax()
+        self.hand, policy = load_hand(), load_policy(name)
+        if policy.task not in TASKS:
+            raise HandError(f"{name}: the emulated hand has the tasks {' and '.join(TASKS)}, not {policy.task!r}")
+        check_policy(name, policy.task, self.hand)
+        self._controller = Controller(policy, self.hand)
+        self._controller.warm()
+        self._calibration = ideal_calibration(self.hand)
+        self.period, self.camera, self._seed, self._trial = self._controller.period, policy.task, seed, -1
+
+    def controls(self) -> dict[str, Control]:
+        """The grip command, where the policy takes one."""
+        return {} if self._controller.spec.turn else {"command": Slider(0.0, 1.0, 0.05, 0.5)}
+
+    def reset(self, values: Values) -> Frame:
+        self._trial += 1
+        plant = EmulatedHand(self.hand, self.camera, self._seed, trials=1, first=self._trial)
+        self._run = VirtualRun(plant, self._controller, self._calibration, RunOptions(values.get("command", 0.5)))
+        self._ticks: Iterator[None] = self._run.ticking()
+        return self.step(values)
+
+    def step(self, values: Values) -> Frame:
+        run = self._run
+        run.options = dataclasses.replace(run.options, command=values.get("command", 0.5))
+        if next(self._ticks, "over") == "over":
+            return self.reset(values)
+        return self._frame()
+
+    def _frame(self) -> Frame:
+        plant, now = self._run.plant, self._run.now
+        joints, position, quat = plant.true_pose()
+        parts = plant.shape.parts
+        goals, measured = self._run.goals, self._run.measured()
+        finger_force = self._controller.spec.finger_force
+        target = np.nan if finger_force is None else np.interp(self._run.options.command, (0, 1), finger_force)
+        snapshot = Snapshot(
+            joint_position=joints,
+            object_position=position,
+            object_rotation=matrix(quat),
+            primitive_size=np.array([(*part.size, 0, 0)[:3] for part in parts]),
+            primitive_position=np.array([part.place for part in parts]),
+            primitive_rotation=np.tile(np.eye(3), (len(parts), 1, 1)),
+            primitive_active=np.ones(len(parts), bool),
+            taxel_force=measured.taxel_force,
+            command=np.array(self._run.options.command),
+            target_force=np.float32(target),
+            finger_force=measured.finger_force,
+            goal_rotation=matrix(goals.quat) if goals else None,
+            turns=goals.successes if goals else None,
+            seconds=now,
+        )
+        return Frame(snapshot, tuple(part.kind for part in parts), f"trial {self._trial}")

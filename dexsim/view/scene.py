@@ -1,0 +1,184 @@
+"""The scene of a view: hand, taxels, contact forces, object and goal as viser draws them.
+
+Geometry is sent once and then moved; a frame costs a few kilobytes.
+"""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from dexsim.hand.kinematics import Hand
+from dexsim.render.colors import FACES, LINK, OBJECT, PALM, TIP
+from dexsim.render.panel import force_color
+from dexsim.render.picture import Pose
+from dexsim.render.raycast import look
+from dexsim.render.render import CAMERAS, hand_poses
+from dexsim.view.source import Frame
+
+_IDLE = (60, 66, 78)  # sRGB of a taxel that feels nothing
+_ARROW = (255, 190, 70)
+_METRES_PER_NEWTON = 0.006  # length of a force's arrow
+_GOAL_AT = 0.10  # m above the object, where the goal is shown
+_AWAY, _ASIDE = 1.3, 0.07  # of a film's camera's distance; m
+_LIFT = 0.0004  # m of the taxels off the skin, so that they are not inside it
+
+
+class Scene:
+    """A hand in the browser.
+
+    Args:
+      server: of viser.
+      hand: the hand.
+      camera: a preset of `CAMERAS`, which also says where up is.
+    """
+
+    def __init__(self, server: Any, hand: Hand, camera: str):
+        self._server, self._hand = server, hand
+        self._shape: Any = None  # what the object looked like when it was last sent
+        view = CAMERAS[camera]
+        self._up = np.asarray(view.up, float)
+        server.scene.set_up_direction(view.up)
+        server.scene.configure_default_lights(True, cast_shadow=False)
+        server.scene.add_light_ambient("/light", intensity=1.2)
+        # Farther away than a film's camera, and to the right: the controls cover that part of the page.
+        seen = look(dataclasses.replace(view, distance=_AWAY * view.distance), (4, 3))
+        aside = _ASIDE * seen.axes[0]
+        server.initial_camera.position = tuple(seen.origin + aside)
+        server.initial_camera.look_at = tuple(view.target + aside)
+        server.initial_camera.fov = float(np.deg2rad(view.field_of_view))
+        self._links = [server.scene.add_frame(f"/hand/{name}", show_axes=False) for name in hand.body_names]
+        for number, geom in enumerate(hand.geoms):
+            if geom.kind != "plane":
+                tone = TIP if geom.body in hand.tip_body else PALM if geom.body == 0 else LINK
+                mesh = primitive(geom.kind, geom.size)
+                server.scene.add_mesh_simple(
+                    f"/hand/{hand.body_names[geom.body]}/{number}",
+                    mesh.vertices,
+                    mesh.faces,
+                    color=tone,
+                    position=geom.position,
+                    wxyz=quaternion(geom.rotation),
+                )
+        # Each fingertip carries its taxels, so that they are in place however late a slow browser draws.
+        self._taxels = [
+            server.scene.add_point_cloud(
+                f"/hand/{hand.body_names[body]}/taxels",
+                (hand.taxel_position + _LIFT * hand.taxel_normal)[finger].astype(np.float32),
+                np.tile(np.array(_IDLE, np.uint8), (hand.num_taxels, 1)),
+                point_size=0.0015,
+                point_shape="circle",
+                precision="float32",
+            )
+            for finger, body in enumerate(hand.tip_body)
+        ]
+        self._forces = server.scene.add_arrows(
+            "/forces",
+            np.zeros((1, 2, 3)),
+            _ARROW,
+            shaft_radius=0.0009,
+            head_radius=0.0022,
+            head_length=0.005,
+            visible=False,
+        )
+        self._object = server.scene.add_frame("/object", show_axes=False, axes_length=0.03, axes_radius=0.001)
+        self._goal = server.scene.add_frame("/goal", show_axes=False, visible=False)
+
+    def show(self, frame: Frame, force_range: float) -> None:
+        """Draw a frame; taxels are coloured from 0 to `force_range` N."""
+        snapshot = frame.snapshot
+        pose = hand_poses(self._hand, np.asarray(snapshot.joint_position, np.float32)[None])[0]
+        with self._server.atomic():
+            for link, position, rotation in zip(self._links, pose.body_position, pose.body_rotation, strict=True):
+                link.position, link.wxyz = position, quaternion(rotation)
+            force = np.asarray(snapshot.taxel_force)
+            colors = np.where(force[..., None] > 0, force_color(force, force_range), np.array(_IDLE, np.uint8))
+            for taxels, color in zip(self._taxels, colors, strict=True):
+                taxels.colors = color
+            arrows = force_arrows(pose, force)
+            self._forces.visible = len(arrows) > 0
+            if len(arrows):
+                self._forces.points = arrows.astype(np.float32)
+            self._draw_object(frame)
+            self._object.position = snapshot.object_position
+            self._object.wxyz = quaternion(snapshot.object_rotation)
+            if snapshot.goal_rotation is not None:
+                self._goal.visible = True
+                self._goal.position = np.asarray(snapshot.object_position) + _GOAL_AT * self._up
+                self._goal.wxyz = quaternion(snapshot.goal_rotation)
+
+    def _draw_object(self, frame: Frame) -> None:
+        """The object's primitives, and again for the goal, where they are not those of the frame before."""
+        snapshot = frame.snapshot
+        active = np.flatnonzero(snapshot.primitive_active)
+        shape = (
+            tuple(frame.kinds[k] for k in active),
+            *(
+                np.asarray(x)[active].tobytes()
+                for x in (snapshot.primitive_size, snapshot.primitive_position, snapshot.primitive_rotation)
+            ),
+        )
+        if shape == self._shape:
+            return
+        self._shape = shape
+        for root in ("/object/shape", "/goal/shape"):
+            self._server.scene.remove_by_name(root)
+        self._object.show_axes = len(active) == 0
+        for root in ("object", "goal"):
+            ghost = root == "goal"
+            for k in active:
+                mesh = primitive(frame.kinds[k], snapshot.primitive_size[k])
+                mesh.apply_scale(0.6 if ghost else 1.0)
+                parts = box_faces(mesh) if frame.kinds[k] == "box" and len(active) == 1 else [(OBJECT, mesh)]
+                for number, (color, part) in enumerate(parts):
+                    self._server.scene.add_mesh_simple(
+                        f"/{root}/shape/{k}/{number}",
+                        part.vertices,
+                        part.faces,
+                        color=color,
+                        opacity=0.6,
+                        flat_shading=frame.kinds[k] == "box",
+                        position=np.asarray(snapshot.primitive_position[k]) * (0.6 if ghost else 1.0),
+                        wxyz=quaternion(snapshot.primitive_rotation[k]),
+                    )
+            if ghost and len(active):
+                self._server.scene.add_label("/goal/shape/label", "goal")
+
+
+def force_arrows(pose: Pose, taxel_force: np.ndarray) -> np.ndarray:
+    """Arrows [M, 2, 3] m of the fingers that feel something: from the centre of force, along what the taxels bear."""
+    total = taxel_force.sum(-1)
+    felt = total > 0
+    force = -np.einsum("fn,fnk->fk", taxel_force, pose.taxel_normal)[felt]
+    centre = np.einsum("fn,fnk->fk", taxel_force, pose.taxel_position)[felt] / total[felt, None]
+    # The head is at the skin, so that the arrow is outside of the finger.
+    return np.stack([centre - _METRES_PER_NEWTON * force, centre], 1)
+
+
+def primitive(kind: str, size: np.ndarray) -> trimesh.Trimesh:
+    """A primitive as a mesh; `size` as in MuJoCo, m."""
+    a, b, c = (float(x) for x in size)
+    if kind == "box":
+        return trimesh.creation.box(extents=(2 * a, 2 * b, 2 * c))
+    if kind == "capsule":
+        return trimesh.creation.capsule(radius=a, height=2 * b, count=(24, 16))
+    if kind == "cylinder":
+        return trimesh.creation.cylinder(radius=a, height=2 * b, sections=32)
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    ball.apply_scale((a, b, c) if kind == "ellipsoid" else a)
+    return ball
+
+
+def box_faces(box: trimesh.Trimesh) -> list[tuple[tuple[int, int, int], trimesh.Trimesh]]:
+    """The six faces of a box, each with its colour of `FACES`: +x, -x, +y, -y, +z, -z."""
+    axis = np.abs(box.face_normals).argmax(-1)
+    side = 2 * axis + (box.face_normals[np.arange(len(axis)), axis] < 0)
+    return [(FACES[k], box.submesh([np.flatnonzero(side == k)], append=True)) for k in range(6)]
+
+
+def quaternion(rotation: np.ndarray) -> np.ndarray:
+    """(w, x, y, z) of a rotation matrix [3, 3]."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation
+    return trimesh.transformations.quaternion_from_matrix(matrix)

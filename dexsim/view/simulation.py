@@ -1,0 +1,101 @@
+"""A simulated hand with a policy, one tick a frame."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dexsim.env.env import Env
+from dexsim.env.state import State
+from dexsim.objects.config import KINDS
+from dexsim.render.render import CAMERAS
+from dexsim.view.policies import PolicyShelf
+from dexsim.view.source import Button, Choice, Control, Frame, Slider, Values
+
+_ANY = "any"
+_PUSH = 0.5  # m/s that a push adds to the object's velocity, until the page says otherwise
+_SHOWN = 1.0  # s that a dropped object stays in sight
+
+
+class Simulation:
+    """Episodes of an environment; the page chooses policy, object, command, friction and pushes.
+
+    Args:
+      env: made for one environment.
+      policies: to choose from.
+      seed: of the episodes.
+    """
+
+    def __init__(self, env: Env, policies: PolicyShelf, seed: int = 0):
+        self.env, self.hand, self.period, self.policies = env, env.hand, env.control_period, policies
+        self.camera = env.name if env.name in CAMERAS else "grasp"
+        self._random = np.random.default_rng(seed)
+        self._key, self._ended = jax.random.key(seed), 0.0
+        self._shapes = np.asarray(env.pool.object.shape_index)
+        # The goal of an evaluation: it does not change or give up by itself.
+        _, goals = env.task.evaluation_plan(1, self._shapes)
+        self._goal = jax.tree.map(lambda x: jnp.asarray(x)[0], goals)
+        self._reset = jax.jit(env.reset_to)
+        self._step = jax.jit(self._tick)
+        self._snapshot = jax.jit(env.snapshot)
+        self._state: State = self._begin({})
+
+    def controls(self) -> dict[str, Control]:
+        """Policy, object (where the task has several), command (where it has one), friction and pushes."""
+        kinds = [KINDS[index] for index in np.unique(self._shapes)]
+        return {
+            "policy": Choice(self.policies.names()),
+            **({"object": Choice((_ANY, *kinds))} if len(kinds) > 1 else {}),
+            **({"command": Slider(0.0, 1.0, 0.05, 0.5)} if hasattr(self._goal, "command") else {}),
+            "friction factor": Slider(0.1, 2.0, 0.05, 1.0),
+            "push [m/s]": Slider(0.0, 2.0, 0.1, _PUSH),
+            "push": Button(),
+        }
+
+    def reset(self, values: Values) -> Frame:
+        self._state = self._begin(values)
+        return self._frame()
+
+    def step(self, values: Values) -> Frame:
+        if self._ended >= _SHOWN:
+            return self.reset(values)
+        policy = self.policies.get(values["policy"])
+        action = jnp.zeros(self.env.action_size) if policy is None else policy(self._state.obs["actor"])
+        push = np.zeros(3, np.float32)
+        if values["push"]:
+            push = self._random.normal(size=3).astype(np.float32)
+            push *= np.float32(values["push [m/s]"] / np.linalg.norm(push))
+        command = np.float32(values.get("command", 0.0))
+        self._state = self._step(self._state, action, command, np.float32(values["friction factor"]), push, self._bare)
+        dropped = bool(self._state.terminated) or self._ended > 0
+        self._ended = self._ended + self.period if dropped else 0.0
+        return self._frame("dropped" if dropped else "")
+
+    def _begin(self, values: Values) -> State:
+        kind = values.get("object", _ANY)
+        rows = np.arange(len(self._shapes)) if kind == _ANY else np.flatnonzero(self._shapes == KINDS.index(kind))
+        self._key, key = jax.random.split(self._key)
+        state = self._reset(key, jnp.asarray(self._random.choice(rows)), self._goal)
+        object, self._ended = state.episode.object, 0.0
+        self._bare = object.friction, object.link_friction  # as drawn: the page scales them
+        return state
+
+    def _tick(
+        self, state: State, action: jax.Array, command: jax.Array, friction: jax.Array, push: jax.Array, bare: Any
+    ) -> State:
+        """A step after which the page's changes hold: what they do is seen in the next observation."""
+        tips, links = bare
+        links = None if links is None else links * friction
+        object = dataclasses.replace(state.episode.object, friction=tips * friction, link_friction=links)
+        dofs = self.env.physics.object_dof[:3]
+        physics = dataclasses.replace(state.physics, qvel=state.physics.qvel.at[dofs].add(push))
+        goal = state.goal
+        if hasattr(goal, "command"):
+            goal = dataclasses.replace(goal, command=command)
+        episode = dataclasses.replace(state.episode, object=object)
+        return self.env.step(dataclasses.replace(state, episode=episode, physics=physics, goal=goal), action)
+
+    def _frame(self, note: str = "") -> Frame:
+        return Frame(jax.device_get(self._snapshot(self._state)), self.env.primitive_kinds, note)

@@ -1,0 +1,111 @@
+"""Records simulated episodes of a policy for other programs.
+
+    python -m dexsim_ppo.record grasp --lerobot data/grasp --episodes 16
+    python -m dexsim_ppo.record rotate --rrd rotate.rrd --episodes 1
+
+A recording holds what the hand's own sensors measured, as a log of a run on a hand does; `python -m dexsim_real.replay`
+writes the same formats from such a log.
+"""
+
+import dataclasses
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import jax
+import numpy as np
+import tyro
+
+from dexsim.core import cli
+from dexsim.core.config import setting, validate
+from dexsim.core.errors import ConfigError
+from dexsim.datasets.lerobot import write_lerobot
+from dexsim.datasets.rerun import show_rerun
+from dexsim.datasets.trajectory import READINGS, Trajectory, from_readings
+from dexsim_ppo.policy import Policy, act, load_policy
+
+
+def record(policy: Policy, env: Any, *, episodes: int, seconds: float, seed: int) -> list[Trajectory]:
+    """Trajectories of the first episodes of the task's evaluation, each until it ends or `seconds` are over.
+
+    Args:
+      env: made for that many environments.
+    """
+    ticks = max(round(seconds / env.control_period), 1)
+
+    def tick(state: Any, _: Any) -> tuple[Any, Any]:
+        after = jax.vmap(env.step)(state, act(policy.params, state.obs["actor"]))
+        seen = {name: getattr(state.readings, name) for name in READINGS}
+        return after, (seen, after.joint_target, after.terminated)
+
+    starts = env.evaluation_starts(env.evaluation_plan(episodes, seed))
+    _, recorded = jax.jit(lambda state: jax.lax.scan(tick, state, None, length=ticks))(starts)
+    seen, target, ended = jax.device_get(recorded)
+    found = []
+    for i in range(episodes):
+        length = int(np.argmax(ended[:, i])) + 1 if ended[:, i].any() else ticks
+        rows = [{name: values[t, i] for name, values in seen.items()} for t in range(length)]
+        found.append(from_readings(np.arange(length) * env.control_period, rows, target[:length, i]))
+    return found
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordArguments:
+    """Options of `python -m dexsim_ppo.record`."""
+
+    policy: Annotated[str, tyro.conf.Positional]
+    """A policy file, or the name of a shipped policy, such as grasp."""
+    lerobot: Path | None = None
+    """Folder for a dataset in the LeRobot format (extra `lerobot`), which must not exist yet; None writes none."""
+    rrd: Path | None = None
+    """Recording of the first episode for the rerun viewer (extra `rerun`); None writes none."""
+    episodes: int = setting(8, unit="1", low=1, high=1024)
+    """Number of episodes."""
+    seconds: float = setting(8.0, unit="s", low=0.1, high=600.0)
+    """Longest duration of an episode."""
+    seed: int = setting(0, unit="1", low=0, high=2**32 - 2)
+    """Seed of the episodes."""
+
+    def __post_init__(self) -> None:
+        validate(self)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command. Returns its exit code, 0."""
+    arguments = cli.parse(
+        RecordArguments,
+        sys.argv[1:] if argv is None else argv,
+        prog="python -m dexsim_ppo.record",
+        description="Record simulated episodes of a policy for other programs.",
+    )
+    if arguments.lerobot is None and arguments.rrd is None:
+        raise ConfigError("give --lerobot FOLDER or --rrd FILE")
+    cli.enable_caches()
+    policy = load_policy(arguments.policy)
+    env = policy.make_env(num_envs=arguments.episodes)
+    found = record(policy, env, episodes=arguments.episodes, seconds=arguments.seconds, seed=arguments.seed)
+    if arguments.lerobot:
+        write_lerobot(arguments.lerobot, env.hand, policy.task, found)
+        print(f"LeRobot dataset: {arguments.lerobot}, {len(found)} episodes")
+    if arguments.rrd:
+        first = found[0]
+        names = {"joint_position": env.hand.joint_names, "target": env.hand.joint_names}
+        series = {
+            field.name: (
+                names.get(field.name, tuple(f"{field.name} {i}" for i in range(values.shape[1]))),
+                values,
+            )
+            for field in dataclasses.fields(first)
+            if field.name not in ("time", "taxel_force")
+            for values in [getattr(first, field.name).reshape(len(first.time), -1)]
+        }
+        series["force"] = env.hand.finger_names, first.taxel_force.sum(-1)
+        show_rerun(env.hand, first.time, series, first.taxel_force, arguments.rrd)
+        print(f"rerun recording: {arguments.rrd}")
+    return 0
+
+
+if __name__ == "__main__":
+    cli.run(main)

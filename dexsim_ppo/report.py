@@ -1,0 +1,98 @@
+"""What an evaluation reports: figures with intervals by start state, and the table that is printed of them."""
+
+from typing import Any
+
+import numpy as np
+
+from dexsim.core import statistics
+from dexsim_ppo.learner.types import Environment
+
+
+def summarize(
+    env: Environment, metrics: dict[str, np.ndarray], terminated: np.ndarray, start: np.ndarray
+) -> dict[str, Any]:
+    """Report of episodes from their metrics `[T, N]`, termination flags `[T, N]` and starts `[N]`.
+
+    An episode lives up to, and not including, its first terminated step. That step's reward belongs to
+    the return, and nothing after it counts.
+    """
+    steps, episodes = terminated.shape
+    alive = ~np.logical_or.accumulate(terminated, axis=0)
+    steps_held = alive.sum(axis=0)
+    last = np.minimum(steps_held, steps - 1)
+    returns = metrics["return"][last, np.arange(episodes)]
+    masked = {name: np.where(alive, values, 0) for name, values in metrics.items()}
+    return {
+        "episodes": episodes,
+        "steps": steps,
+        **_intervals(alive[-1], returns, steps_held, start),
+        "task": env.summarize(masked, alive),
+    }
+
+
+def summarize_totals(
+    env: Environment, metrics: dict[str, np.ndarray], lived: np.ndarray, start: np.ndarray
+) -> dict[str, Any]:
+    """Report of episodes from the metrics of their last tick [N], the ticks they lived [N] and their starts [N]."""
+    held = lived == env.evaluation_steps
+    return {
+        "episodes": int(lived.size),
+        "steps": env.evaluation_steps,
+        **_intervals(held, metrics["return"], lived, start),
+        "task": env.summarize(metrics, lived),
+    }
+
+
+def _intervals(held: np.ndarray, returns: np.ndarray, lived: np.ndarray, start: np.ndarray) -> dict[str, Any]:
+    """What every report has, of episodes [N]: how many starts they had, and the figures with intervals by start."""
+    starts = len(np.unique(start))
+    share = proportion(held) if starts == held.size else mean_interval(held.astype(float), start)
+    share |= {"low": max(share["low"], 0.0), "high": min(share["high"], 1.0)}
+    return {
+        "starts": starts,
+        "held": share,
+        "return": mean_interval(returns, start),
+        "steps_held": mean_interval(lived, start),
+    }
+
+
+def mean_interval(x: np.ndarray, start: np.ndarray) -> dict[str, float]:
+    """Mean of samples [N] with its normal 95 % interval, by start [N]: samples of one start are not independent."""
+    _, which = np.unique(start, return_inverse=True)
+    mean, starts = float(np.mean(x)), int(which.max()) + 1
+    off = np.bincount(which, np.asarray(x, float) - mean)
+    half = 1.96 * float(np.sqrt(np.sum(off**2) * starts / max(starts - 1, 1))) / x.size
+    return {"value": mean, "low": mean - half, "high": mean + half}
+
+
+def proportion(x: np.ndarray) -> dict[str, float]:
+    """Share of true samples with its Wilson 95 % interval."""
+    share = statistics.proportion(x)
+    return {"value": share["mean"], "low": share["low"], "high": share["high"]}
+
+
+def print_report(report: dict[str, Any], do_nothing: dict[str, Any] | None, *, title: str) -> None:
+    """A table of the report's headline, and beside it that of a hand that does nothing, if it was measured."""
+    from rich.console import Console
+    from rich.table import Table
+
+    idle = do_nothing and _headline(do_nothing)
+    table = Table("measure", "value", "95 % interval", *(["doing nothing"] if idle else []), title=title)
+    for name, entry in _headline(report).items():
+        low, high = entry.get("low"), entry.get("high")
+        span = "" if low is None or high is None else f"{low:.4g} .. {high:.4g}"
+        beside = [_number(idle.get(name, {}).get("value"))] if idle else []
+        table.add_row(name, _number(entry["value"]), span, *beside)
+    Console().print(table)
+    print(f"{report['episodes']} episodes of {report['steps']} steps, seed {report['seed']}, {report['seconds']:.1f} s")
+
+
+def _headline(report: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """Names of the task's headline, or else the share held, and the return: value, low and high."""
+    headline = report["task"].get("headline") or {"held": report["held"]}
+    rows = {name: entry if isinstance(entry, dict) else {"value": entry} for name, entry in headline.items()}
+    return rows | {"return": report["return"]}
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.4g}"

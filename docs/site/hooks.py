@@ -1,0 +1,117 @@
+"""Pages of the site that are made from sources: tutorials, result cards, commands, the Python reference, changelog."""
+
+import contextlib
+import importlib
+import io
+import json
+import os
+import re
+from pathlib import Path
+
+from mkdocs.plugins import event_priority
+from mkdocs.structure.files import File, Files
+
+ROOT = Path(__file__).parents[2]
+PACKAGES = ("dexsim", "dexsim_ppo", "dexsim_real")
+OUTSIDE = ("CHANGELOG.md", "CONTRIBUTING.md")
+"""Pages that lie beside docs/, for readers of the checkout."""
+
+
+def on_config(config):
+    """Every notebook is a tutorial."""
+    for entry in config.nav:
+        if isinstance(entry, dict) and "Tutorials" in entry:
+            entry["Tutorials"] = [f"notebooks/{path.name}" for path in notebooks()]
+    return config
+
+
+def notebooks() -> list[Path]:
+    """In the order of their names."""
+    return sorted((ROOT / "notebooks").glob("*.ipynb"))
+
+
+@event_priority(100)  # before the notebooks' plugin, which has to see them
+def on_files(files: Files, config) -> Files:
+    """Add the pages that lie elsewhere or are made here."""
+    made = {"results.md": results(), "reference/commands.md": commands(), "reference/python.md": python_reference()}
+    made |= {name: (ROOT / name).read_text().replace("](docs/", "](") for name in OUTSIDE}
+    for name, text in made.items():
+        files.append(File.generated(config, name, content=text))
+    for notebook in notebooks():
+        files.append(File(f"notebooks/{notebook.name}", str(ROOT), config.site_dir, config.use_directory_urls))
+    return files
+
+
+def on_page_markdown(markdown: str, page, **_) -> str:
+    """Links that leave docs/ lead to the site's copies; those to other files of the checkout become their names."""
+    up = os.path.relpath(".", Path(page.file.src_uri).parent)
+    markdown = markdown.replace("](../notebooks/", f"]({up}/notebooks/")
+    for name in OUTSIDE:
+        markdown = re.sub(rf"\]\((?:\.\./)+{re.escape(name)}", f"]({up}/{name}", markdown)
+    return re.sub(r"\[([^\]]+)\]\((?:\.\./)+(?!\w+\.md|experiments|notebooks)[^)]+\)", r"\1", markdown)
+
+
+def results() -> str:
+    """A card for each shipped policy, from the JSON beside it."""
+    cards = ["# Result cards", "", "One card for each shipped policy, made from the report that it is shipped with."]
+    for path in sorted((ROOT / "assets" / "policies").glob("*.json")):
+        report = json.loads(path.read_text())
+        trained, timing = report["trained"], report["timing"]
+        held, origin = trained["held"], report["origin"]
+        rows = {
+            "Task": report["task"],
+            "Held to the end": f"{held['value']:.1%} ({held['low']:.1%} to {held['high']:.1%})",
+            "Return": f"{trained['return']['value']:.1f}",
+            "Episodes": f"{trained['episodes']} of {trained['steps']} ticks",
+            "Training": f"{timing['training_s'] / 60:.1f} min, {origin['env_steps'] / 1e6:.0f} M steps",
+            "Steps per second": f"{timing['env_steps_per_s']:,.0f}",
+            "Seed": origin["seed"],
+            "Hardware": report["hardware"]["device"],
+            "Versions": ", ".join(
+                f"{name} {report['versions'][name]}" for name in ("jax", "mujoco") if name in report["versions"]
+            ),
+        }
+        table = [f"| {name} | {value} |" for name, value in rows.items()]
+        cards += ["", f"## {path.stem}", "", "| figure | value |", "|---|---|", *table]
+    cards += ["", "The [experiment log](experiments/README.md) says how each figure was measured, and what came later."]
+    return "\n".join(cards) + "\n"
+
+
+def commands() -> str:
+    """What each command prints for `--help-all`."""
+    from dexsim.__main__ import COMMANDS
+
+    pages = [
+        "# Commands",
+        "",
+        "`dexsim COMMAND` and `python -m MODULE` are the same. Each takes `--help` and `--help-all`.",
+    ]
+    os.environ["COLUMNS"] = "90"
+    for name, (module, purpose) in COMMANDS.items():
+        out = io.StringIO()
+        with contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):
+            importlib.import_module(module).main(["--help-all"])
+        title = purpose[0].upper() + purpose[1:]
+        pages += [
+            "",
+            f"## {name}",
+            "",
+            f"{title}: `python -m {module.removesuffix('.__main__')}`.",
+            "",
+            "```text",
+            out.getvalue().strip(),
+            "```",
+        ]
+    return "\n".join(pages) + "\n"
+
+
+def python_reference() -> str:
+    """The public names of each package, from their docstrings."""
+    lines = ["# Python", "", "The public names of the three packages."]
+    for package in PACKAGES:
+        door = importlib.import_module(package)
+        lines += ["", f"## {package}", ""]
+        for name in door.__all__:
+            home = getattr(getattr(door, name), "__module__", package)
+            lines += [f"::: {home}.{name}", ""]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,295 @@
+"""The live view: what it draws, what its controls change, and the page in a real browser."""
+
+import dataclasses
+import io
+import shutil
+import sys
+import threading
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import dexsim
+from dexsim.core.errors import ConfigError
+from dexsim.hand.kinematics import forward_kinematics, taxel_normals, taxel_positions
+from dexsim.objects.config import KINDS
+from dexsim.render.colors import FACES
+from dexsim.render.picture import Pose
+from dexsim.tasks.grasp.config import GraspConfig
+from dexsim.view.__main__ import ViewArguments, open_source
+from dexsim.view.policies import NONE, PolicyShelf
+from dexsim.view.scene import box_faces, force_arrows, primitive, quaternion
+from dexsim.view.simulation import Simulation
+from dexsim_ppo import load_policy
+
+VALUES = {"policy": "grasp", "object": "any", "command": 0.5, "friction factor": 1.0, "push [m/s]": 0.0, "push": False}
+
+
+# --- what is drawn --------------------------------------------------------------------------------------
+
+
+def test_an_arrow_ends_at_the_loaded_taxel_and_pushes_into_the_skin(hand):
+    links = forward_kinematics(hand, np.full(hand.num_joints, 0.3, np.float32))
+    pose = Pose(
+        *map(
+            np.asarray,
+            (links.body_position, links.body_rotation, taxel_positions(hand, links), taxel_normals(hand, links)),
+        )
+    )
+    force = np.zeros((5, 120))
+    force[2, 17] = 2.0
+    ((tail, head),) = force_arrows(pose, force)
+    np.testing.assert_allclose(head, pose.taxel_position[2, 17], atol=1e-7)
+    np.testing.assert_allclose((head - tail) / np.linalg.norm(head - tail), -pose.taxel_normal[2, 17], atol=1e-5)
+    force[2, 17] = 4.0
+    ((longer, _),) = force_arrows(pose, force)
+    np.testing.assert_allclose(np.linalg.norm(head - longer), 2 * np.linalg.norm(head - tail), rtol=1e-5)
+
+
+def test_every_side_of_a_box_has_its_colour():
+    found = box_faces(primitive("box", np.array([0.01, 0.02, 0.03])))
+    assert [color for color, _ in found] == list(FACES)
+    for side, (_, mesh) in enumerate(found):
+        axis, sign = divmod(side, 2)
+        np.testing.assert_allclose(mesh.vertices[:, axis], (1 - 2 * sign) * [0.01, 0.02, 0.03][axis])
+
+
+@pytest.mark.parametrize(
+    ("kind", "size", "half"),
+    [
+        ("box", (0.01, 0.02, 0.03), (0.01, 0.02, 0.03)),
+        ("capsule", (0.01, 0.02, 0), (0.01, 0.01, 0.03)),
+        ("cylinder", (0.01, 0.02, 0), (0.01, 0.01, 0.02)),
+        ("sphere", (0.01, 0, 0), (0.01, 0.01, 0.01)),
+        ("ellipsoid", (0.01, 0.02, 0.03), (0.01, 0.02, 0.03)),
+    ],
+)
+def test_primitives_have_their_size(kind, size, half):
+    np.testing.assert_allclose(primitive(kind, np.array(size)).bounds, [-np.array(half), half], rtol=0.02)
+
+
+def test_quaternions_turn_as_matrices_do():
+    angle = 0.7
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    np.testing.assert_allclose(quaternion(turn), [np.cos(0.35), 0, 0, np.sin(0.35)], atol=1e-12)
+
+
+# --- policies -------------------------------------------------------------------------------------------
+
+
+def test_policies_are_listed_where_they_fit_and_read_again_when_they_change(tmp_path):
+    grasp = load_policy("grasp")
+    env = SimpleNamespace(observation_layout={"actor": grasp.observation_layout})
+    shelf = PolicyShelf(env, "grasp", tmp_path)
+    assert shelf.names() == ("grasp", NONE) and shelf.get(NONE) is None
+    for run, policy in (("mine", grasp), ("other", load_policy("rotate"))):
+        (tmp_path / run).mkdir()
+        policy.save(tmp_path / run / "last.msgpack")
+    file = tmp_path / "mine" / "last.msgpack"
+    assert shelf.names() == ("grasp", str(file), NONE), "the policy of another observation is not offered"
+    assert shelf.get(str(file)).training == grasp.training
+    dataclasses.replace(grasp, training={"steps": 1}).save(file)
+    set_back(file, 5)
+    assert shelf.get(str(file)).training == {"steps": 1}
+    file.write_bytes(b"half a file")
+    assert shelf.get(str(file)).training == {"steps": 1}, "a damaged file keeps the last sound policy"
+
+
+def set_back(file, seconds):
+    """Another time of change, also where the clock of the file system is coarse."""
+    import os
+
+    os.utime(file, (time.time() - seconds,) * 2)
+
+
+# --- sources --------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def simulation():
+    env = dexsim.make("grasp", GraspConfig(pool_size=80), backend="c")
+    return Simulation(env, PolicyShelf(env, "grasp"), seed=3)
+
+
+def run(source, ticks, **values):
+    return [source.step(VALUES | values) for _ in range(ticks)]
+
+
+def force(frames):
+    return float(np.mean([frame.snapshot.finger_force.sum() for frame in frames]))
+
+
+def test_the_command_changes_the_force(simulation):
+    simulation.reset(VALUES | {"object": "box"})
+    gentle = force(run(simulation, 70, command=0.0)[-20:])
+    firm = force(run(simulation, 40, command=1.0)[-20:])
+    assert firm > 1.5 * gentle > 0
+
+
+def test_the_object_is_the_one_asked_for(simulation):
+    for kind in ("cylinder", "sphere"):
+        frame = simulation.reset(VALUES | {"object": kind})
+        assert KINDS[int(simulation._state.episode.object.shape_index)] == kind
+        assert "box" not in [frame.kinds[k] for k in np.flatnonzero(frame.snapshot.primitive_active)]
+
+
+def test_a_push_moves_the_object_and_friction_is_scaled_from_what_was_drawn(simulation, monkeypatch):
+    simulation.reset(VALUES)
+    # Downwards, where no finger is in the way: the push is there in full.
+    monkeypatch.setattr(simulation, "_random", SimpleNamespace(normal=lambda size: np.array([0.3, 0.0, 0.0])))
+    before, state = simulation._state.episode.object.friction, simulation._state
+    speed = []
+    for push in (False, True):
+        simulation._state = state
+        run(simulation, 1, push=push, **{"push [m/s]": 2.0, "friction factor": 0.5})
+        speed.append(np.asarray(simulation._state.physics.qvel[simulation.env.physics.object_dof[:3]]))
+    np.testing.assert_allclose(speed[1] - speed[0], [2.0, 0, 0], atol=0.1)
+    run(simulation, 2, **{"friction factor": 0.5})
+    assert float(simulation._state.episode.object.friction) == pytest.approx(0.5 * float(before), rel=1e-5)
+
+
+def test_a_dropped_object_is_seen_and_then_replaced(simulation):
+    simulation.reset(VALUES)
+    frames = run(simulation, 120, policy=NONE, **{"push [m/s]": 2.0, "push": True})
+    notes = [frame.note for frame in frames]
+    first = notes.index("dropped")
+    seconds = [float(frame.snapshot.seconds) for frame in frames]
+    assert 20 < len([note for note in notes[first : first + 40] if note]) < 40
+    assert min(seconds[first + 20 : first + 45]) < 0.1, "a new episode begins"
+
+
+def test_the_emulated_hand_is_a_source(hand, monkeypatch):
+    # The flags that other tests compile with stay as they are.
+    monkeypatch.setattr("dexsim_real.control.controller.prepare_jax", lambda: None)
+    source = open_source(ViewArguments(what="rotate", emulated=True))
+    assert source.controls() == {}
+    frames = [source.reset({}), *(source.step({}) for _ in range(30))]
+    snapshot = frames[-1].snapshot
+    assert frames[0].kinds == ("box",) and frames[-1].note == "trial 0" and snapshot.turns >= 0
+    assert np.linalg.norm(snapshot.object_position - [0.047, 0.024, 0.088]) < 0.05
+    moved = np.ptp([frame.snapshot.joint_position for frame in frames], 0)
+    assert moved.max() > 0.1 and np.all(snapshot.joint_position > hand.joint_lower - 0.1)
+    assert source.reset({}).note == "trial 1"
+
+
+def test_a_log_is_a_source(tmp_path, monkeypatch):
+    pytest.importorskip("serial")
+    monkeypatch.setattr("dexsim_real.run.__main__.prepare_jax", lambda: None)
+    from following_hand import FollowingHand, arguments, records
+
+    from dexsim_real.core.log import Kind
+    from dexsim_real.run import __main__ as runner
+
+    with FollowingHand() as peer:
+        assert runner.main(arguments(peer, tmp_path, "--seconds", "0.6")) == 0
+    ticks = records(tmp_path, Kind.TICK)
+    source = open_source(ViewArguments(what=str(tmp_path / "run.log")))
+    frames = [source.reset({"go to [s]": 0.0}), *(source.step({"go to [s]": 0.0}) for _ in ticks[1:])]
+    for frame, tick in zip(frames, ticks, strict=True):
+        np.testing.assert_array_equal(frame.snapshot.joint_position, tick["readings"]["joint_position"])
+    assert frames[0].kinds == () and source.controls()["go to [s]"].high == pytest.approx(0.6, abs=0.2)
+    late = source.reset({"go to [s]": 0.3}).snapshot
+    assert float(late.seconds) == pytest.approx(0.3, abs=0.1)
+
+
+def test_what_is_nothing_is_refused_in_one_line():
+    with pytest.raises(ConfigError, match="^no_such_thing: no policy file, no shipped policy, and unknown task"):
+        open_source(ViewArguments(what="no_such_thing"))
+
+
+def test_without_viser_the_extra_is_named(simulation, monkeypatch):
+    from dexsim.core.errors import DexsimError
+    from dexsim.view.viewer import Viewer
+
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(DexsimError, match=r"pip install -e '\.\[view\]'"):
+        Viewer(simulation, title="test")
+
+
+# --- the page -------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def page(simulation):
+    """The page in a headless Chromium, its viewer running beside it."""
+    chromium = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    if chromium is None:
+        pytest.skip("no Chromium on this machine (apt-get install chromium)")
+    pytest.importorskip("viser")
+    sync_playwright = pytest.importorskip("playwright.sync_api").sync_playwright
+    from dexsim.view.viewer import Viewer
+
+    viewer, stop = Viewer(simulation, title="test", port=18080), threading.Event()
+    running = threading.Thread(target=viewer.run, args=(stop.is_set,), daemon=True)
+    running.start()
+    with sync_playwright() as playwright:
+        software = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+        browser = playwright.chromium.launch(executable_path=chromium, args=software)
+        opened = browser.new_page(viewport={"width": 900, "height": 600})
+        opened.goto(viewer.url)
+        opened.wait_for_selector("canvas")
+        opened.viewer = viewer
+        yield opened
+        browser.close()
+    stop.set()
+    running.join(10)
+    assert not running.is_alive()
+
+
+def wait_until(condition, seconds=25.0):
+    end = time.monotonic() + seconds
+    while not (met := condition()) and time.monotonic() < end:
+        time.sleep(0.2)
+    return met
+
+
+def total(page):
+    """The force that the page shows, N."""
+    found = page.locator("text=/total: /").first.inner_text().split("total: ")[1]
+    return float(found.split()[0])
+
+
+def test_the_page_shows_the_hand(page):
+    from PIL import Image
+
+    def colors():
+        picture = np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB"))[100:, :450]
+        return len(np.unique(picture.reshape(-1, 3), axis=0))
+
+    assert wait_until(lambda: colors() > 200), "the canvas stays empty"
+
+
+def test_a_slider_changes_the_force(page):
+    command = page.get_by_role("slider").first
+
+    def slide(key, wanted):
+        command.focus()
+        page.keyboard.press(key)
+        assert wait_until(lambda: page.viewer.values()["command"] == wanted)
+
+    def mean(seconds):
+        end, samples = time.monotonic() + seconds, []
+        while time.monotonic() < end:
+            samples.append(total(page))
+            time.sleep(0.2)
+        return np.mean(samples)
+
+    slide("Home", 0.0)
+    time.sleep(1.0)
+    gentle = mean(2.0)
+    slide("End", 1.0)
+    assert wait_until(lambda: mean(1.0) > 1.3 * gentle), "the force stays what it was"
+
+
+def test_pause_and_step(page):
+    page.viewer.paused.value = True
+    time.sleep(0.5)
+    at = float(page.viewer.source._state.length)
+    time.sleep(0.5)
+    assert float(page.viewer.source._state.length) == at
+    page.get_by_role("button", name="step").click()
+    assert wait_until(lambda: float(page.viewer.source._state.length) == at + 1)
+    page.get_by_role("button", name="reset").click()
+    assert wait_until(lambda: float(page.viewer.source._state.length) == 0)

@@ -1,0 +1,138 @@
+"""Exported policies act as the policy does, without JAX, and the bridge takes them."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from paths import ROOT
+
+from dexsim import load_hand
+from dexsim.core.errors import CheckpointError, ConfigError
+from dexsim_ppo import export, load_policy
+from dexsim_ppo.portable import PortablePolicy
+
+NAMES = ("grasp", "rotate", "rotate_without_orientation")
+
+
+def observations(policy, count=1000, seed=0):
+    """Around the mean of training, and now and then far beyond the clip."""
+    rng, normalizer = np.random.default_rng(seed), policy.params.normalizer
+    spread = np.where(rng.random((count, 1)) < 0.1, 30.0, 1.0)
+    noise = spread * rng.standard_normal((count, len(normalizer.mean)))
+    return (np.asarray(normalizer.mean) + np.asarray(normalizer.std) * noise).astype(np.float32)
+
+
+@pytest.fixture(scope="module", params=[".npz", ".onnx"])
+def suffix(request):
+    if request.param == ".onnx":
+        pytest.importorskip("onnx")
+        pytest.importorskip("onnxruntime")
+    return request.param
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_actions_agree_on_a_thousand_observations(name, suffix, tmp_path):
+    path = tmp_path / f"{name}{suffix}"
+    assert export.main([name, "--output", str(path)]) == 0
+    policy, exported = load_policy(name), export.load_exported(path)
+    seen = observations(policy)
+    wanted = np.asarray(policy(seen))
+    assert np.abs(exported(seen) - wanted).max() < 1e-5
+    assert 0.1 < wanted.std() and wanted.min() < -0.9 and wanted.max() > 0.9, "the observations try the policy"
+    np.testing.assert_allclose(exported(seen[3]), wanted[3], atol=1e-5)  # one alone
+    assert exported.task == policy.task and exported.spec == policy.spec
+    assert exported.observation_layout == policy.observation_layout and exported.control_rate == policy.control_rate
+
+
+def test_a_squashing_policy_is_exported_as_such(suffix, tmp_path):
+    import dataclasses
+
+    policy = load_policy("grasp")
+    policy = dataclasses.replace(policy, params=dataclasses.replace(policy.params, squash="tanh"))
+    path = tmp_path / f"policy{suffix}"
+    {".npz": export.to_numpy, ".onnx": export.to_onnx}[suffix](policy, path)
+    seen = observations(policy)
+    np.testing.assert_allclose(export.load_exported(path)(seen), policy(seen), atol=1e-5)
+
+
+def test_it_runs_where_there_is_neither_jax_nor_the_rest_of_the_library(tmp_path):
+    policy = load_policy("grasp")
+    export.to_numpy(policy, tmp_path / "grasp.npz")
+    seen = observations(policy)
+    np.save(tmp_path / "seen.npy", seen)
+    (tmp_path / "portable.py").write_text((ROOT / "dexsim_ppo" / "portable.py").read_text())
+    code = """
+import sys
+for name in ("jax", "jaxlib", "mujoco", "scipy", "msgpack", "dexsim", "dexsim_ppo"):
+    sys.modules[name] = None
+import numpy as np
+from portable import PortablePolicy
+np.save("action.npy", PortablePolicy.load("grasp.npz")(np.load("seen.npy")))
+"""
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert np.abs(np.load(tmp_path / "action.npy") - np.asarray(policy(seen))).max() < 1e-5
+
+
+def test_the_bridge_chooses_the_same_targets(suffix, tmp_path):
+    from dexsim_real.control.controller import IDENTITY, Controller
+    from dexsim_real.sensors.hand import HandMeasurement
+    from dexsim_real.sensors.readings import ObjectEstimate
+
+    path, hand = tmp_path / f"grasp{suffix}", load_hand()
+    export.main(["grasp", "--output", str(path)])
+    controllers = [Controller(policy, hand) for policy in (load_policy("grasp"), export.load_exported(path))]
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        joints = rng.uniform(0, 1, 12).astype(np.float32)
+        touch = (rng.random((5, 120)) * (rng.random((5, 120)) < 0.1)).astype(np.float32)
+        rest = np.zeros(1)
+        measured = HandMeasurement(joints, 0.1 * joints, touch, joints, rest, rest, rest)
+        seen = ObjectEstimate(np.array([0.05, 0.0, 0.09]), np.zeros(3), IDENTITY)
+        ticks = [controller.tick(measured, seen, IDENTITY, 0.5) for controller in controllers]
+        np.testing.assert_allclose(ticks[0].target, ticks[1].target, atol=1e-5)
+        assert np.abs(ticks[0].action).max() > 0.01
+
+
+def test_a_run_takes_an_exported_policy(tmp_path, monkeypatch):
+    pytest.importorskip("serial")
+    from following_hand import FollowingHand, arguments, summary
+
+    from dexsim_real.run import __main__ as run
+
+    monkeypatch.setattr("dexsim_real.run.__main__.prepare_jax", lambda: None)
+    export.main(["grasp", "--output", str(tmp_path / "grasp.npz")])
+    with FollowingHand() as peer:
+        _, *others = arguments(peer, tmp_path, "--seconds", "0.5")
+        assert run.main([str(tmp_path / "grasp.npz"), *others]) == 0
+    assert summary(tmp_path)["end"] == "time is over"
+
+
+def test_what_is_unsound_is_refused_in_one_line(tmp_path):
+    export.to_numpy(load_policy("grasp"), tmp_path / "good.npz")
+    with np.load(tmp_path / "good.npz") as file:
+        good = dict(file)
+    header = json.loads(str(good["header"]))
+    for name, change in {
+        "another format": {"header": np.array(json.dumps(header | {"format": "other"}))},
+        "a layer that does not fit": {"kernel_1": np.zeros((3, 3), np.float32)},
+        "not finite": {"bias_0": np.full_like(good["bias_0"], np.nan)},
+        "another layout": {"header": np.array(json.dumps(header | {"observation_layout": [["a", 3, None]]}))},
+    }.items():
+        path = tmp_path / f"{name}.npz"
+        np.savez(path, **(good | change))
+        with pytest.raises(CheckpointError, match="is not a policy of this format") as error:
+            export.load_exported(path)
+        assert "\n" not in str(error.value)
+    (tmp_path / "text.npz").write_text("no archive")
+    with pytest.raises(CheckpointError, match=r"text\.npz"):
+        export.load_exported(tmp_path / "text.npz")
+    with pytest.raises(CheckpointError, match="No such file"):
+        export.load_exported(tmp_path / "missing.npz")
+    np.savez(tmp_path / "pickle.npz", header=np.array([{"a": 1}], object))
+    with pytest.raises(ValueError, match="is not a policy"):
+        PortablePolicy.load(tmp_path / "pickle.npz")
+    with pytest.raises(ConfigError, match=r"ends in \.npz or \.onnx"):
+        export.main(["grasp", "--output", str(tmp_path / "grasp.tflite")])

@@ -1,0 +1,45 @@
+"""Recorded episodes: readings and the targets that followed, to the end of each."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+import dexsim
+from dexsim.core.errors import ConfigError
+from dexsim.tasks.grasp.config import GraspConfig
+from dexsim_ppo import load_policy, record
+
+
+@pytest.fixture(scope="module")
+def env():
+    return dexsim.make("grasp", GraspConfig(pool_size=80), backend="c", num_envs=3)
+
+
+def test_readings_and_targets_are_those_of_the_episodes(env):
+    policy = load_policy("grasp")
+    found = record.record(policy, env, episodes=3, seconds=0.3, seed=0)
+    assert [len(one.time) for one in found] == [10, 10, 10]
+    state = env.evaluation_starts(env.evaluation_plan(3, 0))
+    step = jax.jit(jax.vmap(env.step))
+    for tick in range(10):
+        for i, one in enumerate(found):
+            for name in ("joint_position", "taxel_force", "command"):
+                wanted = np.asarray(getattr(state.readings, name))[i]
+                np.testing.assert_allclose(getattr(one, name)[tick], wanted, atol=2e-3)
+        state = step(state, policy(state.obs["actor"]))
+        np.testing.assert_allclose([one.target[tick] for one in found], state.joint_target, atol=2e-3)
+
+
+def test_an_episode_ends_with_its_drop(env):
+    policy = load_policy("grasp")
+    still = jax.tree.map(np.zeros_like, policy.params.layers)
+    idle = dataclasses.replace(policy, params=dataclasses.replace(policy.params, layers=still))
+    lengths = [len(one.time) for one in record.record(idle, env, episodes=3, seconds=4.0, seed=0)]
+    assert max(lengths) < round(4.0 / env.control_period), "a hand that does nothing drops the object"
+
+
+def test_it_must_be_told_what_to_write():
+    with pytest.raises(ConfigError, match="--lerobot FOLDER or --rrd FILE"):
+        record.main(["grasp"])

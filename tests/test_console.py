@@ -1,0 +1,59 @@
+"""The console command `dexsim`: every command under its word, and errors that name the page that helps."""
+
+import importlib
+from pathlib import Path
+
+import pytest
+from paths import ROOT
+
+from dexsim import __main__ as console
+from dexsim.core import cli, errors
+from dexsim.core.errors import ConfigError
+from dexsim_real.core.errors import HandError
+
+
+@pytest.mark.parametrize("name", console.COMMANDS)
+def test_a_word_runs_the_module_with_the_rest_of_the_line(name, monkeypatch):
+    module = importlib.import_module(console.COMMANDS[name][0])
+    given = []
+    monkeypatch.setattr(module, "main", lambda argv: given.append(argv) or 7)
+    assert console.main([name, "--seed", "1"]) == 7 and given == [["--seed", "1"]]
+
+
+def test_every_command_of_the_modules_has_a_word():
+    modules = {module for module, _ in console.COMMANDS.values()}
+    folders = [ROOT / package for package in ("dexsim", "dexsim_ppo", "dexsim_real")]
+    found = {
+        ".".join(path.relative_to(ROOT).with_suffix("").parts)
+        for folder in folders
+        for path in folder.rglob("*.py")
+        if "cli.run(main)" in path.read_text()
+    }
+    assert found - {"dexsim.__main__"} == modules
+
+
+def test_help_lists_the_commands_and_a_typo_is_named(capsys):
+    assert console.main([]) == 0
+    shown = capsys.readouterr().out
+    assert all(f"  {name} " in shown for name in console.COMMANDS) and max(map(len, shown.splitlines())) <= 80
+    with pytest.raises(ConfigError, match=r"^evalute: no such command \(perhaps evaluate\)"):
+        console.main(["evalute"])
+
+
+@pytest.mark.parametrize(
+    "error", [errors.AssetError, errors.CheckpointError, errors.CalibrationError, HandError, errors.ConfigError]
+)
+def test_an_error_names_the_page_that_helps(error, capsys):
+    def fails(argv):
+        raise error("something is wrong")
+
+    with pytest.raises(SystemExit) as stop:
+        cli.run(fails)
+    text = capsys.readouterr().err
+    assert stop.value.code == 2 and text.startswith("error: something is wrong") and text.count("\n") == 1
+    assert (error.page in text) if error.page else text == "error: something is wrong\n"
+    page, _, anchor = error.page.partition("#")
+    headings = (
+        [line.strip("# ").lower().replace(" ", "-") for line in (ROOT / page).read_text().splitlines()] if page else []
+    )
+    assert not page or Path(ROOT / page).exists() and (not anchor or anchor in headings)
