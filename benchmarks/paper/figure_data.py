@@ -24,18 +24,10 @@ def calibration(row: Row, seed: int, budget: Budget, work: Path) -> dict[str, An
     from dexsim_real.calibrate.report import report
     from dexsim_real.twin.press import PressBench, VirtualPort
 
-    class Bench(PressBench):
-        """Keeps the direction of the foam, which the base class overwrites with the forces of the fingertips."""
-
-        def _contacts(self) -> None:
-            normal = self._normal
-            super()._contacts()
-            self._normal = normal
-
     work.mkdir(parents=True, exist_ok=True)
     hand, log = load_hand(), work / "press.log"
     log.unlink(missing_ok=True)
-    plant = Bench(hand, seed, kind="inside")
+    plant = PressBench(hand, seed, kind="inside")
     port = VirtualPort(plant)
     arguments = CalibrateArguments(
         port="virtual",

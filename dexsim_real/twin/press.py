@@ -81,7 +81,7 @@ class PressBench(EmulatedHand):
 
     def gauge(self) -> float:
         """Force N of the pen on the foam along its normal, as a perfect scale under it shows."""
-        return max(float(-self._spring @ self._normal), 0.0)
+        return max(float(-self._spring @ self._facing), 0.0)
 
     def results(self) -> list[dict[str, Any]]:
         """True values of the hand (`truth`)."""
@@ -123,7 +123,7 @@ class PressBench(EmulatedHand):
         scene, data, foam = self._scene, self._data, self._foam
         at, dof, mass = scene.object_qpos, scene.object_dof, float(self.parameters.mass)
         shift, speed = data.qpos[at : at + 3] - self._place.position, data.qvel[dof : dof + 3]
-        along = np.outer(self._normal, self._normal)
+        along = np.outer(self._facing, self._facing)
         across = np.eye(3) - along
         force = -(foam.stiffness * along + foam.shear * across) @ shift
         force -= 2 * _RATIO * (np.sqrt(foam.stiffness * mass) * along + np.sqrt(foam.shear * mass) * across) @ speed
@@ -172,20 +172,20 @@ class PressBench(EmulatedHand):
         taxels = list(placement.taxels)
         point = probe.xpos[body] + frame @ self.hand.taxel_position[finger, taxels].mean(0)
         normal = frame @ self.hand.taxel_normal[finger, taxels].mean(0)
-        self._normal = normal / np.linalg.norm(normal)
+        self._facing = normal / np.linalg.norm(normal)
         along = frame @ (self.hand.taxel_position[finger, 11] - self.hand.taxel_position[finger, 0])
-        quat = _facing(self._normal, along)
+        quat = _facing(self._facing, along)
         far = 0.03
-        put(self._scene, probe, point + (_RADIUS + far) * self._normal, quat)
+        put(self._scene, probe, point + (_RADIUS + far) * self._facing, quat)
         mujoco.mj_kinematics(model, probe)
         pen = model.geom("object_0").id
         touching = np.union1d(model.pair_geom1, model.pair_geom2)
         tips = touching[self._scene.finger_of_geom[touching] == finger]
         gap = min(mujoco.mj_geomDistance(model, probe, int(tip), pen, 0.1, None) for tip in tips)
-        self._put(point + (_RADIUS + far - gap + self._foam.gap) * self._normal, quat)
+        self._put(point + (_RADIUS + far - gap + self._foam.gap) * self._facing, quat)
 
     def _remove(self) -> None:
-        self._pressing_placement, self._normal = None, np.array([0.0, 0.0, 1.0])
+        self._pressing_placement, self._facing = None, np.array([0.0, 0.0, 1.0])
         self._put(_AWAY, np.array([1.0, 0.0, 0.0, 0.0]))
 
     def _put(self, position: np.ndarray, quat: np.ndarray) -> None:

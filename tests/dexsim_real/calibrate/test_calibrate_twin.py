@@ -25,7 +25,7 @@ def test_the_emulated_hand_gives_its_torque_constants_back(hand, tmp_path, seed)
     from dexsim_real.twin.press import PressBench, VirtualPort
 
     plant = PressBench(hand, seed)
-    bench, press_bench.GAUGE = VirtualPort(plant), lambda: float(max(-plant._spring @ plant._normal, 0.0))
+    bench, press_bench.GAUGE = VirtualPort(plant), plant.gauge
     options = arguments(tmp_path, fingers=("middle",), press=PressConfig(), gauge="press_bench:read_gauge")
     fit_and_report(options, hand, [record(bench, hand, options)], operator())
     found, truth = -torque_constants(load_calibration(options.output, hand)), plant.truth()
