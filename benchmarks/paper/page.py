@@ -14,8 +14,9 @@ Made from the reports in `docs/results` by `python benchmarks/paper.py page`. Th
 anew: `--list` shows what is done, `--budget gpu` trains longer and measures more, `--output docs/results` writes here.
 
 The paper's numbers are from its real hand. No policy of ours has run on one yet: the emulated hand is another simulator
-behind the bridge's own frames, with every parameter outside training's ranges. Numbers in brackets: of one seed the
-95 % interval over episodes or trials, of several the lowest and highest seed.
+behind the bridge's own frames, with parameters outside training's ranges or of its own. Numbers in brackets: of one
+seed the 95 % interval over episodes or trials, of several the lowest and highest seed. Every table names the commit that
+it was measured at; those before d521ffc had narrower ranges of rubber and friction.
 """
 
 
