@@ -15,8 +15,8 @@ anew: `--list` shows what is done, `--budget gpu` trains longer and measures mor
 
 The paper's numbers are from its real hand. No policy of ours has run on one yet: the emulated hand is another simulator
 behind the bridge's own frames, with parameters outside training's ranges or of its own. Numbers in brackets: of one
-seed the 95 % interval over episodes or trials, of several the lowest and highest seed. Every table names the commit that
-it was measured at; those before d521ffc had narrower ranges of rubber and friction.
+seed the 95 % interval over episodes or trials, of several the lowest and highest seed. Every table names the commit
+that it was measured at; those before d521ffc had narrower ranges of rubber and friction.
 """
 
 
