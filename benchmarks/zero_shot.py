@@ -135,7 +135,8 @@ def grasp_metrics(reports: list[dict[str, Any]], span: tuple[float, float]) -> d
     from dexsim.tasks.grasp.report import FORCES, correlations, force_error, pearson, saturates, slope
 
     held = np.array([r["held"] for r in reports])
-    names = (*FORCES.values(), "total_force", "total_torque", "torque_limited")
+    torque = ("total_torque",) if all("total_torque" in r for r in reports) else ()  # not with processes of their own
+    names = (*FORCES.values(), "total_force", *torque, "torque_limited")
     command, *columns = (np.array([r[name] for r in reports], float) for name in ("command", *names))
     mean_of = dict(zip(names, columns, strict=True))
     # A referee's means end with the trial; a lost object is not pressed for the rest of the window.
@@ -156,9 +157,9 @@ def grasp_metrics(reports: list[dict[str, Any]], span: tuple[float, float]) -> d
         "held": proportion(held),
         "force_error_n": force_error(np.where(held, 1.0, lived) * mean_of["finger_force"], wanted),
         **correlations(command, held, mean_of),
-        "r_torque": pearson(command[held], mean_of["total_torque"][held]),
+        **({"r_torque": pearson(command[held], mean_of["total_torque"][held])} if torque else {}),
         "slope_force_n": slope(command[held], mean_of["finger_force"][held]),
-        "slope_torque": slope(command[held], mean_of["total_torque"][held]),
+        **({"slope_torque": slope(command[held], mean_of["total_torque"][held])} if torque else {}),
         "torque_limited": mean(mean_of["torque_limited"][held]),
         "window_s": [float(start.min()), float(end.max())],
         "by_command": by_command,

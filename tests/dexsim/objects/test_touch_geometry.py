@@ -59,13 +59,15 @@ def gripped(objects):
 def closed_forms(env, state):
     """Taxel forces [WORLDS, F, N] of the primitives, and contact centres [WORLDS, F, 3], from the state alone."""
 
-    def one(physics, target, finger_force):
+    def one(physics, target, finger_force, cover):
         place = physics.qpos[12:]
         pose = forward_kinematics(env.hand, physics.qpos[:12])
         turn = rotations.quat_to_matrix(place[3:] / jnp.linalg.norm(place[3:]))
-        return feel_links(env.hand, pose, target.shape(), place[:3], turn, finger_force, SKIN).force, pose
+        touch = feel_links(env.hand, pose, target.shape(), place[:3], turn, finger_force, SKIN, cover=cover)
+        return touch.force, pose
 
-    return jax.jit(jax.vmap(one))(state.physics, state.episode.object, state.finger_force)
+    episode = state.episode
+    return jax.jit(jax.vmap(one))(state.physics, episode.object, state.finger_force, episode.hand.cover)
 
 
 def compare(env, states, kinds):

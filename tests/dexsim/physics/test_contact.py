@@ -14,7 +14,6 @@ from dexsim.physics.config import PhysicsConfig
 from dexsim.physics.model import build_model
 from dexsim.physics.physics import Physics
 from dexsim.tasks.grasp.config import GraspConfig
-from dexsim.tasks.grasp.start import make_pool
 from dexsim.tasks.grasp.task import Grasp
 from dexsim.touch.skin import Skin
 
@@ -148,7 +147,7 @@ def test_springs_follow_the_skin(hand):
     seam = Physics(
         hand, SLOTS, ObjectConfig().largest, PhysicsConfig(), gravity=c_scene.GRAVITY, backend="jax", skin=Skin()
     )
-    pool = make_pool(jax.random.key(3), hand, GraspConfig(pool_size=3 * len(SHAPES)), Grasp.reference)
+    pool = Grasp(GraspConfig(pool_size=3 * len(SHAPES)), hand).make_pool(jax.random.key(3))
 
     @jax.jit
     def configure(target, qpos):

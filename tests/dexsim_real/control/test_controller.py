@@ -54,7 +54,7 @@ class FakePhysics:
         self.object_qpos, self.object_dof = np.arange(12, 19), np.arange(12, 18)
         self.mj_model = SimpleNamespace(nv=18, dof_M0=np.ones(18), opt=SimpleNamespace(timestep=config.timestep))
 
-    def advance_motors(self, object, state, motors, memory, push):
+    def advance_motors(self, object, state, motors, memory, push, cover):
         joints, velocity = state.qpos[:12], state.qvel[:12]
         torque, memory = motors(jnp.asarray(5), joints, velocity, memory)
         velocity = torque * 2.0
