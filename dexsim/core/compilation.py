@@ -1,8 +1,9 @@
-"""Compilation options for large programs."""
+"""Compilation options for large programs, and the cores that they may use."""
 
 import contextlib
 import functools
 import gc
+import os
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -10,6 +11,11 @@ import jax
 
 # LLVM optimises less, and XLA's older emitters produce less code per fusion: faster to compile, as fast to run.
 LIGHT = (("xla_backend_optimization_level", 1), ("xla_cpu_use_fusion_emitters", False))
+
+
+def available_cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def jit(function: Callable, *, backend: str = "jax", once: bool = False, **options: Any) -> Any:

@@ -1,10 +1,10 @@
 """Training defaults per device: sizes and durations."""
 
-import os
 from dataclasses import dataclass, replace
 
 import jax
 
+from dexsim.core.compilation import available_cores
 from dexsim_ppo.learner.config import PPOConfig
 
 
@@ -29,42 +29,33 @@ class Preset:
     """Share of training episodes whose hand or object takes the extreme of every range."""
 
 
-PRESETS = {
-    # Two cores: simulation takes nearly all of the time, so small networks and many passes over little data.
-    "cpu": Preset(
-        ppo=PPOConfig(
-            num_envs=256,
-            rollout_length=16,
-            epochs=5,
-            minibatches=4,
-            kl_target=0.02,
-            actor_layers=(128, 128),
-            critic_layers=(128, 128),
-        ),
-        steps=0,
-        minutes=7.0,
-        evaluate_every=0,
-        evaluation_chunk=50,
-        evaluation_episodes=150,
-        log_every=5,
+# Two cores: simulation takes nearly all of the time, so small networks and many passes over little data.
+_CPU = Preset(
+    ppo=PPOConfig(
+        num_envs=256,
+        rollout_length=16,
+        epochs=5,
+        minibatches=4,
+        kl_target=0.02,
+        actor_layers=(128, 128),
+        critic_layers=(128, 128),
     ),
-    # 16 cores and more: enough environments for all of them. Sized by a cost model, tried on 12 cores.
-    "cpu-large": Preset(
-        ppo=PPOConfig(
-            num_envs=1024,
-            rollout_length=16,
-            epochs=4,
-            minibatches=16,
-            kl_target=0.02,
-            actor_layers=(128, 128),
-            critic_layers=(128, 128),
-        ),
-        steps=0,
+    steps=0,
+    minutes=7.0,
+    evaluate_every=0,
+    evaluation_chunk=50,
+    evaluation_episodes=150,
+    log_every=5,
+)
+PRESETS = {
+    "cpu": _CPU,
+    # 16 cores and more: enough environments for all of them. Sized from trainings of rotate on 2 to 12 cores.
+    "cpu-large": replace(
+        _CPU,
+        ppo=replace(_CPU.ppo, num_envs=1024, epochs=4, minibatches=16),
         minutes=5.0,
-        evaluate_every=0,
         evaluation_chunk=250,
         evaluation_episodes=500,
-        log_every=5,
     ),
     # One large GPU: enough environments to fill it, and few large minibatches.
     "gpu": Preset(
@@ -111,5 +102,4 @@ def device_preset() -> str:
     """The name of the preset for the device found, and on a CPU for the number of cores that this process may use."""
     if jax.default_backend() == "gpu":
         return "gpu"
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return "cpu-large" if cores >= 16 else "cpu"
+    return "cpu-large" if available_cores() >= 16 else "cpu"

@@ -46,7 +46,7 @@ class Run:
     def _evaluation_env(self) -> Environment:
         """The training environment, or one of its own: Warp sizes buffers by the batch, and training has extremes and
         no force loop."""
-        if self.env.backend != "warp" and training_config(self.arguments) == self.arguments.env:
+        if self.env.backend != "warp" and training_config(self.arguments) is self.arguments.env:
             return self.env
         import dexsim
 

@@ -18,6 +18,7 @@ import mujoco
 import numpy as np
 from mujoco.rollout import Rollout
 
+from dexsim.core.compilation import available_cores
 from dexsim.physics.host.law import read_law
 from dexsim.physics.parameters import places
 from dexsim.physics.seam import PhysicsScene
@@ -33,7 +34,7 @@ class _Pool:
 
     def __init__(self):
         self.lock, self.process = threading.Lock(), os.getpid()
-        self.threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        self.threads = available_cores()
         self.rollout = Rollout(nthread=self.threads if self.threads > 1 else 0).rollout_
 
 
