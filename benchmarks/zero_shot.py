@@ -121,7 +121,7 @@ def _shown(report: dict[str, Any], show: bool) -> dict[str, Any]:
 # --- metrics -------------------------------------------------------------------------------------
 
 
-def grasp_metrics(reports: list[dict[str, Any]], span: tuple[float, float]) -> dict[str, Any]:
+def grasp_metrics(reports: list[dict[str, Any]], span: tuple[float, float], force_command: str) -> dict[str, Any]:
     """Success rate, force error over all trials, and correlation of the forces of held objects with the command.
 
     Names, window and forces are those of the evaluation in simulation (`dexsim.tasks.grasp.report`); torques are as the
@@ -129,16 +129,19 @@ def grasp_metrics(reports: list[dict[str, Any]], span: tuple[float, float]) -> d
 
     Args:
       reports: the referee's, of trials.
-      span: N, target force per touching finger at command 0 and 1.
+      span: N, target at command 0 and 1.
+      force_command: of what, see `dexsim.force_loop.FORCE_COMMANDS`.
     """
     from dexsim.core.statistics import mean, proportion
     from dexsim.tasks.grasp.report import FORCES, correlations, force_error, pearson, saturates, slope
 
     held = np.array([r["held"] for r in reports])
     torque = ("total_torque",) if all("total_torque" in r for r in reports) else ()  # not with processes of their own
-    names = (*FORCES.values(), "total_force", *torque, "torque_limited")
+    forces = {part: f"{force_command}_{part}" for part in FORCES.values()}
+    names = (*forces.values(), "total_force", *torque, "torque_limited")
     command, *columns = (np.array([r[name] for r in reports], float) for name in ("command", *names))
     mean_of = dict(zip(names, columns, strict=True))
+    commanded = {part: mean_of[name] for part, name in forces.items()}
     # A referee's means end with the trial; a lost object is not pressed for the rest of the window.
     start, end = np.array([r["window_s"] for r in reports], float).T
     lived = np.clip((np.array([r["seconds"] for r in reports], float) - start) / (end - start), 0.0, 1.0)
@@ -155,10 +158,11 @@ def grasp_metrics(reports: list[dict[str, Any]], span: tuple[float, float]) -> d
     ]
     return {
         "held": proportion(held),
-        "force_error_n": force_error(np.where(held, 1.0, lived) * mean_of["finger_force"], wanted),
-        **correlations(command, held, mean_of),
+        "force_error_n": force_error(np.where(held, 1.0, lived) * commanded["force"], wanted),
+        "force_command": force_command,
+        **correlations(command, held, commanded),
         **({"r_torque": pearson(command[held], mean_of["total_torque"][held])} if torque else {}),
-        "slope_force_n": slope(command[held], mean_of["finger_force"][held]),
+        "slope_force_n": slope(command[held], commanded["force"][held]),
         **({"slope_torque": slope(command[held], mean_of["total_torque"][held])} if torque else {}),
         "torque_limited": mean(mean_of["torque_limited"][held]),
         "window_s": [float(start.min()), float(end.max())],
@@ -193,7 +197,8 @@ def metrics(task: str, policy: str, reports: list[dict[str, Any]]) -> dict[str, 
         return rotate_metrics(reports)
     from dexsim_ppo.policy import load_policy
 
-    return grasp_metrics(reports, tuple(load_policy(policy).env_config["finger_force"]))
+    config = load_policy(policy).env_config
+    return grasp_metrics(reports, tuple(config["finger_force"]), config.get("force_command", "finger"))
 
 
 def simulated(task: str, policy: str) -> dict[str, Any]:
@@ -245,17 +250,18 @@ def table(here: dict[str, Any], there: dict[str, Any], idle: dict[str, Any]) -> 
     def at(metrics: dict[str, Any], command: float) -> dict[str, Any]:
         return next((row for row in metrics.get("by_command", []) if row["command"] == command), {})
 
+    force = f"{here.get('force_command')}_force"
     names = [name for name in here if isinstance(here[name], dict)]
     rows = [(name.replace("_", " "), cell(here[name]), cell(there.get(name)), cell(idle.get(name))) for name in names]
     for entry in here.get("by_command", []):
         other, still = (at(metrics, entry["command"]) for metrics in (there, idle))
         for name, shown, name_there in (
             ("held", "held", "held"),
-            ("finger_force", "finger force (N)", "finger_force_n"),
+            (force, f"{force.replace('_', ' ')} (N)", f"{force}_n"),
             ("torque_limited", "ticks with a joint at its torque limit", "torque_limited"),
         ):
             cells = cell(entry[name]), cell(other.get(name_there)), cell(still.get(name))
-            mark = " (saturates)" if name == "finger_force" and entry["saturates"] else ""
+            mark = " (saturates)" if name == force and entry["saturates"] else ""
             rows.append((f"command {entry['command']:g}: {shown}{mark}", *cells))
     rows += [(f"{entry['shape']}: held", cell(entry["held"]), "", "") for entry in here.get("by_shape", [])]
     rows = [("", "emulated hand", "simulation", "doing nothing"), *rows]

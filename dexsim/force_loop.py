@@ -1,7 +1,7 @@
 """An outer loop around a policy that takes a force command: what the fingers lack is added to the command.
 
-The loop integrates the difference between the commanded force and the mean estimated force of the touching fingers but
-the first, the thumb, which balances them. The policy sees the corrected command. Simulation and bridge run this code.
+The loop integrates the difference between the commanded force and the estimated one (`commanded_force`). The policy
+sees the corrected command. Simulation and bridge run this code.
 """
 
 import dataclasses
@@ -13,6 +13,10 @@ from dexsim.core.config import setting, validate
 
 # Of the command that a policy trained on [0, 1] is shown. Below 0 it lets go of weak grips.
 _LOW, _HIGH = 0.0, 1.5
+
+FORCE_COMMANDS = ("squeeze", "finger")
+"""What a force command speaks of. squeeze: the sum over the fingers that oppose the thumb, so a grip can reach it that
+the thumb can balance; finger: each of them that touches (the paper)."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -30,8 +34,21 @@ class ForceLoop:
         validate(self)
 
 
+def commanded_force(force: jax.Array, touching: jax.Array, force_command: str) -> jax.Array:
+    """The force [] N that a command speaks of, of `FORCE_COMMANDS`.
+
+    Args:
+      force: [F] N. The first finger, the thumb, balances the others and does not count.
+      touching: [F] bool.
+      force_command: "squeeze" for the sum, "finger" for the mean over fingers that touch, 0 where none does.
+    """
+    total = jnp.sum(jnp.where(touching, force, 0.0)[1:])
+    return total if force_command == "squeeze" else total / jnp.maximum(jnp.sum(touching[1:].astype(jnp.float32)), 1.0)
+
+
 def correct_command(
     loop: ForceLoop,
+    force_command: str,
     span: tuple[float, float],
     period: float,
     command: jax.Array,
@@ -42,17 +59,17 @@ def correct_command(
 
     Args:
       loop: settings.
-      span: N, force of a touching finger at the commands 0 and 1.
+      force_command: what the command speaks of, of `FORCE_COMMANDS`.
+      span: N, that force at the commands 0 and 1.
       period: s, control tick.
       command: [] in [0, 1].
       correction: [] so far; it stays while fewer than two fingers beside the first touch.
       force: [F] N estimated, zero where nothing touches.
     """
-    others = force[1:]
-    touching = jnp.sum(jnp.where(others > 0, 1.0, 0.0))
-    mean = jnp.sum(others) / jnp.maximum(touching, 1.0)
-    error = command - (mean - span[0]) / (span[1] - span[0])
+    touching = force > 0
+    felt = commanded_force(force, touching, force_command)
+    error = command - (felt - span[0]) / (span[1] - span[0])
     change = jnp.clip(loop.gain * error, -loop.slew, loop.slew) * period
-    moved = jnp.where(touching >= 2, correction + change, correction)
+    moved = jnp.where(jnp.sum(touching[1:]) >= 2, correction + change, correction)
     # No windup: the sum stays in what a policy is shown.
     return jnp.clip(moved, jnp.maximum(-loop.limit, _LOW - command), jnp.minimum(loop.limit, _HIGH - command))

@@ -6,10 +6,10 @@ from dexsim.core.statistics import bootstrap, entry, mean, proportion, statistic
 from dexsim.objects.config import KINDS
 
 SETTLE = 3.0  # s after release from which forces count
-FORCES = {"r_resultant": "finger_force", "r_normal": "finger_normal", "r_taxels": "finger_taxels"}
-"""Correlations with the command, and the metric of each: a touching finger's whole contact force with friction, what of
-it presses into the skin, and what of that the taxels bear."""
-_MEANS = (*FORCES.values(), "total_force", "total_torque", "taxel_force", "thumb_force", "touching", "torque_limited")
+FORCES = {"r_resultant": "force", "r_normal": "normal", "r_taxels": "taxels"}
+"""Correlations with the command, and what of the contact force each takes: all of it with friction, what of it presses
+into the skin, and what of that the taxels bear. The metric is the force command's name, `_` and this."""
+_MEANS = "total_force", "total_torque", "taxel_force", "thumb_force", "touching", "torque_limited"
 
 
 def window(seconds: float) -> tuple[float, float]:
@@ -21,6 +21,7 @@ def summarize(
     metrics: dict[str, np.ndarray],
     alive: np.ndarray,
     control_period: float,
+    force_command: str,
     span: tuple[float, float],
     shapes: tuple[str, ...] = KINDS,
 ) -> dict:
@@ -30,17 +31,19 @@ def summarize(
       metrics: [T, N] per tick and episode, as the environment returns them.
       alive: [T, N] bool, False after the object was lost.
       control_period: s.
-      span: N, target force per touching finger at command 0 and 1.
+      force_command: what the command speaks of, of `dexsim.force_loop.FORCE_COMMANDS`.
+      span: N, its target at command 0 and 1.
       shapes: names of what the metric "shape" counts.
 
     Returns:
       A JSON-able dict. Forces are averaged over the ticks of "window_s": from 3 s after release (from the middle of
-      shorter episodes) to the end, for episodes held to the end. They are means over the touching fingers among those
-      commanded (all but the thumb); "total_force" is the solver's force summed over all fingers, "taxel_force" that
-      sum as the taxels feel it. "r_resultant", "r_normal" and "r_taxels" correlate command and force, see `FORCES`.
+      shorter episodes) to the end, for episodes held to the end. "finger_..." are means over the touching fingers but
+      the thumb, "squeeze_..." sums over them; "force_command" says which one the command speaks of;
+      "total_force" is the solver's force summed over all fingers, "taxel_force" that sum as the taxels feel it.
+      "r_resultant", "r_normal" and "r_taxels" correlate command and commanded force, see `FORCES`.
       "total_torque" is the sum over touching fingers of the root joint's torque as a share of its limit; "r_torque"
       correlates it with the command. "slope_torque" and "slope_force_n" are least-squares slopes over the command, of
-      it and of the finger force.
+      it and of the commanded force.
       "torque_limited" is the share of these ticks with a joint at its torque limit: there force cannot follow.
       "force_error_n" is the root mean square error of the resultant over all episodes; a lost object is not pressed.
       Intervals are 95 %: Wilson's for proportions, else bootstrap over episodes.
@@ -49,12 +52,16 @@ def summarize(
     held = alive[-1]
     late = slice(min(round(SETTLE / control_period), ticks // 2), None)
     command, shape = metrics["command"][0], metrics["shape"][0].astype(int)
+    forces = {part: f"{force_command}_{part}" for part in FORCES.values()}
     # Of each episode [N], the mean over its late ticks.
-    mean_of = {name: np.where(alive, metrics[name], 0.0)[late].mean(0) for name in _MEANS}
+    mean_of = {name: np.where(alive, metrics[name], 0.0)[late].mean(0) for name in (*forces.values(), *_MEANS)}
     wanted = span[0] + command * (span[1] - span[0])
+    commanded = {part: mean_of[name] for part, name in forces.items()}
     returns = np.where(alive, metrics["reward"], 0.0).sum(0) if "reward" in metrics else metrics["return"].max(0)
-    by_command = [_command_row(level, command, held, wanted, mean_of) for level in np.unique(command)]
-    by_shape = [_shape_row(shapes[index], shape == index, command, held, wanted, mean_of) for index in np.unique(shape)]
+    by_command = [_command_row(level, command, held, wanted, mean_of, force_command) for level in np.unique(command)]
+    by_shape = [
+        _shape_row(shapes[index], shape == index, command, held, wanted, commanded) for index in np.unique(shape)
+    ]
     means = [row["total_force_n"]["mean"] for row in by_command]
     complete = all(m is not None for m in means)
     report = {
@@ -64,15 +71,16 @@ def summarize(
         "held": proportion(held),
         "hold_time_s": mean(alive.sum(0) * control_period),
         "return": mean(returns),
-        **correlations(command, held, mean_of),
+        "force_command": force_command,
+        **correlations(command, held, commanded),
         "r_torque": pearson(command[held], mean_of["total_torque"][held]),
-        "slope_force_n": slope(command[held], mean_of["finger_force"][held]),
+        "slope_force_n": slope(command[held], commanded["force"][held]),
         "slope_torque": slope(command[held], mean_of["total_torque"][held]),
-        "force_error_n": force_error(mean_of["finger_force"], wanted),
+        "force_error_n": force_error(commanded["force"], wanted),
         "torque_limited": mean(mean_of["torque_limited"][held]),
         "force_range": float(means[-1] / means[0]) if complete and len(means) > 1 and means[0] > 0 else None,
         "total_force_monotone": bool(complete and np.all(np.diff(means) > 0)),
-        "finger_force_by_command_n": [row["finger_force_n"]["mean"] for row in by_command],
+        f"{force_command}_force_by_command_n": [row[f"{force_command}_force_n"]["mean"] for row in by_command],
         "total_force_by_command_n": means,
         "skin_correlation": _optional_pearson(metrics, alive),
         "joint_speed_rad_s": mean(metrics["joint_speed"].mean(0)),
@@ -84,7 +92,12 @@ def summarize(
 
 
 def _command_row(
-    level: float, command: np.ndarray, held: np.ndarray, wanted: np.ndarray, mean_of: dict[str, np.ndarray]
+    level: float,
+    command: np.ndarray,
+    held: np.ndarray,
+    wanted: np.ndarray,
+    mean_of: dict[str, np.ndarray],
+    force_command: str,
 ) -> dict:
     """The episodes at one command; arrays [N] are of all episodes."""
     mine = command == level
@@ -94,9 +107,7 @@ def _command_row(
         "episodes": int(mine.sum()),
         "held": proportion(held[mine]),
         "target_force_n": float(wanted[mine].mean()),
-        "finger_force_n": mean(mean_of["finger_force"][good]),
-        "finger_normal_n": mean(mean_of["finger_normal"][good]),
-        "finger_taxels_n": mean(mean_of["finger_taxels"][good]),
+        **{f"{n}_n": mean(mean_of[n][good]) for n in (f"{force_command}_{part}" for part in FORCES.values())},
         "total_force_n": mean(mean_of["total_force"][good]),
         "total_torque": mean(mean_of["total_torque"][good]),
         "taxel_force_n": mean(mean_of["taxel_force"][good]),
@@ -113,15 +124,15 @@ def _shape_row(
     command: np.ndarray,
     held: np.ndarray,
     wanted: np.ndarray,
-    mean_of: dict[str, np.ndarray],
+    commanded: dict[str, np.ndarray],
 ) -> dict:
     """The episodes `mine` with one shape; arrays [N] are of all episodes."""
     return {
         "shape": name,
         "episodes": int(mine.sum()),
         "held": proportion(held[mine]),
-        **correlations(command, mine & held, mean_of),
-        "force_error_n": force_error(mean_of["finger_force"][mine], wanted[mine]),
+        **correlations(command, mine & held, commanded),
+        "force_error_n": force_error(commanded["force"][mine], wanted[mine]),
     }
 
 
@@ -154,9 +165,9 @@ def saturates(torque_limited: np.ndarray) -> bool:
     return bool(torque_limited.size and torque_limited.mean() > 0.5)
 
 
-def correlations(command: np.ndarray, held: np.ndarray, mean_of: dict[str, np.ndarray]) -> dict:
+def correlations(command: np.ndarray, held: np.ndarray, commanded: dict[str, np.ndarray]) -> dict:
     """Pearson's r of command [N] and each of `FORCES` [N], of what was held [N]."""
-    return {name: pearson(command[held], mean_of[metric][held]) for name, metric in FORCES.items()}
+    return {name: pearson(command[held], commanded[part][held]) for name, part in FORCES.items()}
 
 
 def force_error(values: np.ndarray, wanted: np.ndarray) -> dict:

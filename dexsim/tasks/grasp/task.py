@@ -17,6 +17,7 @@ from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import pytree_dataclass
 from dexsim.env.state import Start
 from dexsim.env.task import GroundTruth
+from dexsim.force_loop import FORCE_COMMANDS, commanded_force
 from dexsim.geometry.vectors import length
 from dexsim.hand.kinematics import Hand, flexion_joints
 from dexsim.objects import params
@@ -25,7 +26,7 @@ from dexsim.objects.params import ObjectParams
 from dexsim.tasks.grasp.config import GraspConfig, GraspReward
 from dexsim.tasks.grasp.report import summarize
 from dexsim.tasks.grasp.start import make_pool
-from dexsim.tasks.terms import action_rate, joint_speed, mean_where, random_push
+from dexsim.tasks.terms import action_rate, joint_speed, random_push
 
 COMMANDS = (0.0, 0.25, 0.5, 0.75, 1.0)
 """The commands of an evaluation."""
@@ -41,7 +42,7 @@ class GraspGoal:
 
 
 def target_force(command: jax.Array, span: tuple[float, float]) -> jax.Array:
-    """Force [] N that each touching finger should press with."""
+    """Force [] N that the hand should press with; `GraspConfig.force_command` says with which part of it."""
     return span[0] + command * (span[1] - span[0])
 
 
@@ -168,25 +169,31 @@ class Grasp:
         contact = force > _CONTACT
         wanted = self.target_force(goal)
         torque = truth.joint_torque[self._roots]
+        pressed, share = force, wanted
+        if config.force_command == "squeeze":
+            # Each of the four answers for their sum, so more fingers earn more; the thumb opposes that sum.
+            squeeze = commanded_force(force, contact, config.force_command)
+            pressed = jnp.full_like(force, squeeze).at[0].set(force[0])
+            share = wanted / jnp.maximum(jnp.sum(contact[1:].astype(jnp.float32)), 1.0)
         fallen = dropped.astype(jnp.float32)
         held = 1.0 - fallen
         fingers = self._finger_joints
         terms = {
             "force": held
             * weights.force
-            * command_reward(force, wanted, contact, (0.01, 200.0), config.max_force, weights),
+            * command_reward(pressed, wanted, contact, (0.01, 200.0), config.max_force, weights),
             "torque": held
             * weights.torque
             * command_reward(
                 torque / self._max_torque,
-                wanted / config.force_per_torque / self._max_torque,
+                share / config.force_per_torque / self._max_torque,
                 contact & (torque >= 0.01),
                 (0.0, 1.0),
                 1.0,
                 weights,
             ),
             "alive": held * weights.alive,
-            "overload": held * weights.overload * overload(force[1:], wanted + weights.margin) / config.max_force,
+            "overload": held * weights.overload * overload(force[1:], share + weights.margin) / config.max_force,
             "spread": weights.spread * joint_spread(truth.joint_position[self._roots[1:]]),
             "outer": weights.outer * posture_distance(truth.joint_position[fingers], self._centre[fingers]),
             "action": weights.action * action_rate(truth.action, truth.last_action),
@@ -199,16 +206,18 @@ class Grasp:
     def _metrics(self, goal: GraspGoal, truth: GroundTruth, held: jax.Array) -> dict[str, jax.Array]:
         force = length(truth.finger_force)
         contact = force > _CONTACT
-        # The command speaks to the four fingers; the thumb balances them.
-        mean_force = mean_where(contact[1:], force[1:])
         pressing = jnp.sum(truth.touch.force, -1)
+        parts = {"force": force, "normal": truth.normal_force, "taxels": pressing}
+        commanded = {
+            f"{what}_{name}": commanded_force(part, contact, what)
+            for what in FORCE_COMMANDS
+            for name, part in parts.items()
+        }
         return {
             "success": held,
             "command": goal.command,
-            "force_error": jnp.abs(mean_force - self.target_force(goal)),
-            "finger_force": mean_force,
-            "finger_normal": mean_where(contact[1:], truth.normal_force[1:]),
-            "finger_taxels": mean_where(contact[1:], pressing[1:]),
+            "force_error": jnp.abs(commanded[f"{self.config.force_command}_force"] - self.target_force(goal)),
+            **commanded,
             "total_force": jnp.sum(force),
             "total_torque": jnp.sum(
                 jnp.where(contact, jnp.abs(truth.joint_torque[self._roots]), 0.0) / self._max_torque
@@ -241,4 +250,5 @@ class Grasp:
 
     def summarize(self, metrics: dict[str, np.ndarray], alive: np.ndarray, control_period: float) -> dict:
         """The report of an evaluation; see `dexsim.tasks.grasp.report`."""
-        return summarize(metrics, alive, control_period, self.config.finger_force, self.shape_names)
+        config = self.config
+        return summarize(metrics, alive, control_period, config.force_command, config.finger_force, self.shape_names)
