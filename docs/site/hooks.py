@@ -26,8 +26,8 @@ def on_config(config):
 
 
 def notebooks() -> list[Path]:
-    """In the order of their names."""
-    return sorted((ROOT / "notebooks").glob("*.ipynb"))
+    """The quickstart, then the others in the order of their names."""
+    return sorted((ROOT / "notebooks").glob("*.ipynb"), key=lambda path: (path.stem != "quickstart", path.stem))
 
 
 @event_priority(100)  # before the notebooks' plugin, which has to see them
