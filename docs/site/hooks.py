@@ -51,6 +51,15 @@ def on_page_markdown(markdown: str, page, **_) -> str:
     return re.sub(r"\[([^\]]+)\]\((?:\.\./)+(?!\w+\.md|experiments|notebooks)[^)]+\)", r"\1", markdown)
 
 
+def on_page_content(html: str, page, **_) -> str:
+    """Links from notebooks into docs/ lead to the site's pages."""
+    return (
+        re.sub(r'href="\.\./docs/(\w+)\.md"', r'href="../../\1/"', html)
+        if page.file.src_uri.startswith("notebooks/")
+        else html
+    )
+
+
 def results() -> str:
     """A card for each shipped policy, from the JSON beside it."""
     cards = ["# Result cards", "", "One card for each shipped policy, made from the report that it is shipped with."]
