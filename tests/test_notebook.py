@@ -1,40 +1,92 @@
-"""The quickstart notebook runs from top to bottom, headless."""
+"""The notebooks run from top to bottom, headless and small, and have the outputs of a whole run with them."""
 
 import base64
 import io
+import os
+import re
 
 import numpy as np
 import pytest
 from paths import ROOT
 
-NOTEBOOK = ROOT / "notebooks" / "quickstart.ipynb"
+nbformat = pytest.importorskip("nbformat")
+nbclient = pytest.importorskip("nbclient")
+pytest.importorskip("ipykernel")
+
+NUMBER = r"(-?\d+\.?\d*)"
+# Number of pictures, and what is printed.
+EXPECTED = {
+    "quickstart": (
+        4,
+        ["12 joints, 5 fingers with 120 taxels each", "environment steps per second", r"trained +\d\.\d\d"],
+    ),
+    "shipped_policies": (2, [r"\d+ of \d+ objects held for 8 s", r"true force: Pearson r = 0\.[5-9]"]),
+    "touch": (3, [r"N at first, 2\.0\d N after 25 steps", r"surface_points +median error +\d+\.\d um"]),
+    "own_task": (2, ["level level 0.3", r"level = 1\.0 \(trained: 0\.3\)"]),
+    "motors": (3, [r"12 joints pressed, torque at 0\.3 A off by [0-5]\.\d %", "2 sub-steps of 5 ms"]),
+    "hand_bridge": (
+        1,
+        ["1 frame after noise and in two pieces, 0 with", r"(\d+) ticks from \d+ frames: \1 readings and \1 "],
+    ),
+}
+
+
+def printed(notebook):
+    """What the cells print, and their pictures as arrays."""
+    from PIL import Image
+
+    outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
+    assert not [output for output in outputs if output.output_type == "error"]
+    text = "".join(output["text"] for output in outputs if output.output_type == "stream" and output.name == "stdout")
+    found = [output["data"]["image/png"] for output in outputs if "image/png" in output.get("data", {})]
+    return text, [np.asarray(Image.open(io.BytesIO(base64.b64decode(png)))) for png in found]
+
+
+def check(name, notebook):
+    text, pictures = printed(notebook)
+    count, patterns = EXPECTED[name]
+    for pattern in patterns:
+        assert re.search(pattern, text), (pattern, text)
+    assert len(pictures) == count and all(picture.std() > 10 for picture in pictures)
+    if name == "touch":
+        pairs = re.findall(rf"^[xyz]: +{NUMBER} N/m by gradient, +{NUMBER} N/m", text, re.MULTILINE)
+        assert len(pairs) == 3
+        slopes = np.array(pairs, float)
+        np.testing.assert_allclose(*slopes.T, atol=0.02 * np.abs(slopes).max())
+    if name == "motors":
+        found = re.findall(rf"^(stiffness|damping) +{NUMBER}, truth +{NUMBER},", text, re.MULTILINE)
+        assert len(found) == 2
+        for _, value, truth in found:
+            assert float(value) == pytest.approx(float(truth), rel=0.1)
+
+
+def test_there_are_no_others():
+    assert {path.stem for path in (ROOT / "notebooks").glob("*.ipynb")} == set(EXPECTED)
+
+
+@pytest.mark.parametrize("name", EXPECTED)
+def test_outputs_are_of_a_whole_run(name):
+    notebook = nbformat.read(ROOT / "notebooks" / f"{name}.ipynb", as_version=4)
+    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    assert [cell.execution_count for cell in code] == list(range(1, len(code) + 1))
+    check(name, notebook)
 
 
 @pytest.mark.slow
-def test_quickstart_runs(monkeypatch):
-    nbformat = pytest.importorskip("nbformat")
-    nbclient = pytest.importorskip("nbclient")
-    pytest.importorskip("ipykernel")
-    from PIL import Image
-
+@pytest.mark.parametrize("name", EXPECTED)
+def test_it_runs(name, monkeypatch):
     # The kernel is started with this process's environment; the inline backend is its own choice.
     monkeypatch.delenv("MPLBACKEND", raising=False)
-    monkeypatch.setenv("PYTHONPATH", str(NOTEBOOK.parent.parent))
-    notebook = nbformat.read(NOTEBOOK, as_version=4)
-    parameters = next(cell for cell in notebook.cells if "parameters" in cell.metadata.get("tags", []))
-    assert parameters.source.startswith("train_seconds = 60") and "\nepisodes = 32" in parameters.source
-    parameters.source = "train_seconds = 5\nepisodes = 8"
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    monkeypatch.setenv("DEXSIM_SMALL", "1")
+    # Small sizes are mostly compilation.
+    monkeypatch.setenv(
+        "XLA_FLAGS", os.environ.get("XLA_FLAGS", "").replace("optimization_level=1", "optimization_level=0")
+    )
+    notebook = nbformat.read(ROOT / "notebooks" / f"{name}.ipynb", as_version=4)
     for cell in notebook.cells:
         if cell.cell_type == "code":
             cell.outputs = []
-
-    nbclient.NotebookClient(notebook, timeout=600, resources={"metadata": {"path": str(NOTEBOOK.parent)}}).execute()
-
-    outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
-    text = "".join(output["text"] for output in outputs if output.output_type == "stream" and output.name == "stdout")
-    assert "12 joints, 5 fingers with 120 taxels each" in text
-    assert "environment steps per second" in text and "trained" in text.splitlines()[-1]
-    pictures = [output["data"]["image/png"] for output in outputs if "image/png" in output.get("data", {})]
-    assert len(pictures) == 4  # the hand, the taxel maps, the learning curve, the trained policy
-    frame = np.asarray(Image.open(io.BytesIO(base64.b64decode(pictures[0]))))
-    assert frame.shape[:2] == (480, 640) and frame.std() > 10
+    folder = {"metadata": {"path": str(ROOT / "notebooks")}}
+    nbclient.NotebookClient(notebook, timeout=600, resources=folder).execute()
+    check(name, notebook)

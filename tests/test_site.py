@@ -65,5 +65,7 @@ def test_result_cards_have_the_figures_of_the_reports(site):
 
 def test_tutorials_and_changelog_are_pages(site):
     for notebook in (ROOT / "notebooks").glob("*.ipynb"):
-        assert (site / "notebooks" / notebook.stem / "index.html").exists()
+        page = site / "notebooks" / notebook.stem / "index.html"
+        links = re.findall(r'href="(\.\./[^"#:]+)"', page.read_text())
+        assert links and not [link for link in links if not (page.parent / link).exists()]
     assert "Keep a Changelog" in text_of(site, "CHANGELOG")

@@ -27,7 +27,8 @@ class Servo:
       rate: exchanges per second.
       beat: called before every exchange as a sign of life, with the time s by which the next call may be late.
 
-    `masked` is called with the number of the exchange from which on taxels are masked, and with lines that name them.
+    `retared` is called with the number of the exchange from which on another tare holds, and with lines that name
+    taxels which it masks.
     """
 
     def __init__(
@@ -44,7 +45,7 @@ class Servo:
         self.waited = 0  # deadlines missed because of late answers
         self.error: BaseException | None = None
         self.driven = False  # whether the motors may be on
-        self.masked: Callable[[int, list[str]], None] = lambda sequence, lines: None
+        self.retared: Callable[[int, list[str]], None] = lambda sequence, lines: None
         self._filter = VelocityFilter(sensing.config.velocity_time)
         self._generation = 0
         self._rested = False
@@ -128,8 +129,9 @@ class Servo:
         return took
 
     def _sample(self, reply: Reply) -> HandSample:
-        if lines := self.sensing.mask_stuck(reply.state, self.safety.config.finger_force):
-            self.masked(reply.sequence, lines)
+        lines = self.sensing.mask_stuck(reply.state, self.safety.config.finger_force)
+        if self.sensing.track_zero(reply.received, reply.state) or lines:
+            self.retared(reply.sequence, lines)
         measured = self.sensing.measure(reply.state)
         if reply.generation != self._generation:
             self._filter.reset()

@@ -69,7 +69,7 @@ def replay(path: Path) -> Replay:
             if frame is None:
                 counts["without_frame"] += 1
                 continue
-            # The exchange thread may have masked a taxel before the tick's record was written.
+            # The exchange thread may have changed the tare before the tick's record was written.
             sensing.tare = next(tare for begin, tare in reversed(tares) if begin <= tick["sequence"])
             now = sensing.measure(frames.decode_state(frame[frames.HEADER.size : -2]))
             same = all(_same(getattr(now, name), tick["readings"][name]) for name in MEASURED)

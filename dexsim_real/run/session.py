@@ -72,7 +72,7 @@ class Session:
         rate = keep_phase(arguments.rate, policy.control_rate)
         beat = self.guard.beat if self.guard else lambda more: None
         self.servo = Servo(self.port, self.sensing, self.safety, rate, beat)
-        self.servo.masked = self._mask
+        self.servo.retared = self._retare
         self.view = StatusView(f"{policy.task} on {arguments.port}", lambda: overview(self), arguments.quiet)
         self.objects: ObjectSensors | None = None
         self.goals: TurnGoals | None = None
@@ -288,8 +288,8 @@ class Session:
         kind = Kind.SENT if direction == "tx" else Kind.RECEIVED
         self.log.add(kind, (self.port.counts.sent, data))
 
-    def _mask(self, sequence: int, lines: list[str]) -> None:
-        """Taxels have got stuck: a replay needs to know from which exchange on."""
+    def _retare(self, sequence: int, lines: list[str]) -> None:
+        """Zeros have moved, or taxels got stuck: a replay needs to know from which exchange on."""
         self.log.add(Kind.META, {"tare": self.sensing.tare, "from": sequence})
         for line in lines:
             self._note(f"warning: {line}")

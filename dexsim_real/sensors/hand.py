@@ -10,6 +10,7 @@ from dexsim.calibration.maps import Calibration, current_from_counts, normalised
 from dexsim.core.config import setting, validate
 from dexsim.hand.kinematics import Hand
 from dexsim_real.core.errors import HandError
+from dexsim_real.sensors.taxel_zero import ZeroTracker
 from dexsim_real.sensors.taxels import StuckTaxels, judge_rest, taxel_names
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Mode
@@ -49,6 +50,8 @@ class HardwareConfig:
     tare_sum: float = setting(50.0, unit="count", low=0.0, high=30600.0)
     """Largest sum of a fingertip's counts when it is tared, single taxels left out: the largest load that taring can
     hide, 5 N by the vendor's 0.1 N."""
+    track_zero: bool = True
+    """Follow the zero of taxels that touch nothing, which wanders with temperature; `tare_sum` bounds it, too."""
     current_sign: float = setting(-1.0, unit="1", low=-1.0, high=1.0)
     """Sign of the current without a calibration: -1 when a positive current opens the hand."""
     current_scale: float = setting(1000.0, unit="mA", low=1.0, high=20000.0)
@@ -117,7 +120,7 @@ class HandSensing:
         self._sign = np.array(config.joint_sign, np.float32)
         self._offset = np.array(config.joint_offset, np.float32)
         self.tare = np.zeros((frames.TIPS, frames.TAXELS), np.float32)
-        self._stuck = StuckTaxels(hand)
+        self._stuck, self._zero = StuckTaxels(hand), ZeroTracker(hand, config.tare_sum)
         if calibration is None:
             self._per_count = np.full((frames.TIPS, 1), config.force_per_count, np.float32)
             scale = np.float32(config.current_sign / config.current_scale)
@@ -177,6 +180,18 @@ class HandSensing:
             return []
         self.tare = np.where(stuck, np.float32(np.inf), self.tare)
         return self._say_masked(stuck)
+
+    def track_zero(self, time: float, state: np.ndarray) -> bool:
+        """Follow the zero of taxels that touch nothing, given every answer of a run; whether `tare` has changed.
+
+        Args:
+          time: s of the answer.
+          state: a `frames.STATE_BLOCK`.
+        """
+        before = self.tare
+        if self.config.track_zero:
+            self.tare = self._zero.update(time, self._counts(state), before)
+        return not np.array_equal(self.tare, before)
 
     def _say_masked(self, stuck: np.ndarray) -> list[str]:
         return [

@@ -32,7 +32,7 @@ def judge_rest(hand: Hand, counts: np.ndarray, limit: float, most: float) -> np.
       HandError: something touches a fingertip, or many of its taxels are stuck.
     """
     high = counts > limit
-    beside = _around(hand, high.astype(np.float32)).sum(0)
+    beside = around(hand, high.astype(np.float32)).sum(0)
     total = np.where(_alone(hand, counts), 0.0, counts).sum(1)
     for finger, name in enumerate(hand.finger_names):
         patch = high[finger] & (beside[finger] > 0)
@@ -91,10 +91,10 @@ class StuckTaxels:
 
 def _alone(hand: Hand, counts: np.ndarray) -> np.ndarray:
     """Mask [F, N] of taxels whose neighbours read next to nothing, compared with themselves."""
-    return _around(hand, counts).max(0) <= _ALONE * counts
+    return around(hand, counts).max(0) <= _ALONE * counts
 
 
-def _around(hand: Hand, values: np.ndarray) -> np.ndarray:
+def around(hand: Hand, values: np.ndarray) -> np.ndarray:
     """Values [8, F, N] of the eight neighbours of each taxel, given values [F, N]; 0 beyond the lattice."""
     columns, rows = hand.taxel_grid
     padded = np.pad(values.reshape(-1, columns, rows), ((0, 0), (1, 1), (1, 1)))

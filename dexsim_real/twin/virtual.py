@@ -264,6 +264,7 @@ class VirtualRun:
     def _receive(self, data: bytes) -> None:
         for frame in self._replies.feed(data):
             self._state = frames.decode_state(frame.data)
+            self.sensing.track_zero(self._now, self._state)
             measured = self.sensing.measure(self._state)
             velocity = self._filter.estimate(self._now, measured.joint_position)
             if self.safety.see(HandSample(self._now, 0, 0, measured, velocity)):

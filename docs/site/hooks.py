@@ -26,8 +26,8 @@ def on_config(config):
 
 
 def notebooks() -> list[Path]:
-    """In the order of their names."""
-    return sorted((ROOT / "notebooks").glob("*.ipynb"))
+    """The quickstart, then the others in the order of their names."""
+    return sorted((ROOT / "notebooks").glob("*.ipynb"), key=lambda path: (path.stem != "quickstart", path.stem))
 
 
 @event_priority(100)  # before the notebooks' plugin, which has to see them
@@ -49,6 +49,15 @@ def on_page_markdown(markdown: str, page, **_) -> str:
     for name in OUTSIDE:
         markdown = re.sub(rf"\]\((?:\.\./)+{re.escape(name)}", f"]({up}/{name}", markdown)
     return re.sub(r"\[([^\]]+)\]\((?:\.\./)+(?!\w+\.md|experiments|notebooks)[^)]+\)", r"\1", markdown)
+
+
+def on_page_content(html: str, page, **_) -> str:
+    """Links from notebooks into docs/ lead to the site's pages."""
+    return (
+        re.sub(r'href="\.\./docs/(\w+)\.md"', r'href="../../\1/"', html)
+        if page.file.src_uri.startswith("notebooks/")
+        else html
+    )
 
 
 def results() -> str:

@@ -10,7 +10,7 @@ from dexsim_real.twin.plant.parameters import sample_trial
 from dexsim_real.twin.plant.protocol import MotorCommands
 from dexsim_real.wire.frames import Mode
 
-QUIET = {"taxel_noise": 0.0, "taxel_bias": 0.0, "taxel_spread": 0.0, "taxel_threshold": 0.0}
+QUIET = {"taxel_noise": 0.0, "taxel_bias": 0.0, "taxel_spread": 0.0, "taxel_threshold": 0.0, "taxel_drift": 0.0}
 
 IDEAL = {
     "coulomb_friction": 0.0,

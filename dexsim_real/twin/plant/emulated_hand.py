@@ -108,7 +108,7 @@ class EmulatedHand:
             joint_position=shown + self.parameters.encoder_noise * rng.standard_normal(shown.shape),
             current=self._reported_current(past),
             temperature=self._drives.case.copy(),
-            taxel_force=self._skin.report(self._delayed_taxel_force(late), rng),
+            taxel_force=self._skin.report(self._delayed_taxel_force(late), rng, self.time - self._began),
             object_quat=quat,
             object_position=position,
             object_acceleration=acceleration,

@@ -134,6 +134,7 @@ STRUCTURE: dict[str, float | tuple[float, ...]] = {
     "encoder_noise": 0.001,  # rad
     "taxel_noise": 0.015,  # N
     "taxel_bias": 0.02,  # N, standard deviation
+    "taxel_drift": 0.05,  # N, standard deviation of how far a zero wanders as the fingertips warm up
     "taxel_spread": 0.08,  # standard deviation of the gains
     "taxel_threshold": 0.06,  # N
     "taxel_crosstalk": 0.06,  # share of a taxel's force that spreads to its neighbours

@@ -4,7 +4,8 @@ The taxels are covered by rubber, which reaches some way beyond the lattice and 
 is nearer than that. The rubber's pressure grows as its remaining thickness shrinks and distributes the load over the
 taxels. The total load is the normal force of the solver's contacts, as a scale under the fingertip would measure.
 Contacts beside the lattice (at the nail) load no taxel. Shear is distributed in the same proportion, along the taxels'
-own axes. Imperfections follow: crosstalk, gains, zero errors, noise, a threshold.
+own axes. Imperfections follow: crosstalk, gains, zero errors that wander as the
+fingertips warm up, noise, a threshold.
 """
 
 import numpy as np
@@ -14,6 +15,7 @@ from dexsim_real.twin.plant.parameters import TrialParameters
 from dexsim_real.twin.plant.shapes import ObjectShape
 
 _FULLY, _NOT_AT_ALL = 0.004, 0.008  # m along the skin from a contact to the nearest taxel: fully felt, not felt
+_WARMING = 600.0  # s, time constant with which the zeros wander
 _LEFT = 0.15  # smallest remaining share of the rubber's thickness
 
 
@@ -35,6 +37,7 @@ class EmulatedTaxels:
         self._bias = parameters.taxel_bias * rng.standard_normal(shape)
         self._noise, self._threshold = float(parameters.taxel_noise), float(parameters.taxel_threshold)
         self._crosstalk = float(parameters.taxel_crosstalk)
+        self._drift = parameters.taxel_drift * rng.standard_normal(shape)
 
     def load(
         self,
@@ -70,11 +73,11 @@ class EmulatedTaxels:
             force[finger, :, 2] = share * pressed
         return force
 
-    def report(self, force: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Add the imperfections to forces [F, N, 3] N."""
+    def report(self, force: np.ndarray, rng: np.random.Generator, seconds: float) -> np.ndarray:
+        """Add the imperfections to forces [F, N, 3] N, this long after the hand was switched on."""
         mixed = force + self._crosstalk / 4 * _spill(force, self._grid)
         shown = mixed * self._gain[..., None] + self._noise * rng.standard_normal(force.shape)
-        shown[..., 2] += self._bias
+        shown[..., 2] += self._bias + (1 - np.exp(-seconds / _WARMING)) * self._drift
         return np.where(np.abs(shown) < self._threshold, 0.0, shown)
 
     def _gap(self, away: np.ndarray, outward: np.ndarray) -> float:

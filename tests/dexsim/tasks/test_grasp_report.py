@@ -280,5 +280,5 @@ class TestTorque:
 
     def test_names_of_other_shapes(self):
         names = tuple(f"object {k}" for k in range(5))
-        found = report.summarize(*evaluation(), PERIOD, SPAN, names)
+        found = report.summarize(*evaluation(), PERIOD, "finger", SPAN, names)
         assert [row["shape"] for row in found["by_shape"]] == list(names)

@@ -1,5 +1,6 @@
 """The exchange thread's end: how long a hand is told to turn its motors off, by whether they may be on."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import numpy as np
@@ -101,3 +102,21 @@ def test_a_hand_that_was_silent_when_it_was_told_to_turn_off_may_still_be_on(ser
     assert servo.driven
     servo.stop()
     assert not servo.driven and servo.port.modes[-1] == Mode.PASSIVE
+
+
+def test_who_keeps_the_log_is_told_when_a_zero_has_moved(servo):
+    """From the exchange on whose measurement is the first with the new zero: a replay uses it from there."""
+    told, tares = [], []
+    servo.retared = lambda sequence, lines: told.append((sequence, lines, servo.sensing.tare.copy()))
+    warm, exchange = frames.empty_state(), servo.port.exchange
+    warm["joint"]["position"] = MIDDLE
+    warm["tip"]["taxel"]["z"][3, 60] = 1
+
+    servo.port.exchange = lambda command: dataclasses.replace(exchange(command), state=warm)
+    for _ in range(round(6.0 / CYCLE)):
+        servo._cycle()
+        tares.append(servo.sensing.tare[3, 60])
+    ((sequence, lines, tare),) = told
+    assert tare[3, 60] == 1.0 and tare.sum() == 1.0 and lines == []
+    assert tares[sequence - 2 : sequence] == [0.0, 1.0]
+    assert servo.safety.sample.measured.finger_force[3] == 0.0
