@@ -28,8 +28,10 @@ from dexsim.registry import find_task
 from dexsim_ppo import checkpoint
 from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.curriculum import Curriculum
+from dexsim_ppo.learner.sharding import make_mesh
 from dexsim_ppo.policy import Policy, load_policy
 from dexsim_ppo.retired import migrate_arguments
+from dexsim_ppo.training import processes
 from dexsim_ppo.training.arguments import TrainArguments, check_resumed, printable, training_config
 from dexsim_ppo.training.fine_tune import check_fit, fine_tuning_config
 from dexsim_ppo.training.presets import Preset, device_preset, find_preset
@@ -101,17 +103,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     started = time.perf_counter()
     argv = list(sys.argv[1:] if argv is None else argv)
     cli.enable_caches()
+    if any(argument.split("=")[0] == "--devices" for argument in argv):
+        processes.connect()
     arguments, begun = parse_arguments(argv)
     command = shlex.join(["python", "-m", "dexsim_ppo.train", *argv])
     with cli.naming_options(TrainArguments, arguments):
         run, stopped = run_training(arguments, begun, started, command)
-    if stopped:
+    if stopped and processes.is_first():
         print(
             f"stopped by {signal.Signals(stopped).name}; resume with: "
             f"python -m dexsim_ppo.train --resume {shlex.quote(str(run.folder.path))}"
         )
-        return 128 + stopped
-    return 0
+    return 128 + stopped if stopped else 0
 
 
 def run_training(
@@ -120,29 +123,35 @@ def run_training(
     """Train, then evaluate and report; the run, and the number of the signal that stopped it or 0."""
     import dexsim
 
-    resumed = begun if isinstance(begun, checkpoint.Checkpoint) else None
-    if not resumed and arguments.run_dir and arguments.run_dir.exists():
+    resumed, first = begun if isinstance(begun, checkpoint.Checkpoint) else None, processes.is_first()
+    if first and not resumed and arguments.run_dir and arguments.run_dir.exists():
         raise _taken(arguments.run_dir)
+    mesh = make_mesh(arguments.devices, arguments.ppo)
     env = dexsim.make(
-        arguments.task, training_config(arguments), backend=arguments.backend, num_envs=arguments.ppo.num_envs
+        arguments.task,
+        training_config(arguments),
+        backend=arguments.backend,
+        num_envs=arguments.ppo.num_envs // (mesh.size if mesh else 1),
     )
     arguments = dataclasses.replace(
         arguments, backend=cast(Any, env.backend)
     )  # so that a resumed run has the same engine
     if isinstance(begun, Policy):
         check_fit(begun, env, arguments.ppo)
-    folder = RunFolder(resumed.path.parent.parent if resumed else make_run_folder(arguments))
-    if not resumed:
+    path = resumed.path.parent.parent if resumed else make_run_folder(arguments) if first else Path()
+    folder = RunFolder(processes.agree_on_path(path))
+    if first and not resumed:
         folder.checkpoints.mkdir()
         cli.write_json(
             folder.config, {"command": command, "arguments": printable(arguments)} | cli.environment_report()
         )
-    run = Run(env, arguments, folder, started)
-    with stop_on_signals() as stopped:
-        run.train(begun, stopped)
-    if not stopped():
+    run = Run(env, arguments, folder, started, mesh)
+    with stop_on_signals() as received, processes.noticing_losses(folder.path):
+        run.train(begun, lambda: processes.agree(received()))
+        stopped = processes.agree(received())
+    if first and not stopped:
         run.finish(command)
-    return run, stopped()
+    return run, stopped
 
 
 # --- options ------------------------------------------------------------------------------------------

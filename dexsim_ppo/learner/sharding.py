@@ -88,6 +88,16 @@ def start_on(mesh: Mesh, init: Callable[[jax.Array], Any], shapes: Callable[[jax
     return begin
 
 
+def spanned(state: Any) -> Mesh:
+    """The mesh that a `TrainState` is on."""
+    return state.iteration.sharding.mesh
+
+
+def learned(state: Any) -> Any:
+    """A `TrainState` without its environments, as arrays of this process, whatever devices it is on."""
+    return jax.device_get(dataclasses.replace(state, env_state=None, key=None))
+
+
 def place(tree: Tree, like: Any) -> Tree:
     """A copy of `tree`, which every process has whole, as arrays sharded as those of `like`."""
     keys = [jnp.issubdtype(x.dtype, jax.dtypes.prng_key) for x in jax.tree.leaves(tree)]
