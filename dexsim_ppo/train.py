@@ -13,6 +13,7 @@ import dataclasses
 import datetime
 import itertools
 import json
+import os
 import shlex
 import signal
 import sys
@@ -107,8 +108,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         processes.connect()
     arguments, begun = parse_arguments(argv)
     command = shlex.join(["python", "-m", "dexsim_ppo.train", *argv])
-    with cli.naming_options(TrainArguments, arguments):
-        run, stopped = run_training(arguments, begun, started, command)
+    try:
+        with cli.naming_options(TrainArguments, arguments):
+            run, stopped = run_training(arguments, begun, started, command)
+    except processes.ProcessLost as error:
+        print(f"error: {error}", file=sys.stderr, flush=True)
+        os._exit(2)
     if stopped and processes.is_first():
         print(
             f"stopped by {signal.Signals(stopped).name}; resume with: "

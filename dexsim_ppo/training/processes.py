@@ -5,7 +5,7 @@ import functools
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import jax
 import numpy as np
@@ -16,13 +16,15 @@ from dexsim_ppo import checkpoint
 from dexsim_ppo.learner.ppo import TrainState
 from dexsim_ppo.learner.sharding import copied, spanned
 
-Tree = TypeVar("Tree")
-
 # Set in each process of a job of several: by Slurm's srun, Open MPI's mpirun, an indexed job of Kubernetes.
 _JOBS = ("SLURM_STEP_NODELIST", "OMPI_COMM_WORLD_SIZE", "JOB_COMPLETION_INDEX")
 _LOST_AFTER = 60  # s without a sign of life
 _REPORT = 3600  # s that the others wait for the first, which evaluates and renders
 _PATH = 4096  # bytes
+
+
+class ProcessLost(DexsimError):
+    """Another process of this training has ended. JAX's own shutdown would wait for it and abort."""
 
 
 def connect() -> None:
@@ -74,7 +76,7 @@ def noticing_losses(folder: Path) -> Iterator[None]:
     """Turn the loss of another process into one line.
 
     Raises:
-      DexsimError: another process has ended.
+      ProcessLost: another process has ended.
     """
     try:
         yield
@@ -83,7 +85,7 @@ def noticing_losses(folder: Path) -> Iterator[None]:
             raise
         if not any(word in str(error) for word in ("Gloo", "NCCL", "UNAVAILABLE", "ABORTED", "DEADLINE")):
             raise
-        raise DexsimError(
+        raise ProcessLost(
             "another process of this training has ended; resume with: "
             f"python -m dexsim_ppo.train --resume {folder} --devices {jax.device_count()}"
         ) from None
