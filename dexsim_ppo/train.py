@@ -37,6 +37,7 @@ from dexsim_ppo.training.arguments import TrainArguments, check_resumed, printab
 from dexsim_ppo.training.fine_tune import check_fit, fine_tuning_config
 from dexsim_ppo.training.presets import Preset, device_preset, find_preset
 from dexsim_ppo.training.runlog import RunFolder
+from dexsim_ppo.training.seeds import seed_folder, write_summary
 from dexsim_ppo.training.trainer import Run
 
 
@@ -93,6 +94,8 @@ def train_policy(
     arguments = dataclasses.replace(arguments, **{name: value for name, value in given.items() if value is not None})
     if isinstance(begun, checkpoint.Checkpoint):
         check_resumed(arguments, default)
+    if arguments.seeds > 1:
+        raise ConfigError(f"train_policy(seeds={arguments.seeds}): trains one seed; call it once for each")
     run, stopped = run_training(arguments, begun, started, command="train_policy(...)")
     if stopped:
         raise DexsimError(f"training was stopped; resume it with train_policy(resume={str(run.folder.path)!r})")
@@ -110,7 +113,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     command = shlex.join(["python", "-m", "dexsim_ppo.train", *argv])
     try:
         with cli.naming_options(TrainArguments, arguments):
-            run, stopped = run_training(arguments, begun, started, command)
+            train = train_seeds if arguments.seeds > 1 else run_training
+            run, stopped = train(arguments, begun, started, command)
     except processes.ProcessLost as error:
         print(f"error: {error}", file=sys.stderr, flush=True)
         os._exit(2)
@@ -157,6 +161,28 @@ def run_training(
     if first and not stopped:
         run.finish(command)
     return run, stopped
+
+
+def train_seeds(
+    arguments: TrainArguments, begun: checkpoint.Checkpoint | Policy | None, started: float, command: str
+) -> tuple[Run, int]:
+    """`run_training` for each seed in turn, then one report; the last run, and the signal that stopped it or 0."""
+    first, reports = processes.is_first(), dict[int, dict[str, Any]]()
+    folder = processes.agree_on_path(make_run_folder(arguments) if first else Path())
+    if first:
+        content = {"command": command, "arguments": printable(arguments)} | cli.environment_report()
+        cli.write_json(RunFolder(folder).config, content)
+    for seed in range(arguments.seed, arguments.seed + arguments.seeds):
+        one = dataclasses.replace(arguments, seed=seed, seeds=1, run_dir=seed_folder(folder, seed))
+        run, stopped = run_training(one, begun, started, command)
+        if stopped:
+            return run, stopped
+        started = time.perf_counter()
+        if first:
+            reports[seed] = json.loads(run.folder.report.read_text())
+    if first:
+        print(f"report of {arguments.seeds} seeds: {write_summary(folder, arguments.task, reports, command)}")
+    return run, 0
 
 
 # --- options ------------------------------------------------------------------------------------------

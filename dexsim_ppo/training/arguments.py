@@ -33,6 +33,8 @@ class TrainArguments(Generic[EnvConfig]):
     """Devices to train on, which share the environments; 0 for all. In a job of several processes those of all."""
     seed: int = setting(0, unit="1", low=0, high=2**32 - 1)
     """Seed of everything random."""
+    seeds: int = setting(1, unit="1", low=1, high=1000)
+    """Trainings one after the other, from --seed on; --steps and --minutes are those of each."""
     backend: Literal["auto", "jax", "warp", "c"] = setting("auto")
     """Physics backend. auto: c on a CPU, warp on an NVIDIA GPU if it is installed, otherwise jax."""
     preset: Literal["auto", "cpu", "cpu-large", "gpu"] = setting("auto")
