@@ -13,7 +13,6 @@ import dataclasses
 import datetime
 import itertools
 import json
-import os
 import shlex
 import signal
 import sys
@@ -109,15 +108,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     cli.enable_caches()
     if any(argument.split("=")[0] == "--devices" for argument in argv):
         processes.connect()
-    arguments, begun = parse_arguments(argv)
     command = shlex.join(["python", "-m", "dexsim_ppo.train", *argv])
-    try:
+    with processes.leaving_at_once():
+        arguments, begun = parse_arguments(argv)
         with cli.naming_options(TrainArguments, arguments):
             train = train_seeds if arguments.seeds > 1 else run_training
             run, stopped = train(arguments, begun, started, command)
-    except processes.ProcessLost as error:
-        print(f"error: {error}", file=sys.stderr, flush=True)
-        os._exit(2)
     if stopped and processes.is_first():
         print(
             f"stopped by {signal.Signals(stopped).name}; resume with: "

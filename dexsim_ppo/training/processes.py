@@ -3,6 +3,8 @@
 import contextlib
 import functools
 import os
+import sys
+import traceback
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -21,10 +23,6 @@ _JOBS = ("SLURM_STEP_NODELIST", "OMPI_COMM_WORLD_SIZE", "JOB_COMPLETION_INDEX")
 _LOST_AFTER = 60  # s without a sign of life
 _REPORT = 3600  # s that the others wait for the first, which evaluates and renders
 _PATH = 4096  # bytes
-
-
-class ProcessLost(DexsimError):
-    """Another process of this training has ended. JAX's own shutdown would wait for it and abort."""
 
 
 def connect() -> None:
@@ -72,11 +70,29 @@ def save(path: Path, *, tree: TrainState, **content: Any) -> None:
 
 
 @contextlib.contextmanager
+def leaving_at_once() -> Iterator[None]:
+    """End this process at once after an error where there are others: JAX's own shutdown would wait for them, and they
+    for this one."""
+    try:
+        yield
+    except Exception as error:
+        if not jax.distributed.is_initialized():
+            raise
+        if isinstance(error, (DexsimError, OSError)):
+            print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        else:
+            traceback.print_exc()
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(2)
+
+
+@contextlib.contextmanager
 def noticing_losses(folder: Path) -> Iterator[None]:
     """Turn the loss of another process into one line.
 
     Raises:
-      ProcessLost: another process has ended.
+      DexsimError: another process has ended.
     """
     try:
         yield
@@ -85,7 +101,7 @@ def noticing_losses(folder: Path) -> Iterator[None]:
             raise
         if not any(word in str(error) for word in ("Gloo", "NCCL", "UNAVAILABLE", "ABORTED", "DEADLINE")):
             raise
-        raise ProcessLost(
+        raise DexsimError(
             "another process of this training has ended; resume with: "
             f"python -m dexsim_ppo.train --resume {folder} --devices {jax.device_count()}"
         ) from None

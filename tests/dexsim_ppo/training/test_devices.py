@@ -97,6 +97,7 @@ def test_one_device_begins_and_two_go_on(alone, tmp_path):
     assert_same_training(RunFolder(tmp_path / "run"), alone)
 
 
+@pytest.mark.slow
 def test_two_processes_train_as_one_and_the_first_alone_writes(alone, tmp_path):
     runs = start_two(*OPTIONS, *STEPS, "--run-dir", tmp_path / "run")
     said = [run.communicate(timeout=120) for run in runs]
@@ -111,6 +112,14 @@ def test_two_processes_train_as_one_and_the_first_alone_writes(alone, tmp_path):
     )
 
 
+def test_an_error_of_one_process_leaves_none_waiting(tmp_path):
+    runs = start_two(*OPTIONS, *STEPS, "--run-dir", tmp_path)  # which exists, and only the first process looks
+    said = [run.communicate(timeout=100) for run in runs]
+    assert runs[0].returncode == 2 and runs[1].returncode != 0
+    assert f"error: --run-dir {tmp_path}: exists already" in said[0][1] and "Traceback" not in said[0][1]
+
+
+@pytest.mark.slow
 def test_a_killed_process_ends_the_run_with_one_line_and_it_can_be_resumed(alone, tmp_path):
     folder = RunFolder(tmp_path / "run")
     runs = start_two(*OPTIONS, "--minutes", 3, "--keep-checkpoints", 1000, "--run-dir", folder.path)
