@@ -34,7 +34,8 @@ class Display:
     """
 
     def __init__(self, title: str, quiet: bool = False):
-        self.console = Console(quiet=quiet)
+        self.console = Console()
+        self.console.quiet = quiet
         self._title = title
         self._live = (
             Live(console=self.console, refresh_per_second=4) if self.console.is_terminal and not quiet else None
