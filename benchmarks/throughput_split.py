@@ -30,6 +30,7 @@ from dexsim_ppo.learner.distribution import log_prob, sample
 from dexsim_ppo.learner.ppo import TrainState, make_train
 from dexsim_ppo.learner.rollout import Rollout, scan_restarting
 from dexsim_ppo.learner.running_stats import update_stats
+from dexsim_ppo.learner.update import Learner, update
 from dexsim_ppo.training.presets import find_preset
 
 
@@ -189,11 +190,11 @@ def learn(env: Env, config: PPOConfig, state: TrainState, rollout: Rollout) -> A
     """Advantages, all epochs over all minibatches, statistics."""
     normalizers = ppo.make_normalizers(env, config, state.observation_stats)
     value_stats, params, samples = ppo.prepare(config, state.value_stats, state.params, rollout)
-    learner = ppo.Learner(params, state.adam, state.learning_rate, state.skipped_updates)
+    learner = Learner(params, state.adam, state.learning_rate, state.skipped_updates)
     stats = {
         group: update_stats(state.observation_stats[group], rollout.obs[group]) for group in state.observation_stats
     }
-    return ppo.update(config, normalizers, samples, state.key, learner), value_stats, stats
+    return update(config, normalizers, samples, state.key, learner), value_stats, stats
 
 
 def _used(tree: Any) -> jax.Array:

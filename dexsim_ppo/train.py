@@ -28,12 +28,15 @@ from dexsim.registry import find_task
 from dexsim_ppo import checkpoint
 from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.curriculum import Curriculum
+from dexsim_ppo.learner.sharding import make_mesh
 from dexsim_ppo.policy import Policy, load_policy
 from dexsim_ppo.retired import migrate_arguments
+from dexsim_ppo.training import processes
 from dexsim_ppo.training.arguments import TrainArguments, check_resumed, printable, training_config
 from dexsim_ppo.training.fine_tune import check_fit, fine_tuning_config
 from dexsim_ppo.training.presets import Preset, device_preset, find_preset
 from dexsim_ppo.training.runlog import RunFolder
+from dexsim_ppo.training.seeds import seed_folder, write_summary
 from dexsim_ppo.training.trainer import Run
 
 
@@ -90,6 +93,8 @@ def train_policy(
     arguments = dataclasses.replace(arguments, **{name: value for name, value in given.items() if value is not None})
     if isinstance(begun, checkpoint.Checkpoint):
         check_resumed(arguments, default)
+    if arguments.seeds > 1:
+        raise ConfigError(f"train_policy(seeds={arguments.seeds}): trains one seed; call it once for each")
     run, stopped = run_training(arguments, begun, started, command="train_policy(...)")
     if stopped:
         raise DexsimError(f"training was stopped; resume it with train_policy(resume={str(run.folder.path)!r})")
@@ -101,17 +106,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     started = time.perf_counter()
     argv = list(sys.argv[1:] if argv is None else argv)
     cli.enable_caches()
-    arguments, begun = parse_arguments(argv)
+    if any(argument.split("=")[0] == "--devices" for argument in argv):
+        processes.connect()
     command = shlex.join(["python", "-m", "dexsim_ppo.train", *argv])
-    with cli.naming_options(TrainArguments, arguments):
-        run, stopped = run_training(arguments, begun, started, command)
-    if stopped:
+    with processes.leaving_at_once():
+        arguments, begun = parse_arguments(argv)
+        with cli.naming_options(TrainArguments, arguments):
+            train = train_seeds if arguments.seeds > 1 else run_training
+            run, stopped = train(arguments, begun, started, command)
+    if stopped and processes.is_first():
         print(
             f"stopped by {signal.Signals(stopped).name}; resume with: "
             f"python -m dexsim_ppo.train --resume {shlex.quote(str(run.folder.path))}"
         )
-        return 128 + stopped
-    return 0
+    return 128 + stopped if stopped else 0
 
 
 def run_training(
@@ -120,29 +128,57 @@ def run_training(
     """Train, then evaluate and report; the run, and the number of the signal that stopped it or 0."""
     import dexsim
 
-    resumed = begun if isinstance(begun, checkpoint.Checkpoint) else None
-    if not resumed and arguments.run_dir and arguments.run_dir.exists():
+    resumed, first = begun if isinstance(begun, checkpoint.Checkpoint) else None, processes.is_first()
+    if first and not resumed and arguments.run_dir and arguments.run_dir.exists():
         raise _taken(arguments.run_dir)
+    mesh = make_mesh(arguments.devices, arguments.ppo)
     env = dexsim.make(
-        arguments.task, training_config(arguments), backend=arguments.backend, num_envs=arguments.ppo.num_envs
+        arguments.task,
+        training_config(arguments),
+        backend=arguments.backend,
+        num_envs=arguments.ppo.num_envs // (mesh.size if mesh else 1),
     )
     arguments = dataclasses.replace(
         arguments, backend=cast(Any, env.backend)
     )  # so that a resumed run has the same engine
     if isinstance(begun, Policy):
         check_fit(begun, env, arguments.ppo)
-    folder = RunFolder(resumed.path.parent.parent if resumed else make_run_folder(arguments))
-    if not resumed:
+    path = resumed.path.parent.parent if resumed else make_run_folder(arguments) if first else Path()
+    folder = RunFolder(processes.agree_on_path(path))
+    if first and not resumed:
         folder.checkpoints.mkdir()
         cli.write_json(
             folder.config, {"command": command, "arguments": printable(arguments)} | cli.environment_report()
         )
-    run = Run(env, arguments, folder, started)
-    with stop_on_signals() as stopped:
-        run.train(begun, stopped)
-    if not stopped():
+    run = Run(env, arguments, folder, started, mesh)
+    with stop_on_signals() as received, processes.noticing_losses(folder.path):
+        run.train(begun, lambda: processes.agree(received()))
+        stopped = processes.agree(received())
+    if first and not stopped:
         run.finish(command)
-    return run, stopped()
+    return run, stopped
+
+
+def train_seeds(
+    arguments: TrainArguments, begun: checkpoint.Checkpoint | Policy | None, started: float, command: str
+) -> tuple[Run, int]:
+    """`run_training` for each seed in turn, then one report; the last run, and the signal that stopped it or 0."""
+    first, reports = processes.is_first(), dict[int, dict[str, Any]]()
+    folder = processes.agree_on_path(make_run_folder(arguments) if first else Path())
+    if first:
+        content = {"command": command, "arguments": printable(arguments)} | cli.environment_report()
+        cli.write_json(RunFolder(folder).config, content)
+    for seed in range(arguments.seed, arguments.seed + arguments.seeds):
+        one = dataclasses.replace(arguments, seed=seed, seeds=1, run_dir=seed_folder(folder, seed))
+        run, stopped = run_training(one, begun, started, command)
+        if stopped:
+            return run, stopped
+        started = time.perf_counter()
+        if first:
+            reports[seed] = json.loads(run.folder.report.read_text())
+    if first:
+        print(f"report of {arguments.seeds} seeds: {write_summary(folder, arguments.task, reports, command)}")
+    return run, 0
 
 
 # --- options ------------------------------------------------------------------------------------------

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
+from jax.sharding import Mesh
 
 from dexsim.core.compilation import jit
 from dexsim.core.errors import ConfigError
@@ -21,7 +22,7 @@ from dexsim_ppo.learner.adam import AdamState
 from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.curriculum import Curriculum, next_scale
 from dexsim_ppo.learner.gae import compute_gae
-from dexsim_ppo.learner.loss import Metrics, Samples, actor_mean, critic_value, loss
+from dexsim_ppo.learner.loss import Metrics, Samples, actor_mean, critic_value
 from dexsim_ppo.learner.networks import Params, init_params, rescale_output
 from dexsim_ppo.learner.rollout import Decision, Rollout, bound_rewards, collect
 from dexsim_ppo.learner.running_stats import (
@@ -32,7 +33,9 @@ from dexsim_ppo.learner.running_stats import (
     update_stats,
     value_std,
 )
+from dexsim_ppo.learner.sharding import batched, copied, shardings, start_on
 from dexsim_ppo.learner.types import CurriculumEnvironment, Environment, layout_size
+from dexsim_ppo.learner.update import Learner, update
 
 
 @pytree_dataclass
@@ -56,39 +59,64 @@ class Training(NamedTuple):
 
     init: Callable[[jax.Array], TrainState]
     shapes: Callable[[jax.Array], TrainState]
-    """Shapes and types of what `init` returns, without computing it."""
+    """Shapes, types and, on several devices, shardings of what `init` returns, without computing it."""
     plain_step: Callable[[TrainState], tuple[TrainState, Metrics]]
     """`step` before compilation."""
     step: Callable[[TrainState], tuple[TrainState, Metrics]]
     """Donates its argument: do not use that state again. Metrics are [iterations_per_call]."""
 
 
-def make_train(env: Environment, config: PPOConfig, curriculum: Curriculum | None = None) -> Training:
-    """Compiled `init` and `step` for this environment."""
+def make_train(
+    env: Environment, config: PPOConfig, curriculum: Curriculum | None = None, mesh: Mesh | None = None
+) -> Training:
+    """Compiled `init` and `step` for this environment; with a mesh, over its devices (`learner.sharding`)."""
     if curriculum is not None and not curriculum.on:
         curriculum = None
 
     def init(key: jax.Array) -> TrainState:
-        return strong_types(init_state(env, config, key, curriculum))
+        return strong_types(init_state(env, config, key, curriculum, mesh))
 
     def step(state: TrainState) -> tuple[TrainState, Metrics]:
         state, metrics = jax.lax.scan(
-            lambda s, _: train_iteration(env, config, s, curriculum), state, None, length=config.iterations_per_call
+            lambda s, _: train_iteration(env, config, s, curriculum, mesh),
+            state,
+            None,
+            length=config.iterations_per_call,
         )
-        return strong_types(state), metrics
+        state = strong_types(state)
+        if mesh is not None:
+            state = jax.lax.with_sharding_constraint(state, shardings(state, mesh))
+        return state, copied(metrics, mesh)
 
-    compiled_init = jit(init, once=True)
+    def shapes(key: jax.Array) -> TrainState:
+        found = jax.eval_shape(init, key)
+        if mesh is None:
+            return found
+        return jax.tree.map(
+            lambda x, where: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=where), found, shardings(found, mesh)
+        )
+
+    if mesh is None:
+        compiled_init = jit(init, once=True)
+    else:
+        compiled_init = start_on(mesh, init, shapes)
     # Leaves may share a buffer (actor and critic may observe the same array), and no buffer can be donated
     # twice: copies separate them.
     return Training(
         init=lambda key: jax.tree.map(jnp.copy, compiled_init(key)),
-        shapes=lambda key: jax.eval_shape(init, key),
+        shapes=shapes,
         plain_step=step,
         step=jit(step, backend=env.backend, donate_argnums=0),
     )
 
 
-def init_state(env: Environment, config: PPOConfig, key: jax.Array, curriculum: Curriculum | None = None) -> TrainState:
+def init_state(
+    env: Environment,
+    config: PPOConfig,
+    key: jax.Array,
+    curriculum: Curriculum | None = None,
+    mesh: Mesh | None = None,
+) -> TrainState:
     """A fresh learner, and freshly reset environments with staggered clocks."""
     params_key, reset_key, stagger_key, key = jax.random.split(key, 4)
     sizes = {group: layout_size(fields) for group, fields in env.observation_layout.items()}
@@ -102,8 +130,8 @@ def init_state(env: Environment, config: PPOConfig, key: jax.Array, curriculum: 
     if curriculum is not None:
         scale = jnp.float32(curriculum.start)
         reset = functools.partial(cast(CurriculumEnvironment, env).reset, scale=scale)
-    env_state = jax.vmap(reset)(jax.random.split(reset_key, config.num_envs))
-    env_state = jax.vmap(env.stagger)(env_state, jax.random.split(stagger_key, config.num_envs))
+    env_state = batched(reset, mesh)(jax.random.split(reset_key, config.num_envs))
+    env_state = batched(env.stagger, mesh)(env_state, jax.random.split(stagger_key, config.num_envs))
     return TrainState(
         params=params,
         adam=adam.init(params),
@@ -119,13 +147,17 @@ def init_state(env: Environment, config: PPOConfig, key: jax.Array, curriculum: 
 
 
 def train_iteration(
-    env: Environment, config: PPOConfig, state: TrainState, curriculum: Curriculum | None = None
+    env: Environment,
+    config: PPOConfig,
+    state: TrainState,
+    curriculum: Curriculum | None = None,
+    mesh: Mesh | None = None,
 ) -> tuple[TrainState, Metrics]:
     """Collect, estimate advantages, update; with a curriculum, widen or narrow the ranges."""
     key, collect_key, update_key = jax.random.split(state.key, 3)
     # Shared by collection and update, so that the first minibatch's probability ratio is exactly one.
     normalizers = make_normalizers(env, config, state.observation_stats)
-    env_state, rollout, metrics = collect_rollout(env, config, state, normalizers, collect_key)
+    env_state, rollout, metrics = collect_rollout(env, config, state, normalizers, collect_key, mesh)
     if config.normalize_value:
         rollout, bounded = bound_rewards(rollout, state.value_stats, config.reward_scale)
         metrics |= {"bounded_rewards": bounded}
@@ -136,6 +168,7 @@ def train_iteration(
         samples,
         update_key,
         Learner(params, state.adam, state.learning_rate, state.skipped_updates),
+        mesh,
     )
     metrics |= update_metrics | {
         "explained_variance": 1 - jnp.var(samples.target - samples.value) / jnp.var(samples.target),
@@ -195,7 +228,12 @@ def make_normalizers(env: Environment, config: PPOConfig, stats: dict[str, Runni
 
 
 def collect_rollout(
-    env: Environment, config: PPOConfig, state: TrainState, normalizers: dict[str, Normalizer], key: jax.Array
+    env: Environment,
+    config: PPOConfig,
+    state: TrainState,
+    normalizers: dict[str, Normalizer],
+    key: jax.Array,
+    mesh: Mesh | None = None,
 ) -> tuple[Any, Rollout, Metrics]:
     """Experience [T, B, ...] under the current policy; values are in reward units."""
     params, std = state.params, value_std(state.value_stats)
@@ -209,7 +247,7 @@ def collect_rollout(
     def value(obs):
         return state.value_stats.mean + std * critic_value(config, params, normalizers, obs)
 
-    return collect(env, state.env_state, key, act, value, config.rollout_length)
+    return collect(env, state.env_state, key, act, value, config.rollout_length, mesh)
 
 
 # --- advantages ---------------------------------------------------------------------------------------
@@ -241,86 +279,6 @@ def prepare(
         target=(target - mean) / std,
     )
     return value_stats, params, jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), samples)
-
-
-# --- update -------------------------------------------------------------------------------------------
-
-
-class Learner(NamedTuple):
-    """What the minibatch loop carries."""
-
-    params: Params
-    adam: AdamState
-    learning_rate: jax.Array
-    skipped_updates: jax.Array
-
-
-def update(
-    config: PPOConfig, normalizers: dict[str, Normalizer], samples: Samples, key: jax.Array, learner: Learner
-) -> tuple[Learner, Metrics]:
-    """All epochs over shuffled minibatches, then the learning rate of the next iteration.
-
-    Metrics are means over all minibatches, except the KL divergence: its mean over the last epoch.
-    """
-    rows = config.steps_per_iteration
-    keys = jax.random.split(key, config.epochs)
-    order = jax.vmap(lambda key: jax.random.permutation(key, rows))(keys)
-    order = order.reshape(config.epochs * config.minibatches, rows // config.minibatches)
-    old_log_std, moves = learner.params.log_std, actor_learns(config, learner)
-
-    def minibatch(learner, indices):
-        batch = jax.tree.map(lambda x: x[indices], samples)
-        grads, metrics = jax.grad(loss, has_aux=True)(learner.params, config, normalizers, batch, old_log_std)
-        learner, norms = apply_gradients(config, learner, grads)
-        return learner, metrics | norms
-
-    learner, metrics = jax.lax.scan(minibatch, learner, order)
-    last_epoch = metrics["kl"][-config.minibatches :]
-    metrics = jax.tree.map(jnp.nanmean, metrics) | {"kl": jnp.nanmean(last_epoch)}
-    rate = adapt_learning_rate(config, learner.learning_rate, metrics["kl"])
-    if config.critic_first:  # A policy that does not move says nothing about the rate.
-        rate = jnp.where(moves, rate, learner.learning_rate)
-    return learner._replace(learning_rate=rate), metrics
-
-
-def apply_gradients(config: PPOConfig, learner: Learner, grads: Params) -> tuple[Learner, Metrics]:
-    """Clip the gradients and step. A minibatch whose gradient is not finite is skipped and counted."""
-    actor_grads, actor_norm = adam.clip_by_global_norm((grads.actor, grads.log_std), config.max_grad_norm)
-    critic_grads, critic_norm = adam.clip_by_global_norm(grads.critic, config.max_grad_norm)
-    rate, moves = learner.learning_rate, actor_learns(config, learner)
-    if config.critic_first:
-        rate = jnp.where(moves, rate, config.learning_rate_max)
-    params, moments = adam.update(Params(*actor_grads, critic_grads), learner.adam, learner.params, rate)
-    # Projected after the step, not clipped in the loss: beyond a clip the gradient is zero, and it could not return.
-    log_std = jnp.clip(params.log_std, jnp.log(config.std_min), jnp.log(config.std_max))
-    params = Params(params.actor, log_std, params.critic)
-    if config.critic_first:  # Adam's moments already follow the gradient, so that the actor's first step is small.
-        held = jax.tree.map(functools.partial(jnp.where, moves), params, learner.params)
-        params = Params(held.actor, held.log_std, params.critic)
-    ok = jnp.isfinite(actor_norm) & jnp.isfinite(critic_norm)
-    new = learner._replace(params=params, adam=moments)
-    learner = jax.tree.map(functools.partial(jnp.where, ok), new, learner)
-    skipped = learner.skipped_updates + (1 - ok.astype(jnp.int32))
-    return learner._replace(skipped_updates=skipped), {"actor_grad_norm": actor_norm, "critic_grad_norm": critic_norm}
-
-
-def actor_learns(config: PPOConfig, learner: Learner) -> jax.Array:
-    """Whether the initial iterations for the critic alone are over: bool []."""
-    return learner.adam.count >= config.critic_first * config.epochs * config.minibatches
-
-
-def adapt_learning_rate(config: PPOConfig, rate: jax.Array, kl: jax.Array) -> jax.Array:
-    """The next learning rate []: lower above twice the target KL, higher below half of it, within its bounds.
-
-    `kl` [] measures the whole iteration. Adapting after every minibatch would overshoot: once beyond the
-    target, each further minibatch of the iteration would lower the rate again.
-    """
-    if config.kl_target == 0:
-        return rate
-    slower = jnp.maximum(rate / 1.5, config.learning_rate_min)
-    faster = jnp.minimum(rate * 1.5, config.learning_rate_max)
-    rate = jnp.where(kl > 2 * config.kl_target, slower, rate)
-    return jnp.where(kl < 0.5 * config.kl_target, faster, rate)
 
 
 def strong_types(tree: Any) -> Any:

@@ -6,9 +6,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.sharding import Mesh
 
 from dexsim.core.pytree import choose, pytree_dataclass
 from dexsim_ppo.learner.running_stats import RunningStats, value_std
+from dexsim_ppo.learner.sharding import batched
 from dexsim_ppo.learner.types import Environment
 
 # A reward beyond this many deviations of the returns is a fault of the simulation, not something to learn from. It is
@@ -48,7 +50,13 @@ Value = Callable[[Mapping[str, jax.Array]], jax.Array]
 
 
 def collect(
-    env: Environment, state: Any, key: jax.Array, act: Act, value: Value, length: int
+    env: Environment,
+    state: Any,
+    key: jax.Array,
+    act: Act,
+    value: Value,
+    length: int,
+    mesh: Mesh | None = None,
 ) -> tuple[Any, Rollout, dict[str, jax.Array]]:
     """Run the policy for `length` steps.
 
@@ -63,7 +71,7 @@ def collect(
       `episode/<name>` the mean final value over the episodes that ended (NaN if none did), `episodes`
       their number, `repeated_starts` how many starts were used before (see `scan_restarting`).
     """
-    step_env = jax.vmap(env.step)
+    step_env = batched(env.step, mesh)
 
     def step(state, key):
         obs = dict(state.obs)
@@ -80,7 +88,7 @@ def collect(
         )
         return after, (record, dict(after.metrics))
 
-    state, (rollout, step_metrics) = scan_restarting(env, step, state, jax.random.split(key, length))
+    state, (rollout, step_metrics) = scan_restarting(env, step, state, jax.random.split(key, length), mesh)
     # Sums are taken outside the scan: inside it each would reduce few numbers, which is slow on GPUs.
     finite, done = jnp.isfinite(rollout.reward), rollout.terminated | rollout.truncated
     rollout = dataclasses.replace(rollout, reward=jnp.where(finite, rollout.reward, 0.0))
@@ -98,7 +106,11 @@ def collect(
 
 
 def scan_restarting(
-    env: Environment, step: Callable[[Any, Any], tuple[Any, Any]], state: Any, inputs: Any
+    env: Environment,
+    step: Callable[[Any, Any], tuple[Any, Any]],
+    state: Any,
+    inputs: Any,
+    mesh: Mesh | None = None,
 ) -> tuple[Any, Any]:
     """`jax.lax.scan` that starts a new episode after each step wherever one ended.
 
@@ -117,7 +129,7 @@ def scan_restarting(
     """
     length = jax.tree.leaves(inputs)[0].shape[0]
     block = _block(length)
-    restart = jax.jit(jax.vmap(env.restart))
+    restart = jax.jit(batched(env.restart, mesh))
 
     def run_block(state, inputs):
         everyone = jnp.ones(state.reward.shape[0], bool)

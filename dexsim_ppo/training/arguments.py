@@ -29,8 +29,12 @@ class TrainArguments(Generic[EnvConfig]):
     file keep to the settings of `--env`."""
     task: str = "grasp"
     """Task to train; my_module:poke for a task of your own."""
+    devices: int = setting(1, unit="1", low=0)
+    """Devices to train on, which share the environments; 0 for all. In a job of several processes those of all."""
     seed: int = setting(0, unit="1", low=0, high=2**32 - 1)
     """Seed of everything random."""
+    seeds: int = setting(1, unit="1", low=1, high=1000)
+    """Trainings one after the other, from --seed on; --steps and --minutes are those of each."""
     backend: Literal["auto", "jax", "warp", "c"] = setting("auto")
     """Physics backend. auto: c on a CPU, warp on an NVIDIA GPU if it is installed, otherwise jax."""
     preset: Literal["auto", "cpu", "cpu-large", "gpu"] = setting("auto")
@@ -97,6 +101,7 @@ def training_config(arguments: TrainArguments) -> Any:
 # What a resumed run may be given anew: its budget, and what looks on. Everything else is part of the saved state.
 _RESUMABLE = {
     "checkpoint_every",
+    "devices",
     "evaluate_every",
     "evaluation_chunk",
     "evaluation_episodes",

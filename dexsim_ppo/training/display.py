@@ -30,12 +30,16 @@ class Display:
 
     Args:
       title: the task and the device.
+      quiet: show nothing.
     """
 
-    def __init__(self, title: str):
+    def __init__(self, title: str, quiet: bool = False):
         self.console = Console()
+        self.console.quiet = quiet
         self._title = title
-        self._live = Live(console=self.console, refresh_per_second=4) if self.console.is_terminal else None
+        self._live = (
+            Live(console=self.console, refresh_per_second=4) if self.console.is_terminal and not quiet else None
+        )
         self._known: dict[str, Any] = {}
         self._returns: list[float] = []
 

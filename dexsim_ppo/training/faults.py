@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from dexsim.core.errors import DexsimError
-from dexsim_ppo import checkpoint
 from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.ppo import TrainState
+from dexsim_ppo.training import processes
 from dexsim_ppo.training.runlog import RunFolder
 
 DIVERGED_AFTER = 5  # calls in a row that skip more than half of their updates
@@ -83,7 +83,7 @@ class Faults:
             return ""
         path = self._folder.path / f"reproduce-{int(before.iteration):08d}.msgpack"
         try:
-            checkpoint.save(
+            processes.save(
                 path, kind="reproducer", task=self._content["task"], tree=before, content=self._content | {"lost": lost}
             )
         except OSError as error:  # A full disk is no reason to stop.

@@ -1,5 +1,6 @@
 """One training run: compile, loop, measure, save, report."""
 
+import dataclasses
 import functools
 import time
 from collections.abc import Callable
@@ -10,6 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
 from dexsim.core import cli
 from dexsim.core.compilation import collector_paused
@@ -18,10 +20,11 @@ from dexsim_ppo import checkpoint
 from dexsim_ppo.evaluate import Evaluator, write_video
 from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.ppo import TrainState, make_train
+from dexsim_ppo.learner.sharding import learned, place
 from dexsim_ppo.learner.types import Environment
 from dexsim_ppo.policy import Policy
 from dexsim_ppo.report import print_report
-from dexsim_ppo.training import programs
+from dexsim_ppo.training import processes, programs
 from dexsim_ppo.training.arguments import TrainArguments, printable, training_config
 from dexsim_ppo.training.display import Display
 from dexsim_ppo.training.faults import Faults, keep
@@ -35,8 +38,15 @@ SELECTION_SEED, REPORT_SEED = 2**32 - 1, 0
 class Run:
     """One training run. `train` and then `finish` leave everything in its folder."""
 
-    def __init__(self, env: Environment, arguments: TrainArguments, folder: RunFolder, started: float):
-        self.env, self.arguments, self.folder, self.started = env, arguments, folder, started
+    def __init__(
+        self,
+        env: Environment,
+        arguments: TrainArguments,
+        folder: RunFolder,
+        started: float,
+        mesh: Mesh | None = None,
+    ):
+        self.env, self.arguments, self.folder, self.started, self.mesh = env, arguments, folder, started, mesh
         self.config: PPOConfig = arguments.ppo
         self.evaluator = Evaluator(self._evaluation_env(), arguments.evaluation_chunk)
         self.best: dict[str, Any] = {"return": None, "iteration": 0}
@@ -59,33 +69,37 @@ class Run:
 
         Args:
           source: a checkpoint to resume, a policy to fine-tune, or None to start from scratch.
-          stopped: nonzero once the run is to end early.
+          stopped: nonzero once the run is to end early, in all processes alike.
         """
-        arguments, device = self.arguments, jax.devices()[0]
-        with Display(f"{arguments.task} on {device.device_kind}, {self.env.backend}") as display:
+        arguments, device = self.arguments, jax.devices()[0].device_kind
+        if self.mesh is not None:
+            device = f"{self.mesh.size} x {device}"
+        with Display(f"{arguments.task} on {device}, {self.env.backend}", not processes.is_first()) as display:
             display.note(
                 f"{self.folder.path}: {arguments.task}, {self.config.num_envs} environments, "
-                f"{self.env.backend} physics on {device.device_kind}"
+                f"{self.env.backend} physics on {device}"
             )
             display.working("compiling the training step; the second time it is read from the cache")
             state, step = self._prepare(source)
             display.note(f"compiled in {self.clock['compile_s']:.1f} s")
             display.working("first update" + (": compiling Warp's kernels" if self.env.backend == "warp" else ""))
-            log = MetricsLog(self.folder, int(state.iteration))
+            log = MetricsLog(self.folder, int(state.iteration)) if processes.is_first() else None
             try:
                 self._loop(state, step, display, log, stopped)
             finally:
-                log.close()
+                if log:
+                    log.close()
 
     def _prepare(self, source: checkpoint.Checkpoint | Policy | None) -> tuple[TrainState, Callable]:
         """The state to start from and the compiled training step."""
-        training = make_train(self.env, self.config, self.arguments.curriculum)
+        training = make_train(self.env, self.config, self.arguments.curriculum, self.mesh)
         key, begin = jax.random.key(self.arguments.seed), time.perf_counter()
         shapes = training.shapes(key)
         # One core compiles and runs `init` while another traces the step.
         with ThreadPoolExecutor(1) as aside:
             if isinstance(source, checkpoint.Checkpoint):
-                state = jax.tree.map(jnp.copy, checkpoint.restore(source, shapes))
+                state = checkpoint.restore(source, shapes)
+                state = place(state, shapes) if self.mesh is not None else jax.tree.map(jnp.copy, state)
                 progress = source.content["progress"]
                 self.best, self.seconds_before = progress["best"], progress["seconds"]
             else:
@@ -101,23 +115,31 @@ class Run:
                 state = fresh.result()
                 if source:
                     state = initialize_from(source, self.config, state)
-                self._policy(state).save(self.folder.untrained)
+                    if self.mesh is not None:
+                        learner = place(
+                            (state.params, state.observation_stats), (shapes.params, shapes.observation_stats)
+                        )
+                        state = dataclasses.replace(state, params=learner[0], observation_stats=learner[1])
+                self._write_policy(self._policy(state), self.folder.untrained)
         self.clock["compile_s"] = time.perf_counter() - begin
         return state, step
 
     def _identity(self) -> Any:
-        """What identifies the training step's program; None for an environment without a fingerprint."""
+        """What identifies the training step's program; None for one of several devices, which is not cached, and for an
+        environment without a fingerprint."""
+        if self.mesh is not None:
+            return None
         fingerprint = getattr(self.env, "fingerprint", lambda: None)()
         return fingerprint and [fingerprint, to_dict(self.config), to_dict(self.arguments.curriculum)]
 
     def _loop(
-        self, state: TrainState, step: Callable, display: Display, log: MetricsLog, stopped: Callable[[], int]
+        self, state: TrainState, step: Callable, display: Display, log: MetricsLog | None, stopped: Callable[[], int]
     ) -> None:
         arguments, per_call = self.arguments, self.config.iterations_per_call
         iteration = first = int(state.iteration)
         begin, spent_elsewhere = time.perf_counter(), 0.0
         faults, evaluated = Faults(self.config, self.folder, self._content(), state), iteration == 0
-        while not stopped() and self._seconds_left(iteration, 1.0) > 0:
+        while not stopped() and not processes.agree(self._seconds_left(iteration, 1.0) <= 0):
             call = time.perf_counter()
             with collector_paused():
                 before = keep(state)
@@ -138,7 +160,8 @@ class Run:
             if evaluated:
                 row |= self._evaluate(state, iteration, display)
             if evaluated or iteration == first + per_call or self._due(iteration, arguments.log_every):
-                log.write(row)
+                if log:
+                    log.write(row)
                 display.show(row)
             if self._due(iteration, arguments.checkpoint_every):
                 self._save(state, iteration)
@@ -191,6 +214,8 @@ class Run:
         }
 
     def _policy(self, state: TrainState) -> Policy:
+        if self.mesh is not None:
+            state = learned(state)
         return Policy.from_training(
             self.evaluator.env,
             self.config,
@@ -213,7 +238,7 @@ class Run:
         better = self.best["return"] is None or score > self.best["return"]
         if better:
             self.best = {"return": score, "iteration": iteration}
-            policy.save(self.folder.best)
+            self._write_policy(policy, self.folder.best)
         display.note(
             f"evaluation at iteration {iteration}: held {held:.1%}, return {score:.2f}"
             f"{', the best so far' if better else ''} ({report['seconds']:.1f} s)"
@@ -222,7 +247,7 @@ class Run:
 
     def _save(self, state: TrainState, iteration: int) -> None:
         """Save a checkpoint, from which training resumes exactly, and the current policy."""
-        checkpoint.save(
+        processes.save(
             self.folder.checkpoint(iteration),
             kind="train",
             task=self.arguments.task,
@@ -232,8 +257,13 @@ class Run:
                 "progress": {"best": self.best, "seconds": self._seconds()},
             },
         )
-        self.folder.prune(self.arguments.keep_checkpoints)
-        self._policy(state).save(self.folder.last)
+        if processes.is_first():
+            self.folder.prune(self.arguments.keep_checkpoints)
+        self._write_policy(self._policy(state), self.folder.last)
+
+    def _write_policy(self, policy: Policy, path: Path) -> None:
+        if processes.is_first():
+            policy.save(path)
 
     @property
     def selected(self) -> Path:

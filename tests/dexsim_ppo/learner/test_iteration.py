@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 from tiny_env import SMALL, TinyEnv
 
-from dexsim_ppo.learner import ppo
+from dexsim_ppo.learner import ppo, update
 from dexsim_ppo.learner.curriculum import Curriculum, next_scale
 from dexsim_ppo.learner.loss import Samples
 from dexsim_ppo.learner.networks import apply_mlp, init_params
-from dexsim_ppo.learner.ppo import Learner, make_train
+from dexsim_ppo.learner.ppo import make_train
 from dexsim_ppo.learner.rollout import Decision, Rollout, bound_rewards
 from dexsim_ppo.learner.running_stats import RunningStats
+from dexsim_ppo.learner.update import Learner
 
 UPDATES = dataclasses.replace(SMALL, epochs=3, minibatches=4, kl_target=0.0)  # of 64 rows
 RATE = UPDATES.learning_rate
@@ -35,10 +36,10 @@ def updates(learner, monkeypatch):
         jax.debug.callback(lambda x: rows.append(np.asarray(x).astype(int)), batch.advantage, ordered=True)
         return jnp.sum(params.log_std), {"kl": jnp.sum(old_log_std - params.log_std)}
 
-    monkeypatch.setattr(ppo, "loss", downward)
+    monkeypatch.setattr(update, "loss", downward)
     number, action = jnp.arange(count, dtype=jnp.float32), jnp.zeros((count, 1))
     samples = Samples({}, Decision(action, action, number), number, number, number)
-    _, metrics = ppo.update(UPDATES, {}, samples, jax.random.key(1), learner)
+    _, metrics = update.update(UPDATES, {}, samples, jax.random.key(1), learner)
     jax.effects_barrier()
     return rows, metrics
 
@@ -64,7 +65,7 @@ def test_actor_and_critic_are_each_clipped_to_the_norm(learner):
     for long in ("actor", "critic"):
         grads = jax.tree.map(lambda x: jnp.full_like(x, 1e-3), learner.params)
         grads = dataclasses.replace(grads, **{long: jax.tree.map(lambda x: 1e6 * x, getattr(grads, long))})
-        after, norms = ppo.apply_gradients(UPDATES, learner, grads)
+        after, norms = update.apply_gradients(UPDATES, learner, grads)
         for part in ("actor", "critic"):
             moments = np.concatenate([np.ravel(x) for x in jax.tree.leaves(getattr(after.adam.mean, part))])
             if part == long:
@@ -76,7 +77,7 @@ def test_actor_and_critic_are_each_clipped_to_the_norm(learner):
 
 def test_a_critic_that_learns_first_does_so_at_the_largest_rate(learner):
     config = dataclasses.replace(UPDATES, critic_first=1)
-    after, _ = ppo.apply_gradients(config, learner, jax.tree.map(jnp.ones_like, learner.params))
+    after, _ = update.apply_gradients(config, learner, jax.tree.map(jnp.ones_like, learner.params))
     moved = jax.tree.map(lambda new, old: np.asarray(old - new), after.params, learner.params)
     for leaf in jax.tree.leaves(moved.critic):  # Adam's first step is the rate.
         np.testing.assert_allclose(leaf, config.learning_rate_max, rtol=1e-2)

@@ -10,10 +10,12 @@ import pytest
 from tiny_env import CONFIG, SMALL, TinyEnv
 
 from dexsim.core.pytree import choose
-from dexsim_ppo.learner import ppo
+from dexsim_ppo.learner import ppo, update
 from dexsim_ppo.learner.distribution import log_prob as gaussian_log_prob
-from dexsim_ppo.learner.ppo import Learner, make_train
+from dexsim_ppo.learner.loss import loss
+from dexsim_ppo.learner.ppo import make_train
 from dexsim_ppo.learner.rollout import Decision, collect, scan_restarting
+from dexsim_ppo.learner.update import Learner
 
 
 @pytest.mark.slow
@@ -48,7 +50,7 @@ def test_ratio_is_one_before_the_first_gradient(distribution, normalize_value):
         _, params, samples = ppo.prepare(config, state.value_stats, state.params, rollout)
         mean = ppo.actor_mean(config, params, normalizers, samples.obs)
         value = ppo.critic_value(config, params, normalizers, samples.obs)
-        _, metrics = ppo.loss(params, config, normalizers, samples, params.log_std)
+        _, metrics = loss(params, config, normalizers, samples, params.log_std)
         return samples, mean, value, metrics
 
     samples, mean, value, metrics = first_loss(state)
@@ -91,10 +93,10 @@ def test_a_gradient_that_is_not_finite_is_skipped_and_counted():
     learner = Learner(state.params, state.adam, state.learning_rate, state.skipped_updates)
     grads = jax.tree.map(jnp.ones_like, state.params)
     bad = dataclasses.replace(grads, log_std=jnp.full_like(grads.log_std, jnp.nan))
-    after, _ = ppo.apply_gradients(SMALL, learner, bad)
+    after, _ = update.apply_gradients(SMALL, learner, bad)
     assert int(after.skipped_updates) == 1
     jax.tree.map(np.testing.assert_array_equal, after.params, state.params)
-    after, _ = ppo.apply_gradients(SMALL, after, grads)
+    after, _ = update.apply_gradients(SMALL, after, grads)
     assert int(after.skipped_updates) == 1
     assert not np.array_equal(after.params.log_std, state.params.log_std)
 
@@ -106,7 +108,7 @@ def test_log_std_stays_between_floor_and_cap():
         learner = Learner(state.params, state.adam, state.learning_rate, state.skipped_updates)
         grads = jax.tree.map(lambda x, sign=sign: jnp.full_like(x, 100 * sign), state.params)
         for _ in range(5):
-            learner, _ = ppo.apply_gradients(config, learner, grads)
+            learner, _ = update.apply_gradients(config, learner, grads)
         np.testing.assert_allclose(jnp.exp(learner.params.log_std), bound, rtol=1e-5)
 
 

@@ -14,9 +14,9 @@ from dexsim_ppo.learner import adam, distribution, running_stats
 from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.gae import compute_gae
 from dexsim_ppo.learner.networks import apply_mlp, init_mlp, rescale_output
-from dexsim_ppo.learner.ppo import adapt_learning_rate
 from dexsim_ppo.learner.running_stats import RunningStats, init_stats, make_normalizer, normalize, update_stats
 from dexsim_ppo.learner.types import Field
+from dexsim_ppo.learner.update import adapt_learning_rate
 
 
 def gae(reward, value, next_value, terminated, truncated, discount=0.5, gae_lambda=0.5):

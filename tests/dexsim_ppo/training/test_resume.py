@@ -79,7 +79,7 @@ def test_only_budget_and_what_looks_on_may_change(finished):
             allowed.add(field.name)
     assert allowed == {
         *("checkpoint_every", "evaluate_every", "evaluation_chunk", "evaluation_episodes", "keep_checkpoints"),
-        *("log_every", "minutes", "resume", "steps", "video"),
+        *("devices", "log_every", "minutes", "resume", "steps", "video"),
     }
 
 

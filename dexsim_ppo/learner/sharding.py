@@ -1,0 +1,111 @@
+"""Environments spread over several devices: which arrays are split, which are copied to all.
+
+The environments [B] are split over one mesh axis, all else is the same everywhere. Only the environments' own
+functions run under `shard_map`, since physics engines are opaque to XLA; sums over all environments are XLA's to
+place. So an iteration is the same arithmetic on any number of devices, up to the order of sums.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
+
+from dexsim.core.compilation import jit
+from dexsim.core.errors import ConfigError
+from dexsim_ppo.learner.config import PPOConfig
+
+AXIS = "devices"
+Tree = TypeVar("Tree")
+
+
+def make_mesh(devices: int, config: PPOConfig) -> Mesh | None:
+    """The devices to train on; None for one device of one process, which needs no mesh.
+
+    Args:
+      devices: how many, of all processes together; 0 for all that there are.
+
+    Raises:
+      ConfigError: there are fewer, some process would have none, or environments or minibatches do not divide by them.
+    """
+    found = jax.devices()
+    count = devices or len(found)
+    if count > len(found) or (jax.process_count() > 1 and count < len(found)):
+        raise ConfigError(
+            f"TrainArguments.devices = {devices}: there are {len(found)}, in {jax.process_count()} processes"
+        )
+    for name, size in (
+        ("num_envs", config.num_envs),
+        ("minibatches", config.steps_per_iteration // config.minibatches),
+    ):
+        if size % count:
+            what = "must be a multiple of" if name == "num_envs" else f"leaves {size} steps each, no multiple of"
+            raise ConfigError(f"PPOConfig.{name} = {getattr(config, name)}: {what} the {count} devices")
+    if count == 1:
+        return None
+    return jax.make_mesh((count,), (AXIS,), axis_types=(AxisType.Auto,), devices=found[:count])
+
+
+def batched(function: Callable, mesh: Mesh | None) -> Callable:
+    """`jax.vmap(function)` whose batch is split over the mesh; arguments and results are [B, ...]."""
+    if mesh is None:
+        return jax.vmap(function)
+    split = PartitionSpec(AXIS)
+    return jax.shard_map(jax.vmap(function), mesh=mesh, in_specs=split, out_specs=split, check_vma=False)
+
+
+def copied(tree: Tree, mesh: Mesh | None) -> Tree:
+    """The whole `tree` on every device."""
+    return tree if mesh is None else jax.lax.with_sharding_constraint(tree, NamedSharding(mesh, PartitionSpec()))
+
+
+def split_rows(tree: Tree, mesh: Mesh | None) -> Tree:
+    """Arrays [N, ...] of which every device has N / devices rows."""
+    return tree if mesh is None else jax.lax.with_sharding_constraint(tree, NamedSharding(mesh, PartitionSpec(AXIS)))
+
+
+def shardings(state: Any, mesh: Mesh) -> Any:
+    """The sharding of each array of a `TrainState`: the environments' are split, all others copied."""
+    whole, split = (NamedSharding(mesh, spec) for spec in (PartitionSpec(), PartitionSpec(AXIS)))
+    found = jax.tree.map(lambda _: whole, state)
+    return dataclasses.replace(found, env_state=jax.tree.map(lambda _: split, state.env_state))
+
+
+def start_on(mesh: Mesh, init: Callable[[jax.Array], Any], shapes: Callable[[jax.Array], Any]) -> Callable:
+    """`init(key) -> TrainState`, compiled for the devices of a mesh."""
+
+    def begin(key: jax.Array) -> Any:
+        start = jit(
+            lambda data: init(jax.random.wrap_key_data(data)),
+            once=True,
+            out_shardings=shardings(shapes(key), mesh),
+        )
+        return start(np.asarray(jax.random.key_data(key)))  # plain numbers are the same array for all processes
+
+    return begin
+
+
+def spanned(state: Any) -> Mesh:
+    """The mesh that a `TrainState` is on."""
+    return state.iteration.sharding.mesh
+
+
+def learned(state: Any) -> Any:
+    """A `TrainState` without its environments, as arrays of this process, whatever devices it is on."""
+    return jax.device_get(dataclasses.replace(state, env_state=None, key=None))
+
+
+def place(tree: Tree, like: Any) -> Tree:
+    """A copy of `tree`, which every process has whole, as arrays sharded as those of `like`."""
+    keys = [jnp.issubdtype(x.dtype, jax.dtypes.prng_key) for x in jax.tree.leaves(tree)]
+    leaves, structure = jax.tree.flatten(tree)
+    plain = [np.asarray(jax.random.key_data(x) if key else x) for x, key in zip(leaves, keys, strict=True)]
+
+    def typed(plain: list[jax.Array]) -> Tree:
+        found = [jax.random.wrap_key_data(x) if key else jnp.copy(x) for x, key in zip(plain, keys, strict=True)]
+        return jax.tree.unflatten(structure, found)
+
+    return jax.jit(typed, out_shardings=jax.tree.map(lambda x: x.sharding, like))(plain)

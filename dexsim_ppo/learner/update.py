@@ -1,0 +1,103 @@
+"""The update: epochs over shuffled minibatches, gradient clipping, the adaptive learning rate."""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.sharding import Mesh
+
+from dexsim_ppo.learner import adam
+from dexsim_ppo.learner.adam import AdamState
+from dexsim_ppo.learner.config import PPOConfig
+from dexsim_ppo.learner.loss import Metrics, Samples, loss
+from dexsim_ppo.learner.networks import Params
+from dexsim_ppo.learner.running_stats import Normalizer
+from dexsim_ppo.learner.sharding import copied, split_rows
+
+
+class Learner(NamedTuple):
+    """What the minibatch loop carries."""
+
+    params: Params
+    adam: AdamState
+    learning_rate: jax.Array
+    skipped_updates: jax.Array
+
+
+def update(
+    config: PPOConfig,
+    normalizers: dict[str, Normalizer],
+    samples: Samples,
+    key: jax.Array,
+    learner: Learner,
+    mesh: Mesh | None = None,
+) -> tuple[Learner, Metrics]:
+    """All epochs over shuffled minibatches, then the learning rate of the next iteration.
+
+    Metrics are means over all minibatches, except the KL divergence: its mean over the last epoch.
+    """
+    rows = config.steps_per_iteration
+    keys = jax.random.split(key, config.epochs)
+    order = jax.vmap(lambda key: jax.random.permutation(key, rows))(keys)
+    order = order.reshape(config.epochs * config.minibatches, rows // config.minibatches)
+    old_log_std, moves = learner.params.log_std, actor_learns(config, learner)
+
+    # A minibatch has rows from all devices, in one order whatever their number. Sending all rows to all devices once
+    # is cheaper than sending those of every minibatch.
+    samples = copied(samples, mesh)
+
+    def minibatch(learner, indices):
+        indices = split_rows(indices, mesh)
+        batch = split_rows(jax.tree.map(lambda x: x[indices], samples), mesh)
+        grads, metrics = jax.grad(loss, has_aux=True)(learner.params, config, normalizers, batch, old_log_std)
+        learner, norms = apply_gradients(config, learner, grads)
+        return learner, metrics | norms
+
+    learner, metrics = jax.lax.scan(minibatch, learner, order)
+    last_epoch = metrics["kl"][-config.minibatches :]
+    metrics = jax.tree.map(jnp.nanmean, metrics) | {"kl": jnp.nanmean(last_epoch)}
+    rate = adapt_learning_rate(config, learner.learning_rate, metrics["kl"])
+    if config.critic_first:  # A policy that does not move says nothing about the rate.
+        rate = jnp.where(moves, rate, learner.learning_rate)
+    return learner._replace(learning_rate=rate), metrics
+
+
+def apply_gradients(config: PPOConfig, learner: Learner, grads: Params) -> tuple[Learner, Metrics]:
+    """Clip the gradients and step. A minibatch whose gradient is not finite is skipped and counted."""
+    actor_grads, actor_norm = adam.clip_by_global_norm((grads.actor, grads.log_std), config.max_grad_norm)
+    critic_grads, critic_norm = adam.clip_by_global_norm(grads.critic, config.max_grad_norm)
+    rate, moves = learner.learning_rate, actor_learns(config, learner)
+    if config.critic_first:
+        rate = jnp.where(moves, rate, config.learning_rate_max)
+    params, moments = adam.update(Params(*actor_grads, critic_grads), learner.adam, learner.params, rate)
+    # Projected after the step, not clipped in the loss: beyond a clip the gradient is zero, and it could not return.
+    log_std = jnp.clip(params.log_std, jnp.log(config.std_min), jnp.log(config.std_max))
+    params = Params(params.actor, log_std, params.critic)
+    if config.critic_first:  # Adam's moments already follow the gradient, so that the actor's first step is small.
+        held = jax.tree.map(functools.partial(jnp.where, moves), params, learner.params)
+        params = Params(held.actor, held.log_std, params.critic)
+    ok = jnp.isfinite(actor_norm) & jnp.isfinite(critic_norm)
+    new = learner._replace(params=params, adam=moments)
+    learner = jax.tree.map(functools.partial(jnp.where, ok), new, learner)
+    skipped = learner.skipped_updates + (1 - ok.astype(jnp.int32))
+    return learner._replace(skipped_updates=skipped), {"actor_grad_norm": actor_norm, "critic_grad_norm": critic_norm}
+
+
+def actor_learns(config: PPOConfig, learner: Learner) -> jax.Array:
+    """Whether the initial iterations for the critic alone are over: bool []."""
+    return learner.adam.count >= config.critic_first * config.epochs * config.minibatches
+
+
+def adapt_learning_rate(config: PPOConfig, rate: jax.Array, kl: jax.Array) -> jax.Array:
+    """The next learning rate []: lower above twice the target KL, higher below half of it, within its bounds.
+
+    `kl` [] measures the whole iteration. Adapting after every minibatch would overshoot: once beyond the
+    target, each further minibatch of the iteration would lower the rate again.
+    """
+    if config.kl_target == 0:
+        return rate
+    slower = jnp.maximum(rate / 1.5, config.learning_rate_min)
+    faster = jnp.minimum(rate * 1.5, config.learning_rate_max)
+    rate = jnp.where(kl > 2 * config.kl_target, slower, rate)
+    return jnp.where(kl < 0.5 * config.kl_target, faster, rate)

@@ -1,0 +1,69 @@
+"""Training on several devices is the training on one, up to the order of sums."""
+
+import dataclasses
+import os
+import subprocess
+import sys
+
+import jax
+import numpy as np
+import pytest
+from paths import ROOT
+from tiny_env import SMALL, TinyEnv
+
+from dexsim.core.errors import ConfigError
+from dexsim_ppo.learner.ppo import make_train
+from dexsim_ppo.learner.sharding import make_mesh
+
+CONFIG = dataclasses.replace(SMALL, num_envs=16, iterations_per_call=10)
+
+
+def trained(devices):
+    """All numbers of the state after 20 iterations, and how many devices hold the environments."""
+    training = make_train(TinyEnv(), CONFIG, mesh=make_mesh(devices, CONFIG))
+    state = training.init(jax.random.key(0))
+    for _ in range(2):
+        state, _ = training.step(state)
+    used = len(state.env_state.x.sharding.device_set)
+    state = dataclasses.replace(state, key=jax.random.key_data(state.key))
+    state = dataclasses.replace(
+        state, env_state=dataclasses.replace(state.env_state, key=jax.random.key_data(state.env_state.key))
+    )
+    return [np.asarray(leaf) for leaf in jax.tree.leaves(state)], used
+
+
+def test_one_two_and_eight_devices_agree_and_each_repeats_itself_to_the_bit(tmp_path):
+    """In a process with eight devices, against the training without a mesh in this one."""
+    done = subprocess.run(
+        [sys.executable, __file__, str(tmp_path)],
+        env={
+            **os.environ,
+            "PYTHONPATH": f"{ROOT}:{ROOT / 'tests/support'}",
+            "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=8",
+        },
+        capture_output=True,
+        text=True,
+        timeout=200,
+    )
+    assert done.returncode == 0, done.stderr
+    alone, used = trained(1)
+    assert used == 1
+    for devices in (2, 8):
+        first, again = (np.load(tmp_path / f"{devices}-{i}.npz") for i in range(2))
+        assert int(first["used"]) == devices
+        for i, leaf in enumerate(alone):
+            np.testing.assert_allclose(first[str(i)], leaf, rtol=2e-3, atol=2e-4)
+            np.testing.assert_array_equal(again[str(i)], first[str(i)])
+
+
+def test_what_does_not_divide_is_refused():
+    with pytest.raises(ConfigError, match=r"TrainArguments\.devices = 4096: there are"):
+        make_mesh(4096, CONFIG)
+    assert make_mesh(1, CONFIG) is None
+
+
+if __name__ == "__main__":
+    for devices in (2, 8):
+        for i in range(2):
+            leaves, used = trained(devices)
+            np.savez(f"{sys.argv[1]}/{devices}-{i}.npz", used=used, **{str(k): leaf for k, leaf in enumerate(leaves)})

@@ -1,0 +1,54 @@
+"""Several seeds in one command: each is the training that it would be alone, and the report has their spread."""
+
+import json
+
+import numpy as np
+import pytest
+import tiny_train
+
+from dexsim.core.errors import ConfigError
+from dexsim_ppo import train
+from dexsim_ppo.policy import Policy
+from dexsim_ppo.training.seeds import band, spread
+
+OPTIONS = "--task tiny --preset cpu --no-video --ppo.num-envs 16 --ppo.rollout-length 8 --ppo.actor-layers 8".split()
+OPTIONS += "--ppo.critic-layers 8 --evaluation-chunk 16 --evaluation-episodes 16 --log-every 1 --steps 512".split()
+
+
+@pytest.fixture(autouse=True)
+def tiny_task(monkeypatch):
+    tiny_train.install(monkeypatch)
+
+
+def test_each_seed_is_its_own_training_and_the_report_has_their_spread(tmp_path):
+    path = tmp_path / "both"
+    assert train.main([*OPTIONS, "--seed", "4", "--seeds", "2", "--run-dir", str(path)]) == 0
+    assert train.main([*OPTIONS, "--seed", "5", "--run-dir", str(tmp_path / "alone")]) == 0
+    report = json.loads((path / "report.json").read_text())
+    assert report["seeds"] == [4, 5] and (path / "curve.png").stat().st_size > 1000
+    alone = json.loads((tmp_path / "alone/report.json").read_text())
+    returns = report["trained"]["return"]
+    assert returns["values"][1] == alone["trained"]["return"]["value"] != returns["values"][0]
+    assert returns["mean"] == pytest.approx(np.mean(returns["values"]))
+    kernels = [np.asarray(Policy.load(path / file).params.layers[0].kernel) for file in report["policies"].values()]
+    np.testing.assert_array_equal(
+        kernels[1], np.asarray(Policy.load(tmp_path / "alone/last.msgpack").params.layers[0].kernel)
+    )
+    assert not np.array_equal(*kernels)
+    with pytest.raises(ConfigError, match="--seeds 2: a resumed run keeps its 1"):
+        train.main(["--resume", str(path / "seed-4"), "--seeds", "2"])
+
+
+def test_python_trains_one_seed_at_a_time():
+    with pytest.raises(ConfigError, match=r"train_policy\(seeds=3\)"):
+        train.train_policy("tiny", preset="cpu", seeds=3)
+
+
+def test_spread_and_band_in_closed_form():
+    assert spread([1.0, 3.0]) == {"mean": 2.0, "std": 2**0.5, "min": 1.0, "max": 3.0, "values": [1.0, 3.0]}
+    runs = [
+        [{"env_steps": 10, "x": 1.0}, {"env_steps": 20, "x": 5.0}, {"env_steps": 30, "x": 5.0}],
+        [{"env_steps": 10, "x": 3.0}, {"env_steps": 20, "x": None}, {"env_steps": 30, "x": float("nan")}],
+    ]
+    np.testing.assert_array_equal(band(runs, "x"), [[10], [1], [2], [3]])
+    assert band(runs, "absent").size == 0
