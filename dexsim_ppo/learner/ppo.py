@@ -21,7 +21,7 @@ from dexsim_ppo.learner import adam, distribution
 from dexsim_ppo.learner.adam import AdamState
 from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.curriculum import Curriculum, next_scale
-from dexsim_ppo.learner.gae import compute_gae
+from dexsim_ppo.learner.gae import compute_gae, explained_variance
 from dexsim_ppo.learner.loss import Metrics, Samples, actor_mean, critic_value
 from dexsim_ppo.learner.networks import Params, init_params, rescale_output
 from dexsim_ppo.learner.rollout import Decision, Rollout, bound_rewards, collect
@@ -171,7 +171,7 @@ def train_iteration(
         mesh,
     )
     metrics |= update_metrics | {
-        "explained_variance": 1 - jnp.var(samples.target - samples.value) / jnp.var(samples.target),
+        "explained_variance": explained_variance(samples.target, samples.value),
         "action_std": jnp.mean(jnp.exp(learner.params.log_std)),
         "learning_rate": learner.learning_rate,
         "skipped_updates": learner.skipped_updates,

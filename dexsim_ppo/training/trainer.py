@@ -35,6 +35,16 @@ from dexsim_ppo.training.runlog import MetricsLog, RunFolder, draw_curve, read_m
 SELECTION_SEED, REPORT_SEED = 2**32 - 1, 0
 
 
+def due(iteration: int, per_call: int, every: int) -> bool:
+    """Whether a call of `per_call` iterations that ended at `iteration` passed a multiple of `every`; 0 is never."""
+    return every > 0 and iteration // every > (iteration - per_call) // every
+
+
+def surely_better(trained: dict[str, Any], untrained: dict[str, Any]) -> dict[str, bool]:
+    """Which headline figures of the trained policy lie above those of the untrained one, interval above interval."""
+    return {name: trained[name]["low"] > untrained[name]["high"] for name in ("held", "return", "steps_held")}
+
+
 class Run:
     """One training run. `train` and then `finish` leave everything in its folder."""
 
@@ -139,7 +149,7 @@ class Run:
         iteration = first = int(state.iteration)
         begin, spent_elsewhere = time.perf_counter(), 0.0
         faults, evaluated = Faults(self.config, self.folder, self._content(), state), iteration == 0
-        while not stopped() and not processes.agree(self._seconds_left(iteration, 1.0) <= 0):
+        while not stopped() and not processes.agree(self.seconds_left(iteration, 1.0) <= 0):
             call = time.perf_counter()
             with collector_paused():
                 before = keep(state)
@@ -156,14 +166,14 @@ class Run:
             row |= faults.check(before, metrics, iteration, display.note)
             del before
             row |= self._progress(iteration, now - call)
-            evaluated = self._due(iteration, arguments.evaluate_every)
+            evaluated = due(iteration, per_call, arguments.evaluate_every)
             if evaluated:
                 row |= self._evaluate(state, iteration, display)
-            if evaluated or iteration == first + per_call or self._due(iteration, arguments.log_every):
+            if evaluated or iteration == first + per_call or due(iteration, per_call, arguments.log_every):
                 if log:
                     log.write(row)
                 display.show(row)
-            if self._due(iteration, arguments.checkpoint_every):
+            if due(iteration, per_call, arguments.checkpoint_every):
                 self._save(state, iteration)
             spent_elsewhere += time.perf_counter() - now
         self.clock["training_s"] = time.perf_counter() - begin
@@ -176,15 +186,11 @@ class Run:
             self._evaluate(state, iteration, display)
         self._save(state, iteration)
 
-    def _due(self, iteration: int, every: int) -> bool:
-        """Whether the call that ended at `iteration` passed a multiple of `every`; 0 is never."""
-        return every > 0 and iteration // every > (iteration - self.config.iterations_per_call) // every
-
     def _seconds(self) -> float:
         """Wall-clock time of the whole run, including that before a resume, s."""
         return self.seconds_before + time.perf_counter() - self.started
 
-    def _seconds_left(self, iteration: int, env_steps_per_s: float) -> float:
+    def seconds_left(self, iteration: int, env_steps_per_s: float) -> float:
         """Time until the first budget is used up, s; infinite without a budget."""
         steps, minutes = self.arguments.steps, self.arguments.minutes
         left = [float("inf")]
@@ -201,7 +207,7 @@ class Run:
             "env_steps": iteration * self.config.steps_per_iteration,
             "seconds": self._seconds(),
             "env_steps_per_s": rate,
-            "seconds_left": self._seconds_left(iteration, rate),
+            "seconds_left": self.seconds_left(iteration, rate),
         }
 
     def _content(self) -> dict[str, Any]:
@@ -294,10 +300,7 @@ class Run:
             "backend": self.env.backend,
             "seed": arguments.seed,
             **reports,
-            "better": {
-                name: reports["trained"][name]["low"] > reports["untrained"][name]["high"]
-                for name in ("held", "return", "steps_held")
-            },
+            "better": surely_better(reports["trained"], reports["untrained"]),
             "command": command,
             "arguments": printable(arguments),
             "timing": self.clock,

@@ -267,6 +267,16 @@ class TestReward:
         assert float(lost["reward/overload"]) == 0.0
         assert GraspReward().overload == 0.0, "off unless asked for"
 
+    def test_a_finger_whose_root_joint_does_not_pull_earns_no_torque_reward(self, hand, task):
+        force = np.zeros((5, 3))
+        force[2, 1] = 3.0
+        torque = np.zeros(12)
+        for pull, earned in ((0.0, False), (0.009, False), (0.02, True)):
+            torque[hand.root_joint] = pull
+            truth = make_moment(hand, finger_force=force, joint_torque=torque)
+            _, metrics = task.reward(goal_of(0.0), truth, jnp.zeros((), bool))
+            assert (float(metrics["reward/torque"]) > 0) == earned
+
     def test_the_torque_target_goes_with_the_force_target(self, hand, task):
         """At force_per_torque = 19 N/Nm a finger on its force target is on its torque target."""
         for command in COMMANDS:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from dexsim.core.errors import ConfigError
 from dexsim_ppo.learner import adam, distribution, running_stats
 from dexsim_ppo.learner.config import PPOConfig
-from dexsim_ppo.learner.gae import compute_gae
+from dexsim_ppo.learner.gae import compute_gae, explained_variance
 from dexsim_ppo.learner.networks import apply_mlp, init_mlp, rescale_output
 from dexsim_ppo.learner.running_stats import RunningStats, init_stats, make_normalizer, normalize, update_stats
 from dexsim_ppo.learner.types import Field
@@ -33,6 +33,13 @@ def gae(reward, value, next_value, terminated, truncated, discount=0.5, gae_lamb
     )
     np.testing.assert_allclose(target[:, 0], np.asarray(advantage[:, 0]) + np.asarray(value), rtol=1e-6)
     return np.asarray(advantage[:, 0])
+
+
+def test_explained_variance_is_relative_to_the_returns():
+    target = jnp.array([0.0, 2.0, 4.0])
+    assert float(explained_variance(target, jnp.array([1.0, 2.0, 3.0]))) == pytest.approx(0.75)
+    assert float(explained_variance(target, target)) == 1.0
+    assert float(explained_variance(target, jnp.array([4.0, 2.0, 0.0]))) == pytest.approx(-3.0)
 
 
 class TestGAE:

@@ -94,6 +94,16 @@ def test_what_tells_programs_apart(monkeypatch):
     assert key(["x"], SHAPES) != base
 
 
+def test_the_newest_programs_are_kept(folder, monkeypatch):
+    monkeypatch.setattr(programs, "KEPT", 2)
+    for age, name in enumerate(("one", "two", "three")):
+        run(name)
+        for path in folder.glob("*.pkl"):
+            os.utime(path, (path.stat().st_atime, path.stat().st_mtime - 100 * (age < 2)))
+    assert len(list(folder.glob("*.pkl"))) == 2
+    assert not run("three")[1] and not run("two")[1] and run("one")[1]
+
+
 @pytest.mark.parametrize("harm", [lambda content: content[: len(content) // 2], lambda content: b"x" * 99])
 def test_a_damaged_file_is_compiled_again(folder, harm):
     good, _ = run("one")

@@ -25,7 +25,7 @@ from dexsim_ppo.policy import Policy
 from dexsim_ppo.report import mean_interval, print_report, proportion, summarize
 from dexsim_ppo.training.arguments import training_config
 from dexsim_ppo.training.runlog import RunFolder, read_metrics
-from dexsim_ppo.training.trainer import SELECTION_SEED
+from dexsim_ppo.training.trainer import SELECTION_SEED, Run, due, surely_better
 
 QUICK = [
     "--task",
@@ -382,3 +382,27 @@ def test_a_signal_saves_and_says_how_to_go_on(number, tmp_path):
     assert process.returncode == 128 + number
     assert f"--resume {tmp_path / 'a'}" in out.splitlines()[-1]
     assert RunFolder(tmp_path / "a").latest_checkpoint().exists()
+
+
+@pytest.mark.parametrize(("every", "wanted"), [(6, [8, 12, 20, 24]), (4, [4, 8, 12, 16, 20, 24]), (0, []), (30, [])])
+def test_what_falls_due_amid_a_call_is_done_at_its_end(every, wanted):
+    assert [i for i in range(4, 25, 4) if due(i, 4, every)] == wanted
+
+
+def test_better_is_what_lies_above_with_its_interval():
+    low, wide, high = ({"value": v, "low": v - d, "high": v + d} for v, d in ((1.0, 0.1), (1.3, 0.4), (2.0, 0.2)))
+    trained = {"held": wide, "return": high, "steps_held": low}
+    assert surely_better(trained, {"held": low, "return": low, "steps_held": low}) == {
+        "held": False,
+        "return": True,
+        "steps_held": False,
+    }
+
+
+def test_time_spent_before_a_resume_counts(tmp_path, monkeypatch):
+    tiny_train.install(monkeypatch)
+    arguments = train.parse_arguments([*QUICK, "--minutes", "1"])[0]
+    trainer = Run(TinyEnv(), arguments, RunFolder(tmp_path), time.perf_counter())
+    assert 55 < trainer.seconds_left(0, 1e3) <= 60
+    trainer.seconds_before = 50.0
+    assert 5 < trainer.seconds_left(0, 1e3) <= 10
