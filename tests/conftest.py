@@ -36,6 +36,8 @@ if not ON_GPU and "PYTEST_XDIST_WORKER" not in os.environ:
             env={**os.environ, "XLA_FLAGS": wanted},
         ).returncode:
             os.environ["XLA_FLAGS"] = wanted
+    # Programs of tests run for less time than they take to compile.
+    os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "").replace("optimization_level=1", "optimization_level=0")
 
 import hypothesis  # noqa: E402
 import jax  # noqa: E402
@@ -47,6 +49,11 @@ hypothesis.settings.load_profile("dexsim")
 # These begin: two processes share the files, and the longest would otherwise be what one of them ends alone with.
 LONGEST = (
     "test_notebook",
+    "test_paper",
+    "test_devices",
+    "test_own_task",
+    "test_touch_geometry",
+    "test_trials",
     "test_env",
     "test_brax",
     "test_warp",
