@@ -28,7 +28,7 @@ FLOORS = {
         ("env",),
         ("tasks",),
         ("registry",),
-        ("randomization_check", "wrappers"),
+        ("check_hand", "randomization_check", "wrappers"),
         ("view",),
         ("__main__",),
         ("",),

@@ -1,0 +1,43 @@
+"""The contract of a hand's files."""
+
+import shutil
+
+import numpy as np
+import pytest
+
+from dexsim import check_hand
+from dexsim.core.assets import asset_path
+from dexsim.core.errors import AssetError
+from dexsim.hand.load import load_hand
+
+
+@pytest.fixture
+def folder(tmp_path):
+    shutil.copytree(asset_path("hand/xhand_right.toml").parent, tmp_path, dirs_exist_ok=True)
+    return tmp_path
+
+
+def test_shipped_hand_passes(capsys):
+    assert check_hand.main([str(asset_path("hand/xhand_right.toml"))]) == 0
+    out = capsys.readouterr().out
+    assert "12 joints, 5 fingers of 120 taxels" in out and out.count("ok  ") == 4 and "FAIL" not in out
+
+
+def test_wrong_link_is_named(folder):
+    hand = load_hand(folder / "xhand_right.toml")
+    hand.body_position[-1, 0] += np.float32(0.001)
+    with pytest.raises(AssetError, match=r"right_hand_pinky_link2.* is 1 mm"):
+        check_hand.check_kinematics(hand)
+
+
+def test_tip_without_primitive_fails(folder, capsys):
+    model = folder / "xhand_right.xml"
+    model.write_text(model.read_text().replace('name="index_pad" class="pad"', 'name="index_pad" class="shell"'))
+    assert check_hand.main([str(folder / "xhand_right.toml")]) == 1
+    out = capsys.readouterr().out
+    assert "FAIL  fingertips touch" in out and "finger 'index'" in out
+
+
+def test_missing_file_is_one_line(tmp_path, capsys):
+    assert check_hand.main([str(tmp_path / "none.toml")]) == 1
+    assert capsys.readouterr().out.count("\n") == 1
