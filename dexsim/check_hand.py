@@ -5,14 +5,16 @@ python -m dexsim.check_hand my_hand.toml
 
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
 import mujoco
 import numpy as np
+import tyro
 
 from dexsim.core import cli
-from dexsim.core.errors import AssetError, ConfigError
+from dexsim.core.errors import AssetError
 from dexsim.hand.kinematics import Hand, forward_kinematics
 from dexsim.hand.layout import check_hand as check_taxels
 from dexsim.hand.load import load_hand
@@ -81,15 +83,23 @@ def report(path: Path) -> tuple[list[str], bool]:
     return lines, passed
 
 
+@dataclass(frozen=True, kw_only=True)
+class CheckHandArguments:
+    """Options of `python -m dexsim.check_hand`."""
+
+    hand: Annotated[Path, tyro.conf.Positional]
+    """The TOML of a hand."""
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """The command. Returns 0 if the hand passes, else 1."""
-    arguments: list[Any] = list(sys.argv[1:] if argv is None else argv)
-    if arguments in (["-h"], ["--help"]):
-        print("usage: python -m dexsim.check_hand FILE\n\nCheck the TOML of a hand and the files that it names.")
-        return 0
-    if len(arguments) != 1:
-        raise ConfigError("check_hand takes one file: python -m dexsim.check_hand my_hand.toml")
-    lines, passed = report(Path(arguments[0]))
+    arguments = cli.parse(
+        CheckHandArguments,
+        sys.argv[1:] if argv is None else argv,
+        prog="python -m dexsim.check_hand",
+        description="Check the TOML of a hand and the files that it names.",
+    )
+    lines, passed = report(arguments.hand)
     print("\n".join(lines))
     return 0 if passed else 1
 

@@ -35,6 +35,7 @@ COMMANDS = {
     "dexsim_real.calibrate": "dexsim_real.calibrate.options:CalibrateArguments",
     "dexsim_real.twin": "dexsim_real.twin.options:TwinArguments",
     "dexsim_real.replay": "dexsim_real.replay.__main__:ReplayArguments",
+    "dexsim.check_hand": "dexsim.check_hand:CheckHandArguments",
     "dexsim.view": "dexsim.view.__main__:ViewArguments",
     "dexsim.randomization_check": "dexsim.randomization_check.__main__:CheckArguments",
 }
