@@ -36,8 +36,6 @@ if not ON_GPU and "PYTEST_XDIST_WORKER" not in os.environ:
             env={**os.environ, "XLA_FLAGS": wanted},
         ).returncode:
             os.environ["XLA_FLAGS"] = wanted
-    # Programs of tests run for less time than they take to compile.
-    os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "").replace("optimization_level=1", "optimization_level=0")
 
 import hypothesis  # noqa: E402
 import jax  # noqa: E402

@@ -88,6 +88,7 @@ def test_two_devices_train_and_one_goes_on(alone, tmp_path):
     assert_same_training(RunFolder(tmp_path / "run"), alone)
 
 
+@pytest.mark.long
 def test_one_device_begins_and_two_go_on(alone, tmp_path):
     half = ["--steps", str(ITERATIONS * 16 * 8 // 2)]
     assert train.main([*OPTIONS, *half, "--run-dir", str(tmp_path / "run")]) == 0
