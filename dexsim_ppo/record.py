@@ -40,7 +40,7 @@ def record(policy: Policy, env: Any, *, episodes: int, seconds: float, seed: int
         seen = {name: getattr(state.readings, name) for name in READINGS}
         return after, (seen, after.joint_target, after.terminated)
 
-    starts = env.evaluation_starts(env.evaluation_plan(episodes, seed))
+    starts = jax.jit(env.evaluation_starts)(env.evaluation_plan(episodes, seed))
     _, recorded = jax.jit(lambda state: jax.lax.scan(tick, state, None, length=ticks))(starts)
     seen, target, ended = jax.device_get(recorded)
     found = []

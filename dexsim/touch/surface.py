@@ -8,6 +8,7 @@ force: within some 5 % where a face dents an XHand's fingertip by 1 mm.
 
 import dataclasses
 
+import jax
 import numpy as np
 
 from dexsim.geometry import sdf
@@ -80,7 +81,7 @@ def _beyond(hand: Hand, finger: int, reach: float | None) -> np.ndarray:
 
 def _on_surface(points: np.ndarray, shape: sdf.Shape) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The nearest points [N, 3] of a surface, its normals [N, 3] there and how far away they are [N] m."""
-    distance, normal = (np.asarray(x) for x in sdf.distance_and_normal(points, shape))
+    distance, normal = (np.asarray(x) for x in jax.jit(sdf.distance_and_normal)(points, shape))
     return points - distance[:, None] * normal, normal, distance
 
 

@@ -46,7 +46,7 @@ def test_the_policy_makes_the_environment_that_it_was_trained_in(run):
         env = run.policy.make_env(backend="c")
         run.policy.check_env(env)
     assert env.config.gain == 3.0 and env.config.pool_size == 4
-    action = run.policy(env.reset(jax.random.key(0)).obs["actor"])
+    action = run.policy(jax.jit(env.reset)(jax.random.key(0)).obs["actor"])
     assert action.shape == (12,) and np.all(np.abs(action) <= 1)
 
 

@@ -21,7 +21,7 @@ def test_readings_and_targets_are_those_of_the_episodes(env):
     policy = load_policy("grasp")
     found = record.record(policy, env, episodes=3, seconds=0.3, seed=0)
     assert [len(one.time) for one in found] == [10, 10, 10]
-    state = env.evaluation_starts(env.evaluation_plan(3, 0))
+    state = jax.jit(env.evaluation_starts)(env.evaluation_plan(3, 0))
     step = jax.jit(jax.vmap(env.step))
     for tick in range(10):
         for i, one in enumerate(found):

@@ -116,8 +116,9 @@ def reads(env, state, forces, key=None):
 def test_a_tilted_hand_pulls_the_object_aside_and_leaves_the_orientation_alone(make):
     """The bridge aligns the IMU to a known pose of the object, so that a mount that leans is no error of the IMU."""
     env = make(Sensing(orientation=ImuConfig(bias=0.0)), Randomization(gravity_tilt=0.1))
+    draw = jax.jit(lambda key: env.reset(key).episode)
     for key in jax.random.split(jax.random.key(0), 4):
-        episode = env.reset(key).episode
+        episode = draw(key)
         push = np.asarray(env.sampler.tilt_force(episode)) / float(episode.object.mass)
         pitch, roll = np.asarray(episode.hand.tilt, np.float64)
         down = np.array([1.0, -np.tan(roll), np.tan(pitch)])

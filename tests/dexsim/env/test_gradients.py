@@ -72,7 +72,7 @@ def check_gradients(env, steps):
     assert np.all(np.any(gradient[0] != 0, axis=-1))
 
 
-@pytest.mark.parametrize("steps", [1, 10])
+@pytest.mark.parametrize("steps", [pytest.param(1, marks=pytest.mark.long), 10])
 def test_gradients_are_finite_while_fingers_touch_nothing(env, steps):
     check_gradients(env, steps)
 

@@ -20,7 +20,7 @@ RADIUS = 0.03  # m
 @pytest.fixture(scope="module")
 def contact(hand):
     """Pose, ball, its place 1 mm into the skin's reach over a taxel, and that taxel's outward normal [3]."""
-    pose = forward_kinematics(hand, jnp.asarray((hand.joint_lower + hand.joint_upper) / 2))
+    pose = jax.jit(lambda joints: forward_kinematics(hand, joints))((hand.joint_lower + hand.joint_upper) / 2)
     ball = sample_object(jax.random.key(0), GraspConfig().objects, jnp.int32(0))
     ball = dataclasses.replace(ball, size=ball.size.at[1, 0].set(RADIUS))
     taxel = 5 * 12 + 6  # in the middle of the pad
@@ -41,7 +41,7 @@ def test_it_is_the_part_along_the_skins_normal(hand, contact, total, untaxelled,
     force[FINGER] = -along * outward + across * tangent / np.linalg.norm(tangent)
     force[3] = 2.0  # touches with no skin: nobody knows how
     model = TouchModel(GraspConfig(skin=Skin(total=total, untaxelled=untaxelled)), hand)
-    felt = model.feel(pose, ball, place, jnp.array([1.0, 0, 0, 0]), jnp.asarray(force))
+    felt = jax.jit(model.feel)(pose, ball, place, jnp.array([1.0, 0, 0, 0]), jnp.asarray(force))
     wanted = np.zeros(5)
     wanted[FINGER] = max(along, 0.0)
     np.testing.assert_allclose(felt.normal_force, wanted, atol=0.25)  # the pad is round: its normals differ

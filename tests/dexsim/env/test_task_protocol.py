@@ -121,7 +121,7 @@ def test_it_runs_from_reset_to_restart(env):
 
 
 def test_it_is_evaluated_by_its_own_plan_and_report(env):
-    starts = env.evaluation_starts(env.evaluation_plan(8, 0))
+    starts = jax.jit(env.evaluation_starts)(env.evaluation_plan(8, 0))
     assert starts.reward.shape == (8,)
     report = env.summarize({}, np.array([[True, True], [True, False]]))
     assert report["headline"] == {"held": 0.5}

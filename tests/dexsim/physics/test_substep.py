@@ -301,7 +301,7 @@ def test_other_cones_are_left_to_mjx(hand):
     assert find_stepper(mjx, model, tips, max_contacts=20) is None
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_mjx_step_agrees(hand, grasp_env):
     """Both ways through a sub-step, converged, with capsules in closing hands: one answer."""
     one = SLOTS.index("capsule")

@@ -429,11 +429,9 @@ class TestObservation:
         rng = np.random.default_rng(0)
         joints, speed = rng.uniform(0, 1, 12), rng.normal(size=12)
         with double_precision():
-            twist = np.asarray(tip_twist(hand, jnp.asarray(joints), jnp.asarray(speed)))
-            poses = [
-                jax.tree.map(np.asarray, forward_kinematics(hand, jnp.asarray(joints + s * speed * 1e-6)))
-                for s in (-1, 1)
-            ]
+            twist = np.asarray(jax.jit(lambda q, v: tip_twist(hand, q, v))(joints, speed))
+            pose = jax.jit(lambda q: forward_kinematics(hand, q))
+            poses = [jax.tree.map(np.asarray, pose(joints + s * speed * 1e-6)) for s in (-1, 1)]
         linear = (poses[1].tip_position - poses[0].tip_position) / 2e-6
         np.testing.assert_allclose(twist[:, :3], linear, atol=1e-5)
         turn = [Rotation.from_matrix(np.asarray(p.tip_rotation)) for p in poses]

@@ -202,7 +202,8 @@ def test_ppo_trains_on_a_point():
     assert history[-1]["eval/avg_episode_length"] == 6
 
 
-@pytest.mark.parametrize("physics", ["simple", pytest.param("mjx", marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("physics", ["simple", "mjx"])
 def test_ppo_runs_on_grasp(physics, grasp_env, monkeypatch):
     """The task itself under brax's wrappers and learner. Its evaluations compile the task once more: the point's do."""
     env = grasp_env
