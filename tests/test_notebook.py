@@ -72,8 +72,11 @@ def test_outputs_are_of_a_whole_run(name):
     check(name, notebook)
 
 
+# What own_task trains, tests/dexsim_ppo/test_own_task.py trains too, so that it can wait for the long tests.
 @pytest.mark.slow
-@pytest.mark.parametrize("name", EXPECTED)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.long if name == "own_task" else ()) for name in EXPECTED]
+)
 def test_it_runs(name, monkeypatch):
     # The kernel is started with this process's environment; the inline backend is its own choice.
     monkeypatch.delenv("MPLBACKEND", raising=False)

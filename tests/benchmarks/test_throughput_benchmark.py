@@ -80,6 +80,7 @@ def test_replayed_torques_give_the_same_motion_and_contacts(benchmarks, simple):
             np.testing.assert_allclose(ours, theirs, atol=1e-5, rtol=1e-5, err_msg=name)
 
 
+@pytest.mark.long
 def test_hands_are_kept_or_nominal(benchmarks, simple, hand):
     throughput, _ = benchmarks
     kept = throughput.make("grasp", "redrawing", "jax", WORLDS)

@@ -76,6 +76,7 @@ def test_resuming_by_name_goes_on_where_it_stopped(run):
     assert again.policy.task == "poke"
 
 
+@pytest.mark.long
 def test_fine_tuning_begins_with_the_policy(run, tmp_path):
     tuned = train_policy(
         policy=str(run.folder / "last.msgpack"), ppo=SMALL, backend="c", steps=32, run_dir=tmp_path / "tuned", **SIZES

@@ -178,6 +178,7 @@ def test_taxels_feel_the_mesh_at_the_size_of_the_episode(simple, folder, method)
     assert error.mean() < mean and error.max() < worst
 
 
+@pytest.mark.long
 def test_an_environment_steps_with_a_mesh(simple, folder):
     objects = ObjectConfig(mesh=str(folder / "ell.obj"))
     env = dexsim.make("grasp", GraspConfig(objects=objects, pool_size=16, touch_method="grid"), backend="c")

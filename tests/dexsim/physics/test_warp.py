@@ -79,6 +79,7 @@ def test_a_sub_step_equals_c_mujoco(worlds, results, shape):
     np.testing.assert_allclose(after.qvel, velocity, atol=2e-3)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("shape", ["sphere", "capsule"])
 def test_a_sub_step_equals_jax(worlds, results, physics_advance, shape):
     (target, state, torque), *_ = worlds[shape]
