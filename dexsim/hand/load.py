@@ -10,24 +10,21 @@ from typing import Any
 
 import numpy as np
 
-from dexsim.core.assets import asset_path
 from dexsim.core.errors import AssetError
 from dexsim.core.files import read_toml
-from dexsim.hand.kinematics import (
-    Geom,
-    Hand,
-)
+from dexsim.hand.files import digest_of, find_hand
+from dexsim.hand.kinematics import Geom, Hand
 
 TAXEL_COLUMNS = ("finger", "column", "row", "x", "y", "z", "nx", "ny", "nz", "area")
 
 
 def load_hand(path: str | Path | None = None) -> Hand:
-    """Read a hand from its TOML (the shipped hand when `path` is None).
+    """Read a hand from its TOML, or a shipped one by its name; the XHand when `path` is None.
 
     Raises:
       AssetError: a file is missing or broken, or the three do not fit together.
     """
-    path = Path(path) if path is not None else asset_path("hand/xhand_right.toml")
+    given, path = path, find_hand(path)
     table = _read_toml(path)
     _check_table(path, table)
     model_path = path.parent / table["model"]
@@ -72,6 +69,8 @@ def load_hand(path: str | Path | None = None) -> Hand:
         taxel_normal=taxels[..., 3:6],
         taxel_area=taxels[..., 6],
         geoms=_read_geoms(model, row),
+        source=path.stem if path.parent == find_hand(None).parent else str(given),
+        digest=digest_of(path, model_path, path.parent / table["taxels"]),
     )
 
 
