@@ -225,6 +225,9 @@ class EvaluateArguments:
     """Length of an evaluation episode; 0 for the task's own."""
     task: str = ""
     """Module and name of a task of your own, such as my_module:poke; the policy's file names all others."""
+    hand: str = ""
+    """The TOML of a hand of your own, where it is not in the place that the policy's file names; a changed file of the
+    same joints, fingers and taxels is warned of."""
     baseline: bool = True
     """Measure a hand that does nothing on the same episodes, too, which doubles the time."""
     ablate: tuple[str, ...] = ()
@@ -262,15 +265,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         policy.check_mesh()
     seconds = [f"evaluation_seconds={arguments.seconds}"] if arguments.seconds else []
     policy = dataclasses.replace(policy, env_config=override(policy.env_config, (*seconds, *arguments.set)))
-    entry = find_task(policy.task)
+    entry, hand = find_task(policy.task), policy.find_hand(arguments.hand)
     with cli.naming_options(entry.config_class, entry.config(), functools.partial(_typed, arguments)):
-        env = policy.build_env(backend=arguments.backend, num_envs=chunk)
+        env = policy.build_env(backend=arguments.backend, num_envs=chunk, hand=hand)
     evaluator, episodes = Evaluator(env, chunk), arguments.episodes or default_episodes(env)
     measure = functools.partial(evaluator, policy.params, episodes=episodes, seed=arguments.seed)
     report, snapshots = measure(label=arguments.policy)
     if arguments.baseline:
         report["do_nothing"], _ = measure(idle=True, label="doing nothing")
     report |= {"policy": arguments.policy, "ablate": list(arguments.ablate), "set": list(arguments.set)}
+    report |= {"hand": arguments.hand} if arguments.hand else {}
     report |= {"backend": env.backend} | cli.environment_report()
     # First the table: a full disk must not cost what was measured.
     print_report(report, report.get("do_nothing"), title=f"{policy.task}: {arguments.policy}")

@@ -43,6 +43,8 @@ class ExportedPolicy:
     params: Any
     """Whatever tells it from others: bytes."""
     function: Callable[[np.ndarray], np.ndarray]
+    hand: dict[str, Any] | None = None
+    """As of `Policy`."""
 
     def __call__(self, obs: Any) -> np.ndarray:
         """Action `[..., A]` for an actor observation `[..., n]`."""
@@ -61,6 +63,7 @@ def header_of(policy: Policy) -> dict[str, Any]:
         "layers": len(policy.params.layers),
         "spec": policy.spec and to_dict(policy.spec),
         "training": cli.plain(policy.training),
+        "hand": policy.hand,
     }
 
 
@@ -136,6 +139,7 @@ def load_exported(path: str | Path) -> ExportedPolicy:
             spec=from_dict(TaskSpec, header["spec"]) if header.get("spec") else None,
             params=np.frombuffer(path.read_bytes(), np.uint8),
             function=function,
+            hand=header.get("hand"),
         )
     except (KeyError, TypeError, ValueError, ConfigError) as error:
         raise CheckpointError(f"{path}: is not a sound policy ({' '.join(str(error).split()):.200})") from None

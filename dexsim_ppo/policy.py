@@ -21,6 +21,7 @@ from dexsim.core.assets import asset_path
 from dexsim.core.config import from_dict, to_dict
 from dexsim.core.errors import AssetError, CheckpointError, ConfigError, OtherEnvWarning
 from dexsim.core.pytree import Array, pytree_dataclass, static
+from dexsim.hand.source import check_record, check_same, record_of, recorded_hand
 from dexsim.task_spec import TaskSpec
 from dexsim_ppo import checkpoint
 from dexsim_ppo.learner.networks import MLP, Layer, apply_mlp
@@ -68,6 +69,8 @@ class Policy:
     """Where it comes from: seed, steps, learner settings."""
     spec: TaskSpec | None = None
     """What a host must know of the task; None for an environment that is not of this library."""
+    hand: dict[str, Any] | None = None
+    """Which hand it was trained on (`dexsim.hand.source`); None for the shipped default one."""
 
     def __call__(self, obs: Array) -> jax.Array:
         """Action `[..., A]` for an actor observation `[..., n]`."""
@@ -100,6 +103,7 @@ class Policy:
             "layers": len(self.params.layers),
             "training": self.training,
             "spec": self.spec and to_dict(self.spec),
+            "hand": self.hand,
         }
         checkpoint.save(path, kind="policy", task=self.task, content=content, tree=self.params)
 
@@ -121,6 +125,19 @@ class Policy:
         except (KeyError, TypeError, ValueError, IndexError, AttributeError, RecursionError, ConfigError) as error:
             text = " ".join(repr(error).split())
             raise CheckpointError(f"{path}: is not a sound policy ({text:.300})") from None
+
+    def find_hand(self, given: str | Path | None = None) -> "Hand | None":
+        """The hand that the policy was trained on, or the file that is `given`; None for the default one.
+
+        Raises:
+          ConfigError: that hand is not here, its files have changed, or the given one has other joints, fingers or
+            taxels.
+        """
+        return recorded_hand(self.hand, given, f"the policy of {self.task!r}")
+
+    def check_hand(self, hand: "Hand") -> None:
+        """Raises ConfigError: the policy was trained on another hand than this one."""
+        check_same(self.hand, hand, f"the policy of {self.task!r}")
 
     def make_env(self, *, num_envs: int = 1, backend: str = "auto", hand: "Hand | None" = None, seed: int = 0) -> "Env":
         """The environment that the policy was trained in; arguments as in `dexsim.make`.
@@ -153,6 +170,7 @@ class Policy:
         from dexsim.registry import find_task, make
 
         config = from_dict(find_task(self.task).config_class, self.env_config)
+        hand = self.find_hand() if hand is None else hand
         env = make(self.task, config, backend=backend, num_envs=num_envs, hand=hand, seed=seed)
         self.check_env(env)
         return env
@@ -211,6 +229,7 @@ class Policy:
             control_rate=1.0 / env.control_period,
             training=training or {},
             spec=getattr(env, "spec", None),
+            hand=record_of(getattr(env, "hand", None)),
         )
 
     @classmethod
@@ -234,6 +253,8 @@ class Policy:
         _check_numbers(layers, normalizer)
         params = PolicyParams(layers, normalizer, content["squash"])
         env_config = migrate_config(content["env_config"], file.path)
+        if content.get("hand") is not None:
+            check_record(content["hand"])
         return cls(
             task=file.task,
             env_config=env_config,
@@ -242,6 +263,7 @@ class Policy:
             control_rate=content["control_rate"],
             training=content["training"],
             spec=_read_spec(file, env_config),
+            hand=content.get("hand"),
         )
 
 

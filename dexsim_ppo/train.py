@@ -24,6 +24,7 @@ from typing import Any, NamedTuple, cast
 from dexsim.core import cli
 from dexsim.core.config import from_dict, naming_file
 from dexsim.core.errors import ConfigError, DexsimError
+from dexsim.hand.source import record_of
 from dexsim.registry import find_task
 from dexsim_ppo import checkpoint
 from dexsim_ppo.learner.config import PPOConfig
@@ -32,7 +33,7 @@ from dexsim_ppo.learner.sharding import make_mesh
 from dexsim_ppo.policy import Policy, load_policy
 from dexsim_ppo.retired import migrate_arguments
 from dexsim_ppo.training import processes
-from dexsim_ppo.training.arguments import TrainArguments, check_resumed, printable, training_config
+from dexsim_ppo.training.arguments import TrainArguments, check_resumed, find_hand, printable, training_config
 from dexsim_ppo.training.fine_tune import check_fit, fine_tuning_config
 from dexsim_ppo.training.presets import Preset, device_preset, find_preset
 from dexsim_ppo.training.runlog import RunFolder
@@ -131,12 +132,13 @@ def run_training(
     resumed, first = begun if isinstance(begun, checkpoint.Checkpoint) else None, processes.is_first()
     if first and not resumed and arguments.run_dir and arguments.run_dir.exists():
         raise _taken(arguments.run_dir)
-    mesh = make_mesh(arguments.devices, arguments.ppo)
+    mesh, hand = make_mesh(arguments.devices, arguments.ppo), find_hand(arguments, begun)
     env = dexsim.make(
         arguments.task,
         training_config(arguments),
         backend=arguments.backend,
         num_envs=arguments.ppo.num_envs // (mesh.size if mesh else 1),
+        hand=hand,
     )
     arguments = dataclasses.replace(
         arguments, backend=cast(Any, env.backend)
@@ -148,7 +150,8 @@ def run_training(
     if first and not resumed:
         folder.checkpoints.mkdir()
         cli.write_json(
-            folder.config, {"command": command, "arguments": printable(arguments)} | cli.environment_report()
+            folder.config,
+            {"command": command, "arguments": printable(arguments), "hand": record_of(hand)} | cli.environment_report(),
         )
     run = Run(env, arguments, folder, started, mesh)
     with stop_on_signals() as received, processes.noticing_losses(folder.path):
@@ -211,6 +214,7 @@ def default_arguments(task: str | None, preset: str, begun: checkpoint.Checkpoin
     if begun:
         env = from_dict(entry.config_class, begun.env_config)
         default = dataclasses.replace(default, env=env, ppo=fine_tuning_config(begun, default.ppo))
+        default = dataclasses.replace(default, hand=begun.hand["file"] if begun.hand else "")
     return default
 
 

@@ -61,6 +61,8 @@ class Hand:
     taxel_normal: np.ndarray  # [F, N, 3] outward
     taxel_area: np.ndarray  # [F, N] m^2
     geoms: tuple[Geom, ...]
+    source: str = ""  # the TOML as it was named, or the name of a shipped hand
+    digest: str = ""  # of its files
 
     @property
     def num_joints(self) -> int:

@@ -10,24 +10,21 @@ from typing import Any
 
 import numpy as np
 
-from dexsim.core.assets import asset_path
 from dexsim.core.errors import AssetError
 from dexsim.core.files import read_toml
-from dexsim.hand.kinematics import (
-    Geom,
-    Hand,
-)
+from dexsim.hand.files import digest_of, find_hand
+from dexsim.hand.kinematics import Geom, Hand
 
 TAXEL_COLUMNS = ("finger", "column", "row", "x", "y", "z", "nx", "ny", "nz", "area")
 
 
 def load_hand(path: str | Path | None = None) -> Hand:
-    """Read a hand from its TOML (the shipped hand when `path` is None).
+    """Read a hand from its TOML, or a shipped one by its name; the XHand when `path` is None.
 
     Raises:
       AssetError: a file is missing or broken, or the three do not fit together.
     """
-    path = Path(path) if path is not None else asset_path("hand/xhand_right.toml")
+    given, path = path, find_hand(path)
     table = _read_toml(path)
     _check_table(path, table)
     model_path = path.parent / table["model"]
@@ -71,7 +68,9 @@ def load_hand(path: str | Path | None = None) -> Hand:
         taxel_position=taxels[..., 0:3],
         taxel_normal=taxels[..., 3:6],
         taxel_area=taxels[..., 6],
-        geoms=_read_geoms(model, row),
+        geoms=_read_geoms(model_path, model, row),
+        source=path.stem if path.parent == find_hand(None).parent else str(given),
+        digest=digest_of(path, model_path, path.parent / table["taxels"]),
     )
 
 
@@ -221,13 +220,18 @@ def _is_below(parent: np.ndarray, body: int, ancestor: int) -> bool:
     return False
 
 
-def _read_geoms(model, row: dict[int, int]) -> tuple[Geom, ...]:
+def _read_geoms(path: Path, model: Any, row: dict[int, int]) -> tuple[Geom, ...]:
     names = {2: "sphere", 3: "capsule", 4: "ellipsoid", 5: "cylinder", 6: "box", 0: "plane"}
     geoms = []
     for g in range(model.ngeom):
-        kind = names.get(int(model.geom_type[g]))
+        kind, touches = names.get(int(model.geom_type[g])), bool(model.geom_contype[g] | model.geom_conaffinity[g])
+        if kind is None and touches and int(model.geom_bodyid[g]) in row:
+            body = model.body(int(model.geom_bodyid[g])).name
+            raise AssetError(
+                f"{path}: geom {model.geom(g).name or f'#{g}'!r} of {body!r} is no primitive and touches: meshes are "
+                "drawn only (contype and conaffinity 0); put capsules, spheres or boxes in its place"
+            )
         if int(model.geom_bodyid[g]) in row and kind is not None:
-            touches = bool(model.geom_contype[g] | model.geom_conaffinity[g])
             geoms.append(
                 Geom(
                     model.geom(g).name,

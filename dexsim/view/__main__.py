@@ -16,6 +16,7 @@ import tyro
 from dexsim.core import cli
 from dexsim.core.config import setting, validate
 from dexsim.core.errors import CheckpointError, ConfigError
+from dexsim.hand.load import load_hand
 from dexsim.registry import find_task, make
 from dexsim.view.policies import NONE, PolicyShelf
 from dexsim.view.source import Source
@@ -31,6 +32,8 @@ class ViewArguments:
     run on a hand."""
     emulated: bool = False
     """Run the policy on the emulated hand instead of the simulation that it was trained in."""
+    hand: str = ""
+    """The TOML of a hand of your own; empty for the one that the policy or the log is of."""
     seed: int = setting(0, unit="1", low=0, high=2**31 - 1)
     """Seed of the episodes."""
     host: str = "127.0.0.1"
@@ -53,11 +56,11 @@ def open_source(arguments: ViewArguments) -> Source:
     if name.endswith(".log"):
         from dexsim.view.recording import Recording
 
-        return Recording(Path(name))
+        return Recording(Path(name), arguments.hand)
     if arguments.emulated:
         from dexsim.view.emulation import Emulation
 
-        return Emulation(name, arguments.seed)
+        return Emulation(name, arguments.seed, arguments.hand)
     from dexsim.view.simulation import Simulation
     from dexsim_ppo.policy import load_policy
 
@@ -70,9 +73,9 @@ def open_source(arguments: ViewArguments) -> Source:
             find_task(name)
         except ConfigError as error:
             raise ConfigError(f"{name}: no policy file, no shipped policy, and {error}") from None
-        env, name = make(name.rpartition(":")[2]), NONE
+        env, name = make(name.rpartition(":")[2], hand=load_hand(arguments.hand or None)), NONE
     else:
-        env = policy.make_env()
+        env = policy.make_env(hand=policy.find_hand(arguments.hand))
     return Simulation(env, PolicyShelf(env, name), arguments.seed)
 
 

@@ -11,6 +11,7 @@ from dexsim.view.source import Control, Frame, Slider, Values
 from dexsim_ppo.policy import load_policy
 from dexsim_real.control.controller import Controller, prepare_jax
 from dexsim_real.core.errors import HandError
+from dexsim_real.sensors.hand import check_wire
 from dexsim_real.twin.__main__ import check_policy
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand
 from dexsim_real.twin.plant.parameters import TASKS
@@ -24,17 +25,20 @@ class Emulation:
     Args:
       name: a policy file, or the name of a shipped policy.
       seed: of the trials.
+      hand: TOML of the hand, where it is not in the place that the policy's file names.
 
     Raises:
       HandError: the emulated hand has no such task or mount, or the policy observes what no sensor measures.
     """
 
-    def __init__(self, name: str, seed: int = 0):
+    def __init__(self, name: str, seed: int = 0, hand: str = ""):
         prepare_jax()
-        self.hand, policy = load_hand(), load_policy(name)
+        policy = load_policy(name)
+        self.hand = policy.find_hand(hand) or load_hand()
         if policy.task not in TASKS:
             raise HandError(f"{name}: the emulated hand has the tasks {' and '.join(TASKS)}, not {policy.task!r}")
-        check_policy(name, policy.task, self.hand)
+        check_policy(name, policy.task, hand)
+        check_wire(self.hand)
         self._controller = Controller(policy, self.hand)
         self._controller.warm()
         self._calibration = ideal_calibration(self.hand)

@@ -6,7 +6,6 @@ import numpy as np
 
 from dexsim.core.errors import DexsimError
 from dexsim.geometry import rotations
-from dexsim.hand.load import load_hand
 from dexsim.render.snapshot import Snapshot
 from dexsim.view.source import Control, Frame, Slider, Values
 from dexsim_real.replay.replay import replay
@@ -17,14 +16,16 @@ class Recording:
 
     Args:
       path: of the log.
+      hand: TOML of the hand, where it is not in the place that the log names.
 
     Raises:
       LogError: not a log, or one that ends before the hand was ready.
       DexsimError: the policy never ran in it.
     """
 
-    def __init__(self, path: Path):
-        self.hand, self._run, self._at = load_hand(), replay(path), 0
+    def __init__(self, path: Path, hand: str = ""):
+        self._run, self._at = replay(path, hand), 0
+        self.hand = self._run.hand
         if not self._run.ticks:
             raise DexsimError(f"{path}: the log has no tick of a policy to show")
         time = self._run.time

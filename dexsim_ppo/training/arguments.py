@@ -8,8 +8,13 @@ from typing import Any, Generic, Literal, TypeVar
 
 from dexsim.core.config import setting, to_dict, validate
 from dexsim.core.errors import ConfigError
+from dexsim.hand.kinematics import Hand
+from dexsim.hand.load import load_hand
+from dexsim.hand.source import check_same, recorded_hand
+from dexsim_ppo.checkpoint import Checkpoint
 from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.curriculum import Curriculum
+from dexsim_ppo.policy import Policy
 
 EnvConfig = TypeVar("EnvConfig")
 
@@ -29,6 +34,8 @@ class TrainArguments(Generic[EnvConfig]):
     file keep to the settings of `--env`."""
     task: str = "grasp"
     """Task to train; my_module:poke for a task of your own."""
+    hand: str = ""
+    """The TOML of a hand of your own, or the name of a shipped one; empty for the XHand."""
     devices: int = setting(1, unit="1", low=0)
     """Devices to train on, which share the environments; 0 for all. In a job of several processes those of all."""
     seed: int = setting(0, unit="1", low=0, high=2**32 - 1)
@@ -73,6 +80,23 @@ class TrainArguments(Generic[EnvConfig]):
         validate(self)
 
 
+def find_hand(arguments: TrainArguments, begun: Checkpoint | Policy | None) -> Hand | None:
+    """The hand to train; None for the default one.
+
+    Raises:
+      ConfigError: the run or policy to begin from is of another hand.
+    """
+    if begun is None:
+        return load_hand(arguments.hand) if arguments.hand else None
+    if isinstance(begun, Policy):
+        return begun.find_hand(arguments.hand)
+    record, what = begun.content.get("hand"), str(begun.path)
+    hand = recorded_hand(record, arguments.hand, what)
+    if hand is not None:
+        check_same(record, hand, what)
+    return hand
+
+
 def training_config(arguments: TrainArguments) -> Any:
     """The task's configuration as training uses it: with its share of extremes, and without a force loop.
 
@@ -105,6 +129,7 @@ _RESUMABLE = {
     "evaluate_every",
     "evaluation_chunk",
     "evaluation_episodes",
+    "hand",  # where its files are: their content must be the same
     "keep_checkpoints",
     "log_every",
     "minutes",

@@ -16,6 +16,7 @@ from jax.sharding import Mesh
 from dexsim.core import cli
 from dexsim.core.compilation import collector_paused
 from dexsim.core.config import to_dict
+from dexsim.hand.source import record_of
 from dexsim_ppo import checkpoint
 from dexsim_ppo.evaluate import Evaluator, write_video
 from dexsim_ppo.learner.config import PPOConfig
@@ -71,7 +72,11 @@ class Run:
         import dexsim
 
         return dexsim.make(
-            self.arguments.task, self.arguments.env, backend=self.env.backend, num_envs=self.arguments.evaluation_chunk
+            self.arguments.task,
+            self.arguments.env,
+            backend=self.env.backend,
+            num_envs=self.arguments.evaluation_chunk,
+            hand=getattr(self.env, "hand", None),
         )
 
     def train(self, source: checkpoint.Checkpoint | Policy | None, stopped: Callable[[], int]) -> None:
@@ -260,6 +265,7 @@ class Run:
             tree=state,
             content={
                 "arguments": printable(self.arguments),
+                "hand": record_of(getattr(self.env, "hand", None)),
                 "progress": {"best": self.best, "seconds": self._seconds()},
             },
         )

@@ -11,7 +11,6 @@ from typing import Annotated
 
 import tyro
 
-from dexsim import load_hand
 from dexsim.core import cli
 from dexsim.datasets.lerobot import write_lerobot
 from dexsim_real.control.controller import prepare_jax
@@ -35,6 +34,8 @@ class ReplayArguments:
     lerobot: Path | None = None
     """Folder for a dataset of one episode in the LeRobot format (extra `lerobot`), which must not exist yet; None
     writes none."""
+    hand: str = ""
+    """The TOML of a hand of your own, where it is not in the place that the log names."""
     output: Path | None = None
     """JSON file for the report; None writes no file."""
 
@@ -49,7 +50,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     prepare_jax()
     cli.enable_caches()
-    run = replay(arguments.log)
+    run = replay(arguments.log, arguments.hand)
     report = run.report
     for note in report["notes"]:
         print(note)
@@ -75,7 +76,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         open_rerun(run, arguments.rrd)
         print(f"rerun recording: {arguments.rrd}")
     if arguments.lerobot and run.ticks:
-        print(f"LeRobot dataset: {write_lerobot(arguments.lerobot, load_hand(), report['task'], [trajectory(run)])}")
+        print(f"LeRobot dataset: {write_lerobot(arguments.lerobot, run.hand, report['task'], [trajectory(run)])}")
     return 0 if same else 1
 
 

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dexsim import load_hand
 from dexsim.datasets.rerun import show_rerun
 from dexsim.datasets.trajectory import Trajectory, from_readings
 from dexsim.hand.kinematics import Hand
@@ -31,7 +30,7 @@ def plot(run: Replay, path: Path) -> None:
     """Write a figure: joint angles and targets by finger, finger forces and command, ages, and the observation."""
     import matplotlib.pyplot as plt
 
-    hand, seen = load_hand(), signals(run)
+    hand, seen = run.hand, signals(run)
     fingers = hand.num_fingers
     figure, axes = plt.subplots(
         fingers + 3,
@@ -103,7 +102,7 @@ def open_rerun(run: Replay, path: Path | None = None) -> None:
       DexsimError: rerun is not installed.
       OSError: the file cannot be written.
     """
-    hand = load_hand()
+    hand = run.hand
     edges = np.cumsum([field.size for field in run.fields])[:-1]
     names = {"angle": hand.joint_names, "target": hand.joint_names, "force": hand.finger_names}
     series = {

@@ -14,6 +14,8 @@ import numpy as np
 from dexsim import load_hand
 from dexsim.calibration.maps import load_calibration
 from dexsim.core.config import from_dict
+from dexsim.hand.kinematics import Hand
+from dexsim.hand.source import recorded_hand
 from dexsim.observation import LayoutEntry, Readings, layout
 from dexsim.task_spec import TaskSpec
 from dexsim_ppo.retired import old_spec
@@ -35,12 +37,18 @@ class Replay:
     ticks: list[dict[str, Any]]  # one per tick, as logged
     observation: np.ndarray  # [T, n] recomputed
     fields: tuple[LayoutEntry, ...]  # of the observation
+    hand: Hand
 
 
-def replay(path: Path) -> Replay:
+def replay(path: Path, hand: str = "") -> Replay:
     """Recompute a log.
 
+    Args:
+      path: of the log.
+      hand: TOML of the hand, where it is not in the place that the log names.
+
     Raises:
+      ConfigError: the log is of another hand.
       LogError: not a log, or the log ends before the hand was ready.
     """
     reader = LogReader(path)
@@ -56,7 +64,7 @@ def replay(path: Path) -> Replay:
             tares.append((record.content["from"], record.content["tare"]))
         elif record.kind == Kind.META:
             meta = record.content
-            sensing, observe, fields = _rebuild(meta)
+            sensing, observe, fields = _rebuild(meta, hand)
             tares = [(0, sensing.tare)]
         elif record.kind == Kind.RECEIVED:
             number, frame = record.content
@@ -105,12 +113,12 @@ def replay(path: Path) -> Replay:
         "recorded_on": meta["environment"],
     }
     since = np.array(times) - (times[0] if times else 0.0)
-    return Replay(report, since, measured, ticks, np.array(observations), fields)
+    return Replay(report, since, measured, ticks, np.array(observations), fields, sensing.hand)
 
 
-def _rebuild(meta: dict[str, Any]) -> tuple[HandSensing, Any, tuple[LayoutEntry, ...]]:
+def _rebuild(meta: dict[str, Any], given: str) -> tuple[HandSensing, Any, tuple[LayoutEntry, ...]]:
     """Sensing, observation function and observation fields of a logged run."""
-    hand, calibration = load_hand(), None
+    hand, calibration = recorded_hand(meta.get("hand"), given, "the log") or load_hand(), None
     if meta["calibration"]:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "calibration.toml"

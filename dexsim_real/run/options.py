@@ -23,6 +23,8 @@ class RunArguments:
     """Policy file, name of a shipped policy ("grasp"), or file of `python -m dexsim_ppo.export` (.npz or .onnx)."""
     port: str
     """Serial port of the hand (names under /dev/serial/by-id are stable), or sdk:MODULE:FUNCTION."""
+    hand: str = ""
+    """The TOML of a hand of your own, where it is not in the place that the policy's file names."""
     command: float = setting(0.5, unit="1", low=0.0, high=1.0)
     """Grip command in [0, 1]."""
     seconds: float = setting(30.0, unit="s", low=0.1, high=86400.0)

@@ -15,6 +15,7 @@ from dexsim import load_hand
 from dexsim.calibration.maps import load_calibration
 from dexsim.core import cli
 from dexsim.core.config import to_dict
+from dexsim.hand.source import record_of, recorded_hand
 from dexsim_ppo.export import load_exported
 from dexsim_ppo.policy import load_policy
 from dexsim_real.control.controller import IDENTITY, Controller, Tick
@@ -55,7 +56,8 @@ class Session:
         wanted = arguments.guard and not arguments.motors_off
         self.guard = Guard(arguments.port, arguments.link) if wanted else None
         exported = arguments.policy.endswith((".npz", ".onnx"))
-        policy, hand = (load_exported if exported else load_policy)(arguments.policy), load_hand()
+        policy: Any = (load_exported if exported else load_policy)(arguments.policy)
+        hand = recorded_hand(policy.hand, arguments.hand, arguments.policy) or load_hand()
         self.controller = Controller(policy, hand)
         calibration = load_calibration(arguments.calibration, hand) if arguments.calibration else None
         self.sensing = HandSensing(hand, arguments.hardware, calibration)
@@ -315,6 +317,7 @@ class Session:
                 "spec": to_dict(policy.spec),
                 "policy": arguments.policy,
                 "policy_sha256": digest.hexdigest(),
+                "hand": record_of(self.sensing.hand),
                 "calibration": text,
                 "tare": self.sensing.tare,
                 "hardware": to_dict(arguments.hardware),

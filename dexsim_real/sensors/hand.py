@@ -96,6 +96,15 @@ class HandMeasurement:
         )
 
 
+def check_wire(hand: Hand) -> None:
+    """Raises HandError: the hand has other joints or taxels than the frames carry."""
+    if (hand.num_joints, hand.num_fingers, hand.num_taxels) != (_JOINTS, frames.TIPS, frames.TAXELS):
+        raise HandError(
+            f"{hand.name}: {hand.num_joints} joints and {hand.num_fingers} x {hand.num_taxels} taxels; the frames "
+            f"carry {_JOINTS} and {frames.TIPS} x {frames.TAXELS}. Use the model of that hand"
+        )
+
+
 class HandSensing:
     """Converts the hand's state blocks to SI units, and joint angles to command blocks.
 
@@ -111,11 +120,7 @@ class HandSensing:
     """
 
     def __init__(self, hand: Hand, config: HardwareConfig, calibration: Calibration | None = None):
-        if (hand.num_joints, hand.num_fingers, hand.num_taxels) != (_JOINTS, frames.TIPS, frames.TAXELS):
-            raise HandError(
-                f"{hand.name}: {hand.num_joints} joints and {hand.num_fingers} x {hand.num_taxels} taxels; the frames "
-                f"carry {_JOINTS} and {frames.TIPS} x {frames.TAXELS}. Use the model of that hand"
-            )
+        check_wire(hand)
         self.hand, self.config, self.calibration = hand, config, calibration
         self._sign = np.array(config.joint_sign, np.float32)
         self._offset = np.array(config.joint_offset, np.float32)

@@ -24,6 +24,7 @@ from dexsim.hand.load import load_hand
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.process import use_realtime
 from dexsim_real.sensors.camera import CameraConfig
+from dexsim_real.sensors.hand import check_wire
 from dexsim_real.twin.options import TwinArguments
 from dexsim_real.twin.plant.protocol import Plant
 from dexsim_real.twin.server import Twin
@@ -57,16 +58,18 @@ def make_plant(arguments: TwinArguments, hand: Hand) -> Plant:
     )
 
 
-def check_policy(name: str, task: str, hand: Hand) -> None:
-    """Check that a policy fits the task and the mount of the emulated hand.
+def check_policy(name: str, task: str, hand: str) -> None:
+    """Check that a policy fits the task, the hand (its TOML) and the mount of the emulated hand.
 
     Raises:
       HandError: it does not.
+      ConfigError: it is of another hand.
     """
     from dexsim_ppo.policy import load_policy
     from dexsim_real.twin.plant.mount import nominal_gravity
 
     policy = load_policy(name)
+    policy.find_hand(hand)
     if policy.task != task:
         raise HandError(f"{name} is a policy of the task {policy.task!r}; give --task {policy.task}")
     if policy.spec is None:
@@ -101,6 +104,7 @@ def runner_command(twin: Twin, calibration: Path | None) -> list[str]:
         str(twin.line.terminal.name),
         *(["--calibration", str(calibration)] if calibration else ["--uncalibrated"]),
         "--yes",
+        *(["--hand", arguments.hand] if arguments.hand else []),
     ]
     if arguments.command is not None:
         words += ["--command", f"{arguments.command:g}"]
@@ -129,9 +133,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         prog="python -m dexsim_real.twin",
         description="Emulate a hand on a pseudo-terminal.",
     )
-    hand = load_hand()
+    hand = load_hand(arguments.hand or None)
+    check_wire(hand)
     if arguments.policy:
-        check_policy(arguments.policy, arguments.task, hand)
+        check_policy(arguments.policy, arguments.task, arguments.hand)
     lines: queue.SimpleQueue = queue.SimpleQueue()
     with tempfile.TemporaryDirectory(prefix="dexsim-twin-") as folder:
         twin = Twin(arguments, hand, make_plant(arguments, hand), Path(folder), lines.put)

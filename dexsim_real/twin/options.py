@@ -22,6 +22,8 @@ class TwinArguments:
     policy: str | None = None
     """Policy that will run on the hand, to check that it fits: a file, or the name of a shipped policy. None for the
     shipped policy of the task."""
+    hand: str = ""
+    """The TOML of a hand of your own, with the joints and taxels that the wire format has; empty for the XHand."""
     seed: int = setting(0, unit="1", low=0, high=2**31 - 1)
     """Seed of all random numbers: parameters, objects, noise, faults."""
     trials: int = setting(10, unit="1", low=1, high=100_000)

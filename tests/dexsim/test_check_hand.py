@@ -41,3 +41,14 @@ def test_tip_without_primitive_fails(folder, capsys):
 def test_missing_file_is_one_line(tmp_path, capsys):
     assert check_hand.main([str(tmp_path / "none.toml")]) == 1
     assert capsys.readouterr().out.count("\n") == 1
+
+
+def test_mesh_that_touches_is_refused(folder, capsys):
+    model, corners = folder / "xhand_right.xml", "0 0 0  0.01 0 0  0 0.01 0  0 0 0.01"
+    text = model.read_text().replace("<worldbody>", f'<asset><mesh name="hull" vertex="{corners}"/></asset><worldbody>')
+    site, mesh = '<site name="index_tip"', '<geom name="index_hull" class="{}" type="mesh" mesh="hull"/>'
+    for kind, code in (("shell", 0), ("pad", 1)):
+        model.write_text(text.replace(site, mesh.format(kind) + site))
+        assert check_hand.main([str(folder / "xhand_right.toml")]) == code
+    out = capsys.readouterr().out
+    assert "FAIL  files load" in out and "geom 'index_hull' of 'right_hand_index_rota_link2' is no primitive" in out

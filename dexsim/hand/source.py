@@ -1,0 +1,90 @@
+"""Which files a hand was read from, so that what was trained on it is used on the same hand.
+
+A record is plain data: the TOML's name as it was given, a hash of the hand's files, and what its arrays count. None
+stands for the shipped default hand, of which policies have no record.
+"""
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+from dexsim.core.errors import ConfigError, OtherEnvWarning
+from dexsim.hand.files import DEFAULT, find_hand
+from dexsim.hand.kinematics import Hand
+from dexsim.hand.load import load_hand
+
+Record = dict[str, Any]
+
+
+def record_of(hand: Hand | None) -> Record | None:
+    """What tells this hand from others; None for the default one."""
+    return None if hand is None or hand.source in ("", DEFAULT) else record_as_of(hand)
+
+
+def check_same(record: Record | None, hand: Hand, what: str) -> None:
+    """Whether something recorded is of this hand.
+
+    Raises:
+      ConfigError: it is of another one; `what` names it.
+    """
+    now = record_of(hand)
+    if (record and record["digest"]) != (now and now["digest"]):
+        raise ConfigError(f"{what} is of the hand {_name(record)}, not of {_name(now)}{_changed(record, now)}")
+
+
+def recorded_hand(record: Record | None, given: str | Path | None, what: str) -> Hand | None:
+    """The hand of something recorded: the `given` one, or the one that the record names; None for the default one.
+
+    Files that were changed since are refused. A given file of the same joints, fingers and taxels is warned of.
+
+    Raises:
+      ConfigError: the hand is another one, or its record makes no sense.
+      AssetError: its files are missing or broken.
+    """
+    if record is not None:
+        check_record(record)
+    if not given:
+        if record is None:
+            return None
+        if not find_hand(record["file"]).is_file():
+            raise ConfigError(f"{what} is of the hand {_name(record)}, which is not here: give --hand FILE")
+        hand = load_hand(record["file"])
+        check_same(record, hand, what)
+        return hand
+    hand = load_hand(given)
+    now = record_of(hand)
+    if (record and record["digest"]) != (now and now["digest"]):
+        before: Any = record or record_as_of(load_hand())
+        if before | {"file": "", "digest": ""} != record_as_of(hand) | {"file": "", "digest": ""}:
+            check_same(record, hand, what)
+        warnings.warn(
+            f"{what} is of the hand {_name(record)}, and is used on {_name(now)}", OtherEnvWarning, stacklevel=3
+        )
+    return hand
+
+
+def check_record(record: Any) -> None:
+    """Raises ConfigError: a record of a hand makes no sense."""
+    kinds = {"file": str, "digest": str, "joints": list, "fingers": list, "taxels": int}
+    if not isinstance(record, dict) or any(type(record.get(name)) is not kind for name, kind in kinds.items()):
+        raise ConfigError(f"the record of the hand makes no sense: {str(record):.80}")
+
+
+def record_as_of(hand: Hand) -> Record:
+    """What a record counts, of any hand."""
+    return {
+        "file": hand.source,
+        "digest": hand.digest,
+        "joints": list(hand.joint_names),
+        "fingers": list(hand.finger_names),
+        "taxels": hand.num_taxels,
+    }
+
+
+def _name(record: Record | None) -> str:
+    return f"{str(record['file'])[:200]!r}" if record else f"{DEFAULT!r}"
+
+
+def _changed(record: Record | None, now: Record | None) -> str:
+    same = record and now and record["file"] == now["file"]
+    return ": its files have changed since" if same else ""

@@ -1,0 +1,96 @@
+"""Policies, runs and logs keep to the hand that they are of."""
+
+import dataclasses
+import shutil
+
+import pytest
+
+from dexsim.core.assets import asset_path
+from dexsim.core.errors import AssetError, CheckpointError, ConfigError, OtherEnvWarning
+from dexsim.hand.load import load_hand
+from dexsim.hand.source import check_same, record_of, recorded_hand
+from dexsim_ppo.checkpoint import Checkpoint
+from dexsim_ppo.policy import Policy, load_policy
+from dexsim_ppo.train import default_arguments, find_hand
+
+
+@pytest.fixture
+def own(tmp_path, monkeypatch):
+    shutil.copytree(asset_path("hand/xhand_right.toml").parent, tmp_path / "own")
+    monkeypatch.chdir(tmp_path)
+    return "own/xhand_right.toml"
+
+
+def heavier(path, change=('mass="0.538515"', 'mass="0.6"')):
+    model = path.replace(".toml", ".xml")
+    with open(model) as file:
+        text = file.read()
+    with open(model, "w") as file:
+        file.write(text.replace(*change))
+
+
+def test_default_hand_has_no_record(hand):
+    assert record_of(hand) is None and recorded_hand(None, "", "x") is None
+    assert load_hand("xhand_right").source == hand.source == "xhand_right"
+
+
+def test_unknown_name_is_one_line():
+    with pytest.raises(AssetError, match="hand 'nohand': no such file, and no shipped hand has that name"):
+        load_hand("nohand")
+
+
+def test_policy_carries_its_hand(own, tmp_path):
+    record = record_of(load_hand(own))
+    dataclasses.replace(load_policy("grasp"), hand=record).save("policy.msgpack")
+    policy = Policy.load("policy.msgpack")
+    assert policy.hand == record and policy.find_hand().digest == record["digest"]
+    assert load_policy("grasp").hand is None and load_policy("grasp").find_hand() is None
+    shutil.move("own", "elsewhere")
+    with pytest.raises(ConfigError, match=r"of the hand 'own/xhand_right.toml', which is not here: give --hand"):
+        policy.find_hand()
+    assert policy.find_hand("elsewhere/xhand_right.toml").digest == record["digest"]
+
+
+def test_changed_files_are_refused_or_warned_of(own):
+    policy = dataclasses.replace(load_policy("grasp"), hand=record_of(load_hand(own)))
+    heavier(own)
+    with pytest.raises(ConfigError, match="its files have changed since"):
+        policy.find_hand()
+    with pytest.warns(OtherEnvWarning, match="is used on 'own/xhand_right.toml'"):
+        policy.find_hand(own)
+    with pytest.raises(ConfigError, match="not of 'xhand_right'"):
+        policy.check_hand(load_hand())
+
+
+def test_another_hand_is_refused(own):
+    with open(own) as file:
+        text = file.read()
+    with open(own, "w") as file:
+        file.write(text.replace('name = "pinky"\n', 'name = "little"\n'))
+    with open("own/taxels.csv") as file:
+        rows = file.read()
+    with open("own/taxels.csv", "w") as file:
+        file.write(rows.replace("pinky,", "little,"))
+    with pytest.raises(ConfigError, match="is of the hand 'xhand_right', not of 'own/xhand_right.toml'"):
+        load_policy("grasp").find_hand(own)
+
+
+def test_record_without_sense_is_refused(tmp_path):
+    path = tmp_path / "policy.msgpack"
+    dataclasses.replace(load_policy("grasp"), hand={"file": 3}).save(path)
+    with pytest.raises(CheckpointError, match="record of the hand makes no sense"):
+        Policy.load(path)
+
+
+def test_run_keeps_its_hand(own, tmp_path):
+    arguments = dataclasses.replace(default_arguments("grasp", "cpu", None), hand=own)
+    hand = find_hand(arguments, None)
+    begun = Checkpoint(tmp_path / "run", "train", "grasp", "", {"hand": record_of(hand)}, {})
+    assert find_hand(arguments, begun).digest == hand.digest
+    fine = dataclasses.replace(load_policy("grasp"), hand=record_of(hand))
+    assert default_arguments(None, "cpu", fine).hand == own
+    heavier(own)
+    with pytest.warns(OtherEnvWarning), pytest.raises(ConfigError, match="changed since"):
+        find_hand(arguments, begun)
+    with pytest.raises(ConfigError, match="not of"):
+        check_same(None, load_hand(own), "the log")
