@@ -10,8 +10,10 @@ import importlib.metadata
 import inspect
 import typing
 from collections.abc import Callable
-from typing import Any
+from types import ModuleType
+from typing import Any, cast
 
+from dexsim.core.config import NoSettings
 from dexsim.core.errors import ConfigError
 from dexsim.env.config import EnvConfig
 from dexsim.env.env import Env
@@ -36,6 +38,8 @@ class TaskEntry:
     """`task(config, hand)`: the rules; see `dexsim.env.task.Task`."""
     config: Callable[[], EnvConfig]
     """Makes the configuration that the name stands for."""
+    environment: Callable[[], Any] | None = None
+    """Makes an environment that is no task on a hand; the entry then has no rules and no settings."""
 
 
 TASKS: dict[str, TaskEntry] = {
@@ -77,14 +81,17 @@ def register(
 
 
 def find_task(name: str) -> TaskEntry:
-    """The entry of a task by its name, or by `module:name` of the module that registers it.
+    """The entry of a task by its name, or by `module:name` of the module that registers it, or that has a function of
+    that name which makes an environment of another kind.
 
     Raises:
       ConfigError: there is no such task or module.
     """
     module, _, word = name.rpartition(":")
     if module:
-        _import(module)
+        makes = getattr(_import(module), word, None)
+        if word not in TASKS and callable(makes):
+            TASKS[word] = TaskEntry(cast(Any, NoSettings), _no_task, cast(Any, NoSettings), makes)
     if word not in TASKS:
         for plugin in importlib.metadata.entry_points(group=PLUGINS):
             plugin.load()
@@ -118,6 +125,8 @@ def make(
     """
     if num_envs < 1:
         raise ConfigError(f"make({task!r}, num_envs={num_envs}): must be at least 1")
+    if (makes := find_task(task).environment) is not None:
+        return _make_other(task, makes)
     hand = load_hand() if hand is None else hand
     return Env(make_task(task, hand, config), hand, backend=backend, num_envs=num_envs, seed=seed)
 
@@ -146,8 +155,20 @@ def _annotated_config(name: str, factory: Callable) -> type[EnvConfig]:
     return found
 
 
-def _import(module: str) -> None:
+def _make_other(task: str, makes: Callable[[], Any]) -> Any:
     try:
-        importlib.import_module(module)
+        inspect.signature(makes).bind()
+    except (TypeError, ValueError):
+        raise ConfigError(f"--task {task}: must be callable without arguments") from None
+    return makes()
+
+
+def _no_task(config: Any, hand: Hand) -> Task:
+    raise ConfigError("an environment from elsewhere has no task on a hand: it can be trained and evaluated, no more")
+
+
+def _import(module: str) -> ModuleType:
+    try:
+        return importlib.import_module(module)
     except ImportError as error:
         raise ConfigError(f"task module {module!r}: cannot be imported ({error})") from None

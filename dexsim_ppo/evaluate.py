@@ -27,6 +27,7 @@ import tyro
 from dexsim.core import cli
 from dexsim.core.compilation import collector_paused, jit
 from dexsim.core.config import override, setting, validate
+from dexsim.core.errors import ConfigError
 from dexsim.core.options import Option
 from dexsim.core.progress import progress
 from dexsim.registry import find_task
@@ -147,6 +148,8 @@ def write_video(env: Environment, snapshots: Any, path: Path, quality: str = "qu
     """
     from dexsim.render.render import render_episode
 
+    if not jax.tree.leaves(snapshots):
+        raise ConfigError(f"--video {path}: {env.name!r} draws nothing")
     fps = 1.0 / env.control_period
     seconds = jax.tree.leaves(snapshots)[0].shape[0] / fps
     # At fewer than eight pictures a second a gait cannot be followed.

@@ -11,7 +11,7 @@ import dataclasses
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +24,7 @@ from dexsim.core.pytree import Array, pytree_dataclass, static
 from dexsim.hand.source import check_record, check_same, record_of, recorded_hand
 from dexsim.task_spec import TaskSpec
 from dexsim_ppo import checkpoint
+from dexsim_ppo.learner.adapter import adapt
 from dexsim_ppo.learner.networks import MLP, Layer, apply_mlp
 from dexsim_ppo.learner.running_stats import Normalizer, make_normalizer, normalize
 from dexsim_ppo.learner.types import Environment, Field, Fields, layout_size
@@ -171,7 +172,9 @@ class Policy:
 
         config = from_dict(find_task(self.task).config_class, self.env_config)
         hand = self.find_hand() if hand is None else hand
-        env = make(self.task, config, backend=backend, num_envs=num_envs, hand=hand, seed=seed)
+        env = cast(
+            Any, adapt(make(self.task, config, backend=backend, num_envs=num_envs, hand=hand, seed=seed), self.task)
+        )
         self.check_env(env)
         return env
 

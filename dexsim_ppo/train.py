@@ -27,6 +27,7 @@ from dexsim.core.errors import ConfigError, DexsimError
 from dexsim.hand.source import record_of
 from dexsim.registry import find_task
 from dexsim_ppo import checkpoint
+from dexsim_ppo.learner.adapter import adapt
 from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.curriculum import Curriculum
 from dexsim_ppo.learner.sharding import make_mesh
@@ -133,13 +134,14 @@ def run_training(
     if first and not resumed and arguments.run_dir and arguments.run_dir.exists():
         raise _taken(arguments.run_dir)
     mesh, hand = make_mesh(arguments.devices, arguments.ppo), find_hand(arguments, begun)
-    env = dexsim.make(
+    made = dexsim.make(
         arguments.task,
         training_config(arguments),
         backend=arguments.backend,
         num_envs=arguments.ppo.num_envs // (mesh.size if mesh else 1),
         hand=hand,
     )
+    env = adapt(made, arguments.task)
     arguments = dataclasses.replace(
         arguments, backend=cast(Any, env.backend)
     )  # so that a resumed run has the same engine

@@ -121,6 +121,11 @@ def _numbers(value: Any) -> list[float]:
     return []
 
 
+@dataclasses.dataclass(frozen=True)
+class NoSettings:
+    """The configuration of an environment that has none."""
+
+
 def to_dict(config: Any) -> dict[str, Any]:
     """A config dataclass as nested plain dicts and lists (JSON and msgpack friendly)."""
 

@@ -315,7 +315,7 @@ class Run:
         cli.write_json(folder.report, report)
         for name, policy in (("untrained", "untrained"), ("trained", selected)):
             print_report(reports[name], reports["do_nothing"], title=f"{arguments.task}: {policy}")
-        if arguments.video:
+        if arguments.video and jax.tree.leaves(film):  # an environment from elsewhere draws nothing
             begin = time.perf_counter()
             video = write_video(self.evaluator.env, film, folder.path / "policy.mp4")
             self.clock["video_s"] = time.perf_counter() - begin

@@ -1,0 +1,224 @@
+"""Environments from elsewhere: what the learner makes of five members, what it refuses, and gymnax as in the docs."""
+
+import dataclasses
+import re
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from paths import ROOT
+from reach_env import MAX_STEPS, Broken, Reach
+from tiny_env import SMALL
+
+from dexsim import ConfigError, registry
+from dexsim_ppo import Policy, evaluate_policy, make_train, train_policy
+from dexsim_ppo import evaluate as evaluate_command
+from dexsim_ppo.learner.adapter import adapt
+
+
+def play(env, actions, key=0):
+    """All states of one episode, the first included."""
+    states = [jax.jit(env.reset)(jax.random.key(key))]
+    step = jax.jit(env.step)
+    for action in actions:
+        states.append(step(states[-1], jnp.full(1, action, jnp.float32)))
+    return states
+
+
+def test_steps_are_those_of_the_environment_with_return_and_length():
+    env = adapt(Reach(), "reach")
+    states = play(env, [0.5, -1.0, 0.0])
+    begun = float(states[0].inner["x"])
+    x = begun + 0.25 * np.cumsum([0.5, -1.0, 0.0])
+    np.testing.assert_allclose([s.obs["actor"][0] for s in states[1:]], x, rtol=1e-6)
+    np.testing.assert_allclose([s.reward for s in states[1:]], 1 - np.abs(x), rtol=1e-6)
+    np.testing.assert_allclose([s.metrics["return"] for s in states[1:]], np.cumsum(1 - np.abs(x)), rtol=1e-6)
+    np.testing.assert_allclose([s.metrics["distance"] for s in states], np.abs([begun, *x]), rtol=1e-6)
+    assert [float(s.metrics["length"]) for s in states] == [0, 1, 2, 3]
+    assert not any(s.terminated or s.truncated for s in states)
+
+
+def test_the_time_limit_truncates_and_a_terminal_state_terminates():
+    env = adapt(Reach(), "reach")
+    states = play(env, [0.0] * MAX_STEPS)
+    assert [bool(s.truncated) for s in states] == [False] * MAX_STEPS + [True]
+    assert not states[-1].terminated
+    away = play(env, [np.sign(states[0].inner["x"])] * MAX_STEPS)
+    first = next(i for i, s in enumerate(away) if s.terminated)
+    assert abs(away[first].inner["x"]) > 2 >= abs(away[first - 1].inner["x"])
+    # In the last step of an episode, what terminates it is no time limit.
+    late = dataclasses.replace(away[first - 1], clock=jnp.int32(MAX_STEPS - 1))
+    ended = env.step(late, jnp.sign(late.inner["x"])[None])
+    assert ended.terminated and not ended.truncated
+
+
+def test_restart_is_a_new_episode_where_asked_and_keys_advance_either_way():
+    env = adapt(Reach(), "reach")
+    state = play(env, [0.3, 0.3])[-1]
+    same, fresh = (jax.jit(env.restart)(state, jnp.bool_(done)) for done in (False, True))
+    np.testing.assert_array_equal(same.inner["x"], state.inner["x"])
+    assert fresh.inner["x"] != state.inner["x"] and fresh.clock == 0 and fresh.metrics["length"] == 0
+    again = jax.jit(env.restart)(same, jnp.bool_(True))
+    assert again.inner["x"] != fresh.inner["x"]
+    clocks = jax.vmap(lambda key: env.stagger(state, key).clock)(jax.random.split(jax.random.key(1), 200))
+    assert set(np.asarray(clocks).tolist()) == set(range(MAX_STEPS))
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"reset": None}, "fails: TypeError"),
+        ({"observation_size": 3}, r"observation has the shape \(2,\), not \(3,\)"),
+        ({"action_size": 0}, "action_size = 0: must be a whole number of at least 1"),
+        ({"max_steps": 2.0}, "max_steps = 2.0"),
+        ({"control_period": 60.0}, "control_period = 60 s"),
+        ({"reset": lambda key: (jnp.zeros(2), jnp.zeros(3))}, "step.* fails"),
+        ({"reset": lambda key: jnp.zeros(2)}, "where a tuple of 2 is wanted"),
+        ({"step": lambda k, s, a: (jnp.zeros(2), s, jnp.zeros(1), jnp.bool_(False))}, r"reward has the shape \(1,\)"),
+        ({"step": lambda k, s, a: (jnp.zeros(2), s, jnp.zeros(()), jnp.zeros(()))}, "terminated is float32, not bool"),
+        ({"step": lambda k, s, a: (jnp.zeros(2), s["x"], jnp.zeros(()), jnp.bool_(False))}, "another structure"),
+        (
+            {
+                "step": lambda k, s, a: (
+                    jnp.zeros(2),
+                    s | {"steps": s["steps"].astype(jnp.float32)},
+                    jnp.zeros(()),
+                    jnp.bool_(False),
+                )
+            },
+            r"\['steps'\] is int32\[\] after reset and float32\[\] after step",
+        ),
+    ],
+)
+def test_what_does_not_fit_is_one_line(change, message):
+    env = Reach()
+    for name, value in change.items():
+        setattr(env, name, value)
+    with pytest.raises(ConfigError, match=message) as error:
+        adapt(env, "reach")
+    assert "'reach'" in str(error.value) and "\n" not in str(error.value)
+
+
+def test_missing_members_are_named_and_complete_environments_left_alone():
+    with pytest.raises(ConfigError, match="a dict has no observation_size, action_size, max_steps, reset, step"):
+        adapt({}, "nothing")
+    env = adapt(Reach(), "reach")
+    assert adapt(env, "other") is env
+    with pytest.raises(ConfigError, match="gives tuple where a tuple of 4"):
+        adapt(Broken(), "broken")
+
+
+@pytest.mark.parametrize(
+    "name, message",
+    [
+        ("no_such_module:make", "cannot be imported"),
+        ("reach_env:nothing", "unknown task 'nothing'"),
+        ("reach_env:NUMBER", "unknown task 'NUMBER'"),
+        ("reach_env:needs_a_size", "callable without arguments"),
+    ],
+)
+def test_bad_names_are_one_line(name, message, monkeypatch):
+    monkeypatch.setattr(registry, "TASKS", dict(registry.TASKS))
+    with pytest.raises(ConfigError, match=message):
+        train_policy(name, ppo=SMALL, steps=64)
+
+
+def test_training_by_name_is_reported_saved_resumed_and_evaluated(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(registry, "TASKS", dict(registry.TASKS))
+    config = dataclasses.replace(SMALL, num_envs=16)
+    sizes = {"evaluation_chunk": 16, "evaluation_episodes": 16}
+    run = train_policy("reach_env:reach", ppo=config, steps=16 * 8 * 4, run_dir=tmp_path / "run", seed=1, **sizes)
+    assert run.policy.task == run.report["task"] == "reach" and run.policy.control_rate == 10.0
+    assert run.report["trained"]["steps"] == MAX_STEPS and not (tmp_path / "run" / "policy.mp4").exists()
+    # Doing nothing leaves the point where it begins: half a metre off in the mean over its range.
+    idle = run.report["do_nothing"]
+    assert idle["held"]["value"] == 1.0 and 0.2 < idle["task"]["headline"]["distance"] < 0.8
+    assert idle["return"]["value"] == pytest.approx(MAX_STEPS * (1 - idle["task"]["headline"]["distance"]), rel=1e-4)
+    longer = train_policy("reach_env:reach", resume=tmp_path / "run", steps=16 * 8 * 8)
+    assert longer.policy.training["iteration"] == 8
+    report = evaluate_policy(Policy.load(tmp_path / "run" / "last.msgpack"), episodes=16, chunk=16, seed=3)
+    code = evaluate_command.main(
+        [str(tmp_path / "run" / "last.msgpack"), "--task", "reach_env:reach", "--episodes", "16", "--chunk", "16"]
+        + ["--seed", "3", "--output", str(tmp_path / "report.json")]
+    )
+    assert code == 0 and f"{report['return']['value']:.4g}" in capsys.readouterr().out
+
+
+class Params:
+    """As gymnax's: a frozen record with `replace`."""
+
+    def __init__(self, max_steps_in_episode=200):
+        self.max_steps_in_episode = max_steps_in_episode
+
+    def replace(self, **changes):
+        return Params(**changes)
+
+
+class Box:
+    def __init__(self, low, high, shape):
+        self.low, self.high, self.shape = low, high, shape
+
+
+class GymnaxPendulum:
+    """gymnax's functions for a pendulum in a few lines, its time limit inside."""
+
+    def observation_space(self, params):
+        return Box(-jnp.ones(3), jnp.ones(3), (3,))
+
+    def action_space(self, params):
+        return Box(-2.0, 2.0, (1,))
+
+    def reset_env(self, key, params):
+        theta, speed = jax.random.uniform(key, (2,), minval=-1.0, maxval=1.0)
+        state = {"theta": theta, "speed": speed, "time": jnp.int32(0)}
+        return self._seen(state), state
+
+    def step_env(self, key, state, action, params):
+        cost = state["theta"] ** 2 + 0.1 * state["speed"] ** 2 + 0.001 * action**2
+        speed = state["speed"] + 0.05 * (15.0 * jnp.sin(state["theta"]) + 3.0 * action[0])
+        state = {"theta": state["theta"] + 0.05 * speed, "speed": speed, "time": state["time"] + 1}
+        done = state["time"] >= params.max_steps_in_episode
+        return self._seen(state), state, -cost, done, {"discount": 1.0}
+
+    def _seen(self, state):
+        return jnp.stack([jnp.cos(state["theta"]), jnp.sin(state["theta"]), state["speed"]])
+
+
+def test_the_docs_adapter_fits_gymnax():
+    if not (ROOT / "docs").exists():
+        pytest.skip("needs a checkout")
+    page = (ROOT / "docs" / "any_environment.md").read_text()
+    (code,) = (block for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "FromGymnax" in block)
+    names = {}
+    exec(compile(code, "docs/any_environment.md", "exec"), names)
+    env = adapt(names["FromGymnax"](GymnaxPendulum(), Params(max_steps_in_episode=5)), "pendulum")
+    states = play(env, [1.0] * 5)
+    assert [bool(s.truncated) for s in states] == [False] * 5 + [True] and not states[-1].terminated
+    # A full action is a torque of 2.
+    begun, after = states[0].inner, states[1].inner
+    assert after["speed"] - begun["speed"] == pytest.approx(0.05 * (15 * np.sin(begun["theta"]) + 6.0), rel=1e-4)
+    training = make_train(env, SMALL)
+    state, metrics = training.step(training.init(jax.random.key(0)))
+    assert np.isfinite(metrics["reward"]).all() and int(state.iteration) == 1
+
+
+def test_the_learner_needs_no_hand():
+    code = (
+        "import sys, reach_env; from dexsim_ppo import make_train; from dexsim_ppo.learner.adapter import adapt; "
+        "make_train(adapt(reach_env.Reach(), 'reach'), __import__('dexsim_ppo').PPOConfig()); "
+        "print(sorted(m for m in sys.modules if m.split('.')[0] in ('mujoco', 'warp', 'brax') "
+        "or m.startswith(('dexsim.env', 'dexsim.hand', 'dexsim.physics', 'dexsim.tasks', 'dexsim.registry'))))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT / "tests" / "support", env=_environment()
+    )
+    assert done.stdout.strip() == "[]", done.stdout + done.stderr
+
+
+def _environment():
+    import os
+
+    return {**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tests' / 'support'}"}
