@@ -18,7 +18,7 @@ import threading
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.monitoring
@@ -53,6 +53,13 @@ class Program:
         """`fallback` compiles the program again if a cached one does not run."""
         self._compiled, self._names, self._fallback = compiled, names, fallback
         self._leaves = _Leaves(like)
+
+    def memory_analysis(self) -> Any:
+        """What the compiled program needs, in bytes; None where the runtime does not say."""
+        try:
+            return cast(Any, self._compiled).memory_analysis()
+        except (AttributeError, NotImplementedError, jax.errors.JaxRuntimeError):
+            return None
 
     def __call__(self, state: Any) -> tuple[Any, dict[str, jax.Array]]:
         leaves = self._leaves.of(state)

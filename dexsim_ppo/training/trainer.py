@@ -25,7 +25,7 @@ from dexsim_ppo.learner.sharding import learned, place
 from dexsim_ppo.learner.types import Environment
 from dexsim_ppo.policy import Policy
 from dexsim_ppo.report import print_report
-from dexsim_ppo.training import processes, programs
+from dexsim_ppo.training import memory, processes, programs
 from dexsim_ppo.training.arguments import TrainArguments, printable, training_config
 from dexsim_ppo.training.display import Display
 from dexsim_ppo.training.faults import Faults, keep
@@ -97,6 +97,7 @@ class Run:
             display.working("compiling the training step; the second time it is read from the cache")
             state, step = self._prepare(source)
             display.note(f"compiled in {self.clock['compile_s']:.1f} s")
+            memory.check(step, self.config.num_envs // (self.mesh.size if self.mesh else 1), display.note)
             display.working("first update" + (": compiling Warp's kernels" if self.env.backend == "warp" else ""))
             log = MetricsLog(self.folder, int(state.iteration)) if processes.is_first() else None
             try:
