@@ -9,8 +9,6 @@ import jax
 
 from dexsim.core.errors import ConfigError
 
-GIB = 2.0**30
-
 
 def needed(program: Any) -> int | None:
     """Bytes on a device of a compiled training step: its arguments, results and intermediate arrays; None where the
@@ -52,11 +50,15 @@ def check(program: Any, num_envs: int, note: Callable[[str], None]) -> None:
         return
     kind = jax.local_devices()[0].device_kind
     if limit is None:
-        return note(f"{num_envs} environments need {need / GIB:.2g} GiB")
+        return note(f"{num_envs} environments need {_text(need)}")
     if need > limit:
         fit = 2 ** int(math.log2(max(num_envs * limit / need, 1.0)))
         raise ConfigError(
-            f"{num_envs} environments need {need / GIB:.3g} GiB, and {kind} has {limit / GIB:.3g} GiB for JAX: about "
+            f"{num_envs} environments need {_text(need)}, and {kind} has {_text(limit)} for JAX: about "
             f"{fit} should fit (--ppo.num-envs {fit})"
         )
-    note(f"{num_envs} environments need {need / GIB:.2g} GiB, {kind} has {limit / GIB:.3g}")
+    note(f"{num_envs} environments need {_text(need)}, {kind} has {_text(limit)}")
+
+
+def _text(size: int) -> str:
+    return f"{size / 2**30:.3g} GiB" if size >= 2**28 else f"{size / 2**20:.3g} MiB"

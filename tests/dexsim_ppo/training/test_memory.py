@@ -34,7 +34,9 @@ def test_a_step_that_cannot_fit_is_refused_with_a_number_that_can(monkeypatch):
     monkeypatch.setattr(memory, "available", lambda: 80 * GIB)
     notes = []
     memory.check(program(11 * GIB, 0, 0, 30 * GIB), 32768, notes.append)
-    assert len(notes) == 1 and notes[0].startswith("32768 environments need 41 GiB, ") and notes[0].endswith("has 80")
+    assert (
+        len(notes) == 1 and notes[0].startswith("32768 environments need 41 GiB, ") and notes[0].endswith("has 80 GiB")
+    )
     memory.check(program(50 * GIB, 0, 0, 30 * GIB), 32768, notes.append)  # exactly all of it
     with pytest.raises(ConfigError, match=r"need 120 GiB, and .* has 80 GiB for JAX: about 16384 should fit") as error:
         memory.check(program(60 * GIB, 0, 0, 60 * GIB), 32768, notes.append)
@@ -42,6 +44,8 @@ def test_a_step_that_cannot_fit_is_refused_with_a_number_that_can(monkeypatch):
     monkeypatch.setattr(memory, "available", lambda: None)
     memory.check(program(GIB, 0, 0, GIB), 8, notes.append)
     assert notes[-1] == "8 environments need 2 GiB"
+    memory.check(program(3 * 2**20, 0, 0, 0), 8, notes.append)
+    assert notes[-1] == "8 environments need 3 MiB"
 
 
 def test_the_device_says_what_it_has():
@@ -67,7 +71,7 @@ def test_twice_the_environments_need_about_twice_as_much(tmp_path, monkeypatch):
 
 # The peak of a process's memory beyond what it had before the step: a program of its own, in a process of its own.
 MEASURE = """
-import dataclasses, resource
+import dataclasses, re
 import jax
 from tiny_env import SMALL, TinyEnv
 from dexsim_ppo import make_train
@@ -76,7 +80,7 @@ config = dataclasses.replace(SMALL, num_envs=32768, rollout_length=16, actor_lay
 training = make_train(TinyEnv(), config)
 shapes = training.shapes(jax.random.key(0))
 step = programs.compile_step(training.plain_step, shapes, None, lambda: None)
-peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+peak = lambda: 1024 * int(re.search(r'VmHWM:\\s+(\\d+)', open('/proc/self/status').read())[1])
 before = peak()
 state = jax.block_until_ready(training.init(jax.random.key(0)))
 state, _ = jax.block_until_ready(step(state))
@@ -84,7 +88,7 @@ print(memory.needed(step), peak() - before)
 """
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="ru_maxrss is in kilobytes on Linux only")
+@pytest.mark.skipif(sys.platform != "linux", reason="Linux tells the peak of a process since it began")
 def test_it_is_the_peak_that_is_measured():
     path = os.pathsep.join([str(ROOT), str(ROOT / "tests" / "support")])
     environment = {**os.environ, "PYTHONPATH": path}

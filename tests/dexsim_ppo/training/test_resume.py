@@ -78,7 +78,7 @@ def test_only_budget_and_what_looks_on_may_change(finished):
             check_resumed(dataclasses.replace(saved, **{field.name: value}), saved)
             allowed.add(field.name)
     assert allowed == {
-        *("checkpoint_every", "evaluate_every", "evaluation_chunk", "evaluation_episodes", "keep_checkpoints"),
+        *("checkpoint_every", "evaluate_every", "evaluation_chunk", "evaluation_episodes", "hand", "keep_checkpoints"),
         *("devices", "log_every", "minutes", "resume", "steps", "video"),
     }
 

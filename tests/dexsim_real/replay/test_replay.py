@@ -20,7 +20,7 @@ pytestmark = pytest.mark.usefixtures("jax_as_it_is")
 
 def test_a_run_from_the_measured_pose_to_motors_off_and_its_replay(hand, tmp_path):
     with FollowingHand() as peer:
-        assert run.main(arguments(peer, tmp_path, "--seconds", "1.2", "--command", "0.6")) == 0
+        assert run.main(arguments(peer, tmp_path, "--seconds", "1.2", "--command", "0.6", "--link.margin", "0.1")) == 0
         on, commands = peer.on(), peer.commands
     first = int(np.argmax(on))
     # Off while zeroing and warming, on at the measured pose, without a break until the end, then off.
