@@ -103,7 +103,7 @@ def test_programs_in_flight_do_not_block_each_other(cores):
 def test_ctrl_c_while_the_pool_runs():
     process = start(LONG, "long", 64)
     assert process.stdout.readline() == "running\n"
-    # Python loses an interrupt that arrives within a finalizer: whoever presses Ctrl-C presses it again.
+    # Seen once on a busy machine: it ran on, deaf to any further interrupt. A lost one alone is no failure.
     for _ in range(3):
         process.send_signal(signal.SIGINT)
         with contextlib.suppress(subprocess.TimeoutExpired):
