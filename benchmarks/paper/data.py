@@ -2,13 +2,18 @@
 
 import dataclasses
 import functools
+import hashlib
 import json
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from dexsim.core.assets import asset_path
 from dexsim.core.errors import ConfigError
+from dexsim_ppo.checkpoint import load
 
 ROOT = Path(__file__).resolve().parents[2]
 REPORTS = ROOT / "docs" / "results"
@@ -104,7 +109,9 @@ class Row:
     settings: tuple[str, ...] = ()
     """Changes to the task's configuration, as `--set` of the evaluation command takes them."""
     policy: str = ""
-    """Shipped policy: what is measured, or where rows are trained the one whose own report is shown beside them."""
+    """Shipped policy that is measured."""
+    stand_in: str = ""
+    """Shipped policy whose own report a row shows until its trainings are done."""
     ablate: tuple[str, ...] = ()
     """Observation fields that the policy does without."""
     points: tuple[float, ...] = ()
@@ -171,12 +178,20 @@ def load_report(path: Path) -> dict[str, Any]:
 
 
 def settings_of(row: Row) -> dict[str, Any]:
-    """What a report must have been measured with to be this row's."""
-    return {
+    """What a report must have been measured with to be this row's, the weights of the shipped policy among it."""
+    settings = {
         name: list(value) if isinstance(value, tuple) else value
         for name, value in dataclasses.asdict(row).items()
-        if name not in ("label", "paper", "training")
+        if name not in ("label", "paper", "training", "stand_in")
     }
+    return settings | ({"weights": weights_of(asset_path(f"policies/{row.policy}.msgpack"))} if row.policy else {})
+
+
+@functools.cache
+def weights_of(file: Path) -> str:
+    """Sixteen digits of the SHA-256 of a policy's arrays; a policy of other weights is another policy."""
+    leaves = load(file, kind="policy").leaves.values()
+    return hashlib.sha256(b"".join(np.asarray(leaf).tobytes() for leaf in leaves)).hexdigest()[:16]
 
 
 def is_done(experiment: Experiment, row: Row, budget: Budget, report: dict[str, Any]) -> bool:

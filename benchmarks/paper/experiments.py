@@ -39,7 +39,7 @@ def _observation_rows(task: str) -> tuple[Row, ...]:
             label=label,
             task=task,
             settings=settings,
-            policy=shipped.get(name, ""),
+            stand_in=shipped.get(name, ""),
             paper=_paper(name),
         )
         for name, (label, settings) in _OBSERVATIONS.items()
@@ -49,7 +49,6 @@ def _observation_rows(task: str) -> tuple[Row, ...]:
 def _sweep_rows() -> tuple[Row, ...]:
     """The rows of both skills. With a range of training the points are its ends and those of a range twice as wide."""
     shared = (
-        ("friction", "finger friction", "objects.friction=[{},{}]", (0.6, 1.2), ()),
         ("latency", "command latency [s]", "randomization.latency=[{},{}]", (0.0, 0.02), (0.0, 0.01, 0.02, 0.03)),
         ("torque_gain", "torque gain", "randomization.torque_gain=[{},{}]", (0.9, 1.1), ()),
         ("taxel_noise", "taxel noise [N]", "sensing.taxel.noise={}", None, (0.0, 0.01, 0.02, 0.04)),
@@ -58,11 +57,13 @@ def _sweep_rows() -> tuple[Row, ...]:
     )
     own = {
         "grasp": (
+            ("friction", "finger friction", "objects.friction=[{},{}]", (0.6, 1.2), ()),
             ("link_friction", "link friction", "objects.link_friction=[{},{}]", (0.6, 1.2), ()),
             ("mass", "mass [kg]", "objects.mass=[{},{}]", (0.05, 0.20), ()),
         ),
         "rotate": (
-            ("link_friction", "link friction", "objects.link_friction=[{},{}]", (0.3, 0.7), ()),
+            ("friction", "finger friction", "objects.friction=[{},{}]", (0.4, 1.2), ()),
+            ("link_friction", "link friction", "objects.link_friction=[{},{}]", (0.3, 0.9), ()),
             ("mass", "mass [kg]", "objects.mass=[{},{}]", (0.06, 0.15), ()),
             (
                 "orientation",

@@ -50,7 +50,7 @@ def seeds(report: dict[str, Any] | None) -> list[dict[str, Any]]:
 def how(experiment: Experiment, row: Row, report: dict[str, Any] | None) -> str:
     """Where a row's numbers are from."""
     if not report:
-        return "shipped policy, one seed, trained on a GPU" if row.policy else UNTRAINED
+        return "shipped policy, one seed, trained on a GPU" if row.stand_in else UNTRAINED
     count = len(report["seeds"])
     trained = [seed["training"] for seed in seeds(report) if seed.get("training")]
     if not trained:
@@ -103,9 +103,9 @@ def _seconds_each(count: float, seconds: float) -> dict[str, Any]:
 
 def _shipped(row: Row) -> list[dict[str, Any]]:
     """The shipped policy's own report in simulation, where the row names one."""
-    if not row.policy:
+    if not row.stand_in:
         return []
-    report = json.loads(asset_path(f"policies/{row.policy}.json").read_text())
+    report = json.loads(asset_path(f"policies/{row.stand_in}.json").read_text())
     return [report.get("evaluation", report["trained"])["task"]]
 
 

@@ -7,6 +7,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+
+from dexsim.core.assets import asset_path
 from paths import ROOT
 
 from dexsim.core.errors import ConfigError
@@ -205,10 +207,10 @@ def test_settings_of_all_rows_are_of_their_tasks(paper):
         for row in experiment.rows:
             if row.points:
                 entry, policy = find_task(row.task), load_policy(row.policy)
-                for point in row.points:
-                    settings = paper.measure.sweep_settings(row, point)
-                    changed = override(policy.env_config, settings)
-                    assert to_dict(from_dict(entry.config_class, changed)) != policy.env_config or point in (0.0, 0.02)
+                settings = [paper.measure.sweep_settings(row, point) for point in row.points]
+                changed = [override(policy.env_config, change) for change in settings]
+                found = {json.dumps(to_dict(from_dict(entry.config_class, config))) for config in changed}
+                assert len(found) == len(row.points)
             elif row.task:
                 paper.measure.task_config(row)
             if row.ablate:
@@ -340,7 +342,28 @@ def test_rows_without_training_say_so(paper):
     assert len(lines) == 8 and {line[-1] for line in lines[1:]} == {"not trained yet"}
     assert [line[1].split(" / ")[0] for line in lines[1:]] == ["25.1", "2.9", "12.2", "13.2", "7.5", "1.1", "11.2"]
     shipped = paper.tables.rotation(paper.experiments.EXPERIMENTS["observations"], {})
-    assert "shipped policy" in shipped[1][-1] and shipped[1][2].startswith("118")
+    report = json.loads(asset_path("policies/rotate.json").read_text())
+    mean = report.get("evaluation", report["trained"])["task"]["successes"]["mean"]["mean"]
+    assert "shipped policy" in shipped[1][-1] and shipped[1][2].startswith(f"{mean:.3g} (")
+
+
+def test_reports_of_other_weights_do_not_count(paper, tmp_path):
+    """A newly shipped policy has no report until it is measured."""
+    experiment = paper.experiments.EXPERIMENTS["force"]
+    (row,) = experiment.rows
+    path = paper.data.report_path(tmp_path, experiment, row)
+    path.parent.mkdir(parents=True)
+    report = {"budget": "cpu", "seeds": {"0": {}}, "row": paper.data.settings_of(row)}
+    path.write_text(json.dumps(report))
+    assert paper.page.reports_of(experiment, tmp_path) == {row.name: report}
+    path.write_text(json.dumps(report | {"row": report["row"] | {"weights": "0" * 16}}))
+    assert paper.page.reports_of(experiment, tmp_path) == {}
+    assert not paper.data.is_done(experiment, row, paper.data.BUDGETS["cpu"], json.loads(path.read_text()))
+
+
+def test_weights_tell_policies_apart(paper):
+    files = [asset_path(f"policies/{name}.msgpack") for name in ("grasp", "rotate", "rotate_clear")]
+    assert len({paper.data.weights_of(file) for file in files}) == 3
 
 
 def test_the_page_agrees_with_the_reports(paper):
