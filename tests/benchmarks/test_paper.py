@@ -7,10 +7,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-
-from dexsim.core.assets import asset_path
 from paths import ROOT
 
+from dexsim.core.assets import asset_path
 from dexsim.core.errors import ConfigError
 
 pytest.importorskip("serial")
