@@ -63,7 +63,8 @@ def _sweep_rows() -> tuple[Row, ...]:
         ),
         "rotate": (
             ("friction", "finger friction", "objects.friction=[{},{}]", (0.4, 1.2), ()),
-            ("link_friction", "link friction", "objects.link_friction=[{},{}]", (0.3, 0.9), ()),
+            # Below 0.1 hardly a cube stays on the palm to begin with.
+            ("link_friction", "link friction", "objects.link_friction=[{},{}]", (0.3, 0.9), (0.1, 0.3, 0.9, 1.2)),
             ("mass", "mass [kg]", "objects.mass=[{},{}]", (0.06, 0.15), ()),
             (
                 "orientation",
