@@ -15,7 +15,7 @@ import tyro
 
 from dexsim.core import cli
 from dexsim.core.errors import AssetError
-from dexsim.hand.kinematics import Hand, forward_kinematics
+from dexsim.hand.kinematics import Hand, forward_kinematics, hinge_angles
 from dexsim.hand.layout import check_hand as check_taxels
 from dexsim.hand.load import load_hand
 
@@ -32,10 +32,9 @@ def check_kinematics(hand: Hand) -> None:
     model = mujoco.MjModel.from_xml_path(str(hand.model_path))
     data, random = mujoco.MjData(model), np.random.default_rng(0)
     palm, bodies = model.body(hand.palm).id, [model.body(name).id for name in hand.body_names]
-    address = [int(model.joint(name).qposadr[0]) for name in hand.joint_names]
     for _ in range(_POSES):
         angle = random.uniform(hand.joint_lower, hand.joint_upper)
-        data.qpos[address] = angle
+        data.qpos[:] = hinge_angles(hand, angle)
         mujoco.mj_kinematics(model, data)
         expected = (data.xpos[bodies] - data.xpos[palm]) @ data.xmat[palm].reshape(3, 3)
         found = np.asarray(forward_kinematics(hand, angle.astype(np.float32)).body_position)

@@ -12,6 +12,7 @@ import numpy as np
 
 from dexsim.core.errors import AssetError
 from dexsim.core.files import read_toml
+from dexsim.hand.coupling import read_followers
 from dexsim.hand.files import digest_of, find_hand
 from dexsim.hand.kinematics import Geom, Hand
 
@@ -29,13 +30,14 @@ def load_hand(path: str | Path | None = None) -> Hand:
     _check_table(path, table)
     model_path = path.parent / table["model"]
     model = _load_model(path, model_path)
-    joints = _find_joints(path, model_path, model, table)
+    joints, followers = _find_joints(path, model_path, model, table)
     palm = _find(path, model_path, model, "body", table["palm"])
     bodies = [b for b in range(1, model.nbody) if _is_below(model.body_parentid, b, palm)]
     row = {body: i for i, body in enumerate(bodies)}
-    body_joint = _joints_of_bodies(model_path, model, table, joints, palm, row)
-    at = np.array([joints[j] if j >= 0 else -1 for j in body_joint])
+    at = _hinges_of_bodies(model_path, model, palm, row)
     has = at >= 0
+    moved = {joint: (joint, 1.0, 0.0) for joint in joints} | followers | {-1: (-1, 1.0, 0.0)}
+    body_motor, body_ratio, body_offset = zip(*(moved[hinge] for hinge in at), strict=True)
     tips, root = _find_fingers(path, model_path, model, table, row)
     finger_names = tuple(finger["name"] for finger in table["fingers"])
     taxels = read_taxels(path.parent / table["taxels"], finger_names, table["taxel_grid"])
@@ -55,7 +57,9 @@ def load_hand(path: str | Path | None = None) -> Hand:
         body_parent=parent,
         body_position=_f32([np.zeros(3) if b == palm else model.body_pos[b] for b in bodies]),
         body_rotation=_f32([identity if b == palm else _matrix(model.body_quat[b]) for b in bodies]),
-        body_joint=body_joint,
+        body_joint=np.array([joints.index(joint) if joint >= 0 else -1 for joint in body_motor], np.int32),
+        body_ratio=_f32(body_ratio),
+        body_offset=_f32(body_offset),
         joint_axis=_f32(np.where(has[:, None], model.jnt_axis[at], [0, 0, 1])),
         joint_anchor=_f32(np.where(has[:, None], model.jnt_pos[at], 0)),
         joint_reference=_f32(np.where(has, model.qpos0[model.jnt_qposadr[at]], 0)),
@@ -97,15 +101,18 @@ def _find(path: Path, model_path: Path, model: Any, kind: str, name: str) -> int
     return index
 
 
-def _find_joints(path: Path, model_path: Path, model: Any, table: dict) -> list[int]:
-    """The model's joints in the order of the TOML."""
+def _find_joints(
+    path: Path, model_path: Path, model: Any, table: dict
+) -> tuple[list[int], dict[int, tuple[int, float, float]]]:
+    """The model's joints in the order of the TOML, and those that follow them (`read_followers`)."""
     import mujoco
 
     joints = [_find(path, model_path, model, "joint", name) for name in table["joints"]]
-    if len(set(joints)) != model.njnt or model.nq != model.njnt:
+    followers = read_followers(model_path, model, joints)
+    if len(set(joints)) != model.njnt - len(followers) or len(set(joints)) != len(joints) or model.nq != model.njnt:
         raise AssetError(
-            f"{path}: joints lists {len(set(joints))} of the {model.njnt} joints of "
-            f"{model_path.name}; every joint must be listed once and be a hinge"
+            f"{path}: joints lists {len(set(joints))} of the {model.njnt - len(followers)} joints of "
+            f"{model_path.name}; every joint must be a hinge, and be listed once or follow one by an equality"
         )
     if np.any(model.jnt_type != mujoco.mjtJoint.mjJNT_HINGE):
         raise AssetError(f"{model_path}: only hinge joints are supported")
@@ -117,23 +124,21 @@ def _find_joints(path: Path, model_path: Path, model: Any, table: dict) -> list[
             n for n, j, t in zip(table["joints"], joints, limit, strict=True) if not model.jnt_limited[j] or t <= 0
         )
         raise AssetError(f"{model_path}: joint {bad!r} needs a range and an actuatorfrcrange")
-    return joints
+    return joints, followers
 
 
-def _joints_of_bodies(
-    model_path: Path, model: Any, table: dict, joints: list[int], palm: int, row: dict[int, int]
-) -> np.ndarray:
-    """The joint [B] that moves each body, as an index into the TOML's; -1 for none."""
-    body_joint = np.full(len(row), -1, np.int32)
-    for index, joint in enumerate(joints):
+def _hinges_of_bodies(model_path: Path, model: Any, palm: int, row: dict[int, int]) -> np.ndarray:
+    """The model's joint [B] that moves each body; -1 for none."""
+    hinges = np.full(len(row), -1)
+    for joint in range(model.njnt):
         body = int(model.jnt_bodyid[joint])
-        if body not in row or body == palm or body_joint[row[body]] >= 0:
+        if body not in row or body == palm or hinges[row[body]] >= 0:
             raise AssetError(
-                f"{model_path}: joint {table['joints'][index]!r} must be the only "
-                f"joint of a body below {table['palm']!r}"
+                f"{model_path}: joint {model.joint(joint).name!r} must be the only joint of a body below "
+                f"{model.body(palm).name!r}"
             )
-        body_joint[row[body]] = index
-    return body_joint
+        hinges[row[body]] = joint
+    return hinges
 
 
 def _find_fingers(
