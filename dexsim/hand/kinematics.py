@@ -64,6 +64,8 @@ class Hand:
     taxel_normal: np.ndarray  # [F, N, 3] outward
     taxel_area: np.ndarray  # [F, N] m^2
     geoms: tuple[Geom, ...]
+    grasp_posture: tuple[float, ...] = ()  # rad, from which grasps start; empty: not given
+    grasp_centre: tuple[float, ...] = ()  # m, where the object of a grasp belongs; empty: not given
     source: str = ""  # the TOML as it was named, or the name of a shipped hand
     digest: str = ""  # of its files
 
@@ -154,16 +156,30 @@ def _levels(parent: np.ndarray) -> list[np.ndarray]:
 
 
 def flexion_joints(hand: Hand, fingers: range) -> np.ndarray:
-    """Joint indices of these fingers from their root joint to the tip."""
+    """Joint indices of these fingers from their root joint to the tip, but those that swing the finger sideways: hinges
+    whose axes are not parallel to the root joint's."""
+    frames = _drawn_frames(hand)
     joints = set[int]()
     for finger in fingers:
         body, chain = int(hand.tip_body[finger]), list[int]()
         while body >= 0:
-            chain.append(int(hand.body_joint[body]))
+            chain.append(body)
             body = int(hand.body_parent[body])
-        root = [place for place, joint in enumerate(chain) if joint == hand.root_joint[finger]]
-        joints |= set(chain[: root[-1] + 1 if root else None])
-    return np.array(sorted(joints - {-1}))
+        root = [place for place, body in enumerate(chain) if hand.body_joint[body] == hand.root_joint[finger]]
+        axes = np.stack([frames[body] @ hand.joint_axis[body] for body in chain])
+        for body, cosine in zip(chain[: root[-1] + 1], np.abs(axes @ axes[root[-1]]), strict=False):
+            if hand.body_joint[body] >= 0 and cosine > 0.7:
+                joints.add(int(hand.body_joint[body]))
+    return np.array(sorted(joints))
+
+
+def _drawn_frames(hand: Hand) -> np.ndarray:
+    """Rotations [B, 3, 3] of the bodies in the palm's frame, with every hinge as drawn."""
+    frames = np.array(hand.body_rotation)
+    for body, above in enumerate(hand.body_parent):
+        if above >= 0:
+            frames[body] = frames[above] @ frames[body]
+    return frames
 
 
 def tip_twist(hand: Hand, joint_position: jax.Array, joint_velocity: jax.Array) -> jax.Array:

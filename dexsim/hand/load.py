@@ -13,7 +13,7 @@ import numpy as np
 from dexsim.core.errors import AssetError
 from dexsim.core.files import read_toml
 from dexsim.hand.coupling import read_followers
-from dexsim.hand.files import digest_of, find_hand
+from dexsim.hand.files import digest_of, find_hand, shipped_name
 from dexsim.hand.kinematics import Geom, Hand
 
 TAXEL_COLUMNS = ("finger", "column", "row", "x", "y", "z", "nx", "ny", "nz", "area")
@@ -40,8 +40,21 @@ def load_hand(path: str | Path | None = None) -> Hand:
     body_motor, body_ratio, body_offset = zip(*(moved[hinge] for hinge in at), strict=True)
     tips, root = _find_fingers(path, model_path, model, table, row)
     finger_names = tuple(finger["name"] for finger in table["fingers"])
-    taxels = read_taxels(path.parent / table["taxels"], finger_names, table["taxel_grid"])
+    tip_body = np.array([row[int(model.site_bodyid[s])] for s in tips], np.int32)
+    geoms = _read_geoms(model_path, model, row)
+    files = (path, model_path)
+    if "taxels" in table:
+        files = (*files, path.parent / table["taxels"])
+        taxels = read_taxels(files[-1], finger_names, table["taxel_grid"])
+    else:
+        from dexsim.hand.pads import lay_taxels
+
+        taxels = lay_taxels(path, table, geoms, tip_body)
     parent = np.array([row.get(int(model.body_parentid[b]), -1) for b in bodies])
+    for finger, site in zip(table["fingers"], tips, strict=True):
+        rooted = int(model.jnt_bodyid[_find(path, model_path, model, "joint", finger["root_joint"])])
+        if not _is_below(model.body_parentid, int(model.site_bodyid[site]), rooted):
+            raise AssetError(f"{path}: root_joint {finger['root_joint']!r} does not move the tip {finger['tip']!r}")
     identity = np.eye(3)
 
     return Hand(
@@ -64,7 +77,7 @@ def load_hand(path: str | Path | None = None) -> Hand:
         joint_anchor=_f32(np.where(has[:, None], model.jnt_pos[at], 0)),
         joint_reference=_f32(np.where(has, model.qpos0[model.jnt_qposadr[at]], 0)),
         finger_names=finger_names,
-        tip_body=np.array([row[int(model.site_bodyid[s])] for s in tips], np.int32),
+        tip_body=tip_body,
         tip_offset=_f32(model.site_pos[tips]),
         root_joint=np.array(root, np.int32),
         force_per_torque=_f32([finger.get("force_per_torque", 0.0) for finger in table["fingers"]]),
@@ -72,9 +85,11 @@ def load_hand(path: str | Path | None = None) -> Hand:
         taxel_position=taxels[..., 0:3],
         taxel_normal=taxels[..., 3:6],
         taxel_area=taxels[..., 6],
-        geoms=_read_geoms(model_path, model, row),
-        source=path.stem if path.parent == find_hand(None).parent else str(given),
-        digest=digest_of(path, model_path, path.parent / table["taxels"]),
+        geoms=geoms,
+        grasp_posture=tuple(float(x) for x in table.get("grasp", {}).get("posture", ())),
+        grasp_centre=tuple(float(x) for x in table.get("grasp", {}).get("centre", ())),
+        source=shipped_name(path) or str(given),
+        digest=digest_of(*files),
     )
 
 
@@ -158,7 +173,6 @@ def _check_table(path: Path, table: dict) -> None:
     """Entries and their types; names are checked against the model by `load_hand`."""
     kinds = {
         "model": str,
-        "taxels": str,
         "taxel_grid": list,
         "palm": str,
         "joints": list,
@@ -170,6 +184,13 @@ def _check_table(path: Path, table: dict) -> None:
             raise AssetError(f"{path}: no entry {key!r}")
         if not isinstance(table[key], kind):
             raise AssetError(f"{path}: {key} = {table[key]!r:.60}: expected a {'string' if kind is str else 'list'}")
+    if not isinstance(table.get("taxels", ""), str):
+        raise AssetError(f"{path}: taxels = {table['taxels']!r:.60}: expected a string")
+    grasp = table.get("grasp", {})
+    for key, length in (("posture", len(table["joints"])), ("centre", 3)):
+        values = grasp.get(key, [0] * length) if isinstance(grasp, dict) else None
+        if not isinstance(values, list) or len(values) != length or any(type(x) not in (int, float) for x in values):
+            raise AssetError(f"{path}: grasp.{key} = {values!r:.60}: expected {length} numbers")
     if not isinstance(table.get("name", ""), str):
         raise AssetError(f"{path}: name = {table['name']!r:.60}: expected a string")
     grid, speeds = table["taxel_grid"], table["speed_limits"]
