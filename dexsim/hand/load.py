@@ -42,7 +42,7 @@ def load_hand(path: str | Path | None = None) -> Hand:
     finger_names = tuple(finger["name"] for finger in table["fingers"])
     tip_body = np.array([row[int(model.site_bodyid[s])] for s in tips], np.int32)
     geoms = _read_geoms(model_path, model, row)
-    files = (path, model_path)
+    files: tuple[Path, ...] = (path, model_path)
     if "taxels" in table:
         files = (*files, path.parent / table["taxels"])
         taxels = read_taxels(files[-1], finger_names, table["taxel_grid"])

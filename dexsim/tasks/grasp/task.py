@@ -104,7 +104,8 @@ class Grasp:
             raise ConfigError(
                 f"GraspConfig.posture has {len(config.posture)} angles, the hand {hand.num_joints} joints"
             )
-        self.config, self.hand, self.reference = config, hand, hand.grasp_centre
+        x, y, z = hand.grasp_centre
+        self.config, self.hand, self.reference = config, hand, (x, y, z)
         self.slots, self.largest = config.objects.slots, config.objects.largest
         self.object_ranges = tuple(f"objects.{name}" for name in config.objects.ranges)
         self._roots = hand.root_joint
