@@ -4,7 +4,6 @@
 files under `assets/hand/` knows which hand it is.
 """
 
-import csv
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +14,8 @@ from dexsim.core.files import read_toml
 from dexsim.hand.coupling import read_followers
 from dexsim.hand.files import digest_of, find_hand, shipped_name
 from dexsim.hand.kinematics import Geom, Hand
-
-TAXEL_COLUMNS = ("finger", "column", "row", "x", "y", "z", "nx", "ny", "nz", "area")
+from dexsim.hand.layout import read_taxels
+from dexsim.hand.pads import lay_taxels
 
 
 def load_hand(path: str | Path | None = None) -> Hand:
@@ -47,8 +46,6 @@ def load_hand(path: str | Path | None = None) -> Hand:
         files = (*files, path.parent / table["taxels"])
         taxels = read_taxels(files[-1], finger_names, table["taxel_grid"])
     else:
-        from dexsim.hand.pads import lay_taxels
-
         taxels = lay_taxels(path, table, geoms, tip_body)
     parent = np.array([row.get(int(model.body_parentid[b]), -1) for b in bodies])
     for finger, site in zip(table["fingers"], tips, strict=True):
@@ -279,47 +276,3 @@ def _read_toml(path: Path) -> dict:
         raise AssetError(f"{path}: no such file") from None
     except (OSError, ValueError) as error:
         raise AssetError(f"{path}: {error}") from None
-
-
-def read_taxels(path: Path, fingers: tuple[str, ...], grid: tuple[int, int]) -> np.ndarray:
-    """[F, N, 7]: position, normal, area. Every finger must have columns * rows taxels."""
-    try:
-        with open(path, newline="") as file:
-            rows = list(csv.DictReader(file))
-    except FileNotFoundError:
-        raise AssetError(f"{path}: no such file") from None
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise AssetError(f"{path}: {error}") from None
-    if not rows or tuple(rows[0]) != TAXEL_COLUMNS:
-        raise AssetError(f"{path}: the first line must read {','.join(TAXEL_COLUMNS)}")
-    columns, length = grid
-    table = np.full((len(fingers), columns * length, 7), np.nan, np.float32)
-    for line, entry in enumerate(rows, start=2):
-        if entry["finger"] not in fingers:
-            raise AssetError(f"{path}:{line}: no finger {entry['finger']!r}; the hand has {', '.join(fingers)}")
-        try:
-            column, at = int(entry["column"]), int(entry["row"])
-            values = [float(entry[name]) for name in TAXEL_COLUMNS[3:]]
-            if None in entry:  # more values than columns
-                raise ValueError
-        except (TypeError, ValueError):
-            raise AssetError(f"{path}:{line}: not ten values with numbers from column 2 on") from None
-        if not (0 <= column < columns and 0 <= at < length) or not np.all(np.isfinite(values)):
-            raise AssetError(
-                f"{path}:{line}: column {column}, row {at} or a number in the line "
-                f"is outside the {columns} x {length} grid or not finite"
-            )
-        if abs(np.linalg.norm(values[3:6]) - 1) > 0.01 or values[6] <= 0:
-            raise AssetError(f"{path}:{line}: the normal must be of length 1 and the area above 0")
-        table[fingers.index(entry["finger"]), column * length + at] = values
-    count = np.sum(np.isfinite(table[..., 0]), axis=1)
-    if np.any(count != columns * length):
-        worst = int(np.argmin(count))
-        raise AssetError(
-            f"{path}: finger {fingers[worst]!r} has {count[worst]} taxels, the grid asks for {columns * length}"
-        )
-    if len(rows) != table.shape[0] * table.shape[1]:
-        raise AssetError(
-            f"{path}: {len(rows)} taxels, expected {table.shape[0] * table.shape[1]} (a column and row is given twice)"
-        )
-    return table
