@@ -11,8 +11,8 @@ import functools
 import mujoco
 import numpy as np
 
-from dexsim.core.errors import AssetError
 from dexsim.hand.kinematics import Hand
+from dexsim_real.core.errors import HandError
 from dexsim_real.twin.plant.parameters import TrialParameters
 from dexsim_real.twin.plant.shapes import ObjectShape
 
@@ -57,10 +57,10 @@ def build_scene(hand: Hand, parameters: TrialParameters, shape: ObjectShape | No
       gravity: [3] m/s^2, palm frame.
 
     Raises:
-      AssetError: the hand has coupled joints.
+      HandError: the hand has coupled joints.
     """
     if hand.num_hinges > hand.num_joints:
-        raise AssetError(f"{hand.model_path}: the emulated hand has gear play, which coupled joints cannot have")
+        raise HandError(f"{hand.model_path}: the emulated hand has gear play, which coupled joints cannot have")
     spec = mujoco.MjSpec.from_file(str(hand.model_path))
     for element in (*spec.actuators, *spec.sensors, *spec.keys):
         spec.delete(element)
