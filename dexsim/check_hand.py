@@ -9,17 +9,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
+import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import tyro
 
+from dexsim import registry
 from dexsim.core import cli
-from dexsim.core.errors import AssetError
-from dexsim.hand.kinematics import Hand, forward_kinematics
+from dexsim.core.errors import AssetError, ConfigError
+from dexsim.env.state import State
+from dexsim.hand.kinematics import Hand, forward_kinematics, hinge_angles
 from dexsim.hand.layout import check_hand as check_taxels
 from dexsim.hand.load import load_hand
+from dexsim.tasks.grasp.config import GraspConfig
 
-_POSES = 20
+_POSES, _ENVS = 20, 16
 _TOLERANCE = 1e-5  # m, of link positions in float32
 
 
@@ -32,10 +37,9 @@ def check_kinematics(hand: Hand) -> None:
     model = mujoco.MjModel.from_xml_path(str(hand.model_path))
     data, random = mujoco.MjData(model), np.random.default_rng(0)
     palm, bodies = model.body(hand.palm).id, [model.body(name).id for name in hand.body_names]
-    address = [int(model.joint(name).qposadr[0]) for name in hand.joint_names]
     for _ in range(_POSES):
         angle = random.uniform(hand.joint_lower, hand.joint_upper)
-        data.qpos[address] = angle
+        data.qpos[:] = hinge_angles(hand, angle)
         mujoco.mj_kinematics(model, data)
         expected = (data.xpos[bodies] - data.xpos[palm]) @ data.xmat[palm].reshape(3, 3)
         found = np.asarray(forward_kinematics(hand, angle.astype(np.float32)).body_position)
@@ -56,12 +60,59 @@ def check_fingertips(hand: Hand) -> None:
             raise AssetError(f"{hand.model_path}: finger {name!r} has no primitive at its tip that touches (no mesh)")
 
 
+def check_rollout(hand: Hand) -> None:
+    """Random actions in the grasp task, as fast as they may change, for a second.
+
+    Raises:
+      AssetError: the hand has no grasp, or something that it measures is not finite.
+    """
+    try:
+        env = registry.make("grasp", GraspConfig(pool_size=_ENVS), hand=hand)
+    except ConfigError as error:
+        raise AssetError(str(error)) from None
+
+    def episode(key: jax.Array) -> jax.Array:
+        begin, *keys = jax.random.split(key, 1 + round(1 / env.control_period))
+
+        def step(state: State, key: jax.Array) -> tuple[State, jax.Array]:
+            state = env.step(state, jax.random.uniform(key, (env.action_size,), minval=-1.0))
+            return state, (state.metrics["non_finite"] > 0) | ~jnp.isfinite(state.obs["actor"]).all()
+
+        return jax.lax.scan(step, env.reset(begin), jnp.stack(keys))[1]
+
+    bad = np.asarray(jax.jit(jax.vmap(episode))(jax.random.split(jax.random.key(0), _ENVS)))
+    if bad.any():
+        raise AssetError(f"{hand.model_path}: physics diverged in {np.sum(bad.any(1))} of {_ENVS} episodes")
+
+
 CHECKS: dict[str, Callable[[Hand], None]] = {
     "kinematics agree with MuJoCo": check_kinematics,
     "fingertips touch": check_fingertips,
     "taxels are on the skin": check_taxels,
+    "random actions stay finite": check_rollout,
 }
 """What every hand must fulfil, beside what `load_hand` requires."""
+
+
+def describe(hand: Hand) -> list[str]:
+    """Motors, touch and self-collisions of a hand, a line each."""
+    lines = ["motor             range [rad]     stall [Nm]  no load [rad/s]  moves"]
+    for joint, name in enumerate(hand.joint_names):
+        moved = [f"{hand.body_names[b]} (x {hand.body_ratio[b]:.4g})" for b in np.flatnonzero(hand.body_joint == joint)]
+        lines.append(
+            f"  {name:15s} {hand.joint_lower[joint]:6.2f} to {hand.joint_upper[joint]:5.2f} "
+            f"{hand.torque_limit[joint]:12.2f} {hand.speed_limit[joint]:16.2f}  {', '.join(moved)}"
+        )
+    lines.append("finger            taxels          area [mm^2]")
+    for finger, name in enumerate(hand.finger_names):
+        columns, rows = hand.taxel_grid
+        lines.append(f"  {name:15s} {columns:3d} x {rows:3d} {1e6 * hand.taxel_area[finger].sum():18.0f}")
+    pairs = mujoco.MjModel.from_xml_path(str(hand.model_path)).npair
+    return [
+        *lines,
+        f"self-collision: {pairs} pairs. Links touch each other where a <pair> in the MJCF says so; contype and "
+        "conaffinity only say what touches the object",
+    ]
 
 
 def report(path: Path) -> tuple[list[str], bool]:
@@ -71,9 +122,13 @@ def report(path: Path) -> tuple[list[str], bool]:
     except AssetError as error:
         return [f"FAIL  files load: {error}"], False
     lines = [f"{hand.name}: {hand.num_joints} joints, {hand.num_fingers} fingers of {hand.num_taxels} taxels"]
+    lines += describe(hand)
     lines.append("ok    files load")
     passed = True
     for name, check in CHECKS.items():
+        if check is check_rollout and not passed:
+            lines.append(f"-     {name}: not tried")
+            continue
         try:
             check(hand)
             lines.append(f"ok    {name}")
@@ -88,7 +143,7 @@ class CheckHandArguments:
     """Options of `python -m dexsim.check_hand`."""
 
     hand: Annotated[Path, tyro.conf.Positional]
-    """The TOML of a hand."""
+    """The TOML of a hand, or the name of a shipped one."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:

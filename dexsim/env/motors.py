@@ -53,7 +53,7 @@ class Motors:
     """The motors of one environment, and the physics under them. Pure methods."""
 
     def __init__(self, config: EnvConfig, hand: Hand, physics: Physics):
-        """Raises ConfigError: gear play for joints without an armature."""
+        """Raises ConfigError: gear play for joints that have no armature, or are coupled."""
         self.hand, self.physics, self._substeps = hand, physics, config.physics.substeps
         model, dofs = physics.mj_model, physics.joint_dof
         self._timestep = float(model.opt.timestep)
@@ -61,6 +61,8 @@ class Motors:
         ranges = config.randomization
         self.gear_play = ranges.backlash == "gear_play"
         if self.gear_play:
+            if hand.num_hinges > hand.num_joints:
+                raise ConfigError(f"Randomization.backlash = 'gear_play': not with the coupled joints of {hand.name}")
             self._tooth_stiffness = ranges.tooth_stiffness
             self._rotor_inertia, self._steps = _rotors(ranges, model, dofs)
             self._link_inertia = np.asarray(1 / model.dof_invweight0[dofs], np.float32)

@@ -16,10 +16,10 @@ from dexsim.sensing.taxels import TaxelMemory, TaxelParams
 
 @pytree_dataclass
 class Start:
-    """A start state of the pool; J joints."""
+    """A start state of the pool; J joints, H hinges (`hand.kinematics.hinge_angles`)."""
 
-    qpos: jax.Array  # [J + 7] rad; m and unit quaternion of the object
-    qvel: jax.Array  # [J + 6] rad/s; m/s (palm frame) and rad/s (object frame)
+    qpos: jax.Array  # [H + 7] rad; m and unit quaternion of the object
+    qvel: jax.Array  # [H + 6] rad/s; m/s (palm frame) and rad/s (object frame)
     object: ObjectParams
     joint_target: jax.Array | None = None  # [J] rad; None: where the joints are
 

@@ -1,5 +1,6 @@
 """The files of a hand: found by a path or a shipped hand's name, and their hash."""
 
+import contextlib
 import hashlib
 import re
 from pathlib import Path
@@ -14,11 +15,18 @@ def find_hand(name: str | Path | None) -> Path:
     """The TOML of a hand that is named by a path, or by the name of a shipped one; None for the default one."""
     text = str(name or DEFAULT)
     if re.fullmatch(r"\w+", text) and not Path(text).exists():
-        try:
-            return asset_path(f"hand/{text}.toml")
-        except AssetError:
-            raise AssetError(f"hand {text!r}: no such file, and no shipped hand has that name") from None
+        for place in (f"hand/{text}.toml", f"hand/{text}/{text}.toml"):
+            with contextlib.suppress(AssetError):
+                return asset_path(place)
+        raise AssetError(f"hand {text!r}: no such file, and no shipped hand has that name")
     return Path(text)
+
+
+def shipped_name(path: Path) -> str:
+    """The name of the shipped hand whose TOML this is; empty for others."""
+    with contextlib.suppress(AssetError):
+        return path.stem if path.resolve() == find_hand(path.stem).resolve() else ""
+    return ""
 
 
 def digest_of(*files: Path) -> str:

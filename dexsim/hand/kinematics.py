@@ -3,7 +3,8 @@
 `forward_kinematics` is the one kinematics that simulation and hardware share. `dexsim.hand.load.load_hand`
 reads a `Hand` from files.
 
-Shapes: J joints, B bodies, F fingers, N taxels a finger. Frames: poses are in the palm frame
+Shapes: J joints that have motors, H hinges (more than J where one motor moves two), B bodies, F fingers, N taxels a
+finger. Frames: poses are in the palm frame
 (fingers +z, palm normal +x, thumb side +y).
 """
 
@@ -48,7 +49,9 @@ class Hand:
     body_position: np.ndarray  # [B, 3] m, in the parent's frame
     body_rotation: np.ndarray  # [B, 3, 3]
     body_joint: np.ndarray  # [B] index into joint_names, -1 where rigid
-    joint_axis: np.ndarray  # [B, 3], of the body's joint
+    body_ratio: np.ndarray  # [B] its hinge's angle over that joint's, 1 where it is that joint
+    body_offset: np.ndarray  # [B] rad, its hinge's angle where that joint's is 0
+    joint_axis: np.ndarray  # [B, 3], of the body's hinge
     joint_anchor: np.ndarray  # [B, 3] m
     joint_reference: np.ndarray  # [B] rad, angle at which the body is as drawn
     finger_names: tuple[str, ...]
@@ -61,12 +64,19 @@ class Hand:
     taxel_normal: np.ndarray  # [F, N, 3] outward
     taxel_area: np.ndarray  # [F, N] m^2
     geoms: tuple[Geom, ...]
+    grasp_posture: tuple[float, ...] = ()  # rad, from which grasps start; empty: not given
+    grasp_centre: tuple[float, ...] = ()  # m, where the object of a grasp belongs; empty: not given
     source: str = ""  # the TOML as it was named, or the name of a shipped hand
     digest: str = ""  # of its files
 
     @property
     def num_joints(self) -> int:
         return len(self.joint_names)
+
+    @property
+    def num_hinges(self) -> int:
+        """Hinges of the MJCF: joints, and those that follow them."""
+        return int(np.sum(self.body_joint >= 0))
 
     @property
     def num_fingers(self) -> int:
@@ -96,6 +106,8 @@ def forward_kinematics(hand: Hand, joint_position: Array) -> HandPose:
     """
     moving = hand.body_joint >= 0
     angle = jnp.where(moving, joint_position[np.maximum(hand.body_joint, 0)], 0.0)
+    if hand.num_hinges > hand.num_joints:
+        angle = angle * hand.body_ratio + hand.body_offset
     angle = angle - hand.joint_reference
     turn = rotations.axis_angle_to_matrix(jnp.asarray(hand.joint_axis), angle)
     local_rotation = rotations.compose(jnp.asarray(hand.body_rotation), turn)
@@ -118,6 +130,12 @@ def forward_kinematics(hand: Hand, joint_position: Array) -> HandPose:
     return HandPose(position, rotation, tip_position, tip_rotation)
 
 
+def hinge_angles(hand: Hand, joint_position: Array) -> jax.Array:
+    """Angles [H] rad of all hinges, in the order of the MJCF, from joint angles [J] rad."""
+    moving = np.flatnonzero(hand.body_joint >= 0)
+    return joint_position[hand.body_joint[moving]] * hand.body_ratio[moving] + hand.body_offset[moving]
+
+
 def taxel_positions(hand: Hand, pose: HandPose) -> jax.Array:
     """Taxel positions [F, N, 3] m in the palm frame."""
     rotation, origin = pose.tip_rotation[:, None], pose.body_position[hand.tip_body][:, None]
@@ -138,15 +156,30 @@ def _levels(parent: np.ndarray) -> list[np.ndarray]:
 
 
 def flexion_joints(hand: Hand, fingers: range) -> np.ndarray:
-    """Joint indices of these fingers from their root joint to the tip."""
-    joints = []
+    """Joint indices of these fingers from their root joint to the tip, but those that swing the finger sideways: hinges
+    whose axes are not parallel to the root joint's."""
+    frames = _drawn_frames(hand)
+    joints = set[int]()
     for finger in fingers:
-        body, joint = int(hand.tip_body[finger]), -1
-        while body >= 0 and joint != hand.root_joint[finger]:
-            joint = int(hand.body_joint[body])
-            joints += [joint] if joint >= 0 else []
+        body, chain = int(hand.tip_body[finger]), list[int]()
+        while body >= 0:
+            chain.append(body)
             body = int(hand.body_parent[body])
+        root = [place for place, body in enumerate(chain) if hand.body_joint[body] == hand.root_joint[finger]]
+        axes = np.stack([frames[body] @ hand.joint_axis[body] for body in chain])
+        for body, cosine in zip(chain[: root[-1] + 1], np.abs(axes @ axes[root[-1]]), strict=False):
+            if hand.body_joint[body] >= 0 and cosine > 0.7:
+                joints.add(int(hand.body_joint[body]))
     return np.array(sorted(joints))
+
+
+def _drawn_frames(hand: Hand) -> np.ndarray:
+    """Rotations [B, 3, 3] of the bodies in the palm's frame, with every hinge as drawn."""
+    frames = np.array(hand.body_rotation)
+    for body, above in enumerate(hand.body_parent):
+        if above >= 0:
+            frames[body] = frames[above] @ frames[body]
+    return frames
 
 
 def tip_twist(hand: Hand, joint_position: jax.Array, joint_velocity: jax.Array) -> jax.Array:

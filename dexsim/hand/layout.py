@@ -222,8 +222,6 @@ def read_layout(path: str | Path) -> dict[str, Patch]:
     Raises:
       AssetError: missing or broken file, with the line.
     """
-    from dexsim.hand.load import read_taxels
-
     path = Path(path)
     try:
         with open(path, newline="") as file:
@@ -239,6 +237,50 @@ def read_layout(path: str | Path) -> dict[str, Patch]:
         name: Patch((columns, rows), taxels[:, 0:3], taxels[:, 3:6], taxels[:, 6])
         for name, taxels in zip(fingers, table, strict=True)
     }
+
+
+def read_taxels(path: Path, fingers: tuple[str, ...], grid: tuple[int, int]) -> np.ndarray:
+    """[F, N, 7]: position, normal, area. Every finger must have columns * rows taxels."""
+    try:
+        with open(path, newline="") as file:
+            rows = list(csv.DictReader(file))
+    except FileNotFoundError:
+        raise AssetError(f"{path}: no such file") from None
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise AssetError(f"{path}: {error}") from None
+    if not rows or tuple(rows[0]) != COLUMNS:
+        raise AssetError(f"{path}: the first line must read {','.join(COLUMNS)}")
+    columns, length = grid
+    table = np.full((len(fingers), columns * length, 7), np.nan, np.float32)
+    for line, entry in enumerate(rows, start=2):
+        if entry["finger"] not in fingers:
+            raise AssetError(f"{path}:{line}: no finger {entry['finger']!r}; the hand has {', '.join(fingers)}")
+        try:
+            column, at = int(entry["column"]), int(entry["row"])
+            values = [float(entry[name]) for name in COLUMNS[3:]]
+            if None in entry:  # more values than columns
+                raise ValueError
+        except (TypeError, ValueError):
+            raise AssetError(f"{path}:{line}: not ten values with numbers from column 2 on") from None
+        if not (0 <= column < columns and 0 <= at < length) or not np.all(np.isfinite(values)):
+            raise AssetError(
+                f"{path}:{line}: column {column}, row {at} or a number in the line "
+                f"is outside the {columns} x {length} grid or not finite"
+            )
+        if abs(np.linalg.norm(values[3:6]) - 1) > 0.01 or values[6] <= 0:
+            raise AssetError(f"{path}:{line}: the normal must be of length 1 and the area above 0")
+        table[fingers.index(entry["finger"]), column * length + at] = values
+    count = np.sum(np.isfinite(table[..., 0]), axis=1)
+    if np.any(count != columns * length):
+        worst = int(np.argmin(count))
+        raise AssetError(
+            f"{path}: finger {fingers[worst]!r} has {count[worst]} taxels, the grid asks for {columns * length}"
+        )
+    if len(rows) != table.shape[0] * table.shape[1]:
+        raise AssetError(
+            f"{path}: {len(rows)} taxels, expected {table.shape[0] * table.shape[1]} (a column and row is given twice)"
+        )
+    return table
 
 
 def _direction(vector: Any) -> np.ndarray:

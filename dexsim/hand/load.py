@@ -4,7 +4,6 @@
 files under `assets/hand/` knows which hand it is.
 """
 
-import csv
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +11,11 @@ import numpy as np
 
 from dexsim.core.errors import AssetError
 from dexsim.core.files import read_toml
-from dexsim.hand.files import digest_of, find_hand
+from dexsim.hand.coupling import read_followers
+from dexsim.hand.files import digest_of, find_hand, shipped_name
 from dexsim.hand.kinematics import Geom, Hand
-
-TAXEL_COLUMNS = ("finger", "column", "row", "x", "y", "z", "nx", "ny", "nz", "area")
+from dexsim.hand.layout import read_taxels
+from dexsim.hand.pads import lay_taxels
 
 
 def load_hand(path: str | Path | None = None) -> Hand:
@@ -29,17 +29,29 @@ def load_hand(path: str | Path | None = None) -> Hand:
     _check_table(path, table)
     model_path = path.parent / table["model"]
     model = _load_model(path, model_path)
-    joints = _find_joints(path, model_path, model, table)
+    joints, followers = _find_joints(path, model_path, model, table)
     palm = _find(path, model_path, model, "body", table["palm"])
     bodies = [b for b in range(1, model.nbody) if _is_below(model.body_parentid, b, palm)]
     row = {body: i for i, body in enumerate(bodies)}
-    body_joint = _joints_of_bodies(model_path, model, table, joints, palm, row)
-    at = np.array([joints[j] if j >= 0 else -1 for j in body_joint])
+    at = _hinges_of_bodies(model_path, model, palm, row)
     has = at >= 0
+    moved = {joint: (joint, 1.0, 0.0) for joint in joints} | followers | {-1: (-1, 1.0, 0.0)}
+    body_motor, body_ratio, body_offset = zip(*(moved[hinge] for hinge in at), strict=True)
     tips, root = _find_fingers(path, model_path, model, table, row)
     finger_names = tuple(finger["name"] for finger in table["fingers"])
-    taxels = read_taxels(path.parent / table["taxels"], finger_names, table["taxel_grid"])
+    tip_body = np.array([row[int(model.site_bodyid[s])] for s in tips], np.int32)
+    geoms = _read_geoms(model_path, model, row)
+    files: tuple[Path, ...] = (path, model_path)
+    if "taxels" in table:
+        files = (*files, path.parent / table["taxels"])
+        taxels = read_taxels(files[-1], finger_names, table["taxel_grid"])
+    else:
+        taxels = lay_taxels(path, table, geoms, tip_body)
     parent = np.array([row.get(int(model.body_parentid[b]), -1) for b in bodies])
+    for finger, site in zip(table["fingers"], tips, strict=True):
+        rooted = int(model.jnt_bodyid[_find(path, model_path, model, "joint", finger["root_joint"])])
+        if not _is_below(model.body_parentid, int(model.site_bodyid[site]), rooted):
+            raise AssetError(f"{path}: root_joint {finger['root_joint']!r} does not move the tip {finger['tip']!r}")
     identity = np.eye(3)
 
     return Hand(
@@ -55,12 +67,14 @@ def load_hand(path: str | Path | None = None) -> Hand:
         body_parent=parent,
         body_position=_f32([np.zeros(3) if b == palm else model.body_pos[b] for b in bodies]),
         body_rotation=_f32([identity if b == palm else _matrix(model.body_quat[b]) for b in bodies]),
-        body_joint=body_joint,
+        body_joint=np.array([joints.index(joint) if joint >= 0 else -1 for joint in body_motor], np.int32),
+        body_ratio=_f32(body_ratio),
+        body_offset=_f32(body_offset),
         joint_axis=_f32(np.where(has[:, None], model.jnt_axis[at], [0, 0, 1])),
         joint_anchor=_f32(np.where(has[:, None], model.jnt_pos[at], 0)),
         joint_reference=_f32(np.where(has, model.qpos0[model.jnt_qposadr[at]], 0)),
         finger_names=finger_names,
-        tip_body=np.array([row[int(model.site_bodyid[s])] for s in tips], np.int32),
+        tip_body=tip_body,
         tip_offset=_f32(model.site_pos[tips]),
         root_joint=np.array(root, np.int32),
         force_per_torque=_f32([finger.get("force_per_torque", 0.0) for finger in table["fingers"]]),
@@ -68,9 +82,11 @@ def load_hand(path: str | Path | None = None) -> Hand:
         taxel_position=taxels[..., 0:3],
         taxel_normal=taxels[..., 3:6],
         taxel_area=taxels[..., 6],
-        geoms=_read_geoms(model_path, model, row),
-        source=path.stem if path.parent == find_hand(None).parent else str(given),
-        digest=digest_of(path, model_path, path.parent / table["taxels"]),
+        geoms=geoms,
+        grasp_posture=tuple(float(x) for x in table.get("grasp", {}).get("posture", ())),
+        grasp_centre=tuple(float(x) for x in table.get("grasp", {}).get("centre", ())),
+        source=shipped_name(path) or str(given),
+        digest=digest_of(*files),
     )
 
 
@@ -97,15 +113,18 @@ def _find(path: Path, model_path: Path, model: Any, kind: str, name: str) -> int
     return index
 
 
-def _find_joints(path: Path, model_path: Path, model: Any, table: dict) -> list[int]:
-    """The model's joints in the order of the TOML."""
+def _find_joints(
+    path: Path, model_path: Path, model: Any, table: dict
+) -> tuple[list[int], dict[int, tuple[int, float, float]]]:
+    """The model's joints in the order of the TOML, and those that follow them (`read_followers`)."""
     import mujoco
 
     joints = [_find(path, model_path, model, "joint", name) for name in table["joints"]]
-    if len(set(joints)) != model.njnt or model.nq != model.njnt:
+    followers = read_followers(model_path, model, joints)
+    if len(set(joints)) != model.njnt - len(followers) or len(set(joints)) != len(joints) or model.nq != model.njnt:
         raise AssetError(
-            f"{path}: joints lists {len(set(joints))} of the {model.njnt} joints of "
-            f"{model_path.name}; every joint must be listed once and be a hinge"
+            f"{path}: joints lists {len(set(joints))} of the {model.njnt - len(followers)} joints of "
+            f"{model_path.name}; every joint must be a hinge, and be listed once or follow one by an equality"
         )
     if np.any(model.jnt_type != mujoco.mjtJoint.mjJNT_HINGE):
         raise AssetError(f"{model_path}: only hinge joints are supported")
@@ -117,23 +136,21 @@ def _find_joints(path: Path, model_path: Path, model: Any, table: dict) -> list[
             n for n, j, t in zip(table["joints"], joints, limit, strict=True) if not model.jnt_limited[j] or t <= 0
         )
         raise AssetError(f"{model_path}: joint {bad!r} needs a range and an actuatorfrcrange")
-    return joints
+    return joints, followers
 
 
-def _joints_of_bodies(
-    model_path: Path, model: Any, table: dict, joints: list[int], palm: int, row: dict[int, int]
-) -> np.ndarray:
-    """The joint [B] that moves each body, as an index into the TOML's; -1 for none."""
-    body_joint = np.full(len(row), -1, np.int32)
-    for index, joint in enumerate(joints):
+def _hinges_of_bodies(model_path: Path, model: Any, palm: int, row: dict[int, int]) -> np.ndarray:
+    """The model's joint [B] that moves each body; -1 for none."""
+    hinges = np.full(len(row), -1)
+    for joint in range(model.njnt):
         body = int(model.jnt_bodyid[joint])
-        if body not in row or body == palm or body_joint[row[body]] >= 0:
+        if body not in row or body == palm or hinges[row[body]] >= 0:
             raise AssetError(
-                f"{model_path}: joint {table['joints'][index]!r} must be the only "
-                f"joint of a body below {table['palm']!r}"
+                f"{model_path}: joint {model.joint(joint).name!r} must be the only joint of a body below "
+                f"{model.body(palm).name!r}"
             )
-        body_joint[row[body]] = index
-    return body_joint
+        hinges[row[body]] = joint
+    return hinges
 
 
 def _find_fingers(
@@ -153,7 +170,6 @@ def _check_table(path: Path, table: dict) -> None:
     """Entries and their types; names are checked against the model by `load_hand`."""
     kinds = {
         "model": str,
-        "taxels": str,
         "taxel_grid": list,
         "palm": str,
         "joints": list,
@@ -165,6 +181,13 @@ def _check_table(path: Path, table: dict) -> None:
             raise AssetError(f"{path}: no entry {key!r}")
         if not isinstance(table[key], kind):
             raise AssetError(f"{path}: {key} = {table[key]!r:.60}: expected a {'string' if kind is str else 'list'}")
+    if not isinstance(table.get("taxels", ""), str):
+        raise AssetError(f"{path}: taxels = {table['taxels']!r:.60}: expected a string")
+    grasp = table.get("grasp", {})
+    for key, length in (("posture", len(table["joints"])), ("centre", 3)):
+        values = grasp.get(key, [0] * length) if isinstance(grasp, dict) else None
+        if not isinstance(values, list) or len(values) != length or any(type(x) not in (int, float) for x in values):
+            raise AssetError(f"{path}: grasp.{key} = {values!r:.60}: expected {length} numbers")
     if not isinstance(table.get("name", ""), str):
         raise AssetError(f"{path}: name = {table['name']!r:.60}: expected a string")
     grid, speeds = table["taxel_grid"], table["speed_limits"]
@@ -253,47 +276,3 @@ def _read_toml(path: Path) -> dict:
         raise AssetError(f"{path}: no such file") from None
     except (OSError, ValueError) as error:
         raise AssetError(f"{path}: {error}") from None
-
-
-def read_taxels(path: Path, fingers: tuple[str, ...], grid: tuple[int, int]) -> np.ndarray:
-    """[F, N, 7]: position, normal, area. Every finger must have columns * rows taxels."""
-    try:
-        with open(path, newline="") as file:
-            rows = list(csv.DictReader(file))
-    except FileNotFoundError:
-        raise AssetError(f"{path}: no such file") from None
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise AssetError(f"{path}: {error}") from None
-    if not rows or tuple(rows[0]) != TAXEL_COLUMNS:
-        raise AssetError(f"{path}: the first line must read {','.join(TAXEL_COLUMNS)}")
-    columns, length = grid
-    table = np.full((len(fingers), columns * length, 7), np.nan, np.float32)
-    for line, entry in enumerate(rows, start=2):
-        if entry["finger"] not in fingers:
-            raise AssetError(f"{path}:{line}: no finger {entry['finger']!r}; the hand has {', '.join(fingers)}")
-        try:
-            column, at = int(entry["column"]), int(entry["row"])
-            values = [float(entry[name]) for name in TAXEL_COLUMNS[3:]]
-            if None in entry:  # more values than columns
-                raise ValueError
-        except (TypeError, ValueError):
-            raise AssetError(f"{path}:{line}: not ten values with numbers from column 2 on") from None
-        if not (0 <= column < columns and 0 <= at < length) or not np.all(np.isfinite(values)):
-            raise AssetError(
-                f"{path}:{line}: column {column}, row {at} or a number in the line "
-                f"is outside the {columns} x {length} grid or not finite"
-            )
-        if abs(np.linalg.norm(values[3:6]) - 1) > 0.01 or values[6] <= 0:
-            raise AssetError(f"{path}:{line}: the normal must be of length 1 and the area above 0")
-        table[fingers.index(entry["finger"]), column * length + at] = values
-    count = np.sum(np.isfinite(table[..., 0]), axis=1)
-    if np.any(count != columns * length):
-        worst = int(np.argmin(count))
-        raise AssetError(
-            f"{path}: finger {fingers[worst]!r} has {count[worst]} taxels, the grid asks for {columns * length}"
-        )
-    if len(rows) != table.shape[0] * table.shape[1]:
-        raise AssetError(
-            f"{path}: {len(rows)} taxels, expected {table.shape[0] * table.shape[1]} (a column and row is given twice)"
-        )
-    return table

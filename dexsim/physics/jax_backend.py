@@ -77,6 +77,6 @@ class JaxBackend(MjxBackend):
         finger = jnp.asarray(self._finger_of_geom)[touch.geom[use]]
         is_object = jnp.asarray(self._is_object_geom)[touch.geom[use]]
         # MuJoCo's contact force acts on geom2; geom1 feels the opposite.
-        on_second = is_object[:, 0].astype(jnp.float32) * jax.nn.one_hot(finger[:, 1], fingers).T
-        on_first = is_object[:, 1].astype(jnp.float32) * jax.nn.one_hot(finger[:, 0], fingers).T
-        return jnp.sum((on_second - on_first)[..., None] * force, 1)
+        on_second = is_object[None, :, 0].astype(jnp.float32) * jax.nn.one_hot(finger[:, 1], fingers).T
+        on_first = is_object[None, :, 1].astype(jnp.float32) * jax.nn.one_hot(finger[:, 0], fingers).T
+        return jnp.sum((on_second - on_first)[..., None] * force[None], 1)

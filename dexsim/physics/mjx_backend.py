@@ -63,7 +63,9 @@ class MjxBackend:
             data, memory = carry
             tau, memory = torque(index, data.qpos[scene.joint_qpos], data.qvel[scene.joint_dof], memory)
             applied = jnp.zeros(scene.model.nv).at[scene.joint_dof].set(tau)
-            return (self.mjx.step(model, data.replace(qfrc_applied=applied)), memory), None
+            # MJX relies on implicit promotion, which the caller may have made an error.
+            with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
+                return (self.mjx.step(model, data.replace(qfrc_applied=applied)), memory), None
 
         # Forces are read after the scan: stacking sensordata as a scan output more than doubled
         # the step and returned zeros on the GPU.

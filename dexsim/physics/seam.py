@@ -5,7 +5,8 @@ the state small and lets an episode restart by selecting arrays, with every engi
 
 A new engine is one module with a class that follows `Backend`, and one line in `dexsim.physics.physics`.
 
-Shapes: J joints, F fingers, K primitives of the object, P pairs of a hand geom and an object geom.
+Shapes: J joints, H hinges (`Hand.num_hinges`), F fingers, K primitives of the object, P pairs of a hand geom and an
+object geom.
 """
 
 import dataclasses
@@ -28,11 +29,11 @@ it. Engines call it before every sub-step; the memory is any pytree."""
 
 @pytree_dataclass
 class PhysicsState:
-    """The Markov state: hand joints first, then the object's free joint."""
+    """The Markov state: the hand's hinges first, in the order of its MJCF, then the object's free joint."""
 
-    qpos: jax.Array  # [J + 7] rad; m and unit quaternion
-    qvel: jax.Array  # [J + 6] rad/s; m/s (palm frame) and rad/s (object frame)
-    warmstart: jax.Array  # [J + 6] last accelerations, the solver's first guess
+    qpos: jax.Array  # [H + 7] rad; m and unit quaternion
+    qvel: jax.Array  # [H + 6] rad/s; m/s (palm frame) and rad/s (object frame)
+    warmstart: jax.Array  # [H + 6] last accelerations, the solver's first guess
 
 
 @pytree_dataclass

@@ -53,5 +53,5 @@ class WarpBackend(MjxBackend):
 
 
 def constraint_rows(config: PhysicsConfig, hand: Hand) -> int:
-    """Constraint rows that Warp allocates for a world: three per contact, and joint limits."""
-    return 3 * 2 * config.max_contacts + hand.num_joints
+    """Constraint rows that Warp allocates for a world: three per contact, the hinges' limits, and their couplings."""
+    return 3 * 2 * config.max_contacts + 2 * hand.num_hinges - hand.num_joints

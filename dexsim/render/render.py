@@ -29,6 +29,8 @@ CAMERAS = {
 }
 """The hand held palm down, and palm up from the side on which fingers and thumb are both in sight."""
 
+_GRASP_CENTRE = (0.055, -0.005, 0.090)  # m, of the hand that the presets are aimed at
+
 
 def render_frame(
     hand: Hand,
@@ -133,7 +135,7 @@ def _painter(hand, kinds, snapshot, camera, size, force_range, finger_range) -> 
         raise ValueError(f"size: {width}x{height} must be even, at least 120 high and 0.75 times as wide as high")
     if np.shape(snapshot.primitive_size)[-2] != len(kinds):
         raise ValueError(f"kinds: {len(kinds)} given, the snapshot has {np.shape(snapshot.primitive_size)[-2]}")
-    camera = CAMERAS[camera] if isinstance(camera, str) else camera
+    camera = _aimed(CAMERAS[camera], hand) if isinstance(camera, str) else camera
     layout = make_layout(panel_width, height, hand.taxel_grid, len(hand.finger_names))
     view = look(camera, (width - panel_width, height))
     force_range = force_range or float(np.max(snapshot.taxel_force)) or 1.0
@@ -150,6 +152,14 @@ def _painter(hand, kinds, snapshot, camera, size, force_range, finger_range) -> 
         return np.concatenate([scene, panel], 1)
 
     return draw
+
+
+def _aimed(camera: Camera, hand: Hand) -> Camera:
+    """A preset, moved as far as the grasps of this hand are from those of the shipped one."""
+    if not hand.grasp_centre:
+        return camera
+    moved = np.asarray(camera.target) + np.asarray(hand.grasp_centre) - _GRASP_CENTRE
+    return dataclasses.replace(camera, target=tuple(moved.tolist()))
 
 
 @lru_cache(maxsize=4)

@@ -88,7 +88,7 @@ def finger_joints(hand: Hand, finger: int) -> list[int]:
     while body >= 0:
         joints += [int(hand.body_joint[body])] if hand.body_joint[body] >= 0 else []
         body = int(hand.body_parent[body])
-    return joints[::-1]
+    return list(dict.fromkeys(joints[::-1]))  # a motor may move two
 
 
 def open_rerun(run: Replay, path: Path | None = None) -> None:

@@ -30,7 +30,8 @@ class Mine(Grasp):
 def test_a_registered_task_is_made_by_name_with_its_annotated_configuration(hand):
     dexsim.register("mine", Mine)
     task = registry.make_task("mine", hand)
-    assert isinstance(task, Mine) and task.config == GraspConfig()
+    assert isinstance(task, Mine)
+    assert task.config == dataclasses.replace(GraspConfig(), posture=hand.grasp_posture)
     assert registry.find_task("mine").config_class is GraspConfig
 
 
@@ -39,7 +40,7 @@ def test_a_factory_without_annotations_names_its_configuration(hand):
     with pytest.raises(ConfigError, match="annotate the factory's first parameter"):
         dexsim.register("mine", lambda config, hand: Mine(config, hand))
     dexsim.register("mine", lambda config, hand: Mine(config, hand), config=lambda: default)
-    assert registry.make_task("mine", hand).config == default
+    assert registry.make_task("mine", hand).config == dataclasses.replace(default, posture=hand.grasp_posture)
 
 
 def test_the_same_task_may_be_registered_again_and_no_other(hand):

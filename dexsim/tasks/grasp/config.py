@@ -74,10 +74,8 @@ class GraspConfig(EnvConfig):
     """Largest change of the object's speed in a push."""
     drop_distance: float = setting(0.12, unit="m", low=0.02, high=1.0)
     """The object is lost when its centre is farther than this from the grasp centre."""
-    posture: tuple[float, ...] = setting(
-        (1.45, 0.15, 0.25, 0.0, 1.1, 0.8, 1.1, 0.8, 1.1, 0.8, 1.1, 0.8), unit="rad", low=-3.2, high=3.2
-    )
-    """Joint angles that episodes start near."""
+    posture: tuple[float, ...] = setting((), unit="rad", low=-3.2, high=3.2)
+    """Joint angles that episodes start near; empty for those that the hand's TOML gives."""
     posture_noise: float = setting(0.12, unit="rad", low=0.0, high=1.0)
     """Largest deviation of the start posture from `posture`, per joint."""
     curl: tuple[float, float] = setting((-0.3, 0.1), unit="rad", low=-3.0, high=3.0)

@@ -10,7 +10,7 @@ import numpy as np
 from dexsim.core import compilation
 from dexsim.core.errors import ConfigError
 from dexsim.geometry import rotations
-from dexsim.hand.kinematics import flexion_joints
+from dexsim.hand.kinematics import flexion_joints, hinge_angles
 from dexsim.objects.params import extent
 from dexsim.tasks.placement import clearance, palm_height
 
@@ -90,9 +90,9 @@ def _candidate(key: jax.Array, shape_index: jax.Array, task: Any) -> tuple[Any, 
     top = extent(object.size, object.position, object.active, up, object.kinds, object.quat)
     position = jnp.stack([palm_height(hand) + gap + top, reference[1] + shift[0], reference[2] + shift[1]])
     speed = jax.random.uniform(keys[5], minval=config.release_speed[0], maxval=config.release_speed[1])
-    qpos = jnp.concatenate([joints, position, quat])
+    qpos = jnp.concatenate([hinge_angles(hand, joints), position, quat])
     drift = config.release_drift * jax.random.uniform(jax.random.fold_in(keys[5], 1), (2,), minval=-1.0)
     spin = config.release_spin * jax.random.uniform(jax.random.fold_in(keys[5], 2), (3,), minval=-1.0)
-    qvel = jnp.concatenate([jnp.zeros(hand.num_joints), speed[None], drift, spin])
+    qvel = jnp.concatenate([jnp.zeros(hand.num_hinges), speed[None], drift, spin])
     start = Start(qpos=qpos, qvel=qvel, object=object)
     return start, clearance(hand, joints, object.shape(), position, matrix) > -_OVERLAP

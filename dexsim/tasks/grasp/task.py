@@ -93,16 +93,19 @@ class Grasp:
     evaluation = "series"
     fields: dict[str, tuple[str, ...]] = {"actor": observation.GRASP, "critic": observation.GRASP}
     gravity = (9.81, 0.0, 0.0)  # upside down: the palm's normal points to the ground
-    reference = (0.055, -0.005, 0.090)  # m, between palm and half-closed fingers
     shape_names = KINDS
     """What `ObjectParams.shape_index` counts."""
 
     def __init__(self, config: GraspConfig, hand: Hand):
+        if not hand.grasp_centre or not (config.posture or hand.grasp_posture):
+            raise ConfigError(f"hand {hand.name!r} has no grasp: its TOML needs [grasp] with posture and centre")
+        config = dataclasses.replace(config, posture=config.posture or hand.grasp_posture)
         if len(config.posture) != hand.num_joints:
             raise ConfigError(
                 f"GraspConfig.posture has {len(config.posture)} angles, the hand {hand.num_joints} joints"
             )
-        self.config, self.hand = config, hand
+        x, y, z = hand.grasp_centre
+        self.config, self.hand, self.reference = config, hand, (x, y, z)
         self.slots, self.largest = config.objects.slots, config.objects.largest
         self.object_ranges = tuple(f"objects.{name}" for name in config.objects.ranges)
         self._roots = hand.root_joint

@@ -25,7 +25,7 @@ from dexsim.core.config import to_dict
 from dexsim.core.errors import ConfigError
 from dexsim.core.files import write_whole
 from dexsim.geometry import rotations
-from dexsim.hand.kinematics import Hand, flexion_joints
+from dexsim.hand.kinematics import Hand, flexion_joints, hinge_angles
 from dexsim.objects.config import load_mesh_object
 from dexsim.objects.params import ObjectParams
 from dexsim.physics import contact
@@ -151,7 +151,7 @@ def _make(key: jax.Array, hand: Hand, config: Any, gravity: tuple[float, float, 
     chosen = np.concatenate([chosen, chosen[: size - len(chosen)]])
     return [
         np.stack([starts[k][0] for k in chosen]),
-        np.zeros((size, hand.num_joints + 6), np.float32),
+        np.zeros((size, hand.num_hinges + 6), np.float32),
         np.stack([starts[k][1] for k in chosen]),
         *(leaf[chosen] for leaf in jax.tree.leaves(objects)),
     ]
@@ -178,7 +178,7 @@ def _candidate(key: jax.Array, object: ObjectParams, hand: Hand, config: Any) ->
     closed[flexion_joints(hand, range(1))] = 1.0
     joint_target = jnp.clip(joints + squeeze * closed, hand.joint_lower, hand.joint_upper)
     return {
-        "qpos": jnp.concatenate([joints, place, quat]),
+        "qpos": jnp.concatenate([hinge_angles(hand, joints), place, quat]),
         "joint_target": joint_target,
         "object": object,
         "clear": overlap > -0.001,

@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 
 from dexsim.hand.kinematics import Hand
+from dexsim_real.core.errors import HandError
 from dexsim_real.twin.plant.parameters import TrialParameters
 from dexsim_real.twin.plant.shapes import ObjectShape
 
@@ -54,7 +55,12 @@ def build_scene(hand: Hand, parameters: TrialParameters, shape: ObjectShape | No
       parameters: of the trial.
       shape: of the object; None for the hand alone, with a body without geometry in its place.
       gravity: [3] m/s^2, palm frame.
+
+    Raises:
+      HandError: the hand has coupled joints.
     """
+    if hand.num_hinges > hand.num_joints:
+        raise HandError(f"{hand.model_path}: the emulated hand has gear play, which coupled joints cannot have")
     spec = mujoco.MjSpec.from_file(str(hand.model_path))
     for element in (*spec.actuators, *spec.sensors, *spec.keys):
         spec.delete(element)

@@ -66,15 +66,18 @@ def test_bands_repeat_the_ranges_of_the_tasks_and_of_the_shipped_policies(task):
         assert PUSHES[task][0] == pytest.approx(
             config["push_probability"] / config["physics"]["timestep"] / config["physics"]["substeps"]
         )
-        assert POSTURES[task] == pytest.approx(config["posture"])
         assert referee.LOST[task] == config["drop_distance"]
         assert referee.LIMITS[task] == config["evaluation_seconds"]
 
 
 def test_rules_and_places_are_those_of_the_tasks(hand):
+    from dexsim_ppo.policy import load_policy
+
     for task in TASKS:
         rules = TRAINED[task].task(TRAINED[task].config_class(), hand)
         assert REFERENCES[task] == pytest.approx(rules.reference)
+        assert POSTURES[task] == pytest.approx(rules.config.posture)
+        assert POSTURES[task] == pytest.approx(load_policy(task).env_config["posture"])
         assert nominal_gravity(task) == pytest.approx(rules.gravity)
     config = rules.config
     assert (
