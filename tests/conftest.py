@@ -6,6 +6,7 @@ Set `DEXSIM_TEST_GPU=1` to run on the GPU (`pytest -m gpu` then runs the tests t
 
 import contextlib
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -40,6 +41,10 @@ if not ON_GPU and "PYTEST_XDIST_WORKER" not in os.environ:
 import hypothesis  # noqa: E402
 import jax  # noqa: E402
 import pytest  # noqa: E402
+
+# A shell that starts the suite in the background has it ignore SIGINT, which programs started by tests would inherit.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 hypothesis.settings.register_profile("dexsim", deadline=None, max_examples=20, derandomize=True)
 hypothesis.settings.load_profile("dexsim")

@@ -1,6 +1,5 @@
 """Calls of the host from compiled programs, each in a process of its own: two cores, Ctrl-C, and cached programs."""
 
-import contextlib
 import json
 import os
 import signal
@@ -103,15 +102,8 @@ def test_programs_in_flight_do_not_block_each_other(cores):
 def test_ctrl_c_while_the_pool_runs():
     process = start(LONG, "long", 64)
     assert process.stdout.readline() == "running\n"
-    # Seen once on a busy machine: it ran on, deaf to any further interrupt. A lost one alone is no failure.
-    for _ in range(3):
-        process.send_signal(signal.SIGINT)
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            out, _ = process.communicate(timeout=20)
-            break
-    else:
-        process.kill()
-        pytest.fail("three interrupts did not end it")
+    process.send_signal(signal.SIGINT)
+    out, _ = process.communicate(timeout=60)
     assert out.startswith("stopped") and process.returncode == 0
 
 
