@@ -95,26 +95,27 @@ def _sweep_rows() -> tuple[Row, ...]:
     return tuple(rows)
 
 
+_PER_FINGER = ("finger_force=[2,7]", "max_force=10", "control.force.gain=0")
 _REWARDS = (
     Row(
         name="both",
         label="R_force and R_torque",
         task="grasp",
-        settings=("reward.force=2", "reward.torque=0.2", "control.force.gain=0"),
+        settings=("reward.force=2", "reward.torque=0.2", *_PER_FINGER),
         paper={"force range [N]": "44.50–93.92", "torque range": "1.09–1.52"},
     ),
     Row(
         name="force",
         label="R_force alone",
         task="grasp",
-        settings=("reward.force=2", "reward.torque=0", "control.force.gain=0"),
+        settings=("reward.force=2", "reward.torque=0", *_PER_FINGER),
         paper={"force range [N]": "37.29–70.02", "torque range": "0.69–0.75"},
     ),
     Row(
         name="torque",
         label="R_torque alone",
         task="grasp",
-        settings=("reward.force=0", "reward.torque=2", "control.force.gain=0"),
+        settings=("reward.force=0", "reward.torque=2", *_PER_FINGER),
         paper={"force range [N]": "38.45–47.12", "torque range": "0.85–1.02"},
     ),
 )
