@@ -3,7 +3,6 @@
 import copy
 import dataclasses
 import json
-import time
 from types import SimpleNamespace
 
 import jax
