@@ -84,7 +84,7 @@ def collect(
             next_value=value(after.obs),
             reward=after.reward,
             terminated=after.terminated,
-            truncated=after.truncated & ~after.terminated,
+            truncated=after.truncated,
         )
         return after, (record, dict(after.metrics))
 

@@ -1,13 +1,18 @@
 """Files of older versions: their fields under today's names and values, and what is said about it."""
 
+import dataclasses
 import warnings
 
 import pytest
 
 from dexsim.core.config import from_dict, to_dict
-from dexsim.core.errors import OldFileWarning
+from dexsim.core.errors import CheckpointError, OldFileWarning
+from dexsim.task_spec import TaskSpec
 from dexsim.tasks.grasp.config import GraspConfig
-from dexsim_ppo.retired import migrate_arguments, migrate_config, migrate_leaves
+from dexsim.tasks.grasp.task import Grasp
+from dexsim.tasks.rotate.config import RotateConfig
+from dexsim.tasks.rotate.task import Rotate
+from dexsim_ppo.retired import migrate_arguments, migrate_config, migrate_leaves, old_spec
 
 ARRAY = {
     "scale": 0.0,
@@ -114,3 +119,26 @@ def test_arrays_of_an_older_environment_go_where_todays_are():
     # A task of one's own may use a name that is gone elsewhere.
     own = wanted | {".env_state.goal.dwell": [7.0]}
     assert migrate_leaves(old, own) == own
+
+
+@pytest.mark.parametrize(
+    ("task", "config"),
+    [
+        (Grasp, GraspConfig()),
+        (Rotate, RotateConfig()),
+        (Rotate, RotateConfig(direction=-1, tilt=0.3, roll=-0.2, axis=(0.6, 0.0, -0.8), goal_step=0.7, goal_angle=0.2)),
+    ],
+)
+def test_a_policy_without_a_specification_gets_the_one_that_its_task_has(task, config, hand):
+    """Today's task of the same configuration says the same, but for what those tasks could not have."""
+    control = dataclasses.replace(config.control, force=dataclasses.replace(config.control.force, gain=0.0))
+    config = dataclasses.replace(config, posture=config.posture or hand.grasp_posture, control=control)
+    today = TaskSpec.of(task(config, hand))
+    old = old_spec(task.name, to_dict(config))
+    for field in dataclasses.fields(TaskSpec):
+        if field.name in ("name", "fields", "posture", "control", "object_axes", "velocity_filter"):
+            assert getattr(old, field.name) == getattr(today, field.name), field.name
+    assert old.gravity == pytest.approx(today.gravity) and old.reference == pytest.approx(today.reference)
+    assert old.turn == today.turn and old.observation == today.observation
+    with pytest.raises(CheckpointError, match="of the task 'juggle' without a task specification"):
+        old_spec("juggle", {})

@@ -259,6 +259,18 @@ class TestReward:
         assert float(metrics["reward/force"]) == pytest.approx(wanted, rel=1e-5)
         assert float(metrics["force_error"]) == pytest.approx(1.0) and float(metrics["squeeze_force"]) == 7.0
 
+    def test_the_fingers_of_a_squeeze_share_its_torque_and_its_overload(self, hand):
+        """Two of the four touch: each is to pull half of it, and may press half and the margin."""
+        task = Grasp(dataclasses.replace(CONFIG, force_command="squeeze", finger_force=(2.0, 14.0)), hand)
+        force, torque = np.zeros((5, 3)), np.zeros(12)
+        force[:, 1] = 9.0, 5.0, 2.0, 0.0, 0.0
+        torque[hand.root_joint] = 4.0 / 19  # half of 8 N
+        truth = make_moment(hand, finger_force=force, joint_torque=torque)
+        _, metrics = task.reward(goal_of(0.5), truth, jnp.zeros((), bool))
+        assert float(metrics["reward/torque"]) == pytest.approx(0.2 * 3 / 5, rel=1e-4), "thumb, index and middle"
+        assert float(metrics["reward/overload"]) == pytest.approx(-2.0 * (5.0 - 4.0 - 0.4) / 10, rel=1e-4)
+        assert float(metrics["squeeze_force"]) == 7.0 and float(metrics["finger_force"]) == 3.5
+
     def test_overload_counts_the_four_fingers_and_only_above(self, hand, task):
         force = np.zeros((5, 3))
         force[:, 1] = 20.0, 4.3, 3.0, 6.4, 0.0  # targets 4 N; the thumb is free to balance them

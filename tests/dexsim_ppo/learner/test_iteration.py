@@ -60,6 +60,52 @@ def test_the_divergence_is_that_of_the_last_epoch(updates):
     assert float(updates[1]["kl"]) == pytest.approx(expected, rel=1e-2)
 
 
+def test_a_minibatch_without_a_finite_loss_says_nothing(learner, monkeypatch):
+    """The means are over the others; so is the divergence that the learning rate follows."""
+    config = dataclasses.replace(UPDATES, kl_target=0.01)
+
+    def broken(params, config, normalizers, batch, old_log_std):
+        found = jnp.where(jnp.any(batch.advantage == 5.0), jnp.nan, 1.0)
+        return found * jnp.sum(params.log_std), {"kl": found, "value_loss": 2 * found}
+
+    monkeypatch.setattr(update, "loss", broken)
+    number, action = jnp.arange(config.steps_per_iteration, dtype=jnp.float32), jnp.zeros((64, 1))
+    samples = Samples({}, Decision(action, action, number), number, number, number)
+    after, metrics = update.update(config, {}, samples, jax.random.key(1), learner)
+    assert int(after.skipped_updates) == config.epochs, "row 5 is in one minibatch of each epoch"
+    assert float(metrics["kl"]) == 1.0 and float(metrics["value_loss"]) == 2.0
+    assert float(after.learning_rate) == pytest.approx(RATE / 1.5)
+    assert int(after.adam.count) == config.epochs * (config.minibatches - 1)
+
+
+def test_the_critic_is_first_for_whole_iterations(learner):
+    config = dataclasses.replace(UPDATES, critic_first=2)
+    learns = lambda count: bool(  # noqa: E731
+        update.actor_learns(config, learner._replace(adam=dataclasses.replace(learner.adam, count=jnp.int32(count))))
+    )
+    assert [learns(count) for count in (0, 12, 23, 24, 25)] == [False, False, False, True, True]
+
+
+@pytest.mark.parametrize("part", ["actor", "log_std", "critic"])
+def test_nothing_moves_where_one_part_of_the_gradient_is_not_finite(learner, part):
+    grads = jax.tree.map(jnp.ones_like, learner.params)
+    grads = dataclasses.replace(
+        grads, **{part: jax.tree.map(lambda x: jnp.full_like(x, jnp.inf), getattr(grads, part))}
+    )
+    after, _ = update.apply_gradients(UPDATES, learner, grads)
+    assert int(after.skipped_updates) == int(learner.skipped_updates) + 1
+    jax.tree.map(np.testing.assert_array_equal, (after.params, after.adam), (learner.params, learner.adam))
+
+
+def test_the_deviations_gradient_is_clipped_with_the_actors(learner):
+    grads = jax.tree.map(jnp.zeros_like, learner.params)
+    grads = dataclasses.replace(grads, log_std=jnp.full_like(grads.log_std, 1e3))
+    after, norms = update.apply_gradients(UPDATES, learner, grads)
+    size = np.sqrt(learner.params.log_std.size)
+    assert float(norms["actor_grad_norm"]) == pytest.approx(1e3 * size) and float(norms["critic_grad_norm"]) == 0
+    np.testing.assert_allclose(after.adam.mean.log_std, 0.1 * UPDATES.max_grad_norm / size, rtol=1e-4)
+
+
 def test_actor_and_critic_are_each_clipped_to_the_norm(learner):
     """A long gradient of one does not shorten the other's."""
     for long in ("actor", "critic"):
@@ -142,6 +188,56 @@ def test_far_rewards_are_bounded_in_units_of_scaled_returns(scale):
     assert float(count) == 1
     np.testing.assert_allclose(bounded.reward[1, 2], 0.9 * limit, rtol=1e-6)
     np.testing.assert_allclose(bounded.reward[2, 3], -limit, rtol=1e-5)
+
+
+def test_what_is_far_among_the_first_rewards_is_so_by_the_others():
+    """A thousand times the root mean square of all but the largest."""
+    reward = jnp.full((4, 8), -0.5).at[1, 2].set(700.0).at[0, 0].set(2.0)
+    zero, flag = jnp.zeros_like(reward), jnp.zeros(reward.shape, bool)
+    rollout = Rollout({}, None, zero, zero, reward, flag, flag)
+    limit = 1000 * np.sqrt((30 * 0.25 + 4.0) / 32)
+    bounded, count = bound_rewards(rollout, RunningStats(jnp.int32(0), jnp.float32(0), jnp.float32(1)), 1.0)
+    assert float(count) == 1 and float(bounded.reward[1, 2]) == pytest.approx(limit, rel=1e-5)
+    bounded, count = bound_rewards(rollout, RunningStats(jnp.int32(0), jnp.float32(0), jnp.float32(1)), 0.01)
+    assert float(bounded.reward[1, 2]) == pytest.approx(limit, rel=1e-5), "rewards against rewards: no scale in it"
+
+
+def test_healthy_rewards_of_a_small_scale_are_not_bounded():
+    """The deviation is of scaled returns: the bound on rewards is the larger for a small scale."""
+    training = make_train(TinyEnv(), dataclasses.replace(SMALL, reward_scale=1e-3))
+    state = training.init(jax.random.key(0))
+    for _ in range(2):
+        state, metrics = training.step(state)
+        assert float(metrics["bounded_rewards"][0]) == 0
+
+
+def test_an_iteration_reports_what_it_had_and_what_it_made():
+    """Of the experience, which collecting it again with the same key gives again, and of the state after it."""
+    env = Watched()
+    training = make_train(env, SMALL)
+    state = training.init(jax.random.key(0))
+    before = jax.tree.map(jnp.copy, state)
+    after, metrics = training.step(state)
+
+    @jax.jit
+    def again(state):
+        normalizers = ppo.make_normalizers(env, SMALL, state.observation_stats)
+        key = jax.random.split(state.key, 3)[1]
+        _, rollout, _ = ppo.collect_rollout(env, SMALL, state, normalizers, key)
+        return ppo.prepare(SMALL, state.value_stats, state.params, rollout)[2]
+
+    samples = jax.tree.map(lambda x: np.asarray(x, np.float64), again(before))
+    explained = 1 - np.var(samples.target - samples.value) / np.var(samples.target)
+    assert float(metrics["explained_variance"][0]) == pytest.approx(explained, rel=1e-3, abs=1e-4)
+    assert float(metrics["action_std"][0]) == pytest.approx(float(np.mean(np.exp(after.params.log_std))), rel=1e-5)
+    assert float(metrics["learning_rate"][0]) == float(after.learning_rate) != RATE
+    assert int(metrics["skipped_updates"][0]) == int(after.skipped_updates) == 0 and int(after.iteration) == 1
+    assert int(after.adam.count) == SMALL.epochs * SMALL.minibatches
+    assert int(after.value_stats.count) == int(after.observation_stats["actor"].count) == SMALL.steps_per_iteration
+    keys = [
+        np.asarray(jax.random.key_data(key)) for key in (before.key, after.key, *jax.random.split(before.key, 3)[1:])
+    ]
+    assert len({key.tobytes() for key in keys}) == 4, "the next iteration draws anew"
 
 
 @pytest.mark.parametrize(

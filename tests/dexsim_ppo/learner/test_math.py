@@ -85,6 +85,13 @@ class TestDistribution:
         entropy = distribution.entropy(jnp.log(jnp.array([1.0, 2.0])))
         assert float(entropy) == pytest.approx(np.log(2) + np.log(2 * np.pi * np.e), rel=1e-6)
 
+    def test_samples_have_the_mean_and_deviation(self):
+        mean, std = jnp.tile(jnp.array([1.0, -3.0]), (40_000, 1)), jnp.array([0.5, 2.0])
+        drawn = np.asarray(distribution.sample(jax.random.key(0), mean, jnp.log(std)))
+        np.testing.assert_allclose(drawn.mean(0), [1, -3], atol=0.05)
+        np.testing.assert_allclose(drawn.std(0), std, rtol=0.03)
+        assert abs(np.corrcoef(drawn.T)[0, 1]) < 0.03
+
     def test_kl_against_closed_form(self):
         # KL(N(0, 1) || N(1, 2^2)) = ln 2 + (1 + 1) / 8 - 1/2, and zero for equal ones.
         zero, one, log2 = jnp.zeros(1), jnp.ones(1), jnp.log(jnp.full(1, 2.0))
@@ -124,6 +131,31 @@ class TestRunningStats:
         assert int(stats.count) > 0
         assert float(stats.mean) == pytest.approx(2.0, rel=0.02)
 
+    def test_recovered_statistics_give_the_normaliser_back_and_hardly_change(self):
+        fields, given = (
+            (Field("x", 2, None),),
+            RunningStats(jnp.int32(9), jnp.array([1.0, -2.0]), jnp.array([4.0, 0.25])),
+        )
+        normalizer = make_normalizer(given, fields, std_floor=0.5, clip=3.0)
+        found = running_stats.recover_stats(normalizer, std_floor=0.5)
+        np.testing.assert_allclose(found.mean, given.mean)
+        np.testing.assert_allclose(found.variance, given.variance, rtol=1e-6)
+        again = make_normalizer(update_stats(found, jnp.full((1000, 2), 50.0)), fields, std_floor=0.5, clip=3.0)
+        np.testing.assert_allclose(again.mean, given.mean, atol=1e-2)
+        # A deviation below the floor is not known any more: none is left, and no NaN.
+        narrow = running_stats.recover_stats(normalizer, std_floor=1.0)
+        np.testing.assert_allclose(narrow.variance, [3.25, 0.0], rtol=1e-6)
+
+    def test_constant_returns_have_a_deviation(self):
+        assert float(running_stats.value_std(RunningStats(0, 0.0, jnp.float32(0)))) == pytest.approx(1e-3)
+        assert float(running_stats.value_std(RunningStats(0, 0.0, jnp.float32(9)))) == pytest.approx(3)
+
+    def test_memory_fades_over_a_full_count(self):
+        """A sample's weight is never below one in `MEMORY`, nor above it once the count is full."""
+        full = RunningStats(jnp.int32(running_stats.MEMORY), jnp.zeros(()), jnp.ones(()))
+        after = update_stats(full, jnp.full(2**20, 1.0))
+        assert float(after.mean) == pytest.approx(1 / 129, rel=1e-4)
+
     def test_non_finite_batches_leave_their_elements_alone(self):
         stats = update_stats(init_stats((2,)), jnp.array([[1.0, 2.0], [3.0, jnp.nan]]))
         np.testing.assert_allclose(stats.mean, [2, 0])
@@ -155,7 +187,7 @@ class TestAdam:
         state, got = adam.init(single(params)), single(params)
         moments = {k: (np.zeros_like(v), np.zeros_like(v)) for k, v in params.items()}
         for t, grad in enumerate(grads, start=1):
-            got, state = adam.update(single(grad), state, got, 0.01, epsilon=1e-5)
+            got, state = adam.update(single(grad), state, got, 0.01)
             for k, g in grad.items():
                 m, v = (0.9 * moments[k][0] + 0.1 * g, 0.999 * moments[k][1] + 0.001 * g**2)
                 moments[k] = m, v
@@ -171,12 +203,20 @@ class TestAdam:
         same, _ = adam.clip_by_global_norm(grads, 10.0)
         np.testing.assert_allclose(same["a"], grads["a"])
 
+    def test_no_gradient_at_all_stays_none(self):
+        clipped, norm = adam.clip_by_global_norm({"a": jnp.zeros(3)}, 1.0)
+        np.testing.assert_array_equal(clipped["a"], np.zeros(3))
+        assert float(norm) == 0
+
 
 class TestConfig:
     def test_learning_rate_adapts_within_its_band(self):
         config = PPOConfig(learning_rate=1e-3, learning_rate_min=9e-4, learning_rate_max=1.2e-3, kl_target=0.01)
         rate = lambda kl: float(adapt_learning_rate(config, jnp.float32(1e-3), jnp.float32(kl)))  # noqa: E731
         assert [rate(kl) for kl in (0.0, 0.006, 0.01, 0.021)] == pytest.approx([1.2e-3, 1e-3, 1e-3, 9e-4])
+        config = dataclasses.replace(config, learning_rate_min=1e-5, learning_rate_max=1e-1)
+        wide = [1.5e-3, 1e-3, 1e-3, 1e-3 / 1.5]
+        assert [rate(kl) for kl in (0.0049, 0.0051, 0.0199, 0.0201)] == pytest.approx(wide)
         fixed = dataclasses.replace(config, kl_target=0.0)
         assert float(adapt_learning_rate(fixed, jnp.float32(1e-3), jnp.float32(9.0))) == pytest.approx(1e-3)
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import re
 import subprocess
 import sys
 
@@ -60,6 +61,34 @@ def test_what_does_not_divide_is_refused():
     with pytest.raises(ConfigError, match=r"TrainArguments\.devices = 4096: there are"):
         make_mesh(4096, CONFIG)
     assert make_mesh(1, CONFIG) is None
+
+
+@pytest.mark.parametrize(
+    ("changes", "devices", "message"),
+    [
+        ({}, 0, None),
+        ({}, 3, "PPOConfig.num_envs = 16: must be a multiple of the 3 devices"),
+        (
+            {"num_envs": 12, "minibatches": 16},
+            4,
+            "PPOConfig.minibatches = 16: leaves 6 steps each, no multiple of the 4",
+        ),
+        ({}, 5, "TrainArguments.devices = 5: there are 4, in 1 processes"),
+    ],
+)
+def test_every_device_gets_as_many_environments_and_rows(changes, devices, message, monkeypatch):
+    monkeypatch.setattr(jax, "devices", lambda: list("abcd"))
+    monkeypatch.setattr(jax, "make_mesh", lambda shape, names, *, devices, **_: (shape, devices))
+    config = dataclasses.replace(CONFIG, **changes)
+    if message:
+        with pytest.raises(ConfigError, match=re.escape(message)):
+            make_mesh(devices, config)
+    else:
+        assert make_mesh(devices, config) == ((4,), list("abcd"))
+        assert make_mesh(2, config) == ((2,), list("ab"))
+        monkeypatch.setattr(jax, "process_count", lambda: 2)
+        with pytest.raises(ConfigError, match="devices = 2: there are 4, in 2 processes"):
+            make_mesh(2, config)  # a process without a device would wait for ever
 
 
 if __name__ == "__main__":

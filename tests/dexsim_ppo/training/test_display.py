@@ -89,3 +89,29 @@ def test_what_is_compiled_is_said_until_the_first_row(shown):
     assert "compiling the training step" in " ".join(lines)
     plain, _ = shown([ROW], terminal=False)
     assert plain[0] == "compiling the training step" and plain[1].startswith("iteration 1180 | steps 4.83M")
+
+
+def test_what_no_episode_has_told_keeps_its_last_value(shown):
+    lines, _ = shown([ROW, ROW | {"episode/return": float("nan"), "kl": 0.5}], terminal=False)
+    assert "return 184.24" in lines[-1] and "KL 0.5000" in lines[-1]
+    assert "rate" not in lines[-1] and "skipped updates 2 of 2360" in lines[-1]
+
+
+def test_the_sparkline_is_of_the_last_eighteen_returns(shown):
+    lines, _ = shown([ROW | {"episode/return": float(k)} for k in range(30)])
+    bars = [letter for letter in "".join(lines) if letter in "▁▂▃▄▅▆▇█"]
+    assert len(bars) == 18 and bars[0] == "▁" and bars[-1] == "█"
+
+
+def test_numbers_are_short():
+    assert [display.count(x) for x in (0, 999, 1000, 12345, 1e6, 2.5e9)] == ["0", "999", "1k", "12.3k", "1M", "2.5G"]
+    seconds = (0, 59.4, 59.6, 75, 3600, -3, float("inf"), float("nan"))
+    assert [display.duration(s) for s in seconds] == ["0:00", "0:59", "1:00", "1:15", "60:00", "0:00", "-", "-"]
+
+
+def test_all_but_the_first_process_are_quiet(capsys):
+    with display.Display("grasp on cpu, c", quiet=True) as view:
+        view.working("compiling")
+        view.show(ROW)
+        view.note("a line")
+    assert capsys.readouterr() == ("", "")

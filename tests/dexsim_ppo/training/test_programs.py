@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from jax.experimental.compilation_cache.compilation_cache import reset_cache
 
+import dexsim_ppo
 from dexsim.core.assets import asset_path
 from dexsim.core.errors import DexsimWarning
 from dexsim.env.fingerprint import fingerprint
@@ -90,8 +91,56 @@ def test_what_tells_programs_apart(monkeypatch):
     assert key(["x"], SHAPES | {"total": jax.ShapeDtypeStruct((4,), jnp.float32)}) != base
     with jax.enable_x64(True):
         assert key(["x"], SHAPES) != base
-    monkeypatch.setattr(programs, "_cpu_features", lambda: "another processor")
-    assert key(["x"], SHAPES) != base
+    others = [key({"x": 1}, SHAPES), key(["x"], {"sum": SHAPES["total"]} | {k: SHAPES[k] for k in ("key", "keys")})]
+    for option in (
+        jax.numpy_dtype_promotion("standard"),  # the tests are strict
+        jax.default_matmul_precision("float32"),
+        jax.debug_nans(True),
+        jax.debug_infs(True),
+        jax.default_prng_impl("rbg"),
+        jax.threefry_partitionable(not jax.config.jax_threefry_partitionable),
+        jax.disable_jit(),
+    ):
+        with option:
+            others.append(key(["x"], SHAPES))
+    for name, change in (
+        ("_cpu_features", lambda: "another processor"),
+        ("environment_report", lambda: {"versions": "other ones"}),
+        ("python_sources", lambda folder: [Path(__file__)]),
+    ):
+        with monkeypatch.context() as patch:
+            patch.setattr(programs, name, change)
+            others.append(key(["x"], SHAPES))
+    assert len({base, *others}) == 1 + len(others)
+
+
+def test_its_sources_are_those_of_the_learner(monkeypatch):
+    asked = []
+    monkeypatch.setattr(programs, "python_sources", lambda folder: asked.append(folder) or [])
+    key(["x"], SHAPES)
+    assert asked == [Path(dexsim_ppo.__file__).parent]
+
+
+def test_a_program_that_is_used_stays(folder, monkeypatch):
+    """The oldest by use goes, not the oldest by age."""
+    monkeypatch.setattr(programs, "KEPT", 2)
+    for name in ("one", "two"):
+        run(name)
+        for path in folder.glob("*.pkl"):
+            os.utime(path, (path.stat().st_atime, path.stat().st_mtime - 100))
+    assert not run("one")[1]
+    run("three")
+    assert not run("one")[1] and run("two")[1]
+
+
+def test_the_step_takes_its_state_over(folder):
+    """Two states would not fit beside each other. What came from the cache is tried on a copy, once."""
+    for identity in ("one", None, "one"):
+        program, state = compile_step(step, SHAPES, identity, lambda: None), fresh()
+        if isinstance(program, programs.Program) and program._fallback:
+            state, _ = program(state)
+        program(state)
+        assert state["total"].is_deleted()
 
 
 def test_the_newest_programs_are_kept(folder, monkeypatch):

@@ -1,9 +1,13 @@
 """The learning curve says what it shows, in words and units."""
 
+import json
+
 import matplotlib.pyplot as plt
 import pytest
 
+from dexsim.core.errors import CheckpointError
 from dexsim_ppo.training import runlog
+from dexsim_ppo.training.runlog import MetricsLog, RunFolder, read_metrics
 
 
 @pytest.fixture
@@ -43,3 +47,61 @@ def test_evaluations_are_marked_and_unknown_errors_are_named(figure):
 
 def test_nothing_to_show_draws_nothing(figure):
     assert figure([{"iteration": 1, "env_steps": 1}]) is None
+
+
+def test_the_time_is_above_the_steps(figure):
+    """Half a million steps take a minute."""
+    axes = figure([row(i, **{"episode/success": 1.0}) for i in (1, 2, 3)]).axes
+    (above,) = axes[0].child_axes
+    assert above.get_xlabel() == "elapsed [min]"
+    to_minutes, to_steps = above._functions
+    assert [float(to_minutes(x)) for x in (0.5, 1.25)] == [1.0, 2.5] and float(to_steps(2.5)) == 1.25
+    assert axes[1].get_ylim()[0] < 0 and axes[1].get_ylim()[1] > 1, "a line at 0 or 1 is not on the frame"
+    assert not figure([row(1)]).axes[0].child_axes, "one point has no rate"
+
+
+def test_checkpoints_are_listed_oldest_first_and_the_newest_are_kept(tmp_path):
+    folder = RunFolder(tmp_path)
+    folder.checkpoints.mkdir()
+    with pytest.raises(CheckpointError, match="holds no checkpoint"):
+        folder.latest_checkpoint()
+    for iteration in (900, 20, 1000, 100):
+        folder.checkpoint(iteration).touch()
+    (folder.checkpoints / "00000999.msgpack.tmp").touch()
+    (folder.checkpoints / "mine-00000999.msgpack").touch()
+    found = lambda: [int(path.stem) for path in folder.existing_checkpoints()]  # noqa: E731
+    assert found() == [20, 100, 900, 1000] and folder.latest_checkpoint() == folder.checkpoint(1000)
+    folder.prune(9)
+    assert len(found()) == 4
+    folder.prune(3)
+    assert found() == [100, 900, 1000]
+    folder.prune(1)
+    assert found() == [1000] and len(list(folder.checkpoints.iterdir())) == 3
+
+
+class Writer:
+    """A TensorBoard writer that remembers."""
+
+    def __init__(self):
+        self.scalars, self.closed = [], False
+
+    def add_scalar(self, *scalar):
+        self.scalars.append(scalar)
+
+    def close(self):
+        self.closed = True
+
+
+def test_a_resumed_log_goes_on_after_the_checkpoint(tmp_path, monkeypatch):
+    """What came after it is repeated; a line that was cut ends the rows."""
+    writer = Writer()
+    monkeypatch.setattr(runlog, "_tensorboard_writer", lambda path: writer)
+    folder = RunFolder(tmp_path)
+    folder.metrics.write_text("".join(json.dumps({"iteration": i}) + "\n" for i in (2, 4, 6, 8)) + '{"iterat')
+    log = MetricsLog(folder, 6)
+    log.write({"iteration": 8, "env_steps": 800, "kl": 0.5, "episode/return": float("nan")})
+    assert [row["iteration"] for row in read_metrics(folder.metrics)] == [2, 4, 6, 8], "written at once"
+    assert read_metrics(folder.metrics)[-1] == {"iteration": 8, "env_steps": 800, "kl": 0.5, "episode/return": None}
+    assert writer.scalars == [("kl", 0.5, 800)], "over environment steps, and no NaN"
+    log.close()
+    assert writer.closed

@@ -2,6 +2,7 @@
 
 import json
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import tiny_train
@@ -9,7 +10,7 @@ import tiny_train
 from dexsim.core.errors import ConfigError
 from dexsim_ppo import train
 from dexsim_ppo.policy import Policy
-from dexsim_ppo.training.seeds import band, spread
+from dexsim_ppo.training.seeds import band, draw_band, spread
 
 OPTIONS = "--task tiny --preset cpu --no-video --ppo.num-envs 16 --ppo.rollout-length 8 --ppo.actor-layers 8".split()
 OPTIONS += "--ppo.critic-layers 8 --evaluation-chunk 16 --evaluation-episodes 16 --log-every 1 --steps 512".split()
@@ -52,3 +53,17 @@ def test_spread_and_band_in_closed_form():
     ]
     np.testing.assert_array_equal(band(runs, "x"), [[10], [1], [2], [3]])
     assert band(runs, "absent").size == 0
+
+
+def test_the_band_is_from_the_lowest_to_the_highest_around_the_mean(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(plt, "close", drawn.append)
+    runs = [[{"env_steps": 1e6 * k, "episode/return": value * k} for k in (1, 2)] for value in (1.0, 2.0, 6.0)]
+    draw_band(runs, tmp_path / "curve.png", "tiny")
+    (axes,) = drawn[0].axes
+    assert axes.get_title(loc="left") == "tiny: mean and range of 3 seeds"
+    np.testing.assert_allclose(axes.lines[0].get_xydata(), [[1, 3], [2, 6]])
+    corners = {tuple(map(float, point)) for point in axes.collections[0].get_paths()[0].vertices}
+    assert corners == {(1, 1), (1, 6), (2, 2), (2, 12)}
+    draw_band([[], []], tmp_path / "none.png", "tiny")
+    assert not (tmp_path / "none.png").exists()

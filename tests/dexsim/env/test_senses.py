@@ -1,0 +1,108 @@
+"""From what sensors see to what the host reads: latency, biases, steps and filters in closed form, without physics."""
+
+import dataclasses
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dexsim.env.senses import SensorSuite
+from dexsim.env.state import SensorInput
+from dexsim.sensing.config import Sensing
+from dexsim.sensing.imu import ImuConfig, ImuParams
+from dexsim.tasks.grasp.config import GraspConfig
+from dexsim.tasks.grasp.task import Grasp
+
+QUIET = Sensing(
+    joint_noise=0.0, joint_resolution=0.0, torque_noise=0.0, object_noise=0.0, orientation=ImuConfig(noise=0.0)
+)
+LEVEL = jnp.array([1.0, 0.0, 0.0, 0.0])
+GOAL = jnp.float32(0.25), jnp.array([0.6, 0.8, 0.0, 0.0])
+AGE = 0.25  # of a tick
+
+
+@pytest.fixture
+def read(hand):
+    """`read(sensing, now, last)` gives the readings of an episode whose hand has an error of every kind."""
+
+    def run(sensing, now, last=None, key=0, age=AGE):
+        config = GraspConfig(sensing=sensing)
+        suite = SensorSuite(config, hand, Grasp(config, hand))
+        zero = jnp.zeros(())
+        errors = SimpleNamespace(
+            sensing_latency=jnp.float32(age),
+            encoder_bias=jnp.linspace(-0.01, 0.01, 12),
+            torque_gain=jnp.full(12, 1.5),
+            taxel_gain=jnp.ones(hand.taxel_area.shape),
+        )
+        imu = ImuParams(**{f.name: zero for f in dataclasses.fields(ImuParams)})
+        imu = dataclasses.replace(imu, bias=jnp.zeros(3))
+        episode = SimpleNamespace(hand=errors, imu=imu, taxels=suite.sample_taxels(jax.random.key(0), 0.0))
+        return suite.read(jax.random.key(key), episode, now, GOAL, jnp.full(12, 0.5), last)[0]
+
+    return run
+
+
+def seen(hand, joint, torque, place):
+    return SensorInput(
+        joint_position=jnp.full(12, joint),
+        joint_torque=jnp.full(12, torque),
+        taxel_force=jnp.zeros(hand.taxel_area.shape),
+        object_position=jnp.asarray(place, jnp.float32),
+        object_quat=LEVEL,
+        tangential_force=None,
+    )
+
+
+def before(hand, readings, then):
+    return SimpleNamespace(
+        sensor_input=then,
+        readings=readings,
+        length=jnp.int32(3),
+        taxel_memory=SensorSuite(GraspConfig(), hand, Grasp(GraspConfig(), hand)).taxels.init(),
+    )
+
+
+def test_readings_are_a_quarter_tick_old_and_have_the_hands_own_errors(hand, read):
+    then, now = seen(hand, 0.2, 0.1, (0.05, 0, 0.1)), seen(hand, 0.6, 0.3, (0.09, 0.01, 0.2))
+    first = read(QUIET, then)
+    np.testing.assert_allclose(first.joint_position, 0.2 + np.linspace(-0.01, 0.01, 12), rtol=1e-5)
+    found = read(QUIET, now, before(hand, first, then))
+    np.testing.assert_allclose(found.joint_position, 0.5 + np.linspace(-0.01, 0.01, 12), rtol=1e-5)
+    np.testing.assert_allclose(found.joint_torque, 1.5 * 0.25, rtol=1e-5)
+    assert float(found.command) == 0.25 and np.all(np.asarray(found.last_action) == 0.5)
+    np.testing.assert_array_equal(found.goal_quat, GOAL[1])
+
+
+def test_only_the_measured_coordinates_move_and_their_velocity_is_filtered(hand, read):
+    """The others rest at the reference, as a camera that gives only the height leaves them."""
+    sensing = dataclasses.replace(QUIET, object_axes=(True, False, True), velocity_filter=0.3)
+    period, reference = GraspConfig().physics.control_period, hand.grasp_centre
+    heights, velocity = (0.05, 0.06, 0.09), 0.0
+    last = then = None
+    for k, height in enumerate(heights):
+        now = seen(hand, 0.0, 0.0, (height, 0.5, 2 * height))
+        found = read(sensing, now, last, age=0.0)
+        np.testing.assert_allclose(found.object_position, [height, reference[1], 2 * height], rtol=1e-5)
+        if k:
+            velocity += 0.3 * ((height - heights[k - 1]) / period - velocity)
+        np.testing.assert_allclose(found.object_velocity, [velocity, 0.0, 2 * velocity], rtol=1e-4, atol=1e-6)
+        then = now
+        last = before(hand, found, then)
+
+
+def test_angles_come_in_steps_and_each_reading_has_its_own_noise(hand, read):
+    now = seen(hand, 0.2, 0.1, (0.05, 0, 0.1))
+    stepped = np.asarray(read(dataclasses.replace(QUIET, joint_resolution=0.004), now).joint_position)
+    np.testing.assert_allclose(stepped / 0.004, np.round(stepped / 0.004), atol=1e-3)
+    assert np.abs(stepped - (0.2 + np.linspace(-0.01, 0.01, 12))).max() <= 0.002 + 1e-6
+    noisy = dataclasses.replace(QUIET, joint_noise=0.01, torque_noise=0.02, object_noise=0.03, object_axes=(True,) * 3)
+    plain = read(QUIET, now)
+    reads = [read(noisy, now, key=key) for key in range(40)]
+    for name, size in (("joint_position", 0.01), ("joint_torque", 0.02)):
+        off = np.array([getattr(r, name) - getattr(plain, name) for r in reads])
+        assert off.std() == pytest.approx(size, rel=0.15) and abs(np.corrcoef(off[:, 0], off[:, 1])[0, 1]) < 0.5
+    place = np.array([r.object_position for r in reads]) - np.array([0.05, 0, 0.1])
+    assert place.std() == pytest.approx(0.03, rel=0.25)

@@ -1,0 +1,108 @@
+"""How many episodes are measured and which, and what is made of the totals of long ones."""
+
+from types import SimpleNamespace
+
+import jax
+import numpy as np
+import pytest
+from tiny_env import SMALL, TinyEnv
+
+from dexsim.core.errors import ConfigError
+from dexsim.render import render
+from dexsim_ppo import evaluate
+from dexsim_ppo.learner.ppo import make_train
+from dexsim_ppo.policy import Policy
+from dexsim_ppo.report import mean_interval, summarize_totals
+
+
+class Totals(TinyEnv):
+    """Is asked for the metrics of last ticks only."""
+
+    evaluation = "totals"
+
+    def summarize(self, metrics, alive):
+        return {"lived": alive.tolist()}
+
+
+@pytest.fixture(scope="module")
+def policy():
+    return Policy.from_training(TinyEnv(), SMALL, make_train(TinyEnv(), SMALL).init(jax.random.key(0)))
+
+
+def test_whole_chunks_are_measured_and_the_seed_chooses_the_episodes(policy):
+    env = TinyEnv()
+    evaluator = evaluate.Evaluator(env, 4)
+    reports = [evaluator(policy.params, episodes=n, seed=seed, idle=True)[0] for n, seed in ((5, 1), (8, 1), (5, 2))]
+    assert [report["episodes"] for report in reports] == [8, 8, 8] and [r["seed"] for r in reports] == [1, 1, 2]
+    for report, seed in zip(reports, (1, 1, 2), strict=True):  # Standing still earns 32 (1 - distance).
+        start = env.evaluation_starts(env.evaluation_plan(8, seed))
+        returns = 32 * (1 - np.abs(np.asarray(start.x - start.target)))
+        assert report["return"]["value"] == pytest.approx(returns.mean(), rel=1e-4)
+        assert report["seconds"] > 0
+
+
+def test_totals_are_those_of_the_series(policy):
+    """The same episodes, their last ticks kept on the way."""
+    series, totals = (evaluate.Evaluator(env, 4)(policy.params, episodes=8, seed=3)[0] for env in (TinyEnv(), Totals()))
+    for name in ("return", "held", "steps_held", "starts", "episodes", "steps"):
+        assert totals[name] == pytest.approx(series[name], rel=1e-5), name
+    assert totals["task"] == {"lived": [32] * 8}
+
+
+def test_an_episode_of_totals_is_held_to_its_last_tick():
+    env = SimpleNamespace(evaluation_steps=9, summarize=lambda metrics, lived: {"ticks": int(lived.sum())})
+    report = summarize_totals(env, {"return": np.array([1.0, 2.0, 6.0])}, np.array([9, 8, 9]), np.arange(3))
+    assert report["held"]["value"] == pytest.approx(2 / 3) and report["return"]["value"] == 3
+    assert report["steps_held"]["value"] == pytest.approx(26 / 3)
+    assert (report["episodes"], report["steps"], report["starts"]) == (3, 9, 3) and report["task"] == {"ticks": 26}
+
+
+def test_one_start_has_no_interval_to_speak_of():
+    entry = mean_interval(np.array([1.0, 1.0, 4.0]), np.zeros(3))
+    assert entry["value"] == 2.0 and entry["low"] == entry["high"] == 2.0
+    uneven = mean_interval(np.array([0.0, 0.0, 0.0, 1.0]), np.array([7, 7, 7, 9]))  # sums of starts: -3/4 and 3/4
+    assert uneven["high"] - 0.25 == pytest.approx(1.96 * np.sqrt(2 * 2 * 0.75**2) / 4)
+
+
+def test_the_device_and_the_length_of_an_episode_give_their_number(monkeypatch):
+    """On a CPU about 128,000 ticks, but one chunk at least and 1,024 episodes at most."""
+    number = lambda steps: evaluate.default_episodes(SimpleNamespace(evaluation_steps=steps))  # noqa: E731
+    assert [number(n) for n in (10, 125, 250, 290, 1000, 2001, 4000)] == [1024, 1024, 512, 384, 128, 64, 64]
+    assert evaluate.default_chunk() == 64
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert number(4000) == evaluate.default_chunk() == 1024
+
+
+def test_few_episodes_are_one_chunk(policy):
+    env = TinyEnv()
+    count = lambda **options: evaluate.evaluate_policy(policy, env=env, baseline=False, **options)["episodes"]  # noqa: E731
+    assert count(episodes=3) == 3 and count(episodes=3, chunk=2) == 4
+
+
+def test_a_film_is_shown_to_a_minute(policy):
+    """Of each of the two episodes."""
+    env = TinyEnv()
+    env.control_period, env.evaluation_steps = 0.5, 130
+    _, film = evaluate.Evaluator(env, 2)(policy.params, episodes=2, seed=0)
+    assert film["x"].shape == (2 * 120,)
+
+
+@pytest.mark.parametrize(
+    ("frames", "quality", "size", "rate"),
+    [
+        (200, "quick", (640, 480), 10.0),  # 20 s at 10 Hz: no more pictures than there are
+        (450, "quick", (640, 480), 400 / 45),
+        (600, "quick", (640, 480), 8.0),  # 400 pictures would be 6.7 a second
+        (600, "talk", (1920, 1080), 30.0),
+    ],
+)
+def test_a_video_has_enough_pictures_to_follow(frames, quality, size, rate, monkeypatch, tmp_path):
+    made = []
+    monkeypatch.setattr(render, "render_episode", lambda *a, **options: made.append((a, options)) or a[2])
+    film, env = {"x": np.zeros((frames, 3))}, TinyEnv()
+    assert evaluate.write_video(env, film, tmp_path / "a.mp4", quality) == tmp_path / "a.mp4"
+    ((_, shown, _, fps), options) = made[0]
+    assert shown is film and fps == pytest.approx(10.0)
+    assert options == {"size": size, "rate": pytest.approx(rate)}
+    with pytest.raises(ConfigError, match="'tiny' draws nothing"):
+        evaluate.write_video(env, {}, tmp_path / "a.mp4")

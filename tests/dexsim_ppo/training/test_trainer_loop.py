@@ -1,0 +1,234 @@
+"""What the training loop keeps account of, around a step that learns nothing: when it logs, saves, evaluates, ends."""
+
+import copy
+import dataclasses
+import json
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import tiny_train
+from tiny_env import SMALL, TinyConfig, TinyEnv
+
+from dexsim.core.pytree import pytree_dataclass
+from dexsim_ppo import checkpoint, train
+from dexsim_ppo.learner.curriculum import Curriculum
+from dexsim_ppo.training import trainer
+from dexsim_ppo.training.arguments import TrainArguments
+from dexsim_ppo.training.runlog import RunFolder
+from dexsim_ppo.training.trainer import Run, _mean, surely_better
+
+CONFIG = dataclasses.replace(SMALL, iterations_per_call=2)
+PER_ITERATION = 64
+STEP_S, EVALUATION_S, SAVE_S = 2.0, 100.0, 1000.0
+
+
+@pytree_dataclass
+class State:
+    """What the loop reads of a state."""
+
+    iteration: jax.Array
+    skipped_updates: jax.Array
+
+
+@pytest.fixture
+def loop(tmp_path, monkeypatch):
+    """`loop(first, **options)` runs the loop on a clock that only its parts move on; returns the run, whose
+    `evaluated`, `saved`, `shown`, `logged` and `notes` say what it did."""
+    clock = SimpleNamespace(now=50.0)
+    monkeypatch.setattr(trainer, "time", SimpleNamespace(perf_counter=lambda: clock.now))
+
+    def run(first=0, stop_after=10**6, **options):
+        arguments = TrainArguments(env=TinyConfig(), ppo=CONFIG, task="tiny", **options)
+        found = Run(TinyEnv(), arguments, RunFolder(tmp_path), 20.0)
+        found.evaluated, found.saved, found.shown, found.logged, found.notes, calls = [], [], [], [], [], []
+
+        def step(state):
+            calls.append(1)
+            clock.now += STEP_S
+            state = State(state.iteration + 2, state.skipped_updates)
+            return state, {"reward": jnp.array([1.0, 3.0]), "skipped_updates": jnp.zeros(2)}
+
+        def evaluate(state, iteration, display):
+            clock.now += EVALUATION_S
+            found.evaluated.append((iteration, int(state.iteration)))
+            return {"evaluation/return": 7.0}
+
+        def save(state, iteration):
+            clock.now += SAVE_S
+            found.saved.append((iteration, int(state.iteration)))
+
+        monkeypatch.setattr(found, "_evaluate", evaluate)
+        monkeypatch.setattr(found, "_save", save)
+        display = SimpleNamespace(note=found.notes.append, show=found.shown.append)
+        state = State(jnp.int32(first), jnp.int32(0))
+        log = SimpleNamespace(write=found.logged.append)
+        found._loop(state, step, display, log, lambda: len(calls) >= stop_after)
+        return found
+
+    return run
+
+
+def both(*iterations):
+    """The loop's own count agrees with the state's."""
+    return [(i, i) for i in iterations]
+
+
+def test_each_thing_is_done_when_it_is_due(loop):
+    run = loop(steps=13 * PER_ITERATION, log_every=6, evaluate_every=8, checkpoint_every=4)
+    assert run.evaluated == both(8, 14) and run.saved == both(4, 8, 12, 14)
+    assert [row["iteration"] for row in run.logged] == [2, 6, 8, 12], "the first, every sixth, and what was evaluated"
+    assert run.shown == run.logged
+    assert [row.get("evaluation/return") for row in run.logged] == [None, None, 7.0, None]
+
+
+def test_a_run_that_was_evaluated_last_is_not_evaluated_again(loop):
+    assert loop(steps=8 * PER_ITERATION, evaluate_every=4).evaluated == both(4, 8)
+    assert loop(steps=8 * PER_ITERATION).evaluated == []
+
+
+def test_a_resumed_run_logs_its_first_call_and_counts_on(loop):
+    run = loop(first=10, steps=14 * PER_ITERATION, log_every=100)
+    assert [row["iteration"] for row in run.logged] == [12] and run.saved == both(14)
+    assert run.clock["env_steps"] == 14 * PER_ITERATION
+
+
+def test_who_stops_it_gets_a_checkpoint_and_no_evaluation(loop):
+    run = loop(stop_after=3, evaluate_every=100)
+    assert run.saved == both(6) and not run.evaluated
+
+
+def test_a_row_has_means_of_the_call_and_the_progress(loop):
+    run = loop(steps=8 * PER_ITERATION)
+    row = run.logged[1]
+    rate = 2 * PER_ITERATION / STEP_S
+    assert row["reward"] == 2.0 and row["env_steps"] == 4 * PER_ITERATION and row["env_steps_per_s"] == rate
+    assert row["seconds"] == 30.0 + 2 * STEP_S, "since the run was started, compilation included"
+    assert row["seconds_left"] == 4 * PER_ITERATION / rate
+    assert row["updates"] == 4 * CONFIG.epochs * CONFIG.minibatches
+
+
+def test_the_rate_leaves_out_evaluations_checkpoints_and_the_first_call(loop):
+    run = loop(steps=8 * PER_ITERATION, evaluate_every=4, checkpoint_every=4)
+    assert run.clock["setup_s"] == 30.0
+    assert run.clock["first_update_s"] == 30.0 + STEP_S and run.clock["first_call_s"] == STEP_S
+    assert "first update 32.0 s after the start, 2.0 s of it" in run.notes[0] and len(run.notes) == 1
+    assert run.clock["training_s"] == 4 * STEP_S + 2 * (EVALUATION_S + SAVE_S)
+    assert run.clock["step_s"] == 4 * STEP_S
+    assert run.clock["env_steps_per_s"] == 6 * PER_ITERATION / (3 * STEP_S)
+
+
+def test_the_first_budget_that_is_used_up_ends_it(loop):
+    run = loop(steps=4 * PER_ITERATION, minutes=2.0)
+    run.started = trainer.time.perf_counter() - 90.0
+    assert run.seconds_left(2, 100.0) == pytest.approx(2 * PER_ITERATION / 100.0)
+    assert run.seconds_left(2, 0.1) == pytest.approx(30.0)
+    run.arguments = dataclasses.replace(run.arguments, steps=0.0, minutes=0.0)
+    assert run.seconds_left(2, 100.0) == float("inf")
+
+
+def test_minutes_count_from_the_start_of_the_run(loop):
+    assert loop(minutes=(30.0 + 3 * STEP_S) / 60).saved == both(6)
+
+
+def test_means_are_over_what_is_finite():
+    assert _mean(np.array([1.0, np.nan, 3.0])) == 2.0 and np.isnan(_mean(np.array([np.nan, np.nan])))
+
+
+def test_the_best_policy_so_far_is_kept(tmp_path, monkeypatch):
+    run = Run(TinyEnv(), TrainArguments(env=TinyConfig(), ppo=CONFIG, evaluation_chunk=5), RunFolder(tmp_path), 0.0)
+    scores, asked, written, notes = iter([-4.0, -1.0, -2.0, 0.5]), [], [], []
+
+    def evaluator(params, **options):
+        asked.append((params, options))
+        entry = lambda value: {"value": value}  # noqa: E731
+        return {"return": entry(next(scores)), "held": entry(0.25), "seconds": 1.0}, None
+
+    run.evaluator = evaluator
+    monkeypatch.setattr(run, "_policy", lambda state: SimpleNamespace(params=state))
+    monkeypatch.setattr(run, "_write_policy", lambda policy, path: written.append((policy.params, path)))
+    rows = [run._evaluate(f"state {i}", i, SimpleNamespace(note=notes.append)) for i in (1, 2, 3, 4)]
+    assert rows[2] == {"evaluation/return": -2.0, "evaluation/held": 0.25}
+    assert asked[2] == ("state 3", {"episodes": 5, "seed": trainer.SELECTION_SEED})
+    assert written == [(f"state {i}", run.folder.best) for i in (1, 2, 4)]
+    assert ["the best so far" in note for note in notes] == [True, True, False, True]
+    assert run.best == {"return": 0.5, "iteration": 4}
+
+
+def test_better_needs_the_other_interval_to_be_wholly_below():
+    entry = lambda low, value, high: {"low": low, "value": value, "high": high}  # noqa: E731
+    trained = {name: entry(1.5, 2.0, 3.0) for name in ("held", "return", "steps_held")}
+    untrained = {"held": entry(0.0, 1.0, 1.6), "return": entry(0.0, 1.0, 1.5), "steps_held": entry(0.0, 1.0, 1.4)}
+    assert surely_better(trained, untrained) == {"held": False, "return": False, "steps_held": True}
+
+
+def test_whatever_the_program_depends_on_identifies_it(tmp_path):
+    """And a step over several devices, or of an environment that cannot say what it is, has no identity."""
+    arguments = TrainArguments(env=TinyConfig(), ppo=CONFIG, curriculum=Curriculum(on=True))
+    run = Run(TinyEnv(), arguments, RunFolder(tmp_path), 0.0)
+    assert run._identity() is None
+    run.env.fingerprint = lambda: "hand and task"
+    found = [run._identity()]
+    run.env.fingerprint = lambda: "another hand"
+    found.append(run._identity())
+    run.config = dataclasses.replace(CONFIG, discount=0.5)
+    found.append(run._identity())
+    run.arguments = dataclasses.replace(arguments, curriculum=Curriculum(on=True, step=0.5))
+    found.append(run._identity())
+    assert len({json.dumps(one) for one in found}) == 4
+    run.mesh = SimpleNamespace(size=2)
+    assert run._identity() is None
+
+
+@pytest.mark.parametrize(("own", "backend"), [(False, "jax"), (True, "jax"), (True, "warp")])
+def test_an_evaluation_is_of_the_task_as_configured(own, backend, tmp_path, monkeypatch):
+    """Not of training's corners; and Warp's buffers are of the batch's size."""
+    import dexsim
+
+    made = []
+    monkeypatch.setattr(dexsim, "make", lambda *a, **options: made.append((a, options)) or TinyEnv(), raising=False)
+    env = TinyEnv()
+    env.backend, env.hand = backend, "the hand"
+    arguments = TrainArguments(env=TinyConfig(), ppo=CONFIG, task="tiny", evaluation_chunk=6)
+    if own and backend == "jax":
+        monkeypatch.setattr(trainer, "training_config", lambda arguments: copy.copy(arguments.env))
+    run = Run(env, arguments, RunFolder(tmp_path), 0.0)
+    if own:
+        options = {"backend": backend, "num_envs": 6, "hand": "the hand"}
+        assert made == [(("tiny", arguments.env), options)] and run.evaluator.env is not env
+    else:
+        assert not made and run.evaluator.env is env
+    assert run.evaluator.chunk == 6
+
+
+QUICK = "--task tiny --preset cpu --no-video --ppo.num-envs 16 --ppo.rollout-length 8 --ppo.actor-layers 8".split()
+QUICK += "--ppo.critic-layers 8 --evaluation-chunk 16 --evaluation-episodes 16 --log-every 1 --evaluate-every 1".split()
+
+
+def test_a_resumed_run_goes_on_with_its_best_its_time_and_as_many_checkpoints(tmp_path, monkeypatch):
+    tiny_train.install(monkeypatch)
+    folder = RunFolder(tmp_path / "a")
+    options = ["--checkpoint-every", "1", "--keep-checkpoints", "2", "--run-dir", str(folder.path)]
+    assert train.main([*QUICK, *options, "--steps", str(3 * 128)]) == 0
+    assert [path.name for path in folder.existing_checkpoints()] == ["00000002.msgpack", "00000003.msgpack"]
+    last = checkpoint.load(folder.latest_checkpoint(), kind="train")
+    progress = last.content["progress"]
+    rows = [json.loads(line) for line in folder.metrics.read_text().splitlines()]
+    best = max(rows, key=lambda row: row["evaluation/return"])
+    assert progress["best"] == {"return": best["evaluation/return"], "iteration": best["iteration"]}
+    assert progress["seconds"] >= rows[-1]["seconds"] > 0
+    # As if it had been better, and taken longer.
+    load, progress = checkpoint.load, {"best": {"return": 1e9, "iteration": 1}, "seconds": 5000.0}
+    doctored = lambda *a, **options: (  # noqa: E731
+        dataclasses.replace(found := load(*a, **options), content=found.content | {"progress": progress})
+    )
+    before = folder.best.read_bytes()
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoint, "load", doctored)
+        assert train.main(["--resume", str(folder.path), "--steps", str(4 * 128)]) == 0
+    assert folder.best.read_bytes() == before
+    assert 5000 < json.loads(folder.metrics.read_text().splitlines()[-1])["seconds"] < 5600
+    progress = checkpoint.load(folder.latest_checkpoint(), kind="train").content["progress"]
+    assert progress["best"] == {"return": 1e9, "iteration": 1} and progress["seconds"] > 5000
