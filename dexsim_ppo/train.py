@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 from dexsim.core import cli
+from dexsim.core.compilation import make_deterministic
 from dexsim.core.config import from_dict, naming_file
 from dexsim.core.errors import ConfigError, DexsimError
 from dexsim.hand.source import record_of
@@ -133,6 +134,8 @@ def run_training(
     resumed, first = begun if isinstance(begun, checkpoint.Checkpoint) else None, processes.is_first()
     if first and not resumed and arguments.run_dir and arguments.run_dir.exists():
         raise _taken(arguments.run_dir)
+    if arguments.deterministic and not make_deterministic() and first:
+        print("--deterministic changes nothing here: without a GPU, trainings repeat to the last bit anyway")
     mesh, hand = make_mesh(arguments.devices, arguments.ppo), find_hand(arguments, begun)
     made = dexsim.make(
         arguments.task,

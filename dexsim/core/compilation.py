@@ -12,6 +12,8 @@ import jax
 # LLVM optimises less, and XLA's older emitters produce less code per fusion: faster to compile, as fast to run.
 LIGHT = (("xla_backend_optimization_level", 1), ("xla_cpu_use_fusion_emitters", False))
 
+_on_gpu: dict[str, Any] = {}  # compiler options, set by `make_deterministic`
+
 
 def available_cores() -> int:
     """Cores that this process may use."""
@@ -31,7 +33,26 @@ def jit(function: Callable, *, backend: str = "jax", once: bool = False, **optio
     """
     if jax.default_backend() == "cpu" and (once or backend != "c"):
         options["compiler_options"] = _light() | ({"xla_backend_optimization_level": 0} if once else {})
+    elif _on_gpu:
+        options["compiler_options"] = dict(_on_gpu)
     return jax.jit(function, **options)
+
+
+def make_deterministic() -> bool:
+    """Have all GPU programs that this process makes from here on repeat to the last bit.
+
+    XLA then neither times rival kernels to choose one nor adds in whatever order threads come; Warp sorts its atomic
+    additions (`WarpBackend`). Returns whether there is a GPU: programs on a CPU repeat anyway.
+    """
+    if jax.default_backend() not in ("gpu", "cuda"):
+        return False
+    _on_gpu["xla_gpu_deterministic_ops"] = True
+    return True
+
+
+def is_deterministic() -> bool:
+    """Whether `make_deterministic` was called, on a GPU."""
+    return bool(_on_gpu)
 
 
 @functools.cache

@@ -44,6 +44,8 @@ class TrainArguments(Generic[EnvConfig]):
     """Trainings one after the other, from --seed on; --steps and --minutes are those of each."""
     backend: Literal["auto", "jax", "warp", "c"] = setting("auto")
     """Physics backend. auto: c on a CPU, warp on an NVIDIA GPU if it is installed, otherwise jax."""
+    deterministic: bool = False
+    """Have a training on a GPU repeat to the last bit from one seed, at a cost in speed. On a CPU it does so anyway."""
     preset: Literal["auto", "cpu", "cpu-large", "gpu"] = setting("auto")
     """Default sizes and durations. auto: those of the device found; cpu-large is for 16 cores and more."""
     steps: float = setting(0.0, unit="environment steps", low=0.0)

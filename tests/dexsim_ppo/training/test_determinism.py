@@ -1,0 +1,93 @@
+"""Two trainings from one seed are the same to the last bit: on a CPU always, on a GPU with `--deterministic`."""
+
+import json
+import subprocess
+import sys
+
+import jax
+import numpy as np
+import pytest
+import tiny_train
+from paths import ROOT
+
+import dexsim
+from dexsim.core import compilation
+from dexsim.tasks.grasp.config import GraspConfig
+from dexsim_ppo import checkpoint, train
+from dexsim_ppo.learner.config import PPOConfig
+from dexsim_ppo.learner.ppo import make_train
+from dexsim_ppo.training.runlog import RunFolder
+
+
+def plain(tree):
+    """A tree's arrays by their path."""
+    keys = jax.tree.map(
+        lambda x: jax.random.key_data(x) if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key) else x, tree
+    )
+    return {jax.tree_util.keystr(path): np.asarray(x) for path, x in jax.tree.leaves_with_path(keys)}
+
+
+def unequal(first, second):
+    """Paths of the arrays that differ in any bit."""
+    assert first.keys() == second.keys()
+    return [path for path, x in first.items() if x.tobytes() != second[path].tobytes()]
+
+
+def test_physics_in_jax_repeats_to_the_bit(grasp_rollout):
+    def episode(seed):
+        state = grasp_rollout.reset(jax.random.key(0))
+        for key in jax.random.split(jax.random.key(seed), 20):
+            action = jax.random.uniform(key, (grasp_rollout.num_envs, 12), minval=-1.0, maxval=1.0)
+            state = grasp_rollout.step(state, action)
+        return plain(state)
+
+    assert not unequal(episode(1), episode(1))
+    assert unequal(episode(1), episode(2)), "else the comparison sees nothing"
+
+
+def test_training_on_c_repeats_to_the_bit():
+    """Though its worlds are stepped by several threads."""
+    env = dexsim.make("grasp", GraspConfig(pool_size=80, episode_seconds=0.6), backend="c", num_envs=8)
+    training = make_train(
+        env, PPOConfig(num_envs=8, rollout_length=8, minibatches=2, actor_layers=(8,), critic_layers=(8,))
+    )
+
+    def train_from(seed):
+        state = training.init(jax.random.key(seed))
+        for _ in range(3):
+            state, _ = training.step(state)
+        return plain(state)
+
+    assert not unequal(train_from(0), train_from(0))
+    assert unequal(train_from(0), train_from(1)), "else the comparison sees nothing"
+
+
+def test_the_option_is_kept_and_on_a_cpu_says_that_it_changes_nothing(monkeypatch, tmp_path, capsys):
+    tiny_train.install(monkeypatch)
+    sizes = "--ppo.num-envs 16 --ppo.rollout-length 8 --ppo.actor-layers 8 --ppo.critic-layers 8 --steps 128".split()
+    sizes += "--evaluation-chunk 16 --evaluation-episodes 16 --no-video --preset cpu".split()
+    folder = RunFolder(tmp_path / "a")
+    assert train.main(["--task", "tiny", "--deterministic", *sizes, "--run-dir", str(folder.path)]) == 0
+    assert "--deterministic changes nothing here" in capsys.readouterr().out
+    assert json.loads(folder.config.read_text())["arguments"]["deterministic"] is True
+    assert not compilation.is_deterministic()
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("backend", ["warp", "jax"])
+def test_training_on_a_gpu_repeats_to_the_bit(backend, tmp_path):
+    """Each training in a process of its own, which starts XLA and Warp anew."""
+    if backend == "warp":
+        pytest.importorskip("warp")
+    envs, updates = (1024, 8) if backend == "warp" else (64, 2)
+    command = [sys.executable, "-m", "dexsim_ppo.train", "--task", "grasp", "--backend", backend, "--deterministic"]
+    command += ["--ppo.num-envs", envs, "--ppo.rollout-length", 16, "--ppo.iterations-per-call", 1, "--preset", "gpu"]
+    command += ["--steps", envs * 16 * updates, "--env.pool-size", 80, "--env.episode-seconds", 0.6, "--no-video"]
+    command += ["--evaluation-chunk", 32, "--evaluation-episodes", 32, "--evaluate-every", 0, "--run-dir"]
+    found = []
+    for name in ("first", "second"):
+        folder = RunFolder(tmp_path / name)
+        subprocess.run([str(part) for part in [*command, folder.path]], cwd=ROOT, check=True)
+        saved = checkpoint.load(folder.latest_checkpoint(), kind="train")
+        found.append(plain(saved.leaves))
+    assert unequal(*found) == []
