@@ -25,8 +25,8 @@ from dexsim.hand.source import check_record, check_same, record_of, recorded_han
 from dexsim.task_spec import TaskSpec
 from dexsim_ppo import checkpoint
 from dexsim_ppo.learner.adapter import adapt
-from dexsim_ppo.learner.memory import Memory, empty, remember
-from dexsim_ppo.learner.networks import MLP, apply_mlp
+from dexsim_ppo.learner.memory import History, Memory, empty, remember
+from dexsim_ppo.learner.networks import MLP, Layer, apply_mlp
 from dexsim_ppo.learner.running_stats import Normalizer, make_normalizer, normalize
 from dexsim_ppo.learner.types import Environment, Field, Fields
 from dexsim_ppo.policy_file import memory_to_list, read_network
@@ -35,6 +35,11 @@ from dexsim_ppo.retired import migrate_config, old_spec
 if TYPE_CHECKING:
     from dexsim.env.env import Env
     from dexsim.hand.kinematics import Hand
+
+
+NEEDS_MEMORY = (
+    "this policy has a memory: memory = policy.begin(), then memory, action = policy.act(memory, observation)"
+)
 
 
 @pytree_dataclass
@@ -60,7 +65,7 @@ def act(params: PolicyParams, obs: jax.Array) -> jax.Array:
       ConfigError: the policy has a memory.
     """
     if params.memory is not None:
-        raise ConfigError("this policy has a memory: memory, action = policy.act(memory, obs), from policy.begin() on")
+        raise ConfigError(NEEDS_MEMORY)
     return act_from(params, None, obs)[1]
 
 
@@ -129,9 +134,15 @@ class Policy:
         if unknown := sorted(set(names) - set(fields)):
             raise ConfigError(f"the policy does not observe {', '.join(unknown)}; it observes {', '.join(fields)}")
         kept = np.concatenate([np.full(field.size, field.name not in names) for field in self.observation_layout])
-        first, *others = self.params.layers
-        first = dataclasses.replace(first, kernel=jnp.where(kept[:, None], first.kernel, 0.0))
-        return dataclasses.replace(self, params=dataclasses.replace(self.params, layers=(first, *others)))
+        (first, *others), memory = self.params.layers, self.params.memory
+        rows = np.ones(first.kernel.shape[0], bool)
+        rows[: kept.size] = kept
+        if isinstance(memory, History):
+            rows = np.tile(kept, memory.length + 1)
+        elif memory is not None:
+            memory = dataclasses.replace(memory, input=_without(memory.input, kept))
+        layers = (_without(first, rows), *others)
+        return dataclasses.replace(self, params=dataclasses.replace(self.params, layers=layers, memory=memory))
 
     def save(self, path: str | Path) -> None:
         """Write to a file, whole or not at all."""
@@ -299,6 +310,11 @@ class Policy:
 def layout_to_list(fields: Fields) -> list[list[Any]]:
     """Fields as plain lists, `[name, size, scale]`."""
     return [[field.name, field.size, field.scale] for field in fields]
+
+
+def _without(layer: Layer, kept: np.ndarray) -> Layer:
+    """A layer that gets 0 for the inputs that are not `kept` [in]."""
+    return dataclasses.replace(layer, kernel=jnp.where(kept[:, None], layer.kernel, 0.0))
 
 
 def load_policy(name: str | Path, *, task: str | None = None) -> Policy:
