@@ -32,7 +32,7 @@ from dexsim.core.options import Option
 from dexsim.core.progress import progress
 from dexsim.registry import find_task
 from dexsim_ppo.learner.types import Environment
-from dexsim_ppo.policy import Policy, PolicyParams, act, load_policy
+from dexsim_ppo.policy import Policy, PolicyParams, act_from, begin, load_policy
 from dexsim_ppo.report import print_report, summarize, summarize_totals
 
 
@@ -98,20 +98,21 @@ class Evaluator:
         shown = self._extremes(state)
 
         def step(carry, _):
-            state, last = carry
-            action = act(params, state.obs["actor"])
+            state, memory, last = carry
+            memory, action = act_from(params, memory, state.obs["actor"])
             state = jax.vmap(self.env.step)(state, jnp.where(idle, jnp.zeros_like(action), action))
             frame = jax.tree.map(lambda x: x[shown], jax.vmap(self.env.snapshot)(state))
             series = (dict(state.metrics), state.terminated)
             film = (frame, state.terminated[shown])
             if not self.totals:
-                return (state, None), (series, film)
-            return (state, _follow(last, *series)), (None, film)
+                return (state, memory, None), (series, film)
+            return (state, memory, _follow(last, *series)), (None, film)
 
         last: Any = None
         if self.totals:
             last = (dict(state.metrics), jnp.zeros(self.chunk, jnp.int32), jnp.zeros(self.chunk, bool))
-        (_, last), (series, film) = jax.lax.scan(step, (state, last), None, length=self.env.evaluation_steps)
+        first = state, begin(params, (self.chunk,)), last
+        (*_, last), (series, film) = jax.lax.scan(step, first, None, length=self.env.evaluation_steps)
         return (last[:2] if self.totals else series), film
 
     def _extremes(self, state: Any) -> jax.Array:

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
+import jax
 import numpy as np
 import tyro
 
@@ -24,9 +25,11 @@ from dexsim.core.errors import CheckpointError, ConfigError
 from dexsim.core.files import write_whole
 from dexsim.core.install import install_line
 from dexsim.task_spec import TaskSpec
+from dexsim_ppo.learner.memory import GRU, state_size
 from dexsim_ppo.learner.types import Field
-from dexsim_ppo.policy import Policy, layout_to_list, load_policy
-from dexsim_ppo.portable import FORMAT, PortablePolicy
+from dexsim_ppo.policy import NEEDS_MEMORY, Policy, layout_to_list, load_policy
+from dexsim_ppo.policy_file import memory_to_list
+from dexsim_ppo.portable import FORMAT, UNIT, PortablePolicy
 
 _OPSET = 17
 _KEY = "dexsim"  # of the header among the model's properties
@@ -42,13 +45,26 @@ class ExportedPolicy:
     spec: TaskSpec | None
     params: Any
     """Whatever tells it from others: bytes."""
-    function: Callable[[np.ndarray], np.ndarray]
+    function: Callable[[np.ndarray | None, np.ndarray], tuple[np.ndarray | None, np.ndarray]]
+    """From memory and observation to memory and action."""
+    memory: int = 0
+    """Numbers that it remembers; 0 if it has no memory."""
     hand: dict[str, Any] | None = None
     """As of `Policy`."""
 
     def __call__(self, obs: Any) -> np.ndarray:
-        """Action `[..., A]` for an actor observation `[..., n]`."""
-        return self.function(np.asarray(obs, np.float32))
+        """Action `[..., A]` for an actor observation `[..., n]`; for policies without memory."""
+        if self.memory:
+            raise ConfigError(NEEDS_MEMORY)
+        return self.act(None, obs)[1]
+
+    def begin(self, *batch: int) -> np.ndarray | None:
+        """As of `Policy`."""
+        return np.zeros((*batch, self.memory), np.float32) if self.memory else None
+
+    def act(self, memory: Any, obs: Any) -> tuple[np.ndarray | None, np.ndarray]:
+        """As of `Policy`."""
+        return self.function(memory, np.asarray(obs, np.float32))
 
 
 def header_of(policy: Policy) -> dict[str, Any]:
@@ -61,6 +77,7 @@ def header_of(policy: Policy) -> dict[str, Any]:
         "squash": policy.params.squash,
         "clip": policy.params.normalizer.clip,
         "layers": len(policy.params.layers),
+        "memory": memory_to_list(policy.params.memory),
         "spec": policy.spec and to_dict(policy.spec),
         "training": cli.plain(policy.training),
         "hand": policy.hand,
@@ -73,13 +90,15 @@ def to_numpy(policy: Policy, path: Path) -> None:
     arrays = {"mean": normalizer.mean, "std": normalizer.std, "header": np.array(json.dumps(header_of(policy)))}
     for i, layer in enumerate(policy.params.layers):
         arrays |= {f"kernel_{i}": layer.kernel, f"bias_{i}": layer.bias}
+    arrays |= dict(zip(UNIT, jax.tree.leaves(policy.params.memory), strict=False))
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, **{name: np.asarray(array) for name, array in arrays.items()})
     write_whole(path, [buffer.getvalue()])
 
 
 def to_onnx(policy: Policy, path: Path) -> None:
-    """Write an ONNX model: input `observation` [batch, n], output `action` [batch, A], float32.
+    """Write an ONNX model: input `observation` [batch, n], output `action` [batch, A], float32. One with a memory also
+    has `memory` [batch, m], zero at an episode's start, and gives `next_memory`.
 
     Raises:
       ConfigError: onnx is not installed.
@@ -94,8 +113,30 @@ def to_onnx(policy: Policy, path: Path) -> None:
     nodes += [
         helper.make_node("Sub", ["observation", "mean"], ["centred"]),
         helper.make_node("Div", ["centred", "std"], ["scaled"]),
-        helper.make_node("Clip", ["scaled", "low", "high"], ["hidden_0"]),
+        helper.make_node("Clip", ["scaled", "low", "high"], ["seen" if params.memory else "hidden_0"]),
     ]
+    remembered = state_size(params.memory, len(params.normalizer.mean))
+    if isinstance(params.memory, GRU):
+        values |= _gru_weights(params.memory)
+        nodes += [
+            helper.make_node("Unsqueeze", ["seen", "time"], ["seen_at_once"]),
+            helper.make_node("Unsqueeze", ["memory", "time"], ["before"]),
+            helper.make_node(
+                "GRU",
+                ["seen_at_once", "gru_input", "gru_recurrent", "gru_bias", "", "before"],
+                ["", "after"],
+                hidden_size=remembered,
+                linear_before_reset=1,
+            ),
+            helper.make_node("Squeeze", ["after", "time"], ["next_memory"]),
+            helper.make_node("Concat", ["seen", "next_memory"], ["hidden_0"], axis=1),
+        ]
+    elif params.memory is not None:
+        values |= {"begin": np.array([0]), "end": np.array([remembered]), "axis": np.array([1])}
+        nodes += [
+            helper.make_node("Concat", ["seen", "memory"], ["hidden_0"], axis=1),
+            helper.make_node("Slice", ["hidden_0", "begin", "end", "axis"], ["next_memory"]),
+        ]
     last = len(params.layers) - 1
     for i, layer in enumerate(params.layers):
         values |= {f"kernel_{i}": layer.kernel, f"bias_{i}": layer.bias}
@@ -110,17 +151,38 @@ def to_onnx(policy: Policy, path: Path) -> None:
     else:
         values |= {"lowest": -1.0, "highest": 1.0}
         nodes.append(helper.make_node("Clip", [f"sum_{last}", "lowest", "highest"], ["action"]))
-    sizes = params.layers[0].kernel.shape[0], params.layers[-1].kernel.shape[1]
-    ports = [
-        helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", size])
-        for name, size in zip(("observation", "action"), sizes, strict=True)
+    sizes = {"observation": len(params.normalizer.mean), "action": params.layers[-1].kernel.shape[1]}
+    if remembered:
+        sizes |= {"memory": remembered, "next_memory": remembered}
+    ports = {
+        name: helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", size]) for name, size in sizes.items()
+    }
+    given = [ports.pop(name) for name in ("observation", "memory") if name in ports]
+    arrays = {name: np.asarray(value) for name, value in values.items()}
+    tensors = [
+        numpy_helper.from_array(array if array.dtype.kind == "i" else array.astype(np.float32), name)
+        for name, array in arrays.items()
     ]
-    tensors = [numpy_helper.from_array(np.asarray(value, np.float32), name) for name, value in values.items()]
-    graph = helper.make_graph(nodes, policy.task, ports[:1], ports[1:], tensors)
+    graph = helper.make_graph(nodes, policy.task, given, list(ports.values()), tensors)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", _OPSET)], ir_version=8)
     helper.set_model_props(model, {_KEY: json.dumps(header_of(policy))})
     checker.check_model(model)
     write_whole(path, [model.SerializeToString()])
+
+
+def _gru_weights(unit: GRU) -> dict[str, np.ndarray]:
+    """Weights as ONNX orders them: update gate first, one row a unit, and a leading axis for the direction."""
+
+    def ordered(array: Any) -> np.ndarray:
+        reset, update, new = np.split(np.asarray(array), 3, -1)
+        return np.concatenate([update, reset, new], -1).T[None]
+
+    return {
+        "time": np.array([0]),
+        "gru_input": ordered(unit.input.kernel),
+        "gru_recurrent": ordered(unit.recurrent.kernel),
+        "gru_bias": np.concatenate([ordered(unit.input.bias), ordered(unit.recurrent.bias)], -1),
+    }
 
 
 def load_exported(path: str | Path) -> ExportedPolicy:
@@ -139,10 +201,16 @@ def load_exported(path: str | Path) -> ExportedPolicy:
             spec=from_dict(TaskSpec, header["spec"]) if header.get("spec") else None,
             params=np.frombuffer(path.read_bytes(), np.uint8),
             function=function,
+            memory=_memory_size(header),
             hand=header.get("hand"),
         )
     except (KeyError, TypeError, ValueError, ConfigError) as error:
         raise CheckpointError(f"{path}: is not a sound policy ({' '.join(str(error).split()):.200})") from None
+
+
+def _memory_size(header: dict[str, Any]) -> int:
+    kind, size = header.get("memory") or ("none", 0)
+    return size * sum(n for _, n, _ in header["observation_layout"]) if kind == "history" else size
 
 
 def _read_numpy(path: Path) -> tuple[dict[str, Any], Callable]:
@@ -150,7 +218,7 @@ def _read_numpy(path: Path) -> tuple[dict[str, Any], Callable]:
         policy = PortablePolicy.load(path)
     except (OSError, ValueError) as error:
         raise CheckpointError(f"{path}: {getattr(error, 'strerror', None) or error}") from None
-    return policy.header, policy
+    return policy.header, policy.act
 
 
 def _read_onnx(path: Path) -> tuple[dict[str, Any], Callable]:
@@ -166,10 +234,14 @@ def _read_onnx(path: Path) -> tuple[dict[str, Any], Callable]:
     except Exception as error:  # onnxruntime's own error types differ by version
         raise CheckpointError(f"{path}: is not an exported policy ({' '.join(str(error).split()):.200})") from None
 
-    def act(observation: np.ndarray) -> np.ndarray:
-        rows = observation.reshape(-1, observation.shape[-1])
-        (action,) = session.run(["action"], {"observation": rows})
-        return action.reshape(*observation.shape[:-1], -1)
+    def act(memory: np.ndarray | None, observation: np.ndarray) -> tuple[np.ndarray | None, np.ndarray]:
+        batch = observation.shape[:-1]
+        given = {"observation": observation.reshape(-1, observation.shape[-1])}
+        if memory is None:
+            return None, session.run(["action"], given)[0].reshape(*batch, -1)
+        given["memory"] = memory.reshape(-1, memory.shape[-1])
+        memory, action = session.run(["next_memory", "action"], given)
+        return memory.reshape(*batch, -1), action.reshape(*batch, -1)
 
     return header, act
 

@@ -25,14 +25,21 @@ from dexsim.hand.source import check_record, check_same, record_of, recorded_han
 from dexsim.task_spec import TaskSpec
 from dexsim_ppo import checkpoint
 from dexsim_ppo.learner.adapter import adapt
+from dexsim_ppo.learner.memory import History, Memory, empty, remember
 from dexsim_ppo.learner.networks import MLP, Layer, apply_mlp
 from dexsim_ppo.learner.running_stats import Normalizer, make_normalizer, normalize
-from dexsim_ppo.learner.types import Environment, Field, Fields, layout_size
+from dexsim_ppo.learner.types import Environment, Field, Fields
+from dexsim_ppo.policy_file import memory_to_list, read_network
 from dexsim_ppo.retired import migrate_config, old_spec
 
 if TYPE_CHECKING:
     from dexsim.env.env import Env
     from dexsim.hand.kinematics import Hand
+
+
+NEEDS_MEMORY = (
+    "this policy has a memory: memory = policy.begin(), then memory, action = policy.act(memory, observation)"
+)
 
 
 @pytree_dataclass
@@ -43,15 +50,41 @@ class PolicyParams:
     normalizer: Normalizer
     squash: Literal["gaussian", "tanh"] = static(default="gaussian")
     """`"gaussian"`: actions are clipped to [-1, 1]; `"tanh"`: squashed."""
+    memory: Memory = None
+
+
+def begin(params: PolicyParams, batch: tuple[int, ...] = ()) -> jax.Array | None:
+    """What a policy remembers `[*batch, m]` at the start of an episode; None if it has no memory."""
+    return empty(params.memory, params.normalizer.mean.shape[0], batch)
 
 
 def act(params: PolicyParams, obs: jax.Array) -> jax.Array:
-    """The policy's mode: actor observation `[..., n]`, SI units, to action `[..., A]` in [-1, 1]."""
-    mean = apply_mlp(params.layers, normalize(params.normalizer, obs))
-    return jnp.tanh(mean) if params.squash == "tanh" else jnp.clip(mean, -1.0, 1.0)
+    """The policy's mode: actor observation `[..., n]`, SI units, to action `[..., A]` in [-1, 1].
+
+    Raises:
+      ConfigError: the policy has a memory.
+    """
+    if params.memory is not None:
+        raise ConfigError(NEEDS_MEMORY)
+    return act_from(params, None, obs)[1]
 
 
-_act = jax.jit(act)
+def act_from(params: PolicyParams, memory: jax.Array | None, obs: jax.Array) -> tuple[jax.Array | None, jax.Array]:
+    """One step of a policy with or without memory.
+
+    Args:
+      memory: `[..., m]`, at the start of an episode that of `begin`.
+      obs: actor observation `[..., n]`, SI units.
+
+    Returns:
+      Memory after it, and the policy's mode: action `[..., A]` in [-1, 1].
+    """
+    memory, seen = remember(params.memory, memory, normalize(params.normalizer, obs))
+    mean = apply_mlp(params.layers, seen)
+    return memory, jnp.tanh(mean) if params.squash == "tanh" else jnp.clip(mean, -1.0, 1.0)
+
+
+_act, _act_from = jax.jit(act), jax.jit(act_from)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,8 +107,20 @@ class Policy:
     """Which hand it was trained on (`dexsim.hand.source`); None for the shipped default one."""
 
     def __call__(self, obs: Array) -> jax.Array:
-        """Action `[..., A]` for an actor observation `[..., n]`."""
+        """Action `[..., A]` for an actor observation `[..., n]`.
+
+        Raises:
+          ConfigError: the policy has a memory.
+        """
         return _act(self.params, obs)
+
+    def begin(self, *batch: int) -> jax.Array | None:
+        """What it remembers `[*batch, m]` at the start of an episode; None if it has no memory."""
+        return begin(self.params, batch)
+
+    def act(self, memory: Array | None, obs: Array) -> tuple[jax.Array | None, jax.Array]:
+        """Memory after this observation `[..., n]`, and action `[..., A]`: for policies with or without memory."""
+        return _act_from(self.params, memory, obs)
 
     def ablate(self, *names: str) -> "Policy":
         """This policy with some observation fields replaced by their mean in training.
@@ -89,9 +134,15 @@ class Policy:
         if unknown := sorted(set(names) - set(fields)):
             raise ConfigError(f"the policy does not observe {', '.join(unknown)}; it observes {', '.join(fields)}")
         kept = np.concatenate([np.full(field.size, field.name not in names) for field in self.observation_layout])
-        first, *others = self.params.layers
-        first = dataclasses.replace(first, kernel=jnp.where(kept[:, None], first.kernel, 0.0))
-        return dataclasses.replace(self, params=dataclasses.replace(self.params, layers=(first, *others)))
+        (first, *others), memory = self.params.layers, self.params.memory
+        rows = np.ones(first.kernel.shape[0], bool)
+        rows[: kept.size] = kept
+        if isinstance(memory, History):
+            rows = np.tile(kept, memory.length + 1)
+        elif memory is not None:
+            memory = dataclasses.replace(memory, input=_without(memory.input, kept))
+        layers = (_without(first, rows), *others)
+        return dataclasses.replace(self, params=dataclasses.replace(self.params, layers=layers, memory=memory))
 
     def save(self, path: str | Path) -> None:
         """Write to a file, whole or not at all."""
@@ -102,6 +153,7 @@ class Policy:
             "squash": self.params.squash,
             "clip": self.params.normalizer.clip,
             "layers": len(self.params.layers),
+            "memory": memory_to_list(self.params.memory),
             "training": self.training,
             "spec": self.spec and to_dict(self.spec),
             "hand": self.hand,
@@ -223,7 +275,7 @@ class Policy:
             std_floor=config.observation_std_floor,
             clip=config.observation_clip,
         )
-        params = PolicyParams(state.params.actor, normalizer, config.distribution)
+        params = PolicyParams(state.params.actor, normalizer, config.distribution, state.params.memory)
         return cls(
             task=env.name,
             env_config=to_dict(env.config),
@@ -237,24 +289,9 @@ class Policy:
 
     @classmethod
     def _from_file(cls, file: checkpoint.Checkpoint) -> "Policy":
-        content, leaves = file.content, file.leaves
-        layout = tuple(Field(*field) for field in content["observation_layout"])
-        _check_content(content, layout)
-        layers = tuple(
-            Layer(leaves[f".layers[{i}].kernel"], leaves[f".layers[{i}].bias"]) for i in range(content["layers"])
-        )
-        normalizer = Normalizer(leaves[".normalizer.mean"], leaves[".normalizer.std"], content["clip"])
-        sizes = [layout_size(layout), *(layer.kernel.shape[1] for layer in layers)]
-        shapes = [(layer.kernel.shape, layer.bias.shape) for layer in layers]
-        wanted = [((n, m), (m,)) for n, m in zip(sizes[:-1], sizes[1:], strict=True)]
-        if (
-            len(leaves) != 2 * len(layers) + 2
-            or shapes != wanted
-            or not normalizer.mean.shape == normalizer.std.shape == (sizes[0],)
-        ):
-            raise ValueError(f"layer shapes {shapes} for {sizes[0]} observations")
-        _check_numbers(layers, normalizer)
-        params = PolicyParams(layers, normalizer, content["squash"])
+        content = file.content
+        layout, layers, normalizer, memory = read_network(content, file.leaves)
+        params = PolicyParams(layers, normalizer, content["squash"], memory)
         env_config = migrate_config(content["env_config"], file.path)
         if content.get("hand") is not None:
             check_record(content["hand"])
@@ -270,50 +307,14 @@ class Policy:
         )
 
 
-def _check_content(content: dict[str, Any], layout: tuple[Field, ...]) -> None:
-    """Raises ValueError: a value of another type, or beyond what a policy of a hand can have."""
-    for name, kind in (("env_config", dict), ("training", dict), ("layers", int)):
-        if type(content[name]) is not kind:
-            raise ValueError(f"{name} is not a {kind.__name__}")
-    # No hand is run at less than one command a second, and none answers a thousand.
-    for name, low, high in (("control_rate", 1.0, 1000.0), ("clip", 0.1, 1e4), ("layers", 1, 64)):
-        _check_number(name, content[name], low, high)
-    if content["squash"] not in ("gaussian", "tanh"):
-        raise ValueError(f"squash = {str(content['squash']):.50}")
-    for field in layout:
-        if not isinstance(field.name, str) or type(field.size) is not int:
-            raise ValueError(f"observation field {str(tuple(field)):.100}")
-        _check_number(f"size of {field.name:.50}", field.size, 1, 100_000)
-        if field.scale is not None:
-            _check_number(f"scale of {field.name:.50}", field.scale, 1e-9, 1e9)
-
-
-def _check_number(name: str, value: Any, low: float, high: float) -> None:
-    if type(value) not in (int, float) or not low <= value <= high:
-        raise ValueError(f"{name} = {str(value):.50}: must be a number between {low:g} and {high:g}")
-
-
-def _check_numbers(layers: MLP, normalizer: Normalizer) -> None:
-    """Raises ValueError: some number is not finite, or some observation would give an action that is not."""
-    arrays = {"normalizer.mean": normalizer.mean, "normalizer.std": normalizer.std}
-    for i, layer in enumerate(layers):
-        arrays |= {f"layers[{i}].kernel": layer.kernel, f"layers[{i}].bias": layer.bias}
-    for name, array in arrays.items():
-        if array.dtype != np.float32 or not np.all(np.isfinite(array)):
-            raise ValueError(f"{name} holds what is not a finite float32")
-    if not np.all(np.asarray(normalizer.std) >= 1e-12):
-        raise ValueError("normalizer.std is not positive")
-    largest = np.full(normalizer.mean.shape, float(normalizer.clip))
-    for layer in layers:  # The activation does not go beyond its input or 1.
-        kernel, bias = np.asarray(layer.kernel, float), np.asarray(layer.bias, float)
-        largest = np.maximum(largest @ np.abs(kernel) + np.abs(bias), 1.0)
-        if largest.max(initial=0.0) > 1e30:
-            raise ValueError("its weights are so large that actions overflow")
-
-
 def layout_to_list(fields: Fields) -> list[list[Any]]:
     """Fields as plain lists, `[name, size, scale]`."""
     return [[field.name, field.size, field.scale] for field in fields]
+
+
+def _without(layer: Layer, kept: np.ndarray) -> Layer:
+    """A layer that gets 0 for the inputs that are not `kept` [in]."""
+    return dataclasses.replace(layer, kernel=jnp.where(kept[:, None], layer.kernel, 0.0))
 
 
 def load_policy(name: str | Path, *, task: str | None = None) -> Policy:

@@ -24,7 +24,7 @@ from dexsim.core.errors import ConfigError
 from dexsim.datasets.lerobot import write_lerobot
 from dexsim.datasets.rerun import show_rerun
 from dexsim.datasets.trajectory import READINGS, Trajectory, from_readings
-from dexsim_ppo.policy import Policy, act, load_policy
+from dexsim_ppo.policy import Policy, act_from, load_policy
 
 
 def record(policy: Policy, env: Any, *, episodes: int, seconds: float, seed: int) -> list[Trajectory]:
@@ -35,13 +35,16 @@ def record(policy: Policy, env: Any, *, episodes: int, seconds: float, seed: int
     """
     ticks = max(round(seconds / env.control_period), 1)
 
-    def tick(state: Any, _: Any) -> tuple[Any, Any]:
-        after = jax.vmap(env.step)(state, act(policy.params, state.obs["actor"]))
+    def tick(now: Any, _: Any) -> tuple[Any, Any]:
+        state, memory = now
+        memory, action = act_from(policy.params, memory, state.obs["actor"])
+        after = jax.vmap(env.step)(state, action)
         seen = {name: getattr(state.readings, name) for name in READINGS}
-        return after, (seen, after.joint_target, after.terminated)
+        return (after, memory), (seen, after.joint_target, after.terminated)
 
     starts = jax.jit(env.evaluation_starts)(env.evaluation_plan(episodes, seed))
-    _, recorded = jax.jit(lambda state: jax.lax.scan(tick, state, None, length=ticks))(starts)
+    begun = starts, policy.begin(episodes)
+    _, recorded = jax.jit(lambda begun: jax.lax.scan(tick, begun, None, length=ticks))(begun)
     seen, target, ended = jax.device_get(recorded)
     found = []
     for i in range(episodes):

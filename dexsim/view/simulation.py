@@ -40,6 +40,8 @@ class Simulation:
         self._reset = jax.jit(env.reset_to)
         self._step = jax.jit(self._tick)
         self._snapshot = jax.jit(env.snapshot)
+        self._acting: Any = None  # the policy that the memory is of
+        self._memory: Any = None
         self._state: State = self._begin({})
 
     def controls(self) -> dict[str, Control]:
@@ -62,7 +64,11 @@ class Simulation:
         if self._ended >= _SHOWN:
             return self.reset(values)
         policy = self.policies.get(values["policy"])
-        action = jnp.zeros(self.env.action_size) if policy is None else policy(self._state.obs["actor"])
+        if policy is not self._acting:  # another one, or another episode
+            self._acting, self._memory = policy, policy and policy.begin()
+        action = jnp.zeros(self.env.action_size)
+        if policy is not None:
+            self._memory, action = policy.act(self._memory, self._state.obs["actor"])
         push = np.zeros(3, np.float32)
         if values["push"]:
             push = self._random.normal(size=3).astype(np.float32)
@@ -78,7 +84,7 @@ class Simulation:
         rows = np.arange(len(self._shapes)) if kind == _ANY else np.flatnonzero(self._shapes == KINDS.index(kind))
         self._key, key = jax.random.split(self._key)
         state = self._reset(key, jnp.asarray(self._random.choice(rows)), self._goal)
-        object, self._ended = state.episode.object, 0.0
+        object, self._ended, self._acting = state.episode.object, 0.0, None
         self._bare = object.friction, object.link_friction  # as drawn: the page scales them
         return state
 

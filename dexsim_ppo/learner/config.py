@@ -61,6 +61,12 @@ class PPOConfig:
     """Hidden layer sizes of the actor."""
     critic_layers: tuple[int, ...] = setting((512, 256, 128), unit="1", low=1)
     """Hidden layer sizes of the critic."""
+    memory: Literal["none", "history", "gru"] = setting("none")
+    """What the policy keeps of an episode: nothing, its last observations, or the state of a gated recurrent unit."""
+    memory_length: int = setting(4, unit="observations", low=2, high=64)
+    """Observations that a policy with `history` sees, the present one among them."""
+    memory_size: int = setting(64, unit="1", low=1, high=4096)
+    """Units of `gru`. Its gradient goes back to the start of the rollout."""
     normalize_value: bool = True
     """Learn values in units of the running deviation of returns."""
     observation_std_floor: float = setting(1e-2, unit="observation units", low=0.0)
@@ -72,10 +78,10 @@ class PPOConfig:
 
     def __post_init__(self) -> None:
         validate(self)
-        if self.num_envs * self.rollout_length % self.minibatches:
+        if self.rows % self.minibatches:
+            of = "" if self.memory == "gru" else " * PPOConfig.rollout_length"
             raise ConfigError(
-                f"PPOConfig.minibatches = {self.minibatches}: must divide PPOConfig.num_envs * "
-                f"PPOConfig.rollout_length, which is {self.num_envs * self.rollout_length}"
+                f"PPOConfig.minibatches = {self.minibatches}: must divide PPOConfig.num_envs{of}, which is {self.rows}"
             )
         for low, mid, high in (
             ("learning_rate_min", "learning_rate", "learning_rate_max"),
@@ -91,3 +97,8 @@ class PPOConfig:
     def steps_per_iteration(self) -> int:
         """Environment steps collected in one iteration, T * B."""
         return self.num_envs * self.rollout_length
+
+    @property
+    def rows(self) -> int:
+        """Rows of experience that minibatches are drawn from: steps, or with a GRU whole rollouts."""
+        return self.num_envs if self.memory == "gru" else self.steps_per_iteration

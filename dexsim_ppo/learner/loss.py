@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from dexsim.core.pytree import align, pytree_dataclass
 from dexsim_ppo.learner import distribution
 from dexsim_ppo.learner.config import PPOConfig
+from dexsim_ppo.learner.memory import recall
 from dexsim_ppo.learner.networks import Params, apply_mlp
 from dexsim_ppo.learner.rollout import Decision
 from dexsim_ppo.learner.running_stats import Normalizer, normalize
@@ -15,39 +16,54 @@ Metrics = dict[str, jax.Array]
 
 @pytree_dataclass
 class Samples:
-    """Experience as the update sees it; arrays [N, ...] with N = T * B."""
+    """Experience as the update sees it; arrays [N, ...] with N = T * B. With a GRU they are [B, T, ...]."""
 
     obs: dict[str, jax.Array]
     decision: Decision
     advantage: jax.Array
     value: jax.Array  # normalised
     target: jax.Array  # normalised
+    memory: jax.Array | None = None  # state of the actor's memory before the step
+    first: jax.Array | None = None  # whether the step is the first of an episode, with a GRU
 
 
 def actor_mean(
-    config: PPOConfig, params: Params, normalizers: dict[str, Normalizer], obs: dict[str, jax.Array]
+    config: PPOConfig,
+    params: Params,
+    normalizers: dict[str, Normalizer],
+    obs: dict[str, jax.Array],
+    memory: jax.Array | None = None,
+    first: jax.Array | None = None,
 ) -> jax.Array:
-    """Mean of the Gaussian, `[..., A]`."""
-    return apply_mlp(params.actor, normalize(normalizers["actor"], obs["actor"]), config.matmul_precision)
+    """Mean of the Gaussian, `[..., A]`; `memory` and `first` as in `Samples`."""
+    x = normalize(normalizers["actor"], obs["actor"])
+    seen = recall(params.memory, memory, x, first, config.matmul_precision)
+    return apply_mlp(params.actor, seen, config.matmul_precision)
 
 
 def critic_value(
-    config: PPOConfig, params: Params, normalizers: dict[str, Normalizer], obs: dict[str, jax.Array]
+    config: PPOConfig,
+    params: Params,
+    normalizers: dict[str, Normalizer],
+    obs: dict[str, jax.Array],
+    memory: jax.Array | None = None,
 ) -> jax.Array:
-    """Normalised value, `[...]`."""
-    return apply_mlp(params.critic, normalize(normalizers["critic"], obs["critic"]), config.matmul_precision)[..., 0]
+    """Normalised value, `[...]`. The critic also sees what the actor remembered before this observation."""
+    x = normalize(normalizers["critic"], obs["critic"])
+    x = x if memory is None else jnp.concatenate([x, memory], -1)
+    return apply_mlp(params.critic, x, config.matmul_precision)[..., 0]
 
 
 def loss(
     params: Params, config: PPOConfig, normalizers: dict[str, Normalizer], batch: Samples, old_log_std: jax.Array
 ) -> tuple[jax.Array, Metrics]:
     """The objective [] and its metrics over one minibatch."""
-    mean = actor_mean(config, params, normalizers, batch.obs)
+    mean = actor_mean(config, params, normalizers, batch.obs, batch.memory, batch.first)
     ratio = jnp.exp(distribution.log_prob(batch.decision.action, mean, params.log_std) - batch.decision.log_prob)
     clipped = jnp.clip(ratio, 1 - config.clip_ratio, 1 + config.clip_ratio)
     policy_loss = -jnp.mean(jnp.minimum(ratio * batch.advantage, clipped * batch.advantage))
 
-    value = critic_value(config, params, normalizers, batch.obs)
+    value = critic_value(config, params, normalizers, batch.obs, batch.memory)
     errors = (value - batch.target) ** 2
     if config.value_clip > 0:
         near = batch.value + jnp.clip(value - batch.value, -config.value_clip, config.value_clip)

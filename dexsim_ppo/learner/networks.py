@@ -5,6 +5,7 @@ kept cube reorientation from being learned.
 """
 
 import itertools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -30,6 +31,7 @@ class Params:
     actor: MLP
     log_std: jax.Array  # [A], of the Gaussian before any squashing
     critic: MLP
+    memory: Any = None  # `learner.memory.Memory` of the actor
 
 
 def init_mlp(key: jax.Array, sizes: tuple[int, ...], output_gain: float) -> MLP:
@@ -57,19 +59,26 @@ def apply_mlp(layers: MLP, x: jax.Array, precision: str = "highest") -> jax.Arra
 
 
 def init_params(
-    key: jax.Array, *, actor_sizes: tuple[int, ...], critic_sizes: tuple[int, ...], initial_std: float
+    key: jax.Array,
+    *,
+    actor_sizes: tuple[int, ...],
+    critic_sizes: tuple[int, ...],
+    initial_std: float,
+    memory: Any = None,
 ) -> Params:
     """Parameters of both networks. The actor's small output gain makes the first actions nearly pure noise.
 
     Args:
       actor_sizes: observation size, hidden sizes, action size.
       critic_sizes: observation size, hidden sizes, 1.
+      memory: `learner.memory.Memory` of the actor; its state's size is part of both observation sizes.
     """
     actor_key, critic_key = jax.random.split(key)
     return Params(
         actor=init_mlp(actor_key, actor_sizes, output_gain=0.01),
         log_std=jnp.full(actor_sizes[-1], jnp.log(initial_std)),
         critic=init_mlp(critic_key, critic_sizes, output_gain=1.0),
+        memory=memory,
     )
 
 

@@ -6,6 +6,7 @@
 saving and loading that one pytree resumes training exactly.
 """
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple, cast
@@ -22,14 +23,16 @@ from dexsim_ppo.learner.adam import AdamState
 from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.curriculum import Curriculum, next_scale
 from dexsim_ppo.learner.gae import compute_gae, explained_variance
-from dexsim_ppo.learner.loss import Metrics, Samples, actor_mean, critic_value
-from dexsim_ppo.learner.networks import Params, init_params, rescale_output
+from dexsim_ppo.learner.loss import Metrics, Samples, critic_value
+from dexsim_ppo.learner.memory import empty, init_memory, remember, state_size
+from dexsim_ppo.learner.networks import Params, apply_mlp, init_params, rescale_output
 from dexsim_ppo.learner.rollout import Decision, Rollout, bound_rewards, collect
 from dexsim_ppo.learner.running_stats import (
     Normalizer,
     RunningStats,
     init_stats,
     make_normalizer,
+    normalize,
     update_stats,
     value_std,
 )
@@ -52,6 +55,7 @@ class TrainState:
     iteration: jax.Array  # int32 []
     skipped_updates: jax.Array  # int32 [], minibatches whose gradient was not finite
     scale: jax.Array | None = None  # [] width of the randomisation ranges, with a curriculum
+    memory: jax.Array | None = None  # [B, m] state of the policy's memory
 
 
 class Training(NamedTuple):
@@ -120,11 +124,14 @@ def init_state(
     """A fresh learner, and freshly reset environments with staggered clocks."""
     params_key, reset_key, stagger_key, key = jax.random.split(key, 4)
     sizes = {group: layout_size(fields) for group, fields in env.observation_layout.items()}
+    memory = init_memory(jax.random.fold_in(params_key, 1), config, sizes["actor"])
+    remembered = state_size(memory, sizes["actor"])
     params = init_params(
         params_key,
-        actor_sizes=(sizes["actor"], *config.actor_layers, env.action_size),
-        critic_sizes=(sizes["critic"], *config.critic_layers, 1),
+        actor_sizes=(sizes["actor"] + remembered, *config.actor_layers, env.action_size),
+        critic_sizes=(sizes["critic"] + remembered, *config.critic_layers, 1),
         initial_std=config.initial_std,
+        memory=memory,
     )
     scale, reset = None, env.reset
     if curriculum is not None:
@@ -143,6 +150,7 @@ def init_state(
         iteration=jnp.int32(0),
         skipped_updates=jnp.int32(0),
         scale=scale,
+        memory=empty(memory, sizes["actor"], (config.num_envs,)),
     )
 
 
@@ -157,7 +165,7 @@ def train_iteration(
     key, collect_key, update_key = jax.random.split(state.key, 3)
     # Shared by collection and update, so that the first minibatch's probability ratio is exactly one.
     normalizers = make_normalizers(env, config, state.observation_stats)
-    env_state, rollout, metrics = collect_rollout(env, config, state, normalizers, collect_key, mesh)
+    (env_state, memory), rollout, metrics = collect_rollout(env, config, state, normalizers, collect_key, mesh)
     if config.normalize_value:
         rollout, bounded = bound_rewards(rollout, state.value_stats, config.reward_scale)
         metrics |= {"bounded_rewards": bounded}
@@ -196,6 +204,7 @@ def train_iteration(
         iteration=state.iteration + 1,
         skipped_updates=learner.skipped_updates,
         scale=scale,
+        memory=memory,
     ), metrics
 
 
@@ -234,20 +243,23 @@ def collect_rollout(
     normalizers: dict[str, Normalizer],
     key: jax.Array,
     mesh: Mesh | None = None,
-) -> tuple[Any, Rollout, Metrics]:
-    """Experience [T, B, ...] under the current policy; values are in reward units."""
+) -> tuple[tuple[Any, jax.Array | None], Rollout, Metrics]:
+    """States and memory afterwards, and experience [T, B, ...] under the current policy; values are in reward units."""
     params, std = state.params, value_std(state.value_stats)
 
-    def act(key, obs):
-        mean = actor_mean(config, params, normalizers, obs)
+    def act(key, obs, memory):
+        x = normalize(normalizers["actor"], obs["actor"])
+        memory, seen = remember(params.memory, memory, x, config.matmul_precision)
+        mean = apply_mlp(params.actor, seen, config.matmul_precision)
         action = distribution.sample(key, mean, params.log_std)
         decision = Decision(action, mean, distribution.log_prob(action, mean, params.log_std))
-        return decision, jnp.tanh(action) if config.distribution == "tanh" else jnp.clip(action, -1.0, 1.0)
+        action = jnp.tanh(action) if config.distribution == "tanh" else jnp.clip(action, -1.0, 1.0)
+        return decision, action, memory
 
-    def value(obs):
-        return state.value_stats.mean + std * critic_value(config, params, normalizers, obs)
+    def value(obs, memory):
+        return state.value_stats.mean + std * critic_value(config, params, normalizers, obs, memory)
 
-    return collect(env, state.env_state, key, act, value, config.rollout_length, mesh)
+    return collect(env, state.env_state, key, act, value, config.rollout_length, mesh, state.memory)
 
 
 # --- advantages ---------------------------------------------------------------------------------------
@@ -256,7 +268,8 @@ def collect_rollout(
 def prepare(
     config: PPOConfig, value_stats: RunningStats, params: Params, rollout: Rollout
 ) -> tuple[RunningStats, Params, Samples]:
-    """Advantages and normalised value targets as flat rows [T * B]; updates the value normaliser."""
+    """Advantages and normalised value targets as flat rows [T * B], with a GRU as sequences [B, T]; updates the value
+    normaliser."""
     advantage, target = compute_gae(
         config.reward_scale * rollout.reward,
         rollout.value,
@@ -269,7 +282,7 @@ def prepare(
     if config.normalize_value:
         new = update_stats(value_stats, target)
         critic = rescale_output(params.critic, value_stats.mean, value_std(value_stats), new.mean, value_std(new))
-        params, value_stats = Params(params.actor, params.log_std, critic), new
+        params, value_stats = dataclasses.replace(params, critic=critic), new
     mean, std = value_stats.mean, value_std(value_stats)
     samples = Samples(
         obs=rollout.obs,
@@ -277,8 +290,14 @@ def prepare(
         advantage=(advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8),
         value=(rollout.value - mean) / std,
         target=(target - mean) / std,
+        memory=rollout.memory,
     )
-    return value_stats, params, jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), samples)
+    if config.memory != "gru":
+        return value_stats, params, jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), samples)
+    ended = rollout.terminated | rollout.truncated
+    # What is remembered at the rollout's first step is zero where an episode begins with it.
+    samples = dataclasses.replace(samples, first=jnp.zeros_like(ended).at[1:].set(ended[:-1]))
+    return value_stats, params, jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), samples)
 
 
 def strong_types(tree: Any) -> Any:

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -41,12 +41,36 @@ class Rollout:
     reward: jax.Array
     terminated: jax.Array
     truncated: jax.Array
+    memory: jax.Array | None = None  # [T, B, m] state of the policy's memory before the step
 
 
-Act = Callable[[jax.Array, Mapping[str, jax.Array]], tuple[Decision, jax.Array]]
-"""`act(key, obs) -> (decision, action for the environment [B, A])`"""
-Value = Callable[[Mapping[str, jax.Array]], jax.Array]
-"""`value(obs) -> [B]`"""
+Act = Callable[[jax.Array, Mapping[str, jax.Array], Any], tuple[Decision, jax.Array, Any]]
+"""`act(key, obs, memory) -> (decision, action for the environment [B, A], memory)`"""
+Value = Callable[[Mapping[str, jax.Array], Any], jax.Array]
+"""`value(obs, memory) -> [B]`, of the memory before this observation"""
+
+
+@pytree_dataclass
+class Remembering:
+    """State of an environment and of the policy's memory."""
+
+    state: Any
+    memory: jax.Array | None
+
+    reward = property(lambda self: self.state.reward)
+    terminated = property(lambda self: self.state.terminated)
+    truncated = property(lambda self: self.state.truncated)
+
+
+class Restarting(NamedTuple):
+    """What begins an episode with an empty memory."""
+
+    env: Environment
+
+    def restart(self, now: Remembering, done: jax.Array) -> Remembering:
+        """As of `Environment`."""
+        memory = jax.tree.map(lambda x: jnp.where(done, 0.0, x), now.memory)
+        return Remembering(self.env.restart(now.state, done), memory)
 
 
 def collect(
@@ -57,7 +81,8 @@ def collect(
     value: Value,
     length: int,
     mesh: Mesh | None = None,
-) -> tuple[Any, Rollout, dict[str, jax.Array]]:
+    memory: jax.Array | None = None,
+) -> tuple[tuple[Any, jax.Array | None], Rollout, dict[str, jax.Array]]:
     """Run the policy for `length` steps.
 
     The order is act, step, record, restart: the recorded flags, metrics and `next_value` belong to the true
@@ -65,30 +90,34 @@ def collect(
 
     Args:
       state: batch [B] of environment states.
+      memory: [B, m] state of the policy's memory; zero at the start of every episode.
 
     Returns:
-      The last states, the experience, and scalar metrics: `step/<name>` is a mean over all steps,
+      The last states and memory, the experience, and scalar metrics: `step/<name>` is a mean over all steps,
       `episode/<name>` the mean final value over the episodes that ended (NaN if none did), `episodes`
       their number, `repeated_starts` how many starts were used before (see `scan_restarting`).
     """
     step_env = batched(env.step, mesh)
 
-    def step(state, key):
+    def step(now, key):
+        state, memory = now.state, now.memory
         obs = dict(state.obs)
-        decision, action = act(key, obs)
+        decision, action, later = act(key, obs, memory)
         after = step_env(state, action)
         record = Rollout(
             obs=obs,
             decision=decision,
-            value=value(obs),
-            next_value=value(after.obs),
+            value=value(obs, memory),
+            next_value=value(after.obs, later),
             reward=after.reward,
             terminated=after.terminated,
             truncated=after.truncated,
+            memory=memory,
         )
-        return after, (record, dict(after.metrics))
+        return Remembering(after, later), (record, dict(after.metrics))
 
-    state, (rollout, step_metrics) = scan_restarting(env, step, state, jax.random.split(key, length), mesh)
+    begin, keys = Remembering(state, memory), jax.random.split(key, length)
+    end, (rollout, step_metrics) = scan_restarting(cast(Any, Restarting(env)), step, begin, keys, mesh)
     # Sums are taken outside the scan: inside it each would reduce few numbers, which is slow on GPUs.
     finite, done = jnp.isfinite(rollout.reward), rollout.terminated | rollout.truncated
     rollout = dataclasses.replace(rollout, reward=jnp.where(finite, rollout.reward, 0.0))
@@ -102,7 +131,7 @@ def collect(
     }
     metrics |= {f"step/{k}": _sum(v, jnp.ones_like(done)) / steps for k, v in step_metrics.items()}
     metrics |= {f"episode/{k}": _sum(v, done) / episodes for k, v in step_metrics.items()}
-    return state, rollout, metrics
+    return (end.state, end.memory), rollout, metrics
 
 
 def scan_restarting(

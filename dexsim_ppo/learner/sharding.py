@@ -37,12 +37,13 @@ def make_mesh(devices: int, config: PPOConfig) -> Mesh | None:
         raise ConfigError(
             f"TrainArguments.devices = {devices}: there are {len(found)}, in {jax.process_count()} processes"
         )
+    rows = "rollouts" if config.memory == "gru" else "steps"
     for name, size in (
         ("num_envs", config.num_envs),
-        ("minibatches", config.steps_per_iteration // config.minibatches),
+        ("minibatches", config.rows // config.minibatches),
     ):
         if size % count:
-            what = "must be a multiple of" if name == "num_envs" else f"leaves {size} steps each, no multiple of"
+            what = "must be a multiple of" if name == "num_envs" else f"leaves {size} {rows} each, no multiple of"
             raise ConfigError(f"PPOConfig.{name} = {getattr(config, name)}: {what} the {count} devices")
     if count == 1:
         return None
@@ -71,7 +72,9 @@ def shardings(state: Any, mesh: Mesh) -> Any:
     """The sharding of each array of a `TrainState`: the environments' are split, all others copied."""
     whole, split = (NamedSharding(mesh, spec) for spec in (PartitionSpec(), PartitionSpec(AXIS)))
     found = jax.tree.map(lambda _: whole, state)
-    return dataclasses.replace(found, env_state=jax.tree.map(lambda _: split, state.env_state))
+    return dataclasses.replace(
+        found, **{name: jax.tree.map(lambda _: split, getattr(state, name)) for name in ("env_state", "memory")}
+    )
 
 
 def start_on(mesh: Mesh, init: Callable[[jax.Array], Any], shapes: Callable[[jax.Array], Any]) -> Callable:
@@ -95,7 +98,7 @@ def spanned(state: Any) -> Mesh:
 
 def learned(state: Any) -> Any:
     """A `TrainState` without its environments, as arrays of this process, whatever devices it is on."""
-    return jax.device_get(dataclasses.replace(state, env_state=None, key=None))
+    return jax.device_get(dataclasses.replace(state, env_state=None, memory=None, key=None))
 
 
 def place(tree: Tree, like: Any) -> Tree:

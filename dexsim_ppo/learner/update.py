@@ -1,5 +1,6 @@
 """The update: epochs over shuffled minibatches, gradient clipping, the adaptive learning rate."""
 
+import dataclasses
 import functools
 from typing import NamedTuple
 
@@ -37,7 +38,7 @@ def update(
 
     Metrics are means over all minibatches, except the KL divergence: its mean over the last epoch.
     """
-    rows = config.steps_per_iteration
+    rows = config.rows
     keys = jax.random.split(key, config.epochs)
     order = jax.vmap(lambda key: jax.random.permutation(key, rows))(keys)
     order = order.reshape(config.epochs * config.minibatches, rows // config.minibatches)
@@ -65,18 +66,20 @@ def update(
 
 def apply_gradients(config: PPOConfig, learner: Learner, grads: Params) -> tuple[Learner, Metrics]:
     """Clip the gradients and step. A minibatch whose gradient is not finite is skipped and counted."""
-    actor_grads, actor_norm = adam.clip_by_global_norm((grads.actor, grads.log_std), config.max_grad_norm)
+    actor = (grads.actor, grads.log_std, grads.memory)
+    (actor_grads, std_grads, memory_grads), actor_norm = adam.clip_by_global_norm(actor, config.max_grad_norm)
     critic_grads, critic_norm = adam.clip_by_global_norm(grads.critic, config.max_grad_norm)
     rate, moves = learner.learning_rate, actor_learns(config, learner)
     if config.critic_first:
         rate = jnp.where(moves, rate, config.learning_rate_max)
-    params, moments = adam.update(Params(*actor_grads, critic_grads), learner.adam, learner.params, rate)
+    grads = Params(actor_grads, std_grads, critic_grads, memory_grads)
+    params, moments = adam.update(grads, learner.adam, learner.params, rate)
     # Projected after the step, not clipped in the loss: beyond a clip the gradient is zero, and it could not return.
     log_std = jnp.clip(params.log_std, jnp.log(config.std_min), jnp.log(config.std_max))
-    params = Params(params.actor, log_std, params.critic)
+    params = dataclasses.replace(params, log_std=log_std)
     if config.critic_first:  # Adam's moments already follow the gradient, so that the actor's first step is small.
         held = jax.tree.map(functools.partial(jnp.where, moves), params, learner.params)
-        params = Params(held.actor, held.log_std, params.critic)
+        params = dataclasses.replace(held, critic=params.critic)
     ok = jnp.isfinite(actor_norm) & jnp.isfinite(critic_norm)
     new = learner._replace(params=params, adam=moments)
     learner = jax.tree.map(functools.partial(jnp.where, ok), new, learner)

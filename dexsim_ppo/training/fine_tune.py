@@ -11,6 +11,7 @@ from dexsim_ppo.learner.ppo import TrainState
 from dexsim_ppo.learner.running_stats import recover_stats
 from dexsim_ppo.learner.types import Environment
 from dexsim_ppo.policy import Policy, layout_to_list
+from dexsim_ppo.policy_file import memory_to_list
 
 
 def fine_tuning_config(policy: Policy, config: PPOConfig) -> PPOConfig:
@@ -19,8 +20,12 @@ def fine_tuning_config(policy: Policy, config: PPOConfig) -> PPOConfig:
     A policy file holds neither critic nor noise. The noise and step size of training from scratch would make the
     policy forget. So would a fresh critic, whose errors are correlated: it trains alone first.
     """
+    kind, size = memory_to_list(policy.params.memory) or ["none", 0]
+    sizes = {"history": {"memory_length": size + 1}, "gru": {"memory_size": size}}.get(kind, {})
     return dataclasses.replace(
         config,
+        memory=kind,
+        **sizes,
         actor_layers=tuple(layer.kernel.shape[1] for layer in policy.params.layers[:-1]),
         distribution=policy.params.squash,
         learning_rate=1e-5,
@@ -42,6 +47,10 @@ def check_fit(policy: Policy, env: Environment, config: PPOConfig) -> None:
     if theirs != mine:
         odd = [name for name, *_ in (*(f for f in theirs if f not in mine), *(f for f in mine if f not in theirs))]
         raise ConfigError(f"observations of policy and environment differ: {', '.join(odd) or 'their order'}")
+    remembers = memory_to_list(policy.params.memory)
+    wanted = {"history": ["history", config.memory_length - 1], "gru": ["gru", config.memory_size]}.get(config.memory)
+    if remembers != wanted:
+        raise ConfigError("the policy has another memory: do not set --ppo.memory or its size")
     layers = tuple(layer.kernel.shape[1] for layer in policy.params.layers)
     if layers != (*config.actor_layers, env.action_size) or policy.params.squash != config.distribution:
         raise ConfigError(
@@ -54,8 +63,9 @@ def initialize_from(policy: Policy, config: PPOConfig, state: TrainState) -> Tra
     """A fresh learner's state with the policy's actor and observation statistics: the actor's inputs keep the
     normalisation that it was trained with."""
     stats = recover_stats(policy.params.normalizer, std_floor=config.observation_std_floor)
+    actor, memory = jax.tree.map(jnp.copy, (policy.params.layers, policy.params.memory))
     return dataclasses.replace(
         state,
-        params=dataclasses.replace(state.params, actor=jax.tree.map(jnp.copy, policy.params.layers)),
+        params=dataclasses.replace(state.params, actor=actor, memory=memory),
         observation_stats=state.observation_stats | {"actor": stats},
     )

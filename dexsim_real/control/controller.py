@@ -93,6 +93,13 @@ class Controller:
         self.target = np.asarray(target, np.float32)
         self.last_action = np.zeros(self.hand.num_joints, np.float32)
         self.correction = np.zeros((), np.float32)  # of the command, by the force loop
+        self.memory = self.policy.begin()
+
+    def resume(self, position: np.ndarray) -> None:
+        """Continue from this pose [J] rad after a hold, perhaps with the object put back: what came before is
+        forgotten."""
+        self.anchor(position)
+        self.memory = self.policy.begin()
 
     def anchor(self, position: np.ndarray) -> None:
         """Continue from this pose [J] rad, after a time in which the hand did not follow its targets."""
@@ -113,8 +120,10 @@ class Controller:
             readings, correction = jax.device_get(self._correct(readings, self.correction))
             self.correction = np.asarray(correction)
         observation = np.asarray(self._observe(readings))
-        action = np.clip(np.asarray(self.policy(observation)), -1.0, 1.0)
+        memory, action = self.policy.act(self.memory, observation)
+        action = np.clip(np.asarray(action), -1.0, 1.0)
         if np.isfinite(action).all():
+            self.memory = memory
             target = np.asarray(self._move(self.target, action, measured.joint_position))
             self.target = target
         else:  # As in simulation this counts as no action; `Safety` holds when a target is not finite.

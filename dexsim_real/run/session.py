@@ -253,7 +253,7 @@ class Session:
             if measured:
                 if anchor != self.safety.anchor:
                     anchor = self.safety.anchor
-                    self.controller.anchor(self.safety.commanded)
+                    self.controller.resume(self.safety.commanded)
                 self._tick(now, sample)
                 self.compute.add(time.monotonic() - now)
             self.pace.wait()

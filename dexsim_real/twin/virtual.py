@@ -212,7 +212,7 @@ class VirtualRun:
         while self.plant.trial == trial and self._now < began + limit:
             if anchor != self.safety.anchor:
                 anchor = self.safety.anchor
-                self.controller.anchor(self.safety.commanded)
+                self.controller.resume(self.safety.commanded)
             self._tick()
             tick += 1
             self._until(began + tick * self.controller.period)

@@ -121,8 +121,11 @@ def test_bridge_and_simulation_show_the_policy_the_same_command(hand):
         task, spec, control_rate = env.name, env.spec, env.control_rate
         observation_layout = env.observation_layout["actor"]
 
-        def __call__(self, observation):
-            return np.full(12, 0.2, np.float32)
+        def begin(self):
+            return None
+
+        def act(self, memory, observation):
+            return memory, np.full(12, 0.2, np.float32)
 
     state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(3), 8))
     step, controllers = jax.jit(jax.vmap(env.step)), [Controller(Close(), hand) for _ in range(8)]

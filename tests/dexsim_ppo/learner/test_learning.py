@@ -227,18 +227,19 @@ def test_metrics_are_those_of_a_plain_loop():
     states = dataclasses.replace(
         states, metrics=states.metrics | {"length": jnp.arange(count, dtype=jnp.float32) * 2.0}
     )
-    decide = lambda key, obs: (  # noqa: E731
+    decide = lambda key, obs, memory: (  # noqa: E731
         Decision(*[jnp.zeros((count, 1))] * 2, jnp.zeros(count)),
         jax.random.normal(key, (count, 1)),
+        memory,
     )
     _, rollout, metrics = jax.jit(
-        lambda state: collect(env, state, jax.random.key(4), decide, lambda obs: obs["critic"][..., 0], length)
+        lambda state: collect(env, state, jax.random.key(4), decide, lambda obs, _: obs["critic"][..., 0], length)
     )(states)
     everywhere, ended, final, broken, reward = [], 0, [], 0, []
     fresh = jax.vmap(env.restart)(states, jnp.ones(count, bool))
     state = jax.vmap(env.restart)(states, jnp.zeros(count, bool))
     for key in jax.random.split(jax.random.key(4), length):
-        state = jax.vmap(env.step)(state, decide(key, state.obs)[1])
+        state = jax.vmap(env.step)(state, decide(key, state.obs, None)[1])
         for row in range(count):
             value = float(state.reward[row])
             broken, reward = broken + (not np.isfinite(value)), [*reward, value if np.isfinite(value) else 0.0]

@@ -81,12 +81,15 @@ class Acts:
 
     def __init__(self, task, hand, act):
         config = task.config
-        self.act, self.task, self.spec = act, task.name, TaskSpec.of(task)
+        self.function, self.task, self.spec = act, task.name, TaskSpec.of(task)
         self.control_rate = 1 / config.physics.control_period
         self.observation_layout = layout(hand, task.fields["actor"], config.observation)
 
-    def __call__(self, observation):
-        return self.act(observation)
+    def begin(self):
+        return None
+
+    def act(self, memory, observation):
+        return memory, self.function(observation)
 
 
 def random_state(rng, hand):
