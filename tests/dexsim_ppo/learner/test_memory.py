@@ -17,6 +17,7 @@ from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.memory import GRU, init_memory, remember
 from dexsim_ppo.learner.networks import Layer
 from dexsim_ppo.policy import Policy
+from dexsim_ppo.training.fine_tune import check_fit, fine_tuning_config, initialize_from
 
 KINDS = ("history", "gru")
 
@@ -159,3 +160,18 @@ def test_a_file_holds_the_memory(kind, tmp_path):
     assert again.begin().shape == one.shape[1:] and np.abs(one).max() > 0
     with pytest.raises(ConfigError, match=r"^this policy has a memory: .*policy\.act"):
         again(obs[0])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_fine_tuning_begins_with_it(kind):
+    env, policy = policy_of(kind)
+    config = fine_tuning_config(policy, dataclasses.replace(CONFIG, memory_length=2, memory_size=3))
+    check_fit(policy, env, config)
+    state = initialize_from(policy, config, ppo.make_train(env, config).init(jax.random.key(9)))
+    again = Policy.from_training(env, config, state)
+    memory = jax.random.normal(jax.random.key(3), policy.begin(5).shape)
+    obs = jnp.ones((5, 2))
+    for one, other in zip(policy.act(memory, obs), again.act(memory, obs), strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-5)
+    with pytest.raises(ConfigError, match="do not set --ppo.memory or its size"):
+        check_fit(policy, env, dataclasses.replace(config, memory="none"))
