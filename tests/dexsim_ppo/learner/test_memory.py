@@ -14,6 +14,7 @@ from dexsim_ppo.evaluate import evaluate_policy
 from dexsim_ppo.learner import ppo
 from dexsim_ppo.learner.adapter import adapt
 from dexsim_ppo.learner.config import PPOConfig
+from dexsim_ppo.learner.loss import actor_mean, critic_value
 from dexsim_ppo.learner.memory import GRU, init_memory, remember
 from dexsim_ppo.learner.networks import Layer
 from dexsim_ppo.policy import Policy
@@ -43,8 +44,8 @@ def experience(kind):
         normalizers = ppo.make_normalizers(env, config, state.observation_stats)
         after, rollout, _ = ppo.collect_rollout(env, config, state, normalizers, jax.random.key(1))
         _, params, samples = ppo.prepare(config, state.value_stats, state.params, rollout)
-        mean = ppo.actor_mean(config, params, normalizers, samples.obs, samples.memory, samples.first)
-        value = ppo.critic_value(config, params, normalizers, samples.obs, samples.memory)
+        mean = actor_mean(config, params, normalizers, samples.obs, samples.memory, samples.first)
+        value = critic_value(config, params, normalizers, samples.obs, samples.memory)
         return after, rollout, samples, mean, value
 
     return jax.device_get(collect(state))
@@ -89,9 +90,7 @@ def test_the_value_after_a_step_is_that_of_the_true_next_observation(kind):
     _, rollout, *_ = experience(kind)
     normalizers = ppo.make_normalizers(env, config, state.observation_stats)
     memory = jax.vmap(lambda memory, obs: policy_of(kind)[1].act(memory, obs)[0])(rollout.memory, rollout.obs["actor"])
-    value = ppo.critic_value(
-        config, state.params, normalizers, {"critic": jnp.zeros_like(rollout.obs["critic"])}, memory
-    )
+    value = critic_value(config, state.params, normalizers, {"critic": jnp.zeros_like(rollout.obs["critic"])}, memory)
     std = np.sqrt(state.value_stats.variance + 1e-6)
     np.testing.assert_allclose(rollout.next_value, state.value_stats.mean + std * value, atol=1e-4)
 
@@ -131,7 +130,7 @@ def test_gradients_go_back_through_the_rollout():
     normalizers = ppo.make_normalizers(env, config, state.observation_stats)
 
     def last(obs, first):
-        return ppo.actor_mean(config, state.params, normalizers, {"actor": obs}, jnp.asarray(samples.memory), first)[
+        return actor_mean(config, state.params, normalizers, {"actor": obs}, jnp.asarray(samples.memory), first)[
             :, -1
         ].sum()
 
