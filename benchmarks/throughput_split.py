@@ -27,6 +27,7 @@ from dexsim.touch.reduce import reduce_touch
 from dexsim_ppo.learner import ppo
 from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.distribution import log_prob, sample
+from dexsim_ppo.learner.loss import actor_mean, critic_value
 from dexsim_ppo.learner.ppo import TrainState, make_train
 from dexsim_ppo.learner.rollout import Rollout, scan_restarting
 from dexsim_ppo.learner.running_stats import update_stats
@@ -101,7 +102,7 @@ def record(env: Recorder, config: PPOConfig, state: TrainState) -> tuple[Any, ja
     normalizers = ppo.make_normalizers(env, config, state.observation_stats)
 
     def tick(env_state, key):
-        mean = ppo.actor_mean(config, state.params, normalizers, env_state.obs)
+        mean = actor_mean(config, state.params, normalizers, env_state.obs)
         action = sample(key, mean, state.params.log_std)
         after, given = jax.vmap(env.recorded_step)(env_state, action)
         outcome = after.physics.qpos, after.finger_force
@@ -174,11 +175,11 @@ def policy(env: Env, config: PPOConfig, state: TrainState, rollout: Rollout) -> 
 
     def tick(key, obs):
         key, use = jax.random.split(key)
-        mean = ppo.actor_mean(config, state.params, normalizers, obs)
+        mean = actor_mean(config, state.params, normalizers, obs)
         action = sample(use, mean, state.params.log_std)
         # The value after the step is that of another observation; here those of other rows stand for it.
         values = [
-            ppo.critic_value(config, state.params, normalizers, seen)
+            critic_value(config, state.params, normalizers, seen)
             for seen in (obs, jax.tree.map(lambda x: jnp.roll(x, 1, 0), obs))
         ]
         return key, _used((action, log_prob(action, mean, state.params.log_std), values))

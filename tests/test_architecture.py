@@ -36,7 +36,7 @@ FLOORS = {
     "dexsim_ppo": (
         ("learner", "portable"),
         ("retired",),
-        ("checkpoint", "report"),
+        ("checkpoint", "policy_file", "report"),
         ("policy",),
         ("evaluate", "export", "record"),
         ("training",),

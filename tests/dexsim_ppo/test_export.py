@@ -7,6 +7,7 @@ import sys
 import numpy as np
 import pytest
 from paths import ROOT
+from remembering import KINDS, remembering
 
 from dexsim import load_hand
 from dexsim.core.errors import CheckpointError, ConfigError
@@ -57,6 +58,24 @@ def test_a_squashing_policy_is_exported_as_such(suffix, tmp_path):
     np.testing.assert_allclose(export.load_exported(path)(seen), policy(seen), atol=1e-5)
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_policy_with_memory_is_exported_with_it(kind, suffix, tmp_path):
+    policy, path = remembering(kind), tmp_path / f"policy{suffix}"
+    {".npz": export.to_numpy, ".onnx": export.to_onnx}[suffix](policy, path)
+    exported, seen = export.load_exported(path), observations(policy, 80).reshape(8, 10, -1)
+    memory, other = policy.begin(10), exported.begin(10)
+    np.testing.assert_array_equal(other, memory)
+    for obs in seen:
+        (memory, wanted), (other, action) = policy.act(memory, obs), exported.act(other, obs)
+        np.testing.assert_allclose(action, wanted, atol=2e-5)
+        np.testing.assert_allclose(other, memory, atol=2e-5)
+    one = exported.act(exported.begin(), seen[0, 0])  # one alone, from the start
+    np.testing.assert_allclose(one[1], policy.act(policy.begin(), seen[0, 0])[1], atol=2e-5)
+    assert np.abs(action - np.asarray(policy.act(policy.begin(10), obs)[1])).max() > 0.01, "memory matters"
+    with pytest.raises(ConfigError, match="this policy has a memory"):
+        exported(seen[0])
+
+
 def test_it_runs_where_there_is_neither_jax_nor_the_rest_of_the_library(tmp_path):
     policy = load_policy("grasp")
     export.to_numpy(policy, tmp_path / "grasp.npz")
@@ -76,14 +95,17 @@ np.save("action.npy", PortablePolicy.load("grasp.npz")(np.load("seen.npy")))
     assert np.abs(np.load(tmp_path / "action.npy") - np.asarray(policy(seen))).max() < 1e-5
 
 
-def test_the_bridge_chooses_the_same_targets(suffix, tmp_path):
+@pytest.mark.parametrize("kind", ["", *KINDS])
+def test_the_bridge_chooses_the_same_targets(kind, suffix, tmp_path):
     from dexsim_real.control.controller import IDENTITY, Controller
     from dexsim_real.sensors.hand import HandMeasurement
     from dexsim_real.sensors.readings import ObjectEstimate
 
     path, hand = tmp_path / f"grasp{suffix}", load_hand()
-    export.main(["grasp", "--output", str(path)])
-    controllers = [Controller(policy, hand) for policy in (load_policy("grasp"), export.load_exported(path))]
+    policy = remembering(kind) if kind else load_policy("grasp")
+    policy.save(tmp_path / "policy.msgpack")
+    export.main([str(tmp_path / "policy.msgpack"), "--output", str(path)])
+    controllers = [Controller(policy, hand) for policy in (policy, export.load_exported(path))]
     rng = np.random.default_rng(1)
     for _ in range(20):
         joints = rng.uniform(0, 1, 12).astype(np.float32)

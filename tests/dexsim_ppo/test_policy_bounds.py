@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from remembering import remembering
 from tiny_env import SMALL, TinyEnv
 
 from dexsim.core.assets import asset_path
@@ -108,6 +109,26 @@ def test_weights_that_cancel_for_some_observations_overflow_for_others(sound, tm
     forged.save(tmp_path / "p.msgpack")
     with pytest.raises(CheckpointError, match=r"^[^\n]*so large that actions overflow[^\n]*$"):
         Policy.load(tmp_path / "p.msgpack")
+
+
+FORGED_MEMORY = {
+    "no memory where the network has one": (None, {}),
+    "another kind": (["lstm", 16], {}),
+    "another size": (["gru", 15], {}),
+    "a history": (["history", 2], {}),
+    "no size": (["gru"], {}),
+    "a fraction of a size": (["history", 1.5], {}),
+    "NaN weight": (["gru", 16], {".memory.input.kernel": np.nan}),
+    "weights that overflow": (["gru", 16], {".memory.recurrent.kernel": 3e38}),
+}
+
+
+@pytest.mark.parametrize("what", FORGED_MEMORY)
+def test_a_memory_that_no_policy_has_is_one_line(tmp_path, what):
+    memory, arrays = FORGED_MEMORY[what]
+    forged = forge(remembering("gru"), tmp_path / "p.msgpack", content={"memory": memory}, arrays=arrays)
+    with pytest.raises(CheckpointError, match=r"^[^\n]{1,400}$"):
+        Policy.load(forged)
 
 
 def test_an_observation_that_nothing_gives_is_one_line(hand):

@@ -5,6 +5,7 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
+from remembering import KINDS, remembering
 
 import dexsim
 from dexsim.core.errors import ConfigError
@@ -17,18 +18,20 @@ def env():
     return dexsim.make("grasp", GraspConfig(pool_size=80), backend="c", num_envs=3)
 
 
-def test_readings_and_targets_are_those_of_the_episodes(env):
-    policy = load_policy("grasp")
+@pytest.mark.parametrize("kind", ["", *KINDS])
+def test_readings_and_targets_are_those_of_the_episodes(env, kind):
+    policy = remembering(kind) if kind else load_policy("grasp")
     found = record.record(policy, env, episodes=3, seconds=0.3, seed=0)
     assert [len(one.time) for one in found] == [10, 10, 10]
-    state = jax.jit(env.evaluation_starts)(env.evaluation_plan(3, 0))
+    state, memory = jax.jit(env.evaluation_starts)(env.evaluation_plan(3, 0)), policy.begin(3)
     step = jax.jit(jax.vmap(env.step))
     for tick in range(10):
         for i, one in enumerate(found):
             for name in ("joint_position", "taxel_force", "command"):
                 wanted = np.asarray(getattr(state.readings, name))[i]
                 np.testing.assert_allclose(getattr(one, name)[tick], wanted, atol=2e-3)
-        state = step(state, policy(state.obs["actor"]))
+        memory, action = policy.act(memory, state.obs["actor"])
+        state = step(state, action)
         np.testing.assert_allclose([one.target[tick] for one in found], state.joint_target, atol=2e-3)
 
 

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from remembering import KINDS, remembering
 
 import dexsim
 from dexsim.core.assets import asset_path
@@ -95,6 +96,18 @@ def test_an_ablated_policy_takes_the_mean_of_what_it_does_not_see():
     np.testing.assert_array_equal(policy.ablate()(obs), policy(obs))
     with pytest.raises(ConfigError, match="does not observe colour; it observes .*joint_position"):
         policy.ablate("colour")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_an_ablated_memory_takes_the_mean_as_well(kind):
+    policy = remembering(kind)
+    hidden = np.concatenate([np.full(f.size, f.name == "contact_force") for f in policy.observation_layout])
+    obs = np.random.default_rng(0).normal(size=(4, 20, 66)).astype(np.float32)
+    ablated, mean = policy.ablate("contact_force"), np.asarray(policy.params.normalizer.mean)
+    one, other = policy.begin(20), policy.begin(20)
+    for x in obs:
+        (one, action), (other, wanted) = ablated.act(one, x), policy.act(other, np.where(hidden, mean, x))
+        np.testing.assert_allclose(action, wanted, atol=2e-5)
 
 
 WORLDS = 8

@@ -150,6 +150,24 @@ def test_a_push_moves_the_object_and_friction_is_scaled_from_what_was_drawn(simu
     assert float(simulation._state.episode.object.friction) == pytest.approx(0.5 * float(before), rel=1e-5)
 
 
+def test_a_memory_lasts_as_long_as_the_episode_and_the_choice_of_its_policy(simulation, monkeypatch):
+    had = []
+
+    class Counts:
+        def begin(self):
+            return 0
+
+        def act(self, memory, obs):
+            had.append(memory)
+            return memory + 1, np.zeros(12, np.float32)
+
+    policies = {"a": Counts(), "b": Counts(), NONE: None}
+    monkeypatch.setattr(simulation, "policies", policies)
+    for name in ("a", "a", "a", "reset", "a", "a", "b", "b", NONE, "b"):
+        simulation.reset(VALUES) if name == "reset" else run(simulation, 1, policy=name)
+    assert had == [0, 1, 2, 0, 1, 0, 1, 0]
+
+
 def test_a_dropped_object_is_seen_and_then_replaced(simulation):
     simulation.reset(VALUES)
     frames = run(simulation, 120, policy=NONE, **{"push [m/s]": 2.0, "push": True})

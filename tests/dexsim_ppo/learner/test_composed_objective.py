@@ -104,6 +104,7 @@ def experience(script, config, params, stats, value_stats, key):
             params=params,
             value_stats=value_stats,
             env_state=jax.vmap(lambda row: script.at(row, 0))(jnp.arange(ROWS)),
+            memory=None,
         )
         normalizers = ppo.make_normalizers(script, config, stats)
         _, rollout, _ = ppo.collect_rollout(script, config, state, normalizers, key)

@@ -12,7 +12,7 @@ from tiny_env import CONFIG, SMALL, TinyEnv
 from dexsim.core.pytree import choose
 from dexsim_ppo.learner import ppo, update
 from dexsim_ppo.learner.distribution import log_prob as gaussian_log_prob
-from dexsim_ppo.learner.loss import loss
+from dexsim_ppo.learner.loss import actor_mean, critic_value, loss
 from dexsim_ppo.learner.ppo import make_train
 from dexsim_ppo.learner.rollout import Decision, collect, scan_restarting
 from dexsim_ppo.learner.update import Learner
@@ -48,8 +48,8 @@ def test_ratio_is_one_before_the_first_gradient(distribution, normalize_value):
         normalizers = ppo.make_normalizers(env, config, state.observation_stats)
         _, rollout, _ = ppo.collect_rollout(env, config, state, normalizers, jax.random.key(4))
         _, params, samples = ppo.prepare(config, state.value_stats, state.params, rollout)
-        mean = ppo.actor_mean(config, params, normalizers, samples.obs)
-        value = ppo.critic_value(config, params, normalizers, samples.obs)
+        mean = actor_mean(config, params, normalizers, samples.obs)
+        value = critic_value(config, params, normalizers, samples.obs)
         _, metrics = loss(params, config, normalizers, samples, params.log_std)
         return samples, mean, value, metrics
 
@@ -157,7 +157,7 @@ def test_next_value_is_that_of_the_true_final_observation():
     _, rollout, metrics = ppo.collect_rollout(env, config, state, normalizers, jax.random.key(1))
     obs = rollout.obs["critic"].at[..., 0].set(7.0).at[..., 2].set(7.0)
     # The target belongs to the episode that ended.
-    expected = ppo.critic_value(config, state.params, normalizers, {"critic": obs})
+    expected = critic_value(config, state.params, normalizers, {"critic": obs})
     np.testing.assert_allclose(rollout.next_value, expected, rtol=1e-4, atol=1e-5)
     assert float(metrics["episodes"]) == config.steps_per_iteration
     assert bool((jnp.abs(rollout.obs["critic"][1:, :, 0]) <= 1).all()), "restarted before the next step"

@@ -16,7 +16,8 @@ from dexsim.core.errors import ConfigError
 from dexsim_ppo.learner.ppo import make_train
 from dexsim_ppo.learner.sharding import make_mesh
 
-CONFIG = dataclasses.replace(SMALL, num_envs=16, iterations_per_call=10)
+# A GRU's memory is split as the environments are; `training/test_devices.py` has a policy without.
+CONFIG = dataclasses.replace(SMALL, num_envs=16, iterations_per_call=10, memory="gru", memory_size=4)
 
 
 def trained(devices):
@@ -26,6 +27,7 @@ def trained(devices):
     for _ in range(2):
         state, _ = training.step(state)
     used = len(state.env_state.x.sharding.device_set)
+    assert state.memory.sharding.device_set == state.env_state.x.sharding.device_set
     state = dataclasses.replace(state, key=jax.random.key_data(state.key))
     state = dataclasses.replace(
         state, env_state=dataclasses.replace(state.env_state, key=jax.random.key_data(state.env_state.key))

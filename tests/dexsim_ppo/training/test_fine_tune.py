@@ -116,6 +116,7 @@ def test_what_does_not_fit_is_refused(policy, tiny_task, tmp_path, monkeypatch, 
         (["--policy", "nothing.msgpack"], "cannot be read"),
         (["--policy", "other.msgpack"], "observations of policy and environment differ"),
         (["--policy", "policy.msgpack", "--ppo.actor-layers", "7"], "do not set --ppo.actor-layers"),
+        (["--policy", "policy.msgpack", "--ppo.memory", "gru"], "do not set --ppo.memory"),
     ):
         assert exit_code(train.main, [*arguments, "--steps", "128"]) == 2
         error = capsys.readouterr().err
