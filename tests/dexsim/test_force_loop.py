@@ -79,6 +79,23 @@ def test_its_limits_hold_whatever_is_measured(force, command, correction, gain, 
     assert abs(after - start) <= slew * PERIOD + 1e-6
 
 
+@pytest.mark.parametrize(
+    ("command", "force", "rest"),
+    [(0.5, 2.1, 0.6), (1.0, 2.1, 0.5), (0.2, 60.0, -0.2), (0.9, 60.0, -0.6), (0.0, 60.0, 0.0)],
+)
+def test_it_rests_at_its_limit_or_at_the_ends_of_what_a_policy_is_shown(command, force, rest):
+    """A grip that cannot follow: the command shown is between 0 and 1.5, the correction 0.6 at most."""
+    loop, correction, steps = ForceLoop(gain=20.0, limit=0.6, slew=2.0), jnp.zeros(()), [0.0]
+    for _ in range(40):
+        correction = correct_command(
+            loop, "finger", SPAN, PERIOD, jnp.asarray(command), correction, fingers(0, force, force, 0, 0)
+        )
+        steps.append(float(correction))
+    assert steps[-1] == pytest.approx(rest, abs=1e-6)
+    if rest:
+        assert abs(steps[1]) == pytest.approx(2.0 * PERIOD, rel=1e-5), "no faster, and as fast as allowed"
+
+
 def test_an_estimate_is_the_larger_of_taxels_and_torque_and_zero_without_touch(hand):
     taxels = np.zeros((5, hand.num_taxels), np.float32)
     taxels[:, 3] = [2.0, 0.5, 0.0, 6.0, 0.05]

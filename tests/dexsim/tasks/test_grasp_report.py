@@ -182,6 +182,22 @@ class TestSummary:
         assert headline["r, force on the taxels"]["value"] == found["r_taxels"]["r"]
         assert headline["r, force on the taxels, worst shape"] == found["by_shape"][2]["r_taxels"]["r"] < 0.5
 
+    def test_the_headline_repeats_the_report(self):
+        found = report.summarize(*evaluation(noise=0.3, lost=range(40, 50)), PERIOD, "finger", SPAN)
+        headline = found["headline"]
+        assert headline["held"]["value"] == found["held"]["mean"] == 0.95
+        assert headline["held at worst command"] == found["by_command"][1]["held"]["mean"] == 0.75
+        assert headline["force error, 0 N where lost (N)"]["value"] == found["force_error_n"]["mean"] > 0.2
+        assert headline["r, resultant force (3 to 6 s)"]["value"] == found["r_resultant"]["r"]
+        assert headline["r, normal force"]["value"] == found["r_normal"]["r"] != found["r_resultant"]["r"]
+        assert headline["force range"] == found["force_range"]
+        assert found["joint_speed_rad_s"]["mean"] == pytest.approx(0.1)
+        assert report.window(4.0) == (2.0, 4.0) and report.window(8.0) == (3.0, 8.0)
+
+    def test_most_of_the_time_is_more_than_half(self):
+        marks = [report.saturates(np.array(shares)) for shares in ([0.6], [0.4, 0.7], [0.5], [1.0, 0.0], [])]
+        assert marks == [True, True, False, False, False]
+
     def test_commands_that_saturate_are_marked(self):
         found = report.summarize(*evaluation(), PERIOD, "finger", SPAN)
         assert [row["torque_limited"]["mean"] for row in found["by_command"]] == [0, 0, 0, 0, 1]

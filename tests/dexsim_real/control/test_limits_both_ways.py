@@ -120,3 +120,22 @@ def test_the_first_reason_for_motors_off_is_the_one_that_is_told(hand):
     bench.safety.relax("the cable")
     bench.safety.relax("a later one")
     assert bench.cycle(wish=MIDDLE).reason == bench.safety.latched == "the cable"
+
+
+@pytest.mark.parametrize(
+    ("measurement", "held"),
+    [
+        ({"force": (13.9,) * 5}, False),  # 69.5 N together
+        ({"force": (14.1,) * 5}, True),
+        ({"force": (14.9, 0, 0, 0, 0)}, False),
+        ({"force": (0, 0, 0, 0, 15.1)}, True),
+        ({"velocity": 9.9}, False),
+        ({"velocity": 10.1}, True),
+        ({"velocity": -10.1}, True),
+    ],
+)
+def test_a_firm_grasp_and_a_fast_joint_go_on_up_to_their_limits(hand, measurement, held):
+    """By the defaults: 15 N a fingertip, 70 N all together, 10 rad/s."""
+    bench = ready(hand)
+    decision = bench.cycle(wish=MIDDLE, **measurement)
+    assert decision.reaction == (Reaction.HOLD if held else Reaction.NONE)
