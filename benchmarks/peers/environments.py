@@ -40,9 +40,10 @@ class Pendulum:
 class ToBrax(Env):
     """A `SimpleEnvironment` behind brax's interface; the time limit is brax's (`episode_length`)."""
 
+    backend, observation_size, action_size = "jax", 0, 0
+
     def __init__(self, env: SimpleEnvironment):
-        self.env, self.backend = env, "jax"
-        self.observation_size, self.action_size = env.observation_size, env.action_size
+        self.env, self.observation_size, self.action_size = env, env.observation_size, env.action_size
 
     def reset(self, rng: jax.Array) -> State:
         key, begin = jax.random.split(rng)
