@@ -145,9 +145,8 @@ def run_training(
         hand=hand,
     )
     env = adapt(made, arguments.task)
-    arguments = dataclasses.replace(
-        arguments, backend=cast(Any, env.backend)
-    )  # so that a resumed run has the same engine
+    if env.backend != "own":  # so that a resumed run has the same engine
+        arguments = dataclasses.replace(arguments, backend=cast(Any, env.backend))
     if isinstance(begun, Policy):
         check_fit(begun, env, arguments.ppo)
     path = resumed.path.parent.parent if resumed else make_run_folder(arguments) if first else Path()

@@ -68,7 +68,7 @@ class AdaptedPlan(NamedTuple):
 class Adapted:
     """A `SimpleEnvironment` as the learner's `Environment`; see `adapt`."""
 
-    backend, evaluation, config = "jax", "series", NoSettings()
+    backend, evaluation, config = "own", "series", NoSettings()
 
     def __init__(self, env: SimpleEnvironment, name: str):
         self.name, self._env = name, env

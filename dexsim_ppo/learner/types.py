@@ -44,7 +44,7 @@ class Environment(Protocol):
 
     @property
     def backend(self) -> str:
-        """The physics backend."""
+        """The physics backend; "own" for an environment from elsewhere."""
         ...
 
     @property

@@ -39,8 +39,7 @@ def update(
     Metrics are means over all minibatches, except the KL divergence: its mean over the last epoch.
     """
     rows = config.rows
-    keys = jax.random.split(key, config.epochs)
-    order = jax.vmap(lambda key: jax.random.permutation(key, rows))(keys)
+    order = draw_order(key, config.epochs, rows)
     order = order.reshape(config.epochs * config.minibatches, rows // config.minibatches)
     old_log_std, moves = learner.params.log_std, actor_learns(config, learner)
 
@@ -50,7 +49,8 @@ def update(
 
     def minibatch(learner, indices):
         indices = split_rows(indices, mesh)
-        batch = split_rows(jax.tree.map(lambda x: x[indices], samples), mesh)
+        batch = jax.tree.map(lambda x: x.at[indices].get(mode="promise_in_bounds"), samples)
+        batch = split_rows(batch, mesh)
         grads, metrics = jax.grad(loss, has_aux=True)(learner.params, config, normalizers, batch, old_log_std)
         learner, norms = apply_gradients(config, learner, grads)
         return learner, metrics | norms
@@ -62,6 +62,19 @@ def update(
     if config.critic_first:  # A policy that does not move says nothing about the rate.
         rate = jnp.where(moves, rate, learner.learning_rate)
     return learner._replace(learning_rate=rate), metrics
+
+
+def draw_order(key: jax.Array, epochs: int, rows: int) -> jax.Array:
+    """The rows of each epoch in random order, int32 [epochs, rows].
+
+    Sorts random numbers whose low bits are the row's: one sort of plain numbers, for which a CPU takes an eighth of
+    the time of `jax.random.permutation`. Rows with equal random bits keep their order, which matters only where such a
+    group meets the edge of a minibatch.
+    """
+    width = (rows - 1).bit_length()
+    number = jax.random.bits(key, (epochs, rows), jnp.uint32) >> width << width
+    ordered = jnp.sort(number | jnp.arange(rows, dtype=jnp.uint32)[None], axis=1)
+    return (ordered & ((1 << width) - 1)).astype(jnp.int32)
 
 
 def apply_gradients(config: PPOConfig, learner: Learner, grads: Params) -> tuple[Learner, Metrics]:
