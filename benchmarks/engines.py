@@ -154,13 +154,13 @@ def run_policies(options: argparse.Namespace) -> None:
     for name in options.policies:
         for backend in options.backends:
             for converged in (False, True):
-                seconds = options.rotate_seconds if name.startswith("rotate") else 0.0
-                row = engine_policies.measure(name, backend, converged, options.episodes, seconds)
+                row = engine_policies.measure(name, backend, converged, options.episodes, options.seconds)
                 show(row)
                 for key in ("held", "r", "successes_per_minute", "kept"):
                     if key in row:
                         low, high = row[f"{key}_ci95"]
-                        cells.append((f"{name}, {key}", way(row), f"{row[key]:.3g} ({low:.3g}–{high:.3g})"))
+                        text = "" if row[key] is None else f"{row[key]:.3g} ({low:.3g}–{high:.3g})"
+                        cells.append((f"{name}, {key}", way(row), text))
     print(table("policy", cells))
 
 
@@ -203,7 +203,7 @@ def main(argv: list[str] | None = None) -> None:
     command.set_defaults(run=run_policies)
     command.add_argument("--policies", nargs="+", default=["grasp", "rotate"])
     command.add_argument("--episodes", type=int, default=64)
-    command.add_argument("--rotate-seconds", type=float, default=30.0, help="length of an episode of rotate")
+    command.add_argument("--seconds", type=float, default=0.0, help="length of an episode; 0 for the task's own")
     command.add_argument("--backends", nargs="+", default=list(BACKENDS), choices=list(BACKENDS))
     options = parser.parse_args(argv)
     enable_caches()
