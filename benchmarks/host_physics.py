@@ -75,13 +75,14 @@ def main() -> None:
         for name, case in cases.items():
             times[name].append(seconds(*case)[0])
     for name, taken in times.items():
-        rate = round(count * substeps / statistics.median(taken))
+        ticks = count / statistics.median(taken)
         common = {
             "threads": workers.threads,
             "num_envs": count,
             "touching": round(float(jnp.mean(state.finger_force > 0)), 3),
         }
-        print(json.dumps({"way": name, "physics_steps_per_s": rate} | common), flush=True)
+        speed = {"physics_steps_per_s": round(ticks * substeps), "env_ticks_per_s": round(ticks)}
+        print(json.dumps({"way": name} | speed | common), flush=True)
 
 
 if __name__ == "__main__":

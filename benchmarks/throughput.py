@@ -3,6 +3,7 @@
     python benchmarks/throughput.py --backends warp jax --num-envs 4096 16384 32768
     python benchmarks/throughput.py --leave-out actuator randomization      # their shares alone
     python benchmarks/throughput.py --task rotate --split                   # where a training step goes
+    python benchmarks/throughput.py --task rotate --train 6 --backends c jax
 
 The first measures the full step of the task (action to observation, restarts included) under random
 actions, and again with parts left out one at a time. All variants begin at the same states, take the
@@ -17,8 +18,9 @@ the median over the rounds of 1 - (time without) / (time of the full step), with
 | redrawing | hands drawn once and kept: the same spread of hands, so the same contacts |
 | randomization | scale 0: one nominal hand, nothing is drawn; contacts may differ a little |
 
-`--train` measures training with the device's preset, all backends in turn, `--split` the parts of a training step
-(see `throughput_split`).
+`--train` measures training with the device's preset and nothing else, all backends in turn; `times_jax` is the median
+over the rounds of the `jax` backend's time over this one's. `--split` measures the parts of a training step (see
+`throughput_split`).
 """
 
 import argparse
@@ -143,7 +145,10 @@ class TapedMotors(Around):
             episode.object, physics, lambda substep, position, velocity: tape[substep], push, episode.hand.cover
         )
         after, gear, force, finite = stay_finite(command.valid, (physics, gear), (after, gear), force)
-        return PhysicsTick(physics=after, finger_force=force, joint_torque=tape[-1], gear=gear, finite=finite)
+        limited = jnp.zeros(tape[-1].shape, bool)  # what the tape does not tell; a metric
+        return PhysicsTick(
+            physics=after, finger_force=force, joint_torque=tape[-1], gear=gear, limited=limited, finite=finite
+        )
 
 
 PARTS = ("touch", "observation", "actuator", "redrawing", "randomization")
@@ -207,7 +212,7 @@ def compare(task: str, backend: str, num_envs: int, parts: tuple[str, ...], step
                 recorder,
                 num_envs,
                 steps,
-                lambda state, action, _, r=recorder: (lambda after, tick: (after, tick[3]))(
+                lambda state, action, _, r=recorder: (lambda after, tick: (after, tick[-1]))(
                     *r.recorded_step(state, action)
                 ),
             )
@@ -257,13 +262,18 @@ def measure(env: Env, num_envs: int, steps: int, repeats: int) -> dict:
     return timing([seconds(run, state, jax.random.key(2), None)[0] for _ in range(repeats)], num_envs * steps, steps)
 
 
+def preset(task: str) -> Any:
+    """Training's preset for the device; of CPUs the one for few cores."""
+    from dexsim_ppo.training.presets import find_preset
+
+    return find_preset("gpu" if jax.default_backend() == "gpu" else "cpu", task)
+
+
 def measure_training(task: str, backends: list[str], num_envs: int, iterations: int, repeats: int) -> list[dict]:
     """Env-steps per second of the device's training preset, learner included and compilation excluded; in turn."""
     from dexsim_ppo.learner.ppo import make_train
-    from dexsim_ppo.training.presets import find_preset
 
-    preset = find_preset("gpu" if jax.default_backend() == "gpu" else "cpu", task)
-    config = dataclasses.replace(preset.ppo, num_envs=num_envs, iterations_per_call=1)
+    config = dataclasses.replace(preset(task).ppo, num_envs=num_envs, iterations_per_call=1)
     runs = {}
     for backend in backends:
         env = dexsim.make(task, backend=backend, num_envs=num_envs)
@@ -280,22 +290,25 @@ def measure_training(task: str, backends: list[str], num_envs: int, iterations: 
                     run[1], metrics = run[0](run[1])
                 jax.block_until_ready(metrics)
                 run[2].append(time.perf_counter() - start)
-    steps = iterations * config.rollout_length
-    return [
-        {"backend": name, "num_envs": num_envs} | timing(times, num_envs * steps, steps) | {"first_calls_s": first}
-        for name, (_, _, times, first) in runs.items()
-    ]
+    steps, rows = iterations * config.rollout_length, []
+    for name, (_, _, times, first) in runs.items():
+        row = {"backend": name, "num_envs": num_envs} | timing(times, num_envs * steps, steps)
+        if name != "jax" and "jax" in runs:
+            ratios = [theirs / mine for mine, theirs in zip(times, runs["jax"][2], strict=True)]
+            row["times_jax"] = round(statistics.median(ratios), 2)
+        rows.append(row | {"first_calls_s": first})
+    return rows
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--task", default="grasp", choices=sorted(TASKS))
     parser.add_argument("--backends", nargs="+", default=["auto"], choices=["auto", "jax", "warp", "c"])
-    parser.add_argument("--num-envs", nargs="+", type=int, default=[256])
+    parser.add_argument("--num-envs", nargs="+", type=int, default=[], help="training's by default")
     parser.add_argument("--leave-out", nargs="*", default=list(PARTS), choices=PARTS)
     parser.add_argument("--steps", type=int, default=16)
     parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--train", type=int, default=0, metavar="ITERATIONS")
+    parser.add_argument("--train", type=int, default=0, metavar="ITERATIONS", help="training, and nothing else")
     parser.add_argument("--split", action="store_true", help="the parts of a training step, and nothing else")
     options = parser.parse_args()
     enable_caches()
@@ -305,8 +318,12 @@ def main() -> None:
     def show(row: dict) -> None:
         print(json.dumps(row | common), flush=True)
 
-    for backend in options.backends:
-        for num_envs in options.num_envs:
+    for num_envs in options.num_envs or [preset(options.task).ppo.num_envs]:
+        if options.train:
+            for row in measure_training(options.task, options.backends, num_envs, options.train, options.repeats):
+                show({"measure": "training"} | row)
+            continue
+        for backend in options.backends:
             if options.split:
                 from throughput_split import split
 
@@ -317,9 +334,6 @@ def main() -> None:
                 options.task, backend, num_envs, tuple(options.leave_out), options.steps, options.repeats
             ):
                 show({"measure": "env"} | row)
-    for num_envs in options.num_envs if options.train else ():
-        for row in measure_training(options.task, options.backends, num_envs, options.train, options.repeats):
-            show({"measure": "training"} | row)
 
 
 if __name__ == "__main__":

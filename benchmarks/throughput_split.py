@@ -145,7 +145,7 @@ def touch(env: Env, ticks: Any, key: jax.Array) -> jax.Array:
     array = TaxelArray(config.sensing.taxel, hand.taxel_grid, hand.num_fingers, config.physics.control_period)
     params, memory = array.sample(jax.random.key(0)), array.init()
 
-    def feel(object, qpos, strength, key):
+    def feel(object, cover, qpos, strength, key):
         pose = forward_kinematics(hand, qpos[seam.joint_qpos])
         taxels, place = taxel_positions(hand, pose), qpos[seam.object_qpos]
         felt = tactile.feel(
@@ -156,15 +156,16 @@ def touch(env: Env, ticks: Any, key: jax.Array) -> jax.Array:
             rotations.quat_to_matrix(place[3:]),
             strength,
             config.skin,
+            cover,
         )
         read = array.apply(params, memory, key, felt.force, jnp.ones((hand.num_fingers, 1)))[1]
         weighting = config.observation.weighting
         return [reduce_touch(force, taxels, weighting) for force in (felt.force, read)]
 
     def tick(key, given):
-        object, _, _, _, qpos, strength = given
+        object, _, _, cover, _, qpos, strength = given
         key, use = jax.random.split(key)
-        return key, _used(jax.vmap(feel)(object, qpos, strength, jax.random.split(use, len(qpos))))
+        return key, _used(jax.vmap(feel)(object, cover, qpos, strength, jax.random.split(use, len(qpos))))
 
     return jax.lax.scan(tick, key, ticks)[1]
 

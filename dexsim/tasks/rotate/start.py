@@ -80,8 +80,9 @@ def _fingerprint(key: jax.Array, hand: Hand, config: Any) -> str:
         "push_speed",
     ):
         settings.pop(name, None)
-    digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode())
-    digest.update(hand.model_path.read_bytes())
+    motors = config.randomization.stiffness, config.randomization.damping  # objects settle under these
+    digest = hashlib.sha256(json.dumps([settings, motors], sort_keys=True).encode())
+    digest.update(hand.model_path.read_bytes() + hand.digest.encode())
     digest.update(np.asarray(jax.random.key_data(key)).tobytes())
     digest.update(f"{_VERSION} {mujoco.__version__}".encode())
     if config.object == "mesh":

@@ -395,6 +395,23 @@ class TestPool:
         same = dataclasses.replace(config, reward=RotateReward(bonus=1.0), episode_seconds=5.0)
         assert _fingerprint(key, hand, same) in names
 
+    def test_motors_are_part_of_a_pool_and_ranges_about_them_are_not(self, hand):
+        """Objects settle under the nominal stiffness and damping: a pool from disk must have been made with them."""
+        key, config = jax.random.key(0), RotateConfig()
+
+        def named(**changes):
+            ranges = dataclasses.replace(config.randomization, **changes)
+            return _fingerprint(key, hand, dataclasses.replace(config, randomization=ranges))
+
+        names = {named(), named(stiffness=6.0), named(damping=0.3)}
+        assert len(names) == 3
+        assert named(stiffness_factor=(0.5, 2.0), scale=0.5) in names
+
+    def test_the_same_mjcf_under_another_toml_is_another_pool(self, hand):
+        key, config = jax.random.key(0), RotateConfig()
+        other = dataclasses.replace(hand, digest="another")
+        assert _fingerprint(key, other, config) != _fingerprint(key, hand, config)
+
     def test_no_start_state_is_one_clear_line(self, hand, monkeypatch, tmp_path):
         monkeypatch.setenv("DEXSIM_CACHE", str(tmp_path))
         config = RotateConfig(tilt=1.2, reference=(0.3, 0.0, 0.3), support="fingers", pool_size=4)

@@ -1,0 +1,256 @@
+"""Motions of objects on each engine against C MuJoCo in double precision, for `engines.py motions`.
+
+| motion | begins | gravity |
+|---|---|---|
+| grip | with fingers that hold the object still | out of the hand |
+| slide | on the palm at 0.5 m/s, without spin | onto the palm |
+| roll | on the palm at 0.2 m/s, with the spin of rolling | onto the palm |
+| drop | over the palm, between half-closed fingers | onto the palm |
+
+Joints follow targets that do not change, and skin has one stiffness. The reference steps one model a row with
+`mujoco.mj_step`, from the same numbers. "nudged" is the reference again, from a place 1 micrometre away along each
+axis: it shows how far a motion itself spreads what rounding begins.
+"""
+
+import copy
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+import dexsim
+from dexsim.core.compilation import jit
+from dexsim.core.pytree import pytree_dataclass
+from dexsim.env.env import Env
+from dexsim.hand.kinematics import flexion_joints
+from dexsim.objects.params import ObjectParams, extent
+from dexsim.physics.physics import Physics
+from dexsim.physics.seam import PhysicsState
+from dexsim.registry import TASKS
+from dexsim.tasks.placement import palm_height
+
+MOTIONS = ("grip", "slide", "roll", "drop")
+CONVERGED = {"iterations": 50, "line_search": 50}
+STIFFNESS, DAMPING, REACH = 3.0, 0.1, 0.3  # Nm/rad, Nm s/rad, rad
+TOUCHING = 0.01  # N
+NUDGE = 1e-6  # m
+CLOSING, TRIES = 100, 6  # sub-steps in which fingers close for a grip, and attempts with one object
+
+
+@pytree_dataclass
+class Begin:
+    """Where motions begin, [B, ...] each."""
+
+    object: ObjectParams
+    state: PhysicsState
+    target: jax.Array  # [J] rad, of the joints
+    push: jax.Array  # [3] N on the object: what turns the scene's gravity into the motion's
+
+
+@dataclasses.dataclass
+class Trace:
+    """What a motion was, [T, B, ...] each, at the end of every control tick."""
+
+    place: np.ndarray  # [3] m
+    quat: np.ndarray  # [4]
+    force: np.ndarray  # [F + 1, 3] N: on each finger at that moment, and on the object by the hand, mean of the tick
+
+
+class Bench:
+    """Motions of one task's objects.
+
+    Args:
+      task: its name.
+      starts: of each motion and shape.
+      seconds: that motions last.
+    """
+
+    def __init__(self, task: str, starts: int, seconds: float):
+        shapes = len(TASKS[task].config().objects.shapes)
+        config = dataclasses.replace(TASKS[task].config(), pool_size=max(2 * shapes * starts, 16))
+        self.env: Env = dexsim.make(task, config, backend="c")
+        self.task, self.ticks = task, max(round(seconds / self.env.control_period), 1)
+        self.exact = self.physics("c", CONVERGED)
+        pool, names = self.env.pool, self.env.task.shape_names
+        index = np.asarray(pool.object.shape_index)
+        self.cases, begins = list[tuple[str, str]](), list[Begin]()
+        for motion in MOTIONS:
+            for shape in np.unique(index):
+                rows = np.flatnonzero(index == shape)
+                for row in rows if motion == "grip" else rows[:starts]:
+                    begin = self._begin(motion, jax.tree.map(lambda x, r=row: np.asarray(x)[r], pool))
+                    if begin is not None and self.cases.count((motion, names[shape])) < starts:
+                        self.cases.append((motion, names[shape]))
+                        begins.append(begin)
+        self.begin: Begin = jax.tree.map(lambda *rows: jnp.stack([jnp.asarray(x, x.dtype) for x in rows]), *begins)
+
+    def physics(self, backend: str, changes: dict[str, int]) -> Physics:
+        """The scene on an engine, with these solver iterations."""
+        config, task = dataclasses.replace(self.env.config.physics, **changes), self.env.task
+        return Physics(
+            self.env.hand,
+            task.slots,
+            task.largest,
+            config,
+            gravity=task.gravity,
+            backend=backend,
+            num_envs=len(getattr(self, "cases", ())),
+        )
+
+    def _begin(self, motion: str, start: Any) -> Begin | None:
+        """A motion from a start state of the task; None for a grip that does not hold."""
+        scene, hand = self.exact.scene, self.env.hand
+        object = dataclasses.replace(start.object, com=np.zeros(3, np.float32))
+        qpos, qvel = np.array(start.qpos, np.float64), np.zeros(scene.model.nv)
+        target, place = qpos[scene.joint_qpos].copy(), scene.object_qpos[:3]
+        gravity = np.array([9.81 if motion == "grip" else -9.81, 0.0, 0.0])
+        push = np.float32(object.mass * (gravity - np.asarray(self.env.task.gravity)))
+        if motion == "drop":
+            qpos[place[0]] += 0.01
+        if motion in ("slide", "roll"):
+            target = np.clip(0.0, hand.joint_lower, hand.joint_upper)
+            qpos[scene.joint_qpos] = target
+            down = np.float32([-1.0, 0.0, 0.0])
+            height = float(extent(object.size, object.position, object.active, down, object.kinds, object.quat))
+            # Where palms are half-spaces nothing else of the hand is near; boxes have the palm's middle.
+            beside = (0.0, -0.5) if len(scene.slots) > 1 else (0.0, 0.085)
+            qpos[scene.object_qpos] = palm_height(hand) + height, *beside, 1, 0, 0, 0
+            speed = 0.5 if motion == "slide" else 0.2
+            qvel[scene.object_dof] = 0, speed, 0, 0, 0, 0 if motion == "slide" else speed / height
+        begin = Begin(object, PhysicsState(qpos, qvel, np.zeros(scene.model.nv)), target, push)
+        if motion == "grip":
+            tries = (self._closed(begin, np.random.default_rng(seed)) for seed in range(TRIES))
+            begin = next((found for found in tries if found), None)
+            if begin is None:
+                return None
+        single = jax.tree.map(np.float32, (begin.state, begin.target))
+        return dataclasses.replace(begin, state=single[0], target=single[1])
+
+    def _closed(self, begin: Begin, rng: np.random.Generator) -> Begin | None:
+        """Fingers closed round the object, which weighs nothing until they are; None if they do not hold it."""
+        hand, scene = self.env.hand, self.exact.scene
+        free = -begin.object.mass * np.asarray(self.env.task.gravity)
+        target = np.array(begin.target)
+        for fingers, most in ((range(1), 0.5), (range(1, hand.num_fingers), 0.8)):
+            joints = flexion_joints(hand, fingers)
+            target[joints] += rng.uniform(0.3, most, len(joints))
+        begin = dataclasses.replace(begin, target=np.clip(target, hand.joint_lower, hand.joint_upper))
+        model = self.model(begin)
+        data = self._run(dataclasses.replace(begin, push=free), model, CLOSING)
+        data = self._run(begin, model, CLOSING // 2, data)
+        touching = np.linalg.norm(self._finger_force(model, data), axis=-1) > 0.3
+        if touching.sum() < 2 or np.linalg.norm(data.qvel[scene.object_dof[:3]]) > 0.03:
+            return None
+        state = PhysicsState(data.qpos.copy(), data.qvel.copy(), data.qacc_warmstart.copy())
+        return dataclasses.replace(begin, state=state)
+
+    # --- the reference --------------------------------------------------------------------------
+
+    def model(self, begin: Begin) -> mujoco.MjModel:
+        """C MuJoCo's model of one row."""
+        scene, model = self.exact.scene, copy.copy(self.exact.scene.model)
+        model.opt.tolerance = 1e-12
+        for name, values in self.exact.configure(begin.object).items():
+            getattr(model, name)[:] = values
+        model.body_subtreemass[scene.object_body] = begin.object.mass
+        return model
+
+    def _run(self, begin: Begin, model: mujoco.MjModel, count: int, data: mujoco.MjData | None = None):
+        """`count` sub-steps of C MuJoCo."""
+        scene = self.exact.scene
+        if data is None:
+            data = mujoco.MjData(model)
+            data.qpos[:], data.qvel[:] = begin.state.qpos, begin.state.qvel
+            data.qacc_warmstart[:] = begin.state.warmstart
+        data.xfrc_applied[scene.object_body, :3] = begin.push
+        for _ in range(count):
+            position, velocity = data.qpos[scene.joint_qpos], data.qvel[scene.joint_dof]
+            reach = np.clip(begin.target - position, -REACH, REACH)
+            limit = self.env.hand.torque_limit
+            data.qfrc_applied[scene.joint_dof] = np.clip(STIFFNESS * reach - DAMPING * velocity, -limit, limit)
+            mujoco.mj_step(model, data)
+        return data
+
+    def reference(self, nudge: float = 0.0) -> Trace:
+        """All motions by `mujoco` alone."""
+        traces = []
+        for row in range(len(self.cases)):
+            begin = jax.tree.map(lambda x, r=row: np.asarray(x)[r], self.begin)
+            qpos = np.array(begin.state.qpos, np.float64)
+            qpos[self.exact.object_qpos[:3]] += nudge
+            begin = dataclasses.replace(begin, state=dataclasses.replace(begin.state, qpos=qpos))
+            model, data, ticks = self.model(begin), None, []
+            for _ in range(self.ticks):
+                data = self._run(begin, model, self.env.config.physics.substeps, data)
+                ticks.append((data.qpos.copy(), data.qvel.copy(), self._finger_force(model, data)))
+            traces.append([np.stack(x) for x in zip(*ticks, strict=True)])
+        return self._trace(*(np.stack(x, 1) for x in zip(*traces, strict=True)))
+
+    def _finger_force(self, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+        """Force of the object on each finger [F, 3] N: a sum over `mj_contactForce`."""
+        scene, wrench = self.exact.scene, np.zeros(6)
+        total, tips = np.zeros((len(scene.tip_bodies), 3)), scene.tip_bodies.tolist()
+        for index, contact in enumerate(data.contact):
+            first, second = (int(model.geom_bodyid[geom]) for geom in contact.geom)
+            if scene.object_body in (first, second):
+                mujoco.mj_contactForce(model, data, index, wrench)
+                force = contact.frame.reshape(3, 3).T @ wrench[:3]  # of the first on the second
+                for body, sign in ((second, 1.0), (first, -1.0)):
+                    if body in tips:
+                        total[tips.index(body)] += sign * force
+        return total
+
+    # --- the engines ----------------------------------------------------------------------------
+
+    def run(self, backend: str, changes: dict[str, int]) -> Trace:
+        """All motions on an engine."""
+        physics, limit = self.physics(backend, changes), jnp.asarray(self.env.hand.torque_limit)
+
+        def tick(begin: Begin) -> tuple[PhysicsState, jax.Array]:
+            def motors(substep: jax.Array, position: jax.Array, velocity: jax.Array) -> jax.Array:
+                reach = jnp.clip(begin.target - position, -REACH, REACH)
+                return jnp.clip(STIFFNESS * reach - DAMPING * velocity, -limit, limit)
+
+            return physics.advance(begin.object, begin.state, motors, begin.push)
+
+        def all_ticks(begin: Begin):
+            def body(state: PhysicsState, _: None):
+                after, force = jax.vmap(tick)(dataclasses.replace(begin, state=state))
+                return after, (after.qpos, after.qvel, force)
+
+            return jax.lax.scan(body, begin.state, length=self.ticks)[1]
+
+        found = jit(all_ticks, backend=backend)(self.begin)
+        return self._trace(*(np.asarray(x, np.float64) for x in found))
+
+    def _trace(self, qpos: np.ndarray, qvel: np.ndarray, finger_force: np.ndarray) -> Trace:
+        physics, begin = self.exact, self.begin
+        velocity = np.concatenate([np.asarray(begin.state.qvel)[None], qvel])[..., physics.object_dof[:3]]
+        acceleration = np.diff(velocity, axis=0) / self.env.control_period - np.asarray(self.env.task.gravity)
+        on_object = np.asarray(begin.object.mass)[:, None] * acceleration - np.asarray(begin.push)
+        place, quat = np.split(qpos[..., physics.object_qpos], [3], -1)
+        return Trace(place, quat, np.concatenate([finger_force, on_object[:, :, None]], 2))
+
+    def compare(self, found: Trace, wanted: Trace) -> list[dict[str, Any]]:
+        """A row for each motion and shape: how far an engine's motions are from others."""
+        place = 1e3 * np.linalg.norm(found.place - wanted.place, axis=-1)
+        chord = np.minimum(*(np.linalg.norm(found.quat - sign * wanted.quat, axis=-1) for sign in (1, -1)))
+        turn = np.degrees(4 * np.arcsin(np.minimum(chord / 2, 1)))
+        force, strength = np.linalg.norm(found.force - wanted.force, axis=-1), np.linalg.norm(wanted.force, axis=-1)
+        touching, rows = np.maximum(strength, np.linalg.norm(found.force, axis=-1)) > TOUCHING, []
+        for motion, shape in dict.fromkeys(self.cases):
+            mine = [case == (motion, shape) for case in self.cases]
+            row: dict[str, Any] = {"task": self.task, "motion": motion, "shape": shape, "n": sum(mine)}
+            touched = touching[:, mine]
+            row["force_n"] = float(strength[:, mine][touched].mean())
+            for name, values in (
+                ("place_mm", place[:, mine]),
+                ("turn_deg", turn[:, mine]),
+                ("force_error_n", force[:, mine][touched]),
+            ):
+                row |= {f"{name}_p95": float(np.percentile(values, 95)), f"{name}_max": float(values.max())}
+            rows.append(row)
+        return rows

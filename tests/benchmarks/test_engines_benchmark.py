@@ -1,0 +1,96 @@
+"""`benchmarks/engines.py`, motions and policies, in a small form; the fit of `benchmarks/scaling.py`."""
+
+import importlib.util
+import json
+import sys
+
+import jax
+import numpy as np
+import pytest
+from paths import ROOT
+
+from dexsim.objects.config import ObjectConfig
+from dexsim.registry import TASKS, TaskEntry
+from dexsim.tasks.grasp.config import GraspConfig
+from dexsim.tasks.grasp.task import Grasp
+
+
+@pytest.fixture(scope="module")
+def benchmarks():
+    """The modules by name, as they import each other."""
+    found = {}
+    for name in ("throughput", "engine_motions", "engine_policies", "engines", "scaling"):
+        spec = importlib.util.spec_from_file_location(name, ROOT / "benchmarks" / f"{name}.py")
+        found[name] = sys.modules[name] = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(found[name])
+    return found
+
+
+@pytest.fixture(scope="module")
+def bench(benchmarks):
+    config = GraspConfig(objects=ObjectConfig(shapes=("sphere",)))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(TASKS, "grasp", TaskEntry(GraspConfig, Grasp, lambda: config))
+        return benchmarks["engine_motions"].Bench("grasp", starts=1, seconds=0.18)
+
+
+@pytest.fixture(scope="module")
+def wanted(bench):
+    return bench.reference()
+
+
+@pytest.mark.parametrize("backend", ["c", pytest.param("warp", marks=pytest.mark.slow)])
+def test_an_engine_moves_as_c_mujoco_does(benchmarks, bench, wanted, backend):
+    pytest.importorskip("warp" if backend == "warp" else "mujoco")
+    rows = bench.compare(bench.run(backend, benchmarks["engine_motions"].CONVERGED), wanted)
+    assert [(row["motion"], row["shape"]) for row in rows] == [(m, "sphere") for m in ("grip", "slide", "roll", "drop")]
+    for row in rows:
+        assert row["force_n"] > 0.1, row
+        assert row["place_mm_max"] < 0.01 and row["turn_deg_max"] < 0.05 and row["force_error_n_max"] < 0.05, row
+
+
+def test_the_reference_is_physics(bench, wanted):
+    """A sphere that rolls keeps rolling; one that slides keeps its moment about the palm until it rolls."""
+    speeds = np.diff(wanted.place[..., 1], axis=0) / bench.env.control_period
+    cases = [motion for motion, _ in bench.cases]
+    np.testing.assert_allclose(speeds[:, cases.index("roll")], 0.2, rtol=0.02)
+    row = cases.index("slide")
+    object = jax.tree.map(lambda x: np.asarray(x)[row], bench.begin.object)
+    radius, mass, inertia = object.size[1, 0], object.mass, object.inertia[2]
+    assert speeds[-1, row] == pytest.approx(0.5 / (1 + inertia / (mass * radius**2)), rel=0.03)
+    assert wanted.force[-1, row, -1, 0] == pytest.approx(9.81 * mass, rel=0.1)
+
+
+def test_differences_are_found(bench, wanted, benchmarks):
+    """Of places in mm, of turns in degrees, of forces where something touches."""
+    trace = benchmarks["engine_motions"].Trace
+    upright, over = (np.broadcast_to(np.eye(4)[axis], wanted.quat.shape) for axis in (0, 3))
+    shifted = trace(wanted.place + [0.003, 0, 0.004], upright, wanted.force + 0.5)
+    turned = trace(wanted.place, over, wanted.force)
+    (row, *_) = bench.compare(shifted, wanted)
+    assert row["place_mm_max"] == pytest.approx(5.0) and row["force_error_n_p95"] == pytest.approx(0.5 * 3**0.5)
+    (row, *_) = bench.compare(turned, shifted)
+    assert row["turn_deg_max"] == pytest.approx(180.0)
+
+
+def test_policies_are_measured_with_intervals(benchmarks, capsys):
+    """One short evaluation on an engine; the table has a row for each figure."""
+    engines = benchmarks["engines"]
+    options = ["policies", "--policies", "grasp", "--backends", "c", "--episodes", "5", "--seconds", "0.3"]
+    engines.main(options)
+    *lines, title, _, held, r = [line for line in capsys.readouterr().out.splitlines() if line]
+    rows = [json.loads(line) for line in lines]
+    assert [row["converged"] for row in rows] == [False, True]
+    assert all(row["episodes"] == 5 and row["seconds"] == pytest.approx(0.3) and not row["non_finite"] for row in rows)
+    assert all(low <= row["held"] <= high for row in rows for low, high in [row["held_ci95"]])
+    assert (
+        title == "| policy | c | c, converged |" and held.startswith("| grasp, held |") and r.startswith("| grasp, r |")
+    )
+
+
+def test_more_cores_by_amdahl(benchmarks):
+    """Times that follow the model give its parts back; a serial part is never negative."""
+    fit = benchmarks["scaling"].fit
+    assert fit({1: 130.0, 2: 80.0}) == pytest.approx((30.0, 100.0))
+    assert fit({1: 130.0, 2: 80.0, 4: 55.0}) == pytest.approx((30.0, 100.0))
+    assert fit({1: 100.0, 2: 40.0})[0] == pytest.approx(0.0)
