@@ -34,10 +34,10 @@ class GraspReward:
     """Width of the wide Gaussian, which gives a gradient far from the target."""
     tail: float = setting(0.4, unit="1", low=0.0, high=1.0)
     """Share of the wide Gaussian in the reward."""
-    overload: float = setting(0.0, unit="1", low=-1000.0, high=0.0)
+    overload: float = setting(-0.5, unit="1", low=-1000.0, high=0.0)
     """Weight of the four fingers' force beyond `margin` above their target, divided by `max_force`. The Gaussians are
     flat there: a finger that carries an object nearly alone gains nothing by relaxing a little."""
-    margin: float = setting(1.5, unit="N", low=0.0, high=100.0)
+    margin: float = setting(1.0, unit="N", low=0.0, high=100.0)
     """Force above the target that `overload` does not count."""
     thumb: str = setting("loose", choices=("loose", "track", "binary"))
     """Force term of the thumb, which opposes all other fingers and needs more force than each of them. loose: the wide
@@ -51,8 +51,9 @@ class GraspReward:
 class GraspConfig(EnvConfig):
     """The grasp task."""
 
-    control: Control = setting(Control(force=ForceLoop(gain=0.5, limit=1.5)))
-    """From action to joint target. The force loop is for use: training goes without."""
+    control: Control = setting(Control(reach=0.33, force=ForceLoop(gain=0.5, limit=1.5)))
+    """From action to joint target. The reach keeps the thumb's joints below their torque limit, where force could not
+    follow a command. The force loop is for use: training goes without."""
     episode_seconds: float = setting(6.0, unit="s", low=0.2, high=3600.0)
     """Training episode length. Force is scored from 3 s on, so it must be longer than that."""
     evaluation_seconds: float = setting(8.0, unit="s", low=0.2, high=3600.0)
@@ -60,9 +61,9 @@ class GraspConfig(EnvConfig):
     force_command: str = setting("finger", choices=FORCE_COMMANDS)
     """What the command speaks of. finger: the force of each touching finger but the thumb (the paper); squeeze: the sum
     over these fingers."""
-    finger_force: tuple[float, float] = setting((2.0, 7.0), unit="N", low=0.05, high=40.0)
-    """Target of what `force_command` names, at command 0 and 1."""
-    max_force: float = setting(10.0, unit="N", low=0.5, high=200.0)
+    finger_force: tuple[float, float] = setting((1.2, 4.8), unit="N", low=0.05, high=40.0)
+    """Target of what `force_command` names, at command 0 and 1: what the thumb can oppose with four fingers."""
+    max_force: float = setting(6.9, unit="N", low=0.5, high=200.0)
     """Force that forces are normalised by."""
     force_per_torque: float = setting(19.0, unit="N/Nm", low=1.0, high=200.0)
     """Finger force per root-joint torque; ties the torque target to the force target."""
