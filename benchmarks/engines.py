@@ -34,18 +34,19 @@ from dexsim.env.motors import JointCommand
 from dexsim.env.state import State
 from dexsim.objects.config import SHAPES
 from dexsim.physics.physics import BACKENDS, Physics
-from dexsim_ppo import load_policy
+from dexsim_ppo import Policy, load_policy
 
 WAYS = {"closed": ("jax", "closed"), "mjx": ("jax", "mjx"), "c": ("c", "closed")}
 TOUCHING = 0.01  # N
 
 
-def grips(env: Env, act, count: int, ticks: list[int]) -> State:
+def grips(env: Env, policy: Policy, count: int, ticks: list[int]) -> State:
     """States [count times len(ticks)] of grips that are as old as `ticks`."""
     state = jit(jax.vmap(env.reset), backend="c")(jax.random.split(jax.random.key(0), count))
-    step, found = jit(jax.vmap(env.step), backend="c"), []
+    step, memory, found = jit(jax.vmap(env.step), backend="c"), policy.begin(count), []
     for tick in range(max(ticks)):
-        state = step(state, act(state.obs["actor"]))
+        memory, action = policy.act(memory, state.obs["actor"])
+        state = step(state, action)
         if tick + 1 in ticks:
             found.append(state)
     return jax.tree.map(lambda *parts: jnp.concatenate(parts), *found)

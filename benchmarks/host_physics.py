@@ -35,9 +35,10 @@ def main() -> None:
     policy, count = load_policy(options.task), options.num_envs
     env = policy.make_env(backend="c", num_envs=count)
     state = jit(jax.vmap(env.reset), backend="c")(jax.random.split(jax.random.key(0), count))
-    advance = jit(lambda state: jax.vmap(env.step)(state, policy(state.obs["actor"])), backend="c")
+    advance, memory = jit(jax.vmap(env.step), backend="c"), policy.begin(count)
     for _ in range(options.ticks):
-        state = advance(state)
+        memory, action = policy.act(memory, state.obs["actor"])
+        state = advance(state, action)
 
     def hold(s):
         return JointCommand(

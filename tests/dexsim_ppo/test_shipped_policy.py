@@ -39,13 +39,14 @@ def test_it_fits_the_task_and_the_hand(hand, name):
     fields = layout(hand, names, config.observation)
     assert layout_to_list(policy.observation_layout) == layout_to_list(fields)
     assert sum(field.size for field in fields) == size
-    action = np.asarray(policy(jnp.zeros(size)))
+    action = np.asarray(policy.act(policy.begin(), jnp.zeros(size))[1])
     assert action.shape == (hand.num_joints,) and np.all(np.abs(action) <= 1.0)
     assert policy.control_rate == pytest.approx(1 / config.physics.control_period)
 
 
 def test_the_command_is_heard():
-    low, high = (np.asarray(load("grasp")(jnp.zeros(66).at[-1].set(c))) for c in (0.0, 1.0))
+    policy = load("grasp")
+    low, high = (np.asarray(policy.act(policy.begin(), jnp.zeros(66).at[-1].set(c))[1]) for c in (0.0, 1.0))
     assert np.max(np.abs(high - low)) > 1e-3
 
 
@@ -121,9 +122,12 @@ def player(env):
     step = jax.jit(jax.vmap(env.step))
 
     def play(states, seconds, policy=None):
-        history = []
+        history, action = [], jnp.zeros((WORLDS, 12))
+        memory = policy and policy.begin(WORLDS)
         for _ in range(round(seconds / env.control_period)):
-            states = step(states, jnp.zeros((WORLDS, 12)) if policy is None else policy(states.obs["actor"]))
+            if policy is not None:
+                memory, action = policy.act(memory, states.obs["actor"])
+            states = step(states, action)
             history.append(jax.device_get((states.terminated, states.finger_force, states.metrics)))
         return jax.tree.map(lambda *ticks: np.stack(ticks), *history)
 

@@ -314,12 +314,13 @@ def test_the_shipped_policy_holds_as_much_as_on_the_jax_backend():
     for backend in ("jax", "c"):
         env = policy.make_env(num_envs=64, backend=backend)
 
-        def body(state, _, env=env):
-            after = jax.vmap(env.step)(state, policy(state.obs["actor"]))
-            return after, (after.terminated, after.finger_force)
+        def body(carry, _, env=env):
+            memory, action = policy.act(carry[1], carry[0].obs["actor"])
+            after = jax.vmap(env.step)(carry[0], action)
+            return (after, memory), (after.terminated, after.finger_force)
 
         begun = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(5), 64))
-        _, (lost, pressed) = jit(lambda state, body=body: jax.lax.scan(body, state, length=200))(begun)
+        _, (lost, pressed) = jit(lambda carry, body=body: jax.lax.scan(body, carry, length=200))((begun, policy.begin(64)))
         kept = ~np.asarray(lost).any(0)
         held[backend], force[backend] = kept.mean(), np.asarray(pressed)[100:].sum(-1)[:, kept].mean()
     assert held["jax"] > 0.8
