@@ -79,7 +79,7 @@ def test_what_it_knows_survives_and_grows(policy):
     first = score(state)
     assert first > score(training.init(jax.random.key(1))) + 3
     scores = []
-    for iteration in range(30):
+    for iteration in range(45):
         state, _ = training.step(state)
         if iteration % 5 == 4:
             scores.append(score(state))
