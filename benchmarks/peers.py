@@ -11,7 +11,7 @@ does not count. Figures are medians over seeds, with the range in brackets.
 
 | column | content |
 |---|---|
-| compile | the first chunk less the median of the others: tracing, compilation, first states |
+| compile | tracing, compilation, first states: the first two chunks, less two others |
 | first update | from the start to the end of the first iteration |
 | steps/s | environment steps a second of the median chunk |
 | return | of the last chunk's policy |
@@ -48,11 +48,12 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
         "--environments", nargs="*", default=["pendulum", "hopper", "grasp"], help="pendulum, grasp or brax's names"
     )
     parser.add_argument("--brax-backend", default="spring", help="of brax's environments")
+    parser.add_argument("--learners", nargs="+", default=list(LEARNERS), choices=list(LEARNERS))
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--num-envs", type=int, default=256)
     parser.add_argument("--rollout-length", type=int, default=16)
     parser.add_argument("--layers", nargs="+", type=int, default=[128, 128])
-    parser.add_argument("--chunks", type=int, default=6, help="turns of each learner, at least 2")
+    parser.add_argument("--chunks", type=int, default=8, help="turns of each learner, at least 3")
     parser.add_argument("--iterations", nargs="+", type=int, default=[20, 20, 5], help="in a turn, an environment each")
     parser.add_argument("--episodes", type=int, default=64, help="of an evaluation")
     parser.add_argument("--engines", nargs="*", default=list(physics.WAYS), choices=list(physics.WAYS))
@@ -63,8 +64,8 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
         options.iterations *= len(options.environments)
     if len(options.iterations) < len(options.environments):
         parser.error("--iterations: one number, or one for each environment")
-    if options.chunks < 2:
-        parser.error("--chunks: at least 2, since the first one is compilation besides")
+    if options.chunks < 3:
+        parser.error("--chunks: at least 3, since the first two are compilation besides")
     return options
 
 
@@ -81,10 +82,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     report: dict[str, Any] = {"learners": {}, "engines": {}, "options": vars(options)} | cli.environment_report()
     for name, iterations in zip(options.environments, options.iterations, strict=False):
-        rows: dict[str, list[dict]] = {learner: [] for learner in LEARNERS}
+        rows: dict[str, list[dict]] = {learner: [] for learner in options.learners}
         for seed in options.seeds:
             contest = make(name, options.brax_backend, options.num_envs)
-            for learner, row in contend(contest, config, seed, options.chunks, iterations, options.episodes).items():
+            for learner, row in contend(
+                options.learners, contest, config, seed, options.chunks, iterations, options.episodes
+            ).items():
                 rows[learner].append(row)
                 print(json.dumps(cli.plain({"environment": name, "learner": learner, "seed": seed} | row)), flush=True)
         report["learners"][name] = {learner: summary(found) for learner, found in rows.items()}

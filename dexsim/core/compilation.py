@@ -9,8 +9,10 @@ from typing import Any
 
 import jax
 
-# LLVM optimises less, and XLA's older emitters produce less code per fusion: faster to compile, as fast to run.
-LIGHT = (("xla_backend_optimization_level", 1), ("xla_cpu_use_fusion_emitters", False))
+# LLVM optimises less, and XLA's older emitters produce less code per fusion: faster to compile. Physics run as fast,
+# networks take nearly twice as long with the older emitters.
+EMITTERS = "xla_cpu_use_fusion_emitters"
+LIGHT = (("xla_backend_optimization_level", 1), (EMITTERS, False))
 
 _on_gpu: dict[str, Any] = {}  # compiler options, set by `make_deterministic`
 
@@ -25,15 +27,18 @@ def jit(function: Callable, *, backend: str = "jax", once: bool = False, **optio
 
     A physics step in JAX is one very large program. On two cores this halves its compilation time for a few
     per cent of speed; otherwise a short training run would be mostly compilation. Programs that leave the physics to
-    the host, or have an environment from elsewhere, are smaller, take as long to compile either way, and run a quarter
-    to a half faster when fully optimised.
+    the host are smaller, take as long to compile either way, and run a quarter faster when fully optimised. With an
+    environment from elsewhere the learner may be most of it, so only LLVM optimises less there.
 
     Args:
       backend: of the physics in it; "own" for an environment from elsewhere.
       once: the program runs only once, so that optimising it does not pay off.
     """
-    if jax.default_backend() == "cpu" and (once or backend not in ("c", "own")):
-        options["compiler_options"] = _light() | ({"xla_backend_optimization_level": 0} if once else {})
+    if jax.default_backend() == "cpu" and (once or backend != "c"):
+        light = _light() | ({"xla_backend_optimization_level": 0} if once else {})
+        if backend == "own":
+            light.pop(EMITTERS, None)
+        options["compiler_options"] = light
     elif _on_gpu:
         options["compiler_options"] = dict(_on_gpu)
     return jax.jit(function, **options)

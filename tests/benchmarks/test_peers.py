@@ -98,19 +98,21 @@ def test_learners_take_turns():
     assert seen == list("ababbb")
 
 
-def test_a_small_run_writes_what_it_shows(tmp_path, capsys, monkeypatch):
+@pytest.mark.parametrize("learners", [["ours"], pytest.param(["ours", "brax"], marks=pytest.mark.long)])
+def test_a_small_run_writes_what_it_shows(learners, tmp_path, capsys, monkeypatch):
     import runpy
 
     path = tmp_path / "peers.json"
-    given = "--environments pendulum --seeds 0 --num-envs 8 --rollout-length 4 --layers 8 --chunks 2 --iterations 2"
+    given = "--environments pendulum --seeds 0 --num-envs 8 --rollout-length 4 --layers 8 --chunks 3 --iterations 2"
     monkeypatch.setattr(sys, "argv", ["peers.py", *given.split(), "--episodes", "2", "--repeats", "0"])
     main = runpy.run_path(str(ROOT / "benchmarks" / "peers.py"))["main"]
-    assert main([*sys.argv[1:], "--output", str(path)]) == 0
+    assert main([*sys.argv[1:], "--learners", *learners, "--output", str(path)]) == 0
     out = capsys.readouterr().out
     found = json.loads(path.read_text())["learners"]["pendulum"]
-    for learner in ("ours", "brax"):
+    assert list(found) == learners
+    for learner in learners:
         assert learner in out
         (rate,), (compiled,), (walls,) = (found[learner][name] for name in ("steps_per_s", "compile_s", "wall_s"))
-        assert rate > 0 and len(walls) == 2 and walls[0] < walls[1]
-        assert rate == pytest.approx(2 * 8 * 4 / (walls[1] - walls[0])) and compiled < walls[0]
+        assert rate > 0 and len(walls) == 3 and walls[0] < walls[1] < walls[2]
+        assert rate == pytest.approx(2 * 8 * 4 / (walls[2] - walls[1])) and compiled < walls[1]
         assert all(-200 * 17 < value < 0 for value in found[learner]["returns"][0])

@@ -13,10 +13,18 @@ from dexsim.core.errors import ConfigError
 from dexsim_ppo.learner import adam, distribution, running_stats
 from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.gae import compute_gae, explained_variance
-from dexsim_ppo.learner.networks import apply_mlp, init_mlp, rescale_output
+from dexsim_ppo.learner.networks import apply_mlp, elu, init_mlp, rescale_output
 from dexsim_ppo.learner.running_stats import RunningStats, init_stats, make_normalizer, normalize, update_stats
 from dexsim_ppo.learner.types import Field
 from dexsim_ppo.learner.update import adapt_learning_rate
+
+
+def test_elu_and_its_slope():
+    x = np.array([-1e4, -20.0, -1.0, -1e-4, 0.0, 1e-4, 3.0, 1e4], np.float32)
+    exact = np.where(x > 0, x, np.expm1(np.minimum(x, 0).astype(float)))
+    np.testing.assert_allclose(elu(jnp.array(x)), exact, rtol=1e-7, atol=1.2e-7)
+    slope = jax.grad(lambda x: jnp.sum(elu(x)))(jnp.array(x))
+    np.testing.assert_allclose(slope, np.exp(np.minimum(x, 0).astype(float)), rtol=1e-6)
 
 
 def gae(reward, value, next_value, terminated, truncated, discount=0.5, gae_lambda=0.5):

@@ -1,0 +1,57 @@
+"""Which programs are compiled with less optimisation, and which on a GPU repeat to the bit."""
+
+import sys
+
+import jax
+import pytest
+
+from dexsim.core import compilation
+from dexsim.core.compilation import EMITTERS
+
+
+@pytest.fixture
+def options(monkeypatch):
+    """`options(**given)`: the compiler options that `compilation.jit` chooses."""
+    chosen = {}
+    compilation._light()  # compiles, and is kept
+    monkeypatch.setattr(jax, "jit", lambda function, compiler_options=None: chosen.update(o=compiler_options))
+
+    def choose(**given):
+        compilation.jit(lambda x: x, **given)
+        return chosen["o"] or {}
+
+    return choose
+
+
+def test_only_programs_that_are_mostly_physics_do_without_fast_networks(options):
+    assert EMITTERS in options(backend="jax")
+    assert EMITTERS not in options(backend="own") and options(backend="own")
+    assert options(backend="c") == {}
+    assert options(backend="c", once=True)["xla_backend_optimization_level"] == 0
+
+
+def test_programs_on_a_gpu_are_made_deterministic_on_request(options, monkeypatch):
+    assert not compilation.make_deterministic() and not compilation.is_deterministic()  # on a CPU
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(compilation, "_on_gpu", {})
+    assert options(backend="jax") == {}
+    assert compilation.make_deterministic() and compilation.is_deterministic()
+    for backend in ("jax", "warp", "own"):
+        assert options(backend=backend) == {"xla_gpu_deterministic_ops": True}
+    assert options(once=True) == {"xla_gpu_deterministic_ops": True}
+
+
+def test_warps_kernels_sort_their_additions_on_request():
+    """MJX's as well as those that it makes later."""
+    warp = pytest.importorskip("warp")
+    from dexsim.physics.warp_backend import _order_atomics
+
+    before, mode = warp.config.deterministic, warp.DeterministicMode.RUN_TO_RUN
+    solver = warp.get_module("mujoco.mjx.third_party.mujoco_warp._src.solver")
+    try:
+        _order_atomics()
+        assert warp.config.deterministic == mode == solver.options["deterministic"]
+    finally:
+        warp.config.deterministic = before
+        for name in [name for name in sys.modules if name.startswith("mujoco.mjx.third_party.mujoco_warp")]:
+            warp.set_module_options({"deterministic": before}, name)
