@@ -3,13 +3,13 @@
 | motion | begins | gravity |
 |---|---|---|
 | grip | with fingers that hold the object still | out of the hand |
-| slide | on the palm at 0.5 m/s, without spin | onto the palm |
+| slide | on the palm at 0.3 m/s, turned a little, without spin | onto the palm |
 | roll | on the palm at 0.2 m/s, with the spin of rolling | onto the palm |
 | drop | over the palm, between half-closed fingers | onto the palm |
 
 Joints follow targets that do not change, and skin has one stiffness. The reference steps one model a row with
-`mujoco.mj_step`, from the same numbers. "nudged" is the reference again, from a place 1 micrometre away along each
-axis: it shows how far a motion itself spreads what rounding begins.
+`mujoco.mj_step`, from the same numbers. "nudged" is the reference again, moved by 1 micrometre along each
+axis and turned by some microradians: it shows how far a motion itself spreads what rounding begins.
 """
 
 import copy
@@ -36,7 +36,8 @@ MOTIONS = ("grip", "slide", "roll", "drop")
 CONVERGED = {"iterations": 50, "line_search": 50}
 STIFFNESS, DAMPING, REACH = 3.0, 0.1, 0.3  # Nm/rad, Nm s/rad, rad
 TOUCHING = 0.01  # N
-NUDGE = 1e-6  # m
+GAP = 1e-4  # m between palm and object: without one the first contact hangs on the last digit
+NUDGE = 1e-6  # m, and of each part of the quaternion
 CLOSING, TRIES = 100, 6  # sub-steps in which fingers close for a grip, and attempts with one object
 
 
@@ -74,11 +75,11 @@ class Bench:
         self.env: Env = dexsim.make(task, config, backend="c")
         self.task, self.ticks = task, max(round(seconds / self.env.control_period), 1)
         self.exact = self.physics("c", CONVERGED)
-        pool, names = self.env.pool, self.env.task.shape_names
-        index = np.asarray(pool.object.shape_index)
+        pool, index = self.env.pool, np.asarray(self.env.pool.object.shape_index)
+        names = {shape: getattr(config, "object", "") or self.env.task.shape_names[shape] for shape in np.unique(index)}
         self.cases, begins = list[tuple[str, str]](), list[Begin]()
         for motion in MOTIONS:
-            for shape in np.unique(index):
+            for shape in names:
                 rows = np.flatnonzero(index == shape)
                 for row in rows if motion == "grip" else rows[:starts]:
                     begin = self._begin(motion, jax.tree.map(lambda x, r=row: np.asarray(x)[r], pool))
@@ -117,8 +118,10 @@ class Bench:
             height = float(extent(object.size, object.position, object.active, down, object.kinds, object.quat))
             # Where palms are half-spaces nothing else of the hand is near; boxes have the palm's middle.
             beside = (0.0, -0.5) if len(scene.slots) > 1 else (0.0, 0.085)
-            qpos[scene.object_qpos] = palm_height(hand) + height, *beside, 1, 0, 0, 0
-            speed = 0.5 if motion == "slide" else 0.2
+            # Boxes that are parallel to each other are a special case, whose contacts hang on the last digit.
+            heading = 0.1 if motion == "slide" else 0.0
+            qpos[scene.object_qpos] = palm_height(hand) + height + GAP, *beside, np.cos(heading), np.sin(heading), 0, 0
+            speed = 0.3 if motion == "slide" else 0.2
             qvel[scene.object_dof] = 0, speed, 0, 0, 0, 0 if motion == "slide" else speed / height
         begin = Begin(object, PhysicsState(qpos, qvel, np.zeros(scene.model.nv)), target, push)
         if motion == "grip":
@@ -180,7 +183,7 @@ class Bench:
         for row in range(len(self.cases)):
             begin = jax.tree.map(lambda x, r=row: np.asarray(x)[r], self.begin)
             qpos = np.array(begin.state.qpos, np.float64)
-            qpos[self.exact.object_qpos[:3]] += nudge
+            qpos[self.exact.object_qpos] += nudge
             begin = dataclasses.replace(begin, state=dataclasses.replace(begin.state, qpos=qpos))
             model, data, ticks = self.model(begin), None, []
             for _ in range(self.ticks):

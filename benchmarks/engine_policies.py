@@ -31,7 +31,7 @@ def measure(name: str, backend: str, converged: bool, episodes: int, seconds: fl
     if "successes_per_minute" in task:
         spread = {"kept": task["kept_to_the_end"], "successes_per_minute": task["successes_per_minute"]}
     else:
-        spread = {"held": report["held"], "r": task["r_resultant"], "force_error_n": task["force_error_n"]}
+        spread = {"held": task["held"], "r": task["r_resultant"], "force_error_n": task["force_error_n"]}
     row = {"policy": name, "backend": backend, "converged": converged, "episodes": episodes, "seconds": task["seconds"]}
     for key, entry in spread.items():
         row[key] = entry["r" if key == "r" else "mean"]

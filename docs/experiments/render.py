@@ -87,7 +87,11 @@ TABLES: dict[str, tuple[str, dict[str, str]]] = {
     "physics": (
         "Physics",
         {f"pearson_r_per_finger_{s}": f"skin law r, {s}" for s in ("sphere", "box", "cylinder", "capsule")}
-        | {f"force_difference_p95_n_{s}": f"force difference p95, {s} [N]" for s in ("box", "cylinder", "capsule")},
+        | {f"force_difference_p95_n_{s}": f"force difference p95, {s} [N]" for s in ("box", "cylinder", "capsule")}
+        | {
+            "place_error_max_mm": "place off at most: grip, slide, roll, drop [mm]",
+            "force_error_max_n": "force off at most: grip, slide, roll, drop [N]",
+        },
     ),
     "cpu": (
         "Two CPU cores",

@@ -1,5 +1,6 @@
 """`benchmarks/throughput.py` leaves out what it says, and nothing else; over physics that compile in a second."""
 
+import dataclasses
 import importlib.util
 import json
 import sys
@@ -147,3 +148,30 @@ def test_the_parts_of_a_training_step(benchmarks, simple):
     parts = sum(rows[name]["share"] for name in ("physics", "touch", "environment rest", "policy", "learner", "rest"))
     assert parts == pytest.approx(1, abs=2e-3)
     assert all(rows[name]["share"] > 0 for name in ("rollout", "environment", "physics", "touch", "policy", "learner"))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("task", ["grasp", "rotate"])
+def test_training_of_two_engines_in_turn(benchmarks, simple, monkeypatch, capsys, task):
+    """The ratio is that of the times; the number of environments is the preset's where none is given."""
+
+    class Named(SimplePhysics):
+        def __init__(self, hand, slots, largest, config, **options):
+            super().__init__(hand, slots, largest, config, **options)
+            self.backend = options["backend"]
+
+    throughput, _ = benchmarks
+    monkeypatch.setattr("dexsim.env.env.Physics", Named)
+    monkeypatch.setattr(throughput, "enable_caches", lambda: None)
+    preset = throughput.preset(task)
+    small = dataclasses.replace(preset, ppo=dataclasses.replace(preset.ppo, num_envs=WORLDS, rollout_length=4))
+    monkeypatch.setattr(throughput, "preset", lambda task: small)
+    options = ["--task", task, "--train", "1", "--repeats", "2", "--backends", "c", "jax"]
+    monkeypatch.setattr(sys, "argv", ["throughput.py", *options])
+    throughput.main()
+    ours, theirs = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [(row["backend"], row["num_envs"], row["measure"]) for row in (ours, theirs)] == [
+        ("c", WORLDS, "training"),
+        ("jax", WORLDS, "training"),
+    ]
+    assert ours["times_jax"] > 0 and "times_jax" not in theirs
