@@ -204,6 +204,9 @@ def _check_table(path: Path, table: dict) -> None:
         for key in ("name", "tip", "root_joint"):
             if not isinstance(finger, dict) or not isinstance(finger.get(key), str):
                 raise AssetError(f"{path}: finger {number} has no entry {key!r}")
+        for key in ("name", "tip"):
+            if sum(other[key] == finger[key] for other in table["fingers"][:number]) > 1:
+                raise AssetError(f"{path}: finger {number}: {key} = {finger[key]!r:.60} is that of another finger")
         force = finger.get("force_per_torque", 0.0)
         if type(force) not in (int, float) or not 0 <= force <= 1000:
             raise AssetError(f"{path}: finger {number}: force_per_torque = {force!r:.60}: expected 0 to 1000 N/Nm")
