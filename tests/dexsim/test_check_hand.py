@@ -90,7 +90,7 @@ BROKEN = {
     "name twice": ("xml", '<site name="mid_tip"', '<site name="index_tip"', "files load", "repeated name 'index_tip'"),
     "finger twice": ("toml", 'name = "ring"', 'name = "index"', "files load", "finger 4: name = 'index' is that of an"),
     "tip twice": ("toml", 'tip = "ring_tip"', 'tip = "mid_tip"', "files load", "finger 4: tip = 'mid_tip' is that of"),
-    "millimetres": ("csv", scaled(1e3), None, "taxels are on the skin", r"mm away from its link: metres, in the link's"),
+    "millimetres": ("csv", scaled(1e3), None, "taxels are on the skin", r"mm away from its link: metres, in"),
     "inches": ("csv", scaled(0.0254), None, "taxels are on the skin", r"mm inside its link"),
     "frame": ("csv", lifted, None, "taxels are on the skin", r"'thumb': taxel .* mm away from its link"),
     "normals": ("csv", inward, None, "taxels are on the skin", r"faces into its link: .*120 of 120"),
