@@ -25,14 +25,14 @@ from dexsim.hand.load import load_hand
 from dexsim.tasks.grasp.config import GraspConfig
 
 _POSES, _ENVS = 20, 16
-_TOLERANCE = 1e-5  # m, of link positions in float32
+_NEAR, _ALIGNED = 1e-5, 1e-4  # m and rad, of link poses in float32
 
 
 def check_kinematics(hand: Hand) -> None:
-    """Link positions against C MuJoCo at random joint angles.
+    """Link poses against C MuJoCo at random joint angles.
 
     Raises:
-      AssetError: a link is elsewhere.
+      AssetError: a link is elsewhere or turned.
     """
     model = mujoco.MjModel.from_xml_path(str(hand.model_path))
     data, random = mujoco.MjData(model), np.random.default_rng(0)
@@ -41,12 +41,15 @@ def check_kinematics(hand: Hand) -> None:
         angle = random.uniform(hand.joint_lower, hand.joint_upper)
         data.qpos[:] = hinge_angles(hand, angle)
         mujoco.mj_kinematics(model, data)
-        expected = (data.xpos[bodies] - data.xpos[palm]) @ data.xmat[palm].reshape(3, 3)
-        found = np.asarray(forward_kinematics(hand, angle.astype(np.float32)).body_position)
-        error = np.linalg.norm(found - expected, axis=-1)
-        if error.max() > _TOLERANCE:
-            name = hand.body_names[int(error.argmax())]
-            raise AssetError(f"{hand.model_path}: link {name!r} is {1e3 * error.max():.3g} mm from where MuJoCo has it")
+        frame = data.xmat[palm].reshape(3, 3)
+        place, turn = (data.xpos[bodies] - data.xpos[palm]) @ frame, frame.T @ data.xmat[bodies].reshape(-1, 3, 3)
+        found = forward_kinematics(hand, angle.astype(np.float32))
+        away = np.linalg.norm(found.body_position - place, axis=-1)
+        turned = np.linalg.norm(found.body_rotation - turn, axis=(-2, -1)) / np.sqrt(2)  # small angles
+        for error, limit, unit in ((away, _NEAR, "m from"), (turned, _ALIGNED, "rad turned from")):
+            if error.max() > limit:
+                name = hand.body_names[int(error.argmax())]
+                raise AssetError(f"{hand.model_path}: link {name!r} is {error.max():.3g} {unit} where MuJoCo has it")
 
 
 def check_fingertips(hand: Hand) -> None:

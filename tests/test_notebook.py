@@ -28,6 +28,10 @@ EXPECTED = {
         1,
         ["1 frame after noise and in two pieces, 0 with", r"(\d+) ticks from \d+ frames: \1 readings and \1 "],
     ),
+    "own_hand": (
+        4,
+        [r"(ok    .+\n){5}", r"FAIL  files load: my_hand/leap_like\.toml: .* has no site 'ring_tip'", "of 192 taxels"],
+    ),
 }
 
 
@@ -72,10 +76,13 @@ def test_outputs_are_of_a_whole_run(name):
     check(name, notebook)
 
 
-# What own_task trains, tests/dexsim_ppo/test_own_task.py trains too, so that it can wait for the long tests.
+# What these train, test_own_task.py and test_example_hands.py train too, so that they can wait for the long tests.
+LONG = ("own_task", "own_hand")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.long if name == "own_task" else ()) for name in EXPECTED]
+    "name", [pytest.param(name, marks=pytest.mark.long if name in LONG else ()) for name in EXPECTED]
 )
 def test_it_runs(name, monkeypatch):
     # The kernel is started with this process's environment; the inline backend is its own choice.

@@ -66,6 +66,8 @@ class Hand:
     geoms: tuple[Geom, ...]
     grasp_posture: tuple[float, ...] = ()  # rad, from which grasps start; empty: not given
     grasp_centre: tuple[float, ...] = ()  # m, where the object of a grasp belongs; empty: not given
+    rotate_posture: tuple[float, ...] = ()  # rad, from which rotations start; empty: not given
+    rotate_reference: tuple[float, ...] = ()  # m, where the object of a rotation belongs; empty: not given
     source: str = ""  # the TOML as it was named, or the name of a shipped hand
     digest: str = ""  # of its files
 

@@ -21,6 +21,8 @@ import numpy as np
 from dexsim.core.errors import AssetError, ConfigError
 
 SURFACES = ("plane", "cylinder", "capsule", "sphere")
+_AWAY = 3e-3  # m, how far from its link a taxel may be: as thick as the rubber
+_STEP = 3e-3  # m, along a normal, which must lead away from the link
 COLUMNS = ("finger", "column", "row", "x", "y", "z", "nx", "ny", "nz", "area")
 
 
@@ -169,14 +171,15 @@ def check_outside(patch: Patch, geometry: Any, *, tolerance: float = 1e-4, name:
 
 
 def check_hand(hand: Any, *, tolerance: float = 1.5e-3) -> None:
-    """`check_outside` for every finger of a hand against the primitives of the link that carries its taxels.
+    """That the taxels of every finger are on the primitives of the link that carries them, and face outwards.
 
     The default tolerance allows for pads that are capsules fitted to the real skin.
 
     Raises:
-      AssetError: a taxel is inside its link.
+      AssetError: a taxel is inside its link (`check_outside`), away from it, or faces inwards.
     """
     from dexsim.geometry import sdf
+    from dexsim.geometry.distance import signed_distance
 
     for finger, name in enumerate(hand.finger_names):
         geometry = sdf.of_geoms(g for g in hand.geoms if g.body == hand.tip_body[finger])
@@ -184,6 +187,19 @@ def check_hand(hand: Any, *, tolerance: float = 1.5e-3) -> None:
             continue
         patch = Patch(hand.taxel_grid, hand.taxel_position[finger], hand.taxel_normal[finger], hand.taxel_area[finger])
         check_outside(patch, geometry, tolerance=tolerance, name=f"finger {name!r}")
+        distance, ahead = (
+            np.asarray(signed_distance(np.asarray(patch.position + step * patch.normal, np.float32), geometry))
+            for step in (0.0, _STEP)
+        )
+        for what, wrong in (
+            (f"is {1e3 * distance.max():.3g} mm away from its link: metres, in the link's frame?", distance > _AWAY),
+            ("faces into its link: is the normal outward?", ahead <= distance),
+        ):
+            if wrong.any():
+                column, row = divmod(int(np.argmax(np.where(wrong, distance, -np.inf))), patch.grid[1])
+                raise AssetError(
+                    f"finger {name!r}: taxel column {column}, row {row} {what} ({wrong.sum()} of {len(wrong)} are so)"
+                )
 
 
 def write_layout(path: str | Path, patches: dict[str, Patch]) -> Path:

@@ -83,8 +83,10 @@ def load_hand(path: str | Path | None = None) -> Hand:
         taxel_normal=taxels[..., 3:6],
         taxel_area=taxels[..., 6],
         geoms=geoms,
-        grasp_posture=tuple(float(x) for x in table.get("grasp", {}).get("posture", ())),
-        grasp_centre=tuple(float(x) for x in table.get("grasp", {}).get("centre", ())),
+        grasp_posture=_numbers(table, "grasp", "posture"),
+        grasp_centre=_numbers(table, "grasp", "centre"),
+        rotate_posture=_numbers(table, "rotate", "posture"),
+        rotate_reference=_numbers(table, "rotate", "reference"),
         source=shipped_name(path) or str(given),
         digest=digest_of(*files),
     )
@@ -183,11 +185,12 @@ def _check_table(path: Path, table: dict) -> None:
             raise AssetError(f"{path}: {key} = {table[key]!r:.60}: expected a {'string' if kind is str else 'list'}")
     if not isinstance(table.get("taxels", ""), str):
         raise AssetError(f"{path}: taxels = {table['taxels']!r:.60}: expected a string")
-    grasp = table.get("grasp", {})
-    for key, length in (("posture", len(table["joints"])), ("centre", 3)):
-        values = grasp.get(key, [0] * length) if isinstance(grasp, dict) else None
-        if not isinstance(values, list) or len(values) != length or any(type(x) not in (int, float) for x in values):
-            raise AssetError(f"{path}: grasp.{key} = {values!r:.60}: expected {length} numbers")
+    for task, place in (("grasp", "centre"), ("rotate", "reference")):
+        given = table.get(task, {})
+        for key, length in (("posture", len(table["joints"])), (place, 3)):
+            values = given.get(key, [0] * length) if isinstance(given, dict) else None
+            if not isinstance(values, list) or len(values) != length or not all(map(_is_number, values)):
+                raise AssetError(f"{path}: {task}.{key} = {values!r:.60}: expected {length} numbers")
     if not isinstance(table.get("name", ""), str):
         raise AssetError(f"{path}: name = {table['name']!r:.60}: expected a string")
     grid, speeds = table["taxel_grid"], table["speed_limits"]
@@ -201,6 +204,9 @@ def _check_table(path: Path, table: dict) -> None:
         for key in ("name", "tip", "root_joint"):
             if not isinstance(finger, dict) or not isinstance(finger.get(key), str):
                 raise AssetError(f"{path}: finger {number} has no entry {key!r}")
+        for key in ("name", "tip"):
+            if sum(other[key] == finger[key] for other in table["fingers"][:number]) > 1:
+                raise AssetError(f"{path}: finger {number}: {key} = {finger[key]!r:.60} is that of another finger")
         force = finger.get("force_per_torque", 0.0)
         if type(force) not in (int, float) or not 0 <= force <= 1000:
             raise AssetError(f"{path}: finger {number}: force_per_torque = {force!r:.60}: expected 0 to 1000 N/Nm")
@@ -221,6 +227,14 @@ def _check_finite(model, path: Path) -> None:
             if bad.size:
                 element = getattr(model, kind)(int(bad[0])).name
                 raise AssetError(f"{path}: {kind} {element!r}: {name} is not a finite number")
+
+
+def _is_number(value: Any) -> bool:
+    return type(value) in (int, float) and bool(np.isfinite(value))
+
+
+def _numbers(table: dict, task: str, key: str) -> tuple[float, ...]:
+    return tuple(map(float, table.get(task, {}).get(key, ())))
 
 
 def _f32(values) -> np.ndarray:

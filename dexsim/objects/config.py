@@ -10,7 +10,15 @@ from dexsim.core.errors import ConfigError
 from dexsim.objects.mesh import MeshObject, load
 
 SLOTS = ("box", "capsule", "cylinder")
-SHAPES = ("sphere", "box", "cylinder", "capsule", "composition")
+"""Kinds of primitives; the template has those that the shapes asked for need, in this order."""
+_SLOTS_OF: dict[str, tuple[str, ...]] = {
+    "sphere": ("capsule",),
+    "box": ("box",),
+    "cylinder": ("cylinder",),
+    "capsule": ("capsule",),
+    "composition": SLOTS,
+}
+SHAPES = tuple(_SLOTS_OF)
 KINDS = (*SHAPES, "mesh")
 """What `ObjectParams.shape_index` counts."""
 INACTIVE_SIZE = 1e-4  # m, size of a slot that is switched off: at the object's centre
@@ -106,8 +114,11 @@ class ObjectConfig:
 
     @property
     def slots(self) -> tuple[str, ...]:
-        """Primitives of the compiled template."""
-        return load_mesh_object(self).kinds if self.mesh else SLOTS
+        """Primitives of the compiled template: those that its shapes need."""
+        if self.mesh:
+            return load_mesh_object(self).kinds
+        needed = {slot for shape in self.shapes for slot in _SLOTS_OF[shape]}
+        return tuple(slot for slot in SLOTS if slot in needed)
 
     @property
     def largest(self) -> np.ndarray:
@@ -117,13 +128,12 @@ class ObjectConfig:
         radius = max(self.cylinder_radius[1], self.sphere_radius[1], self.neck_radius[1])
         half = max(self.cylinder_half[1], self.neck_half[1])
         body = max(self.composition_scale, 1.0)  # of the box or cylinder in a composition
-        return np.array(
-            [
-                [body * self.box_half[1]] * 3,
-                [radius, half, 0.0],
-                [body * self.cylinder_radius[1], body * self.cylinder_half[1], 0.0],
-            ]
-        )
+        size = {
+            "box": [body * self.box_half[1]] * 3,
+            "capsule": [radius, half, 0.0],
+            "cylinder": [body * self.cylinder_radius[1], body * self.cylinder_half[1], 0.0],
+        }
+        return np.array([size[slot] for slot in self.slots])
 
 
 def load_mesh_object(config: ObjectConfig) -> MeshObject:

@@ -1,7 +1,7 @@
 """What is grasped: unions of a few primitives whose sizes are drawn at every episode start.
 
-One compiled model has a fixed slot per primitive kind. An object switches slots on and sizes
-them, so spheres, boxes, cylinders, capsules and compositions share one batch. Collision and
+One compiled model has a fixed slot for each kind of primitive that the shapes asked for need. An object switches
+slots on and sizes them, so spheres, boxes, cylinders, capsules and compositions share one batch. Collision and
 touch read the same sizes.
 
 A sphere is the capsule slot with next to no length: a slot less to collide. A mesh takes the place of
@@ -115,13 +115,13 @@ def sample_object(key: jax.Array, config: ObjectConfig, shape_index: jax.Array |
         allowed = jnp.array([SHAPES.index(name) for name in config.shapes])
         shape_index = jax.random.choice(keys[0], allowed)
     size, position, active = _sample_slots(keys[1], shape_index, config, extreme)
-    density_mass, com, inertia = _mass_properties(size, position, active)
+    kept = np.array([SLOTS.index(slot) for slot in config.slots])  # a mesh, which has slots of its own, is not here
+    size, position, active = size[kept], position[kept], active[kept]
+    density_mass, com, inertia = _mass_properties(config.slots, size, position, active)
     position = position - com[None]  # the origin is the centre of a uniform solid
-    return _with_bulk(
-        _bare(shape_index.astype(jnp.int32), size, position, active, extreme),
-        inertia / density_mass,
-        _sample_bulk(keys, config, extreme),
-    )
+    object = _bare(shape_index.astype(jnp.int32), size, position, active, extreme)
+    object = dataclasses.replace(object, kinds=config.slots)
+    return _with_bulk(object, inertia / density_mass, _sample_bulk(keys, config, extreme))
 
 
 def _sample_mesh(keys: jax.Array, config: ObjectConfig, extreme: jax.Array | None) -> ObjectParams:
@@ -208,7 +208,7 @@ def unit_inertia(object: ObjectParams, config: ObjectConfig | None = None) -> ja
     if config is not None and config.mesh:
         mesh_object = load_mesh_object(config)
         return (object.size[0, 0] / mesh_object.boxes.size[0, 0]) ** 2 * jnp.asarray(mesh_object.inertia)
-    mass, _, inertia = _mass_properties(object.size, object.position, object.active)
+    mass, _, inertia = _mass_properties(object.kinds, object.size, object.position, object.active)
     return inertia / mass
 
 
@@ -291,23 +291,16 @@ def _sample_slots(
     return jnp.where(active[:, None], size, INACTIVE_SIZE), position, active
 
 
-def _mass_properties(size: jax.Array, position: jax.Array, active: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _mass_properties(
+    kinds: tuple[str, ...], size: jax.Array, position: jax.Array, active: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Mass, centre and inertia (about the centre) of the union at unit density.
 
     Overlaps count twice; the drawn mass and inertia scale absorb it.
     """
-    (a, b, c), (r, h, _), (cr, ch, _) = size
-    box_mass = 8 * a * b * c
-    box_inertia = box_mass / 3 * jnp.stack([b * b + c * c, a * a + c * c, a * a + b * b])
-    tube, ball = 2 * jnp.pi * r * r * h, 4 / 3 * jnp.pi * r**3
-    side = tube * (r * r / 4 + h * h / 3) + ball * (2 / 5 * r * r + h * h + 3 / 4 * r * h)
-    capsule_inertia = jnp.stack([side, side, tube * r * r / 2 + ball * 2 / 5 * r * r])
-    cylinder_mass = 2 * jnp.pi * cr * cr * ch
-    side = cylinder_mass * (cr * cr / 4 + ch * ch / 3)
-    cylinder_inertia = jnp.stack([side, side, cylinder_mass * cr * cr / 2])
-
-    mass = jnp.where(active, jnp.stack([box_mass, tube + ball, cylinder_mass]), 0.0)
-    inertia = jnp.where(active[:, None], jnp.stack([box_inertia, capsule_inertia, cylinder_inertia]), 0.0)
+    masses, inertias = zip(*(_SOLIDS[kind](*size[k]) for k, kind in enumerate(kinds)), strict=True)
+    mass = jnp.where(active, jnp.stack(masses), 0.0)
+    inertia = jnp.where(active[:, None], jnp.stack(inertias), 0.0)
     z = jnp.where(active, position[:, 2], 0.0)
     total = jnp.sum(mass)
     centre = jnp.sum(mass * z) / total
@@ -317,3 +310,24 @@ def _mass_properties(size: jax.Array, position: jax.Array, active: jax.Array) ->
         jnp.stack([jnp.zeros(()), jnp.zeros(()), centre]),
         jnp.sum(inertia, 0) + shift * jnp.array([1.0, 1.0, 0.0]),
     )
+
+
+def _box(a: jax.Array, b: jax.Array, c: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Mass and inertia [3] at unit density, as of the other solids."""
+    mass = 8 * a * b * c
+    return mass, mass / 3 * jnp.stack([b * b + c * c, a * a + c * c, a * a + b * b])
+
+
+def _capsule(r: jax.Array, h: jax.Array, _: jax.Array) -> tuple[jax.Array, jax.Array]:
+    tube, ball = 2 * jnp.pi * r * r * h, 4 / 3 * jnp.pi * r**3
+    side = tube * (r * r / 4 + h * h / 3) + ball * (2 / 5 * r * r + h * h + 3 / 4 * r * h)
+    return tube + ball, jnp.stack([side, side, tube * r * r / 2 + ball * 2 / 5 * r * r])
+
+
+def _cylinder(r: jax.Array, h: jax.Array, _: jax.Array) -> tuple[jax.Array, jax.Array]:
+    mass = 2 * jnp.pi * r * r * h
+    side = mass * (r * r / 4 + h * h / 3)
+    return mass, jnp.stack([side, side, mass * r * r / 2])
+
+
+_SOLIDS = {"box": _box, "capsule": _capsule, "cylinder": _cylinder}

@@ -17,8 +17,6 @@ GEOM_TYPES = {
     "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
     "ellipsoid": mujoco.mjtGeom.mjGEOM_ELLIPSOID,
 }
-# Primitives that meet a box in closed form with every engine.
-_MEETS_BOXES = {"sphere", "capsule", "box"}
 
 
 def build_model(
@@ -139,8 +137,8 @@ def _touching_geoms(hand: Hand, slots: tuple[str, ...]) -> list[str]:
     kinds = {g.kind for g in geoms if g.body == palm}
     if "plane" in kinds:
         # The half-space at the palm's face collides with every primitive in closed form, but also supports objects
-        # next to the palm. The palm's box is exact, and collides with boxes, capsules and spheres only.
-        use_box = "box" in kinds and set(slots) <= _MEETS_BOXES
+        # next to the palm. The palm's box is exact, and every engine has a closed form for it with boxes only.
+        use_box = "box" in kinds and set(slots) <= {"box"}
         geoms = [g for g in geoms if g.body != palm or (g.kind != "plane") == use_box]
     if not geoms or any(not g.name for g in geoms):
         raise AssetError(

@@ -33,7 +33,8 @@ class ViewArguments:
     emulated: bool = False
     """Run the policy on the emulated hand instead of the simulation that it was trained in."""
     hand: str = ""
-    """The TOML of a hand of your own; empty for the one that the policy or the log is of."""
+    """The TOML of a hand of your own, or the name of a shipped one; empty for the one that the policy or the log is of.
+    With the name of a task: the task on that hand."""
     seed: int = setting(0, unit="1", low=0, high=2**31 - 1)
     """Seed of the episodes."""
     host: str = "127.0.0.1"
@@ -66,8 +67,10 @@ def open_source(arguments: ViewArguments) -> Source:
 
     try:
         policy = load_policy(name)
-    except CheckpointError:
-        if Path(name).exists():
+        hand = policy.find_hand(arguments.hand)
+    except (CheckpointError, ConfigError) as error:
+        # "grasp" is a task and also a policy, which is of the XHand: on another hand the task is shown.
+        if Path(name).exists() or (isinstance(error, ConfigError) and not arguments.hand):
             raise
         try:
             find_task(name)
@@ -75,7 +78,7 @@ def open_source(arguments: ViewArguments) -> Source:
             raise ConfigError(f"{name}: no policy file, no shipped policy, and {error}") from None
         env, name = make(name.rpartition(":")[2], hand=load_hand(arguments.hand or None)), NONE
     else:
-        env = policy.make_env(hand=policy.find_hand(arguments.hand))
+        env = policy.make_env(hand=hand)
     return Simulation(env, PolicyShelf(env, name), arguments.seed)
 
 

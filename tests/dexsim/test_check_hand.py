@@ -1,9 +1,11 @@
 """The contract of a hand's files."""
 
+import re
 import shutil
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from dexsim import check_hand
 from dexsim.core.assets import asset_path
@@ -28,7 +30,15 @@ def test_shipped_hand_passes(capsys):
 def test_wrong_link_is_named(folder):
     hand = load_hand(folder / "xhand_right.toml")
     hand.body_position[-1, 0] += np.float32(0.001)
-    with pytest.raises(AssetError, match=r"right_hand_pinky_link2.* is 1 mm"):
+    with pytest.raises(AssetError, match=r"right_hand_pinky_link2.* is 0.001 m from"):
+        check_hand.check_kinematics(hand)
+
+
+def test_turned_link_is_named(folder):
+    """The last link: no other is displaced by it."""
+    hand = load_hand(folder / "xhand_right.toml")
+    hand.body_rotation[-1] = hand.body_rotation[-1] @ Rotation.from_euler("x", 0.01).as_matrix()
+    with pytest.raises(AssetError, match=r"right_hand_pinky_link2.* is 0.01 rad turned"):
         check_hand.check_kinematics(hand)
 
 
@@ -47,6 +57,61 @@ def test_hand_without_a_grasp_fails(folder, capsys):
     assert check_hand.main([str(table)]) == 1
     out = capsys.readouterr().out
     assert "FAIL  random actions stay finite: hand 'xhand_right' has no grasp" in out
+
+
+COUPLING = '<joint joint1="index_joint2" joint2="index_joint1" polycoef="{}"/>'
+TENDON = '<tendon><fixed name="pull"><joint joint="index_joint1" coef="1"/></fixed></tendon>'
+
+
+def scaled(factor):
+    """Positions of another unit."""
+    return lambda line: [*line[:3], *(f"{factor * float(x):.6g}" for x in line[3:6]), *line[6:]]
+
+
+def lifted(line):
+    """Positions in a frame whose origin is elsewhere."""
+    return [*line[:5], f"{float(line[5]) + 0.18:.6g}", *line[6:]]
+
+
+def inward(line):
+    return [*line[:6], *(f"{-float(x):.6g}" for x in line[6:9]), line[9]]
+
+
+# What is changed in the MJCF, the TOML or the lines of the taxel file; the check that fails, and what it says.
+BROKEN = {
+    "no site": ("xml", '<site name="index_tip"', '<site name="index_end"', "files load", "has no site 'index_tip'"),
+    "no inertia": ("xml", '<inertial mass="0.0158240"', '<inertial mass="0"', "files load", "mass"),
+    "tendon": ("xml", "</worldbody>", "</worldbody>" + TENDON, "files load", "tendon 'pull': tendons are not"),
+    "not linear": ("xml", "</worldbody>", "</worldbody><equality>" + COUPLING.format("0 1 .1 0 0") + "</equality>",
+                   "files load", r"polycoef .* is not of the form a0 a1 0 0 0"),
+    "two drives": ("xml", "</worldbody>", "</worldbody><equality>" + COUPLING.format("0 1 0 0 0") + "</equality>",
+                   "files load", "'index_joint2' has a motor"),
+    "range": ("xml", 'range="-0.698 1.57"', 'range="1.57 -0.698"', "files load", "range"),
+    "name twice": ("xml", '<site name="mid_tip"', '<site name="index_tip"', "files load", "repeated name 'index_tip'"),
+    "finger twice": ("toml", 'name = "ring"', 'name = "index"', "files load", "finger 4: name = 'index' is that of an"),
+    "tip twice": ("toml", 'tip = "ring_tip"', 'tip = "mid_tip"', "files load", "finger 4: tip = 'mid_tip' is that of"),
+    "millimetres": ("csv", scaled(1e3), None, "taxels are on the skin", r"mm away from its link: metres, in"),
+    "inches": ("csv", scaled(0.0254), None, "taxels are on the skin", r"mm inside its link"),
+    "frame": ("csv", lifted, None, "taxels are on the skin", r"'thumb': taxel .* mm away from its link"),
+    "normals": ("csv", inward, None, "taxels are on the skin", r"faces into its link: .*120 of 120"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_broken_files_are_one_clear_line(name, folder, capsys, monkeypatch):
+    monkeypatch.delitem(check_hand.CHECKS, "random actions stay finite")  # it takes seconds
+    kind, old, new, check, said = BROKEN[name]
+    path = folder / {"xml": "xhand_right.xml", "toml": "xhand_right.toml", "csv": "taxels.csv"}[kind]
+    lines = path.read_text().splitlines()
+    if kind == "csv":
+        lines = [lines[0], *(",".join(old(line.split(","))) for line in lines[1:])]
+    else:
+        assert any(old in line for line in lines)
+        lines = [line.replace(old, new) for line in lines]
+    path.write_text("\n".join(lines))
+    assert check_hand.main([str(folder / "xhand_right.toml")]) == 1
+    failed = [line for line in capsys.readouterr().out.splitlines() if line.startswith("FAIL")]
+    assert len(failed) == 1 and failed[0].startswith(f"FAIL  {check}: ") and re.search(said, failed[0]), failed
 
 
 def test_missing_file_is_one_line(tmp_path, capsys):

@@ -97,8 +97,8 @@ class RotateConfig(EnvConfig):
     roll: float = setting(-0.2, unit="rad", low=-1.2, high=1.2)
     """Nominal roll of the hand. Positive lets the object slide toward the thumb, where it falls over the palm's edge
     most easily."""
-    reference: tuple[float, float, float] = setting((0.047, 0.024, 0.088), unit="m", low=-0.5, high=0.5)
-    """Reference position of the object, where thumb and fingers meet."""
+    reference: tuple[float, ...] = setting((), unit="m", low=-0.5, high=0.5)
+    """Reference position of the object, where thumb and fingers meet; empty for the one that the hand's TOML gives."""
     drop_distance: float = setting(0.07, unit="m", low=0.01, high=1.0)
     """The object is lost when its centre is farther than this from the reference."""
     drop_tilt: float = setting(1.0, unit="rad", low=0.1, high=3.2)
@@ -120,10 +120,8 @@ class RotateConfig(EnvConfig):
     """Probability per tick of a push on the object."""
     push_speed: float = setting(0.1, unit="m/s", low=0.0, high=5.0)
     """Largest change of the object's speed in a push."""
-    posture: tuple[float, ...] = setting(
-        (1.0, 0.2, 0.3, 0.0, 0.8, 0.5, 0.8, 0.5, 0.8, 0.5, 0.8, 0.5), unit="rad", low=-3.2, high=3.2
-    )
-    """Joint angles that episodes start near."""
+    posture: tuple[float, ...] = setting((), unit="rad", low=-3.2, high=3.2)
+    """Joint angles that episodes start near; empty for those that the hand's TOML gives."""
     posture_noise: float = setting(0.3, unit="rad", low=0.0, high=1.0)
     """Largest deviation of the start posture from `posture`, per joint. It is wide, so that a stroke can begin where
     another ended."""
@@ -148,6 +146,8 @@ class RotateConfig(EnvConfig):
         check_ranges(self, "edge", "curl", "squeeze")
         if self.direction == 0:
             raise ConfigError("RotateConfig.direction = 0: must be +1 or -1")
+        if len(self.reference) not in (0, 3):
+            raise ConfigError(f"RotateConfig.reference = {self.reference}: expected 3 numbers")
         if np.linalg.norm(self.axis) < 1e-6:
             raise ConfigError("RotateConfig.axis is (0, 0, 0): give a direction")
         if (self.object == "mesh") != bool(self.objects.mesh):

@@ -92,6 +92,10 @@ class Rotate:
     evaluation = "totals"
 
     def __init__(self, config: RotateConfig, hand: Hand):
+        posture, reference = config.posture or hand.rotate_posture, config.reference or hand.rotate_reference
+        if not (posture and reference):
+            raise ConfigError(f"hand {hand.name!r} has no rotate: its TOML needs [rotate] with posture and reference")
+        config = dataclasses.replace(config, posture=posture, reference=reference)
         if len(config.posture) != hand.num_joints:
             raise ConfigError(
                 f"RotateConfig.posture has {len(config.posture)} angles, the hand {hand.num_joints} joints"
@@ -103,7 +107,8 @@ class Rotate:
         # Palm up; the tilt lowers the wrist, the roll the thumb's side.
         level = 9.81 * math.cos(config.roll)
         self.gravity = (-level * math.cos(config.tilt), 9.81 * math.sin(config.roll), -level * math.sin(config.tilt))
-        self.reference, self._palm = config.reference, palm_height(hand)
+        (x, y, z), self._palm = reference, palm_height(hand)
+        self.reference = (x, y, z)
         self._axis = jnp.asarray(config.unit_axis)
         self._step = config.direction * config.goal_step
         self._period = config.physics.control_period

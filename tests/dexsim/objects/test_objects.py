@@ -237,6 +237,32 @@ def test_slots_that_are_off_are_specks_inside_the_object():
         assert np.all(is_inside(one, one.position[off]))
 
 
+@pytest.mark.parametrize(
+    ("shapes", "slots"),
+    [
+        (("sphere",), ("capsule",)),
+        (("box",), ("box",)),
+        (("cylinder", "sphere"), ("capsule", "cylinder")),
+        (("composition",), SLOTS),
+        (SHAPES, SLOTS),
+    ],
+)
+def test_a_template_has_the_slots_of_its_shapes_and_the_same_objects(shapes, slots):
+    config, kept = ObjectConfig(shapes=shapes), [SLOTS.index(slot) for slot in slots]
+    np.testing.assert_array_equal(config.largest, ObjectConfig().largest[kept])
+    for name in shapes:
+        few, all = draw(config, name), default(name)
+        assert config.slots == few.kinds == slots and not np.delete(all.active, kept, axis=1).any()
+        for field in ("size", "active"):
+            np.testing.assert_array_equal(getattr(few, field), getattr(all, field)[:, kept])
+        np.testing.assert_allclose(few.position, all.position[:, kept], atol=1e-9)
+        for field in ("mass", "com", "friction", "contact"):
+            np.testing.assert_array_equal(getattr(few, field), getattr(all, field))
+        np.testing.assert_allclose(few.inertia, all.inertia, rtol=1e-6)
+        plain = jax.vmap(functools.partial(unit_inertia, config=config))(few)
+        np.testing.assert_allclose(plain, jax.vmap(unit_inertia)(all), rtol=1e-6)
+
+
 @pytest.mark.parametrize("scale", [0.8, 2.0])
 def test_nothing_is_larger_than_the_template(scale):
     config = ObjectConfig(composition_scale=scale, neck_radius=(0.03, 0.04), neck_half=(0.03, 0.05))

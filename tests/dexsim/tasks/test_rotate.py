@@ -101,6 +101,19 @@ class TestGoal:
             np.testing.assert_allclose(one.angle, two.angle, atol=1e-5)
             np.testing.assert_allclose(one.spin, two.spin, atol=1e-6)
 
+    def test_posture_and_reference_are_the_hands_unless_given(self, hand):
+        of_hand, given = Rotate(RotateConfig(), hand), Rotate(clear_of_palm(), hand)
+        assert of_hand.reference == of_hand.config.reference == hand.rotate_reference == (0.047, 0.024, 0.088)
+        assert of_hand.config.posture == hand.rotate_posture
+        assert given.config == clear_of_palm() and given.reference == (0.072, 0.005, 0.098)
+        bare = dataclasses.replace(hand, name="bare", rotate_posture=(), rotate_reference=())
+        with pytest.raises(ConfigError, match=r"^hand 'bare' has no rotate: .*\[rotate\] with posture and reference$"):
+            Rotate(RotateConfig(), bare)
+        with pytest.raises(ConfigError, match="12 angles, the hand 6 joints"):
+            Rotate(clear_of_palm(), dexsim.load_hand("inspire_like"))
+        with pytest.raises(ConfigError, match="expected 3 numbers"):
+            RotateConfig(reference=(0.0, 0.0))
+
     @pytest.mark.parametrize("degrees", [72.5, 73.5, 90, 106.5, 107.5])
     def test_within_0_3_rad_is_reached(self, task, begun, degrees):
         now = task.progress(begun, truth(task, object_quat=turned(degrees)))

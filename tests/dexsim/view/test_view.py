@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import dexsim
-from dexsim.core.errors import ConfigError
+from dexsim.core.errors import AssetError, ConfigError
 from dexsim.hand.kinematics import forward_kinematics, taxel_normals, taxel_positions
 from dexsim.objects.config import KINDS
 from dexsim.render.colors import FACES
@@ -176,6 +176,19 @@ def test_a_dropped_object_is_seen_and_then_replaced(simulation):
     seconds = [float(frame.snapshot.seconds) for frame in frames]
     assert 20 < len([note for note in notes[first : first + 40] if note]) < 40
     assert min(seconds[first + 20 : first + 45]) < 0.1, "a new episode begins"
+
+
+def test_a_task_is_shown_on_another_hand_without_the_policy_of_its_name(monkeypatch):
+    from dexsim.view import __main__ as command
+
+    made = []
+    monkeypatch.setattr(command, "make", lambda task, hand: made.append((task, hand.name)))
+    monkeypatch.setattr(command, "PolicyShelf", lambda env, first: made.append(first))
+    monkeypatch.setattr("dexsim.view.simulation.Simulation", lambda env, shelf, seed: None)
+    open_source(ViewArguments(what="grasp", hand="inspire_like"))
+    assert made == [("grasp", "inspire_like"), NONE]
+    with pytest.raises(AssetError, match="no shipped hand has that name"):
+        open_source(ViewArguments(what="grasp", hand="no_such_hand"))
 
 
 def test_the_emulated_hand_is_a_source(hand, monkeypatch):

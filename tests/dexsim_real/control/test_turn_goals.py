@@ -10,6 +10,8 @@ from dexsim.tasks.rotate.task import goal_quat
 from dexsim_real.control.goals import TurnGoals
 from dexsim_real.sensors.readings import ObjectEstimate
 
+REFERENCE = (0.047, 0.024, 0.088)
+
 
 def seen(angle, axis=(1.0, 0, 0), place=(0.048, 0.0, 0.085)):
     quat = np.array([math.cos(angle / 2), *(math.sin(angle / 2) * np.array(axis))])
@@ -19,7 +21,7 @@ def seen(angle, axis=(1.0, 0, 0), place=(0.048, 0.0, 0.085)):
 @pytest.mark.parametrize("direction", [1, -1])
 def test_goals_move_on_as_in_the_task(direction):
     config = RotateConfig(direction=direction)
-    goals = TurnGoals(config.turn, config.reference)
+    goals = TurnGoals(config.turn, REFERENCE)
     rate, period, turns = 0.8 * direction, 0.03, 0
     for k in range(600):
         wanted = np.asarray(goal_quat(turns, np.asarray(config.axis), direction * config.goal_step))
@@ -36,7 +38,7 @@ def test_goals_move_on_as_in_the_task(direction):
 def test_a_goal_passed_at_speed_or_far_away_does_not_count(way):
     """Whichever way round the object passes it."""
     config = RotateConfig(goal_spin=2.0)
-    fast, far = TurnGoals(config.turn, config.reference), TurnGoals(config.turn, config.reference)
+    fast, far = TurnGoals(config.turn, REFERENCE), TurnGoals(config.turn, REFERENCE)
     for k in range(40):
         fast.update(0.03 * k, seen(way * 6.0 * 0.03 * k))
         far.update(0.03 * k, seen(way * 1.0 * 0.03 * k, place=(0.2, 0, 0.085)))
@@ -47,7 +49,7 @@ def test_a_goal_passed_at_speed_or_far_away_does_not_count(way):
 def test_a_quaternion_of_the_other_sign_is_no_turn(direction):
     """q and -q are one orientation; an IMU may give either, from one sample to the next."""
     config = RotateConfig(direction=direction, goal_spin=2.0)
-    goals = TurnGoals(config.turn, config.reference)
+    goals = TurnGoals(config.turn, REFERENCE)
     for k in range(100):
         estimate = seen(0.8 * direction * 0.03 * k)
         sign = -1 if k % 2 else 1
