@@ -180,7 +180,8 @@ def sample_hand(
       timestep, control_period: s, of a physics sub-step and a control tick.
       scale: [] in [0, 1], on top of `config.scale`; may be traced. 0 is the nominal hand, exactly.
     """
-    values = _draw(key, config, hand, config.scale * scale)
+    drawn = _draw(key, config, hand, config.scale * scale)
+    values = {name: row[: hand.num_joints] for name, row in drawn.items()}
     joints, geared = (hand.num_joints,), config.backlash == "gear_play"
     count_key, phase_key = jax.random.split(key, len(_KEYS))[_KEYS.index("ripple_count") :][:2]
     low, high = config.ripple_count
@@ -206,15 +207,15 @@ def sample_hand(
         sensing_latency=jnp.clip(values["sensing_latency"][0] / control_period, 0.0, 1.0),
         encoder_bias=values["encoder_bias"],
         torque_gain=values["torque_gain"],
-        taxel_gain=values["taxel_gain"][: hand.num_fingers, None],
-        tilt=values["gravity_tilt"][:2],
+        taxel_gain=drawn["taxel_gain"][: hand.num_fingers, None],
+        tilt=drawn["gravity_tilt"][:2],
         cover=values["cover"][0],
         gear_gap=values["gear_gap"] if geared else None,
     )
 
 
 def _draw(key: jax.Array, config: Randomization, hand: Hand, width: jax.Array | float) -> dict[str, jax.Array]:
-    """A row of values for every name of `NOMINAL`: as many as a hand has joints (or fingers, or two)."""
+    """A row of values for every name of `NOMINAL`: as many as the hand has joints or fingers, and two at least."""
     shape, nominal = (max(hand.num_joints, hand.num_fingers, 2),), np.array(list(NOMINAL.values()), np.float32)
     if isinstance(width, (int, float)) and width == 0:  # known beforehand: nothing is drawn
         return {name: jnp.full(shape, value, float) for name, value in NOMINAL.items()}
