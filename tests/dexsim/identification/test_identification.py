@@ -230,7 +230,7 @@ def test_parameters_come_back_in_90_of_100():
 
 def test_holdout_and_report():
     holdout = log_of(TRUTH, 7, target=HOLDOUT)
-    found = identify(log_of(TRUTH, 6, target=SHORT), GUESS, latencies=(2,), holdout=holdout)
+    found = identify(log_of(TRUTH, 6), GUESS, latencies=(2,), holdout=holdout)
     assert found.holdout_rmse < 0.0013 and found.holdout_rmse_before > 0.003
     direct = evaluate(holdout, found.values, latency=2, substeps=SUBSTEPS)
     assert direct[0] == pytest.approx(found.holdout_rmse)
