@@ -17,6 +17,7 @@ import tyro
 
 from dexsim import registry
 from dexsim.core import cli
+from dexsim.core.compilation import jit
 from dexsim.core.errors import AssetError, ConfigError
 from dexsim.env.state import State
 from dexsim.hand.kinematics import Hand, forward_kinematics, hinge_angles
@@ -83,7 +84,7 @@ def check_rollout(hand: Hand) -> None:
 
         return jax.lax.scan(step, env.reset(begin), jnp.stack(keys))[1]
 
-    bad = np.asarray(jax.jit(jax.vmap(episode))(jax.random.split(jax.random.key(0), _ENVS)))
+    bad = np.asarray(jit(jax.vmap(episode), once=True)(jax.random.split(jax.random.key(0), _ENVS)))
     if bad.any():
         raise AssetError(f"{hand.model_path}: physics diverged in {np.sum(bad.any(1))} of {_ENVS} episodes")
 

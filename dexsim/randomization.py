@@ -5,7 +5,6 @@ scale may be traced, so that a curriculum widens the ranges while training (`Cur
 """
 
 import dataclasses
-from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +14,7 @@ from dexsim.actuator.drive import Actuator
 from dexsim.core.config import check_ranges, setting, validate
 from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import pytree_dataclass
-from dexsim.core.ranges import sample_extreme, uniform
+from dexsim.core.ranges import sample_extreme, uniforms
 from dexsim.hand.kinematics import Hand
 
 NOMINAL = {
@@ -41,6 +40,29 @@ NOMINAL = {
 """The nominal hand: a value for every range of `Randomization` but the ripples' number, which has none."""
 _DEVIATIONS = ("encoder_bias", "gravity_tilt")  # given by one number, the largest deviation to either side
 _SPANS = (*(name for name in NOMINAL if name not in _DEVIATIONS), "ripple_count")
+_KEYS = (
+    "stiffness_factor",
+    "damping_factor",
+    "dead_band",
+    "torque_factor",
+    "speed_factor",
+    "efficiency",
+    "latency",
+    "sensing_latency",
+    "encoder_bias",
+    "torque_gain",
+    "taxel_gain",
+    "gravity_tilt",
+    "latency_spread",
+    "ripple",
+    "ripple_count",
+    "ripple_phase",
+    "coulomb_friction",
+    "viscous_friction",
+    "gear_gap",
+    "cover",
+)
+"""Which of an episode's keys draws what."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -158,76 +180,52 @@ def sample_hand(
       timestep, control_period: s, of a physics sub-step and a control tick.
       scale: [] in [0, 1], on top of `config.scale`; may be traced. 0 is the nominal hand, exactly.
     """
-    width = config.scale * scale
-    off = isinstance(width, (int, float)) and width == 0  # known beforehand: nothing is drawn
-    extreme = sample_extreme(key, config.extremes)
-
-    def value(key: jax.Array, name: str, shape: tuple[int, ...]) -> jax.Array:
-        nominal, span = NOMINAL[name], getattr(config, name)
-        if off:
-            return jnp.full(shape, nominal, float)
-        span = (-span, span) if name in _DEVIATIONS else span
-        drawn = uniform(key, span, extreme, shape, nominal=nominal, beyond=config.beyond)
-        return nominal + width * (drawn - nominal)
-
-    return _assemble(key, value, config, hand, timestep, control_period)
-
-
-def _assemble(
-    key: jax.Array,
-    value: Callable[[jax.Array, str, tuple[int, ...]], jax.Array],
-    config: Randomization,
-    hand: Hand,
-    timestep: float,
-    control_period: float,
-) -> HandParams:
-    keys = iter(jax.random.split(key, 20))
-    joints, fingers = (hand.num_joints,), (hand.num_fingers, 1)
-    stiffness = config.stiffness * value(next(keys), "stiffness_factor", joints)
-    damping = config.damping * value(next(keys), "damping_factor", joints)
-    dead_band = value(next(keys), "dead_band", joints)
-    geared = config.backlash == "gear_play"
-    if geared:
-        dead_band = jnp.zeros(joints)
-    stall_torque = jnp.asarray(hand.torque_limit) * value(next(keys), "torque_factor", joints)
-    no_load_speed = jnp.asarray(hand.speed_limit) * value(next(keys), "speed_factor", joints)
-    efficiency = value(next(keys), "efficiency", joints)
-    latency = value(next(keys), "latency", ())
-    age = value(next(keys), "sensing_latency", ()) / control_period
-    encoder_bias = value(next(keys), "encoder_bias", joints)
-    torque_gain = value(next(keys), "torque_gain", joints)
-    taxel_gain = value(next(keys), "taxel_gain", fingers)
-    tilt = value(next(keys), "gravity_tilt", (2,))
-    latency = latency + value(next(keys), "latency_spread", joints)
+    drawn = _draw(key, config, hand, config.scale * scale)
+    values = {name: row[: hand.num_joints] for name, row in drawn.items()}
+    joints, geared = (hand.num_joints,), config.backlash == "gear_play"
+    count_key, phase_key = jax.random.split(key, len(_KEYS))[_KEYS.index("ripple_count") :][:2]
     low, high = config.ripple_count
+    limit = jnp.asarray(hand.torque_limit)
     actuator = Actuator(
-        stiffness=stiffness,
-        damping=damping,
-        dead_band=dead_band,
-        stall_torque=stall_torque,
-        no_load_speed=no_load_speed,
-        efficiency=efficiency,
-        ripple=value(next(keys), "ripple", joints),
-        ripple_count=jax.random.uniform(next(keys), joints, minval=low, maxval=high),
-        ripple_phase=jax.random.uniform(next(keys), joints, maxval=2 * jnp.pi),
-        encoder_bias=encoder_bias,
-        coulomb_friction=jnp.asarray(hand.torque_limit) * value(next(keys), "coulomb_friction", joints),
-        viscous_friction=value(next(keys), "viscous_friction", joints),
+        stiffness=config.stiffness * values["stiffness_factor"],
+        damping=config.damping * values["damping_factor"],
+        dead_band=jnp.zeros(joints) if geared else values["dead_band"],
+        stall_torque=limit * values["torque_factor"],
+        no_load_speed=jnp.asarray(hand.speed_limit) * values["speed_factor"],
+        efficiency=values["efficiency"],
+        ripple=values["ripple"],
+        ripple_count=jax.random.uniform(count_key, joints, minval=low, maxval=high),
+        ripple_phase=jax.random.uniform(phase_key, joints, maxval=2 * jnp.pi),
+        encoder_bias=values["encoder_bias"],
+        coulomb_friction=limit * values["coulomb_friction"],
+        viscous_friction=values["viscous_friction"],
     )
-    gap_key = next(keys)
-    gap = value(gap_key, "gear_gap", joints) if geared else None
-    substeps = jnp.round(jnp.minimum(latency, control_period) / timestep).astype(jnp.int32)
+    latency = values["latency"][0] + values["latency_spread"]
     return HandParams(
         actuator=actuator,
-        latency=substeps,
-        sensing_latency=jnp.clip(age, 0.0, 1.0),
-        encoder_bias=encoder_bias,
-        torque_gain=torque_gain,
-        taxel_gain=taxel_gain,
-        tilt=tilt,
-        cover=value(next(keys), "cover", ()),
-        gear_gap=gap,
+        latency=jnp.round(jnp.minimum(latency, control_period) / timestep).astype(jnp.int32),
+        sensing_latency=jnp.clip(values["sensing_latency"][0] / control_period, 0.0, 1.0),
+        encoder_bias=values["encoder_bias"],
+        torque_gain=values["torque_gain"],
+        taxel_gain=drawn["taxel_gain"][: hand.num_fingers, None],
+        tilt=drawn["gravity_tilt"][:2],
+        cover=values["cover"][0],
+        gear_gap=values["gear_gap"] if geared else None,
     )
+
+
+def _draw(key: jax.Array, config: Randomization, hand: Hand, width: jax.Array | float) -> dict[str, jax.Array]:
+    """A row of values for every name of `NOMINAL`: as many as the hand has joints or fingers, and two at least."""
+    shape, nominal = (max(hand.num_joints, hand.num_fingers, 2),), np.array(list(NOMINAL.values()), np.float32)
+    if isinstance(width, (int, float)) and width == 0:  # known beforehand: nothing is drawn
+        return {name: jnp.full(shape, value, float) for name, value in NOMINAL.items()}
+    spans = [getattr(config, name) for name in NOMINAL]
+    spans = [(-span, span) if name in _DEVIATIONS else span for name, span in zip(NOMINAL, spans, strict=True)]
+    keys = jax.random.split(key, len(_KEYS))[np.array([_KEYS.index(name) for name in NOMINAL])]
+    extreme = sample_extreme(key, config.extremes)
+    drawn = uniforms(keys, spans, extreme, shape, nominal=list(NOMINAL.values()), beyond=config.beyond)
+    rows = nominal[:, None] + width * (drawn - nominal[:, None])
+    return dict(zip(NOMINAL, rows, strict=True))
 
 
 def tilted_down(down: np.ndarray, tilt: jax.Array) -> jax.Array:

@@ -5,6 +5,7 @@ Set `DEXSIM_TEST_GPU=1` to run on the GPU (`pytest -m gpu` then runs the tests t
 """
 
 import contextlib
+import functools
 import os
 import signal
 import subprocess
@@ -29,7 +30,8 @@ if not ON_GPU and "PYTEST_XDIST_WORKER" not in os.environ:
     # process over a flag that it does not know, and versions know different ones: a process that may end tries.
     from dexsim.core.compilation import LIGHT
 
-    for option, value in LIGHT:
+    # The other core has the suite's other process: to split a program into parts for several threads only costs.
+    for option, value in (*LIGHT, ("xla_cpu_parallel_codegen_split_count", 1)):
         wanted = f"{os.environ.get('XLA_FLAGS', '')} --{option}={str(value).lower()}".strip()
         if not subprocess.run(
             [sys.executable, "-c", "import jax; jax.devices()"],
@@ -42,6 +44,11 @@ import hypothesis  # noqa: E402
 import jax  # noqa: E402
 import pytest  # noqa: E402
 
+from dexsim.core import compilation  # noqa: E402
+
+# What the library compiles runs for seconds at most here, and compiles in half the time where it is not optimised.
+compilation.jit = functools.partial(compilation.jit, once=True)
+
 # A shell that starts the suite in the background has it ignore SIGINT, which programs started by tests would inherit.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -52,23 +59,32 @@ hypothesis.settings.load_profile("dexsim")
 # These begin: two processes share the files, and the longest would otherwise be what one of them ends alone with.
 LONGEST = (
     "test_notebook",
-    "test_paper",
-    "test_devices",
-    "test_own_task",
-    "test_touch_geometry",
-    "test_trials",
     "test_env",
-    "test_brax",
+    "test_devices",
+    "test_identification",
+    "test_own_task",
+    "test_env_options",
     "test_warp",
     "test_rotate",
-    "test_view",
-    "test_substep",
-    "test_env_options",
-    "test_skin_law",
-    "test_randomization",
-    "test_object_mesh",
     "test_learning",
-    "test_physics",
+    "test_docs",
+    "test_bridge_run",
+    "test_touch_geometry",
+    "test_randomization",
+    "test_gradients",
+    "test_object_mesh",
+    "test_motors_off",
+    "test_record",
+    "test_shipped_policy",
+    "test_fine_tune",
+    "test_faults",
+    "test_tactile",
+    "test_grid",
+    "test_calibrate_failures",
+    "test_host_law",
+    "test_trials",
+    "test_substep",
+    "test_view",
 )
 # The size of the batch that the tests share. Another batch is another compilation: use this one.
 NUM_ENVS = 8
@@ -146,9 +162,9 @@ def grasp_rollout(grasp_env: Any) -> Rollout:
     """The grasp task over 8 environments; each function compiles at its first use, once."""
     return Rollout(
         env=grasp_env,
-        reset=jax.jit(lambda key: jax.vmap(grasp_env.reset)(jax.random.split(key, NUM_ENVS))),
+        reset=compilation.jit(lambda key: jax.vmap(grasp_env.reset)(jax.random.split(key, NUM_ENVS)), once=True),
         step=jax.jit(jax.vmap(grasp_env.step)),
-        restart=jax.jit(jax.vmap(grasp_env.restart)),
+        restart=compilation.jit(jax.vmap(grasp_env.restart), once=True),
         num_envs=NUM_ENVS,
     )
 

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dexsim.core.pytree import pytree_dataclass, static
-from dexsim.core.ranges import sample_extreme, uniform
+from dexsim.core.ranges import sample_extreme, uniform, uniforms
 from dexsim.geometry import rotations, sdf
 from dexsim.objects.config import (
     INACTIVE_SIZE,
@@ -165,14 +165,14 @@ def redraw_bulk(
 
 def _sample_bulk(keys: jax.Array, config: ObjectConfig, extreme: jax.Array | None) -> dict[str, jax.Array]:
     """One value of each bulk range; "com_offset" is the centre of mass [3], "restitution" a damping ratio."""
-    return {
-        "mass": uniform(keys[2], config.mass, extreme),
-        "inertia_scale": uniform(keys[3], config.inertia_scale, extreme),
-        "com_offset": config.com_offset * uniform(keys[4], (-1.0, 1.0), extreme, (3,)),
-        "friction": uniform(keys[5], config.friction, extreme),
-        "link_friction": uniform(jax.random.fold_in(keys[5], 1), config.link_friction, extreme),
-        "stiffness": uniform(keys[6], config.stiffness, extreme),
-        "restitution": damping_ratio(uniform(keys[7], config.restitution, extreme)),
+    names = ("mass", "inertia_scale", "com_offset", "friction", "stiffness", "restitution", "link_friction")
+    spans = [(-1.0, 1.0) if name == "com_offset" else getattr(config, name) for name in names]
+    keys = jnp.concatenate([keys[2:], jax.random.fold_in(keys[5], 1)[None]])
+    rows = dict(zip(names, uniforms(keys, spans, extreme, (3,)), strict=True))
+    bulk = {name: row if name == "com_offset" else row[0] for name, row in rows.items()}
+    return bulk | {
+        "com_offset": config.com_offset * bulk["com_offset"],
+        "restitution": damping_ratio(bulk["restitution"]),
     }
 
 
@@ -267,11 +267,10 @@ def _sample_slots(
     keys = jax.random.split(key, 7)
     is_sphere, is_box, is_cylinder, is_capsule, is_union = (shape_index == i for i in range(5))
     part = jnp.where(is_union, config.composition_scale, 1.0)
-    half = part * uniform(keys[0], config.box_half, extreme, (3,))
-    radius = part * uniform(keys[1], config.cylinder_radius, extreme)
-    length = part * uniform(keys[2], config.cylinder_half, extreme)
-    ball = uniform(keys[3], config.sphere_radius, extreme)
-    neck, neck_half = uniform(keys[4], config.neck_radius, extreme), uniform(keys[5], config.neck_half, extreme)
+    names = ("box_half", "cylinder_radius", "cylinder_half", "sphere_radius", "neck_radius", "neck_half")
+    drawn = uniforms(keys[:6], [getattr(config, name) for name in names], extreme, (3,))
+    half, (radius, length, ball, neck, neck_half) = part * drawn[0], drawn[1:, 0]
+    radius, length = part * radius, part * length
     box_body = jax.random.bernoulli(keys[6])
 
     # A composition is a box or a cylinder with a capsule jutting out along its axis.

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 
 from dexsim.core.config import check_ranges, setting, validate
 from dexsim.core.pytree import pytree_dataclass
-from dexsim.core.ranges import uniform
+from dexsim.core.ranges import uniforms
 from dexsim.geometry import rotations
 
 
@@ -53,11 +53,11 @@ def sample_imu(
     Where `extreme` [] is true, all three are at an end of their ranges (`dexsim.core.ranges`).
     """
     keys, sides = jax.random.split(key, 4), (-1.0, 1.0)
-    delay = uniform(keys[2], config.delay, extreme, nominal=0.0)
+    bias, drift, delay = uniforms(keys[:3], (sides, sides, config.delay), extreme, (3,), nominal=(0.0, 0.0, 0.0))
     return ImuParams(
-        bias=scale * config.bias * uniform(keys[0], sides, extreme, (3,)),
-        drift=scale * config.drift * uniform(keys[1], sides, extreme),
-        delay=jnp.clip(scale * delay / control_period, 0.0, 1.0),
+        bias=scale * config.bias * bias,
+        drift=scale * config.drift * drift[0],
+        delay=jnp.clip(scale * delay[0] / control_period, 0.0, 1.0),
         phase=jax.random.uniform(keys[3]),
     )
 

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dexsim.control import Control
+from dexsim.core.compilation import jit
 from dexsim.core.errors import ConfigError
 from dexsim.force_loop import ForceLoop, commanded_force, correct_command
 from dexsim.task_spec import TaskSpec
@@ -144,8 +145,8 @@ def test_bridge_and_simulation_show_the_policy_the_same_command(hand):
         def act(self, memory, observation):
             return memory, np.full(12, 0.2, np.float32)
 
-    state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(3), 8))
-    step, controllers = jax.jit(jax.vmap(env.step)), [Controller(Close(), hand) for _ in range(8)]
+    state = jit(jax.vmap(env.reset), once=True)(jax.random.split(jax.random.key(3), 8))
+    step, controllers = jit(jax.vmap(env.step), once=True), [Controller(Close(), hand) for _ in range(8)]
     shown, wanted, nothing = [], [], np.zeros(1)
     for _ in range(60):
         readings = jax.device_get(state.readings)

@@ -8,6 +8,7 @@ import pytest
 from remembering import KINDS, remembering
 
 import dexsim
+from dexsim.core.compilation import jit
 from dexsim.core.errors import ConfigError
 from dexsim.tasks.grasp.config import GraspConfig
 from dexsim_ppo import load_policy, record
@@ -23,8 +24,8 @@ def test_readings_and_targets_are_those_of_the_episodes(env, kind):
     policy = remembering(kind) if kind else load_policy("grasp")
     found = record.record(policy, env, episodes=3, seconds=0.3, seed=0)
     assert [len(one.time) for one in found] == [10, 10, 10]
-    state, memory = jax.jit(env.evaluation_starts)(env.evaluation_plan(3, 0)), policy.begin(3)
-    step = jax.jit(jax.vmap(env.step))
+    state, memory = jit(env.evaluation_starts, once=True)(env.evaluation_plan(3, 0)), policy.begin(3)
+    step = jit(jax.vmap(env.step), once=True)
     for tick in range(10):
         for i, one in enumerate(found):
             for name in ("joint_position", "taxel_force", "command"):

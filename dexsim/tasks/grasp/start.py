@@ -9,6 +9,7 @@ import numpy as np
 
 from dexsim.core import compilation
 from dexsim.core.errors import ConfigError
+from dexsim.core.ranges import uniforms
 from dexsim.geometry import rotations
 from dexsim.hand.kinematics import flexion_joints, hinge_angles
 from dexsim.objects.params import extent
@@ -65,8 +66,17 @@ def _candidate(key: jax.Array, shape_index: jax.Array, task: Any) -> tuple[Any, 
     hand, config, reference = task.hand, task.config, task.reference
     keys = jax.random.split(key, 7)
     object = task.sample_object(keys[0], config, shape_index)
-    noise = config.posture_noise * jax.random.uniform(keys[1], (hand.num_joints,), minval=-1.0)
-    curl = jax.random.uniform(keys[6], minval=config.curl[0], maxval=config.curl[1])
+    sides = (-1.0, 1.0)
+    drawn = uniforms(
+        jnp.concatenate([keys[1:], jax.vmap(jax.random.fold_in, (None, 0))(keys[5], jnp.array([1, 2]))]),
+        (sides, sides, config.release_gap, sides, config.release_speed, config.curl, sides, sides),
+        None,
+        (max(hand.num_joints, 3),),
+    )
+    noise = config.posture_noise * drawn[0, : hand.num_joints]
+    (roll, turn, askew), shift = drawn[1, :3], config.place_noise * drawn[3, :2]
+    gap, speed, curl = drawn[2, 0], drawn[4, 0], drawn[5, 0]
+    drift, spin = config.release_drift * drawn[6, :2], config.release_spin * drawn[7, :3]
     flexion = np.zeros(hand.num_joints, np.float32)
     flexion[flexion_joints(hand, range(1, hand.num_fingers))] = 1.0
     joints = jnp.asarray(config.posture) + noise + curl * flexion
@@ -74,7 +84,6 @@ def _candidate(key: jax.Array, shape_index: jax.Array, task: Any) -> tuple[Any, 
 
     # Long objects lie across the fingers (their z along the palm's y), turned about the palm's
     # normal and a little askew; the roll about their own axis is free.
-    roll, turn, askew = jax.random.uniform(keys[2], (3,), minval=-1.0)
     quat = rotations.axis_angle_to_quat(jnp.array([0.0, 0.0, 1.0]), roll * jnp.pi)
     most = config.turn_noise
     for axis, angle in (
@@ -85,14 +94,9 @@ def _candidate(key: jax.Array, shape_index: jax.Array, task: Any) -> tuple[Any, 
         quat = rotations.quat_multiply(rotations.axis_angle_to_quat(jnp.array(axis), jnp.asarray(angle)), quat)
     matrix = rotations.quat_to_matrix(quat)
     up = rotations.rotate_inverse(matrix, jnp.array([-1.0, 0.0, 0.0]))
-    gap = jax.random.uniform(keys[3], minval=config.release_gap[0], maxval=config.release_gap[1])
-    shift = config.place_noise * jax.random.uniform(keys[4], (2,), minval=-1.0)
     top = extent(object.size, object.position, object.active, up, object.kinds, object.quat)
     position = jnp.stack([palm_height(hand) + gap + top, reference[1] + shift[0], reference[2] + shift[1]])
-    speed = jax.random.uniform(keys[5], minval=config.release_speed[0], maxval=config.release_speed[1])
     qpos = jnp.concatenate([hinge_angles(hand, joints), position, quat])
-    drift = config.release_drift * jax.random.uniform(jax.random.fold_in(keys[5], 1), (2,), minval=-1.0)
-    spin = config.release_spin * jax.random.uniform(jax.random.fold_in(keys[5], 2), (3,), minval=-1.0)
     qvel = jnp.concatenate([jnp.zeros(hand.num_hinges), speed[None], drift, spin])
     start = Start(qpos=qpos, qvel=qvel, object=object)
     return start, clearance(hand, joints, object.shape(), position, matrix) > -_OVERLAP

@@ -14,6 +14,7 @@ from episodes import with_episode
 import dexsim
 from dexsim import observation
 from dexsim.control import Control
+from dexsim.core.compilation import jit
 from dexsim.core.errors import ConfigError
 from dexsim.env.config import EnvConfig
 from dexsim.geometry import rotations
@@ -320,7 +321,7 @@ class TestEpisodes:
 
     def test_evaluation_starts(self, grasp_env):
         """Commands and shapes as planned, never changing; starts from a pool that is not training's."""
-        starts = jax.jit(grasp_env.evaluation_starts)(grasp_env.evaluation_plan(50, 0))
+        starts = jit(grasp_env.evaluation_starts, once=True)(grasp_env.evaluation_plan(50, 0))
         assert np.all(np.asarray(starts.goal.fixed))
         np.testing.assert_allclose(starts.goal.command, np.tile(np.float32(COMMANDS), 10))
         assert np.bincount(starts.episode.object.shape_index).tolist() == [10] * 5
@@ -493,7 +494,7 @@ class TestReadings:
             ),
             backend="jax",
         )
-        state = jax.jit(env.reset)(jax.random.key(0))
+        state = jit(env.reset, once=True)(jax.random.key(0))
         np.testing.assert_array_equal(state.readings.joint_position, state.physics.qpos[:12])
         np.testing.assert_array_equal(state.readings.object_position, state.physics.qpos[12:15])
         np.testing.assert_array_equal(state.readings.taxel_force, np.zeros((5, 120)))
@@ -661,9 +662,10 @@ class TestTouch:
 
         with c_scene.double_precision():
             both = jax.jit(jax.value_and_grad(force, argnums=3))
+            taxels_at = jax.jit(lambda joints: taxel_positions(hand, forward_kinematics(hand, joints)))
             for world in worlds:
                 joints = jnp.asarray(np.asarray(after.physics.qpos[world, :12], np.float64))
-                taxels = taxel_positions(hand, forward_kinematics(hand, joints))
+                taxels = taxels_at(joints)
                 target = jax.tree.map(
                     lambda x: jnp.asarray(x, jnp.float64) if x.dtype == np.float32 else jnp.asarray(x),
                     c_scene.row(after.episode.object, world),

@@ -12,6 +12,7 @@ from simple_physics import SimplePhysics
 
 import dexsim
 from dexsim import observation
+from dexsim.core.compilation import jit
 from dexsim.core.errors import ConfigError
 from dexsim.geometry import rotations
 from dexsim.hand.kinematics import forward_kinematics, taxel_normals
@@ -86,11 +87,11 @@ def busy(make):
     env = make(
         dataclasses.replace(QUIET, three_axis=True, taxel=dataclasses.replace(QUIET_TAXELS, gain=(0.5, 1.5))), GEARED
     )
-    history = [jax.jit(lambda key: jax.vmap(env.reset)(jax.random.split(key, WORLDS)))(jax.random.key(0))]
-    step, rng = jax.jit(jax.vmap(env.step)), np.random.default_rng(0)
+    history = [jit(lambda key: jax.vmap(env.reset)(jax.random.split(key, WORLDS)), once=True)(jax.random.key(0))]
+    step, rng = jit(jax.vmap(env.step), once=True), np.random.default_rng(0)
     for _ in range(40):
         history.append(step(history[-1], jnp.asarray(rng.uniform(-1, 1, (WORLDS, 12)), jnp.float32)))
-    begun = jax.jit(jax.vmap(env.restart))(history[-1], jnp.array([True, False, True, False]))
+    begun = jit(jax.vmap(env.restart), once=True)(history[-1], jnp.array([True, False, True, False]))
     return env, history, begun
 
 
@@ -370,7 +371,7 @@ class TestGearPlay:
 def drawn(make):
     """An environment and 64 resets at three scales."""
     env = make(dataclasses.replace(QUIET, taxel=POOR_TAXELS, orientation=ImuConfig()), Randomization())
-    draw = jax.jit(lambda key, scale: jax.vmap(lambda k: env.reset(k, scale))(jax.random.split(key, 64)))
+    draw = jit(lambda key, scale: jax.vmap(lambda k: env.reset(k, scale))(jax.random.split(key, 64)), once=True)
     return env, {scale: draw(jax.random.key(0), jnp.float32(scale)) for scale in (0.0, 0.5, 1.0)}
 
 
@@ -404,7 +405,7 @@ class TestScale:
 
     def test_one_is_as_without_a_scale(self, drawn):
         env, states = drawn
-        plain = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 64))
+        plain = jit(jax.vmap(env.reset), once=True)(jax.random.split(jax.random.key(0), 64))
         for name in ("mass", "inertia", "com", "friction", "contact"):
             np.testing.assert_allclose(
                 getattr(states[1.0].episode.object, name),
@@ -426,7 +427,7 @@ class TestScale:
         env, states = drawn
         state = jax.vmap(env.widen, (0, None))(states[1.0], jnp.float32(0.0))
         np.testing.assert_array_equal(state.episode.hand.encoder_bias, states[1.0].episode.hand.encoder_bias)
-        begun = jax.jit(jax.vmap(env.restart))(state, jnp.arange(64) < 32)
+        begun = jit(jax.vmap(env.restart), once=True)(state, jnp.arange(64) < 32)
         assert np.all(np.asarray(begun.episode.hand.encoder_bias)[:32] == 0) and np.all(np.asarray(begun.scale) == 0)
         np.testing.assert_array_equal(begun.episode.hand.encoder_bias[32:], state.episode.hand.encoder_bias[32:])
         np.testing.assert_array_equal(begun.episode.object.mass[:32], np.float32(np.mean(env.config.objects.mass)))
@@ -475,7 +476,7 @@ def test_all_of_it_is_reached_from_the_command_line():
 @pytest.mark.long
 def test_the_self_test_finds_every_range_of_gears_and_taxels(make):
     env = make(Sensing(taxel=dataclasses.replace(POOR_TAXELS, rate=(8.0, 20.0), resolution=0.0)), GEARED)
-    states = jax.jit(lambda key: jax.vmap(env.reset)(jax.random.split(key, WORLDS)))(jax.random.key(0))
+    states = jit(lambda key: jax.vmap(env.reset)(jax.random.split(key, WORLDS)), once=True)(jax.random.key(0))
     names = (
         "hysteresis",
         "hysteresis_time",

@@ -64,8 +64,8 @@ def rewards(env, steps):
 def check_gradients(env, steps):
     """All gradients are finite although fingers are free; the values that they belong to."""
     actions = 0.3 * jax.random.normal(jax.random.key(1), (WORLDS, 12))
-    states = jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), WORLDS))
-    slope = jit(jax.vmap(jax.grad(rewards(env, steps), argnums=(0, 1), has_aux=True)))
+    states = jit(jax.vmap(env.reset), once=True)(jax.random.split(jax.random.key(0), WORLDS))
+    slope = jit(jax.vmap(jax.grad(rewards(env, steps), argnums=(0, 1), has_aux=True)), once=True)
     gradient, (_, force) = jax.device_get(slope(actions, jnp.zeros((WORLDS, 3)), states))
     assert np.any(force == 0) and np.any(force > 0), "free fingers and pressing ones are needed"
     assert all(np.all(np.isfinite(part)) for part in gradient)
@@ -86,12 +86,12 @@ def test_gradients_are_finite_through_the_real_physics(grasp_env, steps):
 def test_the_gradient_of_the_reward_is_its_finite_difference(env):
     """Central differences in single precision along random directions of the action."""
     keys = jax.random.split(jax.random.key(2), 3)
-    states = jit(jax.vmap(env.reset))(jax.random.split(keys[0], WORLDS))
+    states = jit(jax.vmap(env.reset), once=True)(jax.random.split(keys[0], WORLDS))
     actions = 0.3 * jax.random.normal(keys[1], (WORLDS, 12))
     way = jax.random.normal(keys[2], actions.shape)
     reward = lambda action, state: rewards(env, 3)(action, jnp.zeros(3), state)[1][0]  # noqa: E731
-    exact = jnp.sum(jit(jax.vmap(jax.grad(reward)))(actions, states) * way, -1)
-    run, step = jit(jax.vmap(reward)), 0.01
+    exact = jnp.sum(jit(jax.vmap(jax.grad(reward)), once=True)(actions, states) * way, -1)
+    run, step = jit(jax.vmap(reward), once=True), 0.01
     numeric = (run(actions + step * way, states) - run(actions - step * way, states)) / (2 * step)
     close = np.isclose(exact, numeric, rtol=0.05, atol=0.02 * np.abs(numeric).max())
     assert np.mean(close) >= 0.75, (exact, numeric)

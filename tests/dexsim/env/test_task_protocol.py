@@ -10,6 +10,7 @@ from simple_physics import SimplePhysics
 
 import dexsim
 from dexsim import registry
+from dexsim.core.compilation import jit
 from dexsim.core.config import setting
 from dexsim.core.pytree import pytree_dataclass
 from dexsim.env.config import EnvConfig
@@ -106,9 +107,9 @@ def env(monkeypatch):
 
 def test_it_runs_from_reset_to_restart(env):
     """In `SimplePhysics` an object falls freely: it is lost after sqrt(2 reach / g), and the episode begins again."""
-    state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), WORLDS))
+    state = jit(jax.vmap(env.reset), once=True)(jax.random.split(jax.random.key(0), WORLDS))
     assert state.obs["actor"].shape == (WORLDS, 12 + 5) and state.obs["critic"].shape == (WORLDS, 24)
-    step, restart = jax.jit(jax.vmap(env.step)), jax.jit(jax.vmap(env.restart))
+    step, restart = (jit(jax.vmap(one), once=True) for one in (env.step, env.restart))
     lost = int(np.ceil(np.sqrt(2 * env.config.reach / 9.81) / env.control_period))
     for tick in range(1, lost + 1):
         state = step(state, jnp.zeros((WORLDS, env.action_size)))
@@ -121,7 +122,7 @@ def test_it_runs_from_reset_to_restart(env):
 
 
 def test_it_is_evaluated_by_its_own_plan_and_report(env):
-    starts = jax.jit(env.evaluation_starts)(env.evaluation_plan(8, 0))
+    starts = jit(env.evaluation_starts, once=True)(env.evaluation_plan(8, 0))
     assert starts.reward.shape == (8,)
     report = env.summarize({}, np.array([[True, True], [True, False]]))
     assert report["headline"] == {"held": 0.5}

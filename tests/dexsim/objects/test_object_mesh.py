@@ -10,6 +10,7 @@ import trimesh
 from simple_physics import SimplePhysics
 
 import dexsim
+from dexsim.core.compilation import jit
 from dexsim.core.errors import AssetError, ConfigError
 from dexsim.geometry import distance, mesh, rotations, sdf
 from dexsim.objects.boxes import fit_boxes
@@ -183,8 +184,8 @@ def test_an_environment_steps_with_a_mesh(simple, folder):
     objects = ObjectConfig(mesh=str(folder / "ell.obj"))
     env = dexsim.make("grasp", GraspConfig(objects=objects, pool_size=16, touch_method="grid"), backend="c")
     assert set(env.primitive_kinds) == {"box"} and "objects.mesh_size" in env.task.object_ranges
-    state = jax.jit(lambda key: jax.vmap(env.reset)(jax.random.split(key, WORLDS)))(jax.random.key(0))
-    step, felt = jax.jit(jax.vmap(env.step)), 0
+    state = jit(lambda key: jax.vmap(env.reset)(jax.random.split(key, WORLDS)), once=True)(jax.random.key(0))
+    step, felt = jit(jax.vmap(env.step), once=True), 0
     for _ in range(12):
         state = step(state, jnp.ones((WORLDS, 12)))
         felt += np.sum(state.readings.taxel_force > 0)
@@ -210,8 +211,8 @@ def test_a_mesh_is_turned_like_the_cube_that_it_is(simple, folder):
 def test_an_l_is_dropped_on_the_real_physics(folder):
     config = GraspConfig(pool_size=80, objects=ObjectConfig(mesh=str(folder / "ell.obj"), mesh_size=(0.9, 1.1)))
     env = dexsim.make("grasp", config, backend="c", num_envs=8)
-    state = jax.jit(lambda key: jax.vmap(env.reset)(jax.random.split(key, 8)))(jax.random.key(0))
-    step, force, taxels = jax.jit(jax.vmap(env.step)), 0, 0
+    state = jit(lambda key: jax.vmap(env.reset)(jax.random.split(key, 8)), once=True)(jax.random.key(0))
+    step, force, taxels = jit(jax.vmap(env.step), once=True), 0, 0
     (size,) = check(env, step, state, key=jax.random.key(1), ticks=9, names=["ObjectConfig.mesh_size"])
     assert {"geom_size", "geom_pos"} <= set(size.changed) and max(size.object, size.joint) > 1e-6
     for _ in range(40):

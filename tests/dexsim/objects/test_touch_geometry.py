@@ -9,6 +9,7 @@ import pytest
 import trimesh
 
 import dexsim
+from dexsim.core.compilation import jit
 from dexsim.core.errors import ConfigError
 from dexsim.geometry import rotations, surface_points
 from dexsim.hand.kinematics import forward_kinematics
@@ -44,7 +45,7 @@ def gripped(objects):
     """An environment that feels by surface points, and batches of its states [WORLDS] while hands close."""
     config = GraspConfig(objects=objects, pool_size=16, skin=SKIN, touch_method="surface_points")
     env = dexsim.make("grasp", config, backend="c", num_envs=WORLDS)
-    reset, step, states = jax.jit(jax.vmap(env.reset_to)), jax.jit(jax.vmap(env.step)), []
+    reset, step, states = jit(jax.vmap(env.reset_to), once=True), jit(jax.vmap(env.step), once=True), []
     # Pools hold one shape after the other: two of each at a time. One batch's means scatter by a half of themselves.
     for batch in range(4):
         rows = jnp.arange(WORLDS) * 2 + batch % 2
@@ -56,26 +57,26 @@ def gripped(objects):
     return env, states
 
 
-def closed_forms(env, state):
-    """Taxel forces [WORLDS, F, N] of the primitives, and contact centres [WORLDS, F, 3], from the state alone."""
+def closed_forms(env):
+    """A function of a state alone: taxel forces [WORLDS, F, N] of the primitives, and the hand's pose."""
 
-    def one(physics, target, finger_force, cover):
+    def one(state):
+        physics, target, cover = state.physics, state.episode.object, state.episode.hand.cover
         place = physics.qpos[12:]
         pose = forward_kinematics(env.hand, physics.qpos[:12])
         turn = rotations.quat_to_matrix(place[3:] / jnp.linalg.norm(place[3:]))
-        touch = feel_links(env.hand, pose, target.shape(), place[:3], turn, finger_force, SKIN, cover=cover)
+        touch = feel_links(env.hand, pose, target.shape(), place[:3], turn, state.finger_force, SKIN, cover=cover)
         return touch.force, pose
 
-    episode = state.episode
-    return jax.jit(jax.vmap(one))(state.physics, episode.object, state.finger_force, episode.hand.cover)
+    return jit(jax.vmap(one), once=True)
 
 
 def compare(env, states, kinds):
     """Per kind a row for each touching finger: share of the force on other taxels, error of the centre m."""
     centre = jax.jit(jax.vmap(lambda force, pose: reduce_touch_links(force, env.hand, pose)))
-    found = {kind: [] for kind in kinds}
+    found, felt = {kind: [] for kind in kinds}, closed_forms(env)
     for state in states:
-        wanted, pose = closed_forms(env, state)
+        wanted, pose = felt(state)
         read = state.sensor_input.taxel_force
         (total, at), (_, place) = centre(wanted, pose), centre(read, pose)
         moved = np.abs(np.asarray(read) - wanted).sum(-1) / 2

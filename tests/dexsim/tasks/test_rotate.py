@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 import dexsim
 from dexsim import observation
+from dexsim.core.compilation import jit
 from dexsim.core.errors import ConfigError
 from dexsim.env.task import GroundTruth
 from dexsim.geometry.sdf import signed_distance
@@ -585,9 +586,9 @@ class TestEnvironment:
     def test_lives_through_an_episode(self, rotate_env):
         """A still hand keeps the cube; counts start anew with the next episode."""
         env = rotate_env
-        state = jax.jit(lambda key: jax.vmap(env.reset)(jax.random.split(key, 8)))(jax.random.key(0))
+        state = jit(lambda key: jax.vmap(env.reset)(jax.random.split(key, 8)), once=True)(jax.random.key(0))
         assert state.obs["actor"].shape == (8, 65) and state.obs["critic"].shape == (8, 149)
-        step, restart = jax.jit(jax.vmap(env.step)), jax.jit(jax.vmap(env.restart))
+        step, restart = (jit(jax.vmap(one), once=True) for one in (env.step, env.restart))
         for _ in range(30):
             state = step(state, jnp.zeros((8, 12)))
         assert not np.any(state.terminated) and np.all(np.isfinite(state.reward))
