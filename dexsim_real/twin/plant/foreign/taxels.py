@@ -33,6 +33,6 @@ class ContactTaxels(EmulatedTaxels):
             felt = np.clip((_NOT_AT_ALL - nearest) / (_NOT_AT_ALL - _FULLY), 0.0, 1.0)
             share = np.exp(-(square - nearest**2) / (2 * _SPREAD**2))
             share *= felt / share.sum()
-            force[finger] += share[:, None] * ((self._axes[finger] @ frame.T) @ tangent)
+            force[finger, :, :2] += share[:, None] * (self._axes[finger][:, :2] @ (frame.T @ tangent))
             force[finger, :, 2] += share * float(np.linalg.norm(normal))
         return force
