@@ -138,10 +138,15 @@ def alignment(calibration: Calibration) -> np.ndarray:
 
 
 def calibrated_hand(hand: Hand, calibration: Calibration | None) -> Hand:
-    """The hand with the `force_per_torque` of its calibration, where fingertips were pressed."""
+    """The hand with the `force_per_torque` of its calibration, where fingertips were pressed.
+
+    The first finger, the thumb, keeps its own: in a grasp its root joint also bears what lies on its links, which a
+    press does not show.
+    """
     if calibration is None or calibration.force_per_torque is None:
         return hand
-    found = np.asarray(calibration.force_per_torque, np.float32)[0]
+    found = np.array(calibration.force_per_torque, np.float32)[0]
+    found[0] = 0.0
     return dataclasses.replace(hand, force_per_torque=np.where(found > 0, found, hand.force_per_torque))
 
 

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from dexsim.calibration.maps import (
     Calibration,
     Side,
+    calibrated_hand,
     load_calibration,
     normalised_torque,
     save_calibration,
@@ -132,7 +133,10 @@ def test_a_file_from_before_has_no_force_per_torque(hand, sound, tmp_path):
     (tmp_path / "c.toml").write_text(old)
     assert load_calibration(tmp_path / "c.toml", hand).force_per_torque is None
     (tmp_path / "c.toml").write_text(sound)
-    np.testing.assert_array_equal(load_calibration(tmp_path / "c.toml", hand).force_per_torque[:, 0], [12, 11, 13])
+    calibration = load_calibration(tmp_path / "c.toml", hand)
+    np.testing.assert_array_equal(calibration.force_per_torque[:, 0], [12, 11, 13])
+    wanted = [hand.force_per_torque[0], 12, 12, 12, 12]  # The thumb keeps its own.
+    np.testing.assert_allclose(calibrated_hand(hand, calibration).force_per_torque, wanted)
 
 
 def test_three_fingers_are_of_another_hand(hand, sound, tmp_path):
