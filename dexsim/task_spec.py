@@ -171,7 +171,7 @@ def next_target(
     angle = reflex_target(hand, move_reflex(control.reflex, period, reflex, wanted, force))
     # Within the policy's own limits; what they cut off does not wind up.
     pressed = move_target(control, hand, chosen + angle, jnp.zeros_like(action), measured)
-    return pressed, closing(hand) * (pressed - chosen)[hand.root_joint]
+    return pressed, (pressed - chosen)[hand.root_joint] * closing(hand)
 
 
 def _triple(values: Iterable[float]) -> tuple[float, float, float]:

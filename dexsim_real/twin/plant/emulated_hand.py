@@ -167,7 +167,8 @@ class EmulatedHand:
     # --- trials ---------------------------------------------------------------------------------
 
     def _make_parts(self) -> None:
-        self._drives, self._skin = Drives(self.hand.torque_limit, self.hand.speed_limit), EmulatedTaxels(self.hand)
+        self._drives: Any = Drives(self.hand.torque_limit, self.hand.speed_limit)
+        self._skin = EmulatedTaxels(self.hand)
 
     def _build(self) -> Scene:
         self._palm_face = PALM_FACE

@@ -11,15 +11,14 @@ cannot be found:
 """
 
 import dataclasses
+import tomllib
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from dexsim.core.files import read_toml
-from dexsim.hand.kinematics import Hand, forward_kinematics
+from dexsim.hand.kinematics import Hand
 from dexsim_real.core.errors import HandError
 
 PREFIX = "plant/"  # of all names of the MJCF in the model of a trial
@@ -52,7 +51,7 @@ def read_model(path: str | Path, hand: Hand) -> ForeignModel:
       HandError: it cannot be read, or does not fit the hand.
     """
     path = Path(path)
-    names = _names(path) if path.suffix == ".toml" else {"model": path.name}
+    names: dict[str, Any] = _names(path) if path.suffix == ".toml" else {"model": path.name}
     spec = _load(path.parent / names["model"])
     model = spec.compile()
     if not _TIMESTEPS[0] <= model.opt.timestep <= _TIMESTEPS[1]:
@@ -79,7 +78,7 @@ def read_model(path: str | Path, hand: Hand) -> ForeignModel:
 
 def _names(path: Path) -> dict[str, Any]:
     try:
-        table = read_toml(path)
+        table = tomllib.loads(path.read_text())
     except (OSError, ValueError) as error:
         raise HandError(f"{path}: cannot be read ({_line(error)})") from None
     wrong = [key for key, value in table.items() if key not in _KEYS or not isinstance(value, _KEYS[key])]
@@ -202,14 +201,14 @@ def _check_places(
 ) -> None:
     """Check where the fingertips are with all joints at 0, and with each at its upper end."""
     data, at = mujoco.MjData(model), model.jnt_qposadr[joints]
+    reference = mujoco.MjModel.from_xml_path(str(hand.model_path))
     for j in range(-1, hand.num_joints):
         posture = np.zeros(hand.num_joints)
         posture[j] = hand.joint_upper[j] if j >= 0 else 0.0
         data.qpos[at] = posture
         mujoco.mj_kinematics(model, data)
         found = (data.site_xpos[tips] - palm[0]) @ palm[1]
-        wanted = forward_kinematics(hand, jnp.asarray(posture, jnp.float32)).tip_position
-        apart = np.linalg.norm(found - np.asarray(wanted), axis=-1)
+        apart = np.linalg.norm(found - _hand_tips(reference, hand, posture)[0], axis=-1)
         worst = int(apart.argmax())
         if apart[worst] > _APART:
             where = "all joints at 0" if j < 0 else f"{model.joint(joints[j]).name} at {posture[j]:.2f} rad"
@@ -217,6 +216,19 @@ def _check_places(
                 f"{path}: with {where} the tip of {hand.finger_names[worst]} is {1e3 * apart[worst]:.0f} mm from where "
                 f"the hand has it: check palm frame, and order, axes and zeros of the joints"
             )
+
+
+def _hand_tips(reference: mujoco.MjModel, hand: Hand, posture: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Positions [F, 3] and rotations [F, 3, 3] of the fingertips in the palm frame, by the hand's own MJCF."""
+    data = mujoco.MjData(reference)
+    for name, angle in zip(hand.joint_names, posture, strict=True):
+        data.joint(name).qpos[0] = angle
+    mujoco.mj_kinematics(reference, data)
+    palm = data.body(hand.palm)
+    bodies = [data.body(hand.body_names[body]) for body in hand.tip_body]
+    turns = np.array([palm.xmat.reshape(3, 3).T @ body.xmat.reshape(3, 3) for body in bodies])
+    places = [(body.xpos - palm.xpos) @ palm.xmat.reshape(3, 3) for body in bodies]
+    return np.array(places) + np.einsum("fij,fj->fi", turns, hand.tip_offset), turns
 
 
 def _add_lattices(
@@ -228,7 +240,8 @@ def _add_lattices(
     tips: list[int],
 ) -> list[str]:
     """Add the frames of the taxels: at the tip sites, turned as on the hand with all joints at 0."""
-    turns = np.asarray(forward_kinematics(hand, jnp.zeros(hand.num_joints)).tip_rotation, float)
+    reference = mujoco.MjModel.from_xml_path(str(hand.model_path))
+    _, turns = _hand_tips(reference, hand, np.zeros(hand.num_joints))
     names = [f"lattice_{finger}" for finger in hand.finger_names]
     for name, site, turn, offset in zip(names, tips, turns, hand.tip_offset, strict=True):
         turn, body = palm[1] @ turn, int(model.site_bodyid[site])
