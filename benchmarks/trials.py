@@ -60,7 +60,7 @@ def twin_words(options: dict[str, Any], seed: int, number: int, command: float, 
     return words
 
 
-def shown_command(twin: subprocess.Popen) -> list[str]:
+def shown_command(twin: subprocess.Popen, errors: Path) -> list[str]:
     """Arguments of the runner, from the output of the emulated hand."""
     until = time.monotonic() + _START
     for line in twin.stdout:
@@ -69,7 +69,7 @@ def shown_command(twin: subprocess.Popen) -> list[str]:
             return words[words.index("-m") :]
         if time.monotonic() > until:
             break
-    raise SystemExit(f"the emulated hand did not start (exit code {twin.poll()})")
+    raise SystemExit(f"the emulated hand did not start (exit code {twin.poll()}): {errors.read_text().strip()[-500:]}")
 
 
 def real_trial(options: dict[str, Any], seed: int, number: int, command: float, shape: str) -> dict[str, Any]:
@@ -86,7 +86,7 @@ def _run(options: dict[str, Any], words_of_twin: list[str], folder: Path) -> dic
         runner = None
         try:
             words = [
-                *shown_command(twin),
+                *shown_command(twin, folder / "twin.txt"),
                 "--seconds",
                 f"{limit + _AFTER:g}",
                 "--place",

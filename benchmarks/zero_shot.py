@@ -274,7 +274,8 @@ def arguments() -> argparse.Namespace:
     return given
 
 
-def main() -> None:
+def main() -> int:
+    """The command. Returns its exit code."""
     given = arguments()
     options = {
         "task": given.task,
@@ -311,7 +312,10 @@ def main() -> None:
     if given.json:
         found = {"options": options, "metrics": here, "simulation": there, "do_nothing": idle, "trials": reports}
         given.json.write_text(json.dumps(found, indent=1))
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    from dexsim.core import cli
+
+    cli.run(lambda _: main())
