@@ -257,12 +257,12 @@ def _set_servos(spec: mujoco.MjSpec, model: mujoco.MjModel, hand: Hand, actuator
     for j, k in enumerate(actuators):
         actuator, joint, gear = spec.actuators[k], int(model.actuator_trnid[k, 0]), model.actuator_gear[k, 0]
         servo = model.actuator_biastype[k] == int(mujoco.mjtBias.mjBIAS_AFFINE) and model.actuator_biasprm[k, 1] < 0
-        limits = [np.abs(model.actuator_forcerange[k]).min()] if model.actuator_forcelimited[k] else []
+        limits = [np.abs(model.actuator_forcerange[k]).max()] if model.actuator_forcelimited[k] else []
         if model.jnt_actfrclimited[joint]:
-            limits.append(np.abs(model.jnt_actfrcrange[joint]).min() / abs(gear))
+            limits.append(np.abs(model.jnt_actfrcrange[joint]).max() / abs(gear))
         if not servo:
             if model.actuator_ctrllimited[k]:
-                limits.append(np.abs(model.actuator_ctrlrange[k] * model.actuator_gainprm[k, 0]).min())
+                limits.append(np.abs(model.actuator_ctrlrange[k] * model.actuator_gainprm[k, 0]).max())
             actuator.set_to_position(kp=STIFFNESS / gear**2, kv=DAMPING / gear**2)
         limit = min(limits, default=hand.torque_limit[j] / abs(gear))
         actuator.forcelimited, actuator.forcerange = mujoco.mjtLimited.mjLIMITED_TRUE, [-limit, limit]
