@@ -1,8 +1,5 @@
-"""The grip reflex against closed forms; its limits; the same on the bridge; a policy's file carries it."""
+"""The grip reflex against closed forms, and its limits. `test_force_loop.py` compares bridge and simulation."""
 
-import dataclasses
-
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -97,47 +94,3 @@ def test_targets_stay_within_reach_and_what_is_cut_off_does_not_wind_up(hand):
 def test_a_task_without_a_force_command_refuses_a_reflex():
     with pytest.raises(ConfigError, match="Control.reflex needs a force command"):
         TaskSpec(name="turn", fields=(), control=Control(reflex=REFLEX))
-
-
-def test_bridge_and_simulation_send_the_same_targets(hand):
-    """The environment's readings, given to the controller, lead to the targets of the environment."""
-    pytest.importorskip("serial")
-    import dexsim
-    from dexsim.tasks.grasp.config import GraspConfig
-    from dexsim_real.control.controller import Controller
-    from dexsim_real.sensors.hand import HandMeasurement
-    from dexsim_real.sensors.readings import ObjectEstimate
-
-    config = GraspConfig(pool_size=64)
-    control = dataclasses.replace(config.control, reflex=dataclasses.replace(REFLEX, gain=0.1))
-    env = dexsim.make("grasp", dataclasses.replace(config, control=control), num_envs=8)
-
-    class Close:
-        task, spec, control_rate = env.name, env.spec, env.control_rate
-        observation_layout = env.observation_layout["actor"]
-
-        def __call__(self, observation):
-            return np.full(12, 0.2, np.float32)
-
-    state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(3), 8))
-    step, controllers = jax.jit(jax.vmap(env.step)), [Controller(Close(), hand) for _ in range(8)]
-    for index, controller in enumerate(controllers):
-        controller.start(np.asarray(state.joint_target[index]))
-    sent, wanted, nothing, largest = [], [], np.zeros(1), 0.0
-    encoder = jax.jit(jax.vmap(lambda s: env.motors.encoder(s.physics.qpos[env.physics.joint_qpos], s.gear)))
-    for _ in range(60):
-        before, true = jax.device_get((state, encoder(state)))
-        for index, controller in enumerate(controllers):
-            row = jax.tree.map(lambda x, i=index: x[i], before.readings)
-            # Targets are kept near the true angles in simulation, near the measured ones on the hand.
-            measured = HandMeasurement(
-                true[index], row.joint_torque, row.taxel_force, row.joint_torque, nothing, nothing, nothing
-            )
-            seen = ObjectEstimate(row.object_position, row.object_velocity, row.object_quat)
-            command = float(before.goal.command[index])
-            sent.append(controller.tick(measured, seen, row.goal_quat, command).target)
-        state = step(state, jnp.full((8, 12), 0.2))
-        wanted += list(np.asarray(state.joint_target))
-        largest = max(largest, float(np.abs(np.asarray(state.reflex)).max()))
-    np.testing.assert_allclose(sent, wanted, atol=1e-5)
-    assert largest > 0.02, "no hand has pressed"
