@@ -1,16 +1,10 @@
-"""Trials of a policy on the emulated hand in real time, as a user runs them: the paper's metrics.
-
-    python benchmarks/trials.py --task rotate --trials 10
-    python benchmarks/trials.py --task grasp --trials 25
+"""Trials on the emulated hand in real time, as a user runs them (`zero_shot.py --real-time`).
 
 For each trial a new `python -m dexsim_real.twin` provides one object, and the command that it prints,
 `python -m dexsim_real.run ...`, controls it through RS485 frames, an IMU's bytes and a camera's masks. The metrics use
-the true state of the emulated hand. Trial k of a seed is trial k of `benchmarks/zero_shot.py`, which computes it in
-virtual time.
+the true state of the emulated hand. Trial k of a seed is trial k in virtual time.
 """
 
-import argparse
-import contextlib
 import json
 import os
 import shlex
@@ -21,8 +15,6 @@ import tempfile
 import time
 from pathlib import Path
 from typing import Any
-
-from zero_shot import COMMANDS, TARGETS, metrics, run_all, simulated, table
 
 ROOT = Path(__file__).resolve().parent.parent
 LIMITS = {"grasp": 8.0, "rotate": 120.0}  # s, the tasks' own
@@ -37,19 +29,17 @@ def start(words: list[str], **options: Any) -> subprocess.Popen:
     )
 
 
-def twin_words(options: argparse.Namespace, number: int, folder: Path) -> list[str]:
-    """Arguments of the emulated hand for a trial; commands and shapes as in `zero_shot.py`."""
-    from dexsim_real.twin.plant.shapes import SHAPES
-
+def twin_words(options: dict[str, Any], seed: int, number: int, command: float, shape: str, folder: Path) -> list[str]:
+    """Arguments of the emulated hand for a trial."""
     words = [
         "-m",
         "dexsim_real.twin",
         "--task",
-        options.task,
+        options["task"],
         "--seed",
-        str(options.seed),
+        str(seed),
         "--parameters",
-        options.parameters,
+        options["parameters"],
         "--first",
         str(number),
         "--trials",
@@ -58,25 +48,19 @@ def twin_words(options: argparse.Namespace, number: int, folder: Path) -> list[s
         str(folder / "hand"),
         "--output",
         str(folder / "twin.json"),
-        *options.twin.split(),
+        *options["twin"].split(),
     ]
-    if options.task == "grasp":
-        words += [
-            "--mask-socket",
-            str(folder / "masks"),
-            "--command",
-            f"{COMMANDS[number % len(COMMANDS)]:g}",
-            "--shape",
-            SHAPES[number // len(COMMANDS) % len(SHAPES)],
-        ]
+    if options["task"] == "grasp":
+        words += ["--mask-socket", str(folder / "masks"), "--command", f"{command:g}", "--shape", shape]
     else:
         words += ["--imu-link", str(folder / "imu")]
-    words += ["--policy", options.policy] if options.policy else []
-    words += ["--seconds", f"{options.seconds:g}"] if options.seconds else []
-    return words + ([] if options.realtime else ["--no-realtime"])
+    words += ["--policy", options["policy"]]
+    words += ["--seconds", f"{options['seconds']:g}"] if options["seconds"] else []
+    words += ["--plant-model", options["plant_model"]] if options["plant_model"] else []
+    return words
 
 
-def shown_command(twin: subprocess.Popen) -> list[str]:
+def shown_command(twin: subprocess.Popen, errors: Path) -> list[str]:
     """Arguments of the runner, from the output of the emulated hand."""
     until = time.monotonic() + _START
     for line in twin.stdout:
@@ -85,19 +69,24 @@ def shown_command(twin: subprocess.Popen) -> list[str]:
             return words[words.index("-m") :]
         if time.monotonic() > until:
             break
-    raise SystemExit(f"the emulated hand did not start (exit code {twin.poll()})")
+    raise SystemExit(f"the emulated hand did not start (exit code {twin.poll()}): {errors.read_text().strip()[-500:]}")
 
 
-def run_trial(options: argparse.Namespace, number: int, folder: Path) -> dict[str, Any]:
+def real_trial(options: dict[str, Any], seed: int, number: int, command: float, shape: str) -> dict[str, Any]:
     """Run one trial: the referee's report, with statistics of the bridge as `bridge`."""
+    with tempfile.TemporaryDirectory(prefix="dexsim-trial-") as folder:
+        return _run(options, twin_words(options, seed, number, command, shape, Path(folder)), Path(folder))
+
+
+def _run(options: dict[str, Any], words_of_twin: list[str], folder: Path) -> dict[str, Any]:
     began = time.monotonic()
-    limit = options.seconds or LIMITS[options.task]
+    limit = options["seconds"] or LIMITS[options["task"]]
     with (folder / "twin.txt").open("w") as errors, (folder / "run.txt").open("w") as shown:
-        twin = start(twin_words(options, number, folder), stdout=subprocess.PIPE, stderr=errors)
+        twin = start(words_of_twin, stdout=subprocess.PIPE, stderr=errors)
         runner = None
         try:
             words = [
-                *shown_command(twin),
+                *shown_command(twin, folder / "twin.txt"),
                 "--seconds",
                 f"{limit + _AFTER:g}",
                 "--place",
@@ -107,8 +96,12 @@ def run_trial(options: argparse.Namespace, number: int, folder: Path) -> dict[st
                 str(folder / "run.log"),
                 "--output",
                 str(folder / "run.json"),
-                *options.runner.split(),
-                *([] if options.realtime else ["--no-realtime"]),
+                *(
+                    word
+                    for name, value in options["limit"].items()
+                    for word in (f"--safety.{name.replace('_', '-')}", f"{value:g}")
+                ),
+                *options["runner"].split(),
             ]
             runner = start(words, stdout=shown, stderr=subprocess.STDOUT)
             until = time.monotonic() + _START + limit + _AFTER
@@ -152,91 +145,3 @@ def _collect(folder: Path, code: int, wall: float) -> dict[str, Any]:
             "slipped_s": twin["physics"]["slipped_s"],
         },
     }
-
-
-def line(report: dict[str, Any]) -> str:
-    """One trial as a line of text."""
-    result = (
-        f"command {report['command']:.2f} {report['shape']:<11} fingers {report['finger_force']:6.2f} N"
-        if report["task"] == "grasp"
-        else f"{report['successes']:3d} successes ({report['paper_successes']} as the paper counts)"
-    )
-    bridge = report["bridge"]
-    return (
-        f"{report['trial']:4d}  {result}  {report['seconds']:7.2f} s  {report['end']}  ({report['wall']:.0f} s; "
-        f"{bridge['unanswered']} of {bridge['exchanges']} exchanges unanswered, policy late p99 "
-        f"{bridge['policy_jitter']['p99_ms']:.1f} ms, simulated time slipped {bridge['slipped_s']:.2f} s)"
-    )
-
-
-def idle_trials(options: argparse.Namespace, policy: str, count: int) -> list[dict[str, Any]]:
-    """The trials of a hand that does nothing, in virtual time."""
-    idle = {name: getattr(options, name) for name in ("task", "parameters", "seconds")}
-    idle |= {"policy": policy, "seed": [options.seed], "safety": True, "set": {}, "idle": True}
-    return run_all(idle, options.first + count, 1, show=False)[options.first :]
-
-
-def arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--task", choices=("grasp", "rotate"), required=True)
-    parser.add_argument("--policy", help="policy file; by default the shipped policy of the task")
-    parser.add_argument("--trials", type=int, default=10)
-    parser.add_argument("--first", type=int, default=0, help="number of the first trial")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument(
-        "--seconds", type=float, help="time limit of a trial in s; by default that of the task (8 or 120)"
-    )
-    parser.add_argument(
-        "--parameters",
-        choices=("outside", "inside", "nominal"),
-        default="outside",
-        help="parameters of hand and object: outside training's ranges, inside them, or nominal",
-    )
-    parser.add_argument("--twin", default="", help="more options of `dexsim_real.twin`, as one argument")
-    parser.add_argument("--runner", default="", help="more options of `dexsim_real.run`, as one argument")
-    parser.add_argument("--no-realtime", dest="realtime", action="store_false")
-    parser.add_argument(
-        "--no-baseline",
-        dest="baseline",
-        action="store_false",
-        help="do not run the trials with an idle hand, too (in virtual time)",
-    )
-    parser.add_argument("--json", type=Path, help="JSON file for all results")
-    return parser.parse_args()
-
-
-def main() -> None:
-    options = arguments()
-    reports = []
-    with contextlib.suppress(KeyboardInterrupt):  # Show the trials done so far.
-        for number in range(options.first, options.first + options.trials):
-            with tempfile.TemporaryDirectory(prefix="dexsim-trial-") as folder:
-                reports.append(run_trial(options, number, Path(folder)))
-            print(line(reports[-1]), file=sys.stderr, flush=True)
-    if not reports:
-        sys.exit(130)
-    policy = options.policy or options.task
-    here, there = metrics(options.task, policy, reports), simulated(options.task, policy)
-    idle = metrics(options.task, policy, idle_trials(options, policy, len(reports))) if options.baseline else {}
-    print(
-        f"{options.task}: {len(reports)} trials in real time, parameters {options.parameters}, seed {options.seed}; "
-        f"targets {TARGETS[options.task]}"
-    )
-    print(table(here, there, idle))
-    if options.json:
-        options.json.write_text(
-            json.dumps(
-                {
-                    "options": {k: str(v) for k, v in vars(options).items()},
-                    "metrics": here,
-                    "simulation": there,
-                    "do_nothing": idle,
-                    "trials": reports,
-                },
-                indent=1,
-            )
-        )
-
-
-if __name__ == "__main__":
-    main()

@@ -4,10 +4,13 @@
     python benchmarks/zero_shot.py --task grasp --trials 50 --parameters inside --set gear_play=0
     python benchmarks/zero_shot.py --task grasp --trials 50 --seed 0 1 2 3 --processes 2
     python benchmarks/zero_shot.py --task grasp --trials 25 --limit speed=20 --limit margin=0
+    python benchmarks/zero_shot.py --task grasp --trials 20 --plant-model assets/plants/foreign_right.xml
+    python benchmarks/zero_shot.py --task rotate --trials 3 --real-time
 
 In virtual time (`dexsim_real.twin.virtual`): frames, emulated palm board, and the bridge's sensing, safety and
-controller run in one process, as fast as they compute. The metrics use the true state, not the measurements of the
-bridge. Trial k of a seed does not depend on the other trials. A hand that does nothing gets the same trials.
+controller run in one process, as fast as they compute. With `--real-time` hand and runner are processes of their own,
+as for a user (`trials.py`). The metrics use the true state, not the measurements of the bridge. Trial k of a seed does
+not depend on the other trials. A hand that does nothing gets the same trials, in virtual time.
 """
 
 import argparse
@@ -23,6 +26,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from trials import real_trial
+from zero_shot_table import simulated, table
 
 TARGETS = {"grasp": "held 90 %, r 0.8", "rotate": "25.1 successes, 17.9 a minute, 84.3 s to fall"}
 COMMANDS = (0.0, 0.25, 0.5, 0.75, 1.0)
@@ -51,15 +56,23 @@ def load(name: str, idle: bool) -> tuple[Any, Any, Any]:
 
 def run_trial(options: dict[str, Any], seed: int, number: int) -> dict[str, Any]:
     """The referee's report of one trial."""
-    from dexsim_real.control.safety import SafetyConfig
-    from dexsim_real.twin.plant.emulated_hand import EmulatedHand
     from dexsim_real.twin.plant.shapes import SHAPES
+
+    # As in the task's evaluation: five commands for each shape.
+    command, shape = COMMANDS[number % len(COMMANDS)], SHAPES[number // len(COMMANDS) % len(SHAPES)]
+    one = real_trial if options.get("real_time") else virtual_trial
+    return one(options, seed, number, command, shape)
+
+
+def virtual_trial(options: dict[str, Any], seed: int, number: int, command: float, shape: str) -> dict[str, Any]:
+    """One trial in virtual time: the referee's report, with the bridge's measurements as `bridge`."""
+    from dexsim_real.control.safety import SafetyConfig
+    from dexsim_real.twin.plant.foreign.hand import hand_of
     from dexsim_real.twin.virtual import RunOptions, VirtualRun
 
     hand, controller, calibration = load(options["policy"], options.get("idle", False))
-    # As in the task's evaluation: five commands for each shape.
-    command, shape = COMMANDS[number % len(COMMANDS)], SHAPES[number // len(COMMANDS) % len(SHAPES)]
-    plant = EmulatedHand(
+    plant = hand_of(
+        options.get("plant_model"),
         hand,
         options["task"],
         seed,
@@ -94,8 +107,8 @@ def _measured_torque(trace: list[dict[str, Any]], hand: Any, window: list[float]
 
 def run_all(options: dict[str, Any], trials: int, processes: int, show: bool) -> list[dict[str, Any]]:
     """All trials, seed by seed and in order."""
-    trial = functools.partial(run_trial, options)
-    seeds, numbers = zip(*itertools.product(options["seed"], range(trials)), strict=True)
+    trial, first = functools.partial(run_trial, options), options.get("first", 0)
+    seeds, numbers = zip(*itertools.product(options["seed"], range(first, first + trials)), strict=True)
     if processes <= 1:
         return [_shown(report, show) for report in map(trial, seeds, numbers)]
     # JAX does not support fork.
@@ -110,8 +123,12 @@ def _shown(report: dict[str, Any], show: bool) -> dict[str, Any]:
             if report["task"] == "grasp"
             else f"{report['successes']:3d} successes ({report['paper_successes']} as the paper counts)"
         )
+        link, bridge = f"{report['wall']:.0f} s", report["bridge"]
+        if "exchanges" in bridge:
+            link += f", {bridge['unanswered']} of {bridge['exchanges']} exchanges unanswered, policy late p99 "
+            link += f"{bridge['policy_jitter']['p99_ms']:.1f} ms, simulated time slipped {bridge['slipped_s']:.2f} s"
         print(
-            f"{report['trial']:4d}  {result}  {report['seconds']:7.2f} s  {report['end']}  ({report['wall']:.0f} s)",
+            f"{report['trial']:4d}  {result}  {report['seconds']:7.2f} s  {report['end']}  ({link})",
             file=sys.stderr,
             flush=True,
         )
@@ -201,77 +218,6 @@ def metrics(task: str, policy: str, reports: list[dict[str, Any]]) -> dict[str, 
     return grasp_metrics(reports, tuple(config["finger_force"]), config.get("force_command", "finger"))
 
 
-def simulated(task: str, policy: str) -> dict[str, Any]:
-    """The same metrics from the policy's report in simulation; those that it has."""
-    from dexsim.core.assets import asset_path
-    from dexsim.core.errors import DexsimError
-    from dexsim.tasks.grasp.report import FORCES
-
-    path = Path(policy).with_suffix(".json")
-    try:
-        path = path if path.is_file() else asset_path(f"policies/{Path(policy).stem}.json")
-        report = json.loads(path.read_text())
-        report = report.get("evaluation", report["trained"])["task"]
-    except (OSError, KeyError, ValueError, DexsimError):
-        return {}
-    if task == "grasp":
-        names = (
-            "held",
-            "force_error_n",
-            *FORCES,
-            "r_torque",
-            "slope_force_n",
-            "slope_torque",
-            "torque_limited",
-            "by_command",
-        )
-        return {name: report[name] for name in names if name in report}
-    counts = {
-        name: report[name]["mean"] | {"median": report[name]["median"]["median"]}
-        for name in ("successes", "paper_successes")
-    }
-    names = "successes_per_minute", "seconds_to_fall", "kept_to_the_end"
-    return counts | {name: report[name] for name in names if name in report}
-
-
-def table(here: dict[str, Any], there: dict[str, Any], idle: dict[str, Any]) -> str:
-    """Table with the columns metric, emulated hand, simulation, and a hand that does nothing in the same trials."""
-
-    def cell(entry: Any) -> str:
-        if not isinstance(entry, dict):
-            return "-"
-        key = "r" if "r" in entry else "mean"
-        if entry.get(key) is None:
-            return "-"
-        span = f" ({entry['low']:.3g} to {entry['high']:.3g})" if entry.get("low") is not None else ""
-        middle = f", median {entry['median']:.3g}" if "median" in entry else ""
-        return f"{entry[key]:.3g}{span}{middle}"
-
-    def at(metrics: dict[str, Any], command: float) -> dict[str, Any]:
-        return next((row for row in metrics.get("by_command", []) if row["command"] == command), {})
-
-    force = f"{here.get('force_command')}_force"
-    names = [name for name in here if isinstance(here[name], dict)]
-    rows = [(name.replace("_", " "), cell(here[name]), cell(there.get(name)), cell(idle.get(name))) for name in names]
-    for entry in here.get("by_command", []):
-        other, still = (at(metrics, entry["command"]) for metrics in (there, idle))
-        for name, shown, name_there in (
-            ("held", "held", "held"),
-            (force, f"{force.replace('_', ' ')} (N)", f"{force}_n"),
-            ("torque_limited", "ticks with a joint at its torque limit", "torque_limited"),
-        ):
-            cells = cell(entry[name]), cell(other.get(name_there)), cell(still.get(name))
-            mark = " (saturates)" if name == force and entry["saturates"] else ""
-            rows.append((f"command {entry['command']:g}: {shown}{mark}", *cells))
-    rows += [(f"{entry['shape']}: held", cell(entry["held"]), "", "") for entry in here.get("by_shape", [])]
-    rows = [("", "emulated hand", "simulation", "doing nothing"), *rows]
-    widths = [max(len(row[k]) for row in rows) for k in range(4)]
-    lines = ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]
-    if "window_s" in here:
-        lines.append("forces and r: of held objects, from {:g} to {:g} s after release".format(*here["window_s"]))
-    return "\n".join(lines)
-
-
 def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--task", choices=("grasp", "rotate"), required=True)
@@ -288,6 +234,11 @@ def arguments() -> argparse.Namespace:
         choices=("outside", "inside", "nominal"),
         default="outside",
         help="parameters of hand and object: outside training's ranges, inside them, or nominal",
+    )
+    parser.add_argument(
+        "--plant-model",
+        metavar="FILE",
+        help="MJCF of a hand by somebody else in place of the emulated hand's physics (docs/hardware.md)",
     )
     parser.add_argument(
         "--set",
@@ -309,20 +260,35 @@ def arguments() -> argparse.Namespace:
     parser.add_argument(
         "--no-baseline", dest="baseline", action="store_false", help="do not run the trials with an idle hand, too"
     )
-    parser.add_argument("--processes", type=int, default=1)
+    parser.add_argument("--processes", type=int, default=1, help="trials at once, in virtual time")
+    parser.add_argument("--real-time", action="store_true", help="run hand and runner as processes, in real time")
+    parser.add_argument("--first", type=int, default=0, help="number of the first trial")
+    parser.add_argument("--twin", default="", help="more options of `dexsim_real.twin`, as one argument")
+    parser.add_argument("--runner", default="", help="more options of `dexsim_real.run`, as one argument")
     parser.add_argument("--json", type=Path, help="JSON file for all results")
-    return parser.parse_args()
+    given = parser.parse_args()
+    if given.real_time and (given.set or not given.safety or given.processes > 1):
+        parser.error("--set, --no-safety and --processes are for virtual time")
+    if not given.real_time and (given.twin or given.runner):
+        parser.error("--twin and --runner need --real-time")
+    return given
 
 
-def main() -> None:
+def main() -> int:
+    """The command. Returns its exit code."""
     given = arguments()
     options = {
         "task": given.task,
         "policy": given.policy or given.task,
         "seed": given.seed,
+        "first": given.first,
         "parameters": given.parameters,
         "seconds": given.seconds,
         "safety": given.safety,
+        "plant_model": given.plant_model,
+        "real_time": given.real_time,
+        "twin": given.twin,
+        "runner": given.runner,
         "set": {
             name: value if value in ("outside", "inside", "nominal") else float(value)
             for name, value in (pair.split("=") for pair in given.set)
@@ -330,19 +296,26 @@ def main() -> None:
         "limit": {name: float(value) for name, value in (pair.split("=") for pair in given.limit)},
     }
     reports = run_all(options, given.trials, given.processes, show=True)
-    still = run_all(options | {"idle": True}, given.trials, given.processes, show=False) if given.baseline else []
+    still = (
+        run_all(options | {"idle": True, "real_time": False}, given.trials, given.processes, show=False)
+        if given.baseline
+        else []
+    )
     here = metrics(given.task, options["policy"], reports)
     idle = metrics(given.task, options["policy"], still) if still else {}
     there = simulated(given.task, options["policy"])
     print(
-        f"{given.task}: {len(reports)} trials, parameters {given.parameters}, seed {' '.join(map(str, given.seed))}; "
-        f"targets {TARGETS[given.task]}"
+        f"{given.task}: {len(reports)} trials{' in real time' * given.real_time}, parameters {given.parameters}, "
+        f"seed {' '.join(map(str, given.seed))}; targets {TARGETS[given.task]}"
     )
     print(table(here, there, idle))
     if given.json:
         found = {"options": options, "metrics": here, "simulation": there, "do_nothing": idle, "trials": reports}
         given.json.write_text(json.dumps(found, indent=1))
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    from dexsim.core import cli
+
+    cli.run(lambda _: main())

@@ -1,13 +1,16 @@
 """From an action to joint targets: the same code in simulation and on the hand."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from dexsim.core.config import setting, validate
 from dexsim.force_loop import ForceLoop
-from dexsim.hand.kinematics import Hand
+from dexsim.grip_reflex import GripReflex
+from dexsim.hand.kinematics import Hand, forward_kinematics
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -24,6 +27,8 @@ class Control:
     hard it presses."""
     force: ForceLoop = setting(ForceLoop())
     """Correction of the force command by the estimated force, for tasks that have one."""
+    reflex: GripReflex = setting(GripReflex())
+    """Correction of each finger's joint target by its estimated force, for tasks with a force command."""
 
     def __post_init__(self):
         validate(self)
@@ -40,6 +45,26 @@ def move_target(control: Control, hand: Hand, target: jax.Array, action: jax.Arr
     target = target + control.step * action
     target = jnp.clip(target, measured - control.reach, measured + control.reach)
     return jnp.clip(target, hand.joint_lower, hand.joint_upper)
+
+
+def reflex_target(hand: Hand, angle: jax.Array) -> jax.Array:
+    """What the reflex's angles [F] rad add to the joint targets: [J] rad on the fingers' root joints."""
+    return jnp.zeros(hand.num_joints).at[hand.root_joint].set(closing(hand) * angle)
+
+
+@functools.cache
+def closing(hand: Hand) -> np.ndarray:
+    """Signs [F] of the root joints' rotation that closes the fingers: toward the centre of a grasp."""
+    if not hand.grasp_posture or not hand.grasp_centre:
+        return np.ones(hand.num_fingers, np.float32)
+
+    def distance(posture: jax.Array) -> jax.Array:
+        tips = forward_kinematics(hand, posture).tip_position
+        return jnp.linalg.norm(tips - np.asarray([hand.grasp_centre], np.float32), axis=-1)
+
+    with jax.ensure_compile_time_eval():
+        moves = np.asarray(jax.jacfwd(distance)(jnp.asarray(hand.grasp_posture)))
+    return -np.sign(moves[np.arange(hand.num_fingers), hand.root_joint]).astype(np.float32)
 
 
 def observed_action(control: Control, hand: Hand, action: jax.Array, target: jax.Array) -> jax.Array:

@@ -12,10 +12,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dexsim.control import Control
+from dexsim.control import Control, closing, move_target, reflex_target
 from dexsim.core.config import setting, validate
 from dexsim.core.errors import ConfigError
 from dexsim.force_loop import FORCE_COMMANDS, correct_command
+from dexsim.grip_reflex import move_reflex, wanted_force
 from dexsim.hand.kinematics import Hand
 from dexsim.observation import ObservationConfig, Readings
 from dexsim.touch.estimate import estimate_force
@@ -78,13 +79,19 @@ class TaskSpec:
 
     def __post_init__(self) -> None:
         validate(self)
-        if self.control.force.gain and self.finger_force is None:
-            raise ConfigError(f"task {self.name!r}: Control.force needs a force command, which the task has not")
+        for loop in ("force", "reflex"):
+            if getattr(self.control, loop).gain and self.finger_force is None:
+                raise ConfigError(f"task {self.name!r}: Control.{loop} needs a force command, which the task has not")
 
     @property
     def force_loop(self) -> bool:
         """Whether the command is corrected by the estimated force."""
         return self.control.force.gain > 0
+
+    @property
+    def grip_reflex(self) -> bool:
+        """Whether the fingers' joint targets are corrected by their estimated forces."""
+        return self.control.reflex.gain > 0
 
     @classmethod
     def of(cls, task: Any) -> "TaskSpec":
@@ -130,6 +137,41 @@ def correct_readings(
         spec.control.force, spec.force_command, spec.finger_force, period, readings.command, before, force
     )
     return dataclasses.replace(readings, command=readings.command + after), after
+
+
+def next_target(
+    spec: TaskSpec,
+    hand: Hand,
+    period: float,
+    readings: Readings,
+    target: jax.Array,
+    reflex: jax.Array | None,
+    action: jax.Array,
+    measured: jax.Array,
+) -> tuple[jax.Array, jax.Array | None]:
+    """The next joint targets [J] rad, and the angles [F] rad in them that are the grip reflex's.
+
+    Args:
+      spec: of the task.
+      hand: the hand.
+      period: s, control tick.
+      readings: what the action answers to.
+      target: [J] rad, joint targets so far.
+      reflex: [F] rad, of the tick before; None without a reflex.
+      action: [J] in [-1, 1].
+      measured: [J] rad, joint angles now.
+    """
+    control = spec.control
+    if reflex is None:
+        return move_target(control, hand, target, action, measured), None
+    assert spec.finger_force is not None, "checked when the specification was made"
+    force = estimate_force(spec.observation.force, hand, readings.taxel_force, readings.joint_torque)
+    wanted = wanted_force(spec.force_command, spec.finger_force, readings.command, force > 0)
+    chosen = move_target(control, hand, target - reflex_target(hand, reflex), action, measured)
+    angle = reflex_target(hand, move_reflex(control.reflex, period, reflex, wanted, force))
+    # Within the policy's own limits; what they cut off does not wind up.
+    pressed = move_target(control, hand, chosen + angle, jnp.zeros_like(action), measured)
+    return pressed, (pressed - chosen)[hand.root_joint] * closing(hand)
 
 
 def _triple(values: Iterable[float]) -> tuple[float, float, float]:

@@ -18,7 +18,7 @@ PACKAGES = ("dexsim", "dexsim_ppo", "dexsim_real")
 FLOORS = {
     "dexsim": (
         ("core",),
-        ("geometry", "actuator", "force_loop"),
+        ("geometry", "actuator", "force_loop", "grip_reflex"),
         ("hand",),
         ("objects", "control", "randomization", "touch"),
         ("sensing", "render", "calibration", "identification", "observation"),

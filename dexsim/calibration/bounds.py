@@ -22,6 +22,7 @@ _FORCE = (1e-3, 100.0)  # N: the whole hand is rated for 80 N
 # N a count; the maker's is 0.1 N. Below 1 mN all 120 taxels, saturated at 255 counts, read 31 N together: less than the
 # 37 N of a motor of 1.1 Nm at a lever of 0.03 m. Above 1 N one saturated taxel reads three times what the hand gives.
 _PER_FORCE = (1e-3, 1.0)
+_PER_TORQUE = (1.0 / _LEVER[1], 1e3)  # N/Nm: a fingertip 0.3 m to 1 mm from its root joint's axis
 _REPORTED = 1e12  # magnitude of numbers that people read
 
 _REPORTS = ("gain_low", "gain_high", "offset_low", "offset_high", "noise", "r_squared", "condition", "friction")
@@ -42,6 +43,12 @@ def check(path: object, calibration: "Calibration", hand: Hand | None = None) ->
     joints, scale = calibration.joint_names, np.asarray(calibration.torque_scale)
     _range(path, (), "current_per_count", [calibration.current_per_count], _PER_CURRENT, "A")
     _range(path, calibration.finger_names, "force_per_count", calibration.force_per_count, _PER_FORCE, "N")
+    if calibration.force_per_torque is not None:
+        force, (low, high) = np.asarray(calibration.force_per_torque), _PER_TORQUE
+        fits = (force == 0) | (force >= low) & (force <= high)
+        says = f"must be 0, or between {low:.3g} and {high:g} N/Nm"
+        _require(path, calibration.finger_names, "force_per_torque", force[0], fits[0], says)
+        _require(path, calibration.finger_names, "its interval", force[1:], np.abs(force[1:]) <= _REPORTED, "too large")
     _range(path, joints, "torque_scale", scale, _TORQUE, "Nm")
     if hand is not None:
         same = np.abs(scale - hand.torque_limit) <= 0.01 * hand.torque_limit

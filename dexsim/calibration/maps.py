@@ -12,6 +12,7 @@ same line when both sessions end at the same force, and `alignment` says how far
 Shapes: J joints, F fingers, N taxels a finger; a leading 2 is (loading, unloading).
 """
 
+import dataclasses
 import math
 from pathlib import Path
 from typing import Any
@@ -71,6 +72,7 @@ class Calibration:
     handedness: str = static(default="")  # likewise
     created: str = static(default="")
     notes: tuple[str, ...] = static(default=())
+    force_per_torque: Array | None = None  # [3, F] N/Nm at the root joint: value, 95 % low, high; 0: not pressed
 
 
 # --- run time -------------------------------------------------------------------------------
@@ -135,6 +137,19 @@ def alignment(calibration: Calibration) -> np.ndarray:
     return np.asarray(slopes[0] / slopes[1])
 
 
+def calibrated_hand(hand: Hand, calibration: Calibration | None) -> Hand:
+    """The hand with the `force_per_torque` of its calibration, where fingertips were pressed.
+
+    The first finger, the thumb, keeps its own: in a grasp its root joint also bears what lies on its links, which a
+    press does not show.
+    """
+    if calibration is None or calibration.force_per_torque is None:
+        return hand
+    found = np.array(calibration.force_per_torque, np.float32)[0]
+    found[0] = 0.0
+    return dataclasses.replace(hand, force_per_torque=np.where(found > 0, found, hand.force_per_torque))
+
+
 # --- file -----------------------------------------------------------------------------------
 
 _PAIRS = (
@@ -151,6 +166,7 @@ _PAIRS = (
     "outliers",
 )
 _SINGLES = ("friction", "value_max", "force_max")
+_FORCE_PER_TORQUE = ("force_per_torque", "force_per_torque_low", "force_per_torque_high")
 
 
 def save_calibration(path: str | Path, calibration: Calibration) -> None:
@@ -166,8 +182,11 @@ def save_calibration(path: str | Path, calibration: Calibration) -> None:
         f"current_per_count = {_number(calibration.current_per_count)}  # A",
         f"finger_names = [{', '.join(map(_text, calibration.finger_names))}]",
         f"force_per_count = {_list(calibration.force_per_count)}  # N",
-        "notes = [",
     ]
+    if calibration.force_per_torque is not None:
+        rows = zip(_FORCE_PER_TORQUE, calibration.force_per_torque, strict=True)
+        lines += [f"{name} = {_list(row)}  # N/Nm, 0: not pressed" for name, row in rows]
+    lines.append("notes = [")
     lines += [f"  {_text(note)}," for note in calibration.notes] + ["]", ""]
     lines += [
         "# Lines value = gain * force + offset; pairs are [loading, unloading].",
@@ -227,6 +246,7 @@ def load_calibration(path: str | Path, hand: Hand | None = None) -> Calibration:
         handedness=_field(path, {"handedness": "", **table}, "handedness", str),
         created=_field(path, table, "created", str),
         notes=tuple(_list_of(path, table, "notes", str)),
+        force_per_torque=_force_per_torque(path, table, len(fingers)),
     )
     bounds.check(path, calibration, hand)
     return calibration
@@ -250,6 +270,12 @@ def _read(path: Path) -> dict[str, Any]:
         raise CalibrationError(f"{path}: cut off: its end is missing")
     _field(path, table, "hand", str)
     return table
+
+
+def _force_per_torque(path: Path, table: dict[str, Any], fingers: int) -> np.ndarray | None:
+    if not any(name in table for name in _FORCE_PER_TORQUE):
+        return None  # a file from before
+    return np.array([_numbers(path, table, name, fingers) for name in _FORCE_PER_TORQUE])
 
 
 def _side(path: Path, joints: list[dict], key: str) -> Side:

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dexsim.control import move_target, observed_action
+from dexsim.control import observed_action
 from dexsim.core.pytree import choose
 from dexsim.env.episode import EpisodeSampler
 from dexsim.env.evaluation import EvaluationPlan, make_plan
@@ -32,7 +32,7 @@ from dexsim.geometry.vectors import length
 from dexsim.hand.kinematics import Hand, forward_kinematics
 from dexsim.physics.physics import Physics
 from dexsim.render.snapshot import Snapshot
-from dexsim.task_spec import TaskSpec, correct_readings
+from dexsim.task_spec import TaskSpec, correct_readings, next_target
 
 
 class Env:
@@ -109,6 +109,8 @@ class Env:
         start = dataclasses.replace(start, object=episode.object)
         goal = self.task.begin(goal_key, start) if goal is None else goal
         command, tick = self.motors.rest(start.qpos, start.qvel, start.joint_target)
+        if self.spec.grip_reflex:
+            command = dataclasses.replace(command, reflex=jnp.zeros(self.hand.num_fingers))
         truth = self._ground_truth(episode, tick, command.action, command.action)
         sensor_input = self.senses.at_rest(start.qpos[self.physics.joint_qpos], start.qpos[self.physics.object_qpos])
         seen = self._sense(noise_key, episode, command, truth, goal, sensor_input)
@@ -154,8 +156,11 @@ class Env:
         valid = jnp.all(jnp.isfinite(action))
         action = jnp.where(valid, jnp.clip(action, -1.0, 1.0), 0.0)
         measured = self.motors.encoder(state.physics.qpos[self.physics.joint_qpos], state.gear)
-        target = move_target(self.config.control, self.hand, state.joint_target, action, measured)
-        return JointCommand(action=action, target=target, previous=state.joint_target, valid=valid)
+        before = state.joint_target
+        target, reflex = next_target(
+            self.spec, self.hand, self.control_period, state.readings, before, state.reflex, action, measured
+        )
+        return JointCommand(action=action, target=target, previous=before, valid=valid, reflex=reflex)
 
     def _ground_truth(
         self, episode: Episode, tick: PhysicsTick, action: jax.Array, last_action: jax.Array
@@ -267,6 +272,7 @@ class Env:
             },
             taxel_memory=seen.taxel_memory,
             correction=seen.correction,
+            reflex=command.reflex,
             gear=tick.gear,
             scale=scale,
         )

@@ -35,6 +35,7 @@ class JointCommand:
     target: jax.Array  # [J] rad
     previous: jax.Array  # [J] rad, acts until the latency is over
     valid: jax.Array  # [] bool, whether the action was finite
+    reflex: jax.Array | None = None  # [F] rad of the target, with a grip reflex
 
 
 @pytree_dataclass

@@ -70,6 +70,7 @@ class State:
     taxel_memory: TaxelMemory
     gear: GearState | None = None  # of the joints, with gear play
     correction: jax.Array | None = None  # [] of the command, with a force loop
+    reflex: jax.Array | None = None  # [F] rad in the joint targets, with a grip reflex
     scale: jax.Array | None = None  # [] of the ranges that the next episode is drawn from
 
 

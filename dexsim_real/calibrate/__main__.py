@@ -29,7 +29,7 @@ from dexsim_real.calibrate.plan import placements
 from dexsim_real.calibrate.press_fit import fit
 from dexsim_real.calibrate.press_procedure import PressProcedure
 from dexsim_real.calibrate.read import read_logs
-from dexsim_real.calibrate.report import grouped, report, table
+from dexsim_real.calibrate.report import force_table, grouped, report, table
 from dexsim_real.control.controller import prepare_jax
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.process import stopping
@@ -75,6 +75,7 @@ def fit_and_report(arguments: CalibrateArguments, hand: Hand, logs: Sequence[Pat
     """
     found = fit(read_logs(logs, hand), hand)
     operator.console.print(table(found))
+    operator.console.print(force_table(found.calibration))
     for note in grouped(found.calibration.notes):
         operator.tell(f"note: {note}")
     if arguments.report:

@@ -27,6 +27,7 @@ from dexsim.calibration.press import MIN_LEVER
 from dexsim.calibration.sensor import FingerFit
 from dexsim.core.errors import CalibrationError
 from dexsim.hand.kinematics import Hand, forward_kinematics, taxel_normals, taxel_positions
+from dexsim_real.calibrate.force_per_torque import fit_force_per_torque
 from dexsim_real.calibrate.force_scale import ACTIVE, force_scale
 from dexsim_real.calibrate.press_procedure import LOADING, RELEASED, UNLOADING
 from dexsim_real.calibrate.read import PressSession, Recording
@@ -145,6 +146,7 @@ def fit(session: PressSession, hand: Hand, created: str | None = None) -> Fit:
             "; ".join([str(error), *(note for note in notes if "hardly moved" in note or "by shear" in note)])
         ) from None
     notes += _zero_note(session, hand)
+    result = dataclasses.replace(result, force_per_torque=fit_force_per_torque(hand, result, real, sim))
     # With a gauge the absolute scale is known.
     kept = tuple(note for note in result.notes if not (scale.sensors and note.startswith("only the ratio")))
     return Fit(dataclasses.replace(result, notes=(*kept, METHOD, *notes)), real, sim, source, scale.sensors)

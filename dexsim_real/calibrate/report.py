@@ -57,6 +57,10 @@ def report(fit: Fit) -> dict[str, Any]:
         "handedness": calibration.handedness,
         "created": calibration.created,
         "newtons_per_count": dict(zip(calibration.finger_names, calibration.force_per_count, strict=True)),
+        "newtons_per_newton_metre": {
+            name: dict(zip(("value", "low", "high"), column, strict=True))
+            for name, column in zip(calibration.finger_names, _per_torque(calibration).T, strict=True)
+        },
         "gauge": {name: to_dict(found) for name, found in fit.sensors.items()},
         "joints": joints,
         "notes": list(calibration.notes),
@@ -83,6 +87,21 @@ def table(fit: Fit) -> Table:
             f"{real.force_max[joint]:.1f} N",
         )
     return shown
+
+
+def force_table(calibration: Calibration) -> Table:
+    """A table of the forces per root-joint torque; a finger that was not pressed has those of the hand's TOML."""
+    shown = Table(box=None, padding=(0, 1, 0, 0), title="fingertip force over root-joint torque", title_justify="left")
+    for head in ("finger", "N / Nm", "95 %"):
+        shown.add_column(head, no_wrap=True)
+    for name, (value, low, high) in zip(calibration.finger_names, _per_torque(calibration).T, strict=True):
+        shown.add_row(name, *((f"{value:.2f}", f"{low:.2f} to {high:.2f}") if value else ("(hand's TOML)", "")))
+    return shown
+
+
+def _per_torque(calibration: Calibration) -> np.ndarray:
+    zero = np.zeros((3, len(calibration.finger_names)))
+    return zero if calibration.force_per_torque is None else np.asarray(calibration.force_per_torque)
 
 
 def grouped(notes: tuple[str, ...]) -> list[str]:

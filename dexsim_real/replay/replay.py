@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from dexsim import load_hand
-from dexsim.calibration.maps import load_calibration
+from dexsim.calibration.maps import calibrated_hand, load_calibration
 from dexsim.core.config import from_dict
 from dexsim.hand.kinematics import Hand
 from dexsim.hand.source import recorded_hand
@@ -128,7 +128,7 @@ def _rebuild(meta: dict[str, Any], given: str) -> tuple[HandSensing, Any, tuple[
     sensing.tare = np.array(meta["tare"], np.float32)
     spec = from_dict(TaskSpec, meta["spec"]) if "spec" in meta else old_spec(meta["task"], meta["env_config"])
     names, config = spec.fields, spec.observation
-    return sensing, make_observe(hand, names, config), layout(hand, names, config)
+    return sensing, make_observe(calibrated_hand(hand, calibration), names, config), layout(hand, names, config)
 
 
 def _same(a: np.ndarray, b: np.ndarray) -> bool:

@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from dexsim import load_hand
-from dexsim.calibration.maps import load_calibration
+from dexsim.calibration.maps import calibrated_hand, load_calibration
 from dexsim.core import cli
 from dexsim.core.config import to_dict
 from dexsim.hand.source import record_of, recorded_hand
@@ -58,8 +58,8 @@ class Session:
         exported = arguments.policy.endswith((".npz", ".onnx"))
         policy: Any = (load_exported if exported else load_policy)(arguments.policy)
         hand = recorded_hand(policy.hand, arguments.hand, arguments.policy) or load_hand()
-        self.controller = Controller(policy, hand)
         calibration = load_calibration(arguments.calibration, hand) if arguments.calibration else None
+        self.controller = Controller(policy, calibrated_hand(hand, calibration))
         self.sensing = HandSensing(hand, arguments.hardware, calibration)
         self.controller.warm()
         self.sensing.measure(empty_state())

@@ -43,9 +43,10 @@ def make_plant(arguments: TwinArguments, hand: Hand) -> Plant:
             return getattr(importlib.import_module(module), function or "make_plant")(arguments)
         except (ImportError, AttributeError) as error:
             raise HandError(f"--plant {arguments.plant}: {error}; give MODULE:FUNCTION") from None
-    from dexsim_real.twin.plant.emulated_hand import EmulatedHand
+    from dexsim_real.twin.plant.foreign.hand import hand_of
 
-    return EmulatedHand(
+    return hand_of(
+        arguments.plant_model,
         hand,
         arguments.task,
         arguments.seed,

@@ -4,6 +4,7 @@ import dataclasses
 from pathlib import Path
 
 from dexsim.core.config import setting, validate
+from dexsim_real.core.errors import HandError
 from dexsim_real.twin.plant.parameters import KINDS, TASKS
 from dexsim_real.twin.plant.shapes import SHAPES
 from dexsim_real.twin.wire.command_check import LimitsConfig
@@ -54,6 +55,9 @@ class TwinArguments:
     plant: str | None = None
     """MODULE:FUNCTION that creates the physics (a `dexsim_real.twin.plant.protocol.Plant`) from these options; None for
     the library's own."""
+    plant_model: Path | None = None
+    """MJCF of the hand by somebody else, which takes the place of the emulated hand's body, motors and contacts; or a
+    TOML that names it and its parts (docs/hardware.md). None for the emulated hand's own."""
     line: LineConfig = setting(LineConfig())
     """Timing of the serial line."""
     firmware: FirmwareConfig = setting(FirmwareConfig())
@@ -67,3 +71,5 @@ class TwinArguments:
 
     def __post_init__(self):
         validate(self)
+        if self.plant and self.plant_model:
+            raise HandError("--plant and --plant-model: give one of them")

@@ -167,10 +167,10 @@ class PressBench(EmulatedHand):
         self._pressing_placement, probe, model = placement, self._probe, self._scene.model
         probe.qpos[self._scene.drive_qpos] = placement.posture
         mujoco.mj_kinematics(model, probe)
-        body = self._scene.tip_body[placement.finger]
-        frame, finger = probe.xmat[body].reshape(3, 3), placement.finger
+        site, finger = self._scene.tip_site[placement.finger], placement.finger
+        frame = probe.site_xmat[site].reshape(3, 3)
         taxels = list(placement.taxels)
-        point = probe.xpos[body] + frame @ self.hand.taxel_position[finger, taxels].mean(0)
+        point = probe.site_xpos[site] + frame @ self.hand.taxel_position[finger, taxels].mean(0)
         normal = frame @ self.hand.taxel_normal[finger, taxels].mean(0)
         self._facing = normal / np.linalg.norm(normal)
         along = frame @ (self.hand.taxel_position[finger, 11] - self.hand.taxel_position[finger, 0])

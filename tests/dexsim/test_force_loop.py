@@ -13,6 +13,7 @@ from dexsim.control import Control
 from dexsim.core.compilation import jit
 from dexsim.core.errors import ConfigError
 from dexsim.force_loop import ForceLoop, commanded_force, correct_command
+from dexsim.grip_reflex import GripReflex
 from dexsim.task_spec import TaskSpec
 from dexsim.touch.estimate import ForceEstimate, estimate_force
 
@@ -121,8 +122,9 @@ def test_a_task_without_a_force_command_refuses_a_loop():
     assert TaskSpec(name="hold", fields=(), control=Control(force=LOOP), finger_force=SPAN).force_loop
 
 
-def test_bridge_and_simulation_show_the_policy_the_same_command(hand):
-    """The environment's readings, given to the controller with the user's command, lead to the same corrections."""
+def test_bridge_and_simulation_show_the_policy_the_same_command_and_send_the_same_targets(hand):
+    """The environment's readings, given to the controller with the user's command, lead to the same corrections, of the
+    command by the force loop and of the joint targets by the grip reflex."""
     pytest.importorskip("serial")
     import dexsim
     from dexsim.tasks.grasp.config import GraspConfig
@@ -132,7 +134,8 @@ def test_bridge_and_simulation_show_the_policy_the_same_command(hand):
 
     config = GraspConfig(pool_size=64)
     observation = dataclasses.replace(config.observation, force=ForceEstimate(per_torque=(8.0, 15.0, 13.0, 14.0, 15.0)))
-    control = dataclasses.replace(config.control, force=dataclasses.replace(LOOP, gain=5.0))
+    reflex = GripReflex(gain=0.1, limit=0.3, slew=0.5)
+    control = dataclasses.replace(config.control, force=dataclasses.replace(LOOP, gain=5.0), reflex=reflex)
     env = dexsim.make("grasp", dataclasses.replace(config, observation=observation, control=control), num_envs=8)
 
     class Close:
@@ -147,18 +150,27 @@ def test_bridge_and_simulation_show_the_policy_the_same_command(hand):
 
     state = jit(jax.vmap(env.reset), once=True)(jax.random.split(jax.random.key(3), 8))
     step, controllers = jit(jax.vmap(env.step), once=True), [Controller(Close(), hand) for _ in range(8)]
-    shown, wanted, nothing = [], [], np.zeros(1)
+    for index, controller in enumerate(controllers):
+        controller.start(np.asarray(state.joint_target[index]))
+    encoder = jax.jit(jax.vmap(lambda s: env.motors.encoder(s.physics.qpos[env.physics.joint_qpos], s.gear)))
+    shown, wanted, nothing, sent, targets, angle = [], [], np.zeros(1), [], [], 0.0
     for _ in range(60):
-        readings = jax.device_get(state.readings)
+        readings, true = jax.device_get((state.readings, encoder(state)))
         for index, controller in enumerate(controllers):
             row = jax.tree.map(lambda x, i=index: x[i], readings)
+            # Targets are kept near the true angles in simulation, near the measured ones on the hand.
             measured = HandMeasurement(
-                row.joint_position, row.joint_torque, row.taxel_force, row.joint_torque, nothing, nothing, nothing
+                true[index], row.joint_torque, row.taxel_force, row.joint_torque, nothing, nothing, nothing
             )
             seen = ObjectEstimate(row.object_position, row.object_velocity, row.object_quat)
             command = float(state.goal.command[index])
-            shown.append(float(controller.tick(measured, seen, row.goal_quat, command).readings.command))
+            tick = controller.tick(measured, seen, row.goal_quat, command)
+            shown.append(float(tick.readings.command))
             wanted.append(float(row.command))
+            sent.append(tick.target)
         state = step(state, jnp.full((8, 12), 0.2))
+        targets += list(np.asarray(state.joint_target))
+        angle = max(angle, float(np.abs(np.asarray(state.reflex)).max()))
     np.testing.assert_allclose(shown, wanted, atol=1e-6)
-    assert np.abs(np.asarray(state.correction)).max() > 0.1, "no hand has pressed"
+    np.testing.assert_allclose(sent, targets, atol=1e-5)
+    assert np.abs(np.asarray(state.correction)).max() > 0.1 and angle > 0.02, "no hand has pressed"

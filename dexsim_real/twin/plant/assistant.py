@@ -28,7 +28,7 @@ REFERENCES = {"grasp": (0.055, -0.005, 0.090), "rotate": (0.047, 0.024, 0.088)}
 PLACES = {"grasp": REFERENCES["grasp"][1:], "rotate": (0.007, 0.079)}
 """Position along the palm (y, z) m where the object is placed: the centre of the start states in training. Few of them
 are 5 mm nearer to the wrist, and a policy may miss an object there (docs/hardware.md)."""
-PALM_FACE = 0.020  # m, x of the palm's surface
+PALM_FACE = 0.020  # m, x of the emulated hand's palm
 _ARRIVED, _LEFT = 0.002, 0.005  # rad, distance of targets from the start posture: arrived below, left above
 _NEAR = 0.3  # rad, largest distance of a joint from the start posture
 _OVERLAP = 0.0015  # m, largest overlap of object and hand where it is placed
@@ -53,8 +53,10 @@ class Place:
     velocity: np.ndarray  # [3] m/s
 
 
-def sample_place(parameters: TrialParameters, shape: ObjectShape, rng: np.random.Generator) -> Place:
-    """Sample a release pose of the object; the fingers may overlap it."""
+def sample_place(
+    parameters: TrialParameters, shape: ObjectShape, rng: np.random.Generator, face: float = PALM_FACE
+) -> Place:
+    """Sample a release pose of the object over a palm at x = `face` m; the fingers may overlap it."""
     if parameters.task == "rotate":
         quat = turn((1.0, 0.0, 0.0), float(parameters.heading_error) * rng.uniform(-1, 1))
         shift = float(parameters.place_error) * rng.uniform(-1, 1, 2)
@@ -68,16 +70,18 @@ def sample_place(parameters: TrialParameters, shape: ObjectShape, rng: np.random
         shift = 0.01 * rng.uniform(-1, 1, 2)
         gap, speed = float(parameters.gap), float(parameters.release_speed)
     up = shapes.matrix(quat).T @ np.array([-1.0, 0.0, 0.0])
-    position = np.array([PALM_FACE + gap + shape.reach(up), *(PLACES[parameters.task] + shift)])
+    position = np.array([face + gap + shape.reach(up), *(PLACES[parameters.task] + shift)])
     return Place(position, quat, np.array([speed, 0.0, 0.0]))
 
 
-def find_place(scene: Scene, parameters: TrialParameters, shape: ObjectShape, rng: np.random.Generator) -> Place | None:
+def find_place(
+    scene: Scene, parameters: TrialParameters, shape: ObjectShape, rng: np.random.Generator, face: float = PALM_FACE
+) -> Place | None:
     """Sample a release pose that the hand in its start posture leaves clear; None when 60 attempts find none."""
     data = mujoco.MjData(scene.model)
     data.qpos[scene.drive_qpos] = POSTURES[parameters.task]
     for _ in range(60):
-        place = sample_place(parameters, shape, rng)
+        place = sample_place(parameters, shape, rng, face)
         if clear(scene, data, place):
             return place
     return None

@@ -11,21 +11,21 @@ import mujoco
 import numpy as np
 
 from dexsim.hand.kinematics import Hand
-from dexsim_real.twin.plant.assistant import Assistant, Place, Stage, clear, find_place, put
+from dexsim_real.twin.plant.assistant import PALM_FACE, Assistant, Place, Stage, clear, find_place, put
 from dexsim_real.twin.plant.contacts import tip_contacts
 from dexsim_real.twin.plant.drives import PERIOD, Drives
 from dexsim_real.twin.plant.mount import GRAVITY, tilted_gravity
-from dexsim_real.twin.plant.parameters import EXCHANGE_SENSE, PUSHES, TrialParameters, sample_trial
+from dexsim_real.twin.plant.parameters import EXCHANGE_SENSE, TrialParameters, sample_trial
 from dexsim_real.twin.plant.protocol import MotorCommands, PlantMeasurement
+from dexsim_real.twin.plant.pushes import Pushes
 from dexsim_real.twin.plant.referee import Referee
-from dexsim_real.twin.plant.scene import TIMESTEP, build_scene
+from dexsim_real.twin.plant.scene import Scene, build_scene
 from dexsim_real.twin.plant.shapes import ObjectShape, matrix, product, sample_shape, turn
 from dexsim_real.twin.plant.taxel_array import EmulatedTaxels
 from dexsim_real.wire.frames import Mode
 
 IMU_TRANSPORT = 0.0017  # s for the bytes of an orientation
-_SUBSTEPS = round(PERIOD / TIMESTEP)
-_LOOK = 10  # firmware periods between two updates of the referee
+_LOOK = 0.01  # s between two updates of the referee
 _MEMORY = 0.2  # s, longest delay of a sensor
 
 
@@ -71,8 +71,8 @@ class EmulatedHand:
         self.hand, self.task, self.seed, self.kind = hand, task, seed, kind
         self.command, self._end = command, None if trials is None else first + trials
         self._overrides, self._seconds, self._shape = overrides, seconds, shape
-        self._drives = Drives(hand.torque_limit, hand.speed_limit)
-        self._skin, self._assistant = EmulatedTaxels(hand), Assistant(task)
+        self._assistant = Assistant(task)
+        self._make_parts()
         self._done: list[dict[str, Any]] = []
         self.time, self._ticks, self._due = 0.0, 0, 0.0
         self._commands: MotorCommands | None = None
@@ -92,8 +92,8 @@ class EmulatedHand:
     def advance(self, seconds: float) -> None:
         """Simulate this duration in s; a remainder below 1 ms is kept for the next call."""
         self._due += seconds
-        while self._due >= PERIOD - 1e-12:
-            self._due -= PERIOD
+        while self._due >= self._period - 1e-12:
+            self._due -= self._period
             self._tick()
 
     def measure(self) -> PlantMeasurement:
@@ -137,7 +137,8 @@ class EmulatedHand:
     def true_pose(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """True joint angles [12] rad; position [3] m and orientation [4] of the object."""
         qpos, scene, at = self._data.qpos.copy(), self._scene, self._scene.object_qpos
-        return qpos[scene.drive_qpos] + qpos[scene.play_qpos], qpos[at : at + 3], qpos[at + 3 : at + 7]
+        play = 0.0 if scene.play_qpos is None else qpos[scene.play_qpos]
+        return qpos[scene.drive_qpos] + play, qpos[at : at + 3], qpos[at + 3 : at + 7]
 
     def warm(self, joint: int, degrees: float) -> None:
         """Heat a motor by this many K (a fault); cool it if negative."""
@@ -165,6 +166,14 @@ class EmulatedHand:
 
     # --- trials ---------------------------------------------------------------------------------
 
+    def _make_parts(self) -> None:
+        self._drives: Any = Drives(self.hand.torque_limit, self.hand.speed_limit)
+        self._skin = EmulatedTaxels(self.hand)
+
+    def _build(self) -> Scene:
+        self._palm_face = PALM_FACE
+        return build_scene(self.hand, self.parameters, self.shape, self._gravity)
+
     def _next_trial(self) -> None:
         self.trial += 1
         if self._finished:
@@ -176,12 +185,13 @@ class EmulatedHand:
             self.parameters: TrialParameters = sample_trial(self.task, rng, self.kind, self._overrides)
             self.shape: ObjectShape = sample_shape(self.parameters, rng, self._shape)
             self._gravity = tilted_gravity(self.task, self.parameters.gravity_tilt)
-            scene = build_scene(self.hand, self.parameters, self.shape, self._gravity)
-            place = find_place(scene, self.parameters, self.shape, rng)
+            scene = self._build()
+            place = find_place(scene, self.parameters, self.shape, rng, self._palm_face)
             if place is not None:
                 break
-        self._scene, self._place = scene, place
-        self._noise, self._object_noise, self._pushing = rng.spawn(3)
+        self._enter(scene, place)
+        self._noise, self._object_noise, pushing = rng.spawn(3)
+        self._pushes = Pushes(self.parameters, pushing)
         self._drives.configure(self.parameters)
         self._skin.configure(self.parameters, rng)
         self._data = mujoco.MjData(scene.model)
@@ -189,13 +199,11 @@ class EmulatedHand:
         self._assistant.begin(self.time)
         self._referee = Referee(self.task, self._seconds)
         self._began, self._hottest = self.time, 0.0
-        self._push_until: float | None = None
-        self._push_at = np.inf
-        self._pin(self._assistant.shelf(place), place)
+        put(scene, self._data, self._assistant.shelf(place), place.quat)
         mujoco.mj_forward(scene.model, self._data)
         self._tips, self._normal = np.zeros((5, 3)), np.zeros(5)
         self._touches: list[Any] = []
-        self._past: collections.deque[_Past] = collections.deque(maxlen=round(_MEMORY / PERIOD))
+        self._past: collections.deque[_Past] = collections.deque(maxlen=round(_MEMORY / self._period))
         samples = round(_MEMORY / float(self.parameters.taxel_period)) + 2
         self._samples: collections.deque = collections.deque(maxlen=samples)
         self._next_sample = self.time
@@ -208,8 +216,12 @@ class EmulatedHand:
     def _joints(self) -> np.ndarray:
         return self._data.qpos[self._scene.drive_qpos].copy()
 
-    def _pin(self, position: np.ndarray, place: Place) -> None:
-        put(self._scene, self._data, position, place.quat)
+    def _enter(self, scene: Scene, place: Place) -> None:
+        """Take the scene of a new trial. A period has whole time steps, about as many as the firmware's."""
+        self._scene, self._place, step = scene, place, scene.model.opt.timestep
+        self._substeps = max(round(PERIOD / step), 1)
+        self._period = self._substeps * step
+        self._look_every = max(round(_LOOK / self._period), 1)
 
     def _report(self) -> dict[str, Any]:
         return {
@@ -228,27 +240,32 @@ class EmulatedHand:
     # --- one firmware period --------------------------------------------------------------------
 
     def _tick(self) -> None:
-        scene, data, drives = self._scene, self._data, self._drives
-        rotor, speed = data.qpos[scene.drive_qpos], data.qvel[scene.drive_dof]
-        torque, friction = drives.step(self.time, rotor, speed)
-        data.qfrc_applied[scene.drive_dof] = torque
-        scene.model.dof_frictionloss[scene.drive_dof] = friction
+        scene, data = self._scene, self._data
+        self._power()
         if self.stage is Stage.FREE:
-            self._push()
-            mujoco.mj_step(scene.model, data, _SUBSTEPS)
+            self._pushes.apply(self.time, data.xfrc_applied[scene.object_body][:3])
+            mujoco.mj_step(scene.model, data, self._substeps)
         else:
             held = self._place.position if self.stage is Stage.HOLD else self._assistant.shelf(self._place)
-            for _ in range(_SUBSTEPS):
-                self._pin(held, self._place)
+            for _ in range(self._substeps):
+                put(scene, data, held, self._place.quat)
                 mujoco.mj_step(scene.model, data)
         self._ticks += 1
-        self.time = self._ticks * PERIOD
+        self.time = self._ticks * self._period
         self._remember()
         if self.time >= self._next_sample - 1e-9:
             self._next_sample += float(self.parameters.taxel_period)
             self._sample_skin()
-        if self._ticks % _LOOK == 0:
+        if self._ticks % self._look_every == 0:
             self._look()
+
+    def _power(self) -> None:
+        """The drives' torques and friction for the next period."""
+        scene, data = self._scene, self._data
+        rotor, speed = data.qpos[scene.drive_qpos], data.qvel[scene.drive_dof]
+        torque, friction = self._drives.step(self.time, rotor, speed)
+        data.qfrc_applied[scene.drive_dof] = torque
+        scene.model.dof_frictionloss[scene.drive_dof] = friction
 
     def _look(self) -> None:
         scene, data = self._scene, self._data
@@ -258,7 +275,7 @@ class EmulatedHand:
             quat = data.qpos[at + 3 : at + 7]
             spin = matrix(quat) @ data.qvel[dof + 3 : dof + 6]
             self._referee.watch(
-                _LOOK * PERIOD,
+                self._look_every * self._period,
                 data.qpos[at : at + 3].copy(),
                 quat.copy(),
                 spin,
@@ -282,30 +299,12 @@ class EmulatedHand:
         free = self._place_is_clear() if self._assistant.wants_clearance(self.time) else None
         if self._assistant.watch(self.time, targets, self._joints(), free) is Stage.FREE and before is Stage.HOLD:
             put(scene, data, self._place.position, self._place.quat, self._place.velocity)
-            self._plan_push()
+            self._pushes.begin(self.time)
 
     def _place_is_clear(self) -> bool:
         probe = mujoco.MjData(self._scene.model)
         probe.qpos[:] = self._data.qpos
         return clear(self._scene, probe, self._place)
-
-    def _push(self) -> None:
-        """Push the object at random times, with a constant force for a short time."""
-        force = self._data.xfrc_applied[self._scene.object_body]
-        if self._push_until is not None and self.time >= self._push_until:
-            force[:3], self._push_until = 0.0, None
-        if self.time < self._push_at:
-            return
-        rng, duration = self._pushing, float(self.parameters.push_seconds)
-        direction = rng.standard_normal(3)
-        change = PUSHES[self.task][1] * rng.random() * direction / np.linalg.norm(direction)
-        force[:3] = float(self.parameters.mass) * change / duration
-        self._push_until = self.time + duration
-        self._plan_push()
-
-    def _plan_push(self) -> None:
-        rate = PUSHES[self.task][0] * float(self.parameters.push_rate)
-        self._push_at = self.time + self._pushing.exponential(1 / rate) if rate > 0 else np.inf
 
     # --- sensors --------------------------------------------------------------------------------
 
@@ -318,7 +317,7 @@ class EmulatedHand:
         scene, data = self._scene, self._data
         force = np.zeros((5, self.hand.num_taxels, 3))
         if self._touches:
-            tips = data.xpos[scene.tip_body], data.xmat[scene.tip_body].reshape(-1, 3, 3)
+            tips = data.site_xpos[scene.tip_site], data.site_xmat[scene.tip_site].reshape(-1, 3, 3)
             force = self._skin.load(
                 self.shape,
                 data.xpos[scene.object_body],
@@ -335,7 +334,7 @@ class EmulatedHand:
 
     def _before(self, age: float) -> _Past:
         """The state `age` s ago, or the oldest one stored."""
-        back = min(round(age / PERIOD), len(self._past) - 1)
+        back = min(round(age / self._period), len(self._past) - 1)
         return self._past[-1 - back]
 
     def _delayed_taxel_force(self, late: float) -> np.ndarray:

@@ -37,12 +37,12 @@ class Scene:
     model: mujoco.MjModel
     drive_qpos: np.ndarray  # [J]
     drive_dof: np.ndarray  # [J]
-    play_qpos: np.ndarray  # [J]
-    play_dof: np.ndarray  # [J]
+    play_qpos: np.ndarray | None  # [J], None without gear play
+    play_dof: np.ndarray | None  # [J]
     object_qpos: int  # first of seven
     object_dof: int  # first of six
     object_body: int
-    tip_body: np.ndarray  # [F]
+    tip_site: np.ndarray  # [F] at the frames in which the hand gives the taxels
     finger_of_geom: np.ndarray  # [geoms] index of the fingertip, -1 for none
     is_object: np.ndarray  # [geoms] bool
 
@@ -66,9 +66,11 @@ def build_scene(hand: Hand, parameters: TrialParameters, shape: ObjectShape | No
         spec.delete(element)
     palm = spec.body(hand.palm)
     palm.pos, palm.quat = [0, 0, 0], [1, 0, 0, 0]
+    for body in hand.tip_body:
+        spec.body(hand.body_names[body]).add_site(name=f"{hand.body_names[body]}_taxels")
     _add_play(spec, hand, parameters)
     skins = _cover(spec, hand, parameters)
-    _add_object(spec, parameters, shape)
+    add_object(spec, parameters, shape)
     _add_pairs(spec, shape, parameters, skins)
     option = spec.option
     option.timestep, option.gravity = TIMESTEP, gravity
@@ -122,7 +124,8 @@ def _cover(spec: mujoco.MjSpec, hand: Hand, parameters: TrialParameters) -> dict
     return names
 
 
-def _add_object(spec: mujoco.MjSpec, parameters: TrialParameters, shape: ObjectShape | None) -> None:
+def add_object(spec: mujoco.MjSpec, parameters: TrialParameters, shape: ObjectShape | None) -> None:
+    """Add the object as the free body "object", its geoms touching nothing."""
     body = spec.worldbody.add_body(name="object", pos=[0.5, 0, 0])
     body.add_freejoint(name="object")
     if shape is None:
@@ -271,8 +274,8 @@ def _set_springs(model: mujoco.MjModel, parameters: TrialParameters, skins: dict
 def _index(model: mujoco.MjModel, hand: Hand) -> Scene:
     drives = [model.joint(name) for name in hand.joint_names]
     plays = [model.joint(f"{name}_play") for name in hand.joint_names]
-    tips = np.array([model.body(hand.body_names[b]).id for b in hand.tip_body])
-    finger = {int(body): f for f, body in enumerate(tips)}
+    tips = [hand.body_names[b] for b in hand.tip_body]
+    finger = {model.body(name).id: f for f, name in enumerate(tips)}
     free, body = model.joint("object"), model.body("object").id
     return Scene(
         model=model,
@@ -283,7 +286,7 @@ def _index(model: mujoco.MjModel, hand: Hand) -> Scene:
         object_qpos=int(free.qposadr[0]),
         object_dof=int(free.dofadr[0]),
         object_body=body,
-        tip_body=tips,
+        tip_site=np.array([model.site(f"{name}_taxels").id for name in tips]),
         finger_of_geom=np.array([finger.get(int(b), -1) for b in model.geom_bodyid]),
         is_object=model.geom_bodyid == body,
     )

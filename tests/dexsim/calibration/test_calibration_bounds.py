@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from dexsim.calibration.maps import (
     Calibration,
     Side,
+    calibrated_hand,
     load_calibration,
     normalised_torque,
     save_calibration,
@@ -40,6 +41,7 @@ def sound(hand, tmp_path_factory):
         joint_names=hand.joint_names,
         finger_names=hand.finger_names,
         notes=("pressed on Monday",),
+        force_per_torque=np.array([[12.0] * 5, [11.0] * 5, [13.0] * 5]),
     )
     path = tmp_path_factory.mktemp("sound") / "c.toml"
     save_calibration(path, calibration)
@@ -95,6 +97,20 @@ WRONG = {
     "a count that is no number": (("[0.1, 0.1,", "[0.1, nan,"), "index: force_per_count = nan: "),
     "a count of 10 N": (("[0.1, 0.1,", "[10.0, 0.1,"), "thumb: force_per_count = 10: "),
     "an endless count": (("current_per_count = 0.001", "current_per_count = inf"), "current_per_count = inf: "),
+    "no force for any torque": (
+        ("force_per_torque = [12.0, 12.0,", "force_per_torque = [12.0, 0.5,"),
+        "index: force_per_torque = 0.5: must be 0, or between 3.33 and 1000 N/Nm",
+    ),
+    "a force that is no number": (
+        ("force_per_torque = [12.0, 12.0,", "force_per_torque = [nan, 12.0,"),
+        "thumb: force_per_torque = nan: ",
+    ),
+    "an endless interval": (
+        ("force_per_torque_high = [13.0, 13.0,", "force_per_torque_high = [13.0, inf,"),
+        "index: its interval = inf: too large",
+    ),
+    "three forces per torque": (("force_per_torque = [12.0, 12.0,", "force_per_torque = ["), "must hold 5 number"),
+    "no interval": (("force_per_torque_low", "force_per_torque_law"), "'force_per_torque_low' must hold 5 number"),
     "six counts": (("[0.1, 0.1,", "[0.1, 0.1, 0.1,"), "'force_per_count' must hold 5 number"),
     "a word for a number": ((PAIR, 'gain = ["a", "b"]'), "'gain' must hold 2 number"),
     "a number for a name": (('name = "thumb_bend"', "name = 7"), "'name' is missing or not a str"),
@@ -112,9 +128,21 @@ def test_what_no_hand_gives_is_named(hand, sound, tmp_path, what):
     assert re.search(says, refused(tmp_path / "c.toml", hand, sound.replace(old, new, 1)))
 
 
+def test_a_file_from_before_has_no_force_per_torque(hand, sound, tmp_path):
+    old = "\n".join(line for line in sound.splitlines() if not line.startswith("force_per_torque"))
+    (tmp_path / "c.toml").write_text(old)
+    assert load_calibration(tmp_path / "c.toml", hand).force_per_torque is None
+    (tmp_path / "c.toml").write_text(sound)
+    calibration = load_calibration(tmp_path / "c.toml", hand)
+    np.testing.assert_array_equal(calibration.force_per_torque[:, 0], [12, 11, 13])
+    wanted = [hand.force_per_torque[0], 12, 12, 12, 12]  # The thumb keeps its own.
+    np.testing.assert_allclose(calibrated_hand(hand, calibration).force_per_torque, wanted)
+
+
 def test_three_fingers_are_of_another_hand(hand, sound, tmp_path):
     text = sound.replace('"thumb", "index", "middle", "ring", "pinky"', '"thumb", "index", "middle"')
     text = text.replace("[0.1, 0.1, 0.1, 0.1, 0.1]", "[0.1, 0.1, 0.1]")
+    text = re.sub(r"force_per_torque.*\n", "", text)
     assert "with 12 joints and 3 fingers, not of 'xhand_right'" in refused(tmp_path / "c.toml", hand, text)
 
 

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 
+import mujoco
 import numpy as np
 import press_bench
 import pytest
@@ -18,6 +19,15 @@ from dexsim_real.calibrate.options import PressConfig
 from dexsim_real.calibrate.report import torque_constants
 
 
+def torque_of(plant, joint):
+    """Torque Nm that a joint must hold against the pen: J^T f by C MuJoCo, of the true contacts."""
+    scene, data, jacobian, found = plant._scene, plant._data, np.zeros((3, plant._scene.model.nv)), 0.0
+    for finger, point, normal, tangent in plant._touches:
+        mujoco.mj_jac(scene.model, data, jacobian, None, point, scene.model.site_bodyid[scene.tip_site[finger]])
+        found -= jacobian[:, scene.drive_dof[joint]] @ (normal + tangent)
+    return found
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_emulated_hand_gives_its_torque_constants_back(hand, tmp_path, seed):
@@ -25,13 +35,22 @@ def test_the_emulated_hand_gives_its_torque_constants_back(hand, tmp_path, seed)
     from dexsim_real.twin.press import PressBench, VirtualPort
 
     plant = PressBench(hand, seed)
-    bench, press_bench.GAUGE = VirtualPort(plant), plant.gauge
+    pressed = []
+
+    def gauge():
+        pressed.append((plant.gauge(), torque_of(plant, int(hand.root_joint[2]))))
+        return plant.gauge()
+
+    bench, press_bench.GAUGE = VirtualPort(plant), gauge
     options = arguments(tmp_path, fingers=("middle",), press=PressConfig(), gauge="press_bench:read_gauge")
     fit_and_report(options, hand, [record(bench, hand, options)], operator())
     found, truth = -torque_constants(load_calibration(options.output, hand)), plant.truth()
     error = np.array([found[0] / truth["loading_nm_per_a"], found[1] / truth["unloading_nm_per_a"]])[:, 6:8] - 1
     # Its motors warm up by 15 K and so lose 1.5 %; ripple is 3 %; contact and taxels differ by a millimetre.
     assert np.abs(error).max() < 0.08 and abs(error.mean()) < 0.05
+    force, torque = np.array(pressed)[np.array(pressed)[:, 0] > 3.0].T
+    value, low, high = load_calibration(options.output, hand).force_per_torque[:, 2]
+    assert low < np.mean(force / torque) < high and value == pytest.approx(np.mean(force / torque), rel=0.06)
     # The scale of the taxels is drawn up to 13 % off, and is known afterwards.
     scale = 0.1 / load_calibration(options.output, hand).force_per_count[2]
     assert scale == pytest.approx(truth["taxel_gain"][2], rel=0.06)

@@ -10,8 +10,9 @@ from calibrating import arguments, off, on, operator, plates, record
 from press_bench import BenchHand
 from rich.console import Console
 
-from dexsim.calibration.maps import joint_torque, load_calibration
+from dexsim.calibration.maps import calibrated_hand, joint_torque, load_calibration, normalised_torque
 from dexsim.core.errors import CalibrationError
+from dexsim.touch.estimate import ForceEstimate, estimate_force
 from dexsim_real.calibrate.__main__ import fit_and_report
 from dexsim_real.calibrate.force_scale import upright
 from dexsim_real.calibrate.gauge import parse_reading
@@ -44,6 +45,29 @@ def test_torque_constants_come_back(hand, session):
     torque = 4.5 * bench.plates[0].arms[4]
     gap = torque * (1 / truth[0, 4] - 1 / truth[1, 4]) / 2 + bench.idle[4]
     assert calibration.real.friction[4] == pytest.approx(gap, rel=0.15)
+
+
+def test_the_force_over_the_root_joints_torque_comes_back(hand, session):
+    """One over the plate's lever arm, of a hand whose motors and losses are not those of the model."""
+    bench, options, _, shown = session
+    calibration = load_calibration(options.output, hand)
+    value, low, high = np.asarray(calibration.force_per_torque)[:, 1]
+    truth = 1.0 / bench.plates[0].arms[4]
+    assert low < truth < high and value == pytest.approx(truth, rel=0.02) and high - low < 0.35 * truth
+    assert np.all(np.asarray(calibration.force_per_torque)[:, [0, 2, 3, 4]] == 0) and "(hand's TOML)" in shown
+    used = calibrated_hand(hand, calibration).force_per_torque
+    np.testing.assert_allclose(used[[0, 2, 3, 4]], hand.force_per_torque[[0, 2, 3, 4]])
+    assert used[1] == pytest.approx(value) and calibrated_hand(hand, None) is hand
+    # What a run reads of a press at 6 N while the finger closes: the estimate is off by the friction alone.
+    torque = 6.0 / truth
+    current = np.zeros(12)
+    current[4] = -(torque / (bench.constant * bench.efficiency)[4] + bench.idle[4] + bench.bias[4])
+    read = normalised_torque(calibration, current)
+    taxels = np.zeros((5, hand.num_taxels))
+    taxels[1, 50] = 1.0
+    force = estimate_force(ForceEstimate(), calibrated_hand(hand, calibration), taxels, read)[1]
+    friction = calibration.real.friction[4] / abs(np.mean(calibration.real.gain[:, 4]))
+    assert abs(float(force) - 6.0) < friction * 1.3 + 0.3
 
 
 def test_the_file_names_the_hand(hand, session):

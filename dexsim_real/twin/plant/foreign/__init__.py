@@ -1,0 +1,1 @@
+"""A hand from a user's MJCF in place of the emulated hand's own physics."""

@@ -1,0 +1,282 @@
+"""Reads a user's MJCF of the hand: which joints, palm and fingertips are meant, and whether they fit the hand.
+
+Names need not be those of the hand. Joints are found by name, or by the order of the actuators; the palm is the body
+that carries all of them; a fingertip is the site on the body that the finger's last joint moves. A TOML says what
+cannot be found:
+
+    model = "my_hand.xml"
+    palm = "base"                  # body or site: fingers along z, palm normal x, thumb side y
+    joints = ["j0", ..., "j11"]    # in the order of the hand
+    tips = ["tip_0", ..., "tip_4"] # sites at the tips, in the order of the fingers
+"""
+
+import dataclasses
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from dexsim.hand.kinematics import Hand
+from dexsim_real.core.errors import HandError
+
+PREFIX = "plant/"  # of all names of the MJCF in the model of a trial
+STIFFNESS, DAMPING = 3.0, 0.1  # Nm/rad, Nm s/rad, of the servo that a torque motor gets
+_TIMESTEPS = (1e-4, 5e-3)  # s
+_RANGE = 0.05  # rad, largest difference of an end of a joint's range
+_APART = 0.015  # m, largest distance of a fingertip from where the hand has it
+_KEYS = {"model": str, "palm": str, "joints": list, "tips": list}
+
+
+@dataclasses.dataclass(frozen=True)
+class ForeignModel:
+    """A checked MJCF, in the palm frame; names have the `PREFIX`."""
+
+    path: Path
+    spec: mujoco.MjSpec
+    joints: tuple[str, ...]  # [J] in the order of the hand
+    actuators: tuple[int, ...]  # [J]
+    lattices: tuple[str, ...]  # [F] sites: the frames in which the hand gives the taxels of a fingertip
+
+
+def read_model(path: str | Path, hand: Hand) -> ForeignModel:
+    """Read and check an MJCF.
+
+    Args:
+      path: the MJCF, or a TOML that names it and its parts.
+      hand: whose joints, fingertips and taxels it must have.
+
+    Raises:
+      HandError: it cannot be read, or does not fit the hand.
+    """
+    path = Path(path)
+    names: dict[str, Any] = _names(path) if path.suffix == ".toml" else {"model": path.name}
+    spec = _load(path.parent / names["model"])
+    model = spec.compile()
+    if not _TIMESTEPS[0] <= model.opt.timestep <= _TIMESTEPS[1]:
+        raise HandError(f"{path}: a timestep of {1e3 * model.opt.timestep:g} ms; 0.1 to 5 ms are possible")
+    actuators, joints = _joints(path, model, hand, names.get("joints"))
+    data = mujoco.MjData(model)
+    data.qpos[model.jnt_qposadr[joints]] = 0.0
+    mujoco.mj_kinematics(model, data)
+    palm = _palm(path, model, data, joints, names.get("palm"))
+    tips = [_tip(path, model, hand, joints, f, names.get("tips")) for f in range(hand.num_fingers)]
+    _check_places(path, model, hand, joints, palm, tips)
+    if not np.any(model.geom_contype | model.geom_conaffinity):
+        raise HandError(f"{path}: no geom can touch anything (contype and conaffinity are 0)")
+    lattices = _add_lattices(spec, model, data, hand, palm, tips)
+    _set_servos(spec, model, hand, actuators)
+    return ForeignModel(
+        path,
+        _in_palm_frame(spec, palm),
+        tuple(PREFIX + model.joint(j).name for j in joints),
+        tuple(actuators),
+        tuple(PREFIX + name for name in lattices),
+    )
+
+
+def _names(path: Path) -> dict[str, Any]:
+    try:
+        table = tomllib.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise HandError(f"{path}: cannot be read ({_line(error)})") from None
+    wrong = [key for key, value in table.items() if key not in _KEYS or not isinstance(value, _KEYS[key])]
+    if wrong or "model" not in table:
+        raise HandError(
+            f"{path}: field {wrong[0] if wrong else 'model'!r}: give model, and where needed {list(_KEYS)[1:]}"
+        )
+    return table
+
+
+def _load(path: Path) -> mujoco.MjSpec:
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+        for element in (*spec.keys, *spec.sensors):
+            spec.delete(element)
+        for geom in [g for g in spec.worldbody.geoms if g.type == mujoco.mjtGeom.mjGEOM_PLANE]:
+            spec.delete(geom)  # a floor
+        spec.compile()
+    except ValueError as error:
+        raise HandError(f"{path}: MuJoCo cannot read it ({_line(error)})") from None
+    return spec
+
+
+def _joints(path: Path, model: mujoco.MjModel, hand: Hand, wanted: list[str] | None) -> tuple[list[int], list[int]]:
+    """Actuators and joints of the MJCF, in the order of the hand."""
+    driven: dict[int, int] = {}  # actuator by joint
+    for k in range(model.nu):
+        joint = int(model.actuator_trnid[k, 0])
+        on_joint = model.actuator_trntype[k] == int(mujoco.mjtTrn.mjTRN_JOINT)
+        hinge = on_joint and model.jnt_type[joint] == int(mujoco.mjtJoint.mjJNT_HINGE)
+        if not hinge or model.actuator_dyntype[k] != int(mujoco.mjtDyn.mjDYN_NONE) or joint in driven:
+            raise HandError(
+                f"{path}: actuator {model.actuator(k).name or k}: a hinge takes one motor or position servo without "
+                "state, other actuators cannot be driven"
+            )
+        driven[joint] = k
+    if len(driven) != hand.num_joints:
+        raise HandError(f"{path}: {len(driven)} actuated joints, the hand has {hand.num_joints}")
+    known = {model.joint(j).name: j for j in driven}
+    names = wanted or (list(hand.joint_names) if set(hand.joint_names) == set(known) else list(known))
+    missing = [name for name in names if name not in known]
+    if missing or len(set(names)) != hand.num_joints:
+        what = f"{missing[0]!r} is not one of them" if missing else f"{len(set(names))} of {hand.num_joints} are named"
+        raise HandError(f"{path}: joints: {what}; actuated are {', '.join(known)}")
+    joints = [known[name] for name in names]
+    for j, (joint, name) in enumerate(zip(joints, names, strict=True)):
+        ends = hand.joint_lower[j], hand.joint_upper[j]
+        found = model.jnt_range[joint] if model.jnt_limited[joint] else (-np.inf, np.inf)
+        if np.abs(np.subtract(found, ends)).max() > _RANGE:
+            raise HandError(
+                f"{path}: joint {name} has a range of {found[0]:.3f} to {found[1]:.3f} rad, {hand.joint_names[j]} of "
+                f"the hand {ends[0]:.3f} to {ends[1]:.3f}"
+            )
+    return [driven[j] for j in joints], joints
+
+
+def _palm(
+    path: Path, model: mujoco.MjModel, data: mujoco.MjData, joints: list[int], wanted: str | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Position [3] and rotation [3, 3] of the palm frame in the world."""
+    if wanted and any(model.site(i).name == wanted for i in range(model.nsite)):
+        site = model.site(wanted).id
+        body, place, turn = int(model.site_bodyid[site]), data.site_xpos[site], data.site_xmat[site]
+    else:
+        carrying = set.intersection(*(set(_above(model, int(model.jnt_bodyid[j]))) for j in joints))
+        body = max(carrying)  # The deepest: a body comes after its parent.
+        if wanted:
+            body = next((b for b in range(model.nbody) if model.body(b).name == wanted), -1)
+        if body < 0:
+            raise HandError(f"{path}: palm: there is neither a body nor a site {wanted!r}")
+        place, turn = data.xpos[body], data.xmat[body]
+    if model.body_weldid[body] != 0:
+        raise HandError(f"{path}: the palm ({model.body(body).name}) moves: fix it to the world")
+    return place.copy(), turn.reshape(3, 3).copy()
+
+
+def _above(model: mujoco.MjModel, body: int) -> list[int]:
+    """Bodies that carry a body, up to the world."""
+    found = []
+    while body:
+        body = int(model.body_parentid[body])
+        found.append(body)
+    return found
+
+
+def _tip(
+    path: Path, model: mujoco.MjModel, hand: Hand, joints: list[int], finger: int, wanted: list[str] | None
+) -> int:
+    """The site at the tip of a finger."""
+    name, body = hand.finger_names[finger], int(hand.tip_body[finger])
+    while hand.body_joint[body] < 0:
+        body = int(hand.body_parent[body])
+    joint = joints[int(hand.body_joint[body])]
+    moved = model.body_weldid[model.jnt_bodyid[joint]]
+    sites = [s for s in range(model.nsite) if model.body_weldid[model.site_bodyid[s]] == moved]
+    label = model.joint(joint).name
+    if wanted:
+        found = [s for s in sites if len(wanted) == hand.num_fingers and model.site(s).name == wanted[finger]]
+        if not found:
+            raise HandError(
+                f"{path}: tips: give {hand.num_fingers} sites; that of {name} on the body that {label} moves"
+            )
+        return found[0]
+    found = sites if len(sites) == 1 else [s for s in sites if "tip" in model.site(s).name.lower()]
+    if len(found) != 1:
+        raise HandError(
+            f"{path}: {len(found) or 'no'} fingertip sites of {name}: put one site with 'tip' in its name on the body "
+            f"that {label} moves, at the tip"
+        )
+    return found[0]
+
+
+def _check_places(
+    path: Path,
+    model: mujoco.MjModel,
+    hand: Hand,
+    joints: list[int],
+    palm: tuple[np.ndarray, np.ndarray],
+    tips: list[int],
+) -> None:
+    """Check where the fingertips are with all joints at 0, and with each at its upper end."""
+    data, at = mujoco.MjData(model), model.jnt_qposadr[joints]
+    reference = mujoco.MjModel.from_xml_path(str(hand.model_path))
+    for j in range(-1, hand.num_joints):
+        posture = np.zeros(hand.num_joints)
+        posture[j] = hand.joint_upper[j] if j >= 0 else 0.0
+        data.qpos[at] = posture
+        mujoco.mj_kinematics(model, data)
+        found = (data.site_xpos[tips] - palm[0]) @ palm[1]
+        apart = np.linalg.norm(found - _hand_tips(reference, hand, posture)[0], axis=-1)
+        worst = int(apart.argmax())
+        if apart[worst] > _APART:
+            where = "all joints at 0" if j < 0 else f"{model.joint(joints[j]).name} at {posture[j]:.2f} rad"
+            raise HandError(
+                f"{path}: with {where} the tip of {hand.finger_names[worst]} is {1e3 * apart[worst]:.0f} mm from where "
+                f"the hand has it: check palm frame, and order, axes and zeros of the joints"
+            )
+
+
+def _hand_tips(reference: mujoco.MjModel, hand: Hand, posture: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Positions [F, 3] and rotations [F, 3, 3] of the fingertips in the palm frame, by the hand's own MJCF."""
+    data = mujoco.MjData(reference)
+    for name, angle in zip(hand.joint_names, posture, strict=True):
+        data.joint(name).qpos[0] = angle
+    mujoco.mj_kinematics(reference, data)
+    palm = data.body(hand.palm)
+    bodies = [data.body(hand.body_names[body]) for body in hand.tip_body]
+    turns = np.array([palm.xmat.reshape(3, 3).T @ body.xmat.reshape(3, 3) for body in bodies])
+    places = [(body.xpos - palm.xpos) @ palm.xmat.reshape(3, 3) for body in bodies]
+    return np.array(places) + np.einsum("fij,fj->fi", turns, hand.tip_offset), turns
+
+
+def _add_lattices(
+    spec: mujoco.MjSpec,
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    hand: Hand,
+    palm: tuple[np.ndarray, np.ndarray],
+    tips: list[int],
+) -> list[str]:
+    """Add the frames of the taxels: at the tip sites, turned as on the hand with all joints at 0."""
+    reference = mujoco.MjModel.from_xml_path(str(hand.model_path))
+    _, turns = _hand_tips(reference, hand, np.zeros(hand.num_joints))
+    names = [f"lattice_{finger}" for finger in hand.finger_names]
+    for name, site, turn, offset in zip(names, tips, turns, hand.tip_offset, strict=True):
+        turn, body = palm[1] @ turn, int(model.site_bodyid[site])
+        frame, quat = data.xmat[body].reshape(3, 3), np.empty(4)
+        mujoco.mju_mat2Quat(quat, (frame.T @ turn).ravel())
+        place = frame.T @ (data.site_xpos[site] - turn @ offset - data.xpos[body])
+        spec.bodies[body].add_site(name=name, pos=place, quat=quat)
+    return names
+
+
+def _set_servos(spec: mujoco.MjSpec, model: mujoco.MjModel, hand: Hand, actuators: list[int]) -> None:
+    """Give torque motors a position servo, and every actuator a torque limit."""
+    for j, k in enumerate(actuators):
+        actuator, joint, gear = spec.actuators[k], int(model.actuator_trnid[k, 0]), model.actuator_gear[k, 0]
+        servo = model.actuator_biastype[k] == int(mujoco.mjtBias.mjBIAS_AFFINE) and model.actuator_biasprm[k, 1] < 0
+        limits = [np.abs(model.actuator_forcerange[k]).max()] if model.actuator_forcelimited[k] else []
+        if model.jnt_actfrclimited[joint]:
+            limits.append(np.abs(model.jnt_actfrcrange[joint]).max() / abs(gear))
+        if not servo:
+            if model.actuator_ctrllimited[k]:
+                limits.append(np.abs(model.actuator_ctrlrange[k] * model.actuator_gainprm[k, 0]).max())
+            actuator.set_to_position(kp=STIFFNESS / gear**2, kv=DAMPING / gear**2)
+        limit = min(limits, default=hand.torque_limit[j] / abs(gear))
+        actuator.forcelimited, actuator.forcerange = mujoco.mjtLimited.mjLIMITED_TRUE, [-limit, limit]
+        actuator.ctrllimited = mujoco.mjtLimited.mjLIMITED_FALSE
+
+
+def _in_palm_frame(spec: mujoco.MjSpec, palm: tuple[np.ndarray, np.ndarray]) -> mujoco.MjSpec:
+    """The same model with the palm frame as its world."""
+    quat, world = np.empty(4), mujoco.MjSpec()
+    mujoco.mju_mat2Quat(quat, palm[1].T.ravel())
+    world.option = spec.option
+    world.attach(spec, frame=world.worldbody.add_frame(pos=-palm[1].T @ palm[0], quat=quat), prefix=PREFIX)
+    return world
+
+
+def _line(error: object) -> str:
+    return " ".join(str(error).split())[:200]
