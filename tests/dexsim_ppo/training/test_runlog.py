@@ -1,9 +1,16 @@
-"""The learning curve says what it shows, in words and units."""
+"""Where metrics go, and that the learning curve says what it shows, in words and units."""
+
+import importlib.util
+import sys
+import types
 
 import matplotlib.pyplot as plt
 import pytest
+from tiny_env import SMALL, TinyConfig
 
+from dexsim.core.errors import ConfigError
 from dexsim_ppo.training import runlog
+from dexsim_ppo.training.arguments import TrainArguments
 
 
 @pytest.fixture
@@ -43,3 +50,24 @@ def test_evaluations_are_marked_and_unknown_errors_are_named(figure):
 
 def test_nothing_to_show_draws_nothing(figure):
     assert figure([{"iteration": 1, "env_steps": 1}]) is None
+
+
+def test_metrics_go_to_weights_and_biases(tmp_path, monkeypatch):
+    said = []
+    run = types.SimpleNamespace(log=lambda row, step: said.append((row, step)), finish=lambda: said.append("finished"))
+    fake = types.SimpleNamespace(init=lambda **given: (said.append(given), run)[1])
+    monkeypatch.setitem(sys.modules, "wandb", fake)
+    arguments = TrainArguments(env=TinyConfig(), ppo=SMALL, wandb="hands", seed=3)
+    log = runlog.MetricsLog(runlog.RunFolder(tmp_path), 0, arguments)
+    log.write({"iteration": 1, "env_steps": 500, "reward": 0.5, "kl": float("nan")})
+    log.close()
+    begun, *logged = said
+    assert begun["project"] == "hands" and begun["config"]["seed"] == 3 and begun["dir"] == tmp_path
+    assert logged == [({"reward": 0.5}, 500), "finished"]
+
+
+def test_weights_and_biases_are_asked_for_before_training_begins(monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    runlog.check_wandb("")
+    with pytest.raises(ConfigError, match="--wandb hands: install the extra"):
+        runlog.check_wandb("hands")

@@ -47,6 +47,8 @@ QUICK = [
     "32",
     "--evaluate-every",
     "4",
+    "--evaluation-share",
+    "1",
     "--log-every",
     "1",
 ]
