@@ -33,7 +33,7 @@ from dexsim_ppo.learner.running_stats import (
     update_stats,
     value_std,
 )
-from dexsim_ppo.learner.sharding import batched, copied, shardings, start_on
+from dexsim_ppo.learner.sharding import batched, block_count, copied, in_blocks, shardings, start_on
 from dexsim_ppo.learner.types import CurriculumEnvironment, Environment, layout_size
 from dexsim_ppo.learner.update import Learner, update
 
@@ -161,7 +161,7 @@ def train_iteration(
     if config.normalize_value:
         rollout, bounded = bound_rewards(rollout, state.value_stats, config.reward_scale)
         metrics |= {"bounded_rewards": bounded}
-    value_stats, params, samples = prepare(config, state.value_stats, state.params, rollout)
+    value_stats, params, samples = prepare(config, state.value_stats, state.params, rollout, mesh)
     learner, update_metrics = update(
         config,
         normalizers,
@@ -254,9 +254,9 @@ def collect_rollout(
 
 
 def prepare(
-    config: PPOConfig, value_stats: RunningStats, params: Params, rollout: Rollout
+    config: PPOConfig, value_stats: RunningStats, params: Params, rollout: Rollout, mesh: Mesh | None = None
 ) -> tuple[RunningStats, Params, Samples]:
-    """Advantages and normalised value targets as flat rows [T * B]; updates the value normaliser."""
+    """Advantages and normalised value targets in blocks [K, T * B / K]; updates the value normaliser."""
     advantage, target = compute_gae(
         config.reward_scale * rollout.reward,
         rollout.value,
@@ -278,7 +278,7 @@ def prepare(
         value=(rollout.value - mean) / std,
         target=(target - mean) / std,
     )
-    return value_stats, params, jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), samples)
+    return value_stats, params, in_blocks(samples, block_count(config, mesh))
 
 
 def strong_types(tree: Any) -> Any:

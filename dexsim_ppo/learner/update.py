@@ -13,7 +13,7 @@ from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.loss import Metrics, Samples, loss
 from dexsim_ppo.learner.networks import Params
 from dexsim_ppo.learner.running_stats import Normalizer
-from dexsim_ppo.learner.sharding import copied, split_rows
+from dexsim_ppo.learner.sharding import on_each
 
 
 class Learner(NamedTuple):
@@ -35,21 +35,20 @@ def update(
 ) -> tuple[Learner, Metrics]:
     """All epochs over shuffled minibatches, then the learning rate of the next iteration.
 
-    Metrics are means over all minibatches, except the KL divergence: its mean over the last epoch.
+    Each block of `samples` [K, rows, ...] is shuffled by itself and gives the same share of every minibatch: a device
+    needs no rows of another one. Metrics are means over all minibatches, except the KL divergence: its mean over the
+    last epoch.
     """
-    rows = config.steps_per_iteration
-    keys = jax.random.split(key, config.epochs)
-    order = jax.vmap(lambda key: jax.random.permutation(key, rows))(keys)
-    order = order.reshape(config.epochs * config.minibatches, rows // config.minibatches)
+    blocks, rows = samples.advantage.shape
+    keys = jax.random.split(key, (config.epochs, blocks))
+    order = jax.vmap(jax.vmap(lambda key: jax.random.permutation(key, rows)))(keys)
+    order = order.reshape(config.epochs, blocks, config.minibatches, -1).swapaxes(1, 2)
+    order = order.reshape(config.epochs * config.minibatches, blocks, -1)
     old_log_std, moves = learner.params.log_std, actor_learns(config, learner)
-
-    # A minibatch has rows from all devices, in one order whatever their number. Sending all rows to all devices once
-    # is cheaper than sending those of every minibatch.
-    samples = copied(samples, mesh)
+    pick = on_each(pick_rows, mesh)
 
     def minibatch(learner, indices):
-        indices = split_rows(indices, mesh)
-        batch = split_rows(jax.tree.map(lambda x: x[indices], samples), mesh)
+        batch = pick(samples, indices)
         grads, metrics = jax.grad(loss, has_aux=True)(learner.params, config, normalizers, batch, old_log_std)
         learner, norms = apply_gradients(config, learner, grads)
         return learner, metrics | norms
@@ -61,6 +60,12 @@ def update(
     if config.critic_first:  # A policy that does not move says nothing about the rate.
         rate = jnp.where(moves, rate, learner.learning_rate)
     return learner._replace(learning_rate=rate), metrics
+
+
+def pick_rows(samples: Samples, indices: jax.Array) -> Samples:
+    """Rows `indices` [K, M] of each block of `samples` [K, rows, ...], as [K * M, ...]."""
+    flat = (indices + samples.advantage.shape[1] * jnp.arange(len(indices))[:, None]).reshape(-1)
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[flat], samples)
 
 
 def apply_gradients(config: PPOConfig, learner: Learner, grads: Params) -> tuple[Learner, Metrics]:

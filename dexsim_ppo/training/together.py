@@ -106,9 +106,7 @@ def _loop(
             "training_s": time.perf_counter() - begin,
             "step_s": sum(steps_s),
             "env_steps": steps,
-            "env_steps_per_s": len(runs)
-            * (steps - per_call * config.steps_per_iteration)
-            / max(sum(steps_s[1:]), 1e-9),
+            "env_steps_per_s": timed / max(sum(steps_s[1:]), 1e-9),
         }
         if run.best["return"] is not None and not stopped() and not evaluated:
             run.evaluate(_part(states, i), iteration, display)
