@@ -160,7 +160,7 @@ def make_run(
             folder.config,
             {"command": command, "arguments": printable(arguments), "hand": record_of(hand)} | cli.environment_report(),
         )
-    return Run(env, arguments, folder, started, mesh, like and like.evaluator)
+    return Run(env, arguments, folder, started, mesh, like.evaluator if like else None)
 
 
 def make_environment(arguments: TrainArguments, hand: Hand | None, devices: int) -> Environment:
