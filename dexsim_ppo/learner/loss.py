@@ -15,7 +15,7 @@ Metrics = dict[str, jax.Array]
 
 @pytree_dataclass
 class Samples:
-    """Experience as the update sees it; arrays [K, T * B / K, ...] in blocks of environments, or a minibatch [N, ...]."""
+    """Experience as the update sees it: arrays [K, T * B / K, ...] in blocks of environments, a minibatch [N, ...]."""
 
     obs: dict[str, jax.Array]
     decision: Decision

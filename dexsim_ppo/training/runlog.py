@@ -6,8 +6,11 @@ import importlib.util
 import itertools
 import json
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from dexsim.core.cli import plain
 from dexsim.core.errors import CheckpointError, ConfigError
@@ -136,6 +139,12 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
     return rows
 
 
+def means(metrics: Mapping[str, Any]) -> dict[str, float]:
+    """Mean [] of each metric over the iterations of a call, or over seeds, that have a finite value."""
+    found = {name: np.asarray(values, np.float64) for name, values in metrics.items()}
+    return {name: float(np.nanmean(x)) if np.isfinite(x).any() else float("nan") for name, x in found.items()}
+
+
 def _tensorboard_writer(path: Path) -> Any:
     for module in ("tensorboardX", "torch.utils.tensorboard"):
         if importlib.util.find_spec(module.split(".")[0]) is None:
@@ -169,7 +178,6 @@ def draw_curve(rows: list[dict[str, Any]], path: Path, title: str) -> None:
 
     matplotlib.use("agg")
     import matplotlib.pyplot as plt
-    import numpy as np
 
     errors = sorted({name for row in rows for name in row if name.startswith("step/") and name.endswith("error")})[:1]
     words = CURVES | {

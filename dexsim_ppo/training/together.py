@@ -13,8 +13,8 @@ from dexsim_ppo.policy import Policy
 from dexsim_ppo.training import memory, programs
 from dexsim_ppo.training.display import Display
 from dexsim_ppo.training.faults import Faults, keep
-from dexsim_ppo.training.runlog import MetricsLog
-from dexsim_ppo.training.trainer import Run, due, means
+from dexsim_ppo.training.runlog import MetricsLog, means
+from dexsim_ppo.training.trainer import Run, due
 
 # One seed's part of a tree [S, ...].
 _part: Callable[[Any, int], Any] = jax.jit(lambda tree, index: jax.tree.map(lambda x: x[index], tree))

@@ -3,14 +3,13 @@
 import dataclasses
 import functools
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.sharding import Mesh
 
 from dexsim.core import cli
@@ -24,13 +23,13 @@ from dexsim_ppo.learner.ppo import TrainState, make_train
 from dexsim_ppo.learner.sharding import learned, place
 from dexsim_ppo.learner.types import Environment
 from dexsim_ppo.policy import Policy
-from dexsim_ppo.report import print_report
+from dexsim_ppo.report import print_report, surely_better
 from dexsim_ppo.training import memory, processes, programs
 from dexsim_ppo.training.arguments import TrainArguments, printable, training_config
 from dexsim_ppo.training.display import Display
 from dexsim_ppo.training.faults import Faults, keep
 from dexsim_ppo.training.fine_tune import initialize_from
-from dexsim_ppo.training.runlog import MetricsLog, RunFolder, draw_curve, read_metrics
+from dexsim_ppo.training.runlog import MetricsLog, RunFolder, draw_curve, means, read_metrics
 
 # Selecting the best policy uses starts and episodes that no report has: `evaluate --seed` ends below.
 SELECTION_SEED, REPORT_SEED = 2**32 - 1, 0
@@ -39,11 +38,6 @@ SELECTION_SEED, REPORT_SEED = 2**32 - 1, 0
 def due(iteration: int, per_call: int, every: int) -> bool:
     """Whether a call of `per_call` iterations that ended at `iteration` passed a multiple of `every`; 0 is never."""
     return every > 0 and iteration // every > (iteration - per_call) // every
-
-
-def surely_better(trained: dict[str, Any], untrained: dict[str, Any]) -> dict[str, bool]:
-    """Which headline figures of the trained policy lie above those of the untrained one, interval above interval."""
-    return {name: trained[name]["low"] > untrained[name]["high"] for name in ("held", "return", "steps_held")}
 
 
 class Run:
@@ -293,11 +287,7 @@ class Run:
             content={
                 "arguments": printable(self.arguments),
                 "hand": record_of(getattr(self.env, "hand", None)),
-                "progress": {
-                    "best": self.best,
-                    "seconds": self._seconds(),
-                    "without_better": self.without_better,
-                },
+                "progress": {"best": self.best, "seconds": self._seconds(), "without_better": self.without_better},
             },
         )
         if processes.is_first():
@@ -354,9 +344,3 @@ class Run:
         self.clock["total_s"] = time.perf_counter() - self.started
         cli.write_json(folder.report, report)
         print(f"report: {folder.report}")
-
-
-def means(metrics: Mapping[str, Any]) -> dict[str, float]:
-    """Mean [] of each metric over the iterations of a call, or over seeds, that have a finite value."""
-    found = {name: np.asarray(values, np.float64) for name, values in metrics.items()}
-    return {name: float(np.nanmean(x)) if np.isfinite(x).any() else float("nan") for name, x in found.items()}
