@@ -14,7 +14,7 @@ PY := $(VENV)/bin/python
 PIP := $(PY) -m pip --disable-pip-version-check
 
 # With an NVIDIA driver present, training goes to the GPU through Warp.
-EXTRAS ?= video$(if $(shell nvidia-smi -L 2>/dev/null),$(comma)cuda$(comma)warp)
+EXTRAS ?= video,tb$(if $(shell nvidia-smi -L 2>/dev/null),$(comma)cuda$(comma)warp)
 comma := ,
 
 # One stamp for each set of requirements: a step runs again only when pyproject.toml has changed.

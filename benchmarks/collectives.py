@@ -33,8 +33,10 @@ def received(text: str) -> tuple[float, dict[str, int]]:
             if match := _OP.search(line):
                 shapes, kind, started = match.groups()
                 sizes = [_bytes(*each) for each in _SHAPE.findall(shapes)]
-                if started and kind != "all-reduce":  # (operands, results, ...)
-                    sizes = [max(sizes)]
+                if started and kind == "collective-permute":  # (operand, result, contexts)
+                    sizes = sizes[1:2]
+                elif started and kind != "all-reduce":  # (operands, results)
+                    sizes = sizes[len(sizes) // 2 :]
                 counts[kind] += times
                 total += times * sum(sizes) * _RING[kind](_group(line, partitions))
                 continue

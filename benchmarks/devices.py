@@ -2,6 +2,7 @@
 
     python benchmarks/devices.py --task rotate --devices 1 2 4 8    # devices of this process
     python benchmarks/devices.py --task grasp --processes 2         # two processes, cores and GPUs shared out
+    python benchmarks/devices.py --task grasp --seeds 4             # four seeds in one program, against one
 
 `--devices` measures training with so many devices in turn, the same environments on each. `--processes` measures so
 many processes that train together, all their devices in one mesh, and beside it as many that train alone at the same
@@ -15,68 +16,101 @@ import argparse
 import dataclasses
 import json
 import statistics
+import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import jax
+from collectives import received
+from launch import start
 
 import dexsim
 from dexsim.core.cli import enable_caches
-from dexsim.core.compilation import collector_paused
-from dexsim.registry import TASKS
+from dexsim.core.compilation import collector_paused, jit
+from dexsim.registry import find_task
+from dexsim_ppo.learner.adapter import adapt
 from dexsim_ppo.learner.ppo import make_train
 from dexsim_ppo.learner.sharding import make_mesh
 from dexsim_ppo.training import processes
 from dexsim_ppo.training.presets import find_preset
 
 
-def measure(options: argparse.Namespace, devices: int) -> dict[str, Any]:
-    """Speed of training on the first devices, learner included and compilation excluded."""
-    from collectives import received
+class Case:
+    """A training, compiled and ready to be timed.
 
-    ppo = find_preset("gpu" if jax.default_backend() == "gpu" else "cpu", options.task).ppo
-    each = options.num_envs or ppo.num_envs
-    config = dataclasses.replace(ppo, num_envs=each * devices, iterations_per_call=options.iterations)
-    if options.rollout_length:
-        config = dataclasses.replace(config, rollout_length=options.rollout_length)
-    env = dexsim.make(options.task, backend=options.backend, num_envs=each)
-    mesh, begin = make_mesh(devices, config), time.perf_counter()
-    training = make_train(env, config, mesh=mesh)
-    state, shapes = training.init(jax.random.key(0)), training.shapes(jax.random.key(0))
-    step = training.step.lower(shapes).compile()
-    compiled, times = time.perf_counter() - begin, []
-    for _ in range(options.warmup + options.repeats):
+    Args:
+      options: of the command.
+      devices: how many of this process's, or of all processes together.
+      seeds: trainings in one program.
+    """
+
+    def __init__(self, options: argparse.Namespace, devices: int, seeds: int = 1):
+        ppo = find_preset("gpu" if jax.default_backend() == "gpu" else "cpu", options.task).ppo
+        each = options.num_envs or ppo.num_envs
+        self.config = dataclasses.replace(ppo, num_envs=each * devices, iterations_per_call=options.iterations)
+        if options.rollout_length:
+            self.config = dataclasses.replace(self.config, rollout_length=options.rollout_length)
+        env = adapt(dexsim.make(options.task, backend=options.backend, num_envs=each), options.task)
+        begin, self.times, self.seeds = time.perf_counter(), list[float](), seeds
+        training = make_train(env, self.config, mesh=make_mesh(devices, self.config))
+        shapes, step = training.shapes(jax.random.key(0)), training.step
+        if seeds == 1:
+            self.state = training.init(jax.random.key(0))
+        else:
+            self.state = jax.vmap(training.init)(jax.random.split(jax.random.key(0), seeds))
+            shapes = jax.eval_shape(lambda: self.state)
+            step = jit(jax.vmap(training.plain_step), backend=env.backend, donate_argnums=0)
+        self.step = step.lower(shapes).compile()
+        bytes_, counts = received(self.step.as_text())
+        self.row = {
+            "devices": devices,
+            "processes": jax.process_count(),
+            "seeds": seeds,
+            "backend": env.backend,
+            "num_envs_per_device": each,
+            "compile_s": round(time.perf_counter() - begin, 1),
+            "received_bytes": round(bytes_ / options.iterations),
+            "collectives": {name: round(count / options.iterations, 1) for name, count in counts.items()},
+        }
+
+    def run(self) -> None:
+        """One call."""
         with collector_paused():
             start = time.perf_counter()
-            state, metrics = step(state)
+            self.state, metrics = self.step(self.state)
             jax.block_until_ready(metrics)
-            times.append(time.perf_counter() - start)
-    seconds = statistics.median(times[options.warmup :])
-    bytes_, counts = received(step.as_text())
-    return {
-        "devices": devices,
-        "processes": jax.process_count(),
-        "backend": env.backend,
-        "num_envs_per_device": each,
-        "env_steps_per_s": round(options.iterations * config.steps_per_iteration / seconds),
-        "iteration_ms": round(1e3 * seconds / options.iterations, 2),
-        "spread": round((max(times[options.warmup :]) - min(times[options.warmup :])) / seconds, 4),
-        "received_bytes": round(bytes_ / options.iterations),
-        "collectives": {name: round(count / options.iterations, 1) for name, count in counts.items()},
-        "compile_s": round(compiled, 1),
-        "first_call_s": round(times[0], 1),
-        "reward": round(float(metrics["reward"][-1]), 4),
-    }
+            self.times.append(time.perf_counter() - start)
+        self.reward = float(metrics["reward"].mean())
+
+
+def measure(options: argparse.Namespace, *cases: Case) -> list[dict[str, Any]]:
+    """A row for each case; they are run in turn, so that what else the machine does falls on all of them."""
+    for _ in range(options.warmup + options.repeats):
+        for case in cases:
+            case.run()
+    rows = []
+    for case in cases:
+        times = case.times[options.warmup :]
+        seconds = statistics.median(times)
+        speed = case.seeds * options.iterations * case.config.steps_per_iteration / seconds
+        rows.append(
+            case.row
+            | {
+                "env_steps_per_s": round(speed),
+                "iteration_ms": round(1e3 * seconds / options.iterations, 2),
+                "spread": round((max(times) - min(times)) / seconds, 4),
+                "first_call_s": round(case.times[0], 1),
+                "reward": round(case.reward, 4),
+            }
+        )
+    return rows
 
 
 def run_processes(argv: list[str], number: int, joined: bool) -> dict[str, Any]:
     """One row of processes that train together, or of as many that train alone at the same time."""
-    import subprocess
-
-    from launch import start
-
     command = [sys.executable, __file__, *argv, "--worker"]
     running = start(command, number, joined=joined, stdout=subprocess.PIPE, text=True)
     said = [process.communicate()[0] for process in running]
@@ -91,10 +125,11 @@ def run_processes(argv: list[str], number: int, joined: bool) -> dict[str, Any]:
 
 def parse(argv: list[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--task", default="rotate", choices=sorted(TASKS))
+    parser.add_argument("--task", default="rotate", help="as in training")
     parser.add_argument("--backend", default="auto", choices=["auto", "jax", "warp", "c"])
     parser.add_argument("--devices", nargs="+", type=int, default=[1], metavar="N")
     parser.add_argument("--processes", type=int, default=1, metavar="N")
+    parser.add_argument("--seeds", type=int, default=1, metavar="N", help="in one program, beside one")
     parser.add_argument("--num-envs", type=int, default=0, help="environments on a device; 0 for the preset's")
     parser.add_argument("--rollout-length", type=int, default=0, help="0 for the preset's")
     parser.add_argument("--iterations", type=int, default=1, help="in one compiled call")
@@ -105,25 +140,38 @@ def parse(argv: list[str]) -> argparse.Namespace:
     return parser.parse_args(argv)
 
 
+def rows(options: argparse.Namespace, argv: list[str]) -> Iterator[dict[str, Any]]:
+    """What is measured, one after another."""
+    if options.processes > 1:
+        for together in (False, True):
+            yield run_processes(argv, options.processes, together)
+    elif options.seeds > 1:
+        yield from measure(options, Case(options, 1), Case(options, 1, options.seeds))
+    else:
+        for devices in options.devices:
+            yield from measure(options, Case(options, devices))
+
+
 def main(argv: list[str]) -> None:
-    options, rows = parse(argv), []
+    options, found = parse(argv), list[dict[str, Any]]()
+    find_task(options.task)
+    options.task = options.task.rpartition(":")[2]
     if options.worker:
         processes.connect()
         with processes.leaving_at_once():
             enable_caches()
-            return print(json.dumps(measure(options, jax.device_count())), flush=True)
+            return print(json.dumps(measure(options, Case(options, jax.device_count()))[0]), flush=True)
     enable_caches()
-    several = options.processes > 1
-    for case in (False, True) if several else options.devices:
-        row = run_processes(argv, options.processes, case) if several else measure(options, case)
-        rows.append({"measure": "devices", "task": options.task} | row)
-        speeds = [each["env_steps_per_s"] / each["devices"] for each in rows]
-        rows[-1] |= {"env_steps_per_s_per_device": round(speeds[-1]), "efficiency": round(speeds[-1] / speeds[0], 4)}
-        print(json.dumps(rows[-1]), flush=True)
+    for row in rows(options, argv):
+        found.append({"measure": "devices", "task": options.task} | row)
+        speeds = [each["env_steps_per_s"] / each["devices"] for each in found]
+        found[-1] |= {"env_steps_per_s_per_device": round(speeds[-1]), "efficiency": round(speeds[-1] / speeds[0], 4)}
+        print(json.dumps(found[-1]), flush=True)
     if options.output:
         about = {"command": ["python", "benchmarks/devices.py", *argv], "jax": jax.__version__}
-        about |= {} if several else {"device": jax.devices()[0].device_kind}
-        options.output.write_text(json.dumps(about | {"rows": rows}, indent=1))
+        # The processes have the devices; asking for them here would take their memory.
+        about |= {} if options.processes > 1 else {"device": jax.devices()[0].device_kind}
+        options.output.write_text(json.dumps(about | {"rows": found}, indent=1))
 
 
 if __name__ == "__main__":

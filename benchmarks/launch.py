@@ -2,7 +2,7 @@
 
     python benchmarks/launch.py 2 -- python -m dexsim_ppo.train --task grasp --devices 0 --run-dir runs/two
 
-Ends with the first exit code that is not 0. A signal goes to all.
+Says the process ids, and ends with the first exit code that is not 0.
 """
 
 import argparse
@@ -65,6 +65,8 @@ def main() -> int:
     parser.add_argument("command", nargs="+", help="after --")
     options = parser.parse_args()
     running = start(options.command, options.number)
+    for index, process in enumerate(running):
+        print(f"process {index}: pid {process.pid}", file=sys.stderr, flush=True)
     try:
         codes = [process.wait() for process in running]
     except KeyboardInterrupt:  # The terminal has sent it to all of them.

@@ -96,3 +96,8 @@ def _headline(report: dict[str, Any]) -> dict[str, dict[str, Any]]:
 
 def _number(value: float | None) -> str:
     return "-" if value is None else f"{value:.4g}"
+
+
+def surely_better(trained: dict[str, Any], untrained: dict[str, Any]) -> dict[str, bool]:
+    """Which headline figures of the trained policy lie above those of the untrained one, interval above interval."""
+    return {name: trained[name]["low"] > untrained[name]["high"] for name in ("held", "return", "steps_held")}

@@ -10,8 +10,6 @@ and at the end `report.json` (trained against untrained, same episodes) and a vi
 import argparse
 import contextlib
 import dataclasses
-import datetime
-import itertools
 import json
 import shlex
 import signal
@@ -25,6 +23,7 @@ from dexsim.core import cli
 from dexsim.core.compilation import make_deterministic
 from dexsim.core.config import from_dict, naming_file
 from dexsim.core.errors import ConfigError, DexsimError
+from dexsim.hand.kinematics import Hand
 from dexsim.hand.source import record_of
 from dexsim.registry import find_task
 from dexsim_ppo import checkpoint
@@ -32,14 +31,16 @@ from dexsim_ppo.learner.adapter import adapt
 from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.curriculum import Curriculum
 from dexsim_ppo.learner.sharding import make_mesh
+from dexsim_ppo.learner.types import Environment
 from dexsim_ppo.policy import Policy, load_policy
 from dexsim_ppo.retired import migrate_arguments
 from dexsim_ppo.training import processes
 from dexsim_ppo.training.arguments import TrainArguments, check_resumed, find_hand, printable, training_config
 from dexsim_ppo.training.fine_tune import check_fit, fine_tuning_config
 from dexsim_ppo.training.presets import Preset, device_preset, find_preset
-from dexsim_ppo.training.runlog import RunFolder
+from dexsim_ppo.training.runlog import RunFolder, check_wandb, new_folder, taken
 from dexsim_ppo.training.seeds import seed_folder, write_summary
+from dexsim_ppo.training.together import train_together
 from dexsim_ppo.training.trainer import Run
 
 
@@ -129,27 +130,31 @@ def run_training(
     arguments: TrainArguments, begun: checkpoint.Checkpoint | Policy | None, started: float, command: str
 ) -> tuple[Run, int]:
     """Train, then evaluate and report; the run, and the number of the signal that stopped it or 0."""
-    import dexsim
+    run = make_run(arguments, begun, started, command)
+    return run, train_run(run, begun, command)
 
+
+def make_run(
+    arguments: TrainArguments,
+    begun: checkpoint.Checkpoint | Policy | None,
+    started: float,
+    command: str,
+    like: Run | None = None,
+) -> Run:
+    """A run with its folder, ready to train; with the environment and the evaluator of another seed's run `like` it."""
     resumed, first = begun if isinstance(begun, checkpoint.Checkpoint) else None, processes.is_first()
     if first and not resumed and arguments.run_dir and arguments.run_dir.exists():
-        raise _taken(arguments.run_dir)
+        raise taken(arguments.run_dir)
+    check_wandb(arguments.wandb)
     if arguments.deterministic and not make_deterministic() and first:
         print("--deterministic changes nothing here: without a GPU, trainings repeat to the last bit anyway")
     mesh, hand = make_mesh(arguments.devices, arguments.ppo), find_hand(arguments, begun)
-    made = dexsim.make(
-        arguments.task,
-        training_config(arguments),
-        backend=arguments.backend,
-        num_envs=arguments.ppo.num_envs // (mesh.size if mesh else 1),
-        hand=hand,
-    )
-    env = adapt(made, arguments.task)
+    env = like.env if like else make_environment(arguments, hand, mesh.size if mesh else 1)
     if env.backend != "own":  # so that a resumed run has the same engine
         arguments = dataclasses.replace(arguments, backend=cast(Any, env.backend))
     if isinstance(begun, Policy):
         check_fit(begun, env, arguments.ppo)
-    path = resumed.path.parent.parent if resumed else make_run_folder(arguments) if first else Path()
+    path = resumed.path.parent.parent if resumed else new_folder(arguments.run_dir, arguments.task) if first else Path()
     folder = RunFolder(processes.agree_on_path(path))
     if first and not resumed:
         folder.checkpoints.mkdir()
@@ -157,35 +162,61 @@ def run_training(
             folder.config,
             {"command": command, "arguments": printable(arguments), "hand": record_of(hand)} | cli.environment_report(),
         )
-    run = Run(env, arguments, folder, started, mesh)
-    with stop_on_signals() as received, processes.noticing_losses(folder.path):
+    return Run(env, arguments, folder, started, mesh, like.evaluator if like else None)
+
+
+def make_environment(arguments: TrainArguments, hand: Hand | None, devices: int) -> Environment:
+    """The environment to train in, for the batch of one device."""
+    import dexsim
+
+    made = dexsim.make(
+        arguments.task,
+        training_config(arguments),
+        backend=arguments.backend,
+        num_envs=arguments.ppo.num_envs // devices,
+        hand=hand,
+    )
+    return adapt(made, arguments.task)
+
+
+def train_run(run: Run, begun: checkpoint.Checkpoint | Policy | None, command: str) -> int:
+    """Train, then evaluate and report; the number of the signal that stopped it or 0."""
+    with stop_on_signals() as received, processes.noticing_losses(run.folder.path):
         run.train(begun, lambda: processes.agree(received()))
         stopped = processes.agree(received())
-    if first and not stopped:
+    if processes.is_first() and not stopped:
         run.finish(command)
-    return run, stopped
+    return stopped
 
 
 def train_seeds(
     arguments: TrainArguments, begun: checkpoint.Checkpoint | Policy | None, started: float, command: str
 ) -> tuple[Run, int]:
-    """`run_training` for each seed in turn, then one report; the last run, and the signal that stopped it or 0."""
-    first, reports = processes.is_first(), dict[int, dict[str, Any]]()
-    folder = processes.agree_on_path(make_run_folder(arguments) if first else Path())
+    """Train several seeds, in one program where that is possible, else in turn; then one report. The last run to be
+    trained, and the signal that stopped it or 0."""
+    first, runs = processes.is_first(), list[Run]()
+    folder = processes.agree_on_path(new_folder(arguments.run_dir, arguments.task) if first else Path())
     if first:
         content = {"command": command, "arguments": printable(arguments)} | cli.environment_report()
         cli.write_json(RunFolder(folder).config, content)
     for seed in range(arguments.seed, arguments.seed + arguments.seeds):
         one = dataclasses.replace(arguments, seed=seed, seeds=1, run_dir=seed_folder(folder, seed))
-        run, stopped = run_training(one, begun, started, command)
+        runs.append(make_run(one, begun, started, command, runs[0] if runs else None))
+    with stop_on_signals() as received:
+        together = train_together(runs, cast(Policy | None, begun), received)
+        stopped = received() if together else 0
+    for run in runs:
+        if together and not stopped:
+            run.finish(command)
+        elif not together:
+            run.started = started
+            stopped, started = train_run(run, begun, command), time.perf_counter()
         if stopped:
             return run, stopped
-        started = time.perf_counter()
-        if first:
-            reports[seed] = json.loads(run.folder.report.read_text())
     if first:
+        reports = {run.arguments.seed: json.loads(run.folder.report.read_text()) for run in runs}
         print(f"report of {arguments.seeds} seeds: {write_summary(folder, arguments.task, reports, command)}")
-    return run, 0
+    return runs[-1], 0
 
 
 # --- options ------------------------------------------------------------------------------------------
@@ -293,27 +324,6 @@ def arguments_from_dict(config_class: type[Any], data: dict[str, Any]) -> TrainA
     curriculum = from_dict(Curriculum, data.pop("curriculum", {}))
     known = {f.name for f in dataclasses.fields(TrainArguments)}
     return TrainArguments(env=env, ppo=ppo, curriculum=curriculum, **{k: v for k, v in data.items() if k in known})
-
-
-def make_run_folder(arguments: TrainArguments) -> Path:
-    """A new folder. Making it is what takes the name, so that runs that begin in one second get different ones."""
-    if arguments.run_dir:
-        try:
-            arguments.run_dir.mkdir(parents=True)
-        except FileExistsError:
-            raise _taken(arguments.run_dir) from None
-        return arguments.run_dir
-    stem = Path("runs") / f"{arguments.task}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
-    for number in itertools.count():
-        path = Path(f"{stem}-{number}" if number else stem)
-        with contextlib.suppress(FileExistsError):
-            path.mkdir(parents=True)
-            return path
-    raise AssertionError("unreachable")
-
-
-def _taken(path: Path) -> ConfigError:
-    return ConfigError(f"--run-dir {path}: exists already; choose another, or resume it with --resume")
 
 
 @contextlib.contextmanager

@@ -16,7 +16,10 @@ Metrics = dict[str, jax.Array]
 
 @pytree_dataclass
 class Samples:
-    """Experience as the update sees it; arrays [N, ...] with N = T * B. With a GRU they are [B, T, ...]."""
+    """Experience as the update sees it: arrays [K, T * B / K, ...] in blocks of environments, a minibatch [N, ...].
+
+    With a GRU they are [K, B / K, T, ...] and [N, T, ...].
+    """
 
     obs: dict[str, jax.Array]
     decision: Decision

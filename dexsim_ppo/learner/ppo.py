@@ -36,7 +36,15 @@ from dexsim_ppo.learner.running_stats import (
     update_stats,
     value_std,
 )
-from dexsim_ppo.learner.sharding import batched, copied, shardings, start_on
+from dexsim_ppo.learner.sharding import (
+    batched,
+    block_count,
+    copied,
+    in_blocks,
+    sequences_in_blocks,
+    shardings,
+    start_on,
+)
 from dexsim_ppo.learner.types import CurriculumEnvironment, Environment, layout_size
 from dexsim_ppo.learner.update import Learner, update
 
@@ -169,7 +177,7 @@ def train_iteration(
     if config.normalize_value:
         rollout, bounded = bound_rewards(rollout, state.value_stats, config.reward_scale)
         metrics |= {"bounded_rewards": bounded}
-    value_stats, params, samples = prepare(config, state.value_stats, state.params, rollout)
+    value_stats, params, samples = prepare(config, state.value_stats, state.params, rollout, mesh)
     learner, update_metrics = update(
         config,
         normalizers,
@@ -266,10 +274,10 @@ def collect_rollout(
 
 
 def prepare(
-    config: PPOConfig, value_stats: RunningStats, params: Params, rollout: Rollout
+    config: PPOConfig, value_stats: RunningStats, params: Params, rollout: Rollout, mesh: Mesh | None = None
 ) -> tuple[RunningStats, Params, Samples]:
-    """Advantages and normalised value targets as flat rows [T * B], with a GRU as sequences [B, T]; updates the value
-    normaliser."""
+    """Advantages and normalised value targets in blocks [K, T * B / K], with a GRU as sequences [K, B / K, T]; updates
+    the value normaliser."""
     advantage, target = compute_gae(
         config.reward_scale * rollout.reward,
         rollout.value,
@@ -292,12 +300,13 @@ def prepare(
         target=(target - mean) / std,
         memory=rollout.memory,
     )
+    blocks = block_count(config, mesh)
     if config.memory != "gru":
-        return value_stats, params, jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), samples)
+        return value_stats, params, in_blocks(samples, blocks)
     ended = rollout.terminated | rollout.truncated
     # What is remembered at the rollout's first step is zero where an episode begins with it.
     samples = dataclasses.replace(samples, first=jnp.zeros_like(ended).at[1:].set(ended[:-1]))
-    return value_stats, params, jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), samples)
+    return value_stats, params, sequences_in_blocks(samples, blocks)
 
 
 def strong_types(tree: Any) -> Any:

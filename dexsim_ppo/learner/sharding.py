@@ -6,6 +6,7 @@ place. So an iteration is the same arithmetic on any number of devices, up to th
 """
 
 import dataclasses
+import math
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -19,6 +20,8 @@ from dexsim.core.errors import ConfigError
 from dexsim_ppo.learner.config import PPOConfig
 
 AXIS = "devices"
+# Parts of the environments, each of which shuffles its own rows: results are the same on all numbers that divide it.
+BLOCKS = 16
 Tree = TypeVar("Tree")
 
 
@@ -52,20 +55,42 @@ def make_mesh(devices: int, config: PPOConfig) -> Mesh | None:
 
 def batched(function: Callable, mesh: Mesh | None) -> Callable:
     """`jax.vmap(function)` whose batch is split over the mesh; arguments and results are [B, ...]."""
+    return on_each(jax.vmap(function), mesh)
+
+
+def on_each(function: Callable, mesh: Mesh | None) -> Callable:
+    """`function` on each device's own part of arguments and results [N, ...]; without a mesh on the whole."""
     if mesh is None:
-        return jax.vmap(function)
+        return function
     split = PartitionSpec(AXIS)
-    return jax.shard_map(jax.vmap(function), mesh=mesh, in_specs=split, out_specs=split, check_vma=False)
+    return jax.shard_map(function, mesh=mesh, in_specs=split, out_specs=split, check_vma=False)
+
+
+def block_count(config: PPOConfig, mesh: Mesh | None) -> int:
+    """Blocks of environments (K): each device has as many, and each minibatch as many rows of each."""
+    rows, devices = config.rows // config.minibatches, mesh.size if mesh else 1
+    count = math.gcd(BLOCKS, config.num_envs, rows)
+    return devices if count % devices else count
+
+
+def in_blocks(tree: Tree, count: int) -> Tree:
+    """Arrays [T, B, ...] as [K, T * B / K, ...]: the rows of each block of environments."""
+
+    def blocks(x: jax.Array) -> jax.Array:
+        x = x.reshape(x.shape[0], count, -1, *x.shape[2:]).swapaxes(0, 1)
+        return x.reshape(count, -1, *x.shape[3:])
+
+    return jax.tree.map(blocks, tree)
+
+
+def sequences_in_blocks(tree: Tree, count: int) -> Tree:
+    """Arrays [T, B, ...] as [K, B / K, T, ...]: the rollouts of each block of environments."""
+    return jax.tree.map(lambda x: x.swapaxes(0, 1).reshape(count, -1, len(x), *x.shape[2:]), tree)
 
 
 def copied(tree: Tree, mesh: Mesh | None) -> Tree:
     """The whole `tree` on every device."""
     return tree if mesh is None else jax.lax.with_sharding_constraint(tree, NamedSharding(mesh, PartitionSpec()))
-
-
-def split_rows(tree: Tree, mesh: Mesh | None) -> Tree:
-    """Arrays [N, ...] of which every device has N / devices rows."""
-    return tree if mesh is None else jax.lax.with_sharding_constraint(tree, NamedSharding(mesh, PartitionSpec(AXIS)))
 
 
 def shardings(state: Any, mesh: Mesh) -> Any:

@@ -14,7 +14,7 @@ from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.loss import Metrics, Samples, loss
 from dexsim_ppo.learner.networks import Params
 from dexsim_ppo.learner.running_stats import Normalizer
-from dexsim_ppo.learner.sharding import copied, split_rows
+from dexsim_ppo.learner.sharding import on_each
 
 
 class Learner(NamedTuple):
@@ -36,21 +36,19 @@ def update(
 ) -> tuple[Learner, Metrics]:
     """All epochs over shuffled minibatches, then the learning rate of the next iteration.
 
-    Metrics are means over all minibatches, except the KL divergence: its mean over the last epoch.
+    Each block of `samples` [K, rows, ...] is shuffled by itself and gives the same share of every minibatch: a device
+    needs no rows of another one. Metrics are means over all minibatches, except the KL divergence: its mean over the
+    last epoch.
     """
-    rows = config.rows
-    order = draw_order(key, config.epochs, rows)
-    order = order.reshape(config.epochs * config.minibatches, rows // config.minibatches)
+    blocks, rows = samples.advantage.shape[:2]
+    order = draw_order(key, config.epochs * blocks, rows)
+    order = order.reshape(config.epochs, blocks, config.minibatches, -1).swapaxes(1, 2)
+    order = order.reshape(config.epochs * config.minibatches, blocks, -1)
     old_log_std, moves = learner.params.log_std, actor_learns(config, learner)
-
-    # A minibatch has rows from all devices, in one order whatever their number. Sending all rows to all devices once
-    # is cheaper than sending those of every minibatch.
-    samples = copied(samples, mesh)
+    pick = on_each(pick_rows, mesh)
 
     def minibatch(learner, indices):
-        indices = split_rows(indices, mesh)
-        batch = jax.tree.map(lambda x: x.at[indices].get(mode="promise_in_bounds"), samples)
-        batch = split_rows(batch, mesh)
+        batch = pick(samples, indices)
         grads, metrics = jax.grad(loss, has_aux=True)(learner.params, config, normalizers, batch, old_log_std)
         learner, norms = apply_gradients(config, learner, grads)
         return learner, metrics | norms
@@ -64,17 +62,24 @@ def update(
     return learner._replace(learning_rate=rate), metrics
 
 
-def draw_order(key: jax.Array, epochs: int, rows: int) -> jax.Array:
-    """The rows of each epoch in random order, int32 [epochs, rows].
+def draw_order(key: jax.Array, times: int, rows: int) -> jax.Array:
+    """All rows in random order, int32 [times, rows].
 
     Sorts random numbers whose low bits are the row's: one sort of plain numbers, for which a CPU takes an eighth of
     the time of `jax.random.permutation`. Rows with equal random bits keep their order, which matters only where such a
     group meets the edge of a minibatch.
     """
     width = (rows - 1).bit_length()
-    number = jax.random.bits(key, (epochs, rows), jnp.uint32) >> width << width
+    number = jax.random.bits(key, (times, rows), jnp.uint32) >> width << width
     ordered = jnp.sort(number | jnp.arange(rows, dtype=jnp.uint32)[None], axis=1)
     return (ordered & ((1 << width) - 1)).astype(jnp.int32)
+
+
+def pick_rows(samples: Samples, indices: jax.Array) -> Samples:
+    """Rows `indices` [K, M] of each block of `samples` [K, rows, ...], as [K * M, ...]."""
+    flat = (indices + samples.advantage.shape[1] * jnp.arange(len(indices))[:, None]).reshape(-1)
+    rows = lambda x: x.reshape(-1, *x.shape[2:]).at[flat].get(mode="promise_in_bounds")  # noqa: E731
+    return jax.tree.map(rows, samples)
 
 
 def apply_gradients(config: PPOConfig, learner: Learner, grads: Params) -> tuple[Learner, Metrics]:

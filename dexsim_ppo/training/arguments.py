@@ -41,7 +41,7 @@ class TrainArguments(Generic[EnvConfig]):
     seed: int = setting(0, unit="1", low=0, high=2**32 - 1)
     """Seed of everything random."""
     seeds: int = setting(1, unit="1", low=1, high=1000)
-    """Trainings one after the other, from --seed on; --steps and --minutes are those of each."""
+    """Trainings, from --seed on, in one program where that is possible; --steps and --minutes are those of each."""
     backend: Literal["auto", "jax", "warp", "c"] = setting("auto")
     """Physics backend. auto: c on a CPU, warp on an NVIDIA GPU if it is installed, otherwise jax."""
     deterministic: bool = False
@@ -63,6 +63,8 @@ class TrainArguments(Generic[EnvConfig]):
     policy: str = ""
     """Policy to fine-tune: a file, or the name of a shipped one. Its task and configuration are the defaults. Empty:
     train from scratch."""
+    wandb: str = ""
+    """Weights & Biases project that metrics go to as well; empty for none. Needs the extra `wandb`."""
     video: bool = True
     """Render a video at the end."""
     log_every: int = setting(1, unit="iterations", low=1)
@@ -72,7 +74,11 @@ class TrainArguments(Generic[EnvConfig]):
     keep_checkpoints: int = setting(3, unit="1", low=1)
     """Number of latest checkpoints to keep."""
     evaluate_every: int = setting(0, unit="iterations", low=0)
-    """Iterations between the evaluations that choose the best policy; 0 for none."""
+    """Iterations between the evaluations that choose the best policy, if `--evaluation-share` allows; 0 for none."""
+    evaluation_share: float = setting(0.05, unit="1", low=0.0, high=1.0)
+    """Largest share of the time that evaluations during training take; those beyond it are left out."""
+    patience: int = setting(0, unit="evaluations", low=0)
+    """End training after this many evaluations in a row without a better return; 0 for never."""
     evaluation_chunk: int = setting(32, unit="episodes", low=1)
     """Episodes evaluated in parallel; an evaluation during training is one chunk."""
     evaluation_episodes: int = setting(128, unit="episodes", low=1)
@@ -80,6 +86,10 @@ class TrainArguments(Generic[EnvConfig]):
 
     def __post_init__(self) -> None:
         validate(self)
+        if self.patience and not self.evaluate_every:
+            raise ConfigError(
+                f"TrainArguments.patience = {self.patience}: needs evaluations, TrainArguments.evaluate_every"
+            )
 
 
 def find_hand(arguments: TrainArguments, begun: Checkpoint | Policy | None) -> Hand | None:
@@ -131,13 +141,16 @@ _RESUMABLE = {
     "evaluate_every",
     "evaluation_chunk",
     "evaluation_episodes",
+    "evaluation_share",
     "hand",  # where its files are: their content must be the same
     "keep_checkpoints",
     "log_every",
     "minutes",
+    "patience",
     "resume",
     "steps",
     "video",
+    "wandb",
 }
 
 

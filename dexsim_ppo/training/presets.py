@@ -42,7 +42,7 @@ _CPU = Preset(
     ),
     steps=0,
     minutes=7.0,
-    evaluate_every=0,
+    evaluate_every=20,
     evaluation_chunk=50,
     evaluation_episodes=150,
     log_every=5,
@@ -88,8 +88,7 @@ def find_preset(name: str, task: str) -> Preset:
     preset = PRESETS.get(name, PRESETS["cpu"])
     if not task.startswith("rotate"):
         return preset
-    # Two-minute episodes are slow to evaluate, so they are evaluated once, at the end. A gait needs less
-    # noise than a grasp, which has to explore forces.
+    # A gait needs less noise than a grasp, which has to explore forces.
     ppo = replace(preset.ppo, epochs=4, minibatches=16, entropy_coefficient=0.001)
     if preset is PRESETS["cpu"]:
         ppo = replace(ppo, num_envs=512)
@@ -97,7 +96,7 @@ def find_preset(name: str, task: str) -> Preset:
     if preset is PRESETS["cpu-large"]:
         return replace(preset, ppo=ppo, minutes=15.0, evaluation_chunk=256, evaluation_episodes=256)
     # A quarter of the environments: four times the updates from the same experience, which finding a gait needs.
-    return replace(preset, ppo=replace(ppo, num_envs=8192, memory="none"), minutes=5.0, evaluate_every=0)
+    return replace(preset, ppo=replace(ppo, num_envs=8192, memory="none"), minutes=5.0)
 
 
 def device_preset() -> str:

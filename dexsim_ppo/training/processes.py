@@ -3,6 +3,7 @@
 import contextlib
 import functools
 import os
+import subprocess
 import sys
 import traceback
 from collections.abc import Iterator
@@ -94,14 +95,34 @@ def noticing_losses(folder: Path) -> Iterator[None]:
     Raises:
       DexsimError: another process has ended.
     """
-    try:
+    if jax.process_count() == 1:
         yield
+        return
+    lost = (
+        "another process of this training has ended; resume with: "
+        f"python -m dexsim_ppo.train --resume {folder} --devices {jax.device_count()}"
+    )
+    try:
+        with last_words(f"error: {lost}"):
+            yield
     except (jax.errors.JaxRuntimeError, ValueError) as error:
-        if jax.process_count() == 1:
-            raise
         if not any(word in str(error) for word in ("Gloo", "NCCL", "UNAVAILABLE", "ABORTED", "DEADLINE")):
             raise
-        raise DexsimError(
-            "another process of this training has ended; resume with: "
-            f"python -m dexsim_ppo.train --resume {folder} --devices {jax.device_count()}"
-        ) from None
+        raise DexsimError(lost) from None
+
+
+@contextlib.contextmanager
+def last_words(line: str) -> Iterator[None]:
+    """Have `line` printed if this process is ended inside without a chance to say anything.
+
+    JAX aborts a process that has lost the first one, or waits for others in a collective of GPUs, from a thread of its
+    own. A helper waits for that: it reads until this process closes its end.
+    """
+    script = "import sys; sys.stdin.read() or print(sys.argv[1], file=sys.stderr)"
+    helper = subprocess.Popen(
+        [sys.executable, "-I", "-S", "-c", script, line], stdin=subprocess.PIPE, start_new_session=True
+    )
+    try:
+        yield
+    finally:
+        helper.communicate(b"alive")

@@ -1,14 +1,20 @@
 """A run's folder: configuration, metrics, checkpoints, policies and the learning curve."""
 
+import contextlib
+import datetime
 import importlib.util
 import itertools
 import json
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from dexsim.core.cli import plain
-from dexsim.core.errors import CheckpointError
+from dexsim.core.errors import CheckpointError, ConfigError
+from dexsim_ppo.training.arguments import TrainArguments, printable
 
 CURVES = {
     "episode/return": "return\nof an episode",
@@ -64,29 +70,62 @@ class RunFolder:
             path.unlink()
 
 
-class MetricsLog:
-    """Appends one line of JSON per logged iteration, and TensorBoard events if a writer is installed."""
+def new_folder(path: Path | None, task: str) -> Path:
+    """A new folder for a run, by default one that is named after its task and the time. Making it is what takes the
+    name, so that runs that begin in one second get different ones.
 
-    def __init__(self, folder: RunFolder, first_iteration: int):
+    Raises:
+      ConfigError: `path` exists already.
+    """
+    if path:
+        try:
+            path.mkdir(parents=True)
+        except FileExistsError:
+            raise taken(path) from None
+        return path
+    stem = Path("runs") / f"{task}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
+    for number in itertools.count():
+        path = Path(f"{stem}-{number}" if number else stem)
+        with contextlib.suppress(FileExistsError):
+            path.mkdir(parents=True)
+            return path
+    raise AssertionError("unreachable")
+
+
+def taken(path: Path) -> ConfigError:
+    """What is wrong with the name of an existing folder."""
+    return ConfigError(f"--run-dir {path}: exists already; choose another, or resume it with --resume")
+
+
+class MetricsLog:
+    """Appends one line of JSON per logged iteration; the same goes to TensorBoard, if a writer is installed, and to
+    Weights & Biases, if the options name a project."""
+
+    def __init__(self, folder: RunFolder, first_iteration: int, arguments: TrainArguments):
         rows = [row for row in read_metrics(folder.metrics) if row["iteration"] <= first_iteration]
         # A resumed run repeats what came after its checkpoint.
         folder.metrics.write_text("".join(json.dumps(row) + "\n" for row in rows))
         self._file = folder.metrics.open("a", buffering=1)
-        self._writer = _tensorboard_writer(folder.path)
+        self._tensorboard = _tensorboard_writer(folder.path)
+        self._wandb = _wandb_run(folder.path, arguments) if arguments.wandb else None
 
     def write(self, row: dict[str, Any]) -> None:
         """Log one iteration: `"iteration"`, `"env_steps"` and any scalars."""
         self._file.write(json.dumps(plain(row)) + "\n")
-        if self._writer:
-            for name, value in row.items():
-                if name not in ("iteration", "env_steps") and value == value:
-                    self._writer.add_scalar(name, value, row["env_steps"])
+        scalars = {k: v for k, v in row.items() if k not in ("iteration", "env_steps") and v == v}
+        if self._tensorboard:
+            for name, value in scalars.items():
+                self._tensorboard.add_scalar(name, value, row["env_steps"])
+        if self._wandb:
+            self._wandb.log(scalars, step=row["env_steps"])
 
     def close(self) -> None:
         """Flush to disk."""
         self._file.close()
-        if self._writer:
-            self._writer.close()
+        if self._tensorboard:
+            self._tensorboard.close()
+        if self._wandb:
+            self._wandb.finish()
 
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:
@@ -100,6 +139,12 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
     return rows
 
 
+def means(metrics: Mapping[str, Any]) -> dict[str, float]:
+    """Mean [] of each metric over the iterations of a call, or over seeds, that have a finite value."""
+    found = {name: np.asarray(values, np.float64) for name, values in metrics.items()}
+    return {name: float(np.nanmean(x)) if np.isfinite(x).any() else float("nan") for name, x in found.items()}
+
+
 def _tensorboard_writer(path: Path) -> Any:
     for module in ("tensorboardX", "torch.utils.tensorboard"):
         if importlib.util.find_spec(module.split(".")[0]) is None:
@@ -111,13 +156,28 @@ def _tensorboard_writer(path: Path) -> Any:
     return None
 
 
+def _wandb_run(path: Path, arguments: TrainArguments) -> Any:
+    import wandb
+
+    return wandb.init(project=arguments.wandb, name=path.name, dir=path, config=printable(arguments))
+
+
+def check_wandb(project: str) -> None:
+    """Check that metrics can go to a Weights & Biases project.
+
+    Raises:
+      ConfigError: its library is not installed.
+    """
+    if project and importlib.util.find_spec("wandb") is None:
+        raise ConfigError(f"--wandb {project}: install the extra, pip install -e '.[wandb]'")
+
+
 def draw_curve(rows: list[dict[str, Any]], path: Path, title: str) -> None:
     """Learning curves over environment steps as a PNG, with the elapsed time above."""
     import matplotlib
 
     matplotlib.use("agg")
     import matplotlib.pyplot as plt
-    import numpy as np
 
     errors = sorted({name for row in rows for name in row if name.startswith("step/") and name.endswith("error")})[:1]
     words = CURVES | {

@@ -10,7 +10,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.sharding import Mesh
 
 from dexsim.core import cli
@@ -24,13 +23,13 @@ from dexsim_ppo.learner.ppo import TrainState, make_train
 from dexsim_ppo.learner.sharding import learned, place
 from dexsim_ppo.learner.types import Environment
 from dexsim_ppo.policy import Policy
-from dexsim_ppo.report import print_report
+from dexsim_ppo.report import print_report, surely_better
 from dexsim_ppo.training import memory, processes, programs
 from dexsim_ppo.training.arguments import TrainArguments, printable, training_config
 from dexsim_ppo.training.display import Display
 from dexsim_ppo.training.faults import Faults, keep
 from dexsim_ppo.training.fine_tune import initialize_from
-from dexsim_ppo.training.runlog import MetricsLog, RunFolder, draw_curve, read_metrics
+from dexsim_ppo.training.runlog import MetricsLog, RunFolder, draw_curve, means, read_metrics
 
 # Selecting the best policy uses starts and episodes that no report has: `evaluate --seed` ends below.
 SELECTION_SEED, REPORT_SEED = 2**32 - 1, 0
@@ -39,11 +38,6 @@ SELECTION_SEED, REPORT_SEED = 2**32 - 1, 0
 def due(iteration: int, per_call: int, every: int) -> bool:
     """Whether a call of `per_call` iterations that ended at `iteration` passed a multiple of `every`; 0 is never."""
     return every > 0 and iteration // every > (iteration - per_call) // every
-
-
-def surely_better(trained: dict[str, Any], untrained: dict[str, Any]) -> dict[str, bool]:
-    """Which headline figures of the trained policy lie above those of the untrained one, interval above interval."""
-    return {name: trained[name]["low"] > untrained[name]["high"] for name in ("held", "return", "steps_held")}
 
 
 class Run:
@@ -56,12 +50,17 @@ class Run:
         folder: RunFolder,
         started: float,
         mesh: Mesh | None = None,
+        evaluator: Evaluator | None = None,
     ):
+        """`evaluator` is that of another run which differs in its seed only; None makes one."""
         self.env, self.arguments, self.folder, self.started, self.mesh = env, arguments, folder, started, mesh
         self.config: PPOConfig = arguments.ppo
-        self.evaluator = Evaluator(self._evaluation_env(), arguments.evaluation_chunk)
+        self.evaluator = evaluator or Evaluator(self._evaluation_env(), arguments.evaluation_chunk)
         self.best: dict[str, Any] = {"return": None, "iteration": 0}
-        self.seconds_before = 0.0
+        self.evaluations_s = list[float]()
+        self.without_better = 0  # evaluations in a row
+        self.seconds_before, self.share = 0.0, 1.0
+        """Wall-clock time before a resume, s, and the share of the time since then that is this run's."""
         self.clock = {"setup_s": time.perf_counter() - started}
 
     def _evaluation_env(self) -> Environment:
@@ -99,7 +98,7 @@ class Run:
             display.note(f"compiled in {self.clock['compile_s']:.1f} s")
             memory.check(step, self.config.num_envs // (self.mesh.size if self.mesh else 1), display.note)
             display.working("first update" + (": compiling Warp's kernels" if self.env.backend == "warp" else ""))
-            log = MetricsLog(self.folder, int(state.iteration)) if processes.is_first() else None
+            log = MetricsLog(self.folder, int(state.iteration), arguments) if processes.is_first() else None
             try:
                 self._loop(state, step, display, log, stopped)
             finally:
@@ -118,29 +117,32 @@ class Run:
                 state = place(state, shapes) if self.mesh is not None else jax.tree.map(jnp.copy, state)
                 progress = source.content["progress"]
                 self.best, self.seconds_before = progress["best"], progress["seconds"]
+                self.without_better = progress.get("without_better", 0)
             else:
                 fresh = aside.submit(lambda: jax.block_until_ready(training.init(key)))
             step = programs.compile_step(
                 training.plain_step,
                 shapes,
-                self._identity(),
+                self.identity(),
                 lambda: self.clock.update(trace_s=time.perf_counter() - begin),
                 self.env.backend,
             )
             if not isinstance(source, checkpoint.Checkpoint):
-                state = fresh.result()
-                if source:
-                    state = initialize_from(source, self.config, state)
-                    if self.mesh is not None:
-                        learner = place(
-                            (state.params, state.observation_stats), (shapes.params, shapes.observation_stats)
-                        )
-                        state = dataclasses.replace(state, params=learner[0], observation_stats=learner[1])
-                self._write_policy(self._policy(state), self.folder.untrained)
+                state = self.begin(fresh.result(), source)
         self.clock["compile_s"] = time.perf_counter() - begin
         return state, step
 
-    def _identity(self) -> Any:
+    def begin(self, state: TrainState, source: Policy | None) -> TrainState:
+        """The fresh state with what the policy to fine-tune has learnt; writes the untrained policy."""
+        if source:
+            fresh, state = state, initialize_from(source, self.config, state)
+            if self.mesh is not None:
+                learner = place((state.params, state.observation_stats), (fresh.params, fresh.observation_stats))
+                state = dataclasses.replace(state, params=learner[0], observation_stats=learner[1])
+        self._write_policy(self._policy(state), self.folder.untrained)
+        return state
+
+    def identity(self) -> Any:
         """What identifies the training step's program; None for one of several devices, which is not cached, and for an
         environment without a fingerprint."""
         if self.mesh is not None:
@@ -154,8 +156,8 @@ class Run:
         arguments, per_call = self.arguments, self.config.iterations_per_call
         iteration = first = int(state.iteration)
         begin, spent_elsewhere = time.perf_counter(), 0.0
-        faults, evaluated = Faults(self.config, self.folder, self._content(), state), iteration == 0
-        while not stopped() and not processes.agree(self.seconds_left(iteration, 1.0) <= 0):
+        faults, evaluated = Faults(self.config, self.folder, self.content(), state), iteration == 0
+        while not stopped() and not processes.agree(self.is_over(iteration)):
             call = time.perf_counter()
             with collector_paused():
                 before = keep(state)
@@ -168,19 +170,18 @@ class Run:
                     f"first update {self.clock['first_update_s']:.1f} s after the start, "
                     f"{now - call:.1f} s of it for itself"
                 )
-            row = {name: _mean(values) for name, values in metrics.items()}
-            row |= faults.check(before, metrics, iteration, display.note)
+            row = means(metrics) | faults.check(before, metrics, iteration, display.note)
             del before
-            row |= self._progress(iteration, now - call)
-            evaluated = due(iteration, per_call, arguments.evaluate_every)
+            row |= self.progress(iteration, now - call)
+            evaluated = self.is_evaluation_due(iteration, row["env_steps_per_s"])
             if evaluated:
-                row |= self._evaluate(state, iteration, display)
+                row |= self.evaluate(state, iteration, display)
             if evaluated or iteration == first + per_call or due(iteration, per_call, arguments.log_every):
                 if log:
                     log.write(row)
                 display.show(row)
             if due(iteration, per_call, arguments.checkpoint_every):
-                self._save(state, iteration)
+                self.save(state, iteration)
             spent_elsewhere += time.perf_counter() - now
         self.clock["training_s"] = time.perf_counter() - begin
         self.clock["step_s"] = self.clock["training_s"] - spent_elsewhere
@@ -188,13 +189,29 @@ class Run:
         # The first call is left out of the rate: Warp compiles its kernels in it.
         steps = max(iteration - first - per_call, 0) * self.config.steps_per_iteration
         self.clock["env_steps_per_s"] = steps / max(self.clock["step_s"] - self.clock.get("first_call_s", 0.0), 1e-9)
-        if arguments.evaluate_every and not stopped() and not evaluated:
-            self._evaluate(state, iteration, display)
-        self._save(state, iteration)
+        if self.best["return"] is not None and not stopped() and not evaluated:
+            self.evaluate(state, iteration, display)
+        self.save(state, iteration)
 
     def _seconds(self) -> float:
         """Wall-clock time of the whole run, including that before a resume, s."""
-        return self.seconds_before + time.perf_counter() - self.started
+        return self.seconds_before + self.share * (time.perf_counter() - self.started)
+
+    def is_over(self, iteration: int) -> bool:
+        """Whether a budget is used up, or the return no longer gets better."""
+        return 0 < self.arguments.patience <= self.without_better or self.seconds_left(iteration, 1.0) <= 0
+
+    def is_evaluation_due(self, iteration: int, env_steps_per_s: float) -> bool:
+        """Whether to evaluate after a call that ended at `iteration`: that evaluation, and the one at the end, must
+        keep to their share of the time. The same in all processes."""
+        arguments = self.arguments
+        if not due(iteration, self.config.iterations_per_call, arguments.evaluate_every):
+            return False
+        guess = arguments.evaluation_chunk * self.env.evaluation_steps / env_steps_per_s
+        # The first one's time is mostly compilation, which the report at the end needs anyway.
+        spent = [guess, *self.evaluations_s[1:]] if self.evaluations_s else []
+        each = spent[-1] if spent else guess
+        return bool(processes.agree(sum(spent) + 2 * each <= arguments.evaluation_share * self._seconds()))
 
     def seconds_left(self, iteration: int, env_steps_per_s: float) -> float:
         """Time until the first budget is used up, s; infinite without a budget."""
@@ -206,7 +223,7 @@ class Run:
             left.append(60 * minutes - self._seconds())
         return min(left)
 
-    def _progress(self, iteration: int, call_s: float) -> dict[str, float]:
+    def progress(self, iteration: int, call_s: float) -> dict[str, float]:
         rate = self.config.iterations_per_call * self.config.steps_per_iteration / call_s
         return {
             "iteration": iteration,
@@ -216,7 +233,7 @@ class Run:
             "seconds_left": self.seconds_left(iteration, rate),
         }
 
-    def _content(self) -> dict[str, Any]:
+    def content(self) -> dict[str, Any]:
         """What a reproducer has to know of the run."""
         return {
             "task": self.arguments.task,
@@ -242,22 +259,25 @@ class Run:
             | ({"policy": self.arguments.policy} if self.arguments.policy else {}),
         )
 
-    def _evaluate(self, state: TrainState, iteration: int, display: Display) -> dict[str, float]:
+    def evaluate(self, state: TrainState, iteration: int, display: Display) -> dict[str, float]:
         """Evaluate the policy, and save it if its return is the best so far."""
         policy = self._policy(state)
         report, _ = self.evaluator(policy.params, episodes=self.arguments.evaluation_chunk, seed=SELECTION_SEED)
         score, held = report["return"]["value"], report["held"]["value"]
+        self.evaluations_s.append(report["seconds"])
         better = self.best["return"] is None or score > self.best["return"]
+        self.without_better = 0 if better else self.without_better + 1
         if better:
             self.best = {"return": score, "iteration": iteration}
             self._write_policy(policy, self.folder.best)
         display.note(
             f"evaluation at iteration {iteration}: held {held:.1%}, return {score:.2f}"
-            f"{', the best so far' if better else ''} ({report['seconds']:.1f} s)"
+            f", {'the best so far' if better else f'{self.without_better} without a better one'} "
+            f"({report['seconds']:.1f} s)"
         )
         return {"evaluation/return": score, "evaluation/held": held}
 
-    def _save(self, state: TrainState, iteration: int) -> None:
+    def save(self, state: TrainState, iteration: int) -> None:
         """Save a checkpoint, from which training resumes exactly, and the current policy."""
         processes.save(
             self.folder.checkpoint(iteration),
@@ -267,7 +287,7 @@ class Run:
             content={
                 "arguments": printable(self.arguments),
                 "hand": record_of(getattr(self.env, "hand", None)),
-                "progress": {"best": self.best, "seconds": self._seconds()},
+                "progress": {"best": self.best, "seconds": self._seconds(), "without_better": self.without_better},
             },
         )
         if processes.is_first():
@@ -324,9 +344,3 @@ class Run:
         self.clock["total_s"] = time.perf_counter() - self.started
         cli.write_json(folder.report, report)
         print(f"report: {folder.report}")
-
-
-def _mean(values: np.ndarray) -> float:
-    """Mean [] over the iterations of a call that have a finite value."""
-    values = np.asarray(values, np.float64)
-    return float(np.nanmean(values)) if np.isfinite(values).any() else float("nan")

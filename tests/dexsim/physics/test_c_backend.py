@@ -320,7 +320,9 @@ def test_the_shipped_policy_holds_as_much_as_on_the_jax_backend():
             return (after, memory), (after.terminated, after.finger_force)
 
         begun = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(5), 64))
-        _, (lost, pressed) = jit(lambda carry, body=body: jax.lax.scan(body, carry, length=200))((begun, policy.begin(64)))
+        _, (lost, pressed) = jit(lambda carry, body=body: jax.lax.scan(body, carry, length=200))(
+            (begun, policy.begin(64))
+        )
         kept = ~np.asarray(lost).any(0)
         held[backend], force[backend] = kept.mean(), np.asarray(pressed)[100:].sum(-1)[:, kept].mean()
     assert held["jax"] > 0.8

@@ -18,7 +18,7 @@ from dexsim_ppo.learner.running_stats import RunningStats
 from dexsim_ppo.learner.update import Learner
 
 UPDATES = dataclasses.replace(SMALL, epochs=3, minibatches=4, kl_target=0.0)  # of 64 rows
-RATE = UPDATES.learning_rate
+RATE, BLOCKS = UPDATES.learning_rate, 2
 
 
 @pytest.fixture(scope="module")
@@ -39,6 +39,7 @@ def updates(learner, monkeypatch):
     monkeypatch.setattr(update, "loss", downward)
     number, action = jnp.arange(count, dtype=jnp.float32), jnp.zeros((count, 1))
     samples = Samples({}, Decision(action, action, number), number, number, number)
+    samples = jax.tree.map(lambda x: x.reshape(BLOCKS, count // BLOCKS, *x.shape[1:]), samples)
     _, metrics = update.update(UPDATES, {}, samples, jax.random.key(1), learner)
     jax.effects_barrier()
     return rows, metrics
@@ -49,8 +50,18 @@ def test_every_epoch_takes_every_row_once_in_an_order_of_its_own(updates):
     assert len(rows) == UPDATES.epochs * UPDATES.minibatches
     epochs = np.concatenate(rows).reshape(UPDATES.epochs, count)
     np.testing.assert_array_equal(np.sort(epochs, axis=1), np.tile(np.arange(count), (UPDATES.epochs, 1)))
-    for order in (*epochs, epochs[0][epochs[1].argsort()]):
-        assert abs(np.corrcoef(order, np.arange(count))[0, 1]) < 0.5, "shuffled, and not alike in two epochs"
+    of_block = count // BLOCKS
+    for block in range(BLOCKS):
+        mine = np.array([epoch[epoch // of_block == block] for epoch in epochs])
+        for order in (*mine, mine[0][mine[1].argsort()]):
+            far = np.corrcoef(order, np.arange(of_block))[0, 1]
+            assert abs(far) < 0.5, "shuffled, and not alike in two epochs"
+
+
+def test_every_minibatch_has_as_many_rows_of_each_block(updates):
+    of_block = UPDATES.steps_per_iteration // BLOCKS
+    for rows in updates[0]:
+        np.testing.assert_array_equal(np.bincount(rows // of_block), [len(rows) // BLOCKS] * BLOCKS)
 
 
 @pytest.mark.parametrize("rows", [1, 7, 4096, 5000])

@@ -15,7 +15,7 @@ from dexsim.core.errors import ConfigError
 from dexsim_ppo import checkpoint, train
 from dexsim_ppo.learner.curriculum import Curriculum
 from dexsim_ppo.policy import Policy
-from dexsim_ppo.train import make_run_folder
+from dexsim_ppo.training import runlog
 from dexsim_ppo.training.arguments import check_resumed
 from dexsim_ppo.training.runlog import RunFolder
 
@@ -68,6 +68,7 @@ def test_only_budget_and_what_looks_on_may_change(finished):
     _, begun = train.parse_arguments(["--resume", str(finished.path)])
     saved = train.default_arguments(None, "auto", begun)
     other = {"seed": 9, "extremes": 0.5, "backend": "warp", "preset": "gpu", "task": "other", "policy": "grasp"}
+    other |= {"evaluation_share": 0.5, "evaluate_every": 5, "wandb": "mine"}
     other |= {"run_dir": Path("x"), "resume": Path("x"), "video": True, "env": TinyConfig(gain=0.5)}
     other |= {"ppo": dataclasses.replace(saved.ppo, discount=0.5), "curriculum": Curriculum(on=True)}
     allowed = set()
@@ -79,7 +80,7 @@ def test_only_budget_and_what_looks_on_may_change(finished):
             allowed.add(field.name)
     assert allowed == {
         *("checkpoint_every", "evaluate_every", "evaluation_chunk", "evaluation_episodes", "hand", "keep_checkpoints"),
-        *("devices", "log_every", "minutes", "resume", "steps", "video"),
+        *("devices", "evaluation_share", "log_every", "minutes", "patience", "resume", "steps", "video", "wandb"),
     }
 
 
@@ -100,9 +101,8 @@ def test_runs_that_begin_in_one_second_get_folders_of_their_own(tmp_path, monkey
             return cls(2026, 1, 1, 12)
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(train.datetime, "datetime", Now)
-    arguments, _ = train.parse_arguments(QUICK)
+    monkeypatch.setattr(runlog.datetime, "datetime", Now)
     with ThreadPoolExecutor(8) as many:
-        made = list(many.map(lambda _: make_run_folder(arguments), range(24)))
+        made = list(many.map(lambda _: runlog.new_folder(None, "tiny"), range(24)))
     assert len(set(made)) == 24 and all(path.is_dir() for path in made)
     assert str(min(made, key=lambda path: len(str(path)))) == "runs/tiny-20260101-120000"

@@ -1,12 +1,17 @@
-"""The learning curve says what it shows, in words and units."""
+"""Where metrics go, and that the learning curve says what it shows, in words and units."""
 
+import importlib.util
 import json
+import sys
+import types
 
 import matplotlib.pyplot as plt
 import pytest
+from tiny_env import SMALL, TinyConfig
 
-from dexsim.core.errors import CheckpointError
+from dexsim.core.errors import CheckpointError, ConfigError
 from dexsim_ppo.training import runlog
+from dexsim_ppo.training.arguments import TrainArguments
 from dexsim_ppo.training.runlog import MetricsLog, RunFolder, read_metrics
 
 
@@ -98,10 +103,31 @@ def test_a_resumed_log_goes_on_after_the_checkpoint(tmp_path, monkeypatch):
     monkeypatch.setattr(runlog, "_tensorboard_writer", lambda path: writer)
     folder = RunFolder(tmp_path)
     folder.metrics.write_text("".join(json.dumps({"iteration": i}) + "\n" for i in (2, 4, 6, 8)) + '{"iterat')
-    log = MetricsLog(folder, 6)
+    log = MetricsLog(folder, 6, TrainArguments(env=TinyConfig(), ppo=SMALL))
     log.write({"iteration": 8, "env_steps": 800, "kl": 0.5, "episode/return": float("nan")})
     assert [row["iteration"] for row in read_metrics(folder.metrics)] == [2, 4, 6, 8], "written at once"
     assert read_metrics(folder.metrics)[-1] == {"iteration": 8, "env_steps": 800, "kl": 0.5, "episode/return": None}
     assert writer.scalars == [("kl", 0.5, 800)], "over environment steps, and no NaN"
     log.close()
     assert writer.closed
+
+
+def test_metrics_go_to_weights_and_biases(tmp_path, monkeypatch):
+    said = []
+    run = types.SimpleNamespace(log=lambda row, step: said.append((row, step)), finish=lambda: said.append("finished"))
+    fake = types.SimpleNamespace(init=lambda **given: (said.append(given), run)[1])
+    monkeypatch.setitem(sys.modules, "wandb", fake)
+    arguments = TrainArguments(env=TinyConfig(), ppo=SMALL, wandb="hands", seed=3)
+    log = runlog.MetricsLog(runlog.RunFolder(tmp_path), 0, arguments)
+    log.write({"iteration": 1, "env_steps": 500, "reward": 0.5, "kl": float("nan")})
+    log.close()
+    begun, *logged = said
+    assert begun["project"] == "hands" and begun["config"]["seed"] == 3 and begun["dir"] == tmp_path
+    assert logged == [({"reward": 0.5}, 500), "finished"]
+
+
+def test_weights_and_biases_are_asked_for_before_training_begins(monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    runlog.check_wandb("")
+    with pytest.raises(ConfigError, match="--wandb hands: install the extra"):
+        runlog.check_wandb("hands")

@@ -2,14 +2,17 @@
 
 import json
 
+import jax
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import tiny_train
 
 from dexsim.core.errors import ConfigError
-from dexsim_ppo import train
+from dexsim_ppo import checkpoint, train
 from dexsim_ppo.policy import Policy
+from dexsim_ppo.training import memory
+from dexsim_ppo.training.runlog import RunFolder, read_metrics
 from dexsim_ppo.training.seeds import band, draw_band, spread
 
 OPTIONS = "--task tiny --preset cpu --no-video --ppo.num-envs 16 --ppo.rollout-length 8 --ppo.actor-layers 8".split()
@@ -21,23 +24,40 @@ def tiny_task(monkeypatch):
     tiny_train.install(monkeypatch)
 
 
-def test_each_seed_is_its_own_training_and_the_report_has_their_spread(tmp_path):
-    path = tmp_path / "both"
-    assert train.main([*OPTIONS, "--seed", "4", "--seeds", "2", "--run-dir", str(path)]) == 0
-    assert train.main([*OPTIONS, "--seed", "5", "--run-dir", str(tmp_path / "alone")]) == 0
-    report = json.loads((path / "report.json").read_text())
-    assert report["seeds"] == [4, 5] and (path / "curve.png").stat().st_size > 1000
-    alone = json.loads((tmp_path / "alone/report.json").read_text())
+def numbers(folder):
+    """All numbers of a run's last checkpoint, by path; random keys as their data."""
+    leaves = checkpoint.load(RunFolder(folder).latest_checkpoint(), kind="train").leaves
+    is_key = {name: jax.numpy.issubdtype(x.dtype, jax.dtypes.prng_key) for name, x in leaves.items()}
+    return {name: np.asarray(jax.random.key_data(x) if is_key[name] else x) for name, x in leaves.items()}
+
+
+def test_seeds_in_one_program_are_the_trainings_in_turn_and_the_report_has_their_spread(tmp_path, monkeypatch, capsys):
+    at_once, in_turn = tmp_path / "at-once", tmp_path / "in-turn"
+    seeds = ["--seed", "4", "--seeds", "2"]
+    assert train.main([*OPTIONS, *seeds, "--run-dir", str(at_once)]) == 0
+    assert "in turn" not in capsys.readouterr().out
+    monkeypatch.setattr(memory, "needed", lambda program: 2**50)
+    monkeypatch.setattr(memory, "check", lambda *_: None)
+    assert train.main([*OPTIONS, *seeds, "--run-dir", str(in_turn)]) == 0
+    assert "2 seeds in turn: at once they need" in capsys.readouterr().out
+    for seed in (4, 5):
+        mine, theirs = (numbers(folder / f"seed-{seed}") for folder in (at_once, in_turn))
+        assert mine.keys() == theirs.keys() and int(mine[".iteration"]) == 4
+        for name, leaf in mine.items():
+            np.testing.assert_allclose(leaf, theirs[name], rtol=2e-3, atol=2e-4, err_msg=name)
+    report = json.loads((at_once / "report.json").read_text())
+    assert report["seeds"] == [4, 5] and (at_once / "curve.png").stat().st_size > 1000
     returns = report["trained"]["return"]
-    assert returns["values"][1] == alone["trained"]["return"]["value"] != returns["values"][0]
+    assert returns["values"][0] != returns["values"][1]
     assert returns["mean"] == pytest.approx(np.mean(returns["values"]))
-    kernels = [np.asarray(Policy.load(path / file).params.layers[0].kernel) for file in report["policies"].values()]
-    np.testing.assert_array_equal(
-        kernels[1], np.asarray(Policy.load(tmp_path / "alone/last.msgpack").params.layers[0].kernel)
+    assert returns["values"] == pytest.approx(
+        json.loads((in_turn / "report.json").read_text())["trained"]["return"]["values"], rel=1e-2
     )
+    kernels = [np.asarray(Policy.load(at_once / file).params.layers[0].kernel) for file in report["policies"].values()]
     assert not np.array_equal(*kernels)
+    assert [row["iteration"] for row in read_metrics(RunFolder(at_once / "seed-5").metrics)] == [1, 2, 3, 4]
     with pytest.raises(ConfigError, match="--seeds 2: a resumed run keeps its 1"):
-        train.main(["--resume", str(path / "seed-4"), "--seeds", "2"])
+        train.main(["--resume", str(at_once / "seed-4"), "--seeds", "2"])
 
 
 def test_python_trains_one_seed_at_a_time():

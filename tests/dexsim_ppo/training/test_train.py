@@ -22,10 +22,10 @@ from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import pytree_dataclass
 from dexsim_ppo import evaluate, train
 from dexsim_ppo.policy import Policy
-from dexsim_ppo.report import mean_interval, print_report, proportion, summarize
+from dexsim_ppo.report import mean_interval, print_report, proportion, summarize, surely_better
 from dexsim_ppo.training.arguments import training_config
 from dexsim_ppo.training.runlog import RunFolder, read_metrics
-from dexsim_ppo.training.trainer import SELECTION_SEED, Run, due, surely_better
+from dexsim_ppo.training.trainer import SELECTION_SEED, Run, due
 
 QUICK = [
     "--task",
@@ -47,6 +47,8 @@ QUICK = [
     "32",
     "--evaluate-every",
     "4",
+    "--evaluation-share",
+    "1",
     "--log-every",
     "1",
 ]

@@ -1,0 +1,78 @@
+"""Evaluations during training: when they happen, which policy they choose, and when they end a training."""
+
+import dataclasses
+import time
+import types
+
+import pytest
+from tiny_env import SMALL, TinyConfig, TinyEnv
+
+from dexsim.core.errors import ConfigError
+from dexsim_ppo.training import trainer
+from dexsim_ppo.training.arguments import TrainArguments
+from dexsim_ppo.training.runlog import RunFolder
+from dexsim_ppo.training.trainer import Run
+
+ARGUMENTS = TrainArguments(
+    env=TinyConfig(), ppo=SMALL, task="tiny", evaluate_every=2, evaluation_chunk=10, patience=2, evaluation_share=0.1
+)
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch):
+    """A run whose clock stands at 100 s, and whose evaluations return what `returns` has."""
+    monkeypatch.setattr(time, "perf_counter", lambda: 100.0)
+
+    def evaluator(params, *, episodes, seed):
+        assert (episodes, seed) == (10, trainer.SELECTION_SEED)
+        return {"return": {"value": run.returns.pop(0)}, "held": {"value": 1.0}, "seconds": run.takes}, None
+
+    run = Run(TinyEnv(), ARGUMENTS, RunFolder(tmp_path), 0.0, evaluator=evaluator)
+    run.returns, run.takes = [], 1.0
+    return run
+
+
+def evaluate(run, monkeypatch, *returns):
+    """Evaluate one policy after another; the iterations whose policy became the best."""
+    saved = []
+    display = types.SimpleNamespace(note=lambda _: None)
+    for iteration, value in enumerate(returns):
+        policy = types.SimpleNamespace(params=None, save=lambda path, i=iteration: saved.append((i, path)))
+        monkeypatch.setattr(run, "_policy", lambda _, policy=policy: policy)
+        run.returns.append(value)
+        run.evaluate(None, iteration, display)
+    assert all(path == run.folder.best for _, path in saved)
+    return [i for i, _ in saved]
+
+
+def test_the_best_policy_is_the_one_with_the_highest_return(run, monkeypatch):
+    assert evaluate(run, monkeypatch, 3.0, 2.0, 5.0, 5.0) == [0, 2]
+    assert run.best == {"return": 5.0, "iteration": 2}
+
+
+def test_training_ends_after_evaluations_in_a_row_without_a_better_return(run, monkeypatch):
+    evaluate(run, monkeypatch, 3.0, 2.0, 4.0, 1.0)
+    assert not run.is_over(8)
+    evaluate(run, monkeypatch, 4.0)
+    assert run.is_over(8)
+    run.arguments = dataclasses.replace(ARGUMENTS, patience=0)
+    assert not run.is_over(8)
+
+
+def test_evaluations_keep_to_their_share_of_the_time(run, monkeypatch):
+    """A tenth of 100 s: one evaluation must leave room for the one at the end."""
+    rate = 10 * 32 / 4.0  # by which an evaluation is expected to take 4 s: of the two, 8 s
+    assert run.is_evaluation_due(2, rate) and not run.is_evaluation_due(3, rate)
+    assert not run.is_evaluation_due(2, rate / 1.5)  # 12 s
+    run.takes = 60.0  # compilation
+    evaluate(run, monkeypatch, 1.0)
+    assert not run.is_evaluation_due(4, rate)  # 4 s are spent, and two more would make it 12
+    assert run.is_evaluation_due(4, 2 * rate)  # 2 s each
+    run.takes = 1.0
+    evaluate(run, monkeypatch, 1.0, 1.0)
+    assert run.is_evaluation_due(4, rate) and not run.is_evaluation_due(4, rate / 2)  # 4 + 1 + 1 + 2 s, 8 + 1 + 1 + 2 s
+
+
+def test_patience_needs_evaluations():
+    with pytest.raises(ConfigError, match=r"TrainArguments\.patience = 2: needs evaluations"):
+        dataclasses.replace(ARGUMENTS, evaluate_every=0)
