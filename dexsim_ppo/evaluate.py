@@ -111,7 +111,7 @@ class Evaluator:
         last: Any = None
         if self.totals:
             last = (dict(state.metrics), jnp.zeros(self.chunk, jnp.int32), jnp.zeros(self.chunk, bool))
-        first = state, begin(params, (self.chunk,)), last
+        first: Any = state, begin(params, (self.chunk,)), last
         (*_, last), (series, film) = jax.lax.scan(step, first, None, length=self.env.evaluation_steps)
         return (last[:2] if self.totals else series), film
 

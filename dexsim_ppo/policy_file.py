@@ -41,7 +41,7 @@ def memory_to_list(memory: Memory) -> list[Any] | None:
     """A memory's kind and size as plain data; None of a policy without."""
     if isinstance(memory, History):
         return ["history", memory.length]
-    return memory and ["gru", memory.recurrent.kernel.shape[0]]
+    return None if memory is None else ["gru", memory.recurrent.kernel.shape[0]]
 
 
 def _read_memory(content: Any, leaves: dict[str, Any]) -> Memory:

@@ -174,8 +174,8 @@ _ALL = (
         draw=figures.command_curves,
         differs="Our targets are 2 to 7 N a finger; the paper's hand presses harder. The paper does not say "
         "what its joint torque is a share of. Ours is the sum over touching fingers of the root joint's torque over "
-        "its limit. Alone, R_torque has the weight that R_force has. As in the paper, R_torque alone has the narrowest range "
-        "of force. R_force alone ties with both, since R_torque beside it has a tenth of its weight.",
+        "its limit. Alone, R_torque has the weight that R_force has. As in the paper, R_torque alone has the narrowest "
+        "range of force. R_force alone ties with both, since R_torque beside it has a tenth of its weight.",
         trains=True,
         minutes=3.0,
     ),
