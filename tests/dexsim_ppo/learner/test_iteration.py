@@ -55,7 +55,8 @@ def test_every_epoch_takes_every_row_once_in_an_order_of_its_own(updates):
         mine = np.array([epoch[epoch // of_block == block] for epoch in epochs])
         for order in (*mine, mine[0][mine[1].argsort()]):
             far = np.corrcoef(order, np.arange(of_block))[0, 1]
-            assert abs(far) < 0.5, "shuffled, and not alike in two epochs"
+            # Of 32 rows in random order the correlation exceeds 0.7 once in 100,000 times.
+            assert abs(far) < 0.7, "shuffled, and not alike in two epochs"
 
 
 def test_every_minibatch_has_as_many_rows_of_each_block(updates):
@@ -95,7 +96,8 @@ def test_a_minibatch_without_a_finite_loss_says_nothing(learner, monkeypatch):
     monkeypatch.setattr(update, "loss", broken)
     number, action = jnp.arange(config.steps_per_iteration, dtype=jnp.float32), jnp.zeros((64, 1))
     samples = Samples({}, Decision(action, action, number), number, number, number)
-    after, metrics = update.update(config, {}, samples, jax.random.key(1), learner)
+    one_block = jax.tree.map(lambda x: x[None], samples)
+    after, metrics = update.update(config, {}, one_block, jax.random.key(1), learner)
     assert int(after.skipped_updates) == config.epochs, "row 5 is in one minibatch of each epoch"
     assert float(metrics["kl"]) == 1.0 and float(metrics["value_loss"]) == 2.0
     assert float(after.learning_rate) == pytest.approx(RATE / 1.5)

@@ -21,22 +21,28 @@ from collectives import received
 
 # A GRU's memory is split as the environments are; `training/test_devices.py` has a policy without.
 CONFIG = dataclasses.replace(SMALL, num_envs=16, iterations_per_call=10, memory="gru", memory_size=4)
+PLAIN = dataclasses.replace(CONFIG, memory="none")
 
 
 def trained(devices):
-    """All numbers of the state after 20 iterations, how many devices hold the environments, and the program's text."""
+    """All numbers of the state after 20 iterations, and how many devices hold the environments."""
     training = make_train(TinyEnv(), CONFIG, mesh=make_mesh(devices, CONFIG))
     state = training.init(jax.random.key(0))
-    step = training.step.lower(training.shapes(jax.random.key(0))).compile()
     for _ in range(2):
-        state, _ = step(state)
+        state, _ = training.step(state)
     used = len(state.env_state.x.sharding.device_set)
     assert state.memory.sharding.device_set == state.env_state.x.sharding.device_set
     state = dataclasses.replace(state, key=jax.random.key_data(state.key))
     state = dataclasses.replace(
         state, env_state=dataclasses.replace(state.env_state, key=jax.random.key_data(state.env_state.key))
     )
-    return [np.asarray(leaf) for leaf in jax.tree.leaves(state)], used, step.as_text()
+    return [np.asarray(leaf) for leaf in jax.tree.leaves(state)], used
+
+
+def communicated(devices):
+    """Bytes that a device receives in a call of a training without memory."""
+    training = make_train(TinyEnv(), PLAIN, mesh=make_mesh(devices, PLAIN))
+    return received(training.step.lower(training.shapes(jax.random.key(0))).compile().as_text())[0]
 
 
 def test_one_two_and_eight_devices_agree_and_each_repeats_itself_to_the_bit(tmp_path):
@@ -53,8 +59,8 @@ def test_one_two_and_eight_devices_agree_and_each_repeats_itself_to_the_bit(tmp_
         timeout=200,
     )
     assert done.returncode == 0, done.stderr
-    alone, used, text = trained(1)
-    assert used == 1 and received(text)[0] == 0
+    alone, used = trained(1)
+    assert used == 1 and communicated(1) == 0
     for devices in (2, 8):
         first, again = (np.load(tmp_path / f"{devices}-{i}.npz") for i in range(2))
         assert int(first["used"]) == devices
@@ -62,7 +68,7 @@ def test_one_two_and_eight_devices_agree_and_each_repeats_itself_to_the_bit(tmp_
             np.testing.assert_allclose(first[str(i)], leaf, rtol=2e-3, atol=2e-4)
             np.testing.assert_array_equal(again[str(i)], first[str(i)])
         # Of the experience only the rewards, of which one may be a fault; else gradients and sums.
-        shapes = make_train(TinyEnv(), CONFIG).shapes(jax.random.key(0)).params
+        shapes = make_train(TinyEnv(), PLAIN).shapes(jax.random.key(0)).params
         gradients = CONFIG.epochs * CONFIG.minibatches * sum(leaf.size for leaf in jax.tree.leaves(shapes))
         least = CONFIG.iterations_per_call * 4 * (devices - 1) / devices * (CONFIG.steps_per_iteration + 2 * gradients)
         assert least < float(first["received"]) < 1.25 * least
@@ -80,7 +86,7 @@ def test_what_does_not_divide_is_refused():
         ({}, 0, None),
         ({}, 3, "PPOConfig.num_envs = 16: must be a multiple of the 3 devices"),
         (
-            {"num_envs": 12, "minibatches": 16},
+            {"num_envs": 12, "minibatches": 16, "memory": "none"},
             4,
             "PPOConfig.minibatches = 16: leaves 6 steps each, no multiple of the 4",
         ),
@@ -105,6 +111,6 @@ def test_every_device_gets_as_many_environments_and_rows(changes, devices, messa
 if __name__ == "__main__":
     for devices in (2, 8):
         for i in range(2):
-            leaves, used, text = trained(devices)
+            leaves, used = trained(devices)
             numbers = {str(k): leaf for k, leaf in enumerate(leaves)}
-            np.savez(f"{sys.argv[1]}/{devices}-{i}.npz", used=used, received=received(text)[0], **numbers)
+            np.savez(f"{sys.argv[1]}/{devices}-{i}.npz", used=used, received=communicated(devices), **numbers)
