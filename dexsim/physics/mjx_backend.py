@@ -22,7 +22,7 @@ class MjxBackend:
         self.scene = scene
         self.mjx: ModuleType = mjx
         try:
-            self.model = mjx.put_model(scene.model, impl=impl)
+            self.model = mjx.put_model(scene.model, device=jax.local_devices()[0], impl=impl)
         except NotImplementedError as error:
             raise AssetError(f"{scene.hand.model_path}: backend {impl}: {error}") from None
 
