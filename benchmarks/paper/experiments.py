@@ -57,8 +57,8 @@ def _sweep_rows() -> tuple[Row, ...]:
     )
     own = {
         "grasp": (
-            ("friction", "finger friction", "objects.friction=[{},{}]", (0.6, 1.2), ()),
-            ("link_friction", "link friction", "objects.link_friction=[{},{}]", (0.6, 1.2), ()),
+            ("friction", "finger friction", "objects.friction=[{},{}]", (0.4, 1.2), ()),
+            ("link_friction", "link friction", "objects.link_friction=[{},{}]", (0.3, 1.2), ()),
             ("mass", "mass [kg]", "objects.mass=[{},{}]", (0.05, 0.20), ()),
         ),
         "rotate": (

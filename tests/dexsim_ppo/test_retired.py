@@ -132,7 +132,8 @@ def test_arrays_of_an_older_environment_go_where_todays_are():
 def test_a_policy_without_a_specification_gets_the_one_that_its_task_has(task, config, hand):
     """Today's task of the same configuration says the same, but for what those tasks could not have."""
     control = dataclasses.replace(config.control, force=dataclasses.replace(config.control.force, gain=0.0))
-    config = dataclasses.replace(config, posture=config.posture or hand.grasp_posture, control=control)
+    # Files from before a hand's TOML gave them name posture and reference themselves.
+    config = dataclasses.replace(task(config, hand).config, control=control)
     today = TaskSpec.of(task(config, hand))
     old = old_spec(task.name, to_dict(config))
     for field in dataclasses.fields(TaskSpec):

@@ -17,8 +17,8 @@ from dexsim_ppo import checkpoint, train
 from dexsim_ppo.learner.curriculum import Curriculum
 from dexsim_ppo.training import trainer
 from dexsim_ppo.training.arguments import TrainArguments
-from dexsim_ppo.training.runlog import RunFolder
-from dexsim_ppo.training.trainer import Run, _mean, surely_better
+from dexsim_ppo.training.runlog import RunFolder, means
+from dexsim_ppo.training.trainer import Run, surely_better
 
 CONFIG = dataclasses.replace(SMALL, iterations_per_call=2)
 PER_ITERATION = 64
@@ -134,7 +134,8 @@ def test_minutes_count_from_the_start_of_the_run(loop):
 
 
 def test_means_are_over_what_is_finite():
-    assert _mean(np.array([1.0, np.nan, 3.0])) == 2.0 and np.isnan(_mean(np.array([np.nan, np.nan])))
+    found = means({"some": np.array([1.0, np.nan, 3.0]), "none": np.array([np.nan, np.nan])})
+    assert found["some"] == 2.0 and np.isnan(found["none"])
 
 
 def test_the_best_policy_so_far_is_kept(tmp_path, monkeypatch):

@@ -60,8 +60,8 @@ def test_a_quaternion_of_the_other_sign_is_no_turn(direction):
 @pytest.mark.parametrize(("off", "counts"), [(0.049, True), (0.051, False)])
 def test_a_goal_counts_within_its_distance_at_the_time_of_the_orientation(off, counts):
     config = RotateConfig(goal_distance=0.05)
-    goals = TurnGoals(config.turn, config.reference)
-    place = np.asarray(config.reference) + [0.0, 0.6 * off, 0.8 * off]
+    goals = TurnGoals(config.turn, REFERENCE)
+    place = np.asarray(REFERENCE) + [0.0, 0.6 * off, 0.8 * off]
     goals.update(7.5, seen(math.pi / 2, place=place))
     assert goals.successes == counts and goals.times == [7.5] * counts
 
