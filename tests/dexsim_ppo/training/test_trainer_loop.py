@@ -41,7 +41,8 @@ def loop(tmp_path, monkeypatch):
     monkeypatch.setattr(trainer, "time", SimpleNamespace(perf_counter=lambda: clock.now))
 
     def run(first=0, stop_after=10**6, **options):
-        arguments = TrainArguments(env=TinyConfig(), ppo=CONFIG, task="tiny", **options)
+        free = {"evaluation_chunk": 1, "evaluation_share": 1.0}  # what evaluations may cost has tests of its own
+        arguments = TrainArguments(env=TinyConfig(), ppo=CONFIG, task="tiny", **free, **options)
         found = Run(TinyEnv(), arguments, RunFolder(tmp_path), 20.0)
         found.evaluated, found.saved, found.shown, found.logged, found.notes, calls = [], [], [], [], [], []
 
@@ -54,14 +55,15 @@ def loop(tmp_path, monkeypatch):
         def evaluate(state, iteration, display):
             clock.now += EVALUATION_S
             found.evaluated.append((iteration, int(state.iteration)))
+            found.best = {"return": 7.0, "iteration": iteration}
             return {"evaluation/return": 7.0}
 
         def save(state, iteration):
             clock.now += SAVE_S
             found.saved.append((iteration, int(state.iteration)))
 
-        monkeypatch.setattr(found, "_evaluate", evaluate)
-        monkeypatch.setattr(found, "_save", save)
+        monkeypatch.setattr(found, "evaluate", evaluate)
+        monkeypatch.setattr(found, "save", save)
         display = SimpleNamespace(note=found.notes.append, show=found.shown.append)
         state = State(jnp.int32(first), jnp.int32(0))
         log = SimpleNamespace(write=found.logged.append)
@@ -150,11 +152,12 @@ def test_the_best_policy_so_far_is_kept(tmp_path, monkeypatch):
     run.evaluator = evaluator
     monkeypatch.setattr(run, "_policy", lambda state: SimpleNamespace(params=state))
     monkeypatch.setattr(run, "_write_policy", lambda policy, path: written.append((policy.params, path)))
-    rows = [run._evaluate(f"state {i}", i, SimpleNamespace(note=notes.append)) for i in (1, 2, 3, 4)]
+    rows = [run.evaluate(f"state {i}", i, SimpleNamespace(note=notes.append)) for i in (1, 2, 3, 4)]
     assert rows[2] == {"evaluation/return": -2.0, "evaluation/held": 0.25}
     assert asked[2] == ("state 3", {"episodes": 5, "seed": trainer.SELECTION_SEED})
     assert written == [(f"state {i}", run.folder.best) for i in (1, 2, 4)]
     assert ["the best so far" in note for note in notes] == [True, True, False, True]
+    assert run.without_better == 0 and "1 without a better one" in notes[2]
     assert run.best == {"return": 0.5, "iteration": 4}
 
 
@@ -169,18 +172,18 @@ def test_whatever_the_program_depends_on_identifies_it(tmp_path):
     """And a step over several devices, or of an environment that cannot say what it is, has no identity."""
     arguments = TrainArguments(env=TinyConfig(), ppo=CONFIG, curriculum=Curriculum(on=True))
     run = Run(TinyEnv(), arguments, RunFolder(tmp_path), 0.0)
-    assert run._identity() is None
+    assert run.identity() is None
     run.env.fingerprint = lambda: "hand and task"
-    found = [run._identity()]
+    found = [run.identity()]
     run.env.fingerprint = lambda: "another hand"
-    found.append(run._identity())
+    found.append(run.identity())
     run.config = dataclasses.replace(CONFIG, discount=0.5)
-    found.append(run._identity())
+    found.append(run.identity())
     run.arguments = dataclasses.replace(arguments, curriculum=Curriculum(on=True, step=0.5))
-    found.append(run._identity())
+    found.append(run.identity())
     assert len({json.dumps(one) for one in found}) == 4
     run.mesh = SimpleNamespace(size=2)
-    assert run._identity() is None
+    assert run.identity() is None
 
 
 @pytest.mark.parametrize(("own", "backend"), [(False, "jax"), (True, "jax"), (True, "warp")])
@@ -205,7 +208,7 @@ def test_an_evaluation_is_of_the_task_as_configured(own, backend, tmp_path, monk
 
 
 QUICK = "--task tiny --preset cpu --no-video --ppo.num-envs 16 --ppo.rollout-length 8 --ppo.actor-layers 8".split()
-QUICK += "--ppo.critic-layers 8 --evaluation-chunk 16 --evaluation-episodes 16 --log-every 1 --evaluate-every 1".split()
+QUICK += "--ppo.critic-layers 8 --evaluation-chunk 16 --evaluation-episodes 16 --log-every 1 --evaluate-every 1 --evaluation-share 1".split()
 
 
 def test_a_resumed_run_goes_on_with_its_best_its_time_and_as_many_checkpoints(tmp_path, monkeypatch):

@@ -68,7 +68,7 @@ def test_a_goal_counts_within_its_distance_at_the_time_of_the_orientation(off, c
 
 def test_the_spin_is_smoothed_over_a_tenth_of_a_second():
     """A spin of 3 rad/s that starts at once: a first-order filter over 0.1 s."""
-    goals, period = TurnGoals(RotateConfig().turn, RotateConfig().reference), 0.01
+    goals, period = TurnGoals(RotateConfig().turn, REFERENCE), 0.01
     goals.update(0.0, seen(0.0))
     for k in range(1, 20):
         goals.update(period * k, seen(3.0 * period * k))

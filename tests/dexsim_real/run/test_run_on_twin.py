@@ -47,11 +47,11 @@ def test_wrong_angles_move_nothing_as_judged_by_the_true_ones(hand, tmp_path):
 
 
 def test_a_wrong_angle_that_stays_ends_the_run_with_its_name(hand, tmp_path):
-    with Running(hand, tmp_path, task="grasp", faults=FaultConfig(script=("2 angle 5 stuck 1.9 60",))) as running:
+    with Running(hand, tmp_path, task="grasp", faults=FaultConfig(script=("2 angle 5 stuck 0.2 60",))) as running:
         process = start(running, tmp_path, "--seconds", "30")
         assert process.wait(60) == 1
         assert not running.twin.firmware.on and running.twin.check.report()["outside_limits"] == 0
-    assert "index_joint2 reads 1.9 rad" in summary(tmp_path)["end"]
+    assert "index_joint2 reads 0.2 rad" in summary(tmp_path)["end"]
 
 
 def test_the_guard_turns_the_emulated_hand_off_after_sigkill(hand, tmp_path):
