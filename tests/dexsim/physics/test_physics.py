@@ -299,7 +299,7 @@ class TestConstruction:
             Physics(broken, SLOTS, ObjectConfig().largest, PhysicsConfig(), gravity=GRAVITY, backend="jax")
 
     def test_what_mjx_itself_refuses(self, hand, monkeypatch):
-        def refuse(model, impl):
+        def refuse(model, **_):
             raise NotImplementedError("no such joint")
 
         monkeypatch.setattr(mjx, "put_model", refuse)
