@@ -208,7 +208,8 @@ def test_an_evaluation_is_of_the_task_as_configured(own, backend, tmp_path, monk
 
 
 QUICK = "--task tiny --preset cpu --no-video --ppo.num-envs 16 --ppo.rollout-length 8 --ppo.actor-layers 8".split()
-QUICK += "--ppo.critic-layers 8 --evaluation-chunk 16 --evaluation-episodes 16 --log-every 1 --evaluate-every 1 --evaluation-share 1".split()
+QUICK += "--ppo.critic-layers 8 --evaluation-chunk 16 --evaluation-episodes 16 --log-every 1".split()
+QUICK += "--evaluate-every 1 --evaluation-share 1".split()
 
 
 def test_a_resumed_run_goes_on_with_its_best_its_time_and_as_many_checkpoints(tmp_path, monkeypatch):
