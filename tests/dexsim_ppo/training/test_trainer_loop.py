@@ -212,6 +212,14 @@ QUICK += "--ppo.critic-layers 8 --evaluation-chunk 16 --evaluation-episodes 16 -
 QUICK += "--evaluate-every 1 --evaluation-share 1".split()
 
 
+def test_a_budget_that_ends_while_compiling_is_said(tmp_path, monkeypatch, capsys):
+    tiny_train.install(monkeypatch)
+    assert train.main([*QUICK, "--minutes", "1e-4", "--run-dir", str(tmp_path / "a")]) == 0
+    assert "nothing was trained: compiling took" in capsys.readouterr().out
+    assert train.main([*QUICK, "--steps", "128", "--run-dir", str(tmp_path / "b")]) == 0
+    assert "nothing was trained" not in capsys.readouterr().out
+
+
 def test_a_resumed_run_goes_on_with_its_best_its_time_and_as_many_checkpoints(tmp_path, monkeypatch):
     tiny_train.install(monkeypatch)
     folder = RunFolder(tmp_path / "a")
