@@ -56,26 +56,30 @@ def _change_priority(by: int) -> None:
 
 _ENDING = ("SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP")
 _armed = False  # whether a signal may still interrupt the program
+_interrupted = False  # whether one has
 
 
 @contextlib.contextmanager
-def stopping() -> Iterator[None]:
+def stopping(leaving: bool = False) -> Iterator[None]:
     """Within this context the first signal that would end or suspend the program interrupts it; later ones do nothing.
 
     SIGTERM, SIGHUP, SIGQUIT and SIGTSTP (Ctrl-Z) raise SystemExit(128 + number), and SIGINT raises KeyboardInterrupt.
     A second one could otherwise interrupt what turns the motors off. A shell starts background programs with SIGINT
     ignored. It is handled here nevertheless, so that a moving hand can always be interrupted.
+
+    `leaving` says that the program ends afterwards: if it was interrupted, it ignores signals from then on, since a
+    late one would kill it before its exit code is given.
     """
-    global _armed
+    global _armed, _interrupted
     numbers = [signal.SIGINT, *(getattr(signal, name) for name in _ENDING if hasattr(signal, name))]
     before = {number: signal.signal(number, _interrupt) for number in numbers}
-    _armed = True
+    _armed, _interrupted = True, False
     try:
         yield
     finally:
         _armed = False
         for number, handler in before.items():
-            signal.signal(number, handler)
+            signal.signal(number, signal.SIG_IGN if leaving and _interrupted else handler)
 
 
 def ignore_signals() -> None:
@@ -85,10 +89,10 @@ def ignore_signals() -> None:
 
 
 def _interrupt(number: int, frame: Any) -> None:
-    global _armed
+    global _armed, _interrupted
     if not _armed:
         return
-    _armed = False
+    _armed, _interrupted = False, True
     if number == signal.SIGINT:
         raise KeyboardInterrupt
     raise SystemExit(128 + number)

@@ -34,7 +34,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     cli.enable_caches()
     session = Session(arguments)
     reason, code = "", 0
-    with stopping():
+    with stopping(leaving=argv is None):
         try:
             try:
                 session.prepare()

@@ -182,3 +182,20 @@ def test_a_serial_hand_turns_off_over_a_reconnection():
         assert turn_off(hand, passive_command(), 5.0)
         assert len(peer.commands) > asked and np.all(~peer.on())
         hand.close()
+
+
+@pytest.mark.parametrize(("leaving", "code"), [(True, 143), (False, -signal.SIGTERM)])
+def test_a_late_signal_does_not_change_how_an_interrupted_command_ends(leaving, code):
+    """It comes while the interpreter shuts down."""
+    script = f"""
+import os, signal, sys
+from dexsim_real.core.process import stopping
+try:
+    with stopping(leaving={leaving}):
+        os.kill(os.getpid(), signal.SIGTERM)
+except SystemExit as stop:
+    os.kill(os.getpid(), signal.SIGTERM)
+    sys.exit(stop.code)
+"""
+    done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, timeout=60)
+    assert done.returncode == code
