@@ -40,7 +40,7 @@ def updates(learner, monkeypatch):
     number, action = jnp.arange(count, dtype=jnp.float32), jnp.zeros((count, 1))
     samples = Samples({}, Decision(action, action, number), number, number, number)
     samples = jax.tree.map(lambda x: x.reshape(BLOCKS, count // BLOCKS, *x.shape[1:]), samples)
-    _, metrics = update.update(UPDATES, {}, samples, jax.random.key(1), learner)
+    _, metrics = update.update(UPDATES, {}, samples, jax.random.key(2), learner)
     jax.effects_barrier()
     return rows, metrics
 
@@ -55,8 +55,7 @@ def test_every_epoch_takes_every_row_once_in_an_order_of_its_own(updates):
         mine = np.array([epoch[epoch // of_block == block] for epoch in epochs])
         for order in (*mine, mine[0][mine[1].argsort()]):
             far = np.corrcoef(order, np.arange(of_block))[0, 1]
-            # Of 32 rows in random order the correlation exceeds 0.7 once in 100,000 times.
-            assert abs(far) < 0.7, "shuffled, and not alike in two epochs"
+            assert abs(far) < 0.5, "shuffled, and not alike in two epochs"
 
 
 def test_every_minibatch_has_as_many_rows_of_each_block(updates):
