@@ -49,6 +49,7 @@ def test_the_bridges_imu_reader_sees_how_the_object_turns(hand, tmp_path):
     with Running(hand, tmp_path, plant, task="rotate") as running:
         reader = imu.Imu(str(running.twin.imu.terminal.name))
         reader.wait()
+        joined = reader.parser.damaged  # The port may be opened within a frame, whose rest can look like a head.
         half = 0.5 * plant.turn * plant.time
         reader.calibrate(np.array([math.cos(half), math.sin(half), 0, 0]))
         seen = []
@@ -60,7 +61,7 @@ def test_the_bridges_imu_reader_sees_how_the_object_turns(hand, tmp_path):
     for when, quat in seen:
         off = 2 * math.acos(min(1.0, abs(quat @ [math.cos(when), math.sin(when), 0, 0])))
         assert off < 0.15  # What it turns in the time that this busy test takes to look.
-    assert reader.parser.damaged == 0 and sent == pytest.approx(100 * passed, rel=0.15)
+    assert reader.parser.damaged == joined <= 1 and sent == pytest.approx(100 * passed, rel=0.15)
 
 
 OPTICS = CameraConfig()
