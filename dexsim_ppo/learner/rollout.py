@@ -129,8 +129,12 @@ def collect(
         "nonfinite_rewards": jnp.sum(~finite, dtype=jnp.float32),
         "repeated_starts": _repeated(done),
     }
-    metrics |= {f"step/{k}": _sum(v, jnp.ones_like(done)) / steps for k, v in step_metrics.items()}
-    metrics |= {f"episode/{k}": _sum(v, done) / episodes for k, v in step_metrics.items()}
+    if step_metrics:
+        # One array, so that several processes exchange one message instead of many.
+        values = jnp.stack([v.astype(jnp.float32) for v in step_metrics.values()])
+        for name, total, mask in (("step", steps, jnp.ones_like(done)), ("episode", episodes, done)):
+            means = jnp.sum(jnp.where(mask[None] & jnp.isfinite(values), values, 0.0), (1, 2)) / total
+            metrics |= {f"{name}/{k}": mean for k, mean in zip(step_metrics, means, strict=True)}
     return (end.state, end.memory), rollout, metrics
 
 
@@ -204,9 +208,3 @@ def _repeated(done: jax.Array) -> jax.Array:
     block = _block(done.shape[0])
     ends = jnp.sum(done.reshape(-1, block, done.shape[1]), axis=1, dtype=jnp.float32)
     return jnp.sum(jnp.maximum(ends - 1, 0.0))
-
-
-def _sum(x: jax.Array, mask: jax.Array) -> jax.Array:
-    """Sum of the finite elements of `x` [T, B] where `mask`."""
-    x = x.astype(jnp.float32)
-    return jnp.sum(jnp.where(mask & jnp.isfinite(x), x, 0.0))

@@ -1,8 +1,8 @@
 """Environments spread over several devices: which arrays are split, which are copied to all.
 
-The environments [B] are split over one mesh axis, all else is the same everywhere. Only the environments' own
-functions run under `shard_map`, since physics engines are opaque to XLA; sums over all environments are XLA's to
-place. So an iteration is the same arithmetic on any number of devices, up to the order of sums.
+The environments [B] are split over one mesh axis, all else is the same everywhere. The environments' own functions run
+under `shard_map`, since physics engines are opaque to XLA, and so do gradients, which are averaged as one array; other
+sums over all environments are XLA's to place. So an iteration is the same arithmetic on any number of devices, up to the order of sums.
 """
 
 import dataclasses
@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 from dexsim.core.compilation import jit
@@ -64,6 +65,22 @@ def on_each(function: Callable, mesh: Mesh | None) -> Callable:
         return function
     split = PartitionSpec(AXIS)
     return jax.shard_map(function, mesh=mesh, in_specs=split, out_specs=split, check_vma=False)
+
+
+def averaged(function: Callable, mesh: Mesh | None) -> Callable:
+    """`function(shared, split)` on each device's own part of `split` [N, ...], its results averaged over the devices.
+
+    They travel as one array: between processes on CPUs each array of a reduction costs milliseconds, whatever its size.
+    """
+    if mesh is None:
+        return function
+
+    def part(shared: Any, split: Any) -> Any:
+        flat, restore = ravel_pytree(function(shared, split))
+        return restore(jax.lax.pmean(flat, AXIS))
+
+    whole, parts = PartitionSpec(), PartitionSpec(AXIS)
+    return jax.shard_map(part, mesh=mesh, in_specs=(whole, parts), out_specs=whole, check_vma=False)
 
 
 def block_count(config: PPOConfig, mesh: Mesh | None) -> int:

@@ -14,7 +14,7 @@ from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.loss import Metrics, Samples, loss
 from dexsim_ppo.learner.networks import Params
 from dexsim_ppo.learner.running_stats import Normalizer
-from dexsim_ppo.learner.sharding import on_each
+from dexsim_ppo.learner.sharding import averaged
 
 
 class Learner(NamedTuple):
@@ -45,11 +45,15 @@ def update(
     order = order.reshape(config.epochs, blocks, config.minibatches, -1).swapaxes(1, 2)
     order = order.reshape(config.epochs * config.minibatches, blocks, -1)
     old_log_std, moves = learner.params.log_std, actor_learns(config, learner)
-    pick = on_each(pick_rows, mesh)
+
+    def part_of_gradients(shared, split):
+        params, normalizers, old_log_std = shared
+        return jax.grad(loss, has_aux=True)(params, config, normalizers, pick_rows(*split), old_log_std)
+
+    gradients = averaged(part_of_gradients, mesh)
 
     def minibatch(learner, indices):
-        batch = pick(samples, indices)
-        grads, metrics = jax.grad(loss, has_aux=True)(learner.params, config, normalizers, batch, old_log_std)
+        grads, metrics = gradients((learner.params, normalizers, old_log_std), (samples, indices))
         learner, norms = apply_gradients(config, learner, grads)
         return learner, metrics | norms
 

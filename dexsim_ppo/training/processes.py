@@ -37,6 +37,7 @@ def connect() -> None:
         return
     try:
         jax.distributed.initialize(heartbeat_timeout_seconds=_LOST_AFTER, shutdown_timeout_seconds=_REPORT)
+        agree(0)  # The first exchange on CPUs waits 30 s at most: now, since later one may compile longer than another.
     except (RuntimeError, ValueError) as error:
         raise DexsimError(f"the other processes of this job cannot be reached: {error}") from None
 

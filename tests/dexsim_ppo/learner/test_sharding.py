@@ -40,9 +40,10 @@ def trained(devices):
 
 
 def communicated(devices):
-    """Bytes that a device receives in a call of a training without memory."""
+    """Bytes that a device receives in a call of a training without memory, and the arrays in each of its reductions."""
     training = make_train(TinyEnv(), PLAIN, mesh=make_mesh(devices, PLAIN))
-    return received(training.step.lower(training.shapes(jax.random.key(0))).compile().as_text())[0]
+    text = training.step.lower(training.shapes(jax.random.key(0))).compile().as_text()
+    return received(text)[0], [shapes.count("[") for shapes in re.findall(r"= (.*?) all-reduce(?:-start)?\(", text)]
 
 
 def test_one_two_and_eight_devices_agree_and_each_repeats_itself_to_the_bit(tmp_path):
@@ -60,7 +61,7 @@ def test_one_two_and_eight_devices_agree_and_each_repeats_itself_to_the_bit(tmp_
     )
     assert done.returncode == 0, done.stderr
     alone, used = trained(1)
-    assert used == 1 and communicated(1) == 0
+    assert used == 1 and communicated(1) == (0, [])
     for devices in (2, 8):
         first, again = (np.load(tmp_path / f"{devices}-{i}.npz") for i in range(2))
         assert int(first["used"]) == devices
@@ -72,6 +73,8 @@ def test_one_two_and_eight_devices_agree_and_each_repeats_itself_to_the_bit(tmp_
         gradients = CONFIG.epochs * CONFIG.minibatches * sum(leaf.size for leaf in jax.tree.leaves(shapes))
         least = CONFIG.iterations_per_call * 4 * (devices - 1) / devices * (CONFIG.steps_per_iteration + 2 * gradients)
         assert least < float(first["received"]) < 1.25 * least
+        # Each array of a reduction costs processes on CPUs milliseconds: all gradients are one.
+        assert first["arrays"].sum() <= 25
 
 
 def test_what_does_not_divide_is_refused():
@@ -113,4 +116,5 @@ if __name__ == "__main__":
         for i in range(2):
             leaves, used = trained(devices)
             numbers = {str(k): leaf for k, leaf in enumerate(leaves)}
-            np.savez(f"{sys.argv[1]}/{devices}-{i}.npz", used=used, received=communicated(devices), **numbers)
+            size, arrays = communicated(devices)
+            np.savez(f"{sys.argv[1]}/{devices}-{i}.npz", used=used, received=size, arrays=arrays, **numbers)

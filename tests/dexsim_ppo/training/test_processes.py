@@ -71,9 +71,12 @@ def test_processes_of_a_job_join_and_a_single_one_does_not(job, monkeypatch):
         monkeypatch.delenv(name, raising=False)
     if job:
         monkeypatch.setenv(job, "1")
+    met = []
     monkeypatch.setattr(jax.distributed, "initialize", lambda **options: joined.append(options))
+    monkeypatch.setattr(processes, "agree", lambda number: met.append(len(joined)))
     processes.connect()
     assert len(joined) == bool(job)
+    assert met == [1] * bool(job), "they exchange something before one of them compiles for long"
     if job:  # A dead process is noticed within minutes, and the first one's report is waited for.
         assert joined[0]["heartbeat_timeout_seconds"] <= 120 < 1800 <= joined[0]["shutdown_timeout_seconds"]
         monkeypatch.setattr(jax.distributed, "is_initialized", lambda: True)
