@@ -100,13 +100,17 @@ def test_the_stop_is_repeated_until_the_cable_is_back(tmp_path):
     assert summary(tmp_path)["motors_off"]
 
 
-def test_a_hand_that_never_confirms_is_named(tmp_path):
+def test_a_hand_that_never_confirms_is_named_and_left_to_the_guard(tmp_path):
     with FollowingHand() as peer:
-        process = runner(peer, tmp_path)
+        process = runner(peer, tmp_path, "--no-guard")
         wait(lambda: peer.on().sum() > 60)
         peer.close()
         process.send_signal(signal.SIGINT)
         assert process.wait(30) == 1
+        asked = len(peer.commands)
+        peer.open()
+        wait(lambda: len(peer.commands) > asked, 20.0)
+        assert not peer.on()[asked:].any()
         process.communicate()
     report = summary(tmp_path)
     assert not report["motors_off"] and "press the emergency stop" in report["end"]

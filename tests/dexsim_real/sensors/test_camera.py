@@ -38,9 +38,15 @@ def picture(point, config, radius=9, shape=(480, 640)):
 
 
 @settings(max_examples=25)
-@given(st.floats(0.0, 0.12), st.floats(-0.3, 0.3), st.floats(-0.2, 0.2))
-def test_height_from_a_mask(height, yaw, pitch):
+@given(
+    st.floats(0.0, 0.12),
+    st.floats(-0.3, 0.3),
+    st.floats(-0.2, 0.2),
+    st.sampled_from([(600, 600), (600, 800), (800, 600)]),
+)
+def test_height_from_a_mask(height, yaw, pitch, focal):
     config = CameraConfig(
+        focal=focal,
         position=(0.05 + 0.4 * math.sin(pitch), 0.5, 0.1 + 0.3 * math.sin(yaw)),
         forward=(-math.sin(pitch), -1.0, -math.sin(yaw) * 0.6),
         down=(1.0, 0.2, 0.1),
