@@ -2,7 +2,8 @@
 
 The environments [B] are split over one mesh axis, all else is the same everywhere. The environments' own functions run
 under `shard_map`, since physics engines are opaque to XLA, and so do gradients, which are averaged as one array; other
-sums over all environments are XLA's to place. So an iteration is the same arithmetic on any number of devices, up to the order of sums.
+sums over all environments are XLA's to place. So an iteration is the same arithmetic on any number of devices, up to
+the order of sums.
 """
 
 import dataclasses
