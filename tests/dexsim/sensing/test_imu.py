@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from dexsim.env.episode import EpisodeSampler
 from dexsim.env.senses import SensorSuite
+from dexsim.randomization import Randomization
 from dexsim.sensing.config import Sensing
 from dexsim.sensing.imu import ImuConfig, ImuParams, measure_orientation
 from dexsim.tasks.rotate.config import RotateConfig
@@ -48,3 +50,20 @@ def test_the_heading_drifts_from_the_start_of_the_episode(hand):
     turn = (rotation(read) * TURNED.inv()).as_rotvec()
     gravity = np.asarray(Rotate(config, hand).gravity)
     np.testing.assert_allclose(turn, -gravity / np.linalg.norm(gravity) * 0.1 * 2 * senses.period, atol=1e-5)
+
+
+@pytest.mark.parametrize(("ranges", "curriculum"), [(0.0, 1.0), (0.5, 1.0), (0.5, 0.5), (1.0, 0.0)])
+def test_an_episodes_imu_is_as_wide_as_the_ranges_and_the_curriculum_together(hand, ranges, curriculum):
+    """All three errors are proportional to both; without either the sensor is perfect."""
+
+    def drawn(scale, *more):
+        config = RotateConfig(randomization=Randomization(scale=scale))
+        task = Rotate(config, hand)
+        sampler = EpisodeSampler(config, hand, task, SensorSuite(config, hand, task))
+        return sampler.sample_hand(jax.random.key(1), jax.random.key(2), *more)[1]
+
+    full, part = drawn(1.0), drawn(ranges, curriculum)
+    for name in ("bias", "drift", "delay"):
+        wide, narrow = (np.asarray(getattr(imu, name)) for imu in (full, part))
+        assert np.all(wide != 0)
+        np.testing.assert_allclose(narrow, ranges * curriculum * wide, rtol=1e-5)

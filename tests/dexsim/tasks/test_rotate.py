@@ -409,6 +409,31 @@ class TestPool:
         same = dataclasses.replace(config, reward=RotateReward(bonus=1.0), episode_seconds=5.0)
         assert _fingerprint(key, hand, same) in names
 
+    @pytest.mark.parametrize(
+        "change",
+        [
+            {"posture": (0.1,) * 12},
+            {"reference": (0.06, 0.0, 0.09)},
+            {"posture_noise": 0.2},
+            {"axis": (0.0, 1.0, 0.0)},
+            {"direction": -1},
+            {"roll": 0.0},
+            {"drop_distance": 0.05},
+            {"clearance": 0.002},
+            {"curl": (0.0, 0.1)},
+            {"squeeze": (0.0, 0.1)},
+            {"heading_noise": 0.1},
+            {"start_offset": (-0.02, 0.0)},
+            {"place_noise": 0.0},
+            {"settle_seconds": 0.4},
+            {"pool_size": 64},
+        ],
+        ids=lambda change: next(iter(change)),
+    )
+    def test_another_start_is_another_pool(self, hand, change):
+        key = jax.random.key(0)
+        assert _fingerprint(key, hand, RotateConfig(**change)) != _fingerprint(key, hand, RotateConfig())
+
     def test_motors_are_part_of_a_pool_and_ranges_about_them_are_not(self, hand):
         """Objects settle under the nominal stiffness and damping: a pool from disk must have been made with them."""
         key, config = jax.random.key(0), RotateConfig()
