@@ -19,6 +19,7 @@ from dexsim.observation import (
     ObservationField,
     Readings,
     ThreeAxisReadings,
+    group_configs,
     layout,
 )
 from dexsim_real.sensors.readings import sources_of
@@ -159,6 +160,14 @@ def test_ablations_leave_their_fields_out(hand, readings, truth, names, leave_ou
     fields = check(hand, readings, names, ObservationConfig(leave_out=leave_out), truth)
     assert [f.name for f in fields] == [name for name in names if name not in leave_out]
     assert sum(f.size for f in fields) == size
+
+
+def test_the_critic_keeps_what_the_actor_goes_without(hand):
+    """An ablation is of the actor; what only simulation knows is the critic's alone."""
+    config = ObservationConfig(leave_out=("contact_force",), add=("last_action",), add_critic=("object_spin",))
+    actor, critic = ([field.name for field in layout(hand, GRASP, one)] for one in group_configs(config))
+    assert actor == [*(name for name in GRASP if name != "contact_force"), "last_action"]
+    assert critic == [*GRASP, "last_action", "object_spin"]
 
 
 def test_a_finger_that_touches_nothing_has_its_centre_at_zero(hand, readings):
