@@ -42,7 +42,7 @@ def test_wrong_angles_move_nothing_as_judged_by_the_true_ones(hand, tmp_path):
         assert process.wait(60) == 0, summary(tmp_path)["end"]
         report = running.twin.report()
     assert report["faults"]["injected"] == {"angle": 4} and report["commands"]["outside_limits"] == 0
-    assert summary(tmp_path)["safety"]["implausible: measurement"] > 20
+    assert summary(tmp_path)["safety"]["implausible: measurement"] >= 4  # One of each, on however busy a machine.
     assert not [note for note in records(tmp_path, Kind.NOTE) if note.startswith("relax: implausible")]
 
 
