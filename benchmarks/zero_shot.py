@@ -138,7 +138,7 @@ def _shown(report: dict[str, Any], show: bool) -> dict[str, Any]:
 # --- metrics -------------------------------------------------------------------------------------
 
 
-def grasp_metrics(reports: list[dict[str, Any]], span: tuple[float, float], force_command: str) -> dict[str, Any]:
+def grasp_metrics(reports: list[dict[str, Any]], span: tuple[float, float]) -> dict[str, Any]:
     """Success rate, force error over all trials, and correlation of the forces of held objects with the command.
 
     Names, window and forces are those of the evaluation in simulation (`dexsim.tasks.grasp.report`); torques are as the
@@ -147,14 +147,13 @@ def grasp_metrics(reports: list[dict[str, Any]], span: tuple[float, float], forc
     Args:
       reports: the referee's, of trials.
       span: N, target at command 0 and 1.
-      force_command: of what, see `dexsim.force_loop.FORCE_COMMANDS`.
     """
     from dexsim.core.statistics import mean, proportion
     from dexsim.tasks.grasp.report import FORCES, correlations, force_error, pearson, saturates, slope
 
     held = np.array([r["held"] for r in reports])
     torque = ("total_torque",) if all("total_torque" in r for r in reports) else ()  # not with processes of their own
-    forces = {part: f"{force_command}_{part}" for part in FORCES.values()}
+    forces = {part: f"finger_{part}" for part in FORCES.values()}
     names = (*forces.values(), "total_force", *torque, "torque_limited")
     command, *columns = (np.array([r[name] for r in reports], float) for name in ("command", *names))
     mean_of = dict(zip(names, columns, strict=True))
@@ -176,7 +175,6 @@ def grasp_metrics(reports: list[dict[str, Any]], span: tuple[float, float], forc
     return {
         "held": proportion(held),
         "force_error_n": force_error(np.where(held, 1.0, lived) * commanded["force"], wanted),
-        "force_command": force_command,
         **correlations(command, held, commanded),
         **({"r_torque": pearson(command[held], mean_of["total_torque"][held])} if torque else {}),
         "slope_force_n": slope(command[held], commanded["force"][held]),
@@ -214,8 +212,7 @@ def metrics(task: str, policy: str, reports: list[dict[str, Any]]) -> dict[str, 
         return rotate_metrics(reports)
     from dexsim_ppo.policy import load_policy
 
-    config = load_policy(policy).env_config
-    return grasp_metrics(reports, tuple(config["finger_force"]), config.get("force_command", "finger"))
+    return grasp_metrics(reports, tuple(load_policy(policy).env_config["finger_force"]))
 
 
 def arguments() -> argparse.Namespace:

@@ -54,7 +54,7 @@ def table(here: dict[str, Any], there: dict[str, Any], idle: dict[str, Any]) -> 
     def at(metrics: dict[str, Any], command: float) -> dict[str, Any]:
         return next((row for row in metrics.get("by_command", []) if row["command"] == command), {})
 
-    force = f"{here.get('force_command')}_force"
+    force = "finger_force"
     names = [name for name in here if isinstance(here[name], dict)]
     rows = [(name.replace("_", " "), cell(here[name]), cell(there.get(name)), cell(idle.get(name))) for name in names]
     for entry in here.get("by_command", []):

@@ -14,10 +14,6 @@ from dexsim.core.config import setting, validate
 # Of the command that a policy trained on [0, 1] is shown. Below 0 it lets go of weak grips.
 _LOW, _HIGH = 0.0, 1.5
 
-FORCE_COMMANDS = ("squeeze", "finger")
-"""What a force command speaks of. squeeze: the sum over the fingers that oppose the thumb, so a grip can reach it that
-the thumb can balance; finger: each of them that touches (the paper)."""
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ForceLoop:
@@ -34,21 +30,24 @@ class ForceLoop:
         validate(self)
 
 
-def commanded_force(force: jax.Array, touching: jax.Array, force_command: str) -> jax.Array:
-    """The force [] N that a command speaks of, of `FORCE_COMMANDS`.
+def target_force(command: jax.Array, span: tuple[float, float]) -> jax.Array:
+    """Force [...] N that each touching finger but the thumb should press with, `span` at the commands 0 and 1."""
+    return span[0] + command * (span[1] - span[0])
+
+
+def commanded_force(force: jax.Array, touching: jax.Array) -> jax.Array:
+    """The force [] N that a command speaks of: the mean over the touching fingers, 0 where none touches.
 
     Args:
       force: [F] N. The first finger, the thumb, balances the others and does not count.
       touching: [F] bool.
-      force_command: "squeeze" for the sum, "finger" for the mean over fingers that touch, 0 where none does.
     """
     total = jnp.sum(jnp.where(touching, force, 0.0)[1:])
-    return total if force_command == "squeeze" else total / jnp.maximum(jnp.sum(touching[1:].astype(jnp.float32)), 1.0)
+    return total / jnp.maximum(jnp.sum(touching[1:].astype(jnp.float32)), 1.0)
 
 
 def correct_command(
     loop: ForceLoop,
-    force_command: str,
     span: tuple[float, float],
     period: float,
     command: jax.Array,
@@ -59,15 +58,14 @@ def correct_command(
 
     Args:
       loop: settings.
-      force_command: what the command speaks of, of `FORCE_COMMANDS`.
-      span: N, that force at the commands 0 and 1.
+      span: N, a finger's target at the commands 0 and 1.
       period: s, control tick.
       command: [] in [0, 1].
       correction: [] so far; it stays while fewer than two fingers beside the first touch.
       force: [F] N estimated, zero where nothing touches.
     """
     touching = force > 0
-    felt = commanded_force(force, touching, force_command)
+    felt = commanded_force(force, touching)
     error = command - (felt - span[0]) / (span[1] - span[0])
     change = jnp.clip(loop.gain * error, -loop.slew, loop.slew) * period
     moved = jnp.where(jnp.sum(touching[1:]) >= 2, correction + change, correction)

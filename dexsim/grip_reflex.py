@@ -27,21 +27,6 @@ class GripReflex:
         validate(self)
 
 
-def wanted_force(force_command: str, span: tuple[float, float], command: jax.Array, touching: jax.Array) -> jax.Array:
-    """The force [] N that each touching finger but the thumb should give.
-
-    Args:
-      force_command: what the command speaks of, of `dexsim.force_loop.FORCE_COMMANDS`.
-      span: N, that force at the commands 0 and 1.
-      command: [].
-      touching: [F] bool.
-    """
-    wanted = span[0] + command * (span[1] - span[0])
-    return (
-        wanted / jnp.maximum(jnp.sum(touching[1:].astype(jnp.float32)), 1.0) if force_command == "squeeze" else wanted
-    )
-
-
 def move_reflex(reflex: GripReflex, period: float, angle: jax.Array, wanted: jax.Array, force: jax.Array) -> jax.Array:
     """The next angles [F] rad that the reflex adds, closing positive; the thumb's is 0.
 

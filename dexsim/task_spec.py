@@ -15,8 +15,8 @@ import numpy as np
 from dexsim.control import Control, closing, move_target, reflex_target
 from dexsim.core.config import setting, validate
 from dexsim.core.errors import ConfigError
-from dexsim.force_loop import FORCE_COMMANDS, correct_command
-from dexsim.grip_reflex import move_reflex, wanted_force
+from dexsim.force_loop import correct_command, target_force
+from dexsim.grip_reflex import move_reflex
 from dexsim.hand.kinematics import Hand
 from dexsim.observation import ObservationConfig, Readings
 from dexsim.touch.estimate import estimate_force
@@ -73,9 +73,7 @@ class TaskSpec:
     turn: TurnSpec | None = None
     """Goals that follow one another; None for a task without."""
     finger_force: tuple[float, float] | None = None
-    """Force in N at the commands 0 and 1; None for a task without a force command."""
-    force_command: str = setting("finger", choices=FORCE_COMMANDS)
-    """What `finger_force` is the force of."""
+    """Force in N of a touching finger at the commands 0 and 1; None for a task without a force command."""
 
     def __post_init__(self) -> None:
         validate(self)
@@ -109,7 +107,6 @@ class TaskSpec:
             velocity_filter=config.sensing.velocity_filter,
             turn=getattr(config, "turn", None),
             finger_force=getattr(config, "finger_force", None),
-            force_command=getattr(config, "force_command", "finger"),
         )
 
     def check_hand(self, hand: Hand) -> None:
@@ -133,9 +130,7 @@ def correct_readings(
     assert spec.finger_force is not None, "checked when the specification was made"
     force = estimate_force(spec.observation.force, hand, readings.taxel_force, readings.joint_torque)
     before = jnp.zeros(()) if correction is None else correction
-    after = correct_command(
-        spec.control.force, spec.force_command, spec.finger_force, period, readings.command, before, force
-    )
+    after = correct_command(spec.control.force, spec.finger_force, period, readings.command, before, force)
     return dataclasses.replace(readings, command=readings.command + after), after
 
 
@@ -166,7 +161,7 @@ def next_target(
         return move_target(control, hand, target, action, measured), None
     assert spec.finger_force is not None, "checked when the specification was made"
     force = estimate_force(spec.observation.force, hand, readings.taxel_force, readings.joint_torque)
-    wanted = wanted_force(spec.force_command, spec.finger_force, readings.command, force > 0)
+    wanted = target_force(readings.command, spec.finger_force)
     chosen = move_target(control, hand, target - reflex_target(hand, reflex), action, measured)
     angle = reflex_target(hand, move_reflex(control.reflex, period, reflex, wanted, force))
     # Within the policy's own limits; what they cut off does not wind up.

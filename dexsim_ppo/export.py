@@ -20,7 +20,7 @@ import numpy as np
 import tyro
 
 from dexsim.core import cli
-from dexsim.core.config import from_dict, to_dict
+from dexsim.core.config import to_dict
 from dexsim.core.errors import CheckpointError, ConfigError
 from dexsim.core.files import write_whole
 from dexsim.core.install import install_line
@@ -30,6 +30,7 @@ from dexsim_ppo.learner.types import Field
 from dexsim_ppo.policy import NEEDS_MEMORY, Policy, layout_to_list, load_policy
 from dexsim_ppo.policy_file import memory_to_list
 from dexsim_ppo.portable import FORMAT, UNIT, PortablePolicy
+from dexsim_ppo.retired import read_spec
 
 _OPSET = 17
 _KEY = "dexsim"  # of the header among the model's properties
@@ -198,7 +199,7 @@ def load_exported(path: str | Path) -> ExportedPolicy:
             task=str(header["task"]),
             observation_layout=tuple(Field(*field) for field in header["observation_layout"]),
             control_rate=float(header["control_rate"]),
-            spec=from_dict(TaskSpec, header["spec"]) if header.get("spec") else None,
+            spec=read_spec(header["spec"], path) if header.get("spec") else None,
             params=np.frombuffer(path.read_bytes(), np.uint8),
             function=function,
             memory=_memory_size(header),

@@ -30,7 +30,7 @@ from dexsim_ppo.learner.networks import MLP, Layer, apply_mlp
 from dexsim_ppo.learner.running_stats import Normalizer, make_normalizer, normalize
 from dexsim_ppo.learner.types import Environment, Field, Fields
 from dexsim_ppo.policy_file import memory_to_list, read_network
-from dexsim_ppo.retired import migrate_config, old_spec
+from dexsim_ppo.retired import migrate_config, old_spec, read_spec
 
 if TYPE_CHECKING:
     from dexsim.env.env import Env
@@ -335,7 +335,7 @@ def _find(name: str | Path) -> Path:
 
 def _read_spec(file: checkpoint.Checkpoint, env_config: dict[str, Any]) -> TaskSpec | None:
     if file.content.get("spec"):
-        return from_dict(TaskSpec, file.content["spec"])
+        return read_spec(file.content["spec"], file.path)
     return old_spec(file.task, env_config) if file.task in ("grasp", "rotate") else None
 
 

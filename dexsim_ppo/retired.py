@@ -22,6 +22,7 @@ from dexsim.task_spec import TaskSpec, TurnSpec
 FIELDS: dict[str, str | None] = {
     "control.mode": None,
     "control.smoothing": None,
+    "force_command": None,
     "goal_dwell": None,
     "leash": "drop_radius",
     "objects.bare_friction": "objects.link_friction",
@@ -61,6 +62,7 @@ VALUES: dict[str, dict[Any, Any]] = {
 UNCHANGED: dict[str, Any] = {
     "control.mode": "delta",
     "control.smoothing": 0.4,
+    "force_command": "finger",
     "goal_dwell": 0.0,
     "physics.condim": 3,
     "physics.cone": "elliptic",
@@ -75,6 +77,9 @@ UNCHANGED: dict[str, Any] = {
 INACTIVE: dict[str, tuple[str, Any]] = {"sensing.array": ("scale", 0.0)}
 """Groups of fields that had no effect while this one of them had this value: dropped, and not reported."""
 
+SPEC: dict[str, str | None] = {"force_command": None}
+"""Fields of a task's specification, likewise."""
+
 ARGUMENTS: dict[str, str | None] = {"corners": "extremes"}
 """Options of a training run, likewise; those under `env` are in `FIELDS`."""
 
@@ -86,6 +91,9 @@ LEAVES: dict[str, str | None] = {
     ".env_state.draw": ".env_state.episode.hand",
     ".env_state.goal.dwell": None,
     ".env_state.metrics['reward/fingertips']": None,
+    ".env_state.metrics['squeeze_force']": None,
+    ".env_state.metrics['squeeze_normal']": None,
+    ".env_state.metrics['squeeze_taxels']": None,
     ".env_state.object_velocity": None,
     ".env_state.orientation_sensor": ".env_state.episode.imu",
     ".env_state.sample": ".env_state.sensor_input",
@@ -121,6 +129,15 @@ def _leaf_path(path: str) -> str | None:
         if path == old or path.startswith((f"{old}.", f"{old}[")):
             return None if new is None else new + path.removeprefix(old)
     return path
+
+
+def read_spec(spec: dict[str, Any], where: Any) -> TaskSpec:
+    """A task's specification from the file `where`.
+
+    Raises:
+      ConfigError: it is not one.
+    """
+    return from_dict(TaskSpec, _migrate(spec, SPEC, where))
 
 
 def old_spec(task: str, config: dict[str, Any]) -> TaskSpec:
@@ -190,7 +207,7 @@ def _migrate(config: dict[str, Any], fields: dict[str, str | None], where: Any, 
     for path, values in VALUES.items():
         *groups, name = (prefix + path).split(".")
         group = _group(config, groups)
-        if group is not None and (value := group.get(name)) in values:
+        if group is not None and isinstance(value := group.get(name), str) and value in values:
             group[name] = values[value]
             changes.append(f"{path} = {value!r} is now {values[value]!r}")
     if changes:

@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 
 from dexsim.control import Control, closing, reflex_target
 from dexsim.core.errors import ConfigError
-from dexsim.grip_reflex import GripReflex, move_reflex, wanted_force
+from dexsim.force_loop import target_force
+from dexsim.grip_reflex import GripReflex, move_reflex
 from dexsim.task_spec import TaskSpec, next_target
 
 SPAN, PERIOD = (2.0, 7.0), 0.03
@@ -38,16 +39,10 @@ def test_a_finger_in_the_air_loses_its_angle_and_does_not_close_on_nothing():
 @given(FORCES, st.floats(-0.3, 0.3), st.floats(0.001, 1.0), st.floats(0.01, 5.0), st.floats(0, 1.5))
 def test_its_limits_hold_whatever_is_measured(force, start, gain, slew, command):
     reflex = GripReflex(gain=gain, limit=0.3, slew=slew)
-    wanted = wanted_force("finger", SPAN, jnp.asarray(command), jnp.ones(5, bool))
+    wanted = target_force(jnp.asarray(command), SPAN)
     angle = jnp.full(5, start).at[0].set(0.0)
     after = np.asarray(move_reflex(reflex, PERIOD, angle, wanted, jnp.asarray(force)))
     assert np.all(np.abs(after) <= 0.3 + 1e-6) and np.all(np.abs(after - angle) <= slew * PERIOD + 1e-6)
-
-
-@pytest.mark.parametrize(("force_command", "wanted"), [("finger", 4.5), ("squeeze", 1.5)])
-def test_a_squeeze_is_shared_among_the_fingers_that_touch(force_command, wanted):
-    touching = jnp.array([True, True, False, True, True])
-    assert float(wanted_force(force_command, SPAN, jnp.asarray(0.5), touching)) == pytest.approx(wanted)
 
 
 def test_closing_brings_every_fingertip_nearer_to_what_is_grasped(hand):

@@ -6,13 +6,13 @@ import warnings
 import pytest
 
 from dexsim.core.config import from_dict, to_dict
-from dexsim.core.errors import CheckpointError, OldFileWarning
+from dexsim.core.errors import CheckpointError, ConfigError, OldFileWarning
 from dexsim.task_spec import TaskSpec
 from dexsim.tasks.grasp.config import GraspConfig
 from dexsim.tasks.grasp.task import Grasp
 from dexsim.tasks.rotate.config import RotateConfig
 from dexsim.tasks.rotate.task import Rotate
-from dexsim_ppo.retired import migrate_arguments, migrate_config, migrate_leaves, old_spec
+from dexsim_ppo.retired import migrate_arguments, migrate_config, migrate_leaves, old_spec, read_spec
 
 ARRAY = {
     "scale": 0.0,
@@ -75,6 +75,21 @@ def test_a_physics_that_is_gone_is_named():
     ):
         assert words in message
     assert "condim" not in message and config.skin.total == "pressing"
+
+
+def test_a_command_of_the_sum_over_the_fingers_is_named_and_one_of_each_finger_is_not(hand):
+    """The choice between them is gone from configurations and specifications."""
+    config = GraspConfig()
+    spec = TaskSpec.of(Grasp(config, hand))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert from_dict(GraspConfig, migrate_config(to_dict(config) | {"force_command": "finger"}, "a file")) == config
+        assert read_spec(to_dict(spec) | {"force_command": "finger"}, "a file") == spec
+    with pytest.warns(OldFileWarning, match="a file: .*force_command = 'squeeze' dropped"):
+        read_spec(to_dict(spec) | {"force_command": "squeeze"}, "a file")
+    for forged in (3, [], {"skin": {"total": []}}):
+        with pytest.raises(ConfigError):
+            read_spec(forged, "a file")
 
 
 def test_arguments_of_a_run_hold_the_same_fields():

@@ -5,7 +5,7 @@ import dataclasses
 from dexsim.control import Control
 from dexsim.core.config import check_ranges, setting, validate
 from dexsim.env.config import EnvConfig
-from dexsim.force_loop import FORCE_COMMANDS, ForceLoop
+from dexsim.force_loop import ForceLoop
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -58,11 +58,8 @@ class GraspConfig(EnvConfig):
     """Training episode length. Force is scored from 3 s on, so it must be longer than that."""
     evaluation_seconds: float = setting(8.0, unit="s", low=0.2, high=3600.0)
     """Evaluation episode length; the object must be held this long."""
-    force_command: str = setting("finger", choices=FORCE_COMMANDS)
-    """What the command speaks of. finger: the force of each touching finger but the thumb (the paper); squeeze: the sum
-    over these fingers."""
     finger_force: tuple[float, float] = setting((1.2, 4.8), unit="N", low=0.05, high=40.0)
-    """Target of what `force_command` names, at command 0 and 1: what the thumb can oppose with four fingers."""
+    """Target of each touching finger but the thumb, at command 0 and 1: what the thumb can oppose with four fingers."""
     max_force: float = setting(6.9, unit="N", low=0.5, high=200.0)
     """Force that forces are normalised by."""
     force_per_torque: float = setting(19.0, unit="N/Nm", low=1.0, high=200.0)

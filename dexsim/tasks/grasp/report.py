@@ -8,7 +8,7 @@ from dexsim.objects.config import KINDS
 SETTLE = 3.0  # s after release from which forces count
 FORCES = {"r_resultant": "force", "r_normal": "normal", "r_taxels": "taxels"}
 """Correlations with the command, and what of the contact force each takes: all of it with friction, what of it presses
-into the skin, and what of that the taxels bear. The metric is the force command's name, `_` and this."""
+into the skin, and what of that the taxels bear. The metric is `finger_` and this."""
 _MEANS = "total_force", "total_torque", "taxel_force", "thumb_force", "touching", "torque_limited"
 
 
@@ -21,7 +21,6 @@ def summarize(
     metrics: dict[str, np.ndarray],
     alive: np.ndarray,
     control_period: float,
-    force_command: str,
     span: tuple[float, float],
     shapes: tuple[str, ...] = KINDS,
 ) -> dict:
@@ -31,15 +30,14 @@ def summarize(
       metrics: [T, N] per tick and episode, as the environment returns them.
       alive: [T, N] bool, False after the object was lost.
       control_period: s.
-      force_command: what the command speaks of, of `dexsim.force_loop.FORCE_COMMANDS`.
-      span: N, its target at command 0 and 1.
+      span: N, a finger's target at command 0 and 1.
       shapes: names of what the metric "shape" counts.
 
     Returns:
       A JSON-able dict. Forces are averaged over the ticks of "window_s": from 3 s after release (from the middle of
       shorter episodes) to the end, for episodes held to the end. "finger_..." are means over the touching fingers but
-      the thumb, "squeeze_..." sums over them; "force_command" says which one the command speaks of;
-      "total_force" is the solver's force summed over all fingers, "taxel_force" that sum as the taxels feel it.
+      the thumb, of which the command speaks; "total_force" is the solver's force summed over all fingers,
+      "taxel_force" that sum as the taxels feel it.
       "r_resultant", "r_normal" and "r_taxels" correlate command and commanded force, see `FORCES`.
       "total_torque" is the sum over touching fingers of the root joint's torque as a share of its limit; "r_torque"
       correlates it with the command. "slope_torque" and "slope_force_n" are least-squares slopes over the command, of
@@ -52,13 +50,13 @@ def summarize(
     held = alive[-1]
     late = slice(min(round(SETTLE / control_period), ticks // 2), None)
     command, shape = metrics["command"][0], metrics["shape"][0].astype(int)
-    forces = {part: f"{force_command}_{part}" for part in FORCES.values()}
+    forces = {part: f"finger_{part}" for part in FORCES.values()}
     # Of each episode [N], the mean over its late ticks.
     mean_of = {name: np.where(alive, metrics[name], 0.0)[late].mean(0) for name in (*forces.values(), *_MEANS)}
     wanted = span[0] + command * (span[1] - span[0])
     commanded = {part: mean_of[name] for part, name in forces.items()}
     returns = np.where(alive, metrics["reward"], 0.0).sum(0) if "reward" in metrics else metrics["return"].max(0)
-    by_command = [_command_row(level, command, held, wanted, mean_of, force_command) for level in np.unique(command)]
+    by_command = [_command_row(level, command, held, wanted, mean_of) for level in np.unique(command)]
     by_shape = [
         _shape_row(shapes[index], shape == index, command, held, wanted, commanded) for index in np.unique(shape)
     ]
@@ -71,7 +69,6 @@ def summarize(
         "held": proportion(held),
         "hold_time_s": mean(alive.sum(0) * control_period),
         "return": mean(returns),
-        "force_command": force_command,
         **correlations(command, held, commanded),
         "r_torque": pearson(command[held], mean_of["total_torque"][held]),
         "slope_force_n": slope(command[held], commanded["force"][held]),
@@ -80,7 +77,7 @@ def summarize(
         "torque_limited": mean(mean_of["torque_limited"][held]),
         "force_range": float(means[-1] / means[0]) if complete and len(means) > 1 and means[0] > 0 else None,
         "total_force_monotone": bool(complete and np.all(np.diff(means) > 0)),
-        f"{force_command}_force_by_command_n": [row[f"{force_command}_force_n"]["mean"] for row in by_command],
+        "finger_force_by_command_n": [row["finger_force_n"]["mean"] for row in by_command],
         "total_force_by_command_n": means,
         "skin_correlation": _optional_pearson(metrics, alive),
         "joint_speed_rad_s": mean(metrics["joint_speed"].mean(0)),
@@ -97,7 +94,6 @@ def _command_row(
     held: np.ndarray,
     wanted: np.ndarray,
     mean_of: dict[str, np.ndarray],
-    force_command: str,
 ) -> dict:
     """The episodes at one command; arrays [N] are of all episodes."""
     mine = command == level
@@ -107,7 +103,7 @@ def _command_row(
         "episodes": int(mine.sum()),
         "held": proportion(held[mine]),
         "target_force_n": float(wanted[mine].mean()),
-        **{f"{n}_n": mean(mean_of[n][good]) for n in (f"{force_command}_{part}" for part in FORCES.values())},
+        **{f"{n}_n": mean(mean_of[n][good]) for n in (f"finger_{part}" for part in FORCES.values())},
         "total_force_n": mean(mean_of["total_force"][good]),
         "total_torque": mean(mean_of["total_torque"][good]),
         "taxel_force_n": mean(mean_of["taxel_force"][good]),

@@ -17,7 +17,7 @@ from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import pytree_dataclass
 from dexsim.env.state import Start
 from dexsim.env.task import GroundTruth
-from dexsim.force_loop import FORCE_COMMANDS, commanded_force
+from dexsim.force_loop import commanded_force, target_force
 from dexsim.geometry.vectors import length
 from dexsim.hand.kinematics import Hand, flexion_joints
 from dexsim.objects import params
@@ -39,11 +39,6 @@ class GraspGoal:
 
     command: jax.Array  # [] in [0, 1]
     fixed: jax.Array  # [] bool, the command never changes (evaluation)
-
-
-def target_force(command: jax.Array, span: tuple[float, float]) -> jax.Array:
-    """Force [] N that the hand should press with; `GraspConfig.force_command` says with which part of it."""
-    return span[0] + command * (span[1] - span[0])
 
 
 def tailed_gaussian(error: jax.Array, sigma: float, tail_sigma: float, tail: float) -> jax.Array:
@@ -172,31 +167,25 @@ class Grasp:
         contact = force > _CONTACT
         wanted = self.target_force(goal)
         torque = truth.joint_torque[self._roots]
-        pressed, share = force, wanted
-        if config.force_command == "squeeze":
-            # Each of the four answers for their sum, so more fingers earn more; the thumb opposes that sum.
-            squeeze = commanded_force(force, contact, config.force_command)
-            pressed = jnp.full_like(force, squeeze).at[0].set(force[0])
-            share = wanted / jnp.maximum(jnp.sum(contact[1:].astype(jnp.float32)), 1.0)
         fallen = dropped.astype(jnp.float32)
         held = 1.0 - fallen
         fingers = self._finger_joints
         terms = {
             "force": held
             * weights.force
-            * command_reward(pressed, wanted, contact, (0.01, 200.0), config.max_force, weights),
+            * command_reward(force, wanted, contact, (0.01, 200.0), config.max_force, weights),
             "torque": held
             * weights.torque
             * command_reward(
                 torque / self._max_torque,
-                share / config.force_per_torque / self._max_torque,
+                wanted / config.force_per_torque / self._max_torque,
                 contact & (torque >= 0.01),
                 (0.0, 1.0),
                 1.0,
                 weights,
             ),
             "alive": held * weights.alive,
-            "overload": held * weights.overload * overload(force[1:], share + weights.margin) / config.max_force,
+            "overload": held * weights.overload * overload(force[1:], wanted + weights.margin) / config.max_force,
             "spread": weights.spread * joint_spread(truth.joint_position[self._roots[1:]]),
             "outer": weights.outer * posture_distance(truth.joint_position[fingers], self._centre[fingers]),
             "action": weights.action * action_rate(truth.action, truth.last_action),
@@ -211,15 +200,11 @@ class Grasp:
         contact = force > _CONTACT
         pressing = jnp.sum(truth.touch.force, -1)
         parts = {"force": force, "normal": truth.normal_force, "taxels": pressing}
-        commanded = {
-            f"{what}_{name}": commanded_force(part, contact, what)
-            for what in FORCE_COMMANDS
-            for name, part in parts.items()
-        }
+        commanded = {f"finger_{name}": commanded_force(part, contact) for name, part in parts.items()}
         return {
             "success": held,
             "command": goal.command,
-            "force_error": jnp.abs(commanded[f"{self.config.force_command}_force"] - self.target_force(goal)),
+            "force_error": jnp.abs(commanded["finger_force"] - self.target_force(goal)),
             **commanded,
             "total_force": jnp.sum(force),
             "total_torque": jnp.sum(
@@ -254,4 +239,4 @@ class Grasp:
     def summarize(self, metrics: dict[str, np.ndarray], alive: np.ndarray, control_period: float) -> dict:
         """The report of an evaluation; see `dexsim.tasks.grasp.report`."""
         config = self.config
-        return summarize(metrics, alive, control_period, config.force_command, config.finger_force, self.shape_names)
+        return summarize(metrics, alive, control_period, config.finger_force, self.shape_names)

@@ -41,7 +41,6 @@ class Referee:
         self._counted, self._weight = 0, 0.0
         self._force, self._total, self._limited = np.zeros(5), 0.0, 0.0
         self._finger = dict.fromkeys(("force", "normal", "taxels"), 0.0)
-        self._squeeze = dict(self._finger)
         self._duty, self._speed = np.zeros(5), 0.0
         self.goals = None if task == "grasp" else {"task": GoalCount(GOAL_SPIN), "paper": GoalCount(math.inf)}
 
@@ -111,7 +110,6 @@ class Referee:
         if touching.any():
             for name, force in forces.items():
                 self._finger[name] += float(force[1:][touching].mean())
-                self._squeeze[name] += float(force[1:][touching].sum())
         self._force += strength
         self._total += float(strength.sum())
         self._counted += 1
@@ -121,8 +119,8 @@ class Referee:
 
         The forces of a grasp are those of `dexsim.tasks.grasp.report`, by the same names and over the same window:
         "finger_force" is the whole contact force of a touching finger, "finger_normal" what of it presses into the
-        skin, "finger_taxels" what of that the taxels bear, "squeeze_..." sums of these over the four;
-        "torque_limited" is the share of the window with a joint at its torque limit.
+        skin, "finger_taxels" what of that the taxels bear; "torque_limited" is the share of the window with a joint at
+        its torque limit.
         """
         lived, count = max(self.time, 1e-9), max(self._counted, 1)
         report: dict[str, Any] = {
@@ -137,7 +135,6 @@ class Referee:
                 "force": np.round(self._force / count, 4).tolist(),
                 "window_s": list(self.window),
                 **{f"finger_{name}": round(total / count, 4) for name, total in self._finger.items()},
-                **{f"squeeze_{name}": round(total / count, 4) for name, total in self._squeeze.items()},
                 "total_force": round(self._total / count, 4),
                 "torque_limited": round(self._limited / count, 4),
             }

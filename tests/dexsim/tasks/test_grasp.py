@@ -14,6 +14,7 @@ import pytest
 import dexsim
 from dexsim.core.errors import ConfigError
 from dexsim.env.task import GroundTruth
+from dexsim.force_loop import target_force
 from dexsim.hand.kinematics import forward_kinematics
 from dexsim.objects.config import SHAPES, ObjectConfig
 from dexsim.physics.config import PhysicsConfig
@@ -27,7 +28,6 @@ from dexsim.tasks.grasp.task import (
     joint_spread,
     posture_distance,
     tailed_gaussian,
-    target_force,
 )
 from dexsim.tasks.terms import action_rate, joint_speed
 from dexsim.touch.feel import Touch
@@ -209,7 +209,6 @@ class TestReward:
             "finger_force": 5.0,
             "finger_normal": 4.5,
             "finger_taxels": 4.0,
-            "squeeze_force": 5.0,
             "force_error": 1.0,
             "total_force": 7.005,
             "total_torque": 0.11 / 1.1 + 0.33 / 1.1,
@@ -239,37 +238,6 @@ class TestReward:
         assert float(lost["success"]) == 0.0
         penalties = sum(float(lost[f"reward/{n}"]) for n in ("spread", "outer", "action", "velocity"))
         assert float(reward) == pytest.approx(-20.0 + penalties)
-
-    def test_a_squeeze_is_rewarded_by_its_sum_for_each_finger_that_helps(self, hand, make_config=CONFIG):
-        task = Grasp(dataclasses.replace(make_config, force_command="squeeze", finger_force=(2.0, 14.0)), hand)
-        force = np.zeros((5, 3))
-        force[:, 1] = 9.0, 5.0, 2.0, 0.0, 0.0
-        _, metrics = task.reward(goal_of(0.5), make_moment(hand, finger_force=force), jnp.zeros((), bool))
-        weights, scale = task.config.reward, task.config.max_force
-
-        def match(error, narrow):
-            tail = math.exp(-0.5 * (error / scale / weights.tail_sigma) ** 2)
-            return (
-                tail
-                if narrow is None
-                else (1 - weights.tail) * math.exp(-0.5 * (error / scale / narrow) ** 2) + weights.tail * tail
-            )
-
-        wanted = weights.force * (2 * match(7.0 - 8.0, weights.sigma) + match(9.0 - 8.0, None)) / 5
-        assert float(metrics["reward/force"]) == pytest.approx(wanted, rel=1e-5)
-        assert float(metrics["force_error"]) == pytest.approx(1.0) and float(metrics["squeeze_force"]) == 7.0
-
-    def test_the_fingers_of_a_squeeze_share_its_torque_and_its_overload(self, hand):
-        """Two of the four touch: each is to pull half of it, and may press half and the margin."""
-        task = Grasp(dataclasses.replace(CONFIG, force_command="squeeze", finger_force=(2.0, 14.0)), hand)
-        force, torque = np.zeros((5, 3)), np.zeros(12)
-        force[:, 1] = 9.0, 5.0, 2.0, 0.0, 0.0
-        torque[hand.root_joint] = 4.0 / 19  # half of 8 N
-        truth = make_moment(hand, finger_force=force, joint_torque=torque)
-        _, metrics = task.reward(goal_of(0.5), truth, jnp.zeros((), bool))
-        assert float(metrics["reward/torque"]) == pytest.approx(0.2 * 3 / 5, rel=1e-4), "thumb, index and middle"
-        assert float(metrics["reward/overload"]) == pytest.approx(-2.0 * (5.0 - 4.0 - 0.4) / 10, rel=1e-4)
-        assert float(metrics["squeeze_force"]) == 7.0 and float(metrics["finger_force"]) == 3.5
 
     def test_overload_counts_the_four_fingers_and_only_above(self, hand, task):
         force = np.zeros((5, 3))

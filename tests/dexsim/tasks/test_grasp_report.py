@@ -113,7 +113,7 @@ class TestSummary:
         )
 
     def test_a_perfect_follower(self):
-        found = report.summarize(*evaluation(noise=1e-3), PERIOD, "finger", SPAN)
+        found = report.summarize(*evaluation(noise=1e-3), PERIOD, SPAN)
         assert found["episodes"] == 200 and found["seconds"] == pytest.approx(6.0)
         assert found["held"]["mean"] == 1.0 and found["hold_time_s"]["mean"] == pytest.approx(6.0)
         assert found["r_resultant"]["r"] > 0.9999 and found["force_error_n"]["mean"] < 2e-3
@@ -124,7 +124,7 @@ class TestSummary:
 
     def test_only_settled_ticks_count(self):
         """The force before 3 s is 99 N; none of it may enter a mean."""
-        found = report.summarize(*evaluation(), PERIOD, "finger", SPAN)
+        found = report.summarize(*evaluation(), PERIOD, SPAN)
         wanted = [1.0, 2.0, 3.0, 4.0, 5.0]
         assert found["finger_force_by_command_n"] == pytest.approx(wanted)
         assert found["total_force_by_command_n"] == pytest.approx([3 * w for w in wanted])
@@ -136,7 +136,7 @@ class TestSummary:
 
     def test_short_episodes_count_from_the_middle(self):
         metrics, alive = evaluation(ticks=40)  # 4 s: the middle is tick 20, where it is still 99 N
-        found = report.summarize(metrics, alive, PERIOD, "finger", SPAN)
+        found = report.summarize(metrics, alive, PERIOD, SPAN)
         assert found["finger_force_by_command_n"][0] == pytest.approx((10 * 99 + 10 * 1) / 20)
 
     def test_lost_episodes(self):
@@ -144,7 +144,7 @@ class TestSummary:
         metrics, alive = evaluation(lost=range(0, 200, 4))
         for name in ("finger_force", "total_force", "taxel_force"):
             metrics[name][:, ::4] = 1e6
-        found = report.summarize(metrics, alive, PERIOD, "finger", SPAN)
+        found = report.summarize(metrics, alive, PERIOD, SPAN)
         assert found["held"]["mean"] == 0.75
         assert found["hold_time_s"]["mean"] == pytest.approx(0.75 * 6 + 0.25 * 2)
         assert found["return"]["mean"] == pytest.approx(0.25 * (0.75 * 60 + 0.25 * 20))
@@ -157,7 +157,7 @@ class TestSummary:
         worst = metrics["shape"][0] == 3
         rng = np.random.default_rng(5)
         metrics["finger_force"][:, worst] = rng.uniform(1, 5, worst.sum())
-        found = report.summarize(metrics, alive, PERIOD, "finger", SPAN)
+        found = report.summarize(metrics, alive, PERIOD, SPAN)
         by_name = {row["shape"]: row["r_resultant"]["r"] for row in found["by_shape"]}
         assert list(by_name) == list(SHAPES)
         assert all(r > 0.99 for name, r in by_name.items() if name != SHAPES[3])
@@ -171,7 +171,7 @@ class TestSummary:
         rng = np.random.default_rng(7)
         worst = metrics["shape"][0] == 2
         metrics["finger_taxels"][:, worst] = rng.uniform(1, 5, worst.sum())
-        found = report.summarize(metrics, alive, PERIOD, "finger", SPAN)
+        found = report.summarize(metrics, alive, PERIOD, SPAN)
         assert found["window_s"] == pytest.approx([3.0, 6.0])
         late = {name: metrics[name][30:].mean(0) for name in ("finger_force", "finger_normal", "finger_taxels")}
         for name, metric in (("resultant", "force"), ("normal", "normal"), ("taxels", "taxels")):
@@ -183,7 +183,7 @@ class TestSummary:
         assert headline["r, force on the taxels, worst shape"] == found["by_shape"][2]["r_taxels"]["r"] < 0.5
 
     def test_the_headline_repeats_the_report(self):
-        found = report.summarize(*evaluation(noise=0.3, lost=range(40, 50)), PERIOD, "finger", SPAN)
+        found = report.summarize(*evaluation(noise=0.3, lost=range(40, 50)), PERIOD, SPAN)
         headline = found["headline"]
         assert headline["held"]["value"] == found["held"]["mean"] == 0.95
         assert headline["held at worst command"] == found["by_command"][1]["held"]["mean"] == 0.75
@@ -199,7 +199,7 @@ class TestSummary:
         assert marks == [True, True, False, False, False]
 
     def test_commands_that_saturate_are_marked(self):
-        found = report.summarize(*evaluation(), PERIOD, "finger", SPAN)
+        found = report.summarize(*evaluation(), PERIOD, SPAN)
         assert [row["torque_limited"]["mean"] for row in found["by_command"]] == [0, 0, 0, 0, 1]
         assert [row["saturates"] for row in found["by_command"]] == [False] * 4 + [True]
         assert found["torque_limited"]["mean"] == found["headline"]["ticks with a joint at its torque limit"]["value"]
@@ -208,44 +208,35 @@ class TestSummary:
     def test_dropping_objects_does_not_lower_the_force_error(self):
         """Whoever loses everything is off by the whole target: sqrt(mean of 1, 4, 9, 16, 25) N."""
         metrics, alive = evaluation(lost=range(200))
-        found = report.summarize(metrics, alive, PERIOD, "finger", SPAN)
+        found = report.summarize(metrics, alive, PERIOD, SPAN)
         assert found["force_error_n"]["mean"] == pytest.approx(np.sqrt(11))
-        good = report.summarize(*evaluation(), PERIOD, "finger", SPAN)["force_error_n"]["mean"]
-        some = report.summarize(*evaluation(lost=range(0, 200, 4)), PERIOD, "finger", SPAN)["force_error_n"]["mean"]
+        good = report.summarize(*evaluation(), PERIOD, SPAN)["force_error_n"]["mean"]
+        some = report.summarize(*evaluation(lost=range(0, 200, 4)), PERIOD, SPAN)["force_error_n"]["mean"]
         assert good < 1e-9 and some == pytest.approx(np.sqrt(11 / 4))
 
     def test_a_dip_is_not_monotone(self):
         metrics, alive = evaluation()
         metrics["total_force"][:, metrics["command"][0] == 0.75] = 8.9  # between 9 and 15
-        found = report.summarize(metrics, alive, PERIOD, "finger", SPAN)
+        found = report.summarize(metrics, alive, PERIOD, SPAN)
         assert found["total_force_monotone"] is False
         assert found["force_range"] == pytest.approx(5.0)
 
     def test_a_flat_force_is_not_monotone(self):
-        found = report.summarize(*evaluation(slope=0.0), PERIOD, "finger", SPAN)
+        found = report.summarize(*evaluation(slope=0.0), PERIOD, SPAN)
         assert found["total_force_monotone"] is False
         assert found["force_range"] == pytest.approx(1.0)
         assert found["r_resultant"]["r"] is None
 
-    def test_a_command_of_the_squeeze_is_judged_by_the_squeeze(self):
-        metrics, alive = evaluation()
-        metrics |= {f"squeeze_{part}": 2.5 * metrics[f"finger_{part}"] for part in ("force", "normal", "taxels")}
-        found = report.summarize(metrics, alive, PERIOD, "squeeze", (2.5, 12.5))
-        assert found["force_command"] == "squeeze" and found["force_error_n"]["mean"] == pytest.approx(0.0, abs=1e-9)
-        assert found["squeeze_force_by_command_n"] == pytest.approx([2.5, 5.0, 7.5, 10.0, 12.5])
-        assert found["slope_force_n"]["mean"] == pytest.approx(10.0)
-        assert "finger_force_n" not in found["by_command"][0]
-
     def test_a_command_without_held_episodes(self):
         metrics, alive = evaluation(lost=range(40, 80))  # all of command 0.25
-        found = report.summarize(metrics, alive, PERIOD, "finger", SPAN)
+        found = report.summarize(metrics, alive, PERIOD, SPAN)
         assert found["by_command"][1]["held"]["mean"] == 0.0
         assert found["finger_force_by_command_n"][1] is None
         assert found["total_force_monotone"] is False and found["force_range"] is None
         assert found["headline"]["held at worst command"] == 0.0
 
     def test_nothing_held(self):
-        found = report.summarize(*evaluation(lost=range(200)), PERIOD, "finger", SPAN)
+        found = report.summarize(*evaluation(lost=range(200)), PERIOD, SPAN)
         assert found["held"]["mean"] == 0.0 and 0 < found["held"]["high"] < 0.03
         assert found["hold_time_s"]["mean"] == pytest.approx(2.0)
         assert found["r_resultant"]["r"] is None
@@ -255,7 +246,7 @@ class TestSummary:
     def test_diverged_worlds_are_counted(self):
         metrics, alive = evaluation()
         metrics["non_finite"][7, 3] = metrics["non_finite"][9, 5] = 1.0
-        assert report.summarize(metrics, alive, PERIOD, "finger", SPAN)["non_finite"] == 2
+        assert report.summarize(metrics, alive, PERIOD, SPAN)["non_finite"] == 2
 
     def test_skin_correlation_counts_only_what_lives_and_touches(self):
         metrics, alive = evaluation(noise=0.5, lost=range(0, 200, 4), settle_force=2.0)
@@ -263,20 +254,20 @@ class TestSummary:
         metrics["total_force"] += np.random.default_rng(1).uniform(0, 2, alive.shape)  # borne by skin without taxels
         metrics["skin_force"][20:, ::4] = -1e3
         metrics["total_force"][:5], metrics["skin_force"][:5] = 0.0, 50.0
-        found = report.summarize(metrics, alive, PERIOD, "finger", SPAN)
+        found = report.summarize(metrics, alive, PERIOD, SPAN)
         assert found["skin_correlation"]["r"] == pytest.approx(1.0)
         del metrics["skin_force"]
-        assert report.summarize(metrics, alive, PERIOD, "finger", SPAN)["skin_correlation"] is None
+        assert report.summarize(metrics, alive, PERIOD, SPAN)["skin_correlation"] is None
 
     @pytest.mark.parametrize("lost", [(), range(40, 80), range(200)])
     def test_goes_through_json(self, lost):
-        found = report.summarize(*evaluation(lost=lost), PERIOD, "finger", SPAN)
+        found = report.summarize(*evaluation(lost=lost), PERIOD, SPAN)
         assert json.loads(json.dumps(found, allow_nan=False)) == found
 
 
 class TestTorque:
     def test_slopes_and_range(self):
-        found = report.summarize(*evaluation(), PERIOD, "finger", SPAN)
+        found = report.summarize(*evaluation(), PERIOD, SPAN)
         assert found["slope_force_n"]["mean"] == pytest.approx(4.0) and found["slope_torque"]["mean"] == pytest.approx(
             0.8
         )
@@ -296,5 +287,5 @@ class TestTorque:
 
     def test_names_of_other_shapes(self):
         names = tuple(f"object {k}" for k in range(5))
-        found = report.summarize(*evaluation(), PERIOD, "finger", SPAN, names)
+        found = report.summarize(*evaluation(), PERIOD, SPAN, names)
         assert [row["shape"] for row in found["by_shape"]] == list(names)

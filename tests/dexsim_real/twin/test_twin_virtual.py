@@ -209,7 +209,7 @@ def test_metrics_of_grasps_count_only_what_was_held(benchmark):
         for c in (0.0, 0.5, 1.0)
         for shape, held in (("box", True), ("sphere", c < 1))
     ]
-    metrics = benchmark.grasp_metrics(reports, (2.0, 7.0), "finger")
+    metrics = benchmark.grasp_metrics(reports, (2.0, 7.0))
     assert metrics["held"]["mean"] == pytest.approx(5 / 6)
     assert metrics["r_resultant"]["r"] == pytest.approx(1.0) and metrics["r_taxels"]["r"] == pytest.approx(-1.0)
     command = np.array([0.0, 0.0, 0.5, 0.5, 1.0])
@@ -239,9 +239,8 @@ def test_measured_torque_is_of_touching_fingers_in_the_window(benchmark, hand):
 
 def test_both_worlds_name_forces_alike(benchmark):
     """What the referee reports is what the task's report reduces, name by name."""
-    from dexsim.force_loop import FORCE_COMMANDS
     from dexsim.tasks.grasp.report import FORCES, window
 
     judge = Referee("grasp")
-    assert {f"{what}_{part}" for what in FORCE_COMMANDS for part in FORCES.values()} <= judge.report().keys()
+    assert {f"finger_{part}" for part in FORCES.values()} <= judge.report().keys()
     assert judge.window == window(judge.limit) == (3.0, 8.0)
