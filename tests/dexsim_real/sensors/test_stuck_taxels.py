@@ -92,7 +92,9 @@ def test_a_taxel_that_gets_stuck_is_masked_within_a_third_of_a_second(sensing):
     assert force[0] > 10 and force[3] < 10
 
 
-@pytest.mark.parametrize("what", ["a press", "a changing load", "a load that eases a count at a time", "below the limit", "for a moment"])
+@pytest.mark.parametrize(
+    "what", ["a press", "a changing load", "a load that eases a count at a time", "below the limit", "for a moment"]
+)
 def test_what_is_not_stuck_is_not_masked(sensing, what):
     blocks = []
     for k in range(60):
