@@ -118,23 +118,26 @@ def collect(
 
     begin, keys = Remembering(state, memory), jax.random.split(key, length)
     end, (rollout, step_metrics) = scan_restarting(cast(Any, Restarting(env)), step, begin, keys, mesh)
-    # Sums are taken outside the scan: inside it each would reduce few numbers, which is slow on GPUs.
     finite, done = jnp.isfinite(rollout.reward), rollout.terminated | rollout.truncated
     rollout = dataclasses.replace(rollout, reward=jnp.where(finite, rollout.reward, 0.0))
-    episodes, steps = jnp.sum(done, dtype=jnp.float32), done.size
+    counted = {"reward": rollout.reward, "ended": done, "terminated": rollout.terminated, "nonfinite": ~finite}
+    # Sums are taken outside the scan: inside it each would reduce few numbers, which is slow on GPUs. One product gives
+    # all of them, so that several processes exchange one array.
+    values = jnp.stack([v.astype(jnp.float32) for v in (*counted.values(), *step_metrics.values())])
+    masks = jnp.stack([jnp.ones_like(done), done]).astype(jnp.float32)
+    sums, ended_sums = jnp.einsum(
+        "ktb,mtb->km", masks, jnp.where(jnp.isfinite(values), values, 0.0), precision="highest"
+    )
+    total = dict(zip(counted, sums[: len(counted)], strict=True))
     metrics = {
-        "reward": jnp.mean(rollout.reward),
-        "episodes": episodes,
-        "terminated_share": jnp.sum(rollout.terminated, dtype=jnp.float32) / episodes,
-        "nonfinite_rewards": jnp.sum(~finite, dtype=jnp.float32),
+        "reward": total["reward"] / done.size,
+        "episodes": total["ended"],
+        "terminated_share": total["terminated"] / total["ended"],
+        "nonfinite_rewards": total["nonfinite"],
         "repeated_starts": _repeated(done),
     }
-    if step_metrics:
-        # One array, so that several processes exchange one message instead of many.
-        values = jnp.stack([v.astype(jnp.float32) for v in step_metrics.values()])
-        for name, total, mask in (("step", steps, jnp.ones_like(done)), ("episode", episodes, done)):
-            means = jnp.sum(jnp.where(mask[None] & jnp.isfinite(values), values, 0.0), (1, 2)) / total
-            metrics |= {f"{name}/{k}": mean for k, mean in zip(step_metrics, means, strict=True)}
+    for name, of, count in (("step", sums, done.size), ("episode", ended_sums, total["ended"])):
+        metrics |= {f"{name}/{k}": v / count for k, v in zip(step_metrics, of[len(counted) :], strict=True)}
     return (end.state, end.memory), rollout, metrics
 
 
