@@ -29,8 +29,8 @@ class Preset:
     """Share of training episodes whose hand or object takes the extreme of every range."""
 
 
-# Two cores: simulation takes nearly all of the time, so small networks, many passes over little data, and large steps: a
-# KL target of 0.02 learns to follow the command half as fast.
+# Two cores: simulation takes nearly all of the time, so small networks, many passes over little data, and large steps:
+# a KL target of 0.02 learns to follow the command half as fast.
 _CPU = Preset(
     ppo=PPOConfig(
         num_envs=256,
