@@ -149,6 +149,7 @@ def grasp_metrics(reports: list[dict[str, Any]], span: tuple[float, float]) -> d
       span: N, target at command 0 and 1.
     """
     from dexsim.core.statistics import mean, proportion
+    from dexsim.force_loop import target_force
     from dexsim.tasks.grasp.report import FORCES, correlations, force_error, pearson, saturates, slope
 
     held = np.array([r["held"] for r in reports])
@@ -161,7 +162,7 @@ def grasp_metrics(reports: list[dict[str, Any]], span: tuple[float, float]) -> d
     # A referee's means end with the trial; a lost object is not pressed for the rest of the window.
     start, end = np.array([r["window_s"] for r in reports], float).T
     lived = np.clip((np.array([r["seconds"] for r in reports], float) - start) / (end - start), 0.0, 1.0)
-    wanted = span[0] + command * (span[1] - span[0])
+    wanted = target_force(command, span)
     by_command = [
         {"command": float(c), "held": proportion(held[command == c])}
         | {name: mean(mean_of[name][held & (command == c)]) for name in names}

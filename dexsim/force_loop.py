@@ -5,11 +5,15 @@ sees the corrected command. Simulation and bridge run this code.
 """
 
 import dataclasses
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from dexsim.core.config import setting, validate
+
+Array = TypeVar("Array", jax.Array, np.ndarray)
 
 # Of the command that a policy trained on [0, 1] is shown. Below 0 it lets go of weak grips.
 _LOW, _HIGH = 0.0, 1.5
@@ -30,7 +34,7 @@ class ForceLoop:
         validate(self)
 
 
-def target_force(command: jax.Array, span: tuple[float, float]) -> jax.Array:
+def target_force(command: Array, span: tuple[float, float]) -> Array:
     """Force [...] N that each touching finger but the thumb should press with, `span` at the commands 0 and 1."""
     return span[0] + command * (span[1] - span[0])
 

@@ -3,6 +3,7 @@
 import numpy as np
 
 from dexsim.core.statistics import bootstrap, entry, mean, proportion, statistic
+from dexsim.force_loop import target_force
 from dexsim.objects.config import KINDS
 
 SETTLE = 3.0  # s after release from which forces count
@@ -53,7 +54,7 @@ def summarize(
     forces = {part: f"finger_{part}" for part in FORCES.values()}
     # Of each episode [N], the mean over its late ticks.
     mean_of = {name: np.where(alive, metrics[name], 0.0)[late].mean(0) for name in (*forces.values(), *_MEANS)}
-    wanted = span[0] + command * (span[1] - span[0])
+    wanted = target_force(command, span)
     commanded = {part: mean_of[name] for part, name in forces.items()}
     returns = np.where(alive, metrics["reward"], 0.0).sum(0) if "reward" in metrics else metrics["return"].max(0)
     by_command = [_command_row(level, command, held, wanted, mean_of) for level in np.unique(command)]
