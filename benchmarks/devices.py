@@ -32,6 +32,7 @@ from dexsim.core.cli import enable_caches
 from dexsim.core.compilation import collector_paused, jit
 from dexsim.registry import find_task
 from dexsim_ppo.learner.adapter import adapt
+from dexsim_ppo.learner.apart import ApartStep
 from dexsim_ppo.learner.ppo import make_train
 from dexsim_ppo.learner.sharding import make_mesh
 from dexsim_ppo.training import processes
@@ -65,6 +66,7 @@ class Case:
             step = jit(jax.vmap(training.plain_step), backend=env.backend, donate_argnums=0)
         self.step = step.lower(shapes).compile()
         bytes_, counts = received(self.step.as_text())
+        iterations = 1 if isinstance(self.step, ApartStep) else options.iterations  # in the program
         self.row = {
             "devices": devices,
             "processes": jax.process_count(),
@@ -72,8 +74,8 @@ class Case:
             "backend": env.backend,
             "num_envs_per_device": each,
             "compile_s": round(time.perf_counter() - begin, 1),
-            "received_bytes": round(bytes_ / options.iterations),
-            "collectives": {name: round(count / options.iterations, 1) for name, count in counts.items()},
+            "received_bytes": round(bytes_ / iterations),
+            "collectives": {name: round(count / iterations, 1) for name, count in counts.items()},
         }
 
     def run(self) -> None:

@@ -48,11 +48,11 @@ def split(task: str, backend: str, num_envs: int, repeats: int) -> list[dict]:
     compiled = functools.partial(jit, backend=env.backend)
     whole = compiled(lambda state: ppo.train_iteration(env, config, state))
     ticks, actions = compiled(lambda state: record(recorder, config, state))(state)
-    rollout = compiled(lambda state: experience(env, config, state))(state)[1]
+    rollout = compiled(lambda state: ppo.experience(env, config, state))(state)[1]
     # What a part works on is an argument: as constants, XLA would fold it or hold it twice.
     cases: dict[str, tuple[Callable, tuple[Any, ...]]] = {
         "training step": (whole, (state,)),
-        "rollout": (compiled(lambda state: experience(env, config, state)), (state,)),
+        "rollout": (compiled(lambda state: ppo.experience(env, config, state)), (state,)),
         "environment": (compiled(lambda begin, actions: environment(env, begin, actions)), (state.env_state, actions)),
         "physics": (compiled(lambda ticks: physics(env, ticks)), (ticks,)),
         "touch": (compiled(lambda ticks, key: touch(env, ticks, key)), (ticks, jax.random.key(1))),
@@ -90,20 +90,13 @@ def rows(times: dict[str, list[float]], backend: str, config: PPOConfig):
         )
 
 
-def experience(env: Env, config: PPOConfig, state: TrainState) -> tuple[Any, Rollout, dict]:
-    """The first half of an iteration, exactly as it is."""
-    _, collect_key, _ = jax.random.split(state.key, 3)
-    normalizers = ppo.make_normalizers(env, config, state.observation_stats)
-    return ppo.collect_rollout(env, config, state, normalizers, collect_key)
-
-
 def record(env: Recorder, config: PPOConfig, state: TrainState) -> tuple[Any, jax.Array]:
     """The ticks [T, B] that physics gets under the policy, with what comes of them, and the actions."""
     normalizers = ppo.make_normalizers(env, config, state.observation_stats)
 
     def tick(env_state, key):
         mean = actor_mean(config, state.params, normalizers, env_state.obs)
-        action = sample(key, mean, state.params.log_std)
+        action = sample(jax.random.normal(key, mean.shape), mean, state.params.log_std)
         after, given = jax.vmap(env.recorded_step)(env_state, action)
         outcome = after.physics.qpos, after.finger_force
         return after, (*given, *outcome, action)

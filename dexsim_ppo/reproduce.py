@@ -89,7 +89,8 @@ def findings(env: Environment, config: PPOConfig, state: TrainState) -> Iterator
             yield f"before it: state{jax.tree_util.keystr(path)}, {count} of {leaf.size} numbers"
     normalizers = make_normalizers(env, config, state.observation_stats)
     collect_key = jax.random.split(state.key, 3)[1]
-    _, rollout, metrics = jax.jit(lambda state: collect_rollout(env, config, state, normalizers, collect_key))(state)
+    _, rollout, tally = jax.jit(lambda state: collect_rollout(env, config, state, normalizers, collect_key))(state)
+    metrics = tally.metrics()
     for group, fields in env.observation_layout.items():
         bad, start = ~np.isfinite(np.asarray(rollout.obs[group])), 0
         for field in fields:

@@ -13,10 +13,9 @@ import jax.numpy as jnp
 from dexsim.core.pytree import align
 
 
-def sample(key: jax.Array, mean: jax.Array, log_std: jax.Array) -> jax.Array:
-    """A random action [..., A], of the shape of `mean`."""
-    std, noise = jnp.exp(log_std), jax.random.normal(key, mean.shape)
-    return mean + align(std, mean) * noise
+def sample(noise: jax.Array, mean: jax.Array, log_std: jax.Array) -> jax.Array:
+    """A random action [..., A], from standard normal noise of its shape."""
+    return mean + align(jnp.exp(log_std), mean) * noise
 
 
 def log_prob(x: jax.Array, mean: jax.Array, log_std: jax.Array) -> jax.Array:

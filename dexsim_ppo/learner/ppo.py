@@ -4,6 +4,8 @@
 `step(state) -> (state, metrics)`. One step collects [T, B] experience, estimates advantages, and makes
 `epochs` passes over it in `minibatches` parts. `TrainState` holds everything that training depends on:
 saving and loading that one pytree resumes training exactly.
+
+The parts that follow are those of an iteration: `experience`, then `learn`. `apart` runs them as programs of their own.
 """
 
 import dataclasses
@@ -20,13 +22,14 @@ from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import pytree_dataclass
 from dexsim_ppo.learner import adam, distribution
 from dexsim_ppo.learner.adam import AdamState
+from dexsim_ppo.learner.apart import ENGINES, ApartStep, start_apart
 from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.curriculum import Curriculum, next_scale
 from dexsim_ppo.learner.gae import compute_gae, explained_variance
 from dexsim_ppo.learner.loss import Metrics, Samples, critic_value
 from dexsim_ppo.learner.memory import empty, init_memory, remember, state_size
 from dexsim_ppo.learner.networks import Params, apply_mlp, init_params, rescale_output
-from dexsim_ppo.learner.rollout import Decision, Rollout, bound_rewards, collect
+from dexsim_ppo.learner.rollout import Decision, Rollout, Tally, bound_rewards, collect
 from dexsim_ppo.learner.running_stats import (
     Normalizer,
     RunningStats,
@@ -37,13 +40,16 @@ from dexsim_ppo.learner.running_stats import (
     value_std,
 )
 from dexsim_ppo.learner.sharding import (
+    Part,
     batched,
     block_count,
     copied,
     in_blocks,
+    of_part,
     sequences_in_blocks,
     shardings,
     start_on,
+    whole_shape,
 )
 from dexsim_ppo.learner.types import CurriculumEnvironment, Environment, layout_size
 from dexsim_ppo.learner.update import Learner, update
@@ -108,8 +114,27 @@ def make_train(
             lambda x, where: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=where), found, shardings(found, mesh)
         )
 
+    compiled_step: Callable = jit(step, backend=env.backend, donate_argnums=0)
     if mesh is None:
         compiled_init = jit(init, once=True)
+    elif env.backend in ENGINES:
+        compiled_init = start_apart(
+            mesh,
+            lambda key: strong_types(init_learner(env, config, key, curriculum)),
+            lambda key, part: strong_types(
+                (
+                    init_environments(env, config, key, curriculum, part=part),
+                    init_memories(env, config, config.num_envs // part.total),
+                )
+            ),
+        )
+        compiled_step = ApartStep(
+            lambda state, part: strong_types(experience(env, config, state, part=part)),
+            lambda state, rollout, tally: strong_types(learn(env, config, state, rollout, tally, curriculum, mesh)),
+            mesh,
+            config.iterations_per_call,
+            env.backend,
+        )
     else:
         compiled_init = start_on(mesh, init, shapes)
     # Leaves may share a buffer (actor and critic may observe the same array), and no buffer can be donated
@@ -118,7 +143,7 @@ def make_train(
         init=lambda key: jax.tree.map(jnp.copy, compiled_init(key)),
         shapes=shapes,
         plain_step=step,
-        step=jit(step, backend=env.backend, donate_argnums=0),
+        step=compiled_step,
     )
 
 
@@ -130,7 +155,18 @@ def init_state(
     mesh: Mesh | None = None,
 ) -> TrainState:
     """A fresh learner, and freshly reset environments with staggered clocks."""
-    params_key, reset_key, stagger_key, key = jax.random.split(key, 4)
+    return dataclasses.replace(
+        init_learner(env, config, key, curriculum),
+        env_state=init_environments(env, config, key, curriculum, mesh),
+        memory=init_memories(env, config, config.num_envs),
+    )
+
+
+def init_learner(
+    env: Environment, config: PPOConfig, key: jax.Array, curriculum: Curriculum | None = None
+) -> TrainState:
+    """The state of a fresh learner, without environments."""
+    params_key, _, _, key = jax.random.split(key, 4)
     sizes = {group: layout_size(fields) for group, fields in env.observation_layout.items()}
     memory = init_memory(jax.random.fold_in(params_key, 1), config, sizes["actor"])
     remembered = state_size(memory, sizes["actor"])
@@ -141,25 +177,41 @@ def init_state(
         initial_std=config.initial_std,
         memory=memory,
     )
-    scale, reset = None, env.reset
-    if curriculum is not None:
-        scale = jnp.float32(curriculum.start)
-        reset = functools.partial(cast(CurriculumEnvironment, env).reset, scale=scale)
-    env_state = batched(reset, mesh)(jax.random.split(reset_key, config.num_envs))
-    env_state = batched(env.stagger, mesh)(env_state, jax.random.split(stagger_key, config.num_envs))
     return TrainState(
         params=params,
         adam=adam.init(params),
         learning_rate=jnp.float32(config.learning_rate),
         observation_stats={group: init_stats((size,)) for group, size in sizes.items()},
         value_stats=init_stats(()),
-        env_state=env_state,
+        env_state=None,
         key=key,
         iteration=jnp.int32(0),
         skipped_updates=jnp.int32(0),
-        scale=scale,
-        memory=empty(memory, sizes["actor"], (config.num_envs,)),
+        scale=None if curriculum is None else jnp.float32(curriculum.start),
     )
+
+
+def init_environments(
+    env: Environment,
+    config: PPOConfig,
+    key: jax.Array,
+    curriculum: Curriculum | None = None,
+    mesh: Mesh | None = None,
+    part: Part | None = None,
+) -> Any:
+    """Freshly reset environments [B, ...] with staggered clocks, or a part of them."""
+    _, reset_key, stagger_key, _ = jax.random.split(key, 4)
+    resets, staggers = (of_part(jax.random.split(key, config.num_envs), part) for key in (reset_key, stagger_key))
+    reset = env.reset
+    if curriculum is not None:
+        reset = functools.partial(cast(CurriculumEnvironment, env).reset, scale=jnp.float32(curriculum.start))
+    return batched(env.stagger, mesh)(batched(reset, mesh)(resets), staggers)
+
+
+def init_memories(env: Environment, config: PPOConfig, count: int) -> jax.Array | None:
+    """The policy's memory [count, m] at the start of episodes."""
+    size = layout_size(env.observation_layout["actor"])
+    return empty(init_memory(jax.random.key(0), config, size), size, (count,))
 
 
 def train_iteration(
@@ -170,10 +222,32 @@ def train_iteration(
     mesh: Mesh | None = None,
 ) -> tuple[TrainState, Metrics]:
     """Collect, estimate advantages, update; with a curriculum, widen or narrow the ranges."""
-    key, collect_key, update_key = jax.random.split(state.key, 3)
-    # Shared by collection and update, so that the first minibatch's probability ratio is exactly one.
+    (env_state, memory), rollout, tally = experience(env, config, state, mesh)
+    state = dataclasses.replace(state, env_state=env_state, memory=memory)
+    return learn(env, config, state, rollout, tally, curriculum, mesh)
+
+
+def experience(
+    env: Environment, config: PPOConfig, state: TrainState, mesh: Mesh | None = None, part: Part | None = None
+) -> tuple[tuple[Any, jax.Array | None], Rollout, Tally]:
+    """What an iteration collects; `state` may hold a part of the environments."""
     normalizers = make_normalizers(env, config, state.observation_stats)
-    (env_state, memory), rollout, metrics = collect_rollout(env, config, state, normalizers, collect_key, mesh)
+    return collect_rollout(env, config, state, normalizers, jax.random.split(state.key, 3)[1], mesh, part)
+
+
+def learn(
+    env: Environment,
+    config: PPOConfig,
+    state: TrainState,
+    rollout: Rollout,
+    tally: Tally,
+    curriculum: Curriculum | None = None,
+    mesh: Mesh | None = None,
+) -> tuple[TrainState, Metrics]:
+    """The state after an iteration with this experience, and its metrics."""
+    key, _, update_key = jax.random.split(state.key, 3)
+    # Those of the collection, so that the first minibatch's probability ratio is exactly one.
+    normalizers, metrics = make_normalizers(env, config, state.observation_stats), tally.metrics()
     if config.normalize_value:
         rollout, bounded = bound_rewards(rollout, state.value_stats, config.reward_scale)
         metrics |= {"bounded_rewards": bounded}
@@ -192,7 +266,7 @@ def train_iteration(
         "learning_rate": learner.learning_rate,
         "skipped_updates": learner.skipped_updates,
     }
-    scale = state.scale
+    scale, env_state = state.scale, state.env_state
     if curriculum is not None:
         assert scale is not None, "the state of a training with a curriculum"
         scale, success = update_scale(curriculum, scale, metrics)
@@ -212,7 +286,7 @@ def train_iteration(
         iteration=state.iteration + 1,
         skipped_updates=learner.skipped_updates,
         scale=scale,
-        memory=memory,
+        memory=state.memory,
     ), metrics
 
 
@@ -251,15 +325,18 @@ def collect_rollout(
     normalizers: dict[str, Normalizer],
     key: jax.Array,
     mesh: Mesh | None = None,
-) -> tuple[tuple[Any, jax.Array | None], Rollout, Metrics]:
-    """States and memory afterwards, and experience [T, B, ...] under the current policy; values are in reward units."""
+    part: Part | None = None,
+) -> tuple[tuple[Any, jax.Array | None], Rollout, Tally]:
+    """States and memory afterwards, experience [T, B, ...] under the current policy, and what metrics follow from;
+    values are in reward units."""
     params, std = state.params, value_std(state.value_stats)
 
     def act(key, obs, memory):
         x = normalize(normalizers["actor"], obs["actor"])
         memory, seen = remember(params.memory, memory, x, config.matmul_precision)
         mean = apply_mlp(params.actor, seen, config.matmul_precision)
-        action = distribution.sample(key, mean, params.log_std)
+        noise = of_part(jax.random.normal(key, whole_shape(mean.shape, part)), part)
+        action = distribution.sample(noise, mean, params.log_std)
         decision = Decision(action, mean, distribution.log_prob(action, mean, params.log_std))
         action = jnp.tanh(action) if config.distribution == "tanh" else jnp.clip(action, -1.0, 1.0)
         return decision, action, memory

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
 
-from dexsim.core.pytree import choose, pytree_dataclass
+from dexsim.core.pytree import choose, pytree_dataclass, static
 from dexsim_ppo.learner.running_stats import RunningStats, value_std
 from dexsim_ppo.learner.sharding import batched
 from dexsim_ppo.learner.types import Environment
@@ -43,6 +43,35 @@ class Rollout:
     truncated: jax.Array
     memory: jax.Array | None = None  # [T, B, m] state of the policy's memory before the step
 
+
+@pytree_dataclass
+class Tally:
+    """Sums from which metrics follow, each over a part of the environments [D]."""
+
+    sums: jax.Array  # [D, 2, K] of the quantities below: over all steps, and over the last ones of episodes
+    repeated: jax.Array  # [D] episodes that began with a start already used
+    names: tuple[str, ...] = static(default=())  # of the environment's metrics, which follow after `COUNTED`
+    steps: int = static(default=0)  # of each part
+
+    def metrics(self) -> dict[str, jax.Array]:
+        """Scalars: `step/<name>` is a mean over all steps, `episode/<name>` the mean final value over the episodes that
+        ended (NaN if none did), `episodes` their number, `repeated_starts` how many starts were used before (see
+        `scan_restarting`)."""
+        sums, ended_sums = jnp.sum(self.sums, axis=0)
+        total, size = dict(zip(COUNTED, sums[: len(COUNTED)], strict=True)), self.sums.shape[0] * self.steps
+        found = {
+            "reward": total["reward"] / size,
+            "episodes": total["ended"],
+            "terminated_share": total["terminated"] / total["ended"],
+            "nonfinite_rewards": total["nonfinite"],
+            "repeated_starts": jnp.sum(self.repeated),
+        }
+        for name, of, count in (("step", sums, size), ("episode", ended_sums, total["ended"])):
+            found |= {f"{name}/{k}": v / count for k, v in zip(self.names, of[len(COUNTED) :], strict=True)}
+        return found
+
+
+COUNTED = ("reward", "ended", "terminated", "nonfinite")
 
 Act = Callable[[jax.Array, Mapping[str, jax.Array], Any], tuple[Decision, jax.Array, Any]]
 """`act(key, obs, memory) -> (decision, action for the environment [B, A], memory)`"""
@@ -82,7 +111,7 @@ def collect(
     length: int,
     mesh: Mesh | None = None,
     memory: jax.Array | None = None,
-) -> tuple[tuple[Any, jax.Array | None], Rollout, dict[str, jax.Array]]:
+) -> tuple[tuple[Any, jax.Array | None], Rollout, Tally]:
     """Run the policy for `length` steps.
 
     The order is act, step, record, restart: the recorded flags, metrics and `next_value` belong to the true
@@ -93,9 +122,7 @@ def collect(
       memory: [B, m] state of the policy's memory; zero at the start of every episode.
 
     Returns:
-      The last states and memory, the experience, and scalar metrics: `step/<name>` is a mean over all steps,
-      `episode/<name>` the mean final value over the episodes that ended (NaN if none did), `episodes`
-      their number, `repeated_starts` how many starts were used before (see `scan_restarting`).
+      The last states and memory, the experience, and what metrics follow from, of one part.
     """
     step_env = batched(env.step, mesh)
 
@@ -120,25 +147,14 @@ def collect(
     end, (rollout, step_metrics) = scan_restarting(cast(Any, Restarting(env)), step, begin, keys, mesh)
     finite, done = jnp.isfinite(rollout.reward), rollout.terminated | rollout.truncated
     rollout = dataclasses.replace(rollout, reward=jnp.where(finite, rollout.reward, 0.0))
-    counted = {"reward": rollout.reward, "ended": done, "terminated": rollout.terminated, "nonfinite": ~finite}
+    counted = (rollout.reward, done, rollout.terminated, ~finite)
     # Sums are taken outside the scan: inside it each would reduce few numbers, which is slow on GPUs. One product gives
     # all of them, so that several processes exchange one array.
-    values = jnp.stack([v.astype(jnp.float32) for v in (*counted.values(), *step_metrics.values())])
+    values = jnp.stack([v.astype(jnp.float32) for v in (*counted, *step_metrics.values())])
     masks = jnp.stack([jnp.ones_like(done), done]).astype(jnp.float32)
-    sums, ended_sums = jnp.einsum(
-        "ktb,mtb->km", masks, jnp.where(jnp.isfinite(values), values, 0.0), precision="highest"
-    )
-    total = dict(zip(counted, sums[: len(counted)], strict=True))
-    metrics = {
-        "reward": total["reward"] / done.size,
-        "episodes": total["ended"],
-        "terminated_share": total["terminated"] / total["ended"],
-        "nonfinite_rewards": total["nonfinite"],
-        "repeated_starts": _repeated(done),
-    }
-    for name, of, count in (("step", sums, done.size), ("episode", ended_sums, total["ended"])):
-        metrics |= {f"{name}/{k}": v / count for k, v in zip(step_metrics, of[len(counted) :], strict=True)}
-    return (end.state, end.memory), rollout, metrics
+    sums = jnp.einsum("ktb,mtb->mk", jnp.where(jnp.isfinite(values), values, 0.0), masks, precision="highest")
+    tally = Tally(sums[None], _repeated(done)[None], tuple(step_metrics), done.size)
+    return (end.state, end.memory), rollout, tally
 
 
 def scan_restarting(

@@ -9,7 +9,7 @@ the order of sums.
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +25,26 @@ AXIS = "devices"
 # Parts of the environments, each of which shuffles its own rows: results are the same on all numbers that divide it.
 BLOCKS = 16
 Tree = TypeVar("Tree")
+
+
+class Part(NamedTuple):
+    """One of equal parts of the environments, for a program that has no others."""
+
+    number: jax.Array  # int32 []
+    total: int
+
+
+def of_part(rows: jax.Array, part: Part | None) -> jax.Array:
+    """The rows of a part [B / total, ...] of all environments' [B, ...]; without a part all."""
+    if part is None:
+        return rows
+    size = len(rows) // part.total
+    return jax.lax.dynamic_slice_in_dim(rows, part.number * size, size)
+
+
+def whole_shape(shape: tuple[int, ...], part: Part | None) -> tuple[int, ...]:
+    """The shape over all environments of what has `shape` over a part of them."""
+    return shape if part is None else (shape[0] * part.total, *shape[1:])
 
 
 def make_mesh(devices: int, config: PPOConfig) -> Mesh | None:

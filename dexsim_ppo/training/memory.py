@@ -12,7 +12,11 @@ from dexsim.core.errors import ConfigError
 
 def needed(program: Any) -> int | None:
     """Bytes on a device of a compiled training step: its arguments, results and intermediate arrays; None where the
-    runtime does not say. What Warp allocates for itself is not part of it."""
+    runtime does not say. Of a step of several programs that of the largest. What Warp allocates for itself is not part
+    of it."""
+    if hasattr(program, "parts"):
+        found = [needed(part) for part in program.parts]
+        return max(size for size in found if size) if all(found) else None
     analysis = getattr(program, "memory_analysis", lambda: None)()
     if analysis is None:
         return None

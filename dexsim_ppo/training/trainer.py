@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -120,13 +120,13 @@ class Run:
                 self.without_better = progress.get("without_better", 0)
             else:
                 fresh = aside.submit(lambda: jax.block_until_ready(training.init(key)))
-            step = programs.compile_step(
-                training.plain_step,
-                shapes,
-                self.identity(),
-                lambda: self.clock.update(trace_s=time.perf_counter() - begin),
-                self.env.backend,
-            )
+            traced = lambda: self.clock.update(trace_s=time.perf_counter() - begin)  # noqa: E731
+            if self.mesh is None:
+                step = programs.compile_step(training.plain_step, shapes, self.identity(), traced, self.env.backend)
+            else:  # not cached
+                lowered = cast(Any, training.step).lower(shapes)
+                traced()
+                step = lowered.compile()
             if not isinstance(source, checkpoint.Checkpoint):
                 state = self.begin(fresh.result(), source)
         self.clock["compile_s"] = time.perf_counter() - begin
@@ -143,10 +143,7 @@ class Run:
         return state
 
     def identity(self) -> Any:
-        """What identifies the training step's program; None for one of several devices, which is not cached, and for an
-        environment without a fingerprint."""
-        if self.mesh is not None:
-            return None
+        """What identifies the training step's program; None for an environment without a fingerprint."""
         fingerprint = getattr(self.env, "fingerprint", lambda: None)()
         return fingerprint and [fingerprint, to_dict(self.config), to_dict(self.arguments.curriculum)]
 

@@ -154,12 +154,12 @@ def test_next_value_is_that_of_the_true_final_observation():
     env, config = TrueFinal(), dataclasses.replace(SMALL, observation_clip=100.0)
     state = make_train(env, config).init(jax.random.key(0))
     normalizers = ppo.make_normalizers(env, config, state.observation_stats)
-    _, rollout, metrics = ppo.collect_rollout(env, config, state, normalizers, jax.random.key(1))
+    _, rollout, tally = ppo.collect_rollout(env, config, state, normalizers, jax.random.key(1))
     obs = rollout.obs["critic"].at[..., 0].set(7.0).at[..., 2].set(7.0)
     # The target belongs to the episode that ended.
     expected = critic_value(config, state.params, normalizers, {"critic": obs})
     np.testing.assert_allclose(rollout.next_value, expected, rtol=1e-4, atol=1e-5)
-    assert float(metrics["episodes"]) == config.steps_per_iteration
+    assert float(tally.metrics()["episodes"]) == config.steps_per_iteration
     assert bool((jnp.abs(rollout.obs["critic"][1:, :, 0]) <= 1).all()), "restarted before the next step"
 
 
@@ -232,9 +232,10 @@ def test_metrics_are_those_of_a_plain_loop():
         jax.random.normal(key, (count, 1)),
         memory,
     )
-    _, rollout, metrics = jax.jit(
+    _, rollout, tally = jax.jit(
         lambda state: collect(env, state, jax.random.key(4), decide, lambda obs, _: obs["critic"][..., 0], length)
     )(states)
+    metrics = tally.metrics()
     everywhere, ended, final, broken, reward = [], 0, [], 0, []
     fresh = jax.vmap(env.restart)(states, jnp.ones(count, bool))
     state = jax.vmap(env.restart)(states, jnp.zeros(count, bool))

@@ -21,12 +21,13 @@ from collectives import received
 
 # A GRU's memory is split as the environments are; `training/test_devices.py` has a policy without.
 CONFIG = dataclasses.replace(SMALL, num_envs=16, iterations_per_call=10, memory="gru", memory_size=4)
+CASES = (2, "jax"), (8, "jax"), (4, "warp")  # with Warp each device collects in a program of its own
 PLAIN = dataclasses.replace(CONFIG, memory="none")
 
 
-def trained(devices):
+def trained(devices, backend="jax"):
     """All numbers of the state after 20 iterations, and how many devices hold the environments."""
-    training = make_train(TinyEnv(), CONFIG, mesh=make_mesh(devices, CONFIG))
+    training = make_train(TinyEnv(backend=backend), CONFIG, mesh=make_mesh(devices, CONFIG))
     state = training.init(jax.random.key(0))
     for _ in range(2):
         state, _ = training.step(state)
@@ -39,9 +40,9 @@ def trained(devices):
     return [np.asarray(leaf) for leaf in jax.tree.leaves(state)], used
 
 
-def communicated(devices):
+def communicated(devices, backend="jax"):
     """Bytes that a device receives in a call of a training without memory, and the arrays in each of its reductions."""
-    training = make_train(TinyEnv(), PLAIN, mesh=make_mesh(devices, PLAIN))
+    training = make_train(TinyEnv(backend=backend), PLAIN, mesh=make_mesh(devices, PLAIN))
     text = training.step.lower(training.shapes(jax.random.key(0))).compile().as_text()
     return received(text)[0], [shapes.count("[") for shapes in re.findall(r"= (.*?) all-reduce(?:-start)?\(", text)]
 
@@ -62,8 +63,8 @@ def test_one_two_and_eight_devices_agree_and_each_repeats_itself_to_the_bit(tmp_
     assert done.returncode == 0, done.stderr
     alone, used = trained(1)
     assert used == 1 and communicated(1) == (0, [])
-    for devices in (2, 8):
-        first, again = (np.load(tmp_path / f"{devices}-{i}.npz") for i in range(2))
+    for devices, backend in CASES:
+        first, again = (np.load(tmp_path / f"{devices}-{backend}-{i}.npz") for i in range(2))
         assert int(first["used"]) == devices
         for i, leaf in enumerate(alone):
             np.testing.assert_allclose(first[str(i)], leaf, rtol=2e-3, atol=2e-4)
@@ -71,7 +72,8 @@ def test_one_two_and_eight_devices_agree_and_each_repeats_itself_to_the_bit(tmp_
         # Of the experience only the rewards, of which one may be a fault; else gradients and sums.
         shapes = make_train(TinyEnv(), PLAIN).shapes(jax.random.key(0)).params
         gradients = CONFIG.epochs * CONFIG.minibatches * sum(leaf.size for leaf in jax.tree.leaves(shapes))
-        least = CONFIG.iterations_per_call * 4 * (devices - 1) / devices * (CONFIG.steps_per_iteration + 2 * gradients)
+        iterations = 1 if backend == "warp" else CONFIG.iterations_per_call  # in the program
+        least = iterations * 4 * (devices - 1) / devices * (CONFIG.steps_per_iteration + 2 * gradients)
         assert least < float(first["received"]) < 1.25 * least
         # Each array of a reduction costs processes on CPUs milliseconds: all gradients are one.
         assert first["arrays"].sum() <= 25
@@ -112,9 +114,9 @@ def test_every_device_gets_as_many_environments_and_rows(changes, devices, messa
 
 
 if __name__ == "__main__":
-    for devices in (2, 8):
+    for devices, backend in CASES:
         for i in range(2):
-            leaves, used = trained(devices)
+            leaves, used = trained(devices, backend)
             numbers = {str(k): leaf for k, leaf in enumerate(leaves)}
-            size, arrays = communicated(devices)
-            np.savez(f"{sys.argv[1]}/{devices}-{i}.npz", used=used, received=size, arrays=arrays, **numbers)
+            size, arrays = communicated(devices, backend)
+            np.savez(f"{sys.argv[1]}/{devices}-{backend}-{i}.npz", used=used, received=size, arrays=arrays, **numbers)

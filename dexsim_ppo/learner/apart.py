@@ -1,0 +1,189 @@
+"""Training on several devices with environments that XLA cannot compile for all of them at once.
+
+MuJoCo Warp's calls crash XLA's compiler in a program of several devices (JAX 0.11.2). So each device resets and
+collects in programs of its own, and one program of all devices learns from what they have collected. The parts draw
+the random numbers of the whole: training is the same up to the order of sums.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec, SingleDeviceSharding
+
+from dexsim.core.compilation import jit
+from dexsim_ppo.learner.sharding import AXIS, Part, shardings
+
+ENGINES = ("warp",)
+"""Physics that needs it."""
+
+# Experience is [T, B, ...], all else [B, ...].
+_AXES = (0, 1, 0)
+
+
+class ApartStep:
+    """A training step `step(state) -> (state, metrics [iterations])` of several programs. Donates its argument.
+
+    It is lowered and compiled as a step of one program is: `step.lower(shapes).compile()`.
+
+    Args:
+      collect: `(state with a part of the environments, part) -> ((env_state, memory), rollout, tally)`.
+      learn: `(state, rollout, tally) -> (state, metrics)`, of all environments.
+      iterations: in a call.
+      backend: of the physics.
+    """
+
+    def __init__(
+        self,
+        collect: Callable[[Any, Part], Any],
+        learn: Callable[[Any, Any, Any], Any],
+        mesh: Mesh,
+        iterations: int,
+        backend: str,
+    ):
+        self._mesh, self._iterations, self._programs = mesh, iterations, list[Any]()
+
+        def collect_part(environments: Any, learner: Any, index: jax.Array) -> Any:
+            return collect(_with(learner, environments), Part(index, mesh.size))
+
+        def learn_from_all(environments: Any, learner: Any, rollout: Any, tally: Any) -> Any:
+            state, metrics = learn(_with(learner, environments), rollout, tally)
+            whole = jax.tree.map(lambda _: NamedSharding(mesh, PartitionSpec()), metrics)
+            return jax.lax.with_sharding_constraint((state, metrics), (shardings(state, mesh), whole))
+
+        self._collect = jit(collect_part, backend=backend, donate_argnums=0)
+        self._learn = jit(learn_from_all, backend=backend, donate_argnums=(0, 1))
+
+    def lower(self, shapes: Any) -> "ApartStep":
+        """Trace the programs for a state of these shapes and shardings."""
+        learner, environments = _without(shapes), (shapes.env_state, shapes.memory)
+        self._lowered = []
+        for device in own_devices(self._mesh):
+            where = SingleDeviceSharding(device)
+            here = lambda x, where=where: jax.ShapeDtypeStruct(  # noqa: E731
+                x.sharding.shard_shape(x.shape), x.dtype, sharding=where
+            )
+            index = jax.ShapeDtypeStruct((), jnp.int32, sharding=where)
+            self._lowered.append(
+                self._collect.lower(jax.tree.map(here, environments), jax.tree.map(here, learner), index)
+            )
+        collected = [
+            _shapes_of_all(tree, self._mesh, axis) for tree, axis in zip(self._lowered[0].out_info, _AXES, strict=True)
+        ]
+        self._lowered.append(self._learn.lower(collected[0], learner, *collected[1:]))
+        return self
+
+    def compile(self) -> "ApartStep":
+        """Compile them at the same time."""
+        with ThreadPoolExecutor(len(self._lowered)) as pool:
+            self._programs = list(pool.map(lambda lowered: lowered.compile(), self._lowered))
+        return self
+
+    @property
+    def parts(self) -> list[Any]:
+        """The compiled programs that a device runs, one after the other."""
+        return [self._programs[0], self._programs[-1]]
+
+    def as_text(self) -> str:
+        """The program that communicates, once an iteration."""
+        return self._programs[-1].as_text()
+
+    def __call__(self, state: Any) -> tuple[Any, dict[str, jax.Array]]:
+        if not self._programs:
+            self.lower(jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=x.sharding), state))
+            self.compile()
+        found = []
+        for _ in range(self._iterations):
+            state, metrics = self._iterate(state)
+            found.append(metrics)
+        return state, jax.tree.map(lambda *x: jnp.stack(x), *found)
+
+    def _iterate(self, state: Any) -> tuple[Any, dict[str, jax.Array]]:
+        learner, environments = _without(state), (state.env_state, state.memory)
+        del state
+        # All before the first program runs: it donates its part, with which the whole is gone.
+        given = [
+            (_on(device, environments), _on(device, learner), _number(device, self._mesh))
+            for device in own_devices(self._mesh)
+        ]
+        collected = [program(*one) for program, one in zip(self._programs[:-1], given, strict=True)]
+        del environments, given
+        environments, rollout, tally = (
+            join([part[i] for part in collected], self._mesh, axis) for i, axis in enumerate(_AXES)
+        )
+        del collected
+        return self._programs[-1](environments, learner, rollout, tally)
+
+
+def start_apart(
+    mesh: Mesh, learner: Callable[[jax.Array], Any], environments: Callable[[jax.Array, Part], tuple[Any, Any]]
+) -> Callable[[jax.Array], Any]:
+    """`init(key) -> TrainState` of several programs.
+
+    Args:
+      learner: `key -> TrainState` without environments.
+      environments: `(key, part) -> (env_state, memory)`.
+    """
+
+    def begin(key: jax.Array) -> Any:
+        data, parts = np.asarray(jax.random.key_data(key)), []
+        start = jit(lambda data, index: environments(jax.random.wrap_key_data(data), Part(index, mesh.size)), once=True)
+        for device in own_devices(mesh):
+            parts.append(start(jax.device_put(data, device), _number(device, mesh)))
+        whole = NamedSharding(mesh, PartitionSpec())
+        state = jit(lambda data: learner(jax.random.wrap_key_data(data)), once=True, out_shardings=whole)(data)
+        return _with(state, join(parts, mesh, 0))
+
+    return begin
+
+
+def own_devices(mesh: Mesh) -> list[jax.Device]:
+    """The mesh's devices of this process, in its order."""
+    return [device for device in mesh.devices.flat if device.process_index == jax.process_index()]
+
+
+def _number(device: jax.Device, mesh: Mesh) -> jax.Array:
+    """A device's place in the mesh, int32 [] on that device."""
+    return jax.device_put(np.int32(list(mesh.devices.flat).index(device)), device)
+
+
+def join(parts: Sequence[Any], mesh: Mesh, axis: int) -> Any:
+    """Trees of arrays on this process's devices as one of arrays over all, split along `axis`."""
+    where = _split(mesh, axis)
+
+    def one(*parts: jax.Array) -> jax.Array:
+        return jax.make_array_from_single_device_arrays(_times(parts[0].shape, mesh.size, axis), where, list(parts))
+
+    return jax.tree.map(one, *parts)
+
+
+def _shapes_of_all(tree: Any, mesh: Mesh, axis: int) -> Any:
+    """The shapes over all devices of what has these on each."""
+    return jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct(_times(x.shape, mesh.size, axis), x.dtype, sharding=_split(mesh, axis)), tree
+    )
+
+
+def _split(mesh: Mesh, axis: int) -> NamedSharding:
+    return NamedSharding(mesh, PartitionSpec(*[None] * axis, AXIS))
+
+
+def _times(shape: tuple[int, ...], count: int, axis: int) -> tuple[int, ...]:
+    return (*shape[:axis], count * shape[axis], *shape[axis + 1 :])
+
+
+def _on(device: jax.Device, tree: Any) -> Any:
+    """What a device has of arrays over several."""
+    return jax.tree.map(lambda x: next(s.data for s in x.addressable_shards if s.device == device), tree)
+
+
+def _with(learner: Any, environments: tuple[Any, Any]) -> Any:
+    return dataclasses.replace(learner, env_state=environments[0], memory=environments[1])
+
+
+def _without(state: Any) -> Any:
+    return dataclasses.replace(state, env_state=None, memory=None)
