@@ -32,9 +32,9 @@ from dexsim.core.cli import enable_caches
 from dexsim.core.compilation import collector_paused, jit
 from dexsim.registry import find_task
 from dexsim_ppo.learner.adapter import adapt
-from dexsim_ppo.learner.apart import ApartStep
+from dexsim_ppo.learner.devices.apart import ApartStep
+from dexsim_ppo.learner.devices.sharding import make_mesh
 from dexsim_ppo.learner.ppo import make_train
-from dexsim_ppo.learner.sharding import make_mesh
 from dexsim_ppo.training import processes
 from dexsim_ppo.training.presets import find_preset
 

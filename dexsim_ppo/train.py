@@ -30,7 +30,7 @@ from dexsim_ppo import checkpoint
 from dexsim_ppo.learner.adapter import adapt
 from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.curriculum import Curriculum
-from dexsim_ppo.learner.sharding import make_mesh
+from dexsim_ppo.learner.devices.sharding import make_mesh
 from dexsim_ppo.learner.types import Environment
 from dexsim_ppo.policy import Policy, load_policy
 from dexsim_ppo.retired import migrate_arguments

@@ -9,7 +9,6 @@ The parts that follow are those of an iteration: `experience`, then `learn`. `ap
 """
 
 import dataclasses
-import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple, cast
 
@@ -19,29 +18,12 @@ from jax.sharding import Mesh
 
 from dexsim.core.compilation import jit
 from dexsim.core.errors import ConfigError
-from dexsim.core.pytree import pytree_dataclass
-from dexsim_ppo.learner import adam, distribution
-from dexsim_ppo.learner.adam import AdamState
-from dexsim_ppo.learner.apart import ENGINES, ApartStep, start_apart
+from dexsim_ppo.learner import distribution
 from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.curriculum import Curriculum, next_scale
-from dexsim_ppo.learner.gae import compute_gae, explained_variance
-from dexsim_ppo.learner.loss import Metrics, Samples, critic_value
-from dexsim_ppo.learner.memory import empty, init_memory, remember, state_size
-from dexsim_ppo.learner.networks import Params, apply_mlp, init_params, rescale_output
-from dexsim_ppo.learner.rollout import Decision, Rollout, Tally, bound_rewards, collect
-from dexsim_ppo.learner.running_stats import (
-    Normalizer,
-    RunningStats,
-    init_stats,
-    make_normalizer,
-    normalize,
-    update_stats,
-    value_std,
-)
-from dexsim_ppo.learner.sharding import (
+from dexsim_ppo.learner.devices.apart import ENGINES, ApartStep, start_apart
+from dexsim_ppo.learner.devices.sharding import (
     Part,
-    batched,
     block_count,
     copied,
     in_blocks,
@@ -51,25 +33,28 @@ from dexsim_ppo.learner.sharding import (
     start_on,
     whole_shape,
 )
-from dexsim_ppo.learner.types import CurriculumEnvironment, Environment, layout_size
+from dexsim_ppo.learner.gae import compute_gae, explained_variance
+from dexsim_ppo.learner.loss import Metrics, Samples, critic_value
+from dexsim_ppo.learner.memory import remember
+from dexsim_ppo.learner.networks import Params, apply_mlp, rescale_output
+from dexsim_ppo.learner.rollout import Decision, Rollout, Tally, bound_rewards, collect
+from dexsim_ppo.learner.running_stats import (
+    Normalizer,
+    RunningStats,
+    make_normalizer,
+    normalize,
+    update_stats,
+    value_std,
+)
+from dexsim_ppo.learner.state import (
+    TrainState,
+    init_environments,
+    init_learner,
+    init_memories,
+    init_state,
+)
+from dexsim_ppo.learner.types import CurriculumEnvironment, Environment
 from dexsim_ppo.learner.update import Learner, update
-
-
-@pytree_dataclass
-class TrainState:
-    """All that training carries from one iteration to the next."""
-
-    params: Params
-    adam: AdamState
-    learning_rate: jax.Array  # []
-    observation_stats: dict[str, RunningStats]
-    value_stats: RunningStats  # of returns []
-    env_state: Any  # [B, ...]
-    key: jax.Array
-    iteration: jax.Array  # int32 []
-    skipped_updates: jax.Array  # int32 [], minibatches whose gradient was not finite
-    scale: jax.Array | None = None  # [] width of the randomisation ranges, with a curriculum
-    memory: jax.Array | None = None  # [B, m] state of the policy's memory
 
 
 class Training(NamedTuple):
@@ -87,7 +72,7 @@ class Training(NamedTuple):
 def make_train(
     env: Environment, config: PPOConfig, curriculum: Curriculum | None = None, mesh: Mesh | None = None
 ) -> Training:
-    """Compiled `init` and `step` for this environment; with a mesh, over its devices (`learner.sharding`)."""
+    """Compiled `init` and `step` for this environment; with a mesh, over its devices (`learner.devices.sharding`)."""
     if curriculum is not None and not curriculum.on:
         curriculum = None
 
@@ -145,73 +130,6 @@ def make_train(
         plain_step=step,
         step=compiled_step,
     )
-
-
-def init_state(
-    env: Environment,
-    config: PPOConfig,
-    key: jax.Array,
-    curriculum: Curriculum | None = None,
-    mesh: Mesh | None = None,
-) -> TrainState:
-    """A fresh learner, and freshly reset environments with staggered clocks."""
-    return dataclasses.replace(
-        init_learner(env, config, key, curriculum),
-        env_state=init_environments(env, config, key, curriculum, mesh),
-        memory=init_memories(env, config, config.num_envs),
-    )
-
-
-def init_learner(
-    env: Environment, config: PPOConfig, key: jax.Array, curriculum: Curriculum | None = None
-) -> TrainState:
-    """The state of a fresh learner, without environments."""
-    params_key, _, _, key = jax.random.split(key, 4)
-    sizes = {group: layout_size(fields) for group, fields in env.observation_layout.items()}
-    memory = init_memory(jax.random.fold_in(params_key, 1), config, sizes["actor"])
-    remembered = state_size(memory, sizes["actor"])
-    params = init_params(
-        params_key,
-        actor_sizes=(sizes["actor"] + remembered, *config.actor_layers, env.action_size),
-        critic_sizes=(sizes["critic"] + remembered, *config.critic_layers, 1),
-        initial_std=config.initial_std,
-        memory=memory,
-    )
-    return TrainState(
-        params=params,
-        adam=adam.init(params),
-        learning_rate=jnp.float32(config.learning_rate),
-        observation_stats={group: init_stats((size,)) for group, size in sizes.items()},
-        value_stats=init_stats(()),
-        env_state=None,
-        key=key,
-        iteration=jnp.int32(0),
-        skipped_updates=jnp.int32(0),
-        scale=None if curriculum is None else jnp.float32(curriculum.start),
-    )
-
-
-def init_environments(
-    env: Environment,
-    config: PPOConfig,
-    key: jax.Array,
-    curriculum: Curriculum | None = None,
-    mesh: Mesh | None = None,
-    part: Part | None = None,
-) -> Any:
-    """Freshly reset environments [B, ...] with staggered clocks, or a part of them."""
-    _, reset_key, stagger_key, _ = jax.random.split(key, 4)
-    resets, staggers = (of_part(jax.random.split(key, config.num_envs), part) for key in (reset_key, stagger_key))
-    reset = env.reset
-    if curriculum is not None:
-        reset = functools.partial(cast(CurriculumEnvironment, env).reset, scale=jnp.float32(curriculum.start))
-    return batched(env.stagger, mesh)(batched(reset, mesh)(resets), staggers)
-
-
-def init_memories(env: Environment, config: PPOConfig, count: int) -> jax.Array | None:
-    """The policy's memory [count, m] at the start of episodes."""
-    size = layout_size(env.observation_layout["actor"])
-    return empty(init_memory(jax.random.key(0), config, size), size, (count,))
 
 
 def train_iteration(

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 from jax.sharding import Mesh
 
 from dexsim.core.pytree import choose, pytree_dataclass, static
+from dexsim_ppo.learner.devices.sharding import batched
 from dexsim_ppo.learner.running_stats import RunningStats, value_std
-from dexsim_ppo.learner.sharding import batched
 from dexsim_ppo.learner.types import Environment
 
 # A reward beyond this many deviations of the returns is a fault of the simulation, not something to learn from. It is

@@ -10,7 +10,7 @@ import numpy as np
 
 from dexsim.core.errors import DexsimError
 from dexsim_ppo.learner.config import PPOConfig
-from dexsim_ppo.learner.ppo import TrainState
+from dexsim_ppo.learner.state import TrainState
 from dexsim_ppo.training import processes
 from dexsim_ppo.training.runlog import RunFolder
 

@@ -92,7 +92,9 @@ def find_preset(name: str, task: str) -> Preset:
     # A gait needs less noise than a grasp, which has to explore forces.
     ppo = replace(preset.ppo, epochs=4, minibatches=16, entropy_coefficient=0.001)
     if preset is PRESETS["cpu"]:
-        return replace(preset, ppo=replace(ppo, num_envs=512), minutes=30.0, evaluation_chunk=64, evaluation_episodes=256)
+        return replace(
+            preset, ppo=replace(ppo, num_envs=512), minutes=30.0, evaluation_chunk=64, evaluation_episodes=256
+        )
     if preset is PRESETS["cpu-large"]:
         return replace(preset, ppo=ppo, minutes=15.0, evaluation_chunk=256, evaluation_episodes=256)
     # A quarter of the environments: four times the updates from the same experience, which finding a gait needs.

@@ -16,8 +16,8 @@ from jax.experimental import multihost_utils
 
 from dexsim.core.errors import DexsimError
 from dexsim_ppo import checkpoint
-from dexsim_ppo.learner.ppo import TrainState
-from dexsim_ppo.learner.sharding import copied, spanned
+from dexsim_ppo.learner.devices.sharding import copied, spanned
+from dexsim_ppo.learner.state import TrainState
 
 # Set in each process of a job of several: by Slurm's srun, Open MPI's mpirun, an indexed job of Kubernetes.
 _JOBS = ("SLURM_STEP_NODELIST", "OMPI_COMM_WORLD_SIZE", "JOB_COMPLETION_INDEX")

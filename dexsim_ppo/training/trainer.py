@@ -19,8 +19,8 @@ from dexsim.hand.source import record_of
 from dexsim_ppo import checkpoint
 from dexsim_ppo.evaluate import Evaluator, write_video
 from dexsim_ppo.learner.config import PPOConfig
+from dexsim_ppo.learner.devices.sharding import learned, place
 from dexsim_ppo.learner.ppo import TrainState, make_train
-from dexsim_ppo.learner.sharding import learned, place
 from dexsim_ppo.learner.types import Environment
 from dexsim_ppo.policy import Policy
 from dexsim_ppo.report import print_report, surely_better

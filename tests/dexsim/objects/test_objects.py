@@ -10,7 +10,14 @@ import pytest
 from dexsim.core.errors import ConfigError
 from dexsim.geometry import sdf
 from dexsim.objects.config import INACTIVE_SIZE, SHAPES, SLOTS, ObjectConfig
-from dexsim.objects.params import bounding_radius, damping_ratio, extent, sample_object, unit_inertia
+from dexsim.objects.params import (
+    bounding_radius,
+    damping_ratio,
+    extent,
+    sample_object,
+    toward_nominal,
+    unit_inertia,
+)
 
 BOX, CAPSULE, CYLINDER = range(3)
 ACTIVE = {
@@ -347,6 +354,17 @@ def test_damping_falls_as_the_bounce_grows_and_is_bounded():
     ratio = np.asarray(damping_ratio(jnp.linspace(0.0, 0.9, 50)))
     assert ratio[0] == 3.0 and np.all(ratio > 0)
     assert np.all(np.diff(ratio[2:]) < 0)
+
+
+def test_a_nominal_object_bounces_in_the_middle_of_its_range():
+    """At scale 0 of a curriculum; at 0.5 its damping ratio is halfway to the drawn one."""
+    config = ObjectConfig(shapes=("sphere",), restitution=(0.2, 0.4))
+    drawn = sample_object(jax.random.key(0), config)
+    narrow, half = (
+        float(toward_nominal(drawn, config, unit_inertia(drawn), jnp.float32(scale)).contact[1]) for scale in (0.0, 0.5)
+    )
+    assert bounce(narrow) == pytest.approx(0.3, rel=0.01)
+    assert half == pytest.approx((narrow + float(drawn.contact[1])) / 2, rel=1e-5)
 
 
 # --- the pool of start states -----------------------------------------------------------------------------

@@ -37,12 +37,12 @@ def forces(seed=0):
     return (rng.uniform(0, 3, SHAPE) * (rng.random(SHAPE) < 0.2)).astype(np.float32)
 
 
-def run(sensor, force, key=KEY):
+def run(sensor, force, key=KEY, finger_gain=1.0):
     """Readings [T, F, N] of forces [T, F, N], and the episode's draw."""
     params = sensor.sample(key)
 
     def step(state, inputs):
-        return sensor.apply(params, state, *inputs)
+        return sensor.apply(params, state, *inputs, finger_gain)
 
     keys = jax.random.split(jax.random.fold_in(key, 1), len(force))
     return np.asarray(jax.jit(lambda: jax.lax.scan(step, sensor.init(), (keys, jnp.asarray(force))))()[1]), params
@@ -113,6 +113,16 @@ def test_hysteresis_is_an_exponential_creep():
     left = 2 * (1 - np.exp(-20 * PERIOD / 0.1))
     np.testing.assert_allclose(readings[20:, 2, 7], 0.4 * left * np.exp(-time / 0.1), rtol=1e-4)
     np.testing.assert_array_equal(readings[:, 2, 8], 0)
+
+
+def test_hysteresis_creeps_to_the_force_times_the_fingers_gain():
+    """After a step to 2 N a finger of gain g reads 2 g (1 - a exp(-t / tau)): under a steady force, 2 g."""
+    sensor = model(hysteresis=(0.4, 0.4), hysteresis_time=(0.1, 0.1))
+    gain = np.float32([[0.8], [0.9], [1.0], [1.1], [1.2]])
+    readings, _ = run(sensor, np.full((60, *SHAPE), 2, np.float32), finger_gain=gain)
+    missing = 0.4 * np.exp(-PERIOD * np.arange(1, 61) / 0.1)
+    np.testing.assert_allclose(readings[..., 7], 2 * gain[:, 0] * (1 - missing)[:, None], rtol=1e-5)
+    np.testing.assert_allclose(readings[-1], np.broadcast_to(2 * gain, SHAPE), rtol=1e-5)
 
 
 def test_hysteresis_makes_a_loop():

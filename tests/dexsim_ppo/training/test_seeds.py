@@ -14,6 +14,7 @@ from dexsim_ppo.policy import Policy
 from dexsim_ppo.training import memory
 from dexsim_ppo.training.runlog import RunFolder, read_metrics
 from dexsim_ppo.training.seeds import band, draw_band, spread
+from dexsim_ppo.training.trainer import Run
 
 OPTIONS = "--task tiny --preset cpu --no-video --ppo.num-envs 16 --ppo.rollout-length 8 --ppo.actor-layers 8".split()
 OPTIONS += "--ppo.critic-layers 8 --evaluation-chunk 16 --evaluation-episodes 16 --log-every 1 --steps 512".split()
@@ -58,6 +59,16 @@ def test_seeds_in_one_program_are_the_trainings_in_turn_and_the_report_has_their
     assert [row["iteration"] for row in read_metrics(RunFolder(at_once / "seed-5").metrics)] == [1, 2, 3, 4]
     with pytest.raises(ConfigError, match="--seeds 2: a resumed run keeps its 1"):
         train.main(["--resume", str(at_once / "seed-4"), "--seeds", "2"])
+
+
+def test_a_seed_that_is_over_does_not_end_the_others(tmp_path, monkeypatch):
+    """As when the patience of one runs out: all are trained until the last one is over."""
+    ends = {4: 1, 5: 3}  # iterations, by seed
+    monkeypatch.setattr(Run, "is_over", lambda run, iteration: iteration >= ends[run.arguments.seed])
+    assert train.main([*OPTIONS, "--seed", "4", "--seeds", "2", "--run-dir", str(tmp_path / "a")]) == 0
+    for seed in ends:
+        folder = RunFolder(tmp_path / "a" / f"seed-{seed}")
+        assert [row["iteration"] for row in read_metrics(folder.metrics)] == [1, 2, 3]
 
 
 def test_python_trains_one_seed_at_a_time():

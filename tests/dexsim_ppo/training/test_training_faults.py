@@ -4,15 +4,17 @@ import dataclasses
 import re
 import types
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import tiny_train
-from tiny_env import TinyConfig, TinyEnv
+from tiny_env import SMALL, TinyConfig, TinyEnv
 
 from dexsim.core.errors import DexsimError
 from dexsim_ppo import checkpoint, reproduce, train
 from dexsim_ppo.learner.config import PPOConfig
+from dexsim_ppo.learner.ppo import make_train
 from dexsim_ppo.training.display import Display
 from dexsim_ppo.training.faults import Faults
 from dexsim_ppo.training.runlog import RunFolder, read_metrics
@@ -137,6 +139,26 @@ def test_a_fault_that_is_gone_is_not_reproduced(diverged, monkeypatch, capsys):
     out = capsys.readouterr().out
     # The state itself already holds the first NaN observation.
     assert reproduced == 0 and "before it: state.env_state.obs['actor']" in out
+
+
+class Unpaid(TinyEnv):
+    """The reward of every move to the right is NaN."""
+
+    def step(self, state, action):
+        state = super().step(state, action)
+        return dataclasses.replace(state, reward=jnp.where(action[0] > 0, jnp.nan, state.reward))
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_the_replay_takes_the_actions_of_the_training(seed):
+    """Which rewards are NaN depends on the actions, so on the random numbers: training counts as many."""
+    env = Unpaid()
+    training = make_train(env, SMALL)
+    state = training.init(jax.random.key(seed))
+    found = list(reproduce.findings(env, SMALL, state))
+    (count,) = map(int, training.step(state)[1]["nonfinite_rewards"])
+    assert 0 < count < SMALL.steps_per_iteration
+    assert found == [f"rewards: {count} of {SMALL.steps_per_iteration} (taken as 0)"]
 
 
 def test_totals_of_faulty_rewards_are_shown():

@@ -160,6 +160,44 @@ def test_motors_that_give_no_more_turn_round(hand, tmp_path):
     assert -torque_constants(found.calibration)[0, 4] == pytest.approx(truth, rel=0.05)
 
 
+class Squeezed(BenchHand):
+    """Somebody squeezes the ring finger with 20 N for half a second when the index is first pressed with 3 N."""
+
+    def __init__(self, hand):
+        super().__init__(hand, plates(hand, "index pad"))
+        self.since, self.seen = None, []  # seen: numbers of the exchanges before which the hand reported it
+
+    def exchange(self, command):
+        if self.touched.any():
+            self.seen.append(self.sequence + 1)
+        if self.since is None and self.force[1] > 3.0:
+            self.since = self.time
+        self.touched[3, 40:60] = 1.0 if self.since is not None and self.time < self.since + 0.5 else 0.0
+        return super().exchange(command)
+
+
+def test_a_press_waits_while_safety_holds_the_hand(hand, tmp_path, monkeypatch):
+    """Its target stays where it is, none of the samples is one of the press, and then the press continues."""
+    bench, asked, set_target = Squeezed(hand), {}, Safety.set_target
+
+    def ask(safety, position, *rest):
+        asked[bench.sequence + 1] = np.array(position)
+        set_target(safety, position, *rest)
+
+    monkeypatch.setattr(Safety, "set_target", ask)
+    log = record(bench, hand, arguments(tmp_path, press=QUICK, sides=False))
+    entries, held = list(LogReader(log)), bench.seen
+    assert len(held) > 20 and "hold: the fingertip force is too high" in [entry.content for entry in entries]
+    moved = [asked[number + 1] - asked[number] for number in range(held[0] - 2, held[-1] + 3)]
+    # Two steps before the hold's first request, none until the first request after it, and two more.
+    for step in (moved[1], *moved[-2:]):
+        np.testing.assert_allclose(step, moved[0], atol=1e-9)
+    assert moved[0][4] > 0 and not np.any(moved[2:-2])
+    marks = [entry.content for entry in entries if entry.kind == Kind.TICK]
+    loading = {mark["sequence"] for mark in marks if mark.get("phase") == "loading"}
+    assert {held[0] - 1, held[-1] + 1} < loading and not set(held) & loading
+
+
 def test_nothing_is_overwritten(hand, session, tmp_path):
     _, _, log, _ = session
     path = tmp_path / "hand.toml"

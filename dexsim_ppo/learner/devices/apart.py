@@ -16,7 +16,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec, SingleDeviceSharding
 
 from dexsim.core.compilation import jit
-from dexsim_ppo.learner.sharding import AXIS, Part, shardings
+from dexsim_ppo.learner.devices.sharding import AXIS, Part, shardings
 
 ENGINES = ("warp",)
 """Physics that needs it."""
