@@ -7,8 +7,8 @@ import jax.numpy as jnp
 
 from dexsim.core.errors import ConfigError
 from dexsim_ppo.learner.config import PPOConfig
-from dexsim_ppo.learner.state import TrainState
 from dexsim_ppo.learner.running_stats import recover_stats
+from dexsim_ppo.learner.state import TrainState
 from dexsim_ppo.learner.types import Environment
 from dexsim_ppo.policy import Policy, layout_to_list
 from dexsim_ppo.policy_file import memory_to_list
