@@ -32,7 +32,8 @@ from rich.console import Console
 from rich.table import Table
 
 from dexsim.core import cli
-from dexsim_ppo.training.presets import PRESETS
+from dexsim_ppo.learner.config import PPOConfig
+from dexsim_ppo.training.presets import find_preset
 
 COLUMNS = {
     "compile_s": "compile [s]",
@@ -73,20 +74,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     options, console = parse(argv), Console()
     if options.output:
         cli.check_writable(options.output)
-    config = dataclasses.replace(
-        PRESETS["cpu"].ppo,
-        num_envs=options.num_envs,
-        rollout_length=options.rollout_length,
-        actor_layers=tuple(options.layers),
-        critic_layers=tuple(options.layers),
-    )
     report: dict[str, Any] = {"learners": {}, "engines": {}, "options": vars(options)} | cli.environment_report()
     for name, iterations in zip(options.environments, options.iterations, strict=False):
         rows: dict[str, list[dict]] = {learner: [] for learner in options.learners}
         for seed in options.seeds:
             contest = make(name, options.brax_backend, options.num_envs)
             for learner, row in contend(
-                options.learners, contest, config, seed, options.chunks, iterations, options.episodes
+                options.learners, contest, learning(options, name), seed, options.chunks, iterations, options.episodes
             ).items():
                 rows[learner].append(row)
                 print(json.dumps(cli.plain({"environment": name, "learner": learner, "seed": seed} | row)), flush=True)
@@ -98,6 +92,18 @@ def main(argv: Sequence[str] | None = None) -> int:
         console.print(engine_table(report["engines"]))
     _write(options.output, report)
     return 0
+
+
+def learning(options: argparse.Namespace, environment: str) -> PPOConfig:
+    """Our defaults for this environment on a CPU, with the sizes asked for."""
+    task = environment if environment == "grasp" else f"brax:{environment}"  # from elsewhere
+    return dataclasses.replace(
+        find_preset("cpu", task).ppo,
+        num_envs=options.num_envs,
+        rollout_length=options.rollout_length,
+        actor_layers=tuple(options.layers),
+        critic_layers=tuple(options.layers),
+    )
 
 
 def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
