@@ -76,11 +76,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         cli.check_writable(options.output)
     report: dict[str, Any] = {"learners": {}, "engines": {}, "options": vars(options)} | cli.environment_report()
     for name, iterations in zip(options.environments, options.iterations, strict=False):
-        rows: dict[str, list[dict]] = {learner: [] for learner in options.learners}
+        config, rows = learning(options, name), {learner: list[dict]() for learner in options.learners}
         for seed in options.seeds:
             contest = make(name, options.brax_backend, options.num_envs)
             for learner, row in contend(
-                options.learners, contest, learning(options, name), seed, options.chunks, iterations, options.episodes
+                options.learners, contest, config, seed, options.chunks, iterations, options.episodes
             ).items():
                 rows[learner].append(row)
                 print(json.dumps(cli.plain({"environment": name, "learner": learner, "seed": seed} | row)), flush=True)

@@ -22,7 +22,7 @@ from dexsim.core.config import naming_file
 from dexsim.registry import find_task
 from dexsim_ppo import checkpoint
 from dexsim_ppo.learner.config import PPOConfig
-from dexsim_ppo.learner.ppo import TrainState, collect_rollout, make_normalizers, make_train
+from dexsim_ppo.learner.ppo import TrainState, experience, make_train
 from dexsim_ppo.learner.types import Environment
 from dexsim_ppo.retired import migrate_arguments
 from dexsim_ppo.train import arguments_from_dict
@@ -87,10 +87,7 @@ def findings(env: Environment, config: PPOConfig, state: TrainState) -> Iterator
     for path, leaf in jax.tree.leaves_with_path(state):
         if jnp.issubdtype(leaf.dtype, jnp.floating) and (count := int(jnp.sum(~jnp.isfinite(leaf)))):
             yield f"before it: state{jax.tree_util.keystr(path)}, {count} of {leaf.size} numbers"
-    normalizers = make_normalizers(env, config, state.observation_stats)
-    collect_key = jax.random.split(state.key, 3)[1]
-    _, rollout, tally = jax.jit(lambda state: collect_rollout(env, config, state, normalizers, collect_key))(state)
-    metrics = tally.metrics()
+    _, rollout, tally = jax.jit(lambda state: experience(env, config, state))(state)
     for group, fields in env.observation_layout.items():
         bad, start = ~np.isfinite(np.asarray(rollout.obs[group])), 0
         for field in fields:
@@ -102,7 +99,7 @@ def findings(env: Environment, config: PPOConfig, state: TrainState) -> Iterator
                     f"{group} observation {field.name!r}: {len(set(rows.tolist()))} of {bad.shape[1]} environments "
                     f"({some}), first at step {steps.min()}"
                 )
-    if count := int(metrics["nonfinite_rewards"]):
+    if count := int(tally.metrics()["nonfinite_rewards"]):
         yield f"rewards: {count} of {config.steps_per_iteration} (taken as 0)"
     for name in ("value", "next_value"):
         if count := int(jnp.sum(~jnp.isfinite(getattr(rollout, name)))):

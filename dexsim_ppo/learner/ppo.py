@@ -46,13 +46,7 @@ from dexsim_ppo.learner.running_stats import (
     update_stats,
     value_std,
 )
-from dexsim_ppo.learner.state import (
-    TrainState,
-    init_environments,
-    init_learner,
-    init_memories,
-    init_state,
-)
+from dexsim_ppo.learner.state import TrainState, init_environments, init_learner, init_state
 from dexsim_ppo.learner.types import CurriculumEnvironment, Environment
 from dexsim_ppo.learner.update import Learner, update
 
@@ -106,12 +100,7 @@ def make_train(
         compiled_init = start_apart(
             mesh,
             lambda key: strong_types(init_learner(env, config, key, curriculum)),
-            lambda key, part: strong_types(
-                (
-                    init_environments(env, config, key, curriculum, part=part),
-                    init_memories(env, config, config.num_envs // part.total),
-                )
-            ),
+            lambda key, part: strong_types(init_environments(env, config, key, curriculum, part=part)),
         )
         compiled_step = ApartStep(
             lambda state, part: strong_types(experience(env, config, state, part=part)),

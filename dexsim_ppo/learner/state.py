@@ -45,11 +45,8 @@ def init_state(
     mesh: Mesh | None = None,
 ) -> TrainState:
     """A fresh learner, and freshly reset environments with staggered clocks."""
-    return dataclasses.replace(
-        init_learner(env, config, key, curriculum),
-        env_state=init_environments(env, config, key, curriculum, mesh),
-        memory=init_memories(env, config, config.num_envs),
-    )
+    environments = init_environments(env, config, key, curriculum, mesh)
+    return dataclasses.replace(init_learner(env, config, key, curriculum), env_state=environments)
 
 
 def init_learner(
@@ -78,6 +75,7 @@ def init_learner(
         iteration=jnp.int32(0),
         skipped_updates=jnp.int32(0),
         scale=None if curriculum is None else jnp.float32(curriculum.start),
+        memory=empty(memory, sizes["actor"], (config.num_envs,)),
     )
 
 
@@ -96,9 +94,3 @@ def init_environments(
     if curriculum is not None:
         reset = functools.partial(cast(CurriculumEnvironment, env).reset, scale=jnp.float32(curriculum.start))
     return batched(env.stagger, mesh)(batched(reset, mesh)(resets), staggers)
-
-
-def init_memories(env: Environment, config: PPOConfig, count: int) -> jax.Array | None:
-    """The policy's memory [count, m] at the start of episodes."""
-    size = layout_size(env.observation_layout["actor"])
-    return empty(init_memory(jax.random.key(0), config, size), size, (count,))

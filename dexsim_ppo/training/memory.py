@@ -15,8 +15,7 @@ def needed(program: Any) -> int | None:
     runtime does not say. Of a step of several programs that of the largest. What Warp allocates for itself is not part
     of it."""
     if hasattr(program, "parts"):
-        found = [needed(part) for part in program.parts]
-        return max(size for size in found if size) if all(found) else None
+        return max((size for part in program.parts if (size := needed(part)) is not None), default=None)
     analysis = getattr(program, "memory_analysis", lambda: None)()
     if analysis is None:
         return None

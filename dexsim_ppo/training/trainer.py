@@ -121,9 +121,9 @@ class Run:
             else:
                 fresh = aside.submit(lambda: jax.block_until_ready(training.init(key)))
             traced = lambda: self.clock.update(trace_s=time.perf_counter() - begin)  # noqa: E731
-            if self.mesh is None:
-                step = programs.compile_step(training.plain_step, shapes, self.identity(), traced, self.env.backend)
-            else:  # not cached
+            if identity := self.identity():
+                step = programs.compile_step(training.plain_step, shapes, identity, traced, self.env.backend)
+            else:
                 lowered = cast(Any, training.step).lower(shapes)
                 traced()
                 step = lowered.compile()
@@ -143,7 +143,10 @@ class Run:
         return state
 
     def identity(self) -> Any:
-        """What identifies the training step's program; None for an environment without a fingerprint."""
+        """What identifies the training step's program; None for one of several devices, which is not cached, and for an
+        environment without a fingerprint."""
+        if self.mesh is not None:
+            return None
         fingerprint = getattr(self.env, "fingerprint", lambda: None)()
         return fingerprint and [fingerprint, to_dict(self.config), to_dict(self.arguments.curriculum)]
 

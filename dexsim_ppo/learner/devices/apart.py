@@ -6,6 +6,7 @@ the random numbers of the whole: training is the same up to the order of sums.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -16,7 +17,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec, SingleDeviceSharding
 
 from dexsim.core.compilation import jit
-from dexsim_ppo.learner.devices.sharding import AXIS, Part, shardings
+from dexsim_ppo.learner.devices.sharding import AXIS, Part, copied, shardings, start_on
 
 ENGINES = ("warp",)
 """Physics that needs it."""
@@ -45,15 +46,15 @@ class ApartStep:
         iterations: int,
         backend: str,
     ):
-        self._mesh, self._iterations, self._programs = mesh, iterations, list[Any]()
+        self._mesh, self._iterations, self._numbers = mesh, iterations, own_numbers(mesh)
+        self._lowered, self._programs = list[Any](), list[Any]()
 
-        def collect_part(environments: Any, learner: Any, index: jax.Array) -> Any:
-            return collect(_with(learner, environments), Part(index, mesh.size))
+        def collect_part(environments: Any, learner: Any, number: jax.Array) -> Any:
+            return collect(_with(learner, environments), Part(number, mesh.size))
 
         def learn_from_all(environments: Any, learner: Any, rollout: Any, tally: Any) -> Any:
             state, metrics = learn(_with(learner, environments), rollout, tally)
-            whole = jax.tree.map(lambda _: NamedSharding(mesh, PartitionSpec()), metrics)
-            return jax.lax.with_sharding_constraint((state, metrics), (shardings(state, mesh), whole))
+            return jax.lax.with_sharding_constraint(state, shardings(state, mesh)), copied(metrics, mesh)
 
         self._collect = jit(collect_part, backend=backend, donate_argnums=0)
         self._learn = jit(learn_from_all, backend=backend, donate_argnums=(0, 1))
@@ -62,14 +63,13 @@ class ApartStep:
         """Trace the programs for a state of these shapes and shardings."""
         learner, environments = _without(shapes), (shapes.env_state, shapes.memory)
         self._lowered = []
-        for device in own_devices(self._mesh):
+        for device, number in self._numbers.items():
             where = SingleDeviceSharding(device)
             here = lambda x, where=where: jax.ShapeDtypeStruct(  # noqa: E731
                 x.sharding.shard_shape(x.shape), x.dtype, sharding=where
             )
-            index = jax.ShapeDtypeStruct((), jnp.int32, sharding=where)
             self._lowered.append(
-                self._collect.lower(jax.tree.map(here, environments), jax.tree.map(here, learner), index)
+                self._collect.lower(jax.tree.map(here, environments), jax.tree.map(here, learner), number)
             )
         collected = [
             _shapes_of_all(tree, self._mesh, axis) for tree, axis in zip(self._lowered[0].out_info, _AXES, strict=True)
@@ -81,6 +81,7 @@ class ApartStep:
         """Compile them at the same time."""
         with ThreadPoolExecutor(len(self._lowered)) as pool:
             self._programs = list(pool.map(lambda lowered: lowered.compile(), self._lowered))
+        self._lowered = []
         return self
 
     @property
@@ -106,10 +107,7 @@ class ApartStep:
         learner, environments = _without(state), (state.env_state, state.memory)
         del state
         # All before the first program runs: it donates its part, with which the whole is gone.
-        given = [
-            (_on(device, environments), _on(device, learner), _number(device, self._mesh))
-            for device in own_devices(self._mesh)
-        ]
+        given = [(_on(device, environments), _on(device, learner), number) for device, number in self._numbers.items()]
         collected = [program(*one) for program, one in zip(self._programs[:-1], given, strict=True)]
         del environments, given
         environments, rollout, tally = (
@@ -120,35 +118,31 @@ class ApartStep:
 
 
 def start_apart(
-    mesh: Mesh, learner: Callable[[jax.Array], Any], environments: Callable[[jax.Array, Part], tuple[Any, Any]]
+    mesh: Mesh, learner: Callable[[jax.Array], Any], environments: Callable[[jax.Array, Part], Any]
 ) -> Callable[[jax.Array], Any]:
     """`init(key) -> TrainState` of several programs.
 
     Args:
       learner: `key -> TrainState` without environments.
-      environments: `(key, part) -> (env_state, memory)`.
+      environments: `(key, part) -> env_state`.
     """
+    start = jit(lambda key, number: environments(key, Part(number, mesh.size)), once=True)
 
     def begin(key: jax.Array) -> Any:
-        data, parts = np.asarray(jax.random.key_data(key)), []
-        start = jit(lambda data, index: environments(jax.random.wrap_key_data(data), Part(index, mesh.size)), once=True)
-        for device in own_devices(mesh):
-            parts.append(start(jax.device_put(data, device), _number(device, mesh)))
-        whole = NamedSharding(mesh, PartitionSpec())
-        state = jit(lambda data: learner(jax.random.wrap_key_data(data)), once=True, out_shardings=whole)(data)
-        return _with(state, join(parts, mesh, 0))
+        parts = [start(jax.device_put(key, device), number) for device, number in own_numbers(mesh).items()]
+        state = start_on(mesh, learner, functools.partial(jax.eval_shape, learner))(key)
+        return dataclasses.replace(state, env_state=join(parts, mesh, 0))
 
     return begin
 
 
-def own_devices(mesh: Mesh) -> list[jax.Device]:
-    """The mesh's devices of this process, in its order."""
-    return [device for device in mesh.devices.flat if device.process_index == jax.process_index()]
-
-
-def _number(device: jax.Device, mesh: Mesh) -> jax.Array:
-    """A device's place in the mesh, int32 [] on that device."""
-    return jax.device_put(np.int32(list(mesh.devices.flat).index(device)), device)
+def own_numbers(mesh: Mesh) -> dict[jax.Device, jax.Array]:
+    """The mesh's devices of this process, and on each its place in the mesh, int32 []."""
+    return {
+        device: jax.device_put(np.int32(number), device)
+        for number, device in enumerate(mesh.devices.flat)
+        if device.process_index == jax.process_index()
+    }
 
 
 def join(parts: Sequence[Any], mesh: Mesh, axis: int) -> Any:

@@ -169,7 +169,7 @@ def test_better_needs_the_other_interval_to_be_wholly_below():
 
 
 def test_whatever_the_program_depends_on_identifies_it(tmp_path):
-    """And a step of an environment that cannot say what it is has no identity."""
+    """And a step over several devices, or of an environment that cannot say what it is, has no identity."""
     arguments = TrainArguments(env=TinyConfig(), ppo=CONFIG, curriculum=Curriculum(on=True))
     run = Run(TinyEnv(), arguments, RunFolder(tmp_path), 0.0)
     assert run.identity() is None
@@ -182,6 +182,8 @@ def test_whatever_the_program_depends_on_identifies_it(tmp_path):
     run.arguments = dataclasses.replace(arguments, curriculum=Curriculum(on=True, step=0.5))
     found.append(run.identity())
     assert len({json.dumps(one) for one in found}) == 4
+    run.mesh = SimpleNamespace(size=2)
+    assert run.identity() is None
 
 
 @pytest.mark.parametrize(("own", "backend"), [(False, "jax"), (True, "jax"), (True, "warp")])
