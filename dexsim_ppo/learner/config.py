@@ -47,6 +47,8 @@ class PPOConfig:
     """Upper end of the adaptive learning rate."""
     kl_target: float = setting(0.012, unit="nats", low=0.0)
     """KL divergence per iteration that the learning rate adapts to; 0 keeps the rate fixed."""
+    kl_halving: int = setting(0, unit="iterations", low=0)
+    """Iterations after which `kl_target` has halved; after twice as many it is a third. 0 keeps it."""
     distribution: Literal["gaussian", "tanh"] = setting("gaussian")
     """Gaussian clipped by the environment, or squashed by tanh."""
     critic_first: int = setting(0, unit="iterations", low=0)

@@ -60,7 +60,7 @@ def update(
     learner, metrics = jax.lax.scan(minibatch, learner, order)
     last_epoch = metrics["kl"][-config.minibatches :]
     metrics = jax.tree.map(jnp.nanmean, metrics) | {"kl": jnp.nanmean(last_epoch)}
-    rate = adapt_learning_rate(config, learner.learning_rate, metrics["kl"])
+    rate = adapt_learning_rate(config, learner.learning_rate, metrics["kl"], iterations(config, learner))
     if config.critic_first:  # A policy that does not move says nothing about the rate.
         rate = jnp.where(moves, rate, learner.learning_rate)
     return learner._replace(learning_rate=rate), metrics
@@ -111,10 +111,15 @@ def apply_gradients(config: PPOConfig, learner: Learner, grads: Params) -> tuple
 
 def actor_learns(config: PPOConfig, learner: Learner) -> jax.Array:
     """Whether the initial iterations for the critic alone are over: bool []."""
-    return learner.adam.count >= config.critic_first * config.epochs * config.minibatches
+    return iterations(config, learner) >= config.critic_first
 
 
-def adapt_learning_rate(config: PPOConfig, rate: jax.Array, kl: jax.Array) -> jax.Array:
+def iterations(config: PPOConfig, learner: Learner) -> jax.Array:
+    """How many iterations the learner has taken, skipped minibatches not counted: float32 []."""
+    return learner.adam.count / (config.epochs * config.minibatches)
+
+
+def adapt_learning_rate(config: PPOConfig, rate: jax.Array, kl: jax.Array, iteration: jax.Array) -> jax.Array:
     """The next learning rate []: lower above twice the target KL, higher below half of it, within its bounds.
 
     `kl` [] measures the whole iteration. Adapting after every minibatch would overshoot: once beyond the
@@ -122,7 +127,8 @@ def adapt_learning_rate(config: PPOConfig, rate: jax.Array, kl: jax.Array) -> ja
     """
     if config.kl_target == 0:
         return rate
+    target = config.kl_target / (1.0 + iteration / config.kl_halving) if config.kl_halving else config.kl_target
     slower = jnp.maximum(rate / 1.5, config.learning_rate_min)
     faster = jnp.minimum(rate * 1.5, config.learning_rate_max)
-    rate = jnp.where(kl > 2 * config.kl_target, slower, rate)
-    return jnp.where(kl < 0.5 * config.kl_target, faster, rate)
+    rate = jnp.where(kl > 2 * target, slower, rate)
+    return jnp.where(kl < 0.5 * target, faster, rate)

@@ -220,13 +220,13 @@ class TestAdam:
 class TestConfig:
     def test_learning_rate_adapts_within_its_band(self):
         config = PPOConfig(learning_rate=1e-3, learning_rate_min=9e-4, learning_rate_max=1.2e-3, kl_target=0.01)
-        rate = lambda kl: float(adapt_learning_rate(config, jnp.float32(1e-3), jnp.float32(kl)))  # noqa: E731
+        rate = lambda kl: float(adapt_learning_rate(config, jnp.float32(1e-3), jnp.float32(kl), 0))  # noqa: E731
         assert [rate(kl) for kl in (0.0, 0.006, 0.01, 0.021)] == pytest.approx([1.2e-3, 1e-3, 1e-3, 9e-4])
         config = dataclasses.replace(config, learning_rate_min=1e-5, learning_rate_max=1e-1)
         wide = [1.5e-3, 1e-3, 1e-3, 1e-3 / 1.5]
         assert [rate(kl) for kl in (0.0049, 0.0051, 0.0199, 0.0201)] == pytest.approx(wide)
         fixed = dataclasses.replace(config, kl_target=0.0)
-        assert float(adapt_learning_rate(fixed, jnp.float32(1e-3), jnp.float32(9.0))) == pytest.approx(1e-3)
+        assert float(adapt_learning_rate(fixed, jnp.float32(1e-3), jnp.float32(9.0), 0)) == pytest.approx(1e-3)
 
     @pytest.mark.parametrize(
         ("values", "said"),
