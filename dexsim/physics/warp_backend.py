@@ -58,10 +58,12 @@ class WarpBackend(MjxBackend):
 
 def _order_atomics() -> None:
     """Have kernels that are not compiled yet sort their atomic additions, so that results repeat on one kind of GPU."""
-    import mujoco.mjx.third_party.mujoco_warp  # noqa: F401  (its kernels, which Warp compiles at their first launch)
     import warp
 
-    warp.config.deterministic = warp.DeterministicMode.RUN_TO_RUN  # kernels that are made from here on
+    # Modules that are made from here on: some of MuJoCo's kernels have one each, without a name to find it by.
+    warp.config.deterministic = warp.DeterministicMode.RUN_TO_RUN
+    import mujoco.mjx.third_party.mujoco_warp  # noqa: F401  (its kernels, which Warp compiles at their first launch)
+
     for name in [name for name in sys.modules if name.startswith("mujoco.mjx.third_party.mujoco_warp")]:
         warp.set_module_options({"deterministic": warp.config.deterministic}, name)
 

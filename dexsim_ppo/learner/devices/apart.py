@@ -48,6 +48,8 @@ class ApartStep:
     ):
         self._mesh, self._iterations, self._numbers = mesh, iterations, own_numbers(mesh)
         self._lowered, self._programs = list[Any](), list[Any]()
+        # A device's kernels are launched by the thread that calls its program: one thread would start them in turn.
+        self._threads = ThreadPoolExecutor(mesh.size)
 
         def collect_part(environments: Any, learner: Any, number: jax.Array) -> Any:
             return collect(_with(learner, environments), Part(number, mesh.size))
@@ -79,8 +81,7 @@ class ApartStep:
 
     def compile(self) -> "ApartStep":
         """Compile them at the same time."""
-        with ThreadPoolExecutor(len(self._lowered)) as pool:
-            self._programs = list(pool.map(lambda lowered: lowered.compile(), self._lowered))
+        self._programs = list(self._threads.map(lambda lowered: lowered.compile(), self._lowered))
         self._lowered = []
         return self
 
@@ -108,7 +109,7 @@ class ApartStep:
         del state
         # All before the first program runs: it donates its part, with which the whole is gone.
         given = [(_on(device, environments), _on(device, learner), number) for device, number in self._numbers.items()]
-        collected = [program(*one) for program, one in zip(self._programs[:-1], given, strict=True)]
+        collected = list(self._threads.map(lambda program, one: program(*one), self._programs[:-1], given))
         del environments, given
         environments, rollout, tally = (
             join([part[i] for part in collected], self._mesh, axis) for i, axis in enumerate(_AXES)
