@@ -248,7 +248,9 @@ def default_arguments(task: str | None, preset: str, begun: checkpoint.Checkpoin
     default = preset_arguments(name, entry.config(), preset)
     if begun:
         env = from_dict(entry.config_class, begun.env_config)
-        default = dataclasses.replace(default, env=env, ppo=fine_tuning_config(begun, default.ppo))
+        default = dataclasses.replace(
+            default, env=env, ppo=fine_tuning_config(begun, default.ppo), curriculum=Curriculum()
+        )
         default = dataclasses.replace(default, hand=begun.hand["file"] if begun.hand else "")
     return default
 

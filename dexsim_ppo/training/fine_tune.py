@@ -32,6 +32,7 @@ def fine_tuning_config(policy: Policy, config: PPOConfig) -> PPOConfig:
         learning_rate_min=1e-6,
         learning_rate_max=5e-4,
         kl_target=2e-4,
+        kl_halving=0,
         initial_std=0.2,
         critic_first=100,
     )

@@ -225,6 +225,11 @@ class TestConfig:
         config = dataclasses.replace(config, learning_rate_min=1e-5, learning_rate_max=1e-1)
         wide = [1.5e-3, 1e-3, 1e-3, 1e-3 / 1.5]
         assert [rate(kl) for kl in (0.0049, 0.0051, 0.0199, 0.0201)] == pytest.approx(wide)
+        halved = dataclasses.replace(config, kl_target=0.04, kl_halving=100)
+        for iteration, target in ((0, 0.04), (100, 0.02), (300, 0.01)):
+            for share, factor in ((0.49, 1.5), (0.51, 1.0), (1.99, 1.0), (2.01, 1 / 1.5)):
+                after = adapt_learning_rate(halved, jnp.float32(1e-3), jnp.float32(share * target), iteration)
+                assert float(after) == pytest.approx(1e-3 * factor), (iteration, share)
         fixed = dataclasses.replace(config, kl_target=0.0)
         assert float(adapt_learning_rate(fixed, jnp.float32(1e-3), jnp.float32(9.0), 0)) == pytest.approx(1e-3)
 

@@ -5,6 +5,7 @@ import dataclasses
 import jax
 import pytest
 
+import dexsim
 from dexsim.tasks.grasp.config import GraspConfig
 from dexsim.tasks.rotate.config import RotateConfig
 from dexsim_ppo import train
@@ -57,6 +58,19 @@ def test_rotation_has_less_noise_and_more_updates(task):
     assert gpu[0].num_envs == 4 * gpu[1].num_envs, "a quarter of the environments"
     small, large = (find_preset(name, "rotate") for name in ("cpu", "cpu-large"))
     assert small.ppo.num_envs < large.ppo.num_envs and small.minutes > large.minutes
+
+
+def test_rotation_on_a_cpu_begins_on_nearly_nominal_hands():
+    """And no other training does, fine-tuning included: its policy knows the full ranges."""
+    for name, task, widens in (("cpu", "rotate", True), ("cpu-large", "rotate", True), ("gpu", "rotate", False)):
+        preset = find_preset(name, task)
+        assert preset.curriculum.on == widens and bool(preset.ppo.kl_halving) == widens
+    assert not find_preset("cpu", "rotate_without_orientation").curriculum.on, "fewer turns than the threshold"
+    assert not find_preset("cpu", "grasp").curriculum.on
+    scratch, tuned = (train.default_arguments("rotate", "cpu", begun) for begun in (None, load_policy("rotate")))
+    assert scratch.curriculum.on and not tuned.curriculum.on and not tuned.ppo.kl_halving
+    env = dexsim.make("rotate", RotateConfig(pool_size=8), backend="c", num_envs=2)
+    assert scratch.curriculum.metric.removeprefix("episode/") in env.reset(jax.random.key(0)).metrics
 
 
 def test_a_policy_is_fine_tuned_with_little_noise_and_small_steps():
