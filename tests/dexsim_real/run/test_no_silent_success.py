@@ -86,12 +86,12 @@ def test_a_camera_that_is_lost(tmp_path):
     thread = threading.Thread(target=show)
     thread.start()
     with FollowingHand() as peer:
-        options = arguments(peer, tmp_path, "--seconds", "9", "--safety.patience", "0.3")
+        options = arguments(peer, tmp_path, "--seconds", "30", "--safety.patience", "0.3")
         options[options.index("--fixed-object")] = f"--camera=unix:{tmp_path / 'masks'}"
         assert run.main(options) == 1
         on, seconds = peer.on(), np.ptp(peer.times)
     thread.join()
-    assert on.any() and not on[-1] and seconds < 5
+    assert on.any() and not on[-1] and seconds < 20, "of 30: the pictures last 1.2 s, a busy machine some more"
     assert summary(tmp_path)["end"] == "stopped: the camera sends no more pictures for 0.3 s"
 
 
