@@ -111,7 +111,7 @@ def apply_gradients(config: PPOConfig, learner: Learner, grads: Params) -> tuple
 
 def actor_learns(config: PPOConfig, learner: Learner) -> jax.Array:
     """Whether the initial iterations for the critic alone are over: bool []."""
-    return iterations(config, learner) >= config.critic_first
+    return learner.adam.count >= config.critic_first * config.epochs * config.minibatches
 
 
 def iterations(config: PPOConfig, learner: Learner) -> jax.Array:
