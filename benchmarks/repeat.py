@@ -18,7 +18,7 @@ from typing import Any
 import jax
 import numpy as np
 from throughput import Recorder, make
-from throughput_split import record
+from throughput_split import record, replay
 
 from dexsim.core.cli import enable_caches
 from dexsim.core.compilation import collector_paused, jit, make_deterministic
@@ -33,22 +33,14 @@ def parts(task: str, backend: str, num_envs: int, warmup: int) -> Iterator[tuple
     ppo_config = find_preset("gpu" if jax.default_backend() == "gpu" else "cpu", task).ppo
     config = dataclasses.replace(ppo_config, num_envs=num_envs, iterations_per_call=1)
     training, compiled = ppo.make_train(env, config), functools.partial(jit, backend=env.backend)
-    yield "pool of start states", lambda env: env.pool, make(task, "full", backend, num_envs)
+    yield "pool of start states", lambda pool: pool, env.pool
     yield "initial state", training.init, jax.random.key(0)
     state = training.init(jax.random.key(0))
     for _ in range(warmup):  # else nothing touches anything
         state, _ = training.step(state)
-    (ticks, _) = compiled(lambda state: record(recorder, config, state))(state)
-    object, before, push, cover, tape, *_ = jax.tree.map(lambda x: x[0], ticks)
-
-    def tick(given):
-        return jax.vmap(
-            lambda object, state, push, cover, tape: env.physics.advance(
-                object, state, lambda substep, *_: tape[substep], push, cover
-            )
-        )(*given)
-
-    yield "physics of a tick", compiled(tick), (object, before, push, cover, tape)
+    ticks, _ = compiled(lambda state: record(recorder, config, state))(state)
+    first = jax.tree.map(lambda x: x[0], ticks)
+    yield "physics of a tick", compiled(lambda tick: replay(env, tick)), first
     collect = compiled(lambda state: ppo.experience(env, config, state))
     yield "experience", collect, state
     (env_state, memory), rollout, tally = collect(state)

@@ -119,16 +119,17 @@ def environment(env: Env, state: Any, actions: jax.Array) -> Any:
 def physics(env: Env, ticks: Any) -> jax.Array:
     """The recorded ticks, each from its own start."""
 
-    def tick(_, given):
-        object, state, push, cover, tape, *_ = given
-        after, force = jax.vmap(
-            lambda object, state, push, cover, tape: env.physics.advance(
-                object, state, lambda substep, position, velocity: tape[substep], push, cover
-            )
-        )(object, state, push, cover, tape)
-        return None, _used((after, force))
+    return jax.lax.scan(lambda _, given: (None, _used(replay(env, given))), None, ticks)[1]
 
-    return jax.lax.scan(tick, None, ticks)[1]
+
+def replay(env: Env, tick: Any) -> Any:
+    """Physics of one recorded tick of all environments: what is after it, and the fingers' forces."""
+    object, state, push, cover, tape, *_ = tick
+    return jax.vmap(
+        lambda object, state, push, cover, tape: env.physics.advance(
+            object, state, lambda substep, position, velocity: tape[substep], push, cover
+        )
+    )(object, state, push, cover, tape)
 
 
 def touch(env: Env, ticks: Any, key: jax.Array) -> jax.Array:

@@ -103,12 +103,10 @@ def find_preset(name: str, task: str) -> Preset:
         return replace(preset, ppo=replace(ppo, num_envs=8192, memory="none"), minutes=5.0)
     # Large steps find the gait, smaller ones refine it.
     ppo, curriculum = replace(ppo, kl_halving=400), _WIDENING if task == "rotate" else Curriculum()
-    if preset is PRESETS["cpu-large"]:
-        sizes = {"minutes": 15.0, "evaluation_chunk": 256, "evaluation_episodes": 256}
-    else:
-        ppo = replace(ppo, num_envs=512)
-        sizes = {"minutes": 30.0, "evaluation_chunk": 64, "evaluation_episodes": 256}
-    return replace(preset, ppo=ppo, curriculum=curriculum, **sizes)
+    preset = replace(preset, curriculum=curriculum, evaluation_episodes=256)
+    if name == "cpu-large":
+        return replace(preset, ppo=ppo, minutes=15.0, evaluation_chunk=256)
+    return replace(preset, ppo=replace(ppo, num_envs=512), minutes=30.0, evaluation_chunk=64)
 
 
 def device_preset() -> str:
