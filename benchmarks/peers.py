@@ -96,9 +96,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def learning(options: argparse.Namespace, environment: str) -> PPOConfig:
     """Our defaults for this environment on a CPU, with the sizes asked for."""
-    task = environment if environment == "grasp" else f"brax:{environment}"  # from elsewhere
     return dataclasses.replace(
-        find_preset("cpu", task).ppo,
+        find_preset("cpu", environment).ppo,
         num_envs=options.num_envs,
         rollout_length=options.rollout_length,
         actor_layers=tuple(options.layers),

@@ -37,7 +37,7 @@ from dexsim_ppo.retired import migrate_arguments
 from dexsim_ppo.training import processes
 from dexsim_ppo.training.arguments import TrainArguments, check_resumed, find_hand, printable, training_config
 from dexsim_ppo.training.fine_tune import check_fit, fine_tuning_config
-from dexsim_ppo.training.presets import Preset, device_preset, find_preset
+from dexsim_ppo.training.presets import preset_arguments
 from dexsim_ppo.training.runlog import RunFolder, check_wandb, new_folder, taken
 from dexsim_ppo.training.seeds import seed_folder, write_summary
 from dexsim_ppo.training.together import train_together
@@ -308,15 +308,6 @@ def parse_arguments(argv: list[str]) -> tuple[TrainArguments, checkpoint.Checkpo
         with cli.naming_options(generic[type(default.env)], default):
             check_resumed(arguments, default)
     return arguments, begun
-
-
-def preset_arguments(task: str, env_config: Any, name: str) -> TrainArguments:
-    """The options' defaults under a preset."""
-    if name == "auto":
-        name = device_preset()
-    preset = find_preset(name, task)
-    values = {f.name: getattr(preset, f.name) for f in dataclasses.fields(Preset)}
-    return TrainArguments(env=env_config, task=task, **values)
 
 
 def arguments_from_dict(config_class: type[Any], data: dict[str, Any]) -> TrainArguments:

@@ -110,10 +110,11 @@ def test_console_command_exists(line):
 
 def parse_train(argv: list[str]) -> None:
     from dexsim_ppo import train
+    from dexsim_ppo.training.presets import preset_arguments
 
     task = argv[argv.index("--task") + 1] if "--task" in argv else "grasp"
     entry = registry.find_task(task)
-    default = train.preset_arguments(task, entry.config(), "cpu")
+    default = preset_arguments(task, entry.config(), "cpu")
     cli.parse(train.TrainArguments[entry.config_class], argv, prog="train", description="", default=default)
 
 

@@ -1,12 +1,14 @@
 """Training defaults per device: sizes and durations."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import jax
 
 from dexsim.core.compilation import available_cores
 from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.curriculum import Curriculum
+from dexsim_ppo.training.arguments import TrainArguments
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,17 +32,20 @@ class Preset:
     """Share of training episodes whose hand or object takes the extreme of every range."""
     curriculum: Curriculum = Curriculum()
     """How the ranges widen during training."""
+    episode_seconds: float = 0.0
+    """Length of an episode in training, in s; 0 for the task's own."""
 
 
-# Two cores: simulation takes nearly all of the time, so small networks, many passes over little data, and large steps.
+# Two cores: simulation takes nearly all of the time, so small networks and many passes over little data. Our tasks take
+# large steps, which become smaller; see `find_preset`.
 _CPU = Preset(
     ppo=PPOConfig(
         num_envs=256,
         rollout_length=16,
         epochs=5,
         minibatches=4,
-        learning_rate=1e-3,
-        kl_target=0.04,
+        learning_rate=5e-4,
+        kl_target=0.02,
         actor_layers=(128, 128),
         critic_layers=(128, 128),
     ),
@@ -91,22 +96,37 @@ PRESETS = {
 
 
 def find_preset(name: str, task: str) -> Preset:
-    """The preset of a device, adapted to the task."""
+    """The preset of a device, adapted to our tasks; `task` is a name without its module."""
     preset = PRESETS.get(name, PRESETS["cpu"])
-    if ":" in task and name != "gpu":  # From elsewhere: steps as large as ours take would end Pendulum's learning.
-        return replace(preset, ppo=replace(preset.ppo, learning_rate=5e-4, kl_target=0.02))
-    if not task.startswith("rotate"):
+    grasp, rotate, cpu = task == "grasp", task.startswith("rotate"), name != "gpu"
+    if not (grasp or rotate):
         return preset
+    if cpu:  # Large steps find a skill, smaller ones refine it. They would end Pendulum's learning.
+        preset = replace(preset, ppo=replace(preset.ppo, learning_rate=1e-3, kl_target=0.04, kl_halving=150))
+    if grasp and not cpu:
+        return preset
+    if grasp:
+        # A force follows its command within tenths of a second, so a short horizon is enough and is learnt from fewer
+        # steps. Short episodes practise the catch, in which most of the lost objects are lost.
+        return replace(preset, ppo=replace(preset.ppo, discount=0.97), episode_seconds=3.0)
     # A gait needs less noise than a grasp, which has to explore forces.
     ppo = replace(preset.ppo, epochs=4, minibatches=16, entropy_coefficient=0.001)
-    if name == "gpu":  # A quarter of the environments: four times the updates from the same experience, for the gait.
+    if not cpu:  # A quarter of the environments: four times the updates from the same experience, for the gait.
         return replace(preset, ppo=replace(ppo, num_envs=8192, memory="none"), minutes=5.0)
-    # Large steps find the gait, smaller ones refine it.
-    ppo, curriculum = replace(ppo, kl_halving=400), _WIDENING if task == "rotate" else Curriculum()
-    preset = replace(preset, curriculum=curriculum, evaluation_episodes=256)
+    curriculum = _WIDENING if task == "rotate" else Curriculum()
+    preset = replace(preset, ppo=replace(ppo, kl_halving=400), curriculum=curriculum, evaluation_episodes=256)
     if name == "cpu-large":
-        return replace(preset, ppo=ppo, minutes=15.0, evaluation_chunk=256)
-    return replace(preset, ppo=replace(ppo, num_envs=512), minutes=30.0, evaluation_chunk=64)
+        return replace(preset, minutes=15.0, evaluation_chunk=256)
+    return replace(preset, ppo=replace(preset.ppo, num_envs=512), minutes=30.0, evaluation_chunk=64)
+
+
+def preset_arguments(task: str, env_config: Any, name: str) -> TrainArguments:
+    """The options' defaults under a preset."""
+    preset = find_preset(device_preset() if name == "auto" else name, task)
+    values = {f.name: getattr(preset, f.name) for f in fields(Preset)}
+    if seconds := values.pop("episode_seconds"):
+        env_config = replace(env_config, episode_seconds=seconds)
+    return TrainArguments(env=env_config, task=task, **values)
 
 
 def device_preset() -> str:

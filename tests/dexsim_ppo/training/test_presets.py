@@ -14,7 +14,7 @@ from dexsim_ppo.policy import load_policy
 from dexsim_ppo.training import presets
 from dexsim_ppo.training.arguments import printable, training_config
 from dexsim_ppo.training.fine_tune import fine_tuning_config
-from dexsim_ppo.training.presets import PRESETS, device_preset, find_preset
+from dexsim_ppo.training.presets import PRESETS, device_preset, find_preset, preset_arguments
 
 
 @pytest.mark.parametrize(
@@ -32,23 +32,42 @@ def test_what_the_manual_says_of_defaults():
     assert {name: find_preset(name, "grasp").extremes for name in PRESETS} == {"cpu": 0, "cpu-large": 0, "gpu": 0.6}
     assert find_preset("cpu", "rotate").minutes == 30
     assert all(preset.steps == 0 and 0 < preset.minutes <= 10 for preset in PRESETS.values())
-    assert find_preset("tpu", "grasp") is PRESETS["cpu"]
+    assert find_preset("tpu", "grasp") == find_preset("cpu", "grasp")
 
 
-def test_environments_from_elsewhere_are_trained_in_smaller_steps_on_cpus():
-    """Pendulum: -847, -158 and -452 with the steps of our tasks, after -153."""
-    for name in ("cpu", "cpu-large", "tpu"):
-        ours, other = (find_preset(name, task).ppo for task in ("grasp", "package:make_env"))
-        assert other.kl_target == 0.5 * ours.kl_target and other.learning_rate == 0.5 * ours.learning_rate
-        assert dataclasses.replace(other, kl_target=ours.kl_target, learning_rate=ours.learning_rate) == ours
-    assert find_preset("gpu", "package:make_env") is PRESETS["gpu"]
+@pytest.mark.parametrize("task", ["reach_env:reach", "poke_task:poke"])
+def test_tasks_from_elsewhere_get_no_setting_of_ours(task):
+    """Pendulum: -847, -158 and -452 with the steps of our tasks on a CPU, after -153."""
+    for name in PRESETS:
+        ours = preset_arguments("grasp", GraspConfig(), name)
+        given, _ = train.parse_arguments(["--task", task, "--preset", name])
+        default = PPOConfig()
+        for field in ("learning_rate", "discount", "kl_halving"):
+            assert getattr(given.ppo, field) == getattr(default, field)
+        assert given.ppo.kl_target == (0.5 if name != "gpu" else 1.0) * ours.ppo.kl_target
+        assert given.ppo.num_envs == ours.ppo.num_envs and not given.curriculum.on
+
+
+def test_grasp_trains_on_short_episodes_on_cpus():
+    """And is judged, and made by `dexsim.make`, with the task's own."""
+    own = GraspConfig()
+    for name in ("cpu", "cpu-large"):
+        arguments, _ = train.parse_arguments(["--preset", name])
+        assert arguments.env == dataclasses.replace(own, episode_seconds=3.0)
+        assert arguments.ppo.discount < PPOConfig().discount
+        given, _ = train.parse_arguments(["--preset", name, "--env.episode-seconds", "7"])
+        assert given.env.episode_seconds == 7
+    arguments, _ = train.parse_arguments(["--preset", "gpu"])
+    assert arguments.env == own and arguments.ppo.discount == PPOConfig().discount
+    tuned = train.default_arguments("grasp", "cpu", load_policy("grasp"))
+    assert tuned.env.episode_seconds == own.episode_seconds
 
 
 @pytest.mark.parametrize("task", ["rotate", "rotate_without_orientation", "rotate_clear"])
 def test_rotation_has_less_noise_and_more_updates(task):
     for name in PRESETS:
         grasp, rotate = find_preset(name, "grasp"), find_preset(name, task)
-        assert grasp == PRESETS[name] and rotate.extremes == grasp.extremes
+        assert rotate.extremes == grasp.extremes
         assert rotate.ppo.entropy_coefficient == find_preset("gpu", task).ppo.entropy_coefficient
         updates = [p.epochs * p.minibatches / p.steps_per_iteration for p in (grasp.ppo, rotate.ppo)]
         assert updates[1] > updates[0] or name == "cpu-large"
@@ -90,17 +109,17 @@ def test_training_has_no_force_loop_and_the_policy_keeps_its_configuration():
     config = GraspConfig()
     force = dataclasses.replace(config.control.force, gain=0.5)
     config = dataclasses.replace(config, control=dataclasses.replace(config.control, force=force))
-    arguments = dataclasses.replace(train.preset_arguments("grasp", config, "cpu"), extremes=0.0)
+    arguments = dataclasses.replace(preset_arguments("grasp", config, "gpu"), extremes=0.0)
     trained = training_config(arguments)
     assert trained.control.force == dataclasses.replace(force, gain=0.0) and arguments.env == config
     back = dataclasses.replace(trained.control, force=force)
     assert dataclasses.replace(trained, control=back) == config, "nothing else changes"
-    plain = train.preset_arguments("rotate", RotateConfig(), "cpu")
+    plain = preset_arguments("rotate", RotateConfig(), "cpu")
     assert training_config(plain) is plain.env, "by which an evaluation knows that it may use the same environment"
 
 
 def test_where_a_run_was_written_is_not_part_of_its_options(tmp_path):
-    arguments = train.preset_arguments("rotate", RotateConfig(), "cpu")
+    arguments = preset_arguments("rotate", RotateConfig(), "cpu")
     here = dataclasses.replace(arguments, run_dir=tmp_path, resume=tmp_path, config=tmp_path, seed=5)
     data = printable(here)
     assert str(tmp_path) not in str(data) and not {"run_dir", "resume", "config"} & set(data)
