@@ -19,6 +19,7 @@ def screen(monkeypatch):
             super().__init__(file=out, width=80, force_terminal=bool(terminal))
 
     monkeypatch.setattr(console, "Console", Screen)
+    monkeypatch.setenv("TERM", "xterm")
     return out, terminal
 
 

@@ -37,7 +37,7 @@ def finished(tmp_path):
 
 CHANGES = {
     "seed": (["--seed", "9"], "--seed 9: a resumed run keeps its 3"),
-    "learner": (["--ppo.learning-rate", "5e-4"], "--ppo.learning-rate 0.0005: a resumed run keeps its 0.001"),
+    "learner": (["--ppo.learning-rate", "1e-3"], "--ppo.learning-rate 0.001: a resumed run keeps its 0.0005"),
     "task": (["--env.gain", "0.5"], "--env.gain 0.5: a resumed run keeps its 0.25"),
     "curriculum": (["--curriculum.on"], "--curriculum.on True: a resumed run keeps its False"),
     "extremes": (["--extremes", "0.5"], "--extremes 0.5: a resumed run keeps its 0"),
@@ -53,7 +53,7 @@ def test_what_would_change_the_training_is_refused_and_the_rest_applies(finished
         assert str(refused.value).startswith(said) and "\n" not in str(refused.value)
     with pytest.raises(ConfigError, match=r"TrainArguments\.seed = 9: a resumed run keeps its 3"):
         train.train_policy(resume=finished.path, seed=9)
-    same = ["--seed", "3", "--ppo.learning-rate", "1e-3"]
+    same = ["--seed", "3", "--ppo.learning-rate", "5e-4"]
     looks_on = ["--steps", str(3 * PER_ITERATION), "--evaluation-episodes", "32", "--log-every", "2"]
     assert train.main(["--resume", str(finished.path), *same, *looks_on]) == 0
     report = json.loads(finished.report.read_text())

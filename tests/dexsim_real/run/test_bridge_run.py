@@ -66,6 +66,7 @@ def test_motors_off_means_off_and_the_view_says_what_is_read(tmp_path, monkeypat
 
 
 def test_the_live_table(monkeypatch):
+    monkeypatch.setenv("TERM", "xterm")
     shown = io.StringIO()
     console = Console(file=shown, force_terminal=True, width=80)
     monkeypatch.setattr(status, "Console", lambda **options: console)
