@@ -44,7 +44,8 @@ def test_tasks_from_elsewhere_get_no_setting_of_ours():
         for field in ("learning_rate", "discount", "kl_halving"):
             assert getattr(given.ppo, field) == getattr(default, field)
         assert given.ppo.kl_target == (0.5 if name != "gpu" else 1.0) * ours.ppo.kl_target
-        assert given.ppo.num_envs == ours.ppo.num_envs and not given.curriculum.on
+        assert given.ppo == PRESETS[name].ppo and not given.curriculum.on
+    assert find_preset("tpu", "reach") is PRESETS["cpu"]
 
 
 def test_grasp_trains_on_short_episodes_on_cpus():

@@ -20,7 +20,8 @@ pytestmark = pytest.mark.usefixtures("jax_as_it_is")
 
 def test_a_run_from_the_measured_pose_to_motors_off_and_its_replay(hand, tmp_path):
     with FollowingHand() as peer:
-        assert run.main(arguments(peer, tmp_path, "--seconds", "1.2", "--command", "0.6", "--link.margin", "0.1")) == 0
+        patient = ("--link.margin", "0.5")  # on a busy machine an answer takes longer than 0.1 s
+        assert run.main(arguments(peer, tmp_path, "--seconds", "1.2", "--command", "0.6", *patient)) == 0
         on, commands = peer.on(), peer.commands
     first = int(np.argmax(on))
     # Off while zeroing and warming, on at the measured pose, without a break until the end, then off.
@@ -33,14 +34,10 @@ def test_a_run_from_the_measured_pose_to_motors_off_and_its_replay(hand, tmp_pat
     report = summary(tmp_path)
     assert report["end"] == "time is over" and report["command"] == 0.6
     assert report["policy_jitter"]["count"] == pytest.approx(1.2 * 100 / 3, abs=15)
-    # And the version, serial number and side. On a busy machine single answers miss their deadline.
-    link = report["link"]
-    assert (
-        link["sent"] == link["answered"] + link["silent"] == len(commands) + 3 and link["silent"] < 0.05 * link["sent"]
-    )
+    # And the version, serial number and side.
+    assert report["link"]["sent"] == report["link"]["answered"] == len(commands) + 3
     # Everything is in the log: each frame, and each tick with the frame that it saw.
-    assert len(records(tmp_path, Kind.SENT)) == link["sent"]
-    assert link["answered"] <= len(records(tmp_path, Kind.RECEIVED)) <= link["sent"]
+    assert len(records(tmp_path, Kind.RECEIVED)) == len(records(tmp_path, Kind.SENT)) == len(commands) + 3
     ticks = records(tmp_path, Kind.TICK)
     assert [tick["readings"]["command"] for tick in ticks] == [np.float32(0.6)] * len(ticks)
     for before, after in zip(ticks[:-1], ticks[1:], strict=True):
