@@ -32,8 +32,6 @@ class Preset:
     """Share of training episodes whose hand or object takes the extreme of every range."""
     curriculum: Curriculum = Curriculum()
     """How the ranges widen during training."""
-    episode_seconds: float = 0.0
-    """Length of an episode in training, in s; 0 for the task's own."""
 
 
 # Two cores: simulation takes nearly all of the time, so small networks and many passes over little data. Our tasks take
@@ -104,8 +102,7 @@ def find_preset(name: str, task: str) -> Preset:
         preset = replace(preset, ppo=replace(preset.ppo, learning_rate=1e-3, kl_target=0.04, kl_halving=150))
     if grasp:
         # A force follows its command within tenths of a second: a short horizon is enough, and learnt from fewer steps.
-        # Short episodes practise the catch, in which most of the lost objects are lost. Neither is tried on a GPU yet.
-        return replace(preset, ppo=replace(preset.ppo, discount=0.97), episode_seconds=3.0) if cpu else preset
+        return replace(preset, ppo=replace(preset.ppo, discount=0.97))
     # A gait needs less noise than a grasp, which has to explore forces.
     ppo = replace(preset.ppo, epochs=4, minibatches=16, entropy_coefficient=0.001)
     if not cpu:  # A quarter of the environments: four times the updates from the same experience, for the gait.
@@ -120,10 +117,7 @@ def find_preset(name: str, task: str) -> Preset:
 def preset_arguments(task: str, env_config: Any, name: str) -> TrainArguments:
     """The options' defaults under a preset."""
     preset = find_preset(device_preset() if name == "auto" else name, task)
-    values = {f.name: getattr(preset, f.name) for f in fields(Preset)}
-    if seconds := values.pop("episode_seconds"):
-        env_config = replace(env_config, episode_seconds=seconds)
-    return TrainArguments(env=env_config, task=task, **values)
+    return TrainArguments(env=env_config, task=task, **{f.name: getattr(preset, f.name) for f in fields(Preset)})
 
 
 def device_preset() -> str:

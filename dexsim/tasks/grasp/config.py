@@ -54,10 +54,10 @@ class GraspConfig(EnvConfig):
     control: Control = setting(Control(reach=0.33, force=ForceLoop(gain=0.5, limit=1.5)))
     """From action to joint target. The reach keeps the thumb's joints below their torque limit, where force could not
     follow a command. The force loop is for use: training goes without."""
-    episode_seconds: float = setting(6.0, unit="s", low=0.2, high=3600.0)
-    """Training episode length. Force is scored from 3 s on, so it must be longer than that."""
+    episode_seconds: float = setting(3.0, unit="s", low=0.2, high=3600.0)
+    """Training episode length. Short episodes practise the catch, in which most of the lost objects are lost."""
     evaluation_seconds: float = setting(8.0, unit="s", low=0.2, high=3600.0)
-    """Evaluation episode length; the object must be held this long."""
+    """Evaluation episode length; the object must be held this long. Force is scored from 3 s on."""
     finger_force: tuple[float, float] = setting((1.2, 4.8), unit="N", low=0.05, high=40.0)
     """Target of each touching finger but the thumb, at command 0 and 1: what the thumb can oppose with four fingers."""
     max_force: float = setting(6.9, unit="N", low=0.5, high=200.0)
