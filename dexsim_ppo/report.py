@@ -76,9 +76,9 @@ def print_report(report: dict[str, Any], do_nothing: dict[str, Any] | None, *, t
     from rich.console import Console
     from rich.table import Table
 
-    idle = do_nothing and _headline(do_nothing)
+    idle = do_nothing and headline(do_nothing)
     table = Table("measure", "value", "95 % interval", *(["doing nothing"] if idle else []), title=title)
-    for name, entry in _headline(report).items():
+    for name, entry in headline(report).items():
         low, high = entry.get("low"), entry.get("high")
         span = "" if low is None or high is None else f"{low:.4g} .. {high:.4g}"
         beside = [_number(idle.get(name, {}).get("value"))] if idle else []
@@ -87,10 +87,10 @@ def print_report(report: dict[str, Any], do_nothing: dict[str, Any] | None, *, t
     print(f"{report['episodes']} episodes of {report['steps']} steps, seed {report['seed']}, {report['seconds']:.1f} s")
 
 
-def _headline(report: dict[str, Any]) -> dict[str, dict[str, Any]]:
+def headline(report: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """Names of the task's headline, or else the share held, and the return: value, low and high."""
-    headline = report["task"].get("headline") or {"held": report["held"]}
-    rows = {name: entry if isinstance(entry, dict) else {"value": entry} for name, entry in headline.items()}
+    own = report["task"].get("headline") or {"held": report["held"]}
+    rows = {name: entry if isinstance(entry, dict) else {"value": entry} for name, entry in own.items()}
     return rows | {"return": report["return"]}
 
 

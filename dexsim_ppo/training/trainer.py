@@ -23,7 +23,7 @@ from dexsim_ppo.learner.devices.sharding import learned, place
 from dexsim_ppo.learner.ppo import TrainState, make_train
 from dexsim_ppo.learner.types import Environment
 from dexsim_ppo.policy import Policy
-from dexsim_ppo.report import print_report, surely_better
+from dexsim_ppo.report import headline, print_report, surely_better
 from dexsim_ppo.training import memory, processes, programs
 from dexsim_ppo.training.arguments import TrainArguments, printable, training_config
 from dexsim_ppo.training.display import Display
@@ -263,7 +263,8 @@ class Run:
         """Evaluate the policy, and save it if its return is the best so far."""
         policy = self._policy(state)
         report, _ = self.evaluator(policy.params, episodes=self.arguments.evaluation_chunk, seed=SELECTION_SEED)
-        score, held = report["return"]["value"], report["held"]["value"]
+        figures = {name: entry["value"] for name, entry in headline(report).items() if entry["value"] is not None}
+        score, first = figures["return"], next(iter(figures))
         self.evaluations_s.append(report["seconds"])
         better = self.best["return"] is None or score > self.best["return"]
         self.without_better = 0 if better else self.without_better + 1
@@ -271,11 +272,11 @@ class Run:
             self.best = {"return": score, "iteration": iteration}
             self._write_policy(policy, self.folder.best)
         display.note(
-            f"evaluation at iteration {iteration}: held {held:.1%}, return {score:.2f}"
+            f"evaluation at iteration {iteration}: {first} {figures[first]:.3g}, return {score:.2f}"
             f", {'the best so far' if better else f'{self.without_better} without a better one'} "
             f"({report['seconds']:.1f} s)"
         )
-        return {"evaluation/return": score, "evaluation/held": held}
+        return {f"evaluation/{name}": x for name, x in (figures | {"held": report["held"]["value"]}).items()}
 
     def save(self, state: TrainState, iteration: int) -> None:
         """Save a checkpoint, from which training resumes exactly, and the current policy."""

@@ -147,15 +147,22 @@ def test_the_best_policy_so_far_is_kept(tmp_path, monkeypatch):
     def evaluator(params, **options):
         asked.append((params, options))
         entry = lambda value: {"value": value}  # noqa: E731
-        return {"return": entry(next(scores)), "held": entry(0.25), "seconds": 1.0}, None
+        task = {"headline": {"turns (median)": entry(17.0), "kept": 0.5, "unknown": None}}
+        return {"return": entry(next(scores)), "held": entry(0.25), "seconds": 1.0, "task": task}, None
 
     run.evaluator = evaluator
     monkeypatch.setattr(run, "_policy", lambda state: SimpleNamespace(params=state))
     monkeypatch.setattr(run, "_write_policy", lambda policy, path: written.append((policy.params, path)))
     rows = [run.evaluate(f"state {i}", i, SimpleNamespace(note=notes.append)) for i in (1, 2, 3, 4)]
-    assert rows[2] == {"evaluation/return": -2.0, "evaluation/held": 0.25}
+    assert rows[2] == {
+        "evaluation/turns (median)": 17.0,
+        "evaluation/kept": 0.5,
+        "evaluation/held": 0.25,
+        "evaluation/return": -2.0,
+    }
     assert asked[2] == ("state 3", {"episodes": 5, "seed": trainer.SELECTION_SEED})
     assert written == [(f"state {i}", run.folder.best) for i in (1, 2, 4)]
+    assert "iteration 3: turns (median) 17, return -2.00" in notes[2]
     assert ["the best so far" in note for note in notes] == [True, True, False, True]
     assert run.without_better == 0 and "1 without a better one" in notes[2]
     assert run.best == {"return": 0.5, "iteration": 4}
