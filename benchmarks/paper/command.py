@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from dexsim.core import cli
+from dexsim.core.errors import ConfigError
 from paper import page
 from paper.data import (
     BUDGETS,
@@ -27,6 +28,8 @@ from paper.data import (
 from paper.experiments import EXPERIMENTS
 
 WORK = Path("runs") / "paper"
+_STEPS_PER_MINUTE = 3e7
+"""Of a training on one GPU, for the estimate of the time left."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -38,11 +41,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     budget, output = BUDGETS[given.budget], given.output
     chosen = list(EXPERIMENTS.values()) if given.name == "all" else [EXPERIMENTS[given.name]]
+    if unknown := set(given.row) - {row.name for experiment in chosen for row in experiment.rows}:
+        raise ConfigError(f"--row {sorted(unknown)[0]}: not a row of {given.name}; --list names them")
     for experiment in chosen:
         if given.list:
             print("\n".join(listing(experiment, budget, output)))
         else:
-            run(experiment, budget, output, WORK / budget.name)
+            run(experiment, budget, output, WORK / budget.name, given.row)
     return 0
 
 
@@ -52,6 +57,7 @@ def parser() -> argparse.ArgumentParser:
     found.add_argument("name", choices=(*EXPERIMENTS, "all", "page"), help="table or figure; page: docs/results.md")
     found.add_argument("--budget", choices=tuple(BUDGETS), default="cpu", help="smoke, two cores, or one GPU")
     found.add_argument("--list", action="store_true", help="rows, what is done, and an estimate of the time left")
+    found.add_argument("--row", nargs="+", default=[], help="these rows alone, so that several GPUs share a table")
     found.add_argument(
         "--output", type=Path, default=WORK / "reports", help="folder of reports, tables and figures (docs/results)"
     )
@@ -77,7 +83,10 @@ def minutes_of(experiment: Experiment, row: Row, budget: Budget) -> float:
     """Estimate for one seed of a row."""
     if budget.name == "smoke":
         return 0.2
-    return experiment.minutes + (budget.minutes[row.skill] if experiment.trains else 0.0)
+    if not experiment.trains:
+        return experiment.minutes
+    training = budget.training[row.skill]
+    return experiment.minutes + training.get("minutes", training.get("steps", 0.0) / _STEPS_PER_MINUTE)
 
 
 def _kept(experiment: Experiment, row: Row, budget: Budget, report: dict[str, Any]) -> dict[str, Any]:
@@ -86,8 +95,11 @@ def _kept(experiment: Experiment, row: Row, budget: Budget, report: dict[str, An
     return dict(report["seeds"]) if same else {}
 
 
-def run(experiment: Experiment, budget: Budget, output: Path, work: Path) -> list[Path]:
+def run(experiment: Experiment, budget: Budget, output: Path, work: Path, only: Sequence[str] = ()) -> list[Path]:
     """Measure what is missing, row by row and seed by seed; then write the table and the figures.
+
+    Args:
+      only: names of the rows to measure; none: all.
 
     Returns:
       The files written at the end.
@@ -100,7 +112,7 @@ def run(experiment: Experiment, budget: Budget, output: Path, work: Path) -> lis
     for row in experiment.rows:
         path = report_path(output, experiment, row)
         report = load_report(path)
-        if is_done(experiment, row, budget, report):
+        if (only and row.name not in only) or is_done(experiment, row, budget, report):
             continue
         seeds = _kept(experiment, row, budget, report)
         for seed in experiment.seeds(budget):

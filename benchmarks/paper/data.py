@@ -30,8 +30,9 @@ class Budget:
     preset: str
     """Of the training command."""
     backend: str
-    minutes: dict[str, float]
-    """Training of one seed, by skill; empty: shipped policies stand in, nothing is trained."""
+    training: dict[str, dict[str, float]]
+    """Of one seed, by skill: "minutes", or "steps" of the environments; empty: shipped policies stand in, nothing is
+    trained."""
     seeds: int
     episodes: dict[str, int]
     """Evaluation in simulation, by skill."""
@@ -56,7 +57,7 @@ BUDGETS = {
             level=0,
             preset="cpu",
             backend="c",
-            minutes={},
+            training={},
             seeds=1,
             episodes={"grasp": 10, "rotate": 10},
             trials={"grasp": 1, "rotate": 1},
@@ -70,7 +71,7 @@ BUDGETS = {
             level=1,
             preset="cpu",
             backend="c",
-            minutes={"grasp": 20.0, "rotate": 30.0},
+            training={"grasp": {"minutes": 20.0}, "rotate": {"minutes": 30.0}},
             seeds=3,
             episodes={"grasp": 150, "rotate": 16},
             trials={"grasp": 25, "rotate": 10},
@@ -84,7 +85,7 @@ BUDGETS = {
             level=2,
             preset="gpu",
             backend="auto",
-            minutes={"grasp": 8.0, "rotate": 7.5},
+            training={"grasp": {"minutes": 8.0}, "rotate": {"steps": 6e7}},
             seeds=3,
             episodes={"grasp": 1024, "rotate": 1024},
             trials={"grasp": 50, "rotate": 10},

@@ -17,6 +17,8 @@ from dexsim_ppo.training.runlog import RunFolder
 from paper.data import BUDGETS, Budget, Row
 
 HELD_OUT_POOL = 480
+NO_LIMIT = {"minutes": 0.0, "steps": 0.0}
+"""A preset's own budget of training does not count."""
 
 
 def trained(row: Row, seed: int, budget: Budget, work: Path) -> dict[str, Any]:
@@ -24,7 +26,7 @@ def trained(row: Row, seed: int, budget: Budget, work: Path) -> dict[str, Any]:
 
     A budget without training measures the shipped policy of the skill in its place, one for all rows.
     """
-    if not budget.minutes:
+    if not budget.training:
         return _both_worlds(row, row.skill, seed, budget) | {"training": None}
     file, training = train(row, seed, budget, work)
     return _both_worlds(row, str(file), seed, budget) | {"training": training}
@@ -58,7 +60,7 @@ def train(row: Row, seed: int, budget: Budget, folder: Path) -> tuple[Path, dict
                 task_config(row),
                 preset=budget.preset,
                 backend=budget.backend,
-                minutes=budget.minutes[row.skill],
+                **NO_LIMIT | budget.training[row.skill],
                 seed=seed,
                 run_dir=folder,
                 video=False,
@@ -67,7 +69,7 @@ def train(row: Row, seed: int, budget: Budget, folder: Path) -> tuple[Path, dict
     origin = report["origin"]
     return folder / report["policy"], {
         "env_steps": origin["env_steps"],
-        "minutes": budget.minutes[row.skill],
+        **budget.training[row.skill],
         "seed": seed,
         "hardware": report["hardware"],
     }
@@ -210,7 +212,7 @@ def held_out(row: Row, seed: int, budget: Budget, work: Path) -> dict[str, Any]:
     policy, hand = load_policy(row.policy), dexsim.load_hand()
     names = NAMES
     settings = [*row.settings, f"pool_size={HELD_OUT_POOL}"]
-    if not budget.minutes:  # A look at the machinery: meshes take seconds each to be followed by boxes.
+    if not budget.training:  # A look at the machinery: meshes take seconds each to be followed by boxes.
         names, settings = tuple(COMPOSITIONS)[:3], [*settings, "pool_size=30"]
     if seconds := budget.seconds.get("grasp"):
         settings.append(f"evaluation_seconds={seconds}")

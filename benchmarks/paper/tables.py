@@ -56,7 +56,9 @@ def how(experiment: Experiment, row: Row, report: dict[str, Any] | None) -> str:
     if not trained:
         return f"{report['budget']} budget"
     short = "short " if row.skill == "rotate" and report["budget"] == "cpu" else ""
-    return f"{count} × {short}{trained[0]['minutes']:g} min, {report['budget']} budget"
+    minutes, steps = trained[0].get("minutes"), trained[0].get("steps", 0.0)
+    each = f"{minutes:g} min" if minutes else f"{steps / 1e6:g} million steps"
+    return f"{count} × {short}{each}, {report['budget']} budget"
 
 
 # --- rotation -------------------------------------------------------------------------------------------

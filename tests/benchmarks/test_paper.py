@@ -125,6 +125,16 @@ class TestResuming:
         head, first, second, _ = paper.command.listing(experiment, budget, here)
         assert "about 126 min left" in head and "3 of 3 seeds, cpu budget" in first and "0 of 3 seeds" in second
 
+    def test_rows_can_be_measured_apart(self, paper, here):
+        experiment, calls = stub(paper)
+        budget = paper.data.BUDGETS["cpu"]
+        paper.command.run(experiment, budget, here, here / "work", only=["b"])
+        assert {name for name, _ in calls} == {"b"} and len(calls) == 3
+        paper.command.run(experiment, budget, here, here / "work")
+        assert [name for name, _ in calls[3:6]] == ["a"] * 3, "what another process measured is not done again"
+        with pytest.raises(ConfigError, match="--row quaternio: not a row of observations; --list names them"):
+            paper.command.main(["observations", "--row", "quaternio"])
+
     @pytest.mark.parametrize(
         "text", ["", '{"budget": "cpu"', "[]", '{"budget": "large", "row": {"a": 1}, "seeds": {}}']
     )
@@ -176,6 +186,13 @@ class TestTraining:
         assert (arguments.seed, arguments.minutes, arguments.backend) == (2, 20.0, "c")
         paper.measure.train(self.row(paper), 2, budget, folder)
         assert len(trained) == 1, "a finished training is not repeated"
+
+    def test_a_budget_of_steps_has_no_limit_of_time(self, paper, trained, here):
+        row = paper.experiments.EXPERIMENTS["observations"].rows[0]
+        _, found = paper.measure.train(row, 0, paper.data.BUDGETS["gpu"], here / "seed0")
+        assert (trained[0][2]["steps"], trained[0][2]["minutes"]) == (6e7, 0.0)
+        report = {"seeds": {"0": {"training": found}}, "budget": "gpu"}
+        assert paper.tables.how(None, row, report) == "1 × 60 million steps, gpu budget"
 
     def test_it_resumes_from_a_checkpoint(self, paper, trained, here):
         folder = here / "seed0"
