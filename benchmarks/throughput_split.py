@@ -11,7 +11,7 @@ import dataclasses
 import functools
 import statistics
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -27,10 +27,12 @@ from dexsim.touch.reduce import reduce_touch
 from dexsim_ppo.learner import ppo
 from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.distribution import log_prob, sample
-from dexsim_ppo.learner.loss import actor_mean, critic_value
+from dexsim_ppo.learner.loss import critic_value
+from dexsim_ppo.learner.memory import remember
+from dexsim_ppo.learner.networks import apply_mlp
 from dexsim_ppo.learner.ppo import TrainState, make_train
-from dexsim_ppo.learner.rollout import Rollout, scan_restarting
-from dexsim_ppo.learner.running_stats import update_stats
+from dexsim_ppo.learner.rollout import Remembering, Restarting, Rollout, scan_restarting
+from dexsim_ppo.learner.running_stats import normalize, update_stats
 from dexsim_ppo.learner.update import Learner, update
 from dexsim_ppo.training.presets import find_preset
 
@@ -94,16 +96,23 @@ def record(env: Recorder, config: PPOConfig, state: TrainState) -> tuple[Any, ja
     """The ticks [T, B] that physics gets under the policy, with what comes of them, and the actions."""
     normalizers = ppo.make_normalizers(env, config, state.observation_stats)
 
-    def tick(env_state, key):
-        mean = actor_mean(config, state.params, normalizers, env_state.obs)
-        action = sample(jax.random.normal(key, mean.shape), mean, state.params.log_std)
-        after, given = jax.vmap(env.recorded_step)(env_state, action)
+    def tick(now, key):
+        memory, mean = decide(config, state, normalizers, now.state.obs, now.memory)
+        action = jnp.clip(sample(jax.random.normal(key, mean.shape), mean, state.params.log_std), -1.0, 1.0)
+        after, given = jax.vmap(env.recorded_step)(now.state, action)
         outcome = after.physics.qpos, after.finger_force
-        return after, (*given, *outcome, action)
+        return Remembering(after, memory), (*given, *outcome, action)
 
-    keys = jax.random.split(state.key, config.rollout_length)
-    *ticks, actions = scan_restarting(env, tick, state.env_state, keys)[1]
+    keys, begin = jax.random.split(state.key, config.rollout_length), Remembering(state.env_state, state.memory)
+    *ticks, actions = scan_restarting(cast(Any, Restarting(cast(Any, env))), tick, begin, keys)[1]
     return tuple(ticks), actions
+
+
+def decide(config: PPOConfig, state: TrainState, normalizers: Any, obs: Any, memory: Any) -> tuple[Any, jax.Array]:
+    """The policy's memory after an observation, and the mean of its action [B, A]."""
+    x = normalize(normalizers["actor"], obs["actor"])
+    memory, seen = remember(state.params.memory, memory, x, config.matmul_precision)
+    return memory, apply_mlp(state.params.actor, seen, config.matmul_precision)
 
 
 def environment(env: Env, state: Any, actions: jax.Array) -> Any:
@@ -168,18 +177,18 @@ def policy(env: Env, config: PPOConfig, state: TrainState, rollout: Rollout) -> 
     """An action and two values for every observation, as in a rollout."""
     normalizers = ppo.make_normalizers(env, config, state.observation_stats)
 
-    def tick(key, obs):
+    def tick(key, given):
         key, use = jax.random.split(key)
-        mean = actor_mean(config, state.params, normalizers, obs)
-        action = sample(use, mean, state.params.log_std)
+        later, mean = decide(config, state, normalizers, *given)
+        action = sample(jax.random.normal(use, mean.shape), mean, state.params.log_std)
         # The value after the step is that of another observation; here those of other rows stand for it.
         values = [
-            critic_value(config, state.params, normalizers, seen)
-            for seen in (obs, jax.tree.map(lambda x: jnp.roll(x, 1, 0), obs))
+            critic_value(config, state.params, normalizers, *seen)
+            for seen in (given, jax.tree.map(lambda x: jnp.roll(x, 1, 0), given))
         ]
-        return key, _used((action, log_prob(action, mean, state.params.log_std), values))
+        return key, _used((action, log_prob(action, mean, state.params.log_std), values, later))
 
-    return jax.lax.scan(tick, state.key, rollout.obs)[1]
+    return jax.lax.scan(tick, state.key, (rollout.obs, rollout.memory))[1]
 
 
 def learn(env: Env, config: PPOConfig, state: TrainState, rollout: Rollout) -> Any:

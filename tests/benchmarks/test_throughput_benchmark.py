@@ -129,8 +129,12 @@ def test_rows_are_json_with_a_share(benchmarks, simple, capsys, monkeypatch):
 
 
 @pytest.mark.long
-def test_the_parts_of_a_training_step(benchmarks, simple):
+@pytest.mark.parametrize("memory", ["none", "gru"])
+def test_the_parts_of_a_training_step(benchmarks, simple, monkeypatch, memory):
     _, split = benchmarks
+    preset = split.find_preset("cpu", "grasp")
+    preset = dataclasses.replace(preset, ppo=dataclasses.replace(preset.ppo, memory=memory))
+    monkeypatch.setattr(split, "find_preset", lambda device, task: preset)
     rows = {row["part"]: row for row in split.split("grasp", "jax", WORLDS, 1)}
     assert list(rows) == [
         "training step",
