@@ -16,7 +16,7 @@ class Curriculum:
     on: bool = setting(False)
     """Widen the ranges during training; otherwise they have their full width from the start."""
     metric: str = setting("")
-    """Training metric that measures success, such as episode/goals_per_minute. Empty: the share of ended episodes that
+    """Training metric that measures success, such as episode/successes. Empty: the share of ended episodes that
     reached their time limit."""
     start: float = setting(0.1, unit="1", low=0.0, high=1.0)
     """Initial scale."""

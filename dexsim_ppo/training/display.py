@@ -13,7 +13,7 @@ from rich.table import Table
 COLUMNS = (
     ("return", "episode/return", ".2f"),
     ("success", "episode/success", ".1%"),
-    ("goals/min", "episode/goals_per_minute", ".1f"),
+    ("goals", "episode/successes", ".1f"),
     ("length", "episode/length", ".0f"),
     ("reward", "reward", ".3f"),
     ("KL", "kl", ".4f"),

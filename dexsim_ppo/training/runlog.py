@@ -19,7 +19,7 @@ from dexsim_ppo.training.arguments import TrainArguments, printable
 CURVES = {
     "episode/return": "return\nof an episode",
     "episode/success": "success\n[share of episodes]",
-    "episode/goals_per_minute": "goals\n[1/min]",
+    "episode/successes": "goals\nof an episode",
     "episode/length": "length of an\nepisode [ticks]",
     "reward": "reward\nof a tick",
     "step/force_error": "force error\n[N]",
