@@ -25,7 +25,7 @@ def run(tmp_path, monkeypatch):
 
     def evaluator(params, *, episodes, seed):
         assert (episodes, seed) == (10, trainer.SELECTION_SEED)
-        return {"return": {"value": run.returns.pop(0)}, "held": {"value": 1.0}, "seconds": run.takes}, None
+        return {"return": {"value": run.returns.pop(0)}, "held": {"value": 1.0}, "task": {}, "seconds": run.takes}, None
 
     run = Run(TinyEnv(), ARGUMENTS, RunFolder(tmp_path), 0.0, evaluator=evaluator)
     run.returns, run.takes = [], 1.0
