@@ -26,13 +26,11 @@ from dexsim.touch import feel as tactile
 from dexsim.touch.reduce import reduce_touch
 from dexsim_ppo.learner import ppo
 from dexsim_ppo.learner.config import PPOConfig
-from dexsim_ppo.learner.distribution import log_prob, sample
-from dexsim_ppo.learner.loss import critic_value
-from dexsim_ppo.learner.memory import remember
-from dexsim_ppo.learner.networks import apply_mlp
+from dexsim_ppo.learner.distribution import log_prob, sample, squash
+from dexsim_ppo.learner.loss import actor_step, critic_value
 from dexsim_ppo.learner.ppo import TrainState, make_train
 from dexsim_ppo.learner.rollout import Remembering, Restarting, Rollout, scan_restarting
-from dexsim_ppo.learner.running_stats import normalize, update_stats
+from dexsim_ppo.learner.running_stats import update_stats
 from dexsim_ppo.learner.update import Learner, update
 from dexsim_ppo.training.presets import find_preset
 
@@ -97,8 +95,9 @@ def record(env: Recorder, config: PPOConfig, state: TrainState) -> tuple[Any, ja
     normalizers = ppo.make_normalizers(env, config, state.observation_stats)
 
     def tick(now, key):
-        memory, mean = decide(config, state, normalizers, now.state.obs, now.memory)
-        action = jnp.clip(sample(jax.random.normal(key, mean.shape), mean, state.params.log_std), -1.0, 1.0)
+        memory, mean = actor_step(config, state.params, normalizers, now.state.obs, now.memory)
+        action = sample(jax.random.normal(key, mean.shape), mean, state.params.log_std)
+        action = squash(action, config.distribution)
         after, given = jax.vmap(env.recorded_step)(now.state, action)
         outcome = after.physics.qpos, after.finger_force
         return Remembering(after, memory), (*given, *outcome, action)
@@ -106,13 +105,6 @@ def record(env: Recorder, config: PPOConfig, state: TrainState) -> tuple[Any, ja
     keys, begin = jax.random.split(state.key, config.rollout_length), Remembering(state.env_state, state.memory)
     *ticks, actions = scan_restarting(cast(Any, Restarting(cast(Any, env))), tick, begin, keys)[1]
     return tuple(ticks), actions
-
-
-def decide(config: PPOConfig, state: TrainState, normalizers: Any, obs: Any, memory: Any) -> tuple[Any, jax.Array]:
-    """The policy's memory after an observation, and the mean of its action [B, A]."""
-    x = normalize(normalizers["actor"], obs["actor"])
-    memory, seen = remember(state.params.memory, memory, x, config.matmul_precision)
-    return memory, apply_mlp(state.params.actor, seen, config.matmul_precision)
 
 
 def environment(env: Env, state: Any, actions: jax.Array) -> Any:
@@ -179,7 +171,7 @@ def policy(env: Env, config: PPOConfig, state: TrainState, rollout: Rollout) -> 
 
     def tick(key, given):
         key, use = jax.random.split(key)
-        later, mean = decide(config, state, normalizers, *given)
+        later, mean = actor_step(config, state.params, normalizers, *given)
         action = sample(jax.random.normal(use, mean.shape), mean, state.params.log_std)
         # The value after the step is that of another observation; here those of other rows stand for it.
         values = [

@@ -25,6 +25,7 @@ from dexsim.hand.source import check_record, check_same, record_of, recorded_han
 from dexsim.task_spec import TaskSpec
 from dexsim_ppo import checkpoint
 from dexsim_ppo.learner.adapter import adapt
+from dexsim_ppo.learner.distribution import squash
 from dexsim_ppo.learner.memory import History, Memory, empty, remember
 from dexsim_ppo.learner.networks import MLP, Layer, apply_mlp
 from dexsim_ppo.learner.running_stats import Normalizer, make_normalizer, normalize
@@ -80,8 +81,7 @@ def act_from(params: PolicyParams, memory: jax.Array | None, obs: jax.Array) -> 
       Memory after it, and the policy's mode: action `[..., A]` in [-1, 1].
     """
     memory, seen = remember(params.memory, memory, normalize(params.normalizer, obs))
-    mean = apply_mlp(params.layers, seen)
-    return memory, jnp.tanh(mean) if params.squash == "tanh" else jnp.clip(mean, -1.0, 1.0)
+    return memory, squash(apply_mlp(params.layers, seen), params.squash)
 
 
 _act, _act_from = jax.jit(act), jax.jit(act_from)

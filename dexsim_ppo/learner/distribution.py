@@ -18,6 +18,11 @@ def sample(noise: jax.Array, mean: jax.Array, log_std: jax.Array) -> jax.Array:
     return mean + align(jnp.exp(log_std), mean) * noise
 
 
+def squash(x: jax.Array, kind: str) -> jax.Array:
+    """A sample or mean [..., A] as an action in [-1, 1]; `kind` is `PPOConfig.distribution`."""
+    return jnp.tanh(x) if kind == "tanh" else jnp.clip(x, -1.0, 1.0)
+
+
 def log_prob(x: jax.Array, mean: jax.Array, log_std: jax.Array) -> jax.Array:
     """Log density of `x`, summed over the last axis."""
     z = (x - mean) * align(jnp.exp(-log_std), mean)

@@ -1,12 +1,14 @@
 """PPO's objective over one minibatch: clipped surrogate, value loss and regularisers."""
 
+from collections.abc import Mapping
+
 import jax
 import jax.numpy as jnp
 
 from dexsim.core.pytree import align, pytree_dataclass
 from dexsim_ppo.learner import distribution
 from dexsim_ppo.learner.config import PPOConfig
-from dexsim_ppo.learner.memory import recall
+from dexsim_ppo.learner.memory import recall, remember
 from dexsim_ppo.learner.networks import Params, apply_mlp
 from dexsim_ppo.learner.rollout import Decision
 from dexsim_ppo.learner.running_stats import Normalizer, normalize
@@ -42,6 +44,19 @@ def actor_mean(
     x = normalize(normalizers["actor"], obs["actor"])
     seen = recall(params.memory, memory, x, first, config.matmul_precision)
     return apply_mlp(params.actor, seen, config.matmul_precision)
+
+
+def actor_step(
+    config: PPOConfig,
+    params: Params,
+    normalizers: dict[str, Normalizer],
+    obs: Mapping[str, jax.Array],
+    memory: jax.Array | None,
+) -> tuple[jax.Array | None, jax.Array]:
+    """The memory after an observation, and the mean of the Gaussian `[..., A]`."""
+    x = normalize(normalizers["actor"], obs["actor"])
+    memory, seen = remember(params.memory, memory, x, config.matmul_precision)
+    return memory, apply_mlp(params.actor, seen, config.matmul_precision)
 
 
 def critic_value(

@@ -34,15 +34,13 @@ from dexsim_ppo.learner.devices.sharding import (
     whole_shape,
 )
 from dexsim_ppo.learner.gae import compute_gae, explained_variance
-from dexsim_ppo.learner.loss import Metrics, Samples, critic_value
-from dexsim_ppo.learner.memory import remember
-from dexsim_ppo.learner.networks import Params, apply_mlp, rescale_output
+from dexsim_ppo.learner.loss import Metrics, Samples, actor_step, critic_value
+from dexsim_ppo.learner.networks import Params, rescale_output
 from dexsim_ppo.learner.rollout import Decision, Rollout, Tally, bound_rewards, collect
 from dexsim_ppo.learner.running_stats import (
     Normalizer,
     RunningStats,
     make_normalizer,
-    normalize,
     update_stats,
     value_std,
 )
@@ -239,14 +237,11 @@ def collect_rollout(
     params, std = state.params, value_std(state.value_stats)
 
     def act(key, obs, memory):
-        x = normalize(normalizers["actor"], obs["actor"])
-        memory, seen = remember(params.memory, memory, x, config.matmul_precision)
-        mean = apply_mlp(params.actor, seen, config.matmul_precision)
+        memory, mean = actor_step(config, params, normalizers, obs, memory)
         noise = of_part(jax.random.normal(key, whole_shape(mean.shape, part)), part)
         action = distribution.sample(noise, mean, params.log_std)
         decision = Decision(action, mean, distribution.log_prob(action, mean, params.log_std))
-        action = jnp.tanh(action) if config.distribution == "tanh" else jnp.clip(action, -1.0, 1.0)
-        return decision, action, memory
+        return decision, distribution.squash(action, config.distribution), memory
 
     def value(obs, memory):
         return state.value_stats.mean + std * critic_value(config, params, normalizers, obs, memory)
