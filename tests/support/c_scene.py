@@ -83,7 +83,7 @@ def compile_scene(
     option.iterations, option.ls_iterations = iterations, line_search
     option.integrator, option.solver = mujoco.mjtIntegrator.mjINT_EULER, mujoco.mjtSolver.mjSOL_NEWTON
     option.cone, option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, 20.0
-    option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
+    option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP | mujoco.mjtDisableBit.mjDSBL_MULTICCD
     if not exact:
         option.disableflags |= mujoco.mjtDisableBit.mjDSBL_NATIVECCD
     for pair in spec.pairs:

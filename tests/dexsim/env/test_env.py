@@ -276,7 +276,7 @@ class TestEpisodes:
             terms = [v for k, v in after.metrics.items() if k.startswith("reward/")]
             np.testing.assert_allclose(after.reward, np.sum(terms, axis=0), rtol=1e-5, atol=1e-6)
             total += np.asarray(after.reward)
-            np.testing.assert_allclose(after.metrics["return"], total, rtol=1e-5)
+            np.testing.assert_allclose(after.metrics["return"], total, rtol=1e-5, atol=1e-5)
         assert np.all(history[-1][2].metrics["length"] == len(history))
         assert np.all(history[-1][2].length == len(history))
 

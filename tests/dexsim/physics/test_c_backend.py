@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 from c_scene import CONVERGED, GRAVITY, row, rows_of, squeeze, stack
+from scipy.spatial.transform import Rotation
 
 from dexsim.core.compilation import jit
 from dexsim.core.errors import ConfigError
@@ -170,7 +171,7 @@ class TestForces:
             np.testing.assert_allclose(after.qpos[index], data.qpos, atol=1e-5)
         assert touched > len(grips) / 2, "hardly a world is in contact: the test tests nothing"
 
-    @pytest.mark.parametrize("shape", ["sphere", "box", "capsule", "composition"])
+    @pytest.mark.parametrize("shape", SHAPES)
     def test_the_jax_backend_has_the_same_forces(self, one_step, physics_advance, grips, shape):
         """Within single precision's share: contact depths of 1e-7 m under springs of 1e4 N/m."""
         mine = grips[SHAPES.index(shape) * WORLDS :][:WORLDS]
@@ -181,6 +182,32 @@ class TestForces:
         assert np.all(np.abs(force - wanted).max((1, 2)) < 0.01 + 2e-3 * strength)
         apart = np.abs(after.qvel - theirs.qvel).max(0)
         assert np.all(apart < np.where(np.arange(18) == 3, 2e-2, 5e-3)), apart  # index on middle finger: see SWING
+
+    def test_a_capsule_over_a_cylinders_rim(self, seam):
+        """One contact, as deep as the nearest point of a finely divided axis, where C MuJoCo would have two others."""
+        (radius, half), (wide, tall) = (0.0103, 0.0271), (0.0215, 0.0203)
+        model = mujoco.MjModel.from_xml_string(f"""<mujoco><worldbody>
+          <body><freejoint/><geom type="capsule" size="{radius} {half}"/></body>
+          <body><freejoint/><geom type="cylinder" size="{wide} {tall}"/></body></worldbody></mujoco>""")
+        rng, data, depths = np.random.default_rng(0), mujoco.MjData(model), {}
+        share = np.linspace(-half, half, 20_001)[:, None]
+        for flags in (0, seam.mj_model.opt.disableflags):
+            model.opt.disableflags = flags
+            for _ in range(100):
+                # Beside the rim, the axis hardly above the cap's plane and across it.
+                data.qpos[:3] = rng.uniform(-0.005, 0.005), wide + 0.0093, tall + rng.uniform(-5e-4, 1e-3)
+                turn = Rotation.from_euler("yx", [np.pi / 2, 0]) * Rotation.from_rotvec(rng.normal(size=3) * 0.05)
+                data.qpos[3:7], data.qpos[7:] = np.roll(turn.as_quat(), 1), [0, 0, 0, 1, 0, 0, 0]
+                mujoco.mj_forward(model, data)
+                points = data.qpos[:3] + share * turn.as_matrix()[:, 2]
+                out = np.maximum(np.stack([np.hypot(points[:, 0], points[:, 1]) - wide, abs(points[:, 2]) - tall]), 0)
+                if (depth := np.hypot(*out).min() - radius) < -1e-4:
+                    depths.setdefault(flags, []).append((depth, data.contact.dist.copy()))
+        apart = [max(abs(wanted - found)) if len(found) else -wanted for wanted, found in depths.pop(0)]
+        assert max(apart) > 2e-4, "C MuJoCo has the right contacts by itself: the flag may go"
+        ((_, ours),) = depths.items()
+        assert len(ours) > 50 and {len(found) for _, found in ours} == {1}
+        np.testing.assert_allclose([found[0] for _, found in ours], [wanted for wanted, _ in ours], atol=2e-6)
 
     def test_the_default_iterations_are_enough(self, hand, one_step, grips):
         """Three and six, which the configuration asks for and Warp takes, are not: C MuJoCo takes more."""

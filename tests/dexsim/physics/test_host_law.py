@@ -56,7 +56,8 @@ def test_they_agree_with_xla_to_rounding(motors):
         assert torque.dtype == np.float32 and np.shape(torque) == (WORLDS, 12)
         np.testing.assert_allclose(torque, expected, rtol=2e-5, atol=2e-6)
         for mine, theirs in zip(after, jax.tree.leaves(gear), strict=True):
-            np.testing.assert_allclose(mine, theirs, rtol=2e-5, atol=2e-5)
+            # Velocities of up to 30 rad/s, as differences of larger terms.
+            np.testing.assert_allclose(mine, theirs, rtol=2e-5, atol=1e-4)
         moved = max(moved, np.abs(torque).max())
     assert moved > 0.05, "no torque: the test tests nothing"
 

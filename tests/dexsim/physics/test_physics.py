@@ -74,7 +74,7 @@ def error(found):
 
 
 class TestAgainstC:
-    @pytest.mark.parametrize("shape", ["sphere", "box", "capsule", "composition"])
+    @pytest.mark.parametrize("shape", SHAPES)
     def test_a_sub_step_in_contact(self, contact_steps, shape):
         """Contacts with capsules, boxes and the palm's plane are where C MuJoCo has them.
 
@@ -88,13 +88,6 @@ class TestAgainstC:
         apart = np.abs(found.velocity - found.c_velocity).max(0)
         assert np.all(apart < SWING), apart
         assert np.all(np.abs(found.position - found.c_position).max(0) < 0.006 * np.append(SWING, 5e-3))
-
-    def test_a_sub_step_in_contact_with_a_cylinder(self, contact_steps):
-        """A link that lies on a cylinder has one contact in C MuJoCo and one at each end of the stretch here."""
-        wrong, strength = error(contact_steps["cylinder"])
-        assert np.sum(strength > 0.5) >= 5
-        assert np.all(wrong < 0.02 + strength / 8), (wrong, strength)
-        assert np.mean(wrong < 0.01 + 2e-3 * strength) >= 0.5, (wrong, strength)
 
     def test_every_shape_on_the_palm(self, hand, grasp_env, physics_advance):
         """Pressed against the palm's plane, whose contacts have one answer for every primitive."""
