@@ -82,20 +82,31 @@ def _candidate(key: jax.Array, shape_index: jax.Array, task: Any) -> tuple[Any, 
     joints = jnp.asarray(config.posture) + noise + curl * flexion
     joints = jnp.clip(joints, hand.joint_lower, hand.joint_upper)
 
-    # Long objects lie across the fingers (their z along the palm's y), turned about the palm's
-    # normal and a little askew; the roll about their own axis is free.
+    # Long objects lie across the fingers (their z along the palm's y, either way), turned about the palm's normal and a
+    # little askew; the roll about their own axis is free.
     quat = rotations.axis_angle_to_quat(jnp.array([0.0, 0.0, 1.0]), roll * jnp.pi)
     most = config.turn_noise
     for axis, angle in (
-        ((1.0, 0.0, 0.0), -jnp.pi / 2),
+        ((1.0, 0.0, 0.0), jnp.where(drawn[3, 2] < 0.0, -0.5, 0.5) * jnp.pi),
         ((0.0, 0.0, 1.0), most[1] * askew),
         ((1.0, 0.0, 0.0), most[0] * turn),
     ):
         quat = rotations.quat_multiply(rotations.axis_angle_to_quat(jnp.array(axis), jnp.asarray(angle)), quat)
     matrix = rotations.quat_to_matrix(quat)
-    up = rotations.rotate_inverse(matrix, jnp.array([-1.0, 0.0, 0.0]))
-    top = extent(object.size, object.position, object.active, up, object.kinds, object.quat)
-    position = jnp.stack([palm_height(hand) + gap + top, reference[1] + shift[0], reference[2] + shift[1]])
+    # How far the object reaches [3, 2] along the palm's axes, each in both directions. Its middle, not its origin, is
+    # put where the fingers meet: that of a composition is in its body, beside which the neck juts out.
+    reach = jax.vmap(
+        lambda way: extent(
+            object.size,
+            object.position,
+            object.active,
+            rotations.rotate_inverse(matrix, way),
+            object.kinds,
+            object.quat,
+        )
+    )(jnp.concatenate([jnp.eye(3), -jnp.eye(3)]))
+    middle = (reach[1:3] - reach[4:]) / 2
+    position = jnp.stack([palm_height(hand) + gap + reach[3], *(jnp.asarray(reference[1:]) + shift - middle)])
     qpos = jnp.concatenate([hinge_angles(hand, joints), position, quat])
     qvel = jnp.concatenate([jnp.zeros(hand.num_hinges), speed[None], drift, spin])
     start = Start(qpos=qpos, qvel=qvel, object=object)

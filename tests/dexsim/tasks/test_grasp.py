@@ -10,11 +10,13 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+import trimesh
 
 import dexsim
 from dexsim.core.errors import ConfigError
 from dexsim.env.task import GroundTruth
 from dexsim.force_loop import target_force
+from dexsim.geometry import rotations
 from dexsim.hand.kinematics import forward_kinematics
 from dexsim.objects.config import SHAPES, ObjectConfig
 from dexsim.physics.config import PhysicsConfig
@@ -373,7 +375,32 @@ class TestEvaluationPlan:
         np.testing.assert_array_equal(first[0], second[0])
 
 
+def middles(pool):
+    """Middle [N, 2] of what each object of a pool takes up along the palm (y, z), by meshes of its parts."""
+    found = []
+    for i in range(pool.qpos.shape[0]):
+        parts, object = [], jax.tree.map(lambda leaf, i=i: np.asarray(leaf)[i], pool.object)
+        for kind, size, position, active in zip(object.kinds, object.size, object.position, object.active, strict=True):
+            a, b = float(size[0]), 2 * float(size[1])
+            solid = {
+                "box": lambda size=size: trimesh.creation.box(2 * size),
+                "capsule": lambda a=a, b=b: trimesh.creation.capsule(height=b, radius=a, count=[64, 64]),
+                "cylinder": lambda a=a, b=b: trimesh.creation.cylinder(radius=a, height=b, sections=128),
+            }[kind]()
+            if active:
+                parts.append(solid.apply_translation(position - (kind == "capsule") * solid.bounds.mean(0)))
+        turned = trimesh.util.concatenate(parts)
+        turned.apply_transform(trimesh.transformations.quaternion_matrix(pool.qpos[i, 15:]))
+        found.append(pool.qpos[i, 13:15] + turned.bounds.mean(0)[1:])
+    return np.array(found)
+
+
 class TestPool:
+    def test_a_composition_lies_either_way(self, grasp_env):
+        axis = rotations.quat_to_matrix(jnp.asarray(grasp_env.pool.qpos[:, 15:]))[:, 1, 2]
+        juts = np.asarray(axis)[np.asarray(grasp_env.pool.object.shape_index) == SHAPES.index("composition")]
+        assert 0.2 < np.mean(juts > 0.0) < 0.8 and np.all(np.abs(juts) > 0.5)
+
     def test_every_shape_has_its_share(self, grasp_env):
         count = np.bincount(grasp_env.pool.object.shape_index, minlength=len(SHAPES))
         assert count.tolist() == [16] * 5
@@ -414,7 +441,7 @@ class TestPool:
         for moved, most in (
             (pool.qvel[:, 13:15], config.release_drift),
             (pool.qvel[:, 15:], config.release_spin),
-            (pool.qpos[:, 13:15] - np.array(CENTRE[1:]), config.place_noise),
+            (middles(pool) - np.array(CENTRE[1:]), config.place_noise),
         ):
             assert 0.8 * most < np.max(np.abs(moved)) <= most + 1e-6
 
