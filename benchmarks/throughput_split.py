@@ -30,7 +30,6 @@ from dexsim_ppo.learner.distribution import log_prob, sample, squash
 from dexsim_ppo.learner.loss import actor_step, critic_value
 from dexsim_ppo.learner.ppo import TrainState, make_train
 from dexsim_ppo.learner.rollout import Remembering, Restarting, Rollout, scan_restarting
-from dexsim_ppo.learner.running_stats import update_stats
 from dexsim_ppo.learner.update import Learner, update
 from dexsim_ppo.training.presets import find_preset
 
@@ -186,12 +185,9 @@ def policy(env: Env, config: PPOConfig, state: TrainState, rollout: Rollout) -> 
 def learn(env: Env, config: PPOConfig, state: TrainState, rollout: Rollout) -> Any:
     """Advantages, all epochs over all minibatches, statistics."""
     normalizers = ppo.make_normalizers(env, config, state.observation_stats)
-    value_stats, params, samples = ppo.prepare(config, state.value_stats, state.params, rollout)
-    learner = Learner(params, state.adam, state.learning_rate, state.skipped_updates)
-    stats = {
-        group: update_stats(state.observation_stats[group], rollout.obs[group]) for group in state.observation_stats
-    }
-    return update(config, normalizers, samples, state.key, learner), value_stats, stats
+    ready = ppo.prepare(config, state.value_stats, state.observation_stats, state.params, rollout)
+    learner = Learner(ready.params, state.adam, state.learning_rate, state.skipped_updates)
+    return update(config, normalizers, ready.samples, state.key, learner), ready
 
 
 def _used(tree: Any) -> jax.Array:

@@ -4,11 +4,6 @@ import jax
 import jax.numpy as jnp
 
 
-def explained_variance(target: jax.Array, value: jax.Array) -> jax.Array:
-    """Share [] of the variance of the returns `target` that predictions `value` of the same shape explain."""
-    return 1 - jnp.var(target - value) / jnp.var(target)
-
-
 def compute_gae(
     reward: jax.Array,
     value: jax.Array,

@@ -27,13 +27,14 @@ from dexsim_ppo.learner.devices.sharding import (
     block_count,
     copied,
     in_blocks,
+    moments,
     of_part,
     sequences_in_blocks,
     shardings,
     start_on,
     whole_shape,
 )
-from dexsim_ppo.learner.gae import compute_gae, explained_variance
+from dexsim_ppo.learner.gae import compute_gae
 from dexsim_ppo.learner.loss import Metrics, Samples, actor_step, critic_value
 from dexsim_ppo.learner.networks import Params, rescale_output
 from dexsim_ppo.learner.rollout import Decision, Rollout, Tally, bound_rewards, collect
@@ -41,7 +42,7 @@ from dexsim_ppo.learner.running_stats import (
     Normalizer,
     RunningStats,
     make_normalizer,
-    update_stats,
+    merge_moments,
     value_std,
 )
 from dexsim_ppo.learner.state import TrainState, init_environments, init_learner, init_state
@@ -156,17 +157,17 @@ def learn(
     if config.normalize_value:
         rollout, bounded = bound_rewards(rollout, state.value_stats, config.reward_scale)
         metrics |= {"bounded_rewards": bounded}
-    value_stats, params, samples = prepare(config, state.value_stats, state.params, rollout, mesh)
+    ready = prepare(config, state.value_stats, state.observation_stats, state.params, rollout, mesh)
     learner, update_metrics = update(
         config,
         normalizers,
-        samples,
+        ready.samples,
         update_key,
-        Learner(params, state.adam, state.learning_rate, state.skipped_updates),
+        Learner(ready.params, state.adam, state.learning_rate, state.skipped_updates),
         mesh,
     )
     metrics |= update_metrics | {
-        "explained_variance": explained_variance(samples.target, samples.value),
+        "explained_variance": ready.explained_variance,
         "action_std": jnp.mean(jnp.exp(learner.params.log_std)),
         "learning_rate": learner.learning_rate,
         "skipped_updates": learner.skipped_updates,
@@ -177,15 +178,12 @@ def learn(
         scale, success = update_scale(curriculum, scale, metrics)
         metrics |= {"curriculum/scale": scale, "curriculum/success": success}
         env_state = jax.vmap(cast(CurriculumEnvironment, env).widen, (0, None))(env_state, scale)
-    stats = {
-        group: update_stats(state.observation_stats[group], rollout.obs[group]) for group in state.observation_stats
-    }
     return TrainState(
         params=learner.params,
         adam=learner.adam,
         learning_rate=learner.learning_rate,
-        observation_stats=stats,
-        value_stats=value_stats,
+        observation_stats=ready.observation_stats,
+        value_stats=ready.value_stats,
         env_state=env_state,
         key=key,
         iteration=state.iteration + 1,
@@ -252,11 +250,26 @@ def collect_rollout(
 # --- advantages ---------------------------------------------------------------------------------------
 
 
+class Ready(NamedTuple):
+    """What is learnt from, and the statistics that include it."""
+
+    samples: Samples
+    params: Params  # their critic's output in the units of `value_stats`
+    value_stats: RunningStats
+    observation_stats: dict[str, RunningStats]
+    explained_variance: jax.Array  # [] share of the returns' variance that the critic's values explain
+
+
 def prepare(
-    config: PPOConfig, value_stats: RunningStats, params: Params, rollout: Rollout, mesh: Mesh | None = None
-) -> tuple[RunningStats, Params, Samples]:
+    config: PPOConfig,
+    value_stats: RunningStats,
+    observation_stats: dict[str, RunningStats],
+    params: Params,
+    rollout: Rollout,
+    mesh: Mesh | None = None,
+) -> Ready:
     """Advantages and normalised value targets in blocks [K, T * B / K], with a GRU as sequences [K, B / K, T]; updates
-    the value normaliser."""
+    the statistics."""
     advantage, target = compute_gae(
         config.reward_scale * rollout.reward,
         rollout.value,
@@ -266,26 +279,38 @@ def prepare(
         discount=config.discount,
         gae_lambda=config.gae_lambda,
     )
+    seen = {group: rollout.obs[group] for group in observation_stats}
+    means, variances = moments(
+        {"obs": seen, "advantage": advantage, "target": target, "error": target - rollout.value}, mesh
+    )
+    size = advantage.size
+    observation_stats = {
+        group: merge_moments(stats, means["obs"][group], variances["obs"][group], size)
+        for group, stats in observation_stats.items()
+    }
     if config.normalize_value:
-        new = update_stats(value_stats, target)
+        new = merge_moments(value_stats, means["target"], variances["target"], size)
         critic = rescale_output(params.critic, value_stats.mean, value_std(value_stats), new.mean, value_std(new))
         params, value_stats = dataclasses.replace(params, critic=critic), new
     mean, std = value_stats.mean, value_std(value_stats)
     samples = Samples(
         obs=rollout.obs,
         decision=rollout.decision,
-        advantage=(advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8),
+        advantage=(advantage - means["advantage"]) / (jnp.sqrt(variances["advantage"]) + 1e-8),
         value=(rollout.value - mean) / std,
         target=(target - mean) / std,
         memory=rollout.memory,
     )
     blocks = block_count(config, mesh)
     if config.memory != "gru":
-        return value_stats, params, in_blocks(samples, blocks)
-    ended = rollout.terminated | rollout.truncated
-    # What is remembered at the rollout's first step is zero where an episode begins with it.
-    samples = dataclasses.replace(samples, first=jnp.zeros_like(ended).at[1:].set(ended[:-1]))
-    return value_stats, params, sequences_in_blocks(samples, blocks)
+        samples = in_blocks(samples, blocks)
+    else:
+        ended = rollout.terminated | rollout.truncated
+        # What is remembered at the rollout's first step is zero where an episode begins with it.
+        samples = dataclasses.replace(samples, first=jnp.zeros_like(ended).at[1:].set(ended[:-1]))
+        samples = sequences_in_blocks(samples, blocks)
+    explained = 1 - variances["error"] / variances["target"]
+    return Ready(samples, params, value_stats, observation_stats, explained)
 
 
 def strong_types(tree: Any) -> Any:

@@ -35,16 +35,16 @@ def init_stats(shape: tuple[int, ...]) -> RunningStats:
     return RunningStats(count=jnp.zeros((), jnp.int32), mean=jnp.zeros(shape), variance=jnp.ones(shape))
 
 
-def update_stats(stats: RunningStats, batch: jax.Array) -> RunningStats:
-    """Merge a batch [..., n] (Chan et al. 1979). Elements whose batch is not finite stay unchanged."""
-    axes = tuple(range(batch.ndim - stats.mean.ndim))
-    size = int(np.prod([batch.shape[axis] for axis in axes]))
-    batch_mean, batch_variance = jnp.mean(batch, axes), jnp.var(batch, axes)
+def merge_moments(stats: RunningStats, mean: jax.Array, variance: jax.Array, size: int) -> RunningStats:
+    """Merge `size` samples of this mean and variance [n] (Chan et al. 1979).
+
+    Elements that are not finite stay unchanged.
+    """
     count = jnp.minimum(stats.count, MEMORY) + size
     weight = size / count.astype(jnp.float32)
-    delta = batch_mean - stats.mean
+    delta = mean - stats.mean
     mean = stats.mean + weight * delta
-    variance = (1 - weight) * stats.variance + weight * batch_variance + weight * (1 - weight) * delta**2
+    variance = (1 - weight) * stats.variance + weight * variance + weight * (1 - weight) * delta**2
     ok = jnp.isfinite(mean) & jnp.isfinite(variance)
     return RunningStats(
         count=count, mean=jnp.where(ok, mean, stats.mean), variance=jnp.where(ok, variance, stats.variance)

@@ -1,8 +1,9 @@
 """Environments spread over several devices: which arrays are split, which are copied to all.
 
 The environments [B] are split over one mesh axis, all else is the same everywhere. The environments' own functions run
-under `shard_map`, since physics engines are opaque to XLA, and so do gradients, which are averaged as one array; other
-sums over all environments are XLA's to place. So an iteration is the same arithmetic on any number of devices, up to
+under `shard_map`, since physics engines are opaque to XLA, and so do gradients and moments, which are averaged as one
+array: between processes on CPUs each array of a reduction costs milliseconds, whatever its size. The few other sums
+over all environments are XLA's to place. So an iteration is the same arithmetic on any number of devices, up to
 the order of sums.
 """
 
@@ -19,6 +20,7 @@ from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 from dexsim.core.compilation import jit
 from dexsim.core.errors import ConfigError
+from dexsim.core.pytree import align
 from dexsim_ppo.learner.config import PPOConfig
 
 AXIS = "devices"
@@ -89,19 +91,33 @@ def on_each(function: Callable, mesh: Mesh | None) -> Callable:
 
 
 def averaged(function: Callable, mesh: Mesh | None) -> Callable:
-    """`function(shared, split)` on each device's own part of `split` [N, ...], its results averaged over the devices.
-
-    They travel as one array: between processes on CPUs each array of a reduction costs milliseconds, whatever its size.
-    """
+    """`function(shared, split)` on each device's part of `split` [N, ...], its results averaged over the devices."""
     if mesh is None:
         return function
 
-    def part(shared: Any, split: Any) -> Any:
-        flat, restore = ravel_pytree(function(shared, split))
-        return restore(jax.lax.pmean(flat, AXIS))
-
     whole, parts = PartitionSpec(), PartitionSpec(AXIS)
+    part = lambda shared, split: _average(function(shared, split))  # noqa: E731
     return jax.shard_map(part, mesh=mesh, in_specs=(whole, parts), out_specs=whole, check_vma=False)
+
+
+def moments(tree: Any, mesh: Mesh | None) -> tuple[Any, Any]:
+    """Mean and variance [...] of each array [T, B, ...] over steps and environments, with two reductions in all."""
+    average: Callable = (lambda tree: tree) if mesh is None else _average
+
+    def part(tree: Any) -> tuple[Any, Any]:
+        mean = average(jax.tree.map(lambda x: jnp.mean(x, (0, 1)), tree))
+        return mean, average(jax.tree.map(lambda x, m: jnp.mean((x - align(m, x)) ** 2, (0, 1)), tree, mean))
+
+    if mesh is None:
+        return part(tree)
+    split = PartitionSpec(None, AXIS)
+    return jax.shard_map(part, mesh=mesh, in_specs=split, out_specs=PartitionSpec(), check_vma=False)(tree)
+
+
+def _average(tree: Tree) -> Tree:
+    """The mean over the devices, which travels as one array."""
+    flat, restore = ravel_pytree(tree)
+    return restore(jax.lax.pmean(flat, AXIS))
 
 
 def block_count(config: PPOConfig, mesh: Mesh | None) -> int:

@@ -89,7 +89,7 @@ def test_rewards_that_grow_are_followed():
     @jax.jit
     def iterate(stats):
         rollout, counted = bound_rewards(experience(reward), stats, 1.0)
-        return ppo.prepare(config, stats, params, rollout)[0], rollout, counted
+        return ppo.prepare(config, stats, {}, params, rollout).value_stats, rollout, counted
 
     for _ in range(40):
         stats, rollout, counted = iterate(stats)

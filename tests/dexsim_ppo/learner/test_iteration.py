@@ -249,7 +249,7 @@ def test_an_iteration_reports_what_it_had_and_what_it_made():
         normalizers = ppo.make_normalizers(env, SMALL, state.observation_stats)
         key = jax.random.split(state.key, 3)[1]
         _, rollout, _ = ppo.collect_rollout(env, SMALL, state, normalizers, key)
-        return ppo.prepare(SMALL, state.value_stats, state.params, rollout)[2]
+        return ppo.prepare(SMALL, state.value_stats, {}, state.params, rollout).samples
 
     samples = jax.tree.map(lambda x: np.asarray(x, np.float64), again(before))
     explained = 1 - np.var(samples.target - samples.value) / np.var(samples.target)

@@ -47,7 +47,7 @@ def test_ratio_is_one_before_the_first_gradient(distribution, normalize_value):
     def first_loss(state):
         normalizers = ppo.make_normalizers(env, config, state.observation_stats)
         _, rollout, _ = ppo.collect_rollout(env, config, state, normalizers, jax.random.key(4))
-        _, params, samples = ppo.prepare(config, state.value_stats, state.params, rollout)
+        samples, params, *_ = ppo.prepare(config, state.value_stats, {}, state.params, rollout)
         mean = actor_mean(config, params, normalizers, samples.obs)
         value = critic_value(config, params, normalizers, samples.obs)
         _, metrics = loss(params, config, normalizers, samples, params.log_std)

@@ -43,7 +43,7 @@ def experience(kind):
     def collect(state):
         normalizers = ppo.make_normalizers(env, config, state.observation_stats)
         after, rollout, _ = ppo.collect_rollout(env, config, state, normalizers, jax.random.key(1))
-        _, params, samples = ppo.prepare(config, state.value_stats, state.params, rollout)
+        samples, params, *_ = ppo.prepare(config, state.value_stats, {}, state.params, rollout)
         samples = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), samples)  # the blocks, one after another
         mean = actor_mean(config, params, normalizers, samples.obs, samples.memory, samples.first)
         value = critic_value(config, params, normalizers, samples.obs, samples.memory)
