@@ -1,7 +1,7 @@
 """The force of a finger, estimated from what a hand measures: its taxels, and the torque of its root joint.
 
-Taxels miss what the skin beside them bears; a root joint's torque misses what its friction holds. Pressing, the torque
-tells more of a finger's force, and the taxels are a lower bound of it.
+Taxels miss what the skin beside them bears: they are a lower bound. A root joint's torque has it all, with the joint's
+friction in it, and how much force it is depends on where the finger touches.
 """
 
 import dataclasses
@@ -22,6 +22,8 @@ class ForceEstimate:
     per_torque: tuple[float, ...] = setting((), unit="N", low=0.0, high=1000.0)
     """Force of each finger with its root joint at the torque limit; empty: by the hand's own `force_per_torque`, and of
     a hand without it the taxels alone."""
+    torque_share: float = setting(0.4, unit="1", low=0.0, high=1.0)
+    """How much of the force that the torque tells of beyond the taxels' is believed."""
     touching: float = setting(0.1, unit="N", low=0.001, high=10.0)
     """Force on a finger's taxels from which it counts as touching."""
 
@@ -30,7 +32,8 @@ class ForceEstimate:
 
 
 def estimate_force(estimate: ForceEstimate, hand: Hand, taxel_force: jax.Array, joint_torque: jax.Array) -> jax.Array:
-    """Estimated force [F] N of each finger: the larger of its taxels' sum and its torque's force; 0 without touch.
+    """Estimated force [F] N of each finger: its taxels' sum and a share of what its torque tells beyond it; 0 without
+    touch.
 
     Args:
       estimate: its settings.
@@ -49,5 +52,5 @@ def estimate_force(estimate: ForceEstimate, hand: Hand, taxel_force: jax.Array, 
                 f"ForceEstimate.per_torque has {len(estimate.per_torque)} values, the hand {hand.num_fingers} fingers"
             )
         gain = np.asarray(estimate.per_torque, np.float32)
-    force = jnp.maximum(felt, gain * jnp.abs(joint_torque[hand.root_joint]))
-    return jnp.where(felt > estimate.touching, force, 0.0)
+    beyond = jnp.maximum(gain * jnp.abs(joint_torque[hand.root_joint]) - felt, 0.0)
+    return jnp.where(felt > estimate.touching, felt + estimate.torque_share * beyond, 0.0)

@@ -65,7 +65,7 @@ def test_the_force_over_the_root_joints_torque_comes_back(hand, session):
     read = normalised_torque(calibration, current)
     taxels = np.zeros((5, hand.num_taxels))
     taxels[1, 50] = 1.0
-    force = estimate_force(ForceEstimate(), calibrated_hand(hand, calibration), taxels, read)[1]
+    force = estimate_force(ForceEstimate(torque_share=1.0), calibrated_hand(hand, calibration), taxels, read)[1]
     friction = calibration.real.friction[4] / abs(np.mean(calibration.real.gain[:, 4]))
     assert abs(float(force) - 6.0) < friction * 1.3 + 0.3
 
