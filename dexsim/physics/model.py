@@ -165,7 +165,7 @@ def _set_options(spec: mujoco.MjSpec, config: PhysicsConfig, gravity: tuple[floa
         option.iterations, option.ls_iterations = max(config.iterations, 20), max(config.line_search, 50)
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP  # it costs a factorisation more
     # A capsule over a cylinder's rim: the search for more than one contact answers with two at the same place, along
-    # the cylinder's axis instead of away from it and at a third of the depth. C MuJoCo and Warp both do.
+    # the cylinder's axis instead of away from it, and too shallow. C MuJoCo and Warp both do.
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_MULTICCD
     if backend != "c":
         # In MJX box-box has its own kernel only with nativeccd off. C MuJoCo has it anyway, and its older convex

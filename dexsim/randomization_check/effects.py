@@ -28,7 +28,7 @@ _AIDS: dict[str, dict[str, Any]] = {
     "hysteresis_time": {"hysteresis": (0.3, 0.3)},
 }
 _SHAPE_OF = {"sphere": "sphere", "cylinder": "cylinder", "neck": "composition"}
-# Of the worlds, that must differ by more than two runs of the same where these differ at all.
+# Share of the worlds that must differ by more than two runs of the same do, where these differ.
 _SHARE = 0.25
 _WIDTHS = ("encoder_bias", "gravity_tilt", "com_offset", "bias", "drift")  # ranges given by one number
 
@@ -127,7 +127,7 @@ class _Bench:
         )
         self.base = self._run(self.states)
         # On the Warp backend two runs of the same differ: what is not well above that is no effect.
-        # Contacts that two runs meet differently part a world by itself, so that it takes a share of them.
+        # One world whose contacts come out differently is far away by chance, so it takes a share of the worlds.
         self.share = _SHARE if env.backend == "warp" else 0.0
         again = [self._distance(self._run(self.states)) for _ in range(3 if env.backend == "warp" else 1)]
         self.floor = {name: 3.0 * np.max([run[name] for run in again], 0) for name in self.base}

@@ -23,7 +23,7 @@ class ForceEstimate:
     """Force of each finger with its root joint at the torque limit; empty: by the hand's own `force_per_torque`, and of
     a hand without it the taxels alone."""
     torque_share: float = setting(0.4, unit="1", low=0.0, high=1.0)
-    """How much of the force that the torque tells of beyond the taxels' is believed."""
+    """Share of the torque's force beyond the taxels' that counts: 0 for the taxels alone, 1 for the larger of both."""
     touching: float = setting(0.1, unit="N", low=0.001, high=10.0)
     """Force on a finger's taxels from which it counts as touching."""
 

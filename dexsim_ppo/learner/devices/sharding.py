@@ -102,16 +102,16 @@ def averaged(function: Callable, mesh: Mesh | None) -> Callable:
 
 def moments(tree: Any, mesh: Mesh | None) -> tuple[Any, Any]:
     """Mean and variance [...] of each array [T, B, ...] over steps and environments, with two reductions in all."""
-    average: Callable = (lambda tree: tree) if mesh is None else _average
 
-    def part(tree: Any) -> tuple[Any, Any]:
+    def part(tree: Any, average: Callable = lambda tree: tree) -> tuple[Any, Any]:
         mean = average(jax.tree.map(lambda x: jnp.mean(x, (0, 1)), tree))
         return mean, average(jax.tree.map(lambda x, m: jnp.mean((x - align(m, x)) ** 2, (0, 1)), tree, mean))
 
     if mesh is None:
         return part(tree)
-    split = PartitionSpec(None, AXIS)
-    return jax.shard_map(part, mesh=mesh, in_specs=split, out_specs=PartitionSpec(), check_vma=False)(tree)
+    whole, parts = PartitionSpec(), PartitionSpec(None, AXIS)
+    each = lambda tree: part(tree, _average)  # noqa: E731
+    return jax.shard_map(each, mesh=mesh, in_specs=parts, out_specs=whole, check_vma=False)(tree)
 
 
 def _average(tree: Tree) -> Tree:

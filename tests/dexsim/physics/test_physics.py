@@ -76,7 +76,7 @@ def error(found):
 class TestAgainstC:
     @pytest.mark.parametrize("shape", SHAPES)
     def test_a_sub_step_in_contact(self, contact_steps, shape):
-        """Contacts with capsules, boxes and the palm's plane are where C MuJoCo has them.
+        """Contacts with all shapes and the palm's plane are where C MuJoCo has them.
 
         What is left is float32: contact depths of 1e-7 m under springs of some 1e4 N/m move
         forces by 1e-3 N, and velocities of 1e-5 kg m^2 links by 1e-3.
