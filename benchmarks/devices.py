@@ -26,6 +26,7 @@ from typing import Any
 import jax
 from collectives import received
 from launch import start
+from throughput import preset
 
 import dexsim
 from dexsim.core.cli import enable_caches
@@ -36,7 +37,6 @@ from dexsim_ppo.learner.devices.apart import ApartStep
 from dexsim_ppo.learner.devices.sharding import make_mesh
 from dexsim_ppo.learner.ppo import make_train
 from dexsim_ppo.training import processes
-from dexsim_ppo.training.presets import find_preset
 
 
 class Case:
@@ -49,7 +49,7 @@ class Case:
     """
 
     def __init__(self, options: argparse.Namespace, devices: int, seeds: int = 1):
-        ppo = find_preset("gpu" if jax.default_backend() == "gpu" else "cpu", options.task).ppo
+        ppo = preset(options.task).ppo
         each = options.num_envs or ppo.num_envs
         self.config = dataclasses.replace(ppo, num_envs=each * devices, iterations_per_call=options.iterations)
         if options.rollout_length:

@@ -17,20 +17,19 @@ from typing import Any
 
 import jax
 import numpy as np
-from throughput import Recorder, make
+from throughput import Recorder, make, preset
 from throughput_split import record, replay
 
 from dexsim.core.cli import enable_caches
 from dexsim.core.compilation import collector_paused, jit, make_deterministic
 from dexsim.registry import TASKS
 from dexsim_ppo.learner import ppo
-from dexsim_ppo.training.presets import find_preset
 
 
 def parts(task: str, backend: str, num_envs: int, warmup: int) -> Iterator[tuple[str, Callable, Any]]:
     """Name, compiled function and its argument, in the order of a training."""
     env, recorder = make(task, "full", backend, num_envs), Recorder(make(task, "full", backend, num_envs))
-    ppo_config = find_preset("gpu" if jax.default_backend() == "gpu" else "cpu", task).ppo
+    ppo_config = preset(task).ppo
     config = dataclasses.replace(ppo_config, num_envs=num_envs, iterations_per_call=1)
     training, compiled = ppo.make_train(env, config), functools.partial(jit, backend=env.backend)
     yield "pool of start states", lambda pool: pool, env.pool

@@ -15,7 +15,7 @@ from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
-from throughput import Recorder, make, seconds, timing
+from throughput import Recorder, make, preset, seconds, timing
 
 from dexsim.core.compilation import jit
 from dexsim.env.env import Env
@@ -31,14 +31,12 @@ from dexsim_ppo.learner.loss import actor_step, critic_value
 from dexsim_ppo.learner.ppo import TrainState, make_train
 from dexsim_ppo.learner.rollout import Remembering, Restarting, Rollout, scan_restarting
 from dexsim_ppo.learner.update import Learner, update
-from dexsim_ppo.training.presets import find_preset
 
 
 def split(task: str, backend: str, num_envs: int, repeats: int) -> list[dict]:
     """A row for a whole training iteration and one for each part."""
     env, recorder = make(task, "full", backend, num_envs), Recorder(make(task, "full", backend, num_envs))
-    preset = find_preset("gpu" if jax.default_backend() == "gpu" else "cpu", task)
-    config = dataclasses.replace(preset.ppo, num_envs=num_envs, iterations_per_call=1)
+    config = dataclasses.replace(preset(task).ppo, num_envs=num_envs, iterations_per_call=1)
     training = make_train(env, config)
     # Some iterations first: objects settle, episodes of all ages are under way.
     state = training.init(jax.random.key(0))

@@ -111,8 +111,6 @@ class Row:
     """Changes to the task's configuration, as `--set` of the evaluation command takes them."""
     policy: str = ""
     """Shipped policy that is measured."""
-    stand_in: str = ""
-    """Shipped policy whose own report a row shows until its trainings are done."""
     ablate: tuple[str, ...] = ()
     """Observation fields that the policy does without."""
     points: tuple[float, ...] = ()
@@ -183,7 +181,7 @@ def settings_of(row: Row) -> dict[str, Any]:
     settings = {
         name: list(value) if isinstance(value, tuple) else value
         for name, value in dataclasses.asdict(row).items()
-        if name not in ("label", "paper", "training", "stand_in")
+        if name not in ("label", "paper", "training")
     }
     return settings | ({"weights": weights_of(asset_path(f"policies/{row.policy}.msgpack"))} if row.policy else {})
 

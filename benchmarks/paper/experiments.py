@@ -32,14 +32,12 @@ def _paper(name: str) -> dict[str, str]:
 
 def _observation_rows(task: str) -> tuple[Row, ...]:
     """The seven rows of the paper's table, trained on a task."""
-    shipped = {"full": "rotate", "no_orientation": "rotate_without_orientation"} if task == "rotate" else {}
     return tuple(
         Row(
             name=name,
             label=label,
             task=task,
             settings=settings,
-            stand_in=shipped.get(name, ""),
             paper=_paper(name),
         )
         for name, (label, settings) in _OBSERVATIONS.items()

@@ -1,10 +1,8 @@
 """Tables of the experiments: a header and rows of text, made from the reports."""
 
-import json
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from dexsim.core.assets import asset_path
 from paper.data import Experiment, Row
 
 Reports = dict[str, dict[str, Any]]
@@ -50,7 +48,7 @@ def seeds(report: dict[str, Any] | None) -> list[dict[str, Any]]:
 def how(experiment: Experiment, row: Row, report: dict[str, Any] | None) -> str:
     """Where a row's numbers are from."""
     if not report:
-        return "shipped policy, one seed, trained on a GPU" if row.stand_in else UNTRAINED
+        return UNTRAINED
     count = len(report["seeds"])
     trained = [seed["training"] for seed in seeds(report) if seed.get("training")]
     if not trained:
@@ -75,7 +73,7 @@ def rotation(experiment: Experiment, reports: Reports) -> list[list[str]]:
     for row in experiment.rows:
         report = reports.get(row.name)
         found, numbers = seeds(report), row.paper
-        there = [seed["simulation"] for seed in found if "simulation" in seed] or _shipped(row)
+        there = [seed["simulation"] for seed in found if "simulation" in seed]
         line = [row.label]
         if paper:
             line.append(numbers["mean / median / s each / s to fall"])
@@ -103,14 +101,6 @@ def _seconds_each(count: float, seconds: float) -> dict[str, Any]:
     return {"mean": seconds / count if count else None}
 
 
-def _shipped(row: Row) -> list[dict[str, Any]]:
-    """The shipped policy's own report in simulation, where the row names one."""
-    if not row.stand_in:
-        return []
-    report = json.loads(asset_path(f"policies/{row.stand_in}.json").read_text())
-    return [report.get("evaluation", report["trained"])["task"]]
-
-
 # --- grasp ----------------------------------------------------------------------------------------------
 
 
@@ -124,7 +114,7 @@ def grasp(experiment: Experiment, reports: Reports) -> list[list[str]]:
         report = reports.get(row.name)
         line = [row.label, row.paper["force range [N]"], row.paper["torque range"]]
         for world in ("simulation", "hand"):
-            found = [seed[world] for seed in seeds(report)] or (_shipped(row) if world == "simulation" else [])
+            found = [seed[world] for seed in seeds(report)]
             line += [
                 percent(s["held"] for s in found),
                 _range(found, ("total_force", "total_force_n")),
