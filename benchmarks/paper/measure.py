@@ -1,5 +1,6 @@
 """How a row is measured: training, evaluation in simulation, trials on the emulated hand, sweeps, held-out objects."""
 
+import dataclasses
 import functools
 import json
 import shutil
@@ -13,6 +14,7 @@ from dexsim.registry import find_task
 from dexsim_ppo import load_policy, train_policy
 from dexsim_ppo.evaluate import Evaluator
 from dexsim_ppo.policy import Policy
+from dexsim_ppo.training.presets import find_preset
 from dexsim_ppo.training.runlog import RunFolder
 from paper.data import BUDGETS, Budget, Row
 
@@ -55,9 +57,11 @@ def train(row: Row, seed: int, budget: Budget, folder: Path) -> tuple[Path, dict
         else:
             # A run without a checkpoint has nothing to resume, and its folder is in the way.
             shutil.rmtree(folder, ignore_errors=True)
+            ppo, changes = find_preset(budget.preset, row.task).ppo, budget.learner.get(row.skill, {})
             train_policy(
                 row.task,
                 task_config(row),
+                ppo=dataclasses.replace(ppo, **changes),
                 preset=budget.preset,
                 backend=budget.backend,
                 **NO_LIMIT | budget.training[row.skill],
@@ -69,7 +73,7 @@ def train(row: Row, seed: int, budget: Budget, folder: Path) -> tuple[Path, dict
     origin = report["origin"]
     return folder / report["policy"], {
         "env_steps": origin["env_steps"],
-        **budget.training[row.skill],
+        **budget.training[row.skill] | budget.learner.get(row.skill, {}),
         "seed": seed,
         "hardware": report["hardware"],
     }

@@ -190,9 +190,11 @@ class TestTraining:
     def test_a_budget_of_steps_has_no_limit_of_time(self, paper, trained, here):
         row = paper.experiments.EXPERIMENTS["observations"].rows[0]
         _, found = paper.measure.train(row, 0, paper.data.BUDGETS["gpu"], here / "seed0")
-        assert (trained[0][2]["steps"], trained[0][2]["minutes"]) == (6e7, 0.0)
+        options = trained[0][2]
+        assert (options["steps"], options["minutes"]) == (4e7, 0.0)
+        assert (options["ppo"].num_envs, options["ppo"].kl_target, found["kl_target"]) == (8192, 0.04, 0.04)
         report = {"seeds": {"0": {"training": found}}, "budget": "gpu"}
-        assert paper.tables.how(None, row, report) == "1 × 60 million steps, gpu budget"
+        assert paper.tables.how(None, row, report) == "1 × 40 million steps, gpu budget"
 
     def test_it_resumes_from_a_checkpoint(self, paper, trained, here):
         folder = here / "seed0"
