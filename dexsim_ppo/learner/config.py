@@ -18,7 +18,7 @@ class PPOConfig:
     epochs: int = setting(5, unit="1", low=1)
     """Passes over the experience of one iteration."""
     minibatches: int = setting(4, unit="1", low=1)
-    """Minibatches per epoch; must divide T * B. A few large ones work best."""
+    """Minibatches per epoch; must divide T * B, with `gru` B."""
     iterations_per_call: int = setting(1, unit="1", low=1)
     """Iterations inside one compiled call."""
     discount: float = setting(0.99, unit="1", low=0.0, high=1.0)

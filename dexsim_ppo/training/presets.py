@@ -117,6 +117,8 @@ def find_preset(name: str, task: str) -> Preset:
 def preset_arguments(task: str, env_config: Any, name: str) -> TrainArguments:
     """The options' defaults under a preset."""
     preset = find_preset(device_preset() if name == "auto" else name, task)
+    if not hasattr(env_config, "randomization"):  # An environment from elsewhere: no ranges, and small as a rule.
+        preset = replace(preset, extremes=0.0, ppo=replace(preset.ppo, memory="none"))
     return TrainArguments(env=env_config, task=task, **{f.name: getattr(preset, f.name) for f in fields(Preset)})
 
 

@@ -44,7 +44,8 @@ def test_tasks_from_elsewhere_get_no_setting_of_ours():
         for field in ("learning_rate", "discount", "kl_halving"):
             assert getattr(given.ppo, field) == getattr(default, field)
         assert given.ppo.kl_target == (0.5 if name != "gpu" else 1.0) * ours.ppo.kl_target
-        assert given.ppo == PRESETS[name].ppo and not given.curriculum.on
+        assert given.ppo == dataclasses.replace(PRESETS[name].ppo, memory="none") and not given.curriculum.on
+        assert training_config(given) is given.env, "extremes need ranges, which it has none of"
     assert find_preset("tpu", "reach") is PRESETS["cpu"]
 
 
