@@ -16,7 +16,7 @@ anew: `--list` shows what is done, `--budget gpu` trains longer and measures mor
 The paper's numbers are from its real hand. No policy of ours has run on one yet: the emulated hand is another simulator
 behind the bridge's own frames, with parameters outside training's ranges or of its own. Numbers in brackets: of one
 seed the 95 % interval over episodes or trials, of several the lowest and highest seed. Every table names the commit
-that it was measured at; those before d521ffc had narrower ranges of rubber and friction.
+that it was measured at.
 """
 
 
@@ -46,9 +46,9 @@ def render(folder: Path = REPORTS) -> str:
 
 def _section(experiment: Experiment, reports: dict[str, dict[str, Any]], folder: Path) -> str:
     lines = [f"## {experiment.title}", ""]
-    if experiment.table and (reports or experiment.trains):
+    if experiment.table and reports:
         lines += [markdown(experiment.table(experiment, reports)), ""]
-    if not reports and not experiment.trains:
+    if not reports:
         lines += ["Not measured yet.", ""]
     lines += [line for report in reports.values() for seed in seeds(report) for line in _summary(seed)]
     figures = sorted(path for path in (folder / experiment.name).rglob("*") if path.suffix in (".svg", ".jpg"))
