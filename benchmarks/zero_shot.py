@@ -13,21 +13,22 @@ as for a user (`trials.py`). The metrics use the true state, not the measurement
 not depend on the other trials. A hand that does nothing gets the same trials, in virtual time.
 """
 
-import argparse
 import concurrent.futures
 import dataclasses
 import functools
 import itertools
-import json
 import multiprocessing
 import sys
 import time
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from trials import real_trial
+from zero_shot_options import arguments
 from zero_shot_table import simulated, table
+
+from dexsim.core import cli
 
 TARGETS = {"grasp": "held 90 %, r 0.8", "rotate": "25.1 successes, 17.9 a minute, 84.3 s to fall"}
 COMMANDS = (0.0, 0.25, 0.5, 0.75, 1.0)
@@ -216,65 +217,9 @@ def metrics(task: str, policy: str, reports: list[dict[str, Any]]) -> dict[str, 
     return grasp_metrics(reports, tuple(load_policy(policy).env_config["finger_force"]))
 
 
-def arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--task", choices=("grasp", "rotate"), required=True)
-    parser.add_argument("--policy", help="policy file; by default the shipped policy of the task")
-    parser.add_argument("--trials", type=int, default=10, help="trials of each seed")
-    parser.add_argument(
-        "--seed", type=int, nargs="+", default=[0], help="seeds; the metrics are over the trials of all seeds"
-    )
-    parser.add_argument(
-        "--seconds", type=float, help="time limit of a trial in s; by default that of the task (8 or 120)"
-    )
-    parser.add_argument(
-        "--parameters",
-        choices=("outside", "inside", "nominal"),
-        default="outside",
-        help="parameters of hand and object: outside training's ranges, inside them, or nominal",
-    )
-    parser.add_argument(
-        "--plant-model",
-        metavar="FILE",
-        help="MJCF of a hand by somebody else in place of the emulated hand's physics (docs/hardware.md)",
-    )
-    parser.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="NAME=VALUE",
-        help="fix a parameter (dexsim_real/twin/plant/parameters.py): a number, or outside, inside, nominal",
-    )
-    parser.add_argument(
-        "--limit",
-        action="append",
-        default=[],
-        metavar="NAME=VALUE",
-        help="another value for a safety limit of the bridge (dexsim_real/control/safety.py)",
-    )
-    parser.add_argument(
-        "--no-safety", dest="safety", action="store_false", help="run without the bridge's safety limits"
-    )
-    parser.add_argument(
-        "--no-baseline", dest="baseline", action="store_false", help="do not run the trials with an idle hand, too"
-    )
-    parser.add_argument("--processes", type=int, default=1, help="trials at once, in virtual time")
-    parser.add_argument("--real-time", action="store_true", help="run hand and runner as processes, in real time")
-    parser.add_argument("--first", type=int, default=0, help="number of the first trial")
-    parser.add_argument("--twin", default="", help="more options of `dexsim_real.twin`, as one argument")
-    parser.add_argument("--runner", default="", help="more options of `dexsim_real.run`, as one argument")
-    parser.add_argument("--json", type=Path, help="JSON file for all results")
-    given = parser.parse_args()
-    if given.real_time and (given.set or not given.safety or given.processes > 1):
-        parser.error("--set, --no-safety and --processes are for virtual time")
-    if not given.real_time and (given.twin or given.runner):
-        parser.error("--twin and --runner need --real-time")
-    return given
-
-
-def main() -> int:
+def main(argv: Sequence[str] | None = None) -> int:
     """The command. Returns its exit code."""
-    given = arguments()
+    given = arguments(__doc__.splitlines()[0], argv)
     options = {
         "task": given.task,
         "policy": given.policy or given.task,
@@ -287,11 +232,8 @@ def main() -> int:
         "real_time": given.real_time,
         "twin": given.twin,
         "runner": given.runner,
-        "set": {
-            name: value if value in ("outside", "inside", "nominal") else float(value)
-            for name, value in (pair.split("=") for pair in given.set)
-        },
-        "limit": {name: float(value) for name, value in (pair.split("=") for pair in given.limit)},
+        "set": given.set,
+        "limit": given.limit,
     }
     reports = run_all(options, given.trials, given.processes, show=True)
     still = (
@@ -302,18 +244,16 @@ def main() -> int:
     here = metrics(given.task, options["policy"], reports)
     idle = metrics(given.task, options["policy"], still) if still else {}
     there = simulated(given.task, options["policy"])
+    if given.json:  # Before the output, whose reader may be gone.
+        found = {"options": options, "metrics": here, "simulation": there, "do_nothing": idle, "trials": reports}
+        cli.write_json(given.json, found)
     print(
         f"{given.task}: {len(reports)} trials{' in real time' * given.real_time}, parameters {given.parameters}, "
         f"seed {' '.join(map(str, given.seed))}; targets {TARGETS[given.task]}"
     )
     print(table(here, there, idle))
-    if given.json:
-        found = {"options": options, "metrics": here, "simulation": there, "do_nothing": idle, "trials": reports}
-        given.json.write_text(json.dumps(found, indent=1))
     return 0
 
 
 if __name__ == "__main__":
-    from dexsim.core import cli
-
-    cli.run(lambda _: main())
+    cli.run(main)

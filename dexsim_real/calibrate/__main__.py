@@ -68,7 +68,7 @@ def record(arguments: CalibrateArguments, hand: Hand, operator: Operator, **benc
 
 
 def fit_and_report(arguments: CalibrateArguments, hand: Hand, logs: Sequence[Path], operator: Operator) -> None:
-    """Fit the presses, print the result, and write the files asked for, the calibration last.
+    """Fit the presses, print the result, and write the files asked for, the calibration first.
 
     Raises:
       DexsimError: the recordings are insufficient, or a file cannot be written.
@@ -78,11 +78,6 @@ def fit_and_report(arguments: CalibrateArguments, hand: Hand, logs: Sequence[Pat
     operator.console.print(force_table(found.calibration))
     for note in grouped(found.calibration.notes):
         operator.tell(f"note: {note}")
-    if arguments.report:
-        cli.write_json(arguments.report, report(found))
-    if arguments.plot:
-        plot_calibration(arguments.plot, found.calibration, found.real, found.sim)
-        operator.tell(f"figure: {arguments.plot}")
     if arguments.destination.exists() and not arguments.force:  # It may have been created meanwhile.
         raise HandError(
             f"{arguments.destination} already exists: --from-log {' '.join(map(str, logs))} fits these "
@@ -90,6 +85,11 @@ def fit_and_report(arguments: CalibrateArguments, hand: Hand, logs: Sequence[Pat
         )
     save_calibration(arguments.destination, found.calibration)
     operator.tell(f"calibration: {arguments.destination}")
+    if arguments.report:
+        cli.write_json(arguments.report, report(found))
+    if arguments.plot:
+        plot_calibration(arguments.plot, found.calibration, found.real, found.sim)
+        operator.tell(f"figure: {arguments.plot}")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -100,6 +100,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         prog="python -m dexsim_real.calibrate",
         description=__doc__.splitlines()[0],
     )
+    for path in (arguments.destination, arguments.report, arguments.plot):
+        if path:
+            cli.check_writable(path)
     prepare_jax()
     cli.enable_caches()
     hand = load_hand()

@@ -24,7 +24,7 @@ from dexsim_real.core.timing import Pace
 from dexsim_real.sensors.hand import HandSensing, VelocityFilter
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Command, Frame, Mode
-from dexsim_real.wire.link import HandPort, Reply
+from dexsim_real.wire.link import HandPort, Reply, checked
 
 _PATIENCE = 2.0  # s, longest hold by `Safety` or silence of the hand
 
@@ -90,7 +90,7 @@ class HandLoop:
         reply = self.port.exchange(command)
         if reply is None:
             self.safety.refuse(getattr(self.port, "refusal", None))
-        exchange = None if reply is None else self._take(reply, decision.reaction)
+        exchange = None if reply is None else self._take(checked(reply, self.clock()), decision.reaction)
         self._check(now, decision, reply)
         self.pace.wait()
         return exchange

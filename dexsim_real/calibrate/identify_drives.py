@@ -23,6 +23,7 @@ from dexsim.identification.report import Identification
 from dexsim_real.calibrate.bench import Workbench
 from dexsim_real.calibrate.hand_loop import Operator
 from dexsim_real.calibrate.options import CalibrateArguments
+from dexsim_real.calibrate.taxel_check import check_answered
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogError, LogReader
 from dexsim_real.core.process import stopping
@@ -36,6 +37,7 @@ _SIGNALS: dict[str, dict[str, Any]] = {
     "hold-out": {"amplitude": 0.2, "chirp_frequency": (0.5, 2.5), "chirp_seconds": 3.0, "step_count": 3},
 }
 _TIMESTEP = 0.006  # s, about that of the simulation
+_TARE = 0.5  # s
 _LOST = 0.02  # share of the exchanges that may be missing
 
 
@@ -81,7 +83,11 @@ def identify_hand(arguments: CalibrateArguments, hand: Hand, operator: Operator,
 
 
 def record(arguments: CalibrateArguments, hand: Hand, operator: Operator, **bench: Any) -> Path:
-    """Move the joints and record their answers; returns the log."""
+    """Move the joints and record their answers; returns the log.
+
+    Raises:
+      HandError: the procedure failed, or the hand did not answer; the motors are off.
+    """
     period = 1.0 / arguments.rate
     signals = {
         label: excitation(hand, Excitation(period=period, **options), _open_posture(hand), arguments.joints or None)
@@ -93,7 +99,7 @@ def record(arguments: CalibrateArguments, hand: Hand, operator: Operator, **benc
         try:
             loop = work.loop
             # Otherwise `Safety` would mistake the taxels' zero error for a touch.
-            loop.sensing.set_tare([exchange.state for exchange in loop.collect(0.5)])
+            loop.sensing.set_tare([exchange.state for exchange in check_answered(loop.collect(_TARE), _TARE)])
             loop.step()
             if not operator.assume_yes and operator.ask("  Enter starts, s stops:", loop.step).lower() in ("s", "stop"):
                 raise HandError("stopped before anything moved")
@@ -123,7 +129,7 @@ def read_logs(
     parts: dict[tuple[str, str], list] = {}
     hardware, period = HardwareConfig(), 0.0
     for path in paths:
-        task = None
+        task, received = None, (-1, b"")  # The first exchange that is recorded may be unanswered.
         for record in LogReader(path):
             content = record.content
             if record.kind == Kind.META and "task" in content:
@@ -134,9 +140,8 @@ def read_logs(
             elif record.kind == Kind.RECEIVED:
                 received = content
             elif record.kind == Kind.TICK and task == TASK:
-                parts.setdefault((content["joint"], content["signal"]), []).append(
-                    (content["sequence"], sent, received)
-                )
+                answer = received[1] if received[0] == content["sequence"] else None
+                parts.setdefault((content["joint"], content["signal"]), []).append((sent[1], answer))
         if task != TASK:
             found = f"it is a log of {task!r}" if task else "it ends before the hand was ready"
             raise LogError(f"{path}: this is not a log of --identify: {found}")
@@ -145,24 +150,31 @@ def read_logs(
 
 
 def _joint_log(
-    name: str, rows: list, hand: Hand, hardware: HardwareConfig, calibration: Calibration | None, period: float
+    name: str,
+    rows: list[tuple[bytes, bytes | None]],
+    hand: Hand,
+    hardware: HardwareConfig,
+    calibration: Calibration | None,
+    period: float,
 ) -> JointLog:
+    """The samples of a joint, given the frames of every command and of its answer, None without one."""
     joint = hand.joint_names.index(name)
     sign, offset = hardware.joint_sign[joint], hardware.joint_offset[joint]
-    lost = np.array([number != received[0] for number, _, received in rows])
+    lost = np.array([answer is None for _, answer in rows])
     if np.mean(lost) > _LOST:
         raise LogError(f"{name}: {np.sum(lost)} of {len(lost)} exchanges are missing; check the cable and record again")
-    state = np.array([frames.decode_state(received[1][frames.HEADER.size : -2])["joint"] for _, _, received in rows])
-    command = np.array([frames.decode_command(sent[1][frames.HEADER.size : -2])["position"] for _, sent, _ in rows])
+    answers = [answer for _, answer in rows if answer is not None]
+    state = np.array([frames.decode_state(frame[frames.HEADER.size : -2])["joint"] for frame in answers])
+    command = np.array([frames.decode_command(frame[frames.HEADER.size : -2])["position"] for frame, _ in rows])
     target, position = (part[:, joint].astype(float) * sign + offset for part in (command, state["position"]))
     # Few samples are missing: interpolate them.
     time = np.arange(len(rows))
-    position = np.interp(time, time[~lost], position[~lost])
+    position = np.interp(time, time[~lost], position)
     torque = None
     if calibration is not None:
         current = state["current"].astype(float) * calibration.current_per_count
         torque = np.array(joint_torque(calibration, current))[:, joint]
-        torque = np.interp(time, time[~lost], torque[~lost])
+        torque = np.interp(time, time[~lost], torque)
     return JointLog(period, target, position, torque, name)
 
 

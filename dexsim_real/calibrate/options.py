@@ -117,6 +117,8 @@ class CalibrateArguments:
             raise HandError("give --port for a hand, or --from-log FILE for a log of this command")
         if self.destination.exists() and not self.force:
             raise HandError(f"{self.destination} already exists: give another --output, or --force to overwrite it")
+        if self.plot and self.plot.suffix.lower() not in (".png", ".pdf", ".svg"):
+            raise HandError(f"--plot {self.plot}: give a file that ends in .png, .pdf or .svg")
         if self.press.current >= self.safety.current:
             raise HandError(
                 f"--press.current {self.press.current:g} A must be below --safety.current {self.safety.current:g} A"

@@ -89,12 +89,12 @@ def fit(session: PressSession, hand: Hand, created: str | None = None) -> Fit:
     pressed = [r for r in session.recordings.values() if len(r.samples(LOADING, UNLOADING))]
     if not pressed:
         raise CalibrationError("no press was recorded; record again")
-    scale = force_scale(session, hand, pressed)
-    notes = list(scale.notes)
+    felt, faint = _felt(pressed, hand.taxel_grid)
+    scale = force_scale(session, hand, [recording for recording, _ in felt])
+    notes = [*scale.notes, *faint]
     real, sim, source = {}, {}, {}
     reach: dict[str, float] = {}
-    for recording in pressed:
-        blocks = make_blocks(recording, hand.taxel_grid)
+    for recording, blocks in felt:
         dead = dead_taxels(hand, blocks.counts, session.check.neighbours)
         blocks = dataclasses.replace(blocks, counts=fill_dead(hand, blocks.counts, dead))
         gain, offset = scale.newtons[recording.name]
@@ -142,14 +142,28 @@ def fit(session: PressSession, hand: Hand, created: str | None = None) -> Fit:
             created=created,
         )
     except CalibrationError as error:
-        raise CalibrationError(
-            "; ".join([str(error), *(note for note in notes if "hardly moved" in note or "by shear" in note)])
-        ) from None
+        why = [note for note in notes if "hardly moved" in note or "by shear" in note]
+        raise CalibrationError("; ".join([str(error), *faint, *why])) from None
     notes += _zero_note(session, hand)
     result = dataclasses.replace(result, force_per_torque=fit_force_per_torque(hand, result, real, sim))
     # With a gauge the absolute scale is known.
     kept = tuple(note for note in result.notes if not (scale.sensors and note.startswith("only the ratio")))
     return Fit(dataclasses.replace(result, notes=(*kept, METHOD, *notes)), real, sim, source, scale.sensors)
+
+
+def _felt(pressed: list[Recording], grid: tuple[int, int]) -> tuple[list[tuple[Recording, Blocks]], list[str]]:
+    """The presses that the taxels felt, with their blocks, and a note on each other one: without force no lever arm."""
+    felt, notes = [], []
+    for recording in pressed:
+        blocks = make_blocks(recording, grid)
+        if blocks.counts.sum() > 0:
+            felt.append((recording, blocks))
+        else:
+            notes.append(
+                f"{recording.name}: left out: no taxel read {ACTIVE:g} counts or more; press on the taxels, or with "
+                "more current (--press.current)"
+            )
+    return felt, notes
 
 
 def make_blocks(recording: Recording, grid: tuple[int, int]) -> Blocks:

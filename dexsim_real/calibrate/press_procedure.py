@@ -15,7 +15,7 @@ from dexsim_real.calibrate.gauge import Gauge
 from dexsim_real.calibrate.hand_loop import Exchange, HandLoop, Operator
 from dexsim_real.calibrate.options import CalibrateArguments
 from dexsim_real.calibrate.plan import Placement
-from dexsim_real.calibrate.taxel_check import RestReport, check_release, check_rest, raw_sensing
+from dexsim_real.calibrate.taxel_check import RestReport, check_answered, check_release, check_rest, raw_sensing
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind
 
@@ -124,13 +124,19 @@ class PressProcedure:
         return True
 
     def _tare_in_air(self) -> None:
-        """Tare in the air where the press begins: gravity and the last press have moved the zero."""
-        self.loop.collect(self.config.pause, self._target())
-        exchanges = self.loop.collect(self.config.pause, self._target())
+        """Tare in the air where the press begins: gravity and the last press have moved the zero.
+
+        Raises:
+          HandError: the hand did not answer, something touches a fingertip, or a taxel is stuck.
+        """
+        pause = self.config.pause
+        self.loop.collect(pause, self._target())
+        exchanges = check_answered(self.loop.collect(pause, self._target()), pause)
         if stuck := self.loop.sensing.set_tare([exchange.state for exchange in exchanges]):
             raise HandError(f"{'; '.join(stuck)}; power-cycle the hand")
         self._set_tare(self.loop.sensing.tare)
-        free = [self._force(exchange) for exchange in self.loop.collect(self.config.pause, self._target())]
+        exchanges = check_answered(self.loop.collect(pause, self._target()), pause)
+        free = [self._force(exchange) for exchange in exchanges]
         self._touch = max(self.config.touch, float(np.mean(free) + 6 * np.std(free)))
 
     def _set_tare(self, tare: np.ndarray) -> None:

@@ -54,7 +54,7 @@ class PressSession:
 
 
 def read_logs(paths: Iterable[Path], hand: Hand) -> PressSession:
-    """The presses in logs of `dexsim_real.calibrate`. A press in several logs is taken from the last.
+    """The presses in logs of `dexsim_real.calibrate`. A press in several logs is taken from the last that has samples.
 
     Raises:
       LogError: not a log of presses, or recorded with other settings than the logs before.
@@ -69,7 +69,8 @@ def read_logs(paths: Iterable[Path], hand: Hand) -> PressSession:
         elif found.serial != session.serial:
             raise LogError(f"{path}: is of hand {found.serial!r}, the logs before of hand {session.serial!r}")
         else:
-            session.recordings.update(found.recordings)
+            # A press that was skipped or missed is in its log without samples.
+            session.recordings.update({name: press for name, press in found.recordings.items() if press.time})
     assert session is not None, "no log given"
     return session
 

@@ -5,10 +5,12 @@ neighbours are pressed, so it is looked for after a press.
 """
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 
 from dexsim.hand.kinematics import Hand
+from dexsim_real.calibrate.hand_loop import Exchange
 from dexsim_real.calibrate.options import CheckConfig
 from dexsim_real.core.errors import HandError
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
@@ -74,6 +76,17 @@ def check_rest(
         if finger in fingers and mean[finger].max() > limit / 2:
             notes.append(f"{name}: up to {mean[finger].max():.0f} counts at rest, included in the tare")
     return RestReport(mean, counts.sum(-1).std(0), current.mean(0), current.std(0), tuple(notes))
+
+
+def check_answered(exchanges: Sequence[Exchange], seconds: float) -> Sequence[Exchange]:
+    """The exchanges that the taxels are to be tared with, of a time in s.
+
+    Raises:
+      HandError: there are none.
+    """
+    if not exchanges:
+        raise HandError(f"cannot tare the taxels: no usable answer in {seconds:g} s; check the cable")
+    return exchanges
 
 
 def check_release(name: str, sums: np.ndarray, config: CheckConfig) -> None:

@@ -51,8 +51,8 @@ class SafetyConfig:
     """Limits of the hand. Ages count from the time of the measurement or joint target."""
 
     margin: float = setting(0.03, unit="rad", low=0.0, high=0.5)
-    """Distance of commands from the joints' end stops; motors that come on nearer to one begin there. What it cuts
-    off a target does not count as a clip."""
+    """Distance of commands from the joints' end stops, at most half of a joint's range; motors that come on nearer to
+    one begin there. What it cuts off a target does not count as a clip."""
     beyond: float = setting(0.1, unit="rad", low=0.0, high=1.0)
     """Distance beyond a joint's limits at which a measured angle counts as wrong."""
     speed: float = setting(7.0, unit="rad/s", low=0.01, high=200.0)
@@ -135,8 +135,9 @@ class Safety:
     def __init__(self, hand: Hand, config: SafetyConfig, note: Callable[[str], None] = lambda text: None):
         self.config, self._note = config, note
         self._stops = hand.joint_lower.astype(np.float32), hand.joint_upper.astype(np.float32)
-        self._lower = hand.joint_lower.astype(np.float32) + config.margin
-        self._upper = hand.joint_upper.astype(np.float32) - config.margin
+        # At most half of a joint's range: beyond that the limits would change sides.
+        margin = np.minimum(np.float32(config.margin), (self._stops[1] - self._stops[0]) / 2)
+        self._lower, self._upper = self._stops[0] + margin, self._stops[1] - margin
         self.sample: HandSample | None = None  # the newest plausible one
         self.problem = ""  # why the newest measurement does not count
         self.engaged = False
@@ -299,7 +300,8 @@ class Safety:
 
     def _follow(self, now: float, sample: HandSample, target: np.ndarray) -> SafetyDecision:
         config, measured = self.config, sample.measured.joint_position
-        grown = min((now - self._ramp_start) / config.ramp, 1.0) if config.ramp > 0 else 1.0
+        # Not below 0, should a clock go back: the speed would become negative.
+        grown = min(max((now - self._ramp_start) / config.ramp, 0.0), 1.0) if config.ramp > 0 else 1.0
         # Reach ends a motion away from the measured pose and starts none: that pose may be wrong.
         near = (
             np.minimum(measured - config.reach, self.commanded),

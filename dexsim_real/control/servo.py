@@ -14,7 +14,7 @@ from dexsim_real.core.process import ignore_signals, raise_priority
 from dexsim_real.core.timing import Pace, Timing
 from dexsim_real.sensors.hand import HandSensing, VelocityFilter
 from dexsim_real.wire.frames import Mode
-from dexsim_real.wire.link import HandPort, Reply
+from dexsim_real.wire.link import HandPort, Reply, checked
 
 
 class Servo:
@@ -120,6 +120,7 @@ class Servo:
         if reply is None:
             self.safety.refuse(getattr(self.port, "refusal", None))
             return took
+        reply = checked(reply, time.monotonic())
         self.driven = decision.mode == Mode.POSITION
         self.round_trip.add(reply.received - reply.sent)
         sample = self._sample(reply)

@@ -3,9 +3,13 @@
 import errno
 import grp
 import os
+import termios
 from pathlib import Path
 
 from dexsim.core.errors import DexsimError
+
+PORT_ERRORS = (OSError, ValueError, termios.error)
+"""What opening a serial port raises; the last, no `OSError`, when the port vanishes meanwhile."""
 
 
 class HandError(DexsimError):

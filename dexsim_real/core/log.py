@@ -3,7 +3,8 @@
     DXSLOG1\\n, then records: sync (4 bytes) | kind | time | length | CRC-32 | payload
 
 A record reaches the kernel within 0.1 s and then survives the end of the program. Once a second the file
-is synced to the disk. A truncated or damaged record costs only itself.
+is synced to the disk. A truncated or damaged record costs only itself; one
+with a right checksum whose payload cannot be read counts as damaged, too.
 """
 
 import contextlib
@@ -32,6 +33,7 @@ _SEQUENCE = struct.Struct("<Q")
 _WAIT = 0.05  # s between two writes
 _FORCE = 1.0  # s between two syncs to the disk
 _MAX_QUEUED = 50_000  # records waiting for a slow disk
+_LONGEST = 1 << 22  # bytes of a payload; the longest, of a run's configuration, has some ten thousand
 
 
 class LogError(DexsimError):
@@ -170,18 +172,30 @@ def _decode(data: bytes, at: int) -> tuple[Record | None, int]:
     if at + _HEAD.size > len(data):
         return None, 0
     sync, kind, when, length, check = _HEAD.unpack_from(data, at)
+    # The length first: the checksum of a long payload takes long, and a damaged file may have many such heads.
+    if sync != SYNC or length > _LONGEST or kind not in set(Kind):
+        return None, 0
     payload = data[at + _HEAD.size : at + _HEAD.size + length]
-    if sync != SYNC or len(payload) != length or kind not in set(Kind):
+    if len(payload) != length:
         return None, 0
     if zlib.crc32(payload, zlib.crc32(_HEAD.pack(sync, kind, when, length, 0))) != check:
         return None, 0
+    try:
+        return Record(Kind(kind), when, _content(Kind(kind), payload)), _HEAD.size + length
+    except Exception:  # A checksum can be forged; msgpack, struct and NumPy each raise their own.
+        return None, 0
+
+
+def _content(kind: Kind, payload: bytes) -> Any:
+    """The content of a record; bytes that are none raise any error."""
     if kind in (Kind.SENT, Kind.RECEIVED):
-        content: Any = (*_SEQUENCE.unpack_from(payload), payload[_SEQUENCE.size :])
-    elif kind == Kind.NOTE:
-        content = payload.decode()
-    else:
-        content = msgpack.unpackb(payload, object_hook=_unpack_array, strict_map_key=False)
-    return Record(Kind(kind), when, content), _HEAD.size + length
+        return (*_SEQUENCE.unpack_from(payload), payload[_SEQUENCE.size :])
+    if kind == Kind.NOTE:
+        return payload.decode()
+    content = msgpack.unpackb(payload, object_hook=_unpack_array, strict_map_key=False)
+    if not isinstance(content, dict):
+        raise TypeError(f"{type(content).__name__} in place of a dict")
+    return content
 
 
 def _pack_array(value: Any) -> Any:

@@ -7,7 +7,7 @@ import dataclasses
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
@@ -41,7 +41,7 @@ class ReplayArguments:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The command. Returns its exit code: 0, or 1 when a recomputed observation differs."""
+    """The command. Returns its exit code: 0, or 1 when a recomputed observation differs or none could be recomputed."""
     arguments = cli.parse(
         ReplayArguments,
         sys.argv[1:] if argv is None else argv,
@@ -54,17 +54,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     report = run.report
     for note in report["notes"]:
         print(note)
-    same = report["readings_same"] == report["observations_same"] == report["ticks"]
+    same = report["readings_same"] == report["observations_same"] == report["ticks"] > 0
     print(
         f"{report['ticks']} ticks in {report['seconds']:.2f} s, {report['frames']} frames, "
         f"{report['damaged_bytes']} damaged bytes, end: {report['ended']}"
     )
-    print(
-        "all observations agree to the last bit"
-        if same
-        else f"{report['observations_same']} of {report['ticks']} observations agree; first difference: "
-        f"{report['first_difference']}"
-    )
+    print(_verdict(report, same))
     if arguments.output:
         cli.write_json(arguments.output, report)
     if arguments.plot and run.ticks:
@@ -78,6 +73,23 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments.lerobot and run.ticks:
         print(f"LeRobot dataset: {write_lerobot(arguments.lerobot, run.hand, report['task'], [trajectory(run)])}")
     return 0 if same else 1
+
+
+def _verdict(report: dict[str, Any], same: bool) -> str:
+    """One line on what was compared."""
+    ticks, missing = report["ticks"], report["without_frame"]
+    if not ticks:
+        if not missing:
+            return "nothing could be compared: the log has no ticks"
+        why = "" if report["frames"] else "; drivers given as sdk: log none"
+        return f"nothing could be compared: none of {missing} ticks has the frame that it used{why}"
+    line = (
+        "all observations agree to the last bit"
+        if same
+        else f"{report['observations_same']} of {ticks} observations agree; first difference: "
+        f"{report['first_difference']}"
+    )
+    return f"{line}; {missing} more ticks lack their frame and were not compared" if missing else line
 
 
 if __name__ == "__main__":

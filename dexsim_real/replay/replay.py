@@ -1,7 +1,8 @@
 """Recomputes every observation of a logged run from the raw frames.
 
 Joint angles, torques and taxel forces are recomputed from the frame that each tick used, and the observation from the
-readings, by the code that ran on the hand. The report counts the ticks that agree to the last bit.
+readings, by the code that ran on the hand. The report counts the ticks that agree to the last bit, and those whose
+frame is missing: they are not recomputed.
 """
 
 import dataclasses
@@ -24,6 +25,11 @@ from dexsim_real.sensors.hand import HandMeasurement, HandSensing, HardwareConfi
 from dexsim_real.wire import frames
 
 MEASURED = ("joint_position", "joint_torque", "taxel_force")
+_OTHERS = {
+    "calibrate": ("a calibration", "--from-log"),
+    "identify": ("an identification", "--identify --from-log"),
+}
+"""Logs of `python -m dexsim_real.calibrate`, by their task, and its options that read them."""
 
 
 @dataclasses.dataclass
@@ -48,7 +54,7 @@ def replay(path: Path, hand: str = "") -> Replay:
 
     Raises:
       ConfigError: the log is of another hand.
-      LogError: not a log, or the log ends before the hand was ready.
+      LogError: not a log, or one of another command, or the log ends before the hand was ready.
     """
     reader = LogReader(path)
     states: dict[int, bytes] = {}
@@ -63,12 +69,13 @@ def replay(path: Path, hand: str = "") -> Replay:
             tares.append((record.content["from"], record.content["tare"]))
         elif record.kind == Kind.META:
             meta = record.content
+            _check_run(path, meta)
             sensing, observe, fields = _rebuild(meta, hand)
             tares = [(0, sensing.tare)]
         elif record.kind == Kind.RECEIVED:
             number, frame = record.content
             counts["frames"] += 1
-            if frame[4] == frames.Command.EXCHANGE:
+            if frame[4:5] == bytes([frames.Command.EXCHANGE]):
                 states = {**{n: f for n, f in states.items() if n > number - 50}, number: frame}
         elif record.kind == Kind.TICK and meta is not None:
             tick = record.content
@@ -113,6 +120,17 @@ def replay(path: Path, hand: str = "") -> Replay:
     }
     since = np.array(times) - (times[0] if times else 0.0)
     return Replay(report, since, measured, ticks, np.array(observations), fields, sensing.hand)
+
+
+def _check_run(path: Path, meta: dict[str, Any]) -> None:
+    """Refuse a configuration that is not of a run."""
+    if other := _OTHERS.get(str(meta.get("task"))):
+        what, options = other
+        raise LogError(f"{path}: this is a log of {what}; `python -m dexsim_real.calibrate {options} {path}` reads it")
+    needed = ("task", "policy", "calibration", "tare", "hardware", "environment")
+    lacking = [name for name in needed if name not in meta]
+    if lacking:
+        raise LogError(f"{path}: this is not a log of a run: its configuration lacks {lacking[0]!r}")
 
 
 def _rebuild(meta: dict[str, Any], given: str) -> tuple[HandSensing, Any, tuple[LayoutEntry, ...]]:

@@ -61,6 +61,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         if code == 0 and summary["missing"]:
             code = 1
             print(f"error: {'; '.join(summary['missing'])}", file=sys.stderr)
+        elif code == 1:
+            print(f"error: {session.end}", file=sys.stderr)
         if not arguments.quiet:
             session.view.console.print(summary_table(f"{session.controller.policy.task}: {session.end}", summary))
         if arguments.output:

@@ -37,6 +37,7 @@ from dexsim_real.run.status import StatusView
 from dexsim_real.sensors.hand import HandSensing
 from dexsim_real.wire.frames import Mode, empty_state
 from dexsim_real.wire.identity import check_identity
+from dexsim_real.wire.link import checked
 from dexsim_real.wire.serial_hand import open_port
 
 _TARE_SAMPLES = 30
@@ -185,7 +186,7 @@ class Session:
         while len(states) < _TARE_SAMPLES and time.monotonic() < until:
             reply = self.port.exchange(self.sensing.command(self.sensing.hand.joint_lower, Mode.PASSIVE))
             if reply is not None:
-                states.append(reply.state)
+                states.append(checked(reply, time.monotonic()).state)
             elif (refusal := getattr(self.port, "refusal", None)) and refusal.serious:
                 raise HandError(f"{self.arguments.port}: {refusal.text}")
         if len(states) < _TARE_SAMPLES:

@@ -191,9 +191,10 @@ def open_masks(spec: str, config: CameraConfig) -> Masks:
     if ":" in spec and not spec.startswith(("/", "rtsp:", "http")):
         module, _, function = spec.partition(":")
         try:
-            return _camera("0", getattr(importlib.import_module(module), function))
-        except (ImportError, AttributeError) as error:
+            mask = getattr(importlib.import_module(module), function)
+        except (ImportError, AttributeError, ValueError, TypeError) as error:  # The last two: no name, a relative one.
             raise HandError(f"{spec}: {error}; give MODULE:FUNCTION of an importable module") from None
+        return _camera("0", mask)
     return _camera(spec, lambda picture: colour_mask(picture, config))
 
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from dexsim.core.install import install_line
-from dexsim_real.core.errors import HandError, explain
+from dexsim_real.core.errors import PORT_ERRORS, HandError, explain
 
 HEAD = b"\xaa\xaa"
 SIZE = 19
@@ -175,5 +175,5 @@ def _open(port: str) -> Any:
         raise HandError(f"pyserial is missing: {install_line('real')}") from None
     try:
         return serial.Serial(port, BAUD, timeout=0.05, exclusive=True)
-    except (OSError, ValueError) as error:
+    except PORT_ERRORS as error:
         raise HandError(explain(port, error)) from None

@@ -40,9 +40,10 @@ def make_plant(arguments: TwinArguments, hand: Hand) -> Plant:
     if arguments.plant:
         module, _, function = arguments.plant.partition(":")
         try:
-            return getattr(importlib.import_module(module), function or "make_plant")(arguments)
-        except (ImportError, AttributeError) as error:
+            make = getattr(importlib.import_module(module), function or "make_plant")
+        except (ImportError, AttributeError, ValueError, TypeError) as error:  # The last two: no name, a relative one.
             raise HandError(f"--plant {arguments.plant}: {error}; give MODULE:FUNCTION") from None
+        return make(arguments)
     from dexsim_real.twin.plant.foreign.hand import hand_of
 
     return hand_of(

@@ -5,13 +5,17 @@ another implementation.
 """
 
 import dataclasses
+import math
 from typing import Protocol
 
 import numpy as np
 
 from dexsim.core.config import check_ranges, setting, validate
+from dexsim_real.core.errors import HandError
+from dexsim_real.wire import frames
 
 BITS_PER_BYTE = 10  # 8N1
+_AHEAD = 1.0  # s, by which no stamp of the same clock is ahead
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -73,6 +77,29 @@ class Reply:
     received: float  # s
     sequence: int  # number of this exchange since the port was created
     generation: int  # number of handshakes; it grows when the hand was disconnected
+
+
+def checked(reply: Reply, now: float) -> Reply:
+    """A reply that its reader can rely on: a driver from elsewhere may have been wrong about it.
+
+    Args:
+      reply: of a port.
+      now: s, of the clock that `received` is of. A stamp a little ahead of it becomes `now`: it must grow old.
+
+    Raises:
+      HandError: the state is none, is of another hand, or was stamped by another clock.
+    """
+    state, received = reply.state, reply.received
+    if not isinstance(state, np.ndarray) or state.dtype != frames.STATE_BLOCK or state.shape != ():
+        found = f"{state.dtype.name} {list(state.shape)}" if isinstance(state, np.ndarray) else type(state).__name__
+        raise HandError(f"the driver's reply has a state of {found}; expected one `frames.STATE_BLOCK`")
+    if not np.array_equal(state["joint"]["id"], np.arange(frames.JOINTS)):
+        raise HandError(f"the driver's reply has joint ids {state['joint']['id'].tolist()}; expected 0 to 11")
+    if not math.isfinite(received) or received > now + _AHEAD:
+        raise HandError(
+            f"the driver stamped its reply {received - now:.3g} s ahead: `Reply.received` is of `time.monotonic()`"
+        )
+    return dataclasses.replace(reply, received=min(received, now))
 
 
 class HandPort(Protocol):

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from dexsim.core.install import install_line
-from dexsim_real.core.errors import HandError, explain, latency_warnings
+from dexsim_real.core.errors import PORT_ERRORS, HandError, explain, latency_warnings
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Command, Frame, Mode
 from dexsim_real.wire.identity import SERIAL_NUMBER, SIDE, Identity, read_identity
@@ -188,7 +188,7 @@ class SerialHand:
             self._serial = serial.serial_for_url(
                 self.port, baudrate=self.config.baud, timeout=_POLL, write_timeout=_WRITE, **options
             )
-        except (OSError, ValueError) as error:
+        except PORT_ERRORS as error:
             raise HandError(explain(self.port, error)) from None
         if local:
             # Only real adapters support it. The FTDI driver then sets its latency timer to 1 ms.
@@ -298,9 +298,10 @@ def open_port(spec: str, config: LinkConfig, tap: Callable[[str, bytes], None] |
         return SerialHand(spec, config, tap=tap)
     module, _, function = spec.removeprefix("sdk:").partition(":")
     try:
-        return getattr(importlib.import_module(module), function or "open_hand")(config)
-    except (ImportError, AttributeError) as error:
+        make = getattr(importlib.import_module(module), function or "open_hand")
+    except (ImportError, AttributeError, ValueError, TypeError) as error:  # The last two: no name, a relative one.
         raise HandError(f"{spec}: {error}; give sdk:MODULE:FUNCTION of an importable module") from None
+    return make(config)
 
 
 def _printable(data: bytes) -> str:

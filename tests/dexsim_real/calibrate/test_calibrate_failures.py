@@ -212,6 +212,46 @@ def test_nothing_is_overwritten(hand, session, tmp_path):
     assert load_calibration(path, hand).joint_names == hand.joint_names
 
 
+@pytest.mark.parametrize(("option", "name"), [("plot", "hand.png"), ("report", "report.json")])
+def test_a_figure_or_report_that_cannot_be_written_leaves_the_calibration(hand, session, tmp_path, option, name):
+    (tmp_path / "file").touch()
+    options = arguments(tmp_path, **{option: tmp_path / "file" / name})
+    with pytest.raises(OSError, match="file"):
+        fit_and_report(options, hand, [session[2]], operator())
+    assert load_calibration(options.output, hand).joint_names == hand.joint_names
+
+
+@pytest.mark.parametrize(
+    ("option", "path", "says"),
+    [
+        ("--plot", "hand.abc", "error: --plot .*hand.abc: give a file that ends in .png, .pdf or .svg"),
+        ("--plot", "hand", "give a file that ends in"),
+        ("--plot", "file/hand.png", "error: .*file: File exists"),
+        ("--report", "file/hand.json", "error: .*file: File exists"),
+        ("--output", "file/hand.toml", "error: .*file(/hand.toml)?: (File exists|Not a directory)"),
+        ("--plot", "folder.png", "error: .*folder.png: Is a directory"),
+    ],
+)
+def test_where_nothing_can_be_written_nothing_moves(tmp_path, monkeypatch, capsys, option, path, says):
+    (tmp_path / "file").touch()
+    (tmp_path / "folder.png").mkdir()
+    touched = []
+    monkeypatch.setattr(calibrate, "prepare_jax", lambda: None)
+    monkeypatch.setattr(calibrate, "record", lambda *_: touched.append("hand") or tmp_path / "no.log")
+    output = [] if option == "--output" else ["--output", str(tmp_path / "hand.toml")]
+    assert command("--port", "x", *output, option, str(tmp_path / path)) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert re.search(says, line) and not touched
+
+
+def test_the_folder_of_a_figure_is_made(tmp_path, monkeypatch):
+    monkeypatch.setattr(calibrate, "prepare_jax", lambda: None)
+    monkeypatch.setattr(calibrate, "record", lambda *_: tmp_path / "hand.log")
+    monkeypatch.setattr(calibrate, "fit_and_report", lambda *_: None)
+    options = ["--output", str(tmp_path / "hand.toml"), "--plot", str(tmp_path / "new" / "hand.PNG")]
+    assert main(["--port", "x", *options]) == 0 and (tmp_path / "new").is_dir()
+
+
 def test_logs_that_are_none_of_presses(hand, tmp_path):
     with LogWriter(tmp_path / "run.log") as log:
         log.add(Kind.META, {"task": "grasp"})

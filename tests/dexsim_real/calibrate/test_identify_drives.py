@@ -4,14 +4,15 @@ import dataclasses
 
 import numpy as np
 import pytest
-from calibrating import arguments, off, operator
+from calibrating import arguments, off, on, operator
 from press_bench import BenchHand
 
 from dexsim.core.errors import CalibrationError
 from dexsim_real.calibrate import identify_drives
 from dexsim_real.calibrate.read import read_logs
 from dexsim_real.core.errors import HandError
-from dexsim_real.core.log import LogError
+from dexsim_real.core.log import Kind, LogError, LogReader, LogWriter
+from dexsim_real.twin.virtual import ideal_calibration
 
 
 def identifying(bench, hand, folder, monkeypatch, **options):
@@ -77,3 +78,37 @@ def test_a_line_that_loses_too_much_identifies_nothing(hand, tmp_path):
     with pytest.raises(HandError, match="no joint 'knee'"):
         wrong = dataclasses.replace(options, joints=("knee",), log=tmp_path / "b.log")
         identify_drives.identify_hand(wrong, hand, operator())
+
+
+def test_a_first_exchange_without_an_answer_is_a_lost_one(hand, tmp_path, monkeypatch):
+    """Nothing was received before it."""
+    bench = BenchHand(hand, [])
+    whole = identifying(bench, hand, tmp_path, monkeypatch)[0]
+    entries = list(LogReader(tmp_path / "hand.log"))
+    first = next(entry.content[0] for entry in entries if entry.kind == Kind.SENT)
+    with LogWriter(tmp_path / "cut.log") as log:
+        for entry in entries:
+            if entry.kind != Kind.RECEIVED or entry.content[0] != first:
+                log.add(entry.kind, entry.content, entry.time)
+    for calibration in (None, ideal_calibration(hand)):
+        found, check = identify_drives.read_logs([tmp_path / "cut.log"], hand, calibration)["mid_joint1"]
+        np.testing.assert_array_equal(found.target, whole.target)
+        np.testing.assert_array_equal(found.position[1:], whole.position[1:])
+        assert found.position[0] == whole.position[1] and check is not None
+        assert (found.torque is None) == (calibration is None)
+        assert found.torque is None or len(found.torque) == len(whole.target)
+
+
+def test_a_hand_that_is_silent_while_it_is_tared_moves_nothing(hand, tmp_path):
+    bench = BenchHand(hand, [])
+    exchange = bench.exchange
+
+    def answer(command):
+        reply = exchange(command)
+        return None if reply.sent < 1.0 else reply
+
+    bench.exchange = answer
+    options = arguments(tmp_path, identify=True, output=tmp_path / "hand.json", joints=("mid_joint1",))
+    with pytest.raises(HandError, match="cannot tare the taxels: no usable answer in 0.5 s; check the cable"):
+        identify_drives.identify_hand(options, hand, operator(), port=bench, clock=bench.clock, sleep=bench.sleep)
+    assert not on(bench).any() and off(bench) and bench.closed

@@ -6,7 +6,7 @@ import queue
 
 import numpy as np
 import pytest
-from calibrating import arguments, off, on, operator, plates, record
+from calibrating import QUICK, arguments, off, on, operator, plates, record
 from press_bench import BenchHand
 from rich.console import Console
 
@@ -128,6 +128,39 @@ def test_logs_add_up(hand, session, scale, tmp_path):
                     content = {**content, "hardware": {**content["hardware"], "taxel_floor": 2.0}}
                 log.add(entry.kind, content, entry.time)
         read_logs([other, path], hand)
+
+
+def test_a_skipped_press_leaves_the_one_of_the_log_before(hand, session, tmp_path):
+    who = Operator(Console(file=io.StringIO(), width=200), stream=io.StringIO("s\n"))
+    options = arguments(tmp_path, sides=False, yes=False)
+    skipped = record(BenchHand(hand, []), hand, options, who)
+    alone, both = (read_logs(logs, hand).recordings for logs in ([session[2]], [session[2], skipped]))
+    assert not read_logs([skipped], hand).recordings["index pad"].time
+    assert both.keys() == alone.keys() == {"index pad", "index side"}
+    assert [press.time for press in both.values()] == [press.time for press in alone.values()]
+    # One that was pressed again is the new one.
+    options = arguments(tmp_path, sides=False, press=QUICK, log=tmp_path / "again.log")
+    again = record(BenchHand(hand, plates(hand, "index pad")), hand, options)
+    both, new = (read_logs(logs, hand).recordings for logs in ([session[2], again], [again]))
+    assert both["index pad"].time == new["index pad"].time and both["index side"].time == alone["index side"].time
+
+
+def test_a_press_that_no_taxel_feels_is_left_out(hand, session, scale):
+    """Six taxels of one count each are contact enough for the procedure; the current ends the press."""
+    faint = np.zeros(hand.num_taxels)
+    faint[50:56] = 1.0
+    recorded = read_logs([session[2], scale[1].log], hand)
+    pad, gauged = recorded.recordings["index pad"], recorded.recordings["middle pad"]
+    gauged.counts = [faint] * len(gauged.counts)
+    found = fit(recorded, hand)
+    assert set(found.source.values()) == {"index pad", "index side"} and not found.sensors
+    assert any(
+        note.startswith("middle pad: left out: no taxel read 2 counts or more") for note in found.calibration.notes
+    )
+    recorded.recordings = {"index pad": pad}
+    pad.counts = [faint] * len(pad.counts)
+    with pytest.raises(CalibrationError, match="index pad: left out: no taxel read 2 counts"):
+        fit(recorded, hand)
 
 
 class Typist(io.StringIO):

@@ -8,6 +8,7 @@ from calibrating import QUICK, arguments, off, on, operator, plates, record
 from press_bench import BenchHand
 
 from dexsim_real.calibrate.options import CheckConfig
+from dexsim_real.calibrate.press_procedure import PressProcedure
 from dexsim_real.calibrate.read import read_logs
 from dexsim_real.calibrate.taxel_check import check_rest, dead_taxels, taxel_names
 from dexsim_real.core.errors import HandError
@@ -71,6 +72,27 @@ def test_a_touched_hand_is_refused_before_the_motors_come_on(hand, tmp_path):
     with pytest.raises(HandError, match="of the middle .* free the fingertips"):
         record(bench, hand, arguments(tmp_path, press=QUICK))
     assert not on(bench).any() and bench.closed and not (tmp_path / "hand.toml").exists()
+
+
+@pytest.mark.parametrize("after", [0.0, 0.39])
+def test_a_hand_that_is_silent_while_it_is_tared_ends_it_in_one_line(hand, tmp_path, monkeypatch, after):
+    """From the begin of the tare in the air, or from the end of its first part, with pauses of 0.2 s."""
+    bench, tare, silent = BenchHand(hand, plates(hand, "index pad")), PressProcedure._tare_in_air, [np.inf]
+    exchange = bench.exchange
+
+    def answer(command):
+        reply = exchange(command)
+        return None if silent[0] <= reply.sent < silent[0] + 1.0 else reply
+
+    def begin(procedure):
+        silent[0] = bench.time + after
+        tare(procedure)
+
+    bench.exchange = answer
+    monkeypatch.setattr(PressProcedure, "_tare_in_air", begin)
+    with pytest.raises(HandError, match="cannot tare the taxels: no usable answer in 0.2 s; check the cable") as caught:
+        record(bench, hand, arguments(tmp_path, press=QUICK, sides=False))
+    assert "\n" not in str(caught.value) and on(bench).any() and off(bench) and bench.closed
 
 
 def test_a_finger_zeroed_under_load_is_found_out(hand, tmp_path):

@@ -139,3 +139,27 @@ def test_a_firm_grasp_and_a_fast_joint_go_on_up_to_their_limits(hand, measuremen
     bench = ready(hand)
     decision = bench.cycle(wish=MIDDLE, **measurement)
     assert decision.reaction == (Reaction.HOLD if held else Reaction.NONE)
+
+
+def test_a_margin_of_more_than_half_the_range_leaves_the_middle(hand):
+    """Limits that change sides would pull a joint away from where it was told to stay."""
+    half = np.min(hand.joint_upper - hand.joint_lower) / 2
+    bench = Bench(hand, margin=float(half) + 0.1)
+    middle = ((hand.joint_lower + hand.joint_upper) / 2).astype(np.float32)
+    narrow = hand.joint_upper - hand.joint_lower < 2 * (half + 0.1)
+    assert narrow.any()
+    bench.position = middle
+    bench.engage()
+    for way in (UP, DOWN):
+        bench.run(2.0, wish=middle + np.float32(way * 9.0))
+        np.testing.assert_allclose(bench.position[narrow], middle[narrow], atol=1e-5)
+
+
+def test_a_clock_that_goes_back_moves_no_joint(hand):
+    bench = ready(hand)
+    before = bench.position.copy()
+    bench.now -= 50.0
+    for _ in range(20):
+        bench.cycle(wish=MIDDLE + np.float32(0.5) * FREE)
+    moved = np.abs(bench.position - before).max()
+    assert moved <= 20 * CYCLE * 8.0 and (bench.position <= hand.joint_upper).all()

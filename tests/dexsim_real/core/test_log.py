@@ -6,14 +6,16 @@ import subprocess
 import sys
 import threading
 import time
+import zlib
 
+import msgpack
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from paths import ROOT
 
-from dexsim_real.core.log import MAGIC, Kind, LogError, LogReader, LogWriter, encode
+from dexsim_real.core.log import _HEAD, MAGIC, SYNC, Kind, LogError, LogReader, LogWriter, encode
 
 
 def contents():
@@ -95,6 +97,45 @@ def test_damage_costs_the_damaged_record_only(small, tmp_path_factory, data):
     reader = LogReader(path)
     got = {record.content for record in reader}
     assert got <= {f"note {i}" for i in range(20)} and len(got) == 19 and reader.damaged > 0
+
+
+def checked(kind, payload):
+    """A record of any payload, with a right checksum."""
+    check = zlib.crc32(payload, zlib.crc32(_HEAD.pack(SYNC, kind, 0.0, len(payload), 0)))
+    return _HEAD.pack(SYNC, kind, 0.0, len(payload), check) + payload
+
+
+@pytest.mark.parametrize(
+    ("kind", "payload"),
+    [
+        (Kind.NOTE, b"\xff\xfe"),
+        (Kind.RECEIVED, b"abc"),
+        (Kind.META, b"\xc1"),
+        (Kind.META, b"\xdf\xff\xff\xff\xff"),
+        (Kind.META, msgpack.packb([1])),
+        (Kind.TICK, msgpack.packb(5)),
+        (Kind.TICK, msgpack.packb({"a": {"__array__": "O", "shape": [1], "data": b"12345678"}})),
+        (Kind.TICK, msgpack.packb({"a": {"__array__": "<f4", "shape": [99], "data": b"1234"}})),
+        (Kind.TICK, msgpack.packb({"a": {"__array__": "no type", "shape": [1], "data": b"1234"}})),
+        (Kind.TICK, msgpack.packb({"a": {"__array__": "<f4"}})),
+    ],
+)
+def test_a_record_that_cannot_be_decoded_counts_as_damage(tmp_path, kind, payload):
+    bad, path = checked(kind, payload), tmp_path / "run.log"
+    path.write_bytes(MAGIC + encode(Kind.NOTE, 0.0, "before") + bad + encode(Kind.NOTE, 0.0, "after"))
+    reader = LogReader(path)
+    assert [record.content for record in reader] == ["before", "after"] and reader.damaged == len(bad)
+
+
+def test_impossible_lengths_cost_no_time(tmp_path, monkeypatch):
+    """Heads that claim 50 MB, in a file that has as many: no checksum is computed."""
+    summed = []
+    real = zlib.crc32
+    monkeypatch.setattr(zlib, "crc32", lambda data, *start: summed.append(len(data)) or real(data, *start))
+    heads, path = b"".join([_HEAD.pack(SYNC, Kind.SENT, 1.0, 50_000_000, 0)] * 100), tmp_path / "run.log"
+    path.write_bytes(MAGIC + heads + encode(Kind.NOTE, 0.0, "after") + bytes(50_000_000))
+    summed.clear()
+    assert [record.content for record in LogReader(path)] == ["after"] and sum(summed) < 1000
 
 
 def test_files_that_are_no_log(tmp_path):

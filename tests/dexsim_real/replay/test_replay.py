@@ -1,5 +1,7 @@
 """A run and its replay: to the last bit, and what the viewer gets."""
 
+import contextlib
+import io
 import sys
 
 import numpy as np
@@ -8,8 +10,10 @@ import pytest
 pytest.importorskip("serial")
 from following_hand import FollowingHand, arguments, records, summary
 
+from dexsim.core import cli
 from dexsim.core.errors import DexsimError
-from dexsim_real.core.log import Kind, LogReader
+from dexsim_real.calibrate.options import CalibrateArguments
+from dexsim_real.core.log import Kind, LogError, LogReader, LogWriter
 from dexsim_real.replay import __main__ as replay_command
 from dexsim_real.replay import replay
 from dexsim_real.replay.plots import open_rerun, trajectory
@@ -48,6 +52,7 @@ def test_a_run_from_the_measured_pose_to_motors_off_and_its_replay(hand, tmp_pat
     drawn_by_finger(hand, tmp_path, ticks)
     taken_along(tmp_path, ticks)
     forged(tmp_path)
+    without_frames(tmp_path)
     seen_in_rerun(tmp_path)
 
 
@@ -150,8 +155,6 @@ def test_the_real_viewer_takes_a_replay(tmp_path):
 
 def forged(folder):
     """One bit of one logged observation changed: replay must tell."""
-    from dexsim_real.core.log import LogWriter
-
     path = folder / "forged.log"
     with LogWriter(path) as log:
         seen = 0
@@ -167,3 +170,61 @@ def forged(folder):
     report = replay.replay(path).report
     assert report["observations_same"] == report["ticks"] - 1 and report["first_difference"].startswith("tick 9 ")
     assert replay_command.main([str(path)]) == 1
+
+
+def verdict(path):
+    """Exit code and last line of the command."""
+    out = io.StringIO()
+    with contextlib.redirect_stdout(out):
+        code = replay_command.main([str(path)])
+    return code, out.getvalue().splitlines()[-1]
+
+
+def without_frames(folder):
+    """A driver of the user's own logs no frames: then nothing is compared, and replay must not say that all agrees."""
+    source = list(LogReader(folder / "run.log"))
+    count = sum(record.kind == Kind.TICK for record in source)
+    frames = (Kind.SENT, Kind.RECEIVED)
+    # Of the whole log, of one whose frames came after its ticks, and of one without ticks.
+    for name, kept, says in (
+        ("none", [r for r in source if r.kind not in frames], f"none of {count} ticks has the frame that it used; "),
+        ("late", sorted(source, key=lambda r: r.kind in frames), f"none of {count} ticks has the frame that it used"),
+        ("idle", [r for r in source if r.kind != Kind.TICK], "the log has no ticks"),
+    ):
+        with LogWriter(folder / f"{name}.log") as log:
+            for record in kept:
+                log.add(record.kind, record.content, record.time)
+        code, line = verdict(folder / f"{name}.log")
+        assert code == 1 and line.startswith(f"nothing could be compared: {says}"), line
+        assert ("sdk:" in line) == (name == "none")
+    # The first frames are missing: the rest is compared, and the line says how much is not.
+    ticks = [record.content["sequence"] for record in source if record.kind == Kind.TICK]
+    with LogWriter(folder / "some.log") as log:
+        for record in source:
+            if record.kind not in frames or record.content[0] > ticks[2]:
+                log.add(record.kind, record.content, record.time)
+    code, line = verdict(folder / "some.log")
+    assert (code, line.partition(";")[0]) == (0, "all observations agree to the last bit")
+    assert "; 3 more ticks lack their frame" in line
+
+
+@pytest.mark.parametrize(("task", "what"), [("calibrate", "a calibration"), ("identify", "an identification")])
+def test_a_log_of_another_command_is_named_with_the_command_that_reads_it(tmp_path, task, what):
+    path = tmp_path / "other.log"
+    with LogWriter(path) as log:
+        log.add(Kind.META, {"task": task, "policy": "", "calibration": "", "hardware": {}, "environment": {}})
+    with pytest.raises(LogError, match=f"this is a log of {what}; `python -m dexsim_real.calibrate ") as error:
+        replay_command.main([str(path)])
+    assert "\n" not in str(error.value)
+    words = str(error.value).split("`")[1].split()
+    given = cli.parse(CalibrateArguments, words[3:], prog="", description="")
+    assert given.from_log == (path,) and given.identify == (task == "identify")
+
+
+def test_a_configuration_that_is_not_of_a_run(tmp_path):
+    """The first record of a calibration is lost, and the next is read in its place."""
+    path = tmp_path / "other.log"
+    with LogWriter(path) as log:
+        log.add(Kind.META, {"tare": np.zeros((5, 120), np.float32)})
+    with pytest.raises(LogError, match="not a log of a run: its configuration lacks 'task'"):
+        replay_command.main([str(path)])

@@ -114,7 +114,7 @@ def test_a_policy_that_dies_leaves_the_hand_safe(tmp_path, monkeypatch, failure,
     assert records(tmp_path, Kind.END)
 
 
-def test_a_hot_hand_is_relaxed_and_the_run_ends(tmp_path):
+def test_a_hot_hand_is_relaxed_and_the_run_ends(tmp_path, capsys):
     def heat(index, state):
         state["joint"]["temperature"] = 30 if index < 100 else 95
 
@@ -122,7 +122,9 @@ def test_a_hot_hand_is_relaxed_and_the_run_ends(tmp_path):
         assert run.main(arguments(peer, tmp_path, "--seconds", "5")) == 1
         hot = peer.times[100]
         assert not peer.on()[np.array(peer.times) > hot + 0.3].any()
-    assert "too hot: joint thumb_bend (thumb), 95 degC" in summary(tmp_path)["end"]
+    end = summary(tmp_path)["end"]
+    assert "too hot: joint thumb_bend (thumb), 95 degC" in end
+    assert capsys.readouterr().err == f"error: {end}\n", "also with --quiet"
 
 
 def test_a_line_full_of_faults_does_not_end_the_run(hand, tmp_path):

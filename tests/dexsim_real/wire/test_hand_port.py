@@ -3,7 +3,10 @@
 import dataclasses
 import errno
 import os
+import re
+import termios
 
+import numpy as np
 import pytest
 from pty_hand import QUICK, PtyHand
 
@@ -12,13 +15,9 @@ from dexsim_real.core.errors import (
     explain,
     latency_warnings,
 )
-from dexsim_real.wire.frames import (
-    Command,
-    Frame,
-)
-from dexsim_real.wire.link import (
-    LinkConfig,
-)
+from dexsim_real.sensors.imu import Imu
+from dexsim_real.wire.frames import STATE_BLOCK, Command, Frame, empty_state
+from dexsim_real.wire.link import LinkConfig, Reply, checked
 from dexsim_real.wire.serial_hand import SerialHand, open_port
 
 
@@ -64,6 +63,53 @@ def test_messages_for_the_usual_troubles(tmp_path):
     assert "another program" in explain("/dev/x", OSError(errno.EBUSY, "busy"))
     with pytest.raises(HandError, match="no_such_module"):
         open_port("sdk:no_such_module:f", QUICK)
+    for spec in ("sdk:", "sdk::f", "sdk:.relative:f"):
+        with pytest.raises(HandError, match=f"^{re.escape(spec)}: .*give sdk:MODULE:FUNCTION"):
+            open_port(spec, QUICK)
+
+
+def test_an_error_of_a_driver_is_its_own(tmp_path, monkeypatch):
+    """Not a wrong name of the module."""
+    (tmp_path / "broken_sdk.py").write_text("def open_hand(config):\n    return config.no_such_field\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(AttributeError, match="no_such_field"):
+        open_port("sdk:broken_sdk", QUICK)
+
+
+def test_a_port_that_vanishes_while_it_opens_is_a_hand_that_is_gone(monkeypatch):
+    """pyserial lets `termios.error` pass, which is no OSError; a reconnection must not end with it."""
+    import serial
+
+    def vanish(*_, **__):
+        raise termios.error(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(serial, "serial_for_url", vanish)
+    with pytest.raises(HandError, match="^/dev/hand: cannot be opened .*check the name and the cable"):
+        SerialHand("/dev/hand", QUICK).connect()
+    monkeypatch.setattr(serial, "Serial", vanish)
+    with pytest.raises(HandError, match="^/dev/imu: cannot be opened"):
+        Imu("/dev/imu")
+
+
+def test_a_reply_is_checked_whoever_made_it():
+    """A stamp of another clock would never grow old: `Safety` would not notice that the hand is silent."""
+    good = Reply(empty_state(), 9.99, 10.0, 1, 1)
+    assert checked(good, 10.0) == good and checked(good, 12.0).received == 10.0
+    assert checked(good, 9.9).received == 9.9, "a little ahead"
+    for received, said in ((1.7e9, "1.7e.09 s ahead"), (np.inf, "inf s ahead"), (np.nan, "nan s ahead")):
+        with pytest.raises(HandError, match=f"{said}.*time.monotonic"):
+            checked(dataclasses.replace(good, received=received), 10.0)
+    other = empty_state()
+    other["joint"]["id"] = np.arange(12)[::-1]
+    for state, said in (
+        (None, "NoneType"),
+        ([1.0, 2.0], "list"),
+        (np.zeros(12), r"float64 \[12\]"),
+        (np.zeros(2, STATE_BLOCK), r"\[2\]; expected one"),
+        (other, r"joint ids \[11, 10"),
+    ):
+        with pytest.raises(HandError, match=said):
+            checked(dataclasses.replace(good, state=state), 10.0)
 
 
 def test_the_latency_timer(tmp_path):

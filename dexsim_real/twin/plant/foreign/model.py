@@ -86,6 +86,10 @@ def _names(path: Path) -> dict[str, Any]:
         raise HandError(
             f"{path}: field {wrong[0] if wrong else 'model'!r}: give model, and where needed {list(_KEYS)[1:]}"
         )
+    for key, value in table.items():
+        other = [item for item in value if not isinstance(item, str)] if isinstance(value, list) else []
+        if other:
+            raise HandError(f"{path}: field {key!r}: {other[0]!r:.80} is not a name in quotes")
     return table
 
 
@@ -114,6 +118,8 @@ def _joints(path: Path, model: mujoco.MjModel, hand: Hand, wanted: list[str] | N
                 f"{path}: actuator {model.actuator(k).name or k}: a hinge takes one motor or position servo without "
                 "state, other actuators cannot be driven"
             )
+        if abs(model.actuator_gear[k, 0]) < mujoco.mjMINVAL:
+            raise HandError(f"{path}: the actuator of {model.joint(joint).name} has a gear of 0 and moves nothing")
         driven[joint] = k
     if len(driven) != hand.num_joints:
         raise HandError(f"{path}: {len(driven)} actuated joints, the hand has {hand.num_joints}")

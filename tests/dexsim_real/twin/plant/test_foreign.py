@@ -74,6 +74,9 @@ def test_palm_fingertips_and_lattices_are_where_the_hand_has_them(hand):
         ('<geom type="cylinder"', '<joint axis="0 0 1"/><geom type="cylinder"', "(hand) moves: fix it to the world"),
         ('joint="thumb_swing"/>', 'joint="thumb_swing" dyntype="integrator"/>', "MuJoCo cannot read it"),
         ("<mujoco model", "<mujoko model", "MuJoCo cannot read it"),
+        ('<position class="strong" joint="thumb_swing"/>', '<motor joint="thumb_swing" gear="0"/>',
+         "the actuator of thumb_swing has a gear of 0 and moves nothing"),
+        ('joint="thumb_swing"/>', 'joint="thumb_swing" gear="0"/>', "thumb_swing has a gear of 0"),
     ],
 )  # fmt: skip
 def test_what_does_not_fit_is_refused_in_one_line(hand, text, write, old, new, says):
@@ -117,6 +120,8 @@ def test_a_toml_names_what_cannot_be_found(hand, text, write):
         (f"{names}", "2 fingertip sites of middle|no fingertip sites of middle"),
         (f'joints = ["a"]\n{tips}', "joints: 'a' is not one of them"),
         (f"{names}tip = 1", "field 'tip'"),
+        ('joints = [["a"]]', r"field 'joints': \['a'\] is not a name in quotes"),
+        (f"{names}tips = [1, 2, 3, 4, 5]", "field 'tips': 1 is not a name in quotes"),
     ):
         with pytest.raises(HandError, match=says):
             read_model(write(f'model = "hand.xml"\n{lines}\n', "bad.toml"), hand)
