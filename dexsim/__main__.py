@@ -54,6 +54,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def console() -> None:
     """The entry point of the console command."""
+    sys.path.insert(0, "")  # As `python -m` does: `--task my_module:make_env` is found in the current folder.
     cli.run(main)
 
 

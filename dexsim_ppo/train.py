@@ -38,7 +38,7 @@ from dexsim_ppo.training import processes
 from dexsim_ppo.training.arguments import TrainArguments, check_resumed, find_hand, printable, training_config
 from dexsim_ppo.training.fine_tune import check_fit, fine_tuning_config
 from dexsim_ppo.training.presets import preset_arguments
-from dexsim_ppo.training.runlog import RunFolder, check_wandb, new_folder, taken
+from dexsim_ppo.training.runlog import RunFolder, check_wandb, folder_of, new_folder, taken
 from dexsim_ppo.training.seeds import seed_folder, write_summary
 from dexsim_ppo.training.together import train_together
 from dexsim_ppo.training.trainer import Run
@@ -61,7 +61,7 @@ def train_policy(
     *,
     ppo: PPOConfig | None = None,
     preset: str = "auto",
-    policy: str = "",
+    policy: str | Path = "",
     resume: str | Path | None = None,
     **options: Any,
 ) -> Trained:
@@ -83,6 +83,9 @@ def train_policy(
     """
     started = time.perf_counter()
     cli.enable_caches()
+    policy, run_dir = str(policy or ""), options.get("run_dir")
+    if run_dir is not None:
+        options = options | {"run_dir": Path(run_dir)}
     begun = find_beginning(task, policy, resume)
     arguments = default_arguments(task, preset, begun)
     given = {"env": config, "ppo": ppo, "policy": policy or None, "resume": resume and Path(resume)} | options
@@ -154,7 +157,7 @@ def make_run(
         arguments = dataclasses.replace(arguments, backend=cast(Any, env.backend))
     if isinstance(begun, Policy):
         check_fit(begun, env, arguments.ppo)
-    path = resumed.path.parent.parent if resumed else new_folder(arguments.run_dir, arguments.task) if first else Path()
+    path = folder_of(resumed.path) if resumed else new_folder(arguments.run_dir, arguments.task) if first else Path()
     folder = RunFolder(processes.agree_on_path(path))
     if first and not resumed:
         folder.checkpoints.mkdir()
@@ -285,6 +288,8 @@ def parse_arguments(argv: list[str]) -> tuple[TrainArguments, checkpoint.Checkpo
     if known.config:
         if known.resume:
             raise ConfigError("--config begins a run and --resume resumes one: give one of them")
+        if known.preset:
+            raise ConfigError("--config has all options of a run, those of its preset among them: leave --preset out")
         default = saved_arguments(Path(known.config), known.task)
         begun = find_beginning(default.task, known.policy or default.policy, None)
     else:

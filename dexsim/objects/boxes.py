@@ -149,6 +149,11 @@ def _grow(mesh: meshes.Mesh, parts: int, rng: np.random.Generator) -> tuple[np.n
     points = np.stack(np.meshgrid(*centres, indexing="ij"), -1).reshape(-1, 3)
     distance = meshes.signed_distance(mesh, points)[0].reshape(shape)
     inside, left = distance < 0, distance < 0
+    if not inside.any():
+        raise AssetError(
+            f"a mesh of {1000 * float((high - low).max()):.0f} mm has no inside at a resolution of {1000 * pitch:.1f} "
+            "mm: its walls are too thin for boxes; give it as a solid"
+        )
     kept: list[tuple[np.ndarray, np.ndarray]] = []
     for _ in range(parts):
         if left.sum() < 0.01 * inside.sum():

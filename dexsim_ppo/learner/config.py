@@ -73,7 +73,7 @@ class PPOConfig:
     """Learn values in units of the running deviation of returns."""
     observation_std_floor: float = setting(1e-2, unit="observation units", low=0.0)
     """Smallest deviation that a running observation normaliser divides by."""
-    observation_clip: float = setting(5.0, unit="1", low=0.1)
+    observation_clip: float = setting(5.0, unit="1", low=0.1, high=1e4)
     """Bound on the magnitude of normalised observations."""
     matmul_precision: Literal["default", "high", "highest"] = setting("highest")
     """Precision of the networks' matrix products; on NVIDIA GPUs `default` is TF32."""

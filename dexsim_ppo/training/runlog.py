@@ -1,10 +1,10 @@
 """A run's folder: configuration, metrics, checkpoints, policies and the learning curve."""
 
-import contextlib
 import datetime
 import importlib.util
 import itertools
 import json
+import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -64,6 +64,13 @@ class RunFolder:
             number = next(i for i in itertools.count(1) if not (self.path / f"report-{i}.json").exists())
             self.report.rename(self.path / f"report-{number}.json")
 
+    def set_aside(self, after: int) -> None:
+        """Rename the checkpoints of later iterations than the one that is resumed: they are of another course, and the
+        newest would be resumed next time."""
+        for path in self.existing_checkpoints():
+            if int(path.stem) > after:
+                path.rename(path.with_suffix(".aside.msgpack"))
+
     def prune(self, keep: int) -> None:
         """Delete all but the newest `keep` checkpoints."""
         for path in self.existing_checkpoints()[:-keep]:
@@ -86,10 +93,25 @@ def new_folder(path: Path | None, task: str) -> Path:
     stem = Path("runs") / f"{task}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
     for number in itertools.count():
         path = Path(f"{stem}-{number}" if number else stem)
-        with contextlib.suppress(FileExistsError):
+        try:
             path.mkdir(parents=True)
             return path
+        except FileExistsError:
+            if not os.path.lexists(path):  # It is a parent that is in the way.
+                raise ConfigError(f"{path.parent}: is no folder; give another place with --run-dir") from None
     raise AssertionError("unreachable")
+
+
+def folder_of(checkpoint: Path) -> Path:
+    """The folder of the run that a checkpoint is of.
+
+    Raises:
+      ConfigError: it is in none.
+    """
+    folder = checkpoint.resolve().parent.parent
+    if not RunFolder(folder).config.exists():
+        raise ConfigError(f"--resume {checkpoint}: is not in the checkpoints of a run; {folder} has no config.json")
+    return folder
 
 
 def taken(path: Path) -> ConfigError:
@@ -105,6 +127,7 @@ class MetricsLog:
         rows = [row for row in read_metrics(folder.metrics) if row["iteration"] <= first_iteration]
         # A resumed run repeats what came after its checkpoint.
         folder.metrics.write_text("".join(json.dumps(row) + "\n" for row in rows))
+        folder.set_aside(first_iteration)
         self._file = folder.metrics.open("a", buffering=1)
         self._tensorboard = _tensorboard_writer(folder.path)
         self._wandb = _wandb_run(folder.path, arguments) if arguments.wandb else None

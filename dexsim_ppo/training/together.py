@@ -96,7 +96,9 @@ def _loop(
                 run.save(_part(states, i), iteration)
             rows.append(row)
         if logged:
-            row = means({name: [row[name] for row in rows] for name in rows[0]})
+            # A figure that a seed does not have, such as r of too few held objects, is left out of the mean.
+            names = dict.fromkeys(name for row in rows for name in row)
+            row = means({name: [row[name] for row in rows if name in row] for name in names})
             display.show(row | {name: len(runs) * row[name] for name in ("seconds", "seconds_left")})
     steps = iteration * config.steps_per_iteration
     timed = len(runs) * (steps - per_call * config.steps_per_iteration)

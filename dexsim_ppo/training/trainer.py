@@ -266,7 +266,8 @@ class Run:
         figures = {name: entry["value"] for name, entry in headline(report).items() if entry["value"] is not None}
         score, first = figures["return"], next(iter(figures))
         self.evaluations_s.append(report["seconds"])
-        better = self.best["return"] is None or score > self.best["return"]
+        best = self.best["return"]
+        better = best is None or best != best or score > best  # Nothing is better than NaN, and NaN than nothing.
         self.without_better = 0 if better else self.without_better + 1
         if better:
             self.best = {"return": score, "iteration": iteration}

@@ -110,6 +110,7 @@ class TestErrors:
             ("open.stl", 6, "the surface is open, 3 edges belong to one triangle only"),
             ("ring.stl", 1, "1 boxes do not follow its surface, .* mm at worst, of 120 mm; allow more"),
             ("large.stl", 6, "pass scale=0.001 for a file in millimetres"),
+            ("hollow.stl", 6, "a mesh of 60 mm has no inside at a resolution of .* its walls are too thin for boxes"),
         ],
     )
     def test_a_mesh_that_will_not_do(self, hand, tmp_path, name, parts, message):
@@ -117,6 +118,9 @@ class TestErrors:
         trimesh.Trimesh(cube.vertices, cube.faces[1:], process=False).export(tmp_path / "open.stl")
         trimesh.creation.torus(0.05, 0.01, major_sections=24, minor_sections=8).export(tmp_path / "ring.stl")
         trimesh.creation.box((50, 50, 50)).export(tmp_path / "large.stl")
+        cavity = trimesh.creation.box((0.059, 0.059, 0.059))
+        cavity.invert()
+        trimesh.util.concatenate([trimesh.creation.box((0.06, 0.06, 0.06)), cavity]).export(tmp_path / "hollow.stl")
         with pytest.raises(AssetError, match=message) as caught:
             dexsim.make(
                 "grasp", GraspConfig(objects=ObjectConfig(mesh=str(tmp_path / name), mesh_parts=parts)), hand=hand

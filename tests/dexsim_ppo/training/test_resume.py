@@ -106,3 +106,38 @@ def test_runs_that_begin_in_one_second_get_folders_of_their_own(tmp_path, monkey
         made = list(many.map(lambda _: runlog.new_folder(None, "tiny"), range(24)))
     assert len(set(made)) == 24 and all(path.is_dir() for path in made)
     assert str(min(made, key=lambda path: len(str(path)))) == "runs/tiny-20260101-120000"
+
+
+def test_an_older_checkpoint_is_resumed_for_good(finished):
+    """The later ones are of another course: kept under another name, so that the next resume does not go back to it."""
+    first, later = finished.checkpoint(1), finished.latest_checkpoint()
+    assert later == finished.checkpoint(2)
+    # As `--checkpoint-every 1` would have left it.
+    assert train.main([*QUICK, "--steps", str(PER_ITERATION), "--run-dir", str(finished.path.parent / "b")]) == 0
+    first.write_bytes(RunFolder(finished.path.parent / "b").latest_checkpoint().read_bytes())
+    content = later.read_bytes()
+    assert train.main(["--resume", str(first), "--steps", str(3 * PER_ITERATION), "--keep-checkpoints", "1"]) == 0
+    assert finished.latest_checkpoint() == finished.checkpoint(3)
+    assert (finished.checkpoints / "00000002.aside.msgpack").read_bytes() == content
+
+
+def test_a_checkpoint_is_resumed_from_within_its_folder_and_not_from_elsewhere(finished, monkeypatch, tmp_path):
+    lonely = tmp_path / "x" / "y" / "00000002.msgpack"
+    lonely.parent.mkdir(parents=True)
+    lonely.write_bytes(finished.latest_checkpoint().read_bytes())
+    with pytest.raises(ConfigError, match="is not in the checkpoints of a run; .*/x has no config.json"):
+        train.main(["--resume", str(lonely)])
+    assert [path.name for path in (tmp_path / "x").iterdir()] == ["y"]
+    monkeypatch.chdir(finished.checkpoints)
+    assert train.main(["--resume", "00000002.msgpack", "--steps", str(3 * PER_ITERATION)]) == 0
+    assert finished.latest_checkpoint() == finished.checkpoint(3)
+
+
+def test_options_of_a_run_leave_no_room_for_a_preset(finished):
+    with pytest.raises(ConfigError, match="leave --preset out"):
+        train.main(["--config", str(finished.path), "--preset", "cpu"])
+
+
+def test_python_takes_paths_and_words_alike(finished, tmp_path):
+    tuned = train.train_policy(policy=finished.last, steps=PER_ITERATION, run_dir=str(tmp_path / "tuned"), video=False)
+    assert tuned.folder == tmp_path / "tuned" and tuned.report["arguments"]["policy"] == str(finished.last)

@@ -131,3 +131,10 @@ def test_weights_and_biases_are_asked_for_before_training_begins(monkeypatch):
     runlog.check_wandb("")
     with pytest.raises(ConfigError, match="--wandb hands: install the extra"):
         runlog.check_wandb("hands")
+
+
+def test_a_parent_that_is_no_folder_is_told_and_not_tried_for_ever(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "runs").symlink_to(tmp_path / "gone")
+    with pytest.raises(ConfigError, match="runs: is no folder; give another place with --run-dir"):
+        runlog.new_folder(None, "grasp")

@@ -98,3 +98,18 @@ def test_the_band_is_from_the_lowest_to_the_highest_around_the_mean(tmp_path, mo
     assert corners == {(1, 1), (1, 6), (2, 2), (2, 12)}
     draw_band([[], []], tmp_path / "none.png", "tiny")
     assert not (tmp_path / "none.png").exists()
+
+
+def test_a_figure_that_one_seed_lacks_ends_no_training(tmp_path, monkeypatch):
+    """As the correlation of a policy that holds too few objects; the other seed's is shown."""
+    real = Run.evaluate
+
+    def evaluate(run, *inputs):
+        found = real(run, *inputs)
+        return found | ({"evaluation/r": 0.5} if run.arguments.seed == 5 else {})
+
+    monkeypatch.setattr(Run, "evaluate", evaluate)
+    options = [*OPTIONS, "--seed", "4", "--seeds", "2", "--evaluate-every", "1", "--evaluation-share", "1"]
+    assert train.main([*options, "--run-dir", str(tmp_path / "a")]) == 0
+    rows = {seed: read_metrics(RunFolder(tmp_path / "a" / f"seed-{seed}").metrics) for seed in (4, 5)}
+    assert any("evaluation/r" in row for row in rows[5]) and not any("evaluation/r" in row for row in rows[4])

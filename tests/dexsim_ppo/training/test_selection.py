@@ -76,3 +76,8 @@ def test_evaluations_keep_to_their_share_of_the_time(run, monkeypatch):
 def test_patience_needs_evaluations():
     with pytest.raises(ConfigError, match=r"TrainArguments\.patience = 2: needs evaluations"):
         dataclasses.replace(ARGUMENTS, evaluate_every=0)
+
+
+def test_a_return_that_is_not_a_number_is_no_best_to_beat(run, monkeypatch):
+    nan = float("nan")
+    assert evaluate(run, monkeypatch, nan, 3.0, nan, 2.0, 4.0) == [0, 1, 4]
