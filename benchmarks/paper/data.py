@@ -90,7 +90,7 @@ BUDGETS = {
             preset="gpu",
             backend="auto",
             training={"grasp": {"minutes": 8.0}, "rotate": {"steps": 4e7, "evaluate_every": 0}},
-            # Larger steps at first end the plateau of one goal after 20 million steps in every seed that was tried.
+            # Larger steps at first: four seeds of rotate had two goals an episode after 14 to 20 million steps.
             learner={"rotate": {"learning_rate": 1e-3, "kl_target": 0.04, "kl_halving": 150}},
             seeds=3,
             episodes={"grasp": 1024, "rotate": 128},

@@ -1,6 +1,5 @@
 """Reference force of a press: a reading typed by the user, or a function of the user."""
 
-import importlib
 import re
 from collections.abc import Callable
 
@@ -8,6 +7,7 @@ import numpy as np
 
 from dexsim_real.calibrate.hand_loop import Operator
 from dexsim_real.core.errors import HandError
+from dexsim_real.core.names import find_function
 
 _UNITS = {"": 1.0, "n": 1.0, "g": 9.80665e-3, "kg": 9.80665}
 _LARGEST = 100.0  # N, largest plausible reading
@@ -65,8 +65,4 @@ class Gauge:
 
 
 def _find(source: str) -> Callable[[], float]:
-    module, _, name = source.partition(":")
-    try:
-        return getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise HandError(f"--gauge {source}: {error}; give ask, or MODULE:FUNCTION") from None
+    return find_function(source, f"--gauge {source}", "ask, or MODULE:FUNCTION")

@@ -6,7 +6,6 @@ stream from another program.
 """
 
 import dataclasses
-import importlib
 import socket
 import struct
 import threading
@@ -19,6 +18,7 @@ import numpy as np
 from dexsim.core.config import setting, validate
 from dexsim.core.install import install_line
 from dexsim_real.core.errors import HandError
+from dexsim_real.core.names import find_function
 from dexsim_real.core.process import lower_priority
 
 Masks = Callable[[], tuple[float, np.ndarray] | None]
@@ -189,12 +189,7 @@ def open_masks(spec: str, config: CameraConfig) -> Masks:
     if spec.startswith("unix:"):
         return _stream(spec.removeprefix("unix:"))
     if ":" in spec and not spec.startswith(("/", "rtsp:", "http")):
-        module, _, function = spec.partition(":")
-        try:
-            mask = getattr(importlib.import_module(module), function)
-        except (ImportError, AttributeError, ValueError, TypeError) as error:  # The last two: no name, a relative one.
-            raise HandError(f"{spec}: {error}; give MODULE:FUNCTION of an importable module") from None
-        return _camera("0", mask)
+        return _camera("0", find_function(spec, spec, "MODULE:FUNCTION of an importable module"))
     return _camera(spec, lambda picture: colour_mask(picture, config))
 
 

@@ -6,7 +6,6 @@ It prints the command that runs a policy on it, and ends after its trials or wit
 """
 
 import dataclasses
-import importlib
 import queue
 import shlex
 import signal
@@ -22,6 +21,7 @@ from dexsim.core import cli
 from dexsim.hand.kinematics import Hand
 from dexsim.hand.load import load_hand
 from dexsim_real.core.errors import HandError
+from dexsim_real.core.names import find_function
 from dexsim_real.core.process import use_realtime
 from dexsim_real.sensors.camera import CameraConfig
 from dexsim_real.sensors.hand import check_wire
@@ -38,12 +38,8 @@ def make_plant(arguments: TwinArguments, hand: Hand) -> Plant:
       HandError: the function of `--plant` cannot be found.
     """
     if arguments.plant:
-        module, _, function = arguments.plant.partition(":")
-        try:
-            make = getattr(importlib.import_module(module), function or "make_plant")
-        except (ImportError, AttributeError, ValueError, TypeError) as error:  # The last two: no name, a relative one.
-            raise HandError(f"--plant {arguments.plant}: {error}; give MODULE:FUNCTION") from None
-        return make(arguments)
+        given = f"--plant {arguments.plant}"
+        return find_function(arguments.plant, given, "MODULE:FUNCTION", default="make_plant")(arguments)
     from dexsim_real.twin.plant.foreign.hand import hand_of
 
     return hand_of(

@@ -5,7 +5,6 @@
 """
 
 import contextlib
-import importlib
 import time
 from collections.abc import Callable
 from typing import Any
@@ -14,6 +13,7 @@ import numpy as np
 
 from dexsim.core.install import install_line
 from dexsim_real.core.errors import PORT_ERRORS, HandError, explain, latency_warnings
+from dexsim_real.core.names import find_function
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Command, Frame, Mode
 from dexsim_real.wire.identity import SERIAL_NUMBER, SIDE, Identity, read_identity
@@ -296,12 +296,8 @@ def open_port(spec: str, config: LinkConfig, tap: Callable[[str, bytes], None] |
     """
     if not spec.startswith("sdk:"):
         return SerialHand(spec, config, tap=tap)
-    module, _, function = spec.removeprefix("sdk:").partition(":")
-    try:
-        make = getattr(importlib.import_module(module), function or "open_hand")
-    except (ImportError, AttributeError, ValueError, TypeError) as error:  # The last two: no name, a relative one.
-        raise HandError(f"{spec}: {error}; give sdk:MODULE:FUNCTION of an importable module") from None
-    return make(config)
+    form = "sdk:MODULE:FUNCTION of an importable module"
+    return find_function(spec.removeprefix("sdk:"), spec, form, default="open_hand")(config)
 
 
 def _printable(data: bytes) -> str:
