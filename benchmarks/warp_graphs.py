@@ -3,8 +3,9 @@
     python benchmarks/warp_graphs.py --task rotate --num-envs 16384 --modes WARP WARP_STAGED WARP_STAGED_EX
 
 One iteration of PPO is recorded, then its ticks are run again: by the library in each mode of MJX's CUDA graphs, and by
-mujoco_warp alone with the same states, objects, contact parameters and torques, sub-steps of a tick in one graph. One
-JSON line per measurement; `captures` counts graphs captured per call once all programs have run twice.
+mujoco_warp alone with the same states, objects, contact parameters and torques, each sub-step launched kernel by kernel
+and as one graph. One JSON line per measurement; `captures` counts graphs captured per call once all programs have run
+twice.
 """
 
 import argparse
@@ -73,8 +74,8 @@ def timed(run: Callable[[], Any], captures: Captures, repeats: int, steps: int) 
     return {"ms": round(1e3 * median, 3), "env_steps_per_s": round(steps / median), "captures": counts}
 
 
-def bare(env: Env, ticks: Any) -> Callable[[], None]:
-    """The recorded ticks [T, B] in mujoco_warp alone; on a GPU each tick is one graph."""
+def bare(env: Env, ticks: Any, in_graph: bool) -> Callable[[], None]:
+    """The recorded ticks [T, B] in mujoco_warp alone; `in_graph`: a sub-step is one CUDA graph."""
     import mujoco.mjx.third_party.mujoco_warp as mjw
     import warp as wp
 
@@ -105,24 +106,23 @@ def bare(env: Env, ticks: Any) -> Callable[[], None]:
     inputs = [[(to, wp.array(np.asarray(x[tick]), dtype=to.dtype)) for to, x in fill] for tick in range(len(tapes))]
     torque = [[wp.array(x) for x in tick[: scene.config.substeps]] for tick in applied.swapaxes(1, 2)]
 
-    def advance(tick: int) -> None:
+    def advance(tick: int, step: Callable[[], Any]) -> None:
         for to, source in inputs[tick]:
             wp.copy(to, source)
         for each in torque[tick]:
             wp.copy(data.qfrc_applied, each)
-            mjw.step(model, data)
+            step()
 
-    advance(0)  # loads the kernels outside of the capture
-    calls = [functools.partial(advance, tick) for tick in range(len(tapes))]
-    if wp.get_device().is_cuda:
-        for tick, _ in enumerate(calls):
-            with wp.ScopedCapture() as capture:
-                advance(tick)
-            calls[tick] = functools.partial(wp.capture_launch, capture.graph)
+    sub_step = functools.partial(mjw.step, model, data)
+    advance(0, sub_step)  # loads the kernels outside of the capture
+    if in_graph:
+        with wp.ScopedCapture() as capture:
+            sub_step()
+        sub_step = functools.partial(wp.capture_launch, capture.graph)
 
     def run() -> None:
-        for call in calls:
-            call()
+        for tick in range(len(tapes)):
+            advance(tick, sub_step)
         wp.synchronize()
 
     return run
@@ -141,7 +141,12 @@ def measure(task: str, config: PPOConfig, modes: list[str], per_calls: list[int]
         run = functools.partial(jit(functools.partial(physics, env)), ticks)
         yield {"measure": "physics", "mode": mode} | timed(run, captures, repeats, physics_steps)
         if mode == modes[0]:
-            yield {"measure": "bare"} | timed(bare(env, ticks[:5]), captures, repeats, physics_steps)
+            for in_graph in (False, True) if jax.default_backend() == "gpu" else (False,):
+                row = {"measure": "bare", "in_graph": in_graph}
+                try:
+                    yield row | timed(bare(env, ticks[:5], in_graph), captures, repeats, physics_steps)
+                except RuntimeError as error:  # Warp's, where CUDA refuses the graph
+                    yield row | {"failed": str(error).splitlines()[0]}
         for per_call in per_calls:
             training = make_train(env, dataclasses.replace(config, iterations_per_call=per_call))
             run = functools.partial(iterate, training.step, [training.init(jax.random.key(0))])
