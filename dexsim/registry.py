@@ -49,6 +49,7 @@ TASKS: dict[str, TaskEntry] = {
     "rotate_without_orientation": TaskEntry(rotate.RotateConfig, Rotate, rotate.without_orientation),
     "rotate_clear": TaskEntry(rotate.RotateConfig, Rotate, rotate.clear_of_palm),
 }
+_OURS = tuple(TASKS)
 
 
 def register(
@@ -85,11 +86,13 @@ def find_task(name: str) -> TaskEntry:
     that name which makes an environment of another kind.
 
     Raises:
-      ConfigError: there is no such task or module.
+      ConfigError: there is no such task or module, or the module has something by the name of a task of dexsim's.
     """
     module, _, word = name.rpartition(":")
     if module:
         makes = getattr(_import(module), word, None)
+        if word in _OURS and callable(makes) and TASKS[word].task is not makes:
+            raise ConfigError(f"task {name!r}: dexsim has a task {word!r} of its own; give yours another name")
         if word not in TASKS and callable(makes):
             TASKS[word] = TaskEntry(cast(Any, NoSettings), _no_task, cast(Any, NoSettings), makes)
     if word not in TASKS:
@@ -137,7 +140,14 @@ def make_task(name: str, hand: Hand, config: EnvConfig | None = None) -> Task:
     config = entry.config() if config is None else config
     if not isinstance(config, entry.config_class):
         raise ConfigError(f"task {name!r} takes a {entry.config_class.__name__}, not a {type(config).__name__}")
-    return entry.task(config, hand)
+    task = entry.task(config, hand)
+    home = TASKS.get(task.name)
+    if home is None or home.task not in (entry.task, type(task)):  # A policy's file has this name.
+        raise ConfigError(
+            f"task {name!r}: its class {type(task).__name__} has the name {task.name!r}, by which "
+            f"{'another task' if home else 'no task'} is registered; give the class name = {name!r}"
+        )
+    return task
 
 
 def _annotated_config(name: str, factory: Callable) -> type[EnvConfig]:
@@ -168,6 +178,8 @@ def _no_task(config: Any, hand: Hand) -> Task:
 
 
 def _import(module: str) -> ModuleType:
+    if not all(part.isidentifier() for part in module.split(".")):
+        raise ConfigError(f"task module {module!r}: must be what `import` takes, such as my_module, and no path")
     try:
         return importlib.import_module(module)
     except ImportError as error:

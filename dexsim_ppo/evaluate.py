@@ -261,9 +261,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     for path in (arguments.output, arguments.video):
         if path:
             cli.check_writable(path)
-    policy = load_policy(arguments.policy).ablate(*arguments.ablate)
-    if arguments.task:
-        find_task(arguments.task)
+    policy = load_policy(arguments.policy, task=arguments.task or None).ablate(*arguments.ablate)
     chunk = min(arguments.chunk or default_chunk(), arguments.episodes or default_chunk())
     if not any(entry.startswith("objects.mesh=") for entry in arguments.set):
         policy.check_mesh()

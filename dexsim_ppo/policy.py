@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dexsim.core.assets import asset_path
-from dexsim.core.config import from_dict, to_dict
+from dexsim.core.config import flat, from_dict, to_dict
 from dexsim.core.errors import AssetError, CheckpointError, ConfigError, OtherEnvWarning
 from dexsim.core.pytree import Array, pytree_dataclass, static
 from dexsim.hand.source import check_record, check_same, record_of, recorded_hand
@@ -244,7 +244,7 @@ class Policy:
                 f"the policy observes {layout_to_list(self.observation_layout)}, and {env.name} gives {given}"
             )
         trained = from_dict(type(env.config), self.env_config)  # with today's defaults for fields that are newer
-        trained, now = _flat(to_dict(trained)), _flat(to_dict(env.config))
+        trained, now = flat(to_dict(trained)), flat(to_dict(env.config))
         changed = [
             f"{path} = {now.get(path)!r} (trained: {trained.get(path)!r})"
             for path in sorted(trained.keys() | now.keys())
@@ -318,8 +318,17 @@ def _without(layer: Layer, kept: np.ndarray) -> Layer:
 
 
 def load_policy(name: str | Path, *, task: str | None = None) -> Policy:
-    """A policy from a file, or a shipped one by its name: the same as `Policy.load`."""
-    return Policy.load(name, task=task)
+    """A policy from a file, or a shipped one by its name; `task` is also any other name of its task, with its module
+    (`my_module:poke`) where that has to be imported. In all else the same as `Policy.load`."""
+    policy = Policy.load(name)
+    if task:
+        from dexsim.registry import find_task
+
+        entry, word = find_task(task), task.rpartition(":")[2]
+        # One task may be registered under several names; the file has one of them.
+        if policy.task != word and (entry.environment or find_task(policy.task).task is not entry.task):
+            raise CheckpointError(f"{name}: is of the task {policy.task!r}, not {word!r}")
+    return policy
 
 
 def _find(name: str | Path) -> Path:
@@ -337,10 +346,3 @@ def _read_spec(file: checkpoint.Checkpoint, env_config: dict[str, Any]) -> TaskS
     if file.content.get("spec"):
         return read_spec(file.content["spec"], file.path)
     return old_spec(file.task, env_config) if file.task in ("grasp", "rotate") else None
-
-
-def _flat(config: Any, path: str = "") -> dict[str, Any]:
-    """Nested plain data as one mapping from path to value."""
-    if not isinstance(config, dict):
-        return {path: config}
-    return {k: v for name, value in config.items() for k, v in _flat(value, f"{path}.{name}" if path else name).items()}

@@ -70,6 +70,8 @@ class RecordArguments:
     """Longest duration of an episode."""
     seed: int = setting(0, unit="1", low=0, high=2**32 - 2)
     """Seed of the episodes."""
+    task: str = ""
+    """Module and name of a task of your own, such as my_module:poke; the policy's file names all others."""
 
     def __post_init__(self) -> None:
         validate(self)
@@ -86,7 +88,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments.lerobot is None and arguments.rrd is None:
         raise ConfigError("give --lerobot FOLDER or --rrd FILE")
     cli.enable_caches()
-    policy = load_policy(arguments.policy)
+    policy = load_policy(arguments.policy, task=arguments.task or None)
     env = policy.make_env(num_envs=arguments.episodes)
     found = record(policy, env, episodes=arguments.episodes, seconds=arguments.seconds, seed=arguments.seed)
     if arguments.lerobot:

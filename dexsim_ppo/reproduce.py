@@ -25,8 +25,8 @@ from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.ppo import TrainState, experience, make_train
 from dexsim_ppo.learner.types import Environment
 from dexsim_ppo.retired import migrate_arguments
-from dexsim_ppo.train import arguments_from_dict
-from dexsim_ppo.training.arguments import training_config
+from dexsim_ppo.train import arguments_from_dict, make_environment
+from dexsim_ppo.training.arguments import find_hand
 from dexsim_ppo.training.faults import keep
 
 
@@ -69,13 +69,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _prepare(file: checkpoint.Checkpoint) -> tuple[Environment, PPOConfig, TrainState, Any, int]:
     """Environment, learner's settings, state, step of one iteration, and how many to replay."""
-    import dexsim
-
     entry = find_task(file.task)
     with naming_file(file.path):
         saved = arguments_from_dict(entry.config_class, migrate_arguments(file.content["arguments"], file.path))
     config = dataclasses.replace(saved.ppo, iterations_per_call=1)
-    env = dexsim.make(file.task, training_config(saved), backend=file.content["backend"], num_envs=saved.ppo.num_envs)
+    if (backend := file.content["backend"]) != "own":
+        saved = dataclasses.replace(saved, backend=backend)
+    env = make_environment(saved, find_hand(saved, file), 1)
     training = make_train(env, config, saved.curriculum)
     state = checkpoint.restore(file, training.shapes(jax.random.key(saved.seed)))
     print(f"{file.path}: {file.task}, seed {saved.seed}, {config.num_envs} environments, {env.backend} physics")

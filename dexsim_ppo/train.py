@@ -238,7 +238,7 @@ def find_beginning(
         path = Path(resume)
         file = path if path.is_file() else RunFolder(path).latest_checkpoint()
         return checkpoint.load(file, kind="train", task=name)
-    return load_policy(policy, task=name) if policy else None
+    return load_policy(policy, task=task) if policy else None
 
 
 def default_arguments(task: str | None, preset: str, begun: checkpoint.Checkpoint | Policy | None) -> TrainArguments:
@@ -291,7 +291,10 @@ def parse_arguments(argv: list[str]) -> tuple[TrainArguments, checkpoint.Checkpo
         if known.preset:
             raise ConfigError("--config has all options of a run, those of its preset among them: leave --preset out")
         default = saved_arguments(Path(known.config), known.task)
-        begun = find_beginning(default.task, known.policy or default.policy, None)
+        begun = find_beginning(known.task or default.task, known.policy or default.policy, None)
+        if known.policy and not default.policy:  # the run began from scratch
+            ppo = fine_tuning_config(cast(Policy, begun), default.ppo)
+            default = dataclasses.replace(default, ppo=ppo, curriculum=Curriculum())
     else:
         begun = find_beginning(known.task, known.policy, known.resume)
         default = default_arguments(known.task, preset, begun)
@@ -316,12 +319,12 @@ def parse_arguments(argv: list[str]) -> tuple[TrainArguments, checkpoint.Checkpo
 
 
 def arguments_from_dict(config_class: type[Any], data: dict[str, Any]) -> TrainArguments:
-    """The options that a checkpoint holds."""
-    data = dict(data)
-    env, ppo = from_dict(config_class, data.pop("env")), from_dict(PPOConfig, data.pop("ppo"))
-    curriculum = from_dict(Curriculum, data.pop("curriculum", {}))
+    """The options that a checkpoint or `config.json` holds; those that exist no more are left out."""
     known = {f.name for f in dataclasses.fields(TrainArguments)}
-    return TrainArguments(env=env, ppo=ppo, curriculum=curriculum, **{k: v for k, v in data.items() if k in known})
+    if missing := {"env", "ppo"} - data.keys():
+        raise ConfigError(f"TrainArguments: no {min(missing)}")
+    known_data = {name: value for name, value in data.items() if name in known}
+    return from_dict(TrainArguments, known_data | {"env": from_dict(config_class, data["env"])})
 
 
 @contextlib.contextmanager

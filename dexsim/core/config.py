@@ -184,6 +184,13 @@ def override(data: dict[str, Any], settings: Iterable[str]) -> dict[str, Any]:
     return data
 
 
+def flat(data: Any, path: str = "") -> dict[str, Any]:
+    """`to_dict`'s output as one mapping from path ("objects.mass") to value."""
+    if not isinstance(data, dict):
+        return {path: data}
+    return {k: v for name, value in data.items() for k, v in flat(value, f"{path}.{name}" if path else name).items()}
+
+
 def _merge(data: Any, change: dict[str, Any]) -> dict[str, Any]:
     before = data if isinstance(data, dict) else {}
     return before | {

@@ -43,4 +43,4 @@ class EnvConfig:
     def three_axis(self) -> bool:
         """Whether the taxels also feel along the skin: asked for, or observed."""
         observed = (*self.observation.add, *self.observation.add_critic)
-        return self.touch and (self.sensing.three_axis or "tangential_force" in observed)
+        return self.sensing.three_axis or "tangential_force" in observed

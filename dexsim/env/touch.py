@@ -52,7 +52,7 @@ class TouchModel:
         if config.touch:
             touch, normal, share = self._press(pose, object, position, quat, force, cover)
         else:
-            nothing, normal, share = jnp.zeros(hand.taxel_area.shape), jnp.zeros(hand.num_fingers), 1.0
+            nothing, normal, share = jnp.zeros(hand.taxel_area.shape), jnp.zeros(hand.num_fingers), 0.0
             touch = Touch(nothing, nothing, nothing)
         if not config.three_axis:
             return FingertipTouch(touch, normal, None)

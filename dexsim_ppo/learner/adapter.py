@@ -74,9 +74,10 @@ class Adapted:
         self.name, self._env = name, env
         self._check()
         self.action_size, self.evaluation_steps = env.action_size, env.max_steps
-        self.control_period = float(getattr(env, "control_period", CONTROL_PERIOD))
-        if not 1e-3 <= self.control_period <= 1.0:
-            raise self._error(f"control_period = {self.control_period:g} s: must be between 0.001 and 1")
+        period = getattr(env, "control_period", CONTROL_PERIOD)
+        if not isinstance(period, int | float) or not 1e-3 <= period <= 1.0:
+            raise self._error(f"control_period = {period!r} s: must be a number between 0.001 and 1")
+        self.control_period = float(period)
         # One vector for both networks, scaled by its running statistics.
         fields = (Field("observation", env.observation_size, None),)
         self.observation_layout: Mapping[str, Any] = {"actor": fields, "critic": fields}
@@ -162,6 +163,12 @@ class Adapted:
         self._check_array("step: what says whether it terminated", after[3], ())
         if np.dtype(after[3].dtype) != np.dtype(bool):
             raise self._error(f"step: what says whether it terminated is {after[3].dtype}, not bool")
+        if hasattr(env, "metrics"):
+            (own,) = self._shapes("metrics(state)", 1, lambda state: (env.metrics(state),), begun[1])
+            if not isinstance(own, dict):
+                raise self._error(f"metrics(state) gives {type(own).__name__} where a dict is wanted")
+            for name, value in own.items():
+                self._check_array(f"metrics: {name!r}", value, ())
         # The state is carried through a compiled loop: it must stay what it is.
         old, new = (jax.tree_util.tree_flatten_with_path(state)[0] for state in (begun[1], after[1]))
         structures: list[Any] = [jax.tree.structure(state) for state in (begun[1], after[1])]

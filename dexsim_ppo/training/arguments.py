@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, Literal, TypeVar
 
-from dexsim.core.config import setting, to_dict, validate
+from dexsim.core.config import NoSettings, setting, to_dict, validate
 from dexsim.core.errors import ConfigError
 from dexsim.hand.kinematics import Hand
 from dexsim.hand.load import load_hand
@@ -87,6 +87,8 @@ class TrainArguments(Generic[EnvConfig]):
 
     def __post_init__(self) -> None:
         validate(self)
+        if self.seed + self.seeds > 2**32:
+            raise ConfigError(f"TrainArguments.seeds = {self.seeds}: the last seed must be at most {2**32 - 1}")
         if self.patience and not self.evaluate_every:
             raise ConfigError(
                 f"TrainArguments.patience = {self.patience}: needs evaluations, TrainArguments.evaluate_every"
@@ -116,9 +118,11 @@ def training_config(arguments: TrainArguments) -> Any:
     A policy that does not follow its command yet learns from a loop to ignore a command that drifts.
 
     Raises:
-      ConfigError: extremes for a task without randomisation ranges.
+      ConfigError: extremes or a curriculum for a task without randomisation ranges.
     """
     env, share = arguments.env, arguments.extremes
+    if arguments.curriculum.on and isinstance(env, NoSettings):
+        raise ConfigError("Curriculum.on = True: an environment from elsewhere has no ranges that could widen")
     control = getattr(env, "control", None)
     if control is not None and control.force.gain:
         env = dataclasses.replace(

@@ -238,6 +238,7 @@ class Run:
         return {
             "task": self.arguments.task,
             "backend": self.env.backend,
+            "hand": record_of(getattr(self.env, "hand", None)),
             "arguments": printable(self.arguments),
             "calls": self.config.iterations_per_call,
         }
@@ -264,9 +265,8 @@ class Run:
         policy = self._policy(state)
         report, _ = self.evaluator(policy.params, episodes=self.arguments.evaluation_chunk, seed=SELECTION_SEED)
         figures = {name: entry["value"] for name, entry in headline(report).items() if entry["value"] is not None}
-        score, first = figures["return"], next(iter(figures))
+        score, first, best = figures["return"], next(iter(figures)), self.best["return"]
         self.evaluations_s.append(report["seconds"])
-        best = self.best["return"]
         better = best is None or best != best or score > best  # Nothing is better than NaN, and NaN than nothing.
         self.without_better = 0 if better else self.without_better + 1
         if better:

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from simple_physics import SimplePhysics
 
-from dexsim import ConfigError, OtherEnvWarning, registry
+from dexsim import CheckpointError, ConfigError, OtherEnvWarning, registry
 from dexsim.core.config import override
-from dexsim_ppo import Policy, evaluate_policy, train_policy
+from dexsim_ppo import Policy, evaluate_policy, load_policy, record, train_policy
 from dexsim_ppo import evaluate as evaluate_command
 from dexsim_ppo import train as train_command
 from dexsim_ppo.learner.config import PPOConfig
@@ -83,6 +83,15 @@ def test_fine_tuning_begins_with_the_policy(run, tmp_path):
         policy=str(run.folder / "last.msgpack"), ppo=SMALL, backend="c", steps=32, run_dir=tmp_path / "tuned", **SIZES
     )
     assert tuned.policy.task == "poke" and tuned.policy.training["policy"].endswith("last.msgpack")
+
+
+def test_a_policy_of_another_task_is_refused(run):
+    file = str(run.folder / "last.msgpack")
+    for command in (evaluate_command.main, train_command.main, record.main):
+        policy = ["--policy", file] if command is train_command.main else [file, "--rrd", "x.rrd"]
+        with pytest.raises(CheckpointError, match="is of the task 'poke', not 'grasp'"):
+            command([*policy[: 1 if command is evaluate_command.main else 3], "--task", "grasp"])
+    assert load_policy("rotate_without_orientation", task="rotate_without_orientation").task == "rotate"
 
 
 def test_what_is_refused(run):

@@ -39,4 +39,20 @@ class Broken(Reach):
         return super().step(key, state, action)[:3]
 
 
+class Breaks(Reach):
+    """Observes NaN from the fourth step of an episode on."""
+
+    def step(self, key, state, action):
+        seen, state, reward, terminated = super().step(key, state, action)
+        return jnp.where(state["steps"] > 3, jnp.nan, seen), state, reward, terminated
+
+
+def breaks():
+    return Breaks()
+
+
+def grasp():
+    return Reach()
+
+
 NUMBER = 3

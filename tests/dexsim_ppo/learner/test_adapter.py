@@ -13,10 +13,11 @@ from paths import ROOT
 from reach_env import MAX_STEPS, Broken, Reach
 from tiny_env import SMALL
 
-from dexsim import ConfigError, registry
-from dexsim_ppo import Policy, evaluate_policy, make_train, train_policy
+from dexsim import ConfigError, DexsimError, registry
+from dexsim_ppo import Policy, evaluate_policy, make_train, reproduce, train_policy
 from dexsim_ppo import evaluate as evaluate_command
 from dexsim_ppo.learner.adapter import adapt
+from dexsim_ppo.learner.curriculum import Curriculum
 
 
 def play(env, actions, key=0):
@@ -74,7 +75,11 @@ def test_restart_is_a_new_episode_where_asked_and_keys_advance_either_way():
         ({"observation_size": 3}, r"observation has the shape \(2,\), not \(3,\)"),
         ({"action_size": 0}, "action_size = 0: must be a whole number of at least 1"),
         ({"max_steps": 2.0}, "max_steps = 2.0"),
-        ({"control_period": 60.0}, "control_period = 60 s"),
+        ({"control_period": 60.0}, "control_period = 60.0 s"),
+        ({"control_period": "fast"}, "control_period = 'fast' s: must be a number"),
+        ({"metrics": lambda state: [state["x"]]}, "gives list where a dict is wanted"),
+        ({"metrics": lambda state: {"far": jnp.zeros(3)}}, r"metrics: 'far' has the shape \(3,\), not \(\)"),
+        ({"metrics": lambda state: {"far": "very"}}, r"metrics\(state\) fails: TypeError"),
         ({"reset": lambda key: (jnp.zeros(2), jnp.zeros(3))}, "step.* fails"),
         ({"reset": lambda key: jnp.zeros(2)}, "where a tuple of 2 is wanted"),
         ({"step": lambda k, s, a: (jnp.zeros(2), s, jnp.zeros(1), jnp.bool_(False))}, r"reward has the shape \(1,\)"),
@@ -118,12 +123,31 @@ def test_missing_members_are_named_and_complete_environments_left_alone():
         ("reach_env:nothing", "unknown task 'nothing'"),
         ("reach_env:NUMBER", "unknown task 'NUMBER'"),
         ("reach_env:needs_a_size", "callable without arguments"),
+        ("reach_env:grasp", "dexsim has a task 'grasp' of its own; give yours another name"),
+        ("./reach_env:reach", "'./reach_env': must be what `import` takes"),
     ],
 )
 def test_bad_names_are_one_line(name, message, monkeypatch):
     monkeypatch.setattr(registry, "TASKS", dict(registry.TASKS))
     with pytest.raises(ConfigError, match=message):
         train_policy(name, ppo=SMALL, steps=64)
+
+
+def test_ranges_that_do_not_exist_cannot_widen(monkeypatch, tmp_path):
+    monkeypatch.setattr(registry, "TASKS", dict(registry.TASKS))
+    with pytest.raises(ConfigError, match="an environment from elsewhere has no ranges that could widen"):
+        train_policy("reach_env:reach", ppo=SMALL, steps=64, curriculum=Curriculum(on=True), run_dir=tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_fault_is_replayed(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(registry, "TASKS", dict(registry.TASKS))
+    sizes = {"evaluation_chunk": 8, "evaluation_episodes": 8}
+    with pytest.raises(DexsimError, match="training diverged"):
+        train_policy("reach_env:breaks", ppo=SMALL, steps=1e5, run_dir=tmp_path / "run", **sizes)
+    file = sorted((tmp_path / "run").glob("reproduce-*.msgpack"))[0]
+    assert reproduce.main([str(file), "--task", "reach_env:breaks"]) == 0
+    assert re.search(r"'observation': \d+ of \d+ environments .*, first at step", capsys.readouterr().out)
 
 
 def test_training_by_name_is_reported_saved_resumed_and_evaluated(tmp_path, monkeypatch, capsys):

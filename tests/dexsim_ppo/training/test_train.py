@@ -198,6 +198,26 @@ def test_without_a_number_of_episodes_the_device_decides(finished):
     assert evaluate.default_episodes(long) == 64
 
 
+def edited(finished, folder, **changes):
+    """A copy of a run's configuration with some options changed; `...` leaves one out."""
+    saved = json.loads(finished.config.read_text())
+    saved["arguments"] |= changes
+    saved["arguments"] = {name: value for name, value in saved["arguments"].items() if value is not ...}
+    path = folder / f"edited-{'-'.join(changes)}.json"
+    path.write_text(json.dumps(saved))
+    return path
+
+
+def test_a_policy_beside_a_saved_configuration_is_fine_tuned(finished, tmp_path):
+    """The run was trained from scratch: its steps would make a policy forget."""
+    file = edited(finished, tmp_path, minutes=3.0)
+    arguments, begun = train.parse_arguments(["--config", str(file), "--policy", str(finished.best)])
+    tuned, _ = train.parse_arguments(["--policy", str(finished.best), "--preset", "cpu"])
+    assert isinstance(begun, Policy) and arguments.minutes == 3.0
+    for name in ("learning_rate", "kl_target", "critic_first", "initial_std"):
+        assert getattr(arguments.ppo, name) == getattr(tuned.ppo, name), name
+
+
 def test_a_saved_configuration_begins_a_new_run(finished, tmp_path, capsys):
     """Its options are the defaults; what is typed beside it holds."""
     for given in (finished.path, finished.config):
@@ -215,6 +235,10 @@ def test_a_saved_configuration_begins_a_new_run(finished, tmp_path, capsys):
         (["--config", str(finished.path), "--resume", str(finished.path)], "give one of them"),
         (["--config", str(tmp_path / "other.json")], "no configuration of a run"),
         (["--config", str(tmp_path / "none.json")], "no configuration of a run"),
+        (["--config", str(edited(finished, tmp_path, seed="x"))], "TrainArguments.seed = 'x': expected int"),
+        (["--config", str(edited(finished, tmp_path, minutes=None))], "TrainArguments.minutes = None: expected float"),
+        (["--config", str(edited(finished, tmp_path, env=...))], "TrainArguments: no env"),
+        (["--task", "tiny", "--seed", str(2**32 - 1), "--seeds", "2"], "--seeds 2: the last seed must be at most"),
     ):
         capsys.readouterr()
         assert exit_code(train.main, arguments) == 2
