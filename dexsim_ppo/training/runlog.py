@@ -1,5 +1,6 @@
 """A run's folder: configuration, metrics, checkpoints, policies and the learning curve."""
 
+import contextlib
 import datetime
 import importlib.util
 import itertools
@@ -144,11 +145,14 @@ class MetricsLog:
 
     def close(self) -> None:
         """Flush to disk."""
-        self._file.close()
-        if self._tensorboard:
-            self._tensorboard.close()
-        if self._wandb:
-            self._wandb.finish()
+        try:
+            self._file.close()
+        finally:
+            if self._tensorboard:
+                with contextlib.suppress(OSError):  # The disk is full, and `metrics.jsonl` says so.
+                    self._tensorboard.close()
+            if self._wandb:
+                self._wandb.finish()
 
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:
@@ -173,7 +177,8 @@ def _tensorboard_writer(path: Path) -> Any:
         if importlib.util.find_spec(module.split(".")[0]) is None:
             continue
         try:
-            return importlib.import_module(module).SummaryWriter(str(path / "tensorboard"))
+            # Its thread ends where the disk is full, and a bounded queue would then stop the training for good.
+            return importlib.import_module(module).SummaryWriter(str(path / "tensorboard"), max_queue=0)
         except ImportError:
             continue
     return None

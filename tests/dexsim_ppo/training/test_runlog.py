@@ -3,6 +3,7 @@
 import importlib.util
 import json
 import sys
+import threading
 import types
 
 import matplotlib.pyplot as plt
@@ -110,6 +111,32 @@ def test_a_resumed_log_goes_on_after_the_checkpoint(tmp_path, monkeypatch):
     assert writer.scalars == [("kl", 0.5, 800)], "over environment steps, and no NaN"
     log.close()
     assert writer.closed
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_tensorboard_on_a_full_disk_does_not_stop_the_log(tmp_path, monkeypatch):
+    record_writer = pytest.importorskip("tensorboardX.record_writer").RecordWriter
+    write_record, written = record_writer.write, []
+
+    def filling(self, data):
+        written.append(data)
+        if len(written) > 5:
+            raise OSError(28, "No space left on device")
+        write_record(self, data)
+
+    monkeypatch.setattr(record_writer, "write", filling)
+    folder = RunFolder(tmp_path)
+
+    def write():
+        log = MetricsLog(folder, 0, TrainArguments(env=TinyConfig(), ppo=SMALL))
+        for i in range(1, 101):
+            log.write({"iteration": i, "env_steps": i, "kl": 0.5})
+        log.close()
+
+    thread = threading.Thread(target=write, daemon=True)
+    thread.start()
+    thread.join(30)
+    assert not thread.is_alive() and len(read_metrics(folder.metrics)) == 100
 
 
 def test_metrics_go_to_weights_and_biases(tmp_path, monkeypatch):
