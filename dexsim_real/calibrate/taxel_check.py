@@ -98,8 +98,10 @@ def check_release(name: str, sums: np.ndarray, config: CheckConfig) -> None:
       config: thresholds.
 
     Raises:
-      HandError: it reads far below zero, so it was touched when it was tared.
+      HandError: it reads far below zero, so it was touched when it was tared; or nothing was read.
     """
+    if not len(sums):
+        raise HandError(f"{name}: the hand did not answer after the press")
     left = float(np.median(sums))
     if left < -config.release:
         raise HandError(

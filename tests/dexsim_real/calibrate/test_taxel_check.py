@@ -10,7 +10,7 @@ from press_bench import BenchHand
 from dexsim_real.calibrate.options import CheckConfig
 from dexsim_real.calibrate.press_procedure import PressProcedure
 from dexsim_real.calibrate.read import read_logs
-from dexsim_real.calibrate.taxel_check import check_rest, dead_taxels, taxel_names
+from dexsim_real.calibrate.taxel_check import check_release, check_rest, dead_taxels, taxel_names
 from dexsim_real.core.errors import HandError
 from dexsim_real.sensors.hand import HardwareConfig
 
@@ -114,3 +114,11 @@ def test_a_finger_zeroed_under_load_is_found_out(hand, tmp_path):
     (recording,) = read_logs([log], hand).recordings.values()
     assert recording.time[0] > let_go_at[0] + 1.0 and len(recording.time) > 50
     assert off(bench) and bench.closed
+
+
+def test_a_fingertip_is_free_after_a_press():
+    check_release("index", np.array([-3.0, 2.0, 40.0]), CheckConfig())
+    with pytest.raises(HandError, match="index: reads -900 counts after the press"):
+        check_release("index", np.full(5, -900.0), CheckConfig())
+    with pytest.raises(HandError, match="index: the hand did not answer after the press"):
+        check_release("index", np.array([]), CheckConfig())
