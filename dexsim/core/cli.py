@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from dexsim.core.assets import cache_path
-from dexsim.core.errors import ConfigError, DexsimError, DexsimWarning
+from dexsim.core.errors import AssetError, ConfigError, DexsimError, DexsimWarning
 from dexsim.core.files import make_private, write_whole
 from dexsim.core.install import DISTRIBUTION
 from dexsim.core.options import Option, explain, group_docs, help_page, in_option_names, options_of
@@ -98,6 +98,8 @@ def naming_options(
         yield
     except ConfigError as error:
         raise UsageError(in_option_names(str(error), options_of(cls, default), typed)) from None
+    except AssetError as error:
+        raise AssetError(in_option_names(str(error), options_of(cls, default), typed)) from None
 
 
 def wants_help(argv: Sequence[str]) -> bool:

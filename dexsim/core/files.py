@@ -83,7 +83,7 @@ def read_toml(path: Path) -> dict[str, Any]:
       ValueError: too large, keys with too many parts, nested too deep, or no TOML.
       OSError: it cannot be read.
     """
-    text = read_bounded(path).decode("utf-8").replace("\r\n", "\n")
+    text = read_bounded(path).decode("utf-8-sig").replace("\r\n", "\n")
     if found := _LONG_KEY.search(text):
         line = text.count("\n", 0, found.start()) + 1
         raise ValueError(f"a key with more than {_TOML_PARTS} parts (at line {line})")

@@ -107,8 +107,8 @@ def load_mesh(source: Any, *, scale: float = 1.0, name: str | None = None) -> Me
     size = float(np.ptp(vertices, axis=0).max())
     if not SMALLEST <= size <= LARGEST:
         raise AssetError(
-            f"{name}: {size:.3g} m across, expected {SMALLEST:g} to {LARGEST:g} m; coordinates are "
-            "metres, pass scale=0.001 for a file in millimetres"
+            f"{name}: {size:.3g} m across at scale {scale:g}, expected {SMALLEST:g} to {LARGEST:g} m; coordinates are "
+            "metres, pass scale=0.001 for a file in millimetres (ObjectConfig.mesh_unit)"
         )
     vertices, faces = _merge(vertices, faces, 1e-7 * size)
     _check_closed(name, vertices, faces, size)

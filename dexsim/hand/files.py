@@ -3,6 +3,7 @@
 import contextlib
 import hashlib
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 from dexsim.core.assets import asset_path
@@ -13,12 +14,15 @@ DEFAULT = "xhand_right"
 
 def find_hand(name: str | Path | None) -> Path:
     """The TOML of a hand that is named by a path, or by the name of a shipped one; None for the default one."""
-    text = str(name or DEFAULT)
-    if re.fullmatch(r"\w+", text) and not Path(text).exists():
+    if not name:
+        return asset_path(f"hand/{DEFAULT}.toml")
+    text = str(name)
+    if re.fullmatch(r"\w+", text) and not Path(text).is_file():  # a folder of that name is no hand
         for place in (f"hand/{text}.toml", f"hand/{text}/{text}.toml"):
             with contextlib.suppress(AssetError):
                 return asset_path(place)
-        raise AssetError(f"hand {text!r}: no such file, and no shipped hand has that name")
+        what = "a folder" if Path(text).is_dir() else "no such file"
+        raise AssetError(f"hand {text!r}: {what}, and no shipped hand has that name")
     return Path(text)
 
 
@@ -30,13 +34,21 @@ def shipped_name(path: Path) -> str:
 
 
 def digest_of(*files: Path) -> str:
-    """A hash of the content of a hand's files, and of the files that its MJCF includes."""
+    """A hash of the content of a hand's files, and of the files that its MJCF includes, directly or not."""
     digest = hashlib.sha256()
     for path in files:
         data = path.read_bytes()
         digest.update(len(data).to_bytes(8, "little") + data)
-        if path.suffix == ".xml":
-            for name in re.findall(rb'<include\s+file\s*=\s*"([^"]+)"', data):
-                included = path.parent / name.decode(errors="replace")
-                digest.update(included.read_bytes() if included.is_file() else b"")
+        for included in _included(path.parent, path.parent, data, set()):
+            digest.update(included.read_bytes())
     return digest.hexdigest()
+
+
+def _included(top: Path, folder: Path, data: bytes, seen: set[Path]) -> Iterator[Path]:
+    """The files that an MJCF in `folder` includes, and theirs. MuJoCo looks beside the model first, in `top`."""
+    for name in re.findall(rb"""<include\s+file\s*=\s*["']([^"']+)["']""", data):
+        places = [base / name.decode(errors="replace") for base in (top, folder)]
+        for path in [place for place in places if place.is_file() and place not in seen][:1]:
+            seen.add(path)
+            yield path
+            yield from _included(top, path.parent, path.read_bytes(), seen)

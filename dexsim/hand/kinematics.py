@@ -172,7 +172,7 @@ def flexion_joints(hand: Hand, fingers: range) -> np.ndarray:
         for body, cosine in zip(chain[: root[-1] + 1], np.abs(axes @ axes[root[-1]]), strict=False):
             if hand.body_joint[body] >= 0 and cosine > 0.7:
                 joints.add(int(hand.body_joint[body]))
-    return np.array(sorted(joints))
+    return np.array(sorted(joints), int)
 
 
 def _drawn_frames(hand: Hand) -> np.ndarray:

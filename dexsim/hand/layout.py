@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,8 @@ from dexsim.core.errors import AssetError, ConfigError
 
 SURFACES = ("plane", "cylinder", "capsule", "sphere")
 _AWAY = 3e-3  # m, how far from its link a taxel may be: as thick as the rubber
+_SMALLEST, _LARGEST = 1e-12, 1e-2  # m^2, area of a taxel: square millimetres are refused
+_MOST = 1000  # columns or rows
 _STEP = 3e-3  # m, along a normal, which must lead away from the link
 COLUMNS = ("finger", "column", "row", "x", "y", "z", "nx", "ny", "nz", "area")
 
@@ -240,13 +243,17 @@ def read_layout(path: str | Path) -> dict[str, Patch]:
     """
     path = Path(path)
     try:
-        with open(path, newline="") as file:
+        with open(path, newline="", encoding="utf-8-sig") as file:
             entries = list(csv.DictReader(file))
+        if not entries:
+            raise ValueError("no taxels")
         fingers = tuple(dict.fromkeys(entry["finger"] for entry in entries))
         columns, rows = (1 + max(int(entry[name]) for entry in entries) for name in ("column", "row"))
+        if max(columns, rows) > _MOST:
+            raise ValueError(f"{columns} x {rows} taxels")
     except FileNotFoundError:
         raise AssetError(f"{path}: no such file") from None
-    except (OSError, KeyError, TypeError, ValueError) as error:
+    except (OSError, KeyError, TypeError, ValueError, csv.Error) as error:
         raise AssetError(f"{path}: not a taxel layout ({error})") from None
     table = read_taxels(path, fingers, (columns, rows)).astype(np.float64)
     return {
@@ -257,20 +264,22 @@ def read_layout(path: str | Path) -> dict[str, Patch]:
 
 def read_taxels(path: Path, fingers: tuple[str, ...], grid: tuple[int, int]) -> np.ndarray:
     """[F, N, 7]: position, normal, area. Every finger must have columns * rows taxels."""
+    columns, length = grid
+    wanted = len(fingers) * columns * length
     try:
-        with open(path, newline="") as file:
-            rows = list(csv.DictReader(file))
+        with open(path, newline="", encoding="utf-8-sig") as file:  # spreadsheets begin a CSV with a byte order mark
+            reader = csv.DictReader(file)
+            if tuple(reader.fieldnames or ()) != COLUMNS:
+                raise AssetError(f"{path}: the first line must read {','.join(COLUMNS)}")
+            rows = [(reader.line_num, entry) for entry in itertools.islice(reader, wanted + 1)]
     except FileNotFoundError:
         raise AssetError(f"{path}: no such file") from None
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+    except (OSError, ValueError, csv.Error) as error:
         raise AssetError(f"{path}: {error}") from None
-    if not rows or tuple(rows[0]) != COLUMNS:
-        raise AssetError(f"{path}: the first line must read {','.join(COLUMNS)}")
-    columns, length = grid
     table = np.full((len(fingers), columns * length, 7), np.nan, np.float32)
-    for line, entry in enumerate(rows, start=2):
+    for line, entry in rows:
         if entry["finger"] not in fingers:
-            raise AssetError(f"{path}:{line}: no finger {entry['finger']!r}; the hand has {', '.join(fingers)}")
+            raise AssetError(f"{path}:{line}: no finger {entry['finger']!r:.60}; the hand has {', '.join(fingers)}")
         try:
             column, at = int(entry["column"]), int(entry["row"])
             values = [float(entry[name]) for name in COLUMNS[3:]]
@@ -278,23 +287,23 @@ def read_taxels(path: Path, fingers: tuple[str, ...], grid: tuple[int, int]) -> 
                 raise ValueError
         except (TypeError, ValueError):
             raise AssetError(f"{path}:{line}: not ten values with numbers from column 2 on") from None
-        if not (0 <= column < columns and 0 <= at < length) or not np.all(np.isfinite(values)):
+        if not (0 <= column < columns and 0 <= at < length) or not np.all(np.abs(values) < 1e6):  # NaN is not
             raise AssetError(
                 f"{path}:{line}: column {column}, row {at} or a number in the line "
                 f"is outside the {columns} x {length} grid or not finite"
             )
-        if abs(np.linalg.norm(values[3:6]) - 1) > 0.01 or values[6] <= 0:
-            raise AssetError(f"{path}:{line}: the normal must be of length 1 and the area above 0")
+        if abs(np.linalg.norm(values[3:6]) - 1) > 0.01 or not _SMALLEST <= values[6] <= _LARGEST:
+            raise AssetError(
+                f"{path}:{line}: the normal must be of length 1 and the area above 0 and at most {_LARGEST:g} m^2"
+            )
         table[fingers.index(entry["finger"]), column * length + at] = values
+    if len(rows) > wanted:
+        raise AssetError(f"{path}: {len(rows)} taxels or more, expected {wanted}: a column and row is given twice")
     count = np.sum(np.isfinite(table[..., 0]), axis=1)
     if np.any(count != columns * length):
         worst = int(np.argmin(count))
         raise AssetError(
             f"{path}: finger {fingers[worst]!r} has {count[worst]} taxels, the grid asks for {columns * length}"
-        )
-    if len(rows) != table.shape[0] * table.shape[1]:
-        raise AssetError(
-            f"{path}: {len(rows)} taxels, expected {table.shape[0] * table.shape[1]} (a column and row is given twice)"
         )
     return table
 

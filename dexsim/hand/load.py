@@ -4,6 +4,7 @@
 files under `assets/hand/` knows which hand it is.
 """
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,13 @@ from dexsim.hand.files import digest_of, find_hand, shipped_name
 from dexsim.hand.kinematics import Geom, Hand
 from dexsim.hand.layout import read_taxels
 from dexsim.hand.pads import lay_taxels
+
+_SLACK = 1e-3  # rad, how far a posture may be beyond a joint's range
+_ENTRIES = (
+    *("name", "model", "palm", "joints", "speed_limits"),
+    *("taxels", "taxel_grid", "taxel_pitch", "grasp", "rotate", "fingers"),
+)
+_FINGER_ENTRIES = ("name", "tip", "root_joint", "force_per_torque", "pad", "facing")
 
 
 def load_hand(path: str | Path | None = None) -> Hand:
@@ -30,6 +38,7 @@ def load_hand(path: str | Path | None = None) -> Hand:
     model_path = path.parent / table["model"]
     model = _load_model(path, model_path)
     joints, followers = _find_joints(path, model_path, model, table)
+    _check_postures(path, model, joints, table)
     palm = _find(path, model_path, model, "body", table["palm"])
     bodies = [b for b in range(1, model.nbody) if _is_below(model.body_parentid, b, palm)]
     row = {body: i for i, body in enumerate(bodies)}
@@ -101,7 +110,11 @@ def _load_model(path: Path, model_path: Path) -> Any:
         model = mujoco.MjModel.from_xml_path(str(model_path))
     except ValueError as error:
         raise AssetError(f"{model_path}: {' '.join(str(error).split())}") from None
-    _check_finite(model, model_path)
+    _check_numbers(model, model_path)
+    for kind, count in (("body", model.nbody), ("joint", model.njnt), ("geom", model.ngeom)):
+        for name in (getattr(model, kind)(index).name for index in range(count)):
+            if re.fullmatch(r"object(_\d+)?", name):
+                raise AssetError(f"{model_path}: {kind} {name!r}: what the hand holds has this name; choose another")
     return model
 
 
@@ -168,8 +181,28 @@ def _find_fingers(
     return tips, [table["joints"].index(finger["root_joint"]) for finger in table["fingers"]]
 
 
+def _check_postures(path: Path, model: Any, joints: list[int], table: dict) -> None:
+    """Postures lie in the joints' ranges: degrees, in the TOML or as ranges of the MJCF, do not."""
+    for task in ("grasp", "rotate"):
+        for name, joint, angle in zip(table["joints"], joints, _numbers(table, task, "posture"), strict=False):
+            low, high = model.jnt_range[joint]
+            if not low - _SLACK <= angle <= high + _SLACK:
+                raise AssetError(
+                    f"{path}: {task}.posture: {angle:g} rad of {name!r} is outside of its range in the MJCF, "
+                    f"{low:.4g} to {high:.4g} rad"
+                )
+
+
+def _check_known(path: Path, where: str, table: dict, known: tuple[str, ...]) -> None:
+    """A misspelt entry would count as one that is left out."""
+    for key in table:
+        if key not in known:
+            raise AssetError(f"{path}: {where}unknown entry {key!r:.60}: choose from {', '.join(known)}")
+
+
 def _check_table(path: Path, table: dict) -> None:
     """Entries and their types; names are checked against the model by `load_hand`."""
+    _check_known(path, "", table, _ENTRIES)
     kinds = {
         "model": str,
         "taxel_grid": list,
@@ -191,13 +224,15 @@ def _check_table(path: Path, table: dict) -> None:
             values = given.get(key, [0] * length) if isinstance(given, dict) else None
             if not isinstance(values, list) or len(values) != length or not all(map(_is_number, values)):
                 raise AssetError(f"{path}: {task}.{key} = {values!r:.60}: expected {length} numbers")
+        _check_known(path, f"[{task}]: ", given, ("posture", place))
     if not isinstance(table.get("name", ""), str):
         raise AssetError(f"{path}: name = {table['name']!r:.60}: expected a string")
     grid, speeds = table["taxel_grid"], table["speed_limits"]
     if len(grid) != 2 or any(type(n) is not int or not 1 <= n <= 1000 for n in grid):
         raise AssetError(f"{path}: taxel_grid = {grid!s:.60}: expected two whole numbers above 0, at most 1000")
-    if any(type(v) not in (int, float) or not 0 < v <= 1000 for v in speeds):
-        raise AssetError(f"{path}: speed_limits = {speeds!s:.60}: expected numbers above 0, at most 1000 rad/s")
+    for v in speeds:
+        if type(v) not in (int, float) or not 0 < v <= 1000:
+            raise AssetError(f"{path}: {v!r:.60} in speed_limits: expected numbers above 0, at most 1000 rad/s")
     if any(type(name) is not str for name in table["joints"]) or not table["fingers"]:
         raise AssetError(f"{path}: joints must list names, and there must be a finger")
     for number, finger in enumerate(table["fingers"], start=1):
@@ -210,27 +245,33 @@ def _check_table(path: Path, table: dict) -> None:
         force = finger.get("force_per_torque", 0.0)
         if type(force) not in (int, float) or not 0 <= force <= 1000:
             raise AssetError(f"{path}: finger {number}: force_per_torque = {force!r:.60}: expected 0 to 1000 N/Nm")
+        _check_known(path, f"finger {number}: ", finger, _FINGER_ENTRIES)
 
 
-def _check_finite(model, path: Path) -> None:
-    """MuJoCo only warns of a NaN in the XML."""
+def _check_numbers(model, path: Path) -> None:
+    """MuJoCo only warns of a NaN in the XML, and takes a joint that drives itself."""
     fields = {
         "body": ("pos", "quat", "ipos", "mass", "inertia"),
-        "geom": ("pos", "quat", "size"),
-        "jnt": ("pos", "axis", "range", "actfrcrange"),
+        "geom": ("pos", "quat", "size", "friction", "solref", "solimp", "margin", "gap"),
+        "jnt": ("pos", "axis", "range", "actfrcrange", "stiffness"),
         "site": ("pos", "quat"),
+        "eq": ("data", "solref", "solimp"),
     }
-    for kind, names in fields.items():
-        for name in names:
-            values = getattr(model, f"{kind}_{name}")
-            bad = np.flatnonzero(~np.all(np.isfinite(values.reshape(len(values), -1)), axis=1))
-            if bad.size:
-                element = getattr(model, kind)(int(bad[0])).name
-                raise AssetError(f"{path}: {kind} {element!r}: {name} is not a finite number")
+    found = [(kind, name, getattr(model, f"{kind}_{name}")) for kind, names in fields.items() for name in names]
+    found.append(("jnt", "ref", model.qpos0[model.jnt_qposadr]))
+    resists = ("damping", "armature", "frictionloss")
+    found += [("jnt", name, getattr(model, f"dof_{name}")[model.jnt_dofadr]) for name in resists]
+    for kind, name, values in found:
+        infinite = ~np.isfinite(values)
+        for wrong, what in ((infinite, "not a finite number"), ((values < 0) & (name in resists), "below 0")):
+            if wrong.any():
+                row = int(np.argwhere(wrong)[0, 0])
+                element = getattr(model, "equality" if kind == "eq" else kind)(row).name or f"#{row}"
+                raise AssetError(f"{path}: {kind} {element!r}: {name} is {what}")
 
 
 def _is_number(value: Any) -> bool:
-    return type(value) in (int, float) and bool(np.isfinite(value))
+    return type(value) in (int, float) and abs(value) < 1e6  # NaN is not; some whole numbers of TOML are no floats
 
 
 def _numbers(table: dict, task: str, key: str) -> tuple[float, ...]:

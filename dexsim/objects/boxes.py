@@ -14,6 +14,7 @@ import contextlib
 import dataclasses
 import hashlib
 import io
+import warnings
 from collections.abc import Sequence
 
 import jax
@@ -22,7 +23,7 @@ import mujoco
 import numpy as np
 
 from dexsim.core.assets import cache_path
-from dexsim.core.errors import AssetError
+from dexsim.core.errors import AssetError, DexsimWarning
 from dexsim.core.files import write_whole
 from dexsim.geometry import mesh as meshes
 from dexsim.geometry import rotations, sdf
@@ -32,6 +33,7 @@ _VOXELS = 28  # along the longest side
 _SEEDS = 120  # boxes grown for every one that is kept
 _STEPS = 400  # of the refinement
 _ALIKE = 0.002  # fits whose mean deviations differ by less, as a share of the mesh's size, are as good
+_MANY = 30_000  # triangles that take long to fit
 _WORST = (0.025, 0.1)  # largest deviation, mean and 99th percentile, as a share of the mesh's size
 
 
@@ -73,6 +75,13 @@ def fit_boxes(mesh: meshes.Mesh, parts: int, *, frames: Sequence[np.ndarray] = (
     path = cache_path("boxes") / f"{key}.npz"
     boxes = _load(path) if cache else None
     if boxes is None:
+        if len(mesh.faces) > _MANY:
+            warnings.warn(
+                f"{mesh.name}: {len(mesh.faces)} triangles, so that the first fit of boxes takes a minute or more; a "
+                "mesh simplified to some thousands gives nearly the same boxes",
+                DexsimWarning,
+                stacklevel=2,
+            )
         boxes = _fit(mesh, parts, frames)
         if cache:
             buffer = io.BytesIO()

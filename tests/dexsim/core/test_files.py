@@ -11,7 +11,7 @@ from paths import ROOT
 
 from dexsim.core import cli
 from dexsim.core.errors import DexsimWarning
-from dexsim.core.files import make_private, write_whole
+from dexsim.core.files import make_private, read_toml, write_whole
 
 # Writes half of a file, says so, and waits to be killed.
 HALF = """
@@ -54,6 +54,11 @@ def test_what_a_kill_during_a_write_leaves_is_removed_by_the_next_write(tmp_path
     finally:
         writing.kill()
         writing.wait()
+
+
+def test_a_toml_may_begin_with_a_byte_order_mark(tmp_path):
+    (tmp_path / "hand.toml").write_bytes(b"\xef\xbb\xbfname = 'from a spreadsheet'\r\n")
+    assert read_toml(tmp_path / "hand.toml") == {"name": "from a spreadsheet"}
 
 
 def test_only_temporaries_are_removed(tmp_path):

@@ -161,6 +161,9 @@ def test_errors_after_parsing_name_options_too():
     with pytest.raises(cli.UsageError, match=r"^--seat.span has no room; see --colour$"):
         with cli.naming_options(Chair, parse(*GIVEN)):
             raise cli.ConfigError("Spring.span has no room; see Chair.colour")
+    with pytest.raises(cli.AssetError, match=r"^cube.stl: too large \(--seat.span\)$"):
+        with cli.naming_options(Chair, parse(*GIVEN)):
+            raise cli.AssetError("cube.stl: too large (Spring.span)")
 
 
 # --- help ----------------------------------------------------------------------------------------------

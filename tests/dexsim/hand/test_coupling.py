@@ -201,6 +201,7 @@ COUPLE_A = '<joint name="couple_a" joint1="a_next" joint2="a" polycoef="0.05 1.3
 COUPLE_B = '<joint name="couple_b" joint1="b_next" joint2="b" polycoef="-0.1 0.7 0 0 0"/>'
 REFUSED = {
     "not linear": (COUPLE_A, COUPLE_A.replace("1.3 0 ", "1.3 0.2 "), "couple_a.*polycoef"),
+    "not a number": (COUPLE_A, COUPLE_A.replace("0.05", "nan"), "couple_a.*not a finite number"),
     "no ratio": (COUPLE_A, COUPLE_A.replace("1.3", "0"), "couple_a.*polycoef"),
     "one joint": (COUPLE_A, COUPLE_A.replace('joint2="a" ', ""), "couple_a.*two joints"),
     "switched off": (COUPLE_A, COUPLE_A.replace("/>", ' active="false"/>'), "couple_a.*active"),
@@ -219,7 +220,8 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_refused_in_one_line(tmp_path, case):
+def test_refused_in_one_line(tmp_path, monkeypatch, case):
+    monkeypatch.chdir(tmp_path)  # MuJoCo logs its warnings in the working directory
     old, new, words = REFUSED[case]
     assert MJCF.count(old) == 1
     with pytest.raises(AssetError, match=words) as error:

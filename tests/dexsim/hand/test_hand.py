@@ -101,6 +101,7 @@ def test_finger_and_joint_tables(hand):
 
 
 def test_flexion_joints_run_from_root_to_tip(hand):
+    assert flexion_joints(hand, range(1, 1)).dtype == int  # of a hand of one finger: none, to index with
     assert flexion_joints(hand, range(1, 5)).tolist() == [4, 5, 6, 7, 8, 9, 10, 11]
     assert flexion_joints(hand, range(0, 1)).tolist() == [1, 2]
 
@@ -434,6 +435,27 @@ BAD_MODELS = [
         table=PINCH_TOML.replace('"left_b"]', '"left_b", "lever"]').replace("3, 4]\n[[", "3, 4, 5]\n[["),
     ),
 ]
+BAD_MODELS += [
+    bad("no hand", "pinch.toml", "no joint 'left_a'", mjcf="<mujoco/>"),
+    *(
+        bad(f"{name} {value}", "pinch.xml", ("left_b", name, said), mjcf=mjcf('"left_b"', f'"left_b" {name}="{value}"'))
+        for name in ("damping", "armature", "frictionloss")
+        for value, said in (("nan", "not a finite number"), ("-1", "below 0"))
+    ),
+    bad("not a number in a reference", "pinch.xml", ("right_b", "ref"), mjcf=mjcf('ref="15"', 'ref="nan"')),
+    bad("name of the object", "pinch.xml", "body 'object'", mjcf=mjcf('body name="stand"', 'body name="object"')),
+    bad("name of its part", "pinch.xml", "geom 'object_1'", mjcf=mjcf('geom name="stand"', 'geom name="object_1"')),
+    bad("name of its joint", "pinch.xml", "joint 'object'", mjcf=PINCH_MJCF.replace('"left_b"', '"object"'),
+        table=PINCH_TOML.replace('"left_b"', '"object"')),
+]  # fmt: skip
+GRASP = "[grasp]\nposture = [0.1, 0.2, 0.3, 0.4]\ncentre = [0.1, 0, 0.1]\n"
+
+
+def grasp(old, new):
+    assert old in GRASP
+    return table("[[fingers]]", GRASP.replace(old, new) + "[[fingers]]")
+
+
 BAD_TABLES = [
     bad("missing", "pinch.toml", "no such file", table=None),
     bad("no TOML", "pinch.toml", "Invalid", table="name = 'x'\nmodel = ["),
@@ -468,6 +490,30 @@ BAD_TABLES = [
     bad("speed of zero", "pinch.toml", "speed_limits", table=table("[1, 2, 3, 4]", "[1, 0, 3, 4]")),
     bad("speed not a number", "pinch.toml", "speed_limits", table=table("[1, 2, 3, 4]", "[1, nan, 3, 4]")),
     bad("speed a word", "pinch.toml", "speed_limits", table=table("[1, 2, 3, 4]", '[1, "fast", 3, 4]')),
+    bad("the speed that is wrong", "pinch.toml", "-4 in speed_limits", table=table("[1, 2, 3, 4]", "[1, 2, 3, -4]")),
+    bad("misspelt entry", "pinch.toml", ("'taxel_pich'", "taxel_pitch"), table="taxel_pich = 1\n" + PINCH_TOML),
+    bad(
+        "misspelt entry of a finger",
+        "pinch.toml",
+        ("finger 2", "'force_per_torqe'"),
+        table=f"{PINCH_TOML}force_per_torqe = 3",
+    ),
+    bad("misspelt table", "pinch.toml", "'grsp'", table=grasp("[grasp]", "[grsp]")),
+    bad("misspelt entry of a table", "pinch.toml", ("[grasp]", "'center'"), table=grasp("centre", "center")),
+    bad(
+        "posture in degrees",
+        "pinch.toml",
+        ("grasp.posture", "17", "'right_b'", "-0.1745 to 1.396"),
+        table=grasp("0.3", "17"),
+    ),
+    bad(
+        "posture for ranges in degrees",
+        "pinch.toml",
+        "grasp.posture",
+        mjcf=mjcf('"degree"', '"degree" autolimits="true"').replace('range="-60 60"', 'range="-.06 .06"'),
+        table=grasp("0.3", "0.3"),
+    ),
+    bad("posture too large for a float", "pinch.toml", "grasp.posture", table=grasp("0.3", "9" * 400)),
     bad("grid of one", "pinch.toml", "taxel_grid", table=table("[3, 4]", "[12]")),
     bad("grid a word", "pinch.toml", "taxel_grid", table=table("[3, 4]", '"3x4"')),
     bad("grid negative", "pinch.toml", "taxel_grid", table=table("[3, 4]", "[-3, 4]")),
@@ -491,8 +537,26 @@ BAD_LAYOUTS = [
     bad("short line", "pinch.csv:25", "ten values", layout=PINCH_CSV[:-7]),
     bad("long line", "pinch.csv:25", "ten values", layout=PINCH_CSV[:-1] + ",7\n"),
     bad("normal of length zero", "pinch.csv:2", "normal", layout=layout("0,0,1,2e-06", "0,0,0,2e-06")),
+    bad("area in square millimetres", "pinch.csv:2", ("area", "m^2"), layout=PINCH_CSV.replace("2e-06", "2")),
+    bad("area of nothing", "pinch.csv:2", "area", layout=layout("0,0,1,2e-06", "0,0,1,2e-60")),
+    bad("too large for a float", "pinch.csv:3", "finite", layout=layout("right,1,0,0.001", "right,1,0,1e39")),
+    bad("blank lines before", "pinch.csv:5", "numbers", layout=layout("right,1,0,0.001", "\n\nright,1,0,here")),
+    bad("open quote", "pinch.csv:25", "no finger 'right,0,0", layout=layout("right,0,0", '"right,0,0')),
+    bad("only a first line", "pinch.csv", "0 taxels", layout=ROWS[0]),
+    bad("no path", "", "null byte", table=table("pinch.csv", "\\u0000")),
     bad("negative area", "pinch.csv:2", "area", layout=layout("0,0,1,2e-06", "0,0,1,-2e-06")),
 ]
+
+
+def test_of_a_giant_layout_no_more_is_read_than_the_grid_asks_for(tmp_path):
+    with pytest.raises(AssetError, match="25 taxels or more, expected 24"):
+        load_hand(write_pinch(tmp_path, layout=PINCH_CSV + ROWS[1] * 300_000))
+
+
+def test_a_layout_from_a_spreadsheet_loads(tmp_path):
+    """With a byte order mark and Windows' line ends."""
+    hand = load_hand(write_pinch(tmp_path, layout="\ufeff" + PINCH_CSV.replace("\n", "\r\n")))
+    assert hand.taxel_position.shape == (2, 12, 3)
 
 
 def check_refused(folder, monkeypatch, case):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import shutil
+from pathlib import Path
 
 import pytest
 
@@ -37,6 +38,32 @@ def test_default_hand_has_no_record(hand):
 def test_unknown_name_is_one_line():
     with pytest.raises(AssetError, match="hand 'nohand': no such file, and no shipped hand has that name"):
         load_hand("nohand")
+
+
+def test_a_folder_does_not_hide_a_shipped_hand(own, tmp_path):
+    for name in ("xhand_right", "leap_like"):
+        (tmp_path / name).mkdir()
+    assert load_hand().source == "xhand_right" and load_hand("leap_like").source == "leap_like"
+    with pytest.raises(AssetError, match="hand 'own': a folder, and no shipped hand has that name"):
+        load_hand("own")
+
+
+@pytest.mark.parametrize("quote", ['"', "'"])
+def test_the_hash_has_what_the_included_files_include(own, quote):
+    """MuJoCo finds those beside the model, or beside the file that includes them."""
+    own = Path(own).resolve()  # MuJoCo misses the file of a file where the model's path is relative
+    folder = own.parent
+    (folder / "parts").mkdir()
+    model = (folder / "xhand_right.xml").read_text()
+    begin = model.index("<mujoco")
+    end = model.index(">", begin) + 1
+    (folder / "xhand_right.xml").write_text(f"{model[:end]}<include file={quote}parts/a.xml{quote}/>{model[end:]}")
+    for place in (folder / "parts/b.xml", folder / "b.xml"):
+        (folder / "parts/a.xml").write_text(f"<mujoco><include file={quote}b.xml{quote}/></mujoco>")
+        place.write_text("<mujoco><custom><numeric name='x' data='1'/></custom></mujoco>")
+        before = load_hand(own).digest
+        place.write_text("<mujoco><custom><numeric name='x' data='2'/></custom></mujoco>")
+        assert load_hand(own).digest != before
 
 
 def test_policy_carries_its_hand(own, tmp_path):

@@ -155,6 +155,15 @@ def test_broken_layout_files(tmp_path):
     path.write_text("finger,column\nthumb,0\n")
     with pytest.raises(AssetError, match="not a taxel layout"):
         layout.read_layout(path)
+    path.write_text(f"{','.join(layout.COLUMNS)}\nthumb,1000000,100000,0,0,0,1,0,0,1e-6\n")
+    with pytest.raises(AssetError, match="not a taxel layout .1000001 x 100001 taxels"):
+        layout.read_layout(path)
+    path.write_text(f"{','.join(layout.COLUMNS)}\n" + 200_000 * "a")
+    with pytest.raises(AssetError, match="not a taxel layout .field larger"):
+        layout.read_layout(path)
+    path.write_text(f"{','.join(layout.COLUMNS)}\n")
+    with pytest.raises(AssetError, match="not a taxel layout .no taxels"):
+        layout.read_layout(path)
     with pytest.raises(ConfigError, match="one grid"):
         layout.write_layout(
             path,

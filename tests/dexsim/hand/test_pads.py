@@ -35,6 +35,8 @@ def test_taxels_are_on_the_pads_and_face_as_told():
 REFUSED = {
     "no pitch": ("taxel_pitch = [0.0035, 0.0035]\n", "", "taxel_pitch = None"),
     "pitch below 0": ("[0.0035, 0.0035]", "[0.0035, -1]", "taxel_pitch"),
+    "pitch too large for a float": ("[0.0035, 0.0035]", f"[0.0035, {'9' * 400}]", "taxel_pitch"),
+    "direction too large for a float": ("facing = [0, 0, 1]", f"facing = [0, 0, {'9' * 400}]", "facing"),
     "no such pad": ('pad = "index_pad"', 'pad = "palm"', "finger 'index': pad = 'palm'"),
     "no direction": ("facing = [0, 0, 1]", "facing = 3", "finger 'thumb': facing = 3"),
     "along the pad": ("facing = [0, 0, 1]", "facing = [0, 1, 0]", "runs along the pad 'thumb_pad'"),

@@ -1,6 +1,7 @@
 """Meshes as objects: the boxes that follow them, mass properties, errors, and environments with them."""
 
 import dataclasses
+import warnings
 
 import jax
 import jax.numpy as jnp
@@ -11,8 +12,9 @@ from simple_physics import SimplePhysics
 
 import dexsim
 from dexsim.core.compilation import jit
-from dexsim.core.errors import AssetError, ConfigError
+from dexsim.core.errors import AssetError, ConfigError, DexsimWarning
 from dexsim.geometry import distance, mesh, rotations, sdf
+from dexsim.objects import boxes
 from dexsim.objects.boxes import fit_boxes
 from dexsim.objects.config import KINDS, ObjectConfig
 from dexsim.objects.mesh import from_mesh, load
@@ -100,6 +102,20 @@ class TestBoxes:
         np.testing.assert_allclose(mesh_object.boxes.size, [sides / 2], rtol=1e-3)
 
 
+def test_a_scan_of_many_triangles_is_said_to_take_long(monkeypatch):
+    found = boxes.Boxes(np.full((1, 3), 0.03), np.zeros((1, 3)), np.array([[1.0, 0, 0, 0]]), (0.0, 0.0))
+    monkeypatch.setattr(boxes, "_fit", lambda *_: found)
+    cube = trimesh.creation.box((0.06, 0.06, 0.06))
+    for _ in range(5):
+        cube = cube.subdivide()
+    few, many = (mesh.load_mesh((solid.vertices, solid.faces)) for solid in (cube, cube.subdivide()))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        fit_boxes(few, 1, cache=False)
+    with pytest.warns(DexsimWarning, match="49152 triangles, so that the first fit"):
+        fit_boxes(many, 1, cache=False)
+
+
 class TestErrors:
     """One clear line each."""
 
@@ -109,7 +125,7 @@ class TestErrors:
             ("none.stl", 6, "none.stl: no such file"),
             ("open.stl", 6, "the surface is open, 3 edges belong to one triangle only"),
             ("ring.stl", 1, "1 boxes do not follow its surface, .* mm at worst, of 120 mm; allow more"),
-            ("large.stl", 6, "pass scale=0.001 for a file in millimetres"),
+            ("large.stl", 6, r"at scale 1, .* pass scale=0.001 for a file in millimetres .ObjectConfig.mesh_unit"),
             ("hollow.stl", 6, "a mesh of 60 mm has no inside at a resolution of .* its walls are too thin for boxes"),
         ],
     )
