@@ -217,13 +217,13 @@ class EvaluateArguments:
 
     policy: Annotated[str, tyro.conf.Positional]
     """A policy file, or the name of a shipped policy, such as grasp."""
-    episodes: int = setting(0, unit="1", low=0)
+    episodes: int = setting(0, unit="1", low=0, high=1_000_000)
     """Evaluation episodes, rounded up to whole chunks. 0: 1024 on a GPU; on a CPU 448 of grasp, 64 of rotate."""
     seed: int = setting(0, unit="1", low=0, high=2**32 - 2)
     """Seed of the episodes and their start states. Training selects its best policy by episodes of another."""
     backend: Literal["auto", "jax", "warp", "c"] = setting("auto")
     """Physics backend. auto: c on a CPU, warp on an NVIDIA GPU if it is installed, otherwise jax."""
-    chunk: int = setting(0, unit="1", low=0)
+    chunk: int = setting(0, unit="1", low=0, high=65536)
     """Episodes simulated side by side; 0 chooses by the device."""
     seconds: float = setting(0.0, unit="s", low=0.0)
     """Length of an evaluation episode; 0 for the task's own."""
@@ -257,6 +257,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         prog="python -m dexsim_ppo.evaluate",
         description="Measure a policy over fixed, seeded episodes.",
     )
+    video = arguments.video
+    if video and video.suffix not in (".mp4", ".gif"):
+        raise ConfigError(f"--video {video}: give a file that ends in .mp4 or .gif")
+    for name, path in (("--output", arguments.output), ("--video", video)):
+        if path and path.exists() and Path(arguments.policy).exists() and path.samefile(arguments.policy):
+            raise ConfigError(f"{name} {path}: is the policy itself; name another file")
     cli.enable_caches()
     for path in (arguments.output, arguments.video):
         if path:

@@ -24,12 +24,13 @@ from dexsim.core.config import to_dict
 from dexsim.core.errors import CheckpointError, ConfigError
 from dexsim.core.files import write_whole
 from dexsim.core.install import install_line
+from dexsim.hand.source import check_record
 from dexsim.task_spec import TaskSpec
 from dexsim_ppo.learner.memory import GRU, state_size
 from dexsim_ppo.learner.types import Field
 from dexsim_ppo.policy import NEEDS_MEMORY, Policy, layout_to_list, load_policy
 from dexsim_ppo.policy_file import memory_to_list
-from dexsim_ppo.portable import FORMAT, UNIT, PortablePolicy
+from dexsim_ppo.portable import FORMAT, UNIT, PortablePolicy, check_header
 from dexsim_ppo.retired import read_spec
 
 _OPSET = 17
@@ -195,7 +196,10 @@ def load_exported(path: str | Path) -> ExportedPolicy:
     path = Path(path)
     header, function = _read_onnx(path) if path.suffix == ".onnx" else _read_numpy(path)
     try:
-        return ExportedPolicy(
+        check_header(header)
+        if header.get("hand") is not None:
+            check_record(header["hand"])
+        policy = ExportedPolicy(
             task=str(header["task"]),
             observation_layout=tuple(Field(*field) for field in header["observation_layout"]),
             control_rate=float(header["control_rate"]),
@@ -205,8 +209,22 @@ def load_exported(path: str | Path) -> ExportedPolicy:
             memory=_memory_size(header),
             hand=header.get("hand"),
         )
-    except (KeyError, TypeError, ValueError, ConfigError) as error:
+        _try(policy)
+    except Exception as error:  # onnxruntime's own error types differ by version
         raise CheckpointError(f"{path}: is not a sound policy ({' '.join(str(error).split()):.200})") from None
+    return policy
+
+
+def _try(policy: ExportedPolicy) -> None:
+    """Raises what a tick raises; ValueError: it gives what is no action, or another memory than it takes.
+
+    A network of ONNX may be any: what it takes and gives is not said by the header.
+    """
+    memory = policy.begin()
+    after, action = policy.act(memory, np.zeros(sum(field.size for field in policy.observation_layout), np.float32))
+    kept = getattr(after, "shape", None) == getattr(memory, "shape", None)
+    if action.ndim != 1 or not np.isfinite(action).all() or not kept:
+        raise ValueError("it gives actions that are not finite, or another memory than it takes")
 
 
 def _memory_size(header: dict[str, Any]) -> int:
@@ -218,7 +236,9 @@ def _read_numpy(path: Path) -> tuple[dict[str, Any], Callable]:
     try:
         policy = PortablePolicy.load(path)
     except (OSError, ValueError) as error:
-        raise CheckpointError(f"{path}: {getattr(error, 'strerror', None) or error}") from None
+        # Other errors than of the system name the file themselves.
+        where = f"{path}: {error.strerror or error}" if isinstance(error, OSError) else str(error)
+        raise CheckpointError(where) from None
     return policy.header, policy.act
 
 
@@ -230,8 +250,11 @@ def _read_onnx(path: Path) -> tuple[dict[str, Any], Callable]:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1  # waking threads costs more than this small network
     try:
-        session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+        # From memory, so that it takes no weights from other files.
+        session = onnxruntime.InferenceSession(path.read_bytes(), options, providers=["CPUExecutionProvider"])
         header = json.loads(session.get_modelmeta().custom_metadata_map[_KEY])
+    except OSError as error:
+        raise CheckpointError(f"{path}: {error.strerror or error}") from None
     except Exception as error:  # onnxruntime's own error types differ by version
         raise CheckpointError(f"{path}: is not an exported policy ({' '.join(str(error).split()):.200})") from None
 
@@ -268,6 +291,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     writers = {".npz": to_numpy, ".onnx": to_onnx}
     if arguments.output.suffix not in writers:
         raise ConfigError(f"--output {arguments.output}: give a file that ends in {' or '.join(writers)}")
+    cli.check_writable(arguments.output)
     policy = load_policy(arguments.policy)
     writers[arguments.output.suffix](policy, arguments.output)
     sizes = ", ".join(f"{field.name} {field.size}" for field in policy.observation_layout)

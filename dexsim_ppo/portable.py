@@ -15,7 +15,6 @@ candidate.
 """
 
 import json
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +22,39 @@ import numpy as np
 
 FORMAT = "dexsim policy 1"
 UNIT = ("input_kernel", "input_bias", "recurrent_kernel", "recurrent_bias")
+
+
+def check_header(header: Any) -> None:
+    """Raises ValueError: it lacks something, or has it of another type or beyond what a policy of a hand can have."""
+    if not isinstance(header, dict) or header.get("format") != FORMAT:
+        raise ValueError(f"its header is not of the format {FORMAT}")
+    numbers: dict[str, Any] = {name: header.get(name) for name in ("control_rate", "clip")}
+    limits = {"control_rate": (1.0, 1000.0), "clip": (0.1, 1e4), "size of the memory": (1, 4096)}
+    layout, memory = header.get("observation_layout"), header.get("memory")
+    if not isinstance(layout, list) or not all(
+        isinstance(field, list)
+        and [type(part) for part in field[:2]] == [str, int]
+        and len(field) == 3
+        and field[1] > 0
+        and (field[2] is None or type(field[2]) in (int, float))
+        for field in layout
+    ):
+        raise ValueError(f"observation_layout = {str(layout):.100}")
+    if memory is not None:
+        if not isinstance(memory, list) or len(memory) != 2 or type(memory[1]) is not int:
+            raise ValueError(f"memory = {str(memory):.100}")
+        numbers["size of the memory"] = memory[1]
+    for name, value in numbers.items():
+        low, high = limits[name]
+        if type(value) not in (int, float) or not low <= value <= high:
+            raise ValueError(f"{name} = {str(value):.50}: must be a number between {low:g} and {high:g}")
+    if not isinstance(header.get("task"), str) or header.get("squash") not in ("gaussian", "tanh"):
+        raise ValueError(f"task = {str(header.get('task')):.50}, squash = {str(header.get('squash')):.50}")
+
+
+def _bound(inputs: np.ndarray, kernel: np.ndarray, bias: np.ndarray) -> np.ndarray:
+    """Largest size of a layer's sums for inputs of at most this size."""
+    return inputs @ np.abs(kernel.astype(float)) + np.abs(bias.astype(float))
 
 
 class PortablePolicy:
@@ -35,7 +67,7 @@ class PortablePolicy:
       unit: kernel and bias of a gated recurrent unit's input, and of its state.
 
     Raises:
-      ValueError: shapes that do not fit, or numbers that are not finite.
+      ValueError: a header that makes no sense, shapes that do not fit, or numbers with which actions are not finite.
     """
 
     def __init__(
@@ -46,6 +78,7 @@ class PortablePolicy:
         layers: list[tuple[np.ndarray, np.ndarray]],
         unit: tuple[np.ndarray, ...] = (),
     ):
+        check_header(header)
         kind, size = header.get("memory") or (None, 0)
         self._kept = len(mean) * size if kind == "history" else size
         sizes = [len(mean) + self._kept, *(len(bias) for _, bias in layers)]
@@ -57,8 +90,12 @@ class PortablePolicy:
             raise ValueError(f"a memory {kind!r} of shapes {[x.shape for x in unit]}")
         if len(mean) != sum(size for _, size, _ in header["observation_layout"]):
             raise ValueError(f"{len(mean)} observations, and a layout of other size")
-        if not all(np.isfinite(x).all() for x in (mean, std, *unit, *(x for layer in layers for x in layer))):
-            raise ValueError("numbers that are not finite")
+        arrays = (mean, std, *unit, *(x for layer in layers for x in layer))
+        if not all(x.dtype == np.float32 and np.isfinite(x).all() for x in arrays):
+            raise ValueError("numbers that are not finite float32")
+        if not (std >= 1e-12).all():
+            raise ValueError("deviations of the observation that are not positive")
+        self._check_bounds(header["clip"], kind, size, layers, unit)
         self.task: str = header["task"]
         self.control_rate: float = header["control_rate"]
         """Actions per second, Hz."""
@@ -76,6 +113,9 @@ class PortablePolicy:
           OSError: it cannot be read.
         """
         try:
+            with open(path, "rb") as file:  # NumPy takes whatever is no archive for a pickle.
+                if file.read(4) != b"PK\3\4":
+                    raise ValueError("it is no archive of NumPy")
             with np.load(path, allow_pickle=False) as file:
                 header = json.loads(str(file["header"]))
                 if header.get("format") != FORMAT:
@@ -83,8 +123,10 @@ class PortablePolicy:
                 layers = [(file[f"kernel_{i}"], file[f"bias_{i}"]) for i in range(header["layers"])]
                 unit = tuple(file[name] for name in UNIT if name in file)
                 return cls(header, file["mean"], file["std"], layers, unit)
-        except (KeyError, TypeError, ValueError, AttributeError, zipfile.BadZipFile) as error:
-            raise ValueError(f"{path}: is not a policy of this format ({error})") from None
+        except OSError:
+            raise
+        except Exception as error:  # An archive may be damaged in more ways than NumPy and zipfile have types for.
+            raise ValueError(f"{path}: is not a policy of this format ({' '.join(str(error).split()):.200})") from None
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
         """Action [..., A] in [-1, 1] for an actor observation [..., n] in SI units.
@@ -115,6 +157,19 @@ class PortablePolicy:
             if i < len(self._layers) - 1:
                 x = np.where(x > 0, x, np.expm1(np.minimum(x, 0.0)))  # ELU
         return memory, np.tanh(x) if self.header["squash"] == "tanh" else np.clip(x, -1.0, 1.0)
+
+    @staticmethod
+    def _check_bounds(clip: float, kind: str | None, size: int, layers: list, unit: tuple) -> None:
+        """Raises ValueError: some observation would give an action that is not finite."""
+        seen = np.full(len(unit[0]) if unit else len(layers[0][0]), float(clip))
+        parts = [(seen, *unit[:2]), (np.ones(size), *unit[2:])] if unit else []
+        largest = np.append(seen, np.ones(size)) if unit else seen
+        for kernel, bias in layers:
+            parts.append((largest, kernel, bias))
+            # The activation does not go beyond its input or 1.
+            largest = np.maximum(_bound(largest, kernel, bias), 1.0)
+        if max(_bound(*part).max(initial=0.0) for part in parts) > 1e30:
+            raise ValueError("weights so large that actions overflow")
 
     def _recur(self, state: np.ndarray, x: np.ndarray) -> np.ndarray:
         """State of the gated recurrent unit after the normalised observation `x`."""

@@ -21,9 +21,10 @@ import tyro
 from dexsim.core import cli
 from dexsim.core.config import setting, validate
 from dexsim.core.errors import ConfigError
-from dexsim.datasets.lerobot import write_lerobot
-from dexsim.datasets.rerun import show_rerun
+from dexsim.datasets.lerobot import check_lerobot, write_lerobot
+from dexsim.datasets.rerun import check_rerun, show_rerun
 from dexsim.datasets.trajectory import READINGS, Trajectory, from_readings
+from dexsim.registry import find_task
 from dexsim_ppo.policy import Policy, act_from, load_policy
 
 
@@ -87,8 +88,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     if arguments.lerobot is None and arguments.rrd is None:
         raise ConfigError("give --lerobot FOLDER or --rrd FILE")
+    # First what could be wrong after minutes of simulation.
+    if arguments.lerobot:
+        check_lerobot(arguments.lerobot)
+    if arguments.rrd:
+        check_rerun()
+        cli.check_writable(arguments.rrd)
     cli.enable_caches()
     policy = load_policy(arguments.policy, task=arguments.task or None)
+    if find_task(policy.task).environment:
+        raise ConfigError(f"{arguments.policy}: {policy.task!r} is no task on a hand: there is nothing to record")
     env = policy.make_env(num_envs=arguments.episodes)
     found = record(policy, env, episodes=arguments.episodes, seconds=arguments.seconds, seed=arguments.seed)
     if arguments.lerobot:

@@ -7,6 +7,7 @@ that frame, is in `meta/tactile.json`, which is our own addition.
 """
 
 import json
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,23 @@ _FILE = "chunk-000/file-000.parquet"
 _QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 
 
+def check_lerobot(folder: Path) -> None:
+    """Whether a dataset can be written into `folder`.
+
+    Raises:
+      DexsimError: pyarrow or pandas is not installed, or the folder exists.
+      OSError: its parent is no folder, or cannot be made.
+    """
+    try:
+        import pandas  # noqa: F401
+        import pyarrow.parquet  # noqa: F401
+    except ImportError:
+        raise DexsimError(f"the LeRobot format needs pyarrow and pandas: {install_line('lerobot')}") from None
+    if folder.exists() or folder.is_symlink():
+        raise DexsimError(f"{folder}: exists already; name another folder")
+    folder.parent.mkdir(parents=True, exist_ok=True)
+
+
 def write_lerobot(folder: Path, hand: Hand, task: str, trajectories: Sequence[Trajectory]) -> Path:
     """Write a dataset, one episode for each trajectory; returns its folder.
 
@@ -37,14 +55,7 @@ def write_lerobot(folder: Path, hand: Hand, task: str, trajectories: Sequence[Tr
     Raises:
       DexsimError: pyarrow is not installed, the folder exists, or there is no trajectory.
     """
-    try:
-        import pandas
-        import pyarrow
-        import pyarrow.parquet as parquet
-    except ImportError:
-        raise DexsimError(f"the LeRobot format needs pyarrow and pandas: {install_line('lerobot')}") from None
-    if folder.exists():
-        raise DexsimError(f"{folder}: exists already; name another folder")
+    check_lerobot(folder)
     if not trajectories:
         raise DexsimError(f"{folder}: no trajectory to write")
     columns: dict[str, list[np.ndarray]] = {}
@@ -62,6 +73,20 @@ def write_lerobot(folder: Path, hand: Hand, task: str, trajectories: Sequence[Tr
         episodes.append(_episode(number, begin, length, task, frames))
         begin += length
     whole = {name: np.concatenate(parts) for name, parts in columns.items()}
+    folder.mkdir()
+    try:
+        _write(folder, hand, task, whole, episodes)
+    except BaseException:  # A part of a dataset would look like one, and be in the way of the next attempt.
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
+    return folder
+
+
+def _write(folder: Path, hand: Hand, task: str, whole: dict[str, np.ndarray], episodes: list[dict[str, Any]]) -> None:
+    import pandas
+    import pyarrow
+    import pyarrow.parquet as parquet
+
     for part in ("data/chunk-000", "meta/episodes/chunk-000"):
         (folder / part).mkdir(parents=True)
     parquet.write_table(
@@ -70,12 +95,11 @@ def write_lerobot(folder: Path, hand: Hand, task: str, trajectories: Sequence[Tr
     parquet.write_table(pyarrow.Table.from_pylist(episodes), folder / "meta" / "episodes" / _FILE)
     pandas.DataFrame({"task_index": [0]}, index=[task]).to_parquet(folder / "meta" / "tasks.parquet")
     for name, content in {
-        "info": _info(hand, whole, len(trajectories)),
+        "info": _info(hand, whole, len(episodes)),
         "stats": {name: _statistics(values) for name, values in whole.items()},
         "tactile": _tactile(hand),
     }.items():
         (folder / "meta" / f"{name}.json").write_text(json.dumps(content, indent=1) + "\n")
-    return folder
 
 
 def features_of(hand: Hand, trajectory: Trajectory) -> dict[str, np.ndarray]:

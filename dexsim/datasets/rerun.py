@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -12,6 +13,19 @@ from dexsim.render.panel import taxel_image
 
 Series = Mapping[str, tuple[Sequence[str], np.ndarray]]
 """Values [T, n] and the names of their columns, by entity."""
+
+
+def check_rerun() -> Any:
+    """The module `rerun`.
+
+    Raises:
+      DexsimError: it is not installed.
+    """
+    try:
+        import rerun
+    except ImportError:
+        raise DexsimError(f"the rerun viewer is not installed: {install_line('rerun')}") from None
+    return rerun
 
 
 def show_rerun(hand: Hand, time: np.ndarray, series: Series, taxel_force: np.ndarray, path: Path | None = None) -> None:
@@ -28,10 +42,7 @@ def show_rerun(hand: Hand, time: np.ndarray, series: Series, taxel_force: np.nda
       DexsimError: rerun is not installed.
       OSError: the file cannot be written.
     """
-    try:
-        import rerun
-    except ImportError:
-        raise DexsimError(f"the rerun viewer is not installed: {install_line('rerun')}") from None
+    rerun = check_rerun()
     recording = rerun.RecordingStream("dexsim")
     if path is None:
         recording.spawn()

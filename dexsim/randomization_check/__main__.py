@@ -18,6 +18,7 @@ import jax
 from dexsim.core import cli
 from dexsim.core.compilation import collector_paused
 from dexsim.core.config import setting, validate
+from dexsim.core.errors import ConfigError
 from dexsim.randomization_check.effects import Effect, check
 
 
@@ -73,7 +74,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         prog="python -m dexsim.randomization_check",
         description="Show that every range of the randomisation has an effect.",
     )
-    config = dataclasses.replace(find_task(arguments.task).config(), pool_size=80)
+    entry = find_task(arguments.task)
+    if entry.environment:
+        raise ConfigError(f"--task {arguments.task}: is no task on a hand: it has no randomisation to check")
+    config = dataclasses.replace(entry.config(), pool_size=80)
     env = make(arguments.task, config, backend=arguments.backend, num_envs=arguments.num_envs)
     keys = jax.random.split(jax.random.key(arguments.seed), arguments.num_envs)
     with collector_paused():

@@ -6,6 +6,8 @@ installed), `draw_taxels` is the matplotlib figure for notebooks. Pillow and mat
 
 import contextlib
 import dataclasses
+import io
+import tempfile
 import warnings
 from collections.abc import Callable, Iterator
 from functools import lru_cache
@@ -15,6 +17,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from dexsim.core.files import write_whole
 from dexsim.core.pytree import Array
 from dexsim.hand.kinematics import Hand, forward_kinematics, taxel_normals, taxel_positions
 from dexsim.hand.load import load_hand
@@ -71,9 +74,14 @@ def render_episode(
 ) -> Path:
     """Write snapshots stacked along T, `fps` of them a second, as a video as long as they last; return its path.
 
-    MP4 where imageio-ffmpeg (extra `video`) can be imported, else GIF with the suffix changed. `rate` is the video's
+    MP4 where imageio-ffmpeg (extra `video`) can be imported, else GIF with the suffix changed; a path that ends in .gif
+    is always a GIF. The file appears whole or not at all. `rate` is the video's
     own number of frames a second, each the nearest snapshot; None shows every snapshot. The camera is the preset named
     like the task.
+
+    Raises:
+      ValueError: no snapshots, or see `render_frame`.
+      OSError: the file cannot be written.
     """
     snapshots = _finite(snapshots)
     total = len(snapshots.joint_position)
@@ -185,7 +193,8 @@ def _finite(snapshot: Snapshot) -> Snapshot:
 
 
 def _write_video(frame: Callable[[int], np.ndarray], count: int, path: Path, fps: float, size: tuple[int, int]) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.suffix == ".gif":
+        return _write_gif(frame, count, path, fps)
     try:
         import imageio_ffmpeg
 
@@ -194,17 +203,25 @@ def _write_video(frame: Callable[[int], np.ndarray], count: int, path: Path, fps
     except (ImportError, RuntimeError):  # the wheel of some platforms comes without the program
         return _write_gif(frame, count, path.with_suffix(".gif"), fps)
     path = path.with_suffix(".mp4")
-    writer = imageio_ffmpeg.write_frames(
-        str(path), size, fps=fps, codec="libx264", pix_fmt_out="yuv420p", macro_block_size=2,
-        output_params=["-crf", "20", "-preset", "veryfast", "-movflags", "+faststart"], ffmpeg_log_level="error",
-    )  # fmt: skip
-    with _forks_quietly():
-        writer.send(None)
-    try:
-        for t in range(count):
-            writer.send(np.ascontiguousarray(frame(t)))
-    finally:
-        writer.close()
+    with tempfile.TemporaryDirectory() as folder:
+        film = Path(folder) / "film.mp4"
+        writer = imageio_ffmpeg.write_frames(
+            str(film), size, fps=fps, codec="libx264", pix_fmt_out="yuv420p", macro_block_size=2,
+            output_params=["-crf", "20", "-preset", "veryfast", "-movflags", "+faststart"], ffmpeg_log_level="quiet",
+        )  # fmt: skip
+        try:
+            with _forks_quietly():
+                writer.send(None)
+            for t in range(count):
+                writer.send(np.ascontiguousarray(frame(t)))
+            writer.close()
+            with _forks_quietly():  # The encoder ends in the same way on a full disk.
+                imageio_ffmpeg.count_frames_and_secs(str(film))
+        except (OSError, RuntimeError):  # Their text is the encoder's whole command.
+            raise OSError(f"{path}: the film cannot be encoded in {folder} (is the disk full?)") from None
+        finally:
+            writer.close()
+        write_whole(path, [film.read_bytes()])
     return path
 
 
@@ -227,5 +244,7 @@ def _write_gif(frame: Callable[[int], np.ndarray], count: int, path: Path, fps: 
     palette = Image.new("P", (1, 1))
     palette.putpalette(scene + force_color(np.linspace(0, 1, 64), 1.0).reshape(-1).tolist())
     images = [Image.fromarray(frame(t)).quantize(palette=palette, dither=Image.Dither.NONE) for t in range(count)]
-    images[0].save(path, save_all=True, append_images=images[1:], duration=round(1000 / fps), loop=0)
+    buffer = io.BytesIO()
+    images[0].save(buffer, "GIF", save_all=True, append_images=images[1:], duration=round(1000 / fps), loop=0)
+    write_whole(path, [buffer.getvalue()])
     return path

@@ -73,9 +73,11 @@ def open_source(arguments: ViewArguments) -> Source:
         if Path(name).exists() or (isinstance(error, ConfigError) and not arguments.hand):
             raise
         try:
-            find_task(name)
+            environment = find_task(name).environment
         except ConfigError as error:
             raise ConfigError(f"{name}: no policy file, no shipped policy, and {error}") from None
+        if environment:
+            raise ConfigError(f"{name}: is no task on a hand: there is nothing to show") from None
         env, name = make(name.rpartition(":")[2], hand=load_hand(arguments.hand or None)), NONE
     else:
         env = policy.make_env(hand=hand)

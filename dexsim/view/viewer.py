@@ -2,7 +2,9 @@
 
 import contextlib
 import dataclasses
+import errno
 import io
+import socket
 import time
 from collections.abc import Callable
 from typing import Any
@@ -29,8 +31,7 @@ class Viewer:
       host, port: where the page is served.
 
     Raises:
-      DexsimError: viser is not installed.
-      OSError: the port is taken.
+      DexsimError: viser is not installed, `host` is no address of this computer, or no port is free.
     """
 
     def __init__(self, source: Source, *, title: str, host: str = "127.0.0.1", port: int = 8080):
@@ -39,6 +40,7 @@ class Viewer:
         except ImportError:
             raise DexsimError(f"the live view needs viser: {install_line('view')}") from None
         self.source, hand = source, source.hand
+        port = free_port(host, port)
         with contextlib.redirect_stdout(io.StringIO()):  # Its box names the address in its own words.
             self.server = viser.ViserServer(host=host, port=port, label=title)
         self.server.gui.configure_theme(dark_mode=True, show_share_button=False, control_width="large")
@@ -138,3 +140,35 @@ class Viewer:
             self._finger_range,
             FELT,
         )
+
+
+def free_port(host: str, port: int) -> int:
+    """The port, or the next free one.
+
+    Viser looks for one by itself, but waits forever where there is none.
+
+    Raises:
+      DexsimError: `host` is no address of this computer, or no port from this one on is free.
+    """
+    try:
+        _listen(host, 0)
+    except OSError as error:
+        raise DexsimError(f"host {host!r:.100}: no page can be served there ({error.strerror or error})") from None
+    for number in range(port, 65536):
+        with contextlib.suppress(OSError):
+            _listen(host, number)
+            return number
+    raise DexsimError(f"port {port}: neither it nor one after it is free")
+
+
+def _listen(host: str, port: int) -> None:
+    """Raises OSError: the port is taken, or a server can listen at none of the host's addresses."""
+    failed, found = list[OSError](), socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+    for family, _, _, _, address in found:
+        try:
+            socket.create_server(address[:2], family=family).close()
+        except OSError as error:
+            failed.append(error)
+    # A computer without IPv6 may still name its address.
+    if failed and (len(failed) == len(found) or any(error.errno == errno.EADDRINUSE for error in failed)):
+        raise failed[0]

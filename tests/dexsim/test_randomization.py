@@ -442,3 +442,12 @@ def test_a_range_without_width_is_off_and_no_error(grasp_env, grasp_rollout, fre
     still.config = config
     (effect,) = check(still, grasp_rollout.step, fresh, key=jax.random.key(0), ticks=1, names=("Randomization.ripple",))
     assert effect.off and effect.found and "off" in table([effect])
+
+
+def test_an_environment_from_elsewhere_has_no_ranges_to_check(monkeypatch):
+    from dexsim import registry
+    from dexsim.randomization_check import __main__ as command
+
+    monkeypatch.setitem(registry.TASKS, "elsewhere", dataclasses.replace(registry.TASKS["grasp"], environment=object))
+    with pytest.raises(ConfigError, match="^--task elsewhere: is no task on a hand"):
+        command.main(["--task", "elsewhere"])

@@ -9,7 +9,7 @@ from tiny_env import SMALL, TinyEnv
 
 from dexsim.core.errors import ConfigError
 from dexsim.render import render
-from dexsim_ppo import evaluate
+from dexsim_ppo import evaluate, load_policy
 from dexsim_ppo.learner.ppo import make_train
 from dexsim_ppo.policy import Policy
 from dexsim_ppo.report import mean_interval, summarize_totals
@@ -106,3 +106,18 @@ def test_a_video_has_enough_pictures_to_follow(frames, quality, size, rate, monk
     assert options == {"size": size, "rate": pytest.approx(rate)}
     with pytest.raises(ConfigError, match="'tiny' draws nothing"):
         evaluate.write_video(env, {}, tmp_path / "a.mp4")
+
+
+def test_outputs_that_would_surprise_are_refused_at_once(tmp_path, monkeypatch):
+    load_policy("grasp").save(tmp_path / "policy.msgpack")
+    monkeypatch.setattr(evaluate, "load_policy", lambda *_, **__: pytest.fail("it went on"))
+    before = (tmp_path / "policy.msgpack").read_bytes()
+    name = str(tmp_path / "policy.msgpack")
+    for options, words in {
+        ("--video", "film.avi"): "--video film.avi: give a file that ends in .mp4 or .gif",
+        ("--output", name): f"--output {name}: is the policy itself",
+        ("--episodes", "2000000"): "--episodes 2000000: must be between 0 and 1000000",
+    }.items():
+        with pytest.raises(ConfigError, match=f"^{words}"):
+            evaluate.main([name, *options])
+    assert (tmp_path / "policy.msgpack").read_bytes() == before

@@ -165,3 +165,97 @@ def test_what_is_unsound_is_refused_in_one_line(tmp_path):
         PortablePolicy.load(tmp_path / "pickle.npz")
     with pytest.raises(ConfigError, match=r"ends in \.npz or \.onnx"):
         export.main(["grasp", "--output", str(tmp_path / "grasp.tflite")])
+
+
+def rewritten(path, good, header, arrays):
+    """The exported policy `good` (an .npz) with changes, in the format of `path`'s suffix."""
+    with np.load(good) as file:
+        kept = dict(file)
+    kept["header"] = np.array(json.dumps(json.loads(str(kept["header"])) | header))
+    np.savez(path, **(kept | arrays))
+    return path
+
+
+HEADERS = (
+    {"control_rate": 0.0},
+    {"control_rate": 1e6},
+    {"control_rate": "33"},
+    {"clip": "5"},
+    {"clip": float("nan")},
+    {"squash": "sine"},
+    {"task": 3},
+    {"memory": ["gru", 64.0]},
+    {"memory": None},
+    {"observation_layout": [[3, 66, None]]},
+    {"hand": "mine"},
+    {"hand": {"file": 3}},
+    {"spec": {"nothing": 1}},
+)
+
+
+@pytest.mark.parametrize("header", HEADERS, ids=str)
+def test_a_forged_header_is_refused_in_one_line(header, suffix, tmp_path):
+    path = tmp_path / f"good{suffix}"
+    export.main(["grasp", "--output", str(path)])
+    if suffix == ".npz":
+        path = rewritten(tmp_path / "forged.npz", path, header, {})
+    else:
+        import onnx
+
+        model = onnx.load(path)
+        (known,) = (prop for prop in model.metadata_props if prop.key == "dexsim")
+        known.value = json.dumps(json.loads(known.value) | header)
+        path = tmp_path / "forged.onnx"
+        onnx.save(model, path)
+    with pytest.raises(CheckpointError, match=rf"forged\{suffix}: is not a ") as error:
+        export.load_exported(path)
+    assert "\n" not in str(error.value) and str(error.value).count(f"forged{suffix}") == 1
+
+
+def test_forged_numbers_are_refused_in_one_line(tmp_path):
+    export.to_numpy(load_policy("grasp"), tmp_path / "good.npz")
+    with np.load(tmp_path / "good.npz") as file:
+        std, kernel, bias = file["std"], file["kernel_0"], file["bias_0"]
+    for name, arrays in {
+        "no deviation": {"std": np.zeros_like(std)},
+        "overflow": {"kernel_0": np.full_like(kernel, 3e38)},
+        "dates": {"bias_0": np.full(bias.shape, np.datetime64("2026-01-01"))},
+    }.items():
+        path = rewritten(tmp_path / f"{name}.npz", tmp_path / "good.npz", {}, arrays)
+        with pytest.raises(ValueError, match="is not a policy of this format"):
+            PortablePolicy.load(path)
+    (tmp_path / "empty.npz").write_bytes(b"")
+    (tmp_path / "text.npz").write_text("no archive")
+    whole = bytearray((tmp_path / "good.npz").read_bytes())
+    whole[whole.rindex(b"PK\1\2") + 10] = 77  # a compression that nobody has
+    (tmp_path / "packed.npz").write_bytes(whole)
+    deep = np.array("[" * 100_000)
+    np.savez(tmp_path / "deep.npz", header=deep)
+    for name in ("empty", "text", "packed", "deep"):
+        with pytest.raises(ValueError, match=rf"{name}\.npz: is not a policy of this format") as error:
+            PortablePolicy.load(tmp_path / f"{name}.npz")
+        assert "pickle" not in str(error.value)
+
+
+def test_a_network_of_onnx_must_take_and_give_what_the_header_says(tmp_path):
+    onnx, path = pytest.importorskip("onnx"), tmp_path / "rotate.onnx"
+    pytest.importorskip("onnxruntime")
+    export.main(["rotate", "--output", str(path)])
+    model = onnx.load(path)
+    for tensor in model.graph.initializer:
+        if tensor.name == "bias_0":
+            numbers = np.full(onnx.numpy_helper.to_array(tensor).shape, np.nan, np.float32)
+            tensor.CopyFrom(onnx.numpy_helper.from_array(numbers, "bias_0"))
+    onnx.save(model, path)
+    with pytest.raises(CheckpointError, match="not finite"):
+        export.load_exported(path)
+    with pytest.raises(CheckpointError, match="missing.onnx: No such file or directory$"):
+        export.load_exported(tmp_path / "missing.onnx")
+
+
+def test_an_output_that_is_a_folder_is_named_as_typed(tmp_path):
+    folder = tmp_path / "folder.npz"
+    folder.mkdir()
+    with pytest.raises(IsADirectoryError) as error:
+        export.main(["grasp", "--output", str(folder)])
+    assert error.value.filename == str(folder)

@@ -1,6 +1,8 @@
 """Recorded episodes: readings and the targets that followed, to the end of each."""
 
 import dataclasses
+import sys
+import types
 
 import jax
 import numpy as np
@@ -8,8 +10,9 @@ import pytest
 from remembering import KINDS, remembering
 
 import dexsim
+from dexsim import registry
 from dexsim.core.compilation import jit
-from dexsim.core.errors import ConfigError
+from dexsim.core.errors import ConfigError, DexsimError
 from dexsim.tasks.grasp.config import GraspConfig
 from dexsim_ppo import load_policy, record
 
@@ -47,3 +50,25 @@ def test_an_episode_ends_with_its_drop(env):
 def test_it_must_be_told_what_to_write():
     with pytest.raises(ConfigError, match="--lerobot FOLDER or --rrd FILE"):
         record.main(["grasp"])
+
+
+def test_what_cannot_be_written_is_refused_before_anything_is_simulated(monkeypatch, tmp_path):
+    monkeypatch.setattr(record, "load_policy", lambda *_, **__: pytest.fail("it went on"))
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(DexsimError, match="folder: exists already"):
+        record.main(["grasp", "--lerobot", str(tmp_path / "folder")])
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    with pytest.raises(DexsimError, match=r"pip install -e '\.\[rerun\]'"):
+        record.main(["grasp", "--rrd", str(tmp_path / "a.rrd")])
+    monkeypatch.setitem(sys.modules, "rerun", types.ModuleType("rerun"))
+    with pytest.raises(IsADirectoryError):
+        record.main(["grasp", "--rrd", str(tmp_path / "folder")])
+
+
+def test_an_environment_from_elsewhere_has_nothing_to_record(monkeypatch, tmp_path):
+    pytest.importorskip("pyarrow")
+    policy = dataclasses.replace(load_policy("grasp"), task="elsewhere")
+    monkeypatch.setitem(registry.TASKS, "elsewhere", dataclasses.replace(registry.TASKS["grasp"], environment=object))
+    policy.save(tmp_path / "policy.msgpack")
+    with pytest.raises(ConfigError, match="'elsewhere' is no task on a hand"):
+        record.main([str(tmp_path / "policy.msgpack"), "--lerobot", str(tmp_path / "data")])

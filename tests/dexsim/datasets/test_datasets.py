@@ -105,3 +105,15 @@ def test_refusals_are_one_line(hand, tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "pyarrow", None)
     with pytest.raises(DexsimError, match=r"pip install -e '\.\[lerobot\]'"):
         write_lerobot(tmp_path / "new", hand, "grasp", [trajectory(3)])
+
+
+def test_a_dataset_that_fails_leaves_nothing(hand, tmp_path, monkeypatch):
+    pytest.importorskip("pyarrow")
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("dexsim.datasets.lerobot._tactile", full)
+    with pytest.raises(OSError, match="No space left"):
+        write_lerobot(tmp_path / "new", hand, "grasp", [trajectory(3)])
+    assert not list(tmp_path.iterdir())

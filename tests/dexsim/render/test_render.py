@@ -396,3 +396,35 @@ def test_rendering_needs_no_opengl_and_no_pyplot():
         "assert not bad, bad"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
+
+
+def test_a_film_that_is_named_a_gif_is_one(hand, tmp_path):
+    pytest.importorskip("imageio_ffmpeg")
+    env, steps = episode(hand, 2)
+    other = tmp_path / "video.mp4"
+    other.write_text("another film")
+    path = render.render_episode(env, steps, tmp_path / "video.gif", fps=20, size=(160, 120))
+    assert path == tmp_path / "video.gif" and path.read_bytes().startswith(b"GIF8")
+    assert other.read_text() == "another film"
+
+
+@pytest.mark.parametrize("fails", [0, 2], ids=["at once", "later"])
+def test_a_film_that_fails_leaves_the_one_before_it(fails, hand, tmp_path, monkeypatch):
+    ffmpeg, path = pytest.importorskip("imageio_ffmpeg"), tmp_path / "video.mp4"
+    path.write_text("the one before it")
+    env, steps = episode(hand, 3)
+    if fails:
+        monkeypatch.setattr(ffmpeg, "write_frames", truncated)
+    else:
+        monkeypatch.setattr(render.tempfile, "tempdir", "/proc")
+    with pytest.raises(OSError) as error:
+        render.render_episode(env, steps, path, fps=20, size=(160, 120))
+    assert "\n" not in str(error.value) and path.read_text() == "the one before it"
+    assert [other.name for other in tmp_path.iterdir()] == ["video.mp4"]
+
+
+def truncated(path, *_, **__):
+    """An encoder on a full disk, which says nothing."""
+    with open(path, "wb") as file:
+        while True:
+            file.write(b"ftyp" if (yield) is None else b"")

@@ -1,8 +1,10 @@
 """The live view: what it draws, what its controls change, and the page in a real browser."""
 
+import contextlib
 import dataclasses
 import io
 import shutil
+import socket
 import sys
 import threading
 import time
@@ -324,3 +326,25 @@ def test_pause_and_step(page):
     assert wait_until(lambda: float(page.viewer.source._state.length) == at + 1)
     page.get_by_role("button", name="reset").click()
     assert wait_until(lambda: float(page.viewer.source._state.length) == 0)
+
+
+def test_an_address_that_is_not_this_computers_is_refused_in_one_line():
+    from dexsim.core.errors import DexsimError
+    from dexsim.view.viewer import free_port
+
+    with pytest.raises(DexsimError, match=r"^host '203\.0\.113\.7': no page can be served there \("):
+        free_port("203.0.113.7", 18090)
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        assert free_port("127.0.0.1", port) > port
+    with contextlib.suppress(OSError), socket.create_server(("127.0.0.1", 65535)):
+        with pytest.raises(DexsimError, match="^port 65535: neither it nor one after it is free"):
+            free_port("127.0.0.1", 65535)
+
+
+def test_an_environment_from_elsewhere_is_refused_in_one_line(monkeypatch):
+    from dexsim import registry
+
+    monkeypatch.setitem(registry.TASKS, "elsewhere", dataclasses.replace(registry.TASKS["grasp"], environment=object))
+    with pytest.raises(ConfigError, match="^elsewhere: is no task on a hand"):
+        open_source(ViewArguments(what="elsewhere"))
