@@ -139,7 +139,11 @@ def test_the_object_is_the_one_asked_for(simulation):
 
 def test_a_push_moves_the_object_and_friction_is_scaled_from_what_was_drawn(simulation, monkeypatch):
     simulation.reset(VALUES)
-    # Downwards, where no finger is in the way: the push is there in full.
+    # Away from the hand, where no finger is in the way: the push is there in full.
+    begun = simulation._state.physics
+    away = begun.qpos.at[simulation.env.physics.object_qpos[0]].add(0.2)
+    moved = dataclasses.replace(simulation._state, physics=dataclasses.replace(begun, qpos=away))
+    monkeypatch.setattr(simulation, "_state", moved)
     monkeypatch.setattr(simulation, "_random", SimpleNamespace(normal=lambda size: np.array([0.3, 0.0, 0.0])))
     before, state = simulation._state.episode.object.friction, simulation._state
     speed = []
