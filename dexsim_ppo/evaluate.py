@@ -257,16 +257,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         prog="python -m dexsim_ppo.evaluate",
         description="Measure a policy over fixed, seeded episodes.",
     )
+    cli.enable_caches()
+    for path in (arguments.output, arguments.video):
+        if path:
+            cli.check_writable(path)
     video = arguments.video
     if video and video.suffix not in (".mp4", ".gif"):
         raise ConfigError(f"--video {video}: give a file that ends in .mp4 or .gif")
     for name, path in (("--output", arguments.output), ("--video", video)):
         if path and path.exists() and Path(arguments.policy).exists() and path.samefile(arguments.policy):
             raise ConfigError(f"{name} {path}: is the policy itself; name another file")
-    cli.enable_caches()
-    for path in (arguments.output, arguments.video):
-        if path:
-            cli.check_writable(path)
     policy = load_policy(arguments.policy, task=arguments.task or None).ablate(*arguments.ablate)
     chunk = min(arguments.chunk or default_chunk(), arguments.episodes or default_chunk())
     if not any(entry.startswith("objects.mesh=") for entry in arguments.set):

@@ -88,6 +88,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     if arguments.lerobot is None and arguments.rrd is None:
         raise ConfigError("give --lerobot FOLDER or --rrd FILE")
+    policy = load_policy(arguments.policy, task=arguments.task or None)
     # First what could be wrong after minutes of simulation.
     if arguments.lerobot:
         check_lerobot(arguments.lerobot)
@@ -95,7 +96,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         check_rerun()
         cli.check_writable(arguments.rrd)
     cli.enable_caches()
-    policy = load_policy(arguments.policy, task=arguments.task or None)
     if find_task(policy.task).environment:
         raise ConfigError(f"{arguments.policy}: {policy.task!r} is no task on a hand: there is nothing to record")
     env = policy.make_env(num_envs=arguments.episodes)

@@ -53,7 +53,7 @@ def test_it_must_be_told_what_to_write():
 
 
 def test_what_cannot_be_written_is_refused_before_anything_is_simulated(monkeypatch, tmp_path):
-    monkeypatch.setattr(record, "load_policy", lambda *_, **__: pytest.fail("it went on"))
+    monkeypatch.setattr(record, "find_task", lambda *_, **__: pytest.fail("it went on"))
     (tmp_path / "folder").mkdir()
     with pytest.raises(DexsimError, match="folder: exists already"):
         record.main(["grasp", "--lerobot", str(tmp_path / "folder")])

@@ -7,7 +7,7 @@ from tiny_env import TinyConfig, TinyEnv
 import dexsim
 from dexsim import registry
 
-ENTRY = types.SimpleNamespace(config_class=TinyConfig, config=TinyConfig)
+ENTRY = types.SimpleNamespace(config_class=TinyConfig, config=TinyConfig, task=TinyEnv, environment=None)
 
 
 def make(task, config=None, *, backend="auto", num_envs=1, **_):

@@ -353,7 +353,7 @@ def test_files_are_never_overwritten_or_mistaken(finished, tmp_path, monkeypatch
         (train.main, ["--resume", str(finished.best)], "'policy' file, not a 'train' file"),
         (evaluate.main, [str(broken)], "cut short"),
         (evaluate.main, ["no-such-policy"], "no shipped policy has that name"),
-        (evaluate.main, [str(finished.best), "--episodes", "-1"], "at least 0"),
+        (evaluate.main, [str(finished.best), "--episodes", "-1"], "must be between 0 and"),
         (evaluate.main, [str(finished.best), "--set", "colour=red"], "has no field 'colour'"),
         (evaluate.main, [str(finished.best), "--set", "gain=7"], "error: --set gain=7 m: must be between"),
         (evaluate.main, [str(finished.best), "--set", "colour"], "'colour': expected NAME=VALUE"),
