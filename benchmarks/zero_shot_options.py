@@ -6,10 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
+import numpy as np
+
 from dexsim.core import cli
 from dexsim.core.errors import ConfigError, DexsimError
-
-KINDS = ("outside", "inside", "nominal")
+from dexsim_real.twin.plant.parameters import KINDS, sample_trial
 
 
 class Parser(argparse.ArgumentParser):
@@ -115,10 +116,6 @@ def _pairs(option: str, given: list[str], words: tuple[str, ...] = ()) -> dict[s
 
 def _parameters(given: argparse.Namespace) -> dict[str, Any]:
     """Values of --set, of parameters that a trial has."""
-    import numpy as np
-
-    from dexsim_real.twin.plant.parameters import sample_trial
-
     table = _pairs("--set", given.set, KINDS)
     try:
         sample_trial(given.task, np.random.default_rng(0), given.parameters, table)

@@ -88,7 +88,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     if arguments.lerobot is None and arguments.rrd is None:
         raise ConfigError("give --lerobot FOLDER or --rrd FILE")
-    policy = load_policy(arguments.policy, task=arguments.task or None)
+    policy = load_policy(arguments.policy, task=arguments.task)
     # First what could be wrong after minutes of simulation.
     if arguments.lerobot:
         check_lerobot(arguments.lerobot)

@@ -24,7 +24,8 @@ from dexsim.core.errors import AssetError, ConfigError
 SURFACES = ("plane", "cylinder", "capsule", "sphere")
 _AWAY = 3e-3  # m, how far from its link a taxel may be: as thick as the rubber
 _SMALLEST, _LARGEST = 1e-12, 1e-2  # m^2, area of a taxel: square millimetres are refused
-_MOST = 1000  # columns or rows
+MOST = 1000
+"""Columns or rows of taxels, at most."""
 _STEP = 3e-3  # m, along a normal, which must lead away from the link
 COLUMNS = ("finger", "column", "row", "x", "y", "z", "nx", "ny", "nz", "area")
 
@@ -249,7 +250,7 @@ def read_layout(path: str | Path) -> dict[str, Patch]:
             raise ValueError("no taxels")
         fingers = tuple(dict.fromkeys(entry["finger"] for entry in entries))
         columns, rows = (1 + max(int(entry[name]) for entry in entries) for name in ("column", "row"))
-        if max(columns, rows) > _MOST:
+        if max(columns, rows) > MOST:
             raise ValueError(f"{columns} x {rows} taxels")
     except FileNotFoundError:
         raise AssetError(f"{path}: no such file") from None

@@ -15,8 +15,8 @@ from dexsim.core.files import read_toml
 from dexsim.hand.coupling import read_followers
 from dexsim.hand.files import digest_of, find_hand, shipped_name
 from dexsim.hand.kinematics import Geom, Hand
-from dexsim.hand.layout import read_taxels
-from dexsim.hand.pads import lay_taxels
+from dexsim.hand.layout import MOST, read_taxels
+from dexsim.hand.pads import are_numbers, lay_taxels
 
 _SLACK = 1e-3  # rad, how far a posture may be beyond a joint's range
 _ENTRIES = (
@@ -222,14 +222,14 @@ def _check_table(path: Path, table: dict) -> None:
         given = table.get(task, {})
         for key, length in (("posture", len(table["joints"])), (place, 3)):
             values = given.get(key, [0] * length) if isinstance(given, dict) else None
-            if not isinstance(values, list) or len(values) != length or not all(map(_is_number, values)):
+            if not are_numbers(values, length):
                 raise AssetError(f"{path}: {task}.{key} = {values!r:.60}: expected {length} numbers")
         _check_known(path, f"[{task}]: ", given, ("posture", place))
     if not isinstance(table.get("name", ""), str):
         raise AssetError(f"{path}: name = {table['name']!r:.60}: expected a string")
     grid, speeds = table["taxel_grid"], table["speed_limits"]
-    if len(grid) != 2 or any(type(n) is not int or not 1 <= n <= 1000 for n in grid):
-        raise AssetError(f"{path}: taxel_grid = {grid!s:.60}: expected two whole numbers above 0, at most 1000")
+    if len(grid) != 2 or any(type(n) is not int or not 1 <= n <= MOST for n in grid):
+        raise AssetError(f"{path}: taxel_grid = {grid!s:.60}: expected two whole numbers above 0, at most {MOST}")
     for v in speeds:
         if type(v) not in (int, float) or not 0 < v <= 1000:
             raise AssetError(f"{path}: {v!r:.60} in speed_limits: expected numbers above 0, at most 1000 rad/s")
@@ -268,10 +268,6 @@ def _check_numbers(model, path: Path) -> None:
                 row = int(np.argwhere(wrong)[0, 0])
                 element = getattr(model, "equality" if kind == "eq" else kind)(row).name or f"#{row}"
                 raise AssetError(f"{path}: {kind} {element!r}: {name} is {what}")
-
-
-def _is_number(value: Any) -> bool:
-    return type(value) in (int, float) and abs(value) < 1e6  # NaN is not; some whole numbers of TOML are no floats
 
 
 def _numbers(table: dict, task: str, key: str) -> tuple[float, ...]:

@@ -31,7 +31,7 @@ def lay_taxels(path: Path, table: dict[str, Any], geoms: tuple[Geom, ...], tip_b
       AssetError: an entry is missing or wrong, a pad is no capsule or sphere of its tip, or the lattice does not fit.
     """
     pitch: Any = table.get("taxel_pitch")
-    if not _are_numbers(pitch, 2, 0, 1):
+    if not are_numbers(pitch, 2, 0, 1):
         raise AssetError(f"{path}: taxel_pitch = {pitch!r:.60}: expected two numbers above 0 m (or taxels: a file)")
     points = lattice(*table["taxel_grid"], pitch=tuple(pitch))
     found = []
@@ -53,15 +53,15 @@ def lay_taxels(path: Path, table: dict[str, Any], geoms: tuple[Geom, ...], tip_b
     return np.asarray(found, np.float32)
 
 
-def _are_numbers(values: Any, count: int, above: float, most: float) -> bool:
+def are_numbers(values: Any, count: int, above: float = -1e6, below: float = 1e6) -> bool:
     """Whether these are so many numbers in a range; NaN is in none, and a whole number of TOML may be no float."""
-    numbers = isinstance(values, list) and all(type(x) in (int, float) and above < x <= most for x in values)
+    numbers = isinstance(values, list) and all(type(x) in (int, float) and above < x < below for x in values)
     return numbers and len(values) == count
 
 
 def _frame(where: str, pad: Geom, facing: Any) -> np.ndarray:
     """The rotation [3, 3] that takes a primitive's axis, z, to the pad's, and x to the direction that it faces."""
-    if not _are_numbers(facing, 3, -1e6, 1e6):
+    if not are_numbers(facing, 3):
         raise AssetError(f"{where}: facing = {facing!r:.60}: expected a direction of three numbers")
     along = np.asarray(pad.rotation[:, 2], float)
     across = np.asarray(facing, float) - np.dot(facing, along) * along

@@ -77,7 +77,7 @@ def fit_boxes(mesh: meshes.Mesh, parts: int, *, frames: Sequence[np.ndarray] = (
     if boxes is None:
         if len(mesh.faces) > _MANY:
             warnings.warn(
-                f"{mesh.name}: {len(mesh.faces)} triangles, so that the first fit of boxes takes a minute or more; a "
+                f"{mesh.name}: {len(mesh.faces)} triangles, so that the first fit of boxes takes long; a "
                 "mesh simplified to some thousands gives nearly the same boxes",
                 DexsimWarning,
                 stacklevel=2,

@@ -75,9 +75,8 @@ def render_episode(
     """Write snapshots stacked along T, `fps` of them a second, as a video as long as they last; return its path.
 
     MP4 where imageio-ffmpeg (extra `video`) can be imported, else GIF with the suffix changed; a path that ends in .gif
-    is always a GIF. The file appears whole or not at all. `rate` is the video's
-    own number of frames a second, each the nearest snapshot; None shows every snapshot. The camera is the preset named
-    like the task.
+    is always a GIF. The file appears whole or not at all. `rate` is the video's own number of frames a second, each the
+    nearest snapshot; None shows every snapshot. The camera is the preset named like the task.
 
     Raises:
       ValueError: no snapshots, or see `render_frame`.

@@ -3,8 +3,8 @@
     DXSLOG1\\n, then records: sync (4 bytes) | kind | time | length | CRC-32 | payload
 
 A record reaches the kernel within 0.1 s and then survives the end of the program. Once a second the file
-is synced to the disk. A truncated or damaged record costs only itself; one
-with a right checksum whose payload cannot be read counts as damaged, too.
+is synced to the disk. A truncated or damaged record costs only itself; one with a right checksum whose payload cannot
+be read counts as damaged, too.
 """
 
 import contextlib
