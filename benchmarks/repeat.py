@@ -1,6 +1,6 @@
 """Which part of a training repeats to the last bit: each is run again on the same inputs, one JSON line each.
 
-    python benchmarks/repeat.py --task grasp --backend warp --deterministic
+    python benchmarks/repeat.py --task grasp --backend jax --deterministic
 
 `differ` names the arrays that differ between the repetitions of this process, worst first. `digest` is that of the
 first result: two runs of the command whose digests differ, where nothing differs within them, were compiled into

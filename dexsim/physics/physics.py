@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dexsim.core.compilation import is_deterministic
 from dexsim.core.errors import ConfigError
 from dexsim.core.install import install_line
 from dexsim.geometry import rotations
@@ -33,6 +34,8 @@ BACKENDS: dict[str, Callable[..., Backend]] = {"jax": JaxBackend, "warp": WarpBa
 def choose_backend(backend: str) -> str:
     """The name of a backend. `auto`: c on a CPU, warp on an NVIDIA GPU where it can be imported, else jax.
 
+    Programs that were asked to repeat to the last bit (`make_deterministic`) do without warp.
+
     Raises:
       ConfigError: no such backend, or its library or device is missing.
     """
@@ -40,9 +43,13 @@ def choose_backend(backend: str) -> str:
         raise ConfigError(f"backend {backend!r}: choose from auto, {', '.join(BACKENDS)}")
     device, found = jax.default_backend(), importlib.util.find_spec("warp") is not None
     if backend == "auto":
-        return "c" if device == "cpu" else "warp" if found and device in ("gpu", "cuda") else "jax"
+        fast = found and device in ("gpu", "cuda") and not is_deterministic()
+        return "c" if device == "cpu" else "warp" if fast else "jax"
     if backend == "warp" and not found:
         raise ConfigError(f"backend 'warp' needs the extra: {install_line('warp')}")
+    if backend == "warp" and is_deterministic():
+        # Warp has a mode for it (1.18), in which contacts get lost: mujoco_warp, issue 1635.
+        raise ConfigError("backend 'warp' does not repeat to the last bit: choose jax, or leave out --deterministic")
     if backend == "c" and device != "cpu":
         raise ConfigError("backend 'c' runs on the CPU's cores: set JAX_PLATFORMS=cpu")
     return backend

@@ -1,12 +1,10 @@
 """MJX's Warp implementation: about four times faster than JAX on NVIDIA GPUs, without gradients."""
 
-import sys
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from dexsim.core.compilation import is_deterministic
 from dexsim.hand.kinematics import Hand
 from dexsim.physics.config import PhysicsConfig
 from dexsim.physics.mjx_backend import MjxBackend
@@ -25,8 +23,6 @@ class WarpBackend(MjxBackend):
         import warp
 
         warp.config.log_level = warp.LOG_WARNING  # else it lists devices and every kernel that it loads
-        if is_deterministic():
-            _order_atomics()
         super().__init__(scene, "warp")
         # Warp prints from the device whenever a solver stops at its iteration limit, which is intended here. Full
         # buffers show in `finger_force` instead.
@@ -54,18 +50,6 @@ class WarpBackend(MjxBackend):
         """
         force = -data.sensordata.reshape(self.scene.hand.num_fingers, 3)
         return jnp.where((data._impl.overflow & _OVERFLOW) != 0, jnp.nan, force)
-
-
-def _order_atomics() -> None:
-    """Have kernels that are not compiled yet sort their atomic additions, so that results repeat on one kind of GPU."""
-    import warp
-
-    # Modules that are made from here on: some of MuJoCo's kernels have one each, without a name to find it by.
-    warp.config.deterministic = warp.DeterministicMode.RUN_TO_RUN
-    import mujoco.mjx.third_party.mujoco_warp  # noqa: F401  (its kernels, which Warp compiles at their first launch)
-
-    for name in [name for name in sys.modules if name.startswith("mujoco.mjx.third_party.mujoco_warp")]:
-        warp.set_module_options({"deterministic": warp.config.deterministic}, name)
 
 
 def constraint_rows(config: PhysicsConfig, hand: Hand) -> int:

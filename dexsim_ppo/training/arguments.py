@@ -45,8 +45,8 @@ class TrainArguments(Generic[EnvConfig]):
     backend: Literal["auto", "jax", "warp", "c"] = setting("auto")
     """Physics backend. auto: c on a CPU, warp on an NVIDIA GPU if it is installed, otherwise jax."""
     deterministic: bool = False
-    """On a GPU, have XLA and Warp order their sums, at a cost in speed, so that a training repeats from one seed. With
-    Warp this does not suffice yet. On a CPU trainings repeat anyway."""
+    """On a GPU, have XLA order its sums and do without Warp, at a cost in speed, so that a training repeats from one
+    seed. On a CPU trainings repeat anyway."""
     preset: Literal["auto", "cpu", "cpu-large", "gpu"] = setting("auto")
     """Default sizes and durations. auto: those of the device found; cpu-large is for 16 cores and more."""
     steps: float = setting(0.0, unit="environment steps", low=0.0)

@@ -1,7 +1,5 @@
 """Which programs are compiled with less optimisation, and which on a GPU repeat to the bit."""
 
-import sys
-
 import jax
 import pytest
 
@@ -40,19 +38,3 @@ def test_programs_on_a_gpu_are_made_deterministic_on_request(options, monkeypatc
     for backend in ("jax", "warp", "own"):
         assert options(backend=backend) == {"xla_gpu_deterministic_ops": True}
     assert options(once=True) == {"xla_gpu_deterministic_ops": True}
-
-
-def test_warps_kernels_sort_their_additions_on_request():
-    """MJX's as well as those that it makes later."""
-    warp = pytest.importorskip("warp")
-    from dexsim.physics.warp_backend import _order_atomics
-
-    before, mode = warp.config.deterministic, warp.DeterministicMode.RUN_TO_RUN
-    solver = warp.get_module("mujoco.mjx.third_party.mujoco_warp._src.solver")
-    try:
-        _order_atomics()
-        assert warp.config.deterministic == mode == solver.options["deterministic"]
-    finally:
-        warp.config.deterministic = before
-        for name in [name for name in sys.modules if name.startswith("mujoco.mjx.third_party.mujoco_warp")]:
-            warp.set_module_options({"deterministic": before}, name)

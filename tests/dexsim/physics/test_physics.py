@@ -14,6 +14,7 @@ import pytest
 from c_scene import CONVERGED, GRAVITY, row, rows_of, squeeze, stack
 from mujoco import mjx
 
+from dexsim.core import compilation
 from dexsim.core.errors import AssetError, ConfigError
 from dexsim.hand.load import load_hand
 from dexsim.objects.config import SHAPES, SLOTS, ObjectConfig
@@ -254,6 +255,11 @@ class TestConstruction:
         assert choose_backend("auto") == choose_backend("warp") == "warp"
         with pytest.raises(ConfigError, match="JAX_PLATFORMS=cpu"):
             choose_backend("c")
+        monkeypatch.setattr(compilation, "_on_gpu", {})
+        assert compilation.make_deterministic()
+        assert choose_backend("auto") == choose_backend("jax") == "jax"
+        with pytest.raises(ConfigError, match="'warp' does not repeat.*leave out --deterministic"):
+            choose_backend("warp")
 
     @pytest.mark.parametrize(
         "field, value, message",
