@@ -50,6 +50,7 @@ TASKS: dict[str, TaskEntry] = {
     "rotate_clear": TaskEntry(rotate.RotateConfig, Rotate, rotate.clear_of_palm),
 }
 _OURS = tuple(TASKS)
+_MODULES: dict[str, str] = {}  # that tasks were found in, by their names
 
 
 def register(
@@ -88,6 +89,8 @@ def find_task(name: str) -> TaskEntry:
     Raises:
       ConfigError: there is no such task or module, or the module has something by the name of a task of dexsim's.
     """
+    if not isinstance(name, str):
+        raise ConfigError(f"task {name!r:.80}: give its name, such as 'grasp' or 'my_module:make_env'")
     module, _, word = name.rpartition(":")
     if module:
         makes = getattr(_import(module), word, None)
@@ -95,6 +98,8 @@ def find_task(name: str) -> TaskEntry:
             raise ConfigError(f"task {name!r}: dexsim has a task {word!r} of its own; give yours another name")
         if word not in TASKS and callable(makes):
             TASKS[word] = TaskEntry(cast(Any, NoSettings), _no_task, cast(Any, NoSettings), makes)
+        if word in TASKS and word not in _OURS:
+            _MODULES[word] = module
     if word not in TASKS:
         for plugin in importlib.metadata.entry_points(group=PLUGINS):
             plugin.load()
@@ -102,6 +107,12 @@ def find_task(name: str) -> TaskEntry:
         hint = "" if module else f"; a task of your own needs its module: --task my_module:{word}"
         raise ConfigError(f"unknown task {word!r}: choose from {', '.join(sorted(TASKS))}{hint}")
     return TASKS[word]
+
+
+def task_option(name: str) -> str:
+    """What a command needs to find this task: its `--task` with a space before it where a module was given to this
+    program, else nothing."""
+    return f" --task {_MODULES[name]}:{name}" if name in _MODULES else ""
 
 
 def make(
@@ -129,6 +140,8 @@ def make(
     if num_envs < 1:
         raise ConfigError(f"make({task!r}, num_envs={num_envs}): must be at least 1")
     if (makes := find_task(task).environment) is not None:
+        if not isinstance(config, NoSettings | None):
+            raise ConfigError(f"task {task!r} takes no config: its environment comes from elsewhere")
         return _make_other(task, makes)
     hand = load_hand() if hand is None else hand
     return Env(make_task(task, hand, config), hand, backend=backend, num_envs=num_envs, seed=seed)

@@ -17,7 +17,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, cast
 
 import jax
 import jax.numpy as jnp
@@ -198,6 +198,7 @@ def evaluate_policy(
     Raises:
       CheckpointError, ConfigError: see `Policy.load` and `Policy.make_env`.
     """
+    EvaluateArguments(policy=str(policy), episodes=episodes, seed=seed, backend=cast(Any, backend), chunk=chunk)
     policy = policy if isinstance(policy, Policy) else load_policy(policy)
     chunk = min(chunk or default_chunk(), episodes or default_chunk())
     if env is None:

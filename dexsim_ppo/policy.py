@@ -333,6 +333,8 @@ def load_policy(name: str | Path, *, task: str | None = None) -> Policy:
 
 def _find(name: str | Path) -> Path:
     """The file of a policy that is named by a path, or by the name of a shipped one."""
+    if not isinstance(name, str | Path):
+        raise CheckpointError(f"{name!r:.80}: give a policy's file, or the name of a shipped one")
     text = str(name)
     if Path(text).exists() or "/" in text or text.endswith(".msgpack"):
         return Path(text)

@@ -14,6 +14,7 @@ import json
 import shlex
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -25,7 +26,7 @@ from dexsim.core.config import from_dict, naming_file
 from dexsim.core.errors import ConfigError, DexsimError
 from dexsim.hand.kinematics import Hand
 from dexsim.hand.source import record_of
-from dexsim.registry import find_task
+from dexsim.registry import find_task, task_option
 from dexsim_ppo import checkpoint
 from dexsim_ppo.learner.adapter import adapt
 from dexsim_ppo.learner.config import PPOConfig
@@ -83,12 +84,12 @@ def train_policy(
     """
     started = time.perf_counter()
     cli.enable_caches()
-    policy, run_dir = str(policy or ""), options.get("run_dir")
+    run_dir = options.get("run_dir")
     if run_dir is not None:
         options = options | {"run_dir": Path(run_dir)}
     begun = find_beginning(task, policy, resume)
     arguments = default_arguments(task, preset, begun)
-    given = {"env": config, "ppo": ppo, "policy": policy or None, "resume": resume and Path(resume)} | options
+    given = {"env": config, "ppo": ppo, "policy": str(policy) or None, "resume": resume and Path(resume)} | options
     if "steps" in options and "minutes" not in options:
         given["minutes"] = 0.0
     unknown = sorted(set(options) - {field.name for field in dataclasses.fields(TrainArguments)})
@@ -124,7 +125,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if stopped and processes.is_first():
         print(
             f"stopped by {signal.Signals(stopped).name}; resume with: "
-            f"python -m dexsim_ppo.train --resume {shlex.quote(str(run.folder.path))}"
+            f"python -m dexsim_ppo.train --resume {shlex.quote(str(run.folder.path))}{task_option(run.arguments.task)}"
         )
     return 128 + stopped if stopped else 0
 
@@ -226,12 +227,12 @@ def train_seeds(
 
 
 def find_beginning(
-    task: str | None, policy: str | None, resume: str | Path | None
+    task: str | None, policy: str | Path | None, resume: str | Path | None
 ) -> checkpoint.Checkpoint | Policy | None:
     """What a run begins from: the checkpoint to resume, the policy to fine-tune, or nothing."""
-    name = task and task.rpartition(":")[2]
     if task:
         find_task(task)
+    name = task and task.rpartition(":")[2]
     if resume and policy:
         raise ConfigError("--policy begins a run and --resume resumes one: give one of them")
     if resume:
@@ -336,7 +337,8 @@ def stop_on_signals() -> Iterator[Callable[[], int]]:
         received.append(number)
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
-    old = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
+    numbers = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()
+    old = {number: signal.signal(number, handler) for number in numbers}  # Python takes handlers in no other thread.
     try:
         yield lambda: received[0] if received else 0
     finally:

@@ -9,6 +9,8 @@ from typing import Any
 
 import jax
 
+from dexsim.core.errors import ConfigError
+
 # LLVM optimises less, and XLA's older emitters produce less code per fusion: faster to compile. Physics run as fast,
 # networks take nearly twice as long with the older emitters.
 EMITTERS = "xla_cpu_use_fusion_emitters"
@@ -42,6 +44,12 @@ def jit(function: Callable, *, backend: str = "jax", once: bool = False, **optio
     elif _on_gpu:
         options["compiler_options"] = dict(_on_gpu)
     return jax.jit(function, **options)
+
+
+def check_float32() -> None:
+    """Raises ConfigError: JAX computes in float64, but the states that compiled loops carry are float32."""
+    if jax.config.read("jax_enable_x64"):
+        raise ConfigError("jax_enable_x64 is on: training and evaluation are in float32; unset JAX_ENABLE_X64")
 
 
 def make_deterministic() -> bool:

@@ -40,15 +40,19 @@ def setting(
 
 
 def validate(config: Any) -> None:
-    """Check every field of a config dataclass against its metadata; call from `__post_init__`.
+    """Check every field of a config dataclass against its type and metadata; call from `__post_init__`.
+
+    Lists become tuples and NumPy's numbers Python's, as a file would give them back.
 
     Raises:
-      ConfigError: names the class, the field, the value, the unit and the range.
+      ConfigError: names the class, the field, the value, and its type or the unit and the range.
     """
     cls: type = type(config)
     for field in dataclasses.fields(cls):
-        value = getattr(config, field.name)
         where = f"{cls.__name__}.{field.name}"
+        value = _checked(_hints(cls).get(field.name), getattr(config, field.name), where)
+        if value is not getattr(config, field.name):
+            object.__setattr__(config, field.name, value)
         choices = choices_of(cls).get(field.name)
         if choices is not None and value is not None:
             for item in value if isinstance(value, tuple) else (value,):
@@ -68,13 +72,38 @@ def validate(config: Any) -> None:
 @functools.cache
 def choices_of(cls: type) -> dict[str, tuple[Any, ...]]:
     """What each field may be, where only some values may: by its `setting` or its `Literal` type."""
-    try:
-        hints = typing.get_type_hints(cls)
-    except NameError:  # A type that only a type checker imports.
-        hints = {}
-    fields = dataclasses.fields(cls)
+    fields, hints = dataclasses.fields(cls), _hints(cls)
     choices = {field.name: field.metadata.get("choices") or _literals(hints.get(field.name)) for field in fields}
     return {name: values for name, values in choices.items() if values}
+
+
+@functools.cache
+def _hints(cls: type) -> dict[str, Any]:
+    """The types of a class's fields; none if one of them is only imported by type checkers."""
+    try:
+        return typing.get_type_hints(cls)
+    except NameError:
+        return {}
+
+
+def _checked(hint: Any, value: Any, where: str) -> Any:
+    """A field's value as `_rebuild` has it. A configuration in a field is one already, and integers are numbers too."""
+    if isinstance(hint, type) and dataclasses.is_dataclass(hint):
+        if not isinstance(value, hint):
+            raise ConfigError(f"{where} = {value!r:.80}: expected a {hint.__name__}")
+        return value
+    if hint not in (bool, int, float, str) and typing.get_origin(hint) is not tuple:
+        return value
+    value = _plain(value)
+    rebuilt = _rebuild(hint, value, where)
+    return value if value == rebuilt else rebuilt
+
+
+def _plain(value: Any) -> Any:
+    """Python's numbers and lists for NumPy's, in a tuple too."""
+    if isinstance(value, (tuple, list)):
+        return type(value)(map(_plain, value))
+    return value.tolist() if hasattr(value, "tolist") else value
 
 
 def range_text(low: float | None, high: float | None, both: str) -> str:

@@ -23,6 +23,7 @@ from dexsim.env.evaluation import EvaluationPlan, make_plan
 from dexsim.env.fingerprint import fingerprint
 from dexsim.env.motors import JointCommand, Motors, PhysicsTick, rotor_share
 from dexsim.env.observer import Observer
+from dexsim.env.rules import dropped_of, reward_of, updated_goal
 from dexsim.env.senses import SensorSuite
 from dexsim.env.state import Episode, Outcome, Perception, SensorInput, Start, State
 from dexsim.env.task import GroundTruth, Task
@@ -125,7 +126,7 @@ class Env:
         push = self.task.push(push_key, episode.object) + self.sampler.tilt_force(episode)
         tick = self.motors.tick(episode, command, state.physics, state.gear, push)
         truth = self._ground_truth(episode, tick, command.action, state.action)
-        goal = self.task.update(goal_key, state.goal, truth)
+        goal = updated_goal(self.task, goal_key, state.goal, truth)
         seen = self._sense(noise_key, episode, command, truth, goal, self._sensor_input(truth, tick), state)
         outcome = self._judge(truth, goal, tick.finite, state)
         return self._state(key, episode, command, tick, goal, seen, outcome, state.scale)
@@ -225,10 +226,10 @@ class Env:
         """The task's verdict on a tick after the state `last`; an episode's start earns nothing."""
         zero, false, ticks = jnp.zeros(()), jnp.zeros((), bool), jnp.zeros((), jnp.int32)
         if last is None:
-            _, terms = self.task.reward(goal, truth, false)
+            _, terms = reward_of(self.task, goal, truth, false)
             return Outcome(zero, false, false, ticks, ticks, zero, terms)
-        dropped = self.task.dropped(goal, truth) | ~finite
-        reward, terms = self.task.reward(last.goal, truth, dropped)
+        dropped = dropped_of(self.task, goal, truth) | ~finite
+        reward, terms = reward_of(self.task, last.goal, truth, dropped)
         tick = last.tick + 1
         truncated = (tick >= self.task.episode_ticks) & ~dropped
         return Outcome(reward, dropped, truncated, tick, last.length + 1, last.episode_return + reward, terms)

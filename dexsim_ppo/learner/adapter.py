@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dexsim.core.compilation import check_float32
 from dexsim.core.config import NoSettings
 from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import choose, pytree_dataclass
@@ -20,6 +21,8 @@ from dexsim_ppo.learner.types import Environment, Field
 
 CONTROL_PERIOD = 0.05
 """Length of a step, s, where an environment does not say; only reports and policies speak of it."""
+LONGEST = 1_000_000
+"""Largest time limit, steps: an evaluation runs episodes to their end, and keeps the metrics of every step."""
 
 
 class SimpleEnvironment(Protocol):
@@ -72,14 +75,14 @@ class Adapted:
 
     def __init__(self, env: SimpleEnvironment, name: str):
         self.name, self._env = name, env
-        self._check()
-        self.action_size, self.evaluation_steps = env.action_size, env.max_steps
+        observation_size, self.action_size, self.evaluation_steps = self._sizes()
+        self._check(observation_size, self.action_size)
         period = getattr(env, "control_period", CONTROL_PERIOD)
         if not isinstance(period, int | float) or not 1e-3 <= period <= 1.0:
             raise self._error(f"control_period = {period!r} s: must be a number between 0.001 and 1")
         self.control_period = float(period)
         # One vector for both networks, scaled by its running statistics.
-        fields = (Field("observation", env.observation_size, None),)
+        fields = (Field("observation", observation_size, None),)
         self.observation_layout: Mapping[str, Any] = {"actor": fields, "critic": fields}
 
     def reset(self, key: jax.Array) -> AdaptedState:
@@ -98,7 +101,7 @@ class Adapted:
         reward, clock = jnp.asarray(reward, jnp.float32), state.clock + 1
         total, length = state.metrics["return"] + reward, state.metrics["length"] + 1.0
         terminated = jnp.asarray(terminated, bool)
-        truncated = (clock >= self._env.max_steps) & ~terminated
+        truncated = (clock >= self.evaluation_steps) & ~terminated
         metrics = self._metrics(inner, total, length)
         return AdaptedState(inner, self._seen(observation), reward, terminated, truncated, metrics, clock, key)
 
@@ -109,7 +112,7 @@ class Adapted:
 
     def stagger(self, state: AdaptedState, key: jax.Array) -> AdaptedState:
         """The episode's clock at a random time."""
-        return replace(state, clock=jax.random.randint(key, (), 0, self._env.max_steps))
+        return replace(state, clock=jax.random.randint(key, (), 0, self.evaluation_steps))
 
     def evaluation_plan(self, count: int, seed: int) -> AdaptedPlan:
         """`count` episodes, each from a key of its own."""
@@ -144,21 +147,28 @@ class Adapted:
     def _error(self, text: str) -> ConfigError:
         return ConfigError(f"environment {self.name!r}: {text}")
 
-    def _check(self) -> None:
-        """Raises ConfigError: a member is missing, or gives something of another shape or type."""
-        env, key = self._env, jax.random.key(0)
-        wanted = ("observation_size", "action_size", "max_steps", "reset", "step")
-        if missing := [name for name in wanted if not hasattr(env, name)]:
-            raise self._error(f"a {type(env).__name__} has no {', '.join(missing)}")
+    def _sizes(self) -> list[int]:
+        """Sizes of observation and action, and the time limit. Raises ConfigError: a member is missing or no size."""
+        wanted, sizes = ("observation_size", "action_size", "max_steps", "reset", "step"), list[int]()
+        if missing := [name for name in wanted if not hasattr(self._env, name)]:
+            raise self._error(f"a {type(self._env).__name__} has no {', '.join(missing)}")
         for name in wanted[:3]:
-            value = getattr(env, name)
-            if type(value) is not int or value < 1:
+            value = getattr(self._env, name)
+            if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
                 raise self._error(f"{name} = {value!r}: must be a whole number of at least 1")
+            sizes.append(int(value))
+        if sizes[2] > LONGEST:
+            raise self._error(f"max_steps = {sizes[2]}: must be at most {LONGEST}, for an evaluation runs that many")
+        return sizes
+
+    def _check(self, observation_size: int, action_size: int) -> None:
+        """Raises ConfigError: a member gives something of another shape or type."""
+        env, key = self._env, jax.random.key(0)
         begun = self._shapes("reset(key)", 2, env.reset, key)
-        action = jax.ShapeDtypeStruct((env.action_size,), jnp.float32)
+        action = jax.ShapeDtypeStruct((action_size,), jnp.float32)
         after = self._shapes("step(key, state, action)", 4, env.step, key, begun[1], action)
         for call, found in (("reset", begun[0]), ("step", after[0])):
-            self._check_array(f"{call}: the observation", found, (env.observation_size,))
+            self._check_array(f"{call}: the observation", found, (observation_size,))
         self._check_array("step: the reward", after[2], ())
         self._check_array("step: what says whether it terminated", after[3], ())
         if np.dtype(after[3].dtype) != np.dtype(bool):
@@ -168,6 +178,10 @@ class Adapted:
             if not isinstance(own, dict):
                 raise self._error(f"metrics(state) gives {type(own).__name__} where a dict is wanted")
             for name, value in own.items():
+                if not isinstance(name, str) or name in ("return", "length"):
+                    raise self._error(
+                        f"metrics: {name!r} must be a word other than 'return' and 'length', the learner's"
+                    )
                 self._check_array(f"metrics: {name!r}", value, ())
         # The state is carried through a compiled loop: it must stay what it is.
         old, new = (jax.tree_util.tree_flatten_with_path(state)[0] for state in (begun[1], after[1]))
@@ -206,6 +220,7 @@ def adapt(env: Any, name: str) -> Environment:
       name: of the task, for reports and policies.
 
     Raises:
-      ConfigError: a member is missing, or gives something of another shape or type.
+      ConfigError: a member is missing, or gives something of another shape or type; or JAX is set to float64.
     """
+    check_float32()
     return env if hasattr(env, "observation_layout") else Adapted(env, name)

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
 
-from dexsim.core.compilation import jit
+from dexsim.core.compilation import check_float32, jit
 from dexsim.core.errors import ConfigError
 from dexsim_ppo.learner import distribution
 from dexsim_ppo.learner.config import PPOConfig
@@ -65,7 +65,12 @@ class Training(NamedTuple):
 def make_train(
     env: Environment, config: PPOConfig, curriculum: Curriculum | None = None, mesh: Mesh | None = None
 ) -> Training:
-    """Compiled `init` and `step` for this environment; with a mesh, over its devices (`learner.devices.sharding`)."""
+    """Compiled `init` and `step` for this environment; with a mesh, over its devices (`learner.devices.sharding`).
+
+    Raises:
+      ConfigError: JAX is set to float64.
+    """
+    check_float32()
     if curriculum is not None and not curriculum.on:
         curriculum = None
 

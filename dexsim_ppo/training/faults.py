@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dexsim.core.errors import DexsimError
+from dexsim.registry import task_option
 from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.state import TrainState
 from dexsim_ppo.training import processes
@@ -92,7 +93,8 @@ class Faults:
         return self._how_to_replay()
 
     def _how_to_replay(self) -> str:
-        return f"; replay: python -m dexsim_ppo.reproduce {self._files[-1]}" if self._files else ""
+        option = task_option(self._content["task"])
+        return f"; replay: python -m dexsim_ppo.reproduce {self._files[-1]}{option}" if self._files else ""
 
     def _from_before(self) -> str:
         """Which checkpoints are from before the fault: later ones hold its state."""

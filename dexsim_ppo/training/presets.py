@@ -6,6 +6,7 @@ from typing import Any
 import jax
 
 from dexsim.core.compilation import available_cores
+from dexsim.core.errors import ConfigError
 from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.curriculum import Curriculum
 from dexsim_ppo.training.arguments import TrainArguments
@@ -115,7 +116,13 @@ def find_preset(name: str, task: str) -> Preset:
 
 
 def preset_arguments(task: str, env_config: Any, name: str) -> TrainArguments:
-    """The options' defaults under a preset."""
+    """The options' defaults under a preset.
+
+    Raises:
+      ConfigError: there is no such preset.
+    """
+    if name != "auto" and name not in PRESETS:
+        raise ConfigError(f"preset {name!r}: choose from auto, {', '.join(PRESETS)}")
     preset = find_preset(device_preset() if name == "auto" else name, task)
     if not hasattr(env_config, "randomization"):  # An environment from elsewhere: no ranges, and small as a rule.
         preset = replace(preset, extremes=0.0, ppo=replace(preset.ppo, memory="none"))

@@ -15,6 +15,8 @@ import numpy as np
 
 from dexsim.core.cli import plain
 from dexsim.core.errors import CheckpointError, ConfigError
+from dexsim.core.files import write_whole
+from dexsim_ppo.policy import Policy
 from dexsim_ppo.training.arguments import TrainArguments, printable
 
 CURVES = {
@@ -66,16 +68,28 @@ class RunFolder:
             self.report.rename(self.path / f"report-{number}.json")
 
     def set_aside(self, after: int) -> None:
-        """Rename the checkpoints of later iterations than the one that is resumed: they are of another course, and the
-        newest would be resumed next time."""
-        for path in self.existing_checkpoints():
-            if int(path.stem) > after:
-                path.rename(path.with_suffix(".aside.msgpack"))
+        """Rename what is of later iterations than the one that is resumed, checkpoints and the best policy: it is of
+        another course. The newest checkpoint would be resumed next time, and the best policy be replaced or reported.
+
+        Raises:
+          CheckpointError: the best policy's file is unsound.
+        """
+        later = [path for path in self.existing_checkpoints() if int(path.stem) > after]
+        if self.best.exists() and Policy.load(self.best).training.get("iteration", 0) > after:
+            later.append(self.best)
+        for path in later:
+            path.rename(_aside(path))
 
     def prune(self, keep: int) -> None:
         """Delete all but the newest `keep` checkpoints."""
         for path in self.existing_checkpoints()[:-keep]:
             path.unlink()
+
+
+def _aside(path: Path) -> Path:
+    """The name under which a file is set aside, numbered where one of an earlier course has it."""
+    names = (f"{path.stem}.aside{number or ''}{path.suffix}" for number in itertools.count())
+    return next(free for name in names if not (free := path.with_name(name)).exists())
 
 
 def new_folder(path: Path | None, task: str) -> Path:
@@ -127,7 +141,7 @@ class MetricsLog:
     def __init__(self, folder: RunFolder, first_iteration: int, arguments: TrainArguments):
         rows = [row for row in read_metrics(folder.metrics) if row["iteration"] <= first_iteration]
         # A resumed run repeats what came after its checkpoint.
-        folder.metrics.write_text("".join(json.dumps(row) + "\n" for row in rows))
+        write_whole(folder.metrics, ["".join(json.dumps(row) + "\n" for row in rows).encode()])
         folder.set_aside(first_iteration)
         self._file = folder.metrics.open("a", buffering=1)
         self._tensorboard = _tensorboard_writer(folder.path)
@@ -156,14 +170,25 @@ class MetricsLog:
 
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:
-    """Rows of a metrics file; a truncated last line is left out."""
-    rows = []
-    for line in path.read_text().splitlines() if path.exists() else []:
-        try:
-            rows.append(json.loads(line))
-        except json.JSONDecodeError:
-            break
-    return rows
+    """Rows of a metrics file; a truncated last line is left out.
+
+    Raises:
+      CheckpointError: another line is no row.
+    """
+    lines = path.read_text(errors="replace").splitlines() if path.exists() else []
+    rows = [_row(line) for line in lines]
+    if None in rows[:-1]:
+        raise CheckpointError(f"{path}: line {rows.index(None) + 1} holds no metrics; mend the file or move it away")
+    return [row for row in rows if row is not None]
+
+
+def _row(line: str) -> dict[str, Any] | None:
+    """A line of a metrics file; None if it is something else."""
+    try:
+        row = json.loads(line)
+    except ValueError:
+        return None
+    return row if isinstance(row, dict) and type(row.get("iteration")) is int else None
 
 
 def means(metrics: Mapping[str, Any]) -> dict[str, float]:

@@ -19,7 +19,7 @@ from dexsim_real.core.log import Kind, LogWriter
 from dexsim_real.core.process import leave_realtime, use_realtime
 from dexsim_real.sensors.hand import HandSensing
 from dexsim_real.wire.identity import check_identity
-from dexsim_real.wire.link import HandPort
+from dexsim_real.wire.link import HandPort, greet
 from dexsim_real.wire.serial_hand import open_port
 
 
@@ -62,9 +62,8 @@ class Workbench:
             # Only during the procedure: long computations in a real-time thread would starve the machine.
             if self._arguments.realtime:
                 use_realtime()
-            self._say(self.loop.port.connect())
-            for warning in getattr(self.loop.port, "warnings", list)():
-                self._say(f"warning: {warning}")
+            for line in greet(self.loop.port):
+                self._say(line)
             identity, calibration = getattr(self.loop.port, "identity", None), self._arguments.calibration
             known = load_calibration(calibration, self.loop.sensing.hand) if calibration else None
             for note in check_identity(identity, self.loop.sensing.hand, known):

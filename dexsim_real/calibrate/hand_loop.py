@@ -4,6 +4,7 @@ In a run a separate thread keeps the delays of a policy away from the hand. A pr
 makes an exchange and returns its result. Clock and hand can be simulated.
 """
 
+import contextlib
 import dataclasses
 import queue
 import sys
@@ -24,7 +25,7 @@ from dexsim_real.core.timing import Pace
 from dexsim_real.sensors.hand import HandSensing, VelocityFilter
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Command, Frame, Mode
-from dexsim_real.wire.link import HandPort, Reply, checked
+from dexsim_real.wire.link import HandPort, Reply, checked, refusal_of
 
 _PATIENCE = 2.0  # s, longest hold by `Safety` or silence of the hand
 
@@ -89,7 +90,7 @@ class HandLoop:
         self.driven |= decision.mode == Mode.POSITION
         reply = self.port.exchange(command)
         if reply is None:
-            self.safety.refuse(getattr(self.port, "refusal", None))
+            self.safety.refuse(refusal_of(self.port))
         exchange = None if reply is None else self._take(checked(reply, self.clock()), decision.reaction)
         self._check(now, decision, reply)
         self.pace.wait()
@@ -132,7 +133,8 @@ class HandLoop:
                 self.driven = False
         finally:
             self._closed = True
-            self.port.close()
+            with contextlib.suppress(Exception):  # Of a driver from elsewhere; the hand has been told.
+                self.port.close()
 
     # --- pieces ---------------------------------------------------------------------------------
 

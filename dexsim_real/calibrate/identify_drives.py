@@ -25,7 +25,7 @@ from dexsim_real.calibrate.hand_loop import Operator
 from dexsim_real.calibrate.options import CalibrateArguments
 from dexsim_real.calibrate.taxel_check import check_answered
 from dexsim_real.core.errors import HandError
-from dexsim_real.core.log import Kind, LogError, LogReader
+from dexsim_real.core.log import Kind, LogError, LogReader, reading
 from dexsim_real.core.process import stopping
 from dexsim_real.sensors.hand import HardwareConfig
 from dexsim_real.wire import frames
@@ -130,18 +130,19 @@ def read_logs(
     hardware, period = HardwareConfig(), 0.0
     for path in paths:
         task, received = None, (-1, b"")  # The first exchange that is recorded may be unanswered.
-        for record in LogReader(path):
-            content = record.content
-            if record.kind == Kind.META and "task" in content:
-                task, period = content["task"], 1.0 / content["rate"]
-                hardware = from_dict(HardwareConfig, content["hardware"])
-            elif record.kind == Kind.SENT:
-                sent = content
-            elif record.kind == Kind.RECEIVED:
-                received = content
-            elif record.kind == Kind.TICK and task == TASK:
-                answer = received[1] if received[0] == content["sequence"] else None
-                parts.setdefault((content["joint"], content["signal"]), []).append((sent[1], answer))
+        with reading(path):
+            for record in LogReader(path):
+                content = record.content
+                if record.kind == Kind.META and "task" in content:
+                    task, period = content["task"], 1.0 / content["rate"]
+                    hardware = from_dict(HardwareConfig, content["hardware"])
+                elif record.kind == Kind.SENT:
+                    sent = content
+                elif record.kind == Kind.RECEIVED:
+                    received = content
+                elif record.kind == Kind.TICK and task == TASK:
+                    answer = received[1] if received[0] == content["sequence"] else None
+                    parts.setdefault((content["joint"], content["signal"]), []).append((sent[1], answer))
         if task != TASK:
             found = f"it is a log of {task!r}" if task else "it ends before the hand was ready"
             raise LogError(f"{path}: this is not a log of --identify: {found}")

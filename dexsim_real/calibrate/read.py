@@ -12,7 +12,7 @@ from dexsim.hand.kinematics import Hand
 from dexsim_real.calibrate.options import CheckConfig
 from dexsim_real.calibrate.press_procedure import REST
 from dexsim_real.calibrate.taxel_check import raw_sensing
-from dexsim_real.core.log import Kind, LogError, LogReader
+from dexsim_real.core.log import Kind, LogError, LogReader, reading
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
 from dexsim_real.wire import frames
 
@@ -61,7 +61,8 @@ def read_logs(paths: Iterable[Path], hand: Hand) -> PressSession:
     """
     session: PressSession | None = None
     for path in paths:
-        found = _Reader(Path(path), hand).read()
+        with reading(path):
+            found = _Reader(Path(path), hand).read()
         if session is None:
             session = found
         elif (found.hardware, found.rate) != (session.hardware, session.rate):

@@ -4,15 +4,16 @@ import time
 
 import numpy as np
 
-from dexsim_real.wire.link import HandPort
+from dexsim_real.wire.link import HandPort, Reply
 
 UNCONFIRMED = "the hand did not confirm that its motors are off"
 PATIENCE = 5.0  # s for which a hand that was on and does not answer is told to turn its motors off
+_PAUSE = 0.01  # s after an error of the port
 _BRIEF = 0.3  # s, the same for a hand that was off already
 
 
 def turn_off(port: HandPort, command: np.ndarray, seconds: float) -> bool:
-    """Send a command until the hand answers it; a port that fails is opened again.
+    """Send a command until the hand answers it; a port that fails is asked again.
 
     Args:
       port: connected, or lost.
@@ -23,10 +24,14 @@ def turn_off(port: HandPort, command: np.ndarray, seconds: float) -> bool:
       Whether the hand has confirmed it.
     """
     until = time.monotonic() + seconds
-    while port.exchange(command) is None:
+    while True:
+        try:
+            if isinstance(port.exchange(command), Reply):
+                return True
+        except Exception:  # Of a driver from elsewhere, which may work again.
+            time.sleep(_PAUSE)
         if time.monotonic() > until:
             return False
-    return True
 
 
 def patience(driven: bool) -> float:

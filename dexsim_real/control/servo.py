@@ -4,6 +4,7 @@ The policy runs in another thread at a lower rate. If it dies, this thread conti
 this thread, it turns the motors off.
 """
 
+import contextlib
 import threading
 import time
 from collections.abc import Callable
@@ -14,7 +15,7 @@ from dexsim_real.core.process import ignore_signals, raise_priority
 from dexsim_real.core.timing import Pace, Timing
 from dexsim_real.sensors.hand import HandSensing, VelocityFilter
 from dexsim_real.wire.frames import Mode
-from dexsim_real.wire.link import HandPort, Reply, checked
+from dexsim_real.wire.link import HandPort, Reply, checked, refusal_of
 
 
 class Servo:
@@ -118,7 +119,7 @@ class Servo:
         reply = self.port.exchange(self.sensing.command(decision.position, decision.mode))
         took = time.monotonic() - started
         if reply is None:
-            self.safety.refuse(getattr(self.port, "refusal", None))
+            self.safety.refuse(refusal_of(self.port))
             return took
         reply = checked(reply, time.monotonic())
         self.driven = decision.mode == Mode.POSITION
@@ -151,4 +152,5 @@ class Servo:
             if turn_off(self.port, off, patience(self.driven)):
                 self.driven = False
         finally:
-            self.port.close()
+            with contextlib.suppress(Exception):  # Of a driver from elsewhere; the hand has been told.
+                self.port.close()

@@ -112,7 +112,7 @@ class LogWriter:
             batch = []
             with contextlib.suppress(queue.Empty):
                 while True:
-                    batch.append(encode(*self._queue.get_nowait()))
+                    batch += self._encoded(*self._queue.get_nowait())
                     time.sleep(0)  # Releases the interpreter lock to a waiting thread.
             try:
                 _write_all(self._file, b"".join(batch))
@@ -124,6 +124,15 @@ class LogWriter:
                 self.dropped += len(batch)
             if last:
                 return
+
+    def _encoded(self, kind: Kind, when: float, content: Any) -> list[bytes]:
+        """The bytes of a record; none if it cannot be written, which must not end the thread."""
+        try:
+            return [encode(kind, when, content)]
+        except Exception as error:
+            self.failure = f"{self.path}: a {kind.name} record cannot be written ({error})"
+            self.dropped += 1
+            return []
 
 
 def encode(kind: Kind, when: float, content: Any) -> bytes:
@@ -166,6 +175,23 @@ class LogReader:
             else:
                 at += size
                 yield record
+
+
+@contextlib.contextmanager
+def reading(path: str | Path) -> Iterator[None]:
+    """Within this context a record that is intact, and yet not as the bridge writes it, is refused in one line.
+
+    Raises:
+      LogError: there is such a record.
+    """
+    try:
+        yield
+    except DexsimError:
+        raise
+    except Exception as error:  # Whatever stands in a forged record, its reader raises another one.
+        raise LogError(
+            f"{path}: a record is not as the bridge writes it ({type(error).__name__}: {error}); record again"
+        ) from error
 
 
 def _decode(data: bytes, at: int) -> tuple[Record | None, int]:

@@ -20,7 +20,7 @@ from dexsim.hand.source import recorded_hand
 from dexsim.observation import LayoutEntry, Readings, layout
 from dexsim_ppo.retired import old_spec, read_spec
 from dexsim_real.control.controller import make_observe
-from dexsim_real.core.log import Kind, LogError, LogReader
+from dexsim_real.core.log import Kind, LogError, LogReader, reading
 from dexsim_real.sensors.hand import HandMeasurement, HandSensing, HardwareConfig
 from dexsim_real.wire import frames
 
@@ -56,6 +56,11 @@ def replay(path: Path, hand: str = "") -> Replay:
       ConfigError: the log is of another hand.
       LogError: not a log, or one of another command, or the log ends before the hand was ready.
     """
+    with reading(path):
+        return _replay(path, hand)
+
+
+def _replay(path: Path, hand: str) -> Replay:
     reader = LogReader(path)
     states: dict[int, bytes] = {}
     times, measured, observations, notes = [], [], [], []

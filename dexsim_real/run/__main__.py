@@ -30,6 +30,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     if not (arguments.yes or arguments.motors_off):
         consent.check_terminal()
+    if arguments.output:
+        cli.check_writable(arguments.output)
     prepare_jax()
     cli.enable_caches()
     session = Session(arguments)

@@ -37,7 +37,7 @@ from dexsim_real.run.status import StatusView
 from dexsim_real.sensors.hand import HandSensing
 from dexsim_real.wire.frames import Mode, empty_state
 from dexsim_real.wire.identity import check_identity
-from dexsim_real.wire.link import checked
+from dexsim_real.wire.link import checked, greet, refusal_of
 from dexsim_real.wire.serial_hand import open_port
 
 _TARE_SAMPLES = 30
@@ -95,9 +95,8 @@ class Session:
         Raises:
           HandError: something is missing or does not answer.
         """
-        self._note(self.port.connect())
-        for warning in getattr(self.port, "warnings", list)():
-            self._note(f"warning: {warning}")
+        for line in greet(self.port):
+            self._note(line)
         for note in check_identity(getattr(self.port, "identity", None), self.sensing.hand, self.sensing.calibration):
             self._note(note)
         if self.arguments.tare:
@@ -187,7 +186,7 @@ class Session:
             reply = self.port.exchange(self.sensing.command(self.sensing.hand.joint_lower, Mode.PASSIVE))
             if reply is not None:
                 states.append(checked(reply, time.monotonic()).state)
-            elif (refusal := getattr(self.port, "refusal", None)) and refusal.serious:
+            elif (refusal := refusal_of(self.port)) and refusal.serious:
                 raise HandError(f"{self.arguments.port}: {refusal.text}")
         if len(states) < _TARE_SAMPLES:
             raise HandError(
@@ -233,8 +232,9 @@ class Session:
     def _check(self) -> None:
         if self.guard:
             self.guard.check()
-        if self.servo.error is not None:
-            raise HandError(f"the exchange thread failed: {self.servo.error!r}")
+        if (error := self.servo.error) is not None:
+            why = error if isinstance(error, HandError) else repr(error)
+            raise HandError(f"the exchange thread failed: {why}")
         if self.safety.latched:
             raise HandError(f"stopped: {self.safety.latched}")
 

@@ -8,6 +8,7 @@ from typing import Any
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
+from rich.markup import escape
 from rich.table import Table
 
 from dexsim_real.core.process import lower_priority
@@ -88,17 +89,18 @@ class StatusView:
     def _tables(self, status: Status) -> RenderableType:
         rows = Table.grid(padding=(0, 2))
         for row in status.rows.items():
-            rows.add_row(*row)
-        return Group(self._title, *([hand_tables(status.hand)] if status.hand else []), "", rows)
+            rows.add_row(*map(escape, row))
+        return Group(escape(self._title), *([hand_tables(status.hand)] if status.hand else []), "", rows)
 
 
 def summary_table(title: str, summary: dict[str, Any]) -> Table:
     """A table of nested results."""
-    table = Table("measure", "value", title=title, title_justify="left")
+    # Escaped, since an error may have text in brackets, which Rich would take for its markup.
+    table = Table("measure", "value", title=escape(title), title_justify="left")
     for name, value in summary.items():
         if isinstance(value, dict):
             value = ", ".join(f"{k} {_short(v)}" for k, v in value.items() if v not in (0, {}))
-        table.add_row(name.replace("_", " "), _short(value))
+        table.add_row(name.replace("_", " "), escape(_short(value)))
     return table
 
 

@@ -131,6 +131,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         prog="python -m dexsim_real.twin",
         description="Emulate a hand on a pseudo-terminal.",
     )
+    if arguments.output:
+        cli.check_writable(arguments.output)
     hand = load_hand(arguments.hand or None)
     check_wire(hand)
     if arguments.policy:

@@ -51,6 +51,8 @@ def check_identity(identity: Identity | None, hand: Hand, calibration: Calibrati
     Raises:
       HandError: it is another hand.
     """
+    if identity is not None and not isinstance(identity, Identity):
+        raise HandError(f"the driver's `identity` is {identity!r:.80}; expected an `Identity`, or None")
     found = identity or Identity()
     model = next((side for side in _SIDES if side in hand.name), "")
     if model and found.handedness in _SIDES and found.handedness != model:

@@ -6,16 +6,25 @@ another implementation.
 
 import dataclasses
 import math
-from typing import Protocol
+import numbers
+from typing import Any, Protocol
 
 import numpy as np
 
 from dexsim.core.config import check_ranges, setting, validate
 from dexsim_real.core.errors import HandError
 from dexsim_real.wire import frames
+from dexsim_real.wire.refusals import Refusal
 
 BITS_PER_BYTE = 10  # 8N1
 _AHEAD = 1.0  # s, by which no stamp of the same clock is ahead
+_NUMBERS: dict[str, type] = {
+    "sent": numbers.Real,
+    "received": numbers.Real,
+    "sequence": numbers.Integral,
+    "generation": numbers.Integral,
+}
+"""Fields of a `Reply` that are one number."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -87,8 +96,15 @@ def checked(reply: Reply, now: float) -> Reply:
       now: s, of the clock that `received` is of. A stamp a little ahead of it becomes `now`: it must grow old.
 
     Raises:
-      HandError: the state is none, is of another hand, or was stamped by another clock.
+      HandError: it is no reply, its state is none, is of another hand, or was stamped by another clock.
     """
+    if not isinstance(reply, Reply):
+        raise HandError(
+            f"the driver answered with {type(reply).__name__}; expected a `Reply`, or None without an answer"
+        )
+    for name, kind in _NUMBERS.items():
+        if not isinstance(value := getattr(reply, name), kind):
+            raise HandError(f"the driver's reply has {name} {value!r:.80}; expected a number")
     state, received = reply.state, reply.received
     if not isinstance(state, np.ndarray) or state.dtype != frames.STATE_BLOCK or state.shape != ():
         found = f"{state.dtype.name} {list(state.shape)}" if isinstance(state, np.ndarray) else type(state).__name__
@@ -100,6 +116,46 @@ def checked(reply: Reply, now: float) -> Reply:
             f"the driver stamped its reply {received - now:.3g} s ahead: `Reply.received` is of `time.monotonic()`"
         )
     return dataclasses.replace(reply, received=min(received, now))
+
+
+def refusal_of(port: "HandPort") -> Refusal | None:
+    """Why the newest exchange was refused, if the port tells it.
+
+    Raises:
+      HandError: the driver tells it in another form.
+    """
+    found = getattr(port, "refusal", None)
+    if found is not None and not isinstance(found, Refusal):
+        raise HandError(f"the driver's `refusal` is {found!r:.80}; expected a `Refusal`, or None")
+    return found
+
+
+def greet(port: "HandPort") -> list[str]:
+    """Connect a hand; returns lines for the user: what it is, and the port's warnings.
+
+    Raises:
+      HandError: see `HandPort.connect`; or a driver returned something else than text.
+    """
+    line = port.connect()
+    warnings: Any = getattr(port, "warnings", list)()
+    if not isinstance(line, str):
+        raise HandError(f"the driver's `connect` returned {line!r:.80}; expected one line of text")
+    if not isinstance(warnings, list | tuple) or not all(isinstance(warning, str) for warning in warnings):
+        raise HandError(f"the driver's `warnings` returned {warnings!r:.80}; expected a list of lines")
+    return [line, *(f"warning: {warning}" for warning in warnings)]
+
+
+def check_port(port: Any, spec: str) -> None:
+    """Check that a driver's function returned a port.
+
+    Raises:
+      HandError: it returned something else.
+    """
+    lacking = [name for name in ("counts", "connect", "exchange", "close") if not hasattr(port, name)]
+    if lacking:
+        raise HandError(f"{spec}: it returned {type(port).__name__} without {lacking[0]!r}; expected a `HandPort`")
+    if not isinstance(port.counts, LinkCounts):
+        raise HandError(f"{spec}: `counts` is {type(port.counts).__name__}; expected `LinkCounts`")
 
 
 class HandPort(Protocol):

@@ -95,6 +95,8 @@ def test_a_policy_of_another_task_is_refused(run):
 
 
 def test_what_is_refused(run):
+    with pytest.raises(ConfigError, match="EvaluateArguments.episodes = -4: must be between 0 and"):
+        evaluate_policy(run.policy, episodes=-4)
     with pytest.raises(ConfigError, match="no option 'epochs'"):
         train_policy("poke", epochs=3)
     with pytest.raises(ConfigError, match="give one of them"):

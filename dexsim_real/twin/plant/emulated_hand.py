@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 
 from dexsim.hand.kinematics import Hand
+from dexsim_real.core.errors import HandError
 from dexsim_real.twin.plant.assistant import PALM_FACE, Assistant, Place, Stage, clear, find_place, put
 from dexsim_real.twin.plant.contacts import tip_contacts
 from dexsim_real.twin.plant.drives import PERIOD, Drives
@@ -26,6 +27,7 @@ from dexsim_real.wire.frames import Mode
 
 IMU_TRANSPORT = 0.0017  # s for the bytes of an orientation
 _LOOK = 0.01  # s between two updates of the referee
+_OBJECTS = 200  # sampled for a trial, until one has room between the fingers
 _MEMORY = 0.2  # s, longest delay of a sensor
 
 
@@ -181,7 +183,7 @@ class EmulatedHand:
             return
         rng = np.random.default_rng([self.seed, self.trial])
         joints = self._rest if self._data is None else self._joints()
-        while True:  # Some objects fit nowhere between the fingers: sample another.
+        for _ in range(_OBJECTS):  # Some fit nowhere between the fingers: sample another.
             self.parameters: TrialParameters = sample_trial(self.task, rng, self.kind, self._overrides)
             self.shape: ObjectShape = sample_shape(self.parameters, rng, self._shape)
             self._gravity = tilted_gravity(self.task, self.parameters.gravity_tilt)
@@ -189,6 +191,8 @@ class EmulatedHand:
             place = find_place(scene, self.parameters, self.shape, rng, self._palm_face)
             if place is not None:
                 break
+        else:
+            raise HandError(f"trial {self.trial}: none of {_OBJECTS} objects had room in the hand's start posture")
         self._enter(scene, place)
         self._noise, self._object_noise, pushing = rng.spawn(3)
         self._pushes = Pushes(self.parameters, pushing)
@@ -204,8 +208,7 @@ class EmulatedHand:
         self._tips, self._normal = np.zeros((5, 3)), np.zeros(5)
         self._touches: list[Any] = []
         self._past: collections.deque[_Past] = collections.deque(maxlen=round(_MEMORY / self._period))
-        samples = round(_MEMORY / float(self.parameters.taxel_period)) + 2
-        self._samples: collections.deque = collections.deque(maxlen=samples)
+        self._samples = collections.deque[Any](maxlen=round(_MEMORY / float(self.parameters.taxel_period)) + 2)
         self._next_sample = self.time
         self._remember()
 
@@ -338,10 +341,8 @@ class EmulatedHand:
         return self._past[-1 - back]
 
     def _delayed_taxel_force(self, late: float) -> np.ndarray:
-        for time, force in reversed(self._samples):
-            if time <= self.time - late + 1e-9:
-                return force
-        return np.zeros((5, self.hand.num_taxels, 3))
+        taken = (force for time, force in reversed(self._samples) if time <= self.time - late + 1e-9)
+        return next(taken, np.zeros((5, self.hand.num_taxels, 3)))
 
     def _reported_current(self, past: _Past) -> np.ndarray:
         """Reported current [12] mA, positive when opening."""

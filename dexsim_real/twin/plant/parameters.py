@@ -150,6 +150,10 @@ STRUCTURE: dict[str, float | tuple[float, ...]] = {
 """Parameters that training does not randomise or does not model: one value for all trials."""
 
 
+_SIZES = TASK_BANDS["grasp"].keys() - {"gap", "release_speed"} | {"edge"}
+_POSITIVE = _SIZES | {"inertia_scale", "stiffness_contact", "palm_stiffness", "taxel_period"}
+"""What is divided by, or has to have a size or a mass."""
+
 PUSHES = {"grasp": (0.5, 0.3), "rotate": (1 / 6, 0.1)}
 """Pushes per second, and largest change of velocity m/s by a push, as in the evaluation of each task."""
 
@@ -202,8 +206,18 @@ def sample_trial(
             raise HandError(f"the emulated hand has no parameter {name!r}; choose from {known}")
         if isinstance(number, str) and (number not in KINDS or name not in table):
             raise HandError(f"{name} = {number!r}: give a number, or for a sampled parameter one of {', '.join(KINDS)}")
+        if not isinstance(number, str):
+            _check(name, number, table.get(name))
     kinds = {name: number for name, number in given.items() if isinstance(number, str)}
     value = {name: table[name].sample(rng, kinds.get(name, kind)) for name in sorted(table)}
     value |= {name: np.asarray(number, float) for name, number in STRUCTURE.items()}
     value |= {name: np.full_like(value[name], number) for name, number in given.items() if name not in kinds}
     return TrialParameters(task, kind, value)
+
+
+def _check(name: str, number: float, band: Band | None) -> None:
+    """Refuse a value that no hand or object has. Only what lies to both sides of zero may be negative."""
+    if name in _POSITIVE and not number > 0:
+        raise HandError(f"{name} = {number:g}: must be above 0")
+    if (band is None or band.low >= 0) and not number >= 0:
+        raise HandError(f"{name} = {number:g}: must not be negative")

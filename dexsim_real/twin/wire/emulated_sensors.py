@@ -7,6 +7,7 @@ from the plant; this module adds formats, rates and lost pictures.
 
 import contextlib
 import dataclasses
+import errno
 import math
 import socket
 from collections import Counter
@@ -110,6 +111,12 @@ class EmulatedImu(Clocked):
         self.terminal.read()  # It ignores what it receives.
         self.terminal.write(rvc_frame(self.sent, world @ _matrix(quat) @ self._mount, self._mount.T @ felt))
         self.sent += 1
+
+
+def _abandoned(path: Path) -> bool:
+    """Whether a socket was left by a program that has ended: nobody listens."""
+    with socket.socket(socket.AF_UNIX) as probe:
+        return probe.connect_ex(str(path)) == errno.ECONNREFUSED
 
 
 def _matrix(quat: np.ndarray) -> np.ndarray:
@@ -217,13 +224,14 @@ class EmulatedCamera(Clocked):
         self._clients: dict[socket.socket, bytearray] = {}
         self._server = socket.socket(socket.AF_UNIX)
         try:
-            if path.is_socket():
-                path.unlink()  # Left by a program that has ended.
+            if path.is_socket() and _abandoned(path):
+                path.unlink()
             self._server.bind(str(path))
         except OSError as error:
             self._server.close()
             raise HandError(
-                f"{path}: the socket for masks cannot be created ({error.strerror}); choose another --mask-socket"
+                f"{path}: the socket for masks cannot be created ({error.strerror or error}); choose another "
+                "--mask-socket"
             ) from None
         self._server.listen()
         self._server.setblocking(False)

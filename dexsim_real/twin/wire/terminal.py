@@ -9,6 +9,7 @@ from pathlib import Path
 from dexsim_real.core.errors import HandError
 
 _RATES = {getattr(termios, name): int(name[1:]) for name in dir(termios) if name[0] == "B" and name[1:].isdigit()}
+_TERMINALS = "/dev/pts/"
 
 
 class Terminal:
@@ -18,14 +19,15 @@ class Terminal:
       link: path of the link.
 
     Raises:
-      HandError: the path exists and is not a link, or no terminal can be created.
+      HandError: the path exists and is not a link to a terminal like this one, or no terminal can be created.
     """
 
     def __init__(self, link: Path):
         self.name = Path(link)
         self._master = self._slave = -1
-        if self.name.exists() and not self.name.is_symlink():
-            raise HandError(f"{link}: already exists and is not a link; choose another path")
+        ours = self.name.is_symlink() and os.path.realpath(self.name).startswith(_TERMINALS)
+        if self.name.exists() and not ours:
+            raise HandError(f"{link}: already exists and is not a link to a pseudo-terminal; choose another path")
         self.open()
 
     def open(self) -> None:

@@ -5,6 +5,7 @@ import json
 import math
 import typing
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -40,6 +41,9 @@ class Chair:
     seat: Spring = setting(Spring())
     legs: int = setting(4)
 
+    def __post_init__(self):
+        validate(self)
+
 
 def message(build, *arguments, **keywords):
     with pytest.raises(ConfigError) as caught:
@@ -56,6 +60,13 @@ def message(build, *arguments, **keywords):
         (dict(stiffness=0.25), "Spring.stiffness = 0.25 N/m: must be between 0.5 and 8 N/m"),
         (dict(turns=0), "Spring.turns = 0: must be at least 1"),
         (dict(rest=0.2), "Spring.rest = 0.2 m: must be at most 0.1 m"),
+        (dict(stiffness="2"), "Spring.stiffness = '2': expected float"),
+        (dict(stiffness=None), "Spring.stiffness = None: expected float"),
+        (dict(turns=3.0), "Spring.turns = 3.0: expected int"),
+        (dict(turns=True), "Spring.turns = True: expected int"),
+        (dict(span=1.0), "Spring.span = 1.0: expected a list"),
+        (dict(span=(1.0,)), "Spring.span: expected 2 values, found 1"),
+        (dict(wound="no"), "Spring.wound = 'no': expected bool"),
         (dict(span=(0.0, 3.0)), "Spring.span = 3 m: must be between -1 and 2 m"),
         (dict(span=(1.0, 0.5)), "Spring.span = (1, 0.5): the first must not exceed the second"),
         (dict(wire="tin"), "Spring.wire = 'tin': choose from steel, brass"),
@@ -277,3 +288,12 @@ def test_a_type_that_only_a_type_checker_knows_does_not_hinder_the_check():
             validate(self)
 
     assert message(Lamp, colour="green") == "Lamp.colour = 'green': choose from red, blue"
+
+
+def test_a_configuration_is_no_table_and_numbers_of_numpy_become_pythons():
+    """As a file gives them back, so that they are saved, hashed and compared like those that were read."""
+    assert message(Chair, seat={"turns": 3}) == "Chair.seat = {'turns': 3}: expected a Spring"
+    spring = Spring(turns=np.int64(4), stiffness=np.float32(2.5), span=[np.float32(0.5), 1], wound=np.bool_(False))
+    assert spring == from_dict(Spring, json.loads(json.dumps(to_dict(spring))))
+    assert type(spring.turns) is int and type(spring.stiffness) is float and spring.span == (0.5, 1)
+    assert Spring(span=np.array([0.25, 0.5])).span == (0.25, 0.5) and hash(spring)

@@ -127,3 +127,36 @@ def test_it_is_evaluated_by_its_own_plan_and_report(env):
     report = env.summarize({}, np.array([[True, True], [True, False]]))
     assert report["headline"] == {"held": 0.5}
     assert env.spec.name == "balance" and env.spec.fields == Balance.fields["actor"]
+
+
+@pytest.mark.parametrize("reward", [1, True, jnp.int32(1), np.float64(1.0), jnp.float16(1.0)])
+def test_a_reward_may_be_any_number(env, monkeypatch, reward):
+    """A compiled loop carries it from the float that an episode begins with, in evaluation as in training."""
+    monkeypatch.setattr(Balance, "reward", lambda *_: (reward, {}))
+
+    def run(state):
+        return jax.lax.scan(lambda state, _: (env.step(state, jnp.zeros(env.action_size)), None), state, None, 3)[0]
+
+    state = jax.eval_shape(lambda key: run(env.reset(key)), jax.random.key(0))
+    assert (state.reward.shape, state.reward.dtype) == ((), jnp.float32)
+
+
+@pytest.mark.parametrize(
+    "method, gives, message",
+    [
+        ("reward", None, "reward gives NoneType where the reward and a dict of metrics are wanted"),
+        ("reward", (0.0, 0.0), "reward gives tuple where"),
+        ("reward", (jnp.zeros(2), {}), r"reward has the shape \(2,\), not \(\)"),
+        ("reward", (None, {}), "reward is a NoneType, not a number"),
+        ("reward", (0.0, {"far": jnp.zeros(3)}), r"reward: metric 'far' has the shape \(3,\)"),
+        ("dropped", jnp.zeros(()), "dropped is float32, not bool"),
+        ("dropped", jnp.zeros(4, bool), r"dropped has the shape \(4,\), not \(\)"),
+        ("update", Goal(jnp.zeros(2)), r"update makes goal.ticks float32\[2\], which was float32\[\]"),
+        ("update", Goal(jnp.int32(0)), r"update makes goal.ticks int32\[\], which was float32\[\]"),
+        ("update", (), "update gives a goal of another structure than before"),
+    ],
+)
+def test_rules_that_give_something_else_are_one_line(env, monkeypatch, method, gives, message):
+    monkeypatch.setattr(Balance, method, lambda *_: gives)
+    with pytest.raises(dexsim.ConfigError, match=f"^task 'balance': {message}"):
+        jax.eval_shape(lambda key: env.step(env.reset(key), jnp.zeros(env.action_size)), jax.random.key(0))

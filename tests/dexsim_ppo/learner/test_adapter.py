@@ -1,5 +1,6 @@
 """Environments from elsewhere: what the learner makes of five members, what it refuses, and gymnax as in the docs."""
 
+import contextlib
 import dataclasses
 import re
 import subprocess
@@ -14,6 +15,7 @@ from reach_env import MAX_STEPS, Broken, Reach
 from tiny_env import SMALL
 
 from dexsim import ConfigError, DexsimError, registry
+from dexsim.tasks.grasp.config import GraspConfig
 from dexsim_ppo import Policy, evaluate_policy, make_train, reproduce, train_policy
 from dexsim_ppo import evaluate as evaluate_command
 from dexsim_ppo.learner.adapter import adapt
@@ -75,6 +77,9 @@ def test_restart_is_a_new_episode_where_asked_and_keys_advance_either_way():
         ({"observation_size": 3}, r"observation has the shape \(2,\), not \(3,\)"),
         ({"action_size": 0}, "action_size = 0: must be a whole number of at least 1"),
         ({"max_steps": 2.0}, "max_steps = 2.0"),
+        ({"max_steps": 10**9}, "max_steps = 1000000000: must be at most 1000000"),
+        ({"metrics": lambda state: {1: state["x"]}}, "metrics: 1 must be a word"),
+        ({"metrics": lambda state: {"return": state["x"]}}, "metrics: 'return' must be a word other than"),
         ({"control_period": 60.0}, "control_period = 60.0 s"),
         ({"control_period": "fast"}, "control_period = 'fast' s: must be a number"),
         ({"metrics": lambda state: [state["x"]]}, "gives list where a dict is wanted"),
@@ -107,6 +112,22 @@ def test_what_does_not_fit_is_one_line(change, message):
     assert "'reach'" in str(error.value) and "\n" not in str(error.value)
 
 
+def test_sizes_may_be_numpys_whole_numbers():
+    env = Reach()
+    env.observation_size, env.action_size, env.max_steps = np.int64(2), np.int32(1), np.uint8(MAX_STEPS)
+    given = adapt(env, "reach")
+    assert [type(n) for n in (given.observation_layout["actor"][0].size, given.action_size)] == [int, int]
+    assert given.evaluation_steps == MAX_STEPS and bool(play(given, [0.0] * MAX_STEPS)[-1].truncated)
+
+
+def test_float64_is_refused_before_anything_is_compiled():
+    env = adapt(Reach(), "reach")
+    with jax.enable_x64(True):
+        for begin in (lambda: adapt(Reach(), "reach"), lambda: make_train(env, SMALL)):
+            with pytest.raises(ConfigError, match="jax_enable_x64 is on: .* unset JAX_ENABLE_X64"):
+                begin()
+
+
 def test_missing_members_are_named_and_complete_environments_left_alone():
     with pytest.raises(ConfigError, match="a dict has no observation_size, action_size, max_steps, reset, step"):
         adapt({}, "nothing")
@@ -125,12 +146,29 @@ def test_missing_members_are_named_and_complete_environments_left_alone():
         ("reach_env:needs_a_size", "callable without arguments"),
         ("reach_env:grasp", "dexsim has a task 'grasp' of its own; give yours another name"),
         ("./reach_env:reach", "'./reach_env': must be what `import` takes"),
+        (Reach(), "give its name, such as 'grasp' or 'my_module:make_env'"),
     ],
 )
 def test_bad_names_are_one_line(name, message, monkeypatch):
     monkeypatch.setattr(registry, "TASKS", dict(registry.TASKS))
     with pytest.raises(ConfigError, match=message):
         train_policy(name, ppo=SMALL, steps=64)
+
+
+def test_an_environment_from_elsewhere_takes_no_configuration(monkeypatch, tmp_path):
+    monkeypatch.setattr(registry, "TASKS", dict(registry.TASKS))
+    with pytest.raises(ConfigError, match="task 'reach' takes no config"):
+        train_policy("reach_env:reach", GraspConfig(), ppo=SMALL, steps=64, run_dir=tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_command_that_is_printed_names_the_module(monkeypatch):
+    monkeypatch.setattr(registry, "TASKS", dict(registry.TASKS))
+    monkeypatch.setattr(registry, "_MODULES", {})
+    for name in ("reach_env:reach", "grasp", "tiny_env:grasp"):
+        with contextlib.suppress(ConfigError):
+            registry.find_task(name)
+    assert registry.task_option("reach") == " --task reach_env:reach" and registry.task_option("grasp") == ""
 
 
 def test_ranges_that_do_not_exist_cannot_widen(monkeypatch, tmp_path):
@@ -143,7 +181,7 @@ def test_ranges_that_do_not_exist_cannot_widen(monkeypatch, tmp_path):
 def test_a_fault_is_replayed(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(registry, "TASKS", dict(registry.TASKS))
     sizes = {"evaluation_chunk": 8, "evaluation_episodes": 8}
-    with pytest.raises(DexsimError, match="training diverged"):
+    with pytest.raises(DexsimError, match="training diverged.* --task reach_env:breaks$"):
         train_policy("reach_env:breaks", ppo=SMALL, steps=1e5, run_dir=tmp_path / "run", **sizes)
     file = sorted((tmp_path / "run").glob("reproduce-*.msgpack"))[0]
     assert reproduce.main([str(file), "--task", "reach_env:breaks"]) == 0

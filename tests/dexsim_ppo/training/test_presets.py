@@ -6,6 +6,7 @@ import jax
 import pytest
 
 import dexsim
+from dexsim.core.errors import ConfigError
 from dexsim.tasks.grasp.config import GraspConfig
 from dexsim.tasks.rotate.config import RotateConfig
 from dexsim_ppo import train
@@ -47,6 +48,11 @@ def test_tasks_from_elsewhere_get_no_setting_of_ours():
         assert given.ppo == dataclasses.replace(PRESETS[name].ppo, memory="none") and not given.curriculum.on
         assert training_config(given) is given.env, "extremes need ranges, which it has none of"
     assert find_preset("tpu", "reach") is PRESETS["cpu"]
+
+
+def test_an_unknown_preset_is_no_other_one():
+    with pytest.raises(ConfigError, match="preset 'huge': choose from auto, cpu, cpu-large, gpu"):
+        train.train_policy("grasp", preset="huge")
 
 
 def test_grasp_has_a_short_horizon_on_every_device():

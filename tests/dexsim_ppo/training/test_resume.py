@@ -11,7 +11,7 @@ import pytest
 import tiny_train
 from tiny_env import TinyConfig
 
-from dexsim.core.errors import ConfigError
+from dexsim.core.errors import CheckpointError, ConfigError
 from dexsim_ppo import checkpoint, train
 from dexsim_ppo.learner.curriculum import Curriculum
 from dexsim_ppo.policy import Policy
@@ -69,6 +69,7 @@ def test_only_budget_and_what_looks_on_may_change(finished):
     saved = train.default_arguments(None, "auto", begun)
     other = {"seed": 9, "extremes": 0.5, "backend": "warp", "preset": "gpu", "task": "other", "policy": "grasp"}
     other |= {"evaluation_share": 0.5, "evaluate_every": 5, "wandb": "mine"}
+    other |= {"hand": "mine.toml", "deterministic": True}
     other |= {"run_dir": Path("x"), "resume": Path("x"), "video": True, "env": TinyConfig(gain=0.5)}
     other |= {"ppo": dataclasses.replace(saved.ppo, discount=0.5), "curriculum": Curriculum(on=True)}
     allowed = set()
@@ -121,6 +122,18 @@ def test_an_older_checkpoint_is_resumed_for_good(finished):
     assert (finished.checkpoints / "00000002.aside.msgpack").read_bytes() == content
 
 
+def test_the_best_policy_of_a_course_that_is_left_is_kept_and_not_reported(tmp_path):
+    often = ["--evaluate-every", "1", "--evaluation-share", "1", "--checkpoint-every", "1", "--run-dir"]
+    assert train.main([*QUICK, "--steps", str(3 * PER_ITERATION), *often, str(tmp_path / "a")]) == 0
+    folder = RunFolder(tmp_path / "a")
+    Policy.load(folder.last).save(folder.best)  # the third iteration's, as if it had the highest return
+    content = folder.best.read_bytes()
+    no_more = ["--evaluate-every", "0", "--steps", str(PER_ITERATION)]
+    assert train.main(["--resume", str(folder.checkpoint(1)), *no_more]) == 0
+    assert (folder.path / "best.aside.msgpack").read_bytes() == content
+    assert json.loads(folder.report.read_text())["origin"]["iteration"] == 1
+
+
 def test_a_checkpoint_is_resumed_from_within_its_folder_and_not_from_elsewhere(finished, monkeypatch, tmp_path):
     lonely = tmp_path / "x" / "y" / "00000002.msgpack"
     lonely.parent.mkdir(parents=True)
@@ -139,5 +152,7 @@ def test_options_of_a_run_leave_no_room_for_a_preset(finished):
 
 
 def test_python_takes_paths_and_words_alike(finished, tmp_path):
+    with pytest.raises(CheckpointError, match=r"Policy\(task='tiny'.*: give a policy's file, or the name of a shipped"):
+        train.train_policy(policy=Policy.load(finished.last), steps=PER_ITERATION)
     tuned = train.train_policy(policy=finished.last, steps=PER_ITERATION, run_dir=str(tmp_path / "tuned"), video=False)
     assert tuned.folder == tmp_path / "tuned" and tuned.report["arguments"]["policy"] == str(finished.last)

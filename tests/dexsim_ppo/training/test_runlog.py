@@ -6,11 +6,16 @@ import sys
 import threading
 import types
 
+import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import pytest
 from tiny_env import SMALL, TinyConfig
 
 from dexsim.core.errors import CheckpointError, ConfigError
+from dexsim_ppo.learner.networks import Layer
+from dexsim_ppo.learner.running_stats import Normalizer
+from dexsim_ppo.learner.types import Field
+from dexsim_ppo.policy import Policy, PolicyParams
 from dexsim_ppo.training import runlog
 from dexsim_ppo.training.arguments import TrainArguments
 from dexsim_ppo.training.runlog import MetricsLog, RunFolder, read_metrics
@@ -83,6 +88,55 @@ def test_checkpoints_are_listed_oldest_first_and_the_newest_are_kept(tmp_path):
     assert found() == [100, 900, 1000]
     folder.prune(1)
     assert found() == [1000] and len(list(folder.checkpoints.iterdir())) == 3
+
+
+def policy_after(iteration):
+    """A small policy that was saved after so many iterations."""
+    layer = Layer(jnp.zeros((2, 1)), jnp.zeros(1))
+    params = PolicyParams((layer,), Normalizer(jnp.zeros(2), jnp.ones(2), 5.0))
+    layout, training = (Field("joint_position", 2, None),), {"iteration": iteration}
+    return Policy(
+        task="tiny", env_config={}, observation_layout=layout, params=params, control_rate=20.0, training=training
+    )
+
+
+def test_what_is_set_aside_is_never_replaced(tmp_path):
+    """Of every course that an older checkpoint's resume ends: its later checkpoints, and its best policy."""
+    folder = RunFolder(tmp_path)
+    folder.checkpoints.mkdir()
+    for course in ("first", "second", "third"):
+        for iteration in (4, 8):
+            folder.checkpoint(iteration).write_text(course)
+        policy_after(8).save(folder.best)
+        folder.set_aside(8)
+        assert folder.best.exists() and len(folder.existing_checkpoints()) == 2, "all of it is before or at 8"
+        folder.set_aside(6)
+        assert not folder.best.exists() and folder.existing_checkpoints() == [folder.checkpoint(4)]
+    kept = {path.name: path.read_text() for path in folder.checkpoints.glob("00000008.*")}
+    assert kept == {f"00000008.aside{n}.msgpack": c for n, c in (("", "first"), (1, "second"), (2, "third"))}
+    assert {path.name for path in tmp_path.glob("best*")} == {f"best.aside{n}.msgpack" for n in ("", 1, 2)}
+
+
+def test_a_full_disk_does_not_cost_the_metrics_so_far(tmp_path, monkeypatch):
+    def full(handle):
+        raise OSError(28, "No space left on device")
+
+    folder = RunFolder(tmp_path)
+    folder.metrics.write_text("".join(json.dumps({"iteration": i}) + "\n" for i in (2, 4)))
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        MetricsLog(folder, 2, TrainArguments(env=TinyConfig(), ppo=SMALL))
+    assert [row["iteration"] for row in read_metrics(folder.metrics)] == [2, 4]
+
+
+@pytest.mark.parametrize("line", ["3", "[]", "{}", '{"iteration": "two"}', '{"iterat', "\xff"])
+def test_a_line_without_metrics_is_named_and_not_dropped_with_those_after_it(tmp_path, line):
+    file = RunFolder(tmp_path).metrics
+    content = '{"iteration": 2}\n' + line + '\n{"iteration": 4}\n'
+    file.write_text(content, encoding="latin-1")
+    with pytest.raises(CheckpointError, match="metrics.jsonl: line 2 holds no metrics"):
+        MetricsLog(RunFolder(tmp_path), 2, TrainArguments(env=TinyConfig(), ppo=SMALL))
+    assert file.read_text(encoding="latin-1") == content
 
 
 class Writer:

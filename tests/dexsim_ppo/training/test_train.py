@@ -7,7 +7,9 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -17,6 +19,7 @@ import tiny_train
 from paths import ROOT
 from tiny_env import TinyEnv
 
+from dexsim import registry
 from dexsim.core import cli
 from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import pytree_dataclass
@@ -408,6 +411,25 @@ def test_a_signal_saves_and_says_how_to_go_on(number, tmp_path):
     assert process.returncode == 128 + number
     assert f"--resume {tmp_path / 'a'}" in out.splitlines()[-1]
     assert RunFolder(tmp_path / "a").latest_checkpoint().exists()
+
+
+def test_the_command_to_go_on_with_names_the_module_of_an_own_task(monkeypatch, capsys):
+    run = SimpleNamespace(folder=RunFolder(Path("runs/a")), arguments=SimpleNamespace(task="tiny"))
+    monkeypatch.setitem(registry._MODULES, "tiny", "my_module")
+    monkeypatch.setattr(train, "run_training", lambda *_: (run, signal.SIGTERM))
+    assert train.main([*QUICK, "--steps", "1"]) == 128 + signal.SIGTERM
+    assert capsys.readouterr().out.endswith("dexsim_ppo.train --resume runs/a --task my_module:tiny\n")
+
+
+def test_signals_are_left_alone_in_a_thread():
+    """Python takes handlers in the main thread only, and trainings are called from others, too."""
+
+    def stopped():
+        with train.stop_on_signals() as received:
+            return received()
+
+    with ThreadPoolExecutor(1) as other:
+        assert other.submit(stopped).result() == 0
 
 
 @pytest.mark.parametrize(("every", "wanted"), [(6, [8, 12, 20, 24]), (4, [4, 8, 12, 16, 20, 24]), (0, []), (30, [])])

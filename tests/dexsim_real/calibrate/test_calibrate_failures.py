@@ -261,6 +261,10 @@ def test_logs_that_are_none_of_presses(hand, tmp_path):
         log.add(Kind.NOTE, "end: no answer")
     with pytest.raises(LogError, match="ends before the hand was ready"):
         read_logs([tmp_path / "early.log"], hand)
+    with LogWriter(tmp_path / "forged.log") as log:
+        log.add(Kind.META, {"task": "calibrate"})
+    with pytest.raises(LogError, match="forged.log: a record is not as the bridge writes it .KeyError"):
+        read_logs([tmp_path / "forged.log"], hand)
     with pytest.raises(CalibrationError, match="no press was recorded"):
         bench = BenchHand(hand, [])
         with pytest.raises(HandError, match="met nothing"):

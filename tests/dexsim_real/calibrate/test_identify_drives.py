@@ -75,6 +75,10 @@ def test_a_line_that_loses_too_much_identifies_nothing(hand, tmp_path):
         identify_drives.identify_hand(options, hand, operator(), port=bench, clock=bench.clock, sleep=bench.sleep)
     with pytest.raises(LogError, match="this is a log of .identify."):
         read_logs([options.log], hand)
+    with LogWriter(tmp_path / "forged.log") as log:
+        log.add(Kind.META, {"task": "identify"})
+    with pytest.raises(LogError, match="forged.log: a record is not as the bridge writes it"):
+        identify_drives.read_logs([tmp_path / "forged.log"], hand, None)
     with pytest.raises(HandError, match="no joint 'knee'"):
         wrong = dataclasses.replace(options, joints=("knee",), log=tmp_path / "b.log")
         identify_drives.identify_hand(wrong, hand, operator())

@@ -81,6 +81,18 @@ def test_a_command_without_an_answer_may_have_turned_the_motors_on(servo):
     assert not servo.driven and servo.port.modes[-1] == Mode.PASSIVE
 
 
+def test_a_driver_that_cannot_be_closed_has_turned_the_motors_off_first(servo):
+    servo.engage()
+    run(servo, 5)
+
+    def fail():
+        raise OSError("close failed")
+
+    servo.port.close = fail
+    servo.stop()
+    assert not servo.driven and servo.port.modes[-1] == Mode.PASSIVE
+
+
 def test_the_velocity_begins_anew_with_a_connection(servo):
     """A hand that was moved while it was away is not a fast one."""
     run(servo, 5)

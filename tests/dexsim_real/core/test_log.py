@@ -165,6 +165,16 @@ def test_a_full_disk_ends_the_log_and_not_the_run(tmp_path, monkeypatch):
     assert "No space left" in log.failure and log.dropped == 2
 
 
+def test_a_record_that_cannot_be_written_is_counted_and_costs_no_other(tmp_path):
+    """Not the thread that writes them."""
+    with LogWriter(tmp_path / "run.log") as log:
+        log.add(Kind.NOTE, "before")
+        log.add(Kind.NOTE, "a name that is no text: \udcff")
+        log.add(Kind.NOTE, "with it")
+    assert "a NOTE record cannot be written" in log.failure and log.dropped == 1
+    assert [record.content for record in LogReader(log.path)] == ["before", "with it"]
+
+
 def test_adding_does_not_wait_for_the_disk(tmp_path, monkeypatch):
     release = threading.Event()
     monkeypatch.setattr(os, "fdatasync", lambda file: release.wait(5))

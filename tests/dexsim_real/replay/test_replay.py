@@ -170,6 +170,19 @@ def forged(folder):
     report = replay.replay(path).report
     assert report["observations_same"] == report["ticks"] - 1 and report["first_difference"].startswith("tick 9 ")
     assert replay_command.main([str(path)]) == 1
+    for number, (kind, name, value) in enumerate(
+        ((Kind.TICK, "readings", 1.0), (Kind.TICK, "sequence", [1]), (Kind.META, "calibration", {"a": 1}))
+    ):
+        path = folder / f"forged_{number}.log"
+        with LogWriter(path) as log:
+            for record in LogReader(folder / "run.log"):
+                content = record.content
+                if record.kind == kind and name in content:
+                    content = {**content, name: value}
+                log.add(record.kind, content, record.time)
+        with pytest.raises(LogError, match=f"^{path}: a record is not as the bridge writes it") as found:
+            replay.replay(path)
+        assert "\n" not in str(found.value)
 
 
 def verdict(path):

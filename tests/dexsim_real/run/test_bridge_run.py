@@ -78,6 +78,24 @@ def test_the_live_table(monkeypatch):
         assert text in shown.getvalue()
 
 
+def test_text_in_brackets_is_shown_as_it_is(monkeypatch):
+    """Such as a driver's error that names its port: to Rich it is markup, or an error."""
+    text, shown = "cannot open [/dev/ttyUSB0] [bold]", io.StringIO()
+    console = Console(file=shown, width=200)
+    monkeypatch.setattr(status, "Console", lambda **options: console)
+    status.StatusView(f"view {text}", lambda: status.Status({"safety": f"row {text}"})).show()
+    console.print(status.summary_table(f"title {text}", {"end": f"cell {text}"}))
+    for where in ("view", "row", "title", "cell"):
+        assert f"{where} {text}" in shown.getvalue()
+
+
+def test_a_summary_that_cannot_be_written_is_refused_before_the_run(tmp_path):
+    options = ["--port", "none", "--uncalibrated", "--yes", "--log", str(tmp_path / "run.log")]
+    with pytest.raises(IsADirectoryError, match=str(tmp_path)):
+        run.main(["grasp", *options, "--output", str(tmp_path)])
+    assert not (tmp_path / "run.log").exists()
+
+
 @pytest.mark.parametrize(("failure", "reaction"), [("raises", None), ("hangs", "no target"), ("nan", "not finite")])
 def test_a_policy_that_dies_leaves_the_hand_safe(tmp_path, monkeypatch, failure, reaction):
     real, count = Controller.tick, iter(range(10**6))

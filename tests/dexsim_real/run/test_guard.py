@@ -18,7 +18,8 @@ from dexsim_real.control.safety import Safety, SafetyConfig
 from dexsim_real.control.servo import Servo
 from dexsim_real.run.guard import Guard
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
-from dexsim_real.wire.link import LinkCounts
+from dexsim_real.wire.frames import empty_state
+from dexsim_real.wire.link import LinkCounts, Reply
 
 FREEZE = 4.0  # s, in which a frozen runner's hand must be off: 2 s with this line, the rest for a busy machine
 RUNNER = """
@@ -96,7 +97,7 @@ def test_the_exchange_thread_gives_the_signs_of_life(hand):
     servo.start()
     while events.count("exchange") < 20:
         time.sleep(0.001)
-    Port.exchange = lambda self, command: events.append("answered") or True
+    Port.exchange = lambda self, command: events.append("answered") or Reply(empty_state(), 0.0, 0.0, 1, 1)
     servo.stop()
     last = events.index(PATIENCE)
     assert events[:last:2] == [0.0] * (last // 2) and set(events[1:last:2]) <= {"exchange"}

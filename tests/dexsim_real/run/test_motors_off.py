@@ -19,6 +19,8 @@ from pty_hand import QUICK
 from dexsim_real.control.motors_off import turn_off
 from dexsim_real.core.process import ignore_signals, stopping
 from dexsim_real.run.guard import Guard
+from dexsim_real.wire.frames import empty_state
+from dexsim_real.wire.link import Reply
 from dexsim_real.wire.serial_hand import SerialHand, passive_command
 
 
@@ -123,6 +125,26 @@ def test_turning_off_is_bounded():
 
     begin = time.monotonic()
     assert not turn_off(Deaf(), passive_command(), 0.2) and time.monotonic() - begin < 1.0
+
+
+def test_a_driver_that_fails_is_asked_again_and_only_a_reply_confirms():
+    """A procedure has no guard process: an error of the driver must not leave the motors on."""
+
+    class Failing:
+        def __init__(self, answers):
+            self.answers = answers
+
+        def exchange(self, command):
+            answer = self.answers.pop(0) if len(self.answers) > 1 else self.answers[0]
+            if isinstance(answer, Exception):
+                raise answer
+            return answer
+
+    gone, reply = OSError("the adapter is gone"), Reply(empty_state(), 0.0, 0.0, 1, 1)
+    port = Failing([gone, None, False, gone, reply])
+    assert turn_off(port, passive_command(), 5.0) and port.answers == [reply]
+    for answer in (gone, False, True):
+        assert not turn_off(Failing([answer]), passive_command(), 0.05)
 
 
 @pytest.mark.parametrize("way", [signal.SIGKILL, signal.SIGSTOP])

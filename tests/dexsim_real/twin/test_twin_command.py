@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -19,6 +20,7 @@ from dexsim.calibration.maps import current_from_counts, load_calibration, norma
 from dexsim.core.errors import DexsimError
 from dexsim_real.twin import __main__ as twin_command
 from dexsim_real.twin.server import PlantClock
+from dexsim_real.twin.wire.emulated_sensors import EmulatedCamera, ObjectSensorConfig
 from dexsim_real.twin.wire.firmware import FirmwareConfig
 
 
@@ -113,7 +115,30 @@ def test_what_is_wrong_is_said_in_one_line(tmp_path):
             ["--plant", "twin_plant:make", "--mask-socket", str(tmp_path / "no" / "m")],
             "socket for masks cannot be created",
         ),
+        (
+            ["--plant", "twin_plant:make", "--mask-socket", str(tmp_path / ("m" * 150))],
+            "socket for masks cannot be created .AF_UNIX path too long",
+        ),
     ):
         with pytest.raises(DexsimError, match=message) as found:
             twin_command.main([*options, "--no-realtime"])
         assert "\n" not in str(found.value)
+
+
+def test_results_that_cannot_be_written_are_refused_before_the_trials(tmp_path):
+    (tmp_path / "file").touch()
+    for path in (tmp_path, tmp_path / "file" / "results.json"):
+        with pytest.raises(OSError, match=str(tmp_path)):
+            twin_command.main(["--plant", "nowhere:make", "--output", str(path)])
+
+
+def test_a_socket_on_which_a_program_listens_is_left_alone(tmp_path):
+    path = tmp_path / "masks"
+    with socket.socket(socket.AF_UNIX) as other:
+        other.bind(str(path))
+        other.listen()
+        with pytest.raises(DexsimError, match="Address already in use"):
+            twin_command.main(["--plant", "twin_plant:make", "--mask-socket", str(path), "--no-realtime"])
+        with socket.socket(socket.AF_UNIX) as client:
+            client.connect(str(path))
+    EmulatedCamera(path, ScriptedPlant(), ObjectSensorConfig(), seed=0, start=0.0).close()

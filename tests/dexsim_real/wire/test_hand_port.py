@@ -17,7 +17,8 @@ from dexsim_real.core.errors import (
 )
 from dexsim_real.sensors.imu import Imu
 from dexsim_real.wire.frames import STATE_BLOCK, Command, Frame, empty_state
-from dexsim_real.wire.link import LinkConfig, Reply, checked
+from dexsim_real.wire.link import LinkConfig, LinkCounts, Reply, checked, greet, refusal_of
+from dexsim_real.wire.refusals import Refusal
 from dexsim_real.wire.serial_hand import SerialHand, open_port
 
 
@@ -110,6 +111,55 @@ def test_a_reply_is_checked_whoever_made_it():
     ):
         with pytest.raises(HandError, match=said):
             checked(dataclasses.replace(good, state=state), 10.0)
+    for answer, said in (([1, 2], "answered with list"), (True, "answered with bool"), (good.state, "with ndarray")):
+        with pytest.raises(HandError, match=said):
+            checked(answer, 10.0)
+    for name, value in (("sent", None), ("received", "now"), ("sequence", None), ("generation", [1])):
+        with pytest.raises(HandError, match=f"has {name} {re.escape(repr(value))}; expected a number"):
+            checked(dataclasses.replace(good, **{name: value}), 10.0)
+
+
+class Driver:
+    """A driver that does nothing."""
+
+    def __init__(self, **parts):
+        vars(self).update(
+            {"counts": LinkCounts(), "connect": lambda: "a hand", "exchange": print, "close": print} | parts
+        )
+
+
+def test_what_a_driver_tells_is_checked():
+    assert greet(Driver(warnings=lambda: ["slow"])) == ["a hand", "warning: slow"] and greet(Driver()) == ["a hand"]
+    for parts, said in (
+        ({"connect": lambda: None}, "`connect` returned None"),
+        ({"connect": lambda: (1, "a")}, r"`connect` returned \(1, 'a'\)"),
+        ({"warnings": lambda: "slow"}, "`warnings` returned 'slow'; expected a list"),
+        ({"warnings": lambda: None}, "`warnings` returned None"),
+    ):
+        with pytest.raises(HandError, match=said):
+            greet(Driver(**parts))
+    busy = Refusal("busy", serious=False)
+    assert refusal_of(Driver()) is None and refusal_of(Driver(refusal=busy)) is busy
+    with pytest.raises(HandError, match="`refusal` is 'busy'"):
+        refusal_of(Driver(refusal="busy"))
+
+
+def test_a_function_that_returns_no_driver_is_refused(tmp_path, monkeypatch):
+    (tmp_path / "my_driver.py").write_text("made = None\ndef open_hand(config):\n    return made\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    import my_driver
+
+    lacking = Driver()
+    del lacking.close
+    for made, said in (
+        (None, "returned NoneType without 'counts'"),
+        (Driver, "returned type without 'counts'"),
+        (lacking, "returned Driver without 'close'"),
+        (Driver(counts={"sent": 1}), "`counts` is dict; expected `LinkCounts`"),
+    ):
+        monkeypatch.setattr(my_driver, "made", made)
+        with pytest.raises(HandError, match=f"^sdk:my_driver: .*{said}"):
+            open_port("sdk:my_driver", QUICK)
 
 
 def test_the_latency_timer(tmp_path):

@@ -53,6 +53,7 @@ def calibration(hand, serial="2R32A001", handedness="right"):
         ),
         (None, ("2R32A001", "right"), "does not tell its serial number, and the calibration is of hand 2R32A001"),
         (Identity("2L32A001", "left"), None, "this is a left hand .* the model a right one"),
+        ("2R32A001", None, "the driver's `identity` is '2R32A001'; expected an `Identity`"),
         (Identity("A001", "code 1"), ("A001", "right"), "this hand is code 1, the calibration is of a right one"),
     ],
 )

@@ -24,6 +24,7 @@ from dexsim_real.core.errors import HandError
 PREFIX = "plant/"  # of all names of the MJCF in the model of a trial
 STIFFNESS, DAMPING = 3.0, 0.1  # Nm/rad, Nm s/rad, of the servo that a torque motor gets
 _TIMESTEPS = (1e-4, 5e-3)  # s
+_FLAGS = ("contact", "constraint", "actuation")  # of MuJoCo, that must not be disabled
 _RANGE = 0.05  # rad, largest difference of an end of a joint's range
 _APART = 0.015  # m, largest distance of a fingertip from where the hand has it
 _KEYS = {"model": str, "palm": str, "joints": list, "tips": list}
@@ -56,6 +57,7 @@ def read_model(path: str | Path, hand: Hand) -> ForeignModel:
     model = spec.compile()
     if not _TIMESTEPS[0] <= model.opt.timestep <= _TIMESTEPS[1]:
         raise HandError(f"{path}: a timestep of {1e3 * model.opt.timestep:g} ms; 0.1 to 5 ms are possible")
+    _check_physics(path, model)
     actuators, joints = _joints(path, model, hand, names.get("joints"))
     data = mujoco.MjData(model)
     data.qpos[model.jnt_qposadr[joints]] = 0.0
@@ -96,14 +98,37 @@ def _names(path: Path) -> dict[str, Any]:
 def _load(path: Path) -> mujoco.MjSpec:
     try:
         spec = mujoco.MjSpec.from_file(str(path))
-        for element in (*spec.keys, *spec.sensors):
+        for element in (*spec.keys, *spec.sensors, *spec.cameras, *spec.lights):
             spec.delete(element)
         for geom in [g for g in spec.worldbody.geoms if g.type == mujoco.mjtGeom.mjGEOM_PLANE]:
             spec.delete(geom)  # a floor
+        for body in [b for b in spec.worldbody.bodies if _is_loose(b)]:
+            spec.delete(body)  # an object, which would be in the way of the trial's
         spec.compile()
     except ValueError as error:
         raise HandError(f"{path}: MuJoCo cannot read it ({_line(error)})") from None
     return spec
+
+
+def _is_loose(body: mujoco.MjsBody) -> bool:
+    """Whether a body of the world moves freely and carries no other joint."""
+    joints = body.find_all("joint")
+    return len(joints) == 1 and joints[0].type == mujoco.mjtJoint.mjJNT_FREE
+
+
+def _check_physics(path: Path, model: mujoco.MjModel) -> None:
+    """Check that all numbers are finite, and that nothing is disabled without which a trial shows nothing."""
+    arrays = {name: getattr(model, name) for name in dir(model) if not name.startswith("_")}
+    wrong = [
+        name
+        for name, array in arrays.items()
+        if isinstance(array, np.ndarray) and array.dtype.kind == "f" and not np.isfinite(array).all()
+    ]
+    if wrong:
+        raise HandError(f"{path}: a number is nan or infinite: MuJoCo has it in {', '.join(wrong)}")
+    for name in _FLAGS:
+        if model.opt.disableflags & int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name.upper()}")):
+            raise HandError(f'{path}: <flag {name}="disable"/>: a trial needs {name}')
 
 
 def _joints(path: Path, model: mujoco.MjModel, hand: Hand, wanted: list[str] | None) -> tuple[list[int], list[int]]:
@@ -113,13 +138,21 @@ def _joints(path: Path, model: mujoco.MjModel, hand: Hand, wanted: list[str] | N
         joint = int(model.actuator_trnid[k, 0])
         on_joint = model.actuator_trntype[k] == int(mujoco.mjtTrn.mjTRN_JOINT)
         hinge = on_joint and model.jnt_type[joint] == int(mujoco.mjtJoint.mjJNT_HINGE)
-        if not hinge or model.actuator_dyntype[k] != int(mujoco.mjtDyn.mjDYN_NONE) or joint in driven:
+        fixed = model.actuator_gaintype[k] == int(mujoco.mjtGain.mjGAIN_FIXED)
+        motor = fixed and model.actuator_biastype[k] == int(mujoco.mjtBias.mjBIAS_NONE)
+        drivable = hinge and (motor or (fixed and _is_servo(model, k)))
+        if not drivable or model.actuator_dyntype[k] != int(mujoco.mjtDyn.mjDYN_NONE) or joint in driven:
             raise HandError(
                 f"{path}: actuator {model.actuator(k).name or k}: a hinge takes one motor or position servo without "
                 "state, other actuators cannot be driven"
             )
-        if abs(model.actuator_gear[k, 0]) < mujoco.mjMINVAL:
-            raise HandError(f"{path}: the actuator of {model.joint(joint).name} has a gear of 0 and moves nothing")
+        for name, value in (("gear", model.actuator_gear[k, 0]), ("gain", model.actuator_gainprm[k, 0])):
+            if abs(value) < mujoco.mjMINVAL:
+                raise HandError(
+                    f"{path}: the actuator of {model.joint(joint).name} has a {name} of 0 and moves nothing"
+                )
+        if model.opt.disableactuator >> model.actuator_group[k] & 1:
+            raise HandError(f"{path}: actuatorgroupdisable turns off the actuator of {model.joint(joint).name}")
         driven[joint] = k
     if len(driven) != hand.num_joints:
         raise HandError(f"{path}: {len(driven)} actuated joints, the hand has {hand.num_joints}")
@@ -139,6 +172,12 @@ def _joints(path: Path, model: mujoco.MjModel, hand: Hand, wanted: list[str] | N
                 f"the hand {ends[0]:.3f} to {ends[1]:.3f}"
             )
     return [driven[j] for j in joints], joints
+
+
+def _is_servo(model: mujoco.MjModel, actuator: int) -> bool:
+    """Whether an actuator of fixed gain is a position servo."""
+    affine = model.actuator_biastype[actuator] == int(mujoco.mjtBias.mjBIAS_AFFINE)
+    return bool(affine and model.actuator_biasprm[actuator, 1] < 0)
 
 
 def _palm(
@@ -262,11 +301,12 @@ def _set_servos(spec: mujoco.MjSpec, model: mujoco.MjModel, hand: Hand, actuator
     """Give torque motors a position servo, and every actuator a torque limit."""
     for j, k in enumerate(actuators):
         actuator, joint, gear = spec.actuators[k], int(model.actuator_trnid[k, 0]), model.actuator_gear[k, 0]
-        servo = model.actuator_biastype[k] == int(mujoco.mjtBias.mjBIAS_AFFINE) and model.actuator_biasprm[k, 1] < 0
         limits = [np.abs(model.actuator_forcerange[k]).max()] if model.actuator_forcelimited[k] else []
         if model.jnt_actfrclimited[joint]:
             limits.append(np.abs(model.jnt_actfrcrange[joint]).max() / abs(gear))
-        if not servo:
+        if _is_servo(model, k):  # Of an angle, not of a share of the range or the like.
+            actuator.gainprm[0], actuator.biasprm[0] = -model.actuator_biasprm[k, 1], 0.0
+        else:
             if model.actuator_ctrllimited[k]:
                 limits.append(np.abs(model.actuator_ctrlrange[k] * model.actuator_gainprm[k, 0]).max())
             actuator.set_to_position(kp=STIFFNESS / gear**2, kv=DAMPING / gear**2)

@@ -28,6 +28,7 @@ def build_foreign_scene(
         geom.condim, geom.friction, geom.solmix = 1, [0.0, 0.0, 0.0], 1e-9
         geom.priority, geom.margin, geom.gap = 0, 0.0, 0.0
     spec.option.gravity = gravity
+    spec.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_GRAVITY)
     return _index(spec.compile(), foreign)
 
 

@@ -77,6 +77,17 @@ def test_palm_fingertips_and_lattices_are_where_the_hand_has_them(hand):
         ('<position class="strong" joint="thumb_swing"/>', '<motor joint="thumb_swing" gear="0"/>',
          "the actuator of thumb_swing has a gear of 0 and moves nothing"),
         ('joint="thumb_swing"/>', 'joint="thumb_swing" gear="0"/>', "thumb_swing has a gear of 0"),
+        ('<position class="strong" joint="thumb_swing"/>', '<general joint="thumb_swing" gainprm="0"/>',
+         "the actuator of thumb_swing has a gain of 0 and moves nothing"),
+        ('<position class="strong" joint="thumb_swing"/>', '<velocity joint="thumb_swing" kv="1"/>',
+         "actuator 0: a hinge takes one motor or position servo"),
+        ('<position class="strong" joint="thumb_swing"/>', '<damper joint="thumb_swing" kv="1" ctrlrange="0 1"/>',
+         "actuator 0: a hinge takes one motor or position servo"),
+        ("<option ", '<option actuatorgroupdisable="0" ', "actuatorgroupdisable turns off the actuator of thumb_swing"),
+        ("<option ", '<option><flag contact="disable"/></option><option ', '<flag contact="disable"/>: a trial needs'),
+        ("<option ", '<option><flag actuation="disable"/></option><option ', "a trial needs actuation"),
+        ('name="middle_tip" pos="-0.0422483', 'name="middle_tip" pos="nan', "MuJoCo has it in site_pos"),
+        ('joint damping="0.035"', 'joint damping="inf"', "nan or infinite: MuJoCo has it in dof_damping"),
     ],
 )  # fmt: skip
 def test_what_does_not_fit_is_refused_in_one_line(hand, text, write, old, new, says):
@@ -221,3 +232,35 @@ def test_an_object_between_the_fingers_is_felt_by_the_fingers_that_hold_it(hand)
     strength = np.linalg.norm(ours._tips, axis=-1)
     assert strength.sum() > 2.0 and ours.stage is Stage.FREE
     assert np.all(felt[strength == 0] < 0.2) and felt.sum() > 0.5 * strength.sum()
+
+
+def test_a_hand_without_room_for_an_object_is_no_endless_search(hand, text, write, monkeypatch):
+    monkeypatch.setattr("dexsim_real.twin.plant.emulated_hand._OBJECTS", 3)
+    path = write(text.replace("<worldbody>", '<worldbody><geom type="sphere" size="2"/>'))
+    with pytest.raises(HandError, match="trial 0: none of 3 objects had room"):
+        plant(hand, path)
+
+
+def test_a_scene_of_its_own_is_left_out(hand, text, write):
+    """Its object would be in the way of the trial's; a camera may look at it. Gravity is the trial's."""
+    scene = """<worldbody><body name="cube" pos="0 0 0.46"><freejoint/><geom type="box" size=".03 .03 .03"/></body>
+        <camera mode="targetbody" target="cube" pos="0 0 1"/><light mode="targetbody" target="cube" pos="0 0 1"/>"""
+    words = text.replace("<worldbody>", scene).replace("<option ", '<option><flag gravity="disable"/></option><option ')
+    ours = plant(hand, write(words), "grasp")
+    assert [ours._scene.model.body(b).name for b in range(ours._scene.model.nbody)].count("plant/cube") == 0
+    free(ours, (0.5, 0.0, 0.0))
+    ours.advance(0.2)
+    fallen = ours._data.qpos[ours._scene.object_qpos] - 0.5
+    assert fallen == pytest.approx(0.5 * GRAVITY * 0.04, rel=0.03)
+
+
+def test_a_servo_of_another_input_is_driven_by_angles(hand, text, write):
+    """As in models whose control is a share of the range: 2.8 Nm/rad, 0 to 255 for 0 to 1.83 rad."""
+    servo = (
+        '<general joint="thumb_swing" biastype="affine" gainprm="0.0201" biasprm="0.5 -2.8 -.11" ctrlrange="0 255"/>'
+    )
+    ours = plant(hand, write(text.replace('<position class="strong" joint="thumb_swing"/>', servo)))
+    ours._scene.model.opt.gravity[:] = 0.0
+    ours.drive(motors(np.full(12, 0.15)))
+    ours.advance(1.0)
+    assert ours._joints()[0] == pytest.approx(0.15, abs=0.02)

@@ -124,6 +124,23 @@ def test_every_value_lies_outside_its_range_and_near_it(task):
         assert sides[name] == {"both": {True, False}, "high": {True}, "low": {False}}[band.sides], name
 
 
+@pytest.mark.parametrize(
+    "name, value, message",
+    [
+        ("edge", 0.0, "edge = 0: must be above 0"),
+        ("mass", -1.0, "mass = -1: must be above 0"),
+        ("taxel_period", 0.0, "taxel_period = 0: must be above 0"),
+        ("camera_delay", -1.0, "camera_delay = -1: must not be negative"),
+        ("friction", -0.5, "friction = -0.5: must not be negative"),
+    ],
+)
+def test_values_that_no_hand_has_are_refused(name, value, message):
+    with pytest.raises(HandError, match=message):
+        sample_trial("rotate", np.random.default_rng(0), overrides={name: value})
+    below = sample_trial("rotate", np.random.default_rng(0), overrides={"gravity_tilt": -0.1, "torque": 0.0})
+    assert (below.gravity_tilt == -0.1).all() and (below.torque == 0).all()
+
+
 def test_inside_nominal_and_overrides():
     for task in TASKS:
         inside, nominal = (sample_trial(task, np.random.default_rng(3), kind) for kind in ("inside", "nominal"))

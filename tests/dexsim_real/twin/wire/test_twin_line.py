@@ -155,3 +155,9 @@ def test_a_terminal_keeps_its_name(tmp_path):
         Terminal(tmp_path / "file")
     with pytest.raises(HandError, match="no pseudo-terminal"):
         Terminal(tmp_path / "none" / "port")
+    (tmp_path / "mine").symlink_to(tmp_path / "file")
+    with pytest.raises(HandError, match="mine: already exists and is not a link to a pseudo-terminal"):
+        Terminal(tmp_path / "mine")
+    assert (tmp_path / "mine").resolve() == tmp_path / "file"
+    (tmp_path / "stale").symlink_to("/dev/pts/999999")
+    Terminal(tmp_path / "stale").close()
