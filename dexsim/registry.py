@@ -14,7 +14,7 @@ from types import ModuleType
 from typing import Any, cast
 
 from dexsim.core.config import NoSettings
-from dexsim.core.errors import ConfigError
+from dexsim.core.errors import ConfigError, DexsimError
 from dexsim.env.config import EnvConfig
 from dexsim.env.env import Env
 from dexsim.env.task import Task
@@ -183,7 +183,13 @@ def _make_other(task: str, makes: Callable[[], Any]) -> Any:
         inspect.signature(makes).bind()
     except (TypeError, ValueError):
         raise ConfigError(f"--task {task}: must be callable without arguments") from None
-    return makes()
+    try:
+        return makes()
+    except DexsimError:
+        raise
+    except Exception as error:  # whatever it raises
+        text = " ".join(str(error).split())
+        raise ConfigError(f"--task {task}: making it fails: {type(error).__name__}: {text:.200}") from error
 
 
 def _no_task(config: Any, hand: Hand) -> Task:
@@ -197,3 +203,7 @@ def _import(module: str) -> ModuleType:
         return importlib.import_module(module)
     except ImportError as error:
         raise ConfigError(f"task module {module!r}: cannot be imported ({error})") from None
+    except DexsimError:
+        raise
+    except Exception as error:  # whatever it raises
+        raise ConfigError(f"task module {module!r}: importing it fails: {type(error).__name__}: {error}") from error

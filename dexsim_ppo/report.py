@@ -60,7 +60,8 @@ def mean_interval(x: np.ndarray, start: np.ndarray) -> dict[str, float]:
     """Mean of samples [N] with its normal 95 % interval, by start [N]: samples of one start are not independent."""
     _, which = np.unique(start, return_inverse=True)
     mean, starts = float(np.mean(x)), int(which.max()) + 1
-    off = np.bincount(which, np.asarray(x, float) - mean)
+    with np.errstate(invalid="ignore"):  # A return beyond float32 is infinite, its interval not a number.
+        off = np.bincount(which, np.asarray(x, float) - mean)
     half = 1.96 * float(np.sqrt(np.sum(off**2) * starts / max(starts - 1, 1))) / x.size
     return {"value": mean, "low": mean - half, "high": mean + half}
 

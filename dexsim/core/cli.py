@@ -17,7 +17,7 @@ from typing import Any, Literal, TypeVar
 
 from dexsim.core.assets import cache_path
 from dexsim.core.errors import AssetError, ConfigError, DexsimError, DexsimWarning
-from dexsim.core.files import make_private, write_whole
+from dexsim.core.files import is_device, make_private, write_whole
 from dexsim.core.install import DISTRIBUTION
 from dexsim.core.options import Option, explain, group_docs, help_page, in_option_names, options_of
 
@@ -182,8 +182,9 @@ def check_writable(path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
-    if not os.access(path.parent, os.W_OK):
-        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path.parent))
+    place = path if is_device(path) else Path(os.path.realpath(path)).parent
+    if not os.access(place, os.W_OK):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(place))
 
 
 def write_json(path: Path, data: Any) -> None:

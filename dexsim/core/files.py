@@ -28,11 +28,17 @@ def write_whole(path: Path, chunks: Iterable[bytes | memoryview]) -> None:
 
     They go to a temporary file, which is renamed once everything is on the disk. So neither a crash nor
     another program leaves or sees half a file, and an existing file stays until then. Temporary files that a
-    killed program left in the folder are removed.
+    killed program left in the folder are removed. A device or a pipe, such as /dev/null, is written into, not replaced;
+    a link to a file stays one.
 
     Raises:
       OSError: the file cannot be written; an existing file is untouched.
     """
+    if is_device(path):
+        with path.open("wb") as file:
+            file.writelines(chunks)
+        return
+    path = Path(os.path.realpath(path))
     path.parent.mkdir(parents=True, exist_ok=True)
     remove_stale(path.parent)
     handle, temporary = _locked_temporary(path)
@@ -52,6 +58,11 @@ def write_whole(path: Path, chunks: Iterable[bytes | memoryview]) -> None:
         os.fsync(folder)
     finally:
         os.close(folder)
+
+
+def is_device(path: Path) -> bool:
+    """Whether a device, a pipe or a socket is there: nothing that a file may take the place of."""
+    return path.exists() and not path.is_file() and not path.is_dir()
 
 
 def remove_stale(folder: Path) -> None:

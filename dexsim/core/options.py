@@ -229,7 +229,7 @@ def help_page(cls: type, default: Any, *, prog: str, description: str, group: st
     lines = [f"usage: {' '.join([prog, *places, '[options]'])}", "", *_filled(description, "")]
     own = tuple(group.split(".")) if group else ()
     for path in [own] if group == "" else [path for path in ((), *groups) if path[: len(own)] == own]:
-        title = f"--{'.'.join(path)}: {groups[path]}".replace("_", "-") if path else "options:"
+        title = f"--{'.'.join(path).replace('_', '-')}: {groups[path]}" if path else "options:"
         lines += ["", *_filled(title, "")]
         for option in options:
             if option.path[:-1] == path:

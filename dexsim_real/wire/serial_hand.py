@@ -54,6 +54,7 @@ class SerialHand:
         self._serial: Any = None
         self._parser = frames.Parser(frames.HAND_REPLIES)
         self._received = 0  # bytes since the port was opened, without late answers
+        self._others = 0  # frames of other hands
         self._generation = 0
         self._first: Reply | None = None
         self._retry_at, self._pause = 0.0, self.config.backoff[0]
@@ -147,7 +148,7 @@ class SerialHand:
             data, now = self._read(), time.monotonic()
             heard = now if data else heard
             final = now > deadline and (now - heard > _QUIET or now > deadline + self.config.on_wire(_LONGEST))
-            for frame in self._parser.feed(data) + (self._parser.expire() if final else []):
+            for frame in self._answers(self._parser.feed(data) + (self._parser.expire() if final else [])):
                 self._tap("rx", frame.encode())
                 size = frames.OVERHEAD + len(frame.data)
                 possible = not self.config.paced or now - sent >= self.config.on_wire(request + size)
@@ -172,7 +173,17 @@ class SerialHand:
         while (self._serial.in_waiting or self._parser.pending) and time.monotonic() < until:
             found += self._parser.feed(self._read())
         found += self._parser.expire()
-        self.counts.late += len(found)
+        self.counts.late += len(self._answers(found))
+
+    def _answers(self, found: list[Frame]) -> list[Frame]:
+        """The frames that are from no other hand, whose state must never be taken for this one's.
+
+        Other addresses pass: no capture of a real hand's replies is published.
+        """
+        others = {frames.palm_address(number) for number in range(126) if number != self.config.hand_id}
+        mine = [frame for frame in found if frame.source not in others]
+        self._others += len(found) - len(mine)
+        return mine
 
     # --- opening and reopening --------------------------------------------------------------
 
@@ -248,6 +259,11 @@ class SerialHand:
             return (
                 f"{self.port}: no answer; check the power, the A and B wires of RS485, and that the hand has the id "
                 f"{self.config.hand_id} (--link.hand-id)"
+            )
+        if self._others and not self.counts.late:
+            return (
+                f"{self.port}: frames arrive, but from no hand with the id {self.config.hand_id}; check --link.hand-id, "
+                "and that nothing else talks on the line"
             )
         if self.counts.late:
             return (

@@ -89,6 +89,16 @@ def test_a_module_is_named_with_the_task(hand):
         registry.find_task("poke_task:prod")
 
 
+def test_what_the_users_module_or_function_raises_is_told_in_one_line(tmp_path, monkeypatch):
+    (tmp_path / "poke_task.py").write_text("def poke():\n    raise RuntimeError('no\\nlicence')\n")
+    (tmp_path / "half_task.py").write_text("def poke(:\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ConfigError, match="--task poke_task:poke: making it fails: RuntimeError: no licence"):
+        registry.make("poke_task:poke")
+    with pytest.raises(ConfigError, match="task module 'half_task': importing it fails: SyntaxError"):
+        registry.make("half_task:poke")
+
+
 def test_an_installed_package_brings_tasks_by_its_entry_point(monkeypatch, hand):
     class Point:
         def load(self):

@@ -64,6 +64,12 @@ def test_one_start_has_no_interval_to_speak_of():
     assert uneven["high"] - 0.25 == pytest.approx(1.96 * np.sqrt(2 * 2 * 0.75**2) / 4)
 
 
+@pytest.mark.filterwarnings("error")
+def test_an_infinite_return_has_no_interval_and_no_warning():
+    entry = mean_interval(np.array([1.0, np.inf]), np.arange(2))
+    assert entry["value"] == np.inf and np.isnan(entry["low"]) and np.isnan(entry["high"])
+
+
 def test_the_device_and_the_length_of_an_episode_give_their_number(monkeypatch):
     """On a CPU about 128,000 ticks, but one chunk at least and 1,024 episodes at most."""
     number = lambda steps: evaluate.default_episodes(SimpleNamespace(evaluation_steps=steps))  # noqa: E731

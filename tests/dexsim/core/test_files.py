@@ -56,6 +56,24 @@ def test_what_a_kill_during_a_write_leaves_is_removed_by_the_next_write(tmp_path
         writing.wait()
 
 
+def test_a_pipe_is_written_into_and_a_link_stays_a_link(tmp_path):
+    pipe, link, there = tmp_path / "pipe", tmp_path / "link.json", tmp_path / "elsewhere" / "there.json"
+    os.mkfifo(pipe)
+    there.parent.mkdir()
+    there.write_text("old")
+    link.symlink_to(there)
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    try:
+        for path in (pipe, link):
+            cli.check_writable(path)
+            cli.write_json(path, {"a": 1})
+        assert os.read(reader, 100) == there.read_bytes()
+    finally:
+        os.close(reader)
+    assert pipe.is_fifo() and link.is_symlink()
+    assert {path.name for path in tmp_path.iterdir()} == {"pipe", "link.json", "elsewhere"}
+
+
 def test_a_toml_may_begin_with_a_byte_order_mark(tmp_path):
     (tmp_path / "hand.toml").write_bytes(b"\xef\xbb\xbfname = 'from a spreadsheet'\r\n")
     assert read_toml(tmp_path / "hand.toml") == {"name": "from a spreadsheet"}

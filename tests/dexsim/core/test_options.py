@@ -199,6 +199,17 @@ def test_the_whole_help_and_that_of_a_group(capsys, monkeypatch):
     assert "--legs" in whole and "--legs" not in seat
 
 
+def test_the_title_of_a_group_has_dashes_in_its_name_alone(capsys):
+    @dataclasses.dataclass(frozen=True, kw_only=True)
+    class Bench:
+        spare_seat: Spring = setting(Spring())
+        """As those of `dexsim_real.run`."""
+
+    with pytest.raises(SystemExit):
+        cli.parse(Bench, ["--help-all"], prog="bench", description="")
+    assert "--spare-seat: As those of `dexsim_real.run`." in capsys.readouterr().out.splitlines()
+
+
 @pytest.mark.parametrize("columns", [60, 80, 100])
 def test_help_keeps_to_the_terminal(capsys, monkeypatch, columns):
     monkeypatch.setenv("COLUMNS", str(columns))

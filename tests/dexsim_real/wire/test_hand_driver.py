@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from pty_hand import QUICK, PtyHand
 
+from dexsim_real.core.errors import HandError
 from dexsim_real.wire import frames, serial_hand
 from dexsim_real.wire.frames import (
     Command,
@@ -55,6 +56,17 @@ def test_one_request_one_answer():
     assert port.counts.sent == 5 == port.counts.answered
 
 
+def test_a_line_on_which_only_others_talk_is_refused_with_a_hint_at_the_id():
+    def answer(index, block, state):
+        return Frame(0x81, 0xFE, Command.EXCHANGE, state.tobytes()).encode()
+
+    with (
+        PtyHand(answer, version=None) as peer,
+        pytest.raises(HandError, match=r"no hand with the id 0 .*--link.hand-id"),
+    ):
+        SerialHand(peer.port, QUICK).connect()
+
+
 FAULTS = {
     "flip": "corrupt",
     "cut": "corrupt",
@@ -62,6 +74,7 @@ FAULTS = {
     "nothing": "silent",
     "error": "refused",
     "ids": "corrupt",
+    "another hand": "corrupt",
 }
 
 
@@ -84,6 +97,8 @@ def test_every_fault_is_counted_as_what_it_is_and_the_next_answer_is_sound():
             whole = bytearray()
         elif fault == "error":
             whole = bytearray(Frame(0x80, 0xFE, Command.ERROR, b"\x46\x00").encode())
+        elif fault == "another hand":
+            whole = bytearray(Frame(0x81, 0xFE, Command.EXCHANGE, state.tobytes()).encode())
         else:
             bad = state.copy()
             bad["joint"]["id"][5] = 4
