@@ -262,7 +262,7 @@ class SerialHand:
             )
         if self._others and not self.counts.late:
             return (
-                f"{self.port}: frames arrive, but from no hand with the id {self.config.hand_id}; check --link.hand-id, "
+                f"{self.port}: frames come, but from no hand with the id {self.config.hand_id}; check --link.hand-id, "
                 "and that nothing else talks on the line"
             )
         if self.counts.late:

@@ -62,7 +62,7 @@ def test_a_line_on_which_only_others_talk_is_refused_with_a_hint_at_the_id():
 
     with (
         PtyHand(answer, version=None) as peer,
-        pytest.raises(HandError, match=r"no hand with the id 0 .*--link.hand-id"),
+        pytest.raises(HandError, match=r"no hand with the id 0; .*--link.hand-id"),
     ):
         SerialHand(peer.port, QUICK).connect()
 
