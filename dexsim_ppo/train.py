@@ -84,7 +84,7 @@ def train_policy(
     """
     started = time.perf_counter()
     cli.enable_caches()
-    run_dir = options.get("run_dir")
+    policy, run_dir = policy or "", options.get("run_dir")
     if run_dir is not None:
         options = options | {"run_dir": Path(run_dir)}
     begun = find_beginning(task, policy, resume)

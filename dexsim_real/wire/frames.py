@@ -124,6 +124,10 @@ def palm_address(hand_id: int) -> int:
     return hand_id | 0x80
 
 
+PALMS = range(palm_address(0), palm_address(125) + 1)
+"""Bus addresses of all palm boards."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Frame:
     """A frame without head and checksum."""

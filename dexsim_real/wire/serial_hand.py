@@ -180,8 +180,8 @@ class SerialHand:
 
         Other addresses pass: no capture of a real hand's replies is published.
         """
-        others = {frames.palm_address(number) for number in range(126) if number != self.config.hand_id}
-        mine = [frame for frame in found if frame.source not in others]
+        own = frames.palm_address(self.config.hand_id)
+        mine = [frame for frame in found if frame.source == own or frame.source not in frames.PALMS]
         self._others += len(found) - len(mine)
         return mine
 

@@ -55,6 +55,22 @@ def test_an_unknown_preset_is_no_other_one():
         train.train_policy("grasp", preset="huge")
 
 
+def test_no_policy_is_none_whichever_way_it_is_said(monkeypatch):
+    class Begun(Exception):
+        pass
+
+    def begin(arguments, *_, **__):
+        raise Begun(arguments.policy)
+
+    monkeypatch.setattr(train, "run_training", begin)
+    found = []
+    for given in ({}, {"policy": ""}, {"policy": None}):
+        with pytest.raises(Begun) as caught:
+            train.train_policy("grasp", preset="cpu", **given)
+        found += caught.value.args
+    assert found[0] == found[1] == found[2]
+
+
 def test_grasp_has_a_short_horizon_on_every_device():
     for name in PRESETS:
         arguments, _ = train.parse_arguments(["--preset", name])
