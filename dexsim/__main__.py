@@ -15,6 +15,7 @@ COMMANDS = {
     "train": ("dexsim_ppo.train", "train a task"),
     "evaluate": ("dexsim_ppo.evaluate", "measure a policy over fixed episodes"),
     "view": ("dexsim.view.__main__", "show a hand live in the browser"),
+    "average": ("dexsim_ppo.average", "average policies that were fine-tuned from one"),
     "export": ("dexsim_ppo.export", "write a policy for programs without JAX"),
     "record": ("dexsim_ppo.record", "record simulated episodes for other programs"),
     "run": ("dexsim_real.run.__main__", "run a policy on the hand"),

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from dexsim.core.door import open_door
 
 if TYPE_CHECKING:
+    from dexsim_ppo.average import average_policies
     from dexsim_ppo.evaluate import evaluate_policy
     from dexsim_ppo.learner.config import PPOConfig
     from dexsim_ppo.learner.ppo import TrainState, make_train
@@ -24,6 +25,7 @@ __all__ = [
     "TrainState",
     "Trained",
     "act",
+    "average_policies",
     "evaluate_policy",
     "load_policy",
     "make_train",
@@ -39,6 +41,7 @@ __getattr__, __dir__ = open_door(
         "TrainState": "dexsim_ppo.learner.ppo",
         "Trained": "dexsim_ppo.train",
         "act": "dexsim_ppo.policy",
+        "average_policies": "dexsim_ppo.average",
         "evaluate_policy": "dexsim_ppo.evaluate",
         "load_policy": "dexsim_ppo.policy",
         "make_train": "dexsim_ppo.learner.ppo",

@@ -38,7 +38,7 @@ FLOORS = {
         ("retired",),
         ("checkpoint", "policy_file", "report"),
         ("policy",),
-        ("evaluate", "export", "record"),
+        ("average", "evaluate", "export", "record"),
         ("training",),
         ("train",),
         ("reproduce",),

@@ -24,6 +24,7 @@ from dexsim_ppo.train import preset_arguments
 COMMANDS = {
     "dexsim_ppo.train": ("dexsim_ppo.train:TrainArguments", []),
     "dexsim_ppo.evaluate": ("dexsim_ppo.evaluate:EvaluateArguments", ["grasp"]),
+    "dexsim_ppo.average": ("dexsim_ppo.average:AverageArguments", ["rotate", "rotate", "--output", "x.msgpack"]),
     "dexsim_ppo.export": ("dexsim_ppo.export:ExportArguments", ["grasp", "--output", "grasp.npz"]),
     "dexsim_ppo.record": ("dexsim_ppo.record:RecordArguments", ["grasp", "--rrd", "x.rrd"]),
     "dexsim_ppo.reproduce": ("dexsim_ppo.reproduce:ReproduceArguments", ["x.msgpack"]),

@@ -27,6 +27,7 @@ WORDS = {"README.md": 700, "docs/findings.md": 800}
 """Pages with a limit of words."""
 
 COMMANDS = {
+    "dexsim_ppo.average": "dexsim_ppo.average:AverageArguments",
     "dexsim_ppo.evaluate": "dexsim_ppo.evaluate:EvaluateArguments",
     "dexsim_ppo.export": "dexsim_ppo.export:ExportArguments",
     "dexsim_ppo.record": "dexsim_ppo.record:RecordArguments",

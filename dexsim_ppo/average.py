@@ -1,0 +1,111 @@
+"""Averages the weights of policies that were fine-tuned from one.
+
+    python -m dexsim_ppo.average runs/a/last.msgpack runs/b/last.msgpack --output rotate.msgpack
+
+What the policies share stays, and much of what each has learned by chance goes; the result runs as fast as one of them
+(Wortsman et al. 2022, "Model soups"; Nikishin et al. 2018, "Improving stability in deep reinforcement learning with
+weight averaging").
+"""
+
+import dataclasses
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import jax
+import numpy as np
+import tyro
+
+from dexsim.core import cli
+from dexsim.core.errors import ConfigError
+from dexsim_ppo.policy import Policy, layout_to_list, load_policy
+from dexsim_ppo.policy_file import memory_to_list
+
+# Two fine-tunings of rotate are 0.17 apart after 400 million steps each, checkpoints of one training 0.4, policies
+# that were trained from scratch 1.3 to 2.
+APART = 1.0
+
+
+def average_policies(policies: Sequence[Policy]) -> Policy:
+    """The policy whose weights and observation normaliser are the mean of theirs.
+
+    Its configuration is that of the first; its `training` lists theirs. It may be worse than they are: evaluate it.
+
+    Raises:
+      ConfigError: fewer than two; of different tasks, hands, observations or networks; or of no common origin.
+    """
+    if len(policies) < 2:
+        raise ConfigError("an average needs two policies or more")
+    first, *others = policies
+    for number, other in enumerate(others, start=2):
+        odd = [name for name, value in _form(other).items() if value != _form(first)[name]]
+        if odd:
+            raise ConfigError(f"policy {number} differs from the first in {', '.join(odd)}")
+        if (apart := distance(first, other)) > APART:
+            raise ConfigError(
+                f"policy {number} has no common origin with the first: weights differ by {apart:.0%} of their size"
+            )
+    params = jax.tree.map(
+        lambda *leaves: np.mean(leaves, 0, dtype=float).astype(np.float32), *[p.params for p in policies]
+    )
+    return dataclasses.replace(first, params=params, training={"average_of": [p.training for p in policies]})
+
+
+def distance(one: Policy, other: Policy) -> float:
+    """How far apart the weights of two networks of the same form are, over the size of their mean."""
+    a, b = (
+        np.concatenate([np.ravel(leaf).astype(float) for leaf in jax.tree.leaves((p.params.layers, p.params.memory))])
+        for p in (one, other)
+    )
+    return float(np.linalg.norm(a - b) / (np.linalg.norm(a + b) / 2 + 1e-12))
+
+
+def _form(policy: Policy) -> dict[str, Any]:
+    """What averaged policies must have in common."""
+    return {
+        "task": policy.task,
+        "control rate": policy.control_rate,
+        "hand": policy.hand,
+        "observation": layout_to_list(policy.observation_layout),
+        "clip of the observation": policy.params.normalizer.clip,
+        "memory": memory_to_list(policy.params.memory),
+        "layers": [layer.kernel.shape for layer in policy.params.layers],
+        "distribution": policy.params.squash,
+    }
+
+
+@dataclass(frozen=True, kw_only=True)
+class AverageArguments:
+    """Options of `python -m dexsim_ppo.average`."""
+
+    policies: Annotated[tuple[str, ...], tyro.conf.Positional]
+    """Two policies or more: files, or names of shipped ones. The average has the configuration of the first."""
+    output: Path
+    """File to write."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command. Returns its exit code, 0."""
+    arguments = cli.parse(
+        AverageArguments,
+        sys.argv[1:] if argv is None else argv,
+        prog="python -m dexsim_ppo.average",
+        description="Average the weights of policies that were fine-tuned from one.",
+    )
+    cli.check_writable(arguments.output)
+    policies = [load_policy(name) for name in arguments.policies]
+    try:
+        average = average_policies(policies)
+    except ConfigError as error:
+        raise ConfigError(f"{' '.join(arguments.policies)}: {error}") from None
+    average.save(arguments.output)
+    for name, policy in zip(arguments.policies, policies, strict=True):
+        print(f"{name}: {distance(average, policy):.1%} away from the average")
+    print(f"{arguments.output}: measure it with python -m dexsim_ppo.evaluate {arguments.output}")
+    return 0
+
+
+if __name__ == "__main__":
+    cli.run(main)
