@@ -13,7 +13,7 @@ NAMES = {
         OldFileWarning OtherEnvWarning Readings State Task TaskSpec load_hand make observe register
     """,
     "dexsim_ppo": """
-        PPOConfig Policy TrainState Trained act evaluate_policy load_policy make_train train_policy
+        PPOConfig Policy TrainState Trained act average_policies evaluate_policy load_policy make_train train_policy
     """,
     "dexsim_real": """
         Controller HandError HandMeasurement HandPort HandSensing HardwareConfig LinkConfig LogReader LogWriter

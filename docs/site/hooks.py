@@ -67,19 +67,22 @@ def results() -> str:
         report = json.loads(path.read_text())
         trained, timing = report["trained"], report["timing"]
         held, origin = trained["held"], report["origin"]
+        origins = origin.get("average_of", [origin])
         rows = {
             "Task": report["task"],
             "Held to the end": f"{held['value']:.1%} ({held['low']:.1%} to {held['high']:.1%})",
             "Return": f"{trained['return']['value']:.1f}",
             "Episodes": f"{trained['episodes']} of {trained['steps']} ticks",
-            "Training": f"{timing['training_s'] / 60:.1f} min, {origin['env_steps'] / 1e6:.0f} M steps",
+            "Training": f"{timing['training_s'] / 60:.1f} min, {timing['env_steps'] / 1e6:.0f} M steps",
             "Steps per second": f"{timing['env_steps_per_s']:,.0f}",
-            "Seed": origin["seed"],
+            "Seed": ", ".join(sorted({str(each["seed"]) for each in origins})),
             "Hardware": report["hardware"]["device"],
             "Versions": ", ".join(
                 f"{name} {report['versions'][name]}" for name in ("jax", "mujoco") if name in report["versions"]
             ),
         }
+        if len(origins) > 1:
+            rows["Average"] = f"of {len(origins)} policies"
         table = [f"| {name} | {value} |" for name, value in rows.items()]
         cards += ["", f"## {path.stem}", "", "| figure | value |", "|---|---|", *table]
     cards += ["", "The [experiment log](experiments/README.md) says how each figure was measured, and what came later."]
