@@ -23,8 +23,8 @@ from dexsim.core.errors import ConfigError
 from dexsim_ppo.policy import Policy, layout_to_list, load_policy
 from dexsim_ppo.policy_file import memory_to_list
 
-# Two fine-tunings of rotate are 0.17 apart after 400 million steps each, checkpoints of one training 0.4, policies
-# that were trained from scratch 1.3 to 2.
+# Two fine-tunings of rotate are 0.17 apart, checkpoints of one training 0.38, policies that were trained from scratch
+# 1.3 to 2 (record average-39971f3-distances).
 APART = 1.0
 
 
@@ -39,8 +39,9 @@ def average_policies(policies: Sequence[Policy]) -> Policy:
     if len(policies) < 2:
         raise ConfigError("an average needs two policies or more")
     first, *others = policies
+    form = _form(first)
     for number, other in enumerate(others, start=2):
-        odd = [name for name, value in _form(other).items() if value != _form(first)[name]]
+        odd = [name for name, value in _form(other).items() if value != form[name]]
         if odd:
             raise ConfigError(f"policy {number} differs from the first in {', '.join(odd)}")
         if (apart := distance(first, other)) > APART:
@@ -103,7 +104,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     average.save(arguments.output)
     for name, policy in zip(arguments.policies, policies, strict=True):
         print(f"{name}: {distance(average, policy):.1%} away from the average")
-    print(f"{arguments.output}: measure it with python -m dexsim_ppo.evaluate {arguments.output}")
+    print(f"{arguments.output}: evaluate it with python -m dexsim_ppo.evaluate {arguments.output}")
     return 0
 
 
