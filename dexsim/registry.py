@@ -104,7 +104,9 @@ def find_task(name: str) -> TaskEntry:
         for plugin in importlib.metadata.entry_points(group=PLUGINS):
             plugin.load()
     if word not in TASKS:
-        hint = "" if module else f"; a task of your own needs its module: --task my_module:{word}"
+        hint = f"; a task of your own needs its module: --task my_module:{word}"
+        if module:
+            hint = f"; {module} neither registers it nor has a function of that name"
         raise ConfigError(f"unknown task {word!r}: choose from {', '.join(sorted(TASKS))}{hint}")
     return TASKS[word]
 
@@ -135,10 +137,12 @@ def make(
       seed: of the pool of start states.
 
     Raises:
-      ConfigError: unknown task, a config of another task, or `num_envs` below 1.
+      ConfigError: unknown task, a config of another task, no `Hand`, or `num_envs` below 1.
     """
     if num_envs < 1:
         raise ConfigError(f"make({task!r}, num_envs={num_envs}): must be at least 1")
+    if not isinstance(hand, Hand | None):
+        raise ConfigError(f"make({task!r}, hand={hand!r:.80}): must be a Hand, such as dexsim.load_hand(...) returns")
     if (makes := find_task(task).environment) is not None:
         if not isinstance(config, NoSettings | None):
             raise ConfigError(f"task {task!r} takes no config: its environment comes from elsewhere")

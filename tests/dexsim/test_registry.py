@@ -87,6 +87,8 @@ def test_a_module_is_named_with_the_task(hand):
         registry.find_task("no_such_module:poke")
     with pytest.raises(ConfigError, match="unknown task 'prod': choose from grasp, poke, rotate"):
         registry.find_task("poke_task:prod")
+    with pytest.raises(ConfigError, match="rotate.*; poke_task neither registers it nor has a function of that name$"):
+        registry.find_task("poke_task:__name__")  # A value that is no function.
 
 
 def test_what_the_users_module_or_function_raises_is_told_in_one_line(tmp_path, monkeypatch):
@@ -115,6 +117,7 @@ def test_what_make_refuses():
         ("rotate", {"config": GraspConfig()}, "takes a RotateConfig, not a GraspConfig"),
         ("grasp", {"num_envs": 0}, r"num_envs=0\): must be at least 1"),
         ("grasp", {"num_envs": -3}, "must be at least 1"),
+        ("grasp", {"hand": "xhand"}, r"make\('grasp', hand='xhand'\): must be a Hand, such as dexsim.load_hand"),
     ):
         with pytest.raises(ConfigError, match=message):
             dexsim.make(name, options.pop("config", None), **options)
