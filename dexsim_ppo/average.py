@@ -1,6 +1,6 @@
-"""Averages the weights of policies that were fine-tuned from one.
+"""Averages the weights of policies that were fine-tuned from one, or of one run's checkpoints.
 
-    python -m dexsim_ppo.average runs/a/last.msgpack runs/b/last.msgpack --output rotate.msgpack
+    python -m dexsim_ppo.average runs/a runs/b --output rotate.msgpack
 
 What the policies share stays, and much of what each has learned by chance goes; the result runs as fast as one of them
 (Wortsman et al. 2022, "Model soups"; Nikishin et al. 2018, "Improving stability in deep reinforcement learning with
@@ -15,13 +15,20 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import tyro
 
 from dexsim.core import cli
-from dexsim.core.errors import ConfigError
+from dexsim.core.errors import CheckpointError, ConfigError
+from dexsim_ppo import checkpoint
+from dexsim_ppo.learner.networks import Params
+from dexsim_ppo.learner.running_stats import make_normalizer, recover_stats
+from dexsim_ppo.learner.state import TrainState
 from dexsim_ppo.policy import Policy, layout_to_list, load_policy
 from dexsim_ppo.policy_file import memory_to_list
+from dexsim_ppo.retired import migrate_leaves
+from dexsim_ppo.training.runlog import RunFolder
 
 # Two fine-tunings of rotate are 0.17 apart, checkpoints of one training 0.38, policies that were trained from scratch
 # 1.3 to 2 (record average-39971f3-distances).
@@ -63,6 +70,47 @@ def distance(one: Policy, other: Policy) -> float:
     return float(np.linalg.norm(a - b) / (np.linalg.norm(a + b) / 2 + 1e-12))
 
 
+def policies_of(run: str | Path) -> dict[Path, Policy]:
+    """The policies of the checkpoints that a run has kept (`--keep-checkpoints`), oldest first.
+
+    Raises:
+      CheckpointError: there is no checkpoint, or one or the last policy is missing or unsound.
+    """
+    folder = RunFolder(Path(run))
+    folder.latest_checkpoint()
+    last = Policy.load(folder.last)
+    if "ppo" not in last.training:
+        raise CheckpointError(f"{folder.last}: does not say how it was trained; name policies instead of the run")
+    return {path: _policy_at(path, last) for path in folder.existing_checkpoints()}
+
+
+def _policy_at(path: Path, last: Policy) -> Policy:
+    """The policy of a checkpoint, in the form of its run's last one."""
+    ppo, params = last.training["ppo"], last.params
+    std_floor = ppo["observation_std_floor"]
+    file = checkpoint.load(path, kind="train", task=last.task)
+    nothing: Any = None
+    like = TrainState(
+        params=Params(params.layers, nothing, nothing, params.memory),
+        observation_stats={"actor": recover_stats(params.normalizer, std_floor=std_floor)},
+        iteration=jnp.int32(0),
+        **dict.fromkeys(("adam", "learning_rate", "value_stats", "env_state", "key", "skipped_updates"), nothing),
+    )
+    names = {jax.tree_util.keystr(name) for name, _ in jax.tree_util.tree_leaves_with_path(like)}
+    leaves = {name: leaf for name, leaf in migrate_leaves(file.leaves, names).items() if name in names}
+    state = checkpoint.restore(dataclasses.replace(file, leaves=leaves), like)
+    stats, clip = state.observation_stats["actor"], params.normalizer.clip
+    normalizer = make_normalizer(stats, last.observation_layout, std_floor=std_floor, clip=clip)
+    steps = int(state.iteration) * ppo["num_envs"] * ppo["rollout_length"]
+    return dataclasses.replace(
+        last,
+        params=dataclasses.replace(
+            params, layers=state.params.actor, normalizer=normalizer, memory=state.params.memory
+        ),
+        training=last.training | {"iteration": int(state.iteration), "env_steps": steps},
+    )
+
+
 def _form(policy: Policy) -> dict[str, Any]:
     """What averaged policies must have in common."""
     return {
@@ -82,7 +130,8 @@ class AverageArguments:
     """Options of `python -m dexsim_ppo.average`."""
 
     policies: Annotated[tuple[str, ...], tyro.conf.Positional]
-    """Two policies or more: files, or names of shipped ones. The average has the configuration of the first."""
+    """Policies: files, names of shipped ones, or folders of runs, which stand for the checkpoints that they have kept.
+    The average has the configuration of the first."""
     output: Path
     """File to write."""
 
@@ -93,17 +142,19 @@ def main(argv: Sequence[str] | None = None) -> int:
         AverageArguments,
         sys.argv[1:] if argv is None else argv,
         prog="python -m dexsim_ppo.average",
-        description="Average the weights of policies that were fine-tuned from one.",
+        description="Average the weights of policies that were fine-tuned from one, or of one run's checkpoints.",
     )
     cli.check_writable(arguments.output)
-    policies = [load_policy(name) for name in arguments.policies]
+    policies: list[tuple[str | Path, Policy]] = []
+    for name in arguments.policies:
+        policies += policies_of(name).items() if Path(name).is_dir() else [(name, load_policy(name))]
     try:
-        average = average_policies(policies)
+        average = average_policies([policy for _, policy in policies])
     except ConfigError as error:
         raise ConfigError(f"{' '.join(arguments.policies)}: {error}") from None
     average.save(arguments.output)
-    for name, policy in zip(arguments.policies, policies, strict=True):
-        print(f"{name}: {distance(average, policy):.1%} away from the average")
+    for path, policy in policies:
+        print(f"{path}: {distance(average, policy):.1%} away from the average")
     print(f"{arguments.output}: evaluate it with python -m dexsim_ppo.evaluate {arguments.output}")
     return 0
 

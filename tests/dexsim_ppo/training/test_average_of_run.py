@@ -1,0 +1,75 @@
+"""The average of a run's checkpoints: that of the policies which the run had when it wrote them."""
+
+import jax
+import numpy as np
+import pytest
+import tiny_train
+
+from dexsim.core.errors import CheckpointError, ConfigError
+from dexsim_ppo import average, average_policies, train
+from dexsim_ppo.policy import Policy
+from dexsim_ppo.training.runlog import RunFolder
+
+QUICK = "--task tiny --preset cpu --no-video --ppo.num-envs 16 --ppo.rollout-length 8 --ppo.actor-layers 8".split()
+QUICK += "--ppo.critic-layers 8 --evaluation-chunk 16 --evaluation-episodes 16 --seed 3".split()
+PER_ITERATION = 16 * 8
+
+
+@pytest.fixture(autouse=True)
+def tiny_task(monkeypatch):
+    tiny_train.install(monkeypatch)
+
+
+@pytest.mark.parametrize("memory", ["none", "gru", "history"])
+def test_a_run_stands_for_the_policies_of_its_checkpoints(memory, tmp_path):
+    run = RunFolder(tmp_path / "a")
+    policies = []
+    for steps in (1, 3, 4):  # Each time it ends it writes a checkpoint, and the policy as it is.
+        begin = (
+            [*QUICK, "--ppo.memory", memory, "--run-dir", str(run.path)] if steps == 1 else ["--resume", str(run.path)]
+        )
+        assert train.main([*begin, "--steps", str(steps * PER_ITERATION)]) == 0
+        policies.append(Policy.load(run.last))
+
+    found = average.policies_of(run.path)
+    assert [path.name for path in found] == ["00000001.msgpack", "00000003.msgpack", "00000004.msgpack"]
+    for policy, copy in zip(found.values(), policies, strict=True):
+        assert policy.training == copy.training
+        for a, b in zip(jax.tree.leaves(policy.params), jax.tree.leaves(copy.params), strict=True):
+            np.testing.assert_array_equal(a, b)
+
+    output = tmp_path / "average.msgpack"
+    assert average.main([str(run.path), "--output", str(output)]) == 0
+    wanted = average_policies(policies)
+    mean = Policy.load(output)
+    assert mean.training["average_of"] == [policy.training for policy in policies]
+    for a, b in zip(jax.tree.leaves(mean.params), jax.tree.leaves(wanted.params), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_what_is_no_whole_run_is_refused(tmp_path):
+    run, output = RunFolder(tmp_path / "a"), tmp_path / "average.msgpack"
+    refused = lambda: average.main([str(run.path), "--output", str(output)])  # noqa: E731
+    run.path.mkdir()
+    with pytest.raises(CheckpointError, match="a: holds no checkpoint"):
+        refused()
+    run.path.rmdir()
+    assert train.main([*QUICK, "--steps", str(PER_ITERATION), "--run-dir", str(run.path)]) == 0
+    with pytest.raises(ConfigError, match="a: an average needs two policies or more"):
+        refused()
+
+    # A last policy of another network, and a checkpoint that is cut short.
+    (written,) = run.existing_checkpoints()
+    last, network = run.last.read_bytes(), ["--ppo.actor-layers", "4"]
+    assert train.main([*QUICK, *network, "--steps", str(PER_ITERATION), "--run-dir", str(tmp_path / "b")]) == 0
+    run.last.write_bytes(RunFolder(tmp_path / "b").last.read_bytes())
+    with pytest.raises(CheckpointError, match=r"00000001.msgpack: does not fit this configuration: \.params"):
+        refused()
+    run.last.write_bytes(last)
+    written.write_bytes(written.read_bytes()[:-1])
+    with pytest.raises(CheckpointError, match="00000001.msgpack"):
+        refused()
+    run.last.unlink()
+    with pytest.raises(CheckpointError, match="last.msgpack"):
+        refused()
+    assert not output.exists()
