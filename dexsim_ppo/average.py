@@ -26,7 +26,7 @@ from dexsim_ppo.learner.networks import Params
 from dexsim_ppo.learner.running_stats import make_normalizer, recover_stats
 from dexsim_ppo.learner.state import TrainState
 from dexsim_ppo.policy import Policy, layout_to_list, load_policy
-from dexsim_ppo.policy_file import memory_to_list
+from dexsim_ppo.policy_file import check_numbers, memory_to_list
 from dexsim_ppo.retired import migrate_leaves
 from dexsim_ppo.training.runlog import RunFolder
 
@@ -79,15 +79,19 @@ def policies_of(run: str | Path) -> dict[Path, Policy]:
     folder = RunFolder(Path(run))
     folder.latest_checkpoint()
     last = Policy.load(folder.last)
-    if "ppo" not in last.training:
-        raise CheckpointError(f"{folder.last}: does not say how it was trained; name policies instead of the run")
-    return {path: _policy_at(path, last) for path in folder.existing_checkpoints()}
+    try:
+        ppo = last.training["ppo"]
+        std_floor, steps = float(ppo["observation_std_floor"]), int(ppo["num_envs"]) * int(ppo["rollout_length"])
+    except (KeyError, TypeError, ValueError):
+        raise CheckpointError(
+            f"{folder.last}: does not say how it was trained; name policies instead of the run"
+        ) from None
+    return {path: _policy_at(path, last, std_floor, steps) for path in folder.existing_checkpoints()}
 
 
-def _policy_at(path: Path, last: Policy) -> Policy:
-    """The policy of a checkpoint, in the form of its run's last one."""
-    ppo, params = last.training["ppo"], last.params
-    std_floor = ppo["observation_std_floor"]
+def _policy_at(path: Path, last: Policy, std_floor: float, steps: int) -> Policy:
+    """The policy of a checkpoint, in the form of its run's last one; `steps` are those of an iteration."""
+    params = last.params
     file = checkpoint.load(path, kind="train", task=last.task)
     nothing: Any = None
     like = TrainState(
@@ -101,13 +105,17 @@ def _policy_at(path: Path, last: Policy) -> Policy:
     state = checkpoint.restore(dataclasses.replace(file, leaves=leaves), like)
     stats, clip = state.observation_stats["actor"], params.normalizer.clip
     normalizer = make_normalizer(stats, last.observation_layout, std_floor=std_floor, clip=clip)
-    steps = int(state.iteration) * ppo["num_envs"] * ppo["rollout_length"]
+    try:
+        check_numbers(state.params.actor, normalizer, state.params.memory)
+    except ValueError as error:
+        raise CheckpointError(f"{path}: holds no sound policy ({error})") from None
+    iteration = int(state.iteration)
     return dataclasses.replace(
         last,
         params=dataclasses.replace(
             params, layers=state.params.actor, normalizer=normalizer, memory=state.params.memory
         ),
-        training=last.training | {"iteration": int(state.iteration), "env_steps": steps},
+        training=last.training | {"iteration": iteration, "env_steps": iteration * steps},
     )
 
 

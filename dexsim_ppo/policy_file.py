@@ -33,7 +33,7 @@ def read_network(content: dict[str, Any], leaves: dict[str, Any]) -> tuple[tuple
         or not normalizer.mean.shape == normalizer.std.shape == (inputs,)
     ):
         raise ValueError(f"layer shapes {shapes} for {sizes[0]} inputs")
-    _check_numbers(layers, normalizer, memory)
+    check_numbers(layers, normalizer, memory)
     return layout, layers, normalizer, memory
 
 
@@ -83,7 +83,7 @@ def _check_number(name: str, value: Any, low: float, high: float) -> None:
         raise ValueError(f"{name} = {str(value):.50}: must be a number between {low:g} and {high:g}")
 
 
-def _check_numbers(layers: MLP, normalizer: Normalizer, memory: Memory) -> None:
+def check_numbers(layers: MLP, normalizer: Normalizer, memory: Memory) -> None:
     """Raises ValueError: some number is not finite, or some observation would give an action that is not."""
     arrays = {"normalizer.mean": normalizer.mean, "normalizer.std": normalizer.std}
     if isinstance(memory, GRU):

@@ -1,12 +1,14 @@
 """The average of a run's checkpoints: that of the policies which the run had when it wrote them."""
 
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
 import tiny_train
 
 from dexsim.core.errors import CheckpointError, ConfigError
-from dexsim_ppo import average, average_policies, train
+from dexsim_ppo import average, average_policies, checkpoint, train
 from dexsim_ppo.policy import Policy
 from dexsim_ppo.training.runlog import RunFolder
 
@@ -47,7 +49,7 @@ def test_a_run_stands_for_the_policies_of_its_checkpoints(memory, tmp_path):
         np.testing.assert_array_equal(a, b)
 
 
-def test_what_is_no_whole_run_is_refused(tmp_path):
+def test_what_is_no_whole_run_is_refused(tmp_path, monkeypatch):
     run, output = RunFolder(tmp_path / "a"), tmp_path / "average.msgpack"
     refused = lambda: average.main([str(run.path), "--output", str(output)])  # noqa: E731
     run.path.mkdir()
@@ -65,7 +67,26 @@ def test_what_is_no_whole_run_is_refused(tmp_path):
     run.last.write_bytes(RunFolder(tmp_path / "b").last.read_bytes())
     with pytest.raises(CheckpointError, match=r"00000001.msgpack: does not fit this configuration: \.params"):
         refused()
+    policy = Policy.load(tmp_path / "b" / "last.msgpack")
+    dataclasses.replace(policy, training={"ppo": {"num_envs": "many"}}).save(run.last)
+    with pytest.raises(CheckpointError, match="last.msgpack: does not say how it was trained; name policies"):
+        refused()
     run.last.write_bytes(last)
+
+    # Weights that are no numbers, and a checkpoint that is cut short.
+    load = checkpoint.load
+
+    def forged(path, *, kind, **options):
+        file = load(path, kind=kind, **options)
+        actor = {name: x * np.float32("nan") for name, x in file.leaves.items() if name.startswith(".params.actor")}
+        return dataclasses.replace(file, leaves=file.leaves | actor)
+
+    with (
+        monkeypatch.context() as patch,
+        pytest.raises(CheckpointError, match="00000001.msgpack: holds no sound policy"),
+    ):
+        patch.setattr(checkpoint, "load", forged)
+        refused()
     written.write_bytes(written.read_bytes()[:-1])
     with pytest.raises(CheckpointError, match="00000001.msgpack"):
         refused()
