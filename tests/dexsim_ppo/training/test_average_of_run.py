@@ -22,11 +22,11 @@ def tiny_task(monkeypatch):
     tiny_train.install(monkeypatch)
 
 
-@pytest.mark.parametrize("memory", ["none", "gru", "history"])
+@pytest.mark.parametrize("memory", ["gru", "history"])
 def test_a_run_stands_for_the_policies_of_its_checkpoints(memory, tmp_path):
     run = RunFolder(tmp_path / "a")
     policies = []
-    for steps in (1, 3, 4):  # Each time it ends it writes a checkpoint, and the policy as it is.
+    for steps in (1, 3):  # Each time it ends it writes a checkpoint, and the policy as it is.
         begin = (
             [*QUICK, "--ppo.memory", memory, "--run-dir", str(run.path)] if steps == 1 else ["--resume", str(run.path)]
         )
@@ -34,7 +34,7 @@ def test_a_run_stands_for_the_policies_of_its_checkpoints(memory, tmp_path):
         policies.append(Policy.load(run.last))
 
     found = average.policies_of(run.path)
-    assert [path.name for path in found] == ["00000001.msgpack", "00000003.msgpack", "00000004.msgpack"]
+    assert [path.name for path in found] == ["00000001.msgpack", "00000003.msgpack"]
     for policy, copy in zip(found.values(), policies, strict=True):
         assert policy.training == copy.training
         for a, b in zip(jax.tree.leaves(policy.params), jax.tree.leaves(copy.params), strict=True):
