@@ -104,10 +104,9 @@ def find_task(name: str) -> TaskEntry:
         for plugin in importlib.metadata.entry_points(group=PLUGINS):
             plugin.load()
     if word not in TASKS:
-        hint = f"; a task of your own needs its module: --task my_module:{word}"
-        if module:
-            hint = f"; {module} neither registers it nor has a function of that name"
-        raise ConfigError(f"unknown task {word!r}: choose from {', '.join(sorted(TASKS))}{hint}")
+        lacks = f"{module} neither registers it nor has a function of that name"
+        hint = lacks if module else f"a task of your own needs its module: --task my_module:{word}"
+        raise ConfigError(f"unknown task {word!r}: choose from {', '.join(sorted(TASKS))}; {hint}")
     return TASKS[word]
 
 

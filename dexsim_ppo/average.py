@@ -27,7 +27,6 @@ from dexsim_ppo.learner.running_stats import make_normalizer, recover_stats
 from dexsim_ppo.learner.state import TrainState
 from dexsim_ppo.policy import Policy, layout_to_list, load_policy
 from dexsim_ppo.policy_file import check_numbers, memory_to_list
-from dexsim_ppo.retired import migrate_leaves
 from dexsim_ppo.training.runlog import RunFolder
 
 # Two fine-tunings of rotate are 0.17 apart, checkpoints of one training 0.38, policies that were trained from scratch
@@ -92,7 +91,6 @@ def policies_of(run: str | Path) -> dict[Path, Policy]:
 def _policy_at(path: Path, last: Policy, std_floor: float, steps: int) -> Policy:
     """The policy of a checkpoint, in the form of its run's last one; `steps` are those of an iteration."""
     params = last.params
-    file = checkpoint.load(path, kind="train", task=last.task)
     nothing: Any = None
     like = TrainState(
         params=Params(params.layers, nothing, nothing, params.memory),
@@ -100,9 +98,7 @@ def _policy_at(path: Path, last: Policy, std_floor: float, steps: int) -> Policy
         iteration=jnp.int32(0),
         **dict.fromkeys(("adam", "learning_rate", "value_stats", "env_state", "key", "skipped_updates"), nothing),
     )
-    names = {jax.tree_util.keystr(name) for name, _ in jax.tree_util.tree_leaves_with_path(like)}
-    leaves = {name: leaf for name, leaf in migrate_leaves(file.leaves, names).items() if name in names}
-    state = checkpoint.restore(dataclasses.replace(file, leaves=leaves), like)
+    state = checkpoint.restore(checkpoint.load(path, kind="train", task=last.task), like, part=True)
     stats, clip = state.observation_stats["actor"], params.normalizer.clip
     normalizer = make_normalizer(stats, last.observation_layout, std_floor=std_floor, clip=clip)
     try:

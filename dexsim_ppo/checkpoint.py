@@ -140,10 +140,10 @@ def load(path: str | Path, *, kind: str, task: str | None = None) -> Checkpoint:
     )
 
 
-def restore(checkpoint: Checkpoint, like: Tree) -> Tree:
+def restore(checkpoint: Checkpoint, like: Tree, *, part: bool = False) -> Tree:
     """The loaded leaves in the shape of `like`, a pytree of arrays or of `jax.ShapeDtypeStruct`s.
 
-    Leaves of older versions go where today's are (`dexsim_ppo.retired`).
+    Leaves of older versions go where today's are (`dexsim_ppo.retired`). With `part`, `like` may lack some of them.
 
     Raises:
       CheckpointError: a leaf is missing, left over, or of another shape or type; names it.
@@ -151,7 +151,7 @@ def restore(checkpoint: Checkpoint, like: Tree) -> Tree:
     wanted, structure = jax.tree_util.tree_flatten_with_path(like)
     paths = [jax.tree_util.keystr(tree_path) for tree_path, _ in wanted]
     leaves = migrate_leaves(checkpoint.leaves, set(paths))
-    for name in (*paths, *leaves):
+    for name in paths if part else (*paths, *leaves):
         if (name in leaves) != (name in set(paths)):
             raise CheckpointError(
                 f"{checkpoint.path}: does not fit this configuration: {name} is "

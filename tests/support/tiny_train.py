@@ -9,6 +9,10 @@ from dexsim import registry
 
 ENTRY = types.SimpleNamespace(config_class=TinyConfig, config=TinyConfig, task=TinyEnv, environment=None)
 
+QUICK = "--task tiny --preset cpu --no-video --ppo.num-envs 16 --ppo.rollout-length 8 --ppo.actor-layers 8".split()
+QUICK += "--ppo.critic-layers 8 --evaluation-chunk 16 --evaluation-episodes 16".split()
+PER_ITERATION = 16 * 8  # steps of QUICK
+
 
 def make(task, config=None, *, backend="auto", num_envs=1, **_):
     assert task == "tiny"

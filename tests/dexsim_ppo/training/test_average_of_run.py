@@ -6,15 +6,14 @@ import jax
 import numpy as np
 import pytest
 import tiny_train
+from tiny_train import PER_ITERATION
 
 from dexsim.core.errors import CheckpointError, ConfigError
 from dexsim_ppo import average, average_policies, checkpoint, train
 from dexsim_ppo.policy import Policy
 from dexsim_ppo.training.runlog import RunFolder
 
-QUICK = "--task tiny --preset cpu --no-video --ppo.num-envs 16 --ppo.rollout-length 8 --ppo.actor-layers 8".split()
-QUICK += "--ppo.critic-layers 8 --evaluation-chunk 16 --evaluation-episodes 16 --seed 3".split()
-PER_ITERATION = 16 * 8
+QUICK = [*tiny_train.QUICK, "--seed", "3"]
 
 
 @pytest.fixture(autouse=True)

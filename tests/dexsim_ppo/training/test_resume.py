@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import tiny_train
 from tiny_env import TinyConfig
+from tiny_train import PER_ITERATION
 
 from dexsim.core.errors import CheckpointError, ConfigError
 from dexsim_ppo import checkpoint, train
@@ -19,9 +20,7 @@ from dexsim_ppo.training import runlog
 from dexsim_ppo.training.arguments import check_resumed
 from dexsim_ppo.training.runlog import RunFolder
 
-QUICK = "--task tiny --preset cpu --no-video --ppo.num-envs 16 --ppo.rollout-length 8 --ppo.actor-layers 8".split()
-QUICK += "--ppo.critic-layers 8 --evaluation-chunk 16 --evaluation-episodes 16 --seed 3".split()
-PER_ITERATION = 16 * 8
+QUICK = [*tiny_train.QUICK, "--seed", "3"]
 
 
 @pytest.fixture(autouse=True)

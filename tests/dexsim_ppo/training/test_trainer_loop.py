@@ -214,9 +214,7 @@ def test_an_evaluation_is_of_the_task_as_configured(own, backend, tmp_path, monk
     assert run.evaluator.chunk == 6
 
 
-QUICK = "--task tiny --preset cpu --no-video --ppo.num-envs 16 --ppo.rollout-length 8 --ppo.actor-layers 8".split()
-QUICK += "--ppo.critic-layers 8 --evaluation-chunk 16 --evaluation-episodes 16 --log-every 1".split()
-QUICK += "--evaluate-every 1 --evaluation-share 1".split()
+QUICK = [*tiny_train.QUICK, *"--log-every 1 --evaluate-every 1 --evaluation-share 1".split()]
 
 
 def test_a_budget_that_ends_while_compiling_is_said(tmp_path, monkeypatch, capsys):

@@ -19,10 +19,7 @@ from dexsim_ppo.training.display import Display
 from dexsim_ppo.training.faults import Faults
 from dexsim_ppo.training.runlog import RunFolder, read_metrics
 
-QUICK = "--task tiny --preset cpu --no-video --ppo.num-envs 16 --ppo.rollout-length 8 --ppo.actor-layers 8".split()
-QUICK += "--ppo.critic-layers 8 --ppo.minibatches 2 --ppo.epochs 1 --evaluation-chunk 16 --seed 3".split()
-QUICK += "--evaluation-episodes 16 --log-every 1".split()
-PER_ITERATION = 16 * 8
+QUICK = [*tiny_train.QUICK, *"--ppo.minibatches 2 --ppo.epochs 1 --seed 3 --log-every 1".split()]
 GOOD_ITERATIONS = 3
 
 
