@@ -13,7 +13,7 @@ from following_hand import records, summary
 from twin_line import Running
 
 from dexsim_real.core.log import Kind
-from dexsim_real.twin.wire.faults import FaultConfig
+from dexsim_real.twin.wire.faults import Fault, FaultConfig
 
 
 def start(running, folder, *more):
@@ -47,8 +47,11 @@ def test_wrong_angles_move_nothing_as_judged_by_the_true_ones(hand, tmp_path):
 
 
 def test_a_wrong_angle_that_stays_ends_the_run_with_its_name(hand, tmp_path):
-    with Running(hand, tmp_path, task="grasp", faults=FaultConfig(script=("2 angle 5 stuck 0.2 60",))) as running:
+    with Running(hand, tmp_path, task="grasp") as running:
         process = start(running, tmp_path, "--seconds", "30")
+        # Once the joint is far away, however long that takes: an angle stuck where the joint is could be true.
+        wait(lambda: running.plant.angle[5] > 1.0, 60)
+        running.twin.firmware.faults.append(Fault("angle", joint=5, form="stuck", radians=0.2))
         assert process.wait(60) == 1
         assert not running.twin.firmware.on and running.twin.check.report()["outside_limits"] == 0
     assert "index_joint2 reads 0.2 rad" in summary(tmp_path)["end"]
