@@ -14,17 +14,16 @@ drives: `identify` on a joint of the model, with autocorrelated noise and a torq
 """
 
 import argparse
-import concurrent.futures
 import functools
 import io
 import json
-import multiprocessing
 import sys
 import tempfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from workers import pool
 
 GAUGE_ERROR = 0.005  # standard deviation of a gauge's scale
 GRAM = 9.80665e-3  # N, resolution of a kitchen scale
@@ -221,13 +220,13 @@ def main() -> int:
     seeds, rows = range(options.seed, options.seed + options.trials), []
     with (
         tempfile.TemporaryDirectory() as scratch,
-        concurrent.futures.ProcessPoolExecutor(options.processes, multiprocessing.get_context("spawn")) as pool,
+        pool(options.processes) as workers,
     ):
         folder = options.logs or Path(scratch)
         folder.mkdir(parents=True, exist_ok=True)
         for part in options.parts:
             trial = functools.partial(PARTS[part], folder) if part == "hand" else PARTS[part]
-            for seed, found in zip(seeds, pool.map(trial, seeds), strict=True):
+            for seed, found in zip(seeds, workers.map(trial, seeds), strict=True):
                 print(f"{part} {seed}", file=sys.stderr, flush=True)
                 rows += found
     table = summary(rows)

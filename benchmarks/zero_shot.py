@@ -13,11 +13,9 @@ as for a user (`trials.py`). The metrics use the true state, not the measurement
 not depend on the other trials. A hand that does nothing gets the same trials, in virtual time.
 """
 
-import concurrent.futures
 import dataclasses
 import functools
 import itertools
-import multiprocessing
 import sys
 import time
 from collections.abc import Sequence
@@ -25,6 +23,7 @@ from typing import Any
 
 import numpy as np
 from trials import real_trial
+from workers import pool
 from zero_shot_options import arguments
 from zero_shot_table import simulated, table
 
@@ -112,9 +111,8 @@ def run_all(options: dict[str, Any], trials: int, processes: int, show: bool) ->
     seeds, numbers = zip(*itertools.product(options["seed"], range(first, first + trials)), strict=True)
     if processes <= 1:
         return [_shown(report, show) for report in map(trial, seeds, numbers)]
-    # JAX does not support fork.
-    with concurrent.futures.ProcessPoolExecutor(processes, multiprocessing.get_context("spawn")) as pool:
-        return [_shown(report, show) for report in pool.map(trial, seeds, numbers)]
+    with pool(processes) as workers:
+        return [_shown(report, show) for report in workers.map(trial, seeds, numbers)]
 
 
 def _shown(report: dict[str, Any], show: bool) -> dict[str, Any]:

@@ -2,12 +2,13 @@
 
 import contextlib
 import datetime
+import fcntl
 import importlib.util
 import itertools
 import json
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -60,6 +61,23 @@ class RunFolder:
         if not found:
             raise CheckpointError(f"{self.path}: holds no checkpoint to resume from")
         return found[-1]
+
+    @contextlib.contextmanager
+    def locked(self) -> Iterator[None]:
+        """Keep other processes from training this run, until the context or this process ends. Where the file system
+        has no locks, nothing does.
+
+        Raises:
+          ConfigError: one trains it already.
+        """
+        with self.config.open("rb+") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise ConfigError(f"{self.path}: another process is training this run") from None
+            except OSError:
+                pass
+            yield
 
     def keep_report(self) -> None:
         """Number the report of a run that had ended before and was resumed: another must not replace it."""
@@ -121,11 +139,16 @@ def folder_of(checkpoint: Path) -> Path:
     """The folder of the run that a checkpoint is of.
 
     Raises:
-      ConfigError: it is in none.
+      ConfigError: it is in none, or the run lacks a file that it needs at the end.
     """
     folder = checkpoint.resolve().parent.parent
     if not RunFolder(folder).config.exists():
         raise ConfigError(f"--resume {checkpoint}: is not in the checkpoints of a run; {folder} has no config.json")
+    if not RunFolder(folder).untrained.exists():
+        raise ConfigError(
+            f"--resume {checkpoint}: {folder} has no untrained.msgpack, with which the report compares; put it back, "
+            "or begin another run with --policy"
+        )
     return folder
 
 
@@ -139,11 +162,14 @@ class MetricsLog:
     Weights & Biases, if the options name a project."""
 
     def __init__(self, folder: RunFolder, first_iteration: int, arguments: TrainArguments):
-        rows = [row for row in read_metrics(folder.metrics) if row["iteration"] <= first_iteration]
-        # A resumed run repeats what came after its checkpoint.
-        write_whole(folder.metrics, ["".join(json.dumps(row) + "\n" for row in rows).encode()])
-        folder.set_aside(first_iteration)
-        self._file = folder.metrics.open("a", buffering=1)
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(folder.locked())
+            rows = [row for row in read_metrics(folder.metrics) if row["iteration"] <= first_iteration]
+            # A resumed run repeats what came after its checkpoint.
+            write_whole(folder.metrics, ["".join(json.dumps(row) + "\n" for row in rows).encode()])
+            folder.set_aside(first_iteration)
+            self._file = stack.enter_context(folder.metrics.open("a", buffering=1))
+            self._closing = stack.pop_all()
         self._tensorboard = _tensorboard_writer(folder.path)
         self._wandb = _wandb_run(folder.path, arguments) if arguments.wandb else None
 
@@ -160,7 +186,7 @@ class MetricsLog:
     def close(self) -> None:
         """Flush to disk."""
         try:
-            self._file.close()
+            self._closing.close()
         finally:
             if self._tensorboard:
                 with contextlib.suppress(OSError):  # The disk is full, and `metrics.jsonl` says so.

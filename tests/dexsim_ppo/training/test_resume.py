@@ -4,11 +4,14 @@ import contextlib
 import dataclasses
 import datetime
 import json
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 import tiny_train
+from paths import ROOT
 from tiny_env import TinyConfig
 from tiny_train import PER_ITERATION
 
@@ -143,6 +146,37 @@ def test_a_checkpoint_is_resumed_from_within_its_folder_and_not_from_elsewhere(f
     monkeypatch.chdir(finished.checkpoints)
     assert train.main(["--resume", "00000002.msgpack", "--steps", str(3 * PER_ITERATION)]) == 0
     assert finished.latest_checkpoint() == finished.checkpoint(3)
+
+
+def contents(folder):
+    return {path: path.read_bytes() for path in folder.path.rglob("*") if path.is_file()}
+
+
+def test_a_run_that_another_process_trains_is_left_alone(finished):
+    before, further = contents(finished), ["--resume", str(finished.path), "--steps", str(3 * PER_ITERATION)]
+    script = f"import sys; from pathlib import Path; from {RunFolder.__module__} import RunFolder\n"
+    script += "with RunFolder(Path(sys.argv[1])).locked(): print(flush=True); sys.stdin.read()"
+    other = subprocess.Popen(
+        [sys.executable, "-c", script, str(finished.path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=ROOT
+    )
+    try:
+        other.stdout.readline()
+        with pytest.raises(ConfigError, match=r"/a: another process is training this run$"):
+            train.main(further)
+        assert contents(finished) == before
+    finally:
+        other.kill()  # What a killed process held is free.
+        other.communicate()
+    assert train.main(further) == 0
+    assert Policy.load(finished.last).training["iteration"] == 3
+
+
+def test_a_run_without_its_untrained_policy_is_refused_before_it_trains(finished):
+    finished.untrained.unlink()
+    before = contents(finished)
+    with pytest.raises(ConfigError, match=r"--resume .*00000002\.msgpack: .*/a has no untrained\.msgpack"):
+        train.main(["--resume", str(finished.path), "--steps", str(3 * PER_ITERATION)])
+    assert contents(finished) == before
 
 
 def test_options_of_a_run_leave_no_room_for_a_preset(finished):
