@@ -19,6 +19,7 @@ import numpy as np
 import tyro
 
 from dexsim.core import cli
+from dexsim.core.compilation import jit
 from dexsim.core.config import setting, validate
 from dexsim.core.errors import ConfigError
 from dexsim.datasets.lerobot import check_lerobot, write_lerobot
@@ -43,9 +44,10 @@ def record(policy: Policy, env: Any, *, episodes: int, seconds: float, seed: int
         seen = {name: getattr(state.readings, name) for name in READINGS}
         return (after, memory), (seen, after.joint_target, after.terminated)
 
-    starts = jax.jit(env.evaluation_starts)(env.evaluation_plan(episodes, seed))
+    starts = jit(env.evaluation_starts, once=True)(env.evaluation_plan(episodes, seed))
     begun = starts, policy.begin(episodes)
-    _, recorded = jax.jit(lambda begun: jax.lax.scan(tick, begun, None, length=ticks))(begun)
+    run = jit(lambda begun: jax.lax.scan(tick, begun, None, length=ticks), backend=env.backend)
+    _, recorded = run(begun)
     seen, target, ended = jax.device_get(recorded)
     found = []
     for i in range(episodes):

@@ -1,6 +1,8 @@
 """The notebooks run from top to bottom, headless and small, and have the outputs of a whole run with them."""
 
+import ast
 import base64
+import importlib
 import io
 import os
 import re
@@ -76,8 +78,25 @@ def test_outputs_are_of_a_whole_run(name):
     check(name, notebook)
 
 
-# What these train, test_own_task.py and test_example_hands.py train too, so that they can wait for the long tests.
-LONG = ("own_task", "own_hand")
+def test_all_that_they_import_is_there():
+    """Also of those that run with the long tests alone."""
+    found = 0
+    for name in EXPECTED:
+        for cell in nbformat.read(ROOT / "notebooks" / f"{name}.ipynb", as_version=4).cells:
+            if cell.cell_type != "code":
+                continue
+            for node in ast.walk(ast.parse(re.sub(r"(?m)^([%!].*)$", "", cell.source))):
+                if isinstance(node, ast.ImportFrom) and node.module.startswith("dexsim"):
+                    module = importlib.import_module(node.module)
+                    for one in node.names:
+                        assert hasattr(module, one.name) or importlib.import_module(f"{node.module}.{one.name}"), name
+                        found += 1
+    assert found > 30
+
+
+# What these do, other tests do too: test_own_task, test_example_hands, test_identification, test_press_fit,
+# test_bridge_run, test_shipped_policy.
+LONG = ("own_task", "own_hand", "motors", "hand_bridge", "shipped_policies")
 
 
 @pytest.mark.slow

@@ -16,7 +16,7 @@ from typing import Literal
 import jax
 
 from dexsim.core import cli
-from dexsim.core.compilation import collector_paused
+from dexsim.core.compilation import collector_paused, jit
 from dexsim.core.config import setting, validate
 from dexsim.core.errors import ConfigError
 from dexsim.randomization_check.effects import Effect, check
@@ -81,10 +81,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     env = make(arguments.task, config, backend=arguments.backend, num_envs=arguments.num_envs)
     keys = jax.random.split(jax.random.key(arguments.seed), arguments.num_envs)
     with collector_paused():
-        states = jax.block_until_ready(jax.jit(jax.vmap(env.reset))(keys))
-    effects = check(
-        env, jax.jit(jax.vmap(env.step)), states, key=jax.random.key(arguments.seed + 1), ticks=arguments.ticks
-    )
+        states = jax.block_until_ready(jit(jax.vmap(env.reset), once=True)(keys))
+    step = jit(jax.vmap(env.step), backend=env.backend)
+    effects = check(env, step, states, key=jax.random.key(arguments.seed + 1), ticks=arguments.ticks)
     print(f"{arguments.task} on {env.backend}, {arguments.num_envs} hands, {arguments.ticks} ticks")
     return conclude(effects)
 

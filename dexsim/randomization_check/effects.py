@@ -307,7 +307,7 @@ def changes(before: Any, after: Any) -> tuple[tuple[str, ...], float]:
         old, new = np.asarray(old, float), np.asarray(new, float)
         if np.array_equal(old, new):
             continue
-        names.append(jax.tree_util.keystr(path).lstrip("."))
+        names.append(jax.tree_util.keystr(path, simple=True, separator="."))
         size = np.sqrt(np.mean(new**2, 0))
         spreads.append(float(np.max(np.std(new - old, 0) / np.where(size > 0, size, 1.0))))
     return tuple(names), max(spreads)

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dexsim.core.compilation import jit
 from dexsim.env.env import Env
 from dexsim.env.state import State
 from dexsim.objects.config import KINDS
@@ -37,9 +38,9 @@ class Simulation:
         # The goal of an evaluation: it does not change or give up by itself.
         _, goals = env.task.evaluation_plan(1, self._shapes)
         self._goal = jax.tree.map(lambda x: jnp.asarray(x)[0], goals)
-        self._reset = jax.jit(env.reset_to)
-        self._step = jax.jit(self._tick)
-        self._snapshot = jax.jit(env.snapshot)
+        self._reset = jit(env.reset_to, once=True)
+        self._step = jit(self._tick, backend=env.backend)
+        self._snapshot = jit(env.snapshot, backend=env.backend)
         self._acting: Any = None  # the policy that the memory is of
         self._memory: Any = None
         self._state: State = self._begin({})

@@ -1,7 +1,9 @@
 """Scale of the force: newtons per taxel count by the gauge, and how far it may be off."""
 
 import dataclasses
+import functools
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.ndimage import binary_dilation
@@ -88,10 +90,15 @@ def upright(hand: Hand, finger: int, counts: np.ndarray, position: np.ndarray) -
 
     It faces the fingertip at the smallest of the forces, at joint angles [K, J].
     """
-    normals = [taxel_normals(hand, forward_kinematics(hand, jnp.asarray(q, jnp.float32)))[finger] for q in position]
+    normals = [_normals(hand, jnp.int32(finger), jnp.asarray(q, jnp.float32)) for q in position]
     push = np.array([weight @ np.asarray(normal) for weight, normal in zip(counts, normals, strict=True)])
     push /= np.linalg.norm(push, axis=-1, keepdims=True)
     return push @ push[counts.sum(-1).argmin()]
+
+
+@functools.partial(jax.jit, static_argnames="hand")
+def _normals(hand: Hand, finger: jax.Array, position: jax.Array) -> jax.Array:
+    return taxel_normals(hand, forward_kinematics(hand, position))[finger]
 
 
 def _against(gauge: np.ndarray, counts: np.ndarray, name: str) -> FingerFit:

@@ -239,12 +239,16 @@ def _shear_share(blocks: Blocks) -> float:
 
 def _shear_lever(hand: Hand, position: np.ndarray, finger: int, counts: np.ndarray) -> np.ndarray:
     """Largest lever arms [J] m of a force along the skin at the centre of the counts [B, N], at joint angles [J]."""
-    weight = jnp.asarray(counts.sum(0) / counts.sum(), jnp.float32)
-    at = jnp.asarray(position, jnp.float32)
+    at, weight = jnp.asarray(position, jnp.float32), jnp.asarray(counts.sum(0) / counts.sum(), jnp.float32)
+    return np.asarray(_along_skin(hand, jnp.int32(finger), at, weight))
+
+
+@functools.partial(jax.jit, static_argnames="hand")
+def _along_skin(hand: Hand, finger: jax.Array, at: jax.Array, weight: jax.Array) -> jax.Array:
     normal = weight @ taxel_normals(hand, forward_kinematics(hand, at))[finger]
     way = jax.jacfwd(lambda q: weight @ taxel_positions(hand, forward_kinematics(hand, q))[finger])(at)
     along = (normal / jnp.linalg.norm(normal)) @ way
-    return np.sqrt(np.maximum(np.sum(np.square(way), 0) - np.square(along), 0.0))
+    return jnp.sqrt(jnp.maximum(jnp.sum(jnp.square(way), 0) - jnp.square(along), 0.0))
 
 
 def _direction(speed: np.ndarray, recording: Recording, joint: int) -> np.ndarray:

@@ -204,12 +204,11 @@ def test_ppo_trains_on_a_point():
 
 @pytest.mark.long
 @pytest.mark.parametrize("physics", ["simple", "mjx"])
-def test_ppo_runs_on_grasp(physics, grasp_env, monkeypatch):
+def test_ppo_runs_on_grasp(physics, monkeypatch):
     """The task itself under brax's wrappers and learner. Its evaluations compile the task once more: the point's do."""
-    env = grasp_env
     if physics == "simple":
         monkeypatch.setattr("dexsim.env.env.Physics", SimplePhysics)
-        env = dexsim.make("grasp", GraspConfig(pool_size=20), backend="c")
+    env = dexsim.make("grasp", GraspConfig(pool_size=20), backend="jax", num_envs=8)
     history, params = train(
         BraxEnv(env),
         num_timesteps=3 * 8 * 4,

@@ -99,7 +99,7 @@ def test_one_device_begins_and_two_go_on(alone, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("backend", ["jax", "warp"])
+@pytest.mark.parametrize("backend", ["jax", pytest.param("warp", marks=pytest.mark.long)])
 def test_two_processes_train_as_one_and_the_first_alone_writes(backend, alone, tmp_path):
     runs = start_two(*OPTIONS, *STEPS, "--backend", backend, "--run-dir", tmp_path / "run")
     said = [run.communicate(timeout=120) for run in runs]

@@ -25,9 +25,12 @@ CASES = (2, "jax"), (8, "jax"), (4, "warp")  # with Warp each device collects in
 PLAIN = dataclasses.replace(CONFIG, memory="none")
 
 
-def trained(devices, backend="jax"):
+def make(devices, backend="jax", config=CONFIG):
+    return make_train(TinyEnv(backend=backend), config, mesh=make_mesh(devices, config))
+
+
+def trained(training):
     """All numbers of the state after 20 iterations, and how many devices hold the environments."""
-    training = make_train(TinyEnv(backend=backend), CONFIG, mesh=make_mesh(devices, CONFIG))
     state = training.init(jax.random.key(0))
     for _ in range(2):
         state, _ = training.step(state)
@@ -42,7 +45,7 @@ def trained(devices, backend="jax"):
 
 def communicated(devices, backend="jax"):
     """Bytes that a device receives in a call of a training without memory, and the arrays in each of its reductions."""
-    training = make_train(TinyEnv(backend=backend), PLAIN, mesh=make_mesh(devices, PLAIN))
+    training = make(devices, backend, PLAIN)
     text = training.step.lower(training.shapes(jax.random.key(0))).compile().as_text()
     return received(text)[0], [shapes.count("[") for shapes in re.findall(r"= (.*?) all-reduce(?:-start)?\(", text)]
 
@@ -61,10 +64,10 @@ def test_one_two_and_eight_devices_agree_and_each_repeats_itself_to_the_bit(tmp_
         timeout=200,
     )
     assert done.returncode == 0, done.stderr
-    alone, used = trained(1)
+    alone, used = trained(make(1))
     assert used == 1 and communicated(1) == (0, [])
     for devices, backend in CASES:
-        first, again = (np.load(tmp_path / f"{devices}-{backend}-{i}.npz") for i in range(2))
+        first, again = (np.load(tmp_path / f"{devices}-{backend}-{name}.npz") for name in ("first", "again"))
         assert int(first["used"]) == devices
         for i, leaf in enumerate(alone):
             np.testing.assert_allclose(first[str(i)], leaf, rtol=2e-3, atol=2e-4)
@@ -115,8 +118,9 @@ def test_every_device_gets_as_many_environments_and_rows(changes, devices, messa
 
 if __name__ == "__main__":
     for devices, backend in CASES:
-        for i in range(2):
-            leaves, used = trained(devices, backend)
+        training, (size, arrays) = make(devices, backend), communicated(devices, backend)
+        for name in ("first", "again"):
+            leaves, used = trained(training)
             numbers = {str(k): leaf for k, leaf in enumerate(leaves)}
-            size, arrays = communicated(devices, backend)
-            np.savez(f"{sys.argv[1]}/{devices}-{backend}-{i}.npz", used=used, received=size, arrays=arrays, **numbers)
+            file = f"{sys.argv[1]}/{devices}-{backend}-{name}.npz"
+            np.savez(file, used=used, received=size, arrays=arrays, **numbers)
