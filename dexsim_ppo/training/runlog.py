@@ -64,15 +64,16 @@ class RunFolder:
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
-        """Keep other processes from training this run, until the context or this process ends. Where the file system
-        has no locks, nothing does.
+        """Keep other processes from training this run, until the context or this process ends. Where its configuration
+        cannot be locked, because of the file system or its mode, nothing does.
 
         Raises:
           ConfigError: one trains it already.
         """
-        with self.config.open("rb+") as file:
+        with contextlib.ExitStack() as stack:
             try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                # Network file systems lock a file only for those who may write to it.
+                fcntl.flock(stack.enter_context(self.config.open("rb+")), fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 raise ConfigError(f"{self.path}: another process is training this run") from None
             except OSError:

@@ -19,7 +19,7 @@ def test_coverage_is_counted_for_each_interval():
 
 def test_a_gauge_that_reads_nothing_of_the_truth_fails(capsys, monkeypatch, tmp_path):
     monkeypatch.setattr(calibration_coverage, "PARTS", {"joint": missing})
-    monkeypatch.setattr(calibration_coverage.concurrent.futures, "ProcessPoolExecutor", Serial)
+    monkeypatch.setattr(calibration_coverage, "pool", Serial)
     monkeypatch.setattr(sys, "argv", ["calibration_coverage", "joint", "--trials", "10"])
     assert calibration_coverage.main() == 1
     assert '"covered_pct": 80.0' in capsys.readouterr().out
