@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import datetime
 import json
+import shutil
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -31,10 +32,19 @@ def tiny_task(monkeypatch):
     tiny_train.install(monkeypatch)
 
 
+@pytest.fixture(scope="module")
+def once(tmp_path_factory):
+    """A finished run, which tests copy."""
+    path = tmp_path_factory.mktemp("once") / "a"
+    with pytest.MonkeyPatch.context() as patch:
+        tiny_train.install(patch)
+        assert train.main([*QUICK, "--steps", str(2 * PER_ITERATION), "--run-dir", str(path)]) == 0
+    return path
+
+
 @pytest.fixture
-def finished(tmp_path):
-    assert train.main([*QUICK, "--steps", str(2 * PER_ITERATION), "--run-dir", str(tmp_path / "a")]) == 0
-    return RunFolder(tmp_path / "a")
+def finished(once, tmp_path):
+    return RunFolder(shutil.copytree(once, tmp_path / "a"))
 
 
 CHANGES = {
