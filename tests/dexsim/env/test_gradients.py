@@ -78,9 +78,9 @@ def test_gradients_are_finite_while_fingers_touch_nothing(env, steps):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("steps", [1, 10])
-def test_gradients_are_finite_through_the_real_physics(steps):
-    check_gradients(dexsim.make("grasp", GraspConfig(pool_size=80), backend="jax", num_envs=WORLDS), steps)
+def test_gradients_are_finite_through_the_real_physics():
+    """Objects start clear of the fingers: one step would press nothing."""
+    check_gradients(dexsim.make("grasp", GraspConfig(pool_size=80), backend="jax", num_envs=WORLDS), 10)
 
 
 def test_the_gradient_of_the_reward_is_its_finite_difference(env):
