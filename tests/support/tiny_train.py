@@ -2,6 +2,7 @@
 
 import types
 
+import pytest
 from tiny_env import TinyConfig, TinyEnv
 
 import dexsim
@@ -24,6 +25,17 @@ def install(patch):
     patch.setitem(registry.TASKS, "tiny", ENTRY)
     patch.setattr(registry, "make", make)
     patch.setattr(dexsim, "make", make, raising=False)
+
+
+def finished_run(path, *arguments):
+    """The folder of a run that the command has finished: for fixtures that outlive a test's patches."""
+    from dexsim_ppo import train
+    from dexsim_ppo.training.runlog import RunFolder
+
+    with pytest.MonkeyPatch.context() as patch:
+        install(patch)
+        assert train.main([*arguments, "--run-dir", str(path)]) == 0
+    return RunFolder(path)
 
 
 if __name__ == "__main__":

@@ -17,8 +17,7 @@ from dexsim_ppo import checkpoint, train
 from dexsim_ppo.policy import Policy
 from dexsim_ppo.training.runlog import RunFolder
 
-OPTIONS = "--task tiny --preset cpu --no-video --ppo.num-envs 16 --ppo.rollout-length 8 --ppo.actor-layers 8".split()
-OPTIONS += "--ppo.critic-layers 8 --evaluation-chunk 16 --evaluation-episodes 16 --checkpoint-every 5".split()
+OPTIONS = [*tiny_train.QUICK, "--checkpoint-every", "5"]
 ITERATIONS = 20
 STEPS = ["--steps", str(ITERATIONS * 16 * 8)]
 
@@ -31,11 +30,7 @@ def tiny_task(monkeypatch):
 @pytest.fixture(scope="module")
 def alone(tmp_path_factory):
     """A finished run on one device."""
-    path = tmp_path_factory.mktemp("alone") / "run"
-    with pytest.MonkeyPatch.context() as patch:
-        tiny_train.install(patch)
-        assert train.main([*OPTIONS, *STEPS, "--run-dir", str(path)]) == 0
-    return RunFolder(path)
+    return tiny_train.finished_run(tmp_path_factory.mktemp("alone") / "run", *OPTIONS, *STEPS)
 
 
 def start(*options, devices=1, **environment):

@@ -35,16 +35,12 @@ def tiny_task(monkeypatch):
 @pytest.fixture(scope="module")
 def once(tmp_path_factory):
     """A finished run, which tests copy."""
-    path = tmp_path_factory.mktemp("once") / "a"
-    with pytest.MonkeyPatch.context() as patch:
-        tiny_train.install(patch)
-        assert train.main([*QUICK, "--steps", str(2 * PER_ITERATION), "--run-dir", str(path)]) == 0
-    return path
+    return tiny_train.finished_run(tmp_path_factory.mktemp("once") / "a", *QUICK, "--steps", str(2 * PER_ITERATION))
 
 
 @pytest.fixture
 def finished(once, tmp_path):
-    return RunFolder(shutil.copytree(once, tmp_path / "a"))
+    return RunFolder(shutil.copytree(once.path, tmp_path / "a"))
 
 
 CHANGES = {

@@ -66,11 +66,7 @@ def tiny_task(monkeypatch):
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     """A finished run of six iterations."""
-    path = tmp_path_factory.mktemp("runs") / "a"
-    with pytest.MonkeyPatch.context() as patch:
-        tiny_train.install(patch)
-        assert train.main([*QUICK, "--steps", str(6 * PER_ITERATION), "--run-dir", str(path)]) == 0
-    return RunFolder(path)
+    return tiny_train.finished_run(tmp_path_factory.mktemp("runs") / "a", *QUICK, "--steps", str(6 * PER_ITERATION))
 
 
 def test_a_run_leaves_its_files(finished):
