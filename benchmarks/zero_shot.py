@@ -66,7 +66,7 @@ def run_trial(options: dict[str, Any], seed: int, number: int) -> dict[str, Any]
 
 def virtual_trial(options: dict[str, Any], seed: int, number: int, command: float, shape: str) -> dict[str, Any]:
     """One trial in virtual time: the referee's report, with the bridge's measurements as `bridge`."""
-    from dexsim_real.control.safety import SafetyConfig
+    from dexsim_real.control.limits import SafetyConfig
     from dexsim_real.twin.plant.foreign.hand import hand_of
     from dexsim_real.twin.virtual import RunOptions, VirtualRun
 

@@ -126,7 +126,7 @@ def _parameters(given: argparse.Namespace) -> dict[str, Any]:
 
 def _limits(given: list[str]) -> dict[str, float]:
     """Values of --limit, of safety limits that are one number."""
-    from dexsim_real.control.safety import SafetyConfig
+    from dexsim_real.control.limits import SafetyConfig
 
     table, defaults = _pairs("--limit", given), vars(SafetyConfig())
     known = [name for name, value in defaults.items() if isinstance(value, float)]

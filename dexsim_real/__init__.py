@@ -10,7 +10,8 @@ from dexsim.core.door import open_door
 
 if TYPE_CHECKING:
     from dexsim_real.control.controller import Controller
-    from dexsim_real.control.safety import Safety, SafetyConfig
+    from dexsim_real.control.limits import SafetyConfig
+    from dexsim_real.control.safety import Safety
     from dexsim_real.core.errors import HandError
     from dexsim_real.core.log import LogReader, LogWriter
     from dexsim_real.sensors.hand import HandMeasurement, HandSensing, HardwareConfig
@@ -51,7 +52,7 @@ __getattr__, __dir__ = open_door(
         "LogWriter": "dexsim_real.core.log",
         "ObjectEstimate": "dexsim_real.sensors.readings",
         "Safety": "dexsim_real.control.safety",
-        "SafetyConfig": "dexsim_real.control.safety",
+        "SafetyConfig": "dexsim_real.control.limits",
         "SerialHand": "dexsim_real.wire.serial_hand",
         "make_readings": "dexsim_real.sensors.readings",
         "open_port": "dexsim_real.wire.serial_hand",

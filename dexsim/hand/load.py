@@ -41,6 +41,9 @@ def load_hand(path: str | Path | None = None) -> Hand:
     _check_postures(path, model, joints, table)
     palm = _find(path, model_path, model, "body", table["palm"])
     bodies = [b for b in range(1, model.nbody) if _is_below(model.body_parentid, b, palm)]
+    if unnamed := [b for b in bodies if not model.body(b).name]:
+        parent = model.body(model.body_parentid[unnamed[0]]).name
+        raise AssetError(f"{model_path}: a body of {parent!r} has no name: every link from the palm on needs one")
     row = {body: i for i, body in enumerate(bodies)}
     at = _hinges_of_bodies(model_path, model, palm, row)
     has = at >= 0

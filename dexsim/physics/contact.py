@@ -121,7 +121,7 @@ def split_pads(spec: mujoco.MjSpec, hand: Hand, touching: list[str], points: int
             continue
         for index, along in enumerate(np.linspace(-1.0, 1.0, points) if points > 1 else [0.0]):
             ball = geom.parent.add_geom(
-                name=f"{name}_{index}",
+                name=f"{name}/{index}",  # a hand may have pads called pad and pad_1
                 type=mujoco.mjtGeom.mjGEOM_SPHERE,
                 mass=0.0,
                 group=geom.group,

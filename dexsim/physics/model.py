@@ -5,6 +5,7 @@ import numpy as np
 
 from dexsim.core.errors import AssetError
 from dexsim.hand.kinematics import Hand
+from dexsim.hand.mjcf import read_mjcf
 from dexsim.physics import contact
 from dexsim.physics.config import PhysicsConfig
 from dexsim.physics.guard import check_model
@@ -32,15 +33,14 @@ def build_model(
     """The scene as a C MuJoCo model: hand, free object, explicit pairs, force sensors.
 
     Also what the tests and the emulated hand compare against.
+
+    Raises:
+      AssetError: the backend cannot simulate the hand's MJCF, or it does not go into one scene with the object.
     """
-    spec = mujoco.MjSpec.from_file(str(hand.model_path))
-    check_model(spec.compile(), backend, hand.model_path)
-    for element in (*spec.actuators, *spec.sensors, *spec.keys):
-        spec.delete(element)  # torques come from our actuator model, readings from our sensors
+    check_model(mujoco.MjModel.from_xml_path(str(hand.model_path)), backend, hand.model_path)
+    spec = read_mjcf(hand)  # torques come from our actuator model, readings from our sensors
     for joint in spec.joints:
         joint.armature *= 1 - rotor_share
-    palm = spec.body(hand.palm)
-    palm.pos, palm.quat = [0, 0, 0], [1, 0, 0, 0]
     touching = _touching_geoms(hand, slots)
     contact.cover_tips(spec, hand, config.cover)
     touching = contact.split_pads(spec, hand, touching, config.pad_points)
@@ -82,7 +82,10 @@ def build_model(
         if pair.condim == 1:
             # MJX in JAX has no frictionless contacts with elliptic cones; this friction is negligible.
             pair.condim, pair.friction = 3, [1e-3, 1e-3, 0.005, 1e-4, 1e-4]
-    model = spec.compile()
+    try:
+        model = spec.compile()
+    except ValueError as error:
+        raise AssetError(f"{hand.model_path}: with the object in the scene: {' '.join(str(error).split())}") from None
     geoms = np.flatnonzero(model.geom_bodyid == model.body("object").id)
     pairs = contact.pairs_with(model, geoms)
     compliance, share, _ = contact.pair_constants(model, pairs, tip_bodies(model, hand))
@@ -173,4 +176,6 @@ def _set_options(spec: mujoco.MjSpec, config: PhysicsConfig, gravity: tuple[floa
         option.disableflags |= mujoco.mjtDisableBit.mjDSBL_NATIVECCD
     # MJX also offers max_geom_pairs, a cull by bounding spheres. It drops touching pairs of long
     # capsules, one tick this finger, the next tick that one, so it stays off.
+    for own in [numeric for numeric in spec.numerics if numeric.name == "max_contact_points"]:
+        spec.delete(own)
     spec.add_numeric(name="max_contact_points", data=[float(config.max_contacts)], size=1)

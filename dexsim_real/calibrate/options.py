@@ -4,7 +4,7 @@ import dataclasses
 from pathlib import Path
 
 from dexsim.core.config import setting, validate
-from dexsim_real.control.safety import SafetyConfig
+from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.core.errors import HandError
 from dexsim_real.sensors.hand import HardwareConfig
 from dexsim_real.wire.link import LinkConfig

@@ -11,17 +11,13 @@ The meaning of the error bits is not public, so every bit counts unless it is li
 line that names joint and finger.
 """
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from dexsim.hand.kinematics import Hand
+from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.sensors.hand import HandMeasurement
 from dexsim_real.wire.frames import Mode
 from dexsim_real.wire.refusals import Refusal
-
-if TYPE_CHECKING:
-    from dexsim_real.control.safety import SafetyConfig
 
 _BOARDS = ("palm", "joint", "tip")
 _STILL = 0.05  # rad, motion below which a joint with high current is stalled
@@ -57,7 +53,7 @@ class Alarms:
       config: limits.
     """
 
-    def __init__(self, hand: Hand, config: "SafetyConfig"):
+    def __init__(self, hand: Hand, config: SafetyConfig):
         self.config = config
         self.fatal = ""  # why the motors must go off
         self.hold = ""  # why the hand must not be moved now

@@ -21,12 +21,13 @@ import dataclasses
 import enum
 from collections import Counter
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
-from dexsim.core.config import setting, validate
 from dexsim.hand.kinematics import Hand
 from dexsim_real.control.alarms import Alarms, joint_labels
+from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.pose_check import UNKNOWN, PoseCheck
 from dexsim_real.sensors.hand import HandMeasurement
 from dexsim_real.wire.frames import Mode
@@ -44,59 +45,6 @@ class Reaction(enum.IntEnum):
     CLIP = 1
     HOLD = 2
     RELAX = 3
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class SafetyConfig:
-    """Limits of the hand. Ages count from the time of the measurement or joint target."""
-
-    margin: float = setting(0.03, unit="rad", low=0.0, high=0.5)
-    """Distance of commands from the joints' end stops, at most half of a joint's range; motors that come on nearer to
-    one begin there. What it cuts off a target does not count as a clip."""
-    beyond: float = setting(0.1, unit="rad", low=0.0, high=1.0)
-    """Distance beyond a joint's limits at which a measured angle counts as wrong."""
-    speed: float = setting(7.0, unit="rad/s", low=0.01, high=200.0)
-    """Largest rate of change of a command, below the no-load speed of the slower joints (8.6 rad/s). A policy that
-    changes targets by 0.2 rad every 0.03 s needs 6.7 rad/s."""
-    reach: float = setting(0.6, unit="rad", low=0.01, high=4.0)
-    """Distance of a command from the measured angle beyond which it does not move farther away."""
-    joint_speed: float = setting(10.0, unit="rad/s", low=0.1, high=1000.0)
-    """Measured joint speed above which the hand holds; above `speed`, since a joint catches up with its command."""
-    current: float = setting(1.8, unit="A", low=0.01, high=20.0)
-    """Current of a joint above which the motors go off; the XHand reports 1.5 A when stalled at its usual limit."""
-    current_seconds: float = setting(1.0, unit="s", low=0.0, high=60.0)
-    """Time for which a joint may exceed `current`."""
-    stall_current: float = setting(1.3, unit="A", low=0.01, high=20.0)
-    """Current above which a joint that does not move is stalled. A stalled thumb reported 1.5 A, other joints 0.8 to
-    1.1 A, which a firm grasp also needs."""
-    stall_seconds: float = setting(3.0, unit="s", low=0.1, high=600.0)
-    """Time after which the motors go off when a joint is stalled."""
-    temperature: float = setting(70.0, unit="degC", low=20.0, high=150.0)
-    """Temperature of a joint board, a fingertip or the palm board above which the motors go off."""
-    alarm_seconds: float = setting(0.2, unit="s", low=0.0, high=60.0)
-    """Time for which the hand holds while it reports an error or motors that are off, before they go off for good."""
-    ignored_errors: tuple[int, int, int] = setting((0, 0, 0), unit="1", low=0, high=65535)
-    """Error bits of palm, joint and tip board that are harmless on this hand, as sums of bits."""
-    finger_force: float = setting(15.0, unit="N", low=0.1, high=1000.0)
-    """Force of a fingertip (sum of its taxels) above which the hand holds; the XHand is specified for 15 N."""
-    total_force: float = setting(70.0, unit="N", low=0.1, high=1000.0)
-    """Force of all fingertips above which the hand holds; it is rated for 80 N."""
-    stale: float = setting(0.05, unit="s", low=0.001, high=10.0)
-    """Age of the newest measurement above which the hand holds."""
-    stale_object: float = setting(0.3, unit="s", low=0.01, high=60.0)
-    """Age of the newest camera or IMU measurement above which the hand holds."""
-    watchdog: float = setting(0.08, unit="s", low=0.001, high=10.0)
-    """Age of the newest joint target above which the hand holds, at least two control ticks."""
-    patience: float = setting(1.0, unit="s", low=0.0, high=60.0)
-    """Duration of a hold for lack of joint targets or measurements, also of the object, after which the motors go
-    off."""
-    slow_speed: float = setting(0.5, unit="rad/s", low=0.01, high=100.0)
-    """Speed of commands right after the motors turn on or a hold ends; it then grows to `speed`."""
-    ramp: float = setting(1.0, unit="s", low=0.0, high=60.0)
-    """Time in which the speed of commands grows from `slow_speed` to `speed`."""
-
-    def __post_init__(self):
-        validate(self)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,6 +68,15 @@ class SafetyDecision:
     reason: str
 
 
+class Wish(NamedTuple):
+    """What `Safety.set_target` was told last."""
+
+    time: float  # s
+    position: np.ndarray  # [J] rad
+    hold_reason: str
+    since: float  # s, of the first of the requests to hold that have come without a break
+
+
 class Safety:
     """Decides which command is sent.
 
@@ -137,6 +94,7 @@ class Safety:
         self._stops = hand.joint_lower.astype(np.float32), hand.joint_upper.astype(np.float32)
         # At most half of a joint's range: beyond that the limits would change sides.
         margin = np.minimum(np.float32(config.margin), (self._stops[1] - self._stops[0]) / 2)
+        self._slow = min(config.slow_speed, config.speed)  # rad/s
         self._lower, self._upper = self._stops[0] + margin, self._stops[1] - margin
         self.sample: HandSample | None = None  # the newest plausible one
         self.problem = ""  # why the newest measurement does not count
@@ -144,14 +102,14 @@ class Safety:
         self.latched = ""  # why the motors are off permanently
         self.anchor = 0  # number of times that commands restarted, after a hold or with the motors off before
         self.counts: Counter[str] = Counter()  # cycles by reason
-        self._target: tuple[float, np.ndarray, str] | None = None  # time s, joint target, reason to hold
+        self._target: Wish | None = None
         self._pose = PoseCheck(hand, config.beyond)
         self._alarms = Alarms(hand, config)
         self._joints = joint_labels(hand)
         self._generation: int | None = None
         self._wrong: tuple[float, float] | None = None  # s, first and last of the newest wrong measurements
         self._holding = False
-        self._since = 0.0  # s, when the current reason to hold began
+        self._on = 0.0  # s, when the motors came on
         self._commanded: np.ndarray | None = None  # last command with the motors on
         self._confirmed: np.ndarray | None = None  # last one that the hand answered
         self._time = self._ramp_start = 0.0
@@ -204,7 +162,9 @@ class Safety:
           hold_reason: why the hand should hold instead of moving there, and the motors go off when it lasts; empty to
             move.
         """
-        self._target = time, np.array(position, np.float32), hold_reason
+        before = self._target
+        since = before.since if before is not None and before.hold_reason else time
+        self._target = Wish(time, np.array(position, np.float32), hold_reason, since)
 
     def engage(self) -> None:
         """Turn the motors on at the measured pose. No effect once latched."""
@@ -230,12 +190,14 @@ class Safety:
                 return self._finish(now, Reaction.RELAX, why, self._rest())
             self._start(now, sample)
         wish = self._target  # Read once: another thread may replace it meanwhile.
+        if lasted := self._lasted(now, sample, wish):
+            return self._turn_off(now, lasted)
         reason = self._reason_to_hold(now, sample, wish)
         if reason:
-            return self._hold(now, sample, reason, wish)
+            return self._hold(now, sample, reason)
         if self._holding:
             self._restart(now)
-        return self._follow(now, sample, self.commanded if wish is None else wish[1])
+        return self._follow(now, sample, self.commanded if wish is None else wish.position)
 
     # --- pieces -----------------------------------------------------------------------------
 
@@ -247,7 +209,18 @@ class Safety:
     def _silence(self) -> str:
         return f"{_SILENT}: {self.refused}" if self.refused else _SILENT
 
-    def _reason_to_hold(self, now: float, sample: HandSample, wish: tuple[float, np.ndarray, str] | None) -> str:
+    def _lasted(self, now: float, sample: HandSample, wish: Wish | None) -> str:
+        """What has lasted for longer than `patience`, whatever else the hand held for meanwhile; empty for nothing."""
+        patience, silent = self.config.patience, now - sample.time - self.config.stale
+        if silent > 0:
+            return self._silence() if silent > patience else ""
+        if wish is None:
+            return ""
+        if now - max(wish.time + self.config.watchdog, self._on) > patience:
+            return _DEAD
+        return wish.hold_reason if now - max(wish.since, self._on) > patience else ""
+
+    def _reason_to_hold(self, now: float, sample: HandSample, wish: Wish | None) -> str:
         config, force = self.config, sample.measured.finger_force
         if now - sample.time > config.stale:
             return self._silence()
@@ -260,16 +233,16 @@ class Safety:
             return _FORCE
         if wish is None:  # Before the first target the start pose is the target.
             return ""
-        if not np.isfinite(wish[1]).all():
+        if not np.isfinite(wish.position).all():
             return "target is not finite"
-        return _DEAD if now - wish[0] > config.watchdog else wish[2]
+        return _DEAD if now - wish.time > config.watchdog else wish.hold_reason
 
     def _start(self, now: float, sample: HandSample) -> None:
         """Turn the motors on at the measured pose."""
         # Between the end stops, not within the margin: enabling must not move the hand.
         pose = np.clip(sample.measured.joint_position, self._stops[0], self._stops[1])
         self._commanded = self._confirmed = pose.astype(np.float32)
-        self._time = now
+        self._time = self._on = now
         self._restart(now)
 
     def _restart(self, now: float) -> None:
@@ -277,23 +250,20 @@ class Safety:
         self._holding, self._ramp_start = False, now
         self.anchor += 1
 
-    def _hold(
-        self, now: float, sample: HandSample, reason: str, wish: tuple[float, np.ndarray, str] | None
-    ) -> SafetyDecision:
-        config, asked, silent = self.config, wish is not None and reason == wish[2], reason.startswith(_SILENT)
-        if reason != self.last[1] and not (silent and self.last[1].startswith(_SILENT)):
-            self._since = now
-        if (asked or silent or reason == _DEAD) and now - self._since > config.patience:
-            if asked or reason == _DEAD:
-                self.relax(f"{reason} for {config.patience:g} s")
-            elif not self.problem:
-                self._pose.release()
-            # With the motors off the pose may change: restart from the next one that is known.
-            self._commanded = self._confirmed = None
-            return self._finish(now, Reaction.RELAX, reason, self._rest())
+    def _turn_off(self, now: float, reason: str) -> SafetyDecision:
+        if not reason.startswith(_SILENT):
+            self.relax(f"{reason} for {self.config.patience:g} s")
+        elif not self.problem:
+            self._pose.release()
+        # With the motors off the pose may change: restart from the next one that is known.
+        self._commanded = self._confirmed = None
+        return self._finish(now, Reaction.RELAX, reason, self._rest())
+
+    def _hold(self, now: float, sample: HandSample, reason: str) -> SafetyDecision:
+        config = self.config
         self._holding = True
         if reason == _FORCE:  # Staying there would keep the force.
-            position = self._toward(now, self._inside(sample.measured.joint_position), config.slow_speed)
+            position = self._toward(now, self._inside(sample.measured.joint_position), self._slow)
         else:
             position = self._toward(now, self.commanded if self._confirmed is None else self._confirmed, config.speed)
         return self._finish(now, Reaction.HOLD, reason, position)
@@ -307,9 +277,8 @@ class Safety:
             np.minimum(measured - config.reach, self.commanded),
             np.maximum(measured + config.reach, self.commanded),
         )
-        position = self._toward(
-            now, self._inside(np.clip(target, *near)), config.slow_speed + grown * (config.speed - config.slow_speed)
-        )
+        speed = self._slow + grown * (config.speed - self._slow)
+        position = self._toward(now, self._inside(np.clip(target, *near)), speed)
         # Policies rest joints at their stops: the margin alone is no event.
         clipped = np.abs(position - self._inside(target)), np.abs(target - np.clip(target, *self._stops))
         if np.maximum(*clipped).max() <= 1e-5:

@@ -7,7 +7,7 @@ from typing import Annotated
 import tyro
 
 from dexsim.core.config import setting, validate
-from dexsim_real.control.safety import SafetyConfig
+from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.core.errors import HandError
 from dexsim_real.sensors.camera import CameraConfig
 from dexsim_real.sensors.hand import HardwareConfig

@@ -17,7 +17,8 @@ from dexsim.calibration.maps import Calibration, Side
 from dexsim.hand.kinematics import Hand
 from dexsim_real.control.controller import IDENTITY, Controller
 from dexsim_real.control.goals import TurnGoals
-from dexsim_real.control.safety import HandSample, Safety, SafetyConfig
+from dexsim_real.control.limits import SafetyConfig
+from dexsim_real.control.safety import HandSample, Safety
 from dexsim_real.sensors.camera import HeightSensor
 from dexsim_real.sensors.hand import HandMeasurement, HandSensing, HardwareConfig, VelocityFilter
 from dexsim_real.sensors.imu import BAUD, UPRIGHT_X, RvcParser, align, conjugate, encode, multiply

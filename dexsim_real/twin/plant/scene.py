@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 
 from dexsim.hand.kinematics import Hand
+from dexsim.hand.mjcf import read_mjcf
 from dexsim_real.core.errors import HandError
 from dexsim_real.twin.plant.parameters import TrialParameters
 from dexsim_real.twin.plant.shapes import ObjectShape
@@ -61,11 +62,7 @@ def build_scene(hand: Hand, parameters: TrialParameters, shape: ObjectShape | No
     """
     if hand.num_hinges > hand.num_joints:
         raise HandError(f"{hand.model_path}: the emulated hand has gear play, which coupled joints cannot have")
-    spec = mujoco.MjSpec.from_file(str(hand.model_path))
-    for element in (*spec.actuators, *spec.sensors, *spec.keys):
-        spec.delete(element)
-    palm = spec.body(hand.palm)
-    palm.pos, palm.quat = [0, 0, 0], [1, 0, 0, 0]
+    spec = read_mjcf(hand)
     for body in hand.tip_body:
         spec.body(hand.body_names[body]).add_site(name=f"{hand.body_names[body]}_taxels")
     _add_play(spec, hand, parameters)

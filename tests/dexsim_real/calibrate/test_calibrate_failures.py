@@ -24,7 +24,8 @@ from dexsim_real.calibrate.press_fit import fit
 from dexsim_real.calibrate.press_procedure import PressProcedure
 from dexsim_real.calibrate.read import read_logs
 from dexsim_real.calibrate.report import torque_constants
-from dexsim_real.control.safety import Safety, SafetyConfig
+from dexsim_real.control.limits import SafetyConfig
+from dexsim_real.control.safety import Safety
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogError, LogReader, LogWriter
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig

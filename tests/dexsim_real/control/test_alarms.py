@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from test_safety import CYCLE, FREE, MIDDLE, Bench, sample
 
 from dexsim_real.control.alarms import Alarms, joint_labels
-from dexsim_real.control.safety import Reaction, Safety, SafetyConfig
+from dexsim_real.control.limits import SafetyConfig
+from dexsim_real.control.safety import Reaction, Safety
 from dexsim_real.control.servo import Servo
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
 from dexsim_real.wire import frames

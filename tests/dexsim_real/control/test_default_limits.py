@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 from test_safety import CYCLE, Bench, sample
 
 from dexsim_ppo.policy import load_policy
-from dexsim_real.control.safety import Reaction, Safety, SafetyConfig
+from dexsim_real.control.limits import SafetyConfig
+from dexsim_real.control.safety import Reaction, Safety
 from dexsim_real.twin.wire.command_check import LimitsConfig
 from dexsim_real.wire.frames import Mode
 

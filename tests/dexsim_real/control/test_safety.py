@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dexsim.core.errors import ConfigError
-from dexsim_real.control.safety import HandSample, Reaction, Safety, SafetyConfig
+from dexsim_real.control.limits import SafetyConfig
+from dexsim_real.control.safety import HandSample, Reaction, Safety
 from dexsim_real.control.servo import Servo
 from dexsim_real.core.timing import GRACE, Pace, keep_phase
 from dexsim_real.sensors.hand import HandMeasurement, HandSensing, HardwareConfig
@@ -92,6 +93,28 @@ def test_the_first_command_is_the_measured_pose_then_a_ramp(hand):
     allowed = 0.5 + 7.5 * np.minimum(np.arange(len(speed)) * CYCLE + CYCLE, 1.0)
     assert np.all(speed <= allowed + 1e-3) and speed[0] < 0.7
     np.testing.assert_allclose(path[-1], MIDDLE + 0.15, atol=1e-6)
+
+
+@pytest.mark.parametrize("force", [0.0, 16.0])
+def test_no_command_is_faster_than_a_speed_below_the_slow_one(hand, force):
+    bench = Bench(hand, speed=0.1, slow_speed=0.5, reach=4.0)
+    bench.engage()
+    path = [bench.cycle(wish=hand.joint_upper, follow=False, force=0.0).position for _ in range(100)]
+    path += [bench.cycle(wish=hand.joint_upper, follow=False, force=force).position for _ in range(100)]
+    assert 0.05 < np.abs(np.diff(path, axis=0)).max() / CYCLE <= 0.1 + 1e-4
+
+
+@pytest.mark.parametrize("cause", ["dead", "out of sight"])
+@pytest.mark.parametrize("other", [{"force": 16.0}, {"velocity": 20.0}])
+def test_a_cause_that_lasts_turns_the_motors_off_whatever_else_interrupts(bench, cause, other):
+    start, k = bench.now, 0
+    while not bench.safety.latched and bench.now < start + 5:
+        if cause != "dead":
+            bench.safety.set_target(MIDDLE, bench.now, "the object is out of sight")
+        bench.cycle(**other if k % 30 == 0 else {})  # every 0.36 s, for one cycle
+        k += 1
+    assert bench.safety.latched == f"{'no target' if cause == 'dead' else 'the object is out of sight'} for 1 s"
+    assert 1.0 < bench.now - start < 1.2
 
 
 def test_an_ordinary_wish_passes_untouched(bench):

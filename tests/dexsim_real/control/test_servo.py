@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from test_safety import CYCLE, MIDDLE
 
+from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.motors_off import PATIENCE
-from dexsim_real.control.safety import Reaction, Safety, SafetyConfig
+from dexsim_real.control.safety import Reaction, Safety
 from dexsim_real.control.servo import Servo
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
 from dexsim_real.wire import frames

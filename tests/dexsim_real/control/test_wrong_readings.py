@@ -9,8 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_safety import CYCLE, FREE, MIDDLE, Bench, sample
 
+from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.pose_check import PoseCheck
-from dexsim_real.control.safety import Reaction, Safety, SafetyConfig
+from dexsim_real.control.safety import Reaction, Safety, Wish
 from dexsim_real.control.servo import Servo
 from dexsim_real.core.errors import HandError
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
@@ -188,7 +189,7 @@ class Alternating:
 
 
 def test_the_wish_is_read_once_a_cycle(bench):
-    good, bad = (bench.now, MIDDLE, ""), (bench.now, np.full(12, np.nan, np.float32), "")
+    good, bad = (Wish(bench.now, pose, "", bench.now) for pose in (MIDDLE, np.full(12, np.nan, np.float32)))
 
     class Torn(Safety):
         _target = Alternating([good, bad])

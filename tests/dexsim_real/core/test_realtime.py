@@ -7,7 +7,8 @@ import time
 import pytest
 
 from dexsim import load_hand
-from dexsim_real.control.safety import Safety, SafetyConfig
+from dexsim_real.control.limits import SafetyConfig
+from dexsim_real.control.safety import Safety
 from dexsim_real.control.servo import Servo
 from dexsim_real.core.log import LogWriter
 from dexsim_real.core.process import lower_priority, raise_priority, use_realtime

@@ -13,8 +13,9 @@ pytest.importorskip("serial")
 from following_hand import FollowingHand
 from pty_hand import QUICK
 
+from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.motors_off import PATIENCE
-from dexsim_real.control.safety import Safety, SafetyConfig
+from dexsim_real.control.safety import Safety
 from dexsim_real.control.servo import Servo
 from dexsim_real.run.guard import Guard
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig

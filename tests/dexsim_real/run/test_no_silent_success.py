@@ -18,7 +18,8 @@ pytest.importorskip("serial")
 from following_hand import FollowingHand, arguments, summary
 
 from dexsim_real.control.controller import Controller
-from dexsim_real.control.safety import Reaction, Safety, SafetyConfig
+from dexsim_real.control.limits import SafetyConfig
+from dexsim_real.control.safety import Reaction, Safety
 from dexsim_real.core import log
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import LogWriter

@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 
 from dexsim_ppo.policy import load_policy
-from dexsim_real.control.safety import SafetyConfig
+from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.run.options import RunArguments
 from dexsim_real.run.session import Session
 

@@ -10,7 +10,8 @@ from pty_hand import QUICK, PtyHand
 pytest.importorskip("serial")
 
 from dexsim.calibration.maps import load_calibration, save_calibration
-from dexsim_real.control.safety import Safety, SafetyConfig
+from dexsim_real.control.limits import SafetyConfig
+from dexsim_real.control.safety import Safety
 from dexsim_real.control.servo import Servo
 from dexsim_real.core.errors import HandError
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig

@@ -1,0 +1,101 @@
+"""The hand in the scene: at the palm, however its file places that; names that the scene adds or needs."""
+
+import shutil
+
+import mujoco
+import numpy as np
+import pytest
+
+from dexsim.core.errors import AssetError
+from dexsim.hand.files import find_hand
+from dexsim.hand.kinematics import forward_kinematics
+from dexsim.hand.load import load_hand
+from dexsim.hand.mjcf import read_mjcf
+from dexsim.objects.config import ObjectConfig
+from dexsim.physics.config import PhysicsConfig
+from dexsim.physics.model import build_model
+
+PALM, END = '<body name="right_hand_link">', "  </worldbody>"
+SKEW = 'pos="0.1 0.2 0.3" euler="0.3 1.5 -0.4"'
+
+
+def rewrite(folder, *changes):
+    """The shipped hand with its MJCF changed."""
+    path = find_hand(None)
+    for file in path.parent.iterdir():
+        if file.is_file():
+            shutil.copy(file, folder)
+    mjcf = folder / "xhand_right.xml"
+    text = mjcf.read_text()
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    mjcf.write_text(text)
+    return folder / path.name
+
+
+def scene(hand):
+    return build_model(hand, ("box",), ObjectConfig().largest[:1], PhysicsConfig(), (0.0, 0.0, -9.81), "c")
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        [],
+        [(PALM, f'<body name="right_hand_link" {SKEW}>')],
+        [(PALM, '<body name="right_hand_link" pos="0.1 0.2 0.3" quat="0.5 0.5 0.5 0.5">')],
+        [(PALM, '<body name="right_hand_link" axisangle="0 1 0 1.5708">')],
+        [(PALM, f'<body name="wrist" {SKEW}>{PALM}'), (END, "</body></worldbody>")],
+        [(PALM, f"<frame {SKEW}>{PALM}"), (END, "</frame></worldbody>")],
+        [
+            (PALM, f'<frame {SKEW}><body name="arm" xyaxes="0 1 0 0 0 1">{PALM[:-1]} {SKEW}>'),
+            (END, "</body></frame></worldbody>"),
+        ],
+    ],
+    ids=["as it is", "euler", "quat", "axisangle", "on a wrist", "in a frame", "all at once"],
+)
+def test_links_are_in_the_palm_frame_however_the_file_places_the_palm(tmp_path, changes):
+    hand = load_hand(rewrite(tmp_path, *changes))
+    model = scene(hand)
+    data = mujoco.MjData(model)
+    angle = np.random.default_rng(0).uniform(hand.joint_lower, hand.joint_upper).astype(np.float32)
+    data.qpos[[model.joint(name).qposadr[0] for name in hand.joint_names]] = angle
+    mujoco.mj_kinematics(model, data)
+    bodies, found = [model.body(name).id for name in hand.body_names], forward_kinematics(hand, angle)
+    np.testing.assert_allclose(found.body_position, data.xpos[bodies], atol=1e-6)
+    np.testing.assert_allclose(found.body_rotation, data.xmat[bodies].reshape(-1, 3, 3), atol=1e-5)
+
+
+def test_fixed_bodies_that_carry_the_palm_move_with_it(tmp_path):
+    plain = mujoco.MjModel.from_xml_path(
+        str(
+            load_hand(
+                rewrite(
+                    tmp_path,
+                    (PALM, f'<body name="wrist" {SKEW}>{PALM[:-1]} pos="0 0 0.1">'),
+                    (END, "</body></worldbody>"),
+                )
+            ).model_path
+        )
+    )
+    model = read_mjcf(load_hand(tmp_path / find_hand(None).name)).compile()
+    apart = []
+    for each in (plain, model):
+        data = mujoco.MjData(each)
+        mujoco.mj_kinematics(each, data)
+        wrist, palm = data.body("wrist"), data.body("right_hand_link")
+        apart.append((wrist.xpos - palm.xpos) @ palm.xmat.reshape(3, 3))
+    np.testing.assert_allclose(apart[1], apart[0], atol=1e-9)
+    assert np.linalg.norm(apart[0]) > 0.05
+
+
+def test_names_that_the_scene_adds_do_not_meet_those_of_the_file(tmp_path):
+    numeric = '<custom><numeric name="max_contact_points" data="1"/></custom>\n  <worldbody>'
+    hand = load_hand(rewrite(tmp_path, ("thumb_pad_right", "thumb_pad_left_1"), ("<worldbody>", numeric)))
+    assert scene(hand).numeric("max_contact_points").data[0] == PhysicsConfig().max_contacts
+
+
+def test_a_link_without_a_name_is_refused(tmp_path):
+    path = rewrite(tmp_path, (PALM, PALM + "<body><geom size='0.01' contype='0' conaffinity='0'/></body>"))
+    with pytest.raises(AssetError, match="xhand_right.xml: a body of 'right_hand_link' has no name"):
+        load_hand(path)
