@@ -8,6 +8,7 @@ import dataclasses
 import importlib
 import importlib.metadata
 import inspect
+import numbers
 import typing
 from collections.abc import Callable
 from types import ModuleType
@@ -73,6 +74,8 @@ def register(
     if not isinstance(name, str) or not name.isidentifier():
         raise ConfigError(f"register({name!r}, ...): the name must be a word, such as 'poke'")
     make_config = _annotated_config(name, factory) if config is None else config
+    if not callable(make_config):
+        raise ConfigError(f"register({name!r}, ...): config = {config!r:.80}: give its class or a function")
     default = make_config()
     if not isinstance(default, EnvConfig):
         raise ConfigError(f"register({name!r}, ...): the configuration is a {type(default).__name__}, not an EnvConfig")
@@ -94,6 +97,8 @@ def find_task(name: str) -> TaskEntry:
     module, _, word = name.rpartition(":")
     if module:
         makes = getattr(_import(module), word, None)
+        if word in _OURS and makes is None:
+            raise ConfigError(f"task {name!r}: {module} has no {word!r}; dexsim's own task is {word}, without a module")
         if word in _OURS and callable(makes) and TASKS[word].task is not makes:
             raise ConfigError(f"task {name!r}: dexsim has a task {word!r} of its own; give yours another name")
         if word not in TASKS and callable(makes):
@@ -138,8 +143,11 @@ def make(
     Raises:
       ConfigError: unknown task, a config of another task, no `Hand`, or `num_envs` below 1.
     """
-    if num_envs < 1:
-        raise ConfigError(f"make({task!r}, num_envs={num_envs}): must be at least 1")
+    for option, value, low in (("num_envs", num_envs, 1), ("seed", seed, None)):
+        if not isinstance(value, numbers.Integral) or isinstance(value, bool) or (low is not None and value < low):
+            raise ConfigError(
+                f"make({task!r}, {option}={value!r:.80}): must be a whole number{'' if low is None else ' above 0'}"
+            )
     if not isinstance(hand, Hand | None):
         raise ConfigError(f"make({task!r}, hand={hand!r:.80}): must be a Hand, such as dexsim.load_hand(...) returns")
     if (makes := find_task(task).environment) is not None:
@@ -187,12 +195,15 @@ def _make_other(task: str, makes: Callable[[], Any]) -> Any:
     except (TypeError, ValueError):
         raise ConfigError(f"--task {task}: must be callable without arguments") from None
     try:
-        return makes()
+        env = makes()
     except DexsimError:
         raise
     except Exception as error:  # whatever it raises
         text = " ".join(str(error).split())
         raise ConfigError(f"--task {task}: making it fails: {type(error).__name__}: {text:.200}") from error
+    if not (callable(getattr(env, "reset", None)) and callable(getattr(env, "step", None))):
+        raise ConfigError(f"--task {task}: it makes a {type(env).__name__}, which has no reset and step")
+    return env
 
 
 def _no_task(config: Any, hand: Hand) -> Task:
@@ -208,5 +219,5 @@ def _import(module: str) -> ModuleType:
         raise ConfigError(f"task module {module!r}: cannot be imported ({error})") from None
     except DexsimError:
         raise
-    except Exception as error:  # whatever it raises
+    except (Exception, SystemExit) as error:  # whatever it raises; a script without a main guard may exit
         raise ConfigError(f"task module {module!r}: importing it fails: {type(error).__name__}: {error}") from error

@@ -20,6 +20,7 @@ import numpy as np
 import tyro
 
 from dexsim.core import cli
+from dexsim.core.config import to_dict
 from dexsim.core.errors import CheckpointError, ConfigError
 from dexsim_ppo import checkpoint
 from dexsim_ppo.learner.networks import Params
@@ -119,6 +120,7 @@ def _form(policy: Policy) -> dict[str, Any]:
     """What averaged policies must have in common."""
     return {
         "task": policy.task,
+        "control": policy.spec and to_dict(policy.spec.control),
         "control rate": policy.control_rate,
         "hand": policy.hand,
         "observation": layout_to_list(policy.observation_layout),
@@ -156,6 +158,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         average = average_policies([policy for _, policy in policies])
     except ConfigError as error:
         raise ConfigError(f"{' '.join(arguments.policies)}: {error}") from None
+    for path, _ in policies:
+        if Path(path).exists() and arguments.output.exists() and Path(path).samefile(arguments.output):
+            raise ConfigError(f"--output {arguments.output}: is one of the averaged policies; give another file")
     average.save(arguments.output)
     for path, policy in policies:
         print(f"{path}: {distance(average, policy):.1%} away from the average")

@@ -268,6 +268,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     for name, path in (("--output", arguments.output), ("--video", video)):
         if path and path.exists() and Path(arguments.policy).exists() and path.samefile(arguments.policy):
             raise ConfigError(f"{name} {path}: is the policy itself; name another file")
+    if video and arguments.output and video.resolve() == arguments.output.resolve():
+        raise ConfigError(f"--output and --video are both {video}: name two files")
     policy = load_policy(arguments.policy, task=arguments.task).ablate(*arguments.ablate)
     chunk = min(arguments.chunk or default_chunk(), arguments.episodes or default_chunk())
     if not any(entry.startswith("objects.mesh=") for entry in arguments.set):

@@ -171,13 +171,12 @@ class Policy:
         Raises:
           CheckpointError: there is no such policy; see `dexsim_ppo.checkpoint.load`; or the parts do not fit together.
         """
-        path = _find(name)
-        file = checkpoint.load(path, kind="policy", task=task)
+        file = checkpoint.load(_find(name), kind="policy", task=task)
         try:
             return cls._from_file(file)
         except (KeyError, TypeError, ValueError, IndexError, AttributeError, RecursionError, ConfigError) as error:
             text = " ".join(repr(error).split())
-            raise CheckpointError(f"{path}: is not a sound policy ({text:.300})") from None
+            raise CheckpointError(f"{file.path}: is not a sound policy ({text:.300})") from None
 
     def find_hand(self, given: str | Path | None = None) -> "Hand | None":
         """The hand that the policy was trained on, or the file that is `given`; None for the default one.
@@ -236,15 +235,17 @@ class Policy:
         Warns (`OtherEnvWarning`) of settings that differ.
 
         Raises:
-          CheckpointError: the environment's observation has other fields than the policy's.
+          CheckpointError: the environment's observation has other fields than the policy's, or it takes other actions.
         """
-        given = layout_to_list(env.observation_layout["actor"])
+        given, actions = layout_to_list(env.observation_layout["actor"]), self.params.layers[-1].bias.size
         if given != layout_to_list(self.observation_layout):
             raise CheckpointError(
                 f"the policy observes {layout_to_list(self.observation_layout)}, and {env.name} gives {given}"
             )
-        trained = from_dict(type(env.config), self.env_config)  # with today's defaults for fields that are newer
-        trained, now = flat(to_dict(trained)), flat(to_dict(env.config))
+        if actions != env.action_size:
+            raise CheckpointError(f"the policy gives {actions} actions, and {env.name} takes {env.action_size}")
+        today = from_dict(type(env.config), self.env_config)  # with defaults for fields that are newer
+        trained, now = flat(to_dict(today)), flat(to_dict(env.config))
         changed = [
             f"{path} = {now.get(path)!r} (trained: {trained.get(path)!r})"
             for path in sorted(trained.keys() | now.keys())
@@ -292,9 +293,9 @@ class Policy:
         content = file.content
         layout, layers, normalizer, memory = read_network(content, file.leaves)
         params = PolicyParams(layers, normalizer, content["squash"], memory)
-        env_config = migrate_config(content["env_config"], file.path)
-        if content.get("hand") is not None:
-            check_record(content["hand"])
+        env_config, hand = migrate_config(content["env_config"], file.path), content.get("hand")
+        if hand is not None:
+            check_record(hand)
         return cls(
             task=file.task,
             env_config=env_config,
@@ -303,7 +304,7 @@ class Policy:
             control_rate=content["control_rate"],
             training=content["training"],
             spec=_read_spec(file, env_config),
-            hand=content.get("hand"),
+            hand=hand,
         )
 
 
@@ -335,8 +336,7 @@ def _find(name: str | Path) -> Path:
     """The file of a policy that is named by a path, or by the name of a shipped one."""
     if not isinstance(name, str | Path):
         raise CheckpointError(f"{name!r:.80}: give a policy's file, or the name of a shipped one")
-    text = str(name)
-    if Path(text).exists() or "/" in text or text.endswith(".msgpack"):
+    if Path(text := str(name)).exists() or "/" in text or text.endswith(".msgpack"):
         return Path(text)
     try:
         return Path(asset_path(f"policies/{text}.msgpack"))

@@ -80,7 +80,7 @@ INACTIVE: dict[str, tuple[str, Any]] = {"sensing.array": ("scale", 0.0)}
 SPEC: dict[str, str | None] = {"force_command": None}
 """Fields of a task's specification, likewise."""
 
-ARGUMENTS: dict[str, str | None] = {"corners": "extremes"}
+ARGUMENTS: dict[str, str | None] = {"corners": "extremes", "episode_seconds": None}
 """Options of a training run, likewise; those under `env` are in `FIELDS`."""
 
 LEAVES: dict[str, str | None] = {

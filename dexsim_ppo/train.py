@@ -23,7 +23,7 @@ from typing import Any, NamedTuple, cast
 from dexsim.core import cli
 from dexsim.core.compilation import make_deterministic
 from dexsim.core.config import from_dict, naming_file
-from dexsim.core.errors import ConfigError, DexsimError
+from dexsim.core.errors import CheckpointError, ConfigError, DexsimError
 from dexsim.hand.kinematics import Hand
 from dexsim.hand.source import record_of
 from dexsim.registry import find_task, task_option
@@ -92,8 +92,7 @@ def train_policy(
     given = {"env": config, "ppo": ppo, "policy": str(policy) or None, "resume": resume and Path(resume)} | options
     if "steps" in options and "minutes" not in options:
         given["minutes"] = 0.0
-    unknown = sorted(set(options) - {field.name for field in dataclasses.fields(TrainArguments)})
-    if unknown:
+    if unknown := sorted(set(options) - {field.name for field in dataclasses.fields(TrainArguments)}):
         raise ConfigError(f"train_policy has no option {unknown[0]!r}")
     if isinstance(begun, Policy) and config is None:
         begun.check_mesh()
@@ -238,7 +237,11 @@ def find_beginning(
     if resume:
         path = Path(resume)
         file = path if path.is_file() else RunFolder(path).latest_checkpoint()
-        return checkpoint.load(file, kind="train", task=name)
+        begun = checkpoint.load(file, kind="train", task=name)
+        for part in ("arguments", "progress"):
+            if not isinstance(begun.content.get(part), dict):
+                raise CheckpointError(f"{file}: its {part} are {begun.content.get(part)!r:.80}: no checkpoint of a run")
+        return begun
     return load_policy(policy, task=task) if policy else None
 
 
@@ -252,10 +255,8 @@ def default_arguments(task: str | None, preset: str, begun: checkpoint.Checkpoin
     default = preset_arguments(name, entry.config(), preset)
     if begun:
         env = from_dict(entry.config_class, begun.env_config)
-        default = dataclasses.replace(
-            default, env=env, ppo=fine_tuning_config(begun, default.ppo), curriculum=Curriculum()
-        )
-        default = dataclasses.replace(default, hand=begun.hand["file"] if begun.hand else "")
+        ppo, hand = fine_tuning_config(begun, default.ppo), begun.hand["file"] if begun.hand else ""
+        default = dataclasses.replace(default, env=env, ppo=ppo, curriculum=Curriculum(), hand=hand)
     return default
 
 
@@ -269,7 +270,7 @@ def saved_arguments(path: Path, task: str | None) -> TrainArguments:
     try:
         saved = json.loads(file.read_text())["arguments"]
         name = str(saved["task"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise ConfigError(f"--config {path}: no configuration of a run ({' '.join(str(error).split()):.200})") from None
     if task and task.rpartition(":")[2] != name:
         raise ConfigError(f"--config {path}: is of the task {name!r}, not {task!r}")
@@ -320,12 +321,10 @@ def parse_arguments(argv: list[str]) -> tuple[TrainArguments, checkpoint.Checkpo
 
 
 def arguments_from_dict(config_class: type[Any], data: dict[str, Any]) -> TrainArguments:
-    """The options that a checkpoint or `config.json` holds; those that exist no more are left out."""
-    known = {f.name for f in dataclasses.fields(TrainArguments)}
+    """The options that a checkpoint or `config.json` holds."""
     if missing := {"env", "ppo"} - data.keys():
         raise ConfigError(f"TrainArguments: no {min(missing)}")
-    known_data = {name: value for name, value in data.items() if name in known}
-    return from_dict(TrainArguments, known_data | {"env": from_dict(config_class, data["env"])})
+    return from_dict(TrainArguments, data | {"env": from_dict(config_class, data["env"])})
 
 
 @contextlib.contextmanager

@@ -4,14 +4,14 @@ import contextlib
 import fcntl
 import os
 import re
+import secrets
 import stat
-import tempfile
 import tomllib
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-_TEMPORARY = ".part"
+_TEMPORARY = ".dexsim-part"
 _SMALL = 128 * 1024  # bytes; a hand's calibration has 20,000
 _TOML_PARTS = 16  # of a dotted key; the reader's time and memory grow with their square
 _PART = r"""(?:[\w-]++|"(?:[^"\\\n]|\\.){0,200}+"|'[^'\n]{0,200}+')"""  # Of longer parts few fit into the file.
@@ -29,7 +29,7 @@ def write_whole(path: Path, chunks: Iterable[bytes | memoryview]) -> None:
     They go to a temporary file, which is renamed once everything is on the disk. So neither a crash nor
     another program leaves or sees half a file, and an existing file stays until then. Temporary files that a
     killed program left in the folder are removed. A device or a pipe, such as /dev/null, is written into, not replaced;
-    a link to a file stays one.
+    a link to a file stays one, and an existing file's mode stays.
 
     Raises:
       OSError: the file cannot be written; an existing file is untouched.
@@ -48,7 +48,8 @@ def write_whole(path: Path, chunks: Iterable[bytes | memoryview]) -> None:
                 file.write(chunk)
             file.flush()
             os.fsync(file.fileno())
-            os.chmod(temporary, 0o644)
+            with contextlib.suppress(FileNotFoundError):  # A new file has the mode of every new file (umask).
+                os.chmod(temporary, stat.S_IMODE(os.stat(path).st_mode))
             os.replace(temporary, path)
     except BaseException:
         Path(temporary).unlink(missing_ok=True)
@@ -107,7 +108,8 @@ def read_toml(path: Path) -> dict[str, Any]:
 def _locked_temporary(path: Path) -> tuple[int, str]:
     """An open, locked temporary file beside `path`."""
     while True:
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=_TEMPORARY)
+        temporary = f"{path.parent}/.{path.name:.200}.{secrets.token_hex(4)}{_TEMPORARY}"
+        handle = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
         with contextlib.suppress(OSError):  # A file system without locks.
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         with contextlib.suppress(FileNotFoundError):  # Another program took it for stale before it was locked.

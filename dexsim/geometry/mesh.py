@@ -183,7 +183,9 @@ def _read(source: Any) -> tuple[np.ndarray, np.ndarray, str]:
     if isinstance(source, Mesh):
         return source.vertices, source.faces, source.name
     if isinstance(source, tuple):
-        vertices, faces, name = source[0], source[1], "mesh"
+        if len(source) != 2:
+            raise AssetError(f"mesh: a tuple of {len(source)}; give (vertices, faces)")
+        (vertices, faces), name = source, "mesh"
     else:
         if isinstance(source, (str, Path)):
             import trimesh
@@ -201,7 +203,13 @@ def _read(source: Any) -> tuple[np.ndarray, np.ndarray, str]:
         if not hasattr(source, "faces") or not hasattr(source, "vertices"):
             raise AssetError(f"{name}: {type(source).__name__} is no triangle mesh")
         vertices, faces = source.vertices, source.faces
-    vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces)
+    try:
+        vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces)
+        whole = not faces.size or np.array_equal(faces, faces.astype(np.int64))
+    except (TypeError, ValueError) as error:
+        raise AssetError(f"{name}: vertices and triangles must be arrays of numbers ({error})") from None
+    if not whole:
+        raise AssetError(f"{name}: triangles must be whole numbers, the rows of their vertices")
     if vertices.ndim != 2 or vertices.shape[1:] != (3,) or (faces.size and (faces.ndim != 2 or faces.shape[1] != 3)):
         raise AssetError(
             f"{name}: expected vertices [V, 3] and triangles [T, 3], found {vertices.shape} and {faces.shape}"

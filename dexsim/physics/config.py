@@ -3,6 +3,7 @@
 import dataclasses
 
 from dexsim.core.config import setting, validate
+from dexsim.core.errors import ConfigError
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -12,7 +13,7 @@ class PhysicsConfig:
     timestep: float = setting(0.006, unit="s", low=1e-4, high=0.02)
     """One physics sub-step."""
     substeps: int = setting(5, unit="1", low=1, high=200)
-    """Sub-steps in one control tick; the control rate is 1 / (timestep * substeps)."""
+    """Sub-steps in one control tick; the control rate is 1 / (timestep * substeps), from 1 to 1000 Hz."""
     iterations: int = setting(3, unit="1", low=1, high=100)
     """Newton iterations of the contact solver."""
     line_search: int = setting(6, unit="1", low=1, high=100)
@@ -34,6 +35,11 @@ class PhysicsConfig:
 
     def __post_init__(self):
         validate(self)
+        if not 1e-3 <= (period := self.control_period) <= 1.0 + 1e-9:
+            raise ConfigError(
+                f"PhysicsConfig: timestep = {self.timestep:g} s times substeps = {self.substeps} is a control tick of "
+                f"{period:g} s: must be from 0.001 to 1 s"
+            )
 
     @property
     def control_period(self) -> float:

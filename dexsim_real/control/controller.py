@@ -55,7 +55,8 @@ class Controller:
     """The policy between readings and joint targets.
 
     Raises:
-      HandError: the policy observes what its task does not give, or what no sensor can measure.
+      HandError: the policy observes what its task does not give or no sensor can measure, or gives another number of
+        actions than the hand has joints.
     """
 
     def __init__(self, policy: Policy | ExportedPolicy, hand: Hand):
@@ -69,6 +70,9 @@ class Controller:
         wanted = tuple(LayoutEntry(f.name, f.size, f.scale) for f in policy.observation_layout)
         if layout(hand, names, config) != wanted:
             raise HandError(f"the policy's observation does not fit this version's task {policy.task!r}")
+        seen = np.zeros(sum(entry.size for entry in wanted), np.float32)
+        if (shape := np.shape(policy.act(policy.begin(), seen)[1])) != (hand.num_joints,):
+            raise HandError(f"the policy gives actions {list(shape)}; the hand takes {hand.num_joints} of them")
         self.period = 1.0 / policy.control_rate
         self._observe = make_observe(hand, names, config)
         self._move = jax.jit(lambda *arrays: next_target(self.spec, hand, self.period, *arrays))

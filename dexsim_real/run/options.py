@@ -11,7 +11,7 @@ from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.core.errors import HandError
 from dexsim_real.sensors.camera import CameraConfig
 from dexsim_real.sensors.hand import HardwareConfig
-from dexsim_real.sensors.imu import UPRIGHT_X
+from dexsim_real.sensors.imu import UPRIGHT_X, check_mount
 from dexsim_real.wire.link import LinkConfig
 
 
@@ -76,6 +76,7 @@ class RunArguments:
 
     def __post_init__(self):
         validate(self)
+        check_mount(self.imu_mount, "--imu-mount")
         if self.calibration is None and not self.uncalibrated:
             raise HandError("give --calibration FILE, or --uncalibrated to run on default scales")
         if self.calibration is not None and self.uncalibrated:

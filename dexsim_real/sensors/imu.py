@@ -26,6 +26,12 @@ UPRIGHT_X = (0.5**0.5, 0.0, 0.5**0.5, 0.0)
 """Orientation (w, x, y, z) of the IMU in the object: the IMU's z along the object's x."""
 
 
+def check_mount(mount: tuple[float, ...], where: str) -> None:
+    """Raises HandError: an orientation [4] of (nearly) no length; `where` names the option."""
+    if np.linalg.norm(mount) < 1e-3:
+        raise HandError(f"{where} {' '.join(f'{v:g}' for v in mount)}: is no orientation (w, x, y, z)")
+
+
 def encode(index: int, quat: np.ndarray, acceleration: tuple[float, float, float] = (0.0, 0.0, 9.81)) -> bytes:
     """The RVC frame of an orientation (w, x, y, z) in the IMU's world frame, z up; acceleration in m/s^2."""
     w, x, y, z = (float(v) for v in quat)

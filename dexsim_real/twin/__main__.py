@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from dexsim.core import cli
+from dexsim.core.errors import DexsimError
 from dexsim.hand.kinematics import Hand
 from dexsim.hand.load import load_hand
 from dexsim_real.core.errors import HandError
@@ -26,7 +27,7 @@ from dexsim_real.core.process import use_realtime
 from dexsim_real.sensors.camera import CameraConfig
 from dexsim_real.sensors.hand import check_wire
 from dexsim_real.twin.options import TwinArguments
-from dexsim_real.twin.plant.protocol import Plant
+from dexsim_real.twin.plant.protocol import Plant, check_plant
 from dexsim_real.twin.server import Twin
 from dexsim_real.twin.wire.firmware import FirmwareConfig
 
@@ -35,11 +36,20 @@ def make_plant(arguments: TwinArguments, hand: Hand) -> Plant:
     """The physics for the options.
 
     Raises:
-      HandError: the function of `--plant` cannot be found.
+      HandError: the function of `--plant` cannot be found, raises something, or returns no `Plant`.
     """
     if arguments.plant:
         given = f"--plant {arguments.plant}"
-        return find_function(arguments.plant, given, "MODULE:FUNCTION", default="make_plant")(arguments)
+        makes = find_function(arguments.plant, given, "MODULE:FUNCTION", default="make_plant")
+        try:
+            plant = makes(arguments)
+        except DexsimError:
+            raise
+        except Exception as error:  # whatever it raises
+            text = " ".join(str(error).split())
+            raise HandError(f"{given}: making it fails: {type(error).__name__}: {text:.200}") from error
+        check_plant(plant, given)
+        return plant
     from dexsim_real.twin.plant.foreign.hand import hand_of
 
     return hand_of(

@@ -77,6 +77,8 @@ def test_a_name_is_a_word(name):
 def test_a_configuration_is_an_env_config():
     with pytest.raises(ConfigError, match="is a dict, not an EnvConfig"):
         dexsim.register("mine", Mine, config=dict)
+    with pytest.raises(ConfigError, match=r"config = GraspConfig.*: give its class or a function"):
+        dexsim.register("mine", Mine, config=GraspConfig())
     assert issubclass(GraspConfig, EnvConfig)
 
 
@@ -97,6 +99,9 @@ def test_what_the_users_module_or_function_raises_is_told_in_one_line(tmp_path, 
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(ConfigError, match="--task poke_task:poke: making it fails: RuntimeError: no licence"):
         registry.make("poke_task:poke")
+    (tmp_path / "script_task.py").write_text("import sys\nsys.exit(0)\n")
+    with pytest.raises(ConfigError, match="task module 'script_task': importing it fails: SystemExit: 0"):
+        registry.make("script_task:poke")
     with pytest.raises(ConfigError, match="task module 'half_task': importing it fails: SyntaxError"):
         registry.make("half_task:poke")
 
@@ -115,8 +120,13 @@ def test_what_make_refuses():
     for name, options, message in (
         ("juggle", {}, "unknown task 'juggle': choose from grasp, rotate.*--task my_module:juggle"),
         ("rotate", {"config": GraspConfig()}, "takes a RotateConfig, not a GraspConfig"),
-        ("grasp", {"num_envs": 0}, r"num_envs=0\): must be at least 1"),
-        ("grasp", {"num_envs": -3}, "must be at least 1"),
+        ("grasp", {"num_envs": 0}, r"num_envs=0\): must be a whole number above 0"),
+        ("grasp", {"num_envs": 2.5}, "must be a whole number above 0"),
+        ("grasp", {"num_envs": True}, "must be a whole number above 0"),
+        ("grasp", {"num_envs": "3"}, "must be a whole number above 0"),
+        ("grasp", {"seed": 1.5}, r"seed=1.5\): must be a whole number$"),
+        ("os:getcwd", {}, "it makes a str, which has no reset and step"),
+        ("os:grasp", {}, "os has no 'grasp'; dexsim's own task is grasp, without a module"),
         ("grasp", {"hand": "xhand"}, r"make\('grasp', hand='xhand'\): must be a Hand, such as dexsim.load_hand"),
     ):
         with pytest.raises(ConfigError, match=message):

@@ -55,9 +55,24 @@ def test_what_has_no_common_origin_is_refused(tmp_path):
         average_policies([rotate, load_policy("rotate_without_orientation")])
     with pytest.raises(ConfigError, match="policy 2 differs from the first in task"):
         average_policies([rotate, load_policy("grasp")])
+    other = dataclasses.replace(rotate.spec, control=dataclasses.replace(rotate.spec.control, step=0.5))
+    with pytest.raises(ConfigError, match="policy 2 differs from the first in control$"):
+        average_policies([rotate, dataclasses.replace(rotate, spec=other)])
     with pytest.raises(ConfigError, match="two policies or more"):
         average_policies([rotate])
     output = tmp_path / "average.msgpack"
     with pytest.raises(ConfigError, match="^rotate grasp: policy 2 differs"):
         main(["rotate", "grasp", "--output", str(output)])
     assert not output.exists()
+
+
+def test_no_averaged_policy_is_overwritten(tmp_path):
+    files = [tmp_path / "1.msgpack", tmp_path / "2.msgpack"]
+    for k, file in enumerate(files):
+        moved(load_policy("rotate_clear"), 0.1, k).save(file)
+    (tmp_path / "link.msgpack").symlink_to(files[1])
+    before = files[1].read_bytes()
+    for output in (files[1], tmp_path / "link.msgpack"):
+        with pytest.raises(ConfigError, match=f"^--output {output}: is one of the averaged policies"):
+            main([*map(str, files), "--output", str(output)])
+    assert files[1].read_bytes() == before

@@ -120,6 +120,7 @@ def test_outputs_that_would_surprise_are_refused_at_once(tmp_path, monkeypatch):
     before = (tmp_path / "policy.msgpack").read_bytes()
     name = str(tmp_path / "policy.msgpack")
     for options, words in {
+        ("--output", "x.mp4", "--video", "./x.mp4"): "--output and --video are both x.mp4: name two files",
         ("--video", "film.avi"): "--video film.avi: give a file that ends in .mp4 or .gif",
         ("--output", name): f"--output {name}: is the policy itself",
         ("--episodes", "2000000"): "--episodes 2000000: must be between 0 and 1000000",

@@ -1,5 +1,6 @@
 """A task of one's own from registering to resuming, over simple physics: train, evaluate, fine-tune, resume by name."""
 
+import dataclasses
 import json
 import sys
 import warnings
@@ -46,6 +47,11 @@ def test_the_policy_makes_the_environment_that_it_was_trained_in(run):
         env = run.policy.make_env(backend="c")
         run.policy.check_env(env)
     assert env.config.gain == 3.0 and env.config.pool_size == 4
+    (*hidden, last), params = run.policy.params.layers, run.policy.params
+    short = dataclasses.replace(last, kernel=last.kernel[:, :5], bias=last.bias[:5])
+    cut = dataclasses.replace(run.policy, params=dataclasses.replace(params, layers=(*hidden, short)))
+    with pytest.raises(CheckpointError, match="the policy gives 5 actions, and poke takes 12"):
+        cut.check_env(env)
     action = run.policy(jax.jit(env.reset)(jax.random.key(0)).obs["actor"])
     assert action.shape == (12,) and np.all(np.abs(action) <= 1)
 

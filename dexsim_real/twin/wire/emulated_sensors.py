@@ -18,6 +18,7 @@ import numpy as np
 from dexsim.core.config import setting, validate
 from dexsim_real.core.errors import HandError
 from dexsim_real.sensors.camera import CameraConfig, encode_mask
+from dexsim_real.sensors.imu import check_mount
 from dexsim_real.twin.plant.protocol import Plant
 from dexsim_real.twin.plant.shapes import Primitive
 from dexsim_real.twin.wire.terminal import Terminal
@@ -46,6 +47,7 @@ class ObjectSensorConfig:
 
     def __post_init__(self):
         validate(self)
+        check_mount(self.imu_mount, "imu_mount")
 
 
 class Clocked:

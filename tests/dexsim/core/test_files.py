@@ -80,12 +80,24 @@ def test_a_toml_may_begin_with_a_byte_order_mark(tmp_path):
 
 
 def test_only_temporaries_are_removed(tmp_path):
-    for name in (".hidden", "a.part", ".b.txt"):
+    mine = {".hidden", "a.part", ".b.txt", ".download.part", ".file.12345678.part"}
+    for name in mine:
         (tmp_path / name).write_text("mine")
     write_whole(tmp_path / "file", [b"1"])
     write_whole(tmp_path / "file", [b"2"])
-    assert {path.name for path in tmp_path.iterdir()} == {".hidden", "a.part", ".b.txt", "file"}
+    assert {path.name for path in tmp_path.iterdir()} == mine | {"file"}
     assert (tmp_path / "file").read_bytes() == b"2"
+
+
+@pytest.mark.parametrize("mode", [0o600, 0o640, 0o644, 0o444])
+def test_a_file_keeps_its_mode_and_a_new_one_has_that_of_any_other(tmp_path, mode):
+    (tmp_path / "old").write_text("1")
+    (tmp_path / "old").chmod(mode)
+    (tmp_path / "other").write_text("1")
+    for name in ("old", "new"):
+        write_whole(tmp_path / name, [b"2"])
+    modes = {path.name: path.stat().st_mode & 0o777 for path in tmp_path.iterdir()}
+    assert modes == {"old": mode, "new": modes["other"], "other": modes["other"]}
 
 
 def test_a_private_folder(tmp_path):

@@ -113,6 +113,10 @@ def test_bad_meshes_are_refused_in_one_line():
         ((vertices[:, :2], faces), r"\[V, 3\]"),
         ("nowhere.stl", "no such file"),
         (3, "no triangle mesh"),
+        ((vertices,), "a tuple of 1; give .vertices, faces."),
+        ((vertices, faces + 0.7), "must be whole numbers"),
+        ((vertices, [[0, 1, 2], [3]]), "must be arrays of numbers"),
+        ((np.full(vertices.shape, "a"), faces), "must be arrays of numbers"),
     ]
     overlapping = trimesh.util.concatenate([ball, ball.copy().apply_translation((0.02, 0, 0))])
     for source, words in cases:

@@ -23,7 +23,7 @@ from dexsim import registry
 from dexsim.core import cli
 from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import pytree_dataclass
-from dexsim_ppo import evaluate, train
+from dexsim_ppo import checkpoint, evaluate, train
 from dexsim_ppo.policy import Policy
 from dexsim_ppo.report import mean_interval, print_report, proportion, summarize, surely_better
 from dexsim_ppo.training.arguments import training_config
@@ -229,6 +229,9 @@ def test_a_saved_configuration_begins_a_new_run(finished, tmp_path, capsys):
     first, second = (Policy.load(RunFolder(p).last).params for p in (finished.path, path))
     jax.tree.map(np.testing.assert_array_equal, first, second)
     (tmp_path / "other.json").write_text("{}")
+    (tmp_path / "deep.json").write_text('{"arguments":' + "[" * 100_000)
+    for name, content in (("empty", {}), ("odd", {"arguments": {}, "progress": [3]})):
+        checkpoint.save(tmp_path / f"{name}.msgpack", kind="train", task="tiny", content=content, tree={})
     for arguments, said in (
         (["--config", str(finished.path), "--task", "grasp"], "of the task 'tiny', not 'grasp'"),
         (["--config", str(finished.path), "--resume", str(finished.path)], "give one of them"),
@@ -237,6 +240,10 @@ def test_a_saved_configuration_begins_a_new_run(finished, tmp_path, capsys):
         (["--config", str(edited(finished, tmp_path, seed="x"))], "TrainArguments.seed = 'x': expected int"),
         (["--config", str(edited(finished, tmp_path, minutes=None))], "TrainArguments.minutes = None: expected float"),
         (["--config", str(edited(finished, tmp_path, env=...))], "TrainArguments: no env"),
+        (["--config", str(edited(finished, tmp_path, sed=7))], "TrainArguments has no field 'sed'"),
+        (["--config", str(tmp_path / "deep.json")], "no configuration of a run (maximum recursion"),
+        (["--resume", str(tmp_path / "empty.msgpack")], "its arguments are None: no checkpoint of a run"),
+        (["--resume", str(tmp_path / "odd.msgpack")], "its progress are [3]: no checkpoint of a run"),
         (["--task", "tiny", "--seed", str(2**32 - 1), "--seeds", "2"], "--seeds 2: the last seed must be at most"),
     ):
         capsys.readouterr()

@@ -33,6 +33,7 @@ from dexsim.tasks.rotate.objects import sample_turned_object
 from dexsim.tasks.rotate.task import Rotate
 from dexsim_ppo.policy import load_policy
 from dexsim_real.control.controller import IDENTITY, Controller
+from dexsim_real.core.errors import HandError
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
 from dexsim_real.sensors.readings import ObjectEstimate
 from dexsim_real.wire import frames
@@ -183,9 +184,24 @@ def test_a_golden_trace_pins_the_order_of_action_and_sensing(hand, monkeypatch):
     assert np.abs(np.diff(actions, axis=0)).max() > 0.05 and touched > 4
 
 
+@pytest.mark.parametrize("count", [1, 5, 13])
+def test_a_policy_with_another_number_of_actions_is_refused(hand, count):
+    task = Grasp(GraspConfig(), hand)
+    with pytest.raises(HandError, match=rf"gives actions \[{count}\]; the hand takes 12"):
+        Controller(Acts(task, hand, lambda observation: np.zeros(count, np.float32)), hand)
+
+
 def test_an_action_that_is_not_finite_counts_as_none(hand):
     task = Grasp(GraspConfig(), hand)
-    answers = iter([np.full(12, 0.5, np.float32), np.full(12, np.nan, np.float32), np.full(12, 3.0, np.float32)])
+    # The first is asked for when the controller is made.
+    answers = iter(
+        [
+            np.zeros(12, np.float32),
+            np.full(12, 0.5, np.float32),
+            np.full(12, np.nan, np.float32),
+            np.full(12, 3.0, np.float32),
+        ]
+    )
     controller = Controller(Acts(task, hand, lambda observation: next(answers)), hand)
     middle = ((hand.joint_lower + hand.joint_upper) / 2).astype(np.float32)
     controller.start(middle)

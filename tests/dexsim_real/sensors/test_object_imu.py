@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from dexsim.geometry import rotations
 from dexsim_real.control.controller import IDENTITY
 from dexsim_real.core.errors import HandError
+from dexsim_real.run.options import RunArguments
 from dexsim_real.sensors import imu
 
 DATASHEET = bytes.fromhex("AA AA DE 01 00 92 FF 25 08 8D FE EC FF D1 03 00 00 00 E7")
@@ -79,6 +80,11 @@ def test_one_known_pose_aligns_all_three_angles(world, first, later):
 
     found = imu.align(wxyz(world.inv() * first), wxyz(first))
     assert apart(imu.multiply(found, wxyz(world.inv() * later)), wxyz(later)) < 2e-3
+
+
+def test_a_mount_without_a_length_is_refused():
+    with pytest.raises(HandError, match=r"^--imu-mount 0 0 0 0: is no orientation \(w, x, y, z\)$"):
+        RunArguments(policy="rotate", port="", uncalibrated=True, imu_mount=(0.0, 0.0, 0.0, 0.0))
 
 
 def test_the_imu_thread_reads_a_port():

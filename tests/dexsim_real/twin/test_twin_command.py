@@ -103,12 +103,17 @@ def test_it_ends_in_good_order_when_it_is_told_to(tmp_path):
 
 
 def test_what_is_wrong_is_said_in_one_line(tmp_path):
+    (tmp_path / "deep.toml").write_text("model = " + "[" * 5000 + "]" * 5000)
     for options, message in (
         (["--faults.script", "5 melt"], "no kind 'melt'"),
         (["--task", "juggle"], "choose from grasp, rotate"),
         (["--policy", "grasp"], "of the task 'grasp'; give --task grasp"),
         (["--policy", "nobody"], "nobody: no such file"),
         (["--plant", "nowhere:make"], "No module named 'nowhere'"),
+        (["--plant", "builtins:print"], r"print: it returned NoneType without '\w+'; expected a `Plant`"),
+        (["--plant", "math:sqrt"], "sqrt: making it fails: TypeError: must be real number"),
+        (["--object.imu-mount", "0", "0", "0", "0"], "imu_mount 0 0 0 0: is no orientation"),
+        (["--plant-model", str(tmp_path / "deep.toml")], "deep.toml: cannot be read .*nested too deep"),
         (["--faults.flip", "2"], "between 0 and 1"),
         (["--plant", "twin_plant:make", "--link", str(tmp_path / "no" / "port")], "no pseudo-terminal"),
         (

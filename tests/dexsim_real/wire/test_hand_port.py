@@ -95,7 +95,8 @@ def test_a_port_that_vanishes_while_it_opens_is_a_hand_that_is_gone(monkeypatch)
 def test_a_reply_is_checked_whoever_made_it():
     """A stamp of another clock would never grow old: `Safety` would not notice that the hand is silent."""
     good = Reply(empty_state(), 9.99, 10.0, 1, 1)
-    assert checked(good, 10.0) == good and checked(good, 12.0).received == 10.0
+    same, later = checked(good, 10.0), checked(good, 12.0)
+    assert dataclasses.replace(same, state=good.state) == good and same.state == good.state and later.received == 10.0
     assert checked(good, 9.9).received == 9.9, "a little ahead"
     for received, said in ((1.7e9, "1.7e.09 s ahead"), (np.inf, "inf s ahead"), (np.nan, "nan s ahead")):
         with pytest.raises(HandError, match=f"{said}.*time.monotonic"):
@@ -126,6 +127,13 @@ class Driver:
         vars(self).update(
             {"counts": LinkCounts(), "connect": lambda: "a hand", "exchange": print, "close": print} | parts
         )
+
+
+def test_a_driver_may_reuse_its_buffer():
+    state = empty_state()
+    reply = checked(Reply(state, 0.0, 1.0, 0, 1), 2.0)
+    state["joint"]["position"][:] = 1.0
+    assert not reply.state["joint"]["position"].any()
 
 
 def test_what_a_driver_tells_is_checked():
