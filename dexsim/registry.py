@@ -143,11 +143,11 @@ def make(
     Raises:
       ConfigError: unknown task, a config of another task, no `Hand`, or `num_envs` below 1.
     """
-    for option, value, low in (("num_envs", num_envs, 1), ("seed", seed, None)):
-        if not isinstance(value, numbers.Integral) or isinstance(value, bool) or (low is not None and value < low):
-            raise ConfigError(
-                f"make({task!r}, {option}={value!r:.80}): must be a whole number{'' if low is None else ' above 0'}"
-            )
+    for option, value in (("num_envs", num_envs), ("seed", seed)):
+        if not isinstance(value, numbers.Integral) or isinstance(value, bool):
+            raise ConfigError(f"make({task!r}, {option}={value!r:.80}): must be a whole number")
+    if num_envs < 1:
+        raise ConfigError(f"make({task!r}, num_envs={num_envs}): must be at least 1")
     if not isinstance(hand, Hand | None):
         raise ConfigError(f"make({task!r}, hand={hand!r:.80}): must be a Hand, such as dexsim.load_hand(...) returns")
     if (makes := find_task(task).environment) is not None:

@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING
 from dexsim.core.door import open_door
 
 if TYPE_CHECKING:
+    from dexsim_ppo.acting import act
     from dexsim_ppo.average import average_policies
     from dexsim_ppo.evaluate import evaluate_policy
     from dexsim_ppo.learner.config import PPOConfig
     from dexsim_ppo.learner.ppo import TrainState, make_train
-    from dexsim_ppo.policy import Policy, act, load_policy
+    from dexsim_ppo.policy import Policy, load_policy
     from dexsim_ppo.train import Trained, train_policy
 
 __all__ = [
@@ -40,7 +41,7 @@ __getattr__, __dir__ = open_door(
         "Policy": "dexsim_ppo.policy",
         "TrainState": "dexsim_ppo.learner.ppo",
         "Trained": "dexsim_ppo.train",
-        "act": "dexsim_ppo.policy",
+        "act": "dexsim_ppo.acting",
         "average_policies": "dexsim_ppo.average",
         "evaluate_policy": "dexsim_ppo.evaluate",
         "load_policy": "dexsim_ppo.policy",

@@ -31,8 +31,9 @@ from dexsim.core.errors import ConfigError
 from dexsim.core.options import Option
 from dexsim.core.progress import progress
 from dexsim.registry import find_task
+from dexsim_ppo.acting import PolicyParams, act_from, begin
 from dexsim_ppo.learner.types import Environment
-from dexsim_ppo.policy import Policy, PolicyParams, act_from, begin, load_policy
+from dexsim_ppo.policy import Policy, load_policy
 from dexsim_ppo.report import print_report, summarize, summarize_totals
 
 

@@ -26,9 +26,10 @@ from dexsim.core.files import write_whole
 from dexsim.core.install import install_line
 from dexsim.hand.source import check_record
 from dexsim.task_spec import TaskSpec
+from dexsim_ppo.acting import NEEDS_MEMORY
 from dexsim_ppo.learner.memory import GRU, state_size
 from dexsim_ppo.learner.types import Field
-from dexsim_ppo.policy import NEEDS_MEMORY, Policy, layout_to_list, load_policy
+from dexsim_ppo.policy import Policy, layout_to_list, load_policy
 from dexsim_ppo.policy_file import memory_to_list
 from dexsim_ppo.portable import FORMAT, UNIT, PortablePolicy, check_header
 from dexsim_ppo.retired import read_spec

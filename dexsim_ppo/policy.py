@@ -1,17 +1,18 @@
 """A trained policy: loads from one file, needs no simulator, runs anywhere JAX does.
 
     policy = load_policy("grasp")        # a shipped one by name, or a file
-    action = policy(observation)
+    memory = policy.begin()              # None where the policy has no memory
+    memory, action = policy.act(memory, observation)
 
-`act(params, obs)` is the pure function, for use under `jit`, `vmap` and `scan`. `Policy` is what a file
-holds: those parameters together with the task, the observation's layout and the control rate.
+A policy without a memory is a function, too: `action = policy(observation)`. `Policy` is what a file holds: the
+parameters of `dexsim_ppo.acting` together with the task, the observation's layout and the control rate.
 """
 
 import dataclasses
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -20,15 +21,15 @@ import numpy as np
 from dexsim.core.assets import asset_path
 from dexsim.core.config import flat, from_dict, to_dict
 from dexsim.core.errors import AssetError, CheckpointError, ConfigError, OtherEnvWarning
-from dexsim.core.pytree import Array, pytree_dataclass, static
+from dexsim.core.pytree import Array
 from dexsim.hand.source import check_record, check_same, record_of, recorded_hand
 from dexsim.task_spec import TaskSpec
 from dexsim_ppo import checkpoint
+from dexsim_ppo.acting import PolicyParams, act_from, begin
 from dexsim_ppo.learner.adapter import adapt
-from dexsim_ppo.learner.distribution import squash
-from dexsim_ppo.learner.memory import History, Memory, empty, remember
-from dexsim_ppo.learner.networks import MLP, Layer, apply_mlp
-from dexsim_ppo.learner.running_stats import Normalizer, make_normalizer, normalize
+from dexsim_ppo.learner.memory import History
+from dexsim_ppo.learner.networks import Layer
+from dexsim_ppo.learner.running_stats import make_normalizer
 from dexsim_ppo.learner.types import Environment, Field, Fields
 from dexsim_ppo.policy_file import memory_to_list, read_network
 from dexsim_ppo.retired import migrate_config, old_spec, read_spec
@@ -38,53 +39,7 @@ if TYPE_CHECKING:
     from dexsim.hand.kinematics import Hand
 
 
-NEEDS_MEMORY = (
-    "this policy has a memory: memory = policy.begin(), then memory, action = policy.act(memory, observation)"
-)
-
-
-@pytree_dataclass
-class PolicyParams:
-    """What `act` needs."""
-
-    layers: MLP
-    normalizer: Normalizer
-    squash: Literal["gaussian", "tanh"] = static(default="gaussian")
-    """`"gaussian"`: actions are clipped to [-1, 1]; `"tanh"`: squashed."""
-    memory: Memory = None
-
-
-def begin(params: PolicyParams, batch: tuple[int, ...] = ()) -> jax.Array | None:
-    """What a policy remembers `[*batch, m]` at the start of an episode; None if it has no memory."""
-    return empty(params.memory, params.normalizer.mean.shape[0], batch)
-
-
-def act(params: PolicyParams, obs: jax.Array) -> jax.Array:
-    """The policy's mode: actor observation `[..., n]`, SI units, to action `[..., A]` in [-1, 1].
-
-    Raises:
-      ConfigError: the policy has a memory.
-    """
-    if params.memory is not None:
-        raise ConfigError(NEEDS_MEMORY)
-    return act_from(params, None, obs)[1]
-
-
-def act_from(params: PolicyParams, memory: jax.Array | None, obs: jax.Array) -> tuple[jax.Array | None, jax.Array]:
-    """One step of a policy with or without memory.
-
-    Args:
-      memory: `[..., m]`, at the start of an episode that of `begin`.
-      obs: actor observation `[..., n]`, SI units.
-
-    Returns:
-      Memory after it, and the policy's mode: action `[..., A]` in [-1, 1].
-    """
-    memory, seen = remember(params.memory, memory, normalize(params.normalizer, obs))
-    return memory, squash(apply_mlp(params.layers, seen), params.squash)
-
-
-_act, _act_from = jax.jit(act), jax.jit(act_from)
+_act_from = jax.jit(act_from)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,16 +65,20 @@ class Policy:
         """Action `[..., A]` for an actor observation `[..., n]`.
 
         Raises:
-          ConfigError: the policy has a memory.
+          ConfigError: the policy has a memory, or observes another number of values.
         """
-        return _act(self.params, obs)
+        return self.act(None, obs)[1]
 
     def begin(self, *batch: int) -> jax.Array | None:
         """What it remembers `[*batch, m]` at the start of an episode; None if it has no memory."""
         return begin(self.params, batch)
 
     def act(self, memory: Array | None, obs: Array) -> tuple[jax.Array | None, jax.Array]:
-        """Memory after this observation `[..., n]`, and action `[..., A]`: for policies with or without memory."""
+        """Memory after this observation `[..., n]`, and action `[..., A]`: for policies with or without memory.
+
+        Raises:
+          ConfigError: the memory is not that of this policy and batch, or the policy observes another number of values.
+        """
         return _act_from(self.params, memory, obs)
 
     def ablate(self, *names: str) -> "Policy":
@@ -341,7 +300,8 @@ def _find(name: str | Path) -> Path:
     try:
         return Path(asset_path(f"policies/{text}.msgpack"))
     except AssetError:
-        raise CheckpointError(f"{text}: no such file, and no shipped policy has that name") from None
+        shipped = ", ".join(sorted(path.stem for path in Path(asset_path("policies")).glob("*.msgpack")))
+        raise CheckpointError(f"{text}: no such file, and no shipped policy has that name: {shipped}") from None
 
 
 def _read_spec(file: checkpoint.Checkpoint, env_config: dict[str, Any]) -> TaskSpec | None:

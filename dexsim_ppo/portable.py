@@ -1,10 +1,10 @@
 """A policy in a file that needs NumPy alone: no JAX, no simulator, nothing else of this library.
 
     policy = PortablePolicy.load("grasp.npz")   # written by `python -m dexsim_ppo.export`
-    action = policy(observation)
-
-    memory = policy.begin()                     # one that was trained with a memory: at an episode's start
+    memory = policy.begin()                     # at an episode's start; None where the policy has no memory
     memory, action = policy.act(memory, observation)
+
+    action = policy(observation)                # the same for a policy without a memory
 
 This module imports only NumPy and may be copied to a computer that has nothing else.
 
@@ -134,8 +134,6 @@ class PortablePolicy:
         Raises:
           ValueError: the policy has a memory.
         """
-        if self._kept:
-            raise ValueError("this policy has a memory: use begin and act")
         return self.act(None, observation)[1]
 
     def begin(self, *batch: int) -> np.ndarray | None:
@@ -143,7 +141,18 @@ class PortablePolicy:
         return np.zeros((*batch, self._kept), np.float32) if self._kept else None
 
     def act(self, memory: np.ndarray | None, observation: np.ndarray) -> tuple[np.ndarray | None, np.ndarray]:
-        """Memory after this observation [..., n], and action [..., A]: for policies with or without memory."""
+        """Memory after this observation [..., n], and action [..., A]: for policies with or without memory.
+
+        Raises:
+          ValueError: the memory is not that of this policy and batch, or the policy observes another number of values.
+        """
+        size, shape = self._mean.size, np.shape(observation)
+        if shape[-1:] != (size,):
+            raise ValueError(f"the policy observes {size} values, [..., {size}]; the observation has the shape {shape}")
+        if (memory is None) != (not self._kept):
+            raise ValueError(f"this policy has {'a' if self._kept else 'no'} memory: use begin and act")
+        if memory is not None and np.shape(memory) != (*shape[:-1], self._kept):
+            raise ValueError(f"the memory has the shape {np.shape(memory)}, expected {(*shape[:-1], self._kept)}")
         clip = self.header["clip"]
         x = np.clip((np.asarray(observation, np.float32) - self._mean) / self._std, -clip, clip)
         if memory is not None and self._unit:

@@ -26,7 +26,8 @@ from dexsim.datasets.lerobot import check_lerobot, write_lerobot
 from dexsim.datasets.rerun import check_rerun, show_rerun
 from dexsim.datasets.trajectory import READINGS, Trajectory, from_readings
 from dexsim.registry import find_task
-from dexsim_ppo.policy import Policy, act_from, load_policy
+from dexsim_ppo.acting import act_from
+from dexsim_ppo.policy import Policy, load_policy
 
 
 def record(policy: Policy, env: Any, *, episodes: int, seconds: float, seed: int) -> list[Trajectory]:

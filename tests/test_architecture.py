@@ -36,7 +36,7 @@ FLOORS = {
     "dexsim_ppo": (
         ("learner", "portable"),
         ("retired",),
-        ("checkpoint", "policy_file", "report"),
+        ("acting", "checkpoint", "policy_file", "report"),
         ("policy",),
         ("evaluate", "export", "record"),
         ("training",),

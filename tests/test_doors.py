@@ -9,8 +9,9 @@ from paths import ROOT
 
 NAMES = {
     "dexsim": """
-        AssetError CalibrationError CheckpointError ConfigError DexsimError DexsimWarning Env EnvConfig Hand
-        OldFileWarning OtherEnvWarning Readings State Task TaskSpec load_hand make observe register
+        AssetError CalibrationError CheckpointError ConfigError DexsimError DexsimWarning Env EnvConfig
+        GraspConfig Hand OldFileWarning OtherEnvWarning Readings RotateConfig State Task TaskSpec draw_taxels
+        enable_caches load_hand make observe register render_episode render_frame
     """,
     "dexsim_ppo": """
         PPOConfig Policy TrainState Trained act average_policies evaluate_policy load_policy make_train train_policy

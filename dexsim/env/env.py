@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dexsim.control import observed_action
+from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import choose
 from dexsim.env.episode import EpisodeSampler
 from dexsim.env.evaluation import EvaluationPlan, make_plan
@@ -119,7 +120,13 @@ class Env:
         return self._state(key, episode, command, tick, goal, seen, outcome, scale)
 
     def step(self, state: State, action: jax.Array) -> State:
-        """One control tick. `action` [J] is clipped to [-1, 1]. No automatic reset."""
+        """One control tick. `action` [J] is clipped to [-1, 1]. No automatic reset.
+
+        Raises:
+          ConfigError: the action has another shape.
+        """
+        if (shape := jnp.shape(action)) != (self.action_size,):
+            raise ConfigError(f"the action has the shape {shape}; {self.name!r} takes one of ({self.action_size},)")
         key, push_key, goal_key, noise_key = jax.random.split(state.key, 4)
         episode = state.episode
         command = self._control(state, action)

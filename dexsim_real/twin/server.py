@@ -172,7 +172,9 @@ class Twin:
                 done = self._trial - self._first
                 end = self.plant.results()[done - 1].get("end", "")
                 self.note(f"end of trial {done} of {self.arguments.trials}: {end}")
-                self._stop |= done >= self.arguments.trials
+                if done >= self.arguments.trials:
+                    self._stop = True
+                    self.note("all trials are over: the hand's port closes")
             pause = min(until, self.line.due()) - time.monotonic()
             ports = [self.line.terminal] if self.line.terminal.connected else []
             select.select(ports, [], [], max(pause, 0.0))

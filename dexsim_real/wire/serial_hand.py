@@ -60,6 +60,7 @@ class SerialHand:
         self._retry_at, self._pause = 0.0, self.config.backoff[0]
 
     def connect(self) -> str:
+        """Open the port and identify the hand; see `HandPort.connect`."""
         self._open()
         try:
             time.sleep(self.config.settle)
@@ -76,6 +77,7 @@ class SerialHand:
         return f"{self.port}: hand {self.config.hand_id}, {self.identity.describe()}, firmware {version}"
 
     def exchange(self, command: np.ndarray) -> Reply | None:
+        """Send a command and wait for the answer, None without one; see `HandPort.exchange`."""
         self.refusal = None
         if self._serial is None:
             return self._reconnect()
@@ -88,6 +90,7 @@ class SerialHand:
             return None
 
     def close(self) -> None:
+        """Close the port. The hand keeps the mode that it was commanded last."""
         if self._serial is not None:
             with contextlib.suppress(OSError):
                 self._serial.close()

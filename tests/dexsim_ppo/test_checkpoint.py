@@ -14,8 +14,9 @@ from tiny_env import SMALL, TinyConfig, TinyEnv
 from dexsim.core.config import from_dict
 from dexsim.core.errors import CheckpointError
 from dexsim_ppo import checkpoint
+from dexsim_ppo.acting import act
 from dexsim_ppo.learner.ppo import make_train
-from dexsim_ppo.policy import Policy, act
+from dexsim_ppo.policy import Policy
 
 TREE = {
     "x": jnp.arange(6, dtype=jnp.float32).reshape(2, 3),

@@ -18,7 +18,9 @@ from dexsim.registry import TASKS
 from dexsim.tasks.grasp.config import GraspConfig
 from dexsim.tasks.grasp.task import GraspGoal
 from dexsim.tasks.rotate.config import RotateConfig
+from dexsim_ppo.export import to_numpy
 from dexsim_ppo.policy import Policy, layout_to_list
+from dexsim_ppo.portable import PortablePolicy
 from dexsim_real.sensors.readings import sources_of
 
 SHIPPED = {
@@ -172,3 +174,32 @@ def test_the_rotate_turns():
     assert np.sum(~dropped.any(0) & (turns >= 2)) >= 6, turns
     _, _, metrics = play(starts, 4.0)
     assert not metrics["successes"].any()
+
+
+MISUSE = {
+    "no memory": ("grasp", lambda p, obs: p.act(None, obs), "has a memory"),
+    "called as a function": ("grasp", lambda p, obs: p(obs), "has a memory"),
+    "memory of a batch": ("grasp", lambda p, obs: p.act(p.begin(8), obs), r"\(8, 64\).*\(64,\)"),
+    "memory of another": ("rotate", lambda p, obs: p.act(np.zeros(64), obs), "memory"),
+    "other observation": ("rotate", lambda p, obs: p.act(None, obs[:5]), r"observes 65 values.*\(5,\)"),
+    "a number": ("rotate", lambda p, obs: p.act(None, 3.0), r"observes 65 values.*\(\)"),
+}
+
+
+@pytest.mark.parametrize("door", ["jax", "numpy"])
+@pytest.mark.parametrize("what", MISUSE)
+def test_misuse_is_named_by_both_forms_of_a_policy(tmp_path, door, what):
+    name, use, words = MISUSE[what]
+    policy = load(name)
+    obs = np.zeros(policy.params.normalizer.mean.size, np.float32)
+    if door == "numpy":
+        to_numpy(policy, tmp_path / "policy.npz")
+        policy = PortablePolicy.load(tmp_path / "policy.npz")
+    with pytest.raises(ConfigError if door == "jax" else ValueError, match=words):
+        use(policy, obs)
+
+
+def test_the_actors_part_of_the_observation_is_asked_for():
+    policy = load("grasp")
+    with pytest.raises(ConfigError, match=r"give the actor's part, state.obs\['actor'\]"):
+        policy.act(policy.begin(), {"actor": np.zeros(66)})

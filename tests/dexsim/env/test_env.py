@@ -1,6 +1,7 @@
 """The environment as a whole: pure steps, episodes, readings, touch. One compiled grasp for all."""
 
 import dataclasses
+import re
 
 import c_scene
 import jax
@@ -97,6 +98,11 @@ class TestPure:
         order = np.array([3, 1, 7, 0, 5, 2, 6, 4])
         state, action, following = history[6]
         assert_same(grasp_rollout.step(row(state, order), action[order]), row(following, order))
+
+    @pytest.mark.parametrize("shape", [(), (5,), (13,), (1, 12)])
+    def test_an_action_of_another_shape_is_refused(self, grasp_env, history, shape):
+        with pytest.raises(ConfigError, match=rf"the action has the shape {re.escape(str(shape))}; 'grasp' takes one"):
+            grasp_env.step(row(history[0][0], 0), np.zeros(shape, np.float32))
 
     def test_reset_depends_on_the_key_alone(self, grasp_rollout):
         first, again, other = (grasp_rollout.reset(jax.random.key(seed)) for seed in (1, 1, 2))

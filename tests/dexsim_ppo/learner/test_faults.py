@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from tiny_env import SMALL, TinyEnv
 
+from dexsim_ppo.acting import PolicyParams, act
 from dexsim_ppo.learner import ppo
 from dexsim_ppo.learner.ppo import make_train
 from dexsim_ppo.learner.rollout import Rollout, bound_rewards
 from dexsim_ppo.learner.running_stats import RunningStats, value_std
-from dexsim_ppo.policy import PolicyParams, act
 
 NEVER = 1e9
 ROWS = dataclasses.replace(SMALL, num_envs=64, rollout_length=16)  # 1,024 rows an iteration

@@ -12,10 +12,11 @@ import pytest
 from tiny_env import SMALL, TinyConfig
 
 from dexsim.core.errors import CheckpointError, ConfigError
+from dexsim_ppo.acting import PolicyParams
 from dexsim_ppo.learner.networks import Layer
 from dexsim_ppo.learner.running_stats import Normalizer
 from dexsim_ppo.learner.types import Field
-from dexsim_ppo.policy import Policy, PolicyParams
+from dexsim_ppo.policy import Policy
 from dexsim_ppo.training import runlog
 from dexsim_ppo.training.arguments import TrainArguments
 from dexsim_ppo.training.runlog import MetricsLog, RunFolder, read_metrics

@@ -27,9 +27,10 @@ from dexsim.observation import layout
 from dexsim.task_spec import TaskSpec
 from dexsim.tasks.rotate.config import RotateConfig
 from dexsim.tasks.rotate.task import Rotate
+from dexsim_ppo.acting import PolicyParams
 from dexsim_ppo.learner.networks import Layer
 from dexsim_ppo.learner.running_stats import Normalizer
-from dexsim_ppo.policy import Policy, PolicyParams
+from dexsim_ppo.policy import Policy
 from dexsim_real.control.controller import Controller
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogReader
