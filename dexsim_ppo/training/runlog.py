@@ -258,6 +258,7 @@ def draw_curve(rows: list[dict[str, Any]], path: Path, title: str) -> None:
 
     matplotlib.use("agg")
     import matplotlib.pyplot as plt
+    from matplotlib.ticker import MaxNLocator
 
     errors = sorted({name for row in rows for name in row if name.startswith("step/") and name.endswith("error")})[:1]
     words = CURVES | {
@@ -294,6 +295,9 @@ def draw_curve(rows: list[dict[str, Any]], path: Path, title: str) -> None:
         above = axes[0, 0].secondary_xaxis(
             "top", functions=(lambda x: np.interp(x, steps, minutes), lambda t: np.interp(t, minutes, steps))
         )
+        # Beyond the curve's ends the interpolation is flat: marks there would lie on each other.
+        marks = MaxNLocator(7).tick_values(minutes[0], minutes[-1])
+        above.set_xticks([mark for mark in marks if minutes[0] <= mark <= minutes[-1]])
         above.set_xlabel("elapsed [min]")
     figure.savefig(path, dpi=120)
     plt.close(figure)

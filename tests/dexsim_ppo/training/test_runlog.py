@@ -220,3 +220,12 @@ def test_a_parent_that_is_no_folder_is_told_and_not_tried_for_ever(tmp_path, mon
     (tmp_path / "runs").symlink_to(tmp_path / "gone")
     with pytest.raises(ConfigError, match="runs: is no folder; give another place with --run-dir"):
         runlog.new_folder(None, "grasp")
+
+
+def test_the_elapsed_minutes_lie_within_the_curve_and_apart(figure):
+    """Before the first iteration a run compiles: its clock does not begin at zero."""
+    axes = figure([row(i) | {"seconds": 300.0 + 9.0 * i} for i in range(1, 146)]).axes
+    (above,) = axes[0].child_axes
+    marks = above.get_xticks()
+    assert len(marks) >= 3 and marks[0] >= 309 / 60 and marks[-1] <= (300 + 9 * 145) / 60
+    assert np.diff(marks).min() > 1.0
