@@ -238,9 +238,9 @@ def find_beginning(
         path = Path(resume)
         file = path if path.is_file() else RunFolder(path).latest_checkpoint()
         begun = checkpoint.load(file, kind="train", task=name)
-        for part in ("arguments", "progress"):
-            if not isinstance(begun.content.get(part), dict):
-                raise CheckpointError(f"{file}: its {part} are {begun.content.get(part)!r:.80}: no checkpoint of a run")
+        for part, keys in (("arguments", set()), ("progress", {"best", "seconds"})):
+            if not isinstance(found := begun.content.get(part), dict) or not keys <= found.keys():
+                raise CheckpointError(f"{file}: is no checkpoint of a run: {part} = {found!r:.80}")
         return begun
     return load_policy(policy, task=task) if policy else None
 

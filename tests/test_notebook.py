@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 from paths import ROOT
 
+from dexsim_ppo import load_policy
+
 nbformat = pytest.importorskip("nbformat")
 nbclient = pytest.importorskip("nbclient")
 pytest.importorskip("ipykernel")
@@ -119,3 +121,9 @@ def test_it_runs(name, monkeypatch):
     folder = {"metadata": {"path": str(ROOT / "notebooks")}}
     nbclient.NotebookClient(notebook, timeout=600, resources=folder).execute()
     check(name, notebook)
+
+
+def test_the_outputs_are_of_the_policy_that_is_shipped():
+    notebook = nbformat.read(ROOT / "notebooks" / "shipped_policies.ipynb", as_version=4)
+    printed = " ".join(output.get("text", "") for cell in notebook.cells for output in cell.get("outputs", []))
+    assert f"trained for {load_policy('grasp').training['env_steps']:,} environment steps" in printed

@@ -8,6 +8,7 @@ import types
 
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
+import numpy as np
 import pytest
 from tiny_env import SMALL, TinyConfig
 

@@ -230,7 +230,7 @@ def test_a_saved_configuration_begins_a_new_run(finished, tmp_path, capsys):
     jax.tree.map(np.testing.assert_array_equal, first, second)
     (tmp_path / "other.json").write_text("{}")
     (tmp_path / "deep.json").write_text('{"arguments":' + "[" * 100_000)
-    for name, content in (("empty", {}), ("odd", {"arguments": {}, "progress": [3]})):
+    for name, content in (("empty", {}), ("odd", {"arguments": {}, "progress": {"best": 3}})):
         checkpoint.save(tmp_path / f"{name}.msgpack", kind="train", task="tiny", content=content, tree={})
     for arguments, said in (
         (["--config", str(finished.path), "--task", "grasp"], "of the task 'tiny', not 'grasp'"),
@@ -242,8 +242,8 @@ def test_a_saved_configuration_begins_a_new_run(finished, tmp_path, capsys):
         (["--config", str(edited(finished, tmp_path, env=...))], "TrainArguments: no env"),
         (["--config", str(edited(finished, tmp_path, sed=7))], "TrainArguments has no field 'sed'"),
         (["--config", str(tmp_path / "deep.json")], "no configuration of a run (maximum recursion"),
-        (["--resume", str(tmp_path / "empty.msgpack")], "its arguments are None: no checkpoint of a run"),
-        (["--resume", str(tmp_path / "odd.msgpack")], "its progress are [3]: no checkpoint of a run"),
+        (["--resume", str(tmp_path / "empty.msgpack")], "empty.msgpack: is no checkpoint of a run: arguments = None"),
+        (["--resume", str(tmp_path / "odd.msgpack")], "odd.msgpack: is no checkpoint of a run: progress = {'best': 3}"),
         (["--task", "tiny", "--seed", str(2**32 - 1), "--seeds", "2"], "--seeds 2: the last seed must be at most"),
     ):
         capsys.readouterr()
