@@ -10,7 +10,7 @@ import numpy as np
 from dexsim.core.config import setting, validate
 from dexsim.force_loop import ForceLoop
 from dexsim.grip_reflex import GripReflex
-from dexsim.hand.kinematics import Hand, forward_kinematics
+from dexsim.hand.kinematics import Hand, forward_kinematics, taxel_normals
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -54,17 +54,17 @@ def reflex_target(hand: Hand, angle: jax.Array) -> jax.Array:
 
 @functools.cache
 def closing(hand: Hand) -> np.ndarray:
-    """Signs [F] of the root joints' rotation that closes the fingers: toward the centre of a grasp."""
-    if not hand.grasp_posture or not hand.grasp_centre:
-        return np.ones(hand.num_fingers, np.float32)
+    """Signs [F] of the root joints' rotation that closes the fingers: it moves a fingertip where its skin faces."""
+    posture = np.asarray(hand.grasp_posture or np.clip(np.zeros(hand.num_joints), hand.joint_lower, hand.joint_upper))
 
-    def distance(posture: jax.Array) -> jax.Array:
-        tips = forward_kinematics(hand, posture).tip_position
-        return jnp.linalg.norm(tips - np.asarray([hand.grasp_centre], np.float32), axis=-1)
+    def tips(posture: jax.Array) -> jax.Array:
+        return forward_kinematics(hand, posture).tip_position
 
     with jax.ensure_compile_time_eval():
-        moves = np.asarray(jax.jacfwd(distance)(jnp.asarray(hand.grasp_posture)))
-    return -np.sign(moves[np.arange(hand.num_fingers), hand.root_joint]).astype(np.float32)
+        posture = jnp.asarray(posture, jnp.float32)
+        moves = np.asarray(jax.jacfwd(tips)(posture))[np.arange(hand.num_fingers), :, hand.root_joint]
+        faces = np.asarray(taxel_normals(hand, forward_kinematics(hand, posture))).mean(1)
+    return np.where(np.sum(moves * faces, -1) < 0, -1.0, 1.0).astype(np.float32)
 
 
 def observed_action(control: Control, hand: Hand, action: jax.Array, target: jax.Array) -> jax.Array:

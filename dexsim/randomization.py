@@ -70,7 +70,8 @@ class Randomization:
     """Ranges (low, high), drawn uniformly for every joint or finger at every episode start."""
 
     scale: float = setting(1.0, unit="1", low=0.0, high=3.0)
-    """Width of all ranges about their nominal values; 0 switches randomisation off."""
+    """Width of all ranges about their nominal values; 0 switches randomisation of hands, motors and objects off, not
+    the errors of single taxels (`Sensing.taxel`)."""
     stiffness: float = setting(3.0, unit="Nm/rad", low=0.01, high=100.0)
     """Nominal proportional gain k_p (not published for this hand)."""
     damping: float = setting(0.1, unit="Nm s/rad", low=0.0, high=10.0)
@@ -138,6 +139,11 @@ class Randomization:
                 "values beyond their ranges; set extremes, too"
             )
         width = self.scale * (1 + self.beyond)
+        if self.gravity_tilt * width > 1.5:  # At a right angle gravity would turn over.
+            raise ConfigError(
+                f"Randomization.gravity_tilt = {self.gravity_tilt:g} rad at scale {self.scale:g} and beyond "
+                f"{self.beyond:g} reaches {self.gravity_tilt * width:.3g} rad: must stay below 1.5 rad"
+            )
         for name in (name for name, nominal in NOMINAL.items() if nominal):  # factors
             low, high = getattr(self, name)
             if min(1 + width * (low - 1), 1 + width * (high - 1)) < 0:

@@ -193,5 +193,6 @@ def _rotors(ranges: Randomization, model: Any, dofs: np.ndarray) -> tuple[np.nda
             "Randomization.backlash = 'gear_play': every joint of the hand's MJCF needs an "
             "armature, of which rotor_share is the rotor"
         )
-    largest = ranges.damping * max(1.0, 1 + ranges.scale * (ranges.damping_factor[1] - 1))
+    most = ranges.scale * (1 + ranges.beyond)
+    largest = ranges.damping * max(1.0, 1 + most * (ranges.damping_factor[1] - 1))
     return np.asarray(rotor, np.float32), max(int(np.ceil(largest * model.opt.timestep / rotor.min())), 1)

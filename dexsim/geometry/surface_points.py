@@ -57,7 +57,7 @@ class SurfacePoints:
     cells: int = static()  # 0: no table
     position: jax.Array  # [N, 3] m
     normal: jax.Array  # [N, 3] unit, outward
-    table: jax.Array  # [n^3, K] int16, indices of points
+    table: jax.Array  # [n^3, K] int16, or int32 where there are more: indices of points
     origin: jax.Array  # [3] m, corner of the table
     spacing: jax.Array  # [3] m, size of its cells
 
@@ -177,7 +177,7 @@ def _build(position: jax.Array, normal: jax.Array, config: PointsConfig) -> Surf
         cells,
         position,
         normal,
-        jnp.asarray(table, jnp.int16),
+        jnp.asarray(table, jnp.int16 if table.max() < 2**15 else jnp.int32),
         jnp.asarray(origin, jnp.float32),
         jnp.asarray(spacing, jnp.float32),
     )

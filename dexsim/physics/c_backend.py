@@ -5,6 +5,7 @@ from JAX's own trace of them (`dexsim.physics.host.law`).
 """
 
 import collections
+import dataclasses
 import hashlib
 import json
 import weakref
@@ -123,7 +124,11 @@ def _serve(arguments: list[np.ndarray], results: list[np.ndarray], attributes: d
 
 
 def _digest(scene: PhysicsScene) -> str:
-    """A hash of the compiled scene."""
+    """A hash of the compiled scene, and of which of its rows are what: two hands may differ in the order of joints."""
     buffer = np.zeros(mujoco.mj_sizeModel(scene.model), np.uint8)
     mujoco.mj_saveModel(scene.model, None, buffer)
-    return hashlib.sha256(buffer.tobytes()).hexdigest()[:16]
+    digest = hashlib.sha256(buffer.tobytes())
+    for field in dataclasses.fields(scene):
+        if isinstance(rows := getattr(scene, field.name), np.ndarray):
+            digest.update(f"{field.name}{rows.tolist()}".encode())
+    return digest.hexdigest()[:16]

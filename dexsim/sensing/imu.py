@@ -92,4 +92,4 @@ def measure_orientation(
     fresh = rotations.quat_multiply(rotations.axis_angle_to_quat(error / angle, angle), late)
     per_tick = config.rate * control_period
     sampled = jnp.floor(tick * per_tick + imu.phase) > jnp.floor((tick - 1) * per_tick + imu.phase)
-    return jnp.where(sampled, fresh, held)
+    return jnp.where(sampled | (tick == 0), fresh, held)  # At first nothing is held yet but the true pose.

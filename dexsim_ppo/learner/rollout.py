@@ -211,7 +211,8 @@ def bound_rewards(rollout: Rollout, returns: RunningStats, scale: float) -> tupl
     """
     size = jnp.abs(rollout.reward).reshape(-1)
     others = jnp.where(jnp.arange(size.size) == jnp.argmax(size), 0.0, size)  # one fault must not excuse itself
-    at_first = _FAR_AT_FIRST * jnp.sqrt(jnp.mean(others**2))
+    spread = jnp.sqrt(jnp.mean(others**2))
+    at_first = _FAR_AT_FIRST * jnp.where(spread > 0, spread, 1.0 / scale)  # A sparse reward may come once.
     limit = jnp.where(returns.count > 0, _FAR * value_std(returns) / scale, at_first)
     bounded = jnp.sum(size > limit, dtype=jnp.float32)
     return dataclasses.replace(rollout, reward=jnp.clip(rollout.reward, -limit, limit)), bounded

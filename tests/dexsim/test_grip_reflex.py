@@ -1,5 +1,7 @@
 """The grip reflex against closed forms, and its limits. `test_force_loop.py` compares bridge and simulation."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from dexsim.control import Control, closing, reflex_target
 from dexsim.core.errors import ConfigError
 from dexsim.force_loop import target_force
 from dexsim.grip_reflex import GripReflex, move_reflex
+from dexsim.hand.load import load_hand
 from dexsim.task_spec import TaskSpec, next_target
 
 SPAN, PERIOD = (2.0, 7.0), 0.03
@@ -69,6 +72,23 @@ def readings_of(hand, felt):
         command = jnp.asarray(1.0)
 
     return Readings()
+
+
+@pytest.mark.parametrize("name", [None, "leap_like", "inspire_like"])
+def test_every_shipped_hand_closes_with_positive_angles_and_its_mirror_image_with_negative_ones(name):
+    """As their makers count them. In LEAP's posture the fingertips are beyond the point nearest to the grasp."""
+    hand = load_hand(name)
+    np.testing.assert_array_equal(closing(hand), np.ones(hand.num_fingers))
+    mirrored = dataclasses.replace(
+        hand,
+        joint_axis=-hand.joint_axis,
+        joint_lower=-hand.joint_upper,
+        joint_upper=-hand.joint_lower,
+        body_offset=-hand.body_offset,
+        joint_reference=-hand.joint_reference,
+        grasp_posture=tuple(-angle for angle in hand.grasp_posture),
+    )
+    np.testing.assert_array_equal(closing(mirrored), -np.ones(hand.num_fingers))
 
 
 def test_targets_stay_within_reach_and_what_is_cut_off_does_not_wind_up(hand):

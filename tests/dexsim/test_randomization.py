@@ -174,6 +174,13 @@ def test_a_scale_that_would_turn_a_motor_round_is_refused(name):
         Randomization(scale=3.0, **{name: (0.5, 1.0)})
 
 
+@pytest.mark.parametrize("more", [{"scale": 3.0}, {"beyond": 2.0, "extremes": 0.1}])
+def test_a_tilt_that_could_turn_gravity_over_is_refused(more):
+    with pytest.raises(ConfigError, match=r"gravity_tilt = 0.6 rad at scale .* must stay below 1.5 rad"):
+        Randomization(gravity_tilt=0.6, **more)
+    Randomization(gravity_tilt=0.49, **more)
+
+
 def test_beyond_the_ranges_without_corners_is_refused():
     with pytest.raises(ConfigError, match=r"beyond = 0\.2 with extremes = 0"):
         Randomization(beyond=0.2)

@@ -90,18 +90,20 @@ class HostEngine:
         self.scene, model = scene, scene.model
         self._places = places(scene)
         self._datas = [mujoco.MjData(model) for _ in range(pool().threads)]
-        self._rows: collections.OrderedDict[int, _Rows] = collections.OrderedDict()
+        self._rows: collections.OrderedDict[tuple[int, tuple[str, ...]], _Rows] = collections.OrderedDict()
         self._push = model.nv + 6 * scene.object_body + np.arange(3)
         self.diverged = 0
         """World-ticks so far that MuJoCo gave up: not a number, or out of bounds."""
 
-    def _batch(self, size: int) -> _Rows:
-        if size not in self._rows:
-            self._rows[size] = _Rows(self.scene.model, size)
+    def _batch(self, size: int, fields: list[str]) -> _Rows:
+        """Models of their own for each set of fields: what one environment writes, another may leave as it is."""
+        key = size, tuple(fields)
+        if key not in self._rows:
+            self._rows[key] = _Rows(self.scene.model, size)
             while len(self._rows) > _SIZES_KEPT:
                 self._rows.popitem(last=False)
-        self._rows.move_to_end(size)
-        return self._rows[size]
+        self._rows.move_to_end(key)
+        return self._rows[key]
 
     def tick(self, fields: list[str], substeps: int, law: bytes, arguments: list[np.ndarray], out: list) -> None:
         """Some sub-steps for a batch; see `dexsim.physics.c_backend.CBackend` for what crosses."""
@@ -115,7 +117,7 @@ class HostEngine:
                 "start processes with multiprocessing.get_context('spawn')"
             )
         with workers.lock, np.errstate(all="ignore"), _no_warnings():
-            rows = self._batch(size)
+            rows = self._batch(size, fields)
             for name, values in zip(fields, given, strict=False):
                 values = np.broadcast_to(values, (size, *values.shape[1:]))
                 rows.write(name, self._places[name], values)

@@ -56,7 +56,6 @@ def summarize(
     mean_of = {name: np.where(alive, metrics[name], 0.0)[late].mean(0) for name in (*forces.values(), *_MEANS)}
     wanted = target_force(command, span)
     commanded = {part: mean_of[name] for part, name in forces.items()}
-    returns = np.where(alive, metrics["reward"], 0.0).sum(0) if "reward" in metrics else metrics["return"].max(0)
     by_command = [_command_row(level, command, held, wanted, mean_of) for level in np.unique(command)]
     by_shape = [
         _shape_row(shapes[index], shape == index, command, held, wanted, commanded) for index in np.unique(shape)
@@ -69,7 +68,6 @@ def summarize(
         "window_s": list(window(ticks * control_period)),
         "held": proportion(held),
         "hold_time_s": mean(alive.sum(0) * control_period),
-        "return": mean(returns),
         **correlations(command, held, commanded),
         "r_torque": pearson(command[held], mean_of["total_torque"][held]),
         "slope_force_n": slope(command[held], commanded["force"][held]),
@@ -81,7 +79,7 @@ def summarize(
         "finger_force_by_command_n": [row["finger_force_n"]["mean"] for row in by_command],
         "total_force_by_command_n": means,
         "skin_correlation": _optional_pearson(metrics, alive),
-        "joint_speed_rad_s": mean(metrics["joint_speed"].mean(0)),
+        "joint_speed_rad_s": mean(np.where(alive, metrics["joint_speed"], 0.0).sum(0) / np.maximum(alive.sum(0), 1)),
         "non_finite": int(metrics["non_finite"].sum()),
         "by_command": by_command,
         "by_shape": by_shape,

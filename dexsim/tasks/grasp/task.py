@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dexsim import observation
+from dexsim.control import closing
 from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import pytree_dataclass
 from dexsim.env.state import Start
@@ -103,7 +104,7 @@ class Grasp:
         self.config, self.hand, self.reference = config, hand, (x, y, z)
         self.slots, self.largest = config.objects.slots, config.objects.largest
         self.object_ranges = tuple(f"objects.{name}" for name in config.objects.ranges)
-        self._roots = hand.root_joint
+        self._roots, self._closing = hand.root_joint, closing(hand)
         self._max_torque = jnp.asarray(hand.torque_limit[hand.root_joint])
         self._finger_joints = flexion_joints(hand, range(1, hand.num_fingers))
         self._centre = jnp.asarray((hand.joint_lower + hand.joint_upper) / 2)
@@ -166,7 +167,7 @@ class Grasp:
         force = length(truth.finger_force)
         contact = force > _CONTACT
         wanted = self.target_force(goal)
-        torque = truth.joint_torque[self._roots]
+        torque = truth.joint_torque[self._roots] * self._closing
         fallen = dropped.astype(jnp.float32)
         held = 1.0 - fallen
         fingers = self._finger_joints

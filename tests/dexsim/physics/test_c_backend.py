@@ -261,6 +261,22 @@ class TestStateless:
             ):
                 assert_same(step(*given), result)
 
+    def test_objects_that_are_turned_leave_others_upright(self, hand, seam, tick, grips):
+        """One scene serves environments whose objects have an orientation of their own, and some that have none."""
+        upright, state, _ = batch_of(grips[8:12])
+        turned = dataclasses.replace(upright, quat=jnp.tile(jnp.array([0.8, 0.0, 0.6, 0.0]), (4, len(SLOTS), 1)))
+        assert upright.quat is None
+        push = jnp.zeros((4, 3))
+        before = tick(upright, state, push)
+        other = tick(turned, state, push)
+        assert np.any(np.asarray(other[0].qvel) != np.asarray(before[0].qvel))
+        assert_same(tick(upright, state, push), before)
+
+    def test_one_file_with_joints_in_two_orders_is_two_scenes(self, seam):
+        scene = seam.engine.scene
+        other = dataclasses.replace(scene, joint_qpos=scene.joint_qpos[::-1])
+        assert c_backend._digest(other) != c_backend._digest(scene) == c_backend._digest(dataclasses.replace(scene))
+
     def test_a_saved_state_continues_to_the_bit(self, hand, seam, tick, grips):
         """In a new engine, as after a restart, whose cache is empty."""
         target, state, _ = batch_of(grips[:4])

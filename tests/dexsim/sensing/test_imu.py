@@ -1,5 +1,6 @@
 """The object's IMU against SciPy's rotations: whose frame its error is in, and from when its heading drifts."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import jax
@@ -38,6 +39,15 @@ def test_the_error_is_fixed_to_the_palm(bias):
     true, up = quat(TURNED), jnp.array([-1.0, 0.0, 0.0])
     read = measure_orientation(jax.random.key(0), CONFIG, params(bias), jnp.ones(()), true, true, true, up, 0.03)
     np.testing.assert_allclose((rotation(read) * TURNED.inv()).as_rotvec(), bias, atol=1e-5)
+
+
+def test_the_first_reading_has_the_sensors_error_also_where_it_is_slower_than_the_control():
+    slow, true = dataclasses.replace(CONFIG, rate=10.0), quat(TURNED)
+    imu, up = params((0.2, 0.0, 0.0)), jnp.array([-1.0, 0.0, 0.0])
+    for phase in (0.0, 0.3, 0.9):
+        imu = dataclasses.replace(imu, phase=jnp.float32(phase))
+        read = measure_orientation(jax.random.key(0), slow, imu, jnp.zeros(()), true, true, true, up, 0.03)
+        np.testing.assert_allclose((rotation(read) * TURNED.inv()).as_rotvec(), (0.2, 0.0, 0.0), atol=1e-5)
 
 
 def test_the_heading_drifts_from_the_start_of_the_episode(hand):

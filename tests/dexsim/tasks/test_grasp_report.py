@@ -40,9 +40,8 @@ def evaluation(ticks=60, repeats=8, noise=0.0, slope=4.0, lost=(), settle_force=
         "taxel_force": 2 * force,
         "thumb_force": flat * 0.5,
         "touching": flat * 3,
-        "reward": flat * 0.25,
         "return": flat * 7.0,
-        "joint_speed": flat * 0.1,
+        "joint_speed": np.where(alive, 0.1, 0.0),
         "non_finite": flat * 0,
     }
     return metrics, alive
@@ -119,7 +118,6 @@ class TestSummary:
         assert found["r_resultant"]["r"] > 0.9999 and found["force_error_n"]["mean"] < 2e-3
         assert found["total_force_monotone"] is True
         assert found["force_range"] == pytest.approx(5.0, rel=2e-3)
-        assert found["return"]["mean"] == pytest.approx(60 * 0.25)
         assert found["non_finite"] == 0
 
     def test_only_settled_ticks_count(self):
@@ -147,7 +145,7 @@ class TestSummary:
         found = report.summarize(metrics, alive, PERIOD, SPAN)
         assert found["held"]["mean"] == 0.75
         assert found["hold_time_s"]["mean"] == pytest.approx(0.75 * 6 + 0.25 * 2)
-        assert found["return"]["mean"] == pytest.approx(0.25 * (0.75 * 60 + 0.25 * 20))
+        assert found["joint_speed_rad_s"]["mean"] == pytest.approx(0.1), "of the ticks that an episode lived"
         assert found["finger_force_by_command_n"] == pytest.approx([1, 2, 3, 4, 5])
         for row in found["by_shape"] + found["by_command"]:
             assert row["episodes"] == 40 and row["held"]["mean"] == 0.75

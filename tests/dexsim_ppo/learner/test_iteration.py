@@ -227,6 +227,18 @@ def test_what_is_far_among_the_first_rewards_is_so_by_the_others():
     assert float(bounded.reward[1, 2]) == pytest.approx(limit, rel=1e-5), "rewards against rewards: no scale in it"
 
 
+@pytest.mark.parametrize("scale", [1.0, 0.01])
+def test_the_only_reward_of_a_sparse_task_is_kept(scale):
+    reward = jnp.zeros((4, 8)).at[1, 2].set(1.0 / scale)
+    zero, flag = jnp.zeros_like(reward), jnp.zeros(reward.shape, bool)
+    first = RunningStats(jnp.int32(0), jnp.float32(0), jnp.float32(1))
+    bounded, count = bound_rewards(Rollout({}, None, zero, zero, reward, flag, flag), first, scale)
+    assert float(count) == 0 and float(bounded.reward.sum()) == pytest.approx(1.0 / scale)
+    huge = dataclasses.replace(Rollout({}, None, zero, zero, reward, flag, flag), reward=1e30 * reward)
+    bounded, count = bound_rewards(huge, first, scale)
+    assert float(count) == 1 and float(bounded.reward.max()) < 1e6 / scale
+
+
 def test_healthy_rewards_of_a_small_scale_are_not_bounded():
     """The deviation is of scaled returns: the bound on rewards is the larger for a small scale."""
     training = make_train(TinyEnv(), dataclasses.replace(SMALL, reward_scale=1e-3))

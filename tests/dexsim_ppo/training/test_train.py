@@ -265,6 +265,13 @@ def test_episodes_end_at_their_first_termination():
     assert report["task"]["error"] == pytest.approx((1 + 1 + 1 + 4) / 4)
 
 
+def test_a_step_that_diverges_is_counted_although_it_ends_the_episode():
+    terminated = np.array([[0, 0], [1, 0], [0, 0]], bool)
+    metrics = {"return": np.zeros((3, 2)), "non_finite": np.array([[0.0, 0], [1, 0], [1, 0]])}
+    env = SimpleNamespace(summarize=lambda masked, alive: {"non_finite": masked["non_finite"].sum()})
+    assert summarize(env, metrics, terminated, np.arange(2))["task"]["non_finite"] == 1
+
+
 def test_intervals():
     entry = proportion(np.array([True] * 8 + [False] * 2))
     assert (entry["low"], entry["high"]) == pytest.approx((0.4902, 0.9433), abs=2e-4)  # Wilson
