@@ -55,13 +55,13 @@ def reflex_target(hand: Hand, angle: jax.Array) -> jax.Array:
 @functools.cache
 def closing(hand: Hand) -> np.ndarray:
     """Signs [F] of the root joints' rotation that closes the fingers: it moves a fingertip where its skin faces."""
-    posture = np.asarray(hand.grasp_posture or np.clip(np.zeros(hand.num_joints), hand.joint_lower, hand.joint_upper))
+    rest = np.clip(np.zeros(hand.num_joints), hand.joint_lower, hand.joint_upper)
 
     def tips(posture: jax.Array) -> jax.Array:
         return forward_kinematics(hand, posture).tip_position
 
     with jax.ensure_compile_time_eval():
-        posture = jnp.asarray(posture, jnp.float32)
+        posture = jnp.asarray(hand.grasp_posture or rest, jnp.float32)
         moves = np.asarray(jax.jacfwd(tips)(posture))[np.arange(hand.num_fingers), :, hand.root_joint]
         faces = np.asarray(taxel_normals(hand, forward_kinematics(hand, posture))).mean(1)
     return np.where(np.sum(moves * faces, -1) < 0, -1.0, 1.0).astype(np.float32)

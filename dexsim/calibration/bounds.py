@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from dexsim.calibration.maps import Calibration, Side
 
 _CURRENT = (0.03, 33.0)  # A, of a joint's full torque: a stalled XHand joint draws 1.5 A; 16 bits of mA end at 33 A
-_PER_CURRENT = (1e-5, 0.1)  # A a count: 1.5 A must be more than a few counts and fit into 16 bits
+# A a count: the wire counts mA, and runs limit the current by that. With another count, torques would not go with it.
+_PER_CURRENT = (0.99e-3, 1.01e-3)
 _TORQUE = (0.01, 20.0)  # Nm: finger motors stall at 0.4 and 1.1 Nm
 _LEVER = (1e-4, 0.3)  # Nm/N, fingertip about joint: a finger is 0.1 m long
 _FORCE = (1e-3, 100.0)  # N: the whole hand is rated for 80 N
@@ -81,13 +82,17 @@ def _check_side(path: object, joints: tuple[str, ...], key: str, side: "Side", m
 
 
 def _check_torque(path: object, joints: tuple[str, ...], calibration: "Calibration", scale: np.ndarray) -> None:
-    """What the lines make of currents: neither the full torque for next to none, nor a torque without any."""
+    """What `joint_torque` makes of currents: neither the full torque for next to none, nor a torque without any.
+
+    It takes the middle of the simulation's two lines, and the hand's loading line, unloading line or their middle. That
+    one needs no check: its gain and offset are means of two of one sign, so its torques lie between theirs.
+    """
     real, sim = calibration.real, calibration.sim
-    per_ampere = np.asarray(sim.gain) / np.asarray(real.gain)
+    per_ampere = np.mean(sim.gain, 0) / np.asarray(real.gain)
     full, (low, high) = scale / np.abs(per_ampere), _CURRENT
     says = f"the full torque would need {{:.3g}} A, must be {low:g} to {high:g} A"
     _require(path, joints, "real.gain", real.gain, (full >= low) & (full <= high), says, full)
-    unloaded = np.abs(np.asarray(sim.offset) - per_ampere * np.asarray(real.offset)) / scale
+    unloaded = np.abs(np.mean(sim.offset, 0) - per_ampere * np.asarray(real.offset)) / scale
     says = "without current the joint would read {:.3g} of its full torque, must be below 1"
     _require(path, joints, "real.offset", real.offset, unloaded < 1, says, unloaded)
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.special import stdtrit
 
+from dexsim.calibration import bounds
 from dexsim.calibration.joint import JointLines, JointPress, fit_joint
 from dexsim.calibration.maps import Calibration, Side, alignment
 from dexsim.core.errors import CalibrationError
@@ -39,7 +40,7 @@ def calibrate(
       serial, handedness, created: kept in the file; `created` is today by default.
 
     Raises:
-      CalibrationError: names the joint and what data is needed.
+      CalibrationError: names the joint and what data is needed, or a number that no hand gives.
     """
     unknown = sorted({*real, *sim} - set(hand.joint_names))
     if unknown:
@@ -88,6 +89,7 @@ def calibrate(
         created=created if created is not None else datetime.date.today().isoformat(),
         notes=notes,
     )
+    bounds.check("calibration", calibration, hand)  # What is written must be readable.
     return dataclasses.replace(calibration, notes=notes + _compare(calibration))
 
 
@@ -111,11 +113,20 @@ def _gather(hand: Hand, fits: list, side: int) -> tuple[Side, list[str]]:
         if joint in measured:
             rows.append(measured[joint])
             continue
-        same = [row for other, row in measured.items() if hand.torque_limit[other] == hand.torque_limit[joint]]
+        mates = [other for other in measured if hand.torque_limit[other] == hand.torque_limit[joint]]
+        same = [measured[other] for other in mates]
         if not same:
             raise CalibrationError(
                 f"{hand.joint_names[joint]}: no recording of any joint with "
                 f"{hand.torque_limit[joint]:g} Nm to take over"
+            )
+        names = hand.joint_names
+        odd = [other for other in mates if np.sign(measured[other]["gain"][0]) != np.sign(same[0]["gain"][0])]
+        if odd:  # Their mean may be next to nothing.
+            raise CalibrationError(
+                f"{names[odd[0]]}: its gain {('on the hand', 'in simulation')[side]} has not the sign of that of "
+                f"{names[mates[0]]}: no mean of both can stand for {names[joint]}; check the wiring, or record "
+                f"{names[joint]}"
             )
         taken.append(hand.joint_names[joint])
         mean = {key: np.mean([row[key] for row in same], 0) for key in same[0]}

@@ -8,8 +8,9 @@ taxel was pressed, which a flat plate moved by a known way gives.
     force = fit.correct(reading.sum(-1))
     save_fit("sensor.json", {"thumb": fit, ...})
 
-The line is fitted robustly (`dexsim.core.robust_line`), to samples beyond the largest force that still read zero: below
-it noise decides which samples read at all, which would bend the line. Samples of one press belong together: from three
+The line is fitted robustly (`dexsim.core.robust_line`), to samples beyond the forces that still read zero: among them
+noise decides which samples read at all, which would bend the line. A zero far above them is a reading that was lost:
+it is left out, and the samples below it are not. Samples of one press belong together: from three
 presses on, intervals count presses and not samples.
 
 Shapes: T samples, N taxels.
@@ -32,6 +33,8 @@ from dexsim.core.robust_line import LEAST_GROUPS, Regression, fit_line, regress
 
 _RESAMPLES = 400
 _LEAST = 8  # samples
+_NEXT = 0.05  # share of the samples, the next by force, among which
+_LOST = 0.13  # no larger share reads zero where all should read
 _JUMP = 0.1  # share of the range of forces from one sample to the next above which no press is followed
 
 
@@ -118,11 +121,19 @@ def fit_finger(
     if len(np.unique(number)) < LEAST_GROUPS:
         notes.append(f"fewer than {LEAST_GROUPS} presses: the intervals leave out how presses differ")
     force, reading, group = force[keep], reading[keep], number[keep]
+    if len(force) < _LEAST or np.ptp(force) <= 0:
+        raise DexsimError(
+            f"sensor fit: {len(force)} of {len(keep)} samples are not saturated; at least {_LEAST} at different forces "
+            "needed"
+        )
     total = reading.sum(1)
 
     threshold = _threshold(force, total, group, np.random.default_rng(seed))
-    silent = force[total <= 0]
-    above = force > (silent.max() if silent.size else -np.inf)
+    above = force >= _reading_from(force, total <= 0, threshold.value)
+    lost = above & (total <= 0)
+    if np.any(lost):
+        notes.append(f"{np.sum(lost)} of {np.sum(above)} samples above the activation threshold read zero, left out")
+    above &= ~lost
     if above.sum() < _LEAST:
         raise DexsimError(f"sensor fit: {above.sum()} samples above the activation threshold, at least {_LEAST} needed")
     line = fit_line(force[above], total[above], group=group[above])
@@ -171,6 +182,8 @@ def _checked(press: TaxelPress) -> tuple[np.ndarray, np.ndarray]:
     force, reading = np.asarray(press.force, float), np.asarray(press.reading, float)
     if force.ndim != 1 or reading.ndim != 2 or len(force) != len(reading):
         raise DexsimError(f"sensor fit: force {force.shape} and reading {reading.shape}, expected [T] and [T, N]")
+    if press.press is not None and np.shape(press.press) != force.shape:
+        raise DexsimError(f"sensor fit: press {np.shape(press.press)}, expected a number for each force {force.shape}")
     if not (np.all(np.isfinite(force)) and np.all(np.isfinite(reading))):
         raise DexsimError("sensor fit: a force or a reading is not finite")
     if len(force) < _LEAST or np.ptp(force) <= 0:
@@ -204,6 +217,18 @@ def _threshold(force: np.ndarray, total: np.ndarray, group: np.ndarray, rng: np.
         low, high = np.percentile(several, [2.5, 97.5])
     # Nothing is known between two neighbouring forces.
     return Estimate((last + first) / 2, float(min(low, last)), float(max(high, first)))
+
+
+def _reading_from(force: np.ndarray, silent: np.ndarray, threshold: float) -> float:
+    """The least force N, above the threshold, from which on next to all samples read; infinite if there is none."""
+    if not np.any(silent & (force <= threshold)):
+        threshold = -np.inf  # The press began above it.
+    order = np.argsort(force)
+    count = np.concatenate([[0], np.cumsum(silent[order])])
+    levels, first = np.unique(force[order], return_index=True)
+    end = np.minimum(first + max(_LEAST, round(_NEXT * len(force))), len(force))
+    quiet = (levels > threshold) & (count[end] - count[first] <= _LOST * (end - first))
+    return float(levels[np.argmax(quiet)]) if np.any(quiet) else np.inf
 
 
 def _best_split(force: np.ndarray, active: np.ndarray) -> tuple[float, float]:

@@ -61,7 +61,8 @@ def identify(
     Raises:
       CalibrationError: says what is wrong with the log or what to record.
     """
-    check_log(log)
+    for recording in (log,) if holdout is None else (log, holdout):
+        check_log(recording)
     limits = dict(BOUNDS) | {"dead_band": dead_band or (0.0, np.inf)} | dict(bounds or {})
     problem = Problem(log, start, fit, substeps, limits, np.array([position_noise, torque_noise]))
     latency = problem.best_latency(latencies)
@@ -191,11 +192,13 @@ def _conclude(
     found = groups(fitted, null, correlation, half, size)
     errors = residual.reshape(len(problem.measured), -1) * problem.noise[: len(problem.measured), None]
     rmse = np.sqrt(np.mean(errors**2, -1))
-    cost, best = problem.latency_cost, problem.latency_cost[latency]
+    # All from the solution and with the weights found last: costs under other weights cannot be compared.
+    cost = {lag: problem.solve(theta, lag, 10)[0] for lag in latencies}
+    least_cost = min(cost.values())
     slack = CHI2 / max(residual.size - count, 1)
+    plausible = tuple(lag for lag in sorted(cost) if cost[lag] <= least_cost * (1 + slack))
     before = after = float("nan")
     if holdout is not None:
-        check_log(holdout)
         first = {name: float(value) for name, value in problem.fixed.items()}
         before = evaluate(holdout, first, latency=latency, substeps=problem.substeps)[0]
         after = evaluate(holdout, values, latency=latency, substeps=problem.substeps)[0]
@@ -207,8 +210,8 @@ def _conclude(
         correlation=correlation,
         condition=condition,
         latency=latency,
-        latency_cost={lag: cost[lag] / best - 1.0 for lag in sorted(cost)},
-        latency_plausible=tuple(lag for lag in sorted(cost) if cost[lag] <= best * (1 + slack)),
+        latency_cost={lag: cost[lag] / least_cost - 1.0 for lag in sorted(cost)},
+        latency_plausible=plausible,
         timestep=problem.timestep,
         unidentifiable=found,
         at_bound=at_bound,
@@ -216,7 +219,7 @@ def _conclude(
         torque_rmse=float(rmse[1]) if len(rmse) > 1 else float("nan"),
         holdout_rmse=after,
         holdout_rmse_before=before,
-        notes=tuple(_notes(log, latency, latencies, found, at_bound, before, after)),
+        notes=tuple(_notes(log, latency, latencies, plausible, found, at_bound, before, after)),
     )
 
 
@@ -224,6 +227,7 @@ def _notes(
     log: JointLog,
     latency: int,
     latencies: tuple[int, ...],
+    plausible: tuple[int, ...],
     found: tuple[tuple[str, ...], ...],
     at_bound: tuple[str, ...],
     before: float,
@@ -234,6 +238,9 @@ def _notes(
     notes += [f"{name} ran into its bound: its interval is one-sided" for name in at_bound]
     if len(latencies) > 1 and latency == max(latencies):
         notes.append("latency is the largest that was tried: try more")
+    if latency not in plausible:
+        others = ", ".join(map(str, plausible))
+        notes.append(f"latency {others} fits better with the weights found last: identify again with it alone")
     speed = np.gradient(log.position)
     if (
         min(np.mean(speed > 0), np.mean(speed < 0)) < 0.1

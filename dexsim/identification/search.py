@@ -145,7 +145,7 @@ class Problem:
         self.measured = np.stack(channels)
         self.target = jnp.asarray(log.target, jnp.float32)
         self.timestep = log.period / substeps
-        self.best, self.latency_cost = np.inf, dict[int, float]()
+        self.best = np.inf
 
     def _all(self, theta: np.ndarray) -> jax.Array:
         """All parameters [..., len(_NAMES)] from the fitted ones [..., P]."""
@@ -221,8 +221,8 @@ class Problem:
         """Scan all candidates, or those next to a guess."""
         self.best = np.inf
         near = [c for c in candidates if guess is None or abs(c - guess) <= 1]
-        self.latency_cost |= {lag: self.attempt(lag, 6) for lag in near}
-        return min(near, key=self.latency_cost.__getitem__)
+        costs = {lag: self.attempt(lag, 6) for lag in near}
+        return min(near, key=costs.__getitem__)
 
     def search_dead_band(self, latency: int, span: tuple[float, float], fine: bool) -> None:
         """Scan the range, or five values about the present one, then Brent's method."""

@@ -16,10 +16,13 @@ def find_function(name: str, given: str, form: str, default: str = "") -> Callab
       form: what to give, for the error.
 
     Raises:
-      HandError: no such module or function.
+      HandError: no such module or function, or the module fails when it is imported.
     """
     module, _, function = name.partition(":")
     try:
         return getattr(importlib.import_module(module), function or default)
-    except (ImportError, AttributeError, ValueError, TypeError) as error:  # The last two: no name, a relative one.
-        raise HandError(f"{given}: {error}; give {form}") from None
+    except (Exception, SystemExit) as error:  # The module is the user's: importing it may raise anything.
+        says = " ".join(str(error).split())
+        if not isinstance(error, (ImportError, AttributeError)):
+            says = f"{type(error).__name__}: {says}".removesuffix(": ")
+        raise HandError(f"{given}: {says:.200}; give {form}") from None

@@ -12,8 +12,9 @@ from typing import Annotated, Any
 import tyro
 
 from dexsim.core import cli
-from dexsim.datasets.lerobot import write_lerobot
+from dexsim.datasets.lerobot import check_lerobot, write_lerobot
 from dexsim_real.control.controller import prepare_jax
+from dexsim_real.core.errors import HandError
 from dexsim_real.replay.plots import open_rerun, plot, trajectory
 from dexsim_real.replay.replay import replay
 
@@ -39,6 +40,10 @@ class ReplayArguments:
     output: Path | None = None
     """JSON file for the report; None writes no file."""
 
+    def __post_init__(self):
+        if self.plot and self.plot.suffix.lower() not in (".png", ".pdf", ".svg"):
+            raise HandError(f"--plot {self.plot}: give a file that ends in .png, .pdf or .svg")
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """The command. Returns its exit code: 0, or 1 when a recomputed observation differs or none could be recomputed."""
@@ -48,6 +53,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         prog="python -m dexsim_real.replay",
         description="Recompute and plot the log of a run on the hand.",
     )
+    for path in (arguments.plot, arguments.rrd, arguments.output):
+        if path:
+            cli.check_writable(path)
+    if arguments.lerobot:
+        check_lerobot(arguments.lerobot)
     prepare_jax()
     cli.enable_caches()
     run = replay(arguments.log, arguments.hand)

@@ -140,14 +140,16 @@ class HeightSensor:
         return self._newest
 
     def see(self, when: float, mask: np.ndarray) -> None:
-        """Update with the mask of a picture taken at a time in s."""
+        """Update with the mask of a picture taken at a time in s; one no newer than the newest says nothing new."""
+        if self._newest is not None and when <= self._newest[0]:
+            return
         height = height_of(mask, self._config, self._reference, self._axis)
         if height is None:
             return
         position = self._reference.copy()
         position[self._axis] = height
         velocity = np.zeros(3)
-        if self._newest is not None and when > self._newest[0]:
+        if self._newest is not None:
             before, place, velocity = self._newest
             velocity = velocity + self._weight * ((position - place) / (when - before) - velocity)
         self._newest = when, position, velocity

@@ -254,6 +254,27 @@ def test_joints_without_a_recording_take_their_class(hand):
             assert any(note.startswith(f"{name}: not recorded") for note in calibration.notes)
 
 
+SOME = ("thumb_bend", "index_joint1", "index_joint2", "index_bend")
+
+
+def test_what_could_not_be_read_again_is_not_made(hand):
+    with pytest.raises(CalibrationError, match="calibration: thumb: force_per_count = 2: must be between"):
+        calibrated(hand, names=SOME, missing="class", force_per_count=2.0)
+    with pytest.raises(CalibrationError, match="calibration: current_per_count = 1: must be between"):
+        calibrated(hand, names=SOME, missing="class", current_per_count=1.0)
+
+
+@pytest.mark.parametrize("side", ["on the hand", "in simulation"])
+def test_a_class_of_both_signs_has_no_mean(hand, side):
+    _, *sides = calibrated(hand, names=SOME, missing="class")
+    turned = sides[side == "in simulation"]
+    turned["index_joint2"] = dataclasses.replace(turned["index_joint2"], value=-turned["index_joint2"].value)
+    with pytest.raises(
+        CalibrationError, match=f"index_joint2: its gain {side} .* index_bend: .* or record [a-z_0-9]+$"
+    ):
+        calibrate(hand, *sides, missing="class")
+
+
 def test_what_the_data_cannot_separate_is_said(fitted):
     notes = " ".join(fitted[0].notes)
     for words in ("force sensor", "product", "offset"):

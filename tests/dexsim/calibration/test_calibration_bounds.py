@@ -97,6 +97,10 @@ WRONG = {
     "a count that is no number": (("[0.1, 0.1,", "[0.1, nan,"), "index: force_per_count = nan: "),
     "a count of 10 N": (("[0.1, 0.1,", "[10.0, 0.1,"), "thumb: force_per_count = 10: "),
     "an endless count": (("current_per_count = 0.001", "current_per_count = inf"), "current_per_count = inf: "),
+    "a count of 50 mA": (
+        ("current_per_count = 0.001", "current_per_count = 0.05"),
+        "current_per_count = 0.05: .* 0.001",
+    ),
     "no force for any torque": (
         ("force_per_torque = [12.0, 12.0,", "force_per_torque = [12.0, 0.5,"),
         "index: force_per_torque = 0.5: must be 0, or between 3.33 and 1000 N/Nm",
@@ -126,6 +130,31 @@ def test_what_no_hand_gives_is_named(hand, sound, tmp_path, what):
     (old, new), says = WRONG[what]
     assert old in sound
     assert re.search(says, refused(tmp_path / "c.toml", hand, sound.replace(old, new, 1)))
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        # Each line goes with the simulation's of its own direction, but not with the middle of both, which is used.
+        (
+            (
+                ("gain = [0.04, 0.04]", "gain = [0.0001, 0.3]"),
+                (PAIR, "gain = [0.0029, 0.0085]"),
+                ("offset = [0.02, 0.02]", "offset = [31.0, 0.03]"),
+            ),
+            "thumb_bend: real.gain = 0.0029: .* need 0.0213 A",
+        ),
+        (
+            (("gain = [0.04, 0.04]", "gain = [0.01, 0.19]"), ("offset = [0.02, 0.02]", "offset = [5.0, 0.02]")),
+            "thumb_bend: real.offset = 5: without current .* 9.09",
+        ),
+    ],
+)
+def test_lines_are_checked_as_a_run_combines_them(hand, sound, tmp_path, changes, says):
+    for old, new in changes:
+        assert old in sound
+        sound = sound.replace(old, new, 1)
+    assert re.search(says, refused(tmp_path / "c.toml", hand, sound))
 
 
 def test_a_file_from_before_has_no_force_per_torque(hand, sound, tmp_path):

@@ -58,6 +58,30 @@ def test_saturated_samples_are_left_out():
     assert fit.gain.value == pytest.approx(9.0, rel=0.02) and "saturated" in fit.notes[0]
 
 
+@pytest.mark.parametrize("kept", [0, 5])
+def test_a_recording_that_is_saturated_is_refused(kept):
+    press = recording(2)
+    press.reading[kept:] = 255.0
+    with pytest.raises(
+        DexsimError, match=f"sensor fit: {kept} of 150 samples are not saturated; at least 8 "
+    ) as caught:
+        fit_finger(press, saturation=255.0)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("lost", [1, 12])
+def test_lost_readings_do_not_cost_the_others(lost):
+    """Zeros, one of them at the largest force: the samples below are not silent because of it."""
+    press = recording(8, count=600)
+    clean = fit_finger(press)
+    order = np.argsort(press.force)
+    press.reading[order[np.linspace(599, 100, lost).astype(int)]] = 0
+    fit = fit_finger(press)
+    assert fit.samples == clean.samples - lost and f"{lost} of {clean.samples} samples" in fit.notes[-1]
+    assert fit.gain.value == pytest.approx(clean.gain.value, rel=2e-3) and "zero" not in "".join(clean.notes)
+    assert fit.residual == pytest.approx(clean.residual, rel=0.05)
+
+
 def plate(seed, c10, c01, deepest, noise=0.02):
     """A flat plate on 24 of 40 taxels, 2 mm of skin, pushed in steps."""
     rng = np.random.default_rng(seed)
@@ -112,6 +136,7 @@ def test_useless_recordings_are_refused():
         (TaxelPress(force=good.force[:5], reading=good.reading[:5]), "5 samples"),
         (TaxelPress(force=np.full(150, 2.0), reading=good.reading), "different forces"),
         (TaxelPress(force=good.force, reading=good.reading[:20]), r"expected \[T\]"),
+        (TaxelPress(force=good.force, reading=good.reading, press=np.zeros(20, int)), r"press \(20,\), expected"),
         (TaxelPress(force=good.force, reading=0 * good.reading), "above the activation threshold"),
         (TaxelPress(force=good.force, reading=100 - good.reading), "do not rise"),
         (TaxelPress(force=np.where(good.force > 7, np.nan, good.force), reading=good.reading), "not finite"),

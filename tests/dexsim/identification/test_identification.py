@@ -253,6 +253,16 @@ def test_latency_scan_shows_its_valley():
     assert any("largest that was tried" in note for note in late.notes)
 
 
+def test_latencies_are_compared_under_the_same_weights():
+    """Less noise than the first weights say: costs from before the noise was found are too low by far."""
+    quiet = dict(position_noise=2e-4, position_resolution=0.0, with_torque=False)
+    log = log_of(TRUTH | {"dead_band": 0.0}, 3, target=SHORT, latency=3, **quiet)
+    found = identify(log, GUESS, dead_band=None)
+    assert found.latency == 3 and found.latency_plausible == (3,) and set(found.latency_cost) == set(range(9))
+    assert found.latency_cost[3] == 0.0
+    assert all(cost > 0.5 for lag, cost in found.latency_cost.items() if lag != 3), found.latency_cost
+
+
 def c_log(truth, target, latency, timestep=5e-4, seed=0):
     """A log from C MuJoCo: hinge with frictionloss and damping, the PD law in its actuator, finer steps."""
     model = mujoco.MjModel.from_xml_string(f"""<mujoco>
@@ -459,6 +469,12 @@ def test_questions_that_make_no_sense_are_refused(smooth_log, options, says):
     options = {"start": GUESS} | options
     with pytest.raises(CalibrationError, match=says):
         identify(smooth_log, options.pop("start"), **options)
+
+
+def test_the_holdout_is_checked_before_the_fit(smooth_log, monkeypatch):
+    monkeypatch.setattr("dexsim.identification.identify.Problem", lambda *_: pytest.fail("the fit began"))
+    with pytest.raises(CalibrationError, match="another day: 10 samples"):
+        identify(smooth_log, GUESS, holdout=JointLog(PERIOD, TARGET[:10], TARGET[:10], None, "another day"))
 
 
 def test_the_blurred_gradient_is_of_the_same_joint():

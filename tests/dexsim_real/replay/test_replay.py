@@ -241,3 +241,17 @@ def test_a_configuration_that_is_not_of_a_run(tmp_path):
         log.add(Kind.META, {"tare": np.zeros((5, 120), np.float32)})
     with pytest.raises(LogError, match="not a log of a run: its configuration lacks 'task'"):
         replay_command.main([str(path)])
+
+
+def test_what_cannot_be_written_is_said_before_the_replay(tmp_path, monkeypatch):
+    monkeypatch.setattr(replay_command, "replay", lambda *_: pytest.fail("the replay began"))
+    log = str(tmp_path / "run.log")
+    with pytest.raises(DexsimError, match="--plot run.log2: give a file that ends in .png, .pdf or .svg"):
+        replay_command.main([log, "--plot", "run.log2"])
+    (tmp_path / "taken.png").mkdir()
+    for option in ("--plot", "--rrd", "--output"):
+        with pytest.raises(IsADirectoryError, match="taken.png"):
+            replay_command.main([log, option, str(tmp_path / "taken.png")])
+    pytest.importorskip("pyarrow")
+    with pytest.raises(DexsimError, match="taken.png: exists already"):
+        replay_command.main([log, "--lerobot", str(tmp_path / "taken.png")])
