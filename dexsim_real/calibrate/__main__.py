@@ -78,11 +78,11 @@ def fit_and_report(arguments: CalibrateArguments, hand: Hand, logs: Sequence[Pat
     operator.console.print(force_table(found.calibration))
     for note in grouped(found.calibration.notes):
         operator.tell(f"note: {note}")
-    if arguments.destination.exists() and not arguments.force:  # It may have been created meanwhile.
-        raise HandError(
-            f"{arguments.destination} already exists: --from-log {' '.join(map(str, logs))} fits these "
-            "presses into another --output"
-        )
+    for option, path in (("--output", arguments.destination), ("--report", arguments.report)):
+        if path and path.exists() and not arguments.force:  # It may have been created meanwhile.
+            raise HandError(
+                f"{path} already exists: --from-log {' '.join(map(str, logs))} fits these presses into another {option}"
+            )
     save_calibration(arguments.destination, found.calibration)
     operator.tell(f"calibration: {arguments.destination}")
     if arguments.report:

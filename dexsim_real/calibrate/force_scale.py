@@ -12,6 +12,7 @@ from dexsim.calibration.sensor import FingerFit, TaxelPress, fit_finger
 from dexsim.core.errors import CalibrationError, DexsimError
 from dexsim.hand.kinematics import Hand, forward_kinematics, taxel_normals
 from dexsim_real.calibrate.read import PressSession, Recording
+from dexsim_real.calibrate.taxel_check import dead_taxels, fill_dead
 
 ACTIVE = 2.0
 """Counts above which a taxel takes part."""
@@ -51,10 +52,10 @@ def force_scale(session: PressSession, hand: Hand, pressed: list[Recording]) -> 
         every, shown = np.array(recording.counts), np.array(recording.shown)
         counts = np.array([every[recording.samples(level)].mean(0) for level in levels])
         active = binary_dilation((counts.max(0) >= ACTIVE).reshape(hand.taxel_grid), np.ones((3, 3))).ravel()
-        counts, posture = (
-            counts * active,
-            [np.array(recording.position)[recording.samples(level)].mean(0) for level in levels],
-        )
+        counts = counts * active
+        # The fit applies this gain to sums with the dead taxels filled in.
+        counts = fill_dead(hand, counts, dead_taxels(hand, counts, session.check.neighbours))
+        posture = [np.array(recording.position)[recording.samples(level)].mean(0) for level in levels]
         gauge = np.array([recording.gauge[level] for level in levels])
         gauge = gauge / upright(hand, recording.finger, counts, np.array(posture))
         run = np.array([shown[recording.samples(level)].mean() for level in levels])
@@ -88,12 +89,18 @@ def force_scale(session: PressSession, hand: Hand, pressed: list[Recording]) -> 
 def upright(hand: Hand, finger: int, counts: np.ndarray, position: np.ndarray) -> np.ndarray:
     """Share [K] of each force [K, N] that the gauge shows: it stands still while the fingertip turns.
 
-    It faces the fingertip at the smallest of the forces, at joint angles [K, J].
+    It faces the fingertip at the smallest of the forces that the taxels feel, at joint angles [K, J]. Where they feel
+    none their sum has any sign and direction: the share is then 1.
     """
+    sums = counts.sum(-1)
+    felt = sums >= ACTIVE
+    if not felt.any():
+        return np.ones(len(counts))
     normals = [_normals(hand, jnp.int32(finger), jnp.asarray(q, jnp.float32)) for q in position]
-    push = np.array([weight @ np.asarray(normal) for weight, normal in zip(counts, normals, strict=True)])
-    push /= np.linalg.norm(push, axis=-1, keepdims=True)
-    return push @ push[counts.sum(-1).argmin()]
+    weights = np.maximum(counts, 0.0)
+    push = np.array([weight @ np.asarray(normal) for weight, normal in zip(weights, normals, strict=True)])
+    push /= np.maximum(np.linalg.norm(push, axis=-1, keepdims=True), 1e-9)
+    return np.where(felt, push @ push[np.where(felt, sums, np.inf).argmin()], 1.0)
 
 
 @functools.partial(jax.jit, static_argnames="hand")

@@ -196,7 +196,9 @@ class Operator:
           HandError: the input is closed.
         """
         while self._stream.isatty() and not self._lines.empty():  # Discard keys pressed before the question.
-            self._lines.get()
+            if not self._lines.get():
+                self._lines.put("")  # The end of the input remains: no answer will follow.
+                break
         self.tell(text)
         if self._reader is None:
             self._reader = threading.Thread(target=self._read, name="answers", daemon=True)
@@ -205,10 +207,12 @@ class Operator:
             meanwhile()
         line = self._lines.get()
         if not line:
+            self._lines.put("")  # For the next question.
             raise HandError("nobody can answer: standard input is closed (--yes asks nothing)")
         return line.strip()
 
     def _read(self) -> None:
-        for line in self._stream:
-            self._lines.put(line)
+        with contextlib.suppress(OSError, ValueError):  # A terminal that hangs up, or no text: it ends here as well.
+            for line in self._stream:
+                self._lines.put(line)
         self._lines.put("")

@@ -1,6 +1,7 @@
 """Options of `python -m dexsim_real.calibrate`: one dataclass that contains the options of every part."""
 
 import dataclasses
+import os
 from pathlib import Path
 
 from dexsim.core.config import setting, validate
@@ -68,9 +69,10 @@ class CalibrateArguments:
     output: Path | None = None
     """Output file; None for hand.toml, or hand.json with --identify."""
     force: bool = False
-    """Overwrite an existing output file."""
+    """Overwrite an existing output file or report."""
     from_log: tuple[Path, ...] = ()
-    """Fit logs of this command again, without a hand. A press in several logs is taken from the last."""
+    """Fit logs of this command again, without a hand. A press in several logs is taken from the last that
+    finished it."""
     identify: bool = False
     """Identify the drives instead: move each free joint, and fit stiffness, damping, friction and latency."""
     gauge: str | None = None
@@ -115,8 +117,10 @@ class CalibrateArguments:
         validate(self)
         if (self.port is None) == (not self.from_log):
             raise HandError("give --port for a hand, or --from-log FILE for a log of this command")
-        if self.destination.exists() and not self.force:
-            raise HandError(f"{self.destination} already exists: give another --output, or --force to overwrite it")
+        for option, path in (("--output", self.destination), ("--report", self.report)):
+            if path and path.exists() and not self.force:
+                raise HandError(f"{path} already exists: give another {option}, or --force to overwrite it")
+        self._check_distinct()
         if self.plot and self.plot.suffix.lower() not in (".png", ".pdf", ".svg"):
             raise HandError(f"--plot {self.plot}: give a file that ends in .png, .pdf or .svg")
         if self.press.current >= self.safety.current:
@@ -128,6 +132,19 @@ class CalibrateArguments:
                 f"--press.peak {self.press.peak:g} N must be well below --safety.finger-force "
                 f"{self.safety.finger_force:g} N"
             )
+
+    def _check_distinct(self) -> None:
+        """Check that no file is written over another one of the same command, nor over a log that is read."""
+        written = (
+            ("--output", self.destination),
+            ("--report", self.report),
+            ("--plot", self.plot),
+            ("--log", self.log),
+        )
+        used = {os.path.realpath(path): "--from-log" for path in self.from_log}
+        for option, path in written:
+            if path and (other := used.setdefault(os.path.realpath(path), option)) != option:
+                raise HandError(f"{path} is given for both {other} and {option}: give each its own file")
 
     @property
     def destination(self) -> Path:

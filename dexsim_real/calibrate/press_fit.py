@@ -101,7 +101,7 @@ def fit(session: PressSession, hand: Hand, created: str | None = None) -> Fit:
         force = blocks.counts.sum(-1) * gain + offset
         torque = taxel_torque(hand, blocks.position, recording.finger, blocks.counts * gain)
         high = force > 0.5 * force.max()
-        lever = torque[high].sum(0) / force[high].sum()
+        lever = torque[high].sum(0) / (force[high] - offset).sum()  # `torque` is still without the offset.
         slip = _shear_share(blocks) * _shear_lever(hand, blocks.position[high].mean(0), recording.finger, blocks.counts)
         # The force that the gauge adds to the taxels' sum acts at the same place.
         torque += offset * lever
@@ -283,7 +283,7 @@ def _runs(phase: np.ndarray) -> list[tuple[int, int]]:
 def _press_notes(
     session: PressSession, hand: Hand, recording: Recording, blocks: Blocks, dead: np.ndarray
 ) -> list[str]:
-    """Notes on dead taxels, shear and drift of one press."""
+    """Notes on dead taxels, shear, drift and interruption of one press."""
     notes, finger = [], hand.finger_names[recording.finger]
     if dead.any():
         notes.append(
@@ -297,7 +297,9 @@ def _press_notes(
             "ignores; press on something that slides, rolls or is soft"
         )
     left = np.array(recording.counts)[recording.samples(RELEASED)].sum(-1)
-    if len(left) and np.median(left) > session.check.release:
+    if not recording.finished:
+        notes.append(f"{recording.name}: was interrupted; the fit has what was pressed until then, press it again")
+    elif np.median(left) > session.check.release:
         notes.append(f"{recording.name}: {np.median(left):.0f} counts remain after the press: the zero drifts")
     return notes
 

@@ -10,7 +10,7 @@ import numpy as np
 from dexsim.core.config import from_dict
 from dexsim.hand.kinematics import Hand
 from dexsim_real.calibrate.options import CheckConfig
-from dexsim_real.calibrate.press_procedure import REST
+from dexsim_real.calibrate.press_procedure import RELEASED, REST
 from dexsim_real.calibrate.taxel_check import raw_sensing
 from dexsim_real.core.log import Kind, LogError, LogReader, reading
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
@@ -30,7 +30,7 @@ class Recording:
     time: list[float] = dataclasses.field(default_factory=list)  # s
     counts: list[np.ndarray] = dataclasses.field(default_factory=list)  # [N] tared, negative ones included
     shown: list[float] = dataclasses.field(default_factory=list)  # counts of the fingertip as in a run
-    shear: list[np.ndarray] = dataclasses.field(default_factory=list)  # [2] counts, sums of the taxels' x and y
+    shear: list[np.ndarray] = dataclasses.field(default_factory=list)  # [2] counts, sums of x and y beyond the rest's
     current: list[np.ndarray] = dataclasses.field(default_factory=list)  # [J] A, with the sign of the hand
     position: list[np.ndarray] = dataclasses.field(default_factory=list)  # [J] rad
     gauge: dict[str, float] = dataclasses.field(default_factory=dict)  # N by phase
@@ -38,6 +38,11 @@ class Recording:
     def samples(self, *phases: str) -> np.ndarray:
         """Indices of the samples of these phases."""
         return np.flatnonzero(np.isin(self.phase, phases))
+
+    @property
+    def finished(self) -> bool:
+        """Whether the fingertip was freed at the end; otherwise the press was interrupted."""
+        return RELEASED in self.phase
 
 
 @dataclasses.dataclass
@@ -54,7 +59,7 @@ class PressSession:
 
 
 def read_logs(paths: Iterable[Path], hand: Hand) -> PressSession:
-    """The presses in logs of `dexsim_real.calibrate`. A press in several logs is taken from the last that has samples.
+    """The presses in logs of `dexsim_real.calibrate`. A press in several logs is taken from the last that finished it.
 
     Raises:
       LogError: not a log of presses, or recorded with other settings than the logs before.
@@ -70,10 +75,25 @@ def read_logs(paths: Iterable[Path], hand: Hand) -> PressSession:
         elif found.serial != session.serial:
             raise LogError(f"{path}: is of hand {found.serial!r}, the logs before of hand {session.serial!r}")
         else:
-            # A press that was skipped or missed is in its log without samples.
-            session.recordings.update({name: press for name, press in found.recordings.items() if press.time})
+            for name, press in found.recordings.items():
+                before = session.recordings.get(name)
+                # A press that was skipped or missed is in its log without samples.
+                if press.time and (press.finished or before is None or not before.time):
+                    session.recordings[name] = press
     assert session is not None, "no log given"
     return session
+
+
+def logged_rate(path: Path, meta: dict[str, Any]) -> float:
+    """The exchanges per second of a log, from its configuration.
+
+    Raises:
+      LogError: no rate that `--rate` allows.
+    """
+    rate = meta["rate"]
+    if not isinstance(rate, int | float) or not 20.0 <= rate <= 1000.0:  # NaN is not in the range either.
+        raise LogError(f"{path}: a rate of {rate!r:.40} exchanges per second; expected 20 to 1000; record again")
+    return float(rate)
 
 
 class _Reader:
@@ -81,7 +101,7 @@ class _Reader:
         self._path, self._hand, self._number, self._frame = path, hand, -1, b""
 
     def read(self) -> PressSession:
-        session, rest = None, list[np.ndarray]()
+        session, rest, slant = None, list[np.ndarray](), list[np.ndarray]()
         for record in LogReader(self._path):
             content = record.content
             if record.kind == Kind.META and "task" in content:
@@ -93,10 +113,14 @@ class _Reader:
             elif record.kind == Kind.RECEIVED:
                 self._number, self._frame = content
             elif record.kind == Kind.TICK:
-                self._sample(session, record.time, content, rest)
+                self._sample(session, record.time, content, rest, slant)
         if session is None:
             raise LogError(f"{self._path}: the log ends before the hand was ready; record again")
         session.rest_current = np.array(rest)
+        if slant:  # A taxel may read some x and y that no shear has caused.
+            zero = np.mean(slant, 0)
+            for recording in session.recordings.values():
+                recording.shear = [shear - zero[recording.finger] for shear in recording.shear]
         return session
 
     def _begin(self, meta: dict[str, Any]) -> PressSession:
@@ -105,18 +129,33 @@ class _Reader:
         hardware = from_dict(HardwareConfig, meta["hardware"])
         self._sensing, self._raw = HandSensing(self._hand, hardware), raw_sensing(self._hand, hardware)
         check, side = from_dict(CheckConfig, meta["check"]), meta.get("handedness", "")  # Older logs name no side.
-        return PressSession(hardware, check, meta["serial"], side, meta["rate"], {}, np.empty(0))
+        return PressSession(hardware, check, meta["serial"], side, logged_rate(self._path, meta), {}, np.empty(0))
 
     def _configure(self, session: PressSession, content: dict[str, Any]) -> None:
         if "tare" in content:
             self._sensing.tare = np.array(content["tare"], np.float32)
         if "placement" in content:
-            placement = content["placement"]
-            session.recordings[placement["name"]] = Recording(
-                placement["name"], placement["finger"], tuple(placement["joints"]), session.rate
-            )
+            name, finger, joints = (content["placement"][key] for key in ("name", "finger", "joints"))
+            if not isinstance(name, str):
+                raise LogError(f"{self._path}: a press is named {name!r:.40}; expected a text; record again")
+            for what, index, count in (
+                ("finger", finger, len(self._hand.finger_names)),
+                *(("joint", joint, self._hand.num_joints) for joint in joints),
+            ):
+                if type(index) is not int or not 0 <= index < count:
+                    raise LogError(
+                        f"{self._path}: {name}: {what} {index!r:.40}; the hand has 0 to {count - 1}; record again"
+                    )
+            session.recordings[name] = Recording(name, finger, tuple(joints), session.rate)
 
-    def _sample(self, session: PressSession, time: float, tick: dict[str, Any], rest: list[np.ndarray]) -> None:
+    def _sample(
+        self,
+        session: PressSession,
+        time: float,
+        tick: dict[str, Any],
+        rest: list[np.ndarray],
+        slant: list[np.ndarray],
+    ) -> None:
         recording = session.recordings.get(tick["press"])
         if recording is not None and "gauge" in tick:
             recording.gauge[tick["phase"]] = tick["gauge"]
@@ -125,17 +164,19 @@ class _Reader:
             return
         state = frames.decode_state(self._frame[frames.HEADER.size : -2])
         current = state["joint"]["current"].astype(float) * 1e-3
+        taxel = state["tip"]["taxel"]
+        shear = np.stack([taxel[axis].sum(-1, dtype=float) for axis in "xy"], -1)  # [F, 2]
         if tick["phase"] == REST:
             rest.append(current)
+            slant.append(shear)
         if recording is None:
             return
         measured, finger = self._sensing.measure(state), recording.finger
-        taxel = state["tip"]["taxel"][finger]
         recording.tare = self._sensing.tare[finger].astype(float)
         recording.phase.append(tick["phase"])
         recording.time.append(time)
         recording.counts.append(self._raw.measure(state).taxel_force[finger].astype(float) - recording.tare)
         recording.shown.append(float(measured.taxel_force[finger].sum()) / session.hardware.force_per_count)
-        recording.shear.append(np.array([taxel[axis].sum(dtype=float) for axis in "xy"]))
+        recording.shear.append(shear[finger])
         recording.current.append(current)
         recording.position.append(measured.joint_position.astype(float))

@@ -310,21 +310,9 @@ def test_the_command_refuses_a_touched_hand_in_one_line(tmp_path, monkeypatch, c
     monkeypatch.setattr(calibrate, "prepare_jax", lambda: None)
     with PtyHand() as peer:
         peer.state["tip"]["taxel"]["z"][3, 40:43] = 90
-        options = [
-            "--port",
-            peer.port,
-            "--yes",
-            "--output",
-            str(tmp_path / "hand.toml"),
-            "--log",
-            str(tmp_path / "hand.log"),
-            "--link.settle",
-            "0",
-            "--link.no-paced",
-            "--check.seconds",
-            "0.5",
-            "--no-realtime",
-        ]
+        output, log = tmp_path / "hand.toml", tmp_path / "hand.log"
+        options = f"--port {peer.port} --yes --output {output} --log {log} --link.settle 0 --link.no-paced".split()
+        options += "--check.seconds 0.5 --no-realtime".split()
         assert command(*options) == 2
         assert all(np.all(block["mode"] == Mode.PASSIVE) for block in peer.commands)
     lines = capsys.readouterr().err.strip().splitlines()

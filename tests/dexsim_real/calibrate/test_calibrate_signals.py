@@ -1,5 +1,6 @@
-"""A signal at the worst moment of a calibration: just before the motors go off, and while they do."""
+"""A signal at the worst moment of a calibration: just before the motors go off, and while they do; Ctrl-D at any."""
 
+import io
 import os
 import signal
 import time
@@ -8,8 +9,10 @@ import numpy as np
 import pytest
 from calibrating import QUICK, arguments, off, on, plates, record
 from press_bench import BenchHand
+from rich.console import Console
 
-from dexsim_real.calibrate.hand_loop import HandLoop
+from dexsim_real.calibrate.hand_loop import HandLoop, Operator
+from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogReader
 from dexsim_real.wire.frames import Mode
 
@@ -67,3 +70,36 @@ def test_a_signal_while_the_motors_go_off_is_ignored(hand, tmp_path):
     with pytest.raises(RuntimeError, match="broken"):
         record(bench, hand, arguments(tmp_path, press=QUICK))
     assert seen == ["signal"] and on(bench).any() and off(bench) and bench.closed
+
+
+class Terminal:
+    """One line is typed, then Ctrl-D, or the terminal hangs up."""
+
+    def __init__(self, end):
+        self.lines, self.end = ["\n"], end
+
+    def isatty(self):
+        return True
+
+    def __iter__(self):
+        return self
+
+    def __next__(self):
+        if self.lines:
+            return self.lines.pop()
+        raise self.end
+
+
+@pytest.mark.parametrize("end", [StopIteration(), OSError(5, "hung up")])
+def test_the_end_of_the_input_between_two_questions_is_the_end_of_the_second(end):
+    who, cycles = Operator(Console(file=io.StringIO()), stream=Terminal(end)), []
+
+    def wait():
+        cycles.append(time.sleep(0.005))
+        assert len(cycles) < 400, "nobody will answer"
+
+    assert who.ask("Enter presses", wait) == ""
+    who._reader.join(5.0)
+    for _ in range(2):
+        with pytest.raises(HandError, match="nobody can answer: standard input is closed"):
+            who.ask("Enter presses", wait)

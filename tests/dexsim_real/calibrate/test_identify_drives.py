@@ -1,14 +1,18 @@
 """Identification of the drives: what is sent to the hand, and logs that are unusable."""
 
 import dataclasses
+import json
 
 import numpy as np
+import press_bench
 import pytest
 from calibrating import arguments, off, on, operator
 from press_bench import BenchHand
 
+from dexsim.calibration.maps import save_calibration
 from dexsim.core.errors import CalibrationError
 from dexsim_real.calibrate import identify_drives
+from dexsim_real.calibrate.options import CalibrateArguments
 from dexsim_real.calibrate.read import read_logs
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogError, LogReader, LogWriter
@@ -116,3 +120,124 @@ def test_a_hand_that_is_silent_while_it_is_tared_moves_nothing(hand, tmp_path):
     with pytest.raises(HandError, match="cannot tare the taxels: no usable answer in 0.5 s; check the cable"):
         identify_drives.identify_hand(options, hand, operator(), port=bench, clock=bench.clock, sleep=bench.sleep)
     assert not on(bench).any() and off(bench) and bench.closed
+
+
+@pytest.fixture(scope="module")
+def recorded(hand, tmp_path_factory):
+    """The log of one joint."""
+    return moved(hand, tmp_path_factory.mktemp("identify") / "whole.log")
+
+
+def moved(hand, path, **options):
+    bench = BenchHand(hand, [])
+    options = arguments(path.parent, identify=True, joints=("mid_joint1",), log=path, **options)
+    return identify_drives.record(options, hand, operator(), port=bench, clock=bench.clock, sleep=bench.sleep)
+
+
+def rewritten(source, path, change):
+    """A log with changed records; a change to None drops one."""
+    with LogWriter(path) as log:
+        for entry in LogReader(source):
+            if (new := change(entry)) is not None:
+                log.add(new.kind, new.content, new.time)
+    return path
+
+
+def configured(**values):
+    """A change of the configuration."""
+
+    def change(entry):
+        meta = entry.kind == Kind.META and "task" in entry.content
+        return dataclasses.replace(entry, content={**entry.content, **values}) if meta else entry
+
+    return change
+
+
+def samples(*paths, hand, calibration=None):
+    return len(identify_drives.read_logs(paths, hand, calibration)["mid_joint1"][0].target)
+
+
+def test_exchanges_that_took_longer_than_their_period_identify_nothing(hand, tmp_path, monkeypatch):
+    """An adapter that waits 16 ms halves the rate, and the fit would take the motion for twice as fast."""
+    monkeypatch.setattr(press_bench, "EXCHANGE", 0.020)
+    slow = moved(hand, tmp_path / "slow.log")
+    with pytest.raises(LogError, match="slow.log: fit of mid_joint1: an exchange took 24.1 ms, 12.0 ms were expected"):
+        samples(slow, hand=hand)
+
+
+def test_a_stretch_that_is_missing_identifies_nothing_and_a_late_exchange_does(hand, recorded, tmp_path):
+    times = [entry.time for entry in LogReader(recorded) if entry.kind == Kind.SENT]
+    for seconds, name in ((0.02, "late.log"), (1.0, "damaged.log")):
+        begin = times[200] - 0.001
+        path = rewritten(
+            recorded,
+            tmp_path / name,
+            lambda e: None if begin <= e.time < begin + seconds else e,  # noqa: B023
+        )
+        if name == "late.log":
+            assert samples(path, hand=hand) > 0.99 * samples(recorded, hand=hand)
+        else:
+            with pytest.raises(LogError, match=r"damaged.log: fit of mid_joint1: \d+ ms of \d+ ms are missing"):
+                samples(path, hand=hand)
+
+
+def test_a_later_log_replaces_a_joint_and_other_logs_do_not_mix(hand, recorded, tmp_path):
+    again = rewritten(recorded, tmp_path / "again.log", lambda entry: entry)
+    assert samples(recorded, again, hand=hand) == samples(recorded, hand=hand)
+    hardware = {**next(entry.content["hardware"] for entry in LogReader(recorded) if entry.kind == Kind.META)}
+    for name, says, values in (
+        ("rate", "other --hardware options or another --rate", {"rate": 82.0}),
+        ("hardware", "other --hardware options", {"hardware": {**hardware, "taxel_floor": 2.0}}),
+        ("serial", "is of another hand .right, serial number 2R32OTHER.", {"serial": "2R32OTHER"}),
+        ("text", "a rate of '83' exchanges per second", {"rate": "83"}),
+    ):
+        other = rewritten(recorded, tmp_path / f"{name}.log", configured(**values))
+        with pytest.raises(LogError, match=f"{name}.log: .*{says}"):
+            samples(recorded, other, hand=hand)
+
+
+def test_a_calibration_of_another_hand_is_refused_for_a_log(hand, recorded, tmp_path):
+    known = dataclasses.replace(ideal_calibration(hand), serial="2R32OTHER")
+    save_calibration(tmp_path / "other.toml", known)
+    options = CalibrateArguments(
+        from_log=(recorded,), identify=True, calibration=tmp_path / "other.toml", output=tmp_path / "hand.json"
+    )
+    with pytest.raises(HandError, match="whole.log: this is hand 2R32BENCH, the calibration is of hand 2R32OTHER"):
+        identify_drives.identify_hand(options, hand, operator())
+    assert samples(recorded, hand=hand, calibration=dataclasses.replace(known, serial="2R32BENCH"))
+
+
+def test_a_joint_that_fails_leaves_those_of_the_others(hand, recorded, tmp_path, monkeypatch):
+    """One has too little motion, another a log with a gap; the exit code is not 0."""
+
+    @dataclasses.dataclass
+    class Found:
+        joint: str
+
+        def report(self):
+            return "fine"
+
+    def fit(log, start, **rest):
+        if log.name == "ring_joint1":
+            raise CalibrationError("ring_joint1: moved over 0.001 rad")
+        return Found(log.name)
+
+    def as_joint(name):
+        def change(entry):
+            ticks = entry.kind == Kind.TICK and "joint" in entry.content
+            return dataclasses.replace(entry, content={**entry.content, "joint": name}) if ticks else entry
+
+        return change
+
+    ring = rewritten(recorded, tmp_path / "ring.log", as_joint("ring_joint1"))
+    times = [entry.time for entry in LogReader(recorded) if entry.kind == Kind.SENT]
+    cut = rewritten(recorded, tmp_path / "gap.log", lambda e: None if 0 < e.time - times[200] < 1.0 else e)
+    cut = rewritten(cut, tmp_path / "thumb.log", as_joint("thumb_bend"))
+    monkeypatch.setattr(identify_drives, "identify", fit)
+    who, output = operator(), tmp_path / "hand.json"
+    options = CalibrateArguments(from_log=(ring, recorded, cut), identify=True, output=output)
+    with pytest.raises(HandError, match="not identified: thumb_bend, ring_joint1 .*the other joints are in .*json"):
+        identify_drives.identify_hand(options, hand, who)
+    assert list(json.loads(output.read_text())["joints"]) == ["mid_joint1"]
+    said = who.console.file.getvalue()
+    assert "not identified: ring_joint1: moved over 0.001 rad" in said and "thumb.log: fit of thumb_bend: " in said

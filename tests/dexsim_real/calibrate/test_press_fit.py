@@ -1,5 +1,6 @@
 """Presses of a hand with known torque constants, fitted from its log; readings of a gauge."""
 
+import dataclasses
 import io
 import json
 import queue
@@ -145,6 +146,46 @@ def test_a_skipped_press_leaves_the_one_of_the_log_before(hand, session, tmp_pat
     assert both["index pad"].time == new["index pad"].time and both["index side"].time == alone["index side"].time
 
 
+def test_an_interrupted_press_leaves_the_one_of_the_log_before(hand, session, tmp_path):
+    """Cut in the middle of the last press, before the fingertip was free."""
+    entries = list(LogReader(session[2]))
+    marks = [k for k, e in enumerate(entries) if e.kind == Kind.TICK and e.content["press"] == "index pad"]
+    with LogWriter(tmp_path / "cut.log") as log:
+        for entry in entries[: marks[len(marks) * 3 // 5]]:
+            log.add(entry.kind, entry.content, entry.time)
+    whole, cut, both = (read_logs(logs, hand) for logs in ([session[2]], [log.path], [session[2], log.path]))
+    assert cut.recordings["index pad"].time and not cut.recordings["index pad"].finished
+    assert both.recordings["index pad"].time == whole.recordings["index pad"].time
+    assert not any("interrupted" in note for note in fit(both, hand).calibration.notes)
+    assert any(note.startswith("index pad: was interrupted") for note in fit(cut, hand).calibration.notes)
+
+
+@pytest.mark.parametrize(
+    ("part", "value", "says"),
+    [
+        ("joints", [99], "index pad: joint 99; the hand has 0 to 11"),
+        ("joints", [-8], "index pad: joint -8; the hand has 0 to 11"),
+        ("finger", -4, "index pad: finger -4; the hand has 0 to 4"),
+        ("finger", 1.0, "index pad: finger 1.0; the hand has 0 to 4"),
+        ("name", 5, "a press is named 5"),
+        ("rate", "83", "a rate of '83' exchanges per second; expected 20 to 1000"),
+        ("rate", 0, "a rate of 0 exchanges"),
+        ("rate", float("nan"), "a rate of nan exchanges"),
+    ],
+)
+def test_a_forged_log_is_refused_in_one_line(hand, session, tmp_path, part, value, says):
+    with LogWriter(tmp_path / "forged.log") as log:
+        for entry in LogReader(session[2]):
+            content = entry.content
+            if entry.kind == Kind.META and part in content:
+                content = {**content, part: value}
+            elif entry.kind == Kind.META and "placement" in content:
+                content = {"placement": {**content["placement"], part: value}}
+            log.add(entry.kind, content, entry.time)
+    with pytest.raises(LogError, match=f"forged.log: {says}"):
+        read_logs([log.path], hand)
+
+
 def test_a_press_that_no_taxel_feels_is_left_out(hand, session, scale):
     """Six taxels of one count each are contact enough for the procedure; the current ends the press."""
     faint = np.zeros(hand.num_taxels)
@@ -161,6 +202,31 @@ def test_a_press_that_no_taxel_feels_is_left_out(hand, session, scale):
     pad.counts = [faint] * len(pad.counts)
     with pytest.raises(CalibrationError, match="index pad: left out: no taxel read 2 counts"):
         fit(recorded, hand)
+
+
+def test_no_file_of_a_command_overwrites_another(hand, session, tmp_path):
+    (tmp_path / "link").symlink_to(tmp_path)
+    same = tmp_path / "link" / "hand.toml"
+    for options, says in (
+        ({"report": same}, "link/hand.toml is given for both --output and --report"),
+        ({"plot": tmp_path / "a.png", "report": tmp_path / "a.png"}, "for both --report and --plot"),
+        ({"log": tmp_path / "hand.toml"}, "for both --output and --log"),
+        ({"port": None, "from_log": (same, session[2]), "force": True}, "for both --from-log and --output"),
+        (
+            {"port": None, "from_log": (session[2],), "report": session[2], "force": True},
+            "for both --from-log and --rep",
+        ),
+        ({"report": session[2]}, "already exists: give another --report, or --force to overwrite it"),
+    ):
+        with pytest.raises(HandError, match=says):
+            arguments(tmp_path, **options)
+    options = arguments(tmp_path, report=tmp_path / "hand.json")
+    options.report.write_text("precious")  # It came while the hand was pressing.
+    with pytest.raises(HandError, match="hand.json already exists: .* fits these presses into another --report"):
+        fit_and_report(options, hand, [session[2]], operator())
+    assert options.report.read_text() == "precious" and not options.output.exists()
+    fit_and_report(dataclasses.replace(options, force=True), hand, [session[2]], operator())
+    assert options.output.exists() and options.report.read_text() != "precious"
 
 
 class Typist(io.StringIO):
