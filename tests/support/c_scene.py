@@ -106,13 +106,13 @@ def _clad(spec: mujoco.MjSpec, name: str, cover: float) -> list[str]:
     for k in range(ROW):
         share = k / (ROW - 1)
         pad.parent.add_geom(
-            name=f"{name}_{k}",
+            name=f"{name}/{k}",
             type=mujoco.mjtGeom.mjGEOM_SPHERE,
             size=[radius, 0, 0],
             pos=(1 - share) * ends[0] + share * ends[1],
             mass=0,
         )
-    return [f"{name}_{k}" for k in range(ROW)]
+    return [f"{name}/{k}" for k in range(ROW)]
 
 
 def follow_skin(model: mujoco.MjModel, data: mujoco.MjData, hand, target, felt, settling=0.03) -> None:

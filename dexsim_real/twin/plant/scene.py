@@ -12,7 +12,6 @@ import mujoco
 import numpy as np
 
 from dexsim.hand.kinematics import Hand
-from dexsim.hand.mjcf import read_mjcf
 from dexsim_real.core.errors import HandError
 from dexsim_real.twin.plant.parameters import TrialParameters
 from dexsim_real.twin.plant.shapes import ObjectShape
@@ -62,7 +61,10 @@ def build_scene(hand: Hand, parameters: TrialParameters, shape: ObjectShape | No
     """
     if hand.num_hinges > hand.num_joints:
         raise HandError(f"{hand.model_path}: the emulated hand has gear play, which coupled joints cannot have")
-    spec = read_mjcf(hand)
+    spec = mujoco.MjSpec.from_file(str(hand.model_path))
+    for element in (*spec.actuators, *spec.sensors, *spec.keys):
+        spec.delete(element)
+    _place(spec, hand.palm)
     for body in hand.tip_body:
         spec.body(hand.body_names[body]).add_site(name=f"{hand.body_names[body]}_taxels")
     _add_play(spec, hand, parameters)
@@ -77,6 +79,29 @@ def build_scene(hand: Hand, parameters: TrialParameters, shape: ObjectShape | No
     model = spec.compile()
     _set_springs(model, parameters, skins)
     return _index(model, hand)
+
+
+def _place(spec: mujoco.MjSpec, palm: str) -> None:
+    """Move the hand so that its palm is the world's origin, wherever its file places it."""
+    root = spec.body(palm)
+    while root.parent != spec.worldbody:
+        root = root.parent
+    root.pos, root.quat, root.alt.type = [0, 0, 0], [1, 0, 0, 0], mujoco.mjtOrientation.mjORIENTATION_QUAT
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    if np.array_equal(data.body(palm).xpos, np.zeros(3)) and np.array_equal(data.body(palm).xquat, [1, 0, 0, 0]):
+        return
+    place = data.body(root.name).xpos, data.body(root.name).xquat
+    for back in (
+        data.body(palm),
+        data.body(root.name),
+    ):  # In its frame F the root belongs at F^-1 X^-1 F, X the palm's.
+        inverse, moved = (np.empty(3), np.empty(4)), (np.empty(3), np.empty(4))
+        mujoco.mju_negPose(*inverse, back.xpos, back.xquat)
+        mujoco.mju_mulPose(*moved, *inverse, *place)
+        place = moved
+    root.pos, root.quat = place
 
 
 def _add_play(spec: mujoco.MjSpec, hand: Hand, parameters: TrialParameters) -> None:

@@ -14,6 +14,7 @@ from dexsim.hand.mjcf import read_mjcf
 from dexsim.objects.config import ObjectConfig
 from dexsim.physics.config import PhysicsConfig
 from dexsim.physics.model import build_model
+from dexsim_real.twin.plant.scene import _place
 
 PALM, END = '<body name="right_hand_link">', "  </worldbody>"
 SKEW = 'pos="0.1 0.2 0.3" euler="0.3 1.5 -0.4"'
@@ -64,6 +65,14 @@ def test_links_are_in_the_palm_frame_however_the_file_places_the_palm(tmp_path, 
     bodies, found = [model.body(name).id for name in hand.body_names], forward_kinematics(hand, angle)
     np.testing.assert_allclose(found.body_position, data.xpos[bodies], atol=1e-6)
     np.testing.assert_allclose(found.body_rotation, data.xmat[bodies].reshape(-1, 3, 3), atol=1e-5)
+    # The emulated hand, which shares no code with this one.
+    spec = mujoco.MjSpec.from_file(str(hand.model_path))
+    _place(spec, hand.palm)
+    other = spec.compile()
+    data = mujoco.MjData(other)
+    mujoco.mj_kinematics(other, data)
+    palm = data.body(hand.palm)
+    np.testing.assert_allclose(np.append(palm.xpos, palm.xquat), [0, 0, 0, 1, 0, 0, 0], atol=1e-9)
 
 
 def test_fixed_bodies_that_carry_the_palm_move_with_it(tmp_path):

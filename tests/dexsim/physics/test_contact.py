@@ -134,7 +134,7 @@ def test_a_row_of_spheres_fills_its_capsule(hand):
         mujoco.mju_quat2Mat(turn, pad.quat)
         half = pad.size[1] * turn.reshape(3, 3)[:, 2]
         for k in range(3):
-            ball = model.geom(f"{name}_{k}")
+            ball = model.geom(f"{name}/{k}")
             assert ball.type == mujoco.mjtGeom.mjGEOM_SPHERE and ball.bodyid == pad.bodyid
             np.testing.assert_allclose(ball.pos, pad.pos + (k - 1) * half, atol=1e-6)
             assert ball.size[0] == pytest.approx(pad.size[0])

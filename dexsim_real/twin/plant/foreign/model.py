@@ -11,13 +11,13 @@ cannot be found:
 """
 
 import dataclasses
+import tomllib
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 
-from dexsim.core.files import read_toml
 from dexsim.hand.kinematics import Hand
 from dexsim_real.core.errors import HandError
 
@@ -80,7 +80,9 @@ def read_model(path: str | Path, hand: Hand) -> ForeignModel:
 
 def _names(path: Path) -> dict[str, Any]:
     try:
-        table = read_toml(path)
+        table = tomllib.loads(path.read_text())
+    except RecursionError:
+        raise HandError(f"{path}: cannot be read (nested too deep)") from None
     except (OSError, ValueError) as error:
         raise HandError(f"{path}: cannot be read ({_line(error)})") from None
     wrong = [key for key, value in table.items() if key not in _KEYS or not isinstance(value, _KEYS[key])]
