@@ -640,7 +640,7 @@ class TestTouch:
             mujoco.mj_forward(model, data)
             names |= {model.geom(c.geom[0]).name for c in data.contact}
         pads = {"index_pad", "mid_pad", "ring_pad", "pinky_pad"}
-        assert {name.rpartition("_")[0] for name in names} == pads, names
+        assert {name.rpartition("/")[0] for name in names} == pads, names
 
         weight = mass * 9.81
         np.testing.assert_allclose(np.sum(state.finger_force, -1), weight, rtol=0.05)
