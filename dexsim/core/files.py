@@ -109,7 +109,8 @@ def _locked_temporary(path: Path) -> tuple[int, str]:
     """An open, locked temporary file beside `path`."""
     while True:
         temporary = f"{path.parent}/.{path.name:.200}.{secrets.token_hex(4)}{_TEMPORARY}"
-        handle = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
+        # What replaces a private file is private from its first byte.
+        handle = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600 if path.exists() else 0o666)
         with contextlib.suppress(OSError):  # A file system without locks.
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         with contextlib.suppress(FileNotFoundError):  # Another program took it for stale before it was locked.

@@ -99,6 +99,13 @@ def test_a_file_keeps_its_mode_and_a_new_one_has_that_of_any_other(tmp_path, mod
     modes = {path.name: path.stat().st_mode & 0o777 for path in tmp_path.iterdir()}
     assert modes == {"old": mode, "new": modes["other"], "other": modes["other"]}
 
+    def chunks():
+        (temporary,) = tmp_path.glob(".old.*.dexsim-part")
+        assert temporary.stat().st_mode & 0o077 == 0, "nobody else reads what is being written"
+        yield b"3"
+
+    write_whole(tmp_path / "old", chunks())
+
 
 def test_a_private_folder(tmp_path):
     make_private(tmp_path / "new" / "one")
