@@ -81,7 +81,7 @@ def test_outputs_are_of_a_whole_run(name):
 
 
 def test_all_that_they_import_is_there():
-    """Also of those that run with the long tests alone."""
+    """They run with the slow tests alone."""
     found = 0
     for name in EXPECTED:
         for cell in nbformat.read(ROOT / "notebooks" / f"{name}.ipynb", as_version=4).cells:
@@ -96,15 +96,8 @@ def test_all_that_they_import_is_there():
     assert found > 30
 
 
-# What these do, other tests do too: test_own_task, test_example_hands, test_identification, test_press_fit,
-# test_bridge_run, test_shipped_policy.
-LONG = ("own_task", "own_hand", "motors", "hand_bridge", "shipped_policies")
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.long if name in LONG else ()) for name in EXPECTED]
-)
+@pytest.mark.parametrize("name", EXPECTED)
 def test_it_runs(name, monkeypatch):
     # The kernel is started with this process's environment; the inline backend is its own choice.
     monkeypatch.delenv("MPLBACKEND", raising=False)

@@ -41,6 +41,7 @@ def text_of(site, page):
     return html.unescape(re.sub(r"<[^>]+>", "", (site / page / "index.html").read_text()))
 
 
+@pytest.mark.slow
 def test_every_public_name_is_in_the_reference(site):
     page = (site / "reference" / "python" / "index.html").read_text()
     for package in ("dexsim", "dexsim_ppo", "dexsim_real"):

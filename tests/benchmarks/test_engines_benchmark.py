@@ -39,9 +39,8 @@ def wanted(bench):
     return bench.reference()
 
 
-@pytest.mark.parametrize(
-    "backend, converged", [("c", False), ("c", True), pytest.param("warp", True, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("backend, converged", [("c", False), ("c", True), ("warp", True)])
 def test_an_engine_moves_as_c_mujoco_does(benchmarks, bench, wanted, backend, converged):
     """The `c` backend with its own iterations, too: with 20 of the line search boxes on the palm were off by 1 mm."""
     pytest.importorskip("warp" if backend == "warp" else "mujoco")

@@ -52,7 +52,7 @@ def stub(paper, **changes):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["skin", pytest.param("all", marks=pytest.mark.long)])
+@pytest.mark.parametrize("name", ["skin", "all"])
 def test_smoke(paper, here, capsys, name):
     """Every row has a report, every experiment its table or figures; another run has nothing to do."""
     output = here / "reports"
@@ -325,6 +325,7 @@ class TestHeldOut:
         found = paper.held_out._composition(balls).inertia
         assert found == pytest.approx([own + 0.025**2, own + 0.025**2, own], rel=0.02)
 
+    @pytest.mark.slow
     def test_objects_are_drawn_with_their_own_mass(self, paper, hand):
         import jax
 

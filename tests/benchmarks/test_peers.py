@@ -98,7 +98,8 @@ def test_learners_take_turns():
     assert seen == list("ababbb")
 
 
-@pytest.mark.parametrize("learners", [["ours"], pytest.param(["ours", "brax"], marks=pytest.mark.long)])
+@pytest.mark.slow
+@pytest.mark.parametrize("learners", [["ours"], ["ours", "brax"]])
 def test_a_small_run_writes_what_it_shows(learners, tmp_path, capsys, monkeypatch):
     import runpy
 

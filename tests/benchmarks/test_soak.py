@@ -39,7 +39,7 @@ def test_a_short_soak(soak, capsys):
     assert row["runs"] >= 1 and row["commands"] > 100 and sum(row["injected"].values()) > 5
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_two_runners_die(soak, capsys):
     code = soak.main(["--minutes", "0", "--kills", "2", "--life", "4", "--seed", "1", *PATIENT])
     row = json.loads(capsys.readouterr().out)

@@ -51,7 +51,7 @@ def equal(first, second):
             np.testing.assert_array_equal(ours, theirs, err_msg=jax.tree_util.keystr(path))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_replayed_torques_give_the_same_motion_and_contacts(benchmarks, simple):
     """With friction, latency, ripple, restarts: the tape holds all that the drive did, and readings of its torque."""
     throughput, _ = benchmarks
@@ -81,7 +81,7 @@ def test_replayed_torques_give_the_same_motion_and_contacts(benchmarks, simple):
             np.testing.assert_allclose(ours, theirs, atol=1e-5, rtol=1e-5, err_msg=name)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_hands_are_kept_or_nominal(benchmarks, simple, hand):
     throughput, _ = benchmarks
     kept = throughput.make("grasp", "redrawing", "jax", WORLDS)
@@ -101,7 +101,7 @@ def test_hands_are_kept_or_nominal(benchmarks, simple, hand):
     assert text[0].count("threefry") < text[1].count("threefry")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_rows_are_json_with_a_share(benchmarks, simple, capsys, monkeypatch):
     throughput, _ = benchmarks
     monkeypatch.setattr(
@@ -128,7 +128,7 @@ def test_rows_are_json_with_a_share(benchmarks, simple, capsys, monkeypatch):
     assert rows[0]["share_touching"] == rows[1]["share_touching"] and rows[1]["share"] < 1
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("memory", ["none", "gru"])
 def test_the_parts_of_a_training_step(benchmarks, simple, monkeypatch, memory):
     _, split = benchmarks
@@ -154,7 +154,7 @@ def test_the_parts_of_a_training_step(benchmarks, simple, monkeypatch, memory):
     assert all(rows[name]["share"] > 0 for name in ("rollout", "environment", "physics", "touch", "policy", "learner"))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("task", ["grasp", "rotate"])
 def test_training_of_two_engines_in_turn(benchmarks, simple, monkeypatch, capsys, task):
     """The ratio is that of the times; the number of environments is the preset's where none is given."""

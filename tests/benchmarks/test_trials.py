@@ -11,7 +11,7 @@ from paths import ROOT
 pytest.importorskip("serial")
 
 
-@pytest.mark.long  # Processes of their own in real time: test_soak has them, too.
+@pytest.mark.slow  # Processes of their own in real time: test_soak has them, too.
 def test_one_short_trial_through_the_bytes(tmp_path):
     """A grasp at full command: the hand that is emulated is the judge of it."""
     path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH", "")]))

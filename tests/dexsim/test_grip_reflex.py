@@ -74,6 +74,7 @@ def readings_of(hand, felt):
     return Readings()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [None, "leap_like", "inspire_like"])
 def test_every_shipped_hand_closes_with_positive_angles_and_its_mirror_image_with_negative_ones(name):
     """As their makers count them. In LEAP's posture the fingertips are beyond the point nearest to the grasp."""

@@ -365,6 +365,7 @@ def fresh(grasp_rollout):
     return grasp_rollout.reset(jax.random.key(21))
 
 
+@pytest.mark.slow
 def test_every_range_reaches_the_model_and_the_motion(grasp_env, grasp_rollout, fresh):
     effects = check(grasp_env, grasp_rollout.step, fresh, key=jax.random.key(0), ticks=9)
     by_name = {effect.name.split(".")[-1]: effect for effect in effects}

@@ -33,6 +33,7 @@ def run(tmp_path_factory):
     patch.undo()
 
 
+@pytest.mark.slow
 def test_training_by_name_leaves_a_policy_of_that_task(run):
     assert run.policy.task == run.report["task"] == "poke" and run.policy.env_config["gain"] == 3.0
     assert run.policy.spec is not None and run.policy.spec.name == "poke"
@@ -77,13 +78,14 @@ def test_another_environment_is_warned_of(run, monkeypatch):
     assert changed["gain"] == 1.5
 
 
+@pytest.mark.slow
 def test_resuming_by_name_goes_on_where_it_stopped(run):
     again = train_policy(resume=run.folder, steps=96, **SIZES)
     assert again.folder == run.folder and again.report["origin"]["iteration"] == 3
     assert again.policy.task == "poke"
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_fine_tuning_begins_with_the_policy(run, tmp_path):
     tuned = train_policy(
         policy=str(run.folder / "last.msgpack"), ppo=SMALL, backend="c", steps=32, run_dir=tmp_path / "tuned", **SIZES

@@ -29,6 +29,7 @@ def compiled(env):
     return starts, jit(jax.vmap(env.step), once=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["", "history"])  # the shipped policy has a GRU
 def test_readings_and_targets_are_those_of_the_episodes(env, compiled, kind):
     policy = remembering(kind) if kind else load_policy("grasp")

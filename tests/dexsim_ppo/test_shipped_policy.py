@@ -164,6 +164,7 @@ def test_the_grasp_holds_and_presses_as_asked():
     assert np.all(dropped.any(0))
 
 
+@pytest.mark.slow
 def test_the_rotate_turns():
     """At least two quarter turns in four seconds and no drop; a hand that does nothing turns none."""
     env = dexsim.make("rotate", RotateConfig(pool_size=WORLDS), backend="c", num_envs=WORLDS)

@@ -164,6 +164,7 @@ def test_what_the_dead_band_misses():
     assert width["dead-band"] == 0.0
 
 
+@pytest.mark.slow
 def test_every_parameter_carries_a_gradient():
     def end(play):
         rotor, q, v = rotor_at(jnp.zeros(()), jnp.zeros(())), jnp.zeros(()), jnp.zeros(())

@@ -449,6 +449,7 @@ def test_a_failed_write_leaves_the_old_file(fitted, tmp_path, monkeypatch):
     assert path.read_bytes() == before and [p.name for p in tmp_path.iterdir()] == ["c.toml"]
 
 
+@pytest.mark.slow
 def test_the_figure_shows_what_was_recorded(fitted, tmp_path):
     calibration, real, sim = fitted
     path = tmp_path / "c.png"

@@ -115,7 +115,6 @@ class TestPure:
         data = [np.asarray(jax.random.key_data(state.key)) for state, _, _ in history]
         assert len(np.unique(np.concatenate(data), axis=0)) == WORLDS * len(history)
 
-    @pytest.mark.slow
     def test_a_batch_is_a_loop(self, grasp_env, history):
         """`vmap` of the step against one world at a time; float32 in another order of fusion."""
         single = jax.jit(grasp_env.step)

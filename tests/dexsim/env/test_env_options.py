@@ -129,6 +129,7 @@ def test_a_tilted_hand_pulls_the_object_aside_and_leaves_the_orientation_alone(m
         assert not np.any(np.asarray(episode.imu.bias))
 
 
+@pytest.mark.slow
 def test_taxels_feel_no_friction(make):
     """The default skin shares out what presses into it: the rest of the finger's force is along it."""
     env = make()
@@ -156,6 +157,7 @@ class TestTaxels:
         state = jax.eval_shape(make(Sensing()).reset, jax.random.key(0))
         assert not jax.tree.leaves((state.taxel_memory, state.episode.taxels))
 
+    @pytest.mark.slow
     def test_gains_are_drawn_anew_for_an_episode_and_stay_in_it(self, busy):
         env, (state, *_, last), begun = busy
         gain = np.asarray(state.episode.taxels.gain)
@@ -473,7 +475,7 @@ def test_all_of_it_is_reached_from_the_command_line():
     assert arguments.env.randomization.gear_gap == (0.0, 0.03)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_self_test_finds_every_range_of_gears_and_taxels(make):
     env = make(Sensing(taxel=dataclasses.replace(POOR_TAXELS, rate=(8.0, 20.0), resolution=0.0)), GEARED)
     states = jit(lambda key: jax.vmap(env.reset)(jax.random.split(key, WORLDS)), once=True)(jax.random.key(0))
@@ -502,7 +504,7 @@ def test_the_self_test_finds_every_range_of_gears_and_taxels(make):
         assert effect.changed == (leaf,) and effect.found and effect.which == "taxel_force" and effect.joint == 0
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_everything_at_once_on_the_real_physics():
     """A hand that grips and shakes, then holds still, with play in its gears and poor taxels: sober numbers."""
     config = GraspConfig(

@@ -52,6 +52,7 @@ def spans(config):
 
 
 class TestBulk:
+    @pytest.mark.slow
     def test_every_episode_has_its_own_and_the_rows_shape(self, env, drawn):
         for name in ("size", "position", "active", "shape_index"):
             of_row = np.asarray(getattr(env.pool.object, name))
@@ -160,6 +161,7 @@ class TestPlan:
         plan = make_plan(Pairs(), 6, 0)
         assert plan.row.tolist() == [0, 0, 1, 1, 2, 2] and len(rows_of(plan.start.qpos)) == 3
 
+    @pytest.mark.slow
     def test_a_slice_of_a_plan_gives_its_episodes(self, env):
         """Of the real task: more episodes than its pool has rows, all from starts of their own."""
         plan = env.evaluation_plan(12, 0)

@@ -72,12 +72,13 @@ def check_gradients(env, steps):
     assert np.all(np.any(gradient[0] != 0, axis=-1))
 
 
-@pytest.mark.parametrize("steps", [pytest.param(1, marks=pytest.mark.long), 10])
+@pytest.mark.slow
+@pytest.mark.parametrize("steps", [1, 10])
 def test_gradients_are_finite_while_fingers_touch_nothing(env, steps):
     check_gradients(env, steps)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_gradients_are_finite_through_the_real_physics():
     """Objects start clear of the fingers: one step would press nothing."""
     check_gradients(dexsim.make("grasp", GraspConfig(pool_size=80), backend="jax", num_envs=WORLDS), 10)

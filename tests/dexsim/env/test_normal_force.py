@@ -30,6 +30,7 @@ def contact(hand):
     return pose, ball, at + (RADIUS + 0.002) * outward, np.asarray(outward)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("total", ["pressing", "solver"])
 @pytest.mark.parametrize("untaxelled", [False, True])
 @pytest.mark.parametrize("along, across", [(3.0, 0.0), (3.0, 1.5), (-2.0, 1.0)])

@@ -76,6 +76,7 @@ def mesh_like(kind):
     return np.asarray(points)[np.abs(sdf.signed_distance(points, shape)) < 1e-6]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("table", [False, True])
 def test_the_search_finds_the_nearest(table):
     """Against a k-d tree; 300 points do not fill the last block. The table is complete near the surface only."""

@@ -171,7 +171,7 @@ def test_driven_hinges_keep_their_ratio(coupled):
     np.testing.assert_allclose(angles, hinge_angles(coupled, np.array([0.8, 1.0], np.float32)), atol=0.01)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_jax_backend_moves_them_alike(coupled):
     ours, worst = driven(coupled, "jax")
     assert worst < 0.02

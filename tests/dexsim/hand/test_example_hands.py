@@ -138,7 +138,8 @@ def test_files_are_few_and_no_python(name):
     assert sum(len(path.read_text().splitlines()) for path in files) <= 300
 
 
-@pytest.mark.parametrize("name", [pytest.param("leap_like", marks=pytest.mark.long), "inspire_like"])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["leap_like", "inspire_like"])
 def test_passes_the_checks(name, capsys):
     assert check_hand.main([name]) == 0
     out = capsys.readouterr().out
@@ -146,7 +147,7 @@ def test_passes_the_checks(name, capsys):
     assert ("index_intermediate (x 1.064)" in out) == (name == "inspire_like")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("name", HANDS)
 def test_a_short_training_improves(name, tmp_path):
     """Half a minute: held longer than the untrained policy, on the same episodes."""

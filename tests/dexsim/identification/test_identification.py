@@ -212,6 +212,7 @@ def recovered(seed):
     return inside | {"latency": found.latency == latency}, wide
 
 
+@pytest.mark.slow
 def test_parameters_come_back():
     """One trial like those of `test_parameters_come_back_in_90_of_100`."""
     inside, wide = recovered(0)
@@ -220,7 +221,6 @@ def test_parameters_come_back():
 
 
 @pytest.mark.slow
-@pytest.mark.long
 def test_parameters_come_back_in_90_of_100():
     trials = [recovered(seed) for seed in range(100, 200)]
     for name in trials[0][0]:
@@ -228,6 +228,7 @@ def test_parameters_come_back_in_90_of_100():
     assert sum(bool(wide) for _, wide in trials) <= 5
 
 
+@pytest.mark.slow
 def test_holdout_and_report():
     holdout = log_of(TRUTH, 7, target=HOLDOUT)
     found = identify(log_of(TRUTH, 6), GUESS, latencies=(2,), holdout=holdout)
@@ -242,6 +243,7 @@ def test_holdout_and_report():
     np.testing.assert_allclose(np.diag(found.correlation), 1.0)
 
 
+@pytest.mark.slow
 def test_latency_scan_shows_its_valley():
     log = log_of(TRUTH | {"dead_band": 0.0}, 3, target=SHORT, latency=3)
     found = identify(log, GUESS, dead_band=None)

@@ -69,6 +69,7 @@ class TestBoxes:
         np.testing.assert_allclose(mesh_object.inertia, 0.055**2 / 6, rtol=1e-6)
         np.testing.assert_array_equal(mesh_object.axes, np.eye(3))
 
+    @pytest.mark.slow
     def test_an_l_is_two_bars(self):
         """In the object's frame, which lies askew to them."""
         mesh_object = from_mesh(mesh.load_mesh(ell()), 6)
@@ -199,7 +200,7 @@ def test_taxels_feel_the_mesh_at_the_size_of_the_episode(simple, folder, method)
     assert error.mean() < mean and error.max() < worst
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_an_environment_steps_with_a_mesh(simple, folder):
     objects = ObjectConfig(mesh=str(folder / "ell.obj"))
     env = dexsim.make("grasp", GraspConfig(objects=objects, pool_size=16, touch_method="grid"), backend="c")
@@ -227,7 +228,7 @@ def test_a_mesh_is_turned_like_the_cube_that_it_is(simple, folder):
     np.testing.assert_allclose(env.task.unit_inertia(target), 0.055**2 / 6, rtol=1e-4)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_an_l_is_dropped_on_the_real_physics(folder):
     config = GraspConfig(pool_size=80, objects=ObjectConfig(mesh=str(folder / "ell.obj"), mesh_size=(0.9, 1.1)))
     env = dexsim.make("grasp", config, backend="c", num_envs=8)

@@ -89,9 +89,7 @@ def compare(env, states, kinds):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "kinds", [pytest.param(PRIMITIVES, id="primitives"), pytest.param(("mesh",), id="mesh", marks=pytest.mark.long)]
-)
+@pytest.mark.parametrize("kinds", [PRIMITIVES, ("mesh",)], ids=["primitives", "mesh"])
 def test_surface_points_feel_what_closed_forms_feel(cuboid, kinds):
     objects = ObjectConfig(mesh=cuboid, mesh_size=(0.9, 1.1)) if kinds == ("mesh",) else ObjectConfig(shapes=kinds)
     for kind, rows in compare(*gripped(objects), kinds).items():
@@ -103,6 +101,7 @@ def test_a_grid_needs_a_mesh():
         touch_geometry(ObjectConfig(), "grid")
 
 
+@pytest.mark.slow
 def test_sizes_are_the_episodes_own_under_jit_and_vmap(cuboid):
     """A point of the surface is at no distance from it, at every drawn size."""
     config = ObjectConfig(mesh=cuboid, mesh_size=(0.8, 1.2))

@@ -171,6 +171,7 @@ class TestForces:
             np.testing.assert_allclose(after.qpos[index], data.qpos, atol=1e-5)
         assert touched > len(grips) / 2, "hardly a world is in contact: the test tests nothing"
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("shape", SHAPES)
     def test_the_jax_backend_has_the_same_forces(self, one_step, physics_advance, grips, shape):
         """Within single precision's share: contact depths of 1e-7 m under springs of 1e4 N/m."""
@@ -350,7 +351,7 @@ class TestTrouble:
             jax.block_until_ready(tick(target, state, jnp.zeros((4, 3))))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_shipped_policy_holds_as_much_as_on_the_jax_backend():
     """64 hands a backend, the same starts: shares that differ by less than chance lets them (four standard errors)."""
     policy, held, force = load_policy("grasp"), {}, {}

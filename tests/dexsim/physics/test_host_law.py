@@ -35,6 +35,7 @@ def motors(request):
     return env, states, lambda state: env.motors.law(state.episode.hand, command(state))
 
 
+@pytest.mark.slow
 def test_they_agree_with_xla_to_rounding(motors):
     env, states, law_of = motors
     rng, text = np.random.default_rng(0), []

@@ -281,6 +281,7 @@ def test_a_solved_start_stays():
     np.testing.assert_allclose(again, once, rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_gradients_go_through_the_solver():
     """Reverse mode agrees with a difference quotient of the force."""
     _, args, mass, force = problem(np.random.default_rng(4))
@@ -301,7 +302,7 @@ def test_other_cones_are_left_to_mjx(hand):
     assert find_stepper(mjx, model, tips, max_contacts=20) is None
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_mjx_step_agrees(hand, grasp_env):
     """Both ways through a sub-step, converged, with capsules in closing hands: one answer."""
     one = SLOTS.index("capsule")

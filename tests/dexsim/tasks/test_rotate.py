@@ -369,6 +369,7 @@ class TestPool:
         file.write_bytes(file.read_bytes()[:1000])  # a damaged cache is made again
         jax.tree.map(np.testing.assert_array_equal, pool, task.make_pool(jax.random.key(0)))
 
+    @pytest.mark.slow
     def test_held_by_fingers_none_is_a_drop_from_the_beginning(self, hand, monkeypatch, tmp_path):
         monkeypatch.setenv("DEXSIM_CACHE", str(tmp_path))
         config = dataclasses.replace(clear_of_palm(), pool_size=12)
@@ -451,6 +452,7 @@ class TestPool:
         other = dataclasses.replace(hand, digest="another")
         assert _fingerprint(key, other, config) != _fingerprint(key, hand, config)
 
+    @pytest.mark.slow
     def test_no_start_state_is_one_clear_line(self, hand, monkeypatch, tmp_path):
         monkeypatch.setenv("DEXSIM_CACHE", str(tmp_path))
         config = RotateConfig(tilt=1.2, reference=(0.3, 0.0, 0.3), support="fingers", pool_size=4)
@@ -608,6 +610,7 @@ class TestEnvironment:
         names = {model.geom(g).name for g in model.pair_geom1}
         assert "palm" in names and "palm_face" not in names
 
+    @pytest.mark.slow
     def test_lives_through_an_episode(self, rotate_env):
         """A still hand keeps the cube; counts start anew with the next episode."""
         env = rotate_env

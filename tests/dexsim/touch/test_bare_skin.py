@@ -185,6 +185,7 @@ def test_in_the_middle_of_the_pad_taxels_bear_everything(hand, surface):
         assert press(hand, surface, finger, *at)[0] == pytest.approx(5.0, rel=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("finger", [1, 4])
 def test_round_the_pad_less_and_less_is_felt(hand, surface, finger):
     radius, _, centre, _ = pad(hand, finger)
@@ -240,6 +241,7 @@ def touched(environments, hand, angle):
     return [ground_truth(env, state.episode.object, physics, force) for env in both]
 
 
+@pytest.mark.slow
 def test_an_environment_reads_no_more_than_without(environments, hand):
     """The same state with and without: taxels are as deep, and each finger reads at most as much."""
     plain, bare = touched(environments, hand, 0.0)

@@ -83,6 +83,7 @@ def pearson(pairs):
     return np.corrcoef(*pairs[:, pairs[0] > 0.01])[0, 1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", SHAPES)
 def test_it_follows_the_solvers_force(grips, shape):
     pairs, depth = grips[shape][0], 1e3 * np.percentile(grips[shape][1], [50, 90, 99])

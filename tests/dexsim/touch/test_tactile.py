@@ -381,6 +381,7 @@ def pose_response(hand, taxels):
     return jax.jit(lambda poses, active: (jax.vmap(felt, (0, None))(poses, active), jax.jacrev(felt)(poses[0], active)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", sdf.KINDS)
 def test_gradient_of_touch_with_respect_to_the_objects_pose(pose_response, kind):
     """Against central differences, with the shipped hand's taxels round an askew object."""

@@ -123,6 +123,7 @@ def force(frames):
     return float(np.mean([frame.snapshot.finger_force.sum() for frame in frames]))
 
 
+@pytest.mark.slow
 def test_the_command_changes_the_force(simulation):
     simulation.reset(VALUES | {"object": "box"})
     gentle = force(run(simulation, 70, command=0.0)[-20:])
@@ -197,6 +198,7 @@ def test_a_task_is_shown_on_another_hand_without_the_policy_of_its_name(monkeypa
         open_source(ViewArguments(what="grasp", hand="no_such_hand"))
 
 
+@pytest.mark.slow
 def test_the_emulated_hand_is_a_source(hand, monkeypatch):
     # The flags that other tests compile with stay as they are.
     monkeypatch.setattr("dexsim_real.control.controller.prepare_jax", lambda: None)

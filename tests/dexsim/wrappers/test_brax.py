@@ -202,7 +202,7 @@ def test_ppo_trains_on_a_point():
     assert history[-1]["eval/avg_episode_length"] == 6
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("physics", ["simple", "mjx"])
 def test_ppo_runs_on_grasp(physics, monkeypatch):
     """The task itself under brax's wrappers and learner. Its evaluations compile the task once more: the point's do."""

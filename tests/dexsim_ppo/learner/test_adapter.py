@@ -178,6 +178,7 @@ def test_ranges_that_do_not_exist_cannot_widen(monkeypatch, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow
 def test_a_fault_is_replayed(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(registry, "TASKS", dict(registry.TASKS))
     sizes = {"evaluation_chunk": 8, "evaluation_episodes": 8}
@@ -188,6 +189,7 @@ def test_a_fault_is_replayed(monkeypatch, tmp_path, capsys):
     assert re.search(r"'observation': \d+ of \d+ environments .*, first at step", capsys.readouterr().out)
 
 
+@pytest.mark.slow
 def test_training_by_name_is_reported_saved_resumed_and_evaluated(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(registry, "TASKS", dict(registry.TASKS))
     config = dataclasses.replace(SMALL, num_envs=16)
@@ -249,6 +251,7 @@ class GymnaxPendulum:
         return jnp.stack([jnp.cos(state["theta"]), jnp.sin(state["theta"]), state["speed"]])
 
 
+@pytest.mark.slow
 def test_the_docs_adapter_fits_gymnax():
     if not (ROOT / "docs").exists():
         pytest.skip("needs a checkout")

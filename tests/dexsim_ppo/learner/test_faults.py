@@ -40,6 +40,7 @@ def with_fault(state, steps):
     return dataclasses.replace(state, env_state=dataclasses.replace(state.env_state, metrics=metrics))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("before", [0, 10])
 def test_one_reward_of_a_million_does_not_ruin_the_value_normaliser(before):
     """At the start of training and later: the deviation of returns stays of their order, and the fault is counted."""
@@ -104,6 +105,7 @@ class Unclipped(TinyEnv):
         return dataclasses.replace(after, metrics=after.metrics | {"error": jnp.max(jnp.abs(action))})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("distribution", ["gaussian", "tanh"])
 def test_actions_are_in_range_in_training_as_from_a_policy(distribution):
     """A task's reward or its `last_action` sees the same range from the learner and from `act`."""

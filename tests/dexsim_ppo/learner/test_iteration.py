@@ -248,6 +248,7 @@ def test_healthy_rewards_of_a_small_scale_are_not_bounded():
     assert 0.1 < abs(float(metrics["reward"][0])) < 10 and float(metrics["bounded_rewards"][0]) == 0
 
 
+@pytest.mark.slow
 def test_an_iteration_reports_what_it_had_and_what_it_made():
     """Of the experience, which collecting it again with the same key gives again, and of the state after it."""
     env = Watched()

@@ -18,7 +18,6 @@ from dexsim_ppo.learner.rollout import Decision, collect, scan_restarting
 from dexsim_ppo.learner.update import Learner
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("distribution", ["gaussian", "tanh"])
 def test_reaches_the_known_return(distribution):
     """29 of the best possible 31.2 with exploration on, in under 30 s with compilation."""

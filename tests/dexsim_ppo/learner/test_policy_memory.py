@@ -57,6 +57,7 @@ def policy_of(kind):
     return env, Policy.from_training(env, config, state)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["none", *KINDS])
 def test_what_was_shown_once_is_recalled_only_with_memory(kind):
     env, policy = policy_of(kind)
@@ -66,6 +67,7 @@ def test_what_was_shown_once_is_recalled_only_with_memory(kind):
     assert error > 0.35 if kind == "none" else error < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_update_begins_with_the_actions_probabilities_of_the_rollout(kind):
     _, _, samples, mean, value = experience(kind)

@@ -21,6 +21,7 @@ def tiny_task(monkeypatch):
     tiny_train.install(monkeypatch)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("memory", ["gru", "history"])
 def test_a_run_stands_for_the_policies_of_its_checkpoints(memory, tmp_path):
     run = RunFolder(tmp_path / "a")

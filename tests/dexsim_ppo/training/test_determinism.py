@@ -33,6 +33,7 @@ def unequal(first, second):
     return [path for path, x in first.items() if x.tobytes() != second[path].tobytes()]
 
 
+@pytest.mark.slow
 def test_physics_in_jax_repeats_to_the_bit_and_worlds_do_not_mix():
     env = dexsim.make("grasp", GraspConfig(pool_size=80), backend="jax", num_envs=8)
     begin = compilation.jit(jax.vmap(env.reset), once=True)(jax.random.split(jax.random.key(0), 8))
@@ -51,6 +52,7 @@ def test_physics_in_jax_repeats_to_the_bit_and_worlds_do_not_mix():
     assert not unequal(episode(1, order), {path: x[order] for path, x in once.items()})
 
 
+@pytest.mark.slow
 def test_training_on_c_repeats_to_the_bit():
     """Though its worlds are stepped by several threads."""
     env = dexsim.make("grasp", GraspConfig(pool_size=80, episode_seconds=0.6), backend="c", num_envs=8)

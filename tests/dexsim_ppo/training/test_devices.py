@@ -73,6 +73,7 @@ def assert_same_training(folder, other):
         np.testing.assert_allclose(leaf, theirs[name], rtol=2e-3, atol=2e-4, err_msg=name)
 
 
+@pytest.mark.slow
 def test_two_devices_train_and_one_goes_on(alone, tmp_path):
     half = ["--steps", str(ITERATIONS * 16 * 8 // 2)]
     run = start(*OPTIONS, *half, "--devices", 2, "--run-dir", tmp_path / "run", devices=2)
@@ -83,7 +84,7 @@ def test_two_devices_train_and_one_goes_on(alone, tmp_path):
     assert_same_training(RunFolder(tmp_path / "run"), alone)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_one_device_begins_and_two_go_on(alone, tmp_path):
     half = ["--steps", str(ITERATIONS * 16 * 8 // 2)]
     assert train.main([*OPTIONS, *half, "--run-dir", str(tmp_path / "run")]) == 0
@@ -94,7 +95,7 @@ def test_one_device_begins_and_two_go_on(alone, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("backend", ["jax", pytest.param("warp", marks=pytest.mark.long)])
+@pytest.mark.parametrize("backend", ["jax", "warp"])
 def test_two_processes_train_as_one_and_the_first_alone_writes(backend, alone, tmp_path):
     runs = start_two(*OPTIONS, *STEPS, "--backend", backend, "--run-dir", tmp_path / "run")
     said = [run.communicate(timeout=120) for run in runs]

@@ -38,6 +38,7 @@ def started(policy, config, env=None):
     return env, training, initialize_from(policy, config, training.init(jax.random.key(1)))
 
 
+@pytest.mark.slow
 def test_it_acts_like_the_policy(policy):
     config = fine_tuning_config(policy, SMALL)
     env, _, state = started(policy, config)
@@ -65,6 +66,7 @@ def test_the_critic_learns_first_and_then_both(policy):
         np.testing.assert_array_equal(mine.kernel, theirs.kernel)
 
 
+@pytest.mark.slow
 def test_what_it_knows_survives_and_grows(policy):
     """On a weaker motor: better from the first iteration on than one from nothing, never worse, better at the end."""
     env = TinyEnv(TinyConfig(gain=0.15))
@@ -86,6 +88,7 @@ def test_what_it_knows_survives_and_grows(policy):
     assert min(scores) > first - 0.02 and scores[-1] > first + 0.05, scores
 
 
+@pytest.mark.slow
 def test_from_the_command_line(policy, tiny_task, tmp_path):
     file = tmp_path / "policy.msgpack"
     dataclasses.replace(policy, env_config={**policy.env_config, "gain": 0.2}).save(file)

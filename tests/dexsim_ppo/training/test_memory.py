@@ -55,6 +55,7 @@ def test_the_device_says_what_it_has():
     assert memory.available(jax.devices("cpu")[0]) == os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
 
+@pytest.mark.slow
 def test_twice_the_environments_need_about_twice_as_much(tmp_path, monkeypatch):
     monkeypatch.setenv("DEXSIM_CACHE", str(tmp_path))
 
@@ -88,6 +89,7 @@ print(memory.needed(step), peak() - before)
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="Linux tells the peak of a process since it began")
 def test_it_is_the_peak_that_is_measured():
     path = os.pathsep.join([str(ROOT), str(ROOT / "tests" / "support")])

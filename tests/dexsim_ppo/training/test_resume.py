@@ -53,6 +53,7 @@ CHANGES = {
 }
 
 
+@pytest.mark.slow
 def test_what_would_change_the_training_is_refused_and_the_rest_applies(finished):
     """Nothing of the saved state follows from such an option, and the report would name it all the same."""
     for given, said in CHANGES.values():
@@ -130,6 +131,7 @@ def test_an_older_checkpoint_is_resumed_for_good(finished):
     assert (finished.checkpoints / "00000002.aside.msgpack").read_bytes() == content
 
 
+@pytest.mark.slow
 def test_the_best_policy_of_a_course_that_is_left_is_kept_and_not_reported(tmp_path):
     often = ["--evaluate-every", "1", "--evaluation-share", "1", "--checkpoint-every", "1", "--run-dir"]
     assert train.main([*QUICK, "--steps", str(3 * PER_ITERATION), *often, str(tmp_path / "a")]) == 0

@@ -32,6 +32,7 @@ def numbers(folder):
     return {name: np.asarray(jax.random.key_data(x) if is_key[name] else x) for name, x in leaves.items()}
 
 
+@pytest.mark.slow
 def test_seeds_in_one_program_are_the_trainings_in_turn_and_the_report_has_their_spread(tmp_path, monkeypatch, capsys):
     at_once, in_turn = tmp_path / "at-once", tmp_path / "in-turn"
     seeds = ["--seed", "4", "--seeds", "2"]
@@ -100,6 +101,7 @@ def test_the_band_is_from_the_lowest_to_the_highest_around_the_mean(tmp_path, mo
     assert not (tmp_path / "none.png").exists()
 
 
+@pytest.mark.slow
 def test_a_figure_that_one_seed_lacks_ends_no_training(tmp_path, monkeypatch):
     """As the correlation of a policy that holds too few objects; the other seed's is shown."""
     real = Run.evaluate

@@ -397,7 +397,6 @@ def exit_code(main, arguments):
     return stop.value.code
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_saves_and_says_how_to_go_on(number, tmp_path):
     command = [

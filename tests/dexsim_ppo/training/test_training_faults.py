@@ -82,6 +82,7 @@ def diverged(tmp_path, monkeypatch, capsys):
     return folder, str(error.value), capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_skipped_updates_are_shown_as_they_happen(diverged):
     folder, _, shown = diverged
     rows = read_metrics(folder.metrics)
@@ -111,6 +112,7 @@ def test_a_sound_checkpoint_is_named(tmp_path, monkeypatch):
     assert f"the newest checkpoint from before is {path}/checkpoints/00000003.msgpack" in str(error.value)
 
 
+@pytest.mark.slow
 def test_the_fault_can_be_replayed(diverged, capsys):
     folder, error, shown = diverged
     (file,) = folder.path.glob("reproduce-*.msgpack")

@@ -199,6 +199,7 @@ def test_a_press_waits_while_safety_holds_the_hand(hand, tmp_path, monkeypatch):
     assert {held[0] - 1, held[-1] + 1} < loading and not set(held) & loading
 
 
+@pytest.mark.slow
 def test_nothing_is_overwritten(hand, session, tmp_path):
     _, _, log, _ = session
     path = tmp_path / "hand.toml"

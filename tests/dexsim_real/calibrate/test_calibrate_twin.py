@@ -28,7 +28,7 @@ def torque_of(plant, joint):
     return found
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_emulated_hand_gives_its_torque_constants_back(hand, tmp_path, seed):
     """Gears with play, ripple, heat, taxels with faults, parameters outside the ranges of training; a gauge."""
@@ -56,7 +56,7 @@ def test_the_emulated_hand_gives_its_torque_constants_back(hand, tmp_path, seed)
     assert scale == pytest.approx(truth["taxel_gain"][2], rel=0.06)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_command_on_the_emulated_hand_through_the_bytes(hand, tmp_path):
     """Two processes and a terminal between them."""
     twin = subprocess.Popen(

@@ -207,6 +207,7 @@ def test_a_calibration_of_another_hand_is_refused_for_a_log(hand, recorded, tmp_
     assert samples(recorded, hand=hand, calibration=dataclasses.replace(known, serial="2R32BENCH"))
 
 
+@pytest.mark.slow
 def test_a_joint_that_fails_leaves_those_of_the_others(hand, recorded, tmp_path, monkeypatch):
     """One has too little motion, another a log with a gap; the exit code is not 0."""
 

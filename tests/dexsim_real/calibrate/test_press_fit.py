@@ -110,6 +110,7 @@ def test_a_log_gives_the_same_file_without_the_hand(hand, session, tmp_path):
     assert again.output.read_bytes() == options.output.read_bytes()
 
 
+@pytest.mark.slow
 def test_logs_add_up(hand, session, scale, tmp_path):
     """What one session left out another has pressed."""
     other = scale[1].log

@@ -78,6 +78,7 @@ class Slanted(BenchHand):
         return block
 
 
+@pytest.mark.slow
 def test_shear_that_is_there_at_rest_is_none(hand, session, tmp_path):
     log = record(Slanted(hand, plates(hand, "index pad")), hand, arguments(tmp_path, sides=False))
     presses = read_logs([log], hand)

@@ -97,6 +97,7 @@ def test_a_summary_that_cannot_be_written_is_refused_before_the_run(tmp_path):
     assert not (tmp_path / "run.log").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("failure", "reaction"), [("raises", None), ("hangs", "no target"), ("nan", "not finite")])
 def test_a_policy_that_dies_leaves_the_hand_safe(tmp_path, monkeypatch, failure, reaction):
     real, count = Controller.tick, iter(range(10**6))

@@ -46,6 +46,7 @@ def test_wrong_angles_move_nothing_as_judged_by_the_true_ones(hand, tmp_path):
     assert not [note for note in records(tmp_path, Kind.NOTE) if note.startswith("relax: implausible")]
 
 
+@pytest.mark.slow
 def test_a_wrong_angle_that_stays_ends_the_run_with_its_name(hand, tmp_path):
     with Running(hand, tmp_path, task="grasp") as running:
         process = start(running, tmp_path, "--seconds", "30")

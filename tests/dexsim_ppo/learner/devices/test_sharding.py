@@ -50,6 +50,7 @@ def communicated(devices, backend="jax"):
     return received(text)[0], [shapes.count("[") for shapes in re.findall(r"= (.*?) all-reduce(?:-start)?\(", text)]
 
 
+@pytest.mark.slow
 def test_one_two_and_eight_devices_agree_and_each_repeats_itself_to_the_bit(tmp_path):
     """In a process with eight devices, against the training without a mesh in this one."""
     done = subprocess.run(
