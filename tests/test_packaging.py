@@ -166,7 +166,6 @@ def test_wheel_holds_packages_assets_and_licence(wheel):
     assert tops == set(PACKAGES)
 
 
-@pytest.mark.slow
 def test_installed_wheel_works_from_another_directory(wheel, tmp_path):
     site, elsewhere = tmp_path / "site", tmp_path / "elsewhere"
     elsewhere.mkdir()
