@@ -7,6 +7,7 @@ asks before the motors come on (`--yes` does not). They come on at the measured 
 program, even after a failure.
 """
 
+import contextlib
 import sys
 from collections.abc import Sequence
 
@@ -62,14 +63,19 @@ def main(argv: Sequence[str] | None = None) -> int:
         summary = session.summary()
         if code == 0 and summary["missing"]:
             code = 1
-            print(f"error: {'; '.join(summary['missing'])}", file=sys.stderr)
+            _say("; ".join(summary["missing"]))
         elif code == 1:
-            print(f"error: {session.end}", file=sys.stderr)
+            _say(session.end)
         if not arguments.quiet:
             session.view.console.print(summary_table(f"{session.controller.policy.task}: {session.end}", summary))
         if arguments.output:
             cli.write_json(arguments.output, summary)
     return code
+
+
+def _say(text: str) -> None:
+    with contextlib.suppress(OSError):  # The terminal may be gone, and the summary must still be written.
+        print(f"error: {text}", file=sys.stderr)
 
 
 if __name__ == "__main__":
