@@ -2,6 +2,7 @@
 
 import dataclasses
 import errno
+import math
 import os
 import re
 import termios
@@ -115,9 +116,22 @@ def test_a_reply_is_checked_whoever_made_it():
     for answer, said in (([1, 2], "answered with list"), (True, "answered with bool"), (good.state, "with ndarray")):
         with pytest.raises(HandError, match=said):
             checked(answer, 10.0)
-    for name, value in (("sent", None), ("received", "now"), ("sequence", None), ("generation", [1])):
+    for name, value in (
+        ("sent", None),
+        ("sent", math.nan),
+        ("received", "now"),
+        ("sequence", None),
+        ("generation", [1]),
+    ):
         with pytest.raises(HandError, match=f"has {name} {re.escape(repr(value))}; expected a number"):
             checked(dataclasses.replace(good, **{name: value}), 10.0)
+
+
+def test_numbers_of_numpy_become_plain_ones():
+    """A log would keep them as arrays, and the replay could not tell which frame a tick used."""
+    reply = Reply(empty_state(), np.float64(1.0), np.float32(2.0), np.int64(3), np.uint8(1))
+    found = [getattr(checked(reply, 2.5), name) for name in ("sent", "received", "sequence", "generation")]
+    assert found == [1.0, 2.0, 3, 1] and [type(value) for value in found] == [float, float, int, int]
 
 
 class Driver:
