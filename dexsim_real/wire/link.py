@@ -142,7 +142,8 @@ def greet(port: "HandPort") -> list[str]:
       HandError: see `HandPort.connect`; or a driver returned something else than text.
     """
     line = port.connect()
-    warnings: Any = getattr(port, "warnings", list)()
+    warnings: Any = getattr(port, "warnings", list)
+    warnings = warnings() if callable(warnings) else warnings
     if not isinstance(line, str):
         raise HandError(f"the driver's `connect` returned {line!r:.80}; expected one line of text")
     if not isinstance(warnings, list | tuple) or not all(isinstance(warning, str) for warning in warnings):

@@ -68,6 +68,8 @@ def test_messages_for_the_usual_troubles(tmp_path):
     for spec in ("sdk:", "sdk::f", "sdk:.relative:f"):
         with pytest.raises(HandError, match=f"^{re.escape(spec)}: .*give sdk:MODULE:FUNCTION"):
             open_port(spec, QUICK)
+    with pytest.raises(HandError, match="^sdk:math:pi: pi is no function; give sdk:MODULE:FUNCTION"):
+        open_port("sdk:math:pi", QUICK)
 
 
 def test_an_error_of_a_driver_is_its_own(tmp_path, monkeypatch):
@@ -151,7 +153,9 @@ def test_a_driver_may_reuse_its_buffer():
 
 
 def test_what_a_driver_tells_is_checked():
-    assert greet(Driver(warnings=lambda: ["slow"])) == ["a hand", "warning: slow"] and greet(Driver()) == ["a hand"]
+    for warnings in (lambda: ["slow"], ["slow"]):
+        assert greet(Driver(warnings=warnings)) == ["a hand", "warning: slow"]
+    assert greet(Driver()) == ["a hand"]
     for parts, said in (
         ({"connect": lambda: None}, "`connect` returned None"),
         ({"connect": lambda: (1, "a")}, r"`connect` returned \(1, 'a'\)"),
