@@ -95,6 +95,18 @@ def test_a_port_that_vanishes_while_it_opens_is_a_hand_that_is_gone(monkeypatch)
         Imu("/dev/imu")
 
 
+def test_a_url_whose_port_lacks_a_setting_is_refused_in_one_line(monkeypatch):
+    """Such as rfc2217://, which has no limit on the time of writing."""
+    import serial
+
+    def lack(*_, **__):
+        raise NotImplementedError("write_timeout is currently not supported")
+
+    monkeypatch.setattr(serial, "serial_for_url", lack)
+    with pytest.raises(HandError, match="^rfc2217://host:1: cannot be opened .write_timeout"):
+        SerialHand("rfc2217://host:1", QUICK).connect()
+
+
 def test_a_reply_is_checked_whoever_made_it():
     """A stamp of another clock would never grow old: `Safety` would not notice that the hand is silent."""
     good = Reply(empty_state(), 9.99, 10.0, 1, 1)
