@@ -31,6 +31,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     if not (arguments.yes or arguments.motors_off):
         consent.check_terminal()
+    inputs = {"policy": arguments.policy, "calibration": arguments.calibration, "TOML of the hand": arguments.hand}
+    cli.check_apart({"--log": arguments.log, "--output": arguments.output}, inputs)
     if arguments.output:
         cli.check_writable(arguments.output)
     prepare_jax()

@@ -252,6 +252,9 @@ def test_what_cannot_be_written_is_said_before_the_replay(tmp_path, monkeypatch)
     for option in ("--plot", "--rrd", "--output"):
         with pytest.raises(IsADirectoryError, match="taken.png"):
             replay_command.main([log, option, str(tmp_path / "taken.png")])
+    (tmp_path / "run.log").touch()
+    with pytest.raises(DexsimError, match="--output .*run.log: is the log; name another file"):
+        replay_command.main([log, "--output", log])
     pytest.importorskip("pyarrow")
     with pytest.raises(DexsimError, match="taken.png: exists already"):
         replay_command.main([log, "--lerobot", str(tmp_path / "taken.png")])

@@ -23,6 +23,7 @@ from following_hand import FollowingHand, arguments, records, summary
 
 from dexsim.core import cli
 from dexsim.core.config import to_dict
+from dexsim.core.errors import DexsimError
 from dexsim.observation import layout
 from dexsim.task_spec import TaskSpec
 from dexsim.tasks.rotate.config import RotateConfig
@@ -117,6 +118,8 @@ def test_a_summary_that_cannot_be_written_is_refused_before_the_run(tmp_path):
     options = ["--port", "none", "--uncalibrated", "--yes", "--log", str(tmp_path / "run.log")]
     with pytest.raises(IsADirectoryError, match=str(tmp_path)):
         run.main(["grasp", *options, "--output", str(tmp_path)])
+    with pytest.raises(DexsimError, match="--output .*run.log: is the file of --log, too"):
+        run.main(["grasp", *options, "--output", str(tmp_path / "run.log")])
     assert not (tmp_path / "run.log").exists()
 
 
