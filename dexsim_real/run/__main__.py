@@ -46,7 +46,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 session.run()
             except HandError as error:
                 reason, code = str(error), 1
-                if not session.started:
+                if not (session.started or session.safety.engaged):  # Nothing has moved.
                     raise
             except KeyboardInterrupt:
                 reason, code = "Ctrl-C", 130
