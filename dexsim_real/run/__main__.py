@@ -51,8 +51,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             except KeyboardInterrupt:
                 reason, code = "Ctrl-C", 130
             except SystemExit as stop:
-                code = stop.code if isinstance(stop.code, int) else 1
-                reason = f"signal {code - 128}"
+                code = stop.code if isinstance(stop.code, int) and stop.code > 128 else 1
+                reason = f"signal {code - 128}" if code > 128 else f"a driver exits: {stop.code}"
             except BaseException as error:
                 reason = f"failure: {error!r}"
                 raise

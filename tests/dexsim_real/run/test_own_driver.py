@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 pytest.importorskip("serial")
-from following_hand import arguments
+from following_hand import arguments, summary
 
 from dexsim_real.core.errors import HandError
 from dexsim_real.run import __main__ as run
@@ -64,3 +64,11 @@ def test_what_ends_the_exchanges_before_the_motors_come_on_is_told(start, troubl
     """Not that the hand has stopped answering."""
     with pytest.raises(HandError, match=f"the exchange thread failed: .*{says}"):
         start(Driver(trouble, after=_TARED))
+
+
+@pytest.mark.parametrize("code", ["no hand found", 0])
+def test_a_driver_that_exits_is_no_signal_and_no_success(start, tmp_path, monkeypatch, capsys, code):
+    driver = Driver(broken, after=0)
+    monkeypatch.setattr(driver, "connect", lambda: sys.exit(code))
+    assert start(driver) == 1
+    assert capsys.readouterr().err == f"error: a driver exits: {code}\n" and summary(tmp_path)["motors_off"]
