@@ -49,6 +49,19 @@ def test_a_wrong_angle_before_a_silence_remains_wrong_after_it(bench):
     assert bench.safety.latched.startswith("implausible measurements for 1 s: joint index_joint1")
 
 
+@pytest.mark.parametrize("generation", [1, 2])
+def test_after_a_reading_that_was_no_number_several_must_agree_as_well(bench, generation):
+    """It was the last before the hand was silent for long, or disconnected."""
+    bench.position = np.full(12, np.nan, np.float32)
+    bench.cycle(wish=MIDDLE, follow=False)
+    if generation == 1:
+        assert bench.run(2.0, wish=MIDDLE, fresh=False, follow=False)[-1].mode == Mode.PASSIVE
+    bench.position = MIDDLE - np.float32(0.1) * FREE
+    back = [bench.cycle(wish=MIDDLE, generation=generation) for _ in range(3)]
+    assert [decision.mode for decision in back] == [Mode.PASSIVE, Mode.PASSIVE, Mode.POSITION]
+    assert {decision.reason for decision in back[:2]} == {"the pose is not known yet"}
+
+
 def test_a_short_silence_does_not_turn_the_motors_off(bench):
     decisions = bench.run(0.9, wish=MIDDLE, fresh=False) + bench.run(0.1, wish=MIDDLE)
     assert {decision.mode for decision in decisions} == {Mode.POSITION}
