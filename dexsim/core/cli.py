@@ -11,7 +11,7 @@ import platform
 import re
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -185,6 +185,24 @@ def check_writable(path: Path) -> None:
     place = path if is_device(path) else Path(os.path.realpath(path)).parent
     if not os.access(place, os.W_OK):
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(place))
+
+
+def check_apart(outputs: Mapping[str, Path | None], inputs: Mapping[str, str | Path | None]) -> None:
+    """Check that no file which a command writes is one that it reads, or another one that it writes.
+
+    Args:
+      outputs: option to its file.
+      inputs: what it is to its file, or to a name that may be none.
+
+    Raises:
+      ConfigError: there is such a file.
+    """
+    taken = {os.path.realpath(path): f"is the {what}" for what, path in inputs.items() if path and Path(path).is_file()}
+    for option, path in outputs.items():
+        if path and not is_device(path):
+            if found := taken.get(place := os.path.realpath(path)):
+                raise ConfigError(f"{option} {path}: {found}; name another file")
+            taken[place] = f"is the file of {option}, too"
 
 
 def write_json(path: Path, data: Any) -> None:

@@ -28,7 +28,7 @@ def turn_off(port: HandPort, command: np.ndarray, seconds: float) -> bool:
         try:
             if isinstance(port.exchange(command), Reply):
                 return True
-        except Exception:  # Of a driver from elsewhere, which may work again.
+        except (Exception, SystemExit):  # Of a driver from elsewhere, which may work again.
             time.sleep(_PAUSE)
         if time.monotonic() > until:
             return False

@@ -75,7 +75,9 @@ class PoseCheck:
             return f"{self._say(position, jumped)}, too far from {last[jumped.argmax()]:.2f} rad before"
         self._last, self._known_time = position, time
         self._low = self._high = command
-        return ""
+        if command is None:  # The motors went off unseen: others must agree with this reading.
+            self._agreeing = 1
+        return "" if self.known else UNKNOWN
 
     def _say(self, position: np.ndarray, wrong: np.ndarray) -> str:
         joint = int(wrong.argmax())

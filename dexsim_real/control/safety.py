@@ -184,9 +184,9 @@ class Safety:
             self.relax(fatal)
             return self._finish(now, Reaction.RELAX, fatal, self._rest())
         if self._commanded is None:
-            if self.problem or self._alarms.hold or not self._pose.known:
-                silent = now - sample.time > self.config.stale and not self.problem
-                why = self._silence() if silent else self.problem or self._alarms.hold or UNKNOWN
+            silent = now - sample.time > self.config.stale  # The hand may have been moved since.
+            if silent or self.problem or self._alarms.hold or not self._pose.known:
+                why = self.problem or (self._silence() if silent else self._alarms.hold or UNKNOWN)
                 return self._finish(now, Reaction.RELAX, why, self._rest())
             self._start(now, sample)
         wish = self._target  # Read once: another thread may replace it meanwhile.

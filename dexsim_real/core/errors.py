@@ -8,8 +8,9 @@ from pathlib import Path
 
 from dexsim.core.errors import DexsimError
 
-PORT_ERRORS = (OSError, ValueError, termios.error)
-"""What opening a serial port raises; the last, no `OSError`, when the port vanishes meanwhile."""
+PORT_ERRORS = (OSError, ValueError, NotImplementedError, termios.error)
+"""What opening a serial port raises; the last, no `OSError`, when the port vanishes meanwhile, and the one before for a
+URL whose kind of port lacks a setting, such as rfc2217://."""
 
 
 class HandError(DexsimError):

@@ -16,13 +16,16 @@ def find_function(name: str, given: str, form: str, default: str = "") -> Callab
       form: what to give, for the error.
 
     Raises:
-      HandError: no such module or function, or the module fails when it is imported.
+      HandError: no such module or function, it is no function, or the module fails when it is imported.
     """
     module, _, function = name.partition(":")
     try:
-        return getattr(importlib.import_module(module), function or default)
+        found = getattr(importlib.import_module(module), function or default)
     except (Exception, SystemExit) as error:  # The module is the user's: importing it may raise anything.
         says = " ".join(str(error).split())
         if not isinstance(error, (ImportError, AttributeError)):
             says = f"{type(error).__name__}: {says}".removesuffix(": ")
         raise HandError(f"{given}: {says:.200}; give {form}") from None
+    if not callable(found):
+        raise HandError(f"{given}: {function or default} is no function; give {form}")
+    return found

@@ -53,7 +53,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         prog="python -m dexsim_real.replay",
         description="Recompute and plot the log of a run on the hand.",
     )
-    for path in (arguments.plot, arguments.rrd, arguments.output):
+    outputs = {"--plot": arguments.plot, "--rrd": arguments.rrd, "--output": arguments.output}
+    cli.check_apart(outputs, {"log": arguments.log, "TOML of the hand": arguments.hand})
+    for path in outputs.values():
         if path:
             cli.check_writable(path)
     if arguments.lerobot:

@@ -7,6 +7,7 @@ asks before the motors come on (`--yes` does not). They come on at the measured 
 program, even after a failure.
 """
 
+import contextlib
 import sys
 from collections.abc import Sequence
 
@@ -30,6 +31,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     if not (arguments.yes or arguments.motors_off):
         consent.check_terminal()
+    inputs = {"policy": arguments.policy, "calibration": arguments.calibration, "TOML of the hand": arguments.hand}
+    cli.check_apart({"--log": arguments.log, "--output": arguments.output}, inputs)
     if arguments.output:
         cli.check_writable(arguments.output)
     prepare_jax()
@@ -43,13 +46,13 @@ def main(argv: Sequence[str] | None = None) -> int:
                 session.run()
             except HandError as error:
                 reason, code = str(error), 1
-                if not session.started:
+                if not (session.started or session.safety.engaged):  # Nothing has moved.
                     raise
             except KeyboardInterrupt:
                 reason, code = "Ctrl-C", 130
             except SystemExit as stop:
-                code = stop.code if isinstance(stop.code, int) else 1
-                reason = f"signal {code - 128}"
+                code = stop.code if isinstance(stop.code, int) and stop.code > 128 else 1
+                reason = f"signal {code - 128}" if code > 128 else f"a driver exits: {stop.code}"
             except BaseException as error:
                 reason = f"failure: {error!r}"
                 raise
@@ -62,14 +65,19 @@ def main(argv: Sequence[str] | None = None) -> int:
         summary = session.summary()
         if code == 0 and summary["missing"]:
             code = 1
-            print(f"error: {'; '.join(summary['missing'])}", file=sys.stderr)
+            _say("; ".join(summary["missing"]))
         elif code == 1:
-            print(f"error: {session.end}", file=sys.stderr)
+            _say(session.end)
         if not arguments.quiet:
             session.view.console.print(summary_table(f"{session.controller.policy.task}: {session.end}", summary))
         if arguments.output:
             cli.write_json(arguments.output, summary)
     return code
+
+
+def _say(text: str) -> None:
+    with contextlib.suppress(OSError):  # The terminal may be gone, and the summary must still be written.
+        print(f"error: {text}", file=sys.stderr)
 
 
 if __name__ == "__main__":

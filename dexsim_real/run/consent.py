@@ -1,6 +1,8 @@
 """Nobody's hand moves unasked: the question before the motors come on."""
 
+import contextlib
 import sys
+import termios
 
 from dexsim_real.core.errors import HandError
 
@@ -29,6 +31,8 @@ def ask() -> None:
     Raises:
       HandError: the answer is not yes.
     """
+    with contextlib.suppress(OSError, ValueError, termios.error):
+        termios.tcflush(sys.stdin.fileno(), termios.TCIFLUSH)  # What was typed before the question is no answer to it.
     print(_QUESTION, end="", file=sys.stderr, flush=True)
     if sys.stdin.readline().strip().lower() not in ("y", "yes"):
         raise HandError("the answer was not yes: the motors stayed off")

@@ -129,19 +129,23 @@ def main(argv: Sequence[str]) -> int:
     for name in _SIGNALS:
         signal.signal(getattr(signal, name), signal.SIG_IGN)
     runner, port, options = os.getppid(), argv[0], json.loads(argv[1])
+    # What a driver prints must not be taken for the word below, nor fail once the runner is gone.
+    words = os.dup(1)
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     link = LinkConfig(**options | {"settle": 0.0, "backoff": _BACKOFF})
     # Now, so that nothing must be loaded when it counts.
     module = port.removeprefix("sdk:").partition(":")[0] if port.startswith("sdk:") else "serial"
     with contextlib.suppress(ImportError):  # The runner says so.
         importlib.import_module(module)
     with contextlib.suppress(OSError):  # The runner may have ended already.
-        os.write(1, b"ready\n")
+        os.write(words, b"ready\n")
     why = _watch(sys.stdin.fileno())
     if not why:
         return 0
     if why == _FROZEN:
         _kill(runner, sys.stdin.fileno())
-    done = _stop(port, link)
+    with open(os.devnull, "w") as nowhere, contextlib.redirect_stderr(nowhere):  # The terminal may be gone, too.
+        done = _stop(port, link)
     text = "motors off" if done else f"{UNCONFIRMED}; press the emergency stop"
     print(f"guard: {why}: {text}", file=sys.stderr, flush=True)
     return 0 if done else 1
@@ -175,13 +179,14 @@ def _kill(runner: int, pipe: int) -> None:
 
 def _stop(port: str, link: LinkConfig) -> bool:
     """Turn the motors off; returns whether the hand has confirmed it."""
-    until, pause = time.monotonic() + _PATIENCE, _BACKOFF[0]
+    done, until, pause = False, time.monotonic() + _PATIENCE, _BACKOFF[0]
     while time.monotonic() < until:
         # Whatever somebody's own port does here, the next attempt may succeed.
-        with contextlib.suppress(Exception), contextlib.closing(open_port(port, link)) as hand:
+        with contextlib.suppress(Exception, SystemExit), contextlib.closing(open_port(port, link)) as hand:
             hand.connect()
-            if turn_off(hand, passive_command(), _ATTEMPT):
-                return True
+            done = turn_off(hand, passive_command(), _ATTEMPT)
+        if done:  # Also where the port could not be closed.
+            return True
         time.sleep(pause)
         pause = min(2 * pause, _BACKOFF[1])
     return False

@@ -197,6 +197,7 @@ class Session:
 
     def _await_pose(self) -> None:
         if self.servo.wait_fresh(1.0) is None:
+            self._check_servo()
             if self.safety.problem:
                 raise HandError(f"{self.arguments.port}: {self.safety.problem}; check `--hardware.joint-offset`")
             why = self.safety.refused or "the hand stopped answering; check the cable and the power"
@@ -232,11 +233,14 @@ class Session:
     def _check(self) -> None:
         if self.guard:
             self.guard.check()
+        self._check_servo()
+        if self.safety.latched:
+            raise HandError(f"stopped: {self.safety.latched}")
+
+    def _check_servo(self) -> None:
         if (error := self.servo.error) is not None:
             why = error if isinstance(error, HandError) else repr(error)
             raise HandError(f"the exchange thread failed: {why}")
-        if self.safety.latched:
-            raise HandError(f"stopped: {self.safety.latched}")
 
     def _loop(self) -> str:
         anchor, self.started = self.safety.anchor, time.monotonic()

@@ -1,10 +1,12 @@
 """The status of a run on the terminal: live tables, or a line every few seconds when the output is no terminal."""
 
+import contextlib
 import dataclasses
+import sys
 import threading
 from collections import deque
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TextIO, cast
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
@@ -25,6 +27,25 @@ class Status:
     hand: HandState | None = None  # None without a measurement
 
 
+class _Lasting:
+    """A stream to which writing never fails: a terminal that was closed, or a pipe without a reader, ends no run."""
+
+    def __init__(self, stream: TextIO):
+        self._stream = stream
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        with contextlib.suppress(OSError):
+            self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        with contextlib.suppress(OSError):
+            self._stream.flush()
+
+
 class StatusView:
     """Shows `status()` from a background thread. A context manager.
 
@@ -35,7 +56,8 @@ class StatusView:
     """
 
     def __init__(self, title: str, status: Callable[[], Status], quiet: bool = False):
-        self.console = Console(stderr=True, quiet=quiet)
+        stream = cast(TextIO, _Lasting(sys.stderr)) if sys.stderr else None
+        self.console = Console(stderr=True, quiet=quiet, file=stream)
         self._title, self._status = title, status
         self._live = (
             Live(console=self.console, auto_refresh=False, transient=True)
@@ -69,8 +91,9 @@ class StatusView:
         self.console.print(self._tables(self._status()))
 
     def _print_notes(self) -> None:
-        while self._notes:
-            self.console.print(self._notes.popleft(), highlight=False, markup=False, soft_wrap=True)
+        with contextlib.suppress(IndexError):  # Another thread may have printed the last one.
+            while True:
+                self.console.print(self._notes.popleft(), highlight=False, markup=False, soft_wrap=True)
 
     def _run(self) -> None:
         lower_priority()

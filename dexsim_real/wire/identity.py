@@ -15,6 +15,7 @@ SIDE, SERIAL_NUMBER = 20, 21
 """Registers."""
 _WORDS = {"l": "left", "left": "left", "r": "right", "right": "right", "2l32": "left", "2r32": "right"}
 _SIDES = ("left", "right")
+_CODE = "code "
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,7 +38,7 @@ def read_identity(serial_number: bytes | None, side: bytes | None) -> Identity:
     for word in (_text(side or b""), text[:4]):
         if word.lower() in _WORDS:
             return Identity(text, _WORDS[word.lower()])
-    return Identity(text, f"code {side[0]}" if side else "")
+    return Identity(text, f"{_CODE}{side[0]}" if side else "")
 
 
 def check_identity(identity: Identity | None, hand: Hand, calibration: Calibration | None = None) -> list[str]:
@@ -54,6 +55,14 @@ def check_identity(identity: Identity | None, hand: Hand, calibration: Calibrati
     if identity is not None and not isinstance(identity, Identity):
         raise HandError(f"the driver's `identity` is {identity!r:.80}; expected an `Identity`, or None")
     found = identity or Identity()
+    for name, value in dataclasses.asdict(found).items():
+        if not isinstance(value, str):
+            raise HandError(f"the driver's `identity` has {name} {value!r:.80}; expected text")
+    if found.handedness not in ("", *_SIDES) and not found.handedness.startswith(_CODE):
+        raise HandError(
+            f"the driver's `identity` has handedness {found.handedness!r:.80}; expected 'left', 'right' or '', or "
+            f"'{_CODE}' and what the hand told"
+        )
     model = next((side for side in _SIDES if side in hand.name), "")
     if model and found.handedness in _SIDES and found.handedness != model:
         raise HandError(
@@ -75,7 +84,7 @@ def check_identity(identity: Identity | None, hand: Hand, calibration: Calibrati
         notes.append("the hand does not tell its serial number: another hand on this port would not be noticed")
     elif calibration and not serial:
         notes.append("the calibration names no serial number: it may be of another hand")
-    if found.handedness.startswith("code"):
+    if found.handedness.startswith(_CODE):
         notes.append(f"the hand gives its side as {found.handedness}, whose meaning is not known")
     return [f"warning: {note}" for note in notes]
 

@@ -105,8 +105,11 @@ def checked(reply: Reply, now: float) -> Reply:
     for name, kind in _NUMBERS.items():
         if not isinstance(value := getattr(reply, name), kind):
             raise HandError(f"the driver's reply has {name} {value!r:.80}; expected a number")
-    # A copy: a driver may have one buffer for all its answers.
-    state, received = np.copy(reply.state) if isinstance(reply.state, np.ndarray) else reply.state, reply.received
+    # A copy: a driver may have one buffer for all its answers. Plain numbers: a log keeps NumPy's as arrays.
+    state = np.copy(reply.state) if isinstance(reply.state, np.ndarray) else reply.state
+    sent, received = float(reply.sent), float(reply.received)
+    if not math.isfinite(sent):
+        raise HandError(f"the driver's reply has sent {sent!r}; expected a number")
     if not isinstance(state, np.ndarray) or state.dtype != frames.STATE_BLOCK or state.shape != ():
         found = f"{state.dtype.name} {list(state.shape)}" if isinstance(state, np.ndarray) else type(state).__name__
         raise HandError(f"the driver's reply has a state of {found}; expected one `frames.STATE_BLOCK`")
@@ -116,7 +119,8 @@ def checked(reply: Reply, now: float) -> Reply:
         raise HandError(
             f"the driver stamped its reply {received - now:.3g} s ahead: `Reply.received` is of `time.monotonic()`"
         )
-    return dataclasses.replace(reply, state=state, received=min(received, now))
+    sequence, generation = int(reply.sequence), int(reply.generation)
+    return Reply(state, sent, min(received, now), sequence, generation)
 
 
 def refusal_of(port: "HandPort") -> Refusal | None:
@@ -138,7 +142,8 @@ def greet(port: "HandPort") -> list[str]:
       HandError: see `HandPort.connect`; or a driver returned something else than text.
     """
     line = port.connect()
-    warnings: Any = getattr(port, "warnings", list)()
+    warnings: Any = getattr(port, "warnings", list)
+    warnings = warnings() if callable(warnings) else warnings
     if not isinstance(line, str):
         raise HandError(f"the driver's `connect` returned {line!r:.80}; expected one line of text")
     if not isinstance(warnings, list | tuple) or not all(isinstance(warning, str) for warning in warnings):

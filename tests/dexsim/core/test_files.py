@@ -4,13 +4,14 @@ import os
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import jax
 import pytest
 from paths import ROOT
 
 from dexsim.core import cli
-from dexsim.core.errors import DexsimWarning
+from dexsim.core.errors import ConfigError, DexsimWarning
 from dexsim.core.files import make_private, read_toml, write_whole
 
 # Writes half of a file, says so, and waits to be killed.
@@ -72,6 +73,21 @@ def test_a_pipe_is_written_into_and_a_link_stays_a_link(tmp_path):
         os.close(reader)
     assert pipe.is_fifo() and link.is_symlink()
     assert {path.name for path in tmp_path.iterdir()} == {"pipe", "link.json", "elsewhere"}
+
+
+def test_what_a_command_writes_replaces_nothing_that_it_reads_or_wrote(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    read, link, new = tmp_path / "read.toml", tmp_path / "link", tmp_path / "new.json"
+    read.touch()
+    link.symlink_to(read)
+    for path in (Path("read.toml"), link):
+        with pytest.raises(ConfigError, match=f"^--output {path}: is the calibration; name another file"):
+            cli.check_apart({"--output": path}, {"policy": "grasp", "calibration": read})
+    with pytest.raises(ConfigError, match="^--output new.json: is the file of --log, too"):
+        cli.check_apart({"--log": new, "--output": Path("new.json")}, {})
+    nowhere = Path(os.devnull)
+    cli.check_apart({"--log": nowhere, "--output": nowhere, "--plot": None}, {"calibration": None})
+    cli.check_apart({"--output": Path("grasp")}, {"policy": "grasp"})  # a name, and no file
 
 
 def test_a_toml_may_begin_with_a_byte_order_mark(tmp_path):

@@ -49,6 +49,32 @@ def test_a_wrong_angle_before_a_silence_remains_wrong_after_it(bench):
     assert bench.safety.latched.startswith("implausible measurements for 1 s: joint index_joint1")
 
 
+def test_the_motors_do_not_come_on_at_a_pose_that_was_measured_a_while_ago(hand):
+    """Asked for while the hand is silent, which somebody may be moving meanwhile."""
+    bench = Bench(hand)
+    bench.engage()
+    bench.now += 0.06  # s
+    asked = bench.run(0.5, wish=MIDDLE, fresh=False)
+    assert {(decision.mode, decision.reason) for decision in asked} == {(Mode.PASSIVE, "no measurement")}
+    bench.position = SAGGED
+    modes = [bench.cycle(wish=MIDDLE).mode for _ in range(4)]
+    assert Mode.POSITION in modes and not bench.safety.latched
+    assert np.abs(bench.safety.commanded - SAGGED).max() < 0.03
+
+
+@pytest.mark.parametrize("generation", [1, 2])
+def test_after_a_reading_that_was_no_number_several_must_agree_as_well(bench, generation):
+    """It was the last before the hand was silent for long, or disconnected."""
+    bench.position = np.full(12, np.nan, np.float32)
+    bench.cycle(wish=MIDDLE, follow=False)
+    if generation == 1:
+        assert bench.run(2.0, wish=MIDDLE, fresh=False, follow=False)[-1].mode == Mode.PASSIVE
+    bench.position = MIDDLE - np.float32(0.1) * FREE
+    back = [bench.cycle(wish=MIDDLE, generation=generation) for _ in range(3)]
+    assert [decision.mode for decision in back] == [Mode.PASSIVE, Mode.PASSIVE, Mode.POSITION]
+    assert {decision.reason for decision in back[:2]} == {"the pose is not known yet"}
+
+
 def test_a_short_silence_does_not_turn_the_motors_off(bench):
     decisions = bench.run(0.9, wish=MIDDLE, fresh=False) + bench.run(0.1, wish=MIDDLE)
     assert {decision.mode for decision in decisions} == {Mode.POSITION}

@@ -171,7 +171,15 @@ def forged(folder):
     assert report["observations_same"] == report["ticks"] - 1 and report["first_difference"].startswith("tick 9 ")
     assert replay_command.main([str(path)]) == 1
     for number, (kind, name, value) in enumerate(
-        ((Kind.TICK, "readings", 1.0), (Kind.TICK, "sequence", [1]), (Kind.META, "calibration", {"a": 1}))
+        (
+            (Kind.TICK, "readings", 1.0),
+            (Kind.TICK, "sequence", [1]),
+            (Kind.TICK, "target", np.zeros(3)),  # figures and datasets are made of these two
+            (Kind.TICK, "age", "young"),
+            (Kind.META, "calibration", {"a": 1}),
+            (Kind.META, "tare", np.full((5, 120), np.nan)),
+            (Kind.META, "environment", b"of no JSON"),
+        )
     ):
         path = folder / f"forged_{number}.log"
         with LogWriter(path) as log:
@@ -252,6 +260,9 @@ def test_what_cannot_be_written_is_said_before_the_replay(tmp_path, monkeypatch)
     for option in ("--plot", "--rrd", "--output"):
         with pytest.raises(IsADirectoryError, match="taken.png"):
             replay_command.main([log, option, str(tmp_path / "taken.png")])
+    (tmp_path / "run.log").touch()
+    with pytest.raises(DexsimError, match="--output .*run.log: is the log; name another file"):
+        replay_command.main([log, "--output", log])
     pytest.importorskip("pyarrow")
     with pytest.raises(DexsimError, match="taken.png: exists already"):
         replay_command.main([log, "--lerobot", str(tmp_path / "taken.png")])

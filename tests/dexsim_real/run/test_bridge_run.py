@@ -23,6 +23,7 @@ from following_hand import FollowingHand, arguments, records, summary
 
 from dexsim.core import cli
 from dexsim.core.config import to_dict
+from dexsim.core.errors import DexsimError
 from dexsim.observation import layout
 from dexsim.task_spec import TaskSpec
 from dexsim.tasks.rotate.config import RotateConfig
@@ -79,6 +80,29 @@ def test_the_live_table(monkeypatch):
         assert text in shown.getvalue()
 
 
+@pytest.mark.parametrize("gone", ["window", "pipe"])
+def test_a_terminal_that_is_gone_ends_no_run(monkeypatch, gone):
+    """An SSH connection that broke, a `tee` that Ctrl-C ended: with Rich alone the exchange thread would end."""
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setattr(status, "_LIVE", 0.02)
+    far, near = os.openpty() if gone == "window" else os.pipe()
+    screen = os.fdopen(near, "w", buffering=1)
+    monkeypatch.setattr("sys.stderr", screen)
+    view = status.StatusView("a title", lambda: status.Status({"age": "3.1 ms"}))
+    os.close(far)
+    try:
+        view.note("before")
+        view.show()
+        with pytest.raises(SystemExit, match="129"), view:
+            time.sleep(0.1)
+            raise SystemExit(129)
+        view.note("end")
+    finally:
+        with open(os.devnull, "w") as nowhere:
+            os.dup2(nowhere.fileno(), near)  # What the stream still holds can be written now.
+        screen.close()
+
+
 def test_text_in_brackets_is_shown_as_it_is(monkeypatch):
     """Such as a driver's error that names its port: to Rich it is markup, or an error."""
     text, shown = "cannot open [/dev/ttyUSB0] [bold]", io.StringIO()
@@ -94,6 +118,8 @@ def test_a_summary_that_cannot_be_written_is_refused_before_the_run(tmp_path):
     options = ["--port", "none", "--uncalibrated", "--yes", "--log", str(tmp_path / "run.log")]
     with pytest.raises(IsADirectoryError, match=str(tmp_path)):
         run.main(["grasp", *options, "--output", str(tmp_path)])
+    with pytest.raises(DexsimError, match="--output .*run.log: is the file of --log, too"):
+        run.main(["grasp", *options, "--output", str(tmp_path / "run.log")])
     assert not (tmp_path / "run.log").exists()
 
 

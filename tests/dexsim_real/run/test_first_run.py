@@ -1,7 +1,10 @@
 """The first run on a hand: what is shown of it, and the question before the motors come on."""
 
 import io
+import os
 import re
+import select
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -122,6 +125,22 @@ def test_the_motors_stay_off_after_anything_else(tmp_path, asked, answer):
         assert (code, terminal.motors) == (None, False)
         assert peer.commands and not peer.on().any()
     assert "not yes" in records(tmp_path, Kind.END)[0]["end"]
+
+
+def test_what_was_typed_before_the_question_is_no_answer(monkeypatch):
+    """The motors come on at a pose that has been shown."""
+    master, slave = os.openpty()
+    try:
+        with os.fdopen(slave) as terminal:
+            monkeypatch.setattr("sys.stdin", terminal)
+            os.write(master, b"y\n")
+            assert select.select([terminal], [], [], 5)[0]
+            error = SimpleNamespace(write=lambda text: os.write(master, b"n\n"), flush=lambda: None)
+            monkeypatch.setattr("sys.stderr", error)
+            with pytest.raises(HandError, match="the motors stayed off"):
+                consent.ask()
+    finally:
+        os.close(master)
 
 
 @pytest.mark.parametrize("missing", ["stdin", "stderr"])

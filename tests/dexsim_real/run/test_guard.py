@@ -124,3 +124,34 @@ def test_the_guard_stops_a_hand_on_somebodys_own_port(peer, tmp_path, monkeypatc
     guard.dismiss(off=False)
     assert guard._process.wait(10) == 0
     assert peer.commands and not peer.on().any()
+
+
+def test_the_guard_stops_a_hand_whose_driver_prints_exits_and_cannot_be_closed(peer, tmp_path, monkeypatch):
+    """What it prints is no word of the guard's, and has no reader once the runner is gone."""
+    (tmp_path / "loud_sdk.py").write_text(
+        "import sys\n"
+        "from dexsim_real.wire.serial_hand import SerialHand\n"
+        "print('SDK 1.0', flush=True)\n"
+        "opened = []\n"
+        "class Loud:\n"
+        "    def __init__(self, *given):\n"
+        "        self.hand = SerialHand(*given)\n"
+        "        self.counts, self.exchange = self.hand.counts, self.hand.exchange\n"
+        "    def connect(self):\n"
+        "        print('connecting', flush=True)\n"
+        "        if len(opened) < 2:\n"
+        "            sys.exit('not found')\n"
+        "        return self.hand.connect()\n"
+        "    def close(self):\n"
+        "        self.hand.close()\n"
+        "        raise RuntimeError('close failed')\n"
+        "def open_hand(config):\n"
+        "    opened.append(config)\n"
+        f"    return Loud({peer.port!r}, config)\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    guard = Guard("sdk:loud_sdk", QUICK)
+    guard.arm()
+    guard.dismiss(off=False)
+    assert guard._process.wait(10) == 0
+    assert peer.commands and not peer.on().any()

@@ -136,12 +136,12 @@ def test_a_driver_that_fails_is_asked_again_and_only_a_reply_confirms():
 
         def exchange(self, command):
             answer = self.answers.pop(0) if len(self.answers) > 1 else self.answers[0]
-            if isinstance(answer, Exception):
+            if isinstance(answer, BaseException):
                 raise answer
             return answer
 
     gone, reply = OSError("the adapter is gone"), Reply(empty_state(), 0.0, 0.0, 1, 1)
-    port = Failing([gone, None, False, gone, reply])
+    port = Failing([gone, None, False, SystemExit(1), reply])
     assert turn_off(port, passive_command(), 5.0) and port.answers == [reply]
     for answer in (gone, False, True):
         assert not turn_off(Failing([answer]), passive_command(), 0.05)

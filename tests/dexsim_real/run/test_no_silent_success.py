@@ -54,6 +54,19 @@ def test_a_hand_that_was_gone_for_most_of_the_run(tmp_path, capsys):
     assert "no measurement for " in line and "the policy were not finite" not in line
 
 
+def test_a_hand_that_is_stopped_on_its_way_to_the_start_posture(tmp_path, capsys):
+    """As in the run itself: its motors were on."""
+
+    def heat(index, state):
+        state["joint"]["temperature"] = 30 if index < 50 else 95
+
+    with FollowingHand(heat) as peer:
+        assert run.main(arguments(peer, tmp_path, "--place", "20")) == 1
+        assert peer.on().any() and not peer.on()[-1]
+    end = summary(tmp_path)["end"]
+    assert end.startswith("stopped: too hot") and lines(capsys) == [f"error: {end}"]
+
+
 def test_a_policy_whose_actions_are_not_finite(tmp_path, capsys, monkeypatch):
     real = Controller.tick
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import errno
+import math
 import os
 import re
 import termios
@@ -67,6 +68,8 @@ def test_messages_for_the_usual_troubles(tmp_path):
     for spec in ("sdk:", "sdk::f", "sdk:.relative:f"):
         with pytest.raises(HandError, match=f"^{re.escape(spec)}: .*give sdk:MODULE:FUNCTION"):
             open_port(spec, QUICK)
+    with pytest.raises(HandError, match="^sdk:math:pi: pi is no function; give sdk:MODULE:FUNCTION"):
+        open_port("sdk:math:pi", QUICK)
 
 
 def test_an_error_of_a_driver_is_its_own(tmp_path, monkeypatch):
@@ -92,6 +95,18 @@ def test_a_port_that_vanishes_while_it_opens_is_a_hand_that_is_gone(monkeypatch)
         Imu("/dev/imu")
 
 
+def test_a_url_whose_port_lacks_a_setting_is_refused_in_one_line(monkeypatch):
+    """Such as rfc2217://, which has no limit on the time of writing."""
+    import serial
+
+    def lack(*_, **__):
+        raise NotImplementedError("write_timeout is currently not supported")
+
+    monkeypatch.setattr(serial, "serial_for_url", lack)
+    with pytest.raises(HandError, match="^rfc2217://host:1: cannot be opened .write_timeout"):
+        SerialHand("rfc2217://host:1", QUICK).connect()
+
+
 def test_a_reply_is_checked_whoever_made_it():
     """A stamp of another clock would never grow old: `Safety` would not notice that the hand is silent."""
     good = Reply(empty_state(), 9.99, 10.0, 1, 1)
@@ -115,9 +130,22 @@ def test_a_reply_is_checked_whoever_made_it():
     for answer, said in (([1, 2], "answered with list"), (True, "answered with bool"), (good.state, "with ndarray")):
         with pytest.raises(HandError, match=said):
             checked(answer, 10.0)
-    for name, value in (("sent", None), ("received", "now"), ("sequence", None), ("generation", [1])):
+    for name, value in (
+        ("sent", None),
+        ("sent", math.nan),
+        ("received", "now"),
+        ("sequence", None),
+        ("generation", [1]),
+    ):
         with pytest.raises(HandError, match=f"has {name} {re.escape(repr(value))}; expected a number"):
             checked(dataclasses.replace(good, **{name: value}), 10.0)
+
+
+def test_numbers_of_numpy_become_plain_ones():
+    """A log would keep them as arrays, and the replay could not tell which frame a tick used."""
+    reply = Reply(empty_state(), np.float64(1.0), np.float32(2.0), np.int64(3), np.uint8(1))
+    found = [getattr(checked(reply, 2.5), name) for name in ("sent", "received", "sequence", "generation")]
+    assert found == [1.0, 2.0, 3, 1] and [type(value) for value in found] == [float, float, int, int]
 
 
 class Driver:
@@ -137,7 +165,9 @@ def test_a_driver_may_reuse_its_buffer():
 
 
 def test_what_a_driver_tells_is_checked():
-    assert greet(Driver(warnings=lambda: ["slow"])) == ["a hand", "warning: slow"] and greet(Driver()) == ["a hand"]
+    for warnings in (lambda: ["slow"], ["slow"]):
+        assert greet(Driver(warnings=warnings)) == ["a hand", "warning: slow"]
+    assert greet(Driver()) == ["a hand"]
     for parts, said in (
         ({"connect": lambda: None}, "`connect` returned None"),
         ({"connect": lambda: (1, "a")}, r"`connect` returned \(1, 'a'\)"),

@@ -55,6 +55,9 @@ def calibration(hand, serial="2R32A001", handedness="right"):
         (None, ("2R32A001", "right"), "does not tell its serial number, and the calibration is of hand 2R32A001"),
         (Identity("2L32A001", "left"), None, "this is a left hand .* the model a right one"),
         ("2R32A001", None, "the driver's `identity` is '2R32A001'; expected an `Identity`"),
+        (Identity("2L32A001", "Left"), None, "has handedness 'Left'; expected 'left', 'right' or ''"),
+        (Identity(1001, "right"), ("1001", "right"), "has serial_number 1001; expected text"),
+        (Identity("A001", None), None, "has handedness None; expected text"),
         (Identity("A001", "code 1"), ("A001", "right"), "this hand is code 1, the calibration is of a right one"),
     ],
 )
