@@ -101,7 +101,8 @@ def find_task(name: str) -> TaskEntry:
             raise ConfigError(f"task {name!r}: {module} has no {word!r}; dexsim's own task is {word}, without a module")
         if word in _OURS and callable(makes) and TASKS[word].task is not makes:
             raise ConfigError(f"task {name!r}: dexsim has a task {word!r} of its own; give yours another name")
-        if word not in TASKS and callable(makes):
+        # Many modules may have a `make_env`: the one that is named makes it.
+        if callable(makes) and (word not in TASKS or TASKS[word].environment not in (None, makes)):
             TASKS[word] = TaskEntry(cast(Any, NoSettings), _no_task, cast(Any, NoSettings), makes)
         if word in TASKS and word not in _OURS:
             _MODULES[word] = module

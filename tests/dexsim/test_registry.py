@@ -15,6 +15,7 @@ from dexsim.tasks.grasp.task import Grasp
 @pytest.fixture(autouse=True)
 def same_tasks_afterwards(monkeypatch):
     monkeypatch.setattr(registry, "TASKS", dict(registry.TASKS))
+    monkeypatch.setattr(registry, "_MODULES", dict(registry._MODULES))
     monkeypatch.delitem(sys.modules, "poke_task", raising=False)
 
 
@@ -91,6 +92,16 @@ def test_a_module_is_named_with_the_task(hand):
         registry.find_task("poke_task:prod")
     with pytest.raises(ConfigError, match="rotate.*; poke_task neither registers it nor has a function of that name$"):
         registry.find_task("poke_task:__name__")  # A value that is no function.
+
+
+def test_functions_of_one_name_in_two_modules_are_told_apart(tmp_path, monkeypatch):
+    for name in ("first_place", "second_place"):
+        (tmp_path / f"{name}.py").write_text(f"def make_env():\n    raise ValueError('{name}')\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    for name in ("first_place", "second_place", "first_place"):
+        with pytest.raises(ConfigError, match=f"making it fails: ValueError: {name}"):
+            registry.make(f"{name}:make_env")
+        assert registry.task_option("make_env") == f" --task {name}:make_env"
 
 
 def test_what_the_users_module_or_function_raises_is_told_in_one_line(tmp_path, monkeypatch):
