@@ -106,13 +106,13 @@ def find_task(name: str) -> TaskEntry:
             TASKS[word] = TaskEntry(cast(Any, NoSettings), _no_task, cast(Any, NoSettings), makes)
         if word in TASKS and word not in _OURS:
             _MODULES[word] = module
+    broken = ""
     if word not in TASKS:
-        for plugin in importlib.metadata.entry_points(group=PLUGINS):
-            plugin.load()
+        broken = "".join(map(_load, importlib.metadata.entry_points(group=PLUGINS)))
     if word not in TASKS:
         lacks = f"{module} neither registers it nor has a function of that name"
         hint = lacks if module else f"a task of your own needs its module: --task my_module:{word}"
-        raise ConfigError(f"unknown task {word!r}: choose from {', '.join(sorted(TASKS))}; {hint}")
+        raise ConfigError(f"unknown task {word!r}: choose from {', '.join(sorted(TASKS))}; {hint}{broken}")
     return TASKS[word]
 
 
@@ -209,6 +209,17 @@ def _make_other(task: str, makes: Callable[[], Any]) -> Any:
 
 def _no_task(config: Any, hand: Hand) -> Task:
     raise ConfigError("an environment from elsewhere has no task on a hand: it can be trained and evaluated, no more")
+
+
+def _load(plugin: importlib.metadata.EntryPoint) -> str:
+    """Let an installed package register its tasks; the end of a message if it fails, which is no reason to go without
+    those of others."""
+    try:
+        plugin.load()
+    except (Exception, SystemExit) as error:  # whatever it raises
+        text = " ".join(str(error).split())
+        return f"; {plugin.value}, of an installed package, fails: {type(error).__name__}: {text:.200}"
+    return ""
 
 
 def _import(module: str) -> ModuleType:

@@ -127,6 +127,23 @@ def test_an_installed_package_brings_tasks_by_its_entry_point(monkeypatch, hand)
     assert registry.find_task("mine").task is Mine and asked == ["dexsim.tasks"]
 
 
+def test_an_installed_package_that_fails_is_told_and_hides_no_other(monkeypatch):
+    class Point:
+        value = "their_tasks"
+
+        def load(self):
+            raise ImportError("no module\nnamed torch")
+
+    class Other(Point):
+        def load(self):
+            dexsim.register("mine", Mine)
+
+    monkeypatch.setattr(registry.importlib.metadata, "entry_points", lambda *, group: [Point(), Other()])
+    assert registry.find_task("mine").task is Mine
+    with pytest.raises(ConfigError, match="unknown task 'juggle'.*; their_tasks, .* fails: ImportError: no module"):
+        registry.find_task("juggle")
+
+
 def test_what_make_refuses():
     for name, options, message in (
         ("juggle", {}, "unknown task 'juggle': choose from grasp, rotate.*--task my_module:juggle"),
