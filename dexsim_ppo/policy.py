@@ -82,7 +82,7 @@ class Policy:
         return _act_from(self.params, memory, obs)
 
     def ablate(self, *names: str) -> "Policy":
-        """This policy with some observation fields replaced by their mean in training.
+        """This policy with some observation fields replaced by their mean in training, those of a fixed scale by 0.
 
         Shows what the policy relies on. A policy that was trained without those fields may do better.
 

@@ -92,12 +92,14 @@ def test_its_report_is_of_this_file_and_says_how_it_came_about(name):
     assert not report["arguments"]["env"]["randomization"].get("beyond") and "beyond" not in report["command"]
 
 
-def test_an_ablated_policy_takes_the_mean_of_what_it_does_not_see():
+def test_an_ablated_policy_takes_the_mean_or_zero_of_what_it_does_not_see():
     policy = load("rotate")
     names = ("contact_force", "relative_orientation")
     hidden = np.concatenate([np.full(f.size, f.name in names) for f in policy.observation_layout])
     obs = np.random.default_rng(0).normal(size=(20, 65)).astype(np.float32)
     mean = np.asarray(policy.params.normalizer.mean)
+    fixed = np.concatenate([np.full(f.size, f.scale is not None) for f in policy.observation_layout])
+    assert np.any(fixed & hidden) and not mean[fixed].any(), "touch is 0 then"
     ablated = policy.ablate(*names)
     np.testing.assert_allclose(ablated(obs), policy(np.where(hidden, mean, obs)), atol=2e-5)
     np.testing.assert_array_equal(ablated(obs), ablated(np.where(hidden, 9.0, obs)))
