@@ -35,6 +35,7 @@ Tree = TypeVar("Tree")
 MAGIC = b"DEXSIM"
 FORMAT_VERSION = 1
 LIBRARY_VERSION = "0.1.0"
+_DEPTH = 100  # of what a file says; an average of averages adds two
 _DIMENSIONS = 16  # of an array; ours have four at most, and NumPy's limit is 64
 _PREFIX = struct.Struct("<6sHQ32s")
 _HASHED_PREFIX = struct.Struct("<6sHQ")
@@ -200,6 +201,7 @@ def _open_envelope(path: Path, data: memoryview) -> tuple[dict[str, Any], memory
         for name, kind in (("kind", str), ("task", str), ("library", str), ("content", dict), ("sha256", bytes)):
             if not isinstance(header[name], kind):
                 raise TypeError(f"{name} is not a {kind.__name__}")
+        _check_plain(header["content"])
     except Exception as error:  # Hashed, so a faulty writer rather than damage.
         raise CheckpointError(f"{path}: has a header that makes no sense ({error})") from None
     payload = data[_PREFIX.size + header_size :]
@@ -211,6 +213,17 @@ def _open_envelope(path: Path, data: memoryview) -> tuple[dict[str, Any], memory
     if hashlib.sha256(payload).digest() != header["sha256"]:
         raise CheckpointError(f"{path}: is damaged (the arrays' checksum is wrong)")
     return header, payload
+
+
+def _check_plain(value: Any, depth: int = 0) -> None:
+    """Raises TypeError, ValueError: it has what JSON has not, such as bytes, or is nested too deep to walk."""
+    if depth > _DEPTH:
+        raise ValueError("its content is nested too deep")
+    if isinstance(value, dict | list):
+        for item in (*value, *value.values()) if isinstance(value, dict) else value:
+            _check_plain(item, depth + 1)
+    elif not isinstance(value, str | int | float | None):
+        raise TypeError(f"its content holds {type(value).__name__}")
 
 
 def _leaf_size(leaf: dict[str, Any]) -> int:

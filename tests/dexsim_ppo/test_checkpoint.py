@@ -126,6 +126,21 @@ def test_impossible_leaves_are_refused_before_allocation(file, leaf):
     forged.unlink()
 
 
+def deep(levels):
+    return [] if levels == 0 else {"a": deep(levels - 1)}
+
+
+@pytest.mark.parametrize("value", [b"x", {b"x": 1}, msgpack.Timestamp(0), msgpack.ExtType(1, b"x"), deep(800)])
+def test_what_a_file_says_is_plain_and_can_be_walked(file, value):
+    """Or else a report, an export or another file could not hold it."""
+    forged = forge(file, content={"training": value})
+    with pytest.raises(CheckpointError, match=r"^[^\n]*a header that makes no sense \(its content [^\n]*$"):
+        checkpoint.load(forged, kind="train")
+    forge(file, content={"training": deep(90)})
+    assert checkpoint.load(forged, kind="train").content["training"]
+    forged.unlink()
+
+
 def test_other_task_kind_version_and_no_checkpoint(file, tmp_path):
     with pytest.raises(CheckpointError, match="of the task 'tiny', not 'grasp'"):
         checkpoint.load(file, kind="train", task="grasp")
