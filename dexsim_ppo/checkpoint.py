@@ -19,7 +19,7 @@ import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -139,6 +139,27 @@ def load(path: str | Path, *, kind: str, task: str | None = None) -> Checkpoint:
         header["content"],
         _read_leaves(path, header["leaves"], payload),
     )
+
+
+def check_content(file: Checkpoint, kinds: Mapping[str, Any]) -> None:
+    """Check a file's content before it is used.
+
+    Args:
+      kinds: the type of each value that it must have; of a mapping, those of its values.
+
+    Raises:
+      CheckpointError: something is missing or of another type; names it.
+    """
+
+    def check(found: dict[str, Any], kinds: Mapping[str, Any], above: str) -> None:
+        for name, kind in kinds.items():
+            value, inside = found.get(name), isinstance(kind, Mapping)
+            if not isinstance(value, dict if inside else kind) or isinstance(value, bool):
+                raise CheckpointError(f"{file.path}: is no sound {file.kind!r} file: {above}{name} = {value!r:.80}")
+            if inside:
+                check(cast(dict, value), kind, f"{above}{name}.")
+
+    check(file.content, kinds, "")
 
 
 def restore(checkpoint: Checkpoint, like: Tree, *, part: bool = False) -> Tree:

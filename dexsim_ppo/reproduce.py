@@ -69,6 +69,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _prepare(file: checkpoint.Checkpoint) -> tuple[Environment, PPOConfig, TrainState, Any, int]:
     """Environment, learner's settings, state, step of one iteration, and how many to replay."""
+    checkpoint.check_content(file, {"arguments": {}, "backend": str, "calls": int})
     entry = find_task(file.task)
     with naming_file(file.path):
         saved = arguments_from_dict(entry.config_class, migrate_arguments(file.content["arguments"], file.path))

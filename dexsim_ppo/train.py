@@ -23,7 +23,7 @@ from typing import Any, NamedTuple, cast
 from dexsim.core import cli
 from dexsim.core.compilation import make_deterministic
 from dexsim.core.config import from_dict, naming_file
-from dexsim.core.errors import CheckpointError, ConfigError, DexsimError
+from dexsim.core.errors import ConfigError, DexsimError
 from dexsim.hand.kinematics import Hand
 from dexsim.hand.source import record_of
 from dexsim.registry import find_task, task_option
@@ -36,7 +36,7 @@ from dexsim_ppo.learner.types import Environment
 from dexsim_ppo.policy import Policy, load_policy
 from dexsim_ppo.retired import migrate_arguments
 from dexsim_ppo.training import processes
-from dexsim_ppo.training.arguments import TrainArguments, check_resumed, find_hand, printable, training_config
+from dexsim_ppo.training.arguments import SAVED, TrainArguments, check_resumed, find_hand, printable, training_config
 from dexsim_ppo.training.fine_tune import check_fit, fine_tuning_config
 from dexsim_ppo.training.presets import preset_arguments
 from dexsim_ppo.training.runlog import RunFolder, check_wandb, folder_of, new_folder, taken
@@ -238,9 +238,7 @@ def find_beginning(
         path = Path(resume)
         file = path if path.is_file() else RunFolder(path).latest_checkpoint()
         begun = checkpoint.load(file, kind="train", task=name)
-        for part, keys in (("arguments", set()), ("progress", {"best", "seconds"})):
-            if not isinstance(found := begun.content.get(part), dict) or not keys <= found.keys():
-                raise CheckpointError(f"{file}: is no checkpoint of a run: {part} = {found!r:.80}")
+        checkpoint.check_content(begun, SAVED)
         return begun
     return load_policy(policy, task=task) if policy else None
 

@@ -139,6 +139,10 @@ def training_config(arguments: TrainArguments) -> Any:
     )
 
 
+_BEST = {"return": float | int | None, "iteration": int}
+SAVED = {"arguments": {}, "progress": {"best": _BEST, "seconds": float | int, "without_better": int | None}}
+"""Types of what a checkpoint of a run says."""
+
 # What a resumed run may be given anew: its budget, and what looks on. Everything else is part of the saved state.
 _RESUMABLE = {
     "checkpoint_every",
