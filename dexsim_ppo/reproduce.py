@@ -25,8 +25,8 @@ from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.ppo import TrainState, experience, make_train
 from dexsim_ppo.learner.types import Environment
 from dexsim_ppo.retired import migrate_arguments
-from dexsim_ppo.train import arguments_from_dict, make_environment
-from dexsim_ppo.training.arguments import find_hand
+from dexsim_ppo.train import make_environment
+from dexsim_ppo.training.arguments import arguments_from_dict, find_hand
 from dexsim_ppo.training.faults import keep
 
 

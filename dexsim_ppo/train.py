@@ -36,7 +36,15 @@ from dexsim_ppo.learner.types import Environment
 from dexsim_ppo.policy import Policy, load_policy
 from dexsim_ppo.retired import migrate_arguments
 from dexsim_ppo.training import processes
-from dexsim_ppo.training.arguments import SAVED, TrainArguments, check_resumed, find_hand, printable, training_config
+from dexsim_ppo.training.arguments import (
+    SAVED,
+    TrainArguments,
+    arguments_from_dict,
+    check_resumed,
+    find_hand,
+    printable,
+    training_config,
+)
 from dexsim_ppo.training.fine_tune import check_fit, fine_tuning_config
 from dexsim_ppo.training.presets import preset_arguments
 from dexsim_ppo.training.runlog import RunFolder, check_wandb, folder_of, new_folder, taken
@@ -172,13 +180,8 @@ def make_environment(arguments: TrainArguments, hand: Hand | None, devices: int)
     """The environment to train in, for the batch of one device."""
     import dexsim
 
-    made = dexsim.make(
-        arguments.task,
-        training_config(arguments),
-        backend=arguments.backend,
-        num_envs=arguments.ppo.num_envs // devices,
-        hand=hand,
-    )
+    env, share = training_config(arguments), arguments.ppo.num_envs // devices
+    made = dexsim.make(arguments.task, env, backend=arguments.backend, num_envs=share, hand=hand)
     return adapt(made, arguments.task)
 
 
@@ -199,12 +202,17 @@ def train_seeds(
     trained, and the signal that stopped it or 0."""
     first, runs = processes.is_first(), list[Run]()
     folder = processes.agree_on_path(new_folder(arguments.run_dir, arguments.task) if first else Path())
+    try:
+        for seed in range(arguments.seed, arguments.seed + arguments.seeds):
+            one = dataclasses.replace(arguments, seed=seed, seeds=1, run_dir=seed_folder(folder, seed))
+            runs.append(make_run(one, begun, started, command, runs[0] if runs else None))
+    finally:
+        with contextlib.suppress(OSError):  # Options that were refused leave no empty folder behind.
+            folder.rmdir()
     if first:
-        content = {"command": command, "arguments": printable(arguments)} | cli.environment_report()
+        chosen = dataclasses.replace(arguments, backend=runs[0].arguments.backend)
+        content = {"command": command, "arguments": printable(chosen)} | cli.environment_report()
         cli.write_json(RunFolder(folder).config, content)
-    for seed in range(arguments.seed, arguments.seed + arguments.seeds):
-        one = dataclasses.replace(arguments, seed=seed, seeds=1, run_dir=seed_folder(folder, seed))
-        runs.append(make_run(one, begun, started, command, runs[0] if runs else None))
     with stop_on_signals() as received:
         together = train_together(runs, cast(Policy | None, begun), received)
         stopped = received() if together else 0
@@ -316,13 +324,6 @@ def parse_arguments(argv: list[str]) -> tuple[TrainArguments, checkpoint.Checkpo
         with cli.naming_options(generic[type(default.env)], default):
             check_resumed(arguments, default)
     return arguments, begun
-
-
-def arguments_from_dict(config_class: type[Any], data: dict[str, Any]) -> TrainArguments:
-    """The options that a checkpoint or `config.json` holds."""
-    if missing := {"env", "ppo"} - data.keys():
-        raise ConfigError(f"TrainArguments: no {min(missing)}")
-    return from_dict(TrainArguments, data | {"env": from_dict(config_class, data["env"])})
 
 
 @contextlib.contextmanager

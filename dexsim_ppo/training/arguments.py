@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, Literal, TypeVar
 
-from dexsim.core.config import NoSettings, setting, to_dict, validate
+from dexsim.core.config import NoSettings, from_dict, setting, to_dict, validate
 from dexsim.core.errors import ConfigError
 from dexsim.hand.kinematics import Hand
 from dexsim.hand.load import load_hand
@@ -93,6 +93,13 @@ class TrainArguments(Generic[EnvConfig]):
             raise ConfigError(
                 f"TrainArguments.patience = {self.patience}: needs evaluations, TrainArguments.evaluate_every"
             )
+
+
+def arguments_from_dict(config_class: type[Any], data: dict[str, Any]) -> TrainArguments:
+    """The options that a checkpoint or `config.json` holds."""
+    if missing := {"env", "ppo"} - data.keys():
+        raise ConfigError(f"TrainArguments: no {min(missing)}")
+    return from_dict(TrainArguments, data | {"env": from_dict(config_class, data["env"])})
 
 
 def find_hand(arguments: TrainArguments, begun: Checkpoint | Policy | None) -> Hand | None:

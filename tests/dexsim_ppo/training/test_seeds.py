@@ -71,6 +71,21 @@ def test_a_seed_that_is_over_does_not_end_the_others(tmp_path, monkeypatch):
         assert [row["iteration"] for row in read_metrics(folder.metrics)] == [1, 2, 3]
 
 
+def test_options_of_seeds_keep_their_engine_and_those_that_are_refused_leave_no_folder(tmp_path, monkeypatch):
+    """As `auto`, which once meant another engine, a run that begins with them would be slower."""
+    monkeypatch.setattr(train, "train_together", lambda *_: False)
+    monkeypatch.setattr(train, "train_run", lambda *_: 15)
+    make = tiny_train.make
+    monkeypatch.setattr("dexsim.make", lambda *a, **given: make(*a, **given | {"backend": "c"}))
+    path = tmp_path / "a"
+    assert train.main([*OPTIONS, "--seeds", "2", "--run-dir", str(path)]) == 128 + 15
+    options, _ = train.parse_arguments(["--config", str(path)])
+    assert (options.backend, options.seeds) == ("c", 2)
+    with pytest.raises(ConfigError, match="--devices 99: there are"):
+        train.main([*OPTIONS, "--seeds", "2", "--devices", "99", "--run-dir", str(tmp_path / "b")])
+    assert not (tmp_path / "b").exists()
+
+
 def test_python_trains_one_seed_at_a_time():
     with pytest.raises(ConfigError, match=r"train_policy\(seeds=3\)"):
         train.train_policy("tiny", preset="cpu", seeds=3)
