@@ -116,8 +116,8 @@ class Run:
                 state = checkpoint.restore(source, shapes)
                 state = place(state, shapes) if self.mesh is not None else jax.tree.map(jnp.copy, state)
                 progress = source.content["progress"]
-                self.best, self.seconds_before = progress["best"], progress["seconds"]
-                self.without_better = progress.get("without_better", 0)
+                self.best = progress["best"] if self.folder.has_best(int(state.iteration)) else self.best
+                self.seconds_before, self.without_better = progress["seconds"], progress.get("without_better", 0)
             else:
                 fresh = aside.submit(lambda: jax.block_until_ready(training.init(key)))
             traced = lambda: self.clock.update(trace_s=time.perf_counter() - begin)  # noqa: E731
