@@ -295,11 +295,14 @@ def _find(name: str | Path) -> Path:
     """The file of a policy that is named by a path, or by the name of a shipped one."""
     if not isinstance(name, str | Path):
         raise CheckpointError(f"{name!r:.80}: give a policy's file, or the name of a shipped one")
-    if Path(text := str(name)).exists() or "/" in text or text.endswith(".msgpack"):
-        return Path(text)
+    path, text = Path(name), str(name)
+    if (path.exists() and not path.is_dir()) or "/" in text or text.endswith(".msgpack"):
+        return path
     try:
         return Path(asset_path(f"policies/{text}.msgpack"))
     except AssetError:
+        if path.is_dir():
+            return path
         shipped = ", ".join(sorted(path.stem for path in Path(asset_path("policies")).glob("*.msgpack")))
         raise CheckpointError(f"{text}: no such file, and no shipped policy has that name: {shipped}") from None
 

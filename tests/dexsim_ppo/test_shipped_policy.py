@@ -12,7 +12,7 @@ import dexsim
 from dexsim.core.assets import asset_path
 from dexsim.core.compilation import jit
 from dexsim.core.config import from_dict
-from dexsim.core.errors import ConfigError
+from dexsim.core.errors import CheckpointError, ConfigError
 from dexsim.observation import GRASP, ROTATE, layout
 from dexsim.registry import TASKS
 from dexsim.tasks.grasp.config import GraspConfig
@@ -205,3 +205,14 @@ def test_the_actors_part_of_the_observation_is_asked_for():
     policy = load("grasp")
     with pytest.raises(ConfigError, match=r"give the actor's part, state.obs\['actor'\]"):
         policy.act(policy.begin(), {"actor": np.zeros(66)})
+
+
+def test_a_folder_named_as_a_shipped_policy_does_not_hide_it(tmp_path, monkeypatch):
+    """Such as one that `--lerobot grasp` wrote."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("grasp", "mine"):
+        (tmp_path / name).mkdir()
+    assert Policy.load("grasp").task == "grasp"
+    for name in ("mine", "./grasp"):
+        with pytest.raises(CheckpointError, match="cannot be read"):
+            Policy.load(name)
