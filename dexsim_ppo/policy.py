@@ -79,6 +79,8 @@ class Policy:
         Raises:
           ConfigError: the memory is not that of this policy and batch, or the policy observes another number of values.
         """
+        if isinstance(obs, list | tuple):  # To JAX a tree of numbers.
+            obs = np.asarray(obs, np.float32)
         return _act_from(self.params, memory, obs)
 
     def ablate(self, *names: str) -> "Policy":

@@ -201,6 +201,13 @@ def test_misuse_is_named_by_both_forms_of_a_policy(tmp_path, door, what):
         use(policy, obs)
 
 
+def test_an_observation_may_be_a_list():
+    policy, obs = load("rotate"), np.linspace(-1, 1, 65).astype(np.float32)
+    np.testing.assert_array_equal(policy(obs.tolist()), policy(obs))
+    with pytest.raises(ConfigError, match=r"observes 65 values.*\(2,\)"):
+        policy([1.0, 2.0])
+
+
 def test_the_actors_part_of_the_observation_is_asked_for():
     policy = load("grasp")
     with pytest.raises(ConfigError, match=r"give the actor's part, state.obs\['actor'\]"):
