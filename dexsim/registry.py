@@ -18,6 +18,7 @@ from dexsim.core.config import NoSettings
 from dexsim.core.errors import ConfigError, DexsimError
 from dexsim.env.config import EnvConfig
 from dexsim.env.env import Env
+from dexsim.env.rules import check_members
 from dexsim.env.task import Task
 from dexsim.hand.kinematics import Hand
 from dexsim.hand.load import load_hand
@@ -166,6 +167,7 @@ def make_task(name: str, hand: Hand, config: EnvConfig | None = None) -> Task:
     if not isinstance(config, entry.config_class):
         raise ConfigError(f"task {name!r} takes a {entry.config_class.__name__}, not a {type(config).__name__}")
     task = entry.task(config, hand)
+    check_members(task)
     home = TASKS.get(task.name)
     if home is None or home.task not in (entry.task, type(task)):  # A policy's file has this name.
         raise ConfigError(

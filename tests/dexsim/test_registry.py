@@ -54,6 +54,31 @@ def test_a_task_must_have_a_name_by_which_its_policies_find_it(hand):
     assert registry.make_task("other", hand).name == "mine", "one task may have several names, as rotate has"
 
 
+ODD = {
+    "nothing of a task": (object(), "a task object has no name, fields, .*, make_pool, .*`dexsim.Task`"),
+    "one group": ({"fields": {"actor": ("command",)}}, "'mine': fields has no 'critic' with the names"),
+    "a word for a group": ({"fields": {"actor": "command", "critic": ()}}, "'mine': fields has no 'actor'"),
+    "no fields": ({"fields": None}, "'mine': fields has no 'actor'"),
+    "an unknown field": (
+        {"fields": {"actor": ("command", "smell"), "critic": ("command",)}},
+        "'mine': fields: no field 'smell' to observe; choose from joint_position, ",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", ODD)
+def test_what_a_task_lacks_is_named(hand, what):
+    change, message = ODD[what]
+    dexsim.register("mine", lambda config, hand: made, config=GraspConfig)
+    made = change
+    if isinstance(change, dict):
+        made = Mine(GraspConfig(), hand)
+        vars(made).update(change)
+    with pytest.raises(ConfigError, match=message) as error:
+        registry.make_task("mine", hand)
+    assert "\n" not in str(error.value)
+
+
 def test_a_factory_without_annotations_names_its_configuration(hand):
     default = dataclasses.replace(GraspConfig(), push_speed=0.1)
     with pytest.raises(ConfigError, match="annotate the factory's first parameter"):
