@@ -315,7 +315,7 @@ class Run:
         print(f"evaluating {selected.name} and the untrained policy", flush=True)
         begin = time.perf_counter()
         trained, untrained = Policy.load(selected), Policy.load(folder.untrained)
-        if not trained.training["iteration"]:
+        if trained.training.get("iteration") == 0:  # An average of policies, put there by hand, has none.
             print(f"nothing was trained: compiling took {self.clock['compile_s']:.0f} s; give more --minutes")
         measure = functools.partial(self.evaluator, episodes=arguments.evaluation_episodes, seed=REPORT_SEED)
         reports = {}

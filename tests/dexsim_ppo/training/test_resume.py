@@ -142,6 +142,14 @@ def test_the_best_policy_of_a_course_that_is_left_is_kept_and_not_reported(tmp_p
     assert json.loads(folder.report.read_text())["origin"]["iteration"] == 1
 
 
+def test_an_average_in_the_place_of_the_best_policy_is_reported(finished):
+    origin = {"average_of": [{"iteration": 1}, {"iteration": 2}]}
+    dataclasses.replace(Policy.load(finished.last), training=origin).save(finished.best)
+    assert train.main(["--resume", str(finished.path), "--steps", str(3 * PER_ITERATION)]) == 0
+    report = json.loads(finished.report.read_text())
+    assert report["origin"] == origin and report["policy"] == "best.msgpack"
+
+
 def test_a_best_policy_that_is_set_aside_is_none_to_beat(tmp_path, monkeypatch):
     """The file of the one before it is gone; of those that follow one must be kept, though their returns are lower."""
     returns = iter([5.0, 6.0, 3.0, 2.0])
