@@ -222,6 +222,8 @@ def _open_envelope(path: Path, data: memoryview) -> tuple[dict[str, Any], memory
         for name, kind in (("kind", str), ("task", str), ("library", str), ("content", dict), ("sha256", bytes)):
             if not isinstance(header[name], kind):
                 raise TypeError(f"{name} is not a {kind.__name__}")
+        if ":" in header["task"]:  # Which module is imported, and which function is called, is for the user to say.
+            raise ValueError(f"task = {header['task']!r:.80}: must be a word")
         _check_plain(header["content"])
     except Exception as error:  # Hashed, so a faulty writer rather than damage.
         raise CheckpointError(f"{path}: has a header that makes no sense ({error})") from None

@@ -281,7 +281,8 @@ def saved_arguments(path: Path, task: str | None) -> TrainArguments:
     if task and task.rpartition(":")[2] != name:
         raise ConfigError(f"--config {path}: is of the task {name!r}, not {task!r}")
     with naming_file(file):
-        return arguments_from_dict(find_task(task or name).config_class, migrate_arguments(saved, file))
+        config_class = find_task(task or name.rpartition(":")[2]).config_class
+        return arguments_from_dict(config_class, migrate_arguments(saved, file))
 
 
 def parse_arguments(argv: list[str]) -> tuple[TrainArguments, checkpoint.Checkpoint | Policy | None]:

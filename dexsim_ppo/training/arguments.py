@@ -96,9 +96,11 @@ class TrainArguments(Generic[EnvConfig]):
 
 
 def arguments_from_dict(config_class: type[Any], data: dict[str, Any]) -> TrainArguments:
-    """The options that a checkpoint or `config.json` holds."""
+    """The options that a checkpoint or `config.json` holds. Their task is a word: no file says what is imported."""
     if missing := {"env", "ppo"} - data.keys():
         raise ConfigError(f"TrainArguments: no {min(missing)}")
+    if ":" in (task := str(data.get("task", ""))):
+        raise ConfigError(f"TrainArguments.task = {task!r:.80}: must be a word; its module is given with --task")
     return from_dict(TrainArguments, data | {"env": from_dict(config_class, data["env"])})
 
 
