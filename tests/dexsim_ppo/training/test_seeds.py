@@ -93,6 +93,9 @@ def test_python_trains_one_seed_at_a_time():
 
 def test_spread_and_band_in_closed_form():
     assert spread([1.0, 3.0]) == {"mean": 2.0, "std": 2**0.5, "min": 1.0, "max": 3.0, "values": [1.0, 3.0]}
+    assert spread([1.0, None, 3.0]) == {"mean": 2.0, "std": 2**0.5, "min": 1.0, "max": 3.0, "values": [1.0, None, 3.0]}
+    assert spread([None, 3.0]) == {"mean": 3.0, "std": None, "min": 3.0, "max": 3.0, "values": [None, 3.0]}
+    assert spread([None, None])["mean"] is None, "as the return of a simulation that diverges"
     runs = [
         [{"env_steps": 10, "x": 1.0}, {"env_steps": 20, "x": 5.0}, {"env_steps": 30, "x": 5.0}],
         [{"env_steps": 10, "x": 3.0}, {"env_steps": 20, "x": None}, {"env_steps": 30, "x": float("nan")}],
