@@ -18,6 +18,7 @@ from dexsim.core.config import NoSettings
 from dexsim.core.errors import ConfigError, DexsimError
 from dexsim.env.config import EnvConfig
 from dexsim.env.env import Env
+from dexsim.env.rules import check_members
 from dexsim.env.task import Task
 from dexsim.hand.kinematics import Hand
 from dexsim.hand.load import load_hand
@@ -101,17 +102,18 @@ def find_task(name: str) -> TaskEntry:
             raise ConfigError(f"task {name!r}: {module} has no {word!r}; dexsim's own task is {word}, without a module")
         if word in _OURS and callable(makes) and TASKS[word].task is not makes:
             raise ConfigError(f"task {name!r}: dexsim has a task {word!r} of its own; give yours another name")
-        if word not in TASKS and callable(makes):
+        # Many modules may have a `make_env`: the one that is named makes it.
+        if callable(makes) and (word not in TASKS or TASKS[word].environment not in (None, makes)):
             TASKS[word] = TaskEntry(cast(Any, NoSettings), _no_task, cast(Any, NoSettings), makes)
         if word in TASKS and word not in _OURS:
             _MODULES[word] = module
+    broken = ""
     if word not in TASKS:
-        for plugin in importlib.metadata.entry_points(group=PLUGINS):
-            plugin.load()
+        broken = "".join(map(_load, importlib.metadata.entry_points(group=PLUGINS)))
     if word not in TASKS:
         lacks = f"{module} neither registers it nor has a function of that name"
         hint = lacks if module else f"a task of your own needs its module: --task my_module:{word}"
-        raise ConfigError(f"unknown task {word!r}: choose from {', '.join(sorted(TASKS))}; {hint}")
+        raise ConfigError(f"unknown task {word!r}: choose from {', '.join(sorted(TASKS))}; {hint}{broken}")
     return TASKS[word]
 
 
@@ -165,6 +167,7 @@ def make_task(name: str, hand: Hand, config: EnvConfig | None = None) -> Task:
     if not isinstance(config, entry.config_class):
         raise ConfigError(f"task {name!r} takes a {entry.config_class.__name__}, not a {type(config).__name__}")
     task = entry.task(config, hand)
+    check_members(task)
     home = TASKS.get(task.name)
     if home is None or home.task not in (entry.task, type(task)):  # A policy's file has this name.
         raise ConfigError(
@@ -208,6 +211,17 @@ def _make_other(task: str, makes: Callable[[], Any]) -> Any:
 
 def _no_task(config: Any, hand: Hand) -> Task:
     raise ConfigError("an environment from elsewhere has no task on a hand: it can be trained and evaluated, no more")
+
+
+def _load(plugin: importlib.metadata.EntryPoint) -> str:
+    """Let an installed package register its tasks; the end of a message if it fails, which is no reason to go without
+    those of others."""
+    try:
+        plugin.load()
+    except (Exception, SystemExit) as error:  # whatever it raises
+        text = " ".join(str(error).split())
+        return f"; {plugin.value}, of an installed package, fails: {type(error).__name__}: {text:.200}"
+    return ""
 
 
 def _import(module: str) -> ModuleType:

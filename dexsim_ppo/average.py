@@ -158,8 +158,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         average = average_policies([policy for _, policy in policies])
     except ConfigError as error:
         raise ConfigError(f"{' '.join(arguments.policies)}: {error}") from None
-    for path, _ in policies:
-        if Path(path).exists() and arguments.output.exists() and Path(path).samefile(arguments.output):
+    # A run's last policy says how those of its checkpoints are made.
+    read = [RunFolder(Path(name)).last for name in arguments.policies] + [Path(path) for path, _ in policies]
+    for file in read:
+        if file.exists() and arguments.output.exists() and file.samefile(arguments.output):
             raise ConfigError(f"--output {arguments.output}: is one of the averaged policies; give another file")
     average.save(arguments.output)
     for path, policy in policies:

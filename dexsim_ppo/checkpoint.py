@@ -19,7 +19,7 @@ import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -35,6 +35,7 @@ Tree = TypeVar("Tree")
 MAGIC = b"DEXSIM"
 FORMAT_VERSION = 1
 LIBRARY_VERSION = "0.1.0"
+_DEPTH = 100  # of what a file says; an average of averages adds two
 _DIMENSIONS = 16  # of an array; ours have four at most, and NumPy's limit is 64
 _PREFIX = struct.Struct("<6sHQ32s")
 _HASHED_PREFIX = struct.Struct("<6sHQ")
@@ -140,6 +141,27 @@ def load(path: str | Path, *, kind: str, task: str | None = None) -> Checkpoint:
     )
 
 
+def check_content(file: Checkpoint, kinds: Mapping[str, Any]) -> None:
+    """Check a file's content before it is used.
+
+    Args:
+      kinds: the type of each value that it must have; of a mapping, those of its values.
+
+    Raises:
+      CheckpointError: something is missing or of another type; names it.
+    """
+
+    def check(found: dict[str, Any], kinds: Mapping[str, Any], above: str) -> None:
+        for name, kind in kinds.items():
+            value, inside = found.get(name), isinstance(kind, Mapping)
+            if not isinstance(value, dict if inside else kind) or isinstance(value, bool):
+                raise CheckpointError(f"{file.path}: is no sound {file.kind!r} file: {above}{name} = {value!r:.80}")
+            if inside:
+                check(cast(dict, value), kind, f"{above}{name}.")
+
+    check(file.content, kinds, "")
+
+
 def restore(checkpoint: Checkpoint, like: Tree, *, part: bool = False) -> Tree:
     """The loaded leaves in the shape of `like`, a pytree of arrays or of `jax.ShapeDtypeStruct`s.
 
@@ -200,6 +222,9 @@ def _open_envelope(path: Path, data: memoryview) -> tuple[dict[str, Any], memory
         for name, kind in (("kind", str), ("task", str), ("library", str), ("content", dict), ("sha256", bytes)):
             if not isinstance(header[name], kind):
                 raise TypeError(f"{name} is not a {kind.__name__}")
+        if ":" in header["task"]:  # Which module is imported, and which function is called, is for the user to say.
+            raise ValueError(f"task = {header['task']!r:.80}: must be a word")
+        _check_plain(header["content"])
     except Exception as error:  # Hashed, so a faulty writer rather than damage.
         raise CheckpointError(f"{path}: has a header that makes no sense ({error})") from None
     payload = data[_PREFIX.size + header_size :]
@@ -211,6 +236,17 @@ def _open_envelope(path: Path, data: memoryview) -> tuple[dict[str, Any], memory
     if hashlib.sha256(payload).digest() != header["sha256"]:
         raise CheckpointError(f"{path}: is damaged (the arrays' checksum is wrong)")
     return header, payload
+
+
+def _check_plain(value: Any, depth: int = 0) -> None:
+    """Raises TypeError, ValueError: it has what JSON has not, such as bytes, or is nested too deep to walk."""
+    if depth > _DEPTH:
+        raise ValueError("its content is nested too deep")
+    if isinstance(value, dict | list):
+        for item in (*value, *value.values()) if isinstance(value, dict) else value:
+            _check_plain(item, depth + 1)
+    elif not isinstance(value, str | int | float | None):
+        raise TypeError(f"its content holds {type(value).__name__}")
 
 
 def _leaf_size(leaf: dict[str, Any]) -> int:

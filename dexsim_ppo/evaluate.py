@@ -32,6 +32,7 @@ from dexsim.core.options import Option
 from dexsim.core.progress import progress
 from dexsim.registry import find_task
 from dexsim_ppo.acting import PolicyParams, act_from, begin
+from dexsim_ppo.learner.adapter import Adapted
 from dexsim_ppo.learner.types import Environment
 from dexsim_ppo.policy import Policy, load_policy
 from dexsim_ppo.report import print_report, summarize, summarize_totals
@@ -237,7 +238,8 @@ class EvaluateArguments:
     baseline: bool = True
     """Measure a hand that does nothing on the same episodes, too, which doubles the time."""
     ablate: tuple[str, ...] = ()
-    """Observation fields to replace by their training mean, such as contact_force contact_centre."""
+    """Observation fields to replace by their training mean, or by 0 where their scale is fixed, as that of touch; such
+    as contact_force contact_centre."""
     set: tuple[str, ...] = ()
     """Change fields of the task's configuration, such as randomization.extremes=1 edge=[0.05,0.05]."""
     output: Path | None = None
@@ -278,8 +280,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     seconds = [f"evaluation_seconds={arguments.seconds}"] if arguments.seconds else []
     policy = dataclasses.replace(policy, env_config=override(policy.env_config, (*seconds, *arguments.set)))
     entry, hand = find_task(policy.task), policy.find_hand(arguments.hand)
+    if seconds and not any(field.name == "evaluation_seconds" for field in dataclasses.fields(entry.config_class)):
+        raise ConfigError(f"--seconds {arguments.seconds:g}: task {policy.task!r} has no evaluation_seconds to set")
     with cli.naming_options(entry.config_class, entry.config(), functools.partial(_typed, arguments)):
         env = policy.build_env(backend=arguments.backend, num_envs=chunk, hand=hand)
+    if video and isinstance(env, Adapted):
+        raise ConfigError(f"--video {video}: {env.name!r} draws nothing")
     evaluator, episodes = Evaluator(env, chunk), arguments.episodes or default_episodes(env)
     measure = functools.partial(evaluator, policy.params, episodes=episodes, seed=arguments.seed)
     report, snapshots = measure(label=arguments.policy)

@@ -79,10 +79,12 @@ class Policy:
         Raises:
           ConfigError: the memory is not that of this policy and batch, or the policy observes another number of values.
         """
+        if isinstance(obs, list | tuple):  # To JAX a tree of numbers.
+            obs = np.asarray(obs, np.float32)
         return _act_from(self.params, memory, obs)
 
     def ablate(self, *names: str) -> "Policy":
-        """This policy with some observation fields replaced by their mean in training.
+        """This policy with some observation fields replaced by their mean in training, those of a fixed scale by 0.
 
         Shows what the policy relies on. A policy that was trained without those fields may do better.
 
@@ -295,11 +297,14 @@ def _find(name: str | Path) -> Path:
     """The file of a policy that is named by a path, or by the name of a shipped one."""
     if not isinstance(name, str | Path):
         raise CheckpointError(f"{name!r:.80}: give a policy's file, or the name of a shipped one")
-    if Path(text := str(name)).exists() or "/" in text or text.endswith(".msgpack"):
-        return Path(text)
+    path, text = Path(name), str(name)
+    if (path.exists() and not path.is_dir()) or "/" in text or text.endswith(".msgpack"):
+        return path
     try:
         return Path(asset_path(f"policies/{text}.msgpack"))
     except AssetError:
+        if path.is_dir():
+            return path
         shipped = ", ".join(sorted(path.stem for path in Path(asset_path("policies")).glob("*.msgpack")))
         raise CheckpointError(f"{text}: no such file, and no shipped policy has that name: {shipped}") from None
 

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 FORMAT = "dexsim policy 1"
+LARGEST = 2**28  # bytes of all arrays; a small archive may hold a thousand times its size
 UNIT = ("input_kernel", "input_bias", "recurrent_kernel", "recurrent_bias")
 
 
@@ -117,6 +118,8 @@ class PortablePolicy:
                 if file.read(4) != b"PK\3\4":
                     raise ValueError("it is no archive of NumPy")
             with np.load(path, allow_pickle=False) as file:
+                if sum(member.file_size for member in file.zip.infolist()) > LARGEST:
+                    raise ValueError(f"its arrays have more than {LARGEST >> 20} MiB")
                 header = json.loads(str(file["header"]))
                 if header.get("format") != FORMAT:
                     raise ValueError(f"its format is {str(header.get('format')):.50}, not {FORMAT}")

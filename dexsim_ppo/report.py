@@ -1,10 +1,12 @@
 """What an evaluation reports: figures with intervals by start state, and the table that is printed of them."""
 
+import json
 from typing import Any
 
 import numpy as np
 
-from dexsim.core import statistics
+from dexsim.core import cli, statistics
+from dexsim.core.errors import ConfigError
 from dexsim_ppo.learner.types import Environment
 
 
@@ -28,7 +30,7 @@ def summarize(
         "episodes": episodes,
         "steps": steps,
         **_intervals(alive[-1], returns, steps_held, start),
-        "task": env.summarize(masked, alive),
+        "task": _own(env, masked, alive),
     }
 
 
@@ -41,8 +43,26 @@ def summarize_totals(
         "episodes": int(lived.size),
         "steps": env.evaluation_steps,
         **_intervals(held, metrics["return"], lived, start),
-        "task": env.summarize(metrics, lived),
+        "task": _own(env, metrics, lived),
     }
+
+
+def _own(env: Environment, metrics: dict[str, np.ndarray], alive: np.ndarray) -> dict[str, Any]:
+    """What the task makes of its metrics.
+
+    Raises:
+      ConfigError: it is no plain data, or its headline has something else than numbers.
+    """
+    found: Any = env.summarize(metrics, alive)
+    try:
+        json.dumps(cli.plain(found))
+        for value in (found.get("headline") or {}).values():
+            number = value["value"] if isinstance(value, dict) else value
+            _number(number)
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        why = f"{type(error).__name__}: {' '.join(str(error).split()):.200}"
+        raise ConfigError(f"task {env.name!r}: summarize gives no report ({why})") from None
+    return found
 
 
 def _intervals(held: np.ndarray, returns: np.ndarray, lived: np.ndarray, start: np.ndarray) -> dict[str, Any]:

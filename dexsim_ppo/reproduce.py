@@ -25,8 +25,8 @@ from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.ppo import TrainState, experience, make_train
 from dexsim_ppo.learner.types import Environment
 from dexsim_ppo.retired import migrate_arguments
-from dexsim_ppo.train import arguments_from_dict, make_environment
-from dexsim_ppo.training.arguments import find_hand
+from dexsim_ppo.train import make_environment
+from dexsim_ppo.training.arguments import arguments_from_dict, find_hand
 from dexsim_ppo.training.faults import keep
 
 
@@ -69,6 +69,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _prepare(file: checkpoint.Checkpoint) -> tuple[Environment, PPOConfig, TrainState, Any, int]:
     """Environment, learner's settings, state, step of one iteration, and how many to replay."""
+    checkpoint.check_content(file, {"arguments": {}, "backend": str, "calls": int})
     entry = find_task(file.task)
     with naming_file(file.path):
         saved = arguments_from_dict(entry.config_class, migrate_arguments(file.content["arguments"], file.path))

@@ -23,7 +23,7 @@ from typing import Any, NamedTuple, cast
 from dexsim.core import cli
 from dexsim.core.compilation import make_deterministic
 from dexsim.core.config import from_dict, naming_file
-from dexsim.core.errors import CheckpointError, ConfigError, DexsimError
+from dexsim.core.errors import ConfigError, DexsimError
 from dexsim.hand.kinematics import Hand
 from dexsim.hand.source import record_of
 from dexsim.registry import find_task, task_option
@@ -36,7 +36,15 @@ from dexsim_ppo.learner.types import Environment
 from dexsim_ppo.policy import Policy, load_policy
 from dexsim_ppo.retired import migrate_arguments
 from dexsim_ppo.training import processes
-from dexsim_ppo.training.arguments import TrainArguments, check_resumed, find_hand, printable, training_config
+from dexsim_ppo.training.arguments import (
+    SAVED,
+    TrainArguments,
+    arguments_from_dict,
+    check_resumed,
+    find_hand,
+    printable,
+    training_config,
+)
 from dexsim_ppo.training.fine_tune import check_fit, fine_tuning_config
 from dexsim_ppo.training.presets import preset_arguments
 from dexsim_ppo.training.runlog import RunFolder, check_wandb, folder_of, new_folder, taken
@@ -172,13 +180,8 @@ def make_environment(arguments: TrainArguments, hand: Hand | None, devices: int)
     """The environment to train in, for the batch of one device."""
     import dexsim
 
-    made = dexsim.make(
-        arguments.task,
-        training_config(arguments),
-        backend=arguments.backend,
-        num_envs=arguments.ppo.num_envs // devices,
-        hand=hand,
-    )
+    env, share = training_config(arguments), arguments.ppo.num_envs // devices
+    made = dexsim.make(arguments.task, env, backend=arguments.backend, num_envs=share, hand=hand)
     return adapt(made, arguments.task)
 
 
@@ -199,12 +202,17 @@ def train_seeds(
     trained, and the signal that stopped it or 0."""
     first, runs = processes.is_first(), list[Run]()
     folder = processes.agree_on_path(new_folder(arguments.run_dir, arguments.task) if first else Path())
+    try:
+        for seed in range(arguments.seed, arguments.seed + arguments.seeds):
+            one = dataclasses.replace(arguments, seed=seed, seeds=1, run_dir=seed_folder(folder, seed))
+            runs.append(make_run(one, begun, started, command, runs[0] if runs else None))
+    finally:
+        with contextlib.suppress(OSError):  # Options that were refused leave no empty folder behind.
+            folder.rmdir()
     if first:
-        content = {"command": command, "arguments": printable(arguments)} | cli.environment_report()
+        chosen = dataclasses.replace(arguments, backend=runs[0].arguments.backend)
+        content = {"command": command, "arguments": printable(chosen)} | cli.environment_report()
         cli.write_json(RunFolder(folder).config, content)
-    for seed in range(arguments.seed, arguments.seed + arguments.seeds):
-        one = dataclasses.replace(arguments, seed=seed, seeds=1, run_dir=seed_folder(folder, seed))
-        runs.append(make_run(one, begun, started, command, runs[0] if runs else None))
     with stop_on_signals() as received:
         together = train_together(runs, cast(Policy | None, begun), received)
         stopped = received() if together else 0
@@ -238,9 +246,7 @@ def find_beginning(
         path = Path(resume)
         file = path if path.is_file() else RunFolder(path).latest_checkpoint()
         begun = checkpoint.load(file, kind="train", task=name)
-        for part, keys in (("arguments", set()), ("progress", {"best", "seconds"})):
-            if not isinstance(found := begun.content.get(part), dict) or not keys <= found.keys():
-                raise CheckpointError(f"{file}: is no checkpoint of a run: {part} = {found!r:.80}")
+        checkpoint.check_content(begun, SAVED)
         return begun
     return load_policy(policy, task=task) if policy else None
 
@@ -275,7 +281,8 @@ def saved_arguments(path: Path, task: str | None) -> TrainArguments:
     if task and task.rpartition(":")[2] != name:
         raise ConfigError(f"--config {path}: is of the task {name!r}, not {task!r}")
     with naming_file(file):
-        return arguments_from_dict(find_task(task or name).config_class, migrate_arguments(saved, file))
+        config_class = find_task(task or name.rpartition(":")[2]).config_class
+        return arguments_from_dict(config_class, migrate_arguments(saved, file))
 
 
 def parse_arguments(argv: list[str]) -> tuple[TrainArguments, checkpoint.Checkpoint | Policy | None]:
@@ -318,13 +325,6 @@ def parse_arguments(argv: list[str]) -> tuple[TrainArguments, checkpoint.Checkpo
         with cli.naming_options(generic[type(default.env)], default):
             check_resumed(arguments, default)
     return arguments, begun
-
-
-def arguments_from_dict(config_class: type[Any], data: dict[str, Any]) -> TrainArguments:
-    """The options that a checkpoint or `config.json` holds."""
-    if missing := {"env", "ppo"} - data.keys():
-        raise ConfigError(f"TrainArguments: no {min(missing)}")
-    return from_dict(TrainArguments, data | {"env": from_dict(config_class, data["env"])})
 
 
 @contextlib.contextmanager

@@ -175,8 +175,8 @@ _ALL = (
         measure=measure.evaluated,
         table=tables.rotation,
         draw=None,
-        differs="Not in the paper: one policy that loses a reading (it gets its mean in training), where the paper "
-        "trains one without it.",
+        differs="Not in the paper: one policy that loses a reading (touch is 0 then, the orientation its mean in "
+        "training), where the paper trains one without it.",
         minutes=3.0,
     ),
     Experiment(

@@ -7,6 +7,7 @@ that frame, is in `meta/tactile.json`, which is our own addition.
 """
 
 import json
+import secrets
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -44,7 +45,7 @@ def check_lerobot(folder: Path) -> None:
 
 
 def write_lerobot(folder: Path, hand: Hand, task: str, trajectories: Sequence[Trajectory]) -> Path:
-    """Write a dataset, one episode for each trajectory; returns its folder.
+    """Write a dataset, one episode for each trajectory, whole or not at all; returns its folder.
 
     Args:
       folder: must not exist yet.
@@ -73,11 +74,14 @@ def write_lerobot(folder: Path, hand: Hand, task: str, trajectories: Sequence[Tr
         episodes.append(_episode(number, begin, length, task, frames))
         begin += length
     whole = {name: np.concatenate(parts) for name, parts in columns.items()}
-    folder.mkdir()
+    # A part of a dataset would look like one, and be in the way of the next attempt: also after a kill.
+    part = folder.with_name(f".{folder.name:.100}.{secrets.token_hex(4)}.dexsim-part")
+    part.mkdir()
     try:
-        _write(folder, hand, task, whole, episodes)
-    except BaseException:  # A part of a dataset would look like one, and be in the way of the next attempt.
-        shutil.rmtree(folder, ignore_errors=True)
+        _write(part, hand, task, whole, episodes)
+        part.rename(folder)
+    except BaseException:
+        shutil.rmtree(part, ignore_errors=True)
         raise
     return folder
 

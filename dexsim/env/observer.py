@@ -3,6 +3,7 @@
 import jax
 
 from dexsim import observation
+from dexsim.core.errors import ConfigError
 from dexsim.env.config import EnvConfig
 from dexsim.env.task import GroundTruth, Task
 from dexsim.hand.kinematics import Hand
@@ -13,13 +14,17 @@ class Observer:
     """What each group of a task observes. Pure methods, for one environment."""
 
     def __init__(self, config: EnvConfig, hand: Hand, task: Task):
-        """Raises ConfigError: see `group_configs`."""
+        """Raises ConfigError: nothing is left to observe, or see `group_configs`."""
         actor, critic = observation.group_configs(config.observation)
         self.hand, self.fields = hand, task.fields
         self._configs = {group: actor if group == "actor" else critic for group in task.fields}
         self.layout = {
             group: observation.layout(hand, names, self._configs[group]) for group, names in task.fields.items()
         }
+        for group, fields in self.layout.items():
+            if not fields:
+                out = self._configs[group].leave_out
+                raise ConfigError(f"ObservationConfig.leave_out = {out}: leaves the {group} of {task.name!r} nothing")
 
     def observe(
         self, readings: Readings, truth: GroundTruth, command: jax.Array, goal_quat: jax.Array

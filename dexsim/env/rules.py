@@ -1,5 +1,6 @@
-"""What a task's rules give, checked while they are traced: a task may be anybody's."""
+"""What a task has, and what its rules give, checked before and while they are traced: a task may be anybody's."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -7,6 +8,24 @@ import jax.numpy as jnp
 
 from dexsim.core.errors import ConfigError
 from dexsim.env.task import GroundTruth, Task
+from dexsim.observation import FIELDS
+
+
+def check_members(task: Any) -> None:
+    """Whether an object is a `Task`, and observes what there is.
+
+    Raises:
+      ConfigError: it lacks something, or a field that it observes does not exist.
+    """
+    members = (*Task.__annotations__, *(name for name in vars(Task) if not name.startswith("_")))
+    if missing := [name for name in members if not hasattr(task, name)]:
+        raise ConfigError(f"a task {type(task).__name__} has no {', '.join(missing)}; `dexsim.Task` says what they are")
+    for group in ("actor", "critic"):
+        names = task.fields.get(group) if isinstance(task.fields, Mapping) else None
+        if not isinstance(names, tuple | list) or not names:
+            raise _error(task, f"fields has no {group!r} with the names of what it observes")
+        if unknown := [name for name in names if name not in FIELDS]:
+            raise _error(task, f"fields: no field {unknown[0]!r:.80} to observe; choose from {', '.join(FIELDS)}")
 
 
 def reward_of(task: Task, goal: Any, truth: GroundTruth, dropped: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:

@@ -14,6 +14,7 @@ import jax
 import numpy as np
 
 from dexsim.core.compilation import jit
+from dexsim.core.errors import ConfigError
 from dexsim.core.install import install_line
 from dexsim.env.env import Env
 
@@ -32,9 +33,17 @@ class GymVectorEnv(VectorEnv):
       env: what `dexsim.make` returns.
       num_envs: environments side by side.
       observation_group: "actor" or "critic".
+
+    Raises:
+      ConfigError: no environments, or no such group.
     """
 
     def __init__(self, env: Env, num_envs: int, observation_group: str = "actor"):
+        if num_envs < 1:
+            raise ConfigError(f"num_envs = {num_envs}: must be at least 1")
+        if observation_group not in env.observation_layout:
+            groups = ", ".join(env.observation_layout)
+            raise ConfigError(f"no observation group {observation_group!r}: choose from {groups}")
         self.env, self.num_envs, self._group = env, num_envs, observation_group
         size = sum(field.size for field in env.observation_layout[observation_group])
         self.single_observation_space = spaces.Box(-np.inf, np.inf, (size,), np.float32)
@@ -63,8 +72,14 @@ class GymVectorEnv(VectorEnv):
         Returns:
           observation [num_envs, n], reward, terminated, truncated [num_envs], and `info`: where an episode ended,
           `final_obs` [num_envs, n] and `final_info` (return and length) with the masks `_final_obs`, `_final_info`.
+
+        Raises:
+          ConfigError: actions of another shape, or before the first reset.
         """
-        assert self._state is not None, "reset the environment first"
+        if self._state is None:
+            raise ConfigError("reset the environment before its first step")
+        if np.shape(actions) != self.action_space.shape:
+            raise ConfigError(f"the actions have the shape {np.shape(actions)}, expected {self.action_space.shape}")
         self._state, last = self._advance(self._state, np.asarray(actions, np.float32))
         terminated, truncated = np.array(last.terminated), np.array(last.truncated)
         done, info = terminated | truncated, dict[str, Any]()

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, Literal, TypeVar
 
-from dexsim.core.config import NoSettings, setting, to_dict, validate
+from dexsim.core.config import NoSettings, from_dict, setting, to_dict, validate
 from dexsim.core.errors import ConfigError
 from dexsim.hand.kinematics import Hand
 from dexsim.hand.load import load_hand
@@ -95,6 +95,15 @@ class TrainArguments(Generic[EnvConfig]):
             )
 
 
+def arguments_from_dict(config_class: type[Any], data: dict[str, Any]) -> TrainArguments:
+    """The options that a checkpoint or `config.json` holds. Their task is a word: no file says what is imported."""
+    if missing := {"env", "ppo"} - data.keys():
+        raise ConfigError(f"TrainArguments: no {min(missing)}")
+    if ":" in (task := str(data.get("task", ""))):
+        raise ConfigError(f"TrainArguments.task = {task!r:.80}: must be a word; its module is given with --task")
+    return from_dict(TrainArguments, data | {"env": from_dict(config_class, data["env"])})
+
+
 def find_hand(arguments: TrainArguments, begun: Checkpoint | Policy | None) -> Hand | None:
     """The hand to train; None for the default one.
 
@@ -138,6 +147,10 @@ def training_config(arguments: TrainArguments) -> Any:
         objects=dataclasses.replace(env.objects, extremes=share),
     )
 
+
+_BEST = {"return": float | int | None, "iteration": int}
+SAVED = {"arguments": {}, "progress": {"best": _BEST, "seconds": float | int, "without_better": int | None}}
+"""Types of what a checkpoint of a run says."""
 
 # What a resumed run may be given anew: its budget, and what looks on. Everything else is part of the saved state.
 _RESUMABLE = {

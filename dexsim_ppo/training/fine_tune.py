@@ -4,6 +4,7 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from dexsim.core.errors import ConfigError
 from dexsim_ppo.learner.config import PPOConfig
@@ -15,19 +16,26 @@ from dexsim_ppo.policy_file import memory_to_list
 
 
 def fine_tuning_config(policy: Policy, config: PPOConfig) -> PPOConfig:
-    """`config` with the policy's network, little noise, small steps, and initial iterations for the critic alone.
+    """`config` with the policy's network and normaliser, little noise, small steps, and the critic alone at first.
 
     A policy file holds neither critic nor noise. The noise and step size of training from scratch would make the
     policy forget. So would a fresh critic, whose errors are correlated: it trains alone first.
     """
     kind, size = memory_to_list(policy.params.memory) or ["none", 0]
     sizes = {"history": {"memory_length": size + 1}, "gru": {"memory_size": size}}.get(kind, {})
+    normalizer, floor = policy.params.normalizer, config.observation_std_floor
+    running = np.concatenate([np.full(field.size, field.scale is None) for field in policy.observation_layout])
+    smallest = float(np.min(np.asarray(normalizer.std)[running], initial=floor))
+    if smallest < 0.999 * floor:  # Beyond rounding: a higher floor than that of its training would raise deviations.
+        floor = smallest
     return dataclasses.replace(
         config,
         memory=kind,
         **sizes,
         actor_layers=tuple(layer.kernel.shape[1] for layer in policy.params.layers[:-1]),
         distribution=policy.params.squash,
+        observation_clip=normalizer.clip,
+        observation_std_floor=floor,
         learning_rate=1e-5,
         learning_rate_min=1e-6,
         learning_rate_max=5e-4,

@@ -94,10 +94,19 @@ class RunFolder:
           CheckpointError: the best policy's file is unsound.
         """
         later = [path for path in self.existing_checkpoints() if int(path.stem) > after]
-        if self.best.exists() and Policy.load(self.best).training.get("iteration", 0) > after:
+        if self.best.exists() and not self.has_best(after):
             later.append(self.best)
         for path in later:
             path.rename(_aside(path))
+
+    def has_best(self, until: int) -> bool:
+        """Whether the best policy is here, and of no later iteration. A later one is of another course, and replaced
+        the one that a checkpoint before it speaks of.
+
+        Raises:
+          CheckpointError: the file is unsound.
+        """
+        return self.best.exists() and Policy.load(self.best).training.get("iteration", 0) <= until
 
     def prune(self, keep: int) -> None:
         """Delete all but the newest `keep` checkpoints."""

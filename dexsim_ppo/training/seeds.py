@@ -43,13 +43,15 @@ def seed_folder(folder: Path, seed: int) -> Path:
     return folder / f"seed-{seed}"
 
 
-def spread(values: Sequence[float]) -> dict[str, Any]:
-    """Mean, sample standard deviation, extremes and the values themselves, one for each seed (two or more)."""
+def spread(values: Sequence[float | None]) -> dict[str, Any]:
+    """Mean, sample standard deviation, extremes and the values themselves, one for each seed; None, as a report has it
+    for a figure that is not finite, counts in the values alone."""
+    known = [value for value in values if value is not None]
     return {
-        "mean": statistics.fmean(values),
-        "std": statistics.stdev(values),
-        "min": min(values),
-        "max": max(values),
+        "mean": statistics.fmean(known) if known else None,
+        "std": statistics.stdev(known) if len(known) > 1 else None,
+        "min": min(known, default=None),
+        "max": max(known, default=None),
         "values": list(values),
     }
 

@@ -116,8 +116,8 @@ class Run:
                 state = checkpoint.restore(source, shapes)
                 state = place(state, shapes) if self.mesh is not None else jax.tree.map(jnp.copy, state)
                 progress = source.content["progress"]
-                self.best, self.seconds_before = progress["best"], progress["seconds"]
-                self.without_better = progress.get("without_better", 0)
+                self.best = progress["best"] if self.folder.has_best(int(state.iteration)) else self.best
+                self.seconds_before, self.without_better = progress["seconds"], progress.get("without_better", 0)
             else:
                 fresh = aside.submit(lambda: jax.block_until_ready(training.init(key)))
             traced = lambda: self.clock.update(trace_s=time.perf_counter() - begin)  # noqa: E731
@@ -315,7 +315,7 @@ class Run:
         print(f"evaluating {selected.name} and the untrained policy", flush=True)
         begin = time.perf_counter()
         trained, untrained = Policy.load(selected), Policy.load(folder.untrained)
-        if not trained.training["iteration"]:
+        if trained.training.get("iteration") == 0:  # An average of policies, put there by hand, has none.
             print(f"nothing was trained: compiling took {self.clock['compile_s']:.0f} s; give more --minutes")
         measure = functools.partial(self.evaluator, episodes=arguments.evaluation_episodes, seed=REPORT_SEED)
         reports = {}

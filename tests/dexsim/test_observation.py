@@ -1,6 +1,7 @@
 """Observations: sizes, order and content of every field, the ablations, and bitwise sameness."""
 
 import dataclasses
+import types
 
 import jax
 import mujoco
@@ -9,6 +10,7 @@ import pytest
 
 from dexsim import observation
 from dexsim.core.errors import ConfigError
+from dexsim.env.observer import Observer
 from dexsim.observation import (
     FIELDS,
     GRASP,
@@ -168,6 +170,13 @@ def test_the_critic_keeps_what_the_actor_goes_without(hand):
     actor, critic = ([field.name for field in layout(hand, GRASP, one)] for one in group_configs(config))
     assert actor == [*(name for name in GRASP if name != "contact_force"), "last_action"]
     assert critic == [*GRASP, "last_action", "object_spin"]
+
+
+def test_an_actor_that_is_left_nothing_is_refused(hand):
+    task = types.SimpleNamespace(name="mine", fields={"actor": ("contact_force",), "critic": ("contact_force",)})
+    config = types.SimpleNamespace(observation=ObservationConfig(leave_out=("contact_force",)))
+    with pytest.raises(ConfigError, match=r"leave_out = \('contact_force',\): leaves the actor of 'mine' nothing"):
+        Observer(config, hand, task)
 
 
 def test_a_finger_that_touches_nothing_has_its_centre_at_zero(hand, readings):

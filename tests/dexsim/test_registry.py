@@ -15,6 +15,7 @@ from dexsim.tasks.grasp.task import Grasp
 @pytest.fixture(autouse=True)
 def same_tasks_afterwards(monkeypatch):
     monkeypatch.setattr(registry, "TASKS", dict(registry.TASKS))
+    monkeypatch.setattr(registry, "_MODULES", dict(registry._MODULES))
     monkeypatch.delitem(sys.modules, "poke_task", raising=False)
 
 
@@ -51,6 +52,31 @@ def test_a_task_must_have_a_name_by_which_its_policies_find_it(hand):
         registry.make_task("other", hand)
     dexsim.register("mine", Mine)
     assert registry.make_task("other", hand).name == "mine", "one task may have several names, as rotate has"
+
+
+ODD = {
+    "nothing of a task": (object(), "a task object has no name, fields, .*, make_pool, .*`dexsim.Task`"),
+    "one group": ({"fields": {"actor": ("command",)}}, "'mine': fields has no 'critic' with the names"),
+    "a word for a group": ({"fields": {"actor": "command", "critic": ()}}, "'mine': fields has no 'actor'"),
+    "no fields": ({"fields": None}, "'mine': fields has no 'actor'"),
+    "an unknown field": (
+        {"fields": {"actor": ("command", "smell"), "critic": ("command",)}},
+        "'mine': fields: no field 'smell' to observe; choose from joint_position, ",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", ODD)
+def test_what_a_task_lacks_is_named(hand, what):
+    change, message = ODD[what]
+    dexsim.register("mine", lambda config, hand: made, config=GraspConfig)
+    made = change
+    if isinstance(change, dict):
+        made = Mine(GraspConfig(), hand)
+        vars(made).update(change)
+    with pytest.raises(ConfigError, match=message) as error:
+        registry.make_task("mine", hand)
+    assert "\n" not in str(error.value)
 
 
 def test_a_factory_without_annotations_names_its_configuration(hand):
@@ -93,6 +119,16 @@ def test_a_module_is_named_with_the_task(hand):
         registry.find_task("poke_task:__name__")  # A value that is no function.
 
 
+def test_functions_of_one_name_in_two_modules_are_told_apart(tmp_path, monkeypatch):
+    for name in ("first_place", "second_place"):
+        (tmp_path / f"{name}.py").write_text(f"def make_env():\n    raise ValueError('{name}')\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    for name in ("first_place", "second_place", "first_place"):
+        with pytest.raises(ConfigError, match=f"making it fails: ValueError: {name}"):
+            registry.make(f"{name}:make_env")
+        assert registry.task_option("make_env") == f" --task {name}:make_env"
+
+
 def test_what_the_users_module_or_function_raises_is_told_in_one_line(tmp_path, monkeypatch):
     (tmp_path / "poke_task.py").write_text("def poke():\n    raise RuntimeError('no\\nlicence')\n")
     (tmp_path / "half_task.py").write_text("def poke(:\n")
@@ -114,6 +150,23 @@ def test_an_installed_package_brings_tasks_by_its_entry_point(monkeypatch, hand)
     asked = []
     monkeypatch.setattr(registry.importlib.metadata, "entry_points", lambda *, group: asked.append(group) or [Point()])
     assert registry.find_task("mine").task is Mine and asked == ["dexsim.tasks"]
+
+
+def test_an_installed_package_that_fails_is_told_and_hides_no_other(monkeypatch):
+    class Point:
+        value = "their_tasks"
+
+        def load(self):
+            raise ImportError("no module\nnamed torch")
+
+    class Other(Point):
+        def load(self):
+            dexsim.register("mine", Mine)
+
+    monkeypatch.setattr(registry.importlib.metadata, "entry_points", lambda *, group: [Point(), Other()])
+    assert registry.find_task("mine").task is Mine
+    with pytest.raises(ConfigError, match="unknown task 'juggle'.*; their_tasks, .* fails: ImportError: no module"):
+        registry.find_task("juggle")
 
 
 def test_what_make_refuses():

@@ -13,7 +13,7 @@ from tiny_env import SMALL, TinyConfig, TinyEnv
 
 from dexsim.core.config import from_dict
 from dexsim.core.errors import CheckpointError
-from dexsim_ppo import checkpoint
+from dexsim_ppo import checkpoint, reproduce, train
 from dexsim_ppo.acting import act
 from dexsim_ppo.learner.ppo import make_train
 from dexsim_ppo.policy import Policy
@@ -124,6 +124,44 @@ def test_impossible_leaves_are_refused_before_allocation(file, leaf):
     with pytest.raises(CheckpointError):
         checkpoint.load(forged, kind="train")
     forged.unlink()
+
+
+def deep(levels):
+    return [] if levels == 0 else {"a": deep(levels - 1)}
+
+
+@pytest.mark.parametrize("value", [b"x", {b"x": 1}, msgpack.Timestamp(0), msgpack.ExtType(1, b"x"), deep(800)])
+def test_what_a_file_says_is_plain_and_can_be_walked(file, value):
+    """Or else a report, an export or another file could not hold it."""
+    forged = forge(file, content={"training": value})
+    with pytest.raises(CheckpointError, match=r"^[^\n]*a header that makes no sense \(its content [^\n]*$"):
+        checkpoint.load(forged, kind="train")
+    forge(file, content={"training": deep(90)})
+    assert checkpoint.load(forged, kind="train").content["training"]
+    forged.unlink()
+
+
+BEST = {"return": None, "iteration": 0}
+
+
+@pytest.mark.parametrize(
+    "kind, content, said",
+    [
+        ("train", {"arguments": []}, "arguments = []"),
+        ("train", {"progress": {"best": BEST | {"return": "x"}, "seconds": 1.0}}, "progress.best.return = 'x'"),
+        ("train", {"progress": {"best": BEST, "seconds": "x"}}, "progress.seconds = 'x'"),
+        ("train", {"progress": {"best": BEST, "seconds": 1, "without_better": "x"}}, "progress.without_better = 'x'"),
+        ("reproducer", {}, "backend = None"),
+        ("reproducer", {"backend": "c", "calls": 1.5}, "calls = 1.5"),
+        ("reproducer", {"backend": "c", "calls": True}, "calls = True"),
+    ],
+)
+def test_what_a_run_did_not_write_is_named(tmp_path, kind, content, said):
+    path = tmp_path / "a.msgpack"
+    checkpoint.save(path, kind=kind, task="tiny", content={"arguments": {}} | content, tree={})
+    with pytest.raises(CheckpointError) as error:
+        train.find_beginning(None, None, path) if kind == "train" else reproduce.main([str(path)])
+    assert str(error.value) == f"{path}: is no sound {kind!r} file: {said}"
 
 
 def test_other_task_kind_version_and_no_checkpoint(file, tmp_path):

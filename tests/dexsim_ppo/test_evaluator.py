@@ -57,6 +57,31 @@ def test_an_episode_of_totals_is_held_to_its_last_tick():
     assert (report["episodes"], report["steps"], report["starts"]) == (3, 9, 3) and report["task"] == {"ticks": 26}
 
 
+@pytest.mark.parametrize(
+    "found",
+    [
+        None,
+        [1.0],
+        {"headline": 3.0},
+        {"headline": {"r": "high"}},
+        {"headline": {"r": np.ones(2)}},
+        {"headline": {"r": {"mean": 1.0}}},
+        {"kinds": {1, 2}},
+    ],
+    ids=str,
+)
+def test_a_task_that_gives_no_report_is_named(found):
+    env = SimpleNamespace(name="mine", evaluation_steps=9, summarize=lambda metrics, lived: found)
+    with pytest.raises(ConfigError, match=r"^task 'mine': summarize gives no report \([^\n]*\)$"):
+        summarize_totals(env, {"return": np.ones(3)}, np.array([9, 8, 9]), np.arange(3))
+
+
+@pytest.mark.parametrize("value", [None, 1, np.float32(2), {"value": None}, float("nan"), True])
+def test_a_headline_has_numbers_of_any_kind_or_none(value):
+    env = SimpleNamespace(name="mine", evaluation_steps=9, summarize=lambda *_: {"headline": {"r": value}})
+    summarize_totals(env, {"return": np.ones(3)}, np.array([9, 8, 9]), np.arange(3))
+
+
 def test_one_start_has_no_interval_to_speak_of():
     entry = mean_interval(np.array([1.0, 1.0, 4.0]), np.zeros(3))
     assert entry["value"] == 2.0 and entry["low"] == entry["high"] == 2.0

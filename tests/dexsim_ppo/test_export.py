@@ -237,6 +237,14 @@ def test_forged_numbers_are_refused_in_one_line(tmp_path):
         assert "pickle" not in str(error.value)
 
 
+def test_a_small_archive_of_giant_arrays_is_refused_before_they_are_made(tmp_path, monkeypatch):
+    monkeypatch.setattr("dexsim_ppo.portable.LARGEST", 10 * 2**20)
+    np.savez_compressed(tmp_path / "bomb.npz", header=np.array("{}"), mean=np.zeros(11 * 2**20, np.uint8))
+    assert (tmp_path / "bomb.npz").stat().st_size < 2**16
+    with pytest.raises(CheckpointError, match="its arrays have more than 10 MiB"):
+        export.load_exported(tmp_path / "bomb.npz")
+
+
 def test_a_network_of_onnx_must_take_and_give_what_the_header_says(tmp_path):
     onnx, path = pytest.importorskip("onnx"), tmp_path / "rotate.onnx"
     pytest.importorskip("onnxruntime")

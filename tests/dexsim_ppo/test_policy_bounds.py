@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 import hashlib
+import json
 import re
 import struct
 
@@ -18,7 +19,7 @@ from tiny_env import SMALL, TinyEnv
 from dexsim.core.assets import asset_path
 from dexsim.core.config import to_dict
 from dexsim.core.errors import CheckpointError, DexsimError
-from dexsim_ppo import checkpoint, evaluate, train
+from dexsim_ppo import checkpoint, evaluate, reproduce, train
 from dexsim_ppo.learner.ppo import make_train
 from dexsim_ppo.policy import Policy, load_policy
 from dexsim_real.control.controller import Controller
@@ -244,3 +245,33 @@ def test_a_mesh_of_the_current_folder_is_the_policys(sound, tmp_path, monkeypatc
     monkeypatch.chdir(tmp_path)
     for mesh in ("", "mug.stl", "parts/mug.stl", str(tmp_path / "mug.stl")):
         dataclasses.replace(sound, env_config={"objects": {"mesh": mesh}}).check_mesh()
+
+
+def test_no_file_chooses_what_is_imported_or_called(sound, tmp_path, monkeypatch):
+    """A task's name may be `module:function`, but only where a user types it."""
+    called = []
+    (tmp_path / "their_module.py").write_text("import sys\nsys.called.append('imported')\n")
+    monkeypatch.setattr("sys.called", called, raising=False)
+    monkeypatch.syspath_prepend(tmp_path)
+    name, path = "their_module:make_env", tmp_path / "p.msgpack"
+    progress = {"best": {"return": None, "iteration": 0}, "seconds": 0.0}
+    arguments = {"task": name, "env": {}, "ppo": {}}
+    content = {"arguments": arguments, "progress": progress, "backend": "c", "calls": 1}
+    for task in (name, "grasp"):  # In the header, and in the options.
+        dataclasses.replace(sound, task=task).save(path)
+        for kind in ("train", "reproducer"):
+            checkpoint.save(tmp_path / kind, kind=kind, task=task, content=content, tree={})
+        commands = [lambda: evaluate.main([str(path)]), lambda: train.main(["--policy", str(path)])]
+        commands = commands if task == name else []
+        commands += [lambda: train.main(["--resume", str(tmp_path / "train")])]
+        commands += [lambda: reproduce.main([str(tmp_path / "reproducer")])]
+        for command in commands:
+            with pytest.raises(DexsimError, match=r"^[^\n]*task = 'their_module:make_env': must be a word[^\n]*$"):
+                command()
+    (tmp_path / "config.json").write_text(json.dumps({"arguments": arguments}))
+    with pytest.raises(DexsimError, match="unknown task 'make_env'"):
+        train.main(["--config", str(tmp_path / "config.json")])
+    (tmp_path / "config.json").write_text(json.dumps({"arguments": arguments | {"task": "os:grasp"}}))
+    with pytest.raises(DexsimError, match="task = 'os:grasp': must be a word"):
+        train.main(["--config", str(tmp_path / "config.json")])
+    assert called == []

@@ -12,7 +12,7 @@ import dexsim
 from dexsim.core.assets import asset_path
 from dexsim.core.compilation import jit
 from dexsim.core.config import from_dict
-from dexsim.core.errors import ConfigError
+from dexsim.core.errors import CheckpointError, ConfigError
 from dexsim.observation import GRASP, ROTATE, layout
 from dexsim.registry import TASKS
 from dexsim.tasks.grasp.config import GraspConfig
@@ -92,12 +92,14 @@ def test_its_report_is_of_this_file_and_says_how_it_came_about(name):
     assert not report["arguments"]["env"]["randomization"].get("beyond") and "beyond" not in report["command"]
 
 
-def test_an_ablated_policy_takes_the_mean_of_what_it_does_not_see():
+def test_an_ablated_policy_takes_the_mean_or_zero_of_what_it_does_not_see():
     policy = load("rotate")
     names = ("contact_force", "relative_orientation")
     hidden = np.concatenate([np.full(f.size, f.name in names) for f in policy.observation_layout])
     obs = np.random.default_rng(0).normal(size=(20, 65)).astype(np.float32)
     mean = np.asarray(policy.params.normalizer.mean)
+    fixed = np.concatenate([np.full(f.size, f.scale is not None) for f in policy.observation_layout])
+    assert np.any(fixed & hidden) and not mean[fixed].any(), "touch is 0 then"
     ablated = policy.ablate(*names)
     np.testing.assert_allclose(ablated(obs), policy(np.where(hidden, mean, obs)), atol=2e-5)
     np.testing.assert_array_equal(ablated(obs), ablated(np.where(hidden, 9.0, obs)))
@@ -200,7 +202,25 @@ def test_misuse_is_named_by_both_forms_of_a_policy(tmp_path, door, what):
         use(policy, obs)
 
 
+def test_an_observation_may_be_a_list():
+    policy, obs = load("rotate"), np.linspace(-1, 1, 65).astype(np.float32)
+    np.testing.assert_array_equal(policy(obs.tolist()), policy(obs))
+    with pytest.raises(ConfigError, match=r"observes 65 values.*\(2,\)"):
+        policy([1.0, 2.0])
+
+
 def test_the_actors_part_of_the_observation_is_asked_for():
     policy = load("grasp")
     with pytest.raises(ConfigError, match=r"give the actor's part, state.obs\['actor'\]"):
         policy.act(policy.begin(), {"actor": np.zeros(66)})
+
+
+def test_a_folder_named_as_a_shipped_policy_does_not_hide_it(tmp_path, monkeypatch):
+    """Such as one that `--lerobot grasp` wrote."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("grasp", "mine"):
+        (tmp_path / name).mkdir()
+    assert Policy.load("grasp").task == "grasp"
+    for name in ("mine", "./grasp"):
+        with pytest.raises(CheckpointError, match="cannot be read"):
+            Policy.load(name)

@@ -6,6 +6,7 @@ import pytest
 from tiny_env import TinyEnv
 
 pytest.importorskip("gymnasium")
+from dexsim import ConfigError
 from dexsim.wrappers.gymnasium import GymVectorEnv
 
 
@@ -50,3 +51,15 @@ def test_seeds_repeat_and_without_one_the_numbers_go_on():
     first, again = env.reset(seed=5)[0], env.reset(seed=5)[0]
     np.testing.assert_array_equal(first, again)
     assert np.any(env.reset()[0] != first)
+
+
+def test_what_does_not_fit_is_one_line():
+    for count, group, message in ((0, "actor", "num_envs = 0"), (2, "eyes", "no observation group .eyes.: choose")):
+        with pytest.raises(ConfigError, match=message):
+            GymVectorEnv(TinyEnv(), count, group)
+    env = GymVectorEnv(TinyEnv(), 1)
+    with pytest.raises(ConfigError, match="reset the environment before"):
+        env.step(np.zeros((1, 1)))
+    env.reset(seed=0)
+    with pytest.raises(ConfigError, match=r"the actions have the shape \(1,\), expected \(1, 1\)"):
+        env.step(np.zeros(1))

@@ -211,6 +211,19 @@ def test_training_by_name_is_reported_saved_resumed_and_evaluated(tmp_path, monk
     assert code == 0 and f"{report['return']['value']:.4g}" in capsys.readouterr().out
 
 
+def test_what_it_does_not_have_is_refused_before_it_is_measured(tmp_path, monkeypatch):
+    monkeypatch.setattr(registry, "TASKS", dict(registry.TASKS))
+    monkeypatch.setattr(evaluate_command, "Evaluator", None)
+    env, path = adapt(Reach(), "reach"), tmp_path / "p.msgpack"
+    Policy.from_training(env, SMALL, make_train(env, SMALL).init(jax.random.key(0))).save(path)
+    for option, value, said in (
+        ("--seconds", "2", "--seconds 2: task 'reach' has no evaluation_seconds to set"),
+        ("--video", str(tmp_path / "a.mp4"), "a.mp4: 'reach' draws nothing"),
+    ):
+        with pytest.raises(ConfigError, match=said):
+            evaluate_command.main([str(path), "--task", "reach_env:reach", option, value])
+
+
 class Params:
     """As gymnax's: a frozen record with `replace`."""
 

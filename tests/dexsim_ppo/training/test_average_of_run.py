@@ -40,6 +40,9 @@ def test_a_run_stands_for_the_policies_of_its_checkpoints(memory, tmp_path):
         for a, b in zip(jax.tree.leaves(policy.params), jax.tree.leaves(copy.params), strict=True):
             np.testing.assert_array_equal(a, b)
 
+    for read in (run.last, run.checkpoint(3)):
+        with pytest.raises(ConfigError, match="is one of the averaged policies; give another file"):
+            average.main([str(run.path), "--output", str(read)])
     output = tmp_path / "average.msgpack"
     assert average.main([str(run.path), "--output", str(output)]) == 0
     wanted = average_policies(policies)

@@ -12,6 +12,7 @@ from tiny_env import CONFIG, SMALL, TinyConfig, TinyEnv
 
 from dexsim_ppo import evaluate, train
 from dexsim_ppo.learner.ppo import make_train
+from dexsim_ppo.learner.running_stats import Normalizer
 from dexsim_ppo.policy import Policy
 from dexsim_ppo.training.fine_tune import fine_tuning_config, initialize_from
 from dexsim_ppo.training.runlog import RunFolder, read_metrics
@@ -46,6 +47,17 @@ def test_it_acts_like_the_policy(policy):
     again = Policy.from_training(env, config, state)
     np.testing.assert_allclose(again(obs), policy(obs), atol=1e-5)
     assert float(jnp.std(policy(obs))) > 0.1, "a policy that does something"
+
+
+def test_it_sees_as_the_policy_saw(policy):
+    """With another bound on observations, and a smaller floor of their deviations, than those of today's settings."""
+    seeing = Normalizer(jnp.array([0.5, -0.5, 0.0]), jnp.array([1e-3, 0.4, 2.0]), 1.5)
+    policy = dataclasses.replace(policy, params=dataclasses.replace(policy.params, normalizer=seeing))
+    config = fine_tuning_config(policy, SMALL)
+    again = Policy.from_training(TinyEnv(), config, started(policy, config)[2]).params.normalizer
+    assert again.clip == 1.5
+    np.testing.assert_allclose(again.mean, seeing.mean)
+    np.testing.assert_allclose(again.std, seeing.std, rtol=1e-5)
 
 
 def test_the_critic_learns_first_and_then_both(policy):

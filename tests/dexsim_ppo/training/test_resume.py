@@ -20,7 +20,7 @@ from dexsim.core.errors import CheckpointError, ConfigError
 from dexsim_ppo import checkpoint, train
 from dexsim_ppo.learner.curriculum import Curriculum
 from dexsim_ppo.policy import Policy
-from dexsim_ppo.training import runlog
+from dexsim_ppo.training import runlog, trainer
 from dexsim_ppo.training.arguments import check_resumed
 from dexsim_ppo.training.runlog import RunFolder
 
@@ -142,6 +142,27 @@ def test_the_best_policy_of_a_course_that_is_left_is_kept_and_not_reported(tmp_p
     assert train.main(["--resume", str(folder.checkpoint(1)), *no_more]) == 0
     assert (folder.path / "best.aside.msgpack").read_bytes() == content
     assert json.loads(folder.report.read_text())["origin"]["iteration"] == 1
+
+
+def test_an_average_in_the_place_of_the_best_policy_is_reported(finished):
+    origin = {"average_of": [{"iteration": 1}, {"iteration": 2}]}
+    dataclasses.replace(Policy.load(finished.last), training=origin).save(finished.best)
+    assert train.main(["--resume", str(finished.path), "--steps", str(3 * PER_ITERATION)]) == 0
+    report = json.loads(finished.report.read_text())
+    assert report["origin"] == origin and report["policy"] == "best.msgpack"
+
+
+def test_a_best_policy_that_is_set_aside_is_none_to_beat(tmp_path, monkeypatch):
+    """The file of the one before it is gone; of those that follow one must be kept, though their returns are lower."""
+    returns = iter([5.0, 6.0, 3.0, 2.0])
+    monkeypatch.setattr(trainer, "headline", lambda report: {"return": {"value": next(returns)}})
+    often = ["--evaluate-every", "1", "--evaluation-share", "1", "--checkpoint-every", "1", "--run-dir"]
+    assert train.main([*QUICK, "--steps", str(2 * PER_ITERATION), *often, str(tmp_path / "a")]) == 0
+    folder = RunFolder(tmp_path / "a")
+    assert Policy.load(folder.best).training["iteration"] == 2
+    assert train.main(["--resume", str(folder.checkpoint(1)), "--steps", str(3 * PER_ITERATION)]) == 0
+    assert (folder.path / "best.aside.msgpack").exists() and Policy.load(folder.best).training["iteration"] == 2
+    assert json.loads(folder.report.read_text())["policy"] == "best.msgpack"
 
 
 def test_a_checkpoint_is_resumed_from_within_its_folder_and_not_from_elsewhere(finished, monkeypatch, tmp_path):

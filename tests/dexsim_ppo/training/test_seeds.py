@@ -72,6 +72,21 @@ def test_a_seed_that_is_over_does_not_end_the_others(tmp_path, monkeypatch):
         assert [row["iteration"] for row in read_metrics(folder.metrics)] == [1, 2, 3]
 
 
+def test_options_of_seeds_keep_their_engine_and_those_that_are_refused_leave_no_folder(tmp_path, monkeypatch):
+    """As `auto`, which once meant another engine, a run that begins with them would be slower."""
+    monkeypatch.setattr(train, "train_together", lambda *_: False)
+    monkeypatch.setattr(train, "train_run", lambda *_: 15)
+    make = tiny_train.make
+    monkeypatch.setattr("dexsim.make", lambda *a, **given: make(*a, **given | {"backend": "c"}))
+    path = tmp_path / "a"
+    assert train.main([*OPTIONS, "--seeds", "2", "--run-dir", str(path)]) == 128 + 15
+    options, _ = train.parse_arguments(["--config", str(path)])
+    assert (options.backend, options.seeds) == ("c", 2)
+    with pytest.raises(ConfigError, match="--devices 99: there are"):
+        train.main([*OPTIONS, "--seeds", "2", "--devices", "99", "--run-dir", str(tmp_path / "b")])
+    assert not (tmp_path / "b").exists()
+
+
 def test_python_trains_one_seed_at_a_time():
     with pytest.raises(ConfigError, match=r"train_policy\(seeds=3\)"):
         train.train_policy("tiny", preset="cpu", seeds=3)
@@ -79,6 +94,9 @@ def test_python_trains_one_seed_at_a_time():
 
 def test_spread_and_band_in_closed_form():
     assert spread([1.0, 3.0]) == {"mean": 2.0, "std": 2**0.5, "min": 1.0, "max": 3.0, "values": [1.0, 3.0]}
+    assert spread([1.0, None, 3.0]) == {"mean": 2.0, "std": 2**0.5, "min": 1.0, "max": 3.0, "values": [1.0, None, 3.0]}
+    assert spread([None, 3.0]) == {"mean": 3.0, "std": None, "min": 3.0, "max": 3.0, "values": [None, 3.0]}
+    assert spread([None, None])["mean"] is None, "as the return of a simulation that diverges"
     runs = [
         [{"env_steps": 10, "x": 1.0}, {"env_steps": 20, "x": 5.0}, {"env_steps": 30, "x": 5.0}],
         [{"env_steps": 10, "x": 3.0}, {"env_steps": 20, "x": None}, {"env_steps": 30, "x": float("nan")}],

@@ -242,8 +242,8 @@ def test_a_saved_configuration_begins_a_new_run(finished, tmp_path, capsys):
         (["--config", str(edited(finished, tmp_path, env=...))], "TrainArguments: no env"),
         (["--config", str(edited(finished, tmp_path, sed=7))], "TrainArguments has no field 'sed'"),
         (["--config", str(tmp_path / "deep.json")], "no configuration of a run (maximum recursion"),
-        (["--resume", str(tmp_path / "empty.msgpack")], "empty.msgpack: is no checkpoint of a run: arguments = None"),
-        (["--resume", str(tmp_path / "odd.msgpack")], "odd.msgpack: is no checkpoint of a run: progress = {'best': 3}"),
+        (["--resume", str(tmp_path / "empty.msgpack")], "empty.msgpack: is no sound 'train' file: arguments = None"),
+        (["--resume", str(tmp_path / "odd.msgpack")], "odd.msgpack: is no sound 'train' file: progress.best = 3"),
         (["--task", "tiny", "--seed", str(2**32 - 1), "--seeds", "2"], "--seeds 2: the last seed must be at most"),
     ):
         capsys.readouterr()
