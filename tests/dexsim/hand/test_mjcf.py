@@ -98,6 +98,19 @@ def test_fixed_bodies_that_carry_the_palm_move_with_it(tmp_path):
     assert np.linalg.norm(apart[0]) > 0.05
 
 
+@pytest.mark.filterwarnings("ignore:compiler attribute")
+@pytest.mark.parametrize("setting", ["", 'inertiafromgeom="true"', 'settotalmass="1"'])
+def test_neither_rubber_nor_object_change_the_links_masses(tmp_path, monkeypatch, setting):
+    """A fingertip is as heavy as the file has it, though its geoms grow and masses come from them or from a total."""
+    monkeypatch.chdir(tmp_path)  # MuJoCo logs its warnings in the working directory
+    hand = load_hand(rewrite(tmp_path, ('autolimits="true"', f'autolimits="true" {setting}')))
+    alone, placed = mujoco.MjModel.from_xml_path(str(hand.model_path)), scene(hand)
+    for name in hand.body_names:
+        for field in ("mass", "inertia", "ipos", "iquat"):
+            wanted, found = (getattr(model.body(name), field) for model in (alone, placed))
+            np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-15, err_msg=f"{name} {field}")
+
+
 def test_names_that_the_scene_adds_do_not_meet_those_of_the_file(tmp_path):
     numeric = '<custom><numeric name="max_contact_points" data="1"/></custom>\n  <worldbody>'
     hand = load_hand(rewrite(tmp_path, ("thumb_pad_right", "thumb_pad_left_1"), ("<worldbody>", numeric)))
