@@ -17,6 +17,7 @@ from dexsim.physics.model import build_model
 from dexsim_real.twin.plant.scene import _place
 
 PALM, END = '<body name="right_hand_link">', "  </worldbody>"
+PAD = '<geom name="index_pad" class="pad" type="capsule" fromto="0.0033 0 0.0180 0.0011 0 0.0336" size="0.00843"/>'
 SKEW = 'pos="0.1 0.2 0.3" euler="0.3 1.5 -0.4"'
 
 
@@ -109,6 +110,19 @@ def test_neither_rubber_nor_object_change_the_links_masses(tmp_path, monkeypatch
         for field in ("mass", "inertia", "ipos", "iquat"):
             wanted, found = (getattr(model.body(name), field) for model in (alone, placed))
             np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-15, err_msg=f"{name} {field}")
+
+
+@pytest.mark.parametrize(
+    ("shape", "words"),
+    [('type="capsule" mesh="tip"', "a mesh"), ('type="box" fromto="0 0 .018 0 0 .034" size=".008"', "fromto")],
+)
+def test_a_fingertip_whose_size_is_not_in_the_file_is_refused(tmp_path, shape, words):
+    """The compiler would fit it to the mesh without the rubber, and the spheres in it would be of rubber alone."""
+    tip = '<asset><mesh name="tip" vertex="0 0 0  .02 0 0  0 .02 0  0 0 .03"/></asset><worldbody>'
+    pad = PAD.replace('type="capsule" fromto="0.0033 0 0.0180 0.0011 0 0.0336" size="0.00843"', shape)
+    hand = load_hand(rewrite(tmp_path, (PAD, pad), ("<worldbody>", tip)))
+    with pytest.raises(AssetError, match=f"xhand_right.xml: geom 'index_pad' of a fingertip has its size from {words}"):
+        scene(hand)
 
 
 def test_names_that_the_scene_adds_do_not_meet_those_of_the_file(tmp_path):
