@@ -47,6 +47,7 @@ def build_model(
     for geom in spec.geoms:
         geom.contype = geom.conaffinity = 0
 
+    plain = mujoco.MjSpec()  # Its defaults are MuJoCo's: those of the hand's file are for the hand.
     # A template of middling mass: its invweight0 sets the contact stiffness for all objects.
     body = spec.worldbody.add_body(
         name="object", mass=0.1, inertia=[5e-5] * 3, explicitinertial=True, pos=[0.1, 0, 0.1]
@@ -54,6 +55,7 @@ def build_model(
     body.add_freejoint(name="object")
     for k, kind in enumerate(slots):
         body.add_geom(
+            plain.default,
             name=f"object_{k}",
             type=GEOM_TYPES[kind],
             size=largest[k],
@@ -64,7 +66,13 @@ def build_model(
             rgba=[0.85, 0.55, 0.25, 1],
         )
         for name in touching:
-            spec.add_pair(geomname1=name, geomname2=f"object_{k}", condim=3, friction=[0.9, 0.9, 0.005, 1e-4, 1e-4])
+            spec.add_pair(
+                plain.default,
+                geomname1=name,
+                geomname2=f"object_{k}",
+                condim=3,
+                friction=[0.9, 0.9, 0.005, 1e-4, 1e-4],
+            )
     if backend != "jax":  # MJX in JAX has no sensor that matches bodies
         for b in hand.tip_body:
             # data: bit 1 is the force; reduce: 3 is the net force, in the world frame.

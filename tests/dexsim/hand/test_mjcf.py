@@ -12,6 +12,7 @@ from dexsim.hand.kinematics import forward_kinematics
 from dexsim.hand.load import load_hand
 from dexsim.hand.mjcf import read_mjcf
 from dexsim.objects.config import ObjectConfig
+from dexsim.physics import contact
 from dexsim.physics.config import PhysicsConfig
 from dexsim.physics.model import build_model
 from dexsim_real.twin.plant.scene import _place
@@ -123,6 +124,18 @@ def test_a_fingertip_whose_size_is_not_in_the_file_is_refused(tmp_path, shape, w
     hand = load_hand(rewrite(tmp_path, (PAD, pad), ("<worldbody>", tip)))
     with pytest.raises(AssetError, match=f"xhand_right.xml: geom 'index_pad' of a fingertip has its size from {words}"):
         scene(hand)
+
+
+def test_defaults_of_the_file_are_not_for_the_objects_contacts(tmp_path):
+    """A margin would have them begin in the air, on a spring made for a depth."""
+    defaults = '<default><pair margin="0.01" gap="0.002" solreffriction="0.01 1"/><geom density="2" quat="1 1 0 0"/>'
+    model = scene(load_hand(rewrite(tmp_path, ("<default>", defaults))))
+    of_object = contact.pairs_with(model, np.array([model.geom("object_0").id]))
+    assert len(of_object) > 20 and model.npair > len(of_object)
+    assert not model.pair_margin[of_object].any() and not model.pair_gap[of_object].any()
+    assert not model.pair_solreffriction[of_object].any()
+    assert model.geom("object_0").quat.tolist() == [1, 0, 0, 0]
+    assert np.delete(model.pair_margin, of_object).tolist() == [0.01] * (model.npair - len(of_object))
 
 
 def test_names_that_the_scene_adds_do_not_meet_those_of_the_file(tmp_path):
