@@ -160,6 +160,7 @@ def _touching_geoms(hand: Hand, slots: tuple[str, ...]) -> list[str]:
 
 
 def _set_options(spec: mujoco.MjSpec, config: PhysicsConfig, gravity: tuple[float, float, float], backend: str) -> None:
+    spec.option = mujoco.MjSpec().option  # tolerances, flags: none of the hand's file
     option = spec.option
     option.timestep, option.gravity = config.timestep, gravity
     option.integrator = mujoco.mjtIntegrator.mjINT_EULER
@@ -184,6 +185,6 @@ def _set_options(spec: mujoco.MjSpec, config: PhysicsConfig, gravity: tuple[floa
         option.disableflags |= mujoco.mjtDisableBit.mjDSBL_NATIVECCD
     # MJX also offers max_geom_pairs, a cull by bounding spheres. It drops touching pairs of long
     # capsules, one tick this finger, the next tick that one, so it stays off.
-    for own in [numeric for numeric in spec.numerics if numeric.name == "max_contact_points"]:
+    for own in [numeric for numeric in spec.numerics if numeric.name in ("max_contact_points", "max_geom_pairs")]:
         spec.delete(own)
     spec.add_numeric(name="max_contact_points", data=[float(config.max_contacts)], size=1)
