@@ -148,12 +148,14 @@ def _find_joints(
         raise AssetError(f"{model_path}: only hinge joints are supported")
     if len(table["speed_limits"]) != len(joints):
         raise AssetError(f"{path}: {len(table['speed_limits'])} speed_limits for {len(joints)} joints")
-    limit = model.jnt_actfrcrange[joints, 1]
-    if not np.all(model.jnt_limited[joints]) or np.any(limit <= 0):
-        bad = next(
-            n for n, j, t in zip(table["joints"], joints, limit, strict=True) if not model.jnt_limited[j] or t <= 0
-        )
-        raise AssetError(f"{model_path}: joint {bad!r} needs a range and an actuatorfrcrange")
+    for name, joint, (low, high) in zip(table["joints"], joints, model.jnt_actfrcrange[joints], strict=True):
+        if not model.jnt_limited[joint] or high <= 0:
+            raise AssetError(f"{model_path}: joint {name!r} needs a range and an actuatorfrcrange")
+        if not np.isclose(low, -high):
+            raise AssetError(
+                f"{model_path}: joint {name!r} has the actuatorfrcrange {low:g} to {high:g} Nm: a motor's stall torque "
+                "is the same both ways"
+            )
     return joints, followers
 
 

@@ -414,6 +414,12 @@ BAD_MODELS = [
         mjcf=mjcf(LEFT_B, LEFT_B.replace("-.3 .3", "0 0")),
     ),
     bad(
+        "torque limit of one direction",
+        "pinch.xml",
+        ("left_b", "-0.1 to 0.3"),
+        mjcf=mjcf(LEFT_B, LEFT_B.replace("-.3 .3", "-.1 .3")),
+    ),
+    bad(
         "two joints in a body",
         "pinch.xml",
         "left_c",
