@@ -178,9 +178,12 @@ def _find_fingers(
 ) -> tuple[list[int], list[int]]:
     """Each finger's tip site and its first joint, as an index into the TOML's."""
     tips = [_find(path, model_path, model, "site", finger["tip"]) for finger in table["fingers"]]
-    for finger, site in zip(table["fingers"], tips, strict=True):
-        if int(model.site_bodyid[site]) not in row:
+    bodies = [int(body) for body in model.site_bodyid[tips]]
+    for number, (finger, body) in enumerate(zip(table["fingers"], bodies, strict=True)):
+        if body not in row:
             raise AssetError(f"{path}: tip {finger['tip']!r} is on no body of {table['palm']!r}")
+        if body in bodies[:number]:  # The physics gives the force on a link, not where on it.
+            raise AssetError(f"{path}: tip {finger['tip']!r} is on {model.body(body).name!r}, as another finger's tip")
         if finger["root_joint"] not in table["joints"]:
             raise AssetError(f"{path}: root_joint {finger['root_joint']!r} is not among joints")
     return tips, [table["joints"].index(finger["root_joint"]) for finger in table["fingers"]]
@@ -223,6 +226,8 @@ def _check_table(path: Path, table: dict) -> None:
             raise AssetError(f"{path}: {key} = {table[key]!r:.60}: expected a {'string' if kind is str else 'list'}")
     if not isinstance(table.get("taxels", ""), str):
         raise AssetError(f"{path}: taxels = {table['taxels']!r:.60}: expected a string")
+    if "taxels" in table and "taxel_pitch" in table:
+        raise AssetError(f"{path}: taxels is a file and taxel_pitch a lattice in place of it: give one of them")
     for task, place in (("grasp", "centre"), ("rotate", "reference")):
         given = table.get(task, {})
         for key, length in (("posture", len(table["joints"])), (place, 3)):
