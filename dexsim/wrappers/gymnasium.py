@@ -14,6 +14,7 @@ import jax
 import numpy as np
 
 from dexsim.core.compilation import jit
+from dexsim.core.errors import ConfigError
 from dexsim.core.install import install_line
 from dexsim.env.env import Env
 
@@ -32,9 +33,15 @@ class GymVectorEnv(VectorEnv):
       env: what `dexsim.make` returns.
       num_envs: environments side by side.
       observation_group: "actor" or "critic".
+
+    Raises:
+      ConfigError: no such group.
     """
 
     def __init__(self, env: Env, num_envs: int, observation_group: str = "actor"):
+        groups = env.observation_layout
+        if observation_group not in groups:
+            raise ConfigError(f"no observation group {observation_group!r}: choose from {', '.join(groups)}")
         self.env, self.num_envs, self._group = env, num_envs, observation_group
         size = sum(field.size for field in env.observation_layout[observation_group])
         self.single_observation_space = spaces.Box(-np.inf, np.inf, (size,), np.float32)

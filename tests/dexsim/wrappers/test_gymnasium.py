@@ -6,6 +6,7 @@ import pytest
 from tiny_env import TinyEnv
 
 pytest.importorskip("gymnasium")
+from dexsim.core.errors import ConfigError
 from dexsim.wrappers.gymnasium import GymVectorEnv
 
 
@@ -50,3 +51,8 @@ def test_seeds_repeat_and_without_one_the_numbers_go_on():
     first, again = env.reset(seed=5)[0], env.reset(seed=5)[0]
     np.testing.assert_array_equal(first, again)
     assert np.any(env.reset()[0] != first)
+
+
+def test_a_group_that_is_not_there_is_refused():
+    with pytest.raises(ConfigError, match="no observation group 'both': choose from actor"):
+        GymVectorEnv(TinyEnv(), 2, "both")
