@@ -68,6 +68,8 @@ def correct_command(
       correction: [] so far; it stays while fewer than two fingers beside the first touch.
       force: [F] N estimated, zero where nothing touches.
     """
+    if span[0] == span[1]:  # No command speaks of another force.
+        return correction
     touching = force > 0
     felt = commanded_force(force, touching)
     error = command - (felt - span[0]) / (span[1] - span[0])

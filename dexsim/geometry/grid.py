@@ -130,7 +130,14 @@ def stack(grids: list[Grid]) -> Grid:
 
 
 def select(grid: Grid, index: jax.Array | int, scale: jax.Array | float = 1.0) -> Grid:
-    """The object of class `index` [], `scale` times as large; the values stay shared under `vmap`."""
+    """The object of class `index` [], `scale` times as large; the values stay shared under `vmap`.
+
+    Raises:
+      ConfigError: there is no such class; of an index that is traced this cannot be told.
+    """
+    if not isinstance(index, jax.core.Tracer) and np.any((np.asarray(index) < 0) | (np.asarray(index) >= grid.classes)):
+        # Beyond the end the look-up would read any memory.
+        raise ConfigError(f"select: index {index}, the grid has classes 0 to {grid.classes - 1}")
     return dataclasses.replace(grid, index=jnp.asarray(index, jnp.int32), scale=jnp.asarray(scale, jnp.float32))
 
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import io
 import itertools
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from dexsim.core.errors import AssetError, ConfigError
+from dexsim.core.files import write_whole
 
 SURFACES = ("plane", "cylinder", "capsule", "sphere")
 _AWAY = 3e-3  # m, how far from its link a taxel may be: as thick as the rubber
@@ -207,32 +209,35 @@ def check_hand(hand: Any, *, tolerance: float = 1.5e-3) -> None:
 
 
 def write_layout(path: str | Path, patches: dict[str, Patch]) -> Path:
-    """Write the taxels of named fingers (or links) as a layout file; all must have the same grid.
+    """Write the taxels of named fingers (or links) as a layout file, whole or not at all; all must have the same grid.
 
     Raises:
-      ConfigError: grids differ or a normal is not of length 1.
+      ConfigError: grids differ, or a normal, an area or a position is none.
+      OSError: the file cannot be written.
     """
     if len({patch.grid for patch in patches.values()}) != 1:
         raise ConfigError(f"layout: one grid for all fingers expected, found {[p.grid for p in patches.values()]}")
+    text = io.StringIO()
+    out = csv.writer(text, lineterminator="\n")
+    out.writerow(COLUMNS)
+    for name, patch in patches.items():
+        sound = np.abs(np.linalg.norm(patch.normal, axis=-1) - 1) <= 1e-3
+        if not (sound.all() and np.all(patch.area > 0) and np.isfinite(patch.position).all()):
+            raise ConfigError(f"layout {name!r}: normals must be of length 1, areas above 0 and positions finite")
+        for index in range(len(patch.position)):
+            column, row = divmod(index, patch.grid[1])
+            out.writerow(
+                [
+                    name,
+                    column,
+                    row,
+                    *(f"{x:.6f}" for x in patch.position[index]),
+                    *(f"{x:.6f}" for x in patch.normal[index]),
+                    f"{patch.area[index]:.6g}",
+                ]
+            )
     path = Path(path)
-    with open(path, "w", newline="") as file:
-        out = csv.writer(file, lineterminator="\n")
-        out.writerow(COLUMNS)
-        for name, patch in patches.items():
-            if np.any(np.abs(np.linalg.norm(patch.normal, axis=-1) - 1) > 1e-3) or np.any(patch.area <= 0):
-                raise ConfigError(f"layout {name!r}: normals must be of length 1 and areas above 0")
-            for index in range(len(patch.position)):
-                column, row = divmod(index, patch.grid[1])
-                out.writerow(
-                    [
-                        name,
-                        column,
-                        row,
-                        *(f"{x:.6f}" for x in patch.position[index]),
-                        *(f"{x:.6f}" for x in patch.normal[index]),
-                        f"{patch.area[index]:.6g}",
-                    ]
-                )
+    write_whole(path, [text.getvalue().encode()])
     return path
 
 

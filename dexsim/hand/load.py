@@ -148,12 +148,14 @@ def _find_joints(
         raise AssetError(f"{model_path}: only hinge joints are supported")
     if len(table["speed_limits"]) != len(joints):
         raise AssetError(f"{path}: {len(table['speed_limits'])} speed_limits for {len(joints)} joints")
-    limit = model.jnt_actfrcrange[joints, 1]
-    if not np.all(model.jnt_limited[joints]) or np.any(limit <= 0):
-        bad = next(
-            n for n, j, t in zip(table["joints"], joints, limit, strict=True) if not model.jnt_limited[j] or t <= 0
-        )
-        raise AssetError(f"{model_path}: joint {bad!r} needs a range and an actuatorfrcrange")
+    for name, joint, (low, high) in zip(table["joints"], joints, model.jnt_actfrcrange[joints], strict=True):
+        if not model.jnt_limited[joint] or high <= 0:
+            raise AssetError(f"{model_path}: joint {name!r} needs a range and an actuatorfrcrange")
+        if not np.isclose(low, -high):
+            raise AssetError(
+                f"{model_path}: joint {name!r} has the actuatorfrcrange {low:g} to {high:g} Nm: a motor's stall torque "
+                "is the same both ways"
+            )
     return joints, followers
 
 
@@ -176,9 +178,12 @@ def _find_fingers(
 ) -> tuple[list[int], list[int]]:
     """Each finger's tip site and its first joint, as an index into the TOML's."""
     tips = [_find(path, model_path, model, "site", finger["tip"]) for finger in table["fingers"]]
-    for finger, site in zip(table["fingers"], tips, strict=True):
-        if int(model.site_bodyid[site]) not in row:
+    bodies = [int(body) for body in model.site_bodyid[tips]]
+    for number, (finger, body) in enumerate(zip(table["fingers"], bodies, strict=True)):
+        if body not in row:
             raise AssetError(f"{path}: tip {finger['tip']!r} is on no body of {table['palm']!r}")
+        if body in bodies[:number]:  # The physics gives the force on a link, not where on it.
+            raise AssetError(f"{path}: tip {finger['tip']!r} is on {model.body(body).name!r}, as another finger's tip")
         if finger["root_joint"] not in table["joints"]:
             raise AssetError(f"{path}: root_joint {finger['root_joint']!r} is not among joints")
     return tips, [table["joints"].index(finger["root_joint"]) for finger in table["fingers"]]
@@ -221,6 +226,8 @@ def _check_table(path: Path, table: dict) -> None:
             raise AssetError(f"{path}: {key} = {table[key]!r:.60}: expected a {'string' if kind is str else 'list'}")
     if not isinstance(table.get("taxels", ""), str):
         raise AssetError(f"{path}: taxels = {table['taxels']!r:.60}: expected a string")
+    if "taxels" in table and "taxel_pitch" in table:
+        raise AssetError(f"{path}: taxels is a file and taxel_pitch a lattice in place of it: give one of them")
     for task, place in (("grasp", "centre"), ("rotate", "reference")):
         given = table.get(task, {})
         for key, length in (("posture", len(table["joints"])), (place, 3)):

@@ -9,7 +9,8 @@ from dexsim.hand.kinematics import Hand
 def read_mjcf(hand: Hand) -> mujoco.MjSpec:
     """The hand's MJCF without actuators, sensors and keyframes, the palm at the world's origin.
 
-    The file may place the palm anywhere: by any kind of orientation, on fixed bodies, in frames.
+    The file may place the palm anywhere: by any kind of orientation, on fixed bodies, in frames. Masses and inertias
+    are numbers, however the file gives them.
     """
     spec = mujoco.MjSpec.from_file(str(hand.model_path))
     for element in (*spec.actuators, *spec.sensors, *spec.keys):
@@ -25,7 +26,20 @@ def read_mjcf(hand: Hand) -> mujoco.MjSpec:
         place, quat = np.linalg.inv(frame) @ np.linalg.inv(palm) @ frame, np.empty(4)
         mujoco.mju_mat2Quat(quat, place[:3, :3].ravel())
         root.pos, root.quat = place[:3, 3], quat
+    _write_down_masses(spec)
     return spec
+
+
+def _write_down_masses(spec: mujoco.MjSpec) -> None:
+    """A mass by density would grow with a fingertip's rubber, one by the file's total would shrink with the object."""
+    model, compiler, of_geoms = spec.compile(), spec.compiler, mujoco.mjtInertiaFromGeom
+    derived = compiler.settotalmass > 0 or compiler.inertiafromgeom == of_geoms.mjINERTIAFROMGEOM_TRUE
+    compiler.settotalmass, compiler.inertiafromgeom = -1, of_geoms.mjINERTIAFROMGEOM_AUTO
+    for body in spec.bodies[1:]:
+        if derived or not body.explicitinertial:
+            body.explicitinertial, body.mass, body.inertia = True, model.body_mass[body.id], model.body_inertia[body.id]
+            body.ipos, body.iquat = model.body_ipos[body.id], model.body_iquat[body.id]
+            body.fullinertia[0], body.ialt.type = np.nan, mujoco.mjtOrientation.mjORIENTATION_QUAT
 
 
 def _poses(spec: mujoco.MjSpec, *names: str) -> list[np.ndarray]:

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from dexsim.core.errors import AssetError
 from dexsim.core.pytree import Array
 from dexsim.geometry import rotations, sdf
 from dexsim.hand.kinematics import Hand, HandPose
@@ -84,10 +85,20 @@ def pair_constants(
 
 
 def cover_tips(spec: mujoco.MjSpec, hand: Hand, cover: float) -> None:
-    """Enlarge the geoms of the fingertips that touch by `cover` m."""
+    """Enlarge the geoms of the fingertips that touch by `cover` m.
+
+    Raises:
+      AssetError: the size of one is not in the file, where rubber can be added to it.
+    """
     tips = {hand.body_names[b] for b in hand.tip_body}
     for geom in spec.geoms:
         if geom.parent.name in tips and (geom.contype or geom.conaffinity):
+            spanned = np.isfinite(geom.fromto[0]) and geom.type != mujoco.mjtGeom.mjGEOM_CAPSULE
+            if geom.meshname or spanned:
+                raise AssetError(
+                    f"{hand.model_path}: geom {geom.name!r} of a fingertip has its size from "
+                    f"{'fromto' if spanned else 'a mesh'}: rubber is added to it, give it as size, pos and quat"
+                )
             geom.size = np.array(geom.size) + cover * _growth(geom.type)
 
 

@@ -12,6 +12,8 @@ import numpy as np
 
 from dexsim.core.errors import AssetError
 
+_PHYSICS = ("constraint", "equality", "frictionloss", "limit", "contact", "spring", "damper")
+"""Flags that say what a hand is like; gravity is the task's, and others say how MuJoCo works it out."""
 _UNSUPPORTED_COLLISIONS = {
     ("cylinder", "box"),
     ("cylinder", "mesh"),
@@ -68,6 +70,11 @@ def _ignored(model: mujoco.MjModel) -> list[str]:
         found.append("fluid forces (density, viscosity, wind)")
     if model.opt.noslip_iterations:
         found.append("noslip iterations")
+    off = [f for f in _PHYSICS if model.opt.disableflags & int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{f.upper()}"))]
+    if off:
+        found.append(f"flags that disable {', '.join(off)}")
+    if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_OVERRIDE:
+        found.append("flag override")
     return found
 
 

@@ -47,6 +47,7 @@ def build_model(
     for geom in spec.geoms:
         geom.contype = geom.conaffinity = 0
 
+    plain = mujoco.MjSpec()  # Its defaults are MuJoCo's: those of the hand's file are for the hand.
     # A template of middling mass: its invweight0 sets the contact stiffness for all objects.
     body = spec.worldbody.add_body(
         name="object", mass=0.1, inertia=[5e-5] * 3, explicitinertial=True, pos=[0.1, 0, 0.1]
@@ -54,6 +55,7 @@ def build_model(
     body.add_freejoint(name="object")
     for k, kind in enumerate(slots):
         body.add_geom(
+            plain.default,
             name=f"object_{k}",
             type=GEOM_TYPES[kind],
             size=largest[k],
@@ -64,7 +66,13 @@ def build_model(
             rgba=[0.85, 0.55, 0.25, 1],
         )
         for name in touching:
-            spec.add_pair(geomname1=name, geomname2=f"object_{k}", condim=3, friction=[0.9, 0.9, 0.005, 1e-4, 1e-4])
+            spec.add_pair(
+                plain.default,
+                geomname1=name,
+                geomname2=f"object_{k}",
+                condim=3,
+                friction=[0.9, 0.9, 0.005, 1e-4, 1e-4],
+            )
     if backend != "jax":  # MJX in JAX has no sensor that matches bodies
         for b in hand.tip_body:
             # data: bit 1 is the force; reduce: 3 is the net force, in the world frame.
@@ -152,6 +160,7 @@ def _touching_geoms(hand: Hand, slots: tuple[str, ...]) -> list[str]:
 
 
 def _set_options(spec: mujoco.MjSpec, config: PhysicsConfig, gravity: tuple[float, float, float], backend: str) -> None:
+    spec.option = mujoco.MjSpec().option  # tolerances, flags: none of the hand's file
     option = spec.option
     option.timestep, option.gravity = config.timestep, gravity
     option.integrator = mujoco.mjtIntegrator.mjINT_EULER
@@ -176,6 +185,6 @@ def _set_options(spec: mujoco.MjSpec, config: PhysicsConfig, gravity: tuple[floa
         option.disableflags |= mujoco.mjtDisableBit.mjDSBL_NATIVECCD
     # MJX also offers max_geom_pairs, a cull by bounding spheres. It drops touching pairs of long
     # capsules, one tick this finger, the next tick that one, so it stays off.
-    for own in [numeric for numeric in spec.numerics if numeric.name == "max_contact_points"]:
+    for own in [numeric for numeric in spec.numerics if numeric.name in ("max_contact_points", "max_geom_pairs")]:
         spec.delete(own)
     spec.add_numeric(name="max_contact_points", data=[float(config.max_contacts)], size=1)

@@ -19,7 +19,7 @@ def places(scene: PhysicsScene) -> dict[str, Any]:
     geoms, body, pairs = scene.object_geoms, scene.object_body, scene.object_pairs
     return {
         "geom_size": np.concatenate([geoms, scene.tip_geoms]),
-        "geom_rbound": geoms,
+        "geom_rbound": np.concatenate([geoms, scene.tip_geoms]),
         "geom_pos": geoms,
         "geom_quat": geoms,
         "body_mass": body,
@@ -34,9 +34,12 @@ def places(scene: PhysicsScene) -> dict[str, Any]:
 def values(scene: PhysicsScene, object: ObjectParams, contacts: ContactParams) -> dict[str, jax.Array]:
     """What goes to those places; without `geom_quat` where the object's primitives are aligned with it."""
     tips = scene.model.geom_size[scene.tip_geoms] + contacts.cover * scene.tip_growth
+    # The broad phase leaves out what is farther away. Of thinner rubber the sphere round it may stay.
+    around = scene.model.geom_rbound[scene.tip_geoms]
+    around = around + jnp.maximum(contacts.cover, 0.0) * np.linalg.norm(scene.tip_growth, axis=-1)
     found = {
         "geom_size": jnp.concatenate([object.size, tips]),
-        "geom_rbound": bounding_radius(object.size, scene.slots),
+        "geom_rbound": jnp.concatenate([bounding_radius(object.size, scene.slots), around]),
         "geom_pos": object.position,
         "body_mass": object.mass,
         "body_inertia": object.inertia,

@@ -54,6 +54,7 @@ def draw_comparison(
         shape[0],
         figsize=(2.1 * shape[0], 5.2),
         layout="constrained",
+        squeeze=False,
         sharey="row",
         gridspec_kw={"height_ratios": (3, 2)},
     )

@@ -250,7 +250,7 @@ def _taxel_rays(surface: VisibleSurface, view: CameraView, pose: Pose, force: np
     row, column, along = row[taxel, i, 0], column[taxel, 0, j], along[taxel, i, j]
     visible = along - np.float32(_TAXEL_BIAS) < surface.depth[row, column]
     row, column, taxel = row[visible], column[visible], taxel[visible]
-    last = np.empty(surface.depth.shape, np.int16)
+    last = np.empty(surface.depth.shape, np.int32)
     last[row, column] = taxel
     top = last[row, column] == taxel
     row, column, taxel = row[top], column[top], taxel[top]

@@ -117,8 +117,9 @@ def draw_taxels(hand: Hand, taxel_force: np.ndarray, ax: Any = None):
 
     force = np.asarray(taxel_force)
     if ax is None:
-        figure, ax = plt.subplots(1, len(hand.finger_names), figsize=(9, 2.9), layout="constrained")
+        figure, axes = plt.subplots(1, len(hand.finger_names), figsize=(9, 2.9), layout="constrained", squeeze=False)
         plt.close(figure)  # a notebook shows what the cell returns; left open it would be shown twice
+        ax = axes[0]
     top = float(force.max()) or 1.0
     columns, rows = hand.taxel_grid
     for axis, name, values in zip(ax, hand.finger_names, force, strict=True):

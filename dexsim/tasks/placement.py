@@ -20,21 +20,29 @@ def palm_height(hand: Hand) -> float:
 
 
 def clearance(hand: Hand, joints: jax.Array, shape: sdf.Shape, position: jax.Array, rotation: jax.Array) -> jax.Array:
-    """Smallest distance [] m from the object to the hand's capsules, at seven points of each, and spheres.
+    """Smallest distance [] m from the object to what touches of the hand: its spheres, its capsules at seven points of
+    each, and the boxes of all links but the palm at 125 points of each.
 
     Raises:
-      AssetError: the hand has neither.
+      AssetError: the hand has none of them.
     """
-    pose = forward_kinematics(hand, joints)
-    capsules = [g for g in hand.geoms if g.touches and g.kind in ("capsule", "sphere")]
-    if not capsules:
-        raise AssetError(f"{hand.model_path}: no capsule or sphere touches: from what a start keeps clear is not known")
-    lengths = [np.linspace(-1.0, 1.0, 7) * (g.size[1] if g.kind == "capsule" else 0.0) for g in capsules]
-    local = np.stack(
-        [g.position + np.outer(along, g.rotation[:, 2]) for g, along in zip(capsules, lengths, strict=True)]
-    ).astype(np.float32)
-    body = np.array([g.body for g in capsules])
-    radius = np.array([g.size[0] for g in capsules])[:, None]
-    points = pose.body_position[body][:, None] + rotations.rotate(pose.body_rotation[body][:, None], jnp.asarray(local))
-    points = rotations.rotate_inverse(rotation, points - align(position, points))
-    return jnp.min(sdf.signed_distance(points, shape) - radius)
+    pose, palm = forward_kinematics(hand, joints), hand.body_names.index(hand.palm)
+    round_ = [g for g in hand.geoms if g.touches and g.kind in ("capsule", "sphere")]
+    boxes = [g for g in hand.geoms if g.touches and g.kind == "box" and g.body != palm]
+    along = np.array([[0.0, 0.0, part] for part in np.linspace(-1.0, 1.0, 7)])
+    inside = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, 5)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    gaps = []
+    for geoms, unit in ((round_, along), (boxes, inside)):
+        if not geoms:
+            continue
+        reach = [g.size if g.kind == "box" else np.full(3, g.size[1] if g.kind == "capsule" else 0.0) for g in geoms]
+        local = np.stack([g.position + (r * unit) @ g.rotation.T for g, r in zip(geoms, reach, strict=True)])
+        body = np.array([g.body for g in geoms])
+        radius = np.array([0.0 if g.kind == "box" else g.size[0] for g in geoms])[:, None]
+        turned = rotations.rotate(pose.body_rotation[body][:, None], jnp.asarray(local.astype(np.float32)))
+        points = pose.body_position[body][:, None] + turned
+        points = rotations.rotate_inverse(rotation, points - align(position, points))
+        gaps.append(jnp.min(sdf.signed_distance(points, shape) - radius))
+    if not gaps:
+        raise AssetError(f"{hand.model_path}: no capsule, sphere or box of a link touches: what to keep clear of?")
+    return jnp.min(jnp.stack(gaps))

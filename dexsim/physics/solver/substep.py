@@ -168,6 +168,7 @@ def find_stepper(mjx: Any, model: mujoco.MjModel, tips: np.ndarray, *, max_conta
         and not (model.neq or model.ntendon or model.nu)
         and not (model.dof_frictionloss.any() or model.geom_contype.any() or model.geom_conaffinity.any())
         and (model.pair_dim == 3).all()
+        and not (model.pair_gap.any() or model.pair_solreffriction.any())
     )
     collider = collide.find_collider(model) if plain else None
     if collider is None:

@@ -73,8 +73,8 @@ def overload(force: jax.Array, limit: jax.Array) -> jax.Array:
 
 
 def joint_spread(first_joints: jax.Array) -> jax.Array:
-    """R_diff: variance of the inner fingers' first joint angles."""
-    return jnp.var(first_joints)
+    """R_diff: variance of the inner fingers' first joint angles; 0 of a hand of one finger, which has none."""
+    return jnp.var(first_joints) if first_joints.size else jnp.zeros(())
 
 
 def posture_distance(joints: jax.Array, centre: jax.Array) -> jax.Array:

@@ -72,7 +72,6 @@ def _fingerprint(key: jax.Array, hand: Hand, config: Any) -> str:
         "randomization",
         "goal_step",
         "goal_angle",
-        "goal_distance",
         "goal_spin",
         "episode_seconds",
         "evaluation_seconds",

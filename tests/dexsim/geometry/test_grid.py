@@ -282,6 +282,9 @@ def test_classes_share_one_array_and_scale():
         np.testing.assert_allclose(row, s * signed_distance(points / np.float32(s), baked[int(k)]), atol=1e-7)
     # No intermediate is as large as a copy of the values per environment.
     assert run.lower(index, scale).compile().memory_analysis().temp_size_in_bytes < 4 * both.values.size
+    for wrong in (3, -1, np.array([0, 3])):
+        with pytest.raises(ConfigError, match="classes 0 to 2"):
+            grid.select(both, wrong)
     with pytest.raises(ConfigError, match="one configuration"):
         grid.stack([baked[0], grid.bake(kinds[0], GridConfig(nodes=16))])
 

@@ -414,6 +414,12 @@ BAD_MODELS = [
         mjcf=mjcf(LEFT_B, LEFT_B.replace("-.3 .3", "0 0")),
     ),
     bad(
+        "torque limit of one direction",
+        "pinch.xml",
+        ("left_b", "-0.1 to 0.3"),
+        mjcf=mjcf(LEFT_B, LEFT_B.replace("-.3 .3", "-.1 .3")),
+    ),
+    bad(
         "two joints in a body",
         "pinch.xml",
         "left_c",
@@ -472,6 +478,14 @@ BAD_TABLES = [
     bad("joint twice", "pinch.toml", "once", table=table('"right_a", "right_b"', '"left_a", "right_b"')),
     bad("unknown site", "pinch.toml", "left_x", table=table('tip = "left_tip"', 'tip = "left_x"')),
     bad("site outside of the hand", "pinch.toml", ("foot", "base"), table=table('tip = "left_tip"', 'tip = "foot"')),
+    bad(
+        "two tips on a link",
+        "pinch.toml",
+        ("'left_end'", "'left2'", "another finger"),
+        mjcf=mjcf('<site name="left_tip" pos="0 0 .01"/>', '<site name="left_tip"/><site name="left_end"/>'),
+        table=table('tip = "right_tip"\nroot_joint = "right_b"', 'tip = "left_end"\nroot_joint = "left_a"'),
+    ),
+    bad("a file and a lattice of taxels", "pinch.toml", "give one", table="taxel_pitch = [1e-3, 1e-3]\n" + PINCH_TOML),
     bad("unknown root joint", "pinch.toml", "left_x", table=table('root_joint = "left_a"', 'root_joint = "left_x"')),
     bad("unknown palm", "pinch.toml", "paw", table=table('palm = "base"', 'palm = "paw"')),
     bad("finger without a tip", "pinch.toml", "tip", table=table('tip = "left_tip"\n', "")),

@@ -1,5 +1,6 @@
 """Lattices on surfaces against their geometry; the layout file as the hand reads it; refusals."""
 
+import dataclasses
 import shutil
 
 import jax.numpy as jnp
@@ -172,3 +173,14 @@ def test_broken_layout_files(tmp_path):
                 "b": layout.on_surface("plane", layout.lattice(2, 3, pitch=0.01)),
             },
         )
+
+
+@pytest.mark.parametrize("field", ["normal", "area", "position"])
+def test_an_unsound_patch_leaves_the_file_as_it_was(tmp_path, field):
+    good = layout.on_surface("plane", layout.lattice(2, 2, pitch=0.01))
+    path = layout.write_layout(tmp_path / "taxels.csv", {"a": good})
+    before = path.read_bytes()
+    wrong = dataclasses.replace(good, **{field: np.full_like(getattr(good, field), np.nan)})
+    with pytest.raises(ConfigError, match="layout 'b'"):
+        layout.write_layout(path, {"a": good, "b": wrong})
+    assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]

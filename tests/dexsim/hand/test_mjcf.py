@@ -12,11 +12,13 @@ from dexsim.hand.kinematics import forward_kinematics
 from dexsim.hand.load import load_hand
 from dexsim.hand.mjcf import read_mjcf
 from dexsim.objects.config import ObjectConfig
+from dexsim.physics import contact
 from dexsim.physics.config import PhysicsConfig
 from dexsim.physics.model import build_model
 from dexsim_real.twin.plant.scene import _place
 
 PALM, END = '<body name="right_hand_link">', "  </worldbody>"
+PAD = '<geom name="index_pad" class="pad" type="capsule" fromto="0.0033 0 0.0180 0.0011 0 0.0336" size="0.00843"/>'
 SKEW = 'pos="0.1 0.2 0.3" euler="0.3 1.5 -0.4"'
 
 
@@ -96,6 +98,54 @@ def test_fixed_bodies_that_carry_the_palm_move_with_it(tmp_path):
         apart.append((wrist.xpos - palm.xpos) @ palm.xmat.reshape(3, 3))
     np.testing.assert_allclose(apart[1], apart[0], atol=1e-9)
     assert np.linalg.norm(apart[0]) > 0.05
+
+
+@pytest.mark.filterwarnings("ignore:compiler attribute")
+@pytest.mark.parametrize("setting", ["", 'inertiafromgeom="true"', 'settotalmass="1"'])
+def test_neither_rubber_nor_object_change_the_links_masses(tmp_path, monkeypatch, setting):
+    """A fingertip is as heavy as the file has it, though its geoms grow and masses come from them or from a total."""
+    monkeypatch.chdir(tmp_path)  # MuJoCo logs its warnings in the working directory
+    hand = load_hand(rewrite(tmp_path, ('autolimits="true"', f'autolimits="true" {setting}')))
+    alone, placed = mujoco.MjModel.from_xml_path(str(hand.model_path)), scene(hand)
+    for name in hand.body_names:
+        for field in ("mass", "inertia", "ipos", "iquat"):
+            wanted, found = (getattr(model.body(name), field) for model in (alone, placed))
+            np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-15, err_msg=f"{name} {field}")
+
+
+@pytest.mark.parametrize(
+    ("shape", "words"),
+    [('type="capsule" mesh="tip"', "a mesh"), ('type="box" fromto="0 0 .018 0 0 .034" size=".008"', "fromto")],
+)
+def test_a_fingertip_whose_size_is_not_in_the_file_is_refused(tmp_path, shape, words):
+    """The compiler would fit it to the mesh without the rubber, and the spheres in it would be of rubber alone."""
+    tip = '<asset><mesh name="tip" vertex="0 0 0  .02 0 0  0 .02 0  0 0 .03"/></asset><worldbody>'
+    pad = PAD.replace('type="capsule" fromto="0.0033 0 0.0180 0.0011 0 0.0336" size="0.00843"', shape)
+    hand = load_hand(rewrite(tmp_path, (PAD, pad), ("<worldbody>", tip)))
+    with pytest.raises(AssetError, match=f"xhand_right.xml: geom 'index_pad' of a fingertip has its size from {words}"):
+        scene(hand)
+
+
+def test_how_the_file_would_be_worked_out_is_not_for_the_scene(tmp_path):
+    """Gravity is the task's, tolerances are the configuration's, and contacts are not culled by MJX."""
+    own = """<option tolerance="0.1" ls_tolerance="0.9"><flag gravity="disable" sleep="enable"/></option>
+      <custom><numeric name="max_geom_pairs" data="2"/></custom><worldbody>"""
+    model, plain = (scene(load_hand(rewrite(tmp_path, *changes))) for changes in ([], [("<worldbody>", own)]))
+    for field in ("disableflags", "enableflags", "tolerance", "ls_tolerance"):
+        assert getattr(model.opt, field) == getattr(plain.opt, field), field
+    assert [plain.numeric(k).name for k in range(plain.nnumeric)] == ["max_contact_points"]
+
+
+def test_defaults_of_the_file_are_not_for_the_objects_contacts(tmp_path):
+    """A margin would have them begin in the air, on a spring made for a depth."""
+    defaults = '<default><pair margin="0.01" gap="0.002" solreffriction="0.01 1"/><geom density="2" quat="1 1 0 0"/>'
+    model = scene(load_hand(rewrite(tmp_path, ("<default>", defaults))))
+    of_object = contact.pairs_with(model, np.array([model.geom("object_0").id]))
+    assert len(of_object) > 20 and model.npair > len(of_object)
+    assert not model.pair_margin[of_object].any() and not model.pair_gap[of_object].any()
+    assert not model.pair_solreffriction[of_object].any()
+    assert model.geom("object_0").quat.tolist() == [1, 0, 0, 0]
+    assert np.delete(model.pair_margin, of_object).tolist() == [0.01] * (model.npair - len(of_object))
 
 
 def test_names_that_the_scene_adds_do_not_meet_those_of_the_file(tmp_path):

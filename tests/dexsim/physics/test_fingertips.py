@@ -60,6 +60,15 @@ def test_every_engine_is_given_the_same_sizes(hand, scenes, grip):
         np.testing.assert_allclose(size[links], thick.geom_size[links], atol=1e-7)
 
 
+def test_thick_rubber_is_not_beyond_the_broad_phase(scenes, grip):
+    """C MuJoCo and Warp leave out contacts of geoms whose bounding spheres are apart."""
+    model, given = scenes[THIN].mj_model, scenes[THIN].configure(grip[0], cover=THICK - THIN)
+    size, around = np.asarray(given["geom_size"]), np.asarray(given["geom_rbound"])
+    tips = [g for g in range(model.ngeom) if "_pad" in model.geom(g).name and model.geom(g).name[-1].isdigit()]
+    assert len(tips) == 6 * 3 and np.all(size[tips, 0] > model.geom_size[tips, 0] + 1e-3)
+    np.testing.assert_allclose(around[tips], size[tips, 0], atol=1e-8)
+
+
 def test_index_and_middle_finger_stop_each_other(hand):
     """The index finger swings into the middle one at full torque, and then rests on it."""
     model = build_model(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(), (0.0, 0.0, 0.0), "c")

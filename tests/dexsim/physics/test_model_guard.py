@@ -64,6 +64,8 @@ IGNORED = {
     "flex bodies": (scene(world=CLOTH), ""),
     "fluid forces": (scene(option='density="1.2"'), "density"),
     "noslip iterations": (scene(option='noslip_iterations="3"'), ""),
+    "flags that disable": (scene(extra='<option><flag limit="disable" contact="disable"/></option>'), "limit, contact"),
+    "flag override": (scene(extra='<option o_solref="0.1 1"><flag override="enable"/></option>'), ""),
 }
 VARIANTS = {
     "actuator damping": scene(actuator=motor('damping="0 .01"')),

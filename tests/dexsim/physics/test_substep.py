@@ -292,13 +292,18 @@ def test_gradients_go_through_the_solver():
     assert slope[0] == pytest.approx(float(quotient), rel=0.05, abs=5e-3)
 
 
-def test_other_cones_are_left_to_mjx(hand):
+def test_other_cones_and_springs_are_left_to_mjx(hand):
     model = build_model(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(), GRAVITY, "jax")
     tips = tip_bodies(model, hand)
     assert find_stepper(mjx, model, tips, max_contacts=20) is not None
     model.pair_dim[0] = 4
     assert find_stepper(mjx, model, tips, max_contacts=20) is None
-    model.pair_dim[0], model.opt.cone = 3, mujoco.mjtCone.mjCONE_PYRAMIDAL
+    model.pair_dim[0] = 3
+    for field in (model.pair_gap, model.pair_solreffriction):
+        field[0] = 1e-3
+        assert find_stepper(mjx, model, tips, max_contacts=20) is None
+        field[0] = 0
+    model.opt.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
     assert find_stepper(mjx, model, tips, max_contacts=20) is None
 
 

@@ -1,10 +1,13 @@
 """The figures show the numbers they were given."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from dexsim.hand.kinematics import forward_kinematics, taxel_positions
 from dexsim.render.figures import draw_comparison, draw_taxels_3d, lattice_centre
+from dexsim.render.render import draw_taxels
 
 
 def presses(seed, frames=6):
@@ -54,6 +57,18 @@ def test_one_frame_is_drawn_as_bars(hand):
     np.testing.assert_allclose(heights, [force[0].sum(), 2 * force[0].sum()])
     with pytest.raises(ValueError, match=r"\[5, 120\]"):
         draw_comparison(hand, force[:, :50], force[:, :50])
+
+
+def test_a_hand_of_one_finger_has_figures(hand):
+    one = dataclasses.replace(
+        hand,
+        finger_names=hand.finger_names[:1],
+        **{name: getattr(hand, name)[:1] for name in ("taxel_position", "taxel_normal", "taxel_area")},
+    )
+    force = presses(2)[:, :1]
+    assert [axis.get_title() for axis in draw_comparison(one, force, force).axes] == ["thumb", ""]
+    figure = draw_taxels(one, force[0])
+    assert [axis.get_title().split()[0] for axis in figure.axes if axis.images] == ["thumb"]
 
 
 def test_taxels_in_space(hand, tmp_path):

@@ -24,6 +24,7 @@ SIZES = {
     "ellipsoid": [0.02, 0.03, 0.025],
 }
 SMALL = (320, 240)
+CAMERA = render.CAMERAS["grasp"]
 
 
 def primitives(*entries):
@@ -248,6 +249,24 @@ def test_a_loaded_taxel_shows_on_the_finger(hand):
     pixel, _ = project(view, pose.taxel_position[finger, taxel])
     np.testing.assert_allclose([columns.mean() + 0.5, rows.mean() + 0.5], pixel, atol=2)
     assert frames[1][rows, columns].sum() > frames[0][rows, columns].sum()
+
+
+def test_a_picture_shows_however_many_taxels(hand):
+    """Many at the place of each one look like one."""
+    many = 150
+    dense = dataclasses.replace(
+        hand,
+        taxel_grid=(10 * many, 12),
+        **{name: np.repeat(getattr(hand, name), many, 1) for name in ("taxel_position", "taxel_normal", "taxel_area")},
+    )
+    few, lot = (snapshot(h, active=None) for h in (hand, dense))
+    assert lot.taxel_force.size > 2 * 2**15
+    size = (200, 160)
+    pictures = [
+        picture.draw_scene(h, KINDS, s, render.hand_poses(h, s.joint_position[None])[0], CAMERA, size, 1.0)
+        for h, s in ((hand, few), (dense, lot))
+    ]
+    np.testing.assert_array_equal(*pictures)
 
 
 def test_frame_is_deterministic_and_both_cameras_work(hand):

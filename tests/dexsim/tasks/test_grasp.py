@@ -150,6 +150,7 @@ class TestTerms:
 
     def test_penalties(self):
         assert float(joint_spread(jnp.array([0.0, 1.0, 2.0, 3.0]))) == pytest.approx(1.25)
+        assert float(joint_spread(jnp.zeros(0))) == 0.0  # a hand of one finger; NumPy's variance of nothing is NaN
         assert float(posture_distance(jnp.array([3.0, 0.0]), jnp.array([0.0, 4.0]))) == pytest.approx(5.0)
         assert float(action_rate(jnp.array([1.0, -1.0]), jnp.array([0.0, 1.0]))) == 5.0
         assert float(joint_speed(jnp.array([3.0, -4.0]))) == 25.0

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from dexsim.core.errors import AssetError
+from dexsim.hand.kinematics import forward_kinematics
 from dexsim.objects.config import ObjectConfig
 from dexsim.objects.params import sample_object
 from dexsim.tasks.placement import clearance, palm_height
@@ -32,11 +33,28 @@ def test_the_palms_face_is_where_its_box_ends_however_its_axes_are_named(hand):
     assert palm_height(hand) == pytest.approx(palm_height(box), abs=1e-6)
 
 
-def test_spheres_count_and_a_hand_of_boxes_alone_is_refused(hand):
+def test_spheres_count_and_a_hand_of_a_palm_alone_is_refused(hand):
     balls = with_geoms(hand, lambda g: dataclasses.replace(g, kind="sphere") if g.kind == "capsule" else g)
     shape = sample_object(jax.random.key(0), ObjectConfig()).shape()
     joints, away = jnp.zeros(hand.num_joints), jnp.array([1.0, 0.0, 0.1])
     middle = max(float(np.linalg.norm(np.asarray(geom.position))) for geom in hand.geoms)
     assert 0.5 - middle < float(clearance(balls, joints, shape, away, jnp.eye(3))) < 1.0
-    with pytest.raises(AssetError, match="no capsule or sphere touches"):
+    with pytest.raises(AssetError, match="no capsule, sphere or box of a link"):
         clearance(with_geoms(hand, lambda g: g if g.kind == "box" else None), joints, shape, away, jnp.eye(3))
+
+
+def test_boxes_of_links_count(hand):
+    """An object in a link's box is not clear of it."""
+    link, joints = hand.body_names.index("right_hand_mid_link1"), jnp.zeros(hand.num_joints)
+    place = forward_kinematics(hand, joints).body_position[link] + jnp.array([0.0, 0.0, 0.02])
+    shape = sample_object(jax.random.key(0), ObjectConfig()).shape()
+
+    def boxed(geom):
+        if geom.kind != "capsule":
+            return geom
+        size = np.array([0.01, 0.01, 0.03], np.float32)
+        return dataclasses.replace(geom, kind="box", size=size) if geom.body == link else None
+
+    boxes = with_geoms(hand, boxed)
+    assert float(clearance(boxes, joints, shape, place, jnp.eye(3))) < -0.005
+    assert float(clearance(boxes, joints, shape, place + jnp.array([0.2, 0.0, 0.0]), jnp.eye(3))) > 0.1

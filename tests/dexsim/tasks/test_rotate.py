@@ -420,6 +420,7 @@ class TestPool:
             {"direction": -1},
             {"roll": 0.0},
             {"drop_distance": 0.05},
+            {"goal_distance": 0.02},
             {"clearance": 0.002},
             {"curl": (0.0, 0.1)},
             {"squeeze": (0.0, 0.1)},
