@@ -7,13 +7,15 @@ from dexsim.hand.kinematics import Hand
 
 
 def read_mjcf(hand: Hand) -> mujoco.MjSpec:
-    """The hand's MJCF without actuators, sensors and keyframes, the palm at the world's origin.
+    """The hand's MJCF without actuators, sensors, keyframes and options, the palm at the world's origin.
 
-    The file may place the palm anywhere: by any kind of orientation, on fixed bodies, in frames.
+    The scene has options of its own: with the file's flags gravity or contacts could be off. The file may place the
+    palm anywhere: by any kind of orientation, on fixed bodies, in frames.
     """
     spec = mujoco.MjSpec.from_file(str(hand.model_path))
     for element in (*spec.actuators, *spec.sensors, *spec.keys):
         spec.delete(element)
+    spec.option = mujoco.MjSpec().option
     root = spec.body(hand.palm)
     while root.parent != spec.worldbody:
         root = root.parent

@@ -14,7 +14,9 @@ from dexsim.hand.mjcf import read_mjcf
 from dexsim.objects.config import ObjectConfig
 from dexsim.physics.config import PhysicsConfig
 from dexsim.physics.model import build_model
+from dexsim_real.twin.plant.parameters import sample_trial
 from dexsim_real.twin.plant.scene import _place
+from dexsim_real.twin.plant.scene import build_scene as emulated_scene
 
 PALM, END = '<body name="right_hand_link">', "  </worldbody>"
 SKEW = 'pos="0.1 0.2 0.3" euler="0.3 1.5 -0.4"'
@@ -96,6 +98,15 @@ def test_fixed_bodies_that_carry_the_palm_move_with_it(tmp_path):
         apart.append((wrist.xpos - palm.xpos) @ palm.xmat.reshape(3, 3))
     np.testing.assert_allclose(apart[1], apart[0], atol=1e-9)
     assert np.linalg.norm(apart[0]) > 0.05
+
+
+def test_options_of_the_file_do_not_reach_the_scene(tmp_path):
+    flags = '<option tolerance="1"><flag gravity="disable" contact="disable" sleep="enable"/></option><worldbody>'
+    hand = load_hand(rewrite(tmp_path, ("<worldbody>", flags)))
+    parameters = sample_trial("grasp", np.random.default_rng(0), "nominal")
+    off = mujoco.mjtDisableBit.mjDSBL_GRAVITY | mujoco.mjtDisableBit.mjDSBL_CONTACT
+    for model in (scene(hand), emulated_scene(hand, parameters, None, np.array([9.81, 0.0, 0.0])).model):
+        assert not model.opt.disableflags & off and not model.opt.enableflags and model.opt.tolerance < 1e-6
 
 
 def test_names_that_the_scene_adds_do_not_meet_those_of_the_file(tmp_path):
