@@ -29,6 +29,8 @@ def build_foreign_scene(
         geom.priority, geom.margin, geom.gap = 0, 0.0, 0.0
     spec.option.gravity = gravity
     spec.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_GRAVITY)
+    # What is held falls asleep, and would hang in the air when it is let go.
+    spec.option.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
     return _index(spec.compile(), foreign)
 
 

@@ -254,6 +254,17 @@ def test_a_scene_of_its_own_is_left_out(hand, text, write):
     assert fallen == pytest.approx(0.5 * GRAVITY * 0.04, rel=0.03)
 
 
+def test_an_object_that_was_held_is_awake_when_it_is_let_go(hand, text, write):
+    ours = plant(hand, write(text.replace("<option ", '<option><flag sleep="enable"/></option><option ')), "grasp")
+    ours.drive(motors(np.array(POSTURES["grasp"])))
+    ours.advance(1.0)
+    assert ours.stage is Stage.HOLD
+    ours.drive(motors(np.array(POSTURES["grasp"]) + 0.01))
+    before = ours._data.qpos[ours._scene.object_qpos]
+    ours.advance(0.12)
+    assert ours.stage is Stage.FREE and ours._data.qpos[ours._scene.object_qpos] - before > 0.03
+
+
 def test_a_servo_of_another_input_is_driven_by_angles(hand, text, write):
     """As in models whose control is a share of the range: 2.8 Nm/rad, 0 to 255 for 0 to 1.83 rad."""
     servo = (
