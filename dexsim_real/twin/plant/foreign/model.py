@@ -100,12 +100,15 @@ def _names(path: Path) -> dict[str, Any]:
 def _load(path: Path) -> mujoco.MjSpec:
     try:
         spec = mujoco.MjSpec.from_file(str(path))
-        for element in (*spec.keys, *spec.sensors, *spec.cameras, *spec.lights):
+        for element in (*spec.keys, *spec.sensors, *spec.cameras, *spec.lights, *spec.tuples):
             spec.delete(element)
-        for geom in [g for g in spec.worldbody.geoms if g.type == mujoco.mjtGeom.mjGEOM_PLANE]:
-            spec.delete(geom)  # a floor
-        for body in [b for b in spec.worldbody.bodies if _is_loose(b)]:
-            spec.delete(body)  # an object, which would be in the way of the trial's
+        floors = [g for g in spec.worldbody.geoms if g.type == mujoco.mjtGeom.mjGEOM_PLANE]
+        objects = [b for b in spec.worldbody.bodies if _is_loose(b)]  # They would be in the way of the trial's.
+        out = {geom.name for geom in (*floors, *(g for body in objects for g in body.find_all("geom")))}
+        for pair in [p for p in spec.pairs if {p.geomname1, p.geomname2} & out]:
+            spec.delete(pair)
+        for element in (*floors, *objects):
+            spec.delete(element)
         spec.compile()
     except ValueError as error:
         raise HandError(f"{path}: MuJoCo cannot read it ({_line(error)})") from None

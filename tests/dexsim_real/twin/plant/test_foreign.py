@@ -243,9 +243,13 @@ def test_a_hand_without_room_for_an_object_is_no_endless_search(hand, text, writ
 
 def test_a_scene_of_its_own_is_left_out(hand, text, write):
     """Its object would be in the way of the trial's; a camera may look at it. Gravity is the trial's."""
-    scene = """<worldbody><body name="cube" pos="0 0 0.46"><freejoint/><geom type="box" size=".03 .03 .03"/></body>
+    scene = """<worldbody><body name="cube" pos="0 0 .46"><freejoint/><geom name="c" type="box" size=".03 .03 .03"/></body>
         <camera mode="targetbody" target="cube" pos="0 0 1"/><light mode="targetbody" target="cube" pos="0 0 1"/>"""
     words = text.replace("<worldbody>", scene).replace("<option ", '<option><flag gravity="disable"/></option><option ')
+    words = words.replace("<contact>", '<contact><pair geom1="c" geom2="floor"/><exclude body1="cube" body2="hand"/>')
+    words = words.replace(
+        "<actuator>", '<custom><tuple name="all"><element objtype="body" objname="cube"/></tuple></custom><actuator>'
+    )
     ours = plant(hand, write(words), "grasp")
     assert [ours._scene.model.body(b).name for b in range(ours._scene.model.nbody)].count("plant/cube") == 0
     free(ours, (0.5, 0.0, 0.0))
