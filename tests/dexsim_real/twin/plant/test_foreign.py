@@ -138,17 +138,21 @@ def test_a_toml_names_what_cannot_be_found(hand, text, write):
             read_model(write(f'model = "hand.xml"\n{lines}\n', "bad.toml"), hand)
 
 
-@pytest.mark.parametrize("slope", [0.45, 0.7])
-def test_friction_is_that_of_the_file(hand, slope):
+@pytest.mark.parametrize(("slope", "priority"), [(0.45, 0), (0.45, -1), (0.7, 0)])
+def test_friction_is_that_of_the_file(hand, text, write, slope, priority):
     """A cube on the palm, 0.55 in the file: it sticks, or slides with g (sin - 0.55 cos)."""
-    ours = plant(hand)
+    ours = plant(hand, write(text.replace('friction="0.55 ', f'priority="{priority}" solmix="0" friction="0.55 ')))
     model, data, at = ours._scene.model, ours._data, ours._scene.object_qpos
     angle = np.arctan(slope)
     model.opt.gravity[:] = GRAVITY * np.array([-np.cos(angle), 0.0, -np.sin(angle)])
     assert ours._palm_face == pytest.approx(0.0192, abs=1e-5)
     free(ours, (ours._palm_face + 0.0275, -0.002, 0.075))
     ours.drive(motors(np.zeros(12)))
-    ours.advance(0.05)
+    stiffness = []
+    for _ in range(5):
+        ours.advance(0.01)
+        stiffness += data.contact.solref[ours._scene.is_object[data.contact.geom].any(-1)].tolist()
+    assert stiffness and np.all(np.array(stiffness) == [0.007, 1.0])
     before = data.qvel[ours._scene.object_dof + 2]
     ours.advance(0.1)
     rate = (data.qvel[ours._scene.object_dof + 2] - before) / 0.1
@@ -243,7 +247,7 @@ def test_a_hand_without_room_for_an_object_is_no_endless_search(hand, text, writ
 
 def test_a_scene_of_its_own_is_left_out(hand, text, write):
     """Its object would be in the way of the trial's; a camera may look at it. Gravity is the trial's."""
-    scene = """<worldbody><body name="cube" pos="0 0 .46"><freejoint/><geom name="c" type="box" size=".03 .03 .03"/></body>
+    scene = """<worldbody><body name="cube" pos="0 0 .46"><freejoint/><geom name="c" type="box" size="1 1 1"/></body>
         <camera mode="targetbody" target="cube" pos="0 0 1"/><light mode="targetbody" target="cube" pos="0 0 1"/>"""
     words = text.replace("<worldbody>", scene).replace("<option ", '<option><flag gravity="disable"/></option><option ')
     words = words.replace("<contact>", '<contact><pair geom1="c" geom2="floor"/><exclude body1="cube" body2="hand"/>')
