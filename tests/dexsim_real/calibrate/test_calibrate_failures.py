@@ -279,6 +279,10 @@ def test_options_that_do_not_go_together(tmp_path):
         ({"from_log": (tmp_path / "a.log",)}, "--port for a hand, or --from-log"),
         ({"press": PressConfig(current=1.9)}, "must be below --safety.current"),
         ({"press": PressConfig(peak=20.0), "safety": SafetyConfig(finger_force=20.0)}, "well below"),
+        ({"joints": ("mid_joint1",)}, "--joints needs --identify"),
+        ({"dead_band": True}, "--dead-band needs --identify"),
+        ({"identify": True, "fingers": ("index",)}, "--fingers is for presses: not with --identify"),
+        ({"identify": True, "report": tmp_path / "report.json"}, "--report is for presses: not with --identify"),
     ):
         with pytest.raises(HandError, match=says):
             arguments(tmp_path, **options)

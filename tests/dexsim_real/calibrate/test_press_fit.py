@@ -217,6 +217,7 @@ def test_no_file_of_a_command_overwrites_another(hand, session, tmp_path):
             "for both --from-log and --rep",
         ),
         ({"report": session[2]}, "already exists: give another --report, or --force to overwrite it"),
+        ({"identify": True, "calibration": same, "force": True}, "for both --calibration and --output"),
     ):
         with pytest.raises(HandError, match=says):
             arguments(tmp_path, **options)
