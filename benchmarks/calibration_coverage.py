@@ -217,6 +217,11 @@ def main() -> int:
     parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--logs", type=Path, help="folder of recordings, kept; a temporary one if not given")
     options = parser.parse_args()
+    if unknown := [part for part in options.parts if part not in PARTS]:
+        parser.error(f"no part {unknown[0]!r}; choose from {', '.join(PARTS)}")
+    for name in ("trials", "processes"):
+        if getattr(options, name) < 1:  # Without a trial no interval misses.
+            parser.error(f"--{name} {getattr(options, name)}: must be at least 1")
     seeds, rows = range(options.seed, options.seed + options.trials), []
     with (
         tempfile.TemporaryDirectory() as scratch,

@@ -22,11 +22,9 @@ _START, _AFTER = 90.0, 60.0  # s to start a process; s after a trial's time limi
 
 
 def start(words: list[str], **options: Any) -> subprocess.Popen:
-    """Start Python with these arguments in the repository."""
+    """Start Python with these arguments in the present folder, which a policy's or a plant model's path is of."""
     path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH", "")]))
-    return subprocess.Popen(
-        [sys.executable, *words], cwd=ROOT, env={**os.environ, "PYTHONPATH": path}, text=True, **options
-    )
+    return subprocess.Popen([sys.executable, *words], env={**os.environ, "PYTHONPATH": path}, text=True, **options)
 
 
 def twin_words(options: dict[str, Any], seed: int, number: int, command: float, shape: str, folder: Path) -> list[str]:

@@ -63,7 +63,17 @@ def identify(
     """
     for recording in (log,) if holdout is None else (log, holdout):
         check_log(recording)
-    limits = dict(BOUNDS) | {"dead_band": dead_band or (0.0, np.inf)} | dict(bounds or {})
+    if holdout is not None and not np.isclose(holdout.period, log.period):
+        raise CalibrationError(
+            f"{holdout.name}: a period of {holdout.period:g} s, that of the log to fit is {log.period:g} s: a latency "
+            "in sub-steps is not the same in both"
+        )
+    limits = dict(BOUNDS) | {"dead_band": dead_band or (0.0, np.inf)}
+    if unknown := sorted({*(bounds or {})} - {*limits}):
+        raise CalibrationError(f"there are no bounds of {unknown[0]!r}: choose from {', '.join(limits)}")
+    if not latencies:
+        raise CalibrationError("no latencies to try: give at least one, in sub-steps")
+    limits |= dict(bounds or {})
     problem = Problem(log, start, fit, substeps, limits, np.array([position_noise, torque_noise]))
     latency = problem.best_latency(latencies)
     for fine in (False, True):  # once with the given weights, once with those found

@@ -13,7 +13,8 @@ from dexsim_real.core.errors import HandError
 from dexsim_real.core.names import find_function
 
 _UNITS = {"": 1.0, "n": 1.0, "g": 9.80665e-3, "kg": 9.80665}
-_LARGEST = 100.0  # N, largest plausible reading
+LARGEST = 100.0
+"""N, largest plausible reading."""
 _AT_ONCE = 0.005  # s in which most functions answer; the hand goes on without an exchange meanwhile
 _SLOWEST = 10.0  # s, longest wait for a function
 
@@ -28,7 +29,7 @@ def parse_reading(text: str) -> float:
     if not match or match[2].lower() not in _UNITS:
         raise HandError(f"{text.strip()!r} is not a reading: type newtons, or a number with g or kg")
     force = float(match[1].replace(",", ".")) * _UNITS[match[2].lower()]
-    if force > _LARGEST:
+    if force > LARGEST:
         raise HandError(f"{text.strip()!r} is {force:.0f} N, more than a fingertip can press; grams need a g")
     return force
 
@@ -95,8 +96,11 @@ def _call(function: Callable[[], Any], meanwhile: Callable[[], object]) -> float
         force = float(answer[0])
     except Exception:
         force = np.nan
-    if not np.isfinite(force):
-        raise HandError(f"the function of --gauge returned {answer[0]!r:.80}; it must return newtons")
+    if not abs(force) <= LARGEST:
+        raise HandError(
+            f"the function of --gauge returned {answer[0]!r:.80}; it must return newtons, and a fingertip presses with "
+            f"less than {LARGEST:g}"
+        )
     return force
 
 

@@ -6,6 +6,7 @@ makes an exchange and returns its result. Clock and hand can be simulated.
 
 import contextlib
 import dataclasses
+import io
 import queue
 import sys
 import threading
@@ -181,7 +182,7 @@ class Operator:
 
     def __init__(self, console: Console, *, assume_yes: bool = False, stream: TextIO | None = None):
         self.console, self.assume_yes = console, assume_yes
-        self._stream = stream or sys.stdin
+        self._stream = stream or sys.stdin or io.StringIO()  # Python has no `sys.stdin` where it was closed.
         self._lines: queue.SimpleQueue[str] = queue.SimpleQueue()
         self._reader: threading.Thread | None = None
 

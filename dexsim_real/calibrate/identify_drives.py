@@ -144,8 +144,8 @@ def record(arguments: CalibrateArguments, hand: Hand, operator: Operator, **benc
                     loop.move(targets[name][0])
                     loop.recording = True
                     for target in targets[name]:
-                        loop.step(target)
-                        loop.mark({"joint": name, "signal": label})
+                        measured = loop.step(target) is not None  # An angle that cannot be true is no measurement.
+                        loop.mark({"joint": name, "signal": label, "measured": measured})
                     loop.recording = False
         finally:  # A signal that comes just before this line is followed by the close of the workbench.
             work.loop.close()
@@ -230,7 +230,8 @@ def _read(path: Path, hand: Hand) -> tuple[_Source, dict[str, dict[str, list[_Ro
         elif record.kind == Kind.TICK and task == TASK and sent[0] == content["sequence"]:
             if content["joint"] not in hand.joint_names:
                 raise LogError(f"{path}: no joint {content['joint']!r:.40}; choose from {', '.join(hand.joint_names)}")
-            answer = received[1] if received[0] == sent[0] else None
+            measured = received[0] == sent[0] and content.get("measured", True)  # Older logs do not say.
+            answer = received[1] if measured else None
             rows = parts.setdefault(content["joint"], {}).setdefault(content["signal"], [])
             rows.append(_Row(sent_at, sent[1], answer))
     if source is None or task != TASK:

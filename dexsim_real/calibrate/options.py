@@ -121,6 +121,7 @@ class CalibrateArguments:
             if path and path.exists() and not self.force:
                 raise HandError(f"{path} already exists: give another {option}, or --force to overwrite it")
         self._check_distinct()
+        self._check_purpose()
         if self.plot and self.plot.suffix.lower() not in (".png", ".pdf", ".svg"):
             raise HandError(f"--plot {self.plot}: give a file that ends in .png, .pdf or .svg")
         if self.press.current >= self.safety.current:
@@ -134,7 +135,7 @@ class CalibrateArguments:
             )
 
     def _check_distinct(self) -> None:
-        """Check that no file is written over another one of the same command, nor over a log that is read."""
+        """Check that no file is written over another one of the same command, nor over one that is read."""
         written = (
             ("--output", self.destination),
             ("--report", self.report),
@@ -142,9 +143,18 @@ class CalibrateArguments:
             ("--log", self.log),
         )
         used = {os.path.realpath(path): "--from-log" for path in self.from_log}
+        used |= {os.path.realpath(self.calibration): "--calibration"} if self.calibration else {}
         for option, path in written:
             if path and (other := used.setdefault(os.path.realpath(path), option)) != option:
                 raise HandError(f"{path} is given for both {other} and {option}: give each its own file")
+
+    def _check_purpose(self) -> None:
+        """Check that no option is left aside: with another finger or joint than meant the wrong one would move."""
+        presses = {"--fingers": self.fingers, "--gauge": self.gauge, "--plot": self.plot, "--report": self.report}
+        drives = {"--joints": self.joints, "--dead-band": self.dead_band}
+        for option, value in (presses if self.identify else drives).items():
+            if value:
+                raise HandError(f"{option} {'is for presses: not with' if self.identify else 'needs'} --identify")
 
     @property
     def destination(self) -> Path:

@@ -9,6 +9,7 @@ import numpy as np
 
 from dexsim.core.config import from_dict
 from dexsim.hand.kinematics import Hand
+from dexsim_real.calibrate.gauge import LARGEST
 from dexsim_real.calibrate.options import CheckConfig
 from dexsim_real.calibrate.press_procedure import RELEASED, REST
 from dexsim_real.calibrate.taxel_check import raw_sensing
@@ -128,8 +129,12 @@ class _Reader:
             raise LogError(f"{self._path}: this is a log of {meta['task']!r}; give a log of `dexsim_real.calibrate`")
         hardware = from_dict(HardwareConfig, meta["hardware"])
         self._sensing, self._raw = HandSensing(self._hand, hardware), raw_sensing(self._hand, hardware)
-        check, side = from_dict(CheckConfig, meta["check"]), meta.get("handedness", "")  # Older logs name no side.
-        return PressSession(hardware, check, meta["serial"], side, logged_rate(self._path, meta), {}, np.empty(0))
+        check = from_dict(CheckConfig, meta["check"])
+        serial, side = meta["serial"], meta.get("handedness", "")  # Older logs name no side.
+        for word in (serial, side):
+            if not isinstance(word, str) or not word.isprintable():
+                raise LogError(f"{self._path}: the hand calls itself {word!r:.40}; expected a text; record again")
+        return PressSession(hardware, check, serial, side, logged_rate(self._path, meta), {}, np.empty(0))
 
     def _configure(self, session: PressSession, content: dict[str, Any]) -> None:
         if "tare" in content:
@@ -158,7 +163,10 @@ class _Reader:
     ) -> None:
         recording = session.recordings.get(tick["press"])
         if recording is not None and "gauge" in tick:
-            recording.gauge[tick["phase"]] = tick["gauge"]
+            force = tick["gauge"]
+            if not isinstance(force, int | float) or not abs(force) <= LARGEST:
+                raise LogError(f"{self._path}: {tick['press']}: the gauge reads {force!r:.40} N; record again")
+            recording.gauge[tick["phase"]] = float(force)
             return
         if tick["sequence"] != self._number:
             return

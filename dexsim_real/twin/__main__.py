@@ -27,7 +27,8 @@ from dexsim_real.core.process import use_realtime
 from dexsim_real.sensors.camera import CameraConfig
 from dexsim_real.sensors.hand import check_wire
 from dexsim_real.twin.options import TwinArguments
-from dexsim_real.twin.plant.protocol import Plant, check_plant
+from dexsim_real.twin.plant.checked import CheckedPlant
+from dexsim_real.twin.plant.protocol import Plant
 from dexsim_real.twin.server import Twin
 from dexsim_real.twin.wire.firmware import FirmwareConfig
 
@@ -42,14 +43,12 @@ def make_plant(arguments: TwinArguments, hand: Hand) -> Plant:
         given = f"--plant {arguments.plant}"
         makes = find_function(arguments.plant, given, "MODULE:FUNCTION", default="make_plant")
         try:
-            plant = makes(arguments)
+            return CheckedPlant(makes(arguments), given)
         except DexsimError:
             raise
         except Exception as error:  # whatever it raises
             text = " ".join(str(error).split())
             raise HandError(f"{given}: making it fails: {type(error).__name__}: {text:.200}") from error
-        check_plant(plant, given)
-        return plant
     from dexsim_real.twin.plant.foreign.hand import hand_of
 
     return hand_of(

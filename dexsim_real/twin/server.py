@@ -170,7 +170,8 @@ class Twin:
             if self.plant.trial != self._trial:
                 self._trial = self.plant.trial
                 done = self._trial - self._first
-                end = self.plant.results()[done - 1].get("end", "")
+                ended = self.plant.results()[done - 1 : done]
+                end = ended[0].get("end", "") if ended else ""
                 self.note(f"end of trial {done} of {self.arguments.trials}: {end}")
                 if done >= self.arguments.trials:
                     self._stop = True

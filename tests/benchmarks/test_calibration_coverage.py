@@ -2,6 +2,7 @@
 
 import sys
 
+import pytest
 from paths import ROOT
 
 sys.path.insert(0, str(ROOT / "benchmarks"))
@@ -23,6 +24,21 @@ def test_a_gauge_that_reads_nothing_of_the_truth_fails(capsys, monkeypatch, tmp_
     monkeypatch.setattr(sys, "argv", ["calibration_coverage", "joint", "--trials", "10"])
     assert calibration_coverage.main() == 1
     assert '"covered_pct": 80.0' in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        ("joints", "error: no part 'joints'; choose from hand, joint, sensor, drives"),
+        ("joint --trials 0", "error: --trials 0: must be at least 1"),
+        ("joint --processes 0", "error: --processes 0: must be at least 1"),
+    ],
+)
+def test_what_cannot_work_is_refused_in_one_line(capsys, monkeypatch, words, says):
+    monkeypatch.setattr(sys, "argv", ["calibration_coverage", *words.split()])
+    with pytest.raises(SystemExit) as stop:
+        calibration_coverage.main()
+    assert stop.value.code == 2 and capsys.readouterr().err.strip().endswith(says)
 
 
 def missing(seed):

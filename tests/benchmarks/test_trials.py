@@ -1,5 +1,6 @@
 """Trials through the bytes: the emulated hand and the runner as processes of their own, one short trial."""
 
+import importlib
 import json
 import os
 import subprocess
@@ -9,6 +10,15 @@ import pytest
 from paths import ROOT
 
 pytest.importorskip("serial")
+
+
+def test_paths_are_of_the_present_folder(monkeypatch, tmp_path):
+    """As those of trials in virtual time; the modules are the repository's."""
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    monkeypatch.chdir(tmp_path)
+    words = ["-c", "import pathlib, dexsim_real.twin; print(pathlib.Path('hand.xml').resolve())"]
+    shown, _ = importlib.import_module("trials").start(words, stdout=subprocess.PIPE).communicate(timeout=60)
+    assert shown.strip() == str((tmp_path / "hand.xml").resolve())
 
 
 @pytest.mark.slow  # Processes of their own in real time: test_soak has them, too.

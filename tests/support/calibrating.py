@@ -38,7 +38,7 @@ def arguments(folder, **options):
         "log": folder / "hand.log",
         "yes": True,
         "press": SHORT,
-        "fingers": ("index",),
+        "fingers": () if options.get("identify") else ("index",),
         "realtime": False,
         "hardware": HardwareConfig(tare_sum=1000.0),  # The bench's taxels read 0 to 6 counts at rest.
     } | options

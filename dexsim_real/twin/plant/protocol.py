@@ -9,7 +9,6 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from dexsim_real.core.errors import HandError
 from dexsim_real.twin.plant.shapes import ObjectShape
 
 
@@ -40,25 +39,18 @@ class PlantMeasurement:
     object_acceleration: np.ndarray  # [3] m/s^2, measured by an IMU in the object, object frame
 
 
-def check_plant(plant: Any, given: str) -> None:
-    """Check that a user's function returned a plant.
-
-    Raises:
-      HandError: it returned something else; `given` is the option that names the function.
-    """
-    members = {**Plant.__annotations__, **vars(Plant)}
-    lacking = [name for name in members if not name.startswith("_") and not hasattr(plant, name)]
-    if lacking:
-        raise HandError(f"{given}: it returned {type(plant).__name__} without {lacking[0]!r}; expected a `Plant`")
-
-
 class Plant(Protocol):
     """A simulated hand with an object. The owner advances its time."""
 
-    trial: int
-    """Number of the current trial."""
-    shape: ObjectShape
-    """Object of the current trial."""
+    @property
+    def trial(self) -> int:
+        """Number of the current trial."""
+        ...
+
+    @property
+    def shape(self) -> ObjectShape:
+        """Object of the current trial."""
+        ...
 
     @property
     def up(self) -> np.ndarray:

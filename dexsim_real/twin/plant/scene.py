@@ -64,6 +64,7 @@ def build_scene(hand: Hand, parameters: TrialParameters, shape: ObjectShape | No
     spec = mujoco.MjSpec.from_file(str(hand.model_path))
     for element in (*spec.actuators, *spec.sensors, *spec.keys):
         spec.delete(element)
+    spec.option = mujoco.MjSpec().option  # With the file's flags gravity or contacts could be off.
     _place(spec, hand.palm)
     for body in hand.tip_body:
         spec.body(hand.body_names[body]).add_site(name=f"{hand.body_names[body]}_taxels")

@@ -15,7 +15,9 @@ from dexsim.objects.config import ObjectConfig
 from dexsim.physics import contact
 from dexsim.physics.config import PhysicsConfig
 from dexsim.physics.model import build_model
+from dexsim_real.twin.plant.parameters import sample_trial
 from dexsim_real.twin.plant.scene import _place
+from dexsim_real.twin.plant.scene import build_scene as emulated_scene
 
 PALM, END = '<body name="right_hand_link">', "  </worldbody>"
 PAD = '<geom name="index_pad" class="pad" type="capsule" fromto="0.0033 0 0.0180 0.0011 0 0.0336" size="0.00843"/>'
@@ -146,6 +148,15 @@ def test_defaults_of_the_file_are_not_for_the_objects_contacts(tmp_path):
     assert not model.pair_solreffriction[of_object].any()
     assert model.geom("object_0").quat.tolist() == [1, 0, 0, 0]
     assert np.delete(model.pair_margin, of_object).tolist() == [0.01] * (model.npair - len(of_object))
+
+
+def test_options_of_the_file_do_not_reach_the_emulated_hands_scene(tmp_path):
+    flags = '<option tolerance="1"><flag gravity="disable" contact="disable" sleep="enable"/></option><worldbody>'
+    hand = load_hand(rewrite(tmp_path, ("<worldbody>", flags)))
+    parameters = sample_trial("grasp", np.random.default_rng(0), "nominal")
+    off = mujoco.mjtDisableBit.mjDSBL_GRAVITY | mujoco.mjtDisableBit.mjDSBL_CONTACT
+    model = emulated_scene(hand, parameters, None, np.array([9.81, 0.0, 0.0])).model
+    assert not model.opt.disableflags & off and not model.opt.enableflags and model.opt.tolerance < 1e-6
 
 
 def test_names_that_the_scene_adds_do_not_meet_those_of_the_file(tmp_path):

@@ -465,6 +465,8 @@ def test_logs_that_cannot_tell_are_refused_in_one_line(changes, says):
         (dict(start=GUESS | {"mass": 1.0}), "no parameter 'mass'"),
         (dict(start={"stiffness": 3.0}), "no value for damping"),
         (dict(start=GUESS | {"stiffness": 500.0}), "stiffness starts at 500, outside its bounds"),
+        (dict(bounds={"stifness": (1.0, 5.0)}), "there are no bounds of 'stifness': choose from stiffness"),
+        (dict(latencies=()), "no latencies to try"),
     ],
 )
 def test_questions_that_make_no_sense_are_refused(smooth_log, options, says):
@@ -477,6 +479,8 @@ def test_the_holdout_is_checked_before_the_fit(smooth_log, monkeypatch):
     monkeypatch.setattr("dexsim.identification.identify.Problem", lambda *_: pytest.fail("the fit began"))
     with pytest.raises(CalibrationError, match="another day: 10 samples"):
         identify(smooth_log, GUESS, holdout=JointLog(PERIOD, TARGET[:10], TARGET[:10], None, "another day"))
+    with pytest.raises(CalibrationError, match="another day: a period of 0.03 s, that of the log to fit is 0.015 s"):
+        identify(smooth_log, GUESS, holdout=JointLog(2 * PERIOD, TARGET, TARGET, None, "another day"))
 
 
 def test_the_blurred_gradient_is_of_the_same_joint():

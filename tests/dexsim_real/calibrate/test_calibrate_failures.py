@@ -3,6 +3,7 @@
 import dataclasses
 import io
 import re
+import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -280,6 +281,10 @@ def test_options_that_do_not_go_together(tmp_path):
         ({"from_log": (tmp_path / "a.log",)}, "--port for a hand, or --from-log"),
         ({"press": PressConfig(current=1.9)}, "must be below --safety.current"),
         ({"press": PressConfig(peak=20.0), "safety": SafetyConfig(finger_force=20.0)}, "well below"),
+        ({"joints": ("mid_joint1",)}, "--joints needs --identify"),
+        ({"dead_band": True}, "--dead-band needs --identify"),
+        ({"identify": True, "fingers": ("index",)}, "--fingers is for presses: not with --identify"),
+        ({"identify": True, "report": tmp_path / "report.json"}, "--report is for presses: not with --identify"),
     ):
         with pytest.raises(HandError, match=says):
             arguments(tmp_path, **options)
@@ -291,9 +296,11 @@ def test_options_that_do_not_go_together(tmp_path):
         Gauge("ask", operator())
 
 
-def test_nobody_at_the_terminal(hand, tmp_path):
+@pytest.mark.parametrize("stream", [io.StringIO(""), None], ids=["at its end", "closed"])
+def test_nobody_at_the_terminal(hand, tmp_path, monkeypatch, stream):
+    monkeypatch.setattr(sys, "stdin", None)  # As Python has it after `<&-`.
     bench = BenchHand(hand, plates(hand, "index pad"))
-    who = Operator(Console(file=io.StringIO()), stream=io.StringIO(""))
+    who = Operator(Console(file=io.StringIO()), stream=stream)
     with pytest.raises(HandError, match="standard input is closed .--yes asks nothing."):
         record(bench, hand, arguments(tmp_path, yes=False, press=QUICK), who)
     assert off(bench) and bench.closed

@@ -64,6 +64,23 @@ def test_an_identification_gets_what_was_sent_and_answered(hand, tmp_path, monke
     assert 2e-4 < start["inertia"] < 2e-3 and start["stall_torque"] == pytest.approx(1.1)
 
 
+@pytest.mark.parametrize("angle", [0.8, np.nan])
+def test_an_angle_that_cannot_be_true_is_a_lost_one(hand, tmp_path, monkeypatch, angle):
+    bench, count = BenchHand(hand, []), [0]
+    exchange = bench.exchange
+
+    def wrong(command):
+        reply = exchange(command)
+        count[0] += 1
+        if count[0] % 150 == 0:
+            reply.state["joint"]["position"][6] += angle
+        return reply
+
+    bench.exchange = wrong
+    log, _, rest = identifying(bench, hand, tmp_path, monkeypatch)
+    assert np.abs(np.diff(log.position)).max() < 0.1 and np.abs(np.diff(rest["holdout"].position)).max() < 0.1
+
+
 def test_a_line_that_loses_too_much_identifies_nothing(hand, tmp_path):
     bench, count = BenchHand(hand, []), [0]
     exchange = bench.exchange

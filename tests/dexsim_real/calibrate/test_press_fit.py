@@ -172,13 +172,17 @@ def test_an_interrupted_press_leaves_the_one_of_the_log_before(hand, session, tm
         ("rate", "83", "a rate of '83' exchanges per second; expected 20 to 1000"),
         ("rate", 0, "a rate of 0 exchanges"),
         ("rate", float("nan"), "a rate of nan exchanges"),
+        ("serial", 5, "the hand calls itself 5; expected a text"),
+        ("serial", "2R32\x1b", r"the hand calls itself '2R32.x1b'"),
+        ("gauge", "heavy", "middle pad: the gauge reads 'heavy' N"),
+        ("gauge", float("nan"), "middle pad: the gauge reads nan N"),
     ],
 )
-def test_a_forged_log_is_refused_in_one_line(hand, session, tmp_path, part, value, says):
+def test_a_forged_log_is_refused_in_one_line(hand, session, scale, tmp_path, part, value, says):
     with LogWriter(tmp_path / "forged.log") as log:
-        for entry in LogReader(session[2]):
+        for entry in LogReader(scale[1].log if part == "gauge" else session[2]):
             content = entry.content
-            if entry.kind == Kind.META and part in content:
+            if entry.kind in (Kind.META, Kind.TICK) and part in content:
                 content = {**content, part: value}
             elif entry.kind == Kind.META and "placement" in content:
                 content = {"placement": {**content["placement"], part: value}}
@@ -218,6 +222,7 @@ def test_no_file_of_a_command_overwrites_another(hand, session, tmp_path):
             "for both --from-log and --rep",
         ),
         ({"report": session[2]}, "already exists: give another --report, or --force to overwrite it"),
+        ({"identify": True, "calibration": same, "force": True}, "for both --calibration and --output"),
     ):
         with pytest.raises(HandError, match=says):
             arguments(tmp_path, **options)

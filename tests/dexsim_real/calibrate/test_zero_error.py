@@ -143,6 +143,7 @@ def test_a_gauge_that_hangs_or_fails_ends_it_in_one_line(monkeypatch):
         (lambda: None, "returned None; it must return newtons"),
         (lambda: float("nan"), "returned nan; it must return newtons"),
         (lambda: "five", "returned 'five'; it must return newtons"),
+        (lambda: 530.0, "returned 530.0; it must return newtons, and a fingertip presses with less than 100"),
         (hang.wait, "did not return within 0.2 s"),
     ):
         with pytest.raises(HandError, match=says) as caught:

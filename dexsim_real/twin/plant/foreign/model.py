@@ -57,7 +57,7 @@ def read_model(path: str | Path, hand: Hand) -> ForeignModel:
     model = spec.compile()
     if not _TIMESTEPS[0] <= model.opt.timestep <= _TIMESTEPS[1]:
         raise HandError(f"{path}: a timestep of {1e3 * model.opt.timestep:g} ms; 0.1 to 5 ms are possible")
-    _check_physics(path, model)
+    _check_physics(path, spec, model)
     actuators, joints = _joints(path, model, hand, names.get("joints"))
     data = mujoco.MjData(model)
     data.qpos[model.jnt_qposadr[joints]] = 0.0
@@ -100,12 +100,15 @@ def _names(path: Path) -> dict[str, Any]:
 def _load(path: Path) -> mujoco.MjSpec:
     try:
         spec = mujoco.MjSpec.from_file(str(path))
-        for element in (*spec.keys, *spec.sensors, *spec.cameras, *spec.lights):
+        for element in (*spec.keys, *spec.sensors, *spec.cameras, *spec.lights, *spec.tuples):
             spec.delete(element)
-        for geom in [g for g in spec.worldbody.geoms if g.type == mujoco.mjtGeom.mjGEOM_PLANE]:
-            spec.delete(geom)  # a floor
-        for body in [b for b in spec.worldbody.bodies if _is_loose(b)]:
-            spec.delete(body)  # an object, which would be in the way of the trial's
+        floors = [g for g in spec.worldbody.geoms if g.type == mujoco.mjtGeom.mjGEOM_PLANE]
+        objects = [b for b in spec.worldbody.bodies if _is_loose(b)]  # They would be in the way of the trial's.
+        out = {geom.name for geom in (*floors, *(g for body in objects for g in body.find_all("geom")))}
+        for pair in [p for p in spec.pairs if {p.geomname1, p.geomname2} & out]:
+            spec.delete(pair)
+        for element in (*floors, *objects):
+            spec.delete(element)
         spec.compile()
     except ValueError as error:
         raise HandError(f"{path}: MuJoCo cannot read it ({_line(error)})") from None
@@ -118,8 +121,8 @@ def _is_loose(body: mujoco.MjsBody) -> bool:
     return len(joints) == 1 and joints[0].type == mujoco.mjtJoint.mjJNT_FREE
 
 
-def _check_physics(path: Path, model: mujoco.MjModel) -> None:
-    """Check that all numbers are finite, and that nothing is disabled without which a trial shows nothing."""
+def _check_physics(path: Path, spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
+    """Check that all numbers are finite, and that a trial has all that the file asks for, and nothing is disabled."""
     arrays = {name: getattr(model, name) for name in dir(model) if not name.startswith("_")}
     wrong = [
         name
@@ -128,6 +131,10 @@ def _check_physics(path: Path, model: mujoco.MjModel) -> None:
     ]
     if wrong:
         raise HandError(f"{path}: a number is nan or infinite: MuJoCo has it in {', '.join(wrong)}")
+    if model.nflex:
+        raise HandError(f"{path}: flex {spec.flexes[0].name}: the taxels do not feel what is soft; leave it out")
+    if spec.compiler.settotalmass > 0:  # It would count the trial's object.
+        raise HandError(f"{path}: <compiler settotalmass> is not supported: scale the masses in the file")
     for name in _FLAGS:
         if model.opt.disableflags & int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name.upper()}")):
             raise HandError(f'{path}: <flag {name}="disable"/>: a trial needs {name}')

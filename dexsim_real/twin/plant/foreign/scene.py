@@ -22,13 +22,15 @@ def build_foreign_scene(
     """Compile the model of a trial; `gravity` [3] m/s^2 in the palm frame."""
     spec = foreign.spec.copy()
     bits = functools.reduce(int.__or__, (geom.contype | geom.conaffinity for geom in spec.geoms))
+    lowest = min(geom.priority for geom in spec.geoms)
     add_object(spec, parameters, shape)
     for geom in spec.body("object").geoms:
         geom.contype = geom.conaffinity = bits
-        geom.condim, geom.friction, geom.solmix = 1, [0.0, 0.0, 0.0], 1e-9
-        geom.priority, geom.margin, geom.gap = 0, 0.0, 0.0
+        geom.priority, geom.margin, geom.gap = lowest - 1, 0.0, 0.0
     spec.option.gravity = gravity
     spec.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_GRAVITY)
+    # What is held falls asleep, and would hang in the air when it is let go.
+    spec.option.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
     return _index(spec.compile(), foreign)
 
 

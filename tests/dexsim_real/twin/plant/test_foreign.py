@@ -86,6 +86,10 @@ def test_palm_fingertips_and_lattices_are_where_the_hand_has_them(hand):
         ("<option ", '<option actuatorgroupdisable="0" ', "actuatorgroupdisable turns off the actuator of thumb_swing"),
         ("<option ", '<option><flag contact="disable"/></option><option ', '<flag contact="disable"/>: a trial needs'),
         ("<option ", '<option><flag actuation="disable"/></option><option ', "a trial needs actuation"),
+        pytest.param("<compiler ", '<compiler settotalmass="2" ', "<compiler settotalmass> is not supported",
+                     marks=pytest.mark.filterwarnings("ignore:compiler attribute")),
+        ("<worldbody>", '<worldbody><flexcomp name="skin" type="grid" count="2 2 1" radius="0.001" rigid="true"/>',
+         "flex skin: the taxels do not feel what is soft"),
         ('name="middle_tip" pos="-0.0422483', 'name="middle_tip" pos="nan', "MuJoCo has it in site_pos"),
         ('joint damping="0.035"', 'joint damping="inf"', "nan or infinite: MuJoCo has it in dof_damping"),
     ],
@@ -138,17 +142,21 @@ def test_a_toml_names_what_cannot_be_found(hand, text, write):
             read_model(write(f'model = "hand.xml"\n{lines}\n', "bad.toml"), hand)
 
 
-@pytest.mark.parametrize("slope", [0.45, 0.7])
-def test_friction_is_that_of_the_file(hand, slope):
+@pytest.mark.parametrize(("slope", "priority"), [(0.45, 0), (0.45, -1), (0.7, 0)])
+def test_friction_is_that_of_the_file(hand, text, write, slope, priority):
     """A cube on the palm, 0.55 in the file: it sticks, or slides with g (sin - 0.55 cos)."""
-    ours = plant(hand)
+    ours = plant(hand, write(text.replace('friction="0.55 ', f'priority="{priority}" solmix="0" friction="0.55 ')))
     model, data, at = ours._scene.model, ours._data, ours._scene.object_qpos
     angle = np.arctan(slope)
     model.opt.gravity[:] = GRAVITY * np.array([-np.cos(angle), 0.0, -np.sin(angle)])
     assert ours._palm_face == pytest.approx(0.0192, abs=1e-5)
     free(ours, (ours._palm_face + 0.0275, -0.002, 0.075))
     ours.drive(motors(np.zeros(12)))
-    ours.advance(0.05)
+    stiffness = []
+    for _ in range(5):
+        ours.advance(0.01)
+        stiffness += data.contact.solref[ours._scene.is_object[data.contact.geom].any(-1)].tolist()
+    assert stiffness and np.all(np.array(stiffness) == [0.007, 1.0])
     before = data.qvel[ours._scene.object_dof + 2]
     ours.advance(0.1)
     rate = (data.qvel[ours._scene.object_dof + 2] - before) / 0.1
@@ -243,15 +251,30 @@ def test_a_hand_without_room_for_an_object_is_no_endless_search(hand, text, writ
 
 def test_a_scene_of_its_own_is_left_out(hand, text, write):
     """Its object would be in the way of the trial's; a camera may look at it. Gravity is the trial's."""
-    scene = """<worldbody><body name="cube" pos="0 0 0.46"><freejoint/><geom type="box" size=".03 .03 .03"/></body>
+    scene = """<worldbody><body name="cube" pos="0 0 .46"><freejoint/><geom name="c" type="box" size="1 1 1"/></body>
         <camera mode="targetbody" target="cube" pos="0 0 1"/><light mode="targetbody" target="cube" pos="0 0 1"/>"""
     words = text.replace("<worldbody>", scene).replace("<option ", '<option><flag gravity="disable"/></option><option ')
+    words = words.replace("<contact>", '<contact><pair geom1="c" geom2="floor"/><exclude body1="cube" body2="hand"/>')
+    words = words.replace(
+        "<actuator>", '<custom><tuple name="all"><element objtype="body" objname="cube"/></tuple></custom><actuator>'
+    )
     ours = plant(hand, write(words), "grasp")
     assert [ours._scene.model.body(b).name for b in range(ours._scene.model.nbody)].count("plant/cube") == 0
     free(ours, (0.5, 0.0, 0.0))
     ours.advance(0.2)
     fallen = ours._data.qpos[ours._scene.object_qpos] - 0.5
     assert fallen == pytest.approx(0.5 * GRAVITY * 0.04, rel=0.03)
+
+
+def test_an_object_that_was_held_is_awake_when_it_is_let_go(hand, text, write):
+    ours = plant(hand, write(text.replace("<option ", '<option><flag sleep="enable"/></option><option ')), "grasp")
+    ours.drive(motors(np.array(POSTURES["grasp"])))
+    ours.advance(1.0)
+    assert ours.stage is Stage.HOLD
+    ours.drive(motors(np.array(POSTURES["grasp"]) + 0.01))
+    before = ours._data.qpos[ours._scene.object_qpos]
+    ours.advance(0.12)
+    assert ours.stage is Stage.FREE and ours._data.qpos[ours._scene.object_qpos] - before > 0.03
 
 
 def test_a_servo_of_another_input_is_driven_by_angles(hand, text, write):
