@@ -49,6 +49,7 @@ def test_every_public_name_is_in_the_reference(site):
             assert re.search(rf'id="{package}[\w.]*\.{name}"', page), f"{package}.{name}"
 
 
+@pytest.mark.slow
 def test_every_command_is_there_with_its_options(site):
     text = text_of(site, "reference/commands")
     for name, (module, _) in COMMANDS.items():

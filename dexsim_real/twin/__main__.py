@@ -26,8 +26,8 @@ from dexsim_real.core.names import find_function
 from dexsim_real.core.process import use_realtime
 from dexsim_real.sensors.camera import CameraConfig
 from dexsim_real.sensors.hand import check_wire
+from dexsim_real.twin.checked import CheckedPlant
 from dexsim_real.twin.options import TwinArguments
-from dexsim_real.twin.plant.checked import CheckedPlant
 from dexsim_real.twin.plant.protocol import Plant
 from dexsim_real.twin.server import Twin
 from dexsim_real.twin.wire.firmware import FirmwareConfig

@@ -389,6 +389,7 @@ def test_every_range_reaches_the_model_and_the_motion(grasp_env, grasp_rollout, 
     assert 0.2e-3 < early.joint < 10e-3
 
 
+@pytest.mark.slow
 def test_a_range_that_is_lost_is_found_out(grasp_env, grasp_rollout, fresh, monkeypatch, capsys):
     """Lost between configuration and draw, and lost between draw and physics."""
 

@@ -42,6 +42,7 @@ def test_training_by_name_leaves_a_policy_of_that_task(run):
     assert json.loads((run.folder / "config.json").read_text())["arguments"]["task"] == "poke"
 
 
+@pytest.mark.slow
 def test_the_policy_makes_the_environment_that_it_was_trained_in(run):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -57,6 +58,7 @@ def test_the_policy_makes_the_environment_that_it_was_trained_in(run):
     assert action.shape == (12,) and np.all(np.abs(action) <= 1)
 
 
+@pytest.mark.slow
 def test_evaluation_by_name_and_from_python_agree(run, tmp_path, capsys):
     report = evaluate_policy(run.folder / "last.msgpack", episodes=4, chunk=4, backend="c", seed=5)
     code = evaluate_command.main(

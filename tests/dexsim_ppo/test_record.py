@@ -46,6 +46,7 @@ def test_readings_and_targets_are_those_of_the_episodes(env, compiled, kind):
         np.testing.assert_allclose([one.target[tick] for one in found], state.joint_target, atol=2e-3)
 
 
+@pytest.mark.slow
 def test_an_episode_ends_with_its_drop(env):
     policy = load_policy("grasp")
     still = jax.tree.map(np.zeros_like, policy.params.layers)

@@ -114,6 +114,7 @@ def reads(env, state, forces, key=None):
     return seen, state
 
 
+@pytest.mark.slow
 def test_a_tilted_hand_pulls_the_object_aside_and_leaves_the_orientation_alone(make):
     """The bridge aligns the IMU to a known pose of the object, so that a mount that leans is no error of the IMU."""
     env = make(Sensing(orientation=ImuConfig(bias=0.0)), Randomization(gravity_tilt=0.1))
@@ -295,6 +296,7 @@ class TestThreeAxes:
             readings, _ = env.senses.read(jax.random.key(0), state.episode, pressed, goal, jnp.zeros(12), before)
             np.testing.assert_allclose(readings.tangential_force[:, 2], read, atol=1e-5)
 
+    @pytest.mark.slow
     def test_in_state_and_metrics(self, busy):
         _, (_, *_, after), _ = busy
         assert after.sensor_input.tangential_force.shape == (WORLDS, 5, 3)

@@ -62,6 +62,7 @@ class TestBulk:
             values = np.asarray(getattr(drawn, name))[plain]
             assert len(np.unique(values)) > 0.99 * values.size, name
 
+    @pytest.mark.slow
     def test_it_is_uniform_in_its_ranges_whatever_the_row(self, env, drawn):
         low, high = spans(env.config.objects).T
         place = (bulk(drawn) - low) / (high - low)

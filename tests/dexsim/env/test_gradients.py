@@ -84,6 +84,7 @@ def test_gradients_are_finite_through_the_real_physics():
     check_gradients(dexsim.make("grasp", GraspConfig(pool_size=80), backend="jax", num_envs=WORLDS), 10)
 
 
+@pytest.mark.slow
 def test_the_gradient_of_the_reward_is_its_finite_difference(env):
     """Central differences in single precision along random directions of the action."""
     keys = jax.random.split(jax.random.key(2), 3)

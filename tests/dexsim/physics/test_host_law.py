@@ -63,6 +63,7 @@ def test_they_agree_with_xla_to_rounding(motors):
     assert moved > 0.05, "no torque: the test tests nothing"
 
 
+@pytest.mark.slow
 def test_a_tick_is_that_of_a_call_for_each_sub_step(motors, monkeypatch):
     """Laws that the host cannot evaluate stay in XLA, at a call for each sub-step. Here both ways, with one law."""
     env, states, _ = motors

@@ -99,6 +99,7 @@ def test_it_follows_the_solvers_force(grips, shape):
     assert pearson(pairs) >= 0.9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", SHAPES)
 def test_hands_follow_with_one_gain(grips, shape):
     pairs = grips[shape][0]

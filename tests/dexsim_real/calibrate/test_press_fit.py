@@ -26,6 +26,7 @@ from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogError, LogReader, LogWriter
 
 
+@pytest.mark.slow
 def test_torque_constants_come_back(hand, session):
     bench, options, _, _ = session
     calibration = load_calibration(options.output, hand)

@@ -7,7 +7,7 @@ import pytest
 from twin_plant import ScriptedPlant
 
 from dexsim_real.core.errors import HandError
-from dexsim_real.twin.plant.checked import CheckedPlant
+from dexsim_real.twin.checked import CheckedPlant
 from dexsim_real.twin.wire.firmware import idle_motors
 
 
