@@ -304,6 +304,7 @@ def test_the_imu_of_a_hand_in_a_corner_is_in_one_too():
     assert 0.3 < np.mean(extreme) < 0.7 and len(np.unique(np.sign(imu.bias[extreme]), axis=0)) == 8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "config",
     [ObjectConfig(extremes=1.0), RotateConfig(objects=ObjectConfig(shapes=("box",), extremes=1.0))],
@@ -415,6 +416,7 @@ def test_a_range_that_is_lost_is_found_out(grasp_env, grasp_rollout, fresh, monk
     assert conclude(effects[2:]) == 0
 
 
+@pytest.mark.slow
 def test_runs_that_differ_hide_no_range_and_invent_none(grasp_env, grasp_rollout, fresh):
     """As on the Warp backend: no two runs are alike, and contacts let them part further with every tick."""
     rng = np.random.default_rng(0)

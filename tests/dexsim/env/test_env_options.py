@@ -170,6 +170,7 @@ class TestTaxels:
         force, one = press(0), jax.tree.map(lambda x: x[1], last)
         np.testing.assert_allclose(reads(env, one, [force])[0][0], force * gain[1], rtol=1e-6)
 
+    @pytest.mark.slow
     def test_creep_is_remembered_from_tick_to_tick(self, make):
         """A step of force comes in by 1 - a exp(-t / tau); the memory is in the state."""
         env = make(self.sensing(hysteresis=(0.4, 0.4), hysteresis_time=(0.1, 0.1)))
@@ -191,6 +192,7 @@ class TestTaxels:
         runs = np.diff(np.flatnonzero(np.diff(values, prepend=-1.0)))
         assert set(runs[1:].tolist()) <= {4, 5} and len(runs) >= 6  # the first is cut by the array's own clock
 
+    @pytest.mark.slow
     def test_crosstalk_drift_and_counts(self, make):
         still = [jnp.zeros((5, 120)).at[:, 65].set(2.0)] * 40
         env = make(self.sensing(crosstalk=(0.2, 0.2)))

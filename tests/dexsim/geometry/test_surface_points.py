@@ -44,6 +44,7 @@ def probes(shape, count=2000, room=0.004, seed=0):
     return np.random.default_rng(seed).uniform(low - room, high + room, (count, 3)).astype(np.float32)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", SIZES)
 def test_points_lie_on_the_surface_and_look_outward(kind):
     shape = solid(kind, *SIZES[kind])

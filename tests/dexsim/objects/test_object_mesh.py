@@ -80,6 +80,7 @@ class TestBoxes:
         assert len(mesh_object.kinds) == 2 and error.mean() < 1e-5 and error.max() < 3e-4
         assert 0.3 < np.arccos(mesh_object.axes[0, 0]) < 0.8
 
+    @pytest.mark.slow
     def test_what_is_round_is_followed_within_the_deviation_that_is_reported(self):
         radius, half = 0.02, 0.02
         surface = trimesh.creation.capsule(height=2 * half, radius=radius, count=[20, 20])
@@ -91,6 +92,7 @@ class TestBoxes:
         assert off.mean() < 1.5 * mean and np.percentile(off, 99) < 1.5 * most
         assert mean < 0.025 * 0.08 and most < 0.1 * 0.08  # what is stated
 
+    @pytest.mark.slow
     def test_principal_axes_are_found(self):
         turn = rotations.quat_to_matrix(jnp.array([0.9, 0.2, -0.3, 0.25]) / np.linalg.norm([0.9, 0.2, -0.3, 0.25]))
         sides, place = np.array([0.04, 0.06, 0.09]), np.array([0.5, -0.2, 0.1])
@@ -184,6 +186,7 @@ def simple(monkeypatch):
     monkeypatch.setattr("dexsim.env.env.Physics", SimplePhysics)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["closed_form", "grid", "surface_points"])
 def test_taxels_feel_the_mesh_at_the_size_of_the_episode(simple, folder, method):
     objects = ObjectConfig(mesh=str(folder / "cuboid.ply"), mesh_unit=0.001, mesh_size=(0.9, 1.1))
@@ -213,6 +216,7 @@ def test_an_environment_steps_with_a_mesh(simple, folder):
     assert felt > 10 and all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(state.obs))
 
 
+@pytest.mark.slow
 def test_a_mesh_is_turned_like_the_cube_that_it_is(simple, folder):
     """Start states settle in C MuJoCo: a mesh of a cube comes to rest where the cube of that edge does."""
     nominal = ObjectConfig(mass=(0.1, 0.1), friction=(0.9, 0.9), com_offset=0.0)

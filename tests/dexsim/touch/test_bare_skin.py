@@ -251,6 +251,7 @@ def test_an_environment_reads_no_more_than_without(environments, hand):
     assert sums[0][1] > 1.0 and np.all(sums[1] <= sums[0] + 1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("angle, least, most", [(0.0, 0.99, 1.0), (2.1, 0.05, 0.9), (2.9, 0.0, 0.0)])
 def test_what_rests_on_taxels_drags_along_them(environments, hand, angle, least, most):
     """As much of the tangential force as of the load: all of it, a part, nothing."""

@@ -300,6 +300,7 @@ def test_the_page_shows_the_hand(page):
     assert wait_until(lambda: colors() > 200), "the canvas stays empty"
 
 
+@pytest.mark.slow
 def test_a_slider_changes_the_force(page):
     command = page.get_by_role("slider").first
 

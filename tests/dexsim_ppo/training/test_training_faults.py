@@ -129,6 +129,7 @@ def test_the_fault_can_be_replayed(diverged, capsys):
     assert "critic observation 'target'" not in out
 
 
+@pytest.mark.slow
 def test_a_fault_that_is_gone_is_not_reproduced(diverged, monkeypatch, capsys):
     folder, *_ = diverged
     (file,) = folder.path.glob("reproduce-*.msgpack")
@@ -148,6 +149,7 @@ class Unpaid(TinyEnv):
         return dataclasses.replace(state, reward=jnp.where(action[0] > 0, jnp.nan, state.reward))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_the_replay_takes_the_actions_of_the_training(seed):
     """Which rewards are NaN depends on the actions, so on the random numbers: training counts as many."""

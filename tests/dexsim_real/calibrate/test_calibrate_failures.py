@@ -145,6 +145,7 @@ def test_a_missed_pen_can_be_skipped(hand, tmp_path):
     assert helper.told == 4 and not recording.time and off(bench) and bench.closed
 
 
+@pytest.mark.slow
 def test_motors_that_give_no_more_turn_round(hand, tmp_path):
     """A current limit far below what 8 N need: the press ends where the force ends."""
     hardware = dataclasses.replace(arguments(tmp_path).hardware, torque_max=90)  # 0.45 A on the bench

@@ -66,6 +66,7 @@ def test_a_frozen_runner_is_killed_and_its_hand_turned_off(peer):
         assert peer.commands and not peer.on().any()
 
 
+@pytest.mark.slow
 def test_who_counts_as_frozen(peer):
     """Not who gives signs of life, pauses briefly, or has asked for the time, as a runner does that stops its hand."""
     with guarded(peer) as living, guarded(peer) as paused, guarded(peer, "5") as patient:

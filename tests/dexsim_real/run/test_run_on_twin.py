@@ -30,6 +30,7 @@ def wait(condition, seconds):
     assert condition()
 
 
+@pytest.mark.slow
 def test_wrong_angles_move_nothing_as_judged_by_the_true_ones(hand, tmp_path):
     script = (
         "2 angle 4 offset 1.3 0",
