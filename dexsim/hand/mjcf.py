@@ -20,19 +20,20 @@ def read_mjcf(hand: Hand) -> mujoco.MjSpec:
         root = root.parent
     # `alt` (euler and the like) would outweigh the quaternion.
     root.pos, root.quat, root.alt.type = [0, 0, 0], [1, 0, 0, 0], mujoco.mjtOrientation.mjORIENTATION_QUAT
-    frame, palm = _poses(spec, root.name, hand.palm)
+    model = spec.compile()
+    frame, palm = _poses(model, root.name, hand.palm)
     if not np.array_equal(palm, np.eye(4)):
         # The root is at frame @ place, and its palm at frame @ place @ (inverse of frame @ palm): that is to be 1.
         place, quat = np.linalg.inv(frame) @ np.linalg.inv(palm) @ frame, np.empty(4)
         mujoco.mju_mat2Quat(quat, place[:3, :3].ravel())
         root.pos, root.quat = place[:3, 3], quat
-    _write_down_masses(spec)
+    _write_down_masses(spec, model)
     return spec
 
 
-def _write_down_masses(spec: mujoco.MjSpec) -> None:
+def _write_down_masses(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
     """A mass by density would grow with a fingertip's rubber, one by the file's total would shrink with the object."""
-    model, compiler, of_geoms = spec.compile(), spec.compiler, mujoco.mjtInertiaFromGeom
+    compiler, of_geoms = spec.compiler, mujoco.mjtInertiaFromGeom
     derived = compiler.settotalmass > 0 or compiler.inertiafromgeom == of_geoms.mjINERTIAFROMGEOM_TRUE
     compiler.settotalmass, compiler.inertiafromgeom = -1, of_geoms.mjINERTIAFROMGEOM_AUTO
     for body in spec.bodies[1:]:
@@ -42,9 +43,8 @@ def _write_down_masses(spec: mujoco.MjSpec) -> None:
             body.fullinertia[0], body.ialt.type = np.nan, mujoco.mjtOrientation.mjORIENTATION_QUAT
 
 
-def _poses(spec: mujoco.MjSpec, *names: str) -> list[np.ndarray]:
+def _poses(model: mujoco.MjModel, *names: str) -> list[np.ndarray]:
     """Where bodies [4, 4] are in the world, with all joints at their references."""
-    model = spec.compile()
     data, poses = mujoco.MjData(model), []
     mujoco.mj_kinematics(model, data)
     for body in (model.body(name).id for name in names):
