@@ -52,7 +52,7 @@ def write_whole(path: Path, chunks: Iterable[bytes | memoryview]) -> None:
                 os.chmod(temporary, stat.S_IMODE(os.stat(path).st_mode))
             os.replace(temporary, path)
     except BaseException:
-        Path(temporary).unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
         raise
     folder = os.open(path.parent, os.O_RDONLY)
     try:
@@ -105,10 +105,15 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise ValueError("nested too deep") from None
 
 
-def _locked_temporary(path: Path) -> tuple[int, str]:
+def temporary_beside(path: Path) -> Path:
+    """A hidden name beside `path` for what takes its place once it is whole; another one at each call."""
+    return path.with_name(f".{path.name:.200}.{secrets.token_hex(4)}{_TEMPORARY}")
+
+
+def _locked_temporary(path: Path) -> tuple[int, Path]:
     """An open, locked temporary file beside `path`."""
     while True:
-        temporary = f"{path.parent}/.{path.name:.200}.{secrets.token_hex(4)}{_TEMPORARY}"
+        temporary = temporary_beside(path)
         # What replaces a private file is private from its first byte.
         handle = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600 if path.exists() else 0o666)
         with contextlib.suppress(OSError):  # A file system without locks.

@@ -7,7 +7,6 @@ that frame, is in `meta/tactile.json`, which is our own addition.
 """
 
 import json
-import secrets
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from dexsim.core.errors import DexsimError
+from dexsim.core.files import temporary_beside
 from dexsim.core.install import install_line
 from dexsim.datasets.trajectory import Trajectory
 from dexsim.hand.kinematics import Hand
@@ -75,7 +75,7 @@ def write_lerobot(folder: Path, hand: Hand, task: str, trajectories: Sequence[Tr
         begin += length
     whole = {name: np.concatenate(parts) for name, parts in columns.items()}
     # A part of a dataset would look like one, and be in the way of the next attempt: also after a kill.
-    part = folder.with_name(f".{folder.name:.100}.{secrets.token_hex(4)}.dexsim-part")
+    part = temporary_beside(folder)
     part.mkdir()
     try:
         _write(part, hand, task, whole, episodes)
