@@ -88,7 +88,6 @@ def start(program, *arguments, **environment):
     )
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("cores", [1, 2])
 def test_programs_in_flight_do_not_block_each_other(cores):
     """With asynchronous dispatch, as many programs as fit wait for the host on few cores."""

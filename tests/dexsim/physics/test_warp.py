@@ -69,7 +69,6 @@ def results(hand, worlds):
     return {shape: advance(*inputs) for shape, (inputs, *_) in worlds.items()}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("shape", SHAPES)
 def test_a_sub_step_equals_c_mujoco(worlds, results, shape):
     """Both walk the same contacts: what is left is float32, 1e-3 of a newton and of a rad/s."""
@@ -80,7 +79,6 @@ def test_a_sub_step_equals_c_mujoco(worlds, results, shape):
     np.testing.assert_allclose(after.qvel, velocity, atol=2e-3)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("shape", ["sphere", "capsule"])
 def test_a_sub_step_equals_jax(worlds, results, physics_advance, shape):
     (target, state, torque), *_ = worlds[shape]
@@ -101,7 +99,6 @@ def test_a_full_buffer_is_loud(hand, worlds, monkeypatch):
     assert np.all(np.isfinite(np.asarray(force)[~broken]))
 
 
-@pytest.mark.slow
 def test_the_palm_ends_where_the_hand_does():
     """A cube over the palm's edge stays as long as its weight's line meets the palm, and falls beyond.
 
