@@ -238,8 +238,8 @@ class EvaluateArguments:
     baseline: bool = True
     """Measure a hand that does nothing on the same episodes, too, which doubles the time."""
     ablate: tuple[str, ...] = ()
-    """Observation fields to replace by their training mean, or by 0 where their scale is fixed, as that of touch; such
-    as contact_force contact_centre."""
+    """Observation fields, such as contact_force contact_centre, to replace by their training mean; those of a fixed
+    scale, such as touch, become 0."""
     set: tuple[str, ...] = ()
     """Change fields of the task's configuration, such as randomization.extremes=1 edge=[0.05,0.05]."""
     output: Path | None = None
