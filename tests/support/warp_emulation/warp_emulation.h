@@ -69,6 +69,7 @@ static void __syncthreads() { meet(0, BARRIER); }
 static int __popc(unsigned value) { return __builtin_popcount(value); }
 static int __ffs(int value) { return __builtin_ffs(value); }
 static float rsqrtf(float value) { return 1 / sqrtf(value); }
+#define __powf(base, power) powf(base, power)  // the C library has a hidden function of that name
 
 static void enter_lane() {
   const int lane = warp.now;

@@ -1,0 +1,412 @@
+// The acceleration under contacts and limits by Newton's method: MuJoCo's convex problem (documentation, chapter
+// Computation, section Constraint model), as in dexsim.physics.solver.newton, with its names.
+//
+// A step solves H p = -gradient. H is an arrow: fingers are coupled to the object, not to each other, so each finger is
+// eliminated by its own lanes, all at once, and what remains is the object's 6 x 6. Where fingers touch each other, or a
+// hand is not made of short fingers, the hand is eliminated as a whole by the same code.
+#pragma once
+#include "rows.cuh"
+
+// Where a contact is with respect to its cone (`_cone`).
+struct Cone {
+  float slide_y, slide_z, length, inverse;  // of slide, in the scaled space of the cone; 1 / length
+  bool bottom, middle;                      // sticking, sliding
+  float stiff, inside;                      // along the cone, 0 unless sliding; `short`: how far inside the dual cone
+};
+
+DEV Cone cone_at(const ContactRows &rows, Vec3 miss) {
+  const float mu = rows.mu, normal = mu * miss.x;
+  Cone cone;
+  cone.slide_y = rows.friction * miss.y, cone.slide_z = rows.friction * miss.z;
+  const float square = cone.slide_y * cone.slide_y + cone.slide_z * cone.slide_z + 1e-15f;
+  cone.inverse = rsqrtf(square);
+  cone.length = square * cone.inverse;
+  cone.bottom = mu * normal + cone.length <= 0;
+  cone.middle = !cone.bottom && normal < mu * cone.length;
+  cone.stiff = cone.middle ? rows.weight / (mu * mu * (1 + mu * mu)) : 0;
+  cone.inside = normal - mu * cone.length;
+  return cone;
+}
+
+// Force along the rows (`_force`).
+DEV Vec3 cone_force(const ContactRows &rows, const Cone &cone, Vec3 miss) {
+  if (cone.bottom) return {-rows.weight * miss.x, -rows.slide_weight * miss.y, -rows.slide_weight * miss.z};
+  const float press = -cone.stiff * cone.inside * rows.mu, slide = -press * cone.inverse * rows.friction;
+  return {press, slide * cone.slide_y, slide * cone.slide_z};
+}
+
+// What a lane has to do with which contacts, as masks over contacts.
+struct Whose {
+  unsigned mine;     // that the lane adds up: those its hinge moves; for the object's lanes every GROUPS-th of the object
+  unsigned second;   // of these, where the hinge carries the second link
+  unsigned object;   // of the object
+};
+
+DEV Whose whose_contacts(const ContactRows &rows, int contacts, const Lane &lane) {
+  const int first = CHAIN_MASK[rows.first < 0 ? HINGES : rows.first];
+  const int second = CHAIN_MASK[rows.second < 0 ? HINGES : rows.second] & ~first;
+  Whose whose = {0, 0, lanes_where(rows.second == HINGES)};
+#pragma unroll 1
+  for (int contact = 0; contact < contacts; contact++) {
+    const unsigned on_first = from_lane(first, contact), on_second = from_lane(second, contact);
+    whose.mine |= ((on_first | on_second) >> lane.index & 1) << contact;
+    whose.second |= (on_second >> lane.index & 1) << contact;
+  }
+  unsigned every = 0;
+#pragma unroll
+  for (int contact = 0; contact < 32; contact += GROUPS) every |= 1u << contact;
+  if (!lane.hinge) whose.mine = lane.object ? whose.object & (every << lane.group) : 0;
+  return whose;
+}
+
+// What stays the same during a sub-step.
+struct Problem {
+  ContactRows rows;
+  LimitRow limit;
+  Whose whose;
+  float mass[BLOCK ? BLOCK : 1];  // the lane's row within its finger
+  float object_mass[6];
+  float force;
+};
+
+DEV void load_mass(Problem &problem, Shared &shared, const Lane &lane) {
+  if (BLOCK) {
+    const float *row = mass_rows(shared) + lane.index * MASS_STRIDE + lane.first;
+#pragma unroll
+    for (int k = 0; k < BLOCK; k++) problem.mass[k] = lane.hinge && lane.first + k <= BLOCK_LAST[lane.index] ? row[k] : 0;
+  }
+}
+
+// M times `shared.vector`, the lane's row of it.
+DEV float mass_times_vector(const Problem &problem, Shared &shared, const Lane &lane) {
+  float sum = 0;
+  if (BLOCK) {
+#pragma unroll
+    for (int k = 0; k < BLOCK; k++) sum += problem.mass[k] * shared.vector[lane.first + k];
+  } else if (lane.hinge) {
+    for (int k = 0; k < HINGES; k++) sum += shared.mass[lane.index * MASS_STRIDE + k] * shared.vector[k];
+  }
+#pragma unroll
+  for (int axis = 0; axis < 6; axis++) sum += problem.object_mass[axis] * shared.vector[HINGES + axis];
+  return sum;
+}
+
+DEV float dot3(float4 a, float4 b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+
+// Writes three rows whose squares add up to the contact's part of the Hessian, and minus its force along the columns.
+// With weights on the diagonal (sticking) that is sqrt(weight) J; sliding, one row along the cone and one around it.
+// Returns which contacts have any.
+DEV unsigned write_factors(const ContactRows &rows, Vec3 miss, Shared &shared, const Lane &lane) {
+  const Cone cone = cone_at(rows, miss);
+  const Vec3 force = cone_force(rows, cone, miss);
+  const bool active = rows.here && (cone.bottom || cone.middle);
+  Vec3 along;                 // first row, by row of J
+  float around_y, around_z;   // second row, which has no part along the normal
+  float last = 0;             // third row, along the second tangent only
+  if (cone.bottom) {
+    along = {sqrtf(rows.weight), 0, 0};
+    around_y = last = sqrtf(rows.slide_weight), around_z = 0;
+  } else {
+    const float y = cone.slide_y * cone.inverse, z = cone.slide_z * cone.inverse, root = sqrtf(cone.stiff);
+    along = root * rows.mu * Vec3{1, -rows.friction * y, -rows.friction * z};
+    const float bend = rows.friction * sqrtf(cone.stiff * fmaxf(-rows.mu * cone.inside * cone.inverse, 0));
+    around_y = -bend * z, around_z = bend * y;
+  }
+  if (active) {
+#pragma unroll
+    for (int column = 0; column < COLUMNS; column++) {
+      const Vec3 j = {rows.jacobian[0][column], rows.jacobian[1][column], rows.jacobian[2][column]};
+      float4 factor;
+      factor.x = dot(along, j);
+      factor.y = around_y * j.y + around_z * j.z;
+      factor.z = last * j.z;
+      factor.w = -dot(force, j);
+      shared.factor[lane.index * COLUMNS + column] = factor;
+    }
+  }
+  return lanes_where(active);
+}
+
+// A lane's row of the hand's linear system: N columns of hinges, the object's six, the right-hand side.
+template <int N> struct Row {
+  static constexpr int WIDTH = 4 * ((N + 3) / 4);
+  float hinge[WIDTH];
+  float object[6];
+  float right;
+};
+
+// In shared memory: the object's six, right-hand side, inverse of the pivot, then the hinges.
+DEV float *hand_row(Shared &shared, int hinge) { return (float *)(shared.hand + hinge * ROW); }
+
+// Gaussian elimination, one pivot after another: its lane writes its row, lanes after it in `first`... take their share
+// off. The matrix stays symmetric, so a lane finds its own entry of the pivot's column in the pivot's row.
+template <int N> DEV float eliminate(Row<N> &row, Shared &shared, int first, int local, const Lane &lane) {
+#pragma unroll 1
+  for (int k = 0; k < N; k++) {
+    if (lane.hinge && local == k) {
+      float4 *to = shared.hand + lane.index * ROW;
+      to[0] = {row.object[0], row.object[1], row.object[2], row.object[3]};
+      to[1] = {row.object[4], row.object[5], row.right, 0};
+#pragma unroll
+      for (int i = 0; i < Row<N>::WIDTH; i += 4) to[2 + i / 4] = {row.hinge[i], row.hinge[i + 1], row.hinge[i + 2], row.hinge[i + 3]};
+    }
+    __syncwarp();
+    if (lane.hinge && local > k) {
+      const float4 *pivot = shared.hand + (first + k) * ROW;
+      const float share = ((const float *)pivot)[8 + local] / ((const float *)pivot)[8 + k];
+      const float4 a = pivot[0], b = pivot[1];
+      row.object[0] -= share * a.x, row.object[1] -= share * a.y, row.object[2] -= share * a.z;
+      row.object[3] -= share * a.w, row.object[4] -= share * b.x, row.object[5] -= share * b.y;
+      row.right -= share * b.z;
+#pragma unroll
+      for (int i = 0; i < Row<N>::WIDTH; i += 4) {
+        const float4 c = pivot[2 + i / 4];
+        row.hinge[i] -= share * c.x, row.hinge[i + 1] -= share * c.y;
+        row.hinge[i + 2] -= share * c.z, row.hinge[i + 3] -= share * c.w;
+      }
+    }
+  }
+  if (!lane.hinge) return 0;
+  float *own = hand_row(shared, lane.index);
+  return own[7] = 1 / own[8 + local];
+}
+
+// The hinge's part of the step once the object's is known: back-substitution, last pivot first.
+template <int N> DEV float substitute(float right, float inverse, Shared &shared, int first, int local, const Lane &lane) {
+  const float *own = hand_row(shared, lane.hinge ? lane.index : 0) + 8;
+  float step = 0;
+#pragma unroll 1
+  for (int k = N - 1; k >= 0; k--) {
+    if (local == k) step = right * inverse;
+    const float solved = from_lane(step, first + k);
+    if (lane.hinge && local < k) right -= own[k] * solved;
+  }
+  return step;
+}
+
+// What the eliminated hinges leave of the object's 6 x 6, and its solution [6], the same on all lanes. Adds to
+// `decrement` the object's part on the last lane.
+DEV void solve_object(float (&object)[6], float right, Shared &shared, float (&step)[6], float &decrement, const Lane &lane) {
+  if (lane.object) {
+#pragma unroll
+    for (int i = 0; i < (HINGES + GROUPS - 1) / GROUPS; i++) {
+      const int hinge = i * GROUPS + lane.group;
+      if (hinge < HINGES) {
+        const float4 a = shared.hand[hinge * ROW], b = shared.hand[hinge * ROW + 1];
+        const float share = hand_row(shared, hinge)[lane.axis] * b.w;
+        object[0] -= share * a.x, object[1] -= share * a.y, object[2] -= share * a.z;
+        object[3] -= share * a.w, object[4] -= share * b.x, object[5] -= share * b.y;
+        right -= share * b.z;
+      }
+    }
+  }
+  float sums[7] = {object[0], object[1], object[2], object[3], object[4], object[5], right};
+#pragma unroll
+  for (int k = 0; k < 7; k++) {
+    const float own = sums[k];
+#pragma unroll
+    for (int group = 1; group < GROUPS; group++) sums[k] += from_lane(own, lane.index + 6 * group);
+  }
+  if (lane.dof && !lane.hinge) {
+    shared.object[2 * lane.axis] = {sums[0], sums[1], sums[2], sums[3]};
+    shared.object[2 * lane.axis + 1] = {sums[4], sums[5], sums[6], 0};
+  }
+  __syncwarp();
+  float matrix[6][6], pivot[6];
+#pragma unroll
+  for (int i = 0; i < 6; i++) {
+    const float4 a = shared.object[2 * i], b = shared.object[2 * i + 1];
+    matrix[i][0] = a.x, matrix[i][1] = a.y, matrix[i][2] = a.z, matrix[i][3] = a.w, matrix[i][4] = b.x, matrix[i][5] = b.y;
+    step[i] = b.z;
+  }
+  float part = 0;
+#pragma unroll
+  for (int k = 0; k < 6; k++) {
+    pivot[k] = 1 / matrix[k][k];
+    part += step[k] * step[k] * pivot[k];
+#pragma unroll
+    for (int i = k + 1; i < 6; i++) {
+      const float share = matrix[i][k] * pivot[k];
+      step[i] -= share * step[k];
+#pragma unroll
+      for (int j = k + 1; j <= i; j++) matrix[i][j] -= share * matrix[j][k];
+    }
+  }
+#pragma unroll
+  for (int k = 5; k >= 0; k--) {
+#pragma unroll
+    for (int j = k + 1; j < 6; j++) step[k] -= matrix[j][k] * step[j];
+    step[k] *= pivot[k];
+  }
+  if (lane.index == 31) decrement += part;
+}
+
+// One way through elimination and back-substitution.
+template <int N>
+DEV float solve_hand(Row<N> &row, Shared &shared, int first, int local, float &decrement, const Lane &lane) {
+  const float inverse = eliminate(row, shared, first, local, lane);
+  decrement = row.right * row.right * inverse;
+  __syncwarp();
+  float step[6];
+  solve_object(row.object, row.right, shared, step, decrement, lane);
+  float right = row.right;
+#pragma unroll
+  for (int axis = 0; axis < 6; axis++) right -= row.object[axis] * step[axis];
+  const float own = substitute<N>(right, inverse, shared, first, local, lane);
+  if (lane.hinge) return own;
+  return lane.axis == 0 ? step[0] : lane.axis == 1 ? step[1] : lane.axis == 2 ? step[2]
+       : lane.axis == 3 ? step[3] : lane.axis == 4 ? step[4] : step[5];
+}
+
+// The rows of the whole hand, from those of the fingers or of the mass matrix, and the contacts that these lack.
+DEV void whole_rows(const Row<(BLOCK ? BLOCK : 1)> &finger, Row<HINGES> &row, const Problem &problem, unsigned contacts,
+                    float limit, Shared &shared, const Lane &lane) {
+  float *own = hand_row(shared, lane.hinge ? lane.index : 0) + 8;
+  if (lane.hinge) {
+#pragma unroll
+    for (int k = 0; k < 4 * (ROW - 2); k++) own[k] = BLOCK || k >= HINGES ? 0 : shared.mass[lane.index * MASS_STRIDE + k];
+    if (BLOCK) {
+#pragma unroll
+      for (int k = 0; k < BLOCK; k++)
+        if (lane.first + k <= BLOCK_LAST[lane.index]) own[lane.first + k] = finger.hinge[k];
+    } else {
+      own[lane.index] += limit;
+    }
+#pragma unroll 1
+    for (unsigned left = contacts & problem.whose.mine; left; left &= left - 1) {
+      const int contact = __ffs(left) - 1;
+      const Pair &pair = PAIR[shared.contact[contact].pair];
+      const bool second = problem.whose.second >> contact & 1;
+      const float4 *factor = shared.factor + contact * COLUMNS, mine = factor[(second ? CHAIN : 0) + lane.depth];
+#pragma unroll 1
+      for (int side = 0; side < 2; side++) {
+        const int link = side ? pair.second : pair.first;
+        if (link < 0 || link >= HINGES || (BLOCK && side == second)) continue;
+        for (int k = 0; k <= DEPTH[link]; k++)
+          own[CHAIN_HINGE[link][k]] += dot3(mine, factor[side * CHAIN + k]);
+      }
+    }
+#pragma unroll
+    for (int k = 0; k < Row<HINGES>::WIDTH; k++) row.hinge[k] = own[k];
+  }
+#pragma unroll
+  for (int axis = 0; axis < 6; axis++) row.object[axis] = finger.object[axis];
+  row.right = finger.right;
+  __syncwarp();
+}
+
+// The Newton step of the lane's degree of freedom from its gradient without constraints; `decrement` is the lane's
+// part of -gradient p.
+DEV float newton_step(const Problem &problem, Vec3 miss, float acceleration, float gradient, Shared &shared,
+                      float &decrement, const Lane &lane) {
+  const unsigned active = write_factors(problem.rows, miss, shared, lane);
+  Row<(BLOCK ? BLOCK : 1)> row;
+#pragma unroll
+  for (int k = 0; k < row.WIDTH; k++) row.hinge[k] = BLOCK && k < BLOCK ? problem.mass[k] : 0;
+#pragma unroll
+  for (int axis = 0; axis < 6; axis++) row.object[axis] = problem.object_mass[axis];
+  const float short_by = problem.limit.side * acceleration - problem.limit.wanted;
+  const float limit = short_by < 0 ? problem.limit.weight : 0;
+  gradient += limit * short_by * problem.limit.side;
+#pragma unroll
+  for (int k = 0; k < BLOCK; k++) row.hinge[k] += k == lane.depth ? limit : 0;
+  __syncwarp();
+#pragma unroll 1
+  for (unsigned left = active & problem.whose.mine; left; left &= left - 1) {
+    const int contact = __ffs(left) - 1;
+    const float4 *factor = shared.factor + contact * COLUMNS;
+    const float4 *own = factor + (problem.whose.second >> contact & 1 ? CHAIN : 0);
+    const float4 mine = lane.hinge ? own[lane.depth] : factor[CHAIN + lane.axis];
+    gradient += mine.w;
+    if (BLOCK && lane.hinge) {
+#pragma unroll
+      for (int k = 0; k < BLOCK; k++) row.hinge[k] += dot3(mine, own[k]);
+    }
+    if (problem.whose.object >> contact & 1) {
+#pragma unroll
+      for (int axis = 0; axis < 6; axis++) row.object[axis] += dot3(mine, factor[CHAIN + axis]);
+    }
+  }
+  row.right = -gradient;
+  const unsigned among = active & ~problem.whose.object;  // of the hand alone
+  if (BLOCK && !among) return solve_hand(row, shared, lane.first, lane.depth, decrement, lane);
+  Row<HINGES> whole;
+  __syncwarp();
+  whole_rows(row, whole, problem, BLOCK ? among : active, limit, shared, lane);
+  return solve_hand(whole, shared, 0, lane.index, decrement, lane);
+}
+
+// How far along a step the cost is least (`_search`): Newton's method on its slope, which only rises, in a bracket.
+// `line`: slope at 0 and curvature without constraints.
+DEV float line_search(const Args &args, const Problem &problem, Vec3 miss, Vec3 moved, float acceleration, float step,
+                      float line_slope, float line_curve, float decrement, int &evaluations, const Lane &lane) {
+  const ContactRows &rows = problem.rows;
+  const LimitRow &limit = problem.limit;
+  const float across_y = rows.friction * moved.y, across_z = rows.friction * moved.z;
+  float here = 1, low = 0, high = 1e6f;
+#pragma unroll 1
+  for (int evaluation = 0; evaluation < args.line_search; evaluation++) {
+    evaluations++;
+    const Vec3 now = miss + here * moved;
+    const Cone cone = cone_at(rows, now);
+    float slope = 0, curve = 0;
+    if (cone.bottom) {
+      slope = rows.weight * now.x * moved.x + rows.slide_weight * (now.y * moved.y + now.z * moved.z);
+      curve = rows.weight * moved.x * moved.x + rows.slide_weight * (moved.y * moved.y + moved.z * moved.z);
+    } else {
+      const float along = (cone.slide_y * across_y + cone.slide_z * across_z) * cone.inverse;
+      const float bend = (across_y * across_y + across_z * across_z - along * along) * cone.inverse;
+      const float rate = rows.mu * (moved.x - along);
+      slope = cone.stiff * cone.inside * rate;
+      curve = cone.stiff * (rate * rate - cone.inside * rows.mu * bend);
+    }
+    const float short_by = limit.side * (acceleration + here * step) - limit.wanted;
+    if (short_by < 0) {
+      slope += limit.weight * short_by * limit.side * step;
+      curve += limit.weight * step * step;
+    }
+    sum_lanes(slope, curve, lane.index);
+    slope += line_slope + here * line_curve;
+    curve += line_curve;
+    if (fabsf(slope) <= args.line_search_tolerance * decrement) break;
+    if (slope < 0) low = here;
+    else high = here;
+    const float newton = here - slope / fmaxf(curve, 1e-15f);
+    here = newton >= low && newton <= high ? newton : 0.5f * (low + high);
+  }
+  return here;
+}
+
+// The acceleration of the lane's degree of freedom, from a first guess on. `miss` of the rows ends as that of the
+// solution. Counts iterations and evaluations of the line search.
+DEV float solve(const Args &args, Problem &problem, float acceleration, Shared &shared, int &iterations, int &evaluations,
+                const Lane &lane) {
+  if (lane.dof) shared.vector[lane.index] = acceleration;
+  __syncwarp();
+  Vec3 &miss = problem.rows.miss;
+  miss += times(problem.rows, shared.vector);
+  float inertial = mass_times_vector(problem, shared, lane);
+  __syncwarp();
+#pragma unroll 1
+  for (int iteration = 0; iteration < args.iterations; iteration++) {
+    iterations++;
+    float decrement;
+    const float gradient = lane.dof ? inertial - problem.force : 0;
+    float step = newton_step(problem, miss, acceleration, gradient, shared, decrement, lane);
+    if (!lane.dof) step = 0;
+    if (lane.dof) shared.vector[lane.index] = step;
+    __syncwarp();
+    const Vec3 moved = times(problem.rows, shared.vector);
+    const float inertial_step = mass_times_vector(problem, shared, lane);
+    float slope = step * gradient, curve = step * inertial_step;
+    sum_lanes(slope, curve, lane.index);
+    decrement = sum_lanes(decrement);
+    const float share = line_search(args, problem, miss, moved, acceleration, step, slope, curve, decrement, evaluations, lane);
+    acceleration += share * step;
+    inertial += share * inertial_step;
+    miss += share * moved;
+    __syncwarp();
+    if (decrement < args.tolerance) break;
+  }
+  return acceleration;
+}
