@@ -127,10 +127,8 @@ DEV unsigned write_factors(const ContactRows &rows, Vec3 miss, Shared &shared, c
   return lanes_where(active);
 }
 
-// A lane's row of the hand's linear system: N columns of hinges, the object's six, the right-hand side.
-template <int N> struct Row {
-  static constexpr int WIDTH = 4 * ((N + 3) / 4);
-  float hinge[WIDTH];
+// A lane's row of the hand's linear system but for the columns of hinges: the object's six, right-hand side.
+struct Side {
   float object[6];
   float right;
 };
@@ -138,45 +136,45 @@ template <int N> struct Row {
 // In shared memory: the object's six, right-hand side, inverse of the pivot, then the hinges.
 DEV float *hand_row(Shared &shared, int hinge) { return (float *)(shared.hand + hinge * ROW); }
 
+constexpr int rounded(int count) { return 4 * ((count + 3) / 4); }
+constexpr int FINGER = BLOCK ? rounded(BLOCK) : 4, WHOLE = rounded(HINGES);
+
 // Gaussian elimination, one pivot after another: its lane writes its row, lanes after it in `first`... take their share
 // off. The matrix stays symmetric, so a lane finds its own entry of the pivot's column in the pivot's row.
-template <int N> DEV float eliminate(Row<N> &row, Shared &shared, int first, int local, const Lane &lane) {
+template <int WIDTH>
+DEV void eliminate(float (&row)[WIDTH], Side &side, Shared &shared, int pivots, int first, int local, const Lane &lane) {
 #pragma unroll 1
-  for (int k = 0; k < N; k++) {
+  for (int k = 0; k < pivots; k++) {
     if (lane.hinge && local == k) {
       float4 *to = shared.hand + lane.index * ROW;
-      to[0] = {row.object[0], row.object[1], row.object[2], row.object[3]};
-      to[1] = {row.object[4], row.object[5], row.right, 0};
+      to[0] = {side.object[0], side.object[1], side.object[2], side.object[3]};
+      to[1] = {side.object[4], side.object[5], side.right, 0};
 #pragma unroll
-      for (int i = 0; i < Row<N>::WIDTH; i += 4) to[2 + i / 4] = {row.hinge[i], row.hinge[i + 1], row.hinge[i + 2], row.hinge[i + 3]};
+      for (int i = 0; i < WIDTH; i += 4) to[2 + i / 4] = {row[i], row[i + 1], row[i + 2], row[i + 3]};
     }
     __syncwarp();
     if (lane.hinge && local > k) {
       const float4 *pivot = shared.hand + (first + k) * ROW;
       const float share = ((const float *)pivot)[8 + local] / ((const float *)pivot)[8 + k];
       const float4 a = pivot[0], b = pivot[1];
-      row.object[0] -= share * a.x, row.object[1] -= share * a.y, row.object[2] -= share * a.z;
-      row.object[3] -= share * a.w, row.object[4] -= share * b.x, row.object[5] -= share * b.y;
-      row.right -= share * b.z;
+      side.object[0] -= share * a.x, side.object[1] -= share * a.y, side.object[2] -= share * a.z;
+      side.object[3] -= share * a.w, side.object[4] -= share * b.x, side.object[5] -= share * b.y;
+      side.right -= share * b.z;
 #pragma unroll
-      for (int i = 0; i < Row<N>::WIDTH; i += 4) {
+      for (int i = 0; i < WIDTH; i += 4) {
         const float4 c = pivot[2 + i / 4];
-        row.hinge[i] -= share * c.x, row.hinge[i + 1] -= share * c.y;
-        row.hinge[i + 2] -= share * c.z, row.hinge[i + 3] -= share * c.w;
+        row[i] -= share * c.x, row[i + 1] -= share * c.y, row[i + 2] -= share * c.z, row[i + 3] -= share * c.w;
       }
     }
   }
-  if (!lane.hinge) return 0;
-  float *own = hand_row(shared, lane.index);
-  return own[7] = 1 / own[8 + local];
 }
 
 // The hinge's part of the step once the object's is known: back-substitution, last pivot first.
-template <int N> DEV float substitute(float right, float inverse, Shared &shared, int first, int local, const Lane &lane) {
+DEV float substitute(float right, float inverse, Shared &shared, int pivots, int first, int local, const Lane &lane) {
   const float *own = hand_row(shared, lane.hinge ? lane.index : 0) + 8;
   float step = 0;
 #pragma unroll 1
-  for (int k = N - 1; k >= 0; k--) {
+  for (int k = pivots - 1; k >= 0; k--) {
     if (local == k) step = right * inverse;
     const float solved = from_lane(step, first + k);
     if (lane.hinge && local < k) right -= own[k] * solved;
@@ -186,7 +184,8 @@ template <int N> DEV float substitute(float right, float inverse, Shared &shared
 
 // What the eliminated hinges leave of the object's 6 x 6, and its solution [6], the same on all lanes. Adds to
 // `decrement` the object's part on the last lane.
-DEV void solve_object(float (&object)[6], float right, Shared &shared, float (&step)[6], float &decrement, const Lane &lane) {
+DEV void solve_object(const Side &side, Shared &shared, float (&step)[6], float &decrement, const Lane &lane) {
+  float sums[7] = {side.object[0], side.object[1], side.object[2], side.object[3], side.object[4], side.object[5], side.right};
   if (lane.object) {
 #pragma unroll
     for (int i = 0; i < (HINGES + GROUPS - 1) / GROUPS; i++) {
@@ -194,13 +193,11 @@ DEV void solve_object(float (&object)[6], float right, Shared &shared, float (&s
       if (hinge < HINGES) {
         const float4 a = shared.hand[hinge * ROW], b = shared.hand[hinge * ROW + 1];
         const float share = hand_row(shared, hinge)[lane.axis] * b.w;
-        object[0] -= share * a.x, object[1] -= share * a.y, object[2] -= share * a.z;
-        object[3] -= share * a.w, object[4] -= share * b.x, object[5] -= share * b.y;
-        right -= share * b.z;
+        sums[0] -= share * a.x, sums[1] -= share * a.y, sums[2] -= share * a.z, sums[3] -= share * a.w;
+        sums[4] -= share * b.x, sums[5] -= share * b.y, sums[6] -= share * b.z;
       }
     }
   }
-  float sums[7] = {object[0], object[1], object[2], object[3], object[4], object[5], right};
 #pragma unroll
   for (int k = 0; k < 7; k++) {
     const float own = sums[k];
@@ -241,58 +238,36 @@ DEV void solve_object(float (&object)[6], float right, Shared &shared, float (&s
   if (lane.index == 31) decrement += part;
 }
 
-// One way through elimination and back-substitution.
-template <int N>
-DEV float solve_hand(Row<N> &row, Shared &shared, int first, int local, float &decrement, const Lane &lane) {
-  const float inverse = eliminate(row, shared, first, local, lane);
-  decrement = row.right * row.right * inverse;
-  __syncwarp();
-  float step[6];
-  solve_object(row.object, row.right, shared, step, decrement, lane);
-  float right = row.right;
-#pragma unroll
-  for (int axis = 0; axis < 6; axis++) right -= row.object[axis] * step[axis];
-  const float own = substitute<N>(right, inverse, shared, first, local, lane);
-  if (lane.hinge) return own;
-  return lane.axis == 0 ? step[0] : lane.axis == 1 ? step[1] : lane.axis == 2 ? step[2]
-       : lane.axis == 3 ? step[3] : lane.axis == 4 ? step[4] : step[5];
-}
-
 // The rows of the whole hand, from those of the fingers or of the mass matrix, and the contacts that these lack.
-DEV void whole_rows(const Row<(BLOCK ? BLOCK : 1)> &finger, Row<HINGES> &row, const Problem &problem, unsigned contacts,
+DEV void whole_rows(const float (&finger)[FINGER], float (&row)[WHOLE], const Problem &problem, unsigned contacts,
                     float limit, Shared &shared, const Lane &lane) {
-  float *own = hand_row(shared, lane.hinge ? lane.index : 0) + 8;
-  if (lane.hinge) {
+  if (!lane.hinge) return;
+  float *own = hand_row(shared, lane.index) + 8;
 #pragma unroll
-    for (int k = 0; k < 4 * (ROW - 2); k++) own[k] = BLOCK || k >= HINGES ? 0 : shared.mass[lane.index * MASS_STRIDE + k];
-    if (BLOCK) {
+  for (int k = 0; k < WHOLE; k++) own[k] = BLOCK || k >= HINGES ? 0 : shared.mass[lane.index * MASS_STRIDE + k];
+  if (BLOCK) {
 #pragma unroll
-      for (int k = 0; k < BLOCK; k++)
-        if (lane.first + k <= BLOCK_LAST[lane.index]) own[lane.first + k] = finger.hinge[k];
-    } else {
-      own[lane.index] += limit;
-    }
+    for (int k = 0; k < BLOCK; k++)
+      if (lane.first + k <= BLOCK_LAST[lane.index]) own[lane.first + k] = finger[k];
+  } else {
+    own[lane.index] += limit;
+  }
 #pragma unroll 1
-    for (unsigned left = contacts & problem.whose.mine; left; left &= left - 1) {
-      const int contact = __ffs(left) - 1;
-      const Pair &pair = PAIR[shared.contact[contact].pair];
-      const bool second = problem.whose.second >> contact & 1;
-      const float4 *factor = shared.factor + contact * COLUMNS, mine = factor[(second ? CHAIN : 0) + lane.depth];
+  for (unsigned left = contacts & problem.whose.mine; left; left &= left - 1) {
+    const int contact = __ffs(left) - 1;
+    const Pair &pair = PAIR[shared.contact[contact].pair];
+    const bool second = problem.whose.second >> contact & 1;
+    const float4 *factor = shared.factor + contact * COLUMNS, mine = factor[(second ? CHAIN : 0) + lane.depth];
 #pragma unroll 1
-      for (int side = 0; side < 2; side++) {
-        const int link = side ? pair.second : pair.first;
-        if (link < 0 || link >= HINGES || (BLOCK && side == second)) continue;
-        for (int k = 0; k <= DEPTH[link]; k++)
-          own[CHAIN_HINGE[link][k]] += dot3(mine, factor[side * CHAIN + k]);
-      }
+    for (int side = 0; side < 2; side++) {
+      const int link = side ? pair.second : pair.first;
+      if (link < 0 || link >= HINGES || (BLOCK && side == second)) continue;
+#pragma unroll 1
+      for (int k = 0; k <= DEPTH[link]; k++) own[CHAIN_HINGE[link][k]] += dot3(mine, factor[side * CHAIN + k]);
     }
-#pragma unroll
-    for (int k = 0; k < Row<HINGES>::WIDTH; k++) row.hinge[k] = own[k];
   }
 #pragma unroll
-  for (int axis = 0; axis < 6; axis++) row.object[axis] = finger.object[axis];
-  row.right = finger.right;
-  __syncwarp();
+  for (int k = 0; k < WHOLE; k++) row[k] = own[k];
 }
 
 // The Newton step of the lane's degree of freedom from its gradient without constraints; `decrement` is the lane's
@@ -300,16 +275,17 @@ DEV void whole_rows(const Row<(BLOCK ? BLOCK : 1)> &finger, Row<HINGES> &row, co
 DEV float newton_step(const Problem &problem, Vec3 miss, float acceleration, float gradient, Shared &shared,
                       float &decrement, const Lane &lane) {
   const unsigned active = write_factors(problem.rows, miss, shared, lane);
-  Row<(BLOCK ? BLOCK : 1)> row;
+  float finger[FINGER];
+  Side side;
 #pragma unroll
-  for (int k = 0; k < row.WIDTH; k++) row.hinge[k] = BLOCK && k < BLOCK ? problem.mass[k] : 0;
+  for (int k = 0; k < FINGER; k++) finger[k] = k < BLOCK ? problem.mass[k < BLOCK ? k : 0] : 0;
 #pragma unroll
-  for (int axis = 0; axis < 6; axis++) row.object[axis] = problem.object_mass[axis];
+  for (int axis = 0; axis < 6; axis++) side.object[axis] = problem.object_mass[axis];
   const float short_by = problem.limit.side * acceleration - problem.limit.wanted;
   const float limit = short_by < 0 ? problem.limit.weight : 0;
   gradient += limit * short_by * problem.limit.side;
 #pragma unroll
-  for (int k = 0; k < BLOCK; k++) row.hinge[k] += k == lane.depth ? limit : 0;
+  for (int k = 0; k < BLOCK; k++) finger[k] += k == lane.depth ? limit : 0;
   __syncwarp();
 #pragma unroll 1
   for (unsigned left = active & problem.whose.mine; left; left &= left - 1) {
@@ -320,20 +296,41 @@ DEV float newton_step(const Problem &problem, Vec3 miss, float acceleration, flo
     gradient += mine.w;
     if (BLOCK && lane.hinge) {
 #pragma unroll
-      for (int k = 0; k < BLOCK; k++) row.hinge[k] += dot3(mine, own[k]);
+      for (int k = 0; k < BLOCK; k++) finger[k] += dot3(mine, own[k]);
     }
     if (problem.whose.object >> contact & 1) {
 #pragma unroll
-      for (int axis = 0; axis < 6; axis++) row.object[axis] += dot3(mine, factor[CHAIN + axis]);
+      for (int axis = 0; axis < 6; axis++) side.object[axis] += dot3(mine, factor[CHAIN + axis]);
     }
   }
-  row.right = -gradient;
+  side.right = -gradient;
   const unsigned among = active & ~problem.whose.object;  // of the hand alone
-  if (BLOCK && !among) return solve_hand(row, shared, lane.first, lane.depth, decrement, lane);
-  Row<HINGES> whole;
+  const bool whole = !BLOCK || among;
+  const int pivots = whole ? HINGES : BLOCK, first = whole ? 0 : lane.first, local = whole ? lane.index : lane.depth;
+  if (whole) {
+    float row[WHOLE];
+    __syncwarp();
+    whole_rows(finger, row, problem, BLOCK ? among : active, limit, shared, lane);
+    __syncwarp();
+    eliminate(row, side, shared, pivots, first, local, lane);
+  } else {
+    eliminate(finger, side, shared, pivots, first, local, lane);
+  }
+  float inverse = 0;
+  if (lane.hinge) {
+    float *own = hand_row(shared, lane.index);
+    inverse = own[7] = 1 / own[8 + local];
+  }
+  decrement = side.right * side.right * inverse;
   __syncwarp();
-  whole_rows(row, whole, problem, BLOCK ? among : active, limit, shared, lane);
-  return solve_hand(whole, shared, 0, lane.index, decrement, lane);
+  float step[6];
+  solve_object(side, shared, step, decrement, lane);
+#pragma unroll
+  for (int axis = 0; axis < 6; axis++) side.right -= side.object[axis] * step[axis];
+  const float hinge = substitute(side.right, inverse, shared, pivots, first, local, lane);
+  const float object = lane.axis == 0 ? step[0] : lane.axis == 1 ? step[1] : lane.axis == 2 ? step[2]
+                     : lane.axis == 3 ? step[3] : lane.axis == 4 ? step[4] : step[5];
+  return lane.hinge ? hinge : object;
 }
 
 // How far along a step the cost is least (`_search`): Newton's method on its slope, which only rises, in a bracket.
