@@ -2,8 +2,8 @@
 #pragma once
 #include "contacts/balls.cuh"
 
-// m^4: axes whose cross product has a smaller square count as parallel, as in C MuJoCo.
-constexpr float PARALLEL = 1e-15f;
+// Squared sine of the angle between axes below which they count as parallel, as in C MuJoCo.
+constexpr float PARALLEL = 1e-8f;
 
 DEV Round round_primitive(const Search &search, int primitive) {
   const Frame frame = primitive_frame(search, primitive);
@@ -20,16 +20,12 @@ DEV void nearest_places(Vec3 away, Vec3 one, Vec3 two, float &place, float &othe
   place = clamp((mixed * other + dot(one, away)) / first, -1.0f, 1.0f);
 }
 
-// Parallel axes touch at the ends of the stretch in which they run side by side: each end of each axis is tried.
-DEV void place_of_end(int end, Vec3 away, Vec3 one, Vec3 two, float &place, float &other) {
-  const float tip = end & 1 ? -1.0f : 1.0f, mixed = dot(one, two);
-  if (end < 2) {
-    place = tip;
-    other = clamp((mixed * tip - dot(two, away)) / dot(two, two), -1.0f, 1.0f);
-  } else {
-    other = tip;
-    place = clamp((mixed * tip + dot(one, away)) / dot(one, one), -1.0f, 1.0f);
-  }
+// Parallel axes touch at both ends of the stretch in which they run side by side, as in C MuJoCo also where that is one
+// place.
+DEV void place_of_end(float end, Vec3 away, Vec3 one, Vec3 two, float &place, float &other) {
+  const float first = dot(one, one), mixed = dot(one, two);
+  place = clamp((dot(one, away) + end * fabsf(mixed)) / first, -1.0f, 1.0f);
+  other = clamp((mixed * place - dot(two, away)) / dot(two, two), -1.0f, 1.0f);
 }
 
 DEV int capsules_meet(const Search &search, int count) {
@@ -43,17 +39,15 @@ DEV int capsules_meet(const Search &search, int count) {
                                                           : round_geom(search, row.second);
     const Vec3 away = two.middle - one.middle, normal = cross(one.axis, two.axis);
     const float lengths = dot(one.axis, one.axis) * dot(two.axis, two.axis);
-    const bool parallel = dot(normal, normal) < PARALLEL && lengths > 0;
+    const bool parallel = dot(normal, normal) < PARALLEL * lengths;  // never with a sphere
     float place, other;
     nearest_places(away, one.axis, two.axis, place, other);
-    int found = 0;
 #pragma unroll 1
-    for (int end = 0; end < 4; end++) {
+    for (int end = -1; end <= 1; end += 2) {
       if (parallel) place_of_end(end, away, one.axis, two.axis, place, other);
       Vec3 way = away + other * two.axis - place * one.axis;
       const float gap = normalize(way) - one.radius - two.radius;
-      const bool touches = present && gap < 0 && (parallel ? found < 2 : end == 0);
-      found += touches;
+      const bool touches = present && gap < 0 && (parallel || end < 0);
       const Vec3 point = one.middle + place * one.axis + (one.radius + 0.5f * gap) * way;
       count = keep(search, count, touches, gap, point, way, row.pair);
       if (!lanes_where(parallel && present)) break;
