@@ -108,6 +108,7 @@ def check_scene(scene: PhysicsScene) -> None:
         "bodies with several joints": (model.body_jntnum > 1).any(),
         "joints after the object's": not np.array_equal(scene.object_dof, np.arange(model.nv - 6, model.nv)),
         "mocap bodies": model.nmocap,
+        "an object whose inertia has other axes than its body": model.body_iquat[scene.object_body, 0] != 1,
         "tendons": model.ntendon,
         "actuators": model.nu,
         "dry friction of joints": model.dof_frictionloss.any(),

@@ -19,6 +19,7 @@ _KERNEL = Path(cuda_scene.__file__).parent / "kernel"
 _CACHE = Path(tempfile.gettempdir()) / "dexsim_warp_emulation"
 compiler = shutil.which("g++")
 
+# `physics_states.pd_torque`, its targets as the law's only constant.
 PD_LAW = """
 DEV float motor_law(const Args &args, int world, int joint, int, float position, float velocity) {
   const float limit = 3.0f * fmaxf(1 - fabsf(velocity) / 20.0f, 0.0f);
@@ -26,12 +27,6 @@ DEV float motor_law(const Args &args, int world, int joint, int, float position,
   return fminf(fmaxf(torque, -limit), limit);
 }
 """
-
-
-def pd_torque(target: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-    """The same law [J] in NumPy: position control with a torque that falls with speed."""
-    limit = 3.0 * np.maximum(1 - np.abs(velocity) / 20.0, 0)
-    return np.clip(3.0 * (target - position) - 0.02 * velocity, -limit, limit)
 
 
 class Emulation:
