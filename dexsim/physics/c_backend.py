@@ -20,8 +20,8 @@ from dexsim.core.errors import AssetError, ConfigError
 from dexsim.objects.params import ObjectParams
 from dexsim.physics.host import call
 from dexsim.physics.host.engine import HostEngine
-from dexsim.physics.host.law import Recorded, read_law, record
-from dexsim.physics.parameters import places, values
+from dexsim.physics.host.law import Recorded, one_by_one, read_law, record
+from dexsim.physics.parameters import configured, values
 from dexsim.physics.seam import ContactParams, PhysicsScene, PhysicsState, TorqueLaw
 
 # Programs name their engine by a hash of its scene, so that one that was loaded from a cache finds it.
@@ -52,11 +52,7 @@ class CBackend:
 
     def configure(self, object: ObjectParams, contacts: ContactParams) -> dict[str, jax.Array]:
         """What the models of one environment have in place of the scene's, by the names of `mujoco.MjModel`."""
-        where = places(self.scene)
-        return {
-            name: jnp.asarray(getattr(self.scene.model, name), jnp.float32).at[where[name]].set(value)
-            for name, value in values(self.scene, object, contacts).items()
-        }
+        return configured(self.scene, object, contacts)
 
     def advance(
         self,
@@ -74,16 +70,12 @@ class CBackend:
         if law is not None:
             return self._advance(fields, state, law, memory, push, substeps)
 
-        def substep(carry: tuple[PhysicsState, Any], index: jax.Array) -> tuple[tuple[PhysicsState, Any], jax.Array]:
-            state, memory = carry
-            tau, memory = torque(index, state.qpos[scene.joint_qpos], state.qvel[scene.joint_dof], memory)
-            given = self._record(lambda *_: (tau, None), state, None)
-            assert given is not None
-            state, force, _ = self._advance(fields, state, given, None, push, 1)
-            return (state, memory), force
+        def substep(torque: TorqueLaw, state: PhysicsState) -> tuple[PhysicsState, jax.Array]:
+            law = self._record(torque, state, None)
+            assert law is not None
+            return self._advance(fields, state, law, None, push, 1)[:2]
 
-        (state, memory), forces = jax.lax.scan(substep, (state, memory), jnp.arange(substeps))
-        return state, forces[-1], memory
+        return one_by_one(scene, substep, torque, state, memory)
 
     def _record(self, torque: TorqueLaw, state: PhysicsState, memory: Any) -> Recorded | None:
         return record(torque, jnp.zeros(len(self.scene.joint_dof), state.qpos.dtype), memory)

@@ -49,3 +49,12 @@ def values(scene: PhysicsScene, object: ObjectParams, contacts: ContactParams) -
         "pair_solimp": contacts.solimp,
     }
     return found if object.quat is None else found | {"geom_quat": object.quat}
+
+
+def configured(scene: PhysicsScene, object: ObjectParams, contacts: ContactParams) -> dict[str, jax.Array]:
+    """The whole fields of one environment's model, the scene's with `values` in their `places`."""
+    where = places(scene)
+    return {
+        name: jnp.asarray(getattr(scene.model, name), jnp.float32).at[where[name]].set(value)
+        for name, value in values(scene, object, contacts).items()
+    }

@@ -1,10 +1,12 @@
 """`Physics`: the hand, an object and their contacts in one compiled scene, on the engine of choice.
 
-`advance` runs the scene for one control tick. Backends are `jax` (differentiable, any device), `warp` (about four times
-faster on NVIDIA GPUs) and `c` (C MuJoCo on the CPU's cores); `mujoco.mjx` is not imported before a scene is compiled.
+`advance` runs the scene for one control tick. Backends are `jax` (differentiable, any device), `cuda` (one kernel for a
+tick, many times faster on NVIDIA GPUs), `warp` (MuJoCo's own for those) and `c` (C MuJoCo on the CPU's cores);
+`mujoco.mjx` is not imported before a scene is compiled.
 """
 
 import importlib.util
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -13,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dexsim.core.compilation import is_deterministic
-from dexsim.core.errors import ConfigError
+from dexsim.core.errors import AssetError, ConfigError, DexsimWarning
 from dexsim.core.install import install_line
 from dexsim.geometry import rotations
 from dexsim.hand.kinematics import Hand, forward_kinematics
@@ -21,38 +23,47 @@ from dexsim.objects.params import ObjectParams
 from dexsim.physics import contact
 from dexsim.physics.c_backend import CBackend
 from dexsim.physics.config import PhysicsConfig
+from dexsim.physics.cuda.backend import CudaBackend
 from dexsim.physics.jax_backend import JaxBackend
 from dexsim.physics.model import build_scene
-from dexsim.physics.seam import Backend, ContactParams, PhysicsState, TorqueLaw
+from dexsim.physics.seam import Backend, ContactParams, PhysicsScene, PhysicsState, TorqueLaw
 from dexsim.physics.warp_backend import WarpBackend
 from dexsim.touch.skin import Skin
 from dexsim.touch.surface import skin_surface
 
-BACKENDS: dict[str, Callable[..., Backend]] = {"jax": JaxBackend, "warp": WarpBackend, "c": CBackend}
+BACKENDS: dict[str, Callable[..., Backend]] = {
+    "jax": JaxBackend,
+    "cuda": CudaBackend,
+    "warp": WarpBackend,
+    "c": CBackend,
+}
 
 
 def choose_backend(backend: str) -> str:
-    """The name of a backend. `auto`: c on a CPU, warp on an NVIDIA GPU where it can be imported, else jax.
-
-    Programs that were asked to repeat to the last bit (`make_deterministic`) do without warp.
+    """The name of a backend. `auto`: c on a CPU, cuda on an NVIDIA GPU, else jax.
 
     Raises:
       ConfigError: no such backend, or its library or device is missing.
     """
     if backend not in ("auto", *BACKENDS):
         raise ConfigError(f"backend {backend!r}: choose from auto, {', '.join(BACKENDS)}")
-    device, found = jax.default_backend(), importlib.util.find_spec("warp") is not None
+    device = jax.default_backend()
     if backend == "auto":
-        fast = found and device in ("gpu", "cuda") and not is_deterministic()
-        return "c" if device == "cpu" else "warp" if fast else "jax"
-    if backend == "warp" and not found:
+        return "c" if device == "cpu" else "cuda" if _on_nvidia() else "jax"
+    if backend == "cuda" and not _on_nvidia():
+        raise ConfigError(f"backend 'cuda' needs an NVIDIA GPU, and JAX for it: {install_line('cuda')}")
+    if backend == "warp" and importlib.util.find_spec("warp") is None:
         raise ConfigError(f"backend 'warp' needs the extra: {install_line('warp')}")
     if backend == "warp" and is_deterministic():
         # Warp has a mode for it (1.18), in which contacts get lost: mujoco_warp, issue 1635.
-        raise ConfigError("backend 'warp' does not repeat to the last bit: choose jax, or leave out --deterministic")
+        raise ConfigError("backend 'warp' does not repeat to the last bit: choose cuda, or leave out --deterministic")
     if backend == "c" and device != "cpu":
         raise ConfigError("backend 'c' runs on the CPU's cores: set JAX_PLATFORMS=cpu")
     return backend
+
+
+def _on_nvidia() -> bool:
+    return jax.default_backend() == "gpu" and "cuda" in jax.devices()[0].client.platform_version.lower()
 
 
 class Physics:
@@ -79,7 +90,7 @@ class Physics:
           largest: [K, 3] m, the largest size of each slot (broad phase bounds).
           config: solver and contact model.
           gravity: m/s^2 in the palm frame, which is the world's.
-          backend: "auto", "jax", "warp" or "c".
+          backend: "auto", "jax", "cuda", "warp" or "c". `auto` leaves scenes that do not fit into the kernel to jax.
           num_envs: batch size that a backend reserves memory for.
           skin: of the fingertips, whose stiffness it sets; without one it is constant.
           rotor_share: share of the joints' armature that is left out of the scene.
@@ -89,7 +100,19 @@ class Physics:
           ConfigError: see `choose_backend`.
         """
         self.backend = choose_backend(backend)
-        scene = build_scene(hand, slots, largest, config, gravity, self.backend, rotor_share=rotor_share)
+
+        def start(backend: str) -> tuple[PhysicsScene, Backend]:
+            scene = build_scene(hand, slots, largest, config, gravity, backend, rotor_share=rotor_share)
+            return scene, BACKENDS[backend](scene, num_envs)
+
+        try:
+            scene, self.engine = start(self.backend)
+        except AssetError as error:
+            if (backend, self.backend) != ("auto", "cuda"):
+                raise
+            warnings.warn(f"{error}; backend jax instead, which is slower", DexsimWarning, stacklevel=2)
+            self.backend = "jax"
+            scene, self.engine = start("jax")
         self.hand, self.config, self.skin, self.scene = hand, config, skin, scene
         self.mj_model = scene.model
         self.joint_qpos, self.joint_dof = scene.joint_qpos, scene.joint_dof
@@ -99,7 +122,6 @@ class Physics:
         )
         self._pads = contact.find_pads(scene.model, scene.object_pairs, scene.tip_bodies)
         self._surface = None if skin is None else skin_surface(hand, skin)
-        self.engine = BACKENDS[self.backend](scene, num_envs)
 
     def tip_stiffness(self, object: ObjectParams, qpos: jax.Array, cover: jax.Array | float = 0.0) -> jax.Array:
         """How much stiffer [F] than nominal the fingertips are where they press now; `cover` as in `contact_params`."""

@@ -15,6 +15,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dexsim.physics.seam import PhysicsScene, PhysicsState, TorqueLaw
+
 # JAX's primitives that work element by element, in NumPy.
 _ELEMENTWISE: dict[str, Callable[..., Any]] = {
     "abs": np.abs,
@@ -77,6 +79,25 @@ def record(law: Callable[..., Any], joints: jax.Array, memory: Any) -> Recorded 
         return None
     text = json.dumps({"literals": writer.literals, "steps": writer.steps, "results": numbers})
     return Recorded(text, traced.consts, trees[-1])
+
+
+def one_by_one(
+    scene: PhysicsScene,
+    substep: Callable[[TorqueLaw, PhysicsState], tuple[PhysicsState, jax.Array]],
+    torque: TorqueLaw,
+    state: PhysicsState,
+    memory: Any,
+) -> tuple[PhysicsState, jax.Array, Any]:
+    """`Backend.advance` with the law left to XLA: an engine's `substep` for each, under torques that are constant."""
+
+    def run(carry: tuple[PhysicsState, Any], index: jax.Array) -> tuple[tuple[PhysicsState, Any], jax.Array]:
+        state, memory = carry
+        tau, memory = torque(index, state.qpos[scene.joint_qpos], state.qvel[scene.joint_dof], memory)
+        state, force = substep(lambda *_: (tau, None), state)
+        return (state, memory), force
+
+    (state, memory), forces = jax.lax.scan(run, (state, memory), jnp.arange(scene.config.substeps))
+    return state, forces[-1], memory
 
 
 class _Unknown(Exception):
