@@ -66,8 +66,8 @@ DEV int capsules_on(const Search &search, int count, bool present, Vec3 middle, 
     const Vec3 start = in_frame(frame, middle), along = transposed_times(frame.rotation, axis);
     // The distance is convex: nowhere on the axis is it less than by its slope in the middle.
     Vec3 outward;
-    const float least = distance(Primitive{}, start, size, outward) - fabsf(dot(outward, along));
-    if (!lanes_where(present && least < radius)) continue;
+    const float gap = distance(Primitive{}, start, size, outward) - radius;
+    if (!lanes_where(present && gap < fabsf(dot(outward, along)))) continue;
     float place;
     const bool meets = meeting_place(Primitive{}, start, along, size, part, search.lane, place);
     count = keep_ball<Primitive>(search, count, primitive, frame, size, present && meets, middle + place * axis,
