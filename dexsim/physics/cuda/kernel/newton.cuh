@@ -374,6 +374,17 @@ DEV float line_search(const Args &args, const Problem &problem, Vec3 miss, Vec3 
   return here;
 }
 
+// Whether the lane's constraints are quadratic all the way between two points: its contact sticks or is open at both
+// ends, its limit is closed or open at both. Where all are, one whole Newton step has found the solution.
+DEV bool quadratic(const Problem &problem, Vec3 before, Vec3 after, float acceleration, float step) {
+  const Cone from = cone_at(problem.rows, before), to = cone_at(problem.rows, after);
+  const LimitRow &limit = problem.limit;
+  const bool closed_before = limit.side * acceleration < limit.wanted;
+  const bool closed_after = limit.side * (acceleration + step) < limit.wanted;
+  const bool same = !from.middle && !to.middle && from.bottom == to.bottom;
+  return (same || !problem.rows.here) && closed_before == closed_after;
+}
+
 // The acceleration of the lane's degree of freedom, from a first guess on. `miss` of the rows ends as that of the
 // solution. Counts iterations and evaluations of the line search.
 DEV float solve(const Args &args, Problem &problem, float acceleration, Shared &shared, int &iterations, int &evaluations,
@@ -398,12 +409,16 @@ DEV float solve(const Args &args, Problem &problem, float acceleration, Shared &
     float slope = step * gradient, curve = step * inertial_step;
     sum_lanes(slope, curve, lane.index);
     decrement = sum_lanes(decrement);
-    const float share = line_search(args, problem, miss, moved, acceleration, step, slope, curve, decrement, evaluations, lane);
+    // The last step is taken as it is: its slopes are rounding.
+    const bool last = decrement < args.tolerance;
+    const float share =
+        last ? 1 : line_search(args, problem, miss, moved, acceleration, step, slope, curve, decrement, evaluations, lane);
+    const bool found = share == 1 && lanes_where(!quadratic(problem, miss, miss + moved, acceleration, step)) == 0;
     acceleration += share * step;
     inertial += share * inertial_step;
     miss += share * moved;
     __syncwarp();
-    if (decrement < args.tolerance) break;
+    if (last || found) break;
   }
   return acceleration;
 }
