@@ -34,11 +34,11 @@ DEV bool meeting_place(Primitive, Vec3 start, Vec3 axis, Vec3 size, int part, in
 
 // A ball of each lane on one primitive.
 template <class Primitive>
-DEV int keep_ball(const Search &search, int count, int primitive, const Frame &frame, Vec3 size, bool present,
-                  Vec3 centre, float radius, int geom) {
+DEV int keep_ball(const Search &search, int count, int primitive, bool present, Vec3 centre, float radius, int geom) {
+  const Solid &solid = search.primitives[primitive];
   Vec3 outward;
-  const float gap = distance(Primitive{}, in_frame(frame, centre), size, outward) - radius;
-  const Vec3 normal = -(frame.rotation * outward);
+  const float gap = distance(Primitive{}, in_frame(solid, centre), solid.size, outward) - radius;
+  const Vec3 normal = -(solid.rotation * outward);
   const bool touches = present && gap < 0;
   const int pair = touches ? OBJECT_PAIR[primitive][geom] : 0;
   return keep(search, count, touches, gap, centre + (radius + 0.5f * gap) * normal, normal, pair);
@@ -48,9 +48,7 @@ template <class Primitive>
 DEV int spheres_on(const Search &search, int count, bool present, Vec3 centre, float radius, int geom) {
 #pragma unroll 1
   for (int primitive = Primitive::FIRST; primitive < Primitive::FIRST + Primitive::COUNT; primitive++) {
-    const Frame frame = primitive_frame(search, primitive);
-    const Vec3 size = geom_size(search, primitive);
-    count = keep_ball<Primitive>(search, count, primitive, frame, size, present, centre, radius, geom);
+    count = keep_ball<Primitive>(search, count, primitive, present, centre, radius, geom);
   }
   return count;
 }
@@ -61,17 +59,15 @@ DEV int capsules_on(const Search &search, int count, bool present, Vec3 middle, 
   const int part = search.lane & 3;
 #pragma unroll 1
   for (int primitive = Primitive::FIRST; primitive < Primitive::FIRST + Primitive::COUNT; primitive++) {
-    const Frame frame = primitive_frame(search, primitive);
-    const Vec3 size = geom_size(search, primitive);
-    const Vec3 start = in_frame(frame, middle), along = transposed_times(frame.rotation, axis);
+    const Solid &solid = search.primitives[primitive];
+    const Vec3 start = in_frame(solid, middle), along = transposed_times(solid.rotation, axis);
     // The distance is convex: nowhere on the axis is it less than by its slope in the middle.
     Vec3 outward;
-    const float gap = distance(Primitive{}, start, size, outward) - radius;
+    const float gap = distance(Primitive{}, start, solid.size, outward) - radius;
     if (!lanes_where(present && gap < fabsf(dot(outward, along)))) continue;
     float place;
-    const bool meets = meeting_place(Primitive{}, start, along, size, part, search.lane, place);
-    count = keep_ball<Primitive>(search, count, primitive, frame, size, present && meets, middle + place * axis,
-                                 radius, geom);
+    const bool meets = meeting_place(Primitive{}, start, along, solid.size, part, search.lane, place);
+    count = keep_ball<Primitive>(search, count, primitive, present && meets, middle + place * axis, radius, geom);
   }
   return count;
 }

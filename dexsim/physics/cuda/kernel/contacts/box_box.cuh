@@ -11,11 +11,6 @@ constexpr float NOT_AN_AXIS = -1e10f;
 // Squared sine of the angle between edges below which what is across them is rounding error; faces cover it then.
 constexpr float PARALLEL_EDGES = 1e-8f;
 
-struct Solid {
-  Frame frame;
-  Vec3 half;  // m
-};
-
 DEV Vec3 row(const Mat3 &m, int axis) { return axis == 0 ? m.x : axis == 1 ? m.y : m.z; }
 DEV Vec3 unit(int axis) { return {axis == 0 ? 1.0f : 0.0f, axis == 1 ? 1.0f : 0.0f, axis == 2 ? 1.0f : 0.0f}; }
 DEV Vec3 without(Vec3 a, int axis) { return {axis == 0 ? 0 : a.x, axis == 1 ? 0 : a.y, axis == 2 ? 0 : a.z}; }
@@ -124,9 +119,9 @@ DEV bool corner_over_face(const Faces &faces, int lane, Vec3 &corner) {
 
 // All lanes on one pair of boxes.
 DEV int box_on_box(const Search &search, int count, const Solid &one, const Solid &two, int pair) {
-  const Mat3 turn = transposed(one.frame.rotation) * two.frame.rotation;  // columns: axes of the second in the first
-  const Vec3 offset = in_frame(one.frame, two.frame.place);
-  Axis axis = axis_of_lane(search.lane, turn, offset, one.half, two.half);
+  const Mat3 turn = transposed(one.rotation) * two.rotation;  // columns: axes of the second in the first
+  const Vec3 offset = in_frame(one, two.place);
+  Axis axis = axis_of_lane(search.lane, turn, offset, one.size, two.size);
   const bool flat = search.lane < 6;
   const float face = greatest_of_lanes(flat ? axis.gap : NOT_AN_AXIS);
   const float edge = greatest_of_lanes(flat ? NOT_AN_AXIS : axis.gap);
@@ -135,9 +130,9 @@ DEV int box_on_box(const Search &search, int count, const Solid &one, const Soli
   const int sharpest = __ffs(lanes_where(!flat && axis.gap == edge)) - 1;
   if (edges_meet(edge, face, axis.way, sharpest, flattest)) {
     Vec3 point;
-    const float gap = edge_contact(axis, turn, offset, one.half, two.half, point);
+    const float gap = edge_contact(axis, turn, offset, one.size, two.size, point);
     return keep(search, count, search.lane == sharpest && gap < 0, gap,
-                one.frame.place + one.frame.rotation * point, one.frame.rotation * axis.way, pair);
+                one.place + one.rotation * point, one.rotation * axis.way, pair);
   }
   const bool first = flattest < 3;  // whose face is the reference
   const int reference = first ? flattest : flattest - 3;
@@ -145,14 +140,14 @@ DEV int box_on_box(const Search &search, int count, const Solid &one, const Soli
   const Vec3 to_other = first ? offset : -transposed_times(turn, offset);
   const float side = pick(to_other, reference) >= 0 ? 1.0f : -1.0f;
   const Faces both =
-      faces(first ? turn : transposed(turn), to_other, base.half, first ? two.half : one.half, reference, side);
+      faces(first ? turn : transposed(turn), to_other, base.size, first ? two.size : one.size, reference, side);
   Vec3 corner;
   const bool touches = corner_over_face(both, search.lane, corner) && corner.z < 0;
   // Midway between the faces.
   const int x = next(reference), y = next(x);
-  const Vec3 normal = side * column(base.frame.rotation, reference);
-  const Vec3 point = base.frame.place + (pick(base.half, reference) + 0.5f * corner.z) * normal +
-                     corner.x * column(base.frame.rotation, x) + corner.y * column(base.frame.rotation, y);
+  const Vec3 normal = side * column(base.rotation, reference);
+  const Vec3 point = base.place + (pick(base.size, reference) + 0.5f * corner.z) * normal +
+                     corner.x * column(base.rotation, x) + corner.y * column(base.rotation, y);
   return keep(search, count, touches, corner.z, point, first ? normal : -normal, pair);
 }
 
@@ -160,11 +155,7 @@ DEV Solid box_geom(const Search &search, int index) {
   const BoxGeom &geom = BOX_GEOM[index];
   const Pose &pose = search.shared.pose[geom.link];
   const Vec3 half = geom.size < 0 ? geom.half : geom_size(search, geom.size);
-  return {{pose.rotation * geom.rotation, in_world(pose, geom.place)}, half};
-}
-
-DEV Solid box_primitive(const Search &search, int primitive) {
-  return {primitive_frame(search, primitive), geom_size(search, primitive)};
+  return {pose.rotation * geom.rotation, in_world(pose, geom.place), half};
 }
 
 DEV int boxes_meet(const Search &search, int count) {
@@ -174,14 +165,14 @@ DEV int boxes_meet(const Search &search, int count) {
     // The sphere round a box of the object against the box of the hand: a pair a lane.
     const int index = smaller(first + search.lane, PAIRS - 1);
     const Solid mine = box_geom(search, index / EACH);
-    const Solid theirs = box_primitive(search, FIRST_BOX + index % EACH);
+    const Solid &theirs = search.primitives[FIRST_BOX + index % EACH];
     Vec3 outward;
-    const float apart = distance(Box{}, in_frame(mine.frame, theirs.frame.place), mine.half, outward);
-    unsigned near = lanes_where(first + search.lane < PAIRS && apart < length(theirs.half));
+    const float apart = distance(Box{}, in_frame(mine, theirs.place), mine.size, outward);
+    unsigned near = lanes_where(first + search.lane < PAIRS && apart < length(theirs.size));
 #pragma unroll 1
     for (; near; near &= near - 1) {
       const int pair = first + __ffs(near) - 1, box = pair / EACH, primitive = pair % EACH;
-      count = box_on_box(search, count, box_geom(search, box), box_primitive(search, FIRST_BOX + primitive),
+      count = box_on_box(search, count, box_geom(search, box), search.primitives[FIRST_BOX + primitive],
                          OBJECT_PAIR[FIRST_BOX + primitive][FIRST_BOX_GEOM + box]);
     }
   }

@@ -6,9 +6,8 @@
 constexpr float PARALLEL = 1e-8f;
 
 DEV Round round_primitive(const Search &search, int primitive) {
-  const Frame frame = primitive_frame(search, primitive);
-  const Vec3 size = geom_size(search, primitive);
-  return {frame.place, size.y * column(frame.rotation, 2), size.x};
+  const Solid &solid = search.primitives[primitive];
+  return {solid.place, solid.size.y * column(solid.rotation, 2), solid.size.x};
 }
 
 // The places, from -1 to 1, that are nearest to each other on two axes.

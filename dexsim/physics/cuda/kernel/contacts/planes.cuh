@@ -16,7 +16,7 @@ DEV Vec3 lowest_of_cylinder(Vec3 size, Vec3 down, int corner) {
   return {size.x * (-0.5f * rim.x - side * rim.y), size.x * (-0.5f * rim.y + side * rim.x), lower};
 }
 
-// A place of a primitive that may touch a plane; `down` leads to the plane, both in the primitive's frame.
+// A place of a primitive that may touch a plane; `down` leads to the plane, both in the primitive's solid.
 DEV Vec3 lowest(int kind, Vec3 size, Vec3 down, int corner) {
   switch (kind) {
     case ON_CAPSULE:
@@ -41,10 +41,10 @@ DEV int planes_meet(const Search &search, int count) {
     const int index = first + search.lane;
     const PlanePoint row = PLANE_POINT[smaller(index, PLANE_POINTS - 1)];
     const PlaneGeom plane = PLANE_GEOM[row.plane];
-    const Frame frame = primitive_frame(search, row.primitive);
-    const Vec3 down = -transposed_times(frame.rotation, plane.normal);
-    const Vec3 corner = lowest(row.kind, geom_size(search, row.primitive), down, row.corner);
-    const Vec3 point = frame.place + frame.rotation * corner;
+    const Solid &solid = search.primitives[row.primitive];
+    const Vec3 down = -transposed_times(solid.rotation, plane.normal);
+    const Vec3 corner = lowest(row.kind, solid.size, down, row.corner);
+    const Vec3 point = solid.place + solid.rotation * corner;
     const float gap = dot(point - plane.place, plane.normal);
     // Of a box only the lower corners count, however deep it is.
     const bool touches = index < PLANE_POINTS && gap < 0 && (row.kind != ON_BOX || dot(corner, down) >= 0);

@@ -2,17 +2,17 @@
 #pragma once
 #include "shared.cuh"
 
+struct __align__(16) Solid {
+  Mat3 rotation;
+  Vec3 place;
+  Vec3 size;  // m, as MuJoCo has it
+};
+
 struct Search {
   const Args &args;
   Shared &shared;
-  Mat3 rotation;  // of the object
-  Vec3 place;
+  const Solid *primitives;  // of the object, in the world
   int world, lane;
-};
-
-struct Frame {
-  Mat3 rotation;
-  Vec3 place;
 };
 
 DEV float length(Vec3 a) { return sqrtf(dot(a, a)); }
@@ -26,22 +26,25 @@ DEV float normalize(Vec3 &a) {
   return square * inverse;
 }
 
+// A world's own size of a geom of the hand.
 DEV Vec3 geom_size(const Search &search, int row) {
   return load3(search.args.geom_size + (search.world * (PRIMITIVES + TIP_GEOMS) + row) * 3);
 }
 
-// A primitive of the object in the world.
-DEV Frame primitive_frame(const Search &search, int primitive) {
-  const int row = search.world * PRIMITIVES + primitive;
-  Frame frame = {search.rotation, search.place + search.rotation * load3(search.args.geom_pos + row * 3)};
-  if (TURNED_PRIMITIVES) {
-    const float *quat = search.args.geom_quat + row * 4;
-    frame.rotation = search.rotation * rotation_of(quat[0], quat[1], quat[2], quat[3]);
+// The object's primitives, one a lane, to where all lanes can read them.
+DEV void place_primitives(const Args &args, int world, const Mat3 &rotation, Vec3 place, int lane, Solid *primitives) {
+#pragma unroll 1
+  for (int primitive = lane; primitive < PRIMITIVES; primitive += 32) {
+    const int row = world * PRIMITIVES + primitive;
+    const float *size = args.geom_size + (world * (PRIMITIVES + TIP_GEOMS) + primitive) * 3;
+    const float *quat = args.geom_quat + row * 4;
+    const Mat3 turn = TURNED_PRIMITIVES ? rotation * rotation_of(quat[0], quat[1], quat[2], quat[3]) : rotation;
+    primitives[primitive] = {turn, place + rotation * load3(args.geom_pos + row * 3), load3(size)};
   }
-  return frame;
+  __syncwarp();
 }
 
-DEV Vec3 in_frame(const Frame &frame, Vec3 point) { return transposed_times(frame.rotation, point - frame.place); }
+DEV Vec3 in_frame(const Solid &solid, Vec3 point) { return transposed_times(solid.rotation, point - solid.place); }
 
 DEV Vec3 in_world(const Pose &pose, Vec3 point) { return pose.place + pose.rotation * point; }
 
