@@ -32,6 +32,7 @@ DEV Spring spring(const float *solref, const float *solimp, float gap) {
 struct ContactRows {
   bool here;
   int first, second;            // links; second is HINGES for the object
+  int first_dof, other_dof;     // of their first columns, where fingers are chains (BLOCK)
   int finger;                   // that the object presses at its tip, or -1
   Vec3 normal;                  // from the first link to the second
   float jacobian[3][COLUMNS];   // normal and two tangents
@@ -43,12 +44,11 @@ struct ContactRows {
 // Degree of freedom of a column. Unused columns are zero, and get one that exists.
 DEV int column_dof(const ContactRows &rows, int column) {
   const bool other = column >= CHAIN;
-  const int link = other ? rows.second : rows.first, k = other ? column - CHAIN : column;
-  if (other && link == HINGES) return HINGES + k;
-  if (link < 0 || k >= CHAIN) return 0;
-  if (BLOCK) return BLOCK_FIRST[link] + k;
-  const int hinge = CHAIN_HINGE[link][k];
-  return hinge < 0 ? 0 : hinge;
+  const int k = other ? column - CHAIN : column;
+  if (BLOCK) return (other ? rows.other_dof : rows.first_dof) + k;
+  const int link = other ? rows.second : rows.first;
+  if (link == HINGES) return HINGES + k;
+  return link < 0 || k >= CHAIN || CHAIN_HINGE[link][k] < 0 ? 0 : CHAIN_HINGE[link][k];
 }
 
 // J times a vector by degree of freedom.
@@ -93,6 +93,7 @@ DEV ContactRows contact_rows(const Args &args, int world, const Shared &shared, 
   ContactRows rows;
   rows.here = lane.index < contacts;
   rows.first = rows.second = rows.finger = -1;
+  rows.first_dof = rows.other_dof = 0;
   rows.weight = rows.slide_weight = 0;
   rows.mu = rows.friction = 1;
   rows.miss = rows.normal = {0, 0, 0};
@@ -105,6 +106,8 @@ DEV ContactRows contact_rows(const Args &args, int world, const Shared &shared, 
   const Contact &contact = shared.contact[lane.index];
   const Pair pair = PAIR[contact.pair];
   rows.first = pair.first, rows.second = pair.second, rows.finger = pair.finger;
+  if (rows.first >= 0) rows.first_dof = BLOCK_FIRST[rows.first];
+  if (rows.second >= 0) rows.other_dof = rows.second == HINGES ? HINGES : BLOCK_FIRST[rows.second];
   // Friction is the same in all directions, so the tangents need not be those of the turned normal.
   rows.normal = pair.side * contact.normal;
   const Mat3 frame = contact_frame(rows.normal);
