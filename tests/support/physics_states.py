@@ -58,7 +58,9 @@ def private_model(scene: PhysicsScene) -> mujoco.MjModel:
     return model
 
 
-def tumble(scene: PhysicsScene, count: int, start: Callable[[np.random.Generator], np.ndarray], seed: int = 0) -> States:
+def tumble(
+    scene: PhysicsScene, count: int, start: Callable[[np.random.Generator], np.ndarray], seed: int = 0
+) -> States:
     """States while joints move at random and an object falls on the hand from the pose [7] that `start` draws."""
     model, random = private_model(scene), np.random.default_rng(seed)
     data, body, joints = mujoco.MjData(model), scene.object_body, len(scene.joint_dof)

@@ -257,9 +257,7 @@ def _joints(scene: PhysicsScene) -> list[str]:
 
 def _couplings(model: mujoco.MjModel) -> list[str]:
     """Joints that follow others: q - q0 = polynomial of (q' - q0')."""
-    first, second = (
-        np.where(joint >= 0, model.jnt_dofadr[joint], -1) for joint in (model.eq_obj1id, model.eq_obj2id)
-    )
+    first, second = (np.where(joint >= 0, model.jnt_dofadr[joint], -1) for joint in (model.eq_obj1id, model.eq_obj2id))
     zero = [np.where(dof >= 0, model.qpos0[dof], 0.0) for dof in (first, second)]
     compliance = model.dof_invweight0[first] + np.where(second >= 0, model.dof_invweight0[second], 0.0)
     springs = np.hstack([model.eq_solref, model.eq_solimp])

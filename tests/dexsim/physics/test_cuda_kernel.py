@@ -170,3 +170,43 @@ def test_any_tree_of_hinges():
         assert wanted["contacts"].max() >= 4
         assert np.percentile(error["force"], 90) < 0.001 * factor and np.percentile(error["force"], 99) < 0.1 * factor
         assert np.percentile(error["acceleration"], 90) < 0.02 * factor
+
+
+def test_lost_contacts_and_diverged_worlds_have_no_forces(monkeypatch):
+    scene = branched_scene()
+    states = tumble(scene, 24, in_branches)
+    states["target"], inputs = states["target"], states | {"law_0": states["target"]}
+    whole = Emulation(scene).run(inputs, substeps=2)
+    alone = Emulation(scene).run({name: values[3:4] for name, values in inputs.items()}, substeps=2)
+    for name, values in alone.items():  # to the bit
+        np.testing.assert_array_equal(values, whole[name][3:4])
+    assert np.isfinite(whole["finger_force"]).all() and whole["stats"][:, 2].max() > 3
+
+    monkeypatch.setattr(cuda_scene, "MAX_CONTACTS", 3)
+    inputs["qvel"][1, 2], inputs["qpos"][2, -7] = np.inf, np.nan
+    found = Emulation(scene).run(inputs, substeps=2)
+    lost = whole["stats"][:, 2] > 3
+    lost[1:3] = False
+    np.testing.assert_array_equal(found["stats"][lost, 3], 1)
+    lost[1:3] = True
+    np.testing.assert_array_equal(np.isnan(found["finger_force"]).all(1), lost)
+    np.testing.assert_array_equal(np.isnan(found["finger_force"]).any(1), lost)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "message"),
+    [
+        ('name="c1" axis', 'name="c1" type="slide" axis', "joints that are no hinges"),
+        ('<joint name="c1"', '<joint axis="1 0 0"/><joint name="c1"', "bodies with several joints"),
+        ('name="c1" axis', 'name="c1" frictionloss="0.1" axis', "dry friction"),
+        ('condim="3"', 'condim="4"', "dimension"),
+        ('friction="0.4 0.4"', 'friction="0.4 0.5"', "depends on the direction"),
+        ('eulerdamp="disable"', 'eulerdamp="enable"', "implicit damping"),
+        ('cone="elliptic"', 'cone="pyramidal"', "pyramidal"),
+        ("<equality>", '<equality><weld body1="a1" body2="b1"/>', "equality constraints"),
+    ],
+)
+def test_what_does_not_fit_is_named(before, after, message):
+    assert BRANCHED.count(before) >= 1
+    with pytest.raises(AssetError, match=message):
+        cuda_scene.check_scene(branched_scene(BRANCHED.replace(before, after, 1)))

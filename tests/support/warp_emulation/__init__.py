@@ -41,7 +41,7 @@ class Emulation:
         text = "\n".join(
             [declare_args(self.buffers), cuda_scene.kernel_constants(scene), contact_constants(scene), law]
         )
-        library = ctypes.CDLL(str(_build(text)))
+        library = ctypes.CDLL(str(build(text)))
         self._run = library.run
         scalars = [(name, ctypes.c_int) for name in ("n", "substeps", "iterations", "line_search")]
         scalars += [(name, ctypes.c_float) for name in ("tolerance", "line_search_tolerance")]
@@ -70,16 +70,14 @@ class Emulation:
                 assert value.shape[1] == buffer.size, f"{buffer.name}: expected {buffer.size}, got {value.shape[1]}"
                 arrays[buffer.name] = np.ascontiguousarray(value)
         pointers = [array.ctypes.data for array in arrays.values()]
-        arguments = self._arguments(
-            *pointers, n, substeps, iterations, line_search, tolerance, line_search_tolerance
-        )
+        arguments = self._arguments(*pointers, n, substeps, iterations, line_search, tolerance, line_search_tolerance)
         self._run(ctypes.byref(arguments))
         return {buffer.name: arrays[buffer.name] for buffer in self.buffers if buffer.output}
 
 
-def _build(text: str) -> Path:
-    """Compile, or take what was compiled from the same sources."""
-    sources = [*sorted(_KERNEL.rglob("*.cuh")), _HERE / "warp_emulation.h", _HERE / "main.cpp"]
+def build(text: str, main: str = "main.cpp") -> Path:
+    """Compile `main` of this folder with a scene's text, or take what was compiled from the same sources."""
+    sources = [*sorted(_KERNEL.rglob("*.cuh")), _HERE / "warp_emulation.h", _HERE / main]
     digest = hashlib.sha256(text.encode() + b"".join(path.read_bytes() for path in sources)).hexdigest()[:16]
     library = _CACHE / f"{digest}.so"
     if not library.exists():
@@ -88,7 +86,7 @@ def _build(text: str) -> Path:
             (Path(folder) / "scene_text.h").write_text(text)
             made = Path(folder) / "kernel.so"
             command = [compiler, "-std=c++17", "-O2", "-w", "-shared", "-fPIC", "-U_FORTIFY_SOURCE", "-Wl,-z,defs"]
-            command += [f"-I{folder}", f"-I{_HERE}", f"-I{_KERNEL}", str(_HERE / "main.cpp"), "-o", str(made)]
+            command += [f"-I{folder}", f"-I{_HERE}", f"-I{_KERNEL}", str(_HERE / main), "-o", str(made)]
             subprocess.run(command, check=True)
             shutil.move(made, library)
     return library
