@@ -90,7 +90,7 @@ def tumble(
 
 
 def mujoco_substeps(scene: PhysicsScene, states: States, substeps: int) -> dict[str, np.ndarray]:
-    """C MuJoCo after some sub-steps with `pd_torque`: qpos, qvel, acceleration, finger_force, contacts (of the first)."""
+    """C MuJoCo after some sub-steps with `pd_torque`: state, acceleration, finger_force, contacts of the first."""
     model = private_model(scene)
     data = mujoco.MjData(model)
     rows = []

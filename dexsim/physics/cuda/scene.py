@@ -6,10 +6,11 @@ is one about z. Link -1 is fixed in the world (the palm), link `hinges` the obje
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import mujoco
 import numpy as np
+from numpy.typing import ArrayLike
 
 from dexsim.core.errors import AssetError
 from dexsim.physics.cuda.arguments import Buffer
@@ -22,7 +23,7 @@ _FAST = 4  # hinges of a finger that the kernel eliminates by itself
 
 
 def buffers(scene: PhysicsScene, law: Sequence[Buffer]) -> list[Buffer]:
-    """Arguments of the kernel in order: arrays [N, size] of the inputs, of the motor law's constants, of the outputs."""
+    """Arguments of the kernel in order, arrays [N, size]: inputs, the motor law's constants, outputs."""
     model, slots, pairs = scene.model, len(scene.slots), len(scene.object_pairs)
     inputs = {
         "qpos": model.nq,
@@ -151,17 +152,17 @@ def kernel_constants(scene: PhysicsScene) -> str:
     )
 
 
-def table(name: str, values: np.ndarray, kind: str = "float") -> str:
+def table(name: str, values: ArrayLike, kind: str = "float") -> str:
     """A C++ table [...] of device memory."""
-    values = np.asarray(values)
-    sizes = "".join(f"[{n}]" for n in values.shape)
+    array = np.asarray(values)
+    sizes = "".join(f"[{n}]" for n in array.shape)
 
     def braces(part: np.ndarray) -> str:
         if part.ndim:
             return "{" + ", ".join(braces(row) for row in part) + "}"
-        return number(part) if kind == "float" else str(int(part))
+        return number(part.item()) if kind == "float" else str(part.item())
 
-    return f"__device__ const {kind} {name}{sizes} = {braces(values)};"
+    return f"__device__ const {kind} {name}{sizes} = {braces(array)};"
 
 
 def number(value: float) -> str:
@@ -197,8 +198,8 @@ def _sizes(scene: PhysicsScene, links: Links) -> list[str]:
 
 def _tree(links: Links, scene: PhysicsScene) -> list[str]:
     steps, blocks = _gathering(links), _blocks(scene, links)
-    first = np.zeros(links.hinges) if blocks is None else np.searchsorted(blocks, blocks)
-    last = np.zeros(links.hinges) if blocks is None else np.searchsorted(blocks, blocks, side="right") - 1
+    first = np.zeros(links.hinges, int) if blocks is None else np.searchsorted(blocks, blocks)
+    last = np.zeros(links.hinges, int) if blocks is None else np.searchsorted(blocks, blocks, side="right") - 1
     return [
         table("PARENT", _lanes(links.parent, -1), "int"),
         table("DEPTH", _lanes(_depth(links)), "int"),
@@ -281,7 +282,8 @@ def _pairs(scene: PhysicsScene, links: Links) -> list[str]:
     compliance = model.body_invweight0[bodies, 0].sum(0)
     fingers = {int(body): finger for finger, body in enumerate(scene.tip_bodies)}
     rows = {int(pair): row for row, pair in enumerate(scene.object_pairs)}
-    lines, springs = [], []
+    lines: list[str] = []
+    springs: list[list[float]] = []
     for pair, (one, two) in enumerate(bodies.T):
         first, second, side = int(links.link[one]), int(links.link[two]), 1.0
         if first == links.hinges:
@@ -350,17 +352,17 @@ def _padded(rows: list[list[int]]) -> np.ndarray:
     return np.array([row + [-1] * (width - len(row)) for row in rows])
 
 
-def _lanes(values, fill: float = 0.0) -> np.ndarray:
+def _lanes(values: ArrayLike, fill: float = 0.0) -> np.ndarray:
     """Values [H, ...] for all lanes [32, ...]."""
-    values = np.asarray(values)
-    return np.concatenate([values, np.full((LANES - len(values), *values.shape[1:]), fill, values.dtype)])
+    array = np.asarray(values)
+    return np.concatenate([array, np.full((LANES - len(array), *array.shape[1:]), fill, array.dtype)])
 
 
-def _list(values) -> str:
+def _list(values: Iterable[float]) -> str:
     return "{" + ", ".join(map(number, values)) + "}"
 
 
-def _rotation(quat) -> np.ndarray:
+def _rotation(quat: ArrayLike) -> np.ndarray:
     matrix = np.zeros(9)
     mujoco.mju_quat2Mat(matrix, np.asarray(quat, float))
     return matrix.reshape(3, 3)

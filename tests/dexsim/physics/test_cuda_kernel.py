@@ -1,6 +1,5 @@
 """The kernel of the `cuda` engine in an emulated warp, against C MuJoCo in double precision."""
 
-import dataclasses
 import types
 
 import mujoco
