@@ -51,7 +51,7 @@ class CheckArguments:
 
     task: str = "grasp"
     """Name of the task, which gets its default configuration; my_module:poke for a task of your own."""
-    backend: Literal["auto", "jax", "warp", "c"] = setting("auto")
+    backend: Literal["auto", "cuda", "warp", "c", "jax"] = setting("auto")
     """Physics backend. auto: c on a CPU, warp on an NVIDIA GPU if it is installed, otherwise jax."""
     num_envs: int = setting(16, unit="1", low=2, high=65536)
     """Hands sampled for each range."""

@@ -42,7 +42,7 @@ class TrainArguments(Generic[EnvConfig]):
     """Seed of everything random."""
     seeds: int = setting(1, unit="1", low=1, high=1000)
     """Trainings, from --seed on, in one program where that is possible; --steps and --minutes are those of each."""
-    backend: Literal["auto", "jax", "warp", "c"] = setting("auto")
+    backend: Literal["auto", "cuda", "warp", "c", "jax"] = setting("auto")
     """Physics backend. auto: c on a CPU, warp on an NVIDIA GPU if it is installed, otherwise jax."""
     deterministic: bool = False
     """On a GPU, have XLA order its sums and do without Warp, at a cost in speed, so that a training repeats from one
