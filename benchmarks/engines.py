@@ -10,7 +10,7 @@ What is left are contact points and rounding. `n` counts fingers that touch, and
 vectors. Speeds are of a control tick of physics with the default iterations, measured in turn.
 
 `motions` (see `engine_motions`) and `policies` measure every engine with the solver iterations of training, and with 50
-of 50 line-search steps (converged): `c`, `jax` and `warp` on a CPU (Warp on one thread), `cuda`, `jax` and `warp` on a GPU.
+of 50 line-search steps (converged): on a CPU `c`, `jax` and `warp` (on one thread), on a GPU `cuda`, `jax` and `warp`.
 """
 
 import argparse
