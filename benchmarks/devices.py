@@ -128,7 +128,7 @@ def run_processes(argv: list[str], number: int, joined: bool) -> dict[str, Any]:
 def parse(argv: list[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--task", default="rotate", help="as in training")
-    parser.add_argument("--backend", default="auto", choices=["auto", "cuda", "warp", "c", "jax"])
+    parser.add_argument("--backend", default="auto", choices=["auto", "jax", "cuda", "warp", "c"])
     parser.add_argument("--devices", nargs="+", type=int, default=[1], metavar="N")
     parser.add_argument("--processes", type=int, default=1, metavar="N")
     parser.add_argument("--seeds", type=int, default=1, metavar="N", help="in one program, beside one")

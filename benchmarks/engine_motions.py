@@ -27,6 +27,7 @@ from dexsim.core.pytree import pytree_dataclass
 from dexsim.env.env import Env
 from dexsim.hand.kinematics import flexion_joints
 from dexsim.objects.params import ObjectParams, extent
+from dexsim.physics.model import build_model
 from dexsim.physics.physics import Physics
 from dexsim.physics.seam import PhysicsState
 from dexsim.registry import TASKS
@@ -72,9 +73,11 @@ class Bench:
     def __init__(self, task: str, starts: int, seconds: float):
         shapes = len(TASKS[task].config().objects.shapes)
         config = dataclasses.replace(TASKS[task].config(), pool_size=max(2 * shapes * starts, 16))
-        self.env: Env = dexsim.make(task, config, backend="c")
+        self.env: Env = dexsim.make(task, config)
         self.task, self.ticks = task, max(round(seconds / self.env.control_period), 1)
-        self.exact = self.physics("c", CONVERGED)
+        self.exact = self.physics("auto", CONVERGED)
+        made, physics = self.env.task, self.exact.config
+        self.template = build_model(self.env.hand, made.slots, made.largest, physics, made.gravity, "c")
         pool, index = self.env.pool, np.asarray(self.env.pool.object.shape_index)
         names = {shape: getattr(config, "object", "") or self.env.task.shape_names[shape] for shape in np.unique(index)}
         self.cases, begins = list[tuple[str, str]](), list[Begin]()
@@ -154,7 +157,10 @@ class Bench:
 
     def model(self, begin: Begin) -> mujoco.MjModel:
         """C MuJoCo's model of one row."""
-        scene, model = self.exact.scene, copy.copy(self.exact.scene.model)
+        scene, model = self.exact.scene, copy.copy(self.template)
+        # The compiler lets C MuJoCo skip offsets that are zero in the template. Objects bring others.
+        model.geom_sameframe[scene.object_geoms] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
+        model.body_sameframe[scene.object_body] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
         model.opt.tolerance = 1e-12
         for name, values in self.exact.configure(begin.object).items():
             getattr(model, name)[:] = values

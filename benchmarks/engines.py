@@ -10,10 +10,11 @@ What is left are contact points and rounding. `n` counts fingers that touch, and
 vectors. Speeds are of a control tick of physics with the default iterations, measured in turn.
 
 `motions` (see `engine_motions`) and `policies` measure every engine with the solver iterations of training, and with 50
-of 50 line-search steps (converged). Warp runs on one CPU thread here.
+of 50 line-search steps (converged): on a CPU `c`, `jax` and `warp` (on one thread), on a GPU `cuda`, `jax` and `warp`.
 """
 
 import argparse
+import contextlib
 import dataclasses
 import functools
 import json
@@ -29,15 +30,25 @@ from throughput import seconds
 
 from dexsim.core.cli import enable_caches
 from dexsim.core.compilation import jit
+from dexsim.core.errors import ConfigError
 from dexsim.env.env import Env
 from dexsim.env.motors import JointCommand
 from dexsim.env.state import State
 from dexsim.objects.config import SHAPES
-from dexsim.physics.physics import BACKENDS, Physics
+from dexsim.physics.physics import BACKENDS, Physics, choose_backend
 from dexsim_ppo import Policy, load_policy
 
 WAYS = {"closed": ("jax", "closed"), "mjx": ("jax", "mjx"), "c": ("c", "closed")}
 TOUCHING = 0.01  # N
+
+
+def usable() -> list[str]:
+    """The engines that run on this machine and device."""
+    found = []
+    for name in BACKENDS:
+        with contextlib.suppress(ConfigError):
+            found.append(choose_backend(name))
+    return found
 
 
 def grips(env: Env, policy: Policy, count: int, ticks: list[int]) -> State:
@@ -199,13 +210,13 @@ def main(argv: list[str] | None = None) -> None:
     command.add_argument("--tasks", nargs="+", default=["grasp", "rotate"])
     command.add_argument("--starts", type=int, default=4, help="of each motion and shape")
     command.add_argument("--seconds", type=float, default=0.6)
-    command.add_argument("--backends", nargs="+", default=list(BACKENDS), choices=list(BACKENDS))
+    command.add_argument("--backends", nargs="+", default=usable(), choices=list(BACKENDS))
     command = commands.add_parser("policies")
     command.set_defaults(run=run_policies)
     command.add_argument("--policies", nargs="+", default=["grasp", "rotate"])
     command.add_argument("--episodes", type=int, default=64)
     command.add_argument("--seconds", type=float, default=0.0, help="length of an episode; 0 for the task's own")
-    command.add_argument("--backends", nargs="+", default=list(BACKENDS), choices=list(BACKENDS))
+    command.add_argument("--backends", nargs="+", default=usable(), choices=list(BACKENDS))
     options = parser.parse_args(argv)
     enable_caches()
     options.run(options)

@@ -73,7 +73,7 @@ def compare(run: Callable, argument: Any, repeats: int) -> dict[str, Any]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--task", default="grasp", choices=sorted(TASKS))
-    parser.add_argument("--backend", default="auto", choices=["auto", "cuda", "warp", "c", "jax"])
+    parser.add_argument("--backend", default="auto", choices=["auto", "jax", "cuda", "warp", "c"])
     parser.add_argument("--num-envs", type=int, default=256)
     parser.add_argument("--warmup", type=int, default=4, help="iterations of training before what is compared")
     parser.add_argument("--repeats", type=int, default=3)

@@ -1,6 +1,6 @@
 """Environment throughput: one JSON line per measurement, key `env_steps_per_s`.
 
-    python benchmarks/throughput.py --backends warp jax --num-envs 4096 16384 32768
+    python benchmarks/throughput.py --backends cuda warp jax --num-envs 4096 16384 32768
     python benchmarks/throughput.py --leave-out actuator randomization      # their shares alone
     python benchmarks/throughput.py --task rotate --split                   # where a training step goes
     python benchmarks/throughput.py --task rotate --train 6 --backends c jax
@@ -303,7 +303,7 @@ def measure_training(task: str, backends: list[str], num_envs: int, iterations: 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--task", default="grasp", choices=sorted(TASKS))
-    parser.add_argument("--backends", nargs="+", default=["auto"], choices=["auto", "cuda", "warp", "c", "jax"])
+    parser.add_argument("--backends", nargs="+", default=["auto"], choices=["auto", "jax", "cuda", "warp", "c"])
     parser.add_argument("--num-envs", nargs="+", type=int, default=[], help="training's by default")
     parser.add_argument("--leave-out", nargs="*", default=list(PARTS), choices=PARTS)
     parser.add_argument("--steps", type=int, default=16)

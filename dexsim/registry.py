@@ -137,7 +137,7 @@ def make(
     Args:
       task: a name in `TASKS`, registered ones included.
       config: the task's config dataclass; None for what the name stands for.
-      backend: physics, "auto", "jax", "warp" or "c".
+      backend: physics, "auto", "jax", "cuda", "warp" or "c".
       num_envs: batch size that Warp's contact buffers are sized for.
       hand: a `Hand` from `load_hand`; None for the shipped one.
       seed: of the pool of start states.

@@ -224,8 +224,8 @@ class EvaluateArguments:
     """Evaluation episodes, rounded up to whole chunks. 0: 1024 on a GPU; on a CPU 448 of grasp, 64 of rotate."""
     seed: int = setting(0, unit="1", low=0, high=2**32 - 2)
     """Seed of the episodes and their start states. Training selects its best policy by episodes of another."""
-    backend: Literal["auto", "cuda", "warp", "c", "jax"] = setting("auto")
-    """Physics backend. auto: c on a CPU, warp on an NVIDIA GPU if it is installed, otherwise jax."""
+    backend: Literal["auto", "jax", "cuda", "warp", "c"] = setting("auto")
+    """Physics backend. auto: c on a CPU, cuda on an NVIDIA GPU, otherwise jax."""
     chunk: int = setting(0, unit="1", low=0, high=65536)
     """Episodes simulated side by side; 0 chooses by the device."""
     seconds: float = setting(0.0, unit="s", low=0.0)

@@ -46,7 +46,7 @@ class Env:
         Args:
           task: the task with its configuration.
           hand: the hand.
-          backend: "auto", "jax", "warp" or "c".
+          backend: "auto", "jax", "cuda", "warp" or "c".
           num_envs: batch size that the Warp buffers are sized for.
           seed: of the pool. Evaluations have pools of their own.
 

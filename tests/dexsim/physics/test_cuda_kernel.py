@@ -1,6 +1,7 @@
 """The kernel of the `cuda` engine in an emulated warp, against C MuJoCo in double precision."""
 
 import types
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -18,6 +19,7 @@ from dexsim.physics.seam import PhysicsScene
 
 pytestmark = pytest.mark.skipif(warp_emulation.compiler is None, reason="the emulation of a warp needs g++")
 
+DATA = Path(__file__).parents[2] / "data"
 BOX = ("box",), np.array([[0.03, 0.03, 0.03]])
 ALL = ("box", "capsule", "cylinder"), np.array([[0.03, 0.03, 0.03], [0.025, 0.03, 0], [0.03, 0.03, 0]])
 
@@ -48,10 +50,26 @@ def compare(scene: PhysicsScene, states, substeps: int, **options):
     return wanted, found, error
 
 
-@pytest.mark.parametrize("hand", ["xhand", "leap_like", "inspire_like"])
-@pytest.mark.parametrize(("slots", "largest"), [BOX, ALL], ids=["box", "all"])
-def test_substep_is_that_of_c_mujoco(hand, slots, largest):
-    scene = scene_of(hand, slots, largest)
+@pytest.mark.parametrize(
+    ("task", "slots", "largest", "gravity"),
+    [("rotate", *BOX, (-9.42, -1.95, 1.91)), ("grasp", *ALL, (9.81, 0.0, 0.0))],
+    ids=["rotate", "grasp"],
+)
+def test_states_of_the_shipped_policies(task, slots, largest, gravity):
+    """64 states of 16 episodes of each task's policy on C MuJoCo, from reset to 100 (rotate) and 140 ticks (grasp)."""
+    scene = scene_of("xhand", slots, largest, gravity)
+    states = dict(np.load(DATA / f"{task}_states.npz"))
+    for substeps, factor in ((1, 1.0), (5, 10.0)):
+        wanted, found, error = compare(scene, states, substeps)
+        if substeps == 1:
+            np.testing.assert_array_equal(found["stats"][:, 2], wanted["contacts"])
+        assert np.percentile(error["force"], 90) < 0.001 * factor and np.percentile(error["force"], 99) < 0.1 * factor
+        assert np.percentile(error["acceleration"], 90) < 0.01 * factor
+
+
+@pytest.mark.parametrize("hand", ["leap_like", "inspire_like"])
+def test_example_hands(hand):
+    scene = scene_of(hand, *ALL)
     states = tumble(scene, 64, near_palm)
     wanted, found, error = compare(scene, states, 1)
     assert (wanted["contacts"] > 0).mean() > 0.4 and np.linalg.norm(wanted["finger_force"], axis=-1).max() > 1

@@ -2,6 +2,7 @@
 
 import dataclasses
 import shutil
+import types
 from types import SimpleNamespace
 from typing import NamedTuple
 
@@ -240,25 +241,30 @@ def pressed_template(hand, model):
 class TestConstruction:
     def test_backends(self, monkeypatch):
         assert choose_backend("jax") == "jax"
-        with pytest.raises(ConfigError, match="'cuda'.*auto, jax, warp"):
-            choose_backend("cuda")
+        with pytest.raises(ConfigError, match="'metal'.*auto, jax, cuda, warp, c"):
+            choose_backend("metal")
         monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
         assert choose_backend("auto") == choose_backend("c") == "c"
+        with pytest.raises(ConfigError, match=r"'cuda' needs an NVIDIA GPU.*pip install .*\[cuda\]"):
+            choose_backend("cuda")
         monkeypatch.setattr(jax, "default_backend", lambda: "tpu")
         assert choose_backend("auto") == "jax"
         monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
         monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-        assert choose_backend("auto") == "jax"
+        for runtime, chosen in (("rocm 60300", "jax"), ("cuda 13000", "cuda")):
+            device = types.SimpleNamespace(client=types.SimpleNamespace(platform_version=runtime))
+            monkeypatch.setattr(jax, "devices", lambda device=device: [device])
+            assert choose_backend("auto") == chosen
         with pytest.raises(ConfigError, match=r"needs the extra: pip install .*\[warp\]"):
             choose_backend("warp")
         monkeypatch.setattr("importlib.util.find_spec", lambda name: object())
-        assert choose_backend("auto") == choose_backend("warp") == "warp"
+        assert choose_backend("warp") == "warp"
         with pytest.raises(ConfigError, match="JAX_PLATFORMS=cpu"):
             choose_backend("c")
         monkeypatch.setattr(compilation, "_on_gpu", {})
         assert compilation.make_deterministic()
-        assert choose_backend("auto") == choose_backend("jax") == "jax"
-        with pytest.raises(ConfigError, match="'warp' does not repeat.*leave out --deterministic"):
+        assert choose_backend("auto") == choose_backend("cuda") == "cuda" and choose_backend("jax") == "jax"
+        with pytest.raises(ConfigError, match="'warp' does not repeat.*choose cuda, or leave out --deterministic"):
             choose_backend("warp")
 
     @pytest.mark.parametrize(

@@ -55,9 +55,9 @@ template <class T> DEV void add_children(T &value, const Lane &lane) {
 
 DEV Vec3 lane_vector(const float (&rows)[3][32], int lane) { return {rows[0][lane], rows[1][lane], rows[2][lane]}; }
 
-// Rotation and place of the lane's link in the world, also in `shared.pose`.
-DEV Pose link_pose(const State &state, const Mat3 &object, Shared &shared, const Lane &lane) {
-  Pose pose = {object, state.place, 0};
+// Rotation and place of the lane's link in the world to `shared.pose`.
+DEV void place_links(const State &state, Shared &shared, const Lane &lane) {
+  Pose pose = {{{1, 0, 0}, {0, 1, 0}, {0, 0, 1}}, {0, 0, 0}, 0};
   if (lane.hinge) {
     float s, c;
     sincosf(state.angle, &s, &c);
@@ -78,8 +78,14 @@ DEV Pose link_pose(const State &state, const Mat3 &object, Shared &shared, const
       pose.place = origin + turn * pose.place;
     }
   }
-  if (lane.hinge) shared.pose[lane.index] = pose;
-  return pose;
+  if (lane.index <= HINGES) shared.pose[lane.index] = pose;  // the last is the palm's
+  __syncwarp();
+}
+
+// The pose of the lane's link, or of the object.
+DEV Pose pose_of(const State &state, const Mat3 &object, const Shared &shared, const Lane &lane) {
+  if (lane.hinge) return shared.pose[lane.index];
+  return {object, state.place, 0};
 }
 
 // What a unit velocity of the lane's degree of freedom moves: a hinge turns about its link's z axis; the object is

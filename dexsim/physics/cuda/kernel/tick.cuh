@@ -89,7 +89,6 @@ DEV bool diverged(const State &state) {
 DEV void tick(const Args &args, int world, Shared &shared, int index) {
   const Lane lane = lane_of(index);
   State state = load_state(args, world, lane);
-  if (index == 0) shared.pose[HINGES] = {{{1, 0, 0}, {0, 1, 0}, {0, 0, 1}}, {0, 0, 0}, 0};
   int iterations = 0, evaluations = 0, most = 0;
 
 #pragma unroll 1
@@ -97,9 +96,14 @@ DEV void tick(const Args &args, int world, Shared &shared, int index) {
     // Worlds of a block share the instruction cache: they go through the code together.
     __syncthreads();
     const Mat3 object = rotation_of(state.w, state.x, state.y, state.z);
+    place_links(state, shared, lane);
+    const int found = find_contacts(args, world, shared, object, state.place, index);
+    most = found > most ? found : most;
+    const int contacts = found < MAX_CONTACTS ? found : MAX_CONTACTS;
+
     Problem problem;
     {
-      const Pose pose = link_pose(state, object, shared, lane);
+      const Pose pose = pose_of(state, object, shared, lane);
       const Motion unit = unit_motion(pose, shared, lane);
       Vec3 centre;
       const Inertia inertia = link_inertia(args, world, pose, centre, lane);
@@ -109,11 +113,6 @@ DEV void tick(const Args &args, int world, Shared &shared, int index) {
       add_couplings(state, shared, problem.force, lane);
       load_mass(problem, shared, lane);
     }
-    __syncwarp();
-    const int found = find_contacts(args, world, shared, object, state.place, index);
-    most = found > most ? found : most;
-    const int contacts = found < MAX_CONTACTS ? found : MAX_CONTACTS;
-
     if (lane.hinge) shared.vector[index] = state.speed;
     if (index == 0) {
       float *moving = shared.vector + HINGES;

@@ -22,7 +22,7 @@ DEV float sum_lanes(float value) {
   return value;
 }
 
-// Two sums for the shuffles of one and a half: each half of the warp adds up one of them.
+// Two sums for little more than one: each half of the warp adds up one of them.
 DEV void sum_lanes(float &first, float &second, int lane) {
   const bool upper = lane & 16;
   float kept = upper ? second : first;
@@ -30,8 +30,9 @@ DEV void sum_lanes(float &first, float &second, int lane) {
   kept += __shfl_xor_sync(ALL_LANES, given, 16);
 #pragma unroll
   for (int offset = 8; offset; offset >>= 1) kept += __shfl_xor_sync(ALL_LANES, kept, offset);
-  first = from_lane(kept, 0);
-  second = from_lane(kept, 16);
+  const float other = __shfl_xor_sync(ALL_LANES, kept, 16);
+  first = upper ? other : kept;
+  second = upper ? kept : other;
 }
 
 DEV float least_of_lanes(float value) {

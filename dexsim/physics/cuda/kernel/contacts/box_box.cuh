@@ -11,15 +11,45 @@ constexpr float NOT_AN_AXIS = -1e10f;
 // Squared sine of the angle between edges below which what is across them is rounding error; faces cover it then.
 constexpr float PARALLEL_EDGES = 1e-8f;
 
-DEV Vec3 row(const Mat3 &m, int axis) { return axis == 0 ? m.x : axis == 1 ? m.y : m.z; }
+// Two boxes in shared memory, where an index that differs between lanes costs nothing.
+struct __align__(16) BoxPair {
+  float4 turn[3];   // rows: axes of the first box in the frame of the second; last column: the second's place
+  float4 to_first;  // the first's place in the frame of the second
+  Solid hand;       // the first
+};
+
+// An element of what lies in shared memory.
+DEV float at(const float4 &row, int column) { return (&row.x)[column]; }
+DEV float at(const Vec3 &vector, int axis) { return (&vector.x)[axis]; }
+DEV Vec3 axis_of(const Solid &solid, int axis) {
+  return {at(solid.rotation.x, axis), at(solid.rotation.y, axis), at(solid.rotation.z, axis)};
+}
+
 DEV Vec3 unit(int axis) { return {axis == 0 ? 1.0f : 0.0f, axis == 1 ? 1.0f : 0.0f, axis == 2 ? 1.0f : 0.0f}; }
 DEV Vec3 without(Vec3 a, int axis) { return {axis == 0 ? 0 : a.x, axis == 1 ? 0 : a.y, axis == 2 ? 0 : a.z}; }
 DEV Vec3 signed_like(Vec3 a, Vec3 signs) {
   return {copysignf(a.x, signs.x), copysignf(a.y, signs.y), copysignf(a.z, signs.z)};
 }
-DEV Mat3 transposed(const Mat3 &m) { return {column(m, 0), column(m, 1), column(m, 2)}; }
 DEV int next(int axis) { return axis == 2 ? 0 : axis + 1; }
 DEV int greatest(Vec3 a) { return a.x >= a.y && a.x >= a.z ? 0 : a.y >= a.z ? 1 : 2; }
+
+// The relative pose of two boxes: an element a lane.
+DEV void write_relative(BoxPair &pair, const Solid &other, int lane) {
+  const Vec3 away = other.place - pair.hand.place;
+  if (lane < 15) {
+    const int column = lane < 12 ? lane & 3 : 3;
+    const Vec3 axis = lane < 12 ? axis_of(pair.hand, lane >> 2) : -axis_of(other, lane - 12);
+    (&pair.turn[0].x)[lane] = dot(axis, column < 3 ? axis_of(other, column) : away);
+  }
+  __syncwarp();
+}
+
+DEV Mat3 turn_of(const BoxPair &pair) {
+  const float4 x = pair.turn[0], y = pair.turn[1], z = pair.turn[2];
+  return {{x.x, x.y, x.z}, {y.x, y.y, y.z}, {z.x, z.y, z.z}};
+}
+
+DEV Vec3 offset_of(const BoxPair &pair) { return {pair.turn[0].w, pair.turn[1].w, pair.turn[2].w}; }
 
 // An axis of separation of each lane, in the frame of the first box: 0-2 and 3-5 faces, 6-14 edges.
 struct Axis {
@@ -29,16 +59,17 @@ struct Axis {
   float gap;         // m, between the boxes along it
 };
 
-DEV Axis axis_of_lane(int lane, const Mat3 &turn, Vec3 offset, Vec3 half, Vec3 other) {
+DEV Axis axis_of_lane(const BoxPair &pair, const Mat3 &turn, const Solid &other, int lane) {
   Axis axis;
-  axis.mine = lane < 6 ? lane % 3 : (lane - 6) / 3 % 3;
   axis.theirs = lane % 3;
-  const Vec3 mine = unit(axis.mine), theirs = column(turn, axis.theirs);
+  axis.mine = lane < 6 ? axis.theirs : smaller((lane - 6) / 3, 2);
+  const Vec3 mine = unit(axis.mine);
+  const Vec3 theirs = {at(pair.turn[0], axis.theirs), at(pair.turn[1], axis.theirs), at(pair.turn[2], axis.theirs)};
   axis.way = lane < 3 ? mine : lane < 6 ? theirs : cross(mine, theirs);
   axis.sine2 = dot(axis.way, axis.way);
   normalize(axis.way);
-  axis.gap = fabsf(dot(axis.way, offset)) - dot(absolute(axis.way), half) -
-             dot(absolute(transposed_times(turn, axis.way)), other);
+  axis.gap = fabsf(dot(axis.way, offset_of(pair))) - dot(absolute(axis.way), pair.hand.size) -
+             dot(absolute(transposed_times(turn, axis.way)), other.size);
   if (lane >= 15 || axis.sine2 < PARALLEL_EDGES) axis.gap = NOT_AN_AXIS;
   return axis;
 }
@@ -52,14 +83,15 @@ DEV bool edges_meet(float edge, float face, Vec3 way, int sharpest, int flattest
 }
 
 // Where this lane's edges pass each other, and their distance along the axis, in the frame of the first box.
-DEV float edge_contact(Axis &axis, const Mat3 &turn, Vec3 offset, Vec3 half, Vec3 other, Vec3 &point) {
+DEV float edge_contact(Axis &axis, const BoxPair &pair, const Mat3 &turn, const Solid &other, Vec3 &point) {
+  const Vec3 offset = offset_of(pair);
   if (dot(axis.way, offset) < 0) axis.way = -axis.way;
   // The edges that reach farthest toward the other box.
-  const Vec3 mine = without(signed_like(half, axis.way), axis.mine);
-  const Vec3 theirs = without(signed_like(other, -transposed_times(turn, axis.way)), axis.theirs);
+  const Vec3 mine = without(signed_like(pair.hand.size, axis.way), axis.mine);
+  const Vec3 theirs = without(signed_like(other.size, -transposed_times(turn, axis.way)), axis.theirs);
   const Vec3 along = column(turn, axis.theirs), away = offset + turn * theirs - mine;
   const float share = pick(along, axis.mine), ahead = pick(away, axis.mine), behind = dot(along, away);
-  const float reach = pick(half, axis.mine), far = pick(other, axis.theirs);
+  const float reach = at(pair.hand.size, axis.mine), far = at(other.size, axis.theirs);
   float place = clamp((ahead - share * behind) / axis.sine2, -reach, reach);
   const float there = clamp(share * place - behind, -far, far);
   place = clamp(ahead + share * there, -reach, reach);
@@ -75,18 +107,24 @@ struct Faces {
   Vec3 normal;                // unit
 };
 
-DEV Faces faces(const Mat3 &turn, Vec3 offset, Vec3 half, Vec3 other, int face, float side) {
+// Face `face` of the first box or the second, on `side` of it.
+DEV Faces faces(const BoxPair &pair, const Solid &base, const Solid &other, bool first, int face, float side) {
+  const float *turn = &pair.turn[0].x, *to_other = first ? turn + 3 : &pair.to_first.x;
+  const int row = first ? 4 : 1, column = first ? 1 : 4;  // from axis to axis of the reference box, of the other one
   const int x = next(face), y = next(x);
-  const Mat3 axes = {row(turn, x), row(turn, y), side * row(turn, face)};  // columns: axes of the incident box
-  const Vec3 middle = {pick(offset, x), pick(offset, y), side * pick(offset, face) - pick(half, face)};
-  const int down = greatest(absolute(axes.z)), u = next(down), v = next(u);
-  const Vec3 normal = column(axes, down);
-  const float depth = normal.z > 0 ? -pick(other, down) : pick(other, down);
-  return {pick(half, x),
-          pick(half, y),
-          middle + depth * normal,
-          pick(other, u) * column(axes, u),
-          pick(other, v) * column(axes, v),
+  auto axis = [&](int of_other) -> Vec3 {
+    const float *from = turn + column * of_other;
+    return {from[row * x], from[row * y], side * from[row * face]};
+  };
+  const Vec3 one = axis(0), two = axis(1), three = axis(2);
+  const int down = greatest({fabsf(one.z), fabsf(two.z), fabsf(three.z)}), u = next(down), v = next(u);
+  const Vec3 normal = axis(down), middle = {to_other[row * x], to_other[row * y], side * to_other[row * face]};
+  const float depth = copysignf(at(other.size, down), -normal.z);
+  return {at(base.size, x),
+          at(base.size, y),
+          middle + depth * normal - Vec3{0, 0, at(base.size, face)},
+          at(other.size, u) * axis(u),
+          at(other.size, v) * axis(v),
           normal};
 }
 
@@ -118,37 +156,39 @@ DEV bool corner_over_face(const Faces &faces, int lane, Vec3 &corner) {
 }
 
 // All lanes on one pair of boxes.
-DEV int box_on_box(const Search &search, int count, const Solid &one, const Solid &two, int pair) {
-  const Mat3 turn = transposed(one.rotation) * two.rotation;  // columns: axes of the second in the first
-  const Vec3 offset = in_frame(one, two.place);
-  Axis axis = axis_of_lane(search.lane, turn, offset, one.size, two.size);
+DEV int box_on_box(const Search &search, int count, const BoxPair &pair, const Solid &other, int id) {
+  const Mat3 turn = turn_of(pair);
+  Axis axis = axis_of_lane(pair, turn, other, search.lane);
   const bool flat = search.lane < 6;
   const float face = greatest_of_lanes(flat ? axis.gap : NOT_AN_AXIS);
   const float edge = greatest_of_lanes(flat ? NOT_AN_AXIS : axis.gap);
   if (fmaxf(face, edge) >= 0) return count;
   const int flattest = __ffs(lanes_where(flat && axis.gap == face)) - 1;
   const int sharpest = __ffs(lanes_where(!flat && axis.gap == edge)) - 1;
+  Vec3 point, normal;
+  float gap;
+  bool touches;
   if (edges_meet(edge, face, axis.way, sharpest, flattest)) {
-    Vec3 point;
-    const float gap = edge_contact(axis, turn, offset, one.size, two.size, point);
-    return keep(search, count, search.lane == sharpest && gap < 0, gap,
-                one.place + one.rotation * point, one.rotation * axis.way, pair);
+    gap = edge_contact(axis, pair, turn, other, point);
+    touches = search.lane == sharpest;
+    point = pair.hand.place + pair.hand.rotation * point;
+    normal = pair.hand.rotation * axis.way;
+  } else {
+    const bool first = flattest < 3;  // whose face is the reference
+    const int reference = first ? flattest : flattest - 3;
+    const Solid &base = first ? pair.hand : other;
+    const float side = copysignf(1.0f, first ? at(pair.turn[reference], 3) : at(pair.to_first, reference));
+    Vec3 corner;
+    touches = corner_over_face(faces(pair, base, first ? other : pair.hand, first, reference, side), search.lane, corner);
+    gap = corner.z;
+    // Midway between the faces.
+    const int x = next(reference), y = next(x);
+    normal = side * axis_of(base, reference);
+    point = base.place + corner.x * axis_of(base, x) + corner.y * axis_of(base, y) +
+            (at(base.size, reference) + 0.5f * gap) * normal;
+    if (!first) normal = -normal;
   }
-  const bool first = flattest < 3;  // whose face is the reference
-  const int reference = first ? flattest : flattest - 3;
-  const Solid base = first ? one : two;
-  const Vec3 to_other = first ? offset : -transposed_times(turn, offset);
-  const float side = pick(to_other, reference) >= 0 ? 1.0f : -1.0f;
-  const Faces both =
-      faces(first ? turn : transposed(turn), to_other, base.size, first ? two.size : one.size, reference, side);
-  Vec3 corner;
-  const bool touches = corner_over_face(both, search.lane, corner) && corner.z < 0;
-  // Midway between the faces.
-  const int x = next(reference), y = next(x);
-  const Vec3 normal = side * column(base.rotation, reference);
-  const Vec3 point = base.place + (pick(base.size, reference) + 0.5f * corner.z) * normal +
-                     corner.x * column(base.rotation, x) + corner.y * column(base.rotation, y);
-  return keep(search, count, touches, corner.z, point, first ? normal : -normal, pair);
+  return keep(search, count, touches && gap < 0, gap, point, normal, id);
 }
 
 DEV Solid box_geom(const Search &search, int index) {
@@ -159,21 +199,27 @@ DEV Solid box_geom(const Search &search, int index) {
 }
 
 DEV int boxes_meet(const Search &search, int count) {
-  constexpr int PAIRS = BOXES * BOX_PRIMITIVES, EACH = PAIRS ? BOX_PRIMITIVES : 1;
+  BoxPair &pair = *(BoxPair *)(search.primitives + PRIMITIVES);
 #pragma unroll 1
-  for (int first = 0; first < PAIRS; first += 32) {
-    // The sphere round a box of the object against the box of the hand: a pair a lane.
-    const int index = smaller(first + search.lane, PAIRS - 1);
-    const Solid mine = box_geom(search, index / EACH);
-    const Solid &theirs = search.primitives[FIRST_BOX + index % EACH];
-    Vec3 outward;
-    const float apart = distance(Box{}, in_frame(mine, theirs.place), mine.size, outward);
-    unsigned near = lanes_where(first + search.lane < PAIRS && apart < length(theirs.size));
+  for (int box = 0; box < BOXES; box++) {
+    if (search.lane == 0) pair.hand = box_geom(search, box);
+    __syncwarp();
 #pragma unroll 1
-    for (; near; near &= near - 1) {
-      const int pair = first + __ffs(near) - 1, box = pair / EACH, primitive = pair % EACH;
-      count = box_on_box(search, count, box_geom(search, box), search.primitives[FIRST_BOX + primitive],
-                         OBJECT_PAIR[FIRST_BOX + primitive][FIRST_BOX_GEOM + box]);
+    for (int first = 0; first < BOX_PRIMITIVES; first += 32) {
+      // The spheres round boxes of the object against the box of the hand: one a lane.
+      const int index = smaller(first + search.lane, BOX_PRIMITIVES - 1);
+      const Solid &other = search.primitives[FIRST_BOX + index];
+      Vec3 outward;
+      const float apart = distance(Box{}, in_frame(pair.hand, other.place), pair.hand.size, outward);
+      unsigned near = lanes_where(first + search.lane < BOX_PRIMITIVES && apart < length(other.size));
+#pragma unroll 1
+      for (; near; near &= near - 1) {
+        const int primitive = FIRST_BOX + first + __ffs(near) - 1;
+        write_relative(pair, search.primitives[primitive], search.lane);
+        count = box_on_box(search, count, pair, search.primitives[primitive],
+                           OBJECT_PAIR[primitive][FIRST_BOX_GEOM + box]);
+        __syncwarp();
+      }
     }
   }
   return count;

@@ -24,9 +24,10 @@ DEV void try_edge(Vec3 start, Vec3 axis, Vec3 size, Vec3 side, int direction, Ne
   const Vec3 away = Vec3{0, side.y * size.y, side.z * size.z} - start;
   const float a = size.x * size.x, b = -size.x * axis.x, c = dot(axis, axis);
   const float u = -size.x * away.x, v = dot(away, axis);
-  const float square = axis.y * axis.y + axis.z * axis.z;  // det = a c - b^2 without the difference
-  if (square <= 1e-6f * c) return;                         // parallel: one of its corners is another edge's
-  float along = (c * u - b * v) / (a * square), place = (v - b * along) / c, end = 0;
+  const float square = axis.y * axis.y + axis.z * axis.z;
+  if (a * square < 1e-15f) return;  // parallel, as C MuJoCo has it: the ends of this edge are those of others
+  // Seen along the edge, the lines are nearest where the axis passes it.
+  float place = (away.y * axis.y + away.z * axis.z) / square, along = (place * axis.x - away.x) / size.x, end = 0;
   // Beyond an end of the edge, what is nearest to that end; beyond the axis' end, what is nearest to it.
   // The end of the edge counts as in C MuJoCo: also where the end of the axis then leads away from it again.
   if (fabsf(along) > 1) {

@@ -9,7 +9,7 @@
 // all lanes alike; only the first MAX_CONTACTS of them are written.
 DEV int find_contacts(const Args &args, int world, Shared &shared, const Mat3 &object_rotation, Vec3 object_place,
                       int lane) {
-  static_assert(PRIMITIVES * sizeof(Solid) <= SCRATCH * sizeof(float), "the object's primitives fit");
+  static_assert(PRIMITIVES * sizeof(Solid) + sizeof(BoxPair) <= SCRATCH * sizeof(float), "the primitives fit");
   Solid *const primitives = (Solid *)scratch(shared);
   place_primitives(args, world, object_rotation, object_place, lane, primitives);
   const Search search = {args, shared, primitives, world, lane};

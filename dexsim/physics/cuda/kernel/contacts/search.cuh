@@ -11,7 +11,7 @@ struct __align__(16) Solid {
 struct Search {
   const Args &args;
   Shared &shared;
-  const Solid *primitives;  // of the object, in the world
+  Solid *primitives;  // of the object, in the world; behind them free memory
   int world, lane;
 };
 
