@@ -4,7 +4,6 @@
     python benchmarks/paper.py rewards --list              rows, what is done, time left
     python benchmarks/paper.py all --budget smoke
     python benchmarks/paper.py objects --output docs/results
-    python benchmarks/paper.py page                        docs/results.md from the reports in docs/results
 
 Every row writes `report.json` as soon as a seed of it is done, so that an interrupted command goes on there. A row that
 was measured with a larger budget is kept. Trainings are in `runs/paper`, and are resumed as well. The parts are in the

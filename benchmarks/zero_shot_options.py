@@ -46,7 +46,7 @@ def arguments(description: str, argv: Sequence[str] | None = None) -> argparse.N
     parser.add_argument(
         "--plant-model",
         metavar="FILE",
-        help="MJCF of a hand by somebody else in place of the emulated hand's physics (docs/hardware.md)",
+        help="MJCF of a hand by somebody else in place of the emulated hand's physics (docs/emulated_hand.md)",
     )
     parser.add_argument(
         "--set",

@@ -14,8 +14,6 @@ from dexsim.core.errors import ConfigError
 from paper import page
 from paper.data import (
     BUDGETS,
-    REPORTS,
-    ROOT,
     Budget,
     Experiment,
     Row,
@@ -35,10 +33,6 @@ _STEPS_PER_MINUTE = 3e7
 def main(argv: Sequence[str] | None = None) -> int:
     """The command. Returns its exit code."""
     given = parser().parse_args(argv)
-    if given.name == "page":
-        page.PAGE.write_text(page.render(REPORTS))
-        print(page.PAGE.relative_to(ROOT))
-        return 0
     budget, output = BUDGETS[given.budget], given.output
     chosen = list(EXPERIMENTS.values()) if given.name == "all" else [EXPERIMENTS[given.name]]
     if unknown := set(given.row) - {row.name for experiment in chosen for row in experiment.rows}:
@@ -54,7 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def parser() -> argparse.ArgumentParser:
     """Of the command line."""
     found = argparse.ArgumentParser(prog="python benchmarks/paper.py", description="The paper's tables and figures.")
-    found.add_argument("name", choices=(*EXPERIMENTS, "all", "page"), help="table or figure; page: docs/results.md")
+    found.add_argument("name", choices=(*EXPERIMENTS, "all"), help="table or figure")
     found.add_argument("--budget", choices=tuple(BUDGETS), default="cpu", help="smoke, two cores, or one GPU")
     found.add_argument("--list", action="store_true", help="rows, what is done, and an estimate of the time left")
     found.add_argument("--row", nargs="+", default=[], help="these rows alone, so that several GPUs share a table")

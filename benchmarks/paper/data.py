@@ -151,8 +151,6 @@ class Experiment:
     """Header and rows of the table, from the reports by row; None for a figure alone."""
     draw: Callable[["Experiment", dict[str, dict], Path], list[Path]] | None
     """Writes the figures into a folder; None for a table alone."""
-    differs: str
-    """What differs from the paper."""
     trains: bool = False
     """Whether every seed of a row is a training."""
     minutes: float = 1.0

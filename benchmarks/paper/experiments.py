@@ -1,4 +1,4 @@
-"""The experiments: each table and figure as rows, with the paper's numbers and what differs from it."""
+"""The experiments: each table and figure as rows, with the paper's numbers; docs/results.md says what differs."""
 
 from paper import figure_data, figures, measure, tables
 from paper.data import Experiment, Row
@@ -134,15 +134,6 @@ _ALL = (
         measure=measure.trained,
         table=tables.rotation,
         draw=figures.successes,
-        differs=(
-            "A success asks for a spin below 2 rad/s as well; a trial ends after 120 s. As in the paper, the "
-            "quaternion fails: it changes sign where the goal completes a turn, and hardly an episode makes more than "
-            "three goals; the paper's mean is 2.9. Unlike in the paper, touch is no condition: in simulation rows "
-            "with less of it turn as much or more. There the orientation is nearly exact, and after 40 million steps "
-            "a policy with fewer inputs has come farther. Without orientation these steps are too few: the shipped "
-            "policy of that kind has memory and five times as many. Seeds of one row differ by as much as the rows "
-            "that turn do, so that their order says little."
-        ),
         trains=True,
         minutes=12.0,
     ),
@@ -153,15 +144,6 @@ _ALL = (
         measure=measure.trained,
         table=tables.rotation,
         draw=figures.successes,
-        differs=(
-            "A trial ends after 120 s. No success asks for a low spin, so the fastest policies keep the cube "
-            "spinning, at 0.7 s a goal. Rows order as they do with our reward: the quaternion fails, as in the paper, "
-            "and unlike in the paper rows with less touch turn as much or more. Seeds of one row differ by more than "
-            "rows that turn do: of most rows the worst seed makes a third to two thirds of the goals of the best, and "
-            "of one row none. On the emulated hand the cubes that turn leave the palm after 14 s (quaternion) to 72 s. "
-            "Without orientation one seed of three learns in these steps. Three rows have two seeds: the time on the "
-            "machine ended."
-        ),
         trains=True,
         minutes=12.0,
     ),
@@ -175,8 +157,6 @@ _ALL = (
         measure=measure.evaluated,
         table=tables.rotation,
         draw=None,
-        differs="Not in the paper: one policy that loses a reading (touch is 0 then, the orientation its mean in "
-        "training), where the paper trains one without it.",
         minutes=3.0,
     ),
     Experiment(
@@ -186,12 +166,6 @@ _ALL = (
         measure=measure.trained,
         table=tables.grasp,
         draw=figures.command_curves,
-        differs="Targets here are 2 to 7 N a finger, not the default's 1.2 to 4.8; the paper's hand presses harder. "
-        "The paper does not say what its joint torque is a share of. Ours is the sum over touching fingers of the "
-        "root joint's torque over its limit. Alone, R_torque has the weight that R_force has. As in the paper, "
-        "R_torque alone has the narrowest range of force; it follows the torque best and the force worst. R_force "
-        "alone has the range of both, since R_torque beside it has a tenth of its weight; on the emulated hand both "
-        "follow the force a little closer.",
         trains=True,
         minutes=3.0,
     ),
@@ -202,7 +176,6 @@ _ALL = (
         measure=measure.shipped,
         table=tables.commands,
         draw=figures.command_curves,
-        differs="Torque on the emulated hand is what the bridge measures through the current.",
         minutes=4.0,
     ),
     Experiment(
@@ -212,7 +185,6 @@ _ALL = (
         measure=figure_data.calibration,
         table=tables.calibration,
         draw=figures.copied,
-        differs="The emulated hand's motors have friction and other gains than the model in training.",
         minutes=1.0,
     ),
     Experiment(
@@ -222,8 +194,6 @@ _ALL = (
         measure=figure_data.skin,
         table=None,
         draw=figures.skin,
-        differs="The paper measured a rubber. We have no sample of the hand's skin, and compare the touch model with "
-        "the law in closed form.",
         minutes=0.5,
     ),
     Experiment(
@@ -233,7 +203,6 @@ _ALL = (
         measure=figure_data.contacts,
         table=tables.contacts,
         draw=figures.contacts,
-        differs="The actions of a grasp on the emulated hand are repeated in simulation, open loop.",
         minutes=1.0,
     ),
     Experiment(
@@ -249,10 +218,6 @@ _ALL = (
         measure=measure.on_the_hand,
         table=tables.rotation,
         draw=figures.successes,
-        differs="Every parameter is outside training's ranges. A success asks for a spin below 2 rad/s as "
-        "well; a trial ends after 120 s. A policy has ten trials here; in more of them the means are "
-        "[78.6](experiments/zero_shot_rotate.md#zs-rotate-87dc2df-averaged-6000) and "
-        "[42.6](experiments/zero_shot_rotate.md#zs-rotate-without-orientation-ec2a59a-gru-6000).",
         minutes=6.0,
     ),
     Experiment(
@@ -262,7 +227,6 @@ _ALL = (
         measure=measure.held_out,
         table=tables.held_out,
         draw=figures.copied,
-        differs="The paper shows pictures of grasps and no numbers. Ours are in simulation.",
         minutes=2.5,
     ),
     Experiment(
@@ -272,9 +236,6 @@ _ALL = (
         measure=measure.swept,
         table=tables.sweeps,
         draw=figures.sweeps,
-        differs="Not in the paper. One parameter at a time has one value, the others have training's ranges. Latency "
-        "ends at one control tick, the most that is modelled; training has no dead taxels and one level of taxel noise "
-        "(0.02 N). The rotation's policy observes no torque. Its episodes last 20 s.",
         minutes=0.9,
     ),
 )

@@ -68,7 +68,7 @@ def rotation(experiment: Experiment, reports: Reports) -> list[list[str]]:
     head = ["observation", *(["paper: mean / median / s each / s to fall"] if paper else [])]
     head += ["simulation: mean", "median", "s each", "s to fall"]
     hand = any("hand" in seed for report in reports.values() for seed in seeds(report))
-    head += ["emulated hand: mean", "median", "s to fall", "sorted"] if hand else []
+    head += ["emulated hand: mean", "median", "s to fall"] if hand else []
     lines = [[*head, "measured"]]
     for row in experiment.rows:
         report = reports.get(row.name)
@@ -90,7 +90,6 @@ def rotation(experiment: Experiment, reports: Reports) -> list[list[str]]:
                 cell(s[key] for s in worlds),
                 cell({"median": s[key]["median"]} for s in worlds),
                 cell(s["seconds_to_fall"] for s in worlds),
-                ", ".join(f"{v:g}" for v in sorted(v for s in worlds for v in s[key]["sorted"])),
             ]
         lines.append([*line, how(experiment, row, report)])
     return lines

@@ -33,7 +33,7 @@ class AssetError(DexsimError):
 class CheckpointError(DexsimError):
     """A checkpoint or policy file is missing, damaged, of another task or of a newer version."""
 
-    page = "docs/training.md#the-policy-file"
+    page = "docs/policies.md#the-file"
 
 
 class CalibrationError(DexsimError):

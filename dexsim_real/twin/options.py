@@ -57,7 +57,7 @@ class TwinArguments:
     the library's own."""
     plant_model: Path | None = None
     """MJCF of the hand by somebody else, which takes the place of the emulated hand's body, motors and contacts; or a
-    TOML that names it and its parts (docs/hardware.md). None for the emulated hand's own."""
+    TOML that names it and its parts (docs/emulated_hand.md). None for the emulated hand's own."""
     line: LineConfig = setting(LineConfig())
     """Timing of the serial line."""
     firmware: FirmwareConfig = setting(FirmwareConfig())

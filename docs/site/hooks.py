@@ -1,17 +1,20 @@
-"""Pages of the site that are made from sources: tutorials, result cards, commands, the Python reference, changelog."""
+"""Pages of the site that are made from sources: tutorials, experiment log, commands, Python reference, changelog."""
 
 import contextlib
 import importlib
 import io
-import json
 import os
 import re
+import sys
 from pathlib import Path
 
 from mkdocs.plugins import event_priority
 from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).parents[2]
+sys.path.insert(0, str(ROOT / "docs" / "experiments"))
+import records  # noqa: E402
+
 PACKAGES = ("dexsim", "dexsim_ppo", "dexsim_real")
 OUTSIDE = ("CHANGELOG.md", "CONTRIBUTING.md")
 """Pages that lie beside docs/, for readers of the checkout."""
@@ -33,7 +36,7 @@ def notebooks() -> list[Path]:
 @event_priority(100)  # before the notebooks' plugin, which has to see them
 def on_files(files: Files, config) -> Files:
     """Add the pages that lie elsewhere or are made here."""
-    made = {"results.md": results(), "reference/commands.md": commands(), "reference/python.md": python_reference()}
+    made = {"reference/commands.md": commands(), "reference/python.md": python_reference()}
     made |= {name: (ROOT / name).read_text().replace("](docs/", "](") for name in OUTSIDE}
     for name, text in made.items():
         files.append(File.generated(config, name, content=text))
@@ -44,6 +47,8 @@ def on_files(files: Files, config) -> Files:
 
 def on_page_markdown(markdown: str, page, **_) -> str:
     """Links that leave docs/ lead to the site's copies; those to other files of the checkout become their names."""
+    if page.file.src_uri == "experiments/README.md":
+        markdown += "\n" + records.table()
     up = os.path.relpath(".", Path(page.file.src_uri).parent)
     markdown = markdown.replace("](../notebooks/", f"]({up}/notebooks/")
     for name in OUTSIDE:
@@ -58,35 +63,6 @@ def on_page_content(html: str, page, **_) -> str:
         if page.file.src_uri.startswith("notebooks/")
         else html
     )
-
-
-def results() -> str:
-    """A card for each shipped policy, from the JSON beside it."""
-    cards = ["# Result cards", "", "One card for each shipped policy, made from the report that it is shipped with."]
-    for path in sorted((ROOT / "assets" / "policies").glob("*.json")):
-        report = json.loads(path.read_text())
-        trained, timing = report["trained"], report["timing"]
-        held, origin = trained["held"], report["origin"]
-        origins = origin.get("average_of", [origin])
-        rows = {
-            "Task": report["task"],
-            "Held to the end": f"{held['value']:.1%} ({held['low']:.1%} to {held['high']:.1%})",
-            "Return": f"{trained['return']['value']:.1f}",
-            "Episodes": f"{trained['episodes']} of {trained['steps']} ticks",
-            "Training": f"{timing['training_s'] / 60:.1f} min, {timing['env_steps'] / 1e6:.0f} M steps",
-            "Steps per second": f"{timing['env_steps_per_s']:,.0f}",
-            "Seed": ", ".join(sorted({str(each["seed"]) for each in origins})),
-            "Hardware": report["hardware"]["device"],
-            "Versions": ", ".join(
-                f"{name} {report['versions'][name]}" for name in ("jax", "mujoco") if name in report["versions"]
-            ),
-        }
-        if len(origins) > 1:
-            rows["Average"] = f"of {len(origins)} policies"
-        table = [f"| {name} | {value} |" for name, value in rows.items()]
-        cards += ["", f"## {path.stem}", "", "| figure | value |", "|---|---|", *table]
-    cards += ["", "The [experiment log](experiments/README.md) says how each figure was measured, and what came later."]
-    return "\n".join(cards) + "\n"
 
 
 def commands() -> str:

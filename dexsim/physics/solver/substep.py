@@ -1,7 +1,7 @@
 """One physics sub-step on the JAX backend: MJX's rigid bodies, our contacts and solver.
 
 The same equations of motion as `mjx.step` in this library's scenes. Contacts are where C MuJoCo has them, but for links
-on cylinders, which MJX has elsewhere, too; fingers' forces differ accordingly (docs/experiments/physics.md). It is
+on cylinders, which MJX has elsewhere, too; fingers' forces differ accordingly (docs/experiments/physics.jsonl). It is
 faster on a CPU and quicker to compile (`collide`, `newton`). Other scenes need `mjx.step`; see `find_stepper`.
 """
 

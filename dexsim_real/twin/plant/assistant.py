@@ -27,7 +27,7 @@ REFERENCES = {"grasp": (0.055, -0.005, 0.090), "rotate": (0.047, 0.024, 0.088)}
 """Nominal position [3] m of the object by task, palm frame."""
 PLACES = {"grasp": REFERENCES["grasp"][1:], "rotate": (0.007, 0.079)}
 """Position along the palm (y, z) m where the object is placed: the centre of the start states in training. Few of them
-are 5 mm nearer to the wrist, and a policy may miss an object there (docs/hardware.md)."""
+are 5 mm nearer to the wrist, and a policy may miss an object there (docs/camera.md)."""
 PALM_FACE = 0.020  # m, x of the emulated hand's palm
 _ARRIVED, _LEFT = 0.002, 0.005  # rad, distance of targets from the start posture: arrived below, left above
 _NEAR = 0.3  # rad, largest distance of a joint from the start posture
