@@ -20,7 +20,7 @@ from dexsim.core.errors import AssetError, ConfigError
 from dexsim.objects.params import ObjectParams
 from dexsim.physics.host import call
 from dexsim.physics.host.engine import HostEngine
-from dexsim.physics.host.law import Recorded, read_law, record
+from dexsim.physics.host.law import Recorded, record
 from dexsim.physics.parameters import places, values
 from dexsim.physics.seam import ContactParams, PhysicsScene, PhysicsState, TorqueLaw
 
@@ -34,7 +34,7 @@ class CBackend:
     """`dexsim.physics.seam.Backend` in C MuJoCo."""
 
     def __init__(self, scene: PhysicsScene, num_envs: int = 1):
-        """Models are made at the first tick of a batch, so `num_envs` reserves nothing."""
+        """Worlds are made at the first tick of a batch, so `num_envs` reserves nothing."""
         del num_envs
         model = scene.model
         # The compiler lets C MuJoCo skip offsets that are zero in the template. Objects bring others.
@@ -72,14 +72,14 @@ class CBackend:
         fields = values(scene, object, contacts)
         law = self._record(torque, state, memory)
         if law is not None:
-            return self._advance(fields, state, law, memory, push, substeps)
+            return *self._advance(fields, state, law, push, substeps), memory
 
         def substep(carry: tuple[PhysicsState, Any], index: jax.Array) -> tuple[tuple[PhysicsState, Any], jax.Array]:
             state, memory = carry
             tau, memory = torque(index, state.qpos[scene.joint_qpos], state.qvel[scene.joint_dof], memory)
-            given = self._record(lambda *_: (tau, None), state, None)
-            assert given is not None
-            state, force, _ = self._advance(fields, state, given, None, push, 1)
+            constant = self._record(lambda *_: (tau, None), state, None)
+            assert constant is not None
+            state, force = self._advance(fields, state, constant, push, 1)
             return (state, memory), force
 
         (state, memory), forces = jax.lax.scan(substep, (state, memory), jnp.arange(substeps))
@@ -89,26 +89,17 @@ class CBackend:
         return record(torque, jnp.zeros(len(self.scene.joint_dof), state.qpos.dtype), memory)
 
     def _advance(
-        self,
-        fields: dict[str, jax.Array],
-        state: PhysicsState,
-        law: Recorded,
-        memory: Any,
-        push: jax.Array,
-        substeps: int,
-    ) -> tuple[PhysicsState, jax.Array, Any]:
-        arguments = [state.qpos, state.qvel, state.warmstart, push, *law.constants, *jax.tree.leaves(memory)]
-        found = self._tick(tuple(fields), law.text, substeps, *fields.values(), *map(jnp.asarray, arguments))
-        qpos, qvel, warmstart, force, *after = found
-        return PhysicsState(qpos, qvel, warmstart), force, jax.tree.unflatten(law.tree, after)
+        self, fields: dict[str, jax.Array], state: PhysicsState, law: Recorded, push: jax.Array, substeps: int
+    ) -> tuple[PhysicsState, jax.Array]:
+        arguments = [*fields.values(), state.qpos, state.qvel, state.warmstart, push, *law.constants]
+        *after, force = self._tick(tuple(fields), law.text, substeps, *map(jnp.asarray, arguments))
+        return PhysicsState(*after), force
 
     def _call(self, fields: tuple[str, ...], law: str, substeps: int, *arguments: jax.Array) -> list[jax.Array]:
-        force = jax.ShapeDtypeStruct((self.scene.hand.num_fingers, 3), arguments[len(fields)].dtype)
-        memory: tuple[jax.Array, ...] = arguments[len(arguments) - read_law(law.encode()).outputs + 1 :]
-        before, after = ([jax.ShapeDtypeStruct(x.shape, x.dtype) for x in part] for part in (arguments, memory))
-        results = [*before[len(fields) : len(fields) + 3], force, *after]
+        state = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in arguments[len(fields) : len(fields) + 3]]
+        force = jax.ShapeDtypeStruct((self.scene.hand.num_fingers, 3), state[0].dtype)
         head = json.dumps({"engine": self._key, "fields": fields, "substeps": substeps})
-        return call.call(results, *arguments, head=head, law=law)
+        return call.call([*state, force], *arguments, head=head, law=law)
 
 
 def _no_gradient(*_: Any) -> Any:
