@@ -20,7 +20,7 @@ from dexsim.core.errors import AssetError, ConfigError
 from dexsim.objects.params import ObjectParams
 from dexsim.physics.host import call
 from dexsim.physics.host.engine import HostEngine
-from dexsim.physics.host.law import Recorded, one_by_one, read_law, record
+from dexsim.physics.host.law import Recorded, one_by_one, record
 from dexsim.physics.parameters import configured, values
 from dexsim.physics.seam import ContactParams, PhysicsScene, PhysicsState, TorqueLaw
 
@@ -34,7 +34,7 @@ class CBackend:
     """`dexsim.physics.seam.Backend` in C MuJoCo."""
 
     def __init__(self, scene: PhysicsScene, num_envs: int = 1):
-        """Models are made at the first tick of a batch, so `num_envs` reserves nothing."""
+        """Worlds are made at the first tick of a batch, so `num_envs` reserves nothing."""
         del num_envs
         model = scene.model
         # The compiler lets C MuJoCo skip offsets that are zero in the template. Objects bring others.
@@ -68,12 +68,12 @@ class CBackend:
         fields = values(scene, object, contacts)
         law = self._record(torque, state, memory)
         if law is not None:
-            return self._advance(fields, state, law, memory, push, substeps)
+            return *self._advance(fields, state, law, push, substeps), memory
 
         def substep(torque: TorqueLaw, state: PhysicsState) -> tuple[PhysicsState, jax.Array]:
             law = self._record(torque, state, None)
             assert law is not None
-            return self._advance(fields, state, law, None, push, 1)[:2]
+            return self._advance(fields, state, law, push, 1)
 
         return one_by_one(scene, substep, torque, state, memory)
 
@@ -81,26 +81,17 @@ class CBackend:
         return record(torque, jnp.zeros(len(self.scene.joint_dof), state.qpos.dtype), memory)
 
     def _advance(
-        self,
-        fields: dict[str, jax.Array],
-        state: PhysicsState,
-        law: Recorded,
-        memory: Any,
-        push: jax.Array,
-        substeps: int,
-    ) -> tuple[PhysicsState, jax.Array, Any]:
-        arguments = [state.qpos, state.qvel, state.warmstart, push, *law.constants, *jax.tree.leaves(memory)]
-        found = self._tick(tuple(fields), law.text, substeps, *fields.values(), *map(jnp.asarray, arguments))
-        qpos, qvel, warmstart, force, *after = found
-        return PhysicsState(qpos, qvel, warmstart), force, jax.tree.unflatten(law.tree, after)
+        self, fields: dict[str, jax.Array], state: PhysicsState, law: Recorded, push: jax.Array, substeps: int
+    ) -> tuple[PhysicsState, jax.Array]:
+        arguments = [*fields.values(), state.qpos, state.qvel, state.warmstart, push, *law.constants]
+        *after, force = self._tick(tuple(fields), law.text, substeps, *map(jnp.asarray, arguments))
+        return PhysicsState(*after), force
 
     def _call(self, fields: tuple[str, ...], law: str, substeps: int, *arguments: jax.Array) -> list[jax.Array]:
-        force = jax.ShapeDtypeStruct((self.scene.hand.num_fingers, 3), arguments[len(fields)].dtype)
-        memory: tuple[jax.Array, ...] = arguments[len(arguments) - read_law(law.encode()).outputs + 1 :]
-        before, after = ([jax.ShapeDtypeStruct(x.shape, x.dtype) for x in part] for part in (arguments, memory))
-        results = [*before[len(fields) : len(fields) + 3], force, *after]
+        state = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in arguments[len(fields) : len(fields) + 3]]
+        force = jax.ShapeDtypeStruct((self.scene.hand.num_fingers, 3), state[0].dtype)
         head = json.dumps({"engine": self._key, "fields": fields, "substeps": substeps})
-        return call.call(results, *arguments, head=head, law=law)
+        return call.call([*state, force], *arguments, head=head, law=law)
 
 
 def _no_gradient(*_: Any) -> Any:
