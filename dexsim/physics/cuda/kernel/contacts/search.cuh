@@ -85,5 +85,6 @@ DEV int keep_deepest(const Search &search, int count) {
     const int lane = __ffs(lanes_where(mine.gap == shallowest)) - 1;
     if (search.lane == lane && other.gap < shallowest) mine = other;
   }
+  __syncwarp();
   return count <= MAX_CONTACTS + EXTRA_CONTACTS ? smaller(count, MAX_CONTACTS) : count;
 }
