@@ -102,12 +102,7 @@ def _sizes(scene: PhysicsScene, contacts: _Contacts) -> list[str]:
         sizes[f"FIRST_{kind.upper()}"] = scene.slots.index(kind) if kind in scene.slots else 0
     # Fingers touch several boxes of a mesh at once: the deepest contacts are chosen.
     sizes["EXTRA_CONTACTS"] = _EXTRA if scene.slots.count("box") > 1 else 0
-    # A mesh is boxes, each turned its own way; the other objects' primitives are aligned with them.
-    turned = set(scene.slots) == {"box"}
-    return [
-        *(f"constexpr int {name} = {value};" for name, value in sizes.items()),
-        f"constexpr bool TURNED_PRIMITIVES = {str(turned).lower()};",
-    ]
+    return [f"constexpr int {name} = {value};" for name, value in sizes.items()]
 
 
 def _rows(scene: PhysicsScene, contacts: _Contacts) -> list[str]:

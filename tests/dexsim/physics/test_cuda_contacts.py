@@ -33,11 +33,11 @@ HAND = {
 }
 WITHIN = [("rod", "pin"), ("ball", "rod"), ("ball", "tip")]
 KINDS = ("sphere", "capsule", "ellipsoid", "cylinder", "box")
-ALIGNED, TURNED = KINDS, ("box", "box")
+MESH = ("box", "box")
 CASES = [
-    *((ALIGNED, hand, kind) for hand in ("ball", "rod", "floor") for kind in KINDS),
-    *((ALIGNED, *pair) for pair in WITHIN),
-    *((TURNED, hand, "box") for hand in ("tip", "rod", "palm", "block", "floor")),
+    *((KINDS, hand, kind) for hand in ("ball", "rod", "floor") for kind in KINDS),
+    *((KINDS, *pair) for pair in WITHIN),
+    *((MESH, hand, "box") for hand in ("tip", "rod", "palm", "block", "floor")),
 ]
 
 
@@ -139,7 +139,7 @@ class World:
         self.scene, self.pair = scene, pair
         tips = model.geom_size[scene.tip_geoms] * random.uniform(0.8, 1.2)
         self.size = rounded(np.array([*(draw_size(kind, random) for kind in scene.slots), *tips]))
-        self.quat = random.normal(size=(slots, 4)) if scene.slots == TURNED else np.eye(4)[[0] * slots]
+        self.quat = random.normal(size=(slots, 4))
         self.quat /= np.linalg.norm(self.quat, axis=1, keepdims=True)
         self.turn = np.array([matrix(quat) for quat in self.quat])
         self.place = np.array([[40.0 * (k + 1), 0, 0] for k in range(slots)])
@@ -284,8 +284,8 @@ def crowd(slots: tuple[str, ...], seed: int) -> World:
 
 
 def test_deepest_contacts_of_a_mesh_are_kept():
-    worlds = [crowd(TURNED, seed) for seed in range(20)]
-    contacts, count = finder(TURNED)(worlds)
+    worlds = [crowd(MESH, seed) for seed in range(20)]
+    contacts, count = finder(MESH)(worlds)
     crowded = 0
     for world, found, number in zip(worlds, contacts, count, strict=True):
         world.contacts()
@@ -296,7 +296,7 @@ def test_deepest_contacts_of_a_mesh_are_kept():
 
 
 def test_more_contacts_than_fit_are_counted():
-    _, count = finder(ALIGNED)([crowd(ALIGNED, seed) for seed in range(20)])
+    _, count = finder(KINDS)([crowd(KINDS, seed) for seed in range(20)])
     assert count.max() > MAX_CONTACTS
 
 

@@ -46,7 +46,7 @@ DEV void place_primitives(const Search &search, const Mat3 &rotation, Vec3 place
   for (int primitive = search.lane; primitive < PRIMITIVES; primitive += 32) {
     const int row = search.world * PRIMITIVES + primitive;
     const float *quat = search.args.geom_quat + row * 4;
-    const Mat3 turn = TURNED_PRIMITIVES ? rotation * rotation_of(quat[0], quat[1], quat[2], quat[3]) : rotation;
+    const Mat3 turn = rotation * rotation_of(quat[0], quat[1], quat[2], quat[3]);
     const Vec3 middle = place + rotation * load3(search.args.geom_pos + row * 3);
     search.found.primitives[primitive] = {turn, middle, geom_size(search, primitive)};
   }
