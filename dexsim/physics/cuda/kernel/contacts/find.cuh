@@ -17,5 +17,5 @@ DEV int find_contacts(const Args &args, int world, Shared &shared, const Mat3 &o
   if (PLANE_POINTS) count = planes_meet(search, count);
   if (BOXES * BOX_PRIMITIVES) count = boxes_meet(search, count);
   __syncwarp();
-  return count <= MAX_CONTACTS ? count : keep_deepest(search, count);
+  return EXTRA_CONTACTS && count > MAX_CONTACTS ? keep_deepest(search, count) : count;
 }

@@ -76,7 +76,7 @@ DEV int keep(const Search &search, int count, bool touches, float gap, Vec3 poin
 // Of more contacts than a world can have the deepest stay. Returns how many there are, more than MAX_CONTACTS only
 // where not even all of them were looked at.
 DEV int keep_deepest(const Search &search, int count) {
-  static_assert(MAX_CONTACTS == 32, "a contact a lane");
+  static_assert(EXTRA_CONTACTS == 0 || MAX_CONTACTS == 32, "a contact a lane");
   Contact &mine = search.shared.contact[search.lane];
 #pragma unroll 1
   for (int extra = 0; extra < smaller(count - MAX_CONTACTS, EXTRA_CONTACTS); extra++) {
