@@ -9,7 +9,8 @@ import mujoco
 import numpy as np
 
 from dexsim.core.errors import AssetError
-from dexsim.physics.cuda.scene import find_links, number, table
+from dexsim.physics.cuda.links import find_links
+from dexsim.physics.cuda.scene import number, table
 from dexsim.physics.seam import PhysicsScene
 
 _KINDS = {
@@ -26,6 +27,8 @@ _PRIMITIVES = ("sphere", "capsule", "ellipsoid", "cylinder", "box")
 _ROUND = ("sphere", "capsule")
 _PLANE_POINTS = {"sphere": 1, "capsule": 2, "ellipsoid": 1, "cylinder": 4, "box": 8}
 _ON_OBJECT = {"sphere": _PRIMITIVES, "capsule": _PRIMITIVES, "plane": _PRIMITIVES, "box": ("box",)}
+
+_EXTRA = 48  # contacts beyond a lane each, from which the deepest are chosen
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -97,12 +100,9 @@ def _sizes(scene: PhysicsScene, contacts: _Contacts) -> list[str]:
     for kind in _PRIMITIVES:
         sizes[f"{kind.upper()}_PRIMITIVES"] = scene.slots.count(kind)
         sizes[f"FIRST_{kind.upper()}"] = scene.slots.index(kind) if kind in scene.slots else 0
-    # A mesh is boxes, each turned its own way; the other objects' primitives are aligned with them.
-    turned = set(scene.slots) == {"box"}
-    return [
-        *(f"constexpr int {name} = {value};" for name, value in sizes.items()),
-        f"constexpr bool TURNED_PRIMITIVES = {str(turned).lower()};",
-    ]
+    # Fingers touch several boxes of a mesh at once: the deepest contacts are chosen.
+    sizes["EXTRA_CONTACTS"] = _EXTRA if scene.slots.count("box") > 1 else 0
+    return [f"constexpr int {name} = {value};" for name, value in sizes.items()]
 
 
 def _rows(scene: PhysicsScene, contacts: _Contacts) -> list[str]:

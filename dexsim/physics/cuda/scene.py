@@ -1,11 +1,5 @@
-"""What the kernel of the `cuda` engine is generated from: buffers and constants of a scene.
+"""What the kernel of the `cuda` engine is generated from: buffers and constants of a scene."""
 
-Links are what hinges carry, one for each, in the order of the degrees of freedom. A body without a joint belongs to the
-link of its parent. A link's frame has its origin on the hinge and its third axis along it, so that a joint's rotation
-is one about z. Link -1 is fixed in the world (the palm), link `hinges` the object, whose frame is its body's.
-"""
-
-import dataclasses
 from collections.abc import Iterable, Sequence
 
 import mujoco
@@ -14,6 +8,7 @@ from numpy.typing import ArrayLike
 
 from dexsim.core.errors import AssetError
 from dexsim.physics.cuda.arguments import Buffer
+from dexsim.physics.cuda.links import Links, find_links, rotation_matrix
 from dexsim.physics.seam import PhysicsScene
 
 LANES = 32
@@ -52,49 +47,6 @@ def buffers(scene: PhysicsScene, law: Sequence[Buffer]) -> list[Buffer]:
         *law,
         *(Buffer(name, size, output=True) for name, size in outputs.items()),
     ]
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Links:
-    """Where the bodies of a model are in the kernel's links."""
-
-    link: np.ndarray  # [B] of a body; -1 fixed in the world
-    rotation: np.ndarray  # [B, 3, 3] of the body's frame in its link's
-    place: np.ndarray  # [B, 3] m
-    parent: np.ndarray  # [H] link that carries the hinge of a link; -1 the world
-    offset_rotation: np.ndarray  # [H, 3, 3] of a link's frame in its parent's, at joint angle 0
-    offset_place: np.ndarray  # [H, 3] m
-
-    @property
-    def hinges(self) -> int:
-        """Hinges of the hand, which is also the link of the object."""
-        return len(self.parent)
-
-
-def find_links(scene: PhysicsScene) -> Links:
-    """The links of a scene that `check_scene` has passed."""
-    model = scene.model
-    hinges = model.nv - 6
-    link = np.full(model.nbody, -1)
-    rotation, place = np.tile(np.eye(3), (model.nbody, 1, 1)), np.zeros((model.nbody, 3))
-    parent, offset_rotation, offset_place = np.full(hinges, -1), np.zeros((hinges, 3, 3)), np.zeros((hinges, 3))
-    for body in range(1, model.nbody):
-        above = model.body_parentid[body]
-        turn = rotation[above] @ _rotation(model.body_quat[body])
-        origin = place[above] + rotation[above] @ model.body_pos[body]
-        link[body], rotation[body], place[body] = link[above], turn, origin
-        if body == scene.object_body:
-            link[body], rotation[body], place[body] = hinges, np.eye(3), 0.0
-        elif model.body_jntnum[body]:
-            joint = model.body_jntadr[body]
-            hinge = model.jnt_dofadr[joint]
-            axes, anchor = _axes_along(model.jnt_axis[joint]), model.jnt_pos[joint]
-            zero = -model.qpos0[model.jnt_qposadr[joint]]
-            parent[hinge] = link[above]
-            offset_place[hinge] = origin + turn @ anchor
-            offset_rotation[hinge] = turn @ axes @ _rotation([np.cos(zero / 2), 0, 0, np.sin(zero / 2)])
-            link[body], rotation[body], place[body] = hinge, axes.T, -axes.T @ anchor
-    return Links(link, rotation, place, parent, offset_rotation, offset_place)
 
 
 def check_scene(scene: PhysicsScene) -> None:
@@ -174,7 +126,7 @@ def _sizes(scene: PhysicsScene, links: Links) -> list[str]:
     option, blocks = scene.model.opt, _blocks(scene, links)
     sizes = {
         "HINGES": links.hinges,
-        "CHAIN": int(_depth(links).max()) + 1,
+        "CHAIN": max(map(len, links.chains())),
         # Hinges of a finger if every finger is one chain of few; 0: the hand is eliminated as a whole.
         "BLOCK": 0 if blocks is None else int(np.bincount(blocks).max()),
         "PRIMITIVES": len(scene.slots),
@@ -197,18 +149,18 @@ def _sizes(scene: PhysicsScene, links: Links) -> list[str]:
 
 
 def _tree(links: Links, scene: PhysicsScene) -> list[str]:
-    steps, blocks = _gathering(links), _blocks(scene, links)
+    steps, blocks = links.gathering(), _blocks(scene, links)
     first = np.zeros(links.hinges, int) if blocks is None else np.searchsorted(blocks, blocks)
     last = np.zeros(links.hinges, int) if blocks is None else np.searchsorted(blocks, blocks, side="right") - 1
     return [
         table("PARENT", _lanes(links.parent, -1), "int"),
-        table("DEPTH", _lanes(_depth(links)), "int"),
+        table("DEPTH", _lanes([len(chain) - 1 for chain in links.chains()]), "int"),
         table("BLOCK_FIRST", _lanes(first), "int"),
         table("BLOCK_LAST", _lanes(last), "int"),
         f"constexpr int GATHER_STEPS = {len(steps)};",
         table("GATHER_FROM", np.array([_lanes(step, -1) for step in steps] or [_lanes([], -1)]), "int"),
-        table("CHAIN_MASK", [*(sum(1 << h for h in chain) for chain in _chains(links)), 0], "int"),
-        table("CHAIN_HINGE", _padded(_chains(links)), "int"),
+        table("CHAIN_MASK", [*(sum(1 << h for h in chain) for chain in links.chains()), 0], "int"),
+        table("CHAIN_HINGE", _padded(links.chains()), "int"),
     ]
 
 
@@ -219,7 +171,7 @@ def _bodies(scene: PhysicsScene, links: Links) -> list[str]:
     parts = [(body, link) for body, link in enumerate(links.link) if 0 <= link < hinges]
     for body, link in parts:
         centre = links.place[body] + links.rotation[body] @ model.body_ipos[body]
-        turn = links.rotation[body] @ _rotation(model.body_iquat[body])
+        turn = links.rotation[body] @ rotation_matrix(model.body_iquat[body])
         mass[link] += model.body_mass[body]
         moment[link] += model.body_mass[body] * centre
         about[link] += turn @ np.diag(model.body_inertia[body]) @ turn.T + model.body_mass[body] * _spread(centre)
@@ -306,7 +258,7 @@ def _pairs(scene: PhysicsScene, links: Links) -> list[str]:
 
 def _blocks(scene: PhysicsScene, links: Links) -> np.ndarray | None:
     """The finger [H] of each hinge if each is one chain of few; None where the hand has to be taken as a whole."""
-    chains = _chains(links)
+    chains = links.chains()
     finger = np.array([chain[0] for chain in chains])
     model = scene.model
     coupled = [(first, second) for first, second in zip(model.eq_obj1id, model.eq_obj2id, strict=True) if second >= 0]
@@ -315,36 +267,6 @@ def _blocks(scene: PhysicsScene, links: Links) -> np.ndarray | None:
     if across or branched or max(map(len, chains)) > _FAST:
         return None
     return finger
-
-
-def _depth(links: Links) -> np.ndarray:
-    return np.array([len(chain) - 1 for chain in _chains(links)])
-
-
-def _chains(links: Links) -> list[list[int]]:
-    """The hinges that carry each link, from the palm on."""
-    chains: list[list[int]] = []
-    for link, parent in enumerate(links.parent):
-        chains.append([*(chains[parent] if parent >= 0 else []), link])
-    return chains
-
-
-def _gathering(links: Links) -> list[list[int]]:
-    """Steps [H] in which each link adds up what its children have added up: from whom, -1 from none."""
-    children: list[list[int]] = [[] for _ in links.parent]
-    for link, parent in enumerate(links.parent):
-        if parent >= 0:
-            children[parent].append(link)
-    steps: list[list[int]] = []
-    done = np.zeros(links.hinges, int)  # the step after which a link is complete
-    for link in reversed(range(links.hinges)):
-        for child in sorted(children[link], key=lambda child: done[child]):
-            step = max(done[link], done[child])
-            while len(steps) <= step:
-                steps.append([-1] * links.hinges)
-            steps[step][link] = child
-            done[link] = step + 1
-    return steps
 
 
 def _padded(rows: list[list[int]]) -> np.ndarray:
@@ -360,20 +282,6 @@ def _lanes(values: ArrayLike, fill: float = 0.0) -> np.ndarray:
 
 def _list(values: Iterable[float]) -> str:
     return "{" + ", ".join(map(number, values)) + "}"
-
-
-def _rotation(quat: ArrayLike) -> np.ndarray:
-    matrix = np.zeros(9)
-    mujoco.mju_quat2Mat(matrix, np.asarray(quat, float))
-    return matrix.reshape(3, 3)
-
-
-def _axes_along(axis: np.ndarray) -> np.ndarray:
-    """A rotation whose third column is `axis`."""
-    other = np.eye(3)[np.argmin(np.abs(axis))]
-    first = np.cross(other, axis)
-    first /= np.linalg.norm(first)
-    return np.stack([first, np.cross(axis, first), axis], -1)
 
 
 def _spread(centre: np.ndarray) -> np.ndarray:

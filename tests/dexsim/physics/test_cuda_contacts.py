@@ -13,7 +13,8 @@ from dexsim.core.errors import AssetError
 from dexsim.physics.config import PhysicsConfig
 from dexsim.physics.cuda.arguments import Buffer, declare_args
 from dexsim.physics.cuda.contact_tables import contact_constants
-from dexsim.physics.cuda.scene import MAX_CONTACTS, find_links, kernel_constants
+from dexsim.physics.cuda.links import find_links
+from dexsim.physics.cuda.scene import MAX_CONTACTS, kernel_constants
 from dexsim.physics.seam import PhysicsScene
 
 pytestmark = pytest.mark.skipif(warp_emulation.compiler is None, reason="the emulation of a warp needs g++")
@@ -32,11 +33,11 @@ HAND = {
 }
 WITHIN = [("rod", "pin"), ("ball", "rod"), ("ball", "tip")]
 KINDS = ("sphere", "capsule", "ellipsoid", "cylinder", "box")
-ALIGNED, TURNED = KINDS, ("box", "box")
+MESH = ("box", "box")
 CASES = [
-    *((ALIGNED, hand, kind) for hand in ("ball", "rod", "floor") for kind in KINDS),
-    *((ALIGNED, *pair) for pair in WITHIN),
-    *((TURNED, hand, "box") for hand in ("tip", "rod", "palm", "block", "floor")),
+    *((KINDS, hand, kind) for hand in ("ball", "rod", "floor") for kind in KINDS),
+    *((KINDS, *pair) for pair in WITHIN),
+    *((MESH, hand, "box") for hand in ("tip", "rod", "palm", "block", "floor")),
 ]
 
 
@@ -138,7 +139,7 @@ class World:
         self.scene, self.pair = scene, pair
         tips = model.geom_size[scene.tip_geoms] * random.uniform(0.8, 1.2)
         self.size = rounded(np.array([*(draw_size(kind, random) for kind in scene.slots), *tips]))
-        self.quat = random.normal(size=(slots, 4)) if scene.slots == TURNED else np.eye(4)[[0] * slots]
+        self.quat = random.normal(size=(slots, 4))
         self.quat /= np.linalg.norm(self.quat, axis=1, keepdims=True)
         self.turn = np.array([matrix(quat) for quat in self.quat])
         self.place = np.array([[40.0 * (k + 1), 0, 0] for k in range(slots)])
@@ -273,13 +274,30 @@ def test_contacts_are_those_of_c_mujoco(slots, first, second):
     assert np.mean(close) > 0.995
 
 
+def crowd(slots: tuple[str, ...], seed: int) -> World:
+    """All geoms almost in one place."""
+    random = np.random.default_rng(seed)
+    world = World(scene_of(slots), 0, random)
+    world.links[:-1, 9:] = 0.005 * random.normal(size=(len(world.links) - 1, 3))
+    world.object[9:], world.place = 0, rounded(0.005 * random.normal(size=world.place.shape))
+    return world
+
+
+def test_deepest_contacts_of_a_mesh_are_kept():
+    worlds = [crowd(MESH, seed) for seed in range(20)]
+    contacts, count = finder(MESH)(worlds)
+    crowded = 0
+    for world, found, number in zip(worlds, contacts, count, strict=True):
+        world.contacts()
+        deepest = np.sort(world.data.contact.dist)[:MAX_CONTACTS]
+        np.testing.assert_allclose(np.sort(found["gap"][:number]), deepest, atol=1e-5)
+        crowded += world.data.ncon > MAX_CONTACTS
+    assert crowded > 3
+
+
 def test_more_contacts_than_fit_are_counted():
-    """All geoms in one place: the first contacts are written, and the number tells of the others."""
-    world = World(scene_of(TURNED), 0, np.random.default_rng(0))
-    world.links[:, 9:], world.object[9:], world.place[:] = 0, 0, 0
-    contacts, count = finder(TURNED)([world])
-    assert count[0] > MAX_CONTACTS and (contacts[0]["gap"] < 0).all()
-    np.testing.assert_allclose(np.linalg.norm(contacts[0]["normal"], axis=1), 1, atol=1e-5)
+    _, count = finder(KINDS)([crowd(KINDS, seed) for seed in range(20)])
+    assert count.max() > MAX_CONTACTS
 
 
 @pytest.mark.parametrize("kind", ["cylinder", "ellipsoid"])

@@ -189,25 +189,32 @@ def test_any_tree_of_hinges():
         assert np.percentile(error["acceleration"], 90) < 0.02 * factor
 
 
-def test_lost_contacts_and_diverged_worlds_have_no_forces(monkeypatch):
-    scene = branched_scene()
+def test_lost_contacts_and_diverged_worlds_have_no_forces():
+    # Forty more spheres where the link a2 is: all of them touch what it touches.
+    names = [f"more{k}" for k in range(40)]
+    text = BRANCHED.replace(
+        '<geom name="a2"',
+        "".join(f'<geom name="{name}" type="sphere" size="0.009" pos="0.005 0 0.015"/>' for name in names)
+        + '<geom name="a2"',
+    )
+    text = text.replace(
+        "</contact>", "".join(f'<pair geom1="{n}" geom2="object" condim="3"/>' for n in names) + "</contact>"
+    )
+    scene = branched_scene(text)
     states = tumble(scene, 24, in_branches)
-    states["target"], inputs = states["target"], states | {"law_0": states["target"]}
-    whole = Emulation(scene).run(inputs, substeps=2)
-    alone = Emulation(scene).run({name: values[3:4] for name, values in inputs.items()}, substeps=2)
-    for name, values in alone.items():  # to the bit
-        np.testing.assert_array_equal(values, whole[name][3:4])
-    assert np.isfinite(whole["finger_force"]).all() and whole["stats"][:, 2].max() > 3
-
-    monkeypatch.setattr(cuda_scene, "MAX_CONTACTS", 3)
-    inputs["qvel"][1, 2], inputs["qpos"][2, -7] = np.inf, np.nan
+    states["qvel"][1, 2], states["qpos"][2, -7] = np.inf, np.nan
+    inputs = states | {"law_0": states["target"]}
     found = Emulation(scene).run(inputs, substeps=2)
-    lost = whole["stats"][:, 2] > 3
-    lost[1:3] = False
-    np.testing.assert_array_equal(found["stats"][lost, 3], 1)
+    lost = found["stats"][:, 2] > cuda_scene.MAX_CONTACTS
+    assert 0 < lost.sum() < 20
+    np.testing.assert_array_equal(found["stats"][:, 3], lost)
     lost[1:3] = True
     np.testing.assert_array_equal(np.isnan(found["finger_force"]).all(1), lost)
     np.testing.assert_array_equal(np.isnan(found["finger_force"]).any(1), lost)
+
+    alone = Emulation(scene).run({name: values[3:4] for name, values in inputs.items()}, substeps=2)
+    for name, values in alone.items():  # worlds do not depend on each other: equal to the bit
+        np.testing.assert_array_equal(values, found[name][3:4])
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@
 #include <setjmp.h>
 #include <ucontext.h>
 
+#include <algorithm>
 #include <cmath>
 #include <cstdint>
 #include <cstdio>
@@ -64,9 +65,21 @@ static unsigned __ballot_sync(unsigned, bool value) {
   for (int lane = 0; lane < 32; lane++) votes |= warp.value[turn][lane] << lane;
   return votes;
 }
+static unsigned __match_any_sync(unsigned, int value) {
+  const int turn = meet(to_bits(value), SHUFFLE);
+  unsigned same = 0;
+  for (int lane = 0; lane < 32; lane++) same |= (warp.value[turn][lane] == to_bits(value)) << lane;
+  return same;
+}
+static int __reduce_max_sync(unsigned, int value) {
+  const int turn = meet(to_bits(value), SHUFFLE);
+  for (int lane = 0; lane < 32; lane++) value = std::max(value, from_bits<int>(warp.value[turn][lane]));
+  return value;
+}
 static void __syncwarp() { meet(0, BARRIER); }
 static void __syncthreads() { meet(0, BARRIER); }
 static int __popc(unsigned value) { return __builtin_popcount(value); }
+static int __clz(unsigned value) { return __builtin_clz(value); }
 static int __ffs(int value) { return __builtin_ffs(value); }
 static float rsqrtf(float value) { return 1 / sqrtf(value); }
 #define __powf(base, power) powf(base, power)  // the C library has a hidden function of that name

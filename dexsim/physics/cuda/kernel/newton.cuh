@@ -2,8 +2,8 @@
 // Computation, section Constraint model), as in dexsim.physics.solver.newton, with its names.
 //
 // A step solves H p = -gradient. H is an arrow: fingers are coupled to the object, not to each other, so each finger is
-// eliminated by its own lanes, all at once, and what remains is the object's 6 x 6. Where fingers touch each other, or a
-// hand is not made of short fingers, the hand is eliminated as a whole by the same code.
+// eliminated by its own lanes, all at once, and what remains is the object's 6 x 6. Fingers that touch each other are
+// eliminated together, as is a hand that is not made of short fingers: by the same code, with rows over all hinges.
 #pragma once
 #include "rows.cuh"
 
@@ -40,12 +40,31 @@ struct Whose {
   unsigned mine;     // that the lane adds up: those its hinge moves; for the object's lanes every GROUPS-th of the object
   unsigned second;   // of these, where the hinge carries the second link
   unsigned object;   // of the object
+  unsigned hand;     // between two links of the hand
+  unsigned cluster;  // not contacts but lanes: hinges that are coupled to this one but by the object
+  int largest;       // hinges of the largest cluster
 };
+
+// Hinges that touching fingers couple: contact by contact, the second finger takes the label of the first.
+DEV void find_clusters(const ContactRows &rows, Whose &whose, const Lane &lane) {
+  int label = lane.hinge ? lane.first : lane.index;
+#pragma unroll 1
+  for (unsigned left = whose.hand; left; left &= left - 1) {
+    const int contact = __ffs(left) - 1;
+    const int first = from_lane(label, from_lane(rows.first, contact));
+    const int second = from_lane(label, from_lane(rows.second, contact));
+    if (label == second) label = first;
+  }
+  whose.cluster = __match_any_sync(ALL_LANES, label);
+  whose.largest = __reduce_max_sync(ALL_LANES, __popc(whose.cluster));
+}
 
 DEV Whose whose_contacts(const ContactRows &rows, int contacts, const Lane &lane) {
   const int first = CHAIN_MASK[rows.first < 0 ? HINGES : rows.first];
   const int second = CHAIN_MASK[rows.second < 0 ? HINGES : rows.second] & ~first;
-  Whose whose = {0, 0, lanes_where(rows.second == HINGES)};
+  Whose whose = {};
+  whose.object = lanes_where(rows.second == HINGES);
+  whose.hand = lanes_where(rows.first >= 0 && rows.second >= 0 && rows.second < HINGES);
 #pragma unroll 1
   for (int contact = 0; contact < contacts; contact++) {
     const unsigned on_first = from_lane(first, contact), on_second = from_lane(second, contact);
@@ -56,6 +75,7 @@ DEV Whose whose_contacts(const ContactRows &rows, int contacts, const Lane &lane
 #pragma unroll
   for (int contact = 0; contact < 32; contact += GROUPS) every |= 1u << contact;
   if (!lane.hinge) whose.mine = lane.object ? whose.object & (every << lane.group) : 0;
+  find_clusters(rows, whose, lane);
   return whose;
 }
 
@@ -139,13 +159,16 @@ DEV float *hand_row(Shared &shared, int hinge) { return (float *)(shared.hand + 
 constexpr int rounded(int count) { return 4 * ((count + 3) / 4); }
 constexpr int FINGER = BLOCK ? rounded(BLOCK) : 4, WHOLE = rounded(HINGES);
 
-// Gaussian elimination, one pivot after another: its lane writes its row, lanes after it in `first`... take their share
-// off. The matrix stays symmetric, so a lane finds its own entry of the pivot's column in the pivot's row.
+// Gaussian elimination in each cluster, one pivot after another: its lane writes its row, lanes after it take their share
+// off. The matrix stays symmetric, so a lane finds its own entry of the pivot's column in the pivot's row. `origin` is
+// the hinge of a row's first column.
 template <int WIDTH>
-DEV void eliminate(float (&row)[WIDTH], Side &side, Shared &shared, int pivots, int first, int local, const Lane &lane) {
+DEV void eliminate(float (&row)[WIDTH], Side &side, Shared &shared, unsigned cluster, int pivots, int origin, const Lane &lane) {
 #pragma unroll 1
   for (int k = 0; k < pivots; k++) {
-    if (lane.hinge && local == k) {
+    const int pivot = __ffs(cluster) - 1;
+    cluster &= cluster - 1;
+    if (lane.hinge && lane.index == pivot) {
       float4 *to = shared.hand + lane.index * ROW;
       to[0] = {side.object[0], side.object[1], side.object[2], side.object[3]};
       to[1] = {side.object[4], side.object[5], side.right, 0};
@@ -153,16 +176,17 @@ DEV void eliminate(float (&row)[WIDTH], Side &side, Shared &shared, int pivots, 
       for (int i = 0; i < WIDTH; i += 4) to[2 + i / 4] = {row[i], row[i + 1], row[i + 2], row[i + 3]};
     }
     __syncwarp();
-    if (lane.hinge && local > k) {
-      const float4 *pivot = shared.hand + (first + k) * ROW;
-      const float share = ((const float *)pivot)[8 + local] / ((const float *)pivot)[8 + k];
-      const float4 a = pivot[0], b = pivot[1];
+    if (lane.hinge && cluster >> lane.index & 1) {
+      const float4 *from = shared.hand + pivot * ROW;
+      const float *columns = (const float *)(from + 2) - origin;
+      const float share = columns[lane.index] / columns[pivot];
+      const float4 a = from[0], b = from[1];
       side.object[0] -= share * a.x, side.object[1] -= share * a.y, side.object[2] -= share * a.z;
       side.object[3] -= share * a.w, side.object[4] -= share * b.x, side.object[5] -= share * b.y;
       side.right -= share * b.z;
 #pragma unroll
       for (int i = 0; i < WIDTH; i += 4) {
-        const float4 c = pivot[2 + i / 4];
+        const float4 c = from[2 + i / 4];
         row[i] -= share * c.x, row[i + 1] -= share * c.y, row[i + 2] -= share * c.z, row[i + 3] -= share * c.w;
       }
     }
@@ -170,14 +194,16 @@ DEV void eliminate(float (&row)[WIDTH], Side &side, Shared &shared, int pivots, 
 }
 
 // The hinge's part of the step once the object's is known: back-substitution, last pivot first.
-DEV float substitute(float right, float inverse, Shared &shared, int pivots, int first, int local, const Lane &lane) {
-  const float *own = hand_row(shared, lane.hinge ? lane.index : 0) + 8;
+DEV float substitute(float right, float inverse, Shared &shared, unsigned cluster, int pivots, int origin, const Lane &lane) {
+  const float *own = hand_row(shared, lane.hinge ? lane.index : 0) + 8 - origin;
   float step = 0;
 #pragma unroll 1
-  for (int k = pivots - 1; k >= 0; k--) {
-    if (local == k) step = right * inverse;
-    const float solved = from_lane(step, first + k);
-    if (lane.hinge && local < k) right -= own[k] * solved;
+  for (int k = 0; k < pivots; k++) {
+    const int pivot = cluster ? 31 - __clz(cluster) : lane.index;
+    if (lane.index == pivot && cluster) step = right * inverse;
+    const float solved = from_lane(step, pivot);
+    if (lane.hinge && lane.index < pivot) right -= own[pivot] * solved;
+    cluster &= (1u << pivot) - 1;
   }
   return step;
 }
@@ -304,22 +330,23 @@ DEV float newton_step(const Problem &problem, Vec3 miss, float acceleration, flo
     }
   }
   side.right = -gradient;
-  const unsigned among = active & ~problem.whose.object;  // of the hand alone
+  const unsigned among = active & problem.whose.hand;
   const bool whole = !BLOCK || among;
-  const int pivots = whole ? HINGES : BLOCK, first = whole ? 0 : lane.first, local = whole ? lane.index : lane.depth;
+  const unsigned cluster = whole ? problem.whose.cluster : lane.finger;
+  const int pivots = whole ? problem.whose.largest : BLOCK, origin = whole ? 0 : lane.first;
   if (whole) {
     float row[WHOLE];
     __syncwarp();
     whole_rows(finger, row, problem, BLOCK ? among : active, limit, shared, lane);
     __syncwarp();
-    eliminate(row, side, shared, pivots, first, local, lane);
+    eliminate(row, side, shared, cluster, pivots, origin, lane);
   } else {
-    eliminate(finger, side, shared, pivots, first, local, lane);
+    eliminate(finger, side, shared, cluster, pivots, origin, lane);
   }
   float inverse = 0;
   if (lane.hinge) {
     float *own = hand_row(shared, lane.index);
-    inverse = own[7] = 1 / own[8 + local];
+    inverse = own[7] = 1 / own[8 + lane.index - origin];
   }
   decrement = side.right * side.right * inverse;
   __syncwarp();
@@ -327,7 +354,7 @@ DEV float newton_step(const Problem &problem, Vec3 miss, float acceleration, flo
   solve_object(side, shared, step, decrement, lane);
 #pragma unroll
   for (int axis = 0; axis < 6; axis++) side.right -= side.object[axis] * step[axis];
-  const float hinge = substitute(side.right, inverse, shared, pivots, first, local, lane);
+  const float hinge = substitute(side.right, inverse, shared, cluster, pivots, origin, lane);
   const float object = lane.axis == 0 ? step[0] : lane.axis == 1 ? step[1] : lane.axis == 2 ? step[2]
                      : lane.axis == 3 ? step[3] : lane.axis == 4 ? step[4] : step[5];
   return lane.hinge ? hinge : object;

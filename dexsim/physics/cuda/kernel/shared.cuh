@@ -73,6 +73,7 @@ struct Lane {
   int parent;   // lane of the hinge that carries this one's, or any if there is none
   int depth;    // hinges between it and the palm: the column of a contact's Jacobian
   int first;    // hinge of its finger
+  unsigned finger;  // lanes of its finger's hinges
 };
 
 DEV Lane lane_of(int index) {
@@ -86,6 +87,7 @@ DEV Lane lane_of(int index) {
   lane.parent = PARENT[index] < 0 ? index : PARENT[index];
   lane.depth = DEPTH[index];
   lane.first = BLOCK_FIRST[index];
+  lane.finger = (2u << BLOCK_LAST[index]) - (1u << lane.first);
   return lane;
 }
 

@@ -35,7 +35,7 @@ DEV bool meeting_place(Primitive, Vec3 start, Vec3 axis, Vec3 size, int part, in
 // A ball of each lane on one primitive.
 template <class Primitive>
 DEV int keep_ball(const Search &search, int count, int primitive, bool present, Vec3 centre, float radius, int geom) {
-  const Solid &solid = search.primitives[primitive];
+  const Solid &solid = search.found.primitives[primitive];
   Vec3 outward;
   const float gap = distance(Primitive{}, in_frame(solid, centre), solid.size, outward) - radius;
   const Vec3 normal = -(solid.rotation * outward);
@@ -59,7 +59,7 @@ DEV int capsules_on(const Search &search, int count, bool present, Vec3 middle, 
   const int part = search.lane & 3;
 #pragma unroll 1
   for (int primitive = Primitive::FIRST; primitive < Primitive::FIRST + Primitive::COUNT; primitive++) {
-    const Solid &solid = search.primitives[primitive];
+    const Solid &solid = search.found.primitives[primitive];
     const Vec3 start = in_frame(solid, middle), along = transposed_times(solid.rotation, axis);
     // The distance is convex: nowhere on the axis is it less than by its slope in the middle.
     Vec3 outward;

@@ -12,10 +12,10 @@ constexpr float NOT_AN_AXIS = -1e10f;
 constexpr float PARALLEL_EDGES = 1e-8f;
 
 // Two boxes in shared memory, where an index that differs between lanes costs nothing.
-struct __align__(16) BoxPair {
-  float4 turn[3];   // rows: axes of the first box in the frame of the second; last column: the second's place
-  float4 to_first;  // the first's place in the frame of the second
-  Solid hand;       // the first
+struct BoxPair {
+  const Solid &hand, &object;
+  float4 *turn;      // 3 rows: axes of the hand's box in the frame of the object's; last column: the object's place
+  float4 *to_first;  // the hand's place in the frame of the object's
 };
 
 // An element of what lies in shared memory.
@@ -34,12 +34,12 @@ DEV int next(int axis) { return axis == 2 ? 0 : axis + 1; }
 DEV int greatest(Vec3 a) { return a.x >= a.y && a.x >= a.z ? 0 : a.y >= a.z ? 1 : 2; }
 
 // The relative pose of two boxes: an element a lane.
-DEV void write_relative(BoxPair &pair, const Solid &other, int lane) {
-  const Vec3 away = other.place - pair.hand.place;
+DEV void write_relative(const BoxPair &pair, int lane) {
+  const Vec3 away = pair.object.place - pair.hand.place;
   if (lane < 15) {
     const int column = lane < 12 ? lane & 3 : 3;
-    const Vec3 axis = lane < 12 ? axis_of(pair.hand, lane >> 2) : -axis_of(other, lane - 12);
-    (&pair.turn[0].x)[lane] = dot(axis, column < 3 ? axis_of(other, column) : away);
+    const Vec3 axis = lane < 12 ? axis_of(pair.hand, lane >> 2) : -axis_of(pair.object, lane - 12);
+    (&pair.turn[0].x)[lane] = dot(axis, column < 3 ? axis_of(pair.object, column) : away);
   }
   __syncwarp();
 }
@@ -59,7 +59,7 @@ struct Axis {
   float gap;         // m, between the boxes along it
 };
 
-DEV Axis axis_of_lane(const BoxPair &pair, const Mat3 &turn, const Solid &other, int lane) {
+DEV Axis axis_of_lane(const BoxPair &pair, const Mat3 &turn, int lane) {
   Axis axis;
   axis.theirs = lane % 3;
   axis.mine = lane < 6 ? axis.theirs : smaller((lane - 6) / 3, 2);
@@ -69,7 +69,7 @@ DEV Axis axis_of_lane(const BoxPair &pair, const Mat3 &turn, const Solid &other,
   axis.sine2 = dot(axis.way, axis.way);
   normalize(axis.way);
   axis.gap = fabsf(dot(axis.way, offset_of(pair))) - dot(absolute(axis.way), pair.hand.size) -
-             dot(absolute(transposed_times(turn, axis.way)), other.size);
+             dot(absolute(transposed_times(turn, axis.way)), pair.object.size);
   if (lane >= 15 || axis.sine2 < PARALLEL_EDGES) axis.gap = NOT_AN_AXIS;
   return axis;
 }
@@ -83,15 +83,15 @@ DEV bool edges_meet(float edge, float face, Vec3 way, int sharpest, int flattest
 }
 
 // Where this lane's edges pass each other, and their distance along the axis, in the frame of the first box.
-DEV float edge_contact(Axis &axis, const BoxPair &pair, const Mat3 &turn, const Solid &other, Vec3 &point) {
+DEV float edge_contact(Axis &axis, const BoxPair &pair, const Mat3 &turn, Vec3 &point) {
   const Vec3 offset = offset_of(pair);
   if (dot(axis.way, offset) < 0) axis.way = -axis.way;
   // The edges that reach farthest toward the other box.
   const Vec3 mine = without(signed_like(pair.hand.size, axis.way), axis.mine);
-  const Vec3 theirs = without(signed_like(other.size, -transposed_times(turn, axis.way)), axis.theirs);
+  const Vec3 theirs = without(signed_like(pair.object.size, -transposed_times(turn, axis.way)), axis.theirs);
   const Vec3 along = column(turn, axis.theirs), away = offset + turn * theirs - mine;
   const float share = pick(along, axis.mine), ahead = pick(away, axis.mine), behind = dot(along, away);
-  const float reach = at(pair.hand.size, axis.mine), far = at(other.size, axis.theirs);
+  const float reach = at(pair.hand.size, axis.mine), far = at(pair.object.size, axis.theirs);
   float place = clamp((ahead - share * behind) / axis.sine2, -reach, reach);
   const float there = clamp(share * place - behind, -far, far);
   place = clamp(ahead + share * there, -reach, reach);
@@ -107,9 +107,10 @@ struct Faces {
   Vec3 normal;                // unit
 };
 
-// Face `face` of the first box or the second, on `side` of it.
-DEV Faces faces(const BoxPair &pair, const Solid &base, const Solid &other, bool first, int face, float side) {
-  const float *turn = &pair.turn[0].x, *to_other = first ? turn + 3 : &pair.to_first.x;
+// Face `face` of the first box (the hand's) or the second, on `side` of it.
+DEV Faces faces(const BoxPair &pair, bool first, int face, float side) {
+  const Solid &base = first ? pair.hand : pair.object, &other = first ? pair.object : pair.hand;
+  const float *turn = &pair.turn->x, *to_other = first ? turn + 3 : &pair.to_first->x;
   const int row = first ? 4 : 1, column = first ? 1 : 4;  // from axis to axis of the reference box, of the other one
   const int x = next(face), y = next(x);
   auto axis = [&](int of_other) -> Vec3 {
@@ -156,9 +157,9 @@ DEV bool corner_over_face(const Faces &faces, int lane, Vec3 &corner) {
 }
 
 // All lanes on one pair of boxes.
-DEV int box_on_box(const Search &search, int count, const BoxPair &pair, const Solid &other, int id) {
+DEV int box_on_box(const Search &search, int count, const BoxPair &pair, int id) {
   const Mat3 turn = turn_of(pair);
-  Axis axis = axis_of_lane(pair, turn, other, search.lane);
+  Axis axis = axis_of_lane(pair, turn, search.lane);
   const bool flat = search.lane < 6;
   const float face = greatest_of_lanes(flat ? axis.gap : NOT_AN_AXIS);
   const float edge = greatest_of_lanes(flat ? NOT_AN_AXIS : axis.gap);
@@ -169,17 +170,17 @@ DEV int box_on_box(const Search &search, int count, const BoxPair &pair, const S
   float gap;
   bool touches;
   if (edges_meet(edge, face, axis.way, sharpest, flattest)) {
-    gap = edge_contact(axis, pair, turn, other, point);
+    gap = edge_contact(axis, pair, turn, point);
     touches = search.lane == sharpest;
     point = pair.hand.place + pair.hand.rotation * point;
     normal = pair.hand.rotation * axis.way;
   } else {
     const bool first = flattest < 3;  // whose face is the reference
     const int reference = first ? flattest : flattest - 3;
-    const Solid &base = first ? pair.hand : other;
-    const float side = copysignf(1.0f, first ? at(pair.turn[reference], 3) : at(pair.to_first, reference));
+    const Solid &base = first ? pair.hand : pair.object;
+    const float side = copysignf(1.0f, first ? at(pair.turn[reference], 3) : at(*pair.to_first, reference));
     Vec3 corner;
-    touches = corner_over_face(faces(pair, base, first ? other : pair.hand, first, reference, side), search.lane, corner);
+    touches = corner_over_face(faces(pair, first, reference, side), search.lane, corner);
     gap = corner.z;
     // Midway between the faces.
     const int x = next(reference), y = next(x);
@@ -199,25 +200,24 @@ DEV Solid box_geom(const Search &search, int index) {
 }
 
 DEV int boxes_meet(const Search &search, int count) {
-  BoxPair &pair = *(BoxPair *)(search.primitives + PRIMITIVES);
+  Found &found = search.found;
 #pragma unroll 1
   for (int box = 0; box < BOXES; box++) {
-    if (search.lane == 0) pair.hand = box_geom(search, box);
+    if (search.lane == 0) found.box = box_geom(search, box);
     __syncwarp();
 #pragma unroll 1
     for (int first = 0; first < BOX_PRIMITIVES; first += 32) {
       // The spheres round boxes of the object against the box of the hand: one a lane.
-      const int index = smaller(first + search.lane, BOX_PRIMITIVES - 1);
-      const Solid &other = search.primitives[FIRST_BOX + index];
+      const Solid &other = found.primitives[FIRST_BOX + smaller(first + search.lane, BOX_PRIMITIVES - 1)];
       Vec3 outward;
-      const float apart = distance(Box{}, in_frame(pair.hand, other.place), pair.hand.size, outward);
+      const float apart = distance(Box{}, in_frame(found.box, other.place), found.box.size, outward);
       unsigned near = lanes_where(first + search.lane < BOX_PRIMITIVES && apart < length(other.size));
 #pragma unroll 1
       for (; near; near &= near - 1) {
         const int primitive = FIRST_BOX + first + __ffs(near) - 1;
-        write_relative(pair, search.primitives[primitive], search.lane);
-        count = box_on_box(search, count, pair, search.primitives[primitive],
-                           OBJECT_PAIR[primitive][FIRST_BOX_GEOM + box]);
+        const BoxPair pair = {found.box, found.primitives[primitive], found.relative, found.relative + 3};
+        write_relative(pair, search.lane);
+        count = box_on_box(search, count, pair, OBJECT_PAIR[primitive][FIRST_BOX_GEOM + box]);
         __syncwarp();
       }
     }

@@ -6,7 +6,7 @@
 constexpr float PARALLEL = 1e-8f;
 
 DEV Round round_primitive(const Search &search, int primitive) {
-  const Solid &solid = search.primitives[primitive];
+  const Solid &solid = search.found.primitives[primitive];
   return {solid.place, solid.size.y * column(solid.rotation, 2), solid.size.x};
 }
 

@@ -5,19 +5,17 @@
 #include "contacts/capsules.cuh"
 #include "contacts/planes.cuh"
 
-// Finds what touches and writes it to `shared.contact`, in the same order every time. Returns how many there are, on
-// all lanes alike; only the first MAX_CONTACTS of them are written.
+// Finds what touches and writes it to `shared.contact`, in the same order every time. Returns how many contacts there
+// are, on all lanes alike: more than MAX_CONTACTS where there are too many even to choose the deepest.
 DEV int find_contacts(const Args &args, int world, Shared &shared, const Mat3 &object_rotation, Vec3 object_place,
                       int lane) {
-  static_assert(PRIMITIVES * sizeof(Solid) + sizeof(BoxPair) <= SCRATCH * sizeof(float), "the primitives fit");
-  Solid *const primitives = (Solid *)scratch(shared);
-  place_primitives(args, world, object_rotation, object_place, lane, primitives);
-  const Search search = {args, shared, primitives, world, lane};
+  const Search search = {args, shared, *(Found *)scratch(shared), world, lane};
+  place_primitives(search, object_rotation, object_place);
   int count = 0;
   if (SPHERES + CAPSULES) count = balls_meet(search, count);
   if (ROUND_PAIRS) count = capsules_meet(search, count);
   if (PLANE_POINTS) count = planes_meet(search, count);
   if (BOXES * BOX_PRIMITIVES) count = boxes_meet(search, count);
   __syncwarp();
-  return count;
+  return EXTRA_CONTACTS && count > MAX_CONTACTS ? keep_deepest(search, count) : count;
 }

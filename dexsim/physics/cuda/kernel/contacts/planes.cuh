@@ -41,7 +41,7 @@ DEV int planes_meet(const Search &search, int count) {
     const int index = first + search.lane;
     const PlanePoint row = PLANE_POINT[smaller(index, PLANE_POINTS - 1)];
     const PlaneGeom plane = PLANE_GEOM[row.plane];
-    const Solid &solid = search.primitives[row.primitive];
+    const Solid &solid = search.found.primitives[row.primitive];
     const Vec3 down = -transposed_times(solid.rotation, plane.normal);
     const Vec3 corner = lowest(row.kind, solid.size, down, row.corner);
     const Vec3 point = solid.place + solid.rotation * corner;
