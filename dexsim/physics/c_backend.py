@@ -21,8 +21,8 @@ from dexsim.objects.params import ObjectParams
 from dexsim.physics.host import call
 from dexsim.physics.host.engine import HostEngine
 from dexsim.physics.host.law import Recorded, read_law, record
+from dexsim.physics.interface import ContactParams, PhysicsScene, PhysicsState, TorqueLaw
 from dexsim.physics.parameters import places, values
-from dexsim.physics.seam import ContactParams, PhysicsScene, PhysicsState, TorqueLaw
 
 # Programs name their engine by a hash of its scene, so that one that was loaded from a cache finds it.
 _engines: weakref.WeakValueDictionary[str, HostEngine] = weakref.WeakValueDictionary()
@@ -31,7 +31,7 @@ _newest: collections.deque[HostEngine] = collections.deque(maxlen=4)
 
 
 class CBackend:
-    """`dexsim.physics.seam.Backend` in C MuJoCo."""
+    """`dexsim.physics.interface.Backend` in C MuJoCo."""
 
     def __init__(self, scene: PhysicsScene, num_envs: int = 1):
         """Models are made at the first tick of a batch, so `num_envs` reserves nothing."""

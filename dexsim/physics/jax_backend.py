@@ -7,13 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from dexsim.objects.params import ObjectParams
+from dexsim.physics.interface import ContactParams, PhysicsScene, PhysicsState, TorqueLaw
 from dexsim.physics.mjx_backend import MjxBackend
-from dexsim.physics.seam import ContactParams, PhysicsScene, PhysicsState, TorqueLaw
 from dexsim.physics.solver.substep import find_stepper
 
 
 class JaxBackend(MjxBackend):
-    """`dexsim.physics.seam.Backend` in JAX."""
+    """`dexsim.physics.interface.Backend` in JAX."""
 
     def __init__(self, scene: PhysicsScene, num_envs: int = 1):
         """Raises AssetError: MJX lacks what the scene uses. JAX reserves no memory for `num_envs`."""

@@ -8,12 +8,12 @@ import jax.numpy as jnp
 
 from dexsim.core.errors import AssetError
 from dexsim.objects.params import ObjectParams
+from dexsim.physics.interface import ContactParams, PhysicsScene, PhysicsState, TorqueLaw
 from dexsim.physics.parameters import places, values
-from dexsim.physics.seam import ContactParams, PhysicsScene, PhysicsState, TorqueLaw
 
 
 class MjxBackend:
-    """A scene in MJX; see `dexsim.physics.seam.Backend`. Each implementation adds its data and its force reader."""
+    """A scene in MJX; see `dexsim.physics.interface.Backend`. Implementations add data and a force reader."""
 
     def __init__(self, scene: PhysicsScene, impl: str):
         """Raises AssetError: MJX lacks what the scene uses."""

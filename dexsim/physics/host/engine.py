@@ -20,8 +20,8 @@ from mujoco.rollout import Rollout
 
 from dexsim.core.compilation import available_cores
 from dexsim.physics.host.law import read_law
+from dexsim.physics.interface import PhysicsScene
 from dexsim.physics.parameters import places
-from dexsim.physics.seam import PhysicsScene
 
 _SIZES_KEPT = 8
 _APPLIED = mujoco.mjtState.mjSTATE_QFRC_APPLIED.value | mujoco.mjtState.mjSTATE_XFRC_APPLIED.value

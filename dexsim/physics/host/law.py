@@ -57,7 +57,7 @@ class Recorded:
 
 
 def record(law: Callable[..., Any], joints: jax.Array, memory: Any) -> Recorded | None:
-    """Trace `law` (`dexsim.physics.seam.TorqueLaw`); None if it has a primitive that `Law` lacks.
+    """Trace `law` (`dexsim.physics.interface.TorqueLaw`); None if it has a primitive that `Law` lacks.
 
     Of `joints` [J] and `memory` only shapes and types count.
     """

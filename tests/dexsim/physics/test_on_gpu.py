@@ -12,8 +12,8 @@ import dexsim
 from dexsim.core.compilation import collector_paused, jit
 from dexsim.objects.config import SHAPES, SLOTS, ObjectConfig
 from dexsim.physics.config import PhysicsConfig
+from dexsim.physics.interface import PhysicsState
 from dexsim.physics.physics import Physics
-from dexsim.physics.seam import PhysicsState
 from dexsim.tasks.grasp.config import GraspConfig
 
 pytest.importorskip("warp")
@@ -25,10 +25,10 @@ EACH, COPIES = 2, 12  # grips of a shape; how often the large batch has each
 def compile_advance(hand, backend, worlds):
     """`advance(object, state, torque)`: a converged sub-step of `worlds` worlds."""
     config = PhysicsConfig(substeps=1, **CONVERGED)
-    seam = Physics(hand, SLOTS, ObjectConfig().largest, config, gravity=GRAVITY, backend=backend, num_envs=worlds)
+    physics = Physics(hand, SLOTS, ObjectConfig().largest, config, gravity=GRAVITY, backend=backend, num_envs=worlds)
 
     def one(object, state, torque):
-        return seam.advance(object, state, lambda *_: torque, jnp.zeros(3))
+        return physics.advance(lambda *_: torque, object, state, jnp.zeros(3))
 
     program = jit(jax.vmap(one))
 

@@ -11,7 +11,7 @@ object geom.
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import mujoco
@@ -36,6 +36,13 @@ class PhysicsState:
     warmstart: jax.Array  # [H + 6] last accelerations, the solver's first guess
 
 
+class StepResult(NamedTuple):
+    """The world after a control tick."""
+
+    state: PhysicsState
+    finger_force: jax.Array  # [F, 3] N, of the object on the finger tips at the last sub-step, palm frame
+
+
 @pytree_dataclass
 class ContactParams:
     """Contacts of hand and object: parameters of their pairs (`PhysicsScene.object_pairs`) in MuJoCo's terms, and how
@@ -44,7 +51,7 @@ class ContactParams:
     friction: jax.Array  # [P] sliding
     solref: jax.Array  # [P, 2] direct format: minus stiffness, minus damping
     solimp: jax.Array  # [P, 5]
-    cover: jax.Array  # [] m, change of the rubber's thickness from `PhysicsConfig.cover`
+    pad_thickness_delta: jax.Array  # [] m, change of the rubber's thickness from `PhysicsConfig.pad_thickness`
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
