@@ -152,7 +152,8 @@ def make(
     for option, value in (("num_envs", num_envs), ("seed", seed)):
         if not isinstance(value, numbers.Integral) or isinstance(value, bool):
             raise ConfigError(f"make({task!r}, {option}={value!r:.80}): must be a whole number")
-    if not (os.environ.get("DEXSIM_NO_CACHES") or jax.config.read("jax_compilation_cache_dir")):
+    cached = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
+    if not (cached or os.environ.get("DEXSIM_NO_CACHES")):
         enable_caches()
     if num_envs < 1:
         raise ConfigError(f"make({task!r}, num_envs={num_envs}): must be at least 1")
