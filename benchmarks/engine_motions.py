@@ -27,9 +27,9 @@ from dexsim.core.pytree import pytree_dataclass
 from dexsim.env.env import Env
 from dexsim.hand.kinematics import flexion_joints
 from dexsim.objects.params import ObjectParams, extent
+from dexsim.physics.interface import PhysicsState
 from dexsim.physics.model import build_model
 from dexsim.physics.physics import Physics
-from dexsim.physics.seam import PhysicsState
 from dexsim.registry import TASKS
 from dexsim.tasks.placement import palm_height
 
@@ -223,7 +223,7 @@ class Bench:
                 reach = jnp.clip(begin.target - position, -REACH, REACH)
                 return jnp.clip(STIFFNESS * reach - DAMPING * velocity, -limit, limit)
 
-            return physics.advance(begin.object, begin.state, motors, begin.push)
+            return physics.advance(motors, begin.object, begin.state, begin.push)
 
         def all_ticks(begin: Begin):
             def body(state: PhysicsState, _: None):

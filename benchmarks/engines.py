@@ -67,16 +67,15 @@ def physics_tick(env: Env, way: str, **changes):
     """`tick(state)`: the state and the force [B, F, 3] N on the fingers after a tick of an engine, joints held."""
     backend, contacts = WAYS[way]
     config, task = dataclasses.replace(env.config.physics, contacts=contacts, **changes), env.task
-    physics = Physics(
-        env.hand, task.slots, task.largest, config, gravity=task.gravity, backend=backend, skin=env.config.skin
-    )
+    physics = Physics(env.hand, task.slots, task.largest, config, gravity=task.gravity, backend=backend)
 
     def one(s: State):
         target, valid = s.joint_target, jnp.ones((), bool)
         law = env.motors.law(
             s.episode.hand, JointCommand(action=0 * target, target=target, previous=target, valid=valid)
         )
-        return physics.advance_motors(s.episode.object, s.physics, law, s.gear, jnp.zeros(3), s.episode.hand.cover)[:2]
+        delta = s.episode.hand.pad_thickness_delta
+        return physics.advance(law, s.episode.object, s.physics, jnp.zeros(3), s.tip_stiffness, delta)
 
     return jit(jax.vmap(one), backend=backend)
 

@@ -46,7 +46,11 @@ def main() -> None:
         )
 
     def tick(state):
-        return jax.vmap(lambda s: env.motors.tick(s.episode, hold(s), s.physics, s.gear, jnp.zeros(3)))(state)
+        def one(s):
+            law = env.motors.law(s.episode.hand, hold(s))
+            return env.physics.advance(law, s.episode.object, s.physics, jnp.zeros(3), s.tip_stiffness)
+
+        return jax.vmap(one)(state)
 
     whole, known = jit(tick), c_backend.record
 

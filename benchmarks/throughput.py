@@ -38,8 +38,8 @@ import dexsim
 from dexsim.core.cli import enable_caches
 from dexsim.core.compilation import collector_paused, jit
 from dexsim.env.env import Env
-from dexsim.env.motors import PhysicsTick, stay_finite
 from dexsim.env.observer import Observer
+from dexsim.physics.interface import StepResult
 from dexsim.registry import TASKS
 from dexsim_ppo.learner.rollout import scan_restarting
 
@@ -94,10 +94,11 @@ class Recorder(Around):
 
     def __init__(self, env: Env):
         super().__init__(env)
-        env.motors.physics = self.tape = RecordingPhysics(env.physics)
+        env.physics = self.tape = RecordingPhysics(env.physics)
 
     def recorded_step(self, state, action) -> tuple[Any, Any]:
-        """`step`, and its tick: object, physics state, push, cover, joint torques [S + 1, J] Nm (the last: as read)."""
+        """`step`, and its tick: object, physics state, push, stiffness and change of thickness of the fingertips, joint
+        torques [S + 1, J] Nm (the last: as read)."""
         after = self.inner.step(state, action)
         *given, tape = self.tape.given
         torque, self.tape.given = after.sensor_input.joint_torque * self.hand.torque_limit, None
@@ -105,20 +106,20 @@ class Recorder(Around):
 
 
 class RecordingPhysics(Around):
-    """In place of `Motors.physics`; keeps the last tick for the caller who is tracing `step`."""
+    """In place of `Env.physics`; keeps the last tick for the caller who is tracing `step`."""
 
     given = None
 
-    def advance_motors(self, object, state, motors, memory, push, cover):
-        def taped(substep, position, velocity, carried):
-            tape, memory = carried
-            torque, memory = motors(substep, position, velocity, memory)
-            return torque, (tape.at[substep].set(torque), memory)
+    def advance(self, law, object, state, push, tip_stiffness, pad_thickness_delta):
+        def taped(substep, position, velocity, tape):
+            torque = law(substep, position, velocity)
+            return torque, tape.at[substep].set(torque)
 
         tape = jnp.zeros((self.config.substeps + 1, len(self.joint_qpos)))
-        after, force, (tape, memory) = self.inner.advance_motors(object, state, taped, (tape, memory), push, cover)
-        self.given = object, state, push, cover, tape
-        return after, force, memory
+        contacts = self.contact_params(object, tip_stiffness, pad_thickness_delta)
+        after, force, tape = self.engine.advance(object, contacts, state, taped, tape, push)
+        self.given = object, state, push, tip_stiffness, pad_thickness_delta, tape
+        return StepResult(after, force)
 
 
 class Replay(Around):
@@ -139,16 +140,14 @@ class TapedMotors(Around):
 
     tape = None  # [S + 1, J] Nm, of the tick that is being traced
 
-    def tick(self, episode, command, physics, gear, push):
+    def law(self, hand, command):
+        del hand, command
         tape = self.tape
-        after, force = self.physics.advance(
-            episode.object, physics, lambda substep, position, velocity: tape[substep], push, episode.hand.cover
-        )
-        after, gear, force, finite = stay_finite(command.valid, (physics, gear), (after, gear), force)
-        limited = jnp.zeros(tape[-1].shape, bool)  # what the tape does not tell; a metric
-        return PhysicsTick(
-            physics=after, finger_force=force, joint_torque=tape[-1], gear=gear, limited=limited, finite=finite
-        )
+        return lambda substep, position, velocity: tape[substep]
+
+    def current_torque(self, hand, command, state):
+        del hand, command, state
+        return self.tape[-1], jnp.zeros(self.tape[-1].shape, bool)  # the tape does not tell of limits; a metric
 
 
 PARTS = ("touch", "observation", "actuator", "redrawing", "randomization")

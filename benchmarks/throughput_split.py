@@ -122,24 +122,24 @@ def physics(env: Env, ticks: Any) -> jax.Array:
 
 def replay(env: Env, tick: Any) -> Any:
     """Physics of one recorded tick of all environments: what is after it, and the fingers' forces."""
-    object, state, push, cover, tape, *_ = tick
+    object, state, push, stiffness, delta, tape, *_ = tick
     return jax.vmap(
-        lambda object, state, push, cover, tape: env.physics.advance(
-            object, state, lambda substep, position, velocity: tape[substep], push, cover
+        lambda object, state, push, stiffness, delta, tape: env.physics.advance(
+            lambda substep, position, velocity: tape[substep], object, state, push, stiffness, delta
         )
-    )(object, state, push, cover, tape)
+    )(object, state, push, stiffness, delta, tape)
 
 
 def touch(env: Env, ticks: Any, key: jax.Array) -> jax.Array:
     """From poses and forces to taxels, readings, and force and centre of each finger, true and read."""
-    hand, config, seam = env.hand, env.config, env.physics
+    hand, config, physics = env.hand, env.config, env.physics
 
     array = TaxelArray(config.sensing.taxel, hand.taxel_grid, hand.num_fingers, config.physics.control_period)
     params, memory = array.sample(jax.random.key(0)), array.init()
 
-    def feel(object, cover, qpos, strength, key):
-        pose = forward_kinematics(hand, qpos[seam.joint_qpos])
-        taxels, place = taxel_positions(hand, pose), qpos[seam.object_qpos]
+    def feel(object, delta, qpos, strength, key):
+        pose = forward_kinematics(hand, qpos[physics.joint_qpos])
+        taxels, place = taxel_positions(hand, pose), qpos[physics.object_qpos]
         felt = tactile.feel(
             taxels,
             jnp.asarray(hand.taxel_area),
@@ -148,16 +148,16 @@ def touch(env: Env, ticks: Any, key: jax.Array) -> jax.Array:
             rotations.quat_to_matrix(place[3:]),
             strength,
             config.skin,
-            cover,
+            delta,
         )
         read = array.apply(params, memory, key, felt.force, jnp.ones((hand.num_fingers, 1)))[1]
         weighting = config.observation.weighting
         return [reduce_touch(force, taxels, weighting) for force in (felt.force, read)]
 
     def tick(key, given):
-        object, _, _, cover, _, qpos, strength = given
+        object, _, _, _, delta, _, qpos, strength = given
         key, use = jax.random.split(key)
-        return key, _used(jax.vmap(feel)(object, cover, qpos, strength, jax.random.split(use, len(qpos))))
+        return key, _used(jax.vmap(feel)(object, delta, qpos, strength, jax.random.split(use, len(qpos))))
 
     return jax.lax.scan(tick, key, ticks)[1]
 

@@ -80,14 +80,14 @@ def bare(env: Env, ticks: Any, in_graph: bool) -> Callable[[], None]:
     import warp as wp
 
     scene, engine = env.physics.scene, env.physics.engine
-    objects, states, pushes, covers, tapes = ticks
+    objects, states, pushes, stiffnesses, deltas, tapes = ticks
 
-    def parameters(object: Any, state: Any, cover: jax.Array) -> dict[str, jax.Array]:
-        contacts = env.physics.contact_params(object, env.physics.tip_stiffness(object, state.qpos, cover), cover)
+    def parameters(object: Any, stiffness: jax.Array, delta: jax.Array) -> dict[str, jax.Array]:
+        contacts = env.physics.contact_params(object, stiffness, delta)
         where, given = places(scene), values(scene, object, contacts)
         return {name: getattr(engine.model, name).at[where[name]].set(value) for name, value in given.items()}
 
-    given = jax.tree.map(np.asarray, jax.jit(jax.vmap(jax.vmap(parameters)))(objects, states, covers))
+    given = jax.tree.map(np.asarray, jax.jit(jax.vmap(jax.vmap(parameters)))(objects, stiffnesses, deltas))
     wrench = np.zeros((*pushes.shape[:2], scene.model.nbody, 6), np.float32)
     wrench[:, :, scene.object_body, :3] = pushes
     applied = np.zeros((*tapes.shape[:3], scene.model.nv), np.float32)

@@ -93,7 +93,7 @@ def make(name: str, brax_backend: str, num_envs: int) -> Contest:
     """The environment called "pendulum" or "grasp", or one of brax's."""
     if name == "grasp":
         env = dexsim.make("grasp", GraspConfig(), num_envs=num_envs)
-        options = {"wrap_env_fn": wrap, "episode_length": env.evaluation_steps, "reward_scaling": 0.1}
+        options = {"wrap_env_fn": wrap, "episode_length": env.task.evaluation_ticks, "reward_scaling": 0.1}
         return Contest(env, BraxEnv(env), options, 0.99)
     if name == "pendulum":
         simple: Any = Pendulum()

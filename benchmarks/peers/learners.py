@@ -97,7 +97,7 @@ def evaluator(env: Environment, episodes: int) -> Callable[[Act], float]:
                 return (state, alive & ~state.terminated, total), None
 
             begin = state, jnp.ones(episodes, bool), jnp.zeros(episodes)
-            return jnp.mean(jax.lax.scan(tick, begin, None, length=env.evaluation_steps)[0][2])
+            return jnp.mean(jax.lax.scan(tick, begin, None, length=env.task.evaluation_ticks)[0][2])
 
         return float(total(jax.random.split(jax.random.key(12345), episodes)))
 

@@ -21,8 +21,8 @@ from dexsim.objects.params import ObjectParams
 from dexsim.physics.host import call
 from dexsim.physics.host.engine import HostEngine
 from dexsim.physics.host.law import Recorded, one_by_one, record
+from dexsim.physics.interface import ContactParams, PhysicsScene, PhysicsState, StepResult, TorqueLaw
 from dexsim.physics.parameters import configured, values
-from dexsim.physics.seam import ContactParams, PhysicsScene, PhysicsState, TorqueLaw
 
 # Programs name their engine by a hash of its scene, so that one that was loaded from a cache finds it.
 _engines: weakref.WeakValueDictionary[str, HostEngine] = weakref.WeakValueDictionary()
@@ -31,7 +31,7 @@ _newest: collections.deque[HostEngine] = collections.deque(maxlen=4)
 
 
 class CBackend:
-    """`dexsim.physics.seam.Backend` in C MuJoCo."""
+    """`dexsim.physics.interface.Backend` in C MuJoCo."""
 
     def __init__(self, scene: PhysicsScene, num_envs: int = 1):
         """Worlds are made at the first tick of a batch, so `num_envs` reserves nothing."""
@@ -60,32 +60,31 @@ class CBackend:
         contacts: ContactParams,
         state: PhysicsState,
         torque: TorqueLaw,
-        memory: Any,
         push: jax.Array,
-    ) -> tuple[PhysicsState, jax.Array, Any]:
+    ) -> StepResult:
         """One control tick in one call, or one for each sub-step if the host cannot evaluate the law."""
         scene, substeps = self.scene, self.scene.config.substeps
         fields = values(scene, object, contacts)
-        law = self._record(torque, state, memory)
+        law = self._record(torque, state)
         if law is not None:
-            return *self._advance(fields, state, law, push, substeps), memory
+            return self._advance(fields, state, law, push, substeps)
 
-        def substep(torque: TorqueLaw, state: PhysicsState) -> tuple[PhysicsState, jax.Array]:
-            law = self._record(torque, state, None)
+        def substep(torque: TorqueLaw, state: PhysicsState) -> StepResult:
+            law = self._record(torque, state)
             assert law is not None
             return self._advance(fields, state, law, push, 1)
 
-        return one_by_one(scene, substep, torque, state, memory)
+        return one_by_one(scene, substep, torque, state)
 
-    def _record(self, torque: TorqueLaw, state: PhysicsState, memory: Any) -> Recorded | None:
-        return record(torque, jnp.zeros(len(self.scene.joint_dof), state.qpos.dtype), memory)
+    def _record(self, torque: TorqueLaw, state: PhysicsState) -> Recorded | None:
+        return record(torque, jnp.zeros(len(self.scene.joint_dof), state.qpos.dtype))
 
     def _advance(
         self, fields: dict[str, jax.Array], state: PhysicsState, law: Recorded, push: jax.Array, substeps: int
-    ) -> tuple[PhysicsState, jax.Array]:
+    ) -> StepResult:
         arguments = [*fields.values(), state.qpos, state.qvel, state.warmstart, push, *law.constants]
         *after, force = self._tick(tuple(fields), law.text, substeps, *map(jnp.asarray, arguments))
-        return PhysicsState(*after), force
+        return StepResult(PhysicsState(*after), force)
 
     def _call(self, fields: tuple[str, ...], law: str, substeps: int, *arguments: jax.Array) -> list[jax.Array]:
         state = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in arguments[len(fields) : len(fields) + 3]]

@@ -21,7 +21,7 @@ class PhysicsConfig:
     """Line-search iterations in each of them; c and cuda may take 50 and 10."""
     friction_ratio: float = setting(20.0, unit="1", low=0.1, high=1000.0)
     """How much harder a contact resists sliding than penetration (MuJoCo's impratio)."""
-    cover: float = setting(0.003, unit="m", low=0.0, high=0.01)
+    pad_thickness: float = setting(0.003, unit="m", low=0.0, high=0.01)
     """Thickness of the rubber over the fingertips, by which their geoms are enlarged. Keep it equal to `Skin.margin`,
     so that contact begins at the same distance for solver and taxels."""
     pad_points: int = setting(3, unit="1", low=1, high=8)

@@ -23,7 +23,7 @@ def motor_law(env):
         state = env.reset(key)
         target = state.joint_target
         command = JointCommand(action=0 * target, target=target, previous=target, valid=jnp.array(True))
-        law = record(env.motors.law(state.episode.hand, command), jnp.zeros(env.hand.num_joints), None)
+        law = record(env.motors.law(state.episode.hand, command), jnp.zeros(env.hand.num_joints))
         printed.append(print_law(law, env.hand.num_joints))
 
     jax.eval_shape(trace, jax.random.key(0))

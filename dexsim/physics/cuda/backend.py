@@ -18,8 +18,8 @@ from dexsim.physics.cuda.law import PrintedLaw, print_law
 from dexsim.physics.cuda.program import compile_kernel, find_compiler, source
 from dexsim.physics.cuda.scene import buffers, kernel_constants
 from dexsim.physics.host.law import Recorded, one_by_one, record
+from dexsim.physics.interface import ContactParams, PhysicsScene, PhysicsState, StepResult, TorqueLaw
 from dexsim.physics.parameters import configured, values
-from dexsim.physics.seam import ContactParams, PhysicsScene, PhysicsState, TorqueLaw
 
 # Newton's method stops at this decrement, and its line search at this share of it: forces are then as near to C
 # MuJoCo's as float32 allows.
@@ -27,7 +27,7 @@ _TOLERANCE, _LINE_SEARCH_TOLERANCE = 1e-5, 0.01
 
 
 class CudaBackend:
-    """`dexsim.physics.seam.Backend` in CUDA."""
+    """`dexsim.physics.interface.Backend` in CUDA."""
 
     def __init__(self, scene: PhysicsScene, num_envs: int = 1):
         """Every world has its own memory, so `num_envs` reserves nothing.
@@ -54,29 +54,28 @@ class CudaBackend:
         contacts: ContactParams,
         state: PhysicsState,
         torque: TorqueLaw,
-        memory: Any,
         push: jax.Array,
-    ) -> tuple[PhysicsState, jax.Array, Any]:
-        """One control tick in one launch, or one for each sub-step if the law has memory or cannot be printed."""
+    ) -> StepResult:
+        """One control tick in one launch, or one for each sub-step if the law cannot be printed."""
         given = self._inputs(object, contacts, push)
 
-        def run(law: Recorded, state: PhysicsState, substeps: int) -> tuple[PhysicsState, jax.Array]:
+        def run(law: Recorded, state: PhysicsState, substeps: int) -> StepResult:
             name, moving = self._load(law, substeps), (state.qpos, state.qvel, state.warmstart)
             qpos, qvel, warmstart, force, _ = self._tick(name, *moving, *given, *map(jnp.asarray, law.constants))
-            return PhysicsState(qpos, qvel, warmstart), force
+            return StepResult(PhysicsState(qpos, qvel, warmstart), force)
 
-        def substep(torque: TorqueLaw, state: PhysicsState) -> tuple[PhysicsState, jax.Array]:
-            law = self._record(torque, None)
+        def substep(torque: TorqueLaw, state: PhysicsState) -> StepResult:
+            law = self._record(torque)
             assert law is not None
             return run(law, state, 1)
 
-        law = None if jax.tree.leaves(memory) else self._record(torque, memory)
+        law = self._record(torque)
         if law is None:
-            return one_by_one(self.scene, substep, torque, state, memory)
-        return *run(law, state, self.scene.config.substeps), memory
+            return one_by_one(self.scene, substep, torque, state)
+        return run(law, state, self.scene.config.substeps)
 
-    def _record(self, torque: TorqueLaw, memory: Any) -> Recorded | None:
-        return record(torque, jnp.zeros(len(self.scene.joint_dof)), memory)
+    def _record(self, torque: TorqueLaw) -> Recorded | None:
+        return record(torque, jnp.zeros(len(self.scene.joint_dof)))
 
     def _inputs(self, object: ObjectParams, contacts: ContactParams, push: jax.Array) -> list[jax.Array]:
         """What of a tick stays the same, in the order of the kernel's buffers."""

@@ -11,7 +11,7 @@ import numpy as np
 from dexsim.core.errors import AssetError
 from dexsim.physics.cuda.links import find_links
 from dexsim.physics.cuda.scene import number, table
-from dexsim.physics.seam import PhysicsScene
+from dexsim.physics.interface import PhysicsScene
 
 _KINDS = {
     int(mujoco.mjtGeom.mjGEOM_SPHERE): "sphere",

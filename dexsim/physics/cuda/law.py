@@ -78,15 +78,13 @@ def print_law(law: Recorded, joints: int) -> PrintedLaw:
     Joint torque, Nm, at a joint angle, rad, and velocity, rad/s.
 
     Args:
-      law: as recorded, without memory.
+      law: as recorded.
       joints: J; every array of the law is [J] or [].
 
     Raises:
-      ConfigError: the law remembers something, or has arrays of another shape or type.
+      ConfigError: the law has arrays of another shape or type.
     """
     stored = json.loads(law.text)
-    if len(stored["results"]) != 1:
-        raise ConfigError("backend 'cuda': the motor law has memory, which the kernel does not carry")
     shapes, types, names = dict[int, tuple[int, ...]](), dict[int, str](), dict[int, str]()
 
     def add(number: int, name: str, shape: tuple[int, ...], dtype: Any) -> None:

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dexsim.physics.seam import PhysicsScene
+from dexsim.physics.interface import PhysicsScene
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

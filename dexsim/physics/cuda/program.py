@@ -21,7 +21,7 @@ from dexsim.physics.cuda.arguments import declare_args
 from dexsim.physics.cuda.contact_tables import contact_constants
 from dexsim.physics.cuda.law import PrintedLaw
 from dexsim.physics.cuda.scene import buffers, kernel_constants
-from dexsim.physics.seam import PhysicsScene
+from dexsim.physics.interface import PhysicsScene
 
 WORLDS_PER_BLOCK = 8
 """Warps of a block, which pass through the kernel's code in step."""

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from dexsim.core.errors import AssetError
 from dexsim.physics.cuda.arguments import Buffer
 from dexsim.physics.cuda.links import Links, find_links, rotation_matrix
-from dexsim.physics.seam import PhysicsScene
+from dexsim.physics.interface import PhysicsScene
 
 LANES = 32
 MAX_CONTACTS = 32

@@ -17,8 +17,8 @@ from mujoco.batch import Batch
 
 from dexsim.core.compilation import available_cores
 from dexsim.physics.host.law import Law, read_law
+from dexsim.physics.interface import PhysicsScene
 from dexsim.physics.parameters import places
-from dexsim.physics.seam import PhysicsScene
 
 _SIZES_KEPT = 8
 _WARNINGS = mujoco.mjtWarning

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dexsim.physics.seam import PhysicsScene, PhysicsState, TorqueLaw
+from dexsim.physics.interface import PhysicsScene, PhysicsState, StepResult, TorqueLaw
 
 # JAX's primitives that work element by element, in NumPy.
 _ELEMENTWISE: dict[str, Callable[..., Any]] = {
@@ -57,14 +57,12 @@ class Recorded:
     constants: list[jax.Array]
 
 
-def record(law: Callable[..., Any], joints: jax.Array, memory: Any) -> Recorded | None:
-    """Trace `law` (`dexsim.physics.seam.TorqueLaw`); None if it has memory, or a primitive that `Law` lacks.
+def record(law: TorqueLaw, joints: jax.Array) -> Recorded | None:
+    """Trace `law` (`dexsim.physics.interface.TorqueLaw`); None if it has a primitive that `Law` lacks.
 
     Of `joints` [J] only shape and type count.
     """
-    if jax.tree.leaves(memory):
-        return None
-    traced = jax.make_jaxpr(lambda *inputs: law(*inputs, memory)[0])(jnp.int32(0), joints, joints)
+    traced = jax.make_jaxpr(law)(jnp.int32(0), joints, joints)
     writer = _Writer()
     try:
         numbers = writer.run(traced.jaxpr, [writer.new() for _ in (*traced.jaxpr.constvars, *traced.jaxpr.invars)])
@@ -76,21 +74,18 @@ def record(law: Callable[..., Any], joints: jax.Array, memory: Any) -> Recorded 
 
 def one_by_one(
     scene: PhysicsScene,
-    substep: Callable[[TorqueLaw, PhysicsState], tuple[PhysicsState, jax.Array]],
+    substep: Callable[[TorqueLaw, PhysicsState], StepResult],
     torque: TorqueLaw,
     state: PhysicsState,
-    memory: Any,
-) -> tuple[PhysicsState, jax.Array, Any]:
+) -> StepResult:
     """`Backend.advance` with the law left to XLA: an engine's `substep` for each, under torques that are constant."""
 
-    def run(carry: tuple[PhysicsState, Any], index: jax.Array) -> tuple[tuple[PhysicsState, Any], jax.Array]:
-        state, memory = carry
-        tau, memory = torque(index, state.qpos[scene.joint_qpos], state.qvel[scene.joint_dof], memory)
-        state, force = substep(lambda *_: (tau, None), state)
-        return (state, memory), force
+    def run(state: PhysicsState, index: jax.Array) -> tuple[PhysicsState, jax.Array]:
+        tau = torque(index, state.qpos[scene.joint_qpos], state.qvel[scene.joint_dof])
+        return substep(lambda *_: tau, state)
 
-    (state, memory), forces = jax.lax.scan(run, (state, memory), jnp.arange(scene.config.substeps))
-    return state, forces[-1], memory
+    state, forces = jax.lax.scan(run, state, jnp.arange(scene.config.substeps))
+    return StepResult(state, forces[-1])
 
 
 class _Unknown(Exception):

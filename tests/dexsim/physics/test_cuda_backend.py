@@ -10,7 +10,6 @@ import pytest
 import warp_emulation
 
 from dexsim.core.compilation import jit
-from dexsim.core.errors import AssetError, ConfigError, DexsimWarning
 from dexsim.env.motors import JointCommand, Motors
 from dexsim.physics import ffi
 from dexsim.physics import physics as engines
@@ -60,17 +59,19 @@ def emulated(monkeypatch):
 
 def physics_of(env, name):
     task, config = env.task, dataclasses.replace(env.config.physics, iterations=50, line_search=50)
-    return Physics(env.hand, task.slots, task.largest, config, gravity=task.gravity, backend=name, skin=env.config.skin)
+    return Physics(env.hand, task.slots, task.largest, config, gravity=task.gravity, backend=name)
 
 
 def tick(env, physics, state):
     """A control tick of a batch under the task's own motors, whose targets have moved a little."""
-    motors = Motors(env.config, env.hand, physics)
+    motors = Motors(physics)
 
     def one(s):
         target = s.joint_target + 0.1
         command = JointCommand(action=0 * target, target=target, previous=s.joint_target, valid=jnp.array(True))
-        return motors.tick(s.episode, command, s.physics, s.gear, jnp.array([0.1, -0.2, 0.3]))
+        law, push = motors.law(s.episode.hand, command), jnp.array([0.1, -0.2, 0.3])
+        result = physics.advance(law, s.episode.object, s.physics, push, s.tip_stiffness)
+        return result, motors.current_torque(s.episode.hand, command, result.state)[0]
 
     return jax.block_until_ready(jit(jax.vmap(one), once=True)(state))
 
@@ -85,63 +86,34 @@ def states(grasp_rollout):
 
 
 def test_a_tick_is_that_of_c_mujoco(grasp_env, states, emulated):
-    wanted = tick(grasp_env, physics_of(grasp_env, "c"), states)
-    found = tick(grasp_env, physics_of(grasp_env, "cuda"), states)
+    expected, torque = tick(grasp_env, physics_of(grasp_env, "c"), states)
+    result, cuda_torque = tick(grasp_env, physics_of(grasp_env, "cuda"), states)
     assert emulated == [(len(states.tick), grasp_env.config.physics.substeps)]
-    assert np.abs(wanted.finger_force).max() > 0.5, "nothing is touched"
-    assert np.all(found.finite)
-    np.testing.assert_allclose(found.physics.qpos, wanted.physics.qpos, atol=2e-5)
-    np.testing.assert_allclose(found.finger_force, wanted.finger_force, atol=0.02)
-    np.testing.assert_allclose(found.joint_torque, wanted.joint_torque, atol=1e-3)
+    assert np.abs(expected.finger_force).max() > 0.5, "nothing is touched"
+    np.testing.assert_allclose(result.state.qpos, expected.state.qpos, atol=2e-5)
+    np.testing.assert_allclose(result.finger_force, expected.finger_force, atol=0.02)
+    np.testing.assert_allclose(cuda_torque, torque, atol=1e-3)
 
 
-def test_a_law_with_memory_takes_a_launch_for_each_sub_step(grasp_env, states, emulated):
-    """Also a law that has what the kernel cannot evaluate, such as a table."""
+def test_a_law_with_a_table_takes_a_launch_for_each_sub_step(grasp_env, states, emulated):
+    """The kernel evaluates element-wise laws; XLA evaluates all others between launches."""
     physics, table = physics_of(grasp_env, "cuda"), jnp.linspace(0.1, 0.3, 5)
 
-    def remembering(index, position, velocity, count):
-        return (0.1 + 0.05 * count) * jnp.ones_like(position) - 0.01 * velocity, count + 1
+    def looking_up(index, position, velocity):
+        return table[index] * jnp.ones_like(position) - 0.01 * velocity
 
-    def looking_up(index, position, velocity, memory):
-        return table[index] * jnp.ones_like(position) - 0.01 * velocity, memory
+    def plain(index, position, velocity):
+        return (0.1 + 0.05 * index.astype(jnp.float32)) * jnp.ones_like(position) - 0.01 * velocity
 
-    def plain(index, position, velocity, memory):
-        return (0.1 + 0.05 * index.astype(jnp.float32)) * jnp.ones_like(position) - 0.01 * velocity, memory
-
-    def run(law, memory):
+    def run(law):
         emulated.clear()
-        advance = lambda s: physics.advance_motors(s.episode.object, s.physics, law, memory, jnp.zeros(3))  # noqa: E731
-        found = jax.block_until_ready(jit(jax.vmap(advance), once=True)(states))
-        return found, list(emulated)
+        advance = lambda s: physics.advance(law, s.episode.object, s.physics, jnp.zeros(3))  # noqa: E731
+        result = jax.block_until_ready(jit(jax.vmap(advance), once=True)(states))
+        return result, list(emulated)
 
-    (wanted, force, _), launches = run(plain, None)
+    expected, launches = run(plain)
     assert launches == [(len(states.tick), 5)]
-    for law, memory in ((remembering, jnp.float32(0)), (looking_up, None)):
-        (after, other, memory), launches = run(law, memory)
-        assert launches == [(len(states.tick), 1)] * 5
-        np.testing.assert_allclose(after.qpos, wanted.qpos, atol=1e-5)
-        np.testing.assert_allclose(other, force, atol=0.02)
-        assert memory is None or np.all(memory == 5)
-
-
-def test_no_gradient(grasp_env, states, emulated):
-    physics, one = physics_of(grasp_env, "cuda"), jax.tree.map(lambda x: x[0], states)
-
-    def loss(scale):
-        law = lambda index, position, velocity: scale * position  # noqa: E731
-        return jnp.sum(physics.advance(one.episode.object, one.physics, law, jnp.zeros(3))[0].qpos)
-
-    with pytest.raises(ConfigError, match="'cuda' has no gradient: make the environment with backend='jax'"):
-        jax.eval_shape(jax.grad(loss), 1.0)
-
-
-def test_what_does_not_fit_runs_on_jax(grasp_env, emulated, monkeypatch):
-    def lacking(scene):
-        raise AssetError("hand.xml: backend cuda cannot simulate: tendons")
-
-    monkeypatch.setattr(backend, "kernel_constants", lacking)
-    monkeypatch.setattr(engines, "choose_backend", lambda name: "cuda")
-    with pytest.warns(DexsimWarning, match="cannot simulate: tendons; backend jax instead"):
-        assert physics_of(grasp_env, "auto").backend == "jax"
-    with pytest.raises(AssetError, match="cannot simulate: tendons"):
-        physics_of(grasp_env, "cuda")
+    result, launches = run(looking_up)
+    assert launches == [(len(states.tick), 1)] * 5
+    np.testing.assert_allclose(result.state.qpos, expected.state.qpos, atol=1e-5)
+    np.testing.assert_allclose(result.finger_force, expected.finger_force, atol=0.02)

@@ -15,7 +15,7 @@ from dexsim.physics.cuda.arguments import Buffer, declare_args
 from dexsim.physics.cuda.contact_tables import contact_constants
 from dexsim.physics.cuda.links import find_links
 from dexsim.physics.cuda.scene import MAX_CONTACTS, kernel_constants
-from dexsim.physics.seam import PhysicsScene
+from dexsim.physics.interface import PhysicsScene
 
 pytestmark = pytest.mark.skipif(warp_emulation.compiler is None, reason="the emulation of a warp needs g++")
 

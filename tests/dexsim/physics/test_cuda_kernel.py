@@ -14,8 +14,8 @@ from dexsim.core.errors import AssetError
 from dexsim.hand.load import load_hand
 from dexsim.physics.config import PhysicsConfig
 from dexsim.physics.cuda import scene as cuda_scene
+from dexsim.physics.interface import PhysicsScene
 from dexsim.physics.model import build_scene
-from dexsim.physics.seam import PhysicsScene
 
 pytestmark = pytest.mark.skipif(warp_emulation.compiler is None, reason="the emulation of a warp needs g++")
 

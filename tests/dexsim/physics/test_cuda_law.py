@@ -62,7 +62,7 @@ def test_the_motors_are_jaxs(grasp_rollout, tmp_path):
     printed = []
 
     def constants(state):
-        recorded = record(law_of(state), jnp.zeros(JOINTS), None)
+        recorded = record(law_of(state), jnp.zeros(JOINTS))
         printed.append(print_law(recorded, JOINTS))
         return recorded.constants
 
@@ -72,7 +72,7 @@ def test_the_motors_are_jaxs(grasp_rollout, tmp_path):
     rng = np.random.default_rng(0)
     position = np.float32(rng.uniform(-0.3, 1.2, (worlds, JOINTS)))
     velocity = np.float32(rng.uniform(-12, 12, (worlds, JOINTS)))
-    wanted = jax.jit(jax.vmap(lambda s, i, p, v: law_of(s)(i, p, v, None)[0], in_axes=(0, None, 0, 0)))
+    wanted = jax.jit(jax.vmap(lambda s, i, p, v: law_of(s)(i, p, v), in_axes=(0, None, 0, 0)))
     seen = []
     for substep in range(5):
         expected = np.asarray(wanted(states, jnp.int32(substep), position, velocity))
@@ -83,37 +83,29 @@ def test_the_motors_are_jaxs(grasp_rollout, tmp_path):
     assert np.any(seen[0] != seen[-1]), "no latency: the test does not test it"
 
 
-def every_operation(index, position, velocity, memory):
+def every_operation(index, position, velocity):
     near = jnp.abs(position) < 0.7
     either = (near | (velocity > 0.5)) & ~(position >= velocity) | (position != position) | (index == 2)
     bent = jnp.tanh(position) + jnp.cos(velocity) * jnp.exp(-jnp.abs(position)) - jnp.sqrt(jnp.abs(velocity))
     mixed = jnp.where(either, bent, jnp.sign(velocity) / (2.0 + jnp.maximum(position, OFFSET)))
     clipped = jax.lax.clamp(jnp.float32(-1.0), mixed * SCALE, jnp.float32(1.0))
     count = (index <= 1).astype(jnp.int32) + jnp.where(velocity < 0.0, 3, -4)
-    return -clipped + jnp.minimum(jnp.sin(velocity), jnp.inf) * count.astype(jnp.float32), memory
+    return -clipped + jnp.minimum(jnp.sin(velocity), jnp.inf) * count.astype(jnp.float32)
 
 
 @needs_compiler
 def test_every_operation(tmp_path):
-    recorded = record(every_operation, jnp.zeros(JOINTS), None)
+    recorded = record(every_operation, jnp.zeros(JOINTS))
     run = compiled(print_law(recorded, JOINTS), tmp_path)
     position, velocity = np.float32(np.random.default_rng(1).normal(size=(2, WORLDS, JOINTS)))
     constants = [np.broadcast_to(constant, (WORLDS, *np.shape(constant))) for constant in recorded.constants]
     for index in (1, 2):
-        expected = jax.vmap(every_operation, in_axes=(None, 0, 0, None))(jnp.int32(index), position, velocity, None)[0]
+        expected = jax.vmap(every_operation, in_axes=(None, 0, 0))(jnp.int32(index), position, velocity)
         np.testing.assert_allclose(run(constants, index, position, velocity), expected, rtol=2e-6, atol=2e-6)
-
-
-def test_a_law_with_memory_is_refused():
-    recorded = record(lambda index, p, v, memory: (p - memory, memory + v), jnp.zeros(JOINTS), jnp.zeros(JOINTS))
-    with pytest.raises(ConfigError, match="motor law has memory"):
-        print_law(recorded, JOINTS)
 
 
 def test_arrays_that_are_not_of_the_joints_are_refused():
     wide = jnp.zeros((2, JOINTS))
-    recorded = record(
-        lambda index, p, v, memory: (jnp.broadcast_to(p, (2, JOINTS)) + wide, memory), jnp.zeros(JOINTS), None
-    )
+    recorded = record(lambda index, p, v: jnp.broadcast_to(p, (2, JOINTS)) + wide, jnp.zeros(JOINTS))
     with pytest.raises(ConfigError, match=r"an array \[2, 12\] float32: expected \[\] or \[12\]"):
         print_law(recorded, JOINTS)

@@ -24,7 +24,11 @@ def motors():
     """An environment, some of its states, and its motors for one of them."""
     env = dexsim.make("grasp", GraspConfig(pool_size=10), backend="c")
     states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), WORLDS))
-    return env, states, lambda state: env.motors.law(state.episode.hand, command(state))
+
+    def law_of(state):
+        return env.motors.law(state.episode.hand, command(state))
+
+    return env, states, law_of
 
 
 @pytest.mark.slow
@@ -35,13 +39,13 @@ def test_torques_agree_with_xla_to_rounding(motors):
     velocity = np.float32(rng.uniform(-12, 12, (WORLDS, 12)))
 
     def constants(state):
-        written = record(law_of(state), jnp.zeros(12), None)
+        written = record(law_of(state), jnp.zeros(12))
         text.append(written.text)
         return written.constants
 
     given = [np.broadcast_to(x, (WORLDS, *x.shape[1:])) for x in map(np.asarray, jax.vmap(constants)(states))]
     law = Law(text[-1].encode())
-    expected_of = jax.jit(jax.vmap(lambda s, i, p, v: law_of(s)(i, p, v, None)[0], in_axes=(0, None, 0, 0)))
+    expected_of = jax.jit(jax.vmap(lambda s, i, p, v: law_of(s)(i, p, v), in_axes=(0, None, 0, 0)))
     largest = 0.0
     for substep in range(5):
         torque = law(given, substep, position, velocity)
@@ -58,15 +62,18 @@ def test_a_tick_is_that_of_a_call_for_each_sub_step(motors, monkeypatch):
     env, states, _ = motors
 
     def tick():
-        run = jax.vmap(lambda s: env.motors.tick(s.episode, command(s), s.physics, s.gear, jnp.zeros(3)))
-        return jax.jit(run)(states)
+        def run(s):
+            law = env.motors.law(s.episode.hand, command(s))
+            return env.physics.advance(law, s.episode.object, s.physics, jnp.zeros(3), s.tip_stiffness)
+
+        return jax.jit(jax.vmap(run))(states)
 
     whole, calls = tick(), []
 
-    def unknown(law, joints, memory):
+    def unknown(law, joints):
         """Knows no law of the motors', but the torques that the other way sends."""
         calls.append(law)
-        return None if len(calls) == 1 else record(law, joints, memory)
+        return None if len(calls) == 1 else record(law, joints)
 
     monkeypatch.setattr("dexsim.physics.c_backend.record", unknown)
     parts = tick()
@@ -78,12 +85,8 @@ def test_a_tick_is_that_of_a_call_for_each_sub_step(motors, monkeypatch):
 
 def test_a_law_with_a_table_is_left_to_xla():
     table, one = jnp.arange(60.0).reshape(5, 12), jnp.arange(12.0)
-    assert record(lambda index, *_: (table[index], None), jnp.zeros(12), None) is None
-    assert record(lambda *_: (one, None), jnp.zeros(12), None) is not None
-
-
-def test_a_law_with_memory_is_left_to_xla():
-    assert record(lambda index, position, velocity, memory: (position, memory + 1), jnp.zeros(12), jnp.zeros(3)) is None
+    assert record(lambda index, *_: table[index], jnp.zeros(12)) is None
+    assert record(lambda *_: one, jnp.zeros(12)) is not None
 
 
 def test_operations_and_shapes():
@@ -91,14 +94,14 @@ def test_operations_and_shapes():
     scale, offset = jnp.float32(1.7), jnp.linspace(-1.0, 1.0, 12)
 
     def law_of(reach):
-        def law(index, position, velocity, memory):
+        def law(index, position, velocity):
             near = jnp.abs(position) < jnp.abs(reach)
             either = (near | (velocity > 0.5)) & ~(position >= velocity)
             bent = jnp.tanh(position) + jnp.cos(velocity) * jnp.exp(-jnp.abs(position)) - jnp.sqrt(jnp.abs(velocity))
             mixed = jnp.where(either, bent, jnp.sign(velocity) / (2.0 + jnp.maximum(position, offset)))
             clipped = jax.lax.clamp(jnp.float32(-1.0), mixed * scale, jnp.float32(1.0))
             later = (index != 2).astype(jnp.float32)
-            return later * jnp.minimum(reach, 0.3) - clipped, memory
+            return later * jnp.minimum(reach, 0.3) - clipped
 
         return law
 
@@ -107,7 +110,7 @@ def test_operations_and_shapes():
     reach, written = np.float32(rng.normal(size=7)), []
 
     def constants(reach):
-        written.append(record(law_of(reach), jnp.zeros(12), None))
+        written.append(record(law_of(reach), jnp.zeros(12)))
         assert written[-1] is not None, "an operation is missing"
         return written[-1].constants
 
@@ -115,5 +118,5 @@ def test_operations_and_shapes():
     host = Law(written[-1].text.encode())
     for index in (1, 2):
         torque = host(given, index, position, velocity)
-        expected = jax.vmap(lambda r, p, v, i=index: law_of(r)(jnp.int32(i), p, v, None)[0])(reach, position, velocity)
+        expected = jax.vmap(lambda r, p, v, i=index: law_of(r)(jnp.int32(i), p, v))(reach, position, velocity)
         np.testing.assert_allclose(torque, expected, rtol=1e-5, atol=1e-6)

@@ -15,8 +15,8 @@ import dexsim
 from dexsim.core.compilation import collector_paused, jit
 from dexsim.objects.config import SHAPES, SLOTS, ObjectConfig
 from dexsim.physics.config import PhysicsConfig
+from dexsim.physics.interface import PhysicsState
 from dexsim.physics.physics import Physics
-from dexsim.physics.seam import PhysicsState
 from dexsim.tasks.grasp.config import GraspConfig
 
 pytestmark = pytest.mark.gpu
@@ -28,10 +28,10 @@ WARP = pytest.param("warp", marks=pytest.mark.skipif(importlib.util.find_spec("w
 def compile_advance(hand, backend, worlds):
     """`advance(object, state, torque)`: a converged sub-step of `worlds` worlds."""
     config = PhysicsConfig(substeps=1, **CONVERGED)
-    seam = Physics(hand, SLOTS, ObjectConfig().largest, config, gravity=GRAVITY, backend=backend, num_envs=worlds)
+    physics = Physics(hand, SLOTS, ObjectConfig().largest, config, gravity=GRAVITY, backend=backend, num_envs=worlds)
 
     def one(object, state, torque):
-        return seam.advance(object, state, lambda *_: torque, jnp.zeros(3))
+        return physics.advance(lambda *_: torque, object, state, jnp.zeros(3))
 
     program = jit(jax.vmap(one))
 
@@ -121,11 +121,12 @@ def test_memory_grows_as_the_batch(hand, backend):
 def test_cuda_repeats_to_the_bit(hand, grips):
     """50 ticks in a scan, also in a batch that does not fill its last block and in a batch of batches."""
     inputs, *_ = grips
-    seam = Physics(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(), gravity=GRAVITY, backend="cuda")
+    physics = Physics(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(), gravity=GRAVITY, backend="cuda")
 
     def ticks(object, state, torque):
         def body(state, _):
-            return seam.advance(object, state, lambda *_: torque, jnp.zeros(3))
+            result = physics.advance(lambda *_: torque, object, state, jnp.zeros(3))
+            return result.state, result.finger_force
 
         return jax.lax.scan(body, state, length=50)
 

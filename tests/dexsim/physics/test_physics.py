@@ -1,4 +1,4 @@
-"""The physics seam on the JAX backend against C MuJoCo, and the guard against what it would drop."""
+"""Physics on the JAX backend against C MuJoCo, and the guard against what it would drop."""
 
 import dataclasses
 import shutil
@@ -21,9 +21,9 @@ from dexsim.hand.load import load_hand
 from dexsim.objects.config import SHAPES, SLOTS, ObjectConfig
 from dexsim.physics.config import PhysicsConfig
 from dexsim.physics.guard import check_model
+from dexsim.physics.interface import PhysicsState
 from dexsim.physics.model import build_model
 from dexsim.physics.physics import Physics, choose_backend
-from dexsim.physics.seam import PhysicsState
 from dexsim.physics.warp_backend import constraint_rows
 
 WORLDS = 8
@@ -184,15 +184,15 @@ class TestAgainstC:
     def test_the_decoding_of_contact_forces(self, hand):
         """Rows of the solver to forces on fingers, on contacts that C MuJoCo solved."""
         config = PhysicsConfig(**CONVERGED)
-        seam = Physics(hand, SLOTS, ObjectConfig().largest, config, gravity=GRAVITY, backend="jax")
-        model, data = pressed_template(hand, seam.mj_model)
-        contacts = [c for c in data.contact if c.geom[1] in seam.scene.object_geoms]
+        physics = Physics(hand, SLOTS, ObjectConfig().largest, config, gravity=GRAVITY, backend="jax")
+        model, data = pressed_template(hand, physics.mj_model)
+        contacts = [c for c in data.contact if c.geom[1] in physics.scene.object_geoms]
         assert len(contacts) >= 4
         wanted = np.zeros((5, 3))
         tips = {model.body(hand.body_names[b]).id: f for f, b in enumerate(hand.tip_body)}
         for index, contact in enumerate(data.contact):
             finger = tips.get(int(model.geom_bodyid[contact.geom[0]]))
-            if finger is None or contact.geom[1] not in seam.scene.object_geoms:
+            if finger is None or contact.geom[1] not in physics.scene.object_geoms:
                 continue
             wrench = np.zeros(6)
             mujoco.mj_contactForce(model, data, index, wrench)
@@ -211,7 +211,7 @@ class TestAgainstC:
             }
             contact = SimpleNamespace(**column, geom=geom, frame=jnp.asarray(frame))
             impl = SimpleNamespace(contact=contact, efc_force=jnp.asarray(data.efc_force))
-            return np.asarray(seam.engine.finger_force(SimpleNamespace(_impl=impl)))
+            return np.asarray(physics.engine.finger_force(SimpleNamespace(_impl=impl)))
 
         np.testing.assert_allclose(decode(flip=False), wanted, atol=1e-4)
         np.testing.assert_allclose(decode(flip=True), wanted, atol=1e-4)

@@ -12,7 +12,7 @@ import numpy as np
 from dexsim.physics.cuda import scene as cuda_scene
 from dexsim.physics.cuda.arguments import Buffer, declare_args
 from dexsim.physics.cuda.contact_tables import contact_constants
-from dexsim.physics.seam import PhysicsScene
+from dexsim.physics.interface import PhysicsScene
 
 _HERE = Path(__file__).parent
 _KERNEL = Path(cuda_scene.__file__).parent / "kernel"

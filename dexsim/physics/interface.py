@@ -11,7 +11,7 @@ object geom.
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import mujoco
@@ -22,9 +22,8 @@ from dexsim.hand.kinematics import Hand
 from dexsim.objects.params import ObjectParams
 from dexsim.physics.config import PhysicsConfig
 
-TorqueLaw = Callable[[jax.Array, jax.Array, jax.Array, Any], tuple[jax.Array, Any]]
-"""(sub-step [], joint position [J] rad, joint velocity [J] rad/s, memory) to joint torque [J] Nm and the memory after
-it. Engines call it before every sub-step; the memory is any pytree."""
+TorqueLaw = Callable[[jax.Array, jax.Array, jax.Array], jax.Array]
+"""(sub-step [], joint position [J] rad, joint velocity [J] rad/s) to joint torque [J] Nm, before every sub-step."""
 
 
 @pytree_dataclass
@@ -36,6 +35,13 @@ class PhysicsState:
     warmstart: jax.Array  # [H + 6] last accelerations, the solver's first guess
 
 
+class StepResult(NamedTuple):
+    """The world after a control tick."""
+
+    state: PhysicsState
+    finger_force: jax.Array  # [F, 3] N, of the object on the finger tips at the last sub-step, palm frame
+
+
 @pytree_dataclass
 class ContactParams:
     """Contacts of hand and object: parameters of their pairs (`PhysicsScene.object_pairs`) in MuJoCo's terms, and how
@@ -44,7 +50,7 @@ class ContactParams:
     friction: jax.Array  # [P] sliding
     solref: jax.Array  # [P, 2] direct format: minus stiffness, minus damping
     solimp: jax.Array  # [P, 5]
-    cover: jax.Array  # [] m, change of the rubber's thickness from `PhysicsConfig.cover`
+    pad_thickness_delta: jax.Array  # [] m, change of the rubber's thickness from `PhysicsConfig.pad_thickness`
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
@@ -84,9 +90,8 @@ class Backend(Protocol):
         contacts: ContactParams,
         state: PhysicsState,
         torque: TorqueLaw,
-        memory: Any,
         push: jax.Array,
-    ) -> tuple[PhysicsState, jax.Array, Any]:
+    ) -> StepResult:
         """Run one control tick of `PhysicsConfig.substeps` sub-steps.
 
         Args:
@@ -94,11 +99,9 @@ class Backend(Protocol):
           contacts: of the object's pairs during the whole tick.
           state: where to start from.
           torque: of the joints, from sub-step to sub-step.
-          memory: what the torque law carries.
           push: [3] N, force on the object's centre of mass during the whole tick.
 
         Returns:
-          The state after the tick; the contact force of the object on each finger's tip link [F, 3] N in the palm
-          frame at the last sub-step, NaN where the engine could not keep all contacts; the torque law's memory.
+          The world after the tick. Forces are NaN where the engine could not keep all contacts.
         """
         ...
