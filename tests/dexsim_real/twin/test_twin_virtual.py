@@ -62,7 +62,7 @@ def virtual(hand, task, script, *, sources=("imu",), seconds=0.5, safety=True, *
     controller = Scripted(hand, task, script, sources)
     return (
         VirtualRun(
-            plant, controller, ideal_calibration(hand), RunOptions(command=0.25, safety=safety, approach=0.4, place=0.2)
+            plant, controller, ideal_calibration(hand), RunOptions(command=0.25, safety=safety, approach=1.2, place=0.2)
         ),
         plant,
         controller,
