@@ -1,6 +1,6 @@
 """The experiments: each table and figure as rows, with the paper's numbers and what differs from it."""
 
-from paper import figure_data, figures, measure, tables
+from paper import figures, measure, tables
 from paper.data import Experiment, Row
 from paper.measure import points_at_twice
 
@@ -33,63 +33,44 @@ def _paper(name: str) -> dict[str, str]:
 def _observation_rows(task: str) -> tuple[Row, ...]:
     """The seven rows of the paper's table, trained on a task."""
     return tuple(
-        Row(
-            name=name,
-            label=label,
-            task=task,
-            settings=settings,
-            paper=_paper(name),
-        )
+        Row(name=name, label=label, task=task, settings=settings, paper=_paper(name))
         for name, (label, settings) in _OBSERVATIONS.items()
     )
 
 
 def _sweep_rows() -> tuple[Row, ...]:
     """The rows of both skills. With a range of training the points are its ends and those of a range twice as wide."""
+    friction = ("friction", "finger friction", "objects.friction=[{},{}]", points_at_twice(0.4, 1.2, floor=0.02))
     shared = (
-        ("latency", "command latency [s]", "randomization.latency=[{},{}]", (0.0, 0.02), (0.0, 0.01, 0.02, 0.03)),
-        ("torque_gain", "torque gain", "randomization.torque_gain=[{},{}]", (0.9, 1.1), ()),
-        ("taxel_noise", "taxel noise [N]", "sensing.taxel.noise={}", None, (0.0, 0.01, 0.02, 0.04)),
-        ("dead_taxels", "dead taxels [share]", "sensing.taxel.dead=[{},{}]", None, (0.0, 0.05, 0.1, 0.2)),
-        ("lean", "mount lean, at most [rad]", "randomization.gravity_tilt={}", (0.0, 0.1), (0.0, 0.05, 0.1, 0.2)),
+        ("latency", "command latency [s]", "randomization.latency=[{},{}]", (0.0, 0.01, 0.02, 0.03)),
+        ("torque_gain", "torque gain", "randomization.torque_gain=[{},{}]", points_at_twice(0.9, 1.1)),
+        ("taxel_noise", "taxel noise [N]", "sensing.taxel.noise={}", (0.0, 0.01, 0.02, 0.04)),
+        ("dead_taxels", "dead taxels [share]", "sensing.taxel.dead=[{},{}]", (0.0, 0.05, 0.1, 0.2)),
+        ("lean", "mount lean, at most [rad]", "randomization.gravity_tilt={}", (0.0, 0.05, 0.1, 0.2)),
+        friction,
     )
+    link, mass, error = "objects.link_friction=[{},{}]", "objects.mass=[{},{}]", "orientation error, at most [rad]"
     own = {
         "grasp": (
-            ("friction", "finger friction", "objects.friction=[{},{}]", (0.4, 1.2), ()),
-            ("link_friction", "link friction", "objects.link_friction=[{},{}]", (0.3, 1.2), ()),
-            ("mass", "mass [kg]", "objects.mass=[{},{}]", (0.05, 0.20), ()),
+            ("link_friction", "link friction", link, points_at_twice(0.3, 1.2, floor=0.02)),
+            ("mass", "mass [kg]", mass, points_at_twice(0.05, 0.20, floor=0.02)),
         ),
         "rotate": (
-            ("friction", "finger friction", "objects.friction=[{},{}]", (0.4, 1.2), ()),
             # Below 0.1 hardly a cube stays on the palm to begin with.
-            ("link_friction", "link friction", "objects.link_friction=[{},{}]", (0.3, 0.9), (0.1, 0.3, 0.9, 1.2)),
-            ("mass", "mass [kg]", "objects.mass=[{},{}]", (0.06, 0.15), ()),
-            (
-                "orientation",
-                "orientation error, at most [rad]",
-                "sensing.orientation.bias={}",
-                (0.0, 0.04),
-                (0.0, 0.02, 0.04, 0.08),
-            ),
-            ("edge", "cube edge [m]", "edge=[{},{}]", (0.050, 0.060), ()),
+            ("link_friction", "link friction", link, (0.1, 0.3, 0.9, 1.2)),
+            ("mass", "mass [kg]", mass, points_at_twice(0.06, 0.15, floor=0.02)),
+            ("orientation", error, "sensing.orientation.bias={}", (0.0, 0.02, 0.04, 0.08)),
+            ("edge", "cube edge [m]", "edge=[{},{}]", points_at_twice(0.050, 0.060)),
         ),
     }
     rows = []
     for skill, sweeps in own.items():
         rows.append(Row(name=f"{skill}_reference", label=f"{skill}: training's ranges", task=skill, policy=skill))
-        rows += [
-            Row(
-                name=f"{skill}_{name}",
-                label=f"{skill}: {label}",
-                task=skill,
-                policy=skill,
-                # Few small cubes stay in the hand: a pool that they can fill.
-                settings=(setting, "pool_size=256") if name == "edge" else (setting,),
-                points=points or points_at_twice(*training, floor=0.02),
-                training=training,
-            )
-            for name, label, setting, training, points in (*shared, *sweeps)
-        ]
+        for name, label, setting, points in (*shared, *sweeps):
+            # Few small cubes stay in the hand: a pool that they can fill.
+            settings = (setting, "pool_size=256") if name == "edge" else (setting,)
+            about = {"name": f"{skill}_{name}", "label": f"{skill}: {label}", "task": skill, "policy": skill}
+            rows.append(Row(settings=settings, points=points, **about))
     return tuple(rows)
 
 
@@ -134,17 +115,7 @@ _ALL = (
         measure=measure.trained,
         table=tables.rotation,
         draw=figures.successes,
-        differs=(
-            "A success asks for a spin below 2 rad/s as well; a trial ends after 120 s. As in the paper, the "
-            "quaternion fails: it changes sign where the goal completes a turn, and hardly an episode makes more than "
-            "three goals; the paper's mean is 2.9. Unlike in the paper, touch is no condition: in simulation rows "
-            "with less of it turn as much or more. There the orientation is nearly exact, and after 40 million steps "
-            "a policy with fewer inputs has come farther. Without orientation these steps are too few: the shipped "
-            "policy of that kind has memory and five times as many. Seeds of one row differ by as much as the rows "
-            "that turn do, so that their order says little."
-        ),
         trains=True,
-        minutes=12.0,
     ),
     Experiment(
         name="observations_paper",
@@ -153,17 +124,7 @@ _ALL = (
         measure=measure.trained,
         table=tables.rotation,
         draw=figures.successes,
-        differs=(
-            "A trial ends after 120 s. No success asks for a low spin, so the fastest policies keep the cube "
-            "spinning, at 0.7 s a goal. Rows order as they do with our reward: the quaternion fails, as in the paper, "
-            "and unlike in the paper rows with less touch turn as much or more. Seeds of one row differ by more than "
-            "rows that turn do: of most rows the worst seed makes a third to two thirds of the goals of the best, and "
-            "of one row none. On the emulated hand the cubes that turn leave the palm after 14 s (quaternion) to 72 s. "
-            "Without orientation one seed of three learns in these steps. Three rows have two seeds: the time on the "
-            "machine ended."
-        ),
         trains=True,
-        minutes=12.0,
     ),
     Experiment(
         name="readings",
@@ -174,10 +135,6 @@ _ALL = (
         ),
         measure=measure.evaluated,
         table=tables.rotation,
-        draw=None,
-        differs="Not in the paper: one policy that loses a reading (touch is 0 then, the orientation its mean in "
-        "training), where the paper trains one without it.",
-        minutes=3.0,
     ),
     Experiment(
         name="rewards",
@@ -186,14 +143,7 @@ _ALL = (
         measure=measure.trained,
         table=tables.grasp,
         draw=figures.command_curves,
-        differs="Targets here are 2 to 7 N a finger, not the default's 1.2 to 4.8; the paper's hand presses harder. "
-        "The paper does not say what its joint torque is a share of. Ours is the sum over touching fingers of the "
-        "root joint's torque over its limit. Alone, R_torque has the weight that R_force has. As in the paper, "
-        "R_torque alone has the narrowest range of force; it follows the torque best and the force worst. R_force "
-        "alone has the range of both, since R_torque beside it has a tenth of its weight; on the emulated hand both "
-        "follow the force a little closer.",
         trains=True,
-        minutes=3.0,
     ),
     Experiment(
         name="force",
@@ -202,39 +152,6 @@ _ALL = (
         measure=measure.shipped,
         table=tables.commands,
         draw=figures.command_curves,
-        differs="Torque on the emulated hand is what the bridge measures through the current.",
-        minutes=4.0,
-    ),
-    Experiment(
-        name="calibration",
-        title="Current and torque over force",
-        rows=(Row(name="index", label="index finger"),),
-        measure=figure_data.calibration,
-        table=tables.calibration,
-        draw=figures.copied,
-        differs="The emulated hand's motors have friction and other gains than the model in training.",
-        minutes=1.0,
-    ),
-    Experiment(
-        name="skin",
-        title="Stress over compression of the skin",
-        rows=(Row(name="law", label="hand's skin"),),
-        measure=figure_data.skin,
-        table=None,
-        draw=figures.skin,
-        differs="The paper measured a rubber. We have no sample of the hand's skin, and compare the touch model with "
-        "the law in closed form.",
-        minutes=0.5,
-    ),
-    Experiment(
-        name="contacts",
-        title="One motion felt in simulation and on the emulated hand",
-        rows=(Row(name="sphere", label="sphere at command 0.75", task="grasp", policy="grasp"),),
-        measure=figure_data.contacts,
-        table=tables.contacts,
-        draw=figures.contacts,
-        differs="The actions of a grasp on the emulated hand are repeated in simulation, open loop.",
-        minutes=1.0,
     ),
     Experiment(
         name="successes",
@@ -249,11 +166,6 @@ _ALL = (
         measure=measure.on_the_hand,
         table=tables.rotation,
         draw=figures.successes,
-        differs="Every parameter is outside training's ranges. A success asks for a spin below 2 rad/s as "
-        "well; a trial ends after 120 s. A policy has ten trials here; in more of them the means are "
-        "[78.6](experiments/zero_shot_rotate.md#zs-rotate-87dc2df-averaged-6000) and "
-        "[42.6](experiments/zero_shot_rotate.md#zs-rotate-without-orientation-ec2a59a-gru-6000).",
-        minutes=6.0,
     ),
     Experiment(
         name="objects",
@@ -261,9 +173,6 @@ _ALL = (
         rows=(Row(name="grasp", label="shipped policy, 24 objects", task="grasp", policy="grasp"),),
         measure=measure.held_out,
         table=tables.held_out,
-        draw=figures.copied,
-        differs="The paper shows pictures of grasps and no numbers. Ours are in simulation.",
-        minutes=2.5,
     ),
     Experiment(
         name="robustness",
@@ -271,11 +180,6 @@ _ALL = (
         rows=_sweep_rows(),
         measure=measure.swept,
         table=tables.sweeps,
-        draw=figures.sweeps,
-        differs="Not in the paper. One parameter at a time has one value, the others have training's ranges. Latency "
-        "ends at one control tick, the most that is modelled; training has no dead taxels and one level of taxel noise "
-        "(0.02 N). The rotation's policy observes no torque. Its episodes last 20 s.",
-        minutes=0.9,
     ),
 )
 EXPERIMENTS: dict[str, Experiment] = {experiment.name: experiment for experiment in _ALL}

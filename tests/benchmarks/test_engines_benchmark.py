@@ -84,12 +84,17 @@ def test_a_policy_is_measured_with_its_own_iterations_or_converged(engines, monk
     monkeypatch.setattr(engines, "evaluate_policy", evaluate)
     row = engines.policy_row("grasp", "c", converged, episodes=5, seconds=0.3)
     assert seen == [("c", *((50, 50) if converged else (3, 6)), 5, 5)]
-    assert row["seconds"] == 0.3 and row["held"] == 0.8 and row["r"] == 0.6 and row["r_ci95"] == [0.7, 0.9]
+    assert (
+        row["seconds"] == 0.3
+        and row["held"] == 0.8
+        and row["r_resultant"] == 0.6
+        and row["r_resultant_ci95"] == [0.7, 0.9]
+    )
 
 
 def test_tables_have_a_column_for_each_engine(engines, capsys, monkeypatch):
     def measure(policy, backend, converged, episodes, seconds):
-        row = {"policy": policy, "backend": backend, "converged": converged, "r": None, "r_ci95": [None, None]}
+        row = {"policy": policy, "backend": backend, "converged": converged, "r_resultant": None}
         return row | {"held": 0.5, "held_ci95": [0.25, 0.75]}
 
     monkeypatch.setattr(engines, "policy_row", measure)
