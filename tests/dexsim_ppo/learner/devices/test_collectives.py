@@ -1,11 +1,6 @@
 """Bytes that a program communicates, counted by hand. Programs for CPU devices: `learner/test_sharding.py`."""
 
-import sys
-
 import pytest
-from paths import ROOT
-
-sys.path.insert(0, str(ROOT / "benchmarks"))
 from collectives import received
 
 # As XLA writes them for GPUs: asynchronous, combined, in loops whose bodies call others.
