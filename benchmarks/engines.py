@@ -45,7 +45,7 @@ from dexsim.hand.kinematics import flexion_joints
 from dexsim.objects.params import ObjectParams, extent
 from dexsim.physics.model import build_model
 from dexsim.physics.physics import BACKENDS, Physics, choose_backend
-from dexsim.physics.interface import PhysicsState
+from dexsim.physics.interface import PhysicsState, StepResult
 from dexsim.registry import TASKS
 from dexsim.tasks.placement import palm_height
 from dexsim_ppo import evaluate_policy, load_policy
@@ -236,12 +236,12 @@ class Motions:
         """All motions on an engine."""
         physics, limit = self.physics(backend, changes), jnp.asarray(self.env.hand.torque_limit)
 
-        def tick(begin: Begin) -> tuple[PhysicsState, jax.Array]:
+        def tick(begin: Begin) -> StepResult:
             def motors(substep: jax.Array, position: jax.Array, velocity: jax.Array) -> jax.Array:
                 reach = jnp.clip(begin.target - position, -REACH, REACH)
                 return jnp.clip(STIFFNESS * reach - DAMPING * velocity, -limit, limit)
 
-            return physics.advance(begin.object, begin.state, motors, begin.push)
+            return physics.advance(motors, begin.object, begin.state, begin.push)
 
         def all_ticks(begin: Begin):
             def body(state: PhysicsState, _: None):

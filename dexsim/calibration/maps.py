@@ -334,8 +334,8 @@ def _list(values: Any) -> str:
 
 # --- what the numbers of a calibration file can be ------------------------------------------------
 #
-# The bounds are far from the values of a good hand: a wrong unit is found, an unusual hand is no error. Numbers that are
-# only reported need not be physical.
+# The bounds are far from the values of a good hand: a wrong unit is found, an unusual hand is no error. Numbers that
+# are only reported need not be physical.
 
 _CURRENT = (0.03, 33.0)  # A, of a joint's full torque: a stalled XHand joint draws 1.5 A; 16 bits of mA end at 33 A
 # A a count: the wire counts mA, and runs limit the current by that. With another count, torques would not go with it.

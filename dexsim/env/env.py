@@ -20,7 +20,7 @@ from dexsim.control import move_target, observed_action
 from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import choose
 from dexsim.env.episode import EpisodeSampler
-from dexsim.env.motors import JointCommand, Motors
+from dexsim.env.motors import JointCommand, Motors, check_timestep
 from dexsim.env.observer import Observer
 from dexsim.env.senses import SensorSuite
 from dexsim.env.state import Episode, SensorInput, Start, State
@@ -50,9 +50,10 @@ class Env:
           seed: of the pool. Evaluations have pools of their own.
 
         Raises:
-          AssetError, ConfigError: see `Physics`, `load_hand`.
+          AssetError, ConfigError: see `Physics`, `load_hand`, `check_timestep`.
         """
         config = task.config
+        check_timestep(hand, config.physics, config.randomization)
         self.task, self.name, self.config, self.hand = task, task.name, config, hand
         self.spec = TaskSpec.of(task)  # what a host must know to run this task's policies
         self.physics = Physics(

@@ -2,12 +2,18 @@
 
 import jax
 import jax.numpy as jnp
+import mujoco
+import numpy as np
 
 from dexsim.actuator.drive import apply_friction, at_limit, delayed_target, drive
+from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import pytree_dataclass
+from dexsim.hand.kinematics import Hand, hinge_angles
+from dexsim.hand.mjcf import read_mjcf
+from dexsim.physics.config import PhysicsConfig
 from dexsim.physics.interface import PhysicsState, TorqueLaw
 from dexsim.physics.physics import Physics
-from dexsim.randomization import HandParams
+from dexsim.randomization import HandParams, Randomization
 
 
 @pytree_dataclass
@@ -48,3 +54,62 @@ class Motors:
         target = delayed_target(jnp.asarray(self._substeps), hand.latency, command.previous, command.target)
         arguments = hand.actuator, target, jnp.zeros_like(target), position, velocity
         return drive(*arguments), at_limit(*arguments)
+
+
+def check_timestep(hand: Hand, physics: PhysicsConfig, ranges: Randomization) -> None:
+    """Check that the stiffest motors that are drawn are stable at the time step, on every engine.
+
+    Engines step v' = v + h/I tau(q, v), q' = q + h v', with the torque of the old state. For one joint under
+    tau = -k_p q - k_d v the step is a matrix of trace 2 - a - b and determinant 1 - b, with a = h^2 k_p / I and
+    b = h k_d / I. Both eigenvalues are inside the unit circle if and only if |1 - b| < 1 and |trace| < 2 - b, that is
+    a + 2 b < 4, or
+
+        h^2 k_p / I + 2 h k_d / I < 4.
+
+    For all joints at once I is the mass matrix, and the left side the largest eigenvalue of M^-1 (h^2 K_p + 2 h K_d).
+    Beyond it a joint chatters from limit to limit of its torque. `Randomization.beyond`, for hands that training never
+    has, is not counted; nor are friction and dead-band, which damp.
+
+    Raises:
+      ConfigError: names the joint and the largest stable time step.
+    """
+    step, (stiffness, derivative), (damping, mass) = physics.timestep, _largest_gains(ranges), _masses(hand)
+
+    def largest(step: float) -> tuple[float, int]:
+        """The largest eigenvalue, and the joint that moves most in it."""
+        load = np.diag(np.full(hand.num_joints, step**2 * stiffness + 2 * step * derivative)) + 2 * step * damping
+        values, vectors = np.linalg.eig(np.linalg.solve(mass, load))
+        worst = int(np.argmax(values.real))
+        return float(values.real[worst]), int(np.argmax(np.abs(vectors[:, worst])))
+
+    value, joint = largest(step)
+    if value < 4:
+        return
+    steps = np.linspace(step, 0.0, 200, endpoint=False)
+    stable = next((s for s in steps if largest(s)[0] < 4), 0.0)
+    raise ConfigError(
+        f"PhysicsConfig.timestep = {step:g} s: the stiffest motors drawn are unstable at joint "
+        f"{hand.joint_names[joint]} (h^2 k_p / I + 2 h k_d / I = {value:.2f}, must be below 4): "
+        f"use at most {np.floor(stable * 1e5) / 1e5:g} s, or lower gains (Randomization.stiffness, damping)"
+    )
+
+
+def _largest_gains(ranges: Randomization) -> tuple[float, float]:
+    """k_p Nm/rad and k_d Nm s/rad of the stiffest motor that is drawn, with its efficiency and ripple."""
+    high = {name: 1 + ranges.scale * (getattr(ranges, name)[1] - 1) for name in ("stiffness_factor", "damping_factor")}
+    factor = (1 + ranges.scale * (ranges.efficiency[1] - 1)) * (1 + ranges.scale * ranges.ripple[1])
+    return factor * ranges.stiffness * high["stiffness_factor"], factor * ranges.damping * high["damping_factor"]
+
+
+def _masses(hand: Hand) -> tuple[np.ndarray, np.ndarray]:
+    """Damping [J, J] Nm s/rad and mass matrix [J, J] kg m^2 of the joints with all that follows them, at the middle of
+    their ranges; a finger's posture changes the smallest of them by less than 1 %."""
+    model = read_mjcf(hand).compile()
+    data, mass = mujoco.MjData(model), np.zeros((model.nv, model.nv))
+    data.qpos[:] = np.asarray(hinge_angles(hand, (hand.joint_lower + hand.joint_upper) / 2))
+    mujoco.mj_forward(model, data)
+    mujoco.mj_fullM(model, data, mass)
+    moving = np.flatnonzero(hand.body_joint >= 0)
+    follows = np.zeros((model.nv, hand.num_joints))
+    follows[np.arange(model.nv), hand.body_joint[moving]] = hand.body_ratio[moving]
+    return follows.T @ np.diag(model.dof_damping) @ follows, follows.T @ mass @ follows
