@@ -412,10 +412,13 @@ DEV bool quadratic(const Problem &problem, Vec3 before, Vec3 after, float accele
   return (same || !problem.rows.here) && closed_before == closed_after;
 }
 
-// The acceleration of the lane's degree of freedom, from a first guess on. `miss` of the rows ends as that of the
+// The acceleration of the lane's degree of freedom, from the last one on. `miss` of the rows ends as that of the
 // solution. Counts iterations and evaluations of the line search.
 DEV float solve(const Args &args, Problem &problem, float acceleration, Shared &shared, int &iterations, int &evaluations,
                 const Lane &lane) {
+  // Contacts that slip and stick change accelerations a lot: a quarter of the last one is a better first guess than all
+  // of it or nothing (rotate: 5.7 iterations on average, not 6.2 or 5.8).
+  acceleration *= 0.25f;
   if (lane.dof) shared.vector[lane.index] = acceleration;
   __syncwarp();
   Vec3 &miss = problem.rows.miss;
