@@ -36,7 +36,8 @@ DEV Inertia link_inertia(const Args &args, int world, const Pose &pose, Vec3 &ce
 
 // Force along the lane's degree of freedom that gravity and velocities take up (recursive Newton-Euler without
 // acceleration): MuJoCo's qfrc_bias.
-DEV float bias_force(const State &state, const Pose &pose, const Motion &unit, const Inertia &inertia, const Lane &lane) {
+DEV float bias_force(const State &state, const Pose &pose, const Motion &unit, const Inertia &inertia,
+                     const Lane &lane) {
   Motion own = state.speed * unit;
   if (!lane.hinge) {
     own.turn = pose.rotation * state.spin;

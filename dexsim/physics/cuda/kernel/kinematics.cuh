@@ -25,7 +25,8 @@ DEV Inertia from_lane(const Inertia &a, int lane) {
           from_lane(a.xz, lane),   from_lane(a.yy, lane),     from_lane(a.yz, lane), from_lane(a.zz, lane)};
 }
 DEV Inertia operator+(const Inertia &a, const Inertia &b) {
-  return {a.mass + b.mass, a.moment + b.moment, a.xx + b.xx, a.xy + b.xy, a.xz + b.xz, a.yy + b.yy, a.yz + b.yz, a.zz + b.zz};
+  return {a.mass + b.mass, a.moment + b.moment, a.xx + b.xx, a.xy + b.xy,
+          a.xz + b.xz,     a.yy + b.yy,         a.yz + b.yz, a.zz + b.zz};
 }
 DEV Force operator*(const Inertia &i, const Motion &v) {
   const Vec3 turned = {i.xx * v.turn.x + i.xy * v.turn.y + i.xz * v.turn.z,
@@ -66,7 +67,8 @@ DEV void place_links(const State &state, Shared &shared, const Lane &lane) {
     const Vec3 x = {OFFSET_ROTATION[0][l], OFFSET_ROTATION[3][l], OFFSET_ROTATION[6][l]};
     const Vec3 y = {OFFSET_ROTATION[1][l], OFFSET_ROTATION[4][l], OFFSET_ROTATION[7][l]};
     const Vec3 u = c * x + s * y, v = c * y - s * x;
-    pose.rotation = {{u.x, v.x, OFFSET_ROTATION[2][l]}, {u.y, v.y, OFFSET_ROTATION[5][l]}, {u.z, v.z, OFFSET_ROTATION[8][l]}};
+    const Vec3 z = {OFFSET_ROTATION[2][l], OFFSET_ROTATION[5][l], OFFSET_ROTATION[8][l]};
+    pose.rotation = {{u.x, v.x, z.x}, {u.y, v.y, z.y}, {u.z, v.z, z.z}};
     pose.place = lane_vector(OFFSET_PLACE, l);
   }
 #pragma unroll 1
@@ -95,7 +97,7 @@ DEV Motion unit_motion(const Pose &pose, Shared &shared, const Lane &lane) {
   Motion motion;
   motion.turn = column(pose.rotation, axis);
   motion.shift = cross(pose.place, motion.turn);
-  if (!lane.hinge && axis < 0) motion = {{0, 0, 0}, {axis == -3 ? 1.f : 0.f, axis == -2 ? 1.f : 0.f, axis == -1 ? 1.f : 0.f}};
+  if (!lane.hinge && axis < 0) motion = {{0, 0, 0}, {float(axis == -3), float(axis == -2), float(axis == -1)}};
   if (lane.dof) {
     float *to = shared.motion + 7 * lane.index;
     to[0] = motion.turn.x, to[1] = motion.turn.y, to[2] = motion.turn.z;

@@ -1,11 +1,10 @@
 // The acceleration under contacts and limits by Newton's method: MuJoCo's convex problem (documentation, chapter
 // Computation, section Constraint model), as in dexsim.physics.solver.newton, with its names.
 //
-// A step solves H p = -gradient. H is an arrow: fingers are coupled to the object, not to each other, so each finger is
-// eliminated by its own lanes, all at once, and what remains is the object's 6 x 6. Fingers that touch each other are
-// eliminated together, as is a hand that is not made of short fingers: by the same code, with rows over all hinges.
+// A step solves H p = -gradient (elimination.cuh).
 #pragma once
 #include "rows.cuh"
+#include "elimination.cuh"
 
 // Where a contact is with respect to its cone (`_cone`).
 struct Cone {
@@ -37,7 +36,7 @@ DEV Vec3 cone_force(const ContactRows &rows, const Cone &cone, Vec3 miss) {
 
 // What a lane has to do with which contacts, as masks over contacts.
 struct Whose {
-  unsigned mine;     // that the lane adds up: those its hinge moves; for the object's lanes every GROUPS-th of the object
+  unsigned mine;     // that the lane adds up: those its hinge moves; of the object's, for its lanes, every GROUPS-th
   unsigned second;   // of these, where the hinge carries the second link
   unsigned object;   // of the object
   unsigned hand;     // between two links of the hand
@@ -93,7 +92,8 @@ DEV void load_mass(Problem &problem, Shared &shared, const Lane &lane) {
   if (BLOCK) {
     const float *row = mass_rows(shared) + lane.index * MASS_STRIDE + lane.first;
 #pragma unroll
-    for (int k = 0; k < BLOCK; k++) problem.mass[k] = lane.hinge && lane.first + k <= BLOCK_LAST[lane.index] ? row[k] : 0;
+    for (int k = 0; k < BLOCK; k++)
+      problem.mass[k] = lane.hinge && lane.first + k <= BLOCK_LAST[lane.index] ? row[k] : 0;
   }
 }
 
@@ -145,123 +145,6 @@ DEV unsigned write_factors(const ContactRows &rows, Vec3 miss, Shared &shared, c
     }
   }
   return lanes_where(active);
-}
-
-// A lane's row of the hand's linear system but for the columns of hinges: the object's six, right-hand side.
-struct Side {
-  float object[6];
-  float right;
-};
-
-// In shared memory: the object's six, right-hand side, inverse of the pivot, then the hinges.
-DEV float *hand_row(Shared &shared, int hinge) { return (float *)(shared.hand + hinge * ROW); }
-
-constexpr int rounded(int count) { return 4 * ((count + 3) / 4); }
-constexpr int FINGER = BLOCK ? rounded(BLOCK) : 4, WHOLE = rounded(HINGES);
-
-// Gaussian elimination in each cluster, one pivot after another: its lane writes its row, lanes after it take their share
-// off. The matrix stays symmetric, so a lane finds its own entry of the pivot's column in the pivot's row. `origin` is
-// the hinge of a row's first column.
-template <int WIDTH>
-DEV void eliminate(float (&row)[WIDTH], Side &side, Shared &shared, unsigned cluster, int pivots, int origin, const Lane &lane) {
-#pragma unroll 1
-  for (int k = 0; k < pivots; k++) {
-    const int pivot = __ffs(cluster) - 1;
-    cluster &= cluster - 1;
-    if (lane.hinge && lane.index == pivot) {
-      float4 *to = shared.hand + lane.index * ROW;
-      to[0] = {side.object[0], side.object[1], side.object[2], side.object[3]};
-      to[1] = {side.object[4], side.object[5], side.right, 0};
-#pragma unroll
-      for (int i = 0; i < WIDTH; i += 4) to[2 + i / 4] = {row[i], row[i + 1], row[i + 2], row[i + 3]};
-    }
-    __syncwarp();
-    if (lane.hinge && cluster >> lane.index & 1) {
-      const float4 *from = shared.hand + pivot * ROW;
-      const float *columns = (const float *)(from + 2) - origin;
-      const float share = columns[lane.index] / columns[pivot];
-      const float4 a = from[0], b = from[1];
-      side.object[0] -= share * a.x, side.object[1] -= share * a.y, side.object[2] -= share * a.z;
-      side.object[3] -= share * a.w, side.object[4] -= share * b.x, side.object[5] -= share * b.y;
-      side.right -= share * b.z;
-#pragma unroll
-      for (int i = 0; i < WIDTH; i += 4) {
-        const float4 c = from[2 + i / 4];
-        row[i] -= share * c.x, row[i + 1] -= share * c.y, row[i + 2] -= share * c.z, row[i + 3] -= share * c.w;
-      }
-    }
-  }
-}
-
-// The hinge's part of the step once the object's is known: back-substitution, last pivot first.
-DEV float substitute(float right, float inverse, Shared &shared, unsigned cluster, int pivots, int origin, const Lane &lane) {
-  const float *own = hand_row(shared, lane.hinge ? lane.index : 0) + 8 - origin;
-  float step = 0;
-#pragma unroll 1
-  for (int k = 0; k < pivots; k++) {
-    const int pivot = cluster ? 31 - __clz(cluster) : lane.index;
-    if (lane.index == pivot && cluster) step = right * inverse;
-    const float solved = from_lane(step, pivot);
-    if (lane.hinge && lane.index < pivot) right -= own[pivot] * solved;
-    cluster &= (1u << pivot) - 1;
-  }
-  return step;
-}
-
-// What the eliminated hinges leave of the object's 6 x 6, and its solution [6], the same on all lanes. Adds to
-// `decrement` the object's part on the last lane.
-DEV void solve_object(const Side &side, Shared &shared, float (&step)[6], float &decrement, const Lane &lane) {
-  float sums[7] = {side.object[0], side.object[1], side.object[2], side.object[3], side.object[4], side.object[5], side.right};
-  if (lane.object) {
-#pragma unroll
-    for (int i = 0; i < (HINGES + GROUPS - 1) / GROUPS; i++) {
-      const int hinge = i * GROUPS + lane.group;
-      if (hinge < HINGES) {
-        const float4 a = shared.hand[hinge * ROW], b = shared.hand[hinge * ROW + 1];
-        const float share = hand_row(shared, hinge)[lane.axis] * b.w;
-        sums[0] -= share * a.x, sums[1] -= share * a.y, sums[2] -= share * a.z, sums[3] -= share * a.w;
-        sums[4] -= share * b.x, sums[5] -= share * b.y, sums[6] -= share * b.z;
-      }
-    }
-  }
-#pragma unroll
-  for (int k = 0; k < 7; k++) {
-    const float own = sums[k];
-#pragma unroll
-    for (int group = 1; group < GROUPS; group++) sums[k] += from_lane(own, lane.index + 6 * group);
-  }
-  if (lane.dof && !lane.hinge) {
-    shared.object[2 * lane.axis] = {sums[0], sums[1], sums[2], sums[3]};
-    shared.object[2 * lane.axis + 1] = {sums[4], sums[5], sums[6], 0};
-  }
-  __syncwarp();
-  float matrix[6][6], pivot[6];
-#pragma unroll
-  for (int i = 0; i < 6; i++) {
-    const float4 a = shared.object[2 * i], b = shared.object[2 * i + 1];
-    matrix[i][0] = a.x, matrix[i][1] = a.y, matrix[i][2] = a.z, matrix[i][3] = a.w, matrix[i][4] = b.x, matrix[i][5] = b.y;
-    step[i] = b.z;
-  }
-  float part = 0;
-#pragma unroll
-  for (int k = 0; k < 6; k++) {
-    pivot[k] = 1 / matrix[k][k];
-    part += step[k] * step[k] * pivot[k];
-#pragma unroll
-    for (int i = k + 1; i < 6; i++) {
-      const float share = matrix[i][k] * pivot[k];
-      step[i] -= share * step[k];
-#pragma unroll
-      for (int j = k + 1; j <= i; j++) matrix[i][j] -= share * matrix[j][k];
-    }
-  }
-#pragma unroll
-  for (int k = 5; k >= 0; k--) {
-#pragma unroll
-    for (int j = k + 1; j < 6; j++) step[k] -= matrix[j][k] * step[j];
-    step[k] *= pivot[k];
-  }
-  if (lane.index == 31) decrement += part;
 }
 
 // The rows of the whole hand, from those of the fingers or of the mass matrix, and the contacts that these lack.
@@ -332,21 +215,21 @@ DEV float newton_step(const Problem &problem, Vec3 miss, float acceleration, flo
   side.right = -gradient;
   const unsigned among = active & problem.whose.hand;
   const bool whole = !BLOCK || among;
-  const unsigned cluster = whole ? problem.whose.cluster : lane.finger;
-  const int pivots = whole ? problem.whose.largest : BLOCK, origin = whole ? 0 : lane.first;
+  const Order order =
+      whole ? Order{problem.whose.cluster, problem.whose.largest, 0} : Order{lane.finger, BLOCK, lane.first};
   if (whole) {
     float row[WHOLE];
     __syncwarp();
     whole_rows(finger, row, problem, BLOCK ? among : active, limit, shared, lane);
     __syncwarp();
-    eliminate(row, side, shared, cluster, pivots, origin, lane);
+    eliminate(row, side, order, shared, lane);
   } else {
-    eliminate(finger, side, shared, cluster, pivots, origin, lane);
+    eliminate(finger, side, order, shared, lane);
   }
   float inverse = 0;
   if (lane.hinge) {
     float *own = hand_row(shared, lane.index);
-    inverse = own[7] = 1 / own[8 + lane.index - origin];
+    inverse = own[7] = 1 / own[8 + lane.index - order.origin];
   }
   decrement = side.right * side.right * inverse;
   __syncwarp();
@@ -354,7 +237,7 @@ DEV float newton_step(const Problem &problem, Vec3 miss, float acceleration, flo
   solve_object(side, shared, step, decrement, lane);
 #pragma unroll
   for (int axis = 0; axis < 6; axis++) side.right -= side.object[axis] * step[axis];
-  const float hinge = substitute(side.right, inverse, shared, cluster, pivots, origin, lane);
+  const float hinge = substitute(side.right, inverse, order, shared, lane);
   const float object = lane.axis == 0 ? step[0] : lane.axis == 1 ? step[1] : lane.axis == 2 ? step[2]
                      : lane.axis == 3 ? step[3] : lane.axis == 4 ? step[4] : step[5];
   return lane.hinge ? hinge : object;
@@ -414,8 +297,8 @@ DEV bool quadratic(const Problem &problem, Vec3 before, Vec3 after, float accele
 
 // The acceleration of the lane's degree of freedom, from the last one on. `miss` of the rows ends as that of the
 // solution. Counts iterations and evaluations of the line search.
-DEV float solve(const Args &args, Problem &problem, float acceleration, Shared &shared, int &iterations, int &evaluations,
-                const Lane &lane) {
+DEV float solve(const Args &args, Problem &problem, float acceleration, Shared &shared, int &iterations,
+                int &evaluations, const Lane &lane) {
   // Contacts that slip and stick change accelerations a lot: a quarter of the last one is a better first guess than all
   // of it or nothing (rotate: 5.7 iterations on average, not 6.2 or 5.8).
   acceleration *= 0.25f;
@@ -441,8 +324,9 @@ DEV float solve(const Args &args, Problem &problem, float acceleration, Shared &
     decrement = sum_lanes(decrement);
     // The last step is taken as it is: its slopes are rounding.
     const bool last = decrement < args.tolerance;
-    const float share =
-        last ? 1 : line_search(args, problem, miss, moved, acceleration, step, slope, curve, decrement, evaluations, lane);
+    float share = 1;
+    if (!last)
+      share = line_search(args, problem, miss, moved, acceleration, step, slope, curve, decrement, evaluations, lane);
     const bool found = share == 1 && lanes_where(!quadratic(problem, miss, miss + moved, acceleration, step)) == 0;
     acceleration += share * step;
     inertial += share * inertial_step;

@@ -1,4 +1,5 @@
-// The constraints of a sub-step: contacts of three rows each (a contact a lane), limits (a hinge a lane), coupled joints.
+// The constraints of a sub-step: contacts of three rows each (a contact a lane), limits (a hinge a lane), coupled
+// joints.
 //
 // The same rows as dexsim.physics.solver.substep.Stepper._rows makes; MuJoCo's documentation, chapter Computation,
 // sections Constraint model and Parameters.
@@ -72,7 +73,8 @@ DEV Mat3 contact_frame(Vec3 normal) {
 }
 
 // The hinges that carry a link move its contact point: columns `start`... of the Jacobian, times `sign`.
-DEV void chain_columns(ContactRows &rows, const Shared &shared, const Mat3 &frame, Vec3 point, int link, int start, float sign) {
+DEV void chain_columns(ContactRows &rows, const Shared &shared, const Mat3 &frame, Vec3 point, int link, int start,
+                       float sign) {
   if (link < 0) return;
   const int depth = DEPTH[link];
 #pragma unroll
@@ -125,9 +127,10 @@ DEV ContactRows contact_rows(const Args &args, int world, const Shared &shared, 
   } else if (rows.second >= 0) {
     chain_columns(rows, shared, frame, contact.point, rows.second, CHAIN, 1);
     // A hinge that carries both links has one column: the first.
+    const int both = CHAIN_MASK[rows.first < 0 ? HINGES : rows.first] & CHAIN_MASK[rows.second];
 #pragma unroll
     for (int k = 0; k < CHAIN; k++)
-      if ((CHAIN_MASK[rows.first < 0 ? HINGES : rows.first] & CHAIN_MASK[rows.second]) >> column_dof(rows, CHAIN + k) & 1) {
+      if (both >> column_dof(rows, CHAIN + k) & 1) {
 #pragma unroll
         for (int row = 0; row < 3; row++) {
           rows.jacobian[row][k] += rows.jacobian[row][CHAIN + k];
@@ -191,7 +194,8 @@ DEV void add_couplings(const State &state, Shared &shared, float &force, const L
     const float *c = row.polynomial;
     const float x = row.second < 0 ? 0 : from_lane(state.angle, other) - row.zero[1];
     const float slope = row.second < 0 ? 0 : c[1] + x * (2 * c[2] + x * (3 * c[3] + x * 4 * c[4]));
-    const float gap = from_lane(state.angle, row.first) - row.zero[0] - (c[0] + x * (c[1] + x * (c[2] + x * (c[3] + x * c[4]))));
+    const float follows = c[0] + x * (c[1] + x * (c[2] + x * (c[3] + x * c[4])));
+    const float gap = from_lane(state.angle, row.first) - row.zero[0] - follows;
     const float speed = from_lane(state.speed, row.first) - slope * from_lane(state.speed, other);
     const Spring found = spring(row.spring, row.spring + 2, gap);
     const float weight = found.impedance / fmaxf(row.compliance * (1 - found.impedance), 1e-15f);

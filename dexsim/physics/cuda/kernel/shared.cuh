@@ -1,15 +1,15 @@
 // Who the lanes of a world's warp are, and what they share: one `Shared` in shared memory for each warp.
 //
-// Of the scene (scene.py): HINGES of the hand, CHAIN (hinges from the palm to a link at most), BLOCK (hinges of a finger,
-// 0 where the hand is not made of short fingers), MAX_CONTACTS.
+// Of the scene (scene.py): HINGES of the hand, CHAIN (hinges from the palm to a link at most), BLOCK (hinges of a
+// finger, 0 where the hand is not made of short fingers), MAX_CONTACTS.
 #pragma once
 #include "warp.cuh"
 
 constexpr int DOFS = HINGES + 6;
 constexpr int GROUPS = (32 - HINGES) / 6;  // of six lanes for the object, which share its contacts
 
-// Columns of a contact's Jacobian: the hinges that carry its first link, then the object's six degrees of freedom or the
-// hinges that carry its second link.
+// Columns of a contact's Jacobian: the hinges that carry its first link, then the object's six degrees of freedom or
+// the hinges that carry its second link.
 constexpr int OTHER = CHAIN > 6 ? CHAIN : 6;
 constexpr int COLUMNS = CHAIN + OTHER;
 

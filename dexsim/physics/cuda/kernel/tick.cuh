@@ -13,8 +13,8 @@
 
 // All but contact forces along the lane's degree of freedom: bias, motor, damping and spring of a hinge, push on the
 // object.
-DEV float smooth_force(const Args &args, int world, int substep, const State &state, const Pose &pose, const Motion &unit,
-                       const Inertia &inertia, Vec3 centre, const Lane &lane) {
+DEV float smooth_force(const Args &args, int world, int substep, const State &state, const Pose &pose,
+                       const Motion &unit, const Inertia &inertia, Vec3 centre, const Lane &lane) {
   float force = -bias_force(state, pose, unit, inertia, lane);
   if (lane.hinge) {
     const int l = lane.index, joint = DRIVE[l];
@@ -132,6 +132,6 @@ DEV void tick(const Args &args, int world, Shared &shared, int index) {
     }
   }
   store_state(args, world, state, lane);
-  if (index < 4)
-    args.stats[4 * world + index] = index == 0 ? iterations : index == 1 ? evaluations : index == 2 ? most : most > MAX_CONTACTS;
+  const int stats = index == 0 ? iterations : index == 1 ? evaluations : index == 2 ? most : most > MAX_CONTACTS;
+  if (index < 4) args.stats[4 * world + index] = stats;
 }

@@ -78,7 +78,9 @@ DEV Mat3 operator*(const Mat3 &a, const Mat3 &b) { return {row_times(a.x, b), ro
 DEV Mat3 operator+(const Mat3 &a, const Mat3 &b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
 DEV Mat3 operator*(float s, const Mat3 &a) { return {s * a.x, s * a.y, s * a.z}; }
 DEV Vec3 column(const Mat3 &m, int axis) { return {pick(m.x, axis), pick(m.y, axis), pick(m.z, axis)}; }
-DEV Mat3 from_lane(const Mat3 &m, int lane) { return {from_lane(m.x, lane), from_lane(m.y, lane), from_lane(m.z, lane)}; }
+DEV Mat3 from_lane(const Mat3 &m, int lane) {
+  return {from_lane(m.x, lane), from_lane(m.y, lane), from_lane(m.z, lane)};
+}
 
 // Rows of the rotation of a unit quaternion (w, x, y, z).
 DEV Mat3 rotation_of(float w, float x, float y, float z) {
