@@ -1,176 +1,351 @@
-"""The engines side by side: JSON lines, and a table at the end.
+"""The engines side by side: motions against C MuJoCo in double precision, and what the shipped policies reach.
 
-    python benchmarks/engines.py grips          # one sub-step of the shipped policy's grips against C MuJoCo; speed
-    python benchmarks/engines.py motions        # grips, slides, rolling, drops of each shape against C MuJoCo in fp64
-    python benchmarks/engines.py policies       # what the shipped policies reach on each engine
+    python benchmarks/engines.py motions --json motions.json    # grips, slides, rolling, drops of each shape
+    python benchmarks/engines.py policies                       # success of the shipped policies
 
-`grips`: the shipped grasp policy holds objects on the `c` backend. From its states each engine takes one sub-step, the
-solver converged: the `jax` backend with its own contacts and solver (closed), the same with MJX's step (mjx), and `c`.
-What is left are contact points and rounding. `n` counts fingers that touch, and differences are those of their force
-vectors. Speeds are of a control tick of physics with the default iterations, measured in turn.
+One JSON line a row, and a table at the end with a column for each engine that this machine can run: `c` on a CPU,
+`cuda` on an NVIDIA GPU, `jax` and `warp` on both. Every engine is measured with the solver iterations of training, and
+with 50 of 50 line-search steps (converged).
 
-`motions` (see `engine_motions`) and `policies` measure every engine with the solver iterations of training, and with 50
-of 50 line-search steps (converged). Warp runs on one CPU thread here.
+| motion | begins | gravity |
+|---|---|---|
+| grip | with fingers that hold the object still | out of the hand |
+| slide | on the palm at 0.3 m/s, turned a little, without spin | onto the palm |
+| roll | on the palm at 0.2 m/s, with the spin of rolling | onto the palm |
+| drop | over the palm, between half-closed fingers | onto the palm |
+
+Joints follow targets that do not change, and skin has one stiffness. The reference steps one model a row with
+`mujoco.mj_step`, from the same numbers. "nudged" is the reference again, moved by 1 micrometre along each axis and
+turned by some microradians: how far a motion itself spreads what rounding begins.
 """
 
 import argparse
+import contextlib
+import copy
 import dataclasses
 import functools
 import json
-import statistics
-import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
-import engine_motions
-import engine_policies
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
-from throughput import seconds
 
-from dexsim.core.cli import enable_caches
+import dexsim
+from dexsim.core import cli
 from dexsim.core.compilation import jit
+from dexsim.core.config import override
+from dexsim.core.errors import ConfigError
+from dexsim.core.pytree import pytree_dataclass
 from dexsim.env.env import Env
-from dexsim.env.motors import JointCommand
-from dexsim.env.state import State
-from dexsim.objects.config import SHAPES
-from dexsim.physics.physics import BACKENDS, Physics
-from dexsim_ppo import Policy, load_policy
+from dexsim.hand.kinematics import flexion_joints
+from dexsim.objects.params import ObjectParams, extent
+from dexsim.physics.model import build_model
+from dexsim.physics.physics import BACKENDS, Physics, choose_backend
+from dexsim.physics.interface import PhysicsState, StepResult
+from dexsim.registry import TASKS
+from dexsim.tasks.placement import palm_height
+from dexsim_ppo import evaluate_policy, load_policy
 
-WAYS = {"closed": ("jax", "closed"), "mjx": ("jax", "mjx"), "c": ("c", "closed")}
+MOTIONS = ("grip", "slide", "roll", "drop")
+CONVERGED = {"iterations": 50, "line_search": 50}
+STIFFNESS, DAMPING, REACH = 3.0, 0.1, 0.3  # Nm/rad, Nm s/rad, rad
 TOUCHING = 0.01  # N
+MEASURES = ("held", "r_resultant", "force_error_n", "successes_per_minute", "kept_to_the_end")  # of policies
+GAP = 1e-4  # m between palm and object: without one the first contact hangs on the last digit
+NUDGE = 1e-6  # m, and of each part of the quaternion
+CLOSING, TRIES = 100, 6  # sub-steps in which fingers close for a grip, and attempts with one object
 
 
-def grips(env: Env, policy: Policy, count: int, ticks: list[int]) -> State:
-    """States [count times len(ticks)] of grips that are as old as `ticks`."""
-    state = jit(jax.vmap(env.reset), backend="c")(jax.random.split(jax.random.key(0), count))
-    step, memory, found = jit(jax.vmap(env.step), backend="c"), policy.begin(count), []
-    for tick in range(max(ticks)):
-        memory, action = policy.act(memory, state.obs["actor"])
-        state = step(state, action)
-        if tick + 1 in ticks:
-            found.append(state)
-    return jax.tree.map(lambda *parts: jnp.concatenate(parts), *found)
+@pytree_dataclass
+class Begin:
+    """Where motions begin, [B, ...] each."""
+
+    object: ObjectParams
+    state: PhysicsState
+    target: jax.Array  # [J] rad, of the joints
+    push: jax.Array  # [3] N on the object: what turns the scene's gravity into the motion's
 
 
-def physics_tick(env: Env, way: str, **changes):
-    """`tick(state)`: the state and the force [B, F, 3] N on the fingers after a tick of an engine, joints held."""
-    backend, contacts = WAYS[way]
-    config, task = dataclasses.replace(env.config.physics, contacts=contacts, **changes), env.task
-    physics = Physics(
-        env.hand, task.slots, task.largest, config, gravity=task.gravity, backend=backend, skin=env.config.skin
-    )
+@dataclasses.dataclass
+class Trace:
+    """What a motion was, [T, B, ...] each, at the end of every control tick."""
 
-    def one(s: State):
-        target, valid = s.joint_target, jnp.ones((), bool)
-        law = env.motors.law(
-            s.episode.hand, JointCommand(action=0 * target, target=target, previous=target, valid=valid)
+    place: np.ndarray  # [3] m
+    quat: np.ndarray  # [4]
+    force: np.ndarray  # [F + 1, 3] N: on each finger at that moment, and on the object by the hand, mean of the tick
+
+
+class Motions:
+    """Motions of one task's objects.
+
+    Args:
+      task: its name.
+      starts: of each motion and shape.
+      seconds: that motions last.
+    """
+
+    def __init__(self, task: str, starts: int, seconds: float):
+        shapes = len(TASKS[task].config().objects.shapes)
+        config = dataclasses.replace(TASKS[task].config(), pool_size=max(2 * shapes * starts, 16))
+        self.env: Env = dexsim.make(task, config)
+        self.task, self.ticks = task, max(round(seconds / self.env.control_period), 1)
+        self.exact = self.physics("auto", CONVERGED)
+        rules, physics = self.env.task, self.exact.config
+        self.template = build_model(self.env.hand, rules.slots, rules.largest, physics, rules.gravity, "c")
+        pool, index = self.env.pool, np.asarray(self.env.pool.object.shape_index)
+        names = {shape: getattr(config, "object", "") or self.env.task.shape_names[shape] for shape in np.unique(index)}
+        self.cases, begins = list[tuple[str, str]](), list[Begin]()
+        for motion in MOTIONS:
+            for shape in names:
+                rows = np.flatnonzero(index == shape)
+                for row in rows if motion == "grip" else rows[:starts]:
+                    begin = self._begin(motion, jax.tree.map(lambda x, r=row: np.asarray(x)[r], pool))
+                    if begin is not None and self.cases.count((motion, names[shape])) < starts:
+                        self.cases.append((motion, names[shape]))
+                        begins.append(begin)
+        self.begin: Begin = jax.tree.map(lambda *rows: jnp.stack([jnp.asarray(x, x.dtype) for x in rows]), *begins)
+
+    def physics(self, backend: str, changes: dict[str, int]) -> Physics:
+        """The scene on an engine, with these solver iterations."""
+        config, task = dataclasses.replace(self.env.config.physics, **changes), self.env.task
+        return Physics(
+            self.env.hand,
+            task.slots,
+            task.largest,
+            config,
+            gravity=task.gravity,
+            backend=backend,
+            num_envs=len(getattr(self, "cases", ())),
         )
-        return physics.advance_motors(s.episode.object, s.physics, law, s.gear, jnp.zeros(3), s.episode.hand.cover)[:2]
 
-    return jit(jax.vmap(one), backend=backend)
+    def _begin(self, motion: str, start: Any) -> Begin | None:
+        """A motion from a start state of the task; None for a grip that does not hold."""
+        scene, hand = self.exact.scene, self.env.hand
+        object = dataclasses.replace(start.object, com=np.zeros(3, np.float32))
+        qpos, qvel = np.array(start.qpos, np.float64), np.zeros(scene.model.nv)
+        target, place = qpos[scene.joint_qpos].copy(), scene.object_qpos[:3]
+        gravity = np.array([9.81 if motion == "grip" else -9.81, 0.0, 0.0])
+        push = np.float32(object.mass * (gravity - np.asarray(self.env.task.gravity)))
+        if motion == "drop":
+            qpos[place[0]] += 0.01
+        if motion in ("slide", "roll"):
+            target = np.clip(0.0, hand.joint_lower, hand.joint_upper)
+            qpos[scene.joint_qpos] = target
+            down = np.float32([-1.0, 0.0, 0.0])
+            height = float(extent(object.size, object.position, object.active, down, object.kinds, object.quat))
+            # Where palms are half-spaces nothing else of the hand is near; boxes have the palm's middle.
+            beside = (0.0, -0.5) if len(scene.slots) > 1 else (0.0, 0.085)
+            # Boxes that are parallel to each other are a special case, whose contacts hang on the last digit.
+            heading = 0.1 if motion == "slide" else 0.0
+            qpos[scene.object_qpos] = palm_height(hand) + height + GAP, *beside, np.cos(heading), np.sin(heading), 0, 0
+            speed = 0.3 if motion == "slide" else 0.2
+            qvel[scene.object_dof] = 0, speed, 0, 0, 0, 0 if motion == "slide" else speed / height
+        begin = Begin(object, PhysicsState(qpos, qvel, np.zeros(scene.model.nv)), target, push)
+        if motion == "grip":
+            tries = (self._closed(begin, np.random.default_rng(seed)) for seed in range(TRIES))
+            begin = next((found for found in tries if found), None)
+            if begin is None:
+                return None
+        single = jax.tree.map(np.float32, (begin.state, begin.target))
+        return dataclasses.replace(begin, state=single[0], target=single[1])
+
+    def _closed(self, begin: Begin, rng: np.random.Generator) -> Begin | None:
+        """Fingers closed round the object, which weighs nothing until they are; None if they do not hold it."""
+        hand, scene = self.env.hand, self.exact.scene
+        free = -begin.object.mass * np.asarray(self.env.task.gravity)
+        target = np.array(begin.target)
+        for fingers, most in ((range(1), 0.5), (range(1, hand.num_fingers), 0.8)):
+            joints = flexion_joints(hand, fingers)
+            target[joints] += rng.uniform(0.3, most, len(joints))
+        begin = dataclasses.replace(begin, target=np.clip(target, hand.joint_lower, hand.joint_upper))
+        model = self.model(begin)
+        data = self._run(dataclasses.replace(begin, push=free), model, CLOSING)
+        data = self._run(begin, model, CLOSING // 2, data)
+        touching = np.linalg.norm(self._finger_force(model, data), axis=-1) > 0.3
+        if touching.sum() < 2 or np.linalg.norm(data.qvel[scene.object_dof[:3]]) > 0.03:
+            return None
+        state = PhysicsState(data.qpos.copy(), data.qvel.copy(), data.qacc_warmstart.copy())
+        return dataclasses.replace(begin, state=state)
+
+    # --- the reference --------------------------------------------------------------------------
+
+    def model(self, begin: Begin) -> mujoco.MjModel:
+        """C MuJoCo's model of one row."""
+        scene, model = self.exact.scene, copy.copy(self.template)
+        model.opt.tolerance = 1e-12
+        # The compiler lets C MuJoCo skip offsets that are zero in the template. Objects bring others.
+        model.geom_sameframe[scene.object_geoms] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
+        model.body_sameframe[scene.object_body] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
+        for name, values in self.exact.configure(begin.object).items():
+            getattr(model, name)[:] = values
+        model.body_subtreemass[scene.object_body] = begin.object.mass
+        return model
+
+    def _run(self, begin: Begin, model: mujoco.MjModel, count: int, data: mujoco.MjData | None = None):
+        """`count` sub-steps of C MuJoCo."""
+        scene = self.exact.scene
+        if data is None:
+            data = mujoco.MjData(model)
+            data.qpos[:], data.qvel[:] = begin.state.qpos, begin.state.qvel
+            data.qacc_warmstart[:] = begin.state.warmstart
+        data.xfrc_applied[scene.object_body, :3] = begin.push
+        for _ in range(count):
+            position, velocity = data.qpos[scene.joint_qpos], data.qvel[scene.joint_dof]
+            reach = np.clip(begin.target - position, -REACH, REACH)
+            limit = self.env.hand.torque_limit
+            data.qfrc_applied[scene.joint_dof] = np.clip(STIFFNESS * reach - DAMPING * velocity, -limit, limit)
+            mujoco.mj_step(model, data)
+        return data
+
+    def reference(self, nudge: float = 0.0) -> Trace:
+        """All motions by `mujoco` alone."""
+        traces = []
+        for row in range(len(self.cases)):
+            begin = jax.tree.map(lambda x, r=row: np.asarray(x)[r], self.begin)
+            qpos = np.array(begin.state.qpos, np.float64)
+            qpos[self.exact.object_qpos] += nudge
+            begin = dataclasses.replace(begin, state=dataclasses.replace(begin.state, qpos=qpos))
+            model, data, ticks = self.model(begin), None, []
+            for _ in range(self.ticks):
+                data = self._run(begin, model, self.env.config.physics.substeps, data)
+                ticks.append((data.qpos.copy(), data.qvel.copy(), self._finger_force(model, data)))
+            traces.append([np.stack(x) for x in zip(*ticks, strict=True)])
+        return self._trace(*(np.stack(x, 1) for x in zip(*traces, strict=True)))
+
+    def _finger_force(self, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+        """Force of the object on each finger [F, 3] N: a sum over `mj_contactForce`."""
+        scene, wrench = self.exact.scene, np.zeros(6)
+        total, tips = np.zeros((len(scene.tip_bodies), 3)), scene.tip_bodies.tolist()
+        for index, contact in enumerate(data.contact):
+            first, second = (int(model.geom_bodyid[geom]) for geom in contact.geom)
+            if scene.object_body in (first, second):
+                mujoco.mj_contactForce(model, data, index, wrench)
+                force = contact.frame.reshape(3, 3).T @ wrench[:3]  # of the first on the second
+                for body, sign in ((second, 1.0), (first, -1.0)):
+                    if body in tips:
+                        total[tips.index(body)] += sign * force
+        return total
+
+    # --- the engines ----------------------------------------------------------------------------
+
+    def run(self, backend: str, changes: dict[str, int]) -> Trace:
+        """All motions on an engine."""
+        physics, limit = self.physics(backend, changes), jnp.asarray(self.env.hand.torque_limit)
+
+        def tick(begin: Begin) -> StepResult:
+            def motors(substep: jax.Array, position: jax.Array, velocity: jax.Array) -> jax.Array:
+                reach = jnp.clip(begin.target - position, -REACH, REACH)
+                return jnp.clip(STIFFNESS * reach - DAMPING * velocity, -limit, limit)
+
+            return physics.advance(motors, begin.object, begin.state, begin.push)
+
+        def all_ticks(begin: Begin):
+            def body(state: PhysicsState, _: None):
+                after, force = jax.vmap(tick)(dataclasses.replace(begin, state=state))
+                return after, (after.qpos, after.qvel, force)
+
+            return jax.lax.scan(body, begin.state, length=self.ticks)[1]
+
+        found = jit(all_ticks, backend=backend)(self.begin)
+        return self._trace(*(np.asarray(x, np.float64) for x in found))
+
+    def _trace(self, qpos: np.ndarray, qvel: np.ndarray, finger_force: np.ndarray) -> Trace:
+        physics, begin = self.exact, self.begin
+        velocity = np.concatenate([np.asarray(begin.state.qvel)[None], qvel])[..., physics.object_dof[:3]]
+        acceleration = np.diff(velocity, axis=0) / self.env.control_period - np.asarray(self.env.task.gravity)
+        on_object = np.asarray(begin.object.mass)[:, None] * acceleration - np.asarray(begin.push)
+        place, quat = np.split(qpos[..., physics.object_qpos], [3], -1)
+        return Trace(place, quat, np.concatenate([finger_force, on_object[:, :, None]], 2))
+
+    def compare(self, found: Trace, wanted: Trace) -> list[dict[str, Any]]:
+        """A row for each motion and shape: how far an engine's motions are from others."""
+        place = 1e3 * np.linalg.norm(found.place - wanted.place, axis=-1)
+        chord = np.minimum(*(np.linalg.norm(found.quat - sign * wanted.quat, axis=-1) for sign in (1, -1)))
+        turn = np.degrees(4 * np.arcsin(np.minimum(chord / 2, 1)))
+        force, strength = np.linalg.norm(found.force - wanted.force, axis=-1), np.linalg.norm(wanted.force, axis=-1)
+        touching, rows = np.maximum(strength, np.linalg.norm(found.force, axis=-1)) > TOUCHING, []
+        for motion, shape in dict.fromkeys(self.cases):
+            mine = [case == (motion, shape) for case in self.cases]
+            row: dict[str, Any] = {"task": self.task, "motion": motion, "shape": shape, "n": sum(mine)}
+            touched = touching[:, mine]
+            row["force_n"] = float(strength[:, mine][touched].mean())
+            for name, values in (
+                ("place_mm", place[:, mine]),
+                ("turn_deg", turn[:, mine]),
+                ("force_error_n", force[:, mine][touched]),
+            ):
+                row |= {f"{name}_p95": float(np.percentile(values, 95)), f"{name}_max": float(values.max())}
+            rows.append(row)
+        return rows
 
 
-def forces(env: Env, state: State, way: str) -> np.ndarray:
-    """Force [B, F, 3] N on the fingers after one sub-step of an engine, converged."""
-    return np.asarray(physics_tick(env, way, substeps=1, iterations=50, line_search=50)(state)[1])
+def policy_row(name: str, backend: str, converged: bool, episodes: int, seconds: float) -> dict[str, Any]:
+    """What a shipped policy reaches in the same episodes on an engine; `seconds` 0 for the task's own length."""
+    policy = load_policy(name)
+    changes = [f"pool_size={max(episodes, 64)}"] + [f"evaluation_seconds={seconds}"] * bool(seconds)
+    if converged:
+        changes += [f"physics.{field}={value}" for field, value in CONVERGED.items()]
+    policy = dataclasses.replace(policy, env_config=override(policy.env_config, changes))
+    env = policy.build_env(backend=backend, num_envs=episodes)
+    task = evaluate_policy(policy, env=env, episodes=episodes, chunk=episodes, baseline=False)["task"]
+    row = {"policy": name, "backend": backend, "converged": converged, "episodes": episodes, "seconds": task["seconds"]}
+    for key in MEASURES:
+        if key in task:
+            row[key] = task[key]["r" if key == "r_resultant" else "mean"]
+            row[f"{key}_ci95"] = [task[key]["low"], task[key]["high"]]
+    return row | {"non_finite": task["non_finite"]}
 
 
-def speeds(env: Env, state: State, ways: list[str], repeats: int) -> dict[str, dict[str, float]]:
-    """By engine: control ticks a second, their spread, and seconds to the first result."""
-    ticks, times, first = {}, {way: [] for way in ways}, {}
-    for way in ways:
-        start = time.perf_counter()
-        ticks[way] = physics_tick(env, way)
-        jax.block_until_ready(ticks[way](state))
-        first[way] = time.perf_counter() - start
-    for _ in range(repeats):
-        for way, tick in ticks.items():
-            times[way].append(seconds(tick, state)[0])
-    count = len(state.tick)
-    return {
-        way: {
-            "ticks_per_s": round(count / statistics.median(taken)),
-            "slowest_over_fastest": round(max(taken) / min(taken), 2),
-            "first_s": round(first[way], 1),
-        }
-        for way, taken in times.items()
-    }
-
-
-def compare(found: np.ndarray, wanted: np.ndarray) -> dict[str, float]:
-    """How far the forces [B, F, 3] N of fingers that touch by either are apart, and how strong they are."""
-    strength = np.linalg.norm(wanted, axis=-1)
-    touching = np.maximum(strength, np.linalg.norm(found, axis=-1)) > TOUCHING
-    apart = np.linalg.norm(found - wanted, axis=-1)[touching]
-    middle, most = np.percentile(apart, [50, 95])
-    return {
-        "n": int(touching.sum()),
-        "force_n": float(strength[touching].mean()),
-        "median_n": float(middle),
-        "p95_n": float(most),
-        "max_n": float(apart.max()),
-    }
-
-
-def run_grips(options: argparse.Namespace) -> None:
-    """The command `grips`."""
-    policy = load_policy("grasp")
-    env = policy.make_env(num_envs=options.num_envs, backend="c")
-    state = grips(env, policy, options.num_envs, options.ticks)
-    shape, wanted = np.asarray(state.episode.object.shape_index), forces(env, state, "c")
-    for way in options.ways:
-        found = forces(env, state, way)
-        for index, name in enumerate(SHAPES):
-            show({"way": way, "shape": name} | compare(found[shape == index], wanted[shape == index]))
-    if options.repeats:
-        for way, row in speeds(env, state, [*options.ways, "c"], options.repeats).items():
-            show({"way": way, "environments": len(shape)} | row)
-
-
-def run_motions(options: argparse.Namespace) -> None:
+def motions(options: argparse.Namespace) -> list[dict[str, Any]]:
     """The command `motions`."""
     rows = []
     for task in options.tasks:
-        bench = engine_motions.Bench(task, options.starts, options.seconds)
-        wanted = bench.reference()
-        found = {("nudged", True): lambda bench=bench: bench.reference(engine_motions.NUDGE)}
+        bench = Motions(task, options.starts, options.seconds)
+        reference = bench.reference()
+        runs = {("nudged", True): lambda bench=bench: bench.reference(NUDGE)}
         for backend in options.backends:
             for converged in (False, True):
-                changes = engine_motions.CONVERGED if converged else {}
-                found[backend, converged] = functools.partial(bench.run, backend, changes)
-        for (engine, converged), run in found.items():
-            for row in bench.compare(run(), wanted):
-                rows.append({"engine": engine, "converged": converged} | row)
+                runs[backend, converged] = functools.partial(bench.run, backend, CONVERGED if converged else {})
+        for (engine, converged), run in runs.items():
+            for row in bench.compare(run(), reference):
+                rows.append({"backend": engine, "converged": converged} | row)
                 show(rows[-1])
     for title, name in (("object's place, mm", "place_mm"), ("forces, N", "force_error_n")):
         cells = [
-            (f"{r['motion']}, {r['shape']}", way(r), f"{r[name + '_p95']:.2g} / {r[name + '_max']:.2g}") for r in rows
+            (f"{r['motion']}, {r['shape']}", column(r), f"{r[name + '_p95']:.2g} / {r[name + '_max']:.2g}")
+            for r in rows
         ]
         print(table(f"{title}: 95 % / largest", cells))
+    return rows
 
 
-def run_policies(options: argparse.Namespace) -> None:
+def policies(options: argparse.Namespace) -> list[dict[str, Any]]:
     """The command `policies`."""
-    cells = []
+    rows, cells = [], []
     for name in options.policies:
         for backend in options.backends:
             for converged in (False, True):
-                row = engine_policies.measure(name, backend, converged, options.episodes, options.seconds)
+                row = policy_row(name, backend, converged, options.episodes, options.seconds)
+                rows.append(row)
                 show(row)
-                for key in ("held", "r", "successes_per_minute", "kept"):
-                    if key in row:
+                for key in MEASURES:
+                    if row.get(key) is not None:
                         low, high = row[f"{key}_ci95"]
-                        text = "" if row[key] is None else f"{row[key]:.3g} ({low:.3g}–{high:.3g})"
-                        cells.append((f"{name}, {key}", way(row), text))
+                        cells.append((f"{name}, {key}", column(row), f"{row[key]:.3g} ({low:.3g}–{high:.3g})"))
     print(table("policy", cells))
+    return rows
 
 
-def way(row: dict) -> str:
-    """An engine and its iterations, as a column's title."""
-    return row.get("engine", row.get("backend")) + (", converged" if row["converged"] else "")
+def column(row: dict[str, Any]) -> str:
+    """An engine and its iterations."""
+    return row["backend"] + (", converged" if row["converged"] else "")
 
 
-def show(row: dict) -> None:
+def show(row: dict[str, Any]) -> None:
     """A JSON line."""
     rounded = {key: round(value, 5) if isinstance(value, float) else value for key, value in row.items()}
     print(json.dumps(rounded), flush=True)
@@ -179,37 +354,45 @@ def show(row: dict) -> None:
 def table(title: str, cells: list[tuple[str, str, str]]) -> str:
     """Markdown of (row, column, text)."""
     rows, columns = (list(dict.fromkeys(x)) for x in list(zip(*cells, strict=True))[:2])
-    found = {(row, column): text for row, column, text in cells}
+    texts = {(row, column): text for row, column, text in cells}
     lines = [[title, *columns], ["---"] * (1 + len(columns))]
-    lines += [[row, *(found.get((row, column), "") for column in columns)] for row in rows]
+    lines += [[row, *(texts.get((row, column), "") for column in columns)] for row in rows]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
 
 
-def main(argv: list[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+def usable() -> list[str]:
+    """The engines that run on this machine and device."""
+    names = []
+    for name in BACKENDS:
+        with contextlib.suppress(ConfigError):
+            names.append(choose_backend(name))
+    return names
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command. Returns its exit code."""
+    parser, engines = argparse.ArgumentParser(description=__doc__.splitlines()[0]), usable()
     commands = parser.add_subparsers(required=True)
-    command = commands.add_parser("grips")
-    command.set_defaults(run=run_grips)
-    command.add_argument("--num-envs", type=int, default=200)
-    command.add_argument("--ticks", type=int, nargs="+", default=[20, 40, 80], help="age of the grips")
-    command.add_argument("--repeats", type=int, default=7, help="of the timing; 0 leaves it out")
-    command.add_argument("--ways", nargs="+", default=["closed", "mjx"], choices=list(WAYS))
     command = commands.add_parser("motions")
-    command.set_defaults(run=run_motions)
+    command.set_defaults(run=motions)
     command.add_argument("--tasks", nargs="+", default=["grasp", "rotate"])
     command.add_argument("--starts", type=int, default=4, help="of each motion and shape")
     command.add_argument("--seconds", type=float, default=0.6)
-    command.add_argument("--backends", nargs="+", default=list(BACKENDS), choices=list(BACKENDS))
     command = commands.add_parser("policies")
-    command.set_defaults(run=run_policies)
+    command.set_defaults(run=policies)
     command.add_argument("--policies", nargs="+", default=["grasp", "rotate"])
     command.add_argument("--episodes", type=int, default=64)
     command.add_argument("--seconds", type=float, default=0.0, help="length of an episode; 0 for the task's own")
-    command.add_argument("--backends", nargs="+", default=list(BACKENDS), choices=list(BACKENDS))
+    for command in commands.choices.values():
+        command.add_argument("--backends", nargs="+", default=engines, choices=engines)
+        command.add_argument("--json", type=Path, help="file for all rows")
     options = parser.parse_args(argv)
-    enable_caches()
-    options.run(options)
+    cli.enable_caches()
+    rows = options.run(options)
+    if options.json:
+        cli.write_json(options.json, {"rows": rows} | cli.environment_report())
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    cli.run(main)

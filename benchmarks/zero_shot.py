@@ -2,32 +2,36 @@
 
     python benchmarks/zero_shot.py --task rotate --trials 10
     python benchmarks/zero_shot.py --task grasp --trials 50 --parameters inside --set gear_play=0
-    python benchmarks/zero_shot.py --task grasp --trials 50 --seed 0 1 2 3 --processes 2
+    python benchmarks/zero_shot.py --task grasp --trials 50 --seed 0 1 2 3 --processes 2 --json grasp.json
     python benchmarks/zero_shot.py --task grasp --trials 25 --limit speed=20 --limit margin=0
     python benchmarks/zero_shot.py --task grasp --trials 20 --plant-model assets/plants/foreign_right.xml
-    python benchmarks/zero_shot.py --task rotate --trials 3 --real-time
 
 In virtual time (`dexsim_real.twin.virtual`): frames, emulated palm board, and the bridge's sensing, safety and
-controller run in one process, as fast as they compute. With `--real-time` hand and runner are processes of their own,
-as for a user (`trials.py`). The metrics use the true state, not the measurements of the bridge. Trial k of a seed does
-not depend on the other trials. A hand that does nothing gets the same trials, in virtual time.
+controller run in one process, as fast as they compute. The metrics use the true state, not the measurements of the
+bridge. Trial k of a seed does not depend on the other trials. A hand that does nothing gets the same trials.
 """
 
+import argparse
+import concurrent.futures
 import dataclasses
 import functools
 import itertools
+import multiprocessing
+import multiprocessing.connection
+import os
 import sys
+import threading
 import time
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from trials import real_trial
-from workers import pool
-from zero_shot_options import arguments
-from zero_shot_table import simulated, table
+from zero_shot_metrics import metrics, simulated, table
 
 from dexsim.core import cli
+from dexsim_real.control.limits import SafetyConfig
+from dexsim_real.twin.plant.parameters import KINDS, sample_trial
 
 TARGETS = {"grasp": "held 90 %, r 0.8", "rotate": "25.1 successes, 17.9 a minute, 84.3 s to fall"}
 COMMANDS = (0.0, 0.25, 0.5, 0.75, 1.0)
@@ -55,21 +59,13 @@ def load(name: str, idle: bool) -> tuple[Any, Any, Any]:
 
 
 def run_trial(options: dict[str, Any], seed: int, number: int) -> dict[str, Any]:
-    """The referee's report of one trial."""
+    """One trial: the referee's report, with the bridge's measurements as `bridge`."""
+    from dexsim_real.twin.plant.foreign.hand import hand_of
     from dexsim_real.twin.plant.shapes import SHAPES
+    from dexsim_real.twin.virtual import RunOptions, VirtualRun
 
     # As in the task's evaluation: five commands for each shape.
     command, shape = COMMANDS[number % len(COMMANDS)], SHAPES[number // len(COMMANDS) % len(SHAPES)]
-    one = real_trial if options.get("real_time") else virtual_trial
-    return one(options, seed, number, command, shape)
-
-
-def virtual_trial(options: dict[str, Any], seed: int, number: int, command: float, shape: str) -> dict[str, Any]:
-    """One trial in virtual time: the referee's report, with the bridge's measurements as `bridge`."""
-    from dexsim_real.control.limits import SafetyConfig
-    from dexsim_real.twin.plant.foreign.hand import hand_of
-    from dexsim_real.twin.virtual import RunOptions, VirtualRun
-
     hand, controller, calibration = load(options["policy"], options.get("idle", False))
     plant = hand_of(
         options.get("plant_model"),
@@ -83,13 +79,12 @@ def virtual_trial(options: dict[str, Any], seed: int, number: int, command: floa
         first=number,
         shape=shape,
     )
-    began = time.perf_counter()
-    limits = SafetyConfig(**options.get("limit", {}))
+    began, limits = time.perf_counter(), SafetyConfig(**options["limit"])
     run = VirtualRun(plant, controller, calibration, RunOptions(command, safety=options["safety"], limits=limits))
     if options["task"] == "grasp":
         run.trace = []
     report = run.run()
-    if run.trace:
+    if options["task"] == "grasp":
         report["total_torque"] = _measured_torque(run.trace, hand, report["window_s"])
     return report | {"wall": round(time.perf_counter() - began, 2)}
 
@@ -115,6 +110,24 @@ def run_all(options: dict[str, Any], trials: int, processes: int, show: bool) ->
         return [_shown(report, show) for report in workers.map(trial, seeds, numbers)]
 
 
+def pool(processes: int) -> concurrent.futures.ProcessPoolExecutor:
+    """Processes that end with this one. JAX does not support fork."""
+    context = multiprocessing.get_context("spawn")
+    return concurrent.futures.ProcessPoolExecutor(processes, context, initializer=_end_with_parent)
+
+
+def _end_with_parent() -> None:
+    """End this process when its parent is killed: the executor's queue would have it wait for ever."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def watch() -> None:
+        multiprocessing.connection.wait([parent.sentinel])
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
 def _shown(report: dict[str, Any], show: bool) -> dict[str, Any]:
     if show:
         result = (
@@ -122,133 +135,85 @@ def _shown(report: dict[str, Any], show: bool) -> dict[str, Any]:
             if report["task"] == "grasp"
             else f"{report['successes']:3d} successes ({report['paper_successes']} as the paper counts)"
         )
-        link, bridge = f"{report['wall']:.0f} s", report["bridge"]
-        if "exchanges" in bridge:
-            link += f", {bridge['unanswered']} of {bridge['exchanges']} exchanges unanswered, policy late p99 "
-            link += f"{bridge['policy_jitter']['p99_ms']:.1f} ms, simulated time slipped {bridge['slipped_s']:.2f} s"
-        print(
-            f"{report['trial']:4d}  {result}  {report['seconds']:7.2f} s  {report['end']}  ({link})",
-            file=sys.stderr,
-            flush=True,
-        )
+        line = f"{report['trial']:4d}  {result}  {report['seconds']:7.2f} s  {report['end']}  ({report['wall']:.0f} s)"
+        print(line, file=sys.stderr, flush=True)
     return report
 
 
-# --- metrics -------------------------------------------------------------------------------------
+def arguments(argv: Sequence[str] | None = None) -> argparse.Namespace:
+    """The options, checked before the first trial; `set` and `limit` are tables from name to value.
 
-
-def grasp_metrics(reports: list[dict[str, Any]], span: tuple[float, float]) -> dict[str, Any]:
-    """Success rate, force error over all trials, and correlation of the forces of held objects with the command.
-
-    Names, window and forces are those of the evaluation in simulation (`dexsim.tasks.grasp.report`); torques are as the
-    bridge measures them.
-
-    Args:
-      reports: the referee's, of trials.
-      span: N, target at command 0 and 1.
+    Raises:
+      DexsimError: a parameter, a limit or a policy that does not exist, or a value out of range.
+      OSError: the JSON file cannot be written.
     """
-    from dexsim.core.statistics import mean, proportion
-    from dexsim.force_loop import target_force
-    from dexsim.tasks.grasp.report import FORCES, correlations, force_error, pearson, saturates, slope
-
-    held = np.array([r["held"] for r in reports])
-    torque = ("total_torque",) if all("total_torque" in r for r in reports) else ()  # not with processes of their own
-    forces = {part: f"finger_{part}" for part in FORCES.values()}
-    names = (*forces.values(), "total_force", *torque, "torque_limited")
-    command, *columns = (np.array([r[name] for r in reports], float) for name in ("command", *names))
-    mean_of = dict(zip(names, columns, strict=True))
-    commanded = {part: mean_of[name] for part, name in forces.items()}
-    # A referee's means end with the trial; a lost object is not pressed for the rest of the window.
-    start, end = np.array([r["window_s"] for r in reports], float).T
-    lived = np.clip((np.array([r["seconds"] for r in reports], float) - start) / (end - start), 0.0, 1.0)
-    wanted = target_force(command, span)
-    by_command = [
-        {"command": float(c), "held": proportion(held[command == c])}
-        | {name: mean(mean_of[name][held & (command == c)]) for name in names}
-        | {"saturates": saturates(mean_of["torque_limited"][held & (command == c)])}
-        for c in np.unique(command)
-    ]
-    by_shape = [
-        {"shape": s, "held": proportion(held[[r["shape"] == s for r in reports]])}
-        for s in sorted({r["shape"] for r in reports})
-    ]
-    return {
-        "held": proportion(held),
-        "force_error_n": force_error(np.where(held, 1.0, lived) * commanded["force"], wanted),
-        **correlations(command, held, commanded),
-        **({"r_torque": pearson(command[held], mean_of["total_torque"][held])} if torque else {}),
-        "slope_force_n": slope(command[held], commanded["force"][held]),
-        **({"slope_torque": slope(command[held], mean_of["total_torque"][held])} if torque else {}),
-        "torque_limited": mean(mean_of["torque_limited"][held]),
-        "window_s": [float(start.min()), float(end.max())],
-        "by_command": by_command,
-        "by_shape": by_shape,
-    }
-
-
-def rotate_metrics(reports: list[dict[str, Any]]) -> dict[str, Any]:
-    """The paper's three metrics, with goals counted by the task's rule (spin limit) and by the paper's.
-
-    The pace is over all the time that trials lasted, time in which the hand was stuck included.
-    """
-    from dexsim.core.statistics import mean, proportion, ratio
-
-    count, paper, lived = (
-        np.array([r[name] for r in reports], float) for name in ("successes", "paper_successes", "seconds_to_fall")
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    add = parser.add_argument
+    add("--task", choices=("grasp", "rotate"), required=True)
+    add("--policy", help="policy file; by default the shipped policy of the task")
+    add("--trials", type=_whole(1), default=10, help="of each seed")
+    add("--seed", type=_whole(0), nargs="+", default=[0], help="the metrics are over the trials of all seeds")
+    add("--seconds", type=float, help="time limit of a trial in s; by default the task's (8 or 120)")
+    add("--parameters", choices=KINDS, default="outside", help="of hand and object: beside training's ranges, or in")
+    add("--plant-model", metavar="FILE", help="MJCF of another hand in place of the emulated one (docs/hardware.md)")
+    add(
+        "--set", type=_pair, action="append", default=[], metavar="NAME=VALUE", help="fix a parameter: a number or kind"
     )
-    return {
-        "successes": mean(count) | {"median": float(np.median(count)), "sorted": sorted(count.tolist())},
-        "paper_successes": mean(paper) | {"median": float(np.median(paper)), "sorted": sorted(paper.tolist())},
-        "successes_per_minute": ratio(count, lived / 60),
-        "seconds_to_fall": mean(lived),
-        "kept_to_the_end": proportion(np.array([not r["fell"] for r in reports])),
-        "joint_speed": mean(np.array([r["joint_speed"] for r in reports])),
-    }
+    add("--limit", type=_pair, action="append", default=[], metavar="NAME=VALUE", help="a safety limit of the bridge")
+    add("--no-safety", dest="safety", action="store_false", help="run without the bridge's safety limits")
+    add("--no-baseline", dest="baseline", action="store_false", help="no trials of a hand that does nothing")
+    add("--processes", type=_whole(1), default=1, help="trials at once")
+    add("--first", type=_whole(0), default=0, help="number of the first trial")
+    add("--json", type=Path, help="file for all results")
+    given = parser.parse_args(argv)
+    given.set, given.limit, given.policy = dict(given.set), dict(given.limit), given.policy or given.task
+    if given.seconds is not None and not 0.0 < given.seconds < np.inf:
+        parser.error(f"--seconds {given.seconds:g}: must be a time above 0 s")
+    sample_trial(given.task, np.random.default_rng(0), given.parameters, given.set)
+    if unknown := given.limit.keys() - vars(SafetyConfig()):
+        parser.error(f"--limit: the bridge has no limit {sorted(unknown)[0]!r}")
+    SafetyConfig(**given.limit)
+    if given.json:
+        cli.check_writable(given.json)  # All trials would be lost.
 
-
-def metrics(task: str, policy: str, reports: list[dict[str, Any]]) -> dict[str, Any]:
-    """The metrics of a policy's trials."""
-    if task == "rotate":
-        return rotate_metrics(reports)
     from dexsim_ppo.policy import load_policy
+    from dexsim_real.control.controller import prepare_jax
 
-    return grasp_metrics(reports, tuple(load_policy(policy).env_config["finger_force"]))
+    prepare_jax()  # As the trials need it, before anything is computed.
+    load_policy(given.policy, task=given.task)
+    return given
+
+
+def _whole(low: int) -> Any:
+    def number(text: str) -> int:
+        if (value := int(text)) < low:
+            raise argparse.ArgumentTypeError(f"{value}: must be at least {low}")
+        return value
+
+    return number
+
+
+def _pair(text: str) -> tuple[str, float | str]:
+    name, equals, value = text.partition("=")
+    if not name or not equals:
+        raise argparse.ArgumentTypeError(f"{text}: give NAME=VALUE")
+    return name, value if value in KINDS else float(value)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """The command. Returns its exit code."""
-    given = arguments(__doc__.splitlines()[0], argv)
-    options = {
-        "task": given.task,
-        "policy": given.policy or given.task,
-        "seed": given.seed,
-        "first": given.first,
-        "parameters": given.parameters,
-        "seconds": given.seconds,
-        "safety": given.safety,
-        "plant_model": given.plant_model,
-        "real_time": given.real_time,
-        "twin": given.twin,
-        "runner": given.runner,
-        "set": given.set,
-        "limit": given.limit,
-    }
-    reports = run_all(options, given.trials, given.processes, show=True)
-    still = (
-        run_all(options | {"idle": True, "real_time": False}, given.trials, given.processes, show=False)
-        if given.baseline
-        else []
-    )
-    here = metrics(given.task, options["policy"], reports)
-    idle = metrics(given.task, options["policy"], still) if still else {}
-    there = simulated(given.task, options["policy"])
-    if given.json:  # Before the output, whose reader may be gone.
+    options = vars(arguments(argv))
+    json, trials, processes, baseline = (options.pop(name) for name in ("json", "trials", "processes", "baseline"))
+    task, policy = options["task"], options["policy"]
+    reports = run_all(options, trials, processes, show=True)
+    still = run_all(options | {"idle": True}, trials, processes, show=False) if baseline else []
+    here, idle = metrics(task, policy, reports), metrics(task, policy, still) if still else {}
+    there = simulated(task, policy)
+    if json:  # Before the output, whose reader may be gone.
         found = {"options": options, "metrics": here, "simulation": there, "do_nothing": idle, "trials": reports}
-        cli.write_json(given.json, found)
-    print(
-        f"{given.task}: {len(reports)} trials{' in real time' * given.real_time}, parameters {given.parameters}, "
-        f"seed {' '.join(map(str, given.seed))}; targets {TARGETS[given.task]}"
-    )
+        cli.write_json(json, found | cli.environment_report())
+    seeds = " ".join(map(str, options["seed"]))
+    print(f"{task}: {len(reports)} trials, {options['parameters']}, seed {seeds}; targets {TARGETS[task]}")
     print(table(here, there, idle))
     return 0
 

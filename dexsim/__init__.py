@@ -11,48 +11,39 @@ Names are imported at first use, so that a program that only runs a policy loads
 from typing import TYPE_CHECKING
 
 from dexsim.core.door import open_door
-from dexsim.core.errors import (
-    AssetError,
-    CalibrationError,
-    CheckpointError,
-    ConfigError,
-    DexsimError,
-    DexsimWarning,
-    OldFileWarning,
-    OtherEnvWarning,
-)
 
 if TYPE_CHECKING:
     from dexsim.core.cli import enable_caches
     from dexsim.env.config import EnvConfig
     from dexsim.env.env import Env
-    from dexsim.env.state import State
-    from dexsim.env.task import Task
+    from dexsim.env.evaluation import Evaluation
+    from dexsim.env.snapshot import take_snapshot
+    from dexsim.env.state import Start, State
+    from dexsim.env.task import GroundTruth, Task
     from dexsim.hand.kinematics import Hand
     from dexsim.hand.load import load_hand
+    from dexsim.objects.config import ObjectConfig
     from dexsim.observation import Readings, observe
     from dexsim.registry import make, register
     from dexsim.render.render import draw_taxels, render_episode, render_frame
     from dexsim.task_spec import TaskSpec
-    from dexsim.tasks.grasp.config import GraspConfig
-    from dexsim.tasks.rotate.config import RotateConfig
+    from dexsim.tasks.grasp.config import GraspConfig, GraspReward
+    from dexsim.tasks.rotate.config import RotateConfig, RotateReward
 
 __version__ = "0.1.0"
 __all__ = [
-    "AssetError",
-    "CalibrationError",
-    "CheckpointError",
-    "ConfigError",
-    "DexsimError",
-    "DexsimWarning",
     "Env",
     "EnvConfig",
+    "Evaluation",
     "GraspConfig",
+    "GraspReward",
+    "GroundTruth",
     "Hand",
-    "OldFileWarning",
-    "OtherEnvWarning",
+    "ObjectConfig",
     "Readings",
     "RotateConfig",
+    "RotateReward",
+    "Start",
     "State",
     "Task",
     "TaskSpec",
@@ -64,6 +55,7 @@ __all__ = [
     "register",
     "render_episode",
     "render_frame",
+    "take_snapshot",
 ]
 
 __getattr__, __dir__ = open_door(
@@ -72,10 +64,16 @@ __getattr__, __dir__ = open_door(
     {
         "Env": "dexsim.env.env",
         "EnvConfig": "dexsim.env.config",
+        "Evaluation": "dexsim.env.evaluation",
         "GraspConfig": "dexsim.tasks.grasp.config",
+        "GraspReward": "dexsim.tasks.grasp.config",
+        "GroundTruth": "dexsim.env.task",
         "Hand": "dexsim.hand.kinematics",
+        "ObjectConfig": "dexsim.objects.config",
         "Readings": "dexsim.observation",
         "RotateConfig": "dexsim.tasks.rotate.config",
+        "RotateReward": "dexsim.tasks.rotate.config",
+        "Start": "dexsim.env.state",
         "State": "dexsim.env.state",
         "Task": "dexsim.env.task",
         "TaskSpec": "dexsim.task_spec",
@@ -87,5 +85,6 @@ __getattr__, __dir__ = open_door(
         "register": "dexsim.registry",
         "render_episode": "dexsim.render.render",
         "render_frame": "dexsim.render.render",
+        "take_snapshot": "dexsim.env.snapshot",
     },
 )

@@ -9,7 +9,6 @@ import numpy as np
 
 from dexsim.core.config import setting, validate
 from dexsim.force_loop import ForceLoop
-from dexsim.grip_reflex import GripReflex
 from dexsim.hand.kinematics import Hand, forward_kinematics, taxel_normals
 
 
@@ -21,14 +20,12 @@ class Control:
     """Largest change of a target in one tick: the target moves by action * step."""
     reach: float = setting(0.5, unit="rad", low=0.01, high=4.0)
     """Largest distance of a target from the measured angle: bounds windup and grip torque."""
-    recall: str = setting("action", choices=("action", "target"))
+    last_action_encoding: str = setting("action", choices=("action", "target"))
     """What an observation's last action is: the action itself, or the joint targets that it led to,
     as a place in each joint's range. A policy of steps that does not see its targets cannot know how
     hard it presses."""
     force: ForceLoop = setting(ForceLoop())
     """Correction of the force command by the estimated force, for tasks that have one."""
-    reflex: GripReflex = setting(GripReflex())
-    """Correction of each finger's joint target by its estimated force, for tasks with a force command."""
 
     def __post_init__(self):
         validate(self)
@@ -45,11 +42,6 @@ def move_target(control: Control, hand: Hand, target: jax.Array, action: jax.Arr
     target = target + control.step * action
     target = jnp.clip(target, measured - control.reach, measured + control.reach)
     return jnp.clip(target, hand.joint_lower, hand.joint_upper)
-
-
-def reflex_target(hand: Hand, angle: jax.Array) -> jax.Array:
-    """What the reflex's angles [F] rad add to the joint targets: [J] rad on the fingers' root joints."""
-    return jnp.zeros(hand.num_joints).at[hand.root_joint].set(closing(hand) * angle)
 
 
 @functools.cache
@@ -69,7 +61,7 @@ def closing(hand: Hand) -> np.ndarray:
 
 def observed_action(control: Control, hand: Hand, action: jax.Array, target: jax.Array) -> jax.Array:
     """The last action [J] in [-1, 1] as an observation shows it; `target` [J] rad is its outcome."""
-    if control.recall == "action":
+    if control.last_action_encoding == "action":
         return action
     middle = (hand.joint_upper + hand.joint_lower) / 2
     return (target - middle) / ((hand.joint_upper - hand.joint_lower) / 2)

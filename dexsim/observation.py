@@ -40,13 +40,6 @@ class Readings:
 
 
 @pytree_dataclass
-class ThreeAxisReadings(Readings):
-    """Readings of a hand whose taxels also feel along the skin."""
-
-    tangential_force: jax.Array  # [F, 3] N, sum over a finger's taxels, palm frame
-
-
-@pytree_dataclass
 class Motion:
     """What only a simulator knows: the critic's part of an observation."""
 
@@ -80,8 +73,8 @@ class ObservationField:
     size: Callable[[Hand, str], int]
     """How many values, for a hand and an encoding of orientations."""
     source: str
-    """Who measures it on a hand: "hand", "camera", "imu", or "three-axis taxels", which our hand has not; "user" and
-    "policy" know it themselves; "simulator" alone knows the rest, which is for critics."""
+    """Who measures it on a hand: "hand", "camera" or "imu"; "user" and "policy" know it themselves; "simulator" alone
+    knows the rest, which is for critics."""
     compute: Callable[[Features], jax.Array]
     """Its values [size]."""
     scale: float | None = None
@@ -95,11 +88,6 @@ class LayoutEntry(NamedTuple):
     name: str
     size: int
     scale: float | None = None
-
-
-def _tangential_force(features: Features) -> jax.Array:
-    assert isinstance(features.readings, ThreeAxisReadings), "three-axis taxels are off"
-    return features.readings.tangential_force.ravel()
 
 
 def _encode(quat: jax.Array, encoding: str) -> jax.Array:
@@ -180,13 +168,6 @@ FIELDS: dict[str, ObservationField] = {
             compute=lambda f: f.finger_force(),
         ),
         ObservationField(
-            name="tangential_force",
-            size=_per_finger(3),
-            scale=2.0,
-            source="three-axis taxels",
-            compute=_tangential_force,
-        ),
-        ObservationField(
             name="fingertip_position",
             size=_per_finger(3),
             source="hand",
@@ -253,8 +234,7 @@ class ObservationConfig:
     leave_out: tuple[str, ...] = setting((), choices=("contact_force", "contact_centre", "relative_orientation"))
     """Observation fields that the actor goes without."""
     add: tuple[str, ...] = setting((), choices=FIELDS)
-    """Measured fields beyond the task's own, for actor and critic; `tangential_force` turns on
-    `Sensing.three_axis`."""
+    """Measured fields beyond the task's own, for actor and critic."""
     add_critic: tuple[str, ...] = setting((), choices=FIELDS)
     """Fields that only the critic gets on top; those that only a simulator knows, too."""
     force: ForceEstimate = setting(ForceEstimate())
@@ -318,7 +298,12 @@ def group_configs(config: ObservationConfig) -> tuple[ObservationConfig, Observa
 
 
 def observe(
-    hand: Hand, readings: Readings, names: tuple[str, ...], config: ObservationConfig, motion: Motion | None = None
+    hand: Hand,
+    readings: Readings,
+    names: tuple[str, ...],
+    config: ObservationConfig,
+    motion: Motion | None = None,
+    pose: HandPose | None = None,
 ) -> jax.Array:
     """The observation vector: the only road from measurements to a policy.
 
@@ -329,11 +314,13 @@ def observe(
         `ROTATE_CRITIC` (149).
       config: what to leave out and how to encode.
       motion: for a critic whose fields ask for it.
+      pose: of the hand at the readings' joint angles, where it is known already.
 
     Returns:
       [sum of the layout's sizes] float32, not normalised.
     """
-    pose = forward_kinematics(hand, readings.joint_position)
+    if pose is None:
+        pose = forward_kinematics(hand, readings.joint_position)
     force, centre = reduce_touch_links(readings.taxel_force, hand, pose, config.weighting)
     features = Features(
         readings=readings,

@@ -21,7 +21,6 @@ NOMINAL = {
     "stiffness_factor": 1.0,
     "damping_factor": 1.0,
     "dead_band": 0.0,
-    "gear_gap": 0.0,
     "torque_factor": 1.0,
     "speed_factor": 1.0,
     "efficiency": 1.0,
@@ -35,7 +34,7 @@ NOMINAL = {
     "torque_gain": 1.0,
     "taxel_gain": 1.0,
     "gravity_tilt": 0.0,
-    "cover": 0.0,
+    "pad_thickness_delta": 0.0,
 }
 """The nominal hand: a value for every range of `Randomization` but the ripples' number, which has none."""
 _DEVIATIONS = ("encoder_bias", "gravity_tilt")  # given by one number, the largest deviation to either side
@@ -59,8 +58,8 @@ _KEYS = (
     "ripple_phase",
     "coulomb_friction",
     "viscous_friction",
-    "gear_gap",
-    "cover",
+    "",  # free: without it the next one would be drawn by another key
+    "pad_thickness_delta",
 )
 """Which of an episode's keys draws what."""
 
@@ -80,16 +79,8 @@ class Randomization:
     """Factor on k_p."""
     damping_factor: tuple[float, float] = setting((0.7, 1.3), unit="1", low=0.0, high=10.0)
     """Factor on k_d."""
-    backlash: str = setting("dead_band", choices=("dead_band", "gear_play"))
-    """The paper's dead-band, or a gear with play: a rotor with a state of its own before the gap."""
     dead_band: tuple[float, float] = setting((0.0, 0.01), unit="rad", low=0.0, high=0.2)
-    """Backlash threshold epsilon; nominal 0. Not used with gear play."""
-    gear_gap: tuple[float, float] = setting((0.0, 0.02), unit="rad", low=0.0, high=0.2)
-    """Lost motion of a joint at a held rotor, end to end; nominal 0. Only with gear play."""
-    rotor_share: float = setting(0.3, unit="1", low=0.05, high=0.5)
-    """Share of a joint's armature that is the rotor, before the gap. Only with gear play."""
-    tooth_stiffness: float = setting(200.0, unit="Nm/rad", low=1.0, high=1e5)
-    """Stiffness of the gear at either end of the gap. Only with gear play."""
+    """Backlash threshold epsilon; nominal 0."""
     torque_factor: tuple[float, float] = setting((0.9, 1.1), unit="1", low=0.05, high=5.0)
     """Factor on the stall torque."""
     speed_factor: tuple[float, float] = setting((0.9, 1.1), unit="1", low=0.05, high=5.0)
@@ -119,8 +110,8 @@ class Randomization:
     """Factor on a finger's taxel readings."""
     gravity_tilt: float = setting(0.1, unit="rad", low=0.0, high=1.6)
     """Largest tilt of the hand against gravity: pitch and roll (`tilted_down`)."""
-    cover: tuple[float, float] = setting((-0.003, 0.0), unit="m", low=-0.01, high=0.01)
-    """Change of the rubber's thickness over all fingertips, for solver and taxels alike (`PhysicsConfig.cover`,
+    pad_thickness_delta: tuple[float, float] = setting((-0.003, 0.0), unit="m", low=-0.01, high=0.01)
+    """Change of the rubber's thickness over all fingertips, for solver and taxels alike (`PhysicsConfig.pad_thickness`,
     `Skin.margin`); nominal 0. The maker's fingertip ends within 0.5 mm of the taxels, soft rubber yields before it
     bears load: how far out a contact begins is not known. Thicknesses below 0 count as 0."""
     extremes: float = setting(0.0, unit="1", low=0.0, high=1.0)
@@ -160,12 +151,16 @@ class HandParams:
     actuator: Actuator  # [J] leaves
     latency: jax.Array  # [J] int32, sub-steps
     sensing_latency: jax.Array  # [] fraction of a control tick
-    encoder_bias: jax.Array  # [J] rad, the same as in `actuator`
     torque_gain: jax.Array  # [J]
     taxel_gain: jax.Array  # [F, 1]
     tilt: jax.Array  # [2] rad
-    cover: jax.Array  # [] m, on top of `PhysicsConfig.cover`
-    gear_gap: jax.Array | None = None  # [J] rad, with gear play
+    pad_thickness_delta: jax.Array  # [] m, on top of `PhysicsConfig.pad_thickness`
+
+    @property
+    def encoder_bias(self) -> jax.Array:
+        """[J] rad, in readings as in the motors' own loops."""
+        assert self.actuator.encoder_bias is not None
+        return self.actuator.encoder_bias
 
 
 def sample_hand(
@@ -188,14 +183,14 @@ def sample_hand(
     """
     drawn = _draw(key, config, hand, config.scale * scale)
     values = {name: row[: hand.num_joints] for name, row in drawn.items()}
-    joints, geared = (hand.num_joints,), config.backlash == "gear_play"
+    joints = (hand.num_joints,)
     count_key, phase_key = jax.random.split(key, len(_KEYS))[_KEYS.index("ripple_count") :][:2]
     low, high = config.ripple_count
     limit = jnp.asarray(hand.torque_limit)
     actuator = Actuator(
         stiffness=config.stiffness * values["stiffness_factor"],
         damping=config.damping * values["damping_factor"],
-        dead_band=jnp.zeros(joints) if geared else values["dead_band"],
+        dead_band=values["dead_band"],
         stall_torque=limit * values["torque_factor"],
         no_load_speed=jnp.asarray(hand.speed_limit) * values["speed_factor"],
         efficiency=values["efficiency"],
@@ -211,12 +206,10 @@ def sample_hand(
         actuator=actuator,
         latency=jnp.round(jnp.minimum(latency, control_period) / timestep).astype(jnp.int32),
         sensing_latency=jnp.clip(values["sensing_latency"][0] / control_period, 0.0, 1.0),
-        encoder_bias=values["encoder_bias"],
         torque_gain=values["torque_gain"],
         taxel_gain=drawn["taxel_gain"][: hand.num_fingers, None],
         tilt=drawn["gravity_tilt"][:2],
-        cover=values["cover"][0],
-        gear_gap=values["gear_gap"] if geared else None,
+        pad_thickness_delta=values["pad_thickness_delta"][0],
     )
 
 

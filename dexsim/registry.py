@@ -9,17 +9,20 @@ import importlib
 import importlib.metadata
 import inspect
 import numbers
+import os
 import typing
 from collections.abc import Callable
 from types import ModuleType
 from typing import Any, cast
 
+import jax
+
+from dexsim.core.cli import enable_caches
 from dexsim.core.config import NoSettings
 from dexsim.core.errors import ConfigError, DexsimError
 from dexsim.env.config import EnvConfig
 from dexsim.env.env import Env
-from dexsim.env.rules import check_members
-from dexsim.env.task import Task
+from dexsim.env.task import Task, check_task
 from dexsim.hand.kinematics import Hand
 from dexsim.hand.load import load_hand
 from dexsim.tasks.grasp.config import GraspConfig
@@ -132,12 +135,13 @@ def make(
     hand: Hand | None = None,
     seed: int = 0,
 ) -> Env:
-    """An environment.
+    """An environment. Compiled programs are kept between runs (`enable_caches`) unless `DEXSIM_NO_CACHES` is
+    set.
 
     Args:
       task: a name in `TASKS`, registered ones included.
       config: the task's config dataclass; None for what the name stands for.
-      backend: physics, "auto", "jax", "warp" or "c".
+      backend: physics, "auto", "jax", "cuda", "warp" or "c".
       num_envs: batch size that Warp's contact buffers are sized for.
       hand: a `Hand` from `load_hand`; None for the shipped one.
       seed: of the pool of start states.
@@ -148,6 +152,9 @@ def make(
     for option, value in (("num_envs", num_envs), ("seed", seed)):
         if not isinstance(value, numbers.Integral) or isinstance(value, bool):
             raise ConfigError(f"make({task!r}, {option}={value!r:.80}): must be a whole number")
+    cached = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
+    if not (cached or os.environ.get("DEXSIM_NO_CACHES")):
+        enable_caches()
     if num_envs < 1:
         raise ConfigError(f"make({task!r}, num_envs={num_envs}): must be at least 1")
     if not isinstance(hand, Hand | None):
@@ -167,7 +174,7 @@ def make_task(name: str, hand: Hand, config: EnvConfig | None = None) -> Task:
     if not isinstance(config, entry.config_class):
         raise ConfigError(f"task {name!r} takes a {entry.config_class.__name__}, not a {type(config).__name__}")
     task = entry.task(config, hand)
-    check_members(task)
+    check_task(task)
     home = TASKS.get(task.name)
     if home is None or home.task not in (entry.task, type(task)):  # A policy's file has this name.
         raise ConfigError(

@@ -12,11 +12,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dexsim.control import Control, closing, move_target, reflex_target
+from dexsim.control import Control
 from dexsim.core.config import setting, validate
 from dexsim.core.errors import ConfigError
-from dexsim.force_loop import correct_command, target_force
-from dexsim.grip_reflex import move_reflex
+from dexsim.force_loop import correct_command
 from dexsim.hand.kinematics import Hand
 from dexsim.observation import ObservationConfig, Readings
 from dexsim.touch.estimate import estimate_force
@@ -27,9 +26,9 @@ class TurnSpec:
     """Goals that follow one another about an axis, as in the rotation task."""
 
     axis: tuple[float, float, float] = setting((1.0, 0.0, 0.0), unit="1", low=-1.0, high=1.0)
-    """Axis of rotation in the palm frame; any length."""
+    """Axis of rotation in the palm frame, of any length; (1, 0, 0) is the palm's normal."""
     step: float = setting(np.pi / 2, unit="rad", low=-np.pi, high=np.pi)
-    """Angle from one goal to the next, with the sense of rotation."""
+    """Angle from one goal to the next; negative for turning the other way."""
     angle: float = setting(0.3, unit="rad", low=0.01, high=1.5)
     """A goal is reached within this angle ..."""
     distance: float = setting(0.05, unit="m", low=0.001, high=0.5)
@@ -41,6 +40,8 @@ class TurnSpec:
         validate(self)
         if np.linalg.norm(self.axis) < 1e-6:
             raise ConfigError("TurnSpec.axis is (0, 0, 0): give a direction")
+        if abs(self.step) < 0.1:
+            raise ConfigError(f"TurnSpec.step = {self.step:g} rad: must be at least 0.1 rad to either side")
 
     @property
     def unit_axis(self) -> np.ndarray:
@@ -77,36 +78,30 @@ class TaskSpec:
 
     def __post_init__(self) -> None:
         validate(self)
-        for loop in ("force", "reflex"):
-            if getattr(self.control, loop).gain and self.finger_force is None:
-                raise ConfigError(f"task {self.name!r}: Control.{loop} needs a force command, which the task has not")
+        if self.control.force.gain and self.finger_force is None:
+            raise ConfigError(f"task {self.name!r}: Control.force needs a force command, which the task has not")
 
     @property
     def force_loop(self) -> bool:
         """Whether the command is corrected by the estimated force."""
         return self.control.force.gain > 0
 
-    @property
-    def grip_reflex(self) -> bool:
-        """Whether the fingers' joint targets are corrected by their estimated forces."""
-        return self.control.reflex.gain > 0
-
     @classmethod
     def of(cls, task: Any) -> "TaskSpec":
-        """The specification of a `dexsim.env.task.Task`."""
+        """The specification of a `dexsim.Task`."""
         config = task.config
         return cls(
             name=task.name,
             fields=tuple(task.fields["actor"]),
             gravity=_triple(task.gravity),
             reference=_triple(task.reference),
-            posture=tuple(map(float, getattr(config, "posture", ()))),
+            posture=tuple(map(float, task.posture)),
             control=config.control,
             observation=config.observation,
             object_axes=config.sensing.object_axes,
             velocity_filter=config.sensing.velocity_filter,
-            turn=getattr(config, "turn", None),
-            finger_force=getattr(config, "finger_force", None),
+            turn=task.turn,
+            finger_force=task.finger_force,
         )
 
     def check_hand(self, hand: Hand) -> None:
@@ -132,41 +127,6 @@ def correct_readings(
     before = jnp.zeros(()) if correction is None else correction
     after = correct_command(spec.control.force, spec.finger_force, period, readings.command, before, force)
     return dataclasses.replace(readings, command=readings.command + after), after
-
-
-def next_target(
-    spec: TaskSpec,
-    hand: Hand,
-    period: float,
-    readings: Readings,
-    target: jax.Array,
-    reflex: jax.Array | None,
-    action: jax.Array,
-    measured: jax.Array,
-) -> tuple[jax.Array, jax.Array | None]:
-    """The next joint targets [J] rad, and the angles [F] rad in them that are the grip reflex's.
-
-    Args:
-      spec: of the task.
-      hand: the hand.
-      period: s, control tick.
-      readings: what the action answers to.
-      target: [J] rad, joint targets so far.
-      reflex: [F] rad, of the tick before; None without a reflex.
-      action: [J] in [-1, 1].
-      measured: [J] rad, joint angles now.
-    """
-    control = spec.control
-    if reflex is None:
-        return move_target(control, hand, target, action, measured), None
-    assert spec.finger_force is not None, "checked when the specification was made"
-    force = estimate_force(spec.observation.force, hand, readings.taxel_force, readings.joint_torque)
-    wanted = target_force(readings.command, spec.finger_force)
-    chosen = move_target(control, hand, target - reflex_target(hand, reflex), action, measured)
-    angle = reflex_target(hand, move_reflex(control.reflex, period, reflex, wanted, force))
-    # Within the policy's own limits; what they cut off does not wind up.
-    pressed = move_target(control, hand, chosen + angle, jnp.zeros_like(action), measured)
-    return pressed, (pressed - chosen)[hand.root_joint] * closing(hand)
 
 
 def _triple(values: Iterable[float]) -> tuple[float, float, float]:

@@ -30,6 +30,7 @@ from dexsim.core.config import override, setting, validate
 from dexsim.core.errors import ConfigError
 from dexsim.core.options import Option
 from dexsim.core.progress import progress
+from dexsim.env.evaluation import evaluation_of
 from dexsim.registry import find_task
 from dexsim_ppo.acting import PolicyParams, act_from, begin
 from dexsim_ppo.learner.adapter import Adapted
@@ -51,7 +52,8 @@ class Evaluator:
 
     def __init__(self, env: Environment, chunk: int):
         self.env, self.chunk = env, chunk
-        self.totals = env.evaluation == "totals"
+        self.protocol = evaluation_of(env)
+        self.totals = self.protocol.evaluation == "totals"
         self._run, self._plans = jit(self._episodes, backend=env.backend), dict[tuple[int, int], Any]()
 
     def __call__(
@@ -78,7 +80,7 @@ class Evaluator:
         # Episodes are the last axis of all that is measured.
         measured = jax.tree.map(lambda *xs: np.concatenate(xs, axis=-1), *(measured for measured, _ in parts))
         found, over = measured
-        report = (summarize_totals if self.totals else summarize)(self.env, found, over, np.asarray(plan.row)) | {
+        report = (summarize_totals if self.totals else summarize)(self.protocol, found, over, np.asarray(plan.row)) | {
             "seed": seed,
             "seconds": time.perf_counter() - started,
         }
@@ -87,7 +89,7 @@ class Evaluator:
     def _plan(self, count: int, seed: int) -> Any:
         """The episodes; kept, since a run selects its best policy on the same ones again and again."""
         if (count, seed) not in self._plans:
-            self._plans[count, seed] = self.env.evaluation_plan(count, seed)
+            self._plans[count, seed] = self.protocol.evaluation_plan(count, seed)
         return self._plans[count, seed]
 
     def _episodes(self, params: PolicyParams, plan: Any, idle: bool):
@@ -96,14 +98,14 @@ class Evaluator:
         The report needs metrics and termination flags [T, chunk]; of long episodes, whose task keeps its
         own totals, only the metrics of each one's last tick [chunk] and the ticks it lived [chunk].
         """
-        state = self.env.evaluation_starts(plan)
+        state = self.protocol.evaluation_starts(plan)
         shown = self._extremes(state)
 
         def step(carry, _):
             state, memory, last = carry
             memory, action = act_from(params, memory, state.obs["actor"])
             state = jax.vmap(self.env.step)(state, jnp.where(idle, jnp.zeros_like(action), action))
-            frame = jax.tree.map(lambda x: x[shown], jax.vmap(self.env.snapshot)(state))
+            frame = jax.tree.map(lambda x: x[shown], jax.vmap(self.protocol.snapshot)(state))
             series = (dict(state.metrics), state.terminated)
             film = (frame, state.terminated[shown])
             if not self.totals:
@@ -114,14 +116,14 @@ class Evaluator:
         if self.totals:
             last = (dict(state.metrics), jnp.zeros(self.chunk, jnp.int32), jnp.zeros(self.chunk, bool))
         first: Any = state, begin(params, (self.chunk,)), last
-        (*_, last), (series, film) = jax.lax.scan(step, first, None, length=self.env.evaluation_steps)
+        (*_, last), (series, film) = jax.lax.scan(step, first, None, length=self.protocol.evaluation_steps)
         return (last[:2] if self.totals else series), film
 
     def _extremes(self, state: Any) -> jax.Array:
         """Two episodes [2] of a chunk: those of the lowest and the highest command, or the first and the last where
         all are equal or there is none."""
         first_and_last = jnp.array([0, self.chunk - 1])
-        command = getattr(jax.vmap(self.env.snapshot)(state), "command", None)
+        command = getattr(jax.vmap(self.protocol.snapshot)(state), "command", None)
         if command is None:
             return first_and_last
         command = command.reshape(self.chunk, -1).sum(-1)
@@ -169,7 +171,7 @@ def default_episodes(env: Environment) -> int:
     """Episodes of an evaluation on the device found: 1024 on a GPU, on a CPU what about a minute suffices for."""
     if jax.default_backend() == "gpu":
         return 1024
-    return 64 * int(np.clip(2000 / env.evaluation_steps, 1, 16))
+    return 64 * int(np.clip(2000 / evaluation_of(env).evaluation_steps, 1, 16))
 
 
 def evaluate_policy(
@@ -224,8 +226,8 @@ class EvaluateArguments:
     """Evaluation episodes, rounded up to whole chunks. 0: 1024 on a GPU; on a CPU 448 of grasp, 64 of rotate."""
     seed: int = setting(0, unit="1", low=0, high=2**32 - 2)
     """Seed of the episodes and their start states. Training selects its best policy by episodes of another."""
-    backend: Literal["auto", "jax", "warp", "c"] = setting("auto")
-    """Physics backend. auto: c on a CPU, warp on an NVIDIA GPU if it is installed, otherwise jax."""
+    backend: Literal["auto", "jax", "cuda", "warp", "c"] = setting("auto")
+    """Physics backend. auto: c on a CPU, cuda on an NVIDIA GPU, otherwise jax."""
     chunk: int = setting(0, unit="1", low=0, high=65536)
     """Episodes simulated side by side; 0 chooses by the device."""
     seconds: float = setting(0.0, unit="s", low=0.0)

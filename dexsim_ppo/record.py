@@ -25,6 +25,7 @@ from dexsim.core.errors import ConfigError
 from dexsim.datasets.lerobot import check_lerobot, write_lerobot
 from dexsim.datasets.rerun import check_rerun, show_rerun
 from dexsim.datasets.trajectory import READINGS, Trajectory, from_readings
+from dexsim.env.evaluation import evaluation_of
 from dexsim.registry import find_task
 from dexsim_ppo.acting import act_from
 from dexsim_ppo.policy import Policy, load_policy
@@ -45,7 +46,8 @@ def record(policy: Policy, env: Any, *, episodes: int, seconds: float, seed: int
         seen = {name: getattr(state.readings, name) for name in READINGS}
         return (after, memory), (seen, after.joint_target, after.terminated)
 
-    starts = jit(env.evaluation_starts, once=True)(env.evaluation_plan(episodes, seed))
+    protocol = evaluation_of(env)
+    starts = jit(protocol.evaluation_starts, once=True)(protocol.evaluation_plan(episodes, seed))
     begun = starts, policy.begin(episodes)
     run = jit(lambda begun: jax.lax.scan(tick, begun, None, length=ticks), backend=env.backend)
     _, recorded = run(begun)

@@ -7,11 +7,11 @@ import numpy as np
 
 from dexsim.core import cli, statistics
 from dexsim.core.errors import ConfigError
-from dexsim_ppo.learner.types import Environment
+from dexsim_ppo.learner.types import Evaluated
 
 
 def summarize(
-    env: Environment, metrics: dict[str, np.ndarray], terminated: np.ndarray, start: np.ndarray
+    env: Evaluated, metrics: dict[str, np.ndarray], terminated: np.ndarray, start: np.ndarray
 ) -> dict[str, Any]:
     """Report of episodes from their metrics `[T, N]`, termination flags `[T, N]` and starts `[N]`.
 
@@ -35,7 +35,7 @@ def summarize(
 
 
 def summarize_totals(
-    env: Environment, metrics: dict[str, np.ndarray], lived: np.ndarray, start: np.ndarray
+    env: Evaluated, metrics: dict[str, np.ndarray], lived: np.ndarray, start: np.ndarray
 ) -> dict[str, Any]:
     """Report of episodes from the metrics of their last tick [N], the ticks they lived [N] and their starts [N]."""
     held = lived == env.evaluation_steps
@@ -47,7 +47,7 @@ def summarize_totals(
     }
 
 
-def _own(env: Environment, metrics: dict[str, np.ndarray], alive: np.ndarray) -> dict[str, Any]:
+def _own(env: Evaluated, metrics: dict[str, np.ndarray], alive: np.ndarray) -> dict[str, Any]:
     """What the task makes of its metrics.
 
     Raises:

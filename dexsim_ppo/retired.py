@@ -161,13 +161,7 @@ def old_spec(task: str, config: dict[str, Any]) -> TaskSpec:
         return TaskSpec(fields=observation.GRASP, gravity=(9.81, 0.0, 0.0), reference=(0.055, -0.005, 0.090), **common)
     tilt, roll = config["tilt"], config["roll"]
     level = 9.81 * math.cos(roll)
-    turn = TurnSpec(
-        axis=tuple(config["axis"]),
-        step=config["direction"] * config["goal_step"],
-        angle=config["goal_angle"],
-        distance=config["goal_distance"],
-        spin=config["goal_spin"],
-    )
+    turn = from_dict(TurnSpec, config["turn"])
     return TaskSpec(
         fields=observation.ROTATE,
         gravity=(-level * math.cos(tilt), 9.81 * math.sin(roll), -level * math.sin(tilt)),

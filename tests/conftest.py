@@ -188,7 +188,7 @@ def physics_advance(hand: Any) -> Callable[..., Any]:
     from dexsim.physics.config import PhysicsConfig
     from dexsim.physics.physics import Physics
 
-    seam = Physics(
+    physics = Physics(
         hand,
         SLOTS,
         ObjectConfig().largest,
@@ -199,8 +199,8 @@ def physics_advance(hand: Any) -> Callable[..., Any]:
     )
     return jax.jit(
         jax.vmap(
-            lambda object, state, torque, push: seam.advance(
-                object, state, lambda index, position, velocity: torque, push
+            lambda object, state, torque, push: physics.advance(
+                lambda index, position, velocity: torque, object, state, push
             )
         )
     )

@@ -18,7 +18,8 @@ PACKAGES = ("dexsim", "dexsim_ppo", "dexsim_real")
 FLOORS = {
     "dexsim": (
         ("core",),
-        ("geometry", "actuator", "force_loop", "grip_reflex"),
+        ("errors",),
+        ("geometry", "actuator", "force_loop"),
         ("hand",),
         ("objects", "control", "randomization", "touch"),
         ("sensing", "render", "calibration", "identification", "observation"),
@@ -58,6 +59,27 @@ FLOORS = {
 }
 """Rooms of each package from the ground up. A room imports only from rooms below it; "" is the package's door."""
 
+OPEN_CIRCLES = (("dexsim_real.run.overview", "dexsim_real.run.session"),)
+"""Imports for types alone that close a circle: halves of one thing, to be put together."""
+
+ROOTS = "roots"
+BUDGETS = {
+    "dexsim": 19_100,  # goal: 12,500
+    "dexsim/core": 1_660,  # goal: 900
+    "dexsim/geometry dexsim/touch dexsim/actuator dexsim/sensing": 2_440,  # goal: 1,900
+    "dexsim/hand dexsim/objects": 2_120,  # goal: 1,900
+    "dexsim/physics": 2_750,  # goal: 2,200, and 1,300 of CUDA
+    "dexsim/env dexsim/tasks": 2_830,  # goal, with the roots: 3,200
+    ROOTS: 1_450,
+    "dexsim/calibration dexsim/identification": 2_560,  # goal: 1,500
+    "dexsim/render dexsim/view dexsim/datasets dexsim/wrappers": 2_860,  # goal: 1,900
+    "dexsim_ppo": 6_970,  # goal: 4,000
+    "dexsim_real": 12_400,  # goal: 6,500
+    "benchmarks": 7_000,  # goal: 2,000
+    "tests": 35_800,  # goal: 18,000
+}
+"""Lines of Python by folder, docstrings and comments included. Lower a budget when lines have gone."""
+
 FOREIGN = {
     "dexsim": (),
     "dexsim.view": ("dexsim_ppo", "dexsim_real"),  # a command over all three, which nothing imports
@@ -81,9 +103,11 @@ def modules() -> dict[str, Path]:
 
 @cache
 def imports(module: str) -> frozenset[str]:
-    """Our modules that this one imports anywhere in it, except for types alone."""
+    """Our modules that this one imports anywhere in it, for types alone as well; a package's door lists all of its
+    names for type checkers, which is no import."""
     tree = ast.parse(modules()[module].read_text())
-    ignored = {id(node) for block in _type_checking_blocks(tree) for node in ast.walk(block)}
+    door = _type_checking_blocks(tree) if module in PACKAGES else ()
+    ignored = {id(node) for block in door for node in ast.walk(block)}
     found = set()
     for node in ast.walk(tree):
         if id(node) in ignored:
@@ -162,6 +186,8 @@ def test_no_module_is_in_a_circle():
     def visit(module: str, path: tuple[str, ...]) -> None:
         state[module] = 1
         for other in sorted(imports(module)):
+            if (module, other) in OPEN_CIRCLES:
+                continue
             assert state.get(other) != 1 or other == module, f"circle: {' -> '.join((*path, module, other))}"
             if other not in state:
                 visit(other, (*path, module))
@@ -172,15 +198,17 @@ def test_no_module_is_in_a_circle():
             visit(module, ())
 
 
-def test_folders_and_files_are_small():
-    folders = {path.parent for path in modules().values()}
-    crowded = {
-        str(folder.relative_to(ROOT)): count
-        for folder in folders
-        if (count := sum(path.name != "__init__.py" for path in folder.glob("*.py"))) > 15
-    }
-    long = {name: lines for name, path in modules().items() if (lines := len(path.read_text().splitlines())) > 350}
-    assert (crowded, long) == ({}, {})
+def lines(*folders: str) -> int:
+    """Lines of Python in these folders, and of the files that are named."""
+    paths = [path for folder in folders for path in ((ROOT / folder).rglob("*.py"))]
+    return sum(len(path.read_text().splitlines()) for path in {*paths, *map(ROOT.joinpath, folders)} if path.is_file())
+
+
+@pytest.mark.parametrize("place", BUDGETS)
+def test_folders_keep_their_budget(place):
+    """A thing that needs more lines says what it gives up, or takes them from elsewhere."""
+    folders = [f"dexsim/{path.name}" for path in (ROOT / "dexsim").glob("*.py")] if place == ROOTS else place.split()
+    assert lines(*folders) <= BUDGETS[place]
 
 
 def test_rooms_have_a_docstring_and_nothing_else():

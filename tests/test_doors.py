@@ -9,9 +9,9 @@ from paths import ROOT
 
 NAMES = {
     "dexsim": """
-        AssetError CalibrationError CheckpointError ConfigError DexsimError DexsimWarning Env EnvConfig
-        GraspConfig Hand OldFileWarning OtherEnvWarning Readings RotateConfig State Task TaskSpec draw_taxels
-        enable_caches load_hand make observe register render_episode render_frame
+        Env EnvConfig Evaluation GraspConfig GraspReward GroundTruth Hand ObjectConfig Readings RotateConfig
+        RotateReward Start State Task TaskSpec draw_taxels enable_caches load_hand make observe register
+        render_episode render_frame take_snapshot
     """,
     "dexsim_ppo": """
         PPOConfig Policy TrainState Trained act average_policies evaluate_policy load_policy make_train train_policy

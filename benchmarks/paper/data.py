@@ -1,4 +1,4 @@
-"""What a table or figure is made of: rows, seeds and budgets; and where its reports are."""
+"""What a table is made of: rows, seeds and budgets; and where its reports are."""
 
 import dataclasses
 import functools
@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from dexsim.core.assets import asset_path
-from dexsim.core.errors import ConfigError
 from dexsim_ppo.checkpoint import load
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -22,94 +21,72 @@ REPORTS = ROOT / "docs" / "results"
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Budget:
-    """How much a row may cost."""
+    """How much a row may cost. A row keeps the report of the highest level."""
 
     name: str
     level: int
-    """A row keeps the report of the highest level."""
-    preset: str
-    """Of the training command."""
-    backend: str
+    preset: str = "cpu"
+    backend: str = "c"
     training: dict[str, dict[str, float]]
-    """Of one seed, by skill: "minutes", or "steps" of the environments, and other options of the training command.
-    Empty: shipped policies stand in, nothing is trained."""
-    learner: dict[str, dict[str, float]]
+    """Options of the training command for one seed, by skill. Empty: shipped policies stand in, nothing is trained."""
+    learner: dict[str, dict[str, float]] = dataclasses.field(default_factory=dict)
     """Changes to the preset's PPO settings, by skill."""
-    seeds: int
+    seeds: int = 3
     episodes: dict[str, int]
     """Evaluation in simulation, by skill."""
     trials: dict[str, int]
     """On the emulated hand, for each seed."""
-    seconds: dict[str, float]
+    seconds: dict[str, float] = dataclasses.field(default_factory=dict)
     """Length of an evaluation and of a trial; the task's own where missing."""
     sweep: dict[str, Any]
-    """Of a robustness sweep: "points" of each row (0: training's ranges alone, 2: the ends), and by skill "episodes"
-    and "seconds"."""
+    """Points of each row (0: training's ranges alone, 2: the ends); episodes and seconds by skill."""
     objects: int
     """Evaluation episodes of each held-out object."""
-    processes: int
-    """For trials. More than one runs them in processes of their own, as a GPU needs: the bridge's JAX is on the CPU."""
+    processes: int = 1
+    """For trials. A GPU needs more than one: the bridge's JAX is on the CPU."""
 
 
 BUDGETS = {
-    budget.name: budget
-    for budget in (
-        Budget(
-            name="smoke",
-            level=0,
-            preset="cpu",
-            backend="c",
-            training={},
-            learner={},
-            seeds=1,
-            episodes={"grasp": 10, "rotate": 10},
-            trials={"grasp": 1, "rotate": 1},
-            seconds={"grasp": 0.3, "rotate": 0.3},
-            sweep={"points": 0, "episodes": {"grasp": 10, "rotate": 10}, "seconds": {"grasp": 0.3, "rotate": 0.3}},
-            objects=5,
-            processes=1,
-        ),
-        Budget(
-            name="cpu",
-            level=1,
-            preset="cpu",
-            backend="c",
-            training={"grasp": {"minutes": 20.0}, "rotate": {"minutes": 30.0}},
-            learner={},
-            seeds=3,
-            episodes={"grasp": 150, "rotate": 16},
-            trials={"grasp": 25, "rotate": 10},
-            seconds={},
-            sweep={"points": 2, "episodes": {"grasp": 25, "rotate": 16}, "seconds": {"grasp": 8.0, "rotate": 20.0}},
-            objects=25,
-            processes=1,
-        ),
-        Budget(
-            name="gpu",
-            level=2,
-            preset="gpu",
-            backend="auto",
-            training={
-                "grasp": {"steps": 9e7, "evaluate_every": 0},
-                "rotate": {"steps": 4e7, "evaluate_every": 0},
-            },
-            # Larger steps at first: four seeds of rotate had two goals an episode after 14 to 20 million steps.
-            learner={"rotate": {"learning_rate": 1e-3, "kl_target": 0.04, "kl_halving": 150}},
-            seeds=3,
-            episodes={"grasp": 256, "rotate": 128},
-            trials={"grasp": 50, "rotate": 10},
-            seconds={},
-            sweep={"points": 4, "episodes": {"grasp": 256, "rotate": 256}, "seconds": {"grasp": 8.0, "rotate": 20.0}},
-            objects=50,
-            processes=8,
-        ),
-    )
+    "smoke": Budget(
+        name="smoke",
+        level=0,
+        training={},
+        seeds=1,
+        episodes={"grasp": 10, "rotate": 10},
+        trials={"grasp": 1, "rotate": 1},
+        seconds={"grasp": 0.3, "rotate": 0.3},
+        sweep={"points": 0, "episodes": {"grasp": 10, "rotate": 10}, "seconds": {"grasp": 0.3, "rotate": 0.3}},
+        objects=5,
+    ),
+    "cpu": Budget(
+        name="cpu",
+        level=1,
+        training={"grasp": {"minutes": 20.0}, "rotate": {"minutes": 30.0}},
+        episodes={"grasp": 150, "rotate": 16},
+        trials={"grasp": 25, "rotate": 10},
+        sweep={"points": 2, "episodes": {"grasp": 25, "rotate": 16}, "seconds": {"grasp": 8.0, "rotate": 20.0}},
+        objects=25,
+    ),
+    "gpu": Budget(
+        name="gpu",
+        level=2,
+        preset="gpu",
+        backend="auto",
+        training={"grasp": {"steps": 9e7, "evaluate_every": 0}, "rotate": {"steps": 4e7, "evaluate_every": 0}},
+        # Larger steps at first: four seeds of rotate had two goals an episode after 14 to 20 million steps.
+        learner={"rotate": {"learning_rate": 1e-3, "kl_target": 0.04, "kl_halving": 150}},
+        episodes={"grasp": 256, "rotate": 128},
+        trials={"grasp": 50, "rotate": 10},
+        sweep={"points": 4, "episodes": {"grasp": 256, "rotate": 256}, "seconds": {"grasp": 8.0, "rotate": 20.0}},
+        objects=50,
+        processes=8,
+    ),
 }
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Row:
-    """One configuration of a table, or one curve of a figure."""
+    """One configuration of a table."""
 
     name: str
     """Folder of its report."""
@@ -124,8 +101,6 @@ class Row:
     """Observation fields that the policy does without."""
     points: tuple[float, ...] = ()
     """Of a sweep, in order."""
-    training: tuple[float, float] | None = None
-    """The range of training that a sweep goes beyond; None where training has one value."""
     paper: dict[str, str] = dataclasses.field(default_factory=dict)
     """The paper's numbers, by column."""
 
@@ -135,26 +110,21 @@ class Row:
         return self.task.partition("_")[0]
 
 
-Measure = Callable[[Row, int, Budget, Path], dict[str, Any]]
-
-
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Experiment:
-    """A table or figure."""
+    """A table, and figures of it."""
 
     name: str
     title: str
     rows: tuple[Row, ...]
-    measure: Measure
+    measure: Callable[[Row, int, Budget, Path], dict[str, Any]]
     """`measure(row, seed, budget, work)`: the report of one seed; `work` is the folder of its training."""
-    table: Callable[["Experiment", dict[str, dict]], list[list[str]]] | None
-    """Header and rows of the table, from the reports by row; None for a figure alone."""
-    draw: Callable[["Experiment", dict[str, dict], Path], list[Path]] | None
-    """Writes the figures into a folder; None for a table alone."""
+    table: Callable[["Experiment", dict[str, dict]], list[list[str]]]
+    """Header and rows, from the reports by row."""
+    draw: Callable[["Experiment", dict[str, dict], Path], None] | None = None
+    """Writes figures into a folder."""
     trains: bool = False
-    """Whether every seed of a row is a training."""
-    minutes: float = 1.0
-    """Estimate for a row on two cores, training apart."""
+    """Whether every seed of a row is a training run."""
 
     def seeds(self, budget: Budget) -> range:
         """Seeds of each row; what is not trained has one."""
@@ -167,20 +137,8 @@ def report_path(folder: Path, experiment: Experiment, row: Row) -> Path:
 
 
 def load_report(path: Path) -> dict[str, Any]:
-    """A row's report; empty if there is none.
-
-    Raises:
-      ConfigError: the file is no report.
-    """
-    if not path.is_file():
-        return {}
-    try:
-        report = json.loads(path.read_text())
-        if report["budget"] in BUDGETS and isinstance(report["seeds"], dict) and report["row"]:
-            return report
-    except (ValueError, KeyError, TypeError):
-        pass
-    raise ConfigError(f"{path}: is not a report of a row; delete it, and the row is measured anew")
+    """A row's report; empty if there is none."""
+    return json.loads(path.read_text()) if path.is_file() else {}
 
 
 def settings_of(row: Row) -> dict[str, Any]:
@@ -188,7 +146,7 @@ def settings_of(row: Row) -> dict[str, Any]:
     settings = {
         name: list(value) if isinstance(value, tuple) else value
         for name, value in dataclasses.asdict(row).items()
-        if name not in ("label", "paper", "training")
+        if name not in ("label", "paper")
     }
     return settings | ({"weights": weights_of(asset_path(f"policies/{row.policy}.msgpack"))} if row.policy else {})
 
@@ -200,12 +158,14 @@ def weights_of(file: Path) -> str:
     return hashlib.sha256(b"".join(np.asarray(leaf).tobytes() for leaf in leaves)).hexdigest()[:16]
 
 
-def is_done(experiment: Experiment, row: Row, budget: Budget, report: dict[str, Any]) -> bool:
-    """Whether a report holds all that a budget asks of a row."""
-    if not report or report["row"] != settings_of(row):
-        return False
-    level = BUDGETS[report["budget"]].level
-    return level > budget.level or (level == budget.level and len(report["seeds"]) >= len(experiment.seeds(budget)))
+def missing_seeds(experiment: Experiment, row: Row, budget: Budget, report: dict[str, Any]) -> list[int]:
+    """Seeds that a row's report, which may be empty, lacks for a budget."""
+    wanted = list(experiment.seeds(budget))
+    if not report or report["row"] != settings_of(row) or BUDGETS[report["budget"]].level < budget.level:
+        return wanted
+    if BUDGETS[report["budget"]].level > budget.level:
+        return []
+    return [seed for seed in wanted if str(seed) not in report["seeds"]]
 
 
 @functools.cache

@@ -1,6 +1,6 @@
-"""The experiments: each table and figure as rows, with the paper's numbers; docs/results.md says what differs."""
+"""The experiments: each table and figure as rows, with the paper's numbers and what differs from it."""
 
-from paper import figure_data, figures, measure, tables
+from paper import figures, measure, tables
 from paper.data import Experiment, Row
 from paper.measure import points_at_twice
 
@@ -33,63 +33,44 @@ def _paper(name: str) -> dict[str, str]:
 def _observation_rows(task: str) -> tuple[Row, ...]:
     """The seven rows of the paper's table, trained on a task."""
     return tuple(
-        Row(
-            name=name,
-            label=label,
-            task=task,
-            settings=settings,
-            paper=_paper(name),
-        )
+        Row(name=name, label=label, task=task, settings=settings, paper=_paper(name))
         for name, (label, settings) in _OBSERVATIONS.items()
     )
 
 
 def _sweep_rows() -> tuple[Row, ...]:
     """The rows of both skills. With a range of training the points are its ends and those of a range twice as wide."""
+    friction = ("friction", "finger friction", "objects.friction=[{},{}]", points_at_twice(0.4, 1.2, floor=0.02))
     shared = (
-        ("latency", "command latency [s]", "randomization.latency=[{},{}]", (0.0, 0.02), (0.0, 0.01, 0.02, 0.03)),
-        ("torque_gain", "torque gain", "randomization.torque_gain=[{},{}]", (0.9, 1.1), ()),
-        ("taxel_noise", "taxel noise [N]", "sensing.taxel.noise={}", None, (0.0, 0.01, 0.02, 0.04)),
-        ("dead_taxels", "dead taxels [share]", "sensing.taxel.dead=[{},{}]", None, (0.0, 0.05, 0.1, 0.2)),
-        ("lean", "mount lean, at most [rad]", "randomization.gravity_tilt={}", (0.0, 0.1), (0.0, 0.05, 0.1, 0.2)),
+        ("latency", "command latency [s]", "randomization.latency=[{},{}]", (0.0, 0.01, 0.02, 0.03)),
+        ("torque_gain", "torque gain", "randomization.torque_gain=[{},{}]", points_at_twice(0.9, 1.1)),
+        ("taxel_noise", "taxel noise [N]", "sensing.taxel.noise={}", (0.0, 0.01, 0.02, 0.04)),
+        ("dead_taxels", "dead taxels [share]", "sensing.taxel.dead=[{},{}]", (0.0, 0.05, 0.1, 0.2)),
+        ("lean", "mount lean, at most [rad]", "randomization.gravity_tilt={}", (0.0, 0.05, 0.1, 0.2)),
+        friction,
     )
+    link, mass, error = "objects.link_friction=[{},{}]", "objects.mass=[{},{}]", "orientation error, at most [rad]"
     own = {
         "grasp": (
-            ("friction", "finger friction", "objects.friction=[{},{}]", (0.4, 1.2), ()),
-            ("link_friction", "link friction", "objects.link_friction=[{},{}]", (0.3, 1.2), ()),
-            ("mass", "mass [kg]", "objects.mass=[{},{}]", (0.05, 0.20), ()),
+            ("link_friction", "link friction", link, points_at_twice(0.3, 1.2, floor=0.02)),
+            ("mass", "mass [kg]", mass, points_at_twice(0.05, 0.20, floor=0.02)),
         ),
         "rotate": (
-            ("friction", "finger friction", "objects.friction=[{},{}]", (0.4, 1.2), ()),
             # Below 0.1 hardly a cube stays on the palm to begin with.
-            ("link_friction", "link friction", "objects.link_friction=[{},{}]", (0.3, 0.9), (0.1, 0.3, 0.9, 1.2)),
-            ("mass", "mass [kg]", "objects.mass=[{},{}]", (0.06, 0.15), ()),
-            (
-                "orientation",
-                "orientation error, at most [rad]",
-                "sensing.orientation.bias={}",
-                (0.0, 0.04),
-                (0.0, 0.02, 0.04, 0.08),
-            ),
-            ("edge", "cube edge [m]", "edge=[{},{}]", (0.050, 0.060), ()),
+            ("link_friction", "link friction", link, (0.1, 0.3, 0.9, 1.2)),
+            ("mass", "mass [kg]", mass, points_at_twice(0.06, 0.15, floor=0.02)),
+            ("orientation", error, "sensing.orientation.bias={}", (0.0, 0.02, 0.04, 0.08)),
+            ("edge", "cube edge [m]", "edge=[{},{}]", points_at_twice(0.050, 0.060)),
         ),
     }
     rows = []
     for skill, sweeps in own.items():
         rows.append(Row(name=f"{skill}_reference", label=f"{skill}: training's ranges", task=skill, policy=skill))
-        rows += [
-            Row(
-                name=f"{skill}_{name}",
-                label=f"{skill}: {label}",
-                task=skill,
-                policy=skill,
-                # Few small cubes stay in the hand: a pool that they can fill.
-                settings=(setting, "pool_size=256") if name == "edge" else (setting,),
-                points=points or points_at_twice(*training, floor=0.02),
-                training=training,
-            )
-            for name, label, setting, training, points in (*shared, *sweeps)
-        ]
+        for name, label, setting, points in (*shared, *sweeps):
+            # Few small cubes stay in the hand: a pool that they can fill.
+            settings = (setting, "pool_size=256") if name == "edge" else (setting,)
+            about = {"name": f"{skill}_{name}", "label": f"{skill}: {label}", "task": skill, "policy": skill}
+            rows.append(Row(settings=settings, points=points, **about))
     return tuple(rows)
 
 
@@ -135,7 +116,6 @@ _ALL = (
         table=tables.rotation,
         draw=figures.successes,
         trains=True,
-        minutes=12.0,
     ),
     Experiment(
         name="observations_paper",
@@ -145,7 +125,6 @@ _ALL = (
         table=tables.rotation,
         draw=figures.successes,
         trains=True,
-        minutes=12.0,
     ),
     Experiment(
         name="readings",
@@ -156,8 +135,6 @@ _ALL = (
         ),
         measure=measure.evaluated,
         table=tables.rotation,
-        draw=None,
-        minutes=3.0,
     ),
     Experiment(
         name="rewards",
@@ -167,7 +144,6 @@ _ALL = (
         table=tables.grasp,
         draw=figures.command_curves,
         trains=True,
-        minutes=3.0,
     ),
     Experiment(
         name="force",
@@ -176,34 +152,6 @@ _ALL = (
         measure=measure.shipped,
         table=tables.commands,
         draw=figures.command_curves,
-        minutes=4.0,
-    ),
-    Experiment(
-        name="calibration",
-        title="Current and torque over force",
-        rows=(Row(name="index", label="index finger"),),
-        measure=figure_data.calibration,
-        table=tables.calibration,
-        draw=figures.copied,
-        minutes=1.0,
-    ),
-    Experiment(
-        name="skin",
-        title="Stress over compression of the skin",
-        rows=(Row(name="law", label="hand's skin"),),
-        measure=figure_data.skin,
-        table=None,
-        draw=figures.skin,
-        minutes=0.5,
-    ),
-    Experiment(
-        name="contacts",
-        title="One motion felt in simulation and on the emulated hand",
-        rows=(Row(name="sphere", label="sphere at command 0.75", task="grasp", policy="grasp"),),
-        measure=figure_data.contacts,
-        table=tables.contacts,
-        draw=figures.contacts,
-        minutes=1.0,
     ),
     Experiment(
         name="successes",
@@ -218,7 +166,6 @@ _ALL = (
         measure=measure.on_the_hand,
         table=tables.rotation,
         draw=figures.successes,
-        minutes=6.0,
     ),
     Experiment(
         name="objects",
@@ -226,8 +173,6 @@ _ALL = (
         rows=(Row(name="grasp", label="shipped policy, 24 objects", task="grasp", policy="grasp"),),
         measure=measure.held_out,
         table=tables.held_out,
-        draw=figures.copied,
-        minutes=2.5,
     ),
     Experiment(
         name="robustness",
@@ -235,8 +180,6 @@ _ALL = (
         rows=_sweep_rows(),
         measure=measure.swept,
         table=tables.sweeps,
-        draw=figures.sweeps,
-        minutes=0.9,
     ),
 )
 EXPERIMENTS: dict[str, Experiment] = {experiment.name: experiment for experiment in _ALL}

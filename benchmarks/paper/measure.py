@@ -7,8 +7,6 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from dexsim.core.config import from_dict, override, to_dict
 from dexsim.registry import find_task
 from dexsim_ppo import load_policy, train_policy
@@ -185,69 +183,26 @@ def trials(skill: str, policy: str, seed: int, budget_name: str) -> dict[str, An
 # --- objects that no training has seen -------------------------------------------------------------------
 
 
-class HeldOutEvaluator(Evaluator):
-    """Keeps one picture of every object at the middle command, late in its episode."""
-
-    def __init__(self, env: Any, chunk: int, names: int):
-        super().__init__(env, chunk)
-        self._names = names
-
-    def _extremes(self, state: Any) -> Any:
-        """In place of two episodes those of the middle command [names]."""
-        import jax.numpy as jnp
-
-        del state
-        return 5 * jnp.arange(self._names) + 2
-
-    def _film(self, frames: Any, terminated: np.ndarray) -> Any:
-        import jax
-
-        late = round(0.75 * len(terminated))
-        return jax.tree.map(lambda x: x[late], frames)
-
-
 def held_out(row: Row, seed: int, budget: Budget, work: Path) -> dict[str, Any]:
-    """A shipped policy with held-out objects, each at every command; pictures are in `work`."""
+    """A shipped policy with held-out objects, each at every command."""
+    del work
     import dexsim
     from dexsim.env.env import Env
     from dexsim.tasks.grasp.config import GraspConfig
-    from paper.held_out import COMPOSITIONS, NAMES, HeldOutGrasp
+    from paper.held_out import NAMES, HeldOutGrasp
 
     policy, hand = load_policy(row.policy), dexsim.load_hand()
-    names = NAMES
-    settings = [*row.settings, f"pool_size={HELD_OUT_POOL}"]
-    if not budget.training:  # A look at the machinery: meshes take seconds each to be followed by boxes.
-        names, settings = tuple(COMPOSITIONS)[:3], [*settings, "pool_size=30"]
+    names, settings = NAMES, [*row.settings, f"pool_size={HELD_OUT_POOL}"]
+    if not budget.training:  # A look at the machinery.
+        names, settings = NAMES[:3], [*settings, "pool_size=30"]
     if seconds := budget.seconds.get("grasp"):
         settings.append(f"evaluation_seconds={seconds}")
     config = from_dict(GraspConfig, override(policy.env_config, settings))
     chunk = 5 * len(names)
     env = Env(HeldOutGrasp(config, hand, names), hand, backend=budget.backend, num_envs=chunk)
-    evaluator = HeldOutEvaluator(env, chunk, len(names))
-    report, frames = evaluator(policy.params, episodes=budget.objects * len(names), seed=seed)
-    work.mkdir(parents=True, exist_ok=True)
-    sheet = work / "objects.jpg"
-    contact_sheet(hand, env.task.slots, frames, names, sheet)
+    report, _ = Evaluator(env, chunk)(policy.params, episodes=budget.objects * len(names), seed=seed)
     kept = {name: value for name, value in report["task"].items() if name != "headline"}
-    return {"simulation": kept | {"backend": env.backend}, "files": [str(sheet)]}
-
-
-def contact_sheet(hand: Any, kinds: tuple[str, ...], frames: Any, names: tuple[str, ...], path: Path) -> None:
-    """One picture of each object in the hand, six in a row."""
-    import jax
-    from PIL import Image, ImageDraw
-
-    from dexsim.render.render import render_frame
-
-    width, height, columns = 252, 240, 6
-    sheet = Image.new("RGB", (columns * width, -(-len(names) // columns) * height), "white")
-    for k, name in enumerate(names):
-        frame = jax.tree.map(lambda x, k=k: x[k], frames)
-        picture = render_frame(hand, kinds, frame, size=(width + height // 2, height))[:, :width]
-        tile = Image.fromarray(np.ascontiguousarray(picture))
-        ImageDraw.Draw(tile).text((8, 6), name.replace("_", " "), fill="white")
-        sheet.paste(tile, (k % columns * width, k // columns * height))
-    sheet.save(path, quality=82)
+    return {"simulation": kept | {"backend": env.backend}}
 
 
 def points_at_twice(low: float, high: float, floor: float = 0.0) -> tuple[float, float, float, float]:

@@ -186,29 +186,7 @@ def _object(name: str, row: dict[str, Any]) -> list[str]:
     ]
 
 
-# --- others ---------------------------------------------------------------------------------------------
-
-
-def calibration(experiment: Experiment, reports: Reports) -> list[list[str]]:
-    """Every joint that was pressed with."""
-    lines = [["joint", "force to [N]", "current to [A]", "torque to [Nm]", "worst R²", "Nm per A", "true"]]
-    for row in (row for report in reports.values() for s in seeds(report) for row in s["joints"]):
-        worst = min(row["loading_r_squared"], row["unloading_r_squared"])
-        largest = f"{row['force_max_n']:.3g}", f"{row['current_max_a']:.3g}", f"{row['torque_max_nm']:.3g}"
-        # This hand's currents are negative when it closes.
-        ratio = f"{-row['nm_per_a']:.3g}", f"{-row['true_nm_per_a']:.3g}"
-        lines.append([row["joint"], *largest, f"{worst:.3f}", *ratio])
-    return lines
-
-
-def contacts(experiment: Experiment, reports: Reports) -> list[list[str]]:
-    """How far the two worlds are apart."""
-    lines = [["motion", "centres apart, mean [taxels]", "forces apart, rms [N]", "force, rms [N]"]]
-    for found in (s for report in reports.values() for s in seeds(report)):
-        apart, off, size = (found[k] for k in ("centre_distance_taxels", "force_difference_rms_n", "force_rms_n"))
-        text = "" if apart is None else f"{apart:.2f}"
-        lines.append([f"{found['object']}, command {found['command']:g}", text, f"{off:.2f}", f"{size:.2f}"])
-    return lines
+# --- sweeps ---------------------------------------------------------------------------------------------
 
 
 def sweeps(experiment: Experiment, reports: Reports) -> list[list[str]]:

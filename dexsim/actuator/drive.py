@@ -3,8 +3,7 @@
 The four equations of the paper (section Actuator Model Randomization), evaluated at every
 physics sub-step, and beside them what the paper's text names and leaves out: torque ripple, an
 encoder that is off, friction in the gear. Every parameter is a pytree leaf, so it can be drawn
-per joint and per episode, differentiated and fitted. `dexsim.actuator.gear_play` has the other model of
-gear play, with its own state.
+per joint and per episode, differentiated and fitted.
 """
 
 import jax

@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 from scipy.special import stdtrit
 
-from dexsim.calibration import bounds
 from dexsim.calibration.joint import JointLines, JointPress, fit_joint
-from dexsim.calibration.maps import Calibration, Side, alignment
+from dexsim.calibration.maps import Calibration, Side, alignment, check_numbers
 from dexsim.core.errors import CalibrationError
 from dexsim.hand.kinematics import Hand
 
@@ -89,7 +88,7 @@ def calibrate(
         created=created if created is not None else datetime.date.today().isoformat(),
         notes=notes,
     )
-    bounds.check("calibration", calibration, hand)  # What is written must be readable.
+    check_numbers("calibration", calibration, hand)  # What is written must be readable.
     return dataclasses.replace(calibration, notes=notes + _compare(calibration))
 
 

@@ -56,7 +56,8 @@ def make_deterministic() -> bool:
     """Have all GPU programs that this process makes from here on repeat to the last bit.
 
     XLA then neither times rival kernels to choose one nor adds in whatever order threads come; Warp's physics is ruled
-    out (`choose_backend`). Returns whether there is a GPU: programs on a CPU repeat anyway.
+    out (`choose_backend`); the `cuda` backend repeats anyway. Returns whether there is a GPU: programs on a CPU repeat
+    anyway.
     """
     if jax.default_backend() not in ("gpu", "cuda"):
         return False

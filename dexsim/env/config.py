@@ -38,9 +38,3 @@ class EnvConfig:
     follow it), a grid baked from the mesh, or the nearest of points on the surface, as in the paper."""
     touch: bool = setting(True)
     """Feel with the taxels; off only to measure their cost."""
-
-    @property
-    def three_axis(self) -> bool:
-        """Whether the taxels also feel along the skin: asked for, or observed."""
-        observed = (*self.observation.add, *self.observation.add_critic)
-        return self.sensing.three_axis or "tangential_force" in observed

@@ -13,7 +13,7 @@ from dexsim.hand.kinematics import Hand
 from dexsim.objects.config import BULK_RANGES
 from dexsim.objects.params import ObjectParams, redraw_bulk, toward_nominal
 from dexsim.randomization import HandParams, sample_hand, tilted_down
-from dexsim.sensing.imu import ImuParams
+from dexsim.sensing.imu import ImuParams, sample_imu
 
 
 class EpisodeSampler:
@@ -46,7 +46,7 @@ class EpisodeSampler:
             object = toward_nominal(object, self.config.objects, self.task.unit_inertia(object), scale)
         width = 1.0 if scale is None else scale
         hand, imu = self.sample_hand(hand_key, sensor_key, width)
-        taxels = self.senses.sample_taxels(jax.random.fold_in(sensor_key, 1), width)
+        taxels = self.senses.taxels.sample(jax.random.fold_in(sensor_key, 1), width)
         return Episode(hand=hand, object=object, imu=imu, taxels=taxels)
 
     def sample_hand(
@@ -63,7 +63,8 @@ class EpisodeSampler:
             scale=scale,
         )
         extreme = sample_extreme(hand_key, ranges.extremes)  # the one that `sample_hand` draws
-        return hand, self.senses.sample_imu(sensor_key, ranges.scale * scale, extreme)
+        sensor, period = self.config.sensing.orientation, self.config.physics.control_period
+        return hand, sample_imu(sensor_key, sensor, ranges.scale * scale, period, extreme)
 
     def tilt_force(self, episode: Episode) -> jax.Array:
         """The object's share [3] N of a tilted gravity; the links' share is small and left out."""

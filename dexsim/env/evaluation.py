@@ -5,6 +5,8 @@ own seed, and gives every episode a row and a random key of its own: what is mea
 episodes run side by side, and episodes are independent.
 """
 
+from __future__ import annotations
+
 import itertools
 from typing import Any
 
@@ -12,8 +14,11 @@ import jax
 import numpy as np
 
 from dexsim.core.pytree import pytree_dataclass
-from dexsim.env.state import Start
+from dexsim.env.env import Env
+from dexsim.env.snapshot import take_snapshot
+from dexsim.env.state import Start, State
 from dexsim.env.task import Task
+from dexsim.render.snapshot import Snapshot
 
 _POOL, _EPISODES = 0xE7A1, 0xE7A2  # streams of an evaluation's seed; training's pool has the seed's own key
 
@@ -26,6 +31,38 @@ class EvaluationPlan:
     row: np.ndarray  # [N] of the evaluation's pool; episodes with the same one are not independent
     start: Start
     goal: Any  # the task's own pytree
+
+
+class Evaluation:
+    """The evaluation protocol of an environment's task."""
+
+    def __init__(self, env: Env):
+        self.env, self.name = env, env.name
+        self.evaluation = env.task.evaluation
+        """What `summarize` is given: "series" or "totals"."""
+        self.evaluation_steps = env.task.evaluation_ticks
+        """Length of an evaluation episode, ticks."""
+
+    def evaluation_plan(self, count: int, seed: int) -> EvaluationPlan:
+        """The fixed protocol for `count` episodes, from a pool of start states of this evaluation's own."""
+        return make_plan(self.env.task, count, seed)
+
+    def evaluation_starts(self, plan: EvaluationPlan) -> State:
+        """[N] start states of a plan, or of a slice of one."""
+        return jax.vmap(self.env.reset_from)(plan.key, plan.start, plan.goal)
+
+    def summarize(self, metrics: dict[str, np.ndarray], alive: np.ndarray) -> dict:
+        """The task's report of an evaluation (host); see `Task.summarize`."""
+        return self.env.task.summarize(metrics, alive, self.env.control_period)
+
+    def snapshot(self, state: State) -> Snapshot:
+        """What a frame of video shows."""
+        return take_snapshot(self.env, state)
+
+
+def evaluation_of(env: Any) -> Any:
+    """`Evaluation` of an `Env`; an environment of another kind brings these members itself."""
+    return Evaluation(env) if isinstance(env, Env) else env
 
 
 def make_plan(task: Task, count: int, seed: int) -> EvaluationPlan:

@@ -20,7 +20,8 @@ def fingerprint(env: Any) -> str | None:
 
     None where that is not all of it: a task of the user's own, whose sources may be anywhere, and meshes.
     """
-    ours = all(type(part).__module__.partition(".")[0] == "dexsim" for part in (env, env.task))
+    parts = (env, getattr(env, "task", None))
+    ours = all(type(part).__module__.partition(".")[0] == "dexsim" for part in parts)
     if not ours or env.config.objects.mesh:
         return None
     digest = hashlib.sha256(json.dumps([env.name, env.backend, to_dict(env.config)]).encode())

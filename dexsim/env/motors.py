@@ -1,30 +1,19 @@
-"""The motors over one control tick: latency, drive, friction, and gear play where it is chosen.
-
-By default joints move with their motors and the dead-band stands for backlash. With
-`Randomization.backlash = "gear_play"` each joint has a rotor of its own before the gap
-(`dexsim.actuator.gear_play.drive_beside`): it carries a share of the joint's armature, and the encoder sits on it.
-"""
-
-from collections.abc import Callable
-from typing import Any
+"""The motors' law over one control tick: command latency, joint drive and friction, at every physics sub-step."""
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 
 from dexsim.actuator.drive import apply_friction, at_limit, delayed_target, drive
-from dexsim.actuator.gear_play import GearPlay, GearState, drive_beside, gear_at
 from dexsim.core.errors import ConfigError
-from dexsim.core.pytree import choose, pytree_dataclass
-from dexsim.env.config import EnvConfig
-from dexsim.env.state import Episode
-from dexsim.hand.kinematics import Hand
+from dexsim.core.pytree import pytree_dataclass
+from dexsim.hand.kinematics import Hand, hinge_angles
+from dexsim.hand.mjcf import read_mjcf
+from dexsim.physics.config import PhysicsConfig
+from dexsim.physics.interface import PhysicsState, TorqueLaw
 from dexsim.physics.physics import Physics
-from dexsim.physics.seam import PhysicsState
 from dexsim.randomization import HandParams, Randomization
-
-MotorLaw = Callable[..., tuple[jax.Array, GearState | None]]
-"""(sub-step, joint position [J], joint velocity [J], gear) to torque on the links [J] Nm and gear."""
 
 
 @pytree_dataclass
@@ -35,164 +24,92 @@ class JointCommand:
     target: jax.Array  # [J] rad
     previous: jax.Array  # [J] rad, acts until the latency is over
     valid: jax.Array  # [] bool, whether the action was finite
-    reflex: jax.Array | None = None  # [F] rad of the target, with a grip reflex
-
-
-@pytree_dataclass
-class PhysicsTick:
-    """The world after a control tick."""
-
-    physics: PhysicsState
-    finger_force: jax.Array  # [F, 3] N, of the object on the finger tips
-    joint_torque: jax.Array  # [J] Nm, by the motors' currents at the end of the tick
-    gear: GearState | None  # with gear play
-    limited: jax.Array  # [J] bool, whether the motor is at its torque limit at the end of the tick
-    finite: jax.Array  # [] bool; where false the world stays as it was, without forces
 
 
 class Motors:
-    """The motors of one environment, and the physics under them. Pure methods."""
+    """The motors of one environment. Pure methods."""
 
-    def __init__(self, config: EnvConfig, hand: Hand, physics: Physics):
-        """Raises ConfigError: gear play for joints that have no armature, or are coupled."""
-        self.hand, self.physics, self._substeps = hand, physics, config.physics.substeps
-        model, dofs = physics.mj_model, physics.joint_dof
-        self._timestep = float(model.opt.timestep)
-        self._inertia_rate = jnp.asarray(model.dof_M0[dofs] / model.opt.timestep, jnp.float32)
-        ranges = config.randomization
-        self.gear_play = ranges.backlash == "gear_play"
-        if self.gear_play:
-            if hand.num_hinges > hand.num_joints:
-                raise ConfigError(f"Randomization.backlash = 'gear_play': not with the coupled joints of {hand.name}")
-            self._tooth_stiffness = ranges.tooth_stiffness
-            self._rotor_inertia, self._steps = _rotors(ranges, model, dofs)
-            self._link_inertia = np.asarray(1 / model.dof_invweight0[dofs], np.float32)
+    def __init__(self, physics: Physics):
+        self._physics, self._substeps = physics, physics.config.substeps
+        model = physics.mj_model
+        # I / dt: what `apply_friction` needs to stop a joint within a sub-step and not turn it round.
+        self._inertia_rate = jnp.asarray(model.dof_M0[physics.joint_dof] / model.opt.timestep, jnp.float32)
 
-    def rest(
-        self, qpos: jax.Array, qvel: jax.Array, target: jax.Array | None = None
-    ) -> tuple[JointCommand, PhysicsTick]:
-        """The start of an episode: no torque, no touch, rotors at rest in the middle of their gaps.
+    def law(self, hand: HandParams, command: JointCommand) -> TorqueLaw:
+        """The torque [J] Nm on the links, from sub-step to sub-step, for `Physics.advance`."""
 
-        Args:
-          qpos, qvel: of the start state; see `PhysicsState`.
-          target: [J] rad; None for the joints' own angles.
-        """
-        joints, zero = qpos[self.physics.joint_qpos], jnp.zeros(self.hand.num_joints)
-        target, valid = joints if target is None else target, jnp.ones((), bool)
-        return JointCommand(action=zero, target=target, previous=target, valid=valid), PhysicsTick(
-            physics=PhysicsState(qpos, qvel, jnp.zeros(self.physics.mj_model.nv)),
-            finger_force=jnp.zeros((self.hand.num_fingers, 3)),
-            joint_torque=zero,
-            gear=gear_at(joints, jnp.zeros_like(joints)) if self.gear_play else None,
-            limited=jnp.zeros(self.hand.num_joints, bool),
-            finite=valid,
-        )
+        def torque(substep: jax.Array, position: jax.Array, velocity: jax.Array) -> jax.Array:
+            target = delayed_target(substep, hand.latency, command.previous, command.target)
+            torque = drive(hand.actuator, target, jnp.zeros_like(target), position, velocity)
+            return apply_friction(hand.actuator, torque, velocity, self._inertia_rate)
 
-    def encoder(self, joints: jax.Array, gear: GearState | None) -> jax.Array:
-        """What the encoders [J] rad turn with: the joint, or the rotor before the gap."""
-        return joints if gear is None else gear.rotor.position
-
-    def tick(
-        self, episode: Episode, command: JointCommand, physics: PhysicsState, gear: GearState | None, push: jax.Array
-    ) -> PhysicsTick:
-        """A control tick of physics under the motors.
-
-        Args:
-          episode: the hand and the object.
-          command: the joint targets.
-          physics, gear: where the tick begins.
-          push: [3] N on the object.
-        """
-        law = self.law(episode.hand, command)
-        after, force, turned = self.physics.advance_motors(episode.object, physics, law, gear, push, episode.hand.cover)
-        after, turned, force, finite = stay_finite(command.valid, (physics, gear), (after, turned), force)
-        torque, limited = self.current_torque(episode.hand, command, after, turned)
-        return PhysicsTick(
-            physics=after, finger_force=force, joint_torque=torque, gear=turned, limited=limited, finite=finite
-        )
-
-    def law(self, hand: HandParams, command: JointCommand) -> MotorLaw:
-        """The motors as `Physics.advance_motors` wants them."""
-        if self.gear_play:
-            return self._geared(hand, command)
-
-        def motors(substep: jax.Array, position: jax.Array, velocity: jax.Array, gear: None) -> tuple[jax.Array, None]:
-            wanted = delayed_target(substep, hand.latency, command.previous, command.target)
-            torque = drive(hand.actuator, wanted, jnp.zeros_like(wanted), position, velocity)
-            return apply_friction(hand.actuator, torque, velocity, self._inertia_rate), None
-
-        return motors
-
-    def _geared(self, hand: HandParams, command: JointCommand) -> MotorLaw:
-        assert hand.gear_gap is not None, "hands with gear play have a gap"
-        play = GearPlay(hand.gear_gap, self._rotor_inertia, self._tooth_stiffness)
-
-        def motors(
-            substep: jax.Array, position: jax.Array, velocity: jax.Array, gear: GearState
-        ) -> tuple[jax.Array, GearState]:
-            wanted = delayed_target(substep, hand.latency, command.previous, command.target)
-            return drive_beside(
-                hand.actuator,
-                play,
-                gear,
-                wanted,
-                position,
-                velocity,
-                inertia=self._link_inertia,
-                timestep=self._timestep,
-                steps=self._steps,
-            )
-
-        return motors
+        return torque
 
     def current_torque(
-        self, hand: HandParams, command: JointCommand, physics: PhysicsState, gear: GearState | None
+        self, hand: HandParams, command: JointCommand, state: PhysicsState
     ) -> tuple[jax.Array, jax.Array]:
-        """The torque [J] Nm that the motors' currents tell of at the end of a tick, before friction, and whether it
-        [J] is at its limit."""
-        position, velocity = (physics.qpos[self.physics.joint_qpos], physics.qvel[self.physics.joint_dof])
-        if gear is not None:
-            position, velocity = gear.rotor.position, gear.rotor.velocity
-        wanted = delayed_target(jnp.asarray(self._substeps), hand.latency, command.previous, command.target)
-        state = hand.actuator, wanted, jnp.zeros_like(wanted), position, velocity
-        return drive(*state), at_limit(*state)
+        """The torque [J] Nm that the motors' currents correspond to at the end of a tick, before friction, and whether
+        it [J] is at its limit."""
+        position, velocity = state.qpos[self._physics.joint_qpos], state.qvel[self._physics.joint_dof]
+        target = delayed_target(jnp.asarray(self._substeps), hand.latency, command.previous, command.target)
+        arguments = hand.actuator, target, jnp.zeros_like(target), position, velocity
+        return drive(*arguments), at_limit(*arguments)
 
 
-def stay_finite(valid: jax.Array, before: Any, after: Any, force: jax.Array) -> tuple[Any, Any, jax.Array, jax.Array]:
-    """A tick's physics and gears, forces [F, 3] N and whether they are sound [] bool.
+def check_timestep(hand: Hand, physics: PhysicsConfig, ranges: Randomization) -> None:
+    """Check that the stiffest motors that are drawn are stable at the time step, on every engine.
 
-    A world that has diverged ends its episode: it stays as it was `before`, and its forces are zero, since NaNs
-    must not propagate. `valid` [] bool is false where the action was not finite.
+    Engines step v' = v + h/I tau(q, v), q' = q + h v', with the torque of the old state. For one joint under
+    tau = -k_p q - k_d v the step is a matrix of trace 2 - a - b and determinant 1 - b, with a = h^2 k_p / I and
+    b = h k_d / I. Both eigenvalues are inside the unit circle if and only if |1 - b| < 1 and |trace| < 2 - b, that is
+    a + 2 b < 4, or
+
+        h^2 k_p / I + 2 h k_d / I < 4.
+
+    For all joints at once I is the mass matrix, and the left side the largest eigenvalue of M^-1 (h^2 K_p + 2 h K_d).
+    Beyond it a joint chatters from limit to limit of its torque. `Randomization.beyond`, for hands that training never
+    has, is not counted; nor are friction and dead-band, which damp.
+
+    Raises:
+      ConfigError: names the joint and the largest stable time step.
     """
-    physics = after[0]
-    # A diverging solver passes through speeds that are finite and square to 1e27 in the reward.
-    finite = (
-        valid
-        & jnp.all(jnp.isfinite(physics.qpos))
-        & jnp.all(jnp.abs(physics.qvel) < 1e3)
-        & jnp.all(jnp.isfinite(force))
+    step, (stiffness, derivative), (damping, mass) = physics.timestep, _largest_gains(ranges), _masses(hand)
+
+    def largest(step: float) -> tuple[float, int]:
+        """The largest eigenvalue, and the joint that moves most in it."""
+        load = np.diag(np.full(hand.num_joints, step**2 * stiffness + 2 * step * derivative)) + 2 * step * damping
+        values, vectors = np.linalg.eig(np.linalg.solve(mass, load))
+        worst = int(np.argmax(values.real))
+        return float(values.real[worst]), int(np.argmax(np.abs(vectors[:, worst])))
+
+    value, joint = largest(step)
+    if value < 4:
+        return
+    steps = np.linspace(step, 0.0, 200, endpoint=False)
+    stable = next((s for s in steps if largest(s)[0] < 4), 0.0)
+    raise ConfigError(
+        f"PhysicsConfig.timestep = {step:g} s: the stiffest motors drawn are unstable at joint "
+        f"{hand.joint_names[joint]} (h^2 k_p / I + 2 h k_d / I = {value:.2f}, must be below 4): "
+        f"use at most {np.floor(stable * 1e5) / 1e5:g} s, or lower gains (Randomization.stiffness, damping)"
     )
-    physics, gear = choose(finite, after, before)
-    return physics, gear, jnp.where(finite, force, 0.0), finite
 
 
-def rotor_share(ranges: Randomization) -> float:
-    """Share of the joints' armature that `Physics` is to leave out, since rotors carry it."""
-    return ranges.rotor_share if ranges.backlash == "gear_play" else 0.0
+def _largest_gains(ranges: Randomization) -> tuple[float, float]:
+    """k_p Nm/rad and k_d Nm s/rad of the stiffest motor that is drawn, with its efficiency and ripple."""
+    high = {name: 1 + ranges.scale * (getattr(ranges, name)[1] - 1) for name in ("stiffness_factor", "damping_factor")}
+    factor = (1 + ranges.scale * (ranges.efficiency[1] - 1)) * (1 + ranges.scale * ranges.ripple[1])
+    return factor * ranges.stiffness * high["stiffness_factor"], factor * ranges.damping * high["damping_factor"]
 
 
-def _rotors(ranges: Randomization, model: Any, dofs: np.ndarray) -> tuple[np.ndarray, int]:
-    """Rotor inertias [J] kg m^2, and how many steps the rotors take in a sub-step.
-
-    The scene was compiled without the rotors' share of the armature. A rotor is stable while
-    damping * step / inertia < 2; 1 is asked for.
-    """
-    rotor = model.dof_armature[dofs] * ranges.rotor_share / (1 - ranges.rotor_share)
-    if np.any(rotor <= 0):
-        raise ConfigError(
-            "Randomization.backlash = 'gear_play': every joint of the hand's MJCF needs an "
-            "armature, of which rotor_share is the rotor"
-        )
-    most = ranges.scale * (1 + ranges.beyond)
-    largest = ranges.damping * max(1.0, 1 + most * (ranges.damping_factor[1] - 1))
-    return np.asarray(rotor, np.float32), max(int(np.ceil(largest * model.opt.timestep / rotor.min())), 1)
+def _masses(hand: Hand) -> tuple[np.ndarray, np.ndarray]:
+    """Damping [J, J] Nm s/rad and mass matrix [J, J] kg m^2 of the joints with all that follows them, at the middle of
+    their ranges; a finger's posture changes the smallest of them by less than 1 %."""
+    model = read_mjcf(hand).compile()
+    data, mass = mujoco.MjData(model), np.zeros((model.nv, model.nv))
+    data.qpos[:] = np.asarray(hinge_angles(hand, (hand.joint_lower + hand.joint_upper) / 2))
+    mujoco.mj_forward(model, data)
+    mujoco.mj_fullM(model, data, mass)
+    moving = np.flatnonzero(hand.body_joint >= 0)
+    follows = np.zeros((model.nv, hand.num_joints))
+    follows[np.arange(model.nv), hand.body_joint[moving]] = hand.body_ratio[moving]
+    return follows.T @ np.diag(model.dof_damping) @ follows, follows.T @ mass @ follows

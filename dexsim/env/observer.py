@@ -7,7 +7,7 @@ from dexsim.core.errors import ConfigError
 from dexsim.env.config import EnvConfig
 from dexsim.env.task import GroundTruth, Task
 from dexsim.hand.kinematics import Hand
-from dexsim.observation import Motion, Readings, ThreeAxisReadings
+from dexsim.observation import Motion, Readings
 
 
 class Observer:
@@ -23,41 +23,37 @@ class Observer:
         }
         for group, fields in self.layout.items():
             if not fields:
-                out = self._configs[group].leave_out
-                raise ConfigError(f"ObservationConfig.leave_out = {out}: leaves the {group} of {task.name!r} nothing")
+                raise ConfigError(
+                    f"ObservationConfig.leave_out = {self._configs[group].leave_out}: removes every {group} observation"
+                )
 
     def observe(
-        self, readings: Readings, truth: GroundTruth, command: jax.Array, goal_quat: jax.Array
+        self, readings: Readings, truth: GroundTruth, goal: tuple[jax.Array, jax.Array]
     ) -> dict[str, jax.Array]:
         """The observation vectors by group; the critic sees the same fields, but the true values.
 
         Args:
           readings: for the actor.
           truth: for the critic.
-          command, goal_quat: [] and [4], the task's goal as readings carry it.
+          goal: command [] and goal orientation [4], as `Task.goal_readings` gives them.
         """
-        seen = {"actor": readings, "critic": self._true_readings(readings, truth, command, goal_quat)}
+        command, goal_quat = goal
+        true = Readings(
+            joint_position=truth.joint_position,
+            joint_torque=truth.joint_torque / self.hand.torque_limit,
+            taxel_force=truth.touch.force,
+            object_position=truth.object_position,
+            object_velocity=truth.object_velocity,
+            object_quat=truth.object_quat,
+            goal_quat=goal_quat,
+            command=command,
+            last_action=readings.last_action,
+        )
         motion = Motion(truth.joint_velocity, truth.object_spin)
+        # The actor's pose follows from measured angles, which are not the true ones.
+        arguments = {"actor": (readings, None), "critic": (true, truth.pose)}
         return {
-            group: observation.observe(self.hand, seen[group], names, self._configs[group], motion)
+            group: observation.observe(self.hand, seen, names, self._configs[group], motion, pose)
             for group, names in self.fields.items()
+            for seen, pose in (arguments[group],)
         }
-
-    def _true_readings(
-        self, readings: Readings, truth: GroundTruth, command: jax.Array, goal_quat: jax.Array
-    ) -> Readings:
-        known = {
-            "joint_position": truth.joint_position,
-            "joint_torque": truth.joint_torque / self.hand.torque_limit,
-            "taxel_force": truth.touch.force,
-            "object_position": truth.object_position,
-            "object_velocity": truth.object_velocity,
-            "object_quat": truth.object_quat,
-            "goal_quat": goal_quat,
-            "command": command,
-            "last_action": readings.last_action,
-        }
-        if isinstance(readings, ThreeAxisReadings):
-            assert truth.tangential_force is not None, "three-axis taxels are off"
-            return ThreeAxisReadings(**known, tangential_force=truth.tangential_force)
-        return Readings(**known)

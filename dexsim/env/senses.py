@@ -10,11 +10,11 @@ import numpy as np
 
 from dexsim.env.config import EnvConfig
 from dexsim.env.state import Episode, SensorInput, State
-from dexsim.env.task import Task
+from dexsim.env.task import GroundTruth, Task
 from dexsim.hand.kinematics import Hand
-from dexsim.observation import Readings, ThreeAxisReadings
-from dexsim.sensing.imu import ImuParams, measure_orientation, sample_imu
-from dexsim.sensing.taxels import TaxelArray, TaxelMemory, TaxelParams
+from dexsim.observation import Readings
+from dexsim.sensing.imu import measure_orientation
+from dexsim.sensing.taxels import TaxelArray, TaxelMemory
 
 
 class SensorSuite:
@@ -26,14 +26,6 @@ class SensorSuite:
         self.taxels = TaxelArray(config.sensing.taxel, hand.taxel_grid, hand.num_fingers, self.period)
         self._up = -jnp.asarray(task.gravity) / np.linalg.norm(task.gravity)
 
-    def sample_imu(self, key: jax.Array, scale: jax.Array | float, extreme: jax.Array | None) -> ImuParams:
-        """One episode's IMU; see `dexsim.sensing.imu.sample_imu`."""
-        return sample_imu(key, self.config.sensing.orientation, scale, self.period, extreme)
-
-    def sample_taxels(self, key: jax.Array, scale: jax.Array | float) -> TaxelParams:
-        """One episode's taxels."""
-        return self.taxels.sample(key, scale)
-
     def at_rest(self, joints: jax.Array, place: jax.Array) -> SensorInput:
         """What the sensors see at an episode's start, where nothing touches.
 
@@ -41,14 +33,22 @@ class SensorSuite:
           joints: [J] rad.
           place: [7] m and unit quaternion of the object.
         """
-        nothing = jnp.zeros((self.hand.num_fingers, 3)) if self.config.three_axis else None
         return SensorInput(
             joint_position=joints,
             joint_torque=jnp.zeros(self.hand.num_joints),
             taxel_force=jnp.zeros(self.hand.taxel_area.shape),
             object_position=place[:3],
             object_quat=place[3:],
-            tangential_force=nothing,
+        )
+
+    def input(self, truth: GroundTruth) -> SensorInput:
+        """What the sensors see after a tick."""
+        return SensorInput(
+            joint_position=truth.joint_position,
+            joint_torque=truth.joint_torque / self.hand.torque_limit,
+            taxel_force=truth.touch.force,
+            object_position=truth.object_position,
+            object_quat=truth.object_quat,
         )
 
     def read(
@@ -87,21 +87,18 @@ class SensorSuite:
         taxels, memory = self._read_taxels(keys[2], late, episode, last)
         position, velocity = self._read_place(keys[3], late, last)
         command, goal_quat = goal
-        readings = {
-            "joint_position": joints,
-            "joint_torque": torque,
-            "taxel_force": taxels,
-            "object_position": position,
-            "object_velocity": velocity,
-            "object_quat": self._read_orientation(keys[4], now, before, episode, last),
-            "goal_quat": goal_quat,
-            "command": command,
-            "last_action": last_action,
-        }
-        if not self.config.three_axis:
-            return Readings(**readings), memory
-        tangential = self._read_tangential(keys[2], late, episode)
-        return ThreeAxisReadings(**readings, tangential_force=tangential), memory
+        readings = Readings(
+            joint_position=joints,
+            joint_torque=torque,
+            taxel_force=taxels,
+            object_position=position,
+            object_velocity=velocity,
+            object_quat=self._read_orientation(keys[4], now, before, episode, last),
+            goal_quat=goal_quat,
+            command=command,
+            last_action=last_action,
+        )
+        return readings, memory
 
     def _read_place(self, key: jax.Array, late: SensorInput, last: State | None) -> tuple[jax.Array, jax.Array]:
         """The object's position [3] m and the filtered estimate of its velocity [3] m/s."""
@@ -145,9 +142,3 @@ class SensorSuite:
             return late.taxel_force, memory
         memory, taxels = self.taxels.apply(episode.taxels, memory, key, late.taxel_force, episode.hand.taxel_gain)
         return taxels, memory
-
-    def _read_tangential(self, key: jax.Array, late: SensorInput, episode: Episode) -> jax.Array:
-        """[F, 3] N: by the same taxels, with the gains and the dead ones of their normal forces."""
-        assert late.tangential_force is not None, "three-axis taxels are off"
-        key, gain = jax.random.fold_in(key, 1), episode.hand.taxel_gain
-        return self.taxels.apply_tangential(episode.taxels, key, late.tangential_force, late.taxel_force, gain)

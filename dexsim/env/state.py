@@ -4,11 +4,10 @@ from typing import Any
 
 import jax
 
-from dexsim.actuator.gear_play import GearState
 from dexsim.core.pytree import pytree_dataclass
 from dexsim.objects.params import ObjectParams
 from dexsim.observation import Readings
-from dexsim.physics.seam import PhysicsState
+from dexsim.physics.interface import PhysicsState
 from dexsim.randomization import HandParams
 from dexsim.sensing.imu import ImuParams
 from dexsim.sensing.taxels import TaxelMemory, TaxelParams
@@ -43,7 +42,6 @@ class SensorInput:
     taxel_force: jax.Array  # [F, N] N
     object_position: jax.Array  # [3] m
     object_quat: jax.Array  # [4]
-    tangential_force: jax.Array | None = None  # [F, 3] N, with three-axis taxels
 
 
 @pytree_dataclass
@@ -58,8 +56,9 @@ class State:
     goal: Any  # the task's own pytree
     sensor_input: SensorInput
     readings: Readings
+    tip_stiffness: jax.Array  # [F] of the fingertips' springs over nominal, for the next tick
     finger_force: jax.Array  # [F] N, true resultant forces of the object on the finger tips
-    tick: jax.Array  # [] int32 since the episode began (may begin staggered)
+    tick: jax.Array  # [] int32 since the episode began (may begin at a random one)
     length: jax.Array  # [] int32 ticks lived
     episode_return: jax.Array  # []
     obs: dict[str, jax.Array]
@@ -68,31 +67,5 @@ class State:
     truncated: jax.Array  # [] bool
     metrics: dict[str, jax.Array]
     taxel_memory: TaxelMemory
-    gear: GearState | None = None  # of the joints, with gear play
     correction: jax.Array | None = None  # [] of the command, with a force loop
-    reflex: jax.Array | None = None  # [F] rad in the joint targets, with a grip reflex
     scale: jax.Array | None = None  # [] of the ranges that the next episode is drawn from
-
-
-@pytree_dataclass
-class Perception:
-    """What is known of a tick."""
-
-    sensor_input: SensorInput
-    readings: Readings
-    taxel_memory: TaxelMemory
-    obs: dict[str, jax.Array]
-    correction: jax.Array | None
-
-
-@pytree_dataclass
-class Outcome:
-    """What a tick was worth, and whether it ended the episode; see `State`."""
-
-    reward: jax.Array  # []
-    terminated: jax.Array  # [] bool
-    truncated: jax.Array  # [] bool
-    tick: jax.Array  # [] int32
-    length: jax.Array  # [] int32
-    episode_return: jax.Array  # []
-    metrics: dict[str, jax.Array]  # the task's

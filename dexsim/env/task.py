@@ -1,8 +1,8 @@
 """What a task is: the truth that it sees, and the rules that it adds.
 
-A task of one's own is a class with what `Task` names, made from a configuration and a hand, and registered:
+A task of one's own is a subclass of `Task`, made from a configuration and a hand, and registered:
 
-    class Lift:                                    # no base class needed
+    class Lift(dexsim.Task):
         name = "lift"
         ...
         def __init__(self, config: LiftConfig, hand: Hand): ...
@@ -14,16 +14,22 @@ SI units; positions, velocities and forces are in the palm frame, quaternions (w
 fingers, N taxels a finger, K primitives of an object, P start states.
 """
 
-from typing import Any, Protocol
+import abc
+from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
+from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import pytree_dataclass
 from dexsim.env.config import EnvConfig
 from dexsim.env.state import Start
 from dexsim.hand.kinematics import HandPose
+from dexsim.objects import params
 from dexsim.objects.params import ObjectParams
+from dexsim.observation import FIELDS
+from dexsim.task_spec import TurnSpec
 from dexsim.touch.feel import Touch
 
 
@@ -32,28 +38,46 @@ class GroundTruth:
     """The truth after a tick: what reward, termination and the critic may look at."""
 
     object: ObjectParams
-    joint_position: jax.Array  # [J] rad
-    joint_velocity: jax.Array  # [J] rad/s
-    joint_torque: jax.Array  # [J] Nm
+    """The episode's object: size, mass, friction."""
+    joint_position: jax.Array
+    """[J] rad."""
+    joint_velocity: jax.Array
+    """[J] rad/s."""
+    joint_torque: jax.Array
+    """[J] Nm, of the motors, before friction."""
+    torque_limited: jax.Array
+    """[J] bool, whether the motor is at its torque limit."""
     pose: HandPose
-    finger_force: jax.Array  # [F, 3] N, of the object on the finger tips
-    normal_force: jax.Array  # [F] N of it, into the skin; 0 where the finger touches with no skin
+    """Poses of all links and finger tips."""
+    finger_force: jax.Array
+    """[F, 3] N, of the object on the finger tips."""
+    normal_force: jax.Array
+    """[F] N of it, into the skin; 0 where the finger touches with no skin."""
     touch: Touch
-    object_position: jax.Array  # [3] m
-    object_quat: jax.Array  # [4]
-    object_velocity: jax.Array  # [3] m/s
-    object_spin: jax.Array  # [3] rad/s
-    action: jax.Array  # [J]
-    last_action: jax.Array  # [J]
-    tangential_force: jax.Array | None = None  # [F, 3] N of `finger_force`, along the taxels
+    """Depth and force of every taxel."""
+    tip_stiffness: jax.Array
+    """[F] stiffness of the fingertips' contacts over nominal, as the next tick of physics has it."""
+    object_position: jax.Array
+    """[3] m."""
+    object_quat: jax.Array
+    """[4]."""
+    object_velocity: jax.Array
+    """[3] m/s."""
+    object_spin: jax.Array
+    """[3] rad/s."""
+    action: jax.Array
+    """[J] in [-1, 1], that led here."""
+    last_action: jax.Array
+    """[J], the one before."""
 
 
-class Task(Protocol):
+class Task(abc.ABC):
     """What a task adds to a hand and an object.
 
     Methods are pure and written for one environment: JAX traces and vmaps them, but for `make_pool`,
     `evaluation_plan` and `summarize`, which run once, on the host. `Goal` stands for the task's own pytree of arrays,
-    which an episode carries from tick to tick.
+    which an episode carries from tick to tick. A task sets the attributes without a value here, and overrides the
+    abstract methods at least.
     """
 
     name: str
@@ -76,12 +100,16 @@ class Task(Protocol):
     object_ranges: tuple[str, ...]
     """Paths in `config` of the ranges that `sample_object` draws from. Those of the object's bulk among them, such as
     "objects.mass", are drawn anew at every episode start; the others stay as the pool has them."""
+    config: EnvConfig
+    """An `EnvConfig` or a subclass with settings of the task's own."""
+    posture: tuple[float, ...] = ()
+    """rad, joint angles [J] that an episode on a hand starts from; empty: from wherever the hand is."""
+    turn: TurnSpec | None = None
+    """Goals that follow one another about an axis, for a task that has them; see `turns`."""
+    finger_force: tuple[float, float] | None = None
+    """N, force of a touching finger at the commands 0 and 1, for a task with a force command."""
 
-    @property
-    def config(self) -> EnvConfig:
-        """An `EnvConfig` or a subclass with settings of the task's own; an attribute will do."""
-        ...
-
+    @abc.abstractmethod
     def make_pool(self, key: jax.Array) -> Start:
         """Start states [P, ...] of which every episode begins with one; made once for training, and once for each
         evaluation, with keys of their own.
@@ -89,7 +117,6 @@ class Task(Protocol):
         Raises:
           ConfigError: the configuration leaves too few of them.
         """
-        ...
 
     def sample_object(self, key: jax.Array, config: Any, shape_index: jax.Array | None = None) -> ObjectParams:
         """One object.
@@ -99,49 +126,58 @@ class Task(Protocol):
           config: a configuration of this task, whose ranges may be others than `self.config`'s.
           shape_index: [] int32 into `dexsim.objects.config.SHAPES`; None for any that the task has.
         """
-        ...
+        return params.sample_object(key, config.objects, shape_index)
 
     def unit_inertia(self, object: ObjectParams) -> jax.Array:
         """Inertia [3] m^2 of the object as a uniform solid of 1 kg, which a narrowed range of inertia is about."""
-        ...
+        return params.unit_inertia(object, self.config.objects)
 
+    @abc.abstractmethod
     def begin(self, key: jax.Array, start: Start) -> Any:
         """The Goal of a new episode that begins with `start`."""
-        ...
 
+    @abc.abstractmethod
     def update(self, key: jax.Array, goal: Any, truth: GroundTruth) -> Any:
         """The Goal after a tick; of the same structure, shapes and types."""
-        ...
 
     def goal_readings(self, goal: Any) -> tuple[jax.Array, jax.Array]:
         """What readings carry of the goal: grip command [] in [0, 1], and the object's goal orientation [4]."""
-        ...
+        del goal
+        return jnp.zeros(()), jnp.array([1.0, 0.0, 0.0, 0.0])
 
     def push(self, key: jax.Array, object: ObjectParams) -> jax.Array:
         """Force [3] N on the object's centre of mass during the next tick; zeros for none."""
-        ...
+        del key, object
+        return jnp.zeros(3)
 
+    @abc.abstractmethod
     def dropped(self, goal: Any, truth: GroundTruth) -> jax.Array:
         """Whether [] bool the episode has failed and ends here. `goal` is the one after the tick."""
-        ...
 
+    @abc.abstractmethod
     def reward(self, goal: Any, truth: GroundTruth, dropped: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
         """The reward [] of a tick, and metrics [] by name.
 
-        Names must be the same in every tick; "return", "length", "shape", "non_finite", "torque_limited" (whether a
-        joint is at its torque limit) and names that begin with "tangential" are the environment's.
+        Names must be the same in every tick; "return", "length", "shape", "non_finite" and "torque_limited" (whether a
+        joint is at its torque limit) are the environment's.
 
         Args:
           goal: the one that held during the tick.
           truth: after the tick.
           dropped: [] bool, whether the episode ends by failure: `dropped`, or physics that diverged.
         """
-        ...
 
     def target_force(self, goal: Any) -> jax.Array:
         """Force [] N that each finger is asked for; it is shown in pictures only. Zero for none."""
-        ...
+        del goal
+        return jnp.zeros(())
 
+    def turns(self, goal: Any) -> jax.Array | None:
+        """Goals [] int32 reached since the episode began, for pictures of a task with `turn`."""
+        del goal
+        return None
+
+    @abc.abstractmethod
     def evaluation_plan(self, count: int, shape_index: np.ndarray) -> tuple[np.ndarray, Any]:
         """The episodes of an evaluation.
 
@@ -153,8 +189,8 @@ class Task(Protocol):
           Rows [count] of that pool, and Goals [count, ...]. Rows repeat only where there are too few
           of them, or where episodes are meant to share a start.
         """
-        ...
 
+    @abc.abstractmethod
     def summarize(self, metrics: dict[str, np.ndarray], alive: np.ndarray, control_period: float) -> dict[str, Any]:
         """An evaluation's report: plain data that JSON can hold. "headline" maps names to what is
         printed, figures that a hand that does nothing fails: numbers, or dictionaries with "value", "low" and "high".
@@ -165,4 +201,37 @@ class Task(Protocol):
           alive: for "series" [T, N] bool, whether an episode had not ended; for "totals" [N], the ticks it lived.
           control_period: s.
         """
-        ...
+
+
+def check_task(task: Any) -> Task:
+    """`task`, if it is a `Task` with all attributes, and observes fields that exist.
+
+    Raises:
+      ConfigError: it is not.
+    """
+    if not isinstance(task, Task):
+        raise ConfigError(f"{type(task).__name__}: expected a subclass of dexsim.Task")
+    if missing := [name for name in Task.__annotations__ if not hasattr(task, name)]:
+        raise ConfigError(
+            f"task {type(task).__name__}: missing attributes: {', '.join(missing)}; see help(dexsim.Task)"
+        )
+    for group in ("actor", "critic"):
+        if not task.fields.get(group):
+            raise ConfigError(f"task {task.name!r}: fields[{group!r}] is missing or empty")
+        if unknown := [name for name in task.fields[group] if name not in FIELDS]:
+            raise ConfigError(
+                f"task {task.name!r}: no observation field {unknown[0]!r}: choose from {', '.join(FIELDS)}"
+            )
+    return task
+
+
+def reward_of(task: Task, goal: Any, truth: GroundTruth, dropped: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """The task's reward [] as a float, and its metrics; raises ConfigError where it returns something else."""
+    result: Any = task.reward(goal, truth, dropped)
+    if not (isinstance(result, tuple) and len(result) == 2 and isinstance(result[1], dict)):
+        raise ConfigError(f"task {task.name!r}: reward must return (reward, metrics); got {type(result).__name__}")
+    for name, value in (("reward", result[0]), *result[1].items()):
+        if jnp.shape(value) != ():
+            raise ConfigError(f"task {task.name!r}: {name} must be a scalar; got shape {jnp.shape(value)}")
+    # The state begins with a float, and a compiled loop carries it.
+    return jnp.asarray(result[0], float), result[1]

@@ -7,11 +7,11 @@ from dexsim.core.pytree import pytree_dataclass
 from dexsim.env.config import EnvConfig
 from dexsim.geometry import rotations
 from dexsim.geometry.vectors import length
-from dexsim.hand.kinematics import Hand, HandPose, taxel_normals
+from dexsim.hand.kinematics import Hand, HandPose
 from dexsim.objects.params import ObjectParams
 from dexsim.objects.touch_geometry import touch_geometry
-from dexsim.touch.feel import Touch, feel_links, keep_normal_part, split_force, taxel_share
-from dexsim.touch.surface import taxels_only, whole_surface
+from dexsim.touch.feel import Touch, feel_links, keep_normal_part
+from dexsim.touch.surface import skin_surface, taxels_only, whole_surface
 
 
 @pytree_dataclass
@@ -20,70 +20,54 @@ class FingertipTouch:
 
     touch: Touch  # [F, N]
     normal_force: jax.Array  # [F] N, what of the finger's force presses into its skin, with or without taxels
-    tangential_force: jax.Array | None  # [F, 3] N along the taxels, with three-axis taxels
+    skin_force: jax.Array  # [F] N, by the skin's law, of all skin that bears load: for the contact's springs
 
 
 class TouchModel:
     """Taxels and skin of one environment's hand. Pure methods."""
 
     def __init__(self, config: EnvConfig, hand: Hand):
+        skin = config.skin
         self.config, self.hand = config, hand
-        self._surface = whole_surface(hand, config.skin.thickness) if config.skin.untaxelled else taxels_only(hand)
+        self._surface = whole_surface(hand, skin.thickness) if skin.untaxelled else taxels_only(hand)
+        self._bearing = skin_surface(hand, skin)
         self.geometry = touch_geometry(config.objects, config.touch_method)
+        # Whether the taxels' forces are those of the springs: the same points, geometry and rubber.
+        same_rubber = skin.margin == config.physics.pad_thickness
+        self._shared = config.touch and config.touch_method == "closed_form" and not skin.untaxelled and same_rubber
 
     def feel(
         self,
         pose: HandPose,
         object: ObjectParams,
         position: jax.Array,
-        quat: jax.Array,
+        rotation: jax.Array,
         force: jax.Array,
-        cover: jax.Array | float = 0.0,
+        pad_thickness_delta: jax.Array | float = 0.0,
     ) -> FingertipTouch:
         """The taxels' forces.
 
         Args:
           pose: of the hand.
-          object, position [3] m, quat [4]: the object and where it is, palm frame.
+          object, position [3] m, rotation [3, 3]: the object and where it is, palm frame.
           force: [F, 3] N, of the object on the finger tips, palm frame.
-          cover: [] m, change of the rubber's thickness from `Skin.margin`.
+          pad_thickness_delta: [] m, change of the rubber's thickness from `Skin.margin`.
         """
-        hand, config = self.hand, self.config
-        if config.touch:
-            touch, normal, share = self._press(pose, object, position, quat, force, cover)
-        else:
-            nothing, normal, share = jnp.zeros(hand.taxel_area.shape), jnp.zeros(hand.num_fingers), 0.0
-            touch = Touch(nothing, nothing, nothing)
-        if not config.three_axis:
-            return FingertipTouch(touch, normal, None)
-        return FingertipTouch(touch, normal, split_force(touch.force, taxel_normals(hand, pose), share * force)[1])
-
-    def _press(
-        self,
-        pose: HandPose,
-        object: ObjectParams,
-        position: jax.Array,
-        quat: jax.Array,
-        force: jax.Array,
-        cover: jax.Array | float,
-    ) -> tuple[Touch, jax.Array, jax.Array | float]:
-        """The touch, the normal forces [F] N, and the share [F, 1] of each finger's load that the taxels bear."""
-        hand, skin, surface = self.hand, self.config.skin, self._surface
-        touch = feel_links(
-            hand,
-            pose,
-            self.geometry(object),
-            position,
-            rotations.quat_to_matrix(quat),
-            length(force),
-            skin,
-            surface,
-            cover,
-        )
-        # In the links' frames, where the normals are constants.
-        local = rotations.rotate_inverse(pose.tip_rotation, force)
-        pressed = keep_normal_part(touch, jnp.asarray(surface.normal), local)
-        if skin.total == "pressing":
-            touch = pressed
-        share = taxel_share(touch.skin_force, hand.num_taxels) if skin.untaxelled else 1.0
-        return jax.tree.map(lambda x: x[:, : hand.num_taxels], touch), jnp.sum(pressed.force, -1), share
+        hand, skin, place = self.hand, self.config.skin, (position, rotation)
+        nothing = jnp.zeros(hand.taxel_area.shape)
+        touch, normal = Touch(nothing, nothing, nothing), jnp.zeros(hand.num_fingers)
+        if self.config.touch:
+            surface, geometry = self._surface, self.geometry(object)
+            touch = feel_links(hand, pose, geometry, *place, length(force), skin, surface, pad_thickness_delta)
+            # In the links' frames, where the normals are constants.
+            local = rotations.rotate_inverse(pose.tip_rotation, force)
+            pressed = keep_normal_part(touch, jnp.asarray(surface.normal), local)
+            normal = jnp.sum(pressed.force, -1)
+            touch = pressed if skin.total == "pressing" else touch
+        if self._shared:
+            return FingertipTouch(touch, normal, jnp.sum(touch.skin_force, -1))
+        delta = jnp.maximum(pad_thickness_delta, -self.config.physics.pad_thickness)  # the solver's
+        unit = jnp.ones(hand.num_fingers)
+        bearing = feel_links(hand, pose, object.shape(), *place, unit, skin, self._bearing, delta)
+        touch = jax.tree.map(lambda x: x[:, : hand.num_taxels], touch)
+        return FingertipTouch(touch, normal, jnp.sum(bearing.skin_force, -1))

@@ -1,1 +1,1 @@
-"""The physics seam: one scene, several backends."""
+"""Physics: one scene, one interface, several engines."""

@@ -20,9 +20,9 @@ from dexsim.core.errors import AssetError, ConfigError
 from dexsim.objects.params import ObjectParams
 from dexsim.physics.host import call
 from dexsim.physics.host.engine import HostEngine
-from dexsim.physics.host.law import Recorded, read_law, record
-from dexsim.physics.parameters import places, values
-from dexsim.physics.seam import ContactParams, PhysicsScene, PhysicsState, TorqueLaw
+from dexsim.physics.host.law import Recorded, one_by_one, record
+from dexsim.physics.interface import ContactParams, PhysicsScene, PhysicsState, StepResult, TorqueLaw
+from dexsim.physics.parameters import configured, values
 
 # Programs name their engine by a hash of its scene, so that one that was loaded from a cache finds it.
 _engines: weakref.WeakValueDictionary[str, HostEngine] = weakref.WeakValueDictionary()
@@ -31,10 +31,10 @@ _newest: collections.deque[HostEngine] = collections.deque(maxlen=4)
 
 
 class CBackend:
-    """`dexsim.physics.seam.Backend` in C MuJoCo."""
+    """`dexsim.physics.interface.Backend` in C MuJoCo."""
 
     def __init__(self, scene: PhysicsScene, num_envs: int = 1):
-        """Models are made at the first tick of a batch, so `num_envs` reserves nothing."""
+        """Worlds are made at the first tick of a batch, so `num_envs` reserves nothing."""
         del num_envs
         model = scene.model
         # The compiler lets C MuJoCo skip offsets that are zero in the template. Objects bring others.
@@ -52,11 +52,7 @@ class CBackend:
 
     def configure(self, object: ObjectParams, contacts: ContactParams) -> dict[str, jax.Array]:
         """What the models of one environment have in place of the scene's, by the names of `mujoco.MjModel`."""
-        where = places(self.scene)
-        return {
-            name: jnp.asarray(getattr(self.scene.model, name), jnp.float32).at[where[name]].set(value)
-            for name, value in values(self.scene, object, contacts).items()
-        }
+        return configured(self.scene, object, contacts)
 
     def advance(
         self,
@@ -64,51 +60,37 @@ class CBackend:
         contacts: ContactParams,
         state: PhysicsState,
         torque: TorqueLaw,
-        memory: Any,
         push: jax.Array,
-    ) -> tuple[PhysicsState, jax.Array, Any]:
+    ) -> StepResult:
         """One control tick in one call, or one for each sub-step if the host cannot evaluate the law."""
         scene, substeps = self.scene, self.scene.config.substeps
         fields = values(scene, object, contacts)
-        law = self._record(torque, state, memory)
+        law = self._record(torque, state)
         if law is not None:
-            return self._advance(fields, state, law, memory, push, substeps)
+            return self._advance(fields, state, law, push, substeps)
 
-        def substep(carry: tuple[PhysicsState, Any], index: jax.Array) -> tuple[tuple[PhysicsState, Any], jax.Array]:
-            state, memory = carry
-            tau, memory = torque(index, state.qpos[scene.joint_qpos], state.qvel[scene.joint_dof], memory)
-            given = self._record(lambda *_: (tau, None), state, None)
-            assert given is not None
-            state, force, _ = self._advance(fields, state, given, None, push, 1)
-            return (state, memory), force
+        def substep(torque: TorqueLaw, state: PhysicsState) -> StepResult:
+            law = self._record(torque, state)
+            assert law is not None
+            return self._advance(fields, state, law, push, 1)
 
-        (state, memory), forces = jax.lax.scan(substep, (state, memory), jnp.arange(substeps))
-        return state, forces[-1], memory
+        return one_by_one(scene, substep, torque, state)
 
-    def _record(self, torque: TorqueLaw, state: PhysicsState, memory: Any) -> Recorded | None:
-        return record(torque, jnp.zeros(len(self.scene.joint_dof), state.qpos.dtype), memory)
+    def _record(self, torque: TorqueLaw, state: PhysicsState) -> Recorded | None:
+        return record(torque, jnp.zeros(len(self.scene.joint_dof), state.qpos.dtype))
 
     def _advance(
-        self,
-        fields: dict[str, jax.Array],
-        state: PhysicsState,
-        law: Recorded,
-        memory: Any,
-        push: jax.Array,
-        substeps: int,
-    ) -> tuple[PhysicsState, jax.Array, Any]:
-        arguments = [state.qpos, state.qvel, state.warmstart, push, *law.constants, *jax.tree.leaves(memory)]
-        found = self._tick(tuple(fields), law.text, substeps, *fields.values(), *map(jnp.asarray, arguments))
-        qpos, qvel, warmstart, force, *after = found
-        return PhysicsState(qpos, qvel, warmstart), force, jax.tree.unflatten(law.tree, after)
+        self, fields: dict[str, jax.Array], state: PhysicsState, law: Recorded, push: jax.Array, substeps: int
+    ) -> StepResult:
+        arguments = [*fields.values(), state.qpos, state.qvel, state.warmstart, push, *law.constants]
+        *after, force = self._tick(tuple(fields), law.text, substeps, *map(jnp.asarray, arguments))
+        return StepResult(PhysicsState(*after), force)
 
     def _call(self, fields: tuple[str, ...], law: str, substeps: int, *arguments: jax.Array) -> list[jax.Array]:
-        force = jax.ShapeDtypeStruct((self.scene.hand.num_fingers, 3), arguments[len(fields)].dtype)
-        memory: tuple[jax.Array, ...] = arguments[len(arguments) - read_law(law.encode()).outputs + 1 :]
-        before, after = ([jax.ShapeDtypeStruct(x.shape, x.dtype) for x in part] for part in (arguments, memory))
-        results = [*before[len(fields) : len(fields) + 3], force, *after]
+        state = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in arguments[len(fields) : len(fields) + 3]]
+        force = jax.ShapeDtypeStruct((self.scene.hand.num_fingers, 3), state[0].dtype)
         head = json.dumps({"engine": self._key, "fields": fields, "substeps": substeps})
-        return call.call(results, *arguments, head=head, law=law)
+        return call.call([*state, force], *arguments, head=head, law=law)
 
 
 def _no_gradient(*_: Any) -> Any:

@@ -15,12 +15,13 @@ class PhysicsConfig:
     substeps: int = setting(5, unit="1", low=1, high=200)
     """Sub-steps in one control tick; the control rate is 1 / (timestep * substeps), from 1 to 1000 Hz."""
     iterations: int = setting(3, unit="1", low=1, high=100)
-    """Newton iterations of the contact solver."""
+    """Newton iterations of the contact solver. Backends c and cuda stop once they have converged, and may take as many
+    as that needs: 20 and 10 are their least limits."""
     line_search: int = setting(6, unit="1", low=1, high=100)
-    """Line-search iterations in each of them."""
+    """Line-search iterations in each of them; c and cuda may take 50 and 10."""
     friction_ratio: float = setting(20.0, unit="1", low=0.1, high=1000.0)
     """How much harder a contact resists sliding than penetration (MuJoCo's impratio)."""
-    cover: float = setting(0.003, unit="m", low=0.0, high=0.01)
+    pad_thickness: float = setting(0.003, unit="m", low=0.0, high=0.01)
     """Thickness of the rubber over the fingertips, by which their geoms are enlarged. Keep it equal to `Skin.margin`,
     so that contact begins at the same distance for solver and taxels."""
     pad_points: int = setting(3, unit="1", low=1, high=8)
@@ -31,7 +32,7 @@ class PhysicsConfig:
     """JAX backend only. closed: MJX's rigid bodies with closed-form contacts and our own solver where the scene allows
     it (`dexsim.physics.solver.substep`); mjx: `mjx.step`, about twice as slow on a CPU, other points on boxes."""
     max_contacts: int = setting(20, unit="1", low=4, high=400)
-    """Contacts kept per environment (JAX backend: the deepest; Warp: mean over the batch)."""
+    """Contacts kept per environment (JAX backend: the deepest; Warp: mean over the batch; cuda: always 32)."""
 
     def __post_init__(self):
         validate(self)

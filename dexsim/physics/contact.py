@@ -19,9 +19,6 @@ from dexsim.core.pytree import Array
 from dexsim.geometry import rotations, sdf
 from dexsim.hand.kinematics import Hand, HandPose
 from dexsim.objects.params import ObjectParams
-from dexsim.touch.feel import feel_links
-from dexsim.touch.skin import Skin
-from dexsim.touch.surface import Surface
 
 # One sphere's share of a fingertip's stiffness: two or three of a row touch at once.
 ROW_SHARE = 0.5
@@ -84,8 +81,8 @@ def pair_constants(
     return model.body_invweight0[bodies, 0].sum(0), share, finger
 
 
-def cover_tips(spec: mujoco.MjSpec, hand: Hand, cover: float) -> None:
-    """Enlarge the geoms of the fingertips that touch by `cover` m.
+def thicken_tips(spec: mujoco.MjSpec, hand: Hand, thickness: float) -> None:
+    """Enlarge the geoms of the fingertips that touch by `thickness` m of rubber.
 
     Raises:
       AssetError: the size of one is not in the file, where rubber can be added to it.
@@ -99,10 +96,10 @@ def cover_tips(spec: mujoco.MjSpec, hand: Hand, cover: float) -> None:
                     f"{hand.model_path}: geom {geom.name!r} of a fingertip has its size from "
                     f"{'fromto' if spanned else 'a mesh'}: rubber is added to it, give it as size, pos and quat"
                 )
-            geom.size = np.array(geom.size) + cover * _growth(geom.type)
+            geom.size = np.array(geom.size) + thickness * _growth(geom.type)
 
 
-def covered(model: mujoco.MjModel, pairs: np.ndarray, tips: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def rubber_geoms(model: mujoco.MjModel, pairs: np.ndarray, tips: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Geoms [S] on bodies `tips` that are part of `pairs`, and the change [S, 3] of their sizes over the rubber's."""
     used = np.unique([model.pair_geom1[pairs], model.pair_geom2[pairs]])
     used = used[np.isin(model.geom_bodyid[used], tips)]
@@ -167,13 +164,12 @@ def find_pads(model: mujoco.MjModel, pairs: np.ndarray, tips: np.ndarray) -> Pad
 def follow_skin(
     hand: Hand,
     pads: Pads,
-    skin: Skin,
-    surface: Surface,
     pose: HandPose,
     object: ObjectParams,
     position: jax.Array,
     rotation: jax.Array,
-    cover: jax.Array | float = 0.0,
+    skin_force: jax.Array,
+    pad_thickness_delta: jax.Array | float = 0.0,
 ) -> jax.Array:
     """How much stiffer [F] than nominal a fingertip's springs are for their sum to be the skin's force.
 
@@ -182,13 +178,12 @@ def follow_skin(
     The first millimetre blends (`BLEND_DEPTH`).
 
     Args:
-      surface: the skin that bears load (`dexsim.touch.surface.skin_surface`).
       pose: of the hand; `position` [3] and `rotation` [3, 3] are the object's, in the palm frame.
-      cover: [] m, change of the rubber's thickness from `pads` and `skin`.
+      skin_force: [F] N, S: what all skin that bears load (`dexsim.touch.surface.skin_surface`) presses with there.
+      pad_thickness_delta: [] m, change of the rubber's thickness from `pads`.
     """
     shape, radius = object.shape(), jnp.asarray(pads.radius)
-    radius = jnp.where(radius > 0, radius + cover, 0.0)
-    touch = feel_links(hand, pose, shape, position, rotation, jnp.ones(hand.num_fingers), skin, surface, cover)
+    radius = jnp.where(radius > 0, radius + pad_thickness_delta, 0.0)
     centre = pose.body_position[hand.tip_body][:, None] + rotations.rotate(
         pose.tip_rotation[:, None], jnp.asarray(pads.centre)
     )
@@ -199,6 +194,6 @@ def follow_skin(
         gap = sdf.primitive_distance(kind, here, shape.size[k])
         depth += jnp.where(shape.active[k], jnp.maximum(radius - gap, 0.0), 0.0)
     nominal = NOMINAL * ROW_SHARE
-    ratio = (jnp.sum(touch.skin_force, -1) + nominal * BLEND_DEPTH) / (nominal * (jnp.sum(depth, -1) + BLEND_DEPTH))
+    ratio = (skin_force + nominal * BLEND_DEPTH) / (nominal * (jnp.sum(depth, -1) + BLEND_DEPTH))
     has = jnp.asarray(pads.radius.any(-1))  # a fingertip that is no row of spheres keeps its stiffness
     return jnp.where(has, jnp.clip(ratio, SOFTEST, STIFFEST), 1.0)

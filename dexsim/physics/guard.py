@@ -108,7 +108,8 @@ def _lacking_warp(model: mujoco.MjModel) -> list[str]:
     return found
 
 
-_LACKING = {"jax": _lacking_jax, "warp": _lacking_warp, "c": lambda model: []}
+# What the CUDA kernel lacks of a scene, it says itself (`dexsim.physics.cuda.scene.check_scene`).
+_LACKING = {"jax": _lacking_jax, "warp": _lacking_warp, "c": lambda model: [], "cuda": lambda model: []}
 
 
 def _any_row(values: np.ndarray) -> np.ndarray:

@@ -7,13 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from dexsim.objects.params import ObjectParams
+from dexsim.physics.interface import ContactParams, PhysicsScene, PhysicsState, StepResult, TorqueLaw
 from dexsim.physics.mjx_backend import MjxBackend
-from dexsim.physics.seam import ContactParams, PhysicsScene, PhysicsState, TorqueLaw
 from dexsim.physics.solver.substep import find_stepper
 
 
 class JaxBackend(MjxBackend):
-    """`dexsim.physics.seam.Backend` in JAX."""
+    """`dexsim.physics.interface.Backend` in JAX."""
 
     def __init__(self, scene: PhysicsScene, num_envs: int = 1):
         """Raises AssetError: MJX lacks what the scene uses. JAX reserves no memory for `num_envs`."""
@@ -38,30 +38,26 @@ class JaxBackend(MjxBackend):
         contacts: ContactParams,
         state: PhysicsState,
         torque: TorqueLaw,
-        memory: Any,
         push: jax.Array,
-    ) -> tuple[PhysicsState, jax.Array, Any]:
+    ) -> StepResult:
         """One control tick, with our contacts and solver (`substep`) or by `mjx.step`."""
         stepper = self._stepper
         if stepper is None:
-            return super().advance(object, contacts, state, torque, memory, push)
+            return super().advance(object, contacts, state, torque, push)
         scene, model = self.scene, self.configure(object, contacts)
         data = self.make_data()
 
         def run(carry: tuple[Any, ...], index: jax.Array) -> tuple[tuple[Any, ...], jax.Array]:
-            (qpos, qvel, warmstart), memory = carry
-            tau, memory = torque(index, qpos[scene.joint_qpos], qvel[scene.joint_dof], memory)
+            qpos, qvel, warmstart = carry
+            tau = torque(index, qpos[scene.joint_qpos], qvel[scene.joint_dof])
             applied = jnp.zeros(scene.model.nv).at[scene.joint_dof].set(tau)
-            after, force = stepper.step(
-                model, data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart), applied, push
-            )
-            return (after, memory), force
+            return stepper.step(model, data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart), applied, push)
 
         # The force is not part of the carry: it would begin as zeros, which are the same for all environments, and
         # vmap would trace all of this twice.
-        begin = ((state.qpos, state.qvel, state.warmstart), memory)
-        (after, memory), forces = jax.lax.scan(run, begin, jnp.arange(scene.config.substeps))
-        return PhysicsState(*after), forces[-1], memory
+        begin = (state.qpos, state.qvel, state.warmstart)
+        after, forces = jax.lax.scan(run, begin, jnp.arange(scene.config.substeps))
+        return StepResult(PhysicsState(*after), forces[-1])
 
     def finger_force(self, data: Any) -> jax.Array:
         """Sum the solver's forces [F, 3] N per finger; this implementation has no sensor that matches bodies."""

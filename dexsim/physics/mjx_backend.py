@@ -8,12 +8,12 @@ import jax.numpy as jnp
 
 from dexsim.core.errors import AssetError
 from dexsim.objects.params import ObjectParams
+from dexsim.physics.interface import ContactParams, PhysicsScene, PhysicsState, StepResult, TorqueLaw
 from dexsim.physics.parameters import places, values
-from dexsim.physics.seam import ContactParams, PhysicsScene, PhysicsState, TorqueLaw
 
 
 class MjxBackend:
-    """A scene in MJX; see `dexsim.physics.seam.Backend`. Each implementation adds its data and its force reader."""
+    """A scene in MJX; see `dexsim.physics.interface.Backend`. Implementations add data and a force reader."""
 
     def __init__(self, scene: PhysicsScene, impl: str):
         """Raises AssetError: MJX lacks what the scene uses."""
@@ -50,25 +50,22 @@ class MjxBackend:
         contacts: ContactParams,
         state: PhysicsState,
         torque: TorqueLaw,
-        memory: Any,
         push: jax.Array,
-    ) -> tuple[PhysicsState, jax.Array, Any]:
+    ) -> StepResult:
         """One control tick by `mjx.step`."""
         scene, model = self.scene, self.configure(object, contacts)
         data = self.make_data().replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.warmstart)
         wrench = jnp.zeros((scene.model.nbody, 6)).at[scene.object_body, :3].set(push)
         data = data.replace(xfrc_applied=wrench)
 
-        def substep(carry: tuple[Any, Any], index: jax.Array) -> tuple[tuple[Any, Any], None]:
-            data, memory = carry
-            tau, memory = torque(index, data.qpos[scene.joint_qpos], data.qvel[scene.joint_dof], memory)
+        def substep(data: Any, index: jax.Array) -> tuple[Any, None]:
+            tau = torque(index, data.qpos[scene.joint_qpos], data.qvel[scene.joint_dof])
             applied = jnp.zeros(scene.model.nv).at[scene.joint_dof].set(tau)
             # MJX relies on implicit promotion, which the caller may have made an error.
             with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
-                return (self.mjx.step(model, data.replace(qfrc_applied=applied)), memory), None
+                return self.mjx.step(model, data.replace(qfrc_applied=applied)), None
 
         # Forces are read after the scan: stacking sensordata as a scan output more than doubled
         # the step and returned zeros on the GPU.
-        (data, memory), _ = jax.lax.scan(substep, (data, memory), jnp.arange(scene.config.substeps))
-        after = PhysicsState(data.qpos, data.qvel, data.qacc_warmstart)
-        return after, self.finger_force(data), memory
+        data, _ = jax.lax.scan(substep, data, jnp.arange(scene.config.substeps))
+        return StepResult(PhysicsState(data.qpos, data.qvel, data.qacc_warmstart), self.finger_force(data))

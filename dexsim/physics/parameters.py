@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dexsim.objects.params import ObjectParams, bounding_radius
-from dexsim.physics.seam import ContactParams, PhysicsScene
+from dexsim.physics.interface import ContactParams, PhysicsScene
 
 
 def places(scene: PhysicsScene) -> dict[str, Any]:
@@ -33,11 +33,11 @@ def places(scene: PhysicsScene) -> dict[str, Any]:
 
 def values(scene: PhysicsScene, object: ObjectParams, contacts: ContactParams) -> dict[str, jax.Array]:
     """What goes to those places; without `geom_quat` where the object's primitives are aligned with it."""
-    tips = scene.model.geom_size[scene.tip_geoms] + contacts.cover * scene.tip_growth
+    tips = scene.model.geom_size[scene.tip_geoms] + contacts.pad_thickness_delta * scene.tip_growth
     # The broad phase leaves out what is farther away. Of thinner rubber the sphere round it may stay.
     around = scene.model.geom_rbound[scene.tip_geoms]
-    around = around + jnp.maximum(contacts.cover, 0.0) * np.linalg.norm(scene.tip_growth, axis=-1)
-    found = {
+    around = around + jnp.maximum(contacts.pad_thickness_delta, 0.0) * np.linalg.norm(scene.tip_growth, axis=-1)
+    changed = {
         "geom_size": jnp.concatenate([object.size, tips]),
         "geom_rbound": jnp.concatenate([bounding_radius(object.size, scene.slots), around]),
         "geom_pos": object.position,
@@ -48,4 +48,13 @@ def values(scene: PhysicsScene, object: ObjectParams, contacts: ContactParams) -
         "pair_solref": contacts.solref,
         "pair_solimp": contacts.solimp,
     }
-    return found if object.quat is None else found | {"geom_quat": object.quat}
+    return changed if object.quat is None else changed | {"geom_quat": object.quat}
+
+
+def configured(scene: PhysicsScene, object: ObjectParams, contacts: ContactParams) -> dict[str, jax.Array]:
+    """The whole fields of one environment's model, the scene's with `values` in their `places`."""
+    where = places(scene)
+    return {
+        name: jnp.asarray(getattr(scene.model, name), jnp.float32).at[where[name]].set(value)
+        for name, value in values(scene, object, contacts).items()
+    }

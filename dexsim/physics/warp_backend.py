@@ -7,8 +7,8 @@ import jax.numpy as jnp
 
 from dexsim.hand.kinematics import Hand
 from dexsim.physics.config import PhysicsConfig
+from dexsim.physics.interface import PhysicsScene
 from dexsim.physics.mjx_backend import MjxBackend
-from dexsim.physics.seam import PhysicsScene
 
 # Warp's flags for full buffers: constraint rows, their non-zeros, broad phase, narrow phase,
 # convex collision, contact sensors. Its other flags report iteration limits, which are intended.
@@ -16,7 +16,7 @@ _OVERFLOW = 1 | 2 | 4 | 8 | 16 | 64
 
 
 class WarpBackend(MjxBackend):
-    """`dexsim.physics.seam.Backend` on Warp."""
+    """`dexsim.physics.interface.Backend` on Warp."""
 
     def __init__(self, scene: PhysicsScene, num_envs: int):
         """Raises AssetError: Warp lacks what the scene uses."""

@@ -51,8 +51,8 @@ class CheckArguments:
 
     task: str = "grasp"
     """Name of the task, which gets its default configuration; my_module:poke for a task of your own."""
-    backend: Literal["auto", "jax", "warp", "c"] = setting("auto")
-    """Physics backend. auto: c on a CPU, warp on an NVIDIA GPU if it is installed, otherwise jax."""
+    backend: Literal["auto", "jax", "cuda", "warp", "c"] = setting("auto")
+    """Physics backend. auto: c on a CPU, cuda on an NVIDIA GPU, otherwise jax."""
     num_envs: int = setting(16, unit="1", low=2, high=65536)
     """Hands sampled for each range."""
     ticks: int = setting(12, unit="1", low=1, high=1000)

@@ -63,8 +63,7 @@ def check(
       states: a batch of fresh states.
       key: of the draws and actions.
       ticks: length of the comparison.
-      names: which ranges ("Randomization.x", "ObjectConfig.x", "push"); by default all but those of the
-        model of backlash that is not chosen.
+      names: which ranges ("Randomization.x", "ObjectConfig.x", "push"); by default all.
     """
     bench = _Bench(env, step, states, key, ticks)
     tests: dict[str, Callable[[], Effect]] = {}
@@ -78,13 +77,7 @@ def check(
         owner, name = _owner(env.config, path)
         tests[f"{type(owner).__name__}.{name}"] = functools.partial(bench.object_range, path)
     tests["push"] = bench.push
-    unused = f"Randomization.{_unused(env.config.randomization)}"
-    return [tests[name]() for name in names or (name for name in tests if name != unused)]
-
-
-def _unused(ranges: Any) -> str:
-    """The range of the model of backlash that is not chosen."""
-    return {"dead_band": "gear_gap", "gear_play": "dead_band"}[ranges.backlash]
+    return [tests[name]() for name in names or tests]
 
 
 def _ranges(config: Any) -> list[str]:
@@ -216,7 +209,7 @@ class _Bench:
     def hand_range(self, name: str) -> Effect:
         """One field of `Randomization`."""
         label, ranges = f"Randomization.{name}", self.env.config.randomization
-        if name == _unused(ranges) or _width(getattr(ranges, name)) == 0:
+        if _width(getattr(ranges, name)) == 0:
             return Effect(label, off=True)
         base, before = None, self.states.episode.hand
         if name in _AIDS:

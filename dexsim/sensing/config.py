@@ -28,8 +28,6 @@ class Sensing:
     """The IMU inside the object."""
     taxel: TaxelSensor = setting(TaxelSensor())
     """The taxels."""
-    three_axis: bool = setting(False)
-    """Taxels that also feel along the skin: the solver's tangential force on each fingertip."""
 
     def __post_init__(self):
         validate(self)

@@ -21,7 +21,6 @@ import jax.numpy as jnp
 
 from dexsim.core.config import check_ranges, setting, validate
 from dexsim.core.pytree import pytree_dataclass
-from dexsim.touch.feel import taxel_vectors
 
 Range = tuple[float, float]
 DRAWN = ("hysteresis", "crosstalk", "gain", "bias", "drift", "dead", "rate")
@@ -188,41 +187,6 @@ class TaxelArray:
             value = jnp.where(first | (clock >= 1), value, held)
             held, clock = value, clock - jnp.floor(clock)
         return TaxelMemory(late, walk, held, clock), value
-
-    def apply_tangential(
-        self,
-        params: TaxelParams,
-        key: jax.Array,
-        tangential: jax.Array,
-        force: jax.Array,
-        finger_gain: jax.Array | float = 1.0,
-    ) -> jax.Array:
-        """What three-axis taxels report of a finger's tangential force, summed over them.
-
-        Each taxel bears its share with its gain, noise and whole counts (a signed byte of them), so a load that is
-        spread thinly reads too low. Dead taxels report nothing.
-
-        Args:
-          params: of this episode.
-          key: of the noise.
-          tangential: [F, 3] N, true.
-          force: [F, N] N, true normal forces: how it is shared.
-          finger_gain: [F, 1].
-
-        Returns:
-          [F, 3] N.
-        """
-        sensor, gain = self.sensor, finger_gain
-        if params.gain is not None:
-            gain = gain * params.gain
-        if params.alive is not None:
-            gain = gain * params.alive
-        share = taxel_vectors(force, tangential) * jnp.asarray(gain)[..., None]
-        share = share + sensor.noise * jax.random.normal(key, share.shape)
-        if sensor.resolution > 0:
-            counts = jnp.clip(jnp.round(share / sensor.resolution), -128.0, 127.0)
-            share = counts * sensor.resolution
-        return jnp.sum(share, -2)
 
 
 def neighbour_difference(force: jax.Array, grid: tuple[int, int]) -> jax.Array:

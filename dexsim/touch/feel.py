@@ -38,7 +38,7 @@ def feel(
     rotation: jax.Array,
     finger_force: jax.Array,
     skin: Skin,
-    cover: jax.Array | float = 0.0,
+    pad_thickness_delta: jax.Array | float = 0.0,
 ) -> Touch:
     """Taxel forces from the geometry of the contact and the finger's total force.
 
@@ -49,12 +49,12 @@ def feel(
         `dexsim.geometry.distance` (a `sdf.Shape` is as it is), and its pose in the palm frame.
       finger_force: [F] N, resultant fingertip-object force of the physics.
       skin: the skin's law.
-      cover: [] m, by which the rubber is thicker than `skin.margin`.
+      pad_thickness_delta: [] m, by which the rubber is thicker than `skin.margin`.
 
     A finger with all taxels clear of the object reads zero, whatever its total: it touches with a part of the link
     that has no taxels.
     """
-    return _press(sdf.to_local(taxels, position, rotation), area, geometry, finger_force, skin, cover)
+    return _press(sdf.to_local(taxels, position, rotation), area, geometry, finger_force, skin, pad_thickness_delta)
 
 
 def feel_links(
@@ -66,7 +66,7 @@ def feel_links(
     finger_force: jax.Array,
     skin: Skin,
     surface: Surface | None = None,
-    cover: jax.Array | float = 0.0,
+    pad_thickness_delta: jax.Array | float = 0.0,
 ) -> Touch:
     """`feel` for all taxels of a posed hand, or for other points of its fingertips' skin.
 
@@ -80,7 +80,7 @@ def feel_links(
     turn, shift = jax.lax.optimization_barrier((turn, shift))
     taxel = [jnp.asarray(surface.position[..., axis]) for axis in range(3)]
     local = [sum(turn[:, row, axis, None] * taxel[axis] for axis in range(3)) + shift[:, row, None] for row in range(3)]
-    return _press(jnp.stack(local, -1), jnp.asarray(surface.area), geometry, finger_force, skin, cover)
+    return _press(jnp.stack(local, -1), jnp.asarray(surface.area), geometry, finger_force, skin, pad_thickness_delta)
 
 
 def _press(
@@ -89,10 +89,10 @@ def _press(
     geometry: Any,
     finger_force: jax.Array,
     skin: Skin,
-    cover: jax.Array | float = 0.0,
+    pad_thickness_delta: jax.Array | float = 0.0,
 ) -> Touch:
     """`feel` for points [F, N, 3] in the object's frame."""
-    margin = jnp.maximum(skin.margin + cover, 0.0)
+    margin = jnp.maximum(skin.margin + pad_thickness_delta, 0.0)
     depth = jnp.maximum(margin - signed_distance(points, geometry), 0.0)
     skin_force = skin_stress(depth / skin.thickness, skin) * area
     return Touch(depth, skin_force, spread(skin_force, finger_force))
@@ -104,30 +104,19 @@ def spread(skin_force: jax.Array, finger_force: jax.Array) -> jax.Array:
     return finger_force[:, None] * skin_force / jnp.where(total > 0, total, 1.0)
 
 
-def taxel_share(skin_force: jax.Array, taxels: int) -> jax.Array:
-    """Share [F, 1] of each finger's load on the first `taxels` of its points [F, P]; 0 without touch."""
-    borne = jnp.sum(skin_force, -1, keepdims=True)
-    return jnp.sum(skin_force[:, :taxels], -1, keepdims=True) / jnp.where(borne > 0, borne, 1.0)
-
-
-def split_force(force: jax.Array, normals: jax.Array, finger_force: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Each finger's force along and across the contact, for three-axis touch.
+def pressing_force(force: jax.Array, normals: jax.Array, finger_force: jax.Array) -> jax.Array:
+    """What of each finger's force presses into its skin, [F] N; 0 for a finger that touches nothing.
 
     Args:
       force: [F, N] N, normal forces on the taxels; they say where the contact is.
-      normals: [F, N, 3] outward taxel normals, palm frame (`hand.taxel_normals`).
-      finger_force: [F, 3] N, the physics' force vector on the finger, palm frame.
-
-    Returns:
-      [F] N pressed into the skin, and [F, 3] N tangential; both zero for a finger that touches
-      nothing.
+      normals: [F, N, 3] outward taxel normals, in any frame.
+      finger_force: [F, 3] N, the physics' force vector on the finger, in the same one.
     """
     inward = -jnp.sum(force[..., None] * normals, -2)
     square = jnp.sum(inward**2, -1, keepdims=True)
     touching = square > 0
     inward = inward / jnp.sqrt(jnp.where(touching, square, 1.0))
-    pressed = jnp.sum(finger_force * inward, -1)
-    return pressed, jnp.where(touching, finger_force - pressed[:, None] * inward, 0.0)
+    return jnp.sum(finger_force * inward, -1)
 
 
 def keep_normal_part(touch: Touch, normals: jax.Array, finger_force: jax.Array) -> Touch:
@@ -137,12 +126,5 @@ def keep_normal_part(touch: Touch, normals: jax.Array, finger_force: jax.Array) 
       normals: [F, N, 3] outward taxel normals, in any frame.
       finger_force: [F, 3] N, the physics' force vector on the finger, in the same one.
     """
-    pressed, _ = split_force(touch.skin_force, normals, finger_force)
+    pressed = pressing_force(touch.skin_force, normals, finger_force)
     return dataclasses.replace(touch, force=spread(touch.skin_force, jnp.maximum(pressed, 0.0)))
-
-
-def taxel_vectors(force: jax.Array, finger_force: jax.Array) -> jax.Array:
-    """The force vector [F, 3] of each finger shared among its taxels [F, N, 3] like `force`."""
-    total = jnp.sum(force, -1, keepdims=True)
-    share = force / jnp.where(total > 0, total, 1.0)
-    return share[..., None] * finger_force[:, None]

@@ -30,7 +30,7 @@ class Skin:
     """Thickness of the compressed layer."""
     margin: float = setting(0.003, unit="m", low=0.0, high=0.01)
     """Distance above the object's surface at which a taxel begins to feel it: the thickness of the rubber over the
-    lattice. `PhysicsConfig.cover` is the same distance for the solver."""
+    lattice. `PhysicsConfig.pad_thickness` is the same distance for the solver."""
     max_compression: float = setting(0.7, unit="1", low=0.05, high=0.95)
     """Compression beyond which the stress no longer grows."""
     law: str = setting("mooney_rivlin", choices=LAWS)

@@ -1,6 +1,7 @@
 """A simulated hand with a policy, one tick a frame."""
 
 import dataclasses
+import functools
 from typing import Any
 
 import jax
@@ -9,6 +10,7 @@ import numpy as np
 
 from dexsim.core.compilation import jit
 from dexsim.env.env import Env
+from dexsim.env.snapshot import take_snapshot
 from dexsim.env.state import State
 from dexsim.objects.config import KINDS
 from dexsim.render.render import CAMERAS
@@ -38,9 +40,9 @@ class Simulation:
         # The goal of an evaluation: it does not change or give up by itself.
         _, goals = env.task.evaluation_plan(1, self._shapes)
         self._goal = jax.tree.map(lambda x: jnp.asarray(x)[0], goals)
-        self._reset = jit(env.reset_to, once=True)
+        self._reset = jit(env.reset_from, once=True)
         self._step = jit(self._tick, backend=env.backend)
-        self._snapshot = jit(env.snapshot, backend=env.backend)
+        self._snapshot = jit(functools.partial(take_snapshot, env), backend=env.backend)
         self._acting: Any = None  # the policy that the memory is of
         self._memory: Any = None
         self._state: State = self._begin({})
@@ -84,7 +86,8 @@ class Simulation:
         kind = values.get("object", _ANY)
         rows = np.arange(len(self._shapes)) if kind == _ANY else np.flatnonzero(self._shapes == KINDS.index(kind))
         self._key, key = jax.random.split(self._key)
-        state = self._reset(key, jnp.asarray(self._random.choice(rows)), self._goal)
+        row = self._random.choice(rows)
+        state = self._reset(key, jax.tree.map(lambda rows: rows[row], self.env.pool), self._goal)
         object, self._ended, self._acting = state.episode.object, 0.0, None
         self._bare = object.friction, object.link_friction  # as drawn: the page scales them
         return state

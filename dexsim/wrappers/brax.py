@@ -24,6 +24,7 @@ import numpy as np
 
 from dexsim.core.errors import ConfigError
 from dexsim.core.install import install_line
+from dexsim.env.evaluation import evaluation_of
 
 try:
     from brax.envs.base import Env, State, Wrapper
@@ -105,16 +106,16 @@ class BraxEnv(Env):
     @property
     def episode_length(self) -> int:
         """Ticks of an evaluation episode."""
-        return self.env.evaluation_steps
+        return evaluation_of(self.env).evaluation_steps
 
     @property
     def dt(self) -> float:
         """One control tick, s."""
-        return 1.0 / self.env.control_rate
+        return self.env.control_period
 
     def snapshot(self, state: State) -> Any:
         """What a picture of a state needs (`dexsim.render.snapshot.Snapshot`)."""
-        return self.env.snapshot(self._to_dexsim(state))
+        return evaluation_of(self.env).snapshot(self._to_dexsim(state))
 
     def render(self, trajectory: Sequence[State], height: int = 480, width: int = 640) -> list[np.ndarray]:
         """Pictures uint8 `[height, width, 3]` of brax states without a batch axis."""

@@ -1,1 +1,1 @@
-"""PPO in pure JAX, for any environment with `reset`, `step`, `restart` and `stagger`."""
+"""PPO in pure JAX, for any environment with `reset`, `step`, `restart` and `randomize_episode_time`."""

@@ -57,7 +57,7 @@ class AdaptedState:
     truncated: jax.Array
     metrics: dict[str, jax.Array]
     clock: jax.Array
-    """Steps towards the time limit []; `stagger` sets it."""
+    """Steps towards the time limit []; `randomize_episode_time` sets it."""
     key: jax.Array
 
 
@@ -110,7 +110,7 @@ class Adapted:
         key, fresh = jax.random.split(state.key)
         return choose(done, self.reset(fresh), replace(state, key=key))
 
-    def stagger(self, state: AdaptedState, key: jax.Array) -> AdaptedState:
+    def randomize_episode_time(self, state: AdaptedState, key: jax.Array) -> AdaptedState:
         """The episode's clock at a random time."""
         return replace(state, clock=jax.random.randint(key, (), 0, self.evaluation_steps))
 

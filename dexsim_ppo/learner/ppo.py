@@ -182,7 +182,7 @@ def learn(
         assert scale is not None, "the state of a training with a curriculum"
         scale, success = update_scale(curriculum, scale, metrics)
         metrics |= {"curriculum/scale": scale, "curriculum/success": success}
-        env_state = jax.vmap(cast(CurriculumEnvironment, env).widen, (0, None))(env_state, scale)
+        env_state = jax.vmap(cast(CurriculumEnvironment, env).set_randomization_scale, (0, None))(env_state, scale)
     return TrainState(
         params=learner.params,
         adam=learner.adam,

@@ -93,4 +93,4 @@ def init_environments(
     reset = env.reset
     if curriculum is not None:
         reset = functools.partial(cast(CurriculumEnvironment, env).reset, scale=jnp.float32(curriculum.start))
-    return batched(env.stagger, mesh)(batched(reset, mesh)(resets), staggers)
+    return batched(env.randomize_episode_time, mesh)(batched(reset, mesh)(resets), staggers)

@@ -67,16 +67,6 @@ class Environment(Protocol):
         """Length of one control tick, s."""
         ...
 
-    @property
-    def evaluation_steps(self) -> int:
-        """Length of an evaluation episode, control ticks."""
-        ...
-
-    @property
-    def evaluation(self) -> str:
-        """What `summarize` takes: "series" over all ticks, or "totals" that the task accumulates."""
-        ...
-
     def reset(self, key: jax.Array) -> Any:
         """A new episode."""
         ...
@@ -95,8 +85,27 @@ class Environment(Protocol):
         """
         ...
 
-    def stagger(self, state: Any, key: jax.Array) -> Any:
+    def randomize_episode_time(self, state: Any, key: jax.Array) -> Any:
         """Set the episode clock to a random time, so that a batch does not truncate all at once."""
+        ...
+
+
+class Evaluated(Protocol):
+    """What an evaluation needs on top of an environment; see `dexsim.env.evaluation.evaluation_of`."""
+
+    @property
+    def name(self) -> str:
+        """The task's name."""
+        ...
+
+    @property
+    def evaluation_steps(self) -> int:
+        """Length of an evaluation episode, control ticks."""
+        ...
+
+    @property
+    def evaluation(self) -> str:
+        """What `summarize` takes: "series" over all ticks, or "totals" that the task accumulates."""
         ...
 
     def evaluation_plan(self, count: int, seed: int) -> Any:
@@ -127,7 +136,7 @@ class CurriculumEnvironment(Environment, Protocol):
         """A new episode, from ranges of this scale."""
         ...
 
-    def widen(self, state: Any, scale: jax.Array) -> Any:
+    def set_randomization_scale(self, state: Any, scale: jax.Array) -> Any:
         """Take the next episodes from ranges of this scale."""
         ...
 

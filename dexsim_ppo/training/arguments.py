@@ -42,10 +42,10 @@ class TrainArguments(Generic[EnvConfig]):
     """Seed of everything random."""
     seeds: int = setting(1, unit="1", low=1, high=1000)
     """Trainings, from --seed on, in one program where that is possible; --steps and --minutes are those of each."""
-    backend: Literal["auto", "jax", "warp", "c"] = setting("auto")
-    """Physics backend. auto: c on a CPU, warp on an NVIDIA GPU if it is installed, otherwise jax."""
+    backend: Literal["auto", "jax", "cuda", "warp", "c"] = setting("auto")
+    """Physics backend. auto: c on a CPU, cuda on an NVIDIA GPU, otherwise jax."""
     deterministic: bool = False
-    """On a GPU, have XLA order its sums and do without Warp, at a cost in speed, so that a training repeats from one
+    """On a GPU, have XLA order its sums and refuse Warp, at a cost in speed, so that a training repeats from one
     seed. On a CPU trainings repeat anyway."""
     preset: Literal["auto", "cpu", "cpu-large", "gpu"] = setting("auto")
     """Default sizes and durations. auto: those of the device found; cpu-large is for 16 cores and more."""

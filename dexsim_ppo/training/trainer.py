@@ -15,6 +15,8 @@ from jax.sharding import Mesh
 from dexsim.core import cli
 from dexsim.core.compilation import collector_paused
 from dexsim.core.config import to_dict
+from dexsim.env.evaluation import evaluation_of
+from dexsim.env.fingerprint import fingerprint
 from dexsim.hand.source import record_of
 from dexsim_ppo import checkpoint
 from dexsim_ppo.evaluate import Evaluator, write_video
@@ -147,8 +149,8 @@ class Run:
         environment without a fingerprint."""
         if self.mesh is not None:
             return None
-        fingerprint = getattr(self.env, "fingerprint", lambda: None)()
-        return fingerprint and [fingerprint, to_dict(self.config), to_dict(self.arguments.curriculum)]
+        digest = fingerprint(self.env)
+        return digest and [digest, to_dict(self.config), to_dict(self.arguments.curriculum)]
 
     def _loop(
         self, state: TrainState, step: Callable, display: Display, log: MetricsLog | None, stopped: Callable[[], int]
@@ -207,7 +209,7 @@ class Run:
         arguments = self.arguments
         if not due(iteration, self.config.iterations_per_call, arguments.evaluate_every):
             return False
-        guess = arguments.evaluation_chunk * self.env.evaluation_steps / env_steps_per_s
+        guess = arguments.evaluation_chunk * evaluation_of(self.env).evaluation_steps / env_steps_per_s
         # The first one's time is mostly compilation, which the report at the end needs anyway.
         spent = [guess, *self.evaluations_s[1:]] if self.evaluations_s else []
         each = spent[-1] if spent else guess

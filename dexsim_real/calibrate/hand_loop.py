@@ -85,7 +85,7 @@ class HandLoop:
         if target is not None:
             self.safety.set_target(target, now)
         decision = self.safety.decide(now)
-        command = self.sensing.command(decision.position, decision.mode)
+        command = self.sensing.command(decision.position, decision.mode, decision.stiffness)
         self._number += 1
         self._keep(Kind.SENT, frames.HOST, command, now)
         self.driven |= decision.mode == Mode.POSITION
@@ -108,9 +108,19 @@ class HandLoop:
             found.append(self.step(target))
         return [exchange for exchange in found if exchange is not None]
 
+    def engage(self) -> None:
+        """Turn the motors on, and wait until they are.
+
+        Raises:
+          HandError: see `step`.
+        """
+        self.safety.engage()
+        while not self.safety.anchor:
+            self.step()
+
     def move(self, goal: np.ndarray, speed: float = 0.6) -> None:
         """Move to a posture [J] rad; the joint with the longest path has a mean speed of `speed` rad/s."""
-        start = self.pose()
+        start = self.safety.commanded  # Not the last reading, which may be wrong.
         seconds = max(float(np.abs(goal - start).max()) / speed, 0.3)
         begin = self.clock()
         while (share := (self.clock() - begin) / seconds) < 1.0:

@@ -1,7 +1,7 @@
 """A policy on hardware: from measurements to an action and joint targets, in the order of the simulation.
 
 A tick corresponds to one `Env.step`: the readings contain the action that led to them, the same `observe` computes the
-observation, and the same `next_target` applies the policy's action to the joint targets.
+observation, and the same `move_target` applies the policy's action to the joint targets.
 """
 
 import dataclasses
@@ -11,10 +11,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from dexsim.control import observed_action
+from dexsim.control import move_target, observed_action
 from dexsim.hand.kinematics import Hand
 from dexsim.observation import LayoutEntry, ObservationConfig, Readings, layout, observe, select_fields
-from dexsim.task_spec import correct_readings, next_target
+from dexsim.task_spec import correct_readings
 from dexsim_ppo.export import ExportedPolicy
 from dexsim_ppo.policy import Policy
 from dexsim_real.core.errors import HandError
@@ -75,7 +75,7 @@ class Controller:
             raise HandError(f"the policy gives actions {list(shape)}; the hand takes {hand.num_joints} of them")
         self.period = 1.0 / policy.control_rate
         self._observe = make_observe(hand, names, config)
-        self._move = jax.jit(lambda *arrays: next_target(self.spec, hand, self.period, *arrays))
+        self._move = jax.jit(lambda *arrays: move_target(self.spec.control, hand, *arrays))
         self._correct = jax.jit(
             lambda readings, correction: correct_readings(self.spec, hand, self.period, readings, correction)
         )
@@ -98,7 +98,6 @@ class Controller:
         self.last_action = np.zeros(self.hand.num_joints, np.float32)
         self.correction = np.zeros((), np.float32)  # of the command, by the force loop
         self.memory = self.policy.begin()
-        self._let_go()
 
     def resume(self, position: np.ndarray) -> None:
         """Continue from this pose [J] rad after a hold, perhaps with the object put back: what came before is
@@ -109,10 +108,6 @@ class Controller:
     def anchor(self, position: np.ndarray) -> None:
         """Continue from this pose [J] rad, after a time in which the hand did not follow its targets."""
         self.target = np.asarray(position, np.float32)
-        self._let_go()
-
-    def _let_go(self) -> None:
-        self.reflex = np.zeros(self.hand.num_fingers, np.float32) if self.spec.grip_reflex else None  # [F] rad
 
     def tick(self, measured: HandMeasurement, seen: ObjectEstimate, goal_quat: np.ndarray, command: float) -> Tick:
         """Compute readings, observation, action and joint targets.
@@ -133,10 +128,7 @@ class Controller:
         action = np.clip(np.asarray(action), -1.0, 1.0)
         if np.isfinite(action).all():
             self.memory = memory
-            target, reflex = jax.device_get(
-                self._move(readings, self.target, self.reflex, action, measured.joint_position)
-            )
-            self.target, self.reflex = target, reflex
+            target = self.target = jax.device_get(self._move(self.target, action, measured.joint_position))
         else:  # As in simulation this counts as no action; `Safety` holds when a target is not finite.
             action, target = np.zeros_like(self.last_action), np.full_like(self.target, np.nan)
         self.last_action = action

@@ -2,15 +2,20 @@
 
 An angle is wrong outside the joint's limits, or farther from the last plausible angle than the joint can have moved.
 With the motors on, a joint moves between its last angle and its commands, so a wrong angle stays wrong however long it
-lasts. With the motors off anything may move a joint, so several readings must agree before the pose is known.
+lasts. With the motors off anything may move a joint: the pose is the median of several readings, and only known while
+they agree.
 """
+
+from collections import deque
 
 import numpy as np
 
 from dexsim.hand.kinematics import Hand
 
-UNKNOWN = "the pose is not known yet"
-_AGREEING = 3  # readings that must agree before the pose is known
+UNKNOWN = "the pose is not known: the last readings disagree, or are too few"
+_AGREEING = 10  # newest readings of a pose; fewer than half of them may be wrong by as much as they may differ
+_APART = 0.05  # rad, largest distance of these readings from their median
+_NOW = 5  # newest readings whose median is the pose of a hand that moves
 _FASTER = 1.25  # largest joint speed, relative to the no-load speed of the model
 _JUMP = 0.1  # rad, change that is always possible: noise, gear play, a push
 _GAP = 0.03  # s, longest motion that an interval between two readings explains
@@ -32,25 +37,35 @@ class PoseCheck:
         self._last: np.ndarray | None = None  # [J] rad, last plausible angles
         self._low: np.ndarray | None = None  # [J] rad, the commands since then; None with the motors off
         self._high: np.ndarray | None = None
-        self._agreeing = 0
+        self._recent: deque[np.ndarray] = deque(maxlen=_AGREEING)  # [J] rad, newest plausible angles
 
     @property
-    def known(self) -> bool:
-        """Whether the pose is known."""
-        return self._low is not None or self._agreeing >= _AGREEING
+    def at_rest(self) -> np.ndarray | None:
+        """[J] rad, where motors that are off may come on: median of the last readings; None unless they agree."""
+        if len(self._recent) < _AGREEING:
+            return None
+        median = np.median(self._recent, axis=0)
+        return median if np.abs(np.array(self._recent) - median).max() <= _APART else None
+
+    @property
+    def newest(self) -> np.ndarray:
+        """[J] rad, where the hand is, whether it moves or not; no single wrong reading counts."""
+        return np.asarray(np.median(list(self._recent)[-_NOW:], axis=0))
 
     def follow(self, command: np.ndarray) -> None:
         """The motors move toward these joint angles [J] rad from now on."""
+        if self._low is None:
+            self._last = self.newest
         self._low = command if self._low is None else np.minimum(self._low, command)
         self._high = command if self._high is None else np.maximum(self._high, command)
 
     def release(self) -> None:
         """The motors are off, or were off unseen: forget the pose."""
         self._last = self._low = self._high = None
-        self._agreeing = 0
+        self._recent.clear()
 
     def judge(self, time: float, position: np.ndarray, command: np.ndarray | None) -> str:
-        """Why a reading is wrong, or cannot be trusted yet; empty for a plausible one.
+        """Why a reading is wrong; empty for a plausible one.
 
         Args:
           time: s of the reading.
@@ -60,24 +75,21 @@ class PoseCheck:
         gap, self._time = max(time - self._time, 0.0), time
         outside = (position < self._lower) | (position > self._upper)
         if outside.any():
-            self._agreeing = 0
+            self._recent.clear()
             return f"{self._say(position, outside)}, outside its limits"
-        room = _JUMP + self._speed * min(gap, _GAP)
         last, low, high = self._last, self._low, self._high
-        if last is None or low is None or high is None:
-            agrees = last is not None and bool(np.all(np.abs(position - last) <= room))
-            self._agreeing = self._agreeing + 1 if agrees else 1
-            self._last, self._known_time = position, time
-            return "" if self.known else UNKNOWN
-        jumped = (position < np.minimum(last, low) - room) | (position > np.maximum(last, high) + room)
-        jumped |= np.abs(position - last) > _JUMP + self._speed * (time - self._known_time)
-        if jumped.any():
-            return f"{self._say(position, jumped)}, too far from {last[jumped.argmax()]:.2f} rad before"
+        if last is not None and low is not None and high is not None:
+            room = _JUMP + self._speed * min(gap, _GAP)
+            jumped = (position < np.minimum(last, low) - room) | (position > np.maximum(last, high) + room)
+            jumped |= np.abs(position - last) > _JUMP + self._speed * (time - self._known_time)
+            if jumped.any():
+                return f"{self._say(position, jumped)}, too far from {last[jumped.argmax()]:.2f} rad before"
+            if command is None:  # The motors went off unseen: others must agree with this reading.
+                self._recent.clear()
         self._last, self._known_time = position, time
         self._low = self._high = command
-        if command is None:  # The motors went off unseen: others must agree with this reading.
-            self._agreeing = 1
-        return "" if self.known else UNKNOWN
+        self._recent.append(position)
+        return ""
 
     def _say(self, position: np.ndarray, wrong: np.ndarray) -> str:
         joint = int(wrong.argmax())

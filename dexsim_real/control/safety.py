@@ -12,9 +12,10 @@ their times, so any course of events can be tested.
 | alarms of the hand itself (`Alarms`): heat, current, error bits, motors off, refusals | hold, relax permanently |
 
 Hold: the last command that the hand confirmed, at the usual gains; when the force is too high, slowly toward the
-measured pose. Relax: motors off. The motors come on at the measured pose. Then each command differs from the one before
-by at most the speed limit times the time between them, whatever was measured or requested: this limit applies last.
-After a hold or a reconnection commands are slow at first.
+measured pose, but never far from where it was as the hold began. A hold ends after some seconds with the motors off.
+Relax: motors off. The motors come on at the measured pose, with stiffness and speed that grow from zero. Then each
+command differs from the one before by at most the speed limit times the time between them, whatever was measured or
+requested: this limit applies last. After a hold or a reconnection commands are slow at first.
 """
 
 import dataclasses
@@ -36,6 +37,11 @@ from dexsim_real.wire.refusals import Refusal
 _SILENT, _DEAD = "no measurement", "no target"  # reasons that turn the motors off when they last
 _FORCE = "the fingertip force is too high"
 _GAP = 0.03  # s, longest interval between two commands that counts for the speed limit
+_SOFT = 0.5  # s, in which stiffness and speed grow when the motors come on: a joint whose pose was wrong creeps there
+_LONGEST = 5.0  # s of holding after which the motors go off: a policy that is held does not let go of what it squeezes
+_RECOVERY = 0.25  # s of holding that are forgiven per s without: short holds may take a fifth of the time for ever
+_EASE = 0.1  # rad, 1 cm at a fingertip: farther, easing after a joint that reads too high would lead it to its stop
+_SAME = 0.5  # s, holds for force with less time between them are one: each alone could ease by as much again
 
 
 class Reaction(enum.IntEnum):
@@ -66,6 +72,7 @@ class SafetyDecision:
     mode: Mode
     reaction: Reaction
     reason: str
+    stiffness: float  # share of the gain kp
 
 
 class Wish(NamedTuple):
@@ -109,6 +116,8 @@ class Safety:
         self._generation: int | None = None
         self._wrong: tuple[float, float] | None = None  # s, first and last of the newest wrong measurements
         self._holding = False
+        self._held = 0.0  # s, balance of `_LONGEST` and `_RECOVERY`
+        self._eased: tuple[float, np.ndarray] | None = None  # last hold for force: s, its end; [J] rad, pose before it
         self._on = 0.0  # s, when the motors came on
         self._commanded: np.ndarray | None = None  # last command with the motors on
         self._confirmed: np.ndarray | None = None  # last one that the hand answered
@@ -140,9 +149,8 @@ class Safety:
             else "not finite"
         )
         if self.problem:
-            if self.problem != UNKNOWN:
-                self.counts["implausible: measurement"] += 1
-                self._wrong = (sample.time if self._wrong is None else self._wrong[0]), sample.time
+            self.counts["implausible: measurement"] += 1
+            self._wrong = (sample.time if self._wrong is None else self._wrong[0]), sample.time
             return False
         self.sample, self._wrong = sample, None
         self._alarms.see(sample.time, measured, self._commanded is not None)
@@ -185,16 +193,22 @@ class Safety:
             return self._finish(now, Reaction.RELAX, fatal, self._rest())
         if self._commanded is None:
             silent = now - sample.time > self.config.stale  # The hand may have been moved since.
-            if silent or self.problem or self._alarms.hold or not self._pose.known:
+            pose = self._pose.at_rest
+            if silent or self.problem or self._alarms.hold or pose is None:
                 why = self.problem or (self._silence() if silent else self._alarms.hold or UNKNOWN)
                 return self._finish(now, Reaction.RELAX, why, self._rest())
-            self._start(now, sample)
+            self._start(now, pose)
         wish = self._target  # Read once: another thread may replace it meanwhile.
         if lasted := self._lasted(now, sample, wish):
-            return self._turn_off(now, lasted)
+            return self._turn_off(now, lasted, self.config.patience)
         reason = self._reason_to_hold(now, sample, wish)
+        if not reason.startswith(_SILENT):  # Silence has its own limit, and does not end a run.
+            since = max(now - self._time, 0.0)
+            self._held = self._held + since if reason else max(self._held - _RECOVERY * since, 0.0)
+        if self._held > _LONGEST:
+            return self._turn_off(now, reason, _LONGEST)
         if reason:
-            return self._hold(now, sample, reason)
+            return self._hold(now, reason)
         if self._holding:
             self._restart(now)
         return self._follow(now, sample, self.commanded if wish is None else wish.position)
@@ -237,33 +251,38 @@ class Safety:
             return "target is not finite"
         return _DEAD if now - wish.time > config.watchdog else wish.hold_reason
 
-    def _start(self, now: float, sample: HandSample) -> None:
-        """Turn the motors on at the measured pose."""
+    def _start(self, now: float, pose: np.ndarray) -> None:
+        """Turn the motors on at the measured pose [J] rad."""
         # Between the end stops, not within the margin: enabling must not move the hand.
-        pose = np.clip(sample.measured.joint_position, self._stops[0], self._stops[1])
-        self._commanded = self._confirmed = pose.astype(np.float32)
+        self._commanded = self._confirmed = np.clip(pose, *self._stops).astype(np.float32)
         self._time = self._on = now
+        self._held, self._eased = 0.0, None
         self._restart(now)
+        self._ramp_start = now + _SOFT
 
     def _restart(self, now: float) -> None:
         """Continue from the last command, slowly at first."""
         self._holding, self._ramp_start = False, now
         self.anchor += 1
 
-    def _turn_off(self, now: float, reason: str) -> SafetyDecision:
+    def _turn_off(self, now: float, reason: str, seconds: float) -> SafetyDecision:
         if not reason.startswith(_SILENT):
-            self.relax(f"{reason} for {self.config.patience:g} s")
+            self.relax(f"{reason} for {seconds:g} s")
         elif not self.problem:
             self._pose.release()
         # With the motors off the pose may change: restart from the next one that is known.
         self._commanded = self._confirmed = None
         return self._finish(now, Reaction.RELAX, reason, self._rest())
 
-    def _hold(self, now: float, sample: HandSample, reason: str) -> SafetyDecision:
+    def _hold(self, now: float, reason: str) -> SafetyDecision:
         config = self.config
         self._holding = True
         if reason == _FORCE:  # Staying there would keep the force.
-            position = self._toward(now, self._inside(sample.measured.joint_position), self._slow)
+            pose = self._pose.newest
+            before = pose if self._eased is None or now - self._eased[0] > _SAME else self._eased[1]
+            self._eased = now, before
+            goal = np.clip(pose, before - _EASE, before + _EASE)
+            position = self._toward(now, self._inside(goal), self._slow)
         else:
             position = self._toward(now, self.commanded if self._confirmed is None else self._confirmed, config.speed)
         return self._finish(now, Reaction.HOLD, reason, position)
@@ -277,7 +296,7 @@ class Safety:
             np.minimum(measured - config.reach, self.commanded),
             np.maximum(measured + config.reach, self.commanded),
         )
-        speed = self._slow + grown * (config.speed - self._slow)
+        speed = self._soft(now) * self._slow + grown * (config.speed - self._slow)
         position = self._toward(now, self._inside(np.clip(target, *near)), speed)
         # Policies rest joints at their stops: the margin alone is no event.
         clipped = np.abs(position - self._inside(target)), np.abs(target - np.clip(target, *self._stops))
@@ -290,6 +309,10 @@ class Safety:
         """The next command on the way to a goal [J] rad between the end stops: the last limit, after every rule."""
         step = np.float32(speed * min(max(now - self._time, 0.0), _GAP))
         return np.clip(goal, self.commanded - step, self.commanded + step).astype(np.float32)
+
+    def _soft(self, now: float) -> float:
+        """Share of the stiffness, and of the speed of starts, after the motors came on."""
+        return min(max((now - self._on) / _SOFT, 0.0), 1.0)
 
     def _inside(self, position: np.ndarray) -> np.ndarray:
         return np.clip(position, self._lower, self._upper).astype(np.float32)
@@ -309,4 +332,4 @@ class Safety:
             self._note(f"{reaction.name.lower()}: {reason}" if reason else "in command")
             self.last = (reaction, reason)
         mode = Mode.PASSIVE if reaction == Reaction.RELAX else Mode.POSITION
-        return SafetyDecision(position, mode, reaction, reason)
+        return SafetyDecision(position, mode, reaction, reason, self._soft(now))

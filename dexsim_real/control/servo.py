@@ -116,7 +116,7 @@ class Servo:
         decision = self.safety.decide(time.monotonic())
         self.driven |= decision.mode == Mode.POSITION
         started = time.monotonic()
-        reply = self.port.exchange(self.sensing.command(decision.position, decision.mode))
+        reply = self.port.exchange(self.sensing.command(decision.position, decision.mode, decision.stiffness))
         took = time.monotonic() - started
         if reply is None:
             self.safety.refuse(refusal_of(self.port))

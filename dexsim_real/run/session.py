@@ -43,6 +43,7 @@ from dexsim_real.wire.serial_hand import open_port
 _TARE_SAMPLES = 30
 _SWITCH = sys.getswitchinterval()
 _PATIENCE = 60.0  # s to wait until the camera sees the object
+_STILL = 5.0  # s to wait for a hand that is still, whose motors can come on
 
 
 class Session:
@@ -127,8 +128,9 @@ class Session:
                 self.guard.arm()
             if not self.arguments.motors_off:
                 self.servo.engage()
+                self._await_motors()
             self._approach()
-            self.controller.start(self._pose())
+            self.controller.start(self.safety.commanded)
             self._note("the policy starts")
             self.end = self._loop()
 
@@ -203,9 +205,17 @@ class Session:
             why = self.safety.refused or "the hand stopped answering; check the cable and the power"
             raise HandError(f"{self.arguments.port}: {why}")
 
+    def _await_motors(self) -> None:
+        until = time.monotonic() + _STILL
+        while not self.safety.anchor:
+            self._check()
+            if time.monotonic() > until:
+                raise HandError(f"{self.arguments.port}: the motors did not come on: {self.safety.last[1]}")
+            time.sleep(0.01)
+
     def _approach(self) -> None:
         """Move to the start posture, and hold it until the object is seen."""
-        arguments, start = self.arguments, self._pose()
+        arguments, start = self.arguments, self.safety.commanded  # Not the last reading, which may be wrong.
         goal = np.asarray(self.controller.spec.posture or start, np.float32)
         goal = goal if arguments.approach > 0 else start
         begin, pace = time.monotonic(), Pace(arguments.rate)
@@ -225,10 +235,6 @@ class Session:
     def _objects(self) -> ObjectSensors:
         assert self.objects is not None, "`prepare` opens the sensors"
         return self.objects
-
-    def _pose(self) -> np.ndarray:
-        assert self.safety.sample is not None, "no state yet"
-        return self.safety.sample.measured.joint_position
 
     def _check(self) -> None:
         if self.guard:

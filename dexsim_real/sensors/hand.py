@@ -205,8 +205,13 @@ class HandSensing:
             if which.any()
         ]
 
-    def command(self, position: np.ndarray, mode: Mode) -> np.ndarray:
+    def command(self, position: np.ndarray, mode: Mode, stiffness: float = 1.0) -> np.ndarray:
         """A `frames.COMMAND_BLOCK` for joint angles [J] rad of the model. Gains are 0 in all modes but `POSITION`.
+
+        Args:
+          position: [J] rad.
+          mode: of all joints.
+          stiffness: share of the gains kp and ki in [0, 1]; those of damping are always whole.
 
         Raises:
           HandError: an angle is not finite.
@@ -214,8 +219,8 @@ class HandSensing:
         config, on = self.config, mode == Mode.POSITION
         block = frames.command_block(
             (np.asarray(position) - self._offset) * self._sign,
-            kp=np.array(config.kp) * on,
-            ki=np.array(config.ki) * on,
+            kp=np.array(config.kp) * stiffness * on,
+            ki=np.array(config.ki) * stiffness * on,
             kd=np.array(config.kd) * on,
             torque_max=config.torque_max * on,
             mode=mode,

@@ -197,7 +197,7 @@ class VirtualRun:
         self._tare()
         self._mode = Mode.POSITION
         self.safety.engage()
-        start, began = self._pose(), self._now
+        start, began = self._resting(), self._now
         goal = np.asarray(POSTURES[self.plant.task], np.float32)
         while self._now < began + self.options.approach + self.options.place:
             share = np.float32(min((self._now - began) / self.options.approach, 1.0))
@@ -208,7 +208,7 @@ class VirtualRun:
         spec = self.controller.spec
         if spec.turn:
             self.goals = TurnGoals(spec.turn, np.asarray(spec.reference))
-        self.controller.start(self._pose())
+        self.controller.start(self._resting())
         anchor, began, tick = self.safety.anchor, self._now, 0
         while self.plant.trial == trial and self._now < began + limit:
             if anchor != self.safety.anchor:
@@ -247,11 +247,11 @@ class VirtualRun:
 
     def _exchange(self) -> None:
         """The exchange thread's cycle: send a request; its answer arrives 9.6 ms later."""
-        position, mode = self._target, self._mode
+        position, mode, stiffness = self._target, self._mode, 1.0
         if self.safety.engaged and self.options.safety:
             decision = self.safety.decide(self._now)
-            position, mode = decision.position, decision.mode
-        block = self.sensing.command(position, mode)
+            position, mode, stiffness = decision.position, decision.mode, decision.stiffness
+        block = self.sensing.command(position, mode, stiffness)
         data = Frame(frames.HOST, frames.palm_address(0), Command.EXCHANGE, block.tobytes()).encode()
         self._schedule.at(self._now + REQUEST, lambda: self._answer(data, self._now))
         self._schedule.at(self._now + 1 / RATE, self._exchange)
@@ -296,8 +296,9 @@ class VirtualRun:
         assert self.safety.sample is not None, "no state yet"
         return self.safety.sample.measured
 
-    def _pose(self) -> np.ndarray:
-        return self.measured().joint_position
+    def _resting(self) -> np.ndarray:
+        """Where commands continue."""
+        return self.safety.commanded if self.options.safety else self.measured().joint_position
 
     def _until(self, time: float) -> None:
         """Run the plant and the events up to a time in s."""

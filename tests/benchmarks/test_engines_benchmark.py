@@ -1,8 +1,7 @@
-"""`benchmarks/engines.py`, motions and policies, in a small form; the fit of `benchmarks/scaling.py`."""
+"""`benchmarks/engines.py`, motions and policies, in a small form."""
 
-import importlib.util
+import importlib
 import json
-import sys
 
 import jax
 import numpy as np
@@ -16,22 +15,18 @@ from dexsim.tasks.grasp.task import Grasp
 
 
 @pytest.fixture(scope="module")
-def benchmarks():
-    """The modules by name, as they import each other."""
-    found = {}
-    for name in ("throughput", "engine_motions", "engine_policies", "engines", "scaling"):
-        spec = importlib.util.spec_from_file_location(name, ROOT / "benchmarks" / f"{name}.py")
-        found[name] = sys.modules[name] = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(found[name])
-    return found
+def engines():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(ROOT / "benchmarks"))
+        yield importlib.import_module("engines")
 
 
 @pytest.fixture(scope="module")
-def bench(benchmarks):
+def bench(engines):
     config = GraspConfig(objects=ObjectConfig(shapes=("sphere", "box")))
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(TASKS, "grasp", TaskEntry(GraspConfig, Grasp, lambda: config))
-        return benchmarks["engine_motions"].Bench("grasp", starts=1, seconds=0.18)
+        return engines.Motions("grasp", starts=1, seconds=0.18)
 
 
 @pytest.fixture(scope="module")
@@ -41,13 +36,12 @@ def wanted(bench):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("backend, converged", [("c", False), ("c", True), ("warp", True)])
-def test_an_engine_moves_as_c_mujoco_does(benchmarks, bench, wanted, backend, converged):
+def test_an_engine_moves_as_c_mujoco_does(engines, bench, wanted, backend, converged):
     """The `c` backend with its own iterations, too: with 20 of the line search boxes on the palm were off by 1 mm."""
     pytest.importorskip("warp" if backend == "warp" else "mujoco")
-    motions = benchmarks["engine_motions"]
-    rows = bench.compare(bench.run(backend, motions.CONVERGED if converged else {}), wanted)
+    rows = bench.compare(bench.run(backend, engines.CONVERGED if converged else {}), wanted)
     assert {(row["motion"], row["shape"]) for row in rows} == {
-        (m, s) for m in motions.MOTIONS for s in ("sphere", "box")
+        (m, s) for m in engines.MOTIONS for s in ("sphere", "box")
     }
     for row in rows:
         assert row["force_n"] > 0.1, row
@@ -65,9 +59,9 @@ def test_the_reference_is_physics(bench, wanted):
     assert wanted.force[-1, row, -1, 0] == pytest.approx(9.81 * mass, rel=0.1)
 
 
-def test_differences_are_found(bench, wanted, benchmarks):
+def test_differences_are_found(bench, wanted, engines):
     """Of places in mm, of turns in degrees, of forces where something touches."""
-    trace = benchmarks["engine_motions"].Trace
+    trace = engines.Trace
     upright, over = (np.broadcast_to(np.eye(4)[axis], wanted.quat.shape) for axis in (0, 3))
     shifted = trace(wanted.place + [0.003, 0, 0.004], upright, wanted.force + 0.5)
     turned = trace(wanted.place, over, wanted.force)
@@ -78,8 +72,8 @@ def test_differences_are_found(bench, wanted, benchmarks):
 
 
 @pytest.mark.parametrize("converged", [False, True])
-def test_a_policy_is_measured_with_its_own_iterations_or_converged(benchmarks, monkeypatch, converged):
-    policies, seen = benchmarks["engine_policies"], []
+def test_a_policy_is_measured_with_its_own_iterations_or_converged(engines, monkeypatch, converged):
+    seen = []
 
     def evaluate(policy, *, env, episodes, chunk, baseline):
         seen.append((env.backend, env.config.physics.iterations, env.config.physics.line_search, episodes, chunk))
@@ -87,30 +81,26 @@ def test_a_policy_is_measured_with_its_own_iterations_or_converged(benchmarks, m
         task = {"held": found, "r_resultant": found | {"r": 0.6}, "force_error_n": found}
         return {"task": task | {"seconds": env.config.evaluation_seconds, "non_finite": 0}}
 
-    monkeypatch.setattr(policies, "evaluate_policy", evaluate)
-    row = policies.measure("grasp", "c", converged, episodes=5, seconds=0.3)
+    monkeypatch.setattr(engines, "evaluate_policy", evaluate)
+    row = engines.policy_row("grasp", "c", converged, episodes=5, seconds=0.3)
     assert seen == [("c", *((50, 50) if converged else (3, 6)), 5, 5)]
-    assert row["seconds"] == 0.3 and row["held"] == 0.8 and row["r"] == 0.6 and row["r_ci95"] == [0.7, 0.9]
+    assert (
+        row["seconds"] == 0.3
+        and row["held"] == 0.8
+        and row["r_resultant"] == 0.6
+        and row["r_resultant_ci95"] == [0.7, 0.9]
+    )
 
 
-def test_tables_have_a_column_for_each_engine(benchmarks, capsys, monkeypatch):
+def test_tables_have_a_column_for_each_engine(engines, capsys, monkeypatch):
     def measure(policy, backend, converged, episodes, seconds):
-        row = {"policy": policy, "backend": backend, "converged": converged, "r": None, "r_ci95": [None, None]}
+        row = {"policy": policy, "backend": backend, "converged": converged, "r_resultant": None}
         return row | {"held": 0.5, "held_ci95": [0.25, 0.75]}
 
-    engines = benchmarks["engines"]
-    monkeypatch.setattr(benchmarks["engine_policies"], "measure", measure)
-    monkeypatch.setattr(engines, "enable_caches", lambda: None)
+    monkeypatch.setattr(engines, "policy_row", measure)
+    monkeypatch.setattr(engines.cli, "enable_caches", lambda: None)
     engines.main(["policies", "--policies", "grasp", "--backends", "c", "jax"])
-    *lines, title, _, held, r = [line for line in capsys.readouterr().out.splitlines() if line]
+    *lines, title, _, held = [line for line in capsys.readouterr().out.splitlines() if line]
     assert [json.loads(line)["backend"] for line in lines] == ["c", "c", "jax", "jax"]
     assert title == "| policy | c | c, converged | jax | jax, converged |"
-    assert held == "| grasp, held |" + " 0.5 (0.25–0.75) |" * 4 and r == "| grasp, r |" + "  |" * 4
-
-
-def test_more_cores_by_amdahl(benchmarks):
-    """Times that follow the model give its parts back; a serial part is never negative."""
-    fit = benchmarks["scaling"].fit
-    assert fit({1: 130.0, 2: 80.0}) == pytest.approx((30.0, 100.0))
-    assert fit({1: 130.0, 2: 80.0, 4: 55.0}) == pytest.approx((30.0, 100.0))
-    assert fit({1: 100.0, 2: 40.0})[0] == pytest.approx(0.0)
+    assert held == "| grasp, held |" + " 0.5 (0.25–0.75) |" * 4

@@ -24,7 +24,7 @@ def paper():
         # The flags that other tests compile with stay as they are.
         patch.setattr("dexsim_real.control.controller.prepare_jax", lambda: None)
         patch.syspath_prepend(str(ROOT / "benchmarks"))
-        names = ("command", "data", "experiments", "held_out", "measure", "meshes", "page", "tables")
+        names = ("command", "data", "experiments", "held_out", "measure", "tables")
         yield SimpleNamespace(**{name: importlib.import_module(f"paper.{name}") for name in names})
 
 
@@ -44,7 +44,7 @@ def stub(paper, **changes):
         return {"value": len(calls)}
 
     rows = tuple(paper.data.Row(name=name, label=name, task="grasp") for name in ("a", "b", "c"))
-    given = {"name": "stub", "title": "Stub", "table": None, "draw": None, "trains": True}
+    given = {"name": "stub", "title": "Stub", "table": lambda *_: [["head"]], "trains": True}
     return paper.data.Experiment(rows=rows, measure=measure, **given | changes), calls
 
 
@@ -52,7 +52,7 @@ def stub(paper, **changes):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["skin", "all"])
+@pytest.mark.parametrize("name", ["readings", "all"])
 def test_smoke(paper, here, capsys, name):
     """Every row has a report, every experiment its table or figures; another run has nothing to do."""
     output = here / "reports"
@@ -62,16 +62,15 @@ def test_smoke(paper, here, capsys, name):
             report = json.loads(paper.data.report_path(output, experiment, row).read_text())
             assert report["budget"] == "smoke" and set(report["seeds"]) == {"0"}
         written = [path.suffix for path in (output / experiment.name).rglob("*")]
-        assert (".svg" in written or ".jpg" in written) == (experiment.draw is not None)
-        assert (".md" in written) == (experiment.table is not None)
-    skin = json.loads((output / "skin" / "law" / "report.json").read_text())["seeds"]["0"]
-    assert skin["worst_deviation"] < 0.01 and skin["felt"][-1]["compression"] > 0.6
+        assert (".svg" in written) == (experiment.draw is not None) and ".md" in written
     capsys.readouterr()
     again = {path: path.stat().st_mtime_ns for path in output.rglob("report.json")}
     paper.command.main([name, "--budget", "smoke", "--output", str(output)])
     assert again == {path: path.stat().st_mtime_ns for path in output.rglob("report.json")}
     paper.command.main([name, "--budget", "smoke", "--output", str(output), "--list"])
-    assert "about 0 min left" in capsys.readouterr().out
+    assert "0 of 1 seeds" not in capsys.readouterr().out
+    page = paper.command.render(output)
+    assert "Stress over compression of the skin" in page and "smoke budget" in page
 
 
 # --- rows and seeds that are done -----------------------------------------------------------------------
@@ -108,20 +107,19 @@ class TestResuming:
         paper.command.run(experiment, budget, here, here / "work")
         changed = dataclasses.replace(experiment.rows[1], settings=("reward.force=1",))
         other = dataclasses.replace(experiment, rows=(experiment.rows[0], changed, experiment.rows[2]))
-        assert set(paper.page.reports_of(other, here)) == {"a", "c"}
+        assert set(paper.command.reports_of(other, here)) == {"a", "c"}
         paper.command.run(other, budget, here, here / "work")
         assert calls[3:] == [("b", 0)]
         relabelled = dataclasses.replace(changed, label="another label", paper={"x": "1"})
         assert paper.data.settings_of(relabelled) == paper.data.settings_of(changed)
 
-    def test_list_tells_what_is_left(self, paper, here):
+    def test_list_tells_what_is_done(self, paper, here):
         experiment, _ = stub(paper)
         budget = paper.data.BUDGETS["cpu"]
-        assert "about 189 min left" in next(paper.command.listing(experiment, budget, here))  # 3 x 3 x (20 + 1)
         only = dataclasses.replace(experiment, rows=experiment.rows[:1])
         paper.command.run(only, budget, here, here / "work")
-        head, first, second, _ = paper.command.listing(experiment, budget, here)
-        assert "about 126 min left" in head and "3 of 3 seeds, cpu budget" in first and "0 of 3 seeds" in second
+        _, first, second, _ = paper.command.listing(experiment, budget, here)
+        assert "3 of 3 seeds, cpu budget" in first and "0 of 3 seeds" in second
 
     def test_rows_can_be_measured_apart(self, paper, here):
         experiment, calls = stub(paper)
@@ -132,17 +130,6 @@ class TestResuming:
         assert [name for name, _ in calls[3:6]] == ["a"] * 3, "what another process measured is not done again"
         with pytest.raises(ConfigError, match="--row quaternio: not a row of observations; --list names them"):
             paper.command.main(["observations", "--row", "quaternio"])
-
-    @pytest.mark.parametrize(
-        "text", ["", '{"budget": "cpu"', "[]", '{"budget": "large", "row": {"a": 1}, "seeds": {}}']
-    )
-    def test_a_file_that_is_no_report_is_named(self, paper, here, text):
-        experiment, calls = stub(paper)
-        path = here / "stub" / "b" / "report.json"
-        path.parent.mkdir(parents=True)
-        path.write_text(text)
-        with pytest.raises(ConfigError, match="stub/b/report.json: is not a report of a row; delete it"):
-            list(paper.command.listing(experiment, paper.data.BUDGETS["cpu"], here))
 
     def test_an_unknown_name_is_refused(self, paper, capsys):
         with pytest.raises(SystemExit):
@@ -257,17 +244,6 @@ def test_observations_of_the_rows(paper):
     }
 
 
-def test_ranges_of_training_are_those_of_the_shipped_policies(paper):
-    from dexsim_ppo import load_policy
-
-    for row in paper.experiments.EXPERIMENTS["robustness"].rows:
-        if row.training:
-            value = load_policy(row.policy).env_config
-            for name in row.settings[0].partition("=")[0].split("."):
-                value = value[name]
-            assert row.training == pytest.approx(tuple(value) if isinstance(value, (list, tuple)) else (0.0, value))
-
-
 def test_sweeps_reach_twice_the_range_of_training(paper):
     assert paper.measure.points_at_twice(0.6, 1.2) == pytest.approx((0.3, 0.6, 1.2, 1.5))
     assert paper.measure.points_at_twice(0.05, 0.2, 0.02) == pytest.approx((0.02, 0.05, 0.2, 0.275))
@@ -277,51 +253,26 @@ def test_sweeps_reach_twice_the_range_of_training(paper):
 
 
 class TestHeldOut:
-    def test_meshes_are_those_of_the_code(self, paper, tmp_path):
-        paper.meshes.write(tmp_path)
-        for name in paper.meshes.MESHES:
-            assert (tmp_path / f"{name}.stl").read_bytes() == (paper.held_out.FOLDER / f"{name}.stl").read_bytes()
-
-    def test_meshes_are_closed_and_of_many_kinds(self, paper):
-        import trimesh
-
-        convex, thin = 0, 0
-        for name in paper.meshes.MESHES:
-            body = trimesh.load(paper.held_out.FOLDER / f"{name}.stl")
-            assert body.is_watertight and body.is_winding_consistent and body.volume > 0, name
-            assert 0.030 <= body.extents.max() <= 0.090, name
-            convex += body.volume > 0.99 * body.convex_hull.volume
-            thin += body.extents.min() <= 0.012
-        assert len(paper.meshes.MESHES) == 12 and convex <= 3 and thin >= 1 and len(paper.held_out.HEAVY) >= 3
-
-    def test_volumes_are_those_of_closed_forms(self, paper):
-        import trimesh
-
-        volumes = {n: trimesh.load(paper.held_out.FOLDER / f"{n}.stl").volume for n in ("l_bracket", "ring", "plate")}
-        assert volumes["l_bracket"] == pytest.approx(5 * 0.019 * 0.034 * 0.019, rel=1e-5)
-        assert volumes["plate"] == pytest.approx(0.010 * 0.044 * 0.062, rel=1e-5)
-        torus = 2 * np.pi * 0.022 * np.pi * 0.010 * 0.012  # Pappus; the facets cut a little off
-        assert volumes["ring"] == pytest.approx(torus, rel=0.05) and volumes["ring"] < torus
+    def test_every_object_fits_into_the_slots(self, paper):
+        for name in paper.held_out.NAMES:
+            shape, parts = paper.held_out.shape_of(name), paper.held_out.CATALOGUE[name]["parts"]
+            assert shape["active"].sum() == len(parts)
+            assert np.linalg.norm(shape["quat"], axis=-1) == pytest.approx(1.0, abs=1e-5), name
+            assert np.all(shape["inertia"] > 0) and shape["inertia"].sum() > 2 * shape["inertia"].max(), name
+        assert len(paper.held_out.NAMES) == 24 and set(paper.held_out.HEAVY) < set(paper.held_out.NAMES)
 
     def test_no_composition_is_one_of_training(self, paper):
         """Training has a box or a cylinder with one capsule along its z."""
-        for name, parts in paper.held_out.COMPOSITIONS.items():
-            kinds = sorted(part[0] for part in parts)
+        for name in paper.held_out.NAMES[:12]:
+            kinds = sorted(part["kind"] for part in paper.held_out.CATALOGUE[name]["parts"])
             assert kinds not in (["box", "capsule"], ["capsule", "cylinder"]) or name == "mace"
-        # The mace's ball is three times as large as the largest neck of training, and at its end.
-        ball = paper.held_out.COMPOSITIONS["mace"][0]
-        assert ball[2][0] > 16 and len(paper.held_out.COMPOSITIONS) == 12
 
     def test_mass_properties(self, paper):
-        """A box in closed form, and two balls apart by the parallel axis theorem."""
-        box = paper.held_out._composition((("box", "z", (10, 20, 30), (5, 0, 0)),))
-        a, b, c = 0.010, 0.020, 0.030
-        assert box.inertia == pytest.approx(np.array([b * b + c * c, a * a + c * c, a * a + b * b]) / 3, rel=0.02)
-        assert box.position[0] == pytest.approx(np.zeros(3), abs=1e-5)
-        balls = (("capsule", "z", (15, 0.01), (0, 0, 25)), ("capsule", "z", (15, 0.01), (0, 0, -25)))
-        own = 2 / 5 * 0.015**2
-        found = paper.held_out._composition(balls).inertia
-        assert found == pytest.approx([own + 0.025**2, own + 0.025**2, own], rel=0.02)
+        """A plate in closed form."""
+        plate = paper.held_out.shape_of("plate")
+        (a, b, c) = np.sort(plate["size"][0])
+        closed = np.array([b * b + c * c, a * a + c * c, a * a + b * b]) / 3
+        assert np.sort(plate["inertia"]) == pytest.approx(np.sort(closed), rel=0.02)
 
     @pytest.mark.slow
     def test_objects_are_drawn_with_their_own_mass(self, paper, hand):
@@ -339,7 +290,7 @@ class TestHeldOut:
         assert np.asarray(objects[0].active)[0].sum() == 2 and np.asarray(objects[1].active)[0].sum() == 3
 
 
-# --- tables ---------------------------------------------------------------------------------------------
+# --- tables and page ------------------------------------------------------------------------------------
 
 
 def test_a_cell_is_of_one_seed_or_of_several(paper):
@@ -368,10 +319,10 @@ def test_reports_of_other_weights_do_not_count(paper, tmp_path):
     path.parent.mkdir(parents=True)
     report = {"budget": "cpu", "seeds": {"0": {}}, "row": paper.data.settings_of(row)}
     path.write_text(json.dumps(report))
-    assert paper.page.reports_of(experiment, tmp_path) == {row.name: report}
+    assert paper.command.reports_of(experiment, tmp_path) == {row.name: report}
     path.write_text(json.dumps(report | {"row": report["row"] | {"weights": "0" * 16}}))
-    assert paper.page.reports_of(experiment, tmp_path) == {}
-    assert not paper.data.is_done(experiment, row, paper.data.BUDGETS["cpu"], json.loads(path.read_text()))
+    assert paper.command.reports_of(experiment, tmp_path) == {}
+    assert paper.data.missing_seeds(experiment, row, paper.data.BUDGETS["cpu"], json.loads(path.read_text())) == [0]
 
 
 def test_weights_tell_policies_apart(paper):
@@ -379,12 +330,16 @@ def test_weights_tell_policies_apart(paper):
     assert len({paper.data.weights_of(file) for file in files}) == 3
 
 
+def test_the_page_agrees_with_the_reports(paper):
+    assert paper.command.PAGE.read_text() == paper.command.render(), "run python benchmarks/paper.py page"
+
+
 def test_committed_tables_agree_with_the_reports(paper):
     for experiment in paper.experiments.EXPERIMENTS.values():
         path = paper.data.REPORTS / experiment.name / "table.md"
         if path.exists():
-            reports = paper.page.reports_of(experiment, paper.data.REPORTS)
-            assert path.read_text() == paper.page.markdown(experiment.table(experiment, reports)) + "\n"
+            reports = paper.command.reports_of(experiment, paper.data.REPORTS)
+            assert path.read_text() == paper.command.markdown(experiment.table(experiment, reports)) + "\n"
 
 
 def test_committed_reports_are_of_todays_rows(paper):

@@ -36,8 +36,8 @@ def test_a_recalled_target_is_a_place_in_its_joints_range(hand):
     action = jnp.linspace(-1, 1, 12)
     for share, place in ((0.0, -1.0), (0.5, 0.0), (0.75, 0.5), (1.0, 1.0)):
         target = jnp.asarray(lower + share * (upper - lower))
-        found = observed_action(Control(recall="target"), hand, action, target)
+        found = observed_action(Control(last_action_encoding="target"), hand, action, target)
         np.testing.assert_allclose(found, np.full(12, place), atol=1e-5)
         np.testing.assert_array_equal(observed_action(Control(), hand, action, target), action)
-    with pytest.raises(ConfigError, match="recall = 'nothing': choose from action, target"):
-        Control(recall="nothing")
+    with pytest.raises(ConfigError, match="last_action_encoding = 'nothing': choose from action, target"):
+        Control(last_action_encoding="nothing")

@@ -78,7 +78,7 @@ def quantities(hand, drawn):
         "torque_gain": drawn.torque_gain,
         "taxel_gain": drawn.taxel_gain[..., 0],
         "gravity_tilt": drawn.tilt,
-        "cover": drawn.cover[:, None],
+        "pad_thickness_delta": drawn.pad_thickness_delta[:, None],
     }
 
 
@@ -102,7 +102,7 @@ DISTINCT = Randomization(
     torque_gain=(1.3, 1.5),
     taxel_gain=(0.3, 0.4),
     gravity_tilt=0.5,
-    cover=(0.001, 0.002),
+    pad_thickness_delta=(0.001, 0.002),
 )
 
 
@@ -345,11 +345,11 @@ REACHES = {
     "coulomb_friction": {"actuator.coulomb_friction"},
     "viscous_friction": {"actuator.viscous_friction"},
     "sensing_latency": {"sensing_latency"},
-    "encoder_bias": {"actuator.encoder_bias", "encoder_bias"},
+    "encoder_bias": {"actuator.encoder_bias"},
     "torque_gain": {"torque_gain"},
     "taxel_gain": {"taxel_gain"},
     "gravity_tilt": {"tilt"},
-    "cover": {"cover"},
+    "pad_thickness_delta": {"pad_thickness_delta"},
     "mass": {"body_mass"},
     "inertia_scale": {"body_inertia"},
     "com_offset": {"body_ipos"},

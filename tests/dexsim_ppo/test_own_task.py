@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from simple_physics import SimplePhysics
 
-from dexsim import CheckpointError, ConfigError, OtherEnvWarning, registry
+from dexsim import registry
 from dexsim.core.config import override
+from dexsim.errors import CheckpointError, ConfigError, OtherEnvWarning
 from dexsim_ppo import Policy, evaluate_policy, load_policy, record, train_policy
 from dexsim_ppo import evaluate as evaluate_command
 from dexsim_ppo import train as train_command

@@ -13,6 +13,7 @@ import dexsim
 from dexsim import registry
 from dexsim.core.compilation import jit
 from dexsim.core.errors import ConfigError, DexsimError
+from dexsim.env.evaluation import evaluation_of
 from dexsim.tasks.grasp.config import GraspConfig
 from dexsim_ppo import load_policy, record
 
@@ -25,7 +26,8 @@ def env():
 @pytest.fixture(scope="module")
 def compiled(env):
     """The first states of the three episodes, and the step."""
-    starts = jit(env.evaluation_starts, once=True)(env.evaluation_plan(3, 0))
+    protocol = evaluation_of(env)
+    starts = jit(protocol.evaluation_starts, once=True)(protocol.evaluation_plan(3, 0))
     return starts, jit(jax.vmap(env.step), once=True)
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from dexsim.core.config import from_dict, to_dict
 from dexsim.core.errors import CheckpointError, ConfigError, OldFileWarning
-from dexsim.task_spec import TaskSpec
+from dexsim.task_spec import TaskSpec, TurnSpec
 from dexsim.tasks.grasp.config import GraspConfig
 from dexsim.tasks.grasp.task import Grasp
 from dexsim.tasks.rotate.config import RotateConfig
@@ -141,7 +141,10 @@ def test_arrays_of_an_older_environment_go_where_todays_are():
     [
         (Grasp, GraspConfig()),
         (Rotate, RotateConfig()),
-        (Rotate, RotateConfig(direction=-1, tilt=0.3, roll=-0.2, axis=(0.6, 0.0, -0.8), goal_step=0.7, goal_angle=0.2)),
+        (
+            Rotate,
+            RotateConfig(tilt=0.3, roll=-0.2, turn=TurnSpec(axis=(0.6, 0.0, -0.8), step=-0.7, angle=0.2)),
+        ),
     ],
 )
 def test_a_policy_without_a_specification_gets_the_one_that_its_task_has(task, config, hand):

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from episodes import reset_to
 from remembering import KINDS, remembering
 
 import dexsim
@@ -153,7 +154,7 @@ def test_the_grasp_holds_and_presses_as_asked():
     goals = GraspGoal(jnp.tile(jnp.array([0.0, 1.0]), WORLDS // 2), jnp.ones(WORLDS, bool))
     pairs = jnp.repeat(jnp.arange(WORLDS // 2), 2)
     rows = jnp.array([1, 6, 11, 16])[pairs]  # of different shapes
-    starts = jit(jax.vmap(env.reset_to), once=True)(
+    starts = jit(jax.vmap(reset_to(env)), once=True)(
         jax.random.split(jax.random.key(0), WORLDS // 2)[pairs], rows, goals
     )
     assert len(np.unique(starts.episode.object.shape_index)) == WORLDS // 2
@@ -170,7 +171,7 @@ def test_the_grasp_holds_and_presses_as_asked():
 def test_the_rotate_turns():
     """At least two quarter turns in four seconds and no drop; a hand that does nothing turns none."""
     env = dexsim.make("rotate", RotateConfig(pool_size=WORLDS), backend="c", num_envs=WORLDS)
-    starts = jit(jax.vmap(env.reset_to), once=True)(jax.random.split(jax.random.key(0), WORLDS), jnp.arange(WORLDS))
+    starts = jit(jax.vmap(reset_to(env)), once=True)(jax.random.split(jax.random.key(0), WORLDS), jnp.arange(WORLDS))
     play = player(env)
     dropped, _, metrics = play(starts, 4.0, load("rotate"))
     turns = metrics["successes"][-1]

@@ -1,6 +1,6 @@
-"""The grasp scene in C MuJoCo, written down a second time: what the physics seam is held against.
+"""The grasp scene in C MuJoCo, written down a second time: what our physics are held against.
 
-Nothing here comes from `dexsim.physics.seam`. The object is compiled with its true sizes, places and
+Nothing here comes from `dexsim.physics.interface`. The object is compiled with its true sizes, places and
 inertia (C MuJoCo ignores geom offsets that are set on a compiled model whose geoms lie at their
 body's origin), only its active primitives exist, and forces are summed from `mj_contactForce`.
 """

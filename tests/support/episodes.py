@@ -3,9 +3,14 @@
 import dataclasses
 from types import SimpleNamespace
 
+import jax
 import jax.numpy as jnp
 
-from dexsim.env.motors import PhysicsTick
+from dexsim.geometry import rotations
+from dexsim.hand.kinematics import forward_kinematics
+from dexsim.physics.interface import StepResult
+from dexsim.touch.feel import feel_links
+from dexsim.touch.surface import skin_surface
 
 
 def with_episode(state, **parts):
@@ -16,8 +21,20 @@ def with_episode(state, **parts):
 def ground_truth(env, object, physics, force):
     """What a task would see of this object and physics state, under forces [F, 3] N on the finger tips."""
     zero = jnp.zeros(env.hand.num_joints)
-    tick = PhysicsTick(
-        physics=physics, finger_force=force, joint_torque=zero, gear=None, limited=zero > 0, finite=jnp.ones((), bool)
-    )
-    episode = SimpleNamespace(object=object, hand=SimpleNamespace(cover=0.0))
-    return env._ground_truth(episode, tick, zero, zero)
+    episode = SimpleNamespace(object=object, hand=SimpleNamespace(pad_thickness_delta=0.0))
+    return env._ground_truth(episode, StepResult(physics, force), (zero, zero > 0), zero, zero)
+
+
+def reset_to(env):
+    """`reset_to(key, index)`: a new episode from a row of the pool."""
+    return lambda key, index: env.reset_from(key, jax.tree.map(lambda rows: jnp.asarray(rows)[index], env.pool))
+
+
+def tip_stiffness(physics, skin, object, qpos):
+    """The fingertips' stiffness [F] over nominal at a pose of hand and object."""
+    hand, place = physics.hand, qpos[physics.object_qpos]
+    pose = forward_kinematics(hand, qpos[physics.joint_qpos])
+    turn = rotations.quat_to_matrix(place[3:] / jnp.linalg.norm(place[3:]))
+    unit, surface = jnp.ones(hand.num_fingers), skin_surface(hand, skin)
+    pressed = feel_links(hand, pose, object.shape(), place[:3], turn, unit, skin, surface).skin_force.sum(-1)
+    return physics.tip_stiffness(object, pose, place[:3], turn, pressed)

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dexsim.physics.seam import PhysicsState
+from dexsim.physics.interface import PhysicsState, StepResult
 
 ARMATURE = 5e-4  # kg m^2, of every joint
 
@@ -18,35 +18,34 @@ class SimplePhysics:
         self.backend, self.config = "jax", config
         self.joint_qpos, self.joint_dof = np.arange(12), np.arange(12)
         self.object_qpos, self.object_dof = np.arange(12, 19), np.arange(12, 18)
-        armature = ARMATURE * (1 - options.get("rotor_share", 0.0))
-        self.inertia = 5e-4 + armature
+        del options
+        self.inertia = 5e-4 + ARMATURE
         self.mj_model = SimpleNamespace(
             nv=18,
             dof_M0=np.full(18, self.inertia),
-            dof_armature=np.full(18, armature),
+            dof_armature=np.full(18, ARMATURE),
             dof_invweight0=np.full(18, 1 / self.inertia),
             opt=SimpleNamespace(timestep=config.timestep),
         )
 
-    def advance(self, object, state, torque, push, cover=0.0):
-        motors = lambda index, position, velocity, memory: (torque(index, position, velocity), memory)  # noqa: E731
-        return self.advance_motors(object, state, motors, None, push, cover)[:2]
+    def tip_stiffness(self, object, pose, position, rotation, skin_force, pad_thickness_delta=0.0):
+        return jnp.ones(5)
 
-    def advance_motors(self, object, state, motors, memory, push, cover=0.0):
-        del cover  # nothing touches anything
+    def advance(self, law, object, state, push, tip_stiffness=None, pad_thickness_delta=0.0):
+        del tip_stiffness, pad_thickness_delta  # nothing touches anything
 
         def substep(carry, index):
-            qpos, qvel, memory = carry
-            tau, memory = motors(index, qpos[:12], qvel[:12], memory)
+            qpos, qvel = carry
+            tau = law(index, qpos[:12], qvel[:12])
             speed = qvel[:12] + self.config.timestep / self.inertia * (tau - 0.02 * qvel[:12])
             fall = qvel[12:15] + self.config.timestep * (jnp.array([9.81, 0, 0]) + push / object.mass)
             qvel = jnp.concatenate([speed, fall, qvel[15:]])
             moved = jnp.concatenate(
                 [qpos[:12] + self.config.timestep * speed, qpos[12:15] + self.config.timestep * fall, qpos[15:]]
             )
-            return (moved, qvel, memory), None
+            return (moved, qvel), None
 
         steps = jnp.arange(self.config.substeps)
-        (qpos, qvel, memory), _ = jax.lax.scan(substep, (state.qpos, state.qvel, memory), steps)
+        (qpos, qvel), _ = jax.lax.scan(substep, (state.qpos, state.qvel), steps)
         force = jnp.zeros((5, 3)).at[:, 0].set(jnp.maximum(qpos[:10:2] - 0.5, 0))
-        return PhysicsState(qpos, qvel, state.warmstart), force, memory
+        return StepResult(PhysicsState(qpos, qvel, state.warmstart), force)

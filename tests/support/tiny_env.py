@@ -105,7 +105,7 @@ class TinyEnv:
     def reset(self, key: jax.Array) -> TinyState:
         return self._start(key)
 
-    def stagger(self, state: TinyState, key: jax.Array) -> TinyState:
+    def randomize_episode_time(self, state: TinyState, key: jax.Array) -> TinyState:
         clock = jax.random.randint(key, (), 0, self.config.horizon).astype(jnp.float32)
         return dataclasses.replace(state, metrics=state.metrics | {"length": clock})
 

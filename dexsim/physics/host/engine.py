@@ -1,85 +1,57 @@
-"""C MuJoCo on all cores: ticks of a batch of environments, each with a model of its own.
+"""C MuJoCo on all cores: ticks of a batch of worlds, each with object, contacts and fingertips of its own.
 
-What goes in decides what comes out. Models and data stay from call to call, as a cache: rows whose parameters differ
-from those written last are written again. Batches of several sizes have models of their own.
+What goes in decides what comes out: all that differs between worlds, and their whole state, is written at every tick.
+What stays from call to call, a `mujoco.batch.Batch` for each size, is memory and threads.
 """
 
 import collections
 import contextlib
-import copy
-import functools
 import math
 import os
 import threading
 from collections.abc import Iterator
-from typing import Any
 
 import mujoco
 import numpy as np
-from mujoco.rollout import Rollout
+from mujoco.batch import Batch
 
 from dexsim.core.compilation import available_cores
-from dexsim.physics.host.law import read_law
+from dexsim.physics.host.law import Law, read_law
+from dexsim.physics.interface import PhysicsScene
 from dexsim.physics.parameters import places
-from dexsim.physics.seam import PhysicsScene
 
 _SIZES_KEPT = 8
-_APPLIED = mujoco.mjtState.mjSTATE_QFRC_APPLIED.value | mujoco.mjtState.mjSTATE_XFRC_APPLIED.value
-# s, time at the start of a sub-step. MuJoCo resets a world that diverges, its clock too: that is how it shows.
-_CLOCK = 1.0
+_WARNINGS = mujoco.mjtWarning
+_FULL = [_WARNINGS.mjWARN_CONTACTFULL.value, _WARNINGS.mjWARN_CNSTRFULL.value]
+# MuJoCo resets a world that is not a number, or out of bounds.
+_DIVERGED = [w.value for w in (_WARNINGS.mjWARN_BADQPOS, _WARNINGS.mjWARN_BADQVEL, _WARNINGS.mjWARN_BADQACC)]
+_lock = threading.Lock()  # one tick at a time has all cores
 
 
-class _Pool:
-    """One thread for each core that this process may use, shared by all engines. One call at a time."""
+class _Worlds:
+    """Worlds that differ in some fields of the model, and the arrays through which they are written and read."""
 
-    def __init__(self):
-        self.lock, self.process = threading.Lock(), os.getpid()
-        self.threads = available_cores()
-        self.rollout = Rollout(nthread=self.threads if self.threads > 1 else 0).rollout_
+    def __init__(self, scene: PhysicsScene, size: int, fields: list[str]):
+        self.size, self.process = size, os.getpid()
+        # One thread for each core that this process may use.
+        self.batch = Batch(scene.model, size, available_cores())
+        where = {
+            name: (slice(None), *(index if isinstance(index, tuple) else (index,)))
+            for name, index in places(scene).items()
+        }
+        self._fields = [[(self.batch.expand(name), where[name])] for name in fields]
+        # The subtree of the object's body is the object.
+        self._fields[fields.index("body_mass")].append((self.batch.expand("body_subtreemass"), where["body_mass"]))
+        self.qpos, self.qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
+        self.warmstart = self.batch.bind("qacc_warmstart")
+        self.torque, self.wrench = self.batch.bind("qfrc_applied"), self.batch.bind("xfrc_applied")
+        self.sensors = self.batch.bind("sensordata").reshape(size, -1, 3)
 
-
-@functools.cache
-def pool() -> _Pool:
-    """The pool, started at its first use.
-
-    Raises:
-      RuntimeError: in a forked child, which has none of its parent's threads.
-    """
-    return _Pool()
-
-
-class _Rows:
-    """The models of a batch, and what was written into each of them last."""
-
-    def __init__(self, template: mujoco.MjModel, size: int):
-        self.size = size
-        self.models = [copy.copy(template) for _ in range(size)]
-        self._template = template
-        self._given: dict[str, np.ndarray] = {}
-        self._whole: dict[str, np.ndarray] = {}
-        self._views: dict[str, list[np.ndarray]] = {}
-        nstate = mujoco.mj_stateSize(template, mujoco.mjtState.mjSTATE_FULLPHYSICS.value)
-        self.states = [np.zeros((size, nstate)) for _ in range(2)]
-        self.applied = np.zeros((size, mujoco.mj_stateSize(template, _APPLIED)))
-        self.warmstart, self.sensors = np.zeros((size, template.nv)), np.zeros((size, template.nsensordata))
-
-    def write(self, name: str, index: Any, values: np.ndarray) -> None:
-        """Set `field[index]` of every model, where it differs from what is there."""
-        last = self._given.get(name)
-        if last is None:
-            self._given[name] = np.array(values)
-            self._whole[name] = np.repeat(np.asarray(getattr(self._template, name), float)[None], self.size, 0)
-            self._views[name] = [getattr(model, name) for model in self.models]
-            rows = list(range(self.size))
-        else:
-            rows = np.flatnonzero((values != last).reshape(self.size, -1).any(1)).tolist()
-            if not rows:
-                return
-            np.copyto(last, values)
-        whole, views = self._whole[name], self._views[name]
-        whole[(slice(None), *(index if isinstance(index, tuple) else (index,)))] = values
-        for row in rows:
-            np.copyto(views[row], whole[row])
+    def configure(self, values: list[np.ndarray]) -> None:
+        """Write the models' fields."""
+        for targets, value in zip(self._fields, values, strict=True):
+            for array, where in targets:
+                array[where] = value
 
 
 class HostEngine:
@@ -87,97 +59,71 @@ class HostEngine:
 
     def __init__(self, scene: PhysicsScene):
         """`scene` has a contact sensor for each fingertip."""
-        self.scene, model = scene, scene.model
-        self._places = places(scene)
-        self._datas = [mujoco.MjData(model) for _ in range(pool().threads)]
-        self._rows: collections.OrderedDict[tuple[int, tuple[str, ...]], _Rows] = collections.OrderedDict()
-        self._push = model.nv + 6 * scene.object_body + np.arange(3)
+        self.scene = scene
+        self._worlds: collections.OrderedDict[tuple[int, tuple[str, ...]], _Worlds] = collections.OrderedDict()
         self.diverged = 0
         """World-ticks so far that MuJoCo gave up: not a number, or out of bounds."""
 
-    def _batch(self, size: int, fields: list[str]) -> _Rows:
-        """Models of their own for each set of fields: what one environment writes, another may leave as it is."""
+    def _batch(self, size: int, fields: list[str]) -> _Worlds:
+        """Worlds of their own for each set of fields: what one environment writes, another may leave as it is.
+
+        Raises:
+          RuntimeError: in a forked child, which has none of its parent's threads.
+        """
         key = size, tuple(fields)
-        if key not in self._rows:
-            self._rows[key] = _Rows(self.scene.model, size)
-            while len(self._rows) > _SIZES_KEPT:
-                self._rows.popitem(last=False)
-        self._rows.move_to_end(key)
-        return self._rows[key]
+        if key not in self._worlds:
+            self._worlds[key] = _Worlds(self.scene, size, fields)
+            while len(self._worlds) > _SIZES_KEPT:
+                self._worlds.popitem(last=False)
+        self._worlds.move_to_end(key)
+        if self._worlds[key].process != os.getpid():
+            raise RuntimeError(
+                "backend 'c' does not work in a forked process, which lacks its threads: "
+                "start processes with multiprocessing.get_context('spawn')"
+            )
+        return self._worlds[key]
 
     def tick(self, fields: list[str], substeps: int, law: bytes, arguments: list[np.ndarray], out: list) -> None:
         """Some sub-steps for a batch; see `dexsim.physics.c_backend.CBackend` for what crosses."""
         shape = out[0].shape[:-1]
         rank, size = len(shape), math.prod(shape)
         given = [_flatten(x, shape, rank, size) for x in arguments]
-        workers = pool()
-        if workers.process != os.getpid():
-            raise RuntimeError(
-                "backend 'c' does not work in a forked process, which lacks its threads: "
-                "start processes with multiprocessing.get_context('spawn')"
-            )
-        with workers.lock, np.errstate(all="ignore"), _no_warnings():
-            rows = self._batch(size, fields)
-            for name, values in zip(fields, given, strict=False):
-                values = np.broadcast_to(values, (size, *values.shape[1:]))
-                rows.write(name, self._places[name], values)
-                if name == "body_mass":
-                    rows.write("body_subtreemass", self._places[name], values)
-            results = self._run(workers, rows, substeps, law, given[len(fields) :])
-        for target, value in zip(out, results, strict=True):
-            target[...] = value.reshape(target.shape) if value.shape[0] == size else value
+        with _lock, _no_warnings():
+            worlds = self._batch(size, fields)
+            worlds.configure(given[: len(fields)])
+            results = self._run(worlds, substeps, read_law(law), given[len(fields) :])
+            for target, value in zip(out, results, strict=True):
+                target[...] = value.reshape(target.shape)
 
-    def _run(self, workers: _Pool, rows: _Rows, substeps: int, law: bytes, given: list[np.ndarray]) -> list[np.ndarray]:
-        model, scene, torque_law = self.scene.model, self.scene, read_law(law)
-        qpos, qvel, warmstart, push, *rest = given
-        memory_size = torque_law.outputs - 1
-        constants, memory = rest[: len(rest) - memory_size], rest[len(rest) - memory_size :]
-        before, after = rows.states
-        joints, dofs = 1 + scene.joint_qpos, 1 + model.nq + scene.joint_dof
-        speeds = slice(1 + model.nq, 1 + model.nq + model.nv)
-        before[:, 0], before[:, 1 : 1 + model.nq], before[:, speeds] = _CLOCK, qpos, qvel
-        rows.warmstart[:], rows.applied[:, self._push] = warmstart, push
-        lost = np.zeros(rows.size, bool)
+    def _run(self, worlds: _Worlds, substeps: int, law: Law, given: list[np.ndarray]) -> list[np.ndarray]:
+        """Positions, velocities, accelerations, and the fingers' forces [B, F, 3] N of the last sub-step."""
+        scene, warning = self.scene, worlds.batch.warning[..., 1]
+        qpos, qvel, warmstart, push, *constants = given
+        worlds.qpos[:], worlds.qvel[:], worlds.warmstart[:] = qpos, qvel, warmstart
+        worlds.wrench[:, scene.object_body, :3] = push
+        warning[:] = 0
         for substep in range(substeps):
-            position, velocity = (before[:, columns].astype(qpos.dtype) for columns in (joints, dofs))
-            torque, memory = torque_law(constants, substep, position, velocity, memory)
-            rows.applied[:, scene.joint_dof] = torque
-            self._step(workers, rows, before, after)
-            lost |= after[:, 0] < _CLOCK
-            # The warm start is the acceleration, which semi-implicit Euler has added to the velocity.
-            rows.warmstart[:] = (after[:, speeds] - before[:, speeds]) / model.opt.timestep
-            after[:, 0] = _CLOCK
-            before, after = after, before
-        force = -rows.sensors.reshape(rows.size, -1, 3)
-        if lost.any():
-            self.diverged += int(lost.sum())
-            force[lost] = np.nan
-        return [before[:, 1 : 1 + model.nq], before[:, speeds], rows.warmstart, force, *memory]
-
-    def _step(self, workers: _Pool, rows: _Rows, before: np.ndarray, after: np.ndarray) -> None:
-        workers.rollout.rollout(
-            rows.models,
-            self._datas,
-            1,
-            _APPLIED,
-            before,
-            rows.warmstart,
-            rows.applied,
-            after,
-            rows.sensors,
-            max(1, rows.size // (10 * workers.threads)),
-        )
-        if any(data.maxuse_arena >= 0.9 * data.narena for data in self._datas):
+            position = worlds.qpos[:, scene.joint_qpos].astype(qpos.dtype)
+            velocity = worlds.qvel[:, scene.joint_dof].astype(qvel.dtype)
+            worlds.torque[:, scene.joint_dof] = law(constants, substep, position, velocity)
+            worlds.batch.step()
+        if warning[:, _FULL].any():
             raise MemoryError("C MuJoCo has no room for all contacts: raise <size memory> in the hand's MJCF")
+        force = -worlds.sensors
+        if (diverged := warning[:, _DIVERGED].any(1)).any():
+            self.diverged += int(diverged.sum())
+            force[diverged] = np.nan
+        return [worlds.qpos, worlds.qvel, worlds.warmstart, force]
 
 
 @contextlib.contextmanager
 def _no_warnings() -> Iterator[None]:
-    """MuJoCo writes warnings to the terminal and to a file in the working directory. Here its clock tells of them."""
+    """MuJoCo writes warnings to the terminal and to a file in the working directory. Here they are counted."""
     before = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(lambda message: None)
     try:
-        yield
+        with np.errstate(all="ignore"):
+            yield
     finally:
         mujoco.set_mju_user_warning(before)
 

@@ -15,6 +15,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dexsim.physics.interface import PhysicsScene, PhysicsState, StepResult, TorqueLaw
+
 # JAX's primitives that work element by element, in NumPy.
 _ELEMENTWISE: dict[str, Callable[..., Any]] = {
     "abs": np.abs,
@@ -53,30 +55,37 @@ class Recorded:
 
     text: str
     constants: list[jax.Array]
-    tree: Any  # of the memory after it
 
 
-def record(law: Callable[..., Any], joints: jax.Array, memory: Any) -> Recorded | None:
-    """Trace `law` (`dexsim.physics.seam.TorqueLaw`); None if it has a primitive that `Law` lacks.
+def record(law: TorqueLaw, joints: jax.Array) -> Recorded | None:
+    """Trace `law` (`dexsim.physics.interface.TorqueLaw`); None if it has a primitive that `Law` lacks.
 
-    Of `joints` [J] and `memory` only shapes and types count.
+    Of `joints` [J] only shape and type count.
     """
-    trees: list[Any] = []
-
-    def flat(*inputs: Any) -> list[Any]:
-        torque, after = law(*inputs)
-        leaves, tree = jax.tree.flatten(after)
-        trees.append(tree)
-        return [torque, *leaves]
-
-    traced = jax.make_jaxpr(flat)(jnp.int32(0), joints, joints, memory)
+    traced = jax.make_jaxpr(law)(jnp.int32(0), joints, joints)
     writer = _Writer()
     try:
         numbers = writer.run(traced.jaxpr, [writer.new() for _ in (*traced.jaxpr.constvars, *traced.jaxpr.invars)])
     except _Unknown:
         return None
     text = json.dumps({"literals": writer.literals, "steps": writer.steps, "results": numbers})
-    return Recorded(text, traced.consts, trees[-1])
+    return Recorded(text, traced.consts)
+
+
+def one_by_one(
+    scene: PhysicsScene,
+    substep: Callable[[TorqueLaw, PhysicsState], StepResult],
+    torque: TorqueLaw,
+    state: PhysicsState,
+) -> StepResult:
+    """`Backend.advance` with the law left to XLA: an engine's `substep` for each, under torques that are constant."""
+
+    def run(state: PhysicsState, index: jax.Array) -> tuple[PhysicsState, jax.Array]:
+        tau = torque(index, state.qpos[scene.joint_qpos], state.qvel[scene.joint_dof])
+        return substep(lambda *_: tau, state)
+
+    state, forces = jax.lax.scan(run, state, jnp.arange(scene.config.substeps))
+    return StepResult(state, forces[-1])
 
 
 class _Unknown(Exception):
@@ -142,28 +151,25 @@ class Law:
 
     def __init__(self, text: bytes):
         stored = json.loads(text)
-        self._steps, self._results = stored["steps"], stored["results"]
-        self.outputs = len(self._results)
+        self._steps, (self._result,) = stored["steps"], stored["results"]
         self._literals = {number: np.asarray(value, dtype) for number, value, dtype in stored["literals"]}
 
     def __call__(
-        self, constants: list[np.ndarray], substep: int, position: np.ndarray, velocity: np.ndarray, memory: list
-    ) -> tuple[np.ndarray, list[np.ndarray]]:
-        """Torque [B, J] Nm and the memory's leaves after it."""
-        given = [*constants, np.asarray(substep, np.int32), position, velocity, *memory]
-        values = dict(enumerate(given)) | self._literals
+        self, constants: list[np.ndarray], substep: int, position: np.ndarray, velocity: np.ndarray
+    ) -> np.ndarray:
+        """Torque [B, J] Nm."""
+        values = dict(enumerate([*constants, np.asarray(substep, np.int32), position, velocity])) | self._literals
         for kind, operands, number, parameter in self._steps:
-            found = [values[operand] for operand in operands]
+            given = [values[operand] for operand in operands]
             if kind == "broadcast_in_dim":
-                values[number] = _broadcast(found[0], *parameter)
+                values[number] = _broadcast(given[0], *parameter)
             elif kind == "convert_element_type":
-                values[number] = found[0].astype(parameter)
+                values[number] = given[0].astype(parameter)
             elif kind == "reshape":
-                values[number] = found[0].reshape(found[0].shape[:1] + tuple(parameter))
+                values[number] = given[0].reshape(given[0].shape[:1] + tuple(parameter))
             else:
-                values[number] = _ELEMENTWISE[kind](*_aligned(found))
-        torque, *after = (values[number] for number in self._results)
-        return torque, after
+                values[number] = _ELEMENTWISE[kind](*_aligned(given))
+        return values[self._result]
 
 
 @functools.lru_cache(maxsize=64)

@@ -17,11 +17,10 @@ from dexsim.control import closing
 from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import pytree_dataclass
 from dexsim.env.state import Start
-from dexsim.env.task import GroundTruth
+from dexsim.env.task import GroundTruth, Task
 from dexsim.force_loop import commanded_force, target_force
 from dexsim.geometry.vectors import length
 from dexsim.hand.kinematics import Hand, flexion_joints
-from dexsim.objects import params
 from dexsim.objects.config import KINDS
 from dexsim.objects.params import ObjectParams
 from dexsim.tasks.grasp.config import GraspConfig, GraspReward
@@ -82,7 +81,7 @@ def posture_distance(joints: jax.Array, centre: jax.Array) -> jax.Array:
     return jnp.sqrt(jnp.sum((joints - centre) ** 2) + 1e-12)
 
 
-class Grasp:
+class Grasp(Task):
     """The rules of the task, for `dexsim.env.env.Env`."""
 
     name = "grasp"
@@ -91,6 +90,8 @@ class Grasp:
     gravity = (9.81, 0.0, 0.0)  # upside down: the palm's normal points to the ground
     shape_names = KINDS
     """What `ObjectParams.shape_index` counts."""
+
+    config: GraspConfig
 
     def __init__(self, config: GraspConfig, hand: Hand):
         if not hand.grasp_centre or not (config.posture or hand.grasp_posture):
@@ -102,6 +103,7 @@ class Grasp:
             )
         x, y, z = hand.grasp_centre
         self.config, self.hand, self.reference = config, hand, (x, y, z)
+        self.posture, self.finger_force = config.posture, config.finger_force
         self.slots, self.largest = config.objects.slots, config.objects.largest
         self.object_ranges = tuple(f"objects.{name}" for name in config.objects.ranges)
         self._roots, self._closing = hand.root_joint, closing(hand)
@@ -121,14 +123,6 @@ class Grasp:
         """Names, of `shape_names`, of what the pool has."""
         return self.config.objects.kinds
 
-    def sample_object(self, key: jax.Array, config: GraspConfig, shape_index: jax.Array | None = None) -> ObjectParams:
-        """One object of `config`, of a random or the given kind (index into SHAPES)."""
-        return params.sample_object(key, config.objects, shape_index)
-
-    def unit_inertia(self, object: ObjectParams) -> jax.Array:
-        """Inertia [3] m^2 of the object as a uniform solid of 1 kg."""
-        return params.unit_inertia(object, self.config.objects)
-
     def begin(self, key: jax.Array, start: Start) -> GraspGoal:
         del start
         return GraspGoal(jax.random.uniform(key), jnp.zeros((), bool))
@@ -140,7 +134,6 @@ class Grasp:
         return dataclasses.replace(goal, command=jnp.where(change, jax.random.uniform(what), goal.command))
 
     def goal_readings(self, goal: GraspGoal) -> tuple[jax.Array, jax.Array]:
-        """Command and goal orientation, as `Readings` carry them."""
         return goal.command, jnp.array([1.0, 0.0, 0.0, 0.0])
 
     def target_force(self, goal: GraspGoal) -> jax.Array:

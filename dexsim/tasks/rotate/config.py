@@ -3,8 +3,6 @@
 import dataclasses
 import math
 
-import numpy as np
-
 from dexsim.control import Control
 from dexsim.core.config import check_ranges, setting, validate
 from dexsim.core.errors import ConfigError
@@ -70,25 +68,15 @@ class RotateConfig(EnvConfig):
     )
     """Mass, inertia, centre of mass, friction and contact of the object; its sizes are `edge`. Links have less friction
     than fingertips: with more, random strokes carry the object over the thumb."""
-    control: Control = setting(Control(step=0.08, recall="target"))
+    control: Control = setting(Control(step=0.08, last_action_encoding="target"))
     """From action to joint target."""
     object: str = setting("cube", choices=(*KINDS, "mesh"))
     """Object to rotate: a cube, an upright cylinder, an eight-cornered union of two boxes (octagon), or the mesh of
     `objects.mesh`."""
     edge: tuple[float, float] = setting((0.050, 0.060), unit="m", low=0.02, high=0.12)
     """Range of the edge of the cube; of width and height for the other objects."""
-    axis: tuple[float, float, float] = setting((1.0, 0.0, 0.0), unit="1", low=-1.0, high=1.0)
-    """Axis of rotation in the palm frame; (1, 0, 0) is the palm's normal."""
-    direction: int = setting(1, unit="1", low=-1, high=1)
-    """Direction of rotation about the axis, +1 or -1."""
-    goal_step: float = setting(math.pi / 2, unit="rad", low=0.1, high=math.pi)
-    """Angle between two goals."""
-    goal_angle: float = setting(0.3, unit="rad", low=0.01, high=1.5)
-    """Largest angle to a goal at which it is reached."""
-    goal_distance: float = setting(0.05, unit="m", low=0.001, high=0.5)
-    """Largest distance from the reference at which a goal is reached."""
-    goal_spin: float = setting(2.0, unit="rad/s", low=0.0, high=1000.0)
-    """Largest spin about the axis at which a goal is reached; 0 for any."""
+    turn: TurnSpec = setting(TurnSpec(spin=2.0))
+    """Goals that follow one another about an axis, and when each is reached."""
     support: str = setting("palm", choices=("palm", "fingers"))
     """palm: the palm carries the object; fingers: they hold it clear of the palm, and touching the palm is a drop."""
     tilt: float = setting(-0.2, unit="rad", low=-1.2, high=1.2)
@@ -139,49 +127,29 @@ class RotateConfig(EnvConfig):
     settle_seconds: float = setting(0.8, unit="s", low=0.05, high=10.0)
     """Time for start states to come to rest; states that do not are discarded."""
     reward: RotateReward = setting(RotateReward(gate=0.04))
-    """Reward weights. The gate closes before `goal_distance`."""
+    """Reward weights. The gate closes before `turn.distance`."""
 
     def __post_init__(self):
         validate(self)
         check_ranges(self, "edge", "curl", "squeeze")
-        if self.direction == 0:
-            raise ConfigError("RotateConfig.direction = 0: must be +1 or -1")
         if len(self.reference) not in (0, 3):
             raise ConfigError(f"RotateConfig.reference = {self.reference}: expected 3 numbers")
-        if np.linalg.norm(self.axis) < 1e-6:
-            raise ConfigError("RotateConfig.axis is (0, 0, 0): give a direction")
         if (self.object == "mesh") != bool(self.objects.mesh):
             raise ConfigError(
                 f"RotateConfig.object = {self.object!r} with ObjectConfig.mesh = {self.objects.mesh!r}: "
                 "a mesh needs object 'mesh' and the name of its file"
             )
 
-    @property
-    def unit_axis(self) -> np.ndarray:
-        """The axis of rotation [3], of length one."""
-        return self.turn.unit_axis
-
-    @property
-    def turn(self) -> TurnSpec:
-        """The goals, as a host follows them."""
-        return TurnSpec(
-            axis=self.axis,
-            step=self.direction * self.goal_step,
-            angle=self.goal_angle,
-            distance=self.goal_distance,
-            spin=self.goal_spin,
-        )
-
 
 def paper() -> RotateConfig:
     """The paper's own weights and success test."""
     return RotateConfig(
-        goal_spin=0.0,
+        turn=TurnSpec(),
         drop_distance=0.09,
         drop_tilt=math.pi,
         patience=1e6,
         drop_radius=1.0,
-        control=Control(step=0.3, recall="target"),
+        control=Control(step=0.3, last_action_encoding="target"),
         episode_seconds=60.0,
         reward=RotateReward(
             goal=1.0, action=-0.0002, velocity=0.0, torque=0.0, spin=0.0, bonus_tips=0.0, bonus_speed=1e6, drop=0.0
@@ -203,7 +171,7 @@ def clear_of_palm() -> RotateConfig:
         tilt=-1.1,
         roll=0.0,
         drop_radius=1.0,
-        axis=(0.6, 0.0, -0.8),
+        turn=TurnSpec(axis=(0.6, 0.0, -0.8), spin=2.0),
         reference=(0.072, 0.005, 0.098),
         squeeze=(0.0, 0.2),
         posture=(1.2, 0.3, 0.3, 0.0, 0.8, 0.6, 0.8, 0.6, 0.8, 0.6, 0.8, 0.6),

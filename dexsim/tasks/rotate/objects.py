@@ -47,7 +47,7 @@ def sample_turned_object(key: jax.Array, config: Any) -> ObjectParams:
     extreme = sample_extreme(base_key, config.objects.extremes)  # the one that `sample_object` draws
     half = uniform(edge_key, (shortest, longest), extreme) / 2
     scale = base.mass * uniform(scale_key, config.objects.narrowed().inertia_scale, extreme)
-    stand = upright(config.unit_axis)
+    stand = upright(config.turn.unit_axis)
     turns = {
         "cube": None if stand is None else [stand],
         "cylinder": [_UPRIGHT],

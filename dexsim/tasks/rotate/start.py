@@ -70,9 +70,7 @@ def _fingerprint(key: jax.Array, hand: Hand, config: Any) -> str:
         "control",
         "touch",
         "randomization",
-        "goal_step",
-        "goal_angle",
-        "goal_spin",
+        "turn",
         "episode_seconds",
         "evaluation_seconds",
         "push_probability",
@@ -80,7 +78,8 @@ def _fingerprint(key: jax.Array, hand: Hand, config: Any) -> str:
     ):
         settings.pop(name, None)
     motors = config.randomization.stiffness, config.randomization.damping  # objects settle under these
-    digest = hashlib.sha256(json.dumps([settings, motors], sort_keys=True).encode())
+    turn = config.turn.axis, config.turn.distance
+    digest = hashlib.sha256(json.dumps([settings, motors, turn], sort_keys=True).encode())
     digest.update(hand.model_path.read_bytes() + hand.digest.encode())
     digest.update(np.asarray(jax.random.key_data(key)).tobytes())
     digest.update(f"{_VERSION} {mujoco.__version__}".encode())
@@ -166,7 +165,7 @@ def _candidate(key: jax.Array, object: ObjectParams, hand: Hand, config: Any) ->
     curl = jax.random.uniform(keys[3], minval=config.curl[0], maxval=config.curl[1])
     joints = jnp.clip(jnp.asarray(config.posture) + noise + curl * flexion, hand.joint_lower, hand.joint_upper)
     heading = config.heading_noise * jax.random.uniform(keys[1], minval=-1.0)
-    quat = rotations.axis_angle_to_quat(jnp.asarray(config.unit_axis), heading)
+    quat = rotations.axis_angle_to_quat(jnp.asarray(config.turn.unit_axis), heading)
     shift = config.place_noise * jax.random.uniform(keys[2], (2,), minval=-1.0)
     place = jnp.asarray(config.reference).at[1:].add(jnp.asarray(config.start_offset) + shift)
     if config.support == "palm":
@@ -240,9 +239,9 @@ def _stays(model: mujoco.MjModel, config: Any, data: mujoco.MjData) -> bool:
     place = data.qpos[free.qposadr[0] :][:7]
     motion = data.qvel[free.dofadr[0] :][:6]
     turned = np.empty(3)
-    mujoco.mju_rotVecQuat(turned, config.unit_axis, place[3:])
-    tilt = np.arccos(np.clip(turned @ config.unit_axis, -1.0, 1.0))
-    near = np.linalg.norm(place[:3] - config.reference) < 0.6 * config.goal_distance
+    mujoco.mju_rotVecQuat(turned, config.turn.unit_axis, place[3:])
+    tilt = np.arccos(np.clip(turned @ config.turn.unit_axis, -1.0, 1.0))
+    near = np.linalg.norm(place[:3] - config.reference) < 0.6 * config.turn.distance
     rest = (np.linalg.norm(motion[:3]) < _AT_REST[0]) & (np.linalg.norm(motion[3:]) < _AT_REST[1])
     sound = np.all(np.isfinite(data.qpos)) and not np.any(data.warning.number)
     return bool(near and rest and sound and tilt < _LEVEL)

@@ -17,7 +17,7 @@ from dexsim import observation
 from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import pytree_dataclass
 from dexsim.env.state import Start
-from dexsim.env.task import GroundTruth
+from dexsim.env.task import GroundTruth, Task
 from dexsim.geometry import rotations
 from dexsim.geometry.vectors import length
 from dexsim.hand.kinematics import Hand
@@ -84,12 +84,14 @@ def tips_at_work(duty: jax.Array, count: int, enough: float) -> jax.Array:
     return jnp.minimum(jnp.sort(duty)[::-1][:count] / enough, 1.0)[-1]
 
 
-class Rotate:
+class Rotate(Task):
     """The rules of the task, for `dexsim.env.env.Env`."""
 
     name = "rotate"
     fields = {"actor": observation.ROTATE, "critic": observation.ROTATE_CRITIC}
     evaluation = "totals"
+
+    config: RotateConfig
 
     def __init__(self, config: RotateConfig, hand: Hand):
         posture, reference = config.posture or hand.rotate_posture, config.reference or hand.rotate_reference
@@ -100,7 +102,7 @@ class Rotate:
             raise ConfigError(
                 f"RotateConfig.posture has {len(config.posture)} angles, the hand {hand.num_joints} joints"
             )
-        self.config, self.hand = config, hand
+        self.config, self.hand, self.posture, self.turn = config, hand, posture, config.turn
         self.slots, self.largest = slots(config), largest_size(config)
         drawn = ("edge", *(f"objects.{name}" for name in BULK_RANGES))
         self.object_ranges = tuple(f"objects.{name}" for name in MESH_RANGES) if config.object == "mesh" else drawn
@@ -109,8 +111,8 @@ class Rotate:
         self.gravity = (-level * math.cos(config.tilt), 9.81 * math.sin(config.roll), -level * math.sin(config.tilt))
         (x, y, z), self._palm = reference, palm_height(hand)
         self.reference = (x, y, z)
-        self._axis = jnp.asarray(config.unit_axis)
-        self._step = config.direction * config.goal_step
+        self._axis = jnp.asarray(config.turn.unit_axis)
+        self._step, self._sense = config.turn.step, math.copysign(1.0, config.turn.step)
         self._period = config.physics.control_period
         self.episode_ticks = max(round(config.episode_seconds / self._period), 1)
         self.evaluation_ticks = max(round(config.evaluation_seconds / self._period), 1)
@@ -149,12 +151,12 @@ class Rotate:
 
     def progress(self, goal: RotateGoal, truth: GroundTruth) -> Progress:
         """Where the object is with respect to the goal."""
-        config = self.config
+        turn = self.config.turn
         angle = rotations.quat_angle(self._quat(goal), truth.object_quat)
         distance = length(truth.object_position - jnp.asarray(self.reference))
-        spin = config.direction * jnp.sum(truth.object_spin * self._axis)
-        inside = (angle < config.goal_angle) & (distance < config.goal_distance)
-        calm = jnp.abs(spin) <= config.goal_spin if config.goal_spin > 0 else True
+        spin = self._sense * jnp.sum(truth.object_spin * self._axis)
+        inside = (angle < turn.angle) & (distance < turn.distance)
+        calm = jnp.abs(spin) <= turn.spin if turn.spin > 0 else True
         return Progress(angle, distance, spin, goal.entered | inside, inside & calm)
 
     def update(self, key: jax.Array, goal: RotateGoal, truth: GroundTruth) -> RotateGoal:
@@ -189,10 +191,8 @@ class Rotate:
         """Command (unused) and goal orientation, as `Readings` carry them."""
         return jnp.zeros(()), self._quat(goal)
 
-    def target_force(self, goal: RotateGoal) -> jax.Array:
-        """No force is asked for."""
-        del goal
-        return jnp.zeros(())
+    def turns(self, goal: RotateGoal) -> jax.Array:
+        return goal.turns
 
     def push(self, key: jax.Array, object: ObjectParams) -> jax.Array:
         """Force [3] N that changes the object's velocity by up to `push_speed` in one tick."""

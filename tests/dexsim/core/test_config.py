@@ -248,7 +248,6 @@ def test_override_replaces_fields_by_their_path():
         [
             "objects.extremes=0.5",
             'objects.shapes=["box"]',
-            "randomization.backlash=gear_play",
             "randomization.latency=[0, 0.01]",
             "episode_seconds=3",
         ],
@@ -259,7 +258,7 @@ def test_override_replaces_fields_by_their_path():
         GraspConfig(),
         episode_seconds=3.0,
         objects=dataclasses.replace(ObjectConfig(), extremes=0.5, shapes=("box",)),
-        randomization=dataclasses.replace(Randomization(), backlash="gear_play", latency=(0.0, 0.01)),
+        randomization=dataclasses.replace(Randomization(), latency=(0.0, 0.01)),
     )
     assert config == wanted
     # A field that the file does not have yet.

@@ -18,10 +18,11 @@ from dexsim.control import Control
 from dexsim.core.compilation import jit
 from dexsim.core.errors import ConfigError
 from dexsim.env.config import EnvConfig
+from dexsim.env.evaluation import evaluation_of
 from dexsim.geometry import rotations
 from dexsim.hand.kinematics import forward_kinematics, taxel_positions
 from dexsim.objects.config import SHAPES, SLOTS, ObjectConfig
-from dexsim.physics.seam import PhysicsState
+from dexsim.physics.interface import PhysicsState
 from dexsim.randomization import Randomization
 from dexsim.sensing.config import Sensing
 from dexsim.sensing.taxels import TaxelSensor
@@ -172,7 +173,7 @@ class TestTick:
         )
 
         strong, close = 0, []
-        cover = c_scene.COVER + np.asarray(state.episode.hand.cover)
+        cover = c_scene.COVER + np.asarray(state.episode.hand.pad_thickness_delta)
         skin = np.asarray(skin_law(hand, config.skin)(state.physics.qpos, state.episode.object, cover))
         for world in range(WORLDS):
             target = c_scene.row(state.episode.object, world)
@@ -314,19 +315,20 @@ class TestEpisodes:
     def test_stagger(self, grasp_env, history):
         state = history[0][0]
         keys = jax.random.split(jax.random.key(5), WORLDS)
-        spread = jax.vmap(grasp_env.stagger)(state, keys)
+        spread = jax.vmap(grasp_env.randomize_episode_time)(state, keys)
         limit = grasp_env.task.episode_ticks
         assert len(np.unique(spread.tick)) >= 6
         assert np.all((spread.tick >= 0) & (spread.tick < limit))
         assert_same(dataclasses.replace(spread, tick=state.tick), state)
-        many = jax.vmap(lambda key: grasp_env.stagger(row(state, 0), key).tick)(
+        many = jax.vmap(lambda key: grasp_env.randomize_episode_time(row(state, 0), key).tick)(
             jax.random.split(jax.random.key(6), 4000)
         )
         assert np.histogram(many, 4, (0, limit))[0].min() > 850
 
     def test_evaluation_starts(self, grasp_env):
         """Commands and shapes as planned, never changing; starts from a pool that is not training's."""
-        starts = jit(grasp_env.evaluation_starts, once=True)(grasp_env.evaluation_plan(50, 0))
+        protocol = evaluation_of(grasp_env)
+        starts = jit(protocol.evaluation_starts, once=True)(protocol.evaluation_plan(50, 0))
         assert np.all(np.asarray(starts.goal.fixed))
         np.testing.assert_allclose(starts.goal.command, np.tile(np.float32(COMMANDS), 10))
         assert np.bincount(starts.episode.object.shape_index).tolist() == [10] * 5
@@ -379,7 +381,10 @@ class TestTrouble:
     @pytest.mark.parametrize(
         "make, message",
         [
-            (lambda: Control(recall="torque"), "Control.recall = 'torque': choose from action, target"),
+            (
+                lambda: Control(last_action_encoding="torque"),
+                "last_action_encoding = 'torque': choose from",
+            ),
             (lambda: Control(step=5.0), "Control.step = 5 rad: must be between 0.001 and 1 rad"),
             (lambda: Sensing(joint_noise=-1.0), "Sensing.joint_noise = -1 rad"),
             (lambda: EnvConfig(pool_size=0), "EnvConfig.pool_size|pool_size = 0"),
@@ -563,7 +568,7 @@ def skin_pairs(hand, env, states):
     pairs = []
     for state, count in states:
         usable = ~np.asarray(state.terminated) & (np.arange(WORLDS) < count)
-        felt = law(state.physics.qpos, state.episode.object, c_scene.COVER + state.episode.hand.cover)
+        felt = law(state.physics.qpos, state.episode.object, c_scene.COVER + state.episode.hand.pad_thickness_delta)
         pairs.append(np.stack([np.asarray(state.finger_force), np.asarray(felt)])[:, usable])
     return np.concatenate(pairs, 1)
 

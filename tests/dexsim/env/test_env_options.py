@@ -1,7 +1,6 @@
-"""What an environment does beyond its defaults: imperfect taxels, three axes of touch, gear play."""
+"""What an environment does beyond its defaults: imperfect taxels, added observations, scales."""
 
 import dataclasses
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +13,6 @@ import dexsim
 from dexsim import observation
 from dexsim.core.compilation import jit
 from dexsim.core.errors import ConfigError
-from dexsim.geometry import rotations
 from dexsim.hand.kinematics import forward_kinematics, taxel_normals
 from dexsim.objects.config import ObjectConfig
 from dexsim.observation import ObservationConfig
@@ -46,18 +44,6 @@ QUIET = Sensing(
 )
 
 
-GEARED = Randomization(
-    backlash="gear_play",
-    gear_gap=(0.01, 0.02),
-    encoder_bias=0.0,
-    sensing_latency=(0.0, 0.0),
-    torque_gain=(1.0, 1.0),
-    taxel_gain=(1.0, 1.0),
-    latency=(0.0, 0.0),
-    latency_spread=(0.0, 0.0),
-)
-
-
 @pytest.fixture(scope="module")
 def make():
     """An environment over simple physics, quiet and nominal but for what is asked for."""
@@ -84,9 +70,7 @@ def make():
 @pytest.fixture(scope="module")
 def busy(make):
     """All of it at once, compiled once: the environment, states from a reset and 40 ticks on, and a restart."""
-    env = make(
-        dataclasses.replace(QUIET, three_axis=True, taxel=dataclasses.replace(QUIET_TAXELS, gain=(0.5, 1.5))), GEARED
-    )
+    env = make(dataclasses.replace(QUIET, taxel=dataclasses.replace(QUIET_TAXELS, gain=(0.5, 1.5))), Randomization())
     history = [jit(lambda key: jax.vmap(env.reset)(jax.random.split(key, WORLDS)), once=True)(jax.random.key(0))]
     step, rng = jit(jax.vmap(env.step), once=True), np.random.default_rng(0)
     for _ in range(40):
@@ -213,99 +197,7 @@ class TestTaxels:
         assert counted.max() == pytest.approx(25.5)
 
 
-def touching(env, seed=0):
-    """A hand with a sphere pushed into the index fingertip, and forces on all fingers."""
-    state = env.reset(jax.random.key(seed))
-    joints = jnp.asarray(np.random.default_rng(seed).uniform(0.2, 0.9, 12), jnp.float32)
-    pose = forward_kinematics(env.hand, joints)
-    normal = taxel_normals(env.hand, pose)[1, 66]
-    taxel = pose.body_position[env.hand.tip_body[1]] + rotations.rotate(
-        pose.tip_rotation[1], jnp.asarray(env.hand.taxel_position[1, 66])
-    )
-    place = taxel + normal * (state.episode.object.size[1, 0] + 0.001)  # inside the rubber over the taxels
-    physics = dataclasses.replace(state.physics, qpos=jnp.concatenate([joints, place, jnp.array([1.0, 0, 0, 0])]))
-    force = jnp.asarray(np.random.default_rng(seed).normal(0, 2, (5, 3)), jnp.float32) - 3 * normal
-    return state, physics, force
-
-
-class TestThreeAxes:
-    def test_off_by_default_and_then_not_there(self, make):
-        state = jax.eval_shape(make().reset, jax.random.key(0))
-        assert state.sensor_input.tangential_force is None
-        assert not any(name.startswith("tangential") for name in state.metrics)
-
-    @pytest.mark.parametrize("seed", range(3))
-    def test_what_presses_and_what_shears_make_up_the_solvers_force(self, make, seed):
-        env = make(dataclasses.replace(QUIET, three_axis=True))
-        state, physics, force = touching(env, seed)
-        truth = ground_truth(env, state.episode.object, physics, force)
-        felt = np.asarray(truth.touch.force.sum(-1)) > 0
-        assert felt[1] and not felt.all()
-        weights = np.asarray(truth.touch.force)[..., None] * np.asarray(taxel_normals(env.hand, truth.pose))
-        tangential = np.asarray(truth.tangential_force)
-        for finger in range(5):
-            if not felt[finger]:
-                assert np.all(tangential[finger] == 0)
-                continue
-            inward = -weights[finger].sum(0) / np.linalg.norm(weights[finger].sum(0))
-            assert abs(tangential[finger] @ inward) < 1e-4
-            np.testing.assert_allclose(
-                tangential[finger] + (np.asarray(force)[finger] @ inward) * inward, force[finger], atol=1e-4
-            )
-
-    @pytest.mark.parametrize(
-        "config, groups",
-        [
-            (ObservationConfig(add=("tangential_force",)), ("actor", "critic")),
-            (ObservationConfig(add_critic=("tangential_force", "joint_velocity")), ("critic",)),
-        ],
-    )
-    def test_it_is_observed_by_whom_the_configuration_says(self, make, hand, config, groups):
-        env = make(observation=config)
-        assert env.config.three_axis
-        for group in ("actor", "critic"):
-            fields = {field.name: field for field in env.observation_layout[group]}
-            assert ("tangential_force" in fields) == (group in groups)
-            assert ("joint_velocity" in fields) == ("joint_velocity" in config.add_critic and group == "critic")
-        state, physics, force = touching(env)
-        zero = jnp.zeros(12)
-        truth = ground_truth(env, state.episode.object, physics, force)
-        pressed = dataclasses.replace(
-            state.sensor_input, taxel_force=truth.touch.force, tangential_force=truth.tangential_force
-        )
-        before, goal = dataclasses.replace(state, sensor_input=pressed), env.task.goal_readings(state.goal)
-        readings, _ = env.senses.read(jax.random.key(0), state.episode, pressed, goal, zero, before)
-        np.testing.assert_allclose(readings.tangential_force, truth.tangential_force, atol=1e-5)
-        obs = env.observer.observe(readings, truth, *goal)
-        for group in groups:
-            at = 0
-            for field in env.observation_layout[group]:
-                if field.name == "tangential_force":
-                    assert field.size == 15 and field.scale
-                    np.testing.assert_allclose(obs[group][at : at + 15], truth.tangential_force.ravel(), atol=1e-5)
-                at += field.size
-            assert at == len(obs[group])
-
-    def test_thinly_spread_shear_is_lost_in_the_counts(self, make):
-        """0.1 N a count: 2 N of shear on one taxel is read, on a hundred taxels it is not."""
-        env = make(dataclasses.replace(QUIET, three_axis=True, taxel=TaxelSensor(noise=0.0, threshold=0.0)))
-        state = env.reset(jax.random.key(0))
-        tangential = jnp.zeros((5, 3)).at[:, 2].set(2.04)
-        for taxels, read in ((1, 2.0), (100, 0.0)):
-            force = jnp.zeros((5, 120)).at[:, :taxels].set(1.0)
-            pressed = dataclasses.replace(state.sensor_input, taxel_force=force, tangential_force=tangential)
-            before, goal = dataclasses.replace(state, sensor_input=pressed), env.task.goal_readings(state.goal)
-            readings, _ = env.senses.read(jax.random.key(0), state.episode, pressed, goal, jnp.zeros(12), before)
-            np.testing.assert_allclose(readings.tangential_force[:, 2], read, atol=1e-5)
-
-    @pytest.mark.slow
-    def test_in_state_and_metrics(self, busy):
-        _, (_, *_, after), _ = busy
-        assert after.sensor_input.tangential_force.shape == (WORLDS, 5, 3)
-        along = np.linalg.norm(after.sensor_input.tangential_force, axis=-1)
-        np.testing.assert_allclose(after.metrics["tangential_force"], along.sum(-1), rtol=1e-6)
-        np.testing.assert_allclose(np.stack([after.metrics[f"tangential/{i}"] for i in range(5)], 1), along, rtol=1e-6)
-
+class TestObservation:
     def test_an_actor_cannot_see_what_nothing_measures(self, make):
         with pytest.raises(ConfigError, match="ObservationConfig.add = 'object_spin': no sensor measures it"):
             make(observation=ObservationConfig(add=("object_spin",)))
@@ -314,63 +206,6 @@ class TestThreeAxes:
         config = ObservationConfig(leave_out=("contact_force",), add=("joint_torque", "last_action", "last_action"))
         names = [field.name for field in observation.layout(hand, observation.GRASP, config)]
         assert names == [*(n for n in observation.GRASP if n != "contact_force"), "last_action"]
-
-
-class TestGearPlay:
-    def test_off_by_default_and_then_not_there(self, make):
-        env = make()
-        state = jax.eval_shape(env.reset, jax.random.key(0))
-        assert state.gear is None and state.episode.hand.gear_gap is None and not env.motors.gear_play
-
-    def test_the_encoder_sits_on_the_rotor_and_the_link_lags_within_the_gap(self, busy):
-        _, (state, *history), begun = busy
-        gap = np.asarray(state.episode.hand.gear_gap)
-        assert np.all((gap >= 0.01) & (gap <= 0.02)) and np.ptp(gap) > 0.005
-        np.testing.assert_array_equal(state.episode.hand.actuator.dead_band, 0)
-        np.testing.assert_array_equal(state.gear.rotor.position, state.physics.qpos[:, :12])
-        apart = []
-        for state in history:
-            np.testing.assert_allclose(state.readings.joint_position, state.gear.rotor.position, atol=1e-6)
-            apart.append(np.asarray(state.gear.rotor.position - state.physics.qpos[:, :12]))
-        apart = np.abs(np.stack(apart))
-        assert np.all(apart <= gap / 2 + 0.04)  # the tooth gives, and more so to a coarse step
-        assert np.mean(apart > 0.8 * gap / 2) > 0.3, "the gaps are hardly ever crossed"
-        np.testing.assert_array_equal(begun.gear.rotor.position[::2], begun.physics.qpos[::2, :12])
-        np.testing.assert_array_equal(begun.gear.rotor.position[1::2], state.gear.rotor.position[1::2])
-        drawn = np.asarray(begun.episode.hand.gear_gap)
-        assert np.any(drawn[::2] != gap[::2]) and np.all(drawn[1::2] == gap[1::2])
-
-    def test_motors_are_told_the_angle_of_the_encoder(self, busy):
-        """Targets stay within reach of what the encoder reads."""
-        env, history, _ = busy
-        for before, after in zip(history, history[1:], strict=False):
-            wanted = np.asarray(after.joint_target - before.gear.rotor.position)
-            assert np.all(np.abs(wanted) <= env.config.control.reach + 1e-6)
-
-    def test_scale_zero_has_no_gap(self, make):
-        env = make(randomization=dataclasses.replace(GEARED, scale=0.0))
-        np.testing.assert_array_equal(env.reset(jax.random.key(0)).episode.hand.gear_gap, 0)
-
-    def test_the_rotor_takes_its_inertia_from_the_joint(self, hand):
-        from dexsim.env.motors import Motors, rotor_share
-        from dexsim.physics.model import build_model, build_scene
-
-        config = GraspConfig(randomization=GEARED)
-        scene = ("box",), np.full((1, 3), 0.02), config.physics, (0, 0, -9.81), "jax"
-        whole = build_model(hand, *scene)
-        built = build_scene(hand, *scene, rotor_share=rotor_share(config.randomization))
-        seam = SimpleNamespace(mj_model=built.model, joint_dof=built.joint_dof)
-        motors, dofs = Motors(config, hand, seam), seam.joint_dof
-        np.testing.assert_allclose(
-            motors._rotor_inertia + seam.mj_model.dof_armature[dofs], whole.dof_armature[dofs], rtol=1e-5
-        )
-        assert motors._steps >= 4
-        bare = SimpleNamespace(
-            dof_armature=0 * whole.dof_armature,
-            **{name: getattr(whole, name) for name in ("opt", "dof_M0", "dof_invweight0")},
-        )
-        with pytest.raises(ConfigError, match="needs an armature"):
-            Motors(config, hand, SimpleNamespace(mj_model=bare, joint_dof=dofs))
 
 
 @pytest.fixture(scope="module")
@@ -431,7 +266,7 @@ class TestScale:
 
     def test_restarts_draw_at_the_states_scale(self, drawn):
         env, states = drawn
-        state = jax.vmap(env.widen, (0, None))(states[1.0], jnp.float32(0.0))
+        state = jax.vmap(env.set_randomization_scale, (0, None))(states[1.0], jnp.float32(0.0))
         np.testing.assert_array_equal(state.episode.hand.encoder_bias, states[1.0].episode.hand.encoder_bias)
         begun = jit(jax.vmap(env.restart), once=True)(state, jnp.arange(64) < 32)
         assert np.all(np.asarray(begun.episode.hand.encoder_bias)[:32] == 0) and np.all(np.asarray(begun.scale) == 0)
@@ -459,29 +294,19 @@ def test_all_of_it_is_reached_from_the_command_line():
             "--env.sensing.taxel.rate",
             "8",
             "20",
-            "--env.sensing.three-axis",
-            "--env.observation.add",
-            "tangential_force",
             "--env.observation.add-critic",
             "object_spin",
-            "--env.randomization.backlash",
-            "gear_play",
-            "--env.randomization.gear-gap",
-            "0",
-            "0.03",
         ]
     )
     taxel = arguments.env.sensing.taxel
     assert (taxel.hysteresis, taxel.drift, taxel.gain) == ((0.1, 0.2), (0.0, 0.01), None)
-    assert taxel.crosstalk == (0.0, 0.1) and taxel.rate == (8.0, 20.0) and arguments.env.sensing.three_axis
-    assert arguments.env.observation.add == ("tangential_force",)
-    assert arguments.env.randomization.backlash == "gear_play"
-    assert arguments.env.randomization.gear_gap == (0.0, 0.03)
+    assert taxel.crosstalk == (0.0, 0.1) and taxel.rate == (8.0, 20.0)
+    assert arguments.env.observation.add_critic == ("object_spin",)
 
 
 @pytest.mark.slow
-def test_the_self_test_finds_every_range_of_gears_and_taxels(make):
-    env = make(Sensing(taxel=dataclasses.replace(POOR_TAXELS, rate=(8.0, 20.0), resolution=0.0)), GEARED)
+def test_the_self_test_finds_every_range_of_taxels(make):
+    env = make(Sensing(taxel=dataclasses.replace(POOR_TAXELS, rate=(8.0, 20.0), resolution=0.0)))
     states = jit(lambda key: jax.vmap(env.reset)(jax.random.split(key, WORLDS)), once=True)(jax.random.key(0))
     names = (
         "hysteresis",
@@ -499,38 +324,26 @@ def test_the_self_test_finds_every_range_of_gears_and_taxels(make):
         states,
         key=jax.random.key(1),
         ticks=10,
-        names=["Randomization.gear_gap", "Randomization.dead_band", *(f"TaxelSensor.{name}" for name in names)],
+        names=[f"TaxelSensor.{name}" for name in names],
     )
-    gap, band, *taxels = effects
-    assert gap.changed == ("gear_gap",) and gap.joint > 1e-4 and band.off
-    for name, effect in zip(names, taxels, strict=True):
+    for name, effect in zip(names, effects, strict=True):
         leaf = {"hysteresis_time": "memory", "dead": "alive"}.get(name, name)
         assert effect.changed == (leaf,) and effect.found and effect.which == "taxel_force" and effect.joint == 0
 
 
 @pytest.mark.slow
 def test_everything_at_once_on_the_real_physics():
-    """A hand that grips and shakes, then holds still, with play in its gears and poor taxels: sober numbers."""
-    config = GraspConfig(
-        pool_size=80,
-        sensing=Sensing(taxel=dataclasses.replace(POOR_TAXELS, rate=(10.0, 30.0)), three_axis=True),
-        observation=ObservationConfig(add=("tangential_force",)),
-        randomization=Randomization(backlash="gear_play"),
-    )
+    """A hand that grips and shakes, then holds still, with poor taxels: sober numbers."""
+    config = GraspConfig(pool_size=80, sensing=Sensing(taxel=dataclasses.replace(POOR_TAXELS, rate=(10.0, 30.0))))
     env = dexsim.make("grasp", config, backend="c", num_envs=8)
     state = jax.jit(lambda key: jax.vmap(env.reset)(jax.random.split(key, 8)))(jax.random.key(0))
     step, restart = jax.jit(jax.vmap(env.step)), jax.jit(jax.vmap(env.restart))
-    rng, gripped, sheared, beyond = np.random.default_rng(0), 0, 0, []
+    rng, gripped = np.random.default_rng(0), 0
     for tick in range(60):
         action = np.clip(rng.uniform(-1, 1, (8, 12)) + 0.6 * (np.arange(12) > 3), -1, 1) * (tick < 30)
         state = step(state, jnp.asarray(action, jnp.float32))
         assert not np.any(state.metrics["non_finite"])
-        apart = np.abs(np.asarray(state.gear.rotor.position - state.physics.qpos[:, :12]))
-        beyond.append(np.maximum(apart - np.asarray(state.episode.hand.gear_gap) / 2, 0))
         gripped += np.sum(np.asarray(state.finger_force) > 1)
-        sheared += np.sum(np.linalg.norm(state.sensor_input.tangential_force, axis=-1) > 0.3)
-        assert np.all(np.isfinite(state.obs["actor"])) and state.obs["actor"].shape == (8, 66 + 15)
+        assert np.all(np.isfinite(state.obs["actor"])) and state.obs["actor"].shape == (8, 66)
         state = restart(state, state.terminated | state.truncated)
-    assert gripped > 100 and sheared > 100
-    # Teeth give by torque over stiffness, up to 5 mrad; more only in impacts, which last shorter than a sub-step.
-    assert np.mean(beyond) < 3e-3 and np.max(beyond[40:]) < 8e-3 and np.max(beyond) < 0.1
+    assert gripped > 100

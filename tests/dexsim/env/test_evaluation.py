@@ -6,13 +6,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from episodes import reset_to
 from scipy import stats
 from simple_physics import SimplePhysics
 
 import dexsim
 from dexsim.core.compilation import jit
 from dexsim.core.pytree import pytree_dataclass
-from dexsim.env.evaluation import make_plan
+from dexsim.env.evaluation import evaluation_of, make_plan
 from dexsim.env.state import Start
 from dexsim.objects.config import BULK_RANGES, ObjectConfig
 from dexsim.objects.params import damping_ratio, redraw_bulk, unit_inertia
@@ -34,7 +35,7 @@ def env():
 @pytest.fixture(scope="module")
 def drawn(env):
     """The objects of `MANY` episodes from each row of the pool: leaves [8, MANY, ...]."""
-    reset = jit(jax.vmap(jax.vmap(lambda key, row: env.reset_to(key, row).episode.object, (0, None))), once=True)
+    reset = jit(jax.vmap(jax.vmap(lambda key, row: reset_to(env)(key, row).episode.object, (0, None))), once=True)
     return reset(jax.random.split(jax.random.key(5), (8, MANY)), jnp.arange(8))
 
 
@@ -165,9 +166,10 @@ class TestPlan:
     @pytest.mark.slow
     def test_a_slice_of_a_plan_gives_its_episodes(self, env):
         """Of the real task: more episodes than its pool has rows, all from starts of their own."""
-        plan = env.evaluation_plan(12, 0)
+        protocol = evaluation_of(env)
+        plan = protocol.evaluation_plan(12, 0)
         assert len(rows_of(plan.start.qpos) - rows_of(env.pool.qpos)) == 12
-        starts = jit(env.evaluation_starts, once=True)
+        starts = jit(protocol.evaluation_starts, once=True)
         first, second = (starts(jax.tree.map(lambda leaf, i=i: leaf[i : i + 4], plan)) for i in (2, 4))
         np.testing.assert_array_equal(first.physics.qpos, plan.start.qpos[2:6])
         np.testing.assert_array_equal(first.episode.object.size, plan.start.object.size[2:6])

@@ -9,10 +9,10 @@ from episodes import ground_truth
 from simple_physics import SimplePhysics
 
 import dexsim
-from dexsim.env.motors import stay_finite
 from dexsim.objects.config import ObjectConfig
 from dexsim.observation import ObservationConfig, Readings
-from dexsim.physics.seam import PhysicsState
+from dexsim.physics.interface import PhysicsState, StepResult
+from dexsim.physics.physics import revert_if_diverged
 from dexsim.tasks.grasp.config import GraspConfig
 
 MOMENT = 1e-6  # s
@@ -42,7 +42,7 @@ def seen(env):
 
     def look(physics):
         truth = ground_truth(env, object, physics, jnp.zeros((5, 3)))
-        critic = env.observer.observe(readings, truth, jnp.float32(0.5), upright)["critic"]
+        critic = env.observer.observe(readings, truth, (jnp.float32(0.5), upright))["critic"]
         return (truth.object_velocity, truth.object_spin), critic
 
     return jax.jit(look)
@@ -99,7 +99,7 @@ def test_a_world_too_fast_in_either_direction_stays_as_it_was(speed, sound):
     before, after = (PhysicsState(jnp.full(19, x), jnp.zeros(18), jnp.zeros(18)) for x in (1.0, 2.0))
     after = PhysicsState(after.qpos, after.qvel.at[7].set(speed), after.warmstart)
     valid = jnp.ones((), bool)
-    physics, _, force, finite = stay_finite(valid, (before, None), (after, None), jnp.ones((5, 3)))
+    (physics, force), finite = revert_if_diverged(StepResult(after, jnp.ones((5, 3))), before, valid)
     assert bool(finite) == sound
     np.testing.assert_array_equal(physics.qpos, 2.0 if sound else 1.0)
     np.testing.assert_array_equal(force, 1.0 if sound else 0.0)

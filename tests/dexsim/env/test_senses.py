@@ -39,7 +39,7 @@ def read(hand):
         )
         imu = ImuParams(**{f.name: zero for f in dataclasses.fields(ImuParams)})
         imu = dataclasses.replace(imu, bias=jnp.zeros(3))
-        episode = SimpleNamespace(hand=errors, imu=imu, taxels=suite.sample_taxels(jax.random.key(0), 0.0))
+        episode = SimpleNamespace(hand=errors, imu=imu, taxels=suite.taxels.sample(jax.random.key(0), 0.0))
         return suite.read(jax.random.key(key), episode, now, GOAL, jnp.full(12, 0.5), last)[0]
 
     return run
@@ -52,7 +52,6 @@ def seen(hand, joint, torque, place):
         taxel_force=jnp.zeros(hand.taxel_area.shape),
         object_position=jnp.asarray(place, jnp.float32),
         object_quat=LEVEL,
-        tangential_force=None,
     )
 
 

@@ -14,8 +14,9 @@ from dexsim.core.compilation import jit
 from dexsim.core.config import setting
 from dexsim.core.pytree import pytree_dataclass
 from dexsim.env.config import EnvConfig
+from dexsim.env.evaluation import evaluation_of
 from dexsim.env.state import Start
-from dexsim.objects.params import sample_object, unit_inertia
+from dexsim.errors import ConfigError
 
 WORLDS = 4
 
@@ -39,8 +40,8 @@ class Goal:
     ticks: jax.Array  # [] so far
 
 
-class Balance:
-    """The rules: no base class, nothing of another task."""
+class Balance(dexsim.Task):
+    """The rules: nothing of another task."""
 
     name, evaluation, object_ranges = "balance", "series", ("objects.mass",)
     fields = {"actor": ("joint_position", "contact_force"), "critic": ("joint_position", "joint_velocity")}
@@ -58,23 +59,11 @@ class Balance:
         qpos = jnp.tile(rest, (len(keys), 1))
         return Start(qpos=qpos, qvel=jnp.zeros((len(keys), self.hand.num_joints + 6)), object=object)
 
-    def sample_object(self, key, config, shape_index=None):
-        return sample_object(key, config.objects, shape_index)
-
-    def unit_inertia(self, object):
-        return unit_inertia(object, self.config.objects)
-
     def begin(self, key, start):
         return Goal(jnp.zeros(()))
 
     def update(self, key, goal, truth):
         return Goal(goal.ticks + 1)
-
-    def goal_readings(self, goal):
-        return jnp.zeros(()), jnp.array([1.0, 0.0, 0.0, 0.0])
-
-    def push(self, key, object):
-        return jnp.zeros(3)
 
     def dropped(self, goal, truth):
         return self._distance(truth) > self.config.reach
@@ -82,9 +71,6 @@ class Balance:
     def reward(self, goal, truth, dropped):
         distance = self._distance(truth)
         return jnp.where(dropped, -1.0, 1.0 - distance), {"distance": distance, "ticks": goal.ticks}
-
-    def target_force(self, goal):
-        return jnp.zeros(())
 
     def evaluation_plan(self, count, shape_index):
         return np.arange(count) % len(shape_index), Goal(jnp.zeros(count))
@@ -122,9 +108,10 @@ def test_it_runs_from_reset_to_restart(env):
 
 
 def test_it_is_evaluated_by_its_own_plan_and_report(env):
-    starts = jit(env.evaluation_starts, once=True)(env.evaluation_plan(8, 0))
+    protocol = evaluation_of(env)
+    starts = jit(protocol.evaluation_starts, once=True)(protocol.evaluation_plan(8, 0))
     assert starts.reward.shape == (8,)
-    report = env.summarize({}, np.array([[True, True], [True, False]]))
+    report = protocol.summarize({}, np.array([[True, True], [True, False]]))
     assert report["headline"] == {"held": 0.5}
     assert env.spec.name == "balance" and env.spec.fields == Balance.fields["actor"]
 
@@ -144,19 +131,13 @@ def test_a_reward_may_be_any_number(env, monkeypatch, reward):
 @pytest.mark.parametrize(
     "method, gives, message",
     [
-        ("reward", None, "reward gives NoneType where the reward and a dict of metrics are wanted"),
-        ("reward", (0.0, 0.0), "reward gives tuple where"),
-        ("reward", (jnp.zeros(2), {}), r"reward has the shape \(2,\), not \(\)"),
-        ("reward", (None, {}), "reward is a NoneType, not a number"),
-        ("reward", (0.0, {"far": jnp.zeros(3)}), r"reward: metric 'far' has the shape \(3,\)"),
-        ("dropped", jnp.zeros(()), "dropped is float32, not bool"),
-        ("dropped", jnp.zeros(4, bool), r"dropped has the shape \(4,\), not \(\)"),
-        ("update", Goal(jnp.zeros(2)), r"update makes goal.ticks float32\[2\], which was float32\[\]"),
-        ("update", Goal(jnp.int32(0)), r"update makes goal.ticks int32\[\], which was float32\[\]"),
-        ("update", (), "update gives a goal of another structure than before"),
+        ("reward", None, r"reward must return \(reward, metrics\); got NoneType"),
+        ("reward", (0.0, 0.0), r"reward must return \(reward, metrics\); got tuple"),
+        ("reward", (jnp.zeros(2), {}), r"reward must be a scalar; got shape \(2,\)"),
+        ("reward", (0.0, {"far": jnp.zeros(3)}), r"far must be a scalar; got shape \(3,\)"),
     ],
 )
 def test_rules_that_give_something_else_are_one_line(env, monkeypatch, method, gives, message):
     monkeypatch.setattr(Balance, method, lambda *_: gives)
-    with pytest.raises(dexsim.ConfigError, match=f"^task 'balance': {message}"):
+    with pytest.raises(ConfigError, match=f"^task 'balance': {message}"):
         jax.eval_shape(lambda key: env.step(env.reset(key), jnp.zeros(env.action_size)), jax.random.key(0))

@@ -8,16 +8,14 @@ import mujoco
 import numpy as np
 import pytest
 
-from dexsim.core.errors import AssetError, ConfigError
-from dexsim.env.motors import Motors
+from dexsim.core.errors import AssetError
 from dexsim.hand.kinematics import flexion_joints, forward_kinematics, hinge_angles
 from dexsim.hand.load import load_hand
 from dexsim.physics.config import PhysicsConfig
+from dexsim.physics.interface import ContactParams, PhysicsState
 from dexsim.physics.model import build_scene
-from dexsim.physics.seam import ContactParams, PhysicsState
 from dexsim.physics.solver.substep import find_stepper
 from dexsim.physics.warp_backend import constraint_rows
-from dexsim.tasks.grasp.config import GraspConfig
 
 # References, an anchor beside the body's origin, and a ratio and an offset of their own.
 MJCF = """
@@ -185,16 +183,6 @@ def test_backends_leave_room_for_the_couplings(coupled, hand):
     assert scene.model.neq == 2
     assert find_stepper(mjx, scene.model, scene.tip_bodies, max_contacts=4) is None
     assert constraint_rows(PhysicsConfig(), coupled) - constraint_rows(PhysicsConfig(), hand) == 6 - 12
-
-
-def test_gear_play_is_refused(coupled):
-    from types import SimpleNamespace
-
-    scene = scene_of(coupled, "c")
-    config = GraspConfig()
-    config = dataclasses.replace(config, randomization=dataclasses.replace(config.randomization, backlash="gear_play"))
-    with pytest.raises(ConfigError, match="gear_play.*coupled"):
-        Motors(config, coupled, SimpleNamespace(mj_model=scene.model, joint_dof=scene.joint_dof))
 
 
 COUPLE_A = '<joint name="couple_a" joint1="a_next" joint2="a" polycoef="0.05 1.3 0 0 0"/>'

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
+from episodes import reset_to
 
 import dexsim
 from dexsim.core.compilation import jit
@@ -45,7 +46,7 @@ def gripped(objects):
     """An environment that feels by surface points, and batches of its states [WORLDS] while hands close."""
     config = GraspConfig(objects=objects, pool_size=16, skin=SKIN, touch_method="surface_points")
     env = dexsim.make("grasp", config, backend="c", num_envs=WORLDS)
-    reset, step, states = jit(jax.vmap(env.reset_to), once=True), jit(jax.vmap(env.step), once=True), []
+    reset, step, states = jit(jax.vmap(reset_to(env)), once=True), jit(jax.vmap(env.step), once=True), []
     # Pools hold one shape after the other: two of each at a time. One batch's means scatter by a half of themselves.
     for batch in range(4):
         rows = jnp.arange(WORLDS) * 2 + batch % 2
@@ -61,7 +62,7 @@ def closed_forms(env):
     """A function of a state alone: taxel forces [WORLDS, F, N] of the primitives, and the hand's pose."""
 
     def one(state):
-        physics, target, cover = state.physics, state.episode.object, state.episode.hand.cover
+        physics, target, cover = state.physics, state.episode.object, state.episode.hand.pad_thickness_delta
         place = physics.qpos[12:]
         pose = forward_kinematics(env.hand, physics.qpos[:12])
         turn = rotations.quat_to_matrix(place[3:] / jnp.linalg.norm(place[3:]))

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from episodes import tip_stiffness
 
 from dexsim.objects.config import INACTIVE_SIZE, SHAPES, SLOTS, ObjectConfig
 from dexsim.objects.params import damping_ratio
@@ -98,8 +99,10 @@ def test_a_ball_bounces_as_configured(restitution, mass):
 
 def test_only_fingertips_wear_rubber(hand):
     bare, clad = (
-        build_model(hand, SLOTS, np.full((3, 3), INACTIVE_SIZE), PhysicsConfig(cover=cover), (9.81, 0, 0), "jax")
-        for cover in (0.0, 0.003)
+        build_model(
+            hand, SLOTS, np.full((3, 3), INACTIVE_SIZE), PhysicsConfig(pad_thickness=thickness), (9.81, 0, 0), "jax"
+        )
+        for thickness in (0.0, 0.003)
     )
     tips = {bare.body(hand.body_names[b]).id for b in hand.tip_body}
     grown = clad.geom_size - bare.geom_size
@@ -144,19 +147,17 @@ def test_a_row_of_spheres_fills_its_capsule(hand):
 def test_springs_follow_the_skin(hand):
     """In squeezed hands every pair gets the spring that the second scene works out from C MuJoCo's own contacts."""
     law, rng = c_scene.skin_law(hand, Skin()), np.random.default_rng(4)
-    seam = Physics(
-        hand, SLOTS, ObjectConfig().largest, PhysicsConfig(), gravity=c_scene.GRAVITY, backend="jax", skin=Skin()
-    )
+    physics = Physics(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(), gravity=c_scene.GRAVITY, backend="jax")
     pool = Grasp(GraspConfig(pool_size=3 * len(SHAPES)), hand).make_pool(jax.random.key(3))
 
     @jax.jit
     def configure(target, qpos):
-        model = seam.configure(target, seam.tip_stiffness(target, qpos))
+        model = physics.configure(target, tip_stiffness(physics, Skin(), target, qpos))
         return model.pair_solref, model.pair_solimp
 
     first, second = (
-        [seam.mj_model.geom(g).name for g in side[seam.scene.object_pairs]]
-        for side in (seam.mj_model.pair_geom1, seam.mj_model.pair_geom2)
+        [physics.mj_model.geom(g).name for g in side[physics.scene.object_pairs]]
+        for side in (physics.mj_model.pair_geom1, physics.mj_model.pair_geom2)
     )
     changed = dict.fromkeys(SHAPES, 0)
     for index in range(3 * len(SHAPES)):
@@ -171,7 +172,7 @@ def test_springs_follow_the_skin(hand):
             (model.geom(a).name, model.geom(b).name): pair
             for pair, (a, b) in enumerate(zip(model.pair_geom1, model.pair_geom2, strict=True))
         }
-        for pair, link, other in zip(seam.scene.object_pairs, first, second, strict=True):
+        for pair, link, other in zip(physics.scene.object_pairs, first, second, strict=True):
             slot = int(other.removeprefix("object_"))
             if start.object.active[slot]:
                 at = there[link, c_scene.KINDS[slot]]

@@ -8,9 +8,9 @@ from c_scene import GRAVITY, row, rows_of, squeeze
 
 from dexsim.objects.config import SLOTS, ObjectConfig
 from dexsim.physics.config import PhysicsConfig
+from dexsim.physics.interface import PhysicsState
 from dexsim.physics.model import build_model
 from dexsim.physics.physics import Physics
-from dexsim.physics.seam import PhysicsState
 
 THICK, THIN = 0.003, 0.001
 
@@ -19,7 +19,9 @@ THICK, THIN = 0.003, 0.001
 def scenes(hand):
     """{thickness compiled in: scene} on C MuJoCo."""
     return {
-        cover: Physics(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(cover=cover), gravity=GRAVITY, backend="c")
+        cover: Physics(
+            hand, SLOTS, ObjectConfig().largest, PhysicsConfig(pad_thickness=cover), gravity=GRAVITY, backend="c"
+        )
         for cover in (THICK, THIN, 0.0)
     }
 
@@ -37,23 +39,23 @@ def test_a_thickness_drawn_is_a_thickness_compiled(scenes, grip, change, compile
     """Less than no rubber is no rubber."""
     object, state, torque = grip
     motors = lambda *_: jnp.asarray(torque)  # noqa: E731
-    drawn, force = scenes[THICK].advance(object, state, motors, jnp.zeros(3), change)
-    wanted, pressed = scenes[compiled].advance(object, state, motors, jnp.zeros(3))
+    drawn, force = scenes[THICK].advance(motors, object, state, jnp.zeros(3), pad_thickness_delta=change)
+    wanted, pressed = scenes[compiled].advance(motors, object, state, jnp.zeros(3))
     np.testing.assert_allclose(force, pressed, atol=2e-3)
     np.testing.assert_allclose(drawn.qpos, wanted.qpos, atol=1e-5)
-    plain = scenes[THICK].advance(object, state, motors, jnp.zeros(3))[1]
+    plain = scenes[THICK].advance(motors, object, state, jnp.zeros(3))[1]
     assert np.abs(plain - force).max() > 0.5, "the rubber makes no difference: the test tests nothing"
 
 
 def test_every_engine_is_given_the_same_sizes(hand, scenes, grip):
-    thick = build_model(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(cover=THICK), GRAVITY, "jax")
-    thin = build_model(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(cover=THIN), GRAVITY, "jax")
-    seam = Physics(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(), gravity=GRAVITY, backend="jax")
+    thick = build_model(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(pad_thickness=THICK), GRAVITY, "jax")
+    thin = build_model(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(pad_thickness=THIN), GRAVITY, "jax")
+    physics = Physics(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(), gravity=GRAVITY, backend="jax")
     names = [thick.geom(g).name for g in range(thick.ngeom)]
     tips = [g for g, name in enumerate(names) if "_pad" in name and name[-1].isdigit()]
     assert len(tips) == 6 * 3
-    for physics in (seam, scenes[THICK]):
-        given = physics.configure(grip[0], cover=THIN - THICK)
+    for scene in (physics, scenes[THICK]):
+        given = scene.configure(grip[0], pad_thickness_delta=THIN - THICK)
         size = np.asarray(given["geom_size"] if isinstance(given, dict) else given.geom_size)
         np.testing.assert_allclose(size[tips], thin.geom_size[tips], atol=1e-8)
         links = [thick.geom(name).id for name in ("index_link1", "palm_face", "thumb_link1")]
@@ -62,7 +64,7 @@ def test_every_engine_is_given_the_same_sizes(hand, scenes, grip):
 
 def test_thick_rubber_is_not_beyond_the_broad_phase(scenes, grip):
     """C MuJoCo and Warp leave out contacts of geoms whose bounding spheres are apart."""
-    model, given = scenes[THIN].mj_model, scenes[THIN].configure(grip[0], cover=THICK - THIN)
+    model, given = scenes[THIN].mj_model, scenes[THIN].configure(grip[0], pad_thickness_delta=THICK - THIN)
     size, around = np.asarray(given["geom_size"]), np.asarray(given["geom_rbound"])
     tips = [g for g in range(model.ngeom) if "_pad" in model.geom(g).name and model.geom(g).name[-1].isdigit()]
     assert len(tips) == 6 * 3 and np.all(size[tips, 0] > model.geom_size[tips, 0] + 1e-3)

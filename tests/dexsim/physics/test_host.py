@@ -19,12 +19,13 @@ from dexsim.objects.config import SLOTS, ObjectConfig
 from dexsim.objects.params import sample_object
 from dexsim.physics.config import PhysicsConfig
 from dexsim.physics.physics import Physics
-from dexsim.physics.seam import PhysicsState
+from dexsim.physics.interface import PhysicsState
 
 mode, count = sys.argv[1], int(sys.argv[2])
 hits = []
 jax.monitoring.register_event_listener(lambda name, **_: hits.append(name) if name.endswith("/cache_hits") else None)
-seam = Physics(dexsim.load_hand(), SLOTS, ObjectConfig().largest, PhysicsConfig(), gravity=(-9.81, 0, 0), backend="c")
+hand, largest = dexsim.load_hand(), ObjectConfig().largest
+physics = Physics(hand, SLOTS, largest, PhysicsConfig(), gravity=(-9.81, 0, 0), backend="c")
 target = jax.jit(lambda keys: jax.vmap(lambda key: sample_object(key, ObjectConfig()))(keys))(
     jax.random.split(jax.random.key(0), count)
 )
@@ -36,7 +37,7 @@ def hold(index, position, velocity):
 
 def ticks(state):
     def body(state, _):
-        after, force = jax.vmap(lambda t, s: seam.advance(t, s, hold, jnp.zeros(3)))(target, state)
+        after, force = jax.vmap(lambda t, s: physics.advance(hold, t, s, jnp.zeros(3)))(target, state)
         # Work for XLA's own threads between the calls.
         return after, jnp.sum(jnp.sin(jnp.ones((300, 300)) @ jnp.ones((300, 300)))) + jnp.sum(force)
     return jax.lax.scan(body, state, length=10)

@@ -1,7 +1,8 @@
-"""The physics seam on the JAX backend against C MuJoCo, and the guard against what it would drop."""
+"""Physics on the JAX backend against C MuJoCo, and the guard against what it would drop."""
 
 import dataclasses
 import shutil
+import types
 from types import SimpleNamespace
 from typing import NamedTuple
 
@@ -20,9 +21,9 @@ from dexsim.hand.load import load_hand
 from dexsim.objects.config import SHAPES, SLOTS, ObjectConfig
 from dexsim.physics.config import PhysicsConfig
 from dexsim.physics.guard import check_model
+from dexsim.physics.interface import PhysicsState
 from dexsim.physics.model import build_model
 from dexsim.physics.physics import Physics, choose_backend
-from dexsim.physics.seam import PhysicsState
 from dexsim.physics.warp_backend import constraint_rows
 
 WORLDS = 8
@@ -183,15 +184,15 @@ class TestAgainstC:
     def test_the_decoding_of_contact_forces(self, hand):
         """Rows of the solver to forces on fingers, on contacts that C MuJoCo solved."""
         config = PhysicsConfig(**CONVERGED)
-        seam = Physics(hand, SLOTS, ObjectConfig().largest, config, gravity=GRAVITY, backend="jax")
-        model, data = pressed_template(hand, seam.mj_model)
-        contacts = [c for c in data.contact if c.geom[1] in seam.scene.object_geoms]
+        physics = Physics(hand, SLOTS, ObjectConfig().largest, config, gravity=GRAVITY, backend="jax")
+        model, data = pressed_template(hand, physics.mj_model)
+        contacts = [c for c in data.contact if c.geom[1] in physics.scene.object_geoms]
         assert len(contacts) >= 4
         wanted = np.zeros((5, 3))
         tips = {model.body(hand.body_names[b]).id: f for f, b in enumerate(hand.tip_body)}
         for index, contact in enumerate(data.contact):
             finger = tips.get(int(model.geom_bodyid[contact.geom[0]]))
-            if finger is None or contact.geom[1] not in seam.scene.object_geoms:
+            if finger is None or contact.geom[1] not in physics.scene.object_geoms:
                 continue
             wrench = np.zeros(6)
             mujoco.mj_contactForce(model, data, index, wrench)
@@ -210,7 +211,7 @@ class TestAgainstC:
             }
             contact = SimpleNamespace(**column, geom=geom, frame=jnp.asarray(frame))
             impl = SimpleNamespace(contact=contact, efc_force=jnp.asarray(data.efc_force))
-            return np.asarray(seam.engine.finger_force(SimpleNamespace(_impl=impl)))
+            return np.asarray(physics.engine.finger_force(SimpleNamespace(_impl=impl)))
 
         np.testing.assert_allclose(decode(flip=False), wanted, atol=1e-4)
         np.testing.assert_allclose(decode(flip=True), wanted, atol=1e-4)
@@ -240,25 +241,30 @@ def pressed_template(hand, model):
 class TestConstruction:
     def test_backends(self, monkeypatch):
         assert choose_backend("jax") == "jax"
-        with pytest.raises(ConfigError, match="'cuda'.*auto, jax, warp"):
-            choose_backend("cuda")
+        with pytest.raises(ConfigError, match="'metal'.*auto, jax, cuda, warp, c"):
+            choose_backend("metal")
         monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
         assert choose_backend("auto") == choose_backend("c") == "c"
+        with pytest.raises(ConfigError, match=r"'cuda' needs an NVIDIA GPU.*pip install .*\[cuda\]"):
+            choose_backend("cuda")
         monkeypatch.setattr(jax, "default_backend", lambda: "tpu")
         assert choose_backend("auto") == "jax"
         monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
         monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-        assert choose_backend("auto") == "jax"
+        for runtime, chosen in (("rocm 60300", "jax"), ("cuda 13000", "cuda")):
+            device = types.SimpleNamespace(client=types.SimpleNamespace(platform_version=runtime))
+            monkeypatch.setattr(jax, "devices", lambda device=device: [device])
+            assert choose_backend("auto") == chosen
         with pytest.raises(ConfigError, match=r"needs the extra: pip install .*\[warp\]"):
             choose_backend("warp")
         monkeypatch.setattr("importlib.util.find_spec", lambda name: object())
-        assert choose_backend("auto") == choose_backend("warp") == "warp"
+        assert choose_backend("warp") == "warp"
         with pytest.raises(ConfigError, match="JAX_PLATFORMS=cpu"):
             choose_backend("c")
         monkeypatch.setattr(compilation, "_on_gpu", {})
         assert compilation.make_deterministic()
-        assert choose_backend("auto") == choose_backend("jax") == "jax"
-        with pytest.raises(ConfigError, match="'warp' does not repeat.*leave out --deterministic"):
+        assert choose_backend("auto") == choose_backend("cuda") == "cuda" and choose_backend("jax") == "jax"
+        with pytest.raises(ConfigError, match="'warp' does not repeat.*choose cuda, or leave out --deterministic"):
             choose_backend("warp")
 
     @pytest.mark.parametrize(

@@ -16,9 +16,9 @@ from scipy.spatial.transform import Rotation
 
 from dexsim.objects.config import SLOTS, ObjectConfig
 from dexsim.physics.config import PhysicsConfig
+from dexsim.physics.interface import PhysicsState
 from dexsim.physics.model import build_model, tip_bodies
 from dexsim.physics.physics import Physics
-from dexsim.physics.seam import PhysicsState
 from dexsim.physics.solver import collide, newton
 from dexsim.physics.solver.substep import _spring, find_stepper
 
@@ -323,7 +323,7 @@ def test_mjx_step_agrees(hand, grasp_env):
     )
     found = []
     for contacts in ("closed", "mjx"):
-        seam = Physics(
+        physics = Physics(
             hand,
             ("capsule",),
             ObjectConfig().largest[one : one + 1],
@@ -334,8 +334,8 @@ def test_mjx_step_agrees(hand, grasp_env):
         found.append(
             jax.jit(
                 jax.vmap(
-                    lambda target, state, torque, seam=seam: seam.advance(
-                        target, state, lambda *_: torque, jnp.zeros(3)
+                    lambda target, state, torque, physics=physics: physics.advance(
+                        lambda *_: torque, target, state, jnp.zeros(3)
                     )
                 )
             )(alone, PhysicsState(qpos, qvel, warmstart), torque)

@@ -16,8 +16,8 @@ from c_scene import CONVERGED, GRAVITY, row, rows_of, squeeze, stack
 import dexsim
 from dexsim.objects.config import SHAPES, SLOTS, ObjectConfig
 from dexsim.physics.config import PhysicsConfig
+from dexsim.physics.interface import PhysicsState
 from dexsim.physics.physics import Physics
-from dexsim.physics.seam import PhysicsState
 from dexsim.tasks.rotate.config import RotateConfig
 
 pytest.importorskip("warp")
@@ -27,11 +27,11 @@ WORLDS = 4
 
 
 def compile_advance(hand, config):
-    seam = Physics(hand, SLOTS, ObjectConfig().largest, config, gravity=GRAVITY, backend="warp", num_envs=WORLDS)
+    physics = Physics(hand, SLOTS, ObjectConfig().largest, config, gravity=GRAVITY, backend="warp", num_envs=WORLDS)
     return jax.jit(
         jax.vmap(
-            lambda target, state, torque: seam.advance(
-                target, state, lambda index, position, velocity: torque, jnp.zeros(3)
+            lambda target, state, torque: physics.advance(
+                lambda index, position, velocity: torque, target, state, jnp.zeros(3)
             )
         )
     )

@@ -232,20 +232,3 @@ def test_settings_survive_the_round_trip_and_bad_ones_are_refused():
     ):
         with pytest.raises(ConfigError, match=words):
             TaxelSensor(**fields)
-
-
-@pytest.mark.parametrize(
-    ("shear", "read"), [(12.64, 12.6), (12.66, 12.7), (20.0, 12.7), (-12.76, -12.8), (-20.0, -12.8)]
-)
-def test_shear_is_counted_in_a_signed_byte(shear, read):
-    """One taxel that bears all of a finger's load: -128 to 127 counts of 0.1 N."""
-    sensor = model(resolution=0.1)
-    force = np.zeros(SHAPE, np.float32)
-    force[2, 17] = 5.0
-    tangential = np.zeros((FINGERS, 3), np.float32)
-    tangential[2, 1] = shear
-    seen = np.asarray(
-        sensor.apply_tangential(sensor.sample(KEY), KEY, jnp.asarray(tangential), jnp.asarray(force), UNIT)
-    )
-    np.testing.assert_allclose(seen[2], [0, read, 0], atol=1e-5)
-    assert not seen[[0, 1, 3, 4]].any()

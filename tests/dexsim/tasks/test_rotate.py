@@ -18,6 +18,7 @@ from dexsim.env.task import GroundTruth
 from dexsim.geometry.sdf import signed_distance
 from dexsim.hand.kinematics import forward_kinematics, tip_twist
 from dexsim.sensing.imu import ImuConfig, measure_orientation, sample_imu
+from dexsim.task_spec import TurnSpec
 from dexsim.tasks.placement import palm_height
 from dexsim.tasks.rotate.config import RotateConfig, RotateReward, clear_of_palm, paper
 from dexsim.tasks.rotate.objects import KINDS, lowest_point, sample_turned_object, upright
@@ -93,7 +94,7 @@ class TestGoal:
 
     def test_the_mirrored_task_succeeds_on_the_mirrored_motion(self, hand):
         ahead = Rotate(RotateConfig(), hand)
-        back = Rotate(RotateConfig(direction=-1), hand)
+        back = Rotate(RotateConfig(turn=TurnSpec(step=-math.pi / 2, spin=2.0)), hand)
         for degrees in (-90, -60, 0, 75, 90):
             goal = ahead.begin(jax.random.key(0), None)
             one = ahead.progress(goal, truth(ahead, object_quat=turned(degrees), object_spin=[0.5, 0, 0]))
@@ -388,11 +389,11 @@ class TestPool:
 
     @pytest.mark.parametrize("axis", [(0.6, 0.0, -0.8), (0.0, 0.5, 0.0), (-1.0, 0.0, 0.0), (0.3, -0.5, 0.4)])
     def test_a_cube_stands_on_any_axis(self, axis):
-        quat = upright(RotateConfig(axis=axis).unit_axis)
+        quat = upright(TurnSpec(axis=axis).unit_axis)
         np.testing.assert_allclose(
             Rotation.from_quat(np.roll(quat, -1)).apply([1.0, 0, 0]), np.asarray(axis) / np.linalg.norm(axis), atol=1e-6
         )
-        assert upright(RotateConfig(axis=(0.5, 0.0, 0.0)).unit_axis) is None
+        assert upright(TurnSpec(axis=(0.5, 0.0, 0.0)).unit_axis) is None
 
     def test_another_object_is_another_pool(self, hand):
         key, config = jax.random.key(0), RotateConfig()
@@ -416,11 +417,10 @@ class TestPool:
             {"posture": (0.1,) * 12},
             {"reference": (0.06, 0.0, 0.09)},
             {"posture_noise": 0.2},
-            {"axis": (0.0, 1.0, 0.0)},
-            {"direction": -1},
+            {"turn": TurnSpec(axis=(0.0, 1.0, 0.0))},
             {"roll": 0.0},
             {"drop_distance": 0.05},
-            {"goal_distance": 0.02},
+            {"turn": TurnSpec(distance=0.02)},
             {"clearance": 0.002},
             {"curl": (0.0, 0.1)},
             {"squeeze": (0.0, 0.1)},

@@ -6,18 +6,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from episodes import ground_truth
+from episodes import ground_truth, tip_stiffness
 from scipy.spatial.transform import Rotation
 
 import dexsim
 from dexsim.core.config import override, to_dict
+from dexsim.env.fingerprint import fingerprint
 from dexsim.geometry import sdf
 from dexsim.hand.kinematics import forward_kinematics
 from dexsim.objects.config import SLOTS, ObjectConfig
 from dexsim.objects.params import ObjectParams
 from dexsim.physics.config import PhysicsConfig
 from dexsim.physics.physics import Physics
-from dexsim.sensing.config import Sensing
 from dexsim.tasks.grasp.config import GraspConfig
 from dexsim.touch.feel import feel_links
 from dexsim.touch.skin import Skin, skin_stress
@@ -105,10 +105,8 @@ def test_the_points_press_like_the_skin(hand):
 def stiffness(hand):
     """How stiff the index finger is, of nominal, where a face parallel to its pad's axis dents it by `depth` m."""
     skin = Skin(untaxelled=True, law="linear")
-    seam = Physics(
-        hand, SLOTS, ObjectConfig().largest, PhysicsConfig(), gravity=(9.81, 0.0, 0.0), backend="c", skin=skin
-    )
-    follow, side = jax.jit(seam.tip_stiffness), 0.05
+    physics = Physics(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(), gravity=(9.81, 0.0, 0.0), backend="c")
+    follow, side = jax.jit(lambda object, qpos: tip_stiffness(physics, skin, object, qpos)), 0.05
     box = ObjectParams(
         shape_index=jnp.int32(1),
         size=jnp.zeros((3, 3)).at[0].set(side),
@@ -214,12 +212,11 @@ def environments():
     plain = GraspConfig(
         pool_size=64,
         objects=ObjectConfig(shapes=("sphere",)),
-        sensing=Sensing(three_axis=True),
         skin=Skin(total="solver"),
     )
     bare = dataclasses.replace(plain, skin=dataclasses.replace(plain.skin, untaxelled=True))
     first, second = (dexsim.make("grasp", config, backend="jax") for config in (plain, bare))
-    assert first.fingerprint() != second.fingerprint()
+    assert fingerprint(first) != fingerprint(second)
     return first, second, first.reset(jax.random.key(0))
 
 
@@ -253,13 +250,11 @@ def test_an_environment_reads_no_more_than_without(environments, hand):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("angle, least, most", [(0.0, 0.99, 1.0), (2.1, 0.05, 0.9), (2.9, 0.0, 0.0)])
-def test_what_rests_on_taxels_drags_along_them(environments, hand, angle, least, most):
-    """As much of the tangential force as of the load: all of it, a part, nothing."""
+def test_taxels_read_their_share_of_the_load(environments, hand, angle, least, most):
+    """All of it on the pad, a part beside it, nothing on the back."""
     plain, bare = touched(environments, hand, angle)
     share = float(bare.touch.force[1].sum() / jnp.maximum(plain.touch.force[1].sum(), 1e-6))
     assert least <= share <= most + 1e-5
-    np.testing.assert_allclose(bare.tangential_force[1], share * plain.tangential_force[1], atol=1e-4)
-    assert share == 0 or float(jnp.linalg.norm(plain.tangential_force[1])) > 0.5
 
 
 def test_it_can_be_asked_for_by_name():

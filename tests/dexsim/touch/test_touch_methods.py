@@ -17,7 +17,7 @@ from dexsim.geometry.surface_points import PointsConfig
 from dexsim.hand.kinematics import forward_kinematics, taxel_normals, taxel_positions
 from dexsim.touch import feel as tactile
 from dexsim.touch import materials
-from dexsim.touch.feel import feel_links, split_force, taxel_vectors
+from dexsim.touch.feel import feel_links, pressing_force
 from dexsim.touch.reduce import reduce_touch, reduce_touch_links
 from dexsim.touch.skin import Skin, skin_of, skin_stress
 
@@ -165,32 +165,11 @@ def test_known_moduli():
         skin_of("jelly")
 
 
-# --- three axes ----------------------------------------------------------------------------------
-
-
-def test_split_force_by_hand():
-    """Flat skin that faces +z: what presses it comes from above, the rest is tangential."""
+def test_pressing_force_by_hand():
+    """Flat skin that faces +z: what presses it comes from above."""
     normals = np.tile(np.float32([0, 0, 1]), (2, 4, 1))
     force = np.float32([[1, 0, 2, 0], [0, 0, 0, 0]])
     vector = np.float32([[0.3, -0.4, -3.0], [1.0, 1.0, 1.0]])
-    pressed, tangential = split_force(force, normals, vector)
-    np.testing.assert_allclose(pressed, [3, 0], atol=1e-6)
-    np.testing.assert_allclose(tangential, [[0.3, -0.4, 0], [0, 0, 0]], atol=1e-6)
-    shares = np.asarray(taxel_vectors(force, vector))
-    np.testing.assert_allclose(shares[0], force[0][:, None] / 3 * vector[0], rtol=1e-6)
-    np.testing.assert_array_equal(shares[1], 0)
-    slopes = jax.jacfwd(lambda f: split_force(f, normals, vector)[1])(force)
+    np.testing.assert_allclose(pressing_force(force, normals, vector), [3, 0], atol=1e-6)
+    slopes = jax.jacfwd(lambda f: pressing_force(f, normals, vector))(force)
     assert np.all(np.isfinite(slopes))
-
-
-def test_three_axes_keep_the_fingers_force(links):
-    feel, _, _, normals = links
-    touch, force, _ = feel(BALL, Skin(margin=0.001))
-    vector = np.random.default_rng(0).normal(size=(5, 3)).astype(np.float32)
-    felt = np.asarray(force) > 0
-    np.testing.assert_allclose(taxel_vectors(touch.force, vector).sum(1), np.where(felt[:, None], vector, 0), atol=1e-5)
-    pressed, tangential = (np.asarray(x) for x in split_force(touch.force, normals, vector))
-    length = np.sum(vector**2, 1)
-    np.testing.assert_allclose((pressed**2 + np.sum(tangential**2, 1))[felt], length[felt], rtol=1e-4)
-    inward = vector - tangential
-    np.testing.assert_allclose(np.sum(inward * tangential, 1)[felt], 0, atol=1e-5)

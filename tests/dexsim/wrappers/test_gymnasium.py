@@ -6,7 +6,7 @@ import pytest
 from tiny_env import TinyEnv
 
 pytest.importorskip("gymnasium")
-from dexsim import ConfigError
+from dexsim.errors import ConfigError
 from dexsim.wrappers.gymnasium import GymVectorEnv
 
 

@@ -14,7 +14,8 @@ from paths import ROOT
 from reach_env import MAX_STEPS, Broken, Reach
 from tiny_env import SMALL
 
-from dexsim import ConfigError, DexsimError, registry
+from dexsim import registry
+from dexsim.errors import ConfigError, DexsimError
 from dexsim.tasks.grasp.config import GraspConfig
 from dexsim_ppo import Policy, evaluate_policy, make_train, reproduce, train_policy
 from dexsim_ppo import evaluate as evaluate_command
@@ -66,7 +67,9 @@ def test_restart_is_a_new_episode_where_asked_and_keys_advance_either_way():
     assert fresh.inner["x"] != state.inner["x"] and fresh.clock == 0 and fresh.metrics["length"] == 0
     again = jax.jit(env.restart)(same, jnp.bool_(True))
     assert again.inner["x"] != fresh.inner["x"]
-    clocks = jax.vmap(lambda key: env.stagger(state, key).clock)(jax.random.split(jax.random.key(1), 200))
+    clocks = jax.vmap(lambda key: env.randomize_episode_time(state, key).clock)(
+        jax.random.split(jax.random.key(1), 200)
+    )
     assert set(np.asarray(clocks).tolist()) == set(range(MAX_STEPS))
 
 

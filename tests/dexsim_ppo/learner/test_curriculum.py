@@ -43,7 +43,7 @@ class WideEnv(TinyEnv):
         scale, inner = jnp.asarray(scale, jnp.float32), self._start(key)
         return WidthState(dataclasses.replace(inner, metrics=inner.metrics | {"drawn": scale}), scale, scale)
 
-    def stagger(self, state, key):
+    def randomize_episode_time(self, state, key):
         return state
 
     def step(self, state, action):
@@ -61,7 +61,7 @@ class WideEnv(TinyEnv):
         fresh = self.reset(state.inner.key, state.scale)
         return jax.tree.map(lambda new, old: jnp.where(done, new, old), fresh, state)
 
-    def widen(self, state, scale):
+    def set_randomization_scale(self, state, scale):
         return dataclasses.replace(state, scale=scale)
 
 

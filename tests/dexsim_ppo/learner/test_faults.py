@@ -126,7 +126,7 @@ class Short(TinyEnv):
         state = super().step(state, action)
         return dataclasses.replace(state, truncated=state.metrics["length"] >= 4)
 
-    def stagger(self, state, key):
+    def randomize_episode_time(self, state, key):
         return state
 
 

@@ -11,7 +11,7 @@ import pytest
 from paths import ROOT
 from tiny_env import SMALL, TinyEnv
 
-from dexsim import ConfigError
+from dexsim.errors import ConfigError
 from dexsim_ppo import make_train
 from dexsim_ppo.training import memory, programs
 

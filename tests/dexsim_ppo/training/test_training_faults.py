@@ -32,7 +32,7 @@ class Breaks(TinyEnv):
         state = super()._start(key)
         return dataclasses.replace(state, metrics=state.metrics | {"age": jnp.float32(0)})
 
-    def stagger(self, state, key):
+    def randomize_episode_time(self, state, key):
         return state
 
     def step(self, state, action):

@@ -1,4 +1,4 @@
-"""Training with Warp on a GPU: numbers stay finite, hands touch, episodes end and begin."""
+"""Training on a GPU: numbers stay finite, hands touch, episodes end and begin."""
 
 import dataclasses
 
@@ -12,14 +12,15 @@ from dexsim.tasks.grasp.config import GraspConfig
 from dexsim_ppo.learner.ppo import make_train
 from dexsim_ppo.training.presets import find_preset
 
-pytest.importorskip("warp")
 pytestmark = pytest.mark.gpu
 
 ENVS, ITERATIONS = 32, 4
 
 
-def test_some_iterations_of_grasp():
-    env = dexsim.make("grasp", GraspConfig(pool_size=64, episode_seconds=0.6), backend="warp", num_envs=ENVS)
+@pytest.mark.parametrize("backend", ["cuda", "warp"])
+def test_some_iterations_of_grasp(backend):
+    pytest.importorskip("warp" if backend == "warp" else "jax")
+    env = dexsim.make("grasp", GraspConfig(pool_size=64, episode_seconds=0.6), backend=backend, num_envs=ENVS)
     config = dataclasses.replace(
         find_preset("gpu", "grasp").ppo, num_envs=ENVS, rollout_length=8, minibatches=2, iterations_per_call=1
     )

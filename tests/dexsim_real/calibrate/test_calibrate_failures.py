@@ -120,6 +120,7 @@ class Helper(Operator):
         super().tell(text)
         if text.endswith("again"):
             self.told += 1
+        elif text.startswith("index pad"):  # The finger is back where it begins.
             self.bench.plates = self.plates if self.told == self.misses else []
 
 

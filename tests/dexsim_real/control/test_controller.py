@@ -20,7 +20,7 @@ from dexsim.env.observer import Observer
 from dexsim.env.state import Start
 from dexsim.geometry import rotations
 from dexsim.observation import layout
-from dexsim.physics.seam import PhysicsState
+from dexsim.physics.interface import PhysicsState, StepResult
 from dexsim.randomization import Randomization
 from dexsim.sensing.config import Sensing
 from dexsim.sensing.imu import ImuConfig
@@ -57,16 +57,19 @@ class FakePhysics:
         self.object_qpos, self.object_dof = np.arange(12, 19), np.arange(12, 18)
         self.mj_model = SimpleNamespace(nv=18, dof_M0=np.ones(18), opt=SimpleNamespace(timestep=config.timestep))
 
-    def advance_motors(self, object, state, motors, memory, push, cover):
+    def tip_stiffness(self, *arguments):
+        return jnp.ones(5)
+
+    def advance(self, law, object, state, push, tip_stiffness, pad_thickness_delta):
         joints, velocity = state.qpos[:12], state.qvel[:12]
-        torque, memory = motors(jnp.asarray(5), joints, velocity, memory)
+        torque = law(jnp.asarray(5), joints, velocity)
         velocity = torque * 2.0
         joints = joints + self.config.control_period * velocity
         turned = rotations.quat_multiply(jnp.array([jnp.cos(0.02), jnp.sin(0.02), 0.0, 0.0]), state.qpos[15:])
         qpos = jnp.concatenate([joints, state.qpos[12:15], turned])
         qvel = jnp.concatenate([velocity, jnp.zeros(6)])
         force = jnp.zeros((5, 3)).at[:, 0].set(jnp.abs(jnp.sin(5 * joints[:5])) * 3)
-        return PhysicsState(qpos, qvel, state.warmstart), force, memory
+        return StepResult(PhysicsState(qpos, qvel, state.warmstart), force)
 
 
 class StillRotate(Rotate):
@@ -124,7 +127,7 @@ def test_one_frame_gives_the_same_observation_through_both_doors_bit_for_bit(han
             object_spin=jnp.zeros(3),
         )
         command, goal_quat = task.goal_readings(goal)
-        return observer.observe(readings, moment, command, goal_quat)["actor"]
+        return observer.observe(readings, moment, (command, goal_quat))["actor"]
 
     door = jax.jit(door)
     goal = task.begin(jax.random.key(0), None)

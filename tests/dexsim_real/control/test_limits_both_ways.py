@@ -107,7 +107,7 @@ def test_wrong_readings_far_apart_do_not_add_up(hand):
 
 def test_a_target_of_before_the_motors_came_on_moves_nothing(hand):
     bench = Bench(hand)
-    bench.run(0.1, wish=MIDDLE + np.float32(0.1) * FREE)
+    bench.run(0.15, wish=MIDDLE + np.float32(0.1) * FREE)
     bench.safety.set_target(MIDDLE + np.float32(0.1) * FREE, bench.now)
     bench.safety.engage()
     for decision in bench.run(0.05):

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from test_safety import AGREEING, CYCLE
 
 from dexsim_real.control.pose_check import PoseCheck
 
-CYCLE = 0.012
 JOINT, START = 4, 0.9  # index_joint1, in the middle of its range
 UP, DOWN = 1.0, -1.0
 
@@ -14,9 +14,9 @@ UP, DOWN = 1.0, -1.0
 def check(hand):
     """Knows the pose, motors on where the hand is. The newest reading is of time 0."""
     check = PoseCheck(hand, 0.1)
-    for k in range(-2, 1):
+    for k in range(1 - AGREEING, 1):
         check.judge(k * CYCLE, pose(), None)
-    assert check.known
+    np.testing.assert_array_equal(check.at_rest, pose())
     check.follow(pose())
     return check
 
@@ -59,23 +59,44 @@ def test_beyond_its_command_it_is_wrong_however_long_it_lasts(hand, check, way):
     assert check.judge(200 * CYCLE, pose(), pose()) == ""
 
 
-@pytest.mark.parametrize("way", [UP, DOWN])
-def test_readings_that_disagree_do_not_make_a_pose(hand, way):
-    """With the motors off: agreement is counted anew after every jump."""
+@pytest.mark.parametrize("apart", [0.049, 0.051, -0.049, -0.051])
+@pytest.mark.parametrize("at", range(AGREEING))
+def test_readings_that_disagree_do_not_make_a_pose(hand, apart, at):
+    """With the motors off; wherever among the last ten the wrong one is, the pose is the median."""
     check = PoseCheck(hand, 0.1)
-    far = START + way * (0.1 + fastest(hand) * CYCLE + 0.02)
-    for k, angle in enumerate((START, START, far, far)):
-        assert check.judge(k * CYCLE, pose(angle), None) and not check.known
-    assert check.judge(4 * CYCLE, pose(far), None) == "" and check.known
+    for k in range(AGREEING):
+        assert check.at_rest is None
+        assert check.judge(k * CYCLE, pose(START + apart * (k == at)), None) == ""
+    if abs(apart) > 0.05:
+        assert check.at_rest is None
+    else:
+        np.testing.assert_array_equal(check.at_rest, pose())
+
+
+def test_four_equal_wrong_readings_of_ten_do_not_move_the_pose(hand):
+    check = PoseCheck(hand, 0.1)
+    for k in range(AGREEING):
+        check.judge(k * CYCLE, pose(START + 0.04 * (k in (1, 2, 8, 9))), None)
+    np.testing.assert_array_equal(check.at_rest, pose())
 
 
 @pytest.mark.parametrize("angle", [2.02, -0.11])
 def test_a_reading_outside_the_limits_ends_the_agreement(hand, angle):
     check = PoseCheck(hand, 0.1)
-    for k in range(2):
+    for k in range(AGREEING - 1):
         check.judge(k * CYCLE, pose(), None)
-    assert "outside its limits" in check.judge(2 * CYCLE, pose(angle), None)
-    assert [bool(check.judge(k * CYCLE, pose(), None)) for k in range(3, 6)] == [True, True, False]
+    assert "outside its limits" in check.judge(AGREEING * CYCLE, pose(angle), None)
+    for k in range(AGREEING):
+        assert check.at_rest is None
+        assert check.judge((AGREEING + k) * CYCLE, pose(), None) == ""
+    assert check.at_rest is not None
+
+
+def test_motors_that_went_off_unseen_come_on_at_a_pose_of_new_readings(hand, check):
+    for k in range(1, AGREEING + 1):
+        assert check.at_rest is None or k == 1
+        assert check.judge(k * CYCLE, pose(), None) == ""
+    assert check.at_rest is not None
 
 
 @pytest.mark.parametrize("way", [UP, DOWN])

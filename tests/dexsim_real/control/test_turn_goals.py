@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from dexsim.tasks.rotate.config import RotateConfig
+from dexsim.task_spec import TurnSpec
 from dexsim.tasks.rotate.task import goal_quat
 from dexsim_real.control.goals import TurnGoals
 from dexsim_real.sensors.readings import ObjectEstimate
@@ -20,16 +20,16 @@ def seen(angle, axis=(1.0, 0, 0), place=(0.048, 0.0, 0.085)):
 
 @pytest.mark.parametrize("direction", [1, -1])
 def test_goals_move_on_as_in_the_task(direction):
-    config = RotateConfig(direction=direction)
-    goals = TurnGoals(config.turn, REFERENCE)
+    turn = TurnSpec(step=direction * math.pi / 2)
+    goals = TurnGoals(turn, REFERENCE)
     rate, period, turns = 0.8 * direction, 0.03, 0
     for k in range(600):
-        wanted = np.asarray(goal_quat(turns, np.asarray(config.axis), direction * config.goal_step))
+        wanted = np.asarray(goal_quat(turns, np.asarray(turn.axis), turn.step))
         np.testing.assert_allclose(goals.quat, wanted, atol=1e-5)
         angle = rate * period * k
         goals.update(period * k, seen(angle))
         # A goal is reached 0.3 rad before it.
-        turns = max(turns, math.floor((abs(angle) + config.goal_angle - 1e-9) / config.goal_step))
+        turns = max(turns, math.floor((abs(angle) + turn.angle - 1e-9) / abs(turn.step)))
         assert goals.successes == turns
     assert turns >= 8 and len(goals.times) == turns
 
@@ -37,8 +37,8 @@ def test_goals_move_on_as_in_the_task(direction):
 @pytest.mark.parametrize("way", [1, -1])
 def test_a_goal_passed_at_speed_or_far_away_does_not_count(way):
     """Whichever way round the object passes it."""
-    config = RotateConfig(goal_spin=2.0)
-    fast, far = TurnGoals(config.turn, REFERENCE), TurnGoals(config.turn, REFERENCE)
+    turn = TurnSpec(spin=2.0)
+    fast, far = TurnGoals(turn, REFERENCE), TurnGoals(turn, REFERENCE)
     for k in range(40):
         fast.update(0.03 * k, seen(way * 6.0 * 0.03 * k))
         far.update(0.03 * k, seen(way * 1.0 * 0.03 * k, place=(0.2, 0, 0.085)))
@@ -48,8 +48,8 @@ def test_a_goal_passed_at_speed_or_far_away_does_not_count(way):
 @pytest.mark.parametrize("direction", [1, -1])
 def test_a_quaternion_of_the_other_sign_is_no_turn(direction):
     """q and -q are one orientation; an IMU may give either, from one sample to the next."""
-    config = RotateConfig(direction=direction, goal_spin=2.0)
-    goals = TurnGoals(config.turn, REFERENCE)
+    turn = TurnSpec(step=direction * math.pi / 2, spin=2.0)
+    goals = TurnGoals(turn, REFERENCE)
     for k in range(100):
         estimate = seen(0.8 * direction * 0.03 * k)
         sign = -1 if k % 2 else 1
@@ -59,8 +59,8 @@ def test_a_quaternion_of_the_other_sign_is_no_turn(direction):
 
 @pytest.mark.parametrize(("off", "counts"), [(0.049, True), (0.051, False)])
 def test_a_goal_counts_within_its_distance_at_the_time_of_the_orientation(off, counts):
-    config = RotateConfig(goal_distance=0.05)
-    goals = TurnGoals(config.turn, REFERENCE)
+    turn = TurnSpec(distance=0.05)
+    goals = TurnGoals(turn, REFERENCE)
     place = np.asarray(REFERENCE) + [0.0, 0.6 * off, 0.8 * off]
     goals.update(7.5, seen(math.pi / 2, place=place))
     assert goals.successes == counts and goals.times == [7.5] * counts
@@ -68,7 +68,7 @@ def test_a_goal_counts_within_its_distance_at_the_time_of_the_orientation(off, c
 
 def test_the_spin_is_smoothed_over_a_tenth_of_a_second():
     """A spin of 3 rad/s that starts at once: a first-order filter over 0.1 s."""
-    goals, period = TurnGoals(RotateConfig().turn, REFERENCE), 0.01
+    goals, period = TurnGoals(TurnSpec(spin=2.0), REFERENCE), 0.01
     goals.update(0.0, seen(0.0))
     for k in range(1, 20):
         goals.update(period * k, seen(3.0 * period * k))

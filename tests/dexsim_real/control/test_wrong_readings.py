@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_safety import CYCLE, FREE, MIDDLE, Bench, sample
+from test_safety import AGREEING, CYCLE, FREE, MIDDLE, Bench, sample
 
 from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.pose_check import PoseCheck
@@ -123,11 +123,11 @@ def test_nothing_is_enabled_on_a_single_reading(hand):
 def test_a_moving_joint_is_plausible_up_to_its_speed(hand):
     check, top = PoseCheck(hand, 0.1), np.asarray(hand.speed_limit)
     position, goal = np.full(12, 0.1), np.asarray(hand.joint_upper)
-    for k in range(3):
+    for k in range(AGREEING):
         check.judge(k * CYCLE, position, None)
-    assert check.known
+    assert check.at_rest is not None
     check.follow(goal)
-    for k in range(3, 30):
+    for k in range(AGREEING, 40):
         position = np.minimum(position + top * CYCLE, goal)
         assert check.judge(k * CYCLE, position, goal) == ""
 

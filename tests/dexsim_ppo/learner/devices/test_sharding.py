@@ -9,15 +9,13 @@ import sys
 import jax
 import numpy as np
 import pytest
+from collectives import received
 from paths import ROOT
 from tiny_env import SMALL, TinyEnv
 
 from dexsim.core.errors import ConfigError
 from dexsim_ppo.learner.devices.sharding import make_mesh
 from dexsim_ppo.learner.ppo import make_train
-
-sys.path.insert(0, str(ROOT / "benchmarks"))
-from collectives import received
 
 # A GRU's memory is split as the environments are; `training/test_devices.py` has a policy without.
 CONFIG = dataclasses.replace(SMALL, num_envs=16, iterations_per_call=10, memory="gru", memory_size=4)

@@ -86,7 +86,7 @@ def test_rules_and_places_are_those_of_the_tasks(hand):
         referee.GOAL_DISTANCE,
         referee.GOAL_SPIN,
         referee.TIPPED,
-    ) == pytest.approx((config.goal_step, config.goal_angle, config.goal_distance, config.goal_spin, config.drop_tilt))
+    ) == pytest.approx((config.turn.step, config.turn.angle, config.turn.distance, config.turn.spin, config.drop_tilt))
 
 
 def test_a_cube_is_put_in_the_middle_of_trainings_starts(hand, monkeypatch, tmp_path):

@@ -1,0 +1,160 @@
+"""The kernel of a scene: its source, and NVRTC, which compiles it.
+
+NVRTC comes with JAX for CUDA (`nvidia-cuda-nvrtc`) and needs neither nvcc nor CUDA's headers. What it has compiled is
+kept beside JAX's compiled programs.
+"""
+
+import contextlib
+import ctypes
+import functools
+import hashlib
+import importlib.util
+import os
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+
+from dexsim.core.assets import cache_path
+from dexsim.core.errors import ConfigError
+from dexsim.core.files import make_private, read_private, write_whole
+from dexsim.core.install import install_line
+from dexsim.physics.cuda.arguments import declare_args
+from dexsim.physics.cuda.contact_tables import contact_constants
+from dexsim.physics.cuda.law import PrintedLaw
+from dexsim.physics.cuda.scene import buffers, kernel_constants
+from dexsim.physics.interface import PhysicsScene
+
+WORLDS_PER_BLOCK = 8
+"""Warps of a block, which pass through the kernel's code in step."""
+ENTRY = "tick_kernel"
+SHARED_BYTES = "shared_bytes"
+"""The variable on the device that has the size of a world's shared memory."""
+# Square roots, quotients and sines of fewer instructions: no force differs by more than other roundings make it.
+OPTIONS = ("-std=c++17", "-use_fast_math", "-default-device")
+_KERNEL = Path(__file__).parent / "kernel"
+# The warps of the last block that have no world of their own repeat the last one, and write the same bits again.
+_ENTRY = f"""
+extern "C" __device__ unsigned {SHARED_BYTES} = sizeof(Shared);
+
+extern "C" __global__ void __launch_bounds__({WORLDS_PER_BLOCK} * 32, 2) {ENTRY}(const __grid_constant__ Args args) {{
+  extern __shared__ __align__(16) char memory[];
+  const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
+  const int world = min(blockIdx.x * {WORLDS_PER_BLOCK} + warp, args.n - 1);
+  tick(args, world, ((Shared *)memory)[warp], lane);
+}}
+"""
+
+
+def source(scene: PhysicsScene, law: PrintedLaw) -> str:
+    """The kernel's source, which includes `headers`.
+
+    Raises:
+      AssetError: the scene has what the kernel lacks.
+    """
+    return "\n".join(
+        [
+            '#include "warp.cuh"',
+            declare_args(buffers(scene, law.buffers)),
+            kernel_constants(scene),
+            contact_constants(scene),
+            law.text,
+            '#include "tick.cuh"',
+            _ENTRY,
+        ]
+    )
+
+
+@functools.cache
+def headers() -> Mapping[str, str]:
+    """The files of `kernel/` by the names under which they include each other."""
+    return {path.relative_to(_KERNEL).as_posix(): path.read_text() for path in sorted(_KERNEL.rglob("*.cuh"))}
+
+
+def compile_kernel(text: str, architecture: str) -> bytes:
+    """The kernel's machine code (cubin), compiled or from the cache.
+
+    Args:
+      text: of `source`.
+      architecture: of the GPU, such as sm_90.
+
+    Raises:
+      ConfigError: NVRTC is missing or fails.
+    """
+    compiler = find_compiler()
+    options = (*OPTIONS, f"--gpu-architecture={architecture}")
+    digest = hashlib.sha256(repr((text, sorted(headers().items()), options, compiler.version)).encode())
+    path = cache_path("cuda") / f"{digest.hexdigest()}.cubin"
+    with contextlib.suppress(OSError):
+        make_private(path.parent)
+        return read_private(path)
+    code = compiler.compile(text, headers(), options)
+    with contextlib.suppress(OSError):  # a disk without room or rights
+        make_private(path.parent)
+        write_whole(path, [code])
+    return code
+
+
+class Compiler:
+    """NVRTC."""
+
+    def __init__(self, library: ctypes.CDLL):
+        self._library = library
+        major, minor = ctypes.c_int(), ctypes.c_int()
+        library.nvrtcVersion(ctypes.byref(major), ctypes.byref(minor))
+        self.version = major.value, minor.value
+
+    def compile(self, text: str, included: Mapping[str, str], options: tuple[str, ...]) -> bytes:
+        """A cubin of a CUDA source; errors as in `compile_kernel`."""
+        library, program = self._library, ctypes.c_void_p()
+        names, texts = _strings(included.keys()), _strings(included.values())
+        self._check(
+            library.nvrtcCreateProgram(ctypes.byref(program), text.encode(), b"kernel.cu", len(included), texts, names)
+        )
+        try:
+            if library.nvrtcCompileProgram(program, len(options), _strings(options)):
+                log = self._read(program, "ProgramLog").decode(errors="replace").strip("\0\n")
+                first = next((line for line in log.splitlines() if "error" in line), log)
+                raise ConfigError(f"backend 'cuda': NVRTC {self.version[0]}.{self.version[1]}: {first}")
+            return self._read(program, "CUBIN")
+        finally:
+            library.nvrtcDestroyProgram(ctypes.byref(program))
+
+    def _read(self, program: ctypes.c_void_p, what: str) -> bytes:
+        size = ctypes.c_size_t()
+        self._check(getattr(self._library, f"nvrtcGet{what}Size")(program, ctypes.byref(size)))
+        content = ctypes.create_string_buffer(size.value)
+        self._check(getattr(self._library, f"nvrtcGet{what}")(program, content))
+        return content.raw
+
+    def _check(self, code: int) -> None:
+        if code:
+            self._library.nvrtcGetErrorString.restype = ctypes.c_char_p
+            raise ConfigError(f"backend 'cuda': NVRTC: {self._library.nvrtcGetErrorString(code).decode()}")
+
+
+@functools.cache
+def find_compiler() -> Compiler:
+    """NVRTC of the Python environment, of the CUDA toolkit or of the system, in this order.
+
+    Raises:
+      ConfigError: there is none.
+    """
+    for path in _candidates():
+        with contextlib.suppress(OSError):
+            return Compiler(ctypes.CDLL(str(path)))
+    raise ConfigError(f"backend 'cuda' needs NVRTC, which comes with JAX for CUDA: {install_line('cuda')}")
+
+
+def _candidates() -> Iterator[Path | str]:
+    package = importlib.util.find_spec("nvidia")
+    roots = [Path(place) for place in (package and package.submodule_search_locations) or ()]
+    toolkit = Path(os.environ.get("CUDA_HOME", "/usr/local/cuda"))
+    folders = [*(folder for root in roots for folder in sorted(root.glob("*/lib"), reverse=True)), toolkit / "lib64"]
+    for folder in folders:
+        # Beside it lie libnvrtc-builtins, and in some versions a variant for cross compilation.
+        yield from sorted((path for path in folder.glob("libnvrtc.so*") if "alt" not in path.name), reverse=True)
+    yield from ("libnvrtc.so.13", "libnvrtc.so.12")
+
+
+def _strings(values: Iterable[str]) -> ctypes.Array[ctypes.c_char_p]:
+    encoded = [value.encode() for value in values]
+    return (ctypes.c_char_p * len(encoded))(*encoded)

@@ -1,0 +1,176 @@
+"""Calls of Python from a compiled XLA program, through XLA's foreign function interface (FFI), by ctypes.
+
+The structures are those of `xla/ffi/api/c_api.h`, which is an interface with a version: another major version is
+refused by XLA when the target is registered.
+"""
+
+import _thread
+import atexit
+import collections
+import contextlib
+import ctypes
+import functools
+import threading
+import time
+import traceback
+from collections.abc import Callable
+from typing import Any
+
+import jax
+
+_MAJOR, _METADATA, _EXECUTE, _STRING = 0, 1, 3, 4
+_INTERNAL = 13
+
+
+def _struct(name: str, *fields: tuple[str, Any]) -> Any:
+    head = [("struct_size", ctypes.c_size_t), ("extension", ctypes.c_void_p)]
+    return type(name, (ctypes.Structure,), {"_fields_": [*head, *fields]})
+
+
+_POINTERS = ctypes.POINTER(ctypes.c_void_p)
+_Version = _struct("_Version", ("major", ctypes.c_int), ("minor", ctypes.c_int))
+_Api = _struct(
+    "_Api",
+    ("version", _Version),
+    ("internal", ctypes.c_void_p),
+    ("create_error", ctypes.c_void_p),
+    ("get_message", ctypes.c_void_p),
+    ("destroy_error", ctypes.c_void_p),
+    ("register", ctypes.c_void_p),
+    ("get_stream", ctypes.c_void_p),
+)
+_ErrorArguments = _struct("_ErrorArguments", ("message", ctypes.c_char_p), ("code", ctypes.c_int))
+_StreamArguments = _struct("_StreamArguments", ("context", ctypes.c_void_p), ("stream", ctypes.c_void_p))
+Buffer = _struct(
+    "Buffer",
+    ("dtype", ctypes.c_int),
+    ("data", ctypes.c_void_p),
+    ("rank", ctypes.c_int64),
+    ("dims", ctypes.POINTER(ctypes.c_int64)),
+)
+Buffers = _struct("Buffers", ("size", ctypes.c_int64), ("types", ctypes.c_void_p), ("items", _POINTERS))
+_Attributes = _struct(
+    "_Attributes",
+    ("size", ctypes.c_int64),
+    ("types", ctypes.POINTER(ctypes.c_int)),
+    ("names", _POINTERS),
+    ("items", _POINTERS),
+)
+Frame = _struct(
+    "Frame",
+    ("api", ctypes.POINTER(_Api)),
+    ("context", ctypes.c_void_p),
+    ("stage", ctypes.c_int),
+    ("arguments", Buffers),
+    ("results", Buffers),
+    ("attributes", _Attributes),
+)
+
+
+class _Span(ctypes.Structure):
+    _fields_ = [("data", ctypes.c_void_p), ("size", ctypes.c_size_t)]
+
+    def read(self) -> bytes:
+        return ctypes.string_at(self.data, self.size)
+
+
+class _Metadata(ctypes.Structure):
+    _fields_ = [("struct_size", ctypes.c_size_t), ("version", _Version), ("traits", ctypes.c_uint32)]
+
+
+class _MetadataRequest(ctypes.Structure):
+    _fields_ = [
+        ("struct_size", ctypes.c_size_t),
+        ("type", ctypes.c_int),
+        ("next", ctypes.c_void_p),
+        ("metadata", ctypes.POINTER(_Metadata)),
+    ]
+
+
+def addresses(buffers: Any) -> list[int]:
+    """Of the `Buffer` structures."""
+    return buffers.items[: buffers.size]
+
+
+def attributes(frame: Any) -> dict[str, bytes]:
+    """The call's attributes that are strings."""
+    given, found = frame.attributes, {}
+    for index in range(given.size):
+        if given.types[index] == _STRING:
+            name = _Span.from_address(given.names[index]).read().decode()
+            found[name] = _Span.from_address(given.items[index]).read()
+    return found
+
+
+def stream(frame: Any) -> int:
+    """The CUDA stream that the call belongs to."""
+    arguments = _StreamArguments(ctypes.sizeof(_StreamArguments), None, frame.context, None)
+    get = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)(frame.api.contents.get_stream)
+    if get(ctypes.addressof(arguments)):
+        raise RuntimeError("XLA did not say on which stream")
+    return arguments.stream or 0
+
+
+def _error(frame: Any, message: str) -> int:
+    create = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)(frame.api.contents.create_error)
+    arguments = _ErrorArguments(ctypes.sizeof(_ErrorArguments), None, message.encode(), _INTERNAL)
+    return create(ctypes.addressof(arguments))
+
+
+def _answer(handler: Callable[[Any], None], traits: int, address: int) -> int | None:
+    """Serve one call of XLA's. An exception must not leave through C: it becomes XLA's error."""
+    frame = Frame.from_address(address)
+    try:
+        if frame.extension:
+            request = _MetadataRequest.from_address(frame.extension)
+            if request.type == _METADATA:
+                metadata, runtime = request.metadata.contents, frame.api.contents.version
+                version, metadata.traits = metadata.version, traits
+                version.major, version.minor = _MAJOR, runtime.minor if runtime.major == _MAJOR else 0
+                return None
+        if frame.stage == _EXECUTE:
+            _calls.append(time.monotonic())
+            if _ending.is_set():
+                return _error(frame, "the interpreter is ending")
+            handler(frame)
+    except KeyboardInterrupt:
+        # With synchronous dispatch this is the main thread. The program ends here, and Ctrl-C is raised again when
+        # the interpreter has control.
+        _thread.interrupt_main()
+        return _error(frame, "interrupted")
+    except BaseException as error:
+        return _error(frame, f"{error}\n{traceback.format_exc()}")
+    return None
+
+
+_kept: list[Any] = []  # what C holds addresses of
+_ending = threading.Event()
+_calls: collections.deque[float] = collections.deque(maxlen=1)  # s, when the last call came
+_QUIET, _PATIENCE = 0.3, 5.0  # s, without a call before the interpreter may end, and the longest wait for that
+
+
+def _end() -> None:
+    """Before the interpreter ends: a program that is still running must not call into it any more.
+
+    Its next call fails, which ends the program; its results are waited for, and programs without results by silence.
+    """
+    _ending.set()
+    until = time.monotonic() + _PATIENCE
+    for array in jax.live_arrays():
+        with contextlib.suppress(Exception):
+            array.block_until_ready()
+    while _calls and time.monotonic() < min(until, _calls[0] + _QUIET):
+        time.sleep(0.01)
+
+
+@functools.cache
+def register(target: str, platform: str, handler: Callable[[Any], None], traits: int = 0) -> None:
+    """Make `handler`, which gets a `Frame`, what calls of `target` on a platform run; once in a process.
+
+    `traits` is `XLA_FFI_Handler_TraitsBits`.
+    """
+    function = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)(functools.partial(_answer, handler, traits))
+    if not _kept:
+        atexit.register(_end)
+    _kept.append(function)
+    jax.ffi.register_ffi_target(target, jax.ffi.pycapsule(function), platform=platform)

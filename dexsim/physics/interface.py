@@ -1,0 +1,107 @@
+"""What crosses between the environment and a physics engine, and the interface that every engine offers.
+
+The state is Markov: positions, velocities and the solver's warm start. Everything derived is recomputed, which keeps
+the state small and lets an episode restart by selecting arrays, with every engine.
+
+A new engine is one module with a class that follows `Backend`, and one line in `dexsim.physics.physics`.
+
+Shapes: J joints, H hinges (`Hand.num_hinges`), F fingers, K primitives of the object, P pairs of a hand geom and an
+object geom.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import mujoco
+import numpy as np
+
+from dexsim.core.pytree import pytree_dataclass
+from dexsim.hand.kinematics import Hand
+from dexsim.objects.params import ObjectParams
+from dexsim.physics.config import PhysicsConfig
+
+TorqueLaw = Callable[[jax.Array, jax.Array, jax.Array], jax.Array]
+"""(sub-step [], joint position [J] rad, joint velocity [J] rad/s) to joint torque [J] Nm, before every sub-step."""
+
+
+@pytree_dataclass
+class PhysicsState:
+    """The Markov state: the hand's hinges first, in the order of its MJCF, then the object's free joint."""
+
+    qpos: jax.Array  # [H + 7] rad; m and unit quaternion
+    qvel: jax.Array  # [H + 6] rad/s; m/s (palm frame) and rad/s (object frame)
+    warmstart: jax.Array  # [H + 6] last accelerations, the solver's first guess
+
+
+class StepResult(NamedTuple):
+    """The world after a control tick."""
+
+    state: PhysicsState
+    finger_force: jax.Array  # [F, 3] N, of the object on the finger tips at the last sub-step, palm frame
+
+
+@pytree_dataclass
+class ContactParams:
+    """Contacts of hand and object: parameters of their pairs (`PhysicsScene.object_pairs`) in MuJoCo's terms, and how
+    thick the fingertips are."""
+
+    friction: jax.Array  # [P] sliding
+    solref: jax.Array  # [P, 2] direct format: minus stiffness, minus damping
+    solimp: jax.Array  # [P, 5]
+    pad_thickness_delta: jax.Array  # [] m, change of the rubber's thickness from `PhysicsConfig.pad_thickness`
+
+
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
+class PhysicsScene:
+    """The compiled template that an engine runs, with the addresses of what changes in it."""
+
+    hand: Hand
+    config: PhysicsConfig
+    slots: tuple[str, ...]  # kinds of the object's primitives
+    model: mujoco.MjModel
+    joint_qpos: np.ndarray  # [J] addresses in qpos
+    joint_dof: np.ndarray  # [J] addresses in qvel
+    object_qpos: np.ndarray  # [7]
+    object_dof: np.ndarray  # [6]
+    object_body: int
+    object_geoms: np.ndarray  # [K]
+    object_pairs: np.ndarray  # [P]
+    tip_bodies: np.ndarray  # [F]
+    tip_geoms: np.ndarray  # [S] of the fingertips that meet the object
+    tip_growth: np.ndarray  # [S, 3] change of `geom_size` over the rubber's
+
+
+class Backend(Protocol):
+    """A physics engine on one scene. Its methods are pure and written for one environment; the caller vmaps them.
+
+    The constructor takes `(scene, num_envs)`, where `num_envs` is the batch size to reserve memory for. It raises
+    AssetError for a scene that the engine cannot run.
+    """
+
+    def configure(self, object: ObjectParams, contacts: ContactParams) -> Any:
+        """The engine's model of one environment: a pytree whose leaves have the names of `mujoco.MjModel`."""
+        ...
+
+    def advance(
+        self,
+        object: ObjectParams,
+        contacts: ContactParams,
+        state: PhysicsState,
+        torque: TorqueLaw,
+        push: jax.Array,
+    ) -> StepResult:
+        """Run one control tick of `PhysicsConfig.substeps` sub-steps.
+
+        Args:
+          object: the object.
+          contacts: of the object's pairs during the whole tick.
+          state: where to start from.
+          torque: of the joints, from sub-step to sub-step.
+          push: [3] N, force on the object's centre of mass during the whole tick.
+
+        Returns:
+          The world after the tick. Forces are NaN where the engine could not keep all contacts.
+        """
+        ...

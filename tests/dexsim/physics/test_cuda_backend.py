@@ -1,0 +1,119 @@
+"""The `cuda` engine behind `Physics`, its kernel run by the emulation of a warp in place of a GPU."""
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import warp_emulation
+
+from dexsim.core.compilation import jit
+from dexsim.env.motors import JointCommand, Motors
+from dexsim.physics import ffi
+from dexsim.physics import physics as engines
+from dexsim.physics.cuda import backend, launch
+from dexsim.physics.host import call
+from dexsim.physics.physics import Physics
+
+pytestmark = pytest.mark.skipif(warp_emulation.compiler is None, reason="the emulation of a warp needs g++")
+
+
+KERNELS, LAUNCHES = {}, []
+
+
+def serve(frame):
+    """In place of the GPU's: a launch of `KERNELS`."""
+    emulation, settings = KERNELS[ffi.attributes(frame)["kernel"].decode()]
+    given, results = call._arrays(frame.arguments), call._arrays(frame.results)
+    inputs, outputs = ([b for b in emulation.buffers if b.output == which] for which in (False, True))
+    LAUNCHES.append((math.prod(given[0].shape[:-1]), settings.substeps))
+    given = {b.name: x.reshape(-1, b.size) for b, x in zip(inputs, given, strict=True)}
+    found = emulation.run(given, **dataclasses.asdict(settings))
+    for buffer, result in zip(outputs, results, strict=True):
+        result[...] = found[buffer.name].reshape(result.shape)
+
+
+@pytest.fixture
+def emulated(monkeypatch):
+    """Kernels are emulated; returns how many worlds and sub-steps each launch had."""
+
+    def load(code, settings, buffers):
+        scene, law = code
+        emulation, name = warp_emulation.Emulation(scene, law.text, list(law.buffers)), str(len(KERNELS))
+        assert buffers == len(emulation.buffers)
+        KERNELS[name] = emulation, settings
+        return name
+
+    ffi.register(launch.TARGET, "cpu", serve)
+    monkeypatch.setattr(engines, "_on_nvidia", lambda: True)
+    monkeypatch.setattr(launch, "architecture", lambda: "sm_90")
+    monkeypatch.setattr(launch, "load", load)
+    monkeypatch.setattr(backend, "find_compiler", lambda: None)
+    monkeypatch.setattr(backend, "source", lambda scene, law: (scene, law))
+    monkeypatch.setattr(backend, "compile_kernel", lambda text, architecture: text)
+    LAUNCHES.clear()
+    return LAUNCHES
+
+
+def physics_of(env, name):
+    task, config = env.task, dataclasses.replace(env.config.physics, iterations=50, line_search=50)
+    return Physics(env.hand, task.slots, task.largest, config, gravity=task.gravity, backend=name)
+
+
+def tick(env, physics, state):
+    """A control tick of a batch under the task's own motors, whose targets have moved a little."""
+    motors = Motors(physics)
+
+    def one(s):
+        target = s.joint_target + 0.1
+        command = JointCommand(action=0 * target, target=target, previous=s.joint_target, valid=jnp.array(True))
+        law, push = motors.law(s.episode.hand, command), jnp.array([0.1, -0.2, 0.3])
+        result = physics.advance(law, s.episode.object, s.physics, push, s.tip_stiffness)
+        return result, motors.current_torque(s.episode.hand, command, result.state)[0]
+
+    return jax.block_until_ready(jit(jax.vmap(one), once=True)(state))
+
+
+@pytest.fixture(scope="module")
+def states(grasp_rollout):
+    """Start states, a few ticks on: objects lie on the hand."""
+    state = grasp_rollout.reset(jax.random.key(0))
+    for _ in range(6):
+        state = grasp_rollout.step(state, jnp.full((grasp_rollout.num_envs, grasp_rollout.env.action_size), 0.5))
+    return state
+
+
+def test_a_tick_is_that_of_c_mujoco(grasp_env, states, emulated):
+    expected, torque = tick(grasp_env, physics_of(grasp_env, "c"), states)
+    result, cuda_torque = tick(grasp_env, physics_of(grasp_env, "cuda"), states)
+    assert emulated == [(len(states.tick), grasp_env.config.physics.substeps)]
+    assert np.abs(expected.finger_force).max() > 0.5, "nothing is touched"
+    np.testing.assert_allclose(result.state.qpos, expected.state.qpos, atol=2e-5)
+    np.testing.assert_allclose(result.finger_force, expected.finger_force, atol=0.02)
+    np.testing.assert_allclose(cuda_torque, torque, atol=1e-3)
+
+
+def test_a_law_with_a_table_takes_a_launch_for_each_sub_step(grasp_env, states, emulated):
+    """The kernel evaluates element-wise laws; XLA evaluates all others between launches."""
+    physics, table = physics_of(grasp_env, "cuda"), jnp.linspace(0.1, 0.3, 5)
+
+    def looking_up(index, position, velocity):
+        return table[index] * jnp.ones_like(position) - 0.01 * velocity
+
+    def plain(index, position, velocity):
+        return (0.1 + 0.05 * index.astype(jnp.float32)) * jnp.ones_like(position) - 0.01 * velocity
+
+    def run(law):
+        emulated.clear()
+        advance = lambda s: physics.advance(law, s.episode.object, s.physics, jnp.zeros(3))  # noqa: E731
+        result = jax.block_until_ready(jit(jax.vmap(advance), once=True)(states))
+        return result, list(emulated)
+
+    expected, launches = run(plain)
+    assert launches == [(len(states.tick), 5)]
+    result, launches = run(looking_up)
+    assert launches == [(len(states.tick), 1)] * 5
+    np.testing.assert_allclose(result.state.qpos, expected.state.qpos, atol=1e-5)
+    np.testing.assert_allclose(result.finger_force, expected.finger_force, atol=0.02)

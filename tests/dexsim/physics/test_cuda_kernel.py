@@ -1,0 +1,236 @@
+"""The kernel of the `cuda` engine in an emulated warp, against C MuJoCo in double precision."""
+
+import types
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import warp_emulation
+from physics_states import mujoco_substeps, tumble
+from warp_emulation import Emulation
+
+from dexsim.core.errors import AssetError
+from dexsim.hand.load import load_hand
+from dexsim.physics.config import PhysicsConfig
+from dexsim.physics.cuda import scene as cuda_scene
+from dexsim.physics.interface import PhysicsScene
+from dexsim.physics.model import build_scene
+
+pytestmark = pytest.mark.skipif(warp_emulation.compiler is None, reason="the emulation of a warp needs g++")
+
+DATA = Path(__file__).parents[2] / "data"
+BOX = ("box",), np.array([[0.03, 0.03, 0.03]])
+ALL = ("box", "capsule", "cylinder"), np.array([[0.03, 0.03, 0.03], [0.025, 0.03, 0], [0.03, 0.03, 0]])
+
+
+def scene_of(hand: str, slots, largest, gravity=(-9.81, 0.0, 0.0)) -> PhysicsScene:
+    loaded = load_hand() if hand == "xhand" else load_hand(hand)
+    return build_scene(loaded, slots, largest, PhysicsConfig(), gravity, "c")
+
+
+def near_palm(random: np.random.Generator) -> np.ndarray:
+    """A pose over the palm: a place in front of it, any orientation."""
+    quat = random.normal(size=4)
+    place = [random.uniform(0.05, 0.09), random.uniform(-0.03, 0.03), random.uniform(0.05, 0.14)]
+    return np.array([*place, *quat / np.linalg.norm(quat)])
+
+
+def compare(scene: PhysicsScene, states, substeps: int, **options):
+    """Outputs of the kernel, and its errors by world: finger forces N, accelerations of joints rad/s^2."""
+    wanted = mujoco_substeps(scene, states, substeps)
+    found = Emulation(scene).run(states | {"law_0": states["target"]}, substeps=substeps, **options)
+    force = found["finger_force"].reshape(wanted["finger_force"].shape) - wanted["finger_force"]
+    error = {
+        "force": np.linalg.norm(force, axis=-1).max(-1),
+        "acceleration": np.abs(found["warmstart_out"] - wanted["acceleration"])[:, :-6].max(-1),
+        "qpos": np.abs(found["qpos_out"] - wanted["qpos"]).max(-1),
+        "qvel": np.abs(found["qvel_out"] - wanted["qvel"]).max(-1),
+    }
+    return wanted, found, error
+
+
+@pytest.mark.parametrize(
+    ("task", "slots", "largest", "gravity"),
+    [("rotate", *BOX, (-9.42, -1.95, 1.91)), ("grasp", *ALL, (9.81, 0.0, 0.0))],
+    ids=["rotate", "grasp"],
+)
+def test_states_of_the_shipped_policies(task, slots, largest, gravity):
+    """64 states of 16 episodes of each task's policy on C MuJoCo, from reset to 100 (rotate) and 140 ticks (grasp)."""
+    scene = scene_of("xhand", slots, largest, gravity)
+    states = dict(np.load(DATA / f"{task}_states.npz"))
+    for substeps, factor in ((1, 1.0), (5, 10.0)):
+        wanted, found, error = compare(scene, states, substeps)
+        if substeps == 1:
+            np.testing.assert_array_equal(found["stats"][:, 2], wanted["contacts"])
+        assert np.percentile(error["force"], 90) < 0.001 * factor and np.percentile(error["force"], 99) < 0.1 * factor
+        assert np.percentile(error["acceleration"], 90) < 0.01 * factor
+
+
+@pytest.mark.parametrize("hand", ["leap_like", "inspire_like"])
+def test_example_hands(hand):
+    scene = scene_of(hand, *ALL)
+    states = tumble(scene, 64, near_palm)
+    wanted, found, error = compare(scene, states, 1)
+    assert (wanted["contacts"] > 0).mean() > 0.4 and np.linalg.norm(wanted["finger_force"], axis=-1).max() > 1
+    np.testing.assert_array_equal(found["stats"][:, 2], wanted["contacts"])
+    assert np.percentile(error["force"], 90) < 0.001 and np.percentile(error["force"], 99) < 0.01
+    assert np.percentile(error["acceleration"], 90) < 0.01
+    assert np.percentile(error["qpos"], 90) < 1e-6 and np.percentile(error["qvel"], 90) < 1e-4
+
+
+BRANCHED = """
+<mujoco>
+  <compiler angle="radian" autolimits="true"/>
+  <option timestep="0.006" gravity="-9 1 -2" impratio="12" cone="elliptic" integrator="Euler">
+    <flag eulerdamp="disable"/>
+  </option>
+  <default>
+    <joint damping="0.02" armature="0.001" range="-0.2 1.2"/>
+    <geom type="capsule" size="0.009" contype="0" conaffinity="0" density="1500"/>
+  </default>
+  <worldbody>
+    <body name="mount" pos="0.01 -0.01 0.02" euler="0.1 0.2 -0.1">
+      <geom name="mount" type="box" size="0.01 0.03 0.02"/>
+      <body name="wrist" pos="0 0 0.02" euler="0 0.1 0.2">
+        <joint name="wrist" axis="0 1 0.2" pos="0.002 -0.003 0.001" ref="0.1" stiffness="0.3" springref="0.2"/>
+        <geom fromto="0 0 0 0 0 0.03" mass="0.05"/>
+        <body name="palm" pos="0 0 0.03" euler="0.2 0 0">
+          <joint name="sway" axis="1 0.3 0" range="-0.4 0.4" margin="0.05" solreflimit="0.03 0.8"
+            solimplimit="0.8 0.96 0.02 0.4 3"/>
+          <geom name="palm" fromto="0 -0.03 0 0 0.03 0" mass="0.1"/>
+          <body name="rod" pos="0.01 0 0.01" euler="0.3 0.1 0"><geom name="rod" size="0.01 0.01" mass="0.02"/></body>
+          <body name="a1" pos="0.005 0.03 0.01">
+            <joint name="a1" axis="0 1 0"/>
+            <geom name="a1" fromto="0 0 0 0.01 0 0.04" mass="0.02"/>
+            <body name="a2" pos="0.01 0 0.04">
+              <joint name="a2" axis="0.1 1 0" pos="0 0.002 0"/>
+              <geom name="a2" fromto="0 0 0 0.01 0 0.03" mass="0.01"/>
+            </body>
+          </body>
+          <body name="b1" pos="0.005 -0.02 0.01">
+            <joint name="b1" axis="0 1 0.1"/>
+            <geom name="b1" fromto="0 0 0 0.01 0 0.04" mass="0.02"/>
+            <body name="b2" pos="0.01 0 0.04">
+              <joint name="b2" axis="0 1 0"/>
+              <geom name="b2" fromto="0 0 0 0.01 0 0.03" mass="0.01"/>
+            </body>
+          </body>
+        </body>
+      </body>
+      <body name="c1" pos="0.02 0 -0.03">
+        <joint name="c1" axis="0 -1 0"/>
+        <geom name="c1" fromto="0 0 0 0.06 0 0.02" mass="0.03"/>
+      </body>
+    </body>
+    <body name="object" pos="0.1 0 0">
+      <freejoint/>
+      <inertial pos="0.001 0 0" mass="0.1" diaginertia="5e-5 5e-5 5e-5"/>
+      <geom name="object" type="capsule" size="0.02 0.02"/>
+    </body>
+  </worldbody>
+  <equality>
+    <joint joint1="b2" joint2="b1" polycoef="0.05 0.9 0.1 -0.05 0.02" solref="0.015 1" solimp="0.95 0.99 0.003"/>
+    <joint joint1="a2" joint2="b1" polycoef="0 1.1 0 0 0" solref="-400 -30"/>
+  </equality>
+  <contact>
+    <pair geom1="a1" geom2="object" condim="3" solimp="0.7 0.97 0.004 0.3 1.5"/>
+    <pair geom1="a2" geom2="object" condim="3" friction="0.8 0.8" solref="-3000 -40"/>
+    <pair geom1="b1" geom2="object" condim="3"/>
+    <pair geom1="b2" geom2="object" condim="3" solimp="0.9 0.95 0.001 0.5 4"/>
+    <pair geom1="c1" geom2="object" condim="3"/>
+    <pair geom1="rod" geom2="object" condim="3"/>
+    <pair geom1="a2" geom2="b2" condim="3" friction="0.4 0.4"/>
+    <pair geom1="a2" geom2="palm" condim="3"/>
+    <pair geom1="b1" geom2="c1" condim="3"/>
+  </contact>
+</mujoco>
+"""
+
+
+def branched_scene(text: str = BRANCHED) -> PhysicsScene:
+    """A hand that has what ours lack: a wrist that carries fingers, joints away from their bodies' origins, springs,
+    margins of limits, couplings across fingers that are no straight lines, contacts between links of one branch."""
+    model = mujoco.MjModel.from_xml_string(text)
+    joints = [joint for joint in range(model.njnt) if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE]
+    driven = np.array(joints[::-1][1:])  # in another order than the model's, and not all
+    geom = model.geom("object").id
+    tips = np.array([model.body(name).id for name in ("a2", "b2", "c1")])
+    return PhysicsScene(
+        hand=types.SimpleNamespace(num_fingers=3, model_path="branched.xml"),
+        config=PhysicsConfig(),
+        slots=("capsule",),
+        model=model,
+        joint_qpos=driven,
+        joint_dof=driven,
+        object_qpos=np.arange(model.nq - 7, model.nq),
+        object_dof=np.arange(model.nv - 6, model.nv),
+        object_body=model.body("object").id,
+        object_geoms=np.array([geom]),
+        object_pairs=np.flatnonzero((model.pair_geom1 == geom) | (model.pair_geom2 == geom)),
+        tip_bodies=tips,
+        tip_geoms=np.flatnonzero(np.isin(model.geom_bodyid, tips)),
+        tip_growth=np.zeros((3, 3)),
+    )
+
+
+def in_branches(random: np.random.Generator) -> np.ndarray:
+    quat = random.normal(size=4)
+    return np.array([*random.uniform([0.03, -0.04, 0.0], [0.07, 0.04, 0.12]), *quat / np.linalg.norm(quat)])
+
+
+def test_any_tree_of_hinges():
+    scene = branched_scene()
+    states = tumble(scene, 64, in_branches)
+    for substeps, factor in ((1, 1.0), (5, 10.0)):
+        wanted, found, error = compare(scene, states, substeps, iterations=30)
+        assert wanted["contacts"].max() >= 4
+        assert np.percentile(error["force"], 90) < 0.001 * factor and np.percentile(error["force"], 99) < 0.1 * factor
+        assert np.percentile(error["acceleration"], 90) < 0.02 * factor
+
+
+def test_lost_contacts_and_diverged_worlds_have_no_forces():
+    # Forty more spheres where the link a2 is: all of them touch what it touches.
+    names = [f"more{k}" for k in range(40)]
+    text = BRANCHED.replace(
+        '<geom name="a2"',
+        "".join(f'<geom name="{name}" type="sphere" size="0.009" pos="0.005 0 0.015"/>' for name in names)
+        + '<geom name="a2"',
+    )
+    text = text.replace(
+        "</contact>", "".join(f'<pair geom1="{n}" geom2="object" condim="3"/>' for n in names) + "</contact>"
+    )
+    scene = branched_scene(text)
+    states = tumble(scene, 24, in_branches)
+    states["qvel"][1, 2], states["qpos"][2, -7] = np.inf, np.nan
+    inputs = states | {"law_0": states["target"]}
+    found = Emulation(scene).run(inputs, substeps=2)
+    lost = found["stats"][:, 2] > cuda_scene.MAX_CONTACTS
+    assert 0 < lost.sum() < 20
+    np.testing.assert_array_equal(found["stats"][:, 3], lost)
+    lost[1:3] = True
+    np.testing.assert_array_equal(np.isnan(found["finger_force"]).all(1), lost)
+    np.testing.assert_array_equal(np.isnan(found["finger_force"]).any(1), lost)
+
+    alone = Emulation(scene).run({name: values[3:4] for name, values in inputs.items()}, substeps=2)
+    for name, values in alone.items():  # worlds do not depend on each other: equal to the bit
+        np.testing.assert_array_equal(values, found[name][3:4])
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "message"),
+    [
+        ('name="c1" axis', 'name="c1" type="slide" axis', "joints that are no hinges"),
+        ('<joint name="c1"', '<joint axis="1 0 0"/><joint name="c1"', "bodies with several joints"),
+        ('name="c1" axis', 'name="c1" frictionloss="0.1" axis', "dry friction"),
+        ('condim="3"', 'condim="4"', "dimension"),
+        ('friction="0.4 0.4"', 'friction="0.4 0.5"', "depends on the direction"),
+        ('eulerdamp="disable"', 'eulerdamp="enable"', "implicit damping"),
+        ('cone="elliptic"', 'cone="pyramidal"', "pyramidal"),
+        ("<equality>", '<equality><weld body1="a1" body2="b1"/>', "equality constraints"),
+    ],
+)
+def test_what_does_not_fit_is_named(before, after, message):
+    assert BRANCHED.count(before) >= 1
+    with pytest.raises(AssetError, match=message):
+        cuda_scene.check_scene(branched_scene(BRANCHED.replace(before, after, 1)))

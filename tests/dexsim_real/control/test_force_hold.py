@@ -1,0 +1,90 @@
+"""Holds for too much force, judged by the true angles: the hand eases a little, and its motors go off after seconds."""
+
+import numpy as np
+import pytest
+from test_safety import CYCLE, MIDDLE, Bench, sample
+from test_starts import Hands
+
+from dexsim_real.control.limits import SafetyConfig
+from dexsim_real.control.safety import Safety
+
+JOINT = np.arange(12) == 4
+
+
+def hold(hand, error, force, *, seconds=12.0, wish=MIDDLE, before=2.0):
+    """True angle [T] rad of the joint less its first, and whether [T] its motor is on, from the first force on.
+
+    Args:
+      error: rad by which the joint reads too high, by the number of the cycle.
+      force: N of each fingertip, by the number of the cycle.
+      wish: [J] rad, target throughout.
+    """
+    hands, safety = Hands(hand, 1), Safety(hand, SafetyConfig())
+    safety.engage()
+    path, was_on = [], []
+    for k in range(-round(before / CYCLE), round(seconds / CYCLE)):
+        reading = hands.angle[0] + (error(k) if k >= 0 else 0.0) * JOINT
+        safety.see(sample(hands.time, reading, force=force(k) if k >= 0 else 0.0))
+        safety.set_target(wish, hands.time)
+        decision = safety.decide(hands.time)
+        hands.cycle(decision.position[None], np.array([decision.mode != 0]), np.array([decision.stiffness]))
+        if k >= 0:
+            path.append(hands.angle[0, 4])
+            was_on.append(decision.mode != 0)
+    return np.array(path) - path[0], np.array(was_on), safety
+
+
+@pytest.mark.parametrize("error", [0.02, -0.02])
+@pytest.mark.parametrize("force", [lambda k: 30.0, lambda k: 30.0 * (k % 5 > 0), lambda k: 30.0 * (k % 40 > 2)])
+def test_a_joint_that_reads_wrong_does_not_creep_to_its_stop(hand, error, force):
+    """Also where the force falls below its limit for a moment: every new hold could ease by the error again."""
+    path, on, safety = hold(hand, lambda k: error, force)
+    assert np.abs(path).max() < 0.13
+    assert 4.9 <= on.sum() * CYCLE < 8.0 and not on[-1]
+    assert safety.latched == "the fingertip force is too high for 5 s"
+
+
+@pytest.mark.parametrize("size", [-0.22, 0.22])
+@pytest.mark.parametrize("wrong", [1, 2])
+def test_a_wrong_angle_as_a_hold_begins_is_not_eased_to(hand, size, wrong):
+    path, _, safety = hold(hand, lambda k: size * (k < wrong), lambda k: 30.0, seconds=3.0)
+    assert safety.counts["implausible: measurement"] == 0, "small enough to be believed"
+    assert np.abs(path).max() < 0.01
+
+
+def test_whatever_a_joint_reads_an_easing_hand_does_not_go_far(hand):
+    for way in (-1, 1):
+        path, on, _ = hold(hand, lambda k, w=way: w * 0.2, lambda k: 30.0)
+        assert np.abs(path).max() < 0.2 + 0.12 and not on[-1]
+
+
+def test_a_finger_that_is_pushed_gives_way(hand):
+    """By a tenth of a radian from where it was, at the speed of starts."""
+    bench = Bench(hand)
+    bench.engage()
+    bench.run(2.0, wish=MIDDLE)
+    commands = []
+    for _ in range(round(1.0 / CYCLE)):
+        bench.position = bench.position - np.float32(0.004) * JOINT
+        commands.append(bench.cycle(wish=MIDDLE, follow=False, force=30.0).position[4] - MIDDLE[4])
+    assert np.abs(np.diff(commands)).max() <= 0.5 * CYCLE + 1e-6
+    assert commands[-1] == pytest.approx(-0.1, abs=0.005)
+
+
+def test_short_holds_far_apart_end_nothing(hand):
+    """A policy that touches too hard now and then goes on: a tenth of the time for 20 s."""
+    _, on, safety = hold(hand, lambda k: 0.0, lambda k: 30.0 * (k % 100 < 10), seconds=20.0)
+    assert on.all() and not safety.latched
+
+
+@pytest.mark.parametrize("event", [{"velocity": 25.0}, {"wish": np.full(12, np.nan)}])
+def test_no_hold_lasts_for_ever(hand, event):
+    safety, now = Safety(hand, SafetyConfig()), 0.0
+    safety.engage()
+    modes = []
+    for _ in range(round(8.0 / CYCLE)):
+        safety.see(sample(now, MIDDLE, velocity=event.get("velocity", 0.0)))
+        safety.set_target(event.get("wish", MIDDLE), now)
+        modes.append(safety.decide(now).mode != 0)
+        now += CYCLE
+    assert 5.0 <= sum(modes) * CYCLE < 5.1 and not modes[-1] and safety.latched.endswith("for 5 s")

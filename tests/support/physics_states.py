@@ -1,0 +1,140 @@
+"""States of a scene for tests of an engine, and what C MuJoCo makes of them in double precision."""
+
+import copy
+from collections.abc import Callable
+
+import mujoco
+import numpy as np
+
+from dexsim.physics.interface import PhysicsScene
+from dexsim.physics.parameters import places
+
+States = dict[str, np.ndarray]
+"""By name, float32 [N, size]: qpos, qvel, warmstart, push, targets of the joints, and the fields of the object."""
+
+FIELDS = (
+    "geom_size",
+    "geom_pos",
+    "geom_quat",
+    "body_mass",
+    "body_inertia",
+    "body_ipos",
+    "pair_friction",
+    "pair_solref",
+    "pair_solimp",
+)
+
+
+def pd_torque(target: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+    """Position control [J] Nm with a torque that falls with speed: a motor law for tests."""
+    limit = 3.0 * np.maximum(1 - np.abs(velocity) / 20.0, 0)
+    return np.clip(3.0 * (target - position) - 0.02 * velocity, -limit, limit)
+
+
+def read_fields(scene: PhysicsScene, model: mujoco.MjModel) -> States:
+    """What one world has in place of the scene's constants; one friction for both directions."""
+    where = places(scene)
+    found = {name: np.array(getattr(model, name)[where[name]]) for name in FIELDS}
+    return found | {"pair_friction": found["pair_friction"][:, 0]}
+
+
+def write_fields(scene: PhysicsScene, model: mujoco.MjModel, states: States, row: int) -> None:
+    """The opposite of `read_fields`."""
+    where = places(scene)
+    for name in FIELDS:
+        here = getattr(model, name)[where[name]]
+        value = states[name][row].astype(float)
+        getattr(model, name)[where[name]] = value[:, None] if name == "pair_friction" else value.reshape(here.shape)
+    model.body_subtreemass[scene.object_body] = model.body_mass[scene.object_body]
+
+
+def private_model(scene: PhysicsScene) -> mujoco.MjModel:
+    """A copy of the scene's model that objects may be written to, without a broad phase by size."""
+    model = copy.copy(scene.model)
+    model.geom_sameframe[scene.object_geoms] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
+    model.body_sameframe[scene.object_body] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
+    model.geom_rbound[model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE] = 1.0
+    model.opt.iterations = model.opt.ls_iterations = 100
+    return model
+
+
+def tumble(
+    scene: PhysicsScene, count: int, start: Callable[[np.random.Generator], np.ndarray], seed: int = 0
+) -> States:
+    """States while joints move at random and an object falls on the hand from the pose [7] that `start` draws."""
+    model, random = private_model(scene), np.random.default_rng(seed)
+    data, body, joints = mujoco.MjData(model), scene.object_body, len(scene.joint_dof)
+    low, high = model.jnt_range[model.dof_jntid[scene.joint_dof]].T
+    rows: list[States] = []
+    while len(rows) < count:
+        one = random.integers(len(scene.object_geoms))
+        model.geom_size[scene.object_geoms] = 1e-4  # what is switched off
+        geom = scene.object_geoms[one]
+        model.geom_size[geom] = scene.model.geom_size[geom] * random.uniform(0.85, 1.1)
+        model.body_mass[body] = random.uniform(0.05, 0.2)
+        model.body_inertia[body] = model.body_mass[body] * random.uniform(2e-4, 6e-4, 3)
+        model.body_ipos[body] = random.uniform(-0.005, 0.005, 3)
+        model.pair_friction[scene.object_pairs, :2] = random.uniform(0.5, 1.2)
+        mujoco.mj_resetData(model, data)
+        data.qpos[scene.joint_qpos] = np.maximum(low, 0) + 0.3 * random.uniform(0, 1, joints) * (high - low)
+        data.qpos[scene.object_qpos] = start(random)
+        target = data.qpos[scene.joint_qpos] + 0.6 * random.uniform(0, 1, joints) * (high - low)
+        push = random.normal(size=3) * 0.5
+        acceleration = np.zeros(model.nv)
+        for _ in range(random.integers(5, 120)):
+            acceleration = _substep(scene, model, data, target, push, acceleration)
+        if np.abs(data.qpos[scene.object_qpos[:3]]).max() < 0.25:  # still near the hand
+            state = dict(qpos=data.qpos, qvel=data.qvel, warmstart=acceleration, push=push, target=target)
+            rows.append({k: np.ravel(v).astype(np.float32) for k, v in (state | read_fields(scene, model)).items()})
+    return {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+
+
+def mujoco_substeps(scene: PhysicsScene, states: States, substeps: int) -> dict[str, np.ndarray]:
+    """C MuJoCo after some sub-steps with `pd_torque`: state, acceleration, finger_force, contacts of the first."""
+    model = private_model(scene)
+    data = mujoco.MjData(model)
+    rows = []
+    for row in range(len(states["qpos"])):
+        write_fields(scene, model, states, row)
+        mujoco.mj_resetData(model, data)
+        data.qpos[:], data.qvel[:] = states["qpos"][row], states["qvel"][row]
+        acceleration, contacts = states["warmstart"][row].astype(float), 0
+        for substep in range(substeps):
+            acceleration = _substep(
+                scene, model, data, states["target"][row].astype(float), states["push"][row], acceleration
+            )
+            if substep == 0:
+                contacts = sum(contact.dist < 0 for contact in data.contact[: data.ncon])
+        rows.append((data.qpos.copy(), data.qvel.copy(), acceleration, _tip_forces(scene, model, data), contacts))
+    names = ("qpos", "qvel", "acceleration", "finger_force", "contacts")
+    return {name: np.array(values) for name, values in zip(names, zip(*rows, strict=True), strict=True)}
+
+
+def _substep(
+    scene: PhysicsScene,
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    target: np.ndarray,
+    push: np.ndarray,
+    guess: np.ndarray,
+) -> np.ndarray:
+    """One step. Returns the acceleration [V]."""
+    data.qfrc_applied[scene.joint_dof] = pd_torque(target, data.qpos[scene.joint_qpos], data.qvel[scene.joint_dof])
+    data.xfrc_applied[scene.object_body, :3] = push
+    data.qacc_warmstart[:] = guess
+    mujoco.mj_step(model, data)
+    return data.qacc.copy()
+
+
+def _tip_forces(scene: PhysicsScene, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+    """The object's force [F, 3] N on the fingertips, contact by contact."""
+    forces, tips = np.zeros((len(scene.tip_bodies), 3)), list(scene.tip_bodies)
+    for index, contact in enumerate(data.contact[: data.ncon]):
+        bodies = model.geom_bodyid[contact.geom].tolist()
+        finger = [body for body in bodies if body != scene.object_body]
+        if contact.efc_address >= 0 and len(finger) == 1 and finger[0] in tips:
+            local = np.zeros(6)
+            mujoco.mj_contactForce(model, data, index, local)
+            on_second = contact.frame.reshape(3, 3).T @ local[:3]
+            forces[tips.index(finger[0])] += on_second if bodies[1] == finger[0] else -on_second
+    return forces
