@@ -208,7 +208,7 @@ def test_no_text_sends_people_to_the_name_of_another_project():
     files += [*ROOT.glob("*.md"), *ROOT.glob("*.toml"), ROOT / "Makefile"]
     text = {path: path.read_text() for path in files if path.suffix in ("", ".py", ".md", ".toml", ".ipynb")}
     assert len(text) > 100
-    found = r"""pip3? install[^`\n]*[\s'"]dexsim(-xhand)?(?=[\s'"`\[=<>)]|$)|['"`]dexsim(-xhand)?\["""
+    found = r"""pip3? install[^`\n]*[ \t'"]dexsim(-xhand)?(?=[\s'"`\[=<>)]|$)|['"`]dexsim(-xhand)?\["""
     wrong = [path.name for path, content in text.items() if re.search(found, content, re.MULTILINE)]
     assert wrong == ["pyproject.toml"], "there the extra `viz` names another extra"
 

@@ -1,10 +1,9 @@
-"""The command: measure what is missing, row by row and seed by seed; write tables, figures and the page."""
+"""The command: measure what is missing, row by row and seed by seed; write tables and figures."""
 
 import argparse
 import datetime
 import sys
 import time
-import tomllib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,6 @@ from dexsim.core import cli
 from dexsim.core.errors import ConfigError
 from paper.data import (
     BUDGETS,
-    REPORTS,
     Budget,
     Experiment,
     commit,
@@ -25,21 +23,17 @@ from paper.data import (
 from paper.experiments import EXPERIMENTS
 
 WORK = Path("runs") / "paper"
-PAGE = REPORTS.with_suffix(".md")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """The command. Returns its exit code."""
     parser = argparse.ArgumentParser(prog="python benchmarks/paper.py", description="The paper's tables and figures.")
-    parser.add_argument("name", choices=(*EXPERIMENTS, "all", "page"), help="a table; page: docs/results.md")
+    parser.add_argument("name", choices=(*EXPERIMENTS, "all"), help="a table")
     parser.add_argument("--budget", choices=tuple(BUDGETS), default="cpu", help="smoke, two cores, or one GPU")
     parser.add_argument("--list", action="store_true", help="rows, and which seeds are done")
     parser.add_argument("--row", nargs="+", default=[], help="these rows alone, so that several GPUs share a table")
     parser.add_argument("--output", type=Path, default=WORK / "reports", help="folder of reports and tables")
     given = parser.parse_args(argv)
-    if given.name == "page":
-        PAGE.write_text(render())
-        return 0
     budget, chosen = BUDGETS[given.budget], EXPERIMENTS.values() if given.name == "all" else [EXPERIMENTS[given.name]]
     if unknown := set(given.row) - {row.name for experiment in chosen for row in experiment.rows}:
         raise ConfigError(f"--row {sorted(unknown)[0]}: not a row of {given.name}; --list names them")
@@ -111,24 +105,3 @@ def markdown(table: list[list[str]]) -> str:
     """A table as Markdown."""
     head, *rows = table
     return "\n".join("| " + " | ".join(cells) + " |" for cells in [head, ["---"] * len(head), *rows])
-
-
-def render(folder: Path = REPORTS) -> str:
-    """The page: a section for each experiment, and the figures whose programs are no longer here."""
-    differs = tomllib.loads((REPORTS / "differs.toml").read_text())
-    sections = [_section(experiment, folder, differs[experiment.name]) for experiment in EXPERIMENTS.values()]
-    first, last = ((REPORTS / name).read_text() for name in ("head.md", "figures.md"))
-    return "\n".join([first, *sections, last])
-
-
-def _section(experiment: Experiment, folder: Path, differs: str) -> str:
-    reports, lines = reports_of(experiment, folder), [f"## {experiment.title}", ""]
-    lines += [markdown(experiment.table(experiment, reports)) if reports else "Not measured yet.", ""]
-    for path in sorted((folder / experiment.name).glob("*.svg")):
-        where = f"results/{experiment.name}/{path.name}"
-        lines += [f"![{experiment.title}: {path.stem.replace('_', ' ')}]({where})", ""]
-    sources = {
-        f"`{r['command']}` at {r['commit']}, {r['date']}, {r['hardware']['cpu_cores']} cores, {r['hardware']['device']}"
-        for r in reports.values()
-    } or {f"`python benchmarks/paper.py {experiment.name} --budget gpu --output docs/results`"}
-    return "\n".join([*lines, f"What differs: {differs}", "", f"Command: {'; '.join(sorted(sources))}.", ""])

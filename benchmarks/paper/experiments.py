@@ -1,4 +1,4 @@
-"""The experiments: each table and figure as rows, with the paper's numbers and what differs from it."""
+"""The experiments: each table and figure as rows, with the paper's numbers; docs/results.md says what differs."""
 
 from paper import figures, measure, tables
 from paper.data import Experiment, Row

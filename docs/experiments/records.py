@@ -76,7 +76,7 @@ def table() -> str:
     return (
         '<input id="filter" type="search" placeholder="Filter: all words must occur" style="width: 100%">\n'
         f'<table id="records" data-search-exclude><thead><tr>{head}</tr></thead>\n'
-        f'<tbody>{"".join(rows)}</tbody></table>\n'
+        f"<tbody>{''.join(rows)}</tbody></table>\n"
         f"<script>{_FILTER}</script>"
     )
 

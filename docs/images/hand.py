@@ -4,6 +4,7 @@ python docs/images/hand.py
 """
 
 import dataclasses
+import functools
 import io
 from pathlib import Path
 
@@ -38,7 +39,7 @@ def film(task: str, world: int, worlds: int = 16) -> Snapshot:
     policy = load_policy(task)
     env = policy.make_env(num_envs=worlds)
     reset, step = jax.jit(jax.vmap(env.reset)), jax.jit(jax.vmap(env.step))
-    show = jax.jit(jax.vmap(env.snapshot))
+    show = jax.jit(jax.vmap(functools.partial(dexsim.take_snapshot, env)))
     state, carry = reset(jax.random.split(jax.random.key(0), worlds)), policy.initial_carry(worlds)
     shots, fixed = [], np.ones(worlds, bool)  # the task itself changes no command
     for tick in range(round(SECONDS / env.control_period)):

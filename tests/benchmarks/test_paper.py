@@ -69,8 +69,6 @@ def test_smoke(paper, here, capsys, name):
     assert again == {path: path.stat().st_mtime_ns for path in output.rglob("report.json")}
     paper.command.main([name, "--budget", "smoke", "--output", str(output), "--list"])
     assert "0 of 1 seeds" not in capsys.readouterr().out
-    page = paper.command.render(output)
-    assert "Stress over compression of the skin" in page and "smoke budget" in page
 
 
 # --- rows and seeds that are done -----------------------------------------------------------------------
@@ -290,7 +288,7 @@ class TestHeldOut:
         assert np.asarray(objects[0].active)[0].sum() == 2 and np.asarray(objects[1].active)[0].sum() == 3
 
 
-# --- tables and page ------------------------------------------------------------------------------------
+# --- tables ---------------------------------------------------------------------------------------------
 
 
 def test_a_cell_is_of_one_seed_or_of_several(paper):
@@ -328,10 +326,6 @@ def test_reports_of_other_weights_do_not_count(paper, tmp_path):
 def test_weights_tell_policies_apart(paper):
     files = [asset_path(f"policies/{name}.msgpack") for name in ("grasp", "rotate", "rotate_clear")]
     assert len({paper.data.weights_of(file) for file in files}) == 3
-
-
-def test_the_page_agrees_with_the_reports(paper):
-    assert paper.command.PAGE.read_text() == paper.command.render(), "run python benchmarks/paper.py page"
 
 
 def test_committed_tables_agree_with_the_reports(paper):
