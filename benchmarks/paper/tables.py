@@ -24,16 +24,8 @@ def cell(entries: Iterable[dict[str, Any] | None], digits: int = 3) -> str:
 
 def percent(entries: Iterable[dict[str, Any] | None]) -> str:
     """`cell` of shares, in per cent."""
-    scaled = [
-        {
-            name: None if value is None else 100 * value
-            for name, value in entry.items()
-            if name in ("mean", "low", "high")
-        }
-        for entry in entries
-        if entry
-    ]
-    return cell(scaled)
+    parts = ("mean", "low", "high")
+    return cell({k: v and 100 * v for k, v in entry.items() if k in parts} for entry in entries if entry)
 
 
 def _middle(entry: dict[str, Any]) -> Any:
@@ -177,13 +169,7 @@ def held_out(experiment: Experiment, reports: Reports) -> list[list[str]]:
 
 
 def _object(name: str, row: dict[str, Any]) -> list[str]:
-    return [
-        name,
-        percent([row["held"]]),
-        cell([row["r_resultant"]]),
-        cell([row["r_taxels"]]),
-        cell([row["force_error_n"]]),
-    ]
+    return [name, percent([row["held"]]), *(cell([row[key]]) for key in ("r_resultant", "r_taxels", "force_error_n"))]
 
 
 # --- sweeps ---------------------------------------------------------------------------------------------
