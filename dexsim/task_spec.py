@@ -30,11 +30,11 @@ class TurnSpec:
     step: float = setting(np.pi / 2, unit="rad", low=-np.pi, high=np.pi)
     """Angle from one goal to the next; negative for turning the other way."""
     angle: float = setting(0.3, unit="rad", low=0.01, high=1.5)
-    """A goal is reached within this angle ..."""
+    """Largest angle to a goal at which it is reached."""
     distance: float = setting(0.05, unit="m", low=0.001, high=0.5)
-    """... this far from the reference ..."""
+    """Largest distance from the reference at which a goal is reached."""
     spin: float = setting(0.0, unit="rad/s", low=0.0, high=1000.0)
-    """... at no more than this spin about the axis; 0 for any."""
+    """Largest spin about the axis at which a goal is reached; 0 for any."""
 
     def __post_init__(self) -> None:
         validate(self)
