@@ -25,15 +25,12 @@ import numpy as np
 import touch_accuracy as accuracy
 
 from dexsim.geometry import grid, sdf, surface_points
-from dexsim.geometry.grid import GridConfig
-from dexsim.geometry.surface_points import PointsConfig
 from dexsim.hand.kinematics import forward_kinematics, taxel_positions
 from dexsim.touch.feel import feel, feel_links, spread
 from dexsim.touch.reduce import reduce_touch, reduce_touch_links
 from dexsim.touch.skin import Skin, skin_stress
 
 SKIN = Skin()
-CLASSES = 8
 
 
 def union() -> sdf.Shape:
@@ -58,35 +55,18 @@ class Case:
 
     name: str
     geometry: object
-    per_env: object = None  # function (geometry, index) -> object of that environment
     path: str = "links"  # or "taxels": positions in the palm frame first; or "brute"
 
 
 def cases(names: list[str] | None) -> list[Case]:
     box = accuracy.turned_solid("box")
-    kinds = ("box", "cylinder", "sphere", "capsule")
-    shapes = [accuracy.turned_solid(kind, seed) for seed in range(2) for kind in kinds]
-    points = surface_points.from_shape(box, PointsConfig(table=False))
-
-    def classes(dtype: str) -> grid.Grid:
-        return grid.stack([grid.bake(shape, GridConfig(dtype=dtype)) for shape in shapes[:CLASSES]])
-
-    def own_class(geometry, index):
-        return grid.select(geometry, index % CLASSES)
-
+    points = surface_points.from_shape(box)
     makers = {
         "closed box": lambda n: Case(n, box),
         "closed box, palm frame": lambda n: Case(n, box, path="taxels"),
         "closed union of 4": lambda n: Case(n, union()),
         "grid float32": lambda n: Case(n, grid.bake(box)),
-        "grid float16": lambda n: Case(n, grid.bake(box, GridConfig(dtype="float16"))),
-        "grid quadratic float16": lambda n: Case(
-            n, grid.bake(box, GridConfig(dtype="float16", interpolation="quadratic"))
-        ),
-        f"grid float32, {CLASSES} classes": lambda n: Case(n, classes("float32"), own_class),
-        f"grid float16, {CLASSES} classes": lambda n: Case(n, classes("float16"), own_class),
         "points 1024, scan": lambda n: Case(n, points),
-        "points 1024, table": lambda n: Case(n, surface_points.from_shape(box)),
         "points 1024, brute force": lambda n: Case(n, points, path="brute"),
     }
     return [make(name) for name, make in makers.items() if names is None or any(part in name for part in names)]
@@ -103,7 +83,7 @@ def reader(case: Case, hand, kinematics: bool):
     total = jnp.ones(5)
 
     def read(geometry, pose, shift, index):
-        geometry = case.per_env(geometry, index) if case.per_env else geometry
+        del index
         pose = forward_kinematics(hand, pose) if kinematics else pose
         if case.path == "links":
             touch = feel_links(hand, pose, geometry, shift, jnp.eye(3), total, SKIN)
@@ -242,12 +222,7 @@ def costs(options, hand, file) -> None:
             rows.append(row)
         by = {row["case"]: row["ms"] for row in rows}
         show(f"cost, {num_envs} environments x 600 taxels" + (f", step {step:.2f} ms" if step else ""), rows, file)
-        for top, bottom in (
-            (f"grid float32, {CLASSES} classes", "grid float32"),
-            (f"grid float16, {CLASSES} classes", "grid float16"),
-            ("points 1024, brute force", "points 1024, scan"),
-            ("points 1024, brute force", "points 1024, table"),
-        ):
+        for top, bottom in (("points 1024, brute force", "points 1024, scan"),):
             suffix = " + kinematics" if options.kinematics else ""
             if top + suffix in by and bottom + suffix in by:
                 print(f"  {top} / {bottom}: {by[top + suffix] / by[bottom + suffix]:.2f}")

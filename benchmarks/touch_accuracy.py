@@ -16,8 +16,6 @@ import trimesh
 from dexsim.core.assets import asset_path
 from dexsim.geometry import grid, mesh, sdf, surface_points
 from dexsim.geometry.distance import signed_distance
-from dexsim.geometry.grid import GridConfig
-from dexsim.geometry.surface_points import PointsConfig
 from dexsim.hand.kinematics import HandPose
 from dexsim.hand.layout import lattice, on_surface, read_layout
 from dexsim.touch import feel as tactile
@@ -94,11 +92,9 @@ def distance_errors(quick: bool) -> list[dict]:
 
     def methods():
         for nodes in (32, 64) if quick else (32, 64, 128):
-            yield f"grid {nodes}", lambda s, n=nodes: grid.bake(s, GridConfig(nodes=n))
-        yield "grid 64 float16", lambda s: grid.bake(s, GridConfig(dtype="float16"))
-        yield "grid 64 quadratic", lambda s: grid.bake(s, GridConfig(interpolation="quadratic"))
+            yield f"grid {nodes}", lambda s, n=nodes: grid.bake(s, nodes=n)
         for count in (1024,) if quick else (256, 1024, 4096):
-            yield f"points {count}", lambda s, n=count: surface_points.from_shape(s, PointsConfig(count=n, cells=24))
+            yield f"points {count}", lambda s, n=count: surface_points.from_shape(s, n)
 
     rows, run = [], jax.jit(signed_distance)
 
@@ -133,8 +129,7 @@ def distance_errors(quick: bool) -> list[dict]:
         lambda p: mesh.signed_distance(ring, p)[0],
         (
             ("grid 64", grid.bake(ring, cache=False)),
-            ("grid 64 quadratic", grid.bake(ring, GridConfig(interpolation="quadratic"), cache=False)),
-            ("points 1024", surface_points.from_mesh(ring, PointsConfig(cells=24))),
+            ("points 1024", surface_points.from_mesh(ring)),
         ),
     )
     return rows
@@ -233,8 +228,7 @@ def _geometries() -> dict:
     return {
         "closed form": ball,
         "grid": grid.bake(ball),
-        "grid quadratic": grid.bake(ball, GridConfig(interpolation="quadratic")),
-        "points": surface_points.from_shape(ball, PointsConfig(block=16, table=False)),
+        "points": surface_points.from_shape(ball),
     }
 
 
@@ -322,7 +316,7 @@ def random_grasps(shape: sdf.Shape, count: int, seed: int = 0) -> HandPose:
     """
     skin, rng = shipped_skin(), np.random.default_rng(seed)
     fingers, taxels = skin.taxel_area.shape
-    surface = surface_points.from_shape(shape, PointsConfig(count=4096, table=False))
+    surface = surface_points.from_shape(shape, 4096)
     real = np.flatnonzero(np.abs(np.asarray(surface.position)).max(1) < 1)
     pick = rng.choice(real, (count, fingers))
     point, normal = np.asarray(surface.position)[pick], np.asarray(surface.normal)[pick]
@@ -348,7 +342,6 @@ def grasps(quick: bool) -> list[dict]:
     """Contacts, force and centre of random grasps by the grid and by the paper's method, against closed forms."""
     rows, skin, hand = [], Skin(margin=0.0), shipped_skin()
     count = 100 if quick else 1000
-    config = PointsConfig(count=1024)
     for kind in ("sphere", "box", "cylinder"):
         shape = turned_solid(kind)
         pose = random_grasps(shape, count)
@@ -370,12 +363,11 @@ def grasps(quick: bool) -> list[dict]:
         found = {
             "closed form": feel(shape),
             "grid": feel(grid.bake(shape)),
-            "grid quadratic": feel(grid.bake(shape, GridConfig(interpolation="quadratic"))),
-            "points 1024": feel(surface_points.from_shape(shape, config)),
+            "points 1024": feel(surface_points.from_shape(shape)),
         }
         if not quick:
-            found["points 4096"] = feel(surface_points.from_shape(shape, dataclasses.replace(config, count=4096)))
-        pairs = [("grid", "closed form"), ("grid quadratic", "closed form")]
+            found["points 4096"] = feel(surface_points.from_shape(shape, 4096))
+        pairs = [("grid", "closed form")]
         pairs += [(name, "grid") for name in found if name.startswith("points")]
         for name, base in pairs:
             (depth, force, centre, cost), (depth_b, force_b, centre_b, _) = found[name], found[base]

@@ -220,7 +220,6 @@ def _replay(
 
 def _summed(force: np.ndarray, hand: Any) -> dict[str, list]:
     """Force [T, F] N and centre [T, F, 2] on the lattice (column, row; None without touch) of taxel forces."""
-    from dexsim.render.figures import lattice_centre
 
     pairs = [lattice_centre(np.asarray(force[:, finger], float), hand.taxel_grid) for finger in range(hand.num_fingers)]
     centre = np.stack([pair[1] for pair in pairs], 1)
@@ -245,3 +244,11 @@ def _agreement(first: np.ndarray, second: np.ndarray, hand: Any) -> dict[str, An
         "force_difference_rms_n": float(np.sqrt(np.mean(off**2))),
         "force_rms_n": float(np.sqrt(np.mean(np.square(b["force_n"])))),
     }
+
+
+def lattice_centre(force: np.ndarray, grid: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Total [T] N and force-weighted centre [T, 2] in (column, row) of one finger [T, N]; NaN without force."""
+    place = np.stack(np.divmod(np.arange(grid[0] * grid[1]), grid[1]), -1)
+    total = force.sum(-1)
+    centre = force @ place / np.where(total > 0, total, 1.0)[:, None]
+    return total, np.where(total[:, None] > 0, centre, np.nan)

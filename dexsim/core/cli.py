@@ -85,7 +85,7 @@ def naming_options(cls: type, default: Any = None) -> Iterator[None]:
 
 def _option_names(cls: type, default: Any = None, path: str = "--") -> dict[str, str]:
     """The option of every field of a dataclass and of those nested in it, by class and field."""
-    cls, names = typing.get_origin(cls) or cls, {}
+    cls, names = typing.get_origin(cls) or cls, dict[str, str]()
     for field in dataclasses.fields(cls):
         value = getattr(default, field.name, field.default)
         if value is dataclasses.MISSING and field.default_factory is not dataclasses.MISSING:
