@@ -3,15 +3,16 @@
 dexsim train --task grasp        # the same as python -m dexsim_ppo.train --task grasp
 """
 
+import difflib
 import importlib
 import sys
 from collections.abc import Sequence
 
 from dexsim.core import cli
 from dexsim.core.errors import ConfigError
-from dexsim.core.options import closest
 
 COMMANDS = {
+    "tasks": ("dexsim.catalog", "list tasks, hands and shipped policies"),
     "train": ("dexsim_ppo.train", "train a task"),
     "evaluate": ("dexsim_ppo.evaluate", "measure a policy over fixed episodes"),
     "view": ("dexsim.view.__main__", "show a hand live in the browser"),
@@ -49,7 +50,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     name, *rest = argv
     if name not in COMMANDS:
-        raise ConfigError(f"{name}: no such command{closest(name, COMMANDS)}; see dexsim --help")
+        meant = "".join(f" (perhaps {near})" for near in difflib.get_close_matches(name, COMMANDS, n=1))
+        raise ConfigError(f"{name}: no such command{meant}; see dexsim --help")
     return importlib.import_module(COMMANDS[name][0]).main(rest)
 
 

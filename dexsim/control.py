@@ -7,13 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dexsim.core.config import setting, validate
+from dexsim.core.config import Config, setting
 from dexsim.force_loop import ForceLoop
 from dexsim.hand.kinematics import Hand, forward_kinematics, taxel_normals
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Control:
+class Control(Config):
     """How an action in [-1, 1] moves the joint targets."""
 
     step: float = setting(0.2, unit="rad", low=0.001, high=1.0)
@@ -26,9 +26,6 @@ class Control:
     hard it presses."""
     force: ForceLoop = setting(ForceLoop())
     """Correction of the force command by the estimated force, for tasks that have one."""
-
-    def __post_init__(self):
-        validate(self)
 
 
 def move_target(control: Control, hand: Hand, target: jax.Array, action: jax.Array, measured: jax.Array) -> jax.Array:

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dexsim.core.config import setting, validate
+from dexsim.core.config import Config, setting
 
 Array = TypeVar("Array", jax.Array, np.ndarray)
 
@@ -20,7 +20,7 @@ _LOW, _HIGH = 0.0, 1.5
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class ForceLoop:
+class ForceLoop(Config):
     """Settings of the loop."""
 
     gain: float = setting(0.0, unit="1/s", low=0.0, high=20.0)
@@ -29,9 +29,6 @@ class ForceLoop:
     """Largest correction of the command."""
     slew: float = setting(1.0, unit="1/s", low=0.001, high=100.0)
     """Largest rate of the correction."""
-
-    def __post_init__(self) -> None:
-        validate(self)
 
 
 def target_force(command: Array, span: tuple[float, float]) -> Array:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from dexsim.core.config import setting, validate
+from dexsim.core.config import Config, setting
 from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import pytree_dataclass
 from dexsim.geometry import rotations
@@ -224,7 +224,7 @@ FIELDS: dict[str, ObservationField] = {
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class ObservationConfig:
+class ObservationConfig(Config):
     """What of the touch and orientation signals the policy sees (the paper's ablations)."""
 
     weighting: str = setting("force", choices=("force", "none"))
@@ -239,9 +239,6 @@ class ObservationConfig:
     """Fields that only the critic gets on top; those that only a simulator knows, too."""
     force: ForceEstimate = setting(ForceEstimate())
     """Estimate of the fingers' force, for the field `finger_force` and for `Control.force`."""
-
-    def __post_init__(self):
-        validate(self)
 
 
 GRASP = (

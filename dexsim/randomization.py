@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dexsim.actuator.drive import Actuator
-from dexsim.core.config import check_ranges, setting, validate
+from dexsim.core.config import Config, check_ranges, setting
 from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import pytree_dataclass
 from dexsim.core.ranges import sample_extreme, uniforms
@@ -65,7 +65,7 @@ _KEYS = (
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Randomization:
+class Randomization(Config):
     """Ranges (low, high), drawn uniformly for every joint or finger at every episode start."""
 
     scale: float = setting(1.0, unit="1", low=0.0, high=3.0)
@@ -122,7 +122,7 @@ class Randomization:
     nominal. For evaluation on hands that training never had: `extremes` 1 and `beyond` above 0."""
 
     def __post_init__(self):
-        validate(self)
+        super().__post_init__()
         check_ranges(self, *_SPANS)
         if self.beyond and not self.extremes:
             raise ConfigError(

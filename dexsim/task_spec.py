@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dexsim.control import Control
-from dexsim.core.config import setting, validate
+from dexsim.core.config import Config, setting
 from dexsim.core.errors import ConfigError
 from dexsim.force_loop import correct_command
 from dexsim.hand.kinematics import Hand
@@ -22,7 +22,7 @@ from dexsim.touch.estimate import estimate_force
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class TurnSpec:
+class TurnSpec(Config):
     """Goals that follow one another about an axis, as in the rotation task."""
 
     axis: tuple[float, float, float] = setting((1.0, 0.0, 0.0), unit="1", low=-1.0, high=1.0)
@@ -30,14 +30,14 @@ class TurnSpec:
     step: float = setting(np.pi / 2, unit="rad", low=-np.pi, high=np.pi)
     """Angle from one goal to the next; negative for turning the other way."""
     angle: float = setting(0.3, unit="rad", low=0.01, high=1.5)
-    """A goal is reached within this angle ..."""
+    """Largest angle to a goal at which it is reached."""
     distance: float = setting(0.05, unit="m", low=0.001, high=0.5)
-    """... this far from the reference ..."""
+    """Largest distance from the reference at which a goal is reached."""
     spin: float = setting(0.0, unit="rad/s", low=0.0, high=1000.0)
-    """... at no more than this spin about the axis; 0 for any."""
+    """Largest spin about the axis at which a goal is reached; 0 for any."""
 
     def __post_init__(self) -> None:
-        validate(self)
+        super().__post_init__()
         if np.linalg.norm(self.axis) < 1e-6:
             raise ConfigError("TurnSpec.axis is (0, 0, 0): give a direction")
         if abs(self.step) < 0.1:
@@ -50,7 +50,7 @@ class TurnSpec:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class TaskSpec:
+class TaskSpec(Config):
     """One task, as a host sees it. SI units, palm frame."""
 
     name: str
@@ -77,7 +77,7 @@ class TaskSpec:
     """Force in N of a touching finger at the commands 0 and 1; None for a task without a force command."""
 
     def __post_init__(self) -> None:
-        validate(self)
+        super().__post_init__()
         if self.control.force.gain and self.finger_force is None:
             raise ConfigError(f"task {self.name!r}: Control.force needs a force command, which the task has not")
 

@@ -28,7 +28,6 @@ from dexsim.core import cli
 from dexsim.core.compilation import collector_paused, jit
 from dexsim.core.config import override, setting, validate
 from dexsim.core.errors import ConfigError
-from dexsim.core.options import Option
 from dexsim.core.progress import progress
 from dexsim.env.evaluation import evaluation_of
 from dexsim.registry import find_task
@@ -284,8 +283,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     entry, hand = find_task(policy.task), policy.find_hand(arguments.hand)
     if seconds and not any(field.name == "evaluation_seconds" for field in dataclasses.fields(entry.config_class)):
         raise ConfigError(f"--seconds {arguments.seconds:g}: task {policy.task!r} has no evaluation_seconds to set")
-    with cli.naming_options(entry.config_class, entry.config(), functools.partial(_typed, arguments)):
-        env = policy.build_env(backend=arguments.backend, num_envs=chunk, hand=hand)
+    env = policy.build_env(backend=arguments.backend, num_envs=chunk, hand=hand)
     if video and isinstance(env, Adapted):
         raise ConfigError(f"--video {video}: {env.name!r} draws nothing")
     evaluator, episodes = Evaluator(env, chunk), arguments.episodes or default_episodes(env)
@@ -303,14 +301,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments.video:
         print(f"video: {write_video(env, snapshots, arguments.video, arguments.video_quality)}")
     return 0
-
-
-def _typed(arguments: EvaluateArguments, field: Option) -> str | None:
-    """What was typed before the value of a field of the task's configuration; None if it is the file's."""
-    path = ".".join(field.path)
-    if any(entry.partition("=")[0] == path for entry in arguments.set):
-        return f"--set {path}="
-    return "--seconds " if path == "evaluation_seconds" and arguments.seconds else None
 
 
 if __name__ == "__main__":

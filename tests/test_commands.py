@@ -1,22 +1,23 @@
-"""Every option of every command: documented, shown by --help with unit, range and choices, refused by its name."""
+"""Every option of every command: documented, and named in errors as it is typed."""
 
+import ast
 import dataclasses
 import functools
 import importlib
+import inspect
+import itertools
 import os
 import re
 import subprocess
 import sys
+import textwrap
 import types
 import typing
 
 import pytest
 import tyro
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from dexsim.core import cli
-from dexsim.core.options import field_docs
 from dexsim.registry import TASKS
 from dexsim_ppo.train import preset_arguments
 
@@ -129,6 +130,18 @@ def number(value):
     return f"{value:.0f}" if value == int(value) and abs(value) < 1e10 else f"{value:.7g}"
 
 
+@functools.cache
+def field_docs(cls):
+    """The docstring under each field of a dataclass, on one line."""
+    docs = {}
+    for base in reversed([c for c in cls.__mro__ if dataclasses.is_dataclass(c)]):
+        body = ast.parse(textwrap.dedent(inspect.getsource(base))).body[0].body
+        for field, after in itertools.pairwise(body):
+            if isinstance(field, ast.AnnAssign) and isinstance(after, ast.Expr):
+                docs[ast.unparse(field.target)] = " ".join(ast.literal_eval(after.value).split())
+    return docs
+
+
 # --- documentation --------------------------------------------------------------------------------------
 
 
@@ -154,51 +167,6 @@ def test_every_option_says_what_it_is(command, task):
     assert lacking == []
 
 
-# --- help -----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("command", "task"), CASES)
-def test_the_whole_help_shows_unit_range_choices_and_default(command, task, capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "80")
-    given = COMMANDS[command][1] if command == "dexsim_ppo.evaluate" else []
-    page = entries(shown(capsys, command, "--help-all", *given, *(["--task", task] if task else [])))
-    for found in options(command, task):
-        facts, words = page.pop(found.name)
-        assert words == field_docs(found.owner)[found.field.name]
-        meta = found.field.metadata
-        if meta.get("unit") not in (None, "", "1"):
-            assert f"unit: {meta['unit']};" in facts
-        for end in ("low", "high"):
-            if meta.get(end) is not None:
-                assert re.search(rf"range: [^;]*(?<![\d.]){re.escape(number(meta[end]))}(?![\d.])", facts), facts
-        if found.choices:
-            assert f"choices: {', '.join(found.choices)};" in facts
-        if found.default is dataclasses.MISSING:
-            assert facts == "required"
-        elif isinstance(found.default, (int, float)) and not isinstance(found.default, bool):
-            assert facts.endswith(f"default: {number(found.default)}")
-        elif isinstance(found.default, str) and found.default:
-            assert facts.endswith(f"default: {found.default}")
-        else:
-            assert "default: " in facts
-    assert not page
-
-
-@pytest.mark.parametrize(("command", "task"), CASES)
-def test_the_short_help_has_all_of_the_command_and_nothing_of_its_groups(command, task, capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "80")
-    task_option = ["--task", task] if task else []
-    text = shown(capsys, command, "--help", *task_option)
-    names = [found.name for found in options(command, task)]
-    assert set(entries(text)) - {"--help-all"} == {name for name in names if "." not in name}
-    groups = {name[2:].partition(".")[0] for name in names if "." in name}
-    for group in groups:
-        inside = {name for name in names if name.startswith(f"--{group}.")}
-        assert re.search(rf"\n  --{group}\.\*  [^\[]+\[{len(inside)}\s+options\]", text)
-        assert set(entries(shown(capsys, command, "--help-all", group, *task_option))) == inside
-    assert ("--help-all" in text) == bool(groups)
-
-
 def test_help_starts_no_device():
     """With a platform that does not exist every start of JAX's devices fails."""
     environment = os.environ | {"JAX_PLATFORMS": "none_such", "COLUMNS": "80"}
@@ -212,91 +180,38 @@ def test_help_starts_no_device():
 # --- errors ---------------------------------------------------------------------------------------------
 
 
-def refusal(command, task, argv):
-    cls, default, _ = load(command, task)
+@pytest.mark.parametrize(
+    ("command", "option", "says"),
+    [
+        ("dexsim_ppo.train", ["--env.push-probability", "3"], "--env.push-probability 3: must be between 0 and 1"),
+        ("dexsim_ppo.train", ["--ppo.num-envs", "0"], "--ppo.num-envs 0: "),
+        ("dexsim_ppo.train", ["--env.curl", "0.2", "-0.2"], "--env.curl (0.2, -0.2): the first must not exceed"),
+        ("dexsim_ppo.evaluate", ["--chunk", "-1"], "--chunk -1: "),
+        ("dexsim.randomization_check", ["--num-envs", "0"], "--num-envs 0: "),
+    ],
+)
+def test_a_value_out_of_range_is_refused_by_the_options_name(command, option, says):
+    cls, default, _ = load(command, "grasp" if command == "dexsim_ppo.train" else "")
     if default is not None:
         cls = cls[type(default.env)]
-    with pytest.raises(cli.UsageError) as caught:
-        cli.parse(cls, [*COMMANDS[command][1], *argv], prog=command, description="", default=default)
-    text = str(caught.value)
-    assert "\n" not in text
-    return text
+    with pytest.raises(cli.UsageError) as error:
+        cli.parse(cls, [*COMMANDS[command][1], *option], prog=command, description="", default=default)
+    assert str(error.value).startswith(says) and "\n" not in str(error.value)
 
 
-def width(found):
-    """How many values it takes."""
-    arguments = typing.get_args(found.hint)
-    return len(arguments) if typing.get_origin(found.hint) is tuple and Ellipsis not in arguments else 1
+def test_a_misspelt_option_is_refused_and_the_right_one_named(capsys):
+    cls, default, _ = load("dexsim_ppo.train", "grasp")
+    with pytest.raises(SystemExit) as stop:
+        cli.parse(cls[type(default.env)], ["--env.push-probabilty", "1"], prog="x", description="", default=default)
+    assert stop.value.code == 2 and "--env.push-probability" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("command", "task"), CASES)
-@settings(max_examples=12, deadline=None)
-@given(data=st.data())
-def test_a_bad_value_is_refused_by_the_options_name(command, task, data):
-    candidates = [f for f in options(command, task) if f.numeric or f.choices]
-    if not candidates:
-        return
-    found = data.draw(st.sampled_from(candidates), label="option")
-    low, high = found.field.metadata.get("low"), found.field.metadata.get("high")
-    count = 2 if typing.get_origin(found.hint) is types.UnionType and "tuple" in str(found.hint) else width(found)
-    outside = [*(() if low is None else (low - 1,)), *(() if high is None else (2 * high + 1,))]
-    if found.choices:
-        bad = data.draw(st.sampled_from(["nonsense", "12", "Auto"]), label="value")
-    elif found.types & {float}:
-        bad = str(data.draw(st.sampled_from([*outside, "nan", "inf", "many"]), label="value"))
-    else:
-        bad = str(data.draw(st.sampled_from([*outside, "1.5", "many"]), label="value"))
-    text = refusal(command, task, [found.name, *[bad] * count])
-    assert text.startswith(f"{found.name} "), text
-    assert found.owner.__name__ not in text
-    if found.choices:
-        assert ", ".join(found.choices) in text
-    elif re.fullmatch(r"-?[\d.]+", bad) and "expected" not in text:
-        assert all(number(end) in text for end in (low, high) if end is not None)
+def test_the_catalog_lists_what_there_is(capsys):
+    from dexsim.catalog import main
 
-
-@pytest.mark.parametrize(("command", "task"), CASES)
-@settings(max_examples=8, deadline=None)
-@given(data=st.data())
-def test_a_misspelt_option_is_refused_and_the_right_one_named(command, task, data):
-    long = [found for found in options(command, task) if found.name.startswith("--") and len(found.name) > 5]
-    found = data.draw(st.sampled_from(long))
-    at = data.draw(st.integers(4, len(found.name) - 1))
-    wrong = found.name[:at] + "qq" + found.name[at:]
-    text = refusal(command, task, [wrong, "1"])
-    assert re.match(rf"{re.escape(wrong)}: no such option \(perhaps --[\w.-]+\); see --help$", text)
-
-
-def test_reversed_ranges_are_refused_by_the_options_name():
-    command, task = "dexsim_ppo.train", "grasp"
-    seen = 0
-    for found in options(command, task):
-        value, meta = found.default, found.field.metadata
-        if found.hint != tuple[float, float] or value[0] >= value[1] or meta.get("low") is None:
-            continue
-        try:
-            dataclasses.replace(found.owner(), **{found.field.name: value[::-1]})
-        except cli.ConfigError:
-            text = refusal(command, task, [found.name, *map(str, value[::-1])])
-            assert text == f"{found.name} {number(value[1])} {number(value[0])}: the first must not exceed the second"
-            seen += 1
-    assert seen > 20
-
-
-@pytest.mark.parametrize("count", [0, -1])
-def test_no_environments_are_refused_everywhere(count):
-    import dexsim
-
-    for command, task, name in (
-        ("dexsim_ppo.train", "grasp", "--ppo.num-envs"),
-        ("dexsim_ppo.train", "grasp", "--evaluation-chunk"),
-        ("dexsim.randomization_check", "", "--num-envs"),
-    ):
-        assert refusal(command, task, [name, str(count)]).startswith(f"{name} {count}")
-    if count < 0:
-        assert refusal("dexsim_ppo.evaluate", "", ["--chunk", str(count)]).startswith(f"--chunk {count}")
-    with pytest.raises(cli.ConfigError, match=f"{count}.*must be at least 1"):
-        dexsim.make("grasp", num_envs=count)
+    assert main([]) == 0
+    shown = capsys.readouterr().out
+    assert all(name in shown for name in ("rotate_clear", "xhand_right (default)", "leap_like", "grasp"))
 
 
 def test_classes_of_one_command_have_names_of_their_own():

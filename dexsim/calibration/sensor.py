@@ -6,7 +6,6 @@ taxel was pressed, which a flat plate moved by a known way gives.
 
     fit = fit_finger(TaxelPress(force=gauge, reading=taxels, depth=depth, area=area), thickness=0.002)
     force = fit.correct(reading.sum(-1))
-    save_fit("sensor.json", {"thumb": fit, ...})
 
 The line is fitted robustly (`dexsim.core.robust_line`), to samples beyond the forces that still read zero: among them
 noise decides which samples read at all, which would bend the line. A zero far above them is a reading that was lost:
@@ -19,16 +18,12 @@ Shapes: T samples, N taxels.
 from __future__ import annotations
 
 import dataclasses
-import json
-from pathlib import Path
 
 import numpy as np
 from scipy.special import stdtrit
 
 from dexsim.calibration.joint import find_presses
-from dexsim.core.config import from_dict, to_dict
-from dexsim.core.errors import AssetError, DexsimError
-from dexsim.core.files import read_bounded
+from dexsim.core.errors import DexsimError
 from dexsim.core.robust_line import LEAST_GROUPS, Regression, fit_line, regress
 
 _RESAMPLES = 400
@@ -146,36 +141,6 @@ def fit_finger(
         c10, c01, said = _material(press, keep, group, thickness, two_terms)
         notes += said
     return FingerFit(gain, offset, threshold, c10, c01, residual, int(above.sum()), tuple(notes))
-
-
-def save_fit(path: str | Path, fits: dict[str, FingerFit]) -> Path:
-    """Write the fits by finger as JSON."""
-    path = Path(path)
-    path.write_text(json.dumps({name: to_dict(fit) for name, fit in fits.items()}, indent=1) + "\n")
-    return path
-
-
-def load_fit(path: str | Path) -> dict[str, FingerFit]:
-    """Read what `save_fit` wrote.
-
-    Raises:
-      AssetError: missing, broken, or a gain that no sensor has.
-    """
-    try:
-        table = json.loads(read_bounded(Path(path)))
-        fits = {name: from_dict(FingerFit, entry) for name, entry in table.items()}
-    except FileNotFoundError:
-        raise AssetError(f"{path}: no such file") from None
-    except (OSError, ValueError, AttributeError, TypeError, RecursionError, DexsimError) as error:
-        raise AssetError(f"{path}: not a sensor fit ({str(error):.100})") from None
-    for name, fit in fits.items():
-        # Readings are newtons or counts, of 1 mN to 1 N each.
-        if not 0.01 <= fit.gain.value <= 1e3 or not np.isfinite(fit.offset.value):
-            gain, offset = fit.gain.value, fit.offset.value
-            raise AssetError(
-                f"{path}: {name:.40}: gain {gain:g} and offset {offset:g}: must be 0.01 to 1000, and finite"
-            )
-    return fits
 
 
 def _checked(press: TaxelPress) -> tuple[np.ndarray, np.ndarray]:

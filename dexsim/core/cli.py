@@ -1,25 +1,25 @@
 """What the commands share: options from dataclasses, one-line errors, compilation caches."""
 
 import contextlib
+import dataclasses
 import errno
 import importlib.metadata
-import io
 import json
 import math
 import os
 import platform
 import re
 import sys
+import typing
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 from dexsim.core.assets import cache_path
 from dexsim.core.errors import AssetError, ConfigError, DexsimError, DexsimWarning
 from dexsim.core.files import is_device, make_private, write_whole
 from dexsim.core.install import DISTRIBUTION
-from dexsim.core.options import Option, explain, group_docs, help_page, in_option_names, options_of
 
 T = TypeVar("T")
 
@@ -59,72 +59,48 @@ def _show_warning(message: Warning | str, category: type[Warning], *place: Any, 
 
 
 def parse(cls: type[T], argv: Sequence[str], *, prog: str, description: str, default: T | None = None) -> T:
-    """Options of a dataclass, through tyro; what it refuses becomes one line that names the option.
-
-    `--help` and `--help-all` print the options and exit.
+    """Options of a dataclass, through tyro, which answers `--help` and refuses what does not parse.
 
     Raises:
-      UsageError: an option is unknown, or its value is of the wrong type or out of range.
+      UsageError: a value is out of range; names the option.
     """
     import tyro
 
-    page = _help_asked(argv)
-    if page is not False:
-        groups = [".".join(path).replace("_", "-") for path in group_docs(cls, default)]
-        if page and not groups:
-            page = None
-        elif page and page not in groups:
-            raise UsageError(f"--help-all {page}: choose from {', '.join(groups)}")
-        print(help_page(cls, default, prog=prog, description=description, group=page), flush=True)
-        raise SystemExit(0)
-    stderr = io.StringIO()
     kwargs: dict[str, Any] = {} if default is None else {"default": default}
-    try:
-        with contextlib.redirect_stderr(stderr), naming_options(cls, default):
-            return tyro.cli(cls, args=list(argv), prog=prog, description=description, **kwargs)
-    except SystemExit as stop:
-        if not stop.code:
-            raise
-        message = explain(argv, options_of(cls, default), _one_line(stderr.getvalue()))
-        raise UsageError(f"{message}; see --help") from None
+    with naming_options(cls, default):
+        return tyro.cli(cls, args=list(argv), prog=prog, description=description, **kwargs)
 
 
 @contextlib.contextmanager
-def naming_options(
-    cls: type, default: Any = None, typed: Callable[[Option], str | None] = "{.name} ".format
-) -> Iterator[None]:
-    """Errors from within that name a field of these options name the option as it is typed; see `in_option_names`."""
+def naming_options(cls: type, default: Any = None) -> Iterator[None]:
+    """Errors from within that name a field of these options, such as `GraspConfig.push_speed = 9`, name the option as
+    it is typed, `--env.push-speed 9`."""
     try:
         yield
-    except ConfigError as error:
-        raise UsageError(in_option_names(str(error), options_of(cls, default), typed)) from None
-    except AssetError as error:
-        raise AssetError(in_option_names(str(error), options_of(cls, default), typed)) from None
+    except (ConfigError, AssetError) as error:
+        names = _option_names(cls, default)
+        text = re.sub(r"\b(\w+\.\w+)( =)?", lambda match: names.get(match[1], match[0]), str(error))
+        raise (UsageError if isinstance(error, ConfigError) else AssetError)(text) from None
+
+
+def _option_names(cls: type, default: Any = None, path: str = "--") -> dict[str, str]:
+    """The option of every field of a dataclass and of those nested in it, by class and field."""
+    cls, names = typing.get_origin(cls) or cls, dict[str, str]()
+    for field in dataclasses.fields(cls):
+        value = getattr(default, field.name, field.default)
+        if value is dataclasses.MISSING and field.default_factory is not dataclasses.MISSING:
+            value = field.default_factory()
+        option = path + field.name.replace("_", "-")
+        if dataclasses.is_dataclass(value):
+            names |= _option_names(type(value), value, f"{option}.")
+        else:
+            names[f"{cls.__name__}.{field.name}"] = option
+    return names
 
 
 def wants_help(argv: Sequence[str]) -> bool:
     """Whether a command line asks for help, which needs no device."""
-    return _help_asked(argv) is not False
-
-
-def _help_asked(argv: Sequence[str]) -> str | None | Literal[False]:
-    """The page of `help_page` that is asked for: "", a group or None for all of it; False without the wish."""
-    if "--help-all" in argv:
-        group = list(argv)[argv.index("--help-all") + 1 :][:1]
-        return group[0].replace("_", "-") if group and not group[0].startswith("-") else None
-    return "" if "-h" in argv or "--help" in argv else False
-
-
-def _one_line(box: str) -> str:
-    """The message of tyro's box.
-
-    The box has a title, then the message and hints between rules; drawn in plain ASCII where the output
-    is not UTF-8, with the title as a part of its own.
-    """
-    lines = [re.sub(r"[│|╭╮╰╯]", " ", line).strip() for line in box.splitlines() if "╭" not in line]
-    parts = re.split(r"\n[-─]{4,}\n", "\n".join(lines).strip())
-    message = parts[0] if "╭" in box else parts[min(1, len(parts) - 1)]
-    return " ".join(message.split()).rstrip(".")
+    return "-h" in argv or "--help" in argv
 
 
 def enable_caches() -> None:

@@ -69,6 +69,16 @@ def validate(config: Any) -> None:
                 raise ConfigError(f"{where} = {number_text(number)}{unit}: must be {span}{unit}")
 
 
+class Config:
+    """Base of configuration dataclasses: every field is checked when one is made.
+
+    A subclass with checks of its own extends `__post_init__` and calls this one first.
+    """
+
+    def __post_init__(self) -> None:
+        validate(self)
+
+
 @functools.cache
 def choices_of(cls: type) -> dict[str, tuple[Any, ...]]:
     """What each field may be, where only some values may: by its `setting` or its `Literal` type."""

@@ -3,7 +3,7 @@
 import dataclasses
 
 from dexsim.control import Control
-from dexsim.core.config import setting
+from dexsim.core.config import Config, setting
 from dexsim.objects.config import ObjectConfig
 from dexsim.objects.touch_geometry import TOUCH_METHODS
 from dexsim.observation import ObservationConfig
@@ -14,7 +14,7 @@ from dexsim.touch.skin import Skin
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class EnvConfig:
+class EnvConfig(Config):
     """What every task configures."""
 
     physics: PhysicsConfig = setting(PhysicsConfig())

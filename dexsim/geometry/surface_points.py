@@ -3,12 +3,10 @@
 With p_o the surface point nearest to a taxel p and n_o its outward normal, the signed distance is (p - p_o) . n_o: the
 taxel touches where that is negative (paper, section Sim-to-Real Transfer).
 
-Two searches for the nearest point give the same answer. The scan holds a block of points in the program's registers
-at a time and keeps, per taxel, the best so far: taxels x points never reaches memory, and positions may be traced. The
-table lists for every cell of a lattice round the object all points that can be nearest to anything in the cell, so
-that a taxel is compared with a dozen points instead of all; it is built beforehand, for points that do not change.
+The scan holds a block of points in the program's registers at a time and keeps, per taxel, the best so far: taxels x
+points never reaches memory, and positions may be traced.
 
-Shapes: N points, n cells along each axis. Units: m.
+Shapes: N points. Units: m.
 """
 
 from __future__ import annotations
@@ -19,86 +17,54 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dexsim.core.config import setting, validate
-from dexsim.core.errors import ConfigError
-from dexsim.core.pytree import Array, pytree_dataclass, static
+from dexsim.core.pytree import Array, pytree_dataclass
 from dexsim.geometry import mesh as meshes
 from dexsim.geometry import sdf
 
-_ROUND = 4  # candidates of the table compared at a time
+COUNT = 1024
+"""Points of a mesh, or of each primitive of a union."""
+_BLOCK = 64  # points compared at a time
 _OUT_OF_THE_WAY = 10.0  # m, where a point that does not count is put
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class PointsConfig:
-    """How an object is turned into points."""
-
-    count: int = setting(1024, unit="1", low=16, high=16384)
-    """Points in all; per primitive, where the object is a union."""
-    block: int = setting(64, unit="1", low=4, high=256)
-    """Points compared at a time."""
-    table: bool = setting(True)
-    """Build the table of candidates where the points are known beforehand."""
-    cells: int = setting(48, unit="1", low=8, high=128)
-    """Cells of the table along each axis."""
-    reach: float = setting(0.006, unit="m", low=0.001, high=0.05)
-    """How far from the surface the table holds all candidates; farther off it may return the
-    second nearest point."""
-
-    def __post_init__(self):
-        validate(self)
 
 
 @pytree_dataclass
 class SurfacePoints:
-    """Oriented points in the object's frame, with or without a table."""
+    """Oriented points in the object's frame."""
 
-    block: int = static()
-    cells: int = static()  # 0: no table
     position: jax.Array  # [N, 3] m
     normal: jax.Array  # [N, 3] unit, outward
-    table: jax.Array  # [n^3, K] int16, or int32 where there are more: indices of points
-    origin: jax.Array  # [3] m, corner of the table
-    spacing: jax.Array  # [3] m, size of its cells
 
 
-def from_mesh(mesh: meshes.Mesh, config: PointsConfig | None = None) -> SurfacePoints:
+def from_mesh(mesh: meshes.Mesh, count: int = COUNT) -> SurfacePoints:
     """Evenly spread points of a mesh: of random ones, those farthest from each other, with their faces' normals."""
-    config = config or PointsConfig()
-    position, normal, _ = meshes.sample_surface(mesh, 12 * config.count, np.random.default_rng(0))
-    keep = _spread(position, config.count)
-    return _build(jnp.asarray(position[keep], jnp.float32), jnp.asarray(normal[keep], jnp.float32), config)
+    position, normal, _ = meshes.sample_surface(mesh, 12 * count, np.random.default_rng(0))
+    keep = _spread(position, count)
+    return SurfacePoints(jnp.asarray(position[keep], jnp.float32), jnp.asarray(normal[keep], jnp.float32))
 
 
-def from_shape(shape: sdf.Shape, config: PointsConfig | None = None) -> SurfacePoints:
-    """`count` points on each primitive of a union, whose sizes and poses may be traced (then without a table).
+def from_shape(shape: sdf.Shape, count: int = COUNT) -> SurfacePoints:
+    """`count` points on each primitive of a union, whose sizes and poses may be traced.
 
     Points inside another primitive, and those of inactive ones, are put out of the way.
     """
-    config = config or PointsConfig()
     position, normal = [], []
     for k, kind in enumerate(shape.kinds):
-        local, out = _TEMPLATES[kind](config.count, shape.size[k])
+        local, out = _TEMPLATES[kind](count, shape.size[k])
         turn = shape.rotation[k]
         place = jnp.einsum("ij,nj->ni", turn, local, precision="highest") + shape.position[k][None]
-        buried = jnp.zeros(config.count, bool)
+        buried = jnp.zeros(count, bool)
         for other, name in enumerate(shape.kinds):
             if other != k:
-                seen = sdf.to_local(place, shape.position[other], shape.rotation[other])
-                buried |= shape.active[other] & (sdf.primitive_distance(name, seen, shape.size[other]) < 0)
+                inside = sdf.to_local(place, shape.position[other], shape.rotation[other])
+                buried |= shape.active[other] & (sdf.primitive_distance(name, inside, shape.size[other]) < 0)
         position.append(jnp.where((buried | ~shape.active[k])[:, None], _OUT_OF_THE_WAY, place))
         normal.append(jnp.einsum("ij,nj->ni", turn, out, precision="highest"))
-    return _build(jnp.concatenate(position), jnp.concatenate(normal), config)
+    return SurfacePoints(jnp.concatenate(position), jnp.concatenate(normal))
 
 
 def scaled(surface: SurfacePoints, factor: jax.Array | float) -> SurfacePoints:
-    """The points of an object that is `factor` [] times as large; their table stays valid."""
-    return dataclasses.replace(
-        surface,
-        position=factor * surface.position,
-        origin=factor * surface.origin,
-        spacing=factor * surface.spacing,
-    )
+    """The points of an object that is `factor` [] times as large."""
+    return dataclasses.replace(surface, position=factor * surface.position)
 
 
 def signed_distance(points: jax.Array, surface: SurfacePoints) -> jax.Array:
@@ -115,105 +81,29 @@ def distance_and_normal(points: jax.Array, surface: SurfacePoints) -> tuple[jax.
 
 
 def nearest(points: jax.Array, surface: SurfacePoints) -> jax.Array:
-    """Index [...] int32 of the nearest surface point."""
-    points = jax.lax.stop_gradient(points)
-    surface = jax.lax.stop_gradient(surface)
-    return _from_table(points, surface) if surface.cells else _scan(points, surface)
+    """Index [...] int32 of the nearest surface point.
 
-
-def _scan(points: jax.Array, surface: SurfacePoints) -> jax.Array:
-    """Least |q|^2 / 2 - p . q over all points q, which is least where |p - q| is.
-
-    The block is unrolled, so one step is one elementwise kernel that reads and writes one score and one index a taxel.
+    Least |q|^2 / 2 - p . q over all points q, which is least where |p - q| is. The block is unrolled: one step is one
+    elementwise kernel that reads and writes one score and one index a taxel.
     """
+    points, surface = jax.lax.stop_gradient(points), jax.lax.stop_gradient(surface)
     x, y, z = (points[..., k] for k in range(3))
     count = surface.position.shape[0]
-    spare = -count % surface.block
+    spare = -count % _BLOCK
     table = jnp.concatenate([surface.position, 0.5 * jnp.sum(surface.position**2, -1, keepdims=True)], -1)
     filler = jnp.array([[0.0, 0.0, 0.0, jnp.inf]], table.dtype)
-    blocks = jnp.concatenate([table, jnp.repeat(filler, spare, 0)]).reshape(-1, surface.block, 4)
+    blocks = jnp.concatenate([table, jnp.repeat(filler, spare, 0)]).reshape(-1, _BLOCK, 4)
 
     def step(carry, block):
         best, index, start = carry
-        for k in range(surface.block):
+        for k in range(_BLOCK):
             score = block[k, 3] - (x * block[k, 0] + y * block[k, 1] + z * block[k, 2])
             better = score < best
             best, index = jnp.where(better, score, best), jnp.where(better, start + k, index)
-        return (best, index, start + surface.block), None
+        return (best, index, start + _BLOCK), None
 
     start = (jnp.full(x.shape, jnp.inf, jnp.result_type(x, table)), jnp.zeros(x.shape, jnp.int32), jnp.int32(0))
     return jax.lax.scan(step, start, blocks)[0][1]
-
-
-def _from_table(points: jax.Array, surface: SurfacePoints) -> jax.Array:
-    n, cell = surface.cells, []
-    for axis in range(3):
-        at = (points[..., axis] - surface.origin[axis]) / surface.spacing[axis]
-        cell.append(jnp.clip(at, 0, n - 1).astype(jnp.int32))
-    row = (cell[0] * n + cell[1]) * n + cell[2]
-
-    def step(start, carry):
-        best, index = carry
-        for k in range(_ROUND):
-            candidate = surface.table.at[row, start * _ROUND + k].get(mode="promise_in_bounds").astype(jnp.int32)
-            place = surface.position.at[candidate].get(mode="promise_in_bounds")
-            gap = sum((points[..., axis] - place[..., axis]) ** 2 for axis in range(3))
-            better = gap < best
-            best, index = jnp.where(better, gap, best), jnp.where(better, candidate, index)
-        return best, index
-
-    start = (jnp.full(row.shape, jnp.inf, points.dtype), jnp.zeros(row.shape, jnp.int32))
-    return jax.lax.fori_loop(0, surface.table.shape[1] // _ROUND, step, start)[1]
-
-
-def _build(position: jax.Array, normal: jax.Array, config: PointsConfig) -> SurfacePoints:
-    known = config.table and not isinstance(position, jax.core.Tracer)
-    cells, table, origin, spacing = 0, np.zeros((1, 1)), np.zeros(3), np.ones(3)
-    if known:
-        cells = config.cells
-        table, origin, spacing = _candidates(np.asarray(position, np.float64), config)
-    return SurfacePoints(
-        config.block,
-        cells,
-        position,
-        normal,
-        jnp.asarray(table, jnp.int16 if table.max() < 2**15 else jnp.int32),
-        jnp.asarray(origin, jnp.float32),
-        jnp.asarray(spacing, jnp.float32),
-    )
-
-
-def _candidates(position: np.ndarray, config: PointsConfig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """For every cell the points that can be nearest to anything in it, as [n^3, K].
-
-    By the triangle inequality those are the points no farther from the cell's middle than the nearest one and a whole
-    diagonal. Outside of the lattice a point is looked up in the nearest cell.
-    """
-    from scipy.spatial import cKDTree
-
-    real = np.flatnonzero(position[:, 0] < _OUT_OF_THE_WAY / 2)
-    if not real.size:
-        raise ConfigError("surface points: no active primitive")
-    low, high = position[real].min(0) - config.reach, position[real].max(0) + config.reach
-    spacing = (high - low) / config.cells
-    axes = [a + h * (np.arange(config.cells) + 0.5) for a, h in zip(low, spacing, strict=True)]
-    middle = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-    tree = cKDTree(position[real])
-    diagonal = float(np.linalg.norm(spacing)) * 1.001
-    width = 8
-    while True:  # the longest list that a cell near the surface needs
-        width = min(width, len(real))
-        gap, index = tree.query(middle, k=width, workers=-1)
-        gap, index = gap.reshape(len(middle), -1), index.reshape(len(middle), -1)
-        close = gap[:, 0] <= config.reach
-        if width == len(real) or not np.any(gap[close, -1] <= gap[close, 0] + diagonal):
-            break
-        width *= 2
-    longest = int(np.max(np.sum(gap[close] <= gap[close, :1] + diagonal, 1)))
-    longest = min(-(-longest // _ROUND) * _ROUND, width)
-    table = real[index[:, :longest]]
-    spare = np.repeat(table[:, :1], -longest % _ROUND, axis=1)
-    return np.concatenate([table, spare], 1), low, spacing
 
 
 def _spread(position: np.ndarray, count: int) -> np.ndarray:

@@ -9,13 +9,13 @@ import dataclasses
 
 import numpy as np
 
-from dexsim.core.config import check_ranges, setting, validate
+from dexsim.core.config import Config, check_ranges, setting
 from dexsim.core.errors import ConfigError
 from dexsim.hand.kinematics import Hand
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Excitation:
+class Excitation(Config):
     """A recording's signals, in order."""
 
     period: float = setting(0.015, unit="s", low=0.001, high=0.1)
@@ -49,7 +49,7 @@ class Excitation:
     """Kept from the joint's limits."""
 
     def __post_init__(self):
-        validate(self)
+        super().__post_init__()
         check_ranges(self, "chirp_frequency")
 
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from dexsim.core.config import check_ranges, setting, validate
+from dexsim.core.config import Config, check_ranges, setting
 from dexsim.core.errors import ConfigError
 from dexsim.objects.mesh import MeshObject, load
 
@@ -33,7 +33,7 @@ SPHERE_HALF_LENGTH = 1e-4  # m, half-length of a capsule that plays a sphere
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class ObjectConfig:
+class ObjectConfig(Config):
     """Which objects are drawn, and their ranges (low, high). Bulk (mass to restitution) is drawn at every episode
     start, shape and sizes once for each start state of the pool, whose poses were chosen for them."""
 
@@ -85,7 +85,7 @@ class ObjectConfig:
     """Share of objects with every value at an end of its range; see `dexsim.core.ranges`."""
 
     def __post_init__(self):
-        validate(self)
+        super().__post_init__()
         check_ranges(self, *_SPANS)
         if not self.shapes:
             raise ConfigError("ObjectConfig.shapes is empty: name at least one shape")

@@ -8,14 +8,10 @@ import jax
 from dexsim.core.errors import ConfigError
 from dexsim.geometry import grid, surface_points
 from dexsim.geometry.distance import METHODS
-from dexsim.geometry.surface_points import PointsConfig
 from dexsim.objects.config import ObjectConfig, load_mesh_object
 from dexsim.objects.params import ObjectParams
 
 TOUCH_METHODS = tuple(METHODS)
-
-# A table of candidates needs points that are known beforehand; primitives are sized per episode.
-_POINTS = PointsConfig(table=False)
 
 
 def touch_geometry(config: ObjectConfig, method: str) -> Callable[[ObjectParams], Any]:
@@ -37,12 +33,12 @@ def touch_geometry(config: ObjectConfig, method: str) -> Callable[[ObjectParams]
             raise ConfigError(
                 "touch_method = 'grid': needs a mesh (ObjectConfig.mesh); choose closed_form or surface_points"
             )
-        return lambda object: surface_points.from_shape(object.shape(), _POINTS)
+        return lambda object: surface_points.from_shape(object.shape())
     mesh_object = load_mesh_object(config)
     edge = mesh_object.boxes.size[0, 0]
     with jax.ensure_compile_time_eval():
         if method == "grid":
             baked = grid.bake(mesh_object.mesh)
-            return lambda object: grid.select(baked, 0, object.size[0, 0] / edge)
+            return lambda object: grid.scaled(baked, object.size[0, 0] / edge)
         points = surface_points.from_mesh(mesh_object.mesh)
     return lambda object: surface_points.scaled(points, object.size[0, 0] / edge)

@@ -2,12 +2,12 @@
 
 import dataclasses
 
-from dexsim.core.config import setting, validate
+from dexsim.core.config import Config, setting
 from dexsim.core.errors import ConfigError
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class PhysicsConfig:
+class PhysicsConfig(Config):
     """Time step, solver and contact model."""
 
     timestep: float = setting(0.006, unit="s", low=1e-4, high=0.02)
@@ -35,7 +35,7 @@ class PhysicsConfig:
     """Contacts kept per environment (JAX backend: the deepest; Warp: mean over the batch; cuda: always 32)."""
 
     def __post_init__(self):
-        validate(self)
+        super().__post_init__()
         if not 1e-3 <= (period := self.control_period) <= 1.0 + 1e-9:
             raise ConfigError(
                 f"PhysicsConfig: timestep = {self.timestep:g} s times substeps = {self.substeps} is a control tick of "

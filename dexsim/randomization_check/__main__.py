@@ -17,7 +17,7 @@ import jax
 
 from dexsim.core import cli
 from dexsim.core.compilation import collector_paused, jit
-from dexsim.core.config import setting, validate
+from dexsim.core.config import Config, setting
 from dexsim.core.errors import ConfigError
 from dexsim.randomization_check.effects import Effect, check
 
@@ -46,7 +46,7 @@ def conclude(effects: Sequence[Effect]) -> int:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class CheckArguments:
+class CheckArguments(Config):
     """Show that every range of the randomisation has an effect."""
 
     task: str = "grasp"
@@ -59,9 +59,6 @@ class CheckArguments:
     """Control ticks to compare."""
     seed: int = setting(0, unit="1", low=0, high=2**32 - 2)
     """Seed of starts, samples and actions."""
-
-    def __post_init__(self):
-        validate(self)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

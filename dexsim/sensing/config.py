@@ -2,13 +2,13 @@
 
 import dataclasses
 
-from dexsim.core.config import setting, validate
+from dexsim.core.config import Config, setting
 from dexsim.sensing.imu import ImuConfig
 from dexsim.sensing.taxels import TaxelSensor
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Sensing:
+class Sensing(Config):
     """Noise, filtering and resolution of what the hand measures."""
 
     joint_noise: float = setting(0.003, unit="rad", low=0.0, high=0.5)
@@ -28,6 +28,3 @@ class Sensing:
     """The IMU inside the object."""
     taxel: TaxelSensor = setting(TaxelSensor())
     """The taxels."""
-
-    def __post_init__(self):
-        validate(self)

@@ -9,14 +9,14 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from dexsim.core.config import check_ranges, setting, validate
+from dexsim.core.config import Config, check_ranges, setting
 from dexsim.core.pytree import pytree_dataclass
 from dexsim.core.ranges import uniforms
 from dexsim.geometry import rotations
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class ImuConfig:
+class ImuConfig(Config):
     """Errors of the object's orientation reading; ranges are drawn at every episode start."""
 
     noise: float = setting(0.02, unit="rad", low=0.0, high=1.0)
@@ -31,7 +31,7 @@ class ImuConfig:
     """Age of a sample. At most one control tick is modelled."""
 
     def __post_init__(self):
-        validate(self)
+        super().__post_init__()
         check_ranges(self, "delay")
 
 

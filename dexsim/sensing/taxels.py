@@ -19,7 +19,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from dexsim.core.config import check_ranges, setting, validate
+from dexsim.core.config import Config, check_ranges, setting
 from dexsim.core.pytree import pytree_dataclass
 
 Range = tuple[float, float]
@@ -28,7 +28,7 @@ DRAWN = ("hysteresis", "crosstalk", "gain", "bias", "drift", "dead", "rate")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class TaxelSensor:
+class TaxelSensor(Config):
     """From the force on a taxel to its reading. Ranges (low, high) are drawn at every episode start.
 
     Published ranges (Tactile Genesis 2026): gain 0.85 to 1.15, 5 % dead taxels, hysteresis 0.5 at 0.05 s.
@@ -61,7 +61,7 @@ class TaxelSensor:
     samples at the control rate."""
 
     def __post_init__(self):
-        validate(self)
+        super().__post_init__()
         check_ranges(self, "hysteresis_time", *(name for name in DRAWN if getattr(self, name) is not None))
 
 

@@ -14,11 +14,6 @@ def joint_speed(velocity: jax.Array) -> jax.Array:
     return jnp.sum(velocity**2)
 
 
-def mean_where(chosen: jax.Array, values: jax.Array) -> jax.Array:
-    """Mean [] of the `chosen` [N] values [N]; 0 when none is chosen."""
-    return jnp.sum(jnp.where(chosen, values, 0.0)) / jnp.maximum(jnp.sum(chosen), 1).astype(jnp.float32)
-
-
 def random_push(key: jax.Array, mass: jax.Array, *, probability: float, speed: float, period: float) -> jax.Array:
     """Force [3] N that, with this probability, acts for a tick of `period` s.
 

@@ -10,13 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dexsim.core.config import setting, validate
+from dexsim.core.config import Config, setting
 from dexsim.core.errors import ConfigError
 from dexsim.hand.kinematics import Hand
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class ForceEstimate:
+class ForceEstimate(Config):
     """How taxels and torque make an estimate."""
 
     per_torque: tuple[float, ...] = setting((), unit="N", low=0.0, high=1000.0)
@@ -26,9 +26,6 @@ class ForceEstimate:
     """Share of the torque's force beyond the taxels' that counts: 0 for the taxels alone, 1 for the larger of both."""
     touching: float = setting(0.1, unit="N", low=0.001, high=10.0)
     """Force on a finger's taxels from which it counts as touching."""
-
-    def __post_init__(self) -> None:
-        validate(self)
 
 
 def estimate_force(estimate: ForceEstimate, hand: Hand, taxel_force: jax.Array, joint_torque: jax.Array) -> jax.Array:

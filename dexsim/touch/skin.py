@@ -8,7 +8,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from dexsim.core.config import setting, validate
+from dexsim.core.config import Config, setting
 from dexsim.touch import materials
 
 LAWS = ("mooney_rivlin", "linear")
@@ -16,7 +16,7 @@ TOTALS = ("pressing", "solver")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Skin:
+class Skin(Config):
     """The rubber over the taxels (two-term Mooney-Rivlin) and what the taxels notice of it."""
 
     c10: float = setting(0.003e6, unit="Pa", low=0.0, high=1e8)
@@ -44,7 +44,7 @@ class Skin:
     in the paper; beyond them fingertips are as soft as `contact.SOFTEST` lets them be."""
 
     def __post_init__(self):
-        validate(self)
+        super().__post_init__()
         materials.check_stiffness(self.c10, self.c01, self.max_compression)
 
 

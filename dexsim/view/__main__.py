@@ -14,7 +14,7 @@ from typing import Annotated
 import tyro
 
 from dexsim.core import cli
-from dexsim.core.config import setting, validate
+from dexsim.core.config import Config, setting
 from dexsim.core.errors import CheckpointError, ConfigError
 from dexsim.hand.load import load_hand
 from dexsim.registry import find_task, make
@@ -24,7 +24,7 @@ from dexsim.view.viewer import Viewer
 
 
 @dataclass(frozen=True, kw_only=True)
-class ViewArguments:
+class ViewArguments(Config):
     """Options of `python -m dexsim.view`."""
 
     what: Annotated[str, tyro.conf.Positional]
@@ -41,9 +41,6 @@ class ViewArguments:
     """Address to serve the page at; 0.0.0.0 lets other computers see and control it."""
     port: int = setting(8080, unit="1", low=1, high=65535)
     """Port to serve the page at; the next free one if it is taken."""
-
-    def __post_init__(self) -> None:
-        validate(self)
 
 
 def open_source(arguments: ViewArguments) -> Source:

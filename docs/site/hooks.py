@@ -66,19 +66,19 @@ def on_page_content(html: str, page, **_) -> str:
 
 
 def commands() -> str:
-    """What each command prints for `--help-all`."""
+    """What each command prints for `--help`."""
     from dexsim.__main__ import COMMANDS
 
     pages = [
         "# Commands",
         "",
-        "`dexsim COMMAND` and `python -m MODULE` are the same. Each takes `--help` and `--help-all`.",
+        "`dexsim COMMAND` and `python -m MODULE` are the same. Each takes `--help`.",
     ]
     os.environ["COLUMNS"] = "90"
     for name, (module, purpose) in COMMANDS.items():
         out = io.StringIO()
         with contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):
-            importlib.import_module(module).main(["--help-all"])
+            importlib.import_module(module).main(["--help"])
         title = purpose[0].upper() + purpose[1:]
         pages += [
             "",

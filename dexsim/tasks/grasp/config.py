@@ -3,13 +3,13 @@
 import dataclasses
 
 from dexsim.control import Control
-from dexsim.core.config import check_ranges, setting, validate
+from dexsim.core.config import Config, check_ranges, setting
 from dexsim.env.config import EnvConfig
 from dexsim.force_loop import ForceLoop
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class GraspReward:
+class GraspReward(Config):
     """Weights and widths of the reward terms, per control tick."""
 
     force: float = setting(2.0, unit="1", low=0.0, high=1000.0)
@@ -42,9 +42,6 @@ class GraspReward:
     thumb: str = setting("loose", choices=("loose", "track", "binary"))
     """Force term of the thumb, which opposes all other fingers and needs more force than each of them. loose: the wide
     Gaussian only; track: as for the fingers; binary: the paper's, any force within the bounds."""
-
-    def __post_init__(self):
-        validate(self)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -94,5 +91,5 @@ class GraspConfig(EnvConfig):
     """Reward weights."""
 
     def __post_init__(self):
-        validate(self)
+        super().__post_init__()
         check_ranges(self, "finger_force", "curl", "release_gap", "release_speed")

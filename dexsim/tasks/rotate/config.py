@@ -4,7 +4,7 @@ import dataclasses
 import math
 
 from dexsim.control import Control
-from dexsim.core.config import check_ranges, setting, validate
+from dexsim.core.config import Config, check_ranges, setting
 from dexsim.core.errors import ConfigError
 from dexsim.env.config import EnvConfig
 from dexsim.objects.config import ObjectConfig
@@ -14,7 +14,7 @@ from dexsim.tasks.rotate.objects import KINDS
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class RotateReward:
+class RotateReward(Config):
     """Weights of the reward terms, per control tick."""
 
     goal: float = setting(0.2, unit="rad", low=0.0, high=1000.0)
@@ -52,9 +52,6 @@ class RotateReward:
     """Share of the time for which a fingertip must touch to count fully."""
     drop: float = setting(-50.0, unit="1", low=-10000.0, high=0.0)
     """Reward when the object is lost, paid once."""
-
-    def __post_init__(self):
-        validate(self)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -130,7 +127,7 @@ class RotateConfig(EnvConfig):
     """Reward weights. The gate closes before `turn.distance`."""
 
     def __post_init__(self):
-        validate(self)
+        super().__post_init__()
         check_ranges(self, "edge", "curl", "squeeze")
         if len(self.reference) not in (0, 3):
             raise ConfigError(f"RotateConfig.reference = {self.reference}: expected 3 numbers")

@@ -1,19 +1,16 @@
 """Meshes against closed forms and brute force; baked grids against exact distances; what is refused, and why."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dexsim.core.errors import AssetError, ConfigError
-from dexsim.geometry import distance, grid, mesh, sdf
-from dexsim.geometry.grid import GridConfig
+from dexsim.core.errors import AssetError
+from dexsim.geometry import grid, mesh, sdf
 
 trimesh = pytest.importorskip("trimesh")
 BOX = np.array([0.025, 0.02, 0.03])
-COARSE = GridConfig(nodes=24)
+COARSE = 24  # nodes
 signed_distance = jax.jit(grid.signed_distance)
 distance_and_normal = jax.jit(grid.distance_and_normal)
 exact = jax.jit(sdf.distance_and_normal)
@@ -158,35 +155,14 @@ SMOOTH = {"sphere": (0.03,), "capsule": (0.013, 0.025), "ellipsoid": (0.03, 0.02
 
 
 @pytest.mark.parametrize("kind", SMOOTH)
-@pytest.mark.parametrize("dtype", grid.DTYPES)
-def test_64_nodes_are_within_ten_micrometres_on_smooth_shapes(kind, dtype):
+def test_64_nodes_are_within_ten_micrometres_on_smooth_shapes(kind):
     shape = solid(kind, *SMOOTH[kind])
     points, value, normal = shell(shape)
-    ours, ours_normal = distance_and_normal(points, grid.bake(shape, GridConfig(dtype=dtype)))
+    ours, ours_normal = distance_and_normal(points, grid.bake(shape))
     error = np.abs(np.asarray(ours) - value)
     assert error.mean() <= 10e-6 and error.max() < 40e-6
     assert np.mean((np.asarray(ours) < 0) != (value < 0)) < 0.004
     assert np.degrees(np.arccos(np.clip(np.sum(ours_normal * normal, -1), -1, 1))).mean() < 1.0
-
-
-@pytest.mark.parametrize("kind", SMOOTH)
-def test_unbiased_nodes_take_the_mean_error_away(kind):
-    """Interpolation between exact nodes always overshoots a convex shape; lowered nodes err to both sides, and less."""
-    shape = solid(kind, *SMOOTH[kind])
-    points, value, _ = shell(shape)
-    raw, ours = (
-        np.asarray(signed_distance(points, grid.bake(shape, GridConfig(unbiased=u)))) - value for u in (False, True)
-    )
-    assert raw.min() > -1e-6 and raw.mean() > 4e-6
-    assert abs(ours.mean()) < 0.15 * raw.mean() and np.abs(ours).mean() < 0.5 * np.abs(raw).mean()
-
-
-@pytest.mark.parametrize("kind", SMOOTH)
-def test_quadratic_is_ten_times_closer(kind):
-    shape = solid(kind, *SMOOTH[kind])
-    points, value, _ = shell(shape)
-    error = np.abs(np.asarray(signed_distance(points, grid.bake(shape, GridConfig(interpolation="quadratic")))) - value)
-    assert error.mean() < 0.5e-6 and error.max() < 10e-6
 
 
 def test_edges_cost_no_more_than_a_cell():
@@ -196,63 +172,8 @@ def test_edges_cost_no_more_than_a_cell():
     assert error.mean() <= 10e-6 and np.quantile(error, 0.95) < 50e-6 and error.max() < 0.5e-3
 
 
-def test_interpolation_by_hand():
-    """Trilinear: nodes exactly, and half way between two of them their mean; beyond the grid the way there is added."""
-    shape = solid("sphere", 0.02)
-    baked = grid.bake(shape, dataclasses.replace(COARSE, unbiased=False))
-    origin, step = np.asarray(baked.origin[0]), np.asarray(baked.spacing[0])
-    cells = np.random.default_rng(3).integers(0, 23, (100, 3))
-    node, nearby = origin + cells * step, origin + (cells + [0, 1, 0]) * step
-
-    def truth(p):
-        return np.linalg.norm(p, axis=1) - 0.02
-
-    np.testing.assert_allclose(signed_distance(np.float32(node), baked), truth(node), atol=2e-8)
-    np.testing.assert_allclose(
-        signed_distance(np.float32((node + nearby) / 2), baked), (truth(node) + truth(nearby)) / 2, atol=2e-8
-    )
-    out = np.float32([[origin[0] + 23 * step[0] + 0.05, 0.001, 0.002]])
-    held = np.float32([[origin[0] + 23 * step[0], 0.001, 0.002]])
-    np.testing.assert_allclose(signed_distance(out, baked), signed_distance(held, baked) + 0.05, atol=1e-7)
-    assert float(signed_distance(out, baked)[0]) == pytest.approx(truth(out)[0], abs=2e-4)
-    _, normal = distance_and_normal(out, baked)
-    np.testing.assert_allclose(normal, [[1, 0, 0]], atol=0.1)
-
-
-def test_quadratics_are_met_exactly():
-    """Half of the nodes' first-order terms cancels the curvature: any second-order polynomial comes out exact."""
-    rng = np.random.default_rng(4)
-    bend = rng.normal(size=(3, 3))
-    bend, tilt = bend + bend.T, rng.normal(size=3)
-    n = 8
-    axis = np.arange(n) / (n - 1.0)
-    nodes = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
-
-    def polynomial(x):
-        return np.einsum("pi,ij,pj->p", x, bend, x) + x @ tilt
-
-    channels = np.concatenate([1e3 * polynomial(nodes)[:, None], 2 * nodes @ bend + tilt], 1)
-    made = grid.Grid(
-        nodes=n,
-        interpolation="quadratic",
-        values=jnp.asarray(channels.reshape(-1), jnp.float32),
-        origin=jnp.zeros((1, 3)),
-        spacing=jnp.full((1, 3), 1 / (n - 1)),
-        index=jnp.int32(0),
-        scale=jnp.ones(()),
-    )
-    points = rng.uniform(0, 1, (300, 3))
-    value, gradient = (np.asarray(x) for x in jax.jit(grid._look_up)(np.float32(points), made))
-    np.testing.assert_allclose(value, polynomial(points), atol=3e-6)
-    np.testing.assert_allclose(np.stack(gradient, -1), 2 * points @ bend + tilt, atol=1e-4)
-
-
-@pytest.mark.parametrize("interpolation", grid.INTERPOLATIONS)
-@pytest.mark.parametrize("dtype", grid.DTYPES)
-def test_the_analytic_gradient_is_the_automatic_one(interpolation, dtype):
-    baked = grid.bake(
-        solid("ellipsoid", *SMOOTH["ellipsoid"]), dataclasses.replace(COARSE, interpolation=interpolation, dtype=dtype)
-    )
+def test_the_analytic_gradient_is_the_automatic_one():
+    baked = grid.bake(solid("ellipsoid", *SMOOTH["ellipsoid"]), nodes=COARSE)
     points = np.random.default_rng(5).uniform(-0.05, 0.05, (400, 3)).astype(np.float32)  # inside and beyond
 
     def both(p):
@@ -264,29 +185,16 @@ def test_the_analytic_gradient_is_the_automatic_one(interpolation, dtype):
     np.testing.assert_allclose(analytic, automatic, atol=2e-5)
 
 
-def test_classes_share_one_array_and_scale():
-    """Under vmap each environment reads its own class at its own size, as if alone; the values are not copied."""
-    kinds = [solid("sphere", 0.02), solid("box", 0.02, 0.03, 0.02), solid("capsule", 0.015, 0.02)]
-    baked = [grid.bake(kind, COARSE) for kind in kinds]
-    both = grid.stack(baked)
-    assert both.classes == 3 and both.values.shape == (3 * 24**3, 8)
+def test_sizes_share_one_array():
+    """Under vmap each environment reads the grid at its own size, as if alone; the values are not copied."""
+    baked = grid.bake(solid("capsule", 0.015, 0.02), nodes=COARSE)
     points = np.random.default_rng(6).uniform(-0.05, 0.05, (200, 3)).astype(np.float32)
-    index, scale = jnp.array([2, 0, 1, 2]), jnp.array([1.0, 1.2, 0.8, 1.1])
-
-    def felt(index, scale):
-        return grid.signed_distance(points, grid.select(both, index, scale))
-
-    run = jax.jit(jax.vmap(felt))
-    together = np.asarray(run(index, scale))
-    for row, k, s in zip(together, index, scale, strict=True):
-        np.testing.assert_allclose(row, s * signed_distance(points / np.float32(s), baked[int(k)]), atol=1e-7)
+    scale = jnp.array([1.0, 1.2, 0.8, 1.1])
+    run = jax.jit(jax.vmap(lambda scale: grid.signed_distance(points, grid.scaled(baked, scale))))
+    for row, s in zip(np.asarray(run(scale)), scale, strict=True):
+        np.testing.assert_allclose(row, s * signed_distance(points / np.float32(s), baked), atol=1e-7)
     # No intermediate is as large as a copy of the values per environment.
-    assert run.lower(index, scale).compile().memory_analysis().temp_size_in_bytes < 4 * both.values.size
-    for wrong in (3, -1, np.array([0, 3])):
-        with pytest.raises(ConfigError, match="classes 0 to 2"):
-            grid.select(both, wrong)
-    with pytest.raises(ConfigError, match="one configuration"):
-        grid.stack([baked[0], grid.bake(kinds[0], GridConfig(nodes=16))])
+    assert run.lower(scale).compile().memory_analysis().temp_size_in_bytes < 4 * baked.values.size
 
 
 def trilinear(points, distance, origin, step):
@@ -309,58 +217,43 @@ def trilinear(points, distance, origin, step):
     return value + way, np.where(at == held, gradient, 0) + gap / np.maximum(way, 1e-30)[:, None]
 
 
-@pytest.mark.parametrize("dtype", grid.DTYPES)
-@pytest.mark.parametrize("classes", [1, 3])
-def test_values_normals_and_gradients_are_trilinear(classes, dtype):
-    """However the corners lie in memory: nodes at random, in every cell, on its faces and beyond the grid; one class or
-    one an environment. Nodes that float16 holds, and powers of two, so that arithmetic in float32 errs by little."""
+def test_values_normals_and_gradients_are_trilinear():
+    """Nodes at random, in every cell, on its faces and beyond the grid, at four sizes. Powers of two, so that
+    arithmetic in float32 errs by little."""
     n, rng = 10, np.random.default_rng(8)
-    config = GridConfig(nodes=n, dtype=dtype)
     slope = np.einsum("kijl,k->ijl", np.indices((n, n, n)), [1.0, -0.5, 0.75])
-    cubes = [(slope + rng.uniform(-0.3, 0.3, slope.shape)).astype("float16") for _ in range(classes)]  # mm
+    cube = (slope + rng.uniform(-0.3, 0.3, slope.shape)).astype("float16").astype(np.float32)  # mm
+    corners = [np.roll(cube.reshape(-1), -((x * n + y) * n + z)) for x, y, z in np.ndindex(2, 2, 2)]
     origin, step = -np.array([4.0, 2, 6]) / 512, np.array([1.0, 0.5, 2]) / 512
-    shelf = grid.stack(
-        [
-            grid.Grid(
-                nodes=n,
-                interpolation="linear",
-                values=jnp.asarray(grid._pack(cube.reshape(-1, 1), config)),
-                origin=jnp.asarray([size * origin]),
-                spacing=jnp.asarray([size * step]),
-                index=jnp.int32(0),
-                scale=jnp.ones(()),
-            )
-            for size, cube in zip((1.0, 2.0, 0.5), cubes, strict=False)
-        ]
+    baked = grid.Grid(
+        nodes=n,
+        values=jnp.asarray(np.stack(corners, -1).reshape(n, n * n, 8)),
+        origin=jnp.asarray(origin, jnp.float32),
+        spacing=jnp.asarray(step, jnp.float32),
+        scale=jnp.ones(()),
     )
-    assert shelf.values.shape == ((classes * n**3, 8) if dtype == "float32" else (classes * n**3,))
-    index, scale = np.arange(4) % classes, np.array([1.0, 2.0, 0.5, 4.0])
     at = np.concatenate([np.indices((n, n, n)).reshape(3, -1).T, rng.integers(-96, 32 * (n + 3), (3000, 3)) / 32])
-    start, spacing = np.float64(shelf.origin)[index], np.float64(shelf.spacing)[index]
     smooth = np.all((at != 0) & (at != n - 1), 1)  # on the outermost faces JAX's clip halves its derivative
-    points = start[:, None] + at * spacing[:, None]
-
-    def felt(points, index, scale):
-        own = grid.select(shelf, index, scale)
-        automatic = jax.grad(lambda p: grid.signed_distance(p, own).sum())(points)
-        return *grid.distance_and_normal(points, own), automatic
-
-    ours = jax.jit(jax.vmap(felt))(np.float32(scale[:, None, None] * points), index, scale)
-    for env, (value, normal, automatic) in enumerate(zip(*ours, strict=True)):
-        wanted, gradient = trilinear(points[env], 1e-3 * np.float64(cubes[index[env]]), start[env], spacing[env])
-        clear = np.linalg.norm(gradient, axis=1) > 0.1  # a shorter one has no direction to speak of
-        direction = gradient / np.linalg.norm(gradient, axis=1, keepdims=True)
-        np.testing.assert_allclose(value, scale[env] * wanted, rtol=1e-6, atol=1e-9)
+    points = origin + at * step
+    wanted, gradient = trilinear(points, 1e-3 * np.float64(cube), origin, step)
+    clear = np.linalg.norm(gradient, axis=1) > 0.1  # a shorter one has no direction to speak of
+    direction = gradient / np.linalg.norm(gradient, axis=1, keepdims=True)
+    for scale in (1.0, 2.0, 0.5, 4.0):
+        own = grid.scaled(baked, scale)
+        here = np.float32(scale * points)
+        value, normal = distance_and_normal(here, own)
+        automatic = jax.jit(jax.grad(lambda p, own=own: grid.signed_distance(p, own).sum()))(here)
+        np.testing.assert_allclose(value, scale * wanted, rtol=1e-6, atol=1e-9)
         np.testing.assert_allclose(automatic[smooth], gradient[smooth], rtol=1e-6, atol=1e-6)
-        np.testing.assert_allclose(normal[clear], direction[clear], rtol=1e-6, atol=1e-6)
-        assert clear.mean() > 0.99
+        np.testing.assert_allclose(np.asarray(normal)[clear], direction[clear], rtol=1e-6, atol=1e-6)
+    assert clear.mean() > 0.99
 
 
 def test_a_mesh_is_baked_once(monkeypatch, tmp_path):
-    box = trimesh.creation.box(2 * BOX)
-    first = distance.prepare(box, distance.DistanceConfig(grid=COARSE))
+    box = mesh.load_mesh(trimesh.creation.box(2 * BOX))
+    first = grid.bake(box, nodes=COARSE)
     points = np.random.default_rng(7).uniform(-0.03, 0.03, (500, 3)).astype(np.float32)
-    baked = grid.bake(solid("box", *BOX), COARSE)
+    baked = grid.bake(solid("box", *BOX), nodes=COARSE)
     np.testing.assert_allclose(signed_distance(points, first), signed_distance(points, baked), atol=1e-6)
     (kept,) = grid.cache_folder().glob("*.npz")
 
@@ -369,13 +262,10 @@ def test_a_mesh_is_baked_once(monkeypatch, tmp_path):
 
     with monkeypatch.context() as patch:
         patch.setattr(mesh, "signed_distance", refuse)
-        again = distance.prepare(box, distance.DistanceConfig(grid=COARSE))
-        np.testing.assert_array_equal(again.values, first.values)
-        half = dataclasses.replace(COARSE, dtype="float16")  # storage is no reason to bake again
-        assert distance.prepare(box, distance.DistanceConfig(grid=half)).values.dtype == jnp.uint32
+        np.testing.assert_array_equal(grid.bake(box, nodes=COARSE).values, first.values)
         with pytest.raises(AssertionError, match="baked again"):
-            distance.prepare(box, distance.DistanceConfig(grid=dataclasses.replace(COARSE, pad=0.005)))
+            grid.bake(box, nodes=16)
     kept.write_bytes(kept.read_bytes()[:1000])  # damaged: baked again without a word
-    np.testing.assert_array_equal(distance.prepare(box, distance.DistanceConfig(grid=COARSE)).values, first.values)
+    np.testing.assert_array_equal(grid.bake(box, nodes=COARSE).values, first.values)
     monkeypatch.setenv("DEXSIM_CACHE", "/proc/nowhere")  # not writable: no error
-    np.testing.assert_array_equal(distance.prepare(box, distance.DistanceConfig(grid=COARSE)).values, first.values)
+    np.testing.assert_array_equal(grid.bake(box, nodes=COARSE).values, first.values)

@@ -8,8 +8,6 @@ from scipy.spatial import cKDTree
 
 from dexsim.core.errors import ConfigError
 from dexsim.geometry import distance, grid, mesh, sdf, surface_points
-from dexsim.geometry.distance import DistanceConfig
-from dexsim.geometry.surface_points import PointsConfig
 
 SIZES = {
     "sphere": (0.03, 0, 0),
@@ -18,7 +16,7 @@ SIZES = {
     "cylinder": (0.02, 0.025, 0),
     "ellipsoid": (0.03, 0.02, 0.04),
 }
-FEW = {"count": 300, "block": 16, "cells": 24}
+FEW = 300
 nearest = jax.jit(surface_points.nearest)
 
 
@@ -48,7 +46,7 @@ def probes(shape, count=2000, room=0.004, seed=0):
 @pytest.mark.parametrize("kind", SIZES)
 def test_points_lie_on_the_surface_and_look_outward(kind):
     shape = solid(kind, *SIZES[kind])
-    surface = surface_points.from_shape(shape, PointsConfig(table=False, count=500))
+    surface = surface_points.from_shape(shape, 500)
     assert surface.position.shape == (500, 3)
     outside = surface.position + 1e-4 * surface.normal
     value, normal = sdf.distance_and_normal(outside, shape)
@@ -78,11 +76,10 @@ def mesh_like(kind):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("table", [False, True])
-def test_the_search_finds_the_nearest(table):
-    """Against a k-d tree; 300 points do not fill the last block. The table is complete near the surface only."""
+def test_the_search_finds_the_nearest():
+    """Against a k-d tree; 300 points do not fill the last block."""
     shape = union()
-    surface = surface_points.from_shape(shape, PointsConfig(table=table, **FEW))
+    surface = surface_points.from_shape(shape, FEW)
     points = probes(shape)
     real = np.asarray(surface.position)
     gap, wanted = cKDTree(real.astype(float)).query(points.astype(float), k=2)
@@ -91,13 +88,13 @@ def test_the_search_finds_the_nearest(table):
     near = gap[:, 0] < 0.006
     assert near.sum() > 300
     np.testing.assert_allclose(ours[near], gap[near, 0], atol=1e-6)
-    np.testing.assert_allclose(ours, gap[:, 0], atol=2e-3 if table else 1e-6)
+    np.testing.assert_allclose(ours, gap[:, 0], atol=1e-6)
     sure = near & (gap[:, 1] - gap[:, 0] > 1e-6)
     np.testing.assert_array_equal(found[sure], wanted[sure, 0])
 
 
 def test_points_of_inactive_and_buried_parts_do_not_count():
-    surface = surface_points.from_shape(union(), PointsConfig(table=False, **FEW))
+    surface = surface_points.from_shape(union(), FEW)
     real = np.asarray(surface.position)
     real = real[np.abs(real).max(1) < 1]
     np.testing.assert_allclose(sdf.signed_distance(jnp.asarray(real), union()), 0, atol=1e-6)
@@ -106,9 +103,7 @@ def test_points_of_inactive_and_buried_parts_do_not_count():
 
 def test_depth_is_the_offset_along_the_normal():
     """By hand: one point at the origin that looks up."""
-    surface = surface_points.SurfacePoints(
-        4, 0, jnp.zeros((1, 3)), jnp.array([[0.0, 0, 1]]), jnp.zeros((1, 1), jnp.int16), jnp.zeros(3), jnp.ones(3)
-    )
+    surface = surface_points.SurfacePoints(jnp.zeros((1, 3)), jnp.array([[0.0, 0, 1]]))
     value, normal = surface_points.distance_and_normal(jnp.array([[0.01, 0, -0.002], [0.0, 0.03, 0.004]]), surface)
     np.testing.assert_allclose(value, [-0.002, 0.004], atol=1e-9)
     np.testing.assert_array_equal(normal, [[0, 0, 1], [0, 0, 1]])
@@ -116,10 +111,9 @@ def test_depth_is_the_offset_along_the_normal():
 
 def test_sizes_may_be_traced_and_differ_between_environments():
     points = jnp.asarray(probes(solid("sphere", 0.03), 200))
-    config = PointsConfig(count=300, block=16)
 
     def felt(radius):
-        return surface_points.signed_distance(points, surface_points.from_shape(solid("sphere", radius), config))
+        return surface_points.signed_distance(points, surface_points.from_shape(solid("sphere", radius), FEW))
 
     radii = jnp.array([0.02, 0.03])
     together = jax.jit(jax.vmap(felt))(radii)
@@ -131,8 +125,7 @@ def test_sizes_may_be_traced_and_differ_between_environments():
 
 def test_taxels_times_points_never_reach_memory():
     """2,048 points, 60,000 taxels: the matrix would be 491 MB; the program needs a few numbers a taxel."""
-    config = PointsConfig(count=2048, table=False, block=16)
-    surface = surface_points.from_shape(solid("sphere", 0.03), config)
+    surface = surface_points.from_shape(solid("sphere", 0.03), 2048)
     points = jax.ShapeDtypeStruct((60000, 3), jnp.float32)
     plan = jax.jit(surface_points.signed_distance).lower(points, surface).compile().memory_analysis()
     assert plan.temp_size_in_bytes < 60000 * 4 * 16
@@ -141,7 +134,7 @@ def test_taxels_times_points_never_reach_memory():
 def test_points_of_a_mesh():
     trimesh = pytest.importorskip("trimesh")
     ball = mesh.load_mesh(trimesh.creation.icosphere(subdivisions=4, radius=0.03))
-    surface = surface_points.from_mesh(ball, PointsConfig(**FEW))
+    surface = surface_points.from_mesh(ball, FEW)
     gap = cKDTree(np.asarray(surface.position)).query(np.asarray(surface.position), k=2)[0][:, 1]
     assert gap.min() > 0.5 * gap.max()  # far from each other
     points = probes(solid("sphere", 0.03))
@@ -159,29 +152,16 @@ def test_one_signature_for_all():
     points = probes(shape, 500)
     truth = np.linalg.norm(points, axis=1) - 0.03
     near = np.abs(truth) < 0.003
-    for name, bound in (("closed_form", 1e-7), ("grid", 1.5e-5), ("surface_points", 2e-4)):
-        points_config = PointsConfig(block=16, table=False)
-        geometry = distance.prepare(shape, DistanceConfig(method=name, points=points_config))
+    for name, bound, geometry in (
+        ("closed_form", 1e-7, shape),
+        ("grid", 1.5e-5, grid.bake(shape)),
+        ("surface_points", 2e-4, surface_points.from_shape(shape)),
+    ):
         assert distance.method_of(geometry) == name and isinstance(geometry, distance.METHODS[name].kind)
         value, normal = jax.jit(distance.distance_and_normal)(points, geometry)
         np.testing.assert_array_equal(jax.jit(distance.signed_distance)(points, geometry), value)
         assert np.abs(value - truth)[near].max() < bound
         outward = points / np.linalg.norm(points, axis=1, keepdims=True)
         assert np.sum(normal * outward, -1)[near].min() > 0.99
-        assert distance.prepare(geometry) is geometry
-
-
-def test_the_method_is_chosen_by_the_object():
-    trimesh = pytest.importorskip("trimesh")
-    box = trimesh.creation.box((0.04, 0.04, 0.04))
-    small = DistanceConfig(grid=grid.GridConfig(nodes=8), points=PointsConfig(count=32, table=False))
-    assert distance.method_of(distance.prepare(solid("sphere", 0.03))) == "closed_form"
-    assert distance.method_of(distance.prepare(box, small)) == "grid"
-    forced = DistanceConfig(method="surface_points", points=small.points)
-    assert distance.method_of(distance.prepare(box, forced)) == "surface_points"
-    with pytest.raises(ConfigError, match="is a mesh, choose grid or surface_points"):
-        distance.prepare(box, DistanceConfig(method="closed_form"))
-    with pytest.raises(ConfigError, match="prepared for 'grid'"):
-        distance.prepare(distance.prepare(box, small), forced)
-    with pytest.raises(ConfigError, match="prepare it first"):
-        distance.signed_distance(np.zeros((1, 3)), box)
+    with pytest.raises(ConfigError, match="has no distance"):
+        distance.signed_distance(points, "a ball")

@@ -10,10 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dexsim.core.errors import ConfigError
-from dexsim.geometry import distance, rotations, sdf
-from dexsim.geometry.distance import DistanceConfig
-from dexsim.geometry.grid import GridConfig
-from dexsim.geometry.surface_points import PointsConfig
+from dexsim.geometry import grid, rotations, sdf, surface_points
+from dexsim.geometry.mesh import load_mesh
 from dexsim.hand.kinematics import forward_kinematics, taxel_normals, taxel_positions
 from dexsim.touch import feel as tactile
 from dexsim.touch import materials
@@ -27,7 +25,6 @@ BRICK = sdf.Shape(("box",), jnp.array([[0.02, 0.03, 0.025]]), jnp.zeros((1, 3)),
 # Index, middle and ring finger are pressed up to 2.3 mm into a ball of 30 mm there.
 PLACE, TOTAL = np.float32([0.0324, 0.0062, 0.1457]), np.float32([4.0, 1.0, 2.5, 0.5, 3.0])
 TURN = np.asarray(rotations.axis_angle_to_matrix(jnp.array([0.48, 0.6, 0.64]), jnp.float32(0.7)))
-CONFIG = DistanceConfig(grid=GridConfig(nodes=48), points=PointsConfig(count=2048, table=False, block=16))
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +61,8 @@ def test_every_method_feels_the_same_grasp(hand, links, method):
     feel, *_ = links
     skin = Skin(margin=0.001)
     exact, force, centre = feel(BALL, skin)
-    ours, other_force, other_centre = feel(distance.prepare(BALL, dataclasses.replace(CONFIG, method=method)), skin)
+    other = grid.bake(BALL, nodes=48) if method == "grid" else surface_points.from_shape(BALL, 2048)
+    ours, other_force, other_centre = feel(other, skin)
     bound = {"grid": 2.5e-5, "surface_points": 8e-5}[method]
     np.testing.assert_allclose(ours.depth, exact.depth, atol=bound)
     np.testing.assert_allclose(other_force, force, rtol=1e-5)
@@ -75,7 +73,7 @@ def test_600_forces_differentiate_through_a_mesh(hand, links):
     """Load a mesh, place it, read the hand, and push it: against finite differences, in a few lines."""
     trimesh = pytest.importorskip("trimesh")
     _, pose, *_ = links
-    ball = distance.prepare(trimesh.creation.icosphere(subdivisions=3, radius=0.03), CONFIG)
+    ball = grid.bake(load_mesh(trimesh.creation.icosphere(subdivisions=3, radius=0.03)), nodes=48)
     skin = Skin(margin=0.001)
 
     @jax.jit

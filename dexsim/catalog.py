@@ -1,0 +1,39 @@
+"""The command `dexsim tasks`: what there is to train, on which hands, and which policies are shipped."""
+
+import dataclasses
+import sys
+from collections.abc import Sequence
+
+from dexsim.core import cli
+from dexsim.core.assets import asset_path
+from dexsim.hand.files import DEFAULT
+from dexsim.registry import TASKS
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CatalogArguments:
+    """The command has no options."""
+
+
+def catalog() -> dict[str, list[str]]:
+    """Names of tasks, hands and shipped policies."""
+    hands = [path.stem for path in asset_path("hand").rglob("*.toml")]
+    policies = [path.stem for path in asset_path("policies").glob("*.msgpack")]
+    return {"tasks": sorted(TASKS), "hands": sorted(hands), "policies": sorted(policies)}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command. Returns its exit code."""
+    cli.parse(
+        CatalogArguments,
+        sys.argv[1:] if argv is None else argv,
+        prog="dexsim tasks",
+        description="List tasks, hands and shipped policies.",
+    )
+    for kind, names in catalog().items():
+        print(f"{kind + ':':10}{', '.join(f'{name} (default)' if name == DEFAULT else name for name in names)}")
+    return 0
+
+
+if __name__ == "__main__":
+    cli.run(main)
