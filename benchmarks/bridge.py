@@ -227,7 +227,7 @@ def measure_compute(policy: str, ticks: int) -> dict:
         start = time.perf_counter()
         tick = controller.tick(sensing.measure(state), seen, IDENTITY, 0.5)
         middle = time.perf_counter()
-        np.asarray(controller.policy.act(controller.memory, np.asarray(controller._observe(tick.readings)))[1])
+        np.asarray(controller.policy.act(controller.carry, np.asarray(controller._observe(tick.readings)))[1])
         both.append(time.perf_counter() - middle)
         whole.append(middle - start)
     leave_realtime()

@@ -43,9 +43,9 @@ TOUCHING = 0.01  # N
 def grips(env: Env, policy: Policy, count: int, ticks: list[int]) -> State:
     """States [count times len(ticks)] of grips that are as old as `ticks`."""
     state = jit(jax.vmap(env.reset), backend="c")(jax.random.split(jax.random.key(0), count))
-    step, memory, found = jit(jax.vmap(env.step), backend="c"), policy.begin(count), []
+    step, carry, found = jit(jax.vmap(env.step), backend="c"), policy.initial_carry(count), []
     for tick in range(max(ticks)):
-        memory, action = policy.act(memory, state.obs["actor"])
+        carry, action = policy.act(carry, state.obs["actor"])
         state = step(state, action)
         if tick + 1 in ticks:
             found.append(state)

@@ -35,9 +35,9 @@ def main() -> None:
     policy, count = load_policy(options.task), options.num_envs
     env = policy.make_env(backend="c", num_envs=count)
     state = jit(jax.vmap(env.reset), backend="c")(jax.random.split(jax.random.key(0), count))
-    advance, memory = jit(jax.vmap(env.step), backend="c"), policy.begin(count)
+    advance, carry = jit(jax.vmap(env.step), backend="c"), policy.initial_carry(count)
     for _ in range(options.ticks):
-        memory, action = policy.act(memory, state.obs["actor"])
+        carry, action = policy.act(carry, state.obs["actor"])
         state = advance(state, action)
 
     def hold(s):

@@ -50,6 +50,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     name, *rest = argv
     if name not in COMMANDS:
         raise ConfigError(f"{name}: no such command{closest(name, COMMANDS)}; see dexsim --help")
+    if name == "train":
+        cli.announce(cli.LOADING)
     return importlib.import_module(COMMANDS[name][0]).main(rest)
 
 

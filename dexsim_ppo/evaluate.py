@@ -31,7 +31,7 @@ from dexsim.core.errors import ConfigError
 from dexsim.core.options import Option
 from dexsim.core.progress import progress
 from dexsim.registry import find_task
-from dexsim_ppo.acting import PolicyParams, act_from, begin
+from dexsim_ppo.acting import PolicyParams, act, initial_carry
 from dexsim_ppo.learner.adapter import Adapted
 from dexsim_ppo.learner.types import Environment
 from dexsim_ppo.policy import Policy, load_policy
@@ -100,20 +100,20 @@ class Evaluator:
         shown = self._extremes(state)
 
         def step(carry, _):
-            state, memory, last = carry
-            memory, action = act_from(params, memory, state.obs["actor"])
+            state, policy_carry, last = carry
+            policy_carry, action = act(params, policy_carry, state.obs["actor"])
             state = jax.vmap(self.env.step)(state, jnp.where(idle, jnp.zeros_like(action), action))
             frame = jax.tree.map(lambda x: x[shown], jax.vmap(self.env.snapshot)(state))
             series = (dict(state.metrics), state.terminated)
             film = (frame, state.terminated[shown])
             if not self.totals:
-                return (state, memory, None), (series, film)
-            return (state, memory, _follow(last, *series)), (None, film)
+                return (state, policy_carry, None), (series, film)
+            return (state, policy_carry, _follow(last, *series)), (None, film)
 
         last: Any = None
         if self.totals:
             last = (dict(state.metrics), jnp.zeros(self.chunk, jnp.int32), jnp.zeros(self.chunk, bool))
-        first: Any = state, begin(params, (self.chunk,)), last
+        first: Any = state, initial_carry(params, (self.chunk,)), last
         (*_, last), (series, film) = jax.lax.scan(step, first, None, length=self.env.evaluation_steps)
         return (last[:2] if self.totals else series), film
 

@@ -26,7 +26,6 @@ from dexsim.core.files import write_whole
 from dexsim.core.install import install_line
 from dexsim.hand.source import check_record
 from dexsim.task_spec import TaskSpec
-from dexsim_ppo.acting import NEEDS_MEMORY
 from dexsim_ppo.learner.memory import GRU, state_size
 from dexsim_ppo.learner.types import Field
 from dexsim_ppo.policy import Policy, layout_to_list, load_policy
@@ -49,25 +48,19 @@ class ExportedPolicy:
     params: Any
     """Whatever tells it from others: bytes."""
     function: Callable[[np.ndarray | None, np.ndarray], tuple[np.ndarray | None, np.ndarray]]
-    """From memory and observation to memory and action."""
-    memory: int = 0
-    """Numbers that it remembers; 0 if it has no memory."""
+    """From carry and observation to carry and action."""
+    carry_size: int = 0
+    """Length m of its carry; 0 if it has no memory."""
     hand: dict[str, Any] | None = None
     """As of `Policy`."""
 
-    def __call__(self, obs: Any) -> np.ndarray:
-        """Action `[..., A]` for an actor observation `[..., n]`; for policies without memory."""
-        if self.memory:
-            raise ConfigError(NEEDS_MEMORY)
-        return self.act(None, obs)[1]
-
-    def begin(self, *batch: int) -> np.ndarray | None:
+    def initial_carry(self, *batch: int) -> np.ndarray | None:
         """As of `Policy`."""
-        return np.zeros((*batch, self.memory), np.float32) if self.memory else None
+        return np.zeros((*batch, self.carry_size), np.float32) if self.carry_size else None
 
-    def act(self, memory: Any, obs: Any) -> tuple[np.ndarray | None, np.ndarray]:
+    def act(self, carry: Any, obs: Any) -> tuple[np.ndarray | None, np.ndarray]:
         """As of `Policy`."""
-        return self.function(memory, np.asarray(obs, np.float32))
+        return self.function(carry, np.asarray(obs, np.float32))
 
 
 def header_of(policy: Policy) -> dict[str, Any]:
@@ -101,7 +94,7 @@ def to_numpy(policy: Policy, path: Path) -> None:
 
 def to_onnx(policy: Policy, path: Path) -> None:
     """Write an ONNX model: input `observation` [batch, n], output `action` [batch, A], float32. One with a memory also
-    has `memory` [batch, m], zero at an episode's start, and gives `next_memory`.
+    has `carry` [batch, m], zero at an episode's start, and gives `next_carry`.
 
     Raises:
       ConfigError: onnx is not installed.
@@ -123,7 +116,7 @@ def to_onnx(policy: Policy, path: Path) -> None:
         values |= _gru_weights(params.memory)
         nodes += [
             helper.make_node("Unsqueeze", ["seen", "time"], ["seen_at_once"]),
-            helper.make_node("Unsqueeze", ["memory", "time"], ["before"]),
+            helper.make_node("Unsqueeze", ["carry", "time"], ["before"]),
             helper.make_node(
                 "GRU",
                 ["seen_at_once", "gru_input", "gru_recurrent", "gru_bias", "", "before"],
@@ -131,14 +124,14 @@ def to_onnx(policy: Policy, path: Path) -> None:
                 hidden_size=remembered,
                 linear_before_reset=1,
             ),
-            helper.make_node("Squeeze", ["after", "time"], ["next_memory"]),
-            helper.make_node("Concat", ["seen", "next_memory"], ["hidden_0"], axis=1),
+            helper.make_node("Squeeze", ["after", "time"], ["next_carry"]),
+            helper.make_node("Concat", ["seen", "next_carry"], ["hidden_0"], axis=1),
         ]
     elif params.memory is not None:
         values |= {"begin": np.array([0]), "end": np.array([remembered]), "axis": np.array([1])}
         nodes += [
-            helper.make_node("Concat", ["seen", "memory"], ["hidden_0"], axis=1),
-            helper.make_node("Slice", ["hidden_0", "begin", "end", "axis"], ["next_memory"]),
+            helper.make_node("Concat", ["seen", "carry"], ["hidden_0"], axis=1),
+            helper.make_node("Slice", ["hidden_0", "begin", "end", "axis"], ["next_carry"]),
         ]
     last = len(params.layers) - 1
     for i, layer in enumerate(params.layers):
@@ -156,11 +149,11 @@ def to_onnx(policy: Policy, path: Path) -> None:
         nodes.append(helper.make_node("Clip", [f"sum_{last}", "lowest", "highest"], ["action"]))
     sizes = {"observation": len(params.normalizer.mean), "action": params.layers[-1].kernel.shape[1]}
     if remembered:
-        sizes |= {"memory": remembered, "next_memory": remembered}
+        sizes |= {"carry": remembered, "next_carry": remembered}
     ports = {
         name: helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", size]) for name, size in sizes.items()
     }
-    given = [ports.pop(name) for name in ("observation", "memory") if name in ports]
+    given = [ports.pop(name) for name in ("observation", "carry") if name in ports]
     arrays = {name: np.asarray(value) for name, value in values.items()}
     tensors = [
         numpy_helper.from_array(array if array.dtype.kind == "i" else array.astype(np.float32), name)
@@ -207,7 +200,7 @@ def load_exported(path: str | Path) -> ExportedPolicy:
             spec=read_spec(header["spec"], path) if header.get("spec") else None,
             params=np.frombuffer(path.read_bytes(), np.uint8),
             function=function,
-            memory=_memory_size(header),
+            carry_size=_carry_size(header),
             hand=header.get("hand"),
         )
         _try(policy)
@@ -217,18 +210,18 @@ def load_exported(path: str | Path) -> ExportedPolicy:
 
 
 def _try(policy: ExportedPolicy) -> None:
-    """Raises what a tick raises; ValueError: it gives what is no action, or another memory than it takes.
+    """Raises what a tick raises; ValueError: it gives what is no action, or another carry than it takes.
 
     A network of ONNX may be any: what it takes and gives is not said by the header.
     """
-    memory = policy.begin()
-    after, action = policy.act(memory, np.zeros(sum(field.size for field in policy.observation_layout), np.float32))
-    kept = getattr(after, "shape", None) == getattr(memory, "shape", None)
+    carry = policy.initial_carry()
+    after, action = policy.act(carry, np.zeros(sum(field.size for field in policy.observation_layout), np.float32))
+    kept = getattr(after, "shape", None) == getattr(carry, "shape", None)
     if action.ndim != 1 or not np.isfinite(action).all() or not kept:
-        raise ValueError("it gives actions that are not finite, or another memory than it takes")
+        raise ValueError("it gives actions that are not finite, or another carry than it takes")
 
 
-def _memory_size(header: dict[str, Any]) -> int:
+def _carry_size(header: dict[str, Any]) -> int:
     kind, size = header.get("memory") or ("none", 0)
     return size * sum(n for _, n, _ in header["observation_layout"]) if kind == "history" else size
 
@@ -259,14 +252,14 @@ def _read_onnx(path: Path) -> tuple[dict[str, Any], Callable]:
     except Exception as error:  # onnxruntime's own error types differ by version
         raise CheckpointError(f"{path}: is not an exported policy ({' '.join(str(error).split()):.200})") from None
 
-    def act(memory: np.ndarray | None, observation: np.ndarray) -> tuple[np.ndarray | None, np.ndarray]:
+    def act(carry: np.ndarray | None, observation: np.ndarray) -> tuple[np.ndarray | None, np.ndarray]:
         batch = observation.shape[:-1]
         given = {"observation": observation.reshape(-1, observation.shape[-1])}
-        if memory is None:
+        if carry is None:
             return None, session.run(["action"], given)[0].reshape(*batch, -1)
-        given["memory"] = memory.reshape(-1, memory.shape[-1])
-        memory, action = session.run(["next_memory", "action"], given)
-        return memory.reshape(*batch, -1), action.reshape(*batch, -1)
+        given["carry"] = carry.reshape(-1, carry.shape[-1])
+        carry, action = session.run(["next_carry", "action"], given)
+        return carry.reshape(*batch, -1), action.reshape(*batch, -1)
 
     return header, act
 

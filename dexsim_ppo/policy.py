@@ -1,11 +1,11 @@
 """A trained policy: loads from one file, needs no simulator, runs anywhere JAX does.
 
-    policy = load_policy("grasp")        # a shipped one by name, or a file
-    memory = policy.begin()              # None where the policy has no memory
-    memory, action = policy.act(memory, observation)
+    policy = load_policy("grasp")                   # a shipped one by name, or a file
+    carry = policy.initial_carry()                  # at the start of an episode; None where the policy has no memory
+    carry, action = policy.act(carry, observation)  # `act(policy.params, carry, observation)`, compiled
 
-A policy without a memory is a function, too: `action = policy(observation)`. `Policy` is what a file holds: the
-parameters of `dexsim_ppo.acting` together with the task, the observation's layout and the control rate.
+`Policy` is what a file holds: the parameters of `act` together with the task, the observation's layout and the control
+rate.
 """
 
 import dataclasses
@@ -25,7 +25,7 @@ from dexsim.core.pytree import Array
 from dexsim.hand.source import check_record, check_same, record_of, recorded_hand
 from dexsim.task_spec import TaskSpec
 from dexsim_ppo import checkpoint
-from dexsim_ppo.acting import PolicyParams, act_from, begin
+from dexsim_ppo.acting import PolicyParams, act, initial_carry
 from dexsim_ppo.learner.adapter import adapt
 from dexsim_ppo.learner.memory import History
 from dexsim_ppo.learner.networks import Layer
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from dexsim.hand.kinematics import Hand
 
 
-_act_from = jax.jit(act_from)
+_act = jax.jit(act)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,27 +61,19 @@ class Policy:
     hand: dict[str, Any] | None = None
     """Which hand it was trained on (`dexsim.hand.source`); None for the shipped default one."""
 
-    def __call__(self, obs: Array) -> jax.Array:
-        """Action `[..., A]` for an actor observation `[..., n]`.
+    def initial_carry(self, *batch: int) -> jax.Array | None:
+        """The carry `[*batch, m]` at the start of an episode, such as `initial_carry(8)` of eight environments; None
+        for a policy without memory."""
+        return initial_carry(self.params, batch)
+
+    def act(self, carry: Array | None, obs: Array) -> tuple[jax.Array | None, jax.Array]:
+        """The next carry `[..., m]` and the action `[..., A]` for an actor observation `[..., n]`: the compiled
+        `dexsim_ppo.act(self.params, carry, obs)`.
 
         Raises:
-          ConfigError: the policy has a memory, or observes another number of values.
+          ConfigError: the observation has another size, or the carry is not that of this policy and batch.
         """
-        return self.act(None, obs)[1]
-
-    def begin(self, *batch: int) -> jax.Array | None:
-        """What it remembers `[*batch, m]` at the start of an episode; None if it has no memory."""
-        return begin(self.params, batch)
-
-    def act(self, memory: Array | None, obs: Array) -> tuple[jax.Array | None, jax.Array]:
-        """Memory after this observation `[..., n]`, and action `[..., A]`: for policies with or without memory.
-
-        Raises:
-          ConfigError: the memory is not that of this policy and batch, or the policy observes another number of values.
-        """
-        if isinstance(obs, list | tuple):  # To JAX a tree of numbers.
-            obs = np.asarray(obs, np.float32)
-        return _act_from(self.params, memory, obs)
+        return _act(self.params, carry, obs)
 
     def ablate(self, *names: str) -> "Policy":
         """This policy with some observation fields replaced by their mean in training, those of a fixed scale by 0.

@@ -1,10 +1,8 @@
 """A policy in a file that needs NumPy alone: no JAX, no simulator, nothing else of this library.
 
     policy = PortablePolicy.load("grasp.npz")   # written by `python -m dexsim_ppo.export`
-    memory = policy.begin()                     # at an episode's start; None where the policy has no memory
-    memory, action = policy.act(memory, observation)
-
-    action = policy(observation)                # the same for a policy without a memory
+    carry = policy.initial_carry()              # at an episode's start; None where the policy has no memory
+    carry, action = policy.act(carry, observation)
 
 This module imports only NumPy and may be copied to a computer that has nothing else.
 
@@ -81,8 +79,8 @@ class PortablePolicy:
     ):
         check_header(header)
         kind, size = header.get("memory") or (None, 0)
-        self._kept = len(mean) * size if kind == "history" else size
-        sizes = [len(mean) + self._kept, *(len(bias) for _, bias in layers)]
+        self._carry_size = len(mean) * size if kind == "history" else size
+        sizes = [len(mean) + self._carry_size, *(len(bias) for _, bias in layers)]
         shapes = [kernel.shape for kernel, _ in layers]
         if not layers or shapes != list(zip(sizes[:-1], sizes[1:], strict=True)) or mean.shape != std.shape:
             raise ValueError(f"layers of shapes {shapes} for {len(mean)} observations")
@@ -131,44 +129,35 @@ class PortablePolicy:
         except Exception as error:  # An archive may be damaged in more ways than NumPy and zipfile have types for.
             raise ValueError(f"{path}: is not a policy of this format ({' '.join(str(error).split()):.200})") from None
 
-    def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """Action [..., A] in [-1, 1] for an actor observation [..., n] in SI units.
+    def initial_carry(self, *batch: int) -> np.ndarray | None:
+        """The carry [*batch, m] at the start of an episode; None for a policy without memory."""
+        return np.zeros((*batch, self._carry_size), np.float32) if self._carry_size else None
+
+    def act(self, carry: np.ndarray | None, observation: np.ndarray) -> tuple[np.ndarray | None, np.ndarray]:
+        """The next carry [..., m], and the action [..., A] in [-1, 1] for an observation [..., n] in SI units.
 
         Raises:
-          ValueError: the policy has a memory.
-        """
-        return self.act(None, observation)[1]
-
-    def begin(self, *batch: int) -> np.ndarray | None:
-        """What it remembers [*batch, m] at the start of an episode; None if it has no memory."""
-        return np.zeros((*batch, self._kept), np.float32) if self._kept else None
-
-    def act(self, memory: np.ndarray | None, observation: np.ndarray) -> tuple[np.ndarray | None, np.ndarray]:
-        """Memory after this observation [..., n], and action [..., A]: for policies with or without memory.
-
-        Raises:
-          ValueError: the memory is not that of this policy and batch, or the policy observes another number of values.
+          ValueError: the observation has another size, or the carry is not that of this policy and batch.
         """
         size, shape = self._mean.size, np.shape(observation)
         if shape[-1:] != (size,):
             raise ValueError(f"the policy observes {size} values, [..., {size}]; the observation has the shape {shape}")
-        if (memory is None) != (not self._kept):
-            raise ValueError(f"this policy has {'a' if self._kept else 'no'} memory: use begin and act")
-        if memory is not None and np.shape(memory) != (*shape[:-1], self._kept):
-            raise ValueError(f"the memory has the shape {np.shape(memory)}, expected {(*shape[:-1], self._kept)}")
+        expected = (*shape[:-1], self._carry_size) if self._carry_size else None
+        if (given := None if carry is None else np.shape(carry)) != expected:
+            raise ValueError(f"expected a carry of the shape {expected}, got {given}: begin with initial_carry()")
         clip = self.header["clip"]
         x = np.clip((np.asarray(observation, np.float32) - self._mean) / self._std, -clip, clip)
-        if memory is not None and self._unit:
-            memory = self._recur(np.asarray(memory), x)
-            x = np.concatenate([x, memory], -1)
-        elif memory is not None:
-            x = np.concatenate([x, memory], -1)
-            memory = x[..., : self._kept]
+        if carry is not None and self._unit:
+            carry = self._recur(np.asarray(carry), x)
+            x = np.concatenate([x, carry], -1)
+        elif carry is not None:
+            x = np.concatenate([x, carry], -1)
+            carry = x[..., : self._carry_size]
         for i, (kernel, bias) in enumerate(self._layers):
             x = x @ kernel + bias
             if i < len(self._layers) - 1:
                 x = np.where(x > 0, x, np.expm1(np.minimum(x, 0.0)))  # ELU
-        return memory, np.tanh(x) if self.header["squash"] == "tanh" else np.clip(x, -1.0, 1.0)
+        return carry, np.tanh(x) if self.header["squash"] == "tanh" else np.clip(x, -1.0, 1.0)
 
     @staticmethod
     def _check_bounds(clip: float, kind: str | None, size: int, layers: list, unit: tuple) -> None:

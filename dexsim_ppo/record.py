@@ -26,7 +26,7 @@ from dexsim.datasets.lerobot import check_lerobot, write_lerobot
 from dexsim.datasets.rerun import check_rerun, show_rerun
 from dexsim.datasets.trajectory import READINGS, Trajectory, from_readings
 from dexsim.registry import find_task
-from dexsim_ppo.acting import act_from
+from dexsim_ppo.acting import act
 from dexsim_ppo.policy import Policy, load_policy
 
 
@@ -39,14 +39,14 @@ def record(policy: Policy, env: Any, *, episodes: int, seconds: float, seed: int
     ticks = max(round(seconds / env.control_period), 1)
 
     def tick(now: Any, _: Any) -> tuple[Any, Any]:
-        state, memory = now
-        memory, action = act_from(policy.params, memory, state.obs["actor"])
+        state, carry = now
+        carry, action = act(policy.params, carry, state.obs["actor"])
         after = jax.vmap(env.step)(state, action)
         seen = {name: getattr(state.readings, name) for name in READINGS}
-        return (after, memory), (seen, after.joint_target, after.terminated)
+        return (after, carry), (seen, after.joint_target, after.terminated)
 
     starts = jit(env.evaluation_starts, once=True)(env.evaluation_plan(episodes, seed))
-    begun = starts, policy.begin(episodes)
+    begun = starts, policy.initial_carry(episodes)
     run = jit(lambda begun: jax.lax.scan(tick, begun, None, length=ticks), backend=env.backend)
     _, recorded = run(begun)
     seen, target, ended = jax.device_get(recorded)

@@ -21,6 +21,10 @@ from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 from dexsim.core import cli
+
+if __name__ == "__main__":
+    cli.announce(cli.LOADING)
+
 from dexsim.core.compilation import make_deterministic
 from dexsim.core.config import from_dict, naming_file
 from dexsim.core.errors import ConfigError, DexsimError
@@ -160,6 +164,8 @@ def make_run(
     if arguments.deterministic and not make_deterministic() and first:
         print("--deterministic changes nothing here: without a GPU, trainings repeat to the last bit anyway")
     mesh, hand = make_mesh(arguments.devices, arguments.ppo), find_hand(arguments, begun)
+    if first and not like:
+        print(f"making the environment of {arguments.task}", flush=True)
     env = like.env if like else make_environment(arguments, hand, mesh.size if mesh else 1)
     if env.backend != "own":  # so that a resumed run has the same engine
         arguments = dataclasses.replace(arguments, backend=cast(Any, env.backend))

@@ -23,6 +23,9 @@ from dexsim.core.options import Option, explain, group_docs, help_page, in_optio
 
 T = TypeVar("T")
 
+LOADING = "loading JAX and MuJoCo"
+"""What `announce` says before the imports of a command that takes seconds over them."""
+
 
 class UsageError(ConfigError):
     """An option is unknown, or its value is of the wrong type or out of range."""
@@ -100,6 +103,12 @@ def naming_options(
         raise UsageError(in_option_names(str(error), options_of(cls, default), typed)) from None
     except AssetError as error:
         raise AssetError(in_option_names(str(error), options_of(cls, default), typed)) from None
+
+
+def announce(text: str) -> None:
+    """Say on standard error what takes seconds, before it is done; not above a help page."""
+    if not wants_help(sys.argv):
+        print(text, file=sys.stderr, flush=True)
 
 
 def wants_help(argv: Sequence[str]) -> bool:

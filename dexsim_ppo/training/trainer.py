@@ -263,6 +263,7 @@ class Run:
     def evaluate(self, state: TrainState, iteration: int, display: Display) -> dict[str, float]:
         """Evaluate the policy, and save it if its return is the best so far."""
         policy = self._policy(state)
+        display.working(f"evaluating the policy in {self.arguments.evaluation_chunk} episodes")
         report, _ = self.evaluator(policy.params, episodes=self.arguments.evaluation_chunk, seed=SELECTION_SEED)
         figures = {name: entry["value"] for name, entry in headline(report).items() if entry["value"] is not None}
         score, first, best = figures["return"], next(iter(figures)), self.best["return"]
@@ -312,16 +313,16 @@ class Run:
         `command` is what started the run, for the report.
         """
         arguments, folder, selected = self.arguments, self.folder, self.selected
-        print(f"evaluating {selected.name} and the untrained policy", flush=True)
+        print(f"evaluating {selected.name}, the untrained policy and a hand that does nothing", flush=True)
         begin = time.perf_counter()
         trained, untrained = Policy.load(selected), Policy.load(folder.untrained)
         if trained.training.get("iteration") == 0:  # An average of policies, put there by hand, has none.
             print(f"nothing was trained: compiling took {self.clock['compile_s']:.0f} s; give more --minutes")
         measure = functools.partial(self.evaluator, episodes=arguments.evaluation_episodes, seed=REPORT_SEED)
         reports = {}
-        reports["trained"], film = measure(trained.params)
-        reports["untrained"], _ = measure(untrained.params)
-        reports["do_nothing"], _ = measure(untrained.params, idle=True)
+        reports["trained"], film = measure(trained.params, label="trained")
+        reports["untrained"], _ = measure(untrained.params, label="untrained")
+        reports["do_nothing"], _ = measure(untrained.params, idle=True, label="doing nothing")
         self.clock["evaluation_s"] = time.perf_counter() - begin
         draw_curve(read_metrics(folder.metrics), folder.path / "curve.png", arguments.task)
         report = {
@@ -341,6 +342,7 @@ class Run:
         for name, policy in (("untrained", "untrained"), ("trained", selected)):
             print_report(reports[name], reports["do_nothing"], title=f"{arguments.task}: {policy}")
         if arguments.video and jax.tree.leaves(film):  # an environment from elsewhere draws nothing
+            print("rendering the video", flush=True)
             begin = time.perf_counter()
             video = write_video(self.evaluator.env, film, folder.path / "policy.mp4")
             self.clock["video_s"] = time.perf_counter() - begin

@@ -28,8 +28,9 @@ def test_the_average_of_many_noisy_copies_comes_back_to_the_policy(name):
     assert [origin["seed"] for origin in average.training["average_of"]] == list(range(16))
 
     seen = np.asarray(policy.params.normalizer.mean) + 0.5 * np.asarray(policy.params.normalizer.std)
-    wanted, (one, *_) = policy.act(policy.begin(), seen)[1], [copy.act(copy.begin(), seen)[1] for copy in copies]
-    mean = average.act(average.begin(), seen)[1]
+    wanted = policy.act(policy.initial_carry(), seen)[1]
+    one = copies[0].act(copies[0].initial_carry(), seen)[1]
+    mean = average.act(average.initial_carry(), seen)[1]
     assert np.linalg.norm(mean - wanted) < np.linalg.norm(one - wanted)
 
 

@@ -230,9 +230,9 @@ def test_policy_round_trip(trained, tmp_path):
     policy.save(tmp_path / "p.msgpack")
     loaded = Policy.load(tmp_path / "p.msgpack", task="tiny")
     obs = jax.random.normal(jax.random.key(1), (5, 3))
-    np.testing.assert_array_equal(loaded(obs), policy(obs))
-    np.testing.assert_allclose(act(loaded.params, obs[0]), policy(obs)[0], rtol=1e-5, atol=1e-6)
-    assert float(jnp.abs(loaded(1e6 * obs)).max()) <= 1
+    np.testing.assert_array_equal(loaded.act(None, obs)[1], policy.act(None, obs)[1])
+    np.testing.assert_allclose(act(loaded.params, None, obs[0])[1], policy.act(None, obs)[1][0], rtol=1e-5, atol=1e-6)
+    assert float(jnp.abs(loaded.act(None, 1e6 * obs)[1]).max()) <= 1
     assert from_dict(TinyConfig, loaded.env_config) == env.config
     assert loaded.observation_layout == env.observation_layout["actor"]
     assert loaded.control_rate == pytest.approx(10) and loaded.training == {"seed": 0}
@@ -257,7 +257,7 @@ def test_policies_load_without_the_simulator(trained, tmp_path):
     Policy.from_training(env, SMALL, state).save(tmp_path / "p.msgpack")
     code = (
         f"from dexsim_ppo import Policy; import jax.numpy as jnp, sys; "
-        f"p = Policy.load({str(tmp_path / 'p.msgpack')!r}); print(p(jnp.zeros(3)).shape); "
+        f"p = Policy.load({str(tmp_path / 'p.msgpack')!r}); print(p.act(None, jnp.zeros(3))[1].shape); "
         "bad = {'mujoco', 'warp', 'tyro', 'matplotlib', 'trimesh'} & set(sys.modules); "
         "assert not bad, bad"
     )

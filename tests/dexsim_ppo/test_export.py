@@ -27,7 +27,7 @@ def observations(policy, count=1000, seed=0):
 
 def from_the_start(policy, seen):
     """Actions for observations [..., n], each as the first of an episode."""
-    return policy.act(policy.begin(*seen.shape[:-1]), seen)[1]
+    return policy.act(policy.initial_carry(*seen.shape[:-1]), seen)[1]
 
 
 @pytest.fixture(scope="module", params=[".npz", ".onnx"])
@@ -69,17 +69,15 @@ def test_a_policy_with_memory_is_exported_with_it(kind, suffix, tmp_path):
     policy, path = remembering(kind), tmp_path / f"policy{suffix}"
     {".npz": export.to_numpy, ".onnx": export.to_onnx}[suffix](policy, path)
     exported, seen = export.load_exported(path), observations(policy, 80).reshape(8, 10, -1)
-    memory, other = policy.begin(10), exported.begin(10)
-    np.testing.assert_array_equal(other, memory)
+    carry, other = policy.initial_carry(10), exported.initial_carry(10)
+    np.testing.assert_array_equal(other, carry)
     for obs in seen:
-        (memory, wanted), (other, action) = policy.act(memory, obs), exported.act(other, obs)
+        (carry, wanted), (other, action) = policy.act(carry, obs), exported.act(other, obs)
         np.testing.assert_allclose(action, wanted, atol=2e-5)
-        np.testing.assert_allclose(other, memory, atol=2e-5)
-    one = exported.act(exported.begin(), seen[0, 0])  # one alone, from the start
-    np.testing.assert_allclose(one[1], policy.act(policy.begin(), seen[0, 0])[1], atol=2e-5)
-    assert np.abs(action - np.asarray(policy.act(policy.begin(10), obs)[1])).max() > 0.01, "memory matters"
-    with pytest.raises(ConfigError, match="this policy has a memory"):
-        exported(seen[0])
+        np.testing.assert_allclose(other, carry, atol=2e-5)
+    one = exported.act(exported.initial_carry(), seen[0, 0])  # one alone, from the start
+    np.testing.assert_allclose(one[1], policy.act(policy.initial_carry(), seen[0, 0])[1], atol=2e-5)
+    assert np.abs(action - np.asarray(policy.act(policy.initial_carry(10), obs)[1])).max() > 0.01, "memory matters"
 
 
 def test_it_runs_where_there_is_neither_jax_nor_the_rest_of_the_library(tmp_path):
@@ -95,7 +93,7 @@ for name in ("jax", "jaxlib", "mujoco", "scipy", "msgpack", "dexsim", "dexsim_pp
 import numpy as np
 from portable import PortablePolicy
 policy = PortablePolicy.load("grasp.npz")
-np.save("action.npy", policy.act(policy.begin(1000), np.load("seen.npy"))[1])
+np.save("action.npy", policy.act(policy.initial_carry(1000), np.load("seen.npy"))[1])
 """
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr

@@ -54,7 +54,7 @@ def test_the_policy_makes_the_environment_that_it_was_trained_in(run):
     cut = dataclasses.replace(run.policy, params=dataclasses.replace(params, layers=(*hidden, short)))
     with pytest.raises(CheckpointError, match="the policy gives 5 actions, and poke takes 12"):
         cut.check_env(env)
-    action = run.policy(jax.jit(env.reset)(jax.random.key(0)).obs["actor"])
+    action = run.policy.act(None, jax.jit(env.reset)(jax.random.key(0)).obs["actor"])[1]
     assert action.shape == (12,) and np.all(np.abs(action) <= 1)
 
 

@@ -186,7 +186,7 @@ def test_any_other_value_anywhere_is_one_line_or_a_policy(tmp_path_factory, hand
         assert re.match(r"^[^\n]{1,500}$", str(error))
         return
     assert 1 <= policy.control_rate <= 1000
-    assert np.all(np.abs(policy.act(policy.begin(), np.full(66, 1e30, np.float32))[1]) <= 1)
+    assert np.all(np.abs(policy.act(policy.initial_carry(), np.full(66, 1e30, np.float32))[1]) <= 1)
 
 
 def test_large_weights_that_do_not_overflow_are_a_policy(sound, tmp_path):

@@ -116,7 +116,7 @@ def test_actions_are_in_range_in_training_as_from_a_policy(distribution):
     normalizers = ppo.make_normalizers(Unclipped(), config, state.observation_stats)
     layers = jax.tree.map(lambda x: 1e3 * x, state.params.actor)
     obs = 10 * jax.random.normal(jax.random.key(1), (50, 3))
-    assert float(jnp.abs(act(PolicyParams(layers, normalizers["actor"], distribution), obs)).max()) == 1.0
+    assert float(jnp.abs(act(PolicyParams(layers, normalizers["actor"], distribution), None, obs)[1]).max()) == 1.0
 
 
 class Short(TinyEnv):

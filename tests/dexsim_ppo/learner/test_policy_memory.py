@@ -155,13 +155,11 @@ def test_a_file_holds_the_memory(kind, tmp_path):
     policy.save(tmp_path / "policy.msgpack")
     again = Policy.load(tmp_path / "policy.msgpack")
     obs = np.random.default_rng(0).normal(size=(5, 7, 2)).astype(np.float32)
-    one, other = policy.begin(7), again.begin(7)
+    one, other = policy.initial_carry(7), again.initial_carry(7)
     for x in obs:
         (one, action), (other, same) = policy.act(one, x), again.act(other, x)
         np.testing.assert_array_equal(action, same)
-    assert again.begin().shape == one.shape[1:] and np.abs(one).max() > 0
-    with pytest.raises(ConfigError, match=r"^this policy has a memory: .*policy\.act"):
-        again(obs[0])
+    assert again.initial_carry().shape == one.shape[1:] and np.abs(one).max() > 0
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -171,7 +169,7 @@ def test_fine_tuning_begins_with_it(kind):
     check_fit(policy, env, config)
     state = initialize_from(policy, config, ppo.make_train(env, config).init(jax.random.key(9)))
     again = Policy.from_training(env, config, state)
-    memory = jax.random.normal(jax.random.key(3), policy.begin(5).shape)
+    memory = jax.random.normal(jax.random.key(3), policy.initial_carry(5).shape)
     obs = jnp.ones((5, 2))
     for one, other in zip(policy.act(memory, obs), again.act(memory, obs), strict=True):
         np.testing.assert_allclose(one, other, atol=1e-5)
