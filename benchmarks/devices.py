@@ -2,7 +2,6 @@
 
     python benchmarks/devices.py --task rotate --devices 1 2 4 8    # devices of this process
     python benchmarks/devices.py --task grasp --processes 2         # two processes, cores and GPUs shared out
-    python benchmarks/devices.py --task grasp --seeds 4             # four seeds in one program, against one
 
 `--devices` measures training with so many devices in turn, the same environments on each. `--processes` measures so
 many processes that train together, all their devices in one mesh, and beside it as many that train alone at the same
@@ -30,12 +29,11 @@ from throughput import preset
 
 import dexsim
 from dexsim.core.cli import enable_caches
-from dexsim.core.compilation import collector_paused, jit
+from dexsim.core.compilation import collector_paused
 from dexsim.registry import find_task
 from dexsim_ppo.learner.adapter import adapt
-from dexsim_ppo.learner.devices.apart import ApartStep
-from dexsim_ppo.learner.devices.sharding import make_mesh
 from dexsim_ppo.learner.ppo import make_train
+from dexsim_ppo.learner.sharding import make_mesh
 from dexsim_ppo.training import processes
 
 
@@ -45,37 +43,28 @@ class Case:
     Args:
       options: of the command.
       devices: how many of this process's, or of all processes together.
-      seeds: trainings in one program.
     """
 
-    def __init__(self, options: argparse.Namespace, devices: int, seeds: int = 1):
+    def __init__(self, options: argparse.Namespace, devices: int):
         ppo = preset(options.task).ppo
         each = options.num_envs or ppo.num_envs
         self.config = dataclasses.replace(ppo, num_envs=each * devices, iterations_per_call=options.iterations)
         if options.rollout_length:
             self.config = dataclasses.replace(self.config, rollout_length=options.rollout_length)
         env = adapt(dexsim.make(options.task, backend=options.backend, num_envs=each), options.task)
-        begin, self.times, self.seeds = time.perf_counter(), list[float](), seeds
+        begin, self.times = time.perf_counter(), list[float]()
         training = make_train(env, self.config, mesh=make_mesh(devices, self.config))
-        shapes, step = training.shapes(jax.random.key(0)), training.step
-        if seeds == 1:
-            self.state = training.init(jax.random.key(0))
-        else:
-            self.state = jax.vmap(training.init)(jax.random.split(jax.random.key(0), seeds))
-            shapes = jax.eval_shape(lambda: self.state)
-            step = jit(jax.vmap(training.plain_step), backend=env.backend, donate_argnums=0)
-        self.step = step.lower(shapes).compile()
+        self.state = training.init(jax.random.key(0))
+        self.step = training.step.lower(training.shapes(jax.random.key(0))).compile()
         bytes_, counts = received(self.step.as_text())
-        iterations = 1 if isinstance(self.step, ApartStep) else options.iterations  # in the program
         self.row = {
             "devices": devices,
             "processes": jax.process_count(),
-            "seeds": seeds,
             "backend": env.backend,
             "num_envs_per_device": each,
             "compile_s": round(time.perf_counter() - begin, 1),
-            "received_bytes": round(bytes_ / iterations),
-            "collectives": {name: round(count / iterations, 1) for name, count in counts.items()},
+            "received_bytes": round(bytes_ / options.iterations),
+            "collectives": {name: round(count / options.iterations, 1) for name, count in counts.items()},
         }
 
     def run(self) -> None:
@@ -97,7 +86,7 @@ def measure(options: argparse.Namespace, *cases: Case) -> list[dict[str, Any]]:
     for case in cases:
         times = case.times[options.warmup :]
         seconds = statistics.median(times)
-        speed = case.seeds * options.iterations * case.config.steps_per_iteration / seconds
+        speed = options.iterations * case.config.steps_per_iteration / seconds
         rows.append(
             case.row
             | {
@@ -131,7 +120,6 @@ def parse(argv: list[str]) -> argparse.Namespace:
     parser.add_argument("--backend", default="auto", choices=["auto", "jax", "warp", "c"])
     parser.add_argument("--devices", nargs="+", type=int, default=[1], metavar="N")
     parser.add_argument("--processes", type=int, default=1, metavar="N")
-    parser.add_argument("--seeds", type=int, default=1, metavar="N", help="in one program, beside one")
     parser.add_argument("--num-envs", type=int, default=0, help="environments on a device; 0 for the preset's")
     parser.add_argument("--rollout-length", type=int, default=0, help="0 for the preset's")
     parser.add_argument("--iterations", type=int, default=1, help="in one compiled call")
@@ -147,8 +135,6 @@ def rows(options: argparse.Namespace, argv: list[str]) -> Iterator[dict[str, Any
     if options.processes > 1:
         for together in (False, True):
             yield run_processes(argv, options.processes, together)
-    elif options.seeds > 1:
-        yield from measure(options, Case(options, 1), Case(options, 1, options.seeds))
     else:
         for devices in options.devices:
             yield from measure(options, Case(options, devices))
@@ -160,7 +146,7 @@ def main(argv: list[str]) -> None:
     options.task = options.task.rpartition(":")[2]
     if options.worker:
         processes.connect()
-        with processes.leaving_at_once():
+        with processes.exit_on_error():
             enable_caches()
             return print(json.dumps(measure(options, Case(options, jax.device_count()))[0]), flush=True)
     enable_caches()

@@ -40,7 +40,7 @@ def parts(task: str, backend: str, num_envs: int, warmup: int) -> Iterator[tuple
     ticks, _ = compiled(lambda state: record(recorder, config, state))(state)
     first = jax.tree.map(lambda x: x[0], ticks)
     yield "physics of a tick", compiled(lambda tick: replay(env, tick)), first
-    collect = compiled(lambda state: ppo.experience(env, config, state))
+    collect = compiled(lambda state: ppo.collect_rollout(env, config, state))
     yield "experience", collect, state
     (env_state, memory), rollout, tally = collect(state)
     state = dataclasses.replace(state, env_state=env_state, memory=memory)

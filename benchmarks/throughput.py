@@ -177,9 +177,10 @@ def runner(env: Env, num_envs: int, steps: int, step: Callable | None = None) ->
             action = jax.random.uniform(key, (num_envs, env.action_size), minval=-1.0)
             after, tape = jax.vmap(step)(carry, action, tape)
             touched = jnp.mean(jnp.any(after.finger_force > 0, -1))
-            return after, (touched, tape)
+            return after, after.terminated | after.truncated, (touched, tape)
 
-        state, (touched, tape) = scan_restarting(env, body, state, (jax.random.split(key, steps), tape))
+        restart = jax.vmap(env.restart)
+        state, (touched, tape) = scan_restarting(restart, body, state, (jax.random.split(key, steps), tape))
         return state, jnp.mean(touched), tape
 
     return jit(run, backend=env.backend)

@@ -11,7 +11,7 @@ import dataclasses
 import functools
 import statistics
 from collections.abc import Callable
-from typing import Any, cast
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -29,7 +29,7 @@ from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.distribution import log_prob, sample, squash
 from dexsim_ppo.learner.loss import actor_step, critic_value
 from dexsim_ppo.learner.ppo import TrainState, make_train
-from dexsim_ppo.learner.rollout import Remembering, Restarting, Rollout, scan_restarting
+from dexsim_ppo.learner.rollout import Rollout, scan_restarting
 from dexsim_ppo.learner.update import Learner, update
 
 
@@ -45,11 +45,11 @@ def split(task: str, backend: str, num_envs: int, repeats: int) -> list[dict]:
     compiled = functools.partial(jit, backend=env.backend)
     whole = compiled(lambda state: ppo.train_iteration(env, config, state))
     ticks, actions = compiled(lambda state: record(recorder, config, state))(state)
-    rollout = compiled(lambda state: ppo.experience(env, config, state))(state)[1]
+    rollout = compiled(lambda state: ppo.collect_rollout(env, config, state))(state)[1]
     # What a part works on is an argument: as constants, XLA would fold it or hold it twice.
     cases: dict[str, tuple[Callable, tuple[Any, ...]]] = {
         "training step": (whole, (state,)),
-        "rollout": (compiled(lambda state: ppo.experience(env, config, state)), (state,)),
+        "rollout": (compiled(lambda state: ppo.collect_rollout(env, config, state)), (state,)),
         "environment": (compiled(lambda begin, actions: environment(env, begin, actions)), (state.env_state, actions)),
         "physics": (compiled(lambda ticks: physics(env, ticks)), (ticks,)),
         "touch": (compiled(lambda ticks, key: touch(env, ticks, key)), (ticks, jax.random.key(1))),
@@ -91,16 +91,20 @@ def record(env: Recorder, config: PPOConfig, state: TrainState) -> tuple[Any, ja
     """The ticks [T, B] that physics gets under the policy, with what comes of them, and the actions."""
     normalizers = ppo.make_normalizers(env, config, state.observation_stats)
 
+    def restart(now, done):
+        return env.restart(now[0], done), jax.tree.map(lambda x: jnp.where(done, 0.0, x), now[1])
+
     def tick(now, key):
-        memory, mean = actor_step(config, state.params, normalizers, now.state.obs, now.memory)
+        before, carry = now
+        carry, mean = actor_step(config, state.params, normalizers, before.obs, carry)
         action = sample(jax.random.normal(key, mean.shape), mean, state.params.log_std)
         action = squash(action, config.distribution)
-        after, given = jax.vmap(env.recorded_step)(now.state, action)
+        after, given = jax.vmap(env.recorded_step)(before, action)
         outcome = after.physics.qpos, after.finger_force
-        return Remembering(after, memory), (*given, *outcome, action)
+        return (after, carry), after.terminated | after.truncated, (*given, *outcome, action)
 
-    keys, begin = jax.random.split(state.key, config.rollout_length), Remembering(state.env_state, state.memory)
-    *ticks, actions = scan_restarting(cast(Any, Restarting(cast(Any, env))), tick, begin, keys)[1]
+    keys, begin = jax.random.split(state.key, config.rollout_length), (state.env_state, state.carry)
+    *ticks, actions = scan_restarting(jax.vmap(restart), tick, begin, keys)[1]
     return tuple(ticks), actions
 
 
@@ -109,9 +113,9 @@ def environment(env: Env, state: Any, actions: jax.Array) -> Any:
 
     def tick(state, action):
         after = jax.vmap(env.step)(state, action)
-        return after, _used((after.obs, after.reward, after.metrics))
+        return after, after.terminated | after.truncated, _used((after.obs, after.reward, after.metrics))
 
-    return scan_restarting(env, tick, state, actions)
+    return scan_restarting(jax.vmap(env.restart), tick, state, actions)
 
 
 def physics(env: Env, ticks: Any) -> jax.Array:
@@ -177,15 +181,15 @@ def policy(env: Env, config: PPOConfig, state: TrainState, rollout: Rollout) -> 
         ]
         return key, _used((action, log_prob(action, mean, state.params.log_std), values, later))
 
-    return jax.lax.scan(tick, state.key, (rollout.obs, rollout.memory))[1]
+    return jax.lax.scan(tick, state.key, (rollout.obs, rollout.carry))[1]
 
 
 def learn(env: Env, config: PPOConfig, state: TrainState, rollout: Rollout) -> Any:
     """Advantages, all epochs over all minibatches, statistics."""
     normalizers = ppo.make_normalizers(env, config, state.observation_stats)
-    ready = ppo.prepare(config, state.value_stats, state.observation_stats, state.params, rollout)
-    learner = Learner(ready.params, state.adam, state.learning_rate, state.skipped_updates)
-    return update(config, normalizers, ready.samples, state.key, learner), ready
+    batch = ppo.prepare(config, state.value_stats, state.observation_stats, state.params, rollout)
+    learner = Learner(batch.params, state.adam, state.learning_rate, state.skipped_updates)
+    return update(config, normalizers, batch.samples, state.key, learner), batch
 
 
 def _used(tree: Any) -> jax.Array:

@@ -8,7 +8,7 @@ import numpy as np
 from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import pytree_dataclass, static
 from dexsim_ppo.learner.distribution import squash
-from dexsim_ppo.learner.memory import Memory, empty, remember, state_size
+from dexsim_ppo.learner.memory import GRU, carry_size, step_memory, zero_carry
 from dexsim_ppo.learner.networks import MLP, apply_mlp
 from dexsim_ppo.learner.running_stats import Normalizer, normalize
 
@@ -21,12 +21,12 @@ class PolicyParams:
     normalizer: Normalizer
     squash: Literal["gaussian", "tanh"] = static(default="gaussian")
     """`"gaussian"`: actions are clipped to [-1, 1]; `"tanh"`: squashed."""
-    memory: Memory = None
+    memory: GRU | None = None
 
 
 def initial_carry(params: PolicyParams, batch: tuple[int, ...] = ()) -> jax.Array | None:
     """The carry `[*batch, m]` at the start of an episode; None for a policy without memory."""
-    return empty(params.memory, params.normalizer.mean.shape[0], batch)
+    return zero_carry(params.memory, batch)
 
 
 def act(params: PolicyParams, carry: jax.Array | None, obs: jax.Array) -> tuple[jax.Array | None, jax.Array]:
@@ -46,11 +46,11 @@ def act(params: PolicyParams, carry: jax.Array | None, obs: jax.Array) -> tuple[
     size, shape = params.normalizer.mean.shape[0], np.shape(obs)
     if shape[-1:] != (size,):
         raise ConfigError(f"expected the actor's observation [..., {size}], state.obs['actor']; got the shape {shape}")
-    expected = None if params.memory is None else (*shape[:-1], state_size(params.memory, size))
+    expected = None if params.memory is None else (*shape[:-1], carry_size(params.memory))
     if (given := None if carry is None else np.shape(carry)) != expected:
         raise ConfigError(
             f"expected a carry of the shape {expected} (None without memory), got {given}: begin an episode with "
             "carry = policy.initial_carry(number of environments)"
         )
-    carry, features = remember(params.memory, carry, normalize(params.normalizer, obs))
+    carry, features = step_memory(params.memory, carry, normalize(params.normalizer, obs))
     return carry, squash(apply_mlp(params.layers, features), params.squash)

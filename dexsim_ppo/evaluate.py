@@ -76,9 +76,8 @@ class Evaluator:
                 if show:
                     show(i + self.chunk)
         # Episodes are the last axis of all that is measured.
-        measured = jax.tree.map(lambda *xs: np.concatenate(xs, axis=-1), *(measured for measured, _ in parts))
-        found, over = measured
-        report = (summarize_totals if self.totals else summarize)(self.env, found, over, np.asarray(plan.row)) | {
+        metrics, over = jax.tree.map(lambda *xs: np.concatenate(xs, axis=-1), *(measured for measured, _ in parts))
+        report = (summarize_totals if self.totals else summarize)(self.env, metrics, over, np.asarray(plan.row)) | {
             "seed": seed,
             "seconds": time.perf_counter() - started,
         }
@@ -198,7 +197,7 @@ def evaluate_policy(
       `"do_nothing"`: the same of the baseline.
 
     Raises:
-      CheckpointError, ConfigError: see `Policy.load` and `Policy.make_env`.
+      CheckpointError, ConfigError: see `load_policy` and `Policy.make_env`.
     """
     EvaluateArguments(policy=str(policy), episodes=episodes, seed=seed, backend=cast(Any, backend), chunk=chunk)
     policy = policy if isinstance(policy, Policy) else load_policy(policy)
@@ -262,28 +261,20 @@ def main(argv: Sequence[str] | None = None) -> int:
         description="Measure a policy over fixed, seeded episodes.",
     )
     cli.enable_caches()
-    for path in (arguments.output, arguments.video):
+    video = arguments.video
+    for path in (arguments.output, video):
         if path:
             cli.check_writable(path)
-    video = arguments.video
     if video and video.suffix not in (".mp4", ".gif"):
         raise ConfigError(f"--video {video}: give a file that ends in .mp4 or .gif")
-    for name, path in (("--output", arguments.output), ("--video", video)):
-        if path and path.exists() and Path(arguments.policy).exists() and path.samefile(arguments.policy):
-            raise ConfigError(f"{name} {path}: is the policy itself; name another file")
-    if video and arguments.output and video.resolve() == arguments.output.resolve():
-        raise ConfigError(f"--output and --video are both {video}: name two files")
+    cli.check_apart({"--output": arguments.output, "--video": video}, {"policy": arguments.policy})
     policy = load_policy(arguments.policy, task=arguments.task).ablate(*arguments.ablate)
     chunk = min(arguments.chunk or default_chunk(), arguments.episodes or default_chunk())
-    if not any(entry.startswith("objects.mesh=") for entry in arguments.set):
-        policy.check_mesh()
     seconds = [f"evaluation_seconds={arguments.seconds}"] if arguments.seconds else []
     policy = dataclasses.replace(policy, env_config=override(policy.env_config, (*seconds, *arguments.set)))
     entry, hand = find_task(policy.task), policy.find_hand(arguments.hand)
-    if seconds and not any(field.name == "evaluation_seconds" for field in dataclasses.fields(entry.config_class)):
-        raise ConfigError(f"--seconds {arguments.seconds:g}: task {policy.task!r} has no evaluation_seconds to set")
     with cli.naming_options(entry.config_class, entry.config(), functools.partial(_typed, arguments)):
-        env = policy.build_env(backend=arguments.backend, num_envs=chunk, hand=hand)
+        env = policy.make_env(backend=arguments.backend, num_envs=chunk, hand=hand)
     if video and isinstance(env, Adapted):
         raise ConfigError(f"--video {video}: {env.name!r} draws nothing")
     evaluator, episodes = Evaluator(env, chunk), arguments.episodes or default_episodes(env)

@@ -8,7 +8,7 @@ import jax
 from dexsim.core.compilation import available_cores
 from dexsim.core.errors import ConfigError
 from dexsim_ppo.learner.config import PPOConfig
-from dexsim_ppo.learner.curriculum import Curriculum
+from dexsim_ppo.learner.curriculum import CurriculumConfig
 from dexsim_ppo.training.arguments import TrainArguments
 
 
@@ -31,7 +31,7 @@ class Preset:
     """Iterations between logged metrics."""
     extremes: float = 0.0
     """Share of training episodes whose hand or object takes the extreme of every range."""
-    curriculum: Curriculum = Curriculum()
+    curriculum: CurriculumConfig = CurriculumConfig()
     """How the ranges widen during training."""
 
 
@@ -56,7 +56,7 @@ _CPU = Preset(
 )
 # A gait is found on nearly nominal hands and widened: twice the turns of a training on the full ranges. What counts is
 # the goals of an episode: two goals and a stop end it early, so that their rate is that of a slow gait.
-_WIDENING = Curriculum(on=True, metric="episode/successes", widen_above=5.0, narrow_below=2.5, step=0.005)
+_WIDENING = CurriculumConfig(on=True, metric="episode/successes", widen_above=5.0, narrow_below=2.5, step=0.005)
 PRESETS = {
     "cpu": _CPU,
     # 16 cores and more: enough environments for all of them. Sized from trainings of rotate on 2 to 12 cores.
@@ -108,7 +108,7 @@ def find_preset(name: str, task: str) -> Preset:
     ppo = replace(preset.ppo, epochs=4, minibatches=16, entropy_coefficient=0.001)
     if not cpu:  # A quarter of the environments: four times the updates from the same experience, for the gait.
         return replace(preset, ppo=replace(ppo, num_envs=8192, memory="none"), minutes=5.0)
-    curriculum = _WIDENING if task == "rotate" else Curriculum()
+    curriculum = _WIDENING if task == "rotate" else CurriculumConfig()
     preset = replace(preset, ppo=replace(ppo, kl_halving=400), curriculum=curriculum, evaluation_episodes=256)
     if name == "cpu-large":
         return replace(preset, minutes=15.0, evaluation_chunk=256)

@@ -19,7 +19,7 @@ from dexsim.tasks.grasp.config import GraspConfig
 from dexsim_ppo import Policy, evaluate_policy, make_train, reproduce, train_policy
 from dexsim_ppo import evaluate as evaluate_command
 from dexsim_ppo.learner.adapter import adapt
-from dexsim_ppo.learner.curriculum import Curriculum
+from dexsim_ppo.learner.curriculum import CurriculumConfig
 
 
 def play(env, actions, key=0):
@@ -174,7 +174,7 @@ def test_a_command_that_is_printed_names_the_module(monkeypatch):
 def test_ranges_that_do_not_exist_cannot_widen(monkeypatch, tmp_path):
     monkeypatch.setattr(registry, "TASKS", dict(registry.TASKS))
     with pytest.raises(ConfigError, match="an environment from elsewhere has no ranges that could widen"):
-        train_policy("reach_env:reach", ppo=SMALL, steps=64, curriculum=Curriculum(on=True), run_dir=tmp_path / "run")
+        train_policy("reach_env:reach", ppo=SMALL, steps=64, curriculum=CurriculumConfig(on=True), run_dir=tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 

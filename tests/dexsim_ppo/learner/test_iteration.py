@@ -9,7 +9,7 @@ import pytest
 from tiny_env import SMALL, TinyEnv
 
 from dexsim_ppo.learner import ppo, update
-from dexsim_ppo.learner.curriculum import Curriculum, next_scale
+from dexsim_ppo.learner.curriculum import CurriculumConfig, next_scale
 from dexsim_ppo.learner.loss import Samples
 from dexsim_ppo.learner.networks import apply_mlp, init_params
 from dexsim_ppo.learner.ppo import make_train
@@ -282,7 +282,7 @@ def test_an_iteration_reports_what_it_had_and_what_it_made():
     ("success", "change"), [(0.5, -0.1), (0.25, -0.1), (0.75, 0.0), (0.8, 0.0), (0.875, 0.1), (1.0, 0.1)]
 )
 def test_the_curriculum_widens_at_its_upper_mark_and_narrows_below_its_lower(success, change):
-    rules = Curriculum(on=True, widen_above=0.875, narrow_below=0.75, step=0.1)
+    rules = CurriculumConfig(on=True, widen_above=0.875, narrow_below=0.75, step=0.1)
     assert float(next_scale(jnp.float32(0.5), jnp.float32(success), rules)) == pytest.approx(0.5 + change)
 
 

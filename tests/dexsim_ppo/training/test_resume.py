@@ -18,7 +18,7 @@ from tiny_train import PER_ITERATION
 
 from dexsim.core.errors import CheckpointError, ConfigError
 from dexsim_ppo import checkpoint, train
-from dexsim_ppo.learner.curriculum import Curriculum
+from dexsim_ppo.learner.curriculum import CurriculumConfig
 from dexsim_ppo.policy import Policy
 from dexsim_ppo.training import runlog, trainer
 from dexsim_ppo.training.arguments import check_resumed
@@ -80,7 +80,7 @@ def test_only_budget_and_what_looks_on_may_change(finished):
     other |= {"evaluation_share": 0.5, "evaluate_every": 5, "wandb": "mine"}
     other |= {"hand": "mine.toml", "deterministic": True}
     other |= {"run_dir": Path("x"), "resume": Path("x"), "video": True, "env": TinyConfig(gain=0.5)}
-    other |= {"ppo": dataclasses.replace(saved.ppo, discount=0.5), "curriculum": Curriculum(on=True)}
+    other |= {"ppo": dataclasses.replace(saved.ppo, discount=0.5), "curriculum": CurriculumConfig(on=True)}
     allowed = set()
     for field in dataclasses.fields(saved):
         value = other.get(field.name, 77)

@@ -14,7 +14,7 @@ from tiny_env import SMALL, TinyConfig, TinyEnv
 
 from dexsim.core.pytree import pytree_dataclass
 from dexsim_ppo import checkpoint, train
-from dexsim_ppo.learner.curriculum import Curriculum
+from dexsim_ppo.learner.curriculum import CurriculumConfig
 from dexsim_ppo.training import trainer
 from dexsim_ppo.training.arguments import TrainArguments
 from dexsim_ppo.training.runlog import RunFolder, means
@@ -177,7 +177,7 @@ def test_better_needs_the_other_interval_to_be_wholly_below():
 
 def test_whatever_the_program_depends_on_identifies_it(tmp_path):
     """And a step over several devices, or of an environment that cannot say what it is, has no identity."""
-    arguments = TrainArguments(env=TinyConfig(), ppo=CONFIG, curriculum=Curriculum(on=True))
+    arguments = TrainArguments(env=TinyConfig(), ppo=CONFIG, curriculum=CurriculumConfig(on=True))
     run = Run(TinyEnv(), arguments, RunFolder(tmp_path), 0.0)
     assert run.identity() is None
     run.env.fingerprint = lambda: "hand and task"
@@ -186,7 +186,7 @@ def test_whatever_the_program_depends_on_identifies_it(tmp_path):
     found.append(run.identity())
     run.config = dataclasses.replace(CONFIG, discount=0.5)
     found.append(run.identity())
-    run.arguments = dataclasses.replace(arguments, curriculum=Curriculum(on=True, step=0.5))
+    run.arguments = dataclasses.replace(arguments, curriculum=CurriculumConfig(on=True, step=0.5))
     found.append(run.identity())
     assert len({json.dumps(one) for one in found}) == 4
     run.mesh = SimpleNamespace(size=2)

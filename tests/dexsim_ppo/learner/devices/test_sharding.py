@@ -13,7 +13,7 @@ from paths import ROOT
 from tiny_env import SMALL, TinyEnv
 
 from dexsim.core.errors import ConfigError
-from dexsim_ppo.learner.devices.sharding import make_mesh
+from dexsim_ppo.learner.sharding import make_mesh
 from dexsim_ppo.learner.ppo import make_train
 
 sys.path.insert(0, str(ROOT / "benchmarks"))
