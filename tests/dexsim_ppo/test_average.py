@@ -40,7 +40,7 @@ def test_a_tree_of_two_is_halfway_and_a_file_holds_it(tmp_path):
     for policy, file in zip((one, other), files, strict=True):
         policy.save(file)
     assert main([*files, "--output", str(tmp_path / "made" / "average.msgpack")]) == 0
-    found = Policy.load(tmp_path / "made" / "average.msgpack")
+    found = load_policy(tmp_path / "made" / "average.msgpack")
     for a, b, mean in zip(*(jax.tree.leaves(p.params) for p in (one, other, found)), strict=True):
         np.testing.assert_allclose(mean, a + (b - a) / 2, rtol=1e-5, atol=1e-7)
     assert found.training == {"average_of": [{"seed": 1}, {"seed": 2}]}

@@ -72,7 +72,7 @@ def test_evaluation_by_name_and_from_python_agree(run, tmp_path, capsys):
 
 def test_another_environment_is_warned_of(run, monkeypatch):
     monkeypatch.setattr("dexsim_ppo.evaluate.Evaluator", lambda env, chunk: lambda params, **options: ({}, None))
-    other = Policy.load(run.folder / "last.msgpack")
+    other = load_policy(run.folder / "last.msgpack")
     changed = override(other.env_config, ["gain=1.5"])
     env = registry.make("poke", registry.find_task("poke").config_class(gain=1.5), backend="c", num_envs=4)
     with pytest.warns(OtherEnvWarning, match=r"gain = 1\.5 \(trained: 3\.0\)"):

@@ -33,7 +33,7 @@ SHIPPED = {
 
 
 def load(name):
-    return Policy.load(asset_path(f"policies/{name}.msgpack"))
+    return load_policy(asset_path(f"policies/{name}.msgpack"))
 
 
 @pytest.mark.parametrize("name", SHIPPED)
@@ -227,7 +227,7 @@ def test_a_folder_named_as_a_shipped_policy_does_not_hide_it(tmp_path, monkeypat
     monkeypatch.chdir(tmp_path)
     for name in ("grasp", "mine"):
         (tmp_path / name).mkdir()
-    assert Policy.load("grasp").task == "grasp"
+    assert load_policy("grasp").task == "grasp"
     for name in ("mine", "./grasp"):
         with pytest.raises(CheckpointError, match="cannot be read"):
-            Policy.load(name)
+            load_policy(name)

@@ -69,7 +69,7 @@ def test_the_hash_has_what_the_included_files_include(own, quote):
 def test_policy_carries_its_hand(own, tmp_path):
     record = record_of(load_hand(own))
     dataclasses.replace(load_policy("grasp"), hand=record).save("policy.msgpack")
-    policy = Policy.load("policy.msgpack")
+    policy = load_policy("policy.msgpack")
     assert policy.hand == record and policy.find_hand().digest == record["digest"]
     assert load_policy("grasp").hand is None and load_policy("grasp").find_hand() is None
     shutil.move("own", "elsewhere")
@@ -106,7 +106,7 @@ def test_record_without_sense_is_refused(tmp_path):
     path = tmp_path / "policy.msgpack"
     dataclasses.replace(load_policy("grasp"), hand={"file": 3}).save(path)
     with pytest.raises(CheckpointError, match="record of the hand makes no sense"):
-        Policy.load(path)
+        load_policy(path)
 
 
 def test_run_keeps_its_hand(own, tmp_path):

@@ -19,7 +19,7 @@ from dexsim_ppo.learner import ppo
 from dexsim_ppo.learner.loss import loss
 from dexsim_ppo.learner.networks import init_params
 from dexsim_ppo.learner.running_stats import RunningStats
-from dexsim_ppo.learner.types import Field
+from dexsim.core.layout import LayoutEntry
 
 STEPS, ROWS, ACTIONS = 8, 5, 2
 CONFIG = dataclasses.replace(
@@ -57,8 +57,8 @@ class Script:
     """Each row plays the same episode again and again, whatever the actions."""
 
     observation_layout = {
-        "actor": (Field("pose", 2, None), Field("touch", 2, 4.0)),
-        "critic": (Field("touch", 1, 0.5), Field("pose", 3, None)),
+        "actor": (LayoutEntry("pose", 2, None), LayoutEntry("touch", 2, 4.0)),
+        "critic": (LayoutEntry("touch", 1, 0.5), LayoutEntry("pose", 3, None)),
     }
 
     def __init__(self, rng):

@@ -15,9 +15,9 @@ from dexsim_ppo.learner import ppo
 from dexsim_ppo.learner.adapter import adapt
 from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.loss import actor_mean, critic_value
-from dexsim_ppo.learner.memory import GRU, init_memory, remember
+from dexsim_ppo.learner.memory import GRU, init_gru, step_memory
 from dexsim_ppo.learner.networks import Layer
-from dexsim_ppo.policy import Policy
+from dexsim_ppo.policy import Policy, load_policy
 from dexsim_ppo.training.fine_tune import check_fit, fine_tuning_config, initialize_from
 
 KINDS = ("history", "gru")
@@ -45,8 +45,8 @@ def experience(kind):
         after, rollout, _ = ppo.collect_rollout(env, config, state, normalizers, jax.random.key(1))
         samples, params, *_ = ppo.prepare(config, state.value_stats, {}, state.params, rollout)
         samples = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), samples)  # the blocks, one after another
-        mean = actor_mean(config, params, normalizers, samples.obs, samples.memory, samples.first)
-        value = critic_value(config, params, normalizers, samples.obs, samples.memory)
+        mean = actor_mean(config, params, normalizers, samples.obs, samples.carry, samples.first)
+        value = critic_value(config, params, normalizers, samples.obs, samples.carry)
         return after, rollout, samples, mean, value
 
     return jax.device_get(collect(state))
@@ -80,7 +80,7 @@ def test_the_update_begins_with_the_actions_probabilities_of_the_rollout(kind):
 def test_every_episode_begins_with_an_empty_memory_and_only_then(kind):
     (_, last), rollout, *_ = experience(kind)
     ended = rollout.terminated | rollout.truncated
-    later = np.concatenate([rollout.memory[1:], last[None]])
+    later = np.concatenate([rollout.carry[1:], last[None]])
     assert 0 < ended.sum() < ended.size and ended[:-1].any(), "episodes that end within the rollout"
     assert not later[ended].any()
     assert np.abs(later[~ended]).max(-1).min() > 0
@@ -92,7 +92,7 @@ def test_the_value_after_a_step_is_that_of_the_true_next_observation(kind):
     env, config, state = trained(kind)
     _, rollout, *_ = experience(kind)
     normalizers = ppo.make_normalizers(env, config, state.observation_stats)
-    memory = jax.vmap(lambda memory, obs: policy_of(kind)[1].act(memory, obs)[0])(rollout.memory, rollout.obs["actor"])
+    memory = jax.vmap(lambda memory, obs: policy_of(kind)[1].act(memory, obs)[0])(rollout.carry, rollout.obs["actor"])
     value = critic_value(config, state.params, normalizers, {"critic": jnp.zeros_like(rollout.obs["critic"])}, memory)
     std = np.sqrt(state.value_stats.variance + 1e-6)
     np.testing.assert_allclose(rollout.next_value, state.value_stats.mean + std * value, atol=1e-4)
@@ -133,7 +133,7 @@ def test_gradients_go_back_through_the_rollout():
     normalizers = ppo.make_normalizers(env, config, state.observation_stats)
 
     def last(obs, first):
-        return actor_mean(config, state.params, normalizers, {"actor": obs}, jnp.asarray(samples.memory), first)[
+        return actor_mean(config, state.params, normalizers, {"actor": obs}, jnp.asarray(samples.carry), first)[
             :, -1
         ].sum()
 
@@ -153,7 +153,7 @@ def test_minibatches_of_a_gru_are_whole_rollouts():
 def test_a_file_holds_the_memory(kind, tmp_path):
     _, policy = policy_of(kind)
     policy.save(tmp_path / "policy.msgpack")
-    again = Policy.load(tmp_path / "policy.msgpack")
+    again = load_policy(tmp_path / "policy.msgpack")
     obs = np.random.default_rng(0).normal(size=(5, 7, 2)).astype(np.float32)
     one, other = policy.initial_carry(7), again.initial_carry(7)
     for x in obs:

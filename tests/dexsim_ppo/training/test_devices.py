@@ -14,7 +14,7 @@ import tiny_train
 from paths import ROOT
 
 from dexsim_ppo import checkpoint, train
-from dexsim_ppo.policy import Policy
+from dexsim_ppo.policy import load_policy
 from dexsim_ppo.training.runlog import RunFolder
 
 OPTIONS = [*tiny_train.QUICK, "--checkpoint-every", "5"]
@@ -103,7 +103,7 @@ def test_two_processes_train_as_one_and_the_first_alone_writes(backend, alone, t
     folder = RunFolder(tmp_path / "run")
     assert_same_training(folder, alone)
     assert "report:" in said[0][0] and "report" not in said[1][0]
-    assert Policy.load(folder.last).training["iteration"] == ITERATIONS
+    assert load_policy(folder.last).training["iteration"] == ITERATIONS
     report = json.loads(folder.report.read_text())
     assert report["trained"]["return"]["value"] == pytest.approx(
         json.loads(alone.report.read_text())["trained"]["return"]["value"], rel=1e-2

@@ -13,7 +13,7 @@ from tiny_env import CONFIG, SMALL, TinyConfig, TinyEnv
 from dexsim_ppo import evaluate, train
 from dexsim_ppo.learner.ppo import make_train
 from dexsim_ppo.learner.running_stats import Normalizer
-from dexsim_ppo.policy import Policy
+from dexsim_ppo.policy import Policy, load_policy
 from dexsim_ppo.training.fine_tune import fine_tuning_config, initialize_from
 from dexsim_ppo.training.runlog import RunFolder, read_metrics
 
@@ -108,7 +108,7 @@ def test_from_the_command_line(policy, tiny_task, tmp_path):
     options = [o for i, o in enumerate(QUICK) if i not in left_out]
     assert train.main([*options, "--policy", str(file), "--steps", str(2 * 128), "--run-dir", str(tmp_path / "a")]) == 0
     folder = RunFolder(tmp_path / "a")
-    began, ended = Policy.load(folder.untrained), Policy.load(folder.last)
+    began, ended = load_policy(folder.untrained), load_policy(folder.last)
     assert ended.env_config["gain"] == 0.2, "the policy's configuration is the default"
     assert ended.training["policy"] == str(file)
     obs = jax.random.normal(jax.random.key(2), (64, 3))

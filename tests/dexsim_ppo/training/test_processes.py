@@ -94,7 +94,7 @@ def test_processes_of_a_job_join_and_a_single_one_does_not(job, monkeypatch):
 
 def test_the_loss_of_another_process_is_one_line_and_other_errors_stay(several, tmp_path):
     def fail(text):
-        with processes.noticing_losses(tmp_path):
+        with processes.detect_lost_peer(tmp_path):
             raise ValueError(text)
 
     with pytest.raises(ValueError, match="Gloo"):
@@ -112,12 +112,12 @@ def test_the_loss_of_another_process_is_one_line_and_other_errors_stay(several, 
     [(DexsimError("a\nline"), "error: a line\n"), (ZeroDivisionError("why"), "ZeroDivisionError: why")],
 )
 def test_a_process_of_several_ends_at_once(error, said, monkeypatch, capsys):
-    with pytest.raises(type(error)), processes.leaving_at_once():
+    with pytest.raises(type(error)), processes.exit_on_error():
         raise error
     ended = []
     monkeypatch.setattr(jax.distributed, "is_initialized", lambda: True)
     monkeypatch.setattr(os, "_exit", ended.append)
-    with processes.leaving_at_once():
+    with processes.exit_on_error():
         raise error
     assert ended == [2]
     assert said in capsys.readouterr().err

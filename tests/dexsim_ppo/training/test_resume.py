@@ -19,7 +19,7 @@ from tiny_train import PER_ITERATION
 from dexsim.core.errors import CheckpointError, ConfigError
 from dexsim_ppo import checkpoint, train
 from dexsim_ppo.learner.curriculum import CurriculumConfig
-from dexsim_ppo.policy import Policy
+from dexsim_ppo.policy import Policy, load_policy
 from dexsim_ppo.training import runlog, trainer
 from dexsim_ppo.training.arguments import check_resumed
 from dexsim_ppo.training.runlog import RunFolder
@@ -67,7 +67,7 @@ def test_what_would_change_the_training_is_refused_and_the_rest_applies(finished
     assert train.main(["--resume", str(finished.path), *same, *looks_on]) == 0
     report = json.loads(finished.report.read_text())
     assert report["seed"] == 3 and report["trained"]["episodes"] == 32
-    assert Policy.load(finished.last).training["iteration"] == 3
+    assert load_policy(finished.last).training["iteration"] == 3
     saved = checkpoint.load(finished.latest_checkpoint(), kind="train").content["arguments"]
     assert (saved["seed"], saved["log_every"], saved["evaluation_episodes"]) == (3, 2, 32)
 
@@ -136,7 +136,7 @@ def test_the_best_policy_of_a_course_that_is_left_is_kept_and_not_reported(tmp_p
     often = ["--evaluate-every", "1", "--evaluation-share", "1", "--checkpoint-every", "1", "--run-dir"]
     assert train.main([*QUICK, "--steps", str(3 * PER_ITERATION), *often, str(tmp_path / "a")]) == 0
     folder = RunFolder(tmp_path / "a")
-    Policy.load(folder.last).save(folder.best)  # the third iteration's, as if it had the highest return
+    load_policy(folder.last).save(folder.best)  # the third iteration's, as if it had the highest return
     content = folder.best.read_bytes()
     no_more = ["--evaluate-every", "0", "--steps", str(PER_ITERATION)]
     assert train.main(["--resume", str(folder.checkpoint(1)), *no_more]) == 0
@@ -146,7 +146,7 @@ def test_the_best_policy_of_a_course_that_is_left_is_kept_and_not_reported(tmp_p
 
 def test_an_average_in_the_place_of_the_best_policy_is_reported(finished):
     origin = {"average_of": [{"iteration": 1}, {"iteration": 2}]}
-    dataclasses.replace(Policy.load(finished.last), training=origin).save(finished.best)
+    dataclasses.replace(load_policy(finished.last), training=origin).save(finished.best)
     assert train.main(["--resume", str(finished.path), "--steps", str(3 * PER_ITERATION)]) == 0
     report = json.loads(finished.report.read_text())
     assert report["origin"] == origin and report["policy"] == "best.msgpack"
@@ -159,9 +159,9 @@ def test_a_best_policy_that_is_set_aside_is_none_to_beat(tmp_path, monkeypatch):
     often = ["--evaluate-every", "1", "--evaluation-share", "1", "--checkpoint-every", "1", "--run-dir"]
     assert train.main([*QUICK, "--steps", str(2 * PER_ITERATION), *often, str(tmp_path / "a")]) == 0
     folder = RunFolder(tmp_path / "a")
-    assert Policy.load(folder.best).training["iteration"] == 2
+    assert load_policy(folder.best).training["iteration"] == 2
     assert train.main(["--resume", str(folder.checkpoint(1)), "--steps", str(3 * PER_ITERATION)]) == 0
-    assert (folder.path / "best.aside.msgpack").exists() and Policy.load(folder.best).training["iteration"] == 2
+    assert (folder.path / "best.aside.msgpack").exists() and load_policy(folder.best).training["iteration"] == 2
     assert json.loads(folder.report.read_text())["policy"] == "best.msgpack"
 
 
@@ -197,7 +197,7 @@ def test_a_run_that_another_process_trains_is_left_alone(finished):
         other.kill()  # What a killed process held is free.
         other.communicate()
     assert train.main(further) == 0
-    assert Policy.load(finished.last).training["iteration"] == 3
+    assert load_policy(finished.last).training["iteration"] == 3
 
 
 def test_a_run_without_its_untrained_policy_is_refused_before_it_trains(finished):
@@ -215,6 +215,6 @@ def test_options_of_a_run_leave_no_room_for_a_preset(finished):
 
 def test_python_takes_paths_and_words_alike(finished, tmp_path):
     with pytest.raises(CheckpointError, match=r"Policy\(task='tiny'.*: give a policy's file, or the name of a shipped"):
-        train.train_policy(policy=Policy.load(finished.last), steps=PER_ITERATION)
+        train.train_policy(policy=load_policy(finished.last), steps=PER_ITERATION)
     tuned = train.train_policy(policy=finished.last, steps=PER_ITERATION, run_dir=str(tmp_path / "tuned"), video=False)
     assert tuned.folder == tmp_path / "tuned" and tuned.report["arguments"]["policy"] == str(finished.last)

@@ -16,7 +16,7 @@ from dexsim.core.errors import CheckpointError, ConfigError
 from dexsim_ppo.acting import PolicyParams
 from dexsim_ppo.learner.networks import Layer
 from dexsim_ppo.learner.running_stats import Normalizer
-from dexsim_ppo.learner.types import Field
+from dexsim.core.layout import LayoutEntry
 from dexsim_ppo.policy import Policy
 from dexsim_ppo.training import runlog
 from dexsim_ppo.training.arguments import TrainArguments
@@ -96,7 +96,7 @@ def policy_after(iteration):
     """A small policy that was saved after so many iterations."""
     layer = Layer(jnp.zeros((2, 1)), jnp.zeros(1))
     params = PolicyParams((layer,), Normalizer(jnp.zeros(2), jnp.ones(2), 5.0))
-    layout, training = (Field("joint_position", 2, None),), {"iteration": iteration}
+    layout, training = (LayoutEntry("joint_position", 2, None),), {"iteration": iteration}
     return Policy(
         task="tiny", env_config={}, observation_layout=layout, params=params, control_rate=20.0, training=training
     )

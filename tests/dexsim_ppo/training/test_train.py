@@ -24,8 +24,8 @@ from dexsim.core import cli
 from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import pytree_dataclass
 from dexsim_ppo import checkpoint, evaluate, train
-from dexsim_ppo.policy import Policy
-from dexsim_ppo.report import mean_interval, print_report, proportion, summarize, surely_better
+from dexsim_ppo.policy import Policy, load_policy
+from dexsim_ppo.report import mean_interval, print_report, proportion, summarize, significantly_better
 from dexsim_ppo.training.arguments import training_config
 from dexsim_ppo.training.runlog import RunFolder, read_metrics
 from dexsim_ppo.training.trainer import SELECTION_SEED, Run, due
@@ -104,11 +104,11 @@ def test_the_report_compares_with_the_untrained_policy(finished):
 
 def test_the_best_policy_is_the_one_that_was_measured(finished):
     rows = [r for r in read_metrics(finished.metrics) if r.get("evaluation/return") is not None]
-    policy = Policy.load(finished.best, task="tiny")
+    policy = load_policy(finished.best, task="tiny")
     report, _ = evaluate.Evaluator(TinyEnv(), 16)(policy.params, episodes=16, seed=SELECTION_SEED)
     if policy.training["iteration"] == rows[0]["iteration"]:
         assert report["return"]["value"] == pytest.approx(rows[0]["evaluation/return"], rel=1e-5)
-    last = Policy.load(finished.last).params
+    last = load_policy(finished.last).params
     last, _ = evaluate.Evaluator(TinyEnv(), 16)(last, episodes=16, seed=SELECTION_SEED)
     assert report["return"]["value"] >= last["return"]["value"] - 1e-4
 
@@ -117,7 +117,7 @@ def test_resumed_run_equals_an_uninterrupted_one(finished, tmp_path):
     path = tmp_path / "b"
     assert train.main([*QUICK, "--steps", str(3 * PER_ITERATION), "--run-dir", str(path)]) == 0
     assert train.main(["--resume", str(path), "--steps", str(6 * PER_ITERATION)]) == 0
-    a, b = Policy.load(finished.last), Policy.load(RunFolder(path).last)
+    a, b = load_policy(finished.last), load_policy(RunFolder(path).last)
     jax.tree.map(np.testing.assert_array_equal, a.params, b.params)
     assert [r["iteration"] for r in read_metrics(RunFolder(path).metrics)] == [1, 2, 3, 4, 5, 6]
 
@@ -144,7 +144,7 @@ class Drops(TinyEnv):
 
 
 def test_film_shows_the_first_and_last_episode_to_half_a_second_after_its_end(finished):
-    params = Policy.load(finished.best).params
+    params = load_policy(finished.best).params
     _, film = evaluate.Evaluator(TinyEnv(), 4)(params, episodes=4, seed=0)
     assert film["x"].shape == (2 * 32,)
     _, film = evaluate.Evaluator(Drops(), 4)(params, episodes=4, seed=0)
@@ -167,7 +167,7 @@ class Commands(TinyEnv):
 
 def test_film_shows_the_lowest_and_the_highest_command(finished):
     env = Commands()
-    _, film = evaluate.Evaluator(env, 8)(Policy.load(finished.best).params, episodes=8, seed=0)
+    _, film = evaluate.Evaluator(env, 8)(load_policy(finished.best).params, episodes=8, seed=0)
     starts = np.asarray(env.evaluation_starts(env.evaluation_plan(8, 0)).target).reshape(8)
     shown = np.asarray(film.command).reshape(2, -1)
     np.testing.assert_allclose(shown[:, 0], [starts.min(), starts.max()], rtol=1e-6)
@@ -226,7 +226,7 @@ def test_a_saved_configuration_begins_a_new_run(finished, tmp_path, capsys):
         assert again.ppo == saved.ppo and again.evaluation_chunk == 16 and again.steps == 6 * PER_ITERATION
     path = tmp_path / "again"
     assert train.main(["--config", str(finished.path), "--run-dir", str(path)]) == 0
-    first, second = (Policy.load(RunFolder(p).last).params for p in (finished.path, path))
+    first, second = (load_policy(RunFolder(p).last).params for p in (finished.path, path))
     jax.tree.map(np.testing.assert_array_equal, first, second)
     (tmp_path / "other.json").write_text("{}")
     (tmp_path / "deep.json").write_text('{"arguments":' + "[" * 100_000)
@@ -294,7 +294,7 @@ def test_intervals_are_by_start():
 def test_a_hand_that_does_nothing_gets_the_same_episodes(finished, capsys):
     """It stays where it starts: with rewards of 1 - |x - target| over 32 steps the return follows from the starts."""
     env = TinyEnv()
-    evaluator, params = evaluate.Evaluator(env, 16), Policy.load(finished.best).params
+    evaluator, params = evaluate.Evaluator(env, 16), load_policy(finished.best).params
     idle, _ = evaluator(params, episodes=16, seed=4, idle=True)
     starts = env.evaluation_starts(env.evaluation_plan(16, 4))
     assert idle["return"]["value"] == pytest.approx(float(32 * np.mean(1 - np.abs(starts.x - starts.target))), rel=1e-4)
@@ -307,7 +307,7 @@ def test_a_hand_that_does_nothing_gets_the_same_episodes(finished, capsys):
 
 
 def test_the_size_of_a_chunk_does_not_change_the_episodes(finished):
-    params = Policy.load(finished.best).params
+    params = load_policy(finished.best).params
     whole, parts = (evaluate.Evaluator(TinyEnv(), chunk)(params, episodes=16, seed=4)[0] for chunk in (16, 4))
     assert parts["return"] == pytest.approx(whole["return"], rel=1e-5) and parts["starts"] == 16
 
@@ -449,7 +449,7 @@ def test_what_falls_due_amid_a_call_is_done_at_its_end(every, wanted):
 def test_better_is_what_lies_above_with_its_interval():
     low, wide, high = ({"value": v, "low": v - d, "high": v + d} for v, d in ((1.0, 0.1), (1.3, 0.4), (2.0, 0.2)))
     trained = {"held": wide, "return": high, "steps_held": low}
-    assert surely_better(trained, {"held": low, "return": low, "steps_held": low}) == {
+    assert significantly_better(trained, {"held": low, "return": low, "steps_held": low}) == {
         "held": False,
         "return": True,
         "steps_held": False,

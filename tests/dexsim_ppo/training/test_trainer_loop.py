@@ -18,7 +18,7 @@ from dexsim_ppo.learner.curriculum import CurriculumConfig
 from dexsim_ppo.training import trainer
 from dexsim_ppo.training.arguments import TrainArguments
 from dexsim_ppo.training.runlog import RunFolder, means
-from dexsim_ppo.training.trainer import Run, surely_better
+from dexsim_ppo.training.trainer import Run, significantly_better
 
 CONFIG = dataclasses.replace(SMALL, iterations_per_call=2)
 PER_ITERATION = 64
@@ -172,7 +172,7 @@ def test_better_needs_the_other_interval_to_be_wholly_below():
     entry = lambda low, value, high: {"low": low, "value": value, "high": high}  # noqa: E731
     trained = {name: entry(1.5, 2.0, 3.0) for name in ("held", "return", "steps_held")}
     untrained = {"held": entry(0.0, 1.0, 1.6), "return": entry(0.0, 1.0, 1.5), "steps_held": entry(0.0, 1.0, 1.4)}
-    assert surely_better(trained, untrained) == {"held": False, "return": False, "steps_held": True}
+    assert significantly_better(trained, untrained) == {"held": False, "return": False, "steps_held": True}
 
 
 def test_whatever_the_program_depends_on_identifies_it(tmp_path):
