@@ -3,7 +3,6 @@
 import contextlib
 import functools
 import os
-import subprocess
 import sys
 import traceback
 from collections.abc import Iterator
@@ -100,26 +99,8 @@ def detect_lost_peer(folder: Path) -> Iterator[None]:
         f"python -m dexsim_ppo.train --resume {folder} --devices {jax.device_count()}"
     )
     try:
-        with print_on_abort(f"error: {lost}"):
-            yield
+        yield
     except (jax.errors.JaxRuntimeError, ValueError) as error:
         if not any(word in str(error) for word in ("Gloo", "NCCL", "UNAVAILABLE", "ABORTED", "DEADLINE")):
             raise
         raise DexsimError(lost) from None
-
-
-@contextlib.contextmanager
-def print_on_abort(line: str) -> Iterator[None]:
-    """Have `line` printed if this process is ended inside without a chance to say anything.
-
-    JAX aborts a process that has lost the first one, or waits for others in a collective of GPUs, from a thread of its
-    own. A helper waits for that: it reads until this process closes its end.
-    """
-    script = "import sys; sys.stdin.read() or print(sys.argv[1], file=sys.stderr)"
-    helper = subprocess.Popen(
-        [sys.executable, "-I", "-S", "-c", script, line], stdin=subprocess.PIPE, start_new_session=True
-    )
-    try:
-        yield
-    finally:
-        helper.communicate(b"alive")

@@ -82,7 +82,7 @@ class RunFolder:
     def keep_report(self) -> None:
         """Number the report of a run that had ended before and was resumed: another must not replace it."""
         if self.report.exists():
-            self.report.rename(_free(self.path / "report-{}.json"))
+            self.report.rename(_free(self.path, "report-{}.json"))
 
     def set_aside(self, after: int) -> None:
         """Rename checkpoints and the best policy of later iterations than the one that is resumed to `*.aside*`: the
@@ -95,7 +95,7 @@ class RunFolder:
         if self.best.exists() and not self.has_best(after):
             later.append(self.best)
         for path in later:
-            path.rename(_free(path.with_name(f"{path.stem}.aside{{}}{path.suffix}")))
+            path.rename(_free(path.parent, path.stem + ".aside{}" + path.suffix))
 
     def has_best(self, until: int) -> bool:
         """Whether the best policy is here, and of no later iteration than `until`.
@@ -111,10 +111,10 @@ class RunFolder:
             path.unlink()
 
 
-def _free(pattern: Path) -> Path:
-    """The first path of a pattern with a number in it that does not exist."""
-    names = (Path(str(pattern).format(number)) for number in itertools.count(1))
-    return next(path for path in names if not path.exists())
+def _free(folder: Path, pattern: str) -> Path:
+    """The first name of a pattern with a number in it that is free in a folder."""
+    paths = (folder / pattern.format(number) for number in itertools.count(1))
+    return next(path for path in paths if not path.exists())
 
 
 def new_folder(path: Path | None, task: str) -> Path:

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from dexsim.core.errors import ConfigError
-from dexsim_ppo import Policy, average_policies, load_policy
-from dexsim_ppo.average import distance, main
+from dexsim_ppo import load_policy
+from dexsim_ppo.average import average_policies, distance, main
 
 
 def moved(policy, size, seed):

@@ -98,7 +98,10 @@ def test_load_names_what_is_wrong(file, tmp_path):
 
 def test_restore_names_what_does_not_fit(file):
     loaded = checkpoint.load(file, kind="train")
-    for change, word in (({"x": jnp.zeros((2, 4))}, r"\['x'\]: expected"), ({"y": jnp.zeros(1)}, r"\['y'\] is missing")):
+    for change, word in (
+        ({"x": jnp.zeros((2, 4))}, r"\['x'\]: expected"),
+        ({"y": jnp.zeros(1)}, r"\['y'\] is missing"),
+    ):
         with pytest.raises(CheckpointError, match=word):
             checkpoint.restore(loaded, TREE | change)
     with pytest.raises(CheckpointError, match=r"\['x'\] is not expected"):

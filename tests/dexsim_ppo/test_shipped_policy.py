@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from remembering import KINDS, remembering
+from remembering import remembering
 
 import dexsim
 import dexsim_ppo
@@ -20,7 +20,7 @@ from dexsim.tasks.grasp.config import GraspConfig
 from dexsim.tasks.grasp.task import GraspGoal
 from dexsim.tasks.rotate.config import RotateConfig
 from dexsim_ppo.export import to_numpy
-from dexsim_ppo.policy import Policy, layout_to_list
+from dexsim_ppo.policy import load_policy
 from dexsim_ppo.portable import PortablePolicy
 from dexsim_real.sensors.readings import sources_of
 
@@ -32,16 +32,12 @@ SHIPPED = {
 }
 
 
-def load(name):
-    return load_policy(asset_path(f"policies/{name}.msgpack"))
-
-
 @pytest.mark.parametrize("name", SHIPPED)
 def test_it_fits_the_task_and_the_hand(hand, name):
-    policy, (names, size) = load(name), SHIPPED[name]
+    policy, (names, size) = load_policy(name), SHIPPED[name]
     config = from_dict(TASKS[policy.task].config_class, policy.env_config)
     fields = layout(hand, names, config.observation)
-    assert layout_to_list(policy.observation_layout) == layout_to_list(fields)
+    assert policy.observation_layout == fields
     assert sum(field.size for field in fields) == size
     action = np.asarray(policy.act(policy.initial_carry(), jnp.zeros(size))[1])
     assert action.shape == (hand.num_joints,) and np.all(np.abs(action) <= 1.0)
@@ -49,16 +45,16 @@ def test_it_fits_the_task_and_the_hand(hand, name):
 
 
 def test_the_command_is_heard():
-    policy = load("grasp")
+    policy = load_policy("grasp")
     low, high = (np.asarray(policy.act(policy.initial_carry(), jnp.zeros(66).at[-1].set(c))[1]) for c in (0.0, 1.0))
     assert np.max(np.abs(high - low)) > 1e-3
 
 
 def test_the_goal_is_seen():
-    fields = [field.name for field in load("rotate").observation_layout]
+    fields = [field.name for field in load_policy("rotate").observation_layout]
     assert fields[1] == "relative_orientation"
     near, far = (
-        np.asarray(load("rotate").act(None, jnp.zeros(65).at[12:18].set(jnp.array(sixd)))[1])
+        np.asarray(load_policy("rotate").act(None, jnp.zeros(65).at[12:18].set(jnp.array(sixd)))[1])
         for sixd in ([1.0, 0, 0, 0, 1, 0], [1.0, 0, 0, 0, 0, 1])
     )
     assert np.max(np.abs(near - far)) > 1e-3
@@ -67,7 +63,7 @@ def test_the_goal_is_seen():
 @pytest.mark.parametrize("name", SHIPPED)
 def test_one_call_acts_under_jit_vmap_and_scan(name):
     """Also over a whole episode at once, as `Policy.act` does tick by tick."""
-    policy = load(name)
+    policy = load_policy(name)
     obs = np.random.default_rng(0).normal(size=(20, 3, SHIPPED[name][1])).astype(np.float32)
     carry, expected = policy.initial_carry(3), []
     for x in obs:
@@ -92,7 +88,7 @@ def test_one_call_acts_under_jit_vmap_and_scan(name):
     ],
 )
 def test_the_sensors_it_needs(name, sources):
-    assert sources_of([field.name for field in load(name).observation_layout]) == sources
+    assert sources_of([field.name for field in load_policy(name).observation_layout]) == sources
 
 
 def origins(training):
@@ -103,7 +99,7 @@ def origins(training):
 @pytest.mark.parametrize("name", SHIPPED)
 def test_its_report_is_of_this_file_and_says_how_it_came_about(name):
     report = json.loads(asset_path(f"policies/{name}.json").read_text())
-    policy = load(name)
+    policy = load_policy(name)
     for told, origin in zip(origins(report["origin"]), origins(policy.training), strict=True):
         assert told["env_steps"] == origin["env_steps"] and told["seed"] == origin["seed"]
     for key in ("command", "hardware", "versions", "trained", "untrained"):
@@ -113,7 +109,7 @@ def test_its_report_is_of_this_file_and_says_how_it_came_about(name):
 
 
 def test_an_ablated_policy_takes_the_mean_or_zero_of_what_it_does_not_see():
-    policy = load("rotate")
+    policy = load_policy("rotate")
     names = ("contact_force", "relative_orientation")
     hidden = np.concatenate([np.full(f.size, f.name in names) for f in policy.observation_layout])
     obs = np.random.default_rng(0).normal(size=(20, 65)).astype(np.float32)
@@ -130,9 +126,8 @@ def test_an_ablated_policy_takes_the_mean_or_zero_of_what_it_does_not_see():
         policy.ablate("colour")
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_an_ablated_memory_takes_the_mean_as_well(kind):
-    policy = remembering(kind)
+def test_an_ablated_memory_takes_the_mean_as_well():
+    policy = remembering()
     hidden = np.concatenate([np.full(f.size, f.name == "contact_force") for f in policy.observation_layout])
     obs = np.random.default_rng(0).normal(size=(4, 20, 66)).astype(np.float32)
     ablated, mean = policy.ablate("contact_force"), np.asarray(policy.params.normalizer.mean)
@@ -179,7 +174,7 @@ def test_the_grasp_holds_and_presses_as_asked():
     )
     assert len(np.unique(starts.episode.object.shape_index)) == WORLDS // 2
     play = player(env)
-    dropped, force, _ = play(starts, 4.0, load("grasp"))
+    dropped, force, _ = play(starts, 4.0, load_policy("grasp"))
     assert np.sum(~dropped.any(0)) >= 6
     late = force[len(force) // 2 :, :, 1:].sum(-1).mean(0)  # N, of the four fingers
     assert np.all(late[1::2] - late[::2] > 4.0), late
@@ -193,7 +188,7 @@ def test_the_rotate_turns():
     env = dexsim.make("rotate", RotateConfig(pool_size=WORLDS), backend="c", num_envs=WORLDS)
     starts = jit(jax.vmap(env.reset_to), once=True)(jax.random.split(jax.random.key(0), WORLDS), jnp.arange(WORLDS))
     play = player(env)
-    dropped, _, metrics = play(starts, 4.0, load("rotate"))
+    dropped, _, metrics = play(starts, 4.0, load_policy("rotate"))
     turns = metrics["successes"][-1]
     assert np.sum(~dropped.any(0) & (turns >= 2)) >= 6, turns
     _, _, metrics = play(starts, 4.0)
@@ -213,7 +208,7 @@ MISUSE = {
 @pytest.mark.parametrize("what", MISUSE)
 def test_misuse_is_named_by_both_forms_of_a_policy(tmp_path, door, what):
     name, use, words = MISUSE[what]
-    policy = load(name)
+    policy = load_policy(name)
     obs = np.zeros(policy.params.normalizer.mean.size, np.float32)
     if door == "numpy":
         to_numpy(policy, tmp_path / "policy.npz")

@@ -13,9 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from dexsim.core.config import setting, validate
+from dexsim.core.layout import LayoutEntry
 from dexsim.core.pytree import pytree_dataclass
 from dexsim_ppo.learner.config import PPOConfig
-from dexsim.core.layout import LayoutEntry
 
 # Learners: one that solves the task, and one that is quick to compile.
 CONFIG = PPOConfig(

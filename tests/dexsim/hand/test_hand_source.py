@@ -11,7 +11,7 @@ from dexsim.core.errors import AssetError, CheckpointError, ConfigError, OtherEn
 from dexsim.hand.load import load_hand
 from dexsim.hand.source import check_same, record_of, recorded_hand
 from dexsim_ppo.checkpoint import Checkpoint
-from dexsim_ppo.policy import Policy, load_policy
+from dexsim_ppo.policy import load_policy
 from dexsim_ppo.train import default_arguments, find_hand
 
 

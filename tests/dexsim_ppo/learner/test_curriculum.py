@@ -13,8 +13,6 @@ from dexsim.core.pytree import pytree_dataclass
 from dexsim_ppo import checkpoint
 from dexsim_ppo.learner.curriculum import CurriculumConfig
 from dexsim_ppo.learner.ppo import make_train, update_scale
-from dexsim_ppo.train import arguments_from_dict, parse_arguments
-from dexsim_ppo.training.arguments import printable
 
 RULES = CurriculumConfig(on=True, start=0.5, widen_above=0.9, narrow_below=0.3, step=0.1)
 
@@ -127,12 +125,3 @@ def test_a_checkpoint_keeps_the_scale_and_resumes_to_the_bit(tmp_path):
     for ours, theirs in zip(jax.tree.leaves(again), jax.tree.leaves(straight), strict=True):
         if not jnp.issubdtype(ours.dtype, jax.dtypes.prng_key):
             np.testing.assert_array_equal(ours, theirs)
-
-
-def test_options_of_the_command_line_and_of_older_checkpoints():
-    arguments, _ = parse_arguments(["--task", "grasp", "--curriculum.on", "--curriculum.start", "0.2"])
-    assert arguments.curriculum == CurriculumConfig(on=True, start=0.2)
-    data = printable(arguments)
-    assert arguments_from_dict(type(arguments.env), data).curriculum == arguments.curriculum
-    data.pop("curriculum")
-    assert arguments_from_dict(type(arguments.env), data).curriculum == CurriculumConfig()

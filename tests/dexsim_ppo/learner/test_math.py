@@ -10,12 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dexsim.core.errors import ConfigError
+from dexsim.core.layout import LayoutEntry
 from dexsim_ppo.learner import adam, distribution, running_stats
 from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.gae import compute_gae
 from dexsim_ppo.learner.networks import apply_mlp, elu, init_mlp, rescale_output
 from dexsim_ppo.learner.running_stats import RunningStats, init_stats, make_normalizer, merge_moments, normalize
-from dexsim.core.layout import LayoutEntry
 from dexsim_ppo.learner.update import adapt_learning_rate
 
 

@@ -122,7 +122,7 @@ def test_what_does_not_fit_is_refused(policy, tiny_task, tmp_path, monkeypatch, 
     monkeypatch.chdir(tmp_path)
     policy.save("policy.msgpack")
     other = dataclasses.replace(
-        policy, observation_layout=tuple(field._replace(name=field.name + "_2") for field in policy.observation_layout)
+        policy, observation_layout=tuple(e._replace(name=e.name + "_2") for e in policy.observation_layout)
     )
     other.save("other.msgpack")
     before = sorted(tmp_path.iterdir())
@@ -130,8 +130,8 @@ def test_what_does_not_fit_is_refused(policy, tiny_task, tmp_path, monkeypatch, 
         (["--task", "grasp", "--policy", "policy.msgpack"], "of the task 'tiny', not 'grasp'"),
         (["--policy", "nothing.msgpack"], "cannot be read"),
         (["--policy", "other.msgpack"], "observations of policy and environment differ"),
-        (["--policy", "policy.msgpack", "--ppo.actor-layers", "7"], "do not set --ppo.actor-layers"),
-        (["--policy", "policy.msgpack", "--ppo.memory", "gru"], "do not set --ppo.memory"),
+        (["--policy", "policy.msgpack", "--ppo.actor-layers", "7"], "--ppo.actor-layers 7: the policy has"),
+        (["--policy", "policy.msgpack", "--ppo.memory", "gru"], "--ppo.memory gru: the policy has none"),
     ):
         assert exit_code(train.main, [*arguments, "--steps", "128"]) == 2
         error = capsys.readouterr().err

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from paths import ROOT
-from remembering import KINDS, remembering
+from remembering import remembering
 
 pytest.importorskip("serial")
 from dexsim.control import Control
@@ -254,9 +254,8 @@ def test_an_episode_begins_without_a_last_action(hand):
     np.testing.assert_array_equal([*last, again], np.array([0.0, 0.5, 0.0])[:, None] * np.ones(12))
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_memory_is_carried_through_the_ticks_and_emptied_at_a_start_and_after_a_hold(hand, kind):
-    policy, rng = remembering(kind), np.random.default_rng(0)
+def test_a_memory_is_carried_through_the_ticks_and_emptied_at_a_start_and_after_a_hold(hand):
+    policy, rng = remembering(), np.random.default_rng(0)
     controller, sensing = Controller(policy, hand), HandSensing(hand, HardwareConfig())
     seen, carry, forgotten = ObjectEstimate(np.zeros(3), np.zeros(3), IDENTITY), policy.initial_carry(), 0
     for number in range(9):
@@ -273,9 +272,8 @@ def test_a_memory_is_carried_through_the_ticks_and_emptied_at_a_start_and_after_
     assert forgotten == 6, "all but the first ticks show what came before"
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_what_is_not_finite_is_not_remembered(hand, kind):
-    policy, sensing = remembering(kind), HandSensing(hand, HardwareConfig())
+def test_what_is_not_finite_is_not_remembered(hand):
+    policy, sensing = remembering(), HandSensing(hand, HardwareConfig())
     controller, seen = Controller(policy, hand), ObjectEstimate(np.zeros(3), np.zeros(3), IDENTITY)
     measured = sensing.measure(random_state(np.random.default_rng(0), hand))
     lost = dataclasses.replace(measured, joint_position=np.full_like(measured.joint_position, np.nan))
