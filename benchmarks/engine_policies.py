@@ -25,7 +25,7 @@ def measure(name: str, backend: str, converged: bool, episodes: int, seconds: fl
     if converged:
         changes += [f"physics.{field}={value}" for field, value in CONVERGED.items()]
     policy = dataclasses.replace(policy, env_config=override(policy.env_config, changes))
-    env = policy.build_env(backend=backend, num_envs=episodes)
+    env = policy.make_env(backend=backend, num_envs=episodes)
     report = evaluate_policy(policy, env=env, episodes=episodes, chunk=episodes, baseline=False)
     task, spread = report["task"], {}
     if "successes_per_minute" in task:

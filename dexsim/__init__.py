@@ -18,7 +18,6 @@ from dexsim.core.errors import (
     ConfigError,
     DexsimError,
     DexsimWarning,
-    OldFileWarning,
     OtherEnvWarning,
 )
 
@@ -49,7 +48,6 @@ __all__ = [
     "EnvConfig",
     "GraspConfig",
     "Hand",
-    "OldFileWarning",
     "OtherEnvWarning",
     "Readings",
     "RotateConfig",

@@ -138,9 +138,9 @@ class Evaluator:
 def _follow(last: tuple, metrics: dict[str, jax.Array], terminated: jax.Array) -> tuple:
     """`last` (metrics, ticks lived, whether ended), one tick later; an ended episode stays as it is."""
     before, lived, ended = last
-    kept = jax.tree.map(lambda old, new: jnp.where(ended, old, new), before, metrics)
+    latest = jax.tree.map(lambda old, new: jnp.where(ended, old, new), before, metrics)
     ended = ended | terminated
-    return kept, lived + (~ended).astype(jnp.int32), ended
+    return latest, lived + (~ended).astype(jnp.int32), ended
 
 
 def write_video(env: Environment, snapshots: Any, path: Path, quality: str = "quick") -> Path:

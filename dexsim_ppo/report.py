@@ -24,8 +24,8 @@ def summarize(
     last = np.minimum(steps_held, steps - 1)
     returns = metrics["return"][last, np.arange(episodes)]
     # A step that diverges ends the episode: it must be counted although the episode does not survive it.
-    begun = np.concatenate([np.ones((1, episodes), bool), alive[:-1]])
-    masked = {name: np.where(begun if name == "non_finite" else alive, x, 0) for name, x in metrics.items()}
+    entered = np.concatenate([np.ones((1, episodes), bool), alive[:-1]])
+    masked = {name: np.where(entered if name == "non_finite" else alive, x, 0) for name, x in metrics.items()}
     return {
         "episodes": episodes,
         "steps": steps,

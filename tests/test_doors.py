@@ -10,7 +10,7 @@ from paths import ROOT
 NAMES = {
     "dexsim": """
         AssetError CalibrationError CheckpointError ConfigError DexsimError DexsimWarning Env EnvConfig
-        GraspConfig Hand OldFileWarning OtherEnvWarning Readings RotateConfig State Task TaskSpec draw_taxels
+        GraspConfig Hand OtherEnvWarning Readings RotateConfig State Task TaskSpec draw_taxels
         enable_caches load_hand make observe register render_episode render_frame
     """,
     "dexsim_ppo": """
