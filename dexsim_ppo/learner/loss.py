@@ -8,9 +8,9 @@ import jax.numpy as jnp
 from dexsim.core.pytree import align, pytree_dataclass
 from dexsim_ppo.learner import distribution
 from dexsim_ppo.learner.config import PPOConfig
+from dexsim_ppo.learner.distribution import Decision
 from dexsim_ppo.learner.memory import scan_memory, step_memory
 from dexsim_ppo.learner.networks import Params, apply_mlp
-from dexsim_ppo.learner.rollout import Decision
 from dexsim_ppo.learner.running_stats import Normalizer, normalize
 
 Metrics = dict[str, jax.Array]

@@ -16,15 +16,14 @@ from jax.sharding import Mesh
 
 from dexsim.core.compilation import check_float32, jit
 from dexsim.core.errors import ConfigError
-from dexsim_ppo.learner import distribution
 from dexsim_ppo.learner.adapter import adapt
 from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.curriculum import CurriculumConfig, next_scale
 from dexsim_ppo.learner.gae import compute_gae
-from dexsim_ppo.learner.loss import Metrics, Samples, actor_step, critic_value
+from dexsim_ppo.learner.loss import Metrics, Samples
 from dexsim_ppo.learner.networks import Params, rescale_output
-from dexsim_ppo.learner.rollout import Decision, Rollout, bound_rewards, collect
-from dexsim_ppo.learner.running_stats import Normalizer, RunningStats, make_normalizer, merge_moments, value_std
+from dexsim_ppo.learner.rollout import Rollout, bound_rewards, collect_rollout
+from dexsim_ppo.learner.running_stats import RunningStats, make_normalizers, merge_moments, value_std
 from dexsim_ppo.learner.sharding import (
     block_count,
     copied,
@@ -162,39 +161,6 @@ def update_scale(curriculum: CurriculumConfig, scale: jax.Array, metrics: Metric
     else:
         raise ConfigError(f"CurriculumConfig.metric = {curriculum.metric!r}: choose from {', '.join(sorted(metrics))}")
     return next_scale(scale, success, curriculum), success
-
-
-# --- collect ------------------------------------------------------------------------------------------
-
-
-def make_normalizers(env: Environment, config: PPOConfig, stats: dict[str, RunningStats]) -> dict[str, Normalizer]:
-    """One observation normaliser per group."""
-    return {
-        group: make_normalizer(
-            stats[group], layout, std_floor=config.observation_std_floor, clip=config.observation_clip
-        )
-        for group, layout in env.observation_layout.items()
-    }
-
-
-def collect_rollout(
-    env: Environment, config: PPOConfig, state: TrainState, mesh: Mesh | None = None
-) -> tuple[tuple[Any, jax.Array | None], Rollout, Metrics]:
-    """States and carry afterwards, experience [T, B, ...] under the current policy, and its metrics; values are in
-    reward units."""
-    normalizers, key = make_normalizers(env, config, state.observation_stats), jax.random.split(state.key, 3)[1]
-    params, std = state.params, value_std(state.value_stats)
-
-    def act(key, obs, carry):
-        carry, mean = actor_step(config, params, normalizers, obs, carry)
-        action = distribution.sample(jax.random.normal(key, mean.shape), mean, params.log_std)
-        decision = Decision(action, mean, distribution.log_prob(action, mean, params.log_std))
-        return decision, distribution.squash(action, config.distribution), carry
-
-    def value(obs, carry):
-        return state.value_stats.mean + std * critic_value(config, params, normalizers, obs, carry)
-
-    return collect(env, state.env_state, key, act, value, config.rollout_length, mesh, state.carry)
 
 
 # --- advantages ---------------------------------------------------------------------------------------

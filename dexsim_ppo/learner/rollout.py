@@ -9,8 +9,13 @@ import jax.numpy as jnp
 from jax.sharding import Mesh
 
 from dexsim.core.pytree import choose, pytree_dataclass
-from dexsim_ppo.learner.running_stats import RunningStats, value_std
+from dexsim_ppo.learner import distribution
+from dexsim_ppo.learner.config import PPOConfig
+from dexsim_ppo.learner.distribution import Decision
+from dexsim_ppo.learner.loss import actor_step, critic_value
+from dexsim_ppo.learner.running_stats import RunningStats, make_normalizers, value_std
 from dexsim_ppo.learner.sharding import batched
+from dexsim_ppo.learner.state import TrainState
 from dexsim_ppo.learner.types import Environment
 
 # A reward beyond this many deviations of the returns is a fault of the simulation, not something to learn from. It is
@@ -19,15 +24,6 @@ _FAR = 100.0
 _FAR_AT_FIRST = 1000.0  # of the root mean square of the other rewards, while there are no returns
 
 _RESERVE_STEPS = 16  # short compared with an episode; makes a batch of new episodes cheap per step
-
-
-@pytree_dataclass
-class Decision:
-    """The policy's action and its distribution; arrays [B, ...]."""
-
-    action: jax.Array  # [B, A] Gaussian sample before any squashing
-    mean: jax.Array  # [B, A]
-    log_prob: jax.Array  # [B]
 
 
 @pytree_dataclass
@@ -44,44 +40,33 @@ class Rollout:
     carry: jax.Array | None = None  # [T, B, m] of the policy's memory before the step
 
 
-Act = Callable[[jax.Array, Mapping[str, jax.Array], Any], tuple[Decision, jax.Array, Any]]
-"""`act(key, obs, carry) -> (decision, action for the environment [B, A], carry)`"""
-Value = Callable[[Mapping[str, jax.Array], Any], jax.Array]
-"""`value(obs, carry) -> [B]`, with the carry before this observation"""
-
-
-def collect(
-    env: Environment,
-    state: Any,
-    key: jax.Array,
-    act: Act,
-    value: Value,
-    length: int,
-    mesh: Mesh | None = None,
-    carry: jax.Array | None = None,
+def collect_rollout(
+    env: Environment, config: PPOConfig, state: TrainState, mesh: Mesh | None = None
 ) -> tuple[tuple[Any, jax.Array | None], Rollout, dict[str, jax.Array]]:
-    """Run the policy for `length` steps.
+    """Run the policy for T steps.
 
     The order is act, step, record, restart: the recorded flags, metrics and `next_value` belong to the true
-    final state of an episode, and the next step starts from a fresh one.
-
-    Args:
-      state: batch [B] of environment states.
-      carry: [B, m] of the policy's memory; zero at the start of every episode.
+    final state of an episode, and the next step starts from a fresh one, with a zero carry.
 
     Returns:
-      The last states and carry, the experience, and its metrics; see `rollout_metrics`.
+      The last environment states [B] and carry [B, m], the experience, whose values are in reward units, and its
+      metrics; see `rollout_metrics`.
     """
-    step_env = batched(env.step, mesh)
+    normalizers, key = make_normalizers(env, config, state.observation_stats), jax.random.split(state.key, 3)[1]
+    params, std, step_env = state.params, value_std(state.value_stats), batched(env.step, mesh)
+
+    def value(obs, carry):
+        return state.value_stats.mean + std * critic_value(config, params, normalizers, obs, carry)
 
     def step(now, key):
-        state, carry = now
-        obs = dict(state.obs)
-        decision, action, next_carry = act(key, obs, carry)
-        after = step_env(state, action)
+        env_state, carry = now
+        obs = dict(env_state.obs)
+        next_carry, mean = actor_step(config, params, normalizers, obs, carry)
+        action = distribution.sample(jax.random.normal(key, mean.shape), mean, params.log_std)
+        after = step_env(env_state, distribution.squash(action, config.distribution))
         record = Rollout(
             obs=obs,
-            decision=decision,
+            decision=Decision(action, mean, distribution.log_prob(action, mean, params.log_std)),
             value=value(obs, carry),
             next_value=value(after.obs, next_carry),
             reward=after.reward,
@@ -92,11 +77,11 @@ def collect(
         return (after, next_carry), after.terminated | after.truncated, (record, dict(after.metrics))
 
     def restart(now, done):
-        state, carry = now
-        return env.restart(state, done), jax.tree.map(lambda x: jnp.where(done, 0.0, x), carry)
+        env_state, carry = now
+        return env.restart(env_state, done), jax.tree.map(lambda x: jnp.where(done, 0.0, x), carry)
 
-    keys = jax.random.split(key, length)
-    last, (rollout, step_metrics) = scan_restarting(batched(restart, mesh), step, (state, carry), keys)
+    keys = jax.random.split(key, config.rollout_length)
+    last, (rollout, step_metrics) = scan_restarting(batched(restart, mesh), step, (state.env_state, state.carry), keys)
     finite = jnp.isfinite(rollout.reward)
     rollout = dataclasses.replace(rollout, reward=jnp.where(finite, rollout.reward, 0.0))
     return last, rollout, rollout_metrics(rollout, finite, step_metrics)

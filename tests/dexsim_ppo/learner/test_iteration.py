@@ -9,10 +9,11 @@ import pytest
 from tiny_env import SMALL, TinyEnv
 
 from dexsim_ppo.learner import ppo, update
+from dexsim_ppo.learner.distribution import Decision
 from dexsim_ppo.learner.loss import Samples
 from dexsim_ppo.learner.networks import apply_mlp, init_params
 from dexsim_ppo.learner.ppo import make_train
-from dexsim_ppo.learner.rollout import Decision, Rollout, bound_rewards
+from dexsim_ppo.learner.rollout import Rollout, bound_rewards
 from dexsim_ppo.learner.running_stats import RunningStats
 from dexsim_ppo.learner.update import Learner
 

@@ -13,7 +13,7 @@ from dexsim_ppo.learner import ppo, update
 from dexsim_ppo.learner.distribution import log_prob as gaussian_log_prob
 from dexsim_ppo.learner.loss import actor_mean, critic_value, loss
 from dexsim_ppo.learner.ppo import make_train
-from dexsim_ppo.learner.rollout import Decision, collect, scan_restarting
+from dexsim_ppo.learner.rollout import scan_restarting
 from dexsim_ppo.learner.update import Learner
 
 
@@ -217,31 +217,25 @@ def test_starts_differ_between_environments_and_blocks():
 def test_metrics_are_those_of_a_plain_loop():
     """Means over all steps, and over the last steps of episodes; what is not finite is left out and counted."""
     env, count, length = BadRewards(), 6, 16
-    states = jax.vmap(env.reset)(jax.random.split(jax.random.key(3), count))
-    states = dataclasses.replace(
-        states, metrics=states.metrics | {"length": jnp.arange(count, dtype=jnp.float32) * 2.0}
-    )
-    decide = lambda key, obs, memory: (  # noqa: E731
-        Decision(*[jnp.zeros((count, 1))] * 2, jnp.zeros(count)),
-        jax.random.normal(key, (count, 1)),
-        memory,
-    )
-    _, rollout, metrics = jax.jit(
-        lambda state: collect(env, state, jax.random.key(4), decide, lambda obs, _: obs["critic"][..., 0], length)
-    )(states)
+    config = dataclasses.replace(SMALL, num_envs=count, rollout_length=length, minibatches=1)
+    state = make_train(env, config).init(jax.random.key(3))
+    lengths = jnp.arange(count, dtype=jnp.float32) * 2.0
+    begin = dataclasses.replace(state.env_state, metrics=state.env_state.metrics | {"length": lengths})
+    state = dataclasses.replace(state, env_state=begin)
+    _, rollout, metrics = jax.jit(lambda state: ppo.collect_rollout(env, config, state))(state)
     everywhere, ended, final, broken, reward = [], 0, [], 0, []
-    fresh = jax.vmap(env.restart)(states, jnp.ones(count, bool))
-    state = jax.vmap(env.restart)(states, jnp.zeros(count, bool))
-    for key in jax.random.split(jax.random.key(4), length):
-        state = jax.vmap(env.step)(state, decide(key, state.obs, None)[1])
+    fresh = jax.vmap(env.restart)(begin, jnp.ones(count, bool))
+    now = jax.vmap(env.restart)(begin, jnp.zeros(count, bool))
+    for action in rollout.decision.action:
+        now = jax.vmap(env.step)(now, jnp.clip(action, -1, 1))
         for row in range(count):
-            value = float(state.reward[row])
+            value = float(now.reward[row])
             broken, reward = broken + (not np.isfinite(value)), [*reward, value if np.isfinite(value) else 0.0]
-            error = float(state.metrics["error"][row])
+            error = float(now.metrics["error"][row])
             everywhere.append(error if np.isfinite(error) else 0.0)
-            if state.terminated[row] or state.truncated[row]:
-                ended, final = ended + 1, [*final, float(state.metrics["length"][row])]
-        state = jax.vmap(choose)(state.terminated | state.truncated, fresh, state)
+            if now.terminated[row] or now.truncated[row]:
+                ended, final = ended + 1, [*final, float(now.metrics["length"][row])]
+        now = jax.vmap(choose)(now.terminated | now.truncated, fresh, now)
     assert ended > 3 and broken > 3, "the test tests less than it says"
     assert float(metrics["episodes"]) == ended and float(metrics["nonfinite_rewards"]) == broken
     np.testing.assert_allclose(metrics["step/error"], np.mean(everywhere), rtol=1e-4)
