@@ -119,7 +119,7 @@ class Run:
                 f"{self.folder.path}: {arguments.task}, {self.config.num_envs} environments, "
                 f"{self.env.backend} physics on {device}"
             )
-            display.working("compiling the training step; the second time it is read from the cache")
+            display.working("compiling the training step: a minute on two cores, seconds once it is in the cache")
             state, step = self._prepare(source)
             display.note(f"compiled in {self.clock['compile_s']:.1f} s")
             if memory := check_memory(step, self.config.num_envs // devices):
