@@ -85,16 +85,6 @@ def test_two_devices_train_and_one_goes_on(alone, tmp_path):
 
 
 @pytest.mark.slow
-def test_one_device_begins_and_two_go_on(alone, tmp_path):
-    half = ["--steps", str(ITERATIONS * 16 * 8 // 2)]
-    assert train.main([*OPTIONS, *half, "--run-dir", str(tmp_path / "run")]) == 0
-    run = start("--resume", tmp_path / "run", *STEPS, "--devices", 2, devices=2)
-    _, error = run.communicate(timeout=120)
-    assert run.returncode == 0, error
-    assert_same_training(RunFolder(tmp_path / "run"), alone)
-
-
-@pytest.mark.slow
 def test_two_processes_train_as_one_and_the_first_alone_writes(alone, tmp_path):
     runs = start_two(*OPTIONS, *STEPS, "--run-dir", tmp_path / "run")
     said = [run.communicate(timeout=120) for run in runs]

@@ -39,16 +39,6 @@ def started(policy, config, env=None):
     return env, training, initialize_from(policy, config, training.init(jax.random.key(1)))
 
 
-@pytest.mark.slow
-def test_it_acts_like_the_policy(policy):
-    config = fine_tuning_config(policy, SMALL)
-    env, _, state = started(policy, config)
-    obs = jax.random.normal(jax.random.key(2), (256, 3))
-    again = Policy.from_training(env, config, state)
-    np.testing.assert_allclose(again.act(None, obs)[1], policy.act(None, obs)[1], atol=1e-5)
-    assert float(jnp.std(policy.act(None, obs)[1])) > 0.1, "a policy that does something"
-
-
 def test_it_sees_as_the_policy_saw(policy):
     """With another bound on observations, and a smaller floor of their deviations, than those of today's settings."""
     seeing = Normalizer(jnp.array([0.5, -0.5, 0.0]), jnp.array([1e-3, 0.4, 2.0]), 1.5)
