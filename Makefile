@@ -50,6 +50,7 @@ clean:
 
 # pip 25.1 is the first that knows dependency groups.
 $(VENV)/.created:
+	@echo "making a virtual environment in $(VENV)"
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "dexsim needs Python 3.11 or newer; name one with: make PYTHON=python3.12 ..." >&2; exit 2; }
 	$(PYTHON) -m venv $(VENV)
@@ -57,7 +58,8 @@ $(VENV)/.created:
 	@touch $@
 
 $(INSTALLED): pyproject.toml | $(VENV)/.created
-	$(PIP) install --quiet --editable ".[$(EXTRAS)]"
+	@echo "installing dexsim and what it needs into $(VENV), the first time some minutes"
+	$(PIP) install --editable ".[$(EXTRAS)]"
 	@touch $@
 
 $(TESTABLE): pyproject.toml | $(VENV)/.created

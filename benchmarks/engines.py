@@ -43,9 +43,9 @@ from dexsim.core.pytree import pytree_dataclass
 from dexsim.env.env import Env
 from dexsim.hand.kinematics import flexion_joints
 from dexsim.objects.params import ObjectParams, extent
+from dexsim.physics.interface import PhysicsState, StepResult
 from dexsim.physics.model import build_model
 from dexsim.physics.physics import BACKENDS, Physics, choose_backend
-from dexsim.physics.interface import PhysicsState, StepResult
 from dexsim.registry import TASKS
 from dexsim.tasks.placement import palm_height
 from dexsim_ppo import evaluate_policy, load_policy

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+from dexsim_ppo.learner.devices.sharding import make_mesh
 
 import dexsim
 from dexsim.core import cli
@@ -28,7 +29,6 @@ from dexsim.core.compilation import collector_paused, jit
 from dexsim.physics.physics import BACKENDS
 from dexsim.registry import TASKS
 from dexsim_ppo.learner.config import PPOConfig
-from dexsim_ppo.learner.devices.sharding import make_mesh
 from dexsim_ppo.learner.ppo import make_train
 from dexsim_ppo.learner.rollout import scan_restarting
 from dexsim_ppo.training.presets import device_preset, find_preset
@@ -46,9 +46,10 @@ def environment(task: str, backend: str, num_envs: int, steps: int) -> Case:
     def run(state: Any, key: jax.Array) -> Any:
         def body(state: Any, key: jax.Array) -> tuple[Any, None]:
             action = jax.random.uniform(key, (num_envs, env.action_size), minval=-1.0)
-            return jax.vmap(env.step)(state, action), None
+            state = jax.vmap(env.step)(state, action)
+            return state, state.terminated | state.truncated, None
 
-        return scan_restarting(env, body, state, jax.random.split(key, steps))[0]
+        return scan_restarting(jax.vmap(env.restart), body, state, jax.random.split(key, steps))[0]
 
     compiled, key = jit(run, backend=env.backend), jax.random.key(1)
     start = jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), num_envs))

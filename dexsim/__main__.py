@@ -52,6 +52,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     if name not in COMMANDS:
         meant = "".join(f" (perhaps {near})" for near in difflib.get_close_matches(name, COMMANDS, n=1))
         raise ConfigError(f"{name}: no such command{meant}; see dexsim --help")
+    if name == "train":
+        cli.announce(cli.LOADING)
     return importlib.import_module(COMMANDS[name][0]).main(rest)
 
 

@@ -6,5 +6,4 @@ from dexsim.core.errors import CheckpointError as CheckpointError
 from dexsim.core.errors import ConfigError as ConfigError
 from dexsim.core.errors import DexsimError as DexsimError
 from dexsim.core.errors import DexsimWarning as DexsimWarning
-from dexsim.core.errors import OldFileWarning as OldFileWarning
 from dexsim.core.errors import OtherEnvWarning as OtherEnvWarning

@@ -6,13 +6,13 @@ know which world it is in. Shapes: J joints, F fingers, N taxels a finger.
 
 import dataclasses
 from collections.abc import Callable
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from dexsim.core.config import Config, setting
 from dexsim.core.errors import ConfigError
+from dexsim.core.layout import LayoutEntry
 from dexsim.core.pytree import pytree_dataclass
 from dexsim.geometry import rotations
 from dexsim.hand.kinematics import Hand, HandPose, forward_kinematics, tip_twist
@@ -80,14 +80,6 @@ class ObservationField:
     scale: float | None = None
     """None for the running normaliser; a number divides the values instead. Touch has a fixed scale, since running
     statistics of a signal that is mostly zero explode at the first contact."""
-
-
-class LayoutEntry(NamedTuple):
-    """Where a field is in an observation vector; see `ObservationField`."""
-
-    name: str
-    size: int
-    scale: float | None = None
 
 
 def _encode(quat: jax.Array, encoding: str) -> jax.Array:

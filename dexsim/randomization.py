@@ -1,7 +1,7 @@
 """What is drawn anew at every episode start, apart from the object itself.
 
 One dataclass of ranges and one `sample_hand`. With `scale` 0 it gives the nominal hand exactly. The
-scale may be traced, so that a curriculum widens the ranges while training (`Curriculum`).
+scale may be traced, so that a curriculum widens the ranges while training (`CurriculumConfig`).
 """
 
 import dataclasses

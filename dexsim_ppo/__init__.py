@@ -13,20 +13,20 @@ from dexsim.core.door import open_door
 
 if TYPE_CHECKING:
     from dexsim_ppo.acting import act
-    from dexsim_ppo.average import average_policies
     from dexsim_ppo.evaluate import evaluate_policy
     from dexsim_ppo.learner.config import PPOConfig
+    from dexsim_ppo.learner.curriculum import CurriculumConfig
     from dexsim_ppo.learner.ppo import TrainState, make_train
     from dexsim_ppo.policy import Policy, load_policy
-    from dexsim_ppo.train import Trained, train_policy
+    from dexsim_ppo.train import TrainResult, train_policy
 
 __all__ = [
+    "CurriculumConfig",
     "PPOConfig",
     "Policy",
+    "TrainResult",
     "TrainState",
-    "Trained",
     "act",
-    "average_policies",
     "evaluate_policy",
     "load_policy",
     "make_train",
@@ -37,12 +37,12 @@ __getattr__, __dir__ = open_door(
     __name__,
     __all__,
     {
+        "CurriculumConfig": "dexsim_ppo.learner.curriculum",
         "PPOConfig": "dexsim_ppo.learner.config",
         "Policy": "dexsim_ppo.policy",
         "TrainState": "dexsim_ppo.learner.ppo",
-        "Trained": "dexsim_ppo.train",
+        "TrainResult": "dexsim_ppo.train",
         "act": "dexsim_ppo.acting",
-        "average_policies": "dexsim_ppo.average",
         "evaluate_policy": "dexsim_ppo.evaluate",
         "load_policy": "dexsim_ppo.policy",
         "make_train": "dexsim_ppo.learner.ppo",

@@ -20,19 +20,20 @@ import numpy as np
 import tyro
 
 from dexsim.core import cli
-from dexsim.core.config import to_dict
+from dexsim.core.config import from_dict, to_dict
 from dexsim.core.errors import CheckpointError, ConfigError
 from dexsim_ppo import checkpoint
+from dexsim_ppo.learner.config import PPOConfig
+from dexsim_ppo.learner.memory import carry_size
 from dexsim_ppo.learner.networks import Params
 from dexsim_ppo.learner.running_stats import make_normalizer, recover_stats
 from dexsim_ppo.learner.state import TrainState
-from dexsim_ppo.policy import Policy, layout_to_list, load_policy
-from dexsim_ppo.policy_file import check_numbers, memory_to_list
+from dexsim_ppo.policy import Policy, check_finite, load_policy
 from dexsim_ppo.training.runlog import RunFolder
 
 # Two fine-tunings of rotate are 0.17 apart, checkpoints of one training 0.38, policies that were trained from scratch
 # 1.3 to 2 (record average-39971f3-distances).
-APART = 1.0
+FARTHEST = 1.0
 
 
 def average_policies(policies: Sequence[Policy]) -> Policy:
@@ -48,12 +49,11 @@ def average_policies(policies: Sequence[Policy]) -> Policy:
     first, *others = policies
     form = _form(first)
     for number, other in enumerate(others, start=2):
-        odd = [name for name, value in _form(other).items() if value != form[name]]
-        if odd:
-            raise ConfigError(f"policy {number} differs from the first in {', '.join(odd)}")
-        if (apart := distance(first, other)) > APART:
+        if different := [name for name, value in _form(other).items() if value != form[name]]:
+            raise ConfigError(f"policy {number} differs from the first in {', '.join(different)}")
+        if (share := distance(first, other)) > FARTHEST:
             raise ConfigError(
-                f"policy {number} has no common origin with the first: weights differ by {apart:.0%} of their size"
+                f"policy {number} has no common origin with the first: weights differ by {share:.0%} of their size"
             )
     params = jax.tree.map(
         lambda *leaves: np.mean(leaves, 0, dtype=float).astype(np.float32), *[p.params for p in policies]
@@ -78,20 +78,16 @@ def policies_of(run: str | Path) -> dict[Path, Policy]:
     """
     folder = RunFolder(Path(run))
     folder.latest_checkpoint()
-    last = Policy.load(folder.last)
-    try:
-        ppo = last.training["ppo"]
-        std_floor, steps = float(ppo["observation_std_floor"]), int(ppo["num_envs"]) * int(ppo["rollout_length"])
-    except (KeyError, TypeError, ValueError):
-        raise CheckpointError(
-            f"{folder.last}: does not say how it was trained; name policies instead of the run"
-        ) from None
-    return {path: _policy_at(path, last, std_floor, steps) for path in folder.existing_checkpoints()}
+    last = load_policy(folder.last)
+    if "ppo" not in last.training:
+        raise CheckpointError(f"{folder.last}: does not say how it was trained; name policies instead of the run")
+    config = from_dict(PPOConfig, last.training["ppo"])
+    return {path: _policy_at(path, last, config) for path in folder.existing_checkpoints()}
 
 
-def _policy_at(path: Path, last: Policy, std_floor: float, steps: int) -> Policy:
-    """The policy of a checkpoint, in the form of its run's last one; `steps` are those of an iteration."""
-    params = last.params
+def _policy_at(path: Path, last: Policy, config: PPOConfig) -> Policy:
+    """The policy of a checkpoint, in the form of its run's last one."""
+    params, std_floor = last.params, config.observation_std_floor
     nothing: Any = None
     like = TrainState(
         params=Params(params.layers, nothing, nothing, params.memory),
@@ -102,18 +98,11 @@ def _policy_at(path: Path, last: Policy, std_floor: float, steps: int) -> Policy
     state = checkpoint.restore(checkpoint.load(path, kind="train", task=last.task), like, part=True)
     stats, clip = state.observation_stats["actor"], params.normalizer.clip
     normalizer = make_normalizer(stats, last.observation_layout, std_floor=std_floor, clip=clip)
-    try:
-        check_numbers(state.params.actor, normalizer, state.params.memory)
-    except ValueError as error:
-        raise CheckpointError(f"{path}: holds no sound policy ({error})") from None
+    params = dataclasses.replace(params, layers=state.params.actor, normalizer=normalizer, memory=state.params.memory)
+    check_finite(params, path)
     iteration = int(state.iteration)
-    return dataclasses.replace(
-        last,
-        params=dataclasses.replace(
-            params, layers=state.params.actor, normalizer=normalizer, memory=state.params.memory
-        ),
-        training=last.training | {"iteration": iteration, "env_steps": iteration * steps},
-    )
+    origin = {"iteration": iteration, "env_steps": iteration * config.steps_per_iteration}
+    return dataclasses.replace(last, params=params, training=last.training | origin)
 
 
 def _form(policy: Policy) -> dict[str, Any]:
@@ -123,9 +112,9 @@ def _form(policy: Policy) -> dict[str, Any]:
         "control": policy.spec and to_dict(policy.spec.control),
         "control rate": policy.control_rate,
         "hand": policy.hand,
-        "observation": layout_to_list(policy.observation_layout),
+        "observation": policy.observation_layout,
         "clip of the observation": policy.params.normalizer.clip,
-        "memory": memory_to_list(policy.params.memory),
+        "memory": carry_size(policy.params.memory),
         "layers": [layer.kernel.shape for layer in policy.params.layers],
         "distribution": policy.params.squash,
     }
@@ -151,6 +140,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         description="Average the weights of policies that were fine-tuned from one, or of one run's checkpoints.",
     )
     cli.check_writable(arguments.output)
+    # A run's last policy says how those of its checkpoints are made.
+    inputs = [RunFolder(Path(name)).last if Path(name).is_dir() else name for name in arguments.policies]
+    cli.check_apart({"--output": arguments.output}, {f"policy {file}": file for file in inputs})
     policies: list[tuple[str | Path, Policy]] = []
     for name in arguments.policies:
         policies += policies_of(name).items() if Path(name).is_dir() else [(name, load_policy(name))]
@@ -158,11 +150,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         average = average_policies([policy for _, policy in policies])
     except ConfigError as error:
         raise ConfigError(f"{' '.join(arguments.policies)}: {error}") from None
-    # A run's last policy says how those of its checkpoints are made.
-    read = [RunFolder(Path(name)).last for name in arguments.policies] + [Path(path) for path, _ in policies]
-    for file in read:
-        if file.exists() and arguments.output.exists() and file.samefile(arguments.output):
-            raise ConfigError(f"--output {arguments.output}: is one of the averaged policies; give another file")
     average.save(arguments.output)
     for path, policy in policies:
         print(f"{path}: {distance(average, policy):.1%} away from the average")

@@ -31,7 +31,7 @@ from dexsim.core.errors import ConfigError
 from dexsim.core.progress import progress
 from dexsim.env.evaluation import evaluation_of
 from dexsim.registry import find_task
-from dexsim_ppo.acting import PolicyParams, act_from, begin
+from dexsim_ppo.acting import PolicyParams, act, initial_carry
 from dexsim_ppo.learner.adapter import Adapted
 from dexsim_ppo.learner.types import Environment
 from dexsim_ppo.policy import Policy, load_policy
@@ -77,12 +77,10 @@ class Evaluator:
                 if show:
                     show(i + self.chunk)
         # Episodes are the last axis of all that is measured.
-        measured = jax.tree.map(lambda *xs: np.concatenate(xs, axis=-1), *(measured for measured, _ in parts))
-        found, over = measured
-        report = (summarize_totals if self.totals else summarize)(self.protocol, found, over, np.asarray(plan.row)) | {
-            "seed": seed,
-            "seconds": time.perf_counter() - started,
-        }
+        metrics, over = jax.tree.map(lambda *xs: np.concatenate(xs, axis=-1), *(measured for measured, _ in parts))
+        make_report = summarize_totals if self.totals else summarize
+        report = make_report(self.protocol, metrics, over, np.asarray(plan.row))
+        report |= {"seed": seed, "seconds": time.perf_counter() - started}
         return report, self._film(*parts[0][1])
 
     def _plan(self, count: int, seed: int) -> Any:
@@ -101,20 +99,20 @@ class Evaluator:
         shown = self._extremes(state)
 
         def step(carry, _):
-            state, memory, last = carry
-            memory, action = act_from(params, memory, state.obs["actor"])
+            state, policy_carry, last = carry
+            policy_carry, action = act(params, policy_carry, state.obs["actor"])
             state = jax.vmap(self.env.step)(state, jnp.where(idle, jnp.zeros_like(action), action))
             frame = jax.tree.map(lambda x: x[shown], jax.vmap(self.protocol.snapshot)(state))
             series = (dict(state.metrics), state.terminated)
             film = (frame, state.terminated[shown])
             if not self.totals:
-                return (state, memory, None), (series, film)
-            return (state, memory, _follow(last, *series)), (None, film)
+                return (state, policy_carry, None), (series, film)
+            return (state, policy_carry, _follow(last, *series)), (None, film)
 
         last: Any = None
         if self.totals:
             last = (dict(state.metrics), jnp.zeros(self.chunk, jnp.int32), jnp.zeros(self.chunk, bool))
-        first: Any = state, begin(params, (self.chunk,)), last
+        first: Any = state, initial_carry(params, (self.chunk,)), last
         (*_, last), (series, film) = jax.lax.scan(step, first, None, length=self.protocol.evaluation_steps)
         return (last[:2] if self.totals else series), film
 
@@ -140,9 +138,9 @@ class Evaluator:
 def _follow(last: tuple, metrics: dict[str, jax.Array], terminated: jax.Array) -> tuple:
     """`last` (metrics, ticks lived, whether ended), one tick later; an ended episode stays as it is."""
     before, lived, ended = last
-    kept = jax.tree.map(lambda old, new: jnp.where(ended, old, new), before, metrics)
+    latest = jax.tree.map(lambda old, new: jnp.where(ended, old, new), before, metrics)
     ended = ended | terminated
-    return kept, lived + (~ended).astype(jnp.int32), ended
+    return latest, lived + (~ended).astype(jnp.int32), ended
 
 
 def write_video(env: Environment, snapshots: Any, path: Path, quality: str = "quick") -> Path:
@@ -199,7 +197,7 @@ def evaluate_policy(
       `"do_nothing"`: the same of the baseline.
 
     Raises:
-      CheckpointError, ConfigError: see `Policy.load` and `Policy.make_env`.
+      CheckpointError, ConfigError: see `load_policy` and `Policy.make_env`.
     """
     EvaluateArguments(policy=str(policy), episodes=episodes, seed=seed, backend=cast(Any, backend), chunk=chunk)
     policy = policy if isinstance(policy, Policy) else load_policy(policy)
@@ -263,27 +261,20 @@ def main(argv: Sequence[str] | None = None) -> int:
         description="Measure a policy over fixed, seeded episodes.",
     )
     cli.enable_caches()
-    for path in (arguments.output, arguments.video):
+    video = arguments.video
+    for path in (arguments.output, video):
         if path:
             cli.check_writable(path)
-    video = arguments.video
     if video and video.suffix not in (".mp4", ".gif"):
         raise ConfigError(f"--video {video}: give a file that ends in .mp4 or .gif")
-    for name, path in (("--output", arguments.output), ("--video", video)):
-        if path and path.exists() and Path(arguments.policy).exists() and path.samefile(arguments.policy):
-            raise ConfigError(f"{name} {path}: is the policy itself; name another file")
-    if video and arguments.output and video.resolve() == arguments.output.resolve():
-        raise ConfigError(f"--output and --video are both {video}: name two files")
+    cli.check_apart({"--output": arguments.output, "--video": video}, {"policy": arguments.policy})
     policy = load_policy(arguments.policy, task=arguments.task).ablate(*arguments.ablate)
     chunk = min(arguments.chunk or default_chunk(), arguments.episodes or default_chunk())
-    if not any(entry.startswith("objects.mesh=") for entry in arguments.set):
-        policy.check_mesh()
     seconds = [f"evaluation_seconds={arguments.seconds}"] if arguments.seconds else []
     policy = dataclasses.replace(policy, env_config=override(policy.env_config, (*seconds, *arguments.set)))
     entry, hand = find_task(policy.task), policy.find_hand(arguments.hand)
-    if seconds and not any(field.name == "evaluation_seconds" for field in dataclasses.fields(entry.config_class)):
-        raise ConfigError(f"--seconds {arguments.seconds:g}: task {policy.task!r} has no evaluation_seconds to set")
-    env = policy.build_env(backend=arguments.backend, num_envs=chunk, hand=hand)
+    with cli.naming_options(entry.config_class, entry.config()):
+        env = policy.make_env(backend=arguments.backend, num_envs=chunk, hand=hand)
     if video and isinstance(env, Adapted):
         raise ConfigError(f"--video {video}: {env.name!r} draws nothing")
     evaluator, episodes = Evaluator(env, chunk), arguments.episodes or default_episodes(env)

@@ -20,22 +20,21 @@ import numpy as np
 import tyro
 
 from dexsim.core import cli
-from dexsim.core.config import to_dict
+from dexsim.core.config import from_dict, to_dict
 from dexsim.core.errors import CheckpointError, ConfigError
 from dexsim.core.files import write_whole
-from dexsim.core.install import install_line
-from dexsim.hand.source import check_record
+from dexsim.core.install import require
+from dexsim.core.layout import LayoutEntry, layout_size
 from dexsim.task_spec import TaskSpec
-from dexsim_ppo.acting import NEEDS_MEMORY
-from dexsim_ppo.learner.memory import GRU, state_size
-from dexsim_ppo.learner.types import Field
-from dexsim_ppo.policy import Policy, layout_to_list, load_policy
-from dexsim_ppo.policy_file import memory_to_list
-from dexsim_ppo.portable import FORMAT, UNIT, PortablePolicy, check_header
-from dexsim_ppo.retired import read_spec
+from dexsim_ppo.policy import Policy, PolicyHeader, load_policy
+from dexsim_ppo.portable import FORMAT, PortablePolicy
 
 _OPSET = 17
 _KEY = "dexsim"  # of the header among the model's properties
+_GRU = ("input_kernel", "input_bias", "recurrent_kernel", "recurrent_bias")
+
+Function = Callable[[np.ndarray | None, np.ndarray], tuple[np.ndarray | None, np.ndarray]]
+"""From carry and observation to carry and action."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,232 +42,181 @@ class ExportedPolicy:
     """An exported policy as the bridge uses it: what of `Policy` it needs."""
 
     task: str
-    observation_layout: tuple[Field, ...]
+    observation_layout: tuple[LayoutEntry, ...]
     control_rate: float
     spec: TaskSpec | None
-    params: Any
-    """Whatever tells it from others: bytes."""
-    function: Callable[[np.ndarray | None, np.ndarray], tuple[np.ndarray | None, np.ndarray]]
-    """From memory and observation to memory and action."""
-    memory: int = 0
-    """Numbers that it remembers; 0 if it has no memory."""
+    params: np.ndarray
+    """The file's bytes, of which the bridge takes a hash."""
+    function: Function
+    carry_size: int = 0
+    """Length m of its carry; 0 if it has no memory."""
     hand: dict[str, Any] | None = None
     """As of `Policy`."""
 
-    def __call__(self, obs: Any) -> np.ndarray:
-        """Action `[..., A]` for an actor observation `[..., n]`; for policies without memory."""
-        if self.memory:
-            raise ConfigError(NEEDS_MEMORY)
-        return self.act(None, obs)[1]
-
-    def begin(self, *batch: int) -> np.ndarray | None:
+    def initial_carry(self, *batch: int) -> np.ndarray | None:
         """As of `Policy`."""
-        return np.zeros((*batch, self.memory), np.float32) if self.memory else None
+        return np.zeros((*batch, self.carry_size), np.float32) if self.carry_size else None
 
-    def act(self, memory: Any, obs: Any) -> tuple[np.ndarray | None, np.ndarray]:
+    def act(self, carry: Any, obs: Any) -> tuple[np.ndarray | None, np.ndarray]:
         """As of `Policy`."""
-        return self.function(memory, np.asarray(obs, np.float32))
+        return self.function(carry, np.asarray(obs, np.float32))
 
 
-def header_of(policy: Policy) -> dict[str, Any]:
-    """What an exported file says beside its numbers; plain JSON."""
-    return {
-        "format": FORMAT,
-        "task": policy.task,
-        "control_rate": policy.control_rate,
-        "observation_layout": layout_to_list(policy.observation_layout),
-        "squash": policy.params.squash,
-        "clip": policy.params.normalizer.clip,
-        "layers": len(policy.params.layers),
-        "memory": memory_to_list(policy.params.memory),
-        "spec": policy.spec and to_dict(policy.spec),
-        "training": cli.plain(policy.training),
-        "hand": policy.hand,
-    }
+# --- write ----------------------------------------------------------------------------------------------
+
+
+def contents(policy: Policy) -> tuple[str, dict[str, np.ndarray]]:
+    """The header, JSON, and the arrays by name, of either format; see `dexsim_ppo.portable`."""
+    header = {"format": FORMAT, "task": policy.task} | cli.plain(to_dict(policy.header))
+    params = policy.params
+    arrays = {"mean": params.normalizer.mean, "std": params.normalizer.std}
+    for i, layer in enumerate(params.layers):
+        arrays |= {f"kernel_{i}": layer.kernel, f"bias_{i}": layer.bias}
+    if params.memory:
+        arrays |= dict(zip(_GRU, jax.tree.leaves(params.memory), strict=True))
+    return json.dumps(header), {name: np.asarray(array) for name, array in arrays.items()}
 
 
 def to_numpy(policy: Policy, path: Path) -> None:
     """Write a file for `PortablePolicy`."""
-    normalizer = policy.params.normalizer
-    arrays = {"mean": normalizer.mean, "std": normalizer.std, "header": np.array(json.dumps(header_of(policy)))}
-    for i, layer in enumerate(policy.params.layers):
-        arrays |= {f"kernel_{i}": layer.kernel, f"bias_{i}": layer.bias}
-    arrays |= dict(zip(UNIT, jax.tree.leaves(policy.params.memory), strict=False))
-    buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, **{name: np.asarray(array) for name, array in arrays.items()})
+    (header, arrays), buffer = contents(policy), io.BytesIO()
+    np.savez(buffer, allow_pickle=False, header=np.array(header), **arrays)
     write_whole(path, [buffer.getvalue()])
 
 
 def to_onnx(policy: Policy, path: Path) -> None:
     """Write an ONNX model: input `observation` [batch, n], output `action` [batch, A], float32. One with a memory also
-    has `memory` [batch, m], zero at an episode's start, and gives `next_memory`.
+    has `carry` [batch, m], zero at an episode's start, and gives `next_carry`.
 
     Raises:
-      ConfigError: onnx is not installed.
+      DexsimError: onnx is not installed.
     """
-    try:
-        from onnx import TensorProto, checker, helper, numpy_helper
-    except ImportError:
-        raise ConfigError(f"{path}: writing ONNX needs onnx: {install_line('onnx')}") from None
-    params, nodes = policy.params, []
-    clip = float(params.normalizer.clip)
-    values = {"mean": params.normalizer.mean, "std": params.normalizer.std, "low": -clip, "high": clip}
-    nodes += [
-        helper.make_node("Sub", ["observation", "mean"], ["centred"]),
-        helper.make_node("Div", ["centred", "std"], ["scaled"]),
-        helper.make_node("Clip", ["scaled", "low", "high"], ["seen" if params.memory else "hidden_0"]),
+    require("onnx", "onnx", f"writing {path}")
+    from onnx import TensorProto, checker, helper, numpy_helper
+
+    header, arrays = contents(policy)
+    clip, units = np.float32(policy.params.normalizer.clip), policy.params.memory and len(arrays["recurrent_kernel"])
+    values: dict[str, Any] = arrays | {"low": -clip, "high": clip, "lowest": np.float32(-1), "highest": np.float32(1)}
+    node = helper.make_node
+    nodes = [
+        node("Sub", ["observation", "mean"], ["centred"]),
+        node("Div", ["centred", "std"], ["scaled"]),
+        node("Clip", ["scaled", "low", "high"], ["normalized" if units else "hidden_0"]),
     ]
-    remembered = state_size(params.memory, len(params.normalizer.mean))
-    if isinstance(params.memory, GRU):
-        values |= _gru_weights(params.memory)
+    if units:
+        values = {name: value for name, value in values.items() if name not in _GRU} | _onnx_gru(arrays)
         nodes += [
-            helper.make_node("Unsqueeze", ["seen", "time"], ["seen_at_once"]),
-            helper.make_node("Unsqueeze", ["memory", "time"], ["before"]),
-            helper.make_node(
+            node("Unsqueeze", ["normalized", "time"], ["sequence"]),
+            node("Unsqueeze", ["carry", "time"], ["before"]),
+            node(
                 "GRU",
-                ["seen_at_once", "gru_input", "gru_recurrent", "gru_bias", "", "before"],
+                ["sequence", "gru_input", "gru_recurrent", "gru_bias", "", "before"],
                 ["", "after"],
-                hidden_size=remembered,
+                hidden_size=units,
                 linear_before_reset=1,
             ),
-            helper.make_node("Squeeze", ["after", "time"], ["next_memory"]),
-            helper.make_node("Concat", ["seen", "next_memory"], ["hidden_0"], axis=1),
+            node("Squeeze", ["after", "time"], ["next_carry"]),
+            node("Concat", ["normalized", "next_carry"], ["hidden_0"], axis=1),
         ]
-    elif params.memory is not None:
-        values |= {"begin": np.array([0]), "end": np.array([remembered]), "axis": np.array([1])}
+    last = len(policy.params.layers) - 1
+    for i in range(last + 1):
         nodes += [
-            helper.make_node("Concat", ["seen", "memory"], ["hidden_0"], axis=1),
-            helper.make_node("Slice", ["hidden_0", "begin", "end", "axis"], ["next_memory"]),
-        ]
-    last = len(params.layers) - 1
-    for i, layer in enumerate(params.layers):
-        values |= {f"kernel_{i}": layer.kernel, f"bias_{i}": layer.bias}
-        nodes += [
-            helper.make_node("MatMul", [f"hidden_{i}", f"kernel_{i}"], [f"product_{i}"]),
-            helper.make_node("Add", [f"product_{i}", f"bias_{i}"], [f"sum_{i}"]),
+            node("MatMul", [f"hidden_{i}", f"kernel_{i}"], [f"product_{i}"]),
+            node("Add", [f"product_{i}", f"bias_{i}"], [f"sum_{i}"]),
         ]
         if i < last:
-            nodes.append(helper.make_node("Elu", [f"sum_{i}"], [f"hidden_{i + 1}"]))
-    if params.squash == "tanh":
-        nodes.append(helper.make_node("Tanh", [f"sum_{last}"], ["action"]))
+            nodes.append(node("Elu", [f"sum_{i}"], [f"hidden_{i + 1}"]))
+    if policy.params.squash == "tanh":
+        nodes.append(node("Tanh", [f"sum_{last}"], ["action"]))
     else:
-        values |= {"lowest": -1.0, "highest": 1.0}
-        nodes.append(helper.make_node("Clip", [f"sum_{last}", "lowest", "highest"], ["action"]))
-    sizes = {"observation": len(params.normalizer.mean), "action": params.layers[-1].kernel.shape[1]}
-    if remembered:
-        sizes |= {"memory": remembered, "next_memory": remembered}
-    ports = {
-        name: helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", size]) for name, size in sizes.items()
-    }
-    given = [ports.pop(name) for name in ("observation", "memory") if name in ports]
-    arrays = {name: np.asarray(value) for name, value in values.items()}
-    tensors = [
-        numpy_helper.from_array(array if array.dtype.kind == "i" else array.astype(np.float32), name)
-        for name, array in arrays.items()
-    ]
-    graph = helper.make_graph(nodes, policy.task, given, list(ports.values()), tensors)
+        nodes.append(node("Clip", [f"sum_{last}", "lowest", "highest"], ["action"]))
+    port = lambda name, size: helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", size])  # noqa: E731
+    inputs, outputs = [port("observation", len(arrays["mean"]))], [port("action", len(arrays[f"bias_{last}"]))]
+    if units:
+        inputs, outputs = [*inputs, port("carry", units)], [*outputs, port("next_carry", units)]
+    tensors = [numpy_helper.from_array(np.asarray(value), name) for name, value in values.items()]
+    graph = helper.make_graph(nodes, policy.task, inputs, outputs, tensors)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", _OPSET)], ir_version=8)
-    helper.set_model_props(model, {_KEY: json.dumps(header_of(policy))})
+    helper.set_model_props(model, {_KEY: header})
     checker.check_model(model)
     write_whole(path, [model.SerializeToString()])
 
 
-def _gru_weights(unit: GRU) -> dict[str, np.ndarray]:
+def _onnx_gru(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Weights as ONNX orders them: update gate first, one row a unit, and a leading axis for the direction."""
 
-    def ordered(array: Any) -> np.ndarray:
-        reset, update, new = np.split(np.asarray(array), 3, -1)
+    def ordered(name: str) -> np.ndarray:
+        reset, update, new = np.split(arrays[name], 3, -1)
         return np.concatenate([update, reset, new], -1).T[None]
 
     return {
         "time": np.array([0]),
-        "gru_input": ordered(unit.input.kernel),
-        "gru_recurrent": ordered(unit.recurrent.kernel),
-        "gru_bias": np.concatenate([ordered(unit.input.bias), ordered(unit.recurrent.bias)], -1),
+        "gru_input": ordered("input_kernel"),
+        "gru_recurrent": ordered("recurrent_kernel"),
+        "gru_bias": np.concatenate([ordered("input_bias"), ordered("recurrent_bias")], -1),
     }
+
+
+# --- read -----------------------------------------------------------------------------------------------
 
 
 def load_exported(path: str | Path) -> ExportedPolicy:
     """Read an exported policy, `.npz` or `.onnx`.
 
     Raises:
-      CheckpointError: it is unsound, or onnxruntime is not installed.
+      CheckpointError: it is unsound.
+      DexsimError: onnxruntime is not installed.
     """
     path = Path(path)
-    header, function = _read_onnx(path) if path.suffix == ".onnx" else _read_numpy(path)
+    if path.suffix == ".onnx":
+        require("onnxruntime", "onnx", f"running {path}")
     try:
-        check_header(header)
-        if header.get("hand") is not None:
-            check_record(header["hand"])
+        data, function = _read_onnx(path) if path.suffix == ".onnx" else _read_numpy(path)
+        task = data.pop("task")
+        header = from_dict(PolicyHeader, {name: value for name, value in data.items() if name != "format"})
         policy = ExportedPolicy(
-            task=str(header["task"]),
-            observation_layout=tuple(Field(*field) for field in header["observation_layout"]),
-            control_rate=float(header["control_rate"]),
-            spec=read_spec(header["spec"], path) if header.get("spec") else None,
+            task=task,
+            observation_layout=header.layout,
+            control_rate=header.control_rate,
+            spec=header.spec,
             params=np.frombuffer(path.read_bytes(), np.uint8),
             function=function,
-            memory=_memory_size(header),
-            hand=header.get("hand"),
+            carry_size=header.memory[1] if header.memory else 0,
+            hand=header.hand,
         )
-        _try(policy)
-    except Exception as error:  # onnxruntime's own error types differ by version
-        raise CheckpointError(f"{path}: is not a sound policy ({' '.join(str(error).split()):.200})") from None
+        _, action = policy.act(policy.initial_carry(), np.zeros(layout_size(header.layout), np.float32))
+    except OSError as error:
+        raise CheckpointError(f"{path}: {error.strerror or error}") from None
+    except Exception as error:  # onnxruntime's and zipfile's own error types differ by version
+        raise CheckpointError(f"{path}: invalid exported policy ({' '.join(str(error).split()):.200})") from None
+    if not np.isfinite(action).all():  # The network moves motors: numbers of an export have no checksum.
+        raise CheckpointError(f"{path}: gives actions that are not finite")
     return policy
 
 
-def _try(policy: ExportedPolicy) -> None:
-    """Raises what a tick raises; ValueError: it gives what is no action, or another memory than it takes.
-
-    A network of ONNX may be any: what it takes and gives is not said by the header.
-    """
-    memory = policy.begin()
-    after, action = policy.act(memory, np.zeros(sum(field.size for field in policy.observation_layout), np.float32))
-    kept = getattr(after, "shape", None) == getattr(memory, "shape", None)
-    if action.ndim != 1 or not np.isfinite(action).all() or not kept:
-        raise ValueError("it gives actions that are not finite, or another memory than it takes")
+def _read_numpy(path: Path) -> tuple[dict[str, Any], Function]:
+    policy = PortablePolicy.load(path)
+    return dict(policy.header), policy.act
 
 
-def _memory_size(header: dict[str, Any]) -> int:
-    kind, size = header.get("memory") or ("none", 0)
-    return size * sum(n for _, n, _ in header["observation_layout"]) if kind == "history" else size
+def _read_onnx(path: Path) -> tuple[dict[str, Any], Function]:
+    import onnxruntime
 
-
-def _read_numpy(path: Path) -> tuple[dict[str, Any], Callable]:
-    try:
-        policy = PortablePolicy.load(path)
-    except (OSError, ValueError) as error:
-        # Other errors than of the system name the file themselves.
-        where = f"{path}: {error.strerror or error}" if isinstance(error, OSError) else str(error)
-        raise CheckpointError(where) from None
-    return policy.header, policy.act
-
-
-def _read_onnx(path: Path) -> tuple[dict[str, Any], Callable]:
-    try:
-        import onnxruntime
-    except ImportError:
-        raise CheckpointError(f"{path}: running ONNX needs onnxruntime: {install_line('onnx')}") from None
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1  # waking threads costs more than this small network
-    try:
-        # From memory, so that it takes no weights from other files.
-        session = onnxruntime.InferenceSession(path.read_bytes(), options, providers=["CPUExecutionProvider"])
-        header = json.loads(session.get_modelmeta().custom_metadata_map[_KEY])
-    except OSError as error:
-        raise CheckpointError(f"{path}: {error.strerror or error}") from None
-    except Exception as error:  # onnxruntime's own error types differ by version
-        raise CheckpointError(f"{path}: is not an exported policy ({' '.join(str(error).split()):.200})") from None
+    # From memory, so that it takes no weights from other files.
+    session = onnxruntime.InferenceSession(path.read_bytes(), options, providers=["CPUExecutionProvider"])
 
-    def act(memory: np.ndarray | None, observation: np.ndarray) -> tuple[np.ndarray | None, np.ndarray]:
+    def act(carry: np.ndarray | None, observation: np.ndarray) -> tuple[np.ndarray | None, np.ndarray]:
         batch = observation.shape[:-1]
-        given = {"observation": observation.reshape(-1, observation.shape[-1])}
-        if memory is None:
-            return None, session.run(["action"], given)[0].reshape(*batch, -1)
-        given["memory"] = memory.reshape(-1, memory.shape[-1])
-        memory, action = session.run(["next_memory", "action"], given)
-        return memory.reshape(*batch, -1), action.reshape(*batch, -1)
+        inputs = {"observation": observation.reshape(-1, observation.shape[-1])}
+        if carry is None:
+            return None, session.run(["action"], inputs)[0].reshape(*batch, -1)
+        inputs["carry"] = carry.reshape(-1, carry.shape[-1])
+        carry, action = session.run(["next_carry", "action"], inputs)
+        return carry.reshape(*batch, -1), action.reshape(*batch, -1)
 
-    return header, act
+    return json.loads(session.get_modelmeta().custom_metadata_map[_KEY]), act
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -295,7 +243,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     cli.check_writable(arguments.output)
     policy = load_policy(arguments.policy)
     writers[arguments.output.suffix](policy, arguments.output)
-    sizes = ", ".join(f"{field.name} {field.size}" for field in policy.observation_layout)
+    sizes = ", ".join(f"{entry.name} {entry.size}" for entry in policy.observation_layout)
     print(f"{arguments.output}: {policy.task}, {policy.control_rate:g} Hz; observation: {sizes}")
     return 0
 

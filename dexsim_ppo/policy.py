@@ -1,45 +1,81 @@
 """A trained policy: loads from one file, needs no simulator, runs anywhere JAX does.
 
-    policy = load_policy("grasp")        # a shipped one by name, or a file
-    memory = policy.begin()              # None where the policy has no memory
-    memory, action = policy.act(memory, observation)
+    policy = load_policy("grasp")                   # a shipped one by name, or a file
+    carry = policy.initial_carry()                  # at the start of an episode; None where the policy has no memory
+    carry, action = policy.act(carry, observation)  # `act(policy.params, carry, observation)`, compiled
 
-A policy without a memory is a function, too: `action = policy(observation)`. `Policy` is what a file holds: the
-parameters of `dexsim_ppo.acting` together with the task, the observation's layout and the control rate.
+`Policy` is what a file holds: the parameters of `act` together with the task, the observation's layout and the control
+rate.
 """
 
 import dataclasses
+import itertools
 import warnings
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import MISSING, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from dexsim.core.assets import asset_path
-from dexsim.core.config import flat, from_dict, to_dict
+from dexsim.core.config import flat, from_dict, setting, to_dict, validate
 from dexsim.core.errors import AssetError, CheckpointError, ConfigError, OtherEnvWarning
+from dexsim.core.layout import LayoutEntry, layout_size
 from dexsim.core.pytree import Array
 from dexsim.hand.source import check_record, check_same, record_of, recorded_hand
 from dexsim.task_spec import TaskSpec
 from dexsim_ppo import checkpoint
-from dexsim_ppo.acting import PolicyParams, act_from, begin
+from dexsim_ppo.acting import PolicyParams, act, initial_carry
 from dexsim_ppo.learner.adapter import adapt
-from dexsim_ppo.learner.memory import History
+from dexsim_ppo.learner.memory import GRU, carry_size
 from dexsim_ppo.learner.networks import Layer
-from dexsim_ppo.learner.running_stats import make_normalizer
-from dexsim_ppo.learner.types import Environment, Field, Fields
-from dexsim_ppo.policy_file import memory_to_list, read_network
-from dexsim_ppo.retired import migrate_config, old_spec, read_spec
+from dexsim_ppo.learner.running_stats import Normalizer, make_normalizer
+from dexsim_ppo.learner.types import Environment
 
 if TYPE_CHECKING:
     from dexsim.env.env import Env
     from dexsim.hand.kinematics import Hand
 
+_act = jax.jit(act)
 
-_act_from = jax.jit(act_from)
+
+@dataclass(frozen=True, kw_only=True)
+class PolicyHeader:
+    """What the file of a policy says beside its numbers, in every format."""
+
+    env_config: dict[str, Any]
+    """Configuration of the environment that it was trained in."""
+    control_rate: float = setting(MISSING, unit="Hz", low=1.0, high=1000.0)
+    """Actions per second."""
+    observation_layout: tuple[tuple[str, int, float | None], ...]
+    """Name, size and scale of each entry of the observation."""
+    squash: Literal["gaussian", "tanh"]
+    """See `PolicyParams`."""
+    clip: float = setting(MISSING, unit="1", low=0.1, high=1e4)
+    """Bound on normalised observations."""
+    layers: int = setting(MISSING, unit="1", low=1, high=64)
+    """Layers of the actor's network."""
+    memory: tuple[str, int] | None
+    """Kind and units of the memory."""
+    training: dict[str, Any]
+    """Where it comes from."""
+    spec: TaskSpec | None
+    """What a host must know of the task."""
+    hand: dict[str, Any] | None
+    """Which hand it was trained on."""
+
+    def __post_init__(self) -> None:
+        validate(self)
+        if self.hand is not None:
+            check_record(self.hand)
+
+    @property
+    def layout(self) -> tuple[LayoutEntry, ...]:
+        """The observation's layout."""
+        return tuple(LayoutEntry(*entry) for entry in self.observation_layout)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,8 +85,8 @@ class Policy:
     task: str
     env_config: dict[str, Any]
     """Configuration of the environment that it was trained in, as `dexsim.core.config.to_dict` gives it."""
-    observation_layout: tuple[Field, ...]
-    """Fields of the actor's observation."""
+    observation_layout: tuple[LayoutEntry, ...]
+    """Layout of the actor's observation."""
     params: PolicyParams
     control_rate: float
     """Actions per second, Hz."""
@@ -61,27 +97,19 @@ class Policy:
     hand: dict[str, Any] | None = None
     """Which hand it was trained on (`dexsim.hand.source`); None for the shipped default one."""
 
-    def __call__(self, obs: Array) -> jax.Array:
-        """Action `[..., A]` for an actor observation `[..., n]`.
+    def initial_carry(self, *batch: int) -> jax.Array | None:
+        """The carry `[*batch, m]` at the start of an episode, such as `initial_carry(8)` of eight environments; None
+        for a policy without memory."""
+        return initial_carry(self.params, batch)
+
+    def act(self, carry: Array | None, obs: Array) -> tuple[jax.Array | None, jax.Array]:
+        """The next carry `[..., m]` and the action `[..., A]` for an actor observation `[..., n]`: the compiled
+        `dexsim_ppo.act(self.params, carry, obs)`.
 
         Raises:
-          ConfigError: the policy has a memory, or observes another number of values.
+          ConfigError: the observation has another size, or the carry is not that of this policy and batch.
         """
-        return self.act(None, obs)[1]
-
-    def begin(self, *batch: int) -> jax.Array | None:
-        """What it remembers `[*batch, m]` at the start of an episode; None if it has no memory."""
-        return begin(self.params, batch)
-
-    def act(self, memory: Array | None, obs: Array) -> tuple[jax.Array | None, jax.Array]:
-        """Memory after this observation `[..., n]`, and action `[..., A]`: for policies with or without memory.
-
-        Raises:
-          ConfigError: the memory is not that of this policy and batch, or the policy observes another number of values.
-        """
-        if isinstance(obs, list | tuple):  # To JAX a tree of numbers.
-            obs = np.asarray(obs, np.float32)
-        return _act_from(self.params, memory, obs)
+        return _act(self.params, carry, obs)
 
     def ablate(self, *names: str) -> "Policy":
         """This policy with some observation fields replaced by their mean in training, those of a fixed scale by 0.
@@ -91,53 +119,38 @@ class Policy:
         Raises:
           ConfigError: it observes no such field.
         """
-        fields = sorted(field.name for field in self.observation_layout)
-        if unknown := sorted(set(names) - set(fields)):
-            raise ConfigError(f"the policy does not observe {', '.join(unknown)}; it observes {', '.join(fields)}")
-        kept = np.concatenate([np.full(field.size, field.name not in names) for field in self.observation_layout])
+        known = sorted(entry.name for entry in self.observation_layout)
+        if unknown := sorted(set(names) - set(known)):
+            raise ConfigError(f"the policy does not observe {', '.join(unknown)}; it observes {', '.join(known)}")
+        keep = np.concatenate([np.full(entry.size, entry.name not in names) for entry in self.observation_layout])
+        # Normalised observations have mean 0 and come first: without its weights an input counts as its mean.
         (first, *others), memory = self.params.layers, self.params.memory
-        rows = np.ones(first.kernel.shape[0], bool)
-        rows[: kept.size] = kept
-        if isinstance(memory, History):
-            rows = np.tile(kept, memory.length + 1)
-        elif memory is not None:
-            memory = dataclasses.replace(memory, input=_without(memory.input, kept))
-        layers = (_without(first, rows), *others)
-        return dataclasses.replace(self, params=dataclasses.replace(self.params, layers=layers, memory=memory))
+        first = _without_inputs(first, keep)
+        if memory is not None:
+            memory = dataclasses.replace(memory, input=_without_inputs(memory.input, keep))
+        params = dataclasses.replace(self.params, layers=(first, *others), memory=memory)
+        return dataclasses.replace(self, params=params)
+
+    @property
+    def header(self) -> PolicyHeader:
+        """What its file says beside the numbers."""
+        units = carry_size(self.params.memory)
+        return PolicyHeader(
+            env_config=self.env_config,
+            control_rate=self.control_rate,
+            observation_layout=tuple((entry.name, entry.size, entry.scale) for entry in self.observation_layout),
+            squash=self.params.squash,
+            clip=self.params.normalizer.clip,
+            layers=len(self.params.layers),
+            memory=("gru", units) if units else None,
+            training=self.training,
+            spec=self.spec,
+            hand=self.hand,
+        )
 
     def save(self, path: str | Path) -> None:
         """Write to a file, whole or not at all."""
-        content = {
-            "env_config": self.env_config,
-            "control_rate": self.control_rate,
-            "observation_layout": layout_to_list(self.observation_layout),
-            "squash": self.params.squash,
-            "clip": self.params.normalizer.clip,
-            "layers": len(self.params.layers),
-            "memory": memory_to_list(self.params.memory),
-            "training": self.training,
-            "spec": self.spec and to_dict(self.spec),
-            "hand": self.hand,
-        }
-        checkpoint.save(path, kind="policy", task=self.task, content=content, tree=self.params)
-
-    @classmethod
-    def load(cls, name: str | Path, *, task: str | None = None) -> "Policy":
-        """Read a file, or a shipped policy by its name (`Policy.load("grasp")`).
-
-        Args:
-          name: path of a file, or the name of a shipped policy.
-          task: refuse a policy of another task; None takes any.
-
-        Raises:
-          CheckpointError: there is no such policy; see `dexsim_ppo.checkpoint.load`; or the parts do not fit together.
-        """
-        file = checkpoint.load(_find(name), kind="policy", task=task)
-        try:
-            return cls._from_file(file)
-        except (KeyError, TypeError, ValueError, IndexError, AttributeError, RecursionError, ConfigError) as error:
-            text = " ".join(repr(error).split())
-            raise CheckpointError(f"{file.path}: is not a sound policy ({text:.300})") from None
+        checkpoint.save(path, kind="policy", task=self.task, content=to_dict(self.header), tree=self.params)
 
     def find_hand(self, given: str | Path | None = None) -> "Hand | None":
         """The hand that the policy was trained on, or the file that is `given`; None for the default one.
@@ -157,38 +170,15 @@ class Policy:
 
         Raises:
           ConfigError: its task is not registered.
-          CheckpointError: today's task gives another observation, or the policy's mesh is outside of this folder.
+          CheckpointError: today's task gives another observation.
         """
-        self.check_mesh()
-        return self.build_env(num_envs=num_envs, backend=backend, hand=hand, seed=seed)
-
-    def check_mesh(self) -> None:
-        """Refuse an object mesh that the policy's file names outside of the current folder.
-
-        A policy may come from anywhere; which files of this computer are opened is for its user to say.
-
-        Raises:
-          CheckpointError: the mesh is elsewhere.
-        """
-        objects = self.env_config.get("objects")
-        mesh = str(objects.get("mesh") or "") if isinstance(objects, dict) else ""
-        if mesh and not Path(mesh).expanduser().resolve().is_relative_to(Path.cwd().resolve()):
-            raise CheckpointError(
-                f"the policy's object mesh {mesh[:200]!r} is outside of the current folder: name the file yourself, "
-                "with --set objects.mesh=FILE (evaluate) or --env.objects.mesh FILE (train), or go to its folder"
-            )
-
-    def build_env(self, *, num_envs: int, backend: str, hand: "Hand | None" = None, seed: int = 0) -> "Env":
-        """`make_env` with whatever mesh `env_config` names."""
         from dexsim.registry import find_task, make
 
         config = from_dict(find_task(self.task).config_class, self.env_config)
         hand = self.find_hand() if hand is None else hand
-        env = cast(
-            Any, adapt(make(self.task, config, backend=backend, num_envs=num_envs, hand=hand, seed=seed), self.task)
-        )
+        env = adapt(make(self.task, config, backend=backend, num_envs=num_envs, hand=hand, seed=seed), self.task)
         self.check_env(env)
-        return env
+        return cast(Any, env)
 
     def check_env(self, env: Environment) -> None:
         """Whether an environment is the one that the policy was trained in.
@@ -196,15 +186,16 @@ class Policy:
         Warns (`OtherEnvWarning`) of settings that differ.
 
         Raises:
-          CheckpointError: the environment's observation has other fields than the policy's, or it takes other actions.
+          CheckpointError: the environment's observation has another layout than the policy's, or it takes other
+            actions.
         """
-        given, actions = layout_to_list(env.observation_layout["actor"]), self.params.layers[-1].bias.size
-        if given != layout_to_list(self.observation_layout):
+        given, actions = tuple(env.observation_layout["actor"]), self.params.layers[-1].bias.size
+        if given != self.observation_layout:
             raise CheckpointError(
-                f"the policy observes {layout_to_list(self.observation_layout)}, and {env.name} gives {given}"
+                f"{env.name} observes {layout_text(given)}; the policy expects {layout_text(self.observation_layout)}"
             )
         if actions != env.action_size:
-            raise CheckpointError(f"the policy gives {actions} actions, and {env.name} takes {env.action_size}")
+            raise CheckpointError(f"{env.name} takes {env.action_size} actions; the policy gives {actions}")
         today = from_dict(type(env.config), self.env_config)  # with defaults for fields that are newer
         trained, now = flat(to_dict(today)), flat(to_dict(env.config))
         changed = [
@@ -230,10 +221,10 @@ class Policy:
           state: a `TrainState`; its arrays are copied, so the state may be donated afterwards.
           training: what to remember of its origin.
         """
-        fields = env.observation_layout["actor"]
+        layout = tuple(env.observation_layout["actor"])
         normalizer = make_normalizer(
             state.observation_stats["actor"],
-            fields,
+            layout,
             std_floor=config.observation_std_floor,
             clip=config.observation_clip,
         )
@@ -241,7 +232,7 @@ class Policy:
         return cls(
             task=env.name,
             env_config=to_dict(env.config),
-            observation_layout=tuple(Field(f.name, f.size, f.scale) for f in fields),
+            observation_layout=layout,
             params=jax.tree.map(jnp.copy, params),
             control_rate=1.0 / env.control_period,
             training=training or {},
@@ -249,67 +240,79 @@ class Policy:
             hand=record_of(getattr(env, "hand", None)),
         )
 
-    @classmethod
-    def _from_file(cls, file: checkpoint.Checkpoint) -> "Policy":
-        content = file.content
-        layout, layers, normalizer, memory = read_network(content, file.leaves)
-        params = PolicyParams(layers, normalizer, content["squash"], memory)
-        env_config, hand = migrate_config(content["env_config"], file.path), content.get("hand")
-        if hand is not None:
-            check_record(hand)
-        return cls(
-            task=file.task,
-            env_config=env_config,
-            observation_layout=layout,
-            params=jax.tree.map(jnp.asarray, params),
-            control_rate=content["control_rate"],
-            training=content["training"],
-            spec=_read_spec(file, env_config),
-            hand=hand,
-        )
-
-
-def layout_to_list(fields: Fields) -> list[list[Any]]:
-    """Fields as plain lists, `[name, size, scale]`."""
-    return [[field.name, field.size, field.scale] for field in fields]
-
-
-def _without(layer: Layer, kept: np.ndarray) -> Layer:
-    """A layer that gets 0 for the inputs that are not `kept` [in]."""
-    return dataclasses.replace(layer, kernel=jnp.where(kept[:, None], layer.kernel, 0.0))
-
 
 def load_policy(name: str | Path, *, task: str | None = None) -> Policy:
-    """A policy from a file, or a shipped one by its name; `task` is also any other name of its task, with its module
-    (`my_module:poke`) where that has to be imported. In all else the same as `Policy.load`."""
-    policy = Policy.load(name)
+    """A policy from a file, or a shipped one by its name.
+
+    Args:
+      name: path of a file, or the name of a shipped policy.
+      task: the policy's task, or another name that it is registered under; with its module (`my_module:poke`) where
+        that has to be imported. None takes any.
+
+    Raises:
+      CheckpointError: there is no such policy, it is of another task, or its file is unsound.
+    """
+    file = checkpoint.load(_find(name), kind="policy")
+    try:
+        header = from_dict(PolicyHeader, file.content)
+        params = checkpoint.restore(file, _expected_params(header, file.leaves))
+    except (ConfigError, KeyError, TypeError) as error:
+        raise CheckpointError(f"{file.path}: invalid policy: {error}") from None
+    check_finite(params, file.path)
     if task:
         from dexsim.registry import find_task
 
-        entry, word = find_task(task), task.rpartition(":")[2]
         # One task may be registered under several names; the file has one of them.
-        if policy.task != word and (entry.environment or find_task(policy.task).task is not entry.task):
-            raise CheckpointError(f"{name}: is of the task {policy.task!r}, not {word!r}")
-    return policy
+        entry, word = find_task(task), task.rpartition(":")[2]
+        if file.task != word and (entry.environment or find_task(file.task).task is not entry.task):
+            raise CheckpointError(f"{name}: is of the task {file.task!r}, not {word!r}")
+    return Policy(
+        task=file.task,
+        env_config=header.env_config,
+        observation_layout=header.layout,
+        params=jax.tree.map(jnp.asarray, params),
+        control_rate=header.control_rate,
+        training=header.training,
+        spec=header.spec,
+        hand=header.hand,
+    )
+
+
+def check_finite(params: PolicyParams, where: object) -> None:
+    """Raises CheckpointError: a number of the policy is not finite, or a deviation not positive."""
+    if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(params)) or not (params.normalizer.std > 0).all():
+        raise CheckpointError(f"{where}: holds numbers that are not finite, or deviations that are not positive")
+
+
+def layout_text(layout: Sequence[LayoutEntry]) -> str:
+    """A layout in an error message: names with sizes."""
+    return ", ".join(f"{entry.name} [{entry.size}]" for entry in layout)
+
+
+def _without_inputs(layer: Layer, keep: np.ndarray) -> Layer:
+    """A layer without the weights of those of its first inputs that are not to `keep` [n]."""
+    mask = np.ones(len(layer.kernel), np.float32)
+    mask[: keep.size] = keep
+    return dataclasses.replace(layer, kernel=layer.kernel * mask[:, None])
+
+
+def _expected_params(header: PolicyHeader, leaves: dict[str, Any]) -> PolicyParams:
+    """Shapes of the parameters, from the header and the widths of the layers."""
+    f32: Any = lambda *shape: jax.ShapeDtypeStruct(shape, np.float32)  # noqa: E731
+    size, units = layout_size(header.layout), header.memory[1] if header.memory else 0
+    widths = [size + units, *(leaves[f".layers[{i}].bias"].size for i in range(header.layers))]
+    layers = tuple(Layer(f32(n, m), f32(m)) for n, m in itertools.pairwise(widths))
+    memory = GRU(*(Layer(f32(n, 3 * units), f32(3 * units)) for n in (size, units))) if units else None
+    return PolicyParams(layers, Normalizer(f32(size), f32(size), header.clip), header.squash, memory)
 
 
 def _find(name: str | Path) -> Path:
     """The file of a policy that is named by a path, or by the name of a shipped one."""
-    if not isinstance(name, str | Path):
-        raise CheckpointError(f"{name!r:.80}: give a policy's file, or the name of a shipped one")
     path, text = Path(name), str(name)
-    if (path.exists() and not path.is_dir()) or "/" in text or text.endswith(".msgpack"):
+    if path.is_file() or "/" in text or text.endswith(".msgpack"):
         return path
     try:
         return Path(asset_path(f"policies/{text}.msgpack"))
     except AssetError:
-        if path.is_dir():
-            return path
         shipped = ", ".join(sorted(path.stem for path in Path(asset_path("policies")).glob("*.msgpack")))
         raise CheckpointError(f"{text}: no such file, and no shipped policy has that name: {shipped}") from None
-
-
-def _read_spec(file: checkpoint.Checkpoint, env_config: dict[str, Any]) -> TaskSpec | None:
-    if file.content.get("spec"):
-        return read_spec(file.content["spec"], file.path)
-    return old_spec(file.task, env_config) if file.task in ("grasp", "rotate") else None

@@ -27,7 +27,7 @@ from dexsim.datasets.rerun import check_rerun, show_rerun
 from dexsim.datasets.trajectory import READINGS, Trajectory, from_readings
 from dexsim.env.evaluation import evaluation_of
 from dexsim.registry import find_task
-from dexsim_ppo.acting import act_from
+from dexsim_ppo.acting import act
 from dexsim_ppo.policy import Policy, load_policy
 
 
@@ -40,24 +40,22 @@ def record(policy: Policy, env: Any, *, episodes: int, seconds: float, seed: int
     ticks = max(round(seconds / env.control_period), 1)
 
     def tick(now: Any, _: Any) -> tuple[Any, Any]:
-        state, memory = now
-        memory, action = act_from(policy.params, memory, state.obs["actor"])
+        state, carry = now
+        carry, action = act(policy.params, carry, state.obs["actor"])
         after = jax.vmap(env.step)(state, action)
-        seen = {name: getattr(state.readings, name) for name in READINGS}
-        return (after, memory), (seen, after.joint_target, after.terminated)
+        readings = {name: getattr(state.readings, name) for name in READINGS}
+        return (after, carry), (readings, after.joint_target, after.terminated)
 
     protocol = evaluation_of(env)
     starts = jit(protocol.evaluation_starts, once=True)(protocol.evaluation_plan(episodes, seed))
-    begun = starts, policy.begin(episodes)
-    run = jit(lambda begun: jax.lax.scan(tick, begun, None, length=ticks), backend=env.backend)
-    _, recorded = run(begun)
-    seen, target, ended = jax.device_get(recorded)
-    found = []
+    run = jit(lambda begin: jax.lax.scan(tick, begin, None, length=ticks), backend=env.backend)
+    readings, target, ended = jax.device_get(run((starts, policy.initial_carry(episodes)))[1])
+    trajectories = []
     for i in range(episodes):
         length = int(np.argmax(ended[:, i])) + 1 if ended[:, i].any() else ticks
-        rows = [{name: values[t, i] for name, values in seen.items()} for t in range(length)]
-        found.append(from_readings(np.arange(length) * env.control_period, rows, target[:length, i]))
-    return found
+        rows = [{name: values[t, i] for name, values in readings.items()} for t in range(length)]
+        trajectories.append(from_readings(np.arange(length) * env.control_period, rows, target[:length, i]))
+    return trajectories
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,12 +102,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     if find_task(policy.task).environment:
         raise ConfigError(f"{arguments.policy}: {policy.task!r} is no task on a hand: there is nothing to record")
     env = policy.make_env(num_envs=arguments.episodes)
-    found = record(policy, env, episodes=arguments.episodes, seconds=arguments.seconds, seed=arguments.seed)
+    trajectories = record(policy, env, episodes=arguments.episodes, seconds=arguments.seconds, seed=arguments.seed)
     if arguments.lerobot:
-        write_lerobot(arguments.lerobot, env.hand, policy.task, found)
-        print(f"LeRobot dataset: {arguments.lerobot}, {len(found)} episodes")
+        write_lerobot(arguments.lerobot, env.hand, policy.task, trajectories)
+        print(f"LeRobot dataset: {arguments.lerobot}, {len(trajectories)} episodes")
     if arguments.rrd:
-        first = found[0]
+        first = trajectories[0]
         names = {"joint_position": env.hand.joint_names, "target": env.hand.joint_names}
         series = {
             field.name: (

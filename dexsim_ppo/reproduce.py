@@ -22,9 +22,8 @@ from dexsim.core.config import naming_file
 from dexsim.registry import find_task
 from dexsim_ppo import checkpoint
 from dexsim_ppo.learner.config import PPOConfig
-from dexsim_ppo.learner.ppo import TrainState, experience, make_train
+from dexsim_ppo.learner.ppo import TrainState, collect_rollout, make_train
 from dexsim_ppo.learner.types import Environment
-from dexsim_ppo.retired import migrate_arguments
 from dexsim_ppo.train import make_environment
 from dexsim_ppo.training.arguments import arguments_from_dict, find_hand
 from dexsim_ppo.training.faults import keep
@@ -69,10 +68,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _prepare(file: checkpoint.Checkpoint) -> tuple[Environment, PPOConfig, TrainState, Any, int]:
     """Environment, learner's settings, state, step of one iteration, and how many to replay."""
-    checkpoint.check_content(file, {"arguments": {}, "backend": str, "calls": int})
     entry = find_task(file.task)
     with naming_file(file.path):
-        saved = arguments_from_dict(entry.config_class, migrate_arguments(file.content["arguments"], file.path))
+        saved = arguments_from_dict(entry.config_class, file.content["arguments"])
     config = dataclasses.replace(saved.ppo, iterations_per_call=1)
     if (backend := file.content["backend"]) != "own":
         saved = dataclasses.replace(saved, backend=backend)
@@ -88,7 +86,7 @@ def findings(env: Environment, config: PPOConfig, state: TrainState) -> Iterator
     for path, leaf in jax.tree.leaves_with_path(state):
         if jnp.issubdtype(leaf.dtype, jnp.floating) and (count := int(jnp.sum(~jnp.isfinite(leaf)))):
             yield f"before it: state{jax.tree_util.keystr(path)}, {count} of {leaf.size} numbers"
-    _, rollout, tally = jax.jit(lambda state: experience(env, config, state))(state)
+    _, rollout, metrics = jax.jit(lambda state: collect_rollout(env, config, state))(state)
     for group, fields in env.observation_layout.items():
         bad, start = ~np.isfinite(np.asarray(rollout.obs[group])), 0
         for field in fields:
@@ -100,7 +98,7 @@ def findings(env: Environment, config: PPOConfig, state: TrainState) -> Iterator
                     f"{group} observation {field.name!r}: {len(set(rows.tolist()))} of {bad.shape[1]} environments "
                     f"({some}), first at step {steps.min()}"
                 )
-    if count := int(tally.metrics()["nonfinite_rewards"]):
+    if count := int(metrics["nonfinite_rewards"]):
         yield f"rewards: {count} of {config.steps_per_iteration} (taken as 0)"
     for name in ("value", "next_value"):
         if count := int(jnp.sum(~jnp.isfinite(getattr(rollout, name)))):

@@ -13,6 +13,7 @@ import dataclasses
 import json
 import shlex
 import signal
+import statistics
 import sys
 import threading
 import time
@@ -21,6 +22,10 @@ from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 from dexsim.core import cli
+
+if __name__ == "__main__":
+    cli.announce(cli.LOADING)
+
 from dexsim.core.compilation import make_deterministic
 from dexsim.core.config import from_dict, naming_file
 from dexsim.core.errors import ConfigError, DexsimError
@@ -30,14 +35,12 @@ from dexsim.registry import find_task, task_option
 from dexsim_ppo import checkpoint
 from dexsim_ppo.learner.adapter import adapt
 from dexsim_ppo.learner.config import PPOConfig
-from dexsim_ppo.learner.curriculum import Curriculum
-from dexsim_ppo.learner.devices.sharding import make_mesh
+from dexsim_ppo.learner.curriculum import CurriculumConfig
+from dexsim_ppo.learner.sharding import make_mesh
 from dexsim_ppo.learner.types import Environment
 from dexsim_ppo.policy import Policy, load_policy
-from dexsim_ppo.retired import migrate_arguments
 from dexsim_ppo.training import processes
 from dexsim_ppo.training.arguments import (
-    SAVED,
     TrainArguments,
     arguments_from_dict,
     check_resumed,
@@ -47,14 +50,12 @@ from dexsim_ppo.training.arguments import (
 )
 from dexsim_ppo.training.fine_tune import check_fit, fine_tuning_config
 from dexsim_ppo.training.presets import preset_arguments
-from dexsim_ppo.training.runlog import RunFolder, check_wandb, folder_of, new_folder, taken
-from dexsim_ppo.training.seeds import seed_folder, write_summary
-from dexsim_ppo.training.together import train_together
+from dexsim_ppo.training.runlog import RunFolder, check_wandb, draw_curve, folder_of, new_folder, read_metrics, taken
 from dexsim_ppo.training.trainer import Run
 
 
-class Trained(NamedTuple):
-    """What a finished training leaves."""
+class TrainResult(NamedTuple):
+    """What a finished training run leaves."""
 
     policy: Policy
     """The best policy by its evaluations during training, else the last one."""
@@ -73,7 +74,7 @@ def train_policy(
     policy: str | Path = "",
     resume: str | Path | None = None,
     **options: Any,
-) -> Trained:
+) -> TrainResult:
     """Train a task from Python: what `python -m dexsim_ppo.train` does.
 
     Args:
@@ -92,28 +93,25 @@ def train_policy(
     """
     started = time.perf_counter()
     cli.enable_caches()
-    policy, run_dir = policy or "", options.get("run_dir")
-    if run_dir is not None:
-        options = options | {"run_dir": Path(run_dir)}
-    begun = find_beginning(task, policy, resume)
-    arguments = default_arguments(task, preset, begun)
-    given = {"env": config, "ppo": ppo, "policy": str(policy) or None, "resume": resume and Path(resume)} | options
+    source = find_source(task, str(policy or ""), resume)
+    default = default_arguments(task, preset, source)
+    given = {"env": config, "ppo": ppo, "policy": str(policy or "") or None, "resume": resume and Path(resume)}
     if "steps" in options and "minutes" not in options:
         given["minutes"] = 0.0
+    if "run_dir" in options:
+        options["run_dir"] = options["run_dir"] and Path(options["run_dir"])
+    given |= options
     if unknown := sorted(set(options) - {field.name for field in dataclasses.fields(TrainArguments)}):
         raise ConfigError(f"train_policy has no option {unknown[0]!r}")
-    if isinstance(begun, Policy) and config is None:
-        begun.check_mesh()
-    default = arguments
-    arguments = dataclasses.replace(arguments, **{name: value for name, value in given.items() if value is not None})
-    if isinstance(begun, checkpoint.Checkpoint):
+    arguments = dataclasses.replace(default, **{name: value for name, value in given.items() if value is not None})
+    if isinstance(source, checkpoint.Checkpoint):
         check_resumed(arguments, default)
     if arguments.seeds > 1:
         raise ConfigError(f"train_policy(seeds={arguments.seeds}): trains one seed; call it once for each")
-    run, stopped = run_training(arguments, begun, started, command="train_policy(...)")
-    if stopped:
+    run = make_run(arguments, source, started, "train_policy(...)")
+    if train_run(run, source, "train_policy(...)"):
         raise DexsimError(f"training was stopped; resume it with train_policy(resume={str(run.folder.path)!r})")
-    return Trained(Policy.load(run.selected), json.loads(run.folder.report.read_text()), run.folder.path)
+    return TrainResult(load_policy(run.selected), json.loads(run.folder.report.read_text()), run.folder.path)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -124,11 +122,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     if any(argument.split("=")[0] == "--devices" for argument in argv):
         processes.connect()
     command = shlex.join(["python", "-m", "dexsim_ppo.train", *argv])
-    with processes.leaving_at_once():
-        arguments, begun = parse_arguments(argv)
+    with processes.exit_on_error():
+        arguments, source = parse_arguments(argv)
         with cli.naming_options(TrainArguments, arguments):
-            train = train_seeds if arguments.seeds > 1 else run_training
-            run, stopped = train(arguments, begun, started, command)
+            if arguments.seeds > 1:
+                run, stopped = train_seeds(arguments, source, started, command)
+            else:
+                run = make_run(arguments, source, started, command)
+                stopped = train_run(run, source, command)
     if stopped and processes.is_first():
         print(
             f"stopped by {signal.Signals(stopped).name}; resume with: "
@@ -137,34 +138,31 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 128 + stopped if stopped else 0
 
 
-def run_training(
-    arguments: TrainArguments, begun: checkpoint.Checkpoint | Policy | None, started: float, command: str
-) -> tuple[Run, int]:
-    """Train, then evaluate and report; the run, and the number of the signal that stopped it or 0."""
-    run = make_run(arguments, begun, started, command)
-    return run, train_run(run, begun, command)
-
-
 def make_run(
     arguments: TrainArguments,
-    begun: checkpoint.Checkpoint | Policy | None,
+    source: checkpoint.Checkpoint | Policy | None,
     started: float,
     command: str,
     like: Run | None = None,
 ) -> Run:
     """A run with its folder, ready to train; with the environment and the evaluator of another seed's run `like` it."""
-    resumed, first = begun if isinstance(begun, checkpoint.Checkpoint) else None, processes.is_first()
+    resumed, first = source if isinstance(source, checkpoint.Checkpoint) else None, processes.is_first()
     if first and not resumed and arguments.run_dir and arguments.run_dir.exists():
         raise taken(arguments.run_dir)
     check_wandb(arguments.wandb)
     if arguments.deterministic and not make_deterministic() and first:
         print("--deterministic changes nothing here: without a GPU, trainings repeat to the last bit anyway")
-    mesh, hand = make_mesh(arguments.devices, arguments.ppo), find_hand(arguments, begun)
+    mesh, hand = make_mesh(arguments.devices, arguments.ppo), find_hand(arguments, source)
+    if first and not like:
+        print(f"making the environment of {arguments.task}", flush=True)
     env = like.env if like else make_environment(arguments, hand, mesh.size if mesh else 1)
     if env.backend != "own":  # so that a resumed run has the same engine
         arguments = dataclasses.replace(arguments, backend=cast(Any, env.backend))
-    if isinstance(begun, Policy):
-        check_fit(begun, env, arguments.ppo)
+    if mesh is not None and env.backend == "warp":
+        # XLA's compiler crashes on Warp's calls in a program of several devices (JAX 0.11.2).
+        raise ConfigError(f"TrainArguments.devices = {mesh.size}: Warp runs on one device; choose another --backend")
+    if isinstance(source, Policy):
+        check_fit(source, env, arguments.ppo)
     path = folder_of(resumed.path) if resumed else new_folder(arguments.run_dir, arguments.task) if first else Path()
     folder = RunFolder(processes.agree_on_path(path))
     if first and not resumed:
@@ -185,10 +183,10 @@ def make_environment(arguments: TrainArguments, hand: Hand | None, devices: int)
     return adapt(made, arguments.task)
 
 
-def train_run(run: Run, begun: checkpoint.Checkpoint | Policy | None, command: str) -> int:
+def train_run(run: Run, source: checkpoint.Checkpoint | Policy | None, command: str) -> int:
     """Train, then evaluate and report; the number of the signal that stopped it or 0."""
-    with stop_on_signals() as received, processes.noticing_losses(run.folder.path):
-        run.train(begun, lambda: processes.agree(received()))
+    with stop_on_signals() as received, processes.detect_lost_peer(run.folder.path):
+        run.train(source, lambda: processes.agree(received()))
         stopped = processes.agree(received())
     if processes.is_first() and not stopped:
         run.finish(command)
@@ -196,73 +194,80 @@ def train_run(run: Run, begun: checkpoint.Checkpoint | Policy | None, command: s
 
 
 def train_seeds(
-    arguments: TrainArguments, begun: checkpoint.Checkpoint | Policy | None, started: float, command: str
+    arguments: TrainArguments, source: checkpoint.Checkpoint | Policy | None, started: float, command: str
 ) -> tuple[Run, int]:
-    """Train several seeds, in one program where that is possible, else in turn; then one report. The last run to be
+    """Train several seeds in turn, then write `report.json` of their spread and a curve of all. The last run to be
     trained, and the signal that stopped it or 0."""
     first, runs = processes.is_first(), list[Run]()
     folder = processes.agree_on_path(new_folder(arguments.run_dir, arguments.task) if first else Path())
-    try:
-        for seed in range(arguments.seed, arguments.seed + arguments.seeds):
-            one = dataclasses.replace(arguments, seed=seed, seeds=1, run_dir=seed_folder(folder, seed))
-            runs.append(make_run(one, begun, started, command, runs[0] if runs else None))
-    finally:
-        with contextlib.suppress(OSError):  # Options that were refused leave no empty folder behind.
-            folder.rmdir()
-    if first:
-        chosen = dataclasses.replace(arguments, backend=runs[0].arguments.backend)
-        content = {"command": command, "arguments": printable(chosen)} | cli.environment_report()
-        cli.write_json(RunFolder(folder).config, content)
-    with stop_on_signals() as received:
-        together = train_together(runs, cast(Policy | None, begun), received)
-        stopped = received() if together else 0
-    for run in runs:
-        if together and not stopped:
-            run.finish(command)
-        elif not together:
-            run.started = started
-            stopped, started = train_run(run, begun, command), time.perf_counter()
-        if stopped:
-            return run, stopped
+    for seed in range(arguments.seed, arguments.seed + arguments.seeds):
+        one = dataclasses.replace(arguments, seed=seed, seeds=1, run_dir=folder / f"seed-{seed}")
+        runs.append(make_run(one, source, started, command, runs[0] if runs else None))
+        if stopped := train_run(runs[-1], source, command):
+            return runs[-1], stopped
+        started = time.perf_counter()
     if first:
         reports = {run.arguments.seed: json.loads(run.folder.report.read_text()) for run in runs}
-        print(f"report of {arguments.seeds} seeds: {write_summary(folder, arguments.task, reports, command)}")
+        measures = ("held", "return", "steps_held")
+        cli.write_json(
+            folder / "report.json",
+            {
+                "task": arguments.task,
+                "seeds": list(reports),
+                "trained": {name: spread([r["trained"][name]["value"] for r in reports.values()]) for name in measures},
+                "policies": {seed: f"seed-{seed}/{report['policy']}" for seed, report in reports.items()},
+                "command": command,
+            }
+            | cli.environment_report(),
+        )
+        draw_curve([read_metrics(run.folder.metrics) for run in runs], folder / "curve.png", arguments.task)
+        print(f"report of {arguments.seeds} seeds: {folder / 'report.json'}")
     return runs[-1], 0
+
+
+def spread(values: Sequence[float | None]) -> dict[str, Any]:
+    """Mean, sample standard deviation, extremes and the values themselves, one for each seed; None, as a report has it
+    for a figure that is not finite, counts in the values alone."""
+    known = [value for value in values if value is not None]
+    return {
+        "mean": statistics.fmean(known) if known else None,
+        "std": statistics.stdev(known) if len(known) > 1 else None,
+        "min": min(known, default=None),
+        "max": max(known, default=None),
+        "values": list(values),
+    }
 
 
 # --- options ------------------------------------------------------------------------------------------
 
 
-def find_beginning(
-    task: str | None, policy: str | Path | None, resume: str | Path | None
+def find_source(
+    task: str | None, policy: str | None, resume: str | Path | None
 ) -> checkpoint.Checkpoint | Policy | None:
     """What a run begins from: the checkpoint to resume, the policy to fine-tune, or nothing."""
     if task:
         find_task(task)
-    name = task and task.rpartition(":")[2]
     if resume and policy:
         raise ConfigError("--policy begins a run and --resume resumes one: give one of them")
     if resume:
         path = Path(resume)
         file = path if path.is_file() else RunFolder(path).latest_checkpoint()
-        begun = checkpoint.load(file, kind="train", task=name)
-        checkpoint.check_content(begun, SAVED)
-        return begun
+        return checkpoint.load(file, kind="train", task=task and task.rpartition(":")[2])
     return load_policy(policy, task=task) if policy else None
 
 
-def default_arguments(task: str | None, preset: str, begun: checkpoint.Checkpoint | Policy | None) -> TrainArguments:
+def default_arguments(task: str | None, preset: str, source: checkpoint.Checkpoint | Policy | None) -> TrainArguments:
     """The options' defaults: the preset's, or those of what the run begins from."""
-    name = begun.task if begun else (task or "grasp").rpartition(":")[2]
+    name = source.task if source else (task or "grasp").rpartition(":")[2]
     entry = find_task(name)
-    if isinstance(begun, checkpoint.Checkpoint):
-        with naming_file(begun.path):
-            return arguments_from_dict(entry.config_class, migrate_arguments(begun.content["arguments"], begun.path))
+    if isinstance(source, checkpoint.Checkpoint):
+        with naming_file(source.path):
+            return arguments_from_dict(entry.config_class, source.content["arguments"])
     default = preset_arguments(name, entry.config(), preset)
-    if begun:
-        env = from_dict(entry.config_class, begun.env_config)
-        ppo, hand = fine_tuning_config(begun, default.ppo), begun.hand["file"] if begun.hand else ""
-        default = dataclasses.replace(default, env=env, ppo=ppo, curriculum=Curriculum(), hand=hand)
+    if source:
+        env = from_dict(entry.config_class, source.env_config)
+        ppo, hand = fine_tuning_config(source, default.ppo), source.hand["file"] if source.hand else ""
+        default = dataclasses.replace(default, env=env, ppo=ppo, curriculum=CurriculumConfig(), hand=hand)
     return default
 
 
@@ -275,14 +280,13 @@ def saved_arguments(path: Path, task: str | None) -> TrainArguments:
     file = RunFolder(path).config if path.is_dir() else path
     try:
         saved = json.loads(file.read_text())["arguments"]
-        name = str(saved["task"])
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise ConfigError(f"--config {path}: no configuration of a run ({' '.join(str(error).split()):.200})") from None
+        name = saved["task"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ConfigError(f"--config {path}: no configuration of a run ({error})") from None
     if task and task.rpartition(":")[2] != name:
         raise ConfigError(f"--config {path}: is of the task {name!r}, not {task!r}")
     with naming_file(file):
-        config_class = find_task(task or name.rpartition(":")[2]).config_class
-        return arguments_from_dict(config_class, migrate_arguments(saved, file))
+        return arguments_from_dict(find_task(task or name).config_class, saved)
 
 
 def parse_arguments(argv: list[str]) -> tuple[TrainArguments, checkpoint.Checkpoint | Policy | None]:
@@ -295,36 +299,27 @@ def parse_arguments(argv: list[str]) -> tuple[TrainArguments, checkpoint.Checkpo
     if preset == "auto" and cli.wants_help(argv):  # To ask which device there is takes seconds.
         preset, description = "cpu", f"{description} Defaults that depend on the device are those of --preset cpu."
     if known.config:
-        if known.resume:
-            raise ConfigError("--config begins a run and --resume resumes one: give one of them")
-        if known.preset:
-            raise ConfigError("--config has all options of a run, those of its preset among them: leave --preset out")
+        if known.resume or known.preset:
+            raise ConfigError("--config has all options of a new run: leave --resume and --preset out")
         default = saved_arguments(Path(known.config), known.task)
-        begun = find_beginning(known.task or default.task, known.policy or default.policy, None)
+        source = find_source(known.task or default.task, known.policy or default.policy, None)
         if known.policy and not default.policy:  # the run began from scratch
-            ppo = fine_tuning_config(cast(Policy, begun), default.ppo)
-            default = dataclasses.replace(default, ppo=ppo, curriculum=Curriculum())
+            ppo = fine_tuning_config(cast(Policy, source), default.ppo)
+            default = dataclasses.replace(default, ppo=ppo, curriculum=CurriculumConfig())
     else:
-        begun = find_beginning(known.task, known.policy, known.resume)
-        default = default_arguments(known.task, preset, begun)
+        source = find_source(known.task, known.policy, known.resume)
+        default = default_arguments(known.task, preset, source)
     given = {argument.split("=")[0] for argument in argv}
-    if isinstance(begun, Policy) and not cli.wants_help(argv) and "--env.objects.mesh" not in given:
-        begun.check_mesh()
     if "--steps" in given and "--minutes" not in given:
         default = dataclasses.replace(default, minutes=0.0)
     generic: Any = TrainArguments  # a static checker knows no type that is only found at run time
-    arguments = cli.parse(
-        generic[type(default.env)],
-        argv,
-        default=default,
-        prog="python -m dexsim_ppo.train",
-        description=description,
-    )
+    options = generic[type(default.env)]
+    arguments = cli.parse(options, argv, default=default, prog="python -m dexsim_ppo.train", description=description)
     arguments = dataclasses.replace(arguments, task=default.task)
-    if isinstance(begun, checkpoint.Checkpoint):
-        with cli.naming_options(generic[type(default.env)], default):
+    if isinstance(source, checkpoint.Checkpoint):
+        with cli.naming_options(options, default):
             check_resumed(arguments, default)
-    return arguments, begun
+    return arguments, source
 
 
 @contextlib.contextmanager

@@ -36,8 +36,7 @@ FLOORS = {
     ),
     "dexsim_ppo": (
         ("learner", "portable"),
-        ("retired",),
-        ("acting", "checkpoint", "policy_file", "report"),
+        ("acting", "checkpoint", "report"),
         ("policy",),
         ("evaluate", "export", "record"),
         ("training",),

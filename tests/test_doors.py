@@ -14,7 +14,7 @@ NAMES = {
         render_episode render_frame take_snapshot
     """,
     "dexsim_ppo": """
-        PPOConfig Policy TrainState Trained act average_policies evaluate_policy load_policy make_train train_policy
+        CurriculumConfig PPOConfig Policy TrainResult TrainState act evaluate_policy load_policy make_train train_policy
     """,
     "dexsim_real": """
         Controller HandError HandMeasurement HandPort HandSensing HardwareConfig LinkConfig LogReader LogWriter

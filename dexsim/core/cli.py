@@ -23,6 +23,9 @@ from dexsim.core.install import DISTRIBUTION
 
 T = TypeVar("T")
 
+LOADING = "loading JAX and MuJoCo"
+"""What `announce` says before the imports of a command that takes seconds over them."""
+
 
 class UsageError(ConfigError):
     """An option is unknown, or its value is of the wrong type or out of range."""
@@ -96,6 +99,12 @@ def _option_names(cls: type, default: Any = None, path: str = "--") -> dict[str,
         else:
             names[f"{cls.__name__}.{field.name}"] = option
     return names
+
+
+def announce(text: str) -> None:
+    """Say on standard error what takes seconds, before it is done; not above a help page."""
+    if not wants_help(sys.argv):
+        print(text, file=sys.stderr, flush=True)
 
 
 def wants_help(argv: Sequence[str]) -> bool:

@@ -3,6 +3,7 @@
 The same dataclasses are the command line (tyro), the checkpoint header and the documentation.
 """
 
+import ast
 import contextlib
 import dataclasses
 import functools
@@ -204,7 +205,8 @@ def naming_file(path: object) -> typing.Iterator[None]:
 def override(data: dict[str, Any], settings: Iterable[str]) -> dict[str, Any]:
     """`to_dict`'s output with some fields replaced, each as "object.extremes=1" or "edge=[0.05, 0.06]".
 
-    Values are JSON, and words without quotes. `from_dict` tells whether the fields exist and the values fit.
+    Values are JSON, Python's literals (which have .006 and 5.), and words without quotes. `from_dict` tells whether the
+    fields exist and the values fit.
 
     Raises:
       ConfigError: a setting without a name or a value.
@@ -213,14 +215,18 @@ def override(data: dict[str, Any], settings: Iterable[str]) -> dict[str, Any]:
         path, _, text = entry.partition("=")
         if not (path and text):
             raise ConfigError(f"{entry!r}: expected NAME=VALUE, such as randomization.scale=0.5")
-        try:
-            change = json.loads(text)
-        except ValueError:
-            change = text
+        change: Any = _literal(text)
         for name in reversed(path.split(".")):
             change = {name: change}
         data = _merge(data, change)
     return data
+
+
+def _literal(text: str) -> Any:
+    for parse in (json.loads, ast.literal_eval):
+        with contextlib.suppress(ValueError, SyntaxError):
+            return parse(text)
+    return text
 
 
 def flat(data: Any, path: str = "") -> dict[str, Any]:

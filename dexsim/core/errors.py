@@ -20,10 +20,6 @@ class OtherEnvWarning(DexsimWarning):
     """A policy is used in an environment that it was not trained in."""
 
 
-class OldFileWarning(DexsimWarning):
-    """A file of an older version was read; says which of its fields were renamed or dropped."""
-
-
 class AssetError(DexsimError):
     """A model, layout or mesh file is missing, broken or asks for what the library cannot do."""
 

@@ -4,7 +4,7 @@ import contextlib
 import time
 from collections.abc import Callable, Iterator
 
-_QUIET = 20.0  # s between two lines without a terminal
+_QUIET = 10.0  # s between two lines without a terminal
 
 
 @contextlib.contextmanager

@@ -9,18 +9,17 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from dexsim.core import cli
 from dexsim.core.config import Config, setting
 from dexsim.core.errors import CheckpointError, ConfigError
-from dexsim.hand.load import load_hand
-from dexsim.registry import find_task, make
-from dexsim.view.policies import NONE, PolicyShelf
-from dexsim.view.source import Source
-from dexsim.view.viewer import Viewer
+from dexsim.core.install import require
+
+if TYPE_CHECKING:
+    from dexsim.view.source import Source
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +42,7 @@ class ViewArguments(Config):
     """Port to serve the page at; the next free one if it is taken."""
 
 
-def open_source(arguments: ViewArguments) -> Source:
+def open_source(arguments: ViewArguments) -> "Source":
     """What the arguments ask to be shown.
 
     Raises:
@@ -59,6 +58,9 @@ def open_source(arguments: ViewArguments) -> Source:
         from dexsim.view.emulation import Emulation
 
         return Emulation(name, arguments.seed, arguments.hand)
+    from dexsim.hand.load import load_hand
+    from dexsim.registry import find_task, make
+    from dexsim.view.policies import NONE, PolicyShelf
     from dexsim.view.simulation import Simulation
     from dexsim_ppo.policy import load_policy
 
@@ -89,8 +91,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         prog="python -m dexsim.view",
         description="Show a hand live in the browser.",
     )
+    # First what is quick to find out: JAX takes seconds to import, the simulation up to a minute to compile.
+    require("viser", "view", "the live view")
+    print(f"preparing {arguments.what}: compiling takes up to a minute, the first time", flush=True)
+    from dexsim.view.viewer import Viewer
+
     cli.enable_caches()
-    print(f"preparing {arguments.what}", flush=True)
     viewer = Viewer(open_source(arguments), title=f"dexsim: {arguments.what}", host=arguments.host, port=arguments.port)
     print(f"open {viewer.url} in a browser; Ctrl-C ends", flush=True)
     viewer.run()

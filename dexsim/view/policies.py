@@ -5,7 +5,7 @@ from pathlib import Path
 from dexsim.core.assets import asset_path
 from dexsim.core.errors import CheckpointError
 from dexsim.env.env import Env
-from dexsim_ppo.policy import Policy, layout_to_list, load_policy
+from dexsim_ppo.policy import Policy, load_policy
 
 NONE = "none"
 """The choice of no policy: actions are zero."""
@@ -22,7 +22,7 @@ class PolicyShelf:
     """
 
     def __init__(self, env: Env, first: str, runs: Path = Path("runs")):
-        self._layout = layout_to_list(env.observation_layout["actor"])
+        self._layout = tuple(env.observation_layout["actor"])
         self._runs = runs
         self._kept: dict[str, tuple[float, Policy | None]] = {}
         self._first = first
@@ -49,7 +49,7 @@ class PolicyShelf:
                 policy: Policy | None = load_policy(name)
             except (CheckpointError, OSError):
                 policy = kept[1] if kept else None
-            if policy is not None and layout_to_list(policy.observation_layout) != self._layout:
+            if policy is not None and policy.observation_layout != self._layout:
                 policy = None
             kept = self._kept[name] = time, policy
         return kept[1]

@@ -43,8 +43,8 @@ class Simulation:
         self._reset = jit(env.reset_from, once=True)
         self._step = jit(self._tick, backend=env.backend)
         self._snapshot = jit(functools.partial(take_snapshot, env), backend=env.backend)
-        self._acting: Any = None  # the policy that the memory is of
-        self._memory: Any = None
+        self._acting: Any = None  # the policy that the carry is of
+        self._carry: Any = None
         self._state: State = self._begin({})
 
     def controls(self) -> dict[str, Control]:
@@ -68,10 +68,10 @@ class Simulation:
             return self.reset(values)
         policy = self.policies.get(values["policy"])
         if policy is not self._acting:  # another one, or another episode
-            self._acting, self._memory = policy, policy and policy.begin()
+            self._acting, self._carry = policy, policy and policy.initial_carry()
         action = jnp.zeros(self.env.action_size)
         if policy is not None:
-            self._memory, action = policy.act(self._memory, self._state.obs["actor"])
+            self._carry, action = policy.act(self._carry, self._state.obs["actor"])
         push = np.zeros(3, np.float32)
         if values["push"]:
             push = self._random.normal(size=3).astype(np.float32)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from dexsim.core.errors import DexsimError
-from dexsim.core.install import install_line
+from dexsim.core.install import require
 from dexsim.render.panel import FELT, Layout, draw_panel, make_layout, read_outs
 from dexsim.view.scene import Scene
 from dexsim.view.source import Choice, Control, Frame, Slider, Source
@@ -35,10 +35,9 @@ class Viewer:
     """
 
     def __init__(self, source: Source, *, title: str, host: str = "127.0.0.1", port: int = 8080):
-        try:
-            import viser
-        except ImportError:
-            raise DexsimError(f"the live view needs viser: {install_line('view')}") from None
+        require("viser", "view", "the live view")
+        import viser
+
         self.source, hand = source, source.hand
         port = free_port(host, port)
         with contextlib.redirect_stdout(io.StringIO()):  # Its box names the address in its own words.

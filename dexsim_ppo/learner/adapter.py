@@ -1,6 +1,6 @@
 """Environments from elsewhere in the learner's terms: five members are enough.
 
-    training = make_train(adapt(my_env, "mine"), PPOConfig())
+    training = make_train(my_env, PPOConfig())
 
 `python -m dexsim_ppo.train --task my_module:make_env` does the same with what `make_env()` returns.
 """
@@ -13,16 +13,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dexsim.core.compilation import check_float32
 from dexsim.core.config import NoSettings
 from dexsim.core.errors import ConfigError
+from dexsim.core.layout import LayoutEntry
 from dexsim.core.pytree import choose, pytree_dataclass
-from dexsim_ppo.learner.types import Environment, Field
+from dexsim_ppo.learner.types import Environment
 
 CONTROL_PERIOD = 0.05
 """Length of a step, s, where an environment does not say; only reports and policies speak of it."""
-LONGEST = 1_000_000
-"""Largest time limit, steps: an evaluation runs episodes to their end, and keeps the metrics of every step."""
+MEMBERS = ("observation_size", "action_size", "max_steps", "reset", "step")
 
 
 class SimpleEnvironment(Protocol):
@@ -75,15 +74,12 @@ class Adapted:
 
     def __init__(self, env: SimpleEnvironment, name: str):
         self.name, self._env = name, env
-        observation_size, self.action_size, self.evaluation_steps = self._sizes()
-        self._check(observation_size, self.action_size)
-        period = getattr(env, "control_period", CONTROL_PERIOD)
-        if not isinstance(period, int | float) or not 1e-3 <= period <= 1.0:
-            raise self._error(f"control_period = {period!r} s: must be a number between 0.001 and 1")
-        self.control_period = float(period)
+        self._check()
+        self.action_size, self.evaluation_steps = int(env.action_size), int(env.max_steps)
+        self.control_period = float(getattr(env, "control_period", CONTROL_PERIOD))
         # One vector for both networks, scaled by its running statistics.
-        fields = (Field("observation", observation_size, None),)
-        self.observation_layout: Mapping[str, Any] = {"actor": fields, "critic": fields}
+        layout = (LayoutEntry("observation", int(env.observation_size)),)
+        self.observation_layout: Mapping[str, Any] = {"actor": layout, "critic": layout}
 
     def reset(self, key: jax.Array) -> AdaptedState:
         """A new episode."""
@@ -91,7 +87,7 @@ class Adapted:
         observation, inner = self._env.reset(begin)
         zero, no = jnp.float32(0), jnp.bool_(False)
         return AdaptedState(
-            inner, self._seen(observation), zero, no, no, self._metrics(inner, zero, zero), jnp.int32(0), key
+            inner, self._observe(observation), zero, no, no, self._metrics(inner, zero, zero), jnp.int32(0), key
         )
 
     def step(self, state: AdaptedState, action: jax.Array) -> AdaptedState:
@@ -103,7 +99,7 @@ class Adapted:
         terminated = jnp.asarray(terminated, bool)
         truncated = (clock >= self.evaluation_steps) & ~terminated
         metrics = self._metrics(inner, total, length)
-        return AdaptedState(inner, self._seen(observation), reward, terminated, truncated, metrics, clock, key)
+        return AdaptedState(inner, self._observe(observation), reward, terminated, truncated, metrics, clock, key)
 
     def restart(self, state: AdaptedState, done: jax.Array) -> AdaptedState:
         """A new episode if `done` [], else the same state; the random keys advance either way."""
@@ -133,7 +129,7 @@ class Adapted:
         del state
         return {}
 
-    def _seen(self, observation: jax.Array) -> dict[str, jax.Array]:
+    def _observe(self, observation: jax.Array) -> dict[str, jax.Array]:
         observation = jnp.asarray(observation, jnp.float32)
         return {"actor": observation, "critic": observation}
 
@@ -144,83 +140,42 @@ class Adapted:
             "length": length,
         }
 
-    def _error(self, text: str) -> ConfigError:
-        return ConfigError(f"environment {self.name!r}: {text}")
-
-    def _sizes(self) -> list[int]:
-        """Sizes of observation and action, and the time limit. Raises ConfigError: a member is missing or no size."""
-        wanted, sizes = ("observation_size", "action_size", "max_steps", "reset", "step"), list[int]()
-        if missing := [name for name in wanted if not hasattr(self._env, name)]:
-            raise self._error(f"a {type(self._env).__name__} has no {', '.join(missing)}")
-        for name in wanted[:3]:
-            value = getattr(self._env, name)
-            if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
-                raise self._error(f"{name} = {value!r}: must be a whole number of at least 1")
-            sizes.append(int(value))
-        if sizes[2] > LONGEST:
-            raise self._error(f"max_steps = {sizes[2]}: must be at most {LONGEST}, for an evaluation runs that many")
-        return sizes
-
-    def _check(self, observation_size: int, action_size: int) -> None:
-        """Raises ConfigError: a member gives something of another shape or type."""
-        env, key = self._env, jax.random.key(0)
-        begun = self._shapes("reset(key)", 2, env.reset, key)
-        action = jax.ShapeDtypeStruct((action_size,), jnp.float32)
-        after = self._shapes("step(key, state, action)", 4, env.step, key, begun[1], action)
-        for call, found in (("reset", begun[0]), ("step", after[0])):
-            self._check_array(f"{call}: the observation", found, (observation_size,))
-        self._check_array("step: the reward", after[2], ())
-        self._check_array("step: what says whether it terminated", after[3], ())
-        if np.dtype(after[3].dtype) != np.dtype(bool):
-            raise self._error(f"step: what says whether it terminated is {after[3].dtype}, not bool")
-        if hasattr(env, "metrics"):
-            (own,) = self._shapes("metrics(state)", 1, lambda state: (env.metrics(state),), begun[1])
-            if not isinstance(own, dict):
-                raise self._error(f"metrics(state) gives {type(own).__name__} where a dict is wanted")
-            for name, value in own.items():
-                if not isinstance(name, str) or name in ("return", "length"):
-                    raise self._error(
-                        f"metrics: {name!r} must be a word other than 'return' and 'length', the learner's"
-                    )
-                self._check_array(f"metrics: {name!r}", value, ())
+    def _check(self) -> None:
+        """Raises ConfigError: a member is missing, or gives another shape or type than `SimpleEnvironment` says."""
+        env, where = self._env, f"environment {self.name!r}"
+        if missing := [name for name in MEMBERS if not hasattr(env, name)]:
+            raise ConfigError(f"{where}: a {type(env).__name__} has no {', '.join(missing)}")
+        for name in MEMBERS[:3]:
+            if not isinstance(value := getattr(env, name), int | np.integer) or value < 1:
+                raise ConfigError(f"{where}: expected {name} to be a whole number of at least 1, got {value!r}")
+        key, action = jax.random.key(0), jax.ShapeDtypeStruct((int(env.action_size),), jnp.float32)
+        first, state = jax.eval_shape(env.reset, key)
+        second, after, reward, terminated = jax.eval_shape(env.step, key, state, action)
+        expected = (int(env.observation_size),)
+        for what, shape, got in (
+            ("reset: the observation", expected, first),
+            ("step: the observation", expected, second),
+            ("step: the reward", (), reward),
+            ("step: terminated", (), terminated),
+        ):
+            if got.shape != shape:
+                raise ConfigError(f"{where}: {what} must have the shape {shape}, got {got.shape}")
+        if terminated.dtype != bool:
+            raise ConfigError(f"{where}: step: terminated must be bool, got {terminated.dtype}")
         # The state is carried through a compiled loop: it must stay what it is.
-        old, new = (jax.tree_util.tree_flatten_with_path(state)[0] for state in (begun[1], after[1]))
-        structures: list[Any] = [jax.tree.structure(state) for state in (begun[1], after[1])]
-        if structures[0] != structures[1]:
-            raise self._error("step gives a state of another structure than reset")
-        for (path, one), (_, other) in zip(old, new, strict=True):
-            if (one.shape, one.dtype) != (other.shape, other.dtype):
-                where = jax.tree_util.keystr(path) or "the state"
-                raise self._error(f"{where} is {_type(one)} after reset and {_type(other)} after step")
-
-    def _shapes(self, call: str, count: int, function: Any, *arguments: Any) -> tuple[Any, ...]:
-        try:
-            found = jax.eval_shape(function, *arguments)
-        except Exception as error:  # whatever the environment raises
-            text = " ".join(str(error).split())
-            raise self._error(f"{call} fails: {type(error).__name__}: {text:.200}") from error
-        if not isinstance(found, tuple) or len(found) != count:
-            raise self._error(f"{call} gives {type(found).__name__} where a tuple of {count} is wanted")
-        return found
-
-    def _check_array(self, what: str, found: Any, shape: tuple[int, ...]) -> None:
-        if getattr(found, "shape", None) != shape:
-            raise self._error(f"{what} has the shape {getattr(found, 'shape', None)}, not {shape}")
+        forms = [jax.tree.map(lambda x: f"{x.dtype}{list(x.shape)}", tree) for tree in (state, after)]
+        if forms[0] != forms[1]:
+            raise ConfigError(f"{where}: step must return a state of the form of reset's, {forms[0]}, got {forms[1]}")
 
 
-def _type(array: Any) -> str:
-    return f"{array.dtype}{list(array.shape)}"
-
-
-def adapt(env: Any, name: str) -> Environment:
-    """An environment that the learner can train: `env` itself if it has all that is needed, else round it.
+def adapt(env: Any, name: str = "") -> Environment:
+    """An environment that the learner can train: `env` itself if it is an `Environment`, else a wrapper around it.
 
     Args:
       env: an `Environment`, or an object with the members of `SimpleEnvironment`.
-      name: of the task, for reports and policies.
+      name: of the task, for reports and policies; that of the environment's class by default.
 
     Raises:
-      ConfigError: a member is missing, or gives something of another shape or type; or JAX is set to float64.
+      ConfigError: a member is missing, or gives something of another shape or type.
     """
-    check_float32()
-    return env if hasattr(env, "observation_layout") else Adapted(env, name)
+    return env if hasattr(env, "observation_layout") else Adapted(env, name or type(env).__name__)

@@ -63,10 +63,8 @@ class PPOConfig:
     """Hidden layer sizes of the actor."""
     critic_layers: tuple[int, ...] = setting((512, 256, 128), unit="1", low=1)
     """Hidden layer sizes of the critic."""
-    memory: Literal["none", "history", "gru"] = setting("none")
-    """What the policy keeps of an episode: nothing, its last observations, or the state of a gated recurrent unit."""
-    memory_length: int = setting(4, unit="observations", low=2, high=64)
-    """Observations that a policy with `history` sees, the present one among them."""
+    memory: Literal["none", "gru"] = setting("none")
+    """What the policy keeps of an episode: nothing, or the state of a gated recurrent unit."""
     memory_size: int = setting(64, unit="1", low=1, high=4096)
     """Units of `gru`. Its gradient goes back to the start of the rollout."""
     normalize_value: bool = True

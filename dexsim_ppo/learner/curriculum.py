@@ -10,7 +10,7 @@ from dexsim.core.errors import ConfigError
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Curriculum:
+class CurriculumConfig:
     """How the scale of the randomisation ranges follows the success rate. The scale is part of the training state."""
 
     on: bool = setting(False)
@@ -31,11 +31,12 @@ class Curriculum:
         validate(self)
         if self.narrow_below > self.widen_above:
             raise ConfigError(
-                f"Curriculum.narrow_below = {self.narrow_below:g}: must not exceed widen_above = {self.widen_above:g}"
+                f"CurriculumConfig.narrow_below = {self.narrow_below:g}: must not exceed "
+                f"CurriculumConfig.widen_above = {self.widen_above:g}"
             )
 
 
-def next_scale(scale: jax.Array, success: jax.Array, curriculum: Curriculum) -> jax.Array:
+def next_scale(scale: jax.Array, success: jax.Array, curriculum: CurriculumConfig) -> jax.Array:
     """The next scale [] in [0, 1], from the current scale [] and the success [].
 
     A NaN success (no episode has ended) leaves the scale unchanged.

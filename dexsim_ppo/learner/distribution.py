@@ -10,7 +10,16 @@ import math
 import jax
 import jax.numpy as jnp
 
-from dexsim.core.pytree import align
+from dexsim.core.pytree import align, pytree_dataclass
+
+
+@pytree_dataclass
+class Decision:
+    """A drawn action and the distribution that it is from; arrays [B, ...]."""
+
+    action: jax.Array  # [B, A] Gaussian sample before any squashing
+    mean: jax.Array  # [B, A]
+    log_prob: jax.Array  # [B]
 
 
 def sample(noise: jax.Array, mean: jax.Array, log_std: jax.Array) -> jax.Array:

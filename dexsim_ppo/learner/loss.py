@@ -8,9 +8,9 @@ import jax.numpy as jnp
 from dexsim.core.pytree import align, pytree_dataclass
 from dexsim_ppo.learner import distribution
 from dexsim_ppo.learner.config import PPOConfig
-from dexsim_ppo.learner.memory import recall, remember
+from dexsim_ppo.learner.distribution import Decision
+from dexsim_ppo.learner.memory import scan_memory, step_memory
 from dexsim_ppo.learner.networks import Params, apply_mlp
-from dexsim_ppo.learner.rollout import Decision
 from dexsim_ppo.learner.running_stats import Normalizer, normalize
 
 Metrics = dict[str, jax.Array]
@@ -28,7 +28,7 @@ class Samples:
     advantage: jax.Array
     value: jax.Array  # normalised
     target: jax.Array  # normalised
-    memory: jax.Array | None = None  # state of the actor's memory before the step
+    carry: jax.Array | None = None  # of the actor's memory before the step
     first: jax.Array | None = None  # whether the step is the first of an episode, with a GRU
 
 
@@ -37,13 +37,13 @@ def actor_mean(
     params: Params,
     normalizers: dict[str, Normalizer],
     obs: dict[str, jax.Array],
-    memory: jax.Array | None = None,
+    carry: jax.Array | None = None,
     first: jax.Array | None = None,
 ) -> jax.Array:
-    """Mean of the Gaussian, `[..., A]`; `memory` and `first` as in `Samples`."""
+    """Mean of the Gaussian, `[..., A]`; `carry` and `first` as in `Samples`."""
     x = normalize(normalizers["actor"], obs["actor"])
-    seen = recall(params.memory, memory, x, first, config.matmul_precision)
-    return apply_mlp(params.actor, seen, config.matmul_precision)
+    features = scan_memory(params.memory, carry, x, first, config.matmul_precision)
+    return apply_mlp(params.actor, features, config.matmul_precision)
 
 
 def actor_step(
@@ -51,12 +51,12 @@ def actor_step(
     params: Params,
     normalizers: dict[str, Normalizer],
     obs: Mapping[str, jax.Array],
-    memory: jax.Array | None,
+    carry: jax.Array | None,
 ) -> tuple[jax.Array | None, jax.Array]:
-    """The memory after an observation, and the mean of the Gaussian `[..., A]`."""
+    """The carry after an observation, and the mean of the Gaussian `[..., A]`."""
     x = normalize(normalizers["actor"], obs["actor"])
-    memory, seen = remember(params.memory, memory, x, config.matmul_precision)
-    return memory, apply_mlp(params.actor, seen, config.matmul_precision)
+    carry, features = step_memory(params.memory, carry, x, config.matmul_precision)
+    return carry, apply_mlp(params.actor, features, config.matmul_precision)
 
 
 def critic_value(
@@ -64,11 +64,11 @@ def critic_value(
     params: Params,
     normalizers: dict[str, Normalizer],
     obs: dict[str, jax.Array],
-    memory: jax.Array | None = None,
+    carry: jax.Array | None = None,
 ) -> jax.Array:
-    """Normalised value, `[...]`. The critic also sees what the actor remembered before this observation."""
+    """Normalised value, `[...]`. The critic also sees the actor's carry before this observation."""
     x = normalize(normalizers["critic"], obs["critic"])
-    x = x if memory is None else jnp.concatenate([x, memory], -1)
+    x = x if carry is None else jnp.concatenate([x, carry], -1)
     return apply_mlp(params.critic, x, config.matmul_precision)[..., 0]
 
 
@@ -76,14 +76,15 @@ def loss(
     params: Params, config: PPOConfig, normalizers: dict[str, Normalizer], batch: Samples, old_log_std: jax.Array
 ) -> tuple[jax.Array, Metrics]:
     """The objective [] and its metrics over one minibatch."""
-    mean = actor_mean(config, params, normalizers, batch.obs, batch.memory, batch.first)
+    # Clipped surrogate (Schulman et al. 2017, equation 7): no gradient where the ratio has left the clip the good way.
+    mean = actor_mean(config, params, normalizers, batch.obs, batch.carry, batch.first)
     ratio = jnp.exp(distribution.log_prob(batch.decision.action, mean, params.log_std) - batch.decision.log_prob)
     clipped = jnp.clip(ratio, 1 - config.clip_ratio, 1 + config.clip_ratio)
     policy_loss = -jnp.mean(jnp.minimum(ratio * batch.advantage, clipped * batch.advantage))
 
-    value = critic_value(config, params, normalizers, batch.obs, batch.memory)
+    value = critic_value(config, params, normalizers, batch.obs, batch.carry)
     errors = (value - batch.target) ** 2
-    if config.value_clip > 0:
+    if config.value_clip > 0:  # the worse of the clipped and the plain error, as in the authors' code
         near = batch.value + jnp.clip(value - batch.value, -config.value_clip, config.value_clip)
         errors = jnp.maximum(errors, (near - batch.target) ** 2)
     value_loss = 0.5 * jnp.mean(errors)

@@ -31,7 +31,7 @@ class Params:
     actor: MLP
     log_std: jax.Array  # [A], of the Gaussian before any squashing
     critic: MLP
-    memory: Any = None  # `learner.memory.Memory` of the actor
+    memory: Any = None  # `learner.memory.GRU` of the actor, or None
 
 
 def init_mlp(key: jax.Array, sizes: tuple[int, ...], output_gain: float) -> MLP:
@@ -76,7 +76,7 @@ def init_params(
     Args:
       actor_sizes: observation size, hidden sizes, action size.
       critic_sizes: observation size, hidden sizes, 1.
-      memory: `learner.memory.Memory` of the actor; its state's size is part of both observation sizes.
+      memory: `learner.memory.GRU` of the actor, or None; the carry's size is part of both observation sizes.
     """
     actor_key, critic_key = jax.random.split(key)
     return Params(

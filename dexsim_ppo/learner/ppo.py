@@ -4,8 +4,6 @@
 `step(state) -> (state, metrics)`. One step collects [T, B] experience, estimates advantages, and makes
 `epochs` passes over it in `minibatches` parts. `TrainState` holds everything that training depends on:
 saving and loading that one pytree resumes training exactly.
-
-The parts that follow are those of an iteration: `experience`, then `learn`. `apart` runs them as programs of their own.
 """
 
 import dataclasses
@@ -18,34 +16,24 @@ from jax.sharding import Mesh
 
 from dexsim.core.compilation import check_float32, jit
 from dexsim.core.errors import ConfigError
-from dexsim_ppo.learner import distribution
+from dexsim_ppo.learner.adapter import adapt
 from dexsim_ppo.learner.config import PPOConfig
-from dexsim_ppo.learner.curriculum import Curriculum, next_scale
-from dexsim_ppo.learner.devices.apart import ENGINES, ApartStep, start_apart
-from dexsim_ppo.learner.devices.sharding import (
-    Part,
+from dexsim_ppo.learner.curriculum import CurriculumConfig, next_scale
+from dexsim_ppo.learner.gae import compute_gae
+from dexsim_ppo.learner.loss import Metrics, Samples
+from dexsim_ppo.learner.networks import Params, rescale_output
+from dexsim_ppo.learner.rollout import Rollout, bound_rewards, collect_rollout
+from dexsim_ppo.learner.running_stats import RunningStats, make_normalizers, merge_moments, value_std
+from dexsim_ppo.learner.sharding import (
     block_count,
     copied,
     in_blocks,
+    init_on_mesh,
     moments,
-    of_part,
     sequences_in_blocks,
     shardings,
-    start_on,
-    whole_shape,
 )
-from dexsim_ppo.learner.gae import compute_gae
-from dexsim_ppo.learner.loss import Metrics, Samples, actor_step, critic_value
-from dexsim_ppo.learner.networks import Params, rescale_output
-from dexsim_ppo.learner.rollout import Decision, Rollout, Tally, bound_rewards, collect
-from dexsim_ppo.learner.running_stats import (
-    Normalizer,
-    RunningStats,
-    make_normalizer,
-    merge_moments,
-    value_std,
-)
-from dexsim_ppo.learner.state import TrainState, init_environments, init_learner, init_state
+from dexsim_ppo.learner.state import TrainState, init_state
 from dexsim_ppo.learner.types import CurriculumEnvironment, Environment
 from dexsim_ppo.learner.update import Learner, update
 
@@ -56,21 +44,24 @@ class Training(NamedTuple):
     init: Callable[[jax.Array], TrainState]
     shapes: Callable[[jax.Array], TrainState]
     """Shapes, types and, on several devices, shardings of what `init` returns, without computing it."""
-    plain_step: Callable[[TrainState], tuple[TrainState, Metrics]]
-    """`step` before compilation."""
     step: Callable[[TrainState], tuple[TrainState, Metrics]]
     """Donates its argument: do not use that state again. Metrics are [iterations_per_call]."""
 
 
 def make_train(
-    env: Environment, config: PPOConfig, curriculum: Curriculum | None = None, mesh: Mesh | None = None
+    env: Any, config: PPOConfig, curriculum: CurriculumConfig | None = None, mesh: Mesh | None = None
 ) -> Training:
-    """Compiled `init` and `step` for this environment; with a mesh, over its devices (`learner.devices.sharding`).
+    """Compiled `init` and `step`.
+
+    Args:
+      env: an `Environment`, or any object with the members of `adapter.SimpleEnvironment`.
+      mesh: devices to spread the environments over (`learner.devices.sharding`); None for one.
 
     Raises:
-      ConfigError: JAX is set to float64.
+      ConfigError: JAX is set to float64, or the environment lacks something.
     """
     check_float32()
+    env = adapt(env)
     if curriculum is not None and not curriculum.on:
         curriculum = None
 
@@ -90,38 +81,20 @@ def make_train(
         return state, copied(metrics, mesh)
 
     def shapes(key: jax.Array) -> TrainState:
-        found = jax.eval_shape(init, key)
+        state = jax.eval_shape(init, key)
         if mesh is None:
-            return found
+            return state
         return jax.tree.map(
-            lambda x, where: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=where), found, shardings(found, mesh)
+            lambda x, where: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=where), state, shardings(state, mesh)
         )
 
-    compiled_step: Callable = jit(step, backend=env.backend, donate_argnums=0)
-    if mesh is None:
-        compiled_init = jit(init, once=True)
-    elif env.backend in ENGINES:
-        compiled_init = start_apart(
-            mesh,
-            lambda key: strong_types(init_learner(env, config, key, curriculum)),
-            lambda key, part: strong_types(init_environments(env, config, key, curriculum, part=part)),
-        )
-        compiled_step = ApartStep(
-            lambda state, part: strong_types(experience(env, config, state, part=part)),
-            lambda state, rollout, tally: strong_types(learn(env, config, state, rollout, tally, curriculum, mesh)),
-            mesh,
-            config.iterations_per_call,
-            env.backend,
-        )
-    else:
-        compiled_init = start_on(mesh, init, shapes)
+    compiled_init = jit(init, once=True) if mesh is None else init_on_mesh(mesh, init, shapes)
     # Leaves may share a buffer (actor and critic may observe the same array), and no buffer can be donated
     # twice: copies separate them.
     return Training(
         init=lambda key: jax.tree.map(jnp.copy, compiled_init(key)),
         shapes=shapes,
-        plain_step=step,
-        step=compiled_step,
+        step=cast(Callable, jit(step, backend=env.backend, donate_argnums=0)),
     )
 
 
@@ -129,57 +102,34 @@ def train_iteration(
     env: Environment,
     config: PPOConfig,
     state: TrainState,
-    curriculum: Curriculum | None = None,
+    curriculum: CurriculumConfig | None = None,
     mesh: Mesh | None = None,
 ) -> tuple[TrainState, Metrics]:
     """Collect, estimate advantages, update; with a curriculum, widen or narrow the ranges."""
-    (env_state, memory), rollout, tally = experience(env, config, state, mesh)
-    state = dataclasses.replace(state, env_state=env_state, memory=memory)
-    return learn(env, config, state, rollout, tally, curriculum, mesh)
-
-
-def experience(
-    env: Environment, config: PPOConfig, state: TrainState, mesh: Mesh | None = None, part: Part | None = None
-) -> tuple[tuple[Any, jax.Array | None], Rollout, Tally]:
-    """What an iteration collects; `state` may hold a part of the environments."""
-    normalizers = make_normalizers(env, config, state.observation_stats)
-    return collect_rollout(env, config, state, normalizers, jax.random.split(state.key, 3)[1], mesh, part)
-
-
-def learn(
-    env: Environment,
-    config: PPOConfig,
-    state: TrainState,
-    rollout: Rollout,
-    tally: Tally,
-    curriculum: Curriculum | None = None,
-    mesh: Mesh | None = None,
-) -> tuple[TrainState, Metrics]:
-    """The state after an iteration with this experience, and its metrics."""
     key, _, update_key = jax.random.split(state.key, 3)
+    (env_state, carry), rollout, metrics = collect_rollout(env, config, state, mesh)
     # Those of the collection, so that the first minibatch's probability ratio is exactly one.
-    normalizers, metrics = make_normalizers(env, config, state.observation_stats), tally.metrics()
+    normalizers = make_normalizers(env, config, state.observation_stats)
     if config.normalize_value:
         rollout, bounded = bound_rewards(rollout, state.value_stats, config.reward_scale)
         metrics |= {"bounded_rewards": bounded}
-    ready = prepare(config, state.value_stats, state.observation_stats, state.params, rollout, mesh)
+    batch = prepare(config, state.value_stats, state.observation_stats, state.params, rollout, mesh)
     learner, update_metrics = update(
         config,
         normalizers,
-        ready.samples,
+        batch.samples,
         update_key,
-        Learner(ready.params, state.adam, state.learning_rate, state.skipped_updates),
+        Learner(batch.params, state.adam, state.learning_rate, state.skipped_updates),
         mesh,
     )
     metrics |= update_metrics | {
-        "explained_variance": ready.explained_variance,
+        "explained_variance": batch.explained_variance,
         "action_std": jnp.mean(jnp.exp(learner.params.log_std)),
         "learning_rate": learner.learning_rate,
         "skipped_updates": learner.skipped_updates,
     }
-    scale, env_state = state.scale, state.env_state
-    if curriculum is not None:
-        assert scale is not None, "the state of a training with a curriculum"
+    scale = state.scale
+    if curriculum is not None and scale is not None:
         scale, success = update_scale(curriculum, scale, metrics)
         metrics |= {"curriculum/scale": scale, "curriculum/success": success}
         env_state = jax.vmap(cast(CurriculumEnvironment, env).set_randomization_scale, (0, None))(env_state, scale)
@@ -187,18 +137,18 @@ def learn(
         params=learner.params,
         adam=learner.adam,
         learning_rate=learner.learning_rate,
-        observation_stats=ready.observation_stats,
-        value_stats=ready.value_stats,
+        observation_stats=batch.observation_stats,
+        value_stats=batch.value_stats,
         env_state=env_state,
         key=key,
         iteration=state.iteration + 1,
         skipped_updates=learner.skipped_updates,
         scale=scale,
-        memory=state.memory,
+        carry=carry,
     ), metrics
 
 
-def update_scale(curriculum: Curriculum, scale: jax.Array, metrics: Metrics) -> tuple[jax.Array, jax.Array]:
+def update_scale(curriculum: CurriculumConfig, scale: jax.Array, metrics: Metrics) -> tuple[jax.Array, jax.Array]:
     """The next scale [] of the curriculum, and the success [] of this iteration.
 
     Raises:
@@ -209,53 +159,14 @@ def update_scale(curriculum: Curriculum, scale: jax.Array, metrics: Metrics) -> 
     elif curriculum.metric in metrics:
         success = metrics[curriculum.metric]
     else:
-        raise ConfigError(f"Curriculum.metric = {curriculum.metric!r}: choose from {', '.join(sorted(metrics))}")
+        raise ConfigError(f"CurriculumConfig.metric = {curriculum.metric!r}: choose from {', '.join(sorted(metrics))}")
     return next_scale(scale, success, curriculum), success
-
-
-# --- collect ------------------------------------------------------------------------------------------
-
-
-def make_normalizers(env: Environment, config: PPOConfig, stats: dict[str, RunningStats]) -> dict[str, Normalizer]:
-    """One observation normaliser per group."""
-    return {
-        group: make_normalizer(
-            stats[group], fields, std_floor=config.observation_std_floor, clip=config.observation_clip
-        )
-        for group, fields in env.observation_layout.items()
-    }
-
-
-def collect_rollout(
-    env: Environment,
-    config: PPOConfig,
-    state: TrainState,
-    normalizers: dict[str, Normalizer],
-    key: jax.Array,
-    mesh: Mesh | None = None,
-    part: Part | None = None,
-) -> tuple[tuple[Any, jax.Array | None], Rollout, Tally]:
-    """States and memory afterwards, experience [T, B, ...] under the current policy, and what metrics follow from;
-    values are in reward units."""
-    params, std = state.params, value_std(state.value_stats)
-
-    def act(key, obs, memory):
-        memory, mean = actor_step(config, params, normalizers, obs, memory)
-        noise = of_part(jax.random.normal(key, whole_shape(mean.shape, part)), part)
-        action = distribution.sample(noise, mean, params.log_std)
-        decision = Decision(action, mean, distribution.log_prob(action, mean, params.log_std))
-        return decision, distribution.squash(action, config.distribution), memory
-
-    def value(obs, memory):
-        return state.value_stats.mean + std * critic_value(config, params, normalizers, obs, memory)
-
-    return collect(env, state.env_state, key, act, value, config.rollout_length, mesh, state.memory)
 
 
 # --- advantages ---------------------------------------------------------------------------------------
 
 
-class Ready(NamedTuple):
+class TrainingBatch(NamedTuple):
     """What is learnt from, and the statistics that include it."""
 
     samples: Samples
@@ -272,7 +183,7 @@ def prepare(
     params: Params,
     rollout: Rollout,
     mesh: Mesh | None = None,
-) -> Ready:
+) -> TrainingBatch:
     """Advantages and normalised value targets in blocks [K, T * B / K], with a GRU as sequences [K, B / K, T]; updates
     the statistics."""
     advantage, target = compute_gae(
@@ -284,9 +195,9 @@ def prepare(
         discount=config.discount,
         gae_lambda=config.gae_lambda,
     )
-    seen = {group: rollout.obs[group] for group in observation_stats}
+    observations = {group: rollout.obs[group] for group in observation_stats}
     means, variances = moments(
-        {"obs": seen, "advantage": advantage, "target": target, "error": target - rollout.value}, mesh
+        {"obs": observations, "advantage": advantage, "target": target, "error": target - rollout.value}, mesh
     )
     size = advantage.size
     observation_stats = {
@@ -304,18 +215,18 @@ def prepare(
         advantage=(advantage - means["advantage"]) / (jnp.sqrt(variances["advantage"]) + 1e-8),
         value=(rollout.value - mean) / std,
         target=(target - mean) / std,
-        memory=rollout.memory,
+        carry=rollout.carry,
     )
     blocks = block_count(config, mesh)
-    if config.memory != "gru":
+    if rollout.carry is None:
         samples = in_blocks(samples, blocks)
     else:
         ended = rollout.terminated | rollout.truncated
-        # What is remembered at the rollout's first step is zero where an episode begins with it.
+        # The carry at the rollout's first step is zero already where an episode begins with it.
         samples = dataclasses.replace(samples, first=jnp.zeros_like(ended).at[1:].set(ended[:-1]))
         samples = sequences_in_blocks(samples, blocks)
     explained = 1 - variances["error"] / variances["target"]
-    return Ready(samples, params, value_stats, observation_stats, explained)
+    return TrainingBatch(samples, params, value_stats, observation_stats, explained)
 
 
 def strong_types(tree: Any) -> Any:

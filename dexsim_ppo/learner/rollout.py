@@ -2,15 +2,20 @@
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple, cast
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
 
-from dexsim.core.pytree import choose, pytree_dataclass, static
-from dexsim_ppo.learner.devices.sharding import batched
-from dexsim_ppo.learner.running_stats import RunningStats, value_std
+from dexsim.core.pytree import choose, pytree_dataclass
+from dexsim_ppo.learner import distribution
+from dexsim_ppo.learner.config import PPOConfig
+from dexsim_ppo.learner.distribution import Decision
+from dexsim_ppo.learner.loss import actor_step, critic_value
+from dexsim_ppo.learner.running_stats import RunningStats, make_normalizers, value_std
+from dexsim_ppo.learner.sharding import batched
+from dexsim_ppo.learner.state import TrainState
 from dexsim_ppo.learner.types import Environment
 
 # A reward beyond this many deviations of the returns is a fault of the simulation, not something to learn from. It is
@@ -19,15 +24,6 @@ _FAR = 100.0
 _FAR_AT_FIRST = 1000.0  # of the root mean square of the other rewards, while there are no returns
 
 _RESERVE_STEPS = 16  # short compared with an episode; makes a batch of new episodes cheap per step
-
-
-@pytree_dataclass
-class Decision:
-    """The policy's action and its distribution; arrays [B, ...]."""
-
-    action: jax.Array  # [B, A] Gaussian sample before any squashing
-    mean: jax.Array  # [B, A]
-    log_prob: jax.Array  # [B]
 
 
 @pytree_dataclass
@@ -41,139 +37,104 @@ class Rollout:
     reward: jax.Array
     terminated: jax.Array
     truncated: jax.Array
-    memory: jax.Array | None = None  # [T, B, m] state of the policy's memory before the step
+    carry: jax.Array | None = None  # [T, B, m] of the policy's memory before the step
 
 
-@pytree_dataclass
-class Tally:
-    """Sums from which metrics follow, each over a part of the environments [D]."""
-
-    sums: jax.Array  # [D, 2, K] of the quantities below: over all steps, and over the last ones of episodes
-    repeated: jax.Array  # [D] episodes that began with a start already used
-    names: tuple[str, ...] = static(default=())  # of the environment's metrics, which follow after `COUNTED`
-    steps: int = static(default=0)  # of each part
-
-    def metrics(self) -> dict[str, jax.Array]:
-        """Scalars: `step/<name>` is a mean over all steps, `episode/<name>` the mean final value over the episodes that
-        ended (NaN if none did), `episodes` their number, `repeated_starts` how many starts were used before (see
-        `scan_restarting`)."""
-        sums, ended_sums = jnp.sum(self.sums, axis=0)
-        total, size = dict(zip(COUNTED, sums[: len(COUNTED)], strict=True)), self.sums.shape[0] * self.steps
-        found = {
-            "reward": total["reward"] / size,
-            "episodes": total["ended"],
-            "terminated_share": total["terminated"] / total["ended"],
-            "nonfinite_rewards": total["nonfinite"],
-            "repeated_starts": jnp.sum(self.repeated),
-        }
-        for name, of, count in (("step", sums, size), ("episode", ended_sums, total["ended"])):
-            found |= {f"{name}/{k}": v / count for k, v in zip(self.names, of[len(COUNTED) :], strict=True)}
-        return found
-
-
-COUNTED = ("reward", "ended", "terminated", "nonfinite")
-
-Act = Callable[[jax.Array, Mapping[str, jax.Array], Any], tuple[Decision, jax.Array, Any]]
-"""`act(key, obs, memory) -> (decision, action for the environment [B, A], memory)`"""
-Value = Callable[[Mapping[str, jax.Array], Any], jax.Array]
-"""`value(obs, memory) -> [B]`, of the memory before this observation"""
-
-
-@pytree_dataclass
-class Remembering:
-    """State of an environment and of the policy's memory."""
-
-    state: Any
-    memory: jax.Array | None
-
-    reward = property(lambda self: self.state.reward)
-    terminated = property(lambda self: self.state.terminated)
-    truncated = property(lambda self: self.state.truncated)
-
-
-class Restarting(NamedTuple):
-    """What begins an episode with an empty memory."""
-
-    env: Environment
-
-    def restart(self, now: Remembering, done: jax.Array) -> Remembering:
-        """As of `Environment`."""
-        memory = jax.tree.map(lambda x: jnp.where(done, 0.0, x), now.memory)
-        return Remembering(self.env.restart(now.state, done), memory)
-
-
-def collect(
-    env: Environment,
-    state: Any,
-    key: jax.Array,
-    act: Act,
-    value: Value,
-    length: int,
-    mesh: Mesh | None = None,
-    memory: jax.Array | None = None,
-) -> tuple[tuple[Any, jax.Array | None], Rollout, Tally]:
-    """Run the policy for `length` steps.
+def collect_rollout(
+    env: Environment, config: PPOConfig, state: TrainState, mesh: Mesh | None = None
+) -> tuple[tuple[Any, jax.Array | None], Rollout, dict[str, jax.Array]]:
+    """Run the policy for T steps.
 
     The order is act, step, record, restart: the recorded flags, metrics and `next_value` belong to the true
-    final state of an episode, and the next step starts from a fresh one.
-
-    Args:
-      state: batch [B] of environment states.
-      memory: [B, m] state of the policy's memory; zero at the start of every episode.
+    final state of an episode, and the next step starts from a fresh one, with a zero carry.
 
     Returns:
-      The last states and memory, the experience, and what metrics follow from, of one part.
+      The last environment states [B] and carry [B, m], the experience, whose values are in reward units, and its
+      metrics; see `rollout_metrics`.
     """
-    step_env = batched(env.step, mesh)
+    normalizers, key = make_normalizers(env, config, state.observation_stats), jax.random.split(state.key, 3)[1]
+    params, std, step_env = state.params, value_std(state.value_stats), batched(env.step, mesh)
+
+    def value(obs, carry):
+        return state.value_stats.mean + std * critic_value(config, params, normalizers, obs, carry)
 
     def step(now, key):
-        state, memory = now.state, now.memory
-        obs = dict(state.obs)
-        decision, action, later = act(key, obs, memory)
-        after = step_env(state, action)
+        env_state, carry = now
+        obs = dict(env_state.obs)
+        next_carry, mean = actor_step(config, params, normalizers, obs, carry)
+        action = distribution.sample(jax.random.normal(key, mean.shape), mean, params.log_std)
+        after = step_env(env_state, distribution.squash(action, config.distribution))
         record = Rollout(
             obs=obs,
-            decision=decision,
-            value=value(obs, memory),
-            next_value=value(after.obs, later),
+            decision=Decision(action, mean, distribution.log_prob(action, mean, params.log_std)),
+            value=value(obs, carry),
+            next_value=value(after.obs, next_carry),
             reward=after.reward,
             terminated=after.terminated,
             truncated=after.truncated,
-            memory=memory,
+            carry=carry,
         )
-        return Remembering(after, later), (record, dict(after.metrics))
+        return (after, next_carry), after.terminated | after.truncated, (record, dict(after.metrics))
 
-    begin, keys = Remembering(state, memory), jax.random.split(key, length)
-    end, (rollout, step_metrics) = scan_restarting(cast(Any, Restarting(env)), step, begin, keys, mesh)
-    finite, done = jnp.isfinite(rollout.reward), rollout.terminated | rollout.truncated
+    def restart(now, done):
+        env_state, carry = now
+        return env.restart(env_state, done), jax.tree.map(lambda x: jnp.where(done, 0.0, x), carry)
+
+    keys = jax.random.split(key, config.rollout_length)
+    last, (rollout, step_metrics) = scan_restarting(batched(restart, mesh), step, (state.env_state, state.carry), keys)
+    finite = jnp.isfinite(rollout.reward)
     rollout = dataclasses.replace(rollout, reward=jnp.where(finite, rollout.reward, 0.0))
+    return last, rollout, rollout_metrics(rollout, finite, step_metrics)
+
+
+def rollout_metrics(rollout: Rollout, finite: jax.Array, step_metrics: Mapping[str, jax.Array]) -> dict[str, jax.Array]:
+    """Scalars: `step/<name>` is a mean over all steps, `episode/<name>` the mean final value over the episodes that
+    ended (NaN if none did), `episodes` their number, `repeated_starts` how many starts were used before (see
+    `scan_restarting`).
+
+    Args:
+      finite: [T, B] whether the environment's reward was.
+      step_metrics: the environment's own [T, B].
+    """
+    done = rollout.terminated | rollout.truncated
     counted = (rollout.reward, done, rollout.terminated, ~finite)
     # Sums are taken outside the scan: inside it each would reduce few numbers, which is slow on GPUs. One product gives
     # all of them, so that several processes exchange one array.
     values = jnp.stack([v.astype(jnp.float32) for v in (*counted, *step_metrics.values())])
     masks = jnp.stack([jnp.ones_like(done), done]).astype(jnp.float32)
-    sums = jnp.einsum("ktb,mtb->mk", jnp.where(jnp.isfinite(values), values, 0.0), masks, precision="highest")
-    tally = Tally(sums[None], _repeated(done)[None], tuple(step_metrics), done.size)
-    return (end.state, end.memory), rollout, tally
+    sums, ended_sums = jnp.einsum(
+        "ktb,mtb->mk", jnp.where(jnp.isfinite(values), values, 0.0), masks, precision="highest"
+    )
+    reward, ended, terminated, nonfinite = sums[: len(counted)]
+    metrics = {
+        "reward": reward / done.size,
+        "episodes": ended,
+        "terminated_share": terminated / ended,
+        "nonfinite_rewards": nonfinite,
+        "repeated_starts": _repeated(done),
+    }
+    for name, of, count in (("step", sums, done.size), ("episode", ended_sums, ended)):
+        metrics |= {f"{name}/{k}": v / count for k, v in zip(step_metrics, of[len(counted) :], strict=True)}
+    return metrics
 
 
 def scan_restarting(
-    env: Environment,
-    step: Callable[[Any, Any], tuple[Any, Any]],
+    restart: Callable[[Any, jax.Array], Any],
+    step: Callable[[Any, Any], tuple[Any, jax.Array, Any]],
     state: Any,
     inputs: Any,
-    mesh: Mesh | None = None,
 ) -> tuple[Any, Any]:
     """`jax.lax.scan` that starts a new episode after each step wherever one ended.
 
-    `jax.vmap(env.restart)` after every step would compute a new episode for every environment and discard
+    Calling `restart` after every step would compute a new episode for every environment and discard
     nearly all of them. Instead one new episode per environment is kept in reserve and renewed after at most
     16 steps; an environment whose episode ends twice within that time starts the same episode twice
     (`repeated_starts` counts them: none where episodes last longer).
     Restarting only the rows that ended would make a GPU wait for the host at every step.
 
     Args:
-      step: `(states [B], input) -> (next states, output)`, without restarting.
+      restart: `(states [B], done [B]) -> states`, new where `done`.
+      step: `(states [B], input) -> (next states, done [B], output)`, without restarting.
       inputs: pytree [T, ...].
 
     Returns:
@@ -181,16 +142,16 @@ def scan_restarting(
     """
     length = jax.tree.leaves(inputs)[0].shape[0]
     block = _block(length)
-    restart = jax.jit(batched(env.restart, mesh))
+    restart = jax.jit(restart)
 
     def run_block(state, inputs):
-        everyone = jnp.ones(state.reward.shape[0], bool)
+        everyone = jnp.ones(jax.tree.leaves(state)[0].shape[0], bool)
         # The second call advances the random keys that the first one used.
         fresh, state = restart(state, everyone), restart(state, ~everyone)
 
         def run_step(state, step_input):
-            after, output = step(state, step_input)
-            return jax.vmap(choose)(after.terminated | after.truncated, fresh, after), output
+            after, done, output = step(state, step_input)
+            return jax.vmap(choose)(done, fresh, after), output
 
         return jax.lax.scan(run_step, state, inputs)
 

@@ -1,11 +1,15 @@
 """Running mean and variance, and normalisers made from them."""
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dexsim.core.layout import LayoutEntry
 from dexsim.core.pytree import align, pytree_dataclass, static
-from dexsim_ppo.learner.types import Fields, layout_size
+from dexsim_ppo.learner.config import PPOConfig
+from dexsim_ppo.learner.types import Environment
 
 # The count is capped here; from then on the mean is exponential over about this many samples. Without the
 # cap a float32 count would freeze at 2**24, and an int32 count overflow after an hour on a GPU.
@@ -51,26 +55,34 @@ def merge_moments(stats: RunningStats, mean: jax.Array, variance: jax.Array, siz
     )
 
 
-def make_normalizer(stats: RunningStats, fields: Fields, *, std_floor: float, clip: float) -> Normalizer:
+def make_normalizer(stats: RunningStats, layout: Sequence[LayoutEntry], *, std_floor: float, clip: float) -> Normalizer:
     """Normaliser of one observation group.
 
-    Fields with a fixed scale are only divided by it: with running statistics, a channel that is silent
+    Entries with a fixed scale are only divided by it: with running statistics, a channel that is silent
     until first contact would see that contact as an outlier.
 
     Args:
-      stats: of vectors [n], where n is the sum of the fields' sizes.
-      std_floor: smallest standard deviation of the other fields, in the observation's units.
+      stats: of vectors [n], where n is the sum of the entries' sizes.
+      std_floor: smallest standard deviation of the other entries, in the observation's units.
     """
-    scale = np.concatenate([np.full(f.size, f.scale or 0.0, np.float32) for f in fields])
-    if scale.size != layout_size(fields) or scale.shape != stats.mean.shape:
-        raise ValueError(f"layout of {scale.size} elements for statistics of {stats.mean.shape}")
+    scale = np.concatenate([np.full(entry.size, entry.scale or 0.0, np.float32) for entry in layout])
     std = jnp.sqrt(stats.variance + std_floor**2)
     fixed = scale > 0
     return Normalizer(mean=jnp.where(fixed, 0.0, stats.mean), std=jnp.where(fixed, scale, std), clip=clip)
 
 
+def make_normalizers(env: Environment, config: PPOConfig, stats: dict[str, RunningStats]) -> dict[str, Normalizer]:
+    """One observation normaliser per group."""
+    return {
+        group: make_normalizer(
+            stats[group], layout, std_floor=config.observation_std_floor, clip=config.observation_clip
+        )
+        for group, layout in env.observation_layout.items()
+    }
+
+
 def recover_stats(normalizer: Normalizer, *, std_floor: float) -> RunningStats:
-    """Statistics [n] from which `make_normalizer` makes this normaliser, for fields without a fixed scale.
+    """Statistics [n] from which `make_normalizer` makes this normaliser, for entries without a fixed scale.
 
     Their count is the largest, so that further samples hardly change them.
     """

@@ -1,23 +1,12 @@
 """What the learner and its tools require of an environment."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 import jax
 import numpy as np
 
-
-class Field(NamedTuple):
-    """One named slice of an observation vector."""
-
-    name: str
-    size: int
-    scale: float | None
-    """A fixed divisor in the field's own unit; None asks for running statistics."""
-
-
-Fields = Sequence[Any]
-"""Fields of one observation group, in order: anything with `name`, `size` and `scale`."""
+from dexsim.core.layout import LayoutEntry
 
 
 class State(Protocol):
@@ -58,8 +47,8 @@ class Environment(Protocol):
         ...
 
     @property
-    def observation_layout(self) -> Mapping[str, Fields]:
-        """Fields of the `"actor"` and `"critic"` observations."""
+    def observation_layout(self) -> Mapping[str, Sequence[LayoutEntry]]:
+        """Layout of the `"actor"` and `"critic"` observations."""
         ...
 
     @property
@@ -139,8 +128,3 @@ class CurriculumEnvironment(Environment, Protocol):
     def set_randomization_scale(self, state: Any, scale: jax.Array) -> Any:
         """Take the next episodes from ranges of this scale."""
         ...
-
-
-def layout_size(fields: Fields) -> int:
-    """Length of the observation vector that these fields make up."""
-    return sum(field.size for field in fields)

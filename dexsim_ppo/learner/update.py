@@ -11,10 +11,10 @@ from jax.sharding import Mesh
 from dexsim_ppo.learner import adam
 from dexsim_ppo.learner.adam import AdamState
 from dexsim_ppo.learner.config import PPOConfig
-from dexsim_ppo.learner.devices.sharding import averaged
 from dexsim_ppo.learner.loss import Metrics, Samples, loss
 from dexsim_ppo.learner.networks import Params
 from dexsim_ppo.learner.running_stats import Normalizer
+from dexsim_ppo.learner.sharding import averaged
 
 
 class Learner(NamedTuple):

@@ -13,7 +13,7 @@ from dexsim.hand.load import load_hand
 from dexsim.hand.source import check_same, recorded_hand
 from dexsim_ppo.checkpoint import Checkpoint
 from dexsim_ppo.learner.config import PPOConfig
-from dexsim_ppo.learner.curriculum import Curriculum
+from dexsim_ppo.learner.curriculum import CurriculumConfig
 from dexsim_ppo.policy import Policy
 
 EnvConfig = TypeVar("EnvConfig")
@@ -27,7 +27,7 @@ class TrainArguments(Generic[EnvConfig]):
     """The task's settings."""
     ppo: PPOConfig
     """The learner's settings; their defaults depend on the preset."""
-    curriculum: Curriculum = setting(Curriculum())
+    curriculum: CurriculumConfig = setting(CurriculumConfig())
     """Widen the randomisation as the policy succeeds."""
     extremes: float = setting(0.0, unit="1", low=0.0, high=1.0)
     """Share of training's hands and objects that get the extreme of every range at once. Evaluations and the policy's
@@ -41,7 +41,7 @@ class TrainArguments(Generic[EnvConfig]):
     seed: int = setting(0, unit="1", low=0, high=2**32 - 1)
     """Seed of everything random."""
     seeds: int = setting(1, unit="1", low=1, high=1000)
-    """Trainings, from --seed on, in one program where that is possible; --steps and --minutes are those of each."""
+    """Seeds to train in turn, from --seed on; --steps and --minutes are those of each."""
     backend: Literal["auto", "jax", "cuda", "warp", "c"] = setting("auto")
     """Physics backend. auto: c on a CPU, cuda on an NVIDIA GPU, otherwise jax."""
     deterministic: bool = False
@@ -97,24 +97,22 @@ class TrainArguments(Generic[EnvConfig]):
 
 def arguments_from_dict(config_class: type[Any], data: dict[str, Any]) -> TrainArguments:
     """The options that a checkpoint or `config.json` holds. Their task is a word: no file says what is imported."""
-    if missing := {"env", "ppo"} - data.keys():
-        raise ConfigError(f"TrainArguments: no {min(missing)}")
-    if ":" in (task := str(data.get("task", ""))):
-        raise ConfigError(f"TrainArguments.task = {task!r:.80}: must be a word; its module is given with --task")
+    if ":" in data["task"]:
+        raise ConfigError(f"TrainArguments.task = {data['task']!r}: must be a word; its module is given with --task")
     return from_dict(TrainArguments, data | {"env": from_dict(config_class, data["env"])})
 
 
-def find_hand(arguments: TrainArguments, begun: Checkpoint | Policy | None) -> Hand | None:
+def find_hand(arguments: TrainArguments, source: Checkpoint | Policy | None) -> Hand | None:
     """The hand to train; None for the default one.
 
     Raises:
       ConfigError: the run or policy to begin from is of another hand.
     """
-    if begun is None:
+    if source is None:
         return load_hand(arguments.hand) if arguments.hand else None
-    if isinstance(begun, Policy):
-        return begun.find_hand(arguments.hand)
-    record, what = begun.content.get("hand"), str(begun.path)
+    if isinstance(source, Policy):
+        return source.find_hand(arguments.hand)
+    record, what = source.content["hand"], str(source.path)
     hand = recorded_hand(record, arguments.hand, what)
     if hand is not None:
         check_same(record, hand, what)
@@ -131,7 +129,7 @@ def training_config(arguments: TrainArguments) -> Any:
     """
     env, share = arguments.env, arguments.extremes
     if arguments.curriculum.on and isinstance(env, NoSettings):
-        raise ConfigError("Curriculum.on = True: an environment from elsewhere has no ranges that could widen")
+        raise ConfigError("CurriculumConfig.on = True: an environment from elsewhere has no ranges that could widen")
     control = getattr(env, "control", None)
     if control is not None and control.force.gain:
         env = dataclasses.replace(
@@ -147,10 +145,6 @@ def training_config(arguments: TrainArguments) -> Any:
         objects=dataclasses.replace(env.objects, extremes=share),
     )
 
-
-_BEST = {"return": float | int | None, "iteration": int}
-SAVED = {"arguments": {}, "progress": {"best": _BEST, "seconds": float | int, "without_better": int | None}}
-"""Types of what a checkpoint of a run says."""
 
 # What a resumed run may be given anew: its budget, and what looks on. Everything else is part of the saved state.
 _RESUMABLE = {

@@ -8,11 +8,11 @@ import numpy as np
 
 from dexsim.core.errors import ConfigError
 from dexsim_ppo.learner.config import PPOConfig
+from dexsim_ppo.learner.memory import carry_size
 from dexsim_ppo.learner.running_stats import recover_stats
 from dexsim_ppo.learner.state import TrainState
 from dexsim_ppo.learner.types import Environment
-from dexsim_ppo.policy import Policy, layout_to_list
-from dexsim_ppo.policy_file import memory_to_list
+from dexsim_ppo.policy import Policy
 
 
 def fine_tuning_config(policy: Policy, config: PPOConfig) -> PPOConfig:
@@ -21,17 +21,16 @@ def fine_tuning_config(policy: Policy, config: PPOConfig) -> PPOConfig:
     A policy file holds neither critic nor noise. The noise and step size of training from scratch would make the
     policy forget. So would a fresh critic, whose errors are correlated: it trains alone first.
     """
-    kind, size = memory_to_list(policy.params.memory) or ["none", 0]
-    sizes = {"history": {"memory_length": size + 1}, "gru": {"memory_size": size}}.get(kind, {})
+    units = carry_size(policy.params.memory)
     normalizer, floor = policy.params.normalizer, config.observation_std_floor
-    running = np.concatenate([np.full(field.size, field.scale is None) for field in policy.observation_layout])
+    running = np.concatenate([np.full(entry.size, entry.scale is None) for entry in policy.observation_layout])
     smallest = float(np.min(np.asarray(normalizer.std)[running], initial=floor))
     if smallest < 0.999 * floor:  # Beyond rounding: a higher floor than that of its training would raise deviations.
         floor = smallest
     return dataclasses.replace(
         config,
-        memory=kind,
-        **sizes,
+        memory="gru" if units else "none",
+        memory_size=units or config.memory_size,
         actor_layers=tuple(layer.kernel.shape[1] for layer in policy.params.layers[:-1]),
         distribution=policy.params.squash,
         observation_clip=normalizer.clip,
@@ -52,20 +51,16 @@ def check_fit(policy: Policy, env: Environment, config: PPOConfig) -> None:
     Raises:
       ConfigError: the policy's observation is not the environment's, or its network is not the configuration's.
     """
-    theirs, mine = (layout_to_list(fields) for fields in (policy.observation_layout, env.observation_layout["actor"]))
+    theirs, mine = policy.observation_layout, tuple(env.observation_layout["actor"])
     if theirs != mine:
-        odd = [name for name, *_ in (*(f for f in theirs if f not in mine), *(f for f in mine if f not in theirs))]
-        raise ConfigError(f"observations of policy and environment differ: {', '.join(odd) or 'their order'}")
-    remembers = memory_to_list(policy.params.memory)
-    wanted = {"history": ["history", config.memory_length - 1], "gru": ["gru", config.memory_size]}.get(config.memory)
-    if remembers != wanted:
-        raise ConfigError("the policy has another memory: do not set --ppo.memory or its size")
-    layers = tuple(layer.kernel.shape[1] for layer in policy.params.layers)
-    if layers != (*config.actor_layers, env.action_size) or policy.params.squash != config.distribution:
-        raise ConfigError(
-            f"the policy's network has layers {layers} and is {policy.params.squash!r}: do not set "
-            "--ppo.actor-layers or --ppo.distribution"
-        )
+        different = sorted({entry.name for entry in set(theirs) ^ set(mine)})
+        raise ConfigError(f"observations of policy and environment differ: {', '.join(different) or 'their order'}")
+    network = fine_tuning_config(policy, config)
+    for name in ("memory", "memory_size", "actor_layers", "distribution"):
+        if getattr(config, name) != getattr(network, name):
+            raise ConfigError(f"PPOConfig.{name} = {getattr(config, name)}: the policy has {getattr(network, name)}")
+    if (actions := policy.params.layers[-1].bias.size) != env.action_size:
+        raise ConfigError(f"the policy gives {actions} actions; {env.name} takes {env.action_size}")
 
 
 def initialize_from(policy: Policy, config: PPOConfig, state: TrainState) -> TrainState:

@@ -1,43 +1,24 @@
 """Training defaults per device: sizes and durations."""
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import replace
 from typing import Any
 
 import jax
 
 from dexsim.core.compilation import available_cores
+from dexsim.core.config import NoSettings
 from dexsim.core.errors import ConfigError
 from dexsim_ppo.learner.config import PPOConfig
-from dexsim_ppo.learner.curriculum import Curriculum
+from dexsim_ppo.learner.curriculum import CurriculumConfig
 from dexsim_ppo.training.arguments import TrainArguments
 
-
-@dataclass(frozen=True, kw_only=True)
-class Preset:
-    """Defaults of the training command's options."""
-
-    ppo: PPOConfig
-    steps: int
-    """Budget of environment steps; 0 for no limit."""
-    minutes: float
-    """Budget of wall-clock time, compilation included, min; 0 for no limit."""
-    evaluate_every: int
-    """Iterations between evaluations."""
-    evaluation_chunk: int
-    """Episodes evaluated in parallel; an evaluation during training is one chunk."""
-    evaluation_episodes: int
-    """Episodes of the final evaluation."""
-    log_every: int
-    """Iterations between logged metrics."""
-    extremes: float = 0.0
-    """Share of training episodes whose hand or object takes the extreme of every range."""
-    curriculum: Curriculum = Curriculum()
-    """How the ranges widen during training."""
-
+Preset = TrainArguments[Any]
+"""A preset is the command's options without those of a task."""
 
 # Two cores: simulation takes nearly all of the time, so small networks and many passes over little data. Our tasks take
 # large steps, which become smaller; see `find_preset`.
 _CPU = Preset(
+    env=NoSettings(),
     ppo=PPOConfig(
         num_envs=256,
         rollout_length=16,
@@ -47,7 +28,6 @@ _CPU = Preset(
         actor_layers=(128, 128),
         critic_layers=(128, 128),
     ),
-    steps=0,
     minutes=7.0,
     evaluate_every=20,
     evaluation_chunk=50,
@@ -56,7 +36,7 @@ _CPU = Preset(
 )
 # A gait is found on nearly nominal hands and widened: twice the turns of a training on the full ranges. What counts is
 # the goals of an episode: two goals and a stop end it early, so that their rate is that of a slow gait.
-_WIDENING = Curriculum(on=True, metric="episode/successes", widen_above=5.0, narrow_below=2.5, step=0.005)
+_WIDENING = CurriculumConfig(on=True, metric="episode/successes", widen_above=5.0, narrow_below=2.5, step=0.005)
 PRESETS = {
     "cpu": _CPU,
     # 16 cores and more: enough environments for all of them. Sized from trainings of rotate on 2 to 12 cores.
@@ -70,6 +50,7 @@ PRESETS = {
     # One large GPU: enough environments to fill it, and few large minibatches. A grasp that remembers follows its
     # command better; on a CPU there is no time to learn what to remember.
     "gpu": Preset(
+        env=NoSettings(),
         ppo=PPOConfig(
             num_envs=32768,
             rollout_length=16,
@@ -82,7 +63,6 @@ PRESETS = {
             actor_layers=(256, 256, 128),
             critic_layers=(256, 256, 128),
         ),
-        steps=0,
         minutes=8.0,
         evaluate_every=100,
         evaluation_chunk=1024,
@@ -108,7 +88,7 @@ def find_preset(name: str, task: str) -> Preset:
     ppo = replace(preset.ppo, epochs=4, minibatches=16, entropy_coefficient=0.001)
     if not cpu:  # A quarter of the environments: four times the updates from the same experience, for the gait.
         return replace(preset, ppo=replace(ppo, num_envs=8192, memory="none"), minutes=5.0)
-    curriculum = _WIDENING if task == "rotate" else Curriculum()
+    curriculum = _WIDENING if task == "rotate" else CurriculumConfig()
     preset = replace(preset, ppo=replace(ppo, kl_halving=400), curriculum=curriculum, evaluation_episodes=256)
     if name == "cpu-large":
         return replace(preset, minutes=15.0, evaluation_chunk=256)
@@ -126,7 +106,7 @@ def preset_arguments(task: str, env_config: Any, name: str) -> TrainArguments:
     preset = find_preset(device_preset() if name == "auto" else name, task)
     if not hasattr(env_config, "randomization"):  # An environment from elsewhere: no ranges, and small as a rule.
         preset = replace(preset, extremes=0.0, ppo=replace(preset.ppo, memory="none"))
-    return TrainArguments(env=env_config, task=task, **{f.name: getattr(preset, f.name) for f in fields(Preset)})
+    return replace(preset, env=env_config, task=task)
 
 
 def device_preset() -> str:

@@ -3,7 +3,6 @@
 import contextlib
 import functools
 import os
-import subprocess
 import sys
 import traceback
 from collections.abc import Iterator
@@ -16,7 +15,7 @@ from jax.experimental import multihost_utils
 
 from dexsim.core.errors import DexsimError
 from dexsim_ppo import checkpoint
-from dexsim_ppo.learner.devices.sharding import copied, spanned
+from dexsim_ppo.learner.sharding import copied, mesh_of
 from dexsim_ppo.learner.state import TrainState
 
 # Set in each process of a job of several: by Slurm's srun, Open MPI's mpirun, an indexed job of Kubernetes.
@@ -65,14 +64,14 @@ def agree_on_path(path: Path) -> Path:
 def save(path: Path, *, tree: TrainState, **content: Any) -> None:
     """`checkpoint.save` of the global state, written by the first process. All must call it."""
     if jax.process_count() > 1:  # A process can read what every device has, and no other process's environments.
-        mesh = spanned(tree)
+        mesh = mesh_of(tree)
         tree = jax.jit(functools.partial(copied, mesh=mesh))(tree)
     if is_first():
         checkpoint.save(path, tree=tree, **content)
 
 
 @contextlib.contextmanager
-def leaving_at_once() -> Iterator[None]:
+def exit_on_error() -> Iterator[None]:
     """End this process at once after an error where there are others: JAX's own shutdown would wait for them, and they
     for this one."""
     try:
@@ -90,12 +89,8 @@ def leaving_at_once() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def noticing_losses(folder: Path) -> Iterator[None]:
-    """Turn the loss of another process into one line.
-
-    Raises:
-      DexsimError: another process has ended.
-    """
+def detect_lost_peer(folder: Path) -> Iterator[None]:
+    """Raise DexsimError when another process of this training has ended."""
     if jax.process_count() == 1:
         yield
         return
@@ -104,26 +99,8 @@ def noticing_losses(folder: Path) -> Iterator[None]:
         f"python -m dexsim_ppo.train --resume {folder} --devices {jax.device_count()}"
     )
     try:
-        with last_words(f"error: {lost}"):
-            yield
+        yield
     except (jax.errors.JaxRuntimeError, ValueError) as error:
         if not any(word in str(error) for word in ("Gloo", "NCCL", "UNAVAILABLE", "ABORTED", "DEADLINE")):
             raise
         raise DexsimError(lost) from None
-
-
-@contextlib.contextmanager
-def last_words(line: str) -> Iterator[None]:
-    """Have `line` printed if this process is ended inside without a chance to say anything.
-
-    JAX aborts a process that has lost the first one, or waits for others in a collective of GPUs, from a thread of its
-    own. A helper waits for that: it reads until this process closes its end.
-    """
-    script = "import sys; sys.stdin.read() or print(sys.argv[1], file=sys.stderr)"
-    helper = subprocess.Popen(
-        [sys.executable, "-I", "-S", "-c", script, line], stdin=subprocess.PIPE, start_new_session=True
-    )
-    try:
-        yield
-    finally:
-        helper.communicate(b"alive")

@@ -2,6 +2,8 @@
 
 import dataclasses
 import functools
+import math
+import os
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -15,18 +17,18 @@ from jax.sharding import Mesh
 from dexsim.core import cli
 from dexsim.core.compilation import collector_paused
 from dexsim.core.config import to_dict
+from dexsim.core.errors import ConfigError
 from dexsim.env.evaluation import evaluation_of
-from dexsim.env.fingerprint import fingerprint
 from dexsim.hand.source import record_of
 from dexsim_ppo import checkpoint
 from dexsim_ppo.evaluate import Evaluator, write_video
 from dexsim_ppo.learner.config import PPOConfig
-from dexsim_ppo.learner.devices.sharding import learned, place
 from dexsim_ppo.learner.ppo import TrainState, make_train
+from dexsim_ppo.learner.sharding import place, without_environments
 from dexsim_ppo.learner.types import Environment
-from dexsim_ppo.policy import Policy
-from dexsim_ppo.report import headline, print_report, surely_better
-from dexsim_ppo.training import memory, processes, programs
+from dexsim_ppo.policy import Policy, load_policy
+from dexsim_ppo.report import headline, print_report, significantly_better
+from dexsim_ppo.training import processes
 from dexsim_ppo.training.arguments import TrainArguments, printable, training_config
 from dexsim_ppo.training.display import Display
 from dexsim_ppo.training.faults import Faults, keep
@@ -40,6 +42,29 @@ SELECTION_SEED, REPORT_SEED = 2**32 - 1, 0
 def due(iteration: int, per_call: int, every: int) -> bool:
     """Whether a call of `per_call` iterations that ended at `iteration` passed a multiple of `every`; 0 is never."""
     return every > 0 and iteration // every > (iteration - per_call) // every
+
+
+def check_memory(program: Any, num_envs: int) -> str:
+    """What a compiled training step needs and the device has, in a line; empty where the runtime does not say.
+
+    Raises:
+      ConfigError: it needs more than there is; names a number of environments that should fit.
+    """
+    analysis, device = program.memory_analysis(), jax.local_devices()[0]
+    if device.platform == "cpu":
+        limit = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    else:
+        limit = (device.memory_stats() or {}).get("bytes_limit", 0)
+    if analysis is None or not limit:
+        return ""
+    # Results that take the place of arguments (`alias`) are counted with these.
+    results = analysis.output_size_in_bytes - analysis.alias_size_in_bytes
+    need = analysis.argument_size_in_bytes + results + analysis.temp_size_in_bytes
+    text = f"{num_envs} environments need {need / 2**30:.3g} GiB, {device.device_kind} has {limit / 2**30:.3g} GiB"
+    if need > limit:
+        fit = 2 ** int(math.log2(max(num_envs * limit / need, 1.0)))
+        raise ConfigError(f"{text}: about {fit} should fit (--ppo.num-envs {fit})")
+    return text
 
 
 class Run:
@@ -61,8 +86,8 @@ class Run:
         self.best: dict[str, Any] = {"return": None, "iteration": 0}
         self.evaluations_s = list[float]()
         self.without_better = 0  # evaluations in a row
-        self.seconds_before, self.share = 0.0, 1.0
-        """Wall-clock time before a resume, s, and the share of the time since then that is this run's."""
+        self.seconds_before = 0.0
+        """Wall-clock time before a resume, s."""
         self.clock = {"setup_s": time.perf_counter() - started}
 
     def _evaluation_env(self) -> Environment:
@@ -87,18 +112,19 @@ class Run:
           source: a checkpoint to resume, a policy to fine-tune, or None to start from scratch.
           stopped: nonzero once the run is to end early, in all processes alike.
         """
-        arguments, device = self.arguments, jax.devices()[0].device_kind
-        if self.mesh is not None:
-            device = f"{self.mesh.size} x {device}"
+        arguments, device, devices = self.arguments, jax.devices()[0].device_kind, self.mesh.size if self.mesh else 1
+        if devices > 1:
+            device = f"{devices} x {device}"
         with Display(f"{arguments.task} on {device}, {self.env.backend}", not processes.is_first()) as display:
             display.note(
                 f"{self.folder.path}: {arguments.task}, {self.config.num_envs} environments, "
                 f"{self.env.backend} physics on {device}"
             )
-            display.working("compiling the training step; the second time it is read from the cache")
+            display.working("compiling the training step: a minute on two cores, seconds once it is in the cache")
             state, step = self._prepare(source)
             display.note(f"compiled in {self.clock['compile_s']:.1f} s")
-            memory.check(step, self.config.num_envs // (self.mesh.size if self.mesh else 1), display.note)
+            if memory := check_memory(step, self.config.num_envs // devices):
+                display.note(memory)
             display.working("first update" + (": compiling Warp's kernels" if self.env.backend == "warp" else ""))
             log = MetricsLog(self.folder, int(state.iteration), arguments) if processes.is_first() else None
             try:
@@ -119,22 +145,18 @@ class Run:
                 state = place(state, shapes) if self.mesh is not None else jax.tree.map(jnp.copy, state)
                 progress = source.content["progress"]
                 self.best = progress["best"] if self.folder.has_best(int(state.iteration)) else self.best
-                self.seconds_before, self.without_better = progress["seconds"], progress.get("without_better", 0)
+                self.seconds_before, self.without_better = progress["seconds"], progress["without_better"]
             else:
                 fresh = aside.submit(lambda: jax.block_until_ready(training.init(key)))
-            traced = lambda: self.clock.update(trace_s=time.perf_counter() - begin)  # noqa: E731
-            if identity := self.identity():
-                step = programs.compile_step(training.plain_step, shapes, identity, traced, self.env.backend)
-            else:
-                lowered = cast(Any, training.step).lower(shapes)
-                traced()
-                step = lowered.compile()
+            lowered = cast(Any, training.step).lower(shapes)
+            self.clock["trace_s"] = time.perf_counter() - begin
+            step = lowered.compile()
             if not isinstance(source, checkpoint.Checkpoint):
-                state = self.begin(fresh.result(), source)
+                state = self._begin(fresh.result(), source)
         self.clock["compile_s"] = time.perf_counter() - begin
         return state, step
 
-    def begin(self, state: TrainState, source: Policy | None) -> TrainState:
+    def _begin(self, state: TrainState, source: Policy | None) -> TrainState:
         """The fresh state with what the policy to fine-tune has learnt; writes the untrained policy."""
         if source:
             fresh, state = state, initialize_from(source, self.config, state)
@@ -144,14 +166,6 @@ class Run:
         self._write_policy(self._policy(state), self.folder.untrained)
         return state
 
-    def identity(self) -> Any:
-        """What identifies the training step's program; None for one of several devices, which is not cached, and for an
-        environment without a fingerprint."""
-        if self.mesh is not None:
-            return None
-        digest = fingerprint(self.env)
-        return digest and [digest, to_dict(self.config), to_dict(self.arguments.curriculum)]
-
     def _loop(
         self, state: TrainState, step: Callable, display: Display, log: MetricsLog | None, stopped: Callable[[], int]
     ) -> None:
@@ -159,7 +173,7 @@ class Run:
         iteration = first = int(state.iteration)
         begin, spent_elsewhere = time.perf_counter(), 0.0
         faults, evaluated = Faults(self.config, self.folder, self.content(), state), iteration == 0
-        while not stopped() and not processes.agree(self.is_over(iteration)):
+        while not stopped() and not processes.agree(self._is_over(iteration)):
             call = time.perf_counter()
             with collector_paused():
                 before = keep(state)
@@ -174,16 +188,16 @@ class Run:
                 )
             row = means(metrics) | faults.check(before, metrics, iteration, display.note)
             del before
-            row |= self.progress(iteration, now - call)
-            evaluated = self.is_evaluation_due(iteration, row["env_steps_per_s"])
+            row |= self._progress(iteration, now - call)
+            evaluated = self._is_evaluation_due(iteration, row["env_steps_per_s"])
             if evaluated:
-                row |= self.evaluate(state, iteration, display)
+                row |= self._evaluate(state, iteration, display)
             if evaluated or iteration == first + per_call or due(iteration, per_call, arguments.log_every):
                 if log:
                     log.write(row)
                 display.show(row)
             if due(iteration, per_call, arguments.checkpoint_every):
-                self.save(state, iteration)
+                self._save(state, iteration)
             spent_elsewhere += time.perf_counter() - now
         self.clock["training_s"] = time.perf_counter() - begin
         self.clock["step_s"] = self.clock["training_s"] - spent_elsewhere
@@ -192,18 +206,20 @@ class Run:
         steps = max(iteration - first - per_call, 0) * self.config.steps_per_iteration
         self.clock["env_steps_per_s"] = steps / max(self.clock["step_s"] - self.clock.get("first_call_s", 0.0), 1e-9)
         if self.best["return"] is not None and not stopped() and not evaluated:
-            self.evaluate(state, iteration, display)
-        self.save(state, iteration)
+            self._evaluate(state, iteration, display)
+        self._save(state, iteration)
+
+    # --- budgets ------------------------------------------------------------------------------------------
 
     def _seconds(self) -> float:
         """Wall-clock time of the whole run, including that before a resume, s."""
-        return self.seconds_before + self.share * (time.perf_counter() - self.started)
+        return self.seconds_before + time.perf_counter() - self.started
 
-    def is_over(self, iteration: int) -> bool:
+    def _is_over(self, iteration: int) -> bool:
         """Whether a budget is used up, or the return no longer gets better."""
-        return 0 < self.arguments.patience <= self.without_better or self.seconds_left(iteration, 1.0) <= 0
+        return 0 < self.arguments.patience <= self.without_better or self._seconds_left(iteration, 1.0) <= 0
 
-    def is_evaluation_due(self, iteration: int, env_steps_per_s: float) -> bool:
+    def _is_evaluation_due(self, iteration: int, env_steps_per_s: float) -> bool:
         """Whether to evaluate after a call that ended at `iteration`: that evaluation, and the one at the end, must
         keep to their share of the time. The same in all processes."""
         arguments = self.arguments
@@ -215,7 +231,7 @@ class Run:
         each = spent[-1] if spent else guess
         return bool(processes.agree(sum(spent) + 2 * each <= arguments.evaluation_share * self._seconds()))
 
-    def seconds_left(self, iteration: int, env_steps_per_s: float) -> float:
+    def _seconds_left(self, iteration: int, env_steps_per_s: float) -> float:
         """Time until the first budget is used up, s; infinite without a budget."""
         steps, minutes = self.arguments.steps, self.arguments.minutes
         left = [float("inf")]
@@ -225,15 +241,17 @@ class Run:
             left.append(60 * minutes - self._seconds())
         return min(left)
 
-    def progress(self, iteration: int, call_s: float) -> dict[str, float]:
+    def _progress(self, iteration: int, call_s: float) -> dict[str, float]:
         rate = self.config.iterations_per_call * self.config.steps_per_iteration / call_s
         return {
             "iteration": iteration,
             "env_steps": iteration * self.config.steps_per_iteration,
             "seconds": self._seconds(),
             "env_steps_per_s": rate,
-            "seconds_left": self.seconds_left(iteration, rate),
+            "seconds_left": self._seconds_left(iteration, rate),
         }
+
+    # --- files and reports --------------------------------------------------------------------------------
 
     def content(self) -> dict[str, Any]:
         """What a reproducer has to know of the run."""
@@ -247,7 +265,7 @@ class Run:
 
     def _policy(self, state: TrainState) -> Policy:
         if self.mesh is not None:
-            state = learned(state)
+            state = without_environments(state)
         return Policy.from_training(
             self.evaluator.env,
             self.config,
@@ -262,9 +280,10 @@ class Run:
             | ({"policy": self.arguments.policy} if self.arguments.policy else {}),
         )
 
-    def evaluate(self, state: TrainState, iteration: int, display: Display) -> dict[str, float]:
+    def _evaluate(self, state: TrainState, iteration: int, display: Display) -> dict[str, float]:
         """Evaluate the policy, and save it if its return is the best so far."""
         policy = self._policy(state)
+        display.working(f"evaluating the policy in {self.arguments.evaluation_chunk} episodes")
         report, _ = self.evaluator(policy.params, episodes=self.arguments.evaluation_chunk, seed=SELECTION_SEED)
         figures = {name: entry["value"] for name, entry in headline(report).items() if entry["value"] is not None}
         score, first, best = figures["return"], next(iter(figures)), self.best["return"]
@@ -281,7 +300,7 @@ class Run:
         )
         return {f"evaluation/{name}": x for name, x in (figures | {"held": report["held"]["value"]}).items()}
 
-    def save(self, state: TrainState, iteration: int) -> None:
+    def _save(self, state: TrainState, iteration: int) -> None:
         """Save a checkpoint, from which training resumes exactly, and the current policy."""
         processes.save(
             self.folder.checkpoint(iteration),
@@ -314,18 +333,18 @@ class Run:
         `command` is what started the run, for the report.
         """
         arguments, folder, selected = self.arguments, self.folder, self.selected
-        print(f"evaluating {selected.name} and the untrained policy", flush=True)
+        print(f"evaluating {selected.name}, the untrained policy and a hand that does nothing", flush=True)
         begin = time.perf_counter()
-        trained, untrained = Policy.load(selected), Policy.load(folder.untrained)
+        trained, untrained = load_policy(selected), load_policy(folder.untrained)
         if trained.training.get("iteration") == 0:  # An average of policies, put there by hand, has none.
             print(f"nothing was trained: compiling took {self.clock['compile_s']:.0f} s; give more --minutes")
         measure = functools.partial(self.evaluator, episodes=arguments.evaluation_episodes, seed=REPORT_SEED)
         reports = {}
-        reports["trained"], film = measure(trained.params)
-        reports["untrained"], _ = measure(untrained.params)
-        reports["do_nothing"], _ = measure(untrained.params, idle=True)
+        reports["trained"], film = measure(trained.params, label="trained")
+        reports["untrained"], _ = measure(untrained.params, label="untrained")
+        reports["do_nothing"], _ = measure(untrained.params, idle=True, label="doing nothing")
         self.clock["evaluation_s"] = time.perf_counter() - begin
-        draw_curve(read_metrics(folder.metrics), folder.path / "curve.png", arguments.task)
+        draw_curve([read_metrics(folder.metrics)], folder.path / "curve.png", arguments.task)
         report = {
             "task": arguments.task,
             "policy": selected.name,
@@ -333,7 +352,7 @@ class Run:
             "backend": self.env.backend,
             "seed": arguments.seed,
             **reports,
-            "better": surely_better(reports["trained"], reports["untrained"]),
+            "better": significantly_better(reports["trained"], reports["untrained"]),
             "command": command,
             "arguments": printable(arguments),
             "timing": self.clock,
@@ -343,6 +362,7 @@ class Run:
         for name, policy in (("untrained", "untrained"), ("trained", selected)):
             print_report(reports[name], reports["do_nothing"], title=f"{arguments.task}: {policy}")
         if arguments.video and jax.tree.leaves(film):  # an environment from elsewhere draws nothing
+            print("rendering the video", flush=True)
             begin = time.perf_counter()
             video = write_video(self.evaluator.env, film, folder.path / "policy.mp4")
             self.clock["video_s"] = time.perf_counter() - begin

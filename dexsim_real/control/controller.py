@@ -71,7 +71,7 @@ class Controller:
         if layout(hand, names, config) != wanted:
             raise HandError(f"the policy's observation does not fit this version's task {policy.task!r}")
         seen = np.zeros(sum(entry.size for entry in wanted), np.float32)
-        if (shape := np.shape(policy.act(policy.begin(), seen)[1])) != (hand.num_joints,):
+        if (shape := np.shape(policy.act(policy.initial_carry(), seen)[1])) != (hand.num_joints,):
             raise HandError(f"the policy gives actions {list(shape)}; the hand takes {hand.num_joints} of them")
         self.period = 1.0 / policy.control_rate
         self._observe = make_observe(hand, names, config)
@@ -97,13 +97,13 @@ class Controller:
         self.target = np.asarray(target, np.float32)
         self.last_action = np.zeros(self.hand.num_joints, np.float32)
         self.correction = np.zeros((), np.float32)  # of the command, by the force loop
-        self.memory = self.policy.begin()
+        self.carry = self.policy.initial_carry()
 
     def resume(self, position: np.ndarray) -> None:
         """Continue from this pose [J] rad after a hold, perhaps with the object put back: what came before is
         forgotten."""
         self.anchor(position)
-        self.memory = self.policy.begin()
+        self.carry = self.policy.initial_carry()
 
     def anchor(self, position: np.ndarray) -> None:
         """Continue from this pose [J] rad, after a time in which the hand did not follow its targets."""
@@ -124,10 +124,10 @@ class Controller:
             readings, correction = jax.device_get(self._correct(readings, self.correction))
             self.correction = np.asarray(correction)
         observation = np.asarray(self._observe(readings))
-        memory, action = self.policy.act(self.memory, observation)
+        carry, action = self.policy.act(self.carry, observation)
         action = np.clip(np.asarray(action), -1.0, 1.0)
         if np.isfinite(action).all():
-            self.memory = memory
+            self.carry = carry
             target = self.target = jax.device_get(self._move(self.target, action, measured.joint_position))
         else:  # As in simulation this counts as no action; `Safety` holds when a target is not finite.
             action, target = np.zeros_like(self.last_action), np.full_like(self.target, np.nan)

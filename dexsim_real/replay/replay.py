@@ -20,7 +20,7 @@ from dexsim.core.config import from_dict
 from dexsim.hand.kinematics import Hand
 from dexsim.hand.source import recorded_hand
 from dexsim.observation import LayoutEntry, Readings, layout
-from dexsim_ppo.retired import old_spec, read_spec
+from dexsim.task_spec import TaskSpec
 from dexsim_real.control.controller import make_observe
 from dexsim_real.core.log import Kind, LogError, LogReader, reading
 from dexsim_real.sensors.hand import HandMeasurement, HandSensing, HardwareConfig
@@ -167,7 +167,7 @@ def _rebuild(meta: dict[str, Any], given: str) -> tuple[HandSensing, Any, tuple[
             calibration = load_calibration(path, hand)
     sensing = HandSensing(hand, from_dict(HardwareConfig, meta["hardware"]), calibration)
     sensing.tare = np.array(meta["tare"], np.float32)
-    spec = read_spec(meta["spec"], "the log") if "spec" in meta else old_spec(meta["task"], meta["env_config"])
+    spec = from_dict(TaskSpec, meta["spec"])
     names, config = spec.fields, spec.observation
     return sensing, make_observe(calibrated_hand(hand, calibration), names, config), layout(hand, names, config)
 

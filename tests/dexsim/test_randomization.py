@@ -19,7 +19,7 @@ from dexsim.randomization_check.__main__ import conclude, table
 from dexsim.randomization_check.effects import check
 from dexsim.tasks.rotate.config import RotateConfig
 from dexsim.tasks.rotate.objects import sample_turned_object
-from dexsim_ppo.learner.curriculum import Curriculum, next_scale
+from dexsim_ppo.learner.curriculum import CurriculumConfig, next_scale
 
 TIMES = dict(timestep=0.005, control_period=0.03)
 
@@ -216,7 +216,7 @@ def test_a_traced_scale_is_the_configured_one(hand):
 
 
 def test_the_scale_follows_success():
-    rules = Curriculum(start=0.1, widen_above=0.8, narrow_below=0.4, step=0.25)
+    rules = CurriculumConfig(start=0.1, widen_above=0.8, narrow_below=0.4, step=0.25)
     step = jax.jit(lambda scale, success: next_scale(scale, success, rules))
     for scale, success, after in (
         (0.1, 0.8, 0.35),
@@ -227,8 +227,8 @@ def test_the_scale_follows_success():
         (0.5, np.nan, 0.5),
     ):
         assert float(step(scale, success)) == pytest.approx(after)
-    with pytest.raises(ConfigError, match="Curriculum.narrow_below"):
-        Curriculum(narrow_below=0.9)
+    with pytest.raises(ConfigError, match="CurriculumConfig.narrow_below"):
+        CurriculumConfig(narrow_below=0.9)
 
 
 # --- held out ----------------------------------------------------------------------------------------

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from dexsim.core.errors import ConfigError
-from dexsim_ppo import Policy, average_policies, load_policy
-from dexsim_ppo.average import distance, main
+from dexsim_ppo import load_policy
+from dexsim_ppo.average import average_policies, distance, main
 
 
 def moved(policy, size, seed):
@@ -28,8 +28,9 @@ def test_the_average_of_many_noisy_copies_comes_back_to_the_policy(name):
     assert [origin["seed"] for origin in average.training["average_of"]] == list(range(16))
 
     seen = np.asarray(policy.params.normalizer.mean) + 0.5 * np.asarray(policy.params.normalizer.std)
-    wanted, (one, *_) = policy.act(policy.begin(), seen)[1], [copy.act(copy.begin(), seen)[1] for copy in copies]
-    mean = average.act(average.begin(), seen)[1]
+    wanted = policy.act(policy.initial_carry(), seen)[1]
+    one = copies[0].act(copies[0].initial_carry(), seen)[1]
+    mean = average.act(average.initial_carry(), seen)[1]
     assert np.linalg.norm(mean - wanted) < np.linalg.norm(one - wanted)
 
 
@@ -39,7 +40,7 @@ def test_a_tree_of_two_is_halfway_and_a_file_holds_it(tmp_path):
     for policy, file in zip((one, other), files, strict=True):
         policy.save(file)
     assert main([*files, "--output", str(tmp_path / "made" / "average.msgpack")]) == 0
-    found = Policy.load(tmp_path / "made" / "average.msgpack")
+    found = load_policy(tmp_path / "made" / "average.msgpack")
     for a, b, mean in zip(*(jax.tree.leaves(p.params) for p in (one, other, found)), strict=True):
         np.testing.assert_allclose(mean, a + (b - a) / 2, rtol=1e-5, atol=1e-7)
     assert found.training == {"average_of": [{"seed": 1}, {"seed": 2}]}

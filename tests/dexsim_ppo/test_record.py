@@ -7,7 +7,6 @@ import types
 import jax
 import numpy as np
 import pytest
-from remembering import remembering
 
 import dexsim
 from dexsim import registry
@@ -32,12 +31,11 @@ def compiled(env):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["", "history"])  # the shipped policy has a GRU
-def test_readings_and_targets_are_those_of_the_episodes(env, compiled, kind):
-    policy = remembering(kind) if kind else load_policy("grasp")
+def test_readings_and_targets_are_those_of_the_episodes(env, compiled):
+    policy = load_policy("grasp")
     found = record.record(policy, env, episodes=3, seconds=0.3, seed=0)
     assert [len(one.time) for one in found] == [10, 10, 10]
-    (state, step), memory = compiled, policy.begin(3)
+    (state, step), memory = compiled, policy.initial_carry(3)
     for tick in range(10):
         for i, one in enumerate(found):
             for name in ("joint_position", "taxel_force", "command"):

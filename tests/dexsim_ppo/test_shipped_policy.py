@@ -1,5 +1,6 @@
 """The policies in assets/policies: load without a simulator, fit today's tasks, act, hold and turn."""
 
+import dataclasses
 import json
 
 import jax
@@ -7,9 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from episodes import reset_to
-from remembering import KINDS, remembering
+from remembering import remembering
 
 import dexsim
+import dexsim_ppo
 from dexsim.core.assets import asset_path
 from dexsim.core.compilation import jit
 from dexsim.core.config import from_dict
@@ -18,9 +20,8 @@ from dexsim.observation import GRASP, ROTATE, layout
 from dexsim.registry import TASKS
 from dexsim.tasks.grasp.config import GraspConfig
 from dexsim.tasks.grasp.task import GraspGoal
-from dexsim.tasks.rotate.config import RotateConfig
 from dexsim_ppo.export import to_numpy
-from dexsim_ppo.policy import Policy, layout_to_list
+from dexsim_ppo.policy import load_policy
 from dexsim_ppo.portable import PortablePolicy
 from dexsim_real.sensors.readings import sources_of
 
@@ -32,36 +33,51 @@ SHIPPED = {
 }
 
 
-def load(name):
-    return Policy.load(asset_path(f"policies/{name}.msgpack"))
-
-
 @pytest.mark.parametrize("name", SHIPPED)
 def test_it_fits_the_task_and_the_hand(hand, name):
-    policy, (names, size) = load(name), SHIPPED[name]
+    policy, (names, size) = load_policy(name), SHIPPED[name]
     config = from_dict(TASKS[policy.task].config_class, policy.env_config)
     fields = layout(hand, names, config.observation)
-    assert layout_to_list(policy.observation_layout) == layout_to_list(fields)
+    assert policy.observation_layout == fields
     assert sum(field.size for field in fields) == size
-    action = np.asarray(policy.act(policy.begin(), jnp.zeros(size))[1])
+    action = np.asarray(policy.act(policy.initial_carry(), jnp.zeros(size))[1])
     assert action.shape == (hand.num_joints,) and np.all(np.abs(action) <= 1.0)
     assert policy.control_rate == pytest.approx(1 / config.physics.control_period)
 
 
 def test_the_command_is_heard():
-    policy = load("grasp")
-    low, high = (np.asarray(policy.act(policy.begin(), jnp.zeros(66).at[-1].set(c))[1]) for c in (0.0, 1.0))
+    policy = load_policy("grasp")
+    low, high = (np.asarray(policy.act(policy.initial_carry(), jnp.zeros(66).at[-1].set(c))[1]) for c in (0.0, 1.0))
     assert np.max(np.abs(high - low)) > 1e-3
 
 
 def test_the_goal_is_seen():
-    fields = [field.name for field in load("rotate").observation_layout]
+    fields = [field.name for field in load_policy("rotate").observation_layout]
     assert fields[1] == "relative_orientation"
     near, far = (
-        np.asarray(load("rotate")(jnp.zeros(65).at[12:18].set(jnp.array(sixd))))
+        np.asarray(load_policy("rotate").act(None, jnp.zeros(65).at[12:18].set(jnp.array(sixd)))[1])
         for sixd in ([1.0, 0, 0, 0, 1, 0], [1.0, 0, 0, 0, 0, 1])
     )
     assert np.max(np.abs(near - far)) > 1e-3
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_one_call_acts_under_jit_vmap_and_scan(name):
+    """Also over a whole episode at once, as `Policy.act` does tick by tick."""
+    policy = load_policy(name)
+    obs = np.random.default_rng(0).normal(size=(20, 3, SHIPPED[name][1])).astype(np.float32)
+    carry, expected = policy.initial_carry(3), []
+    for x in obs:
+        carry, action = policy.act(carry, x)
+        expected.append(action)
+    each = jax.vmap(dexsim_ppo.act, (None, 0, 0))
+    episode = jax.jit(lambda carry: jax.lax.scan(lambda c, x: each(policy.params, c, x), carry, obs))
+    last, actions = episode(policy.initial_carry(3))
+    np.testing.assert_allclose(actions, np.stack(expected), atol=1e-5)
+    jax.tree.map(lambda one, other: np.testing.assert_allclose(one, other, atol=1e-5), last, carry)
+    one, action = dexsim_ppo.act(policy.params, policy.initial_carry(), obs[0, 0])
+    np.testing.assert_allclose(action, expected[0][0], atol=1e-5)
+    assert jax.tree.structure(one) == jax.tree.structure(carry)
 
 
 @pytest.mark.parametrize(
@@ -73,7 +89,7 @@ def test_the_goal_is_seen():
     ],
 )
 def test_the_sensors_it_needs(name, sources):
-    assert sources_of([field.name for field in load(name).observation_layout]) == sources
+    assert sources_of([field.name for field in load_policy(name).observation_layout]) == sources
 
 
 def origins(training):
@@ -84,7 +100,7 @@ def origins(training):
 @pytest.mark.parametrize("name", SHIPPED)
 def test_its_report_is_of_this_file_and_says_how_it_came_about(name):
     report = json.loads(asset_path(f"policies/{name}.json").read_text())
-    policy = load(name)
+    policy = load_policy(name)
     for told, origin in zip(origins(report["origin"]), origins(policy.training), strict=True):
         assert told["env_steps"] == origin["env_steps"] and told["seed"] == origin["seed"]
     for key in ("command", "hardware", "versions", "trained", "untrained"):
@@ -94,7 +110,7 @@ def test_its_report_is_of_this_file_and_says_how_it_came_about(name):
 
 
 def test_an_ablated_policy_takes_the_mean_or_zero_of_what_it_does_not_see():
-    policy = load("rotate")
+    policy = load_policy("rotate")
     names = ("contact_force", "relative_orientation")
     hidden = np.concatenate([np.full(f.size, f.name in names) for f in policy.observation_layout])
     obs = np.random.default_rng(0).normal(size=(20, 65)).astype(np.float32)
@@ -102,21 +118,21 @@ def test_an_ablated_policy_takes_the_mean_or_zero_of_what_it_does_not_see():
     fixed = np.concatenate([np.full(f.size, f.scale is not None) for f in policy.observation_layout])
     assert np.any(fixed & hidden) and not mean[fixed].any(), "touch is 0 then"
     ablated = policy.ablate(*names)
-    np.testing.assert_allclose(ablated(obs), policy(np.where(hidden, mean, obs)), atol=2e-5)
-    np.testing.assert_array_equal(ablated(obs), ablated(np.where(hidden, 9.0, obs)))
-    assert np.max(np.abs(np.asarray(ablated(obs)) - np.asarray(policy(obs)))) > 0.1
-    np.testing.assert_array_equal(policy.ablate()(obs), policy(obs))
+    full, without = (lambda x, p=p: np.asarray(p.act(None, x)[1]) for p in (policy, ablated))
+    np.testing.assert_allclose(without(obs), full(np.where(hidden, mean, obs)), atol=2e-5)
+    np.testing.assert_array_equal(without(obs), without(np.where(hidden, 9.0, obs)))
+    assert np.max(np.abs(without(obs) - full(obs))) > 0.1
+    np.testing.assert_array_equal(policy.ablate().act(None, obs)[1], full(obs))
     with pytest.raises(ConfigError, match="does not observe colour; it observes .*joint_position"):
         policy.ablate("colour")
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_an_ablated_memory_takes_the_mean_as_well(kind):
-    policy = remembering(kind)
+def test_an_ablated_memory_takes_the_mean_as_well():
+    policy = remembering()
     hidden = np.concatenate([np.full(f.size, f.name == "contact_force") for f in policy.observation_layout])
     obs = np.random.default_rng(0).normal(size=(4, 20, 66)).astype(np.float32)
     ablated, mean = policy.ablate("contact_force"), np.asarray(policy.params.normalizer.mean)
-    one, other = policy.begin(20), policy.begin(20)
+    one, other = policy.initial_carry(20), policy.initial_carry(20)
     for x in obs:
         (one, action), (other, wanted) = ablated.act(one, x), policy.act(other, np.where(hidden, mean, x))
         np.testing.assert_allclose(action, wanted, atol=2e-5)
@@ -134,10 +150,10 @@ def player(env):
 
     def play(states, seconds, policy=None):
         history, action = [], jnp.zeros((WORLDS, 12))
-        memory = policy and policy.begin(WORLDS)
+        carry = policy and policy.initial_carry(WORLDS)
         for _ in range(round(seconds / env.control_period)):
             if policy is not None:
-                memory, action = policy.act(memory, states.obs["actor"])
+                carry, action = policy.act(carry, states.obs["actor"])
             states = step(states, action)
             history.append(jax.device_get((states.terminated, states.finger_force, states.metrics)))
         return jax.tree.map(lambda *ticks: np.stack(ticks), *history)
@@ -159,7 +175,7 @@ def test_the_grasp_holds_and_presses_as_asked():
     )
     assert len(np.unique(starts.episode.object.shape_index)) == WORLDS // 2
     play = player(env)
-    dropped, force, _ = play(starts, 4.0, load("grasp"))
+    dropped, force, _ = play(starts, 4.0, load_policy("grasp"))
     assert np.sum(~dropped.any(0)) >= 6
     late = force[len(force) // 2 :, :, 1:].sum(-1).mean(0)  # N, of the four fingers
     assert np.all(late[1::2] - late[::2] > 4.0), late
@@ -167,26 +183,29 @@ def test_the_grasp_holds_and_presses_as_asked():
     assert np.all(dropped.any(0))
 
 
-@pytest.mark.slow
-def test_the_rotate_turns():
+@pytest.mark.parametrize("name", ["rotate", "rotate_without_orientation", "rotate_clear"])
+def test_the_rotation_policies_turn(name):
     """At least two quarter turns in four seconds and no drop; a hand that does nothing turns none."""
-    env = dexsim.make("rotate", RotateConfig(pool_size=WORLDS), backend="c", num_envs=WORLDS)
+    policy = load_policy(name)
+    config = from_dict(TASKS[policy.task].config_class, policy.env_config)
+    config = dataclasses.replace(config, pool_size=WORLDS)
+    env = dexsim.make(policy.task, config, backend="c", num_envs=WORLDS)
     starts = jit(jax.vmap(reset_to(env)), once=True)(jax.random.split(jax.random.key(0), WORLDS), jnp.arange(WORLDS))
     play = player(env)
-    dropped, _, metrics = play(starts, 4.0, load("rotate"))
+    dropped, _, metrics = play(starts, 4.0, policy)
     turns = metrics["successes"][-1]
     assert np.sum(~dropped.any(0) & (turns >= 2)) >= 6, turns
-    _, _, metrics = play(starts, 4.0)
-    assert not metrics["successes"].any()
+    if name == "rotate":
+        _, _, metrics = play(starts, 4.0)
+        assert not metrics["successes"].any()
 
 
 MISUSE = {
-    "no memory": ("grasp", lambda p, obs: p.act(None, obs), "has a memory"),
-    "called as a function": ("grasp", lambda p, obs: p(obs), "has a memory"),
-    "memory of a batch": ("grasp", lambda p, obs: p.act(p.begin(8), obs), r"\(8, 64\).*\(64,\)"),
-    "memory of another": ("rotate", lambda p, obs: p.act(np.zeros(64), obs), "memory"),
-    "other observation": ("rotate", lambda p, obs: p.act(None, obs[:5]), r"observes 65 values.*\(5,\)"),
-    "a number": ("rotate", lambda p, obs: p.act(None, 3.0), r"observes 65 values.*\(\)"),
+    "no carry": ("grasp", lambda p, obs: p.act(None, obs), r"\(64,\).*None"),
+    "carry of a batch": ("grasp", lambda p, obs: p.act(p.initial_carry(8), obs), r"\(64,\).*\(8, 64\)"),
+    "carry of another": ("rotate", lambda p, obs: p.act(np.zeros(64), obs), r"None.*\(64,\)"),
+    "other observation": ("rotate", lambda p, obs: p.act(None, obs[:5]), r"65.*\(5,\)"),
+    "not the actor's part": ("grasp", lambda p, obs: p.act(p.initial_carry(), {"actor": obs}), r"66.*\(\)"),
 }
 
 
@@ -194,7 +213,7 @@ MISUSE = {
 @pytest.mark.parametrize("what", MISUSE)
 def test_misuse_is_named_by_both_forms_of_a_policy(tmp_path, door, what):
     name, use, words = MISUSE[what]
-    policy = load(name)
+    policy = load_policy(name)
     obs = np.zeros(policy.params.normalizer.mean.size, np.float32)
     if door == "numpy":
         to_numpy(policy, tmp_path / "policy.npz")
@@ -203,25 +222,12 @@ def test_misuse_is_named_by_both_forms_of_a_policy(tmp_path, door, what):
         use(policy, obs)
 
 
-def test_an_observation_may_be_a_list():
-    policy, obs = load("rotate"), np.linspace(-1, 1, 65).astype(np.float32)
-    np.testing.assert_array_equal(policy(obs.tolist()), policy(obs))
-    with pytest.raises(ConfigError, match=r"observes 65 values.*\(2,\)"):
-        policy([1.0, 2.0])
-
-
-def test_the_actors_part_of_the_observation_is_asked_for():
-    policy = load("grasp")
-    with pytest.raises(ConfigError, match=r"give the actor's part, state.obs\['actor'\]"):
-        policy.act(policy.begin(), {"actor": np.zeros(66)})
-
-
 def test_a_folder_named_as_a_shipped_policy_does_not_hide_it(tmp_path, monkeypatch):
     """Such as one that `--lerobot grasp` wrote."""
     monkeypatch.chdir(tmp_path)
     for name in ("grasp", "mine"):
         (tmp_path / name).mkdir()
-    assert Policy.load("grasp").task == "grasp"
+    assert load_policy("grasp").task == "grasp"
     for name in ("mine", "./grasp"):
         with pytest.raises(CheckpointError, match="cannot be read"):
-            Policy.load(name)
+            load_policy(name)

@@ -21,7 +21,6 @@ CONFIG = PPOConfig(
     kl_target=0.02,
     learning_rate=2e-3,
     learning_rate_max=1e-2,
-    memory_length=MAX_STEPS,
     memory_size=16,
     iterations_per_call=10,
 )

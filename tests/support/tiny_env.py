@@ -13,9 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from dexsim.core.config import setting, validate
+from dexsim.core.layout import LayoutEntry
 from dexsim.core.pytree import pytree_dataclass
 from dexsim_ppo.learner.config import PPOConfig
-from dexsim_ppo.learner.types import Field
 
 # Learners: one that solves the task, and one that is quick to compile.
 CONFIG = PPOConfig(
@@ -82,7 +82,7 @@ class TinyEnv:
     evaluation_steps = 32
     evaluation = "series"
     observation_layout = {
-        group: (Field("position", 1, None), Field("target", 1, None), Field("touch", 1, 2.0))
+        group: (LayoutEntry("position", 1, None), LayoutEntry("target", 1, None), LayoutEntry("touch", 1, 2.0))
         for group in ("actor", "critic")
     }
 

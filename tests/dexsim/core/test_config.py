@@ -261,6 +261,10 @@ def test_override_replaces_fields_by_their_path():
         randomization=dataclasses.replace(Randomization(), latency=(0.0, 0.01)),
     )
     assert config == wanted
+    # Numbers as Python has them, in lists too.
+    for text, number in ((".006", 0.006), ("6e-3", 0.006), ("5.", 5.0), ("-.5", -0.5)):
+        assert override({}, [f"physics.timestep={text}"]) == {"physics": {"timestep": number}}
+    assert override({}, ["edge=[.05, 1.]"]) == {"edge": [0.05, 1.0]}
     # A field that the file does not have yet.
     assert from_dict(GraspConfig, override({}, ["objects.extremes=1"])).objects.extremes == 1.0
     for entry, said in (

@@ -359,7 +359,7 @@ def test_the_shipped_policy_holds_as_much_as_on_the_jax_backend():
 
         begun = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(5), 64))
         _, (lost, pressed) = jit(lambda carry, body=body: jax.lax.scan(body, carry, length=200))(
-            (begun, policy.begin(64))
+            (begun, policy.initial_carry(64))
         )
         kept = ~np.asarray(lost).any(0)
         held[backend], force[backend] = kept.mean(), np.asarray(pressed)[100:].sum(-1)[:, kept].mean()

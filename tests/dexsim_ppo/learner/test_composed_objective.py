@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 from tiny_env import SMALL
 
+from dexsim.core.layout import LayoutEntry
 from dexsim.core.pytree import choose, pytree_dataclass
 from dexsim_ppo.learner import ppo
 from dexsim_ppo.learner.loss import loss
 from dexsim_ppo.learner.networks import init_params
 from dexsim_ppo.learner.running_stats import RunningStats
-from dexsim_ppo.learner.types import Field
 
 STEPS, ROWS, ACTIONS = 8, 5, 2
 CONFIG = dataclasses.replace(
@@ -57,8 +57,8 @@ class Script:
     """Each row plays the same episode again and again, whatever the actions."""
 
     observation_layout = {
-        "actor": (Field("pose", 2, None), Field("touch", 2, 4.0)),
-        "critic": (Field("touch", 1, 0.5), Field("pose", 3, None)),
+        "actor": (LayoutEntry("pose", 2, None), LayoutEntry("touch", 2, 4.0)),
+        "critic": (LayoutEntry("touch", 1, 0.5), LayoutEntry("pose", 3, None)),
     }
 
     def __init__(self, rng):
@@ -104,10 +104,12 @@ def experience(script, config, params, stats, value_stats, key):
             params=params,
             value_stats=value_stats,
             env_state=jax.vmap(lambda row: script.at(row, 0))(jnp.arange(ROWS)),
-            memory=None,
+            carry=None,
+            observation_stats=stats,
+            key=key,
         )
         normalizers = ppo.make_normalizers(script, config, stats)
-        _, rollout, _ = ppo.collect_rollout(script, config, state, normalizers, key)
+        _, rollout, _ = ppo.collect_rollout(script, config, state)
         samples, start, *_ = ppo.prepare(config, value_stats, {}, params, rollout)
         moved = jax.tree.map(jnp.add, start, step)
         objective = lambda p: loss(p, config, normalizers, samples, params.log_std)  # noqa: E731

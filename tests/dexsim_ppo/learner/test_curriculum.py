@@ -11,12 +11,10 @@ from tiny_env import SMALL, TinyEnv
 from dexsim.core.errors import ConfigError
 from dexsim.core.pytree import pytree_dataclass
 from dexsim_ppo import checkpoint
-from dexsim_ppo.learner.curriculum import Curriculum
+from dexsim_ppo.learner.curriculum import CurriculumConfig
 from dexsim_ppo.learner.ppo import make_train, update_scale
-from dexsim_ppo.train import arguments_from_dict, parse_arguments
-from dexsim_ppo.training.arguments import printable
 
-RULES = Curriculum(on=True, start=0.5, widen_above=0.9, narrow_below=0.3, step=0.1)
+RULES = CurriculumConfig(on=True, start=0.5, widen_above=0.9, narrow_below=0.3, step=0.1)
 
 
 @pytree_dataclass
@@ -101,13 +99,13 @@ def test_success_may_be_a_metric_by_name():
     rules = dataclasses.replace(RULES, metric="episode/goals", widen_above=6.0, narrow_below=2.0)
     scale, success = update_scale(rules, jnp.float32(0.5), metrics)
     assert float(scale) == pytest.approx(0.6) and float(success) == 7
-    with pytest.raises(ConfigError, match="Curriculum.metric = 'step/luck': choose from episode/goals"):
+    with pytest.raises(ConfigError, match="CurriculumConfig.metric = 'step/luck': choose from episode/goals"):
         update_scale(dataclasses.replace(rules, metric="step/luck"), scale, metrics)
 
 
 def test_off_it_is_not_there():
     """Neither in the state, nor in the metrics, nor at the environment's door (`TinyEnv.reset` knows no scale)."""
-    training = make_train(TinyEnv(), SMALL, Curriculum())
+    training = make_train(TinyEnv(), SMALL, CurriculumConfig())
     state = training.init(jax.random.key(0))
     assert state.scale is None
     assert not any("curriculum" in name for name in training.step(state)[1])
@@ -127,12 +125,3 @@ def test_a_checkpoint_keeps_the_scale_and_resumes_to_the_bit(tmp_path):
     for ours, theirs in zip(jax.tree.leaves(again), jax.tree.leaves(straight), strict=True):
         if not jnp.issubdtype(ours.dtype, jax.dtypes.prng_key):
             np.testing.assert_array_equal(ours, theirs)
-
-
-def test_options_of_the_command_line_and_of_older_checkpoints():
-    arguments, _ = parse_arguments(["--task", "grasp", "--curriculum.on", "--curriculum.start", "0.2"])
-    assert arguments.curriculum == Curriculum(on=True, start=0.2)
-    data = printable(arguments)
-    assert arguments_from_dict(type(arguments.env), data).curriculum == arguments.curriculum
-    data.pop("curriculum")
-    assert arguments_from_dict(type(arguments.env), data).curriculum == Curriculum()

@@ -12,52 +12,10 @@ from dexsim_ppo.acting import PolicyParams, act
 from dexsim_ppo.learner import ppo
 from dexsim_ppo.learner.ppo import make_train
 from dexsim_ppo.learner.rollout import Rollout, bound_rewards
-from dexsim_ppo.learner.running_stats import RunningStats, value_std
+from dexsim_ppo.learner.running_stats import RunningStats
 
 NEVER = 1e9
 ROWS = dataclasses.replace(SMALL, num_envs=64, rollout_length=16)  # 1,024 rows an iteration
-
-
-class OneFault(TinyEnv):
-    """Gives one finite reward of 1e6 when the countdown in its metrics ends."""
-
-    def _start(self, key):
-        state = super()._start(key)
-        return dataclasses.replace(state, metrics=state.metrics | {"countdown": jnp.float32(NEVER)})
-
-    def step(self, state, action):
-        countdown = state.metrics["countdown"] - 1
-        state = super().step(state, action)
-        reward = jnp.where(countdown == 0, 1e6, state.reward)
-        return dataclasses.replace(state, reward=reward, metrics=state.metrics | {"countdown": countdown})
-
-
-def with_fault(state, steps):
-    """One of the environments gives its faulty reward after so many steps."""
-    metrics = dict(state.env_state.metrics)
-    metrics["countdown"] = metrics["countdown"].at[5].set(steps)
-    metrics["length"] = metrics["length"].at[5].set(0.0)
-    return dataclasses.replace(state, env_state=dataclasses.replace(state.env_state, metrics=metrics))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("before", [0, 10])
-def test_one_reward_of_a_million_does_not_ruin_the_value_normaliser(before):
-    """At the start of training and later: the deviation of returns stays of their order, and the fault is counted."""
-    training, deviations = make_train(OneFault(), ROWS), []
-    for fault in (False, True):
-        state, counted = training.init(jax.random.key(0)), 0.0
-        for iteration in range(before + 2):
-            if fault and iteration == before:
-                state = with_fault(state, 3.0)
-            state, metrics = training.step(state)
-            counted += float(metrics["bounded_rewards"][0])
-        assert counted == float(fault)
-        deviations.append(float(value_std(state.value_stats)))
-    assert deviations[1] < 100 * deviations[0]
-    if before:
-        assert deviations[1] < 5 * deviations[0]
-    assert int(state.skipped_updates) == 0
 
 
 def experience(reward):
@@ -116,7 +74,7 @@ def test_actions_are_in_range_in_training_as_from_a_policy(distribution):
     normalizers = ppo.make_normalizers(Unclipped(), config, state.observation_stats)
     layers = jax.tree.map(lambda x: 1e3 * x, state.params.actor)
     obs = 10 * jax.random.normal(jax.random.key(1), (50, 3))
-    assert float(jnp.abs(act(PolicyParams(layers, normalizers["actor"], distribution), obs)).max()) == 1.0
+    assert float(jnp.abs(act(PolicyParams(layers, normalizers["actor"], distribution), None, obs)[1]).max()) == 1.0
 
 
 class Short(TinyEnv):

@@ -1,7 +1,6 @@
 """PPO end to end on the tiny environment."""
 
 import dataclasses
-import time
 
 import jax
 import jax.numpy as jnp
@@ -14,14 +13,13 @@ from dexsim_ppo.learner import ppo, update
 from dexsim_ppo.learner.distribution import log_prob as gaussian_log_prob
 from dexsim_ppo.learner.loss import actor_mean, critic_value, loss
 from dexsim_ppo.learner.ppo import make_train
-from dexsim_ppo.learner.rollout import Decision, collect, scan_restarting
+from dexsim_ppo.learner.rollout import scan_restarting
 from dexsim_ppo.learner.update import Learner
 
 
 @pytest.mark.parametrize("distribution", ["gaussian", "tanh"])
 def test_reaches_the_known_return(distribution):
-    """29 of the best possible 31.2 with exploration on, in under 30 s with compilation."""
-    start = time.perf_counter()
+    """29 of the best possible 31.2 with exploration on."""
     training = make_train(TinyEnv(), dataclasses.replace(CONFIG, distribution=distribution))
     state = training.init(jax.random.key(0))
     returns = []
@@ -29,7 +27,6 @@ def test_reaches_the_known_return(distribution):
         state, metrics = training.step(state)
         returns.append(float(jnp.nanmean(metrics["episode/return"])))
     assert returns[-1] > 29.0 and returns[0] < 25.0, returns
-    assert time.perf_counter() - start < 30
     assert int(state.skipped_updates) == 0
     assert int(state.iteration) == 80
 
@@ -45,7 +42,7 @@ def test_ratio_is_one_before_the_first_gradient(distribution, normalize_value):
     @jax.jit
     def first_loss(state):
         normalizers = ppo.make_normalizers(env, config, state.observation_stats)
-        _, rollout, _ = ppo.collect_rollout(env, config, state, normalizers, jax.random.key(4))
+        _, rollout, _ = ppo.collect_rollout(env, config, state)
         samples, params, *_ = ppo.prepare(config, state.value_stats, {}, state.params, rollout)
         mean = actor_mean(config, params, normalizers, samples.obs)
         value = critic_value(config, params, normalizers, samples.obs)
@@ -60,6 +57,17 @@ def test_ratio_is_one_before_the_first_gradient(distribution, normalize_value):
     # With ratio one the surrogate is the mean of normalised advantages, and values have not moved.
     assert float(metrics["policy_loss"]) == pytest.approx(0, abs=1e-5)
     np.testing.assert_allclose(value, samples.value, rtol=1e-3, atol=1e-3)
+
+
+def test_the_first_minibatch_sees_the_policy_that_collected():
+    """With one minibatch the update measures a ratio of exactly one, also after the normalisers have moved: it uses the
+    statistics of the collection, not those that include it."""
+    training = make_train(TinyEnv(), dataclasses.replace(SMALL, epochs=1, minibatches=1))
+    state = training.init(jax.random.key(0))
+    for _ in range(3):
+        state, metrics = training.step(state)
+        assert float(metrics["kl"][0]) < 1e-9 and float(metrics["clip_fraction"][0]) == 0
+        assert abs(float(metrics["policy_loss"][0])) < 1e-5
 
 
 def test_compiles_once():
@@ -85,19 +93,6 @@ def test_iterations_of_one_call_equal_single_calls():
         run.append(state)
     for a, b in zip(jax.tree.leaves(run[0].params), jax.tree.leaves(run[1].params), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)
-
-
-def test_a_gradient_that_is_not_finite_is_skipped_and_counted():
-    state = make_train(TinyEnv(), SMALL).init(jax.random.key(0))
-    learner = Learner(state.params, state.adam, state.learning_rate, state.skipped_updates)
-    grads = jax.tree.map(jnp.ones_like, state.params)
-    bad = dataclasses.replace(grads, log_std=jnp.full_like(grads.log_std, jnp.nan))
-    after, _ = update.apply_gradients(SMALL, learner, bad)
-    assert int(after.skipped_updates) == 1
-    jax.tree.map(np.testing.assert_array_equal, after.params, state.params)
-    after, _ = update.apply_gradients(SMALL, after, grads)
-    assert int(after.skipped_updates) == 1
-    assert not np.array_equal(after.params.log_std, state.params.log_std)
 
 
 def test_log_std_stays_between_floor_and_cap():
@@ -153,12 +148,12 @@ def test_next_value_is_that_of_the_true_final_observation():
     env, config = TrueFinal(), dataclasses.replace(SMALL, observation_clip=100.0)
     state = make_train(env, config).init(jax.random.key(0))
     normalizers = ppo.make_normalizers(env, config, state.observation_stats)
-    _, rollout, tally = ppo.collect_rollout(env, config, state, normalizers, jax.random.key(1))
+    _, rollout, metrics = ppo.collect_rollout(env, config, state)
     obs = rollout.obs["critic"].at[..., 0].set(7.0).at[..., 2].set(7.0)
     # The target belongs to the episode that ended.
     expected = critic_value(config, state.params, normalizers, {"critic": obs})
     np.testing.assert_allclose(rollout.next_value, expected, rtol=1e-4, atol=1e-5)
-    assert float(tally.metrics()["episodes"]) == config.steps_per_iteration
+    assert float(metrics["episodes"]) == config.steps_per_iteration
     assert bool((jnp.abs(rollout.obs["critic"][1:, :, 0]) <= 1).all()), "restarted before the next step"
 
 
@@ -186,10 +181,10 @@ def test_restarts_what_ended_and_nothing_else(length, block, share):
             terminated=ended & (number % 2 == 0),
             truncated=ended & (number % 2 == 1),
         )
-        return after, (state.x, after.x)
+        return after, after.terminated | after.truncated, (state.x, after.x)
 
     numbers = jnp.arange(length)
-    last, (before, after) = jax.jit(lambda *given: scan_restarting(env, step, *given))(
+    last, (before, after) = jax.jit(lambda *given: scan_restarting(jax.vmap(env.restart), step, *given))(
         states, (numbers, jnp.asarray(ends))
     )
     for row in range(count):
@@ -212,9 +207,9 @@ def test_starts_differ_between_environments_and_blocks():
     states = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), count))
 
     def step(state, _):
-        return dataclasses.replace(state, terminated=jnp.ones(count, bool)), state.x
+        return state, jnp.ones(count, bool), state.x
 
-    _, begun = scan_restarting(env, step, states, jnp.arange(length))
+    _, begun = scan_restarting(jax.vmap(env.restart), step, states, jnp.arange(length))
     assert len(np.unique(begun)) == count * 3, "the first states, and one start for each of two blocks"
     np.testing.assert_array_equal(begun[2:17], np.broadcast_to(begun[1], (15, count)))
 
@@ -222,32 +217,25 @@ def test_starts_differ_between_environments_and_blocks():
 def test_metrics_are_those_of_a_plain_loop():
     """Means over all steps, and over the last steps of episodes; what is not finite is left out and counted."""
     env, count, length = BadRewards(), 6, 16
-    states = jax.vmap(env.reset)(jax.random.split(jax.random.key(3), count))
-    states = dataclasses.replace(
-        states, metrics=states.metrics | {"length": jnp.arange(count, dtype=jnp.float32) * 2.0}
-    )
-    decide = lambda key, obs, memory: (  # noqa: E731
-        Decision(*[jnp.zeros((count, 1))] * 2, jnp.zeros(count)),
-        jax.random.normal(key, (count, 1)),
-        memory,
-    )
-    _, rollout, tally = jax.jit(
-        lambda state: collect(env, state, jax.random.key(4), decide, lambda obs, _: obs["critic"][..., 0], length)
-    )(states)
-    metrics = tally.metrics()
+    config = dataclasses.replace(SMALL, num_envs=count, rollout_length=length, minibatches=1)
+    state = make_train(env, config).init(jax.random.key(3))
+    lengths = jnp.arange(count, dtype=jnp.float32) * 2.0
+    begin = dataclasses.replace(state.env_state, metrics=state.env_state.metrics | {"length": lengths})
+    state = dataclasses.replace(state, env_state=begin)
+    _, rollout, metrics = jax.jit(lambda state: ppo.collect_rollout(env, config, state))(state)
     everywhere, ended, final, broken, reward = [], 0, [], 0, []
-    fresh = jax.vmap(env.restart)(states, jnp.ones(count, bool))
-    state = jax.vmap(env.restart)(states, jnp.zeros(count, bool))
-    for key in jax.random.split(jax.random.key(4), length):
-        state = jax.vmap(env.step)(state, decide(key, state.obs, None)[1])
+    fresh = jax.vmap(env.restart)(begin, jnp.ones(count, bool))
+    now = jax.vmap(env.restart)(begin, jnp.zeros(count, bool))
+    for action in rollout.decision.action:
+        now = jax.vmap(env.step)(now, jnp.clip(action, -1, 1))
         for row in range(count):
-            value = float(state.reward[row])
+            value = float(now.reward[row])
             broken, reward = broken + (not np.isfinite(value)), [*reward, value if np.isfinite(value) else 0.0]
-            error = float(state.metrics["error"][row])
+            error = float(now.metrics["error"][row])
             everywhere.append(error if np.isfinite(error) else 0.0)
-            if state.terminated[row] or state.truncated[row]:
-                ended, final = ended + 1, [*final, float(state.metrics["length"][row])]
-        state = jax.vmap(choose)(state.terminated | state.truncated, fresh, state)
+            if now.terminated[row] or now.truncated[row]:
+                ended, final = ended + 1, [*final, float(now.metrics["length"][row])]
+        now = jax.vmap(choose)(now.terminated | now.truncated, fresh, now)
     assert ended > 3 and broken > 3, "the test tests less than it says"
     assert float(metrics["episodes"]) == ended and float(metrics["nonfinite_rewards"]) == broken
     np.testing.assert_allclose(metrics["step/error"], np.mean(everywhere), rtol=1e-4)

@@ -10,12 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dexsim.core.errors import ConfigError
+from dexsim.core.layout import LayoutEntry
 from dexsim_ppo.learner import adam, distribution, running_stats
 from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.gae import compute_gae
 from dexsim_ppo.learner.networks import apply_mlp, elu, init_mlp, rescale_output
 from dexsim_ppo.learner.running_stats import RunningStats, init_stats, make_normalizer, merge_moments, normalize
-from dexsim_ppo.learner.types import Field
 from dexsim_ppo.learner.update import adapt_learning_rate
 
 
@@ -139,7 +139,7 @@ class TestRunningStats:
 
     def test_recovered_statistics_give_the_normaliser_back_and_hardly_change(self):
         fields, given = (
-            (Field("x", 2, None),),
+            (LayoutEntry("x", 2, None),),
             RunningStats(jnp.int32(9), jnp.array([1.0, -2.0]), jnp.array([4.0, 0.25])),
         )
         normalizer = make_normalizer(given, fields, std_floor=0.5, clip=3.0)
@@ -168,7 +168,7 @@ class TestRunningStats:
         np.testing.assert_allclose(stats.variance, [1, 1])
 
     def test_fixed_scale_floor_and_clip(self):
-        fields = (Field("angle", 1, None), Field("touch", 1, 4.0), Field("still", 1, None))
+        fields = (LayoutEntry("angle", 1, None), LayoutEntry("touch", 1, 4.0), LayoutEntry("still", 1, None))
         stats = RunningStats(jnp.int32(9), jnp.array([1.0, 7.0, 3.0]), jnp.array([4.0, 0.1, 0.0]))
         normalizer = make_normalizer(stats, fields, std_floor=0.01, clip=5.0)
         z = normalize(normalizer, jnp.array([3.0, 8.0, 3.005]))

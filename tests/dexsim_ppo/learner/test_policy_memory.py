@@ -15,12 +15,10 @@ from dexsim_ppo.learner import ppo
 from dexsim_ppo.learner.adapter import adapt
 from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.loss import actor_mean, critic_value
-from dexsim_ppo.learner.memory import GRU, init_memory, remember
+from dexsim_ppo.learner.memory import GRU, step_memory
 from dexsim_ppo.learner.networks import Layer
-from dexsim_ppo.policy import Policy
+from dexsim_ppo.policy import Policy, load_policy
 from dexsim_ppo.training.fine_tune import check_fit, fine_tuning_config, initialize_from
-
-KINDS = ("history", "gru")
 
 
 @functools.cache
@@ -42,11 +40,11 @@ def experience(kind):
     @jax.jit
     def collect(state):
         normalizers = ppo.make_normalizers(env, config, state.observation_stats)
-        after, rollout, _ = ppo.collect_rollout(env, config, state, normalizers, jax.random.key(1))
+        after, rollout, _ = ppo.collect_rollout(env, config, state)
         samples, params, *_ = ppo.prepare(config, state.value_stats, {}, state.params, rollout)
         samples = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), samples)  # the blocks, one after another
-        mean = actor_mean(config, params, normalizers, samples.obs, samples.memory, samples.first)
-        value = critic_value(config, params, normalizers, samples.obs, samples.memory)
+        mean = actor_mean(config, params, normalizers, samples.obs, samples.carry, samples.first)
+        value = critic_value(config, params, normalizers, samples.obs, samples.carry)
         return after, rollout, samples, mean, value
 
     return jax.device_get(collect(state))
@@ -58,7 +56,7 @@ def policy_of(kind):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["none", *KINDS])
+@pytest.mark.parametrize("kind", ["none", "gru"])
 def test_what_was_shown_once_is_recalled_only_with_memory(kind):
     env, policy = policy_of(kind)
     report = evaluate_policy(policy, env=env, episodes=256, chunk=256, baseline=False)
@@ -68,31 +66,28 @@ def test_what_was_shown_once_is_recalled_only_with_memory(kind):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
-def test_the_update_begins_with_the_actions_probabilities_of_the_rollout(kind):
-    _, _, samples, mean, value = experience(kind)
+def test_the_update_begins_with_the_actions_probabilities_of_the_rollout():
+    _, _, samples, mean, value = experience("gru")
     np.testing.assert_allclose(mean, samples.decision.mean, atol=1e-5)
     np.testing.assert_allclose(value, samples.value, atol=1e-4)
     assert np.std(mean) > 0.2, "actions that differ"
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_every_episode_begins_with_an_empty_memory_and_only_then(kind):
-    (_, last), rollout, *_ = experience(kind)
+def test_every_episode_begins_with_an_empty_memory_and_only_then():
+    (_, last), rollout, *_ = experience("gru")
     ended = rollout.terminated | rollout.truncated
-    later = np.concatenate([rollout.memory[1:], last[None]])
+    later = np.concatenate([rollout.carry[1:], last[None]])
     assert 0 < ended.sum() < ended.size and ended[:-1].any(), "episodes that end within the rollout"
     assert not later[ended].any()
     assert np.abs(later[~ended]).max(-1).min() > 0
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_the_value_after_a_step_is_that_of_the_true_next_observation(kind):
+def test_the_value_after_a_step_is_that_of_the_true_next_observation():
     """With what was remembered then, at an episode's end too: there the observation is zero, not that of a start."""
-    env, config, state = trained(kind)
-    _, rollout, *_ = experience(kind)
+    env, config, state = trained("gru")
+    _, rollout, *_ = experience("gru")
     normalizers = ppo.make_normalizers(env, config, state.observation_stats)
-    memory = jax.vmap(lambda memory, obs: policy_of(kind)[1].act(memory, obs)[0])(rollout.memory, rollout.obs["actor"])
+    memory = jax.vmap(lambda memory, obs: policy_of("gru")[1].act(memory, obs)[0])(rollout.carry, rollout.obs["actor"])
     value = critic_value(config, state.params, normalizers, {"critic": jnp.zeros_like(rollout.obs["critic"])}, memory)
     std = np.sqrt(state.value_stats.variance + 1e-6)
     np.testing.assert_allclose(rollout.next_value, state.value_stats.mean + std * value, atol=1e-4)
@@ -112,18 +107,9 @@ def test_a_gated_recurrent_unit_is_that_of_its_equations():
         )
         reset, update = (1 / (1 + np.exp(-given[k] - past[k])) for k in (0, 1))
         wanted.append(update * h[i] + (1 - update) * np.tanh(given[2] + reset * past[2]))
-    state, seen = remember(unit, jnp.float32(h), jnp.float32(x))
+    state, seen = step_memory(unit, jnp.float32(h), jnp.float32(x))
     np.testing.assert_allclose(state, wanted, atol=1e-6)
     np.testing.assert_array_equal(seen, np.append(np.float32(x), state))
-
-
-def test_a_history_is_the_last_observations_latest_first():
-    memory = init_memory(jax.random.key(0), PPOConfig(memory="history", memory_length=3), 2)
-    state, rows = jnp.zeros(4), np.arange(1.0, 11.0, dtype=np.float32).reshape(5, 2)
-    for i, x in enumerate(rows):
-        state, seen = remember(memory, state, x)
-        past = [rows[k] if k >= 0 else np.zeros(2) for k in (i, i - 1, i - 2)]
-        np.testing.assert_array_equal(seen, np.concatenate(past))
 
 
 def test_gradients_go_back_through_the_rollout():
@@ -133,7 +119,7 @@ def test_gradients_go_back_through_the_rollout():
     normalizers = ppo.make_normalizers(env, config, state.observation_stats)
 
     def last(obs, first):
-        return actor_mean(config, state.params, normalizers, {"actor": obs}, jnp.asarray(samples.memory), first)[
+        return actor_mean(config, state.params, normalizers, {"actor": obs}, jnp.asarray(samples.carry), first)[
             :, -1
         ].sum()
 
@@ -149,31 +135,27 @@ def test_minibatches_of_a_gru_are_whole_rollouts():
         PPOConfig(memory="gru", num_envs=8, minibatches=16)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_file_holds_the_memory(kind, tmp_path):
-    _, policy = policy_of(kind)
+def test_a_file_holds_the_memory(tmp_path):
+    _, policy = policy_of("gru")
     policy.save(tmp_path / "policy.msgpack")
-    again = Policy.load(tmp_path / "policy.msgpack")
+    again = load_policy(tmp_path / "policy.msgpack")
     obs = np.random.default_rng(0).normal(size=(5, 7, 2)).astype(np.float32)
-    one, other = policy.begin(7), again.begin(7)
+    one, other = policy.initial_carry(7), again.initial_carry(7)
     for x in obs:
         (one, action), (other, same) = policy.act(one, x), again.act(other, x)
         np.testing.assert_array_equal(action, same)
-    assert again.begin().shape == one.shape[1:] and np.abs(one).max() > 0
-    with pytest.raises(ConfigError, match=r"^this policy has a memory: .*policy\.act"):
-        again(obs[0])
+    assert again.initial_carry().shape == one.shape[1:] and np.abs(one).max() > 0
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_fine_tuning_begins_with_it(kind):
-    env, policy = policy_of(kind)
-    config = fine_tuning_config(policy, dataclasses.replace(CONFIG, memory_length=2, memory_size=3))
+def test_fine_tuning_begins_with_it():
+    env, policy = policy_of("gru")
+    config = fine_tuning_config(policy, dataclasses.replace(CONFIG, memory_size=3))
     check_fit(policy, env, config)
     state = initialize_from(policy, config, ppo.make_train(env, config).init(jax.random.key(9)))
     again = Policy.from_training(env, config, state)
-    memory = jax.random.normal(jax.random.key(3), policy.begin(5).shape)
+    memory = jax.random.normal(jax.random.key(3), policy.initial_carry(5).shape)
     obs = jnp.ones((5, 2))
     for one, other in zip(policy.act(memory, obs), again.act(memory, obs), strict=True):
         np.testing.assert_allclose(one, other, atol=1e-5)
-    with pytest.raises(ConfigError, match="do not set --ppo.memory or its size"):
+    with pytest.raises(ConfigError, match="PPOConfig.memory = none: the policy has gru"):
         check_fit(policy, env, dataclasses.replace(config, memory="none"))

@@ -9,8 +9,9 @@ import tiny_train
 from tiny_train import PER_ITERATION
 
 from dexsim.core.errors import CheckpointError, ConfigError
-from dexsim_ppo import average, average_policies, checkpoint, train
-from dexsim_ppo.policy import Policy
+from dexsim_ppo import average, checkpoint, train
+from dexsim_ppo.average import average_policies
+from dexsim_ppo.policy import load_policy
 from dexsim_ppo.training.runlog import RunFolder
 
 QUICK = [*tiny_train.QUICK, "--seed", "3"]
@@ -22,16 +23,15 @@ def tiny_task(monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("memory", ["gru", "history"])
-def test_a_run_stands_for_the_policies_of_its_checkpoints(memory, tmp_path):
+def test_a_run_stands_for_the_policies_of_its_checkpoints(tmp_path):
     run = RunFolder(tmp_path / "a")
     policies = []
     for steps in (1, 3):  # Each time it ends it writes a checkpoint, and the policy as it is.
         begin = (
-            [*QUICK, "--ppo.memory", memory, "--run-dir", str(run.path)] if steps == 1 else ["--resume", str(run.path)]
+            [*QUICK, "--ppo.memory", "gru", "--run-dir", str(run.path)] if steps == 1 else ["--resume", str(run.path)]
         )
         assert train.main([*begin, "--steps", str(steps * PER_ITERATION)]) == 0
-        policies.append(Policy.load(run.last))
+        policies.append(load_policy(run.last))
 
     found = average.policies_of(run.path)
     assert [path.name for path in found] == ["00000001.msgpack", "00000003.msgpack"]
@@ -40,13 +40,12 @@ def test_a_run_stands_for_the_policies_of_its_checkpoints(memory, tmp_path):
         for a, b in zip(jax.tree.leaves(policy.params), jax.tree.leaves(copy.params), strict=True):
             np.testing.assert_array_equal(a, b)
 
-    for read in (run.last, run.checkpoint(3)):
-        with pytest.raises(ConfigError, match="is one of the averaged policies; give another file"):
-            average.main([str(run.path), "--output", str(read)])
+    with pytest.raises(ConfigError, match="name another file"):
+        average.main([str(run.path), "--output", str(run.last)])
     output = tmp_path / "average.msgpack"
     assert average.main([str(run.path), "--output", str(output)]) == 0
     wanted = average_policies(policies)
-    mean = Policy.load(output)
+    mean = load_policy(output)
     assert mean.training["average_of"] == [policy.training for policy in policies]
     for a, b in zip(jax.tree.leaves(mean.params), jax.tree.leaves(wanted.params), strict=True):
         np.testing.assert_array_equal(a, b)
@@ -70,10 +69,6 @@ def test_what_is_no_whole_run_is_refused(tmp_path, monkeypatch):
     run.last.write_bytes(RunFolder(tmp_path / "b").last.read_bytes())
     with pytest.raises(CheckpointError, match=r"00000001.msgpack: does not fit this configuration: \.params"):
         refused()
-    policy = Policy.load(tmp_path / "b" / "last.msgpack")
-    dataclasses.replace(policy, training={"ppo": {"num_envs": "many"}}).save(run.last)
-    with pytest.raises(CheckpointError, match="last.msgpack: does not say how it was trained; name policies"):
-        refused()
     run.last.write_bytes(last)
 
     # Weights that are no numbers, and a checkpoint that is cut short.
@@ -86,7 +81,7 @@ def test_what_is_no_whole_run_is_refused(tmp_path, monkeypatch):
 
     with (
         monkeypatch.context() as patch,
-        pytest.raises(CheckpointError, match="00000001.msgpack: holds no sound policy"),
+        pytest.raises(CheckpointError, match="00000001.msgpack: holds numbers that are not finite"),
     ):
         patch.setattr(checkpoint, "load", forged)
         refused()

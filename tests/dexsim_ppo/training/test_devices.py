@@ -14,7 +14,7 @@ import tiny_train
 from paths import ROOT
 
 from dexsim_ppo import checkpoint, train
-from dexsim_ppo.policy import Policy
+from dexsim_ppo.policy import load_policy
 from dexsim_ppo.training.runlog import RunFolder
 
 OPTIONS = [*tiny_train.QUICK, "--checkpoint-every", "5"]
@@ -85,25 +85,14 @@ def test_two_devices_train_and_one_goes_on(alone, tmp_path):
 
 
 @pytest.mark.slow
-def test_one_device_begins_and_two_go_on(alone, tmp_path):
-    half = ["--steps", str(ITERATIONS * 16 * 8 // 2)]
-    assert train.main([*OPTIONS, *half, "--run-dir", str(tmp_path / "run")]) == 0
-    run = start("--resume", tmp_path / "run", *STEPS, "--devices", 2, devices=2)
-    _, error = run.communicate(timeout=120)
-    assert run.returncode == 0, error
-    assert_same_training(RunFolder(tmp_path / "run"), alone)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("backend", ["jax", "warp"])
-def test_two_processes_train_as_one_and_the_first_alone_writes(backend, alone, tmp_path):
-    runs = start_two(*OPTIONS, *STEPS, "--backend", backend, "--run-dir", tmp_path / "run")
+def test_two_processes_train_as_one_and_the_first_alone_writes(alone, tmp_path):
+    runs = start_two(*OPTIONS, *STEPS, "--run-dir", tmp_path / "run")
     said = [run.communicate(timeout=120) for run in runs]
     assert [run.returncode for run in runs] == [0, 0], said
     folder = RunFolder(tmp_path / "run")
     assert_same_training(folder, alone)
     assert "report:" in said[0][0] and "report" not in said[1][0]
-    assert Policy.load(folder.last).training["iteration"] == ITERATIONS
+    assert load_policy(folder.last).training["iteration"] == ITERATIONS
     report = json.loads(folder.report.read_text())
     assert report["trained"]["return"]["value"] == pytest.approx(
         json.loads(alone.report.read_text())["trained"]["return"]["value"], rel=1e-2

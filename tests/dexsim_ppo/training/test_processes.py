@@ -1,8 +1,6 @@
 """What one process of several does and does not, with the others made up."""
 
 import os
-import subprocess
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -10,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from paths import ROOT
 
 from dexsim.core.errors import DexsimError
 from dexsim_ppo import checkpoint
@@ -55,7 +52,7 @@ def test_the_path_is_that_of_the_first_process(path, several, monkeypatch):
 
 def test_a_checkpoint_is_gathered_by_all_and_written_by_the_first(several, monkeypatch, tmp_path):
     gathered, written = [], []
-    monkeypatch.setattr(processes, "spanned", lambda tree: "mesh")
+    monkeypatch.setattr(processes, "mesh_of", lambda tree: "mesh")
     monkeypatch.setattr(processes, "copied", lambda tree, mesh: gathered.append(mesh) or tree)
     monkeypatch.setattr(checkpoint, "save", lambda path, **content: written.append((path, content["task"])))
     for index in range(3):
@@ -94,7 +91,7 @@ def test_processes_of_a_job_join_and_a_single_one_does_not(job, monkeypatch):
 
 def test_the_loss_of_another_process_is_one_line_and_other_errors_stay(several, tmp_path):
     def fail(text):
-        with processes.noticing_losses(tmp_path):
+        with processes.detect_lost_peer(tmp_path):
             raise ValueError(text)
 
     with pytest.raises(ValueError, match="Gloo"):
@@ -112,36 +109,12 @@ def test_the_loss_of_another_process_is_one_line_and_other_errors_stay(several, 
     [(DexsimError("a\nline"), "error: a line\n"), (ZeroDivisionError("why"), "ZeroDivisionError: why")],
 )
 def test_a_process_of_several_ends_at_once(error, said, monkeypatch, capsys):
-    with pytest.raises(type(error)), processes.leaving_at_once():
+    with pytest.raises(type(error)), processes.exit_on_error():
         raise error
     ended = []
     monkeypatch.setattr(jax.distributed, "is_initialized", lambda: True)
     monkeypatch.setattr(os, "_exit", ended.append)
-    with processes.leaving_at_once():
+    with processes.exit_on_error():
         raise error
     assert ended == [2]
     assert said in capsys.readouterr().err
-
-
-SCRIPT = """
-import os, sys
-from dexsim_ppo.training.processes import last_words
-try:
-    with last_words("error: resume with ..."):
-        {end}
-finally:
-    print("finally", flush=True)
-"""
-
-
-@pytest.mark.parametrize("end, said", [("os.abort()", True), ("pass", False), ("raise SystemExit(3)", False)])
-def test_only_a_process_that_is_ended_has_its_last_line_said(end, said):
-    done = subprocess.run(
-        [sys.executable, "-c", SCRIPT.format(end=end)],
-        env={"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin", "JAX_PLATFORMS": "cpu"},
-        capture_output=True,
-        text=True,
-        timeout=100,
-    )
-    assert ("error: resume with ..." in done.stderr.splitlines()) == said
-    assert ("finally" in done.stdout) != said

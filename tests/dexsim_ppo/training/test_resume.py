@@ -16,10 +16,10 @@ from paths import ROOT
 from tiny_env import TinyConfig
 from tiny_train import PER_ITERATION
 
-from dexsim.core.errors import CheckpointError, ConfigError
+from dexsim.core.errors import ConfigError
 from dexsim_ppo import checkpoint, train
-from dexsim_ppo.learner.curriculum import Curriculum
-from dexsim_ppo.policy import Policy
+from dexsim_ppo.learner.curriculum import CurriculumConfig
+from dexsim_ppo.policy import load_policy
 from dexsim_ppo.training import runlog, trainer
 from dexsim_ppo.training.arguments import check_resumed
 from dexsim_ppo.training.runlog import RunFolder
@@ -67,7 +67,7 @@ def test_what_would_change_the_training_is_refused_and_the_rest_applies(finished
     assert train.main(["--resume", str(finished.path), *same, *looks_on]) == 0
     report = json.loads(finished.report.read_text())
     assert report["seed"] == 3 and report["trained"]["episodes"] == 32
-    assert Policy.load(finished.last).training["iteration"] == 3
+    assert load_policy(finished.last).training["iteration"] == 3
     saved = checkpoint.load(finished.latest_checkpoint(), kind="train").content["arguments"]
     assert (saved["seed"], saved["log_every"], saved["evaluation_episodes"]) == (3, 2, 32)
 
@@ -80,7 +80,7 @@ def test_only_budget_and_what_looks_on_may_change(finished):
     other |= {"evaluation_share": 0.5, "evaluate_every": 5, "wandb": "mine"}
     other |= {"hand": "mine.toml", "deterministic": True}
     other |= {"run_dir": Path("x"), "resume": Path("x"), "video": True, "env": TinyConfig(gain=0.5)}
-    other |= {"ppo": dataclasses.replace(saved.ppo, discount=0.5), "curriculum": Curriculum(on=True)}
+    other |= {"ppo": dataclasses.replace(saved.ppo, discount=0.5), "curriculum": CurriculumConfig(on=True)}
     allowed = set()
     for field in dataclasses.fields(saved):
         value = other.get(field.name, 77)
@@ -128,7 +128,7 @@ def test_an_older_checkpoint_is_resumed_for_good(finished):
     content = later.read_bytes()
     assert train.main(["--resume", str(first), "--steps", str(3 * PER_ITERATION), "--keep-checkpoints", "1"]) == 0
     assert finished.latest_checkpoint() == finished.checkpoint(3)
-    assert (finished.checkpoints / "00000002.aside.msgpack").read_bytes() == content
+    assert (finished.checkpoints / "00000002.aside1.msgpack").read_bytes() == content
 
 
 @pytest.mark.slow
@@ -136,20 +136,12 @@ def test_the_best_policy_of_a_course_that_is_left_is_kept_and_not_reported(tmp_p
     often = ["--evaluate-every", "1", "--evaluation-share", "1", "--checkpoint-every", "1", "--run-dir"]
     assert train.main([*QUICK, "--steps", str(3 * PER_ITERATION), *often, str(tmp_path / "a")]) == 0
     folder = RunFolder(tmp_path / "a")
-    Policy.load(folder.last).save(folder.best)  # the third iteration's, as if it had the highest return
+    load_policy(folder.last).save(folder.best)  # the third iteration's, as if it had the highest return
     content = folder.best.read_bytes()
     no_more = ["--evaluate-every", "0", "--steps", str(PER_ITERATION)]
     assert train.main(["--resume", str(folder.checkpoint(1)), *no_more]) == 0
-    assert (folder.path / "best.aside.msgpack").read_bytes() == content
+    assert (folder.path / "best.aside1.msgpack").read_bytes() == content
     assert json.loads(folder.report.read_text())["origin"]["iteration"] == 1
-
-
-def test_an_average_in_the_place_of_the_best_policy_is_reported(finished):
-    origin = {"average_of": [{"iteration": 1}, {"iteration": 2}]}
-    dataclasses.replace(Policy.load(finished.last), training=origin).save(finished.best)
-    assert train.main(["--resume", str(finished.path), "--steps", str(3 * PER_ITERATION)]) == 0
-    report = json.loads(finished.report.read_text())
-    assert report["origin"] == origin and report["policy"] == "best.msgpack"
 
 
 def test_a_best_policy_that_is_set_aside_is_none_to_beat(tmp_path, monkeypatch):
@@ -159,9 +151,9 @@ def test_a_best_policy_that_is_set_aside_is_none_to_beat(tmp_path, monkeypatch):
     often = ["--evaluate-every", "1", "--evaluation-share", "1", "--checkpoint-every", "1", "--run-dir"]
     assert train.main([*QUICK, "--steps", str(2 * PER_ITERATION), *often, str(tmp_path / "a")]) == 0
     folder = RunFolder(tmp_path / "a")
-    assert Policy.load(folder.best).training["iteration"] == 2
+    assert load_policy(folder.best).training["iteration"] == 2
     assert train.main(["--resume", str(folder.checkpoint(1)), "--steps", str(3 * PER_ITERATION)]) == 0
-    assert (folder.path / "best.aside.msgpack").exists() and Policy.load(folder.best).training["iteration"] == 2
+    assert (folder.path / "best.aside1.msgpack").exists() and load_policy(folder.best).training["iteration"] == 2
     assert json.loads(folder.report.read_text())["policy"] == "best.msgpack"
 
 
@@ -169,7 +161,7 @@ def test_a_checkpoint_is_resumed_from_within_its_folder_and_not_from_elsewhere(f
     lonely = tmp_path / "x" / "y" / "00000002.msgpack"
     lonely.parent.mkdir(parents=True)
     lonely.write_bytes(finished.latest_checkpoint().read_bytes())
-    with pytest.raises(ConfigError, match="is not in the checkpoints of a run; .*/x has no config.json"):
+    with pytest.raises(ConfigError, match="/x has no config.json"):
         train.main(["--resume", str(lonely)])
     assert [path.name for path in (tmp_path / "x").iterdir()] == ["y"]
     monkeypatch.chdir(finished.checkpoints)
@@ -184,7 +176,7 @@ def contents(folder):
 def test_a_run_that_another_process_trains_is_left_alone(finished):
     before, further = contents(finished), ["--resume", str(finished.path), "--steps", str(3 * PER_ITERATION)]
     script = f"import sys; from pathlib import Path; from {RunFolder.__module__} import RunFolder\n"
-    script += "with RunFolder(Path(sys.argv[1])).locked(): print(flush=True); sys.stdin.read()"
+    script += "with RunFolder(Path(sys.argv[1])).lock(): print(flush=True); sys.stdin.read()"
     other = subprocess.Popen(
         [sys.executable, "-c", script, str(finished.path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=ROOT
     )
@@ -197,24 +189,9 @@ def test_a_run_that_another_process_trains_is_left_alone(finished):
         other.kill()  # What a killed process held is free.
         other.communicate()
     assert train.main(further) == 0
-    assert Policy.load(finished.last).training["iteration"] == 3
-
-
-def test_a_run_without_its_untrained_policy_is_refused_before_it_trains(finished):
-    finished.untrained.unlink()
-    before = contents(finished)
-    with pytest.raises(ConfigError, match=r"--resume .*00000002\.msgpack: .*/a has no untrained\.msgpack"):
-        train.main(["--resume", str(finished.path), "--steps", str(3 * PER_ITERATION)])
-    assert contents(finished) == before
-
-
-def test_options_of_a_run_leave_no_room_for_a_preset(finished):
-    with pytest.raises(ConfigError, match="leave --preset out"):
-        train.main(["--config", str(finished.path), "--preset", "cpu"])
+    assert load_policy(finished.last).training["iteration"] == 3
 
 
 def test_python_takes_paths_and_words_alike(finished, tmp_path):
-    with pytest.raises(CheckpointError, match=r"Policy\(task='tiny'.*: give a policy's file, or the name of a shipped"):
-        train.train_policy(policy=Policy.load(finished.last), steps=PER_ITERATION)
     tuned = train.train_policy(policy=finished.last, steps=PER_ITERATION, run_dir=str(tmp_path / "tuned"), video=False)
     assert tuned.folder == tmp_path / "tuned" and tuned.report["arguments"]["policy"] == str(finished.last)

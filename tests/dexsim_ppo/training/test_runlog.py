@@ -1,6 +1,5 @@
 """Where metrics go, and that the learning curve says what it shows, in words and units."""
 
-import importlib.util
 import json
 import sys
 import threading
@@ -8,15 +7,14 @@ import types
 
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
-import numpy as np
 import pytest
 from tiny_env import SMALL, TinyConfig
 
-from dexsim.core.errors import CheckpointError, ConfigError
+from dexsim.core.errors import CheckpointError, DexsimError
+from dexsim.core.layout import LayoutEntry
 from dexsim_ppo.acting import PolicyParams
 from dexsim_ppo.learner.networks import Layer
 from dexsim_ppo.learner.running_stats import Normalizer
-from dexsim_ppo.learner.types import Field
 from dexsim_ppo.policy import Policy
 from dexsim_ppo.training import runlog
 from dexsim_ppo.training.arguments import TrainArguments
@@ -30,7 +28,7 @@ def figure(tmp_path, monkeypatch):
     monkeypatch.setattr(plt, "close", drawn.append)
 
     def draw(rows):
-        runlog.draw_curve(rows, tmp_path / "curve.png", "grasp")
+        runlog.draw_curve([rows], tmp_path / "curve.png", "grasp")
         return drawn[-1] if drawn else None
 
     return draw
@@ -58,19 +56,15 @@ def test_evaluations_are_marked_and_unknown_errors_are_named(figure):
     assert list(mark.get_ydata()) == [7.0]
 
 
+def test_a_curve_of_several_seeds_has_a_line_for_each(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(plt, "close", drawn.append)
+    runlog.draw_curve([[row(1), row(2)], [row(1), row(2), row(3)]], tmp_path / "curve.png", "grasp")
+    assert [len(line.get_xdata()) for line in drawn[0].axes[0].lines] == [2, 3]
+
+
 def test_nothing_to_show_draws_nothing(figure):
     assert figure([{"iteration": 1, "env_steps": 1}]) is None
-
-
-def test_the_time_is_above_the_steps(figure):
-    """Half a million steps take a minute."""
-    axes = figure([row(i, **{"episode/success": 1.0}) for i in (1, 2, 3)]).axes
-    (above,) = axes[0].child_axes
-    assert above.get_xlabel() == "elapsed [min]"
-    to_minutes, to_steps = above._functions
-    assert [float(to_minutes(x)) for x in (0.5, 1.25)] == [1.0, 2.5] and float(to_steps(2.5)) == 1.25
-    assert axes[1].get_ylim()[0] < 0 and axes[1].get_ylim()[1] > 1, "a line at 0 or 1 is not on the frame"
-    assert not figure([row(1)]).axes[0].child_axes, "one point has no rate"
 
 
 def test_checkpoints_are_listed_oldest_first_and_the_newest_are_kept(tmp_path):
@@ -96,7 +90,7 @@ def policy_after(iteration):
     """A small policy that was saved after so many iterations."""
     layer = Layer(jnp.zeros((2, 1)), jnp.zeros(1))
     params = PolicyParams((layer,), Normalizer(jnp.zeros(2), jnp.ones(2), 5.0))
-    layout, training = (Field("joint_position", 2, None),), {"iteration": iteration}
+    layout, training = (LayoutEntry("joint_position", 2, None),), {"iteration": iteration}
     return Policy(
         task="tiny", env_config={}, observation_layout=layout, params=params, control_rate=20.0, training=training
     )
@@ -115,8 +109,8 @@ def test_what_is_set_aside_is_never_replaced(tmp_path):
         folder.set_aside(6)
         assert not folder.best.exists() and folder.existing_checkpoints() == [folder.checkpoint(4)]
     kept = {path.name: path.read_text() for path in folder.checkpoints.glob("00000008.*")}
-    assert kept == {f"00000008.aside{n}.msgpack": c for n, c in (("", "first"), (1, "second"), (2, "third"))}
-    assert {path.name for path in tmp_path.glob("best*")} == {f"best.aside{n}.msgpack" for n in ("", 1, 2)}
+    assert kept == {f"00000008.aside{n}.msgpack": c for n, c in ((1, "first"), (2, "second"), (3, "third"))}
+    assert {path.name for path in tmp_path.glob("best*")} == {f"best.aside{n}.msgpack" for n in (1, 2, 3)}
 
 
 def test_a_full_disk_does_not_cost_the_metrics_so_far(tmp_path, monkeypatch):
@@ -131,14 +125,12 @@ def test_a_full_disk_does_not_cost_the_metrics_so_far(tmp_path, monkeypatch):
     assert [row["iteration"] for row in read_metrics(folder.metrics)] == [2, 4]
 
 
-@pytest.mark.parametrize("line", ["3", "[]", "{}", '{"iteration": "two"}', '{"iterat', "\xff"])
-def test_a_line_without_metrics_is_named_and_not_dropped_with_those_after_it(tmp_path, line):
+def test_a_line_without_metrics_is_named_and_not_dropped_with_those_after_it(tmp_path):
     file = RunFolder(tmp_path).metrics
-    content = '{"iteration": 2}\n' + line + '\n{"iteration": 4}\n'
-    file.write_text(content, encoding="latin-1")
+    file.write_text(content := '{"iteration": 2}\n{"iterat\n{"iteration": 4}\n')
     with pytest.raises(CheckpointError, match="metrics.jsonl: line 2 holds no metrics"):
         MetricsLog(RunFolder(tmp_path), 2, TrainArguments(env=TinyConfig(), ppo=SMALL))
-    assert file.read_text(encoding="latin-1") == content
+    assert file.read_text() == content
 
 
 class Writer:
@@ -210,23 +202,7 @@ def test_metrics_go_to_weights_and_biases(tmp_path, monkeypatch):
 
 
 def test_weights_and_biases_are_asked_for_before_training_begins(monkeypatch):
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setitem(sys.modules, "wandb", None)
     runlog.check_wandb("")
-    with pytest.raises(ConfigError, match="--wandb hands: install the extra"):
+    with pytest.raises(DexsimError, match=r"--wandb hands needs wandb: .*\[wandb\]"):
         runlog.check_wandb("hands")
-
-
-def test_a_parent_that_is_no_folder_is_told_and_not_tried_for_ever(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "runs").symlink_to(tmp_path / "gone")
-    with pytest.raises(ConfigError, match="runs: is no folder; give another place with --run-dir"):
-        runlog.new_folder(None, "grasp")
-
-
-def test_the_elapsed_minutes_lie_within_the_curve_and_apart(figure):
-    """Before the first iteration a run compiles: its clock does not begin at zero."""
-    axes = figure([row(i) | {"seconds": 300.0 + 9.0 * i} for i in range(1, 146)]).axes
-    (above,) = axes[0].child_axes
-    marks = above.get_xticks()
-    assert len(marks) >= 3 and marks[0] >= 309 / 60 and marks[-1] <= (300 + 9 * 145) / 60
-    assert np.diff(marks).min() > 1.0

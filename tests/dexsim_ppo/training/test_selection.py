@@ -35,12 +35,12 @@ def run(tmp_path, monkeypatch):
 def evaluate(run, monkeypatch, *returns):
     """Evaluate one policy after another; the iterations whose policy became the best."""
     saved = []
-    display = types.SimpleNamespace(note=lambda _: None)
+    display = types.SimpleNamespace(note=lambda _: None, working=lambda _: None)
     for iteration, value in enumerate(returns):
         policy = types.SimpleNamespace(params=None, save=lambda path, i=iteration: saved.append((i, path)))
         monkeypatch.setattr(run, "_policy", lambda _, policy=policy: policy)
         run.returns.append(value)
-        run.evaluate(None, iteration, display)
+        run._evaluate(None, iteration, display)
     assert all(path == run.folder.best for _, path in saved)
     return [i for i, _ in saved]
 
@@ -52,25 +52,27 @@ def test_the_best_policy_is_the_one_with_the_highest_return(run, monkeypatch):
 
 def test_training_ends_after_evaluations_in_a_row_without_a_better_return(run, monkeypatch):
     evaluate(run, monkeypatch, 3.0, 2.0, 4.0, 1.0)
-    assert not run.is_over(8)
+    assert not run._is_over(8)
     evaluate(run, monkeypatch, 4.0)
-    assert run.is_over(8)
+    assert run._is_over(8)
     run.arguments = dataclasses.replace(ARGUMENTS, patience=0)
-    assert not run.is_over(8)
+    assert not run._is_over(8)
 
 
 def test_evaluations_keep_to_their_share_of_the_time(run, monkeypatch):
     """A tenth of 100 s: one evaluation must leave room for the one at the end."""
     rate = 10 * 32 / 4.0  # by which an evaluation is expected to take 4 s: of the two, 8 s
-    assert run.is_evaluation_due(2, rate) and not run.is_evaluation_due(3, rate)
-    assert not run.is_evaluation_due(2, rate / 1.5)  # 12 s
+    assert run._is_evaluation_due(2, rate) and not run._is_evaluation_due(3, rate)
+    assert not run._is_evaluation_due(2, rate / 1.5)  # 12 s
     run.takes = 60.0  # compilation
     evaluate(run, monkeypatch, 1.0)
-    assert not run.is_evaluation_due(4, rate)  # 4 s are spent, and two more would make it 12
-    assert run.is_evaluation_due(4, 2 * rate)  # 2 s each
+    assert not run._is_evaluation_due(4, rate)  # 4 s are spent, and two more would make it 12
+    assert run._is_evaluation_due(4, 2 * rate)  # 2 s each
     run.takes = 1.0
     evaluate(run, monkeypatch, 1.0, 1.0)
-    assert run.is_evaluation_due(4, rate) and not run.is_evaluation_due(4, rate / 2)  # 4 + 1 + 1 + 2 s, 8 + 1 + 1 + 2 s
+    assert run._is_evaluation_due(4, rate) and not run._is_evaluation_due(
+        4, rate / 2
+    )  # 4 + 1 + 1 + 2 s, 8 + 1 + 1 + 2 s
 
 
 def test_patience_needs_evaluations():

@@ -14,11 +14,10 @@ from tiny_env import SMALL, TinyConfig, TinyEnv
 
 from dexsim.core.pytree import pytree_dataclass
 from dexsim_ppo import checkpoint, train
-from dexsim_ppo.learner.curriculum import Curriculum
 from dexsim_ppo.training import trainer
 from dexsim_ppo.training.arguments import TrainArguments
 from dexsim_ppo.training.runlog import RunFolder, means
-from dexsim_ppo.training.trainer import Run, surely_better
+from dexsim_ppo.training.trainer import Run, significantly_better
 
 CONFIG = dataclasses.replace(SMALL, iterations_per_call=2)
 PER_ITERATION = 64
@@ -62,9 +61,9 @@ def loop(tmp_path, monkeypatch):
             clock.now += SAVE_S
             found.saved.append((iteration, int(state.iteration)))
 
-        monkeypatch.setattr(found, "evaluate", evaluate)
-        monkeypatch.setattr(found, "save", save)
-        display = SimpleNamespace(note=found.notes.append, show=found.shown.append)
+        monkeypatch.setattr(found, "_evaluate", evaluate)
+        monkeypatch.setattr(found, "_save", save)
+        display = SimpleNamespace(note=found.notes.append, show=found.shown.append, working=lambda text: None)
         state = State(jnp.int32(first), jnp.int32(0))
         log = SimpleNamespace(write=found.logged.append)
         found._loop(state, step, display, log, lambda: len(calls) >= stop_after)
@@ -122,15 +121,6 @@ def test_the_rate_leaves_out_evaluations_checkpoints_and_the_first_call(loop):
     assert run.clock["env_steps_per_s"] == 6 * PER_ITERATION / (3 * STEP_S)
 
 
-def test_the_first_budget_that_is_used_up_ends_it(loop):
-    run = loop(steps=4 * PER_ITERATION, minutes=2.0)
-    run.started = trainer.time.perf_counter() - 90.0
-    assert run.seconds_left(2, 100.0) == pytest.approx(2 * PER_ITERATION / 100.0)
-    assert run.seconds_left(2, 0.1) == pytest.approx(30.0)
-    run.arguments = dataclasses.replace(run.arguments, steps=0.0, minutes=0.0)
-    assert run.seconds_left(2, 100.0) == float("inf")
-
-
 def test_minutes_count_from_the_start_of_the_run(loop):
     assert loop(minutes=(30.0 + 3 * STEP_S) / 60).saved == both(6)
 
@@ -153,7 +143,10 @@ def test_the_best_policy_so_far_is_kept(tmp_path, monkeypatch):
     run.evaluator = evaluator
     monkeypatch.setattr(run, "_policy", lambda state: SimpleNamespace(params=state))
     monkeypatch.setattr(run, "_write_policy", lambda policy, path: written.append((policy.params, path)))
-    rows = [run.evaluate(f"state {i}", i, SimpleNamespace(note=notes.append)) for i in (1, 2, 3, 4)]
+    rows = [
+        run._evaluate(f"state {i}", i, SimpleNamespace(note=notes.append, working=lambda text: None))
+        for i in (1, 2, 3, 4)
+    ]
     assert rows[2] == {
         "evaluation/turns (median)": 17.0,
         "evaluation/kept": 0.5,
@@ -172,25 +165,7 @@ def test_better_needs_the_other_interval_to_be_wholly_below():
     entry = lambda low, value, high: {"low": low, "value": value, "high": high}  # noqa: E731
     trained = {name: entry(1.5, 2.0, 3.0) for name in ("held", "return", "steps_held")}
     untrained = {"held": entry(0.0, 1.0, 1.6), "return": entry(0.0, 1.0, 1.5), "steps_held": entry(0.0, 1.0, 1.4)}
-    assert surely_better(trained, untrained) == {"held": False, "return": False, "steps_held": True}
-
-
-def test_whatever_the_program_depends_on_identifies_it(tmp_path):
-    """And a step over several devices, or of an environment that cannot say what it is, has no identity."""
-    arguments = TrainArguments(env=TinyConfig(), ppo=CONFIG, curriculum=Curriculum(on=True))
-    run = Run(TinyEnv(), arguments, RunFolder(tmp_path), 0.0)
-    assert run.identity() is None
-    run.env.fingerprint = lambda: "hand and task"
-    found = [run.identity()]
-    run.env.fingerprint = lambda: "another hand"
-    found.append(run.identity())
-    run.config = dataclasses.replace(CONFIG, discount=0.5)
-    found.append(run.identity())
-    run.arguments = dataclasses.replace(arguments, curriculum=Curriculum(on=True, step=0.5))
-    found.append(run.identity())
-    assert len({json.dumps(one) for one in found}) == 4
-    run.mesh = SimpleNamespace(size=2)
-    assert run.identity() is None
+    assert significantly_better(trained, untrained) == {"held": False, "return": False, "steps_held": True}
 
 
 @pytest.mark.parametrize(("own", "backend"), [(False, "jax"), (True, "jax"), (True, "warp")])
@@ -238,7 +213,7 @@ def test_a_resumed_run_goes_on_with_its_best_its_time_and_as_many_checkpoints(tm
     assert progress["best"] == {"return": best["evaluation/return"], "iteration": best["iteration"]}
     assert progress["seconds"] >= rows[-1]["seconds"] > 0
     # As if it had been better, and taken longer.
-    load, progress = checkpoint.load, {"best": {"return": 1e9, "iteration": 1}, "seconds": 5000.0}
+    load, progress = checkpoint.load, {"best": {"return": 1e9, "iteration": 1}, "seconds": 5000.0, "without_better": 0}
     doctored = lambda *a, **options: (  # noqa: E731
         dataclasses.replace(found := load(*a, **options), content=found.content | {"progress": progress})
     )

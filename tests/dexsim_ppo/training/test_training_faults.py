@@ -2,22 +2,16 @@
 
 import dataclasses
 import re
-import types
 
-import jax
 import jax.numpy as jnp
-import numpy as np
 import pytest
 import tiny_train
-from tiny_env import SMALL, TinyConfig, TinyEnv
+from tiny_env import TinyConfig, TinyEnv
 
 from dexsim.core.errors import DexsimError
 from dexsim_ppo import checkpoint, reproduce, train
-from dexsim_ppo.learner.config import PPOConfig
-from dexsim_ppo.learner.ppo import make_train
 from dexsim_ppo.training.display import Display
-from dexsim_ppo.training.faults import Faults
-from dexsim_ppo.training.runlog import RunFolder, read_metrics
+from dexsim_ppo.training.runlog import RunFolder
 
 QUICK = [*tiny_train.QUICK, *"--ppo.minibatches 2 --ppo.epochs 1 --seed 3 --log-every 1".split()]
 GOOD_ITERATIONS = 3
@@ -58,20 +52,6 @@ def install(patch, env_class):
     patch.setattr("dexsim.make", make, raising=False)
 
 
-def test_only_what_was_lost_in_a_call_counts(tmp_path):
-    """One bad call, then good ones: the total of skipped updates stays, and no training is called diverged."""
-    config = PPOConfig(epochs=2, minibatches=2)
-    state = types.SimpleNamespace(skipped_updates=0, iteration=0)
-    faults = Faults(config, RunFolder(tmp_path), {}, state)
-    faults._write = lambda before, lost: ""  # a reproducer needs a whole state
-    notes = []
-    for iteration in range(1, 40):
-        total = min(iteration - 1, 1) * 4
-        found = faults.check(state, {"skipped_updates": np.array([total])}, iteration, notes.append)
-        assert found["skipped_updates"] == total
-    assert len(notes) == 1 and notes[0].startswith("iteration 2: 4 of 4 updates skipped")
-
-
 @pytest.fixture
 def diverged(tmp_path, monkeypatch, capsys):
     """Folder, error and output of a run that diverges."""
@@ -80,19 +60,6 @@ def diverged(tmp_path, monkeypatch, capsys):
     with pytest.raises(DexsimError) as error:
         train.main([*QUICK, "--minutes", "5", "--run-dir", str(folder.path), "--checkpoint-every", "1"])
     return folder, str(error.value), capsys.readouterr().out
-
-
-@pytest.mark.slow
-def test_skipped_updates_are_shown_as_they_happen(diverged):
-    folder, _, shown = diverged
-    rows = read_metrics(folder.metrics)
-    assert [row["skipped_updates"] for row in rows[:GOOD_ITERATIONS]] == [0] * GOOD_ITERATIONS
-    last = rows[-1]
-    assert last["skipped_updates"] > 0 and last["updates"] == 2 * last["iteration"]
-    assert f"skipped updates {last['skipped_updates']:.0f} of {last['updates']:.0f}" in shown
-    assert shown.count("updates skipped, their gradient is not finite") == 1, "said once, not at each iteration"
-    quiet = Display("x")._cells({name: value for name, value in rows[0].items() if value is not None})
-    assert not any("skipped" in name or "rewards" in name for name in quiet)
 
 
 def test_the_error_names_a_checkpoint_that_is_from_before(diverged):
@@ -127,39 +94,6 @@ def test_the_fault_can_be_replayed(diverged, capsys):
     # What follows from it comes later: the integrator takes the NaN action that the policy makes of it.
     assert re.search(r"critic observation 'position': .* first at step 1", out)
     assert "critic observation 'target'" not in out
-
-
-@pytest.mark.slow
-def test_a_fault_that_is_gone_is_not_reproduced(diverged, monkeypatch, capsys):
-    folder, *_ = diverged
-    (file,) = folder.path.glob("reproduce-*.msgpack")
-    mended = type("Mended", (Breaks,), {"share": 9.0})
-    install(monkeypatch, mended)
-    reproduced = reproduce.main([str(file)])
-    out = capsys.readouterr().out
-    # The state itself already holds the first NaN observation.
-    assert reproduced == 0 and "before it: state.env_state.obs['actor']" in out
-
-
-class Unpaid(TinyEnv):
-    """The reward of every move to the right is NaN."""
-
-    def step(self, state, action):
-        state = super().step(state, action)
-        return dataclasses.replace(state, reward=jnp.where(action[0] > 0, jnp.nan, state.reward))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_the_replay_takes_the_actions_of_the_training(seed):
-    """Which rewards are NaN depends on the actions, so on the random numbers: training counts as many."""
-    env = Unpaid()
-    training = make_train(env, SMALL)
-    state = training.init(jax.random.key(seed))
-    found = list(reproduce.findings(env, SMALL, state))
-    (count,) = map(int, training.step(state)[1]["nonfinite_rewards"])
-    assert 0 < count < SMALL.steps_per_iteration
-    assert found == [f"rewards: {count} of {SMALL.steps_per_iteration} (taken as 0)"]
 
 
 def test_totals_of_faulty_rewards_are_shown():

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from paths import ROOT
-from remembering import KINDS, remembering
+from remembering import remembering
 
 pytest.importorskip("serial")
 from dexsim.control import Control
@@ -91,11 +91,11 @@ class Acts:
         self.control_rate = 1 / config.physics.control_period
         self.observation_layout = layout(hand, task.fields["actor"], config.observation)
 
-    def begin(self):
+    def initial_carry(self):
         return None
 
-    def act(self, memory, observation):
-        return memory, self.function(observation)
+    def act(self, carry, observation):
+        return carry, self.function(observation)
 
 
 def random_state(rng, hand):
@@ -257,28 +257,26 @@ def test_an_episode_begins_without_a_last_action(hand):
     np.testing.assert_array_equal([*last, again], np.array([0.0, 0.5, 0.0])[:, None] * np.ones(12))
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_memory_is_carried_through_the_ticks_and_emptied_at_a_start_and_after_a_hold(hand, kind):
-    policy, rng = remembering(kind), np.random.default_rng(0)
+def test_a_memory_is_carried_through_the_ticks_and_emptied_at_a_start_and_after_a_hold(hand):
+    policy, rng = remembering(), np.random.default_rng(0)
     controller, sensing = Controller(policy, hand), HandSensing(hand, HardwareConfig())
-    seen, memory, forgotten = ObjectEstimate(np.zeros(3), np.zeros(3), IDENTITY), policy.begin(), 0
+    seen, carry, forgotten = ObjectEstimate(np.zeros(3), np.zeros(3), IDENTITY), policy.initial_carry(), 0
     for number in range(9):
         measured = sensing.measure(random_state(rng, hand))
         if number in (3, 6):
-            memory = policy.begin()
+            carry = policy.initial_carry()
             (controller.start if number == 3 else controller.resume)(measured.joint_position)
         if number == 5:
             controller.anchor(measured.joint_position)  # with the motors off, at every tick
         tick = controller.tick(measured, seen, IDENTITY, 0.5)
-        memory, action = policy.act(memory, tick.observation)
+        carry, action = policy.act(carry, tick.observation)
         np.testing.assert_array_equal(tick.action, action)
-        forgotten += np.abs(tick.action - policy.act(policy.begin(), tick.observation)[1]).max() > 1e-3
+        forgotten += np.abs(tick.action - policy.act(policy.initial_carry(), tick.observation)[1]).max() > 1e-3
     assert forgotten == 6, "all but the first ticks show what came before"
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_what_is_not_finite_is_not_remembered(hand, kind):
-    policy, sensing = remembering(kind), HandSensing(hand, HardwareConfig())
+def test_what_is_not_finite_is_not_remembered(hand):
+    policy, sensing = remembering(), HandSensing(hand, HardwareConfig())
     controller, seen = Controller(policy, hand), ObjectEstimate(np.zeros(3), np.zeros(3), IDENTITY)
     measured = sensing.measure(random_state(np.random.default_rng(0), hand))
     lost = dataclasses.replace(measured, joint_position=np.full_like(measured.joint_position, np.nan))

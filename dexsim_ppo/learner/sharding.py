@@ -10,7 +10,7 @@ the order of sums.
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -29,26 +29,6 @@ BLOCKS = 16
 Tree = TypeVar("Tree")
 
 
-class Part(NamedTuple):
-    """One of equal parts of the environments, for a program that has no others."""
-
-    number: jax.Array  # int32 []
-    total: int
-
-
-def of_part(rows: jax.Array, part: Part | None) -> jax.Array:
-    """The rows of a part [B / total, ...] of all environments' [B, ...]; without a part all."""
-    if part is None:
-        return rows
-    size = len(rows) // part.total
-    return jax.lax.dynamic_slice_in_dim(rows, part.number * size, size)
-
-
-def whole_shape(shape: tuple[int, ...], part: Part | None) -> tuple[int, ...]:
-    """The shape over all environments of what has `shape` over a part of them."""
-    return shape if part is None else (shape[0] * part.total, *shape[1:])
-
-
 def make_mesh(devices: int, config: PPOConfig) -> Mesh | None:
     """The devices to train on; None for one device of one process, which needs no mesh.
 
@@ -58,23 +38,21 @@ def make_mesh(devices: int, config: PPOConfig) -> Mesh | None:
     Raises:
       ConfigError: there are fewer, some process would have none, or environments or minibatches do not divide by them.
     """
-    found = jax.devices()
-    count = devices or len(found)
-    if count > len(found) or (jax.process_count() > 1 and count < len(found)):
+    available = jax.devices()
+    count = devices or len(available)
+    if count > len(available) or (jax.process_count() > 1 and count < len(available)):
         raise ConfigError(
-            f"TrainArguments.devices = {devices}: there are {len(found)}, in {jax.process_count()} processes"
+            f"TrainArguments.devices = {devices}: there are {len(available)}, in {jax.process_count()} processes"
         )
-    rows = "rollouts" if config.memory == "gru" else "steps"
-    for name, size in (
-        ("num_envs", config.num_envs),
-        ("minibatches", config.rows // config.minibatches),
-    ):
-        if size % count:
-            what = "must be a multiple of" if name == "num_envs" else f"leaves {size} {rows} each, no multiple of"
-            raise ConfigError(f"PPOConfig.{name} = {getattr(config, name)}: {what} the {count} devices")
+    if config.num_envs % count:
+        raise ConfigError(f"PPOConfig.num_envs = {config.num_envs}: must be a multiple of the {count} devices")
+    if (size := config.rows // config.minibatches) % count:
+        raise ConfigError(
+            f"PPOConfig.minibatches = {config.minibatches}: leaves {size} rows each, no multiple of the {count} devices"
+        )
     if count == 1:
         return None
-    return jax.make_mesh((count,), (AXIS,), axis_types=(AxisType.Auto,), devices=found[:count])
+    return jax.make_mesh((count,), (AXIS,), axis_types=(AxisType.Auto,), devices=available[:count])
 
 
 def batched(function: Callable, mesh: Mesh | None) -> Callable:
@@ -150,34 +128,35 @@ def copied(tree: Tree, mesh: Mesh | None) -> Tree:
 def shardings(state: Any, mesh: Mesh) -> Any:
     """The sharding of each array of a `TrainState`: the environments' are split, all others copied."""
     whole, split = (NamedSharding(mesh, spec) for spec in (PartitionSpec(), PartitionSpec(AXIS)))
-    found = jax.tree.map(lambda _: whole, state)
     return dataclasses.replace(
-        found, **{name: jax.tree.map(lambda _: split, getattr(state, name)) for name in ("env_state", "memory")}
+        jax.tree.map(lambda _: whole, state),
+        env_state=jax.tree.map(lambda _: split, state.env_state),
+        carry=jax.tree.map(lambda _: split, state.carry),
     )
 
 
-def start_on(mesh: Mesh, init: Callable[[jax.Array], Any], shapes: Callable[[jax.Array], Any]) -> Callable:
+def init_on_mesh(mesh: Mesh, init: Callable[[jax.Array], Any], shapes: Callable[[jax.Array], Any]) -> Callable:
     """`init(key) -> TrainState`, compiled for the devices of a mesh."""
 
-    def begin(key: jax.Array) -> Any:
-        start = jit(
+    def init_sharded(key: jax.Array) -> Any:
+        compiled = jit(
             lambda data: init(jax.random.wrap_key_data(data)),
             once=True,
             out_shardings=shardings(shapes(key), mesh),
         )
-        return start(np.asarray(jax.random.key_data(key)))  # plain numbers are the same array for all processes
+        return compiled(np.asarray(jax.random.key_data(key)))  # plain numbers are the same array for all processes
 
-    return begin
+    return init_sharded
 
 
-def spanned(state: Any) -> Mesh:
+def mesh_of(state: Any) -> Mesh:
     """The mesh that a `TrainState` is on."""
     return state.iteration.sharding.mesh
 
 
-def learned(state: Any) -> Any:
+def without_environments(state: Any) -> Any:
     """A `TrainState` without its environments, as arrays of this process, whatever devices it is on."""
-    return jax.device_get(dataclasses.replace(state, env_state=None, memory=None, key=None))
+    return jax.device_get(dataclasses.replace(state, env_state=None, carry=None, key=None))
 
 
 def place(tree: Tree, like: Any) -> Tree:
@@ -187,7 +166,9 @@ def place(tree: Tree, like: Any) -> Tree:
     plain = [np.asarray(jax.random.key_data(x) if key else x) for x, key in zip(leaves, keys, strict=True)]
 
     def typed(plain: list[jax.Array]) -> Tree:
-        found = [jax.random.wrap_key_data(x) if key else jnp.copy(x) for x, key in zip(plain, keys, strict=True)]
-        return jax.tree.unflatten(structure, found)
+        return jax.tree.unflatten(
+            structure,
+            [jax.random.wrap_key_data(x) if key else jnp.copy(x) for x, key in zip(plain, keys, strict=True)],
+        )
 
     return jax.jit(typed, out_shardings=jax.tree.map(lambda x: x.sharding, like))(plain)

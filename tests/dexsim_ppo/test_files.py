@@ -1,0 +1,222 @@
+"""Files: what is written is what is read, nothing damaged is read, and a policy's file is checked when it is loaded."""
+
+import hashlib
+import struct
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import msgpack
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from tiny_env import SMALL, TinyConfig, TinyEnv
+
+from dexsim.core.config import from_dict
+from dexsim.core.errors import CheckpointError, DexsimError
+from dexsim_ppo import checkpoint, train
+from dexsim_ppo.learner.ppo import make_train
+from dexsim_ppo.policy import Policy, load_policy
+
+TREE = {
+    "x": jnp.arange(6, dtype=jnp.float32).reshape(2, 3),
+    "empty": jnp.zeros((0, 4)),
+    "flag": jnp.bool_(True),
+    "half": jnp.ones(3, jnp.bfloat16),
+    "key": jax.random.key(7),
+    "keys": jax.random.split(jax.random.key(1), 3),
+    "n": (jnp.int32(-5), jnp.uint32(2**31)),
+}
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory):
+    path = tmp_path_factory.mktemp("checkpoint") / "a.msgpack"
+    checkpoint.save(path, kind="train", task="tiny", content={"answer": [1, 2.5, None]}, tree=TREE)
+    return path
+
+
+@pytest.fixture(scope="module")
+def policy():
+    env = TinyEnv()
+    return Policy.from_training(env, SMALL, make_train(env, SMALL).init(jax.random.key(0)), {"seed": 0})
+
+
+def equal(a, b):
+    def leaf(x, y):
+        if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
+            x, y = jax.random.key_data(x), jax.random.key_data(y)
+        assert x.dtype == y.dtype and np.asarray(x).tobytes() == np.asarray(y).tobytes()
+
+    jax.tree.map(leaf, a, b)
+
+
+def test_checkpoint_round_trip(file):
+    loaded = checkpoint.load(file, kind="train", task="tiny")
+    assert loaded.content == {"answer": [1, 2.5, None]} and loaded.task == "tiny"
+    equal(checkpoint.restore(loaded, jax.eval_shape(lambda: TREE)), TREE)
+    assert [p.name for p in file.parent.iterdir()] == ["a.msgpack"], "no temporary file is left"
+
+
+@given(st.floats(0, 1, exclude_max=True), st.integers(0, 7), st.sampled_from(["flip", "cut", "extend", "drop"]))
+def test_load_finds_any_damage(file, place, bit, how):
+    data = bytearray(file.read_bytes())
+    at = int(place * len(data))
+    if how == "flip":
+        data[at] ^= 1 << bit
+    else:
+        data = {"cut": data[:at], "extend": data + data[: at + 1], "drop": data[:at] + data[at + 1 :]}[how]
+    damaged = file.with_name("damaged")
+    damaged.write_bytes(data)
+    try:
+        with pytest.raises(CheckpointError, match=r"^[^\n]*damaged: [^\n]+$"):
+            checkpoint.load(damaged, kind="train")
+    finally:
+        damaged.unlink()
+
+
+def test_load_names_what_is_wrong(file, tmp_path):
+    newer = tmp_path / "newer"
+    data = bytearray(file.read_bytes())
+    data[6] = 9
+    newer.write_bytes(data)
+    (tmp_path / "text").write_text("no checkpoint")
+    for path, options, word in (
+        (file, {"kind": "train", "task": "grasp"}, "task 'tiny', not 'grasp'"),
+        (file, {"kind": "policy"}, "'train' file, not a 'policy' file"),
+        (newer, {"kind": "train"}, "update dexsim"),
+        (tmp_path / "text", {"kind": "train"}, "not a dexsim checkpoint"),
+        ("/dev/zero", {"kind": "train"}, "not a dexsim checkpoint"),
+        (tmp_path / "missing", {"kind": "train"}, "cannot be read"),
+        (tmp_path, {"kind": "train"}, "cannot be read"),
+    ):
+        with pytest.raises(CheckpointError, match=word):
+            checkpoint.load(path, **options)
+
+
+def test_restore_names_what_does_not_fit(file):
+    loaded = checkpoint.load(file, kind="train")
+    for change, word in (
+        ({"x": jnp.zeros((2, 4))}, r"\['x'\]: expected"),
+        ({"y": jnp.zeros(1)}, r"\['y'\] is missing"),
+    ):
+        with pytest.raises(CheckpointError, match=word):
+            checkpoint.restore(loaded, TREE | change)
+    with pytest.raises(CheckpointError, match=r"\['x'\] is not expected"):
+        checkpoint.restore(loaded, {k: v for k, v in TREE.items() if k != "x"})
+
+
+def test_a_failed_write_leaves_the_old_file(file, monkeypatch):
+    before = file.read_bytes()
+    monkeypatch.setattr("dexsim.core.files.os.replace", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        checkpoint.save(file, kind="train", task="other", content={}, tree=TREE)
+    assert file.read_bytes() == before
+    assert [p.name for p in file.parent.iterdir()] == ["a.msgpack"]
+
+
+def test_resume_is_exact_to_the_bit(tmp_path):
+    """Five iterations equal two, a file, and three more; normalisers, keys and environments included."""
+    straight = make_train(TinyEnv(), SMALL)
+    state = straight.init(jax.random.key(5))
+    for _ in range(2):
+        state, _ = straight.step(state)
+    checkpoint.save(tmp_path / "c", kind="train", task="tiny", content={}, tree=state)
+    for _ in range(3):
+        state, _ = straight.step(state)
+    resumed = make_train(TinyEnv(), SMALL)
+    other = checkpoint.restore(checkpoint.load(tmp_path / "c", kind="train"), resumed.shapes(jax.random.key(0)))
+    other = jax.tree.map(jnp.copy, other)
+    for _ in range(3):
+        other, _ = resumed.step(other)
+    equal(other, state)
+    assert resumed.step._cache_size() == 1
+
+
+# --- policies -------------------------------------------------------------------------------------------
+
+
+def test_policy_round_trip(policy, tmp_path):
+    policy.save(tmp_path / "p.msgpack")
+    loaded = load_policy(tmp_path / "p.msgpack")
+    obs = jax.random.normal(jax.random.key(1), (5, 3))
+    np.testing.assert_array_equal(loaded.act(None, obs)[1], policy.act(None, obs)[1])
+    assert float(jnp.abs(loaded.act(None, 1e6 * obs)[1]).max()) <= 1
+    assert from_dict(TinyConfig, loaded.env_config) == TinyConfig()
+    assert loaded.observation_layout == policy.observation_layout
+    assert loaded.control_rate == pytest.approx(10) and loaded.training == {"seed": 0}
+
+
+INVALID = {
+    "a rate of a gigahertz": ({"control_rate": 1e9}, "control_rate"),
+    "a rate in words": ({"control_rate": "33"}, "control_rate"),
+    "another squashing": ({"squash": "softsign"}, "squash"),
+    "fewer layers": ({"layers": 1}, "layers"),
+    "more layers": ({"layers": 3}, "layers"),
+    "a smaller layout": ({"observation_layout": [["angle", 2, None]]}, "kernel"),
+    "a memory": ({"memory": ["gru", 4]}, "kernel"),
+    "a field that does not exist": ({"colour": "red"}, "colour"),
+    "an invalid specification": ({"spec": {"name": "a", "fields": [], "posture": [1e9]}}, "posture"),
+    "a hand in words": ({"hand": {"file": 3}}, "hand"),
+}
+
+
+@pytest.mark.parametrize("what", INVALID)
+def test_an_invalid_header_is_named_in_one_line(policy, tmp_path, what):
+    changes, word = INVALID[what]
+    policy.save(path := tmp_path / "p.msgpack")
+    content = checkpoint.load(path, kind="policy").content
+    checkpoint.save(path, kind="policy", task="tiny", content=content | changes, tree=policy.params)
+    with pytest.raises(CheckpointError, match=rf"^[^\n]*{word}[^\n]*$"):
+        load_policy(path)
+
+
+@pytest.mark.parametrize(("leaf", "value"), [(".layers[0].kernel", np.nan), (".normalizer.std", 0.0)])
+def test_numbers_that_give_no_action_are_an_error(policy, tmp_path, leaf, value):
+    change = lambda path, x: jnp.full_like(x, value) if jax.tree_util.keystr(path) == leaf else x  # noqa: E731
+    tree = jax.tree_util.tree_map_with_path(change, policy.params)
+    policy.save(path := tmp_path / "p.msgpack")
+    content = checkpoint.load(path, kind="policy").content
+    checkpoint.save(path, kind="policy", task="tiny", content=content, tree=tree)
+    with pytest.raises(CheckpointError, match="not finite, or deviations"):
+        load_policy(path)
+
+
+def test_no_file_chooses_which_module_is_imported(policy, tmp_path, monkeypatch):
+    """A task's name may be `module:function`, but only where a user types it."""
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "their_module.py").write_text("raise AssertionError('imported')\n")
+    path, name = tmp_path / "p.msgpack", "their_module:make_env"
+    checkpoint.save(path, kind="policy", task=name, content={}, tree={})
+    with pytest.raises(CheckpointError, match="invalid task"):
+        load_policy(path)
+    checkpoint.save(path, kind="train", task="grasp", content={"arguments": {"task": name}}, tree={})
+    with pytest.raises(DexsimError, match="must be a word"):
+        train.main(["--resume", str(path)])
+
+
+def test_policies_load_without_the_simulator(policy, tmp_path):
+    policy.save(tmp_path / "p.msgpack")
+    code = (
+        f"from dexsim_ppo import load_policy; import jax.numpy as jnp, sys; "
+        f"p = load_policy({str(tmp_path / 'p.msgpack')!r}); print(p.act(None, jnp.zeros(3))[1].shape); "
+        "bad = {'mujoco', 'warp', 'tyro', 'matplotlib', 'trimesh'} & set(sys.modules); "
+        "assert not bad, bad"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout.strip() == "(1,)", done.stderr
+
+
+def test_a_header_with_a_wrong_checksum_is_found_before_it_is_read(file, tmp_path):
+    data = file.read_bytes()
+    size = struct.unpack("<Q", data[8:16])[0]
+    packed = msgpack.packb(msgpack.unpackb(data[48 : 48 + size]) | {"task": "grasp"})
+    prefix = data[:8] + struct.pack("<Q", len(packed))
+    forged = tmp_path / "forged"
+    forged.write_bytes(prefix + data[16:48] + packed + data[48 + size :])
+    with pytest.raises(CheckpointError, match="header's checksum"):
+        checkpoint.load(forged, kind="train")
+    forged.write_bytes(prefix + hashlib.sha256(prefix + packed).digest() + packed + data[48 + size :])
+    assert checkpoint.load(forged, kind="train").task == "grasp"
