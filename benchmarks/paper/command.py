@@ -72,10 +72,10 @@ def run(experiment: Experiment, budget: Budget, output: Path, work: Path, only: 
     """
     cli.enable_caches()
     commit()  # of the code that is loaded now
-    for row in experiment.rows:
+    for row in [row for row in experiment.rows if not only or row.name in only]:
         path = report_path(output, experiment, row)
         report = load_report(path)
-        missing = missing_seeds(experiment, row, budget, report) if not only or row.name in only else []
+        missing = missing_seeds(experiment, row, budget, report)
         seeds = {} if len(missing) == len(experiment.seeds(budget)) else dict(report["seeds"])
         for seed in missing:
             print(f"{experiment.name}: {row.label}, seed {seed}", file=sys.stderr, flush=True)
@@ -118,7 +118,7 @@ def render(folder: Path = REPORTS) -> str:
     differs = tomllib.loads((REPORTS / "differs.toml").read_text())
     sections = [_section(experiment, folder, differs[experiment.name]) for experiment in EXPERIMENTS.values()]
     first, last = ((REPORTS / name).read_text() for name in ("head.md", "figures.md"))
-    return "\n".join([first, *sections, last])
+    return "\n".join([first, *sections, last.replace("](figures/", "](results/figures/")])
 
 
 def _section(experiment: Experiment, folder: Path, differs: str) -> str:
