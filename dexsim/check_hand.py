@@ -44,9 +44,9 @@ def check_kinematics(hand: Hand) -> None:
         mujoco.mj_kinematics(model, data)
         frame = data.xmat[palm].reshape(3, 3)
         place, turn = (data.xpos[bodies] - data.xpos[palm]) @ frame, frame.T @ data.xmat[bodies].reshape(-1, 3, 3)
-        found = forward_kinematics(hand, angle.astype(np.float32))
-        away = np.linalg.norm(found.body_position - place, axis=-1)
-        turned = np.linalg.norm(found.body_rotation - turn, axis=(-2, -1)) / np.sqrt(2)  # small angles
+        pose = forward_kinematics(hand, angle.astype(np.float32))
+        away = np.linalg.norm(pose.body_position - place, axis=-1)
+        turned = np.linalg.norm(pose.body_rotation - turn, axis=(-2, -1)) / np.sqrt(2)  # small angles
         for error, limit, unit in ((away, _NEAR, "m from"), (turned, _ALIGNED, "rad turned from")):
             if error.max() > limit:
                 name = hand.body_names[int(error.argmax())]

@@ -68,8 +68,8 @@ def correct_command(
     if span[0] == span[1]:  # No command speaks of another force.
         return correction
     touching = force > 0
-    felt = commanded_force(force, touching)
-    error = command - (felt - span[0]) / (span[1] - span[0])
+    measured = commanded_force(force, touching)
+    error = command - (measured - span[0]) / (span[1] - span[0])
     change = jnp.clip(loop.gain * error, -loop.slew, loop.slew) * period
     moved = jnp.where(jnp.sum(touching[1:]) >= 2, correction + change, correction)
     # No windup: the sum stays in what a policy is shown.

@@ -191,12 +191,12 @@ def _annotated_config(name: str, factory: Callable) -> type[EnvConfig]:
         first = next(p for p in inspect.signature(factory).parameters)
     except (NameError, StopIteration, TypeError, ValueError):
         hints, first = {}, ""
-    found = hints.get(first)
-    if not (inspect.isclass(found) and issubclass(found, EnvConfig)):
+    annotated = hints.get(first)
+    if not (inspect.isclass(annotated) and issubclass(annotated, EnvConfig)):
         raise ConfigError(
             f"register({name!r}, ...): annotate the factory's first parameter with its EnvConfig, or give config="
         )
-    return found
+    return annotated
 
 
 def _make_other(task: str, makes: Callable[[], Any]) -> Any:

@@ -63,15 +63,15 @@ OPEN_CIRCLES = (("dexsim_real.run.overview", "dexsim_real.run.session"),)
 
 ROOTS = "roots"
 BUDGETS = {
-    "dexsim": 18_750,  # goal: 12,500
+    "dexsim": 18_160,  # goal: 12,500
     "dexsim/core": 1_290,  # goal: 900
-    "dexsim/geometry dexsim/touch dexsim/actuator dexsim/sensing": 2_440,  # goal: 1,900
-    "dexsim/hand dexsim/objects": 2_120,  # goal: 1,900
-    "dexsim/physics": 2_750,  # goal: 2,200, and 1,300 of CUDA
-    "dexsim/env dexsim/tasks": 2_890,  # goal, with the roots: 3,200
-    ROOTS: 1_480,
-    "dexsim/calibration dexsim/identification": 2_550,  # goal: 1,500
-    "dexsim/render dexsim/view dexsim/datasets dexsim/wrappers": 2_860,  # goal: 1,900
+    "dexsim/geometry dexsim/touch dexsim/actuator dexsim/sensing": 2_130,  # goal: 1,900
+    "dexsim/hand dexsim/objects": 2_115,  # goal: 1,900
+    "dexsim/physics": 2_760,  # goal: 2,200, and 1,300 of CUDA
+    "dexsim/env dexsim/tasks": 2_880,  # goal, with the roots: 3,200
+    ROOTS: 1_470,
+    "dexsim/calibration dexsim/identification": 2_510,  # goal: 1,500
+    "dexsim/render dexsim/view dexsim/datasets dexsim/wrappers": 2_610,  # goal: 1,900
     "dexsim_ppo": 6_970,  # goal: 4,000
     "dexsim_real": 12_400,  # goal: 6,500
     "benchmarks": 7_000,  # goal: 2,000

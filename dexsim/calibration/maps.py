@@ -144,9 +144,9 @@ def calibrated_hand(hand: Hand, calibration: Calibration | None) -> Hand:
     """
     if calibration is None or calibration.force_per_torque is None:
         return hand
-    found = np.array(calibration.force_per_torque, np.float32)[0]
-    found[0] = 0.0
-    return dataclasses.replace(hand, force_per_torque=np.where(found > 0, found, hand.force_per_torque))
+    calibrated = np.array(calibration.force_per_torque, np.float32)[0]
+    calibrated[0] = 0.0
+    return dataclasses.replace(hand, force_per_torque=np.where(calibrated > 0, calibrated, hand.force_per_torque))
 
 
 # --- file -----------------------------------------------------------------------------------

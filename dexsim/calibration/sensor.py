@@ -210,10 +210,10 @@ def _estimates(design: np.ndarray, target: np.ndarray, group: np.ndarray) -> lis
     """Robust regression of the target [T] on the columns of a design [T, K] through zero, with intervals."""
     size = np.max(np.abs(design), 0)
     start = np.linalg.lstsq(design / size, target, rcond=None)[0]
-    found: Regression = regress(design / size, target, start, order=design[:, 0], group=group)
+    fit: Regression = regress(design / size, target, start, order=design[:, 0], group=group)
     return [
         Estimate(float(v), float(v - half), float(v + half))
-        for v, half in zip(found.value / size, found.half / size, strict=True)
+        for v, half in zip(fit.value / size, fit.half / size, strict=True)
     ]
 
 

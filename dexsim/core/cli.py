@@ -185,8 +185,8 @@ def check_apart(outputs: Mapping[str, Path | None], inputs: Mapping[str, str | P
     taken = {os.path.realpath(path): f"is the {what}" for what, path in inputs.items() if path and Path(path).is_file()}
     for option, path in outputs.items():
         if path and not is_device(path):
-            if found := taken.get(place := os.path.realpath(path)):
-                raise ConfigError(f"{option} {path}: {found}; name another file")
+            if clash := taken.get(place := os.path.realpath(path)):
+                raise ConfigError(f"{option} {path}: {clash}; name another file")
             taken[place] = f"is the file of {option}, too"
 
 

@@ -184,7 +184,7 @@ def from_dict(cls: type[T], data: dict[str, Any]) -> T:
       ConfigError: an unknown field, or a value of the wrong type or out of range.
     """
     if not isinstance(data, dict):
-        raise ConfigError(f"{cls.__name__}: expected a table of fields, found {type(data).__name__}")
+        raise ConfigError(f"{cls.__name__}: expected a table of fields, got {type(data).__name__}")
     hints = typing.get_type_hints(cls)
     known = {field.name for field in dataclasses.fields(cls)}
     for name in data:
@@ -257,7 +257,7 @@ def _rebuild(hint: Any, value: Any, where: str) -> Any:
         if len(arguments) == 2 and arguments[1] is Ellipsis:
             return tuple(_rebuild(arguments[0], item, where) for item in value)
         if len(value) != len(arguments):
-            raise ConfigError(f"{where}: expected {len(arguments)} values, found {len(value)}")
+            raise ConfigError(f"{where}: expected {len(arguments)} values, got {len(value)}")
         return tuple(_rebuild(a, item, where) for a, item in zip(arguments, value, strict=True))
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         return _numbers(value)[0]

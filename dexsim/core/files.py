@@ -96,8 +96,8 @@ def read_toml(path: Path) -> dict[str, Any]:
       OSError: it cannot be read.
     """
     text = read_bounded(path).decode("utf-8-sig").replace("\r\n", "\n")
-    if found := _LONG_KEY.search(text):
-        line = text.count("\n", 0, found.start()) + 1
+    if match := _LONG_KEY.search(text):
+        line = text.count("\n", 0, match.start()) + 1
         raise ValueError(f"a key with more than {_TOML_PARTS} parts (at line {line})")
     try:
         return tomllib.loads(text)

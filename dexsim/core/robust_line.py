@@ -70,9 +70,9 @@ def fit_line(x: np.ndarray, y: np.ndarray, *, group: np.ndarray | None = None, s
     reach = np.max(np.abs(x))
     design = np.stack([np.ones_like(x), x / reach], -1)
     start = np.array(theil_sen(x, y, seed)) * [1.0, reach]
-    found = regress(design, y, start, order=x, group=group)
-    weight, residual = found.weight, y - design @ found.value
-    (offset, gain), half = found.value / [1.0, reach], found.half / [1.0, reach]
+    fit = regress(design, y, start, order=x, group=group)
+    weight, residual = fit.weight, y - design @ fit.value
+    (offset, gain), half = fit.value / [1.0, reach], fit.half / [1.0, reach]
     kept = weight > 0
     centred = y[kept] - np.average(y[kept], weights=weight[kept])
     unexplained = np.sum(weight * residual**2) / max(np.sum(weight[kept] * centred**2), 1e-300)
@@ -81,7 +81,7 @@ def fit_line(x: np.ndarray, y: np.ndarray, *, group: np.ndarray | None = None, s
         offset=float(offset),
         gain_interval=(float(gain - half[1]), float(gain + half[1])),
         offset_interval=(float(offset - half[0]), float(offset + half[0])),
-        noise=float(found.scale),
+        noise=float(fit.scale),
         r_squared=float(1.0 - unexplained),
         condition=float(np.linalg.cond(design)),
         samples=len(x),

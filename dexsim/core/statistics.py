@@ -51,10 +51,10 @@ def statistic(values: np.ndarray, function: Callable, name: str, samples: int = 
     return {name: float(function(values)), "low": low, "high": high}
 
 
-def entry(found: dict) -> dict:
+def entry(result: dict) -> dict:
     """A statistic as a headline has it: its number as "value", with its interval."""
-    value = next(found[name] for name in ("mean", "median", "r") if name in found)
-    return {"value": value, "low": found["low"], "high": found["high"]}
+    value = next(result[name] for name in ("mean", "median", "r") if name in result)
+    return {"value": value, "low": result["low"], "high": result["high"]}
 
 
 def bootstrap(function: Callable[[np.ndarray], float], count: int, samples: int) -> tuple[float, float]:

@@ -194,9 +194,9 @@ def _statistics(values: np.ndarray) -> dict[str, Any]:
     """Minimum, maximum, mean, deviation and quantiles over frames; scalars are lists of one number."""
     values = np.asarray(values, float)
     values = values[:, None] if values.ndim == 1 else values
-    found = {"min": values.min(0), "max": values.max(0), "mean": values.mean(0), "std": values.std(0)}
-    found |= {name: np.quantile(values, at, axis=0) for name, at in _QUANTILES.items()}
-    return {name: value.tolist() for name, value in found.items()} | {"count": [len(values)]}
+    summary = {"min": values.min(0), "max": values.max(0), "mean": values.mean(0), "std": values.std(0)}
+    summary |= {name: np.quantile(values, at, axis=0) for name, at in _QUANTILES.items()}
+    return {name: value.tolist() for name, value in summary.items()} | {"count": [len(values)]}
 
 
 def _column(pyarrow: Any, values: np.ndarray) -> Any:

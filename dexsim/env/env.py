@@ -222,7 +222,7 @@ class Env:
         pose = forward_kinematics(self.hand, joints)
         position, quat = place[:3], place[3:] / jnp.linalg.norm(place[3:])
         rotation = rotations.quat_to_matrix(quat)
-        felt = self.touch.feel(pose, object, position, rotation, force, delta)
+        fingertips = self.touch.feel(pose, object, position, rotation, force, delta)
         return GroundTruth(
             object=object,
             joint_position=joints,
@@ -231,9 +231,9 @@ class Env:
             torque_limited=torque[1],
             pose=pose,
             finger_force=force,
-            normal_force=felt.normal_force,
-            touch=felt.touch,
-            tip_stiffness=physics.tip_stiffness(object, pose, position, rotation, felt.skin_force, delta),
+            normal_force=fingertips.normal_force,
+            touch=fingertips.touch,
+            tip_stiffness=physics.tip_stiffness(object, pose, position, rotation, fingertips.skin_force, delta),
             object_position=position,
             object_quat=quat,
             object_velocity=motion[:3],

@@ -53,7 +53,7 @@ class Observer:
         # The actor's pose follows from measured angles, which are not the true ones.
         arguments = {"actor": (readings, None), "critic": (true, truth.pose)}
         return {
-            group: observation.observe(self.hand, seen, names, self._configs[group], motion, pose)
+            group: observation.observe(self.hand, readings_, names, self._configs[group], motion, pose)
             for group, names in self.fields.items()
-            for seen, pose in (arguments[group],)
+            for readings_, pose in (arguments[group],)
         }

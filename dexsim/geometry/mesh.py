@@ -215,7 +215,7 @@ def _read(source: Any) -> tuple[np.ndarray, np.ndarray, str]:
         raise AssetError(f"{name}: triangles must be whole numbers, the rows of their vertices")
     if vertices.ndim != 2 or vertices.shape[1:] != (3,) or (faces.size and (faces.ndim != 2 or faces.shape[1] != 3)):
         raise AssetError(
-            f"{name}: expected vertices [V, 3] and triangles [T, 3], found {vertices.shape} and {faces.shape}"
+            f"{name}: expected vertices [V, 3] and triangles [T, 3], got {vertices.shape} and {faces.shape}"
         )
     return vertices, faces.astype(np.int64), name
 

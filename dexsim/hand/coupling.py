@@ -33,7 +33,7 @@ def read_followers(path: Path, model: Any, motors: list[int]) -> dict[int, tuple
 
     if model.ntendon:
         raise AssetError(f"{path}: tendon {model.tendon(0).name or '#0'!r}: tendons are not supported")
-    found: dict[int, tuple[int, float, float]] = {}
+    followers: dict[int, tuple[int, float, float]] = {}
     for index in range(model.neq):
         first, second = int(model.eq_obj1id[index]), int(model.eq_obj2id[index])
         what = f"{path}: equality {model.equality(index).name or f'#{index}'!r}"
@@ -43,14 +43,14 @@ def read_followers(path: Path, model: Any, motors: list[int]) -> dict[int, tuple
         if any(higher) or not ratio:
             raise AssetError(f"{what}: polycoef {model.eq_data[index, :5].tolist()} is not of the form a0 a1 0 0 0")
         names = [model.joint(joint).name for joint in (first, second)]
-        if first in motors or first in found:
+        if first in motors or first in followers:
             raise AssetError(f"{what}: joint {names[0]!r} has a motor or follows another joint already")
         if second not in motors:
             raise AssetError(f"{what}: joint {names[0]!r} follows {names[1]!r}, which has no motor (see joints)")
         reference = model.qpos0[model.jnt_qposadr[[first, second]]]
-        found[first] = second, float(ratio), float(reference[0] + a0 - ratio * reference[1])
-        _check_range(path, model, first, found[first])
-    return found
+        followers[first] = second, float(ratio), float(reference[0] + a0 - ratio * reference[1])
+        _check_range(path, model, first, followers[first])
+    return followers
 
 
 def _check_range(path: Path, model: Any, joint: int, follows: tuple[int, float, float]) -> None:

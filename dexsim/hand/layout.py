@@ -70,7 +70,7 @@ def lattice(columns: int, rows: int, *, pitch: float | tuple[float, float], kind
         raise ConfigError(f"lattice of {columns} x {rows} at a pitch of {pitch} m: all must be above 0")
     if kind == "hex":
         if across != along:
-            raise ConfigError(f"hex lattice: one pitch expected, found {pitch}")
+            raise ConfigError(f"hex lattice: one pitch expected, got {pitch}")
         along = across * np.sqrt(3) / 2
     column, row = (x.ravel() for x in np.meshgrid(np.arange(columns), np.arange(rows), indexing="ij"))
     shift = 0.25 * np.where(row % 2, 1, -1) if kind == "hex" else 0.0
@@ -216,7 +216,7 @@ def write_layout(path: str | Path, patches: dict[str, Patch]) -> Path:
       OSError: the file cannot be written.
     """
     if len({patch.grid for patch in patches.values()}) != 1:
-        raise ConfigError(f"layout: one grid for all fingers expected, found {[p.grid for p in patches.values()]}")
+        raise ConfigError(f"layout: one grid for all fingers expected, got {[p.grid for p in patches.values()]}")
     text = io.StringIO()
     out = csv.writer(text, lineterminator="\n")
     out.writerow(COLUMNS)
@@ -271,13 +271,13 @@ def read_layout(path: str | Path) -> dict[str, Patch]:
 def read_taxels(path: Path, fingers: tuple[str, ...], grid: tuple[int, int]) -> np.ndarray:
     """[F, N, 7]: position, normal, area. Every finger must have columns * rows taxels."""
     columns, length = grid
-    wanted = len(fingers) * columns * length
+    expected = len(fingers) * columns * length
     try:
         with open(path, newline="", encoding="utf-8-sig") as file:  # spreadsheets begin a CSV with a byte order mark
             reader = csv.DictReader(file)
             if tuple(reader.fieldnames or ()) != COLUMNS:
                 raise AssetError(f"{path}: the first line must read {','.join(COLUMNS)}")
-            rows = [(reader.line_num, entry) for entry in itertools.islice(reader, wanted + 1)]
+            rows = [(reader.line_num, entry) for entry in itertools.islice(reader, expected + 1)]
     except FileNotFoundError:
         raise AssetError(f"{path}: no such file") from None
     except (OSError, ValueError, csv.Error) as error:
@@ -303,8 +303,8 @@ def read_taxels(path: Path, fingers: tuple[str, ...], grid: tuple[int, int]) -> 
                 f"{path}:{line}: the normal must be of length 1 and the area above 0 and at most {_LARGEST:g} m^2"
             )
         table[fingers.index(entry["finger"]), column * length + at] = values
-    if len(rows) > wanted:
-        raise AssetError(f"{path}: {len(rows)} taxels or more, expected {wanted}: a column and row is given twice")
+    if len(rows) > expected:
+        raise AssetError(f"{path}: {len(rows)} taxels or more, expected {expected}: a column and row is given twice")
     count = np.sum(np.isfinite(table[..., 0]), axis=1)
     if np.any(count != columns * length):
         worst = int(np.argmin(count))
@@ -341,5 +341,5 @@ def _first_hit(corners: np.ndarray, start: np.ndarray, ray: np.ndarray) -> tuple
     along = np.where(hit, along, np.inf)
     face = along.argmin(1)
     reach = along[np.arange(len(start)), face]
-    found = np.isfinite(reach)
-    return start + np.where(found, reach, 0.0)[:, None] * ray, np.where(found, face, -1)
+    hits = np.isfinite(reach)
+    return start + np.where(hits, reach, 0.0)[:, None] * ray, np.where(hits, face, -1)

@@ -267,11 +267,11 @@ def _check_numbers(model, path: Path) -> None:
         "site": ("pos", "quat"),
         "eq": ("data", "solref", "solimp"),
     }
-    found = [(kind, name, getattr(model, f"{kind}_{name}")) for kind, names in fields.items() for name in names]
-    found.append(("jnt", "ref", model.qpos0[model.jnt_qposadr]))
+    numbers = [(kind, name, getattr(model, f"{kind}_{name}")) for kind, names in fields.items() for name in names]
+    numbers.append(("jnt", "ref", model.qpos0[model.jnt_qposadr]))
     resists = ("damping", "armature", "frictionloss")
-    found += [("jnt", name, getattr(model, f"dof_{name}")[model.jnt_dofadr]) for name in resists]
-    for kind, name, values in found:
+    numbers += [("jnt", name, getattr(model, f"dof_{name}")[model.jnt_dofadr]) for name in resists]
+    for kind, name, values in numbers:
         infinite = ~np.isfinite(values)
         for wrong, what in ((infinite, "not a finite number"), ((values < 0) & (name in resists), "below 0")):
             if wrong.any():

@@ -34,7 +34,7 @@ def lay_taxels(path: Path, table: dict[str, Any], geoms: tuple[Geom, ...], tip_b
     if not are_numbers(pitch, 2, 0, 1):
         raise AssetError(f"{path}: taxel_pitch = {pitch!r:.60}: expected two numbers above 0 m (or taxels: a file)")
     points = lattice(*table["taxel_grid"], pitch=tuple(pitch))
-    found = []
+    rows = []
     for finger, body in zip(table["fingers"], tip_body, strict=True):
         where = f"{path}: finger {finger['name']!r}"
         pads = [geom for geom in geoms if geom.name == finger.get("pad") and geom.body == body]
@@ -49,8 +49,8 @@ def lay_taxels(path: Path, table: dict[str, Any], geoms: tuple[Geom, ...], tip_b
         except ConfigError as error:
             raise AssetError(f"{where}: {error}") from None
         patch = placed(patch, position=pad.position, rotation=_frame(where, pad, finger.get("facing")))
-        found.append(np.concatenate([patch.position, patch.normal, patch.area[:, None]], -1))
-    return np.asarray(found, np.float32)
+        rows.append(np.concatenate([patch.position, patch.normal, patch.area[:, None]], -1))
+    return np.asarray(rows, np.float32)
 
 
 def are_numbers(values: Any, count: int, above: float = -1e6, below: float = 1e6) -> bool:

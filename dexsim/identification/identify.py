@@ -199,7 +199,7 @@ def _conclude(
     values["start"] = float(problem.starts[0])
     touching = (theta[:count] <= low + 1e-3 * size) | (theta[:count] >= high - 1e-3 * size)
     at_bound = tuple(n for n, hit in zip(fitted, touching, strict=True) if hit)
-    found = groups(fitted, null, correlation, half, size)
+    sets = groups(fitted, null, correlation, half, size)
     errors = residual.reshape(len(problem.measured), -1) * problem.noise[: len(problem.measured), None]
     rmse = np.sqrt(np.mean(errors**2, -1))
     # All from the solution and with the weights found last: costs under other weights cannot be compared.
@@ -223,13 +223,13 @@ def _conclude(
         latency_cost={lag: cost[lag] / least_cost - 1.0 for lag in sorted(cost)},
         latency_plausible=plausible,
         timestep=problem.timestep,
-        unidentifiable=found,
+        unidentifiable=sets,
         at_bound=at_bound,
         rmse=float(rmse[0]),
         torque_rmse=float(rmse[1]) if len(rmse) > 1 else float("nan"),
         holdout_rmse=after,
         holdout_rmse_before=before,
-        notes=tuple(_notes(log, latency, latencies, plausible, found, at_bound, before, after)),
+        notes=tuple(_notes(log, latency, latencies, plausible, sets, at_bound, before, after)),
     )
 
 
@@ -238,12 +238,12 @@ def _notes(
     latency: int,
     latencies: tuple[int, ...],
     plausible: tuple[int, ...],
-    found: tuple[tuple[str, ...], ...],
+    sets: tuple[tuple[str, ...], ...],
     at_bound: tuple[str, ...],
     before: float,
     after: float,
 ) -> list[str]:
-    notes = advice(found)
+    notes = advice(sets)
     notes.append(MODEL)
     notes += [f"{name} ran into its bound: its interval is one-sided" for name in at_bound]
     if len(latencies) > 1 and latency == max(latencies):

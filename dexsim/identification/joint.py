@@ -110,11 +110,11 @@ def simulate(
 
     def tick(state: tuple, inputs: tuple) -> tuple[tuple, tuple]:
         position, velocity = state
-        wanted, last, begin, start = inputs
+        target_of, last, begin, start = inputs
         position, velocity = jnp.where(begin, start, position), jnp.where(begin, 0.0, velocity)
         reading = (position + values["encoder_bias"], motor(drive, last, position, velocity))
         for substep in range(substeps):
-            torque = motor(drive, wanted[substep], position, velocity)
+            torque = motor(drive, target_of[substep], position, velocity)
             torque = torque - (values["gravity_cos"] * jnp.cos(position) + values["gravity_sin"] * jnp.sin(position))
             velocity = velocity + apply_friction(drive, torque, velocity, rate) / rate
             position = position + timestep * velocity

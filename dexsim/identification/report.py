@@ -162,24 +162,24 @@ def groups(
     names: tuple[str, ...], null: list[np.ndarray], correlation: np.ndarray, half: np.ndarray, size: np.ndarray
 ) -> tuple[tuple[str, ...], ...]:
     """Which parameters the data do not separate, or do not see."""
-    found = [tuple(n for n, m in zip(names, members, strict=True) if m) for members in null]
-    inside = {name for group in found for name in group}
+    sets = [tuple(n for n, m in zip(names, members, strict=True) if m) for members in null]
+    inside = {name for group in sets for name in group}
     for i, first in enumerate(names):
         if first in inside:
             continue
         mates = [j for j in range(len(names)) if j != i and abs(correlation[i, j]) > CORRELATED]
         vague = half[i] > NORMAL * VAGUE * size[i]
         if vague and mates:
-            found.append(tuple(sorted({first, *(names[j] for j in mates)}, key=names.index)))
+            sets.append(tuple(sorted({first, *(names[j] for j in mates)}, key=names.index)))
         elif vague:
-            found.append((first,))
-    return tuple(dict.fromkeys(found))
+            sets.append((first,))
+    return tuple(dict.fromkeys(sets))
 
 
-def advice(found: tuple[tuple[str, ...], ...]) -> list[str]:
+def advice(sets: tuple[tuple[str, ...], ...]) -> list[str]:
     """One line for each group."""
     notes = []
-    for group in found:
+    for group in sets:
         hints = [text for pair, text in _ADVICE.items() if pair <= set(group)]
         if len(group) == 1:
             hints = [_ALONE[group[0]]] if group[0] in _ALONE else []

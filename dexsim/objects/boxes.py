@@ -126,7 +126,7 @@ def _fit(mesh: meshes.Mesh, parts: int, frames: Sequence[np.ndarray]) -> Boxes:
     for frame in frames:
         start = _start(mesh, frame, parts, rng)
         refined = _refine(start, jnp.asarray(points, jnp.float32), jnp.asarray(distance, jnp.float32), extent)
-        candidates += [_boxes(mesh, found, rng) for found in (start, refined)]
+        candidates += [_boxes(mesh, fit, rng) for fit in (start, refined)]
     # Among fits that are as good, the one with fewer boxes.
     return min(
         candidates,

@@ -36,12 +36,12 @@ def _names(model: mujoco.MjModel, kind: str, rows: np.ndarray) -> str:
 
 def _ignored(model: mujoco.MjModel) -> list[str]:
     """Features that both backends, or our own actuator model in their place, would drop."""
-    found = []
+    features = []
 
     def note(kind: str, feature: str, mask: np.ndarray) -> None:
         rows = np.flatnonzero(mask)
         if rows.size:
-            found.append(f"{feature} ({kind} {_names(model, kind, rows)})")
+            features.append(f"{feature} ({kind} {_names(model, kind, rows)})")
 
     note("actuator", "actuator delay", (model.actuator_delay > 0) | (model.actuator_history[:, 0] > 0))
     note("actuator", "actuator armature", model.actuator_armature != 0)
@@ -61,25 +61,25 @@ def _ignored(model: mujoco.MjModel) -> list[str]:
     joints[model.dof_jntid[poly]] = True
     note("joint", "polynomial joint damping", joints)
     if model.nplugin:
-        found.append("plugins")
+        features.append("plugins")
     if model.nflex:
-        found.append("flex bodies")
+        features.append("flex bodies")
     if np.any(model.geom_type == mujoco.mjtGeom.mjGEOM_SDF):
-        found.append("SDF geoms")
+        features.append("SDF geoms")
     if model.opt.density or model.opt.viscosity or np.any(model.opt.wind):
-        found.append("fluid forces (density, viscosity, wind)")
+        features.append("fluid forces (density, viscosity, wind)")
     if model.opt.noslip_iterations:
-        found.append("noslip iterations")
+        features.append("noslip iterations")
     off = [f for f in _PHYSICS if model.opt.disableflags & int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{f.upper()}"))]
     if off:
-        found.append(f"flags that disable {', '.join(off)}")
+        features.append(f"flags that disable {', '.join(off)}")
     if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_OVERRIDE:
-        found.append("flag override")
-    return found
+        features.append("flag override")
+    return features
 
 
 def _lacking_jax(model: mujoco.MjModel) -> list[str]:
-    found = []
+    features = []
     contact = model.sensor_type == mujoco.mjtSensor.mjSENS_CONTACT
     body_like = (mujoco.mjtObj.mjOBJ_BODY, mujoco.mjtObj.mjOBJ_XBODY, mujoco.mjtObj.mjOBJ_SITE)
     matched = contact & (np.isin(model.sensor_objtype, body_like) | np.isin(model.sensor_reftype, body_like))
@@ -90,22 +90,22 @@ def _lacking_jax(model: mujoco.MjModel) -> list[str]:
     ):
         rows = np.flatnonzero(mask)
         if rows.size:
-            found.append(f"{feature} (sensor {_names(model, 'sensor', rows)})")
+            features.append(f"{feature} (sensor {_names(model, 'sensor', rows)})")
     if model.opt.integrator == mujoco.mjtIntegrator.mjINT_DISCRETE:
-        found.append("integrator discrete")
+        features.append("integrator discrete")
     if model.opt.solver == mujoco.mjtSolver.mjSOL_PGS:
-        found.append("solver PGS")
+        features.append("solver PGS")
     for first, second in _colliding_kinds(model):
         if {(first, second), (second, first)} & _UNSUPPORTED_COLLISIONS:
-            found.append(f"collision {first}-{second}")
-    return found
+            features.append(f"collision {first}-{second}")
+    return features
 
 
 def _lacking_warp(model: mujoco.MjModel) -> list[str]:
-    found = []
+    features = []
     if model.opt.solver == mujoco.mjtSolver.mjSOL_PGS:
-        found.append("solver PGS")
-    return found
+        features.append("solver PGS")
+    return features
 
 
 # What the CUDA kernel lacks of a scene, it says itself (`dexsim.physics.cuda.scene.check_scene`).

@@ -1,11 +1,13 @@
 """MJX's JAX implementation, any device and differentiable: our contacts and solver where the scene allows them."""
 
+import warnings
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dexsim.core.errors import DexsimWarning
 from dexsim.objects.params import ObjectParams
 from dexsim.physics.interface import ContactParams, PhysicsScene, PhysicsState, StepResult, TorqueLaw
 from dexsim.physics.mjx_backend import MjxBackend
@@ -27,6 +29,13 @@ class JaxBackend(MjxBackend):
         self._stepper = None
         if scene.config.contacts == "closed":
             self._stepper = find_stepper(self.mjx, model, tips, max_contacts=scene.config.max_contacts)
+            if self._stepper is None:
+                warnings.warn(
+                    f"backend jax: {scene.hand.name} in this scene needs mjx.step, about twice as slow, with "
+                    "other contact points on boxes; PhysicsConfig.contacts = 'mjx' asks for it",
+                    DexsimWarning,
+                    stacklevel=2,
+                )
 
     def make_data(self) -> Any:
         """Empty data for one environment."""

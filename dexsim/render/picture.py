@@ -177,8 +177,8 @@ def _paint(
     opacity: float = 1.0,
 ) -> None:
     """Shade a surface and lay it over the picture, linear RGB [3, h * w]."""
-    found = samples(view, surface, _SUPERSAMPLE)
-    pixel, weight, index, points = found.pixel, found.weight, found.index, found.points
+    hits = samples(view, surface, _SUPERSAMPLE)
+    pixel, weight, index, points = hits.pixel, hits.weight, hits.index, hits.points
     normal, toward = normals(primitives, index, points, bevel), _toward(view, points)
     away = 1 - np.clip(_dot(normal, toward), 0, 1)
     # Glass-like: more opaque where the surface turns away, so that the silhouette stays crisp.

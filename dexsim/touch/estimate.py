@@ -41,7 +41,7 @@ def estimate_force(estimate: ForceEstimate, hand: Hand, taxel_force: jax.Array, 
     Raises:
       ConfigError: `per_torque` is of a hand with another number of fingers.
     """
-    felt = jnp.sum(taxel_force, -1)
+    taxels = jnp.sum(taxel_force, -1)
     gain = hand.force_per_torque * hand.torque_limit[hand.root_joint]
     if estimate.per_torque:
         if len(estimate.per_torque) != hand.num_fingers:
@@ -49,5 +49,5 @@ def estimate_force(estimate: ForceEstimate, hand: Hand, taxel_force: jax.Array, 
                 f"ForceEstimate.per_torque has {len(estimate.per_torque)} values, the hand {hand.num_fingers} fingers"
             )
         gain = np.asarray(estimate.per_torque, np.float32)
-    beyond = jnp.maximum(gain * jnp.abs(joint_torque[hand.root_joint]) - felt, 0.0)
-    return jnp.where(felt > estimate.touching, felt + estimate.torque_share * beyond, 0.0)
+    beyond = jnp.maximum(gain * jnp.abs(joint_torque[hand.root_joint]) - taxels, 0.0)
+    return jnp.where(taxels > estimate.touching, taxels + estimate.torque_share * beyond, 0.0)

@@ -32,8 +32,8 @@ class PolicyShelf:
         """What can be chosen now: the first policy, then shipped ones, then the newest files of runs."""
         files = [path for name in ("best", "last") for path in self._runs.glob(f"*/{name}.msgpack")]
         newest = sorted(files, key=_changed, reverse=True)[:_NEWEST]
-        found = dict.fromkeys([self._first, *self._shipped, *map(str, newest), NONE])
-        return tuple(name for name in found if name == NONE or self.get(name) is not None)
+        listed = dict.fromkeys([self._first, *self._shipped, *map(str, newest), NONE])
+        return tuple(name for name in listed if name == NONE or self.get(name) is not None)
 
     def get(self, name: str) -> Policy | None:
         """The policy of this name as its file is now; None where it is unsound, does not fit, or is `NONE`.

@@ -162,12 +162,15 @@ def free_port(host: str, port: int) -> int:
 
 def _listen(host: str, port: int) -> None:
     """Raises OSError: the port is taken, or a server can listen at none of the host's addresses."""
-    failed, found = list[OSError](), socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
-    for family, _, _, _, address in found:
+    failed, addresses = (
+        list[OSError](),
+        socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE),
+    )
+    for family, _, _, _, address in addresses:
         try:
             socket.create_server(address[:2], family=family).close()
         except OSError as error:
             failed.append(error)
     # A computer without IPv6 may still name its address.
-    if failed and (len(failed) == len(found) or any(error.errno == errno.EADDRINUSE for error in failed)):
+    if failed and (len(failed) == len(addresses) or any(error.errno == errno.EADDRINUSE for error in failed)):
         raise failed[0]

@@ -135,8 +135,8 @@ def _clip(
     points = jnp.concatenate([started, ended, inner])
     # An edge that ends over the face ends where the next begins.
     gap = jnp.where(jnp.concatenate([over, over & (end < 1.0), under]), points[:, 2], sdf.FAR)
-    found = points - 0.5 * points[:, 2:] * jnp.array([[0.0, 0.0, 1.0]])
-    world = position[None] + sum(found[:, k, None] * along[k][None] for k in range(3)) + (half[2] * along[2])[None]
+    halfway = points - 0.5 * points[:, 2:] * jnp.array([[0.0, 0.0, 1.0]])
+    world = position[None] + sum(halfway[:, k, None] * along[k][None] for k in range(3)) + (half[2] * along[2])[None]
     return gap, world, along[2]
 
 

@@ -100,8 +100,8 @@ class Collider:
           Distances [C] m (negative inside), points [C, 3] m midway between the surfaces, and unit
           normals [C, 3] from the pair's first geom to its second.
         """
-        found = [group.find(position, rotation, size) for group in self.groups]
-        gap, point, normal = (jnp.concatenate(parts) for parts in zip(*found, strict=True))
+        contacts = [group.find(position, rotation, size) for group in self.groups]
+        gap, point, normal = (jnp.concatenate(parts) for parts in zip(*contacts, strict=True))
         return gap, point, normal
 
 

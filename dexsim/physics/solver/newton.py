@@ -23,11 +23,11 @@ class Rows:
     """
 
     jacobian: jax.Array  # [C, 3, V]
-    wanted: jax.Array  # [C, 3] m/s^2, MuJoCo's aref
+    reference: jax.Array  # [C, 3] m/s^2, MuJoCo's aref
     weight: jax.Array  # [C, 3] kg, MuJoCo's efc_D
     scale: jax.Array  # [C, 3] friction: of the regularised cone, and of both directions
     limit_side: jax.Array  # [V] 1 at the lower limit, -1 at the upper
-    limit_wanted: jax.Array  # [V] rad/s^2
+    limit_reference: jax.Array  # [V] rad/s^2
     limit_weight: jax.Array  # [V] kg m^2
 
 
@@ -56,7 +56,7 @@ def _cone(rows: Rows, miss: jax.Array) -> _Cone:
 
 def contact_force(rows: Rows, acceleration: jax.Array) -> jax.Array:
     """Forces [C, 3] N along the rows of the contacts."""
-    miss = jnp.sum(rows.jacobian * align(acceleration, rows.jacobian), -1) - rows.wanted
+    miss = jnp.sum(rows.jacobian * align(acceleration, rows.jacobian), -1) - rows.reference
     return _force(rows, miss, _cone(rows, miss))
 
 
@@ -83,9 +83,9 @@ def _hessian(rows: Rows, cone: _Cone) -> jax.Array:
 
 def _cost(rows: Rows, mass: jax.Array, force: jax.Array, acceleration: jax.Array) -> jax.Array:
     """What is minimised, but for a constant."""
-    miss = jnp.sum(rows.jacobian * align(acceleration, rows.jacobian), -1) - rows.wanted
+    miss = jnp.sum(rows.jacobian * align(acceleration, rows.jacobian), -1) - rows.reference
     cone = _cone(rows, miss)
-    limit = jnp.minimum(rows.limit_side * acceleration - rows.limit_wanted, 0.0)
+    limit = jnp.minimum(rows.limit_side * acceleration - rows.limit_reference, 0.0)
     return 0.5 * (
         jnp.dot(acceleration, mass @ acceleration - 2 * force)
         + jnp.sum(rows.limit_weight * limit**2)
@@ -110,8 +110,8 @@ def solve(
     flat = rows.jacobian.reshape(-1, rows.jacobian.shape[-1])
 
     def improve(_, now):
-        miss = (flat @ now).reshape(rows.wanted.shape) - rows.wanted
-        limit = rows.limit_side * now - rows.limit_wanted
+        miss = (flat @ now).reshape(rows.reference.shape) - rows.reference
+        limit = rows.limit_side * now - rows.limit_reference
         cone = _cone(rows, miss)
         pressed = jnp.where(limit < 0, rows.limit_weight, 0.0)
         push = _force(rows, miss, cone).reshape(-1) @ flat - pressed * limit * rows.limit_side
@@ -119,7 +119,7 @@ def solve(
         blocks = jnp.sum(_hessian(rows, cone)[:, :, :, None] * rows.jacobian[:, None, :, :], 2)
         curvature = mass + flat.T @ blocks.reshape(flat.shape) + jnp.diag(pressed * rows.limit_side**2)
         step = -_solve_positive(curvature, unbalanced - push)
-        moved = (flat @ step).reshape(rows.wanted.shape)
+        moved = (flat @ step).reshape(rows.reference.shape)
         line = (jnp.dot(step, unbalanced), jnp.dot(step, mass @ step))
         return now + _search(rows, miss, moved, limit, rows.limit_side * step, line, line_search) * step
 

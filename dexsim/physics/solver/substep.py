@@ -110,15 +110,15 @@ class Stepper:
         jacobian = motion * moves[:, None, :]
         stiffness, damping, impedance = _spring(solref, solimp, gap, self.timestep)
         speed = jnp.sum(jacobian * align(data.qvel, jacobian), -1)
-        wanted = -damping[:, None] * speed
-        wanted = wanted.at[:, 0].add(-stiffness * impedance * gap)
+        reference = -damping[:, None] * speed
+        reference = reference.at[:, 0].add(-stiffness * impedance * gap)
         friction = jnp.maximum(friction, 1e-15)
         weight = jnp.where(gap < 0, impedance / jnp.maximum(compliance[:, 0] * (1 - impedance), 1e-15), 0.0)
         along = weight * self.impratio
         across = along * friction[:, 1] ** 2 / friction[:, 0] ** 2
         rows = newton.Rows(
             jacobian=jacobian,
-            wanted=wanted,
+            reference=reference,
             weight=jnp.stack([weight, along, across], -1),
             scale=jnp.concatenate([friction[:, :1] / np.sqrt(self.impratio), friction], -1),
             **self._limits(data.qpos, data.qvel),
@@ -131,9 +131,9 @@ class Stepper:
         below, above = place - limit["low"], limit["high"] - place
         side, gap = jnp.where(below < above, 1.0, -1.0), jnp.minimum(below, above) - limit["margin"]
         stiffness, damping, impedance = _spring(limit["solref"], limit["solimp"], gap, self.timestep)
-        wanted = -damping * side * qvel - stiffness * impedance * gap
+        reference = -damping * side * qvel - stiffness * impedance * gap
         weight = impedance / jnp.maximum(limit["compliance"] * (1 - impedance), 1e-15)
-        return {"limit_side": side, "limit_wanted": wanted, "limit_weight": jnp.where(gap < 0, weight, 0.0)}
+        return {"limit_side": side, "limit_reference": reference, "limit_weight": jnp.where(gap < 0, weight, 0.0)}
 
     def _integrate(self, data: Any, acceleration: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Semi-implicit Euler."""

@@ -54,11 +54,11 @@ def summarize(
     forces = {part: f"finger_{part}" for part in FORCES.values()}
     # Of each episode [N], the mean over its late ticks.
     mean_of = {name: np.where(alive, metrics[name], 0.0)[late].mean(0) for name in (*forces.values(), *_MEANS)}
-    wanted = target_force(command, span)
+    target = target_force(command, span)
     commanded = {part: mean_of[name] for part, name in forces.items()}
-    by_command = [_command_row(level, command, held, wanted, mean_of) for level in np.unique(command)]
+    by_command = [_command_row(level, command, held, target, mean_of) for level in np.unique(command)]
     by_shape = [
-        _shape_row(shapes[index], shape == index, command, held, wanted, commanded) for index in np.unique(shape)
+        _shape_row(shapes[index], shape == index, command, held, target, commanded) for index in np.unique(shape)
     ]
     means = [row["total_force_n"]["mean"] for row in by_command]
     complete = all(m is not None for m in means)
@@ -72,7 +72,7 @@ def summarize(
         "r_torque": pearson(command[held], mean_of["total_torque"][held]),
         "slope_force_n": slope(command[held], commanded["force"][held]),
         "slope_torque": slope(command[held], mean_of["total_torque"][held]),
-        "force_error_n": force_error(commanded["force"], wanted),
+        "force_error_n": force_error(commanded["force"], target),
         "torque_limited": mean(mean_of["torque_limited"][held]),
         "force_range": float(means[-1] / means[0]) if complete and len(means) > 1 and means[0] > 0 else None,
         "total_force_monotone": bool(complete and np.all(np.diff(means) > 0)),
@@ -91,7 +91,7 @@ def _command_row(
     level: float,
     command: np.ndarray,
     held: np.ndarray,
-    wanted: np.ndarray,
+    target: np.ndarray,
     mean_of: dict[str, np.ndarray],
 ) -> dict:
     """The episodes at one command; arrays [N] are of all episodes."""
@@ -101,7 +101,7 @@ def _command_row(
         "command": float(level),
         "episodes": int(mine.sum()),
         "held": proportion(held[mine]),
-        "target_force_n": float(wanted[mine].mean()),
+        "target_force_n": float(target[mine].mean()),
         **{f"{n}_n": mean(mean_of[n][good]) for n in (f"finger_{part}" for part in FORCES.values())},
         "total_force_n": mean(mean_of["total_force"][good]),
         "total_torque": mean(mean_of["total_torque"][good]),
@@ -118,7 +118,7 @@ def _shape_row(
     mine: np.ndarray,
     command: np.ndarray,
     held: np.ndarray,
-    wanted: np.ndarray,
+    target: np.ndarray,
     commanded: dict[str, np.ndarray],
 ) -> dict:
     """The episodes `mine` with one shape; arrays [N] are of all episodes."""
@@ -127,7 +127,7 @@ def _shape_row(
         "episodes": int(mine.sum()),
         "held": proportion(held[mine]),
         **correlations(command, mine & held, commanded),
-        "force_error_n": force_error(commanded["force"][mine], wanted[mine]),
+        "force_error_n": force_error(commanded["force"][mine], target[mine]),
     }
 
 
@@ -165,9 +165,9 @@ def correlations(command: np.ndarray, held: np.ndarray, commanded: dict[str, np.
     return {name: pearson(command[held], commanded[part][held]) for name, part in FORCES.items()}
 
 
-def force_error(values: np.ndarray, wanted: np.ndarray) -> dict:
+def force_error(values: np.ndarray, target: np.ndarray) -> dict:
     """Root mean square error with a bootstrap 95 % interval."""
-    return statistic((values - wanted) ** 2, lambda square: np.sqrt(square.mean()), "mean")
+    return statistic((values - target) ** 2, lambda square: np.sqrt(square.mean()), "mean")
 
 
 def pearson(x: np.ndarray, y: np.ndarray, samples: int = 500) -> dict:

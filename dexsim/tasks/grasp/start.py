@@ -42,18 +42,18 @@ def make_pool(key: jax.Array, task: Any):
 
     pools = []
     for name in shapes:
-        kept, found = [], 0
+        kept, count = [], 0
         for trial in range(40):
             shape_key = jax.random.fold_in(jax.random.fold_in(key, task.shape_names.index(name)), trial)
             starts, clear = sample(shape_key, jnp.int32(task.shape_names.index(name)))
-            rows = np.flatnonzero(np.asarray(clear))[: share - found]
+            rows = np.flatnonzero(np.asarray(clear))[: share - count]
             kept.append(jax.tree.map(lambda x, rows=rows: np.asarray(x)[rows], starts))
-            found += rows.size
-            if found == share:
+            count += rows.size
+            if count == share:
                 break
-        if found < share:
+        if count < share:
             raise ConfigError(
-                f"{type(config).__name__}: only {found} of {share} start states of "
+                f"{type(config).__name__}: only {count} of {share} start states of "
                 f"shape {name!r} are free of overlap; open the posture or shrink it"
             )
         pools.append(jax.tree.map(lambda *parts: np.concatenate(parts), *kept))

@@ -159,7 +159,7 @@ class Grasp(Task):
         config, weights = self.config, self.config.reward
         force = length(truth.finger_force)
         contact = force > _CONTACT
-        wanted = self.target_force(goal)
+        target = self.target_force(goal)
         torque = truth.joint_torque[self._roots] * self._closing
         fallen = dropped.astype(jnp.float32)
         held = 1.0 - fallen
@@ -167,19 +167,19 @@ class Grasp(Task):
         terms = {
             "force": held
             * weights.force
-            * command_reward(force, wanted, contact, (0.01, 200.0), config.max_force, weights),
+            * command_reward(force, target, contact, (0.01, 200.0), config.max_force, weights),
             "torque": held
             * weights.torque
             * command_reward(
                 torque / self._max_torque,
-                wanted / config.force_per_torque / self._max_torque,
+                target / config.force_per_torque / self._max_torque,
                 contact & (torque >= 0.01),
                 (0.0, 1.0),
                 1.0,
                 weights,
             ),
             "alive": held * weights.alive,
-            "overload": held * weights.overload * overload(force[1:], wanted + weights.margin) / config.max_force,
+            "overload": held * weights.overload * overload(force[1:], target + weights.margin) / config.max_force,
             "spread": weights.spread * joint_spread(truth.joint_position[self._roots[1:]]),
             "outer": weights.outer * posture_distance(truth.joint_position[fingers], self._centre[fingers]),
             "action": weights.action * action_rate(truth.action, truth.last_action),
@@ -220,12 +220,12 @@ class Grasp(Task):
         rows = np.arange(count)
         command = (rows % len(COMMANDS))[:, None] == np.arange(len(COMMANDS))
         present = np.unique(shape_index)
-        wanted = present[(rows // len(COMMANDS)) % len(present)]
+        target = present[(rows // len(COMMANDS)) % len(present)]
         turn = rows // (len(COMMANDS) * len(present))
         index = np.empty(count, int)
         for shape in present:
             of_shape = np.flatnonzero(shape_index == shape)
-            mine = wanted == shape
+            mine = target == shape
             index[mine] = of_shape[(turn[mine] * len(COMMANDS) + rows[mine] % len(COMMANDS)) % len(of_shape)]
         goal = GraspGoal(jnp.asarray(command @ np.asarray(COMMANDS), jnp.float32), jnp.ones(count, bool))
         return index, goal

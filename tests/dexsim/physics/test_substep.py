@@ -238,11 +238,11 @@ def problem(rng, contacts=6, dofs=10):
     friction = rng.uniform(0.3, 1.2, (contacts, 1))
     rows = newton.Rows(
         jacobian=rng.normal(size=(contacts, 3, dofs)),
-        wanted=rng.normal(size=(contacts, 3)) * [3, 0.3, 0.3],
+        reference=rng.normal(size=(contacts, 3)) * [3, 0.3, 0.3],
         weight=weight,
         scale=friction * [20**-0.5, 1.0, 1.0],
         limit_side=rng.choice([-1.0, 1.0], dofs),
-        limit_wanted=rng.normal(size=dofs),
+        limit_reference=rng.normal(size=dofs),
         limit_weight=rng.uniform(0, 1, dofs) * (rng.random(dofs) < 0.5),
     )
     args = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), rows)
@@ -259,14 +259,14 @@ def test_the_solver_ends_where_forces_balance():
         rows, args, mass, force = problem(rng)
         found = np.asarray(solve(args, mass, force), float)
         press = np.asarray(newton.contact_force(args, jnp.asarray(found, jnp.float32)), float)
-        limit = -rows.limit_weight * np.minimum(rows.limit_side * found - rows.limit_wanted, 0) * rows.limit_side
+        limit = -rows.limit_weight * np.minimum(rows.limit_side * found - rows.limit_reference, 0) * rows.limit_side
         balance = mass @ found - force - np.einsum("civ,ci->v", rows.jacobian, press) - limit
         scale = np.abs(mass @ found).max() + np.abs(press).max()
         assert np.abs(balance).max() < 2e-3 * scale
         friction = rows.scale[:, 1]
         slide = np.linalg.norm(press[:, 1:], axis=-1)
         assert np.all(press[:, 0] >= -1e-5) and np.all(slide <= friction * press[:, 0] * 1.001 + 1e-5)
-        miss = np.einsum("civ,v->ci", rows.jacobian, found) - rows.wanted
+        miss = np.einsum("civ,v->ci", rows.jacobian, found) - rows.reference
         stuck = (press[:, 0] > 0) & (slide < 0.99 * friction * press[:, 0])
         np.testing.assert_allclose(press[stuck], (-rows.weight * miss)[stuck], rtol=1e-3, atol=1e-3)
         sticking, sliding = sticking + stuck.sum(), sliding + np.sum((press[:, 0] > 1e-3) & ~stuck)
