@@ -70,7 +70,7 @@ def run(experiment: Experiment, budget: Budget, output: Path, work: Path, only: 
         path = report_path(output, experiment, row)
         report = load_report(path)
         missing = missing_seeds(experiment, row, budget, report) if not only or row.name in only else []
-        seeds = {} if len(missing) == len(experiment.seeds(budget)) else dict(report["seeds"])
+        seeds = {} if len(missing) == len(experiment.seeds(budget)) else dict(report.get("seeds", {}))
         for seed in missing:
             print(f"{experiment.name}: {row.label}, seed {seed}", file=sys.stderr, flush=True)
             started = time.perf_counter()
