@@ -102,7 +102,7 @@ class TestPure:
 
     @pytest.mark.parametrize("shape", [(), (5,), (13,), (1, 12)])
     def test_an_action_of_another_shape_is_refused(self, grasp_env, history, shape):
-        with pytest.raises(ConfigError, match=rf"the action has the shape {re.escape(str(shape))}; 'grasp' takes one"):
+        with pytest.raises(ConfigError, match=rf"action: expected shape \(12,\), got {re.escape(str(shape))}$"):
             grasp_env.step(row(history[0][0], 0), np.zeros(shape, np.float32))
 
     def test_reset_depends_on_the_key_alone(self, grasp_rollout):
@@ -299,7 +299,9 @@ class TestEpisodes:
         assert all(tuple(q) in pool for q in ours[".physics.qpos"][done])
         for name in ("tick", "length", "episode_return", "reward"):
             assert not np.any(ours["." + name][done]), name
-        assert np.any(ours[".episode.hand.encoder_bias"][done] != before[".episode.hand.encoder_bias"][done])
+        assert np.any(
+            ours[".episode.hand.actuator.encoder_bias"][done] != before[".episode.hand.actuator.encoder_bias"][done]
+        )
         np.testing.assert_array_equal(begun.joint_target[done], begun.physics.qpos[done, :12])
         # The object goes with its start.
         at = np.flatnonzero((np.asarray(grasp_env.pool.qpos) == ours[".physics.qpos"][0]).all(1))[0]

@@ -82,6 +82,8 @@ def make_moment(hand, **fields):
         "joint_position": joints,
         "joint_velocity": zero,
         "joint_torque": zero,
+        "torque_limited": zero > 0,
+        "tip_stiffness": jnp.ones(5),
         "pose": forward_kinematics(hand, joints),
         "finger_force": jnp.zeros((5, 3)),
         "normal_force": jnp.zeros(5),

@@ -45,6 +45,8 @@ def truth(task: Rotate, **changes) -> GroundTruth:
         "joint_position": joints,
         "joint_velocity": joints,
         "joint_torque": joints,
+        "torque_limited": joints > 0,
+        "tip_stiffness": jnp.ones(5),
         "pose": forward_kinematics(task.hand, joints),
         "finger_force": jnp.zeros((5, 3)),
         "normal_force": jnp.zeros(5),
