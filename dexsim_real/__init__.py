@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from dexsim_real.control.safety import Safety
     from dexsim_real.core.errors import HandError
     from dexsim_real.core.log import LogReader, LogWriter
+    from dexsim_real.run.result import RunResult, run_policy
     from dexsim_real.sensors.hand import HandMeasurement, HandSensing, HardwareConfig
     from dexsim_real.sensors.readings import ObjectEstimate, make_readings
     from dexsim_real.wire.link import HandPort, LinkConfig
@@ -30,11 +31,13 @@ __all__ = [
     "LogReader",
     "LogWriter",
     "ObjectEstimate",
+    "RunResult",
     "Safety",
     "SafetyConfig",
     "SerialHand",
     "make_readings",
     "open_port",
+    "run_policy",
 ]
 
 __getattr__, __dir__ = open_door(
@@ -51,10 +54,12 @@ __getattr__, __dir__ = open_door(
         "LogReader": "dexsim_real.core.log",
         "LogWriter": "dexsim_real.core.log",
         "ObjectEstimate": "dexsim_real.sensors.readings",
+        "RunResult": "dexsim_real.run.result",
         "Safety": "dexsim_real.control.safety",
         "SafetyConfig": "dexsim_real.control.limits",
         "SerialHand": "dexsim_real.wire.serial_hand",
         "make_readings": "dexsim_real.sensors.readings",
         "open_port": "dexsim_real.wire.serial_hand",
+        "run_policy": "dexsim_real.run.result",
     },
 )

@@ -53,7 +53,7 @@ def record(arguments: CalibrateArguments, hand: Hand, operator: Operator, **benc
         pressed = 0
         try:
             procedure.check(tuple(placement.finger for placement in plan))
-            work.loop.engage()
+            work.loop.await_motors()
             for placement in plan:
                 pressed += procedure.press(placement)
         except HandError as error:

@@ -1,11 +1,10 @@
-"""A single-threaded exchange loop through `Safety`, for procedures that move and measure.
+"""The exchange loop of a procedure that moves and measures, and the person beside the hand.
 
-In a run a separate thread keeps the delays of a policy away from the hand. A procedure has no such delays, so one call
-makes an exchange and returns its result. Clock and hand can be simulated.
+In a run a thread keeps the delays of a policy away from the hand. A procedure has no such delays, so one call makes an
+exchange and returns its result. Clock and hand can be simulated.
 """
 
 import contextlib
-import dataclasses
 import io
 import queue
 import sys
@@ -17,39 +16,27 @@ from typing import Any, TextIO
 import numpy as np
 from rich.console import Console
 
-from dexsim_real.control.motors_off import patience, turn_off
-from dexsim_real.control.safety import HandSample, Reaction, Safety
+from dexsim_real.control.policy_loop import smooth
+from dexsim_real.control.safety import Reaction, Safety
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogWriter
-from dexsim_real.core.process import ignore_signals
-from dexsim_real.core.timing import Pace
-from dexsim_real.sensors.hand import HandSensing, VelocityFilter
+from dexsim_real.loop import Exchange, ExchangeLoop
+from dexsim_real.sensors.hand import HandSensing
 from dexsim_real.wire import frames
-from dexsim_real.wire.frames import Command, Frame, Mode
-from dexsim_real.wire.link import HandPort, Reply, checked, refusal_of
+from dexsim_real.wire.frames import Command, Frame
+from dexsim_real.wire.link import HandPort
 
 _PATIENCE = 2.0  # s, longest hold by `Safety` or silence of the hand
 
 
-@dataclasses.dataclass(frozen=True)
-class Exchange:
-    """An answered exchange."""
+class HandLoop(ExchangeLoop):
+    """The exchange loop with a log and a goal, one `step` per cycle.
 
-    sample: HandSample
-    state: np.ndarray  # `frames.STATE_BLOCK`
-    command_applied: bool  # whether the requested target was sent, possibly clipped
-
-
-class HandLoop:
-    """Exchanges with a hand, one `step` per cycle.
+    The taxels' zeros stay as they were tared: what they read is measured.
 
     Args:
-      port: not yet connected; used by this loop only.
-      sensing: conversion to SI units.
-      safety: decides the commands; its notes should go to the log.
+      port, sensing, safety, rate, clock, sleep: see `ExchangeLoop`; the notes of `safety` should go to the log.
       log: gets the frames while `recording` is set, and the marks.
-      rate: exchanges per second.
-      clock, sleep: replace those of `time`, for simulated time.
     """
 
     def __init__(
@@ -63,14 +50,11 @@ class HandLoop:
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ):
-        self.port, self.sensing, self.safety, self.log = port, sensing, safety, log
-        self.clock, self.pace = clock, Pace(rate, clock, sleep)
-        self.recording = False
-        self._filter = VelocityFilter(sensing.config.velocity_time)
+        super().__init__(port, sensing, safety, rate, track_taxels=False, clock=clock, sleep=sleep)
+        self.log, self.recording = log, False
         self._failing_since: float | None = None
-        self._generation: int | None = None
+        self._connection: int | None = None
         self._number = 0
-        self.driven = self._closed = False  # whether the motors may be on; whether the port is closed
 
     def step(self, target: np.ndarray | None = None) -> Exchange | None:
         """Make an exchange; None when it was not answered, or the measurement was implausible.
@@ -84,18 +68,15 @@ class HandLoop:
         now = self.clock()
         if target is not None:
             self.safety.set_target(target, now)
-        decision = self.safety.decide(now)
-        command = self.sensing.command(decision.position, decision.mode, decision.stiffness)
+        decision, command = self.request()
         self._number += 1
-        self._keep(Kind.SENT, frames.HOST, command, now)
-        self.driven |= decision.mode == Mode.POSITION
-        reply = self.port.exchange(command)
-        if reply is None:
-            self.safety.refuse(refusal_of(self.port))
-        exchange = None if reply is None else self._take(checked(reply, self.clock()), decision.reaction)
-        self._check(now, decision, reply)
+        self._record(Kind.SENT, command, now)
+        exchange = self.take(decision, self.port.exchange(command))
+        if exchange is not None:
+            self._record(Kind.RECEIVED, exchange.state, exchange.sample.time)
+        self._check(now, exchange)
         self.pace.wait()
-        return exchange
+        return exchange if exchange is not None and exchange.plausible else None
 
     def mark(self, content: dict[str, Any]) -> None:
         """Annotate the newest exchange in the log."""
@@ -103,18 +84,18 @@ class HandLoop:
 
     def collect(self, seconds: float, target: np.ndarray | None = None) -> list[Exchange]:
         """The answered exchanges of this duration in s."""
-        until, found = self.clock() + seconds, []
+        until, exchanges = self.clock() + seconds, []
         while self.clock() < until:
-            found.append(self.step(target))
-        return [exchange for exchange in found if exchange is not None]
+            exchanges.append(self.step(target))
+        return [exchange for exchange in exchanges if exchange is not None]
 
-    def engage(self) -> None:
+    def await_motors(self) -> None:
         """Turn the motors on, and wait until they are.
 
         Raises:
           HandError: see `step`.
         """
-        self.safety.engage()
+        self.engage()
         while not self.safety.anchor:
             self.step()
 
@@ -124,7 +105,7 @@ class HandLoop:
         seconds = max(float(np.abs(goal - start).max()) / speed, 0.3)
         begin = self.clock()
         while (share := (self.clock() - begin) / seconds) < 1.0:
-            self.step(start + share * share * (3 - 2 * share) * (goal - start))
+            self.step(smooth(start, goal, share))
         self.step(goal)
 
     def pose(self) -> np.ndarray:
@@ -133,51 +114,30 @@ class HandLoop:
         assert sample is not None, "no state yet"
         return sample.measured.joint_position.astype(float)
 
-    def close(self) -> None:
-        """Turn the motors off and close the port; `driven` remains True if the hand has not confirmed it."""
-        ignore_signals()
-        if self._closed:
-            return
-        off = self.sensing.command(self.sensing.hand.joint_lower, Mode.PASSIVE)
-        try:
-            if turn_off(self.port, off, patience(self.driven)):
-                self.driven = False
-        finally:
-            self._closed = True
-            with contextlib.suppress(Exception):  # Of a driver from elsewhere; the hand has been told.
-                self.port.close()
-
     # --- pieces ---------------------------------------------------------------------------------
 
-    def _take(self, reply: Reply, reaction: Reaction) -> Exchange | None:
-        self._keep(Kind.RECEIVED, frames.palm_address(0), reply.state, reply.received)
-        measured = self.sensing.measure(reply.state)
-        velocity = self._filter.estimate(reply.received, measured.joint_position)
-        sample = HandSample(reply.received, reply.sequence, reply.generation, measured, velocity)
-        if not self.safety.see(sample):
-            return None
-        self._filter.update(reply.received, measured.joint_position)
-        return Exchange(sample, reply.state, reaction <= Reaction.CLIP)
-
-    def _keep(self, kind: Kind, source: int, block: np.ndarray, when: float) -> None:
+    def _record(self, kind: Kind, block: np.ndarray, when: float) -> None:
         """Log a frame as it is on the wire of a hand with id 0."""
         if self.recording:
-            target = frames.HOST if kind == Kind.RECEIVED else frames.palm_address(0)
+            ends = frames.HOST, frames.palm_address(0)
+            source, target = ends if kind == Kind.SENT else ends[::-1]
             frame = Frame(source, target, Command.EXCHANGE, block.tobytes())
             self.log.add(kind, (self._number, frame.encode()), when)
 
-    def _check(self, now: float, decision: Any, reply: Reply | None) -> None:
-        if self.safety.latched:
-            raise HandError(f"stopped: {self.safety.latched}")
+    def _check(self, now: float, exchange: Exchange | None) -> None:
+        safety = self.safety
+        if safety.latched:
+            raise HandError(f"stopped: {safety.latched}")
         if self.log.failure:
             raise HandError(f"stopped: the log is lost ({self.log.failure})")
-        if reply is not None and self._generation not in (None, reply.generation):
+        if exchange is not None and self._connection not in (None, exchange.sample.generation):
             raise HandError("stopped: the hand was disconnected and its pose may have changed; start again")
-        self._generation = reply.generation if reply is not None else self._generation
-        working = reply is not None and (decision.reaction <= Reaction.CLIP or not self.safety.engaged)
+        self._connection = exchange.sample.generation if exchange is not None else self._connection
+        reaction, reason = safety.last
+        working = exchange is not None and (reaction <= Reaction.CLIP or not safety.engaged)
         self._failing_since = None if working else self._failing_since or now
         if self._failing_since is not None and now - self._failing_since > _PATIENCE:
-            why = self.safety.refused or decision.reason or "the hand does not answer"
+            why = safety.refused or reason or "the hand does not answer"
             raise HandError(f"stopped: {why} for {_PATIENCE:g} s")
 
 

@@ -137,7 +137,7 @@ def record(arguments: CalibrateArguments, hand: Hand, operator: Operator, **benc
             loop.step()
             if not operator.assume_yes and operator.ask("  Enter starts, s stops:", loop.step).lower() in ("s", "stop"):
                 raise HandError("stopped before anything moved")
-            loop.engage()
+            loop.await_motors()
             for name in next(iter(signals.values())):
                 operator.tell(name)
                 for label, targets in signals.items():

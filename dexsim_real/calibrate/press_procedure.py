@@ -12,12 +12,14 @@ from typing import Any
 import numpy as np
 
 from dexsim_real.calibrate.gauge import Gauge
-from dexsim_real.calibrate.hand_loop import Exchange, HandLoop, Operator
+from dexsim_real.calibrate.hand_loop import HandLoop, Operator
 from dexsim_real.calibrate.options import CalibrateArguments
 from dexsim_real.calibrate.plan import Placement
 from dexsim_real.calibrate.taxel_check import RestReport, check_answered, check_release, check_rest, raw_sensing
+from dexsim_real.control.safety import Reaction
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind
+from dexsim_real.loop import Exchange
 
 LOADING, UNLOADING, RELEASED, REST = "loading", "unloading", "released", "rest"
 """Phases of a press; "level K" is a force held for the gauge."""
@@ -261,7 +263,7 @@ class PressProcedure:
         before, self._advance = self._advance, advance
         self.loop.recording = bool(phase)
         exchange = self.loop.step(self._target())
-        if exchange is None or not exchange.command_applied:
+        if exchange is None or exchange.decision.reaction > Reaction.CLIP:
             self._advance = before
             return None
         if phase:

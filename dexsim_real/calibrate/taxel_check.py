@@ -10,9 +10,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from dexsim.hand.kinematics import Hand
-from dexsim_real.calibrate.hand_loop import Exchange
 from dexsim_real.calibrate.options import CheckConfig
 from dexsim_real.core.errors import HandError
+from dexsim_real.loop import Exchange
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
 from dexsim_real.sensors.taxels import judge_rest, taxel_names
 

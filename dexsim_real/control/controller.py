@@ -19,9 +19,8 @@ from dexsim_ppo.export import ExportedPolicy
 from dexsim_ppo.policy import Policy
 from dexsim_real.core.errors import HandError
 from dexsim_real.sensors.hand import HandMeasurement
+from dexsim_real.sensors.imu import IDENTITY
 from dexsim_real.sensors.readings import ObjectEstimate, make_readings, sources_of
-
-IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 
 
 @dataclasses.dataclass(frozen=True)

@@ -18,31 +18,31 @@ from dexsim.core.config import to_dict
 from dexsim.hand.source import record_of, recorded_hand
 from dexsim_ppo.export import load_exported
 from dexsim_ppo.policy import load_policy
-from dexsim_real.control.controller import IDENTITY, Controller, Tick
-from dexsim_real.control.goals import TurnGoals
+from dexsim_real.control.controller import Controller
 from dexsim_real.control.motors_off import UNCONFIRMED
-from dexsim_real.control.safety import Safety
-from dexsim_real.control.servo import Servo
+from dexsim_real.control.policy_loop import PolicyLoop, PolicyTick, limits_for
+from dexsim_real.control.safety import Reaction, Safety
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogWriter
 from dexsim_real.core.process import ignore_signals, leave_realtime, use_realtime
 from dexsim_real.core.timing import Pace, Timing, keep_phase
+from dexsim_real.loop import LoopThread
 from dexsim_real.run import consent
 from dexsim_real.run.guard import Guard
-from dexsim_real.run.object_sensors import ObjectSensors
+from dexsim_real.run.hand_view import HandState
 from dexsim_real.run.options import RunArguments
 from dexsim_real.run.outcome import Outcome
-from dexsim_real.run.overview import overview
-from dexsim_real.run.status import StatusView
+from dexsim_real.run.status import Status, StatusView
+from dexsim_real.sensors.camera import HeightSensor, open_masks
 from dexsim_real.sensors.hand import HandSensing
-from dexsim_real.wire.frames import Mode, empty_state
+from dexsim_real.sensors.imu import Imu
+from dexsim_real.sensors.object_sensors import ObjectSensors
+from dexsim_real.wire.frames import empty_state
 from dexsim_real.wire.identity import check_identity
-from dexsim_real.wire.link import checked, greet, refusal_of
+from dexsim_real.wire.link import greet
 from dexsim_real.wire.serial_hand import open_port
 
-_TARE_SAMPLES = 30
 _SWITCH = sys.getswitchinterval()
-_PATIENCE = 60.0  # s to wait until the camera sees the object
 _STILL = 5.0  # s to wait for a hand that is still, whose motors can come on
 
 
@@ -55,8 +55,8 @@ class Session:
 
     def __init__(self, arguments: RunArguments):
         self.arguments = arguments
-        wanted = arguments.guard and not arguments.motors_off
-        self.guard = Guard(arguments.port, arguments.link) if wanted else None
+        guarded = arguments.guard and not arguments.motors_off
+        self.guard = Guard(arguments.port, arguments.link) if guarded else None
         exported = arguments.policy.endswith((".npz", ".onnx"))
         policy: Any = (load_exported if exported else load_policy)(arguments.policy)
         hand = recorded_hand(policy.hand, arguments.hand, arguments.policy) or load_hand()
@@ -65,9 +65,7 @@ class Session:
         self.sensing = HandSensing(hand, arguments.hardware, calibration)
         self.controller.warm()
         self.sensing.measure(empty_state())
-        config = arguments.safety
-        config = dataclasses.replace(config, watchdog=max(config.watchdog, 2.5 * self.controller.period))
-        self.safety = Safety(hand, config, self._react)
+        self.safety = Safety(hand, limits_for(arguments.safety, self.controller), self._react)
         # Not earlier: compiling in a real-time thread would starve the machine.
         realtime = arguments.realtime and use_realtime()
         path = arguments.log or Path("runs/real") / time.strftime("%Y%m%d-%H%M%S.log")
@@ -75,15 +73,14 @@ class Session:
         self.port = open_port(arguments.port, arguments.link, self._tap)
         rate = keep_phase(arguments.rate, policy.control_rate)
         beat = self.guard.beat if self.guard else lambda more: None
-        self.servo = Servo(self.port, self.sensing, self.safety, rate, beat)
-        self.servo.retared = self._retare
-        self.view = StatusView(f"{policy.task} on {arguments.port}", lambda: overview(self), arguments.quiet)
-        self.objects: ObjectSensors | None = None
-        self.goals: TurnGoals | None = None
+        self.loop = LoopThread(self.port, self.sensing, self.safety, rate, beat)
+        self.loop.retared = self._retare
+        self.view = StatusView(f"{policy.task} on {arguments.port}", self.status, arguments.quiet)
+        self._policy: PolicyLoop | None = None  # from `prepare` on
         self.compute, self.pace = Timing(), Pace(policy.control_rate)
-        self.started = self.force = self.forces = 0.0
+        self.started = 0.0
         self.outcome = Outcome()
-        self.tick: Tick | None = None
+        self.newest: PolicyTick | None = None
         self.end, self._closed = "not started", False
         if arguments.realtime and not realtime:
             self._note("without real-time priority: expect jitter on a busy machine (docs/hardware.md)")
@@ -103,12 +100,18 @@ class Session:
         if self.arguments.tare:
             self._tare()
         self._write_meta()
-        self.servo.start()
+        self.loop.start()
         self._await_pose()
-        self.objects = ObjectSensors(self.arguments, self.controller)
-        spec = self.controller.spec
-        if self.arguments.imu and spec.turn:
-            self.goals = TurnGoals(spec.turn, np.asarray(spec.reference))
+        arguments = self.arguments
+        self._policy = PolicyLoop(
+            self.controller,
+            self.safety,
+            open_objects(arguments, self.controller),
+            command=arguments.command,
+            approach=arguments.approach,
+            place=arguments.place,
+            motors_off=arguments.motors_off,
+        )
 
     def run(self) -> None:
         """Ask, turn the motors on, approach the start posture, and run the policy until time or `Safety` ends it.
@@ -127,12 +130,15 @@ class Session:
             if self.guard:
                 self.guard.arm()
             if not self.arguments.motors_off:
-                self.servo.engage()
+                self.loop.engage()
                 self._await_motors()
-            self._approach()
-            self.controller.start(self.safety.commanded)
+            pace = Pace(self.arguments.rate)
+            while self.policy.approach(time.monotonic()):
+                self._check()
+                pace.wait()
+            self.policy.begin()
             self._note("the policy starts")
-            self.end = self._loop()
+            self.end = self._run_policy()
 
     def close(self, reason: str = "") -> None:
         """Turn the motors off and close everything; may be called at any stage, and again."""
@@ -140,13 +146,13 @@ class Session:
         if self._closed:
             return
         self.end = reason or self.end
-        self.servo.stop()
+        self.loop.stop()
         if self.guard:
-            self.guard.dismiss(off=not self.servo.driven)
-        if self.servo.driven:
+            self.guard.dismiss(off=not self.loop.driven)
+        if self.loop.driven:
             self.end += f"; {UNCONFIRMED}: press the emergency stop"
-        if self.objects:
-            self.objects.close()
+        if self._policy:
+            self._policy.objects.close()
         self._note(f"end: {self.end}")
         self.log.add(Kind.END, self.summary())
         self.log.close()
@@ -157,49 +163,73 @@ class Session:
 
     def summary(self) -> dict[str, Any]:
         """Results and statistics of the run; JSON-able."""
-        servo, safety = self.servo, self.safety
+        loop, safety, policy = self.loop, self.safety, self._policy
+        force = policy.finger_force.sum() / max(policy.ticks, 1) if policy else 0.0
         summary = {
             "end": self.end,
-            "motors_off": not self.servo.driven,
+            "motors_off": not loop.driven,
             "seconds": round(time.monotonic() - self.started, 3) if self.started else 0.0,
             "command": self.arguments.command,
             "policy_jitter": self.pace.jitter.summary(),
             "policy_compute": self.compute.summary(),
-            "exchange_jitter": servo.pace.jitter.summary(),
-            "round_trip": servo.round_trip.summary(),
-            "missed_for_the_hand": servo.waited,
+            "exchange_jitter": loop.pace.jitter.summary(),
+            "round_trip": loop.round_trip.summary(),
+            "missed_for_the_hand": loop.waited,
             "link": dataclasses.asdict(self.port.counts),
             "safety": dict(safety.counts),
-            "mean_finger_force": self.force / self.forces if self.forces else 0.0,
+            "mean_finger_force": float(force),
             "log": str(self.log.path),
             "log_dropped": self.log.dropped,
             "missing": self.outcome.missing(self.log),
         }
-        if self.goals:
-            times = [t - self.started for t in self.goals.times]
-            summary |= {"successes": self.goals.successes, "success_times": times}
+        if policy and policy.goals:
+            times = [t - self.started for t in policy.goals.times]
+            summary |= {"successes": policy.goals.successes, "success_times": times}
         return summary
+
+    @property
+    def policy(self) -> PolicyLoop:
+        """The policy's side, from `prepare` on."""
+        assert self._policy is not None, "`prepare` comes first"
+        return self._policy
+
+    def status(self) -> Status:
+        """The state of the run in words; called from the view's thread."""
+        safety, loop, counts, sample = self.safety, self.loop, self.port.counts, self.safety.sample
+        if sample is None:
+            return Status({"hand": safety.problem or "no measurement"})
+        reaction, reason = safety.last
+        now, trip = time.monotonic(), loop.round_trip
+        rows = {
+            "time": f"{now - self.started if self.started else 0:.1f} s",
+            "safety": f"{reaction.name.lower()} {reason}".strip(),
+            "age": f"{1e3 * (now - sample.time):.1f} ms {safety.problem}".strip(),
+            "policy": _timing(self.pace),
+            "exchanges": _timing(loop.pace),
+            "round trip": f"p50 {1e3 * trip.percentile(50):.2f} ms, p99 {1e3 * trip.percentile(99):.2f} ms",
+            "link": f"{counts.answered} answered, {counts.corrupt} corrupt, {counts.silent} silent, "
+            f"{counts.late} late, {counts.reconnects} reconnects",
+            "command": f"{self.arguments.command:.2f}",
+        }
+        if self._policy and self._policy.goals:
+            rows["successes"] = str(self._policy.goals.successes)
+        sent = reaction != Reaction.RELAX
+        target = safety.commanded if sent else self.newest.tick.target if self.newest else None
+        return Status(rows, HandState(self.sensing.hand, sample.measured, target, sent))
 
     # --- pieces ---------------------------------------------------------------------------------
 
     def _tare(self) -> None:
-        states, until = list[np.ndarray](), time.monotonic() + 5.0
-        while len(states) < _TARE_SAMPLES and time.monotonic() < until:
-            reply = self.port.exchange(self.sensing.command(self.sensing.hand.joint_lower, Mode.PASSIVE))
-            if reply is not None:
-                states.append(checked(reply, time.monotonic()).state)
-            elif (refusal := refusal_of(self.port)) and refusal.serious:
-                raise HandError(f"{self.arguments.port}: {refusal.text}")
-        if len(states) < _TARE_SAMPLES:
-            raise HandError(
-                f"{self.arguments.port}: only {len(states)} answers in 5 s, cannot tare the taxels; check the cable"
-            )
-        for line in self.sensing.set_tare(states):
+        try:
+            lines = self.loop.tare()
+        except HandError as error:
+            raise HandError(f"{self.arguments.port}: {error}") from None
+        for line in lines:
             self._note(f"warning: {line}")
 
     def _await_pose(self) -> None:
-        if self.servo.wait_fresh(1.0) is None:
-            self._check_servo()
+        if self.loop.wait_fresh(1.0) is None:
+            self._check_loop()
             if self.safety.problem:
                 raise HandError(f"{self.arguments.port}: {self.safety.problem}; check `--hardware.joint-offset`")
             why = self.safety.refused or "the hand stopped answering; check the cable and the power"
@@ -213,76 +243,41 @@ class Session:
                 raise HandError(f"{self.arguments.port}: the motors did not come on: {self.safety.last[1]}")
             time.sleep(0.01)
 
-    def _approach(self) -> None:
-        """Move to the start posture, and hold it until the object is seen."""
-        arguments, start = self.arguments, self.safety.commanded  # Not the last reading, which may be wrong.
-        goal = np.asarray(self.controller.spec.posture or start, np.float32)
-        goal = goal if arguments.approach > 0 else start
-        begin, pace = time.monotonic(), Pace(arguments.rate)
-        ready = begin + arguments.approach + arguments.place
-        objects = self._objects()
-        while (now := time.monotonic()) < ready or not objects.ready():
-            if now > ready + _PATIENCE:
-                raise HandError(
-                    "the camera does not see the object; check the light, the colour thresholds "
-                    "(--optics.hsv-low, --optics.hsv-high) and --optics.min-area"
-                )
-            share = min((now - begin) / arguments.approach, 1.0) if arguments.approach > 0 else 1.0
-            self.safety.set_target(start + np.float32(share * share * (3 - 2 * share)) * (goal - start), now)
-            self._check()
-            pace.wait()
-
-    def _objects(self) -> ObjectSensors:
-        assert self.objects is not None, "`prepare` opens the sensors"
-        return self.objects
-
     def _check(self) -> None:
         if self.guard:
             self.guard.check()
-        self._check_servo()
+        self._check_loop()
         if self.safety.latched:
             raise HandError(f"stopped: {self.safety.latched}")
 
-    def _check_servo(self) -> None:
-        if (error := self.servo.error) is not None:
+    def _check_loop(self) -> None:
+        if (error := self.loop.error) is not None:
             why = error if isinstance(error, HandError) else repr(error)
             raise HandError(f"the exchange thread failed: {why}")
 
-    def _loop(self) -> str:
-        anchor, self.started = self.safety.anchor, time.monotonic()
+    def _run_policy(self) -> str:
+        """Tick until the time is over; returns why it ended."""
+        self.started = time.monotonic()
         self.outcome = Outcome(self.started)
-        self.servo.forget()
+        self.loop.forget()
         self.pace = Pace(self.controller.policy.control_rate)
         # A tick starts when a request has just been sent; rates from `keep_phase` keep it so.
-        self.pace.next = self.servo.free(self.pace.next)
-        while time.monotonic() < self.started + self.arguments.seconds:
+        self.pace.next = self.loop.free(self.pace.next)
+        while (now := time.monotonic()) < self.started + self.arguments.seconds:
             self._check()
-            now, sample = time.monotonic(), self.safety.sample
-            assert sample is not None, "no state yet"
-            measured = now - sample.time <= self.safety.config.stale
-            self.outcome.add(now, measured, self.safety)
-            if measured:
-                if anchor != self.safety.anchor:
-                    anchor = self.safety.anchor
-                    self.controller.resume(self.safety.commanded)
-                self._tick(now, sample)
+            newest = self.policy.tick(now)
+            self.outcome.add(now, newest is not None, self.safety)
+            if newest is not None:
+                self.newest = newest
+                self.outcome.act(newest.tick.target)
+                self._log_tick(now, newest)
                 self.compute.add(time.monotonic() - now)
             self.pace.wait()
         self._check()
         return "time is over"
 
-    def _tick(self, now: float, sample: Any) -> None:
-        objects = self._objects()
-        seen, when = objects.read(now)
-        goal = self.goals.update(when, seen) if self.goals else IDENTITY
-        if self.arguments.motors_off:
-            self.controller.anchor(sample.measured.joint_position)
-        tick = self.controller.tick(sample.measured, seen, goal, self.arguments.command)
-        self.safety.set_target(tick.target, now, objects.lost(now, self.safety.config.stale_object))
-        self.tick = tick
-        self.outcome.act(tick.target)
-        self.force += float(sample.measured.finger_force.sum())
-        self.forces += 1
+    def _log_tick(self, now: float, newest: PolicyTick) -> None:
+        tick, sample = newest
         readings = {field.name: getattr(tick.readings, field.name) for field in dataclasses.fields(tick.readings)}
         self.log.add(
             Kind.TICK,
@@ -339,3 +334,38 @@ class Session:
                 "environment": cli.environment_report(),
             },
         )
+
+
+def open_objects(arguments: RunArguments, controller: Controller) -> ObjectSensors:
+    """Open the camera and the IMU of a run.
+
+    Raises:
+      HandError: the policy needs a sensor that is not given, or a sensor cannot be opened.
+    """
+    spec, needed = controller.spec, controller.sources
+    if "imu" in needed and not arguments.imu:
+        raise HandError("the policy observes the object's orientation; give the IMU's port with --imu")
+    if "camera" in needed and not (arguments.camera or arguments.fixed_object):
+        raise HandError("the policy observes the object's height; give --camera, or --fixed-object to assume it")
+    reference, optics, camera, imu = np.asarray(spec.reference, float), arguments.optics, None, None
+    try:
+        if arguments.camera:
+            masks = open_masks(arguments.camera, optics)
+            camera = HeightSensor(masks, optics, reference, spec.object_axes, spec.velocity_filter)
+        if arguments.imu:
+            imu = Imu(arguments.imu, arguments.imu_mount)
+            imu.wait()
+        return ObjectSensors(reference, camera, imu)
+    except BaseException:
+        ObjectSensors(reference, camera, imu).close()
+        raise
+
+
+def _timing(pace: Pace) -> str:
+    timing = pace.jitter
+    if not timing.count:
+        return f"{1 / pace.period:.1f} Hz"
+    return (
+        f"{1 / pace.period:.1f} Hz, late p50 {1e3 * timing.percentile(50):.2f} ms, "
+        f"p99 {1e3 * timing.percentile(99):.2f} ms, missed {timing.missed}"
+    )

@@ -56,8 +56,7 @@ class StatusView:
     """
 
     def __init__(self, title: str, status: Callable[[], Status], quiet: bool = False):
-        stream = cast(TextIO, _Lasting(sys.stderr)) if sys.stderr else None
-        self.console = Console(stderr=True, quiet=quiet, file=stream)
+        self.console = _console(quiet)
         self._title, self._status = title, status
         self._live = (
             Live(console=self.console, auto_refresh=False, transient=True)
@@ -116,15 +115,20 @@ class StatusView:
         return Group(escape(self._title), *([hand_tables(status.hand)] if status.hand else []), "", rows)
 
 
-def summary_table(title: str, summary: dict[str, Any]) -> Table:
-    """A table of nested results."""
+def show_summary(title: str, summary: dict[str, Any]) -> None:
+    """Print nested results as a table on the standard error."""
     # Escaped, since an error may have text in brackets, which Rich would take for its markup.
     table = Table("measure", "value", title=escape(title), title_justify="left")
     for name, value in summary.items():
         if isinstance(value, dict):
             value = ", ".join(f"{k} {_short(v)}" for k, v in value.items() if v not in (0, {}))
         table.add_row(name.replace("_", " "), escape(_short(value)))
-    return table
+    _console().print(table)
+
+
+def _console(quiet: bool = False) -> Console:
+    stream = cast(TextIO, _Lasting(sys.stderr)) if sys.stderr else None
+    return Console(stderr=True, quiet=quiet, file=stream)
 
 
 def _short(value: Any) -> str:

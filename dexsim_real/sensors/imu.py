@@ -22,6 +22,7 @@ HEAD = b"\xaa\xaa"
 SIZE = 19
 BAUD = 115200
 _BODY = struct.Struct("<B6h3B")
+IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 UPRIGHT_X = (0.5**0.5, 0.0, 0.5**0.5, 0.0)
 """Orientation (w, x, y, z) of the IMU in the object: the IMU's z along the object's x."""
 
@@ -110,7 +111,44 @@ def align(sensed: np.ndarray, known: np.ndarray) -> np.ndarray:
     return multiply(known, conjugate(sensed))
 
 
-class Imu:
+class ImuReader:
+    """From an IMU's bytes to the orientation of the object in the palm frame.
+
+    Args:
+      mount: [4] orientation of the IMU in the object.
+      port: name of its port, for messages.
+    """
+
+    def __init__(self, mount: tuple[float, ...] = UPRIGHT_X, port: str = "IMU"):
+        self.port, self.parser = port, RvcParser()
+        self._mount = np.asarray(mount) / np.linalg.norm(mount)
+        self._world: np.ndarray | None = None
+        self._newest: tuple[float, np.ndarray] | None = None
+
+    def receive(self, time: float, data: bytes) -> None:
+        """Update with bytes that were received at a time in s."""
+        if quats := self.parser.feed(data):
+            before = self._newest[1] if self._newest else quats[-1]
+            # q and -q are one orientation: take the one nearer to the last, as in simulation.
+            self._newest = time, quats[-1] if quats[-1] @ before >= 0 else -quats[-1]
+
+    def calibrate(self, known: np.ndarray) -> None:
+        """Align: the object now has the orientation `known` [4] in the palm frame."""
+        assert self._newest is not None, "`wait` for the first orientation"
+        self._world = align(self._newest[1], multiply(known, self._mount))
+
+    def read(self) -> tuple[float, np.ndarray]:
+        """Time of the newest sample (s, monotonic clock) and orientation [4] of the object in the palm frame."""
+        if self._newest is None or self._world is None:
+            raise HandError(f"{self.port}: the IMU has not been aligned; call `calibrate` first")
+        when, quat = self._newest
+        return when, multiply(multiply(self._world, quat), conjugate(self._mount))
+
+    def close(self) -> None:
+        """Nothing is open here."""
+
+
+class Imu(ImuReader):
     """Reads an IMU from its own thread; `read` returns the newest orientation in the palm frame.
 
     Args:
@@ -122,12 +160,8 @@ class Imu:
     """
 
     def __init__(self, port: str, mount: tuple[float, ...] = UPRIGHT_X):
-        self.port = port
-        self._mount = np.asarray(mount) / np.linalg.norm(mount)
-        self._world: np.ndarray | None = None
-        self._newest: tuple[float, np.ndarray] | None = None
+        super().__init__(mount, port)
         self._stop = threading.Event()
-        self.parser = RvcParser()
         self._serial = _open(port)
         self._thread = threading.Thread(target=self._run, name="imu", daemon=True)
         self._thread.start()
@@ -146,18 +180,6 @@ class Imu:
                 )
             time.sleep(0.005)
 
-    def calibrate(self, known: np.ndarray) -> None:
-        """Align: the object now has the orientation `known` [4] in the palm frame."""
-        assert self._newest is not None, "`wait` for the first orientation"
-        self._world = align(self._newest[1], multiply(known, self._mount))
-
-    def read(self) -> tuple[float, np.ndarray]:
-        """Time of the newest sample (s, monotonic clock) and orientation [4] of the object in the palm frame."""
-        if self._newest is None or self._world is None:
-            raise HandError(f"{self.port}: the IMU has not been aligned; call `calibrate` first")
-        when, quat = self._newest
-        return when, multiply(multiply(self._world, quat), conjugate(self._mount))
-
     def close(self) -> None:
         self._stop.set()
         self._thread.join(1.0)
@@ -166,13 +188,10 @@ class Imu:
     def _run(self) -> None:
         while not self._stop.is_set():
             try:
-                quats = self.parser.feed(self._serial.read(SIZE))
+                data = self._serial.read(SIZE)
             except OSError:
                 return  # `Safety` reacts to the age of the last sample.
-            if quats:
-                before = self._newest[1] if self._newest else quats[-1]
-                # q and -q are one orientation: take the one nearer to the last, as in simulation.
-                self._newest = time.monotonic(), quats[-1] if quats[-1] @ before >= 0 else -quats[-1]
+            self.receive(time.monotonic(), data)
 
 
 def _open(port: str) -> Any:

@@ -18,15 +18,12 @@ from pathlib import Path
 import numpy as np
 
 from dexsim.core import cli
-from dexsim.core.errors import DexsimError
 from dexsim.hand.kinematics import Hand
 from dexsim.hand.load import load_hand
 from dexsim_real.core.errors import HandError
-from dexsim_real.core.names import find_function
 from dexsim_real.core.process import use_realtime
 from dexsim_real.sensors.camera import CameraConfig
 from dexsim_real.sensors.hand import check_wire
-from dexsim_real.twin.checked import CheckedPlant
 from dexsim_real.twin.options import TwinArguments
 from dexsim_real.twin.plant.protocol import Plant
 from dexsim_real.twin.server import Twin
@@ -34,21 +31,11 @@ from dexsim_real.twin.wire.firmware import FirmwareConfig
 
 
 def make_plant(arguments: TwinArguments, hand: Hand) -> Plant:
-    """The physics for the options.
+    """The physics for the options."""
+    if arguments.press:
+        from dexsim_real.twin.press import PressBench
 
-    Raises:
-      HandError: the function of `--plant` cannot be found, raises something, or returns no `Plant`.
-    """
-    if arguments.plant:
-        given = f"--plant {arguments.plant}"
-        makes = find_function(arguments.plant, given, "MODULE:FUNCTION", default="make_plant")
-        try:
-            return CheckedPlant(makes(arguments), given)
-        except DexsimError:
-            raise
-        except Exception as error:  # whatever it raises
-            text = " ".join(str(error).split())
-            raise HandError(f"{given}: making it fails: {type(error).__name__}: {text:.200}") from error
+        return PressBench(hand, arguments.seed, kind=arguments.parameters)
     from dexsim_real.twin.plant.foreign.hand import hand_of
 
     return hand_of(
@@ -151,7 +138,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         twin = Twin(arguments, hand, make_plant(arguments, hand), Path(folder), lines.put)
         before = {number: signal.signal(number, lambda *_: twin.stop()) for number in (signal.SIGTERM, signal.SIGINT)}
         calibration = arguments.calibration or (
-            None if arguments.plant else write_calibration(Path(folder) / "calibration.toml", hand, arguments.firmware)
+            None if arguments.press else write_calibration(Path(folder) / "calibration.toml", hand, arguments.firmware)
         )
         printer = threading.Thread(target=_print, args=(lines,), name="print", daemon=True)
         printer.start()

@@ -4,7 +4,6 @@ import dataclasses
 from pathlib import Path
 
 from dexsim.core.config import setting, validate
-from dexsim_real.core.errors import HandError
 from dexsim_real.twin.plant.parameters import KINDS, TASKS
 from dexsim_real.twin.plant.shapes import SHAPES
 from dexsim_real.twin.wire.command_check import LimitsConfig
@@ -52,9 +51,9 @@ class TwinArguments:
     """JSON file for results, statistics and events, written at the end; None writes no file."""
     realtime: bool = True
     """Request real-time priority; continue without it if not permitted."""
-    plant: str | None = None
-    """MODULE:FUNCTION that creates the physics (a `dexsim_real.twin.plant.protocol.Plant`) from these options; None for
-    the library's own."""
+    press: bool = False
+    """A press bench in place of the trials: a pen on foam in front of the fingertip that `python -m
+    dexsim_real.calibrate` presses."""
     plant_model: Path | None = None
     """MJCF of the hand by somebody else, which takes the place of the emulated hand's body, motors and contacts; or a
     TOML that names it and its parts (docs/emulated_hand.md). None for the emulated hand's own."""
@@ -71,5 +70,3 @@ class TwinArguments:
 
     def __post_init__(self):
         validate(self)
-        if self.plant and self.plant_model:
-            raise HandError("--plant and --plant-model: give one of them")

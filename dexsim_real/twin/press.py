@@ -1,6 +1,6 @@
 """The emulated hand on a press bench: an emulated person holds a pen in front of the fingertip that is to press.
 
-    python -m dexsim_real.twin --plant dexsim_real.twin.press --parameters outside --seed 3
+    python -m dexsim_real.twin --press --parameters outside --seed 3
 
 For `python -m dexsim_real.calibrate`, with the drives, gears and taxels of the trials. The results contain the true
 values that the calibration should find. The pen is across the finger on a block of foam, which yields along its normal
@@ -14,9 +14,7 @@ import mujoco
 import numpy as np
 
 from dexsim.hand.kinematics import Hand
-from dexsim.hand.load import load_hand
 from dexsim_real.calibrate.plan import Placement, placements
-from dexsim_real.twin.options import TwinArguments
 from dexsim_real.twin.plant.assistant import Assistant, Place, Stage, put
 from dexsim_real.twin.plant.drives import STALL_CURRENT
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand
@@ -237,8 +235,3 @@ def _facing(normal: np.ndarray, along: np.ndarray) -> np.ndarray:
     quat = np.empty(4)
     mujoco.mju_mat2Quat(quat, np.stack([normal, y, np.cross(normal, y)], 1).ravel())
     return quat
-
-
-def make_plant(arguments: TwinArguments) -> PressBench:
-    """The plant of `python -m dexsim_real.twin --plant dexsim_real.twin.press`."""
-    return PressBench(load_hand(), arguments.seed, kind=arguments.parameters)

@@ -1,41 +1,44 @@
-"""A run on the emulated hand in virtual time: the parts of the bridge in one process, without a clock.
+"""A run on the emulated hand in virtual time: the bridge's loops in one process, as fast as they compute.
 
-What `dexsim_real.run.session` does with threads and a serial port is simulated as events: exchanges at 83 Hz that take
-9.6 ms, the policy, the IMU and the camera at their own rates. Every exchange is encoded to frames and executed by the
-emulated palm board, so quantisation and delays are those of the wire.
+Exchange loop (`dexsim_real.loop`) and policy loop (`dexsim_real.control.policy_loop`) are those of a run on a hand.
+Their times are events: exchanges at 83 Hz that take 9.6 ms, the policy, the IMU and the camera at their own rates.
+Every exchange is encoded to frames and executed by the emulated palm board, so quantisation and delays are those of
+the wire.
 """
 
 import dataclasses
 import functools
 import heapq
+import itertools
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from dexsim.calibration.maps import Calibration, Side
 from dexsim.hand.kinematics import Hand
-from dexsim_real.control.controller import IDENTITY, Controller
+from dexsim_real.control.controller import Controller
 from dexsim_real.control.goals import TurnGoals
 from dexsim_real.control.limits import SafetyConfig
-from dexsim_real.control.safety import HandSample, Safety
+from dexsim_real.control.policy_loop import PolicyLoop, limits_for
+from dexsim_real.control.safety import HandSample, Reaction, Safety, SafetyDecision, Wish
+from dexsim_real.loop import TARE_SAMPLES, Exchange, ExchangeLoop
 from dexsim_real.sensors.camera import HeightSensor
-from dexsim_real.sensors.hand import HandMeasurement, HandSensing, HardwareConfig, VelocityFilter
-from dexsim_real.sensors.imu import BAUD, UPRIGHT_X, RvcParser, align, conjugate, encode, multiply
-from dexsim_real.sensors.readings import ObjectEstimate
-from dexsim_real.twin.plant.assistant import POSTURES
+from dexsim_real.sensors.hand import HandMeasurement, HandSensing, HardwareConfig
+from dexsim_real.sensors.imu import BAUD, ImuReader, encode, multiply
+from dexsim_real.sensors.object_sensors import ObjectSensors
 from dexsim_real.twin.plant.drives import STALL_CURRENT
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand
 from dexsim_real.twin.plant.shapes import matrix, turn
 from dexsim_real.twin.wire.emulated_sensors import ObjectSensorConfig, outline, silhouette
 from dexsim_real.twin.wire.firmware import Firmware, FirmwareConfig
 from dexsim_real.wire import frames
-from dexsim_real.wire.frames import Command, Frame, Mode, Parser
+from dexsim_real.wire.frames import Command, Frame, Parser
+from dexsim_real.wire.link import HandPort, Reply
 
 RATE = 83.0  # exchanges a second
 REQUEST, ROUND_TRIP = 0.001, 0.0096  # s until a request reaches the board; until its answer has arrived
 IMU_RATE, CAMERA_RATE = 100.0, 30.0  # Hz
-_TARE_SAMPLES = 30
 _LEVER = 2.0**-4  # m, of a fingertip about any joint; cancels out in the ideal calibration
 _SLACK = 5.0  # s after the time limit of a trial at which a run ends anyway
 
@@ -80,19 +83,16 @@ class Schedule:
         return time, what
 
 
-class VirtualImu:
-    """The IMU in the object and the bridge's processing of it, without a port."""
+class VirtualImu(ImuReader):
+    """The IMU in the object, and the bridge's processing of it, without a port."""
 
     def __init__(self, plant: EmulatedHand):
-        self._plant = plant
-        self._mount = np.asarray(UPRIGHT_X)
-        self._parser, self._index = RvcParser(), 0
+        super().__init__()
+        self._plant, self._index = plant, 0
         # The IMU's world frame has the true vertical as z and an arbitrary heading.
         up = plant.up
         level = np.array([1.0 + up[2], up[1], -up[0], 0.0]) if up[2] > -1 + 1e-9 else np.array([0.0, 1, 0, 0])
         self._level = multiply(turn((0, 0, 1), 1.0 + plant.seed), level / np.linalg.norm(level))
-        self._world: np.ndarray | None = None
-        self._sensed, self.time = IDENTITY, 0.0
 
     def sample(self) -> bytes:
         """The bytes of the current orientation."""
@@ -100,43 +100,36 @@ class VirtualImu:
         self._index += 1
         return encode(self._index, multiply(self._level, multiply(quat, self._mount)))
 
-    def receive(self, time: float, data: bytes) -> None:
-        """Process received bytes at a time in s."""
-        for quat in self._parser.feed(data):
-            self._sensed = quat if quat @ self._sensed >= 0 else -quat
-            self.time = time
 
-    def calibrate(self) -> None:
-        """Align: the object now has the identity orientation."""
-        self._world = align(self._sensed, multiply(IDENTITY, self._mount))
-
-    def read(self) -> np.ndarray:
-        """Orientation [4] of the object in the palm frame, as measured by the bridge."""
-        if self._world is None:
-            return IDENTITY
-        return multiply(multiply(self._world, self._sensed), conjugate(self._mount))
-
-
-class VirtualCamera:
+class VirtualCamera(HeightSensor):
     """The camera and the bridge's height sensor, without a socket."""
 
     def __init__(self, plant: EmulatedHand, controller: Controller):
-        spec = controller.spec
-        self._plant, self._config = plant, ObjectSensorConfig()
-        self._parts = [outline(part) for part in plant.shape.parts]
-        self.sensor = HeightSensor(
-            lambda: None,
-            self._config.optics,
-            np.asarray(spec.reference, float),
-            spec.object_axes,
-            spec.velocity_filter,
+        spec, config = controller.spec, ObjectSensorConfig()
+        super().__init__(
+            lambda: None, config.optics, np.asarray(spec.reference, float), spec.object_axes, spec.velocity_filter
         )
+        self._plant, self._picture = plant, config.picture
+        self._parts = [outline(part) for part in plant.shape.parts]
 
     def sample(self, time: float) -> None:
         """Take a picture at a time in s; it shows the object with the delay of the camera."""
         place, quat, _ = self._plant.measure_object()
         parts = [points @ matrix(quat).T + place for points in self._parts]
-        self.sensor.see(time, silhouette(parts, self._config.optics, self._config.picture))
+        self.see(time, silhouette(parts, self._config, self._picture))
+
+
+class Unlimited(Safety):
+    """Lets every finite target through, to find out what the limits cost."""
+
+    def _lasted(self, now: float, sample: HandSample, wish: Wish | None) -> str:
+        return ""
+
+    def _reason_to_hold(self, now: float, sample: HandSample, wish: Wish | None) -> str:
+        return ""
+
+    def _follow(self, now: float, sample: HandSample, target: np.ndarray) -> SafetyDecision:
+        return self._finish(now, Reaction.NONE, "", target if np.isfinite(target).all() else self.commanded)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -151,8 +144,14 @@ class RunOptions:
     limits: SafetyConfig = SafetyConfig()
 
 
+class _Line:
+    """Stands for a port: the exchanges of a run in virtual time are events, and none is refused."""
+
+    refusal = None
+
+
 class VirtualRun:
-    """One trial of a policy on an emulated hand.
+    """One trial of a policy on an emulated hand: the bridge's loop, with the plant's time as its clock.
 
     Args:
       plant: a new one, before its first trial.
@@ -165,18 +164,24 @@ class VirtualRun:
         self.plant, self.controller, self.options = plant, controller, options
         hand = controller.hand
         self.firmware = Firmware(plant, FirmwareConfig())
-        self.sensing = HandSensing(hand, options.hardware, calibration)
-        limits = dataclasses.replace(options.limits, watchdog=max(options.limits.watchdog, 2.5 * controller.period))
-        self.safety = Safety(hand, limits)
-        self._filter = VelocityFilter(options.hardware.velocity_time)
-        self._requests, self._replies = Parser(frames.HOST_REQUESTS), Parser(frames.HAND_REPLIES)
+        limits = limits_for(options.limits, controller)
+        self.safety = Safety(hand, limits) if options.safety else Unlimited(hand, limits)
         self._schedule, self._now = Schedule(), 0.0
-        self._state: np.ndarray | None = None
-        self._mode, self._target = Mode.PASSIVE, hand.joint_lower
-        self.imu = VirtualImu(plant)
+        sensing = HandSensing(hand, options.hardware, calibration)
+        self._loop = ExchangeLoop(cast(HandPort, _Line()), sensing, self.safety, RATE, clock=lambda: self._now)
+        self._requests, self._replies = Parser(frames.HOST_REQUESTS), Parser(frames.HAND_REPLIES)
+        self._exchanges = 0
+        self._newest: Exchange | None = None
+        self.imu = VirtualImu(plant) if "imu" in controller.sources else None
         self.camera = VirtualCamera(plant, controller) if "camera" in controller.sources else None
-        self.goals: TurnGoals | None = None
-        self.ticks, self.sums = 0, np.zeros(5)
+        self.policy = PolicyLoop(
+            controller,
+            self.safety,
+            ObjectSensors(np.asarray(controller.spec.reference, float), self.camera, self.imu),
+            command=options.command,
+            approach=options.approach,
+            place=options.place,
+        )
         self.trace: list[dict[str, Any]] | None = None
 
     def run(self) -> dict[str, Any]:
@@ -188,34 +193,25 @@ class VirtualRun:
 
     def ticking(self) -> Iterator[None]:
         """Run the trial in pieces: yields after each tick of the policy, and ends with the trial."""
-        trial, limit = self.plant.trial, self.plant.limit + _SLACK
+        trial, limit, policy = self.plant.trial, self.plant.limit + _SLACK, self.policy
         self._schedule.at(0.0, self._exchange)
-        if "imu" in self.controller.sources:
-            self._schedule.at(0.001, self._sense_orientation)
+        if self.imu:
+            self._schedule.at(0.001, functools.partial(self._sense_orientation, self.imu))
         if self.camera:
             self._schedule.at(0.002, functools.partial(self._take_picture, self.camera))
         self._tare()
-        self._mode = Mode.POSITION
-        self.safety.engage()
-        start, began = self._resting(), self._now
-        goal = np.asarray(POSTURES[self.plant.task], np.float32)
-        while self._now < began + self.options.approach + self.options.place:
-            share = np.float32(min((self._now - began) / self.options.approach, 1.0))
-            self._set_target(start + share * share * (3 - 2 * share) * (goal - start))
+        self._loop.engage()
+        while not self.safety.anchor or policy.approach(self._now):
             self._until(self._now + 1 / RATE)
-        if "imu" in self.controller.sources:
-            self.imu.calibrate()
-        spec = self.controller.spec
-        if spec.turn:
-            self.goals = TurnGoals(spec.turn, np.asarray(spec.reference))
-        self.controller.start(self._resting())
-        anchor, began, tick = self.safety.anchor, self._now, 0
-        while self.plant.trial == trial and self._now < began + limit:
-            if anchor != self.safety.anchor:
-                anchor = self.safety.anchor
-                self.controller.resume(self.safety.commanded)
-            self._tick()
-            tick += 1
+        policy.begin()
+        began = self._now
+        for tick in itertools.count(1):
+            if self.plant.trial != trial or self._now >= began + limit:
+                break
+            policy.command = self.options.command
+            newest = policy.tick(self._now)
+            if newest is not None and self.trace is not None:
+                self.trace.append({"time": self._now, "tick": newest.tick, "measured": newest.sample.measured})
             self._until(began + tick * self.controller.period)
             yield
 
@@ -224,58 +220,43 @@ class VirtualRun:
         """Virtual time since the start, s."""
         return self._now
 
-    # --- the bridge's threads ---------------------------------------------------------------------
+    @property
+    def goals(self) -> TurnGoals | None:
+        """Goals of the rotation task; None without."""
+        return self.policy.goals
 
-    def _tick(self) -> None:
-        measured = self.measured()
-        position, velocity = np.asarray(self.controller.spec.reference, float), np.zeros(3)
-        if self.camera:
-            _, position, velocity = self.camera.sensor.read()
-        seen = ObjectEstimate(position, velocity, self.imu.read())
-        goal = self.goals.update(self.imu.time, seen) if self.goals else IDENTITY
-        tick = self.controller.tick(measured, seen, goal, self.options.command)
-        self._set_target(tick.target)
-        self.sums += measured.finger_force
-        self.ticks += 1
-        if self.trace is not None:
-            self.trace.append({"time": self._now, "tick": tick, "measured": measured})
+    def measured(self) -> HandMeasurement:
+        """What the bridge measured last."""
+        assert self.safety.sample is not None, "no state yet"
+        return self.safety.sample.measured
 
-    def _set_target(self, target: np.ndarray) -> None:
-        self.safety.set_target(target, self._now)
-        if np.isfinite(target).all():
-            self._target = target
+    # --- events -----------------------------------------------------------------------------------
 
     def _exchange(self) -> None:
-        """The exchange thread's cycle: send a request; its answer arrives 9.6 ms later."""
-        position, mode, stiffness = self._target, self._mode, 1.0
-        if self.safety.engaged and self.options.safety:
-            decision = self.safety.decide(self._now)
-            position, mode, stiffness = decision.position, decision.mode, decision.stiffness
-        block = self.sensing.command(position, mode, stiffness)
+        """A cycle of the exchange loop: a request; its answer arrives 9.6 ms later."""
+        decision, block = self._loop.request()
+        self._exchanges += 1
         data = Frame(frames.HOST, frames.palm_address(0), Command.EXCHANGE, block.tobytes()).encode()
-        self._schedule.at(self._now + REQUEST, lambda: self._answer(data, self._now))
+        self._schedule.at(self._now + REQUEST, functools.partial(self._answer, decision, data, self._now))
         self._schedule.at(self._now + 1 / RATE, self._exchange)
 
-    def _answer(self, data: bytes, now: float) -> None:
+    def _answer(self, decision: SafetyDecision, data: bytes, sent: float) -> None:
         for frame in self._requests.feed(data):
-            reply = self.firmware.answer(frame, now)
+            reply = self.firmware.answer(frame, self._now)
             assert reply is not None, "a request of our own is answered"
-            self._schedule.at(self._now + ROUND_TRIP - REQUEST, functools.partial(self._receive, reply.encode()))
+            receive = functools.partial(self._receive, decision, reply.encode(), sent)
+            self._schedule.at(sent + ROUND_TRIP, receive)
 
-    def _receive(self, data: bytes) -> None:
+    def _receive(self, decision: SafetyDecision, data: bytes, sent: float) -> None:
         for frame in self._replies.feed(data):
-            self._state = frames.decode_state(frame.data)
-            self.sensing.track_zero(self._now, self._state)
-            measured = self.sensing.measure(self._state)
-            velocity = self._filter.estimate(self._now, measured.joint_position)
-            if self.safety.see(HandSample(self._now, 0, 0, measured, velocity)):
-                self._filter.update(self._now, measured.joint_position)
+            reply = Reply(frames.decode_state(frame.data), sent, self._now, self._exchanges, generation=1)
+            self._newest = self._loop.take(decision, reply)
 
-    def _sense_orientation(self) -> None:
-        data = self.imu.sample()
+    def _sense_orientation(self, imu: VirtualImu) -> None:
+        data = imu.sample()
         there = self._now + 10 * len(data) / BAUD  # ten bits a byte
-        self._schedule.at(there, lambda: self.imu.receive(there, data))
-        self._schedule.at(self._now + 1 / IMU_RATE, self._sense_orientation)
+        self._schedule.at(there, functools.partial(imu.receive, there, data))
+        self._schedule.at(self._now + 1 / IMU_RATE, functools.partial(self._sense_orientation, imu))
 
     def _take_picture(self, camera: VirtualCamera) -> None:
         camera.sample(self._now)
@@ -285,20 +266,11 @@ class VirtualRun:
 
     def _tare(self) -> None:
         states: list[np.ndarray] = []
-        while len(states) < _TARE_SAMPLES:
-            self._state = None
+        while len(states) < TARE_SAMPLES:
+            self._newest = None
             self._until(self._now + 1 / RATE)
-            states += [self._state] if self._state is not None else []
-        self.sensing.set_tare(states)
-
-    def measured(self) -> HandMeasurement:
-        """What the bridge measured last."""
-        assert self.safety.sample is not None, "no state yet"
-        return self.safety.sample.measured
-
-    def _resting(self) -> np.ndarray:
-        """Where commands continue."""
-        return self.safety.commanded if self.options.safety else self.measured().joint_position
+            states += [self._newest.state] if self._newest is not None else []
+        self._loop.sensing.set_tare(states)
 
     def _until(self, time: float) -> None:
         """Run the plant and the events up to a time in s."""
@@ -317,10 +289,10 @@ class VirtualRun:
 
     def _summary(self, trial: int) -> dict[str, Any]:
         report = next(r for r in self.plant.results() if r["trial"] == trial)
-        mean = self.sums / max(self.ticks, 1)
+        policy = self.policy
         measured = {
-            "ticks": self.ticks,
-            "sensed_force": np.round(mean, 4).tolist(),
+            "ticks": policy.ticks,
+            "sensed_force": np.round(policy.finger_force / max(policy.ticks, 1), 4).tolist(),
             "safety": dict(self.safety.counts),
             "latched": self.safety.latched,
             "successes": self.goals.successes if self.goals else None,

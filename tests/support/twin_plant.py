@@ -74,6 +74,6 @@ class ScriptedPlant:
         return [{"trial": k} for k in range(self.trial + 1)]
 
 
-def make(arguments) -> ScriptedPlant:
-    """For `python -m dexsim_real.twin --plant twin_plant:make`."""
+def make(arguments, hand) -> ScriptedPlant:
+    """In place of `dexsim_real.twin.__main__.make_plant`."""
     return ScriptedPlant(arguments.seconds or math.inf)

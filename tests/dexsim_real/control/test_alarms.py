@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from test_safety import CYCLE, FREE, MIDDLE, Bench, sample
+from test_safety import AGREEING, CYCLE, FREE, MIDDLE, Bench, sample
 
 from dexsim_real.control.alarms import Alarms, joint_labels
 from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.safety import Reaction, Safety
-from dexsim_real.control.servo import Servo
+from dexsim_real.loop import ExchangeLoop
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Mode
@@ -100,7 +100,7 @@ def test_error_bits_that_are_known_to_be_harmless_are_ignored(hand):
 def test_nothing_is_enabled_on_an_alarm(hand):
     bench = Bench(hand)
     errors = changed(np.zeros((12, 3), np.uint16), (4, 1), 1)
-    for _ in range(3):
+    for _ in range(AGREEING):
         assert cycle(bench, errors=errors).mode == Mode.PASSIVE
     bench.safety.engage()
     assert cycle(bench, errors=errors).mode == Mode.PASSIVE and not bench.safety.latched
@@ -214,32 +214,31 @@ class Refusing:
         return Reply(state, now - CYCLE, now, len(self.sent), 1)
 
 
-def drive(hand, monkeypatch, plan, cycles):
+def drive(hand, plan, cycles):
     port, safety = Refusing(plan), Safety(hand, SafetyConfig())
-    servo = Servo(port, HandSensing(hand, HardwareConfig()), safety, 83.0)
-    monkeypatch.setattr("dexsim_real.control.servo.time.monotonic", lambda: CYCLE * len(port.sent))
-    for _ in range(5):
-        servo._cycle()
-    servo.engage()
+    loop = ExchangeLoop(port, HandSensing(hand, HardwareConfig()), safety, 83.0, clock=lambda: CYCLE * len(port.sent))
+    for _ in range(AGREEING):
+        loop.cycle()
+    loop.engage()
     found = []
     for _ in range(cycles):
-        servo._cycle()
+        loop.cycle()
         found.append(safety.last)
     return port, safety, found
 
 
-def test_a_hand_that_refuses_for_heat_is_turned_off_with_its_own_words(hand, monkeypatch):
+def test_a_hand_that_refuses_for_heat_is_turned_off_with_its_own_words(hand):
     hot = read_refusal((1501028).to_bytes(4, "little"))
-    port, safety, _ = drive(hand, monkeypatch, ["state"] * 10 + [hot, "state", hot, None, hot], 20)
+    port, safety, _ = drive(hand, ["state"] * 15 + [hot, "state", hot, None, hot], 20)
     assert safety.latched == "the hand reports over-temperature (1501028)"
     on = [bool(np.all(command["mode"] == Mode.POSITION)) for command in port.sent]
-    assert on[5:15] == [True] * 10 and not any(on[15:])
+    assert on[10:20] == [True] * 10 and not any(on[20:])
 
 
-def test_a_busy_hand_is_held_then_relaxed_and_the_reason_is_shown(hand, monkeypatch):
+def test_a_busy_hand_is_held_then_relaxed_and_the_reason_is_shown(hand):
     """Silent first, then busy: the silence counts from its beginning."""
     busy = read_refusal(b"\x06\x00")
-    _, safety, found = drive(hand, monkeypatch, ["state"] * 30 + [None] * 50 + [busy], 150)
+    _, safety, found = drive(hand, ["state"] * 35 + [None] * 50 + [busy], 150)
     assert not safety.latched and safety.last == (Reaction.RELAX, "no measurement: the hand reports busy (1501006)")
     held = [k for k, (reaction, _) in enumerate(found) if reaction == Reaction.HOLD]
     assert 0.9 < len(held) * CYCLE < 1.1 and (Reaction.HOLD, "no measurement") in found

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from dexsim.core.errors import ConfigError
 from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.safety import HandSample, Reaction, Safety
-from dexsim_real.control.servo import Servo
 from dexsim_real.core.timing import GRACE, Pace, keep_phase
+from dexsim_real.loop import LoopThread
 from dexsim_real.sensors.hand import HandMeasurement, HandSensing, HardwareConfig
 from dexsim_real.wire.frames import Mode
 
@@ -366,9 +366,9 @@ def test_a_cycle_begins_at_a_deadline_or_a_little_after_and_skips_what_is_past(d
 
 
 def test_the_policy_begins_while_the_line_is_busy(hand):
-    servo = Servo(None, HandSensing(hand, HardwareConfig()), None, 250 / 3)
-    for now in np.linspace(0, 0.2, 41) + servo.pace.next - 0.05:
-        begin = servo.free(now)
-        assert now <= begin < now + servo.pace.period + 1e-9
-        since = (begin - servo.pace.next) % servo.pace.period
+    loop = LoopThread(None, HandSensing(hand, HardwareConfig()), None, 250 / 3)
+    for now in np.linspace(0, 0.2, 41) + loop.pace.next - 0.05:
+        begin = loop.free(now)
+        assert now <= begin < now + loop.pace.period + 1e-9
+        since = (begin - loop.pace.next) % loop.pace.period
         assert since == pytest.approx(0.001, abs=1e-6)

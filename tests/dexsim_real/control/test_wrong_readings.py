@@ -12,8 +12,8 @@ from test_safety import AGREEING, CYCLE, FREE, MIDDLE, Bench, sample
 from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.pose_check import PoseCheck
 from dexsim_real.control.safety import Reaction, Safety, Wish
-from dexsim_real.control.servo import Servo
 from dexsim_real.core.errors import HandError
+from dexsim_real.loop import LoopThread
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
 from dexsim_real.wire import frames
 from dexsim_real.wire.frames import Mode
@@ -255,8 +255,8 @@ def test_one_huge_frame_leaves_no_trace_in_the_velocity(hand):
     port = Port(MIDDLE, MIDDLE, MIDDLE, MIDDLE, wrong(4, 1e30), MIDDLE)
     sensing = HandSensing(hand, HardwareConfig())
     safety = Safety(hand, SafetyConfig())
-    servo = Servo(port, sensing, safety, 83.0)
+    servo = LoopThread(port, sensing, safety, 83.0)
     for _ in range(10):
-        servo._cycle()
+        servo.cycle()
     assert safety.counts["implausible: measurement"] == 1 and safety.sample.sequence == 10
     np.testing.assert_allclose(safety.sample.velocity, 0.0, atol=1e-6)

@@ -9,9 +9,9 @@ import pytest
 from dexsim import load_hand
 from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.safety import Safety
-from dexsim_real.control.servo import Servo
 from dexsim_real.core.log import LogWriter
 from dexsim_real.core.process import lower_priority, raise_priority, use_realtime
+from dexsim_real.loop import LoopThread
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
 
 
@@ -45,7 +45,9 @@ def priorities(folder):
         return None
     hand, port = load_hand(), Silent()
     with LogWriter(folder / "run.log") as log:
-        servo = Servo(port, HandSensing(hand, HardwareConfig()), Safety(hand, SafetyConfig(), lambda text: None), 83.0)
+        servo = LoopThread(
+            port, HandSensing(hand, HardwareConfig()), Safety(hand, SafetyConfig(), lambda text: None), 83.0
+        )
         servo.start()
         assert port.asked.wait(5)
         priority = lambda thread: os.sched_getparam(thread).sched_priority  # noqa: E731

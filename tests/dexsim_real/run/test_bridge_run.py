@@ -109,7 +109,7 @@ def test_text_in_brackets_is_shown_as_it_is(monkeypatch):
     console = Console(file=shown, width=200)
     monkeypatch.setattr(status, "Console", lambda **options: console)
     status.StatusView(f"view {text}", lambda: status.Status({"safety": f"row {text}"})).show()
-    console.print(status.summary_table(f"title {text}", {"end": f"cell {text}"}))
+    status.show_summary(f"title {text}", {"end": f"cell {text}"})
     for where in ("view", "row", "title", "cell"):
         assert f"{where} {text}" in shown.getvalue()
 
@@ -309,7 +309,7 @@ def test_a_rotation_policy_with_an_imu_counts_goals(hand, tmp_path):
         index, start = 0, None
         while not stop.wait(0.01):
             sessions = [block for block in peer.commands[-1:] if np.all(block["mode"] == Mode.POSITION)]
-            start = time.monotonic() if start is None and len(peer.commands) > 110 and sessions else start
+            start = time.monotonic() if start is None and len(peer.commands) > 130 and sessions else start
             angle = 0.0 if start is None else math.radians(70) * (time.monotonic() - start)
             # The part's z is up, and its heading unknown. Nobody may be reading yet.
             with contextlib.suppress(BlockingIOError):

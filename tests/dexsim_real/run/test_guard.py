@@ -16,7 +16,7 @@ from pty_hand import QUICK
 from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.motors_off import PATIENCE
 from dexsim_real.control.safety import Safety
-from dexsim_real.control.servo import Servo
+from dexsim_real.loop import LoopThread
 from dexsim_real.run.guard import Guard
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
 from dexsim_real.wire.frames import empty_state
@@ -94,7 +94,7 @@ def test_the_exchange_thread_gives_the_signs_of_life(hand):
             pass
 
     safety = Safety(hand, SafetyConfig())
-    servo = Servo(Port(), HandSensing(hand, HardwareConfig()), safety, 500.0, events.append)
+    servo = LoopThread(Port(), HandSensing(hand, HardwareConfig()), safety, 500.0, events.append)
     servo.driven = True
     servo.start()
     while events.count("exchange") < 20:

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from dexsim.geometry import rotations
-from dexsim_real.control.controller import IDENTITY
 from dexsim_real.core.errors import HandError
 from dexsim_real.run.options import RunArguments
 from dexsim_real.sensors import imu
+from dexsim_real.sensors.imu import IDENTITY
 
 DATASHEET = bytes.fromhex("AA AA DE 01 00 92 FF 25 08 8D FE EC FF D1 03 00 00 00 E7")
 

@@ -15,6 +15,7 @@ from dexsim.registry import make_task
 from dexsim.task_spec import TaskSpec
 from dexsim_real.control.controller import Tick
 from dexsim_real.sensors.hand import HardwareConfig
+from dexsim_real.sensors.imu import IDENTITY
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand
 from dexsim_real.twin.plant.referee import Referee
 from dexsim_real.twin.plant.shapes import SHAPES, product
@@ -118,9 +119,9 @@ def test_the_imu_shows_the_orientation_whatever_the_mounts_tilt(hand):
         for step in range(3):
             plant.advance(0.03)
             imu.receive(0.03 * step, imu.sample())
-        imu.calibrate()
+        imu.calibrate(IDENTITY)
         true = plant.measure_object()[1]
-        apart = 2 * math.acos(min(1.0, abs(float(product(imu.read() * [1, -1, -1, -1], true)[0]))))
+        apart = 2 * math.acos(min(1.0, abs(float(product(imu.read()[1] * [1, -1, -1, -1], true)[0]))))
         assert apart < 0.002
 
 
@@ -135,7 +136,7 @@ def test_the_camera_measures_the_height(hand):
         plant.advance(0.0)
         plant._remember()
         camera.sample(0.1)
-        _, position, _ = camera.sensor.read()
+        _, position, _ = camera.read()
         assert position[1:] == pytest.approx(reference[1:])
         # A composition's outline has another middle than the composition.
         assert position[0] == pytest.approx(place[0], abs=0.001 if shape != "composition" else 0.006)

@@ -12,8 +12,8 @@ pytest.importorskip("serial")
 from dexsim.calibration.maps import load_calibration, save_calibration
 from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.safety import Safety
-from dexsim_real.control.servo import Servo
 from dexsim_real.core.errors import HandError
+from dexsim_real.loop import LoopThread
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
 from dexsim_real.twin.virtual import ideal_calibration
 from dexsim_real.wire.frames import Mode
@@ -105,21 +105,21 @@ def test_after_a_reconnection_only_the_same_hand_is_driven(hand, same):
     peer.state["joint"]["position"] = np.array([0.1] * 3 + [0.0] + [0.1] * 8)
     peer.open()
     port, safety = SerialHand(peer.port, QUICK), Safety(hand, SafetyConfig())
-    servo = Servo(port, HandSensing(hand, HardwareConfig()), safety, 83.0)
+    servo = LoopThread(port, HandSensing(hand, HardwareConfig()), safety, 83.0)
     port.connect()
-    for _ in range(5):
-        servo._cycle()
+    for _ in range(10):  # A pose needs as many.
+        servo.cycle()
     safety.engage()
-    servo._cycle()
+    servo.cycle()
     assert np.all(peer.commands[-1]["mode"] == Mode.POSITION)
     peer.close()
-    servo._cycle()
+    servo.cycle()
     peer.commands.clear()
     peer.registers[21] = b"2R32A001" if same else b"2R32B002"
     peer.open()
     until = time.monotonic() + 3
     while time.monotonic() < until and not (safety.latched or any(np.any(c["mode"]) for c in peer.commands)):
-        servo._cycle()
+        servo.cycle()
     driven = any(np.any(command["mode"] != Mode.PASSIVE) for command in peer.commands)
     port.close()
     peer.close()

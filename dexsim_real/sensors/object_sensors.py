@@ -2,45 +2,27 @@
 
 import numpy as np
 
-from dexsim_real.control.controller import IDENTITY, Controller
 from dexsim_real.core.errors import HandError
-from dexsim_real.run.options import RunArguments
-from dexsim_real.sensors.camera import HeightSensor, open_masks
-from dexsim_real.sensors.imu import Imu
+from dexsim_real.sensors.camera import HeightSensor
+from dexsim_real.sensors.imu import IDENTITY, ImuReader
 from dexsim_real.sensors.readings import ObjectEstimate
 
 
 class ObjectSensors:
-    """Camera and IMU of a run; a coordinate that neither measures is taken as fixed.
+    """Camera and IMU; a coordinate that neither measures is taken as fixed.
 
-    Raises:
-      HandError: the policy needs a sensor that is not given, or a sensor cannot be opened.
+    Args:
+      reference: [3] m, nominal position of the object.
+      camera, imu: None without one.
     """
 
-    def __init__(self, arguments: RunArguments, controller: Controller):
-        spec, needed = controller.spec, controller.sources
-        self._reference = np.asarray(spec.reference, float)
-        self._camera: HeightSensor | None = None
-        self._imu: Imu | None = None
-        if "imu" in needed and not arguments.imu:
-            raise HandError("the policy observes the object's orientation; give the IMU's port with --imu")
-        if "camera" in needed and not (arguments.camera or arguments.fixed_object):
-            raise HandError("the policy observes the object's height; give --camera, or --fixed-object to assume it")
-        try:
-            if arguments.camera:
-                self._camera = HeightSensor(
-                    open_masks(arguments.camera, arguments.optics),
-                    arguments.optics,
-                    self._reference,
-                    spec.object_axes,
-                    spec.velocity_filter,
-                )
-            if arguments.imu:
-                self._imu = Imu(arguments.imu, arguments.imu_mount)
-                self._imu.wait()
-        except BaseException:
-            self.close()
-            raise
+    def __init__(self, reference: np.ndarray, camera: HeightSensor | None, imu: ImuReader | None):
+        self._reference, self._camera, self._imu = np.asarray(reference, float), camera, imu
+
+    @property
+    def measures_orientation(self) -> bool:
+        """Whether there is an IMU."""
+        return self._imu is not None
 
     def ready(self) -> bool:
         """Whether the camera sees the object; if so, its current orientation becomes the identity.

@@ -1,0 +1,119 @@
+"""The policy's side of a run: from the pose at which the motors came on to the start posture, then tick after tick.
+
+It has no clock and no thread: whoever owns it says what time it is. The runner calls it at absolute deadlines, the run
+in virtual time from its schedule.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+
+from dexsim_real.control.controller import Controller, Tick
+from dexsim_real.control.goals import TurnGoals
+from dexsim_real.control.limits import SafetyConfig
+from dexsim_real.control.safety import HandSample, Safety
+from dexsim_real.core.errors import HandError
+from dexsim_real.sensors.imu import IDENTITY
+from dexsim_real.sensors.object_sensors import ObjectSensors
+
+_PATIENCE = 60.0  # s to wait until the camera sees the object
+
+
+def limits_for(config: SafetyConfig, controller: Controller) -> SafetyConfig:
+    """Limits that leave a policy the time between two of its ticks."""
+    return dataclasses.replace(config, watchdog=max(config.watchdog, 2.5 * controller.period))
+
+
+class PolicyTick(NamedTuple):
+    """A tick of the policy, and the sample that it saw."""
+
+    tick: Tick
+    sample: HandSample
+
+
+class PolicyLoop:
+    """Sets the joint targets of a run.
+
+    Args:
+      controller: of the policy, warmed.
+      safety: gets the targets.
+      objects: camera and IMU.
+      command: grip command in [0, 1].
+      approach: s to move to the start posture; 0 stays at the measured pose.
+      place: s in the start posture.
+      motors_off: compute everything for a hand that is moved by somebody.
+    """
+
+    def __init__(
+        self,
+        controller: Controller,
+        safety: Safety,
+        objects: ObjectSensors,
+        *,
+        command: float,
+        approach: float,
+        place: float,
+        motors_off: bool = False,
+    ):
+        self.controller, self.safety, self.objects, self.command = controller, safety, objects, command
+        spec = controller.spec
+        self.goals: TurnGoals | None = None
+        if spec.turn and objects.measures_orientation:
+            self.goals = TurnGoals(spec.turn, np.asarray(spec.reference))
+        self.ticks, self.finger_force = 0, np.zeros(controller.hand.num_fingers)  # number; N, sum over the ticks
+        self._approach, self._place, self._motors_off = approach, place, motors_off
+        self._begin: float | None = None  # s, of the approach
+        self._anchor = 0
+
+    def approach(self, now: float) -> bool:
+        """Set the target of this time on the way to the start posture; False once the hand and the object are there.
+
+        Raises:
+          HandError: the camera does not see the object, or fails.
+        """
+        if self._begin is None:
+            # Where commands continue, not the last reading, which may be wrong.
+            self._begin, self._start = now, self.safety.commanded
+        ready = self._begin + self._approach + self._place
+        if now >= ready and self.objects.ready():
+            return False
+        if now > ready + _PATIENCE:
+            raise HandError(
+                "the camera does not see the object; check the light, the colour thresholds "
+                "(--optics.hsv-low, --optics.hsv-high) and --optics.min-area"
+            )
+        posture = self.controller.spec.posture if self._approach > 0 else None
+        goal = self._start if posture is None else np.asarray(posture, np.float32)
+        share = min((now - self._begin) / self._approach, 1.0) if self._approach > 0 else 1.0
+        self.safety.set_target(smooth(self._start, goal, share), now)
+        return True
+
+    def begin(self) -> None:
+        """Start the policy's episode."""
+        self._anchor = self.safety.anchor
+        self.controller.start(self.safety.commanded)
+
+    def tick(self, now: float) -> PolicyTick | None:
+        """One action of the policy; None without a measurement that is young enough."""
+        safety, sample = self.safety, self.safety.sample
+        assert sample is not None, "the motors came on at a measured pose"
+        if now - sample.time > safety.config.stale:
+            return None
+        if self._anchor != safety.anchor:
+            self._anchor = safety.anchor
+            self.controller.resume(safety.commanded)
+        if self._motors_off:
+            self.controller.anchor(sample.measured.joint_position)
+        estimate, when = self.objects.read(now)
+        goal = self.goals.update(when, estimate) if self.goals else IDENTITY
+        tick = self.controller.tick(sample.measured, estimate, goal, self.command)
+        safety.set_target(tick.target, now, self.objects.lost(now, safety.config.stale_object))
+        self.ticks += 1
+        self.finger_force += sample.measured.finger_force
+        return PolicyTick(tick, sample)
+
+
+def smooth(start: np.ndarray, goal: np.ndarray, share: float) -> np.ndarray:
+    """Joint angles [J] rad at this share of a motion that begins and ends at rest (smoothstep)."""
+    return (start + np.float32(share * share * (3 - 2 * share)) * (goal - start)).astype(np.float32)

@@ -1,0 +1,233 @@
+"""The exchange loop with a hand: decide, send, sense, judge.
+
+There is one. A run on a hand is this loop in a thread of its own (`LoopThread`), a calibration steps it from its
+procedure (`calibrate.hand_loop`), and a run in virtual time lets the time pass between `request` and `take`
+(`twin.virtual`).
+"""
+
+import contextlib
+import threading
+import time
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from dexsim_real.control.motors_off import patience, turn_off
+from dexsim_real.control.safety import HandSample, Safety, SafetyDecision
+from dexsim_real.core.errors import HandError
+from dexsim_real.core.process import ignore_signals, raise_priority
+from dexsim_real.core.timing import Pace, Timing
+from dexsim_real.sensors.hand import HandSensing, VelocityFilter
+from dexsim_real.wire.frames import Mode
+from dexsim_real.wire.link import HandPort, Reply, checked, refusal_of
+
+TARE_SAMPLES = 30
+_TARE = 5.0  # s in which they must arrive
+
+
+class Exchange(NamedTuple):
+    """An answered exchange."""
+
+    decision: SafetyDecision  # what was sent
+    sample: HandSample
+    state: np.ndarray  # `frames.STATE_BLOCK`
+    plausible: bool  # whether `Safety` takes the sample for a measurement
+
+
+class ExchangeLoop:
+    """Exchanges commands and states with a hand, one `cycle` at a time.
+
+    `retared` is called with the number of the exchange from which on another tare holds, and with lines that name
+    taxels which it masks.
+
+    Args:
+      port: connected; used by this loop only.
+      sensing: conversion to SI units.
+      safety: decides the commands.
+      rate: exchanges per second.
+      beat: called before every exchange as a sign of life, with the time s by which the next call may be late.
+      track_taxels: follow the zeros of the taxels and mask stuck ones; not where the taxels themselves are measured.
+      clock, sleep: replace those of `time`, for simulated time.
+    """
+
+    def __init__(
+        self,
+        port: HandPort,
+        sensing: HandSensing,
+        safety: Safety,
+        rate: float,
+        beat: Callable[[float], None] = lambda more: None,
+        *,
+        track_taxels: bool = True,
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+    ):
+        self.port, self.sensing, self.safety, self.clock = port, sensing, safety, clock
+        self.pace, self._beat = Pace(rate, clock, sleep), beat
+        self.round_trip = Timing()
+        self.driven = self._closed = False  # whether the motors may be on; whether the port is closed
+        self._took = 0.0  # s, duration of the last exchange on the wire
+        self.retared: Callable[[int, list[str]], None] = lambda sequence, lines: None
+        self._track_taxels = track_taxels
+        self._filter = VelocityFilter(sensing.config.velocity_time)
+        self._generation: int | None = None
+        self._engage = False
+
+    def engage(self) -> None:
+        """Turn the motors on at the next cycle; may be called from another thread."""
+        self._engage = True
+
+    def cycle(self) -> Exchange | None:
+        """One exchange; None without an answer."""
+        self._beat(0.0)
+        decision, command = self.request()
+        sent = self.clock()
+        reply = self.port.exchange(command)
+        self._took = self.clock() - sent
+        return self.take(decision, reply)
+
+    def request(self) -> tuple[SafetyDecision, np.ndarray]:
+        """What to send now, and its `frames.COMMAND_BLOCK`."""
+        if self._engage:
+            self.safety.engage()
+            self._engage = False
+        decision = self.safety.decide(self.clock())
+        self.driven |= decision.mode == Mode.POSITION
+        return decision, self.sensing.command(decision.position, decision.mode, decision.stiffness)
+
+    def take(self, decision: SafetyDecision, reply: Reply | None) -> Exchange | None:
+        """Update with the answer to a request; None without one."""
+        if reply is None:
+            self.safety.refuse(refusal_of(self.port))
+            return None
+        reply = checked(reply, self.clock())
+        self.driven = decision.mode == Mode.POSITION
+        self.round_trip.add(reply.received - reply.sent)
+        sample = self._sample(reply)
+        plausible = self.safety.see(sample)
+        if plausible:
+            self._filter.update(sample.time, sample.measured.joint_position)
+        return Exchange(decision, sample, reply.state, plausible)
+
+    def tare(self) -> list[str]:
+        """Tare the taxels with the motors off; returns a line for each fingertip with stuck taxels.
+
+        Raises:
+          HandError: the hand does not answer or refuses, or a fingertip touches something.
+        """
+        states, until = list[np.ndarray](), self.clock() + _TARE
+        while len(states) < TARE_SAMPLES and self.clock() < until:
+            exchange = self.cycle()
+            if exchange is not None:
+                states.append(exchange.state)
+            elif (refusal := refusal_of(self.port)) and refusal.serious:
+                raise HandError(refusal.text)
+        if len(states) < TARE_SAMPLES:
+            raise HandError(f"only {len(states)} answers in {_TARE:g} s, cannot tare the taxels; check the cable")
+        return self.sensing.set_tare(states)
+
+    def close(self) -> None:
+        """Turn the motors off and close the port; `driven` remains True if the hand has not confirmed it."""
+        ignore_signals()
+        self._rest()
+
+    def _rest(self) -> None:
+        if self._closed:
+            return
+        off = self.sensing.command(self.sensing.hand.joint_lower, Mode.PASSIVE)
+        self._closed = True
+        self._beat(patience(self.driven))
+        try:
+            if turn_off(self.port, off, patience(self.driven)):
+                self.driven = False
+        finally:
+            with contextlib.suppress(Exception):  # Of a driver from elsewhere; the hand has been told.
+                self.port.close()
+
+    def _sample(self, reply: Reply) -> HandSample:
+        if self._track_taxels:
+            lines = self.sensing.mask_stuck(reply.state, self.safety.config.finger_force)
+            if self.sensing.track_zero(reply.received, reply.state) or lines:
+                self.retared(reply.sequence, lines)
+        measured = self.sensing.measure(reply.state)
+        if reply.generation != self._generation:
+            self._filter.reset()
+        self._generation = reply.generation
+        velocity = self.sensing.velocity(reply.state)
+        if velocity is None:
+            velocity = self._filter.estimate(reply.received, measured.joint_position)
+        return HandSample(reply.received, reply.sequence, reply.generation, measured, velocity)
+
+
+class LoopThread(ExchangeLoop):
+    """The exchange loop in a thread, at absolute deadlines until stopped.
+
+    The policy runs in another thread at a lower rate. If it dies, this thread continues and `Safety` reacts. Whatever
+    ends this thread, it turns the motors off.
+    """
+
+    def __init__(
+        self,
+        port: HandPort,
+        sensing: HandSensing,
+        safety: Safety,
+        rate: float,
+        beat: Callable[[float], None] = lambda more: None,
+        clock: Callable[[], float] = time.monotonic,
+    ):
+        super().__init__(port, sensing, safety, rate, beat, clock=clock)
+        self.waited = 0  # deadlines missed because of late answers
+        self.error: BaseException | None = None
+        self._stop, self._fresh = threading.Event(), threading.Event()
+        self._thread = threading.Thread(target=self._run, name="exchange", daemon=True)
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def alive(self) -> bool:
+        """Whether the thread runs."""
+        return self._thread.is_alive()
+
+    def forget(self) -> None:
+        """Reset the timing statistics, to exclude the start."""
+        self.pace.jitter, self.round_trip, self.waited = Timing(), Timing(), 0
+
+    def free(self, now: float) -> float:
+        """The next time s at which a request has just been sent and the interpreter is idle until its answer."""
+        lead, period = 0.001, self.pace.period
+        return now + (self.pace.next + lead - now) % period
+
+    def wait_fresh(self, seconds: float) -> HandSample | None:
+        """Wait for the next plausible sample; None when none arrives in time."""
+        self._fresh.clear()
+        return self.safety.sample if self._fresh.wait(seconds) else None
+
+    def stop(self) -> None:
+        """End the thread, and turn the motors off."""
+        ignore_signals()
+        self._stop.set()
+        if self._thread.ident is not None:
+            self._thread.join()
+        else:
+            self.close()
+
+    def _run(self) -> None:
+        raise_priority()
+        try:
+            self.pace.next = self.clock() + self.pace.period
+            while not self._stop.is_set():
+                due = self.pace.next - self.pace.period
+                exchange = self.cycle()
+                if exchange is not None and exchange.plausible:
+                    self._fresh.set()
+                own, missed = self.clock() - due - self._took, self.pace.jitter.missed
+                self.pace.wait()
+                missed = self.pace.jitter.missed - missed
+                # A usual answer would have left enough time: the hand was late, not the bridge.
+                if missed and own + self.round_trip.percentile(50) < self.pace.period:
+                    self.waited += missed
+        except BaseException as error:  # The main thread reports it.
+            self.error = error
+        finally:
+            self._rest()
