@@ -73,22 +73,22 @@ def fit_and_report(arguments: CalibrateArguments, hand: Hand, logs: Sequence[Pat
     Raises:
       DexsimError: the recordings are insufficient, or a file cannot be written.
     """
-    found = fit(read_logs(logs, hand), hand)
-    operator.console.print(table(found))
-    operator.console.print(force_table(found.calibration))
-    for note in grouped(found.calibration.notes):
+    result = fit(read_logs(logs, hand), hand)
+    operator.console.print(table(result))
+    operator.console.print(force_table(result.calibration))
+    for note in grouped(result.calibration.notes):
         operator.tell(f"note: {note}")
     for option, path in (("--output", arguments.destination), ("--report", arguments.report)):
         if path and path.exists() and not arguments.force:  # It may have been created meanwhile.
             raise HandError(
                 f"{path} already exists: --from-log {' '.join(map(str, logs))} fits these presses into another {option}"
             )
-    save_calibration(arguments.destination, found.calibration)
+    save_calibration(arguments.destination, result.calibration)
     operator.tell(f"calibration: {arguments.destination}")
     if arguments.report:
-        cli.write_json(arguments.report, report(found))
+        cli.write_json(arguments.report, report(result))
     if arguments.plot:
-        plot_calibration(arguments.plot, found.calibration, found.real, found.sim)
+        plot_calibration(arguments.plot, result.calibration, result.real, result.sim)
         operator.tell(f"figure: {arguments.plot}")
 
 

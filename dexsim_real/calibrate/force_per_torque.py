@@ -23,7 +23,7 @@ def fit_force_per_torque(
       calibration: of the same presses.
       real, sim: by joint name, force against current (A) and against torque (Nm).
     """
-    found = np.zeros((3, hand.num_fingers))
+    ratio = np.zeros((3, hand.num_fingers))
     for finger, joint in enumerate(hand.root_joint):
         name = hand.joint_names[joint]
         if name not in real:
@@ -39,5 +39,5 @@ def fit_force_per_torque(
         known = max(np.ptp(line.gain_interval) / 2 for line in lines)
         middle, half = gain.mean(), float(np.hypot(known, np.ptp(gain) / 2))
         if half < middle:
-            found[:, finger] = 1.0 / np.array([middle, middle + half, middle - half])
-    return found
+            ratio[:, finger] = 1.0 / np.array([middle, middle + half, middle - half])
+    return ratio

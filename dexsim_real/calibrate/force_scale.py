@@ -49,7 +49,7 @@ def force_scale(session: PressSession, hand: Hand, pressed: list[Recording]) -> 
             if levels:
                 notes.append(f"{recording.name}: {len(levels)} gauge readings are ignored, {_READINGS} are needed")
             continue
-        every, shown = np.array(recording.counts), np.array(recording.shown)
+        every, readings = np.array(recording.counts), np.array(recording.shown)
         counts = np.array([every[recording.samples(level)].mean(0) for level in levels])
         active = binary_dilation((counts.max(0) >= ACTIVE).reshape(hand.taxel_grid), np.ones((3, 3))).ravel()
         counts = counts * active
@@ -58,18 +58,18 @@ def force_scale(session: PressSession, hand: Hand, pressed: list[Recording]) -> 
         posture = [np.array(recording.position)[recording.samples(level)].mean(0) for level in levels]
         gauge = np.array([recording.gauge[level] for level in levels])
         gauge = gauge / upright(hand, recording.finger, counts, np.array(posture))
-        run = np.array([shown[recording.samples(level)].mean() for level in levels])
-        whole, found = (_against(gauge, part, recording.name) for part in (counts.sum(-1), run))
+        run = np.array([readings[recording.samples(level)].mean() for level in levels])
+        whole, sensor_fit = (_against(gauge, part, recording.name) for part in (counts.sum(-1), run))
         newtons[recording.name] = 1.0 / whole.gain.value, -whole.offset.value / whole.gain.value
         share = max(whole.gain.high - whole.gain.value, whole.gain.value - whole.gain.low) / whole.gain.value
         error[recording.name] = float(np.hypot(share, _GAUGE))
-        found = dataclasses.replace(found, gain=found.gain.widened(float(np.hypot(_GAUGE, _PLACE))))
+        sensor_fit = dataclasses.replace(sensor_fit, gain=sensor_fit.gain.widened(float(np.hypot(_GAUGE, _PLACE))))
         notes.append(
-            f"{recording.name}: {found.gain} counts per newton by the gauge ({found.samples} readings), "
-            f"{found.offset} counts at zero force"
+            f"{recording.name}: {sensor_fit.gain} counts per newton by the gauge ({sensor_fit.samples} readings), "
+            f"{sensor_fit.offset} counts at zero force"
         )
-        fits.setdefault(hand.finger_names[recording.finger], found)
-    own = {name: 1.0 / found.gain.value for name, found in fits.items()}
+        fits.setdefault(hand.finger_names[recording.finger], sensor_fit)
+    own = {name: 1.0 / sensor_fit.gain.value for name, sensor_fit in fits.items()}
     others = float(np.mean(list(own.values()))) if own else nominal
     per_count = np.array([own.get(name, others) for name in hand.finger_names])
     notes += [
@@ -93,14 +93,14 @@ def upright(hand: Hand, finger: int, counts: np.ndarray, position: np.ndarray) -
     none their sum has any sign and direction: the share is then 1.
     """
     sums = counts.sum(-1)
-    felt = sums >= ACTIVE
-    if not felt.any():
+    active = sums >= ACTIVE
+    if not active.any():
         return np.ones(len(counts))
     normals = [_normals(hand, jnp.int32(finger), jnp.asarray(q, jnp.float32)) for q in position]
     weights = np.maximum(counts, 0.0)
     push = np.array([weight @ np.asarray(normal) for weight, normal in zip(weights, normals, strict=True)])
     push /= np.maximum(np.linalg.norm(push, axis=-1, keepdims=True), 1e-9)
-    return np.where(felt, push @ push[np.where(felt, sums, np.inf).argmin()], 1.0)
+    return np.where(active, push @ push[np.where(active, sums, np.inf).argmin()], 1.0)
 
 
 @functools.partial(jax.jit, static_argnames="hand")

@@ -75,7 +75,7 @@ def identify_hand(arguments: CalibrateArguments, hand: Hand, operator: Operator,
             raise HandError(f"no joint {name!r}; choose from {', '.join(hand.joint_names)}")
     calibration = load_calibration(arguments.calibration, hand) if arguments.calibration else None
     logs = arguments.from_log or (record(arguments, hand, operator, **bench),)
-    found, failed = [], dict[str, DexsimError]()
+    results, failed = [], dict[str, DexsimError]()
     for name, (log, check) in read_logs(logs, hand, calibration, arguments.joints, failed).items():
         joint = hand.joint_names.index(name)
         start = {
@@ -97,23 +97,23 @@ def identify_hand(arguments: CalibrateArguments, hand: Hand, operator: Operator,
         except CalibrationError as error:
             failed[name] = error
             continue
-        found.append(result)
+        results.append(result)
         operator.tell(result.report())
-    if not found and not failed:
+    if not results and not failed:
         raise HandError("the logs contain none of the chosen joints; check --joints and --from-log")
-    if len(found) + len(failed) > 1:  # A single joint's error ends the command, which prints it.
+    if len(results) + len(failed) > 1:  # A single joint's error ends the command, which prints it.
         for reason in failed.values():
             operator.tell(f"not identified: {reason}")
-    if not found:
+    if not results:
         raise next(iter(failed.values()))
-    cli.write_json(arguments.destination, {"joints": {result.joint: _plain(result) for result in found}})
+    cli.write_json(arguments.destination, {"joints": {result.joint: _plain(result) for result in results}})
     operator.tell(f"identified: {arguments.destination}")
     if failed:
         raise HandError(
             f"not identified: {', '.join(failed)} (the reasons are above); the other joints are in "
             f"{arguments.destination}"
         )
-    return found
+    return results
 
 
 def record(arguments: CalibrateArguments, hand: Hand, operator: Operator, **bench: Any) -> Path:
@@ -191,7 +191,7 @@ def read_logs(
             check_identity(first.identity, hand, calibration)
         except HandError as error:
             raise HandError(f"{first.path}: {error}") from None
-    found = {}
+    results = {}
     for name, (source, signals) in recorded.items():
         if "fit" not in signals or (joints and name not in joints):
             continue
@@ -205,8 +205,8 @@ def read_logs(
                 raise
             failed[name] = error
             continue
-        found[name] = logs["fit"], logs.get("hold-out")
-    return found
+        results[name] = logs["fit"], logs.get("hold-out")
+    return results
 
 
 def _read(path: Path, hand: Hand) -> tuple[_Source, dict[str, dict[str, list[_Row]]]]:
@@ -235,8 +235,8 @@ def _read(path: Path, hand: Hand) -> tuple[_Source, dict[str, dict[str, list[_Ro
             rows = parts.setdefault(content["joint"], {}).setdefault(content["signal"], [])
             rows.append(_Row(sent_at, sent[1], answer))
     if source is None or task != TASK:
-        found = f"it is a log of {task!r}" if task else "it ends before the hand was ready"
-        raise LogError(f"{path}: this is not a log of --identify: {found}")
+        reason = f"it is a log of {task!r}" if task else "it ends before the hand was ready"
+        raise LogError(f"{path}: this is not a log of --identify: {reason}")
     return source, parts
 
 
@@ -304,5 +304,5 @@ def _inertia(hand: Hand) -> np.ndarray:
     return np.array([model.dof_M0[model.joint(name).dofadr[0]] for name in hand.joint_names])
 
 
-def _plain(found: Identification) -> dict[str, Any]:
-    return dataclasses.asdict(found)
+def _plain(result: Identification) -> dict[str, Any]:
+    return dataclasses.asdict(result)

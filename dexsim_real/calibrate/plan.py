@@ -51,10 +51,10 @@ def placements(hand: Hand, fingers: tuple[str, ...] = (), sides: bool = True) ->
     columns, rows = hand.taxel_grid
     middle = [c * rows + r for c in (columns // 2 - 1, columns // 2) for r in (rows // 2 - 2, rows // 2 - 1)]
     side = [(columns - 2) * rows + r for r in (rows // 2 - 2, rows // 2 - 1)]
-    found = []
+    plan = []
     for finger in [*[i for i in selected if i], *[i for i in selected if not i]]:
         name = hand.finger_names[finger]
-        found.append(
+        plan.append(
             _placement(
                 hand,
                 f"{name} pad",
@@ -66,7 +66,7 @@ def placements(hand: Hand, fingers: tuple[str, ...] = (), sides: bool = True) ->
         )
     for finger in [i for i in selected if sides and i in (0, 1)]:
         name, toward = hand.finger_names[finger], ("palm's normal", "thumb")[finger]
-        found.append(
+        plan.append(
             _placement(
                 hand,
                 f"{name} side",
@@ -76,7 +76,7 @@ def placements(hand: Hand, fingers: tuple[str, ...] = (), sides: bool = True) ->
                 f"hold the pen across the side of the {name} that faces the {toward}, 3 mm in front of it",
             )
         )
-    return found
+    return plan
 
 
 def _placement(hand: Hand, name: str, finger: int, taxels: list[int], posture: np.ndarray, task: str) -> Placement:

@@ -89,12 +89,12 @@ def fit(session: PressSession, hand: Hand, created: str | None = None) -> Fit:
     pressed = [r for r in session.recordings.values() if len(r.samples(LOADING, UNLOADING))]
     if not pressed:
         raise CalibrationError("no press was recorded; record again")
-    felt, faint = _felt(pressed, hand.taxel_grid)
-    scale = force_scale(session, hand, [recording for recording, _ in felt])
+    pressed_blocks, faint = _felt(pressed, hand.taxel_grid)
+    scale = force_scale(session, hand, [recording for recording, _ in pressed_blocks])
     notes = [*scale.notes, *faint]
     real, sim, source = {}, {}, {}
     reach: dict[str, float] = {}
-    for recording, blocks in felt:
+    for recording, blocks in pressed_blocks:
         dead = dead_taxels(hand, blocks.counts, session.check.neighbours)
         blocks = dataclasses.replace(blocks, counts=fill_dead(hand, blocks.counts, dead))
         gain, offset = scale.newtons[recording.name]
@@ -147,23 +147,23 @@ def fit(session: PressSession, hand: Hand, created: str | None = None) -> Fit:
     notes += _zero_note(session, hand)
     result = dataclasses.replace(result, force_per_torque=fit_force_per_torque(hand, result, real, sim))
     # With a gauge the absolute scale is known.
-    kept = tuple(note for note in result.notes if not (scale.sensors and note.startswith("only the ratio")))
-    return Fit(dataclasses.replace(result, notes=(*kept, METHOD, *notes)), real, sim, source, scale.sensors)
+    others = tuple(note for note in result.notes if not (scale.sensors and note.startswith("only the ratio")))
+    return Fit(dataclasses.replace(result, notes=(*others, METHOD, *notes)), real, sim, source, scale.sensors)
 
 
 def _felt(pressed: list[Recording], grid: tuple[int, int]) -> tuple[list[tuple[Recording, Blocks]], list[str]]:
     """The presses that the taxels felt, with their blocks, and a note on each other one: without force no lever arm."""
-    felt, notes = [], []
+    pressed_blocks, notes = [], []
     for recording in pressed:
         blocks = make_blocks(recording, grid)
         if blocks.counts.sum() > 0:
-            felt.append((recording, blocks))
+            pressed_blocks.append((recording, blocks))
         else:
             notes.append(
                 f"{recording.name}: left out: no taxel read {ACTIVE:g} counts or more; press on the taxels, or with "
                 "more current (--press.current)"
             )
-    return felt, notes
+    return pressed_blocks, notes
 
 
 def make_blocks(recording: Recording, grid: tuple[int, int]) -> Blocks:
@@ -178,13 +178,13 @@ def make_blocks(recording: Recording, grid: tuple[int, int]) -> Blocks:
     """
     size = max(round(_BLOCK * recording.rate), 1)
     phase = np.array(recording.phase)
-    found = [
+    selected = [
         (phase[first], np.array([np.arange(size) + at for at in range(first, last - size + 1, size)]))
         for first, last in _runs(phase)
         if phase[first] in (LOADING, UNLOADING)
     ]
-    found = [(name, run) for name, run in found if len(run) > 1]  # A single block has no speed.
-    runs = [run for _, run in found]
+    selected = [(name, run) for name, run in selected if len(run) > 1]  # A single block has no speed.
+    runs = [run for _, run in selected]
     if not runs:
         raise CalibrationError(
             f"{recording.name}: no press lasted {2 * _BLOCK:g} s; press more slowly (--press.seconds)"
@@ -197,7 +197,7 @@ def make_blocks(recording: Recording, grid: tuple[int, int]) -> Blocks:
     counts = np.array(recording.counts)[rows].mean(1)
     active = (counts.max(0) >= ACTIVE).reshape(grid)
     counts = counts * binary_dilation(active, np.ones((3, 3))).ravel()
-    names = [UNLOADING] + [name for name, _ in found]
+    names = [UNLOADING] + [name for name, _ in selected]
     begins = [before == UNLOADING and name == LOADING for before, name in zip(names, names[1:], strict=False)]
     return Blocks(
         counts,
@@ -262,13 +262,13 @@ def _direction(speed: np.ndarray, recording: Recording, joint: int) -> np.ndarra
 
 def _at_limit(current: np.ndarray, run: np.ndarray) -> np.ndarray:
     """Mask [B] of blocks in which the motor is at its current limit: its current stays at the maximum of the press."""
-    found = np.zeros(len(current), bool)
+    selected = np.zeros(len(current), bool)
     for number in np.unique(run):
         here = np.flatnonzero(run == number)
         size = np.abs(current[here])
         top = size > _TOP * size.max()
-        found[here] = top & (top.sum() >= _TOP_BLOCKS)
-    return found
+        selected[here] = top & (top.sum() >= _TOP_BLOCKS)
+    return selected
 
 
 def _runs(phase: np.ndarray) -> list[tuple[int, int]]:

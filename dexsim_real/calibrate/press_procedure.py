@@ -273,16 +273,16 @@ class PressProcedure:
     def _record(self, press: str, phase: str, seconds: float) -> list[Exchange]:
         """Record the phase for a time in s without moving; without a press the motors stay as they are."""
         target = self._target() if press else None
-        until, found = self.loop.clock() + seconds, []
+        until, exchanges = self.loop.clock() + seconds, []
         self.loop.recording = bool(phase)
         while self.loop.clock() < until:
             exchange = self.loop.step(target)
             if exchange is not None:
-                found.append(exchange)
+                exchanges.append(exchange)
                 if phase:
                     self.loop.mark({"press": press, "phase": phase})
         self.loop.recording = False
-        return found
+        return exchanges
 
     def _wait(self) -> None:
         self.loop.recording = False

@@ -68,15 +68,15 @@ def read_logs(paths: Iterable[Path], hand: Hand) -> PressSession:
     session: PressSession | None = None
     for path in paths:
         with reading(path):
-            found = _Reader(Path(path), hand).read()
+            newer = _Reader(Path(path), hand).read()
         if session is None:
-            session = found
-        elif (found.hardware, found.rate) != (session.hardware, session.rate):
+            session = newer
+        elif (newer.hardware, newer.rate) != (session.hardware, session.rate):
             raise LogError(f"{path}: recorded with other --hardware options or another --rate than the logs before")
-        elif found.serial != session.serial:
-            raise LogError(f"{path}: is of hand {found.serial!r}, the logs before of hand {session.serial!r}")
+        elif newer.serial != session.serial:
+            raise LogError(f"{path}: is of hand {newer.serial!r}, the logs before of hand {session.serial!r}")
         else:
-            for name, press in found.recordings.items():
+            for name, press in newer.recordings.items():
                 before = session.recordings.get(name)
                 # A press that was skipped or missed is in its log without samples.
                 if press.time and (press.finished or before is None or not before.time):

@@ -61,7 +61,7 @@ def report(fit: Fit) -> dict[str, Any]:
             name: dict(zip(("value", "low", "high"), column, strict=True))
             for name, column in zip(calibration.finger_names, _per_torque(calibration).T, strict=True)
         },
-        "gauge": {name: to_dict(found) for name, found in fit.sensors.items()},
+        "gauge": {name: to_dict(finger_fit) for name, finger_fit in fit.sensors.items()},
         "joints": joints,
         "notes": list(calibration.notes),
     }
@@ -72,11 +72,13 @@ def table(fit: Fit) -> Table:
     calibration, real = fit.calibration, fit.calibration.real
     constants, intervals = torque_constants(calibration), torque_constant_intervals(calibration)
     width = np.max(np.ptp(intervals, axis=-1) / 2 / np.abs(constants), 0)
-    shown = Table(box=None, padding=(0, 1, 0, 0), title="current to torque, loading / unloading", title_justify="left")
+    columns = Table(
+        box=None, padding=(0, 1, 0, 0), title="current to torque, loading / unloading", title_justify="left"
+    )
     for head in ("joint", "pressed with", "Nm / A", "95 %", "R2", "cond.", "friction", "max force"):
-        shown.add_column(head, no_wrap=True)
+        columns.add_column(head, no_wrap=True)
     for joint, name in enumerate(calibration.joint_names):
-        shown.add_row(
+        columns.add_row(
             name,
             fit.source.get(name, "(others)"),
             " / ".join(f"{value:+.3f}" for value in constants[:, joint]),
@@ -86,17 +88,19 @@ def table(fit: Fit) -> Table:
             f"{1e3 * real.friction[joint]:.0f} mA",
             f"{real.force_max[joint]:.1f} N",
         )
-    return shown
+    return columns
 
 
 def force_table(calibration: Calibration) -> Table:
     """A table of the forces per root-joint torque; a finger that was not pressed has those of the hand's TOML."""
-    shown = Table(box=None, padding=(0, 1, 0, 0), title="fingertip force over root-joint torque", title_justify="left")
+    columns = Table(
+        box=None, padding=(0, 1, 0, 0), title="fingertip force over root-joint torque", title_justify="left"
+    )
     for head in ("finger", "N / Nm", "95 %"):
-        shown.add_column(head, no_wrap=True)
+        columns.add_column(head, no_wrap=True)
     for name, (value, low, high) in zip(calibration.finger_names, _per_torque(calibration).T, strict=True):
-        shown.add_row(name, *((f"{value:.2f}", f"{low:.2f} to {high:.2f}") if value else ("(hand's TOML)", "")))
-    return shown
+        columns.add_row(name, *((f"{value:.2f}", f"{low:.2f} to {high:.2f}") if value else ("(hand's TOML)", "")))
+    return columns
 
 
 def _per_torque(calibration: Calibration) -> np.ndarray:

@@ -39,9 +39,9 @@ class _Timer:
     def __init__(self) -> None:
         self._since: float | None = None
 
-    def lasts(self, time: float, found: bool) -> float:
+    def lasts(self, time: float, active: bool) -> float:
         """Seconds from the first answer with this finding to this one; -1 without it."""
-        self._since = (time if self._since is None else self._since) if found else None
+        self._since = (time if self._since is None else self._since) if active else None
         return -1.0 if self._since is None else time - self._since
 
 
@@ -76,10 +76,10 @@ class Alarms:
           on: whether the motors were commanded to be on.
         """
         self.refused, self._serious = "", 0
-        found = (self._heat(time, measured), self._overcurrent(time, measured), self._stall(time, measured))
+        sudden = (self._heat(time, measured), self._overcurrent(time, measured), self._stall(time, measured))
         waiting = (self._errors(time, measured), self._switched_off(time, measured, on))
         limit = self.config.alarm_seconds
-        self.fatal = next(filter(None, found), "") or next((text for text, lasts in waiting if lasts > limit), "")
+        self.fatal = next(filter(None, sudden), "") or next((text for text, lasts in waiting if lasts > limit), "")
         self.hold = next((text for text, lasts in waiting if text), "")
 
     def refuse(self, refusal: Refusal) -> None:

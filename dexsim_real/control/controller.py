@@ -66,11 +66,11 @@ class Controller:
         self.spec.check_hand(hand)
         names, config = self.spec.fields, self.spec.observation
         self.sources = sources_of(select_fields(names, config))
-        wanted = tuple(LayoutEntry(f.name, f.size, f.scale) for f in policy.observation_layout)
-        if layout(hand, names, config) != wanted:
+        expected = tuple(LayoutEntry(f.name, f.size, f.scale) for f in policy.observation_layout)
+        if layout(hand, names, config) != expected:
             raise HandError(f"the policy's observation does not fit this version's task {policy.task!r}")
-        seen = np.zeros(sum(entry.size for entry in wanted), np.float32)
-        if (shape := np.shape(policy.act(policy.initial_carry(), seen)[1])) != (hand.num_joints,):
+        zeros = np.zeros(sum(entry.size for entry in expected), np.float32)
+        if (shape := np.shape(policy.act(policy.initial_carry(), zeros)[1])) != (hand.num_joints,):
             raise HandError(f"the policy gives actions {list(shape)}; the hand takes {hand.num_joints} of them")
         self.period = 1.0 / policy.control_rate
         self._observe = make_observe(hand, names, config)
@@ -108,17 +108,17 @@ class Controller:
         """Continue from this pose [J] rad, after a time in which the hand did not follow its targets."""
         self.target = np.asarray(position, np.float32)
 
-    def tick(self, measured: HandMeasurement, seen: ObjectEstimate, goal_quat: np.ndarray, command: float) -> Tick:
+    def tick(self, measured: HandMeasurement, estimate: ObjectEstimate, goal_quat: np.ndarray, command: float) -> Tick:
         """Compute readings, observation, action and joint targets.
 
         Args:
           measured: of the hand.
-          seen: of the object.
+          estimate: of the object.
           goal_quat: [4] goal orientation of the object.
           command: grip command in [0, 1].
         """
         last_action = np.asarray(self._recall(self.last_action, self.target))
-        readings = make_readings(measured, seen, goal_quat, command, last_action)
+        readings = make_readings(measured, estimate, goal_quat, command, last_action)
         if self.spec.force_loop:
             readings, correction = jax.device_get(self._correct(readings, self.correction))
             self.correction = np.asarray(correction)

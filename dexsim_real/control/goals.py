@@ -30,14 +30,14 @@ class TurnGoals:
         self._spin = 0.0
         self.quat = self._goal()
 
-    def update(self, time: float, seen: ObjectEstimate) -> np.ndarray:
+    def update(self, time: float, estimate: ObjectEstimate) -> np.ndarray:
         """Goal orientation [4] for this tick; the next one as soon as the last was reached.
 
         Args:
           time: s of the orientation.
-          seen: of the object.
+          estimate: of the object.
         """
-        goal, quat = self._turn, seen.quat
+        goal, quat = self._turn, estimate.quat
         if self._last is not None and time > self._last[0]:
             step = time - self._last[0]
             turn = multiply(quat, self._last[1] * [1, -1, -1, -1])
@@ -46,7 +46,7 @@ class TurnGoals:
             self._spin += step / (step + self._SMOOTH) * (rate - self._spin)
         self._last = time, quat
         away = 2 * math.acos(min(1.0, abs(float(quat @ self.quat))))
-        distance = np.linalg.norm(seen.position - self._reference)
+        distance = np.linalg.norm(estimate.position - self._reference)
         inside = away < goal.angle and distance < goal.distance
         calm = goal.spin <= 0 or abs(self._spin) <= goal.spin
         if inside and calm:

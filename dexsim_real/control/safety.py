@@ -75,7 +75,7 @@ class SafetyDecision:
     stiffness: float  # share of the gain kp
 
 
-class Wish(NamedTuple):
+class TargetRequest(NamedTuple):
     """What `Safety.set_target` was told last."""
 
     time: float  # s
@@ -109,7 +109,7 @@ class Safety:
         self.latched = ""  # why the motors are off permanently
         self.anchor = 0  # number of times that commands restarted, after a hold or with the motors off before
         self.counts: Counter[str] = Counter()  # cycles by reason
-        self._target: Wish | None = None
+        self._target: TargetRequest | None = None
         self._pose = PoseCheck(hand, config.beyond)
         self._alarms = Alarms(hand, config)
         self._joints = joint_labels(hand)
@@ -172,7 +172,7 @@ class Safety:
         """
         before = self._target
         since = before.since if before is not None and before.hold_reason else time
-        self._target = Wish(time, np.array(position, np.float32), hold_reason, since)
+        self._target = TargetRequest(time, np.array(position, np.float32), hold_reason, since)
 
     def engage(self) -> None:
         """Turn the motors on at the measured pose. No effect once latched."""
@@ -198,10 +198,10 @@ class Safety:
                 why = self.problem or (self._silence() if silent else self._alarms.hold or UNKNOWN)
                 return self._finish(now, Reaction.RELAX, why, self._rest())
             self._start(now, pose)
-        wish = self._target  # Read once: another thread may replace it meanwhile.
-        if lasted := self._lasted(now, sample, wish):
+        request = self._target  # Read once: another thread may replace it meanwhile.
+        if lasted := self._lasted(now, sample, request):
             return self._turn_off(now, lasted, self.config.patience)
-        reason = self._reason_to_hold(now, sample, wish)
+        reason = self._reason_to_hold(now, sample, request)
         if not reason.startswith(_SILENT):  # Silence has its own limit, and does not end a run.
             since = max(now - self._time, 0.0)
             self._held = self._held + since if reason else max(self._held - _RECOVERY * since, 0.0)
@@ -211,7 +211,7 @@ class Safety:
             return self._hold(now, reason)
         if self._holding:
             self._restart(now)
-        return self._follow(now, sample, self.commanded if wish is None else wish.position)
+        return self._follow(now, sample, self.commanded if request is None else request.position)
 
     # --- pieces -----------------------------------------------------------------------------
 
@@ -223,18 +223,18 @@ class Safety:
     def _silence(self) -> str:
         return f"{_SILENT}: {self.refused}" if self.refused else _SILENT
 
-    def _lasted(self, now: float, sample: HandSample, wish: Wish | None) -> str:
+    def _lasted(self, now: float, sample: HandSample, request: TargetRequest | None) -> str:
         """What has lasted for longer than `patience`, whatever else the hand held for meanwhile; empty for nothing."""
         patience, silent = self.config.patience, now - sample.time - self.config.stale
         if silent > 0:
             return self._silence() if silent > patience else ""
-        if wish is None:
+        if request is None:
             return ""
-        if now - max(wish.time + self.config.watchdog, self._on) > patience:
+        if now - max(request.time + self.config.watchdog, self._on) > patience:
             return _DEAD
-        return wish.hold_reason if now - max(wish.since, self._on) > patience else ""
+        return request.hold_reason if now - max(request.since, self._on) > patience else ""
 
-    def _reason_to_hold(self, now: float, sample: HandSample, wish: Wish | None) -> str:
+    def _reason_to_hold(self, now: float, sample: HandSample, request: TargetRequest | None) -> str:
         config, force = self.config, sample.measured.finger_force
         if now - sample.time > config.stale:
             return self._silence()
@@ -245,11 +245,11 @@ class Safety:
             return f"too fast: {self._joints[int(speed.argmax())]}"
         if force.max() > config.finger_force or force.sum() > config.total_force:
             return _FORCE
-        if wish is None:  # Before the first target the start pose is the target.
+        if request is None:  # Before the first target the start pose is the target.
             return ""
-        if not np.isfinite(wish.position).all():
+        if not np.isfinite(request.position).all():
             return "target is not finite"
-        return _DEAD if now - wish.time > config.watchdog else wish.hold_reason
+        return _DEAD if now - request.time > config.watchdog else request.hold_reason
 
     def _start(self, now: float, pose: np.ndarray) -> None:
         """Turn the motors on at the measured pose [J] rad."""

@@ -30,8 +30,8 @@ def explain(port: str, error: Exception) -> str:
     if number in (errno.EBUSY, errno.EAGAIN) or "exclusively lock" in str(error):
         return f"{port}: another program has it open (`fuser -v {port}` names it). Close that program first"
     if number in (errno.ENOENT, errno.ENXIO, errno.ENODEV):
-        found = sorted(str(link) for link in Path("/dev/serial/by-id").glob("*"))
-        known = f"choose from {', '.join(found)}" if found else "no serial port was found; check cable and power"
+        ports = sorted(str(link) for link in Path("/dev/serial/by-id").glob("*"))
+        known = f"choose from {', '.join(ports)}" if ports else "no serial port was found; check cable and power"
         return f"{port}: there is no such port; {known}"
     return f"{port}: cannot be opened ({error}); check the name and the cable"
 

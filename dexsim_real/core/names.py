@@ -20,12 +20,12 @@ def find_function(name: str, given: str, form: str, default: str = "") -> Callab
     """
     module, _, function = name.partition(":")
     try:
-        found = getattr(importlib.import_module(module), function or default)
+        function_object = getattr(importlib.import_module(module), function or default)
     except (Exception, SystemExit) as error:  # The module is the user's: importing it may raise anything.
         says = " ".join(str(error).split())
         if not isinstance(error, (ImportError, AttributeError)):
             says = f"{type(error).__name__}: {says}".removesuffix(": ")
         raise HandError(f"{given}: {says:.200}; give {form}") from None
-    if not callable(found):
+    if not callable(function_object):
         raise HandError(f"{given}: {function or default} is no function; give {form}")
-    return found
+    return function_object

@@ -30,7 +30,7 @@ def plot(run: Replay, path: Path) -> None:
     """Write a figure: joint angles and targets by finger, finger forces and command, ages, and the observation."""
     import matplotlib.pyplot as plt
 
-    hand, seen = run.hand, signals(run)
+    hand, values = run.hand, signals(run)
     fingers = hand.num_fingers
     figure, axes = plt.subplots(
         fingers + 3,
@@ -43,20 +43,20 @@ def plot(run: Replay, path: Path) -> None:
     for finger, (axis, name) in enumerate(zip(axes, hand.finger_names, strict=False)):
         for joint in finger_joints(hand, finger):
             label = hand.joint_names[joint].removeprefix("right_hand_").removesuffix("_joint").replace("_", " ")
-            (line,) = axis.plot(run.time, seen["angle"][:, joint], lw=1, label=label)
-            axis.plot(run.time, seen["target"][:, joint], lw=0.8, ls=":", color=line.get_color())
+            (line,) = axis.plot(run.time, values["angle"][:, joint], lw=1, label=label)
+            axis.plot(run.time, values["target"][:, joint], lw=0.8, ls=":", color=line.get_color())
         axis.set_ylabel(f"{name} [rad]")
         axis.legend(fontsize=7, ncols=4, loc="upper right", frameon=False)
     axes[0].set_title("joint angles; targets dotted", loc="left", fontsize=9)
-    felt, age, observation = axes[fingers:]
+    forces, age, observation = axes[fingers:]
     for finger, name in enumerate(hand.finger_names):
-        felt.plot(run.time, seen["force"][:, finger], lw=1, label=name)
-    felt.set(ylabel="force on the taxels [N]", ylim=(0, max(1.05 * float(seen["force"].max()), 0.1)))
-    felt.legend(fontsize=7, ncols=5, loc="upper right", frameon=False)
-    command = felt.twinx()
-    command.plot(run.time, seen["command"], "k--", lw=0.8)
+        forces.plot(run.time, values["force"][:, finger], lw=1, label=name)
+    forces.set(ylabel="force on the taxels [N]", ylim=(0, max(1.05 * float(values["force"].max()), 0.1)))
+    forces.legend(fontsize=7, ncols=5, loc="upper right", frameon=False)
+    command = forces.twinx()
+    command.plot(run.time, values["command"], "k--", lw=0.8)
     command.set(ylabel="command, dashed [0 to 1]", ylim=(-0.02, 1.02))
-    age.plot(run.time, 1e3 * seen["age"], lw=0.8)
+    age.plot(run.time, 1e3 * values["age"], lw=0.8)
     age.set_ylabel("age of the\nmeasurement [ms]")
     # Entries differ in unit and scale, so each is normalised.
     spread = np.maximum(run.observation.std(0), 1e-6)

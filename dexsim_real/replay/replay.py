@@ -147,12 +147,12 @@ def _check_tick(time: float, tick: dict[str, Any], measured: HandMeasurement) ->
     """Whether a tick is what figures and datasets can be made of; any error if not."""
     none = ObjectEstimate(np.zeros(3), np.zeros(3), np.zeros(4))
     like = make_readings(measured, none, none.quat, 0.0, measured.joint_position)
-    wanted = {"target": measured.joint_position.shape, "age": (), "time": ()}
-    wanted |= {field.name: getattr(like, field.name).shape for field in dataclasses.fields(like)}
-    found = tick["readings"] | {"target": tick["target"], "age": tick["age"], "time": time}
-    for name, shape in wanted.items():
-        if np.asarray(found[name], np.float32).shape != shape:
-            raise ValueError(f"{name} has the shape {list(np.shape(found[name]))} in place of {list(shape)}")
+    expected = {"target": measured.joint_position.shape, "age": (), "time": ()}
+    expected |= {field.name: getattr(like, field.name).shape for field in dataclasses.fields(like)}
+    entry = tick["readings"] | {"target": tick["target"], "age": tick["age"], "time": time}
+    for name, shape in expected.items():
+        if np.asarray(entry[name], np.float32).shape != shape:
+            raise ValueError(f"{name} has the shape {list(np.shape(entry[name]))} in place of {list(shape)}")
     if not np.isfinite(time) or np.isnan(measured.taxel_force).any():
         raise ValueError("a time or a zero of the taxels is not finite")
 

@@ -24,8 +24,8 @@ class HandState:
 
 def error_text(registers: np.ndarray) -> str:
     """The error registers [3] of a joint: those of its boards that are not zero."""
-    found = [f"{board} 0x{int(bits):04x}" for board, bits in zip(_BOARDS, registers, strict=True) if bits]
-    return ", ".join(found) or "-"
+    errors = [f"{board} 0x{int(bits):04x}" for board, bits in zip(_BOARDS, registers, strict=True) if bits]
+    return ", ".join(errors) or "-"
 
 
 def hand_tables(state: HandState) -> Table:

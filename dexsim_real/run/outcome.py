@@ -45,16 +45,16 @@ class Outcome:
 
     def missing(self, log: LogWriter) -> list[str]:
         """What the run lacks, one line each; empty for a whole run. `log` should be closed."""
-        found = []
+        lines = []
         if self._blind > _BLIND * self._total:
-            found.append(f"no measurement for {self._share(self._blind)} of the run")
+            lines.append(f"no measurement for {self._share(self._blind)} of the run")
         if self._wrong:
-            found.append(f"{self._wrong} of {self._actions} actions of the policy were not finite")
+            lines.append(f"{self._wrong} of {self._actions} actions of the policy were not finite")
         if self._held > _HELD * self._total:
-            found.append(f"the hand was held for {self._share(self._held)} of the run, last because: {self._reason}")
+            lines.append(f"the hand was held for {self._share(self._held)} of the run, last because: {self._reason}")
         if log.dropped or log.failure:
-            found.append(f"{log.dropped} log records are lost ({log.failure or 'the disk is too slow'})")
-        return found
+            lines.append(f"{log.dropped} log records are lost ({log.failure or 'the disk is too slow'})")
+        return lines
 
     def _share(self, seconds: float) -> str:
         return f"{100 * seconds / self._total:.0f} %"

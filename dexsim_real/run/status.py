@@ -96,14 +96,14 @@ class StatusView:
 
     def _run(self) -> None:
         lower_priority()
-        shown = 0.0
+        elapsed = 0.0
         while not self._stop.wait(_LIVE):
             self._print_notes()
-            shown += _LIVE
+            elapsed += _LIVE
             if self._live:
                 self._live.update(self._tables(self._status()), refresh=True)
-            elif shown >= _LINES:
-                shown, status = 0.0, self._status()
+            elif elapsed >= _LINES:
+                elapsed, status = 0.0, self._status()
                 words = status.rows | (hand_line(status.hand) if status.hand else {})
                 self._notes.append(" | ".join(f"{name} {value}" for name, value in words.items()))
         self._print_notes()

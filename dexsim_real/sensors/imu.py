@@ -74,17 +74,17 @@ class RvcParser:
     def feed(self, data: bytes) -> list[np.ndarray]:
         """Add received bytes; returns the orientations that they complete."""
         self._buffer += data
-        buffer, found, done = self._buffer, [], 0
+        buffer, quats, done = self._buffer, [], 0
         while (at := buffer.find(HEAD, done)) >= 0 and at + SIZE <= len(buffer):
             quat = decode(bytes(buffer[at : at + SIZE]))
             if quat is None:
                 self.damaged += 1
             else:
-                found.append(quat)
+                quats.append(quat)
             done = at + (SIZE if quat is not None else 1)
         # The last byte may be the first half of a head, unless it ends a frame.
         del buffer[: at if at >= 0 else max(done, len(buffer) - 1)]
-        return found
+        return quats
 
 
 def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:

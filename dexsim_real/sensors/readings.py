@@ -38,13 +38,13 @@ def sources_of(names: Sequence[str]) -> set[str]:
 
 
 def make_readings(
-    measured: HandMeasurement, seen: ObjectEstimate, goal_quat: np.ndarray, command: float, last_action: np.ndarray
+    measured: HandMeasurement, estimate: ObjectEstimate, goal_quat: np.ndarray, command: float, last_action: np.ndarray
 ) -> Readings:
     """The `Readings` of one tick, float32 as in simulation.
 
     Args:
       measured: of the hand.
-      seen: of the object.
+      estimate: of the object.
       goal_quat: [4] goal orientation of the object.
       command: grip command in [0, 1].
       last_action: [J] the action that led to these measurements.
@@ -53,9 +53,9 @@ def make_readings(
         "joint_position": measured.joint_position,
         "joint_torque": measured.joint_torque,
         "taxel_force": measured.taxel_force,
-        "object_position": seen.position,
-        "object_velocity": seen.velocity,
-        "object_quat": seen.quat,
+        "object_position": estimate.position,
+        "object_velocity": estimate.velocity,
+        "object_quat": estimate.quat,
         "goal_quat": goal_quat,
         "command": command,
         "last_action": last_action,

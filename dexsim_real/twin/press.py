@@ -20,10 +20,7 @@ from dexsim_real.twin.plant.drives import STALL_CURRENT
 from dexsim_real.twin.plant.emulated_hand import EmulatedHand
 from dexsim_real.twin.plant.scene import build_scene
 from dexsim_real.twin.plant.shapes import ObjectShape, Primitive, matrix
-from dexsim_real.twin.wire.firmware import Firmware, FirmwareConfig
-from dexsim_real.wire import frames
-from dexsim_real.wire.frames import Command, Frame, Mode
-from dexsim_real.wire.link import LinkCounts, Reply
+from dexsim_real.wire.frames import Mode
 
 _RADIUS = 0.006  # m
 PEN = ObjectShape("capsule", (Primitive("capsule", (_RADIUS, 0.020)),))
@@ -31,7 +28,6 @@ _AWAY = np.array([0.4, 0.0, 0.0])
 _TOLERANCE = 0.015  # rad, largest distance of targets from the path of a placement
 _TURN = 0.5  # Nm/rad, rotational stiffness of the foam
 _RATIO = 0.7  # damping ratio of both springs
-_REQUEST, _EXCHANGE = 0.001, 0.0096  # s until a request reaches the board; until its answer has arrived
 _SOLID = {"mass": 0.1, "inertia_scale": 10.0, "com_offset": 0.0}
 
 
@@ -189,43 +185,6 @@ class PressBench(EmulatedHand):
     def _put(self, position: np.ndarray, quat: np.ndarray) -> None:
         self._place, self._spring = Place(position, quat, np.zeros(3)), np.zeros(3)
         put(self._scene, self._data, position, quat)
-
-
-class VirtualPort:
-    """`HandPort` of an emulated hand in virtual time, through its palm board and the bytes of both frames."""
-
-    def __init__(self, plant: EmulatedHand):
-        self.plant, self.firmware = plant, Firmware(plant, FirmwareConfig())
-        self.counts, self.sequence, self.time = LinkCounts(), 0, 0.0
-
-    def connect(self) -> str:
-        """There is nothing to open."""
-        return "emulated: hand 0"
-
-    def exchange(self, command: np.ndarray) -> Reply:
-        """Send a command and wait for the answer, which always comes."""
-        sent = self.time
-        self.sleep(_REQUEST)
-        request = Frame(frames.HOST, frames.palm_address(0), Command.EXCHANGE, command.tobytes())
-        answer = self.firmware.answer(request, self.time)
-        assert answer is not None, "the request is addressed to this hand"
-        self.sleep(_EXCHANGE - _REQUEST)
-        self.sequence += 1
-        self.counts.sent += 1
-        self.counts.answered += 1
-        return Reply(frames.decode_state(answer.data), sent, self.time, self.sequence, 1)
-
-    def close(self) -> None:
-        """There is nothing to close."""
-
-    def clock(self) -> float:
-        """Virtual time in s."""
-        return self.time
-
-    def sleep(self, seconds: float) -> None:
-        """Advance the hand by a duration in s."""
-        self.plant.advance(max(seconds, 0.0))
-        self.time += max(seconds, 0.0)
 
 
 def _facing(normal: np.ndarray, along: np.ndarray) -> np.ndarray:

@@ -56,9 +56,9 @@ class PlantClock:
         step = min(now - self.now, limit)
         if step <= 0:
             return
-        begun = time.monotonic()
+        start = time.monotonic()
         self.plant.advance(step)
-        took = time.monotonic() - begun
+        took = time.monotonic() - start
         self.now += step
         self.simulated += step
         self.spent += took

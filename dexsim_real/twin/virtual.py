@@ -21,7 +21,7 @@ from dexsim_real.control.controller import Controller
 from dexsim_real.control.goals import TurnGoals
 from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.policy_loop import PolicyLoop, limits_for
-from dexsim_real.control.safety import HandSample, Reaction, Safety, SafetyDecision, Wish
+from dexsim_real.control.safety import HandSample, Reaction, Safety, SafetyDecision, TargetRequest
 from dexsim_real.loop import TARE_SAMPLES, Exchange, ExchangeLoop
 from dexsim_real.sensors.camera import HeightSensor
 from dexsim_real.sensors.hand import HandMeasurement, HandSensing, HardwareConfig
@@ -122,10 +122,10 @@ class VirtualCamera(HeightSensor):
 class Unlimited(Safety):
     """Lets every finite target through, to find out what the limits cost."""
 
-    def _lasted(self, now: float, sample: HandSample, wish: Wish | None) -> str:
+    def _lasted(self, now: float, sample: HandSample, request: TargetRequest | None) -> str:
         return ""
 
-    def _reason_to_hold(self, now: float, sample: HandSample, wish: Wish | None) -> str:
+    def _reason_to_hold(self, now: float, sample: HandSample, request: TargetRequest | None) -> str:
         return ""
 
     def _follow(self, now: float, sample: HandSample, target: np.ndarray) -> SafetyDecision:

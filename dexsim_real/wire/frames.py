@@ -197,14 +197,14 @@ class Parser:
         return len(self._buffer)
 
     def _scan(self, final: bool) -> list[Frame]:
-        buffer, frames, at, kept = self._buffer, [], 0, 0
+        buffer, frames, at, done = self._buffer, [], 0, 0
         while True:
-            found = buffer.find(HEAD, at)
-            if found < 0:
+            head = buffer.find(HEAD, at)
+            if head < 0:
                 # The last byte may be the first half of a head.
                 at = len(buffer) - (not final and buffer.endswith(HEAD[:1]) and len(buffer) > at)
                 break
-            at = found
+            at = head
             end = self._frame_end(at)
             if end is None:
                 at += 1
@@ -213,17 +213,17 @@ class Parser:
                     break
                 at += 1
             elif self._sound(at, end):
-                self._skip(at - kept)
+                self._skip(at - done)
                 _, source, target, command, size = HEADER.unpack_from(buffer, at)
                 data = bytes(buffer[at + HEADER.size : at + HEADER.size + size])
                 frames.append(Frame(source, target, command, data))
                 self.counts.frames += 1
                 self._searching = False
-                at = kept = end
+                at = done = end
             else:
                 self.counts.crc_errors += 1
                 at += 1
-        self._skip(at - kept)
+        self._skip(at - done)
         del buffer[:at]
         return frames
 

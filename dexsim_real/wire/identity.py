@@ -54,38 +54,40 @@ def check_identity(identity: Identity | None, hand: Hand, calibration: Calibrati
     """
     if identity is not None and not isinstance(identity, Identity):
         raise HandError(f"the driver's `identity` is {identity!r:.80}; expected an `Identity`, or None")
-    found = identity or Identity()
-    for name, value in dataclasses.asdict(found).items():
+    reported = identity or Identity()
+    for name, value in dataclasses.asdict(reported).items():
         if not isinstance(value, str):
             raise HandError(f"the driver's `identity` has {name} {value!r:.80}; expected text")
-    if found.handedness not in ("", *_SIDES) and not found.handedness.startswith(_CODE):
+    if reported.handedness not in ("", *_SIDES) and not reported.handedness.startswith(_CODE):
         raise HandError(
-            f"the driver's `identity` has handedness {found.handedness!r:.80}; expected 'left', 'right' or '', or "
+            f"the driver's `identity` has handedness {reported.handedness!r:.80}; expected 'left', 'right' or '', or "
             f"'{_CODE}' and what the hand told"
         )
     model = next((side for side in _SIDES if side in hand.name), "")
-    if model and found.handedness in _SIDES and found.handedness != model:
+    if model and reported.handedness in _SIDES and reported.handedness != model:
         raise HandError(
-            f"this is a {found.handedness} hand (serial number {found.serial_number}), the model a {model} one"
+            f"this is a {reported.handedness} hand (serial number {reported.serial_number}), the model a {model} one"
         )
     serial = calibration.serial if calibration else ""
-    if serial and not found.serial_number:
+    if serial and not reported.serial_number:
         raise HandError(
             f"the hand does not tell its serial number, and the calibration is of hand {serial}: calibrate this hand, "
             "or remove the serial number from the file if it is this hand's"
         )
-    if serial and serial != found.serial_number:
-        raise HandError(f"this is hand {found.serial_number}, the calibration is of hand {serial}: calibrate this hand")
+    if serial and serial != reported.serial_number:
+        raise HandError(
+            f"this is hand {reported.serial_number}, the calibration is of hand {serial}: calibrate this hand"
+        )
     side = calibration.handedness if calibration else ""
-    if side and found.handedness and side != found.handedness:
-        raise HandError(f"this hand is {found.handedness}, the calibration is of a {side} one: calibrate this hand")
+    if side and reported.handedness and side != reported.handedness:
+        raise HandError(f"this hand is {reported.handedness}, the calibration is of a {side} one: calibrate this hand")
     notes = []
-    if not found.serial_number:
+    if not reported.serial_number:
         notes.append("the hand does not tell its serial number: another hand on this port would not be noticed")
     elif calibration and not serial:
         notes.append("the calibration names no serial number: it may be of another hand")
-    if found.handedness.startswith(_CODE):
-        notes.append(f"the hand gives its side as {found.handedness}, whose meaning is not known")
+    if reported.handedness.startswith(_CODE):
+        notes.append(f"the hand gives its side as {reported.handedness}, whose meaning is not known")
     return [f"warning: {note}" for note in notes]
 
 

@@ -111,8 +111,10 @@ def checked(reply: Reply, now: float) -> Reply:
     if not math.isfinite(sent):
         raise HandError(f"the driver's reply has sent {sent!r}; expected a number")
     if not isinstance(state, np.ndarray) or state.dtype != frames.STATE_BLOCK or state.shape != ():
-        found = f"{state.dtype.name} {list(state.shape)}" if isinstance(state, np.ndarray) else type(state).__name__
-        raise HandError(f"the driver's reply has a state of {found}; expected one `frames.STATE_BLOCK`")
+        kind_of_state = (
+            f"{state.dtype.name} {list(state.shape)}" if isinstance(state, np.ndarray) else type(state).__name__
+        )
+        raise HandError(f"the driver's reply has a state of {kind_of_state}; expected one `frames.STATE_BLOCK`")
     if not np.array_equal(state["joint"]["id"], np.arange(frames.JOINTS)):
         raise HandError(f"the driver's reply has joint ids {state['joint']['id'].tolist()}; expected 0 to 11")
     if not math.isfinite(received) or received > now + _AHEAD:
@@ -129,10 +131,10 @@ def refusal_of(port: "HandPort") -> Refusal | None:
     Raises:
       HandError: the driver tells it in another form.
     """
-    found = getattr(port, "refusal", None)
-    if found is not None and not isinstance(found, Refusal):
-        raise HandError(f"the driver's `refusal` is {found!r:.80}; expected a `Refusal`, or None")
-    return found
+    refusal = getattr(port, "refusal", None)
+    if refusal is not None and not isinstance(refusal, Refusal):
+        raise HandError(f"the driver's `refusal` is {refusal!r:.80}; expected a `Refusal`, or None")
+    return refusal
 
 
 def greet(port: "HandPort") -> list[str]:

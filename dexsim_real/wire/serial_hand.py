@@ -172,20 +172,20 @@ class SerialHand:
 
     def _discard(self) -> None:
         """Discard late answers to their last byte, so that none is mistaken for the next answer."""
-        found, until = [], time.monotonic() + self.config.on_wire(_LONGEST) + _QUIET
+        late, until = [], time.monotonic() + self.config.on_wire(_LONGEST) + _QUIET
         while (self._serial.in_waiting or self._parser.pending) and time.monotonic() < until:
-            found += self._parser.feed(self._read())
-        found += self._parser.expire()
-        self.counts.late += len(self._answers(found))
+            late += self._parser.feed(self._read())
+        late += self._parser.expire()
+        self.counts.late += len(self._answers(late))
 
-    def _answers(self, found: list[Frame]) -> list[Frame]:
+    def _answers(self, answers: list[Frame]) -> list[Frame]:
         """The frames that are from no other hand, whose state must never be taken for this one's.
 
         Other addresses pass: no capture of a real hand's replies is published.
         """
         own = frames.palm_address(self.config.hand_id)
-        mine = [frame for frame in found if frame.source == own or frame.source not in frames.PALMS]
-        self._others += len(found) - len(mine)
+        mine = [frame for frame in answers if frame.source == own or frame.source not in frames.PALMS]
+        self._others += len(answers) - len(mine)
         return mine
 
     # --- opening and reopening --------------------------------------------------------------
@@ -249,12 +249,14 @@ class SerialHand:
         """
         if self.identity == Identity():
             return
-        found = self._identify()
-        if found == self.identity:
+        identity = self._identify()
+        if identity == self.identity:
             return
-        text = f"another hand is on {self.port}: {found.describe()}, not {self.identity.describe()}"
-        told = all(new or not old for new, old in zip(vars(found).values(), vars(self.identity).values(), strict=True))
-        self.refusal = Refusal(text, serious=True) if told else None
+        text = f"another hand is on {self.port}: {identity.describe()}, not {self.identity.describe()}"
+        complete = all(
+            new or not old for new, old in zip(vars(identity).values(), vars(self.identity).values(), strict=True)
+        )
+        self.refusal = Refusal(text, serious=True) if complete else None
         raise HandError(text)
 
     def _silence(self) -> str:

@@ -27,7 +27,7 @@ class TipContacts(NamedTuple):
 
 def tip_contacts(scene: Scene, data: mujoco.MjData) -> TipContacts:
     """Contacts of the object with the fingertips in the state `data`."""
-    found = TipContacts(np.zeros((5, 3)), np.zeros(5), [])
+    contacts = TipContacts(np.zeros((5, 3)), np.zeros(5), [])
     inward, wrench = np.zeros((5, 3)), np.zeros(6)
     for i in range(data.ncon):
         first, second = data.contact.geom[i]
@@ -39,10 +39,10 @@ def tip_contacts(scene: Scene, data: mujoco.MjData) -> TipContacts:
         frame = data.contact.frame[i].reshape(3, 3)
         sign = 1.0 if scene.is_object[first] else -1.0
         normal, tangent = sign * wrench[0] * frame[0], sign * wrench[1:3] @ frame[1:]
-        found.force[finger] += normal + tangent
+        contacts.force[finger] += normal + tangent
         inward[finger] += normal
-        found.touches.append(TipContact(int(finger), data.contact.pos[i].copy(), normal, tangent))
+        contacts.touches.append(TipContact(int(finger), data.contact.pos[i].copy(), normal, tangent))
     # As in simulation (`dexsim.touch.feel.keep_normal_part`), where one direction stands for the whole fingertip.
     length = np.maximum(np.linalg.norm(inward, axis=-1), 1e-12)
-    found.normal[:] = np.maximum((found.force * inward).sum(-1) / length, 0.0)
-    return found
+    contacts.normal[:] = np.maximum((contacts.force * inward).sum(-1) / length, 0.0)
+    return contacts

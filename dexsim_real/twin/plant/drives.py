@@ -130,8 +130,8 @@ class Drives:
             self._integral[:], self._last = 0.0, None
             return np.zeros_like(speed)
         position, kp, ki, kd, _, _ = self._board
-        shown = rotor + self.bias
-        error = position - shown
+        encoder = rotor + self.bias
+        error = position - encoder
         torque = self.stiffness * kp * error - self.emf * speed
         if ki.any():
             self._integral = np.clip(
@@ -139,8 +139,8 @@ class Drives:
             )
             torque += self._integral
         if kd.any():  # This damping acts on the firmware's speed estimate, the back-EMF on the true speed.
-            rate = speed if self._last is None else (shown - self._last) / PERIOD
-            self._last = shown
+            rate = speed if self._last is None else (encoder - self._last) / PERIOD
+            self._last = encoder
             self._speed += PERIOD / (PERIOD + _SPEED_TIME) * (rate - self._speed)
             torque -= DAMPING * kd * self._speed
         # Current that the supply can drive against the back-EMF: less in the direction of motion, more against it.

@@ -103,11 +103,11 @@ class EmulatedHand:
         late = max(float(self.parameters.sensing_latency) - EXCHANGE_SENSE, 0.0)
         past, rng = self._before(late), self._noise
         position, quat, acceleration = self.measure_object()
-        shown = past.qpos[self._scene.drive_qpos] + self._drives.bias
+        encoder = past.qpos[self._scene.drive_qpos] + self._drives.bias
         return PlantMeasurement(
             time=self.time,
             joint_velocity=past.qvel[self._scene.drive_dof],
-            joint_position=shown + self.parameters.encoder_noise * rng.standard_normal(shown.shape),
+            joint_position=encoder + self.parameters.encoder_noise * rng.standard_normal(encoder.shape),
             current=self._reported_current(past),
             temperature=self._drives.case.copy(),
             taxel_force=self._skin.report(self._delayed_taxel_force(late), rng, self.time - self._began),
@@ -127,14 +127,14 @@ class EmulatedHand:
         position = position + parameters.camera_noise * rng.standard_normal(3)
         past = self._before(max(float(getattr(parameters, "imu_delay", 0.0)) - IMU_TRANSPORT, 0.0))
         quat = past.qpos[at + 3 : at + 7].copy()
-        felt = matrix(quat).T @ (past.acceleration - self._gravity)
+        specific_force = matrix(quat).T @ (past.acceleration - self._gravity)
         if self.task != "rotate":
-            return position, quat, felt
+            return position, quat, specific_force
         heading = turn(self.up, float(parameters.imu_drift) * (self.time - self._began))
         error = parameters.imu_bias + parameters.imu_noise * rng.standard_normal(3)
         angle = float(np.linalg.norm(error))
         skew = turn(error / max(angle, 1e-12), angle)
-        return position, product(product(heading, quat), skew), felt
+        return position, product(product(heading, quat), skew), specific_force
 
     def true_pose(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """True joint angles [12] rad; position [3] m and orientation [4] of the object."""

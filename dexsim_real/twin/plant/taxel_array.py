@@ -76,9 +76,9 @@ class EmulatedTaxels:
     def report(self, force: np.ndarray, rng: np.random.Generator, seconds: float) -> np.ndarray:
         """Add the imperfections to forces [F, N, 3] N, this long after the hand was switched on."""
         mixed = force + self._crosstalk / 4 * _spill(force, self._grid)
-        shown = mixed * self._gain[..., None] + self._noise * rng.standard_normal(force.shape)
-        shown[..., 2] += self._bias + (1 - np.exp(-seconds / _WARMING)) * self._drift
-        return np.where(np.abs(shown) < self._threshold, 0.0, shown)
+        reading = mixed * self._gain[..., None] + self._noise * rng.standard_normal(force.shape)
+        reading[..., 2] += self._bias + (1 - np.exp(-seconds / _WARMING)) * self._drift
+        return np.where(np.abs(reading) < self._threshold, 0.0, reading)
 
     def _gap(self, away: np.ndarray, outward: np.ndarray) -> float:
         """Distance m along the skin from a contact to the nearest taxel, given the vectors [N, 3] from all taxels.

@@ -59,15 +59,15 @@ class CommandCheck:
           angles: [12] rad, true angles at the last state that was sent.
           since: s, earliest possible time of arrival; None is `now`.
         """
-        found = self._find(now, now if since is None else since, command, angles)
+        violations = self._find(now, now if since is None else since, command, angles)
         self.checked += 1
-        self.wrong.update(found)
-        if found and len(self.first) < self.MAX_LISTED:
+        self.wrong.update(violations)
+        if violations and len(self.first) < self.MAX_LISTED:
             self.first.append(
-                f"{now:.4f} {', '.join(found)}: {np.round(command['position'], 4).tolist()}, "
+                f"{now:.4f} {', '.join(violations)}: {np.round(command['position'], 4).tolist()}, "
                 f"joints at {np.round(angles, 4).tolist()}"
             )
-        return found
+        return violations
 
     def _find(self, now: float, since: float, command: np.ndarray, angles: np.ndarray) -> list[str]:
         config, position = self.config, command["position"].astype(float)
@@ -78,25 +78,25 @@ class CommandCheck:
         if not np.isfinite(position).all():
             return ["not finite"]
         self._last = since, np.where(on, position, np.nan), on
-        found = []
+        violations = []
         outside = (position < self._lower - self._ROUNDING) | (position > self._upper + self._ROUNDING)
         if np.any(outside & on):
-            found.append("range")
+            violations.append("range")
         if np.any(on & ((command["torque_max"] < 0) | (command["torque_max"] > config.torque_max))):
-            found.append("current limit")
+            violations.append("current limit")
         if np.any(on & (np.abs(position - angles) > config.reach)):
-            found.append("reach")
+            violations.append("reach")
         # A hand that was off starts from the true angle; one that is on continues from the last command.
         fresh = on if before is None else on & ~before[2]
         if np.any(fresh & (np.abs(position - angles) > config.start)):
-            found.append("start")
+            violations.append("start")
         if before is not None:
             step = np.where(on & before[2], np.abs(position - before[1]), 0.0)
             speed = float(np.nanmax(step)) / (now - before[0] + config.slack)
             self.fastest = max(self.fastest, speed)
             if speed > config.speed:
-                found.append("speed")
-        return found
+                violations.append("speed")
+        return violations
 
     def report(self) -> dict[str, object]:
         """Results; JSON-able."""

@@ -107,11 +107,11 @@ class EmulatedImu(Clocked):
         self.terminal.close()
 
     def _sample(self, now: float) -> None:
-        _, quat, felt = self._plant.measure_object()
+        _, quat, specific_force = self._plant.measure_object()
         # The vertical of its world frame follows the true gravity, which the runner knows only approximately.
         world = self._north @ _level(np.asarray(self._plant.up))
         self.terminal.read()  # It ignores what it receives.
-        self.terminal.write(rvc_frame(self.sent, world @ _matrix(quat) @ self._mount, self._mount.T @ felt))
+        self.terminal.write(rvc_frame(self.sent, world @ _matrix(quat) @ self._mount, self._mount.T @ specific_force))
         self.sent += 1
 
 

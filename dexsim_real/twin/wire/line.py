@@ -198,9 +198,9 @@ class HandLine:
         except frames.FrameError:
             return
         known = len(self.check.first)
-        found = self.check.take(request.read, command, self.firmware.angles, request.since)
-        if found and known < CommandCheck.MAX_LISTED:
-            self._note(f"command outside limits ({', '.join(found)})")
+        violations = self.check.take(request.read, command, self.firmware.angles, request.since)
+        if violations and known < CommandCheck.MAX_LISTED:
+            self._note(f"command outside limits ({', '.join(violations)})")
 
     def _reply(self, now: float, request: _Request, answer: bytes, fault: Fault | None) -> None:
         # From when it was due: a late machine catches up during the transfer.

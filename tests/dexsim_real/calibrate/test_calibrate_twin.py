@@ -32,7 +32,9 @@ def torque_of(plant, joint):
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_emulated_hand_gives_its_torque_constants_back(hand, tmp_path, seed):
     """Gears with play, ripple, heat, taxels with faults, parameters outside the ranges of training; a gauge."""
-    from dexsim_real.twin.press import PressBench, VirtualPort
+    from virtual_port import VirtualPort
+
+    from dexsim_real.twin.press import PressBench
 
     plant = PressBench(hand, seed)
     pressed = []

@@ -11,7 +11,7 @@ from test_safety import AGREEING, CYCLE, FREE, MIDDLE, Bench, sample
 
 from dexsim_real.control.limits import SafetyConfig
 from dexsim_real.control.pose_check import PoseCheck
-from dexsim_real.control.safety import Reaction, Safety, Wish
+from dexsim_real.control.safety import Reaction, Safety, TargetRequest
 from dexsim_real.core.errors import HandError
 from dexsim_real.loop import LoopThread
 from dexsim_real.sensors.hand import HandSensing, HardwareConfig
@@ -189,7 +189,7 @@ class Alternating:
 
 
 def test_the_wish_is_read_once_a_cycle(bench):
-    good, bad = (Wish(bench.now, pose, "", bench.now) for pose in (MIDDLE, np.full(12, np.nan, np.float32)))
+    good, bad = (TargetRequest(bench.now, pose, "", bench.now) for pose in (MIDDLE, np.full(12, np.nan, np.float32)))
 
     class Torn(Safety):
         _target = Alternating([good, bad])

@@ -140,7 +140,7 @@ def _check_physics(path: Path, spec: mujoco.MjSpec, model: mujoco.MjModel) -> No
             raise HandError(f'{path}: <flag {name}="disable"/>: a trial needs {name}')
 
 
-def _joints(path: Path, model: mujoco.MjModel, hand: Hand, wanted: list[str] | None) -> tuple[list[int], list[int]]:
+def _joints(path: Path, model: mujoco.MjModel, hand: Hand, given: list[str] | None) -> tuple[list[int], list[int]]:
     """Actuators and joints of the MJCF, in the order of the hand."""
     driven: dict[int, int] = {}  # actuator by joint
     for k in range(model.nu):
@@ -166,7 +166,7 @@ def _joints(path: Path, model: mujoco.MjModel, hand: Hand, wanted: list[str] | N
     if len(driven) != hand.num_joints:
         raise HandError(f"{path}: {len(driven)} actuated joints, the hand has {hand.num_joints}")
     known = {model.joint(j).name: j for j in driven}
-    names = wanted or (list(hand.joint_names) if set(hand.joint_names) == set(known) else list(known))
+    names = given or (list(hand.joint_names) if set(hand.joint_names) == set(known) else list(known))
     missing = [name for name in names if name not in known]
     if missing or len(set(names)) != hand.num_joints:
         what = f"{missing[0]!r} is not one of them" if missing else f"{len(set(names))} of {hand.num_joints} are named"
@@ -174,10 +174,10 @@ def _joints(path: Path, model: mujoco.MjModel, hand: Hand, wanted: list[str] | N
     joints = [known[name] for name in names]
     for j, (joint, name) in enumerate(zip(joints, names, strict=True)):
         ends = hand.joint_lower[j], hand.joint_upper[j]
-        found = model.jnt_range[joint] if model.jnt_limited[joint] else (-np.inf, np.inf)
-        if np.abs(np.subtract(found, ends)).max() > _RANGE:
+        limits = model.jnt_range[joint] if model.jnt_limited[joint] else (-np.inf, np.inf)
+        if np.abs(np.subtract(limits, ends)).max() > _RANGE:
             raise HandError(
-                f"{path}: joint {name} has a range of {found[0]:.3f} to {found[1]:.3f} rad, {hand.joint_names[j]} of "
+                f"{path}: joint {name} has a range of {limits[0]:.3f} to {limits[1]:.3f} rad, {hand.joint_names[j]} of "
                 f"the hand {ends[0]:.3f} to {ends[1]:.3f}"
             )
     return [driven[j] for j in joints], joints
@@ -190,19 +190,19 @@ def _is_servo(model: mujoco.MjModel, actuator: int) -> bool:
 
 
 def _palm(
-    path: Path, model: mujoco.MjModel, data: mujoco.MjData, joints: list[int], wanted: str | None
+    path: Path, model: mujoco.MjModel, data: mujoco.MjData, joints: list[int], given: str | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Position [3] and rotation [3, 3] of the palm frame in the world."""
-    if wanted and any(model.site(i).name == wanted for i in range(model.nsite)):
-        site = model.site(wanted).id
+    if given and any(model.site(i).name == given for i in range(model.nsite)):
+        site = model.site(given).id
         body, place, turn = int(model.site_bodyid[site]), data.site_xpos[site], data.site_xmat[site]
     else:
         carrying = set.intersection(*(set(_above(model, int(model.jnt_bodyid[j]))) for j in joints))
         body = max(carrying)  # The deepest: a body comes after its parent.
-        if wanted:
-            body = next((b for b in range(model.nbody) if model.body(b).name == wanted), -1)
+        if given:
+            body = next((b for b in range(model.nbody) if model.body(b).name == given), -1)
         if body < 0:
-            raise HandError(f"{path}: palm: there is neither a body nor a site {wanted!r}")
+            raise HandError(f"{path}: palm: there is neither a body nor a site {given!r}")
         place, turn = data.xpos[body], data.xmat[body]
     if model.body_weldid[body] != 0:
         raise HandError(f"{path}: the palm ({model.body(body).name}) moves: fix it to the world")
@@ -211,16 +211,14 @@ def _palm(
 
 def _above(model: mujoco.MjModel, body: int) -> list[int]:
     """Bodies that carry a body, up to the world."""
-    found = []
+    matches = []
     while body:
         body = int(model.body_parentid[body])
-        found.append(body)
-    return found
+        matches.append(body)
+    return matches
 
 
-def _tip(
-    path: Path, model: mujoco.MjModel, hand: Hand, joints: list[int], finger: int, wanted: list[str] | None
-) -> int:
+def _tip(path: Path, model: mujoco.MjModel, hand: Hand, joints: list[int], finger: int, given: list[str] | None) -> int:
     """The site at the tip of a finger."""
     name, body = hand.finger_names[finger], int(hand.tip_body[finger])
     while hand.body_joint[body] < 0:
@@ -229,20 +227,20 @@ def _tip(
     moved = model.body_weldid[model.jnt_bodyid[joint]]
     sites = [s for s in range(model.nsite) if model.body_weldid[model.site_bodyid[s]] == moved]
     label = model.joint(joint).name
-    if wanted:
-        found = [s for s in sites if len(wanted) == hand.num_fingers and model.site(s).name == wanted[finger]]
-        if not found:
+    if given:
+        matches = [s for s in sites if len(given) == hand.num_fingers and model.site(s).name == given[finger]]
+        if not matches:
             raise HandError(
                 f"{path}: tips: give {hand.num_fingers} sites; that of {name} on the body that {label} moves"
             )
-        return found[0]
-    found = sites if len(sites) == 1 else [s for s in sites if "tip" in model.site(s).name.lower()]
-    if len(found) != 1:
+        return matches[0]
+    matches = sites if len(sites) == 1 else [s for s in sites if "tip" in model.site(s).name.lower()]
+    if len(matches) != 1:
         raise HandError(
-            f"{path}: {len(found) or 'no'} fingertip sites of {name}: put one site with 'tip' in its name on the body "
-            f"that {label} moves, at the tip"
+            f"{path}: {len(matches) or 'no'} fingertip sites of {name}: put one site with 'tip' in its name on the "
+            f"body that {label} moves, at the tip"
         )
-    return found[0]
+    return matches[0]
 
 
 def _check_places(
@@ -261,8 +259,8 @@ def _check_places(
         posture[j] = hand.joint_upper[j] if j >= 0 else 0.0
         data.qpos[at] = posture
         mujoco.mj_kinematics(model, data)
-        found = (data.site_xpos[tips] - palm[0]) @ palm[1]
-        apart = np.linalg.norm(found - _hand_tips(reference, hand, posture)[0], axis=-1)
+        matches = (data.site_xpos[tips] - palm[0]) @ palm[1]
+        apart = np.linalg.norm(matches - _hand_tips(reference, hand, posture)[0], axis=-1)
         worst = int(apart.argmax())
         if apart[worst] > _APART:
             where = "all joints at 0" if j < 0 else f"{model.joint(joints[j]).name} at {posture[j]:.2f} rad"

@@ -30,9 +30,9 @@ class ContactTaxels(EmulatedTaxels):
             frame = tips[1][finger]
             square = ((self._place[finger] - (point - tips[0][finger]) @ frame) ** 2).sum(-1)
             nearest = float(np.sqrt(square.min()))
-            felt = np.clip((_NOT_AT_ALL - nearest) / (_NOT_AT_ALL - _FULLY), 0.0, 1.0)
+            weight = np.clip((_NOT_AT_ALL - nearest) / (_NOT_AT_ALL - _FULLY), 0.0, 1.0)
             share = np.exp(-(square - nearest**2) / (2 * _SPREAD**2))
-            share *= felt / share.sum()
+            share *= weight / share.sum()
             force[finger, :, :2] += share[:, None] * (self._axes[finger][:, :2] @ (frame.T @ tangent))
             force[finger, :, 2] += share * float(np.linalg.norm(normal))
         return force
