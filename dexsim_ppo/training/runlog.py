@@ -243,7 +243,8 @@ def draw_curve(runs: Sequence[list[dict[str, Any]]], path: Path, title: str) -> 
 
     rows = [row for run in runs for row in run]
     errors = sorted({name for row in rows for name in row if name.startswith("step/") and name.endswith("error")})[:1]
-    words = {name: name.removeprefix("step/").replace("_", " ") + "\nof a tick" for name in errors} | CURVES
+    own = [name for name in errors if name not in CURVES]
+    words = CURVES | {name: name.removeprefix("step/").replace("_", " ") + "\nof a tick" for name in own}
     names = [name for name in words if any(row.get(name) is not None for row in rows)]
     if not names:
         return

@@ -74,6 +74,6 @@ def test_no_averaged_policy_is_overwritten(tmp_path):
     (tmp_path / "link.msgpack").symlink_to(files[1])
     before = files[1].read_bytes()
     for output in (files[1], tmp_path / "link.msgpack"):
-        with pytest.raises(ConfigError, match=f"^--output {output}: is one of the averaged policies"):
+        with pytest.raises(ConfigError, match=f"^--output {output}: is the policy"):
             main([*map(str, files), "--output", str(output)])
     assert files[1].read_bytes() == before

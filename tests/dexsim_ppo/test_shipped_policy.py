@@ -228,6 +228,6 @@ def test_a_folder_named_as_a_shipped_policy_does_not_hide_it(tmp_path, monkeypat
     for name in ("grasp", "mine"):
         (tmp_path / name).mkdir()
     assert load_policy("grasp").task == "grasp"
-    for name in ("mine", "./grasp"):
-        with pytest.raises(CheckpointError, match="cannot be read"):
+    for name, words in (("mine", "no such file"), ("./grasp", "cannot be read")):
+        with pytest.raises(CheckpointError, match=words):
             load_policy(name)
