@@ -5,7 +5,7 @@
 #   make docs                         the documentation site, in site/
 #   make test ARGS="-k touch"         options of pytest (which runs on two processes)
 #   make PYTHON=python3.12 test       another interpreter (for a new .venv)
-#   make EXTRAS=cuda,warp train       other extras than the ones chosen by the device found
+#   make EXTRAS=cuda train       other extras than the ones chosen by the device found
 
 PYTHON ?= python3
 VENV ?= .venv
@@ -13,8 +13,8 @@ ARGS ?=
 PY := $(VENV)/bin/python
 PIP := $(PY) -m pip --disable-pip-version-check
 
-# With an NVIDIA driver present, training goes to the GPU through Warp.
-EXTRAS ?= video,tb$(if $(shell nvidia-smi -L 2>/dev/null),$(comma)cuda$(comma)warp)
+# With an NVIDIA driver present, training goes to the GPU.
+EXTRAS ?= video,tb$(if $(shell nvidia-smi -L 2>/dev/null),$(comma)cuda)
 comma := ,
 
 # One stamp for each set of requirements: a step runs again only when pyproject.toml has changed.
