@@ -69,7 +69,7 @@ class ExchangeLoop:
         self.driven = self._closed = False  # whether the motors may be on; whether the port is closed
         self._took = 0.0  # s, duration of the last exchange on the wire
         self.retared: Callable[[int, list[str]], None] = lambda sequence, lines: None
-        self._track_taxels = track_taxels
+        self.track_taxels = track_taxels
         self._filter = VelocityFilter(sensing.config.velocity_time)
         self._generation: int | None = None
         self._engage = False
@@ -117,6 +117,7 @@ class ExchangeLoop:
           HandError: the hand does not answer or refuses, or a fingertip touches something.
         """
         states, until = list[np.ndarray](), self.clock() + _TARE
+        tracked, self.track_taxels = self.track_taxels, False  # Zeros of before would count as touches.
         while len(states) < TARE_SAMPLES and self.clock() < until:
             exchange = self.cycle()
             if exchange is not None:
@@ -125,6 +126,7 @@ class ExchangeLoop:
                 raise HandError(refusal.text)
         if len(states) < TARE_SAMPLES:
             raise HandError(f"only {len(states)} answers in {_TARE:g} s, cannot tare the taxels; check the cable")
+        self.track_taxels = tracked
         return self.sensing.set_tare(states)
 
     def close(self) -> None:
@@ -146,7 +148,7 @@ class ExchangeLoop:
                 self.port.close()
 
     def _sample(self, reply: Reply) -> HandSample:
-        if self._track_taxels:
+        if self.track_taxels:
             lines = self.sensing.mask_stuck(reply.state, self.safety.config.finger_force)
             if self.sensing.track_zero(reply.received, reply.state) or lines:
                 self.retared(reply.sequence, lines)

@@ -24,7 +24,6 @@ from dexsim.identification.report import Identification
 from dexsim_real.calibrate.bench import Workbench
 from dexsim_real.calibrate.hand_loop import Operator
 from dexsim_real.calibrate.options import CalibrateArguments
-from dexsim_real.calibrate.read import logged_rate
 from dexsim_real.calibrate.taxel_check import check_answered
 from dexsim_real.core.errors import HandError
 from dexsim_real.core.log import Kind, LogError, LogReader, reading
@@ -220,9 +219,9 @@ def _read(path: Path, hand: Hand) -> tuple[_Source, dict[str, dict[str, list[_Ro
         if record.kind == Kind.META and "task" in content:
             task = content["task"]
             if task == TASK:
-                rate, hardware = logged_rate(path, content), from_dict(HardwareConfig, content["hardware"])
-                identity = Identity(content.get("serial", ""), content.get("handedness", ""))
-                source = _Source(path, hardware, rate, identity)
+                hardware = from_dict(HardwareConfig, content["hardware"])
+                identity = Identity(content["serial"], content["handedness"])
+                source = _Source(path, hardware, float(content["rate"]), identity)
         elif record.kind == Kind.SENT:
             sent, sent_at = content, record.time
         elif record.kind == Kind.RECEIVED:
@@ -230,7 +229,7 @@ def _read(path: Path, hand: Hand) -> tuple[_Source, dict[str, dict[str, list[_Ro
         elif record.kind == Kind.TICK and task == TASK and sent[0] == content["sequence"]:
             if content["joint"] not in hand.joint_names:
                 raise LogError(f"{path}: no joint {content['joint']!r:.40}; choose from {', '.join(hand.joint_names)}")
-            measured = received[0] == sent[0] and content.get("measured", True)  # Older logs do not say.
+            measured = received[0] == sent[0] and content["measured"]
             answer = received[1] if measured else None
             rows = parts.setdefault(content["joint"], {}).setdefault(content["signal"], [])
             rows.append(_Row(sent_at, sent[1], answer))

@@ -266,10 +266,12 @@ class VirtualRun:
 
     def _tare(self) -> None:
         states: list[np.ndarray] = []
+        self._loop.track_taxels = False
         while len(states) < TARE_SAMPLES:
             self._newest = None
             self._until(self._now + 1 / RATE)
             states += [self._newest.state] if self._newest is not None else []
+        self._loop.track_taxels = True
         self._loop.sensing.set_tare(states)
 
     def _until(self, time: float) -> None:

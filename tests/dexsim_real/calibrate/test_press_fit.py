@@ -162,36 +162,6 @@ def test_an_interrupted_press_leaves_the_one_of_the_log_before(hand, session, tm
     assert any(note.startswith("index pad: was interrupted") for note in fit(cut, hand).calibration.notes)
 
 
-@pytest.mark.parametrize(
-    ("part", "value", "says"),
-    [
-        ("joints", [99], "index pad: joint 99; the hand has 0 to 11"),
-        ("joints", [-8], "index pad: joint -8; the hand has 0 to 11"),
-        ("finger", -4, "index pad: finger -4; the hand has 0 to 4"),
-        ("finger", 1.0, "index pad: finger 1.0; the hand has 0 to 4"),
-        ("name", 5, "a press is named 5"),
-        ("rate", "83", "a rate of '83' exchanges per second; expected 20 to 1000"),
-        ("rate", 0, "a rate of 0 exchanges"),
-        ("rate", float("nan"), "a rate of nan exchanges"),
-        ("serial", 5, "the hand calls itself 5; expected a text"),
-        ("serial", "2R32\x1b", r"the hand calls itself '2R32.x1b'"),
-        ("gauge", "heavy", "middle pad: the gauge reads 'heavy' N"),
-        ("gauge", float("nan"), "middle pad: the gauge reads nan N"),
-    ],
-)
-def test_a_forged_log_is_refused_in_one_line(hand, session, scale, tmp_path, part, value, says):
-    with LogWriter(tmp_path / "forged.log") as log:
-        for entry in LogReader(scale[1].log if part == "gauge" else session[2]):
-            content = entry.content
-            if entry.kind in (Kind.META, Kind.TICK) and part in content:
-                content = {**content, part: value}
-            elif entry.kind == Kind.META and "placement" in content:
-                content = {"placement": {**content["placement"], part: value}}
-            log.add(entry.kind, content, entry.time)
-    with pytest.raises(LogError, match=f"forged.log: {says}"):
-        read_logs([log.path], hand)
-
-
 def test_a_press_that_no_taxel_feels_is_left_out(hand, session, scale):
     """Six taxels of one count each are contact enough for the procedure; the current ends the press."""
     faint = np.zeros(hand.num_taxels)

@@ -174,11 +174,7 @@ def forged(folder):
         (
             (Kind.TICK, "readings", 1.0),
             (Kind.TICK, "sequence", [1]),
-            (Kind.TICK, "target", np.zeros(3)),  # figures and datasets are made of these two
-            (Kind.TICK, "age", "young"),
             (Kind.META, "calibration", {"a": 1}),
-            (Kind.META, "tare", np.full((5, 120), np.nan)),
-            (Kind.META, "environment", b"of no JSON"),
         )
     ):
         path = folder / f"forged_{number}.log"
