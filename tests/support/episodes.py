@@ -35,6 +35,8 @@ def tip_stiffness(physics, skin, object, qpos):
     hand, place = physics.hand, qpos[physics.object_qpos]
     pose = forward_kinematics(hand, qpos[physics.joint_qpos])
     turn = rotations.quat_to_matrix(place[3:] / jnp.linalg.norm(place[3:]))
-    unit, surface = jnp.ones(hand.num_fingers), skin_surface(hand, skin)
+    with jax.ensure_compile_time_eval():  # points of the skin, also where the caller is traced
+        surface = skin_surface(hand, skin)
+    unit = jnp.ones(hand.num_fingers)
     pressed = feel_links(hand, pose, object.shape(), place[:3], turn, unit, skin, surface).skin_force.sum(-1)
     return physics.tip_stiffness(object, pose, place[:3], turn, pressed)

@@ -19,6 +19,7 @@ from dexsim.env.env import Env
 from dexsim.env.observer import Observer
 from dexsim.env.state import Start
 from dexsim.geometry import rotations
+from dexsim.hand.kinematics import forward_kinematics
 from dexsim.observation import layout
 from dexsim.physics.interface import PhysicsState, StepResult
 from dexsim.randomization import Randomization
@@ -120,6 +121,7 @@ def test_one_frame_gives_the_same_observation_through_both_doors_bit_for_bit(han
         moment = SimpleNamespace(
             **dict.fromkeys(("joint_torque", "joint_velocity", "action"), jnp.zeros(12)),
             joint_position=readings.joint_position,
+            pose=forward_kinematics(hand, readings.joint_position),
             touch=SimpleNamespace(force=readings.taxel_force),
             object_position=readings.object_position,
             object_velocity=readings.object_velocity,
