@@ -290,7 +290,7 @@ def policy_row(name: str, backend: str, converged: bool, episodes: int, seconds:
     if converged:
         changes += [f"physics.{field}={value}" for field, value in CONVERGED.items()]
     policy = dataclasses.replace(policy, env_config=override(policy.env_config, changes))
-    env = policy.build_env(backend=backend, num_envs=episodes)
+    env = policy.make_env(backend=backend, num_envs=episodes)
     task = evaluate_policy(policy, env=env, episodes=episodes, chunk=episodes, baseline=False)["task"]
     row = {"policy": name, "backend": backend, "converged": converged, "episodes": episodes, "seconds": task["seconds"]}
     for key in MEASURES:

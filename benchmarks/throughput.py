@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-from dexsim_ppo.learner.devices.sharding import make_mesh
 
 import dexsim
 from dexsim.core import cli
@@ -31,6 +30,7 @@ from dexsim.registry import TASKS
 from dexsim_ppo.learner.config import PPOConfig
 from dexsim_ppo.learner.ppo import make_train
 from dexsim_ppo.learner.rollout import scan_restarting
+from dexsim_ppo.learner.sharding import make_mesh
 from dexsim_ppo.training.presets import device_preset, find_preset
 
 SETTLING = 8  # iterations of training before the first measured one: objects settle, hands close

@@ -117,7 +117,7 @@ class ExchangeLoop:
           HandError: the hand does not answer or refuses, or a fingertip touches something.
         """
         states, until = list[np.ndarray](), self.clock() + _TARE
-        tracked, self.track_taxels = self.track_taxels, False  # Zeros of before would count as touches.
+        tracked, self.track_taxels = self.track_taxels, False  # Untared, a zero is a touch.
         while len(states) < TARE_SAMPLES and self.clock() < until:
             exchange = self.cycle()
             if exchange is not None:

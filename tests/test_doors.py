@@ -18,7 +18,7 @@ NAMES = {
     """,
     "dexsim_real": """
         Controller HandError HandMeasurement HandPort HandSensing HardwareConfig LinkConfig LogReader LogWriter
-        ObjectEstimate Safety SafetyConfig SerialHand make_readings open_port
+        ObjectEstimate RunResult Safety SafetyConfig SerialHand make_readings open_port run_policy
     """,
 }
 

@@ -119,11 +119,11 @@ def test_bridge_and_simulation_show_the_policy_the_same_command_and_send_the_sam
         task, spec, control_rate = env.name, env.spec, 1 / env.control_period
         observation_layout = env.observation_layout["actor"]
 
-        def begin(self):
+        def initial_carry(self):
             return None
 
-        def act(self, memory, observation):
-            return memory, np.full(12, 0.2, np.float32)
+        def act(self, carry, observation):
+            return carry, np.full(12, 0.2, np.float32)
 
     state = jit(jax.vmap(env.reset), once=True)(jax.random.split(jax.random.key(3), 8))
     step, controllers = jit(jax.vmap(env.step), once=True), [Controller(Close(), hand) for _ in range(8)]

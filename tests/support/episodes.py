@@ -26,8 +26,12 @@ def ground_truth(env, object, physics, force):
 
 
 def reset_to(env):
-    """`reset_to(key, index)`: a new episode from a row of the pool."""
-    return lambda key, index: env.reset_from(key, jax.tree.map(lambda rows: jnp.asarray(rows)[index], env.pool))
+    """`reset_to(key, index, goal=None)`: a new episode from a row of the pool."""
+
+    def reset(key, index, goal=None):
+        return env.reset_from(key, jax.tree.map(lambda rows: jnp.asarray(rows)[index], env.pool), goal)
+
+    return reset
 
 
 def tip_stiffness(physics, skin, object, qpos):

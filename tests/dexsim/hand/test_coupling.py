@@ -148,12 +148,12 @@ def driven(hand, backend):
     qpos = jnp.concatenate([start, jnp.array([0.5, 0, 0, 1, 0, 0, 0.0])])
     state = PhysicsState(qpos, jnp.zeros(10), jnp.zeros(10))
 
-    def law(index, position, velocity, memory):
-        return 1.0 * (goal - position) - 0.05 * velocity, memory
+    def law(index, position, velocity):
+        return 1.0 * (goal - position) - 0.05 * velocity
 
     @jax.jit
     def tick(state):
-        return engine.advance(object, contacts, state, law, None, jnp.zeros(3))[0]
+        return engine.advance(object, contacts, state, law, jnp.zeros(3)).state
 
     worst = 0.0
     for _ in range(17):

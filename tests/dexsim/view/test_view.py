@@ -162,12 +162,12 @@ def test_a_memory_lasts_as_long_as_the_episode_and_the_choice_of_its_policy(simu
     had = []
 
     class Counts:
-        def begin(self):
+        def initial_carry(self):
             return 0
 
-        def act(self, memory, obs):
-            had.append(memory)
-            return memory + 1, np.zeros(12, np.float32)
+        def act(self, carry, obs):
+            had.append(carry)
+            return carry + 1, np.zeros(12, np.float32)
 
     policies = {"a": Counts(), "b": Counts(), NONE: None}
     monkeypatch.setattr(simulation, "policies", policies)
@@ -187,11 +187,9 @@ def test_a_dropped_object_is_seen_and_then_replaced(simulation):
 
 
 def test_a_task_is_shown_on_another_hand_without_the_policy_of_its_name(monkeypatch):
-    from dexsim.view import __main__ as command
-
     made = []
-    monkeypatch.setattr(command, "make", lambda task, hand: made.append((task, hand.name)))
-    monkeypatch.setattr(command, "PolicyShelf", lambda env, first: made.append(first))
+    monkeypatch.setattr("dexsim.registry.make", lambda task, hand: made.append((task, hand.name)))
+    monkeypatch.setattr("dexsim.view.policies.PolicyShelf", lambda env, first: made.append(first))
     monkeypatch.setattr("dexsim.view.simulation.Simulation", lambda env, shelf, seed: None)
     open_source(ViewArguments(what="grasp", hand="inspire_like"))
     assert made == [("grasp", "inspire_like"), NONE]
@@ -216,7 +214,7 @@ def test_the_emulated_hand_is_a_source(hand, monkeypatch):
 
 def test_a_log_is_a_source(tmp_path, monkeypatch):
     pytest.importorskip("serial")
-    monkeypatch.setattr("dexsim_real.run.__main__.prepare_jax", lambda: None)
+    monkeypatch.setattr("dexsim_real.run.result.prepare_jax", lambda: None)
     from following_hand import FollowingHand, arguments, records
 
     from dexsim_real.core.log import Kind

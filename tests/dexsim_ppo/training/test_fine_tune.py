@@ -120,7 +120,7 @@ def test_what_does_not_fit_is_refused(policy, tiny_task, tmp_path, monkeypatch, 
         (["--task", "grasp", "--policy", "policy.msgpack"], "of the task 'tiny', not 'grasp'"),
         (["--policy", "nothing.msgpack"], "cannot be read"),
         (["--policy", "other.msgpack"], "observations of policy and environment differ"),
-        (["--policy", "policy.msgpack", "--ppo.actor-layers", "7"], "--ppo.actor-layers 7: the policy has"),
+        (["--policy", "policy.msgpack", "--ppo.actor-layers", "7"], "--ppo.actor-layers (7,): the policy has"),
         (["--policy", "policy.msgpack", "--ppo.memory", "gru"], "--ppo.memory gru: the policy has none"),
     ):
         assert exit_code(train.main, [*arguments, "--steps", "128"]) == 2

@@ -48,7 +48,6 @@ def test_a_safety_reaction_ends_the_call_with_its_reason(tmp_path):
     def heat(index, state):
         if index > 100:
             state["joint"]["temperature"][4] = 90
-        return state
 
     with FollowingHand(heat) as peer:
         result = run(peer, tmp_path)
