@@ -48,13 +48,13 @@ class PoseCheck:
         return median if np.abs(np.array(self._recent) - median).max() <= _APART else None
 
     @property
-    def newest(self) -> np.ndarray:
-        """[J] rad, where the hand is, whether it moves or not; no single wrong reading counts."""
-        return np.asarray(np.median(list(self._recent)[-_NOW:], axis=0))
+    def newest(self) -> np.ndarray | None:
+        """[J] rad, where the hand is, whether it moves or not; no single wrong reading counts. None right after one."""
+        return np.asarray(np.median(list(self._recent)[-_NOW:], axis=0)) if self._recent else None
 
     def follow(self, command: np.ndarray) -> None:
         """The motors move toward these joint angles [J] rad from now on."""
-        if self._low is None:
+        if self._low is None and self._recent:
             self._last = self.newest
         self._low = command if self._low is None else np.minimum(self._low, command)
         self._high = command if self._high is None else np.maximum(self._high, command)

@@ -279,6 +279,7 @@ class Safety:
         self._holding = True
         if reason == _FORCE:  # Staying there would keep the force.
             pose = self._pose.newest
+            pose = self.commanded if pose is None else pose
             before = pose if self._eased is None or now - self._eased[0] > _SAME else self._eased[1]
             self._eased = now, before
             goal = np.clip(pose, before - _EASE, before + _EASE)

@@ -206,7 +206,6 @@ def test_a_later_log_replaces_a_joint_and_other_logs_do_not_mix(hand, recorded, 
         ("rate", "other --hardware options or another --rate", {"rate": 82.0}),
         ("hardware", "other --hardware options", {"hardware": {**hardware, "taxel_floor": 2.0}}),
         ("serial", "is of another hand .right, serial number 2R32OTHER.", {"serial": "2R32OTHER"}),
-        ("text", "a rate of '83' exchanges per second", {"rate": "83"}),
     ):
         other = rewritten(recorded, tmp_path / f"{name}.log", configured(**values))
         with pytest.raises(LogError, match=f"{name}.log: .*{says}"):

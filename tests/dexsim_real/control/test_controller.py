@@ -127,7 +127,6 @@ def test_one_frame_gives_the_same_observation_through_both_doors_bit_for_bit(han
             object_velocity=readings.object_velocity,
             object_quat=readings.object_quat,
             object_spin=jnp.zeros(3),
-            pose=None,
         )
         command, goal_quat = task.goal_readings(goal)
         return observer.observe(readings, moment, (command, goal_quat))["actor"]

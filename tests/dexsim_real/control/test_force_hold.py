@@ -52,6 +52,12 @@ def test_a_wrong_angle_as_a_hold_begins_is_not_eased_to(hand, size, wrong):
     assert np.abs(path).max() < 0.01
 
 
+def test_a_reading_outside_the_limits_leaves_a_hold_at_its_command(hand):
+    """No pose is known right after one: a command made of it would be NaN."""
+    path, on, _ = hold(hand, lambda k: 9.0 * (k == 3), lambda k: 30.0, seconds=1.0)
+    assert np.isfinite(path).all() and on.all() and np.abs(path).max() < 0.01
+
+
 def test_whatever_a_joint_reads_an_easing_hand_does_not_go_far(hand):
     for way in (-1, 1):
         path, on, _ = hold(hand, lambda k, w=way: w * 0.2, lambda k: 30.0)

@@ -22,6 +22,7 @@ def test_a_wish_stays_good_for_two_and_a_half_ticks_of_its_policy(tmp_path, rate
             uncalibrated=True,
             fixed_object=True,
             guard=False,
+            realtime=False,
             log=tmp_path / "run.log",
             safety=SafetyConfig(watchdog=0.3),
         )
