@@ -159,7 +159,7 @@ def check_outside(patch: Patch, geometry: Any, *, tolerance: float = 1e-4, name:
     """Require that no taxel is deeper than `tolerance` inside the link it sits on.
 
     Args:
-      geometry: the link's surface in its frame, as `distance.prepare` gives it.
+      geometry: the link's surface in its frame, such as `grid.bake` gives.
 
     Raises:
       AssetError: one does; names it and its depth.
