@@ -63,7 +63,7 @@ $(INSTALLED): pyproject.toml | $(VENV)/.created
 	@touch $@
 
 $(TESTABLE): pyproject.toml | $(VENV)/.created
-	$(PIP) install --quiet --editable ".[brax,warp,video,tb,view,onnx,lerobot,gym,docs]" --group test
+	$(PIP) install --quiet --editable ".[brax,video,tb,view,onnx,lerobot,gym,docs]" --group test
 	@touch $@
 
 # With the extras whose modules the reference imports.

@@ -4,8 +4,7 @@
     python benchmarks/engines.py policies                       # success of the shipped policies
 
 One JSON line a row, and a table at the end with a column for each engine that this machine can run: `c` on a CPU,
-`cuda` on an NVIDIA GPU, `jax` and `warp` on both. Every engine is measured with the solver iterations of training, and
-with 50 of 50 line-search steps (converged).
+`cuda` on an NVIDIA GPU, `mjx` on both.
 
 | motion | begins | gravity |
 |---|---|---|
@@ -23,7 +22,6 @@ import argparse
 import contextlib
 import copy
 import dataclasses
-import functools
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -44,14 +42,13 @@ from dexsim.env.env import Env
 from dexsim.hand.kinematics import flexion_joints
 from dexsim.objects.params import ObjectParams, extent
 from dexsim.physics.interface import PhysicsState, StepResult
-from dexsim.physics.model import build_model
+from dexsim.physics.model import build_scene
 from dexsim.physics.physics import BACKENDS, Physics, choose_backend
 from dexsim.registry import TASKS
 from dexsim.tasks.placement import palm_height
 from dexsim_ppo import evaluate_policy, load_policy
 
 MOTIONS = ("grip", "slide", "roll", "drop")
-CONVERGED = {"iterations": 50, "line_search": 50}
 STIFFNESS, DAMPING, REACH = 3.0, 0.1, 0.3  # Nm/rad, Nm s/rad, rad
 TOUCHING = 0.01  # N
 MEASURES = ("held", "r_resultant", "force_error_n", "successes_per_minute", "kept_to_the_end")  # of policies
@@ -93,9 +90,10 @@ class Motions:
         config = dataclasses.replace(TASKS[task].config(), pool_size=max(2 * shapes * starts, 16))
         self.env: Env = dexsim.make(task, config)
         self.task, self.ticks = task, max(round(seconds / self.env.control_period), 1)
-        self.exact = self.physics("auto", CONVERGED)
+        self.exact = self.physics("auto")
         rules, physics = self.env.task, self.exact.config
-        self.template = build_model(self.env.hand, rules.slots, rules.largest, physics, rules.gravity, "c")
+        self.template = build_scene(self.env.hand, rules.slots, rules.largest, physics, rules.gravity, "c").model
+        self.template.opt.iterations = 50
         pool, index = self.env.pool, np.asarray(self.env.pool.object.shape_index)
         names = {shape: getattr(config, "object", "") or self.env.task.shape_names[shape] for shape in np.unique(index)}
         self.cases, begins = list[tuple[str, str]](), list[Begin]()
@@ -109,18 +107,10 @@ class Motions:
                         begins.append(begin)
         self.begin: Begin = jax.tree.map(lambda *rows: jnp.stack([jnp.asarray(x, x.dtype) for x in rows]), *begins)
 
-    def physics(self, backend: str, changes: dict[str, int]) -> Physics:
-        """The scene on an engine, with these solver iterations."""
-        config, task = dataclasses.replace(self.env.config.physics, **changes), self.env.task
-        return Physics(
-            self.env.hand,
-            task.slots,
-            task.largest,
-            config,
-            gravity=task.gravity,
-            backend=backend,
-            num_envs=len(getattr(self, "cases", ())),
-        )
+    def physics(self, backend: str) -> Physics:
+        """The scene on an engine."""
+        task, config = self.env.task, self.env.config.physics
+        return Physics(self.env.hand, task.slots, task.largest, config, gravity=task.gravity, backend=backend)
 
     def _begin(self, motion: str, start: Any) -> Begin | None:
         """A motion from a start state of the task; None for a grip that does not hold."""
@@ -232,9 +222,9 @@ class Motions:
 
     # --- the engines ----------------------------------------------------------------------------
 
-    def run(self, backend: str, changes: dict[str, int]) -> Trace:
+    def run(self, backend: str) -> Trace:
         """All motions on an engine."""
-        physics, limit = self.physics(backend, changes), jnp.asarray(self.env.hand.torque_limit)
+        physics, limit = self.physics(backend), jnp.asarray(self.env.hand.torque_limit)
 
         def tick(begin: Begin) -> StepResult:
             def motors(substep: jax.Array, position: jax.Array, velocity: jax.Array) -> jax.Array:
@@ -283,16 +273,14 @@ class Motions:
         return rows
 
 
-def policy_row(name: str, backend: str, converged: bool, episodes: int, seconds: float) -> dict[str, Any]:
+def policy_row(name: str, backend: str, episodes: int, seconds: float) -> dict[str, Any]:
     """What a shipped policy reaches in the same episodes on an engine; `seconds` 0 for the task's own length."""
     policy = load_policy(name)
     changes = [f"pool_size={max(episodes, 64)}"] + [f"evaluation_seconds={seconds}"] * bool(seconds)
-    if converged:
-        changes += [f"physics.{field}={value}" for field, value in CONVERGED.items()]
     policy = dataclasses.replace(policy, env_config=override(policy.env_config, changes))
-    env = policy.make_env(backend=backend, num_envs=episodes)
+    env = policy.make_env(backend=backend)
     task = evaluate_policy(policy, env=env, episodes=episodes, chunk=episodes, baseline=False)["task"]
-    row = {"policy": name, "backend": backend, "converged": converged, "episodes": episodes, "seconds": task["seconds"]}
+    row = {"policy": name, "backend": backend, "episodes": episodes, "seconds": task["seconds"]}
     for key in MEASURES:
         if key in task:
             row[key] = task[key]["r" if key == "r_resultant" else "mean"]
@@ -306,17 +294,14 @@ def motions(options: argparse.Namespace) -> list[dict[str, Any]]:
     for task in options.tasks:
         bench = Motions(task, options.starts, options.seconds)
         reference = bench.reference()
-        runs = {("nudged", True): lambda bench=bench: bench.reference(NUDGE)}
-        for backend in options.backends:
-            for converged in (False, True):
-                runs[backend, converged] = functools.partial(bench.run, backend, CONVERGED if converged else {})
-        for (engine, converged), run in runs.items():
-            for row in bench.compare(run(), reference):
-                rows.append({"backend": engine, "converged": converged} | row)
+        for engine in ("nudged", *options.backends):
+            found = bench.reference(NUDGE) if engine == "nudged" else bench.run(engine)
+            for row in bench.compare(found, reference):
+                rows.append({"backend": engine} | row)
                 show(rows[-1])
     for title, name in (("object's place, mm", "place_mm"), ("forces, N", "force_error_n")):
         cells = [
-            (f"{r['motion']}, {r['shape']}", column(r), f"{r[name + '_p95']:.2g} / {r[name + '_max']:.2g}")
+            (f"{r['motion']}, {r['shape']}", r["backend"], f"{r[name + '_p95']:.2g} / {r[name + '_max']:.2g}")
             for r in rows
         ]
         print(table(f"{title}: 95 % / largest", cells))
@@ -328,21 +313,15 @@ def policies(options: argparse.Namespace) -> list[dict[str, Any]]:
     rows, cells = [], []
     for name in options.policies:
         for backend in options.backends:
-            for converged in (False, True):
-                row = policy_row(name, backend, converged, options.episodes, options.seconds)
-                rows.append(row)
-                show(row)
-                for key in MEASURES:
-                    if row.get(key) is not None:
-                        low, high = row[f"{key}_ci95"]
-                        cells.append((f"{name}, {key}", column(row), f"{row[key]:.3g} ({low:.3g}–{high:.3g})"))
+            row = policy_row(name, backend, options.episodes, options.seconds)
+            rows.append(row)
+            show(row)
+            for key in MEASURES:
+                if row.get(key) is not None:
+                    low, high = row[f"{key}_ci95"]
+                    cells.append((f"{name}, {key}", backend, f"{row[key]:.3g} ({low:.3g}–{high:.3g})"))
     print(table("policy", cells))
     return rows
-
-
-def column(row: dict[str, Any]) -> str:
-    """An engine and its iterations."""
-    return row["backend"] + (", converged" if row["converged"] else "")
 
 
 def show(row: dict[str, Any]) -> None:

@@ -131,7 +131,6 @@ def make(
     config: EnvConfig | None = None,
     *,
     backend: str = "auto",
-    num_envs: int = 1,
     hand: Hand | None = None,
     seed: int = 0,
 ) -> Env:
@@ -141,22 +140,18 @@ def make(
     Args:
       task: a name in `TASKS`, registered ones included.
       config: the task's config dataclass; None for what the name stands for.
-      backend: physics, "auto", "jax", "cuda", "warp" or "c".
-      num_envs: batch size that Warp's contact buffers are sized for.
+      backend: physics, "auto", "c", "cuda" or "mjx".
       hand: a `Hand` from `load_hand`; None for the shipped one.
       seed: of the pool of start states.
 
     Raises:
-      ConfigError: unknown task, a config of another task, no `Hand`, or `num_envs` below 1.
+      ConfigError: unknown task, a config of another task, or no `Hand`.
     """
-    for option, value in (("num_envs", num_envs), ("seed", seed)):
-        if not isinstance(value, numbers.Integral) or isinstance(value, bool):
-            raise ConfigError(f"make({task!r}, {option}={value!r:.80}): must be a whole number")
+    if not isinstance(seed, numbers.Integral) or isinstance(seed, bool):
+        raise ConfigError(f"make({task!r}, seed={seed!r:.80}): must be a whole number")
     cached = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
     if not (cached or os.environ.get("DEXSIM_NO_CACHES")):
         enable_caches()
-    if num_envs < 1:
-        raise ConfigError(f"make({task!r}, num_envs={num_envs}): must be at least 1")
     if not isinstance(hand, Hand | None):
         raise ConfigError(f"make({task!r}, hand={hand!r:.80}): must be a Hand, such as dexsim.load_hand(...) returns")
     if (makes := find_task(task).environment) is not None:
@@ -164,7 +159,7 @@ def make(
             raise ConfigError(f"task {task!r} takes no config: its environment comes from elsewhere")
         return _make_other(task, makes)
     hand = load_hand() if hand is None else hand
-    return Env(make_task(task, hand, config), hand, backend=backend, num_envs=num_envs, seed=seed)
+    return Env(make_task(task, hand, config), hand, backend=backend, seed=seed)
 
 
 def make_task(name: str, hand: Hand, config: EnvConfig | None = None) -> Task:

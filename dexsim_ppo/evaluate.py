@@ -25,7 +25,7 @@ import numpy as np
 import tyro
 
 from dexsim.core import cli
-from dexsim.core.compilation import collector_paused, jit
+from dexsim.core.compilation import jit
 from dexsim.core.config import override, setting, validate
 from dexsim.core.errors import ConfigError
 from dexsim.core.progress import progress
@@ -70,7 +70,7 @@ class Evaluator:
         started, parts = time.perf_counter(), list[Any]()
         count = math.ceil(episodes / self.chunk) * self.chunk
         plan = self._plan(count, seed)
-        with collector_paused(), progress(label, count, "episodes") if label else contextlib.nullcontext() as show:
+        with progress(label, count, "episodes") if label else contextlib.nullcontext() as show:
             for i in range(0, count, self.chunk):
                 part = jax.tree.map(lambda x, i=i: x[i : i + self.chunk], plan)
                 parts.append(jax.device_get(self._run(params, part, idle)))
@@ -203,7 +203,7 @@ def evaluate_policy(
     policy = policy if isinstance(policy, Policy) else load_policy(policy)
     chunk = min(chunk or default_chunk(), episodes or default_chunk())
     if env is None:
-        env = policy.make_env(backend=backend, num_envs=chunk)
+        env = policy.make_env(backend=backend)
     else:
         policy.check_env(env)
     evaluator, episodes = Evaluator(env, chunk), episodes or default_episodes(env)
@@ -223,7 +223,7 @@ class EvaluateArguments:
     """Evaluation episodes, rounded up to whole chunks. 0: 1024 on a GPU; on a CPU 448 of grasp, 64 of rotate."""
     seed: int = setting(0, unit="1", low=0, high=2**32 - 2)
     """Seed of the episodes and their start states. Training selects its best policy by episodes of another."""
-    backend: Literal["auto", "jax", "cuda", "warp", "c"] = setting("auto")
+    backend: Literal["auto", "c", "cuda", "mjx"] = setting("auto")
     """Physics backend. auto: c on a CPU, cuda on an NVIDIA GPU, otherwise jax."""
     chunk: int = setting(0, unit="1", low=0, high=65536)
     """Episodes simulated side by side; 0 chooses by the device."""
@@ -274,7 +274,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     policy = dataclasses.replace(policy, env_config=override(policy.env_config, (*seconds, *arguments.set)))
     entry, hand = find_task(policy.task), policy.find_hand(arguments.hand)
     with cli.naming_options(entry.config_class, entry.config()):
-        env = policy.make_env(backend=arguments.backend, num_envs=chunk, hand=hand)
+        env = policy.make_env(backend=arguments.backend, hand=hand)
     if video and isinstance(env, Adapted):
         raise ConfigError(f"--video {video}: {env.name!r} draws nothing")
     evaluator, episodes = Evaluator(env, chunk), arguments.episodes or default_episodes(env)

@@ -165,7 +165,7 @@ class Policy:
         """Raises ConfigError: the policy was trained on another hand than this one."""
         check_same(self.hand, hand, f"the policy of {self.task!r}")
 
-    def make_env(self, *, num_envs: int = 1, backend: str = "auto", hand: "Hand | None" = None, seed: int = 0) -> "Env":
+    def make_env(self, *, backend: str = "auto", hand: "Hand | None" = None, seed: int = 0) -> "Env":
         """The environment that the policy was trained in; arguments as in `dexsim.make`.
 
         Raises:
@@ -176,7 +176,7 @@ class Policy:
 
         config = from_dict(find_task(self.task).config_class, self.env_config)
         hand = self.find_hand() if hand is None else hand
-        env = adapt(make(self.task, config, backend=backend, num_envs=num_envs, hand=hand, seed=seed), self.task)
+        env = adapt(make(self.task, config, backend=backend, hand=hand, seed=seed), self.task)
         self.check_env(env)
         return cast(Any, env)
 

@@ -101,7 +101,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     cli.enable_caches()
     if find_task(policy.task).environment:
         raise ConfigError(f"{arguments.policy}: {policy.task!r} is no task on a hand: there is nothing to record")
-    env = policy.make_env(num_envs=arguments.episodes)
+    env = policy.make_env()
     trajectories = record(policy, env, episodes=arguments.episodes, seconds=arguments.seconds, seed=arguments.seed)
     if arguments.lerobot:
         write_lerobot(arguments.lerobot, env.hand, policy.task, trajectories)

@@ -74,7 +74,7 @@ def _prepare(file: checkpoint.Checkpoint) -> tuple[Environment, PPOConfig, Train
     config = dataclasses.replace(saved.ppo, iterations_per_call=1)
     if (backend := file.content["backend"]) != "own":
         saved = dataclasses.replace(saved, backend=backend)
-    env = make_environment(saved, find_hand(saved, file), 1)
+    env = make_environment(saved, find_hand(saved, file))
     training = make_train(env, config, saved.curriculum)
     state = checkpoint.restore(file, training.shapes(jax.random.key(saved.seed)))
     print(f"{file.path}: {file.task}, seed {saved.seed}, {config.num_envs} environments, {env.backend} physics")

@@ -155,12 +155,9 @@ def make_run(
     mesh, hand = make_mesh(arguments.devices, arguments.ppo), find_hand(arguments, source)
     if first and not like:
         print(f"making the environment of {arguments.task}", flush=True)
-    env = like.env if like else make_environment(arguments, hand, mesh.size if mesh else 1)
+    env = like.env if like else make_environment(arguments, hand)
     if env.backend != "own":  # so that a resumed run has the same engine
         arguments = dataclasses.replace(arguments, backend=cast(Any, env.backend))
-    if mesh is not None and env.backend == "warp":
-        # XLA's compiler crashes on Warp's calls in a program of several devices (JAX 0.11.2).
-        raise ConfigError(f"TrainArguments.devices = {mesh.size}: Warp runs on one device; choose another --backend")
     if isinstance(source, Policy):
         check_fit(source, env, arguments.ppo)
     path = folder_of(resumed.path) if resumed else new_folder(arguments.run_dir, arguments.task) if first else Path()
@@ -174,12 +171,11 @@ def make_run(
     return Run(env, arguments, folder, started, mesh, like.evaluator if like else None)
 
 
-def make_environment(arguments: TrainArguments, hand: Hand | None, devices: int) -> Environment:
-    """The environment to train in, for the batch of one device."""
+def make_environment(arguments: TrainArguments, hand: Hand | None) -> Environment:
+    """The environment to train in."""
     import dexsim
 
-    env, share = training_config(arguments), arguments.ppo.num_envs // devices
-    made = dexsim.make(arguments.task, env, backend=arguments.backend, num_envs=share, hand=hand)
+    made = dexsim.make(arguments.task, training_config(arguments), backend=arguments.backend, hand=hand)
     return adapt(made, arguments.task)
 
 

@@ -23,7 +23,6 @@ _cache = Path(os.environ.get("DEXSIM_CACHE") or Path.home() / ".cache" / "dexsim
 os.environ["JAX_COMPILATION_CACHE_DIR"] = str(_cache / "xla")
 os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
 os.environ["JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES"] = "-1"
-os.environ.setdefault("WARP_CACHE_PATH", str(_cache / "warp"))
 os.environ.setdefault("MPLBACKEND", "agg")
 if not ON_GPU and "PYTEST_XDIST_WORKER" not in os.environ:
     # Each about halves the compilation of a physics step, which is most of what the suite does. XLA ends the
@@ -45,12 +44,6 @@ import jax  # noqa: E402
 import pytest  # noqa: E402
 
 from dexsim.core import compilation  # noqa: E402
-
-if not ON_GPU:
-    with contextlib.suppress(ImportError):
-        import warp
-
-        warp.config.optimization_level = 0  # its kernels take longer to compile than to run here
 
 # What the library compiles runs for seconds at most here, and compiles in half the time where it is not optimised.
 compilation.jit = functools.partial(compilation.jit, once=True)
@@ -85,7 +78,6 @@ LONGEST = (
     "test_object_mesh",
     "test_force_loop",
     "test_commands",
-    "test_substep",
     "test_objects",
     "test_calibration",
     "test_identification",
@@ -115,8 +107,8 @@ LENIENT = (
     "dexsim/objects/test_object_mesh.py",
     "dexsim/objects/test_touch_geometry.py",
     "dexsim/physics/test_c_backend.py",
+    "dexsim/physics/test_mjx_backend.py",
     "dexsim/physics/test_physics.py",
-    "dexsim/physics/test_substep.py",
     "dexsim/test_randomization.py",
     "dexsim/wrappers",
 )
@@ -155,12 +147,11 @@ def hand() -> Any:
 
 @pytest.fixture(scope="session")
 def grasp_env() -> Any:
-    """The grasp task on C MuJoCo: the defaults, but for a small pool (16 of each shape). Its program compiles in a
-    tenth of the time of MJX's, which has tests of its own."""
+    """The grasp task on C MuJoCo: the defaults, but for a small pool (16 of each shape)."""
     import dexsim
     from dexsim.tasks.grasp.config import GraspConfig
 
-    return dexsim.make("grasp", GraspConfig(pool_size=80), backend="c", num_envs=NUM_ENVS)
+    return dexsim.make("grasp", GraspConfig(pool_size=80), backend="c")
 
 
 @pytest.fixture(scope="session")
@@ -172,35 +163,4 @@ def grasp_rollout(grasp_env: Any) -> Rollout:
         step=jax.jit(jax.vmap(grasp_env.step)),
         restart=compilation.jit(jax.vmap(grasp_env.restart), once=True),
         num_envs=NUM_ENVS,
-    )
-
-
-@pytest.fixture(scope="session")
-def physics_advance(hand: Any) -> Callable[..., Any]:
-    """One sub-step of 8 worlds on the `jax` backend, under given joint torques and pushes.
-
-    `physics_advance(object, state, torque [8, J], push [8, 3])` returns the state and the fingers'
-    forces [8, F, 3]; the solver converges.
-    """
-    from c_scene import CONVERGED, GRAVITY
-
-    from dexsim.objects.config import SLOTS, ObjectConfig
-    from dexsim.physics.config import PhysicsConfig
-    from dexsim.physics.physics import Physics
-
-    physics = Physics(
-        hand,
-        SLOTS,
-        ObjectConfig().largest,
-        PhysicsConfig(substeps=1, **CONVERGED),
-        gravity=GRAVITY,
-        backend="jax",
-        num_envs=NUM_ENVS,
-    )
-    return jax.jit(
-        jax.vmap(
-            lambda object, state, torque, push: physics.advance(
-                lambda index, position, velocity: torque, object, state, push
-            )
-        )
     )

@@ -14,7 +14,7 @@ from dexsim.core.assets import asset_path
 from dexsim.core.errors import AssetError
 
 PACKAGES = ("dexsim", "dexsim_ppo", "dexsim_real")
-FORBIDDEN = ("optax", "flax", "orbax", "brax", "warp", "serial")
+FORBIDDEN = ("optax", "flax", "orbax", "brax", "serial")
 
 in_checkout = pytest.mark.skipif(not (ROOT / "pyproject.toml").exists(), reason="needs a checkout")
 
@@ -85,7 +85,7 @@ def test_core_dependencies_are_only_the_listed_ones():
         "matplotlib",
         "pillow",
     }
-    assert {"warp", "cuda", "real", "brax", "video"} <= set(project["optional-dependencies"])
+    assert {"cuda", "real", "brax", "video"} <= set(project["optional-dependencies"])
 
 
 @in_checkout
@@ -102,15 +102,6 @@ def test_checkpoints_name_the_version_of_the_distribution():
 
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert project["version"] == LIBRARY_VERSION
-
-
-@in_checkout
-def test_warp_is_the_version_that_mjx_names():
-    from importlib.metadata import requires
-
-    named = [line.partition(";")[0].strip() for line in requires("mujoco-mjx") if line.startswith("warp-lang")]
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    assert project["optional-dependencies"]["warp"] == named
 
 
 @in_checkout

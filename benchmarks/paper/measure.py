@@ -157,7 +157,7 @@ def _evaluator(task: str, config: str, backend: str, chunk: int) -> Evaluator:
     import dexsim
 
     made = from_dict(find_task(task).config_class, json.loads(config))
-    return Evaluator(dexsim.make(task, made, backend=backend, num_envs=chunk), chunk)
+    return Evaluator(dexsim.make(task, made, backend=backend), chunk)
 
 
 @functools.lru_cache(maxsize=4)
@@ -199,7 +199,7 @@ def held_out(row: Row, seed: int, budget: Budget, work: Path) -> dict[str, Any]:
         settings.append(f"evaluation_seconds={seconds}")
     config = from_dict(GraspConfig, override(policy.env_config, settings))
     chunk = 5 * len(names)
-    env = Env(HeldOutGrasp(config, hand, names), hand, backend=budget.backend, num_envs=chunk)
+    env = Env(HeldOutGrasp(config, hand, names), hand, backend=budget.backend)
     report, _ = Evaluator(env, chunk)(policy.params, episodes=budget.objects * len(names), seed=seed)
     kept = {name: value for name, value in report["task"].items() if name != "headline"}
     return {"simulation": kept | {"backend": env.backend}}

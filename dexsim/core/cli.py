@@ -120,8 +120,6 @@ def enable_caches() -> None:
     jax.config.update("jax_compilation_cache_dir", path)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-    if "WARP_CACHE_PATH" not in os.environ and (warp := _cache("warp")):
-        os.environ["WARP_CACHE_PATH"] = warp
 
 
 def _cache(name: str) -> str | None:
@@ -142,7 +140,7 @@ def environment_report() -> dict[str, Any]:
     import jax
 
     versions = {"python": platform.python_version()}
-    for name in (DISTRIBUTION, "jax", "jaxlib", "mujoco", "mujoco-mjx", "warp-lang", "numpy"):
+    for name in (DISTRIBUTION, "jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy"):
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
             versions[name] = importlib.metadata.version(name)
     devices = jax.devices()

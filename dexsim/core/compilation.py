@@ -1,10 +1,8 @@
 """Compilation options for large programs, and the cores that they may use."""
 
-import contextlib
 import functools
-import gc
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -24,7 +22,7 @@ def available_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def jit(function: Callable, *, backend: str = "jax", once: bool = False, **options: Any) -> Any:
+def jit(function: Callable, *, backend: str = "mjx", once: bool = False, **options: Any) -> Any:
     """`jax.jit` with less optimisation on a CPU, where that pays off.
 
     A physics step in JAX is one very large program. On two cores this halves its compilation time for a few
@@ -55,19 +53,13 @@ def check_float32() -> None:
 def make_deterministic() -> bool:
     """Have all GPU programs that this process makes from here on repeat to the last bit.
 
-    XLA then neither times rival kernels to choose one nor adds in whatever order threads come; Warp's physics is ruled
-    out (`choose_backend`); the `cuda` backend repeats anyway. Returns whether there is a GPU: programs on a CPU repeat
-    anyway.
+    XLA then neither times rival kernels to choose one nor adds in whatever order threads come. The `cuda` backend
+    repeats anyway. Returns whether there is a GPU: programs on a CPU repeat anyway.
     """
     if jax.default_backend() not in ("gpu", "cuda"):
         return False
     _on_gpu["xla_gpu_deterministic_ops"] = True
     return True
-
-
-def is_deterministic() -> bool:
-    """Whether `make_deterministic` was called, on a GPU."""
-    return bool(_on_gpu)
 
 
 @functools.cache
@@ -81,19 +73,3 @@ def _light() -> dict[str, Any]:
             continue
         known[name] = value
     return known
-
-
-@contextlib.contextmanager
-def collector_paused() -> Iterator[None]:
-    """No garbage collection inside.
-
-    Warp registers JAX's stream for each graph that it captures. A collection during a capture may delete an
-    earlier registration of the same stream, and the run fails with "unknown stream".
-    """
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if enabled:
-            gc.enable()

@@ -39,14 +39,13 @@ from dexsim.task_spec import TaskSpec, correct_readings
 class Env:
     """A task on a hand: `reset(key)`, `step(state, action)`, `restart(state, done)`."""
 
-    def __init__(self, task: Task, hand: Hand, *, backend: str = "auto", num_envs: int = 1, seed: int = 0):
+    def __init__(self, task: Task, hand: Hand, *, backend: str = "auto", seed: int = 0):
         """Compile the scene and fill the pool of start states.
 
         Args:
           task: the task with its configuration.
           hand: the hand.
-          backend: "auto", "jax", "cuda", "warp" or "c".
-          num_envs: batch size that the Warp buffers are sized for.
+          backend: "auto", "c", "cuda" or "mjx".
           seed: of the pool. Evaluations have pools of their own.
 
         Raises:
@@ -56,9 +55,7 @@ class Env:
         check_timestep(hand, config.physics, config.randomization)
         self.task, self.name, self.config, self.hand = task, task.name, config, hand
         self.spec = TaskSpec.of(task)  # what a host must know to run this task's policies
-        self.physics = Physics(
-            hand, task.slots, task.largest, config.physics, gravity=task.gravity, backend=backend, num_envs=num_envs
-        )
+        self.physics = Physics(hand, task.slots, task.largest, config.physics, gravity=task.gravity, backend=backend)
         self.backend, self.action_size, self.primitive_kinds = self.physics.backend, hand.num_joints, task.slots
         self.motors = Motors(self.physics)
         self.touch = TouchModel(config, hand)

@@ -1,41 +1,57 @@
-"""C MuJoCo on the CPU's cores: several times faster there than the JAX backend, without gradients.
+"""C MuJoCo on the CPU's cores (`mujoco.batch`): the fastest engine there, without gradients.
 
 A control tick is one call from the compiled program, also for a batch. Motors are evaluated in it at every sub-step,
-from JAX's own trace of them (`dexsim.physics.host.law`).
+from JAX's own trace of them (`dexsim.physics.law`).
+
+What goes in decides what comes out: all that differs between worlds, and their whole state, is written at every tick.
+What stays from call to call is memory and threads.
+
+The call is one of XLA's FFI (`dexsim.physics.ffi`). `jax.pure_callback` hands over its arguments as JAX arrays. Reading
+one waits for a copy on the CPU client's own threads, and with asynchronous dispatch on two cores these may all be
+waiting for the callback: a deadlock. It also keeps programs out of JAX's compilation cache, since they hold an address
+of the process. An FFI call does neither, and gets XLA's buffers as NumPy arrays without a copy.
 """
 
 import collections
+import contextlib
 import dataclasses
 import hashlib
 import json
+import math
+import os
+import threading
 import weakref
+from collections.abc import Iterator
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from mujoco.batch import Batch
 
+from dexsim.core.compilation import available_cores
 from dexsim.core.errors import AssetError, ConfigError
 from dexsim.objects.params import ObjectParams
-from dexsim.physics.host import call
-from dexsim.physics.host.engine import HostEngine
-from dexsim.physics.host.law import Recorded, one_by_one, record
+from dexsim.physics import ffi
 from dexsim.physics.interface import ContactParams, PhysicsScene, PhysicsState, StepResult, TorqueLaw
-from dexsim.physics.parameters import configured, values
+from dexsim.physics.law import evaluator, record
+from dexsim.physics.parameters import places, values
 
-# Programs name their engine by a hash of its scene, so that one that was loaded from a cache finds it.
-_engines: weakref.WeakValueDictionary[str, HostEngine] = weakref.WeakValueDictionary()
-# A program may still be running, asynchronously, when its environment is gone already.
-_newest: collections.deque[HostEngine] = collections.deque(maxlen=4)
+TARGET = "dexsim_host"
+_SIZES_KEPT = 8
+_WARNINGS = mujoco.mjtWarning
+_FULL = [_WARNINGS.mjWARN_CONTACTFULL.value, _WARNINGS.mjWARN_CNSTRFULL.value]
+# MuJoCo resets a world that is not a number, or out of bounds.
+_DIVERGED = [w.value for w in (_WARNINGS.mjWARN_BADQPOS, _WARNINGS.mjWARN_BADQVEL, _WARNINGS.mjWARN_BADQACC)]
+_lock = threading.Lock()  # one tick at a time has all cores
 
 
 class CBackend:
     """`dexsim.physics.interface.Backend` in C MuJoCo."""
 
-    def __init__(self, scene: PhysicsScene, num_envs: int = 1):
-        """Worlds are made at the first tick of a batch, so `num_envs` reserves nothing."""
-        del num_envs
+    def __init__(self, scene: PhysicsScene):
+        """Worlds are made at the first tick of a batch."""
         model = scene.model
         # The compiler lets C MuJoCo skip offsets that are zero in the template. Objects bring others.
         model.geom_sameframe[scene.object_geoms] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
@@ -46,13 +62,9 @@ class CBackend:
         self._engine = _engines.get(self._key) or HostEngine(scene)
         _engines[self._key] = self._engine
         _newest.append(self._engine)
-        call.register(_serve)
-        self._tick = jax.custom_jvp(self._call, nondiff_argnums=(0, 1, 2))
+        ffi.register(TARGET, "cpu", _serve)
+        self._tick = jax.custom_jvp(self._call, nondiff_argnums=(0, 1))
         self._tick.defjvp(_no_gradient)
-
-    def configure(self, object: ObjectParams, contacts: ContactParams) -> dict[str, jax.Array]:
-        """What the models of one environment have in place of the scene's, by the names of `mujoco.MjModel`."""
-        return configured(self.scene, object, contacts)
 
     def advance(
         self,
@@ -62,47 +74,130 @@ class CBackend:
         torque: TorqueLaw,
         push: jax.Array,
     ) -> StepResult:
-        """One control tick in one call, or one for each sub-step if the host cannot evaluate the law."""
-        scene, substeps = self.scene, self.scene.config.substeps
-        fields = values(scene, object, contacts)
-        law = self._record(torque, state)
-        if law is not None:
-            return self._advance(fields, state, law, push, substeps)
-
-        def substep(torque: TorqueLaw, state: PhysicsState) -> StepResult:
-            law = self._record(torque, state)
-            assert law is not None
-            return self._advance(fields, state, law, push, 1)
-
-        return one_by_one(scene, substep, torque, state)
-
-    def _record(self, torque: TorqueLaw, state: PhysicsState) -> Recorded | None:
-        return record(torque, jnp.zeros(len(self.scene.joint_dof), state.qpos.dtype))
-
-    def _advance(
-        self, fields: dict[str, jax.Array], state: PhysicsState, law: Recorded, push: jax.Array, substeps: int
-    ) -> StepResult:
+        """One control tick in one call."""
+        fields = values(self.scene, object, contacts)
+        law = record(torque, jnp.zeros(len(self.scene.joint_dof), state.qpos.dtype))
         arguments = [*fields.values(), state.qpos, state.qvel, state.warmstart, push, *law.constants]
-        *after, force = self._tick(tuple(fields), law.text, substeps, *map(jnp.asarray, arguments))
+        *after, force = self._tick(tuple(fields), law.text, *map(jnp.asarray, arguments))
         return StepResult(PhysicsState(*after), force)
 
-    def _call(self, fields: tuple[str, ...], law: str, substeps: int, *arguments: jax.Array) -> list[jax.Array]:
+    def _call(self, fields: tuple[str, ...], law: str, *arguments: jax.Array) -> list[jax.Array]:
+        """Under `vmap` a batch is one call. Batch axes come first in every array, of length one in those that the
+        whole batch shares."""
         state = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in arguments[len(fields) : len(fields) + 3]]
         force = jax.ShapeDtypeStruct((self.scene.hand.num_fingers, 3), state[0].dtype)
-        head = json.dumps({"engine": self._key, "fields": fields, "substeps": substeps})
-        return call.call([*state, force], *arguments, head=head, law=law)
+        head = json.dumps({"engine": self._key, "fields": fields})
+        call = jax.ffi.ffi_call(TARGET, [*state, force], vmap_method="expand_dims")
+        return list(call(*arguments, head=head, law=law))
 
 
 def _no_gradient(*_: Any) -> Any:
-    raise ConfigError("backend 'c' has no gradient: make the environment with backend='jax'")
+    raise ConfigError("backend 'c' has no gradient: make the environment with backend='mjx'")
 
 
-def _serve(arguments: list[np.ndarray], results: list[np.ndarray], attributes: dict[str, bytes]) -> None:
+class _Worlds:
+    """Worlds that differ in some fields of the model, and the arrays through which they are written and read."""
+
+    def __init__(self, scene: PhysicsScene, size: int, fields: list[str]):
+        self.size, self.process = size, os.getpid()
+        # One thread for each core that this process may use.
+        self.batch = Batch(scene.model, size, available_cores())
+        where = {
+            name: (slice(None), *(index if isinstance(index, tuple) else (index,)))
+            for name, index in places(scene).items()
+        }
+        self._fields = [[(self.batch.expand(name), where[name])] for name in fields]
+        # The subtree of the object's body is the object.
+        self._fields[fields.index("body_mass")].append((self.batch.expand("body_subtreemass"), where["body_mass"]))
+        self.qpos, self.qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
+        self.warmstart = self.batch.bind("qacc_warmstart")
+        self.torque, self.wrench = self.batch.bind("qfrc_applied"), self.batch.bind("xfrc_applied")
+        self.sensors = self.batch.bind("sensordata").reshape(size, -1, 3)
+
+    def configure(self, values: list[np.ndarray]) -> None:
+        """Write the models' fields."""
+        for targets, value in zip(self._fields, values, strict=True):
+            for array, where in targets:
+                array[where] = value
+
+
+class HostEngine:
+    """One scene. `tick` is what a compiled program calls."""
+
+    def __init__(self, scene: PhysicsScene):
+        """`scene` has a contact sensor for each fingertip."""
+        self.scene = scene
+        self._worlds: collections.OrderedDict[tuple[int, tuple[str, ...]], _Worlds] = collections.OrderedDict()
+        self.diverged = 0
+        """World-ticks so far that MuJoCo gave up: not a number, or out of bounds."""
+
+    def _batch(self, size: int, fields: list[str]) -> _Worlds:
+        """Worlds of their own for each set of fields: what one environment writes, another may leave as it is.
+
+        Raises:
+          RuntimeError: in a forked child, which has none of its parent's threads.
+        """
+        key = size, tuple(fields)
+        if key not in self._worlds:
+            self._worlds[key] = _Worlds(self.scene, size, fields)
+            while len(self._worlds) > _SIZES_KEPT:
+                self._worlds.popitem(last=False)
+        self._worlds.move_to_end(key)
+        if self._worlds[key].process != os.getpid():
+            raise RuntimeError(
+                "backend 'c' does not work in a forked process, which lacks its threads: "
+                "start processes with multiprocessing.get_context('spawn')"
+            )
+        return self._worlds[key]
+
+    def tick(self, fields: list[str], law: bytes, arguments: list[np.ndarray], out: list[np.ndarray]) -> None:
+        """A control tick of a batch; see `CBackend._call` for what crosses."""
+        shape = out[0].shape[:-1]
+        rank, size = len(shape), math.prod(shape)
+        inputs = [_flatten(x, shape, rank, size) for x in arguments]
+        with _lock, _no_warnings():
+            worlds = self._batch(size, fields)
+            worlds.configure(inputs[: len(fields)])
+            results = self._run(worlds, law, inputs[len(fields) :])
+            for target, value in zip(out, results, strict=True):
+                target[...] = value.reshape(target.shape)
+
+    def _run(self, worlds: _Worlds, law: bytes, inputs: list[np.ndarray]) -> list[np.ndarray]:
+        """Positions, velocities, accelerations, and the fingers' forces [B, F, 3] N of the last sub-step."""
+        scene, warning = self.scene, worlds.batch.warning[..., 1]
+        qpos, qvel, warmstart, push, *constants = inputs
+        worlds.qpos[:], worlds.qvel[:], worlds.warmstart[:] = qpos, qvel, warmstart
+        worlds.wrench[:, scene.object_body, :3] = push
+        warning[:] = 0
+        torque = evaluator(law).bind(constants)
+        for substep in range(scene.config.substeps):
+            position = worlds.qpos[:, scene.joint_qpos].astype(qpos.dtype)
+            velocity = worlds.qvel[:, scene.joint_dof].astype(qvel.dtype)
+            worlds.torque[:, scene.joint_dof] = torque(substep, position, velocity)
+            worlds.batch.step()
+        if warning[:, _FULL].any():
+            raise MemoryError("C MuJoCo has no room for all contacts: raise <size memory> in the hand's MJCF")
+        force = -worlds.sensors
+        if (diverged := warning[:, _DIVERGED].any(1)).any():
+            self.diverged += int(diverged.sum())
+            force[diverged] = np.nan
+        return [worlds.qpos, worlds.qvel, worlds.warmstart, force]
+
+
+# Programs name their engine by a hash of its scene, so that one that was loaded from a cache finds it.
+_engines: weakref.WeakValueDictionary[str, HostEngine] = weakref.WeakValueDictionary()
+# A program may still be running, asynchronously, when its environment is gone already.
+_newest: collections.deque[HostEngine] = collections.deque(maxlen=4)
+
+
+def _serve(frame: Any) -> None:
+    """A call of XLA's (`CBackend._call`)."""
+    attributes = ffi.attributes(frame)
     head = json.loads(attributes["head"])
     engine = _engines.get(head["engine"])
     if engine is None:
         raise RuntimeError("backend 'c': the environment of this program no longer exists")
-    engine.tick(head["fields"], head["substeps"], attributes["law"], arguments, results)
+    engine.tick(head["fields"], attributes["law"], ffi.arrays(frame.arguments), ffi.arrays(frame.results))
 
 
 def _digest(scene: PhysicsScene) -> str:
@@ -110,7 +205,28 @@ def _digest(scene: PhysicsScene) -> str:
     buffer = np.zeros(mujoco.mj_sizeModel(scene.model), np.uint8)
     mujoco.mj_saveModel(scene.model, None, buffer)
     digest = hashlib.sha256(buffer.tobytes())
+    digest.update(f"{scene.config.substeps}".encode())
     for field in dataclasses.fields(scene):
         if isinstance(rows := getattr(scene, field.name), np.ndarray):
             digest.update(f"{field.name}{rows.tolist()}".encode())
     return digest.hexdigest()[:16]
+
+
+@contextlib.contextmanager
+def _no_warnings() -> Iterator[None]:
+    """MuJoCo writes warnings to the terminal and to a file in the working directory. Here they are counted."""
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda message: None)
+    try:
+        with np.errstate(all="ignore"):
+            yield
+    finally:
+        mujoco.set_mju_user_warning(before)
+
+
+def _flatten(value: np.ndarray, shape: tuple[int, ...], rank: int, size: int) -> np.ndarray:
+    """`value` with one batch axis, of length one if the whole batch shares it."""
+    lead, own = value.shape[:rank], value.shape[rank:]
+    if math.prod(lead) == 1 and size != 1:
+        return value.reshape(1, *own)
+    return np.broadcast_to(value, shape + own).reshape(size, *own)

@@ -10,6 +10,7 @@ import collections
 import contextlib
 import ctypes
 import functools
+import math
 import threading
 import time
 import traceback
@@ -17,9 +18,12 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+import numpy as np
 
 _MAJOR, _METADATA, _EXECUTE, _STRING = 0, 1, 3, 4
 _INTERNAL = 13
+# XLA's numbers of the types that cross as NumPy arrays.
+_DTYPES = {1: np.bool_, 4: np.int32, 5: np.int64, 8: np.uint32, 9: np.uint64, 11: np.float32, 12: np.float64}
 
 
 def _struct(name: str, *fields: tuple[str, Any]) -> Any:
@@ -92,14 +96,25 @@ def addresses(buffers: Any) -> list[int]:
     return buffers.items[: buffers.size]
 
 
+def arrays(buffers: Any) -> list[np.ndarray]:
+    """The buffers of a CPU as NumPy arrays, valid during the call only."""
+    return [_array(Buffer.from_address(address)) for address in addresses(buffers)]
+
+
+def _array(buffer: Any) -> np.ndarray:
+    shape, dtype = buffer.dims[: buffer.rank], np.dtype(_DTYPES[buffer.dtype])
+    memory = (ctypes.c_char * (math.prod(shape) * dtype.itemsize)).from_address(buffer.data or 0)
+    return np.ndarray(shape, dtype, memory)
+
+
 def attributes(frame: Any) -> dict[str, bytes]:
     """The call's attributes that are strings."""
-    given, found = frame.attributes, {}
-    for index in range(given.size):
-        if given.types[index] == _STRING:
-            name = _Span.from_address(given.names[index]).read().decode()
-            found[name] = _Span.from_address(given.items[index]).read()
-    return found
+    fields, strings = frame.attributes, {}
+    for index in range(fields.size):
+        if fields.types[index] == _STRING:
+            name = _Span.from_address(fields.names[index]).read().decode()
+            strings[name] = _Span.from_address(fields.items[index]).read()
+    return strings
 
 
 def stream(frame: Any) -> int:

@@ -11,7 +11,7 @@ object geom.
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import jax
 import mujoco
@@ -76,13 +76,8 @@ class PhysicsScene:
 class Backend(Protocol):
     """A physics engine on one scene. Its methods are pure and written for one environment; the caller vmaps them.
 
-    The constructor takes `(scene, num_envs)`, where `num_envs` is the batch size to reserve memory for. It raises
-    AssetError for a scene that the engine cannot run.
+    The constructor takes the scene, and raises AssetError for one that the engine cannot run.
     """
-
-    def configure(self, object: ObjectParams, contacts: ContactParams) -> Any:
-        """The engine's model of one environment: a pytree whose leaves have the names of `mujoco.MjModel`."""
-        ...
 
     def advance(
         self,

@@ -1,48 +1,34 @@
-"""What both implementations of MJX share: the model of one environment, and a tick of `mjx.step`."""
+"""MuJoCo's own `mjx.step`: any device, differentiable."""
 
-from types import ModuleType
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from dexsim.core.errors import AssetError
 from dexsim.objects.params import ObjectParams
 from dexsim.physics.interface import ContactParams, PhysicsScene, PhysicsState, StepResult, TorqueLaw
-from dexsim.physics.parameters import places, values
+from dexsim.physics.parameters import configured
 
 
 class MjxBackend:
-    """A scene in MJX; see `dexsim.physics.interface.Backend`. Implementations add data and a force reader."""
+    """`dexsim.physics.interface.Backend` in JAX."""
 
-    def __init__(self, scene: PhysicsScene, impl: str):
+    def __init__(self, scene: PhysicsScene):
         """Raises AssetError: MJX lacks what the scene uses."""
         from mujoco import mjx
 
-        self.scene = scene
-        self.mjx: ModuleType = mjx
+        self.scene, self.mjx = scene, mjx
         try:
-            self.model = mjx.put_model(scene.model, device=jax.local_devices()[0], impl=impl)
+            self.model = mjx.put_model(scene.model, device=jax.local_devices()[0], impl="jax")
         except NotImplementedError as error:
-            raise AssetError(f"{scene.hand.model_path}: backend {impl}: {error}") from None
-
-    def make_data(self) -> Any:
-        """Empty data for one environment."""
-        raise NotImplementedError
-
-    def finger_force(self, data: Any) -> jax.Array:
-        """Force [F, 3] N of the object on each finger, from data after a step."""
-        raise NotImplementedError
-
-    def configure(self, object: ObjectParams, contacts: ContactParams) -> Any:
-        """The MJX model with one environment's object and contact parameters put in."""
-        where = places(self.scene)
-        return self.model.replace(
-            **{
-                name: getattr(self.model, name).at[where[name]].set(value)
-                for name, value in values(self.scene, object, contacts).items()
-            }
-        )
+            raise AssetError(f"{scene.hand.model_path}: backend mjx: {error}") from None
+        model = scene.model
+        fingers = {int(body): finger for finger, body in enumerate(scene.tip_bodies)}
+        # Whose tip link a geom belongs to, -1 for none.
+        self._finger_of_geom = np.array([fingers.get(int(body), -1) for body in model.geom_bodyid])
+        self._is_object_geom = np.isin(np.arange(model.ngeom), scene.object_geoms)
 
     def advance(
         self,
@@ -53,19 +39,43 @@ class MjxBackend:
         push: jax.Array,
     ) -> StepResult:
         """One control tick by `mjx.step`."""
-        scene, model = self.scene, self.configure(object, contacts)
-        data = self.make_data().replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.warmstart)
+        scene, model = self.scene, self.model.replace(**configured(self.scene, object, contacts))
         wrench = jnp.zeros((scene.model.nbody, 6)).at[scene.object_body, :3].set(push)
-        data = data.replace(xfrc_applied=wrench)
+        data = self.mjx.make_data(self.model).replace(
+            qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.warmstart, xfrc_applied=wrench
+        )
 
         def substep(data: Any, index: jax.Array) -> tuple[Any, None]:
             tau = torque(index, data.qpos[scene.joint_qpos], data.qvel[scene.joint_dof])
             applied = jnp.zeros(scene.model.nv).at[scene.joint_dof].set(tau)
-            # MJX relies on implicit promotion, which the caller may have made an error.
-            with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
+            # MJX relies on implicit promotion, which the caller may have made an error. TF32, the default of products
+            # on NVIDIA GPUs, is too coarse for a solver.
+            with (
+                jax.numpy_rank_promotion("allow"),
+                jax.numpy_dtype_promotion("standard"),
+                jax.default_matmul_precision("highest"),
+            ):
                 return self.mjx.step(model, data.replace(qfrc_applied=applied)), None
 
-        # Forces are read after the scan: stacking sensordata as a scan output more than doubled
-        # the step and returned zeros on the GPU.
+        # Forces are read after the scan: as an output of it they would double the step's time.
         data, _ = jax.lax.scan(substep, data, jnp.arange(scene.config.substeps))
         return StepResult(PhysicsState(data.qpos, data.qvel, data.qacc_warmstart), self.finger_force(data))
+
+    def finger_force(self, data: Any) -> jax.Array:
+        """Force [F, 3] N of the object on each finger, from data after a step: MJX has no sensor that matches bodies,
+        so the solver's forces are added up."""
+        fingers = self.scene.hand.num_fingers
+        touch = data._impl.contact
+        dim, address = np.asarray(touch.dim), np.asarray(touch.efc_address)
+        use = np.flatnonzero((dim == 3) & (address >= 0))
+        local = data._impl.efc_force[address[use][:, None] + np.arange(3)]
+        frame = touch.frame[use]  # rows are the axes; the normal points from geom1 to geom2
+        force = jnp.sum(frame * local[..., None], 1)
+        touching = (touch.dist[use] < touch.includemargin[use])[:, None]
+        force = jnp.where(touching, force, 0.0)
+        finger = jnp.asarray(self._finger_of_geom)[touch.geom[use]]
+        is_object = jnp.asarray(self._is_object_geom)[touch.geom[use]]
+        # MuJoCo's contact force acts on geom2; geom1 feels the opposite.
+        on_second = is_object[None, :, 0].astype(jnp.float32) * jax.nn.one_hot(finger[:, 1], fingers).T
+        on_first = is_object[None, :, 1].astype(jnp.float32) * jax.nn.one_hot(finger[:, 0], fingers).T
+        return jnp.sum((on_second - on_first)[..., None] * force[None], 1)

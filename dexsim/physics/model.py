@@ -11,31 +11,29 @@ from dexsim.physics.config import PhysicsConfig
 from dexsim.physics.guard import check_model
 from dexsim.physics.interface import PhysicsScene
 
-GEOM_TYPES = {
-    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
-    "box": mujoco.mjtGeom.mjGEOM_BOX,
-    "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
-    "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
-    "ellipsoid": mujoco.mjtGeom.mjGEOM_ELLIPSOID,
-}
+# Newton iterations and evaluations of a line search with which forces have converged. c and cuda stop by themselves,
+# mjx computes all of them. With 6 evaluations C MuJoCo's forces were off by up to 28 N in grips, with 20 by 0.5 N where
+# boxes land.
+CONVERGED = {"c": (20, 50), "cuda": (10, 10), "mjx": (10, 10)}
+_MJX_CONTACTS = 20
+"""Contacts that MJX keeps in an environment, the deepest: memory and time grow with them."""
 
 
-def build_model(
+def build_scene(
     hand: Hand,
     slots: tuple[str, ...],
     largest: np.ndarray,
     config: PhysicsConfig,
     gravity: tuple[float, float, float],
     backend: str,
-) -> mujoco.MjModel:
-    """The scene as a C MuJoCo model: hand, free object, explicit pairs, force sensors.
-
-    Also what the tests and the emulated hand compare against.
+) -> PhysicsScene:
+    """The scene for an engine: hand, free object, explicit pairs, force sensors, and the addresses of what changes in
+    the model.
 
     Raises:
       AssetError: the backend cannot simulate the hand's MJCF, or it does not go into one scene with the object.
     """
-    check_model(mujoco.MjModel.from_xml_path(str(hand.model_path)), backend, hand.model_path)
+    check_model(mujoco.MjModel.from_xml_path(str(hand.model_path)), hand.model_path)
     spec = read_mjcf(hand)  # torques come from our actuator model, readings from our sensors
     touching = _touching_geoms(hand, slots)
     contact.thicken_tips(spec, hand, config.pad_thickness)
@@ -53,7 +51,7 @@ def build_model(
         body.add_geom(
             plain.default,
             name=f"object_{k}",
-            type=GEOM_TYPES[kind],
+            type=getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}"),
             size=largest[k],
             contype=0,
             conaffinity=0,
@@ -69,7 +67,7 @@ def build_model(
                 condim=3,
                 friction=[0.9, 0.9, 0.005, 1e-4, 1e-4],
             )
-    if backend != "jax":  # MJX in JAX has no sensor that matches bodies
+    if backend != "mjx":  # it has no sensor that matches bodies
         for b in hand.tip_body:
             # data: bit 1 is the force; reduce: 3 is the net force, in the world frame.
             spec.add_sensor(
@@ -84,34 +82,19 @@ def build_model(
     _set_options(spec, config, gravity, backend)
     for pair in spec.pairs:
         if pair.condim == 1:
-            # MJX in JAX has no frictionless contacts with elliptic cones; this friction is negligible.
+            # MJX has no frictionless contacts with elliptic cones; this friction is negligible.
             pair.condim, pair.friction = 3, [1e-3, 1e-3, 0.005, 1e-4, 1e-4]
     try:
         model = spec.compile()
     except ValueError as error:
         raise AssetError(f"{hand.model_path}: with the object in the scene: {' '.join(str(error).split())}") from None
-    geoms = np.flatnonzero(model.geom_bodyid == model.body("object").id)
-    pairs = contact.pairs_with(model, geoms)
-    compliance, share, _ = contact.pair_constants(model, pairs, tip_bodies(model, hand))
-    model.pair_solref[pairs], model.pair_solimp[pairs] = contact.spring(
-        compliance, share * contact.NOMINAL, 2.0, period=config.contact_period
-    )
-    return model
-
-
-def build_scene(
-    hand: Hand,
-    slots: tuple[str, ...],
-    largest: np.ndarray,
-    config: PhysicsConfig,
-    gravity: tuple[float, float, float],
-    backend: str,
-) -> PhysicsScene:
-    """`build_model`, with the addresses of what changes in it."""
-    model = build_model(hand, slots, largest, config, gravity, backend)
     joints, free = [model.joint(name) for name in hand.joint_names], model.joint("object")
     geoms = np.array([model.geom(f"object_{k}").id for k in range(len(slots))])
     pairs, tips = contact.pairs_with(model, geoms), tip_bodies(model, hand)
+    compliance, share, _ = contact.pair_constants(model, pairs, tips)
+    model.pair_solref[pairs], model.pair_solimp[pairs] = contact.spring(
+        compliance, share * contact.NOMINAL, 2.0, period=config.contact_period
+    )
     rubber, growth = contact.rubber_geoms(model, pairs, tips)
     return PhysicsScene(
         hand=hand,
@@ -161,21 +144,11 @@ def _set_options(spec: mujoco.MjSpec, config: PhysicsConfig, gravity: tuple[floa
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     # A pyramid approximates the cone, and objects creep through the fingers at 12 to 25 mm/s with it.
     option.cone, option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, config.friction_ratio
-    if backend == "warp":
-        # Warp fuses the Hessian of elliptic cones only with a sparse Jacobian: 15 % faster here.
-        option.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
-    option.iterations, option.ls_iterations = config.iterations, config.line_search
-    if backend == "c":
-        # With the few iterations that are enough for Warp's line search, C MuJoCo's stops short: with 6 forces were off
-        # by up to 28 N in grips, with 20 by 0.5 N where boxes land. It stops by itself once it has converged.
-        option.iterations, option.ls_iterations = max(config.iterations, 20), max(config.line_search, 50)
-    if backend == "cuda":
-        # Converged (the kernel stops by itself too): in moving states three iterations leave 2 to 4 N at the 90th
-        # percentile, with any engine.
-        option.iterations, option.ls_iterations = max(config.iterations, 10), max(config.line_search, 10)
+    option.iterations, option.ls_iterations = CONVERGED[backend]
+    option.iterations, option.tolerance = config.iterations or option.iterations, config.tolerance
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP  # it costs a factorisation more
     # A capsule over a cylinder's rim: the search for more than one contact answers with two at the same place, along
-    # the cylinder's axis instead of away from it, and too shallow. C MuJoCo and Warp both do.
+    # the cylinder's axis instead of away from it, and too shallow.
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_MULTICCD
     if backend != "c":
         # In MJX box-box has its own kernel only with nativeccd off. C MuJoCo has it anyway, and its older convex
@@ -185,4 +158,4 @@ def _set_options(spec: mujoco.MjSpec, config: PhysicsConfig, gravity: tuple[floa
     # capsules, one tick this finger, the next tick that one, so it stays off.
     for own in [numeric for numeric in spec.numerics if numeric.name in ("max_contact_points", "max_geom_pairs")]:
         spec.delete(own)
-    spec.add_numeric(name="max_contact_points", data=[float(config.max_contacts)], size=1)
+    spec.add_numeric(name="max_contact_points", data=[_MJX_CONTACTS], size=1)

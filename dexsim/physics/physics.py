@@ -1,21 +1,17 @@
 """`Physics`: the hand, an object and their contacts in one compiled scene, on the engine of choice.
 
-`advance` runs the scene for one control tick. Backends are `jax` (differentiable, any device), `cuda` (one kernel for a
-tick, many times faster on NVIDIA GPUs), `warp` (MuJoCo's own for those) and `c` (C MuJoCo on the CPU's cores);
-`mujoco.mjx` is not imported before a scene is compiled.
+`advance` runs the scene for one control tick. Backends are `c` (C MuJoCo on the CPU's cores), `cuda` (one kernel for a
+tick, on NVIDIA GPUs) and `mjx` (MuJoCo's `mjx.step`: any device, with gradients), which is not imported before a scene
+is compiled.
 """
 
-import importlib.util
-import warnings
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dexsim.core.compilation import is_deterministic
-from dexsim.core.errors import AssetError, ConfigError, DexsimWarning
+from dexsim.core.errors import ConfigError
 from dexsim.core.install import install_line
 from dexsim.core.pytree import choose
 from dexsim.hand.kinematics import Hand, HandPose
@@ -25,36 +21,26 @@ from dexsim.physics.c_backend import CBackend
 from dexsim.physics.config import PhysicsConfig
 from dexsim.physics.cuda.backend import CudaBackend
 from dexsim.physics.interface import Backend, ContactParams, PhysicsScene, PhysicsState, StepResult, TorqueLaw
-from dexsim.physics.jax_backend import JaxBackend
+from dexsim.physics.mjx_backend import MjxBackend
 from dexsim.physics.model import build_scene
-from dexsim.physics.warp_backend import WarpBackend
+from dexsim.physics.parameters import configured
 
-BACKENDS: dict[str, Callable[..., Backend]] = {
-    "jax": JaxBackend,
-    "cuda": CudaBackend,
-    "warp": WarpBackend,
-    "c": CBackend,
-}
+BACKENDS: dict[str, Callable[[PhysicsScene], Backend]] = {"c": CBackend, "cuda": CudaBackend, "mjx": MjxBackend}
 
 
 def choose_backend(backend: str) -> str:
-    """The name of a backend. `auto`: c on a CPU, cuda on an NVIDIA GPU, else jax.
+    """The name of a backend. `auto`: c on a CPU, cuda on an NVIDIA GPU, else mjx.
 
     Raises:
-      ConfigError: no such backend, or its library or device is missing.
+      ConfigError: no such backend, or its device is missing.
     """
     if backend not in ("auto", *BACKENDS):
         raise ConfigError(f"backend {backend!r}: choose from auto, {', '.join(BACKENDS)}")
     device = jax.default_backend()
     if backend == "auto":
-        return "c" if device == "cpu" else "cuda" if _on_nvidia() else "jax"
+        return "c" if device == "cpu" else "cuda" if _on_nvidia() else "mjx"
     if backend == "cuda" and not _on_nvidia():
         raise ConfigError(f"backend 'cuda' needs an NVIDIA GPU, and JAX for it: {install_line('cuda')}")
-    if backend == "warp" and importlib.util.find_spec("warp") is None:
-        raise ConfigError(f"backend 'warp' needs the extra: {install_line('warp')}")
-    if backend == "warp" and is_deterministic():
-        # Warp has a mode for it (1.18), in which contacts get lost: mujoco_warp, issue 1635.
-        raise ConfigError("backend 'warp' does not repeat to the last bit: choose cuda, or leave out --deterministic")
     if backend == "c" and device != "cpu":
         raise ConfigError("backend 'c' runs on the CPU's cores: set JAX_PLATFORMS=cpu")
     return backend
@@ -76,7 +62,6 @@ class Physics:
         *,
         gravity: tuple[float, float, float],
         backend: str = "auto",
-        num_envs: int = 1,
     ):
         """Compile.
 
@@ -86,28 +71,16 @@ class Physics:
           largest: [K, 3] m, the largest size of each slot (broad phase bounds).
           config: solver and contact model.
           gravity: m/s^2 in the palm frame, which is the world's.
-          backend: "auto", "jax", "cuda", "warp" or "c". `auto` leaves scenes that do not fit into the kernel to jax.
-          num_envs: batch size that a backend reserves memory for.
+          backend: "auto", "c", "cuda" or "mjx".
 
         Raises:
           AssetError: the model uses what the backend ignores or lacks.
           ConfigError: see `choose_backend`.
         """
         self.backend = choose_backend(backend)
-
-        def start(backend: str) -> tuple[PhysicsScene, Backend]:
-            scene = build_scene(hand, slots, largest, config, gravity, backend)
-            return scene, BACKENDS[backend](scene, num_envs)
-
-        try:
-            scene, self.engine = start(self.backend)
-        except AssetError as error:
-            if (backend, self.backend) != ("auto", "cuda"):
-                raise
-            warnings.warn(f"{error}; backend jax instead, which is slower", DexsimWarning, stacklevel=2)
-            self.backend = "jax"
-            scene, self.engine = start("jax")
-        self.hand, self.config, self.scene = hand, config, scene
+        self.hand, self.config = hand, config
+        self.scene = scene = build_scene(hand, slots, largest, config, gravity, self.backend)
+        self.engine = BACKENDS[self.backend](scene)
         self.mj_model = scene.model
         self.joint_qpos, self.joint_dof = scene.joint_qpos, scene.joint_dof
         self.object_qpos, self.object_dof = scene.object_qpos, scene.object_dof
@@ -142,9 +115,10 @@ class Physics:
         object: ObjectParams,
         tip_stiffness: jax.Array | None = None,
         pad_thickness_delta: jax.Array | float = 0.0,
-    ) -> Any:
-        """The engine's model of one environment (`Backend.configure`); arguments as in `contact_params`."""
-        return self.engine.configure(object, self.contact_params(object, tip_stiffness, pad_thickness_delta))
+    ) -> dict[str, jax.Array]:
+        """What the model of one environment has in place of the scene's, by the names of `mujoco.MjModel`; arguments
+        as in `contact_params`."""
+        return configured(self.scene, object, self.contact_params(object, tip_stiffness, pad_thickness_delta))
 
     def contact_params(
         self,

@@ -1,6 +1,6 @@
 """Self-test of the randomisation: does drawing a range change the model, and then the motion?
 
-    python -m dexsim.randomization_check --task grasp --backend warp
+    python -m dexsim.randomization_check --task grasp --backend cuda
 
 Every range is drawn by itself, all others at their nominal values. The same starts and actions are
 then run with and without it, and the table says what changed in the drive or the compiled model,
@@ -16,7 +16,7 @@ from typing import Literal
 import jax
 
 from dexsim.core import cli
-from dexsim.core.compilation import collector_paused, jit
+from dexsim.core.compilation import jit
 from dexsim.core.config import Config, setting
 from dexsim.core.errors import ConfigError
 from dexsim.randomization_check.effects import Effect, check
@@ -51,7 +51,7 @@ class CheckArguments(Config):
 
     task: str = "grasp"
     """Name of the task, which gets its default configuration; my_module:poke for a task of your own."""
-    backend: Literal["auto", "jax", "cuda", "warp", "c"] = setting("auto")
+    backend: Literal["auto", "c", "cuda", "mjx"] = setting("auto")
     """Physics backend. auto: c on a CPU, cuda on an NVIDIA GPU, otherwise jax."""
     num_envs: int = setting(16, unit="1", low=2, high=65536)
     """Hands sampled for each range."""
@@ -75,10 +75,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     if entry.environment:
         raise ConfigError(f"--task {arguments.task}: is no task on a hand: it has no randomisation to check")
     config = dataclasses.replace(entry.config(), pool_size=80)
-    env = make(arguments.task, config, backend=arguments.backend, num_envs=arguments.num_envs)
+    env = make(arguments.task, config, backend=arguments.backend)
     keys = jax.random.split(jax.random.key(arguments.seed), arguments.num_envs)
-    with collector_paused():
-        states = jax.block_until_ready(jit(jax.vmap(env.reset), once=True)(keys))
+    states = jit(jax.vmap(env.reset), once=True)(keys)
     step = jit(jax.vmap(env.step), backend=env.backend)
     effects = check(env, step, states, key=jax.random.key(arguments.seed + 1), ticks=arguments.ticks)
     print(f"{arguments.task} on {env.backend}, {arguments.num_envs} hands, {arguments.ticks} ticks")

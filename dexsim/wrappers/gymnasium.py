@@ -1,6 +1,6 @@
 """Our environments as one Gymnasium vector environment, for trainers of other libraries (extra `gym`).
 
-    env = GymVectorEnv(dexsim.make("grasp", num_envs=64), 64)
+    env = GymVectorEnv(dexsim.make("grasp"), 64)
     observation, info = env.reset(seed=0)
     observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
 

@@ -42,11 +42,11 @@ class TrainArguments(Generic[EnvConfig]):
     """Seed of everything random."""
     seeds: int = setting(1, unit="1", low=1, high=1000)
     """Seeds to train in turn, from --seed on; --steps and --minutes are those of each."""
-    backend: Literal["auto", "jax", "cuda", "warp", "c"] = setting("auto")
-    """Physics backend. auto: c on a CPU, cuda on an NVIDIA GPU, otherwise jax."""
+    backend: Literal["auto", "c", "cuda", "mjx"] = setting("auto")
+    """Physics backend. auto: c on a CPU, cuda on an NVIDIA GPU, otherwise mjx."""
     deterministic: bool = False
-    """On a GPU, have XLA order its sums and refuse Warp, at a cost in speed, so that a training repeats from one
-    seed. On a CPU trainings repeat anyway."""
+    """On a GPU, have XLA order its sums, at a cost in speed, so that a training repeats from one seed. On a CPU
+    trainings repeat anyway."""
     preset: Literal["auto", "cpu", "cpu-large", "gpu"] = setting("auto")
     """Default sizes and durations. auto: those of the device found; cpu-large is for 16 cores and more."""
     steps: float = setting(0.0, unit="environment steps", low=0.0)

@@ -15,7 +15,6 @@ import jax.numpy as jnp
 from jax.sharding import Mesh
 
 from dexsim.core import cli
-from dexsim.core.compilation import collector_paused
 from dexsim.core.config import to_dict
 from dexsim.core.errors import ConfigError
 from dexsim.env.evaluation import evaluation_of
@@ -91,9 +90,8 @@ class Run:
         self.clock = {"setup_s": time.perf_counter() - started}
 
     def _evaluation_env(self) -> Environment:
-        """The training environment, or one of its own: Warp sizes buffers by the batch, and training has extremes and
-        no force loop."""
-        if self.env.backend != "warp" and training_config(self.arguments) is self.arguments.env:
+        """The training environment, or one of its own where training has extremes or no force loop."""
+        if training_config(self.arguments) is self.arguments.env:
             return self.env
         import dexsim
 
@@ -101,7 +99,6 @@ class Run:
             self.arguments.task,
             self.arguments.env,
             backend=self.env.backend,
-            num_envs=self.arguments.evaluation_chunk,
             hand=getattr(self.env, "hand", None),
         )
 
@@ -125,7 +122,7 @@ class Run:
             display.note(f"compiled in {self.clock['compile_s']:.1f} s")
             if memory := check_memory(step, self.config.num_envs // devices):
                 display.note(memory)
-            display.working("first update" + (": compiling Warp's kernels" if self.env.backend == "warp" else ""))
+            display.working("first update")
             log = MetricsLog(self.folder, int(state.iteration), arguments) if processes.is_first() else None
             try:
                 self._loop(state, step, display, log, stopped)
@@ -175,10 +172,9 @@ class Run:
         faults, evaluated = Faults(self.config, self.folder, self.content(), state), iteration == 0
         while not stopped() and not processes.agree(self._is_over(iteration)):
             call = time.perf_counter()
-            with collector_paused():
-                before = keep(state)
-                state, metrics = step(state)
-                metrics = jax.device_get(metrics)
+            before = keep(state)
+            state, metrics = step(state)
+            metrics = jax.device_get(metrics)
             now, iteration = time.perf_counter(), iteration + per_call
             if "first_update_s" not in self.clock:
                 self.clock |= {"first_update_s": now - self.started, "first_call_s": now - call}
@@ -202,7 +198,7 @@ class Run:
         self.clock["training_s"] = time.perf_counter() - begin
         self.clock["step_s"] = self.clock["training_s"] - spent_elsewhere
         self.clock["env_steps"] = iteration * self.config.steps_per_iteration
-        # The first call is left out of the rate: Warp compiles its kernels in it.
+        # The first call is left out of the rate: what is compiled or loaded at first use is in it.
         steps = max(iteration - first - per_call, 0) * self.config.steps_per_iteration
         self.clock["env_steps_per_s"] = steps / max(self.clock["step_s"] - self.clock.get("first_call_s", 0.0), 1e-9)
         if self.best["return"] is not None and not stopped() and not evaluated:

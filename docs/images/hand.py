@@ -37,7 +37,7 @@ VIEWS = {  # turned and nearer than the presets; the grasp's leaves room for the
 def film(task: str, world: int, worlds: int = 16) -> Snapshot:
     """Snapshots [T] of one of several episodes of a shipped policy; the grasp's command changes in steps."""
     policy = load_policy(task)
-    env = policy.make_env(num_envs=worlds)
+    env = policy.make_env()
     reset, step = jax.jit(jax.vmap(env.reset)), jax.jit(jax.vmap(env.step))
     show = jax.jit(jax.vmap(functools.partial(dexsim.take_snapshot, env)))
     state, carry = reset(jax.random.split(jax.random.key(0), worlds)), policy.initial_carry(worlds)

@@ -39,10 +39,10 @@ def throughput(monkeypatch):
 @pytest.mark.slow
 def test_a_row_for_each_engine_and_size(throughput, capsys, tmp_path):
     file = tmp_path / "rows.json"
-    words = f"--backends c jax --num-envs 4 8 --steps 4 --repeats 2 --json {file}"
+    words = f"--backends c mjx --num-envs 4 8 --steps 4 --repeats 2 --json {file}"
     assert throughput.main(words.split()) == 0
     rows = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    assert [(row["backend"], row["num_envs"]) for row in rows] == [("c", 4), ("jax", 4), ("c", 8), ("jax", 8)]
+    assert [(row["backend"], row["num_envs"]) for row in rows] == [("c", 4), ("mjx", 4), ("c", 8), ("mjx", 8)]
     assert all(row["env_steps_per_s"] > 0 and row["measure"] == "environment" for row in rows)
     assert json.loads(file.read_text())["rows"] == rows
 

@@ -113,7 +113,7 @@ def test_bridge_and_simulation_show_the_policy_the_same_command_and_send_the_sam
     config = GraspConfig(pool_size=64)
     observation = dataclasses.replace(config.observation, force=ForceEstimate(per_torque=(8.0, 15.0, 13.0, 14.0, 15.0)))
     control = dataclasses.replace(config.control, force=dataclasses.replace(LOOP, gain=5.0))
-    env = dexsim.make("grasp", dataclasses.replace(config, observation=observation, control=control), num_envs=8)
+    env = dexsim.make("grasp", dataclasses.replace(config, observation=observation, control=control))
 
     class Close:
         task, spec, control_rate = env.name, env.spec, 1 / env.control_period

@@ -416,37 +416,6 @@ def test_a_range_that_is_lost_is_found_out(grasp_env, grasp_rollout, fresh, monk
     assert conclude(effects[2:]) == 0
 
 
-@pytest.mark.slow
-def test_runs_that_differ_hide_no_range_and_invent_none(grasp_env, grasp_rollout, fresh):
-    """As on the Warp backend: no two runs are alike, and contacts let them part further with every tick."""
-    rng = np.random.default_rng(0)
-
-    def unsteady(states, action, forgetful=False):
-        drawn = states.episode.hand
-        if forgetful:
-            calm = dataclasses.replace(drawn.actuator, viscous_friction=0 * drawn.actuator.viscous_friction)
-            states = with_episode(states, hand=dataclasses.replace(drawn, actuator=calm))
-        after = grasp_rollout.step(states, action)
-        noise = jnp.asarray(1e-6 * rng.standard_normal(after.physics.qvel.shape), jnp.float32)
-        physics = dataclasses.replace(after.physics, qvel=after.physics.qvel + noise * jnp.abs(after.physics.qvel))
-        return with_episode(dataclasses.replace(after, physics=physics), hand=drawn)
-
-    noisy = copy.copy(grasp_env)
-    noisy.backend = "warp"
-    names = (
-        "Randomization.viscous_friction",
-        "Randomization.encoder_bias",
-        "Randomization.torque_gain",
-        "ObjectConfig.com_offset",
-    )
-    effects = check(noisy, unsteady, fresh, key=jax.random.key(0), ticks=6, names=names)
-    assert all(effect.found and effect.changed for effect in effects), table(effects)
-    (lost,) = check(
-        noisy, lambda *a: unsteady(*a, forgetful=True), fresh, key=jax.random.key(0), ticks=6, names=names[:1]
-    )
-    assert not lost.found and lost.changed == ("actuator.viscous_friction",), table([lost])
-
-
 def test_a_range_without_width_is_off_and_no_error(grasp_env, grasp_rollout, fresh):
     config = dataclasses.replace(grasp_env.config, randomization=Randomization(ripple=(0.0, 0.0)))
     still = copy.copy(grasp_env)

@@ -64,7 +64,7 @@ def test_evaluation_by_name_and_from_python_agree(run, tmp_path, capsys):
     report = evaluate_policy(run.folder / "last.msgpack", episodes=4, chunk=4, backend="c", seed=5)
     code = evaluate_command.main(
         [str(run.folder / "last.msgpack"), "--task", "poke_task:poke", "--episodes", "4", "--chunk", "4"]
-        + ["--backend", "jax", "--seed", "5", "--output", str(tmp_path / "report.json")]
+        + ["--backend", "c", "--seed", "5", "--output", str(tmp_path / "report.json")]
     )
     written = json.loads((tmp_path / "report.json").read_text())
     assert code == 0 and "poke" in capsys.readouterr().out
@@ -75,7 +75,7 @@ def test_another_environment_is_warned_of(run, monkeypatch):
     monkeypatch.setattr("dexsim_ppo.evaluate.Evaluator", lambda env, chunk: lambda params, **options: ({}, None))
     other = load_policy(run.folder / "last.msgpack")
     changed = override(other.env_config, ["gain=1.5"])
-    env = registry.make("poke", registry.find_task("poke").config_class(gain=1.5), backend="c", num_envs=4)
+    env = registry.make("poke", registry.find_task("poke").config_class(gain=1.5), backend="c")
     with pytest.warns(OtherEnvWarning, match=r"gain = 1\.5 \(trained: 3\.0\)"):
         evaluate_policy(other, env=env, episodes=4, chunk=4)
     assert changed["gain"] == 1.5

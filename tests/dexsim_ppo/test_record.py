@@ -19,7 +19,7 @@ from dexsim_ppo import load_policy, record
 
 @pytest.fixture(scope="module")
 def env():
-    return dexsim.make("grasp", GraspConfig(pool_size=80), backend="c", num_envs=3)
+    return dexsim.make("grasp", GraspConfig(pool_size=80), backend="c")
 
 
 @pytest.fixture(scope="module")

@@ -166,7 +166,7 @@ def test_the_grasp_holds_and_presses_as_asked():
 
     A hand that does nothing drops every object, so that holding says something.
     """
-    env = dexsim.make("grasp", GraspConfig(pool_size=20), backend="c", num_envs=WORLDS)
+    env = dexsim.make("grasp", GraspConfig(pool_size=20), backend="c")
     goals = GraspGoal(jnp.tile(jnp.array([0.0, 1.0]), WORLDS // 2), jnp.ones(WORLDS, bool))
     pairs = jnp.repeat(jnp.arange(WORLDS // 2), 2)
     rows = jnp.array([1, 6, 11, 16])[pairs]  # of different shapes
@@ -189,7 +189,7 @@ def test_the_rotation_policies_turn(name):
     policy = load_policy(name)
     config = from_dict(TASKS[policy.task].config_class, policy.env_config)
     config = dataclasses.replace(config, pool_size=WORLDS)
-    env = dexsim.make(policy.task, config, backend="c", num_envs=WORLDS)
+    env = dexsim.make(policy.task, config, backend="c")
     starts = jit(jax.vmap(reset_to(env)), once=True)(jax.random.split(jax.random.key(0), WORLDS), jnp.arange(WORLDS))
     play = player(env)
     dropped, _, metrics = play(starts, 4.0, policy)

@@ -135,10 +135,10 @@ def _set_springs(model: mujoco.MjModel, target, settling: float, tips=None) -> N
     pairs = np.flatnonzero(model.geom_bodyid[model.pair_geom2] == model.body("object").id)
     links, first = model.geom_bodyid[model.pair_geom1[pairs]], model.geom_type[model.pair_geom1[pairs]]
     pad = 0.5 if tips is None else np.array([0.5 * tips.get(body, 0.0) for body in links])
-    wanted = stiffness * np.where(first == mujoco.mjtGeom.mjGEOM_SPHERE, pad, 2.5)
+    spring = stiffness * np.where(first == mujoco.mjtGeom.mjGEOM_SPHERE, pad, 2.5)
     weight = model.body_invweight0[links, 0] + model.body_invweight0[model.body("object").id, 0]
     # mj_diagApprox and mj_makeImpedance: R = weight (1 - d) / d, and at rest N = aref / R.
-    d = weight / (weight + 1 / (settling**2 * wanted))
+    d = weight / (weight + 1 / (settling**2 * spring))
     model.pair_solref[pairs] = np.stack([-d / settling**2, -2 * ratio * d / settling], -1)
     model.pair_solimp[pairs] = np.stack([d, d, *np.tile([[0.001], [0.5], [2]], len(d))], -1)
 
@@ -219,12 +219,12 @@ def squeeze(hand, begun, rng: np.random.Generator, steps=100):
     """
     model = compile_scene(hand, begun.object, exact=bool(begun.object.active[2]), **CONVERGED)
     data = start(model, begun.qpos, 0 * begun.qvel)
-    wanted = begun.qpos[:12] + rng.uniform(0.3, 0.8, 12) * (np.arange(12) > 3)
-    wanted[1:3] += rng.uniform(0.0, 0.5, 2)
+    angle = begun.qpos[:12] + rng.uniform(0.3, 0.8, 12) * (np.arange(12) > 3)
+    angle[1:3] += rng.uniform(0.0, 0.5, 2)
     model.opt.gravity[:] = 0
     for _ in range(steps):
         position, velocity = data.qpos[:12], data.qvel[:12]
-        reach = np.clip(wanted - position, -0.3, 0.3)
+        reach = np.clip(angle - position, -0.3, 0.3)
         torque = np.clip(3 * reach - 0.1 * velocity, -hand.torque_limit, hand.torque_limit)
         data.qfrc_applied[:12] = torque
         mujoco.mj_step(model, data)

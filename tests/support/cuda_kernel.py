@@ -5,7 +5,7 @@ import jax.numpy as jnp
 
 from dexsim.env.motors import JointCommand
 from dexsim.physics.cuda.law import print_law
-from dexsim.physics.host.law import record
+from dexsim.physics.law import record
 from dexsim.physics.model import build_scene
 
 

@@ -34,8 +34,8 @@ def pd_torque(target: np.ndarray, position: np.ndarray, velocity: np.ndarray) ->
 def read_fields(scene: PhysicsScene, model: mujoco.MjModel) -> States:
     """What one world has in place of the scene's constants; one friction for both directions."""
     where = places(scene)
-    found = {name: np.array(getattr(model, name)[where[name]]) for name in FIELDS}
-    return found | {"pair_friction": found["pair_friction"][:, 0]}
+    fields = {name: np.array(getattr(model, name)[where[name]]) for name in FIELDS}
+    return fields | {"pair_friction": fields["pair_friction"][:, 0]}
 
 
 def write_fields(scene: PhysicsScene, model: mujoco.MjModel, states: States, row: int) -> None:

@@ -15,7 +15,7 @@ class SimplePhysics:
     """Each joint is a mass of its own under torque and damping; the object falls, and fingers that turned feel it."""
 
     def __init__(self, hand, slots, largest, config, **options):
-        self.backend, self.config = "jax", config
+        self.backend, self.config = "mjx", config
         self.joint_qpos, self.joint_dof = np.arange(12), np.arange(12)
         self.object_qpos, self.object_dof = np.arange(12, 19), np.arange(12, 18)
         del options

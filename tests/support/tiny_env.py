@@ -86,9 +86,8 @@ class TinyEnv:
         for group in ("actor", "critic")
     }
 
-    def __init__(self, config: TinyConfig | None = None, *, backend: str = "jax", num_envs: int = 1):
-        del num_envs
-        self.config, self.backend = config or TinyConfig(), "jax" if backend == "auto" else backend
+    def __init__(self, config: TinyConfig | None = None, *, backend: str = "mjx"):
+        self.config, self.backend = config or TinyConfig(), "mjx" if backend == "auto" else backend
         self.traces = 0
 
     def _start(self, key: jax.Array) -> TinyState:

@@ -15,9 +15,9 @@ QUICK += "--ppo.critic-layers 8 --evaluation-chunk 16 --evaluation-episodes 16".
 PER_ITERATION = 16 * 8  # steps of QUICK
 
 
-def make(task, config=None, *, backend="auto", num_envs=1, **_):
+def make(task, config=None, *, backend="auto", **_):
     assert task == "tiny"
-    return TinyEnv(config, backend=backend, num_envs=num_envs)
+    return TinyEnv(config, backend=backend)
 
 
 def install(patch):

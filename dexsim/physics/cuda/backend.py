@@ -12,41 +12,33 @@ import jax.numpy as jnp
 from dexsim.core.errors import ConfigError
 from dexsim.objects.params import ObjectParams
 from dexsim.physics.cuda import launch
-from dexsim.physics.cuda.arguments import Settings
-from dexsim.physics.cuda.contact_tables import contact_constants
 from dexsim.physics.cuda.law import PrintedLaw, print_law
 from dexsim.physics.cuda.program import compile_kernel, find_compiler, source
-from dexsim.physics.cuda.scene import buffers, kernel_constants
-from dexsim.physics.host.law import Recorded, one_by_one, record
+from dexsim.physics.cuda.scene import Settings, buffers, kernel_constants
 from dexsim.physics.interface import ContactParams, PhysicsScene, PhysicsState, StepResult, TorqueLaw
-from dexsim.physics.parameters import configured, values
+from dexsim.physics.law import record
+from dexsim.physics.parameters import values
 
-# Newton's method stops at this decrement, and its line search at this share of it: forces are then as near to C
-# MuJoCo's as float32 allows.
+# Newton's method stops at this decrement at least, and its line search at this share of it: forces are then as near to
+# C MuJoCo's as float32 allows.
 _TOLERANCE, _LINE_SEARCH_TOLERANCE = 1e-5, 0.01
 
 
 class CudaBackend:
     """`dexsim.physics.interface.Backend` in CUDA."""
 
-    def __init__(self, scene: PhysicsScene, num_envs: int = 1):
-        """Every world has its own memory, so `num_envs` reserves nothing.
+    def __init__(self, scene: PhysicsScene):
+        """The kernel is compiled when a program is traced.
 
         Raises:
           AssetError: the scene has what the kernel lacks.
           ConfigError: the driver or the compiler is missing.
         """
-        del num_envs
         self.scene = scene
-        kernel_constants(scene), contact_constants(scene)
-        find_compiler(), launch.architecture()
-        self._loaded: dict[tuple[PrintedLaw, int], str] = {}
+        kernel_constants(scene), find_compiler(), launch.architecture()
+        self._loaded: dict[PrintedLaw, str] = {}
         self._tick = jax.custom_jvp(self._call, nondiff_argnums=(0,))
         self._tick.defjvp(_no_gradient)
-
-    def configure(self, object: ObjectParams, contacts: ContactParams) -> dict[str, jax.Array]:
-        """What the model of one environment has in place of the scene's, by the names of `mujoco.MjModel`."""
-        return configured(self.scene, object, contacts)
 
     def advance(
         self,
@@ -56,44 +48,38 @@ class CudaBackend:
         torque: TorqueLaw,
         push: jax.Array,
     ) -> StepResult:
-        """One control tick in one launch, or one for each sub-step if the law cannot be printed."""
-        given = self._inputs(object, contacts, push)
-
-        def run(law: Recorded, state: PhysicsState, substeps: int) -> StepResult:
-            name, moving = self._load(law, substeps), (state.qpos, state.qvel, state.warmstart)
-            qpos, qvel, warmstart, force, _ = self._tick(name, *moving, *given, *map(jnp.asarray, law.constants))
-            return StepResult(PhysicsState(qpos, qvel, warmstart), force)
-
-        def substep(torque: TorqueLaw, state: PhysicsState) -> StepResult:
-            law = self._record(torque)
-            assert law is not None
-            return run(law, state, 1)
-
-        law = self._record(torque)
-        if law is None:
-            return one_by_one(self.scene, substep, torque, state)
-        return run(law, state, self.scene.config.substeps)
-
-    def _record(self, torque: TorqueLaw) -> Recorded | None:
-        return record(torque, jnp.zeros(len(self.scene.joint_dof)))
+        """One control tick in one launch."""
+        joints = len(self.scene.joint_dof)
+        law = record(torque, jnp.zeros(joints))
+        name, moving = self._load(print_law(law, joints)), (state.qpos, state.qvel, state.warmstart)
+        constant = self._inputs(object, contacts, push)
+        qpos, qvel, warmstart, force, _ = self._tick(name, *moving, *constant, *map(jnp.asarray, law.constants))
+        return StepResult(PhysicsState(qpos, qvel, warmstart), force)
 
     def _inputs(self, object: ObjectParams, contacts: ContactParams, push: jax.Array) -> list[jax.Array]:
         """What of a tick stays the same, in the order of the kernel's buffers."""
-        found = values(self.scene, object, contacts) | {"push": push, "pair_friction": contacts.friction}
-        if "geom_quat" not in found:
-            found["geom_quat"] = jnp.tile(jnp.array([1.0, 0.0, 0.0, 0.0]), (len(self.scene.slots), 1))
+        inputs = values(self.scene, object, contacts) | {"push": push, "pair_friction": contacts.friction}
+        if "geom_quat" not in inputs:
+            inputs["geom_quat"] = jnp.tile(jnp.array([1.0, 0.0, 0.0, 0.0]), (len(self.scene.slots), 1))
         names = [buffer.name for buffer in buffers(self.scene, ()) if not buffer.output][3:]
-        return [jnp.asarray(found[name], jnp.float32) for name in names]
+        return [jnp.asarray(inputs[name], jnp.float32) for name in names]
 
-    def _load(self, recorded: Recorded, substeps: int) -> str:
+    def _load(self, law: PrintedLaw) -> str:
         """The name of the kernel with this law, compiled and loaded."""
-        law = print_law(recorded, len(self.scene.joint_dof))
-        if (law, substeps) not in self._loaded:
-            code, option = compile_kernel(source(self.scene, law), launch.architecture()), self.scene.model.opt
-            limits = int(option.iterations), int(option.ls_iterations)
-            settings = Settings(substeps, *limits, _TOLERANCE, _LINE_SEARCH_TOLERANCE)
-            self._loaded[law, substeps] = launch.load(code, settings, len(buffers(self.scene, law.buffers)))
-        return self._loaded[law, substeps]
+        if law not in self._loaded:
+            model, code = self.scene.model, compile_kernel(source(self.scene, law), launch.architecture())
+            # MuJoCo's tolerance is of the cost over (mean inertia) (degrees of freedom), of which Newton's decrement
+            # p^T H p is twice what the next step would improve.
+            tolerance = max(_TOLERANCE, 2 * float(model.opt.tolerance * model.stat.meaninertia * model.nv))
+            settings = Settings(
+                substeps=self.scene.config.substeps,
+                iterations=int(model.opt.iterations),
+                line_search=int(model.opt.ls_iterations),
+                tolerance=tolerance,
+                line_search_tolerance=_LINE_SEARCH_TOLERANCE,
+            )
+            self._loaded[law] = launch.load(code, settings, len(buffers(self.scene, law.buffers)))
+        return self._loaded[law]
 
     def _call(self, name: str, *arguments: jax.Array) -> list[jax.Array]:
         shapes = [array.shape for array in arguments[:3]] + [(self.scene.hand.num_fingers, 3), (4,)]
@@ -101,4 +87,4 @@ class CudaBackend:
 
 
 def _no_gradient(*_: Any) -> Any:
-    raise ConfigError("backend 'cuda' has no gradient: make the environment with backend='jax'")
+    raise ConfigError("backend 'cuda' has no gradient: make the environment with backend='mjx'")

@@ -12,8 +12,8 @@ import jax
 
 from dexsim.core.errors import ConfigError
 from dexsim.physics import ffi
-from dexsim.physics.cuda.arguments import Settings, args_type
 from dexsim.physics.cuda.program import ENTRY, SHARED_BYTES, WORLDS_PER_BLOCK
+from dexsim.physics.cuda.scene import Settings, args_type
 
 TARGET = "dexsim_cuda"
 TRAITS = 1
@@ -66,14 +66,14 @@ def architecture() -> str:
     Raises:
       ConfigError: they differ.
     """
-    found = {
+    kinds = {
         f"sm_{driver().attribute(_MAJOR, device)}{driver().attribute(_MINOR, device)}" for device in _local_devices()
     }
-    if len(found) != 1:
+    if len(kinds) != 1:
         raise ConfigError(
-            f"backend 'cuda': GPUs of one kind, not of {', '.join(sorted(found))}: choose with CUDA_VISIBLE_DEVICES"
+            f"backend 'cuda': GPUs of one kind, not of {', '.join(sorted(kinds))}: choose with CUDA_VISIBLE_DEVICES"
         )
-    return found.pop()
+    return kinds.pop()
 
 
 def _local_devices() -> list[int]:
@@ -108,7 +108,7 @@ class Kernel:
     def _load(self, device: int) -> int:
         """Load the code on a GPU now, since it must not be during a capture. Returns a world's shared memory, bytes."""
         context, old, function = ctypes.c_void_p(), ctypes.c_void_p(), ctypes.c_void_p()
-        address, size, found = ctypes.c_uint64(), ctypes.c_size_t(), ctypes.c_uint()
+        address, size, shared = ctypes.c_uint64(), ctypes.c_size_t(), ctypes.c_uint()
         cuda = driver()
         cuda.call("cuDevicePrimaryCtxRetain", ctypes.byref(context), device)  # XLA's, which keeps it
         cuda.call("cuCtxPushCurrent_v2", context)
@@ -116,10 +116,10 @@ class Kernel:
             cuda.call("cuKernelGetFunction", ctypes.byref(function), self.function)
             name = SHARED_BYTES.encode()
             cuda.call("cuLibraryGetGlobal", ctypes.byref(address), ctypes.byref(size), self.library, name)
-            cuda.call("cuMemcpyDtoH_v2", ctypes.byref(found), address, ctypes.c_size_t(ctypes.sizeof(found)))
+            cuda.call("cuMemcpyDtoH_v2", ctypes.byref(shared), address, ctypes.c_size_t(ctypes.sizeof(shared)))
         finally:
             cuda.call("cuCtxPopCurrent_v2", ctypes.byref(old))
-        return found.value
+        return shared.value
 
     def launch(self, stream: int, worlds: int, pointers: Sequence[int]) -> None:
         """Enqueue a tick of so many worlds on a stream; the stream's GPU runs it."""
@@ -128,8 +128,8 @@ class Kernel:
         args = self._args((ctypes.c_void_p * len(pointers))(*pointers), worlds, *dataclasses.astuple(self.settings))
         parameters = (ctypes.c_void_p * 1)(ctypes.addressof(args))
         blocks, threads = -(-worlds // WORLDS_PER_BLOCK), WORLDS_PER_BLOCK * 32
-        place, given = (blocks, 1, 1, threads, 1, 1, self.shared, ctypes.c_void_p(stream)), (parameters, None)
-        driver().call("cuLaunchKernel", self.function, *place, *given)
+        grid, launch = (blocks, 1, 1, threads, 1, 1, self.shared, ctypes.c_void_p(stream)), (parameters, None)
+        driver().call("cuLaunchKernel", self.function, *grid, *launch)
 
 
 # By the names that programs have for them. They stay: a program may run when its environment is gone.

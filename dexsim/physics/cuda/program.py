@@ -17,10 +17,8 @@ from dexsim.core.assets import cache_path
 from dexsim.core.errors import ConfigError
 from dexsim.core.files import make_private, read_private, write_whole
 from dexsim.core.install import install_line
-from dexsim.physics.cuda.arguments import declare_args
-from dexsim.physics.cuda.contact_tables import contact_constants
 from dexsim.physics.cuda.law import PrintedLaw
-from dexsim.physics.cuda.scene import buffers, kernel_constants
+from dexsim.physics.cuda.scene import buffers, declare_args, kernel_constants
 from dexsim.physics.interface import PhysicsScene
 
 WORLDS_PER_BLOCK = 8
@@ -55,7 +53,6 @@ def source(scene: PhysicsScene, law: PrintedLaw) -> str:
             '#include "warp.cuh"',
             declare_args(buffers(scene, law.buffers)),
             kernel_constants(scene),
-            contact_constants(scene),
             law.text,
             '#include "tick.cuh"',
             _ENTRY,

@@ -29,7 +29,7 @@ from dexsim.hand.kinematics import Hand, flexion_joints, hinge_angles
 from dexsim.objects.config import load_mesh_object
 from dexsim.objects.params import ObjectParams
 from dexsim.physics import contact
-from dexsim.physics.model import build_model, tip_bodies
+from dexsim.physics.model import build_scene, tip_bodies
 from dexsim.tasks.placement import clearance, palm_height
 from dexsim.tasks.rotate.objects import largest_size, lowest_point, sample_turned_object, slots
 
@@ -186,7 +186,7 @@ def _candidate(key: jax.Array, object: ObjectParams, hand: Hand, config: Any) ->
 
 def _model(hand: Hand, config: Any, gravity: tuple[float, float, float]) -> mujoco.MjModel:
     """The scene in C, with springs at the joints for the motors."""
-    model = build_model(hand, slots(config), largest_size(config), config.physics, gravity, "jax")
+    model = build_scene(hand, slots(config), largest_size(config), config.physics, gravity, "mjx").model
     dofs = [model.joint(name).dofadr[0] for name in hand.joint_names]
     model.jnt_stiffness[[model.joint(name).id for name in hand.joint_names]] = config.randomization.stiffness
     model.dof_damping[dofs] += config.randomization.damping

@@ -135,8 +135,8 @@ def test_a_private_folder(tmp_path):
 
 
 def test_compiled_code_is_not_loaded_from_a_folder_that_others_may_write_to(tmp_path, monkeypatch):
-    """JAX's and Warp's caches hold code as well."""
-    for name in ("DEXSIM_CACHE", "JAX_COMPILATION_CACHE_DIR", "WARP_CACHE_PATH"):
+    """JAX's cache holds code as well."""
+    for name in ("DEXSIM_CACHE", "JAX_COMPILATION_CACHE_DIR"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("DEXSIM_CACHE", str(tmp_path))
     (tmp_path / "xla").mkdir()
@@ -146,10 +146,8 @@ def test_compiled_code_is_not_loaded_from_a_folder_that_others_may_write_to(tmp_
         with pytest.warns(DexsimWarning, match=r"^no cache of compiled code: [^\n]*xla can be written by others"):
             cli.enable_caches()
         assert jax.config.jax_compilation_cache_dir is None
-        assert os.environ.pop("WARP_CACHE_PATH") == str(tmp_path / "warp")
         (tmp_path / "xla").chmod(0o700)
         cli.enable_caches()
         assert jax.config.jax_compilation_cache_dir == str(tmp_path / "xla")
     finally:
-        os.environ.pop("WARP_CACHE_PATH", None)
         jax.config.update("jax_compilation_cache_dir", before)

@@ -504,7 +504,7 @@ class TestReadings:
                 pool_size=4,
                 objects=ObjectConfig(shapes=("sphere",)),
             ),
-            backend="jax",
+            backend="c",
         )
         state = jit(env.reset, once=True)(jax.random.key(0))
         np.testing.assert_array_equal(state.readings.joint_position, state.physics.qpos[:12])
@@ -579,7 +579,7 @@ class TestSkinLaw:
     """The skin's law alone, before it is tied to the solver's total."""
 
     @pytest.mark.parametrize("shape", SHAPES)
-    def test_it_follows_the_force_of_the_jax_backend(self, hand, grasp_env, grips, shape):
+    def test_it_follows_the_force_of_the_solver(self, hand, grasp_env, grips, shape):
         """Few grips, of the whole environment: see `test_skin_law` for many of them."""
         pairs = skin_pairs(hand, grasp_env, grips[shape])
         force, felt = pairs[:, pairs[0] > 0.01]

@@ -335,7 +335,7 @@ def test_the_self_test_finds_every_range_of_taxels(make):
 def test_everything_at_once_on_the_real_physics():
     """A hand that grips and shakes, then holds still, with poor taxels: sober numbers."""
     config = GraspConfig(pool_size=80, sensing=Sensing(taxel=dataclasses.replace(POOR_TAXELS, rate=(10.0, 30.0))))
-    env = dexsim.make("grasp", config, backend="c", num_envs=8)
+    env = dexsim.make("grasp", config, backend="c")
     state = jax.jit(lambda key: jax.vmap(env.reset)(jax.random.split(key, 8)))(jax.random.key(0))
     step, restart = jax.jit(jax.vmap(env.step)), jax.jit(jax.vmap(env.restart))
     rng, gripped = np.random.default_rng(0), 0

@@ -28,7 +28,7 @@ def env():
     """Grasp over simple physics, with a pool of eight objects of which some are extreme."""
     patch = pytest.MonkeyPatch()
     patch.setattr("dexsim.env.env.Physics", SimplePhysics)
-    yield dexsim.make("grasp", GraspConfig(pool_size=8, objects=OBJECTS), backend="jax")
+    yield dexsim.make("grasp", GraspConfig(pool_size=8, objects=OBJECTS), backend="mjx")
     patch.undo()
 
 

@@ -28,7 +28,7 @@ def env():
             objects=ObjectConfig(shapes=("sphere",)),
             observation=ObservationConfig(add_critic=("object_orientation", "object_spin")),
         )
-        yield dexsim.make("grasp", config, backend="jax")
+        yield dexsim.make("grasp", config, backend="mjx")
 
 
 @pytest.fixture(scope="module")

@@ -88,7 +88,7 @@ def env(monkeypatch):
     monkeypatch.setattr("dexsim.env.env.Physics", SimplePhysics)
     monkeypatch.setattr(registry, "TASKS", dict(registry.TASKS))
     dexsim.register("balance", Balance)
-    return dexsim.make("balance", backend="c", num_envs=WORLDS)
+    return dexsim.make("balance", backend="c")
 
 
 def test_it_runs_from_reset_to_restart(env):

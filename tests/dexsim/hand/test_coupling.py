@@ -14,8 +14,6 @@ from dexsim.hand.load import load_hand
 from dexsim.physics.config import PhysicsConfig
 from dexsim.physics.interface import ContactParams, PhysicsState
 from dexsim.physics.model import build_scene
-from dexsim.physics.solver.substep import find_stepper
-from dexsim.physics.warp_backend import constraint_rows
 
 # References, an anchor beside the body's origin, and a ratio and an offset of their own.
 MJCF = """
@@ -131,7 +129,7 @@ def driven(hand, backend):
     from dexsim.physics.physics import BACKENDS
 
     scene = scene_of(hand, backend)
-    engine, goal = BACKENDS[backend](scene, 1), jnp.array([0.8, 1.0])
+    engine, goal = BACKENDS[backend](scene), jnp.array([0.8, 1.0])
     model, pairs = scene.model, scene.object_pairs
     contacts = ContactParams(
         jnp.asarray(model.pair_friction[pairs, 0]),
@@ -170,19 +168,10 @@ def test_driven_hinges_keep_their_ratio(coupled):
 
 
 @pytest.mark.slow
-def test_the_jax_backend_moves_them_alike(coupled):
-    ours, worst = driven(coupled, "jax")
+def test_mjx_moves_them_alike(coupled):
+    ours, worst = driven(coupled, "mjx")
     assert worst < 0.02
     np.testing.assert_allclose(ours, driven(coupled, "c")[0], atol=2e-3)
-
-
-def test_backends_leave_room_for_the_couplings(coupled, hand):
-    from mujoco import mjx
-
-    scene = scene_of(coupled, "jax")
-    assert scene.model.neq == 2
-    assert find_stepper(mjx, scene.model, scene.tip_bodies, max_contacts=4) is None
-    assert constraint_rows(PhysicsConfig(), coupled) - constraint_rows(PhysicsConfig(), hand) == 6 - 12
 
 
 COUPLE_A = '<joint name="couple_a" joint1="a_next" joint2="a" polycoef="0.05 1.3 0 0 0"/>'

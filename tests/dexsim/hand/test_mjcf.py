@@ -14,7 +14,7 @@ from dexsim.hand.mjcf import read_mjcf
 from dexsim.objects.config import ObjectConfig
 from dexsim.physics import contact
 from dexsim.physics.config import PhysicsConfig
-from dexsim.physics.model import build_model
+from dexsim.physics.model import build_scene
 from dexsim_real.twin.plant.parameters import sample_trial
 from dexsim_real.twin.plant.scene import _place
 from dexsim_real.twin.plant.scene import build_scene as emulated_scene
@@ -40,7 +40,7 @@ def rewrite(folder, *changes):
 
 
 def scene(hand):
-    return build_model(hand, ("box",), ObjectConfig().largest[:1], PhysicsConfig(), (0.0, 0.0, -9.81), "c")
+    return build_scene(hand, ("box",), ObjectConfig().largest[:1], PhysicsConfig(), (0.0, 0.0, -9.81), "c").model
 
 
 @pytest.mark.parametrize(
@@ -162,7 +162,7 @@ def test_options_of_the_file_do_not_reach_the_emulated_hands_scene(tmp_path):
 def test_names_that_the_scene_adds_do_not_meet_those_of_the_file(tmp_path):
     numeric = '<custom><numeric name="max_contact_points" data="1"/></custom>\n  <worldbody>'
     hand = load_hand(rewrite(tmp_path, ("thumb_pad_right", "thumb_pad_left_1"), ("<worldbody>", numeric)))
-    assert scene(hand).numeric("max_contact_points").data[0] == PhysicsConfig().max_contacts
+    assert scene(hand).numeric("max_contact_points").data[0] == 20
 
 
 def test_a_link_without_a_name_is_refused(tmp_path):

@@ -235,7 +235,7 @@ def test_a_mesh_is_turned_like_the_cube_that_it_is(simple, folder):
 @pytest.mark.slow
 def test_an_l_is_dropped_on_the_real_physics(folder):
     config = GraspConfig(pool_size=80, objects=ObjectConfig(mesh=str(folder / "ell.obj"), mesh_size=(0.9, 1.1)))
-    env = dexsim.make("grasp", config, backend="c", num_envs=8)
+    env = dexsim.make("grasp", config, backend="c")
     state = jit(lambda key: jax.vmap(env.reset)(jax.random.split(key, 8)), once=True)(jax.random.key(0))
     step, force, taxels = jit(jax.vmap(env.step), once=True), 0, 0
     (size,) = check(env, step, state, key=jax.random.key(1), ticks=9, names=["ObjectConfig.mesh_size"])

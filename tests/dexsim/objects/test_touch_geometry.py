@@ -45,7 +45,7 @@ def cuboid(tmp_path_factory):
 def gripped(objects):
     """An environment that feels by surface points, and batches of its states [WORLDS] while hands close."""
     config = GraspConfig(objects=objects, pool_size=16, skin=SKIN, touch_method="surface_points")
-    env = dexsim.make("grasp", config, backend="c", num_envs=WORLDS)
+    env = dexsim.make("grasp", config, backend="c")
     reset, step, states = jit(jax.vmap(reset_to(env)), once=True), jit(jax.vmap(env.step), once=True), []
     # Pools hold one shape after the other: two of each at a time. One batch's means scatter by a half of themselves.
     for batch in range(4):

@@ -12,7 +12,7 @@ from dexsim.objects.config import INACTIVE_SIZE, SHAPES, SLOTS, ObjectConfig
 from dexsim.objects.params import damping_ratio
 from dexsim.physics import contact
 from dexsim.physics.config import PhysicsConfig
-from dexsim.physics.model import build_model
+from dexsim.physics.model import build_scene
 from dexsim.physics.physics import Physics
 from dexsim.tasks.grasp.config import GraspConfig
 from dexsim.tasks.grasp.task import Grasp
@@ -99,9 +99,9 @@ def test_a_ball_bounces_as_configured(restitution, mass):
 
 def test_only_fingertips_wear_rubber(hand):
     bare, clad = (
-        build_model(
-            hand, SLOTS, np.full((3, 3), INACTIVE_SIZE), PhysicsConfig(pad_thickness=thickness), (9.81, 0, 0), "jax"
-        )
+        build_scene(
+            hand, SLOTS, np.full((3, 3), INACTIVE_SIZE), PhysicsConfig(pad_thickness=thickness), (9.81, 0, 0), "c"
+        ).model
         for thickness in (0.0, 0.003)
     )
     tips = {bare.body(hand.body_names[b]).id for b in hand.tip_body}
@@ -114,15 +114,15 @@ def test_only_fingertips_wear_rubber(hand):
 
 def test_who_is_how_stiff(hand):
     """A fingertip's spheres 1/2, its capsules none; other links and the palm 2.5."""
-    model = build_model(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(), (9.81, 0, 0), "jax")
+    model = build_scene(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(), (9.81, 0, 0), "c").model
     geoms = np.array([model.geom(f"object_{k}").id for k in range(3)])
     pairs = contact.pairs_with(model, geoms)
     tips = [model.body(hand.body_names[b]).id for b in hand.tip_body]
     _, share, finger = contact.pair_constants(model, pairs, np.array(tips))
-    for pair, found, whose in zip(pairs, share, finger, strict=True):
+    for pair, part, whose in zip(pairs, share, finger, strict=True):
         link = model.geom(model.pair_geom1[pair]).name
         name, _, rest = link.partition("_pad")
-        assert found == (0.5 if rest else 2.5), link
+        assert part == (0.5 if rest else 2.5), link
         assert whose == (hand.finger_names.index({"mid": "middle"}.get(name, name)) if rest else -1), link
         assert not link.endswith(("pad", "left", "right")), link
     assert np.bincount(finger + 1).tolist() == [3 * 6, 3 * 6, 9, 9, 9, 9]
@@ -130,7 +130,7 @@ def test_who_is_how_stiff(hand):
 
 def test_a_row_of_spheres_fills_its_capsule(hand):
     """Its ends are the capsule's; between them it is thinner by r - sqrt(r^2 - (l / 4)^2), below 0.8 mm."""
-    model = build_model(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(), (9.81, 0, 0), "jax")
+    model = build_scene(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(), (9.81, 0, 0), "c").model
     for name in ("thumb_pad_left", "thumb_pad_right", "index_pad", "mid_pad", "ring_pad", "pinky_pad"):
         pad = model.geom(name)
         turn = np.zeros(9)
@@ -147,13 +147,13 @@ def test_a_row_of_spheres_fills_its_capsule(hand):
 def test_springs_follow_the_skin(hand):
     """In squeezed hands every pair gets the spring that the second scene works out from C MuJoCo's own contacts."""
     law, rng = c_scene.skin_law(hand, Skin()), np.random.default_rng(4)
-    physics = Physics(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(), gravity=c_scene.GRAVITY, backend="jax")
+    physics = Physics(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(), gravity=c_scene.GRAVITY, backend="c")
     pool = Grasp(GraspConfig(pool_size=3 * len(SHAPES)), hand).make_pool(jax.random.key(3))
 
     @jax.jit
     def configure(target, qpos):
         model = physics.configure(target, tip_stiffness(physics, Skin(), target, qpos))
-        return model.pair_solref, model.pair_solimp
+        return model["pair_solref"], model["pair_solimp"]
 
     first, second = (
         [physics.mj_model.geom(g).name for g in side[physics.scene.object_pairs]]

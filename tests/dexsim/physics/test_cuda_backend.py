@@ -14,7 +14,6 @@ from dexsim.env.motors import JointCommand, Motors
 from dexsim.physics import ffi
 from dexsim.physics import physics as engines
 from dexsim.physics.cuda import backend, launch
-from dexsim.physics.host import call
 from dexsim.physics.physics import Physics
 
 pytestmark = pytest.mark.skipif(warp_emulation.compiler is None, reason="the emulation of a warp needs g++")
@@ -26,13 +25,13 @@ KERNELS, LAUNCHES = {}, []
 def serve(frame):
     """In place of the GPU's: a launch of `KERNELS`."""
     emulation, settings = KERNELS[ffi.attributes(frame)["kernel"].decode()]
-    given, results = call._arrays(frame.arguments), call._arrays(frame.results)
+    given, results = ffi.arrays(frame.arguments), ffi.arrays(frame.results)
     inputs, outputs = ([b for b in emulation.buffers if b.output == which] for which in (False, True))
     LAUNCHES.append((math.prod(given[0].shape[:-1]), settings.substeps))
     given = {b.name: x.reshape(-1, b.size) for b, x in zip(inputs, given, strict=True)}
-    found = emulation.run(given, **dataclasses.asdict(settings))
+    outputs_by_name = emulation.run(given, **dataclasses.asdict(settings))
     for buffer, result in zip(outputs, results, strict=True):
-        result[...] = found[buffer.name].reshape(result.shape)
+        result[...] = outputs_by_name[buffer.name].reshape(result.shape)
 
 
 @pytest.fixture
@@ -58,7 +57,7 @@ def emulated(monkeypatch):
 
 
 def physics_of(env, name):
-    task, config = env.task, dataclasses.replace(env.config.physics, iterations=50, line_search=50)
+    task, config = env.task, dataclasses.replace(env.config.physics, iterations=50)
     return Physics(env.hand, task.slots, task.largest, config, gravity=task.gravity, backend=name)
 
 
@@ -93,27 +92,3 @@ def test_a_tick_is_that_of_c_mujoco(grasp_env, states, emulated):
     np.testing.assert_allclose(result.state.qpos, expected.state.qpos, atol=2e-5)
     np.testing.assert_allclose(result.finger_force, expected.finger_force, atol=0.02)
     np.testing.assert_allclose(cuda_torque, torque, atol=1e-3)
-
-
-def test_a_law_with_a_table_takes_a_launch_for_each_sub_step(grasp_env, states, emulated):
-    """The kernel evaluates element-wise laws; XLA evaluates all others between launches."""
-    physics, table = physics_of(grasp_env, "cuda"), jnp.linspace(0.1, 0.3, 5)
-
-    def looking_up(index, position, velocity):
-        return table[index] * jnp.ones_like(position) - 0.01 * velocity
-
-    def plain(index, position, velocity):
-        return (0.1 + 0.05 * index.astype(jnp.float32)) * jnp.ones_like(position) - 0.01 * velocity
-
-    def run(law):
-        emulated.clear()
-        advance = lambda s: physics.advance(law, s.episode.object, s.physics, jnp.zeros(3))  # noqa: E731
-        result = jax.block_until_ready(jit(jax.vmap(advance), once=True)(states))
-        return result, list(emulated)
-
-    expected, launches = run(plain)
-    assert launches == [(len(states.tick), 5)]
-    result, launches = run(looking_up)
-    assert launches == [(len(states.tick), 1)] * 5
-    np.testing.assert_allclose(result.state.qpos, expected.state.qpos, atol=1e-5)
-    np.testing.assert_allclose(result.finger_force, expected.finger_force, atol=0.02)

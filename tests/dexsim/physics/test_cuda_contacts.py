@@ -11,10 +11,7 @@ import warp_emulation
 
 from dexsim.core.errors import AssetError
 from dexsim.physics.config import PhysicsConfig
-from dexsim.physics.cuda.arguments import Buffer, declare_args
-from dexsim.physics.cuda.contact_tables import contact_constants
-from dexsim.physics.cuda.links import find_links
-from dexsim.physics.cuda.scene import MAX_CONTACTS, kernel_constants
+from dexsim.physics.cuda.scene import MAX_CONTACTS, Buffer, declare_args, find_links, kernel_constants
 from dexsim.physics.interface import PhysicsScene
 
 pytestmark = pytest.mark.skipif(warp_emulation.compiler is None, reason="the emulation of a warp needs g++")
@@ -111,7 +108,7 @@ def finder(slots: tuple[str, ...]):
         Buffer("geom_pos", 3 * len(slots)),
         Buffer("geom_quat", 4 * len(slots)),
     ]
-    text = "\n".join([declare_args(buffers), kernel_constants(scene), contact_constants(scene)])
+    text = "\n".join([declare_args(buffers), kernel_constants(scene)])
     library = ctypes.CDLL(str(warp_emulation.build(text, "contacts.cpp")))
     fields = [*((buffer.name, ctypes.c_void_p) for buffer in buffers), ("n", ctypes.c_int)]
     arguments = type("Args", (ctypes.Structure,), {"_fields_": [*fields, ("settings", ctypes.c_byte * 64)]})
@@ -121,11 +118,11 @@ def finder(slots: tuple[str, ...]):
         names = ("size", "place", "quat", "links", "object")
         arrays = [np.array([getattr(world, name) for world in worlds], np.float32) for name in names]
         pointers = [array.ctypes.data_as(ctypes.c_void_p) for array in arrays]
-        found, count = np.zeros((len(worlds), MAX_CONTACTS), CONTACT), np.zeros(len(worlds), np.int32)
+        contacts, count = np.zeros((len(worlds), MAX_CONTACTS), CONTACT), np.zeros(len(worlds), np.int32)
         args = arguments(*pointers[:3], len(worlds))
-        outputs = (part.ctypes.data_as(ctypes.c_void_p) for part in (found, count))
+        outputs = (part.ctypes.data_as(ctypes.c_void_p) for part in (contacts, count))
         library.find(ctypes.byref(args), *pointers[3:], *outputs)
-        return found, count
+        return contacts, count
 
     return find
 
@@ -234,9 +231,9 @@ def turned(vector) -> np.ndarray:
 
 
 def matrix(quat: np.ndarray) -> np.ndarray:
-    found = np.zeros(9)
-    mujoco.mju_quat2Mat(found, quat)
-    return found.reshape(3, 3)
+    elements = np.zeros(9)
+    mujoco.mju_quat2Mat(elements, quat)
+    return elements.reshape(3, 3)
 
 
 def pose(rotation: np.ndarray, place) -> np.ndarray:
@@ -247,16 +244,16 @@ def rounded(values: np.ndarray) -> np.ndarray:
     return values.astype(np.float32).astype(float)
 
 
-def close_to(wanted: np.ndarray, found: np.ndarray) -> bool:
+def close_to(expected: np.ndarray, contacts: np.ndarray) -> bool:
     """Whether contacts are the same within 10 um and 1e-3 of the normal; those of less than 2 um may be missing."""
-    for some, others in ((wanted, found), (found, wanted)):
+    for some, others in ((expected, contacts), (contacts, expected)):
         for one in some[some["gap"] < -2e-6]:
             apart = np.linalg.norm(others["point"] - one["point"], axis=1)
             close = (apart < 1e-5) & (np.abs(others["gap"] - one["gap"]) < 1e-5)
             if not (close & (np.linalg.norm(others["normal"] - one["normal"], axis=1) < 1e-3)).any():
                 return False
-    clear = [np.sum(some["gap"] < -2e-6) for some in (wanted, found)]
-    return clear[0] <= len(found) and clear[1] <= len(wanted)
+    clear = [np.sum(some["gap"] < -2e-6) for some in (expected, contacts)]
+    return clear[0] <= len(contacts) and clear[1] <= len(expected)
 
 
 @pytest.mark.parametrize(("slots", "first", "second"), CASES, ids=lambda part: part if isinstance(part, str) else "on")
@@ -266,11 +263,11 @@ def test_contacts_are_those_of_c_mujoco(slots, first, second):
     other = model.geom(second if second in HAND else f"object_{slots.index(second)}").id
     (pair,) = np.flatnonzero((model.pair_geom1 == model.geom(first).id) & (model.pair_geom2 == other))
     worlds = [World(scene, pair, random) for _ in range(WORLDS)]
-    wanted = [world.contacts() for world in worlds]
+    expected = [world.contacts() for world in worlds]
     contacts, count = finder(slots)(worlds)
-    found = [row[:number][row[:number]["pair"] == pair] for row, number in zip(contacts, count, strict=True)]
-    assert np.mean([len(contacts) > 0 for contacts in wanted]) > 0.6
-    close = [close_to(*both) for both in zip(wanted, found, strict=True)]
+    contacts = [row[:number][row[:number]["pair"] == pair] for row, number in zip(contacts, count, strict=True)]
+    assert np.mean([len(contacts) > 0 for contacts in expected]) > 0.6
+    close = [close_to(*both) for both in zip(expected, contacts, strict=True)]
     assert np.mean(close) > 0.995
 
 
@@ -287,10 +284,10 @@ def test_deepest_contacts_of_a_mesh_are_kept():
     worlds = [crowd(MESH, seed) for seed in range(20)]
     contacts, count = finder(MESH)(worlds)
     crowded = 0
-    for world, found, number in zip(worlds, contacts, count, strict=True):
+    for world, rows, number in zip(worlds, contacts, count, strict=True):
         world.contacts()
         deepest = np.sort(world.data.contact.dist)[:MAX_CONTACTS]
-        np.testing.assert_allclose(np.sort(found["gap"][:number]), deepest, atol=1e-5)
+        np.testing.assert_allclose(np.sort(rows["gap"][:number]), deepest, atol=1e-5)
         crowded += world.data.ncon > MAX_CONTACTS
     assert crowded > 3
 
@@ -303,4 +300,4 @@ def test_more_contacts_than_fit_are_counted():
 @pytest.mark.parametrize("kind", ["cylinder", "ellipsoid"])
 def test_kinds_without_contacts_are_named(kind):
     with pytest.raises(AssetError, match=f"hand.xml: backend cuda has no contacts of {kind} 'extra' on box 'object_0'"):
-        contact_constants(scene_of(("box",), kind))
+        kernel_constants(scene_of(("box",), kind))

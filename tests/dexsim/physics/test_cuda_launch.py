@@ -13,7 +13,7 @@ import pytest
 from dexsim.core.errors import ConfigError
 from dexsim.physics import ffi
 from dexsim.physics.cuda import launch
-from dexsim.physics.cuda.arguments import Buffer, Settings, args_type, declare_args
+from dexsim.physics.cuda.scene import Buffer, Settings, args_type, declare_args
 
 SETTINGS = Settings(substeps=5, iterations=10, line_search=12, tolerance=1e-5, line_search_tolerance=0.25)
 BUFFERS = [
@@ -85,26 +85,13 @@ def test_the_struct_is_that_of_cpp(tmp_path):
     assert size == ctypes.sizeof(args)
 
 
-def test_a_kernel_has_one_name_in_all_processes(driver):
-    name = launch.load(b"code", SETTINGS, len(BUFFERS))
-    assert name == launch.load(b"code", SETTINGS, len(BUFFERS)) and len(launch._kernels) == 1
-    assert launch.load(b"other", SETTINGS, len(BUFFERS)) != name
-
-
-def test_too_much_shared_memory_is_named(driver, monkeypatch):
+def test_what_a_machine_lacks_is_named(driver, monkeypatch):
     monkeypatch.setattr(driver, "attribute", lambda which, device: 39_999)
     with pytest.raises(ConfigError, match="8 worlds need 40000 bytes of shared memory, of which GPU 0 .* 39999"):
         launch.Kernel(b"code", SETTINGS, len(BUFFERS))
-
-
-def test_gpus_of_two_kinds_are_refused(driver, monkeypatch):
-    assert launch.architecture.__wrapped__() == "sm_90"
     monkeypatch.setattr(driver, "attribute", lambda which, device: 8 + device)
     with pytest.raises(ConfigError, match="not of sm_88, sm_99: choose with CUDA_VISIBLE_DEVICES"):
         launch.architecture.__wrapped__()
-
-
-def test_a_machine_without_the_driver(monkeypatch):
     monkeypatch.setattr(ctypes, "CDLL", lambda name: (_ for _ in ()).throw(OSError(name)))
     with pytest.raises(ConfigError, match="needs NVIDIA's driver, with libcuda.so.1"):
         launch.Driver()

@@ -9,7 +9,7 @@ from c_scene import GRAVITY, row, rows_of, squeeze
 from dexsim.objects.config import SLOTS, ObjectConfig
 from dexsim.physics.config import PhysicsConfig
 from dexsim.physics.interface import PhysicsState
-from dexsim.physics.model import build_model
+from dexsim.physics.model import build_scene
 from dexsim.physics.physics import Physics
 
 THICK, THIN = 0.003, 0.001
@@ -40,30 +40,26 @@ def test_a_thickness_drawn_is_a_thickness_compiled(scenes, grip, change, compile
     object, state, torque = grip
     motors = lambda *_: jnp.asarray(torque)  # noqa: E731
     drawn, force = scenes[THICK].advance(motors, object, state, jnp.zeros(3), pad_thickness_delta=change)
-    wanted, pressed = scenes[compiled].advance(motors, object, state, jnp.zeros(3))
+    expected, pressed = scenes[compiled].advance(motors, object, state, jnp.zeros(3))
     np.testing.assert_allclose(force, pressed, atol=2e-3)
-    np.testing.assert_allclose(drawn.qpos, wanted.qpos, atol=1e-5)
+    np.testing.assert_allclose(drawn.qpos, expected.qpos, atol=1e-5)
     plain = scenes[THICK].advance(motors, object, state, jnp.zeros(3))[1]
     assert np.abs(plain - force).max() > 0.5, "the rubber makes no difference: the test tests nothing"
 
 
-def test_every_engine_is_given_the_same_sizes(hand, scenes, grip):
-    thick = build_model(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(pad_thickness=THICK), GRAVITY, "jax")
-    thin = build_model(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(pad_thickness=THIN), GRAVITY, "jax")
-    physics = Physics(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(), gravity=GRAVITY, backend="jax")
+def test_the_model_is_given_the_drawn_sizes(hand, scenes, grip):
+    thick, thin = scenes[THICK].mj_model, scenes[THIN].mj_model
     names = [thick.geom(g).name for g in range(thick.ngeom)]
     tips = [g for g, name in enumerate(names) if "_pad" in name and name[-1].isdigit()]
     assert len(tips) == 6 * 3
-    for scene in (physics, scenes[THICK]):
-        given = scene.configure(grip[0], pad_thickness_delta=THIN - THICK)
-        size = np.asarray(given["geom_size"] if isinstance(given, dict) else given.geom_size)
-        np.testing.assert_allclose(size[tips], thin.geom_size[tips], atol=1e-8)
-        links = [thick.geom(name).id for name in ("index_link1", "palm_face", "thumb_link1")]
-        np.testing.assert_allclose(size[links], thick.geom_size[links], atol=1e-7)
+    size = np.asarray(scenes[THICK].configure(grip[0], pad_thickness_delta=THIN - THICK)["geom_size"])
+    np.testing.assert_allclose(size[tips], thin.geom_size[tips], atol=1e-8)
+    links = [thick.geom(name).id for name in ("index_link1", "palm_face", "thumb_link1")]
+    np.testing.assert_allclose(size[links], thick.geom_size[links], atol=1e-7)
 
 
 def test_thick_rubber_is_not_beyond_the_broad_phase(scenes, grip):
-    """C MuJoCo and Warp leave out contacts of geoms whose bounding spheres are apart."""
+    """C MuJoCo leaves out contacts of geoms whose bounding spheres are apart."""
     model, given = scenes[THIN].mj_model, scenes[THIN].configure(grip[0], pad_thickness_delta=THICK - THIN)
     size, around = np.asarray(given["geom_size"]), np.asarray(given["geom_rbound"])
     tips = [g for g in range(model.ngeom) if "_pad" in model.geom(g).name and model.geom(g).name[-1].isdigit()]
@@ -73,17 +69,17 @@ def test_thick_rubber_is_not_beyond_the_broad_phase(scenes, grip):
 
 def test_index_and_middle_finger_stop_each_other(hand):
     """The index finger swings into the middle one at full torque, and then rests on it."""
-    model = build_model(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(), (0.0, 0.0, 0.0), "c")
+    model = build_scene(hand, SLOTS, ObjectConfig().largest, PhysicsConfig(), (0.0, 0.0, 0.0), "c").model
     data = mujoco.MjData(model)
     names = list(hand.joint_names)
-    bend, wanted = names.index("index_bend"), np.where(np.arange(12) < 3, 0.0, 0.3)
-    wanted[bend] = hand.joint_lower[bend]
-    data.qpos[:12], data.qpos[12:15] = wanted, (0.0, 0.0, 2.0)
+    bend, angle = names.index("index_bend"), np.where(np.arange(12) < 3, 0.0, 0.3)
+    angle[bend] = hand.joint_lower[bend]
+    data.qpos[:12], data.qpos[12:15] = angle, (0.0, 0.0, 2.0)
     data.qpos[bend] = 0.0
     data.qpos[15] = 1.0
     depth = []
     for _ in range(300):
-        torque = 3.0 * (wanted - data.qpos[:12]) - 0.1 * data.qvel[:12]
+        torque = 3.0 * (angle - data.qpos[:12]) - 0.1 * data.qvel[:12]
         torque[bend] = -hand.torque_limit[bend]
         data.qfrc_applied[:12] = torque
         mujoco.mj_step(model, data)

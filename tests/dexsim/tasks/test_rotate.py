@@ -603,12 +603,12 @@ class TestReport:
 
 @pytest.fixture(scope="module")
 def rotate_env():
-    return dexsim.make("rotate", RotateConfig(pool_size=16), backend="c", num_envs=8)
+    return dexsim.make("rotate", RotateConfig(pool_size=16), backend="c")
 
 
 class TestEnvironment:
     def test_the_palm_ends_where_the_hand_does(self, rotate_env):
-        """As a box, where a half-space would carry what lies beside it; how that falls: `test_warp`."""
+        """As a box, where a half-space would carry what lies beside it."""
         model = rotate_env.physics.mj_model
         names = {model.geom(g).name for g in model.pair_geom1}
         assert "palm" in names and "palm_face" not in names

@@ -214,7 +214,7 @@ def environments():
         skin=Skin(total="solver"),
     )
     bare = dataclasses.replace(plain, skin=dataclasses.replace(plain.skin, untaxelled=True))
-    first, second = (dexsim.make("grasp", config, backend="jax") for config in (plain, bare))
+    first, second = (dexsim.make("grasp", config, backend="c") for config in (plain, bare))
     return first, second, first.reset(jax.random.key(0))
 
 

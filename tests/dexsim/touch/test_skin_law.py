@@ -5,7 +5,7 @@ the finger. What is left between the two: the tick's delay, friction, which the 
 the law not, forces of one finger that point apart, and dents in which the springs are as soft or stiff as
 they may be.
 
-In C MuJoCo, whose contacts are the Warp backend's too, over 60 hands a shape: 15 objects, each closed
+In C MuJoCo, over 60 hands a shape: 15 objects, each closed
 on without weight and then held at four random strengths, up to 25 N on a finger (commands ask for 2-7 N).
 """
 

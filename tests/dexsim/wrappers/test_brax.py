@@ -43,7 +43,7 @@ class PointState:
 class PointEnv:
     """A point on a line that terminates when it leaves (-1, 1) and is truncated after 6 ticks."""
 
-    action_size, name, backend, evaluation_steps = 1, "point", "jax", 6
+    action_size, name, backend, evaluation_steps = 1, "point", "mjx", 6
     observation_layout = {"actor": (Field("position", 1),), "critic": (Field("position", 1), Field("clock", 1))}
 
     def reset(self, key):
@@ -91,7 +91,7 @@ def run(env, actions):
 def test_sizes_and_groups():
     env = BraxEnv(PointEnv())
     assert env.observation_size == {"actor": (1,), "critic": (2,)}
-    assert (env.action_size, env.backend, env.episode_length) == (1, "jax", 6)
+    assert (env.action_size, env.backend, env.episode_length) == (1, "mjx", 6)
     state = env.reset(jax.random.PRNGKey(0))
     assert {group: obs.shape for group, obs in state.obs.items()} == env.observation_size
     assert set(state.metrics) == {"reward/centre", "success"}
@@ -202,12 +202,12 @@ def test_ppo_trains_on_a_point():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("physics", ["simple", "mjx"])
+@pytest.mark.parametrize("physics", ["simple", "c"])
 def test_ppo_runs_on_grasp(physics, monkeypatch):
     """The task itself under brax's wrappers and learner. Its evaluations compile the task once more: the point's do."""
     if physics == "simple":
         monkeypatch.setattr("dexsim.env.env.Physics", SimplePhysics)
-    env = dexsim.make("grasp", GraspConfig(pool_size=20), backend="jax", num_envs=8)
+    env = dexsim.make("grasp", GraspConfig(pool_size=20), backend="c")
     history, params = train(
         BraxEnv(env),
         num_timesteps=3 * 8 * 4,

@@ -120,7 +120,7 @@ def test_rotation_on_a_cpu_begins_on_nearly_nominal_hands():
     assert not find_preset("cpu", "grasp").curriculum.on
     scratch, tuned = (train.default_arguments("rotate", "cpu", begun) for begun in (None, load_policy("rotate")))
     assert scratch.curriculum.on and not tuned.curriculum.on and not tuned.ppo.kl_halving
-    env = dexsim.make("rotate", RotateConfig(pool_size=8), backend="c", num_envs=2)
+    env = dexsim.make("rotate", RotateConfig(pool_size=8), backend="c")
     assert scratch.curriculum.metric.removeprefix("episode/") in env.reset(jax.random.key(0)).metrics
 
 

@@ -44,8 +44,8 @@ class Breaks(TinyEnv):
 
 
 def install(patch, env_class):
-    def make(task, config=None, *, backend="auto", num_envs=1, **_):
-        return env_class(config or TinyConfig(), backend=backend, num_envs=num_envs)
+    def make(task, config=None, *, backend="auto", **_):
+        return env_class(config or TinyConfig(), backend=backend)
 
     tiny_train.install(patch)
     patch.setattr("dexsim.registry.make", make)

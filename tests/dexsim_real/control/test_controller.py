@@ -230,7 +230,7 @@ from dexsim_ppo.evaluate import load_policy
 from dexsim_real import run, replay
 from dexsim_real.control.controller import Controller
 Controller(load_policy("grasp"), load_hand()).warm()
-print([name for name in sys.modules if name.startswith("mujoco.mjx") or name in ("warp", "brax", "cv2", "serial")])
+print([name for name in sys.modules if name.startswith("mujoco.mjx") or name in ("brax", "cv2", "serial")])
 """
     done = subprocess.run(
         [sys.executable, "-c", code],

@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from dexsim.physics.cuda import scene as cuda_scene
-from dexsim.physics.cuda.arguments import Buffer, declare_args
-from dexsim.physics.cuda.contact_tables import contact_constants
+from dexsim.physics.cuda.scene import Buffer, declare_args
 from dexsim.physics.interface import PhysicsScene
 
 _HERE = Path(__file__).parent
@@ -38,9 +37,7 @@ class Emulation:
         if law is None:
             law, constants = PD_LAW.replace("JOINTS", str(joints)), [Buffer("law_0", joints)]
         self.buffers = cuda_scene.buffers(scene, constants or [])
-        text = "\n".join(
-            [declare_args(self.buffers), cuda_scene.kernel_constants(scene), contact_constants(scene), law]
-        )
+        text = "\n".join([declare_args(self.buffers), cuda_scene.kernel_constants(scene), law])
         library = ctypes.CDLL(str(build(text)))
         self._run = library.run
         scalars = [(name, ctypes.c_int) for name in ("n", "substeps", "iterations", "line_search")]

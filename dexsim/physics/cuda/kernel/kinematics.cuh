@@ -44,7 +44,7 @@ DEV void add_parents(Motion &motion, const Lane &lane) {
   }
 }
 
-// Adds to each link's value those of all links that it carries, in a fixed order (links.py, `gathering`).
+// Adds to each link's value those of all links that it carries, in a fixed order (scene.py, `Links.gathering`).
 template <class T> DEV void add_children(T &value, const Lane &lane) {
 #pragma unroll 1
   for (int step = 0; step < GATHER_STEPS; step++) {

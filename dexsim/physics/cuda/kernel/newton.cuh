@@ -1,12 +1,13 @@
 // The acceleration under contacts and limits by Newton's method: MuJoCo's convex problem (documentation, chapter
-// Computation, section Constraint model), as in dexsim.physics.solver.newton, with its names.
+// Computation, section Constraint model): the least of 1/2 (a - a0)^T M (a - a0) + s(J a - wanted) over accelerations a,
+// where s is quadratic for limits that are closed and for contacts that stick, and bends along the cone where they slide.
 //
-// A step solves H p = -gradient (elimination.cuh).
+// A step solves H p = -gradient with H = M + J^T s'' J (elimination.cuh).
 #pragma once
 #include "rows.cuh"
 #include "elimination.cuh"
 
-// Where a contact is with respect to its cone (`_cone`).
+// Where a contact is with respect to its cone.
 struct Cone {
   float slide_y, slide_z, length, inverse;  // of slide, in the scaled space of the cone; 1 / length
   bool bottom, middle;                      // sticking, sliding
@@ -27,7 +28,7 @@ DEV Cone cone_at(const ContactRows &rows, Vec3 miss) {
   return cone;
 }
 
-// Force along the rows (`_force`).
+// Force along the rows.
 DEV Vec3 cone_force(const ContactRows &rows, const Cone &cone, Vec3 miss) {
   if (cone.bottom) return {-rows.weight * miss.x, -rows.slide_weight * miss.y, -rows.slide_weight * miss.z};
   const float press = -cone.stiff * cone.inside * rows.mu, slide = -press * cone.inverse * rows.friction;
@@ -243,7 +244,7 @@ DEV float newton_step(const Problem &problem, Vec3 miss, float acceleration, flo
   return lane.hinge ? hinge : object;
 }
 
-// How far along a step the cost is least (`_search`): Newton's method on its slope, which only rises, in a bracket.
+// How far along a step the cost is least: Newton's method on its slope, which only rises, in a bracket.
 // `line`: slope at 0 and curvature without constraints.
 DEV float line_search(const Args &args, const Problem &problem, Vec3 miss, Vec3 moved, float acceleration, float step,
                       float line_slope, float line_curve, float decrement, int &evaluations, const Lane &lane) {

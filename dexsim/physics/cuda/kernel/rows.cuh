@@ -1,8 +1,7 @@
 // The constraints of a sub-step: contacts of three rows each (a contact a lane), limits (a hinge a lane), coupled
 // joints.
 //
-// The same rows as dexsim.physics.solver.substep.Stepper._rows makes; MuJoCo's documentation, chapter Computation,
-// sections Constraint model and Parameters.
+// The equations are those of MuJoCo's documentation, chapter Computation, sections Constraint model and Parameters.
 #pragma once
 #include "dynamics.cuh"
 
@@ -11,7 +10,8 @@ struct Spring {
   float stiffness, damping, impedance;
 };
 
-// MuJoCo's spring from solref [2] and solimp [5] at a gap (`_spring` of the JAX solver).
+// MuJoCo's spring from solref [2] and solimp [5] at a gap: stiffness k and damping b of the reference acceleration -b J v -
+// k d r, and the impedance d, which rises from solimp[0] to solimp[1] over the depth solimp[2].
 DEV Spring spring(const float *solref, const float *solimp, float gap) {
   const float low = fminf(fmaxf(solimp[0], 1e-4f), 0.9999f), high = fminf(fmaxf(solimp[1], 1e-4f), 0.9999f);
   const float middle = fminf(fmaxf(solimp[3], 1e-4f), 0.9999f), power = fmaxf(solimp[4], 1.f);
@@ -63,7 +63,8 @@ DEV Vec3 times(const ContactRows &rows, const float *vector) {
   return sum;
 }
 
-// Tangents as MuJoCo chooses them (`_frame` of the JAX solver).
+// Rows: the normal and two tangents, chosen as by mju_makeFrame: of the y and z axes that which is less along the
+// normal, made orthogonal to it.
 DEV Mat3 contact_frame(Vec3 normal) {
   const bool upright = fabsf(normal.y) < 0.5f;
   const Vec3 other = {0, upright ? 1.f : 0.f, upright ? 0.f : 1.f};

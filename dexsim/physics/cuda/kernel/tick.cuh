@@ -1,6 +1,6 @@
 // A control tick of one world by one warp, top to bottom.
 //
-// Before it come, generated for the scene: `struct Args`, constants (scene.py), tables of contacts (contact_tables.py),
+// Before it come, generated for the scene: `struct Args`, constants and tables of contacts (scene.py),
 // and `motor_law` (law.py).
 #pragma once
 #include "shared.cuh"

@@ -1,4 +1,4 @@
-// Spheres and capsules of the hand on primitives of the object (dexsim/physics/solver/collide.py, `Balls`).
+// Spheres and capsules of the hand on primitives of the object.
 //
 // A capsule is met as balls at one or two places of its axis.
 #pragma once

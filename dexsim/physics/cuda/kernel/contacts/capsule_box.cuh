@@ -1,4 +1,4 @@
-// Where a capsule meets a box: C MuJoCo's two places (dexsim/physics/solver/boxes.py, `capsule_box`).
+// Where a capsule meets a box: C MuJoCo's two places.
 //
 // The one is the axis' nearest point to the box, the other the end of that part of the axis which is over the same
 // face. Four lanes look at a capsule: each at one edge of the box along every axis, two also at the axis' ends.

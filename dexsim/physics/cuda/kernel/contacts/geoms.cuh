@@ -1,4 +1,4 @@
-// Rows of the tables that contact_tables.py prints: geoms of the hand in the frames of their links.
+// Rows of the tables that scene.py prints: geoms of the hand in the frames of their links.
 #pragma once
 #include "warp.cuh"
 

@@ -1,9 +1,8 @@
-// Planes of the hand (a palm's face) under primitives of the object: one place of a primitive a lane
-// (dexsim/physics/solver/collide.py, `_on_plane`).
+// Planes of the hand (a palm's face) under primitives of the object: one place of a primitive a lane.
 #pragma once
 #include "contacts/search.cuh"
 
-// Kinds of PLANE_POINT, in the order of contact_tables.py.
+// Kinds of PLANE_POINT, in the order of scene.py.
 enum { ON_SPHERE, ON_CAPSULE, ON_ELLIPSOID, ON_CYLINDER, ON_BOX };
 
 // The lowest place of each disk of a cylinder, and two more of the lower disk, 120 degrees apart.

@@ -1,0 +1,202 @@
+"""The motors' law as a list of operations: traced by JAX, evaluated by NumPy, printed as CUDA.
+
+Motors have one source, which JAX traces for every engine. `record` writes the traced law down, so that engines can
+evaluate it at every sub-step without going back to XLA: c by `evaluator`, cuda by `dexsim.physics.cuda.law`. All work
+in the same precision and order; results differ where XLA fuses a product and a sum, by a rounding.
+"""
+
+import dataclasses
+import functools
+import json
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dexsim.core.errors import ConfigError
+from dexsim.physics.interface import TorqueLaw
+
+# JAX's primitives that work element by element, in NumPy and as an expression in C. In C NaNs need no care: a world
+# whose state is not finite ends anyway.
+OPERATIONS: dict[str, tuple[Callable[..., Any], str]] = {
+    "abs": (np.abs, "{0} < 0 ? -{0} : {0}"),
+    "add": (np.add, "{0} + {1}"),
+    "and": (np.logical_and, "{0} && {1}"),
+    "clamp": (lambda low, x, high: np.minimum(np.maximum(x, low), high), "{1} < {0} ? {0} : {1} > {2} ? {2} : {1}"),
+    "copy": (np.asarray, "{0}"),
+    "cos": (np.cos, "cosf({0})"),
+    "div": (np.divide, "{0} / {1}"),
+    "eq": (np.equal, "{0} == {1}"),
+    "exp": (np.exp, "expf({0})"),
+    "ge": (np.greater_equal, "{0} >= {1}"),
+    "gt": (np.greater, "{0} > {1}"),
+    "le": (np.less_equal, "{0} <= {1}"),
+    "lt": (np.less, "{0} < {1}"),
+    "max": (np.maximum, "{0} > {1} ? {0} : {1}"),
+    "min": (np.minimum, "{0} < {1} ? {0} : {1}"),
+    "mul": (np.multiply, "{0} * {1}"),
+    "ne": (np.not_equal, "{0} != {1}"),
+    "neg": (np.negative, "-{0}"),
+    "not": (np.logical_not, "!{0}"),
+    "or": (np.logical_or, "{0} || {1}"),
+    "select_n": (lambda which, first, second: np.where(which, second, first), "{0} ? {2} : {1}"),
+    "sign": (np.sign, "({0} > 0) - ({0} < 0)"),
+    "sin": (np.sin, "sinf({0})"),
+    "sqrt": (np.sqrt, "sqrtf({0})"),
+    "sub": (np.subtract, "{0} - {1}"),
+    "tanh": (np.tanh, "tanhf({0})"),
+}
+_LOGICAL = {"and", "or", "not", "select_n"}  # on integers they are something else
+_CALLS = ("jit", "pjit", "custom_jvp_call", "custom_vjp_call", "closed_call")
+
+
+@dataclasses.dataclass(frozen=True)
+class Recorded:
+    """A law over numbered values: first the constants, then sub-step, position and velocity."""
+
+    constants: list[jax.Array]  # of the trace
+    literals: list[list[Any]]  # number, value, dtype
+    steps: list[list[Any]]  # operation, operands, result, parameter
+    result: int
+
+    @property
+    def text(self) -> str:
+        """All but the constants, for `evaluator`."""
+        inputs = range(len(self.constants), len(self.constants) + 3)
+        return json.dumps([list(inputs), self.literals, self.steps, self.result])
+
+
+def record(law: TorqueLaw, joints: jax.Array) -> Recorded:
+    """Trace a law; of `joints` [J] only shape and type count.
+
+    Raises:
+      ConfigError: it has an operation that is not element by element.
+    """
+    traced = jax.make_jaxpr(law)(jnp.int32(0), joints, joints)
+    writer = _Writer()
+    (result,) = writer.run(traced.jaxpr, [writer.new() for _ in (*traced.jaxpr.constvars, *traced.jaxpr.invars)])
+    return Recorded(traced.consts, writer.literals, writer.steps, result)
+
+
+class _Writer:
+    """Turns a jaxpr into the steps and literals of `Recorded`."""
+
+    def __init__(self):
+        self.steps: list[list[Any]] = []
+        self.literals: list[list[Any]] = []
+        self._count = 0
+
+    def new(self) -> int:
+        self._count += 1
+        return self._count - 1
+
+    def run(self, jaxpr: Any, inputs: list[int]) -> list[int]:
+        names = dict(zip((*jaxpr.constvars, *jaxpr.invars), inputs, strict=True))
+
+        def read(variable: Any) -> int:
+            if not hasattr(variable, "val"):
+                return names[variable]
+            if np.ndim(variable.val):
+                raise _unknown("an array that is written into it")
+            number = self.new()
+            self.literals.append([number, np.asarray(variable.val).item(), str(variable.aval.dtype)])
+            return number
+
+        for equation in jaxpr.eqns:
+            operands, kind, options = [read(v) for v in equation.invars], equation.primitive.name, equation.params
+            inner = options.get("jaxpr", options.get("call_jaxpr"))
+            if inner is not None and kind in _CALLS and not inner.consts:
+                numbers = self.run(inner.jaxpr, operands)
+            else:
+                numbers = [self._step(kind, operands, equation)]
+            names.update(zip(equation.outvars, numbers, strict=True))
+        return [read(v) for v in jaxpr.outvars]
+
+    def _step(self, kind: str, operands: list[int], equation: Any) -> int:
+        parameter: Any = None
+        if kind == "broadcast_in_dim" and len(operands) == 1:
+            parameter = [list(equation.params["shape"]), list(equation.params["broadcast_dimensions"])]
+        elif kind == "convert_element_type":
+            parameter = str(np.dtype(equation.params["new_dtype"]))
+        elif kind in ("reshape", "squeeze"):
+            kind, parameter = "reshape", list(equation.outvars[0].aval.shape)
+        elif kind not in OPERATIONS:
+            raise _unknown(kind)
+        elif kind in _LOGICAL and (equation.invars[0].aval.dtype != bool or len(operands) > 3):
+            raise _unknown(f"{kind} of {equation.invars[0].aval.dtype}")
+        number = self.new()
+        self.steps.append([kind, operands, number, parameter])
+        return number
+
+
+def _unknown(what: str) -> ConfigError:
+    return ConfigError(
+        f"a motor law with {what}: backends c and cuda take laws of element-wise operations; choose backend mjx"
+    )
+
+
+class Evaluator:
+    """A recorded law for a batch, in NumPy: every array has one batch axis in front, of length one if it is shared."""
+
+    def __init__(self, text: bytes):
+        self._inputs, literals, steps, self._result = json.loads(text)
+        self._literals = {number: np.asarray(value, dtype) for number, value, dtype in literals}
+        # What depends on constants alone is the same at all sub-steps of a tick.
+        moving, self._once, self._always = set(self._inputs), list[Any](), list[Any]()
+        for step in steps:
+            _, operands, number, _ = step
+            changes = not moving.isdisjoint(operands)
+            (self._always if changes else self._once).append(step)
+            if changes:
+                moving.add(number)
+
+    def bind(self, constants: list[np.ndarray]) -> Callable[[int, np.ndarray, np.ndarray], np.ndarray]:
+        """The law of some constants: sub-step, position and velocity [B, J] to torque [B, J] Nm."""
+        fixed = dict(enumerate(constants)) | self._literals
+        _evaluate(self._once, fixed)
+
+        def torque(substep: int, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+            inputs = np.asarray(substep, np.int32), position, velocity
+            values = fixed | dict(zip(self._inputs, inputs, strict=True))
+            _evaluate(self._always, values)
+            return values[self._result]
+
+        return torque
+
+
+@functools.lru_cache(maxsize=64)
+def evaluator(text: bytes) -> Evaluator:
+    """The evaluator of `Recorded.text`."""
+    return Evaluator(text)
+
+
+def _evaluate(steps: list[Any], values: dict[int, np.ndarray]) -> None:
+    """Add to `values` what `steps` make of them."""
+    for kind, operands, number, parameter in steps:
+        arguments = [values[operand] for operand in operands]
+        if kind == "broadcast_in_dim":
+            values[number] = _broadcast(arguments[0], *parameter)
+        elif kind == "convert_element_type":
+            values[number] = arguments[0].astype(parameter)
+        elif kind == "reshape":
+            values[number] = arguments[0].reshape(arguments[0].shape[:1] + tuple(parameter))
+        else:
+            values[number] = OPERATIONS[kind][0](*_aligned(arguments))
+
+
+def _aligned(values: list[np.ndarray]) -> list[np.ndarray]:
+    """A scalar of each environment [B] beside vectors [B, J] needs an axis; JAX broadcasts scalars by itself."""
+    rank = max(value.ndim for value in values)
+    return [
+        value.reshape(value.shape + (1,) * (rank - value.ndim)) if 0 < value.ndim < rank else value for value in values
+    ]
+
+
+def _broadcast(value: np.ndarray, shape: list[int], axes: list[int]) -> np.ndarray:
+    batch = value.shape[:1] or (1,)
+    own = [1] * len(shape)
+    for axis, length in zip(axes, value.shape[1:], strict=True):
+        own[axis] = length
+    return np.broadcast_to(value.reshape(batch + tuple(own)), batch + tuple(shape))

@@ -1,0 +1,108 @@
+"""Engines `c` and `mjx` in one grip and one slide against C MuJoCo, and a gradient through `mjx`.
+
+`cuda` has the same states in an emulated warp (`test_cuda_kernel`) and on a GPU (`test_on_gpu`).
+"""
+
+import dataclasses
+
+import c_scene
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from c_scene import GRAVITY, row, rows_of, squeeze, stack
+
+from dexsim.core.compilation import jit
+from dexsim.core.errors import AssetError
+from dexsim.objects.config import SLOTS, ObjectConfig
+from dexsim.physics.config import PhysicsConfig
+from dexsim.physics.interface import PhysicsState
+from dexsim.physics.physics import Physics
+
+SUBSTEPS = 2
+CAPSULE = SLOTS.index("capsule")  # MJX compiles one kind of primitive in a third of the time of all
+
+
+def alone(objects):
+    """Capsules without the other slots."""
+    parts = {name: getattr(objects, name)[..., CAPSULE : CAPSULE + 1, :] for name in ("size", "position")}
+    return dataclasses.replace(objects, kinds=("capsule",), active=objects.active[..., CAPSULE : CAPSULE + 1], **parts)
+
+
+def physics_of(hand, backend):
+    largest = ObjectConfig().largest[CAPSULE : CAPSULE + 1]
+    config = PhysicsConfig(substeps=SUBSTEPS)
+    return Physics(hand, ("capsule",), largest, config, gravity=GRAVITY, backend=backend)
+
+
+@pytest.fixture(scope="module")
+def worlds(hand, grasp_env):
+    """Inputs of three grips and one slide over the palm: objects, state, torque, push; and C MuJoCo's velocities and
+    finger forces at the end of `SUBSTEPS`."""
+    rng, inputs, outcomes = np.random.default_rng(5), [], []
+    starts = [row(grasp_env.pool, i) for i in rows_of(grasp_env.pool, "capsule")[:4]]
+    for index, start in enumerate(starts):
+        model, qpos, qvel, warmstart, torque = squeeze(hand, start, rng)
+        push = np.zeros(3, np.float32)
+        if index == 3:  # lying on the palm, away from fingers, with gravity onto it
+            qpos, qvel, warmstart, torque = (np.zeros_like(x) for x in (qpos, qvel, warmstart, torque))
+            place = model.geom("palm_face").id
+            data = mujoco.MjData(model)
+            mujoco.mj_forward(model, data)
+            height = data.geom_xpos[place, 0] + start.object.size[CAPSULE, 0]
+            qpos[12:16], qvel[13] = (height - 2e-4, 0.0, -0.5, 1.0), 0.3
+            push[0] = -2 * 9.81 * start.object.mass
+        data = c_scene.start(model, qpos, qvel, warmstart)
+        data.qfrc_applied[:12] = torque
+        data.xfrc_applied[model.body("object").id, :3] = push
+        for _ in range(SUBSTEPS):
+            mujoco.mj_step(model, data)
+        inputs.append((alone(start.object), PhysicsState(qpos, qvel, warmstart), torque, push))
+        outcomes.append((data.qvel.copy(), c_scene.finger_force(model, data, hand), qvel))
+    return stack(inputs), *(np.stack(x) for x in zip(*outcomes, strict=True))
+
+
+@pytest.fixture(scope="module")
+def mjx_physics(hand):
+    return physics_of(hand, "mjx")
+
+
+@pytest.mark.parametrize("backend", ["c", "mjx"])
+def test_a_grip_and_a_slide_are_c_mujocos(hand, worlds, mjx_physics, backend):
+    inputs, velocity, force, before = worlds
+    physics = mjx_physics if backend == "mjx" else physics_of(hand, backend)
+    tick = jit(jax.vmap(lambda o, s, torque, push: physics.advance(lambda *_: torque, o, s, push)), once=True)
+    after, pressed = tick(*inputs)
+    assert np.linalg.norm(force[:3], axis=-1).max(-1).min() > 0.5, "a hand holds nothing: the test tests nothing"
+    assert not np.any(force[3]) and velocity[3, 13] < before[3, 13] - 0.05, "no friction on the palm"
+    np.testing.assert_allclose(pressed, force, atol=0.02)
+    np.testing.assert_allclose(after.qvel, velocity, atol=5e-3)
+
+
+@pytest.mark.slow
+def test_a_gradient_through_mjx_is_the_finite_difference(worlds, mjx_physics):
+    """Of velocities after two sub-steps of a grip, along a random change of the torques."""
+    (object, state, torque, push), *_ = jax.tree.map(lambda x: x[0], worlds)
+    weight, way = (np.float32(np.random.default_rng(k).normal(size=n)) for k, n in ((0, 18), (1, 12)))
+
+    def outcome(torque):
+        result = mjx_physics.advance(lambda *_: torque, object, state, push)
+        return jnp.sum(weight * result.state.qvel) + jnp.sum(result.finger_force)
+
+    value, gradient = jit(jax.value_and_grad(outcome), once=True)(torque)
+    run, step = jit(outcome, once=True), 3e-3
+    numeric = (run(torque + step * way) - run(torque - step * way)) / (2 * step)
+    assert np.isfinite(value) and abs(numeric) > 0.1
+    assert np.sum(gradient * way) == pytest.approx(float(numeric), rel=0.05)
+
+
+def test_what_mjx_refuses_is_named(hand, monkeypatch):
+    from mujoco import mjx
+
+    def refuse(model, **_):
+        raise NotImplementedError("no such joint")
+
+    monkeypatch.setattr(mjx, "put_model", refuse)
+    with pytest.raises(AssetError, match="backend mjx: no such joint"):
+        physics_of(hand, "mjx")
