@@ -149,7 +149,7 @@ class HandParams:
     """One episode's hand; J joints, F fingers."""
 
     actuator: Actuator  # [J] leaves
-    latency: jax.Array  # [J] int32, sub-steps
+    latency: jax.Array  # [J] sub-steps
     sensing_latency: jax.Array  # [] fraction of a control tick
     torque_gain: jax.Array  # [J]
     taxel_gain: jax.Array  # [F, 1]
@@ -204,7 +204,7 @@ def sample_hand(
     latency = values["latency"][0] + values["latency_spread"]
     return HandParams(
         actuator=actuator,
-        latency=jnp.round(jnp.minimum(latency, control_period) / timestep).astype(jnp.int32),
+        latency=jnp.minimum(latency, control_period) / timestep,
         sensing_latency=jnp.clip(values["sensing_latency"][0] / control_period, 0.0, 1.0),
         torque_gain=values["torque_gain"],
         taxel_gain=drawn["taxel_gain"][: hand.num_fingers, None],

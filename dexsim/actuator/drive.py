@@ -121,8 +121,10 @@ def apply_friction(
 
 
 def delayed_target(substep: jax.Array, latency: jax.Array, previous: jax.Array, target: jax.Array) -> jax.Array:
-    """The target [J] that acts at a sub-step: the previous one for the first `latency` of them.
+    """The mean over a sub-step of the target [J] that acts: the previous one for the first `latency` sub-steps.
 
-    `latency` [] or [J]; one control tick at most is modelled.
+    `latency` [] or [J], sub-steps, need not be whole; one control tick at most is modelled.
     """
-    return jnp.where(substep < latency, previous, target)
+    left = jnp.asarray(latency, target.dtype) - jnp.asarray(substep, target.dtype)
+    share = jnp.clip(left, 0.0, 1.0)
+    return target + share * (previous - target)

@@ -59,25 +59,24 @@ class Motors:
 def check_timestep(hand: Hand, physics: PhysicsConfig, ranges: Randomization) -> None:
     """Check that the stiffest motors that are drawn are stable at the time step, on every engine.
 
-    Engines step v' = v + h/I tau(q, v), q' = q + h v', with the torque of the old state. For one joint under
-    tau = -k_p q - k_d v the step is a matrix of trace 2 - a - b and determinant 1 - b, with a = h^2 k_p / I and
-    b = h k_d / I. Both eigenvalues are inside the unit circle if and only if |1 - b| < 1 and |trace| < 2 - b, that is
-    a + 2 b < 4, or
+    Engines step v' = v + h/I (-k_p q - k_d (v + v') / 2 - d v), q' = q + h v', with the joint's own damping d explicit.
+    With a = h^2 k_p / I, b = h k_d / I and c = h d / I the step is a matrix of determinant (1 - b/2 - c) / (1 + b/2) and
+    trace 1 + determinant - a / (1 + b/2). Both eigenvalues are inside the unit circle if and only if a + 2 c < 4, or
 
-        h^2 k_p / I + 2 h k_d / I < 4.
+        h^2 k_p / I + 2 h d / I < 4,
 
-    For all joints at once I is the mass matrix, and the left side the largest eigenvalue of M^-1 (h^2 K_p + 2 h K_d).
-    Beyond it a joint chatters from limit to limit of its torque. `Randomization.beyond`, for hands that training never
+    whatever the motor's damping k_d. For all joints at once I is the mass matrix, and the left side the largest
+    eigenvalue of M^-1 (h^2 K_p + 2 h D). Beyond it a joint chatters from limit to limit of its torque. `Randomization.beyond`, for hands that training never
     has, is not counted; nor are friction and dead-band, which damp.
 
     Raises:
       ConfigError: names the joint and the largest stable time step.
     """
-    step, (stiffness, derivative), (damping, mass) = physics.timestep, _largest_gains(ranges), _masses(hand)
+    step, stiffness, (damping, mass) = physics.timestep, _largest_stiffness(ranges), _masses(hand)
 
     def largest(step: float) -> tuple[float, int]:
         """The largest eigenvalue, and the joint that moves most in it."""
-        load = np.diag(np.full(hand.num_joints, step**2 * stiffness + 2 * step * derivative)) + 2 * step * damping
+        load = np.diag(np.full(hand.num_joints, step**2 * stiffness)) + 2 * step * damping
         values, vectors = np.linalg.eig(np.linalg.solve(mass, load))
         worst = int(np.argmax(values.real))
         return float(values.real[worst]), int(np.argmax(np.abs(vectors[:, worst])))
@@ -89,16 +88,15 @@ def check_timestep(hand: Hand, physics: PhysicsConfig, ranges: Randomization) ->
     stable = next((s for s in steps if largest(s)[0] < 4), 0.0)
     raise ConfigError(
         f"PhysicsConfig.timestep = {step:g} s: the stiffest motors drawn are unstable at joint "
-        f"{hand.joint_names[joint]} (h^2 k_p / I + 2 h k_d / I = {value:.2f}, must be below 4): "
-        f"use at most {np.floor(stable * 1e5) / 1e5:g} s, or lower gains (Randomization.stiffness, damping)"
+        f"{hand.joint_names[joint]} (h^2 k_p / I + 2 h d / I = {value:.2f}, must be below 4): "
+        f"use at most {np.floor(stable * 1e5) / 1e5:g} s, or a lower gain (Randomization.stiffness)"
     )
 
 
-def _largest_gains(ranges: Randomization) -> tuple[float, float]:
-    """k_p Nm/rad and k_d Nm s/rad of the stiffest motor that is drawn, with its efficiency and ripple."""
-    high = {name: 1 + ranges.scale * (getattr(ranges, name)[1] - 1) for name in ("stiffness_factor", "damping_factor")}
-    factor = (1 + ranges.scale * (ranges.efficiency[1] - 1)) * (1 + ranges.scale * ranges.ripple[1])
-    return factor * ranges.stiffness * high["stiffness_factor"], factor * ranges.damping * high["damping_factor"]
+def _largest_stiffness(ranges: Randomization) -> float:
+    """k_p Nm/rad of the stiffest motor that is drawn, with its efficiency and ripple."""
+    high = 1 + ranges.scale * (ranges.stiffness_factor[1] - 1)
+    return (1 + ranges.scale * (ranges.efficiency[1] - 1)) * (1 + ranges.scale * ranges.ripple[1]) * ranges.stiffness * high
 
 
 def _masses(hand: Hand) -> tuple[np.ndarray, np.ndarray]:

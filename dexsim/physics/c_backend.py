@@ -34,7 +34,7 @@ from dexsim.core.compilation import available_cores
 from dexsim.core.errors import AssetError, ConfigError
 from dexsim.objects.params import ObjectParams
 from dexsim.physics import ffi
-from dexsim.physics.interface import ContactParams, PhysicsScene, PhysicsState, StepResult, TorqueLaw
+from dexsim.physics.interface import ContactParams, ImplicitLaw, PhysicsScene, PhysicsState, StepResult
 from dexsim.physics.law import evaluator, record
 from dexsim.physics.parameters import places, values
 
@@ -71,14 +71,14 @@ class CBackend:
         object: ObjectParams,
         contacts: ContactParams,
         state: PhysicsState,
-        torque: TorqueLaw,
+        law: ImplicitLaw,
         push: jax.Array,
     ) -> StepResult:
         """One control tick in one call."""
         fields = values(self.scene, object, contacts)
-        law = record(torque, jnp.zeros(len(self.scene.joint_dof), state.qpos.dtype))
-        arguments = [*fields.values(), state.qpos, state.qvel, state.warmstart, push, *law.constants]
-        *after, force = self._tick(tuple(fields), law.text, *map(jnp.asarray, arguments))
+        recorded = record(law, jnp.zeros(len(self.scene.joint_dof), state.qpos.dtype))
+        arguments = [*fields.values(), state.qpos, state.qvel, state.warmstart, push, *recorded.constants]
+        *after, force = self._tick(tuple(fields), recorded.text, *map(jnp.asarray, arguments))
         return StepResult(PhysicsState(*after), force)
 
     def _call(self, fields: tuple[str, ...], law: str, *arguments: jax.Array) -> list[jax.Array]:
@@ -111,6 +111,7 @@ class _Worlds:
         self._fields[fields.index("body_mass")].append((self.batch.expand("body_subtreemass"), where["body_mass"]))
         self.qpos, self.qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
         self.warmstart = self.batch.bind("qacc_warmstart")
+        self.armature = self.batch.expand("dof_armature")
         self.torque, self.wrench = self.batch.bind("qfrc_applied"), self.batch.bind("xfrc_applied")
         self.sensors = self.batch.bind("sensordata").reshape(size, -1, 3)
 
@@ -169,11 +170,13 @@ class HostEngine:
         worlds.qpos[:], worlds.qvel[:], worlds.warmstart[:] = qpos, qvel, warmstart
         worlds.wrench[:, scene.object_body, :3] = push
         warning[:] = 0
-        torque = evaluator(law).bind(constants)
+        motors, dofs = evaluator(law).bind(constants), scene.joint_dof
+        armature = scene.model.dof_armature[dofs]
         for substep in range(scene.config.substeps):
             position = worlds.qpos[:, scene.joint_qpos].astype(qpos.dtype)
-            velocity = worlds.qvel[:, scene.joint_dof].astype(qvel.dtype)
-            worlds.torque[:, scene.joint_dof] = torque(substep, position, velocity)
+            velocity = worlds.qvel[:, dofs].astype(qvel.dtype)
+            worlds.torque[:, dofs], inertia = motors(substep, position, velocity)
+            worlds.armature[:, dofs] = armature + inertia
             worlds.batch.step()
         if warning[:, _FULL].any():
             raise MemoryError("C MuJoCo has no room for all contacts: raise <size memory> in the hand's MJCF")

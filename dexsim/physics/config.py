@@ -10,9 +10,9 @@ from dexsim.core.errors import ConfigError
 class PhysicsConfig(Config):
     """Time step, solver and contact model."""
 
-    timestep: float = setting(0.006, unit="s", low=1e-4, high=0.02)
-    """One physics sub-step."""
-    substeps: int = setting(5, unit="1", low=1, high=200)
+    timestep: float = setting(0.01, unit="s", low=1e-4, high=0.01)
+    """One physics sub-step. Beyond 10 ms contacts are unstable."""
+    substeps: int = setting(3, unit="1", low=1, high=200)
     """Sub-steps in one control tick; the control rate is 1 / (timestep * substeps), from 1 to 1000 Hz."""
     iterations: int = setting(0, unit="1", low=0, high=100)
     """Newton iterations of the contact solver at most; 0 for as many as the engine needs to converge. Three leave
@@ -28,7 +28,7 @@ class PhysicsConfig(Config):
     pad_points: int = setting(3, unit="1", low=1, high=8)
     """Spheres in a row that replace each capsule of a fingertip in contacts with the object."""
     settling: float = setting(0.03, unit="s", low=0.005, high=0.2)
-    """Time scale on which a contact resolves penetration (at least four time steps)."""
+    """Time scale on which a contact resolves penetration (at least three time steps)."""
 
     def __post_init__(self):
         super().__post_init__()
@@ -46,4 +46,4 @@ class PhysicsConfig(Config):
     @property
     def contact_period(self) -> float:
         """`settling`, s, as far as the time step allows."""
-        return max(self.settling, 4 * self.timestep)
+        return max(self.settling, 3 * self.timestep)

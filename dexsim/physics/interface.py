@@ -25,6 +25,9 @@ from dexsim.physics.config import PhysicsConfig
 TorqueLaw = Callable[[jax.Array, jax.Array, jax.Array], jax.Array]
 """(sub-step [], joint position [J] rad, joint velocity [J] rad/s) to joint torque [J] Nm, before every sub-step."""
 
+ImplicitLaw = Callable[[jax.Array, jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
+"""As `TorqueLaw`, to the torque [J] Nm and the inertia [J] kg m^2 that an engine adds to the joints' (`implicit`)."""
+
 
 @pytree_dataclass
 class PhysicsState:
@@ -84,7 +87,7 @@ class Backend(Protocol):
         object: ObjectParams,
         contacts: ContactParams,
         state: PhysicsState,
-        torque: TorqueLaw,
+        law: ImplicitLaw,
         push: jax.Array,
     ) -> StepResult:
         """Run one control tick of `PhysicsConfig.substeps` sub-steps.
@@ -93,7 +96,7 @@ class Backend(Protocol):
           object: the object.
           contacts: of the object's pairs during the whole tick.
           state: where to start from.
-          torque: of the joints, from sub-step to sub-step.
+          law: of the motors, evaluated before every sub-step.
           push: [3] N, force on the object's centre of mass during the whole tick.
 
         Returns:

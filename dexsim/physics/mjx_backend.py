@@ -8,7 +8,7 @@ import numpy as np
 
 from dexsim.core.errors import AssetError
 from dexsim.objects.params import ObjectParams
-from dexsim.physics.interface import ContactParams, PhysicsScene, PhysicsState, StepResult, TorqueLaw
+from dexsim.physics.interface import ContactParams, ImplicitLaw, PhysicsScene, PhysicsState, StepResult
 from dexsim.physics.parameters import configured
 
 
@@ -35,7 +35,7 @@ class MjxBackend:
         object: ObjectParams,
         contacts: ContactParams,
         state: PhysicsState,
-        torque: TorqueLaw,
+        law: ImplicitLaw,
         push: jax.Array,
     ) -> StepResult:
         """One control tick by `mjx.step`."""
@@ -46,8 +46,9 @@ class MjxBackend:
         )
 
         def substep(data: Any, index: jax.Array) -> tuple[Any, None]:
-            tau = torque(index, data.qpos[scene.joint_qpos], data.qvel[scene.joint_dof])
-            applied = jnp.zeros(scene.model.nv).at[scene.joint_dof].set(tau)
+            torque, inertia = law(index, data.qpos[scene.joint_qpos], data.qvel[scene.joint_dof])
+            applied = jnp.zeros(scene.model.nv).at[scene.joint_dof].set(torque)
+            armature = self.model.dof_armature.at[scene.joint_dof].add(inertia)
             # MJX relies on implicit promotion, which the caller may have made an error. TF32, the default of products
             # on NVIDIA GPUs, is too coarse for a solver.
             with (
@@ -55,7 +56,7 @@ class MjxBackend:
                 jax.numpy_dtype_promotion("standard"),
                 jax.default_matmul_precision("highest"),
             ):
-                return self.mjx.step(model, data.replace(qfrc_applied=applied)), None
+                return self.mjx.step(model.replace(dof_armature=armature), data.replace(qfrc_applied=applied)), None
 
         # Forces are read after the scan: as an output of it they would double the step's time.
         data, _ = jax.lax.scan(substep, data, jnp.arange(scene.config.substeps))

@@ -21,6 +21,7 @@ from dexsim.physics.c_backend import CBackend
 from dexsim.physics.config import PhysicsConfig
 from dexsim.physics.cuda.backend import CudaBackend
 from dexsim.physics.interface import Backend, ContactParams, PhysicsScene, PhysicsState, StepResult, TorqueLaw
+from dexsim.physics.law import implicit
 from dexsim.physics.mjx_backend import MjxBackend
 from dexsim.physics.model import build_scene
 from dexsim.physics.parameters import configured
@@ -108,7 +109,7 @@ class Physics:
           tip_stiffness, pad_thickness_delta: see `contact_params`.
         """
         contacts = self.contact_params(object, tip_stiffness, pad_thickness_delta)
-        return self.engine.advance(object, contacts, state, law, push)
+        return self.engine.advance(object, contacts, state, implicit(law, self.config.timestep), push)
 
     def configure(
         self,

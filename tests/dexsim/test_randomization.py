@@ -132,28 +132,28 @@ def test_quantities_are_drawn_apart_from_one_another(hand):
 def test_scale_shrinks_all_ranges_about_the_nominal_hand(hand, seed):
     """The same key at half the scale lands half way to nominal."""
     nominal, half, full = (quantities(hand, draws(hand, Randomization(scale=s), seed)) for s in (0.0, 0.5, 1.0))
-    for name in full.keys() - {"latency", "ripple_count"}:  # whole sub-steps; no nominal value
+    for name in full.keys() - {"ripple_count"}:  # it has no nominal value
         wanted = (np.asarray(full[name]) + np.asarray(nominal[name])) / 2
         np.testing.assert_allclose(half[name], wanted, atol=1e-5, err_msg=name)
 
 
-def test_latency_is_whole_substeps_and_reaches_its_bound(hand):
+def test_latency_is_in_substeps_and_reaches_its_bound(hand):
     latency = np.asarray(draws(hand, EVEN).latency)
-    assert latency.dtype == np.int32 and set(latency.ravel()) == {0, 1, 2, 3, 4}
+    assert latency.min() < 0.05 and 3.95 < latency.max() <= 4.0
     assert np.all(latency == latency[:, :1])  # common to all joints
     fixed = draws(hand, Randomization(latency=(0.015, 0.015), latency_spread=(0.0, 0.0)))
-    np.testing.assert_array_equal(fixed.latency, 3)
+    np.testing.assert_allclose(fixed.latency, 3.0, rtol=1e-6)
 
 
 def test_joints_are_late_by_themselves_too(hand):
     latency = np.asarray(draws(hand, Randomization(latency=(0.005, 0.005), latency_spread=(0.0, 0.01))).latency)
-    assert latency.shape == (1000, 12) and set(latency.ravel()) == {1, 2, 3}
+    assert latency.shape == (1000, 12) and latency.min() < 1.05 and 2.95 < latency.max() <= 3.0
     assert np.abs(np.corrcoef(latency.T) - np.eye(12)).max() < 0.15
 
 
 def test_latency_ends_at_one_tick(hand):
     latency = np.asarray(draws(hand, Randomization(latency=(0.02, 0.08))).latency)
-    assert latency.max() == 6 and np.mean(latency == 6) > 0.7
+    assert latency.max() == pytest.approx(6) and np.mean(latency > 5.999) > 0.7
 
 
 def test_a_range_the_wrong_way_round_is_refused():
@@ -242,7 +242,7 @@ def test_held_out_hands_lie_outside_every_range(hand):
         span = getattr(config, name)
         low, high = span if isinstance(span, tuple) else (-span, span)
         nominal = 1.0 if name.endswith(("factor", "gain")) or name == "efficiency" else 0.0
-        slack = 0.5 * TIMES["timestep"] + 1e-9 if name == "latency" else 1e-6
+        slack = 1e-6
         assert np.all((values <= low + slack) | (values >= high - slack)), name
         far = 1.4 * max(high - nominal, nominal - low) + slack
         assert np.all(np.abs(values - nominal) <= far), name

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 
 from dexsim.env.motors import JointCommand
 from dexsim.physics.cuda.law import print_law
-from dexsim.physics.law import record
+from dexsim.physics.law import implicit, record
 from dexsim.physics.model import build_scene
 
 
@@ -23,8 +23,8 @@ def motor_law(env):
         state = env.reset(key)
         target = state.joint_target
         command = JointCommand(action=0 * target, target=target, previous=target, valid=jnp.array(True))
-        law = record(env.motors.law(state.episode.hand, command), jnp.zeros(env.hand.num_joints))
-        printed.append(print_law(law, env.hand.num_joints))
+        law = implicit(env.motors.law(state.episode.hand, command), env.config.physics.timestep)
+        printed.append(print_law(record(law, jnp.zeros(env.hand.num_joints)), env.hand.num_joints))
 
     jax.eval_shape(trace, jax.random.key(0))
     return printed[0]

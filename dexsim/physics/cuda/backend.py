@@ -15,7 +15,7 @@ from dexsim.physics.cuda import launch
 from dexsim.physics.cuda.law import PrintedLaw, print_law
 from dexsim.physics.cuda.program import compile_kernel, find_compiler, source
 from dexsim.physics.cuda.scene import Settings, buffers, kernel_constants
-from dexsim.physics.interface import ContactParams, PhysicsScene, PhysicsState, StepResult, TorqueLaw
+from dexsim.physics.interface import ContactParams, ImplicitLaw, PhysicsScene, PhysicsState, StepResult
 from dexsim.physics.law import record
 from dexsim.physics.parameters import values
 
@@ -45,15 +45,15 @@ class CudaBackend:
         object: ObjectParams,
         contacts: ContactParams,
         state: PhysicsState,
-        torque: TorqueLaw,
+        law: ImplicitLaw,
         push: jax.Array,
     ) -> StepResult:
         """One control tick in one launch."""
         joints = len(self.scene.joint_dof)
-        law = record(torque, jnp.zeros(joints))
-        name, moving = self._load(print_law(law, joints)), (state.qpos, state.qvel, state.warmstart)
+        recorded = record(law, jnp.zeros(joints))
+        name, moving = self._load(print_law(recorded, joints)), (state.qpos, state.qvel, state.warmstart)
         constant = self._inputs(object, contacts, push)
-        qpos, qvel, warmstart, force, _ = self._tick(name, *moving, *constant, *map(jnp.asarray, law.constants))
+        qpos, qvel, warmstart, force, _ = self._tick(name, *moving, *constant, *map(jnp.asarray, recorded.constants))
         return StepResult(PhysicsState(qpos, qvel, warmstart), force)
 
     def _inputs(self, object: ObjectParams, contacts: ContactParams, push: jax.Array) -> list[jax.Array]:

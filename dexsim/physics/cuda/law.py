@@ -28,9 +28,9 @@ class PrintedLaw:
 
 
 def print_law(law: Recorded, joints: int) -> PrintedLaw:
-    """`DEV float motor_law(const Args &args, int world, int joint, int substep, float position, float velocity)`.
+    """`DEV Motor motor_law(const Args &args, int world, int joint, int substep, float position, float velocity)`.
 
-    Joint torque, Nm, at a joint angle, rad, and velocity, rad/s.
+    `Motor` is torque, Nm, and inertia, kg m^2, at a joint angle, rad, and velocity, rad/s (`implicit`).
 
     Args:
       law: as recorded.
@@ -78,8 +78,8 @@ def print_law(law: Recorded, joints: int) -> PrintedLaw:
         value = expression.format(*(names[operand] for operand in operands))
         lines.append(f"  const {_CTYPES[dtype]} v{number} = {value};\n")
     return PrintedLaw(
-        "DEV float motor_law(const Args &args, int world, int joint, int substep, float position, float velocity) {\n"
-        f"{''.join(lines)}  return {names[law.result]};\n}}\n",
+        "DEV Motor motor_law(const Args &args, int world, int joint, int substep, float position, float velocity) {\n"
+        f"{''.join(lines)}  return {{{names[law.torque]}, {names[law.inertia]}}};\n}}\n",
         tuple(buffers),
     )
 

@@ -63,7 +63,7 @@ def declare_args(buffers: Sequence[Buffer]) -> str:
     """`struct Args` in C++: pointers in the order of `buffers`, the number of worlds, `Settings`."""
     pointers = "".join(f"  {'' if buffer.output else 'const '}{buffer.ctype} *{buffer.name};\n" for buffer in buffers)
     numbers = "".join(f"  {kind.__name__} {name};\n" for name, kind in _NUMBERS)
-    return f"struct Args {{\n{pointers}{numbers}}};\n"
+    return f"struct Args {{\n{pointers}{numbers}}};\nstruct Motor {{ float torque, inertia; }};\n"
 
 
 def args_type(count: int) -> type[ctypes.Structure]:

@@ -138,6 +138,11 @@ def test_delay_is_exact_to_the_substep():
             np.testing.assert_array_equal(acts, previous if substep < latency else target)
 
 
+def test_a_delay_within_a_substep_is_the_mean_over_it():
+    acts = [float(delayed_target(jnp.int32(k), jnp.float32(1.25), -jnp.ones(()), jnp.ones(()))) for k in range(3)]
+    np.testing.assert_allclose(acts, [-1.0, 0.5, 1.0])
+
+
 def test_delay_within_a_scan_of_substeps():
     """The sub-step at which the target starts to act, seen from inside a tick, for each environment of a batch."""
 

@@ -190,14 +190,22 @@ class TestTick:
             new = np.clip(new, hand.joint_lower, hand.joint_upper)
             drawn = c_scene.row(state.episode.hand, world)
             drive, latency, tilt = drawn.actuator, drawn.latency, drawn.tilt
-            inertia_rate = model.dof_M0[:12] / model.opt.timestep
+            inertia_rate, armature = model.dof_M0[:12] / model.opt.timestep, model.dof_armature[:12].copy()
             down = np.array([1.0, -np.tan(tilt[1]), np.tan(tilt[0])])
             force = target.mass * 9.81 * (down / np.linalg.norm(down) - [1.0, 0, 0])
             data.xfrc_applied[model.body("object").id, :3] = force + np.asarray(push[world])
             for substep in range(config.physics.substeps):
-                wanted = np.where(substep < latency, old, new)
-                torque = plain_drive(drive, wanted, data.qpos[:12], data.qvel[:12])
-                data.qfrc_applied[:12] = torque - plain_friction(drive, torque, data.qvel[:12], inertia_rate)
+                acting = old + np.clip(substep + 1 - latency, 0, 1) * (new - old)
+
+                def motors(q, v, acting=acting, drive=drive):
+                    torque = plain_drive(drive, acting, q, v)
+                    return torque - plain_friction(drive, torque, v, inertia_rate)
+
+                # The motors' damping acts at the middle of the step: half of its slope, by differences, is inertia.
+                q, v, h = data.qpos[:12].copy(), data.qvel[:12].copy(), model.opt.timestep
+                damping = np.maximum(motors(q, v - 1e-4) - motors(q, v + 1e-4), 0) / 2e-4
+                data.qfrc_applied[:12] = motors(q, v)
+                model.dof_armature[:12] = armature + 0.5 * h * damping
                 mujoco.mj_step(model, data)
             felt = np.linalg.norm(c_scene.finger_force(model, data, hand), axis=-1)
             strong += np.sum(felt > 0.5)

@@ -13,6 +13,7 @@ from dexsim.hand.kinematics import flexion_joints, forward_kinematics, hinge_ang
 from dexsim.hand.load import load_hand
 from dexsim.physics.config import PhysicsConfig
 from dexsim.physics.interface import ContactParams, PhysicsState
+from dexsim.physics.law import implicit
 from dexsim.physics.model import build_scene
 
 # References, an anchor beside the body's origin, and a ratio and an offset of their own.
@@ -151,7 +152,7 @@ def driven(hand, backend):
 
     @jax.jit
     def tick(state):
-        return engine.advance(object, contacts, state, law, jnp.zeros(3)).state
+        return engine.advance(object, contacts, state, implicit(law, PhysicsConfig().timestep), jnp.zeros(3)).state
 
     worst = 0.0
     for _ in range(17):

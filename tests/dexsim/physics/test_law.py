@@ -12,17 +12,19 @@ import pytest
 from dexsim.core.errors import ConfigError
 from dexsim.env.motors import JointCommand
 from dexsim.physics.cuda.law import print_law
-from dexsim.physics.law import evaluator, record
+from dexsim.physics.law import evaluator, implicit, record
 
 WORLDS, JOINTS = 16, 12
 SCALE, OFFSET = jnp.float32(1.7), jnp.linspace(-1.0, 1.0, JOINTS)
 MAIN = """
 extern "C" void run(const void **constants, int worlds, int joints, int substep, const float *position,
-                    const float *velocity, float *torque) {
+                    const float *velocity, float *torque, float *inertia) {
   Args args;
   __builtin_memcpy(&args, constants, sizeof args);
-  for (int i = 0; i < worlds * joints; i++)
-    torque[i] = motor_law(args, i / joints, i % joints, substep, position[i], velocity[i]);
+  for (int i = 0; i < worlds * joints; i++) {
+    const Motor motor = motor_law(args, i / joints, i % joints, substep, position[i], velocity[i]);
+    torque[i] = motor.torque, inertia[i] = motor.inertia;
+  }
 }
 """
 
@@ -40,18 +42,18 @@ def in_cpp(recorded, constants, folder):
     printed = print_law(recorded, JOINTS)
     pointers = "".join(f"const {buffer.ctype} *{buffer.name};" for buffer in printed.buffers)
     source, library = folder / "law.cpp", folder / "law.so"
-    text = f"#include <cmath>\n#define DEV static\nstruct Args {{ {pointers} }};\n{printed.text}{MAIN}"
+    text = f"#include <cmath>\n#define DEV static\nstruct Args {{ {pointers} }};\nstruct Motor {{ float torque, inertia; }};\n{printed.text}{MAIN}"
     source.write_text(text)
     subprocess.run(["g++", "-O2", "-ffp-contract=off", "-shared", "-fPIC", "-o", library, source], check=True)
     call = ctypes.CDLL(str(library)).run
     constants = [np.ascontiguousarray(np.broadcast_to(x, (WORLDS, *x.shape[1:]))) for x in constants]
 
     def run(substep, position, velocity):
-        torque = np.zeros(position.shape, np.float32)
+        torque, inertia = np.zeros((2, *position.shape), np.float32)
         addresses = (ctypes.c_void_p * len(constants))(*(constant.ctypes.data for constant in constants))
-        arrays = (np.ascontiguousarray(x).ctypes.data_as(ctypes.c_void_p) for x in (position, velocity, torque))
+        arrays = (np.ascontiguousarray(x).ctypes.data_as(ctypes.c_void_p) for x in (position, velocity, torque, inertia))
         call(addresses, *position.shape, substep, *arrays)
-        return torque
+        return torque, inertia
 
     return run
 
@@ -75,7 +77,7 @@ def test_the_motors_are_jaxs(grasp_rollout, tmp_path, way):
     def law_of(state):
         target, valid = state.joint_target + 0.2, jnp.array(True)
         command = JointCommand(action=0 * target, target=target, previous=state.joint_target, valid=valid)
-        return env.motors.law(state.episode.hand, command)
+        return implicit(env.motors.law(state.episode.hand, command), env.config.physics.timestep)
 
     def constants(state):
         recorded.append(record(law_of(state), jnp.zeros(JOINTS)))
@@ -86,10 +88,12 @@ def test_the_motors_are_jaxs(grasp_rollout, tmp_path, way):
     expected_of = jax.jit(jax.vmap(lambda s, i, p, v: law_of(s)(i, p, v), in_axes=(0, None, 0, 0)))
     position, velocity = moments(0)
     torques = []
-    for substep in range(5):
-        torques.append(np.asarray(expected_of(states, jnp.int32(substep), position, velocity)))
+    for substep in range(3):
+        expected, inertia = expected_of(states, jnp.int32(substep), position, velocity)
+        torques.append(np.asarray(expected))
         # Torques are differences of larger terms: the rate that friction sees, inertia / dt times velocity.
-        np.testing.assert_allclose(law(substep, position, velocity), torques[-1], rtol=2e-5, atol=2e-6)
+        for result, value in zip(law(substep, position, velocity), (expected, inertia), strict=True):
+            np.testing.assert_allclose(result, value, rtol=2e-5, atol=2e-6)
     assert np.abs(torques).max() > 0.05, "no torque: the test tests nothing"
     assert np.any(torques[0] != torques[-1]), "no latency: the test does not test it"
 
@@ -104,7 +108,8 @@ def every_operation(reach):
         mixed = jnp.where(either, bent, jnp.sign(velocity) / (2.0 + jnp.maximum(position, OFFSET)))
         clipped = jax.lax.clamp(jnp.float32(-1.0), mixed * SCALE, jnp.float32(1.0))
         count = (index <= 1).astype(jnp.int32) + jnp.where(velocity < 0.0, 3, -4)
-        return jnp.minimum(reach, 0.3) - clipped + jnp.minimum(jnp.sin(velocity), jnp.inf) * count.astype(jnp.float32)
+        torque = jnp.minimum(reach, 0.3) - clipped + jnp.minimum(jnp.sin(velocity), jnp.inf) * count.astype(jnp.float32)
+        return torque, velocity * reach
 
     return law
 
@@ -122,18 +127,19 @@ def test_every_operation(tmp_path, way):
     position, velocity = moments(2)
     for index in (1, 2):
         expected = jax.vmap(lambda r, p, v, i=index: every_operation(r)(jnp.int32(i), p, v))(reach, position, velocity)
-        np.testing.assert_allclose(law(index, position, velocity), expected, rtol=1e-5, atol=2e-6)
+        for result, value in zip(law(index, position, velocity), expected, strict=True):
+            np.testing.assert_allclose(result, value, rtol=1e-5, atol=2e-6)
 
 
-TABLE, WIDE = jnp.arange(60.0).reshape(5, JOINTS), jnp.zeros((2, JOINTS))
+TABLE, WIDE, EYE = jnp.arange(60.0).reshape(5, JOINTS), jnp.zeros((2, JOINTS)), jnp.eye(JOINTS)
 
 
 @pytest.mark.parametrize(
     ("law", "message"),
     [
-        (lambda index, *_: TABLE[index], "a motor law with .*choose backend mjx"),
-        (lambda index, p, v: jnp.eye(JOINTS) @ p, "dot_general"),
-        (lambda index, p, v: jnp.broadcast_to(p, WIDE.shape) + WIDE, r"an array \[2, 12\] float32: expected \[\] or"),
+        (lambda index, *_: (TABLE[index], OFFSET), "a motor law with .*choose backend mjx"),
+        (lambda index, p, v: (EYE @ p, v), "dot_general"),
+        (lambda index, p, v: (jnp.broadcast_to(p, WIDE.shape) + WIDE, v), r"an array \[2, 12\] float32: expected \[\] or"),
     ],
 )
 def test_laws_that_are_not_element_by_element_are_named(law, message):

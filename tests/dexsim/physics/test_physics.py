@@ -42,9 +42,9 @@ def test_backends(monkeypatch):
 @pytest.mark.parametrize(
     "changes, message",
     [
-        ({"timestep": 0.5}, "0.5 s: must be between 0.0001 and 0.02 s"),
-        ({"substeps": 200}, "0.006 s times substeps = 200 is a control tick of 1.2 s: must be from 0.001 to 1 s"),
-        ({"timestep": 1e-4}, "a control tick of 0.0005 s"),
+        ({"timestep": 0.5}, "0.5 s: must be between 0.0001 and 0.01 s"),
+        ({"substeps": 200}, "0.01 s times substeps = 200 is a control tick of 2 s: must be from 0.001 to 1 s"),
+        ({"timestep": 1e-4}, "a control tick of 0.0003 s"),
         ({"iterations": -1}, "iterations"),
     ],
 )

@@ -20,10 +20,10 @@ compiler = shutil.which("g++")
 
 # `physics_states.pd_torque`, its targets as the law's only constant.
 PD_LAW = """
-DEV float motor_law(const Args &args, int world, int joint, int, float position, float velocity) {
+DEV Motor motor_law(const Args &args, int world, int joint, int, float position, float velocity) {
   const float limit = 3.0f * fmaxf(1 - fabsf(velocity) / 20.0f, 0.0f);
   const float torque = 3.0f * (args.law_0[world * JOINTS + joint] - position) - 0.02f * velocity;
-  return fminf(fmaxf(torque, -limit), limit);
+  return {fminf(fmaxf(torque, -limit), limit), 0.0f};
 }
 """
 

@@ -60,7 +60,7 @@ DEV float bias_force(const State &state, const Pose &pose, const Motion &unit, c
 }
 
 // The mass matrix: rows of the hand to `mass_rows`, the object's row [6] on the lanes of its first group.
-DEV void mass_matrix(Inertia inertia, const Motion &unit, Shared &shared, float (&object)[6], const Lane &lane) {
+DEV void mass_matrix(Inertia inertia, float armature, const Motion &unit, Shared &shared, float (&object)[6], const Lane &lane) {
   add_children(inertia, lane);
   const Force force = inertia * unit;  // of a unit acceleration of the hinge on all that it carries
   float *rows = mass_rows(shared);
@@ -69,7 +69,7 @@ DEV void mass_matrix(Inertia inertia, const Motion &unit, Shared &shared, float 
   }
   __syncwarp();
   if (lane.hinge) {
-    rows[lane.index * MASS_STRIDE + lane.index] = dot(unit, force) + ARMATURE[lane.index];
+    rows[lane.index * MASS_STRIDE + lane.index] = dot(unit, force) + armature;
 #pragma unroll 1
     for (int above = PARENT[lane.index]; above >= 0; above = PARENT[above]) {
       const float value = dot(motion_of(shared, above), force);

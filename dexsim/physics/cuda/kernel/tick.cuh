@@ -12,13 +12,17 @@
 #include "contacts/find.cuh"
 
 // All but contact forces along the lane's degree of freedom: bias, motor, damping and spring of a hinge, push on the
-// object.
+// object. `armature` is what its rotor and its implicit motor add to its inertia.
 DEV float smooth_force(const Args &args, int world, int substep, const State &state, const Pose &pose,
-                       const Motion &unit, const Inertia &inertia, Vec3 centre, const Lane &lane) {
+                       const Motion &unit, const Inertia &inertia, Vec3 centre, float &armature, const Lane &lane) {
   float force = -bias_force(state, pose, unit, inertia, lane);
+  armature = lane.hinge ? ARMATURE[lane.index] : 0;
   if (lane.hinge) {
     const int l = lane.index, joint = DRIVE[l];
-    if (joint >= 0) force += motor_law(args, world, joint, substep, state.angle, state.speed);
+    if (joint >= 0) {
+      const Motor motor = motor_law(args, world, joint, substep, state.angle, state.speed);
+      force += motor.torque, armature += motor.inertia;
+    }
     force -= DAMPING[l] * state.speed + STIFFNESS[l] * (state.angle - SPRING_ANGLE[l]);
   } else {
     const Vec3 push = load3(args.push + 3 * world);
@@ -108,8 +112,9 @@ DEV void tick(const Args &args, int world, Shared &shared, int index) {
       Vec3 centre;
       const Inertia inertia = link_inertia(args, world, pose, centre, lane);
       __syncwarp();
-      problem.force = smooth_force(args, world, substep, state, pose, unit, inertia, centre, lane);
-      mass_matrix(inertia, unit, shared, problem.object_mass, lane);
+      float armature;
+      problem.force = smooth_force(args, world, substep, state, pose, unit, inertia, centre, armature, lane);
+      mass_matrix(inertia, armature, unit, shared, problem.object_mass, lane);
       add_couplings(state, shared, problem.force, lane);
       load_mass(problem, shared, lane);
     }
