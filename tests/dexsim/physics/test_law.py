@@ -125,14 +125,14 @@ def test_every_operation(tmp_path, way):
         np.testing.assert_allclose(law(index, position, velocity), expected, rtol=1e-5, atol=2e-6)
 
 
-TABLE, WIDE = jnp.arange(60.0).reshape(5, JOINTS), jnp.zeros((2, JOINTS))
+TABLE, WIDE, MATRIX = jnp.arange(60.0).reshape(5, JOINTS), jnp.zeros((2, JOINTS)), jnp.ones((JOINTS, JOINTS))
 
 
 @pytest.mark.parametrize(
     ("law", "message"),
     [
         (lambda index, *_: TABLE[index], "a motor law with .*choose backend mjx"),
-        (lambda index, p, v: jnp.eye(JOINTS) @ p, "dot_general"),
+        (lambda index, p, v: MATRIX @ p, "dot_general"),
         (lambda index, p, v: jnp.broadcast_to(p, WIDE.shape) + WIDE, r"an array \[2, 12\] float32: expected \[\] or"),
     ],
 )
