@@ -36,7 +36,7 @@ def check_model(model: mujoco.MjModel, where: str | Path = "model") -> None:
     features = []
     for kind, values in elements.items():
         for feature, value in values.items():
-            rows = np.flatnonzero([np.any(row) for row in value])
+            rows = np.flatnonzero(np.any(np.c_[value] != 0, axis=1))
             names = [getattr(model, kind)(int(row)).name or f"#{row}" for row in rows]
             if names:
                 features.append(f"{feature} ({kind} {', '.join(names)})")
