@@ -1,12 +1,15 @@
 """The time step at which explicit motors are stable, against a joint that is simulated."""
 
 import dataclasses
+from types import SimpleNamespace
 
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
-from dexsim.env.motors import check_timestep
+from dexsim.actuator.drive import delayed_target
+from dexsim.env.motors import JointCommand, Motors, check_timestep
 from dexsim.errors import ConfigError
 from dexsim.hand.kinematics import hinge_angles
 from dexsim.hand.mjcf import read_mjcf
@@ -67,11 +70,26 @@ def test_it_refuses_the_steps_at_which_the_hand_chatters(hand, step):
     assert accepts(hand, step, NOMINAL) == (not chatters(hand, step, NOMINAL.stiffness, NOMINAL.damping))
 
 
+def test_targets_arrive_after_their_latency_up_to_two_ticks():
+    """Targets 0, 1, 2, ... of successive ticks: at sub-step n acts the newest that is at least `latency` old."""
+    substeps, targets = 6, jnp.arange(8.0)
+    motors = object.__new__(Motors)
+    motors._substeps = substeps
+    latency = jnp.arange(2 * substeps + 1)
+    for tick in range(2, 6):
+        target, previous, earlier = (jnp.full(len(latency), targets[tick - k]) for k in range(3))
+        command = JointCommand(target, target, previous, jnp.bool_(True), earlier)
+        delay = motors._delay(SimpleNamespace(latency=latency), command)
+        for substep in range(substeps):
+            expected = (tick * substeps + substep - np.asarray(latency)) // substeps
+            np.testing.assert_array_equal(delayed_target(jnp.int32(substep), *delay), expected)
+
+
 def test_the_default_is_stable_and_coarser_steps_are_refused_with_what_to_do(hand):
     ranges = Randomization()
     check_timestep(hand, PhysicsConfig(), ranges)
     for step in (0.008, 0.010):
-        with pytest.raises(ConfigError, match=r"motors drawn are unstable at joint \w+ .*: use at most 0.006\d* s"):
+        with pytest.raises(ConfigError, match=r"unstable at joint \w+: use at most 0.006\d* s"):
             check_timestep(hand, PhysicsConfig(timestep=step), ranges)
     soft = dataclasses.replace(ranges, stiffness=1.0, damping=0.02)
     check_timestep(hand, PhysicsConfig(timestep=0.010), soft)

@@ -12,7 +12,6 @@ from test_rotate import PERIOD, quat_of, truth, turned
 
 from dexsim.physics.config import PhysicsConfig
 from dexsim.tasks.rotate.config import RotateConfig, RotateReward
-from dexsim.tasks.rotate.report import summarize
 from dexsim.tasks.rotate.task import Rotate
 from dexsim.touch.feel import Touch
 
@@ -144,12 +143,6 @@ def test_a_touch_is_recent_for_a_fifth_of_a_second(task):
     assert not found["pushed_out"] and not found["slipped"]
 
 
-def test_no_finger_has_touched_before_the_first_tick(task):
-    goal = task.begin(jax.random.key(0), None)
-    _, found = task.reward(goal, moment(task, finger_force=np.zeros((5, 3))), jnp.bool_(True))
-    assert float(found["slipped"]) == 1.0
-
-
 def test_clocks_pushes_and_rows(hand):
     physics = PhysicsConfig(timestep=0.005, substeps=8)  # 0.04 s
     config = RotateConfig(
@@ -164,31 +157,3 @@ def test_clocks_pushes_and_rows(hand):
     assert rows.tolist() == [0, 2, 4, 6, 8] and goals.turns.shape == (5,) and goals.duty.shape == (5, 5)
     assert not np.any(goals.gives_up) and bool(task.begin(key, None).gives_up)
     assert task.evaluation_plan(4, np.zeros(2, int))[0].tolist() == [0, 0, 1, 1]
-
-
-def test_the_report_has_every_figure_under_its_name():
-    n = 201
-    names = ("spin", "joint_speed", "action_rate", "tilt")
-    metrics = {name: np.full(n, value) for name, value in zip(names, (0.1, 0.2, 0.3, 0.4), strict=True)}
-    metrics |= {name: np.zeros(n) for name in ("pushed_out", "slipped")}
-    metrics |= {"successes": np.arange(n)[::-1] * 1.0, "paper_successes": np.arange(n) + 1000.0}
-    metrics |= {"time_at_last_success": np.full(n, 30.0), "non_finite": np.r_[2.0, 5.0, np.zeros(n - 2)]}
-    metrics |= {f"duty/{i}": np.full(n, duty) for i, duty in enumerate((0.11, 0.09, 0.5))}
-    lived = np.r_[np.full(n - 1, 1000), 0]
-    report = summarize(metrics, lived, 0.03, 1000)
-    assert report["episodes"] == n and report["seconds"] == 30.0 and report["non_finite"] == 2
-    gait = report["gait"]
-    keys = ("spin_rad_s", "joint_speed_rad_s", "action_rate", "tilt_rad")
-    assert [gait[key]["mean"] for key in keys] == pytest.approx([0.1, 0.2, 0.3, 0.4])
-    assert report["kept_to_the_end"]["mean"] == pytest.approx(200 / 201) and report["end"]["timeout"] == 200
-    assert report["seconds_to_fall"]["median"] == report["seconds_to_fall"]["longest"] == 30.0
-    assert {q: value for q, value in report["successes"]["percentiles"].items()} == {
-        str(q): 2.0 * q for q in (1, 5, 10, 25, 50, 75, 90, 95, 99)
-    }
-    ordered = report["successes"]["sorted"]
-    assert len(ordered) == 100 and ordered == sorted(ordered) and (ordered[0], ordered[-1]) == (0, 200)
-    headline = report["headline"]
-    assert headline["successes (10th percentile)"] == 20 and headline["successes (mean)"]["value"] == 100
-    assert headline["paper's successes (mean)"]["value"] == 1100 and headline["successes (median)"]["value"] == 100
-    assert headline["joint speed (rad/s)"]["value"] == pytest.approx(0.2)
-    assert headline["fingertips at work (duty over 10 %)"] == 2
