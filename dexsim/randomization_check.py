@@ -112,11 +112,12 @@ def check(
         size = {name: float(np.sqrt(np.mean(base[name] ** 2))) or 1.0 for name in READINGS}
         moved = {name: float(np.max(values)) for name, values in _distance(run(after), base).items()}
         which = max(READINGS, key=lambda name: moved[name] / size[name])
-        models = [env.physics.configure(jax.tree.map(lambda leaf: leaf[0], e.object)) for e in (before, after)]
-        changed = changes(dataclasses.replace(before, object=None), dataclasses.replace(after, object=None))
-        return Effect(
-            path, changed + changes(*models), moved["joint"], moved["object"], moved[which] / size[which], which
-        )
+        if path in env.task.object_ranges:  # What the physics is given must differ, not only what was drawn.
+            models = [env.physics.configure(jax.tree.map(lambda leaf: leaf[0], e.object)) for e in (before, after)]
+            changed = changes(*models)
+        else:
+            changed = changes(before, after)
+        return Effect(path, changed, moved["joint"], moved["object"], moved[which] / size[which], which)
 
     return [effect(path) for path in names or paths]
 

@@ -144,15 +144,6 @@ class TestTraining:
         paper.measure.train(self.row(paper), 2, budget, folder)
         assert len(trained) == 1, "a finished training is not repeated"
 
-    def test_a_budget_of_steps_has_no_limit_of_time(self, paper, trained, here):
-        row = paper.experiments.EXPERIMENTS["observations"].rows[0]
-        _, found = paper.measure.train(row, 0, paper.data.BUDGETS["gpu"], here / "seed0")
-        options = trained[0][2]
-        assert (options["steps"], options["minutes"]) == (4e7, 0.0)
-        assert (options["ppo"].num_envs, options["ppo"].kl_target, found["kl_target"]) == (8192, 0.04, 0.04)
-        report = {"seeds": {"0": {"training": found}}, "budget": "gpu"}
-        assert paper.tables.how(None, row, report) == "1 × 40 million steps, gpu budget"
-
 
 # --- what the rows are ----------------------------------------------------------------------------------
 

@@ -89,7 +89,7 @@ def test_a_module_is_named_with_the_task(hand):
     assert registry.make_task("poke", hand).name == "poke"
     with pytest.raises(ConfigError, match="task module 'no_such_module': cannot be imported"):
         registry.find_task("no_such_module:poke")
-    with pytest.raises(ConfigError, match="unknown task 'prod': choose from grasp, poke, rotate"):
+    with pytest.raises(ConfigError, match="unknown task 'prod': choose from grasp, grasp_paper, poke, rotate"):
         registry.find_task("poke_task:prod")
     with pytest.raises(ConfigError, match="rotate.*; poke_task neither registers it nor has a function of that name$"):
         registry.find_task("poke_task:__name__")  # A value that is no function.
@@ -107,7 +107,7 @@ def test_an_installed_package_brings_tasks_by_its_entry_point(monkeypatch, hand)
 
 def test_what_make_refuses():
     for name, options, message in (
-        ("juggle", {}, "unknown task 'juggle': choose from grasp, rotate.*--task my_module:juggle"),
+        ("juggle", {}, "unknown task 'juggle': choose from grasp, .*rotate.*--task my_module:juggle"),
         ("rotate", {"config": GraspConfig()}, "takes a RotateConfig, not a GraspConfig"),
         ("os:getcwd", {}, "returned a str; expected reset"),
         ("os:grasp", {}, "dexsim has a task 'grasp' of its own"),

@@ -52,16 +52,6 @@ def spans(config):
 
 class TestBulk:
     @pytest.mark.slow
-    def test_every_episode_has_its_own_and_the_rows_shape(self, env, drawn):
-        for name in ("size", "position", "active", "shape_index"):
-            of_row = np.asarray(getattr(env.pool.object, name))
-            np.testing.assert_array_equal(getattr(drawn, name), np.repeat(of_row[:, None], MANY, 1), err_msg=name)
-        plain = ~np.asarray(env.pool.object.extreme)
-        for name in ("mass", "friction", "link_friction"):
-            values = np.asarray(getattr(drawn, name))[plain]
-            assert len(np.unique(values)) > 0.99 * values.size, name
-
-    @pytest.mark.slow
     def test_it_is_uniform_in_its_ranges_whatever_the_row(self, env, drawn):
         low, high = spans(env.config.objects).T
         place = (bulk(drawn) - low) / (high - low)

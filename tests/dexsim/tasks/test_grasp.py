@@ -10,12 +10,11 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from episodes import still_moment
 from simple_physics import SimplePhysics
 
 import dexsim
 from dexsim.core.errors import ConfigError
-from dexsim.env.task import GroundTruth
-from dexsim.hand.kinematics import forward_kinematics
 from dexsim.objects.config import SHAPES, ObjectConfig
 from dexsim.tasks.grasp.config import GraspConfig, GraspReward, paper
 from dexsim.tasks.grasp.task import (
@@ -67,35 +66,8 @@ def gauss(error, sigma):
     return math.exp(-error * error / (2 * sigma * sigma))
 
 
-def make_moment(hand, **fields):
-    """A moment of rest at the middle posture, nothing touching, with `fields` put in."""
-    zero = jnp.zeros(12)
-    joints = jnp.asarray((hand.joint_lower + hand.joint_upper) / 2)
-    nothing = jnp.zeros((5, 120))
-    values = {
-        "object": None,
-        "joint_position": joints,
-        "joint_velocity": zero,
-        "joint_torque": zero,
-        "torque_limited": zero > 0,
-        "tip_stiffness": jnp.ones(5),
-        "pose": forward_kinematics(hand, joints),
-        "finger_force": jnp.zeros((5, 3)),
-        "normal_force": jnp.zeros(5),
-        "touch": Touch(nothing, nothing, nothing),
-        "object_position": jnp.asarray(CENTRE),
-        "object_quat": jnp.array([1.0, 0, 0, 0]),
-        "object_velocity": jnp.zeros(3),
-        "object_spin": jnp.zeros(3),
-        "action": zero,
-        "last_action": zero,
-    }
-    return GroundTruth(
-        **{
-            name: jnp.asarray(value) if name not in ("object", "pose", "touch") else value
-            for name, value in (values | fields).items()
-        }
-    )
+def make_moment(hand, **changes):
+    return still_moment(hand, CENTRE, **changes)
 
 
 def goal_of(command):
